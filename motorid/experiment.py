@@ -1,0 +1,275 @@
+"""One run of a motor: time, inputs, measured channels; validated once, then frozen."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from motorid.errors import DataError, UsageError, one_of
+
+__all__ = ["INPUTS", "MIN_SAMPLES", "OUTPUTS", "UNITS", "Experiment", "split"]
+
+INPUTS = ("v",)
+OUTPUTS = ("i", "omega", "theta")
+# The first unit of each channel is its default. A linear axis is measured in m and m/s; the command of a
+# current- or torque-controlled drive need not be a voltage.
+UNITS: Mapping[str, tuple[str, ...]] = MappingProxyType({
+    "v": ("V", "A", "N·m", "N", "1"),
+    "i": ("A",),
+    "omega": ("rad/s", "m/s"),
+    "theta": ("rad", "m"),
+})
+MIN_SAMPLES = 8
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Experiment:
+    """One run: what went in and what was measured, on one time axis.
+
+    Everything is validated here and nowhere else; arrays are copied to read-only float64 and mappings are made
+    read-only, so a run can be shared between models and processes.
+
+    Parameters
+    ----------
+    t : (N,) array
+        Time in s, finite and strictly increasing; steps may be uneven.
+    inputs : mapping of str to (N,) array
+        ``{"v": ...}``, the drive voltage in V (or the command of a torque-controlled drive). Finite.
+    outputs : mapping of str to (N,) array
+        Some of ``"i"`` (A), ``"omega"`` (rad/s or m/s), ``"theta"`` (rad or m). NaN marks a missing sample.
+    sigma : mapping of str to float, optional
+        Standard deviation of the measurement noise per output channel, where it is known.
+    hold : {"zoh", "linear"}
+        What the input does between samples: held from each sample to the next, or joined by lines.
+    units : mapping of str to str, optional
+        SI unit per channel; missing entries get the default. ``theta`` in m with ``omega`` in m/s is a linear axis.
+    name : str
+        Short name, used in tables and plots.
+    meta : mapping, optional
+        Whatever should travel with the run: source, fingerprint, notes, extra columns.
+
+    Raises
+    ------
+    DataError
+        If anything above does not hold; the message says what was expected and what came.
+    """
+
+    t: Array
+    inputs: Mapping[str, Array]
+    outputs: Mapping[str, Array]
+    sigma: Mapping[str, float] = field(default_factory=dict)
+    hold: Literal["zoh", "linear"] = "zoh"
+    units: Mapping[str, str] = field(default_factory=dict)
+    name: str = "run"
+    meta: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        _freeze(self, "name", str(self.name))
+        t = _frozen_array(self.t, "t", self.name)
+        _check_time(t, self.name)
+        _freeze(self, "t", t)
+        _freeze(self, "inputs", _channels(self.inputs, INPUTS, "input", t, self.name))
+        _freeze(self, "outputs", _channels(self.outputs, OUTPUTS, "output", t, self.name))
+        _check_values(self)
+        _freeze(self, "sigma", _sigmas(self))
+        _freeze(self, "units", _units(self))
+        if self.hold not in ("zoh", "linear"):
+            raise DataError(f"{self.name}: {one_of(str(self.hold), ('zoh', 'linear'), 'hold')}")
+        _freeze(self, "meta", MappingProxyType(dict(self.meta)))
+
+    @property
+    def n(self) -> int:
+        """Number of samples."""
+        return len(self.t)
+
+    @property
+    def dt(self) -> float:
+        """Median time between samples, in s."""
+        return float(np.median(np.diff(self.t)))
+
+    @property
+    def duration(self) -> float:
+        """Time from the first sample to the last, in s."""
+        return float(self.t[-1] - self.t[0])
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """Names of the measured output channels, in the order i, omega, theta."""
+        return tuple(name for name in OUTPUTS if name in self.outputs)
+
+    def with_(self, **changes: Any) -> Experiment:
+        """Return a copy with some fields replaced, validated again."""
+        known = [f.name for f in dataclasses.fields(self)]
+        for key in changes:
+            if key not in known:
+                raise UsageError(f"with_(): {one_of(key, known, 'field')}")
+        return dataclasses.replace(self, **changes)
+
+    def select(self, keep: slice | ArrayLike) -> Experiment:
+        """Return the samples picked by a slice, a boolean mask (N,) or increasing indices."""
+        which = keep if isinstance(keep, slice) else np.asarray(keep)
+        if isinstance(which, np.ndarray) and which.dtype == bool and which.shape != self.t.shape:
+            raise UsageError(f"{self.name}: a mask needs {self.n} entries, one per sample; it has {which.size}.")
+        extra = self.meta.get("extra")
+        meta = dict(self.meta)
+        if isinstance(extra, Mapping):
+            meta["extra"] = {k: np.asarray(a)[which] for k, a in extra.items() if np.size(a) == self.n}
+        try:
+            return self.with_(
+                t=self.t[which],
+                inputs={k: a[which] for k, a in self.inputs.items()},
+                outputs={k: a[which] for k, a in self.outputs.items()},
+                meta=meta,
+            )
+        except IndexError as error:
+            raise UsageError(f"{self.name}: select() takes a slice, a mask or indices of samples: {error}.") from None
+
+    def without(self, *channels: str) -> Experiment:
+        """Return a copy that lacks these output channels (as a model sees it that may not use them)."""
+        for channel in channels:
+            if channel not in self.outputs:
+                raise UsageError(f"{self.name}: {one_of(channel, self.channels, 'output channel')}")
+        return self.with_(
+            outputs={k: a for k, a in self.outputs.items() if k not in channels},
+            sigma={k: s for k, s in self.sigma.items() if k not in channels},
+            units={k: u for k, u in self.units.items() if k not in channels},
+        )
+
+    def decimate(self, k: int) -> Experiment:
+        """Return every k-th sample.
+
+        Outputs are picked, not filtered: a filter would add a lag that looks like physics. A held input is averaged
+        over each longer step, which keeps its integral; a linear one is picked.
+        """
+        if int(k) != k or k < 1:
+            raise UsageError(f"decimate() takes a whole number of at least 1; got {k!r}.")
+        coarse = self.select(slice(None, None, int(k)))
+        if self.hold == "linear" or k == 1:
+            return coarse
+        return coarse.with_(inputs={c: _held_mean(self.t, a, int(k)) for c, a in self.inputs.items()})
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # A mappingproxy cannot be pickled, so hand plain dicts to the constructor of the other process.
+        values = (getattr(self, f.name) for f in dataclasses.fields(self))
+        return Experiment, tuple(dict(v) if isinstance(v, MappingProxyType) else v for v in values)
+
+    def __repr__(self) -> str:
+        shown = ", ".join((*self.inputs, "→", *self.channels)).replace(", →,", " →")
+        return f"<Experiment {self.name!r}: {shown}; {self.n} samples, {self.duration:.4g} s>"
+
+
+def split(experiment: Experiment, n: int = 2) -> list[Experiment]:
+    """Cut a run into `n` contiguous blocks of about equal length, e.g. to hold one out.
+
+    Blocks and not random samples: neighbouring samples of a motor tell nearly the same. Each block keeps its time.
+
+    Raises
+    ------
+    DataError
+        If a block would have too few samples.
+    """
+    if int(n) != n or n < 1:
+        raise UsageError(f"split() takes a whole number of blocks of at least 1; got {n!r}.")
+    edges = np.linspace(0, experiment.n, int(n) + 1).round().astype(int)
+    blocks = (experiment.select(slice(a, b)) for a, b in zip(edges[:-1], edges[1:], strict=True))
+    return [b.with_(name=f"{experiment.name}[{j + 1}/{n}]") for j, b in enumerate(blocks)]
+
+
+def _freeze(experiment: Experiment, name: str, value: object) -> None:
+    object.__setattr__(experiment, name, value)
+
+
+def _frozen_array(values: ArrayLike, what: str, run: str) -> Array:
+    try:
+        raw = np.asarray(values)
+        if raw.dtype.kind not in "fiubO":
+            raise TypeError(f"dtype {raw.dtype}")
+        array = np.array(raw, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise DataError(f"{run}: '{what}' must be a row of real numbers ({error}).") from None
+    if array.ndim != 1:
+        raise DataError(f"{run}: '{what}' must have one dimension; its shape is {array.shape}.")
+    array.flags.writeable = False
+    return array
+
+
+def _check_time(t: Array, run: str) -> None:
+    if len(t) < MIN_SAMPLES:
+        raise DataError(f"{run}: a run needs at least {MIN_SAMPLES} samples; this one has {len(t)}.")
+    if not np.isfinite(t).all():
+        raise DataError(f"{run}: the time of sample {int(np.argmin(np.isfinite(t)))} is not a finite number.")
+    back = np.flatnonzero(np.diff(t) <= 0)
+    if back.size:
+        j = int(back[0])
+        raise DataError(
+            f"{run}: time must increase strictly, but sample {j + 1} (t = {t[j + 1]:.9g} s) does not come after "
+            f"sample {j} (t = {t[j]:.9g} s); {back.size} such steps. Remove or re-stamp these samples."
+        )
+
+
+def _channels(given: object, known: tuple[str, ...], kind: str, t: Array, run: str) -> Mapping[str, Array]:
+    if not isinstance(given, Mapping) or not given:
+        raise DataError(f"{run}: {kind}s must be a mapping with at least one of {', '.join(known)}.")
+    arrays = {}
+    for name, values in given.items():
+        if name not in known:
+            raise DataError(f"{run}: {one_of(str(name), known, f'{kind} channel')}")
+        arrays[name] = _frozen_array(values, str(name), run)
+        if len(arrays[name]) != len(t):
+            raise DataError(f"{run}: '{name}' has {len(arrays[name])} samples but time has {len(t)}.")
+    return MappingProxyType(arrays)
+
+
+def _check_values(run: Experiment) -> None:
+    for name, array in run.inputs.items():
+        bad = int(np.count_nonzero(~np.isfinite(array)))
+        if bad:
+            raise DataError(f"{run.name}: the input '{name}' is missing or infinite in {bad} of {run.n} samples; "
+                            "a simulation needs it everywhere. Fill it or cut these samples out.")
+    for name, array in run.outputs.items():
+        if np.isinf(array).any():
+            raise DataError(f"{run.name}: '{name}' holds infinite values; mark missing samples by NaN.")
+    if not any(np.isfinite(a).any() for a in run.outputs.values()):
+        raise DataError(f"{run.name}: no output channel has a single value; all samples of "
+                        f"{', '.join(run.outputs)} are missing.")
+
+
+def _sigmas(run: Experiment) -> Mapping[str, float]:
+    for name, value in run.sigma.items():
+        if name not in run.outputs:
+            raise DataError(f"{run.name}: {one_of(name, run.channels, 'channel in sigma')}")
+        if not (np.isscalar(value) and np.isreal(value) and np.isfinite(value) and value > 0):
+            raise DataError(f"{run.name}: sigma of '{name}' must be a positive number; got {value!r}.")
+    return MappingProxyType({k: float(s) for k, s in run.sigma.items()})
+
+
+def _units(run: Experiment) -> Mapping[str, str]:
+    present = (*run.inputs, *run.channels)
+    for name, unit in run.units.items():
+        if name not in present:
+            raise DataError(f"{run.name}: {one_of(name, present, 'channel in units')}")
+        if unit not in UNITS[name]:
+            raise DataError(f"{run.name}: '{name}' is kept in {' or '.join(UNITS[name])}, not in {unit!r}; "
+                            "convert it first (read_csv does).")
+    linear = {"omega": "m/s", "theta": "m"}
+    axis = [name for name in ("omega", "theta") if name in run.units]
+    is_linear = {run.units[name] == linear[name] for name in axis}
+    if len(is_linear) > 1:
+        raise DataError(f"{run.name}: omega in {run.units['omega']} does not go with theta in {run.units['theta']}.")
+    default = {c: linear.get(c, UNITS[c][0]) if True in is_linear else UNITS[c][0] for c in present}
+    return MappingProxyType({**default, **run.units})
+
+
+def _held_mean(t: Array, values: Array, k: int) -> Array:
+    starts = np.arange(0, len(t), k)
+    width = np.diff(t, append=t[-1])
+    width[-1] = width[-2]  # the last sample is held for as long as the one before
+    return np.add.reduceat(values * width, starts) / np.add.reduceat(width, starts)
