@@ -5,6 +5,8 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from itertools import pairwise
+from numbers import Real
 from types import MappingProxyType
 from typing import Any, Literal
 
@@ -34,7 +36,7 @@ Array = NDArray[np.float64]
 class Experiment:
     """One run: what went in and what was measured, on one time axis.
 
-    Everything is validated here and nowhere else; arrays are copied to read-only float64 and mappings are made
+    Everything is validated here and nowhere else. Arrays are copied to read-only float64, mappings are made
     read-only, so a run can be shared between models and processes.
 
     Parameters
@@ -50,7 +52,7 @@ class Experiment:
     hold : {"zoh", "linear"}
         What the input does between samples: held from each sample to the next, or joined by lines.
     units : mapping of str to str, optional
-        SI unit per channel; missing entries get the default. ``theta`` in m with ``omega`` in m/s is a linear axis.
+        SI unit per channel, by default V, A, rad/s, rad; m and m/s make a linear axis.
     name : str
         Short name, used in tables and plots.
     meta : mapping, optional
@@ -73,6 +75,8 @@ class Experiment:
 
     def __post_init__(self) -> None:
         _freeze(self, "name", str(self.name))
+        for optional in ("sigma", "units", "meta"):
+            _freeze(self, optional, _mapping(getattr(self, optional), optional, self.name))
         t = _frozen_array(self.t, "t", self.name)
         _check_time(t, self.name)
         _freeze(self, "t", t)
@@ -83,7 +87,6 @@ class Experiment:
         _freeze(self, "units", _units(self))
         if self.hold not in ("zoh", "linear"):
             raise DataError(f"{self.name}: {one_of(str(self.hold), ('zoh', 'linear'), 'hold')}")
-        _freeze(self, "meta", MappingProxyType(dict(self.meta)))
 
     @property
     def n(self) -> int:
@@ -117,37 +120,30 @@ class Experiment:
         """Return the samples picked by a slice, a boolean mask (N,) or increasing indices."""
         which = keep if isinstance(keep, slice) else np.asarray(keep)
         if isinstance(which, np.ndarray) and which.dtype == bool and which.shape != self.t.shape:
-            raise UsageError(f"{self.name}: a mask needs {self.n} entries, one per sample; it has {which.size}.")
-        extra = self.meta.get("extra")
-        meta = dict(self.meta)
-        if isinstance(extra, Mapping):
-            meta["extra"] = {k: np.asarray(a)[which] for k, a in extra.items() if np.size(a) == self.n}
+            raise UsageError(f"{self.name}: a mask needs {self.n} entries, one per sample; got {which.size}.")
+
+        def picked(arrays: Mapping[str, Any]) -> dict[str, Array]:
+            return {k: np.asarray(a)[which] for k, a in arrays.items()}
+
         try:
-            return self.with_(
-                t=self.t[which],
-                inputs={k: a[which] for k, a in self.inputs.items()},
-                outputs={k: a[which] for k, a in self.outputs.items()},
-                meta=meta,
-            )
+            extra = {"extra": picked(self.meta["extra"])} if "extra" in self.meta else {}
+            return self.with_(t=self.t[which], inputs=picked(self.inputs), outputs=picked(self.outputs),
+                              meta={**self.meta, **extra})
         except IndexError as error:
-            raise UsageError(f"{self.name}: select() takes a slice, a mask or indices of samples: {error}.") from None
+            raise UsageError(f"{self.name}: select() takes a slice, a mask or indices: {error}.") from None
 
     def without(self, *channels: str) -> Experiment:
         """Return a copy that lacks these output channels (as a model sees it that may not use them)."""
         for channel in channels:
             if channel not in self.outputs:
                 raise UsageError(f"{self.name}: {one_of(channel, self.channels, 'output channel')}")
-        return self.with_(
-            outputs={k: a for k, a in self.outputs.items() if k not in channels},
-            sigma={k: s for k, s in self.sigma.items() if k not in channels},
-            units={k: u for k, u in self.units.items() if k not in channels},
-        )
+        return self.with_(outputs={k: a for k, a in self.outputs.items() if k not in channels})
 
     def decimate(self, k: int) -> Experiment:
         """Return every k-th sample.
 
-        Outputs are picked, not filtered: a filter would add a lag that looks like physics. A held input is averaged
-        over each longer step, which keeps its integral; a linear one is picked.
+        Outputs are picked, not filtered: a filter would add a lag that looks like physics. A held input is
+        averaged over each longer step, which keeps its integral; a linear one is picked.
         """
         if int(k) != k or k < 1:
             raise UsageError(f"decimate() takes a whole number of at least 1; got {k!r}.")
@@ -169,7 +165,7 @@ class Experiment:
 def split(experiment: Experiment, n: int = 2) -> list[Experiment]:
     """Cut a run into `n` contiguous blocks of about equal length, e.g. to hold one out.
 
-    Blocks and not random samples: neighbouring samples of a motor tell nearly the same. Each block keeps its time.
+    Blocks and not random samples: neighbouring samples tell nearly the same. Each block keeps its time.
 
     Raises
     ------
@@ -179,7 +175,7 @@ def split(experiment: Experiment, n: int = 2) -> list[Experiment]:
     if int(n) != n or n < 1:
         raise UsageError(f"split() takes a whole number of blocks of at least 1; got {n!r}.")
     edges = np.linspace(0, experiment.n, int(n) + 1).round().astype(int)
-    blocks = (experiment.select(slice(a, b)) for a, b in zip(edges[:-1], edges[1:], strict=True))
+    blocks = (experiment.select(slice(a, b)) for a, b in pairwise(edges))
     return [b.with_(name=f"{experiment.name}[{j + 1}/{n}]") for j, b in enumerate(blocks)]
 
 
@@ -189,7 +185,7 @@ def _freeze(experiment: Experiment, name: str, value: object) -> None:
 
 def _frozen_array(values: ArrayLike, what: str, run: str) -> Array:
     try:
-        raw = np.asarray(values)
+        raw = np.ma.filled(values, np.nan) if np.ma.isMaskedArray(values) else np.asarray(values)
         if raw.dtype.kind not in "fiubO":
             raise TypeError(f"dtype {raw.dtype}")
         array = np.array(raw, dtype=np.float64)
@@ -201,6 +197,12 @@ def _frozen_array(values: ArrayLike, what: str, run: str) -> Array:
     return array
 
 
+def _mapping(given: object, what: str, run: str) -> Mapping[str, Any]:
+    if given is not None and not isinstance(given, Mapping):
+        raise DataError(f"{run}: '{what}' must be a mapping from names to values; got {given!r}.")
+    return MappingProxyType(dict(given or {}))
+
+
 def _check_time(t: Array, run: str) -> None:
     if len(t) < MIN_SAMPLES:
         raise DataError(f"{run}: a run needs at least {MIN_SAMPLES} samples; this one has {len(t)}.")
@@ -209,10 +211,9 @@ def _check_time(t: Array, run: str) -> None:
     back = np.flatnonzero(np.diff(t) <= 0)
     if back.size:
         j = int(back[0])
-        raise DataError(
-            f"{run}: time must increase strictly, but sample {j + 1} (t = {t[j + 1]:.9g} s) does not come after "
-            f"sample {j} (t = {t[j]:.9g} s); {back.size} such steps. Remove or re-stamp these samples."
-        )
+        raise DataError(f"{run}: time must increase strictly, but sample {j + 1} (t = {t[j + 1]:.9g} s) does "
+                        f"not come after sample {j} (t = {t[j]:.9g} s); {back.size} such steps. "
+                        "Remove or re-stamp these samples.")
 
 
 def _channels(given: object, known: tuple[str, ...], kind: str, t: Array, run: str) -> Mapping[str, Array]:
@@ -232,8 +233,8 @@ def _check_values(run: Experiment) -> None:
     for name, array in run.inputs.items():
         bad = int(np.count_nonzero(~np.isfinite(array)))
         if bad:
-            raise DataError(f"{run.name}: the input '{name}' is missing or infinite in {bad} of {run.n} samples; "
-                            "a simulation needs it everywhere. Fill it or cut these samples out.")
+            raise DataError(f"{run.name}: the input '{name}' is missing or infinite in {bad} of {run.n} "
+                            "samples; a simulation needs it everywhere. Fill it or cut these samples out.")
     for name, array in run.outputs.items():
         if np.isinf(array).any():
             raise DataError(f"{run.name}: '{name}' holds infinite values; mark missing samples by NaN.")
@@ -244,28 +245,27 @@ def _check_values(run: Experiment) -> None:
 
 def _sigmas(run: Experiment) -> Mapping[str, float]:
     for name, value in run.sigma.items():
-        if name not in run.outputs:
-            raise DataError(f"{run.name}: {one_of(name, run.channels, 'channel in sigma')}")
-        if not (np.isscalar(value) and np.isreal(value) and np.isfinite(value) and value > 0):
+        if name not in OUTPUTS:
+            raise DataError(f"{run.name}: {one_of(str(name), OUTPUTS, 'channel in sigma')}")
+        if not (isinstance(value, Real) and np.isfinite(value) and value > 0):
             raise DataError(f"{run.name}: sigma of '{name}' must be a positive number; got {value!r}.")
-    return MappingProxyType({k: float(s) for k, s in run.sigma.items()})
+    return MappingProxyType({k: float(s) for k, s in run.sigma.items() if k in run.outputs})
 
 
 def _units(run: Experiment) -> Mapping[str, str]:
-    present = (*run.inputs, *run.channels)
     for name, unit in run.units.items():
-        if name not in present:
-            raise DataError(f"{run.name}: {one_of(name, present, 'channel in units')}")
+        if name not in UNITS:
+            raise DataError(f"{run.name}: {one_of(str(name), UNITS, 'channel in units')}")
         if unit not in UNITS[name]:
             raise DataError(f"{run.name}: '{name}' is kept in {' or '.join(UNITS[name])}, not in {unit!r}; "
                             "convert it first (read_csv does).")
-    linear = {"omega": "m/s", "theta": "m"}
-    axis = [name for name in ("omega", "theta") if name in run.units]
-    is_linear = {run.units[name] == linear[name] for name in axis}
-    if len(is_linear) > 1:
-        raise DataError(f"{run.name}: omega in {run.units['omega']} does not go with theta in {run.units['theta']}.")
-    default = {c: linear.get(c, UNITS[c][0]) if True in is_linear else UNITS[c][0] for c in present}
-    return MappingProxyType({**default, **run.units})
+    present = (*run.inputs, *run.channels)
+    given = {k: u for k, u in run.units.items() if k in present}
+    linear = {u in ("m", "m/s") for k, u in given.items() if k in ("omega", "theta")}
+    if len(linear) > 1:
+        raise DataError(f"{run.name}: omega in {given['omega']} does not go with theta in {given['theta']}.")
+    return MappingProxyType({c: UNITS[c][-1 if True in linear and c in ("omega", "theta") else 0]
+                             for c in present} | given)
 
 
 def _held_mean(t: Array, values: Array, k: int) -> Array:

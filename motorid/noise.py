@@ -1,0 +1,120 @@
+"""How noisy is a channel? Estimated from its samples alone, before there is a model."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import ArrayLike, NDArray
+
+__all__ = ["noise_level", "quantum"]
+
+Array = NDArray[np.float64]
+
+ORDERS = (2, 3, 4, 5, 6)
+_SMALLER_HALF = 0.3240277  # mean of |z| over the smaller half, z standard normal: 4·(φ(0) − φ(0.67449))
+_FLOOR = 1e-5  # of the channel's own variation: what a noise-free simulation is given
+_QUANTISED_ONLY = 0.8  # in steps: below this the differences show the steps and not the noise
+
+
+def noise_level(y: ArrayLike, t: ArrayLike | None = None) -> float:
+    """Estimate the standard deviation of the measurement noise of one channel.
+
+    High-order differences remove the signal, which is smooth over a few samples, and keep the noise;
+    averaging the smaller half of them ignores outliers and the few samples after a voltage step. On uneven
+    samples the weights are those of divided differences, so missing and jittering samples do no harm. The
+    order starts at two and grows as long as that removes more signal. Parts in which nothing changes at all
+    are left out. The result is never below what rounding alone does (step/√12, where the channel moves in
+    steps), nor below 1e-5 of the channel's variation.
+
+    Parameters
+    ----------
+    y : (N,) array
+        Samples of the channel; NaN where missing.
+    t : (N,) array, optional
+        Their times in s. Without it even spacing is taken.
+
+    Returns
+    -------
+    float
+        Standard deviation in the unit of `y`, always positive; 1.0 for a channel that is zero throughout.
+
+    Notes
+    -----
+    It sees what changes from sample to sample. Noise that is itself smooth is underestimated: by a factor
+    of about four for first-order noise with a correlation of 0.9 between neighbours. A signal that never
+    rests and has only two or three samples per time constant is overestimated.
+
+    References
+    ----------
+    Gasser, Sroka and Jennen-Steinmetz, "Residual variance and residual pattern in nonlinear regression",
+    Biometrika 73(3), 1986; Hall, Kay and Titterington, Biometrika 77(3), 1990.
+    """
+    values = np.asarray(y, dtype=float)
+    times = np.arange(values.size, dtype=float) if t is None else np.asarray(t, dtype=float)
+    keep = np.isfinite(values) & np.isfinite(times)
+    values, times = values[keep], times[keep]
+    step = quantum(values)
+    return max(_from_differences(values, times, step), step / np.sqrt(12), _floor(values))
+
+
+def quantum(y: ArrayLike) -> float:
+    """Return the step in which a channel moves (encoder count, converter bit), or 0.0 if it shows none.
+
+    Only a step that matters is looked for: one that makes neighbouring samples equal.
+    """
+    values = np.asarray(y, dtype=float)
+    values = values[np.isfinite(values)]
+    levels = np.unique(values)
+    if len(levels) < 4 or np.mean(np.diff(values) == 0) < 0.1:
+        return 0.0
+    gaps = np.diff(levels)
+    gaps = gaps[gaps > 1e-6 * (levels[-1] - levels[0])]  # rounding in the file splits one level into several
+    for candidate in np.quantile(gaps, (0.5, 0.1), method="nearest"):
+        steps = gaps / candidate
+        if np.mean((np.abs(steps - steps.round()) < 0.05) & (steps > 0.5)) > 0.9:
+            return float(np.median(gaps[steps.round() == 1]))
+    return 0.0
+
+
+def _floor(values: Array) -> float:
+    if not values.size:
+        return 1.0
+    size = float(np.std(values)) or float(np.abs(values).max())
+    return _FLOOR * size if size > 0 else 1.0
+
+
+def _from_differences(values: Array, times: Array, step: float) -> float:
+    level = np.inf
+    for order in ORDERS:
+        finer = _of_order(values, times, order, step)
+        if finer > 0.85 * level:  # no more signal was removed: what is left is noise
+            return level
+        level = finer
+    return level if np.isfinite(level) else 0.0
+
+
+def _of_order(values: Array, times: Array, order: int, step: float) -> float:
+    """Robust noise level from differences of one order; 0.0 if there are too few."""
+    if len(values) < order + 4:
+        return 0.0
+    t = sliding_window_view(times, order + 1)
+    y = sliding_window_view(values, order + 1)
+    span = t[:, -1] - t[:, 0]
+    whole = span < 2.5 * np.median(span)  # not across a gap
+    t, y, span = t[whole], y[whole], span[whole]
+    u = (t - t[:, :1]) / span[:, None]
+    apart = u[:, :, None] - u[:, None, :] + np.eye(order + 1)
+    weights = 1.0 / np.prod(apart, axis=2)
+    weights /= np.linalg.norm(weights, axis=1, keepdims=True)
+    size = np.abs(np.sum(weights * (y - y[:, :1]), axis=1))
+    moving = np.ptp(y, axis=1) > 0
+    if not moving.any():
+        return 0.0
+    level = _typical(size[moving])
+    return level if level > _QUANTISED_ONLY * step else _typical(size)
+
+
+def _typical(size: Array) -> float:
+    # The mean of the smaller half is as robust as the median and smoother where values come in steps.
+    half = (len(size) + 1) // 2
+    return float(np.partition(size, half - 1)[:half].mean()) / _SMALLER_HALF
