@@ -1,0 +1,37 @@
+"""An independent motor plant: the reality behind the hidden-effect records. It shares no code with the models."""
+
+from .effects import BEYOND, LIBRARY
+from .excitations import chirp, coast_down, multisine, prbs, random_steps, staircase, step, triangle, warm_up
+from .loops import closed_loop, simulate_linear
+from .motion import Plant, simulate
+from .motors import MOTORS, Motor
+from .sensors import adc, coloured, dropouts, encoder, encoder_speed, outliers, resample, uneven, white
+
+__all__ = [
+    "BEYOND",
+    "LIBRARY",
+    "MOTORS",
+    "Motor",
+    "Plant",
+    "adc",
+    "chirp",
+    "closed_loop",
+    "coast_down",
+    "coloured",
+    "dropouts",
+    "encoder",
+    "encoder_speed",
+    "multisine",
+    "outliers",
+    "prbs",
+    "random_steps",
+    "resample",
+    "simulate",
+    "simulate_linear",
+    "staircase",
+    "step",
+    "triangle",
+    "uneven",
+    "warm_up",
+    "white",
+]

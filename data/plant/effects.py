@@ -1,0 +1,253 @@
+"""What may be hidden in the plant: every effect in the form it has in reality, hard corners included.
+
+An effect is a function of the motor and its own numbers that returns what it does:
+
+    drive(v, w) -> v          the bridge: from the commanded voltage to the one at the terminals
+    drop(i) -> V              voltage lost in the winding circuit
+    R(dT), L(i), K(i), Kt(th) -> factor on that constant (K in both balances, Kt in the torque alone)
+    torque(i, w, th, t) -> N·m on the shaft, continuous in its arguments
+    dry(i, w, th, s, t) -> N·m, level of dry friction when sliding (or about to slide) in direction s = ±1
+    heat(i, dT) -> K/s        rate of the temperature rise
+    part(i, w, th, x) -> (torque, rates)   something with states x of its own, which start at `x0`
+    sensor -> (kind, number)  what happens between the shaft and the logger
+    rate                      1/s, the fastest rate it adds, for the choice of the integration step
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from math import cos, exp, pi, sin, sqrt, tanh
+from typing import Any
+
+from .motors import Motor
+
+Hooks = dict[str, Any]
+LIBRARY: dict[str, Callable[..., Hooks]] = {}  # what the library of models knows by the same name
+BEYOND: dict[str, Callable[..., Hooks]] = {}  # what it does not know
+
+
+def _known(build: Callable[..., Hooks]) -> Callable[..., Hooks]:
+    LIBRARY[build.__name__] = build
+    return build
+
+
+def _unknown(build: Callable[..., Hooks]) -> Callable[..., Hooks]:
+    BEYOND[build.__name__] = build
+    return build
+
+
+def build(motor: Motor, effects: dict[str, dict[str, float]]) -> list[Hooks]:
+    """Hooks of the named effects; ValueError for a name or a number that is not known."""
+    known = LIBRARY | BEYOND
+    hooks = []
+    for name, values in effects.items():
+        if name not in known:
+            raise ValueError(f"unknown effect '{name}'; the plant knows {', '.join(known)}")
+        try:
+            hooks.append(known[name](motor, **values))
+        except TypeError as error:
+            raise ValueError(f"effect '{name}': {error}") from None
+    return hooks
+
+
+# ---------------------------------------------------------------- voltage
+
+
+@_known
+def brush_drop(m: Motor, V_b: float, i_b: float) -> Hooks:
+    return {"drop": lambda i: V_b * tanh(i / i_b), "rate": V_b / i_b / m.L}
+
+
+@_known
+def winding_heating(m: Motor, R_th: float, C_th: float, alpha: float = 0.00393) -> Hooks:
+    def heat(i: float, dT: float) -> float:
+        return (m.R * (1 + alpha * dT) * i * i - dT / R_th) / C_th
+
+    return {"R": lambda dT: 1 + alpha * dT, "heat": heat}
+
+
+@_known
+def inductance_saturation(m: Motor, i_L: float) -> Hooks:
+    return {"L": lambda i: 1 / (1 + (i / i_L) ** 2), "rate": m.R / m.L * (1 + (m.i_max / i_L) ** 2)}
+
+
+@_known
+def magnetic_saturation(m: Motor, i_K: float) -> Hooks:
+    return {"K": lambda i: 1 / (1 + (i / i_K) ** 2)}
+
+
+@_known
+def driver_dead_band(m: Motor, v_d: float) -> Hooks:
+    return {"drive": lambda v, w: v - v_d if v > v_d else v + v_d if v < -v_d else 0.0}
+
+
+@_known
+def voltage_offset(m: Motor, v_0: float) -> Hooks:
+    return {"drive": lambda v, w: v + v_0}
+
+
+# ---------------------------------------------------------------- torque
+
+
+@_known
+def coulomb(m: Motor, tau_c: float) -> Hooks:
+    return {"dry": lambda i, w, th, s, t: tau_c}
+
+
+@_known
+def coulomb_asymmetric(m: Motor, tau_pos: float, tau_neg: float) -> Hooks:
+    return {"dry": lambda i, w, th, s, t: tau_pos if s > 0 else tau_neg}
+
+
+@_known
+def stribeck(m: Motor, tau_c: float, tau_s: float, omega_s: float) -> Hooks:
+    return {"dry": lambda i, w, th, s, t: tau_c + (tau_s - tau_c) * exp(-((w / omega_s) ** 2))}
+
+
+@_known
+def quadratic_drag(m: Motor, c_q: float) -> Hooks:
+    return {"torque": lambda i, w, th, t: -c_q * w * abs(w)}
+
+
+@_known
+def constant_load(m: Motor, tau_l: float) -> Hooks:
+    return {"torque": lambda i, w, th, t: -tau_l}
+
+
+@_known
+def gravity(m: Motor, mgl: float, phi: float = 0.0) -> Hooks:
+    return {"torque": lambda i, w, th, t: -mgl * sin(th + phi)}
+
+
+@_known
+def cogging(m: Motor, A: float, N: float, phi: float = 0.0) -> Hooks:
+    return {"torque": lambda i, w, th, t: -A * sin(N * th + phi), "rate": N * m.no_load_speed}
+
+
+@_known
+def torque_ripple(m: Motor, a: float, N: float, phi: float = 0.0) -> Hooks:
+    return {"Kt": lambda th: 1 + a * sin(N * th + phi), "rate": N * m.no_load_speed}
+
+
+@_known
+def load_friction(m: Motor, mu: float) -> Hooks:
+    return {"dry": lambda i, w, th, s, t: mu * abs(m.K * i)}
+
+
+@_known
+def viscous_asymmetric(m: Motor, b_pos: float, b_neg: float) -> Hooks:
+    """Viscous friction of its own for each direction, on top of b."""
+    return {"torque": lambda i, w, th, t: -(b_pos if w > 0 else b_neg) * w}
+
+
+@_known
+def lugre(
+    m: Motor, sigma_0: float, sigma_1: float, tau_c: float, tau_s: float, omega_s: float
+) -> Hooks:
+    """Bristles of mean deflection z: Canudas de Wit et al., IEEE Trans. Automatic Control 40(3), 1995."""
+
+    def part(i: float, w: float, th: float, x: list[float]) -> tuple[float, tuple[float, ...]]:
+        level = tau_c + (tau_s - tau_c) * exp(-((w / omega_s) ** 2))
+        dz = w - sigma_0 * abs(w) / level * x[0]
+        return -(sigma_0 * x[0] + sigma_1 * dz), (dz,)
+
+    return {"part": part, "x0": lambda w, th: (0.0,), "rate": sigma_0 * m.no_load_speed / tau_c}
+
+
+# ---------------------------------------------------------------- transmission
+
+
+@_known
+def compliance(m: Motor, k_s: float, c_s: float, J_l: float) -> Hooks:
+    """A load of inertia J_l behind a shaft of stiffness k_s and damping c_s; sensors on the motor side."""
+
+    def part(i: float, w: float, th: float, x: list[float]) -> tuple[float, tuple[float, ...]]:
+        twist = k_s * (th - x[1]) + c_s * (w - x[0])
+        return -twist, (twist / J_l, x[0])
+
+    return {"part": part, "x0": lambda w, th: (w, th), "rate": sqrt(k_s / m.J + k_s / J_l)}
+
+
+@_known
+def backlash(m: Motor, gap: float, k_s: float, c_s: float, J_l: float) -> Hooks:
+    """The same load behind a free play of width `gap` (rad): it can be pushed, never pulled."""
+
+    def part(i: float, w: float, th: float, x: list[float]) -> tuple[float, tuple[float, ...]]:
+        twist = th - x[1]
+        if abs(twist) <= gap / 2:
+            push = 0.0
+        elif twist > 0:
+            push = max(0.0, k_s * (twist - gap / 2) + c_s * (w - x[0]))
+        else:
+            push = min(0.0, k_s * (twist + gap / 2) + c_s * (w - x[0]))
+        return -push, (push / J_l, x[0])
+
+    return {"part": part, "x0": lambda w, th: (w, th), "rate": 3 * sqrt(k_s / m.J + k_s / J_l)}
+
+
+# ---------------------------------------------------------------- sensor
+
+
+@_known
+def speed_lag(m: Motor, tau_f: float) -> Hooks:
+    return {"sensor": ("speed_lag", tau_f), "rate": 1 / tau_f}
+
+
+@_known
+def current_lag(m: Motor, tau_i: float) -> Hooks:
+    return {"sensor": ("current_lag", tau_i), "rate": 1 / tau_i}
+
+
+@_known
+def speed_delay(m: Motor, t_d: float) -> Hooks:
+    return {"sensor": ("speed_delay", t_d)}
+
+
+@_known
+def current_offset(m: Motor, i_0: float) -> Hooks:
+    return {"sensor": ("current_offset", i_0)}
+
+
+@_known
+def speed_gain(m: Motor, g: float) -> Hooks:
+    return {"sensor": ("speed_gain", g)}
+
+
+# ---------------------------------------------------------------- beyond the library
+
+
+@_unknown
+def angle_friction(m: Motor, tau_c: float, c: float, phi: float = 0.0) -> Hooks:
+    """A bent shaft or an oval bearing: dry friction that depends on the angle."""
+    return {"dry": lambda i, w, th, s, t: tau_c * (1 + c * sin(th + phi))}
+
+
+@_unknown
+def cam(m: Motor, A: float, kappa: float = 6.0, phi: float = 0.0) -> Hooks:
+    """A spring pressed down by a narrow lobe once per turn: many harmonics, and no energy lost."""
+    return {"torque": lambda i, w, th, t: -A * sin(th + phi) * exp(kappa * (cos(th + phi) - 1))}
+
+
+@_unknown
+def grease_warm_up(m: Motor, tau_c: float, extra: float, t_g: float) -> Hooks:
+    """Dry friction that is (1 + extra) times too large when cold and decays with the running time."""
+    return {"dry": lambda i, w, th, s, t: tau_c * (1 + extra * exp(-t / t_g))}
+
+
+@_unknown
+def supply_sag(m: Motor, s: float) -> Hooks:
+    """The bridge loses the fraction s of its voltage at the no-load speed, and as speed³ below."""
+    return {"drive": lambda v, w: v * (1 - s * abs(w / m.no_load_speed) ** 3)}
+
+
+@_unknown
+def root_drag(m: Motor, c_r: float) -> Hooks:
+    """A seal whose drag grows as the square root of the speed."""
+    return {"torque": lambda i, w, th, t: -c_r * (sqrt(w) if w > 0 else -sqrt(-w))}
+
+
+@_unknown
+def belt_splice(m: Motor, tau: float, width: float = 0.4, ratio: float = 3.7) -> Hooks:
+    """A belt joint that adds dry friction while it runs over the pulley, once per belt turn."""
+    period = 2 * pi * ratio
+    return {"dry": lambda i, w, th, s, t: tau if th % period < width else 0.0}

@@ -1,0 +1,261 @@
+"""The plant: motor plus hidden effects, integrated by RK4 with fine steps and true stick-slip.
+
+Dry friction is discontinuous. Its direction s is frozen during a step; when the speed changes sign the step is cut at
+that instant, the speed is set to exactly zero, and the shaft either sticks (net torque within the breakaway level) or
+slides on. A stuck shaft stays at exactly zero speed until the net torque exceeds the breakaway level.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Callable
+from math import ceil, exp
+
+import numpy as np
+
+from .effects import build
+from .motors import Motor
+
+Effects = dict[str, dict[str, float]]
+FREE = 2  # no dry friction: there is no direction to keep track of
+
+
+class Plant:
+    """One motor on the bench.
+
+    Parameters
+    ----------
+    motor : Motor
+    effects : dict of name -> dict of numbers, see `effects.py`
+    omega0, theta0 : initial speed in rad/s and angle in rad
+    substep : integration step in s; default 50 µs or a quarter of the fastest time constant, whichever is less
+
+    Attributes
+    ----------
+    t, i, omega, theta, dT : the true state; `measured()` gives what the sensors say
+    stuck : whether dry friction holds the shaft
+    """
+
+    def __init__(
+        self,
+        motor: Motor,
+        effects: Effects | None = None,
+        omega0: float = 0.0,
+        theta0: float = 0.0,
+        substep: float | None = None,
+    ) -> None:
+        self.motor = motor
+        self.effects = dict(effects or {})
+        hooks = build(motor, self.effects)
+        fastest = max([motor.R / motor.L, *(h["rate"] for h in hooks if "rate" in h)])
+        self.substep = substep or min(50e-6, 0.25 / fastest)
+        self.t = 0.0
+        self._rates, self._level, x0 = _physics(motor, hooks, omega0, theta0)
+        self._y = [0.0, float(omega0), float(theta0), 0.0, *x0]  # i, omega, theta, dT, and states of parts
+        self._s = (0 if omega0 == 0 else 1 if omega0 > 0 else -1) if self._level else FREE
+        self._sensors = Sensors(hooks, omega0)
+
+    i = property(lambda self: self._y[0])
+    omega = property(lambda self: self._y[1])
+    theta = property(lambda self: self._y[2])
+    dT = property(lambda self: self._y[3])
+    stuck = property(lambda self: self._s == 0)
+
+    def step(self, v: float, dt: float, v_end: float | None = None) -> dict[str, float]:
+        """Advance by dt seconds with v volts held (or going to v_end in a straight line); return `measured()`."""
+        n = max(1, ceil(dt / self.substep - 1e-6))
+        h = dt / n
+        slope = 0.0 if v_end is None else (v_end - v) / n
+        t0 = self.t
+        for k in range(n):
+            self._advance(v + k * slope, v + (k + 1) * slope, h)
+            self.t = t0 + (k + 1) * h
+            self._sensors.sample(self.t, h, self._y[0], self._y[1])
+        return self.measured()
+
+    def measured(self) -> dict[str, float]:
+        """Current, speed and angle as the sensors give them (no noise; see `sensors.py` for that)."""
+        return self._sensors.read(self.t, self._y)
+
+    def _advance(self, v0: float, v1: float, h: float) -> None:
+        if self._s == FREE:
+            self._y = _rk4(self._rates, self._y, v0, v1, h, FREE, self.t)
+            return
+        left = h
+        for _ in range(8):  # more events than that in one step is chatter: the shaft is as good as stuck
+            a, b = v1 - (v1 - v0) * left / h, v1
+            if self._s == 0:
+                self._release(a)
+            y = _rk4(self._rates, self._y, a, b, left, self._s, self.t)
+            if self._s == 0 or y[1] * self._s >= 0:
+                self._y = y
+                return
+            left -= self._reverse(a, b, left)
+            if left <= 1e-12:
+                return
+        self._s = 0
+        self._y = _rk4(self._rates, self._y, v1, v1, left, 0, self.t)
+
+    def _reverse(self, v0: float, v1: float, h: float) -> float:
+        """Go to the instant within h at which the speed becomes zero and stop there; return the time it took."""
+        low, high, w_low, w_high = 0.0, h, self._y[1], None
+        y, at = self._y, 0.0
+        for _ in range(60):
+            at = 0.5 * (low + high) if w_high is None else low + (high - low) * w_low / (w_low - w_high)
+            y = _rk4(self._rates, self._y, v0, v0 + (v1 - v0) * at / h, at, self._s, self.t)
+            if abs(y[1]) < 1e-12 * self.motor.no_load_speed or high - low < 1e-13:
+                break
+            if y[1] * self._s > 0:
+                low, w_low = at, y[1]
+            else:
+                high, w_high = at, y[1]
+        y[1] = 0.0
+        self._y, self._s = y, 0
+        return at
+
+    def _release(self, v: float) -> None:
+        """Let the stuck shaft go if the net torque exceeds the breakaway level."""
+        y = self._y
+        net = self._rates(y, v, FREE, self.t)[1] * self.motor.J
+        s = 1 if net > 0 else -1
+        if abs(net) > self._level(y[0], 0.0, y[2], s, self.t):
+            self._s = s
+
+
+def _rk4(f: Callable, y: list[float], v0: float, v1: float, h: float, s: int, t: float) -> list[float]:
+    half, mid = 0.5 * h, 0.5 * (v0 + v1)
+    k1 = f(y, v0, s, t)
+    k2 = f([a + half * k for a, k in zip(y, k1)], mid, s, t)
+    k3 = f([a + half * k for a, k in zip(y, k2)], mid, s, t)
+    k4 = f([a + h * k for a, k in zip(y, k3)], v1, s, t)
+    sixth = h / 6
+    return [a + sixth * (p + 2 * (q + r) + u) for a, p, q, r, u in zip(y, k1, k2, k3, k4)]
+
+
+def _physics(m: Motor, hooks: list[dict], omega0: float, theta0: float) -> tuple:
+    """The rates of (i, omega, theta, dT, parts), the level of dry friction (None without), and the parts' start."""
+
+    def every(kind: str) -> list:
+        return [h[kind] for h in hooks if kind in h]
+
+    drives, drops, torques, dries, heats = (every(k) for k in ("drive", "drop", "torque", "dry", "heat"))
+    f_R, f_L, f_K, f_Kt = (every(k) for k in ("R", "L", "K", "Kt"))
+    parts, x0 = [], []
+    for h in hooks:
+        if "part" in h:
+            start = h["x0"](omega0, theta0)
+            first = 4 + len(x0)
+            parts.append((h["part"], first, first + len(start)))
+            x0.extend(start)
+    R0, L0, K0, b, J = m.R, m.L, m.K, m.b, m.J
+
+    def level(i: float, w: float, th: float, s: int, t: float) -> float:
+        return sum([f(i, w, th, s, t) for f in dries])
+
+    def rates(y: list[float], v: float, s: int, t: float) -> list[float]:
+        i, w, th, dT = y[0], y[1], y[2], y[3]
+        R, L, K, Kt = R0, L0, K0, 1.0
+        for f in drives:
+            v = f(v, w)
+        for f in drops:
+            v -= f(i)
+        for f in f_R:
+            R *= f(dT)
+        for f in f_L:
+            L *= f(i)
+        for f in f_K:
+            K *= f(i)
+        for f in f_Kt:
+            Kt *= f(th)
+        torque = K * Kt * i - b * w
+        for f in torques:
+            torque += f(i, w, th, t)
+        out = [(v - R * i - K * w) / L, 0.0, w, 0.0]
+        for f in heats:
+            out[3] += f(i, dT)
+        for f, a, z in parts:
+            extra, more = f(i, w, th, y[a:z])
+            torque += extra
+            out += more
+        if s:
+            out[1] = (torque if s == FREE else torque - s * level(i, w, th, s, t)) / J
+        return out
+
+    return rates, level if dries else None, x0
+
+
+class Sensors:
+    """What happens between the shaft and the logger: lags, a pure delay, a gain, an offset."""
+
+    def __init__(self, hooks: list[dict], omega0: float) -> None:
+        has = dict(h["sensor"] for h in hooks if "sensor" in h)
+        self.lag_i, self.lag_w = has.get("current_lag"), has.get("speed_lag")
+        self.delay, self.gain = has.get("speed_delay", 0.0), has.get("speed_gain", 1.0)
+        self.offset = has.get("current_offset", 0.0)
+        self.i, self.w = 0.0, float(omega0)
+        self._last = (0.0, float(omega0))
+        self._times, self._speeds = [0.0], [float(omega0)]
+
+    def sample(self, t: float, h: float, i: float, w: float) -> None:
+        """Follow the true current and speed, taken as straight lines over the last step of h seconds."""
+        self.i = _lag(self.i, self._last[0], i, h, self.lag_i)
+        self.w = _lag(self.w, self._last[1], w, h, self.lag_w)
+        self._last = (i, w)
+        if self.delay:
+            self._times.append(t)
+            self._speeds.append(self.w)
+            if len(self._times) > 4096 and self._times[2048] < t - self.delay:
+                del self._times[:2048], self._speeds[:2048]
+
+    def read(self, t: float, y: list[float]) -> dict[str, float]:
+        w = self._delayed(t - self.delay) if self.delay else self.w
+        return {"i": self.i + self.offset, "omega": self.gain * w, "theta": y[2]}
+
+    def _delayed(self, t: float) -> float:
+        k = bisect_right(self._times, t + 1e-12)
+        if k == 0:
+            return self._speeds[0]
+        if k == len(self._times):
+            return self._speeds[-1]
+        part = max(0.0, (t - self._times[k - 1]) / (self._times[k] - self._times[k - 1]))
+        return self._speeds[k - 1] + part * (self._speeds[k] - self._speeds[k - 1])
+
+
+def _lag(z: float, u0: float, u1: float, h: float, tau: float | None) -> float:
+    """First-order lag over h, exact for an input that goes from u0 to u1 in a straight line."""
+    if not tau:
+        return u1
+    slope = (u1 - u0) / h
+    return (u1 - slope * tau) + (z - u0 + slope * tau) * exp(-h / tau)
+
+
+def simulate(
+    motor: Motor,
+    effects: Effects | None,
+    t: np.ndarray,
+    v: np.ndarray,
+    hold: str = "zoh",
+    omega0: float = 0.0,
+    theta0: float = 0.0,
+    substep: float | None = 20e-6,
+) -> dict[str, np.ndarray]:
+    """Run the plant over the samples t (N,) with the voltage v (N,), held ("zoh") or joined by lines ("linear").
+
+    Returns arrays (N,): t, v; **sensed** i, omega, theta; the truth behind them true_i, true_omega, true_theta and dT.
+    The step is `substep` or the plant's own choice, whichever is less.
+    """
+    if hold not in ("zoh", "linear"):
+        raise ValueError(f"hold is 'zoh' or 'linear', not {hold!r}")
+    plant = Plant(motor, effects, omega0, theta0)
+    plant.substep = min(plant.substep, substep) if substep else plant.substep
+    rows = [_row(plant)]
+    for k in range(len(t) - 1):
+        plant.step(float(v[k]), float(t[k + 1] - t[k]), float(v[k + 1]) if hold == "linear" else None)
+        rows.append(_row(plant))
+    names = ("i", "omega", "theta", "true_i", "true_omega", "true_theta", "dT")
+    columns = np.array(rows).T
+    return {"t": np.asarray(t, float), "v": np.asarray(v, float)} | dict(zip(names, columns))
+
+
+def _row(plant: Plant) -> tuple[float, ...]:
+    return (*plant.measured().values(), plant.i, plant.omega, plant.theta, plant.dT)

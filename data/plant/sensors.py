@@ -1,0 +1,67 @@
+"""What a logger does to a clean signal. Random parts draw from the numpy Generator that is passed in."""
+
+from __future__ import annotations
+
+import numpy as np
+
+
+def white(x: np.ndarray, sigma: float, rng: np.random.Generator) -> np.ndarray:
+    """Add white Gaussian noise of standard deviation sigma."""
+    return x + sigma * rng.standard_normal(len(x))
+
+
+def coloured(x: np.ndarray, sigma: float, rho: float, rng: np.random.Generator) -> np.ndarray:
+    """Add first-order autoregressive noise of standard deviation sigma and lag-one correlation rho."""
+    draws = rng.standard_normal(len(x))
+    e = np.empty(len(x))
+    e[0] = draws[0]
+    for k in range(1, len(x)):
+        e[k] = rho * e[k - 1] + np.sqrt(1 - rho**2) * draws[k]
+    return x + sigma * e
+
+
+def adc(x: np.ndarray, full_scale: float, bits: int = 12) -> np.ndarray:
+    """Quantise to 2**bits levels over ±full_scale, and clip there."""
+    lsb = 2 * full_scale / 2**bits
+    return np.clip(np.round(x / lsb), -(2 ** (bits - 1)), 2 ** (bits - 1) - 1) * lsb
+
+
+def encoder(theta: np.ndarray, counts: int) -> np.ndarray:
+    """Angle as an incremental encoder with so many counts per turn gives it."""
+    return np.floor(theta * counts / (2 * np.pi) + 1e-9) * (2 * np.pi / counts)
+
+
+def encoder_speed(theta: np.ndarray, t: np.ndarray, counts: int, average: int = 1) -> np.ndarray:
+    """Speed from differences of encoder counts, with a causal moving average over `average` samples."""
+    raw = np.diff(encoder(theta, counts)) / np.diff(t)
+    raw = np.concatenate([raw[:1], raw])
+    total = np.cumsum(np.concatenate([np.full(average, raw[0]), raw]))
+    return (total[average:] - total[:-average]) / average
+
+
+def outliers(x: np.ndarray, share: float, size: float, rng: np.random.Generator) -> np.ndarray:
+    """Replace a share of the samples by spikes of ±size on top of them."""
+    hit = rng.random(len(x)) < share
+    return x + np.where(hit, size * (rng.integers(0, 2, len(x)) * 2 - 1), 0.0)
+
+
+def dropouts(x: np.ndarray, share: float, rng: np.random.Generator, length: int = 1) -> np.ndarray:
+    """Replace about this share of the samples by NaN, in gaps of `length`."""
+    y = np.array(x, float)
+    for start in np.flatnonzero(rng.random(len(x)) < share / length):
+        y[start : start + length] = np.nan
+    return y
+
+
+def uneven(t: np.ndarray, jitter: float, rng: np.random.Generator) -> np.ndarray:
+    """Time stamps moved by up to ±jitter of the sampling step (below 0.5, so that they stay in order)."""
+    if not 0 <= jitter < 0.5:
+        raise ValueError(f"jitter is a share of the step below 0.5, not {jitter}")
+    moved = t + rng.uniform(-jitter, jitter, len(t)) * np.median(np.diff(t))
+    moved[0] = t[0]
+    return moved
+
+
+def resample(t_new: np.ndarray, t: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """Values of x(t) at other times by straight lines."""
+    return np.interp(t_new, t, x)

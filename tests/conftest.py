@@ -1,0 +1,46 @@
+"""What every test may use: a seeded generator, the motor plant, the real records where they are."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+os.environ.setdefault("MPLBACKEND", "Agg")  # figures without a display, for processes started by tests too
+
+from motorid.datasets import load_plant
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    """A generator with a fixed seed, new for every test."""
+    return np.random.default_rng(20240611)
+
+
+@pytest.fixture(scope="session")
+def plant():
+    """The independent motor plant (data/plant), which shares no code with the models."""
+    return load_plant()
+
+
+def real_folder() -> Path | None:
+    """Folder of the real records: MOTORID_REAL_DATA, or shared/data/real in or beside a folder above this file."""
+    named = os.environ.get("MOTORID_REAL_DATA")
+    if named:
+        return Path(named) if Path(named).is_dir() else None
+    for folder in Path(__file__).resolve().parents:
+        place = folder / "shared" / "data" / "real"
+        if place.is_dir():
+            return place
+    return None
+
+
+@pytest.fixture(scope="session")
+def real() -> Path:
+    """Folder of the real records; the test is skipped where it is absent."""
+    folder = real_folder()
+    if folder is None:
+        pytest.skip("the real records are not on this machine (set MOTORID_REAL_DATA to their folder)")
+    return folder
