@@ -27,6 +27,10 @@ class FitError(MotoridError):
     """An estimation could not be carried out (exit status 1)."""
 
 
+class DeviceError(MotoridError):
+    """A bench on a serial port does not answer, refuses, or says what cannot be (exit status 1)."""
+
+
 class MissingDependency(MotoridError):
     """An optional package is needed and not installed; the message names the extra to install."""
 

@@ -1,0 +1,75 @@
+"""A small calibration file: how raw values become SI, where the device's own word for it is not good enough.
+
+TOML, one table per channel, every entry optional::
+
+    [i]
+    scale = 0.004883    # A per count
+    offset = 2051.5     # counts at no current
+    sign = -1           # the shunt is the other way round
+
+    [v]
+    gain = 0.985        # the bridge loses 1.5 % of what it is told; multiplies what the device says
+    zero = 0.02         # V added after that
+
+``scale`` and ``offset`` replace the device's own, ``gain``, ``zero`` and ``sign`` work on the outcome.
+"""
+
+from __future__ import annotations
+
+import math
+import tomllib
+from dataclasses import replace
+from pathlib import Path
+
+from motorid.acquire.protocol import Channel, Header
+from motorid.errors import DataError, one_of
+
+__all__ = ["calibrate", "read_calibration"]
+
+_ENTRIES = ("scale", "offset", "gain", "zero", "sign")
+
+
+def read_calibration(path: str | Path) -> dict[str, dict[str, float]]:
+    """Read a calibration file: entries by channel.
+
+    Raises
+    ------
+    DataError
+        If it cannot be read, or holds an entry that is not known or not a finite number.
+    """
+    try:
+        tables = tomllib.loads(Path(path).read_text(encoding="utf-8"))
+    except OSError as error:
+        raise DataError(f"the calibration file {path} cannot be read: {error.strerror}.") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise DataError(f"the calibration file {path} is not TOML: {error}.") from None
+    for channel, entries in tables.items():
+        if not isinstance(entries, dict):
+            raise DataError(f"{path}: expected a table [channel] with entries; '{channel}' stands alone.")
+        for name, value in entries.items():
+            if name not in _ENTRIES:
+                raise DataError(f"{path}, [{channel}]: {one_of(name, _ENTRIES, 'entry')}")
+            if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+                raise DataError(f"{path}, [{channel}]: {name} must be a number; got {value!r}.")
+            if name == "sign" and value not in (1, -1):
+                raise DataError(f"{path}, [{channel}]: sign is 1 or -1; got {value}.")
+            if name in ("scale", "gain") and value == 0:
+                raise DataError(f"{path}, [{channel}]: {name} must not be zero.")
+    return tables
+
+
+def calibrate(header: Header, calibration: dict[str, dict[str, float]]) -> Header:
+    """Return the header with the channels' scales and offsets as the calibration wants them."""
+    names = [c.name for c in header.channels]
+    for name in calibration:
+        if name not in names:
+            raise DataError(f"the calibration speaks of a channel that the device does not send: "
+                            f"{one_of(name, names, 'channel')}")
+    return replace(header, channels=tuple(_calibrated(c, calibration.get(c.name, {})) for c in header.channels))
+
+
+def _calibrated(channel: Channel, entries: dict[str, float]) -> Channel:
+    offset = entries.get("offset", channel.offset)
+    scale = entries.get("scale", channel.scale) * entries.get("gain", 1.0) * entries.get("sign", 1)
+    # zero + scale·(raw − offset) is scale·(raw − (offset − zero/scale)).
+    return replace(channel, scale=scale, offset=offset - entries.get("zero", 0.0) / scale)

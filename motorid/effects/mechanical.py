@@ -1,0 +1,119 @@
+"""Effects on the torque balance: friction, load, angle-dependent torque."""
+
+from __future__ import annotations
+
+import casadi as ca
+
+from motorid.equations import Equations
+from motorid.model import effect
+from motorid.parameters import P
+
+
+@effect(balance="torque")
+def coulomb(m: Equations, tau_c=P(2e-3, "N·m", null=0.0, lower=0.0, doc="Coulomb friction torque")):
+    """Coulomb friction, tau_c·sgn(omega). Armstrong-Hélouvry et al., Automatica 30(7), 1994."""
+    m.torque -= tau_c * m.sign(m.omega)
+
+
+@effect(balance="torque", includes=("coulomb",))
+def coulomb_asymmetric(
+    m: Equations,
+    tau_cp=P(2e-3, "N·m", null=0.0, lower=0.0, doc="Coulomb friction turning forward"),
+    tau_cn=P(2e-3, "N·m", null=0.0, lower=0.0, doc="Coulomb friction turning backward"),
+):
+    """Coulomb friction that differs with the direction. Armstrong-Hélouvry et al., Automatica 30(7), 1994."""
+    forward = (1 + m.sign(m.omega)) / 2
+    m.torque -= tau_cp * forward - tau_cn * (1 - forward) + (tau_cn - tau_cp) * (1 - m.sign(m.omega) ** 2) / 2
+
+
+@effect(balance="torque", includes=("coulomb", "coulomb_asymmetric"))
+def stribeck(
+    m: Equations,
+    tau_c=P(2e-3, "N·m", null=0.0, lower=0.0, doc="Coulomb friction torque at speed"),
+    tau_s=P(3e-3, "N·m", null=0.0, lower=0.0, doc="breakaway torque, at least tau_c"),
+    omega_s=P(5.0, "rad/s", positive=True, grid=(0.01, 0.03, 0.1, 0.3), doc="Stribeck speed"),
+):
+    """Stribeck friction, (tau_c + (tau_s−tau_c)·exp(−(ω/ω_s)²))·sgn ω. Armstrong-Hélouvry et al., Automatica, 1994."""
+    level = tau_c + ca.fmax(tau_s - tau_c, 0) * ca.exp(-((m.omega / omega_s) ** 2))
+    m.torque -= level * m.sign(m.omega)
+
+
+@effect(balance="torque")
+def quadratic_drag(
+    m: Equations,
+    c_2=P(1e-7, "N·m·s²/rad²", null=0.0, lower=0.0, doc="drag coefficient"),
+):
+    """Fan or windage drag, c_2·ω·abs(ω). White, Fluid Mechanics, 2011."""
+    m.torque -= c_2 * m.omega * ca.fabs(m.omega)
+
+
+@effect(balance="torque")
+def constant_load(m: Equations, tau_0=P(1e-3, "N·m", null=0.0, doc="load torque against positive speed")):
+    """Constant load torque (a hoist, a drive's torque offset)."""
+    m.torque -= tau_0
+
+
+@effect(balance="torque")
+def gravity(
+    m: Equations,
+    mgl=P(1e-3, "N·m", null=0.0, lower=0.0, doc="weight times lever arm"),
+    phi_g=P(0.0, "rad", periodic=True, doc="angle of the lever at theta = 0, from hanging"),
+):
+    """Unbalanced load, m·g·l·sin(θ+φ). Any textbook of mechanics; Duclusaud et al., BAM, 2025."""
+    m.torque -= mgl * ca.sin(m.theta + phi_g)
+
+
+@effect(balance="torque")
+def cogging(
+    m: Equations,
+    A=P(1e-3, "N·m", null=0.0, lower=0.0, doc="amplitude of the cogging torque"),
+    N=P(12.0, "", order=True, lower=1.0, doc="periods per turn"),
+    phi=P(0.0, "rad", periodic=True, doc="phase at theta = 0"),
+):
+    """Cogging torque, A·sin(N·θ+φ). Hendershot & Miller, Design of Brushless Permanent-Magnet Machines, 2010."""
+    m.torque -= A * ca.sin(N * m.theta + phi)
+
+
+@effect(balance="torque")
+def torque_ripple(
+    m: Equations,
+    a_r=P(0.05, "", null=0.0, lower=0.0, upper=1.0, doc="relative amplitude"),
+    N_r=P(12.0, "", order=True, lower=1.0, doc="periods per turn"),
+    phi_r=P(0.0, "rad", periodic=True, doc="phase at theta = 0"),
+):
+    """Ripple of the torque constant, K·(1+a·sin(N·θ+φ)) in the torque only. Jahns & Soong, IEEE TIE 43(2), 1996."""
+    m.scale("K_t", 1 + a_r * ca.sin(N_r * m.theta + phi_r))
+
+
+@effect(balance="torque")
+def load_friction(m: Equations, mu=P(0.1, "", null=0.0, lower=0.0, upper=1.0, doc="share of the motor torque lost")):
+    """Friction that grows with the torque carried, μ·abs(K·i)·sgn ω (gears, screws). Wenger et al., 2018; BAM, 2025."""
+    carried = m.K_t * m.i if "i" in m.states else m.g * m.v
+    m.torque -= mu * ca.fabs(carried) * m.sign(m.omega)
+
+
+@effect(balance="torque")
+def viscous_asymmetric(
+    m: Equations,
+    b_a=P(1e-6, "N·m·s/rad", null=0.0, doc="added to b turning forward, taken from it turning backward"),
+):
+    """Viscous friction that differs with the direction, b_a·abs(ω). Janot et al., EMPS benchmark, 2019."""
+    m.torque -= b_a * m.omega * m.sign(m.omega)
+
+
+@effect(balance="torque", includes=("coulomb", "coulomb_asymmetric", "stribeck"))
+def lugre(
+    m: Equations,
+    tau_c=P(2e-3, "N·m", null=0.0, lower=0.0, doc="Coulomb friction torque at speed"),
+    tau_s=P(3e-3, "N·m", null=0.0, lower=0.0, doc="breakaway torque, at least tau_c"),
+    omega_s=P(5.0, "rad/s", positive=True, grid=(0.03, 0.1), doc="Stribeck speed"),
+    theta_s=P(0.01, "rad", positive=True, grid=(0.003, 0.03), doc="presliding angle tau_c/σ0"),
+):
+    """Bristle friction with presliding. Canudas de Wit et al., IEEE TAC 40(3), 1995; bristles critically damped."""
+    excess = ca.fmax(tau_s - tau_c, 0) / (tau_c + 1e-12)
+    level = 1 + excess * ca.exp(-((m.omega / omega_s) ** 2))  # g(ω)/tau_c
+    z = m.state("z_bristle")  # deflection over the presliding angle
+    rate = (m.omega - ca.fabs(m.omega) * z / level) / theta_s
+    m.rate(z, rate)
+    damping = ca.sqrt((tau_c + 1e-12) * m.J / theta_s)  # σ1 of critical damping
+    m.torque -= tau_c * z + damping * theta_s * rate * tau_c / (tau_c + 1e-9)

@@ -1,0 +1,61 @@
+"""Effects of the measuring chain; the motor itself is not touched."""
+
+from __future__ import annotations
+
+from motorid.equations import Equations
+from motorid.model import effect
+from motorid.parameters import P
+
+
+def _lag(m: Equations, channel: str, time_constant) -> None:
+    reaching = m.measured(channel)
+    z = m.state(f"{channel}_lagged", m.start[channel])
+    m.rate(z, (reaching - z) / time_constant)
+    m.measure(channel, z)
+
+
+@effect(balance="sensor")
+def speed_lag(
+    m: Equations,
+    T_w=P(5e-3, "s", null=0.0, positive=True, grid=(1.0, 4.0, 16.0), doc="time constant of the speed filter"),
+):
+    """First-order filter in the speed measurement."""
+    _lag(m, "omega", T_w)
+
+
+@effect(balance="sensor")
+def current_lag(
+    m: Equations,
+    T_i=P(1e-3, "s", null=0.0, positive=True, grid=(0.5, 2.0, 8.0), doc="time constant of the current filter"),
+):
+    """First-order filter in the current measurement."""
+    _lag(m, "i", T_i)
+
+
+@effect(balance="sensor")
+def speed_delay(
+    m: Equations,
+    T_d=P(5e-3, "s", null=0.0, positive=True, grid=(1.0, 4.0, 16.0), doc="delay of the speed measurement"),
+):
+    """Pure delay in the speed measurement, Padé approximation of order 2. Golub & Van Loan, 2013, sec. 9.3."""
+    reaching = m.measured("omega")
+    # (12 − 6Ts + T²s²)/(12 + 6Ts + T²s²) in a realisation scaled by T; z1 carries the slow part.
+    z1, z2 = m.state("omega_delayed", m.start["omega"]), m.state("omega_delayed_2")
+    m.rate(z1, z2 / T_d)
+    m.rate(z2, (12 * (reaching - z1) - 6 * z2) / T_d)
+    m.measure("omega", reaching - 12 * z2 / 12)
+
+
+@effect(balance="sensor")
+def current_offset(m: Equations, i_0=P(0.02, "A", null=0.0, doc="added by the current sensor")):
+    """Offset of the current sensor."""
+    m.measure("i", m.measured("i") + i_0)
+
+
+@effect(balance="sensor")
+def speed_gain(
+    m: Equations,
+    k_w=P(0.01, "", null=0.0, lower=-0.9, upper=9.0, doc="relative error of the speed scale"),
+):
+    """Wrong scale of the speed sensor; needs an angle, or held motor constants, to be told from K and J."""
+    m.measure("omega", m.measured("omega") * (1 + k_w))

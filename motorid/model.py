@@ -1,0 +1,338 @@
+"""Models as a base motor plus effects: ``model + effect``, ``without``, ``replace``, ``fix``."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import casadi as ca
+
+from motorid.equations import CHANNELS, Equations
+from motorid.errors import ModelError, one_of
+from motorid.parameters import P, Parameter
+from motorid.system import System, build_system
+
+BALANCES = ("voltage", "torque", "transmission", "sensor")
+SGN_WIDTH = Parameter("sgn_width", 1e-2, "rad/s", positive=True, vary=False,
+                      doc="speed over which sgn(omega) is smoothed; chosen from the data unless given")
+LINEAR_UNITS = {"N·m": "N", "rad/s": "m/s", "rad": "m", "kg·m²": "kg", "N·m·s/rad": "N·s/m",
+                "N·m·s²/rad²": "N·s²/m²", "N·m/rad": "N/m", "N·m·s²": "kg", "1/(N·m)": "1/N"}
+
+
+@dataclass(frozen=True, eq=False)
+class Effect:
+    """One physical effect: a law that writes on the `Equations` sheet.
+
+    Attributes
+    ----------
+    name : str
+    law : callable
+        ``law(m, **symbols)``.
+    parameters : tuple of Parameter
+    balance : str
+        ``"voltage"``, ``"torque"``, ``"transmission"`` or ``"sensor"``.
+    doc : str
+        What it is, with its source.
+    includes : tuple of str
+        Effects that this one contains as a special case (Stribeck friction contains Coulomb's).
+    """
+
+    name: str
+    law: Callable[..., None] | None
+    parameters: tuple[Parameter, ...]
+    balance: str
+    doc: str = ""
+    includes: tuple[str, ...] = ()
+
+    @property
+    def size(self) -> Parameter | None:
+        """The parameter that makes the effect vanish at its null value, if there is just one such."""
+        sizes = [p for p in self.parameters if p.null is not None]
+        return sizes[0] if sizes else None
+
+    def __call__(self, **values: float) -> Effect:
+        """Return the effect with some parameters given, e.g. ``cogging(N=12)`` (held if it is an order)."""
+        known = {p.name: p for p in self.parameters}
+        for name in values:
+            if name not in known:
+                raise ModelError(f"effect '{self.name}': {one_of(name, known, 'parameter')}")
+        pars = tuple(replace(p, value=float(values[p.name]), given=True, vary=p.vary and not p.order)
+                     if p.name in values else p for p in self.parameters)
+        return replace(self, parameters=pars)
+
+    def __repr__(self) -> str:
+        return f"<effect {self.name} ({self.balance}): {', '.join(p.name for p in self.parameters)}>"
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # Only plain data crosses a process boundary: the law goes by the name of its module, if it has one.
+        module = getattr(self.law, "__module__", None)
+        qualname = getattr(self.law, "__qualname__", "")
+        place = (module, qualname) if module not in (None, "__main__") and "<locals>" not in qualname else None
+        return _restore_effect, (place, self.name, self.parameters, self.balance, self.doc,
+                                 self.includes)
+
+
+def _restore_effect(place: tuple[str, str] | None, name: str, parameters: tuple[Parameter, ...], balance: str,
+                    doc: str, includes: tuple[str, ...]) -> Effect:
+    law = None
+    if place is not None:
+        try:
+            law = getattr(importlib.import_module(place[0]), place[1]).law
+        except (ImportError, AttributeError):
+            law = None
+    return Effect(name, law, parameters, balance, doc, includes)
+
+
+def effect(*, balance: str, name: str | None = None, includes: tuple[str, ...] = ()) -> Callable[[Callable[..., None]], Effect]:
+    """Make an `Effect` of a function ``law(m, size=P(...), shape=P(...))``.
+
+    Parameters
+    ----------
+    balance : {"voltage", "torque", "transmission", "sensor"}
+        The balance (or the sensor) that the effect acts on.
+    name : str, optional
+        Default: the function's name.
+    includes : tuple of str, optional
+        Effects that this one contains as a special case; it takes their place and refuses to stand beside them.
+
+    Raises
+    ------
+    ModelError
+        If an argument has no `P` default or the balance is unknown.
+
+    Examples
+    --------
+    >>> @effect(balance="torque")
+    ... def coulomb(m, tau_c=P(2e-3, "N·m", null=0)):
+    ...     m.torque -= tau_c * m.sign(m.omega)
+    """
+    if balance not in BALANCES:
+        raise ModelError(one_of(balance, BALANCES, "balance"))
+
+    def make(law: Callable[..., None]) -> Effect:
+        title = name or law.__name__
+        pars = []
+        for arg in list(inspect.signature(law).parameters.values())[1:]:
+            if not isinstance(arg.default, P):
+                raise ModelError(f"effect '{title}': argument '{arg.name}' needs a default P(value, unit, null=…).")
+            pars.append(arg.default.named(arg.name))
+        return Effect(title, law, tuple(pars), balance, inspect.cleandoc(law.__doc__ or ""), includes)
+
+    return make
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """A base motor and its effects; every change returns a copy.
+
+    Attributes
+    ----------
+    base : str
+        ``"dc_motor"`` or ``"torque_driven"``.
+    effects : tuple of Effect
+    parameters : dict of str to Parameter
+        Of the base and all effects; `sgn_width` appears where an effect uses sgn.
+    axis : {"rotary", "linear"}
+        Linear: the same equations read as mass and force, units shown so.
+    angle_input : bool
+        Effects take the angle from a given signal instead of the model's own state.
+    """
+
+    base: str
+    effects: tuple[Effect, ...] = ()
+    parameters: Mapping[str, Parameter] = field(default_factory=dict)
+    axis: str = "rotary"
+    angle_input: bool = False
+    _systems: dict[Any, System] = field(default_factory=dict, repr=False)
+
+    def __add__(self, other: Effect) -> Model:
+        """Return the model with one more effect."""
+        if not isinstance(other, Effect):
+            raise ModelError(f"a model takes effects, got {type(other).__name__}. Use mi.effects.<name> or @mi.effect.")
+        if other.name in self.effect_names:
+            raise ModelError(f"the model already has '{other.name}'. Take it out first: model.without('{other.name}').")
+        for e in self.effects:
+            if e.name in other.includes or other.name in e.includes:
+                raise ModelError(f"'{other.name}' and '{e.name}' describe the same friction twice; one contains the "
+                                 f"other. Take the present one out first: model.without('{e.name}').")
+        for p in other.parameters:
+            if p.name in self.parameters:
+                raise ModelError(f"'{other.name}' brings a parameter '{p.name}' that the model already has; "
+                                 "rename it in the effect, or leave one of the two effects out.")
+        added = {p.name: self._in_units(p) for p in other.parameters}
+        model = self._with(effects=(*self.effects, other), parameters={**self.parameters, **added})
+        equations = model.write()
+        if equations.sgn_width is not None and "sgn_width" not in model.parameters:
+            width = replace(SGN_WIDTH, unit="m/s" if self.axis == "linear" else SGN_WIDTH.unit)
+            model = model._with(parameters={**model.parameters, "sgn_width": width})
+        return model
+
+    def without(self, name: str) -> Model:
+        """Return the model without the effect called `name`."""
+        if name not in self.effect_names:
+            raise ModelError(one_of(name, self.effect_names, "effect in this model"))
+        model = self._with(effects=(), parameters={k: v for k, v in self.parameters.items() if k in self._base_names})
+        for e in self.effects:
+            if e.name != name:
+                model = model + e
+        kept = {k: self.parameters[k] for k in model.parameters if k in self.parameters}
+        return model._with(parameters={**model.parameters, **kept})
+
+    def replace(self, **values: float) -> Model:
+        """Return the model with parameter values set (in SI units); a fit starts from them."""
+        return self._change({n: {"value": float(v), "given": True} for n, v in values.items()})
+
+    def start_at(self, values: Mapping[str, float]) -> Model:
+        """Return the model with values taken from a result; unlike `replace`, a later fit may move its start."""
+        return self._change({n: {"value": float(v)} for n, v in values.items() if n in self.parameters})
+
+    def fix(self, *names: str, **values: float) -> Model:
+        """Return the model with parameters held: ``fix("L")`` at its value, ``fix(R=1.2)`` at a new one."""
+        changes: dict[str, dict[str, Any]] = {n: {"vary": False} for n in names}
+        changes |= {n: {"value": float(v), "vary": False, "given": True} for n, v in values.items()}
+        return self._change(changes)
+
+    def free(self, *names: str) -> Model:
+        """Return the model with the parameters `names` estimated again."""
+        return self._change({n: {"vary": True} for n in names})
+
+    def bounded(self, **limits: tuple[float, float]) -> Model:
+        """Return the model with limits set: ``bounded(R=(0.5, 2))``."""
+        return self._change({n: {"lower": float(lo), "upper": float(hi)} for n, (lo, hi) in limits.items()})
+
+    @property
+    def effect_names(self) -> tuple[str, ...]:
+        """Names of the effects, in the order of adding."""
+        return tuple(e.name for e in self.effects)
+
+    @property
+    def values(self) -> dict[str, float]:
+        """Present parameter values, in SI units."""
+        return {n: p.value for n, p in self.parameters.items()}
+
+    @property
+    def free_names(self) -> tuple[str, ...]:
+        """Names of the parameters that a fit varies."""
+        return tuple(n for n, p in self.parameters.items() if p.vary)
+
+    @property
+    def _base_names(self) -> tuple[str, ...]:
+        return tuple(p.name for p in _BASES[self.base])
+
+    def _in_units(self, p: Parameter) -> Parameter:
+        return replace(p, unit=LINEAR_UNITS.get(p.unit, p.unit)) if self.axis == "linear" else p
+
+    def _change(self, changes: Mapping[str, Mapping[str, Any]]) -> Model:
+        pars = dict(self.parameters)
+        for name, fields in changes.items():
+            if name not in pars:
+                raise ModelError(one_of(name, pars, "parameter"))
+            pars[name] = replace(pars[name], **fields)
+        return self._with(parameters=pars)
+
+    def _with(self, **fields: Any) -> Model:
+        new = replace(self, **fields, _systems={})
+        if new.effect_names == self.effect_names and new.angle_input == self.angle_input:
+            # The equations depend on values only through "L is zero and held", which is part of the key.
+            object.__setattr__(new, "_systems", self._systems)
+        return new
+
+    @property
+    def stored(self) -> tuple[str, ...]:
+        """Base states whose balance has storage; without inductance (L held at 0) the current is algebraic."""
+        inductance = self.parameters.get("L")
+        algebraic = inductance is not None and inductance.value == 0 and not inductance.vary
+        return tuple(s for s in _STATES[self.base] if not (s == "i" and algebraic))
+
+    def write(self) -> Equations:
+        """Return the filled sheet: the base and the effects, in an order that does not depend on adding."""
+        m = Equations(_STATES[self.base], self.angle_input)
+        symbols = m.symbols = {n: ca.SX.sym(n) for n in self.parameters}
+        for name in _QUANTITIES[self.base]:
+            m.define(name, symbols[name] if name in symbols else _DERIVED[name](m))
+        m.define("v", m.command)
+        for e in sorted(self.effects, key=lambda e: e.name):
+            if e.law is None:
+                raise ModelError(f"the law of the effect '{e.name}' is not here: it was defined in another "
+                                 "session. Define it again and build the model anew.")
+            m.writer = e.name
+            e.law(m, **{p.name: symbols[p.name] for p in e.parameters})
+        return m
+
+    def system(self, outputs: Iterable[str]) -> System:
+        """Return the CasADi functions of the model for the measured `outputs`, made once per choice.
+
+        Raises
+        ------
+        ModelError
+            If the model cannot show a channel, or definitions go in a circle.
+        """
+        chosen = tuple(c for c in CHANNELS if c in set(outputs))
+        for c in set(outputs) - set(chosen):
+            raise ModelError(one_of(c, CHANNELS, "channel"))
+        if "i" in chosen and "i" not in _STATES[self.base]:
+            raise ModelError(f"the base '{self.base}' has no current: leave the channel 'i' out, or use dc_motor().")
+        key = (chosen, self.stored)
+        if key not in self._systems:
+            self._systems[key] = build_system(self.write(), tuple(self.parameters), chosen, self.stored)
+        return self._systems[key]
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {f: getattr(self, f) for f in self.__dataclass_fields__}
+
+    def __repr__(self) -> str:
+        return f"<model {' + '.join([self.base, *self.effect_names])}: {', '.join(self.free_names)}>"
+
+
+_STATES = {"dc_motor": ("i", "omega"), "torque_driven": ("omega",)}
+_QUANTITIES = {"dc_motor": ("R", "L", "K", "K_t", "K_e", "b", "J"), "torque_driven": ("g", "b", "J")}
+_DERIVED = {"K_t": lambda m: m.K, "K_e": lambda m: m.K}
+_BASES = {
+    "dc_motor": (
+        Parameter("R", 1.0, "Ω", positive=True, doc="winding resistance"),
+        Parameter("L", 1e-3, "H", positive=True, doc="winding inductance"),
+        Parameter("K", 0.05, "N·m/A", positive=True, doc="torque and back-EMF constant (V·s/rad)"),
+        Parameter("b", 1e-5, "N·m·s/rad", positive=True, doc="viscous friction"),
+        Parameter("J", 1e-5, "kg·m²", positive=True, doc="moment of inertia"),
+    ),
+    "torque_driven": (
+        Parameter("g", 1.0, "N·m/V", positive=True, vary=False, doc="torque per unit of the command; held"),
+        Parameter("b", 1e-3, "N·m·s/rad", positive=True, doc="viscous friction"),
+        Parameter("J", 1e-3, "kg·m²", positive=True, doc="moment of inertia"),
+    ),
+}
+
+
+def dc_motor(**values: float) -> Model:
+    """Return the brushed DC motor ``L di/dt = v − R i − K ω``, ``J dω/dt = K i − b ω``.
+
+    Parameters
+    ----------
+    **values : float
+        Known or assumed R (Ω), L (H), K (N·m/A), b (N·m·s/rad), J (kg·m²); none is needed for a fit.
+    """
+    model = Model("dc_motor", parameters={p.name: p for p in _BASES["dc_motor"]})
+    return model.replace(**values)
+
+
+def torque_driven(axis: str = "rotary", **values: float) -> Model:
+    """Return the drive that closes its own current loop: ``J dω/dt = g·u − b ω``.
+
+    Parameters
+    ----------
+    axis : {"rotary", "linear"}
+        Linear: J is a mass (kg), b in N·s/m, g in N per unit of the command.
+    **values : float
+        ``g``, ``b``, ``J``. The gain g is held (only ratios to it can be determined) until ``free("g")``.
+    """
+    if axis not in ("rotary", "linear"):
+        raise ModelError(one_of(axis, ("rotary", "linear"), "axis"))
+    pars = {p.name: p for p in _BASES["torque_driven"]}
+    if axis == "linear":
+        units = {"g": "N/V", "b": "N·s/m", "J": "kg"}
+        docs = {"g": "force per unit of the command; held", "J": "moving mass", "b": "viscous friction"}
+        pars = {n: replace(p, unit=units[n], doc=docs[n]) for n, p in pars.items()}
+    return Model("torque_driven", parameters=pars, axis=axis).replace(**values)
