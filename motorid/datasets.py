@@ -34,7 +34,7 @@ def data_path(name: str = "") -> Path:
     Parameters
     ----------
     name : str
-        Relative to the data folder, as in ``"hidden_friction"`` or ``"two_step/step_6V.csv"``; empty for the folder.
+        As ``"hidden_friction"`` or ``"two_step/step_6V.csv"``; empty for the data folder itself.
 
     Raises
     ------

@@ -26,7 +26,7 @@ def plant():
 
 
 def real_folder() -> Path | None:
-    """Folder of the real records: MOTORID_REAL_DATA, or shared/data/real in or beside a folder above this file."""
+    """MOTORID_REAL_DATA, or else shared/data/real in a folder above this file; None if there is none."""
     named = os.environ.get("MOTORID_REAL_DATA")
     if named:
         return Path(named) if Path(named).is_dir() else None

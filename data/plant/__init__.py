@@ -1,4 +1,4 @@
-"""An independent motor plant: the reality behind the hidden-effect records. It shares no code with the models."""
+"""An independent motor plant: the reality behind the records, sharing no code with the models."""
 
 from .effects import BEYOND, LIBRARY
 from .excitations import chirp, coast_down, multisine, prbs, random_steps, staircase, step, triangle, warm_up

@@ -77,13 +77,13 @@ def magnetic_saturation(m: Motor, i_K: float) -> Hooks:
 
 
 @_known
-def driver_dead_band(m: Motor, v_d: float) -> Hooks:
-    return {"drive": lambda v, w: v - v_d if v > v_d else v + v_d if v < -v_d else 0.0}
+def driver_dead_band(m: Motor, V_d: float) -> Hooks:
+    return {"drive": lambda v, w: v - V_d if v > V_d else v + V_d if v < -V_d else 0.0}
 
 
 @_known
-def voltage_offset(m: Motor, v_0: float) -> Hooks:
-    return {"drive": lambda v, w: v + v_0}
+def voltage_offset(m: Motor, V_0: float) -> Hooks:
+    return {"drive": lambda v, w: v + V_0}
 
 
 # ---------------------------------------------------------------- torque
@@ -95,8 +95,8 @@ def coulomb(m: Motor, tau_c: float) -> Hooks:
 
 
 @_known
-def coulomb_asymmetric(m: Motor, tau_pos: float, tau_neg: float) -> Hooks:
-    return {"dry": lambda i, w, th, s, t: tau_pos if s > 0 else tau_neg}
+def coulomb_asymmetric(m: Motor, tau_cp: float, tau_cn: float) -> Hooks:
+    return {"dry": lambda i, w, th, s, t: tau_cp if s > 0 else tau_cn}
 
 
 @_known
@@ -105,18 +105,18 @@ def stribeck(m: Motor, tau_c: float, tau_s: float, omega_s: float) -> Hooks:
 
 
 @_known
-def quadratic_drag(m: Motor, c_q: float) -> Hooks:
-    return {"torque": lambda i, w, th, t: -c_q * w * abs(w)}
+def quadratic_drag(m: Motor, c_2: float) -> Hooks:
+    return {"torque": lambda i, w, th, t: -c_2 * w * abs(w)}
 
 
 @_known
-def constant_load(m: Motor, tau_l: float) -> Hooks:
-    return {"torque": lambda i, w, th, t: -tau_l}
+def constant_load(m: Motor, tau_0: float) -> Hooks:
+    return {"torque": lambda i, w, th, t: -tau_0}
 
 
 @_known
-def gravity(m: Motor, mgl: float, phi: float = 0.0) -> Hooks:
-    return {"torque": lambda i, w, th, t: -mgl * sin(th + phi)}
+def gravity(m: Motor, mgl: float, phi_g: float = 0.0) -> Hooks:
+    return {"torque": lambda i, w, th, t: -mgl * sin(th + phi_g)}
 
 
 @_known
@@ -125,8 +125,8 @@ def cogging(m: Motor, A: float, N: float, phi: float = 0.0) -> Hooks:
 
 
 @_known
-def torque_ripple(m: Motor, a: float, N: float, phi: float = 0.0) -> Hooks:
-    return {"Kt": lambda th: 1 + a * sin(N * th + phi), "rate": N * m.no_load_speed}
+def torque_ripple(m: Motor, a_r: float, N_r: float, phi_r: float = 0.0) -> Hooks:
+    return {"Kt": lambda th: 1 + a_r * sin(N_r * th + phi_r), "rate": N_r * m.no_load_speed}
 
 
 @_known
@@ -135,15 +135,13 @@ def load_friction(m: Motor, mu: float) -> Hooks:
 
 
 @_known
-def viscous_asymmetric(m: Motor, b_pos: float, b_neg: float) -> Hooks:
-    """Viscous friction of its own for each direction, on top of b."""
-    return {"torque": lambda i, w, th, t: -(b_pos if w > 0 else b_neg) * w}
+def viscous_asymmetric(m: Motor, b_a: float) -> Hooks:
+    """Viscous friction b + b_a forward and b − b_a backward."""
+    return {"torque": lambda i, w, th, t: -b_a * abs(w)}
 
 
 @_known
-def lugre(
-    m: Motor, sigma_0: float, sigma_1: float, tau_c: float, tau_s: float, omega_s: float
-) -> Hooks:
+def lugre(m: Motor, sigma_0: float, sigma_1: float, tau_c: float, tau_s: float, omega_s: float) -> Hooks:
     """Bristles of mean deflection z: Canudas de Wit et al., IEEE Trans. Automatic Control 40(3), 1995."""
 
     def part(i: float, w: float, th: float, x: list[float]) -> tuple[float, tuple[float, ...]]:
@@ -189,18 +187,18 @@ def backlash(m: Motor, gap: float, k_s: float, c_s: float, J_l: float) -> Hooks:
 
 
 @_known
-def speed_lag(m: Motor, tau_f: float) -> Hooks:
-    return {"sensor": ("speed_lag", tau_f), "rate": 1 / tau_f}
+def speed_lag(m: Motor, T_w: float) -> Hooks:
+    return {"sensor": ("speed_lag", T_w), "rate": 1 / T_w}
 
 
 @_known
-def current_lag(m: Motor, tau_i: float) -> Hooks:
-    return {"sensor": ("current_lag", tau_i), "rate": 1 / tau_i}
+def current_lag(m: Motor, T_i: float) -> Hooks:
+    return {"sensor": ("current_lag", T_i), "rate": 1 / T_i}
 
 
 @_known
-def speed_delay(m: Motor, t_d: float) -> Hooks:
-    return {"sensor": ("speed_delay", t_d)}
+def speed_delay(m: Motor, T_d: float) -> Hooks:
+    return {"sensor": ("speed_delay", T_d)}
 
 
 @_known
@@ -209,8 +207,9 @@ def current_offset(m: Motor, i_0: float) -> Hooks:
 
 
 @_known
-def speed_gain(m: Motor, g: float) -> Hooks:
-    return {"sensor": ("speed_gain", g)}
+def speed_gain(m: Motor, k_w: float) -> Hooks:
+    """The speed scale is wrong by the fraction k_w."""
+    return {"sensor": ("speed_gain", 1 + k_w)}
 
 
 # ---------------------------------------------------------------- beyond the library

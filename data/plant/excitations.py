@@ -1,4 +1,4 @@
-"""Voltages to drive a motor with: every function returns (t, v), |v| within the given level, rounded to 0.1 mV.
+"""Voltages to drive a motor with: (t, v) with abs(v) within the given level, rounded to 0.1 mV.
 
 Rounding here means that a record written with four decimals holds exactly the voltage the plant was given.
 """
@@ -48,7 +48,9 @@ def chirp(level: float, duration: float, f0: float, f1: float, dt: float = 1e-3)
     return t, _level(level * np.sin(2 * np.pi * f0 * np.expm1(rate * t) / rate))
 
 
-def prbs(level: float, duration: float, hold: float, rng: np.random.Generator, dt: float = 1e-3) -> Excitation:
+def prbs(
+    level: float, duration: float, hold: float, rng: np.random.Generator, dt: float = 1e-3
+) -> Excitation:
     """Random ±level, drawn anew every `hold` seconds."""
     t = _time(duration, dt)
     signs = rng.integers(0, 2, ceil(duration / hold) + 1) * 2 - 1

@@ -15,7 +15,8 @@ def closed_loop(
 ) -> dict[str, np.ndarray]:
     """Follow a reference (N,) in closed loop, the voltage limited to the motor's v_max.
 
-    gains {"kp", "ki"} make a PI controller of the speed (rad/s), {"kp", "kd"} a PD controller of the angle (rad).
+    Gains {"kp", "ki"} make a PI controller of the speed (rad/s), {"kp", "kd"} a PD controller
+    of the angle (rad).
     Returns arrays (N,): t, reference, v (the voltage really applied), and the sensed i, omega, theta.
     """
     if set(gains) not in ({"kp", "ki"}, {"kp", "kd"}):
@@ -33,11 +34,11 @@ def closed_loop(
         v = float(min(limit, max(-limit, v)))
         rows.append((plant.t, target, v, seen["i"], seen["omega"], seen["theta"]))
         plant.step(v, dt)
-    return dict(zip(("t", "reference", "v", "i", "omega", "theta"), np.array(rows).T))
+    return dict(zip(("t", "reference", "v", "i", "omega", "theta"), np.array(rows).T, strict=True))
 
 
 def simulate_linear(motor: Motor, t: np.ndarray, v: np.ndarray) -> dict[str, np.ndarray]:
-    """The plain motor from rest with held voltage and a constant step, exact to rounding: i, omega, theta, t, v.
+    """The plain motor from rest, voltage held, constant step, exact to rounding: i, omega, theta, t, v.
 
     By the matrix exponential, in plain arithmetic only, so that the digits are the same on every machine.
     """
@@ -53,7 +54,7 @@ def simulate_linear(motor: Motor, t: np.ndarray, v: np.ndarray) -> dict[str, np.
     for volts in v:
         rows.append(x)
         x = [sum([E[r][c] * z for c, z in enumerate((*x, float(volts)))]) for r in range(3)]
-    return dict(zip(("i", "omega", "theta"), np.array(rows).T)) | {"t": t, "v": v}
+    return dict(zip(("i", "omega", "theta"), np.array(rows).T, strict=True)) | {"t": t, "v": v}
 
 
 def _expm(A: list[list[float]]) -> list[list[float]]:
@@ -64,12 +65,14 @@ def _expm(A: list[list[float]]) -> list[list[float]]:
         k += 1
     A = [[a / 2**k for a in row] for row in A]
     E = [[float(r == c) for c in range(n)] for r in range(n)]
-    for order in range(18, 0, -1):
-        E = [[float(r == c) + e / order for c, e in enumerate(row)] for r, row in enumerate(_product(A, E))]
+    for order in range(18, 0, -1):  # Horner: 1 + A/1 (1 + A/2 (1 + …))
+        AE = _product(A, E)
+        E = [[float(r == c) + AE[r][c] / order for c in range(n)] for r in range(n)]
     for _ in range(k):
         E = _product(E, E)
     return E
 
 
 def _product(A: list[list[float]], B: list[list[float]]) -> list[list[float]]:
-    return [[sum([a * b for a, b in zip(row, column)]) for column in zip(*B)] for row in A]
+    columns = list(zip(*B, strict=True))
+    return [[sum([a * b for a, b in zip(row, col, strict=True)]) for col in columns] for row in A]

@@ -1,20 +1,20 @@
 """The plant: motor plus hidden effects, integrated by RK4 with fine steps and true stick-slip.
 
-Dry friction is discontinuous. Its direction s is frozen during a step; when the speed changes sign the step is cut at
-that instant, the speed is set to exactly zero, and the shaft either sticks (net torque within the breakaway level) or
-slides on. A stuck shaft stays at exactly zero speed until the net torque exceeds the breakaway level.
+Dry friction is discontinuous. Its direction s is frozen during a step; when the speed changes sign the step
+is cut at that instant, the speed is set to exactly zero, and the shaft either sticks (net torque within the
+breakaway level) or slides on. A stuck shaft stays at exactly zero speed until the net torque exceeds it.
 """
 
 from __future__ import annotations
 
-from bisect import bisect_right
 from collections.abc import Callable
-from math import ceil, exp
+from math import ceil
 
 import numpy as np
 
 from .effects import build
 from .motors import Motor
+from .sensors import Chain
 
 Effects = dict[str, dict[str, float]]
 FREE = 2  # no dry friction: there is no direction to keep track of
@@ -28,7 +28,7 @@ class Plant:
     motor : Motor
     effects : dict of name -> dict of numbers, see `effects.py`
     omega0, theta0 : initial speed in rad/s and angle in rad
-    substep : integration step in s; default 50 µs or a quarter of the fastest time constant, whichever is less
+    substep : integration step in s; default the lesser of 50 µs and a quarter of the fastest time constant
 
     Attributes
     ----------
@@ -53,7 +53,7 @@ class Plant:
         self._rates, self._level, x0 = _physics(motor, hooks, omega0, theta0)
         self._y = [0.0, float(omega0), float(theta0), 0.0, *x0]  # i, omega, theta, dT, and states of parts
         self._s = (0 if omega0 == 0 else 1 if omega0 > 0 else -1) if self._level else FREE
-        self._sensors = Sensors(hooks, omega0)
+        self._sensors = Chain(hooks, omega0)
 
     i = property(lambda self: self._y[0])
     omega = property(lambda self: self._y[1])
@@ -62,7 +62,7 @@ class Plant:
     stuck = property(lambda self: self._s == 0)
 
     def step(self, v: float, dt: float, v_end: float | None = None) -> dict[str, float]:
-        """Advance by dt seconds with v volts held (or going to v_end in a straight line); return `measured()`."""
+        """Advance by dt seconds with v volts held (or going straight to v_end); return `measured()`."""
         n = max(1, ceil(dt / self.substep - 1e-6))
         h = dt / n
         slope = 0.0 if v_end is None else (v_end - v) / n
@@ -97,7 +97,7 @@ class Plant:
         self._y = _rk4(self._rates, self._y, v1, v1, left, 0, self.t)
 
     def _reverse(self, v0: float, v1: float, h: float) -> float:
-        """Go to the instant within h at which the speed becomes zero and stop there; return the time it took."""
+        """Go to the instant within h at which the speed is zero and stop there; return the time it took."""
         low, high, w_low, w_high = 0.0, h, self._y[1], None
         y, at = self._y, 0.0
         for _ in range(60):
@@ -125,15 +125,15 @@ class Plant:
 def _rk4(f: Callable, y: list[float], v0: float, v1: float, h: float, s: int, t: float) -> list[float]:
     half, mid = 0.5 * h, 0.5 * (v0 + v1)
     k1 = f(y, v0, s, t)
-    k2 = f([a + half * k for a, k in zip(y, k1)], mid, s, t)
-    k3 = f([a + half * k for a, k in zip(y, k2)], mid, s, t)
-    k4 = f([a + h * k for a, k in zip(y, k3)], v1, s, t)
+    k2 = f([a + half * k for a, k in zip(y, k1, strict=True)], mid, s, t)
+    k3 = f([a + half * k for a, k in zip(y, k2, strict=True)], mid, s, t)
+    k4 = f([a + h * k for a, k in zip(y, k3, strict=True)], v1, s, t)
     sixth = h / 6
-    return [a + sixth * (p + 2 * (q + r) + u) for a, p, q, r, u in zip(y, k1, k2, k3, k4)]
+    return [a + sixth * (p + 2 * (q + r) + u) for a, p, q, r, u in zip(y, k1, k2, k3, k4, strict=True)]
 
 
 def _physics(m: Motor, hooks: list[dict], omega0: float, theta0: float) -> tuple:
-    """The rates of (i, omega, theta, dT, parts), the level of dry friction (None without), and the parts' start."""
+    """The rates of (i, omega, theta, dT, parts), the level of dry friction or None, the parts' start."""
 
     def every(kind: str) -> list:
         return [h[kind] for h in hooks if kind in h]
@@ -184,51 +184,6 @@ def _physics(m: Motor, hooks: list[dict], omega0: float, theta0: float) -> tuple
     return rates, level if dries else None, x0
 
 
-class Sensors:
-    """What happens between the shaft and the logger: lags, a pure delay, a gain, an offset."""
-
-    def __init__(self, hooks: list[dict], omega0: float) -> None:
-        has = dict(h["sensor"] for h in hooks if "sensor" in h)
-        self.lag_i, self.lag_w = has.get("current_lag"), has.get("speed_lag")
-        self.delay, self.gain = has.get("speed_delay", 0.0), has.get("speed_gain", 1.0)
-        self.offset = has.get("current_offset", 0.0)
-        self.i, self.w = 0.0, float(omega0)
-        self._last = (0.0, float(omega0))
-        self._times, self._speeds = [0.0], [float(omega0)]
-
-    def sample(self, t: float, h: float, i: float, w: float) -> None:
-        """Follow the true current and speed, taken as straight lines over the last step of h seconds."""
-        self.i = _lag(self.i, self._last[0], i, h, self.lag_i)
-        self.w = _lag(self.w, self._last[1], w, h, self.lag_w)
-        self._last = (i, w)
-        if self.delay:
-            self._times.append(t)
-            self._speeds.append(self.w)
-            if len(self._times) > 4096 and self._times[2048] < t - self.delay:
-                del self._times[:2048], self._speeds[:2048]
-
-    def read(self, t: float, y: list[float]) -> dict[str, float]:
-        w = self._delayed(t - self.delay) if self.delay else self.w
-        return {"i": self.i + self.offset, "omega": self.gain * w, "theta": y[2]}
-
-    def _delayed(self, t: float) -> float:
-        k = bisect_right(self._times, t + 1e-12)
-        if k == 0:
-            return self._speeds[0]
-        if k == len(self._times):
-            return self._speeds[-1]
-        part = max(0.0, (t - self._times[k - 1]) / (self._times[k] - self._times[k - 1]))
-        return self._speeds[k - 1] + part * (self._speeds[k] - self._speeds[k - 1])
-
-
-def _lag(z: float, u0: float, u1: float, h: float, tau: float | None) -> float:
-    """First-order lag over h, exact for an input that goes from u0 to u1 in a straight line."""
-    if not tau:
-        return u1
-    slope = (u1 - u0) / h
-    return (u1 - slope * tau) + (z - u0 + slope * tau) * exp(-h / tau)
-
-
 def simulate(
     motor: Motor,
     effects: Effects | None,
@@ -239,11 +194,14 @@ def simulate(
     theta0: float = 0.0,
     substep: float | None = 20e-6,
 ) -> dict[str, np.ndarray]:
-    """Run the plant over the samples t (N,) with the voltage v (N,), held ("zoh") or joined by lines ("linear").
+    """Run the plant over the samples t (N,) with the voltage v (N,), held ("zoh") or ramped ("linear").
 
-    Returns arrays (N,): t, v; **sensed** i, omega, theta; the truth behind them true_i, true_omega, true_theta and dT.
-    The step is `substep` or the plant's own choice, whichever is less.
+    Returns arrays (N,): t, v; the **sensed** i, omega, theta; the truth behind them true_i, true_omega,
+    true_theta and dT. The step is the lesser of `substep` and the plant's own choice.
     """
+    t, v = np.asarray(t, float), np.asarray(v, float)
+    if t.shape != v.shape or t.ndim != 1 or np.any(np.diff(t) <= 0):
+        raise ValueError(f"t must increase and v be as long: t {t.shape}, v {v.shape}")
     if hold not in ("zoh", "linear"):
         raise ValueError(f"hold is 'zoh' or 'linear', not {hold!r}")
     plant = Plant(motor, effects, omega0, theta0)
@@ -254,7 +212,7 @@ def simulate(
         rows.append(_row(plant))
     names = ("i", "omega", "theta", "true_i", "true_omega", "true_theta", "dT")
     columns = np.array(rows).T
-    return {"t": np.asarray(t, float), "v": np.asarray(v, float)} | dict(zip(names, columns))
+    return {"t": t, "v": v} | dict(zip(names, columns, strict=True))
 
 
 def _row(plant: Plant) -> tuple[float, ...]:

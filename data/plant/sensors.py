@@ -1,6 +1,9 @@
-"""What a logger does to a clean signal. Random parts draw from the numpy Generator that is passed in."""
+"""What sensors and loggers do to a signal; random parts draw from the numpy Generator that is passed in."""
 
 from __future__ import annotations
+
+from bisect import bisect_right
+from math import exp
 
 import numpy as np
 
@@ -65,3 +68,48 @@ def uneven(t: np.ndarray, jitter: float, rng: np.random.Generator) -> np.ndarray
 def resample(t_new: np.ndarray, t: np.ndarray, x: np.ndarray) -> np.ndarray:
     """Values of x(t) at other times by straight lines."""
     return np.interp(t_new, t, x)
+
+
+class Chain:
+    """What happens between the shaft and the logger: lags, a pure delay, a gain, an offset."""
+
+    def __init__(self, hooks: list[dict], omega0: float) -> None:
+        has = dict(h["sensor"] for h in hooks if "sensor" in h)
+        self.lag_i, self.lag_w = has.get("current_lag"), has.get("speed_lag")
+        self.delay, self.gain = has.get("speed_delay", 0.0), has.get("speed_gain", 1.0)
+        self.offset = has.get("current_offset", 0.0)
+        self.i, self.w = 0.0, float(omega0)
+        self._last = (0.0, float(omega0))
+        self._times, self._speeds = [0.0], [float(omega0)]
+
+    def sample(self, t: float, h: float, i: float, w: float) -> None:
+        """Follow the true current and speed, taken as straight lines over the last step of h seconds."""
+        self.i = _lag(self.i, self._last[0], i, h, self.lag_i)
+        self.w = _lag(self.w, self._last[1], w, h, self.lag_w)
+        self._last = (i, w)
+        if self.delay:
+            self._times.append(t)
+            self._speeds.append(self.w)
+            if len(self._times) > 4096 and self._times[2048] < t - self.delay:
+                del self._times[:2048], self._speeds[:2048]
+
+    def read(self, t: float, y: list[float]) -> dict[str, float]:
+        w = self._delayed(t - self.delay) if self.delay else self.w
+        return {"i": self.i + self.offset, "omega": self.gain * w, "theta": y[2]}
+
+    def _delayed(self, t: float) -> float:
+        k = bisect_right(self._times, t + 1e-12)
+        if k == 0:
+            return self._speeds[0]
+        if k == len(self._times):
+            return self._speeds[-1]
+        part = max(0.0, (t - self._times[k - 1]) / (self._times[k] - self._times[k - 1]))
+        return self._speeds[k - 1] + part * (self._speeds[k] - self._speeds[k - 1])
+
+
+def _lag(z: float, u0: float, u1: float, h: float, tau: float | None) -> float:
+    """First-order lag over h, exact for an input that goes from u0 to u1 in a straight line."""
+    if not tau:
+        return u1
+    slope = (u1 - u0) / h
+    return (u1 - slope * tau) + (z - u0 + slope * tau) * exp(-h / tau)
