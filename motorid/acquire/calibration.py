@@ -65,7 +65,8 @@ def calibrate(header: Header, calibration: dict[str, dict[str, float]]) -> Heade
         if name not in names:
             raise DataError(f"the calibration speaks of a channel that the device does not send: "
                             f"{one_of(name, names, 'channel')}")
-    return replace(header, channels=tuple(_calibrated(c, calibration.get(c.name, {})) for c in header.channels))
+    channels = tuple(_calibrated(c, calibration.get(c.name, {})) for c in header.channels)
+    return replace(header, channels=channels)
 
 
 def _calibrated(channel: Channel, entries: dict[str, float]) -> Channel:

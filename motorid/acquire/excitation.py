@@ -1,7 +1,7 @@
 """Excitation programs: what voltage the device applies, in words, as frames and as numbers.
 
-A program is a list of segments that the device itself runs, sample by sample, so that its timing does not hang on
-the computer. Words are joined by commas, numbers by colons, in V, s and Hz::
+A program is a list of segments that the device itself runs, sample by sample, so that its timing does not hang
+on the computer. Words are joined by commas, numbers by colons, in V, s and Hz::
 
     rest:T                        nothing for T
     step:V:T                      V for T
@@ -12,9 +12,9 @@ the computer. Words are joined by commas, numbers by colons, in V, s and Hz::
     coast:T                       coast-down: 0 V, the terminals joined, so that the input stays known
     standard                      steps, stairs, a ramp and a PRBS within 0.6 of the voltage limit, 8.2 s
 
-On the line a segment is ``R,<ms>,<mV from>,<mV to>``, ``C,<ms>,<mV offset>,<mV amplitude>,<mHz from>,<mHz to>`` or
-``P,<ms>,<mV offset>,<mV amplitude>,<µs per bit>,<seed>``. All numbers are whole, so device and computer mean the
-same program.
+On the line a segment is ``R,<ms>,<mV from>,<mV to>``, or
+``C,<ms>,<mV offset>,<mV amplitude>,<mHz from>,<mHz to>``, or ``P,<ms>,<mV offset>,<mV amplitude>,<µs per bit>,<seed>``. All numbers are whole, so device and computer mean
+the same program.
 """
 
 from __future__ import annotations
@@ -132,11 +132,11 @@ class Program:
         """
         for k, segment in enumerate(self.segments):
             if segment.peak > v_max * (1 + 1e-9):
-                raise UsageError(f"segment {k + 1} of the excitation reaches {segment.peak:g} V, but {whose} is "
-                                 f"{v_max:g} V. Nothing was applied to the motor; ask for less voltage.")
+                raise UsageError(f"segment {k + 1} of the excitation reaches {segment.peak:g} V, but {whose} "
+                                 f"is {v_max:g} V. Nothing was applied to the motor; ask for less voltage.")
         if len(self.segments) > segments:
-            raise UsageError(f"the excitation has {len(self.segments)} segments, the device takes at most {segments}; "
-                             "use fewer or longer ones.")
+            raise UsageError(f"the excitation has {len(self.segments)} segments, the device takes at most "
+                             f"{segments}; use fewer or longer ones.")
 
 
 def program(words: str | Program | None, v_max: float = math.inf) -> Program:
@@ -160,8 +160,9 @@ def program(words: str | Program | None, v_max: float = math.inf) -> Program:
         make, least, most = _WORDS[name]
         values = [_number(n, word) for n in numbers]
         if not least <= len(values) <= most:
-            raise UsageError(f"'{word}': {name} takes {least}{f' to {most}' if most > least else ''} numbers, as in "
-                             f"'{_EXAMPLES[name]}'; got {len(values)}.")
+            many = f"{least} to {most}" if most > least else f"{least}"
+            raise UsageError(f"'{word}': {name} takes {many} numbers, as in '{_EXAMPLES[name]}'; "
+                             f"got {len(values)}.")
         segments += make(*values)
     return Program(tuple(segments), words)
 
@@ -178,8 +179,8 @@ def _number(text: str, word: str) -> float:
 
 def _standard(v_max: float) -> str:
     if not math.isfinite(v_max):
-        raise UsageError("the excitation 'standard' is scaled to the voltage limit, and neither you nor the device "
-                         "stated one; add --limit-voltage.")
+        raise UsageError("the excitation 'standard' is scaled to the voltage limit, and neither you nor the "
+                         "device stated one; add --limit-voltage.")
     a, b = 0.6 * v_max, 0.3 * v_max
     return (f"rest:0.2,step:{a}:0.8,coast:0.6,step:{-a}:0.8,coast:0.4,stairs:{b / 2}:{a}:4:0.3,"
             f"stairs:{-b / 2}:{-a}:4:0.3,ramp:{-b}:{b}:1,prbs:{b}:0.04:1.6:0,coast:0.4")
@@ -207,7 +208,8 @@ def _chirp(amplitude: float, low: float, high: float, seconds: float, offset: fl
     return [Segment("C", _milli(seconds), (_milli(offset), _milli(amplitude), _milli(low), _milli(high)))]
 
 
-def _prbs(amplitude: float, bit: float, seconds: float, offset: float = 0.0, seed: float = 1.0) -> list[Segment]:
+def _prbs(amplitude: float, bit: float, seconds: float, offset: float = 0.0,
+          seed: float = 1.0) -> list[Segment]:
     return [Segment("P", _milli(seconds), (_milli(offset), _milli(amplitude), round(bit * 1e6), int(seed)))]
 
 

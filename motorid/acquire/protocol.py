@@ -5,29 +5,31 @@ Everything, both ways, is a frame of printable ASCII on a line of its own::
     $<kind>,<field>,<field>…*<CRC>\\n
 
 with the CRC-16/CCITT-FALSE (polynomial 0x1021, start 0xFFFF, check value 29B1 for "123456789") of the bytes
-between ``$`` and ``*``, as four upper-case hexadecimal digits. A frame ends with its CRC; the newline is for the
-eye. A body has 1 to 240 bytes and holds neither ``$`` nor ``*``, so a reader finds its feet at the next ``$``.
+between ``$`` and ``*``, as four upper-case hexadecimal digits. A frame ends with its CRC; the newline is for
+the eye. A body has 1 to 240 bytes and holds neither ``$`` nor ``*``, so a reader finds its feet at the next
+``$``.
 
 From the device
     ``H,1,<name>,<rate_Hz>,<counter bits>,<timer bits>,<V_max V>,<I_max A>,<most segments>,<channel>…``
-        The header. A channel is ``name:unit:scale:offset:kind``, its value in SI ``scale·(raw − offset)``; kind is
-        ``n`` (a number), ``a12`` (a 12-bit converter, whose end values mean *clipped*) or ``w16`` (a counter that
-        wraps after 16 bits, two's complement or not).
+        The header. A channel is ``name:unit:scale:offset:kind``, its value in SI ``scale·(raw − offset)``;
+        kind is ``n`` (a number), ``a12`` (a 12-bit converter, whose end values mean *clipped*) or ``w16`` (a
+        counter that wraps after 16 bits, two's complement or not).
     ``D,<counter>,<time µs>,<raw>…``
-        One sample, raw values in the order of the channels, integer or decimal, empty where missing. ``v`` is the
-        voltage commanded *from* this instant on, the other channels are measured *at* it. Counter and timer wrap.
+        One sample, raw values in the order of the channels, integer or decimal, empty where missing. ``v`` is
+        the voltage commanded *from* this instant on, the other channels are measured *at* it. Counter and timer
+        wrap.
     ``A,<command>,…``
         A command was carried out: ``A,L,<mV>,<mA>`` (the limits now in force), ``A,S,<index>``,
         ``A,G,<counter of the first sample>,<its time µs>``.
     ``E,done,<samples made>,<why>`` with why ``end``, ``stop``, ``limit`` or ``silent``; ``E,refused,<why>``.
 
 From the computer
-    ``?`` send the header · ``L,<mV>,<mA>`` limits · ``S,<index>,<segment>`` one segment of the excitation (see
-    `motorid.acquire.excitation`) · ``G,<segments>`` go · ``X`` stop · ``K`` still here; a device at rest answers it
-    with its last ``E,done``.
+    ``?`` send the header · ``L,<mV>,<mA>`` set limits and forget the program · ``S,<index>,<segment>`` one
+    segment of the excitation (see `motorid.acquire.excitation`) · ``G,<segments>`` go, once per ``L`` · ``X``
+    stop · ``K`` still here; a device at rest answers it with its last ``E,done``.
 
-A device that hears no valid frame for one second switches the motor off. Repeating a command does no harm, so a lost
-answer is mended by asking again.
+A device that hears no valid frame for one second switches the motor off. Repeating a command does no harm, so a
+lost answer is mended by asking again.
 """
 
 from __future__ import annotations
@@ -89,8 +91,8 @@ class Channel:
             raise DeviceError(f"channel {self.name} must be scaled to {' or '.join(UNITS[self.name])}; "
                               f"the device says '{self.unit}'.")
         if not (math.isfinite(self.scale) and self.scale != 0 and math.isfinite(self.offset)):
-            raise DeviceError(f"channel {self.name}: scale {self.scale} and offset {self.offset} must be finite "
-                              "and the scale not zero.")
+            raise DeviceError(f"channel {self.name}: scale {self.scale} and offset {self.offset} must be "
+                              "finite and the scale not zero.")
         if not re.fullmatch(r"n|[aw]([2-9]|[1-5][0-9]|6[0-4])", self.kind):
             raise DeviceError(f"channel {self.name}: kind '{self.kind}' is none of n, a<bits>, w<bits>.")
 
@@ -125,21 +127,21 @@ class Header:
 
     def __post_init__(self) -> None:
         if not 0 < self.rate <= 1e6 or not (8 <= self.counter_bits <= 64 and 24 <= self.timer_bits <= 64):
-            raise DeviceError(f"the header of '{self.name}' makes no sense: {self.rate} samples per second, counter "
-                              f"of {self.counter_bits} bits, timer of {self.timer_bits} bits.")
+            raise DeviceError(f"the header of '{self.name}' makes no sense: {self.rate} samples per second, "
+                              f"counter of {self.counter_bits} bits, timer of {self.timer_bits} bits.")
         if not (self.v_max > 0 and self.i_max > 0 and self.segments >= 1):
             raise DeviceError(f"the header of '{self.name}' makes no sense: limits of {self.v_max} V and "
                               f"{self.i_max} A, {self.segments} segments.")
         names = [c.name for c in self.channels]
         if len(set(names)) < len(names) or "v" not in names or len(names) < 2:
-            raise DeviceError("a device must send v, the commanded voltage, and something measured, each once; "
-                              f"'{self.name}' sends {', '.join(names) or 'nothing'}.")
+            raise DeviceError("a device must send v, the commanded voltage, and something measured, each "
+                              f"once; '{self.name}' sends {', '.join(names) or 'nothing'}.")
 
     @property
     def fields(self) -> tuple[object, ...]:
         """The header as the fields of its frame."""
-        return ("H", VERSION, self.name, f"{self.rate:.9g}", self.counter_bits, self.timer_bits, f"{self.v_max:.6g}",
-                f"{self.i_max:.6g}", self.segments, *(c.word for c in self.channels))
+        return ("H", VERSION, self.name, f"{self.rate:.9g}", self.counter_bits, self.timer_bits,
+                f"{self.v_max:.6g}", f"{self.i_max:.6g}", self.segments, *(c.word for c in self.channels))
 
     @classmethod
     def read(cls, fields: list[str]) -> Header:
@@ -151,18 +153,18 @@ class Header:
             If the device speaks another version, or says something that cannot be.
         """
         if len(fields) < 2 or fields[1] != str(VERSION):
-            raise DeviceError(f"the device speaks version {fields[1] if len(fields) > 1 else '?'} of the protocol, "
-                              f"this motorid version {VERSION}. Update the older one.")
+            raise DeviceError(f"the device speaks version {''.join(fields[1:2]) or '?'} of the protocol, this "
+                              f"motorid version {VERSION}. Update the older one.")
         try:
-            name, rate, *whole = fields[2], float(fields[3]), int(fields[4]), int(fields[5])
+            name, rate, counter, timer = fields[2], float(fields[3]), int(fields[4]), int(fields[5])
             v_max, i_max, segments = float(fields[6]), float(fields[7]), int(fields[8])
             channels = []
             for word in fields[9:]:
                 channel, unit, scale, offset, kind = word.split(":")
                 channels.append(Channel(channel, unit, float(scale), float(offset), kind))
         except (IndexError, ValueError) as error:
-            raise DeviceError(f"the header of the device cannot be read ({error}): {','.join(fields)}") from None
-        return cls(name, rate, tuple(channels), *whole, v_max, i_max, segments)
+            raise DeviceError(f"the device's header cannot be read ({error}): {','.join(fields)}") from None
+        return cls(name, rate, tuple(channels), counter, timer, v_max, i_max, segments)
 
 
 class Sample(NamedTuple):
@@ -183,9 +185,9 @@ class Message(NamedTuple):
 class Decoder:
     """Takes bytes in pieces of any size and returns the frames in them.
 
-    Arbitrary bytes never raise. What was not a valid frame is counted in `bad`: ``wrong CRC`` (frames), ``cut`` (a
-    ``$`` that never became a frame), ``not understood`` (a valid CRC around nonsense), and ``stray bytes`` outside of
-    frames. How the bytes are cut into pieces makes no difference.
+    Arbitrary bytes never raise. What was not a valid frame is counted in `bad`: ``wrong CRC`` (frames), ``cut``
+    (a ``$`` that never became a frame), ``not understood`` (a valid CRC around nonsense), and ``stray bytes``
+    outside of frames. How the bytes are cut into pieces makes no difference.
     """
 
     bad: Counter[str] = field(default_factory=Counter)

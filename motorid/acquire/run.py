@@ -1,0 +1,197 @@
+"""A recording that is going on: take what comes, keep the device awake, notice every way in which it can end."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+from motorid.acquire.client import Client
+from motorid.acquire.ledger import Ledger, Row
+from motorid.acquire.link import LinkLost
+from motorid.acquire.protocol import Header, Message, Sample, frame
+from motorid.acquire.recording import Progress, Recording
+from motorid.acquire.runfile import Commanded, RunFile
+
+__all__ = ["Run", "Setup"]
+
+OVER_LIMIT = 3  # samples in a row beyond the current limit that make the computer stop the motor too
+LAST_WORDS = 1.5  # s to wait for the device to say how many samples it made
+LOOK = 0.25  # s between two reports of progress
+REASONS = {"limit": "limit", "silent": "watchdog", "stop": "interrupted"}  # the device's word -> ours, else done
+
+
+@dataclass(frozen=True, eq=False)
+class Setup:
+    """Everything that is settled before the motor moves."""
+
+    client: Client
+    header: Header  # channels calibrated
+    file: RunFile
+    segments: int
+    commanded: Commanded
+    i_max: float
+    total: float | None  # s, of the program or until stopped
+    duration: float | None  # s after which to stop
+    timeout: float
+    progress: Callable[[Progress], None] | None
+
+
+class Run:
+    """Starts the device, records until something ends it, stops it, and says what came of it."""
+
+    def __init__(self, setup: Setup, begin: Callable[[], None]) -> None:
+        self.s = setup
+        self.ended, self.detail = "", ""
+        self.made: int | None = None  # samples that the device made, once it has said so
+        self.last: Row | None = None
+        names = [c.name for c in setup.header.channels]
+        self._current = names.index("i") if "i" in names and math.isfinite(setup.i_max) else None
+        self._over = 0
+        setup.client.decoder.bad.clear()
+        counter, micros = setup.client.go(setup.segments)
+        self._heard = time.monotonic()
+        self._look = _Look(setup, self._heard)
+        self.ledger = Ledger(setup.header, counter, micros, self._heard)
+        begin()
+
+    def go(self) -> Recording:
+        """Record to the end."""
+        try:
+            with _by_hand(lambda: self._end("interrupted")):
+                self._record()
+                self._last_words()
+        except BaseException:
+            with contextlib.suppress(LinkLost):
+                self.s.client.link.write(frame("X"))
+            raise
+        return self._close()
+
+    def _record(self) -> None:
+        items = self.s.client.inbox
+        while not self.ended:
+            try:
+                self._take(items)
+                self.s.file.flush()
+                self._watch()
+                self.s.client.keep_alive()
+                items = self.s.client.receive(0.05)
+            except LinkLost as error:
+                self._end("unplugged", str(error))
+            except OSError as error:
+                self._end("disk", error.strerror or str(error))
+
+    def _take(self, items: list[Sample | Message]) -> None:
+        now = time.monotonic()
+        for item in items:
+            if isinstance(item, Message):
+                self._message(item.fields)
+            elif rows := self.ledger.accept(item, now):
+                self.s.file.add(rows, self.s.commanded)
+                self.last, self._heard = rows[-1], now
+                if self._current is not None:
+                    self._check_current(rows, self._current)
+
+    def _check_current(self, rows: list[Row], k: int) -> None:
+        for row in rows:
+            self._over = self._over + 1 if abs(row.values[k]) > self.s.i_max else 0
+            if self._over >= OVER_LIMIT:
+                self._end("limit")
+
+    def _message(self, fields: list[str]) -> None:
+        if fields[0] == "H":
+            self._end("restarted")
+        elif fields[:2] == ["E", "done"] and len(fields) > 2 and fields[2].isdigit():
+            if int(fields[2]) < self.ledger.next_index:
+                self._end("restarted")
+            else:
+                self.made = int(fields[2])
+                self._end(REASONS.get("".join(fields[3:4]), "done"))
+
+    def _end(self, why: str, detail: str = "") -> None:
+        if not self.ended:
+            self.ended, self.detail = why, detail
+
+    def _watch(self) -> None:
+        elapsed = self.last.time if self.last else 0.0
+        if self.s.duration is not None and elapsed >= self.s.duration - 1.5 / self.s.header.rate:
+            self._end("duration")
+        if time.monotonic() - self._heard > self.s.timeout:
+            self._end("silent", f"no valid line for {self.s.timeout:g} s")
+        self._look.at(self.ledger, self.last, bool(self.ended))
+
+    def _last_words(self) -> None:
+        """Switch the motor off and learn how many samples there were."""
+        end = time.monotonic() + LAST_WORDS
+        ask = 0.0
+        with contextlib.suppress(LinkLost):
+            while self.made is None and self.ended not in ("unplugged", "restarted") and time.monotonic() < end:
+                if time.monotonic() > ask:
+                    self.s.client.link.write(frame("X"))
+                    ask = time.monotonic() + 0.3
+                items = self.s.client.receive(0.05)
+                self._take([i for i in items if self.ended != "disk" or isinstance(i, Message)])
+
+    def _close(self) -> Recording:
+        self.s.client.decoder.close()
+        if self.ended == "disk":
+            return self._outcome()
+        try:
+            self.s.file.add(self.ledger.finish(self.made), self.s.commanded)
+            self.s.file.mark_missing(self.made or 0, self.s.commanded)
+            self.s.file.note(self._outcome().meta)
+            self.s.file.flush(sync=True)
+        except OSError as error:
+            self.ended, self.detail = "disk", error.strerror or str(error)
+        return self._outcome()
+
+    def _outcome(self) -> Recording:
+        ledger, received = self.ledger, self.ledger.received
+        lost = max(ledger.lost, (self.made or 0) - received)
+        seconds = self.last.time + 1 / self.s.header.rate if self.last else 0.0
+        bad = self.s.client.decoder.bad + ledger.bad
+        return Recording(self.s.file.out, self.s.header, self.ended, self.detail, received, lost,
+                         self.made is not None, seconds, dict(bad), dict(ledger.clipped))
+
+
+class _Look:
+    """Calls the user's function with a `Progress`, a few times a second."""
+
+    def __init__(self, setup: Setup, now: float) -> None:
+        self.s, self.before = setup, (now, 0, 0.0)
+
+    def at(self, ledger: Ledger, last: Row | None, final: bool) -> None:
+        now, (looked, samples, seconds) = time.monotonic(), self.before
+        if self.s.progress is None or last is None or (now - looked < LOOK and not final):
+            return
+        passed = last.time - seconds
+        rate = (ledger.received - samples) / passed if passed > 0 else 0.0
+        names = (c.name for c in self.s.header.channels)
+        self.before = (now, ledger.received, last.time)
+        self.s.progress(Progress(last.time, self.s.total, rate, ledger.received, ledger.lost,
+                                 dict(zip(names, last.values, strict=True))))
+
+
+@contextlib.contextmanager
+def _by_hand(stop: Callable[[], None]) -> Iterator[None]:
+    """Turn Ctrl-C and a polite kill into an orderly end; a second Ctrl-C is not so patient."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = {s: signal.getsignal(s) for s in (signal.SIGINT, signal.SIGTERM)}
+
+    def handler(number: int, _: object) -> None:
+        signal.signal(number, before[signal.Signals(number)])
+        stop()
+
+    for number in before:
+        signal.signal(number, handler)
+    try:
+        yield
+    finally:
+        for number, old in before.items():
+            signal.signal(number, old)

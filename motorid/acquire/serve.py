@@ -1,0 +1,264 @@
+"""Serve a virtual device in real time, over a pseudo-terminal or (where there is none) a loopback socket."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import select
+import socket
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+from motorid.acquire.faults import Wire
+from motorid.acquire.protocol import SILENCE, frame
+from motorid.acquire.virtual import VirtualDevice
+from motorid.errors import UsageError
+
+__all__ = ["Pace", "Pty", "Socket", "open_end", "serve"]
+
+LOOPBACK = "127.0.0.1"
+BUFFER = 65_536  # bytes a device keeps for a computer that does not read; what is more is lost, as in reality
+TICK = 0.002  # s
+
+
+class End(Protocol):
+    """The device's end of a wire."""
+
+    name: str  # what the recorder is told as --port
+
+    def wait(self, writing: bool, timeout: float) -> None:
+        """Wait until there is something to read (or room to write)."""
+        ...
+
+    def read(self) -> bytes:
+        """Return what the computer sent; nothing is an answer."""
+        ...
+
+    def write(self, data: bytes) -> int:
+        """Return how many bytes were taken."""
+        ...
+
+    def unplug(self) -> None:
+        """Vanish."""
+        ...
+
+    def plug(self) -> None:
+        """Appear again."""
+        ...
+
+
+class Pty:
+    """A pseudo-terminal; `link` is a symbolic link that follows it from one plugging to the next."""
+
+    def __init__(self, link: Path | None = None) -> None:
+        self.link = link
+        if link and link.exists() and not link.is_symlink():
+            raise UsageError(f"{link} exists and is not a link; choose another name for the port.")
+        self.plug()
+
+    def plug(self) -> None:
+        """Open a new pseudo-terminal."""
+        import tty
+
+        self._master, self._slave = os.openpty()
+        tty.setraw(self._slave)  # a bench does not echo; holding this end open keeps the line up between users
+        os.set_blocking(self._master, False)
+        self.name = os.ttyname(self._slave)
+        if self.link:
+            self.link.unlink(missing_ok=True)
+            self.link.symlink_to(self.name)
+            self.name = str(self.link)
+
+    def unplug(self) -> None:
+        """Close it; whoever reads it gets an error, as from a device that was pulled out."""
+        os.close(self._master)
+        os.close(self._slave)
+        if self.link:
+            self.link.unlink(missing_ok=True)
+
+    def wait(self, writing: bool, timeout: float) -> None:
+        """Wait until there is something to read (or room to write)."""
+        select.select([self._master], [self._master] if writing else [], [], timeout)
+
+    def read(self) -> bytes:
+        """Return what the computer sent."""
+        try:
+            return os.read(self._master, 4096)
+        except OSError:
+            return b""
+
+    def write(self, data: bytes) -> int:
+        """Return how many bytes were taken."""
+        try:
+            return os.write(self._master, data)
+        except BlockingIOError:
+            return 0
+
+
+class Socket:
+    """A socket on the loopback address, for one recorder at a time, as pyserial's ``socket://``."""
+
+    def __init__(self, port: int = 0) -> None:
+        self._port = port
+        self._peer: socket.socket | None = None
+        self.plug()
+
+    def plug(self) -> None:
+        """Listen, always on the same port."""
+        self._server = socket.create_server((LOOPBACK, self._port))
+        self._server.setblocking(False)
+        self._port = self._server.getsockname()[1]
+        self.name = f"socket://{LOOPBACK}:{self._port}"
+
+    def unplug(self) -> None:
+        """Hang up and listen no more."""
+        self._hang_up()
+        self._server.close()
+
+    def wait(self, writing: bool, timeout: float) -> None:
+        """Wait until somebody knocks, or there is something to read (or room to write)."""
+        peer = [self._peer] if self._peer else []
+        ready, _, _ = select.select([self._server, *peer], peer if writing else [], [], timeout)
+        if self._server in ready:
+            with contextlib.suppress(OSError):
+                self._greet(self._server.accept()[0])
+
+    def read(self) -> bytes:
+        """Return what the computer sent."""
+        if self._peer is None:
+            return b""
+        try:
+            data = self._peer.recv(4096)
+        except BlockingIOError:
+            return b""
+        except OSError:
+            data = b""
+        if not data:
+            self._hang_up()
+        return data
+
+    def write(self, data: bytes) -> int:
+        """Return how many bytes were taken; all of them where nobody listens."""
+        if self._peer is None:
+            return len(data)
+        try:
+            return self._peer.send(data)
+        except BlockingIOError:
+            return 0
+        except OSError:
+            self._hang_up()
+            return len(data)
+
+    def _greet(self, peer: socket.socket) -> None:
+        if self._peer is None:
+            peer.setblocking(False)
+            self._peer = peer
+            return
+        with contextlib.suppress(OSError):
+            peer.sendall(frame("E", "refused", "the bench is in use by another recorder"))
+        peer.close()
+
+    def _hang_up(self) -> None:
+        if self._peer:
+            self._peer.close()
+            self._peer = None
+
+
+def open_end(link: Path | None = None, port: int | None = None) -> End:
+    """Open a pseudo-terminal, or a loopback socket where `port` is given or the system has no terminals."""
+    return Pty(link) if port is None and hasattr(os, "openpty") else Socket(port or 0)
+
+
+@dataclass(frozen=True)
+class Pace:
+    """How a virtual bench behaves in time.
+
+    Attributes
+    ----------
+    speed : float
+        Times real time; 0 is as fast as the other end reads.
+    unplug_after, plug_after : float or None
+        Seconds of a run after which the line dies, and after which it comes back (None: never).
+    once : bool
+        Whether to end when the first run is over and the recorder has gone.
+    """
+
+    speed: float = 1.0
+    unplug_after: float | None = None
+    plug_after: float | None = None
+    once: bool = False
+
+
+def serve(make: Callable[[], VirtualDevice], end: End, wire: Wire, pace: Pace,
+          stop: Callable[[], bool] = lambda: False) -> VirtualDevice:
+    """Serve devices made by `make` until `stop()` says so; return the last one."""
+    bench = _Bench(make, end, wire, pace)
+    try:
+        while not stop() and not bench.over:
+            bench.turn()
+    finally:
+        if bench.plugged:
+            end.unplug()
+    return bench.device
+
+
+class _Bench:
+    """One turn after the other: hear, run, speak."""
+
+    def __init__(self, make: Callable[[], VirtualDevice], end: End, wire: Wire, pace: Pace) -> None:
+        self.make, self.end, self.wire, self.pace = make, end, wire, pace
+        self.device = make()
+        self.plugged, self.over = True, False
+        self.unplug_at = pace.unplug_after
+        self.out = b""
+        self.began, self.sent, self.ran = 0.0, 0, False
+
+    def turn(self) -> None:
+        """Do what is due."""
+        was_running = self.device.running
+        self.end.wait(bool(self.out), TICK if was_running and self.pace.speed else 0.05 * (not was_running))
+        now = time.monotonic()
+        self.out += self.device.receive(self.end.read(), now) + self.device.watch(now)
+        if self.device.running and not was_running:
+            self.began, self.sent, self.ran = now, 0, True
+        if self.device.running:
+            self._run(now)
+        self.out = self.out[self.end.write(self.out):] if self.out else b""
+        if not self.device.running and self.ran and self.pace.once and now - self.device.heard > SILENCE:
+            self.over = True
+
+    def _run(self, now: float) -> None:
+        rate = self.device.header.rate
+        if self.pace.speed:
+            n = min(int((now - self.began) * rate * self.pace.speed) - self.sent, int(0.1 * rate) + 1)
+        else:
+            n = 0 if self.out else 100
+        if self.unplug_at is not None:
+            n = min(n, int(self.unplug_at * rate) - self.sent)
+        frames = self.device.run(n)
+        self.sent += n
+        data = self.wire.carry(frames)
+        if len(self.out) + len(data) <= BUFFER or not self.pace.speed:
+            self.out += data
+        if self.unplug_at is not None and self.sent >= int(self.unplug_at * rate):
+            self._unplug()
+
+    def _unplug(self) -> None:
+        """Say what is in the buffer, vanish, and come back as a device that was just switched on."""
+        end = time.monotonic() + 1.0
+        while self.out and time.monotonic() < end:
+            self.end.wait(True, 0.05)
+            self.out = self.out[self.end.write(self.out):]
+        time.sleep(0.05)  # a pseudo-terminal forgets what was not yet read when it closes
+        self.end.unplug()
+        self.plugged, self.out, self.unplug_at = False, b"", None
+        if self.pace.plug_after is None:
+            self.over = True
+            return
+        time.sleep(self.pace.plug_after)
+        self.device, self.ran = self.make(), False
+        self.end.plug()
+        self.plugged = True

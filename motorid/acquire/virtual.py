@@ -1,0 +1,188 @@
+"""A bench made of software: the plant behind a converter and an encoder, speaking the protocol.
+
+`VirtualDevice` knows nothing of wires or clocks: bytes go in, bytes come out, and `run` makes the next samples. What
+serves it over a pseudo-terminal in real time is in `motorid.acquire.serve`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from motorid.acquire.excitation import Segment
+from motorid.acquire.hidden import Truth
+from motorid.acquire.protocol import SILENCE, Channel, Decoder, Header, Message, frame
+from motorid.datasets import load_plant
+from motorid.errors import UsageError, one_of
+
+__all__ = ["VirtualDevice"]
+
+LINES_PER_TURN = 4096  # encoder counts, after quadrature
+NOISE = 0.5  # standard deviation of the converters' noise, in counts
+OVER_LIMIT = 3  # samples in a row beyond the current limit that switch the motor off
+
+
+class VirtualDevice:
+    """A device that answers commands and makes samples.
+
+    Parameters
+    ----------
+    truth : Truth
+        The motor and what is hidden in it. At the start of every run the shaft stands still at angle zero.
+    rate : float
+        Samples per second.
+    channels : tuple of str
+        What it sends, ``v`` first.
+    counter_bits, timer_bits, counter0, time0 : int
+        Widths of the counters, and where they stand when the device is switched on.
+    encoder_bits : int
+        Width of the encoder's counter.
+    """
+
+    def __init__(self, truth: Truth, rate: float = 1000.0, channels: tuple[str, ...] = ("v", "i", "omega", "theta"),
+                 counter_bits: int = 32, timer_bits: int = 32, counter0: int = 0, time0: int = 0,
+                 encoder_bits: int = 32) -> None:
+        self.truth, m = truth, truth.motor
+        known = _channels(m, encoder_bits)
+        for name in channels:
+            if name not in known:
+                raise UsageError(one_of(name, known, "channel"))
+        self.header = Header("virtual motor", rate, tuple(known[c] for c in channels), counter_bits, timer_bits,
+                             m.v_max, m.i_max)
+        self._rng = np.random.default_rng([truth.seed, 1])
+        self._decoder = Decoder()
+        self._counter, self._time = counter0, time0
+        self._limits = m.v_max, m.i_max
+        self._segments: list[Segment] = []
+        self._armed, self.running = False, False
+        self._start: tuple[int, int] = (counter0, time0)
+        self._made, self._why = 0, "end"
+        self.heard = 0.0  # clock of the computer when the last valid frame came
+        self._raw = [_CONVERT[c] for c in channels]
+
+    def receive(self, data: bytes, now: float = 0.0) -> bytes:
+        """Take bytes from the computer at clock `now` (s) and return the answers."""
+        answers = b""
+        for item in self._decoder.feed(data):
+            if isinstance(item, Message):
+                self.heard = now
+                answers += self._answer(item.fields)
+        return answers
+
+    def watch(self, now: float) -> bytes:
+        """Switch the motor off if nobody has been heard for a second; return what there is to say."""
+        return self._stop("silent") if self.running and now - self.heard > SILENCE else b""
+
+    def run(self, n: int) -> list[bytes]:
+        """Make up to n samples and return their frames; the last one is followed by ``E,done``."""
+        frames: list[bytes] = []
+        for _ in range(n if self.running else 0):
+            if self._made >= len(self._volts) and self._segments:
+                frames.append(self._stop("end"))
+                break
+            frames.append(self._sample())
+            if self._over >= OVER_LIMIT:
+                frames.append(self._stop("limit"))
+                break
+        return frames
+
+    def _sample(self) -> bytes:
+        mv = self._volts[self._made] if self._segments else 0
+        seen = self._plant.measured()
+        m, noise = self.truth.motor, self._noise[self._made % len(self._noise)]
+        raw = [convert(m, mv, seen, noise) for convert in self._raw]
+        line = frame("D", self._counter, self._time, *raw)
+        self._over = self._over + 1 if abs(seen["i"]) > self._limits[1] else 0
+        self._plant.step(mv / 1e3, 1 / self.header.rate)
+        self._made += 1
+        self._counter = (self._counter + 1) % (1 << self.header.counter_bits)
+        since = round(self._made * 1e6 / self.header.rate)
+        self._time = (self._start[1] + since) % (1 << self.header.timer_bits)
+        return line
+
+    def _answer(self, fields: list[str]) -> bytes:
+        handlers: dict[str, Callable[..., bytes]] = {"?": self._say_header, "L": self._set_limits, "G": self._go,
+                                                     "S": self._add_segment, "X": self._halt, "K": self._alive}
+        handler = handlers.get(fields[0])
+        if handler is None:
+            return frame("E", "refused", "unknown command")
+        try:
+            return handler(*fields[1:])
+        except (TypeError, ValueError, UsageError):
+            return frame("E", "refused", "the numbers make no sense")
+
+    def _say_header(self) -> bytes:
+        return frame(*self.header.fields)
+
+    def _set_limits(self, mv: str, ma: str) -> bytes:
+        if self.running:
+            return frame("E", "refused", "running")
+        m = self.truth.motor
+        v, i = min(int(mv), round(m.v_max * 1e3)), min(int(ma), round(m.i_max * 1e3))
+        self._limits, self._segments, self._armed = (v / 1e3, i / 1e3), [], True
+        return frame("A", "L", v, i)
+
+    def _add_segment(self, index: str, shape: str, ms: str, *args: str) -> bytes:
+        segment, k = Segment(shape, int(ms), tuple(map(int, args))), int(index)
+        if not self._armed or not 0 <= k <= min(len(self._segments), self.header.segments - 1):
+            return frame("E", "refused", "segment out of turn")
+        if segment.peak > self._limits[0] + 1e-9:
+            return frame("E", "refused", "voltage limit")
+        self._segments[k:] = [segment]
+        return frame("A", "S", k)
+
+    def _go(self, segments: str) -> bytes:
+        if self._armed:
+            if int(segments) != len(self._segments):
+                return frame("E", "refused", "segments are missing")
+            rate = self.header.rate
+            volts = [s.volts(rate) for s in self._segments] or [np.zeros(0)]
+            self._volts = np.round(np.concatenate(volts) * 1e3).astype(int).tolist()
+            self._noise = self._rng.normal(0.0, NOISE, size=(50_021, 2)).tolist()
+            self._plant = load_plant().Plant(self.truth.motor, self.truth.effects)
+            self._start, self._made, self._over = (self._counter, self._time), 0, 0
+            self._armed, self.running = False, True
+        return frame("A", "G", *self._start)
+
+    def _halt(self) -> bytes:
+        return self._stop("stop")
+
+    def _alive(self) -> bytes:
+        return b"" if self.running else self._done()
+
+    def _stop(self, why: str) -> bytes:
+        if self.running:
+            self.running, self._why = False, why
+        return self._done()
+
+    def _done(self) -> bytes:
+        return frame("E", "done", self._made, self._why)
+
+
+def _channels(m: Any, encoder_bits: int) -> dict[str, Channel]:
+    current, speed = _steps(m)
+    return {"v": Channel("v", "V", 1e-3), "i": Channel("i", "A", current, 2048, "a12"),
+            "omega": Channel("omega", "rad/s", speed, 2048, "a12"),
+            "theta": Channel("theta", "rad", 2 * math.pi / LINES_PER_TURN, 0, f"w{encoder_bits}")}
+
+
+def _steps(m: Any) -> tuple[float, float]:
+    """Current and speed of one count of the converters, three significant digits as a header would say it."""
+    most = 1.25 * max(m.i_max, m.v_max / m.R), 1.3 * m.no_load_speed
+    return float(f"{most[0] / 2048:.3g}"), float(f"{most[1] / 2048:.3g}")
+
+
+def _converted(value: float, step: float, noise: float) -> int:
+    return min(4095, max(0, round(value / step + 2048 + noise)))
+
+
+# One raw value: (motor, commanded mV, what the sensors see, noise of the two converters) -> counts.
+_CONVERT: dict[str, Callable[[Any, int, dict[str, float], list[float]], int]] = {
+    "v": lambda m, mv, seen, noise: mv,
+    "i": lambda m, mv, seen, noise: _converted(seen["i"], _steps(m)[0], noise[0]),
+    "omega": lambda m, mv, seen, noise: _converted(seen["omega"], _steps(m)[1], noise[1]),
+    "theta": lambda m, mv, seen, noise: math.floor(seen["theta"] * LINES_PER_TURN / (2 * math.pi)),
+}

@@ -1,0 +1,151 @@
+"""The sub-commands `record` and `bench`; registered by `motorid.cli`."""
+
+from __future__ import annotations
+
+import math
+import secrets
+import signal
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from motorid.acquire.faults import Faults, Wire
+from motorid.acquire.recorder import record as record_run
+from motorid.acquire.recording import Progress, Recording
+
+__all__ = ["bench", "record"]
+
+Port = Annotated[str, typer.Option(help="Serial port of the bench: /dev/ttyACM0, COM3, socket://127.0.0.1:7000.")]
+Excite = Annotated[str | None, typer.Option(
+    help="Voltage to apply: rest:T step:V:T stairs:V1:V2:N:T ramp:V1:V2:T chirp:A:F1:F2:T prbs:A:BIT:T coast:T "
+         "standard, joined by commas (V, s, Hz). Without it the motor is held at 0 V.")]
+Probability = Annotated[float, typer.Option(min=0.0, max=1.0)]
+
+
+def record(
+    port: Port,
+    out: Annotated[Path, typer.Option(help="The CSV to write.")],
+    baud: Annotated[int, typer.Option(min=300, help="Bits per second; boards with their own USB do not care.")]
+    = 115_200,
+    excite: Excite = None,
+    duration: Annotated[float | None, typer.Option(help="Stop after so many seconds.")] = None,
+    limit_voltage: Annotated[float | None, typer.Option(help="Never more than so many V, of either sign.")] = None,
+    limit_current: Annotated[float | None, typer.Option(help="Switch the motor off beyond so many A.")] = None,
+    calibration: Annotated[Path | None, typer.Option(help="TOML with scale, offset, gain … per channel.")] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on with a record that was cut short.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Replace a file that exists.")] = False,
+    timeout: Annotated[float, typer.Option(help="Silence in s that ends the recording.")] = 2.0,
+    quiet: Annotated[bool, typer.Option("--quiet", help="No live progress.")] = False,
+) -> None:
+    """Record a run from a bench on a serial port. KEEP CLEAR OF THE SHAFT: the motor will move.
+
+    Ctrl-C stops the motor and keeps the data. Limits are checked here and enforced by the device.
+    """
+    with _live(quiet) as progress:
+        try:
+            outcome = record_run(port, out, baud=baud, excite=excite, duration=duration,
+                                 limit_voltage=_limit(limit_voltage), limit_current=_limit(limit_current),
+                                 calibration=calibration, resume=resume, force=force, timeout=timeout,
+                                 progress=progress)
+        except KeyboardInterrupt:
+            typer.echo("Stopped before anything was recorded.", err=True)
+            raise typer.Exit(1) from None
+    _say(outcome)
+
+
+def bench(
+    effect: Annotated[str, typer.Option(help="What is hidden: none, random, or effects joined by commas, bare "
+                                             "or with numbers as in coulomb:tau_c=0.01.")] = "random",
+    motor: Annotated[str, typer.Option(help="Which motor.")] = "lab",
+    seed: Annotated[int | None, typer.Option(min=0, help="Draws the hidden effect, the motor's constants, the "
+                                                         "noise and the faults.")] = None,
+    rate: Annotated[float, typer.Option(min=1.0, max=20_000.0, help="Samples per second.")] = 1000.0,
+    channels: Annotated[str, typer.Option(help="What it sends.")] = "v,i,omega,theta",
+    speed: Annotated[float, typer.Option(min=0.0, help="Times real time; 0 as fast as it is read.")] = 1.0,
+    drop: Probability = 0.0,
+    garbage: Probability = 0.0,
+    cut: Probability = 0.0,
+    flip: Probability = 0.0,
+    unplug_after: Annotated[float | None, typer.Option(help="Pull the plug after so many s of a run.")] = None,
+    plug_after: Annotated[float | None, typer.Option(help="Plug it in again after so many s.")] = None,
+    link: Annotated[Path | None, typer.Option(help="A name for the port that stays the same.")] = None,
+    socket: Annotated[int | None, typer.Option(help="Serve socket:// on this port of the loopback address (0: "
+                                                    "any) instead of a pseudo-terminal.")] = None,
+    once: Annotated[bool, typer.Option("--once", help="End after the first run.")] = False,
+    reveal: Annotated[bool, typer.Option("--reveal", help="At the end, tell what was hidden.")] = False,
+) -> None:
+    """Serve a virtual motor with a hidden effect, for `motorid record` to be tried on without hardware.
+
+    --drop, --garbage, --cut and --flip are probabilities, per line, of faults on the wire.
+    """
+    import numpy as np
+
+    from motorid.acquire.hidden import hide
+    from motorid.acquire.serve import Pace, open_end, serve
+    from motorid.acquire.virtual import VirtualDevice
+
+    seed = secrets.randbelow(1_000_000) if seed is None else seed
+    truth, names = hide(effect, motor, seed), tuple(channels.replace(" ", "").split(","))
+    VirtualDevice(truth, rate, names)  # complain before anything opens
+    wire = Wire(Faults(drop, garbage, cut, flip), np.random.default_rng([seed, 2]), keep=False)
+    end = open_end(link, socket)
+    typer.echo(f"port: {end.name}")
+    typer.echo(f"A virtual motor '{motor}' at {rate:g} samples per second; now, in another terminal:\n"
+               f"  motorid record --port {end.name} --out run.csv --excite standard\nCtrl-C ends it.")
+    sys.stdout.flush()
+    stopped: list[int] = []
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda n, _: stopped.append(n))
+    serve(lambda: VirtualDevice(truth, rate, names), end, wire, Pace(speed, unplug_after, plug_after, once),
+          lambda: bool(stopped))
+    typer.echo(str(truth) if reveal else f"seed: {seed} (the same seed with --reveal tells what was hidden)")
+
+
+def _limit(value: float | None) -> float:
+    return math.inf if value is None else value
+
+
+def _say(outcome: Recording) -> None:
+    typer.echo(str(outcome), err=not outcome.complete)
+    if not outcome.complete:
+        raise typer.Exit(1)
+    typer.echo(f"Now: motorid diagnose {outcome.path}")
+
+
+@contextmanager
+def _live(quiet: bool) -> Iterator[Callable[[Progress], None] | None]:
+    """Progress on one line of the terminal, or a line every few seconds where there is none."""
+    if quiet:
+        yield None
+        return
+    from rich.console import Console
+    from rich.live import Live
+    from rich.text import Text
+
+    console = Console(stderr=True)
+    if not console.is_terminal:
+        yield _Plain().show
+        return
+    with Live(console=console, refresh_per_second=4, transient=True) as live:
+        yield lambda p: live.update(Text(_line(p)))
+
+
+class _Plain:
+    def __init__(self) -> None:
+        self.next = 0.0
+
+    def show(self, p: Progress) -> None:
+        if p.elapsed >= self.next:
+            typer.echo(_line(p), err=True)
+            self.next = p.elapsed + 5.0
+
+
+def _line(p: Progress) -> str:
+    end = f" of {p.total:.4g}" if p.total else ""
+    values = "  ".join(f"{name} {value:.4g}" for name, value in p.last.items())
+    return f"{p.elapsed:7.2f}{end} s  {p.rate:.0f} samples/s  {p.lost} lost  {values}"
+
