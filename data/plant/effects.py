@@ -180,7 +180,8 @@ def backlash(m: Motor, gap: float, k_s: float, c_s: float, J_l: float) -> Hooks:
             push = min(0.0, k_s * (twist + gap / 2) + c_s * (w - x[0]))
         return -push, (push / J_l, x[0])
 
-    return {"part": part, "x0": lambda w, th: (w, th), "rate": 3 * sqrt(k_s / m.J + k_s / J_l)}
+    # The push jumps at contact and the step does not look for that instant: short steps keep it harmless.
+    return {"part": part, "x0": lambda w, th: (w, th), "rate": 20 * sqrt(k_s / m.J + k_s / J_l)}
 
 
 # ---------------------------------------------------------------- sensor
