@@ -305,6 +305,14 @@ def test_load_behind_a_gap_does_not_feel_the_motor_until_the_play_is_used_up(pla
     assert p.omega < 10.0
 
 
+@pytest.mark.parametrize("side", [1, -1])
+def test_load_in_contact_is_pushed_and_never_pulled(plant, lab, side):
+    (hooks,) = plant.effects.build(lab, {"backlash": {"gap": 0.03, "k_s": 5.0, "c_s": 2e-3, "J_l": 2e-5}})
+    touching = side * 0.016  # 1 mrad into the load
+    assert hooks["part"](0.0, 0.0, touching, [0.0, 0.0])[0] == pytest.approx(-side * 5e-3)
+    assert hooks["part"](0.0, -side * 50.0, touching, [0.0, 0.0])[0] == 0.0  # leaving fast: damping cannot hold it
+
+
 def test_elastic_shaft_rings_at_its_resonance(plant, dead):
     k_s, J_l = 2.0, 3e-5
     p = plant.Plant(dead, {"compliance": {"k_s": k_s, "c_s": 0.0, "J_l": J_l}}, omega0=10.0)
