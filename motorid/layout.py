@@ -1,0 +1,219 @@
+"""Which column is which channel, in which unit: the user's words, then the header's, and every guess told."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+from motorid.errors import DataError, UsageError, one_of
+from motorid.headers import classify, is_duty, is_supply, unit_in
+from motorid.units import DIMENSIONS, SI, Unit, parse_unit, require_unit
+
+__all__ = ["Layout", "Place", "assign", "parse_pairs"]
+
+_CHANNELS = tuple(DIMENSIONS)
+_MEANING = {"t": "the time", "v": "the drive voltage", "i": "the current", "omega": "the speed",
+            "theta": "the angle"}
+Units = Mapping[str, Unit | None]
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where a channel is: its column, its unit, whether that unit was stated; `times` is a factor column."""
+
+    column: str
+    unit: Unit
+    stated: bool
+    score: float = 9.0
+    times: str | None = None
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Channel to place, and what the user should know about it."""
+
+    places: Mapping[str, Place]
+    notes: Sequence[str]
+
+
+def parse_pairs(text: str, what: str) -> dict[str, str]:
+    """Read ``t=time,v=u_volt,omega=speed`` as it is written on a command line.
+
+    Raises
+    ------
+    UsageError
+        If a part is not of the form name=value, or a name comes twice; `what` names the option.
+    """
+    pairs: dict[str, str] = {}
+    for part in filter(None, (p.strip() for p in text.split(","))):
+        name, equals, value = (s.strip() for s in part.partition("="))
+        if not (equals and name and value):
+            raise UsageError(f"{what}: expected name=value pairs with commas between, like t=time,v=u_volt; "
+                             f"cannot read '{part}'.")
+        if name in pairs:
+            raise UsageError(f"{what}: '{name}' is given twice, as '{pairs[name]}' and as '{value}'.")
+        pairs[name] = value
+    if not pairs:
+        raise UsageError(f"{what}: expected name=value pairs like t=time,v=u_volt; got nothing.")
+    return pairs
+
+
+def assign(labels: Sequence[str], *, columns: Mapping[str, object] | None = None,
+           units: Mapping[str, object] | None = None, unit_row: Mapping[str, str] | None = None) -> Layout:
+    """Decide which column holds which channel.
+
+    Parameters
+    ----------
+    labels : sequence of str
+        Column names, all different; their positions "1", "2", ... if the file has no header.
+    columns : mapping, optional
+        Channel (t, v, i, omega, theta) to column name, or to its position counted from 1.
+    units : mapping, optional
+        Channel or column to unit.
+    unit_row : mapping of str to str, optional
+        Column to unit, from the row of units below the header.
+
+    Raises
+    ------
+    DataError
+        If a channel, column or unit is unknown, two columns claim one channel, or the time, the drive voltage
+        or every measured channel is missing.
+    """
+    row = {label: parse_unit((unit_row or {}).get(label, "")) for label in labels}
+    units = units or {}
+    places = _said(labels, columns or {}, units, row)
+    notes: list[str] = []
+    _recognised(places, [c for c in labels if c not in {p.column for p in places.values()}], row)
+    _last_resorts(places, labels, notes)
+    _apply_units(places, labels, units)
+    _settle_counts(places, notes)
+    _require(places, labels)
+    return Layout({c: places[c] for c in _CHANNELS if c in places}, [*notes, *_assumed(places)])
+
+
+def _said(labels: Sequence[str], columns: Mapping[str, object], units: Mapping[str, object],
+          row: Units) -> dict[str, Place]:
+    places = {}
+    for channel, column in columns.items():
+        if channel not in _CHANNELS:
+            raise DataError(f"columns: {one_of(str(channel), _CHANNELS, 'channel')} "
+                            "Write channel=column, e.g. v=u_volt.")
+        label = _find(labels, column)
+        unit = row[label] or unit_in(label)[1]
+        if unit and unit.dimension not in DIMENSIONS[channel]:
+            named = classify(label, row[label])  # u_a is in no ampere, current_A is
+            if not {channel, label} & set(units) and ((named and named.unit) or unit_in(label)[2]):
+                require_unit(unit.label, channel)
+            unit = None
+        places[channel] = Place(label, unit or _default(channel), unit is not None)
+    taken = [p.column for p in places.values()]
+    twice = [label for label in taken if taken.count(label) > 1]
+    if twice:
+        raise DataError(f"columns: '{twice[0]}' is given for {len(twice)} channels; each needs its own.")
+    return places
+
+
+def _find(labels: Sequence[str], column: object) -> str:
+    text = str(column).strip()
+    for same in (str.strip, lambda s: s.strip().lower()):
+        hits = [c for c in labels if same(c) == same(text)]
+        if len(hits) == 1:
+            return hits[0]
+    if text.isdigit() and 1 <= int(text) <= len(labels):
+        return labels[int(text) - 1]
+    raise DataError(f"columns: {one_of(text, labels, 'column')} A column can also be given by its position, "
+                    "counted from 1.")
+
+
+def _recognised(places: dict[str, Place], labels: Sequence[str], row: Units) -> None:
+    """Add the channels that the header names, where the user has not named them."""
+    found: dict[str, list[Place]] = {}
+    for hit in filter(None, (classify(c, row[c]) for c in labels)):
+        place = Place(hit.column, hit.unit or _default(hit.channel), hit.unit is not None, hit.score)
+        found.setdefault(hit.channel, []).append(place)
+    for channel, hits in found.items():
+        best = [p for p in hits if p.score == max(h.score for h in hits)]
+        best = [p for p in best if p.unit.factor == 1.0] or best
+        if channel in places or (len(best) > 1 and best[0].score <= 1 and channel not in ("t", "v")):
+            continue
+        if len(best) > 1:
+            names = " and ".join(f"'{p.column}'" for p in best)
+            raise DataError(f"{names} look like {_MEANING[channel]} ({channel}) all the same; say which one "
+                            f"is meant, e.g. columns={{'{channel}': '{best[0].column}'}}.")
+        places[channel] = best[0]
+
+
+def _last_resorts(places: dict[str, Place], labels: Sequence[str], notes: list[str]) -> None:
+    if not {"i", "omega", "theta"} & set(places) and "y" in labels:
+        places["omega"] = Place("y", _default("omega"), False)
+        notes.append("took column 'y' as the speed; if it is not, say which channel it is with columns.")
+    duty, supply = [c for c in labels if is_duty(c)], [c for c in labels if is_supply(c)]
+    if "v" not in places and len(duty) == len(supply) == 1:
+        unit = unit_in(duty[0])[1]
+        ratio = unit if unit and unit.dimension == "ratio" else Unit("ratio", 1.0, "1", "1")
+        scale = unit_in(supply[0])[1] or _default("v")
+        product = Unit("voltage", ratio.factor * scale.factor, "V", f"{ratio.label}·{scale.label}")
+        places["v"] = Place(duty[0], product, True, times=supply[0])
+        notes.append(f"took '{duty[0]}' times '{supply[0]}' as the drive voltage.")
+
+
+def _apply_units(places: dict[str, Place], labels: Sequence[str], units: Mapping[str, object]) -> None:
+    for key, text in units.items():
+        channel = key if key in places else next((c for c, p in places.items() if p.column == key), None)
+        if channel is None:
+            why = ("no column was recognised as this channel; name it with columns" if key in _CHANNELS else
+                   "this column is not used as a channel" if key in labels else
+                   one_of(str(key), [*places, *(p.column for p in places.values())], "channel or column"))
+            raise DataError(f"units for '{key}': {why}")
+        places[channel] = replace(places[channel], unit=require_unit(text, channel), stated=True)
+    theta, omega = places.get("theta"), places.get("omega")
+    if theta and omega and theta.unit.dimension == "length" and not omega.stated:
+        places["omega"] = replace(omega, unit=Unit("linear speed", 1.0, "m/s", "m/s"))
+
+
+def _settle_counts(places: dict[str, Place], notes: list[str]) -> None:
+    """Leave out an angle in counts of unknown size, unless it is all there is."""
+    for channel in ("theta", "omega"):
+        place = places.get(channel)
+        if place is None or not math.isnan(place.unit.factor):
+            continue
+        if {"i", "omega", "theta"} & set(places) == {channel}:
+            require_unit(place.unit.label, channel)
+        del places[channel]
+        notes.append(f"left out '{place.column}': it is in encoder counts, and how many make one turn is not "
+                     f"known; to use it, say units={{'{channel}': 'counts:2048'}}.")
+
+
+def _require(places: Mapping[str, Place], labels: Sequence[str]) -> None:
+    for channel in ("t", "v"):
+        if channel not in places:
+            duty = [c for c in labels if is_duty(c)] if channel == "v" else []
+            more = (f" '{duty[0]}' is a duty cycle; with a constant supply of, say, 12 V: columns="
+                    f"{{'v': '{duty[0]}'}}, units={{'v': '12 V'}}.") if duty else ""
+            raise DataError(f"no column looks like {_MEANING[channel]} ({channel}). "
+                            f"{_say_which(labels, channel, labels[0])}{more}")
+    if not {"i", "omega", "theta"} & set(places):
+        raise DataError("no column looks like a measured current (i), speed (omega) or angle (theta). "
+                        f"{_say_which(labels, 'omega', labels[-1])}")
+
+
+def _say_which(labels: Sequence[str], channel: str, example: str) -> str:
+    if list(labels) == [str(k + 1) for k in range(len(labels))]:
+        return (f"The file has no header, so name its {len(labels)} columns by position, counted from 1: "
+                "columns={'t': 1, 'v': 2, 'omega': 3}.")
+    listed = ", ".join(f"'{c}'" for c in labels[:20]) + (" ..." if len(labels) > 20 else "")
+    return f"Columns here: {listed}. Say which one it is, e.g. columns={{'{channel}': '{example}'}}."
+
+
+def _assumed(places: Mapping[str, Place]) -> list[str]:
+    guesses = [f"'{p.column}' as {_MEANING[c]}" for c, p in places.items() if p.score <= 1]
+    plain = [f"{c} ('{p.column}') in {p.unit.symbol}" for c, p in places.items() if not p.stated]
+    told = [f"took {', '.join(guesses)} by the look of it; say otherwise with columns."] if guesses else []
+    return told + ([f"no unit stated, taken as it is: {', '.join(plain)}; say otherwise with units."]
+                   if plain else [])
+
+
+def _default(channel: str) -> Unit:
+    dimension = DIMENSIONS[channel][0]
+    return Unit(dimension, 1.0, SI[dimension], SI[dimension])

@@ -1,0 +1,209 @@
+"""Read and write records: CSV and its kin, MATLAB, Parquet. Units and names are settled here, once."""
+
+from __future__ import annotations
+
+import glob
+import hashlib
+import os
+import re
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+
+import numpy as np
+
+from motorid.errors import DataError, UsageError, one_of
+from motorid.experiment import Experiment
+from motorid.formats import mat_table, parquet_table
+from motorid.layout import assign, parse_pairs
+from motorid.rows import build
+from motorid.table import Table, parse_table
+
+__all__ = ["RECORDS", "find_records", "read_csv", "read_mat", "read_parquet", "read_runs", "write_csv"]
+
+Path_ = str | os.PathLike[str]
+RECORDS = (".csv", ".txt", ".tsv", ".dat", ".log", ".mat", ".parquet", ".pq")
+_HEADERS = {("t", "s"): "time_s", ("v", "V"): "voltage_V", ("v", "A"): "command_A",
+            ("v", "N·m"): "command_Nm", ("v", "N"): "command_N", ("v", "1"): "command",
+            ("i", "A"): "current_A", ("omega", "rad/s"): "speed_rad_s", ("omega", "m/s"): "speed_m_s",
+            ("theta", "rad"): "angle_rad", ("theta", "m"): "position_m"}
+_OWN = re.compile(r"#\s*motorid (columns|hold|sigma): (.*)")  # what write_csv says about its own file
+
+
+def read_runs(paths: Path_ | Iterable[Path_], *, columns: Mapping[str, object] | None = None,
+              units: Mapping[str, object] | None = None, hold: str | None = None) -> list[Experiment]:
+    """Read records, one run per file.
+
+    Parameters
+    ----------
+    paths : str, path, or iterable of these
+        Files, directories, or patterns such as ``"data/run*.csv"``, each in natural order (run2, run10).
+    columns : mapping, optional
+        Channel (t, v, i, omega, theta) to column, by name or by position counted from 1, where the header
+        does not tell: ``{"v": "u_volt"}``.
+    units : mapping, optional
+        Channel or column to unit: ``{"omega": "rpm", "theta": "counts:2048", "i": "-1 A"}``.
+    hold : {"zoh", "linear"}, optional
+        The input between samples; by default what the file says (see `write_csv`), else "zoh".
+
+    Returns
+    -------
+    list of Experiment
+        In SI units. ``run.meta["notes"]`` tells in plain words what was assumed, mended or left out;
+        ``meta["extra"]`` holds the other numeric columns.
+
+    Raises
+    ------
+    DataError
+        If a file is missing or cannot be used; the message says why and what to do.
+    """
+    files = find_records(paths)
+    stems = Counter(f.stem for f in files)
+    names = [f.stem if stems[f.stem] == 1 else f"{f.parent.name}/{f.name}" for f in files]
+    return [_READERS.get(f.suffix.lower(), read_csv)(f, columns=columns, units=units, hold=hold, name=name)
+            for f, name in zip(files, names, strict=True)]
+
+
+def read_csv(path: Path_, *, columns: Mapping[str, object] | None = None,
+             units: Mapping[str, object] | None = None, hold: str | None = None,
+             name: str | None = None) -> Experiment:
+    """Read one text file of whatever dialect (delimiter, decimal comma, comments, row of units, encoding).
+
+    Parameters and errors are those of `read_runs`; `name` is used instead of the name of the file.
+    """
+    return _read(path, parse_table, columns, units, hold, name)
+
+
+def read_mat(path: Path_, *, columns: Mapping[str, object] | None = None,
+             units: Mapping[str, object] | None = None, hold: str | None = None,
+             name: str | None = None) -> Experiment:
+    """Read one MATLAB file (up to version 7); otherwise like `read_csv`."""
+    return _read(path, mat_table, columns, units, hold, name)
+
+
+def read_parquet(path: Path_, *, columns: Mapping[str, object] | None = None,
+                 units: Mapping[str, object] | None = None, hold: str | None = None,
+                 name: str | None = None) -> Experiment:
+    """Read one Parquet file, which needs ``motorid[parquet]``; otherwise like `read_csv`."""
+    return _read(path, parquet_table, columns, units, hold, name)
+
+
+_READERS = {".mat": read_mat, ".parquet": read_parquet, ".pq": read_parquet}
+
+
+def write_csv(experiment: Experiment, path: Path_) -> Path:
+    """Write a run so that `read_csv` gives the same run back: time, channels, extra columns, hold, sigma.
+
+    Raises
+    ------
+    DataError
+        If the file cannot be written.
+    """
+    import pandas as pd
+
+    run = experiment
+    channels = {"t": run.t, **run.inputs, **run.outputs}
+    headers = {c: _HEADERS[c, {"t": "s", **run.units}[c]] for c in channels}
+    extra = {str(k): a for k, a in run.meta.get("extra", {}).items() if np.shape(a) == run.t.shape}
+    taken = set(headers.values())
+    table = {headers[c]: a for c, a in channels.items()}
+    table |= {f"{k} (extra)" if k in taken else k: np.asarray(a) for k, a in extra.items()}
+    about = ["# motorid columns: " + ",".join(f"{c}={h}" for c, h in headers.items()),
+             f"# motorid hold: {run.hold}"]
+    about += ["# motorid sigma: " + ",".join(f"{c}={s!r}" for c, s in run.sigma.items())] if run.sigma else []
+    path = Path(path).expanduser()
+    try:
+        with path.open("w", encoding="utf-8", newline="") as file:
+            file.write("\n".join(about) + "\n")
+            pd.DataFrame(table).to_csv(file, index=False, na_rep="", lineterminator="\n")
+    except (OSError, ValueError) as error:
+        raise DataError(f"cannot write {path}: {error}. Choose a folder that can be written.") from None
+    return path
+
+
+def find_records(paths: Path_ | Iterable[Path_]) -> list[Path]:
+    """Return the files meant by names, directories and patterns, each once, in natural order.
+
+    Raises
+    ------
+    DataError
+        If a name, directory or pattern leads to no file.
+    """
+    if isinstance(paths, str | os.PathLike):
+        paths = [paths]
+    if not isinstance(paths, Iterable):
+        raise UsageError(f"expected a file, a directory, a pattern or a list of these; got {paths!r}.")
+    files: dict[Path, None] = {}
+    for path in paths:
+        if not isinstance(path, str | os.PathLike) or isinstance(os.fspath(path), bytes):
+            raise UsageError(f"expected the name of a file as text or path; got {path!r}.")
+        files |= dict.fromkeys(_expand(Path(path).expanduser()))
+    if not files:
+        raise DataError("no record is given; name at least one file, directory or pattern.")
+    return list(files)
+
+
+def _expand(path: Path) -> list[Path]:
+    if path.is_dir():
+        found = [f for f in path.iterdir() if _is_record(f)]
+        if not found:
+            raise DataError(f"the directory {path} holds no records ({', '.join(RECORDS)}).")
+        return sorted(found, key=_natural)
+    if path.exists():
+        return [path]
+    if glob.has_magic(str(path)):
+        found = [f for f in map(Path, glob.glob(str(path), recursive=True)) if f.is_file()]
+        if found:
+            return sorted(found, key=_natural)
+        raise DataError(f"nothing matches the pattern {path}. {_what_is_there(path.parent)}")
+    raise DataError(f"there is no file {path}. {_what_is_there(path.parent, path.name)}")
+
+
+def _what_is_there(folder: Path, wanted: str | None = None) -> str:
+    if not folder.is_dir():
+        return f"Its folder {folder} does not exist, either; the working directory is {Path.cwd()}."
+    names = sorted((f.name for f in folder.iterdir() if f.is_dir() or _is_record(f)), key=str.lower)
+    if not names:
+        return f"There are no records in {folder.absolute()}."
+    if wanted:
+        return one_of(wanted, names[:12], "file")
+    return f"There is: {', '.join(names[:12])}{' ...' if len(names) > 12 else ''}."
+
+
+def _is_record(path: Path) -> bool:
+    return path.suffix.lower() in RECORDS and path.name[0] != "." and path.is_file()
+
+
+def _natural(path: Path) -> list[tuple[int, int, str]]:
+    parts = re.split(r"(\d+)", str(path).lower())
+    return [(0, int(p), "") if p.isdecimal() else (1, 0, p) for p in parts if p]
+
+
+def _read(path: Path_, to_table: Callable[[bytes], Table], columns: Mapping[str, object] | None,
+          units: Mapping[str, object] | None, hold: str | None, name: str | None) -> Experiment:
+    path = Path(path).expanduser()
+    try:
+        data = path.read_bytes()
+    except (OSError, ValueError) as error:
+        reason = "it is a directory; use read_runs" if path.is_dir() else getattr(error, "strerror", error)
+        raise DataError(f"cannot read {path}: {reason}.") from None
+    try:
+        table = to_table(data)
+        own: dict[str, str] = {m[1]: m[2] for m in map(_OWN.fullmatch, table.comments) if m}
+        labels = table.labels
+        if "columns" in own and not columns:
+            columns = parse_pairs(own["columns"], "columns")
+            labels = [c for c in labels if c in columns.values()]
+        layout = assign(labels, columns=columns, units=units, unit_row=table.unit_row)
+        return build(table.columns, table.texts, layout, name=name or path.stem, notes=table.notes,
+                     hold=hold or own.get("hold", "zoh"), sigma=_sigma(own.get("sigma")),
+                     meta={"source": str(path), "sha256": hashlib.sha256(data).hexdigest()})
+    except (DataError, UsageError) as error:
+        raise DataError(f"{path}: {error}") from None
+
+
+def _sigma(text: str | None) -> dict[str, float]:
+    try:
+        return {c: float(s) for c, s in parse_pairs(text, "sigma").items()} if text else {}
+    except ValueError:
+        raise DataError(f"cannot read the noise levels '{text}' in its comments.") from None

@@ -1,0 +1,187 @@
+"""From columns as they were logged to a valid run: order in time, gaps, missing cells; each loss is noted."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from motorid.errors import DataError
+from motorid.experiment import MIN_SAMPLES, Experiment
+from motorid.layout import Layout, Place
+
+__all__ = ["build"]
+
+Array = NDArray[np.float64]
+Texts = Mapping[str, Sequence[object]]
+
+_LATE = 5  # this many rows in a row may come late before it counts as a new start of time
+
+
+def build(columns: Mapping[str, Array], texts: Texts, layout: Layout, *, name: str, hold: str,
+          sigma: Mapping[str, float] | None = None, meta: Mapping[str, Any] | None = None,
+          notes: Sequence[str] = ()) -> Experiment:
+    """Make one run of raw columns.
+
+    Parameters
+    ----------
+    columns : mapping of str to (N,) array
+        Numbers as in the file, NaN where missing.
+    texts : mapping of str to sequence
+        Columns that are no numbers; a time column of dates is understood.
+    layout : Layout
+        Which column is which channel, in which unit.
+    name, hold, sigma, meta, notes
+        Passed on to the run; `notes` and those made here end up in ``meta["notes"]``.
+
+    Raises
+    ------
+    DataError
+        If no valid run is left.
+    """
+    said = [*notes, *layout.notes]
+    places = dict(layout.places)
+    t = _time(columns, texts, places.pop("t"), said)
+    values = {c: _channel(columns, texts, place, c) for c, place in places.items()}
+    rows = _rows_in_order(t, layout.places["t"].column, said)
+    rows = rows[_first_input(values["v"][rows], places["v"].column, said):]
+    t, values = t[rows], {c: a[rows] for c, a in values.items()}
+    v = _held(values.pop("v"), places["v"].column, said)
+    outputs = {c: a for c, a in values.items() if _has_values(c, a, places[c].column, said)}
+    if not outputs:
+        raise DataError(f"every sample of {', '.join(repr(places[c].column) for c in values)} is missing; "
+                        "there is nothing measured to fit.")
+    _note_gaps(t, said)
+    used = {p.column for p in layout.places.values()}
+    extra = {c: a[rows] for c, a in columns.items() if c not in used}
+    if set(texts) - used:
+        said.append(f"left out columns of text: {', '.join(sorted(set(texts) - used))}.")
+    facts = {"notes": said, "extra": extra, "columns": {c: p.column for c, p in layout.places.items()},
+             "original_units": {c: p.unit.label for c, p in layout.places.items()}}
+    units = {c: places[c].unit.symbol for c in ("v", *outputs)}
+    try:
+        return Experiment(t, {"v": v}, outputs, sigma=sigma or {}, units=units, name=name,
+                          hold=hold, meta={**(meta or {}), **facts})  # type: ignore[arg-type]
+    except DataError as error:
+        raise DataError(str(error).removeprefix(f"{name}: ")) from None
+
+
+def _channel(columns: Mapping[str, Array], texts: Texts, place: Place, channel: str) -> Array:
+    for column in filter(None, (place.column, place.times)):
+        if column in texts:
+            sample = next((str(c) for c in texts[column] if str(c).lower() != "nan"), "")
+            raise DataError(f"column '{column}' should be the channel {channel} but holds "
+                            + (f"text, e.g. '{sample[:40]}'." if sample else "nothing."))
+    array = columns[place.column] * place.unit.factor
+    return array * columns[place.times] if place.times else array
+
+
+def _time(columns: Mapping[str, Array], texts: Texts, place: Place, said: list[str]) -> Array:
+    raw = _dates(texts[place.column], place.column) if place.column in texts else columns[place.column]
+    factor = 1.0 if place.column in texts else place.unit.factor
+    start = raw[np.isfinite(raw)][:1]
+    if start.size and abs(start[0] * factor) > 1e8:  # seconds since 1970 leave no digits for microseconds
+        said.append(f"time starts at {start[0] * factor:.6f} s; counted from there.")
+        raw = raw - start[0]
+    return raw * factor + 0.0  # no negative zero
+
+
+def _dates(cells: Sequence[object], column: str) -> Array:
+    import pandas as pd
+
+    series = pd.Series(cells, dtype=object)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            stamps = pd.to_datetime(series, errors="coerce", format="ISO8601", utc=True)
+            dated = stamps.notna().mean() > 0.5
+            spans = stamps - stamps.min() if dated else pd.to_timedelta(series, errors="coerce")
+            seconds = spans.dt.total_seconds().to_numpy(dtype=float)
+        except (ValueError, TypeError, OverflowError, AttributeError):
+            seconds = np.full(len(series), np.nan)
+    if np.isnan(seconds).mean() > 0.5:
+        raise DataError(f"the time column '{column}' holds neither numbers nor dates, e.g. "
+                        f"'{str(cells[0])[:40]}'; expected seconds, or another unit that is stated.")
+    return seconds
+
+
+def _rows_in_order(t: Array, column: str, said: list[str]) -> NDArray[np.intp]:
+    """Return the rows with a time that moves on: the longest stretch without a restart, without repeats."""
+    rows = np.flatnonzero(np.isfinite(t))
+    if len(rows) < len(t):
+        said.append(f"left out {len(t) - len(rows)} of {len(t)} rows without a time.")
+    if not len(rows):
+        raise DataError(f"the time column '{column}' holds no number.")
+    if np.ptp(t[rows]) == 0:
+        raise DataError(f"time does not move: '{column}' is {t[rows[0]]:g} s in every row. "
+                        "Is it the right column?")
+    stretches = _stretches(t[rows])
+    if len(stretches) > 1:
+        longest = max(stretches, key=len)
+        if len(longest) < MIN_SAMPLES:
+            raise DataError(f"time does not increase: '{column}' goes back {len(stretches) - 1} times in "
+                            f"{len(rows)} rows. Is it the right column? Expected rows in order of time.")
+        said.append(f"time starts again {len(stretches) - 1} times; kept the longest stretch, rows "
+                    f"{longest[0] + 1} to {longest[-1] + 1}, and left out {len(rows) - len(longest)} rows. "
+                    "Save each run in a file of its own to use all.")
+        rows = rows[longest]
+    moving = rows[np.r_[True, t[rows][1:] > np.maximum.accumulate(t[rows])[:-1]]]
+    if len(moving) < len(rows):
+        said.append(f"left out {len(rows) - len(moving)} of {len(rows)} rows whose time stamp repeats an "
+                    "earlier one or goes back.")
+    return moving
+
+
+def _stretches(t: Array) -> list[NDArray[np.intp]]:
+    """Cut where time goes back and stays behind; a few late rows are no new start."""
+    cuts, done, high = [], 0, -np.inf
+    for k in np.flatnonzero(np.diff(t) < 0) + 1:
+        high = max(high, float(t[done:k].max())) if k > done else high
+        done = k
+        next_rows = t[k:k + _LATE + 1]
+        if len(next_rows) > _LATE and not (next_rows > high).any():
+            cuts.append(k)
+            high = -np.inf
+    return np.split(np.arange(len(t)), cuts)
+
+
+def _first_input(v: Array, column: str, said: list[str]) -> int:
+    known = np.flatnonzero(np.isfinite(v))
+    if not known.size:
+        raise DataError(f"every sample of the input '{column}' is missing; no simulation can do without it.")
+    if known[0]:
+        said.append(f"left out the first {known[0]} rows: the input '{column}' is not known there.")
+    return int(known[0])
+
+
+def _held(v: Array, column: str, said: list[str]) -> Array:
+    missing = ~np.isfinite(v)
+    if not missing.any():
+        return v
+    said.append(f"the input '{column}' is missing in {np.count_nonzero(missing)} of {len(v)} rows; "
+                "it was held from the last known value.")
+    return v[np.maximum.accumulate(np.where(missing, 0, np.arange(len(v))))]
+
+
+def _has_values(channel: str, values: Array, column: str, said: list[str]) -> bool:
+    missing = int(np.count_nonzero(np.isnan(values)))
+    if missing == len(values):
+        said.append(f"left out '{column}' ({channel}): every sample is missing.")
+    elif missing:
+        said.append(f"'{column}' ({channel}) is missing in {missing} of {len(values)} rows.")
+    return missing < len(values)
+
+
+def _note_gaps(t: Array, said: list[str]) -> None:
+    steps = np.diff(t)
+    if len(steps) < MIN_SAMPLES - 1:
+        return
+    gaps = np.flatnonzero(steps > 5 * np.median(steps))
+    if gaps.size:
+        worst = gaps[np.argmax(steps[gaps])]
+        how_many = "a gap in time," if gaps.size == 1 else f"{gaps.size} gaps in time, the longest"
+        said.append(f"{how_many} {steps[worst]:.4g} s after t = {t[worst]:.6g} s; the input is taken as going "
+                    "on there.")

@@ -1,0 +1,175 @@
+"""A table of numbers from the bytes of a text file: header, row of units, rows. pandas does the parsing."""
+
+from __future__ import annotations
+
+import io
+import re
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from motorid.dialect import MISSING, Dialect, decode, is_data, sniff
+from motorid.errors import DataError
+from motorid.units import parse_unit
+
+__all__ = ["Table", "numbers", "parse_table", "unique_labels"]
+
+_COMMENT = ("#", "%", "//")
+
+@dataclass(frozen=True)
+class Table:
+    """A file as columns.
+
+    `columns` holds (N,) numbers, NaN where a cell is missing; `texts` the columns that are no numbers;
+    `labels` all of them in the order of the file; `unit_row` column to unit, from the row below the header.
+    """
+
+    columns: Mapping[str, NDArray[np.float64]]
+    texts: Mapping[str, Sequence[object]] = field(default_factory=dict)
+    labels: Sequence[str] = ()
+    unit_row: Mapping[str, str] = field(default_factory=dict)
+    comments: Sequence[str] = ()
+    notes: Sequence[str] = ()
+
+
+def parse_table(data: bytes) -> Table:
+    """Read a table of numbers from the bytes of a text file.
+
+    Delimiter (comma, semicolon, tab, white space), decimal mark, encoding, comment lines, header and row of
+    units are found out. Without a header the columns are called "1", "2", ...
+
+    Raises
+    ------
+    DataError
+        If this is not text, or there are no rows of numbers in it, or the header does not go with the rows.
+    """
+    text, notes = decode(data)
+    lines = [line for line in re.split(r"\r\n|\r|\n", text) if line.strip()]
+    comments = [line.strip() for line in lines if line.lstrip().startswith(_COMMENT)]
+    body = [line for line in lines if not line.lstrip().startswith(_COMMENT)]
+    if not body:
+        raise DataError("it holds no rows" + (", only comments." if comments else "; the file is empty."))
+    dialect, width = sniff(body)
+    first = next((k for k, line in enumerate(body) if is_data(dialect.cells(line), dialect, width)), None)
+    if first is None:
+        raise DataError(f"it has no rows of at least two numbers; it begins with '{body[0][:60]}'. Expected "
+                        "one row per sample, with a comma, semicolon, tab or space between the values.")
+    labels, unit_row = _header(body[:first], comments, dialect, width, notes)
+    rows = _rows(body[first:], dialect, len(labels), notes)
+    columns, texts = _parse(rows, dialect, labels, notes)
+    return Table(columns, texts, labels, dict(zip(labels, unit_row, strict=False)), comments, notes)
+
+
+def numbers(values: object, decimal: str = ".") -> tuple[NDArray[np.float64], int]:
+    """Turn a column into float64; count the cells that are neither a finite number nor marked as missing."""
+    import pandas as pd
+
+    series = pd.Series(values)  # type: ignore[call-overload]
+    missing = series.isna().to_numpy()
+    if pd.api.types.is_numeric_dtype(series.dtype) and not pd.api.types.is_complex_dtype(series.dtype):
+        array = series.to_numpy(dtype=float, na_value=np.nan).copy()
+    else:
+        text = series.astype(str).str.strip().str.strip("\"'").str.replace("−", "-", regex=False)
+        text = text.str.replace(",", ".", regex=False) if decimal == "," else text
+        array = np.array(pd.to_numeric(text, errors="coerce"), dtype=float)
+        missing |= text.str.lower().isin(MISSING).to_numpy()
+    array[np.isinf(array)] = np.nan
+    return array, int(np.count_nonzero(np.isnan(array) & ~missing))
+
+
+def unique_labels(labels: Sequence[str]) -> list[str]:
+    """Give every column a name of its own: empty ones by position, repeated ones with a number."""
+    named = [label.strip().strip("\"'") or f"column {k + 1}" for k, label in enumerate(labels)]
+    seen: Counter[str] = Counter()
+    result = []
+    for label in named:
+        seen[label] += 1
+        result.append(label if seen[label] == 1 else f"{label} ({seen[label]})")
+    return result if len(set(result)) == len(result) else [f"{c} [{k + 1}]" for k, c in enumerate(named)]
+
+
+def _header(above: list[str], comments: list[str], dialect: Dialect, width: int,
+            notes: list[str]) -> tuple[list[str], list[str]]:
+    """Column names and the row of units from the lines above the numbers, or from the last comment line."""
+    rows = [_names(line, dialect, width) for line in above]
+    if not rows:
+        named = [_names(c.lstrip("#%/ "), dialect, width) for c in comments]
+        fitting = [row for row in named if len(row) == width and not any(map(dialect.is_number, row))]
+        if fitting:
+            return unique_labels(fitting[-1]), []
+        return [str(k + 1) for k in range(width)], []
+    units = rows[-1] if len(rows) > 1 and _is_unit_row(rows[-1]) and len(rows[-2]) >= width else []
+    names = rows[-2] if units else rows[-1]
+    if len(names) < width:
+        hint = (" If the comma is the decimal mark, too, export with a semicolon between the cells."
+                if dialect.delimiter == "," else "")
+        raise DataError(f"the header has {len(names)} names but the rows have {width} values: "
+                        f"'{above[-1][:80]}'.{hint}")
+    ignored = len(rows) - (2 if units else 1)
+    if ignored:
+        notes.append(f"ignored {ignored} lines above the header, from '{above[0][:60]}' on.")
+    return unique_labels(names), units
+
+
+def _names(line: str, dialect: Dialect, width: int) -> list[str]:
+    cells = dialect.cells(line)
+    if dialect.delimiter is None and len(cells) > width:  # names with blanks in them
+        apart = [c for c in re.split(r"\s{2,}|\t", line.strip()) if c]
+        joined = [c for c in re.split(r"\s+(?![\[(])", line.strip()) if c]
+        cells = next((c for c in (apart, joined) if len(c) == width), cells)
+    while cells and not cells[-1]:
+        cells.pop()
+    return cells
+
+
+def _is_unit_row(cells: list[str]) -> bool:
+    words = [c for c in cells if c.strip("[]()- ")]
+    return bool(words) and sum(parse_unit(c) is not None for c in words) >= 0.5 * len(words)
+
+
+def _rows(lines: list[str], dialect: Dialect, width: int, notes: list[str]) -> list[str]:
+    """Drop the rows that do not fit under the header, and the delimiters that end a row."""
+    ending = " \t" + (dialect.delimiter or "")
+    kept, long, short = [], 0, 0
+    for line in lines:
+        bare = line.rstrip(ending)
+        if '"' in line or dialect.delimiter is None:
+            filled, all_cells = len(dialect.cells(bare)), len(dialect.cells(line))
+        else:
+            filled, all_cells = bare.count(dialect.delimiter) + 1, line.count(dialect.delimiter) + 1
+        short += all_cells < width
+        if filled > width:
+            long += 1
+        elif bare:
+            kept.append(bare.lstrip() if dialect.delimiter is None else bare)
+    if long:
+        notes.append(f"left out {long} rows with more cells than the header has names.")
+    if short:
+        notes.append(f"{short} rows are shorter than the header; their last cells count as missing.")
+    return kept
+
+
+def _parse(rows: list[str], dialect: Dialect, labels: list[str],
+           notes: list[str]) -> tuple[dict[str, NDArray[np.float64]], dict[str, Sequence[object]]]:
+    import pandas as pd
+
+    text = io.StringIO("\n".join(rows))
+    try:
+        frame = pd.read_csv(text, sep=dialect.delimiter or r"\s+", decimal=dialect.decimal,
+                            header=None, names=range(len(labels)), index_col=False, skipinitialspace=True,
+                            low_memory=False, na_values=sorted(MISSING - {""}))
+    except (pd.errors.ParserError, pd.errors.EmptyDataError, ValueError, OverflowError) as error:
+        raise DataError(f"its rows cannot be read as a table ({str(error).strip()}).") from None
+    columns, texts = {}, {}
+    for label, column in zip(labels, frame.columns, strict=True):
+        array, bad = numbers(frame[column], dialect.decimal)
+        if bad > 0.5 * np.count_nonzero(frame[column].notna()):
+            texts[label] = frame[column].astype(str).tolist()
+            continue
+        columns[label] = array
+        if bad:
+            notes.append(f"{bad} cells of '{label}' are not numbers and count as missing.")
+    return columns, texts
