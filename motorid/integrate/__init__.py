@@ -1,0 +1,28 @@
+"""Engines: Rosenbrock (fast, compiled) and SUNDIALS' CVODES and IDAS (reference), one interface."""
+
+from __future__ import annotations
+
+from motorid.errors import UsageError, one_of
+from motorid.integrate.grid import Engine, Grid, Trajectory
+from motorid.integrate.rosenbrock import Rosenbrock
+from motorid.integrate.sundials import Cvodes, Idas
+
+ENGINES = {"rosenbrock": Rosenbrock, "cvodes": Cvodes, "idas": Idas}
+
+
+def engine_of(engine: str | Engine) -> Engine:
+    """Return the engine of that name, or the engine itself.
+
+    Raises
+    ------
+    UsageError
+        If the name is not known.
+    """
+    if isinstance(engine, str):
+        if engine not in ENGINES:
+            raise UsageError(one_of(engine, ENGINES, "engine"))
+        return ENGINES[engine]()
+    return engine
+
+
+__all__ = ["ENGINES", "Cvodes", "Engine", "Grid", "Idas", "Rosenbrock", "Trajectory", "engine_of"]

@@ -1,0 +1,89 @@
+"""The input of one record laid out for an engine, and what an engine gives back."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from motorid.system import System
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Grid:
+    """Sample times and inputs of one record.
+
+    Attributes
+    ----------
+    t : ndarray, shape (N,)
+        s.
+    u : ndarray, shape (N, nu)
+        Inputs seen by the sensors at the samples.
+    u0, u1 : ndarray, shape (N-1, nu)
+        Inputs at the beginning and the end of each interval; equal where the input is held.
+    substeps : ndarray of int, shape (N-1,)
+        Rosenbrock steps per interval.
+    """
+
+    t: Array
+    u: Array
+    u0: Array
+    u1: Array
+    substeps: NDArray[np.int64]
+
+    @staticmethod
+    def of(t: Array, u: Array, held: NDArray[np.bool_]) -> Grid:
+        """Lay out inputs `u` (N, nu); `held` (nu,) tells which stay constant between samples."""
+        u = np.ascontiguousarray(u, float)
+        after = np.where(held, u[:-1], u[1:])
+        return Grid(np.ascontiguousarray(t, float), u, np.ascontiguousarray(u[:-1]), np.ascontiguousarray(after),
+                    np.ones(len(t) - 1, np.int64))
+
+    @property
+    def dt(self) -> Array:
+        """Lengths of the intervals, s."""
+        return np.ascontiguousarray(np.diff(self.t))
+
+    def with_substeps(self, substeps: NDArray[np.int64]) -> Grid:
+        """Return the grid with other sub-steps."""
+        return replace(self, substeps=np.ascontiguousarray(substeps, np.int64))
+
+
+class Trajectory(NamedTuple):
+    """What an engine returns: y (N, ny); dy (N, ny, nq) or None; x (N, nx); dx (N, nx, nq) or None.
+
+    `error` (N-1,) is the local error per interval relative to `xscale`, where the engine estimates it.
+    """
+
+    y: Array
+    dy: Array | None
+    x: Array
+    dx: Array | None
+    error: Array | None
+
+
+class Engine(Protocol):
+    """Integrates a system over a grid, with exact forward sensitivities."""
+
+    name: str
+
+    def run(self, system: System, grid: Grid, x0: Array, p: Array, dx0: Array | None = None,
+            dp: Array | None = None) -> Trajectory:
+        """Return the trajectory from `x0` (nx,) with parameters `p` (np,).
+
+        `dx0` (nx, nq) and `dp` (np, nq) are the derivatives of both with respect to the unknowns q.
+
+        Raises
+        ------
+        SimulationError
+            If the integration does not reach the end; it names the time.
+        """
+        ...
+
+    def prepare(self, system: System, grid: Grid, x0: Array, p: Array, tolerance: float) -> Grid:
+        """Return the grid with its sub-steps chosen for a relative local error of `tolerance`."""
+        ...

@@ -1,0 +1,96 @@
+"""One L-stable linearly implicit (Rosenbrock) step and its exact derivatives, as CasADi functions.
+
+RODAS3 of Sandu et al., "Benchmarking stiff ODE solvers for atmospheric chemistry problems II: Rosenbrock
+solvers", Atmospheric Environment 31(20), 1997: four stages, three right-hand sides, order 3 with an embedded
+order 2, stiffly accurate, so that it also carries algebraic balances (a motor without inductance).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import casadi as ca
+
+from motorid.system import System
+
+GAMMA = 0.5
+A = ((), (0.0,), (2.0, 0.0), (2.0, 0.0, 1.0))
+C = ((), (4.0,), (1.0, -1.0), (1.0, -1.0, -8.0 / 3.0))
+ALPHA = (0.0, 0.0, 1.0, 1.0)
+GAMMA_T = (0.5, 1.5, 0.0, 0.0)
+WEIGHTS = (2.0, 0.0, 1.0, 1.0)
+ERROR_ORDER = 3  # the local error estimate falls with h³
+
+
+class StepFunctions(NamedTuple):
+    """The discrete model.
+
+    light : ``(x, u0, u1, h, p) -> (x⁺, e)``, the input running from u0 to u1 over the step h, e the local error.
+    full : ``(x, u0, u1, h, p) -> (x⁺, e, A, B)`` with A = dx⁺/dx and B = dx⁺/dp.
+    out : ``(x, u, p) -> (y, C, D)`` with C = dy/dx and D = dy/dp.
+    """
+
+    light: ca.Function
+    full: ca.Function
+    out: ca.Function
+
+
+def step_functions(system: System) -> StepFunctions:
+    """Return the step of `system` with exact derivatives of the discrete step itself."""
+    nx, nu, np_, _ = system.sizes
+    x, u0, u1 = ca.SX.sym("x", nx), ca.SX.sym("u0", nu), ca.SX.sym("u1", nu)
+    h, p = ca.SX.sym("h"), ca.SX.sym("p", np_)
+    x_next, error = rosenbrock_step(system, x, u0, u1, h, p)
+    args, names = [x, u0, u1, h, p], ["x", "u0", "u1", "h", "p"]
+    light = _dense("step", args, [x_next, error], names, ["x_next", "error"])
+    full = _dense("step_full", args, [x_next, error, ca.jacobian(x_next, x), ca.jacobian(x_next, p)], names,
+                  ["x_next", "error", "A", "B"])
+    y = system.out(x, u0, p)
+    out = _dense("out_full", [x, u0, p], [y, ca.jacobian(y, x), ca.jacobian(y, p)], ["x", "u", "p"], ["y", "C", "D"])
+    return StepFunctions(light, full, out)
+
+
+def _dense(name: str, args: list[ca.SX], results: list[ca.SX], names: list[str], shown: list[str]) -> ca.Function:
+    return ca.Function(name, args, ca.cse([ca.densify(r) for r in results]), names, shown)
+
+
+def rosenbrock_step(system: System, x, u0, u1, h, p):
+    """Return (x⁺, local error) of one step, symbolically."""
+    f = system.rhs(x, u0, p)
+    slope_x, slope_u = ca.jacobian(f, x), ca.jacobian(f, u0)
+    drift = ca.mtimes(slope_u, u1 - u0)  # h·df/dt
+    mass = ca.diag(ca.DM([float(s) for s in system.stored]))
+    factors = _lu(mass / GAMMA - h * slope_x)
+    stages: list[ca.SX] = []
+    for s in range(4):
+        at = x + sum((a * k for a, k in zip(A[s], stages, strict=True) if a), ca.SX.zeros(x.numel()))
+        u = u0 + ALPHA[s] * (u1 - u0)
+        rhs = h * (system.rhs(at, u, p) if s > 1 else f) + h * GAMMA_T[s] * drift
+        rhs += ca.mtimes(mass, sum((c * k for c, k in zip(C[s], stages, strict=True)), ca.SX.zeros(x.numel())))
+        stages.append(_solve(factors, rhs))
+    return x + sum(w * k for w, k in zip(WEIGHTS, stages, strict=True) if w), stages[3]
+
+
+def _lu(w: ca.SX) -> list[list[ca.SX]]:
+    """LU factors without pivoting: W is near the identity or has positive storage or resistance on its diagonal."""
+    n = w.shape[0]
+    m = [[w[i, j] for j in range(n)] for i in range(n)]
+    for k in range(n):
+        for i in range(k + 1, n):
+            m[i][k] = m[i][k] / m[k][k]
+            for j in range(k + 1, n):
+                m[i][j] = m[i][j] - m[i][k] * m[k][j]
+    return m
+
+
+def _solve(m: list[list[ca.SX]], rhs: ca.SX) -> ca.SX:
+    n = len(m)
+    z = [rhs[i] for i in range(n)]
+    for i in range(n):
+        for j in range(i):
+            z[i] = z[i] - m[i][j] * z[j]
+    for i in reversed(range(n)):
+        for j in range(i + 1, n):
+            z[i] = z[i] - m[i][j] * z[j]
+        z[i] = z[i] / m[i][i]
+    return ca.vertcat(*z)

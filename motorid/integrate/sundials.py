@@ -1,0 +1,184 @@
+"""CVODES and IDAS through CasADi: the reference engines, with forward sensitivities.
+
+A call never spans a jump of the input (CVODES stops there): the record is cut where the input changes. Runs of
+evenly spaced samples under a constant input are walked in pieces of 2^k samples over a scaled time, so that a
+handful of integrators serves every record. Derivatives are taken in forward mode only, over scaled states;
+`quad_err_con` is set because without it CasADi's CVODES interface can return wrong derivatives silently
+(casadi issue 4383).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from motorid.errors import ModelError, SimulationError
+from motorid.integrate.grid import Array, Grid, Trajectory
+from motorid.integrate.rosenbrock import content_key
+from motorid.system import System
+
+LONGEST = 10  # pieces of at most 2**10 samples
+
+
+@dataclass(frozen=True)
+class _Sundials:
+    rtol: float = 1e-8
+    atol: float = 1e-10
+
+    name = "sundials"
+
+    def run(self, system: System, grid: Grid, x0: Array, p: Array, dx0: Array | None = None,
+            dp: Array | None = None) -> Trajectory:
+        """See `Engine.run`."""
+        self._check(system)
+        nx, nq = len(system.states), 0 if dp is None else dp.shape[1]
+        n = len(grid.t)
+        scale = _state_scale(system, grid, x0, p)
+        x, dx = np.empty((n, nx)), np.empty((n, nx, nq))
+        x[0] = x0
+        if nq:
+            dx[0] = dx0
+        integrators = _integrators(self.name, self.rtol, self.atol, content_key(system), nq)
+        if not integrators:
+            integrators.append(_Integrators(self.name, self.rtol, self.atol, system, nq))
+        for first, count in _pieces(grid):
+            try:
+                integrators[0].walk(grid, first, count, x, dx, p, dp, scale)
+            except RuntimeError as error:
+                reason = next((w for w in ("CV_ERR_FAILURE", "CV_CONV_FAILURE", "CV_TOO_MUCH_WORK", "IDA_ERR_FAIL",
+                                           "IDA_CONV_FAIL", "IDA_TOO_MUCH_WORK") if w in str(error)), "no convergence")
+                raise SimulationError(f"{self.name} stopped after t = {grid.t[first]:.6g} s ({reason}). Try "
+                                      "engine='rosenbrock', or parameters nearer to the motor's.") from None
+            if not np.isfinite(x[first + 1:first + count + 1]).all():
+                raise SimulationError(f"{self.name} left the finite numbers after t = {grid.t[first]:.6g} s.")
+        return observe(system, grid, x, dx if nq else None, p, dp)
+
+    def prepare(self, system: System, grid: Grid, x0: Array, p: Array, tolerance: float) -> Grid:
+        """See `Engine.prepare`; these engines choose their own steps."""
+        return grid
+
+    def _check(self, system: System) -> None:
+        return
+
+
+@dataclass(frozen=True)
+class Cvodes(_Sundials):
+    """SUNDIALS CVODES (Hindmarsh et al., ACM TOMS 31(3), 2005): stiff ODEs, variable-order BDF."""
+
+    name = "cvodes"
+
+    def _check(self, system: System) -> None:
+        if not all(system.stored):
+            raise ModelError("cvodes integrates differential equations only, and this model has an algebraic balance "
+                             "(no inductance). Use engine='idas' or engine='rosenbrock'.")
+
+
+@dataclass(frozen=True)
+class Idas(_Sundials):
+    """SUNDIALS IDAS: differential-algebraic systems, variable-order BDF."""
+
+    name = "idas"
+
+
+class _Integrators:
+    """Integrators of one system over 2^k steps of length h, made when first needed."""
+
+    def __init__(self, plugin: str, rtol: float, atol: float, system: System, nq: int) -> None:
+        self.system, self.plugin, self.nq = system, plugin, nq
+        self.options = {"reltol": rtol, "abstol": atol, "quad_err_con": True, "max_num_steps": 100000}
+        self.made: dict[int, tuple[ca.Function, ca.Function | None]] = {}
+        self.stored = np.array(system.stored)
+
+    def _dae(self) -> dict[str, Any]:
+        nx, nu, np_, _ = self.system.sizes
+        z, theta = ca.SX.sym("z", nx), ca.SX.sym("theta", np_ + 2 * nu + 1 + nx)
+        p, u0, u1, h, scale = ca.vertsplit(theta, [0, np_, np_ + nu, np_ + 2 * nu, np_ + 2 * nu + 1, theta.numel()])
+        tau = ca.SX.sym("tau")
+        f = self.system.rhs(z * scale, u0 + tau * (u1 - u0), p)
+        parts = {True: ([], []), False: ([], [])}
+        for k, stored in enumerate(self.system.stored):
+            parts[stored][0].append(z[k])
+            parts[stored][1].append(f[k] * h / scale[k] if stored else f[k])
+        dae = {"x": ca.vertcat(*parts[True][0]), "ode": ca.vertcat(*parts[True][1]), "p": theta, "t": tau}
+        if parts[False][0]:
+            dae |= {"z": ca.vertcat(*parts[False][0]), "alg": ca.vertcat(*parts[False][1])}
+        return dae
+
+    def _integrator(self, count: int) -> tuple[ca.Function, ca.Function | None]:
+        if count not in self.made:
+            # Times are in steps; the slope of a linear input is only used with count = 1.
+            f = ca.integrator(f"walk{count}", self.plugin, self._dae(), 0.0, list(np.arange(1.0, count + 1)),
+                              self.options)
+            self.made[count] = (f, f.forward(self.nq) if self.nq else None)
+        return self.made[count]
+
+    def walk(self, grid: Grid, first: int, count: int, x: Array, dx: Array, p: Array, dp: Array | None,
+             scale: Array) -> None:
+        """Fill x and dx for `count` intervals from sample `first`."""
+        main, forward = self._integrator(count)
+        h = (grid.t[first + count] - grid.t[first]) / count
+        theta = np.concatenate([p, grid.u0[first], grid.u1[first], [h], scale])
+        d, a = self.stored, ~self.stored
+        ks = slice(first + 1, first + count + 1)
+        given = {"x0": x[first, d] / scale[d], "p": theta}
+        if a.any():
+            given["z0"] = x[first, a] / scale[a]
+        res = main(**given)
+        x[ks][:, d] = np.asarray(res["xf"]).T * scale[d]
+        if a.any():
+            x[ks][:, a] = np.asarray(res["zf"]).T * scale[a]
+        if forward is None or dp is None:
+            return
+        seeds = np.zeros((theta.size, self.nq))
+        seeds[:len(p)] = dp
+        given |= {f"out_{k}": res[k] for k in ("xf", "zf")}
+        given |= {"fwd_x0": dx[first][d] / scale[d][:, None], "fwd_p": seeds}
+        sens = forward(**given)
+        for which, key in ((d, "fwd_xf"), (a, "fwd_zf")):
+            if which.any():
+                raw = np.asarray(sens[key]).reshape(which.sum(), self.nq, count)
+                dx[ks][:, which, :] = raw.transpose(2, 0, 1) * scale[which][None, :, None]
+
+
+@lru_cache(maxsize=64)
+def _integrators(plugin: str, rtol: float, atol: float, key: str, nq: int) -> list[_Integrators]:
+    return []
+
+
+def _pieces(grid: Grid) -> Iterator[tuple[int, int]]:
+    """Yield (first sample, number of intervals) of stretches under one constant input and sample time."""
+    dt = grid.dt
+    flat = (grid.u0 == grid.u1).all(axis=1)
+    same = np.zeros(len(dt), bool)  # interval k continues interval k-1
+    same[1:] = (flat[1:] & flat[:-1] & (grid.u0[1:] == grid.u0[:-1]).all(axis=1)
+                & (np.abs(np.diff(dt)) < 1e-6 * dt[1:]))
+    starts = np.append(np.flatnonzero(~same), len(dt))
+    for a, b in zip(starts[:-1], starts[1:], strict=True):
+        while a < b:
+            count = 1 << min((b - a).bit_length() - 1, LONGEST)
+            yield int(a), int(count)
+            a += count
+
+
+def _state_scale(system: System, grid: Grid, x0: Array, p: Array) -> Array:
+    """Rough sizes of the states on this record, for the solver's tolerances only."""
+    from motorid.integrate.rosenbrock import Rosenbrock
+
+    try:
+        size = np.abs(Rosenbrock().run(system, grid, x0, p).x).max(axis=0)
+    except SimulationError:
+        size = np.abs(x0)
+    return np.where((size > 1e-12) & np.isfinite(size), size, 1.0)
+
+
+def observe(system: System, grid: Grid, x: Array, dx: Array | None, p: Array, dp: Array | None) -> Trajectory:
+    """Return the outputs along a state trajectory."""
+    from motorid.integrate.rosenbrock import stepper
+
+    traj, _ = stepper(system).observe(grid, x, dx, p, dp, None, None, None)
+    return traj
