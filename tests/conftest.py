@@ -25,6 +25,12 @@ def plant():
     return load_plant()
 
 
+@pytest.fixture(scope="session")
+def lab(plant):
+    """The plant's motor of a teaching bench."""
+    return plant.MOTORS["lab"]
+
+
 def real_folder() -> Path | None:
     """MOTORID_REAL_DATA, or else shared/data/real in a folder above this file; None if there is none."""
     named = os.environ.get("MOTORID_REAL_DATA")

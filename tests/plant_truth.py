@@ -1,0 +1,57 @@
+"""Sizes of the plant's effects on the lab motor, and the plain motor by the matrix exponential."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import linalg
+
+NUMBERS = {  # one plausible size of every effect
+    "brush_drop": {"V_b": 0.6, "i_b": 0.1},
+    "winding_heating": {"R_th": 5.0, "C_th": 8.0},
+    "inductance_saturation": {"i_L": 3.0},
+    "magnetic_saturation": {"i_K": 6.0},
+    "driver_dead_band": {"V_d": 0.3},
+    "voltage_offset": {"V_0": 0.1},
+    "coulomb": {"tau_c": 5e-3},
+    "coulomb_asymmetric": {"tau_cp": 4e-3, "tau_cn": 7e-3},
+    "stribeck": {"tau_c": 4e-3, "tau_s": 7e-3, "omega_s": 4.0},
+    "quadratic_drag": {"c_2": 2e-6},
+    "constant_load": {"tau_0": 3e-3},
+    "gravity": {"mgl": 2e-2, "phi_g": 0.3},
+    "cogging": {"A": 4e-3, "N": 12, "phi": 0.5},
+    "torque_ripple": {"a_r": 0.1, "N_r": 12, "phi_r": 0.2},
+    "load_friction": {"mu": 0.15},
+    "viscous_asymmetric": {"b_a": 2e-5},
+    "lugre": {"sigma_0": 0.5, "sigma_1": 1e-3, "tau_c": 4e-3, "tau_s": 6e-3, "omega_s": 4.0},
+    "compliance": {"k_s": 2.0, "c_s": 1e-3, "J_l": 2e-5},
+    "backlash": {"gap": 0.03, "k_s": 5.0, "c_s": 2e-3, "J_l": 2e-5},
+    "speed_lag": {"T_w": 5e-3},
+    "current_lag": {"T_i": 2e-3},
+    "speed_delay": {"T_d": 8e-3},
+    "current_offset": {"i_0": 0.03},
+    "speed_gain": {"k_w": 0.05},
+    "angle_friction": {"tau_c": 5e-3, "c": 0.6},
+    "cam": {"A": 2e-2},
+    "grease_warm_up": {"tau_c": 4e-3, "extra": 1.0, "t_g": 1.0},
+    "supply_sag": {"s": 0.2},
+    "root_drag": {"c_r": 5e-4},
+    "belt_splice": {"tau": 4e-3, "width": 1.5, "ratio": 0.4},
+}
+
+
+def state_space(m):
+    A = np.array([[-m.R / m.L, -m.K / m.L, 0], [m.K / m.J, -m.b / m.J, 0], [0, 1, 0]])
+    return A, np.array([[1 / m.L], [0], [0]])
+
+
+def by_expm(m, t, v):
+    A, B = state_space(m)
+    E = linalg.expm(np.block([[A, B], [np.zeros((1, 4))]]) * (t[1] - t[0]))
+    x = np.zeros((len(t), 3))
+    for k in range(len(t) - 1):
+        x[k + 1] = E[:3, :3] @ x[k] + E[:3, 3] * v[k]
+    return x
+
+
+def largest(error, reference):
+    return np.max(np.abs(error)) / np.max(np.abs(reference))

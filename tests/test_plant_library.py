@@ -1,0 +1,66 @@
+"""The library's smooth effects against the same effects in the independent plant, one by one."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from plant_truth import NUMBERS
+from scipy.integrate import solve_ivp
+
+from motorid.effects import LIBRARY
+from motorid.model import dc_motor
+
+# Root mean square of the difference over that of the signal. What is not exact in the library, and why:
+# sgn is smoothed; the delay is a Padé approximation; in a smoothed gap the damping can pull for a moment.
+INEXACT = {"coulomb": 5e-4, "coulomb_asymmetric": 5e-4, "stribeck": 5e-4, "load_friction": 2e-4,
+           "viscous_asymmetric": 1e-5, "current_lag": 2e-5, "speed_delay": 0.04, "backlash": 0.04}
+
+
+def in_library_words(name, numbers, motor):
+    """Numbers of the plant's effect as the library's parameters, and the total inertia."""
+    n, J = dict(numbers), motor.J
+    if name in ("compliance", "backlash"):
+        J_l, k_s, c_s = n.pop("J_l"), n.pop("k_s"), n.pop("c_s")
+        J = motor.J + J_l
+        resonance = np.sqrt(k_s / motor.J + k_s / J_l)
+        shaft = (J_l / J, resonance, c_s * resonance / (2 * k_s))
+        words = ("r_load", "omega_r", "zeta_r") if name == "compliance" else ("r_gap", "omega_c", "zeta_c")
+        n |= dict(zip(words, shaft, strict=True))
+    if name == "lugre":
+        theta_s = n["tau_c"] / n.pop("sigma_0")
+        n |= {"s_b": n.pop("tau_s") / n["tau_c"], "theta_s": theta_s}
+        assert n.pop("sigma_1") * n["omega_s"] == pytest.approx(n["tau_c"])  # the library's bristle damping
+    return n, J
+
+
+def by_library(model, t, v):
+    """Sensed i and omega of a motorid model from rest, by SciPy's LSODA."""
+    system = model.system(("i", "omega"))
+    p = np.array([model.values[name] for name in system.parameters])
+    x, rows = np.array(system.initial([0, 0, 0], p)).ravel(), []
+    for volts, dt in zip(v, np.diff(t, append=2 * t[-1] - t[-2]), strict=True):
+        rows.append(np.array(system.out(x, volts, p)).ravel())
+        rhs = lambda _, x, u=volts: np.array(system.rhs(x, u, p)).ravel()  # noqa: E731
+        x = solve_ivp(rhs, (0, dt), x, method="LSODA", rtol=1e-7, atol=1e-10).y[:, -1]
+    return np.array(rows).T
+
+
+@pytest.mark.parametrize("name", list(LIBRARY))
+def test_library_effect_does_what_the_plant_does(plant, name):
+    motor = plant.MOTORS["lab"]
+    numbers, J = in_library_words(name, NUMBERS[name], motor)
+    model = dc_motor(R=motor.R, L=motor.L, K=motor.K, b=motor.b, J=J) + LIBRARY[name]
+    t, v = plant.staircase([2, -1, 0.6, 0], 0.05)
+    r = plant.simulate(motor, {name: NUMBERS[name]}, t, v)
+    for channel, y in zip(("i", "omega"), by_library(model.replace(**numbers), t, v), strict=True):
+        error = np.sqrt(np.mean((y - r[channel]) ** 2) / np.mean(r[channel] ** 2))
+        assert error < INEXACT.get(name, 1e-6), channel
+
+
+def test_the_library_and_the_plant_know_the_same_effects_by_the_same_words(plant):
+    assert set(plant.LIBRARY) == set(LIBRARY)
+    assert set(NUMBERS) == set(plant.LIBRARY) | set(plant.BEYOND)
+    assert len(plant.BEYOND) >= 3
+    shaped_otherwise = {"lugre", "compliance", "backlash"}  # a stiffness there, a frequency here
+    for name in set(LIBRARY) - shaped_otherwise:
+        assert set(NUMBERS[name]) <= {p.name for p in LIBRARY[name].parameters}, name
