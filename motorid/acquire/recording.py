@@ -16,6 +16,7 @@ SENTENCES = {
     "duration": "The time asked for is over; the motor was stopped.",
     "interrupted": "Stopped by hand; the motor was stopped.",
     "limit": "The current limit was reached; the motor was switched off. Lower the voltage or raise the limit.",
+    "emergency": "The emergency stop of the bench was opened; the motor was switched off.",
     "watchdog": "The device heard nothing from this computer for a second and switched the motor off.",
     "unplugged": "The device is gone (unplugged, or its port was closed). Plug it in again and go on with --resume.",
     "silent": "The device stopped talking. See whether it is powered, then go on with --resume.",
@@ -48,7 +49,7 @@ class Recording:
     header : Header
         Of the device, as calibrated.
     ended : str
-        ``done``, ``duration``, ``interrupted``, ``limit``, ``watchdog``, ``unplugged``, ``silent``, ``restarted`` or
+        ``done``, ``duration``, ``interrupted``, ``limit``, ``emergency``, ``watchdog``, ``unplugged``, ``silent``, ``restarted`` or
         ``disk``.
     detail : str
         What the system said, for the last ones.

@@ -22,7 +22,7 @@ __all__ = ["Run", "Setup"]
 OVER_LIMIT = 3  # samples in a row beyond the current limit that make the computer stop the motor too
 LAST_WORDS = 1.5  # s to wait for the device to say how many samples it made
 LOOK = 0.25  # s between two reports of progress
-REASONS = {"limit": "limit", "silent": "watchdog", "stop": "interrupted"}  # the device's word -> ours, else done
+REASONS = {"limit": "limit", "emergency": "emergency", "silent": "watchdog", "stop": "interrupted"}  # the device's word -> ours, else done
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,6 +22,7 @@ __all__ = ["VirtualDevice"]
 
 LINES_PER_TURN = 4096  # encoder counts, after quadrature
 NOISE = 0.5  # standard deviation of the converters' noise, in counts
+BLOCK = 256  # samples whose noise is drawn at once
 OVER_LIMIT = 3  # samples in a row beyond the current limit that switch the motor off
 
 
@@ -59,7 +60,9 @@ class VirtualDevice:
         self._segments: list[Segment] = []
         self._armed, self.running = False, False
         self._start: tuple[int, int] = (counter0, time0)
-        self._made, self._why = 0, "end"
+        self._made, self._over, self._why = 0, 0, "end"
+        self._noise: list[list[float]] = []
+        self._volts: list[int] = []
         self.heard = 0.0  # clock of the computer when the last valid frame came
         self._raw = [_CONVERT[c] for c in channels]
 
@@ -92,7 +95,9 @@ class VirtualDevice:
     def _sample(self) -> bytes:
         mv = self._volts[self._made] if self._segments else 0
         seen = self._plant.measured()
-        m, noise = self.truth.motor, self._noise[self._made % len(self._noise)]
+        if not self._made % BLOCK:
+            self._noise = self._rng.normal(0.0, NOISE, size=(BLOCK, 2)).tolist()
+        m, noise = self.truth.motor, self._noise[self._made % BLOCK]
         raw = [convert(m, mv, seen, noise) for convert in self._raw]
         line = frame("D", self._counter, self._time, *raw)
         self._over = self._over + 1 if abs(seen["i"]) > self._limits[1] else 0
@@ -141,7 +146,6 @@ class VirtualDevice:
             rate = self.header.rate
             volts = [s.volts(rate) for s in self._segments] or [np.zeros(0)]
             self._volts = np.round(np.concatenate(volts) * 1e3).astype(int).tolist()
-            self._noise = self._rng.normal(0.0, NOISE, size=(50_021, 2)).tolist()
             self._plant = load_plant().Plant(self.truth.motor, self.truth.effects)
             self._start, self._made, self._over = (self._counter, self._time), 0, 0
             self._armed, self.running = False, True

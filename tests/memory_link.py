@@ -1,0 +1,41 @@
+"""A link that lives in memory: a virtual device behind a faulty wire, as fast as it is read."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+from motorid.acquire.faults import Faults, Wire
+from motorid.acquire.link import LinkLost
+from motorid.acquire.virtual import VirtualDevice
+
+
+class MemoryLink:
+    """Also the fake of a port that can be unplugged after so many bytes, or lose what is sent to the device."""
+
+    def __init__(self, device: VirtualDevice, wire: Wire | None = None, step: int = 50,
+                 unplug_after: int | None = None, deaf: float = 0.0) -> None:
+        self.device, self.step, self.left, self.deaf = device, step, unplug_after, deaf
+        self.wire = wire or Wire(Faults(), np.random.default_rng(0))
+        self.commands: list[bytes] = []
+        self.out, self.closed = b"", False
+
+    def write(self, data: bytes) -> None:
+        self.commands.append(data)
+        if not (self.deaf and self.wire.rng.random() < self.deaf):
+            self.out += self.device.receive(data, time.monotonic())
+
+    def read(self, timeout: float) -> bytes:
+        self.out += self.wire.carry(self.device.run(self.step))
+        data, self.out = self.out, b""
+        if self.left is not None and self.device.running:
+            data = data[:self.left]
+            self.left -= len(data)
+            if not data:
+                raise LinkLost("the cable was pulled out.")
+        if not data:
+            time.sleep(min(timeout, 0.002))
+        return data
+
+    def close(self) -> None:
+        self.closed = True
