@@ -52,15 +52,16 @@ def build(columns: Mapping[str, Array], texts: Texts, layout: Layout, *, name: s
     v = _held(values.pop("v"), places["v"].column, said)
     outputs = {c: a for c, a in values.items() if _has_values(c, a, places[c].column, said)}
     if not outputs:
-        raise DataError(f"every sample of {', '.join(repr(places[c].column) for c in values)} is missing; "
-                        "there is nothing measured to fit.")
+        raise DataError(f"every sample of {', '.join(repr(places[c].column) for c in values)} is "
+                        "missing; there is nothing measured to fit.")
     _note_gaps(t, said)
     used = {p.column for p in layout.places.values()}
     extra = {c: a[rows] for c, a in columns.items() if c not in used}
     if set(texts) - used:
         said.append(f"left out columns of text: {', '.join(sorted(set(texts) - used))}.")
     facts = {"notes": said, "extra": extra, "columns": {c: p.column for c, p in layout.places.items()},
-             "original_units": {c: p.unit.label for c, p in layout.places.items()}}
+             "original_units": {c: p.unit.label for c, p in layout.places.items()},
+             "assumed_units": [c for c, p in layout.places.items() if not p.stated]}
     units = {c: places[c].unit.symbol for c in ("v", *outputs)}
     try:
         return Experiment(t, {"v": v}, outputs, sigma=sigma or {}, units=units, name=name,
@@ -122,16 +123,16 @@ def _rows_in_order(t: Array, column: str, said: list[str]) -> NDArray[np.intp]:
     if len(stretches) > 1:
         longest = max(stretches, key=len)
         if len(longest) < MIN_SAMPLES:
-            raise DataError(f"time does not increase: '{column}' goes back {len(stretches) - 1} times in "
-                            f"{len(rows)} rows. Is it the right column? Expected rows in order of time.")
+            raise DataError(f"time does not increase: '{column}' goes back {len(stretches) - 1} times "
+                            f"in {len(rows)} rows. Is it the right column? Expected rows in order of time.")
         said.append(f"time starts again {len(stretches) - 1} times; kept the longest stretch, rows "
-                    f"{longest[0] + 1} to {longest[-1] + 1}, and left out {len(rows) - len(longest)} rows. "
-                    "Save each run in a file of its own to use all.")
+                    f"{longest[0] + 1} to {longest[-1] + 1}, and left out {len(rows) - len(longest)} "
+                    "rows. Save each run in a file of its own to use all.")
         rows = rows[longest]
     moving = rows[np.r_[True, t[rows][1:] > np.maximum.accumulate(t[rows])[:-1]]]
     if len(moving) < len(rows):
-        said.append(f"left out {len(rows) - len(moving)} of {len(rows)} rows whose time stamp repeats an "
-                    "earlier one or goes back.")
+        said.append(f"left out {len(rows) - len(moving)} of {len(rows)} rows whose time stamp repeats "
+                    "an earlier one or goes back.")
     return moving
 
 
@@ -183,5 +184,5 @@ def _note_gaps(t: Array, said: list[str]) -> None:
     if gaps.size:
         worst = gaps[np.argmax(steps[gaps])]
         how_many = "a gap in time," if gaps.size == 1 else f"{gaps.size} gaps in time, the longest"
-        said.append(f"{how_many} {steps[worst]:.4g} s after t = {t[worst]:.6g} s; the input is taken as going "
-                    "on there.")
+        said.append(f"{how_many} {steps[worst]:.4g} s after t = {t[worst]:.6g} s; the input is taken as "
+                    "going on there.")
