@@ -91,7 +91,7 @@ def bench(
     seed = secrets.randbelow(1_000_000) if seed is None else seed
     truth, names = hide(effect, motor, seed), tuple(channels.replace(" ", "").split(","))
     VirtualDevice(truth, rate, names)  # complain before anything opens
-    wire = Wire(Faults(drop, garbage, cut, flip), np.random.default_rng([seed, 2]), keep=False)
+    wire = Wire(Faults(drop, garbage, cut, flip), np.random.default_rng([seed, 2]))
     end = open_end(link, socket)
     typer.echo(f"port: {end.name}")
     typer.echo(f"A virtual motor '{motor}' at {rate:g} samples per second; now, in another terminal:\n"

@@ -18,7 +18,8 @@ class MemoryLink:
         self.device, self.step, self.left, self.deaf = device, step, unplug_after, deaf
         self.wire = wire or Wire(Faults(), np.random.default_rng(0))
         self.commands: list[bytes] = []
-        self.out, self.closed = b"", False
+        self.made: list[bytes] = []  # sample lines, before anything happens to them
+        self.out, self.passed, self.closed = b"", b"", False
 
     def write(self, data: bytes) -> None:
         self.commands.append(data)
@@ -26,13 +27,16 @@ class MemoryLink:
             self.out += self.device.receive(data, time.monotonic())
 
     def read(self, timeout: float) -> bytes:
-        self.out += self.wire.carry(self.device.run(self.step))
+        frames = self.device.run(self.step)
+        self.made += [f[:-1] for f in frames if f.startswith(b"$D")]
+        self.out += self.wire.carry(frames)
         data, self.out = self.out, b""
-        if self.left is not None and self.device.running:
-            data = data[:self.left]
+        if self.left is not None:
+            data, was = data[:self.left], self.left
             self.left -= len(data)
-            if not data:
+            if not was:
                 raise LinkLost("the cable was pulled out.")
+        self.passed += data
         if not data:
             time.sleep(min(timeout, 0.002))
         return data

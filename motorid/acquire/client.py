@@ -6,7 +6,7 @@ import math
 import time
 
 from motorid.acquire.excitation import Program
-from motorid.acquire.link import Link
+from motorid.acquire.link import Link, LinkLost
 from motorid.acquire.protocol import Decoder, Header, Message, Sample, frame
 from motorid.errors import DeviceError
 
@@ -51,6 +51,8 @@ class Client:
             header = Header.read(self.ask("?", "H", within=BOOT))
         except TimeoutError:
             raise DeviceError(self._nobody()) from None
+        except LinkLost as error:
+            raise DeviceError(f"{error} Nobody had answered yet: is it in use by another recorder?") from None
         self.ask("X", "E,done")
         return header
 

@@ -1,8 +1,9 @@
-"""Faults on the wire, on demand and from a seed, with an account of what came through."""
+"""Faults on the wire, on demand and from a seed."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from collections import deque
+from dataclasses import dataclass, fields
 
 import numpy as np
 
@@ -29,27 +30,17 @@ class Faults:
                 raise UsageError(f"--{f.name} is a probability from 0 to 1; got {getattr(self, f.name)}.")
 
 
-@dataclass
 class Wire:
-    """Carries frames to the computer, not always whole.
+    """Carries frames to the computer, not always whole; only sample lines are harmed."""
 
-    Attributes
-    ----------
-    delivered : list of bytes
-        The lines that came through whole, in order, without their newline and without repetitions.
-    damaged : int
-        Lines that did not.
-    """
-
-    faults: Faults
-    rng: np.random.Generator
-    delivered: list[bytes] = field(default_factory=list)
-    damaged: int = 0
-    keep: bool = True  # the account, too; a bench that runs for days does not
+    def __init__(self, faults: Faults, rng: np.random.Generator) -> None:
+        self.faults, self.rng = faults, rng
+        self._faulty = any(vars(faults).values())
+        self._lately: deque[bytes] = deque(maxlen=5)
 
     def carry(self, frames: list[bytes]) -> bytes:
-        """Return the bytes that arrive of these frames; only sample lines are harmed."""
-        if not any(vars(self.faults).values()) and not self.keep:
+        """Return the bytes that arrive of these frames."""
+        if not self._faulty:
             return b"".join(frames)
         return b"".join([self._one(f) if f.startswith(b"$D") else f for f in frames])
 
@@ -57,24 +48,18 @@ class Wire:
         f, hit = self.faults, self.rng.random(7)
         before = self.rng.bytes(int(self.rng.integers(1, 41))) if hit[0] < f.garbage else b""
         if hit[1] < f.drop:
-            line = b""
-        elif hit[2] < f.cut:
-            line = self._cut(line)
-        elif hit[3] < f.flip:
-            line = self._flip(line)
-        else:
-            old = self.delivered[-1 - int(self.rng.integers(min(5, len(self.delivered))))] + b"\n" \
-                if hit[4] < f.swap and self.delivered else b""
-            if self.keep or f.swap:
-                self.delivered.append(line[:-1])
-                del self.delivered[:0 if self.keep else -5]
-            line = line[:-1] if hit[5] < f.glue else line
-            return before + line + (line if hit[6] < f.repeat else b"") + old
-        self.damaged += 1
-        return before + line
+            return before
+        if hit[2] < f.cut:
+            return before + self._cut(line)
+        if hit[3] < f.flip:
+            return before + self._flip(line)
+        late = self._lately[self.rng.integers(len(self._lately))] if hit[4] < f.swap and self._lately else b""
+        self._lately.append(line)
+        came = line[:-1] if hit[5] < f.glue else line
+        return before + came + (came if hit[6] < f.repeat else b"") + late
 
     def _cut(self, line: bytes) -> bytes:
-        at = int(self.rng.integers(1, len(line) - 2))  # the CRC's last digit or the $ goes
+        at = int(self.rng.integers(1, len(line) - 2))
         return line[:at] if self.rng.random() < 0.5 else line[at:]
 
     def _flip(self, line: bytes) -> bytes:

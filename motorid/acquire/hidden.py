@@ -44,7 +44,6 @@ SIZES: Mapping[str, Callable[[Any, Draw], dict[str, float]]] = {
     "gravity": lambda m, draw: {"mgl": _stall(m) * draw(0.04, 0.1)},
     "cogging": lambda m, draw: {"A": _stall(m) * draw(0.03, 0.06), "N": float(round(draw(3.6, 12.4))), "phi": 0.5},
     "load_friction": lambda m, draw: {"mu": draw(0.06, 0.15)},
-    "viscous_asymmetric": lambda m, draw: {"b_a": m.b * draw(0.5, 0.9)},
     "brush_drop": lambda m, draw: {"V_b": m.v_max * draw(0.04, 0.08), "i_b": m.v_max / m.R * 0.01},
     "driver_dead_band": lambda m, draw: {"V_d": m.v_max * draw(0.03, 0.07)},
     "voltage_offset": lambda m, draw: {"V_0": m.v_max * draw(0.02, 0.05)},

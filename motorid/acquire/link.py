@@ -88,8 +88,11 @@ class SerialLink:
         """Stop the thread and let the port go."""
         self._closing = True
         self._thread.join(timeout=1.0)
+        wire = getattr(self._serial, "_socket", None)  # pyserial leaves it open when the other end went first
         with contextlib.suppress(OSError):
             self._serial.close()
+        if wire is not None:
+            wire.close()
 
     def _pump(self) -> None:
         try:
@@ -135,6 +138,8 @@ def _why_not(port: str, baud: int, error: Exception) -> str:
     number = getattr(error, "errno", None)
     if isinstance(error, ValueError):
         return f"{port} cannot be opened at {baud} baud: {error}."
+    if "://" in port:
+        return f"{port} cannot be opened: {str(error).removeprefix(f'Could not open port {port}: ')}."
     if number == errno.ENOENT or ("could not open port" in str(error).lower() and not number):
         return f"there is no port {port}. {_known_ports()}"
     if number in (errno.EACCES, errno.EPERM):

@@ -73,17 +73,19 @@ class Run:
 
     def _record(self) -> None:
         items = self.s.client.inbox
-        while not self.ended:
-            try:
+        try:
+            while True:
                 self._take(items)
                 self.s.file.flush()
                 self._watch()
+                if self.ended:  # only here: what was received is on its way to the disk
+                    return
                 self.s.client.keep_alive()
                 items = self.s.client.receive(0.05)
-            except LinkLost as error:
-                self._end("unplugged", str(error))
-            except OSError as error:
-                self._end("disk", error.strerror or str(error))
+        except LinkLost as error:
+            self._end("unplugged", str(error))
+        except OSError as error:
+            self._end("disk", error.strerror or str(error))
 
     def _take(self, items: list[Sample | Message]) -> None:
         now = time.monotonic()

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Protocol
 
 from motorid.acquire.faults import Wire
-from motorid.acquire.protocol import SILENCE, frame
+from motorid.acquire.protocol import SILENCE
 from motorid.acquire.virtual import VirtualDevice
 from motorid.errors import UsageError
 
@@ -124,7 +124,7 @@ class Socket:
         ready, _, _ = select.select([self._server, *peer], peer if writing else [], [], timeout)
         if self._server in ready:
             with contextlib.suppress(OSError):
-                self._greet(self._server.accept()[0])
+                self._answer(self._server.accept()[0])
 
     def read(self) -> bytes:
         """Return what the computer sent."""
@@ -152,14 +152,12 @@ class Socket:
             self._hang_up()
             return len(data)
 
-    def _greet(self, peer: socket.socket) -> None:
+    def _answer(self, peer: socket.socket) -> None:
         if self._peer is None:
             peer.setblocking(False)
             self._peer = peer
-            return
-        with contextlib.suppress(OSError):
-            peer.sendall(frame("E", "refused", "the bench is in use by another recorder"))
-        peer.close()
+        else:
+            peer.close()
 
     def _hang_up(self) -> None:
         if self._peer:
