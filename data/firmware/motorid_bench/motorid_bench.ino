@@ -71,6 +71,7 @@ void loop() {
   if ((int32_t)(now - next) < 0) return;
   next += 1000000 / RATE;
   int32_t current = analogRead(CURRENT), where = angle, mV = bench.next_mV();
+  if (!bench.running()) return;  // that was the end of the program
   apply(mV);
   bench.sample(now, mV, current, where);
 }
