@@ -76,8 +76,8 @@ def _clipped(run: Experiment) -> str | None:
             if _at_stop(y, float(top)):
                 share = 100 * float(np.mean(y == top))
                 return (f"the {_NAMES[channel]} stays at exactly {top:.4g} {run.units[channel]} in "
-                        f"{share:.0f} % of the samples: clipped at the limit of the sensor or the drive. Use a "
-                        "lower voltage, or mark these samples as missing.")
+                        f"{share:.0f} % of the samples: clipped at the limit of the sensor or the drive. Use "
+                        "a lower voltage, or mark these samples as missing.")
     return None
 
 
@@ -140,8 +140,8 @@ def _slow_sampling(run: Experiment) -> str | None:
     clear = np.isfinite(first) & (full > 10 * noise)
     if clear.sum() and float(np.median(np.abs(first[clear]) / full[clear])) > 0.9:
         return (f"after a voltage step the current is there within one sample ({1e3 * run.dt:.3g} ms): "
-                "the sampling is too slow to see the inductance. Fix L (it hardly matters here), or sample "
-                "faster.")
+                "the sampling is too slow for the inductance, so L will be uncertain. Sample faster, or "
+                "fix L: it hardly matters here.")
     return None
 
 

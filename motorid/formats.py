@@ -11,7 +11,7 @@ import numpy as np
 
 from motorid.errors import DataError, MissingDependency
 from motorid.experiment import MIN_SAMPLES
-from motorid.table import Table, numbers, unique_labels
+from motorid.table import Table, counted, numbers, unique_labels
 
 __all__ = ["mat_table", "parquet_table"]
 
@@ -70,7 +70,7 @@ def parquet_table(data: bytes) -> Table:
     for label, (_, series) in zip(labels, frame.items(), strict=True):
         if pd.api.types.is_numeric_dtype(series.dtype) and not pd.api.types.is_complex_dtype(series.dtype):
             columns[label], bad = numbers(series)
-            notes += [f"{bad} cells of '{label}' are infinite and count as missing."] if bad else []
+            notes += [f"{counted(bad, 'cell')} of '{label}' infinite; taken as missing."] if bad else []
         else:
             texts[label] = series.astype(str).tolist()
     return Table(columns, texts, labels, notes=notes)

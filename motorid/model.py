@@ -6,6 +6,7 @@ import importlib
 import inspect
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from typing import Any
 
 import casadi as ca
@@ -277,7 +278,7 @@ class Model:
             raise ModelError(f"the base '{self.base}' has no current: leave the channel 'i' out, or use dc_motor().")
         key = (chosen, self.stored)
         if key not in self._systems:
-            self._systems[key] = build_system(self.write(), tuple(self.parameters), chosen, self.stored)
+            self._systems[key] = _shared_system(self, chosen)
         return self._systems[key]
 
     def __getstate__(self) -> dict[str, Any]:
@@ -285,6 +286,20 @@ class Model:
 
     def __repr__(self) -> str:
         return f"<model {' + '.join([self.base, *self.effect_names])}: {', '.join(self.free_names)}>"
+
+
+@lru_cache(maxsize=256)
+def _systems_of(structure: Any) -> list[System]:
+    return []
+
+
+def _shared_system(model: Model, outputs: tuple[str, ...]) -> System:
+    """Return the system of the model's structure, shared by all models that differ in values only."""
+    laws = tuple((e.name, e.law) for e in model.effects)
+    slot = _systems_of((model.base, laws, tuple(model.parameters), model.angle_input, outputs, model.stored))
+    if not slot:
+        slot.append(build_system(model.write(), tuple(model.parameters), outputs, model.stored))
+    return slot[0]
 
 
 _STATES = {"dc_motor": ("i", "omega"), "torque_driven": ("omega",)}

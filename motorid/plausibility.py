@@ -71,7 +71,7 @@ def magnitudes(run: Experiment) -> str | None:
     stated = run.meta.get("original_units", {})
     assumed = "omega" in run.meta.get("assumed_units", ())
     limits = {"v": (1000.0, "V", "mV"), "i": (1000.0, "A", "mA"),
-              "omega": (1000.0 if assumed else 3000.0, "rad/s", "rpm")}
+              "omega": (800.0 if assumed else 3000.0, "rad/s", "rpm")}
     for channel, (limit, unit, likely) in limits.items():
         values = run.inputs.get(channel, run.outputs.get(channel))
         if values is None or run.units[channel] != unit:

@@ -24,7 +24,7 @@ __all__ = ["RECORDS", "find_records", "read_csv", "read_mat", "read_parquet", "r
 Path_ = str | os.PathLike[str]
 RECORDS = (".csv", ".txt", ".tsv", ".dat", ".log", ".mat", ".parquet", ".pq")
 _HEADERS = {("t", "s"): "time_s", ("v", "V"): "voltage_V", ("v", "A"): "command_A",
-            ("v", "N·m"): "command_Nm", ("v", "N"): "command_N", ("v", "1"): "command",
+            ("v", "N·m"): "command_Nm", ("v", "N"): "command_N", ("v", "1"): "command (1)",
             ("i", "A"): "current_A", ("omega", "rad/s"): "speed_rad_s", ("omega", "m/s"): "speed_m_s",
             ("theta", "rad"): "angle_rad", ("theta", "m"): "position_m"}
 _OWN = re.compile(r"#\s*motorid (columns|hold|sigma): (.*)")  # what write_csv says about its own file

@@ -12,13 +12,14 @@ from numpy.typing import NDArray
 from motorid.errors import DataError
 from motorid.experiment import MIN_SAMPLES, Experiment
 from motorid.layout import Layout, Place
+from motorid.table import counted
 
 __all__ = ["build"]
 
 Array = NDArray[np.float64]
 Texts = Mapping[str, Sequence[object]]
 
-_LATE = 5  # this many rows in a row may come late before it counts as a new start of time
+_LATE = 2  # this many rows in a row may come late before it counts as a new start of time
 
 
 def build(columns: Mapping[str, Array], texts: Texts, layout: Layout, *, name: str, hold: str,
@@ -81,8 +82,10 @@ def _channel(columns: Mapping[str, Array], texts: Texts, place: Place, channel: 
 
 
 def _time(columns: Mapping[str, Array], texts: Texts, place: Place, said: list[str]) -> Array:
-    raw = _dates(texts[place.column], place.column) if place.column in texts else columns[place.column]
-    factor = 1.0 if place.column in texts else place.unit.factor
+    if place.column in texts:
+        said.append(f"'{place.column}' holds dates or clock times; counted in seconds from the first.")
+        return _dates(texts[place.column], place.column)
+    raw, factor = columns[place.column], place.unit.factor
     start = raw[np.isfinite(raw)][:1]
     if start.size and abs(start[0] * factor) > 1e8:  # seconds since 1970 leave no digits for microseconds
         said.append(f"time starts at {start[0] * factor:.6f} s; counted from there.")
@@ -100,7 +103,7 @@ def _dates(cells: Sequence[object], column: str) -> Array:
             stamps = pd.to_datetime(series, errors="coerce", format="ISO8601", utc=True)
             dated = stamps.notna().mean() > 0.5
             spans = stamps - stamps.min() if dated else pd.to_timedelta(series, errors="coerce")
-            seconds = spans.dt.total_seconds().to_numpy(dtype=float)
+            seconds = (spans - spans.min()).dt.total_seconds().to_numpy(dtype=float)
         except (ValueError, TypeError, OverflowError, AttributeError):
             seconds = np.full(len(series), np.nan)
     if np.isnan(seconds).mean() > 0.5:
@@ -113,26 +116,35 @@ def _rows_in_order(t: Array, column: str, said: list[str]) -> NDArray[np.intp]:
     """Return the rows with a time that moves on: the longest stretch without a restart, without repeats."""
     rows = np.flatnonzero(np.isfinite(t))
     if len(rows) < len(t):
-        said.append(f"left out {len(t) - len(rows)} of {len(t)} rows without a time.")
-    if not len(rows):
-        raise DataError(f"the time column '{column}' holds no number.")
+        said.append(f"left out {counted(len(t) - len(rows), 'row')} of {len(t)}: no time is given.")
+    if len(rows) < MIN_SAMPLES:
+        raise DataError(f"a run needs at least {MIN_SAMPLES} samples; here {counted(len(rows), 'row')} of "
+                        f"{len(t)} hold a time in '{column}'.")
     if np.ptp(t[rows]) == 0:
         raise DataError(f"time does not move: '{column}' is {t[rows[0]]:g} s in every row. "
                         "Is it the right column?")
+    total = len(rows)
+    now = t[rows]
+    ahead = (now[1:-1] > now[2:]) & (now[2:] > now[:-2])  # a stamp that jumps ahead and is not followed
+    rows = rows[np.r_[True, ~ahead, True]]
     stretches = _stretches(t[rows])
+    longest = max(stretches, key=len)
+    again = counted(len(stretches) - 1, "time")
+    if len(stretches) > 1 and len(longest) < MIN_SAMPLES:
+        raise DataError(f"time does not increase: '{column}' goes back {again} in {total} rows. Is it "
+                        "the right column? Expected rows in order of time.")
     if len(stretches) > 1:
-        longest = max(stretches, key=len)
-        if len(longest) < MIN_SAMPLES:
-            raise DataError(f"time does not increase: '{column}' goes back {len(stretches) - 1} times "
-                            f"in {len(rows)} rows. Is it the right column? Expected rows in order of time.")
-        said.append(f"time starts again {len(stretches) - 1} times; kept the longest stretch, rows "
-                    f"{longest[0] + 1} to {longest[-1] + 1}, and left out {len(rows) - len(longest)} "
+        said.append(f"time starts again {again}; kept the longest stretch, {len(longest)} of {total} "
                     "rows. Save each run in a file of its own to use all.")
-        rows = rows[longest]
+        rows, total = rows[longest], len(longest)
     moving = rows[np.r_[True, t[rows][1:] > np.maximum.accumulate(t[rows])[:-1]]]
-    if len(moving) < len(rows):
-        said.append(f"left out {len(rows) - len(moving)} of {len(rows)} rows whose time stamp repeats "
-                    "an earlier one or goes back.")
+    if 2 * len(moving) < total:
+        raise DataError(f"time stands still or goes back in {total - len(moving)} of {total} rows of "
+                        f"'{column}'. Is it the right column? If its clock is too coarse, number the rows "
+                        "and say the step, e.g. columns={'t': 'row'}, units={'t': '0.0002 s'}.")
+    if len(moving) < total:
+        said.append(f"left out {counted(total - len(moving), 'row')} of {total}: the time stamp repeats "
+                    "an earlier one, goes back, or jumps ahead.")
     return moving
 
 
@@ -154,7 +166,8 @@ def _first_input(v: Array, column: str, said: list[str]) -> int:
     if not known.size:
         raise DataError(f"every sample of the input '{column}' is missing; no simulation can do without it.")
     if known[0]:
-        said.append(f"left out the first {known[0]} rows: the input '{column}' is not known there.")
+        said.append(f"left out the first {counted(int(known[0]), 'row')}: the input '{column}' is not "
+                    "known there.")
     return int(known[0])
 
 

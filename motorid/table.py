@@ -15,9 +15,10 @@ from motorid.dialect import MISSING, Dialect, decode, is_data, sniff
 from motorid.errors import DataError
 from motorid.units import parse_unit
 
-__all__ = ["Table", "numbers", "parse_table", "unique_labels"]
+__all__ = ["Table", "counted", "numbers", "parse_table", "unique_labels"]
 
 _COMMENT = ("#", "%", "//")
+_LARGEST = 1e30  # what is larger, or infinite, was not measured
 
 @dataclass(frozen=True)
 class Table:
@@ -68,7 +69,7 @@ def numbers(values: object, decimal: str = ".") -> tuple[NDArray[np.float64], in
     import pandas as pd
 
     series = pd.Series(values)  # type: ignore[call-overload]
-    missing = series.isna().to_numpy()
+    missing = np.array(series.isna(), dtype=bool)
     if pd.api.types.is_numeric_dtype(series.dtype) and not pd.api.types.is_complex_dtype(series.dtype):
         array = series.to_numpy(dtype=float, na_value=np.nan).copy()
     else:
@@ -76,8 +77,13 @@ def numbers(values: object, decimal: str = ".") -> tuple[NDArray[np.float64], in
         text = text.str.replace(",", ".", regex=False) if decimal == "," else text
         array = np.array(pd.to_numeric(text, errors="coerce"), dtype=float)
         missing |= text.str.lower().isin(MISSING).to_numpy()
-    array[np.isinf(array)] = np.nan
+    array[np.abs(array) > _LARGEST] = np.nan
     return array, int(np.count_nonzero(np.isnan(array) & ~missing))
+
+
+def counted(n: int, noun: str) -> str:
+    """Write a number with its noun: 1 row, 2 rows."""
+    return f"{n} {noun}" + ("" if n == 1 else "s")
 
 
 def unique_labels(labels: Sequence[str]) -> list[str]:
@@ -110,7 +116,7 @@ def _header(above: list[str], comments: list[str], dialect: Dialect, width: int,
                         f"'{above[-1][:80]}'.{hint}")
     ignored = len(rows) - (2 if units else 1)
     if ignored:
-        notes.append(f"ignored {ignored} lines above the header, from '{above[0][:60]}' on.")
+        notes.append(f"ignored {counted(ignored, 'line')} above the header, from '{above[0][:60]}' on.")
     return unique_labels(names), units
 
 
@@ -146,9 +152,9 @@ def _rows(lines: list[str], dialect: Dialect, width: int, notes: list[str]) -> l
         elif bare:
             kept.append(bare.lstrip() if dialect.delimiter is None else bare)
     if long:
-        notes.append(f"left out {long} rows with more cells than the header has names.")
+        notes.append(f"left out {counted(long, 'row')} with more cells than the header has names.")
     if short:
-        notes.append(f"{short} rows are shorter than the header; their last cells count as missing.")
+        notes.append(f"{counted(short, 'row')} shorter than the header; the last cells count as missing.")
     return kept
 
 
@@ -166,10 +172,10 @@ def _parse(rows: list[str], dialect: Dialect, labels: list[str],
     columns, texts = {}, {}
     for label, column in zip(labels, frame.columns, strict=True):
         array, bad = numbers(frame[column], dialect.decimal)
-        if bad > 0.5 * np.count_nonzero(frame[column].notna()):
+        if frame[column].dtype.kind not in "fiub" and bad > 0.5 * np.count_nonzero(frame[column].notna()):
             texts[label] = frame[column].astype(str).tolist()
             continue
         columns[label] = array
         if bad:
-            notes.append(f"{bad} cells of '{label}' are not numbers and count as missing.")
+            notes.append(f"{counted(bad, 'cell')} of '{label}' hold no finite number and count as missing.")
     return columns, texts

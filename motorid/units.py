@@ -74,15 +74,15 @@ def parse_unit(text: str) -> Unit | None:
     DataError
         If the number of counts is not a positive number.
     """
-    label = text.strip()
+    label = text.strip("[](){}<> \t")
     scaled = _SCALED.fullmatch(label)
     if scaled:
         unit = parse_unit(scaled[2])
         factor = float(scaled[1])
-        if unit is None or factor == 0 or not math.isfinite(factor):
+        if unit is None or not 1e-50 < abs(factor) < 1e50:
             return None
         return Unit(unit.dimension, factor * unit.factor, unit.symbol, label)
-    word = label.strip("[](){}<> ").translate(_LETTERS).lower().replace("per", "/").replace("^", "")
+    word = label.translate(_LETTERS).lower().replace("per", "/").replace("^", "")
     word = re.sub(r"[\s·*.]", "", word)
     counts = _COUNTS.fullmatch(word)
     if counts:

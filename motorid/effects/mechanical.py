@@ -22,8 +22,8 @@ def coulomb_asymmetric(
     tau_cn=P(2e-3, "N·m", null=0.0, lower=0.0, doc="Coulomb friction turning backward"),
 ):
     """Coulomb friction that differs with the direction. Armstrong-Hélouvry et al., Automatica 30(7), 1994."""
-    forward = (1 + m.sign(m.omega)) / 2
-    m.torque -= tau_cp * forward - tau_cn * (1 - forward) + (tau_cn - tau_cp) * (1 - m.sign(m.omega) ** 2) / 2
+    s = m.sign(m.omega)
+    m.torque -= s * (tau_cp * (1 + s) + tau_cn * (1 - s)) / 2
 
 
 @effect(balance="torque", includes=("coulomb", "coulomb_asymmetric"))
@@ -105,15 +105,16 @@ def viscous_asymmetric(
 def lugre(
     m: Equations,
     tau_c=P(2e-3, "N·m", null=0.0, lower=0.0, doc="Coulomb friction torque at speed"),
-    tau_s=P(3e-3, "N·m", null=0.0, lower=0.0, doc="breakaway torque, at least tau_c"),
+    s_b=P(1.5, "", lower=1.0, upper=10.0, doc="breakaway over Coulomb torque"),
     omega_s=P(5.0, "rad/s", positive=True, grid=(0.03, 0.1), doc="Stribeck speed"),
     theta_s=P(0.01, "rad", positive=True, grid=(0.003, 0.03), doc="presliding angle tau_c/σ0"),
 ):
-    """Bristle friction with presliding. Canudas de Wit et al., IEEE TAC 40(3), 1995; bristles critically damped."""
-    excess = ca.fmax(tau_s - tau_c, 0) / (tau_c + 1e-12)
-    level = 1 + excess * ca.exp(-((m.omega / omega_s) ** 2))  # g(ω)/tau_c
+    """Bristle friction with presliding (LuGre). Canudas de Wit et al., IEEE TAC 40(3), 1995.
+
+    The bristle damping σ1 is σ0 times the time to cross the presliding angle at the Stribeck speed.
+    """
+    level = 1 + (s_b - 1) * ca.exp(-((m.omega / omega_s) ** 2))  # g(ω)/tau_c
     z = m.state("z_bristle")  # deflection over the presliding angle
     rate = (m.omega - ca.fabs(m.omega) * z / level) / theta_s
     m.rate(z, rate)
-    damping = ca.sqrt((tau_c + 1e-12) * m.J / theta_s)  # σ1 of critical damping
-    m.torque -= tau_c * z + damping * theta_s * rate * tau_c / (tau_c + 1e-9)
+    m.torque -= tau_c * (z + theta_s / omega_s * rate)

@@ -39,11 +39,11 @@ def speed_delay(
 ):
     """Pure delay in the speed measurement, Padé approximation of order 2. Golub & Van Loan, 2013, sec. 9.3."""
     reaching = m.measured("omega")
-    # (12 − 6Ts + T²s²)/(12 + 6Ts + T²s²) in a realisation scaled by T; z1 carries the slow part.
+    # (12 − 6Ts + T²s²)/(12 + 6Ts + T²s²) = 1 − Ts·G with G = 12/(12 + 6Ts + T²s²): z1 = G·ω, z2 = T·dz1/dt.
     z1, z2 = m.state("omega_delayed", m.start["omega"]), m.state("omega_delayed_2")
     m.rate(z1, z2 / T_d)
     m.rate(z2, (12 * (reaching - z1) - 6 * z2) / T_d)
-    m.measure("omega", reaching - 12 * z2 / 12)
+    m.measure("omega", reaching - z2)
 
 
 @effect(balance="sensor")

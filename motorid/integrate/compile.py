@@ -21,7 +21,8 @@ import casadi as ca
 
 from motorid.integrate.step import StepFunctions
 
-FLAGS = ("-O2", "-fPIC", "-shared", "-ffp-contract=off", "-fno-math-errno")
+# -Bsymbolic: a name of ours must never be taken from another library.
+FLAGS = ("-O2", "-fPIC", "-shared", "-Wl,-Bsymbolic", "-ffp-contract=off", "-fno-math-errno")
 _told: set[str] = set()
 
 DRIVER = r"""
@@ -34,11 +35,11 @@ long long motorid_run(long long n, const long long* nsub, const double* dt, cons
                       const double* us, const double* x0, const double* xscale, const double* p, long long nq,
                       const double* S0, const double* Pq, double* Y, double* DY, double* X, double* DX, double* E) {
   casadi_int a1, r1, i1, w1, na = 8, nr = 8, ni = 1, nw = 1;
-  step_work(&a1, &r1, &i1, &w1);
+  motorid_light_work(&a1, &r1, &i1, &w1);
   if (a1 > na) na = a1; if (r1 > nr) nr = r1; if (i1 > ni) ni = i1; if (w1 > nw) nw = w1;
-  step_full_work(&a1, &r1, &i1, &w1);
+  motorid_full_work(&a1, &r1, &i1, &w1);
   if (a1 > na) na = a1; if (r1 > nr) nr = r1; if (i1 > ni) ni = i1; if (w1 > nw) nw = w1;
-  out_full_work(&a1, &r1, &i1, &w1);
+  motorid_out_work(&a1, &r1, &i1, &w1);
   if (a1 > na) na = a1; if (r1 > nr) nr = r1; if (i1 > ni) ni = i1; if (w1 > nw) nw = w1;
   const double** arg = malloc(na * sizeof(double*));
   double** res = malloc(nr * sizeof(double*));
@@ -57,7 +58,7 @@ long long motorid_run(long long n, const long long* nsub, const double* dt, cons
     if (DX) memcpy(DX + k * NX * nq, S, NX * nq * sizeof(double));
     arg[0] = x; arg[1] = us + k * NU; arg[2] = p;
     res[0] = y; res[1] = nq ? C : 0; res[2] = nq ? D : 0;
-    out_full(arg, res, iw, w, 0);
+    motorid_out(arg, res, iw, w, 0);
     memcpy(Y + k * NY, y, sizeof(y));
     if (nq) for (r = 0; r < NY; r++) {
       double* row = DY + (k * NY + r) * nq;
@@ -75,7 +76,7 @@ long long motorid_run(long long n, const long long* nsub, const double* dt, cons
       arg[0] = x; arg[1] = ua; arg[2] = ub; arg[3] = &h; arg[4] = p;
       res[0] = xn; res[1] = e; res[2] = A; res[3] = B;
       if (nq) {
-        step_full(arg, res, iw, w, 0);
+        motorid_full(arg, res, iw, w, 0);
         for (r = 0; r < NX; r++) {
           double* row = T + r * nq;
           for (j = 0; j < nq; j++) row[j] = 0;
@@ -83,7 +84,7 @@ long long motorid_run(long long n, const long long* nsub, const double* dt, cons
           for (c = 0; c < NP; c++) { double b = B[c * NX + r]; if (b != 0) for (j = 0; j < nq; j++) row[j] += b * Pq[c * nq + j]; }
         }
         memcpy(S, T, NX * nq * sizeof(double));
-      } else step(arg, res, iw, w, 0);
+      } else motorid_light(arg, res, iw, w, 0);
       if (E) for (r = 0; r < NX; r++) { double q = fabs(e[r]) / xscale[r]; if (!(q <= worst)) worst = q; }
       memcpy(x, xn, sizeof(x));
     }
@@ -129,7 +130,7 @@ def say_once(text: str) -> None:
 
 def generate(functions: StepFunctions) -> str:
     """Return the C source of the step functions and the driver."""
-    code = ca.CodeGenerator("motorid_step", {"casadi_int": "long long", "with_header": False})
+    code = ca.CodeGenerator("motorid_code", {"casadi_int": "long long", "with_header": False})
     for f in functions:
         code.add(f)
     f = functions.full

@@ -42,11 +42,11 @@ def step_functions(system: System) -> StepFunctions:
     h, p = ca.SX.sym("h"), ca.SX.sym("p", np_)
     x_next, error = rosenbrock_step(system, x, u0, u1, h, p)
     args, names = [x, u0, u1, h, p], ["x", "u0", "u1", "h", "p"]
-    light = _dense("step", args, [x_next, error], names, ["x_next", "error"])
-    full = _dense("step_full", args, [x_next, error, ca.jacobian(x_next, x), ca.jacobian(x_next, p)], names,
+    light = _dense("motorid_light", args, [x_next, error], names, ["x_next", "error"])
+    full = _dense("motorid_full", args, [x_next, error, ca.jacobian(x_next, x), ca.jacobian(x_next, p)], names,
                   ["x_next", "error", "A", "B"])
     y = system.out(x, u0, p)
-    out = _dense("out_full", [x, u0, p], [y, ca.jacobian(y, x), ca.jacobian(y, p)], ["x", "u", "p"], ["y", "C", "D"])
+    out = _dense("motorid_out", [x, u0, p], [y, ca.jacobian(y, x), ca.jacobian(y, p)], ["x", "u", "p"], ["y", "C", "D"])
     return StepFunctions(light, full, out)
 
 

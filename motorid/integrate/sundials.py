@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import pairwise
 from typing import Any
 
 import casadi as ca
@@ -158,10 +159,10 @@ def _pieces(grid: Grid) -> Iterator[tuple[int, int]]:
     same[1:] = (flat[1:] & flat[:-1] & (grid.u0[1:] == grid.u0[:-1]).all(axis=1)
                 & (np.abs(np.diff(dt)) < 1e-6 * dt[1:]))
     starts = np.append(np.flatnonzero(~same), len(dt))
-    for a, b in zip(starts[:-1], starts[1:], strict=True):
+    for a, b in pairwise(starts.tolist()):
         while a < b:
             count = 1 << min((b - a).bit_length() - 1, LONGEST)
-            yield int(a), int(count)
+            yield a, count
             a += count
 
 

@@ -1,0 +1,373 @@
+"""fit(): from a model and records to parameter values, and `Fit`, what came out."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from motorid.errors import FitError, SimulationError, UsageError, one_of
+from motorid.experiment import Experiment
+from motorid.integrate import Engine
+from motorid.integrate.grid import Array
+from motorid.least_squares import LevenbergMarquardt, gauss_newton_covariance, levenberg_marquardt
+from motorid.model import Model
+from motorid.prepared import natural_sizes, suited
+from motorid.problem import Problem, as_problem
+from motorid.simulate import Evaluation, Simulation, at, evaluate, judge
+from motorid.start import first_guess
+
+UNDETERMINED = 1.0  # relative standard deviation above which a value is not shown as determined
+ERROR_SHARE = 0.1  # integration error accepted, in units of the noise
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """What an estimation found.
+
+    Attributes
+    ----------
+    problem : Problem
+        As solved; its model holds the starting values.
+    values : dict of str to float
+        All parameters of the model, SI.
+    residuals : ndarray, shape (n,)
+        Whitened: outputs run by run, then priors and penalties.
+    jacobian : ndarray, shape (n, k)
+        d residuals / d unknowns in physical units; unknowns are the free parameters, then initial states.
+    q : ndarray, shape (k,)
+        Solver coordinates of the solution.
+    status : str
+        ``"converged"``, ``"stalled"``, ``"limit"`` or ``"failed"``.
+    message : str
+        Why it ended, and what to try where it did not go well.
+    history : tuple of float
+        Cost after each iteration, cost = ½ rᵀr.
+    seconds : float
+    integration_error : float
+        Largest error of the integration, in units of the noise.
+    extra : dict
+        What a particular solver adds (multipliers, continuity gaps).
+    """
+
+    problem: Problem
+    values: Mapping[str, float]
+    residuals: Array
+    jacobian: Array
+    q: Array
+    status: str
+    message: str
+    history: tuple[float, ...]
+    seconds: float = 0.0
+    integration_error: float = float("nan")
+    formulation: str = "plain"
+    extra: Mapping[str, Any] = field(default_factory=dict)
+
+    @cached_property
+    def model(self) -> Model:
+        """The model with the fitted values: to add an effect to, to simulate, to export."""
+        return self.problem.model.start_at(self.values)
+
+    @property
+    def cost(self) -> float:
+        """½ rᵀr, with priors, penalties and the robust loss."""
+        return 0.5 * float(self.residuals @ self.residuals)
+
+    @property
+    def chi2(self) -> float:
+        """Σ of the squared whitened output residuals."""
+        r = self.residuals[:self.problem.n_outputs]
+        return float(r @ r)
+
+    @property
+    def dof(self) -> int:
+        """Number of output samples minus number of unknowns."""
+        return max(self.problem.n_outputs - len(self.problem.unknown), 1)
+
+    @property
+    def iterations(self) -> int:
+        """Accepted steps."""
+        return len(self.history) - 1
+
+    @cached_property
+    def _covariance(self) -> tuple[Array, Array]:
+        # The noise was estimated beforehand; a model that does not reach it is less certain by that much.
+        variance = max(self.chi2 / self.dof, 1.0) if self.problem.weights == "noise" else self.chi2 / self.dof
+        return gauss_newton_covariance(self.jacobian, variance)
+
+    @property
+    def covariance(self) -> Array:
+        """Gauss-Newton covariance of the unknowns, physical units, white residuals assumed; see `covariance()`."""
+        return self._covariance[0]
+
+    @cached_property
+    def std(self) -> dict[str, float | None]:
+        """One standard deviation per parameter, in its unit: 0 where held, None where the data do not determine it."""
+        covariance, determined = self._covariance
+        found: dict[str, float | None] = {n: 0.0 for n in self.values}
+        at_bound = self._at_bound
+        for j, p in enumerate(self.problem.unknown):
+            if p.name in found:
+                sd = float(np.sqrt(max(covariance[j, j], 0.0)))
+                vague = p.positive and sd > UNDETERMINED * abs(self.values[p.name])
+                found[p.name] = None if not determined[j] or vague or p.name in at_bound else sd
+        return found
+
+    @cached_property
+    def _at_bound(self) -> set[str]:
+        names = set()
+        for p in self.problem.unknown:
+            value = self.values.get(p.name)
+            if value is not None and (value <= p.lower or value >= p.upper) and np.isfinite(value):
+                names.add(p.name)
+        return names
+
+    @property
+    def initial(self) -> dict[str, float]:
+        """Estimated initial states, as ``omega_0[run]``."""
+        physical = self.problem.scaling.physical(self.q)
+        return {p.name: float(physical[j]) for j, p in enumerate(self.problem.unknown) if p.name not in self.values}
+
+    @cached_property
+    def simulations(self) -> tuple[Simulation, ...]:
+        """The fitted model on the records of the fit."""
+        return at(self.problem, self.q)
+
+    @cached_property
+    def evaluation(self) -> Evaluation:
+        """Errors on the records of the fit, over all runs and run by run."""
+        return judge(self.simulations)
+
+    @property
+    def nrmse(self) -> Mapping[str, float]:
+        """RMSE over RMS of the measured channel, per channel."""
+        return self.evaluation.nrmse
+
+    @property
+    def rmse(self) -> Mapping[str, float]:
+        """Root mean square error per channel, SI."""
+        return self.evaluation.rmse
+
+    @property
+    def tau_e(self) -> float | None:
+        """Electrical time constant L/R, s."""
+        v = self.values
+        return v["L"] / v["R"] if "L" in v else None
+
+    @property
+    def tau_m(self) -> float | None:
+        """Mechanical time constant R·J/(K² + R·b), s; J/b for a torque-driven model."""
+        v = self.values
+        if "K" in v:
+            return v["R"] * v["J"] / (v["K"] ** 2 + v["R"] * v["b"])
+        return v["J"] / v["b"] if v["b"] > 0 else None
+
+    @property
+    def damping(self) -> float | None:
+        """Damping ratio of the linear motor's two poles."""
+        v = self.values
+        if "K" not in v or v["L"] <= 0:
+            return None
+        natural = np.sqrt((v["K"] ** 2 + v["R"] * v["b"]) / (v["L"] * v["J"]))
+        return float((v["R"] / v["L"] + v["b"] / v["J"]) / (2 * natural))
+
+    def __repr__(self) -> str:
+        errors = ", ".join(f"{c} {100 * e:.2f} %" for c, e in self.nrmse.items())
+        return f"<fit {self.status}: {' + '.join([self.problem.model.base, *self.problem.model.effect_names])}, NRMSE {errors}>"
+
+
+@dataclass(frozen=True)
+class Failure:
+    """A run that failed, kept as a value: where it started, its status and why."""
+
+    start: Mapping[str, float]
+    status: str
+    message: str
+
+
+def fit(
+    model: Model,
+    runs: Sequence[Experiment] | Experiment,
+    *,
+    solver: Any = None,
+    start: str = "auto",
+    engine: str | Engine = "rosenbrock",
+    formulation: str = "plain",
+    priors: Mapping[str, tuple[float, float]] | None = None,
+    penalties: Sequence[Any] = (),
+    constraints: Sequence[Any] = (),
+    loss: Any = None,
+    weights: str | None = None,
+    initial: str = "auto",
+    callback: Callable[[int, float, Array], object] | None = None,
+) -> Fit:
+    """Estimate the free parameters of `model` from `runs`; no first guess is asked for.
+
+    Parameters
+    ----------
+    model : Model
+        E.g. ``mi.dc_motor() + mi.effects.coulomb``. Values set by ``replace`` are the start, held ones stay.
+    runs : Experiment or sequence of Experiment
+    solver : LevenbergMarquardt or MultipleShooting, optional
+    start : {"auto", "model"}
+        ``"auto"``: the better of the integral-equation guess and the model's present values.
+    engine : {"rosenbrock", "cvodes", "idas"} or Engine
+    formulation : {"plain", "penalty"}
+        ``"penalty"``: the source paper's composite residual; errors over the RMS of each channel, with
+        `constraints` (by default the steady state) as penalties. True constraints: ``solver=MultipleShooting()``.
+    priors : mapping of str to (mean, std), optional
+    penalties, constraints : sequence, optional
+        See `CurrentLimit` and `SteadyState`.
+    loss : Huber, optional
+    weights : {"noise", "rms"}, optional
+    initial : {"auto", "rest", "measured", "estimate"}
+    callback : callable, optional
+        ``callback(iteration, cost, q)``.
+
+    Returns
+    -------
+    Fit
+
+    Raises
+    ------
+    UsageError, ModelError, DataError
+        The words or the data were wrong.
+    FitError
+        The model cannot be simulated at any starting point.
+    """
+    if formulation not in ("plain", "penalty"):
+        raise UsageError(one_of(formulation, ("plain", "penalty"), "formulation") + " For hard constraints use "
+                         "solver=mi.MultipleShooting().")
+    if constraints and formulation == "plain" and not hasattr(solver, "solve"):
+        raise UsageError("constraints need a solver that honours them: solver=mi.MultipleShooting(), or "
+                         "formulation='penalty' to weigh them.")
+    penalties = tuple(penalties)
+    if formulation == "penalty":
+        from motorid.constraints import SteadyState
+
+        penalties += tuple(constraints) or (SteadyState(),)
+        constraints = ()
+    problem = as_problem(model, runs, engine=engine, priors=dict(priors or {}), penalties=penalties, loss=loss,
+                         constraints=tuple(constraints), initial=initial,
+                         weights=weights or ("rms" if formulation == "penalty" else "noise"))
+    return solve(problem, solver, start=start, callback=callback, formulation=formulation)
+
+
+def solve(problem: Problem, solver: Any = None, *, start: str = "auto",
+          callback: Callable[[int, float, Array], object] | None = None, formulation: str = "plain") -> Fit:
+    """Solve a `Problem`; `fit` is this with the problem made on the way. See there."""
+    began = time.perf_counter()
+    if start not in ("auto", "model"):
+        raise UsageError(one_of(start, ("auto", "model"), "start"))
+    problem = started(problem) if start == "auto" else problem
+    if hasattr(solver, "solve"):
+        return solver.solve(problem)
+    if problem.constraints:
+        raise UsageError("LevenbergMarquardt has no true constraints; use solver=mi.MultipleShooting().")
+    return _least_squares(problem, solver or LevenbergMarquardt(), callback, formulation, began)
+
+
+def _least_squares(problem: Problem, options: LevenbergMarquardt, callback, formulation: str, began: float) -> Fit:
+    q, history, error = problem.start, [], float("nan")
+    for _ in range(4):
+        problem = problem.refined(q)
+        found = levenberg_marquardt(problem.residual, problem.residual_and_jacobian, q, problem.scaling.bounds,
+                                    options, callback)
+        history += found.history
+        moved = np.max(np.abs(found.q - q), initial=0.0) > 1e-3
+        q = found.q
+        if found.status == "limit":
+            break
+        finer = problem.refined(q)
+        same = all(np.array_equal(a.grid.substeps, b.grid.substeps)
+                   for a, b in zip(problem.runs, finer.runs, strict=True))
+        if same or not moved:
+            break
+    error = integration_error(problem, q)
+    return Fit(problem, problem.values(q), found.residual, found.jac / problem.scaling.slope(q), q, found.status,
+               _advice(problem, found.status, found.message, error), tuple(history), time.perf_counter() - began, error,
+               formulation)
+
+
+def integration_error(problem: Problem, q: Array) -> float:
+    """Return the largest change of an output when every step is halved, in units of the noise."""
+    worst = 0.0
+    for k, run in enumerate(problem.runs):
+        if not hasattr(problem._engine, "compiled"):
+            return 0.0
+        try:
+            coarse = problem.simulate(q, k, derivatives=False).y
+            finer = problem._keeping(tuple(r if j != k else _halved(r) for j, r in enumerate(problem.runs)))
+            fine = finer.simulate(q, k, derivatives=False).y
+        except SimulationError:
+            return float("inf")
+        sigma = np.array([run.sigma.get(c, np.inf) for c in problem.outputs])
+        worst = max(worst, float(np.max(np.abs(fine - coarse) / sigma)))
+    return worst
+
+
+def _halved(run: Any) -> Any:
+    from dataclasses import replace
+
+    return replace(run, grid=run.grid.with_substeps(2 * run.grid.substeps))
+
+
+def _advice(problem: Problem, status: str, message: str, error: float) -> str:
+    if status == "limit":
+        return f"{message}."
+    if status == "stalled":
+        return f"{message}."
+    if error > 1.0:
+        return (f"{message}; but the integration error is {error:.2g} times the noise: try engine='cvodes' or a "
+                "finer record.")
+    return f"{message}."
+
+
+def started(problem: Problem) -> Problem:
+    """Return the problem with starting values that suit the data: the best of a few candidates by its cost."""
+    model = problem.model
+    guess = first_guess(model, problem.experiments)
+    bounded = {n: float(np.clip(v, model.parameters[n].lower, model.parameters[n].upper)) for n, v in guess.items()}
+    guessed = with_suited_effects(model.start_at(bounded), problem.experiments)
+    candidates = [guessed]
+    if any(p.given for p in model.parameters.values()) or _was_fitted(model):
+        fitted = with_suited_effects(model, problem.experiments)
+        candidates.append(fitted)
+    if len(candidates) == 1:
+        return problem.with_(model=guessed)
+    costs = [_cost_of(problem.with_(model=m)) for m in candidates]
+    return problem.with_(model=candidates[int(np.argmin(costs))])
+
+
+def _was_fitted(model: Model) -> bool:
+    from motorid.model import _BASES
+
+    return any(model.parameters[p.name].value != p.value for p in _BASES[model.base])
+
+
+def _cost_of(problem: Problem) -> float:
+    try:
+        r = problem.residual(problem.start)
+    except SimulationError:
+        return np.inf
+    cost = float(r @ r)
+    return cost if np.isfinite(cost) else np.inf
+
+
+def with_suited_effects(model: Model, runs: Sequence[Experiment]) -> Model:
+    """Return the model with starting values of its effects' parameters that suit the data."""
+    sizes = natural_sizes(runs, model.values)
+    untouched = {}
+    for e in model.effects:
+        for declared in e.parameters:
+            p = model.parameters[declared.name]
+            if p.value == declared.value:
+                untouched[p.name] = suited(p, sizes).value
+    return model.start_at(untouched)
+
+
+__all__ = ["Evaluation", "Failure", "Fit", "FitError", "evaluate", "fit", "integration_error", "solve", "started"]

@@ -1,0 +1,231 @@
+"""Records made ready for estimation: noise, input grids, initial states, natural sizes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from motorid.equations import CHANNELS
+from motorid.errors import ModelError, UsageError, one_of
+from motorid.experiment import Experiment
+from motorid.integrate.grid import Array, Grid
+from motorid.noise import noise_level
+from motorid.parameters import Parameter
+
+INITIAL = ("auto", "rest", "measured", "estimate")
+SGN_WIDTH_SHARE = 1e-3  # of the highest speed: wider smoothing looks like one more missing effect
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """One record as the solver sees it.
+
+    Attributes
+    ----------
+    experiment : Experiment
+    grid : Grid
+    sigma : dict of str to float
+        Noise per channel, SI.
+    start : ndarray, shape (3,)
+        (i, omega, theta) at the first sample: known, measured or the first guess.
+    estimated : tuple of str
+        Which of them are unknowns of the fit.
+    """
+
+    experiment: Experiment
+    grid: Grid
+    sigma: Mapping[str, float]
+    start: Array
+    estimated: tuple[str, ...]
+
+
+def channels_of(runs: Sequence[Experiment]) -> tuple[str, ...]:
+    """Channels measured in at least one run."""
+    return tuple(c for c in CHANNELS if any(c in r.outputs for r in runs))
+
+
+def noise_of(runs: Sequence[Experiment], channels: Sequence[str]) -> dict[str, float]:
+    """Noise per channel, estimated once for all runs (quadratic mean) where no run states it."""
+    levels = {}
+    for c in channels:
+        each = [r.sigma.get(c) or noise_level(r.outputs[c], r.t) for r in runs if c in r.outputs]
+        levels[c] = float(np.sqrt(np.mean(np.square(each))))
+    return levels
+
+
+def prepare_run(run: Experiment, channels: Sequence[str], noise: Mapping[str, float], inputs: Sequence[str],
+                initial: str) -> Run:
+    """Return `run` ready for a system with `inputs`."""
+    if initial not in INITIAL:
+        raise UsageError(one_of(initial, INITIAL, "initial state"))
+    columns, held = [], []
+    for name in inputs:
+        if name == "theta_in":
+            columns.append(angle_signal(run))
+            held.append(False)
+        elif name in run.inputs:
+            columns.append(run.inputs[name])
+            held.append(run.hold == "zoh")
+        else:
+            raise ModelError(f"{run.name}: the model needs the input '{name}', which the record does not have.")
+    sigma = {c: float(run.sigma.get(c, noise[c])) for c in channels if c in run.outputs}
+    start, estimated = initial_state(run, sigma, initial)
+    return Run(run, Grid.of(run.t, np.column_stack(columns), np.array(held)), sigma, start, estimated)
+
+
+def initial_state(run: Experiment, sigma: Mapping[str, float], initial: str) -> tuple[Array, tuple[str, ...]]:
+    """Return (i, omega, theta) at the first sample and the names of those to estimate.
+
+    ``auto``: known zeros where nothing moves yet, otherwise estimated; a measured angle is estimated too (its
+    first sample is as noisy as any), unless it is free of noise.
+    """
+    rest, lead = _at_rest(run, sigma)
+    known = rest if initial == "auto" else initial == "rest"
+    start, estimated = np.zeros(3), []
+    for k, c in enumerate(CHANNELS):
+        if c not in run.outputs:
+            continue
+        y = run.outputs[c]
+        if c == "theta":
+            start[k] = np.nanmean(y[:lead]) if known and np.isfinite(y[:lead]).any() else _first(y, run.t)
+            noisy = sigma[c] > 1e-4 * max(np.nanstd(y), 1e-300)
+            if initial == "estimate" or (initial == "auto" and (noisy or not rest)):
+                estimated.append(c)
+        elif not known:
+            start[k] = _first(y, run.t)
+            if initial != "measured":
+                estimated.append(c)
+    if "omega" not in run.outputs and "theta" in run.outputs and not known:
+        start[1] = _first_slope(run.outputs["theta"], run.t)
+        if initial != "measured":
+            estimated.append("omega")
+    return start, tuple(estimated)
+
+
+def _at_rest(run: Experiment, sigma: Mapping[str, float]) -> tuple[bool, int]:
+    """Tell whether the run begins at rest, and how many samples that lasts."""
+    v = run.inputs["v"]
+    quiet = np.abs(v) <= 1e-3 * max(np.abs(v).max(), 1e-300)
+    lead = int(np.argmin(quiet)) if not quiet.all() else len(v)
+    checked = max(lead, 2)
+    for c in ("i", "omega"):
+        if c in run.outputs:
+            y = run.outputs[c][:checked]
+            y = y[np.isfinite(y)]
+            top = np.nanmax(np.abs(run.outputs[c]))
+            # A wild first sample or an offset of the sensor is not motion; a median above the noise is.
+            if y.size and abs(np.median(y)) > max(5 * sigma[c], 0.02 * top):
+                return False, 1
+    if "omega" not in run.outputs and "theta" in run.outputs:
+        y, t = run.outputs["theta"], run.t
+        slope, top = abs(_first_slope(y, t)), np.nanmax(np.abs(_slopes(y, t)), initial=0.0)
+        if slope > 0.05 * top:
+            return False, 1
+    return True, max(lead, 1)
+
+
+def _first(y: Array, t: Array) -> float:
+    good = np.flatnonzero(np.isfinite(y))[:5]
+    return float(np.median(y[good[:3]])) if good.size else 0.0
+
+
+def _first_slope(theta: Array, t: Array) -> float:
+    s = _slopes(theta, t)
+    return float(s[0]) if s.size else 0.0
+
+
+def _slopes(theta: Array, t: Array, parts: int = 200) -> Array:
+    """Mean speeds over windows of the record, from the angle."""
+    good = np.isfinite(theta)
+    y, s = theta[good], t[good]
+    if len(y) < 4:
+        return np.zeros(0)
+    step = max(len(y) // parts, 1)
+    return np.diff(y[::step]) / np.diff(s[::step])
+
+
+def top_speed(runs: Sequence[Experiment]) -> float:
+    """Highest speed in the runs (99.5th percentile), from the speed or the angle; 0 where neither is there."""
+    top = 0.0
+    for r in runs:
+        if "omega" in r.outputs:
+            top = max(top, float(np.nanpercentile(np.abs(r.outputs["omega"]), 99.5)))
+        elif "theta" in r.outputs:
+            s = np.abs(_slopes(r.outputs["theta"], r.t))
+            top = max(top, float(np.percentile(s, 99.5)) if s.size else 0.0)
+    return top
+
+
+def angle_signal(run: Experiment) -> Array:
+    """Return the angle from the measurements, (N,): the measured one, bridged over gaps, or ∫ω dt."""
+    if "theta" in run.outputs:
+        y = run.outputs["theta"]
+        good = np.isfinite(y)
+        return np.interp(run.t, run.t[good], y[good])
+    if "omega" in run.outputs:
+        y = run.outputs["omega"]
+        good = np.isfinite(y)
+        filled = np.interp(run.t, run.t[good], y[good])
+        return np.concatenate([[0.0], np.cumsum((filled[1:] + filled[:-1]) / 2 * np.diff(run.t))])
+    return np.zeros(len(run.t))
+
+
+def natural_sizes(runs: Sequence[Experiment], values: Mapping[str, float]) -> dict[str, float]:
+    """Return the natural size of each unit in these records, for starting values and grids of effects.
+
+    Torque is what the motor makes at its highest current, time is the sample time, heat is what the winding
+    loses during the longest run for a rise of 30 K.
+    """
+    volt = max(float(np.abs(r.inputs["v"]).max()) for r in runs) or 1.0
+    speed = top_speed(runs) or volt / max(values.get("K", 1.0), 1e-9)
+    gain = values.get("g")
+    resistance = values.get("R", 1.0)
+    amps = [float(np.nanpercentile(np.abs(r.outputs["i"]), 99.5)) for r in runs if "i" in r.outputs]
+    ampere = max(amps) if amps else volt / resistance
+    torque = gain * volt if gain is not None else values.get("K", 1.0) * ampere
+    second = float(np.median([r.dt for r in runs]))
+    heats = [(r.duration, resistance * _mean_square_current(r, values)) for r in runs]
+    duration, power = max(heats, key=lambda h: h[0] * h[1])
+    span = max((float(np.nanmax(r.outputs["theta"]) - np.nanmin(r.outputs["theta"])) for r in runs
+                if "theta" in r.outputs), default=1.0)
+    sizes = {"V": volt, "A": ampere, "rad/s": speed, "m/s": speed, "N·m": torque, "N": torque, "s": second,
+             "m": 0.01 * span, "K/W": 30 / max(power, 1e-9), "J/K": max(power * duration, 1e-9) / 30}
+    for unit in ("N·m·s/rad", "N·s/m"):
+        sizes[unit] = torque / speed
+    for unit in ("N·m·s²/rad²", "N·s²/m²"):
+        sizes[unit] = torque / speed**2
+    return {k: v if np.isfinite(v) and v > 0 else 1.0 for k, v in sizes.items()}
+
+
+def _mean_square_current(run: Experiment, values: Mapping[str, float]) -> float:
+    if "i" in run.outputs:
+        return float(np.nanmean(run.outputs["i"] ** 2))
+    return float(np.mean(run.inputs["v"] ** 2)) / max(values.get("R", 1.0), 1e-9) ** 2 / 4
+
+
+def suited(parameter: Parameter, sizes: Mapping[str, float]) -> Parameter:
+    """Return a parameter of an effect with a starting value that suits the data, unless the user gave one."""
+    if parameter.given or parameter.name == "sgn_width":
+        return parameter
+    size = sizes.get(parameter.unit)
+    if parameter.null is None and parameter.grid:
+        value = parameter.grid[len(parameter.grid) // 2] * (size or 1.0)
+    elif parameter.null == 0 and size is not None and not parameter.positive:
+        value = 0.02 * size
+    elif parameter.grid and size is not None:
+        value = parameter.grid[len(parameter.grid) // 2] * size
+    else:
+        value = parameter.value
+    return replace(parameter, value=float(np.clip(value, parameter.lower, parameter.upper)))
+
+
+def smoothing(runs: Sequence[Experiment], parameters: Mapping[str, Any]) -> float | None:
+    """Return the width of sgn that suits the data; None where it is given or not used."""
+    p = parameters.get("sgn_width")
+    if p is None or p.given:
+        return None
+    speed = top_speed(runs)
+    return SGN_WIDTH_SHARE * speed if speed > 0 else None

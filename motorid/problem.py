@@ -1,0 +1,322 @@
+"""A fitting problem: model, records and what is asked of them, as residual(q) and jacobian(q)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from motorid.errors import ModelError, SimulationError, UsageError, one_of
+from motorid.experiment import Experiment
+from motorid.integrate import Engine, Trajectory, engine_of
+from motorid.integrate.grid import Array
+from motorid.model import Model
+from motorid.parameters import Parameter, Scaling
+from motorid.prepared import Run, channels_of, noise_of, prepare_run, smoothing
+from motorid.system import System
+
+
+@dataclass(frozen=True)
+class Huber:
+    """Robust loss: quadratic within `delta` standard deviations, linear beyond. Huber, Ann. Math. Stat. 35, 1964."""
+
+    delta: float = 1.345
+
+    def pseudo(self, r: Array) -> tuple[Array, Array]:
+        """Return r̃ with r̃² = 2ρ(r), and dr̃/dr, so that least squares of r̃ minimise the robust loss."""
+        size = np.abs(r)
+        far = size > self.delta
+        root = np.sqrt(np.where(far, 2 * self.delta * size - self.delta**2, 1.0))
+        return np.where(far, np.sign(r) * root, r), np.where(far, self.delta / root, 1.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """A model, the records it should explain, and what else is asked.
+
+    Attributes
+    ----------
+    model : Model
+    experiments : tuple of Experiment
+    priors : mapping of str to (mean, std)
+        What is known of a parameter beforehand, in its unit.
+    penalties, constraints : tuple
+        See `motorid.constraints`; penalties enter the residual, constraints are for `MultipleShooting`.
+    loss : Huber or None
+        None: least squares.
+    weights : {"noise", "rms"}
+        Residuals divided by the channel's noise, or by the RMS of the measured channel (the source paper's).
+    initial : {"auto", "rest", "measured", "estimate"}
+        What is known of the state at the first sample.
+    engine : str or Engine
+    """
+
+    model: Model
+    experiments: tuple[Experiment, ...]
+    priors: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    penalties: tuple[Any, ...] = ()
+    constraints: tuple[Any, ...] = ()
+    loss: Huber | None = None
+    weights: str = "noise"
+    initial: str = "auto"
+    engine: str | Engine = "rosenbrock"
+    _runs: tuple[Run, ...] | None = field(default=None, repr=False)
+
+    def __post_init__(self) -> None:
+        runs = self.experiments
+        if isinstance(runs, Experiment):
+            runs = (runs,)
+        object.__setattr__(self, "experiments", tuple(runs))
+        if not self.experiments or not all(isinstance(r, Experiment) for r in self.experiments):
+            raise UsageError("a problem needs at least one Experiment: runs = mi.read_runs('run*.csv').")
+        if self.weights not in ("noise", "rms"):
+            raise UsageError(one_of(self.weights, ("noise", "rms"), "weights"))
+        if not self.outputs:
+            raise ModelError("none of the channels that the model shows was measured; a fit needs at least one of "
+                             "i, omega, theta (torque_driven: omega or theta).")
+        for name in self.priors:
+            if name not in self.model.parameters:
+                raise UsageError(f"prior: {one_of(name, self.model.parameters, 'parameter')}")
+        width = smoothing(self.experiments, self.model.parameters)
+        if width is not None:
+            object.__setattr__(self, "model", self.model.start_at({"sgn_width": width}))
+
+    # -- what is fitted --------------------------------------------------------------------------------
+    @cached_property
+    def outputs(self) -> tuple[str, ...]:
+        """Measured channels that the model can show."""
+        shown = ("i", "omega", "theta") if self.model.base == "dc_motor" else ("omega", "theta")
+        return tuple(c for c in channels_of(self.experiments) if c in shown)
+
+    @cached_property
+    def system(self) -> System:
+        """The model's functions for the measured channels."""
+        return self.model.system(self.outputs)
+
+    @cached_property
+    def runs(self) -> tuple[Run, ...]:
+        """The records made ready, one per experiment."""
+        if self._runs is not None:
+            return self._runs
+        noise = noise_of(self.experiments, self.outputs)
+        return tuple(prepare_run(r, self.outputs, noise, self.system.inputs, self.initial) for r in self.experiments)
+
+    @cached_property
+    def unknown(self) -> tuple[Parameter, ...]:
+        """Free parameters of the model, then the estimated initial states, run by run."""
+        free = [p for p in self.model.parameters.values() if p.vary]
+        return (*free, *self._initial_unknowns)
+
+    @cached_property
+    def _initial_unknowns(self) -> tuple[Parameter, ...]:
+        found = []
+        units = {"i": "A", "omega": "rad/s", "theta": "rad"}
+        for k, run in enumerate(self.runs):
+            for c in run.estimated:
+                if c in self.system.states or c == "theta" and "theta" in self.system.states:
+                    value = float(run.start[("i", "omega", "theta").index(c)])
+                    found.append(Parameter(f"{c}_0[{k}]", value, run.experiment.units.get(c, units[c])))
+        return tuple(found)
+
+    @cached_property
+    def scaling(self) -> Scaling:
+        """Solver coordinates of the unknowns."""
+        sizes = [abs(p.value) if p.value else 1.0 for p in self.unknown]
+        for k, p in enumerate(self.unknown[self._n_free:], self._n_free):
+            channel, run = self._place(p.name)
+            y = self.experiments[run].outputs.get(channel)
+            size = float(np.sqrt(np.nanmean((y - np.nanmean(y)) ** 2))) if y is not None else 1.0
+            sizes[k] = size or 1.0
+        return Scaling.of(self.unknown, sizes)
+
+    @property
+    def _n_free(self) -> int:
+        return len(self.unknown) - len(self._initial_unknowns)
+
+    @staticmethod
+    def _place(name: str) -> tuple[str, int]:
+        channel, run = name[:-1].split("_0[")
+        return channel, int(run)
+
+    @cached_property
+    def start(self) -> Array:
+        """Solver coordinates of the model's present values."""
+        return self.scaling.scaled([p.value for p in self.unknown])
+
+    def values(self, q: Array) -> dict[str, float]:
+        """Return all parameter values of the model at `q`, SI."""
+        physical = self.scaling.physical(q)
+        free = dict(zip([p.name for p in self.unknown[:self._n_free]], physical, strict=False))
+        return {n: float(free.get(n, p.value)) for n, p in self.model.parameters.items()}
+
+    # -- simulation ------------------------------------------------------------------------------------
+    @cached_property
+    def _engine(self) -> Engine:
+        return engine_of(self.engine)
+
+    @cached_property
+    def _directions(self) -> tuple[Array, list[list[tuple[int, int]]]]:
+        """0/1 matrix from q to the system's p, and per run (index of the start value, column)."""
+        names = {n: k for k, n in enumerate(self.system.parameters)}
+        select = np.zeros((len(names), len(self.unknown)))
+        for j, p in enumerate(self.unknown[:self._n_free]):
+            select[names[p.name], j] = 1.0
+        places: list[list[tuple[int, int]]] = [[] for _ in self.experiments]
+        for j, p in enumerate(self._initial_unknowns, self._n_free):
+            channel, run = self._place(p.name)
+            places[run].append((("i", "omega", "theta").index(channel), j))
+        return select, places
+
+    @cached_property
+    def _initial_jacobian(self) -> Any:
+        return self.system.initial.jacobian()
+
+    def simulate(self, q: Array, k: int, *, derivatives: bool = True) -> Trajectory:
+        """Return the trajectory of run `k` at `q`, with derivatives with respect to q.
+
+        Raises
+        ------
+        SimulationError
+            If the integration fails there.
+        """
+        run = self.runs[k]
+        select, places = self._directions
+        physical, slope = self.scaling.physical(q), self.scaling.slope(q)
+        values = self.values(q)
+        p = np.array([values[n] for n in self.system.parameters])
+        start = run.start.copy()
+        for channel, j in places[k]:
+            start[channel] = physical[j]
+        x0 = np.asarray(self.system.initial(start, p)).ravel()
+        if not derivatives:
+            return self._engine.run(self.system, run.grid, x0, p)
+        dp = select * slope
+        js, jp = (np.asarray(a) for a in self._initial_jacobian(start, p, x0))
+        dx0 = jp @ dp
+        for channel, j in places[k]:
+            dx0[:, j] += js[:, channel] * slope[j]
+        return self._engine.run(self.system, run.grid, x0, p, dx0, dp)
+
+    def refined(self, q: Array) -> Problem:
+        """Return the problem with sub-steps that keep the integration error below the noise at `q`."""
+        values = self.values(q)
+        p = np.array([values[n] for n in self.system.parameters])
+        physical = self.scaling.physical(q)
+        new = []
+        for k, run in enumerate(self.runs):
+            start = run.start.copy()
+            for channel, j in self._directions[1][k]:
+                start[channel] = physical[j]
+            x0 = np.asarray(self.system.initial(start, p)).ravel()
+            try:
+                grid = self._engine.prepare(self.system, run.grid, x0, p, self._tolerance(run))
+            except SimulationError:
+                grid = run.grid
+            new.append(replace(run, grid=grid))
+        return self._keeping(tuple(new))
+
+    def _keeping(self, runs: tuple[Run, ...]) -> Problem:
+        """Return a copy with other grids that keeps everything else already made."""
+        other = replace(self, _runs=runs)
+        for name in ("outputs", "system", "unknown", "_initial_unknowns", "scaling", "start", "_engine",
+                     "_directions", "_initial_jacobian", "_weights"):
+            if name in self.__dict__:
+                other.__dict__[name] = self.__dict__[name]
+        return other
+
+    @staticmethod
+    def _tolerance(run: Run) -> float:
+        """Local error relative to the largest state: a small part of the noise, within reason."""
+        ratios = [run.sigma[c] / max(float(np.nanmax(np.abs(run.experiment.outputs[c]))), 1e-300) for c in run.sigma]
+        return float(np.clip(0.03 * min(ratios), 1e-7, 1e-4))
+
+    # -- residual --------------------------------------------------------------------------------------
+    @cached_property
+    def _weights(self) -> list[tuple[Array, Array, Array | None]]:
+        """Per run: measured (N, ny), weights (ny,), index of finite samples (None: all)."""
+        prepared = []
+        for run in self.runs:
+            out = run.experiment.outputs
+            n = len(run.experiment.t)
+            y = np.column_stack([out.get(c, np.full(n, np.nan)) for c in self.outputs])
+            w = np.array([self._weight(run, c) if c in out else 0.0 for c in self.outputs])
+            finite = np.isfinite(y)
+            prepared.append((y, w, None if finite.all() else np.flatnonzero(finite.ravel())))
+        return prepared
+
+    def _weight(self, run: Run, channel: str) -> float:
+        if self.weights == "noise":
+            return 1.0 / run.sigma[channel]
+        return 1.0 / max(float(np.sqrt(np.nanmean(run.experiment.outputs[channel] ** 2))), 1e-300)
+
+    def run_residual(self, k: int, traj: Trajectory) -> tuple[Array, Array | None]:
+        """Return residual and Jacobian (both whitened, before the loss) of run `k`, missing samples left out."""
+        y, w, index = self._weights[k]
+        r = ((traj.y - y) * w).ravel()
+        jac = None if traj.dy is None else (traj.dy * w[:, None]).reshape(r.size, -1)
+        return (r, jac) if index is None else (r[index], None if jac is None else jac[index])
+
+    def residual(self, q: Array) -> Array:
+        """Return the whitened residual: outputs run by run, then priors, then penalties.
+
+        Raises
+        ------
+        SimulationError
+        """
+        return self._evaluate(q, False)[0]
+
+    def jacobian(self, q: Array) -> Array:
+        """Return d residual/dq, exact, shape (n, nq)."""
+        return self.residual_and_jacobian(q)[1]
+
+    def residual_and_jacobian(self, q: Array) -> tuple[Array, Array]:
+        """Return both from one integration."""
+        r, jac = self._evaluate(q, True)
+        assert jac is not None
+        return r, jac
+
+    def _evaluate(self, q: Array, derivatives: bool) -> tuple[Array, Array | None]:
+        q = np.asarray(q, float)
+        trajs = [self.simulate(q, k, derivatives=derivatives) for k in range(len(self.runs))]
+        parts = [self._lossy(*self.run_residual(k, t)) for k, t in enumerate(trajs)]
+        parts += [self._prior_part(q)] if self.priors else []
+        parts += [penalty.evaluate(self, q, trajs) for penalty in self.penalties]
+        r = np.concatenate([p[0] for p in parts]) if len(parts) > 1 else parts[0][0]
+        if not derivatives:
+            return r, None
+        return r, np.concatenate([p[1] for p in parts]) if len(parts) > 1 else parts[0][1]
+
+    def _lossy(self, r: Array, jac: Array | None) -> tuple[Array, Array | None]:
+        if self.loss is None:
+            return r, jac
+        pseudo, slope = self.loss.pseudo(r)
+        return pseudo, None if jac is None else jac * slope[:, None]
+
+    def _prior_part(self, q: Array) -> tuple[Array, Array]:
+        names = [p.name for p in self.unknown]
+        physical, slope = self.scaling.physical(q), self.scaling.slope(q)
+        held = [n for n in self.priors if n in names]
+        r, jac = np.zeros(len(held)), np.zeros((len(held), len(names)))
+        for row, name in enumerate(held):
+            mean, std = self.priors[name]
+            j = names.index(name)
+            r[row], jac[row, j] = (physical[j] - mean) / std, slope[j] / std
+        return r, jac
+
+    @property
+    def n_outputs(self) -> int:
+        """Number of output residuals (finite measured samples)."""
+        return sum(y.size if index is None else len(index) for y, _, index in self._weights)
+
+    def with_(self, **fields: Any) -> Problem:
+        """Return a copy with some fields changed, e.g. ``with_(model=…)``."""
+        return replace(self, **{"_runs": None, **fields})
+
+
+def as_problem(model: Model, runs: Sequence[Experiment] | Experiment, **fields: Any) -> Problem:
+    """Return a `Problem` of a model and one or several runs."""
+    experiments = (runs,) if isinstance(runs, Experiment) else tuple(runs)
+    return Problem(model, experiments, **fields)

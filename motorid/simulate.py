@@ -1,0 +1,145 @@
+"""Simulating a model on records, and judging a model on records that it never saw."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from motorid.experiment import Experiment
+from motorid.integrate import Engine
+from motorid.integrate.grid import Array
+from motorid.model import Model
+from motorid.problem import Problem, as_problem
+
+
+@dataclass(frozen=True, eq=False)
+class Simulation:
+    """A model's answer to one record.
+
+    Attributes
+    ----------
+    experiment : Experiment
+    outputs : dict of str to ndarray
+        Model outputs at the samples, SI.
+    states : dict of str to ndarray
+    initial : dict of str to float
+        Initial state used.
+    """
+
+    experiment: Experiment
+    outputs: Mapping[str, Array]
+    states: Mapping[str, Array]
+
+    def residual(self, channel: str) -> Array:
+        """Return measured minus model, (N,), NaN where missing."""
+        return self.experiment.outputs[channel] - self.outputs[channel]
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """How well values explain records: NRMSE and RMSE per channel, over all runs and run by run.
+
+    NRMSE is RMSE divided by the RMS of the measured channel over the same samples.
+    """
+
+    simulations: tuple[Simulation, ...]
+    nrmse: Mapping[str, float]
+    rmse: Mapping[str, float]
+    by_run: tuple[Mapping[str, float], ...]
+
+    @property
+    def total(self) -> float:
+        """Quadratic mean of the channels' NRMSE."""
+        return float(np.sqrt(np.mean(np.square(list(self.nrmse.values())))))
+
+    def __repr__(self) -> str:
+        errors = ", ".join(f"{c} {100 * e:.2f} %" for c, e in self.nrmse.items())
+        return f"<evaluation of {len(self.simulations)} runs: NRMSE {errors}>"
+
+
+def simulate(model: Model, runs: Sequence[Experiment] | Experiment, *, engine: str | Engine = "rosenbrock",
+             initial: str = "auto", estimate_initial: bool = True) -> list[Simulation]:
+    """Simulate `model`, at its present values, on the inputs of `runs`.
+
+    Parameters
+    ----------
+    model : Model
+    runs : Experiment or sequence of Experiment
+    engine : str or Engine
+    initial : {"auto", "rest", "measured", "estimate"}
+        What is known of the state at the first sample.
+    estimate_initial : bool
+        Unknown initial states are fitted to the record (only they); otherwise the first samples are taken.
+
+    Raises
+    ------
+    SimulationError
+        If the integration fails.
+    """
+    problem = as_problem(model, runs, engine=engine, initial=initial)
+    return list(simulated(problem, estimate_initial))
+
+
+def simulated(problem: Problem, estimate_initial: bool = True) -> tuple[Simulation, ...]:
+    """Return the simulations of a problem at the model's values."""
+    held = problem.with_(model=problem.model.fix(*problem.model.parameters), priors={}, penalties=())
+    q = held.start
+    held = held.refined(q)
+    if len(q) and estimate_initial:
+        from motorid.least_squares import LevenbergMarquardt, levenberg_marquardt
+
+        q = levenberg_marquardt(held.residual, held.residual_and_jacobian, q,
+                                options=LevenbergMarquardt(max_iterations=20)).q
+        held = held.refined(q)
+    return at(held, q)
+
+
+def at(problem: Problem, q: Array) -> tuple[Simulation, ...]:
+    """Return the simulations of a problem at solver coordinates `q`."""
+    found = []
+    for k, run in enumerate(problem.runs):
+        traj = problem.simulate(q, k, derivatives=False)
+        outputs = {c: traj.y[:, j] for j, c in enumerate(problem.outputs)}
+        found.append(Simulation(run.experiment, outputs, {s: traj.x[:, j] for j, s in enumerate(problem.system.states)}))
+    return tuple(found)
+
+
+def judge(simulations: Sequence[Simulation]) -> Evaluation:
+    """Return the errors of `simulations` against what was measured."""
+    channels = [c for c in ("i", "omega", "theta") if any(c in s.experiment.outputs and c in s.outputs for s in simulations)]
+    squares: dict[str, list[Any]] = {c: [] for c in channels}
+    by_run = []
+    for s in simulations:
+        errors = {}
+        for c in channels:
+            if c in s.experiment.outputs:
+                y = s.experiment.outputs[c]
+                ok = np.isfinite(y)
+                e = s.residual(c)[ok]
+                squares[c].append((float(e @ e), float(y[ok] @ y[ok]), int(ok.sum())))
+                errors[c] = float(np.sqrt(e @ e / max(y[ok] @ y[ok], 1e-300)))
+        by_run.append(errors)
+    sums = {c: np.sum(squares[c], axis=0) for c in channels}
+    return Evaluation(tuple(simulations), {c: float(np.sqrt(s[0] / max(s[1], 1e-300))) for c, s in sums.items()},
+                      {c: float(np.sqrt(s[0] / max(s[2], 1))) for c, s in sums.items()}, tuple(by_run))
+
+
+def evaluate(fit_or_model: Any, runs: Sequence[Experiment] | Experiment, **options: Any) -> Evaluation:
+    """Judge a fit (or a model at its values) on `runs` that it may never have seen.
+
+    Unknown initial states of these runs are estimated from them; no parameter is.
+
+    Parameters
+    ----------
+    fit_or_model : Fit or Model
+    runs : Experiment or sequence of Experiment
+    **options
+        `engine` and `initial` as in `simulate`.
+    """
+    model = fit_or_model if isinstance(fit_or_model, Model) else fit_or_model.model
+    if not isinstance(fit_or_model, Model):
+        options = {"engine": fit_or_model.problem.engine, "initial": fit_or_model.problem.initial, **options}
+    return judge(simulate(model, runs, **options))

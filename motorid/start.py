@@ -1,0 +1,141 @@
+"""A first guess of the motor from the data alone.
+
+The balances are integrated over time, so nothing is differentiated, and solved as non-negative linear least
+squares: ``∫v dt = L Δi + R ∫i dt + K ∫ω dt`` and ``K ∫i dt = J Δω + b ∫ω dt`` (Garnier & Wang, Identification of
+Continuous-time Models from Sampled Data, 2008, ch. 1). Where the current or the speed was not measured, it is
+eliminated and what the record cannot tell is taken from the values given, or from round numbers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from scipy.optimize import nnls
+
+from motorid.experiment import Experiment
+from motorid.integrate.grid import Array
+from motorid.model import Model
+
+FLOOR = 1e-3  # share of its natural size given to a parameter that comes out as zero
+
+
+def first_guess(model: Model, runs: Sequence[Experiment]) -> dict[str, float]:
+    """Return values of the base parameters, SI, that suit `runs`; given and held ones keep their value."""
+    held = {n: p.value for n, p in model.parameters.items() if p.given or not p.vary}
+    signals = [_signals(r) for r in runs]
+    if model.base == "torque_driven":
+        found = _torque_driven(signals, held)
+    elif any(s["i"] is not None and s["omega"] is not None for s in signals):
+        found = _full([s for s in signals if s["i"] is not None and s["omega"] is not None], held)
+    elif any(s["omega"] is not None for s in signals):
+        found = _without_current([s for s in signals if s["omega"] is not None], held)
+    else:
+        found = _without_speed([s for s in signals if s["i"] is not None], held)
+    found |= {n: v for n, v in held.items() if n in found}
+    return {n: v for n, v in found.items() if n in model.parameters and np.isfinite(v) and v > 0}
+
+
+def _signals(run: Experiment) -> dict[str, Array | None]:
+    """Return t, v, i, omega of a run on all samples, gaps bridged; omega from the angle where need be."""
+    t = run.t
+    found: dict[str, Array | None] = {"t": t, "v": run.inputs["v"], "i": None, "omega": None}
+    for c in ("i", "omega"):
+        if c in run.outputs:
+            found[c] = _bridged(t, run.outputs[c])
+    if found["omega"] is None and "theta" in run.outputs:
+        found["omega"] = _speed_of(t, _bridged(t, run.outputs["theta"]))
+    if run.hold == "zoh" and found["v"] is not None:
+        found["held"] = np.ones(1)
+    return found
+
+
+def _bridged(t: Array, y: Array) -> Array:
+    good = np.isfinite(y)
+    return y if good.all() else np.interp(t, t[good], y[good])
+
+
+def _speed_of(t: Array, theta: Array) -> Array:
+    """Speed by local straight lines over a few samples."""
+    half = max(2, min(10, len(t) // 200))
+    a, b = np.arange(len(t)) - half, np.arange(len(t)) + half
+    a, b = np.clip(a, 0, len(t) - 1), np.clip(b, 0, len(t) - 1)
+    return (theta[b] - theta[a]) / (t[b] - t[a])
+
+
+def _integral(t: Array, y: Array, held: bool = False) -> Array:
+    steps = np.diff(t) * (y[:-1] if held else (y[1:] + y[:-1]) / 2)
+    return np.concatenate([[0.0], np.cumsum(steps)])
+
+
+def _windowed(t: Array, columns: Sequence[Array], target: Array, windows: int = 20) -> tuple[Array, Array]:
+    """Take differences over a window, so that slow drift of the integrals does not outweigh the transients."""
+    n = len(t)
+    w = max(n // windows, 1)
+    return np.column_stack([c[w:] - c[:-w] for c in columns]), target[w:] - target[:-w]
+
+
+def _solve(rows: list[tuple[Array, Array]], names: Sequence[str], held: Mapping[str, float]) -> dict[str, float]:
+    """Non-negative least squares with some coefficients known; zeros become small positive numbers."""
+    a, b = np.vstack([r[0] for r in rows]), np.concatenate([r[1] for r in rows])
+    known = [n in held for n in names]
+    b = b - a[:, known] @ np.array([held[n] for n in names if n in held])
+    free = [n for n in names if n not in held]
+    a = a[:, [not k for k in known]]
+    if not free:
+        return {n: held[n] for n in names}
+    norms = np.linalg.norm(a, axis=0)
+    norms = np.where(norms > 0, norms, 1.0)
+    triangle = np.linalg.qr(np.column_stack([a / norms, b]), mode="r")
+    z, _ = nnls(triangle[:, :-1], triangle[:, -1])
+    # A coefficient that comes out as zero starts where its term would carry a thousandth of the right-hand side.
+    z = np.maximum(z, FLOOR * np.linalg.norm(b)) / norms
+    return {n: held[n] for n in names if n in held} | dict(zip(free, z.tolist(), strict=True))
+
+
+def _full(signals: list[dict], held: Mapping[str, float]) -> dict[str, float]:
+    electrical, mechanical = [], []
+    for s in signals:
+        t, held_v = s["t"], "held" in s
+        qi, qw = _integral(t, s["i"]), _integral(t, s["omega"])
+        electrical.append(_windowed(t, [s["i"], qi, qw], _integral(t, s["v"], held_v), 200))
+    found = _solve(electrical, ["L", "R", "K"], held)
+    for s in signals:
+        t = s["t"]
+        qi, qw = _integral(t, s["i"]), _integral(t, s["omega"])
+        mechanical.append(_windowed(t, [s["omega"], qw], found["K"] * qi))
+    return found | _solve(mechanical, ["J", "b"], held)
+
+
+def _torque_driven(signals: list[dict], held: Mapping[str, float]) -> dict[str, float]:
+    g = held.get("g", 1.0)
+    rows = [_windowed(s["t"], [s["omega"], _integral(s["t"], s["omega"])], g * _integral(s["t"], s["v"], "held" in s))
+            for s in signals]
+    return {"g": g} | _solve(rows, ["J", "b"], held)
+
+
+def _without_current(signals: list[dict], held: Mapping[str, float]) -> dict[str, float]:
+    """``∫v = (RJ/K) Δω + (K + Rb/K) ∫ω``: two numbers; R, the split of friction and L are assumed."""
+    rows = [_windowed(s["t"], [s["omega"], _integral(s["t"], s["omega"])], _integral(s["t"], s["v"], "held" in s))
+            for s in signals]
+    two = _solve(rows, ["slope", "gain"], {})
+    r = held.get("R", 1.0)
+    k = held.get("K", 0.9 * two["gain"])
+    b = held.get("b", max(two["gain"] - k, 0.05 * two["gain"]) * k / r)
+    dt = float(np.median(np.diff(signals[0]["t"])))
+    return {"R": r, "L": r * dt, "K": k, "b": b, "J": held.get("J", two["slope"] * k / r)}
+
+
+def _without_speed(signals: list[dict], held: Mapping[str, float]) -> dict[str, float]:
+    """``∫v = L i + (R + Lb/J)∫i + (K² + Rb)/J ∬i − (b/J) ∬v``: K alone is assumed."""
+    rows = []
+    for s in signals:
+        t = s["t"]
+        qv, qi = _integral(t, s["v"], "held" in s), _integral(t, s["i"])
+        rows.append(_windowed(t, [s["i"], qi, _integral(t, qi), -_integral(t, qv)], qv))
+    z = _solve(rows, ["L", "R", "stiff", "rate"], {})
+    k = held.get("K", 0.05)
+    j = k**2 / max(z["stiff"] - z["R"] * z["rate"], 0.1 * z["stiff"])
+    return {"R": z["R"], "L": z["L"], "K": k, "J": j, "b": z["rate"] * j}
+
+
