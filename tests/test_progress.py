@@ -1,0 +1,62 @@
+"""Progress bars: seen where someone looks, silent elsewhere, never in the way."""
+
+import io
+import subprocess
+import sys
+
+import pytest
+
+from motorid.progress import progress
+
+
+class Screen(io.StringIO):
+    def isatty(self):
+        return True
+
+
+@pytest.fixture
+def screen(monkeypatch):
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setattr(sys, "stderr", Screen())
+    return sys.stderr
+
+
+def test_bar_counts_up_in_a_terminal(screen):
+    with progress("Refitting", total=3) as advance:
+        for _ in range(3):
+            advance()
+    assert "Refitting" in screen.getvalue()
+    assert "3/3" in screen.getvalue()
+
+
+def test_inner_bar_stays_silent_inside_another(screen):
+    with progress("Outer", total=1) as advance:
+        with progress("Inner", total=1) as inner:
+            inner()
+        advance()
+    assert "Inner" not in screen.getvalue()
+    with progress("Later", total=1) as advance:
+        advance()
+    assert "Later" in screen.getvalue()
+
+
+def test_quiet_shows_nothing(screen):
+    with progress("Refitting", total=1, quiet=True) as advance:
+        advance()
+    assert screen.getvalue() == ""
+
+
+def test_error_in_the_block_passes_and_ends_the_bar(screen):
+    with pytest.raises(KeyError), progress("Refitting", total=1):
+        raise KeyError("x")
+    with progress("Again", total=1) as advance:
+        advance()
+    assert "Again" in screen.getvalue()
+
+
+def test_pipe_stays_clean_and_rich_is_not_loaded():
+    code = ("import sys; from motorid.progress import progress\n"
+            "with progress('Refitting', total=2) as a: a(); a()\n"
+            "assert 'rich' not in sys.modules")
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
