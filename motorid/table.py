@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import re
+import warnings
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -164,10 +165,12 @@ def _parse(rows: list[str], dialect: Dialect, labels: list[str],
 
     text = io.StringIO("\n".join(rows))
     try:
-        frame = pd.read_csv(text, sep=dialect.delimiter or r"\s+", decimal=dialect.decimal,
-                            header=None, names=range(len(labels)), index_col=False, skipinitialspace=True,
-                            low_memory=False, na_values=sorted(MISSING - {""}))
-    except (pd.errors.ParserError, pd.errors.EmptyDataError, ValueError, OverflowError) as error:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", pd.errors.ParserWarning)  # it would lose cells
+            frame = pd.read_csv(text, sep=dialect.delimiter or r"\s+", decimal=dialect.decimal,
+                                header=None, names=range(len(labels)), index_col=False, skipinitialspace=True,
+                                low_memory=False, na_values=sorted(MISSING - {""}))
+    except (pd.errors.ParserWarning, ValueError, OverflowError) as error:  # ParserError is a ValueError
         raise DataError(f"its rows cannot be read as a table ({str(error).strip()}).") from None
     columns, texts = {}, {}
     for label, column in zip(labels, frame.columns, strict=True):

@@ -1,0 +1,460 @@
+"""Records become runs, whatever their dialect; what is wrong with them is said in one clear message."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from broken_inputs import BROKEN, GOOD, HEADER, Broken, rows
+from hypothesis import HealthCheck, example, given, settings
+from hypothesis import strategies as st
+
+from motorid.errors import DataError, MissingDependency, UsageError
+from motorid.experiment import MIN_SAMPLES, OUTPUTS, UNITS, Experiment
+from motorid.layout import parse_pairs
+from motorid.reading import find_records, read_csv, read_mat, read_parquet, read_runs, write_csv
+
+
+def write(folder: Path, content: str | bytes, name: str = "run.csv") -> Path:
+    path = folder / name
+    path.write_bytes(content.encode() if isinstance(content, str) else content)
+    return path
+
+
+def notes(run: Experiment) -> str:
+    return "\n".join(run.meta["notes"])
+
+
+# -- broken inputs ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("broken", BROKEN, ids=lambda b: b.name)
+def test_broken_input_gives_one_clear_error(broken: Broken, tmp_path):
+    path = broken.make(tmp_path)
+    with pytest.raises((DataError, UsageError)) as caught:
+        read_runs(path, columns=broken.columns and parse_pairs(broken.columns, "columns"),
+                  units=broken.units and parse_pairs(broken.units, "units"))
+    message = str(caught.value)
+    assert broken.says in message
+    assert Path(path).name in message or not Path(path).exists() or Path(path).is_dir()
+    assert "\n" not in message
+    assert len(message) < 700
+    assert caught.value.__cause__ is None  # no traceback of something inside
+
+
+def test_the_list_of_broken_inputs_is_long_and_the_good_one_reads(tmp_path):
+    assert len({b.name for b in BROKEN}) == len(BROKEN) >= 30
+    run = read_csv(write(tmp_path, GOOD))
+    assert run.n == 30
+    assert run.channels == ("i", "omega")
+    assert notes(run) == ""
+
+
+@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.one_of(
+    st.binary(max_size=400),
+    st.text(alphabet="0123456789.,;-+e \t\n\"'#%tuvwNa∞\r\0", max_size=400).map(str.encode),
+    st.lists(st.lists(st.one_of(st.floats().map(repr), st.sampled_from(["", "nan", "x", '"', "1e999", "-"])),
+                      max_size=5), max_size=20).map(
+        lambda t: ("t,u,w\n" + "\n".join(",".join(r) for r in t)).encode()),
+))
+@example(b"t,u,w\n" + b"1e308,1e308,1e308\n-1e308,0,0\n" * 9)
+def test_any_bytes_give_a_data_error_or_a_run(tmp_path, data):
+    path = write(tmp_path, data)
+    try:
+        run = read_csv(path)
+    except DataError:
+        return
+    assert run.n >= MIN_SAMPLES
+    assert np.isfinite(run.t).all()
+
+
+@pytest.mark.parametrize("kind", [".mat", ".parquet"])
+@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(start=st.integers(0, 1000), junk=st.binary(min_size=1, max_size=40))
+def test_damaged_binary_formats_give_a_data_error_or_a_run(tmp_path, kind, start, junk):
+    good = tmp_path / f"good{kind}"
+    if not good.exists():
+        _write_binary(good)
+    data = bytearray(good.read_bytes())
+    data[start:start + len(junk)] = junk
+    path = write(tmp_path, bytes(data), f"bad{kind}")
+    try:
+        assert read_runs(path)[0].n >= MIN_SAMPLES
+    except DataError as error:
+        assert str(path) in str(error)  # noqa: PT017
+
+
+def _write_binary(path: Path) -> None:
+    import pandas as pd
+    from scipy.io import savemat
+
+    t = np.arange(50) * 0.01
+    columns = {"time": t, "voltage": np.sign(np.sin(9 * t)), "speed_rpm": 100 * t}
+    if path.suffix == ".mat":
+        savemat(path, columns)
+    else:
+        pd.DataFrame(columns).to_parquet(path)
+
+
+# -- dialects -----------------------------------------------------------------------------------------------
+
+PLAIN = "{t:.3f},{v},{i:.3f},{w:.3f}\n"
+SEMICOLON = rows(pattern=PLAIN.replace(",", ";"))
+GERMAN = SEMICOLON.replace(".", ",")
+DIALECTS = {
+    "comma": GOOD,
+    "semicolon": HEADER.replace(",", ";") + SEMICOLON,
+    "semicolon and decimal comma": "Zeit [s];Spannung [V];Strom [A];Winkelgeschwindigkeit [rad/s]\n" + GERMAN,
+    "tab": GOOD.replace(",", "\t"),
+    "tab and decimal comma": "t\tu\ti\tw\n" + GERMAN.replace(";", "\t"),
+    "white space": GOOD.replace(",", "   "),
+    "white space and decimal comma": "t u i w\n" + GERMAN.replace(";", "  "),
+    "blanks in names": "Time [s]  Voltage [V]  Current [A]  Speed [rad/s]\n" + rows().replace(",", "  "),
+    "comma and space": GOOD.replace(",", ", "),
+    "comments": "# bench 3\n% warm\n// started, late\n" + GOOD + "# end\n",
+    "header in a comment": "# t u i w\n" + rows().replace(",", " "),
+    "header after a percent sign": "%time,u,i,w\n" + rows(),
+    "byte-order mark": "\ufeff" + GOOD,
+    "UTF-16": GOOD.encode("utf-16"),
+    "UTF-16 without mark": GOOD.encode("utf-16-be"),
+    "Latin-1": ("Zeit_s;Spannung_V;Strom_A;Geschwindigkeit_rad_s;Kühlung_°C\n"
+                + rows(pattern="{t:.3f};{v};{i:.3f};{w:.3f};20\n")).encode("latin-1"),
+    "row of units": "time;voltage;current;speed\ns;V;A;rad/s\n" + SEMICOLON,
+    "row of units in brackets": "Time,Voltage,Current,Speed\n(s),(V),(A),(rad/s)\n" + rows(),
+    "lines above the header": "Scope 7\nSampling rate, 100\nOperator: me\n\n" + GOOD,
+    "quoted header": '"time_s","voltage_V","current_A","speed_rad_s"\n' + rows(),
+    "quoted cells with decimal comma": '"t","u","i","w"\n' + rows(
+        pattern='"{t:.3f}"|"{v}"|"{i:.3f}"|"{w:.3f}"\n').replace(".", ",").replace("|", ","),
+    "delimiter at the end": GOOD.replace("\n", ",\n"),
+    "delimiter at the end of rows only": HEADER + rows().replace("\n", ",\n"),
+    "blank lines": "\n\n" + GOOD.replace("\n", "\n\n"),
+    "Windows": GOOD.replace("\n", "\r\n"),
+    "old Mac": GOOD.replace("\n", "\r"),
+    "row numbers": ",".join(["", HEADER]) + "".join(f"{k},{r}\n" for k, r in enumerate(rows().splitlines())),
+    "no line end": GOOD.rstrip("\n"),
+    "typographic minus": GOOD.replace("-", "−"),
+    "blocks of zero bytes": GOOD.encode() + b"\0" * 512,
+}
+
+
+@pytest.mark.parametrize("name", DIALECTS)
+def test_every_dialect_gives_the_same_run(name, tmp_path):
+    expected = read_csv(write(tmp_path, GOOD, "plain.csv"))
+    run = read_csv(write(tmp_path, DIALECTS[name]))
+    np.testing.assert_array_equal(run.t, expected.t)
+    np.testing.assert_array_equal(run.inputs["v"], expected.inputs["v"])
+    assert run.channels == ("i", "omega")
+    for channel in run.channels:
+        np.testing.assert_array_equal(run.outputs[channel], expected.outputs[channel])
+
+
+def test_units_in_the_header_are_converted(tmp_path):
+    run = read_csv(write(tmp_path, "t_ms,voltage_mV,current_mA,speed_rpm,angle_deg\n" + rows(
+        pattern="{t:.3f},{v},{i:.3f},{w:.3f},{w:.3f}\n")))
+    plain = read_csv(write(tmp_path, GOOD))
+    np.testing.assert_allclose(run.t, plain.t * 1e-3)
+    np.testing.assert_allclose(run.inputs["v"], plain.inputs["v"] * 1e-3)
+    np.testing.assert_allclose(run.outputs["i"], plain.outputs["i"] * 1e-3)
+    np.testing.assert_allclose(run.outputs["omega"], plain.outputs["omega"] * 2 * np.pi / 60)
+    np.testing.assert_allclose(run.outputs["theta"], plain.outputs["omega"] * np.pi / 180)
+    assert run.meta["original_units"] == {"t": "ms", "v": "mV", "i": "mA", "omega": "rpm", "theta": "deg"}
+
+
+def test_a_row_of_units_overrules_the_default(tmp_path):
+    run = read_csv(write(tmp_path, "t;u;n\nms;mV;1/min\n" + rows(pattern="{t:.3f};{v};{w:.3f}\n")))
+    assert run.meta["original_units"] == {"t": "ms", "v": "mV", "omega": "1/min"}
+    assert run.inputs["v"].max() == pytest.approx(6e-3)
+
+
+def test_columns_and_units_said_by_the_user_win(tmp_path):
+    path = write(tmp_path, "time,u_volt,speed,w\n" + rows())
+    run = read_csv(path, columns=parse_pairs("t=time,v=u_volt,omega=speed", "--columns"),
+                   units=parse_pairs("omega=rpm", "--units"))
+    assert run.meta["columns"] == {"t": "time", "v": "u_volt", "omega": "speed"}
+    assert list(run.meta["extra"]) == ["w"]
+    plain = read_csv(path, columns={"omega": "speed"})
+    np.testing.assert_allclose(run.outputs["omega"] / np.pi * 30, plain.outputs["omega"])
+
+
+def test_a_sign_and_a_scale_can_be_given_with_the_unit(tmp_path):
+    plain = read_csv(write(tmp_path, GOOD))
+    run = read_csv(write(tmp_path, GOOD), units={"i": "-1 A", "omega": "0.5 rad/s"})
+    np.testing.assert_allclose(run.outputs["i"], -plain.outputs["i"])
+    np.testing.assert_allclose(run.outputs["omega"], plain.outputs["omega"] / 2)
+
+
+def test_a_table_without_header_goes_by_position(tmp_path):
+    run = read_csv(write(tmp_path, rows()), columns={"t": 1, "v": "2", "omega": 4})
+    np.testing.assert_array_equal(run.outputs["omega"], read_csv(write(tmp_path, GOOD)).outputs["omega"])
+    assert list(run.meta["extra"]) == ["3"]
+
+
+def test_encoder_counts_become_an_angle(tmp_path):
+    path = write(tmp_path, "t,u,encoder\n" + "".join(f"{k / 100},6,{64 * k}\n" for k in range(30)))
+    run = read_csv(path, units={"theta": "counts:2048"})
+    np.testing.assert_allclose(run.outputs["theta"], 2 * np.pi * 64 / 2048 * np.arange(30))
+    cells = "".join(f"{k / 100},6,{64 * k},{k}\n" for k in range(30))
+    with_speed = write(tmp_path, "t,u,encoder,w\n" + cells)
+    assert read_csv(with_speed).channels == ("omega",)
+    assert "counts:2048" in notes(read_csv(with_speed))
+
+
+def test_duty_times_supply_is_the_drive_voltage(tmp_path):
+    cells = "".join(f"{k / 100},{k},12,{k}\n" for k in range(30))
+    run = read_csv(write(tmp_path, "t_s,duty_%,bus_V,speed_rpm\n" + cells))
+    np.testing.assert_allclose(run.inputs["v"], 0.12 * np.arange(30))
+    assert "'duty_%' times 'bus_V'" in notes(run)
+
+
+def test_a_force_command_may_drive_a_linear_axis(tmp_path):
+    path = write(tmp_path, "t_s,voltage_V,force_N,position_mm,speed\n" + "".join(
+        f"{k / 100},1,{k},{k},{k}\n" for k in range(30)))
+    run = read_csv(path, columns={"v": "force_N"})
+    assert run.units == {"v": "N", "theta": "m", "omega": "m/s"}
+    assert run.outputs["theta"][-1] == pytest.approx(0.029)
+
+
+def test_dates_and_large_clocks_count_from_the_first(tmp_path):
+    stamps = [f"2024-05-01 12:00:{0.25 * k:06.3f}" for k in range(20)]
+    clock = [f"12:00:{0.25 * k:06.3f}" for k in range(20)]
+    epoch = [str(1714550000_000000 + 250000 * k) for k in range(20)]
+    for header, times in (("time", stamps), ("time", clock), ("timestamp_us", epoch)):
+        run = read_csv(write(tmp_path, f"{header},u,w\n" + "".join(f"{s},1,2\n" for s in times)))
+        np.testing.assert_allclose(run.t, 0.25 * np.arange(20), atol=1e-9)
+        assert "counted" in notes(run)
+
+
+# -- rows ---------------------------------------------------------------------------------------------------
+
+
+def table(t, v, w) -> str:
+    return "t_s,u_V,w_rad_s\n" + "".join(f"{a},{b},{c}\n" for a, b, c in zip(t, v, w, strict=True))
+
+
+def test_missing_outputs_stay_missing_and_missing_inputs_are_held(tmp_path):
+    v = ["", 5, 5, "", "", 3, 3, 3, 3, 3, 3, 3]
+    w = [0, 1, "nan", 3, "-", 5, "ERR", 7, 8, 9, 10, 11]
+    run = read_csv(write(tmp_path, table(np.arange(12) / 10, v, w)))
+    np.testing.assert_array_equal(run.t, np.arange(1, 12) / 10)
+    np.testing.assert_array_equal(run.inputs["v"], [5, 5, 5, 5, 3, 3, 3, 3, 3, 3, 3])
+    np.testing.assert_array_equal(run.outputs["omega"], [1, np.nan, 3, np.nan, 5, np.nan, 7, 8, 9, 10, 11])
+    for part in ("first 1 row", "missing in 2 of 11 rows", "missing in 3 of 11", "1 cell of 'w_rad_s'"):
+        assert part in notes(run)
+
+
+@pytest.mark.parametrize(("t", "dropped", "note"), [
+    ([0, 1, 2, 2, 3, 4, 5, 6, 7, 8], {3}, "1 row of 10"),
+    ([0, 1, 2, 1.5, 3, 4, 5, 6, 7, 8, 9], {2}, "1 row of 11"),
+    ([0, 1, 2, 3, 1.5, 1.6, 4, 5, 6, 7, 8, 9], {4, 5}, "2 rows of 12"),
+    ([0, 1, 2, 900, 3, 4, 5, 6, 7, 8], {3}, "jumps ahead"),
+    ([*range(5), *range(12)], {*range(5)}, "starts again 1 time; kept the longest stretch, 12 of 17"),
+    ([*range(12), *range(9)], {*range(12, 21)}, "12 of 21"),
+    ([*range(9), 3, *range(9, 12), *range(9)], {9, *range(13, 22)}, "starts again 1 time"),
+    ([0, 1, "", 3, 4, 5, 6, 7, 8, 9], {2}, "1 row of 10: no time"),
+    ([*range(8), 20, 21], set(), "a gap in time, 13 s after t = 7 s"),
+])
+def test_time_is_put_in_order_and_every_loss_is_told(t, dropped, note, tmp_path):
+    run = read_csv(write(tmp_path, table(t, [1] * len(t), range(len(t)))))
+    kept = [k for k in range(len(t)) if k not in dropped]
+    np.testing.assert_array_equal(run.t, [t[k] for k in kept])
+    np.testing.assert_array_equal(run.outputs["omega"], kept)
+    assert note in notes(run)
+
+
+def test_rows_of_the_wrong_length_are_told(tmp_path):
+    run = read_csv(write(tmp_path, GOOD + "0.4,6,1,2,3,4\n0.5,6\n"))
+    assert run.n == 31
+    assert np.isnan(run.outputs["omega"][-1])
+    assert "left out 1 row with more cells" in notes(run)
+    assert "1 row shorter" in notes(run)
+
+
+def test_negative_zero_is_zero_and_uneven_samples_are_kept(tmp_path):
+    t = ["-0.0", 0.1, 0.15, 0.4, 0.42, 0.5, 0.6, 0.77, 0.9]
+    run = read_csv(write(tmp_path, table(t, [1] * 9, range(9))))
+    assert not np.signbit(run.t).any()
+    np.testing.assert_array_equal(run.t[1:], t[1:])
+
+
+def test_other_columns_travel_with_the_run(tmp_path):
+    run = read_csv(write(tmp_path, "t,u,w,temp_C,state,omega_ref\n" + rows(
+        pattern="{t:.3f},{v},{w:.3f},25,on,{w:.3f}\n")))
+    assert sorted(run.meta["extra"]) == ["omega_ref", "temp_C"]
+    assert "columns of text: state" in notes(run)
+    np.testing.assert_array_equal(run.meta["extra"]["temp_C"], np.full(30, 25.0))
+    assert len(run.select(slice(5, 20)).meta["extra"]["temp_C"]) == 15
+
+
+def test_a_channel_that_is_missing_throughout_is_left_out(tmp_path):
+    run = read_csv(write(tmp_path, HEADER + rows(pattern="{t:.3f},{v},nan,{w:.3f}\n")))
+    assert run.channels == ("omega",)
+    assert "left out 'current_A' (i)" in notes(run)
+
+
+# -- several files ------------------------------------------------------------------------------------------
+
+
+def test_paths_patterns_and_directories_in_natural_order(tmp_path):
+    for k in (10, 2, 1):
+        write(tmp_path, GOOD, f"run{k}.csv")
+    write(tmp_path, "no record", "notes.md")
+    write(tmp_path, "hidden", ".hidden.csv")
+    names = ["run1", "run2", "run10"]
+    assert [r.name for r in read_runs(tmp_path)] == names
+    assert [r.name for r in read_runs(str(tmp_path / "run*.csv"))] == names
+    both = [tmp_path / "run10.csv", str(tmp_path / "run*.csv")]
+    assert [r.name for r in read_runs(both)] == ["run10", "run1", "run2"]
+    assert [f.name for f in find_records(iter([tmp_path]))] == [f"{n}.csv" for n in names]
+
+
+def test_runs_of_one_name_are_told_apart(tmp_path):
+    for folder in ("a", "b"):
+        (tmp_path / folder).mkdir()
+        write(tmp_path / folder, GOOD)
+    assert [r.name for r in read_runs([tmp_path / "a", tmp_path / "b"])] == ["a/run.csv", "b/run.csv"]
+
+
+def test_a_name_with_pattern_letters_is_taken_as_it_stands(tmp_path):
+    assert read_runs(write(tmp_path, GOOD, "run[1].csv"))[0].name == "run[1]"
+
+
+@pytest.mark.parametrize("paths", [3, None, [3], [b"run.csv"]])
+def test_what_is_no_path_is_a_usage_error(paths):
+    with pytest.raises(UsageError, match="expected"):
+        read_runs(paths)
+
+
+def test_no_path_at_all_is_a_data_error():
+    with pytest.raises(DataError, match="no record"):
+        read_runs([])
+
+
+def test_a_directory_is_no_csv(tmp_path):
+    with pytest.raises(DataError, match="read_runs"):
+        read_csv(tmp_path)
+
+
+def test_source_and_fingerprint_are_kept(tmp_path):
+    import hashlib
+
+    path = write(tmp_path, GOOD)
+    run = read_csv(path)
+    assert run.meta["source"] == str(path)
+    assert run.meta["sha256"] == hashlib.sha256(GOOD.encode()).hexdigest()
+
+
+# -- MATLAB and Parquet -------------------------------------------------------------------------------------
+
+
+def test_matlab_variables_structures_and_matrices(tmp_path):
+    from scipy.io import savemat
+
+    t = np.arange(40) * 0.01
+    savemat(tmp_path / "a.mat", {"t": t, "u": np.sin(t), "omega": np.cos(t), "note": "x", "K": 3.0,
+                                 "other": np.arange(9.0)})
+    a = read_mat(tmp_path / "a.mat")
+    np.testing.assert_array_equal(a.outputs["omega"], np.cos(t))
+    assert "another length than 40: other" in notes(a)
+    savemat(tmp_path / "b.mat", {"log": {"time": t, "voltage_V": np.sin(t), "motor": {"speed_rpm": t}}})
+    b = read_runs(tmp_path / "b.mat")[0]
+    np.testing.assert_allclose(b.outputs["omega"], t * 2 * np.pi / 60)
+    savemat(tmp_path / "c.mat", {"data": np.column_stack([t, np.sin(t), np.cos(t)])})
+    c = read_mat(tmp_path / "c.mat", columns={"t": "data_1", "v": "data_2", "theta": 3})
+    np.testing.assert_array_equal(c.outputs["theta"], np.cos(t))
+
+
+def test_parquet(tmp_path):
+    pd = pytest.importorskip("pandas")
+    pytest.importorskip("pyarrow")
+    t = np.arange(40) * 0.01
+    frame = pd.DataFrame({"voltage_V": np.sin(t), "speed_rpm": t, "state": "on"},
+                         index=pd.Index(t, name="time_s"))
+    frame.to_parquet(tmp_path / "a.parquet")
+    run = read_parquet(tmp_path / "a.parquet")
+    np.testing.assert_array_equal(run.t, t)
+    np.testing.assert_allclose(run.outputs["omega"], t * 2 * np.pi / 60)
+    stamps = pd.Timestamp("2024-05-01") + pd.to_timedelta(t, unit="s")
+    stamped = frame.reset_index(drop=True).assign(time=stamps)
+    stamped.to_parquet(tmp_path / "b.parquet")
+    np.testing.assert_allclose(read_runs(tmp_path / "b.parquet")[0].t, t, atol=1e-9)
+
+
+def test_parquet_without_pyarrow_names_the_extra(tmp_path, monkeypatch):
+    import sys
+
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    with pytest.raises(MissingDependency, match=r"motorid\[parquet\]"):
+        read_parquet(write(tmp_path, b"PAR1", "a.parquet"))
+
+
+# -- writing ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("channels", [("i",), ("omega",), ("theta",), OUTPUTS])
+@pytest.mark.parametrize("linear", [False, True])
+@pytest.mark.parametrize("drive", UNITS["v"])
+def test_writing_and_reading_gives_the_same_run(channels, linear, drive, tmp_path, rng):
+    n = 25
+    outputs = {c: rng.normal(size=n) * 10.0 ** rng.integers(-9, 9) for c in channels}
+    outputs[channels[0]][[3, 7]] = np.nan
+    units = {c: {"omega": "m/s", "theta": "m"}[c] for c in channels if c in ("omega", "theta") and linear}
+    run = Experiment(np.cumsum(rng.uniform(1e-4, 1e-3, n)), {"v": rng.normal(size=n)}, outputs,
+                     sigma={channels[-1]: 0.1 + 0.2}, hold="linear" if linear else "zoh",
+                     units={"v": drive, **units},
+                     meta={"extra": {"temp_C": np.arange(n), "omega": np.ones(n), "time_s": np.zeros(n)}})
+    again = read_csv(write_csv(run, tmp_path / "run.csv"))
+    assert again.hold == run.hold
+    assert again.units == run.units
+    assert again.sigma == run.sigma
+    assert again.channels == run.channels
+    assert notes(again).count("\n") == 0
+    for mine, theirs in [(run.t, again.t), (run.inputs["v"], again.inputs["v"]),
+                         *((run.outputs[c], again.outputs[c]) for c in channels)]:
+        np.testing.assert_allclose(theirs, mine, rtol=1e-15)
+    assert set(again.meta["extra"]) == {"temp_C", "omega", "time_s (extra)"}
+
+
+def test_hold_said_while_reading_wins(tmp_path):
+    run = read_csv(write(tmp_path, GOOD)).with_(hold="linear")
+    path = write_csv(run, tmp_path / "again.csv")
+    assert read_csv(path).hold == "linear"
+    assert read_csv(path, hold="zoh").hold == "zoh"
+    with pytest.raises(DataError, match="zoh, linear"):
+        read_csv(path, hold="spline")
+
+
+def test_a_place_that_cannot_be_written_is_a_data_error(tmp_path):
+    with pytest.raises(DataError, match="cannot write"):
+        write_csv(read_csv(write(tmp_path, GOOD)), tmp_path / "none" / "run.csv")
+
+
+# -- real records -------------------------------------------------------------------------------------------
+
+REAL = {
+    "emps": ({}, ("theta",), {"v": "V", "theta": "m"}, [24841]),
+    "fibo": ({}, ("omega",), {"v": "V", "omega": "rad/s"}, [25502] * 3),
+    "frc": ({}, ("omega", "theta"), {"v": "V", "omega": "rad/s", "theta": "rad"}, [1287, 4211]),
+    "furuta_base": ({}, OUTPUTS, {"v": "V", "i": "A", "omega": "rad/s", "theta": "rad"}, [8001, 5001]),
+    "odri_mn4004": ({}, OUTPUTS, {"v": "V", "i": "A", "omega": "rad/s", "theta": "rad"}, [3717, 26999]),
+    "unmotor": ({"units": {"omega": "deg/s"}}, ("omega",), {"v": "V", "omega": "rad/s"}, [4093, 302]),
+    "xl330": ({}, ("omega", "theta"), {"v": "V", "omega": "rad/s", "theta": "rad"},
+              [1510, 1124, 1116, 1116, 1499, 1125, 1131, 1123]),
+}
+
+
+@pytest.mark.parametrize("folder", REAL)
+def test_real_records_open_as_they_are(folder, real):
+    hints, channels, units, samples = REAL[folder]
+    runs = read_runs(real / folder, **hints)
+    assert [r.n for r in runs] == samples
+    for run in runs:
+        assert run.channels == channels
+        assert run.units == units
+        assert "left out" not in notes(run)
+
+
+def test_the_speed_of_unmotor_is_in_degrees_per_second(real):
+    run = read_runs(real / "unmotor" / "step.csv", units={"omega": "deg/s"})[0]
+    assert run.outputs["omega"][0] == pytest.approx(257.14288330 * np.pi / 180)
