@@ -15,8 +15,8 @@ _showing: ContextVar[bool] = ContextVar("motorid_progress", default=False)
 def progress(text: str, total: float | None = None, *, quiet: bool = False) -> Iterator[Callable[..., None]]:
     """Show a bar while the block runs; call what it yields once per finished task.
 
-    The bar stands on standard error and vanishes at the end. There is none if `quiet`, if nobody looks (a pipe, a
-    log file, a worker process), or inside another bar, so a function may use it without asking who calls it.
+    The bar stands on standard error and vanishes at the end. There is none if `quiet`, if nobody looks (a
+    pipe, a log file, a worker process), or inside another bar, so any function may use it whoever calls it.
 
     Parameters
     ----------
@@ -41,10 +41,9 @@ def progress(text: str, total: float | None = None, *, quiet: bool = False) -> I
         yield lambda n=1.0: None
         return
     from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(),
-               TimeRemainingColumn())
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     token = _showing.set(True)
     try:
         with Progress(*columns, console=Console(stderr=True), transient=True) as bar:

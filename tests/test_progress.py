@@ -14,14 +14,15 @@ class Screen(io.StringIO):
         return True
 
 
-@pytest.fixture
-def screen(monkeypatch):
+def terminal(monkeypatch):
+    """Make standard error a terminal; to be called in the test itself, after pytest has set its own capture."""
     monkeypatch.setenv("TERM", "xterm")
     monkeypatch.setattr(sys, "stderr", Screen())
     return sys.stderr
 
 
-def test_bar_counts_up_in_a_terminal(screen):
+def test_bar_counts_up_in_a_terminal(monkeypatch):
+    screen = terminal(monkeypatch)
     with progress("Refitting", total=3) as advance:
         for _ in range(3):
             advance()
@@ -29,7 +30,8 @@ def test_bar_counts_up_in_a_terminal(screen):
     assert "3/3" in screen.getvalue()
 
 
-def test_inner_bar_stays_silent_inside_another(screen):
+def test_inner_bar_stays_silent_inside_another(monkeypatch):
+    screen = terminal(monkeypatch)
     with progress("Outer", total=1) as advance:
         with progress("Inner", total=1) as inner:
             inner()
@@ -40,13 +42,15 @@ def test_inner_bar_stays_silent_inside_another(screen):
     assert "Later" in screen.getvalue()
 
 
-def test_quiet_shows_nothing(screen):
+def test_quiet_shows_nothing(monkeypatch):
+    screen = terminal(monkeypatch)
     with progress("Refitting", total=1, quiet=True) as advance:
         advance()
     assert screen.getvalue() == ""
 
 
-def test_error_in_the_block_passes_and_ends_the_bar(screen):
+def test_error_in_the_block_passes_and_ends_the_bar(monkeypatch):
+    screen = terminal(monkeypatch)
     with pytest.raises(KeyError), progress("Refitting", total=1):
         raise KeyError("x")
     with progress("Again", total=1) as advance:
