@@ -1,0 +1,112 @@
+"""Numbers for people: values with errors, per cent, durations. One place, so that every table agrees."""
+
+from __future__ import annotations
+
+import math
+from decimal import ROUND_HALF_EVEN, Decimal
+
+__all__ = ["duration", "number", "percent", "quantity", "with_error"]
+
+_RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+_SMALLEST, _LARGEST = -4, 5  # decades written out; beyond them a power of ten is
+
+
+def with_error(value: float, std: float | None, unit: str = "") -> str:
+    """Return a value with its standard deviation, both rounded to what the error allows.
+
+    The error keeps one or two digits by the rule of the Particle Data Group (Review of Particle Physics, §5.3):
+    two where its first digits are 10–35, one from 36–94; the value is rounded to the same place.
+
+    Parameters
+    ----------
+    value : float
+    std : float or None
+        0: held, not estimated. None (or not finite): the data do not determine it.
+    unit : str
+
+    Examples
+    --------
+    >>> with_error(1.30243, 0.00412, "Ω")
+    '1.302 ± 0.004 Ω'
+    >>> with_error(2.0344e-5, 1.23e-7, "kg·m²")
+    '(2.034 ± 0.012)·10⁻⁵ kg·m²'
+    >>> with_error(1.3, 0, "Ω")
+    '1.3 Ω (held)'
+    >>> with_error(1.3, None, "Ω")
+    '1.3 Ω (not determined)'
+    """
+    tail = f" {unit}" if unit else ""
+    if not math.isfinite(value):
+        return number(value) + tail
+    if std is None or not math.isfinite(std) or std < 0:
+        return f"{number(value, 3)}{tail} (not determined)"
+    if std == 0:
+        return f"{number(value, 6)}{tail} (held)"
+    place = _place(std)
+    power = _power(max(abs(value), std))
+    exact, error = _rounded(value, place, power), _rounded(std, place, power)
+    if power:
+        return f"({exact} ± {error})·10{_raised(power)}{tail}"
+    return f"{exact} ± {error}{tail}"
+
+
+def number(value: float | None, digits: int = 4) -> str:
+    """Return a number with `digits` significant digits, trailing zeros left out: ``0.01234``, ``2.03·10⁻⁵``."""
+    if value is None or math.isnan(value):
+        return "–"
+    if math.isinf(value):
+        return "∞" if value > 0 else "−∞"
+    if value == 0:
+        return "0"
+    value = float(f"{value:.{digits - 1}e}")
+    power = _power(abs(value))
+    place = math.floor(math.log10(abs(value))) - digits + 1
+    text = _rounded(value, place, power)
+    text = text.rstrip("0").rstrip(".") if "." in text else text
+    return f"{text}·10{_raised(power)}" if power else text
+
+
+def quantity(value: float | None, unit: str = "", digits: int = 4) -> str:
+    """Return a number with its unit."""
+    return f"{number(value, digits)} {unit}".rstrip()
+
+
+def percent(share: float | None, digits: int = 3) -> str:
+    """Return a share as per cent: ``0.0123`` is ``1.23 %``."""
+    return "–" if share is None or math.isnan(share) else f"{number(100 * share, digits)} %"
+
+
+def duration(seconds: float) -> str:
+    """Return a time for people: ``35 ms``, ``1.2 s``, ``3 min 20 s``."""
+    if not math.isfinite(seconds):
+        return "–"
+    if seconds < 0.9995:
+        return f"{number(1e3 * seconds, 2)} ms"
+    if seconds < 59.95:
+        return f"{number(seconds, 3)} s"
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes} min {rest} s" if rest else f"{minutes} min"
+
+
+def _place(std: float) -> int:
+    """Decimal place to which an error is rounded."""
+    decade = math.floor(math.log10(std))
+    first = round(std / 10.0 ** (decade - 2))  # its first three digits
+    return decade - 1 if first < 355 or first >= 950 else decade
+
+
+def _power(size: float) -> int:
+    decade = math.floor(math.log10(size)) if size > 0 else 0
+    return 0 if _SMALLEST < decade < _LARGEST else decade
+
+
+def _rounded(value: float, place: int, power: int) -> str:
+    shifted = Decimal(repr(float(value))).scaleb(-power)
+    text = f"{shifted.quantize(Decimal(1).scaleb(min(place - power, 0)), ROUND_HALF_EVEN):f}"
+    if place - power > 0:  # the error is tens or more: zeros in their place
+        text = f"{shifted.quantize(Decimal(1).scaleb(place - power), ROUND_HALF_EVEN):f}"
+    return text.replace("-", "−") if text.strip("-0.") else text.replace("-", "")
+
+
+def _raised(power: int) -> str:
+    return str(power).translate(_RAISED)
