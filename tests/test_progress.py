@@ -15,7 +15,7 @@ class Screen(io.StringIO):
 
 
 def terminal(monkeypatch):
-    """Make standard error a terminal; to be called in the test itself, after pytest has set its own capture."""
+    """Make standard error a terminal; called in the test itself, after pytest has set its own capture."""
     monkeypatch.setenv("TERM", "xterm")
     monkeypatch.setattr(sys, "stderr", Screen())
     return sys.stderr
