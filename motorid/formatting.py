@@ -14,7 +14,7 @@ _SMALLEST, _LARGEST = -4, 5  # decades written out; beyond them a power of ten i
 def with_error(value: float, std: float | None, unit: str = "") -> str:
     """Return a value with its standard deviation, both rounded to what the error allows.
 
-    The error keeps one or two digits by the rule of the Particle Data Group (Review of Particle Physics, §5.3):
+    The error keeps one or two digits by the rule of the Particle Data Group (Review of Particle Physics):
     two where its first digits are 10–35, one from 36–94; the value is rounded to the same place.
 
     Parameters
@@ -51,7 +51,7 @@ def with_error(value: float, std: float | None, unit: str = "") -> str:
 
 
 def number(value: float | None, digits: int = 4) -> str:
-    """Return a number with `digits` significant digits, trailing zeros left out: ``0.01234``, ``2.03·10⁻⁵``."""
+    """Return a number with `digits` significant digits, no trailing zeros: ``0.01234``, ``2.03·10⁻⁵``."""
     if value is None or math.isnan(value):
         return "–"
     if math.isinf(value):

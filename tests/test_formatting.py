@@ -38,7 +38,8 @@ def test_what_is_printed_is_within_a_tenth_of_the_error_of_the_value(std):
 
 
 @pytest.mark.parametrize(("value", "text"), [
-    (1.2345e-5, "1.234·10⁻⁵"), (-0.5, "−0.5"), (99999.7, "1·10⁵"), (0.000999999, "0.001"), (12.0, "12"), (100.0, "100"),
+    (1.2345e-5, "1.234·10⁻⁵"), (-0.5, "−0.5"), (99999.7, "1·10⁵"), (0.000999999, "0.001"), (12.0, "12"),
+    (100.0, "100"),
     (0, "0"), (None, "–"), (math.nan, "–"), (-math.inf, "−∞"), (1234.0, "1234"), (12345.0, "12340"),
 ])
 def test_numbers_keep_four_significant_digits(value, text):
