@@ -61,6 +61,17 @@ def prepare_run(run: Experiment, channels: Sequence[str], noise: Mapping[str, fl
     """Return `run` ready for a system with `inputs`."""
     if initial not in INITIAL:
         raise UsageError(one_of(initial, INITIAL, "initial state"))
+    sigma = {c: float(run.sigma.get(c, noise[c])) for c in channels if c in run.outputs}
+    start, estimated = initial_state(run, sigma, initial)
+    return Run(run, _grid(run, inputs), sigma, start, estimated)
+
+
+def with_inputs(run: Run, inputs: Sequence[str]) -> Run:
+    """Return the run with the grid of other inputs and the same sub-steps."""
+    return replace(run, grid=_grid(run.experiment, inputs).with_substeps(run.grid.substeps))
+
+
+def _grid(run: Experiment, inputs: Sequence[str]) -> Grid:
     columns, held = [], []
     for name in inputs:
         if name == "theta_in":
@@ -71,9 +82,7 @@ def prepare_run(run: Experiment, channels: Sequence[str], noise: Mapping[str, fl
             held.append(run.hold == "zoh")
         else:
             raise ModelError(f"{run.name}: the model needs the input '{name}', which the record does not have.")
-    sigma = {c: float(run.sigma.get(c, noise[c])) for c in channels if c in run.outputs}
-    start, estimated = initial_state(run, sigma, initial)
-    return Run(run, Grid.of(run.t, np.column_stack(columns), np.array(held)), sigma, start, estimated)
+    return Grid.of(run.t, np.column_stack(columns), np.array(held))
 
 
 def initial_state(run: Experiment, sigma: Mapping[str, float], initial: str) -> tuple[Array, tuple[str, ...]]:

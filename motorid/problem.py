@@ -15,7 +15,7 @@ from motorid.integrate import Engine, Trajectory, engine_of
 from motorid.integrate.grid import Array
 from motorid.model import Model
 from motorid.parameters import Parameter, Scaling
-from motorid.prepared import Run, channels_of, noise_of, prepare_run, smoothing
+from motorid.prepared import Run, channels_of, noise_of, prepare_run, smoothing, with_inputs
 from motorid.system import System
 
 
@@ -310,6 +310,14 @@ class Problem:
     def n_outputs(self) -> int:
         """Number of output residuals (finite measured samples)."""
         return sum(y.size if index is None else len(index) for y, _, index in self._weights)
+
+    def for_model(self, model: Model) -> Problem:
+        """Return the problem for another model on the same records, keeping noise, grids and initial states."""
+        runs = self.runs
+        if model.angle_input != self.model.angle_input:
+            names = self.system.inputs[:1] + (("theta_in",) if model.angle_input else ())
+            runs = tuple(with_inputs(run, names) for run in runs)
+        return replace(self, model=model, _runs=runs)
 
     def with_(self, **fields: Any) -> Problem:
         """Return a copy with some fields changed, e.g. ``with_(model=…)``."""

@@ -67,7 +67,7 @@ def gravity(
 def cogging(
     m: Equations,
     A=P(1e-3, "N·m", null=0.0, lower=0.0, doc="amplitude of the cogging torque"),
-    N=P(12.0, "", order=True, lower=1.0, doc="periods per turn"),
+    N=P(12.0, "", order=True, vary=False, lower=1.0, doc="periods per turn, found from the misfit, then held"),
     phi=P(0.0, "rad", periodic=True, doc="phase at theta = 0"),
 ):
     """Cogging torque, A·sin(N·θ+φ). Hendershot & Miller, Design of Brushless Permanent-Magnet Machines, 2010."""
@@ -78,7 +78,7 @@ def cogging(
 def torque_ripple(
     m: Equations,
     a_r=P(0.05, "", null=0.0, lower=0.0, upper=1.0, doc="relative amplitude"),
-    N_r=P(12.0, "", order=True, lower=1.0, doc="periods per turn"),
+    N_r=P(12.0, "", order=True, vary=False, lower=1.0, doc="periods per turn, found from the misfit, then held"),
     phi_r=P(0.0, "rad", periodic=True, doc="phase at theta = 0"),
 ):
     """Ripple of the torque constant, K·(1+a·sin(N·θ+φ)) in the torque only. Jahns & Soong, IEEE TIE 43(2), 1996."""
