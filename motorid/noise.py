@@ -13,7 +13,8 @@ Array = NDArray[np.float64]
 ORDERS = (2, 3, 4, 5, 6)
 _SMALLER_HALF = 0.3240277  # mean of |z| over the smaller half, z standard normal: 4·(φ(0) − φ(0.67449))
 _FLOOR = 1e-5  # of the channel's own variation: what a noise-free simulation is given
-_QUANTISED_ONLY = 0.8  # in steps: below this the differences show the steps and not the noise
+_REST = 12  # equal samples in a row that count as standstill
+_DITHERED = 0.6  # noise that is to be seen through the steps leaves fewer neighbours equal than this
 
 
 def noise_level(y: ArrayLike, t: ArrayLike | None = None) -> float:
@@ -54,25 +55,26 @@ def noise_level(y: ArrayLike, t: ArrayLike | None = None) -> float:
     keep = np.isfinite(values) & np.isfinite(times)
     values, times = values[keep], times[keep]
     step = quantum(values)
-    return max(_from_differences(values, times, step), step / np.sqrt(12), _floor(values))
+    return float(max(_from_differences(values, times, step), step / np.sqrt(12), _floor(values)))
 
 
 def quantum(y: ArrayLike) -> float:
     """Return the step in which a channel moves (encoder count, converter bit), or 0.0 if it shows none.
 
-    Only a step that matters is looked for: one that makes neighbouring samples equal.
+    Second differences of a smooth signal that moves in steps are small whole multiples of the step, even if
+    the signal itself passes many steps per sample.
     """
     values = np.asarray(y, dtype=float)
     values = values[np.isfinite(values)]
-    levels = np.unique(values)
-    if len(levels) < 4 or np.mean(np.diff(values) == 0) < 0.1:
+    jumps = np.abs(np.diff(values, 2))
+    jumps = jumps[jumps > 1e-9 * np.abs(values).max(initial=0.0)]
+    if len(jumps) < 20:
         return 0.0
-    gaps = np.diff(levels)
-    gaps = gaps[gaps > 1e-6 * (levels[-1] - levels[0])]  # rounding in the file splits one level into several
-    for candidate in np.quantile(gaps, (0.5, 0.1), method="nearest"):
-        steps = gaps / candidate
-        if np.mean((np.abs(steps - steps.round()) < 0.05) & (steps > 0.5)) > 0.9:
-            return float(np.median(gaps[steps.round() == 1]))
+    for guess in np.unique(np.quantile(jumps, np.arange(0.02, 0.98, 0.04), method="nearest"))[::-1]:
+        step = float(np.median(jumps[np.abs(jumps / guess - 1) < 0.2]))  # rounding in the file blurs it
+        steps = jumps / step
+        if np.mean(np.abs(steps - steps.round()) < 0.1) > 0.95:
+            return step
     return 0.0
 
 
@@ -107,11 +109,18 @@ def _of_order(values: Array, times: Array, order: int, step: float) -> float:
     weights = 1.0 / np.prod(apart, axis=2)
     weights /= np.linalg.norm(weights, axis=1, keepdims=True)
     size = np.abs(np.sum(weights * (y - y[:, :1]), axis=1))
-    moving = np.ptp(y, axis=1) > 0
-    if not moving.any():
+    live = ~_at_rest(values, order)[whole]
+    if not live.any():
         return 0.0
-    level = _typical(size[moving])
-    return level if level > _QUANTISED_ONLY * step else _typical(size)
+    equal = float(np.mean(y[live, 1:] == y[live, :-1]))
+    return _typical(size if step and equal > _DITHERED else size[live])
+
+
+def _at_rest(values: Array, order: int) -> NDArray[np.bool_]:
+    """Tell which windows of order + 1 samples lie in a standstill, where nothing changes at all."""
+    stretch = np.r_[0, np.cumsum(np.diff(values) != 0)]
+    first, last = stretch[:-order], stretch[order:]
+    return (first == last) & (np.bincount(stretch)[first] >= _REST)
 
 
 def _typical(size: Array) -> float:

@@ -1,0 +1,119 @@
+"""The noise of a channel is found from its samples, whatever the motor does meanwhile."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from motorid.noise import noise_level, quantum
+
+N = 2000
+T = np.arange(N) * 1e-3
+
+
+def speed() -> np.ndarray:
+    """Standstill, start, reversal: 80 ms time constant."""
+    start = 100 * (1 - np.exp(-np.maximum(T - 0.3, 0) / 0.08))
+    return np.where(T < 1, start, -100 + 200 * np.exp(-(T - 1) / 0.08))
+
+
+def current() -> np.ndarray:
+    """Two spikes of 4 ms, little otherwise."""
+    return sum(np.exp(-np.clip(T - a, 0, None) / 0.004) * (a <= T) for a in (0.3, 1.0))
+
+
+@pytest.mark.parametrize("signal", [speed, current, lambda: 687 + np.cumsum(speed()) * 1e-3,
+                                    lambda: np.sin(2 * np.pi * np.arange(N) / 40), lambda: np.zeros(N)],
+                         ids=["speed", "current", "angle", "sine", "nothing"])
+@pytest.mark.parametrize("size", [0.003, 0.3])
+def test_white_noise_is_found_within_15_per_cent(signal, size, rng):
+    assert noise_level(signal() + size * rng.normal(size=N)) == pytest.approx(size, rel=0.15)
+
+
+def test_short_records_are_estimated_without_large_bias(rng):
+    levels = [noise_level(np.linspace(0, 9, 30) + rng.normal(size=30)) for _ in range(200)]
+    assert np.mean(levels) == pytest.approx(1, rel=0.1)
+
+
+def test_outliers_and_missing_samples_do_no_harm(rng):
+    y = speed() + 0.5 * rng.normal(size=N)
+    spiked = y.copy()
+    spiked[rng.random(N) < 0.02] += 50
+    assert noise_level(spiked) == pytest.approx(0.5, rel=0.15)
+    holed = y.copy()
+    holed[rng.random(N) < 0.3] = np.nan
+    assert noise_level(holed, T) == pytest.approx(0.5, rel=0.15)
+
+
+def test_uneven_time_stamps_are_used(rng):
+    t = T + 4e-4 * rng.uniform(-1, 1, N)
+    y = 5000 * t + 0.5 * rng.normal(size=N)
+    assert noise_level(y, t) == pytest.approx(0.5, rel=0.15)
+    assert noise_level(y) > 0.8  # without them the jitter counts as noise
+
+
+def test_an_exact_standstill_says_nothing(rng):
+    y = speed() + 0.5 * rng.normal(size=N)
+    y[:1500] = 0
+    assert noise_level(y) == pytest.approx(0.5, rel=0.15)
+
+
+@pytest.mark.parametrize("step", [0.1, 1.0, 6.4])
+def test_a_quantised_channel_has_the_noise_of_its_steps(step):
+    y = step * np.round(speed() / step)
+    assert quantum(y) == pytest.approx(step)
+    assert noise_level(y) == pytest.approx(step / np.sqrt(12), rel=0.15)
+
+
+def test_noise_and_steps_together(rng):
+    y = np.round(speed() + 0.7 * rng.normal(size=N))
+    assert noise_level(y) == pytest.approx(np.hypot(0.7, 1 / np.sqrt(12)), rel=0.2)
+
+
+@pytest.mark.parametrize("step", [0.01, 0.1, 1.0])
+def test_a_quantised_angle_has_the_noise_of_its_steps(step):
+    y = step * np.round(np.cumsum(speed()) * 1e-3 / step)
+    assert noise_level(y) == pytest.approx(step / np.sqrt(12), rel=0.15)
+
+
+def test_steps_are_not_seen_where_there_are_none(rng):
+    assert quantum(speed()) == 0
+    assert quantum(speed() + rng.normal(size=N)) == 0
+    assert quantum(np.linspace(0, 1, N)) == 0
+    assert quantum(np.zeros(N)) == 0
+    assert quantum([]) == 0
+
+
+def test_no_channel_has_no_noise_at_all():
+    assert 1e-6 < noise_level(speed()) / np.std(speed()) < 2e-5
+    assert noise_level(np.full(N, 3.0)) == pytest.approx(3e-5)
+    for nothing in (np.zeros(N), np.full(N, np.nan), [], [1.0]):
+        assert noise_level(nothing) > 0
+
+
+def test_smooth_noise_is_underestimated_by_the_documented_factor(rng):
+    from scipy.signal import lfilter
+
+    coloured = lfilter([np.sqrt(1 - 0.81)], [1, -0.9], rng.normal(size=20000))
+    assert 0.2 < noise_level(coloured) / np.std(coloured) < 0.33
+
+
+@pytest.mark.parametrize("name", ["two_step_noisy", "two_step_small", "hidden_friction", "hidden_cogging",
+                                  "hidden_brush", "hidden_two"])
+def test_the_stated_noise_of_shipped_records_is_found(name):
+    from motorid.datasets import data_path, truth
+    from motorid.reading import read_runs
+
+    for run in read_runs(data_path(name)):
+        for channel, stated in truth(name)["sigma"].items():
+            assert noise_level(run.outputs[channel], run.t) == pytest.approx(stated, rel=0.15)
+
+
+def test_the_step_of_a_fast_encoder_is_found():
+    from motorid.datasets import data_path
+    from motorid.reading import read_runs
+
+    for run in read_runs(data_path("hidden_cogging")):  # up to 27 counts from sample to sample
+        assert quantum(run.outputs["theta"]) == pytest.approx(2 * np.pi / 4096, rel=0.01)
+        level = noise_level(run.outputs["theta"], run.t)
+        assert level == pytest.approx(2 * np.pi / 4096 / np.sqrt(12), rel=0.15)
