@@ -19,27 +19,55 @@ from motorid.acquire.recording import Progress, Recording
 
 __all__ = ["bench", "record"]
 
-Port = Annotated[str, typer.Option(help="Serial port of the bench: /dev/ttyACM0, COM3, socket://127.0.0.1:7000.")]
+Port = Annotated[str, typer.Option(
+    help="Serial port of the bench: /dev/ttyACM0, COM3, socket://127.0.0.1:7000.")]
+Out = Annotated[Path, typer.Option(help="The CSV to write.")]
+Baud = Annotated[int, typer.Option(min=300, help="Bits per second; a board on USB does not care.")]
 Excite = Annotated[str | None, typer.Option(
-    help="Voltage to apply: rest:T step:V:T stairs:V1:V2:N:T ramp:V1:V2:T chirp:A:F1:F2:T prbs:A:BIT:T coast:T "
-         "standard, joined by commas (V, s, Hz). Without it the motor is held at 0 V.")]
-Probability = Annotated[float, typer.Option(min=0.0, max=1.0)]
+    help="Voltage to apply: rest:T step:V:T stairs:V1:V2:N:T ramp:V1:V2:T chirp:A:F1:F2:T prbs:A:BIT:T "
+         "coast:T standard, joined by commas (V, s, Hz). Without it the motor is held at 0 V.")]
+Duration = Annotated[float | None, typer.Option(help="Stop after so many seconds.")]
+Volts = Annotated[float | None, typer.Option(help="Never more than so many V, of either sign.")]
+Amperes = Annotated[float | None, typer.Option(help="Switch the motor off beyond so many A.")]
+Calibration = Annotated[Path | None, typer.Option(help="TOML with scale, offset, gain … per channel.")]
+Resume = Annotated[bool, typer.Option("--resume", help="Go on with a record that was cut short.")]
+Force = Annotated[bool, typer.Option("--force", help="Replace a file that exists.")]
+Timeout = Annotated[float, typer.Option(help="Silence in s that ends the recording.")]
+Quiet = Annotated[bool, typer.Option("--quiet", help="No live progress.")]
+
+Effect = Annotated[str, typer.Option(
+    help="What is hidden: none, random, or effects joined by commas, bare or with numbers as in "
+         "coulomb:tau_c=0.01.")]
+MotorName = Annotated[str, typer.Option(help="Which motor: micro, lab, servo, wheel, big.")]
+Seed = Annotated[int | None, typer.Option(
+    min=0, help="Draws the hidden effect, the motor's constants, the noise and the faults.")]
+Rate = Annotated[float, typer.Option(min=1.0, max=20_000.0, help="Samples per second.")]
+Channels = Annotated[str, typer.Option(help="What it sends.")]
+Speed = Annotated[float, typer.Option(min=0.0, help="Times real time; 0 as fast as it is read.")]
+Probability = Annotated[float, typer.Option(min=0.0, max=1.0, help="Probability of this fault, per line.")]
+UnplugAfter = Annotated[float | None, typer.Option(help="Pull the plug after so many s of a run.")]
+PlugAfter = Annotated[float | None, typer.Option(help="Plug it in again after so many s.")]
+LinkName = Annotated[Path | None, typer.Option(help="A name for the port that stays the same.")]
+SocketPort = Annotated[int | None, typer.Option(
+    min=0, max=65_535, help="Serve socket:// on this port of the loopback address (0: any) instead of a "
+                            "pseudo-terminal.")]
+Once = Annotated[bool, typer.Option("--once", help="End after the first run.")]
+Reveal = Annotated[bool, typer.Option("--reveal", help="At the end, tell what was hidden.")]
 
 
 def record(
     port: Port,
-    out: Annotated[Path, typer.Option(help="The CSV to write.")],
-    baud: Annotated[int, typer.Option(min=300, help="Bits per second; boards with their own USB do not care.")]
-    = 115_200,
+    out: Out,
+    baud: Baud = 115_200,
     excite: Excite = None,
-    duration: Annotated[float | None, typer.Option(help="Stop after so many seconds.")] = None,
-    limit_voltage: Annotated[float | None, typer.Option(help="Never more than so many V, of either sign.")] = None,
-    limit_current: Annotated[float | None, typer.Option(help="Switch the motor off beyond so many A.")] = None,
-    calibration: Annotated[Path | None, typer.Option(help="TOML with scale, offset, gain … per channel.")] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on with a record that was cut short.")] = False,
-    force: Annotated[bool, typer.Option("--force", help="Replace a file that exists.")] = False,
-    timeout: Annotated[float, typer.Option(help="Silence in s that ends the recording.")] = 2.0,
-    quiet: Annotated[bool, typer.Option("--quiet", help="No live progress.")] = False,
+    duration: Duration = None,
+    limit_voltage: Volts = None,
+    limit_current: Amperes = None,
+    calibration: Calibration = None,
+    resume: Resume = False,
+    force: Force = False,
+    timeout: Timeout = 2.0,
+    quiet: Quiet = False,
 ) -> None:
     """Record a run from a bench on a serial port. KEEP CLEAR OF THE SHAFT: the motor will move.
 
@@ -58,25 +86,22 @@ def record(
 
 
 def bench(
-    effect: Annotated[str, typer.Option(help="What is hidden: none, random, or effects joined by commas, bare "
-                                             "or with numbers as in coulomb:tau_c=0.01.")] = "random",
-    motor: Annotated[str, typer.Option(help="Which motor.")] = "lab",
-    seed: Annotated[int | None, typer.Option(min=0, help="Draws the hidden effect, the motor's constants, the "
-                                                         "noise and the faults.")] = None,
-    rate: Annotated[float, typer.Option(min=1.0, max=20_000.0, help="Samples per second.")] = 1000.0,
-    channels: Annotated[str, typer.Option(help="What it sends.")] = "v,i,omega,theta",
-    speed: Annotated[float, typer.Option(min=0.0, help="Times real time; 0 as fast as it is read.")] = 1.0,
+    effect: Effect = "random",
+    motor: MotorName = "lab",
+    seed: Seed = None,
+    rate: Rate = 1000.0,
+    channels: Channels = "v,i,omega,theta",
+    speed: Speed = 1.0,
     drop: Probability = 0.0,
     garbage: Probability = 0.0,
     cut: Probability = 0.0,
     flip: Probability = 0.0,
-    unplug_after: Annotated[float | None, typer.Option(help="Pull the plug after so many s of a run.")] = None,
-    plug_after: Annotated[float | None, typer.Option(help="Plug it in again after so many s.")] = None,
-    link: Annotated[Path | None, typer.Option(help="A name for the port that stays the same.")] = None,
-    socket: Annotated[int | None, typer.Option(help="Serve socket:// on this port of the loopback address (0: "
-                                                    "any) instead of a pseudo-terminal.")] = None,
-    once: Annotated[bool, typer.Option("--once", help="End after the first run.")] = False,
-    reveal: Annotated[bool, typer.Option("--reveal", help="At the end, tell what was hidden.")] = False,
+    unplug_after: UnplugAfter = None,
+    plug_after: PlugAfter = None,
+    link: LinkName = None,
+    socket: SocketPort = None,
+    once: Once = False,
+    reveal: Reveal = False,
 ) -> None:
     """Serve a virtual motor with a hidden effect, for `motorid record` to be tried on without hardware.
 

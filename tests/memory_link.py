@@ -5,13 +5,15 @@ from __future__ import annotations
 import time
 
 import numpy as np
+
 from motorid.acquire.faults import Faults, Wire
 from motorid.acquire.link import LinkLost
 from motorid.acquire.virtual import VirtualDevice
 
 
 class MemoryLink:
-    """Also the fake of a port that can be unplugged after so many bytes, or lose what is sent to the device."""
+    """Also the fake of a port that can be unplugged after so many bytes, or lose what is sent to the
+    device."""
 
     def __init__(self, device: VirtualDevice, wire: Wire | None = None, step: int = 50,
                  unplug_after: int | None = None, deaf: float = 0.0) -> None:

@@ -11,6 +11,7 @@ import subprocess
 import sys
 import threading
 import time
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -43,7 +44,7 @@ def device(**options) -> VirtualDevice:
     return VirtualDevice(QUIET, **options)
 
 
-# ------------------------------------------------------------------------------------- the recorder, in memory
+# ---------------------------------------------------------------------------------- the recorder, in memory
 
 
 def test_a_run_is_recorded_as_it_was_made(out):
@@ -69,8 +70,8 @@ def inject(seed: int, folder: Path) -> None:
     """One recording with faults drawn from the seed; every line that came through whole must be there."""
     rng = np.random.default_rng(seed)
     faults = Faults(*(rng.uniform(0, 0.2, 7) * (rng.random(7) < 0.5)))
-    dev = device(rate=5000.0, counter_bits=int(rng.choice([16, 32])), counter0=int(rng.integers(65_400, 65_536)),
-                 time0=2**32 - int(rng.integers(1, 20_000)), encoder_bits=int(rng.choice([16, 32])))
+    dev = device(rate=5000.0, counter_bits=int(rng.choice([16, 32])), encoder_bits=int(rng.choice([16, 32])),
+                 counter0=int(rng.integers(65_400, 65_536)), time0=2**32 - int(rng.integers(1, 20_000)))
     n = 100
     unplug = int(rng.integers(300, 5000)) if rng.random() < 0.2 else None
     start = dev._counter
@@ -336,7 +337,7 @@ def test_resume_goes_on_where_the_cable_was_pulled(out):
     pause = after[len(before)]
     assert (pause["voltage_V"], pause["current_A"]) == ("0", "")
     t = [float(r["time_s"]) for r in after]
-    assert all(b > a for a, b in zip(t, t[1:], strict=False))
+    assert all(b > a for a, b in pairwise(t))
     assert {float(r["voltage_V"]) for r in after[len(before) + 1:]} == {4.0, 0.0}
     with pytest.raises(UsageError, match="complete"):
         record(MemoryLink(device()), out, resume=True)
@@ -370,19 +371,21 @@ def test_force_replaces_only_once_the_device_has_answered(out, monkeypatch):
 
 def test_calibration_is_applied_to_lost_samples_too(out):
     wire = Wire(Faults(drop=0.3), np.random.default_rng(1))
-    record(MemoryLink(device(), wire), out, excite="step:4:0.1", calibration={"v": {"gain": 0.5, "zero": 1.0}})
+    calibration = {"v": {"gain": 0.5, "zero": 1.0}}
+    record(MemoryLink(device(), wire), out, excite="step:4:0.1", calibration=calibration)
     got = rows(out)
     assert {r["voltage_V"] for r in got} == {"3"}
     assert sum(not r["current_A"] for r in got) > 10
 
 
-@pytest.mark.parametrize("bad", [{"duration": 0}, {"limit_voltage": -1}, {"timeout": 0}, {"limit_current": math.nan}])
+@pytest.mark.parametrize("bad", [{"duration": 0}, {"limit_voltage": -1}, {"timeout": 0},
+                                 {"limit_current": math.nan}])
 def test_numbers_that_make_no_sense_are_refused(out, bad):
     with pytest.raises(UsageError, match="must be positive"):
         record(MemoryLink(device()), out, **bad)
 
 
-# ---------------------------------------------------------------------------------------------- the virtual motor
+# ------------------------------------------------------------------------------------------ the virtual motor
 
 
 @pytest.mark.parametrize("name", sorted(SIZES))
@@ -410,8 +413,9 @@ def test_a_seed_gives_the_same_truth_and_the_same_record(out):
 
 
 @pytest.mark.parametrize(("words", "motor", "said"), [
-    ("colomb", "lab", "Did you mean 'coulomb'"), ("coulomb:tau=1", "lab", "unexpected"), ("coulomb:1", "lab", "name=value"),
-    ("lugre", "lab", "spell its numbers out"), ("none", "lap", "Did you mean 'lab'")])
+    ("colomb", "lab", "Did you mean 'coulomb'"), ("coulomb:tau=1", "lab", "unexpected"),
+    ("coulomb:1", "lab", "name=value"), ("lugre", "lab", "spell its numbers out"),
+    ("none", "lap", "Did you mean 'lab'")])
 def test_a_wrong_effect_or_motor_is_refused_with_the_reason(words, motor, said):
     with pytest.raises(UsageError, match=said):
         hide(words, motor)
@@ -423,7 +427,7 @@ def test_nothing_in_the_record_gives_the_secret_away(out):
     assert "seed" not in out.read_text()
 
 
-# ------------------------------------------------------------------------------ processes and real pseudo-terminals
+# --------------------------------------------------------------------- processes and real pseudo-terminals
 
 MAIN = """
 import sys, typer
@@ -527,8 +531,9 @@ def test_a_killed_recorder_leaves_a_record_and_a_motor_that_stops(out):
 @needs_pty
 def test_a_second_recorder_on_the_same_port_is_turned_away(tmp_path):
     with Bench() as bench:
-        first = start("record", "--port", bench.port, "--out", tmp_path / "a.csv", "--excite", "rest:1", "--quiet")
-        wait_for(lambda: (tmp_path / "a.csv").exists())
+        a = tmp_path / "a.csv"
+        first = start("record", "--port", bench.port, "--out", a, "--excite", "rest:1", "--quiet")
+        wait_for(a.exists)
         code, _, said = finish(start("record", "--port", bench.port, "--out", tmp_path / "b.csv"))
         assert code == 1
         assert "is in use, perhaps by another recorder" in said
@@ -590,8 +595,9 @@ def test_where_there_are_no_pseudo_terminals_a_loopback_socket_serves(out, monke
 def test_a_second_recorder_on_the_socket_is_turned_away(tmp_path):
     with Bench("--socket", 0) as bench:
         assert bench.port.startswith("socket://127.0.0.1:")
-        first = start("record", "--port", bench.port, "--out", tmp_path / "a.csv", "--excite", "rest:1", "--quiet")
-        wait_for(lambda: (tmp_path / "a.csv").exists())
+        a = tmp_path / "a.csv"
+        first = start("record", "--port", bench.port, "--out", a, "--excite", "rest:1", "--quiet")
+        wait_for(a.exists)
         with pytest.raises(DeviceError, match="in use by another recorder"):
             record(bench.port, tmp_path / "b.csv")
         assert finish(first)[0] == 0
@@ -600,7 +606,8 @@ def test_a_second_recorder_on_the_socket_is_turned_away(tmp_path):
 
 @needs_pty
 def test_once_ends_the_bench_and_reveal_tells_the_truth(out):
-    process = start("bench", "--effect", "coulomb:tau_c=0.01", "--seed", 7, "--once", "--reveal", "--speed", 0)
+    hidden = ("--effect", "coulomb:tau_c=0.01", "--seed", 7)
+    process = start("bench", *hidden, "--once", "--reveal", "--speed", 0)
     port = process.stdout.readline().split()[1]
     record(port, out, excite=SHORT)
     code, said, _ = finish(process)

@@ -68,7 +68,8 @@ class Client:
         _, _, mv, ma = self.ask(f"L,{_milli(v)},{_milli(i)}", "A,L")
         if int(mv) > _milli(v) or int(ma) > _milli(i):
             raise DeviceError(f"the device was told to stay within {v:g} V and {i:g} A and answers with "
-                              f"{int(mv) / 1e3:g} V and {int(ma) / 1e3:g} A. Nothing was applied to the motor.")
+                              f"{int(mv) / 1e3:g} V and {int(ma) / 1e3:g} A. Nothing was applied to the "
+                              "motor.")
         for k, segment in enumerate(program.segments):
             self.ask(",".join(map(str, ("S", k, *segment.fields))), f"A,S,{k}")
         return int(mv) / 1e3, int(ma) / 1e3
@@ -110,8 +111,8 @@ class Client:
     def _nobody(self) -> str:
         seen, bad = self.decoder.seen, sum(self.decoder.bad.values())
         if not seen:
-            return (f"nothing answered within {BOOT:g} s. Is it the right port, and does the board run the motorid "
-                    "firmware?")
+            return (f"nothing answered within {BOOT:g} s. Is it the right port, and does the board run the "
+                    "motorid firmware?")
         why = "none of it in the protocol. Is the baud rate right?" if bad else "but no header came."
         return f"no bench answered within {BOOT:g} s: {seen} bytes came, {why}"
 

@@ -1,7 +1,7 @@
 """Excitation programs: what voltage the device applies, in words, as frames and as numbers.
 
-A program is a list of segments that the device itself runs, sample by sample, so that its timing does not hang
-on the computer. Words are joined by commas, numbers by colons, in V, s and Hz::
+A program is a list of segments that the device itself runs, sample by sample, so that its timing does not
+hang on the computer. Words are joined by commas, numbers by colons, in V, s and Hz::
 
     rest:T                        nothing for T
     step:V:T                      V for T
@@ -13,8 +13,8 @@ on the computer. Words are joined by commas, numbers by colons, in V, s and Hz::
     standard                      steps, stairs, a ramp and a PRBS within 0.6 of the voltage limit, 8.2 s
 
 On the line a segment is ``R,<ms>,<mV from>,<mV to>``, or
-``C,<ms>,<mV offset>,<mV amplitude>,<mHz from>,<mHz to>``, or ``P,<ms>,<mV offset>,<mV amplitude>,<µs per bit>,<seed>``. All numbers are whole, so device and computer mean
-the same program.
+``C,<ms>,<mV offset>,<mV amplitude>,<mHz from>,<mHz to>``, or ``P,<ms>,<mV offset>,<mV amplitude>,<µs per
+bit>,<seed>``. All numbers are whole, so device and computer mean the same program.
 """
 
 from __future__ import annotations

@@ -34,7 +34,11 @@ def _asymmetric(m: Any, draw: Draw) -> dict[str, float]:
     return {"tau_cp": tau, "tau_cn": tau * draw(1.6, 2.5)}
 
 
-# Sizes by effect, from the motor's own scales. An effect of the plant that is not here needs its numbers spelt out.
+def _cogging(m: Any, draw: Draw) -> dict[str, float]:
+    return {"A": _stall(m) * draw(0.03, 0.06), "N": float(round(draw(3.6, 12.4))), "phi": 0.5}
+
+
+# Sizes by effect, from the motor's own scales. An effect that is not here needs its numbers spelt out.
 SIZES: Mapping[str, Callable[[Any, Draw], dict[str, float]]] = {
     "coulomb": _friction,
     "coulomb_asymmetric": _asymmetric,
@@ -42,7 +46,7 @@ SIZES: Mapping[str, Callable[[Any, Draw], dict[str, float]]] = {
     "quadratic_drag": lambda m, draw: {"c_2": _stall(m) * draw(0.05, 0.15) / (0.6 * m.no_load_speed) ** 2},
     "constant_load": lambda m, draw: {"tau_0": _stall(m) * draw(0.03, 0.08)},
     "gravity": lambda m, draw: {"mgl": _stall(m) * draw(0.04, 0.1)},
-    "cogging": lambda m, draw: {"A": _stall(m) * draw(0.03, 0.06), "N": float(round(draw(3.6, 12.4))), "phi": 0.5},
+    "cogging": _cogging,
     "load_friction": lambda m, draw: {"mu": draw(0.06, 0.15)},
     "brush_drop": lambda m, draw: {"V_b": m.v_max * draw(0.04, 0.08), "i_b": m.v_max / m.R * 0.01},
     "driver_dead_band": lambda m, draw: {"V_d": m.v_max * draw(0.03, 0.07)},
@@ -67,8 +71,8 @@ class Truth:
         hidden = [f"{name} ({', '.join(f'{k} = {v:.4g}' for k, v in values.items())})"
                   for name, values in self.effects.items()]
         return (f"hidden: {'; '.join(hidden) or 'nothing'}\n"
-                f"motor '{m.name}', seed {self.seed}: R = {m.R:.5g} Ω, L = {m.L:.5g} H, K = {m.K:.5g} V·s/rad, "
-                f"b = {m.b:.5g} N·m·s/rad, J = {m.J:.5g} kg·m²")
+                f"motor '{m.name}', seed {self.seed}: R = {m.R:.5g} Ω, L = {m.L:.5g} H, "
+                f"K = {m.K:.5g} V·s/rad, b = {m.b:.5g} N·m·s/rad, J = {m.J:.5g} kg·m²")
 
 
 def hide(words: str = "random", motor: str = "lab", seed: int = 0) -> Truth:

@@ -30,10 +30,10 @@ class _Mark(NamedTuple):
 class Ledger:
     """Places samples on the axis of a run and keeps account of what is lost.
 
-    A gap is the step of the counter. Where the counter may have wrapped more than once the timer decides, and where
-    the timer may have wrapped too, the clock of the computer. A sample whose counter and time contradict each other
-    is believed only when the next one agrees with it, so that a damaged frame that happens to have a valid CRC does
-    not open a gap.
+    A gap is the step of the counter. Where the counter may have wrapped more than once the timer decides, and
+    where the timer may have wrapped too, the clock of the computer. A sample whose counter and time
+    contradict each other is believed only when the next one agrees with it, so that a damaged frame that
+    happens to have a valid CRC does not open a gap.
 
     Parameters
     ----------
@@ -116,7 +116,8 @@ class Ledger:
 
     def _agree(self, last: _Mark, mark: _Mark) -> bool:
         step = mark.index - last.index
-        return step > 0 and abs((mark.micros - last.micros) * 1e-6 * self.header.rate - step) <= 5 + 0.2 * step
+        by_time = (mark.micros - last.micros) * 1e-6 * self.header.rate
+        return step > 0 and abs(by_time - step) <= 5 + 0.2 * step
 
     def _drop_doubtful(self) -> None:
         if self._doubtful:

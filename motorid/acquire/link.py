@@ -1,4 +1,5 @@
-"""The wire: a serial port (or pyserial's ``socket://``), read by a thread so that a slow disk loses nothing."""
+"""The wire: a serial port (or pyserial's ``socket://``), read by a thread so that a slow disk loses
+nothing."""
 
 from __future__ import annotations
 
@@ -26,7 +27,8 @@ class Link(Protocol):
     """What a recorder needs of a wire."""
 
     def read(self, timeout: float) -> bytes:
-        """Return what has come, at the latest after `timeout` s (then perhaps nothing); LinkLost at the end."""
+        """Return what has come, at the latest after `timeout` s (then perhaps nothing); LinkLost at the
+        end."""
         ...
 
     def write(self, data: bytes) -> None:
@@ -143,8 +145,8 @@ def _why_not(port: str, baud: int, error: Exception) -> str:
     if number == errno.ENOENT or ("could not open port" in str(error).lower() and not number):
         return f"there is no port {port}. {_known_ports()}"
     if number in (errno.EACCES, errno.EPERM):
-        return (f"you may not open {port}. On Linux, become a member of the group that owns it (often 'dialout') "
-                "and log in again.")
+        return (f"you may not open {port}. On Linux, become a member of the group that owns it (often "
+                "'dialout') and log in again.")
     if number in (errno.EAGAIN, errno.EBUSY) or "exclusively lock" in str(error):
         return f"{port} is in use, perhaps by another recorder or a serial monitor. Close that first."
     return f"{port} cannot be opened: {error}."
@@ -154,4 +156,4 @@ def _known_ports() -> str:
     from serial.tools import list_ports
 
     names = [p.device for p in list_ports.comports()]
-    return f"Ports on this computer: {', '.join(names)}." if names else "This computer sees no serial port at all."
+    return f"Ports on this computer: {', '.join(names)}." if names else "This computer sees no serial port."

@@ -16,8 +16,8 @@ From the device
         counter that wraps after 16 bits, two's complement or not).
     ``D,<counter>,<time µs>,<raw>…``
         One sample, raw values in the order of the channels, integer or decimal, empty where missing. ``v`` is
-        the voltage commanded *from* this instant on, the other channels are measured *at* it. Counter and timer
-        wrap.
+        the voltage commanded *from* this instant on, the other channels are measured *at* it. Counter and
+        timer wrap.
     ``A,<command>,…``
         A command was carried out: ``A,L,<mV>,<mA>`` (the limits now in force), ``A,S,<index>``,
         ``A,G,<counter of the first sample>,<its time µs>``.
@@ -29,8 +29,8 @@ From the computer
     segment of the excitation (see `motorid.acquire.excitation`) · ``G,<segments>`` go, once per ``L`` · ``X``
     stop · ``K`` still here; a device at rest answers it with its last ``E,done``.
 
-A device that hears no valid frame for one second switches the motor off. Repeating a command does no harm, so a
-lost answer is mended by asking again.
+A device that hears no valid frame for one second switches the motor off. Repeating a command does no harm, so
+a lost answer is mended by asking again.
 """
 
 from __future__ import annotations
@@ -154,8 +154,8 @@ class Header:
             If the device speaks another version, or says something that cannot be.
         """
         if len(fields) < 2 or fields[1] != str(VERSION):
-            raise DeviceError(f"the device speaks version {''.join(fields[1:2]) or '?'} of the protocol, this "
-                              f"motorid version {VERSION}. Update the older one.")
+            raise DeviceError(f"the device speaks version {''.join(fields[1:2]) or '?'} of the protocol, "
+                              f"this motorid version {VERSION}. Update the older one.")
         try:
             name, rate, counter, timer = fields[2], float(fields[3]), int(fields[4]), int(fields[5])
             v_max, i_max, segments = float(fields[6]), float(fields[7]), int(fields[8])
@@ -186,9 +186,9 @@ class Message(NamedTuple):
 class Decoder:
     """Takes bytes in pieces of any size and returns the frames in them.
 
-    Arbitrary bytes never raise. What was not a valid frame is counted in `bad`: ``wrong CRC`` (frames), ``cut``
-    (a ``$`` that never became a frame), ``not understood`` (a valid CRC around nonsense), and ``stray bytes``
-    outside of frames. How the bytes are cut into pieces makes no difference.
+    Arbitrary bytes never raise. What was not a valid frame is counted in `bad`: ``wrong CRC`` (frames),
+    ``cut`` (a ``$`` that never became a frame), ``not understood`` (a valid CRC around nonsense), and ``stray
+    bytes`` outside of frames. How the bytes are cut into pieces makes no difference.
     """
 
     bad: Counter[str] = field(default_factory=Counter)

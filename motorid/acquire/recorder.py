@@ -22,16 +22,27 @@ from motorid.errors import UsageError
 __all__ = ["record"]
 
 
-def record(port: str | Link, out: str | Path, *, baud: int = 115_200, excite: str | Program | None = None,
-           duration: float | None = None, limit_voltage: float = math.inf, limit_current: float = math.inf,
-           calibration: str | Path | Mapping[str, Any] | None = None, resume: bool = False, force: bool = False,
-           timeout: float = 2.0, progress: Callable[[Progress], None] | None = None,
-           meta: Mapping[str, object] | None = None) -> Recording:
+def record(
+    port: str | Link,
+    out: str | Path,
+    *,
+    baud: int = 115_200,
+    excite: str | Program | None = None,
+    duration: float | None = None,
+    limit_voltage: float = math.inf,
+    limit_current: float = math.inf,
+    calibration: str | Path | Mapping[str, Any] | None = None,
+    resume: bool = False,
+    force: bool = False,
+    timeout: float = 2.0,
+    progress: Callable[[Progress], None] | None = None,
+    meta: Mapping[str, object] | None = None,
+) -> Recording:
     """Record one run from a bench that speaks `motorid.acquire.protocol`, into a CSV that `read_runs` opens.
 
-    Every valid line is in the file within a tenth of a second and on the disk within one; lost samples are rows
-    whose measured cells are empty. The device itself runs the excitation and enforces the limits; they are
-    checked here as well, before anything moves. **Keep clear of the shaft and have a switch at hand.**
+    Every valid line is in the file within a tenth of a second and on the disk within one; lost samples are
+    rows whose measured cells are empty. The device itself runs the excitation and enforces the limits; they
+    are checked here as well, before anything moves. **Keep clear of the shaft and have a switch at hand.**
 
     Parameters
     ----------
@@ -90,8 +101,9 @@ def record(port: str | Link, out: str | Path, *, baud: int = 115_200, excite: st
         mode = "resume" if part.tail else "replace" if force else "new"
         file = RunFile(out, header.channels, header.rate, head if not part.tail else {}, mode)
         try:
-            setup = Setup(client, header, file, len(todo.segments), _commanded(device, header, todo), limits[1],
-                          _total(todo, duration), duration, max(timeout, 4 / header.rate), progress)
+            setup = Setup(client, header, file, len(todo.segments), _commanded(device, header, todo),
+                          limits[1], _total(todo, duration), duration, max(timeout, 4 / header.rate),
+                          progress)
             return Run(setup, lambda: part.begin(file, done)).go()
         finally:
             file.close()
@@ -100,8 +112,9 @@ def record(port: str | Link, out: str | Path, *, baud: int = 115_200, excite: st
 
 
 def _check_numbers(duration: float | None, volts: float, amperes: float, timeout: float) -> None:
-    for name, value, unit in (("duration", 1.0 if duration is None else duration, "s"), ("limit_voltage", volts, "V"),
-                              ("limit_current", amperes, "A"), ("timeout", timeout, "s")):
+    given = (("duration", 1.0 if duration is None else duration, "s"), ("limit_voltage", volts, "V"),
+             ("limit_current", amperes, "A"), ("timeout", timeout, "s"))
+    for name, value, unit in given:
         if not value > 0:
             raise UsageError(f"{name} must be positive, in {unit}; got {value!r}.")
 
@@ -144,8 +157,9 @@ def _head(port: str | Link, header: Header, whole: Program, limits: tuple[float,
     head: dict[str, object] = {
         "motorid record": f"protocol {VERSION}", "device": header.name,
         "port": port if isinstance(port, str) else type(port).__name__,
-        "started": datetime.now().astimezone().isoformat(timespec="milliseconds"), "rate_Hz": f"{header.rate:g}",
-        "limits": f"{limits[0]:g} V, {limits[1]:g} A", "excitation": whole.words,
+        "started": datetime.now().astimezone().isoformat(timespec="milliseconds"),
+        "rate_Hz": f"{header.rate:g}", "limits": f"{limits[0]:g} V, {limits[1]:g} A",
+        "excitation": whole.words,
     }
     for channel in header.channels:
         head[f"channel {channel.name}"] = (f"{channel.scale:.9g} {channel.unit} per count, zero at "

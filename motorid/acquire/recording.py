@@ -15,13 +15,15 @@ SENTENCES = {
     "done": "The excitation ran to its end.",
     "duration": "The time asked for is over; the motor was stopped.",
     "interrupted": "Stopped by hand; the motor was stopped.",
-    "limit": "The current limit was reached; the motor was switched off. Lower the voltage or raise the limit.",
+    "limit": "The current limit was reached; the motor was switched off. Lower the voltage or raise the "
+             "limit.",
     "emergency": "The emergency stop of the bench was opened; the motor was switched off.",
     "watchdog": "The device heard nothing from this computer for a second and switched the motor off.",
-    "unplugged": "The device is gone (unplugged, or its port was closed). Plug it in again and go on with --resume.",
-    "silent": "The device stopped talking. See whether it is powered, then go on with --resume.",
-    "restarted": "The device restarted in the middle of the run (a reset, or its supply broke down). Go on with "
+    "unplugged": "The device is gone (unplugged, or its port was closed). Plug it in again and go on with "
                  "--resume.",
+    "silent": "The device stopped talking. See whether it is powered, then go on with --resume.",
+    "restarted": "The device restarted in the middle of the run (a reset, or its supply broke down). Go on "
+                 "with --resume.",
     "disk": "The disk refused the data; the motor was stopped. Make room, then go on with --resume.",
 }
 COMPLETE = ("done", "duration", "interrupted")
@@ -49,8 +51,8 @@ class Recording:
     header : Header
         Of the device, as calibrated.
     ended : str
-        ``done``, ``duration``, ``interrupted``, ``limit``, ``emergency``, ``watchdog``, ``unplugged``, ``silent``, ``restarted`` or
-        ``disk``.
+        ``done``, ``duration``, ``interrupted``, ``limit``, ``emergency``, ``watchdog``, ``unplugged``,
+        ``silent``, ``restarted`` or ``disk``.
     detail : str
         What the system said, for the last ones.
     received, lost : int
@@ -60,8 +62,8 @@ class Recording:
     seconds : float
         Length of the run, device time.
     bad : mapping of str to int
-        Lines (and bytes) that were not valid or not usable, by reason. They explain losses, they are not added to
-        them.
+        Lines (and bytes) that were not valid or not usable, by reason. They explain losses, they are not
+        added to them.
     clipped : mapping of str to int
         Samples at the end of a converter's range, by channel.
     """
@@ -90,7 +92,7 @@ class Recording:
     @property
     def meta(self) -> dict[str, object]:
         """The outcome as it is written at the end of the file."""
-        lost = f"{self.lost}" + ("" if self.tail_known else " before the last one received; the end is not known")
+        lost = str(self.lost) + ("" if self.tail_known else " before the last one received, then unknown")
         return {"ended": self.ended, "samples received": self.received, "samples lost": lost,
                 **({"not valid": _list(self.bad)} if self.bad else {}),
                 **({"clipped": _list(self.clipped)} if self.clipped else {})}
@@ -98,8 +100,8 @@ class Recording:
     def __str__(self) -> str:
         made = self.received + self.lost
         share = f" ({100 * self.lost / made:.3g} %)" if self.lost else ""
-        lines = [self.sentence, f"{self.path}: {self.received} samples, {self.seconds:.6g} s; {self.lost} lost{share}, "
-                                f"{'marked as missing' if self.lost else 'nothing missing'}."]
+        gaps = f"{self.lost} lost{share}, {'marked as missing' if self.lost else 'nothing missing'}"
+        lines = [self.sentence, f"{self.path}: {self.received} samples, {self.seconds:.6g} s; {gaps}."]
         if not self.tail_known:
             lines.append("Whether the device made more samples after the last one received is not known.")
         if self.bad:

@@ -35,9 +35,11 @@ class Part:
             return whole, 0
         meta = self.tail.meta
         before = int(meta.get("segments done", 0))
-        left = Program(whole.segments[before:], whole.words).after(self.tail.time - float(meta.get("part begins", 0)))
+        ran = self.tail.time - float(meta.get("part begins", 0))
+        left = Program(whole.segments[before:], whole.words).after(ran)
         if meta.get("ended") == "done" or (whole.segments and not left.segments):
-            raise UsageError("this record is complete; there is nothing to resume. Choose another name for --out.")
+            raise UsageError("this record is complete; there is nothing to resume. Choose another name for "
+                             "--out.")
         return left, len(whole.segments) - len(left.segments)
 
     def begin(self, file: RunFile, done: int) -> None:
@@ -51,8 +53,9 @@ class Part:
         at = math.ceil(at * file.rate) / file.rate
         file.pause(tail, at)
         file.note({"resumed": now.isoformat(timespec="milliseconds"), "part begins": f"{at:.6f}",
-                   "segments done": done, "pause": f"{at - tail.time:.3f} s, the motor taken to be off; the angle "
-                   "may count from another zero after it"})
+                   "segments done": done,
+                   "pause": f"{at - tail.time:.3f} s, the motor taken to be off; the angle may count from "
+                            "another zero after it"})
 
 
 def plan(out: Path, excite: str | Program | None, resume: bool) -> Part:

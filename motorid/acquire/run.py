@@ -1,4 +1,5 @@
-"""A recording that is going on: take what comes, keep the device awake, notice every way in which it can end."""
+"""A recording that is going on: take what comes, keep the device awake, notice every way in which it can
+end."""
 
 from __future__ import annotations
 
@@ -22,7 +23,8 @@ __all__ = ["Run", "Setup"]
 OVER_LIMIT = 3  # samples in a row beyond the current limit that make the computer stop the motor too
 LAST_WORDS = 1.5  # s to wait for the device to say how many samples it made
 LOOK = 0.25  # s between two reports of progress
-REASONS = {"limit": "limit", "emergency": "emergency", "silent": "watchdog", "stop": "interrupted"}  # the device's word -> ours, else done
+# The device's word for why it ended -> ours; else done.
+REASONS = {"limit": "limit", "emergency": "emergency", "silent": "watchdog", "stop": "interrupted"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,10 +130,11 @@ class Run:
 
     def _last_words(self) -> None:
         """Switch the motor off and learn how many samples there were."""
-        end = time.monotonic() + LAST_WORDS
-        ask = 0.0
+        if self.ended in ("unplugged", "restarted"):
+            return
+        end, ask = time.monotonic() + LAST_WORDS, 0.0
         with contextlib.suppress(LinkLost):
-            while self.made is None and self.ended not in ("unplugged", "restarted") and time.monotonic() < end:
+            while self.made is None and time.monotonic() < end:
                 if time.monotonic() > ask:
                     self.s.client.link.write(frame("X"))
                     ask = time.monotonic() + 0.3

@@ -32,7 +32,8 @@ def _unknown(index: int) -> None:
 
 def column(channel: Channel) -> str:
     """Name of the channel's column, one that `read_runs` knows."""
-    return _COLUMNS.get((channel.name, channel.unit)) or f"{channel.name}_{channel.unit}".replace("/", "_per_")
+    other = f"{channel.name}_{channel.unit}".replace("/", "_per_")
+    return _COLUMNS.get((channel.name, channel.unit), other)
 
 
 class Tail(NamedTuple):
@@ -59,8 +60,8 @@ def check_target(out: Path, resume: bool, force: bool) -> None:
     if not out.parent.is_dir():
         raise UsageError(f"the folder {out.parent} does not exist; make it first.")
     if out.exists() and not (resume or force):
-        raise UsageError(f"{out} exists and is left alone. Choose another name, or continue it with --resume, or "
-                         "replace it with --force.")
+        raise UsageError(f"{out} exists and is left alone. Choose another name, or continue it with "
+                         "--resume, or replace it with --force.")
 
 
 def read_tail(out: Path) -> Tail:
@@ -95,8 +96,8 @@ def read_tail(out: Path) -> Tail:
 class RunFile:
     """Appends rows to a record; gaps become rows whose measured cells are empty.
 
-    Every call of `flush` hands whole lines to the operating system, and at least every 0.5 s to the disk. If the
-    disk refuses (it is full, say), the file is cut back to its last whole line and the error passed on.
+    Every call of `flush` hands whole lines to the operating system, and at least every 0.5 s to the disk. If
+    the disk refuses (it is full, say), the file is cut back to its last whole line and the error passed on.
 
     Parameters
     ----------

@@ -64,7 +64,7 @@ class Pty:
         import tty
 
         self._master, self._slave = os.openpty()
-        tty.setraw(self._slave)  # a bench does not echo; holding this end open keeps the line up between users
+        tty.setraw(self._slave)  # no echo; holding this end open keeps the line up between users
         os.set_blocking(self._master, False)
         self.name = os.ttyname(self._slave)
         if self.link:

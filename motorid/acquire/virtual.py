@@ -1,7 +1,7 @@
 """A bench made of software: the plant behind a converter and an encoder, speaking the protocol.
 
-`VirtualDevice` knows nothing of wires or clocks: bytes go in, bytes come out, and `run` makes the next samples. What
-serves it over a pseudo-terminal in real time is in `motorid.acquire.serve`.
+`VirtualDevice` knows nothing of wires or clocks: bytes go in, bytes come out, and `run` makes the next
+samples. What serves it over a pseudo-terminal in real time is in `motorid.acquire.serve`.
 """
 
 from __future__ import annotations
@@ -43,16 +43,16 @@ class VirtualDevice:
         Width of the encoder's counter.
     """
 
-    def __init__(self, truth: Truth, rate: float = 1000.0, channels: tuple[str, ...] = ("v", "i", "omega", "theta"),
-                 counter_bits: int = 32, timer_bits: int = 32, counter0: int = 0, time0: int = 0,
-                 encoder_bits: int = 32) -> None:
+    def __init__(self, truth: Truth, rate: float = 1000.0,
+                 channels: tuple[str, ...] = ("v", "i", "omega", "theta"), counter_bits: int = 32,
+                 timer_bits: int = 32, counter0: int = 0, time0: int = 0, encoder_bits: int = 32) -> None:
         self.truth, m = truth, truth.motor
         known = _channels(m, encoder_bits)
         for name in channels:
             if name not in known:
                 raise UsageError(one_of(name, known, "channel"))
-        self.header = Header("virtual motor", rate, tuple(known[c] for c in channels), counter_bits, timer_bits,
-                             m.v_max, m.i_max)
+        self.header = Header("virtual motor", rate, tuple(known[c] for c in channels), counter_bits,
+                             timer_bits, m.v_max, m.i_max)
         self._rng = np.random.default_rng([truth.seed, 1])
         self._decoder = Decoder()
         self._counter, self._time = counter0, time0
@@ -109,8 +109,9 @@ class VirtualDevice:
         return line
 
     def _answer(self, fields: list[str]) -> bytes:
-        handlers: dict[str, Callable[..., bytes]] = {"?": self._say_header, "L": self._set_limits, "G": self._go,
-                                                     "S": self._add_segment, "X": self._halt, "K": self._alive}
+        handlers: dict[str, Callable[..., bytes]] = {
+            "?": self._say_header, "L": self._set_limits, "S": self._add_segment, "G": self._go,
+            "X": self._halt, "K": self._alive}
         handler = handlers.get(fields[0])
         if handler is None:
             return frame("E", "refused", "unknown command")
