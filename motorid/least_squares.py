@@ -114,7 +114,7 @@ def levenberg_marquardt(
         accepted = False
         while not accepted:
             step = np.zeros(len(q))
-            step[free] = _damped(triangle, rotated, d_scale[free], lam)
+            step[free] = _inside(triangle, rotated, d_scale[free], lam, (low - q)[free], (high - q)[free])
             worst = np.max(np.abs(step))
             if worst > o.longest_step:
                 step *= o.longest_step / worst
@@ -161,15 +161,28 @@ def _reduce(jac: Array, r: Array) -> tuple[Array, Array]:
     return full[:n, :n], full[:n, n]
 
 
+def _inside(triangle: Array, rotated: Array, size: Array, lam: float, low: Array, high: Array) -> Array:
+    """Damped step within the box: what would leave it is put on its bound, and the others are solved again."""
+    step, loose = np.zeros(len(size)), np.ones(len(size), bool)
+    while loose.any():
+        rest = rotated + triangle[:, ~loose] @ step[~loose]
+        step[loose] = _damped(triangle[:, loose], rest, size[loose], lam)
+        out = loose & ((step < low) | (step > high))
+        if not out.any():
+            break
+        step[out] = np.clip(step, low, high)[out]
+        loose &= ~out
+    return step
+
+
 def _damped(triangle: Array, rotated: Array, size: Array, lam: float) -> Array:
     """Solve the damped problem by QR of the small stacked system, in scaled unknowns."""
     scaled = triangle / size
     if lam == 0:
         return -np.linalg.lstsq(scaled, rotated, rcond=None)[0] / size
-    n = len(size)
-    stacked = np.vstack([scaled, np.sqrt(lam) * np.eye(n)])
+    stacked = np.vstack([scaled, np.sqrt(lam) * np.eye(len(size))])
     q, small = np.linalg.qr(stacked)
-    return -np.linalg.solve(small, q[:n].T @ rotated) / size
+    return -np.linalg.solve(small, q[:len(rotated)].T @ rotated) / size
 
 
 def _cost(residual: Callable[[Array], Array], q: Array) -> float:

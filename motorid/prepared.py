@@ -8,14 +8,14 @@ from typing import Any
 
 import numpy as np
 
+from motorid.beginning import beginning, slopes
 from motorid.equations import CHANNELS
-from motorid.errors import ModelError, UsageError, one_of
+from motorid.errors import ModelError
 from motorid.experiment import Experiment
 from motorid.integrate.grid import Array, Grid
 from motorid.noise import noise_level
 from motorid.parameters import Parameter
 
-INITIAL = ("auto", "rest", "measured", "estimate")
 SGN_WIDTH_SHARE = 1e-3  # of the highest speed: wider smoothing looks like one more missing effect
 
 
@@ -31,15 +31,20 @@ class Run:
         Noise per channel, SI.
     start : ndarray, shape (3,)
         (i, omega, theta) at the first sample: known, measured or the first guess.
-    estimated : tuple of str
-        Which of them are unknowns of the fit.
+    limits : dict of str to (float, float)
+        Which of them are unknowns of the fit, and between which values.
     """
 
     experiment: Experiment
     grid: Grid
     sigma: Mapping[str, float]
     start: Array
-    estimated: tuple[str, ...]
+    limits: Mapping[str, tuple[float, float]]
+
+    @property
+    def estimated(self) -> tuple[str, ...]:
+        """Initial states that are unknowns of the fit."""
+        return tuple(self.limits)
 
 
 def channels_of(runs: Sequence[Experiment]) -> tuple[str, ...]:
@@ -59,11 +64,9 @@ def noise_of(runs: Sequence[Experiment], channels: Sequence[str]) -> dict[str, f
 def prepare_run(run: Experiment, channels: Sequence[str], noise: Mapping[str, float], inputs: Sequence[str],
                 initial: str) -> Run:
     """Return `run` ready for a system with `inputs`."""
-    if initial not in INITIAL:
-        raise UsageError(one_of(initial, INITIAL, "initial state"))
     sigma = {c: float(run.sigma.get(c, noise[c])) for c in channels if c in run.outputs}
-    start, estimated = initial_state(run, sigma, initial)
-    return Run(run, _grid(run, inputs), sigma, start, estimated)
+    start, limits = beginning(run, sigma, initial)
+    return Run(run, _grid(run, inputs), sigma, start, limits)
 
 
 def with_inputs(run: Run, inputs: Sequence[str]) -> Run:
@@ -85,77 +88,6 @@ def _grid(run: Experiment, inputs: Sequence[str]) -> Grid:
     return Grid.of(run.t, np.column_stack(columns), np.array(held))
 
 
-def initial_state(run: Experiment, sigma: Mapping[str, float], initial: str) -> tuple[Array, tuple[str, ...]]:
-    """Return (i, omega, theta) at the first sample and the names of those to estimate.
-
-    ``auto``: known zeros where nothing moves yet, otherwise estimated; a measured angle is estimated too (its
-    first sample is as noisy as any), unless it is free of noise.
-    """
-    rest, lead = _at_rest(run, sigma)
-    known = rest if initial == "auto" else initial == "rest"
-    start, estimated = np.zeros(3), []
-    for k, c in enumerate(CHANNELS):
-        if c not in run.outputs:
-            continue
-        y = run.outputs[c]
-        if c == "theta":
-            start[k] = np.nanmean(y[:lead]) if known and np.isfinite(y[:lead]).any() else _first(y, run.t)
-            noisy = sigma[c] > 1e-4 * max(np.nanstd(y), 1e-300)
-            if initial == "estimate" or (initial == "auto" and (noisy or not rest)):
-                estimated.append(c)
-        elif not known:
-            start[k] = _first(y, run.t)
-            if initial != "measured":
-                estimated.append(c)
-    if "omega" not in run.outputs and "theta" in run.outputs and not known:
-        start[1] = _first_slope(run.outputs["theta"], run.t)
-        if initial != "measured":
-            estimated.append("omega")
-    return start, tuple(estimated)
-
-
-def _at_rest(run: Experiment, sigma: Mapping[str, float]) -> tuple[bool, int]:
-    """Tell whether the run begins at rest, and how many samples that lasts."""
-    v = run.inputs["v"]
-    quiet = np.abs(v) <= 1e-3 * max(np.abs(v).max(), 1e-300)
-    lead = int(np.argmin(quiet)) if not quiet.all() else len(v)
-    checked = max(lead, 2)
-    for c in ("i", "omega"):
-        if c in run.outputs:
-            y = run.outputs[c][:checked]
-            y = y[np.isfinite(y)]
-            top = np.nanmax(np.abs(run.outputs[c]))
-            # A wild first sample or an offset of the sensor is not motion; a median above the noise is.
-            if y.size and abs(np.median(y)) > max(5 * sigma[c], 0.02 * top):
-                return False, 1
-    if "omega" not in run.outputs and "theta" in run.outputs:
-        y, t = run.outputs["theta"], run.t
-        slope, top = abs(_first_slope(y, t)), np.nanmax(np.abs(_slopes(y, t)), initial=0.0)
-        if slope > 0.05 * top:
-            return False, 1
-    return True, max(lead, 1)
-
-
-def _first(y: Array, t: Array) -> float:
-    good = np.flatnonzero(np.isfinite(y))[:5]
-    return float(np.median(y[good[:3]])) if good.size else 0.0
-
-
-def _first_slope(theta: Array, t: Array) -> float:
-    s = _slopes(theta, t)
-    return float(s[0]) if s.size else 0.0
-
-
-def _slopes(theta: Array, t: Array, parts: int = 200) -> Array:
-    """Mean speeds over windows of the record, from the angle."""
-    good = np.isfinite(theta)
-    y, s = theta[good], t[good]
-    if len(y) < 4:
-        return np.zeros(0)
-    step = max(len(y) // parts, 1)
-    return np.diff(y[::step]) / np.diff(s[::step])
-
-
 def top_speed(runs: Sequence[Experiment]) -> float:
     """Highest speed in the runs (99.5th percentile), from the speed or the angle; 0 where neither is there."""
     top = 0.0
@@ -163,7 +95,7 @@ def top_speed(runs: Sequence[Experiment]) -> float:
         if "omega" in r.outputs:
             top = max(top, float(np.nanpercentile(np.abs(r.outputs["omega"]), 99.5)))
         elif "theta" in r.outputs:
-            s = np.abs(_slopes(r.outputs["theta"], r.t))
+            s = np.abs(slopes(r.outputs["theta"], r.t))
             top = max(top, float(np.percentile(s, 99.5)) if s.size else 0.0)
     return top
 

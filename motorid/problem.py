@@ -118,7 +118,8 @@ class Problem:
             for c in run.estimated:
                 if c in self.system.states or c == "theta" and "theta" in self.system.states:
                     value = float(run.start[("i", "omega", "theta").index(c)])
-                    found.append(Parameter(f"{c}_0[{k}]", value, run.experiment.units.get(c, units[c])))
+                    low, high = run.limits[c]
+                    found.append(Parameter(f"{c}_0[{k}]", value, run.experiment.units.get(c, units[c]), low, high))
         return tuple(found)
 
     @cached_property
