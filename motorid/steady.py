@@ -1,0 +1,140 @@
+"""Steady parts of a record: where the input is held and no measured channel moves any more."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from motorid.experiment import Experiment
+from motorid.integrate.grid import Array
+
+LEAST = 16  # samples
+INPUT_SHARE = 0.02  # of the largest input: how far a held input may wander, and below which it counts as off
+DRIFT_SHARE = 1e-3  # of a channel's largest value: a smaller change between the halves is no drift
+MOVING_SHARE = 0.01  # of the top speed: slower than this is standstill
+
+
+@dataclass(frozen=True)
+class Segment:
+    """One steady part: run (index), first and last sample, times (s), mean input, mean of each channel.
+
+    `means` holds i (A), omega (rad/s) where measured; without a speed, omega is the slope of the angle.
+    `moving` is False at standstill, where dry friction makes the torque balance undetermined.
+    """
+
+    run: int
+    first: int
+    last: int
+    begin: float
+    end: float
+    v: float
+    means: Mapping[str, float]
+    moving: bool
+
+    @property
+    def n(self) -> int:
+        """Number of samples."""
+        return self.last - self.first + 1
+
+    def __str__(self) -> str:
+        shown = ", ".join(f"{c} = {x:.4g}" for c, x in self.means.items())
+        return f"run {self.run}, {self.begin:.4g} to {self.end:.4g} s: v = {self.v:.4g}, {shown}"
+
+
+def find_segments(runs: Sequence[Experiment], sigma: Sequence[Mapping[str, float]]) -> tuple[Segment, ...]:
+    """Return the steady parts of `runs`, at most one per stretch of held input, the longest that ends it.
+
+    A stretch counts where the two halves of its tail agree in every channel within four standard errors or
+    0.1 % of the channel's largest value. Parts without input and without motion say nothing and are left out.
+    """
+    found = []
+    for k, run in enumerate(runs):
+        for first, last in _held_stretches(run.inputs["v"]):
+            segment = _steady_tail(k, run, sigma[k], first, last)
+            if segment is not None:
+                found.append(segment)
+    return tuple(found)
+
+
+def segment_between(k: int, run: Experiment, begin: float, end: float) -> Segment | None:
+    """Return the segment of run `k` between two times the user names; None if it has too few samples."""
+    inside = np.flatnonzero((run.t >= begin) & (run.t <= end))
+    return _segment(k, run, int(inside[0]), int(inside[-1])) if inside.size >= 2 else None
+
+
+def _held_stretches(v: Array) -> list[tuple[int, int]]:
+    """Longest stretches (first, last) in which the input stays within a band around its running mean."""
+    band = INPUT_SHARE * max(float(np.abs(v).max()), 1e-300)
+    stretches, first = [], 0
+    low = high = v[0]
+    for k in range(1, len(v) + 1):
+        if k < len(v):
+            low, high = min(low, v[k]), max(high, v[k])
+        if k == len(v) or high - low > band:
+            if k - first >= LEAST:
+                stretches.append((first, k - 1))
+            if k < len(v):
+                first, low, high = k, v[k], v[k]
+    return stretches
+
+
+def _steady_tail(k: int, run: Experiment, sigma: Mapping[str, float], first: int, last: int) -> Segment | None:
+    length = last - first + 1
+    for share in (0.75, 0.5, 0.25, 0.125):
+        n = int(share * length)
+        if n < LEAST:
+            return None
+        begin = last - n + 1
+        if all(_level(run, c, sigma, begin, last) for c in run.outputs):
+            segment = _segment(k, run, begin, last)
+            idle = abs(segment.v) <= INPUT_SHARE * float(np.abs(run.inputs["v"]).max()) and not segment.moving
+            return None if idle else segment
+    return None
+
+
+def _level(run: Experiment, channel: str, sigma: Mapping[str, float], first: int, last: int) -> bool:
+    y = run.outputs[channel]
+    if channel == "theta":
+        if "omega" in run.outputs:
+            return True
+        halves = [_slope(run, first, (first + last) // 2), _slope(run, (first + last) // 2, last)]
+        half = (run.t[last] - run.t[first]) / 2
+        allowed = max(4 * 2 * sigma[channel] / half, DRIFT_SHARE * _top_slope(run))
+        return bool(np.isfinite(halves).all() and abs(halves[1] - halves[0]) <= allowed)
+    part = y[first:last + 1]
+    middle = len(part) // 2
+    a, b = part[:middle], part[middle:]
+    a, b = a[np.isfinite(a)], b[np.isfinite(b)]
+    if min(a.size, b.size) < LEAST // 4:
+        return False
+    error = sigma[channel] * np.sqrt(1 / a.size + 1 / b.size)
+    return bool(abs(a.mean() - b.mean()) <= max(4 * error, DRIFT_SHARE * float(np.nanmax(np.abs(y)))))
+
+
+def _segment(k: int, run: Experiment, first: int, last: int) -> Segment:
+    part = slice(first, last + 1)
+    means = {c: float(np.nanmean(run.outputs[c][part])) for c in ("i", "omega")
+             if c in run.outputs and np.isfinite(run.outputs[c][part]).any()}
+    if "omega" not in run.outputs and "theta" in run.outputs:
+        slope = _slope(run, first, last)
+        means |= {"omega": slope} if np.isfinite(slope) else {}
+    top = float(np.nanmax(np.abs(run.outputs["omega"]))) if "omega" in run.outputs else _top_slope(run)
+    moving = abs(means["omega"]) > MOVING_SHARE * top if "omega" in means else True
+    return Segment(k, first, last, float(run.t[first]), float(run.t[last]), float(np.mean(run.inputs["v"][part])),
+                   means, bool(moving))
+
+
+def _slope(run: Experiment, first: int, last: int) -> float:
+    t, y = run.t[first:last + 1], run.outputs["theta"][first:last + 1]
+    good = np.isfinite(y)
+    return float(np.polyfit(t[good] - t[0], y[good], 1)[0]) if good.sum() > 2 else float("nan")
+
+
+def _top_slope(run: Experiment) -> float:
+    y = run.outputs.get("theta")
+    if y is None:
+        return 0.0
+    good = np.flatnonzero(np.isfinite(y))[::max(run.n // 200, 1)]
+    return float(np.max(np.abs(np.diff(y[good]) / np.diff(run.t[good])), initial=0.0))
