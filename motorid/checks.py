@@ -40,7 +40,8 @@ def check_runs(runs: Sequence[Experiment]) -> list[str]:
     for check in _CHECKS:
         hits = [(run.name, text) for run in runs if (text := check(run))]
         if hits:
-            others = ", ".join(name for name, _ in hits[1:4]) + (", ..." if len(hits) > 4 else "")
+            others = ", ".join(name for name, _ in hits[1:4])
+            others += f" and {len(hits) - 4} more" if len(hits) > 4 else ""
             remarks.append(f"{hits[0][0]}: {hits[0][1]}" + (f" (The same in {others}.)" if others else ""))
     return remarks + [text for text in (_never_reverses(runs),) if text]
 
@@ -134,11 +135,10 @@ def _slow_sampling(run: Experiment) -> str | None:
     jumps = jumps[(jumps >= 1) & (jumps + 3 < run.n)]
     if not jumps.size:
         return None
-    first = i[jumps + 1] - i[jumps - 1]
-    full = np.nanmax(np.abs(i[jumps[:, None] + np.arange(4)] - i[jumps - 1][:, None]), axis=1, initial=0.0)
-    noise = noise_level(i, run.t)
-    clear = np.isfinite(first) & (full > 10 * noise)
-    if clear.sum() and float(np.median(np.abs(first[clear]) / full[clear])) > 0.9:
+    rise = np.abs(i[jumps[:, None] + np.arange(4)] - i[jumps - 1][:, None])
+    first, full = rise[:, :2].max(axis=1), rise.max(axis=1)  # the step itself may lie between two samples
+    clear = full > 10 * noise_level(i, run.t)
+    if clear.any() and float(np.median(first[clear] / full[clear])) > 0.9:
         return (f"after a voltage step the current is there within one sample ({1e3 * run.dt:.3g} ms): "
                 "the sampling is too slow for the inductance, so L will be uncertain. Sample faster, or "
                 "fix L: it hardly matters here.")

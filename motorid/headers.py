@@ -131,9 +131,9 @@ def _by_words(words: list[str], unit: Unit | None, explicit: bool) -> tuple[str,
             return None
         known = unit or (parse_unit("counts") if _WEAK & set(words) and channel == "theta" else None)
         return channel, known, 2.0 if unit is None and known else score
-    if not explicit:  # u_a, theta_m: the letter is an index, not a unit
-        return (channel, None, score) if score >= 1 else None
     longest = max(len(w) for w in words if _CHANNEL.get(w.rstrip("0123456789"), channel) == channel)
+    if not explicit:  # u_a, theta_m: the letter is an index, not a unit; but speed_V is a tacho
+        return None if score < 1 or (longest > 2 and unit.label in ("V", "A")) else (channel, None, score)
     return _by_unit(words, unit, explicit) if longest < 3 else None
 
 

@@ -1,0 +1,218 @@
+"""What is wrong with a record is said in plain words; a good record gets no remark."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from motorid.checks import check_runs
+from motorid.datasets import data_path, datasets
+from motorid.experiment import OUTPUTS, Experiment
+from motorid.reading import read_csv, read_runs
+
+
+@pytest.fixture(scope="module")
+def good() -> Experiment:
+    """A lab motor with current, speed and angle, driven both ways."""
+    return read_runs(data_path("hidden_cogging/run2.csv"))[0]
+
+
+@pytest.fixture(scope="module")
+def steps() -> Experiment:
+    return read_runs(data_path("hidden_friction/run1.csv"))[0]
+
+
+def said(*runs: Experiment) -> str:
+    return "\n".join(check_runs(runs))
+
+
+def changed(run: Experiment, **scale: float) -> Experiment:
+    return run.with_(inputs={"v": run.inputs["v"] * scale.get("v", 1.0)},
+                     outputs={c: y * scale.get(c, 1.0) for c, y in run.outputs.items()})
+
+
+# -- silence ------------------------------------------------------------------------------------------------
+
+TRUE_REMARKS = ("the voltage never reverses in any run", "too slow for the inductance")
+
+
+@pytest.mark.parametrize("name", datasets())
+def test_shipped_records_raise_no_false_alarm(name):
+    remarks = check_runs(read_runs(data_path(name)))
+    assert [r for r in remarks if not any(t in r for t in TRUE_REMARKS)] == []
+
+
+@pytest.mark.parametrize("motor", ["lab", "micro", "servo"])
+@pytest.mark.parametrize("drive", ["staircase", "chirp"])
+def test_a_plain_motor_raises_no_false_alarm(motor, drive, plant, rng):
+    machine = plant.MOTORS[motor]
+    if drive == "staircase":
+        t, v = plant.staircase([3, -3, 1, 0, 5], hold=0.3)
+    else:
+        t = np.arange(2000) * 1e-3
+        v = 5 * np.sin(2 * np.pi * (0.5 + 2 * t) * t)
+    record = plant.simulate(machine, {}, t, v)
+    noisy = {c: record[c] + 0.003 * np.std(record[c]) * rng.normal(size=len(t)) for c in OUTPUTS}
+    remarks = check_runs([Experiment(t, {"v": v}, noisy)])
+    assert [r for r in remarks if "too slow for the inductance" not in r] == []
+
+
+def test_nothing_is_said_about_nothing():
+    assert check_runs([]) == []
+
+
+def test_real_records_are_remarked_on_with_reason(real):
+    expected = {
+        "emps": [], "fibo": [], "frc": ["never reverses"], "furuta_base": ["the angle advances 1.26"],
+        "odri_mn4004": ["is 1 V from beginning to end", "uneven"], "xl330": ["uneven"],
+        "unmotor": ["never reverses"],
+    }
+    for folder, parts in expected.items():
+        runs = read_runs(real / folder, units={"omega": "deg/s"} if folder == "unmotor" else None)
+        remarks = check_runs(runs)
+        assert len(remarks) == len(parts), remarks
+        for part, remark in zip(parts, remarks, strict=True):
+            assert part in remark
+
+
+# -- signs and units ----------------------------------------------------------------------------------------
+
+
+def test_a_swapped_sign_is_told_with_its_channel(good, steps):
+    assert "sign of the current" in said(changed(good, i=-1))
+    assert "units={'i': '-1 A'}" in said(changed(good, i=-1))
+    assert "sign of the voltage" in said(changed(good, v=-1))
+    both = said(changed(steps, omega=-1))
+    assert "sign of the speed" in both
+    assert "'omega': '-1 rad/s'" in both
+    only = steps.without("i")
+    assert "sign of the speed (or of the voltage)" in said(changed(only, omega=-1))
+    assert "angle falls while the speed is positive" in said(changed(good, theta=-1))
+    angle = good.without("i", "omega")
+    assert "'theta': '-1 rad'" in said(changed(angle, theta=-1))
+
+
+@pytest.mark.parametrize(("scale", "remedy"), [
+    ({"omega": 30 / np.pi}, "'omega': 'rpm'"), ({"omega": 180 / np.pi}, "'omega': 'deg/s'"),
+    ({"theta": 180 / np.pi}, "'theta': 'deg'"),
+    ({"omega": np.pi / 30}, "already in rad/s although rpm is stated"),
+    ({"omega": 1 / (2 * np.pi)}, "'omega': 'rev/s'"), ({"theta": 1 / (2 * np.pi)}, "'theta': 'rev'"),
+    ({"theta": 1 / 43.7}, "a gear between the two sensors"),
+])
+def test_angle_and_speed_must_agree(good, scale, remedy):
+    assert remedy in said(changed(good, **scale))
+
+
+@pytest.mark.parametrize(("scale", "part"), [
+    ({"omega": 100.0}, "is it in rpm"), ({"i": 1000.0}, "mA"), ({"v": 1000.0}, "is it in mV"),
+])
+def test_sizes_no_motor_has_point_to_the_unit(steps, scale, part):
+    assert part in said(changed(steps, **scale))
+
+
+def test_a_speed_of_no_stated_unit_is_suspected_sooner(tmp_path):
+    t = np.arange(200) * 1e-3
+    w = 1650 * (1 - np.exp(-t / 0.03))  # a lab motor at 8 V, in rpm
+    rows = "".join(f"{a:.3f},8,{b:.2f}\n" for a, b in zip(t, w, strict=True))
+    (tmp_path / "a.csv").write_text("time_s,voltage_V,omega\n0,-8,0\n" + rows[rows.index("\n") + 1:])
+    assert "is it in rpm" in said(read_csv(tmp_path / "a.csv"))
+    assert "is it in rpm" not in said(read_csv(tmp_path / "a.csv", units={"omega": "rpm"}))
+
+
+def test_a_tiny_or_a_huge_constant_points_to_the_unit(steps):
+    tiny = changed(steps, v=0.01)
+    assert "V·s/rad, far less" in said(tiny.without("i"))
+    assert "Ω, far less" in said(changed(steps, i=300.0))
+    assert "Ω, far more" in said(changed(steps, i=1e-4))
+
+
+def test_the_unit_of_the_time_is_suspected(steps):
+    assert "is the time in ms" in said(steps.with_(t=steps.t * 1000))
+    assert "unit of the time right" in said(steps.with_(t=steps.t * 1e-6))
+
+
+def test_swapped_columns_are_told(steps):
+    swapped = steps.with_(inputs={"v": steps.outputs["omega"]}, outputs={"omega": steps.inputs["v"]})
+    assert "columns swapped" in said(swapped)
+
+
+# -- quality ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("channel", ["i", "omega"])
+@pytest.mark.parametrize("side", [1, -1])
+def test_a_clipped_channel_is_told(steps, channel, side):
+    y = steps.outputs[channel]
+    stop = 0.6 * (y.max() if side > 0 else y.min())
+    clipped = np.minimum(y, stop) if side > 0 else np.maximum(y, stop)
+    remarks = said(steps.with_(outputs={**steps.outputs, channel: clipped}))
+    assert f"{'current' if channel == 'i' else 'speed'} stays at exactly {stop:.4g}" in remarks
+    assert "clipped" in remarks
+
+
+def test_rest_and_steps_of_the_sensor_are_not_clipping(steps):
+    coarse = steps.with_(outputs={c: np.round(y / (np.ptp(y) / 60)) * np.ptp(y) / 60
+                                  for c, y in steps.outputs.items()})
+    assert "clipped" not in said(coarse)
+    rest = steps.with_(outputs={"omega": np.maximum(steps.outputs["omega"], 0.0)})
+    assert "clipped" not in said(rest)
+
+
+def test_too_few_counts_are_told(steps):
+    step = np.ptp(steps.outputs["omega"]) / 9
+    remarks = said(steps.with_(outputs={"omega": np.round(steps.outputs["omega"] / step) * step}))
+    assert "too few counts" in remarks
+
+
+def test_a_channel_of_noise_is_told(steps, rng):
+    assert "mostly noise" in said(steps.with_(outputs={"i": rng.normal(size=steps.n)}))
+
+
+def test_missing_samples_are_told(steps, rng):
+    y = np.where(rng.random(steps.n) < 0.3, np.nan, steps.outputs["omega"])
+    assert "29 % of the speed samples are missing" in said(steps.with_(outputs={"omega": y}))
+
+
+def test_uneven_sampling_is_told(steps, rng):
+    t = steps.t + rng.uniform(0, 0.9e-3, steps.n)
+    assert "sampling is uneven" in said(steps.with_(t=t))
+    assert "uneven" not in said(steps.with_(t=steps.t + rng.uniform(0, 1e-4, steps.n)))
+
+
+def test_sampling_too_slow_for_the_inductance_is_told(steps):
+    assert "too slow for the inductance" in said(steps.decimate(8).with_(
+        inputs={"v": steps.inputs["v"][::8]}))
+    assert "inductance" not in said(steps)
+
+
+# -- what the records cannot show ---------------------------------------------------------------------------
+
+
+def test_no_excitation_is_told(steps):
+    constant = steps.select(steps.t > steps.t[-1] - 0.1)
+    assert "from beginning to end" in said(constant)
+    dead = steps.with_(outputs={"omega": np.zeros(steps.n), "i": steps.outputs["i"]})
+    assert "speed never changes" in said(dead)
+
+
+def test_a_run_that_never_settles_is_told():
+    t = np.arange(1500) * 1e-3
+    v = np.where(t < 0.2, 0.0, 6.0)
+    slow = 100 * (1 - np.exp(-np.maximum(t - 0.2, 0) / 2.0))
+    fast = 100 * (1 - np.exp(-np.maximum(t - 0.2, 0) / 0.1))
+    assert "never settles" in said(Experiment(t, {"v": v}, {"omega": slow}))
+    assert "never settles" not in said(Experiment(t, {"v": v}, {"omega": fast}))
+
+
+def test_a_voltage_that_never_reverses_is_told_once_for_all_runs(steps):
+    forward = steps.with_(inputs={"v": np.abs(steps.inputs["v"])})
+    assert said(forward, forward).count("never reverses") == 1
+    assert "never reverses" not in said(forward, steps)
+
+
+def test_the_same_remark_about_many_runs_is_made_once(steps):
+    runs = [changed(steps, i=-1).with_(name=f"run{k}") for k in range(6)]
+    remarks = [r for r in check_runs(runs) if "sign of the current" in r]
+    assert len(remarks) == 1
+    assert remarks[0].startswith("run0: ")
+    assert "(The same in run1, run2, run3 and 2 more.)" in remarks[0]
