@@ -39,6 +39,9 @@ class Parameter:
         A number of periods per turn, found from the spectrum of the misfit over the angle.
     given : bool
         Set by the user; then no first guess replaces it.
+    at_least : str
+        Name of a parameter that this one cannot physically fall below (breakaway friction, Coulomb friction);
+        checked after a fit, by `diagnose`.
     doc : str
     """
 
@@ -54,6 +57,7 @@ class Parameter:
     periodic: bool = False
     order: bool = False
     given: bool = False
+    at_least: str = ""
     doc: str = ""
 
     def __post_init__(self) -> None:
@@ -90,12 +94,13 @@ class P:
     grid: tuple[float, ...] = ()
     periodic: bool = False
     order: bool = False
+    at_least: str = ""
     doc: str = ""
 
     def named(self, name: str) -> Parameter:
         """Return the `Parameter` called `name`."""
         return Parameter(name, self.value, self.unit, self.lower, self.upper, self.positive, self.vary,
-                         self.null, tuple(self.grid), self.periodic, self.order, False, self.doc)
+                         self.null, tuple(self.grid), self.periodic, self.order, False, self.at_least, self.doc)
 
 
 @dataclass(frozen=True, eq=False)

@@ -30,11 +30,11 @@ def coulomb_asymmetric(
 def stribeck(
     m: Equations,
     tau_c=P(2e-3, "N·m", null=0.0, lower=0.0, doc="Coulomb friction torque at speed"),
-    tau_s=P(3e-3, "N·m", null=0.0, lower=0.0, doc="breakaway torque, at least tau_c"),
+    tau_s=P(3e-3, "N·m", null=0.0, lower=0.0, at_least="tau_c", doc="breakaway torque"),
     omega_s=P(5.0, "rad/s", positive=True, grid=(0.01, 0.03, 0.1, 0.3), doc="Stribeck speed"),
 ):
     """Stribeck friction, (tau_c + (tau_s−tau_c)·exp(−(ω/ω_s)²))·sgn ω. Armstrong-Hélouvry et al., Automatica, 1994."""
-    level = tau_c + ca.fmax(tau_s - tau_c, 0) * ca.exp(-((m.omega / omega_s) ** 2))
+    level = tau_c + (tau_s - tau_c) * ca.exp(-((m.omega / omega_s) ** 2))
     m.torque -= level * m.sign(m.omega)
 
 
