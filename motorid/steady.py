@@ -80,7 +80,8 @@ def _held_stretches(v: Array) -> list[tuple[int, int]]:
     return stretches
 
 
-def _steady_tail(k: int, run: Experiment, sigma: Mapping[str, float], first: int, last: int) -> Segment | None:
+def _steady_tail(k: int, run: Experiment, sigma: Mapping[str, float], first: int,
+                 last: int) -> Segment | None:
     length = last - first + 1
     for share in (0.75, 0.5, 0.25, 0.125):
         n = int(share * length)
@@ -122,8 +123,8 @@ def _segment(k: int, run: Experiment, first: int, last: int) -> Segment:
         means |= {"omega": slope} if np.isfinite(slope) else {}
     top = float(np.nanmax(np.abs(run.outputs["omega"]))) if "omega" in run.outputs else _top_slope(run)
     moving = abs(means["omega"]) > MOVING_SHARE * top if "omega" in means else True
-    return Segment(k, first, last, float(run.t[first]), float(run.t[last]), float(np.mean(run.inputs["v"][part])),
-                   means, bool(moving))
+    return Segment(k, first, last, float(run.t[first]), float(run.t[last]),
+                   float(np.mean(run.inputs["v"][part])), means, bool(moving))
 
 
 def _slope(run: Experiment, first: int, last: int) -> float:

@@ -1,0 +1,151 @@
+"""Rows that a fit must respect: functions of state, input and parameters at samples, or their means.
+
+Each relation is used in two ways. As a *penalty* it adds rows to the least-squares residual (`evaluate`); as a
+*true constraint* of `MultipleShooting` it keeps rows between limits (`parts`).
+"""
+
+from __future__ import annotations
+
+import weakref
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from motorid.errors import UsageError
+from motorid.integrate.grid import Array, Trajectory
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """Rows of one constraint on one run: ``lower ≤ mean over its samples of local(x, u, p, d) ≤ upper``.
+
+    Attributes
+    ----------
+    run : int
+    local : casadi.Function
+        ``(x, u, p, d) -> (c, dc/dx, dc/dp)``, c of shape (nc,), dimensionless.
+    samples : ndarray of int, shape (m,)
+        In ascending order.
+    group : ndarray of int, shape (m,)
+        Which row block each sample is averaged into.
+    data : ndarray, shape (m, nd)
+    u : ndarray, shape (m, nu)
+    keep : ndarray of bool, shape (ng·nc,)
+        Which rows are used.
+    lower, upper : ndarray, shape (n,)
+        Of the rows kept.
+    size : ndarray, shape (n,)
+        What one unit of a row is, in `unit`.
+    weight : ndarray, shape (n,)
+        Of the rows as a penalty.
+    labels : tuple of str
+    unit : str
+    """
+
+    run: int
+    local: ca.Function
+    samples: np.ndarray
+    group: np.ndarray
+    data: Array
+    u: Array
+    keep: np.ndarray
+    lower: Array
+    upper: Array
+    size: Array
+    weight: Array
+    labels: tuple[str, ...]
+    unit: str
+
+    def rows(self, x: Array, p: Array, dx: Array | None, dp: Array | None) -> tuple[Array, Array | None]:
+        """Return the rows (n,) and d rows/dz (n, nz) at states (m, nx) with dx (m, nx, nz), dp (np, nz)."""
+        m, nc = len(self.samples), self.local.size1_out(0)
+        wide = np.tile(np.asarray(p, float)[:, None], (1, m))
+        found = self.local.map(m)(x.T, self.u.T, wide, self.data.T)
+        c = np.asarray(found[0]).T
+        mean = self._mean(c).ravel()[self.keep]
+        if dx is None:
+            return mean, None
+        cx = np.asarray(found[1]).reshape(nc, m, -1).transpose(1, 0, 2)
+        cp = np.asarray(found[2]).reshape(nc, m, -1).transpose(1, 0, 2)
+        return mean, self._mean(cx @ dx + cp @ dp).reshape(-1, dx.shape[2])[self.keep]
+
+    def _mean(self, values: Array) -> Array:
+        groups = int(self.group[-1]) + 1
+        if groups == len(self.group):
+            return values
+        starts = np.flatnonzero(np.diff(self.group, prepend=-1))
+        counts = np.diff(starts, append=len(self.group))
+        return np.add.reduceat(values, starts, axis=0) / counts.reshape(-1, *[1] * (values.ndim - 1))
+
+
+class Relation:
+    """What all constraints share: parts once per problem, and their use as penalties."""
+
+    def _parts(self, problem: Any) -> tuple[Part, ...]:
+        raise NotImplementedError
+
+    def parts(self, problem: Any) -> tuple[Part, ...]:
+        """Return the rows on each run of `problem`, made once."""
+        made = _made.setdefault(problem, {})
+        if id(self) not in made:
+            made[id(self)] = (self, self._parts(problem))
+        return made[id(self)][1]
+
+    def _penalty(self, c: Array, part: Part) -> tuple[Array, Array]:
+        """Return residual and slope of rows used as a penalty: what lies outside the limits."""
+        out = np.where(c > part.upper, c - part.upper, np.where(c < part.lower, c - part.lower, 0.0))
+        return part.weight * out, part.weight * (out != 0)
+
+    def evaluate(self, problem: Any, q: Array, trajs: Sequence[Trajectory]) -> tuple[Array, Array | None]:
+        """Return the residual (n,) as a penalty and its Jacobian (n, nq), None if the trajectories have none."""
+        p, dp = parameters_of(problem, q)
+        rs, jacs = [np.zeros(0)], [np.zeros((0, len(q)))]
+        derivatives = all(t.dx is not None for t in trajs)
+        for part in self.parts(problem):
+            t, s = trajs[part.run], part.samples
+            c, jac = part.rows(t.x[s], p, t.dx[s] if derivatives and t.dx is not None else None, dp)
+            r, slope = self._penalty(c, part)
+            rs.append(r)
+            if jac is not None:
+                jacs.append(slope[:, None] * jac)
+        return np.concatenate(rs), np.concatenate(jacs) if derivatives else None
+
+
+_made: weakref.WeakKeyDictionary[Any, dict[int, tuple[Any, tuple[Part, ...]]]] = weakref.WeakKeyDictionary()
+
+
+def parameters_of(problem: Any, q: Array) -> tuple[Array, Array]:
+    """Return p (np,) of the system and dp/dq (np, nq)."""
+    values = problem.values(q)
+    names = problem.system.parameters
+    select = np.zeros((len(names), len(problem.unknown)))
+    for j, parameter in enumerate(problem.unknown):
+        if parameter.name in names:
+            select[names.index(parameter.name), j] = 1.0
+    return np.array([values[n] for n in names]), select * problem.scaling.slope(q)
+
+
+def local(system: Any, rows: Callable[..., Any], nd: int) -> ca.Function:
+    """Return ``(x, u, p, d) -> (c, dc/dx, dc/dp)`` of the expression `rows`."""
+    nx, nu, np_, _ = system.sizes
+    x, u, p, d = ca.SX.sym("x", nx), ca.SX.sym("u", nu), ca.SX.sym("p", np_), ca.SX.sym("d", nd)
+    c = ca.SX(rows(x, u, p, d))
+    return ca.Function("rows", [x, u, p, d],
+                       [ca.densify(c), ca.densify(ca.jacobian(c, x)), ca.densify(ca.jacobian(c, p))])
+
+
+def share(problem: Any, k: int) -> float:
+    """RMS of the measured channels in units of their weights: one where the fit is weighted by the RMS."""
+    if problem.weights == "rms":
+        return 1.0
+    run = problem.runs[k]
+    ratios = [float(np.nanmean(run.experiment.outputs[c] ** 2)) / run.sigma[c] ** 2 for c in run.sigma]
+    return float(np.sqrt(np.mean(ratios))) if ratios else 1.0
+
+
+def check_weight(weight: float, what: str) -> None:
+    if not (np.isfinite(weight) and weight >= 0):
+        raise UsageError(f"{what}: the weight must be at least 0; got {weight!r}.")
