@@ -1,0 +1,8 @@
+"""Figures, one function per result; the only place that imports matplotlib."""
+
+from motorid.plots.diagnosis import plot_ladder, plot_missing, plot_ranking
+from motorid.plots.fits import plot_fit, plot_parameters, plot_runs
+from motorid.plots.residuals import plot_residuals
+
+__all__ = ["plot_fit", "plot_ladder", "plot_missing", "plot_parameters", "plot_ranking", "plot_residuals",
+           "plot_runs"]

@@ -1,0 +1,209 @@
+"""Figures of a diagnosis: where the model fails, which effect is missing, how the error falls."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+
+from motorid.diagnosis.results import Binned, Candidate, Diagnosis, Ladder, Missing
+from motorid.errors import UsageError
+from motorid.formatting import number
+from motorid.integrate.grid import Array
+from motorid.plots.residuals import scatter
+from motorid.plots.style import (
+    CYCLE,
+    FAINT,
+    INK,
+    MUTED,
+    PALETTE,
+    WIDTH,
+    axis_label,
+    decade,
+    line,
+    new_figure,
+    only,
+    scaled_title,
+    styled,
+    tidy,
+)
+
+_COLOUR = {"voltage": PALETTE["purple"], "torque": PALETTE["blue"]}
+
+
+@styled
+def plot_missing(result: Missing | Diagnosis, *, show: int = 3, run: int | None = None) -> np.ndarray:
+    """Draw the missing voltage and torque over time, and against what explains them best.
+
+    Dots are samples, the line with its band the mean and its interval of 95 % in bins. The title of each
+    panel says which share of the variance that quantity explains.
+
+    Parameters
+    ----------
+    result : Missing or Diagnosis
+    show : int
+        Number of quantities per balance.
+    run : int, optional
+        Which run is drawn over time; default: the one with the largest missing part.
+
+    Returns
+    -------
+    ndarray of Axes, shape (balances, 1 + show)
+    """
+    missing = result.missing if isinstance(result, Diagnosis) else result
+    if not isinstance(missing, Missing):
+        raise UsageError(f"plot_missing takes a diagnosis, mi.diagnose(fit), got {type(result).__name__}.")
+    balances = [b for b in ("voltage", "torque") if any(np.isfinite(x).any() for x in getattr(missing, b))]
+    if missing.where == "mechanical":
+        balances.reverse()
+    show = min(show, max((len(missing.bins.get(b, ())) for b in balances), default=0))
+    figure = new_figure(WIDTH, 2.3 * len(balances) + 0.2)
+    axes = figure.subplots(len(balances), 1 + show, squeeze=False, sharey="row",
+                           width_ratios=[1.7] + [1.0] * show)
+    for row, balance in zip(axes, balances, strict=True):
+        _balance(row, missing, balance, run)
+    figure.align_ylabels(axes[:, 0])
+    return axes
+
+
+def _balance(row: np.ndarray, missing: Missing, balance: str, run: int | None) -> None:
+    values: Sequence[Array] = getattr(missing, balance)
+    size = float(np.nanmax([np.nanmax(np.abs(v), initial=0.0) for v in values]))
+    power = decade(size)
+    factor = 10.0**-power
+    k = run if run is not None else int(np.argmax([np.nanmean(np.square(v)) for v in values]))
+    line(row[0], missing.t[k], values[k] * factor, color=_COLOUR[balance], lw=0.9)
+    unit = "V" if balance == "voltage" else missing.torque_unit
+    noun = "force" if unit == "N" else balance
+    share = missing.shares.get({"voltage": "electrical", "torque": "mechanical"}[balance])
+    part = "" if share is None else f": {100 * share:.0f} % of the misfit"
+    tidy(row[0], x="time (s)", y=scaled_title(f"missing {noun}", unit, power), title=f"Missing {noun}{part}")
+    for ax, b in zip(row[1:], missing.bins.get(balance, ()), strict=False):
+        _binned(ax, b, missing.signals, values, factor, _COLOUR[balance])
+    for ax in row[1 + len(missing.bins.get(balance, ())):]:
+        ax.set_axis_off()
+
+
+def _binned(ax: Axes, b: Binned, signals: Sequence[Mapping[str, Array]], values: Sequence[Array],
+            factor: float, colour: str) -> None:
+    pairs = [(np.asarray(s[b.against]), v) for s, v in zip(signals, values, strict=True) if b.against in s]
+    if pairs:
+        x, y = np.concatenate([p[0] for p in pairs]), np.concatenate([p[1] for p in pairs]) * factor
+        ok = np.isfinite(x) & np.isfinite(y) & (x >= b.centre.min()) & (x <= b.centre.max())
+        if ok.any():
+            scatter(ax, x[ok], y[ok], most=800, color=MUTED)
+    ax.fill_between(b.centre, b.low * factor, b.high * factor, color=colour, alpha=0.3, lw=0)
+    ax.plot(b.centre, b.mean * factor, color=colour, lw=1.5)
+    ax.axhline(0, color=MUTED, lw=0.6)
+    label = axis_label(b.against)
+    tidy(ax, x=f"{label.split(' (')[0]} ({b.unit})" if b.unit else label,
+         title=f"{100 * b.explained:.0f} % explained")
+
+
+@styled
+def plot_ranking(result: Diagnosis | Sequence[Candidate], ax: Axes | None = None, *, show: int = 10) -> Axes:
+    """Draw the effects tried, best first: the share of the misfit that each would take away.
+
+    The outline is the prediction from the sensitivities, the bar what a refit gave; a diamond is the fall
+    of the held-out error. Accepted effects are blue.
+
+    Parameters
+    ----------
+    result : Diagnosis or sequence of Candidate
+    ax : Axes, optional
+    show : int
+        Number of effects.
+    """
+    every = list(result.ranking if isinstance(result, Diagnosis) else result)
+    chosen = every[:show]
+    if not chosen or not all(isinstance(c, Candidate) for c in chosen):
+        raise UsageError("plot_ranking takes a diagnosis with a ranking: mi.plot_ranking(mi.diagnose(fit)).")
+    ax = only(ax, width=6.4, height=0.6 + 0.3 * len(chosen))
+    for k, c in enumerate(chosen):
+        colour = PALETTE["blue"] if c.accepted else PALETTE["grey"]
+        if c.refit_drop is not None:
+            ax.barh(k, 100 * c.refit_drop, height=0.62, color=colour, alpha=0.85)
+        ax.barh(k, 100 * c.predicted_drop, height=0.62, fill=False, edgecolor=INK, lw=0.9)
+        if c.held_out_gain is not None:
+            ax.plot(100 * max(c.held_out_gain, -0.12), k, "D", ms=5.5, color=PALETTE["orange"], mec="white",
+                    mew=0.7, zorder=3)
+    ax.set_yticks(range(len(chosen)), [c.effect for c in chosen])
+    ax.set_ylim(len(chosen) - 0.4, -0.6)
+    lowest = min([0.0, *(100 * max(c.held_out_gain or 0.0, -0.12) for c in chosen)])
+    ax.set_xlim(lowest - 3 if lowest < 0 else 0, 103)
+    ax.grid(axis="y", visible=False)
+    more = f" (first {len(chosen)} of {len(every)})" if len(every) > len(chosen) else ""
+    tidy(ax, x="share of the misfit taken away (%)", title=f"Which effect is missing?{more}")
+    _ranking_legend(ax, chosen)
+    return ax
+
+
+def _ranking_legend(ax: Axes, chosen: Sequence[Candidate]) -> None:
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+    handles: list[Any] = [Patch(fill=False, edgecolor=INK, label="predicted")]
+    if any(c.accepted and c.refit_drop is not None for c in chosen):
+        handles.append(Patch(color=PALETTE["blue"], alpha=0.85, label="refitted, accepted"))
+    if any(not c.accepted and c.refit_drop is not None for c in chosen):
+        handles.append(Patch(color=PALETTE["grey"], alpha=0.85, label="refitted, not taken"))
+    if any(c.held_out_gain is not None for c in chosen):
+        handles.append(Line2D([], [], marker="D", ls="", color=PALETTE["orange"],
+                              label="fall of the held-out error"))
+    ax.legend(handles=handles, loc="upper left", bbox_to_anchor=(1.0, 1.0))
+
+
+@styled
+def plot_ladder(result: Ladder | Diagnosis, ax: Axes | None = None) -> Axes:
+    """Draw how the error falls as effects are added: on the records of the fit, and on those it never saw.
+
+    Parameters
+    ----------
+    result : Ladder or Diagnosis
+    ax : Axes, optional
+    """
+    ladder = result.ladder if isinstance(result, Diagnosis) else result
+    if not isinstance(ladder, Ladder) or not ladder.rungs:
+        raise UsageError("plot_ladder takes mi.improve(fit) or mi.diagnose(fit), "
+                         f"got {type(result).__name__}.")
+    rungs = ladder.rungs
+    ax = only(ax, width=max(5.6, 1.5 + 1.25 * len(rungs)), height=3.4)
+    x = np.arange(len(rungs), dtype=float)
+    for k, c in enumerate(rungs[0].nrmse):
+        _falling(ax, x, [100 * r.nrmse[c] for r in rungs], c, CYCLE[k], held_out=False)
+        if all(r.validation_nrmse and c in r.validation_nrmse for r in rungs):
+            _falling(ax, x, [100 * (r.validation_nrmse or {})[c] for r in rungs], c, CYCLE[k], held_out=True)
+    ax.set_yscale("log")
+    _decades(ax)
+    first = "plain motor" if rungs[0].fit.model.base == "dc_motor" else "plain drive"
+    started = " + ".join([first, *rungs[0].fit.model.effect_names])
+    ax.set_xticks(x, [started if r.added is None else "+ " + r.added.replace(" + ", "\n+ ") for r in rungs])
+    ax.set_xlim(-0.3, len(rungs) - 0.35)
+    tidy(ax, y="NRMSE (%)", title="The error falls")
+    ax.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    return ax
+
+
+def _falling(ax: Axes, x: Array, errors: Sequence[float], channel: str, colour: str, *,
+             held_out: bool) -> None:
+    name = axis_label(channel).split(" (")[0]
+    ax.plot(x, errors, "s--" if held_out else "o-", color=colour, mfc="white" if held_out else colour, ms=5.5,
+            label=f"{name}, {'held out' if held_out else 'fitted'}")
+    ends = [0, len(x) - 1] if not held_out else []
+    for k in ends:
+        ax.annotate(number(errors[k], 2), (float(x[k]), errors[k]), (7, 5), textcoords="offset points",
+                    fontsize=8, color=colour)
+
+
+def _decades(ax: Axes) -> None:
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    low, high = ax.get_ylim()
+    ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if high < 200 * low else (1,)))
+    ax.yaxis.set_major_formatter(FuncFormatter(lambda v, _: f"{v:g}"))
+    ax.yaxis.set_minor_formatter(NullFormatter())
+    ax.grid(which="minor", visible=False)
+    ax.set_facecolor("none")
+    ax.tick_params(which="minor", color=FAINT)

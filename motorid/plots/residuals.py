@@ -1,0 +1,181 @@
+"""Figures of what a fit leaves over."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+
+from motorid.equations import CHANNELS
+from motorid.errors import UsageError, one_of
+from motorid.fit import Fit
+from motorid.integrate.grid import Array
+from motorid.plots.style import (
+    INK,
+    MUTED,
+    PALETTE,
+    RESIDUAL,
+    WIDTH,
+    axis_label,
+    band,
+    finite,
+    line,
+    new_figure,
+    styled,
+    tidy,
+)
+from motorid.simulate import Simulation
+
+LAGS = 60
+BINS = 24
+
+
+@styled
+def plot_residuals(fit: Fit, channels: Sequence[str] | None = None) -> np.ndarray:
+    """Draw the residuals of each channel: over time, their histogram and autocorrelation, against ω, i, θ.
+
+    What only noise leaves over is flat: a histogram under the curve of the normal distribution, an
+    autocorrelation within its band of 95 %, means of zero against every quantity.
+
+    Parameters
+    ----------
+    fit : Fit
+    channels : sequence of str, optional
+        Default: all measured ones.
+
+    Returns
+    -------
+    ndarray of Axes, shape (channels, k)
+        Time, histogram, autocorrelation, then one per quantity known.
+    """
+    sims = fit.simulations
+    present = [c for c in CHANNELS if any(c in s.experiment.outputs and c in s.outputs for s in sims)]
+    for c in channels or ():
+        if c not in present:
+            raise UsageError(one_of(c, present, "channel"))
+    names = list(channels or present)
+    against = [c for c in ("omega", "i", "theta") if c in present]
+    figure = new_figure(WIDTH, 3.3 * len(names) + 0.2)
+    rows = figure.add_gridspec(2 * len(names), 12)
+    axes = np.empty((len(names), 3 + len(against)), object)
+    for j, c in enumerate(names):
+        axes[j, 0] = figure.add_subplot(rows[2 * j, :9])
+        axes[j, 1] = figure.add_subplot(rows[2 * j, 9:], sharey=axes[j, 0])
+        width = 12 // (1 + len(against))
+        for k in range(1 + len(against)):
+            axes[j, 2 + k] = figure.add_subplot(rows[2 * j + 1, k * width:(k + 1) * width])
+        _channel(axes[j], fit, c, against)
+    figure.align_ylabels([row[k] for row in axes for k in (0, 2)])
+    return axes
+
+
+def _channel(axes: np.ndarray, fit: Fit, channel: str, against: Sequence[str]) -> None:
+    sims = [s for s in fit.simulations if channel in s.experiment.outputs]
+    run = sims[0].experiment
+    unit = run.units[channel]
+    sigma = float(np.mean([r.sigma[channel] for r in fit.problem.runs if channel in r.sigma]))
+    _over_time(axes[0], sims, channel, sigma)
+    tidy(axes[0], x="time, runs one after the other (s)", y=f"residual ({unit})",
+         title=f"Residual of the {axis_label(channel, run)}")
+    every = np.concatenate([s.residual(channel) for s in sims])
+    _histogram(axes[1], finite(every, f"the residual of {channel}"), sigma)
+    _autocorrelation(axes[2], [s.residual(channel) for s in sims])
+    for ax, other in zip(axes[3:], against, strict=True):
+        with_other = [s for s in sims if other in s.experiment.outputs]
+        _against(ax, [s.experiment.outputs[other] for s in with_other],
+                 [s.residual(channel) for s in with_other], sigma)
+        tidy(ax, x=axis_label(other, run), title=f"Against {axis_label(other, run).split(' (')[0]}")
+        ax.sharey(axes[3])
+    if len(axes) > 3:
+        axes[3].set_ylabel(f"residual ({unit})")
+
+
+def _over_time(ax: Axes, sims: Sequence[Simulation], channel: str, sigma: float) -> None:
+    shift = 0.0
+    band(ax, 2 * sigma, "noise, ±2σ")
+    for k, s in enumerate(sims):
+        t = s.experiment.t - s.experiment.t[0]
+        line(ax, t + shift, s.residual(channel), color=RESIDUAL, lw=0.8)
+        if len(sims) <= 6:
+            ax.annotate(s.experiment.name, (shift, 1), (3, -2), xycoords=("data", "axes fraction"),
+                        textcoords="offset points", va="top", fontsize=7, color=MUTED)
+        shift += float(t[-1])
+        if k + 1 < len(sims):
+            ax.axvline(shift, color=MUTED, lw=0.7)
+    ax.legend(loc="lower right", bbox_to_anchor=(1, 0.98), borderpad=0.1)
+
+
+def _histogram(ax: Axes, r: Array, sigma: float) -> None:
+    edges = np.linspace(r.min(), r.max(), 41) if np.ptp(r) > 0 else np.linspace(-1, 1, 41)
+    ax.hist(r, edges.tolist(), density=True, orientation="horizontal", color=RESIDUAL, alpha=0.55)
+    y = np.linspace(-4 * sigma, 4 * sigma, 121)
+    top = float(np.max(np.histogram(r, edges, density=True)[0]))
+    bell = np.exp(-0.5 * (y / sigma) ** 2) / (sigma * np.sqrt(2 * np.pi))
+    ax.plot(bell, y, color=INK, lw=1.0, label="noise")
+    ax.set_xlim(0, 1.25 * max(top, float(bell.max()) if bell.max() < 4 * top else top))
+    ax.set_xticks([])
+    ax.tick_params(labelleft=False)
+    tidy(ax, x="density", title="Histogram")
+    ax.legend(loc="upper right", borderpad=0.1)
+
+
+def _autocorrelation(ax: Axes, residuals: Sequence[Array]) -> None:
+    lags = min(LAGS, min(len(r) for r in residuals) // 3)
+    rho, count = autocorrelation(residuals, lags)
+    half = 1.96 / np.sqrt(max(count, 1))
+    band(ax, half, "white noise, 95 %")
+    k = np.arange(1, lags + 1)
+    ax.vlines(k, 0, rho[1:], color=PALETTE["purple"], lw=1.2)
+    ax.axhline(0, color=MUTED, lw=0.6)
+    ax.set_ylim(min(-0.25, float(rho.min()) * 1.1), max(0.4, min(1.05, float(rho[1:].max(initial=0)) * 1.25)))
+    tidy(ax, x="lag (samples)", y="correlation", title="Autocorrelation")
+    ax.legend(loc="upper right", borderpad=0.1)
+
+
+def autocorrelation(residuals: Sequence[Array], lags: int) -> tuple[Array, int]:
+    """Return the autocorrelation at 0…lags over all runs, gaps left out, and the number of samples."""
+    sums, counts = np.zeros(lags + 1), np.zeros(lags + 1)
+    mean = float(np.nanmean(np.concatenate(list(residuals))))
+    for r in residuals:
+        r = r - mean
+        for k in range(lags + 1):
+            products = r[k:] * r[:len(r) - k]
+            sums[k] += np.nansum(products)
+            counts[k] += np.count_nonzero(np.isfinite(products))
+    covariance = sums / np.maximum(counts, 1)
+    return covariance / (covariance[0] or 1.0), int(counts[0])
+
+
+def _against(ax: Axes, x: Sequence[Array], r: Sequence[Array], sigma: float) -> None:
+    if not x:
+        ax.set_axis_off()
+        return
+    xs, rs = np.concatenate(list(x)), np.concatenate(list(r))
+    ok = np.isfinite(xs) & np.isfinite(rs)
+    xs, rs = xs[ok], rs[ok]
+    band(ax, 2 * sigma)
+    scatter(ax, xs, rs)
+    centre, mean, half = binned_means(xs, rs)
+    ax.errorbar(centre, mean, yerr=half, fmt="o-", ms=2.5, lw=1.1, color=INK)
+
+
+def scatter(ax: Axes, x: Any, y: Any, most: int = 1500, color: str = RESIDUAL) -> None:
+    """Draw points, every so many of them where there are too many, the extreme ones always."""
+    keep = np.arange(len(x))[::max(1, len(x) // most)]
+    extreme = np.argsort(y)[[*range(min(5, len(y))), *range(-min(5, len(y)), 0)]]
+    keep = np.union1d(keep, extreme)
+    ax.plot(x[keep], y[keep], ".", ms=2, color=color, alpha=0.35, mew=0, rasterized=len(keep) > 400, zorder=1)
+
+
+def binned_means(x: Array, y: Array, bins: int = BINS) -> tuple[Array, Array, Array]:
+    """Return centres, means and 1.96 standard errors of y in equal bins of x with five samples or more."""
+    edges = np.linspace(x.min(), x.max(), bins + 1)
+    which = np.clip(np.searchsorted(edges, x, side="right") - 1, 0, bins - 1)
+    count = np.bincount(which, minlength=bins)
+    safe = np.maximum(count, 1)
+    mean = np.bincount(which, y, bins) / safe
+    spread = np.sqrt(np.maximum(np.bincount(which, y**2, bins) / safe - mean**2, 0))
+    full = count >= 5
+    return ((edges[:-1] + edges[1:]) / 2)[full], mean[full], (1.96 * spread / np.sqrt(safe))[full]

@@ -1,0 +1,175 @@
+"""One restrained style for all figures: colours, labels, sizes, decimation that keeps peaks."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from contextvars import ContextVar
+from functools import wraps
+from itertools import pairwise
+from typing import Any, ParamSpec, TypeVar
+
+import matplotlib as mpl
+import numpy as np
+from cycler import cycler
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from motorid.errors import DataError
+from motorid.experiment import Experiment
+from motorid.integrate.grid import Array
+
+__all__ = ["CYCLE", "INK", "MUTED", "PALETTE", "axis_label", "band", "detached", "envelope", "finite", "grid",
+           "line", "only", "styled", "tidy"]
+
+_P = ParamSpec("_P")
+_R = TypeVar("_R")
+
+INK, MUTED, FAINT, PAPER = "#1f2328", "#59636e", "#d1d9e0", "#ffffff"
+# Okabe & Ito, "Color universal design", 2008: distinct to all common kinds of colour vision.
+PALETTE = {"blue": "#0072b2", "orange": "#d55e00", "green": "#009e73", "purple": "#a4507d", "sky": "#56b4e9",
+           "yellow": "#b98500", "grey": "#7a848e"}
+CYCLE = tuple(PALETTE[c] for c in ("blue", "orange", "green", "purple", "yellow", "sky", "grey"))
+MEASURED, MODEL, RESIDUAL, HELD_OUT = PALETTE["grey"], PALETTE["blue"], PALETTE["orange"], PALETTE["green"]
+WIDTH = 9.2  # inches: the text width of a notebook
+POINTS = 1600  # drawn per curve at most: about two per pixel
+
+STYLE: Mapping[str, Any] = {
+    "font.size": 9, "axes.titlesize": 9, "axes.labelsize": 9, "xtick.labelsize": 8, "ytick.labelsize": 8,
+    "legend.fontsize": 8, "figure.titlesize": 10, "legend.frameon": False, "axes.titlelocation": "left",
+    "axes.spines.top": False, "axes.spines.right": False, "axes.grid": True, "axes.axisbelow": True,
+    "grid.color": FAINT, "grid.linewidth": 0.6, "axes.edgecolor": MUTED, "axes.linewidth": 0.7,
+    "xtick.color": MUTED, "ytick.color": MUTED, "xtick.labelcolor": INK, "ytick.labelcolor": INK,
+    "axes.labelcolor": INK, "axes.titlecolor": INK, "text.color": INK, "figure.facecolor": PAPER,
+    "axes.facecolor": PAPER, "savefig.facecolor": PAPER, "lines.linewidth": 1.3, "figure.dpi": 100,
+    "savefig.dpi": 150, "axes.prop_cycle": cycler(color=CYCLE), "axes.formatter.useoffset": False,
+    "axes.formatter.limits": (-4, 5), "axes.formatter.use_mathtext": True, "axes.unicode_minus": True,
+    "svg.fonttype": "none", "axes.xmargin": 0.02, "font.family": ["DejaVu Sans"],
+}
+
+_NAMES = {"t": "time", "v": "voltage v", "i": "current i", "omega": "speed ω", "theta": "angle θ",
+          "heat": "heating ∫i²dt"}
+_UNITS = {"t": "s", "v": "V", "i": "A", "omega": "rad/s", "theta": "rad", "heat": "A²·s"}
+
+_detached: ContextVar[bool] = ContextVar("motorid_detached_figures", default=False)
+
+
+def styled(draw: Callable[_P, _R]) -> Callable[_P, _R]:
+    """Draw in motorid's style and leave the user's own settings as they were."""
+    @wraps(draw)
+    def inner(*args: _P.args, **kwargs: _P.kwargs) -> _R:
+        with mpl.rc_context(dict(STYLE)):  # type: ignore[arg-type]
+            return draw(*args, **kwargs)
+    return inner
+
+
+@contextmanager
+def detached() -> Iterator[None]:
+    """Make figures that belong to no window and that nobody has to close (for files)."""
+    token = _detached.set(True)
+    try:
+        yield
+    finally:
+        _detached.reset(token)
+
+
+def new_figure(width: float, height: float) -> Figure:
+    """Return an empty figure of a size in inches, laid out so that labels do not overlap."""
+    if _detached.get():
+        return Figure(figsize=(width, height), layout="constrained")
+    import matplotlib.pyplot as plt
+
+    return plt.figure(figsize=(width, height), layout="constrained")
+
+
+def grid(rows: int, columns: int, *, row: float = 1.6, width: float = WIDTH, **options: Any) -> np.ndarray:
+    """Return axes (rows, columns) on a new figure; `row` is the height of a row in inches."""
+    ratios = options.get("height_ratios")
+    total = row * (sum(ratios) if ratios is not None else rows)
+    return new_figure(width, total + 0.35).subplots(rows, columns, squeeze=False, **options)
+
+
+def only(ax: Axes | None, *, width: float = 5.6, height: float = 3.2) -> Axes:
+    """Return `ax`, or the axes of a new figure."""
+    return ax if ax is not None else new_figure(width, height).subplots()
+
+
+def axis_label(channel: str, run: Experiment | None = None) -> str:
+    """Return a label with its unit: ``speed ω (rad/s)``."""
+    unit = _UNITS.get(channel, "")
+    unit = run.units.get(channel, unit) if run is not None else unit
+    linear = run is not None and run.units.get(channel) in ("m", "m/s")
+    name = {"theta": "position x", "omega": "speed v"}[channel] if linear else _NAMES.get(channel, channel)
+    if channel == "v" and unit != "V":
+        name = "command u"
+    return f"{name} ({unit})" if unit and unit != "1" else name
+
+
+def envelope(x: Array, y: Array, points: int = POINTS) -> tuple[Array, Array]:
+    """Return fewer points whose line looks the same: the lowest and highest sample of each stretch.
+
+    Peaks of a single sample stay; a stretch with missing samples keeps a gap.
+    """
+    x, y = np.asarray(x, float), np.asarray(y, float)
+    if len(x) <= points:
+        return x, y
+    edges = np.linspace(0, len(x), points // 2 + 1).astype(int)
+    keep = {0, len(x) - 1}
+    for a, b in pairwise(edges):
+        part = y[a:b]
+        good = np.isfinite(part)
+        if good.any():
+            keep |= {a + int(np.nanargmin(part)), a + int(np.nanargmax(part))}
+        if not good.all():
+            keep.add(a + int(np.argmin(good)))
+    index = np.array(sorted(keep))
+    return x[index], y[index]
+
+
+def line(ax: Axes, x: Array, y: Array, *, held: bool = False, **options: Any) -> None:
+    """Draw a curve, decimated without hiding its peaks; `held` as a staircase."""
+    a, b = envelope(x, y)
+    ax.plot(a, b, drawstyle="steps-post" if held and len(x) <= POINTS else "default", **options)
+
+
+def band(ax: Axes, half: float, label: str | None = None) -> None:
+    """Shade ±half around zero."""
+    ax.axhspan(-half, half, color=MUTED, alpha=0.16, lw=0, label=label, zorder=0)
+
+
+def tidy(ax: Axes, *, x: str = "", y: str = "", title: str = "") -> None:
+    """Label axes and leave room for few, round ticks."""
+    if x:
+        ax.set_xlabel(x)
+    if y:
+        ax.set_ylabel(y)
+    if title:
+        ax.set_title(title)
+
+
+def decade(size: float) -> int:
+    """Return the power of ten to take out of numbers of this size; 0 where they read well as they are."""
+    power = int(np.floor(np.log10(size))) if size > 0 and np.isfinite(size) else 0
+    return 0 if -3 < power < 5 else 3 * (power // 3)
+
+
+def scaled_title(name: str, unit: str, power: int = 0) -> str:
+    """Return ``L (10⁻³ H)``."""
+    factor = f"10{str(power).translate(str.maketrans('-0123456789', '⁻⁰¹²³⁴⁵⁶⁷⁸⁹'))}" if power else ""
+    inside = " ".join(w for w in (factor, unit) if w)
+    return f"{name} ({inside})" if inside else name
+
+
+def finite(values: Array, what: str) -> Array:
+    """Return the finite ones of `values`.
+
+    Raises
+    ------
+    DataError
+        If there are none.
+    """
+    good = np.asarray(values, float)
+    good = good[np.isfinite(good)]
+    if not good.size:
+        raise DataError(f"nothing to draw: {what} holds no finite number.")
+    return good
