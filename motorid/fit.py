@@ -10,11 +10,12 @@ from typing import Any
 
 import numpy as np
 
+from motorid.descent import descend, integration_error
 from motorid.errors import FitError, SimulationError, UsageError, one_of
 from motorid.experiment import Experiment
 from motorid.integrate import Engine
 from motorid.integrate.grid import Array
-from motorid.least_squares import LevenbergMarquardt, gauss_newton_covariance, levenberg_marquardt
+from motorid.least_squares import LevenbergMarquardt, Solution, gauss_newton_covariance
 from motorid.model import Model
 from motorid.prepared import natural_sizes, suited
 from motorid.problem import Problem, as_problem
@@ -22,7 +23,7 @@ from motorid.simulate import Evaluation, Simulation, at, evaluate, judge
 from motorid.start import first_guess
 
 UNDETERMINED = 1.0  # relative standard deviation above which a value is not shown as determined
-ERROR_SHARE = 0.1  # integration error accepted, in units of the noise
+MISFIT_SHARE = 0.2  # integration error accepted beside the misfit
 
 
 @dataclass(frozen=True, eq=False)
@@ -268,63 +269,26 @@ def solve(problem: Problem, solver: Any = None, *, start: str = "auto",
         return solver.solve(problem)
     if problem.constraints:
         raise UsageError("LevenbergMarquardt has no true constraints; use solver=mi.MultipleShooting().")
-    return _least_squares(problem, solver or LevenbergMarquardt(), callback, formulation, began)
+    return _least_squares(problem, solver or LevenbergMarquardt(), callback, formulation, start == "auto", began)
 
 
-def _least_squares(problem: Problem, options: LevenbergMarquardt, callback, formulation: str, began: float) -> Fit:
-    q, history, error = problem.start, [], float("nan")
-    for _ in range(4):
-        problem = problem.refined(q)
-        found = levenberg_marquardt(problem.residual, problem.residual_and_jacobian, q, problem.scaling.bounds,
-                                    options, callback)
-        history += found.history
-        moved = np.max(np.abs(found.q - q), initial=0.0) > 1e-3
-        q = found.q
-        if found.status == "limit":
-            break
-        finer = problem.refined(q)
-        same = all(np.array_equal(a.grid.substeps, b.grid.substeps)
-                   for a, b in zip(problem.runs, finer.runs, strict=True))
-        if same or not moved:
-            break
-    error = integration_error(problem, q)
-    return Fit(problem, problem.values(q), found.residual, found.jac / problem.scaling.slope(q), q, found.status,
-               _advice(problem, found.status, found.message, error), tuple(history), time.perf_counter() - began, error,
-               formulation)
+def _least_squares(problem: Problem, options: LevenbergMarquardt, callback, formulation: str, stages: bool,
+                   began: float) -> Fit:
+    done = descend(problem, options, callback, stages=stages)
+    problem, found = done.problem, done.solution
+    error = integration_error(problem, found.q)
+    return Fit(problem, problem.values(found.q), found.residual, found.jac / problem.scaling.slope(found.q), found.q,
+               found.status, _advice(found, error, problem.n_outputs), done.history, time.perf_counter() - began,
+               error, formulation)
 
 
-def integration_error(problem: Problem, q: Array) -> float:
-    """Return the largest change of an output when every step is halved, in units of the noise."""
-    worst = 0.0
-    for k, run in enumerate(problem.runs):
-        if not hasattr(problem._engine, "compiled"):
-            return 0.0
-        try:
-            coarse = problem.simulate(q, k, derivatives=False).y
-            finer = problem._keeping(tuple(r if j != k else _halved(r) for j, r in enumerate(problem.runs)))
-            fine = finer.simulate(q, k, derivatives=False).y
-        except SimulationError:
-            return float("inf")
-        sigma = np.array([run.sigma.get(c, np.inf) for c in problem.outputs])
-        worst = max(worst, float(np.max(np.abs(fine - coarse) / sigma)))
-    return worst
-
-
-def _halved(run: Any) -> Any:
-    from dataclasses import replace
-
-    return replace(run, grid=run.grid.with_substeps(2 * run.grid.substeps))
-
-
-def _advice(problem: Problem, status: str, message: str, error: float) -> str:
-    if status == "limit":
-        return f"{message}."
-    if status == "stalled":
-        return f"{message}."
-    if error > 1.0:
-        return (f"{message}; but the integration error is {error:.2g} times the noise: try engine='cvodes' or a "
-                "finer record.")
-    return f"{message}."
+def _advice(found: Solution, error: float, n: int) -> str:
+    """Return the solver's message, with what to try where the integration error matters beside noise and misfit."""
+    misfit = float(np.sqrt(np.mean(found.residual[:n] ** 2)))
+    if found.status == "converged" and error > max(1.0, MISFIT_SHARE * misfit):
+        return (f"{found.message}; but the integration error is {error:.2g} times the noise: try engine='cvodes' or "
+                "a finer record.")
+    return f"{found.message}."
 
 
 def started(problem: Problem) -> Problem:
