@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -16,6 +17,7 @@ from motorid.integrate.grid import Array, Grid
 from motorid.noise import noise_level
 from motorid.parameters import Parameter
 
+_levels: WeakKeyDictionary[Experiment, dict[str, float]] = WeakKeyDictionary()  # a record is frozen, so is its noise
 SGN_WIDTH_SHARE = 1e-3  # of the highest speed: wider smoothing looks like one more missing effect
 
 
@@ -56,9 +58,16 @@ def noise_of(runs: Sequence[Experiment], channels: Sequence[str]) -> dict[str, f
     """Noise per channel, estimated once for all runs (quadratic mean) where no run states it."""
     levels = {}
     for c in channels:
-        each = [r.sigma.get(c) or noise_level(r.outputs[c], r.t) for r in runs if c in r.outputs]
+        each = [r.sigma.get(c) or _level(r, c) for r in runs if c in r.outputs]
         levels[c] = float(np.sqrt(np.mean(np.square(each))))
     return levels
+
+
+def _level(run: Experiment, channel: str) -> float:
+    known = _levels.setdefault(run, {})
+    if channel not in known:
+        known[channel] = noise_level(run.outputs[channel], run.t)
+    return known[channel]
 
 
 def prepare_run(run: Experiment, channels: Sequence[str], noise: Mapping[str, float], inputs: Sequence[str],

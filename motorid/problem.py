@@ -17,6 +17,7 @@ from motorid.model import Model
 from motorid.parameters import Parameter, Scaling
 from motorid.prepared import Run, channels_of, noise_of, prepare_run, smoothing, with_inputs
 from motorid.system import System
+from motorid.unknowns import Point, Unknowns
 
 
 @dataclass(frozen=True)
@@ -80,9 +81,17 @@ class Problem:
         for name in self.priors:
             if name not in self.model.parameters:
                 raise UsageError(f"prior: {one_of(name, self.model.parameters, 'parameter')}")
+        self._check_visible()
         width = smoothing(self.experiments, self.model.parameters)
         if width is not None:
             object.__setattr__(self, "model", self.model.start_at({"sgn_width": width}))
+
+    def _check_visible(self) -> None:
+        visible = self.system.visible
+        for e in self.model.effects:
+            if e.parameters and not any(p.name in visible for p in e.parameters):
+                raise ModelError(f"'{e.name}' cannot be seen in the measured channels ({', '.join(self.outputs)}). Leave "
+                                 f"it out: model.without('{e.name}'), or add a record with the channel that it acts on.")
 
     # -- what is fitted --------------------------------------------------------------------------------
     @cached_property
@@ -105,75 +114,33 @@ class Problem:
         return tuple(prepare_run(r, self.outputs, noise, self.system.inputs, self.initial) for r in self.experiments)
 
     @cached_property
-    def unknown(self) -> tuple[Parameter, ...]:
-        """Free parameters of the model, then the estimated initial states, run by run."""
-        free = [p for p in self.model.parameters.values() if p.vary]
-        return (*free, *self._initial_unknowns)
-
-    @cached_property
-    def _initial_unknowns(self) -> tuple[Parameter, ...]:
-        found = []
-        units = {"i": "A", "omega": "rad/s", "theta": "rad"}
-        for k, run in enumerate(self.runs):
-            for c in run.estimated:
-                if c in self.system.states or c == "theta" and "theta" in self.system.states:
-                    value = float(run.start[("i", "omega", "theta").index(c)])
-                    low, high = run.limits[c]
-                    found.append(Parameter(f"{c}_0[{k}]", value, run.experiment.units.get(c, units[c]), low, high))
-        return tuple(found)
-
-    @cached_property
-    def scaling(self) -> Scaling:
-        """Solver coordinates of the unknowns."""
-        sizes = [abs(p.value) if p.value else 1.0 for p in self.unknown]
-        for k, p in enumerate(self.unknown[self._n_free:], self._n_free):
-            channel, run = self._place(p.name)
-            y = self.experiments[run].outputs.get(channel)
-            size = float(np.sqrt(np.nanmean((y - np.nanmean(y)) ** 2))) if y is not None else 1.0
-            sizes[k] = size or 1.0
-        return Scaling.of(self.unknown, sizes)
+    def unknowns(self) -> Unknowns:
+        """The unknowns and how they enter the system."""
+        return Unknowns(self.system, self.model.parameters, self.runs)
 
     @property
-    def _n_free(self) -> int:
-        return len(self.unknown) - len(self._initial_unknowns)
+    def unknown(self) -> tuple[Parameter, ...]:
+        """Free parameters of the model, then the estimated initial states, run by run."""
+        return self.unknowns.all
 
-    @staticmethod
-    def _place(name: str) -> tuple[str, int]:
-        channel, run = name[:-1].split("_0[")
-        return channel, int(run)
+    @property
+    def scaling(self) -> Scaling:
+        """Solver coordinates of the unknowns."""
+        return self.unknowns.scaling
 
-    @cached_property
+    @property
     def start(self) -> Array:
         """Solver coordinates of the model's present values."""
-        return self.scaling.scaled([p.value for p in self.unknown])
+        return self.unknowns.start
 
     def values(self, q: Array) -> dict[str, float]:
         """Return all parameter values of the model at `q`, SI."""
-        physical = self.scaling.physical(q)
-        free = dict(zip([p.name for p in self.unknown[:self._n_free]], physical, strict=False))
-        return {n: float(free.get(n, p.value)) for n, p in self.model.parameters.items()}
+        return self.unknowns.values(self.scaling.physical(q))
 
     # -- simulation ------------------------------------------------------------------------------------
     @cached_property
     def _engine(self) -> Engine:
         return engine_of(self.engine)
-
-    @cached_property
-    def _directions(self) -> tuple[Array, list[list[tuple[int, int]]]]:
-        """0/1 matrix from q to the system's p, and per run (index of the start value, column)."""
-        names = {n: k for k, n in enumerate(self.system.parameters)}
-        select = np.zeros((len(names), len(self.unknown)))
-        for j, p in enumerate(self.unknown[:self._n_free]):
-            select[names[p.name], j] = 1.0
-        places: list[list[tuple[int, int]]] = [[] for _ in self.experiments]
-        for j, p in enumerate(self._initial_unknowns, self._n_free):
-            channel, run = self._place(p.name)
-            places[run].append((("i", "omega", "theta").index(channel), j))
-        return select, places
-
-    @cached_property
-    def _initial_jacobian(self) -> Any:
-        return self.system.initial.jacobian()
 
     def simulate(self, q: Array, k: int, *, derivatives: bool = True) -> Trajectory:
         """Return the trajectory of run `k` at `q`, with derivatives with respect to q.
@@ -183,47 +150,30 @@ class Problem:
         SimulationError
             If the integration fails there.
         """
-        run = self.runs[k]
-        select, places = self._directions
-        physical, slope = self.scaling.physical(q), self.scaling.slope(q)
-        values = self.values(q)
-        p = np.array([values[n] for n in self.system.parameters])
-        start = run.start.copy()
-        for channel, j in places[k]:
-            start[channel] = physical[j]
-        x0 = np.asarray(self.system.initial(start, p)).ravel()
+        return self._simulate(self.unknowns.point(np.asarray(q, float)), k, derivatives)
+
+    def _simulate(self, at: Point, k: int, derivatives: bool) -> Trajectory:
+        x0, grid = self.unknowns.first_state(at, k), self.runs[k].grid
         if not derivatives:
-            return self._engine.run(self.system, run.grid, x0, p)
-        dp = select * slope
-        js, jp = (np.asarray(a) for a in self._initial_jacobian(start, p, x0))
-        dx0 = jp @ dp
-        for channel, j in places[k]:
-            dx0[:, j] += js[:, channel] * slope[j]
-        return self._engine.run(self.system, run.grid, x0, p, dx0, dp)
+            return self._engine.run(self.system, grid, x0, at.p)
+        return self._engine.run(self.system, grid, x0, at.p, self.unknowns.first_slopes(at, k), at.dp)
 
     def refined(self, q: Array) -> Problem:
         """Return the problem with sub-steps that keep the integration error below the noise at `q`."""
-        values = self.values(q)
-        p = np.array([values[n] for n in self.system.parameters])
-        physical = self.scaling.physical(q)
-        new = []
+        at, new = self.unknowns.point(np.asarray(q, float)), []
         for k, run in enumerate(self.runs):
-            start = run.start.copy()
-            for channel, j in self._directions[1][k]:
-                start[channel] = physical[j]
-            x0 = np.asarray(self.system.initial(start, p)).ravel()
+            x0 = self.unknowns.first_state(at, k)
             try:
-                grid = self._engine.prepare(self.system, run.grid, x0, p, self._tolerance(run))
+                grid = self._engine.prepare(self.system, run.grid, x0, at.p, self._tolerance(run))
             except SimulationError:
                 grid = run.grid
-            new.append(replace(run, grid=grid))
+            new.append(run if grid is run.grid else replace(run, grid=grid))
         return self._keeping(tuple(new))
 
     def _keeping(self, runs: tuple[Run, ...]) -> Problem:
         """Return a copy with other grids that keeps everything else already made."""
         other = replace(self, _runs=runs)
-        for name in ("outputs", "system", "unknown", "_initial_unknowns", "scaling", "start", "_engine",
-                     "_directions", "_initial_jacobian", "_weights"):
+        for name in ("outputs", "system", "unknowns", "_engine", "_weights"):
             if name in self.__dict__:
                 other.__dict__[name] = self.__dict__[name]
         return other
@@ -281,7 +231,8 @@ class Problem:
 
     def _evaluate(self, q: Array, derivatives: bool) -> tuple[Array, Array | None]:
         q = np.asarray(q, float)
-        trajs = [self.simulate(q, k, derivatives=derivatives) for k in range(len(self.runs))]
+        at = self.unknowns.point(q)
+        trajs = [self._simulate(at, k, derivatives) for k in range(len(self.runs))]
         parts = [self._lossy(*self.run_residual(k, t)) for k, t in enumerate(trajs)]
         parts += [self._prior_part(q)] if self.priors else []
         parts += [penalty.evaluate(self, q, trajs) for penalty in self.penalties]

@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
 
 from motorid.equations import Equations
 from motorid.errors import ModelError
+
+Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,6 +53,55 @@ class System:
     def sizes(self) -> tuple[int, int, int, int]:
         """Numbers of states, inputs, parameters, outputs."""
         return len(self.states), len(self.inputs), len(self.parameters), len(self.outputs)
+
+    @cached_property
+    def visible(self) -> frozenset[str]:
+        """Parameters that can be seen in the outputs, by the structure of the equations."""
+        nx, nu, np_, _ = self.sizes
+        x, u, p, s = ca.SX.sym("x", nx), ca.SX.sym("u", nu), ca.SX.sym("p", np_), ca.SX.sym("s", 3)
+        f, y, x0 = self.rhs(x, u, p), self.out(x, u, p), self.initial(s, p)
+        f_x, f_p, y_x, y_p, x0_p = (_pattern(a, b) for a, b in ((f, x), (f, p), (y, x), (y, p), (x0, p)))
+        seen = y_x.any(axis=0)  # states that act on an output, directly or through other states
+        for _ in range(nx):
+            seen = seen | f_x[seen].any(axis=0)
+        shown = y_p.any(axis=0) | f_p[seen].any(axis=0) | x0_p[seen].any(axis=0)
+        return frozenset(n for n, k in zip(self.parameters, shown, strict=True) if k)
+
+    def first_state(self, s: Array, p: Array) -> Array:
+        """Return x0 (nx,) from s = (i, omega, theta) at the first sample and p."""
+        if self._affine is None:
+            return np.asarray(self.initial(s, p)).ravel()
+        constant, by_s, by_p = self._affine
+        return constant + by_s @ s + by_p @ p
+
+    def first_slopes(self, s: Array, p: Array) -> tuple[Array, Array]:
+        """Return dx0/ds (nx, 3) and dx0/dp (nx, np)."""
+        if self._affine is not None:
+            return self._affine[1], self._affine[2]
+        by_s, by_p = self._initial_jacobian(s, p, np.zeros(len(self.states)))
+        return np.asarray(by_s), np.asarray(by_p)
+
+    @cached_property
+    def _initial_jacobian(self) -> ca.Function:
+        return self.initial.jacobian()
+
+    @cached_property
+    def _affine(self) -> tuple[Array, Array, Array] | None:
+        """x0 = c + S s + P p, where it is so (as in the whole library): then no CasADi call is needed."""
+        z = ca.SX.sym("z", 3 + len(self.parameters))
+        slopes = ca.jacobian(self.initial(z[:3], z[3:]), z)
+        if ca.symvar(slopes):
+            return None
+        matrix = np.asarray(ca.DM(ca.evalf(slopes)))
+        constant = np.asarray(self.initial(np.zeros(3), np.zeros(z.numel() - 3))).ravel()
+        return constant, np.ascontiguousarray(matrix[:, :3]), np.ascontiguousarray(matrix[:, 3:])
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {f: getattr(self, f) for f in self.__dataclass_fields__}
+
+
+def _pattern(f: ca.SX, z: ca.SX) -> NDArray[np.bool_]:
+    return np.asarray(ca.DM(ca.jacobian_sparsity(f, z), 1).full(), bool)
 
 
 def build_system(m: Equations, parameters: tuple[str, ...], outputs: tuple[str, ...],

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple, Protocol
+from functools import cached_property
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,20 +44,33 @@ class Grid:
         return Grid(np.ascontiguousarray(t, float), u, np.ascontiguousarray(u[:-1]), np.ascontiguousarray(after),
                     np.ones(len(t) - 1, np.int64))
 
-    @property
+    @cached_property
     def dt(self) -> Array:
         """Lengths of the intervals, s."""
         return np.ascontiguousarray(np.diff(self.t))
+
+    @cached_property
+    def addresses(self) -> tuple[int | None, ...]:
+        """Where sub-steps, dt, u0, u1 and u are in memory, for compiled code."""
+        return tuple(address(a) for a in (self.substeps, self.dt, self.u0, self.u1, self.u))
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {f: getattr(self, f) for f in self.__dataclass_fields__}  # addresses mean nothing elsewhere
 
     def with_substeps(self, substeps: NDArray[np.int64]) -> Grid:
         """Return the grid with other sub-steps."""
         return replace(self, substeps=np.ascontiguousarray(substeps, np.int64))
 
 
+def address(a: NDArray | None) -> int | None:
+    """Return where the contiguous array `a` begins in memory."""
+    return None if a is None else a.__array_interface__["data"][0]
+
+
 class Trajectory(NamedTuple):
     """What an engine returns: y (N, ny); dy (N, ny, nq) or None; x (N, nx); dx (N, nx, nq) or None.
 
-    `error` (N-1,) is the local error per interval relative to `xscale`, where the engine estimates it.
+    `error` (N-1, nx) is the largest local error of a step in each interval, where it was asked for.
     """
 
     y: Array

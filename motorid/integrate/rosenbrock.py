@@ -8,16 +8,15 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
-import casadi as ca
 import numpy as np
 
 from motorid.errors import SimulationError
 from motorid.integrate import compile as cc
-from motorid.integrate.grid import Array, Grid, Trajectory
+from motorid.integrate.grid import Array, Grid, Trajectory, address
+from motorid.integrate.machine import Machine
 from motorid.integrate.step import ERROR_ORDER, StepFunctions, step_functions
 from motorid.system import System
 
-CHUNK = 256
 PATIENCE = 0.15  # s in the virtual machine before a step is worth compiling
 MOST_SUBSTEPS = 256
 
@@ -36,20 +35,17 @@ class Rosenbrock:
     name: str = "rosenbrock"
 
     def run(self, system: System, grid: Grid, x0: Array, p: Array, dx0: Array | None = None, dp: Array | None = None,
-            xscale: Array | None = None) -> Trajectory:
-        """See `Engine.run`; with `xscale` (nx,) the local error relative to it is returned too."""
-        return stepper(system).run(grid, x0, p, dx0, dp, xscale, self.compiled)
+            local_error: bool = False) -> Trajectory:
+        """See `Engine.run`; on request with the local error of each state."""
+        return stepper(system).run(grid, x0, p, dx0, dp, local_error, self.compiled)
 
     def prepare(self, system: System, grid: Grid, x0: Array, p: Array, tolerance: float) -> Grid:
-        """See `Engine.prepare`. The scale of each state is its largest size on the record."""
-        scale = None
+        """See `Engine.prepare`. Errors are relative to the largest size of each state on the record."""
         for _ in range(6):
-            if scale is None:
-                x = self.run(system, grid, x0, p).x
-                scale = np.maximum(np.abs(x).max(axis=0), 1e-12)
-            error = self.run(system, grid, x0, p, xscale=scale).error
-            assert error is not None
-            if not np.all(np.isfinite(error)) or np.max(error, initial=0.0) <= 2 * tolerance:
+            traj = self.run(system, grid, x0, p, local_error=True)
+            assert traj.error is not None
+            error = (traj.error / np.maximum(np.abs(traj.x).max(axis=0), 1e-12)).max(axis=1)
+            if not np.max(error, initial=0.0) > 2 * tolerance:  # or not a number
                 break
             factor = np.ceil(1.1 * (np.maximum(error, 1e-300) / tolerance) ** (1 / ERROR_ORDER))
             finer = np.clip(grid.substeps * np.clip(factor, 1, 16), 1, MOST_SUBSTEPS).astype(np.int64)
@@ -65,23 +61,26 @@ class Stepper:
     def __init__(self, system: System, key: str) -> None:
         self.key = key
         self.functions: StepFunctions = step_functions(system)
-        self.nx, self.nu, self.np, self.ny = system.sizes
+        self.machine = Machine(self.functions)
+        self.nx, _, _, self.ny = system.sizes
         self._library: Any = None
         self._refused = False
         self._spent = 0.0
-        self._machines: dict[int, ca.Function] = {}
 
-    def run(self, grid: Grid, x0: Array, p: Array, dx0: Array | None, dp: Array | None, xscale: Array | None,
+    def run(self, grid: Grid, x0: Array, p: Array, dx0: Array | None, dp: Array | None, local_error: bool,
             compiled: bool | None) -> Trajectory:
         """Walk over the record; see `Engine.run`."""
+        x0, p = np.ascontiguousarray(x0, float), np.ascontiguousarray(p, float)
+        if dp is not None and dx0 is not None:
+            dx0, dp = np.ascontiguousarray(dx0, float), np.ascontiguousarray(dp, float)
         library = self._load(compiled)
-        walk = self._run_compiled if library is not None else self._run_machine
-        began = time.perf_counter()
-        nq = 0 if dp is None else dp.shape[1]
-        traj, bad = walk(grid, np.ascontiguousarray(x0, float), np.ascontiguousarray(p, float), nq,
-                         None if dx0 is None else np.ascontiguousarray(dx0, float),
-                         None if dp is None else np.ascontiguousarray(dp, float), xscale)
-        if library is None:
+        if library is not None:
+            traj, bad = self._run_compiled(library, grid, x0, p, dx0, dp, local_error)
+        else:
+            began = time.perf_counter()
+            traj = self.machine.run(grid, x0, p, dx0, dp, local_error)
+            finite = np.isfinite(traj.x).all(axis=1)
+            bad = -1 if finite.all() else int(np.argmin(finite))
             self._spent += time.perf_counter() - began
         if bad >= 0:
             raise SimulationError(f"the simulation left the finite numbers at t = {grid.t[bad]:.6g} s; the parameters "
@@ -104,79 +103,15 @@ class Stepper:
                 self._library = cc.load(path)
         return self._library
 
-    def _run_compiled(self, grid, x0, p, nq, dx0, dp, xscale) -> tuple[Trajectory, int]:
-        n = len(grid.t)
-        dt = grid.dt
+    def _run_compiled(self, library: Any, grid: Grid, x0: Array, p: Array, dx0: Array | None, dp: Array | None,
+                      local_error: bool) -> tuple[Trajectory, int]:
+        n, nq = len(grid.t), 0 if dp is None else dp.shape[1]
         y, x = np.empty((n, self.ny)), np.empty((n, self.nx))
         dy, dx = (np.empty((n, self.ny, nq)), np.empty((n, self.nx, nq))) if nq else (None, None)
-        error = np.zeros(n - 1) if xscale is not None else None
-        arrays = (grid.substeps, dt, grid.u0, grid.u1, grid.u, x0, xscale, p)
-        bad = self._library(n, *(_address(a) for a in arrays), nq,
-                            *(_address(a) for a in (dx0, dp, y, dy, x, dx, error)))
+        error = np.empty((n - 1, self.nx)) if local_error else None
+        bad = library(n, *grid.addresses, address(x0), address(p), nq,
+                      *map(address, (dx0, dp, y, dy, x, dx, error)))
         return Trajectory(y, dy, x, dx, error), int(bad)
-
-    def _machine(self, nq: int) -> ca.Function:
-        """Return CHUNK steps in a row as one function of the virtual machine."""
-        if nq not in self._machines:
-            f = self.functions
-            x, s = ca.SX.sym("x", self.nx), ca.SX.sym("S", self.nx, nq)
-            u0, u1, h = ca.SX.sym("u0", self.nu), ca.SX.sym("u1", self.nu), ca.SX.sym("h")
-            p, dp = ca.SX.sym("p", self.np), ca.SX.sym("Pq", self.np, nq)
-            if nq:
-                x_next, e, a, b = f.full(x, u0, u1, h, p)
-                args, results = [x, s, u0, u1, h, p, dp], [x_next, a @ s + b @ dp, e]
-            else:
-                args, results = [x, u0, u1, h, p], list(f.light(x, u0, u1, h, p))
-            one = ca.Function("one", args, results)
-            self._machines[nq] = one.mapaccum("walk", CHUNK, 2 if nq else 1, {})
-        return self._machines[nq]
-
-    def _run_machine(self, grid, x0, p, nq, dx0, dp, xscale) -> tuple[Trajectory, int]:
-        m = grid.substeps
-        ends = np.concatenate([[0], np.cumsum(m)])
-        steps = int(ends[-1])
-        part = np.arange(steps) - np.repeat(ends[:-1], m)
-        slope = np.repeat(grid.u1 - grid.u0, m, axis=0)
-        share = 1.0 / np.repeat(m, m)
-        ua = np.repeat(grid.u0, m, axis=0) + slope * (part * share)[:, None]
-        ub = ua + slope * share[:, None]
-        h = np.repeat(grid.dt, m) * share
-        xs, ss, es = np.empty((steps + 1, self.nx)), np.empty((steps + 1, self.nx, nq)), np.empty((steps, self.nx))
-        xs[0] = x0
-        if nq:
-            ss[0] = dx0
-        walk = self._machine(nq)
-        p_all, dp_all = np.tile(p[:, None], (1, CHUNK)), np.tile(dp, (1, CHUNK)) if nq else None
-        for a in range(0, steps, CHUNK):
-            b = min(a + CHUNK, steps)
-            pick = np.minimum(np.arange(a, a + CHUNK), steps - 1)  # the tail repeats the last step, unused
-            drive = (ua[pick].T, ub[pick].T, h[pick][None, :], p_all)
-            if nq:
-                xn, sn, e = walk(xs[a], ss[a], *drive, dp_all)
-                ss[a + 1:b + 1] = np.asarray(sn).T.reshape(CHUNK, nq, self.nx).transpose(0, 2, 1)[:b - a]
-            else:
-                xn, e = walk(xs[a], *drive)
-            xs[a + 1:b + 1], es[a:b] = np.asarray(xn).T[:b - a], np.asarray(e).T[:b - a]
-        return self.observe(grid, xs[ends], ss[ends] if nq else None, p, dp, es, xscale, ends)
-
-    def observe(self, grid, x, dx, p, dp, es, xscale, ends) -> tuple[Trajectory, int]:
-        n = len(x)
-        finite = np.isfinite(x).all(axis=1)
-        bad = -1 if finite.all() else int(np.argmin(finite))
-        y, c, d = (np.asarray(a) for a in self.functions.out.map(n)(x.T, grid.u.T, np.tile(p[:, None], (1, n))))
-        dy = None
-        if dx is not None:
-            c = c.reshape(self.ny, n, self.nx).transpose(1, 0, 2)
-            d = d.reshape(self.ny, n, self.np).transpose(1, 0, 2)
-            dy = c @ dx + d @ dp
-        error = None
-        if xscale is not None:
-            error = np.maximum.reduceat(np.abs(es / xscale).max(axis=1), ends[:-1])
-        return Trajectory(y.T.copy(), dy, x, dx, error), bad
-
-
-def _address(a: np.ndarray | None) -> int | None:
-    return None if a is None else a.ctypes.data
 
 
 def content_key(system: System) -> str:

@@ -20,7 +20,7 @@ import numpy as np
 
 from motorid.errors import ModelError, SimulationError
 from motorid.integrate.grid import Array, Grid, Trajectory
-from motorid.integrate.rosenbrock import content_key
+from motorid.integrate.rosenbrock import Rosenbrock, stepper
 from motorid.system import System
 
 LONGEST = 10  # pieces of at most 2**10 samples
@@ -44,7 +44,7 @@ class _Sundials:
         x[0] = x0
         if nq:
             dx[0] = dx0
-        integrators = _integrators(self.name, self.rtol, self.atol, content_key(system), nq)
+        integrators = _integrators(self.name, self.rtol, self.atol, stepper(system).key, nq)
         if not integrators:
             integrators.append(_Integrators(self.name, self.rtol, self.atol, system, nq))
         for first, count in _pieces(grid):
@@ -168,8 +168,6 @@ def _pieces(grid: Grid) -> Iterator[tuple[int, int]]:
 
 def _state_scale(system: System, grid: Grid, x0: Array, p: Array) -> Array:
     """Rough sizes of the states on this record, for the solver's tolerances only."""
-    from motorid.integrate.rosenbrock import Rosenbrock
-
     try:
         size = np.abs(Rosenbrock().run(system, grid, x0, p).x).max(axis=0)
     except SimulationError:
@@ -179,7 +177,5 @@ def _state_scale(system: System, grid: Grid, x0: Array, p: Array) -> Array:
 
 def observe(system: System, grid: Grid, x: Array, dx: Array | None, p: Array, dp: Array | None) -> Trajectory:
     """Return the outputs along a state trajectory."""
-    from motorid.integrate.rosenbrock import stepper
-
-    traj, _ = stepper(system).observe(grid, x, dx, p, dp, None, None, None)
-    return traj
+    y, dy = stepper(system).machine.observe(grid, x, dx, p, dp)
+    return Trajectory(y, dy, x, dx, None)

@@ -1,0 +1,144 @@
+"""The unknowns q of a problem: free parameters of the model, then estimated initial states, run by run."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+
+from motorid.equations import CHANNELS
+from motorid.integrate.grid import Array
+from motorid.parameters import Parameter, Scaling
+from motorid.prepared import Run, natural_sizes
+from motorid.system import System
+
+STATE_UNITS = {"i": "A", "omega": "rad/s", "theta": "rad"}
+
+
+class Point(NamedTuple):
+    """One q in the system's terms: q and its physical values (nq,), dphysical/dq (nq,), p (np,), dp/dq (np, nq)."""
+
+    q: Array
+    physical: Array
+    slope: Array
+    p: Array
+    dp: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Unknowns:
+    """Which unknowns there are, and how they enter the system.
+
+    Attributes
+    ----------
+    system : System
+    held : mapping of str to Parameter
+        All parameters of the model.
+    runs : tuple of Run
+    """
+
+    system: System
+    held: Mapping[str, Parameter]
+    runs: tuple[Run, ...]
+
+    @cached_property
+    def free(self) -> tuple[Parameter, ...]:
+        """Free parameters of the model."""
+        return tuple(p for p in self.held.values() if p.vary)
+
+    @cached_property
+    def initial(self) -> tuple[tuple[str, int, Parameter], ...]:
+        """(channel, run, parameter) of each estimated initial state."""
+        found = []
+        for k, run in enumerate(self.runs):
+            for c in run.estimated:
+                if c in self.system.states:
+                    unit = run.experiment.units.get(c, STATE_UNITS[c])
+                    low, high = run.limits[c]
+                    value = float(run.start[CHANNELS.index(c)])
+                    found.append((c, k, Parameter(f"{c}_0[{k}]", value, unit, low, high)))
+        return tuple(found)
+
+    @cached_property
+    def all(self) -> tuple[Parameter, ...]:
+        """Every unknown, in the order of q."""
+        return (*self.free, *(p for _, _, p in self.initial))
+
+    @cached_property
+    def scaling(self) -> Scaling:
+        """Solver coordinates: logarithmic for positive parameters, else in natural sizes of the records."""
+        sizes = [abs(p.value) for p in self.free]
+        if not all(p.positive for p in self.free):
+            natural = natural_sizes([r.experiment for r in self.runs], {n: p.value for n, p in self.held.items()})
+            sizes = [s if p.positive else max(s, natural.get(p.unit, 0.0)) for p, s in zip(self.free, sizes, strict=True)]
+        return Scaling.of(self.all, [*sizes, *(self._spread(c, k) for c, k, _ in self.initial)])
+
+    def _spread(self, channel: str, run: int) -> float:
+        y = self.runs[run].experiment.outputs.get(channel)
+        return 1.0 if y is None else float(np.nanstd(y))
+
+    @cached_property
+    def start(self) -> Array:
+        """Solver coordinates of the present values."""
+        return self.scaling.scaled([p.value for p in self.all])
+
+    def values(self, physical: Array) -> dict[str, float]:
+        """Return all parameter values of the model, SI, for `physical` values of the unknowns."""
+        found = {n: p.value for n, p in self.held.items()}
+        for p, value in zip(self.free, physical.tolist(), strict=False):
+            found[p.name] = value
+        return found
+
+    # -- into the system's terms -----------------------------------------------------------------------
+    @cached_property
+    def _columns(self) -> Array:
+        """Index into the system's p of each free parameter."""
+        place = {n: j for j, n in enumerate(self.system.parameters)}
+        return np.array([place[p.name] for p in self.free], int)
+
+    @cached_property
+    def _fixed(self) -> Array:
+        return np.array([self.held[n].value for n in self.system.parameters])
+
+    @cached_property
+    def _places(self) -> Sequence[tuple[list[int], list[int]]]:
+        """Per run: indices into (i, omega, theta) at the start, and the columns of q that they are."""
+        places: list[tuple[list[int], list[int]]] = [([], []) for _ in self.runs]
+        for j, (channel, k, _) in enumerate(self.initial, len(self.free)):
+            places[k][0].append(CHANNELS.index(channel))
+            places[k][1].append(j)
+        return places
+
+    def point(self, q: Array) -> Point:
+        """Return `q` in the system's terms."""
+        physical = self.scaling.physical(q)
+        slope = np.where(self.scaling.log, physical, self.scaling.scale)
+        p, n = self._fixed.copy(), len(self.free)
+        p[self._columns] = physical[:n]
+        dp = np.zeros((len(p), len(q)))
+        dp[self._columns, np.arange(n)] = slope[:n]
+        return Point(q, physical, slope, p, dp)
+
+    def first_state(self, at: Point, k: int) -> Array:
+        """Return x0 (nx,) of run `k`."""
+        return self.system.first_state(self._sensed(at, k), at.p)
+
+    def first_slopes(self, at: Point, k: int) -> Array:
+        """Return dx0/dq (nx, nq) of run `k`."""
+        js, jp = self.system.first_slopes(self._sensed(at, k), at.p)
+        rows, columns = self._places[k]
+        dx0 = jp @ at.dp
+        if rows:
+            dx0[:, columns] += js[:, rows] * at.slope[columns]
+        return dx0
+
+    def _sensed(self, at: Point, k: int) -> Array:
+        rows, columns = self._places[k]
+        start = self.runs[k].start
+        if rows:
+            start = start.copy()
+            start[rows] = at.physical[columns]
+        return start
