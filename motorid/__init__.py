@@ -1,5 +1,7 @@
 """Grey-box identification of brushed DC motors and actuators: fit, see where it fails, add what is missing."""
 
+from typing import TYPE_CHECKING as _TYPE_CHECKING
+
 from motorid import effects
 from motorid.checks import check_runs
 from motorid.datasets import data_path
@@ -13,3 +15,34 @@ from motorid.parameters import P, Parameter
 from motorid.problem import Huber, Problem
 from motorid.reading import read_csv, read_mat, read_runs
 from motorid.simulate import evaluate, simulate
+
+if _TYPE_CHECKING:
+    from motorid.plots import (
+        plot_current_limit,
+        plot_fit,
+        plot_ladder,
+        plot_missing,
+        plot_parameters,
+        plot_ranking,
+        plot_residuals,
+        plot_runs,
+        plot_sensitivities,
+    )
+
+_FIGURES = (
+    "plot_current_limit", "plot_fit", "plot_ladder", "plot_missing", "plot_parameters", "plot_ranking",
+    "plot_residuals", "plot_runs", "plot_sensitivities",
+)
+
+
+def __getattr__(name: str) -> object:
+    """Import matplotlib only when a figure is asked for."""
+    if name in _FIGURES:
+        from motorid import plots
+
+        return getattr(plots, name)
+    raise AttributeError(f"module 'motorid' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted([n for n in globals() if not n.startswith("_")] + list(_FIGURES))

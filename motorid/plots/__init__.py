@@ -2,7 +2,9 @@
 
 from motorid.plots.diagnosis import plot_ladder, plot_missing, plot_ranking
 from motorid.plots.fits import plot_fit, plot_parameters, plot_runs
+from motorid.plots.formulations import plot_current_limit
 from motorid.plots.residuals import plot_residuals
+from motorid.plots.trust import plot_sensitivities
 
-__all__ = ["plot_fit", "plot_ladder", "plot_missing", "plot_parameters", "plot_ranking", "plot_residuals",
-           "plot_runs"]
+__all__ = ["plot_current_limit", "plot_fit", "plot_ladder", "plot_missing", "plot_parameters", "plot_ranking",
+           "plot_residuals", "plot_runs", "plot_sensitivities"]

@@ -30,6 +30,7 @@ from motorid.plots.style import (
     tidy,
 )
 
+LOWEST_GAIN = -0.12  # drawn; what lies below is shown by an arrow
 _COLOUR = {"voltage": PALETTE["purple"], "torque": PALETTE["blue"]}
 
 
@@ -107,7 +108,7 @@ def plot_ranking(result: Diagnosis | Sequence[Candidate], ax: Axes | None = None
     """Draw the effects tried, best first: the share of the misfit that each would take away.
 
     The outline is the prediction from the sensitivities, the bar what a refit gave; a diamond is the fall
-    of the held-out error. Accepted effects are blue.
+    of the held-out error (an arrow: it rises, by more than the axis shows). Accepted effects are blue.
 
     Parameters
     ----------
@@ -127,11 +128,12 @@ def plot_ranking(result: Diagnosis | Sequence[Candidate], ax: Axes | None = None
             ax.barh(k, 100 * c.refit_drop, height=0.62, color=colour, alpha=0.85)
         ax.barh(k, 100 * c.predicted_drop, height=0.62, fill=False, edgecolor=INK, lw=0.9)
         if c.held_out_gain is not None:
-            ax.plot(100 * max(c.held_out_gain, -0.12), k, "D", ms=5.5, color=PALETTE["orange"], mec="white",
-                    mew=0.7, zorder=3)
+            clipped = c.held_out_gain < LOWEST_GAIN
+            ax.plot(100 * max(c.held_out_gain, LOWEST_GAIN), k, "<" if clipped else "D", ms=6, mew=0.7,
+                    color=PALETTE["orange"], mec="white", zorder=3)
     ax.set_yticks(range(len(chosen)), [c.effect for c in chosen])
     ax.set_ylim(len(chosen) - 0.4, -0.6)
-    lowest = min([0.0, *(100 * max(c.held_out_gain or 0.0, -0.12) for c in chosen)])
+    lowest = min([0.0, *(100 * max(c.held_out_gain or 0.0, LOWEST_GAIN) for c in chosen)])
     ax.set_xlim(lowest - 3 if lowest < 0 else 0, 103)
     ax.grid(axis="y", visible=False)
     more = f" (first {len(chosen)} of {len(every)})" if len(every) > len(chosen) else ""
@@ -180,8 +182,8 @@ def plot_ladder(result: Ladder | Diagnosis, ax: Axes | None = None) -> Axes:
     first = "plain motor" if rungs[0].fit.model.base == "dc_motor" else "plain drive"
     started = " + ".join([first, *rungs[0].fit.model.effect_names])
     ax.set_xticks(x, [started if r.added is None else "+ " + r.added.replace(" + ", "\n+ ") for r in rungs])
-    ax.set_xlim(-0.3, len(rungs) - 0.35)
-    tidy(ax, y="NRMSE (%)", title="The error falls")
+    ax.set_xlim(-0.45, len(rungs) - 0.55)
+    tidy(ax, y="NRMSE (%)", title="Error as effects are added")
     ax.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
     return ax
 
@@ -191,10 +193,10 @@ def _falling(ax: Axes, x: Array, errors: Sequence[float], channel: str, colour: 
     name = axis_label(channel).split(" (")[0]
     ax.plot(x, errors, "s--" if held_out else "o-", color=colour, mfc="white" if held_out else colour, ms=5.5,
             label=f"{name}, {'held out' if held_out else 'fitted'}")
-    ends = [0, len(x) - 1] if not held_out else []
-    for k in ends:
-        ax.annotate(number(errors[k], 2), (float(x[k]), errors[k]), (7, 5), textcoords="offset points",
-                    fontsize=8, color=colour)
+    ends = {0: "right", len(x) - 1: "left"} if not held_out else {}
+    for k, side in ends.items():
+        ax.annotate(number(errors[k], 2), (float(x[k]), errors[k]), (-8 if side == "right" else 8, 0),
+                    va="center", ha=side, textcoords="offset points", fontsize=8, color=colour)
 
 
 def _decades(ax: Axes) -> None:

@@ -16,8 +16,10 @@ from motorid.plots.style import (
     INK,
     MUTED,
     PALETTE,
+    PAPER,
     RESIDUAL,
     WIDTH,
+    above,
     axis_label,
     band,
     finite,
@@ -100,11 +102,12 @@ def _over_time(ax: Axes, sims: Sequence[Simulation], channel: str, sigma: float)
         line(ax, t + shift, s.residual(channel), color=RESIDUAL, lw=0.8)
         if len(sims) <= 6:
             ax.annotate(s.experiment.name, (shift, 1), (3, -2), xycoords=("data", "axes fraction"),
-                        textcoords="offset points", va="top", fontsize=7, color=MUTED)
+                        textcoords="offset points", va="top", fontsize=7, color=MUTED,
+                        bbox={"facecolor": PAPER, "alpha": 0.8, "lw": 0, "pad": 1})
         shift += float(t[-1])
         if k + 1 < len(sims):
             ax.axvline(shift, color=MUTED, lw=0.7)
-    ax.legend(loc="lower right", bbox_to_anchor=(1, 0.98), borderpad=0.1)
+    above(ax)
 
 
 def _histogram(ax: Axes, r: Array, sigma: float) -> None:
@@ -118,7 +121,7 @@ def _histogram(ax: Axes, r: Array, sigma: float) -> None:
     ax.set_xticks([])
     ax.tick_params(labelleft=False)
     tidy(ax, x="density", title="Histogram")
-    ax.legend(loc="upper right", borderpad=0.1)
+    above(ax)
 
 
 def _autocorrelation(ax: Axes, residuals: Sequence[Array]) -> None:
@@ -131,7 +134,7 @@ def _autocorrelation(ax: Axes, residuals: Sequence[Array]) -> None:
     ax.axhline(0, color=MUTED, lw=0.6)
     ax.set_ylim(min(-0.25, float(rho.min()) * 1.1), max(0.4, min(1.05, float(rho[1:].max(initial=0)) * 1.25)))
     tidy(ax, x="lag (samples)", y="correlation", title="Autocorrelation")
-    ax.legend(loc="upper right", borderpad=0.1)
+    above(ax)
 
 
 def autocorrelation(residuals: Sequence[Array], lags: int) -> tuple[Array, int]:

@@ -147,6 +147,12 @@ def tidy(ax: Axes, *, x: str = "", y: str = "", title: str = "") -> None:
         ax.set_title(title)
 
 
+def above(ax: Axes) -> None:
+    """Put the legend at the right above the axes, where it covers no data."""
+    legend = ax.legend(loc="lower right", bbox_to_anchor=(1.02, 0.97), borderpad=0.1, ncols=4, handlelength=1.6)
+    legend.set_in_layout(False)  # the title's line has room for it
+
+
 def decade(size: float) -> int:
     """Return the power of ten to take out of numbers of this size; 0 where they read well as they are."""
     power = int(np.floor(np.log10(size))) if size > 0 and np.isfinite(size) else 0

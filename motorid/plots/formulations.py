@@ -1,0 +1,79 @@
+"""Figures of constraints: the current against its limit, formulations side by side."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+
+from motorid.constraints import CurrentLimit
+from motorid.errors import UsageError
+from motorid.fit import Fit
+from motorid.plots.style import INK, MEASURED, MODEL, MUTED, PALETTE, axis_label, grid, line, styled, tidy
+from motorid.simulate import Simulation
+
+
+@styled
+def plot_current_limit(*fits: Fit, limit: float | None = None,
+                       labels: Sequence[str] | None = None) -> np.ndarray:
+    """Draw the current of one or several fits against the limit, what lies beyond it shaded.
+
+    Parameters
+    ----------
+    *fits : Fit
+        Of the same records, e.g. plain, with penalties, with hard constraints.
+    limit : float, optional
+        In A; default: that of the first `CurrentLimit` found in the fits.
+    labels : sequence of str, optional
+        One per fit; default: its formulation.
+
+    Returns
+    -------
+    ndarray of Axes, shape (fits, runs)
+        At most three runs.
+    """
+    if not fits or not all(isinstance(f, Fit) for f in fits):
+        raise UsageError("plot_current_limit takes fits: mi.plot_current_limit(fit, hard, limit=8.0).")
+    limit = limit if limit is not None else _limit_of(fits)
+    if not all("i" in s.outputs for f in fits for s in f.simulations):
+        raise UsageError("these fits have no current: it was not measured, or the model has none.")
+    words = list(labels or [f.formulation for f in fits])
+    runs = min(len(fits[0].simulations), 3)
+    axes = grid(len(fits), runs, row=1.5, sharex="col", sharey="row")
+    for row, fit, word in zip(axes, fits, words, strict=False):
+        for ax, s in zip(row, fit.simulations, strict=False):
+            _against_limit(ax, s, limit)
+        tidy(row[0], y=f"{word}\n{axis_label('i')}")
+    for ax, s in zip(axes[0], fits[0].simulations, strict=False):
+        tidy(ax, title=s.experiment.name)
+    for ax in axes[-1]:
+        tidy(ax, x="time (s)")
+    figure = axes[0, 0].figure
+    figure.align_ylabels(axes[:, 0])
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper center", ncols=4)
+    return axes
+
+
+def _against_limit(ax: Axes, s: Simulation, limit: float) -> None:
+    t, i = s.experiment.t, s.outputs["i"]
+    if "i" in s.experiment.outputs:
+        line(ax, t, s.experiment.outputs["i"], color=MEASURED, lw=3, alpha=0.5, label="measured")
+    line(ax, t, i, color=MODEL, label="model")
+    for side in (-limit, limit):
+        if float(np.max(np.sign(side) * i)) > 0.5 * limit:
+            ax.axhline(side, color=INK, lw=1.0, ls=(0, (4, 2)), label="limit" if side > 0 else None)
+    ax.fill_between(t, np.clip(i, -limit, limit), i, color=PALETTE["orange"], alpha=0.6, lw=0,
+                    label="beyond it")
+    beyond = float(np.max(np.abs(i)) - limit)
+    words = f"{beyond:.2g} A beyond" if beyond > 1e-6 * limit else "kept"
+    ax.set_title(words, loc="right", fontsize=8, color=MUTED)
+
+
+def _limit_of(fits: Sequence[Fit]) -> float:
+    for f in fits:
+        for c in (*f.problem.constraints, *f.problem.penalties):
+            if isinstance(c, CurrentLimit):
+                return c.limit
+    raise UsageError("no CurrentLimit in these fits; say which one to draw: "
+                     "mi.plot_current_limit(fit, limit=8.0).")
