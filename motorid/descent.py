@@ -21,6 +21,7 @@ from motorid.problem import Problem
 
 WIDER = (30.0, 5.0)  # times the final width of sgn
 ROUNDS = 4  # of refining the sub-steps
+IMBALANCE = 3.0  # between channels, in misfit over noise, above which the misfit decides the weights
 
 Callback = Callable[[int, float, Array], object] | None
 
@@ -65,6 +66,44 @@ def descend(problem: Problem, options: LevenbergMarquardt, callback: Callback = 
         if found.status == "limit" or not moved or _same_grid(problem, problem.refined(q)):
             break
     return Descent(problem, found, tuple(history))
+
+
+def descend_balanced(problem: Problem, options: LevenbergMarquardt, callback: Callback = None, *,
+                     stages: bool = True) -> Descent:
+    """Like `descend`, and where the model fails, weigh channels by their misfit instead of their noise.
+
+    A model that cannot reach the noise would otherwise spend itself on the channel with the smallest noise (an
+    encoder), at any price in the others. Noise and misfit together give the maximum of the likelihood with the
+    channels' variances as unknowns, ``Σ n·ln(SSR)`` (Seber & Wild, Nonlinear Regression, 1989, ch. 11); a model
+    that reaches the noise keeps the weights of the noise.
+    """
+    done = descend(problem, options, callback, stages=stages)
+    if problem.weights != "noise" or problem.loss is not None or len(problem.outputs) < 2:
+        return done
+    begin = problem
+    for _ in range(3):
+        factors = misfit_over_noise(done.problem, done.solution.q)
+        relative = [factors[c] / done.problem.balance.get(c, 1.0) for c in factors]
+        if max(relative) < IMBALANCE * min(relative):
+            break
+        again = descend(begin.balanced(factors), options, callback, stages=stages)
+        done = replace(again, history=done.history + again.history)
+        begin = done.problem.for_model(done.problem.model.start_at(done.problem.values(done.solution.q)))
+    return done
+
+
+def misfit_over_noise(problem: Problem, q: Array) -> dict[str, float]:
+    """Return the RMS of the residual over the noise per channel, at least 1."""
+    sums = {c: [0.0, 0] for c in problem.outputs}
+    for k, run in enumerate(problem.runs):
+        y = problem.simulate(q, k, derivatives=False).y
+        for j, c in enumerate(problem.outputs):
+            if c in run.sigma:
+                e = (run.experiment.outputs[c] - y[:, j]) / run.sigma[c]
+                e = e[np.isfinite(e)]
+                sums[c][0] += float(e @ e)
+                sums[c][1] += e.size
+    return {c: max(float(np.sqrt(s / max(n, 1))), 1.0) for c, (s, n) in sums.items()}
 
 
 def _narrowing(problem: Problem, options: LevenbergMarquardt, callback: Callback, history: list[float]) -> Problem:
@@ -112,4 +151,4 @@ def _halved(run: Run) -> Run:
     return replace(run, grid=run.grid.with_substeps(2 * run.grid.substeps))
 
 
-__all__ = ["Descent", "descend", "integration_error"]
+__all__ = ["Descent", "descend", "descend_balanced", "integration_error", "misfit_over_noise"]

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from motorid.descent import descend, integration_error
+from motorid.descent import descend_balanced, integration_error
 from motorid.errors import FitError, SimulationError, UsageError, one_of
 from motorid.experiment import Experiment
 from motorid.integrate import Engine
@@ -80,9 +80,9 @@ class Fit:
 
     @property
     def chi2(self) -> float:
-        """Σ of the squared whitened output residuals."""
-        r = self.residuals[:self.problem.n_outputs]
-        return float(r @ r)
+        """Σ of the squared output residuals over the noise."""
+        return float(sum(np.nansum((s.residual(c) / run.sigma[c]) ** 2)
+                         for s, run in zip(self.simulations, self.problem.runs, strict=True) for c in run.sigma))
 
     @property
     def dof(self) -> int:
@@ -97,7 +97,9 @@ class Fit:
     @cached_property
     def _covariance(self) -> tuple[Array, Array]:
         # The noise was estimated beforehand; a model that does not reach it is less certain by that much.
-        variance = max(self.chi2 / self.dof, 1.0) if self.problem.weights == "noise" else self.chi2 / self.dof
+        r = self.residuals[:self.problem.n_outputs]
+        variance = float(r @ r) / self.dof
+        variance = max(variance, 1.0) if self.problem.weights == "noise" else variance
         return gauss_newton_covariance(self.jacobian, variance)
 
     @property
@@ -274,7 +276,7 @@ def solve(problem: Problem, solver: Any = None, *, start: str = "auto",
 
 def _least_squares(problem: Problem, options: LevenbergMarquardt, callback, formulation: str, stages: bool,
                    began: float) -> Fit:
-    done = descend(problem, options, callback, stages=stages)
+    done = descend_balanced(problem, options, callback, stages=stages)
     problem, found = done.problem, done.solution
     error = integration_error(problem, found.q)
     return Fit(problem, problem.values(found.q), found.residual, found.jac / problem.scaling.slope(found.q), found.q,

@@ -53,6 +53,8 @@ class Problem:
     initial : {"auto", "rest", "measured", "estimate"}
         What is known of the state at the first sample.
     engine : str or Engine
+    balance : mapping of str to float
+        Factors on the noise per channel where the misfit, not the noise, decides; see `motorid.descent`.
     """
 
     model: Model
@@ -64,6 +66,7 @@ class Problem:
     weights: str = "noise"
     initial: str = "auto"
     engine: str | Engine = "rosenbrock"
+    balance: Mapping[str, float] = field(default_factory=dict)
     _runs: tuple[Run, ...] | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
@@ -200,7 +203,7 @@ class Problem:
 
     def _weight(self, run: Run, channel: str) -> float:
         if self.weights == "noise":
-            return 1.0 / run.sigma[channel]
+            return 1.0 / (run.sigma[channel] * self.balance.get(channel, 1.0))
         return 1.0 / max(float(np.sqrt(np.nanmean(run.experiment.outputs[channel] ** 2))), 1e-300)
 
     def run_residual(self, k: int, traj: Trajectory) -> tuple[Array, Array | None]:
@@ -270,6 +273,10 @@ class Problem:
             names = self.system.inputs[:1] + (("theta_in",) if model.angle_input else ())
             runs = tuple(with_inputs(run, names) for run in runs)
         return replace(self, model=model, _runs=runs)
+
+    def balanced(self, factors: Mapping[str, float]) -> Problem:
+        """Return the problem with other factors on the noise per channel, keeping the rest."""
+        return replace(self, balance=dict(factors), _runs=self.runs)
 
     def with_(self, **fields: Any) -> Problem:
         """Return a copy with some fields changed, e.g. ``with_(model=…)``."""
