@@ -16,15 +16,16 @@ import sys
 import tempfile
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import casadi as ca
 
 from motorid.integrate.step import StepFunctions
 
-# -Bsymbolic: a name of ours must never be taken from another library.
-# The others let divisions by one pivot share its reciprocal; results stay within rounding of the virtual machine's.
-FLAGS = ("-O2", "-fPIC", "-shared", "-Wl,-Bsymbolic", "-ffp-contract=off", "-fno-math-errno", "-freciprocal-math",
-         "-fno-trapping-math")
+# -Bsymbolic: a name of ours must never be taken from another library. The last two let divisions by one pivot
+# share its reciprocal; results stay within rounding of the virtual machine's.
+FLAGS = ("-O2", "-fPIC", "-shared", *(() if sys.platform == "darwin" else ("-Wl,-Bsymbolic",)),
+         "-ffp-contract=off", "-fno-math-errno", "-freciprocal-math", "-fno-trapping-math")
 _told: set[str] = set()
 
 DRIVER = r"""
@@ -32,17 +33,32 @@ DRIVER = r"""
 #include <stdlib.h>
 #include <string.h>
 
+/* row += a * other, over the unknowns. */
+static void add(double* row, double a, const double* other, long long nq) {
+  long long j;
+  if (a != 0) for (j = 0; j < nq; j++) row[j] += a * other[j];
+}
+
+/* Work space for the largest of the functions. */
+static void most(int (*work)(casadi_int*, casadi_int*, casadi_int*, casadi_int*), casadi_int* na,
+                 casadi_int* nr, casadi_int* ni, casadi_int* nw) {
+  casadi_int a, r, i, w;
+  work(&a, &r, &i, &w);
+  if (a > *na) *na = a;
+  if (r > *nr) *nr = r;
+  if (i > *ni) *ni = i;
+  if (w > *nw) *nw = w;
+}
+
 /* x over one record; returns -1, or the index of the first sample whose state is not finite. */
-long long motorid_run(long long n, const long long* nsub, const double* dt, const double* u0, const double* u1,
-                      const double* us, const double* x0, const double* p, long long nq,
-                      const double* S0, const double* Pq, double* Y, double* DY, double* X, double* DX, double* E) {
-  casadi_int a1, r1, i1, w1, na = 8, nr = 8, ni = 1, nw = 1;
-  motorid_light_work(&a1, &r1, &i1, &w1);
-  if (a1 > na) na = a1; if (r1 > nr) nr = r1; if (i1 > ni) ni = i1; if (w1 > nw) nw = w1;
-  motorid_full_work(&a1, &r1, &i1, &w1);
-  if (a1 > na) na = a1; if (r1 > nr) nr = r1; if (i1 > ni) ni = i1; if (w1 > nw) nw = w1;
-  motorid_out_work(&a1, &r1, &i1, &w1);
-  if (a1 > na) na = a1; if (r1 > nr) nr = r1; if (i1 > ni) ni = i1; if (w1 > nw) nw = w1;
+long long motorid_run(long long n, const long long* nsub, const double* dt, const double* u0,
+                      const double* u1, const double* us, const double* x0, const double* p, long long nq,
+                      const double* S0, const double* Pq, double* Y, double* DY, double* X, double* DX,
+                      double* E) {
+  casadi_int na = 8, nr = 8, ni = 1, nw = 1;
+  most(motorid_light_work, &na, &nr, &ni, &nw);
+  most(motorid_full_work, &na, &nr, &ni, &nw);
+  most(motorid_out_work, &na, &nr, &ni, &nw);
   const double** arg = malloc(na * sizeof(double*));
   double** res = malloc(nr * sizeof(double*));
   casadi_int* iw = malloc(ni * sizeof(casadi_int));
@@ -53,7 +69,7 @@ long long motorid_run(long long n, const long long* nsub, const double* dt, cons
   memcpy(x, x0, sizeof(x));
   if (nq) memcpy(S, S0, NX * nq * sizeof(double));
   for (k = 0; k < n; k++) {
-    int r, c; long long j;
+    int r, c;
     for (r = 0; r < NX; r++) if (!isfinite(x[r])) bad = k;
     if (bad >= 0) break;
     if (X) memcpy(X + k * NX, x, sizeof(x));
@@ -64,9 +80,9 @@ long long motorid_run(long long n, const long long* nsub, const double* dt, cons
     memcpy(Y + k * NY, y, sizeof(y));
     if (nq) for (r = 0; r < NY; r++) {
       double* row = DY + (k * NY + r) * nq;
-      for (j = 0; j < nq; j++) row[j] = 0;
-      for (c = 0; c < NX; c++) if (C[c * NY + r] != 0) for (j = 0; j < nq; j++) row[j] += C[c * NY + r] * S[c * nq + j];
-      for (c = 0; c < NP; c++) if (D[c * NY + r] != 0) for (j = 0; j < nq; j++) row[j] += D[c * NY + r] * Pq[c * nq + j];
+      memset(row, 0, nq * sizeof(double));
+      for (c = 0; c < NX; c++) add(row, C[c * NY + r], S + c * nq, nq);
+      for (c = 0; c < NP; c++) add(row, D[c * NY + r], Pq + c * nq, nq);
     }
     if (k == n - 1) break;
     long long s, m = nsub[k]; double h = dt[k] / m;
@@ -82,9 +98,9 @@ long long motorid_run(long long n, const long long* nsub, const double* dt, cons
         motorid_full(arg, res, iw, w, 0);
         for (r = 0; r < NX; r++) {
           double* row = T + r * nq;
-          for (j = 0; j < nq; j++) row[j] = 0;
-          for (c = 0; c < NX; c++) { double a = A[c * NX + r]; if (a != 0) for (j = 0; j < nq; j++) row[j] += a * S[c * nq + j]; }
-          for (c = 0; c < NP; c++) { double b = B[c * NX + r]; if (b != 0) for (j = 0; j < nq; j++) row[j] += b * Pq[c * nq + j]; }
+          memset(row, 0, nq * sizeof(double));
+          for (c = 0; c < NX; c++) add(row, A[c * NX + r], S + c * nq, nq);
+          for (c = 0; c < NP; c++) add(row, B[c * NX + r], Pq + c * nq, nq);
         }
         memcpy(S, T, NX * nq * sizeof(double));
       } else motorid_light(arg, res, iw, w, 0);
@@ -108,7 +124,7 @@ def cache_dir() -> Path:
 
 @lru_cache(maxsize=1)
 def compiler() -> tuple[str, str] | None:
-    """Return (path, version line) of a C compiler, or None; ``$MOTORID_CC`` names one, ``none`` forbids it."""
+    """Return (path, version line) of a C compiler, or None; ``$MOTORID_CC`` names one; ``none``: none."""
     wanted = os.environ.get("MOTORID_CC")
     if wanted == "none" or sys.platform == "win32":
         return None
@@ -116,7 +132,8 @@ def compiler() -> tuple[str, str] | None:
         path = shutil.which(name)
         if path:
             try:
-                done = subprocess.run([path, "--version"], capture_output=True, text=True, timeout=20, check=True)
+                done = subprocess.run([path, "--version"], capture_output=True, text=True, timeout=20,
+                                      check=True)
             except (OSError, subprocess.SubprocessError):
                 continue
             return path, (done.stdout.splitlines() or [""])[0]
@@ -140,46 +157,67 @@ def generate(functions: StepFunctions) -> str:
     return code.dump() + "".join(f"#define {k} {max(v, 1)}\n" for k, v in sizes.items()) + DRIVER
 
 
-def library_path(key: str) -> Path | None:
-    """Return where the library of the content `key` is or would be; None without a compiler."""
+def mark_of(key: str) -> str | None:
+    """Return the name of the library for the content `key`, by all that goes in; None without a compiler."""
     cc = compiler()
     if cc is None:
         return None
-    mark = hashlib.sha256("\0".join([key, *cc, *FLAGS, DRIVER, platform.machine(), ca.__version__]).encode())
-    return cache_dir() / f"step-{mark.hexdigest()[:32]}.so"
+    parts = "\0".join([key, *cc, *FLAGS, DRIVER, platform.machine(), ca.__version__])
+    return "step-" + hashlib.sha256(parts.encode()).hexdigest()[:32]
 
 
-def build(functions: StepFunctions, path: Path) -> bool:
-    """Compile into `path`, atomically; False (said once) if that does not work."""
+def find(mark: str) -> Path | None:
+    """Return the library called `mark` in the cache, if it is there and whole.
+
+    Its file name ends in a digest of its bytes: loading half a file would end the process.
+    """
+    for path in cache_dir().glob(f"{mark}-*.so"):
+        try:
+            if path.stem == f"{mark}-{_digest(path.read_bytes())}":
+                return path
+            path.unlink(missing_ok=True)
+        except OSError:
+            continue
+    return None
+
+
+def _digest(data: bytes) -> str:
+    return hashlib.sha256(data).hexdigest()[:16]
+
+
+def build(functions: StepFunctions, mark: str) -> Path | None:
+    """Compile into the cache, atomically, and return the library; None (said once) if that does not work."""
     cc = compiler()
     if cc is None:
-        return False
+        return None
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=path.parent) as folder:
-            source, target = Path(folder) / "step.c", Path(folder) / "step.so"
-            source.write_text(generate(functions))
-            done = subprocess.run([cc[0], *FLAGS, str(source), "-o", str(target), "-lm"], capture_output=True,
-                                  text=True, timeout=300)
+        cache_dir().mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=cache_dir()) as folder:
+            (Path(folder) / "step.c").write_text(generate(functions))
+            done = subprocess.run([cc[0], *FLAGS, "step.c", "-o", "step.so", "-lm"], capture_output=True,
+                                  text=True, timeout=300, cwd=folder)
             if done.returncode:
                 first = (done.stderr.splitlines() or ["no message"])[0]
-                say_once(f"motorid: the C compiler failed ({first}); going on with CasADi's virtual machine, slower.")
-                return False
-            os.replace(target, path)
+                return _without(f"the C compiler failed ({first})")
+            made = Path(folder) / "step.so"
+            path = cache_dir() / f"{mark}-{_digest(made.read_bytes())}.so"
+            os.replace(made, path)
+            return path
     except (OSError, subprocess.SubprocessError) as error:
-        say_once(f"motorid: cannot compile ({error}); going on with CasADi's virtual machine, slower.")
-        return False
-    return True
+        return _without(f"cannot compile ({error})")
 
 
-def load(path: Path) -> ctypes._CFuncPtr | None:
-    """Return the driver in the library at `path`, or None if it cannot be loaded."""
+def load(path: Path) -> Any:
+    """Return the driver in the library at `path`; None (said once) if it cannot be loaded."""
     try:
         run = ctypes.CDLL(str(path)).motorid_run
-    except (OSError, AttributeError):
-        path.unlink(missing_ok=True)  # a damaged file would fail for ever
-        return None
+    except (OSError, AttributeError) as error:
+        return _without(f"cannot load {path} ({error}; MOTORID_CACHE names another folder)")
     pointer, integer = ctypes.c_void_p, ctypes.c_longlong
     run.restype = integer
     run.argtypes = [integer, *[pointer] * 7, integer, *[pointer] * 7]
     return run
+
+
+def _without(why: str) -> None:
+    say_once(f"motorid: {why}; going on with CasADi's virtual machine, same results, slower.")

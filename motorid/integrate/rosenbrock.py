@@ -23,7 +23,7 @@ MOST_SUBSTEPS = 256
 
 @dataclass(frozen=True)
 class Rosenbrock:
-    """RODAS3 with sub-steps chosen by its error estimate, the exact derivative of the discrete step carried along.
+    """RODAS3, sub-steps chosen by its error estimate; the exact derivative of the discrete step goes along.
 
     Attributes
     ----------
@@ -34,8 +34,8 @@ class Rosenbrock:
     compiled: bool | None = None
     name: str = "rosenbrock"
 
-    def run(self, system: System, grid: Grid, x0: Array, p: Array, dx0: Array | None = None, dp: Array | None = None,
-            local_error: bool = False) -> Trajectory:
+    def run(self, system: System, grid: Grid, x0: Array, p: Array, dx0: Array | None = None,
+            dp: Array | None = None, local_error: bool = False) -> Trajectory:
         """See `Engine.run`; on request with the local error of each state."""
         return stepper(system).run(grid, x0, p, dx0, dp, local_error, self.compiled)
 
@@ -83,28 +83,32 @@ class Stepper:
             bad = -1 if finite.all() else int(np.argmin(finite))
             self._spent += time.perf_counter() - began
         if bad >= 0:
-            raise SimulationError(f"the simulation left the finite numbers at t = {grid.t[bad]:.6g} s; the parameters "
-                                  "make the model unstable or stiff beyond the step.")
+            raise SimulationError(f"the simulation left the finite numbers at t = {grid.t[bad]:.6g} s; the "
+                                  "parameters make the model unstable or stiff beyond the step.")
         return traj
 
     def _load(self, compiled: bool | None) -> Any:
+        """Return the compiled driver if it is there, or worth making now; else None."""
         if compiled is False or self._refused:
             return None
         if self._library is None:
-            path = cc.library_path(self.key)
-            if path is None:
+            mark = cc.mark_of(self.key)
+            if mark is None:
                 self._refused = True
-                cc.say_once("motorid: no C compiler found; using CasADi's virtual machine, same results, slower.")
+                cc.say_once("motorid: no C compiler found; using CasADi's virtual machine, same results, "
+                            "slower.")
                 return None
-            if path.exists() or compiled or self._spent > PATIENCE:
-                if not path.exists() and not cc.build(self.functions, path):
-                    self._refused = True
-                    return None
+            path = cc.find(mark)
+            if path is None and (compiled or self._spent > PATIENCE):
+                path = cc.build(self.functions, mark)
+                self._refused = path is None
+            if path is not None:
                 self._library = cc.load(path)
+                self._refused = self._library is None
         return self._library
 
-    def _run_compiled(self, library: Any, grid: Grid, x0: Array, p: Array, dx0: Array | None, dp: Array | None,
-                      local_error: bool) -> tuple[Trajectory, int]:
+    def _run_compiled(self, library: Any, grid: Grid, x0: Array, p: Array, dx0: Array | None,
+                      dp: Array | None, local_error: bool) -> tuple[Trajectory, int]:
         n, nq = len(grid.t), 0 if dp is None else dp.shape[1]
         y, x = np.empty((n, self.ny)), np.empty((n, self.nx))
         dy, dx = (np.empty((n, self.ny, nq)), np.empty((n, self.nx, nq))) if nq else (None, None)

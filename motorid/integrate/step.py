@@ -25,7 +25,7 @@ ERROR_ORDER = 3  # the local error estimate falls with h³
 class StepFunctions(NamedTuple):
     """The discrete model.
 
-    light : ``(x, u0, u1, h, p) -> (x⁺, e)``, the input running from u0 to u1 over the step h, e the local error.
+    light : ``(x, u0, u1, h, p) -> (x⁺, e)``, the input going from u0 to u1 over h, e the local error.
     full : ``(x, u0, u1, h, p) -> (x⁺, e, A, B)`` with A = dx⁺/dx and B = dx⁺/dp.
     out : ``(x, u, p) -> (y, C, D)`` with C = dy/dx and D = dy/dp.
     """
@@ -48,11 +48,13 @@ def step_functions(system: System) -> StepFunctions:
     full = _dense("motorid_full", args, [x_next, error, slopes[:, :nx], slopes[:, nx:]], names,
                   ["x_next", "error", "A", "B"])
     y = system.out(x, u0, p)
-    out = _dense("motorid_out", [x, u0, p], [y, ca.jacobian(y, x), ca.jacobian(y, p)], ["x", "u", "p"], ["y", "C", "D"])
+    out = _dense("motorid_out", [x, u0, p], [y, ca.jacobian(y, x), ca.jacobian(y, p)], ["x", "u", "p"],
+                 ["y", "C", "D"])
     return StepFunctions(light, full, out)
 
 
-def _dense(name: str, args: list[ca.SX], results: list[ca.SX], names: list[str], shown: list[str]) -> ca.Function:
+def _dense(name: str, args: list[ca.SX], results: list[ca.SX], names: list[str],
+           shown: list[str]) -> ca.Function:
     return ca.Function(name, args, ca.cse([ca.densify(r) for r in results]), names, shown)
 
 
@@ -68,13 +70,14 @@ def rosenbrock_step(system: System, x, u0, u1, h, p):
         at = x + sum((a * k for a, k in zip(A[s], stages, strict=True) if a), ca.SX.zeros(x.numel()))
         u = u0 + ALPHA[s] * (u1 - u0)
         rhs = h * (system.rhs(at, u, p) if s > 1 else f) + h * GAMMA_T[s] * drift
-        rhs += ca.mtimes(mass, sum((c * k for c, k in zip(C[s], stages, strict=True)), ca.SX.zeros(x.numel())))
+        before = sum((c * k for c, k in zip(C[s], stages, strict=True)), ca.SX.zeros(x.numel()))
+        rhs += ca.mtimes(mass, before)
         stages.append(_solve(factors, rhs))
     return x + sum(w * k for w, k in zip(WEIGHTS, stages, strict=True) if w), stages[3]
 
 
 def _lu(w: ca.SX) -> list[list[ca.SX]]:
-    """LU factors without pivoting: W is near the identity or has positive storage or resistance on its diagonal."""
+    """LU factors without pivoting: W has positive storage or resistance on its diagonal."""
     n = w.shape[0]
     m = [[w[i, j] for j in range(n)] for i in range(n)]
     for k in range(n):

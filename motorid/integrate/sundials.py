@@ -1,8 +1,8 @@
 """CVODES and IDAS through CasADi: the reference engines, with forward sensitivities.
 
-A call never spans a jump of the input (CVODES stops there): the record is cut where the input changes. Runs of
-evenly spaced samples under a constant input are walked in pieces of 2^k samples over a scaled time, so that a
-handful of integrators serves every record. Derivatives are taken in forward mode only, over scaled states;
+A call never spans a jump of the input (CVODES stops there): the record is cut where the input changes. Parts
+of evenly spaced samples under one constant input are walked in pieces of 2^k samples over scaled time, so that
+a few integrators serve every record. Derivatives are taken in forward mode only, over scaled states;
 `quad_err_con` is set because without it CasADi's CVODES interface can return wrong derivatives silently
 (casadi issue 4383).
 """
@@ -23,6 +23,8 @@ from motorid.integrate.grid import Array, Grid, Trajectory
 from motorid.integrate.rosenbrock import Rosenbrock, stepper
 from motorid.system import System
 
+REASONS = ("CV_ERR_FAILURE", "CV_CONV_FAILURE", "CV_TOO_MUCH_WORK", "IDA_ERR_FAIL", "IDA_CONV_FAIL",
+           "IDA_TOO_MUCH_WORK")
 LONGEST = 10  # pieces of at most 2**10 samples
 
 
@@ -51,8 +53,7 @@ class _Sundials:
             try:
                 integrators[0].walk(grid, first, count, x, dx, p, dp, scale)
             except RuntimeError as error:
-                reason = next((w for w in ("CV_ERR_FAILURE", "CV_CONV_FAILURE", "CV_TOO_MUCH_WORK", "IDA_ERR_FAIL",
-                                           "IDA_CONV_FAIL", "IDA_TOO_MUCH_WORK") if w in str(error)), "no convergence")
+                reason = next((w for w in REASONS if w in str(error)), "no convergence")
                 raise SimulationError(f"{self.name} stopped after t = {grid.t[first]:.6g} s ({reason}). Try "
                                       "engine='rosenbrock', or parameters nearer to the motor's.") from None
             if not np.isfinite(x[first + 1:first + count + 1]).all():
@@ -75,8 +76,8 @@ class Cvodes(_Sundials):
 
     def _check(self, system: System) -> None:
         if not all(system.stored):
-            raise ModelError("cvodes integrates differential equations only, and this model has an algebraic balance "
-                             "(no inductance). Use engine='idas' or engine='rosenbrock'.")
+            raise ModelError("cvodes integrates differential equations only, and this model has an algebraic "
+                             "balance (no inductance). Use engine='idas' or engine='rosenbrock'.")
 
 
 @dataclass(frozen=True)
@@ -98,7 +99,8 @@ class _Integrators:
     def _dae(self) -> dict[str, Any]:
         nx, nu, np_, _ = self.system.sizes
         z, theta = ca.SX.sym("z", nx), ca.SX.sym("theta", np_ + 2 * nu + 1 + nx)
-        p, u0, u1, h, scale = ca.vertsplit(theta, [0, np_, np_ + nu, np_ + 2 * nu, np_ + 2 * nu + 1, theta.numel()])
+        ends = np.cumsum([0, np_, nu, nu, 1, nx]).tolist()
+        p, u0, u1, h, scale = ca.vertsplit(theta, ends)
         tau = ca.SX.sym("tau")
         f = self.system.rhs(z * scale, u0 + tau * (u1 - u0), p)
         parts = {True: ([], []), False: ([], [])}
