@@ -1,4 +1,4 @@
-"""Grey-box identification of brushed DC motors and actuators: fit, see where it fails, add what is missing."""
+"""Grey-box identification of brushed DC motors: fit, see where the model fails, add what is missing."""
 
 from typing import TYPE_CHECKING as _TYPE_CHECKING
 
@@ -30,8 +30,15 @@ if _TYPE_CHECKING:
     )
 
 _FIGURES = (
-    "plot_current_limit", "plot_fit", "plot_ladder", "plot_missing", "plot_parameters", "plot_ranking",
-    "plot_residuals", "plot_runs", "plot_sensitivities",
+    "plot_current_limit",
+    "plot_fit",
+    "plot_ladder",
+    "plot_missing",
+    "plot_parameters",
+    "plot_ranking",
+    "plot_residuals",
+    "plot_runs",
+    "plot_sensitivities",
 )
 
 

@@ -13,6 +13,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from motorid.display import Shown
 from motorid.errors import DataError, UsageError, one_of
 
 __all__ = ["INPUTS", "MIN_SAMPLES", "OUTPUTS", "UNITS", "Experiment", "split"]
@@ -33,7 +34,7 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
-class Experiment:
+class Experiment(Shown):
     """One run: what went in and what was measured, on one time axis.
 
     Everything is validated here and nowhere else. Arrays are copied to read-only float64, mappings are made

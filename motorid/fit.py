@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from motorid.descent import descend_balanced, integration_error
+from motorid.display import Shown
 from motorid.errors import FitError, SimulationError, UsageError, one_of
 from motorid.experiment import Experiment
 from motorid.integrate import Engine
@@ -27,7 +28,7 @@ MISFIT_SHARE = 0.2  # integration error accepted beside the misfit
 
 
 @dataclass(frozen=True, eq=False)
-class Fit:
+class Fit(Shown):
     """What an estimation found.
 
     Attributes
@@ -183,8 +184,8 @@ class Fit:
         return f"<fit {self.status}: {' + '.join([self.problem.model.base, *self.problem.model.effect_names])}, NRMSE {errors}>"
 
 
-@dataclass(frozen=True)
-class Failure:
+@dataclass(frozen=True, repr=False)
+class Failure(Shown):
     """A run that failed, kept as a value: where it started, its status and why."""
 
     start: Mapping[str, float]
@@ -257,7 +258,9 @@ def fit(
     problem = as_problem(model, runs, engine=engine, priors=dict(priors or {}), penalties=penalties, loss=loss,
                          constraints=tuple(constraints), initial=initial,
                          weights=weights or ("rms" if formulation == "penalty" else "noise"))
-    return solve(problem, solver, start=start, callback=callback, formulation=formulation)
+    found = solve(problem, solver, start=start, callback=callback, formulation=formulation)
+    _ = found.evaluation, found.std  # kept with the fit: showing it then computes nothing
+    return found
 
 
 def solve(problem: Problem, solver: Any = None, *, start: str = "auto",

@@ -11,6 +11,7 @@ from typing import Any
 
 import casadi as ca
 
+from motorid.display import Shown
 from motorid.equations import CHANNELS, Equations
 from motorid.errors import ModelError, one_of
 from motorid.parameters import P, Parameter
@@ -24,7 +25,7 @@ LINEAR_UNITS = {"N·m": "N", "rad/s": "m/s", "rad": "m", "kg·m²": "kg", "N·m�
 
 
 @dataclass(frozen=True, eq=False)
-class Effect:
+class Effect(Shown):
     """One physical effect: a law that writes on the `Equations` sheet.
 
     Attributes
@@ -126,7 +127,7 @@ def effect(*, balance: str, name: str | None = None, includes: tuple[str, ...] =
 
 
 @dataclass(frozen=True, eq=False)
-class Model:
+class Model(Shown):
     """A base motor and its effects; every change returns a copy.
 
     Attributes

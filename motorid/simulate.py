@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from motorid.display import Shown
 from motorid.experiment import Experiment
 from motorid.integrate import Engine
 from motorid.integrate.grid import Array
@@ -39,7 +40,7 @@ class Simulation:
 
 
 @dataclass(frozen=True, eq=False)
-class Evaluation:
+class Evaluation(Shown):
     """How well values explain records: NRMSE and RMSE per channel, over all runs and run by run.
 
     NRMSE is RMSE divided by the RMS of the measured channel over the same samples.

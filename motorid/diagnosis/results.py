@@ -6,12 +6,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from motorid.display import Shown
 from motorid.fit import Fit
 from motorid.integrate.grid import Array
 
 
-@dataclass(frozen=True, eq=False)
-class Adequacy:
+@dataclass(frozen=True, eq=False, repr=False)
+class Adequacy(Shown):
     """Is anything missing at all?
 
     Attributes
@@ -48,8 +49,8 @@ class Binned:
     explained: float  # share of the variance that this quantity explains
 
 
-@dataclass(frozen=True, eq=False)
-class Missing:
+@dataclass(frozen=True, eq=False, repr=False)
+class Missing(Shown):
     """Where the model fails.
 
     Attributes
@@ -127,8 +128,8 @@ class Rung:
     candidates: tuple[Candidate, ...] = ()
 
 
-@dataclass(frozen=True, eq=False)
-class Ladder:
+@dataclass(frozen=True, eq=False, repr=False)
+class Ladder(Shown):
     """Models of growing detail, training and held-out error of each, and why it stopped."""
 
     rungs: tuple[Rung, ...]
@@ -145,8 +146,8 @@ class Ladder:
         return self.rungs[-1].fit
 
 
-@dataclass(frozen=True, eq=False)
-class Diagnosis:
+@dataclass(frozen=True, eq=False, repr=False)
+class Diagnosis(Shown):
     """The answer to: where does the model fail, and what is missing?
 
     Attributes

@@ -1,10 +1,20 @@
 """Figures, one function per result; the only place that imports matplotlib."""
 
 from motorid.plots.diagnosis import plot_ladder, plot_missing, plot_ranking
-from motorid.plots.fits import plot_fit, plot_parameters, plot_runs
+from motorid.plots.fits import plot_fit, plot_runs
 from motorid.plots.formulations import plot_current_limit
+from motorid.plots.parameters import plot_parameters
 from motorid.plots.residuals import plot_residuals
 from motorid.plots.trust import plot_sensitivities
 
-__all__ = ["plot_current_limit", "plot_fit", "plot_ladder", "plot_missing", "plot_parameters", "plot_ranking",
-           "plot_residuals", "plot_runs", "plot_sensitivities"]
+__all__ = [
+    "plot_current_limit",
+    "plot_fit",
+    "plot_ladder",
+    "plot_missing",
+    "plot_parameters",
+    "plot_ranking",
+    "plot_residuals",
+    "plot_runs",
+    "plot_sensitivities",
+]

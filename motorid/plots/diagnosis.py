@@ -61,8 +61,9 @@ def plot_missing(result: Missing | Diagnosis, *, show: int = 3, run: int | None 
         balances.reverse()
     show = min(show, max((len(missing.bins.get(b, ())) for b in balances), default=0))
     figure = new_figure(WIDTH, 2.3 * len(balances) + 0.2)
-    axes = figure.subplots(len(balances), 1 + show, squeeze=False, sharey="row",
-                           width_ratios=[1.7] + [1.0] * show)
+    axes = figure.subplots(
+        len(balances), 1 + show, squeeze=False, sharey="row", width_ratios=[1.7] + [1.0] * show
+    )
     for row, balance in zip(axes, balances, strict=True):
         _balance(row, missing, balance, run)
     figure.align_ylabels(axes[:, 0])
@@ -83,12 +84,18 @@ def _balance(row: np.ndarray, missing: Missing, balance: str, run: int | None) -
     tidy(row[0], x="time (s)", y=scaled_title(f"missing {noun}", unit, power), title=f"Missing {noun}{part}")
     for ax, b in zip(row[1:], missing.bins.get(balance, ()), strict=False):
         _binned(ax, b, missing.signals, values, factor, _COLOUR[balance])
-    for ax in row[1 + len(missing.bins.get(balance, ())):]:
+    for ax in row[1 + len(missing.bins.get(balance, ())) :]:
         ax.set_axis_off()
 
 
-def _binned(ax: Axes, b: Binned, signals: Sequence[Mapping[str, Array]], values: Sequence[Array],
-            factor: float, colour: str) -> None:
+def _binned(
+    ax: Axes,
+    b: Binned,
+    signals: Sequence[Mapping[str, Array]],
+    values: Sequence[Array],
+    factor: float,
+    colour: str,
+) -> None:
     pairs = [(np.asarray(s[b.against]), v) for s, v in zip(signals, values, strict=True) if b.against in s]
     if pairs:
         x, y = np.concatenate([p[0] for p in pairs]), np.concatenate([p[1] for p in pairs]) * factor
@@ -99,8 +106,11 @@ def _binned(ax: Axes, b: Binned, signals: Sequence[Mapping[str, Array]], values:
     ax.plot(b.centre, b.mean * factor, color=colour, lw=1.5)
     ax.axhline(0, color=MUTED, lw=0.6)
     label = axis_label(b.against)
-    tidy(ax, x=f"{label.split(' (')[0]} ({b.unit})" if b.unit else label,
-         title=f"{100 * b.explained:.0f} % explained")
+    tidy(
+        ax,
+        x=f"{label.split(' (')[0]} ({b.unit})" if b.unit else label,
+        title=f"{100 * b.explained:.0f} % explained",
+    )
 
 
 @styled
@@ -129,8 +139,16 @@ def plot_ranking(result: Diagnosis | Sequence[Candidate], ax: Axes | None = None
         ax.barh(k, 100 * c.predicted_drop, height=0.62, fill=False, edgecolor=INK, lw=0.9)
         if c.held_out_gain is not None:
             clipped = c.held_out_gain < LOWEST_GAIN
-            ax.plot(100 * max(c.held_out_gain, LOWEST_GAIN), k, "<" if clipped else "D", ms=6, mew=0.7,
-                    color=PALETTE["orange"], mec="white", zorder=3)
+            ax.plot(
+                100 * max(c.held_out_gain, LOWEST_GAIN),
+                k,
+                "<" if clipped else "D",
+                ms=6,
+                mew=0.7,
+                color=PALETTE["orange"],
+                mec="white",
+                zorder=3,
+            )
     ax.set_yticks(range(len(chosen)), [c.effect for c in chosen])
     ax.set_ylim(len(chosen) - 0.4, -0.6)
     lowest = min([0.0, *(100 * max(c.held_out_gain or 0.0, LOWEST_GAIN) for c in chosen)])
@@ -152,8 +170,9 @@ def _ranking_legend(ax: Axes, chosen: Sequence[Candidate]) -> None:
     if any(not c.accepted and c.refit_drop is not None for c in chosen):
         handles.append(Patch(color=PALETTE["grey"], alpha=0.85, label="refitted, not taken"))
     if any(c.held_out_gain is not None for c in chosen):
-        handles.append(Line2D([], [], marker="D", ls="", color=PALETTE["orange"],
-                              label="fall of the held-out error"))
+        handles.append(
+            Line2D([], [], marker="D", ls="", color=PALETTE["orange"], label="fall of the held-out error")
+        )
     ax.legend(handles=handles, loc="upper left", bbox_to_anchor=(1.0, 1.0))
 
 
@@ -168,8 +187,9 @@ def plot_ladder(result: Ladder | Diagnosis, ax: Axes | None = None) -> Axes:
     """
     ladder = result.ladder if isinstance(result, Diagnosis) else result
     if not isinstance(ladder, Ladder) or not ladder.rungs:
-        raise UsageError("plot_ladder takes mi.improve(fit) or mi.diagnose(fit), "
-                         f"got {type(result).__name__}.")
+        raise UsageError(
+            f"plot_ladder takes mi.improve(fit) or mi.diagnose(fit), got {type(result).__name__}."
+        )
     rungs = ladder.rungs
     ax = only(ax, width=max(5.6, 1.5 + 1.25 * len(rungs)), height=3.4)
     x = np.arange(len(rungs), dtype=float)
@@ -188,15 +208,31 @@ def plot_ladder(result: Ladder | Diagnosis, ax: Axes | None = None) -> Axes:
     return ax
 
 
-def _falling(ax: Axes, x: Array, errors: Sequence[float], channel: str, colour: str, *,
-             held_out: bool) -> None:
+def _falling(
+    ax: Axes, x: Array, errors: Sequence[float], channel: str, colour: str, *, held_out: bool
+) -> None:
     name = axis_label(channel).split(" (")[0]
-    ax.plot(x, errors, "s--" if held_out else "o-", color=colour, mfc="white" if held_out else colour, ms=5.5,
-            label=f"{name}, {'held out' if held_out else 'fitted'}")
+    ax.plot(
+        x,
+        errors,
+        "s--" if held_out else "o-",
+        color=colour,
+        mfc="white" if held_out else colour,
+        ms=5.5,
+        label=f"{name}, {'held out' if held_out else 'fitted'}",
+    )
     ends = {0: "right", len(x) - 1: "left"} if not held_out else {}
     for k, side in ends.items():
-        ax.annotate(number(errors[k], 2), (float(x[k]), errors[k]), (-8 if side == "right" else 8, 0),
-                    va="center", ha=side, textcoords="offset points", fontsize=8, color=colour)
+        ax.annotate(
+            number(errors[k], 2),
+            (float(x[k]), errors[k]),
+            (-8 if side == "right" else 8, 0),
+            va="center",
+            ha=side,
+            textcoords="offset points",
+            fontsize=8,
+            color=colour,
+        )
 
 
 def _decades(ax: Axes) -> None:

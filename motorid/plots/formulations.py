@@ -15,8 +15,9 @@ from motorid.simulate import Simulation
 
 
 @styled
-def plot_current_limit(*fits: Fit, limit: float | None = None,
-                       labels: Sequence[str] | None = None) -> np.ndarray:
+def plot_current_limit(
+    *fits: Fit, limit: float | None = None, labels: Sequence[str] | None = None
+) -> np.ndarray:
     """Draw the current of one or several fits against the limit, what lies beyond it shaded.
 
     Parameters
@@ -63,8 +64,9 @@ def _against_limit(ax: Axes, s: Simulation, limit: float) -> None:
     for side in (-limit, limit):
         if float(np.max(np.sign(side) * i)) > 0.5 * limit:
             ax.axhline(side, color=INK, lw=1.0, ls=(0, (4, 2)), label="limit" if side > 0 else None)
-    ax.fill_between(t, np.clip(i, -limit, limit), i, color=PALETTE["orange"], alpha=0.6, lw=0,
-                    label="beyond it")
+    ax.fill_between(
+        t, np.clip(i, -limit, limit), i, color=PALETTE["orange"], alpha=0.6, lw=0, label="beyond it"
+    )
     beyond = float(np.max(np.abs(i)) - limit)
     words = f"{beyond:.2g} A beyond" if beyond > 1e-6 * limit else "kept"
     ax.set_title(words, loc="right", fontsize=8, color=MUTED)
@@ -75,5 +77,6 @@ def _limit_of(fits: Sequence[Fit]) -> float:
         for c in (*f.problem.constraints, *f.problem.penalties):
             if isinstance(c, CurrentLimit):
                 return c.limit
-    raise UsageError("no CurrentLimit in these fits; say which one to draw: "
-                     "mi.plot_current_limit(fit, limit=8.0).")
+    raise UsageError(
+        "no CurrentLimit in these fits; say which one to draw: mi.plot_current_limit(fit, limit=8.0)."
+    )

@@ -67,7 +67,7 @@ def plot_residuals(fit: Fit, channels: Sequence[str] | None = None) -> np.ndarra
         axes[j, 1] = figure.add_subplot(rows[2 * j, 9:], sharey=axes[j, 0])
         width = 12 // (1 + len(against))
         for k in range(1 + len(against)):
-            axes[j, 2 + k] = figure.add_subplot(rows[2 * j + 1, k * width:(k + 1) * width])
+            axes[j, 2 + k] = figure.add_subplot(rows[2 * j + 1, k * width : (k + 1) * width])
         _channel(axes[j], fit, c, against)
     figure.align_ylabels([row[k] for row in axes for k in (0, 2)])
     return axes
@@ -79,15 +79,23 @@ def _channel(axes: np.ndarray, fit: Fit, channel: str, against: Sequence[str]) -
     unit = run.units[channel]
     sigma = float(np.mean([r.sigma[channel] for r in fit.problem.runs if channel in r.sigma]))
     _over_time(axes[0], sims, channel, sigma)
-    tidy(axes[0], x="time, runs one after the other (s)", y=f"residual ({unit})",
-         title=f"Residual of the {axis_label(channel, run)}")
+    tidy(
+        axes[0],
+        x="time, runs one after the other (s)",
+        y=f"residual ({unit})",
+        title=f"Residual of the {axis_label(channel, run)}",
+    )
     every = np.concatenate([s.residual(channel) for s in sims])
     _histogram(axes[1], finite(every, f"the residual of {channel}"), sigma)
     _autocorrelation(axes[2], [s.residual(channel) for s in sims])
     for ax, other in zip(axes[3:], against, strict=True):
         with_other = [s for s in sims if other in s.experiment.outputs]
-        _against(ax, [s.experiment.outputs[other] for s in with_other],
-                 [s.residual(channel) for s in with_other], sigma)
+        _against(
+            ax,
+            [s.experiment.outputs[other] for s in with_other],
+            [s.residual(channel) for s in with_other],
+            sigma,
+        )
         tidy(ax, x=axis_label(other, run), title=f"Against {axis_label(other, run).split(' (')[0]}")
         ax.sharey(axes[3])
     if len(axes) > 3:
@@ -101,9 +109,17 @@ def _over_time(ax: Axes, sims: Sequence[Simulation], channel: str, sigma: float)
         t = s.experiment.t - s.experiment.t[0]
         line(ax, t + shift, s.residual(channel), color=RESIDUAL, lw=0.8)
         if len(sims) <= 6:
-            ax.annotate(s.experiment.name, (shift, 1), (3, -2), xycoords=("data", "axes fraction"),
-                        textcoords="offset points", va="top", fontsize=7, color=MUTED,
-                        bbox={"facecolor": PAPER, "alpha": 0.8, "lw": 0, "pad": 1})
+            ax.annotate(
+                s.experiment.name,
+                (shift, 1),
+                (3, -2),
+                xycoords=("data", "axes fraction"),
+                textcoords="offset points",
+                va="top",
+                fontsize=7,
+                color=MUTED,
+                bbox={"facecolor": PAPER, "alpha": 0.8, "lw": 0, "pad": 1},
+            )
         shift += float(t[-1])
         if k + 1 < len(sims):
             ax.axvline(shift, color=MUTED, lw=0.7)
@@ -144,7 +160,7 @@ def autocorrelation(residuals: Sequence[Array], lags: int) -> tuple[Array, int]:
     for r in residuals:
         r = r - mean
         for k in range(lags + 1):
-            products = r[k:] * r[:len(r) - k]
+            products = r[k:] * r[: len(r) - k]
             sums[k] += np.nansum(products)
             counts[k] += np.count_nonzero(np.isfinite(products))
     covariance = sums / np.maximum(counts, 1)
@@ -166,7 +182,7 @@ def _against(ax: Axes, x: Sequence[Array], r: Sequence[Array], sigma: float) -> 
 
 def scatter(ax: Axes, x: Any, y: Any, most: int = 1500, color: str = RESIDUAL) -> None:
     """Draw points, every so many of them where there are too many, the extreme ones always."""
-    keep = np.arange(len(x))[::max(1, len(x) // most)]
+    keep = np.arange(len(x))[:: max(1, len(x) // most)]
     extreme = np.argsort(y)[[*range(min(5, len(y))), *range(-min(5, len(y)), 0)]]
     keep = np.union1d(keep, extreme)
     ax.plot(x[keep], y[keep], ".", ms=2, color=color, alpha=0.35, mew=0, rasterized=len(keep) > 400, zorder=1)

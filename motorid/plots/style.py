@@ -19,36 +19,91 @@ from motorid.errors import DataError
 from motorid.experiment import Experiment
 from motorid.integrate.grid import Array
 
-__all__ = ["CYCLE", "INK", "MUTED", "PALETTE", "axis_label", "band", "detached", "envelope", "finite", "grid",
-           "line", "only", "styled", "tidy"]
+__all__ = [
+    "CYCLE",
+    "INK",
+    "MUTED",
+    "PALETTE",
+    "axis_label",
+    "band",
+    "detached",
+    "envelope",
+    "finite",
+    "grid",
+    "line",
+    "only",
+    "styled",
+    "tidy",
+]
 
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
 
 INK, MUTED, FAINT, PAPER = "#1f2328", "#59636e", "#d1d9e0", "#ffffff"
 # Okabe & Ito, "Color universal design", 2008: distinct to all common kinds of colour vision.
-PALETTE = {"blue": "#0072b2", "orange": "#d55e00", "green": "#009e73", "purple": "#a4507d", "sky": "#56b4e9",
-           "yellow": "#b98500", "grey": "#7a848e"}
+PALETTE = {
+    "blue": "#0072b2",
+    "orange": "#d55e00",
+    "green": "#009e73",
+    "purple": "#a4507d",
+    "sky": "#56b4e9",
+    "yellow": "#b98500",
+    "grey": "#7a848e",
+}
 CYCLE = tuple(PALETTE[c] for c in ("blue", "orange", "green", "purple", "yellow", "sky", "grey"))
 MEASURED, MODEL, RESIDUAL, HELD_OUT = PALETTE["grey"], PALETTE["blue"], PALETTE["orange"], PALETTE["green"]
 WIDTH = 9.2  # inches: the text width of a notebook
 POINTS = 1600  # drawn per curve at most: about two per pixel
 
 STYLE: Mapping[str, Any] = {
-    "font.size": 9, "axes.titlesize": 9, "axes.labelsize": 9, "xtick.labelsize": 8, "ytick.labelsize": 8,
-    "legend.fontsize": 8, "figure.titlesize": 10, "legend.frameon": False, "axes.titlelocation": "left",
-    "axes.spines.top": False, "axes.spines.right": False, "axes.grid": True, "axes.axisbelow": True,
-    "grid.color": FAINT, "grid.linewidth": 0.6, "axes.edgecolor": MUTED, "axes.linewidth": 0.7,
-    "xtick.color": MUTED, "ytick.color": MUTED, "xtick.labelcolor": INK, "ytick.labelcolor": INK,
-    "axes.labelcolor": INK, "axes.titlecolor": INK, "text.color": INK, "figure.facecolor": PAPER,
-    "axes.facecolor": PAPER, "savefig.facecolor": PAPER, "lines.linewidth": 1.3, "figure.dpi": 100,
-    "savefig.dpi": 150, "axes.prop_cycle": cycler(color=CYCLE), "axes.formatter.useoffset": False,
-    "axes.formatter.limits": (-4, 5), "axes.formatter.use_mathtext": True, "axes.unicode_minus": True,
-    "svg.fonttype": "none", "axes.xmargin": 0.02, "font.family": ["DejaVu Sans"],
+    "font.size": 9,
+    "axes.titlesize": 9,
+    "axes.labelsize": 9,
+    "xtick.labelsize": 8,
+    "ytick.labelsize": 8,
+    "legend.fontsize": 8,
+    "figure.titlesize": 10,
+    "legend.frameon": False,
+    "axes.titlelocation": "left",
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": FAINT,
+    "grid.linewidth": 0.6,
+    "axes.edgecolor": MUTED,
+    "axes.linewidth": 0.7,
+    "xtick.color": MUTED,
+    "ytick.color": MUTED,
+    "xtick.labelcolor": INK,
+    "ytick.labelcolor": INK,
+    "axes.labelcolor": INK,
+    "axes.titlecolor": INK,
+    "text.color": INK,
+    "figure.facecolor": PAPER,
+    "axes.facecolor": PAPER,
+    "savefig.facecolor": PAPER,
+    "lines.linewidth": 1.3,
+    "figure.dpi": 100,
+    "savefig.dpi": 150,
+    "axes.prop_cycle": cycler(color=CYCLE),
+    "axes.formatter.useoffset": False,
+    "axes.formatter.limits": (-4, 5),
+    "axes.formatter.use_mathtext": True,
+    "axes.unicode_minus": True,
+    "svg.fonttype": "none",
+    "axes.xmargin": 0.02,
+    "font.family": ["DejaVu Sans"],
 }
 
-_NAMES = {"t": "time", "v": "voltage v", "i": "current i", "omega": "speed ω", "theta": "angle θ",
-          "heat": "heating ∫i²dt"}
+_NAMES = {
+    "t": "time",
+    "v": "voltage v",
+    "i": "current i",
+    "omega": "speed ω",
+    "theta": "angle θ",
+    "heat": "heating ∫i²dt",
+}
 _UNITS = {"t": "s", "v": "V", "i": "A", "omega": "rad/s", "theta": "rad", "heat": "A²·s"}
 
 _detached: ContextVar[bool] = ContextVar("motorid_detached_figures", default=False)
@@ -56,10 +111,12 @@ _detached: ContextVar[bool] = ContextVar("motorid_detached_figures", default=Fal
 
 def styled(draw: Callable[_P, _R]) -> Callable[_P, _R]:
     """Draw in motorid's style and leave the user's own settings as they were."""
+
     @wraps(draw)
     def inner(*args: _P.args, **kwargs: _P.kwargs) -> _R:
         with mpl.rc_context(dict(STYLE)):  # type: ignore[arg-type]
             return draw(*args, **kwargs)
+
     return inner
 
 
@@ -149,8 +206,9 @@ def tidy(ax: Axes, *, x: str = "", y: str = "", title: str = "") -> None:
 
 def above(ax: Axes) -> None:
     """Put the legend at the right above the axes, where it covers no data."""
-    legend = ax.legend(loc="lower right", bbox_to_anchor=(1.02, 0.97), borderpad=0.1, ncols=4,
-                       handlelength=1.6)
+    legend = ax.legend(
+        loc="lower right", bbox_to_anchor=(1.02, 0.97), borderpad=0.1, ncols=4, handlelength=1.6
+    )
     legend.set_in_layout(False)  # the title's line has room for it
 
 

@@ -50,8 +50,14 @@ def plot_sensitivities(fit: Fit, *, run: int = 0, names: Sequence[str] | None = 
             j = free.index(name)
             step = 0.01 * (abs(fit.values[name]) or problem.scaling.scale[j])
             change = trajectory.dy[:, problem.outputs.index(c), j] / slope[j] * step
-            line(ax, record.t, change, color=CYCLE[k % len(CYCLE)], ls=("-", "--", ":")[k // len(CYCLE) % 3],
-                 label=name)
+            line(
+                ax,
+                record.t,
+                change,
+                color=CYCLE[k % len(CYCLE)],
+                ls=("-", "--", ":")[k // len(CYCLE) % 3],
+                label=name,
+            )
         tidy(ax, y=f"change of {axis_label(c, record).replace(' (', chr(10) + '(')}")
     tidy(axes[0], title=f"What +1 % of each parameter does, {record.name}")
     tidy(axes[-1], x="time (s)")

@@ -1,0 +1,113 @@
+"""Tables that cards and the report share: parameters, errors, ranking, ladder."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from motorid._html import Flag, Table
+from motorid.formatting import number, percent, quantity, with_error
+
+NAMES = {"v": "voltage", "i": "current", "omega": "speed", "theta": "angle"}
+UNITS = {"i": "A", "omega": "rad/s", "theta": "rad"}
+
+
+def model_name(model: Any) -> str:
+    """Return ``DC motor + coulomb``."""
+    base = {"dc_motor": "DC motor", "torque_driven": "torque-driven axis"}[model.base]
+    return " + ".join([base, *model.effect_names])
+
+
+def counted(n: int, noun: str) -> str:
+    """Return ``1 run``, ``2 runs``."""
+    return f"{n} {noun}" + ("" if n == 1 else "s")
+
+
+def parameter_table(fit: Any, before: Any = None) -> Table:
+    """Values with standard deviations; beside them those of another fit."""
+    rows = []
+    for name, p in fit.model.parameters.items():
+        if name == "sgn_width":
+            continue
+        cell = _value(fit, name)
+        rows.append([name, *([_value(before, name)] if before is not None else []), cell, p.doc])
+    header = ["parameter", *(["before", "after"] if before is not None else ["value ± std"]), "meaning"]
+    return Table(header, rows)
+
+
+def _value(fit: Any, name: str) -> str | Flag:
+    if name not in fit.values:
+        return "–"
+    p = fit.model.parameters[name]
+    std = fit.std.get(name, 0.0) if p.vary else 0.0
+    text = with_error(fit.values[name], std, p.unit)
+    return Flag(text, "note") if std is None else text
+
+
+def error_table(evaluations: Sequence[tuple[str, Any]], units: Mapping[str, str]) -> Table:
+    """RMSE and NRMSE per channel, for each (title, fit or evaluation)."""
+    channels = dict.fromkeys(c for _, e in evaluations for c in e.nrmse)
+    header = [
+        "channel",
+        *(f"{what}, {title}" if title else what for title, _ in evaluations for what in ("NRMSE", "RMSE")),
+    ]
+    rows = [
+        [
+            f"{NAMES[c]} {c}",
+            *(
+                text
+                for _, e in evaluations
+                for text in (percent(e.nrmse.get(c)), quantity(e.rmse.get(c), units.get(c, UNITS[c]), 3))
+            ),
+        ]
+        for c in channels
+    ]
+    return Table(header, rows)
+
+
+def ranking_table(candidates: Sequence[Any], most: int = 10) -> Table:
+    """The effects tried, best first."""
+    rows = []
+    for c in candidates[:most]:
+        verdict = Flag("accepted", "good") if c.accepted else (c.reason or "not refitted")
+        values = ", ".join(f"{n} = {number(v, 3)}" for n, v in c.parameters.items() if n != "sgn_width")
+        rows.append(
+            [
+                c.effect,
+                percent(c.predicted_drop, 3),
+                percent(c.refit_drop, 3),
+                percent(c.held_out_gain, 3),
+                values,
+                verdict,
+            ]
+        )
+    return Table(
+        [
+            "effect",
+            "misfit taken away, predicted",
+            "refitted",
+            "held-out error falls by",
+            "size (SI)",
+            "verdict",
+        ],
+        rows,
+    )
+
+
+def ladder_table(ladder: Any) -> Table:
+    """Errors of the model on each rung."""
+    first = ladder.rungs[0]
+    channels = list(first.nrmse)
+    held_out = any(r.validation_nrmse for r in ladder.rungs)
+    header = [
+        "model",
+        *(f"{NAMES[c]}, fitted" for c in channels),
+        *(f"{NAMES[c]}, held out" for c in channels if held_out),
+    ]
+    rows = []
+    for r in ladder.rungs:
+        held = [percent((r.validation_nrmse or {}).get(c)) for c in channels] if held_out else []
+        name = model_name(first.fit.model) if r.added is None else f"+ {r.added}"
+        name += "".join(f" − {gone}" for gone in r.removed)
+        rows.append([name, *(percent(r.nrmse[c]) for c in channels), *held])
+    return Table(header, rows)
