@@ -83,7 +83,7 @@ def render(card: Card) -> str:
     parts += [f"<p>{escape(t)}</p>" for t in card.text if t]
     parts += [render_table(t) for t in card.tables]
     if card.after:
-        steps = " · ".join(f"{escape(what)} <code>{escape(code)}</code>" for code, what in card.after)
+        steps = " · ".join(f"{escape(what)}: <code>{escape(code)}</code>" for code, what in card.after)
         parts.append(f'<p class="muted">Next: {steps}</p>')
     return "\n".join([*parts, "</div>"])
 

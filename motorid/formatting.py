@@ -8,7 +8,7 @@ from decimal import ROUND_HALF_EVEN, Decimal
 __all__ = ["duration", "number", "percent", "quantity", "with_error"]
 
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
-_SMALLEST, _LARGEST = -4, 5  # decades written out; beyond them a power of ten is
+_LARGEST = 5  # decades below it are written out, from 1e-3 on (with an error: from 1e-2 on)
 
 
 def with_error(value: float, std: float | None, unit: str = "") -> str:
@@ -43,7 +43,7 @@ def with_error(value: float, std: float | None, unit: str = "") -> str:
     if std == 0:
         return f"{number(value, 6)}{tail} (held)"
     place = _place(std)
-    power = _power(max(abs(value), std))
+    power = _power(max(abs(value), std), -2)
     exact, error = _rounded(value, place, power), _rounded(std, place, power)
     if power:
         return f"({exact} ± {error})·10{_raised(power)}{tail}"
@@ -95,9 +95,9 @@ def _place(std: float) -> int:
     return decade - 1 if first < 355 or first >= 950 else decade
 
 
-def _power(size: float) -> int:
+def _power(size: float, smallest: int = -3) -> int:
     decade = math.floor(math.log10(size)) if size > 0 else 0
-    return 0 if _SMALLEST < decade < _LARGEST else decade
+    return 0 if smallest <= decade < _LARGEST else decade
 
 
 def _rounded(value: float, place: int, power: int) -> str:
