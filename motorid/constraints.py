@@ -6,7 +6,7 @@ Each is a penalty of the least-squares residual or a true constraint of `Multipl
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any
@@ -60,7 +60,7 @@ class CurrentLimit(Relation):
             one, every = np.ones(n), np.arange(n)
             labels = tuple(f"{self.name}, run {k}, t = {t:.6g} s" for t in run.experiment.t)
             found.append(Part(k, rows_of, every, every, np.zeros((n, 0)), run.grid.u, np.ones(n, bool), -one, one,
-                              self.limit * one, self.weight * share(problem, k) * one, labels, "A"))
+                              self.limit * one, self.weight * share(problem, k) * one, labels, ("A",) * n))
         return tuple(found)
 
 
@@ -133,12 +133,14 @@ class SteadyState(Relation):
         pick = np.unique(np.linspace(s.first, s.last, min(FEWEST, s.n)).round().astype(int))
         data = np.tile([s.v, *[s.means[c] for c in known]], (len(pick), 1))
         one = np.ones(len(names))
+        size = np.array([abs(s.v) if n == "voltage" else _drive(problem.model.values, s) for n in names])
         allowed = (self.tolerance + 3 * sum(_relative_error(run, s, c) for c in known)) * one
         weight = self.weight * np.sqrt(s.n) * share(problem, s.run) * one
+        torque = "N" if problem.model.axis == "linear" else "N·m"
         labels = tuple(f"{self.name}, {n} balance, run {s.run}, {s.begin:.4g} to {s.end:.4g} s" for n in names)
         return Part(s.run, local(system, _steady_rows(system, known), data.shape[1]), pick,
-                    np.zeros(len(pick), int), data, run.grid.u[pick], np.array(wanted), -allowed, allowed, one,
-                    weight, labels, "1")
+                    np.zeros(len(pick), int), data, run.grid.u[pick], np.array(wanted), -allowed, allowed, size,
+                    weight, labels, tuple({"voltage": "V", "torque": torque}[n] for n in names))
 
     @staticmethod
     def _wanted(system: Any, s: Segment) -> tuple[bool, bool]:
@@ -147,8 +149,9 @@ class SteadyState(Relation):
         current = "i" in s.means
         return electrical and current and s.v != 0, s.moving and "omega" in s.means and (current or not electrical)
 
-    def _penalty(self, c: Array, part: Part) -> tuple[Array, Array]:
-        return part.weight * c, part.weight  # the source paper's: zero only where the balance is
+    def penalty(self, c: Array, part: Part) -> tuple[Array, Array]:
+        """Return residual and slope as a penalty, the source paper's: zero only where the balance is."""
+        return part.weight * c, part.weight
 
 
 def _steady_rows(system: Any, known: Sequence[str]) -> Callable[..., Any]:
@@ -173,6 +176,11 @@ def _steady_rows(system: Any, known: Sequence[str]) -> Callable[..., Any]:
         size = ca.vertcat(d[0], drive)
         return balances / ca.if_else(size == 0, 1.0, size)
     return rows
+
+
+def _drive(values: Mapping[str, float], s: Segment) -> float:
+    """Torque of the motor on this segment, at the present values."""
+    return abs(values["K"] * s.means["i"] if "K" in values else values["g"] * s.v) or 1.0
 
 
 def _relative_error(run: Any, s: Segment, channel: str) -> float:
@@ -248,7 +256,7 @@ class Constraint(Relation):
             labels = [self.title if constant else f"{self.title}, run {k}, t = {at:.6g} s" for at in t]
             found.append(Part(k, rows_of, every, every, np.zeros((n, 0)), run.grid.u[:n], np.ones(n, bool),
                               self.lower / self.size * one, self.upper / self.size * one, self.size * one,
-                              self.weight * share(problem, k) * one, tuple(labels), self.unit))
+                              self.weight * share(problem, k) * one, tuple(labels), (self.unit,) * n))
         return tuple(found)
 
 

@@ -101,7 +101,11 @@ class Fit(Shown):
         r = self.residuals[:self.problem.n_outputs]
         variance = float(r @ r) / self.dof
         variance = max(variance, 1.0) if self.problem.weights == "noise" else variance
-        return gauss_newton_covariance(self.jacobian, variance)
+        free = self.extra.get("free")  # directions that active constraints leave, (k, m)
+        if free is None:
+            return gauss_newton_covariance(self.jacobian, variance)
+        covariance, determined = gauss_newton_covariance(self.jacobian @ free, variance)
+        return free @ covariance @ free.T, ~np.any(np.abs(free[:, ~determined]) > 0, axis=1)
 
     @property
     def covariance(self) -> Array:

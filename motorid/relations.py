@@ -9,6 +9,7 @@ from __future__ import annotations
 import weakref
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import casadi as ca
@@ -41,8 +42,7 @@ class Part:
         What one unit of a row is, in `unit`.
     weight : ndarray, shape (n,)
         Of the rows as a penalty.
-    labels : tuple of str
-    unit : str
+    labels, units : tuple of str
     """
 
     run: int
@@ -57,13 +57,13 @@ class Part:
     size: Array
     weight: Array
     labels: tuple[str, ...]
-    unit: str
+    units: tuple[str, ...]
 
     def rows(self, x: Array, p: Array, dx: Array | None, dp: Array | None) -> tuple[Array, Array | None]:
         """Return the rows (n,) and d rows/dz (n, nz) at states (m, nx) with dx (m, nx, nz), dp (np, nz)."""
         m, nc = len(self.samples), self.local.size1_out(0)
         wide = np.tile(np.asarray(p, float)[:, None], (1, m))
-        found = self.local.map(m)(x.T, self.u.T, wide, self.data.T)
+        found = self._mapped(x.T, self.u.T, wide, self.data.T)
         c = np.asarray(found[0]).T
         mean = self._mean(c).ravel()[self.keep]
         if dx is None:
@@ -71,6 +71,18 @@ class Part:
         cx = np.asarray(found[1]).reshape(nc, m, -1).transpose(1, 0, 2)
         cp = np.asarray(found[2]).reshape(nc, m, -1).transpose(1, 0, 2)
         return mean, self._mean(cx @ dx + cp @ dp).reshape(-1, dx.shape[2])[self.keep]
+
+    @cached_property
+    def _mapped(self) -> ca.Function:
+        return self.local.map(len(self.samples))
+
+    def at_limit(self, c: Array, near: float = 1e-6) -> np.ndarray:
+        """Tell which rows (n,) stand at one of their limits."""
+        return (c >= self.upper - near) | (c <= self.lower + near)
+
+    def violation(self, c: Array) -> Array:
+        """Return how far rows lie outside their limits, (n,), dimensionless, with its sign."""
+        return np.where(c > self.upper, c - self.upper, np.where(c < self.lower, c - self.lower, 0.0))
 
     def _mean(self, values: Array) -> Array:
         groups = int(self.group[-1]) + 1
@@ -87,6 +99,11 @@ class Relation:
     def _parts(self, problem: Any) -> tuple[Part, ...]:
         raise NotImplementedError
 
+    @property
+    def name(self) -> str:
+        """What messages call it."""
+        raise NotImplementedError
+
     def parts(self, problem: Any) -> tuple[Part, ...]:
         """Return the rows on each run of `problem`, made once."""
         made = _made.setdefault(problem, {})
@@ -94,9 +111,9 @@ class Relation:
             made[id(self)] = (self, self._parts(problem))
         return made[id(self)][1]
 
-    def _penalty(self, c: Array, part: Part) -> tuple[Array, Array]:
+    def penalty(self, c: Array, part: Part) -> tuple[Array, Array]:
         """Return residual and slope of rows used as a penalty: what lies outside the limits."""
-        out = np.where(c > part.upper, c - part.upper, np.where(c < part.lower, c - part.lower, 0.0))
+        out = part.violation(c)
         return part.weight * out, part.weight * (out != 0)
 
     def evaluate(self, problem: Any, q: Array, trajs: Sequence[Trajectory]) -> tuple[Array, Array | None]:
@@ -107,7 +124,7 @@ class Relation:
         for part in self.parts(problem):
             t, s = trajs[part.run], part.samples
             c, jac = part.rows(t.x[s], p, t.dx[s] if derivatives and t.dx is not None else None, dp)
-            r, slope = self._penalty(c, part)
+            r, slope = self.penalty(c, part)
             rs.append(r)
             if jac is not None:
                 jacs.append(slope[:, None] * jac)

@@ -1,0 +1,286 @@
+"""A problem cut at shooting nodes: states there are unknowns beside q, each interval is simulated by itself.
+
+Bock & Plitt, "A multiple shooting algorithm for direct solution of optimal control problems", IFAC World
+Congress, 1984. The engine is the one of the least-squares fit, with the same sub-steps, so both formulations
+speak of the same discrete model. Unknowns are z = (q, nodes/scale); the first state of a run is a function of q.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from motorid.integrate.grid import Array, Grid, Trajectory
+from motorid.problem import Problem
+from motorid.relations import Part, Relation
+from motorid.unknowns import Point
+
+FEWEST = 50  # samples per interval, unless a run is so long that it would need more intervals than
+MOST = 200
+
+
+class Interval(NamedTuple):
+    """Samples `first` to `last` of a run; the last belongs to the next interval where there is one.
+
+    `node` and `next` count the nodes of all runs; -1: none (the first state of a run is a function of q).
+    """
+
+    run: int
+    first: int
+    last: int
+    node: int
+    next: int
+    grid: Grid
+
+
+class Block(NamedTuple):
+    """A few rows: values (m,), derivative (m, w) and the w columns of z that it belongs to."""
+
+    values: Array
+    jac: Array
+    columns: np.ndarray
+
+
+class Walk(NamedTuple):
+    """All intervals simulated: per run x, y and their local derivatives; per interval its end state.
+
+    Local columns are (own node, q), in scaled coordinates. `at` is q in the system's terms.
+    """
+
+    at: Point
+    runs: tuple[Trajectory, ...]
+    ends: Array
+    dends: Array | None
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """Intervals of all runs and the rows they give.
+
+    Attributes
+    ----------
+    problem : Problem
+    every : int or None
+        Samples per interval; None chooses.
+    noise : ndarray, shape (nx,), or None
+        Process noise per state, unit/√s: gaps at the nodes are weighed by it instead of forbidden.
+    """
+
+    problem: Problem
+    every: int | None = None
+    noise: Array | None = None
+
+    # -- layout ----------------------------------------------------------------------------------------
+    @cached_property
+    def intervals(self) -> tuple[Interval, ...]:
+        """Intervals in the order of runs and time."""
+        found: list[Interval] = []
+        nodes = 0
+        for k, run in enumerate(self.problem.runs):
+            last = len(run.grid.t) - 1
+            cuts = _cuts(last, self.every)
+            for a, b in zip(cuts[:-1], cuts[1:], strict=True):
+                node = -1 if a == 0 else nodes - 1
+                nodes += b < last
+                found.append(Interval(k, a, b, node, nodes - 1 if b < last else -1, _cut(run.grid, a, b)))
+        return tuple(found)
+
+    @cached_property
+    def n_nodes(self) -> int:
+        """Number of nodes with a state of their own."""
+        return sum(v.next >= 0 for v in self.intervals)
+
+    @cached_property
+    def nq(self) -> int:
+        """Number of unknowns of the problem."""
+        return len(self.problem.unknown)
+
+    @cached_property
+    def nx(self) -> int:
+        """Number of states."""
+        return len(self.problem.system.states)
+
+    def columns(self, v: Interval, *, after: bool = False) -> np.ndarray:
+        """Return the columns of z of (own node, q), with `after` those of the next node too; -1: absent."""
+        def of(node: int) -> np.ndarray:
+            return self.nq + node * self.nx + np.arange(self.nx) if node >= 0 else np.full(self.nx, -1)
+        return np.concatenate([of(v.node), np.arange(self.nq), *([of(v.next)] if after else [])])
+
+    @cached_property
+    def owner(self) -> tuple[np.ndarray, ...]:
+        """Per run: the interval each sample belongs to."""
+        found = [np.zeros(len(run.grid.t), int) for run in self.problem.runs]
+        for j, v in enumerate(self.intervals):
+            found[v.run][v.first:] = j
+        return tuple(found)
+
+    @cached_property
+    def scale(self) -> Array:
+        """Size of each state: the largest seen in the data or, where not measured, in the simulated intervals."""
+        found = np.zeros(self.nx)
+        for j, name in enumerate(self.problem.system.states):
+            for run in self.problem.experiments:
+                if name in run.outputs:
+                    found[j] = max(found[j], float(np.nanmax(np.abs(run.outputs[name]))))
+        return np.where(found > 0, found, 1.0)
+
+    def split(self, z: Array) -> tuple[Array, Array]:
+        """Return q and the states at the nodes (n, nx), physical."""
+        return z[:self.nq], z[self.nq:].reshape(self.n_nodes, self.nx) * self.scale
+
+    def joined(self, q: Array, states: Array) -> Array:
+        """Return z."""
+        return np.concatenate([q, (np.asarray(states).reshape(-1, self.nx) / self.scale).ravel()])
+
+    # -- simulation ------------------------------------------------------------------------------------
+    def walk(self, z: Array, derivatives: bool) -> Walk:
+        """Simulate every interval from its node.
+
+        Raises
+        ------
+        SimulationError
+        """
+        problem, nx, nz = self.problem, self.nx, self.nx + self.nq
+        q, states = self.split(z)
+        at = problem.unknowns.point(q)
+        runs = tuple(_empty(len(r.grid.t), nx, len(problem.outputs), nz if derivatives else 0) for r in problem.runs)
+        ends = np.zeros((len(self.intervals), nx))
+        dends = np.zeros((len(self.intervals), nx, nz)) if derivatives else None
+        dp = np.hstack([np.zeros((len(at.p), nx)), at.dp])
+        inner = np.hstack([np.diag(self.scale), np.zeros((nx, self.nq))])
+        for j, v in enumerate(self.intervals):
+            x0 = problem.unknowns.first_state(at, v.run) if v.node < 0 else states[v.node]
+            if derivatives:
+                dx0 = inner
+                if v.node < 0:
+                    dx0 = np.hstack([np.zeros((nx, nx)), problem.unknowns.first_slopes(at, v.run)])
+                traj = problem._engine.run(problem.system, v.grid, x0, at.p, dx0, dp)
+            else:
+                traj = problem._engine.run(problem.system, v.grid, x0, at.p)
+            _fill(runs[v.run], traj, v.first)
+            ends[j] = traj.x[-1]
+            if dends is not None and traj.dx is not None:
+                dends[j] = traj.dx[-1]
+        return Walk(at, runs, ends, dends)
+
+    # -- rows ------------------------------------------------------------------------------------------
+    def residual(self, z: Array, walk: Walk) -> list[Block]:
+        """Return whitened residuals: outputs, weighed gaps, priors, penalties; ½ of their squares is the cost."""
+        problem = self.problem
+        blocks = []
+        for k in range(len(problem.runs)):
+            r, jac = problem._lossy(*problem.run_residual(k, walk.runs[k]))
+            index = problem._weights[k][2]
+            rows = np.arange(len(r)) if index is None else index
+            blocks += self._by_interval(r, jac, self.owner[k][rows // len(problem.outputs)])
+        if self.noise is not None:
+            blocks += self.gaps(z, walk, weighed=True)
+        if problem.priors:
+            blocks.append(Block(*problem._prior_part(z[:self.nq]), np.arange(self.nq)))
+        for penalty in problem.penalties:
+            for part in penalty.parts(problem):
+                blocks += self._penalty(penalty, part, walk)
+        return blocks
+
+    def _penalty(self, penalty: Relation, part: Part, walk: Walk) -> list[Block]:
+        blocks = self._part(part, walk)
+        r, slope = penalty.penalty(np.concatenate([b.values for b, _ in blocks]), part)
+        return [Block(r[rows], slope[rows, None] * b.jac, b.columns) for b, rows in blocks]
+
+    def gaps(self, z: Array, walk: Walk, weighed: bool) -> list[Block]:
+        """Return, per inner node, the node's state minus the end of the interval before it."""
+        states = z[self.nq:].reshape(self.n_nodes, self.nx)
+        blocks = []
+        for j, v in enumerate(self.intervals):
+            if v.next < 0:
+                continue
+            factor = self.scale / self.gap_size(v) if weighed else np.ones(self.nx)
+            values = (states[v.next] - walk.ends[j] / self.scale) * factor
+            jac = np.zeros((self.nx, 0))
+            if walk.dends is not None:
+                jac = np.hstack([-walk.dends[j] / self.scale[:, None], np.eye(self.nx)]) * factor[:, None]
+            blocks.append(_present(Block(values, jac, self.columns(v, after=True))))
+        return blocks
+
+    def gap_size(self, v: Interval) -> Array:
+        """Standard deviation (nx,) of the gap after an interval, physical."""
+        assert self.noise is not None
+        return self.noise * np.sqrt(v.grid.t[-1] - v.grid.t[0])
+
+    def constraints(self, walk: Walk) -> list[tuple[Block, Part, np.ndarray]]:
+        """Return the rows of all constraints with the part they belong to and their places in it."""
+        return [(b, part, rows) for c in self.problem.constraints for part in c.parts(self.problem)
+                for b, rows in self._part(part, walk)]
+
+    def _part(self, part: Part, walk: Walk) -> list[tuple[Block, np.ndarray]]:
+        traj, s = walk.runs[part.run], part.samples
+        x = traj.x[s]
+        dp = np.hstack([np.zeros((len(walk.at.p), self.nx)), walk.at.dp])
+        owner = self.owner[part.run][s]
+        if len(np.unique(part.group)) == len(s):
+            c, jac = part.rows(x, walk.at.p, None if traj.dx is None else traj.dx[s], dp)
+            blocks = self._by_interval(c, jac, owner)
+            ends = np.cumsum([len(b.values) for b in blocks])
+            return [(b, np.arange(e - len(b.values), e)) for b, e in zip(blocks, ends, strict=True)]
+        columns, dx, dp = self._spread(traj.dx, s, owner, walk.at.dp)
+        c, jac = part.rows(x, walk.at.p, dx, dp)
+        return [(Block(c, jac if jac is not None else np.zeros((len(c), 0)), columns), np.arange(len(c)))]
+
+    def _spread(self, dx: Array | None, samples: np.ndarray, owner: np.ndarray,
+                dq: Array) -> tuple[np.ndarray, Array | None, Array]:
+        """Return the columns of all intervals concerned, and dx and dp spread over them."""
+        nodes = [int(j) for j in np.unique(owner) if self.intervals[j].node >= 0]
+        columns = np.concatenate([np.arange(self.nq), *(self.columns(self.intervals[j])[:self.nx] for j in nodes)])
+        dp = np.hstack([dq, np.zeros((len(dq), len(columns) - self.nq))])
+        if dx is None:
+            return columns, None, dp
+        wide = np.zeros((len(samples), self.nx, len(columns)))
+        wide[:, :, :self.nq] = dx[samples][:, :, self.nx:]
+        for place, j in enumerate(nodes):
+            mine = owner == j
+            a = self.nq + place * self.nx
+            wide[mine, :, a:a + self.nx] = dx[samples[mine]][:, :, :self.nx]
+        return columns, wide, dp
+
+    def _by_interval(self, values: Array, jac: Array | None, owner: np.ndarray) -> list[Block]:
+        """Cut rows with local derivatives (n, nx + nq) where the interval changes."""
+        cuts = [0, *(np.flatnonzero(np.diff(owner)) + 1).tolist(), len(values)]
+        wide = np.zeros((len(values), 0)) if jac is None else jac
+        return [_present(Block(values[a:b], wide[a:b], self.columns(self.intervals[owner[a]])))
+                for a, b in zip(cuts[:-1], cuts[1:], strict=True) if b > a]
+
+
+def _present(b: Block) -> Block:
+    """Drop absent columns."""
+    there = b.columns >= 0
+    return Block(b.values, b.jac[:, there] if b.jac.shape[1] else b.jac, b.columns[there])
+
+
+def _cuts(last: int, every: int | None) -> Sequence[int]:
+    """Samples at which a run is cut, both ends included."""
+    step = every or max(FEWEST, -(-last // MOST))
+    return np.unique(np.linspace(0, last, max(round(last / step), 1) + 1).round().astype(int)).tolist()
+
+
+def _cut(grid: Grid, a: int, b: int) -> Grid:
+    return Grid(grid.t[a:b + 1], grid.u[a:b + 1], grid.u0[a:b], grid.u1[a:b], grid.substeps[a:b])
+
+
+def _empty(n: int, nx: int, ny: int, nz: int) -> Trajectory:
+    dy, dx = (np.zeros((n, ny, nz)), np.zeros((n, nx, nz))) if nz else (None, None)
+    return Trajectory(np.zeros((n, ny)), dy, np.zeros((n, nx)), dx, None)
+
+
+def _fill(whole: Trajectory, traj: Trajectory, first: int) -> None:
+    """Write an interval into the run; the next interval overwrites the shared last sample."""
+    rows = slice(first, first + len(traj.y))
+    whole.y[rows], whole.x[rows] = traj.y, traj.x
+    if whole.dy is not None and whole.dx is not None and traj.dy is not None and traj.dx is not None:
+        whole.dy[rows], whole.dx[rows] = traj.dy, traj.dx
+
+
+__all__ = ["Block", "Interval", "Mesh", "Relation", "Walk"]

@@ -1,0 +1,238 @@
+"""A mesh as a sparse nonlinear program for IPOPT: exact first derivatives, Gauss-Newton Hessian.
+
+Wächter & Biegler, "On the implementation of an interior-point filter line-search algorithm for large-scale
+nonlinear programming", Mathematical Programming 106, 2006. The functions are handed to CasADi as callbacks, so
+that the compiled step of the least-squares engine is used here too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import casadi as ca
+import numpy as np
+
+from motorid.errors import SimulationError
+from motorid.integrate.grid import Array
+from motorid.mesh import Block, Mesh
+
+D = ca.Sparsity.dense
+STEEPEST = 1e4  # largest diagonal entry of the scaled Hessian at the start; IPOPT's tolerances are absolute
+
+
+class NlpResult(NamedTuple):
+    """Where the NLP solver ended: z, multipliers of the rows (of ½rᵀr) and of z's bounds, status, counts."""
+
+    z: Array
+    lam_g: Array
+    lam_x: Array
+    status: str
+    iterations: int
+    history: tuple[float, ...]
+
+
+class _Point(NamedTuple):
+    f: float
+    g: Array
+    residual: list[Block] | None
+    rows: list[Block] | None
+
+
+class ShootingNlp:
+    """Values and derivatives of one mesh at z, the last point kept.
+
+    Parameters
+    ----------
+    mesh : Mesh
+    z : ndarray
+        A point that can be simulated; it shows the sparsity.
+    """
+
+    def __init__(self, mesh: Mesh, z: Array) -> None:
+        self.mesh = mesh
+        self._kept: dict[bool, tuple[bytes, _Point | None]] = {}
+        at = self._evaluate(z, True)
+        assert at.residual is not None and at.rows is not None
+        self.n, self.m = len(z), len(at.g)
+        self.scale = STEEPEST / max(_steepest(at.residual, self.n), 1e-300)
+        self.jac_pattern, self._jac_order = _jacobian_pattern(at.rows, self.m, self.n)
+        self.hess_pattern, self._hess_mask, self._hess_place = _hessian_pattern(at.residual, self.n)
+        self.lower, self.upper = self._limits(z)
+
+    def _limits(self, z: Array) -> tuple[Array, Array]:
+        zero = np.zeros(0 if self.mesh.noise is not None else self.mesh.n_nodes * self.mesh.nx)
+        found = self.mesh.constraints(self.mesh.walk(z, False))
+        return (np.concatenate([zero, *(part.lower[rows] for _, part, rows in found)]),
+                np.concatenate([zero, *(part.upper[rows] for _, part, rows in found)]))
+
+    # -- one point -------------------------------------------------------------------------------------
+    def _evaluate(self, z: Array, derivatives: bool) -> _Point:
+        walk = self.mesh.walk(z, derivatives)
+        residual = self.mesh.residual(z, walk)
+        rows = [] if self.mesh.noise is not None else self.mesh.gaps(z, walk, weighed=False)
+        rows += [b for b, _, _ in self.mesh.constraints(walk)]
+        f = 0.5 * sum(float(b.values @ b.values) for b in residual)
+        return _Point(f, np.concatenate([np.zeros(0), *(b.values for b in rows)]), residual, rows)
+
+    def at(self, z: Array, derivatives: bool) -> _Point | None:
+        """Return the point z, None where it cannot be simulated."""
+        key = z.tobytes()
+        for stronger in (True, derivatives):
+            if stronger in self._kept and self._kept[stronger][0] == key:
+                return self._kept[stronger][1]
+        try:
+            found = self._evaluate(z, derivatives)
+        except SimulationError:
+            found = None
+        self._kept[derivatives] = key, found
+        return found
+
+    # -- what IPOPT asks for ---------------------------------------------------------------------------
+    def values(self, z: Array) -> list[Any]:
+        """Return f and g."""
+        point = self.at(z, False)
+        return [np.nan, np.full(self.m, np.nan)] if point is None else [point.f * self.scale, point.g]
+
+    def gradient(self, z: Array) -> list[Any]:
+        """Return f and its gradient."""
+        point = self.at(z, True)
+        if point is None or point.residual is None:
+            return [np.nan, np.full(self.n, np.nan)]
+        found = np.zeros(self.n)
+        for b in point.residual:
+            found[b.columns] += b.values @ b.jac
+        return [point.f * self.scale, found * self.scale]
+
+    def jacobian(self, z: Array) -> list[Any]:
+        """Return g and its sparse Jacobian."""
+        point = self.at(z, True)
+        if point is None or point.rows is None:
+            return [np.full(self.m, np.nan), np.full(self.jac_pattern.nnz(), np.nan)]
+        entries = np.concatenate([np.zeros(0), *(b.jac.ravel() for b in point.rows)])
+        return [point.g, entries[self._jac_order]]
+
+    def hessian(self, z: Array, lam_f: float) -> Array:
+        """Return the entries of the Gauss-Newton Hessian's upper triangle."""
+        point = self.at(z, True)
+        if point is None or point.residual is None:
+            return np.full(self.hess_pattern.nnz(), np.nan)
+        entries = np.concatenate([(b.jac.T @ b.jac).ravel() for b in point.residual])[self._hess_mask]
+        return np.bincount(self._hess_place, entries, self.hess_pattern.nnz()) * (self.scale * lam_f)
+
+    def functions(self) -> tuple[ca.Callback, dict[str, ca.Callback]]:
+        """Return the NLP and its derivatives in CasADi's naming."""
+        x, p, f, g = D(self.n, 1), D(0, 0), D(1, 1), D(self.m, 1)
+        jac, hess = self.jac_pattern, self.hess_pattern
+        nlp = _Function("nlp", ["x", "p"], ["f", "g"], [x, p], [f, g], lambda z, _: self.values(z))
+        grad_f = _Function("nlp_grad_f", ["x", "p"], ["f", "grad:f:x"], [x, p], [f, x],
+                           lambda z, _: self.gradient(z))
+        jac_g = _Function("nlp_jac_g", ["x", "p"], ["g", "jac:g:x"], [x, p], [g, jac],
+                          lambda z, _: self.jacobian(z))
+        hess_lag = _Function("nlp_hess_l", ["x", "p", "lam:f", "lam:g"], ["triu:hess:gamma:x:x"], [x, p, f, g],
+                             [hess], lambda z, _, lam_f, __: [self.hessian(z, float(lam_f[0]))])
+        return nlp, {"grad_f": grad_f, "jac_g": jac_g, "hess_lag": hess_lag}
+
+
+class _Function(ca.Callback):
+    """A Python function in CasADi's clothes; results are dense arrays or the entries of a sparse one."""
+
+    def __init__(self, name: str, names_in: Sequence[str], names_out: Sequence[str], given: Sequence[ca.Sparsity],
+                 results: Sequence[ca.Sparsity], call: Callable[..., list[Any]]) -> None:
+        ca.Callback.__init__(self)
+        self._names, self._given, self._results, self._call = (names_in, names_out), given, results, call
+        self.construct(name, {})
+
+    def get_n_in(self) -> int:
+        return len(self._given)
+
+    def get_n_out(self) -> int:
+        return len(self._results)
+
+    def get_name_in(self, i: int) -> str:
+        return self._names[0][i]
+
+    def get_name_out(self, i: int) -> str:
+        return self._names[1][i]
+
+    def get_sparsity_in(self, i: int) -> ca.Sparsity:
+        return self._given[i]
+
+    def get_sparsity_out(self, i: int) -> ca.Sparsity:
+        return self._results[i]
+
+    def eval(self, arg: Sequence[ca.DM]) -> list[ca.DM]:
+        found = self._call(*(np.asarray(a).ravel() for a in arg))
+        return [ca.DM(s, np.atleast_1d(v)) for s, v in zip(self._results, found, strict=True)]
+
+
+def _steepest(blocks: Sequence[Block], n: int) -> float:
+    """Return the largest diagonal entry of JᵀJ."""
+    found = np.zeros(n)
+    for b in blocks:
+        found[b.columns] += np.einsum("ij,ij->j", b.jac, b.jac)
+    return float(found.max(initial=0.0))
+
+
+def _jacobian_pattern(blocks: Sequence[Block], m: int, n: int) -> tuple[ca.Sparsity, np.ndarray]:
+    """Return the sparsity and the order in which the blocks' entries fill it, column by column."""
+    rows, columns, first = [np.zeros(0, int)], [np.zeros(0, int)], 0
+    for b in blocks:
+        h, w = b.jac.shape
+        rows.append(np.repeat(np.arange(first, first + h), w))
+        columns.append(np.tile(b.columns, h))
+        first += h
+    r, c = np.concatenate(rows), np.concatenate(columns)
+    order = np.lexsort((r, c))
+    return _ccs(r[order], c[order], m, n), order
+
+
+def _hessian_pattern(blocks: Sequence[Block], n: int) -> tuple[ca.Sparsity, np.ndarray, np.ndarray]:
+    """Return the sparsity of the upper triangle, which entries of the blocks lie in it, and where they go."""
+    rows = np.concatenate([np.repeat(b.columns, len(b.columns)) for b in blocks])
+    columns = np.concatenate([np.tile(b.columns, len(b.columns)) for b in blocks])
+    mask = rows <= columns
+    keys, place = np.unique(columns[mask] * n + rows[mask], return_inverse=True)
+    return _ccs(keys % n, keys // n, n, n), mask, place
+
+
+def _ccs(rows: np.ndarray, columns: np.ndarray, m: int, n: int) -> ca.Sparsity:
+    starts = np.searchsorted(columns, np.arange(n + 1))
+    return ca.Sparsity(m, n, starts.tolist(), rows.tolist())
+
+
+@dataclass(frozen=True)
+class Ipopt:
+    """Options handed to IPOPT."""
+
+    max_iterations: int = 300
+    tol: float = 1e-9
+    verbose: bool = False
+
+    def solve(self, nlp: ShootingNlp, z0: Array, bounds: tuple[Array, Array], warm: NlpResult | None = None) -> NlpResult:
+        """Solve from `z0`, or from an earlier result of the same size."""
+        function, derivatives = nlp.functions()
+        options: dict[str, Any] = {
+            "max_iter": self.max_iterations, "tol": self.tol, "constr_viol_tol": 1e-10, "dual_inf_tol": 1e-6,
+            "compl_inf_tol": 1e-8, "acceptable_iter": 0, "bound_relax_factor": 0.0, "nlp_scaling_method": "none",
+            "print_level": 5 if self.verbose else 0, "sb": "yes", "mu_strategy": "adaptive",
+        }
+        start = {"x0": z0}
+        if warm is not None:
+            options |= {"warm_start_init_point": "yes", "mu_init": 1e-7, "warm_start_bound_push": 1e-9,
+                        "warm_start_mult_bound_push": 1e-9, "mu_strategy": "monotone",
+                        "warm_start_slack_bound_push": 1e-9}
+            start |= {"lam_g0": warm.lam_g * nlp.scale, "lam_x0": warm.lam_x * nlp.scale}
+        solver = ca.nlpsol("solver", "ipopt", function, {
+            **derivatives, "no_nlp_grad": True, "calc_lam_p": False, "print_time": False, "show_eval_warnings": False,
+            "error_on_fail": False, "ipopt": options})
+        found = solver(**start, lbx=bounds[0], ubx=bounds[1], lbg=nlp.lower, ubg=nlp.upper)
+        stats = solver.stats()
+        costs = tuple(float(f) / nlp.scale for f in stats.get("iterations", {}).get("obj", []))
+        return NlpResult(np.asarray(found["x"]).ravel(), np.asarray(found["lam_g"]).ravel() / nlp.scale,
+                         np.asarray(found["lam_x"]).ravel() / nlp.scale, stats["return_status"],
+                         int(stats["iter_count"]), costs)
+
+
+__all__ = ["Ipopt", "NlpResult", "ShootingNlp"]
