@@ -230,6 +230,13 @@ def test_words_become_the_voltage_they_say():
     assert program("stairs:1:3:3:0.001").volts(1000).tolist() == [1, 2, 3]
 
 
+def test_one_sample_of_a_program_is_that_of_the_whole():
+    some = program("rest:0.003,chirp:2:5:50:0.1,prbs:3:0.01:0.05")
+    volts = some.volts(1000)
+    assert [some.at(k, 1000) for k in range(len(volts))] == volts.tolist()
+    assert some.at(len(volts), 1000) is None
+
+
 def test_chirp_goes_from_one_frequency_to_the_other():
     volts = program("chirp:2:5:50:10:1").volts(1000)
     assert volts.mean() == pytest.approx(1, abs=0.02)
@@ -268,9 +275,9 @@ def test_standard_stays_within_the_limit_and_moves_both_ways():
 
 @pytest.mark.parametrize(("words", "said"), [
     ("stop:1", "unknown excitation 'stop'"), ("step:6", "takes 2 numbers"), ("step:x:1", "not a number"),
-    ("step:inf:1", "not a number"), ("step:6:-1", "1 ms to a day"), ("prbs:6:0:1", "positive bit time"),
+    ("step:inf:1", "not a number"), ("step:6:-1", "1 ms to an hour"), ("prbs:6:0:1", "positive bit time"),
     ("stairs:1:6:1:0.3", "levels"), ("chirp:1:-1:5:1", "negative"), ("standard", "limit-voltage"),
-    ("step:6:1,,", "unknown excitation"), ("rest:1e9", "not a number"), ("step:6:90000", "a day")])
+    ("step:6:1,,", "unknown excitation"), ("rest:1e9", "not a number"), ("step:6:3601", "an hour")])
 def test_words_that_make_no_sense_are_refused_with_the_reason(words, said):
     if words == "step:6:1,,":
         words = "step:6:1,,rest:1"

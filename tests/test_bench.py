@@ -279,7 +279,9 @@ def test_a_full_disk_ends_the_run_and_stops_the_motor(out, monkeypatch):
     monkeypatch.setattr(os, "write", write)
     link = MemoryLink(device())
     done = record(link, out, excite="rest:2")
-    assert (done.ended, done.detail) == ("disk", "No space left on device")
+    assert done.ended == "disk"
+    lines = out.read_text().count("\n")
+    assert done.detail == f"No space left on device; {lines} whole lines are in the file"
     assert not link.device.running
     got = rows(out)
     assert out.read_text().endswith("\n")
@@ -532,15 +534,17 @@ def test_a_killed_recorder_leaves_a_record_and_a_motor_that_stops(out):
 def test_a_second_recorder_on_the_same_port_is_turned_away(tmp_path):
     with Bench() as bench:
         a = tmp_path / "a.csv"
-        first = start("record", "--port", bench.port, "--out", a, "--excite", "rest:1", "--quiet")
+        first = start("record", "--port", bench.port, "--out", a, "--excite", "rest:60", "--quiet")
         wait_for(a.exists)
         code, _, said = finish(start("record", "--port", bench.port, "--out", tmp_path / "b.csv"))
         assert code == 1
         assert "is in use, perhaps by another recorder" in said
         assert "Traceback" not in said
+        here = len(rows(a))
+        wait_for(lambda: len(rows(a)) > here + 100)  # the first one has not noticed
+        first.send_signal(signal.SIGINT)
         assert finish(first)[0] == 0
     assert not (tmp_path / "b.csv").exists()
-    assert len(rows(tmp_path / "a.csv")) == 1000
 
 
 @needs_pty
@@ -596,12 +600,14 @@ def test_a_second_recorder_on_the_socket_is_turned_away(tmp_path):
     with Bench("--socket", 0) as bench:
         assert bench.port.startswith("socket://127.0.0.1:")
         a = tmp_path / "a.csv"
-        first = start("record", "--port", bench.port, "--out", a, "--excite", "rest:1", "--quiet")
+        first = start("record", "--port", bench.port, "--out", a, "--excite", "rest:60", "--quiet")
         wait_for(a.exists)
         with pytest.raises(DeviceError, match="in use by another recorder"):
             record(bench.port, tmp_path / "b.csv")
+        here = len(rows(a))
+        wait_for(lambda: len(rows(a)) > here + 100)
+        first.send_signal(signal.SIGINT)
         assert finish(first)[0] == 0
-    assert len(rows(tmp_path / "a.csv")) == 1000
 
 
 @needs_pty
@@ -613,6 +619,19 @@ def test_once_ends_the_bench_and_reveal_tells_the_truth(out):
     code, said, _ = finish(process)
     assert code == 0
     assert "hidden: coulomb (tau_c = 0.01)" in said
+
+
+@needs_pty
+def test_ctrl_c_while_nobody_answers_is_one_sentence(tmp_path):
+    master, slave = os.openpty()
+    process = start("record", "--port", os.ttyname(slave), "--out", tmp_path / "x.csv")
+    wait_for(lambda: os.read(master, 1))  # it is asking
+    process.send_signal(signal.SIGINT)
+    code, _, said = finish(process)
+    os.close(master)
+    os.close(slave)
+    assert (code, said.strip()) == (1, "Stopped before anything was recorded.")
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize(("words", "code", "said"), [

@@ -22,6 +22,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,7 +31,7 @@ from motorid.errors import UsageError, one_of
 
 __all__ = ["Program", "Segment", "lfsr_bits", "program"]
 
-LONGEST = 86_400.0  # s; a day
+LONGEST = 3600.0  # s of one segment
 _SHAPES = {"R": 2, "C": 4, "P": 4}  # numbers after the duration
 
 
@@ -44,7 +45,8 @@ class Segment:
 
     def __post_init__(self) -> None:
         if len(self.args) != _SHAPES.get(self.shape) or not 1 <= self.ms <= LONGEST * 1e3:
-            raise UsageError(f"a segment lasts from 1 ms to a day; got {self}.")
+            raise UsageError(f"a segment lasts from 1 ms to an hour; got {self.ms} ms of {self.shape}. Join "
+                             "several for a longer one.")
         if self.shape == "C" and min(self.args[2:]) < 0:
             raise UsageError("the frequencies of a chirp must not be negative.")
         if self.shape == "P" and not (self.args[2] >= 1 and 1 <= self.args[3] < 1 << 15):
@@ -88,6 +90,11 @@ def lfsr_bits(seed: int, n: int) -> Iterator[int]:
         state = (state >> 1) | (bit << 14)
 
 
+@lru_cache(maxsize=4)
+def _volts(segment: Segment, rate: float) -> NDArray[np.float64]:
+    return segment.volts(rate)
+
+
 @dataclass(frozen=True)
 class Program:
     """A checked sequence of segments; no segments at all means: record at 0 V until stopped."""
@@ -112,6 +119,15 @@ class Program:
     def volts(self, rate: float) -> NDArray[np.float64]:
         """Voltage commanded at each sample, (N,) in V."""
         return np.concatenate([s.volts(rate) for s in self.segments]) if self.segments else np.zeros(0)
+
+    def at(self, index: int, rate: float) -> float | None:
+        """Return the voltage commanded at one sample, in V; None where there is no program."""
+        for segment in self.segments:
+            n = segment.count(rate)
+            if index < n:
+                return float(_volts(segment, rate)[index])
+            index -= n
+        return None
 
     def after(self, seconds: float) -> Program:
         """What is left after that time; a segment that was interrupted is repeated from its start."""

@@ -144,10 +144,10 @@ def _commanded(device: Header, header: Header, todo: Program) -> Commanded:
     """The voltage that the device applies at each sample, in the units of the record."""
     k = next(k for k, c in enumerate(device.channels) if c.name == "v")
     told, kept = device.channels[k], header.channels[k]
-    volts = kept.scale * (todo.volts(device.rate) / told.scale + told.offset - kept.offset)
 
     def at(index: int) -> float | None:
-        return float(volts[index]) if index < len(volts) else None
+        volts = todo.at(index, device.rate)
+        return None if volts is None else kept.scale * (volts / told.scale + told.offset - kept.offset)
 
     return at
 

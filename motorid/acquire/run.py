@@ -87,7 +87,7 @@ class Run:
         except LinkLost as error:
             self._end("unplugged", str(error))
         except OSError as error:
-            self._end("disk", error.strerror or str(error))
+            self._end("disk", f"{error.strerror}; {self.s.file.lines} whole lines are in the file")
 
     def _take(self, items: list[Sample | Message]) -> None:
         now = time.monotonic()

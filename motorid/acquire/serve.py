@@ -21,6 +21,7 @@ __all__ = ["Pace", "Pty", "Socket", "open_end", "serve"]
 
 LOOPBACK = "127.0.0.1"
 BUFFER = 65_536  # bytes a device keeps for a computer that does not read; what is more is lost, as in reality
+STALLED = 0.5  # s without a byte taken after which the computer counts as one that does not read
 TICK = 0.002  # s
 
 
@@ -213,6 +214,7 @@ class _Bench:
         self.unplug_at = pace.unplug_after
         self.out = b""
         self.began, self.sent, self.ran = 0.0, 0, False
+        self.read_at = 0.0  # when the other end last took something
 
     def turn(self) -> None:
         """Do what is due."""
@@ -224,16 +226,31 @@ class _Bench:
             self.began, self.sent, self.ran = now, 0, True
         if self.device.running:
             self._run(now)
-        self.out = self.out[self.end.write(self.out):] if self.out else b""
+        self._speak(now)
         if not self.device.running and self.ran and self.pace.once and now - self.device.heard > SILENCE:
             self.over = True
 
+    def _speak(self, now: float) -> None:
+        taken = self.end.write(self.out) if self.out else 0
+        if taken or not self.out:
+            self.read_at = now
+        self.out = self.out[taken:]
+
+    def _due(self, now: float) -> int:
+        """Number of samples to make now.
+
+        A bench that was kept from running makes up for it as fast as it is read: the samples are late, not lost.
+        """
+        rate, stalled = self.device.header.rate, now - self.read_at > STALLED
+        if not self.pace.speed:
+            return 0 if self.out else 100
+        if len(self.out) > BUFFER // 2 and not stalled:
+            return 0
+        due = int((now - self.began) * rate * self.pace.speed)
+        return min(due - self.sent, int(0.05 * rate) + 1)
+
     def _run(self, now: float) -> None:
-        rate = self.device.header.rate
-        if self.pace.speed:
-            n = min(int((now - self.began) * rate * self.pace.speed) - self.sent, int(0.1 * rate) + 1)
-        else:
-            n = 0 if self.out else 100
+        rate, n = self.device.header.rate, self._due(now)
         if self.unplug_at is not None:
             n = min(n, int(self.unplug_at * rate) - self.sent)
         frames = self.device.run(n)

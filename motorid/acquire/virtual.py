@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from motorid.acquire.excitation import Segment
+from motorid.acquire.excitation import Program, Segment
 from motorid.acquire.hidden import Truth
 from motorid.acquire.protocol import SILENCE, Channel, Decoder, Header, Message, frame
 from motorid.datasets import load_plant
@@ -62,7 +62,7 @@ class VirtualDevice:
         self._start: tuple[int, int] = (counter0, time0)
         self._made, self._over, self._why = 0, 0, "end"
         self._noise: list[list[float]] = []
-        self._volts: list[int] = []
+        self._program, self._length = Program(), 0
         self.heard = 0.0  # clock of the computer when the last valid frame came
         self._raw = [_CONVERT[c] for c in channels]
 
@@ -83,7 +83,7 @@ class VirtualDevice:
         """Make up to n samples and return their frames; the last one is followed by ``E,done``."""
         frames: list[bytes] = []
         for _ in range(n if self.running else 0):
-            if self._made >= len(self._volts) and self._segments:
+            if self._made >= self._length and self._segments:
                 frames.append(self._stop("end"))
                 break
             frames.append(self._sample())
@@ -93,7 +93,7 @@ class VirtualDevice:
         return frames
 
     def _sample(self) -> bytes:
-        mv = self._volts[self._made] if self._segments else 0
+        mv = round(1e3 * (self._program.at(self._made, self.header.rate) or 0.0))
         seen = self._plant.measured()
         if not self._made % BLOCK:
             self._noise = self._rng.normal(0.0, NOISE, size=(BLOCK, 2)).tolist()
@@ -144,9 +144,8 @@ class VirtualDevice:
         if self._armed:
             if int(segments) != len(self._segments):
                 return frame("E", "refused", "segments are missing")
-            rate = self.header.rate
-            volts = [s.volts(rate) for s in self._segments] or [np.zeros(0)]
-            self._volts = np.round(np.concatenate(volts) * 1e3).astype(int).tolist()
+            self._program = Program(tuple(self._segments))
+            self._length = self._program.count(self.header.rate)
             self._plant = load_plant().Plant(self.truth.motor, self.truth.effects)
             self._start, self._made, self._over = (self._counter, self._time), 0, 0
             self._armed, self.running = False, True

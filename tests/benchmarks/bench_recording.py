@@ -50,7 +50,8 @@ def measure(rate: int, seconds: float, folder: Path) -> str:
     empty = sum("" in x for x in samples)
     return (f"{rate} Hz, {seconds:g} s: {len(samples)} rows of {round(rate * seconds)}, {empty} empty; "
             f"wall {wall:.2f} s; CPU recorder {100 * used / wall:.1f} %, "
-            f"bench {100 * bench_used / wall:.1f} % of one core; {out.stat().st_size / 1e6:.1f} MB\n  {done.stdout.splitlines()[1]}")
+            f"bench {100 * bench_used / wall:.1f} % of one core; {out.stat().st_size / 1e6:.1f} MB\n"
+            f"  {done.stdout.splitlines()[1]}")
 
 
 def main() -> None:
