@@ -109,8 +109,9 @@ def bench(
     """
     import numpy as np
 
+    from motorid.acquire.ends import open_end
     from motorid.acquire.hidden import hide
-    from motorid.acquire.serve import Pace, open_end, serve
+    from motorid.acquire.serve import Pace, serve
     from motorid.acquire.virtual import VirtualDevice
 
     seed = secrets.randbelow(1_000_000) if seed is None else seed

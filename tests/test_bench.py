@@ -578,7 +578,8 @@ def test_faults_on_the_wire_are_counted_over_the_pseudo_terminal_too(out):
 
 
 def test_where_there_are_no_pseudo_terminals_a_loopback_socket_serves(out, monkeypatch):
-    from motorid.acquire.serve import LOOPBACK, Pace, Socket, open_end, serve
+    from motorid.acquire.ends import LOOPBACK, Socket, open_end
+    from motorid.acquire.serve import Pace, serve
 
     monkeypatch.delattr(os, "openpty", raising=False)
     end = open_end()
