@@ -11,6 +11,7 @@ import numpy as np
 
 from motorid.errors import DataError, MissingDependency
 from motorid.experiment import MIN_SAMPLES
+from motorid.matfile import check_whole
 from motorid.table import Table, counted, numbers, unique_labels
 
 __all__ = ["mat_table", "parquet_table"]
@@ -29,6 +30,7 @@ def mat_table(data: bytes) -> Table:
     """
     if data.startswith(b"\x89HDF") or b"MATLAB 7.3" in data[:128]:
         raise DataError("it is a MATLAB 7.3 file; save it with save(..., '-v7'), or export CSV.")
+    check_whole(data)
     arrays = dict(_arrays("", _load(data)))
     if not arrays:
         raise DataError(f"it holds no numeric arrays of at least {MIN_SAMPLES} samples.")

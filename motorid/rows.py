@@ -60,15 +60,19 @@ def build(columns: Mapping[str, Array], texts: Texts, layout: Layout, *, name: s
     extra = {c: a[rows] for c, a in columns.items() if c not in used}
     if set(texts) - used:
         said.append(f"left out columns of text: {', '.join(sorted(set(texts) - used))}.")
-    facts = {"notes": said, "extra": extra, "columns": {c: p.column for c, p in layout.places.items()},
-             "original_units": {c: p.unit.label for c, p in layout.places.items()},
-             "assumed_units": [c for c, p in layout.places.items() if not p.stated]}
+    facts = {**(meta or {}), **_origin(layout), "notes": said, "extra": extra}
     units = {c: places[c].unit.symbol for c in ("v", *outputs)}
     try:
-        return Experiment(t, {"v": v}, outputs, sigma=sigma or {}, units=units, name=name,
-                          hold=hold, meta={**(meta or {}), **facts})  # type: ignore[arg-type]
+        return Experiment(t, {"v": v}, outputs, sigma or {}, hold, units, name, facts)  # type: ignore[arg-type]
     except DataError as error:
         raise DataError(str(error).removeprefix(f"{name}: ")) from None
+
+
+def _origin(layout: Layout) -> dict[str, object]:
+    places = layout.places
+    return {"columns": {c: p.column for c, p in places.items()},
+            "original_units": {c: p.unit.label for c, p in places.items()},
+            "assumed_units": [c for c, p in places.items() if not p.stated]}
 
 
 def _channel(columns: Mapping[str, Array], texts: Texts, place: Place, channel: str) -> Array:

@@ -71,7 +71,7 @@ def test_any_bytes_give_a_data_error_or_a_run(tmp_path, data):
 
 
 @pytest.mark.parametrize("kind", [".mat", ".parquet"])
-@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(start=st.integers(0, 1000), junk=st.binary(min_size=1, max_size=40))
 def test_damaged_binary_formats_give_a_data_error_or_a_run(tmp_path, kind, start, junk):
     good = tmp_path / f"good{kind}"
@@ -86,6 +86,16 @@ def test_damaged_binary_formats_give_a_data_error_or_a_run(tmp_path, kind, start
         assert str(path) in str(error)  # noqa: PT017
 
 
+def test_a_mat_file_that_would_end_the_process_is_refused(tmp_path):
+    _write_binary(tmp_path / "run.mat")
+    data = (tmp_path / "run.mat").read_bytes()
+    numbers = data.index(b"\x09\0\0\0\x90\x01\0\0")  # 50 doubles
+    for damage in (b"\x67", b"\x09\0\0\0\x90\x11", b"\x09\0\0\0\0\x01"):
+        broken = data[:numbers] + damage + data[numbers + len(damage):]
+        with pytest.raises(DataError, match="damaged MATLAB file"):
+            read_mat(write(tmp_path, broken, "bad.mat"))
+
+
 def _write_binary(path: Path) -> None:
     import pandas as pd
     from scipy.io import savemat
@@ -93,7 +103,7 @@ def _write_binary(path: Path) -> None:
     t = np.arange(50) * 0.01
     columns = {"time": t, "voltage": np.sign(np.sin(9 * t)), "speed_rpm": 100 * t}
     if path.suffix == ".mat":
-        savemat(path, columns)
+        savemat(path, {"note": "x", "log": columns, "c": np.array(["a", 1.0, t], dtype=object)})
     else:
         pd.DataFrame(columns).to_parquet(path)
 
@@ -360,6 +370,9 @@ def test_matlab_variables_structures_and_matrices(tmp_path):
     savemat(tmp_path / "b.mat", {"log": {"time": t, "voltage_V": np.sin(t), "motor": {"speed_rpm": t}}})
     b = read_runs(tmp_path / "b.mat")[0]
     np.testing.assert_allclose(b.outputs["omega"], t * 2 * np.pi / 60)
+    savemat(tmp_path / "b.mat", {"log": {"time": t, "voltage_V": np.sin(t), "speed_rpm": t},
+                                 "cell": np.array(["a", 1.0], dtype=object), "none": []}, do_compression=True)
+    assert read_runs(tmp_path / "b.mat")[0].n == 40
     savemat(tmp_path / "c.mat", {"data": np.column_stack([t, np.sin(t), np.cos(t)])})
     c = read_mat(tmp_path / "c.mat", columns={"t": "data_1", "v": "data_2", "theta": 3})
     np.testing.assert_array_equal(c.outputs["theta"], np.cos(t))
