@@ -1,0 +1,142 @@
+"""The loop: rank, refit the best, keep what lowers the held-out error, drop what has become superfluous, repeat.
+
+A beam of a few models is carried along, so that a wrong first choice (Coulomb where the friction grows with the
+load) can be overtaken, and after each addition the earlier effects are tried without.
+"""
+
+from __future__ import annotations
+
+import builtins
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from motorid.diagnosis.evidence import compare_errors
+from motorid.diagnosis.results import Candidate, Ladder, Rung
+from motorid.diagnosis.search import Node, Search, library
+from motorid.experiment import Experiment
+from motorid.fit import Fit
+from motorid.model import Effect
+
+BEAM = 2
+HALF_AS_GOOD = 0.5  # of the best child's fall: what a second model must reach to be carried along
+
+
+@dataclass(frozen=True, eq=False)
+class Climb:
+    """What the loop went through: the final path, and per round the candidates and the group of the choice."""
+
+    search: Search
+    path: tuple[Node, ...]
+    rounds: tuple[tuple[Candidate, ...], ...]
+    groups: tuple[tuple[str, ...], ...]
+    text: str
+
+
+def climb(search: Search, max_effects: int, advance: Callable[[str], None]) -> Climb:
+    """Run the loop until nothing more is worth adding."""
+    best, frontier = search.root, [search.root]
+    rounds: list[tuple[Candidate, ...]] = []
+    groups: list[tuple[str, ...]] = []
+    text = f"stopped at the limit of {max_effects} effects"
+    for _ in range(max_effects):
+        children: dict[frozenset[str], Node] = {}
+        for k, node in enumerate(frontier):
+            grown, listed = search.expand(node)
+            if k == 0:
+                rounds.append(tuple(listed))
+            children |= {c.key: c for c in grown if c.key not in children}
+        chosen = search.choose(list(children.values()))
+        if chosen is None or not search.beats(chosen[0], best):
+            text = "stopped: no further effect lowers the error on data it was not fitted to"
+            break
+        new, ordered = chosen
+        group = search.group(new, ordered)
+        search.nodes |= children
+        if new.parent is frontier[0]:
+            rounds[-1] = _marked(rounds[-1], new.added, group)
+        groups.append((new.added or "", *group) if group else ())
+        best = search.pruned(new)
+        frontier = [best, *_runners_up(search, best, ordered)][:BEAM]
+        advance(f"accepted {new.added}")
+    return Climb(search, tuple(_path(search, best)), tuple(rounds), tuple(g for g in groups if g), text)
+
+
+def _runners_up(search: Search, best: Node, ordered: Sequence[Node]) -> list[Node]:
+    """Children that came near enough to be grown too, those of another kind than the best."""
+    goal = compare_errors(search.root.train, best.train, search.held.noise).fall
+    return [n for n in ordered if n.key != best.key
+            and compare_errors(search.root.train, n.train, search.held.noise).fall > HALF_AS_GOOD * goal]
+
+
+def _marked(listed: Sequence[Candidate], name: str | None, group: tuple[str, ...]) -> tuple[Candidate, ...]:
+    return tuple(replace(c, accepted=True, group=group) if c.effect == name else c for c in listed)
+
+
+def _path(search: Search, last: Node) -> list[Node]:
+    """Return the models from the root to `last`, one effect at a time, most helpful first where the way was pruned."""
+    path, node = [last], last
+    while node.parent is not None and len(path) < 10:
+        node = node.parent
+        if len(node.key) < len(path[0].key) and node.key < path[0].key:
+            path.insert(0, node)
+    if path[0] is not search.root:
+        path.insert(0, search.root)
+    return path
+
+
+def ladder_of(found: Climb, validated: bool) -> Ladder:
+    """Return the rungs of a climb."""
+    rungs: list[Rung] = []
+    before: frozenset[str] = search_key(found.path[0])
+    for k, node in enumerate(found.path):
+        names = [n for n in node.fit.problem.model.effect_names if n not in before]
+        removed = tuple(sorted(before - search_key(node)))
+        candidates = found.rounds[k] if k < len(found.rounds) else ()
+        rungs.append(Rung(" + ".join(names) or None, node.fit, node.train.nrmse(),
+                          node.held.nrmse() if validated else None, removed, candidates))
+        before = search_key(node)
+    return Ladder(tuple(rungs), found.text)
+
+
+def search_key(node: Node) -> frozenset[str]:
+    """Names of the effects of a node."""
+    return node.key
+
+
+def improve(
+    fit: Fit,
+    validate: Sequence[Experiment] | Experiment | None = None,
+    *,
+    effects: Iterable[Effect | str] | None = None,
+    also: Iterable[Effect] = (),
+    max_effects: int = 3,
+    map: Callable[..., Iterable[Any]] = builtins.map,
+    progress: Callable[[str], None] | None = None,
+) -> Ladder:
+    """Add effects one by one, as long as the error on held-out data falls.
+
+    Parameters
+    ----------
+    fit : Fit
+        Of the model to begin with.
+    validate : Experiment or sequence of Experiment, optional
+        Held-out runs; without them, blocks of the fitted runs are held out in turn.
+    effects : iterable of Effect or str, optional
+        What to try; by default the whole library.
+    also : iterable of Effect, optional
+        Effects of your own, tried beside the library's.
+    max_effects : int
+    map : callable
+        Anything with the signature of `map`, for the refits (a process pool's, Dask's).
+    progress : callable, optional
+        Called with a word on what was done.
+
+    Returns
+    -------
+    Ladder
+        The models with training and held-out error; ``ladder.best`` is the last fit, to go on from.
+    """
+    say = progress or (lambda word: None)
+    search = Search(fit, validate, library(effects, also), map, say)
+    return ladder_of(climb(search, max_effects, say), validate is not None)

@@ -1,0 +1,85 @@
+"""How the fitted model answers to an unknown voltage and an unknown torque, sample by sample.
+
+Along the model's own trajectory, ``δx⁺ = A δx + B d`` and ``δy = C δx`` with d = (voltage, torque) held over each
+sample. Both the search for angle orders and the estimate of what is missing rest on these matrices.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import casadi as ca
+import numpy as np
+
+from motorid.fit import Fit
+from motorid.integrate.grid import Array
+from motorid.integrate.step import rosenbrock_step
+from motorid.system import System
+
+
+@dataclass(frozen=True, eq=False)
+class Response:
+    """Linear response of one run.
+
+    Attributes
+    ----------
+    a : ndarray, shape (N-1, nx, nx)
+    b : ndarray, shape (N-1, nx, 2)
+        To a voltage (V) and a torque (N·m) held over the sample.
+    c : ndarray, shape (N, ny, nx)
+    states : dict of str to ndarray
+    """
+
+    a: Array
+    b: Array
+    c: Array
+    states: dict[str, Array]
+
+
+@lru_cache(maxsize=64)
+def _disturbed(system: System) -> tuple[ca.Function, ca.Function]:
+    nx, nu, np_, _ = system.sizes
+    x, u0, u1 = ca.SX.sym("x", nx), ca.SX.sym("u0", nu), ca.SX.sym("u1", nu)
+    h, p, d = ca.SX.sym("h"), ca.SX.sym("p", np_), ca.SX.sym("d", 2)
+    xs, us, ps, ds = ca.SX.sym("x", nx), ca.SX.sym("u", nu), ca.SX.sym("p", np_), ca.SX.sym("d", 2)
+    wider = replace(system, rhs=ca.Function("rhs", [xs, ca.vertcat(us, ds), ps], [system.forces(xs, us, ps, ds)]))
+    x_next, _ = rosenbrock_step(wider, x, ca.vertcat(u0, d), ca.vertcat(u1, d), h, p)
+    results = [x_next, ca.jacobian(x_next, x), ca.jacobian(x_next, d)]
+    step = ca.Function("disturbed", [x, u0, u1, h, p, d], ca.cse([ca.densify(r) for r in results]))
+    y = system.out(xs, us, ps)
+    return step, ca.Function("shown", [xs, us, ps], [ca.densify(y), ca.densify(ca.jacobian(y, xs))])
+
+
+def linear_steps(system: System, grid, x: Array, p: Array, d: Array) -> tuple[Array, Array, Array]:
+    """Return one step from every sample, (x⁺, A, B), vectorised; `d` (N-1, 2), `x` (N, nx)."""
+    step, _ = _disturbed(system)
+    n, nx = len(grid.dt), len(system.states)
+    x_next, a, b = step.map(n)(x[:-1].T, grid.u0.T, grid.u1.T, grid.dt[None, :], np.tile(p[:, None], (1, n)), d.T)
+    return (np.asarray(x_next).T, np.asarray(a).reshape(nx, n, nx).transpose(1, 0, 2),
+            np.asarray(b).reshape(nx, n, 2).transpose(1, 0, 2))
+
+
+def shown(system: System, grid, x: Array, p: Array) -> tuple[Array, Array]:
+    """Return (y, C) at every sample."""
+    _, out = _disturbed(system)
+    n, (nx, _, _, ny) = len(x), system.sizes
+    y, c = out.map(n)(x.T, grid.u.T, np.tile(p[:, None], (1, n)))
+    return np.asarray(y).T, np.asarray(c).reshape(ny, n, nx).transpose(1, 0, 2)
+
+
+def parameter_vector(fit: Fit) -> Array:
+    """Return the system's p of a fit."""
+    return np.array([fit.values[n] for n in fit.problem.system.parameters])
+
+
+def responses(fit: Fit) -> list[Response]:
+    """Return the linear response of every run of `fit`."""
+    system, p = fit.problem.system, parameter_vector(fit)
+    found = []
+    for run, sim in zip(fit.problem.runs, fit.simulations, strict=True):
+        x = np.column_stack([sim.states[s] for s in system.states])
+        _, a, b = linear_steps(system, run.grid, x, p, np.zeros((len(x) - 1, 2)))
+        _, c = shown(system, run.grid, x, p)
+        found.append(Response(a, b, c, dict(sim.states)))
+    return found

@@ -1,0 +1,268 @@
+"""Growing a model by one effect, judging the children, choosing among them, pruning.
+
+Every addition must lower
+the error on data it was not fitted to, be worth its parameters on effective samples (BIC, Schwarz 1978), be
+identifiable and have its physical sign; on a tie the smaller model wins.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from motorid.diagnosis.evidence import Errors, Gain, compare_errors
+from motorid.diagnosis.rank import Score, rank
+from motorid.diagnosis.results import Candidate
+from motorid.diagnosis.trial import LEAST_FALL, WORST_CONDITION, HeldOut, condition, objections, refit, train_errors
+from motorid.effects import LIBRARY
+from motorid.errors import ModelError, SimulationError
+from motorid.experiment import Experiment
+from motorid.fit import Fit
+from motorid.model import Effect, Model
+from motorid.prepared import natural_sizes
+
+SHORTLIST = 6
+ALWAYS = ("compliance", "speed_lag", "speed_delay")  # their score at null says little
+EVIDENCE = 4.0  # log likelihood ratio beyond the price of the parameters
+TIE = 3.0  # log likelihood ratio below which two models count as equal
+CLOSE = 0.01  # relative error below which two models count as equal
+
+Advance = Callable[[str], None]
+
+
+@dataclass(frozen=True, eq=False)
+class Node:
+    """One model in the search: its fit and its errors, on the records and held out."""
+
+    fit: Fit
+    added: str | None
+    train: Errors
+    held: Errors
+    parent: Node | None = None
+    candidate: Candidate | None = None
+    children: tuple[Candidate, ...] = ()
+
+    @property
+    def key(self) -> frozenset[str]:
+        return frozenset(self.fit.problem.model.effect_names)
+
+    @property
+    def size(self) -> int:
+        return len(self.fit.problem.model.free_names)
+
+
+def node_of(fit: Fit, held: HeldOut, added: str | None = None, parent: Node | None = None) -> Node:
+    """Judge a fit.
+
+    Raises
+    ------
+    SimulationError
+        If it cannot be simulated on the held-out runs.
+    """
+    return Node(fit, added, train_errors(fit), held.errors(fit), parent)
+
+
+def library(effects: Iterable[Effect | str] | None, also: Iterable[Effect] = ()) -> list[Effect]:
+    """Return the effects to try: the whole library, or those named, and the user's own."""
+    from motorid.effects import get
+
+    chosen = list(LIBRARY.values()) if effects is None else [get(e) if isinstance(e, str) else e for e in effects]
+    return chosen + [e for e in also if e.name not in {c.name for c in chosen}]
+
+
+class Search:
+    """One search over models; `expand` and `choose` are its two moves."""
+
+    def __init__(self, fit: Fit, validate: Sequence[Experiment] | Experiment | None, effects: Sequence[Effect],
+                 map_: Callable[..., Iterable[Any]], advance: Advance) -> None:
+        self.held = HeldOut.of(fit, validate)
+        self.effects, self.map, self.advance = list(effects), map_, advance
+        self.root = node_of(fit, self.held)
+        self.nodes: dict[frozenset[str], Node] = {self.root.key: self.root}
+
+    # -- expanding -------------------------------------------------------------------------------------
+    def expand(self, node: Node) -> tuple[list[Node], list[Candidate]]:
+        """Return the judged models one effect larger, and a candidate for every effect, best score first."""
+        present = node.fit.model
+        fresh, wider = self._takeable(present)
+        scores = rank(node.fit, fresh, lambda: None)
+        self.advance(f"ranked {len(scores)} effects")
+        short = scores[:SHORTLIST] + [s for s in scores[SHORTLIST:] if s.effect.name in ALWAYS]
+        tasks = [(node.fit, present + s.effect, s.starts[:3]) for s in short if s.drop > 0 or s.effect.name in ALWAYS]
+        names = [s.effect for s in short if s.drop > 0 or s.effect.name in ALWAYS]
+        for e in wider:
+            model, start = _widened(node.fit, e)
+            tasks.append((node.fit, model, start))
+            names.append(e)
+        fits = list(self.map(_refit_task, tasks))
+        self.advance(f"refitted {len(fits)}")
+        children, judged = [], {}
+        for e, fit in zip(names, fits, strict=True):
+            child, candidate = self._judge(node, e, fit)
+            judged[e.name] = candidate
+            if child is not None:
+                children.append(child)
+        return children, self._listed(scores, judged)
+
+    def _takeable(self, model: Model) -> tuple[list[Effect], list[Effect]]:
+        """Split the effects into those that can be added and those that would take an earlier one's place."""
+        fresh, wider = [], []
+        have = set(model.effect_names)
+        contained = {i for e in model.effects for i in e.includes}
+        for e in self.effects:
+            if e.name in have or e.name in contained:
+                continue
+            if have & set(e.includes):
+                wider.append(e)
+                continue
+            try:
+                grown = model + e
+                self.root.fit.problem.for_model(grown)
+            except ModelError:
+                continue
+            fresh.append(e)
+        return fresh, wider
+
+    def _judge(self, node: Node, effect: Effect, fit: Fit | None) -> tuple[Node | None, Candidate]:
+        candidate = Candidate(effect.name, 0.0)
+        if fit is None:
+            return None, replace(candidate, reason="its refit could not be simulated")
+        train = train_errors(fit)
+        drop = _drop(node, train)
+        values = {p.name: fit.values[p.name] for p in effect.parameters}
+        candidate = replace(candidate, refit_drop=drop, parameters=values, fit=fit)
+        why = objections(fit, effect)
+        if why:
+            return None, replace(candidate, reason=why)
+        worse, was = condition(fit), condition(node.fit)
+        if worse > WORST_CONDITION and worse > 10 * was:
+            return None, replace(candidate, reason=f"not identifiable with these data: the condition number of the "
+                                                   f"sensitivities rises from {was:.0f} to {worse:.0f}")
+        gain = compare_errors(node.train, train, self.held.noise)
+        price = EVIDENCE + 0.5 * _extra(node, fit) * np.log(max(gain.effective, 2.0))
+        if gain.log_ratio < price:
+            return None, replace(candidate, reason="the improvement is within what noise and chance would give")
+        try:
+            held = self.held.errors(fit)
+        except SimulationError as error:
+            return None, replace(candidate, reason=f"fails on held-out data: {error}")
+        gain = compare_errors(node.held, held, self.held.noise)
+        candidate = replace(candidate, validation_nrmse=held.nrmse())
+        why = _held_out_objection(gain)
+        if why:
+            return None, replace(candidate, reason=why)
+        candidate = replace(candidate, reason=f"lowers the held-out error by {100 * gain.fall:.1f} %")
+        return Node(fit, effect.name, train, held, node, candidate), candidate
+
+    @staticmethod
+    def _listed(scores: Sequence[Score], judged: Mapping[str, Candidate]) -> list[Candidate]:
+        listed = []
+        for s in scores:
+            c = judged.get(s.effect.name)
+            if c is None:
+                c = Candidate(s.effect.name, s.drop, parameters=dict(s.starts[0]) if s.starts else {},
+                              reason="too little to gain for a refit")
+            listed.append(replace(c, predicted_drop=s.drop))
+        rest = [c for n, c in judged.items() if n not in {s.effect.name for s in scores}]
+        return listed + rest
+
+    # -- choosing --------------------------------------------------------------------------------------
+    def choose(self, children: Sequence[Node]) -> tuple[Node, list[Node]] | None:
+        """Return the best child, the smaller on a tie, and the children in order; None without any."""
+        if not children:
+            return None
+        ordered = sorted(children, key=lambda n: -self._worth(n))
+        top = ordered[0]
+        tied = [n for n in ordered if n is top or self._tied(top, n)]
+        chosen = min(tied, key=lambda n: (n.size, -self._worth(n)))
+        return chosen, ordered
+
+    def _worth(self, node: Node) -> float:
+        held = compare_errors(self.root.held, node.held, self.held.noise)
+        train = compare_errors(self.root.train, node.train, self.held.noise)
+        return -float(np.log(max(1 - held.fall, 1e-12)) + 0.5 * np.log(max(1 - train.fall, 1e-12)))
+
+    def _tied(self, best: Node, other: Node) -> bool:
+        held = compare_errors(other.held, best.held, self.held.noise)
+        train = compare_errors(other.train, best.train, self.held.noise)
+        return (held.log_ratio < TIE or held.fall < CLOSE) and (train.log_ratio < TIE or train.fall < CLOSE)
+
+    def beats(self, new: Node, old: Node) -> bool:
+        """Tell whether `new` is worth its extra parameters over `old`."""
+        gain = compare_errors(old.train, new.train, self.held.noise)
+        price = EVIDENCE + 0.5 * max(new.size - old.size, 0) * np.log(max(gain.effective, 2.0))
+        held = compare_errors(old.held, new.held, self.held.noise)
+        return gain.log_ratio > price and not _held_out_objection(held)
+
+    def pruned(self, node: Node) -> Node:
+        """Return `node` without the effects that have become superfluous."""
+        for name in node.fit.problem.model.effect_names[:-1]:
+            smaller = self._without(node, name)
+            if smaller is not None and not self.beats(node, smaller):
+                return self.pruned(smaller)
+        return node
+
+    def _without(self, node: Node, name: str) -> Node | None:
+        model = node.fit.model.without(name)
+        key = frozenset(model.effect_names)
+        if key not in self.nodes:
+            fit = refit(node.fit, model, ({n: node.fit.values[n] for n in model.parameters},))
+            if fit is None:
+                return None
+            try:
+                self.nodes[key] = node_of(fit, self.held, node.added, node.parent)
+            except SimulationError:
+                return None
+        return self.nodes[key]
+
+    def group(self, chosen: Node, siblings: Sequence[Node]) -> tuple[str, ...]:
+        """Names of the siblings that these data cannot tell from `chosen`."""
+        includes = {e.name: e.includes for e in self.effects}
+        return tuple(n.added for n in siblings if n is not chosen and n.added and n.parent is chosen.parent
+                     and chosen.added not in includes.get(n.added, ()) and self._tied(n, chosen)
+                     and self._tied(chosen, n))
+
+
+def _held_out_objection(gain: Gain) -> str:
+    if gain.fall < LEAST_FALL:
+        return f"the held-out error does not fall ({100 * gain.fall:+.1f} %)"
+    if gain.log_ratio < TIE:
+        return "the held-out error falls by no more than chance would give"
+    if gain.worst < -0.05 - 0.5 * gain.fall:
+        return f"one channel's held-out error grows by {-100 * gain.worst:.0f} %"
+    return ""
+
+
+def _extra(node: Node, fit: Fit) -> int:
+    return max(len(fit.problem.model.free_names) - node.size, 1)
+
+
+def _drop(node: Node, train: Errors) -> float:
+    """Share of chi² that vanishes, with the weights of the smaller model."""
+    noise = {c: s * node.fit.problem.balance.get(c, 1.0) for run in node.fit.problem.runs for c, s in run.sigma.items()}
+    old, new = (sum(ss / noise[c] ** 2 for c, (ss, _) in e.squares().items() if c in noise) for e in (node.train, train))
+    return float(1 - new / max(old, 1e-300))
+
+
+def _widened(fit: Fit, effect: Effect) -> tuple[Model, list[dict[str, float]]]:
+    """Return the model with `effect` in the place of those that it includes, and starts that begin where they were."""
+    model, level = fit.model, 0.0
+    for e in model.effects:
+        if e.name in effect.includes:
+            level = max([level, *(fit.values[p.name] for p in e.parameters if p.null == 0)])
+            model = model.without(e.name)
+    model = model + effect
+    natural = natural_sizes(fit.problem.experiments, fit.values)
+    sizes = {p.name: level * (1.3 if p.at_least else 1.0) for p in effect.parameters if p.null == 0}
+    shapes = [[(p.name, g * natural.get(p.unit, 1.0)) for g in p.grid] for p in effect.parameters
+              if p.null is None and p.grid]
+    return model, [{**sizes, **dict(point)} for point in itertools.product(*shapes)][:6]
+
+
+def _refit_task(task: tuple[Fit, Model, Sequence[Mapping[str, float]]]) -> Fit | None:
+    fit, model, starts = task
+    return refit(fit, model, starts)

@@ -1,0 +1,197 @@
+"""Trying an effect for real: refit with it, judge it on data that it never saw, refuse what is not identifiable."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from motorid.descent import descend, misfit_over_noise
+from motorid.diagnosis.evidence import Errors, effective_samples
+from motorid.diagnosis.rank import uses_angle
+from motorid.errors import FitError, ModelError, SimulationError
+from motorid.experiment import Experiment
+from motorid.fit import Fit
+from motorid.least_squares import LevenbergMarquardt
+from motorid.model import Effect, Model
+from motorid.problem import Problem
+from motorid.simulate import at, simulated
+
+QUICK = LevenbergMarquardt(max_iterations=25, ftol=1e-4, xtol=1e-5)
+POLISH = LevenbergMarquardt(max_iterations=60, ftol=1e-7, xtol=1e-7)
+BLOCKS = 10  # contiguous parts of each run; every other one is held out where there are no held-out runs
+WORST_CONDITION = 1e4  # of the column-scaled Jacobian
+SIGNIFICANT = 3.0  # standard deviations
+LEAST_FALL = 0.01  # of the held-out error that makes an effect worth having
+
+
+@dataclass(frozen=True, eq=False)
+class HeldOut:
+    """Where models are judged.
+
+    Attributes
+    ----------
+    validation : Problem or None
+        Held-out runs, of the model to begin with.
+    folds : tuple of (training Problem, test Experiments)
+        Without held-out runs: every other block of the records, twice.
+    noise : dict of str to float
+    """
+
+    validation: Problem | None
+    folds: tuple[tuple[Problem, tuple[Experiment, ...]], ...]
+    noise: Mapping[str, float]
+
+    @staticmethod
+    def of(fit: Fit, validate: Sequence[Experiment] | Experiment | None) -> HeldOut:
+        """Prepare the judgement for models of `fit`'s records."""
+        noise = {c: s for run in fit.problem.runs for c, s in run.sigma.items()}
+        if validate is not None:
+            runs = (validate,) if isinstance(validate, Experiment) else tuple(validate)
+            return HeldOut(fit.problem.with_(experiments=runs, model=fit.model, priors={}, penalties=(), balance={}),
+                           (), noise)
+        folds = []
+        for odd in (0, 1):
+            train, test = zip(*(_blocked(r, odd) for r in fit.problem.experiments), strict=True)
+            prepared = tuple(replace(run, experiment=e) for run, e in zip(fit.problem.runs, train, strict=True))
+            problem = fit.problem.with_(experiments=train, priors={}, penalties=())
+            folds.append((replace(problem, _runs=prepared), test))
+        return HeldOut(None, tuple(folds), noise)
+
+    def errors(self, fit: Fit) -> Errors:
+        """Return the held-out errors of `fit`, refitted to the training part of each fold where there are folds.
+
+        Raises
+        ------
+        SimulationError
+        """
+        if self.validation is not None:
+            return Errors.of(simulated(self.validation.for_model(fit.model)))
+        parts = []
+        for problem, test in self.folds:
+            start = problem.for_model(fit.model).balanced(fit.problem.balance)
+            q = start.scaling.scaled([fit.initial.get(p.name, p.value) for p in start.unknown])
+            done = descend(_from(start, q), QUICK, stages=False)
+            parts.append(Errors.of(at(done.problem, done.solution.q), test))
+        return Errors({c: [r for e in parts for r in e.residuals[c]] for c in parts[0].residuals}, parts[0].measured)
+
+
+def _from(problem: Problem, q) -> Problem:
+    """Return the problem with the values at `q` as its start, initial states too."""
+    values = problem.values(q)
+    physical = dict(zip([p.name for p in problem.unknown], problem.scaling.physical(q), strict=True))
+    runs = []
+    for k, run in enumerate(problem.runs):
+        start = run.start.copy()
+        for j, c in enumerate(("i", "omega", "theta")):
+            start[j] = physical.get(f"{c}_0[{k}]", start[j])
+        runs.append(replace(run, start=start))
+    return replace(problem, model=problem.model.start_at(values), _runs=tuple(runs))
+
+
+def _blocked(run: Experiment, odd: int) -> tuple[Experiment, Experiment]:
+    """Return the run with every other block missing, and with the others missing."""
+    block = np.minimum(np.arange(run.n) * BLOCKS // run.n, BLOCKS - 1) % 2 == odd
+    hidden = {c: np.where(block, np.nan, y) for c, y in run.outputs.items()}
+    judged = {c: np.where(block, y, np.nan) for c, y in run.outputs.items()}
+    keep = {c: y for c, y in hidden.items() if np.isfinite(y).any()}
+    return run.with_(outputs=keep or run.outputs), run.with_(outputs=judged)
+
+
+def refit(fit: Fit, model: Model, starts: Sequence[Mapping[str, float]]) -> Fit | None:
+    """Return the best refit of `model` on the records of `fit` from several starts; None if none can be simulated.
+
+    Effects of the angle start along the measured angle, which the model's own angle, still wrong, would lead
+    astray; then the model's angle takes over.
+    """
+    best: tuple[float, Problem, Any] | None = None
+    angular = any(uses_angle(e) for e in model.effects) and not any(uses_angle(e) for e in fit.model.effects)
+    for start in starts or ({},):
+        names = [n for n in start if n in model.parameters]
+        problem = fit.problem.for_model(_within(model, {n: start[n] for n in names}))
+        q = problem.scaling.scaled([fit.initial.get(p.name, p.value) for p in problem.unknown])
+        problem = _from(problem, q)
+        try:
+            if angular:
+                led = problem.for_model(replace(problem.model, angle_input=True, _systems={}))
+                done = descend(led, QUICK, stages=True)
+                problem = _from(problem, done.solution.q)
+            done = descend(problem, QUICK, stages=not angular)
+        except (FitError, SimulationError, ModelError, np.linalg.LinAlgError):
+            continue
+        cost = done.solution.history[-1]
+        if best is None or cost < best[0]:
+            best = (cost, _from(done.problem, done.solution.q), done)
+    return None if best is None else _polished(fit, best[1])
+
+
+def _polished(fit: Fit, problem: Problem) -> Fit | None:
+    """Converge from a good start, channels weighed anew where the misfit has changed."""
+    try:
+        done = descend(problem, POLISH, stages=False)
+        if problem.balance:
+            factors = misfit_over_noise(done.problem, done.solution.q)
+            if max(abs(np.log(factors[c] / problem.balance.get(c, 1.0))) for c in factors) > 0.1:
+                done = descend(_from(done.problem, done.solution.q).balanced(factors), POLISH, stages=False)
+    except (FitError, SimulationError):
+        return None
+    found, problem = done.solution, done.problem
+    return Fit(problem, problem.values(found.q), found.residual, found.jac / problem.scaling.slope(found.q), found.q,
+               found.status, found.message, done.history)
+
+
+def _within(model: Model, values: Mapping[str, float]) -> Model:
+    """Return the model started at `values`, kept inside the limits of each parameter."""
+    inside = {}
+    for n, v in values.items():
+        p = model.parameters[n]
+        v = float(np.clip(v, p.lower, p.upper))
+        inside[n] = max(v, 1e-12) if p.positive else v
+    return model.start_at(inside)
+
+
+def objections(fit: Fit, added: Effect) -> str:
+    """Say why the refit must not be believed: signs, bounds, significance, identifiability; empty if it may be."""
+    pars = [fit.problem.model.parameters[p.name] for p in added.parameters]
+    for p in pars:
+        if p.at_least and fit.values[p.name] < 0.98 * fit.values[p.at_least]:
+            return f"{p.name} came out below {p.at_least}, which is not physical"
+    covariance, determined = _covariance(fit)
+    names = [p.name for p in fit.problem.unknown]
+    for p in pars:
+        if p.name not in names or p.null is None or p.positive:
+            continue
+        value, j = fit.values[p.name], names.index(p.name)
+        if value <= p.lower and p.lower == p.null:
+            return f"{p.name} goes to {p.null:g}: the data do not want it, or only with the wrong sign"
+        if not determined[j]:
+            return f"{p.name} cannot be determined beside the other parameters"
+        if abs(value - p.null) < SIGNIFICANT * np.sqrt(covariance[j, j]) and len(pars) == 1:
+            return f"{p.name} is not significant ({value:.3g} ± {np.sqrt(covariance[j, j]):.2g})"
+    return ""
+
+
+def condition(fit: Fit) -> float:
+    """Return the condition number of the column-scaled Jacobian of the model's parameters."""
+    n = len([p for p in fit.problem.model.parameters.values() if p.vary])
+    jac = fit.jacobian[:, :n]
+    norms = np.linalg.norm(jac, axis=0)
+    s = np.linalg.svd(np.linalg.qr(jac / np.where(norms > 0, norms, 1.0), mode="r"), compute_uv=False)
+    return float(s[0] / max(s[-1], 1e-300))
+
+
+def _covariance(fit: Fit) -> tuple[Any, Any]:
+    """Gauss-Newton covariance with the residual's effective samples."""
+    covariance, determined = fit._covariance
+    n = sum(int(np.isfinite(s.residual(c)).sum()) for s in fit.simulations for c in s.experiment.outputs if c in s.outputs)
+    worth = sum(effective_samples(s.residual(c)) for s in fit.simulations for c in s.experiment.outputs if c in s.outputs)
+    return covariance * max(n / max(worth, 1.0), 1.0), determined
+
+
+def train_errors(fit: Fit) -> Errors:
+    """Return the errors of a fit on its own records."""
+    return Errors.of(fit.simulations)
+
+
