@@ -59,7 +59,7 @@ def descend(problem: Problem, options: LevenbergMarquardt, callback: Callback = 
     for _ in range(ROUNDS):
         problem = problem.refined(q)
         found = levenberg_marquardt(problem.residual, problem.residual_and_jacobian, q, problem.scaling.bounds,
-                                    options, callback)
+                                    options, callback, problem.scaling.log)
         history += found.history
         moved = np.max(np.abs(found.q - q), initial=0.0) > 1e-3
         q = found.q
@@ -117,7 +117,7 @@ def _narrowing(problem: Problem, options: LevenbergMarquardt, callback: Callback
         try:
             wide = wide.refined(wide.start)
             found = levenberg_marquardt(wide.residual, wide.residual_and_jacobian, wide.start, wide.scaling.bounds,
-                                        options, callback)
+                                        options, callback, wide.scaling.log)
         except (FitError, SimulationError):
             continue
         history += found.history
