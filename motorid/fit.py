@@ -20,7 +20,7 @@ from motorid.least_squares import LevenbergMarquardt, Solution, gauss_newton_cov
 from motorid.model import Model
 from motorid.prepared import natural_sizes, suited
 from motorid.problem import Problem, as_problem
-from motorid.simulate import Evaluation, Simulation, at, evaluate, judge
+from motorid.simulate import Evaluation, Simulation, at, evaluate, judge, steady_errors
 from motorid.start import first_guess
 
 UNDETERMINED = 1.0  # relative standard deviation above which a value is not shown as determined
@@ -149,6 +149,11 @@ class Fit(Shown):
     def evaluation(self) -> Evaluation:
         """Errors on the records of the fit, over all runs and run by run."""
         return judge(self.simulations)
+
+    @cached_property
+    def steady_state_error(self) -> dict[str, float]:
+        """RMS difference of measured and simulated means over the steady parts of the records, SI, per channel."""
+        return steady_errors(self.simulations, [run.sigma for run in self.problem.runs])
 
     @property
     def nrmse(self) -> Mapping[str, float]:

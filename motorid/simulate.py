@@ -14,6 +14,7 @@ from motorid.integrate import Engine
 from motorid.integrate.grid import Array
 from motorid.model import Model
 from motorid.problem import Problem, as_problem
+from motorid.steady import find_segments
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,6 +127,18 @@ def judge(simulations: Sequence[Simulation]) -> Evaluation:
     sums = {c: np.sum(squares[c], axis=0) for c in channels}
     return Evaluation(tuple(simulations), {c: float(np.sqrt(s[0] / max(s[1], 1e-300))) for c, s in sums.items()},
                       {c: float(np.sqrt(s[0] / max(s[2], 1))) for c, s in sums.items()}, tuple(by_run))
+
+
+def steady_errors(simulations: Sequence[Simulation], sigma: Sequence[Mapping[str, float]]) -> dict[str, float]:
+    """Return the RMS difference of measured and simulated means over the steady parts, SI; empty without any."""
+    segments = find_segments([s.experiment for s in simulations], sigma)
+    errors: dict[str, list[float]] = {}
+    for part in segments:
+        s = simulations[part.run]
+        for c in part.means:
+            if c in s.experiment.outputs and c in s.outputs:
+                errors.setdefault(c, []).append(float(np.nanmean(s.residual(c)[part.first:part.last + 1])))
+    return {c: float(np.sqrt(np.mean(np.square(e)))) for c, e in errors.items()}
 
 
 def evaluate(fit_or_model: Any, runs: Sequence[Experiment] | Experiment, **options: Any) -> Evaluation:
