@@ -37,6 +37,9 @@ class Flag:
     text: str
     mood: str = "plain"
 
+    def __contains__(self, part: str) -> bool:
+        return part in self.text
+
 
 @dataclass(frozen=True)
 class Table:
@@ -49,13 +52,14 @@ class Table:
 
 @dataclass(frozen=True)
 class Card:
-    """What a result shows: a title, flags, sentences, tables, and what to do next (code, what it gives)."""
+    """What a result shows: title, flags, sentences, tables, what to do next (code and its use), its plot."""
 
     title: str
     flags: Sequence[Flag] = ()
     text: Sequence[str] = ()
     tables: Sequence[Table] = ()
     after: Sequence[tuple[str, str]] = ()
+    figure: str = ""
 
 
 def html_of(result: object) -> str:

@@ -1,0 +1,235 @@
+"""Sections of a report, each with its text, figures and tables."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from motorid._cards import card_of
+from motorid._html import Table
+from motorid._html_tables import (
+    NAMES,
+    counted,
+    error_table,
+    ladder_table,
+    model_name,
+    parameter_table,
+    ranking_table,
+)
+from motorid.checks import check_runs
+from motorid.diagnosis.results import Diagnosis, Ladder
+from motorid.experiment import Experiment
+from motorid.fit import Fit
+from motorid.formatting import duration, number, percent
+from motorid.simulate import evaluate
+
+
+@dataclass(frozen=True)
+class Figure:
+    """An inline figure with what it shows in words; `small` ones need not fill the page."""
+
+    svg: str
+    caption: str
+    small: bool = False
+
+
+@dataclass(frozen=True)
+class Section:
+    """One part of the page."""
+
+    key: str
+    title: str
+    text: Sequence[str] = ()
+    remarks: Sequence[str] = ()
+    figures: Sequence[Figure] = ()
+    tables: Sequence[Table] = ()
+    code: str = ""
+
+
+def data(runs: Sequence[Experiment]) -> Section:
+    from motorid.plots import plot_runs
+
+    rows = [
+        [
+            r.name,
+            str(r.n),
+            duration(r.duration),
+            f"{number(1e3 * r.dt, 3)} ms",
+            ", ".join(NAMES[c] for c in r.channels),
+        ]
+        for r in runs
+    ]
+    remarks = [*check_runs(runs), *(f"{r.name}: {n}" for r in runs for n in r.meta.get("notes", ()))]
+    text = [f"{counted(len(runs), 'record')} were used." if len(runs) > 1 else "One record was used."]
+    text.append("Remarks of the checks:" if remarks else "The checks found nothing to remark.")
+    names = ", ".join(r.name for r in runs)
+    return Section(
+        "data",
+        "The data",
+        text,
+        remarks,
+        [
+            _figure(
+                "data",
+                "Input and measured channels over time.",
+                f"Records {names} over time",
+                plot_runs,
+                runs,
+            )
+        ],
+        [Table(["record", "samples", "duration", "interval", "measured"], rows)],
+    )
+
+
+def fitted(fit: Fit, title: str, *, key: str = "fit", before: Fit | None = None) -> Section:
+    from motorid.plots import plot_fit
+
+    caption = "Measured, model, and what is left over beside the band of the noise."
+    caption += " The thin curve is the model it began with." if before is not None else ""
+    alt = f"Measured and modelled channels of {model_name(fit.model)}, with residuals. " + _errors_in_words(
+        fit
+    )
+    units = {c: u for r in fit.problem.experiments for c, u in r.units.items()}
+    effort = f"{counted(fit.iterations, 'iteration')}, {duration(fit.seconds)}"
+    text = [f"{model_name(fit.model)}: {effort}. {_sentence(fit.message)}"]
+    figure = _figure(key, caption, alt, plot_fit, fit, before=before)
+    return Section(key, title, text, (), [figure], [parameter_table(fit), error_table([("", fit)], units)])
+
+
+def residuals(fit: Fit) -> Section:
+    from motorid.plots import plot_residuals
+
+    caption = "Noise alone would leave means of zero against every quantity and no correlation in time."
+    figure = _figure(
+        "residuals",
+        caption,
+        "Residuals of each channel over time and against speed and current",
+        plot_residuals,
+        fit,
+    )
+    return Section("residuals", "What is left over", (), (), [figure])
+
+
+def held_out(fit: Fit, validate: Sequence[Experiment]) -> Section:
+    from motorid.plots import plot_fit
+
+    judged = evaluate(fit, validate)
+    units = {c: u for r in validate for c, u in r.units.items()}
+    alt = "Measured and modelled channels of records that the fit never saw. " + _errors_in_words(judged)
+    figure = _figure("held-out", "Records that the fit never saw.", alt, plot_fit, judged)
+    return Section(
+        "held-out", "On records it never saw", (), (), [figure], [error_table([("", judged)], units)]
+    )
+
+
+def where(d: Diagnosis) -> Section:
+    from motorid.plots import plot_missing
+
+    m = d.missing
+    regions = Table(["region", "share of the misfit"], [[k, percent(v, 2)] for k, v in m.regions.items()])
+    best = [
+        f"{balance}: {b.against} explains {percent(b.explained, 2)}"
+        for balance, bins in m.bins.items()
+        for b in bins[:1]
+    ]
+    caption = "The voltage and torque that would make the model match, and what explains them."
+    figure = _figure("missing", caption, "Missing voltage and torque. " + "; ".join(best), plot_missing, d)
+    return Section(
+        "where", "Where it fails", [d.adequacy.text, m.text], (), [figure], [regions] if m.regions else []
+    )
+
+
+def which(d: Diagnosis) -> Section:
+    from motorid.plots import plot_ranking
+
+    alt = "Bars of the misfit that each effect would take away; best: " + ", ".join(
+        c.effect for c in d.ranking[:3]
+    )
+    caption = "Outline: predicted from sensitivities. Bar: refitted. Diamond: fall of the held-out error."
+    figure = _figure("ranking", caption, alt, plot_ranking, d, small=True)
+    return Section("which", "Which effect is missing", (), (), [figure], [ranking_table(d.ranking)])
+
+
+def ladder(steps: Ladder) -> Section:
+    from motorid.plots import plot_ladder
+
+    names = ", ".join(r.added or model_name(r.fit.model) for r in steps.rungs)
+    caption = "Error of each model, on the records of the fit and on those it never saw."
+    alt = f"Error of each model in turn: {names}"
+    figure = _figure("ladder", caption, alt, plot_ladder, steps, small=True)
+    return Section("ladder", "The error falls", [steps.text], (), [figure], [ladder_table(steps)])
+
+
+def parameters(before: Fit, after: Fit) -> Section:
+    from motorid.plots import plot_parameters
+
+    figure = _figure(
+        "parameters",
+        "Bars: two standard deviations.",
+        "Parameters before and after",
+        plot_parameters,
+        before,
+        after,
+        small=True,
+    )
+    text = ["What the parameters had absorbed of the missing effect, they give back once it is in the model."]
+    return Section(
+        "parameters", "How the parameters moved", text, (), [figure], [parameter_table(after, before)]
+    )
+
+
+def apart(d: Diagnosis) -> Section:
+    groups = [f"{', '.join(g)}" for g in d.groups if len(g) > 1]
+    text = (
+        ["These data cannot tell apart:"]
+        if groups
+        else ["No two of the effects that matter look alike in these data."]
+    )
+    closing = [d.remaining.text, f"Next experiment: {d.suggestion}" if d.suggestion else ""]
+    return Section("apart", "What cannot be told apart, and what to do next", [*closing, *text], groups)
+
+
+def fit_again(fit: Fit, k: int) -> Section:
+    return fitted(fit, card_of(fit).title, key=f"result-{k + 1}")
+
+
+def of_card(result: Any, k: int) -> Section:
+    from motorid import plots
+
+    card = card_of(result)
+    draw: Callable[..., Any] | None = getattr(plots, card.figure, None) if card.figure else None
+    figures = [_figure(f"result-{k + 1}", "", card.title, draw, result, small=True)] if draw else []
+    return Section(f"result-{k + 1}", card.title, [t for t in card.text if t], (), figures, card.tables)
+
+
+def _figure(
+    name: str,
+    caption: str,
+    alt: str,
+    draw: Callable[..., Any],
+    *args: Any,
+    small: bool = False,
+    **options: Any,
+) -> Figure:
+    from motorid.plots.svg import svg_of
+
+    return Figure(svg_of(draw, *args, name=name, alt=alt, **options), caption, small)
+
+
+def error_facts(steps: Ladder) -> list[tuple[str, str]]:
+    """Return how the error of each channel fell: held out where it was, else as fitted."""
+    first, last = steps.rungs[0], steps.rungs[-1]
+    kind, old, new = "fitted", first.nrmse, last.nrmse
+    if first.validation_nrmse and last.validation_nrmse:
+        kind, old, new = "held out", first.validation_nrmse, last.validation_nrmse
+    arrow = [f"{percent(e)} → {percent(new[c])}" if last is not first else percent(e) for c, e in old.items()]
+    return [(f"Error of the {NAMES[c]}, {kind}", text) for c, text in zip(old, arrow, strict=True)]
+
+
+def _errors_in_words(judged: Any) -> str:
+    return ", ".join(f"error of the {NAMES[c]} {percent(e)}" for c, e in judged.nrmse.items())
+
+
+def _sentence(text: str) -> str:
+    return text[:1].upper() + text[1:]
