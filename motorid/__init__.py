@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING as _TYPE_CHECKING
 from motorid import effects
 from motorid.checks import check_runs
 from motorid.datasets import data_path
+from motorid.derivatives import check_derivatives
 from motorid.errors import DataError, FitError, ModelError, MotoridError, SimulationError, UsageError
 from motorid.experiment import Experiment
 from motorid.fit import Failure, Fit, fit, solve
@@ -14,6 +15,7 @@ from motorid.model import Effect, Model, dc_motor, effect, torque_driven
 from motorid.parameters import P, Parameter
 from motorid.problem import Huber, Problem
 from motorid.reading import read_csv, read_mat, read_runs
+from motorid.report import report
 from motorid.simulate import evaluate, simulate
 
 if _TYPE_CHECKING:
