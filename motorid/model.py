@@ -14,7 +14,7 @@ import casadi as ca
 from motorid.display import Shown
 from motorid.equations import CHANNELS, Equations
 from motorid.errors import ModelError, one_of
-from motorid.parameters import P, Parameter
+from motorid.parameters import Declared, Parameter
 from motorid.system import System, build_system
 
 BALANCES = ("voltage", "torque", "transmission", "sensor")
@@ -118,7 +118,7 @@ def effect(*, balance: str, name: str | None = None, includes: tuple[str, ...] =
         title = name or law.__name__
         pars = []
         for arg in list(inspect.signature(law).parameters.values())[1:]:
-            if not isinstance(arg.default, P):
+            if not isinstance(arg.default, Declared):
                 raise ModelError(f"effect '{title}': argument '{arg.name}' needs a default P(value, unit, null=…).")
             pars.append(arg.default.named(arg.name))
         return Effect(title, law, tuple(pars), balance, inspect.cleandoc(law.__doc__ or ""), includes)

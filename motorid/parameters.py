@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -78,29 +79,38 @@ class Parameter:
 
 
 @dataclass(frozen=True)
-class P:
-    """A parameter of an effect, declared as a default argument: ``tau_c=P(2e-3, "N·m", null=0)``.
+class Declared:
+    """A parameter of an effect without its name, which is that of the argument; see `P`."""
 
-    The name comes from the argument; the other fields are those of `Parameter`.
-    """
-
-    value: float
-    unit: str = ""
-    null: float | None = None
-    lower: float = -np.inf
-    upper: float = np.inf
-    positive: bool = False
-    vary: bool = True
-    grid: tuple[float, ...] = ()
-    periodic: bool = False
-    order: bool = False
-    at_least: str = ""
-    doc: str = ""
+    fields: Mapping[str, Any]
 
     def named(self, name: str) -> Parameter:
         """Return the `Parameter` called `name`."""
-        return Parameter(name, self.value, self.unit, self.lower, self.upper, self.positive, self.vary,
-                         self.null, tuple(self.grid), self.periodic, self.order, False, self.at_least, self.doc)
+        return Parameter(name, **self.fields)
+
+
+def P(
+    value: float,
+    unit: str = "",
+    null: float | None = None,
+    *,
+    lower: float = -np.inf,
+    upper: float = np.inf,
+    positive: bool = False,
+    vary: bool = True,
+    grid: Iterable[float] = (),
+    periodic: bool = False,
+    order: bool = False,
+    at_least: str = "",
+    doc: str = "",
+) -> Any:
+    """Declare a parameter of an effect as a default argument: ``tau_c=P(2e-3, "N·m", null=0)``.
+
+    The name comes from the argument; what the others mean is told at `Parameter`.
+    """
+    return Declared({"value": value, "unit": unit, "null": null, "lower": lower, "upper": upper,
+                     "positive": positive, "vary": vary, "grid": tuple(grid), "periodic": periodic,
+                     "order": order, "at_least": at_least, "doc": doc})
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,7 +17,8 @@ from motorid.integrate.grid import Array, Grid
 from motorid.noise import noise_level
 from motorid.parameters import Parameter
 
-_levels: WeakKeyDictionary[Experiment, dict[str, float]] = WeakKeyDictionary()  # a record is frozen, so is its noise
+# A record is frozen, and so is its noise.
+_levels: WeakKeyDictionary[Experiment, dict[str, float]] = WeakKeyDictionary()
 SGN_WIDTH_SHARE = 1e-3  # of the highest speed: wider smoothing looks like one more missing effect
 
 
@@ -93,12 +94,12 @@ def _grid(run: Experiment, inputs: Sequence[str]) -> Grid:
             columns.append(run.inputs[name])
             held.append(run.hold == "zoh")
         else:
-            raise ModelError(f"{run.name}: the model needs the input '{name}', which the record does not have.")
+            raise ModelError(f"{run.name}: the model needs the input '{name}', which the record lacks.")
     return Grid.of(run.t, np.column_stack(columns), np.array(held))
 
 
 def top_speed(runs: Sequence[Experiment]) -> float:
-    """Highest speed in the runs (99.5th percentile), from the speed or the angle; 0 where neither is there."""
+    """Highest speed in the runs (99.5th percentile), from speed or angle; 0 where neither is there."""
     top = 0.0
     for r in runs:
         if "omega" in r.outputs:

@@ -8,8 +8,9 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from motorid.errors import ModelError, SimulationError, UsageError, one_of
+from motorid.errors import ModelError, UsageError, one_of
 from motorid.experiment import Experiment
 from motorid.integrate import Engine, Trajectory, engine_of
 from motorid.integrate.grid import Array
@@ -22,7 +23,7 @@ from motorid.unknowns import Point, Unknowns
 
 @dataclass(frozen=True)
 class Huber:
-    """Robust loss: quadratic within `delta` standard deviations, linear beyond. Huber, Ann. Math. Stat. 35, 1964."""
+    """Robust loss: quadratic within `delta` sigma, linear beyond (Huber, Ann. Math. Stat. 35, 1964)."""
 
     delta: float = 1.345
 
@@ -79,8 +80,8 @@ class Problem:
         if self.weights not in ("noise", "rms"):
             raise UsageError(one_of(self.weights, ("noise", "rms"), "weights"))
         if not self.outputs:
-            raise ModelError("none of the channels that the model shows was measured; a fit needs at least one of "
-                             "i, omega, theta (torque_driven: omega or theta).")
+            raise ModelError("none of the channels that the model shows was measured; a fit needs at least "
+                             "one of i, omega, theta (torque_driven: omega or theta).")
         for name in self.priors:
             if name not in self.model.parameters:
                 raise UsageError(f"prior: {one_of(name, self.model.parameters, 'parameter')}")
@@ -93,8 +94,9 @@ class Problem:
         visible = self.system.visible
         for e in self.model.effects:
             if e.parameters and not any(p.name in visible for p in e.parameters):
-                raise ModelError(f"'{e.name}' cannot be seen in the measured channels ({', '.join(self.outputs)}). Leave "
-                                 f"it out: model.without('{e.name}'), or add a record with the channel that it acts on.")
+                channels = ", ".join(self.outputs)
+                raise ModelError(f"'{e.name}' cannot be seen in the measured channels ({channels}). Leave it "
+                                 f"out: model.without('{e.name}'), or add a record of the channel it acts on.")
 
     # -- what is fitted --------------------------------------------------------------------------------
     @cached_property
@@ -114,7 +116,8 @@ class Problem:
         if self._runs is not None:
             return self._runs
         noise = noise_of(self.experiments, self.outputs)
-        return tuple(prepare_run(r, self.outputs, noise, self.system.inputs, self.initial) for r in self.experiments)
+        return tuple(prepare_run(r, self.outputs, noise, self.system.inputs, self.initial)
+                     for r in self.experiments)
 
     @cached_property
     def unknowns(self) -> Unknowns:
@@ -166,10 +169,7 @@ class Problem:
         at, new = self.unknowns.point(np.asarray(q, float)), []
         for k, run in enumerate(self.runs):
             x0 = self.unknowns.first_state(at, k)
-            try:
-                grid = self._engine.prepare(self.system, run.grid, x0, at.p, self._tolerance(run))
-            except SimulationError:
-                grid = run.grid
+            grid = self._engine.prepare(self.system, run.grid, x0, at.p, self._tolerance(run))
             new.append(run if grid is run.grid else replace(run, grid=grid))
         return self._keeping(tuple(new))
 
@@ -184,12 +184,13 @@ class Problem:
     @staticmethod
     def _tolerance(run: Run) -> float:
         """Local error relative to the largest state: a small part of the noise, within reason."""
-        ratios = [run.sigma[c] / max(float(np.nanmax(np.abs(run.experiment.outputs[c]))), 1e-300) for c in run.sigma]
+        out = run.experiment.outputs
+        ratios = [s / max(float(np.nanmax(np.abs(out[c]))), 1e-300) for c, s in run.sigma.items()]
         return float(np.clip(0.03 * min(ratios), 1e-7, 1e-4))
 
     # -- residual --------------------------------------------------------------------------------------
     @cached_property
-    def _weights(self) -> list[tuple[Array, Array, Array | None]]:
+    def _weights(self) -> list[tuple[Array, Array, NDArray[np.int64] | None]]:
         """Per run: measured (N, ny), weights (ny,), index of finite samples (None: all)."""
         prepared = []
         for run in self.runs:
@@ -207,7 +208,7 @@ class Problem:
         return 1.0 / max(float(np.sqrt(np.nanmean(run.experiment.outputs[channel] ** 2))), 1e-300)
 
     def run_residual(self, k: int, traj: Trajectory) -> tuple[Array, Array | None]:
-        """Return residual and Jacobian (both whitened, before the loss) of run `k`, missing samples left out."""
+        """Return whitened residual and Jacobian, before the loss, of run `k`, without missing samples."""
         y, w, index = self._weights[k]
         r = ((traj.y - y) * w).ravel()
         jac = None if traj.dy is None else (traj.dy * w[:, None]).reshape(r.size, -1)
@@ -236,13 +237,13 @@ class Problem:
         q = np.asarray(q, float)
         at = self.unknowns.point(q)
         trajs = [self._simulate(at, k, derivatives) for k in range(len(self.runs))]
-        parts = [self._lossy(*self.run_residual(k, t)) for k, t in enumerate(trajs)]
+        parts: list[tuple[Array, Any]] = [self._lossy(*self.run_residual(k, t)) for k, t in enumerate(trajs)]
         parts += [self._prior_part(q)] if self.priors else []
         parts += [penalty.evaluate(self, q, trajs) for penalty in self.penalties]
-        r = np.concatenate([p[0] for p in parts]) if len(parts) > 1 else parts[0][0]
-        if not derivatives:
-            return r, None
-        return r, np.concatenate([p[1] for p in parts]) if len(parts) > 1 else parts[0][1]
+        if len(parts) == 1:
+            return parts[0]
+        r = np.concatenate([p[0] for p in parts])
+        return r, np.concatenate([p[1] for p in parts]) if derivatives else None
 
     def _lossy(self, r: Array, jac: Array | None) -> tuple[Array, Array | None]:
         if self.loss is None:
@@ -267,7 +268,7 @@ class Problem:
         return sum(y.size if index is None else len(index) for y, _, index in self._weights)
 
     def for_model(self, model: Model) -> Problem:
-        """Return the problem for another model on the same records, keeping noise, grids and initial states."""
+        """Return the problem for another model on the same records; noise, grids, initial states stay."""
         runs = self.runs
         if model.angle_input != self.model.angle_input:
             names = self.system.inputs[:1] + (("theta_in",) if model.angle_input else ())

@@ -35,7 +35,7 @@ class System:
     balances : casadi.Function
         ``(x, u, p) -> (voltage, torque)`` left over, V and N·m, at zero rates.
     forces : casadi.Function
-        ``(x, u, p, d) -> f`` with d = (voltage, torque) added to the balances: the unknown inputs of `diagnose`.
+        ``(x, u, p, d) -> f`` with d = (voltage, torque) added to the balances: `diagnose`'s unknown inputs.
     """
 
     states: tuple[str, ...]
@@ -64,8 +64,8 @@ class System:
         seen = y_x.any(axis=0)  # states that act on an output, directly or through other states
         for _ in range(nx):
             seen = seen | f_x[seen].any(axis=0)
-        shown = y_p.any(axis=0) | f_p[seen].any(axis=0) | x0_p[seen].any(axis=0)
-        return frozenset(n for n, k in zip(self.parameters, shown, strict=True) if k)
+        shown = np.vstack([y_p, f_p[seen], x0_p[seen]]).any(axis=0)
+        return frozenset(self.parameters[k] for k in np.flatnonzero(shown))
 
     def first_state(self, s: Array, p: Array) -> Array:
         """Return x0 (nx,) from s = (i, omega, theta) at the first sample and p."""
@@ -115,12 +115,13 @@ def build_system(m: Equations, parameters: tuple[str, ...], outputs: tuple[str, 
         voltage = ca.SX(0)
         torque = m.g * m.v - m.b * m.omega + m.torque
         if not m.voltage.is_zero():
-            raise ModelError("a torque-driven model has no voltage balance: leave the electrical effects out, "
-                             "or use dc_motor() with a record of the applied voltage.")
+            raise ModelError("a torque-driven model has no voltage balance: leave the electrical effects "
+                             "out, or use dc_motor() with a record of the applied voltage.")
     shown = [m.measured(c) for c in outputs]
     for name in m.states:
         if name not in ("i", "omega") and name not in m.rates:
-            raise ModelError(f"the state '{name}' has no rate: call m.rate({name}, …) in the effect that adds it.")
+            raise ModelError(f"the state '{name}' has no rate: call m.rate({name}, …) in the effect that "
+                             "adds it.")
     d = ca.SX.sym("d", 2)
     rates: dict[str, Any] = dict(m.rates)
     rates["omega"] = (torque + d[1]) / m.J
@@ -128,7 +129,8 @@ def build_system(m: Equations, parameters: tuple[str, ...], outputs: tuple[str, 
         rates["i"] = (voltage + d[0]) / m.L if "i" in stored else voltage + d[0]
     names = tuple(m.states)
     initial = {"i": m.start["i"], "omega": m.start["omega"], **m.initial}
-    filled = m.fill([*[ca.SX(rates[n]) for n in names], *shown, *[ca.SX(initial[n]) for n in names], voltage, torque])
+    filled = m.fill([*[ca.SX(rates[n]) for n in names], *shown, *[ca.SX(initial[n]) for n in names],
+                     voltage, torque])
     n = len(names)
     f, y = ca.vertcat(*filled[:n]), ca.vertcat(*filled[n:n + len(shown)])
     x0, balances = ca.vertcat(*filled[n + len(shown):-2]), ca.vertcat(*filled[-2:])
@@ -159,5 +161,5 @@ def _check_closed(expression: ca.SX, known: ca.SX) -> None:
     names = {s.name() for s in ca.symvar(known)}
     stray = sorted({s.name() for s in ca.symvar(expression)} - names)
     if stray:
-        raise ModelError(f"the model uses {', '.join(stray)}, which nothing defines. Effects may use only the sheet "
-                         "m and their own parameters.")
+        raise ModelError(f"the model uses {', '.join(stray)}, which nothing defines. Effects may use only "
+                         "the sheet m and their own parameters.")

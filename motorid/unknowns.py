@@ -8,6 +8,7 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from motorid.equations import CHANNELS
 from motorid.integrate.grid import Array
@@ -19,7 +20,7 @@ STATE_UNITS = {"i": "A", "omega": "rad/s", "theta": "rad"}
 
 
 class Point(NamedTuple):
-    """One q in the system's terms: q and its physical values (nq,), dphysical/dq (nq,), p (np,), dp/dq (np, nq)."""
+    """One q in the system's terms: physical values and slopes (nq,), p (np,) and dp/dq (np, nq)."""
 
     q: Array
     physical: Array
@@ -72,8 +73,10 @@ class Unknowns:
         """Solver coordinates: logarithmic for positive parameters, else in natural sizes of the records."""
         sizes = [abs(p.value) for p in self.free]
         if not all(p.positive for p in self.free):
-            natural = natural_sizes([r.experiment for r in self.runs], {n: p.value for n, p in self.held.items()})
-            sizes = [s if p.positive else max(s, natural.get(p.unit, 0.0)) for p, s in zip(self.free, sizes, strict=True)]
+            values = {n: p.value for n, p in self.held.items()}
+            natural = natural_sizes([r.experiment for r in self.runs], values)
+            sizes = [s if p.positive else max(s, natural.get(p.unit, 0.0))
+                     for p, s in zip(self.free, sizes, strict=True)]
         return Scaling.of(self.all, [*sizes, *(self._spread(c, k) for c, k, _ in self.initial)])
 
     def _spread(self, channel: str, run: int) -> float:
@@ -94,7 +97,7 @@ class Unknowns:
 
     # -- into the system's terms -----------------------------------------------------------------------
     @cached_property
-    def _columns(self) -> Array:
+    def _columns(self) -> NDArray[np.int64]:
         """Index into the system's p of each free parameter."""
         place = {n: j for j, n in enumerate(self.system.parameters)}
         return np.array([place[p.name] for p in self.free], int)

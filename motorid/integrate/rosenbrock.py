@@ -40,9 +40,15 @@ class Rosenbrock:
         return stepper(system).run(grid, x0, p, dx0, dp, local_error, self.compiled)
 
     def prepare(self, system: System, grid: Grid, x0: Array, p: Array, tolerance: float) -> Grid:
-        """See `Engine.prepare`. Errors are relative to the largest size of each state on the record."""
+        """See `Engine.prepare`. Errors are relative to the largest size of each state on the record.
+
+        Where the run fails, so does every later one on this grid: coarse steps would jump over what happens.
+        """
         for _ in range(6):
-            traj = self.run(system, grid, x0, p, local_error=True)
+            try:
+                traj = self.run(system, grid, x0, p, local_error=True)
+            except SimulationError:
+                break
             assert traj.error is not None
             error = (traj.error / np.maximum(np.abs(traj.x).max(axis=0), 1e-12)).max(axis=1)
             if not np.max(error, initial=0.0) > 2 * tolerance:  # or not a number

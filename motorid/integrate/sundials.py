@@ -1,8 +1,8 @@
 """CVODES and IDAS through CasADi: the reference engines, with forward sensitivities.
 
 A call never spans a jump of the input (CVODES stops there): the record is cut where the input changes. Parts
-of evenly spaced samples under one constant input are walked in pieces of 2^k samples over scaled time, so that
-a few integrators serve every record. Derivatives are taken in forward mode only, over scaled states;
+of evenly spaced samples under one constant input are walked in pieces of 2^k samples over scaled time: a few
+integrators then serve every record. Derivatives are taken in forward mode only, over scaled states;
 `quad_err_con` is set because without it CasADi's CVODES interface can return wrong derivatives silently
 (casadi issue 4383).
 """
