@@ -1,0 +1,61 @@
+"""The command line: ``motorid fit RUN...`` and its fellows."""
+
+from __future__ import annotations
+
+from importlib.metadata import PackageNotFoundError
+from importlib.metadata import version as version_of
+from typing import Annotated
+
+import typer
+
+from motorid import cli_bench, cli_fit, cli_judge, cli_take
+from motorid.cli_common import Command, Group
+
+app = typer.Typer(cls=Group, add_completion=False, rich_markup_mode="rich", pretty_exceptions_enable=False,
+                  context_settings={"help_option_names": ["-h", "--help"]})
+
+
+@app.callback(invoke_without_command=True)
+def motorid(
+    context: typer.Context,
+    version: Annotated[bool, typer.Option("--version", help="Show the version and leave.")] = False,
+) -> None:
+    """Identify brushed DC motors: fit a model to records, see where it fails, add the effect that is missing.
+
+    Start with: motorid demo
+    """
+    if version:
+        typer.echo(f"motorid {_version()}")
+    elif context.invoked_subcommand is None:
+        typer.echo(context.get_help())
+
+
+def _version() -> str:
+    try:
+        return version_of("motorid")
+    except PackageNotFoundError:
+        return "(not installed)"
+
+
+for _name, _command in (
+    ("demo", cli_fit.demo),
+    ("fit", cli_fit.fit),
+    ("simulate", cli_fit.simulate),
+    ("diagnose", cli_judge.diagnose),
+    ("identifiability", cli_judge.identifiability),
+    ("robustness", cli_judge.robustness),
+    ("fit-many", cli_take.fit_many),
+    ("export", cli_take.export),
+    ("record", cli_bench.record),
+    ("bench", cli_bench.bench),
+):
+    app.command(_name, cls=Command)(_command)
+
+
+def main() -> None:
+    """Run the command line; leaves by `SystemExit`."""
+    app()
+
+
+if __name__ == "__main__":
+    main()

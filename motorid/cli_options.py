@@ -1,0 +1,246 @@
+"""The options that every command which fits has in common, and how they become a model and a solver."""
+
+from __future__ import annotations
+
+import functools
+import importlib.util
+import inspect
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Annotated, Any, get_type_hints
+
+import typer
+
+from motorid import effects as library
+from motorid.checks import check_runs
+from motorid.errors import ModelError, UsageError, one_of
+from motorid.experiment import Experiment
+from motorid.fit import Fit, fit
+from motorid.layout import parse_pairs
+from motorid.model import Effect, Model, dc_motor, torque_driven
+from motorid.problem import Huber
+from motorid.progress import progress
+from motorid.reading import read_runs
+
+DRIVES = ("voltage", "torque")
+SOLVERS = ("lm", "multiple-shooting")
+FORMULATIONS = ("plain", "penalty", "hard")
+MODEL, SOLVE, READ, OUT = "Model", "Estimation", "Reading", "Results"
+
+Runs = Annotated[list[str], typer.Argument(metavar="RUN...", help="Records: files, directories or patterns.",
+                                           show_default=False)]
+Json = Annotated[str | None, typer.Option("--json", metavar="PATH", rich_help_panel=OUT,
+                                          help="Write the result as JSON; - for standard output.")]
+Report = Annotated[Path | None, typer.Option("--report", metavar="PATH.html", rich_help_panel=OUT,
+                                             help="Write one page with figures.")]
+Validate = Annotated[list[str] | None, typer.Option("--validate", metavar="RUN...", rich_help_panel=OUT,
+                                                    help="Held-out records, never fitted; after the records, "
+                                                         "since it takes all names that follow.")]
+
+
+@dataclass(frozen=True)
+class Reading:
+    """How to read records."""
+
+    columns: Annotated[str | None, typer.Option(
+        metavar="t=…,v=…", rich_help_panel=READ,
+        help="Which column is which channel, where the header does not tell: t=time,v=u_volt,omega=speed.")] = None
+    units: Annotated[str | None, typer.Option(
+        metavar="omega=rpm", rich_help_panel=READ, help="Units of channels, where the header does not tell.")] = None
+    hold: Annotated[str | None, typer.Option(
+        metavar="zoh|linear", rich_help_panel=READ, help="The input between samples: held or joined by lines.")] = None
+
+    def read(self, paths: Sequence[str]) -> list[Experiment]:
+        """Return the runs."""
+        columns = parse_pairs(self.columns, "--columns") if self.columns else None
+        units = parse_pairs(self.units, "--units") if self.units else None
+        return read_runs(paths, columns=columns, units=units, hold=self.hold)
+
+
+@dataclass(frozen=True)
+class Choices(Reading):
+    """Everything a command that fits may be told."""
+
+    effects: Annotated[str | None, typer.Option(
+        metavar="a,b", rich_help_panel=MODEL, help="Effects in the model beside the plain motor.")] = None
+    fix: Annotated[list[str] | None, typer.Option(
+        metavar="L", rich_help_panel=MODEL, help="Hold parameters: L, or L=0 to leave the inductance out.")] = None
+    set_: Annotated[list[str] | None, typer.Option(
+        "--set", metavar="R=1.2", rich_help_panel=MODEL, help="Values to start from (SI units).")] = None
+    free: Annotated[list[str] | None, typer.Option(
+        metavar="g", rich_help_panel=MODEL, help="Estimate parameters that are held by themselves.")] = None
+    drive: Annotated[str, typer.Option(
+        metavar="voltage|torque", rich_help_panel=MODEL,
+        help="torque: a drive that closes its own current loop; v is its command.")] = "voltage"
+    effects_from: Annotated[Path | None, typer.Option(
+        metavar="FILE.py", rich_help_panel=MODEL, help="Python file with effects of your own (@mi.effect).")] = None
+    solver: Annotated[str | None, typer.Option(
+        metavar="lm|multiple-shooting", rich_help_panel=SOLVE, help="By default lm; multiple-shooting for hard.",
+        show_default=False)] = None
+    formulation: Annotated[str, typer.Option(
+        metavar="plain|penalty|hard", rich_help_panel=SOLVE,
+        help="What is asked beside the data: nothing, weighted penalties, or true constraints.")] = "plain"
+    current_limit: Annotated[float | None, typer.Option(
+        metavar="A", rich_help_panel=SOLVE, help="The current never exceeds this (penalty, hard).")] = None
+    engine: Annotated[str, typer.Option(
+        metavar="rosenbrock|cvodes|idas", rich_help_panel=SOLVE, help="Integrator.")] = "rosenbrock"
+    initial: Annotated[str, typer.Option(
+        metavar="auto|rest|measured|estimate", rich_help_panel=SOLVE,
+        help="What is known of the state at the first sample.")] = "auto"
+    loss: Annotated[str, typer.Option(
+        metavar="squares|huber", rich_help_panel=SOLVE, help="huber forgives outliers.")] = "squares"
+
+    def model(self, runs: Sequence[Experiment]) -> Model:
+        """Return the model that was asked for."""
+        self._check_words()
+        own = own_effects(self.effects_from) if self.effects_from else {}
+        model = dc_motor()
+        if self.drive == "torque":
+            model = torque_driven(axis="linear" if any(_is_linear(r) for r in runs) else "rotary")
+        for name in _words([self.effects] if self.effects else []):
+            model = model + named_effect(name, own)
+        model = model.replace(**_numbers(self.set_ or [], "--set"))
+        model = _fixed(model, self.fix or [])
+        return model.free(*_words(self.free or []))
+
+    def options(self) -> dict[str, Any]:
+        """Return the keyword arguments of `fit`."""
+        self._check_words()
+        hard = self.formulation == "hard"
+        found: dict[str, Any] = {"engine": self.engine, "initial": self.initial,
+                                 "loss": Huber() if self.loss == "huber" else None}
+        if self.current_limit is not None or hard:
+            from motorid.constraints import CurrentLimit, SteadyState
+
+            limits = [CurrentLimit(self.current_limit)] if self.current_limit is not None else []
+            # A plain penalty fit adds the steady state by itself only where no constraint is named.
+            found["constraints"] = [*limits, SteadyState()] if self.formulation != "plain" else limits
+        if hard or self.solver == "multiple-shooting":
+            from motorid.shooting import MultipleShooting
+
+            found["solver"] = MultipleShooting()
+        found["formulation"] = "plain" if hard else self.formulation
+        return found
+
+    def fit(self, runs: Sequence[Experiment], model: Model | None = None) -> Fit:
+        """Fit the model to `runs`."""
+        model = self.model(runs) if model is None else model
+        with progress(f"Fitting {describe(model)}") as advance:
+            return fit(model, runs, callback=lambda *_: advance(1), **self.options())
+
+    def _check_words(self) -> None:
+        for word, known, what in ((self.drive, DRIVES, "drive"), (self.formulation, FORMULATIONS, "formulation"),
+                                  (self.solver or "lm", SOLVERS, "solver"), (self.loss, ("squares", "huber"), "loss")):
+            if word not in known:
+                raise UsageError(f"--{what}: {one_of(word, known, what)}")
+        if self.formulation == "hard" and self.solver == "lm":
+            raise UsageError("--formulation hard needs --solver multiple-shooting: least squares has no true "
+                             "constraints. Leave --solver out, or take --formulation penalty.")
+        if self.formulation == "penalty" and self.solver == "multiple-shooting":
+            raise UsageError("--formulation penalty is a least-squares problem: take --solver lm, or "
+                             "--formulation hard for true constraints.")
+        if self.current_limit is not None and self.formulation == "plain" and self.solver != "multiple-shooting":
+            raise UsageError("--current-limit needs --formulation penalty (weighted) or hard (a true limit).")
+
+
+def with_choices(kind: type) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Give a command whose last parameter is ``choices`` the options of `kind` as its own."""
+
+    def wrap(command: Callable[..., None]) -> Callable[..., None]:
+        hints, own = get_type_hints(kind, include_extras=True), get_type_hints(command, include_extras=True)
+        parts = [inspect.Parameter(f.name, inspect.Parameter.KEYWORD_ONLY, default=f.default, annotation=hints[f.name])
+                 for f in fields(kind)]
+        mine = [p.replace(annotation=own[p.name], kind=inspect.Parameter.KEYWORD_ONLY)
+                for p in inspect.signature(command).parameters.values() if p.name != "choices"]
+
+        @functools.wraps(command)
+        def run(**given: Any) -> None:
+            taken = {f.name: given.pop(f.name) for f in fields(kind)}
+            command(**given, choices=kind(**taken))
+
+        required = [p for p in mine if p.default is inspect.Parameter.empty]
+        rest = [p for p in mine if p.default is not inspect.Parameter.empty]
+        run.__signature__ = inspect.Signature([*required, *parts, *rest])  # type: ignore[attr-defined]
+        run.__annotations__ = {p.name: p.annotation for p in [*required, *parts, *rest]}
+        return run
+
+    return wrap
+
+
+def own_effects(path: Path) -> dict[str, Effect]:
+    """Return the effects defined in a Python file, by name.
+
+    Raises
+    ------
+    UsageError
+        If the file cannot be run or defines none.
+    """
+    path = path.expanduser()
+    if not path.is_file():
+        raise UsageError(f"--effects-from: there is no file {path}.")
+    name = f"motorid_own_{path.stem}"
+    spec = importlib.util.spec_from_file_location(name, path)
+    if spec is None or spec.loader is None:
+        raise UsageError(f"--effects-from: {path} is not a Python file (*.py).")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module  # the laws are looked up there when a model goes to another process
+    try:
+        spec.loader.exec_module(module)
+    except Exception as error:  # whatever the user's own code raises
+        raise UsageError(f"--effects-from: {path} cannot be run: {type(error).__name__}: {error}.") from None
+    found = {e.name: e for e in vars(module).values() if isinstance(e, Effect) and e.name not in library.LIBRARY}
+    if not found:
+        raise UsageError(f"--effects-from: {path} defines no effect of its own. Write a function and decorate it with "
+                         "@mi.effect(balance=\"torque\").")
+    return found
+
+
+def named_effect(name: str, own: dict[str, Effect]) -> Effect:
+    """Return an effect of the user's file, or of the library."""
+    if name in own:
+        return own[name]
+    if name not in library.LIBRARY:
+        raise ModelError(f"--effects: {one_of(name, [*own, *library.LIBRARY], 'effect')}")
+    return library.get(name)
+
+
+def describe(model: Model) -> str:
+    """Return a model in words: ``dc_motor + coulomb``."""
+    return " + ".join([model.base, *model.effect_names])
+
+
+def notes_of(runs: Sequence[Experiment], held_out: Sequence[Experiment] = ()) -> list[str]:
+    """Return what a person should know about the records: how they were read, and what looks wrong."""
+    notes = [f"{r.name}: {note}" for r in runs for note in r.meta.get("notes", [])]
+    known = {r.meta.get("sha256") for r in runs} - {None}
+    same = [r.name for r in held_out if r.meta.get("sha256") in known]
+    if same:
+        notes.append(f"{', '.join(same)} is both fitted and held out: its held-out error means nothing.")
+    return [*dict.fromkeys(notes), *check_runs(runs)]
+
+
+def _is_linear(run: Experiment) -> bool:
+    return run.units.get("theta") == "m" or run.units.get("omega") == "m/s"
+
+
+def _words(texts: Sequence[str]) -> list[str]:
+    return [w for text in texts for w in (part.strip() for part in text.split(",")) if w]
+
+
+def _numbers(texts: Sequence[str], option: str) -> dict[str, float]:
+    found: dict[str, float] = {}
+    for text in texts:
+        for name, value in parse_pairs(text, option).items():
+            try:
+                found[name] = float(value)
+            except ValueError:
+                raise UsageError(f"{option}: '{value}' is not a number; expected e.g. {name}=1.2, in SI units.") from None
+    return found
+
+
+def _fixed(model: Model, texts: Sequence[str]) -> Model:
+    for word in _words(texts):
+        model = model.fix(**_numbers([word], "--fix")) if "=" in word else model.fix(word)
+    return model

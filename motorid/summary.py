@@ -1,0 +1,127 @@
+"""Results as plain data for JSON, and what a person should hear about a fit beside its numbers."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from motorid.errors import UsageError
+
+if TYPE_CHECKING:
+    from motorid.fit import Fit
+    from motorid.simulate import Evaluation
+
+MOTOR = ("R", "L", "K", "b", "J")
+
+
+def fit_dict(fit: Fit, held_out: Evaluation | None = None) -> dict[str, Any]:
+    """Return the contents of ``fit --json``.
+
+    Standard deviations are null where the data do not determine the value, 0 where it was held.
+    """
+    model, problem = fit.problem.model, fit.problem
+    engine = problem.engine if isinstance(problem.engine, str) else problem.engine.name
+    return {
+        "model": {"base": model.base, "axis": model.axis, "effects": list(model.effect_names)},
+        "parameters": {n: {"value": fit.values[n], "std": fit.std[n] if p.vary else 0.0, "unit": p.unit,
+                           "fixed": not p.vary} for n, p in model.parameters.items()},
+        "nrmse": dict(fit.nrmse), "rmse": dict(fit.rmse),
+        "validation_nrmse": dict(held_out.nrmse) if held_out else None,
+        "validation_rmse": dict(held_out.rmse) if held_out else None,
+        "chi2": fit.chi2, "dof": fit.dof, "status": fit.status, "message": fit.message,
+        "iterations": fit.iterations, "seconds": fit.seconds, "engine": engine, "formulation": fit.formulation,
+        "integration_error": fit.integration_error,
+        "derived": {"tau_e": fit.tau_e, "tau_m": fit.tau_m, "damping": fit.damping},
+        "steady_state_error": dict(fit.steady_state_error),
+        "violations": dict(fit.extra.get("violations", {})),
+        "initial": dict(fit.initial),
+        "runs": [run_dict(r) | {"nrmse": dict(e)}
+                 for r, e in zip(problem.experiments, fit.evaluation.by_run, strict=True)],
+        "remarks": remarks(fit),
+    }
+
+
+def run_dict(run: Any) -> dict[str, Any]:
+    """Return what identifies a record."""
+    return {"name": run.name, "source": run.meta.get("source"), "sha256": run.meta.get("sha256"),
+            "samples": run.n, "seconds": run.duration, "channels": list(run.channels)}
+
+
+def remarks(fit: Fit) -> list[str]:
+    """Say in words what the numbers of a fit cannot: what is not determined, and what would determine it."""
+    model, measured = fit.problem.model, fit.problem.outputs
+    vague = [n for n in model.free_names if fit.std[n] is None]
+    at_limit = [n for n in vague if _vanished(fit, n)]
+    vague = [n for n in vague if n not in at_limit]
+    said = []
+    motor = [n for n in vague if n in MOTOR]
+    if model.base == "dc_motor" and motor and "i" not in measured:
+        said.append(f"The current was not measured, so {_listed(motor)} cannot be told apart: only combinations such "
+                    "as R·J/K and K + R·b/K are determined. Measure the current, or fix R where it is known "
+                    "(--fix R=1.2).")
+        vague = [n for n in vague if n not in ("R", "L", "K", "b", "J") and not _a_torque(model, n)]
+    elif model.base == "dc_motor" and motor and "omega" not in measured and "theta" not in measured:
+        said.append(f"Neither speed nor angle was measured, so {_listed(motor)} cannot be told apart. Measure one of "
+                    "them, or fix K (--fix K=0.05).")
+        vague = [n for n in vague if n not in MOTOR and not _a_torque(model, n)]
+    if vague:
+        said.append(f"The records do not determine {_listed(vague)}: another value fits them as well. Hold "
+                    f"{'it' if len(vague) == 1 else 'one of them'} (--fix {vague[0]}), or look at "
+                    "`motorid identifiability`.")
+    for n in at_limit:
+        said.append(f"{n} ended at {fit.values[n]:.3g}, the limit of what is physical: these records show no sign "
+                    "of it.")
+    return said
+
+
+def _vanished(fit: Fit, name: str) -> bool:
+    p = fit.problem.model.parameters[name]
+    return bool(fit.values[name] <= p.lower or fit.values[name] >= p.upper)
+
+
+def _a_torque(model: Any, name: str) -> bool:
+    return "N" in model.parameters[name].unit
+
+
+def _listed(names: list[str]) -> str:
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
+
+
+def plain(value: Any) -> Any:
+    """Return `value` in the types that JSON knows; what is not a finite number becomes None."""
+    if isinstance(value, Mapping):
+        return {str(k): plain(v) for k, v in value.items()}
+    if isinstance(value, np.ndarray):
+        return plain(value.tolist())
+    if isinstance(value, list | tuple | set | frozenset):
+        return [plain(v) for v in value]
+    if isinstance(value, bool | np.bool_):
+        return bool(value)
+    if isinstance(value, int | np.integer):
+        return int(value)
+    if isinstance(value, float | np.floating):
+        return float(value) if np.isfinite(value) else None
+    return value if value is None or isinstance(value, str) else str(value)
+
+
+def write_json(contents: Mapping[str, Any], path: str | Path) -> None:
+    """Write a dictionary as JSON; ``-`` is standard output.
+
+    Raises
+    ------
+    UsageError
+        If the file cannot be written.
+    """
+    text = json.dumps(plain(contents), indent=1, ensure_ascii=False, allow_nan=False)
+    if str(path) == "-":
+        print(text)
+        return
+    try:
+        Path(path).expanduser().write_text(text + "\n", encoding="utf-8")
+    except OSError as error:
+        raise UsageError(f"cannot write {path}: {error.strerror or error}. Choose a folder that can be "
+                         "written.") from None
