@@ -151,8 +151,8 @@ class Equations:
                 used |= {s.name() for s in ca.symvar(e)}
             if not used & marks:
                 return expressions
-            expressions = [ca.substitute(e, ca.vertcat(*symbols), ca.vertcat(*[self.definitions[n] for n in names]))
-                           for e in expressions]
+            definitions = ca.vertcat(*[self.definitions[n] for n in names])
+            expressions = [ca.substitute(e, ca.vertcat(*symbols), definitions) for e in expressions]
         circle = ", ".join(sorted(s[1:] for s in used & marks))
-        raise ModelError(f"the definitions of {circle} go in a circle: an effect scales or replaces a quantity "
-                         "by an expression that needs that same quantity.")
+        raise ModelError(f"the definitions of {circle} go in a circle: an effect scales or replaces a "
+                         "quantity by an expression that needs that same quantity.")

@@ -72,7 +72,8 @@ class Effect(Shown):
         # Only plain data crosses a process boundary: the law goes by the name of its module, if it has one.
         module = getattr(self.law, "__module__", None)
         qualname = getattr(self.law, "__qualname__", "")
-        place = (module, qualname) if module not in (None, "__main__") and "<locals>" not in qualname else None
+        importable = module not in (None, "__main__") and "<locals>" not in qualname
+        place = (module, qualname) if importable else None
         return _restore_effect, (place, self.name, self.parameters, self.balance, self.doc,
                                  self.includes)
 
@@ -88,7 +89,8 @@ def _restore_effect(place: tuple[str, str] | None, name: str, parameters: tuple[
     return Effect(name, law, parameters, balance, doc, includes)
 
 
-def effect(*, balance: str, name: str | None = None, includes: tuple[str, ...] = ()) -> Callable[[Callable[..., None]], Effect]:
+def effect(*, balance: str, name: str | None = None,
+           includes: tuple[str, ...] = ()) -> Callable[[Callable[..., None]], Effect]:
     """Make an `Effect` of a function ``law(m, size=P(...), shape=P(...))``.
 
     Parameters
@@ -98,7 +100,7 @@ def effect(*, balance: str, name: str | None = None, includes: tuple[str, ...] =
     name : str, optional
         Default: the function's name.
     includes : tuple of str, optional
-        Effects that this one contains as a special case; it takes their place and refuses to stand beside them.
+        Effects that this one contains as a special case; it refuses to stand beside them.
 
     Raises
     ------
@@ -119,7 +121,8 @@ def effect(*, balance: str, name: str | None = None, includes: tuple[str, ...] =
         pars = []
         for arg in list(inspect.signature(law).parameters.values())[1:]:
             if not isinstance(arg.default, Declared):
-                raise ModelError(f"effect '{title}': argument '{arg.name}' needs a default P(value, unit, null=…).")
+                raise ModelError(f"effect '{title}': argument '{arg.name}' needs a default "
+                                 "P(value, unit, null=…).")
             pars.append(arg.default.named(arg.name))
         return Effect(title, law, tuple(pars), balance, inspect.cleandoc(law.__doc__ or ""), includes)
 
@@ -153,13 +156,15 @@ class Model(Shown):
     def __add__(self, other: Effect) -> Model:
         """Return the model with one more effect."""
         if not isinstance(other, Effect):
-            raise ModelError(f"a model takes effects, got {type(other).__name__}. Use mi.effects.<name> or @mi.effect.")
+            raise ModelError(f"a model takes effects, got {type(other).__name__}. Use mi.effects.<name> or "
+                             "@mi.effect.")
         if other.name in self.effect_names:
-            raise ModelError(f"the model already has '{other.name}'. Take it out first: model.without('{other.name}').")
+            raise ModelError(f"the model already has '{other.name}'. Take it out first: "
+                             f"model.without('{other.name}').")
         for e in self.effects:
             if e.name in other.includes or other.name in e.includes:
-                raise ModelError(f"'{other.name}' and '{e.name}' describe the same friction twice; one contains the "
-                                 f"other. Take the present one out first: model.without('{e.name}').")
+                raise ModelError(f"'{other.name}' and '{e.name}' describe the same friction twice; one contains "
+                                 f"the other. Take the present one out first: model.without('{e.name}').")
         for p in other.parameters:
             if p.name in self.parameters:
                 raise ModelError(f"'{other.name}' brings a parameter '{p.name}' that the model already has; "
@@ -176,7 +181,8 @@ class Model(Shown):
         """Return the model without the effect called `name`."""
         if name not in self.effect_names:
             raise ModelError(one_of(name, self.effect_names, "effect in this model"))
-        model = self._with(effects=(), parameters={k: v for k, v in self.parameters.items() if k in self._base_names})
+        base = {k: v for k, v in self.parameters.items() if k in self._base_names}
+        model = self._with(effects=(), parameters=base)
         for e in self.effects:
             if e.name != name:
                 model = model + e
@@ -188,7 +194,7 @@ class Model(Shown):
         return self._change({n: {"value": float(v), "given": True} for n, v in values.items()})
 
     def start_at(self, values: Mapping[str, float]) -> Model:
-        """Return the model with values taken from a result; unlike `replace`, a later fit may move its start."""
+        """Return the model with values of a result; unlike after `replace`, a fit may start elsewhere."""
         return self._change({n: {"value": float(v)} for n, v in values.items() if n in self.parameters})
 
     def fix(self, *names: str, **values: float) -> Model:
@@ -244,7 +250,7 @@ class Model(Shown):
 
     @property
     def stored(self) -> tuple[str, ...]:
-        """Base states whose balance has storage; without inductance (L held at 0) the current is algebraic."""
+        """Base states whose balance has storage; with L held at 0 the current is algebraic."""
         inductance = self.parameters.get("L")
         algebraic = inductance is not None and inductance.value == 0 and not inductance.vary
         return tuple(s for s in _STATES[self.base] if not (s == "i" and algebraic))
@@ -276,7 +282,8 @@ class Model(Shown):
         for c in set(outputs) - set(chosen):
             raise ModelError(one_of(c, CHANNELS, "channel"))
         if "i" in chosen and "i" not in _STATES[self.base]:
-            raise ModelError(f"the base '{self.base}' has no current: leave the channel 'i' out, or use dc_motor().")
+            raise ModelError(f"the base '{self.base}' has no current: leave the channel 'i' out, or use "
+                             "dc_motor().")
         key = (chosen, self.stored)
         if key not in self._systems:
             self._systems[key] = _shared_system(self, chosen)

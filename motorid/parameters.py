@@ -70,7 +70,8 @@ class Parameter:
                 f"To leave it out of the model, set it to zero and fix it: model.fix({self.name}=0)."
             )
         if self.lower > self.upper:
-            raise ModelError(f"parameter '{self.name}': lower limit {self.lower:g} above upper {self.upper:g}.")
+            raise ModelError(f"parameter '{self.name}': lower limit {self.lower:g} above upper "
+                             f"{self.upper:g}.")
         if not self.lower <= self.value <= self.upper:
             raise ModelError(
                 f"parameter '{self.name}' = {self.value:g} {self.unit} lies outside its limits "
@@ -139,7 +140,8 @@ class Scaling:
         scale = np.abs(values if sizes is None else np.asarray(sizes, float))
         scale = np.where((scale > 0) & np.isfinite(scale), scale, 1.0)
         log = np.array([p.positive for p in pars], bool)
-        return Scaling(scale, log, np.array([p.lower for p in pars], float), np.array([p.upper for p in pars], float))
+        lower, upper = ([getattr(p, side) for p in pars] for side in ("lower", "upper"))
+        return Scaling(scale, log, np.array(lower, float), np.array(upper, float))
 
     def physical(self, q: ArrayLike) -> NDArray[np.float64]:
         """Return p of q."""
@@ -160,6 +162,6 @@ class Scaling:
     def bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Limits in q."""
         with np.errstate(divide="ignore"):
-            low = np.where(self.log, np.log(np.maximum(self.lower, 0.0) / self.scale), self.lower / self.scale)
-            high = np.where(self.log, np.log(np.maximum(self.upper, 0.0) / self.scale), self.upper / self.scale)
+            low, high = (np.where(self.log, np.log(np.maximum(p, 0.0) / self.scale), p / self.scale)
+                         for p in (self.lower, self.upper))
         return low, high

@@ -31,7 +31,8 @@ from motorid.model import Effect
 LIBRARY: dict[str, Effect] = {
     e.name: e
     for e in (
-        brush_drop, winding_heating, inductance_saturation, magnetic_saturation, driver_dead_band, voltage_offset,
+        brush_drop, winding_heating, inductance_saturation, magnetic_saturation, driver_dead_band,
+        voltage_offset,
         coulomb, coulomb_asymmetric, stribeck, quadratic_drag, constant_load, gravity, cogging, torque_ripple,
         load_friction, viscous_asymmetric, lugre,
         compliance, backlash,

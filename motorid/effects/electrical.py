@@ -15,7 +15,7 @@ def brush_drop(
     V_b=P(0.5, "V", null=0.0, lower=0.0, doc="voltage lost at the brushes"),
     i_b=P(0.1, "A", positive=True, grid=(0.01, 0.03, 0.1, 0.3), doc="knee current"),
 ):
-    """Brush contact drop, V_b·tanh(i/i_b). Hameyer & Belmans, Electrical Machines; Shobert, Carbon Brushes, 1965."""
+    """Brush contact drop, V_b·tanh(i/i_b). Shobert, Carbon Brushes, 1965."""
     m.voltage -= V_b * ca.tanh(m.i / i_b)
 
 
@@ -33,7 +33,7 @@ def magnetic_saturation(
     m: Equations,
     i_K=P(5.0, "A", null=float("inf"), positive=True, grid=(0.7, 1.5, 3.0), doc="current that halves K"),
 ):
-    """Saturating flux, K/(1+(i/i_K)²) in torque and back-EMF. Krause et al., Analysis of Electric Machinery, 2013."""
+    """Saturating flux, K/(1+(i/i_K)²) in torque and back-EMF. Krause et al., Electric Machinery, 2013."""
     m.scale("K", 1 / (1 + (m.i / i_K) ** 2))
 
 
@@ -42,7 +42,7 @@ def driver_dead_band(
     m: Equations,
     V_d=P(0.2, "V", null=0.0, lower=0.0, doc="half-width of the dead band"),
 ):
-    """Dead band of the driver: commands within ±V_d give nothing, larger ones lose V_d. Tao & Kokotović, 1996."""
+    """Dead band of the driver: within ±V_d nothing comes, larger commands lose V_d. Tao & Kokotović, 1996."""
     m.replace("v", m.command - ca.fmax(-V_d, ca.fmin(V_d, m.command)))
 
 

@@ -33,7 +33,7 @@ def stribeck(
     tau_s=P(3e-3, "N·m", null=0.0, lower=0.0, at_least="tau_c", doc="breakaway torque"),
     omega_s=P(5.0, "rad/s", positive=True, grid=(0.01, 0.03, 0.1, 0.3), doc="Stribeck speed"),
 ):
-    """Stribeck friction, (tau_c + (tau_s−tau_c)·exp(−(ω/ω_s)²))·sgn ω. Armstrong-Hélouvry et al., Automatica, 1994."""
+    """Stribeck friction, (tau_c + (tau_s−tau_c)·exp(−(ω/ω_s)²))·sgn ω. Armstrong-Hélouvry et al., 1994."""
     level = tau_c + (tau_s - tau_c) * ca.exp(-((m.omega / omega_s) ** 2))
     m.torque -= level * m.sign(m.omega)
 
@@ -67,10 +67,10 @@ def gravity(
 def cogging(
     m: Equations,
     A=P(1e-3, "N·m", null=0.0, lower=0.0, doc="amplitude of the cogging torque"),
-    N=P(12.0, "", order=True, vary=False, lower=1.0, doc="periods per turn, found from the misfit, then held"),
+    N=P(12.0, "", order=True, vary=False, lower=1.0, doc="periods per turn, from the misfit, then held"),
     phi=P(0.0, "rad", periodic=True, doc="phase at theta = 0"),
 ):
-    """Cogging torque, A·sin(N·θ+φ). Hendershot & Miller, Design of Brushless Permanent-Magnet Machines, 2010."""
+    """Cogging torque, A·sin(N·θ+φ). Hendershot & Miller, Brushless Permanent-Magnet Machines, 2010."""
     m.torque -= A * ca.sin(N * m.theta + phi)
 
 
@@ -78,16 +78,19 @@ def cogging(
 def torque_ripple(
     m: Equations,
     a_r=P(0.05, "", null=0.0, lower=0.0, upper=1.0, doc="relative amplitude"),
-    N_r=P(12.0, "", order=True, vary=False, lower=1.0, doc="periods per turn, found from the misfit, then held"),
+    N_r=P(12.0, "", order=True, vary=False, lower=1.0, doc="periods per turn, from the misfit, then held"),
     phi_r=P(0.0, "rad", periodic=True, doc="phase at theta = 0"),
 ):
-    """Ripple of the torque constant, K·(1+a·sin(N·θ+φ)) in the torque only. Jahns & Soong, IEEE TIE 43(2), 1996."""
+    """Torque ripple, K·(1+a·sin(N·θ+φ)) in the torque only. Jahns & Soong, IEEE TIE 43(2), 1996."""
     m.scale("K_t", 1 + a_r * ca.sin(N_r * m.theta + phi_r))
 
 
 @effect(balance="torque")
-def load_friction(m: Equations, mu=P(0.1, "", null=0.0, lower=0.0, upper=1.0, doc="share of the motor torque lost")):
-    """Friction that grows with the torque carried, μ·abs(K·i)·sgn ω (gears, screws). Wenger et al., 2018; BAM, 2025."""
+def load_friction(
+    m: Equations,
+    mu=P(0.1, "", null=0.0, lower=0.0, upper=1.0, doc="share of the motor torque lost"),
+):
+    """Friction growing with the torque carried, μ·abs(K·i)·sgn ω (gears, screws). Duclusaud et al., BAM, 2025."""
     carried = m.K_t * m.i if "i" in m.states else m.g * m.v
     m.torque -= mu * ca.fabs(carried) * m.sign(m.omega)
 

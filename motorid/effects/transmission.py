@@ -18,7 +18,8 @@ def _two_inertias(m: Equations, share, resonance, zeta, twist_of, name: str) -> 
     twist, omega_load = m.state(f"twist_{name}"), m.state(f"omega_{name}", m.start["omega"])
     slip = m.omega - omega_load
     elastic, contact = twist_of(twist)
-    per_share = (1 - share) * (resonance**2 * elastic + 2 * zeta * resonance * contact * slip)  # shaft torque/(J r)
+    # Shaft torque over J·r:
+    per_share = (1 - share) * (resonance**2 * elastic + 2 * zeta * resonance * contact * slip)
     motor_side = m.symbols["J"]
     m.rate(twist, slip)
     m.rate(omega_load, per_share)
