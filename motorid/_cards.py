@@ -104,9 +104,9 @@ def _fit(fit: Any) -> Card:
     text = (
         f"{counted(len(runs), 'run')}, {fit.problem.n_outputs} samples, {steps} in {duration(fit.seconds)}. "
         + ", ".join(times),
-        "" if fit.status == "converged" else fit.message,
+        "" if fit.status == "converged" else f"{fit.message[:1].upper()}{fit.message[1:]}",
     )
-    after = [("mi.plot_fit(fit)", "see it"), ("mi.diagnose(fit)", "what is missing?")]
+    after = [("mi.plot_fit(fit)", "see it"), ("mi.diagnose(fit)", "what is missing")]
     if undetermined:
         after.append(("mi.identifiability(fit)", f"why {', '.join(undetermined)} cannot be determined"))
     return Card(
@@ -159,7 +159,7 @@ def _adequacy(a: Any) -> Card:
         (flag,),
         (a.text,),
         (Table(["channel", "noise", "residual", "ratio", "autocorrelation", "p"], rows),),
-        () if a.adequate else (("mi.diagnose(fit)", "what?"),),
+        () if a.adequate else (("mi.diagnose(fit)", "what is missing"),),
     )
 
 

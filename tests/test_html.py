@@ -1,0 +1,194 @@
+"""Display in notebooks: what is shown is in golden files, nothing is computed to show it.
+
+After a wanted change: ``MOTORID_UPDATE_GOLDEN=1 pytest tests/test_html.py``, then look at the difference.
+"""
+
+import os
+from pathlib import Path
+from types import SimpleNamespace
+
+import hand_made
+import html5lib
+import numpy as np
+import pytest
+
+import motorid as mi
+from motorid._cards import card_of
+from motorid._html import Card, Flag, Table, render, render_table
+from motorid.fit import Failure
+from motorid.problem import Problem
+
+GOLDEN = Path(__file__).parent / "golden"
+
+
+def fake_fit():
+    """What a card reads of a fit, with numbers chosen here: the golden file depends on nothing else."""
+    model = (mi.dc_motor() + mi.effects.coulomb).start_at(
+        {"R": 1.38012, "L": 1.72e-3, "K": 0.0462, "b": 6.5e-5, "J": 2.35e-5, "tau_c": 8.01e-3}
+    )
+    std = {"R": 0.0041, "L": None, "K": 1.2e-5, "b": 3e-7, "J": 0.0, "tau_c": 6e-6, "sgn_width": 0.0}
+    run = SimpleNamespace(units={"v": "V", "i": "A", "omega": "rad/s"})
+    return SimpleNamespace(
+        model=model.fix("J"), values=model.values, std=std, status="stalled", message="no step is better.",
+        formulation="penalty", problem=SimpleNamespace(experiments=(run, run), n_outputs=7640), iterations=12,
+        seconds=0.231, nrmse={"i": 0.0168, "omega": 0.00815}, rmse={"i": 0.0042, "omega": 0.149},
+        tau_e=1.25e-3, tau_m=15.2e-3, damping=1.71,
+    )  # fmt: skip
+
+
+def fake_ladder():
+    plain, better = fake_fit(), fake_fit()
+    plain.model = mi.dc_motor(R=1.4)
+    plain.values = plain.model.values
+    rungs = (
+        SimpleNamespace(added=None, fit=plain, nrmse={"i": 0.273, "omega": 0.112}, removed=(),
+                        validation_nrmse={"i": 0.211, "omega": 0.127}),
+        SimpleNamespace(added="coulomb", fit=better, nrmse={"i": 0.0168, "omega": 0.00815}, removed=(),
+                        validation_nrmse={"i": 0.0138, "omega": 0.0102}),
+    )  # fmt: skip
+    return SimpleNamespace(rungs=rungs, text="Stopped: nothing is left but noise.")
+
+
+def fake_diagnosis():
+    ladder = fake_ladder()
+    return SimpleNamespace(
+        verdict="missing", text="Coulomb friction is missing.", where="mechanical",
+        suggestion="Reverse slowly.",
+        groups=(("coulomb", "stribeck"),), ranking=hand_made.candidates(), ladder=ladder,
+        before=ladder.rungs[0].fit, after=ladder.rungs[1].fit,
+    )  # fmt: skip
+
+
+def experiment():
+    t = np.arange(10) * 1e-3
+    i = np.where(np.arange(10) == 3, np.nan, 0.5)
+    return mi.Experiment(
+        t, {"v": np.ones(10)}, {"i": i, "omega": t}, name="run1", meta={"notes": ["rpm <converted>."]}
+    )
+
+
+CARDS = {
+    "experiment": lambda: card_of(experiment()),
+    "model": lambda: card_of(mi.dc_motor(R=1.3).fix("L") + mi.effects.cogging(N=12)),
+    "effect": lambda: card_of(mi.effects.stribeck),
+    "fit": lambda: card_of(_as("Fit", fake_fit())),
+    "failure": lambda: card_of(Failure({"R": 1.0, "L": 1e-3}, "failed", "The integration stopped at 0.2 s.")),
+    "evaluation": lambda: card_of(_as("Evaluation", SimpleNamespace(
+        simulations=(SimpleNamespace(experiment=experiment()),), nrmse={"i": 0.0138, "omega": 0.0102},
+        rmse={"i": 0.0042, "omega": 0.154}, by_run=({"i": 0.0138, "omega": 0.0102},)))),
+    "adequacy": lambda: card_of(hand_made.adequacy(False)),
+    "missing": lambda: card_of(_as("Missing", SimpleNamespace(
+        where="mechanical", text="The torque balance fails.", shares={"electrical": 0.04, "mechanical": 0.95},
+        regions={"steady": 0.6}, bins={"torque": (SimpleNamespace(against="omega", explained=0.93),)}))),
+    "ladder": lambda: card_of(_as("Ladder", fake_ladder())),
+    "diagnosis": lambda: card_of(_as("Diagnosis", fake_diagnosis())),
+}  # fmt: skip
+
+
+def _as(kind, fake):
+    """Give a stand-in the name by which cards are found."""
+    return type(kind, (SimpleNamespace,), {})(**vars(fake))
+
+
+@pytest.mark.parametrize("name", CARDS)
+def test_a_card_is_what_its_golden_file_says(name):
+    shown = render(CARDS[name]()) + "\n"
+    path = GOLDEN / f"{name}.html"
+    if os.environ.get("MOTORID_UPDATE_GOLDEN"):
+        path.write_text(shown, encoding="utf-8")
+    assert shown == path.read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("name", CARDS)
+def test_a_card_is_valid_html_with_named_columns_and_rows(name):
+    page = f"<!DOCTYPE html><html><head><title>x</title></head><body>{render(CARDS[name]())}</body></html>"
+    page = page.replace("<style>", "<style type='text/css'>")
+    parser = html5lib.HTMLParser(strict=True, namespaceHTMLElements=False)
+    tree = parser.parse(page)
+    for table in tree.iter("table"):
+        assert all(th.get("scope") == "col" for th in table.find("thead").iter("th"))
+        widths = {len(list(row)) for row in table.iter("tr")}
+        assert len(widths) == 1
+        assert all(row[0].get("scope") == "row" for row in table.find("tbody"))
+
+
+def test_no_golden_file_is_left_over():
+    assert {p.stem for p in GOLDEN.glob("*.html")} == set(CARDS)
+
+
+def test_text_from_files_cannot_become_markup():
+    assert "&lt;converted&gt;" in render(CARDS["experiment"]())
+    table = Table(["<a>"], [["<b>", Flag("<c>", "good")]], caption="<d>")
+    assert not {"<a>", "<b>", "<c>", "<d>"} & set(_tags(render_table(table)))
+
+
+def _tags(html):
+    return [f"<{part.split('>')[0]}>" for part in html.split("<")[1:]]
+
+
+def test_flags_are_told_apart_by_words_and_by_a_colour_of_enough_contrast():
+    from motorid._html import _COLOURS
+
+    for ink, paper in _COLOURS.values():
+        light, dark = sorted((luminance(ink), luminance(paper)), reverse=True)
+        assert (light + 0.05) / (dark + 0.05) >= 5.5
+
+
+def luminance(colour):
+    """Relative luminance of WCAG 2.1."""
+    parts = [int(colour[k : k + 2], 16) / 255 for k in (1, 3, 5)]
+    linear = [c / 12.92 if c <= 0.03928 else ((c + 0.055) / 1.055) ** 2.4 for c in parts]
+    return float(np.dot(linear, [0.2126, 0.7152, 0.0722]))
+
+
+def test_what_is_not_determined_or_held_is_said_in_words():
+    shown = render(CARDS["fit"]())
+    assert "(not determined)" in shown
+    assert "1 not determined" in shown
+    assert "(held)" in shown
+    assert "why L cannot be determined" in shown
+    assert "sgn_width" not in shown
+
+
+def test_every_card_says_what_to_do_next_unless_there_is_nothing_to_do():
+    for name in CARDS:
+        assert CARDS[name]().after or name == "failure"
+
+
+def test_plain_text_is_one_line_for_every_result():
+    found = hand_made.diagnosis(np.random.default_rng(1))
+    results = [
+        found,
+        found.ladder,
+        found.missing,
+        found.adequacy,
+        found.before,
+        experiment(),
+        mi.dc_motor(),
+        mi.effects.coulomb,
+        Failure({}, "failed", "why"),
+        mi.evaluate(found.after, hand_made.friction()[1]),
+    ]
+    for r in results:
+        line = repr(r)
+        assert "\n" not in line
+        assert 8 < len(line) < 160, line
+        assert line.startswith("<")
+
+
+def test_showing_a_result_computes_nothing(monkeypatch):
+    found = hand_made.diagnosis(np.random.default_rng(1))
+    fit = mi.fit(mi.dc_motor(), hand_made.friction()[0])
+
+    def forbidden(*_args, **_kwargs):
+        raise AssertionError("a simulation was made to show a result")
+
+    monkeypatch.setattr(Problem, "simulate", forbidden)
+    monkeypatch.setattr(np.linalg, "svd", forbidden)
+    for r in (found, found.ladder, found.missing, found.adequacy, found.before, fit):
+        assert r._repr_html_().count("<table>") >= 1
+        assert repr(r)
+
+
+def test_a_result_without_a_card_shows_its_line():
+    assert card_of(3) == Card("int", text=("3",))
