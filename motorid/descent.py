@@ -1,9 +1,9 @@
 """Least squares in stages: sgn from wide to narrow, sub-steps refined where the solution goes.
 
 Friction makes the misfit rugged: a parameter moves the instant at which a speed passes through zero. A wide
-sgn smooths this over, and its minimum leads to the right one (numerical continuation, Allgower & Georg, 1990).
-On the EMPS record five starts within a factor of three ended at 2.61-3.01 mm with the final width alone, and
-all at 2.551 mm in stages.
+sgn smooths this over, and its minimum leads to the right one (numerical continuation, Allgower & Georg,
+1990). On the EMPS record five starts within a factor of three ended at 2.61-3.01 mm with the final width
+alone, and all at 2.551 mm in stages.
 """
 
 from __future__ import annotations
@@ -22,6 +22,10 @@ from motorid.problem import Problem
 WIDER = (30.0, 5.0)  # times the final width of sgn
 ROUNDS = 4  # of refining the sub-steps
 IMBALANCE = 3.0  # between channels, in misfit over noise, above which the misfit decides the weights
+
+LOOKS = ((True, 0.1), (False, 10.0))  # again from the start: the other weights first?, first damping
+EXPLAINED = 0.25  # NRMSE above which a channel counts as hardly explained
+FLAT = 0.03  # of the misfit: what a change by a factor of e does at least, if the data have a say in it
 
 Callback = Callable[[int, float, Array], object] | None
 
@@ -58,8 +62,7 @@ def descend(problem: Problem, options: LevenbergMarquardt, callback: Callback = 
     q = problem.start
     for _ in range(ROUNDS):
         problem = problem.refined(q)
-        found = levenberg_marquardt(problem.residual, problem.residual_and_jacobian, q, problem.scaling.bounds,
-                                    options, callback, problem.scaling.log)
+        found = _solve(problem, q, options, callback)
         history += found.history
         moved = np.max(np.abs(found.q - q), initial=0.0) > 1e-3
         q = found.q
@@ -68,16 +71,79 @@ def descend(problem: Problem, options: LevenbergMarquardt, callback: Callback = 
     return Descent(problem, found, tuple(history))
 
 
+def _solve(problem: Problem, q: Array, options: LevenbergMarquardt, callback: Callback) -> Solution:
+    return levenberg_marquardt(problem.residual, problem.residual_and_jacobian, q, problem.scaling.bounds,
+                               options, callback, problem.scaling.log)
+
+
+def descend_surely(problem: Problem, options: LevenbergMarquardt, callback: Callback = None, *,
+                   stages: bool = True) -> Descent:
+    """Like `descend`, and take a second look from the start where the end is doubtful.
+
+    Two valleys lead far starts astray. With the electrical and the mechanical time constant swapped the
+    speed comes out right and the current not at all; with hardly any resistance inductance and inertia
+    ring. The first is left by letting every channel count alike at first (errors over the RMS), the second
+    by smaller first steps.
+    """
+    done = descend(problem, options, callback, stages=stages)
+    for other, damping in LOOKS[:options.looks]:
+        if not doubtful(problem, done):
+            break
+        careful = replace(options, damping=damping)
+        try:
+            begin = _by_other_weights(problem, careful) if other else problem
+            again = descend(begin, careful, callback, stages=stages)
+        except (FitError, SimulationError):
+            continue
+        best = min(done, again, key=lambda d: float(d.solution.residual @ d.solution.residual))
+        done = replace(best, history=done.history + again.history)
+    return done
+
+
+def doubtful(problem: Problem, done: Descent) -> bool:
+    """Tell whether a descent went far and ended where it should not.
+
+    That is: without convergence, with a channel hardly explained, or in a direction that the data do not
+    ask for.
+    """
+    log, found = problem.scaling.log, done.problem.scaling.physical(done.solution.q)
+    moved = np.log(found[log] / problem.scaling.physical(problem.start)[log])
+    if np.max(np.abs(moved), initial=0.0) < 1.0:
+        return False
+    if done.solution.status != "converged" or _hardly_explained(done.problem, done.solution.q):
+        return True
+    jac = done.solution.jac[:, log]
+    s, directions = np.linalg.svd(np.linalg.qr(jac, mode="r"))[1:]
+    flat = directions[:len(s)][s < FLAT * np.linalg.norm(done.solution.residual)]
+    return bool(np.max(np.abs(flat.T @ (flat @ moved)), initial=0.0) > 1.0)
+
+
+def _hardly_explained(problem: Problem, q: Array) -> bool:
+    for c, factor in misfit_over_noise(problem, q).items():
+        runs = [r for r in problem.runs if c in r.sigma]
+        rms = np.sqrt(np.mean([np.nanmean((r.experiment.outputs[c] / r.sigma[c]) ** 2) for r in runs]))
+        if factor > max(3.0, EXPLAINED * rms):
+            return True
+    return False
+
+
+def _by_other_weights(problem: Problem, options: LevenbergMarquardt) -> Problem:
+    weights = "noise" if problem.weights == "rms" else "rms"
+    other = replace(problem, weights=weights, balance={}, _runs=problem.runs)
+    found = descend(other, replace(options, ftol=1e-2), stages=False)
+    return problem.for_model(problem.model.start_at(problem.values(found.solution.q)))
+
+
 def descend_balanced(problem: Problem, options: LevenbergMarquardt, callback: Callback = None, *,
                      stages: bool = True) -> Descent:
     """Like `descend`, and where the model fails, weigh channels by their misfit instead of their noise.
 
-    A model that cannot reach the noise would otherwise spend itself on the channel with the smallest noise (an
-    encoder), at any price in the others. Noise and misfit together give the maximum of the likelihood with the
-    channels' variances as unknowns, ``Σ n·ln(SSR)`` (Seber & Wild, Nonlinear Regression, 1989, ch. 11); a model
-    that reaches the noise keeps the weights of the noise.
+    A model that cannot reach the noise would otherwise spend itself on the channel with the smallest noise
+    (an encoder), at any price in the others. Noise and misfit together give the maximum of the likelihood
+    with the channels' variances as unknowns, ``Σ n·ln(SSR)`` (Seber & Wild, Nonlinear Regression, 1989, ch.
+    11); a model that reaches the noise keeps the weights of the noise.
     """
-    done = descend(problem, options, callback, stages=stages)
+    done = descend_surely(problem, options, callback, stages=stages)
     if problem.weights != "noise" or problem.loss is not None or len(problem.outputs) < 2:
         return done
     begin = problem
@@ -106,7 +172,8 @@ def misfit_over_noise(problem: Problem, q: Array) -> dict[str, float]:
     return {c: max(float(np.sqrt(s / max(n, 1))), 1.0) for c, (s, n) in sums.items()}
 
 
-def _narrowing(problem: Problem, options: LevenbergMarquardt, callback: Callback, history: list[float]) -> Problem:
+def _narrowing(problem: Problem, options: LevenbergMarquardt, callback: Callback,
+               history: list[float]) -> Problem:
     """Return the problem with the values that wider and wider, then narrower, sgn leads to."""
     width = problem.model.parameters.get("sgn_width")
     if width is None or width.given or width.vary:
@@ -116,8 +183,7 @@ def _narrowing(problem: Problem, options: LevenbergMarquardt, callback: Callback
         wide = problem.for_model(problem.model.replace(sgn_width=factor * width.value))
         try:
             wide = wide.refined(wide.start)
-            found = levenberg_marquardt(wide.residual, wide.residual_and_jacobian, wide.start, wide.scaling.bounds,
-                                        options, callback, wide.scaling.log)
+            found = _solve(wide, wide.start, options, callback)
         except (FitError, SimulationError):
             continue
         history += found.history
@@ -151,4 +217,5 @@ def _halved(run: Run) -> Run:
     return replace(run, grid=run.grid.with_substeps(2 * run.grid.substeps))
 
 
-__all__ = ["Descent", "descend", "descend_balanced", "integration_error", "misfit_over_noise"]
+__all__ = ["Descent", "descend", "descend_balanced", "descend_surely", "doubtful", "integration_error",
+           "misfit_over_noise"]

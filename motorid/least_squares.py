@@ -1,19 +1,20 @@
 """Levenberg-Marquardt on whitened residuals with exact Jacobians.
 
-The damped step solves ``min ‖J d + r‖² + λ‖D d‖²`` by a QR factorisation of J (never JᵀJ). A residual that cannot be
-computed counts as a bad step: it is shortened, and the fit goes on. Variables at a bound whose gradient points outward
-are held for the step. λ = 0 is the Gauss-Newton step.
+The damped step solves ``min ‖J d + r‖² + λ‖D d‖²`` by a QR factorisation of J (never JᵀJ). A residual that
+cannot be computed counts as a bad step: it is shortened, and the fit goes on. Variables at a bound whose
+gradient points outward are held for the step. λ = 0 is the Gauss-Newton step.
 
-Why it arrives from far away. On the logarithmic scale a positive parameter that runs to zero or to infinity loses its
-influence, and the plateau behind it looks like a minimum. The usual D, the column norms of J (Moré, "The
-Levenberg-Marquardt algorithm", 1978), hardly brakes a parameter of little influence: a first step that is right for
-the others throws it onto the plateau. Here D = ‖r‖ on a logarithmic scale: a change by a factor of e costs λ times the
-present misfit, whatever the parameter, so parameters that the misfit does not ask for stay where they are until their
-turn comes. Damping in proportion to ‖r‖² makes the method converge globally and quadratically even where J is
-singular (Yamashita & Fukushima, Computing Suppl. 15, 2001; Fan & Yuan, Computing 74, 2005), and it fades as the
-misfit does. λ follows the gain ratio (Nielsen, report IMM-REP-1999-05). Of 400 random starts within a factor of ten in
-each of five parameters, 399 and 398 ended in the optimum of the two shipped motors, in 8 and 11 steps (median);
-with the column norms it was 94 and 75 of 100, in 9 and 17.
+Why it arrives from far away. On the logarithmic scale a positive parameter that runs to zero or to infinity
+loses its influence, and the plateau behind it looks like a minimum. The usual D, the column norms of J
+(Moré, "The Levenberg-Marquardt algorithm", 1978), hardly brakes a parameter of little influence: a first
+step that is right for the others throws it onto the plateau. Here D = ‖r‖ on a logarithmic scale: a change
+by a factor of e costs λ times the present misfit, whatever the parameter, so parameters that the misfit
+does not ask for stay where they are until their turn comes. Damping in proportion to ‖r‖² makes the method
+converge globally and quadratically even where J is singular (Yamashita & Fukushima, Computing Suppl. 15,
+2001; Fan & Yuan, Computing 74, 2005), and it fades as the misfit does. λ follows the gain ratio (Nielsen,
+report IMM-REP-1999-05). Of 400 random starts within a factor of ten in each of five parameters, 399 and 398
+ended in the optimum of the two shipped motors, in 8 and 11 steps (median); with the column norms it was 94
+and 75 of 100, in 9 and 17.
 """
 
 from __future__ import annotations
@@ -42,6 +43,8 @@ class LevenbergMarquardt:
         First λ; 0 is Gauss-Newton.
     longest_step : float
         Largest change of one coordinate per iteration: e² on the logarithmic scale.
+    looks : int
+        How often a doubtful end is looked at again from the start; see `motorid.descent`.
     """
 
     max_iterations: int = 200
@@ -49,6 +52,7 @@ class LevenbergMarquardt:
     xtol: float = 1e-9
     damping: float = 0.1
     longest_step: float = 2.0
+    looks: int = 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,9 +75,13 @@ MESSAGES = {
     "cost": "converged: a full step no longer lowers the cost",
     "step": "converged: the step is below the tolerance",
     "gradient": "converged: the gradient is zero within rounding",
-    "stalled": "stalled: no step lowers the cost; the model may be too stiff here. Try another start or engine",
+    "valley": "stalled: the cost hardly falls along a flat valley; identifiability() shows which parameters "
+              "cannot be told apart",
+    "stalled": "stalled: no step lowers the cost; the model may be too stiff here. Try another start or "
+               "engine",
     "limit": "stopped after {} iterations; raise max_iterations or look at identifiability()",
 }
+VALLEY = (30, 3e-4)  # so many iterations that lower the cost by less than this share are enough
 SLACK = 1.0  # λ above which a small gain does not mean the end: the step was short, not the way
 
 
@@ -109,7 +117,7 @@ def levenberg_marquardt(
     """
     o = options or LevenbergMarquardt()
     search = _Search(residual, both, np.asarray(q0, float), bounds, o, log)
-    history, status = [search.cost], "limit"
+    history, status = [search.cost], ""
     for iteration in range(1, o.max_iterations + 1):
         before = search.cost
         status = search.step()
@@ -117,11 +125,17 @@ def levenberg_marquardt(
             history.append(search.cost)
             if callback is not None:
                 callback(iteration, search.cost, search.q)
-        if status:
+        if status or _crawls(history):
             break
-    status = status or "limit"
-    return Solution(search.q, search.r, search.jac, status if status in ("stalled", "limit") else "converged",
-                    MESSAGES[status].format(o.max_iterations), tuple(history), search.evaluations)
+    reason = status or ("valley" if _crawls(history) else "limit")
+    ends = {"valley": "stalled", "stalled": "stalled", "limit": "limit"}
+    return Solution(search.q, search.r, search.jac, ends.get(reason, "converged"),
+                    MESSAGES[reason].format(o.max_iterations), tuple(history), search.evaluations)
+
+
+def _crawls(history: list[float]) -> bool:
+    back, share = VALLEY
+    return len(history) > back and history[-1 - back] - history[-1] < share * history[-1]
 
 
 class _Search:
@@ -138,8 +152,8 @@ class _Search:
         try:
             self._move(self.q)
         except SimulationError as error:
-            raise FitError(f"the model cannot be simulated at the start: {error} Give other starting values with "
-                           "model.replace(…), or leave them out.") from None
+            raise FitError(f"the model cannot be simulated at the start: {error} Give other starting values "
+                           "with model.replace(…), or leave them out.") from None
 
     def _move(self, q: Array) -> None:
         self.r, self.jac = self.both(q)
@@ -192,7 +206,7 @@ class _Search:
 
 def _reduce(jac: Array, r: Array) -> tuple[Array, Array]:
     """Return R and Qᵀr of jac = QR, through the R of [J r], which needs no Q."""
-    full = np.linalg.qr(np.column_stack([jac, r]), mode="r")
+    full: Array = np.asarray(np.linalg.qr(np.column_stack([jac, r]), mode="r"))
     n = jac.shape[1]
     if full.shape[0] < n:  # fewer residuals than unknowns
         full = np.vstack([full, np.zeros((n - full.shape[0], n + 1))])
@@ -200,7 +214,7 @@ def _reduce(jac: Array, r: Array) -> tuple[Array, Array]:
 
 
 def _inside(triangle: Array, rotated: Array, size: Array, lam: float, low: Array, high: Array) -> Array:
-    """Damped step within the box: what would leave it is put on its bound, and the others are solved again."""
+    """Damped step within the box: what would leave it goes on its bound, and the others are solved again."""
     step, loose = np.zeros(len(size)), np.ones(len(size), bool)
     while loose.any():
         rest = rotated + triangle[:, ~loose] @ step[~loose]
@@ -235,8 +249,8 @@ def _cost(residual: Callable[[Array], Array], q: Array) -> float:
 def gauss_newton_covariance(jac: Array, variance: float = 1.0) -> tuple[Array, Array]:
     """Return the covariance (JᵀJ)⁻¹·variance, and which coordinates the data determine.
 
-    Columns are scaled to unit length first; directions with singular values below 1e-8 of the largest are left
-    out, and a coordinate with a noticeable part in such a direction counts as not determined.
+    Columns are scaled to unit length first; directions with singular values below 1e-8 of the largest are
+    left out, and a coordinate with a noticeable part in such a direction counts as not determined.
 
     Returns
     -------
