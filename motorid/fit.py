@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from motorid.bases import BASES
 from motorid.descent import descend_balanced, integration_error
 from motorid.display import Shown
 from motorid.errors import FitError, SimulationError, UsageError, one_of
@@ -322,9 +323,7 @@ def started(problem: Problem) -> Problem:
 
 
 def _was_fitted(model: Model) -> bool:
-    from motorid.model import _BASES
-
-    return any(model.parameters[p.name].value != p.value for p in _BASES[model.base])
+    return any(model.parameters[p.name].value != p.value for p in BASES[model.base])
 
 
 def _cost_of(problem: Problem) -> float:

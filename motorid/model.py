@@ -2,131 +2,25 @@
 
 from __future__ import annotations
 
-import importlib
-import inspect
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Any
 
 import casadi as ca
 
+from motorid.bases import BASES, DERIVED, QUANTITIES, STATES
 from motorid.display import Shown
 from motorid.equations import CHANNELS, Equations
 from motorid.errors import ModelError, one_of
-from motorid.parameters import Declared, Parameter
+from motorid.parameters import Parameter
 from motorid.system import System, build_system
+from motorid.term import Effect, effect
 
-BALANCES = ("voltage", "torque", "transmission", "sensor")
 SGN_WIDTH = Parameter("sgn_width", 1e-2, "rad/s", positive=True, vary=False,
                       doc="speed over which sgn(omega) is smoothed; chosen from the data unless given")
 LINEAR_UNITS = {"N·m": "N", "rad/s": "m/s", "rad": "m", "kg·m²": "kg", "N·m·s/rad": "N·s/m",
                 "N·m·s²/rad²": "N·s²/m²", "N·m/rad": "N/m", "N·m·s²": "kg", "1/(N·m)": "1/N"}
-
-
-@dataclass(frozen=True, eq=False)
-class Effect(Shown):
-    """One physical effect: a law that writes on the `Equations` sheet.
-
-    Attributes
-    ----------
-    name : str
-    law : callable
-        ``law(m, **symbols)``.
-    parameters : tuple of Parameter
-    balance : str
-        ``"voltage"``, ``"torque"``, ``"transmission"`` or ``"sensor"``.
-    doc : str
-        What it is, with its source.
-    includes : tuple of str
-        Effects that this one contains as a special case (Stribeck friction contains Coulomb's).
-    """
-
-    name: str
-    law: Callable[..., None] | None
-    parameters: tuple[Parameter, ...]
-    balance: str
-    doc: str = ""
-    includes: tuple[str, ...] = ()
-
-    @property
-    def size(self) -> Parameter | None:
-        """The parameter that makes the effect vanish at its null value, if there is just one such."""
-        sizes = [p for p in self.parameters if p.null is not None]
-        return sizes[0] if sizes else None
-
-    def __call__(self, **values: float) -> Effect:
-        """Return the effect with some parameters given, e.g. ``cogging(N=12)`` (held if it is an order)."""
-        known = {p.name: p for p in self.parameters}
-        for name in values:
-            if name not in known:
-                raise ModelError(f"effect '{self.name}': {one_of(name, known, 'parameter')}")
-        pars = tuple(replace(p, value=float(values[p.name]), given=True, vary=p.vary and not p.order)
-                     if p.name in values else p for p in self.parameters)
-        return replace(self, parameters=pars)
-
-    def __repr__(self) -> str:
-        return f"<effect {self.name} ({self.balance}): {', '.join(p.name for p in self.parameters)}>"
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        # Only plain data crosses a process boundary: the law goes by the name of its module, if it has one.
-        module = getattr(self.law, "__module__", None)
-        qualname = getattr(self.law, "__qualname__", "")
-        importable = module not in (None, "__main__") and "<locals>" not in qualname
-        place = (module, qualname) if importable else None
-        return _restore_effect, (place, self.name, self.parameters, self.balance, self.doc,
-                                 self.includes)
-
-
-def _restore_effect(place: tuple[str, str] | None, name: str, parameters: tuple[Parameter, ...], balance: str,
-                    doc: str, includes: tuple[str, ...]) -> Effect:
-    law = None
-    if place is not None:
-        try:
-            law = getattr(importlib.import_module(place[0]), place[1]).law
-        except (ImportError, AttributeError):
-            law = None
-    return Effect(name, law, parameters, balance, doc, includes)
-
-
-def effect(*, balance: str, name: str | None = None,
-           includes: tuple[str, ...] = ()) -> Callable[[Callable[..., None]], Effect]:
-    """Make an `Effect` of a function ``law(m, size=P(...), shape=P(...))``.
-
-    Parameters
-    ----------
-    balance : {"voltage", "torque", "transmission", "sensor"}
-        The balance (or the sensor) that the effect acts on.
-    name : str, optional
-        Default: the function's name.
-    includes : tuple of str, optional
-        Effects that this one contains as a special case; it refuses to stand beside them.
-
-    Raises
-    ------
-    ModelError
-        If an argument has no `P` default or the balance is unknown.
-
-    Examples
-    --------
-    >>> @effect(balance="torque")
-    ... def coulomb(m, tau_c=P(2e-3, "N·m", null=0)):
-    ...     m.torque -= tau_c * m.sign(m.omega)
-    """
-    if balance not in BALANCES:
-        raise ModelError(one_of(balance, BALANCES, "balance"))
-
-    def make(law: Callable[..., None]) -> Effect:
-        title = name or law.__name__
-        pars = []
-        for arg in list(inspect.signature(law).parameters.values())[1:]:
-            if not isinstance(arg.default, Declared):
-                raise ModelError(f"effect '{title}': argument '{arg.name}' needs a default "
-                                 "P(value, unit, null=…).")
-            pars.append(arg.default.named(arg.name))
-        return Effect(title, law, tuple(pars), balance, inspect.cleandoc(law.__doc__ or ""), includes)
-
-    return make
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,8 +57,8 @@ class Model(Shown):
                              f"model.without('{other.name}').")
         for e in self.effects:
             if e.name in other.includes or other.name in e.includes:
-                raise ModelError(f"'{other.name}' and '{e.name}' describe the same friction twice; one contains "
-                                 f"the other. Take the present one out first: model.without('{e.name}').")
+                raise ModelError(f"'{other.name}' and '{e.name}' describe the same friction twice; one "
+                                 f"contains the other. Take the present one out first: model.without('{e.name}').")
         for p in other.parameters:
             if p.name in self.parameters:
                 raise ModelError(f"'{other.name}' brings a parameter '{p.name}' that the model already has; "
@@ -228,7 +122,7 @@ class Model(Shown):
 
     @property
     def _base_names(self) -> tuple[str, ...]:
-        return tuple(p.name for p in _BASES[self.base])
+        return tuple(p.name for p in BASES[self.base])
 
     def _in_units(self, p: Parameter) -> Parameter:
         return replace(p, unit=LINEAR_UNITS.get(p.unit, p.unit)) if self.axis == "linear" else p
@@ -253,14 +147,14 @@ class Model(Shown):
         """Base states whose balance has storage; with L held at 0 the current is algebraic."""
         inductance = self.parameters.get("L")
         algebraic = inductance is not None and inductance.value == 0 and not inductance.vary
-        return tuple(s for s in _STATES[self.base] if not (s == "i" and algebraic))
+        return tuple(s for s in STATES[self.base] if not (s == "i" and algebraic))
 
     def write(self) -> Equations:
         """Return the filled sheet: the base and the effects, in an order that does not depend on adding."""
-        m = Equations(_STATES[self.base], self.angle_input)
+        m = Equations(STATES[self.base], self.angle_input)
         symbols = m.symbols = {n: ca.SX.sym(n) for n in self.parameters}
-        for name in _QUANTITIES[self.base]:
-            m.define(name, symbols[name] if name in symbols else _DERIVED[name](m))
+        for name in QUANTITIES[self.base]:
+            m.define(name, symbols[name] if name in symbols else DERIVED[name](m))
         m.define("v", m.command)
         for e in sorted(self.effects, key=lambda e: e.name):
             if e.law is None:
@@ -281,7 +175,7 @@ class Model(Shown):
         chosen = tuple(c for c in CHANNELS if c in set(outputs))
         for c in set(outputs) - set(chosen):
             raise ModelError(one_of(c, CHANNELS, "channel"))
-        if "i" in chosen and "i" not in _STATES[self.base]:
+        if "i" in chosen and "i" not in STATES[self.base]:
             raise ModelError(f"the base '{self.base}' has no current: leave the channel 'i' out, or use "
                              "dc_motor().")
         key = (chosen, self.stored)
@@ -310,25 +204,6 @@ def _shared_system(model: Model, outputs: tuple[str, ...]) -> System:
     return slot[0]
 
 
-_STATES = {"dc_motor": ("i", "omega"), "torque_driven": ("omega",)}
-_QUANTITIES = {"dc_motor": ("R", "L", "K", "K_t", "K_e", "b", "J"), "torque_driven": ("g", "b", "J")}
-_DERIVED = {"K_t": lambda m: m.K, "K_e": lambda m: m.K}
-_BASES = {
-    "dc_motor": (
-        Parameter("R", 1.0, "Ω", positive=True, doc="winding resistance"),
-        Parameter("L", 1e-3, "H", positive=True, doc="winding inductance"),
-        Parameter("K", 0.05, "N·m/A", positive=True, doc="torque and back-EMF constant (V·s/rad)"),
-        Parameter("b", 1e-5, "N·m·s/rad", positive=True, doc="viscous friction"),
-        Parameter("J", 1e-5, "kg·m²", positive=True, doc="moment of inertia"),
-    ),
-    "torque_driven": (
-        Parameter("g", 1.0, "N·m/V", positive=True, vary=False, doc="torque per unit of the command; held"),
-        Parameter("b", 1e-3, "N·m·s/rad", positive=True, doc="viscous friction"),
-        Parameter("J", 1e-3, "kg·m²", positive=True, doc="moment of inertia"),
-    ),
-}
-
-
 def dc_motor(**values: float) -> Model:
     """Return the brushed DC motor ``L di/dt = v − R i − K ω``, ``J dω/dt = K i − b ω``.
 
@@ -337,7 +212,7 @@ def dc_motor(**values: float) -> Model:
     **values : float
         Known or assumed R (Ω), L (H), K (N·m/A), b (N·m·s/rad), J (kg·m²); none is needed for a fit.
     """
-    model = Model("dc_motor", parameters={p.name: p for p in _BASES["dc_motor"]})
+    model = Model("dc_motor", parameters={p.name: p for p in BASES["dc_motor"]})
     return model.replace(**values)
 
 
@@ -353,9 +228,12 @@ def torque_driven(axis: str = "rotary", **values: float) -> Model:
     """
     if axis not in ("rotary", "linear"):
         raise ModelError(one_of(axis, ("rotary", "linear"), "axis"))
-    pars = {p.name: p for p in _BASES["torque_driven"]}
+    pars = {p.name: p for p in BASES["torque_driven"]}
     if axis == "linear":
         units = {"g": "N/V", "b": "N·s/m", "J": "kg"}
         docs = {"g": "force per unit of the command; held", "J": "moving mass", "b": "viscous friction"}
         pars = {n: replace(p, unit=units[n], doc=docs[n]) for n, p in pars.items()}
     return Model("torque_driven", parameters=pars, axis=axis).replace(**values)
+
+
+__all__ = ["Effect", "Model", "dc_motor", "effect", "torque_driven"]

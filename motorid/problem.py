@@ -95,8 +95,8 @@ class Problem:
         for e in self.model.effects:
             if e.parameters and not any(p.name in visible for p in e.parameters):
                 channels = ", ".join(self.outputs)
-                raise ModelError(f"'{e.name}' cannot be seen in the measured channels ({channels}). Leave it out: "
-                                 f"model.without('{e.name}'), or add a record of the channel it acts on.")
+                raise ModelError(f"'{e.name}' cannot be seen in the measured channels ({channels}). "
+                                 f"Leave it out: model.without('{e.name}'), or add a record of its channel.")
 
     # -- what is fitted --------------------------------------------------------------------------------
     @cached_property

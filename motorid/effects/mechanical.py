@@ -90,7 +90,7 @@ def load_friction(
     m: Equations,
     mu=P(0.1, "", null=0.0, lower=0.0, upper=1.0, doc="share of the motor torque lost"),
 ):
-    """Friction growing with the torque carried, μ·abs(K·i)·sgn ω (gears, screws). Duclusaud et al., BAM, 2025."""
+    """Friction growing with the torque carried, μ·abs(K·i)·sgn ω. Duclusaud et al., BAM, 2025."""
     carried = m.K_t * m.i if "i" in m.states else m.g * m.v
     m.torque -= mu * ca.fabs(carried) * m.sign(m.omega)
 

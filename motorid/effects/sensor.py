@@ -37,7 +37,7 @@ def speed_delay(
     m: Equations,
     T_d=P(5e-3, "s", null=0.0, positive=True, grid=(1.0, 4.0, 16.0), doc="delay of the speed measurement"),
 ):
-    """Pure delay of the speed measurement, Padé of order 2. Golub & Van Loan, Matrix Computations, 9.3, 2013."""
+    """Pure delay of the speed measurement, Padé of order 2. Golub & Van Loan, 2013, sec. 9.3."""
     reaching = m.measured("omega")
     # (12 − 6Ts + T²s²)/(12 + 6Ts + T²s²) = 1 − Ts·G with G = 12/(12 + 6Ts + T²s²): z1 = G·ω, z2 = T·dz1/dt.
     z1, z2 = m.state("omega_delayed", m.start["omega"]), m.state("omega_delayed_2")

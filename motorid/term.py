@@ -1,0 +1,120 @@
+"""One physical effect: a law that writes on the `Equations` sheet, and its parameters."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+from motorid.display import Shown
+from motorid.errors import ModelError, one_of
+from motorid.parameters import Declared, Parameter
+
+BALANCES = ("voltage", "torque", "transmission", "sensor")
+
+
+@dataclass(frozen=True, eq=False)
+class Effect(Shown):
+    """One physical effect: a law that writes on the `Equations` sheet.
+
+    Attributes
+    ----------
+    name : str
+    law : callable
+        ``law(m, **symbols)``.
+    parameters : tuple of Parameter
+    balance : str
+        ``"voltage"``, ``"torque"``, ``"transmission"`` or ``"sensor"``.
+    doc : str
+        What it is, with its source.
+    includes : tuple of str
+        Effects that this one contains as a special case (Stribeck friction contains Coulomb's).
+    """
+
+    name: str
+    law: Callable[..., None] | None
+    parameters: tuple[Parameter, ...]
+    balance: str
+    doc: str = ""
+    includes: tuple[str, ...] = ()
+
+    @property
+    def size(self) -> Parameter | None:
+        """The parameter that makes the effect vanish at its null value, if there is just one such."""
+        sizes = [p for p in self.parameters if p.null is not None]
+        return sizes[0] if sizes else None
+
+    def __call__(self, **values: float) -> Effect:
+        """Return the effect with some parameters given, e.g. ``cogging(N=12)`` (held if it is an order)."""
+        known = {p.name: p for p in self.parameters}
+        for name in values:
+            if name not in known:
+                raise ModelError(f"effect '{self.name}': {one_of(name, known, 'parameter')}")
+        pars = tuple(replace(p, value=float(values[p.name]), given=True, vary=p.vary and not p.order)
+                     if p.name in values else p for p in self.parameters)
+        return replace(self, parameters=pars)
+
+    def __repr__(self) -> str:
+        return f"<effect {self.name} ({self.balance}): {', '.join(p.name for p in self.parameters)}>"
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # Only plain data crosses a process boundary: the law goes by the name of its module, if it has one.
+        module = getattr(self.law, "__module__", None)
+        qualname = getattr(self.law, "__qualname__", "")
+        importable = module not in (None, "__main__") and "<locals>" not in qualname
+        place = (module, qualname) if importable else None
+        return _restore_effect, (place, self.name, self.parameters, self.balance, self.doc,
+                                 self.includes)
+
+
+def _restore_effect(place: tuple[str, str] | None, name: str, parameters: tuple[Parameter, ...], balance: str,
+                    doc: str, includes: tuple[str, ...]) -> Effect:
+    law = None
+    if place is not None:
+        try:
+            law = getattr(importlib.import_module(place[0]), place[1]).law
+        except (ImportError, AttributeError):
+            law = None
+    return Effect(name, law, parameters, balance, doc, includes)
+
+
+def effect(*, balance: str, name: str | None = None,
+           includes: tuple[str, ...] = ()) -> Callable[[Callable[..., None]], Effect]:
+    """Make an `Effect` of a function ``law(m, size=P(...), shape=P(...))``.
+
+    Parameters
+    ----------
+    balance : {"voltage", "torque", "transmission", "sensor"}
+        The balance (or the sensor) that the effect acts on.
+    name : str, optional
+        Default: the function's name.
+    includes : tuple of str, optional
+        Effects that this one contains as a special case; it refuses to stand beside them.
+
+    Raises
+    ------
+    ModelError
+        If an argument has no `P` default or the balance is unknown.
+
+    Examples
+    --------
+    >>> @effect(balance="torque")
+    ... def coulomb(m, tau_c=P(2e-3, "N·m", null=0)):
+    ...     m.torque -= tau_c * m.sign(m.omega)
+    """
+    if balance not in BALANCES:
+        raise ModelError(one_of(balance, BALANCES, "balance"))
+
+    def make(law: Callable[..., None]) -> Effect:
+        title = name or law.__name__
+        pars = []
+        for arg in list(inspect.signature(law).parameters.values())[1:]:
+            if not isinstance(arg.default, Declared):
+                raise ModelError(f"effect '{title}': argument '{arg.name}' needs a default "
+                                 "P(value, unit, null=…).")
+            pars.append(arg.default.named(arg.name))
+        return Effect(title, law, tuple(pars), balance, inspect.cleandoc(law.__doc__ or ""), includes)
+
+    return make
