@@ -183,6 +183,7 @@ def test_sampling_too_slow_for_the_inductance_is_told(steps):
     assert "too slow for the inductance" in said(steps.decimate(8).with_(
         inputs={"v": steps.inputs["v"][::8]}))
     assert "inductance" not in said(steps)
+    assert "too slow for the inductance" in said(*read_runs(data_path("two_step_small")))  # L/R is 0.1 ms
 
 
 # -- what the records cannot show ---------------------------------------------------------------------------

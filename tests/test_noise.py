@@ -52,6 +52,17 @@ def test_uneven_time_stamps_are_used(rng):
     assert noise_level(y) > 0.8  # without them the jitter counts as noise
 
 
+def test_bursts_with_pauses_between_are_used(rng):
+    t = np.concatenate([0.1 * k + 1e-3 * np.arange(5) for k in range(100)])
+    assert noise_level(100 * np.sin(6 * t) + 0.1 * rng.normal(size=500), t) == pytest.approx(0.1, rel=0.15)
+
+
+def test_a_signal_with_few_samples_per_period_counts_as_noise_in_part(rng):
+    nine, five = (np.sin(2 * np.pi * np.arange(N) / k) + 0.01 * rng.normal(size=N) for k in (9, 5))
+    assert noise_level(nine) == pytest.approx(0.01, rel=0.15)
+    assert 0.03 < noise_level(five) < 0.3
+
+
 def test_an_exact_standstill_says_nothing(rng):
     y = speed() + 0.5 * rng.normal(size=N)
     y[:1500] = 0

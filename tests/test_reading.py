@@ -94,6 +94,11 @@ def test_a_mat_file_that_would_end_the_process_is_refused(tmp_path):
         broken = data[:numbers] + damage + data[numbers + len(damage):]
         with pytest.raises(DataError, match="damaged MATLAB file"):
             read_mat(write(tmp_path, broken, "bad.mat"))
+    real = b"\x06\0\0\0\x08\0\0\0\x06\0"  # flags of a double array
+    broken = data.replace(real, real[:-1] + b"\x08")  # complex, but no imaginary part follows
+    assert broken != data
+    with pytest.raises(DataError, match="damaged MATLAB file"):
+        read_mat(write(tmp_path, broken, "bad.mat"))
 
 
 def _write_binary(path: Path) -> None:
@@ -129,6 +134,7 @@ DIALECTS = {
     "byte-order mark": "\ufeff" + GOOD,
     "UTF-16": GOOD.encode("utf-16"),
     "UTF-16 without mark": GOOD.encode("utf-16-be"),
+    "UTF-16 the other way round": GOOD.encode("utf-16-le"),
     "Latin-1": ("Zeit_s;Spannung_V;Strom_A;Geschwindigkeit_rad_s;Kühlung_°C\n"
                 + rows(pattern="{t:.3f};{v};{i:.3f};{w:.3f};20\n")).encode("latin-1"),
     "row of units": "time;voltage;current;speed\ns;V;A;rad/s\n" + SEMICOLON,
@@ -244,11 +250,11 @@ def table(t, v, w) -> str:
 
 
 def test_missing_outputs_stay_missing_and_missing_inputs_are_held(tmp_path):
-    v = ["", 5, 5, "", "", 3, 3, 3, 3, 3, 3, 3]
+    v = ["", 4, 5, "", "", 3, 3, 3, 3, 3, 3, 3]
     w = [0, 1, "nan", 3, "-", 5, "ERR", 7, 8, 9, 10, 11]
     run = read_csv(write(tmp_path, table(np.arange(12) / 10, v, w)))
     np.testing.assert_array_equal(run.t, np.arange(1, 12) / 10)
-    np.testing.assert_array_equal(run.inputs["v"], [5, 5, 5, 5, 3, 3, 3, 3, 3, 3, 3])
+    np.testing.assert_array_equal(run.inputs["v"], [4, 5, 5, 5, 3, 3, 3, 3, 3, 3, 3])
     np.testing.assert_array_equal(run.outputs["omega"], [1, np.nan, 3, np.nan, 5, np.nan, 7, 8, 9, 10, 11])
     for part in ("first 1 row", "missing in 2 of 11 rows", "missing in 3 of 11", "1 cell of 'w_rad_s'"):
         assert part in notes(run)
