@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 import casadi as ca
@@ -61,8 +62,13 @@ class Equations:
             return self._angle()
         if name.startswith("__"):
             raise AttributeError(name)
-        known = [*states, "theta", *placeholders, "voltage", "torque"]
-        raise ModelError(f"{self.writer}: {one_of(name, known, 'quantity')}")
+        raise self._unknown(name, [*states, "theta", *placeholders, "voltage", "torque"])
+
+    def _unknown(self, name: str, known: Iterable[str]) -> ModelError:
+        if name in ("i", "R", "L", "K", "K_t", "K_e"):
+            return ModelError(f"'{self.writer}' needs '{name}', which a torque-driven base does not have: leave "
+                              "it out, or use dc_motor() with a record of the applied voltage.")
+        return ModelError(f"{self.writer}: {one_of(name, known, 'quantity')}")
 
     def _angle(self) -> ca.SX:
         if "theta_in" in self.inputs:
@@ -130,7 +136,7 @@ class Equations:
 
     def _known(self, name: str) -> None:
         if name not in self.placeholders:
-            raise ModelError(f"{self.writer}: {one_of(name, self.placeholders, 'quantity')}")
+            raise self._unknown(name, self.placeholders)
 
     # -- closing ---------------------------------------------------------------------------------------
     def fill(self, expressions: list[ca.SX]) -> list[ca.SX]:

@@ -51,5 +51,5 @@ def voltage_offset(
     m: Equations,
     V_0=P(0.05, "V", null=0.0, doc="added to the applied voltage"),
 ):
-    """Constant error of the applied or measured voltage."""
+    """Constant error of the voltage as recorded. Isermann, Identification of Dynamic Systems, 2011."""
     m.voltage += V_0

@@ -49,7 +49,7 @@ def quadratic_drag(
 
 @effect(balance="torque")
 def constant_load(m: Equations, tau_0=P(1e-3, "N·m", null=0.0, doc="load torque against positive speed")):
-    """Constant load torque (a hoist, a drive's torque offset)."""
+    """Constant load torque (a hoist, the offset of a drive). Janot et al., EMPS benchmark, 2019."""
     m.torque -= tau_0
 
 
@@ -81,8 +81,8 @@ def torque_ripple(
     N_r=P(12.0, "", order=True, vary=False, lower=1.0, doc="periods per turn, from the misfit, then held"),
     phi_r=P(0.0, "rad", periodic=True, doc="phase at theta = 0"),
 ):
-    """Torque ripple, K·(1+a·sin(N·θ+φ)) in the torque only. Jahns & Soong, IEEE TIE 43(2), 1996."""
-    m.scale("K_t", 1 + a_r * ca.sin(N_r * m.theta + phi_r))
+    """Torque ripple, K·(1+a·sin(N·θ+φ)), or of a torque drive's gain. Jahns & Soong, IEEE TIE 43(2), 1996."""
+    m.scale("K_t" if "i" in m.states else "g", 1 + a_r * ca.sin(N_r * m.theta + phi_r))
 
 
 @effect(balance="torque")

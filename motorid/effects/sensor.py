@@ -19,7 +19,7 @@ def speed_lag(
     m: Equations,
     T_w=P(5e-3, "s", null=0.0, positive=True, grid=(1.0, 4.0, 16.0), doc="time constant of the speed filter"),
 ):
-    """First-order filter in the speed measurement."""
+    """First-order filter in the speed measurement. Åström & Murray, Feedback Systems, 2008."""
     _lag(m, "omega", T_w)
 
 
@@ -28,7 +28,7 @@ def current_lag(
     m: Equations,
     T_i=P(1e-3, "s", null=0.0, positive=True, grid=(0.5, 2.0, 8.0), doc="time constant of current filter"),
 ):
-    """First-order filter in the current measurement."""
+    """First-order filter in the current measurement. Åström & Murray, Feedback Systems, 2008."""
     _lag(m, "i", T_i)
 
 
@@ -48,7 +48,7 @@ def speed_delay(
 
 @effect(balance="sensor")
 def current_offset(m: Equations, i_0=P(0.02, "A", null=0.0, doc="added by the current sensor")):
-    """Offset of the current sensor."""
+    """Offset of the current sensor. Isermann, Identification of Dynamic Systems, 2011."""
     m.measure("i", m.measured("i") + i_0)
 
 
@@ -57,5 +57,8 @@ def speed_gain(
     m: Equations,
     k_w=P(0.01, "", null=0.0, lower=-0.9, upper=9.0, doc="relative error of the speed scale"),
 ):
-    """Wrong scale of the speed sensor; needs an angle, or held motor constants, to be told from K and J."""
+    """Wrong scale of the speed sensor. Isermann, Identification of Dynamic Systems, 2011.
+
+    Needs an angle, or held motor constants, to be told from K and J.
+    """
     m.measure("omega", m.measured("omega") * (1 + k_w))

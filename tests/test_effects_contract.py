@@ -1,0 +1,200 @@
+"""The contract of an effect, asked of every one in the library."""
+
+from __future__ import annotations
+
+import re
+from itertools import combinations
+
+import casadi as ca
+import numpy as np
+import pytest
+
+import motorid as mi
+from motorid.effects import LIBRARY
+from motorid.errors import ModelError
+from motorid.integrate import Grid, Rosenbrock
+
+VALUES = {"R": 1.38, "L": 1.72e-3, "K": 0.0462, "b": 6.5e-5, "J": 2.35e-5}
+ALL = ("i", "omega", "theta")
+FRICTION = (
+    "coulomb",
+    "coulomb_asymmetric",
+    "stribeck",
+    "quadratic_drag",
+    "load_friction",
+    "viscous_asymmetric",
+    "lugre",
+)
+UNITS = {"V", "A", "rad/s", "rad", "N·m", "s", "K/W", "J/K", "1/K", "N·m·s/rad", "N·m·s²/rad²", ""}
+every_effect = pytest.mark.parametrize("effect", LIBRARY.values(), ids=LIBRARY)
+
+
+def motor(*effects):
+    model = mi.dc_motor(**VALUES)
+    for e in effects:
+        model = model + e
+    return model
+
+
+def parameters(model, **values):
+    found = {**model.values, **values}
+    return np.array([found[n] for n in model.system(ALL).parameters])
+
+
+def simulated(model, p, x0=None, v=None):
+    t = np.linspace(0, 0.3, 301)
+    v = np.where(t < 0.01, 0, np.where(t < 0.15, 6.0, -5.0)) if v is None else v
+    system = model.system(ALL)
+    x0 = np.zeros(len(system.states)) if x0 is None else x0
+    grid = Grid.of(t, v[:, None], np.array([True]))
+    engine = Rosenbrock(compiled=False)
+    grid = engine.prepare(system, grid, x0, p, 1e-6)
+    return engine.run(system, grid, x0, p, np.zeros((len(x0), len(p))), np.eye(len(p)))
+
+
+def nulls(effect):
+    """Null values of the sizes; a time constant comes close to zero, a knee current goes far away."""
+    sizes = {p.name: p for p in effect.parameters if p.null is not None}
+    return {n: 1e9 if p.null == np.inf else 1e-8 if p.positive else p.null for n, p in sizes.items()}
+
+
+@pytest.fixture(scope="module")
+def plain():
+    model = motor()
+    return simulated(model, parameters(model)).y
+
+
+@every_effect
+def test_vanishes_at_its_null_value(effect, plain):
+    assert nulls(effect), "some parameter must make the effect vanish"
+    model = motor(effect)
+    traj = simulated(model, parameters(model, **nulls(effect)))
+    assert np.abs(traj.y - plain).max(axis=0) == pytest.approx([0, 0, 0], abs=2e-5 * np.abs(plain).max())
+    assert (np.abs(traj.y - plain).max(axis=0) <= 2e-5 * np.abs(plain).max(axis=0)).all()
+    assert np.isfinite(traj.dy).all()  # the score at null of the diagnosis rests on it
+
+
+@every_effect
+def test_does_something_at_its_declared_value(effect, plain):
+    model = motor(effect)
+    traj = simulated(model, parameters(model))
+    assert np.isfinite(traj.y).all()
+    assert np.isfinite(traj.dy).all()
+    assert (np.abs(traj.y - plain).max(axis=0) > 1e-7 * np.abs(plain).max(axis=0)).any()
+
+
+def test_order_of_adding_does_not_matter(rng):
+    for first, second in combinations(LIBRARY.values(), 2):
+        try:
+            models = motor(first, second), motor(second, first)
+        except ModelError:
+            continue  # both describe the same friction
+        a, b = (m.system(ALL) for m in models)
+        assert a.states == b.states
+        nx, nu, _, _ = a.sizes
+        x, u = rng.normal(size=nx), rng.normal(size=nu)
+        for f, g in ((a.rhs, b.rhs), (a.out, b.out)):
+            assert np.array_equal(
+                f(x, u, parameters(models[0])).full(), g(x, u, parameters(models[1])).full()
+            )
+
+
+@every_effect
+@pytest.mark.parametrize("v", [0.0, 6.0])
+def test_value_and_jacobian_are_finite_at_standstill(effect, v):
+    model = motor(effect)
+    system = model.system(ALL)
+    x, u, p = ca.SX.sym("x", len(system.states)), ca.SX.sym("u"), ca.SX.sym("p", len(system.parameters))
+    f = ca.vertcat(system.rhs(x, u, p), system.out(x, u, p))
+    both = ca.Function("both", [x, u, p], [f, ca.jacobian(f, x), ca.jacobian(f, p)])
+    for values in ({}, nulls(effect)):
+        for part in both(np.zeros(x.numel()), v, parameters(model, **values)):
+            assert np.isfinite(part.full()).all()
+
+
+@pytest.mark.parametrize("name", FRICTION)
+def test_friction_never_drives(name, rng):
+    effect = LIBRARY[name]
+    model = motor(effect)
+    values = {"b_a": 6e-5} if name == "viscous_asymmetric" else {}
+    p = parameters(model, **values)
+    system = model.system(ALL)
+    w0 = 80.0
+    for start in (w0, -w0):
+        x0 = np.zeros(len(system.states))
+        x0[system.states.index("omega")] = start
+        omega = simulated(model, p, x0, np.zeros(301)).y[:, 1]
+        assert (np.abs(omega) <= w0 * (1 + 1e-9)).all()
+        assert np.abs(omega[-1]) < 1e-2 * w0
+        back = 1e-2 if name == "lugre" else 1e-3  # bristles spring back a little
+        assert (omega * np.sign(start) > -back * w0).all()  # it stops, it does not turn back
+    if name != "lugre":  # whose bristles store a little energy
+        for _ in range(200):
+            x = rng.normal(size=len(system.states)) * [3.0, 100.0, 10.0]
+            lost = model_torque(model, x, p) - model_torque(motor(), x[:3], parameters(motor()))
+            omega, viscous = x[1], 6.5e-5 * x[1]
+            assert (lost - (viscous if name == "viscous_asymmetric" else 0)) * omega <= 1e-12
+    rest = simulated(model, p, None, np.zeros(301)).y
+    assert np.abs(rest).max() == 0
+
+
+def model_torque(model, x, p):
+    return float(model.system(ALL).balances(x, 0.0, p).full()[1, 0])
+
+
+def test_every_torque_effect_is_either_friction_or_known_to_do_work():
+    drives = {"constant_load", "gravity", "cogging", "torque_ripple"}
+    assert {n for n, e in LIBRARY.items() if e.balance == "torque"} == drives | set(FRICTION)
+
+
+@every_effect
+def test_says_what_it_is_with_units_limits_and_source(effect):
+    assert re.search(r"(18|19|20)\d\d", effect.doc), "the source, with its year"
+    assert effect.doc.splitlines()[0].endswith(".")
+    for p in effect.parameters:
+        assert p.unit in UNITS
+        assert p.doc
+        assert p.unit or p.name in (
+            "mu",
+            "r_load",
+            "zeta_r",
+            "r_gap",
+            "zeta_c",
+            "N",
+            "a_r",
+            "N_r",
+            "k_w",
+            "s_b",
+        )
+    assert effect.balance in ("voltage", "torque", "transmission", "sensor")
+
+
+def linear_record():
+    t = np.linspace(0, 1, 101)
+    v = np.sign(np.sin(10 * t))
+    return (mi.Experiment(t, {"v": v}, {"theta": np.sin(3 * t)}, units={"theta": "m"}),)
+
+
+@every_effect
+def test_a_linear_axis_shows_no_rotary_units(effect):
+    electrical = effect.balance == "voltage" and effect.name != "driver_dead_band"  # any command has that
+    if electrical or effect.name.startswith("current"):
+        with pytest.raises(ModelError, match=r"dc_motor\(\)"):
+            mi.Problem(mi.torque_driven("linear") + effect, linear_record())
+        return
+    model = mi.torque_driven("linear") + effect
+    for p in effect.parameters:
+        unit = model.parameters[p.name].unit
+        angle = p.periodic  # phases stay angles
+        assert angle or not re.search(r"rad|N·m(?!/)", unit.replace("N·m/", "")), (p.name, unit)
+
+
+@every_effect
+def test_survives_a_trip_to_another_process(effect):
+    import pickle
+
+    model = motor(effect)
+    there = pickle.loads(pickle.dumps(model))
+    a, b = model.system(ALL), there.system(ALL)
+    assert a.rhs.serialize() == b.rhs.serialize()
+    assert there.values == model.values
