@@ -66,7 +66,7 @@ class Equations:
 
     def _unknown(self, name: str, known: Iterable[str]) -> ModelError:
         if name in ("i", "R", "L", "K", "K_t", "K_e"):
-            return ModelError(f"'{self.writer}' needs '{name}', which a torque-driven base does not have: leave "
+            return ModelError(f"'{self.writer}' needs '{name}', which a torque-driven base lacks: leave "
                               "it out, or use dc_motor() with a record of the applied voltage.")
         return ModelError(f"{self.writer}: {one_of(name, known, 'quantity')}")
 
