@@ -231,7 +231,6 @@ def _falling(
             ha=side,
             textcoords="offset points",
             fontsize=8,
-            color=colour,
         )
 
 

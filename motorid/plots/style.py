@@ -45,11 +45,10 @@ PALETTE = {
     "orange": "#d55e00",
     "green": "#009e73",
     "purple": "#a4507d",
-    "sky": "#56b4e9",
     "yellow": "#b98500",
     "grey": "#7a848e",
 }
-CYCLE = tuple(PALETTE[c] for c in ("blue", "orange", "green", "purple", "yellow", "sky", "grey"))
+CYCLE = (*(PALETTE[c] for c in ("blue", "orange", "green", "purple", "yellow")), INK, PALETTE["grey"])
 MEASURED, MODEL, RESIDUAL, HELD_OUT = PALETTE["grey"], PALETTE["blue"], PALETTE["orange"], PALETTE["green"]
 WIDTH = 9.2  # inches: the text width of a notebook
 POINTS = 1200  # drawn per curve at most: more than a page has pixels for it
