@@ -15,6 +15,7 @@ from motorid.integrate.grid import Array
 INITIAL = ("auto", "rest", "measured", "estimate")
 REACH = 8.0  # standard deviations that an estimated initial state may lie away from its first samples
 FIRST = 5  # samples that tell it
+FREE_OF_NOISE = 2e-5  # of an angle's variation: what `noise_level` gives a simulation is half of it
 
 
 class Beginning(NamedTuple):
@@ -47,8 +48,8 @@ def beginning(run: Experiment, sigma: Mapping[str, float], initial: str) -> Begi
             continue
         y = run.outputs[c]
         if c == "theta":
-            start[k] = np.nanmean(y[:lead]) if known and np.isfinite(y[:lead]).any() else _first(y)
-            noisy = sigma[c] > 1e-4 * max(np.nanstd(y), 1e-300)
+            start[k] = _resting(y[:lead], sigma[c]) if known else _first(y)
+            noisy = sigma[c] > FREE_OF_NOISE * np.nanstd(y)
             if initial == "estimate" or (initial == "auto" and (noisy or not rest)):
                 reach[c] = _reach(y, sigma[c])
         elif not known:
@@ -99,6 +100,12 @@ def slopes(theta: Array, t: Array, parts: int = 200) -> Array:
 def _first(y: Array) -> float:
     good = y[np.isfinite(y)][:3]
     return float(np.median(good)) if good.size else 0.0
+
+
+def _resting(y: Array, sigma: float) -> float:
+    """Return the mean of an angle before the first voltage; the first samples where it creeps meanwhile."""
+    good = y[np.isfinite(y)]
+    return float(good.mean()) if good.size and np.ptp(good) < REACH * sigma else _first(y)
 
 
 def _reach(y: Array, sigma: float) -> float:
