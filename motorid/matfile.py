@@ -63,7 +63,7 @@ def _elements(data: bytes, order: str) -> Iterator[Element]:
             at += 8
         else:
             at = end if kind == _COMPRESSED else end + -size % 8
-        _need(end <= len(data) and (kind in _SIZES or kind in (_MATRIX, _COMPRESSED)))
+        _need(end <= len(data))
         yield kind, data[start:end]
 
 

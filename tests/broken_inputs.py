@@ -94,6 +94,7 @@ BROKEN = [
     Broken("fewer names than values", _file("time_s;voltage_V\n" + "0;1;2;3\n" * 20), "2 names"),
     Broken("open quotation mark", _file(GOOD + '0.5,6,"1.0,99\n' + rows()), "cannot be read as a table"),
     Broken("quotation over two lines", _file(GOOD + '0.5,6,"1\n2",1,1,1\n'), "cannot be read as a table"),
+    Broken("quotation over the first lines", _file(HEADER + '0,6,"1\n2",1,1,1\n' + rows()), "loss of data"),
     # -- the columns are not clear
     Broken("no header", _file(rows()), "by position"),
     Broken("no time", _file(GOOD.replace("time_s", "sample")), "the time (t)"),
