@@ -10,15 +10,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from motorid.errors import ModelError, UsageError, one_of
+from motorid.errors import ModelError, SimulationError, UsageError, one_of
 from motorid.experiment import Experiment
 from motorid.integrate import Engine, Trajectory, engine_of
-from motorid.integrate.grid import Array
+from motorid.integrate.grid import Array, Grid
 from motorid.model import Model
 from motorid.parameters import Parameter, Scaling
 from motorid.prepared import Run, channels_of, noise_of, prepare_run, smoothing, with_inputs
 from motorid.system import System
 from motorid.unknowns import Point, Unknowns
+
+NOISE_SHARE = 0.03  # local integration error over the noise
+MISFIT_SHARE = 0.01  # of the misfit, where it is what the noise would be
+TIGHTEST, LOOSEST = 1e-7, 1e-4  # local integration error over the largest state
 
 
 @dataclass(frozen=True)
@@ -165,13 +169,22 @@ class Problem:
         return self._engine.run(self.system, grid, x0, at.p, self.unknowns.first_slopes(at, k), at.dp)
 
     def refined(self, q: Array) -> Problem:
-        """Return the problem with sub-steps that keep the integration error below the noise at `q`."""
-        at, new = self.unknowns.point(np.asarray(q, float)), []
-        for k, run in enumerate(self.runs):
-            x0 = self.unknowns.first_state(at, k)
-            grid = self._engine.prepare(self.system, run.grid, x0, at.p, self._tolerance(run))
-            new.append(run if grid is run.grid else replace(run, grid=grid))
-        return self._keeping(tuple(new))
+        """Return the problem with sub-steps that keep the integration error below noise and misfit at `q`."""
+        at = self.unknowns.point(np.asarray(q, float))
+        return self._keeping(tuple(self._refined_run(run, self.unknowns.first_state(at, k), at.p)
+                                   for k, run in enumerate(self.runs)))
+
+    def _refined_run(self, run: Run, x0: Array, p: Array) -> Run:
+        # From one step per sample on, so that the grid depends on q alone and not on the way there.
+        coarse = run.grid.with_substeps(np.ones_like(run.grid.substeps))
+        tolerance = self._tolerance(run, x0, p, coarse)
+        grid = self._engine.prepare(self.system, coarse, x0, p, tolerance)
+        if grid is coarse and np.any(run.grid.substeps > 1):
+            try:
+                self._engine.run(self.system, coarse, x0, p)
+            except SimulationError:  # only finer steps get through
+                grid = self._engine.prepare(self.system, run.grid, x0, p, tolerance)
+        return run if np.array_equal(grid.substeps, run.grid.substeps) else replace(run, grid=grid)
 
     def _keeping(self, runs: tuple[Run, ...]) -> Problem:
         """Return a copy with other grids that keeps everything else already made."""
@@ -181,12 +194,22 @@ class Problem:
                 other.__dict__[name] = self.__dict__[name]
         return other
 
-    @staticmethod
-    def _tolerance(run: Run) -> float:
-        """Local error relative to the largest state: a small part of the noise, within reason."""
+    def _tolerance(self, run: Run, x0: Array, p: Array, coarse: Grid) -> float:
+        """Local error relative to the largest state: a small part of the noise, or of a far larger misfit."""
         out = run.experiment.outputs
-        ratios = [s / max(float(np.nanmax(np.abs(out[c]))), 1e-300) for c, s in run.sigma.items()]
-        return float(np.clip(0.03 * min(ratios), 1e-7, 1e-4))
+        top = {c: max(float(np.nanmax(np.abs(out[c]))), 1e-300) for c in run.sigma}
+        finest = NOISE_SHARE * min(s / top[c] for c, s in run.sigma.items())
+        if finest >= LOOSEST:
+            return LOOSEST
+        try:
+            grid = self._engine.prepare(self.system, coarse, x0, p, LOOSEST)
+            y = self._engine.run(self.system, grid, x0, p).y
+        except SimulationError:
+            return max(finest, TIGHTEST)
+        misfit = {c: out[c] - y[:, j] for j, c in enumerate(self.outputs) if c in top}
+        rms = {c: float(np.sqrt(np.nanmean(e**2))) for c, e in misfit.items()}
+        level = NOISE_SHARE * min(max(run.sigma[c], MISFIT_SHARE * rms[c]) / top[c] for c in top)
+        return float(np.clip(level, TIGHTEST, LOOSEST))
 
     # -- residual --------------------------------------------------------------------------------------
     @cached_property
