@@ -19,6 +19,8 @@ from motorid.parameters import Parameter
 
 # A record is frozen, and so is its noise.
 _levels: WeakKeyDictionary[Experiment, dict[str, float]] = WeakKeyDictionary()
+CREEP_SHARE = 0.2  # of the angle's noise that a stuck motor may creep
+NARROWEST = 1e-5  # of the highest speed
 SGN_WIDTH_SHARE = 1e-3  # of the highest speed: wider smoothing looks like one more missing effect
 
 
@@ -179,4 +181,19 @@ def smoothing(runs: Sequence[Experiment], parameters: Mapping[str, Any]) -> floa
     if p is None or p.given:
         return None
     speed = top_speed(runs)
-    return SGN_WIDTH_SHARE * speed if speed > 0 else None
+    if speed <= 0:
+        return None
+    # A smooth sgn lets a loaded, stuck motor creep; over the longest standstill that must stay below the noise of
+    # the angle, or the creep looks like an effect of its own.
+    creep = min((CREEP_SHARE * noise_level(r.outputs["theta"], r.t) / still for r in runs if "theta" in r.outputs
+                 and (still := _longest_standstill(r, speed)) > 0), default=np.inf)
+    return float(np.clip(creep, NARROWEST * speed, SGN_WIDTH_SHARE * speed))
+
+
+def _longest_standstill(run: Experiment, speed: float) -> float:
+    """Longest time without motion, s, from the angle."""
+    s = np.abs(_slopes(run.outputs["theta"], run.t)) < 0.01 * speed
+    if not s.any():
+        return 0.0
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], s.astype(int), [0]])))
+    return float(np.max(edges[1::2] - edges[::2])) * run.duration / len(s)

@@ -11,8 +11,9 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+from motorid.diagnosis.adequacy import adequacy
 from motorid.diagnosis.evidence import compare_errors
-from motorid.diagnosis.results import Candidate, Ladder, Rung
+from motorid.diagnosis.results import Adequacy, Candidate, Ladder, Rung
 from motorid.diagnosis.search import Node, Search, library
 from motorid.experiment import Experiment
 from motorid.fit import Fit
@@ -31,15 +32,20 @@ class Climb:
     rounds: tuple[tuple[Candidate, ...], ...]
     groups: tuple[tuple[str, ...], ...]
     text: str
+    remaining: Adequacy
 
 
 def climb(search: Search, max_effects: int, advance: Callable[[str], None]) -> Climb:
     """Run the loop until nothing more is worth adding."""
     best, frontier = search.root, [search.root]
+    judged = adequacy(best.fit, search.scores(best))
     rounds: list[tuple[Candidate, ...]] = []
     groups: list[tuple[str, ...]] = []
     text = f"stopped at the limit of {max_effects} effects"
     for _ in range(max_effects):
+        if judged.adequate:
+            text = "stopped: what is left is noise"
+            break
         children: dict[frozenset[str], Node] = {}
         for k, node in enumerate(frontier):
             grown, listed = search.expand(node)
@@ -58,14 +64,15 @@ def climb(search: Search, max_effects: int, advance: Callable[[str], None]) -> C
         groups.append((new.added or "", *group) if group else ())
         best = search.pruned(new)
         frontier = [best, *_runners_up(search, best, ordered)][:BEAM]
+        judged = adequacy(best.fit, search.scores(best))
         advance(f"accepted {new.added}")
-    return Climb(search, tuple(_path(search, best)), tuple(rounds), tuple(g for g in groups if g), text)
+    return Climb(search, tuple(_path(search, best)), tuple(rounds), tuple(g for g in groups if g), text, judged)
 
 
 def _runners_up(search: Search, best: Node, ordered: Sequence[Node]) -> list[Node]:
     """Children that came near enough to be grown too, those of another kind than the best."""
     goal = compare_errors(search.root.train, best.train, search.held.noise).fall
-    return [n for n in ordered if n.key != best.key
+    return [n for n in ordered if n.key != best.key and not search.tied(n, best)
             and compare_errors(search.root.train, n.train, search.held.noise).fall > HALF_AS_GOOD * goal]
 
 

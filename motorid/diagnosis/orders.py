@@ -48,7 +48,8 @@ def _ranked(tangent: Tangent, relative: bool) -> tuple[float, ...]:
     if relative and "i" not in fit.problem.system.states:
         return ()
     answers, found = responses(fit), []
-    for first in range(1, top + 1, CHUNK):
+    lowest = 1 if relative else 2  # a torque that repeats once per turn is gravity's
+    for first in range(lowest, top + 1, CHUNK):
         orders = np.arange(first, min(first + CHUNK, top + 1))
         columns = np.vstack([_columns(fit, k, answer, orders, relative) for k, answer in enumerate(answers)])
         inside = tangent.basis.T @ columns

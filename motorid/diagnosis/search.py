@@ -82,15 +82,23 @@ class Search:
         self.held = HeldOut.of(fit, validate)
         self.effects, self.map, self.advance = list(effects), map_, advance
         self.root = node_of(fit, self.held)
+        self._scores: dict[frozenset[str], list[Score]] = {}
         self.nodes: dict[frozenset[str], Node] = {self.root.key: self.root}
+
+    def scores(self, node: Node) -> list[Score]:
+        """Return the scores of all effects that `node` can take, best first; ranked once per model."""
+        if node.key not in self._scores:
+            fresh, _ = self._takeable(node.fit.model)
+            self._scores[node.key] = rank(node.fit, fresh)
+            self.advance(f"ranked {len(fresh)} effects")
+        return self._scores[node.key]
 
     # -- expanding -------------------------------------------------------------------------------------
     def expand(self, node: Node) -> tuple[list[Node], list[Candidate]]:
         """Return the judged models one effect larger, and a candidate for every effect, best score first."""
         present = node.fit.model
-        fresh, wider = self._takeable(present)
-        scores = rank(node.fit, fresh, lambda: None)
-        self.advance(f"ranked {len(scores)} effects")
+        _, wider = self._takeable(present)
+        scores = self.scores(node)
         short = scores[:SHORTLIST] + [s for s in scores[SHORTLIST:] if s.effect.name in ALWAYS]
         tasks = [(node.fit, present + s.effect, s.starts[:3]) for s in short if s.drop > 0 or s.effect.name in ALWAYS]
         names = [s.effect for s in short if s.drop > 0 or s.effect.name in ALWAYS]
@@ -177,7 +185,7 @@ class Search:
             return None
         ordered = sorted(children, key=lambda n: -self._worth(n))
         top = ordered[0]
-        tied = [n for n in ordered if n is top or self._tied(top, n)]
+        tied = [n for n in ordered if n is top or self.tied(top, n)]
         chosen = min(tied, key=lambda n: (n.size, -self._worth(n)))
         return chosen, ordered
 
@@ -186,7 +194,8 @@ class Search:
         train = compare_errors(self.root.train, node.train, self.held.noise)
         return -float(np.log(max(1 - held.fall, 1e-12)) + 0.5 * np.log(max(1 - train.fall, 1e-12)))
 
-    def _tied(self, best: Node, other: Node) -> bool:
+    def tied(self, best: Node, other: Node) -> bool:
+        """Tell whether `best` is better than `other` by no more than chance or a trifle."""
         held = compare_errors(other.held, best.held, self.held.noise)
         train = compare_errors(other.train, best.train, self.held.noise)
         return (held.log_ratio < TIE or held.fall < CLOSE) and (train.log_ratio < TIE or train.fall < CLOSE)
@@ -223,8 +232,8 @@ class Search:
         """Names of the siblings that these data cannot tell from `chosen`."""
         includes = {e.name: e.includes for e in self.effects}
         return tuple(n.added for n in siblings if n is not chosen and n.added and n.parent is chosen.parent
-                     and chosen.added not in includes.get(n.added, ()) and self._tied(n, chosen)
-                     and self._tied(chosen, n))
+                     and chosen.added not in includes.get(n.added, ()) and self.tied(n, chosen)
+                     and self.tied(chosen, n))
 
 
 def _held_out_objection(gain: Gain) -> str:

@@ -16,14 +16,18 @@ from motorid.experiment import Experiment
 from motorid.fit import Fit
 from motorid.least_squares import LevenbergMarquardt
 from motorid.model import Effect, Model
+from motorid.prepared import natural_sizes
 from motorid.problem import Problem
 from motorid.simulate import at, simulated
 
+RACE = LevenbergMarquardt(max_iterations=6, ftol=1e-3, xtol=1e-4)
 QUICK = LevenbergMarquardt(max_iterations=25, ftol=1e-4, xtol=1e-5)
 POLISH = LevenbergMarquardt(max_iterations=60, ftol=1e-7, xtol=1e-7)
 BLOCKS = 10  # contiguous parts of each run; every other one is held out where there are no held-out runs
 WORST_CONDITION = 1e4  # of the column-scaled Jacobian
 SIGNIFICANT = 3.0  # standard deviations
+ROOM = 10.0  # factor beyond its grid that a shape parameter may run to
+FAILURES = (FitError, SimulationError, ModelError, np.linalg.LinAlgError)
 LEAST_FALL = 0.01  # of the held-out error that makes an effect worth having
 
 
@@ -106,25 +110,45 @@ def refit(fit: Fit, model: Model, starts: Sequence[Mapping[str, float]]) -> Fit 
     Effects of the angle start along the measured angle, which the model's own angle, still wrong, would lead
     astray; then the model's angle takes over.
     """
-    best: tuple[float, Problem, Any] | None = None
+    model = _bounded(fit, model)
     angular = any(uses_angle(e) for e in model.effects) and not any(uses_angle(e) for e in fit.model.effects)
+    raced = []
     for start in starts or ({},):
         names = [n for n in start if n in model.parameters]
         problem = fit.problem.for_model(_within(model, {n: start[n] for n in names}))
         q = problem.scaling.scaled([fit.initial.get(p.name, p.value) for p in problem.unknown])
         problem = _from(problem, q)
+        if angular:
+            problem = problem.for_model(replace(problem.model, angle_input=True, _systems={}))
         try:
-            if angular:
-                led = problem.for_model(replace(problem.model, angle_input=True, _systems={}))
-                done = descend(led, QUICK, stages=True)
-                problem = _from(problem, done.solution.q)
-            done = descend(problem, QUICK, stages=not angular)
-        except (FitError, SimulationError, ModelError, np.linalg.LinAlgError):
+            done = descend(problem, RACE, stages=False)
+        except FAILURES:
             continue
-        cost = done.solution.history[-1]
-        if best is None or cost < best[0]:
-            best = (cost, _from(done.problem, done.solution.q), done)
-    return None if best is None else _polished(fit, best[1])
+        raced.append((done.solution.history[-1], _from(done.problem, done.solution.q)))
+    if not raced:
+        return None
+    best = min(raced, key=lambda c: c[0])[1]
+    try:
+        if angular:
+            best = best.for_model(replace(best.model, angle_input=False, _systems={}))
+        done = descend(best, QUICK, stages="sgn_width" in model.parameters and not fit.model.effects)
+    except FAILURES:
+        return None
+    return _polished(fit, _from(done.problem, done.solution.q))
+
+
+def _bounded(fit: Fit, model: Model) -> Model:
+    """Return the model with the shapes of its effects kept within what these records could show."""
+    natural = natural_sizes(fit.problem.experiments, fit.values)
+    limits = {}
+    for e in model.effects:
+        for p in (model.parameters[q.name] for q in e.parameters):
+            if p.grid and p.null is None and p.vary and not p.given:
+                size = natural.get(p.unit, 1.0)
+                limits[p.name] = (max(p.lower, min(p.grid) * size / ROOM), min(p.upper, max(p.grid) * size * ROOM))
+    inside = {n: float(np.clip(model.parameters[n].value, *limits[n])) for n in limits}
+    pars = {n: replace(model.parameters[n], value=inside[n], lower=lo, upper=hi) for n, (lo, hi) in limits.items()}
+    return model._with(parameters={**model.parameters, **pars})
 
 
 def _polished(fit: Fit, problem: Problem) -> Fit | None:
@@ -135,7 +159,7 @@ def _polished(fit: Fit, problem: Problem) -> Fit | None:
             factors = misfit_over_noise(done.problem, done.solution.q)
             if max(abs(np.log(factors[c] / problem.balance.get(c, 1.0))) for c in factors) > 0.1:
                 done = descend(_from(done.problem, done.solution.q).balanced(factors), POLISH, stages=False)
-    except (FitError, SimulationError):
+    except FAILURES:
         return None
     found, problem = done.solution, done.problem
     return Fit(problem, problem.values(found.q), found.residual, found.jac / problem.scaling.slope(found.q), found.q,
@@ -158,6 +182,8 @@ def objections(fit: Fit, added: Effect) -> str:
     for p in pars:
         if p.at_least and fit.values[p.name] < 0.98 * fit.values[p.at_least]:
             return f"{p.name} came out below {p.at_least}, which is not physical"
+        if added.includes and p.grid and p.vary and not 1.02 * p.lower < fit.values[p.name] < 0.98 * p.upper:
+            return f"{p.name} runs to its limit: nothing of this shape is in the data"
     covariance, determined = _covariance(fit)
     names = [p.name for p in fit.problem.unknown]
     for p in pars:

@@ -1,0 +1,181 @@
+"""Is anything missing at all? Residuals against the noise and against what the motor was doing.
+
+Coloured noise, quantisation and outliers make residuals large or smooth without anything missing, so neither
+their size nor their autocorrelation decides. What does is whether they depend on the motion: residuals are binned
+over speed, current, voltage and angle, and the share of variance that the bins explain is compared with the same
+after shifting the residuals in time against the motion, which keeps the colour of both and breaks every real
+dependence (a circular-shift surrogate test, Theiler et al., Physica D 58, 1992). The library's scores, judged on
+effective samples, see what bins cannot.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from motorid.diagnosis.evidence import autocorrelation, effective_samples
+from motorid.diagnosis.rank import Score
+from motorid.diagnosis.results import Adequacy
+from motorid.fit import Fit
+from motorid.integrate.grid import Array
+from motorid.prepared import angle_signal
+
+FALSE_ALARM = 0.02
+SHIFTS = 60
+BINS = 8
+MATERIAL = 0.03  # share of the residual's variance below which a dependence is not worth a word
+NAMES = {"v": "the voltage", "i": "the current", "omega": "the speed", "theta": "the angle within a turn",
+         "acceleration": "the acceleration"}
+
+
+def adequacy(fit: Fit, scores: Sequence[Score] = (), false_alarm: float = FALSE_ALARM) -> Adequacy:
+    """Judge whether the residuals of `fit` are noise.
+
+    Parameters
+    ----------
+    fit : Fit
+    scores : sequence of Score, optional
+        Of the effects that might be added, see `rank`.
+    false_alarm : float
+        Probability of calling an adequate model inadequate.
+
+    Returns
+    -------
+    Adequacy
+    """
+    channels = {c: _channel(fit, c) for c in fit.problem.outputs}
+    tests = [t for c in channels for t in _dependences(fit, c)]
+    tests += _score_tests(fit, scores)
+    material = [t for t in tests if t["share"] > MATERIAL]
+    p_value = min([1.0, *(t["p"] * len(tests) for t in material)])
+    adequate = p_value > false_alarm
+    for c, facts in channels.items():
+        facts["p_value"] = min([1.0, *(t["p"] for t in tests if t["channel"] == c)])
+    return Adequacy(adequate, float(p_value), false_alarm, channels, _text(adequate, channels, material, false_alarm))
+
+
+def _residuals(fit: Fit, channel: str) -> list[tuple[int, Array]]:
+    return [(k, s.residual(channel)) for k, s in enumerate(fit.simulations)
+            if channel in s.experiment.outputs and channel in s.outputs]
+
+
+def _channel(fit: Fit, channel: str) -> dict[str, float]:
+    parts = _residuals(fit, channel)
+    noise = float(np.sqrt(np.mean([fit.problem.runs[k].sigma[channel] ** 2 for k, _ in parts])))
+    r = np.concatenate([p for _, p in parts])
+    r = r[np.isfinite(r)]
+    rho = float(np.mean([autocorrelation(p, 1)[-1] for _, p in parts]))
+    v = [fit.problem.experiments[k].inputs["v"] for k, _ in parts]
+    linked = max((_largest_cross_correlation(u, p) for u, (_, p) in zip(v, parts, strict=True)), default=0.0)
+    rms = float(np.sqrt(np.mean(r**2))) if r.size else 0.0
+    return {"noise": noise, "rms": rms, "ratio": rms / noise, "autocorrelation": rho, "input_correlation": linked,
+            "effective_samples": sum(effective_samples(p) for _, p in parts)}
+
+
+def _largest_cross_correlation(u: Array, r: Array) -> float:
+    """Largest correlation of the residual with the input at any lag up to a quarter of the run."""
+    from scipy.signal import correlate
+
+    a, b = u - u.mean(), np.where(np.isfinite(r), r, 0.0)
+    size = np.linalg.norm(a) * np.linalg.norm(b)
+    if size <= 0:
+        return 0.0
+    n = len(u)
+    return float(np.abs(correlate(b, a, method="fft"))[n - 1:n + n // 4].max() / size)
+
+
+def motion_of(fit: Fit, k: int) -> dict[str, Array]:
+    """Return what the motor was doing in run `k`, (N,) each, from the model's own signals."""
+    sim, run = fit.simulations[k], fit.problem.experiments[k]
+    signals = {"v": run.inputs["v"]}
+    for c in ("i", "omega"):
+        if c in sim.states:
+            signals[c] = sim.states[c]
+    if "theta" in run.outputs or "omega" in run.outputs:
+        signals["theta"] = np.mod(angle_signal(run), 2 * np.pi)
+    if "omega" in sim.states:
+        signals["acceleration"] = np.gradient(sim.states["omega"], run.t)
+    return signals
+
+
+def _dependences(fit: Fit, channel: str) -> list[dict[str, Any]]:
+    """Test the residual of `channel` against every signal of the motion."""
+    parts = _residuals(fit, channel)
+    motions = [motion_of(fit, k) for k, _ in parts]
+    residuals = [_winsorised(r) for _, r in parts]
+    names = [n for n in motions[0] if all(n in m for m in motions)]
+    found = []
+    for name in names:
+        labels = _labels([m[name] for m in motions], 2 * BINS if name == "theta" else BINS)
+        if labels is not None:
+            share, p = _shift_test(labels, residuals)
+            found.append({"channel": channel, "on": NAMES[name], "share": share, "p": p})
+    return found
+
+
+def _winsorised(r: Array) -> Array:
+    size = 1.4826 * np.nanmedian(np.abs(r)) + 1e-300
+    return np.where(np.isfinite(r), np.clip(r, -6 * size, 6 * size), 0.0)
+
+
+def _labels(signals: Sequence[Array], bins: int) -> list[Array] | None:
+    """Return bin numbers by quantiles of the signal over all runs."""
+    edges = np.unique(np.quantile(np.concatenate(list(signals)), np.linspace(0, 1, bins + 1)[1:-1]))
+    if edges.size == 0:
+        return None
+    return [np.searchsorted(edges, s, side="right") for s in signals]
+
+
+def _shift_test(labels: Sequence[Array], residuals: Sequence[Array]) -> tuple[float, float]:
+    """Return the share of variance that bins explain beyond chance, and its p-value against shifted residuals."""
+    count = int(max(lab.max() for lab in labels)) + 1
+    total = sum(float(r @ r) for r in residuals)
+    if total <= 0:
+        return 0.0, 1.0
+    sizes = sum(np.bincount(lab, minlength=count) for lab in labels)
+
+    def explained(shift: float) -> float:
+        sums = sum(np.bincount(lab, np.roll(r, int(shift * len(r))), count) for lab, r in zip(labels, residuals, strict=True))
+        return float(np.sum(sums**2 / np.maximum(sizes, 1))) / total
+
+    actual = explained(0.0)
+    surrogate = np.log(np.array([explained(s) for s in np.linspace(0.05, 0.95, SHIFTS)]) + 1e-6)
+    # Shares of surrogates are nearly log-normal; a tail beyond their number is read from that.
+    from scipy.stats import t as student
+
+    z = (np.log(actual + 1e-6) - surrogate.mean()) / max(float(surrogate.std(ddof=1)), 0.1)
+    return max(actual - float(np.exp(surrogate.mean())), 0.0), float(student.sf(z, 8))
+
+
+def _score_tests(fit: Fit, scores: Sequence[Score]) -> list[dict[str, Any]]:
+    """Turn predicted drops into p-values on effective samples, the search over shapes paid for."""
+    from scipy.stats import chi2
+
+    if not scores:
+        return []
+    n = sum(effective_samples(r) for c in fit.problem.outputs for _, r in _residuals(fit, c))
+    found = []
+    for s in scores:
+        k = len(s.effect.parameters)
+        searched = 200 if any(p.order for p in s.effect.parameters) else 1 + 3 * sum(bool(p.grid) for p in s.effect.parameters)
+        p = min(1.0, searched * float(chi2.sf(-n * np.log1p(-min(s.drop, 1 - 1e-12)), k)))
+        found.append({"channel": None, "on": s.effect.name, "share": s.drop, "p": p})
+    return found
+
+
+def _text(adequate: bool, channels: Mapping[str, Mapping[str, float]], material: Sequence[Mapping[str, Any]],
+          false_alarm: float) -> str:
+    sizes = ", ".join(f"{c} {f['ratio']:.2g} times its noise" for c, f in channels.items())
+    if adequate:
+        coloured = [c for c, f in channels.items() if f["autocorrelation"] > 0.3]
+        colour = f" The noise of {' and '.join(coloured)} is coloured." if coloured else ""
+        return (f"The model is adequate: its errors ({sizes}) do not depend on the motion "
+                f"(rate of false alarms {100 * false_alarm:g} %).{colour}")
+    worst = min(material, key=lambda t: (t["p"], -t["share"]))
+    if worst["channel"] is None:
+        why = f"adding '{worst['on']}' would explain {100 * worst['share']:.0f} % of them"
+    else:
+        why = f"those of {worst['channel']} depend on {worst['on']} ({100 * worst['share']:.0f} % of their variance)"
+    return f"Something is missing: the errors ({sizes}) are not noise; {why}."
