@@ -72,6 +72,8 @@ def record(
     """Record a run from a bench on a serial port. KEEP CLEAR OF THE SHAFT: the motor will move.
 
     Ctrl-C stops the motor and keeps the data. Limits are checked here and enforced by the device.
+
+    Example: motorid record --port /dev/ttyACM0 --out run.csv --excite standard --limit-voltage 9
     """
     with _live(quiet) as progress:
         try:
@@ -106,6 +108,8 @@ def bench(
     """Serve a virtual motor with a hidden effect, for `motorid record` to be tried on without hardware.
 
     --drop, --garbage, --cut and --flip are probabilities, per line, of faults on the wire.
+
+    Example: motorid bench --effect random --seed 7 --reveal
     """
     import numpy as np
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import subprocess
 import sys
 from binascii import crc_hqx
@@ -391,6 +392,23 @@ def test_two_recorders_cannot_write_one_file(tmp_path):
     with pytest.raises(UsageError, match="another recorder"):
         RunFile(tmp_path / "run.csv", CHANNELS, 1000.0, {}, "resume")
     first.close()
+
+
+def test_trouble_in_the_background_is_told_at_the_next_line(tmp_path, monkeypatch):
+    def broken(fd):
+        raise OSError(5, "Input/output error")
+
+    monkeypatch.setattr("motorid.acquire.disk.SYNC_EVERY", 0.01)
+    file = RunFile(tmp_path / "run.csv", CHANNELS, 1000.0, {})
+    monkeypatch.setattr(os, "fsync", broken)
+    file.add(rows(0))
+    file.flush()
+    file._disk._thread.join(timeout=10)
+    file.add(rows(1))
+    with pytest.raises(OSError, match="Input/output"):
+        file.flush()
+    monkeypatch.undo()
+    file.close()
 
 
 def test_a_line_cut_off_by_a_power_cut_is_cut_away_on_resuming(tmp_path):

@@ -289,6 +289,15 @@ def test_a_full_disk_ends_the_run_and_stops_the_motor(out, monkeypatch):
     assert 19_900 < out.stat().st_size <= 20_000
 
 
+def test_a_disk_that_fails_at_the_very_end_is_told(out, monkeypatch):
+    def broken(fd):
+        raise OSError(5, "Input/output error")
+
+    monkeypatch.setattr(os, "fsync", broken)
+    done = record(MemoryLink(device()), out, excite=SHORT)
+    assert (done.ended, done.detail, done.complete) == ("disk", "Input/output error", False)
+
+
 def test_ctrl_c_stops_the_motor_and_keeps_the_data(out):
     link = MemoryLink(device(), step=5)
 
@@ -493,6 +502,36 @@ def test_bench_and_record_over_a_pseudo_terminal_in_real_time(out):
     assert bench.said[0] == 0
     assert "seed: 1" in bench.said[1]
     assert "hidden:" not in bench.said[1]
+
+
+@needs_pty
+def test_a_slow_disk_holds_up_nothing(out, monkeypatch):
+    real, calls = os.fsync, []
+
+    def slow(fd):
+        calls.append(time.sleep(1.5))
+        real(fd)
+
+    monkeypatch.setattr(os, "fsync", slow)
+    with Bench() as bench:
+        done = record(bench.port, out, excite="rest:2.5", timeout=1.0)
+    assert (done.ended, done.received, done.lost) == ("done", 2500, 0)
+    assert len(calls) >= 2
+
+
+@needs_pty
+def test_a_recorder_that_was_held_up_itself_blames_nobody(out):
+    with Bench() as bench:
+        process = start("record", "--port", bench.port, "--out", out, "--excite", "rest:2", "--quiet",
+                        "--timeout", 0.2)
+        wait_for(lambda: out.exists() and len(rows(out)) > 100)
+        process.send_signal(signal.SIGSTOP)
+        time.sleep(0.7)  # longer than the timeout, shorter than the device's patience
+        process.send_signal(signal.SIGCONT)
+        code, said, _ = finish(process)
+    assert code == 0
+    assert "2000 samples" in said
+    assert "0 lost" in said
 
 
 @needs_pty

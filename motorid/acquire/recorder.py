@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Callable, Mapping
 from datetime import datetime
@@ -106,7 +107,8 @@ def record(
                           progress)
             return Run(setup, lambda: part.begin(file, done)).go()
         finally:
-            file.close()
+            with contextlib.suppress(OSError):  # told already, where it matters
+                file.close()
     finally:
         link.close()
 

@@ -21,6 +21,7 @@ from motorid.acquire.runfile import Commanded, RunFile
 __all__ = ["Run", "Setup"]
 
 OVER_LIMIT = 3  # samples in a row beyond the current limit that make the computer stop the motor too
+EMPTY = 5  # readings in a row without a valid line, at least, that make a silence
 LAST_WORDS = 1.5  # s to wait for the device to say how many samples it made
 LOOK = 0.25  # s between two reports of progress
 # The device's word for why it ended -> ours; else done.
@@ -53,7 +54,7 @@ class Run:
         self.last: Row | None = None
         names = [c.name for c in setup.header.channels]
         self._current = names.index("i") if "i" in names and math.isfinite(setup.i_max) else None
-        self._over = 0
+        self._over, self._empty = 0, 0
         setup.client.decoder.bad.clear()
         counter, micros = setup.client.go(setup.segments)
         self._heard = time.monotonic()
@@ -74,23 +75,23 @@ class Run:
         return self._close()
 
     def _record(self) -> None:
-        items = self.s.client.inbox
+        items, now = self.s.client.inbox, self._heard
         try:
             while True:
-                self._take(items)
+                self._take(items, now)
                 self.s.file.flush()
-                self._watch()
+                self._watch(now)
                 if self.ended:  # only here: what was received is on its way to the disk
                     return
                 self.s.client.keep_alive()
-                items = self.s.client.receive(0.05)
+                items, now = self.s.client.receive(0.05), time.monotonic()
+                self._empty = 0 if items else self._empty + 1
         except LinkLost as error:
             self._end("unplugged", str(error))
         except OSError as error:
             self._end("disk", f"{error.strerror}; {self.s.file.lines} whole lines are in the file")
 
-    def _take(self, items: list[Sample | Message]) -> None:
-        now = time.monotonic()
+    def _take(self, items: list[Sample | Message], now: float) -> None:
         for item in items:
             if isinstance(item, Message):
                 self._message(item.fields)
@@ -120,11 +121,12 @@ class Run:
         if not self.ended:
             self.ended, self.detail = why, detail
 
-    def _watch(self) -> None:
+    def _watch(self, now: float) -> None:
         elapsed = self.last.time if self.last else 0.0
         if self.s.duration is not None and elapsed >= self.s.duration - 1.5 / self.s.header.rate:
             self._end("duration")
-        if time.monotonic() - self._heard > self.s.timeout:
+        # Of a computer that was held up itself nothing can be said; hence the empty readings.
+        if now - self._heard > self.s.timeout and self._empty >= EMPTY:
             self._end("silent", f"no valid line for {self.s.timeout:g} s")
         self._look.at(self.ledger, self.last, bool(self.ended))
 
@@ -139,7 +141,8 @@ class Run:
                     self.s.client.link.write(frame("X"))
                     ask = time.monotonic() + 0.3
                 items = self.s.client.receive(0.05)
-                self._take([i for i in items if self.ended != "disk" or isinstance(i, Message)])
+                wanted = [i for i in items if self.ended != "disk" or isinstance(i, Message)]
+                self._take(wanted, time.monotonic())
 
     def _close(self) -> Recording:
         self.s.client.decoder.close()
@@ -149,7 +152,8 @@ class Run:
             self.s.file.add(self.ledger.finish(self.made), self.s.commanded)
             self.s.file.mark_missing(self.made or 0, self.s.commanded)
             self.s.file.note(self._outcome().meta)
-            self.s.file.flush(sync=True)
+            self.s.file.flush()
+            self.s.file.close()
         except OSError as error:
             self.ended, self.detail = "disk", error.strerror or str(error)
         return self._outcome()

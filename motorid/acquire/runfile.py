@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-import errno
 import math
-import os
-import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
+from motorid.acquire.disk import Appender
 from motorid.acquire.ledger import Row
 from motorid.acquire.protocol import Channel
 from motorid.errors import DataError, UsageError
 
 __all__ = ["RunFile", "Tail", "check_target", "column", "read_tail"]
 
-SYNC_EVERY = 0.5  # s between two calls of fsync: what is older than that survives a power cut
 FILL_UP_TO = 60.0  # s; a longer gap is marked by its first and last sample alone
 _COLUMNS = {("v", "V"): "voltage_V", ("i", "A"): "current_A", ("omega", "rad/s"): "speed_rad_s",
             ("omega", "m/s"): "speed_m_s", ("theta", "rad"): "angle_rad", ("theta", "m"): "position_m"}
@@ -96,8 +93,8 @@ def read_tail(out: Path) -> Tail:
 class RunFile:
     """Appends rows to a record; gaps become rows whose measured cells are empty.
 
-    Every call of `flush` hands whole lines to the operating system, and at least every 0.5 s to the disk. If
-    the disk refuses (it is full, say), the file is cut back to its last whole line and the error passed on.
+    Every call of `flush` hands whole lines to the operating system, and a thread hands them to the disk every
+    0.5 s; see `motorid.acquire.disk` for what happens when it refuses.
 
     Parameters
     ----------
@@ -110,39 +107,37 @@ class RunFile:
 
     def __init__(self, out: Path, channels: tuple[Channel, ...], rate: float, meta: Mapping[str, object],
                  mode: str = "new") -> None:
-        self.out, self.rate, self.lines = out, rate, 0  # lines on disk
+        self.out, self.rate = out, rate
         known = [k for name in _ORDER for k, c in enumerate(channels) if c.name == name]
         self._order = known + [k for k in range(len(channels)) if k not in known]
         self._v = next(k for k, c in enumerate(channels) if c.name == "v")
         self.columns = ",".join(["time_s", *(column(channels[k]) for k in self._order), "sample"])
         self._pending: list[str] = []
-        self._synced = time.monotonic()
         self._next, self._index0, self._time0 = 0, 0, 0.0
         self._last: Row | None = None
-        self._fd = _open(out, mode)
-        try:
-            self._good = os.fstat(self._fd).st_size
-            self._begin(meta, mode)
-        except BaseException as error:
-            os.close(self._fd)
-            if mode == "new":
-                out.unlink()
-            if isinstance(error, OSError):
-                raise UsageError(f"{out} cannot be written: {error.strerror}.") from None
-            raise
+        tail = read_tail(out) if mode == "resume" and out.stat().st_size else None
+        if tail and tail.columns != self.columns:
+            raise DataError(f"{out} has the columns {tail.columns}, but the device now sends {self.columns}. "
+                            "Record into another file.")
+        self._disk = Appender(out, mode)
+        self.note(meta)
+        if not tail:
+            self._pending.append(self.columns + "\n")
+        self._begin(mode)
 
-    def _begin(self, meta: Mapping[str, object], mode: str) -> None:
-        head = "".join(f"# {k}: {' '.join(str(v).split())}\n" for k, v in meta.items())
-        if mode == "resume" and self._good:
-            tail = read_tail(self.out)
-            if tail.columns != self.columns:
-                raise DataError(f"{self.out} has the columns {tail.columns}, but the device now sends "
-                                f"{self.columns}. Record into another file.")
-            self._cut_back_to_whole_lines()
-            self._pending.append(head)
-        else:
-            self._pending += [head, self.columns + "\n"]
-        self.flush()
+    def _begin(self, mode: str) -> None:
+        try:
+            self.flush()
+        except OSError as error:
+            self._disk.close(sync=False)
+            if mode == "new":
+                self.out.unlink()
+            raise UsageError(f"{self.out} cannot be written: {error.strerror}.") from None
+
+    @property
+    def lines(self) -> int:
+        """Number of lines written, whole."""
+        return self._disk.lines
 
     def pause(self, tail: Tail, until: float) -> None:
         """Mark the pause of a resumed record by one row at 0 V; what follows begins at `until` s."""
@@ -172,27 +167,15 @@ class RunFile:
         """Append comment lines ``# key: value``."""
         self._pending += [f"# {k}: {' '.join(str(v).split())}\n" for k, v in meta.items()]
 
-    def flush(self, sync: bool = False) -> None:
-        """Hand everything to the operating system, and to the disk if that is due."""
+    def flush(self) -> None:
+        """Hand everything to the operating system; OSError if it refuses."""
         data = "".join(self._pending).encode()
         self._pending.clear()
-        written = 0
-        try:
-            while written < len(data):
-                written += os.write(self._fd, data[written:])
-            if sync or time.monotonic() - self._synced > SYNC_EVERY:
-                os.fsync(self._fd)
-                self._synced = time.monotonic()
-        finally:
-            whole = data.rfind(b"\n", 0, written) + 1
-            self._good += whole
-            self.lines += data.count(b"\n", 0, whole)
-            if whole < written:
-                os.ftruncate(self._fd, self._good)
+        self._disk.append(data)
 
     def close(self) -> None:
         """Close the file; what was not flushed is not written."""
-        os.close(self._fd)
+        self._disk.close()
 
     def _line(self, index: int, time_s: float, values: tuple[float, ...]) -> str:
         cells = [f"{self._time0 + time_s:.6f}"]
@@ -215,43 +198,3 @@ class RunFile:
             values = [math.nan] * len(self._order)
             values[self._v] = held
             self._pending.append(self._line(first + k, start + (k + 1) * step, tuple(values)))
-
-    def _cut_back_to_whole_lines(self) -> None:
-        with open(self.out, "rb") as file:
-            file.seek(max(0, self._good - 4096))
-            end = file.read()
-        cut = len(end) - (end.rfind(b"\n") + 1)
-        if cut:
-            self._good -= cut
-            os.ftruncate(self._fd, self._good)
-
-
-def _open(out: Path, mode: str) -> int:
-    flags = os.O_WRONLY | os.O_APPEND | os.O_CREAT | getattr(os, "O_BINARY", 0)
-    try:
-        fd = os.open(out, flags | (os.O_EXCL if mode == "new" else 0), 0o644)
-    except FileExistsError:
-        raise UsageError(f"{out} has appeared meanwhile and is left alone; choose another name.") from None
-    except OSError as error:
-        raise UsageError(f"{out} cannot be written: {error.strerror}.") from None
-    try:
-        _lock(fd, out)
-        if mode == "replace":
-            os.ftruncate(fd, 0)
-    except BaseException:
-        os.close(fd)
-        raise
-    return fd
-
-
-def _lock(fd: int, out: Path) -> None:
-    try:
-        import fcntl
-    except ImportError:  # no such locks on this system; the port itself is exclusive there
-        return
-    try:
-        fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError as error:
-        if error.errno not in (errno.EWOULDBLOCK, errno.EACCES):
-            return  # a file system without locks
-        raise UsageError(f"another recorder is writing {out}; choose another name.") from None
