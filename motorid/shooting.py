@@ -1,44 +1,35 @@
 """Multiple shooting: the fit as a nonlinear program, with true constraints, or with process noise.
 
 The same discrete step as in the least-squares fit. States at nodes are unknowns, so a poor start or a drifting
-record does no harm: each short interval begins near the data. At the solution the intervals join, unless process
-noise is allowed; then the gaps at the nodes show where the model fails.
+record does no harm: each short interval begins near the data. At the solution the intervals join, unless
+process noise is allowed; then the gaps at the nodes show where the model fails.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from motorid.conflict import conflict
-from motorid.descent import integration_error, misfit_over_noise
+from motorid.descent import misfit_over_noise
 from motorid.errors import FitError, SimulationError, UsageError, one_of
 from motorid.fit import Fit
 from motorid.integrate.grid import Array
 from motorid.mesh import Mesh
-from motorid.multipliers import free_directions, rows_at, summed
 from motorid.nlp import Ipopt, NlpResult, ShootingNlp
 from motorid.nodes import nodes_from_data, nodes_from_simulation
+from motorid.outcome import Solved, fit_of
 from motorid.problem import Problem
 from motorid.relations import Relation
 
 ROUNDS = 4  # of refining the sub-steps
 IMBALANCE = 3.0  # as in the least-squares fit
 FARTHEST = 25.0  # change of a logarithm beyond which no physical parameter lies
-GOOD = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
-SAID = {
-    "Maximum_Iterations_Exceeded": ("limit", "stopped at the largest number of iterations; raise max_iterations, or "
-                                             "start nearer with warm='model' after a least-squares fit"),
-    "Infeasible_Problem_Detected": ("failed", "no point keeps all constraints"),
-    "Restoration_Failed": ("failed", "the solver could not get back to a point that keeps the constraints; loosen "
-                                     "them, or start from a least-squares fit with warm='model'"),
-    "Invalid_Number_Detected": ("failed", "the model could not be simulated on the way; bound the parameters with "
-                                          "model.bounded(…), or shorten the intervals with every=…"),
-}
+POOR = 0.5  # NRMSE at the start above which the intervals are first joined loosely
+LOOSE = 10, 0.05  # then: samples per interval, and gaps in sizes of the states
+AWAY = 3.0  # change of a logarithm in the loose fit that may mean that a parameter got lost
 
 
 @dataclass(frozen=True)
@@ -53,8 +44,8 @@ class MultipleShooting:
         States at the nodes at the start: from the measured channels, or from a simulation with the starting
         values (after a least-squares fit).
     process_noise : mapping of str to float, optional
-        Standard deviation per state and √s (``{"omega": 3.0}`` rad/s/√s); the states' gaps at the nodes are
-        weighed by it instead of forbidden. States not named get next to none.
+        Standard deviation per state and √s (``{"omega": 3.0}``: rad/s per √s); gaps at the nodes are weighed by
+        it instead of forbidden. States not named get next to none.
     max_iterations : int
     tol : float
         IPOPT's tolerance on the scaled problem.
@@ -78,6 +69,8 @@ class MultipleShooting:
     def solve(self, problem: Problem) -> Fit:
         """Return the fit of `problem` from the values of its model.
 
+        Without the constraints first, which settles sub-steps and weights; then with them from there.
+
         Raises
         ------
         UsageError
@@ -88,56 +81,71 @@ class MultipleShooting:
         """
         began = time.perf_counter()
         _check(problem)
-        done = self._staged(problem)
-        return _fit_of(done, self, time.perf_counter() - began)
-
-    def _staged(self, problem: Problem) -> _Done:
-        """Solve without the constraints, which settles grids and weights, then with them from there."""
         done = self._balanced(replace(problem, constraints=()))
-        if not problem.constraints:
-            return done
-        bound = replace(done.mesh.problem, constraints=problem.constraints)
-        return self._refining(bound, done)
+        if problem.constraints:
+            done = self._refining(replace(done.problem, constraints=problem.constraints), done)
+        return fit_of(done, time.perf_counter() - began)
 
-    def _balanced(self, problem: Problem) -> _Done:
+    # -- stages ----------------------------------------------------------------------------------------
+    def _balanced(self, problem: Problem) -> Solved:
         """Weigh channels by their misfit where the model fails, as the least-squares fit does."""
-        done = self._refining(problem)
+        done = self._from_anywhere(problem)
         if problem.balance or problem.weights != "noise" or problem.loss is not None or len(problem.outputs) < 2:
             return done
-        begin = problem
         for _ in range(3):
             try:
-                factors = misfit_over_noise(done.mesh.problem, done.q)
+                factors = misfit_over_noise(done.problem, done.q)
             except SimulationError:
-                return done
-            relative = [f / done.mesh.problem.balance.get(c, 1.0) for c, f in factors.items()]
+                break
+            relative = [f / done.problem.balance.get(c, 1.0) for c, f in factors.items()]
             if max(relative) < IMBALANCE * min(relative):
-                return done
-            done = self._refining(begin.balanced(factors), done)
-            begin = done.mesh.problem
+                break
+            done = self._refining(done.problem.balanced(factors), done)
         return done
 
-    def _refining(self, problem: Problem, before: _Done | None = None) -> _Done:
+    def _from_anywhere(self, problem: Problem) -> Solved:
+        """Solve from the values of the model; from poor ones by way of a fit whose intervals join loosely."""
+        if self.process_noise is not None or self.warm == "model" or not _poor(problem):
+            return self._refining(problem)
+        # One step per sample is enough to choose by: a lost parameter may ask for very many.
+        found = [self._solve(mesh := Mesh(p, self.every), mesh.joined(p.start, self._nodes(mesh, p.start)))
+                 for p in self._loosely(problem)]
+        best = min([d for d in found if d.status == "converged"] or found, key=lambda d: d.cost)
+        return self._refining(best.problem, best)
+
+    def _loosely(self, problem: Problem) -> list[Problem]:
+        """Return the problem started where a loose fit ends, and with lost parameters put back."""
+        every, size = LOOSE
+        mesh = Mesh(problem, every)
+        step = float(np.median([run.experiment.dt for run in problem.runs]))
+        mesh = replace(mesh, noise=size * mesh.scale / np.sqrt(every * step))
+        z = mesh.joined(problem.start, nodes_from_data(mesh, problem.start))
+        done = self._solve(mesh, z, tol=1e-6)
+        lost = problem.scaling.log & (np.abs(done.q - problem.start) > AWAY)
+        starts = [done.q] + ([np.where(lost, problem.start, done.q)] if lost.any() else [])
+        return [problem.for_model(problem.model.start_at(problem.values(q))) for q in starts]
+
+    def _refining(self, problem: Problem, before: Solved | None = None) -> Solved:
         """Solve, refine the sub-steps at the solution, and again while they change."""
         q = problem.start if before is None else before.q
         mesh = Mesh(problem.refined(q), self.every, self._noise(problem))
         z = mesh.joined(q, self._nodes(mesh, q)) if before is None else before.result.z
-        done = self._solve(mesh, z)
+        done = self._solve(mesh, z, history=() if before is None else before.history)
         for _ in range(ROUNDS - 1):
-            finer = done.mesh.problem.refined(done.q)
+            finer = done.problem.refined(done.q)
             if all(np.array_equal(a.grid.substeps, b.grid.substeps)
-                   for a, b in zip(finer.runs, done.mesh.problem.runs, strict=True)):
+                   for a, b in zip(finer.runs, done.problem.runs, strict=True)):
                 break
             done = self._solve(replace(done.mesh, problem=finer), done.result.z, done.result, done.history)
         return done
 
     def _nodes(self, mesh: Mesh, q: Array) -> Array:
-        if self.warm == "model":
-            try:
-                return nodes_from_simulation(mesh, q)
-            except SimulationError as error:
-                raise FitError(f"the model cannot be simulated at the start: {error} Take warm='data'.") from None
-        return nodes_from_data(mesh, q)
+        if self.warm == "data":
+            return nodes_from_data(mesh, q)
+        try:
+            return nodes_from_simulation(mesh, q)
+        except SimulationError as error:
+            raise FitError(f"the model cannot be simulated at the start: {error} Take warm='data'.") from None
 
     def _noise(self, problem: Problem) -> Array | None:
         if self.process_noise is None:
@@ -148,10 +156,10 @@ class MultipleShooting:
                 raise UsageError(f"process_noise: {one_of(name, states, 'state')}")
             if not value > 0:
                 raise UsageError(f"process_noise: '{name}' must be positive, got {value!r}.")
-        size = Mesh(problem).scale
-        return np.array([self.process_noise.get(n, 1e-6 * s) for n, s in zip(states, size, strict=True)])
+        return np.array([self.process_noise.get(n, 1e-6 * s) for n, s in zip(states, Mesh(problem).scale, strict=True)])
 
-    def _solve(self, mesh: Mesh, z: Array, warm: NlpResult | None = None, history: tuple[float, ...] = ()) -> _Done:
+    def _solve(self, mesh: Mesh, z: Array, warm: NlpResult | None = None, history: tuple[float, ...] = (),
+               tol: float | None = None) -> Solved:
         low, high = mesh.problem.scaling.bounds
         far = np.where(mesh.problem.scaling.log, FARTHEST, np.inf)
         low, high = np.maximum(low, z[:mesh.nq] - far), np.minimum(high, z[:mesh.nq] + far)
@@ -161,23 +169,9 @@ class MultipleShooting:
         except SimulationError as error:
             raise FitError(f"the model cannot be simulated at the start: {error} Give other starting values with "
                            "model.replace(…), or leave them out.") from None
-        result = Ipopt(self.max_iterations, self.tol, self.verbose).solve(
-            nlp, z, (np.concatenate([low, -free]), np.concatenate([high, free])), warm)
-        return _Done(mesh, nlp, result, history + result.history)
-
-
-@dataclass(frozen=True, eq=False)
-class _Done:
-    """A solved mesh."""
-
-    mesh: Mesh
-    nlp: ShootingNlp
-    result: NlpResult
-    history: tuple[float, ...] = field(default=())
-
-    @property
-    def q(self) -> Array:
-        return self.result.z[:self.mesh.nq]
+        ipopt = Ipopt(self.max_iterations, tol or self.tol, self.verbose)
+        result = ipopt.solve(nlp, z, (np.concatenate([low, -free]), np.concatenate([high, free])), warm)
+        return Solved(mesh, nlp, result, history + result.history)
 
 
 def _check(problem: Problem) -> None:
@@ -188,58 +182,18 @@ def _check(problem: Problem) -> None:
         c.parts(problem)
 
 
-def _fit_of(done: _Done, options: MultipleShooting, seconds: float) -> Fit:
-    """Return the `Fit`, or say which constraints are in conflict."""
-    problem, q = done.mesh.problem, done.q
-    status, message = _verdict(done)
-    if status == "failed" and problem.constraints:
-        found = conflict(problem, q)
-        if found:
-            raise FitError(found)
-    extra = _extra(done)
-    residuals, jac = problem.residual_and_jacobian(q)
-    return Fit(problem, problem.values(q), residuals, jac / problem.scaling.slope(q), q, status, message,
-               done.history, seconds, integration_error(problem, q), "hard" if problem.constraints else "plain", extra)
-
-
-def _verdict(done: _Done) -> tuple[str, str]:
-    status = done.result.status
-    if status in GOOD:
-        return "converged", "converged: IPOPT's optimality conditions hold."
-    worst = float(np.max(np.maximum(done.nlp.lower - done.nlp.values(done.result.z)[1], 
-                                    done.nlp.values(done.result.z)[1] - done.nlp.upper), initial=0.0))
-    if status in SAID:
-        return SAID[status][0], SAID[status][1] + "."
-    if worst < 1e-8:
-        return "stalled", (f"stalled ({status}): no step lowers the cost; look at identifiability(), or start "
-                           "elsewhere.")
-    return "failed", f"IPOPT ended with {status}; the intervals do not join (largest gap {worst:.2g})."
-
-
-def _extra(done: _Done) -> dict[str, Any]:
-    problem, mesh = done.mesh.problem, done.mesh
-    walk = mesh.walk(done.result.z, False)
-    lam = done.result.lam_g[0 if mesh.noise is not None else mesh.n_nodes * mesh.nx:]
-    found, first = [], 0
-    collected: dict[int, tuple[Any, Array, Array]] = {}
-    for (block, part, rows) in mesh.constraints(walk):
-        n = len(rows)
-        if id(part) not in collected:
-            collected[id(part)] = (part, np.zeros(len(part.lower)), np.zeros(len(part.lower)))
-        collected[id(part)][1][rows], collected[id(part)][2][rows] = block.values, lam[first:first + n]
-        first += n
-    for c in problem.constraints:
-        found += [(c.name, *collected[id(part)]) for part in c.parts(problem)]
-    totals, rows = summed(found)
-    gaps = mesh.gaps(done.result.z, walk, weighed=False)
-    extra: dict[str, Any] = {
-        "multipliers": totals, "active": rows, "ipopt": done.result.status,
-        "largest_gap": max((float(np.abs(b.values).max()) for b in gaps), default=0.0),
-    }
-    if problem.constraints:
-        active = [jac[part.at_limit(values)] for _, part, values, jac in rows_at(problem, done.q)]
-        extra["free"] = free_directions(np.concatenate(active), problem.scaling.slope(done.q))
-    return extra
+def _poor(problem: Problem) -> bool:
+    """Tell whether the starting values explain less than half of some channel."""
+    for k, run in enumerate(problem.runs):
+        try:
+            y = problem.simulate(problem.start, k, derivatives=False).y
+        except SimulationError:
+            return True
+        for j, c in enumerate(problem.outputs):
+            shown = run.experiment.outputs.get(c)
+            if shown is not None and not np.nanmean((y[:, j] - shown) ** 2) < POOR**2 * np.nanmean(shown**2):
+                return True
+    return False
 
 
 __all__ = ["MultipleShooting"]
