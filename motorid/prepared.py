@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any
 from weakref import WeakKeyDictionary
 
@@ -144,7 +145,7 @@ def natural_sizes(runs: Sequence[Experiment], values: Mapping[str, float]) -> di
     duration, power = max(heats, key=lambda h: h[0] * h[1])
     span = max((float(np.nanmax(r.outputs["theta"]) - np.nanmin(r.outputs["theta"])) for r in runs
                 if "theta" in r.outputs), default=1.0)
-    sizes = {"V": volt, "A": ampere, "rad/s": speed, "m/s": speed, "N·m": torque, "N": torque, "s": second,
+    sizes = {"V": volt, "A": ampere, "rad/s": speed, "m/s": speed, "N·m": torque, "N": torque, "s": second, "1/s": 1 / second,
              "m": 0.01 * span, "K/W": 30 / max(power, 1e-9), "J/K": max(power * duration, 1e-9) / 30}
     for unit in ("N·m·s/rad", "N·s/m"):
         sizes[unit] = torque / speed
@@ -180,6 +181,11 @@ def smoothing(runs: Sequence[Experiment], parameters: Mapping[str, Any]) -> floa
     p = parameters.get("sgn_width")
     if p is None or p.given:
         return None
+    return _suited_width(tuple(runs))
+
+
+@lru_cache(maxsize=64)
+def _suited_width(runs: tuple[Experiment, ...]) -> float | None:
     speed = top_speed(runs)
     if speed <= 0:
         return None
@@ -192,7 +198,7 @@ def smoothing(runs: Sequence[Experiment], parameters: Mapping[str, Any]) -> floa
 
 def _longest_standstill(run: Experiment, speed: float) -> float:
     """Longest time without motion, s, from the angle."""
-    s = np.abs(_slopes(run.outputs["theta"], run.t)) < 0.01 * speed
+    s = np.abs(slopes(run.outputs["theta"], run.t)) < 0.01 * speed
     if not s.any():
         return 0.0
     edges = np.flatnonzero(np.diff(np.concatenate([[0], s.astype(int), [0]])))
