@@ -4,8 +4,10 @@ from typing import TYPE_CHECKING as _TYPE_CHECKING
 
 from motorid import effects
 from motorid.checks import check_runs
+from motorid.comparison import compare
 from motorid.datasets import data_path
 from motorid.derivatives import check_derivatives
+from motorid.diagnosis import diagnose, improve, locate, suggest_experiment
 from motorid.errors import DataError, FitError, ModelError, MotoridError, SimulationError, UsageError
 from motorid.experiment import Experiment
 from motorid.fit import Failure, Fit, fit, solve

@@ -1,0 +1,127 @@
+"""diagnose(): where does the model fail, which effect is missing, and what cannot be told apart."""
+
+from __future__ import annotations
+
+import builtins
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
+
+from motorid.diagnosis.adequacy import FALSE_ALARM, adequacy
+from motorid.diagnosis.evidence import compare_errors
+from motorid.diagnosis.improve import Climb, climb, ladder_of
+from motorid.diagnosis.locate import locate
+from motorid.diagnosis.results import Diagnosis, Missing
+from motorid.diagnosis.search import Search, library
+from motorid.diagnosis.suggest import suggest_experiment
+from motorid.diagnosis.verdict import adequate_text, balance_of, closed_loop_remark, missing_text, unexplained_text
+from motorid.errors import MotoridError
+from motorid.experiment import Experiment
+from motorid.fit import Fit
+from motorid.model import Effect
+
+ENOUGH = 0.5  # fall of the error above which effects explain what is missing, even if something is left
+SAME_DEPENDENCE = 0.3  # share of the variance that still follows the quantity an effect was to explain
+
+
+def diagnose(
+    fit: Fit,
+    validate: Sequence[Experiment] | Experiment | None = None,
+    *,
+    effects: Iterable[Effect | str] | None = None,
+    also: Iterable[Effect] = (),
+    max_effects: int = 3,
+    map: Callable[..., Iterable[Any]] = builtins.map,
+    progress: Callable[[str], None] | None = None,
+) -> Diagnosis:
+    """Say where a fitted model fails and which physical effect it lacks.
+
+    Parameters
+    ----------
+    fit : Fit
+        Of the model as it is, e.g. ``mi.fit(mi.dc_motor(), runs)``.
+    validate : Experiment or sequence of Experiment, optional
+        Held-out runs; every effect must lower the error there. Without them, blocks of the fitted runs are held
+        out in turn.
+    effects : iterable of Effect or str, optional
+        What to try; by default the whole library.
+    also : iterable of Effect, optional
+        Effects of your own, tried beside the library's.
+    max_effects : int
+    map : callable
+        Anything with the signature of `map`, for the refits.
+    progress : callable, optional
+        Called with a word on what was done.
+
+    Returns
+    -------
+    Diagnosis
+        Printed, it is the verdict in words.
+    """
+    say = progress or (lambda word: None)
+    own = tuple(also)
+    search = Search(fit, validate, library(effects, own), map, say)
+    judged = adequacy(fit, search.scores(search.root))
+    found = climb(search, max_effects, say)
+    missing = locate(fit)
+    say("located what is missing")
+    ladder = ladder_of(found, validate is not None)
+    names = tuple(n for n in ladder.best.problem.model.effect_names if n not in fit.problem.model.effect_names)
+    ranking = found.rounds[0] if found.rounds else ()
+    suggestion = None
+    if not names:
+        verdict = "adequate" if judged.adequate else "unexplained"
+        text = adequate_text(judged, ranking) if judged.adequate else unexplained_text(judged, missing, ranking)
+        where = None if judged.adequate else missing.where
+    elif _not_the_form(found, missing):
+        verdict, where = "unexplained", missing.where
+        text = unexplained_text(judged, missing, ranking)
+        names, ladder = (), ladder_of(_cut(found), validate is not None)
+    else:
+        verdict, where = "missing", balance_of(names[0], own)
+        text = missing_text(ladder.rungs, found.remaining, found.groups, validate is not None)
+        suggestion = _suggestion(found)
+    text = " ".join(t for t in (text, closed_loop_remark(fit), suggestion) if t)
+    return Diagnosis(verdict, text, where, names, judged, missing, ranking, ladder, found.groups if names else (),
+                     suggestion, fit, ladder.best, found.remaining if names else judged)
+
+
+def _not_the_form(found: Climb, before: Missing) -> bool:
+    """Tell whether the effects only approximate something outside the library.
+
+    They do if much of the error is left and what is missing still depends on the same quantity as strongly as an
+    effect of the right form would not leave it.
+    """
+    if found.remaining.adequate:
+        return False
+    root, last = found.path[0], found.path[-1]
+    if compare_errors(root.held, last.held, found.search.held.noise).fall > ENOUGH:
+        return False
+    after = locate(last.fit)
+    for name, bins in after.bins.items():
+        was = {b.against: b.explained for b in before.bins.get(name, ())}
+        if any(b.explained > SAME_DEPENDENCE and was.get(b.against, 0.0) > SAME_DEPENDENCE for b in bins):
+            return True
+    return False
+
+
+def _cut(found: Climb) -> Climb:
+    from dataclasses import replace
+
+    return replace(found, path=found.path[:1])
+
+
+def _suggestion(found: Climb) -> str | None:
+    """Say which experiment would separate the first group, if there is one."""
+    if not found.groups:
+        return None
+    names = found.groups[0]
+    fits = [c.fit for c in found.rounds[0] if c.effect in names and c.fit is not None]
+    if len(fits) < 2:
+        return None
+    try:
+        best = suggest_experiment(fits[:4])
+    except MotoridError:
+        return None
+    if best.discrimination[best.name] < 1e-3:
+        return f"No voltage record within the limits would tell {' from '.join(names)}."
+    return f"To tell {' from '.join(names)}, try {best.text}."

@@ -1,0 +1,178 @@
+"""Where does the model fail? The missing voltage and torque over time, by balance, by region, by quantity."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from motorid.diagnosis.evidence import effective_samples
+from motorid.diagnosis.results import Binned, Missing
+from motorid.diagnosis.smoother import Smoothed, smooth
+from motorid.fit import Fit
+from motorid.integrate.grid import Array
+from motorid.prepared import angle_signal, natural_sizes
+
+WALKS = (0.03, 0.1, 0.3, 1.0, 3.0)  # of the natural size per √s, the smallest that explains the data is taken
+BINS = 24
+UNITS = {"i": "A", "omega": "rad/s", "theta": "rad", "heat": "J", "t": "s"}
+WORDS = {"i": "the current", "omega": "the speed", "theta": "the angle within a turn", "heat": "the heat put in",
+         "t": "the time"}
+REGIONS = ("standstill", "reversal", "acceleration", "high current", "steady")
+
+
+def locate(fit: Fit) -> Missing:
+    """Estimate the unknown voltage and torque that would make the model match, and say where they act.
+
+    Parameters
+    ----------
+    fit : Fit
+
+    Returns
+    -------
+    Missing
+        Per run the missing voltage (V) and torque (N·m, N for a linear axis), their dependence on i, omega,
+        theta, heat and t with 95 % bands, the share of the misfit by balance and by region.
+    """
+    natural = natural_sizes(fit.problem.experiments, fit.values)
+    unit = "N" if fit.problem.model.axis == "linear" else "N·m"
+    size = np.array([natural["V"] if "i" in fit.problem.system.states else 0.0, natural[unit]])
+    apart = "i" in fit.problem.outputs and len(fit.problem.outputs) > 1
+    if not apart and "i" in fit.problem.system.states:
+        size[0] = 0.0  # one of them stands for both
+    walk, both = _walk(fit, size)
+    shares = _shares(fit, walk * size, both) if apart else {"mechanical": 1.0}
+    if "i" in fit.problem.system.states and not apart:
+        shares = {"electrical": 0.5, "mechanical": 0.5}
+    signals = tuple(_signals(fit, k, s) for k, s in enumerate(both))
+    voltage, torque = tuple(s.d[:, 0] for s in both), tuple(s.d[:, 1] for s in both)
+    bins = {name: _against(d, signals) for name, d in (("voltage", voltage), ("torque", torque)) if any(x.any() for x in d)}
+    regions = _regions(fit, signals)
+    where = None
+    if len(shares) > 1 and apart:
+        where = max(shares, key=lambda s: shares[s])
+    elif len(shares) == 1:
+        where = "mechanical"
+    return Missing(where, tuple(r.experiment.t for r in fit.problem.runs), voltage, torque, signals, shares, regions,
+                   bins, _text(where, shares, regions, bins, apart), unit)
+
+
+def _walk(fit: Fit, size: Array) -> tuple[float, list[Smoothed]]:
+    """Return the smallest random walk that explains the measurements, and the smoothed runs."""
+    found: list[Smoothed] = []
+    for walk in WALKS:
+        found = [smooth(fit, k, walk * size) for k in range(len(fit.problem.runs))]
+        if np.mean([s.chi2 for s in found]) <= 1.0:
+            return walk, found
+    return WALKS[-1], found
+
+
+def _shares(fit: Fit, walk: Array, both: Sequence[Smoothed]) -> dict[str, float]:
+    """Share of the misfit by balance: what one unknown input alone leaves, the other has to explain."""
+    runs = range(len(fit.problem.runs))
+    left = [float(np.mean([smooth(fit, k, walk * keep).chi2 for k in runs])) for keep in ([1, 0], [0, 1])]
+    rest = float(np.mean([s.chi2 for s in both]))
+    missed = [max(c - max(rest, 1.0), 0.0) + 1e-3 for c in left]
+    total = sum(missed)
+    return {"electrical": missed[1] / total, "mechanical": missed[0] / total}
+
+
+def _signals(fit: Fit, k: int, s: Smoothed) -> Mapping[str, Array]:
+    run = fit.problem.experiments[k]
+    found: dict[str, Array] = {"t": run.t}
+    for c in ("i", "omega"):
+        if c in fit.problem.system.states:
+            found[c] = s.x[:, fit.problem.system.states.index(c)]
+    if "theta" in run.outputs or "omega" in run.outputs:
+        found["theta"] = angle_signal(run)
+    if "i" in found:
+        power = fit.values["R"] * found["i"] ** 2
+        found["heat"] = np.concatenate([[0.0], np.cumsum((power[1:] + power[:-1]) / 2 * np.diff(run.t))])
+    return found
+
+
+def _against(unknown: Sequence[Array], signals: Sequence[Mapping[str, Array]]) -> tuple[Binned, ...]:
+    """Bin an unknown input over every quantity, the best explanation first."""
+    d = np.concatenate(list(unknown))
+    worth = sum(effective_samples(x - x.mean()) for x in unknown) / len(d)
+    found = []
+    for name in ("omega", "i", "theta", "heat", "t"):
+        if not all(name in s for s in signals):
+            continue
+        z = np.concatenate([s[name] for s in signals])
+        z = np.mod(z, 2 * np.pi) if name == "theta" else z
+        if np.ptp(z) > 0:
+            found.append(_binned(name, z, d, worth))
+    return tuple(sorted(found, key=lambda b: -b.explained))
+
+
+def _binned(name: str, z: Array, d: Array, worth: float) -> Binned:
+    # Half of the edges by count, half by distance: rest is one value, and rare speeds matter too.
+    inner = np.concatenate([np.quantile(z, np.linspace(0, 1, BINS // 2 + 1)), np.linspace(z.min(), z.max(), BINS // 2 + 1)])
+    edges = np.unique(inner)
+    label = np.clip(np.searchsorted(edges, z, side="right") - 1, 0, len(edges) - 2)
+    count = np.bincount(label, minlength=len(edges) - 1)
+    keep = count >= 3
+    n = np.maximum(count, 1)
+    mean = np.bincount(label, d, len(edges) - 1) / n
+    spread = np.sqrt(np.maximum(np.bincount(label, d**2, len(edges) - 1) / n - mean**2, 0.0))
+    half = 1.96 * spread / np.sqrt(np.maximum(n * worth, 1.0))
+    centre = np.bincount(label, z, len(edges) - 1) / n
+    total = float(np.sum((d - d.mean()) ** 2))
+    between = float(np.sum(count * (mean - d.mean()) ** 2))
+    inside = (total - between) / max(len(d) - keep.sum(), 1)
+    explained = max(between - keep.sum() * inside, 0.0) / max(total, 1e-300)
+    return Binned(name, UNITS[name], centre[keep], mean[keep], (mean - half)[keep], (mean + half)[keep], count[keep],
+                  float(min(explained, 1.0)))
+
+
+def _regions(fit: Fit, signals: Sequence[Mapping[str, Array]]) -> dict[str, float]:
+    """Share of the squared, whitened misfit by region of operation."""
+    top_speed = max((float(np.abs(s["omega"]).max()) for s in signals if "omega" in s), default=0.0) or 1.0
+    top_current = max((float(np.abs(s["i"]).max()) for s in signals if "i" in s), default=0.0) or np.inf
+    sums = dict.fromkeys(REGIONS, 0.0)
+    for k, s in enumerate(signals):
+        r2 = sum(np.nan_to_num(fit.simulations[k].residual(c) / fit.problem.runs[k].sigma[c]) ** 2
+                 for c in fit.problem.runs[k].sigma)
+        for name, mask in _masks(s, top_speed, top_current).items():
+            sums[name] += float(np.sum(r2[mask]))
+    total = sum(sums.values()) or 1.0
+    return {name: v / total for name, v in sums.items()}
+
+
+def _masks(s: Mapping[str, Array], top_speed: float, top_current: float) -> dict[str, Array]:
+    """Return one mask per region; every sample is in just one."""
+    omega = s.get("omega", np.zeros_like(s["t"]))
+    n = len(omega)
+    still = np.abs(omega) < 0.02 * top_speed
+    crossing = np.flatnonzero(np.diff(np.sign(np.where(still, 0, omega))) != 0)
+    reversal = np.zeros(n, bool)
+    window = max(n // 200, 2)
+    for c in crossing:
+        if omega[max(c - window, 0)] * omega[min(c + window, n - 1)] < 0:
+            reversal[max(c - window, 0):c + window] = True
+    rate = np.abs(np.gradient(omega, s["t"]))
+    fast = rate > 0.2 * max(np.quantile(rate, 0.99), 1e-300)
+    strong = np.abs(s["i"]) > 0.6 * top_current if "i" in s else np.zeros(n, bool)
+    masks, taken = {}, np.zeros(n, bool)
+    for name, mask in (("reversal", reversal), ("standstill", still), ("high current", strong), ("acceleration", fast),
+                       ("steady", np.ones(n, bool))):
+        masks[name] = mask & ~taken
+        taken |= mask
+    return masks
+
+
+def _text(where: str | None, shares: Mapping[str, float], regions: Mapping[str, float],
+          bins: Mapping[str, Sequence[Binned]], apart: bool) -> str:
+    first = max(regions, key=lambda r: regions[r])
+    region = f"Most of the misfit ({100 * regions[first]:.0f} %) lies in {first}."
+    if not apart and len(shares) > 1:
+        lead = "Without current and speed both measured, a missing voltage and a missing torque look the same."
+        name = "torque"
+    else:
+        name = "voltage" if where == "electrical" else "torque"
+        lead = f"The {name} balance fails ({100 * shares.get(where or '', 0):.0f} % of the misfit)."
+    best = bins.get(name, ())
+    if best and best[0].explained > 0.2:
+        return f"{lead} What is missing depends on {WORDS[best[0].against]} ({100 * best[0].explained:.0f} % explained). {region}"
+    return f"{lead} {region}"

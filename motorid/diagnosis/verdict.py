@@ -1,0 +1,116 @@
+"""The answer in words: what is missing, how large, how sure, what cannot be told apart, how the rest moved."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from motorid.diagnosis.results import Adequacy, Candidate, Missing, Rung
+from motorid.effects import LIBRARY
+from motorid.fit import Fit
+from motorid.formatting import percent, with_error
+from motorid.model import Effect
+
+MOVED = 0.1  # relative change of a motor parameter that is worth a word
+RPM = 30 / np.pi
+
+
+def adequate_text(judged: Adequacy, ranking: Sequence[Candidate]) -> str:
+    """Return the verdict when nothing is missing."""
+    near = [c for c in ranking if c.refit_drop]
+    tried = f" Of {len(ranking)} effects tried, none is worth adding." if ranking else ""
+    return f"{judged.text}{tried}" if near or ranking else judged.text
+
+
+def unexplained_text(judged: Adequacy, missing: Missing, ranking: Sequence[Candidate]) -> str:
+    """Return the verdict when something is missing that the library does not have."""
+    best = next((c for c in ranking if c.refit_drop is not None), None)
+    near = ""
+    if best is not None and (best.refit_drop or 0) > 0.05:
+        near = (f" The nearest, '{best.effect}', takes away {percent(best.refit_drop, 2)} of the squared misfit, but "
+                f"{best.reason or 'leaves the rest with the same dependence'}.")
+    return f"{judged.text} {missing.text} None of the library's effects explains it.{near}"
+
+
+def missing_text(rungs: Sequence[Rung], remaining: Adequacy, groups: Sequence[Sequence[str]], validated: bool) -> str:
+    """Return the verdict when effects were found."""
+    after = rungs[-1].fit
+    names = [n for r in rungs[1:] if r.added for n in r.added.split(" + ")]
+    parts = [f"Missing: {'; '.join(_described(after, n) for n in names)}."]
+    parts.append(_errors(rungs[0], rungs[-1], validated))
+    parts += [f"These data cannot tell {g[0]} from {' or '.join(g[1:])}." for g in groups]
+    moved = moves(rungs[0].fit, after)
+    if moved:
+        parts.append(moved)
+    parts.append("What is left is noise." if remaining.adequate else f"Not all is explained: {remaining.text[0].lower()}{remaining.text[1:]}")
+    return " ".join(parts)
+
+
+def _described(fit: Fit, name: str) -> str:
+    effect = next(e for e in fit.problem.model.effects if e.name == name)
+    return f"{name} ({', '.join(_valued(fit, effect))})"
+
+
+def _valued(fit: Fit, effect: Effect) -> list[str]:
+    found = []
+    for p in effect.parameters:
+        unit = fit.problem.model.parameters[p.name].unit
+        text = f"{p.name} = {with_error(fit.values[p.name], fit.std.get(p.name), unit)}"
+        if p.name == "k_w" and abs(1 + fit.values[p.name] - RPM) < 0.3:
+            text += ", the ratio of rpm to rad/s: the speed is probably in rpm"
+        found.append(text)
+    return found
+
+
+def _errors(before: Rung, after: Rung, validated: bool) -> str:
+    falls = [f"{c} from {percent(e, 3)} to {percent(after.nrmse[c], 3)}" for c, e in before.nrmse.items()]
+    text = f"With it the error falls: {', '.join(falls)}"
+    if validated and before.validation_nrmse and after.validation_nrmse:
+        held = [f"{c} {percent(e, 3)} to {percent(after.validation_nrmse[c], 3)}" for c, e in before.validation_nrmse.items()]
+        text += f"; on the held-out runs {', '.join(held)}"
+    return text + "."
+
+
+def moves(before: Fit, after: Fit) -> str:
+    """Say how the motor's own parameters moved, since they had absorbed what was missing."""
+    base = [n for n in ("R", "L", "K", "b", "J") if n in before.values and n in after.values]
+    moved = [n for n in base if abs(after.values[n] / max(before.values[n], 1e-300) - 1) > MOVED]
+    if not moved:
+        return ""
+    said = [f"{n} from {with_error(before.values[n], before.std[n])} to "
+            f"{with_error(after.values[n], after.std[n], after.problem.model.parameters[n].unit)}" for n in moved]
+    return f"The motor's own parameters had absorbed it: {', '.join(said)}."
+
+
+def balance_of(name: str, also: Sequence[Effect] = ()) -> str:
+    """Return where an effect acts: electrical, mechanical or sensor."""
+    known = {**LIBRARY, **{e.name: e for e in also}}
+    return {"voltage": "electrical", "torque": "mechanical", "transmission": "mechanical", "sensor": "sensor"}[known[name].balance]
+
+
+def closed_loop_remark(fit: Fit) -> str:
+    """Say so when a controller made the voltage from the measurement: it hides errors of the model."""
+    for run in fit.problem.experiments:
+        feedback = _noise_feedback(run.inputs["v"], run.outputs.get("omega", run.outputs.get("theta")))
+        extra = run.meta.get("extra", {})
+        if feedback > 0.5 or any("ref" in str(n).lower() or "goal" in str(n).lower() for n in extra):
+            return ("The records seem to come from a closed loop: the controller works against every disturbance, so an "
+                    "open-loop simulation drifts and part of what is missing hides in the voltage. Open-loop records "
+                    "show it better.")
+    return ""
+
+
+def _noise_feedback(v, y) -> float:
+    """Correlation of the fast changes of the voltage with those of the measurement just before."""
+    if y is None or np.ptp(v) == 0:
+        return 0.0
+    dv, dy = np.diff(v, 2), np.diff(np.nan_to_num(y), 2)
+    changed = np.abs(dv) > 0
+    if changed.mean() < 0.5:
+        return 0.0
+    calm = (np.abs(dv) < 6 * np.median(np.abs(dv)) + 1e-300) & (np.abs(dy) < 6 * np.median(np.abs(dy)) + 1e-300)
+    if calm.sum() < 50:
+        return 0.0
+    both = [np.corrcoef(dv[1:][calm[1:]], dy[:-1][calm[1:]])[0, 1], np.corrcoef(dv[calm], dy[calm])[0, 1]]
+    return float(np.nanmax(np.abs(both)))
