@@ -36,7 +36,8 @@ BINS = 24
 
 @styled
 def plot_residuals(fit: Fit, channels: Sequence[str] | None = None) -> np.ndarray:
-    """Draw the residuals of each channel: over time, their histogram and autocorrelation, against ω, i, θ.
+    """Draw the residuals of each channel: over time, their histogram and autocorrelation, against
+    the model's ω, i, θ.
 
     What only noise leaves over is flat: a histogram under the curve of the normal distribution, an
     autocorrelation within its band of 95 %, means of zero against every quantity.
@@ -89,13 +90,9 @@ def _channel(axes: np.ndarray, fit: Fit, channel: str, against: Sequence[str]) -
     _histogram(axes[1], finite(every, f"the residual of {channel}"), sigma)
     _autocorrelation(axes[2], [s.residual(channel) for s in sims])
     for ax, other in zip(axes[3:], against, strict=True):
-        with_other = [s for s in sims if other in s.experiment.outputs]
-        _against(
-            ax,
-            [s.experiment.outputs[other] for s in with_other],
-            [s.residual(channel) for s in with_other],
-            sigma,
-        )
+        # The model's own: the measured one shares its noise with the residual, which then seems to depend.
+        with_other = [s for s in sims if other in s.outputs]
+        _against(ax, [s.outputs[other] for s in with_other], [s.residual(channel) for s in with_other], sigma)
         tidy(ax, x=axis_label(other, run), title=f"Against {axis_label(other, run).split(' (')[0]}")
         ax.sharey(axes[3])
     if len(axes) > 3:
@@ -177,7 +174,9 @@ def _against(ax: Axes, x: Sequence[Array], r: Sequence[Array], sigma: float) -> 
     band(ax, 2 * sigma)
     scatter(ax, xs, rs)
     centre, mean, half = binned_means(xs, rs)
-    ax.errorbar(centre, mean, yerr=half, fmt="o-", ms=2.5, lw=1.1, color=INK)
+    ax.errorbar(centre, mean, yerr=half, fmt="o", ms=2.5, lw=1.1, color=INK)
+    gaps = np.flatnonzero(np.diff(centre) > 1.5 * np.ptp(xs) / BINS) + 1  # no line over empty bins
+    ax.plot(np.insert(centre, gaps, np.nan), np.insert(mean, gaps, np.nan), lw=1.1, color=INK)
 
 
 def scatter(ax: Axes, x: Any, y: Any, most: int = 1500, color: str = RESIDUAL) -> None:

@@ -111,6 +111,10 @@ def styled(draw: Callable[_P, _R]) -> Callable[_P, _R]:
 
     @wraps(draw)
     def inner(*args: _P.args, **kwargs: _P.kwargs) -> _R:
+        if not _detached.get():
+            import matplotlib.pyplot as plt
+
+            plt.draw_if_interactive()  # loads the backend: inside the context its set-up would be undone
         with mpl.rc_context(dict(STYLE)):  # type: ignore[arg-type]
             return draw(*args, **kwargs)
 
