@@ -10,19 +10,17 @@ from typing import Any
 
 import numpy as np
 
-from motorid.bases import BASES
 from motorid.descent import descend_balanced, integration_error
 from motorid.display import Shown
-from motorid.errors import FitError, SimulationError, UsageError, one_of
+from motorid.errors import FitError, UsageError, one_of
 from motorid.experiment import Experiment
 from motorid.integrate import Engine
 from motorid.integrate.grid import Array
 from motorid.least_squares import LevenbergMarquardt, Solution, gauss_newton_covariance
 from motorid.model import Model
-from motorid.prepared import natural_sizes, suited
 from motorid.problem import Problem, as_problem
 from motorid.simulate import Evaluation, Simulation, at, evaluate, judge, steady_errors
-from motorid.start import first_guess
+from motorid.starting import started
 
 UNDETERMINED = 1.0  # relative standard deviation above which a value is not shown as determined
 MISFIT_SHARE = 0.2  # integration error accepted beside the misfit
@@ -304,47 +302,6 @@ def _advice(found: Solution, error: float, n: int) -> str:
         return (f"{found.message}; but the integration error is {error:.2g} times the noise: try engine='cvodes' or "
                 "a finer record.")
     return f"{found.message}."
-
-
-def started(problem: Problem) -> Problem:
-    """Return the problem with starting values that suit the data: the best of a few candidates by its cost."""
-    model = problem.model
-    guess = first_guess(model, problem.experiments)
-    bounded = {n: float(np.clip(v, model.parameters[n].lower, model.parameters[n].upper)) for n, v in guess.items()}
-    guessed = with_suited_effects(model.start_at(bounded), problem.experiments)
-    candidates = [guessed]
-    if any(p.given for p in model.parameters.values()) or _was_fitted(model):
-        fitted = with_suited_effects(model, problem.experiments)
-        candidates.append(fitted)
-    if len(candidates) == 1:
-        return problem.with_(model=guessed)
-    costs = [_cost_of(problem.with_(model=m)) for m in candidates]
-    return problem.with_(model=candidates[int(np.argmin(costs))])
-
-
-def _was_fitted(model: Model) -> bool:
-    return any(model.parameters[p.name].value != p.value for p in BASES[model.base])
-
-
-def _cost_of(problem: Problem) -> float:
-    try:
-        r = problem.residual(problem.start)
-    except SimulationError:
-        return np.inf
-    cost = float(r @ r)
-    return cost if np.isfinite(cost) else np.inf
-
-
-def with_suited_effects(model: Model, runs: Sequence[Experiment]) -> Model:
-    """Return the model with starting values of its effects' parameters that suit the data."""
-    sizes = natural_sizes(runs, model.values)
-    untouched = {}
-    for e in model.effects:
-        for declared in e.parameters:
-            p = model.parameters[declared.name]
-            if p.value == declared.value:
-                untouched[p.name] = suited(p, sizes).value
-    return model.start_at(untouched)
 
 
 __all__ = ["Evaluation", "Failure", "Fit", "FitError", "evaluate", "fit", "integration_error", "solve", "started"]

@@ -25,7 +25,7 @@ FRICTION = (
     "viscous_asymmetric",
     "lugre",
 )
-UNITS = {"V", "A", "rad/s", "rad", "N·m", "s", "K/W", "J/K", "1/K", "N·m·s/rad", "N·m·s²/rad²", ""}
+UNITS = {"V", "A", "rad/s", "rad", "N·m", "s", "1/s", "K/W", "J/K", "1/K", "N·m·s/rad", "N·m·s²/rad²", ""}
 every_effect = pytest.mark.parametrize("effect", LIBRARY.values(), ids=LIBRARY)
 
 

@@ -175,7 +175,7 @@ def test_compiled_and_virtual_machine_give_the_same_numbers():
     (r, jac), (r2, jac2) = (p.residual_and_jacobian(q) for p in both)
     assert np.abs(r - r2).max() <= 1e-9 * np.abs(r).max()
     assert (np.abs(jac - jac2).max(axis=0) <= 1e-8 * np.abs(jac).max(axis=0)).all()
-    assert np.array_equal(both[0].residual(q), r)  # with and without derivatives alike
+    assert np.abs(both[0].residual(q) - r).max() <= 1e-12 * np.abs(r).max()  # with derivatives or without
 
 
 @pytest.mark.parametrize("hold", ["zoh", "linear"])

@@ -31,7 +31,7 @@ def _two_inertias(m: Equations, share, resonance, zeta, twist_of, name: str) -> 
 def compliance(
     m: Equations,
     r_load=P(0.3, "", null=0.0, lower=0.0, upper=0.98, grid=(0.3, 0.7), doc="load's share of the inertia"),
-    omega_r=P(200.0, "rad/s", positive=True, grid=(0.1, 0.3, 1.0), doc="resonance of the two inertias"),
+    omega_r=P(200.0, "1/s", positive=True, grid=(0.02, 0.06, 0.2, 0.6), doc="resonance of the two inertias"),
     zeta_r=P(0.05, "", positive=True, upper=2.0, grid=(0.05, 0.3), doc="damping ratio of the resonance"),
 ):
     """Elastic shaft between two inertias. Ellis, Control System Design Guide, ch. 16, 2012."""
@@ -43,7 +43,7 @@ def backlash(
     m: Equations,
     r_gap=P(0.3, "", null=0.0, lower=0.0, upper=0.98, grid=(0.3, 0.7), doc="load's share of the inertia"),
     gap=P(0.02, "rad", positive=True, grid=(0.01, 0.03, 0.1), doc="total free play"),
-    omega_c=P(500.0, "rad/s", positive=True, grid=(0.3,), doc="resonance while in contact"),
+    omega_c=P(500.0, "1/s", positive=True, grid=(0.1, 0.4), doc="resonance while in contact"),
     zeta_c=P(0.2, "", positive=True, upper=2.0, grid=(0.1, 0.5), doc="damping ratio while in contact"),
 ):
     """Free play between two inertias, elastic in contact. Nordin & Gutman, Automatica 38(10), 2002."""

@@ -33,10 +33,21 @@ DRIVER = r"""
 #include <stdlib.h>
 #include <string.h>
 
-/* row += a * other, over the unknowns. */
-static void add(double* row, double a, const double* other, long long nq) {
+/* out = A S + B Pq, column-major A and B with `rows` rows; Pq by its nonzeros, one or none per unknown mostly. */
+static void propagate(double* out, int rows, const double* A, const double* B, const double* S, long long nq,
+                      long long nz, const long long* param, const long long* unknown, const double* slope) {
   long long j;
-  if (a != 0) for (j = 0; j < nq; j++) row[j] += a * other[j];
+  int r, c;
+  memset(out, 0, rows * nq * sizeof(double));
+  for (r = 0; r < rows; r++) {
+    double* row = out + r * nq;
+    for (c = 0; c < NX; c++) {
+      double a = A[c * rows + r];
+      const double* other = S + c * nq;
+      if (a != 0) for (j = 0; j < nq; j++) row[j] += a * other[j];
+    }
+    for (j = 0; j < nz; j++) row[unknown[j]] += B[param[j] * rows + r] * slope[j];
+  }
 }
 
 /* Work space for the largest of the functions. */
@@ -64,10 +75,15 @@ long long motorid_run(long long n, const long long* nsub, const double* dt, cons
   casadi_int* iw = malloc(ni * sizeof(casadi_int));
   double* w = malloc((nw + 2 * NX * nq + 1) * sizeof(double));
   double *S = w + nw, *T = S + NX * nq;
+  long long nz = 0, *param = malloc((2 * NP * nq + 1) * sizeof(long long)), *unknown = param + NP * nq;
+  double* slope = malloc((NP * nq + 1) * sizeof(double));
   double x[NX], xn[NX], e[NX], A[NX * NX], B[NX * NP], ua[NU], ub[NU], y[NY], C[NY * NX], D[NY * NP];
   long long k, bad = -1;
   memcpy(x, x0, sizeof(x));
   if (nq) memcpy(S, S0, NX * nq * sizeof(double));
+  for (k = 0; k < NP * nq; k++) if (Pq[k] != 0) {
+    param[nz] = k / nq; unknown[nz] = k % nq; slope[nz++] = Pq[k];
+  }
   for (k = 0; k < n; k++) {
     int r, c;
     for (r = 0; r < NX; r++) if (!isfinite(x[r])) bad = k;
@@ -78,12 +94,7 @@ long long motorid_run(long long n, const long long* nsub, const double* dt, cons
     res[0] = y; res[1] = nq ? C : 0; res[2] = nq ? D : 0;
     motorid_out(arg, res, iw, w, 0);
     memcpy(Y + k * NY, y, sizeof(y));
-    if (nq) for (r = 0; r < NY; r++) {
-      double* row = DY + (k * NY + r) * nq;
-      memset(row, 0, nq * sizeof(double));
-      for (c = 0; c < NX; c++) add(row, C[c * NY + r], S + c * nq, nq);
-      for (c = 0; c < NP; c++) add(row, D[c * NY + r], Pq + c * nq, nq);
-    }
+    if (nq) propagate(DY + k * NY * nq, NY, C, D, S, nq, nz, param, unknown, slope);
     if (k == n - 1) break;
     long long s, m = nsub[k]; double h = dt[k] / m;
     if (E) memset(E + k * NX, 0, NX * sizeof(double));
@@ -96,19 +107,14 @@ long long motorid_run(long long n, const long long* nsub, const double* dt, cons
       res[0] = xn; res[1] = e; res[2] = A; res[3] = B;
       if (nq) {
         motorid_full(arg, res, iw, w, 0);
-        for (r = 0; r < NX; r++) {
-          double* row = T + r * nq;
-          memset(row, 0, nq * sizeof(double));
-          for (c = 0; c < NX; c++) add(row, A[c * NX + r], S + c * nq, nq);
-          for (c = 0; c < NP; c++) add(row, B[c * NX + r], Pq + c * nq, nq);
-        }
-        memcpy(S, T, NX * nq * sizeof(double));
+        propagate(T, NX, A, B, S, nq, nz, param, unknown, slope);
+        double* old = S; S = T; T = old;
       } else motorid_light(arg, res, iw, w, 0);
       if (E) for (r = 0; r < NX; r++) { double q = fabs(e[r]); if (!(q <= E[k * NX + r])) E[k * NX + r] = q; }
       memcpy(x, xn, sizeof(x));
     }
   }
-  free(arg); free(res); free(iw); free(w);
+  free(arg); free(res); free(iw); free(w); free(param); free(slope);
   return bad;
 }
 """

@@ -1,0 +1,105 @@
+"""Where a fit begins: the motor from the records, its effects from natural sizes and a few shapes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from itertools import product
+
+import numpy as np
+
+from motorid.bases import BASES
+from motorid.errors import FitError, SimulationError
+from motorid.experiment import Experiment
+from motorid.least_squares import LevenbergMarquardt, levenberg_marquardt
+from motorid.model import Model
+from motorid.parameters import Parameter
+from motorid.prepared import natural_sizes, suited
+from motorid.problem import Problem
+from motorid.start import first_guess
+from motorid.term import Effect
+
+FEW = 3  # shapes that are looked at more closely
+MOST_SHAPES = 24
+PHASES = tuple(np.arange(4) * np.pi / 2)
+
+
+def started(problem: Problem) -> Problem:
+    """Return the problem with starting values that suit the data: the best of a few candidates by cost."""
+    model = problem.model
+    guess = first_guess(model, problem.experiments)
+    bounded = {n: float(np.clip(v, model.parameters[n].lower, model.parameters[n].upper))
+               for n, v in guess.items()}
+    candidates = [with_suited_effects(model.start_at(bounded), problem.experiments)]
+    if any(p.given for p in model.parameters.values()) or _was_fitted(model):
+        candidates.append(with_suited_effects(model, problem.experiments))
+    problems = [problem.for_model(m) for m in candidates]
+    best = min(problems, key=_cost_of) if len(problems) > 1 else problems[0]
+    for effect in model.effects:
+        best = _shaped(best, effect, model)
+    return best
+
+
+def _was_fitted(model: Model) -> bool:
+    return any(model.parameters[p.name].value != p.value for p in BASES[model.base])
+
+
+def _cost_of(problem: Problem) -> float:
+    try:
+        r = problem.residual(problem.start)
+    except SimulationError:
+        return np.inf
+    cost = float(r @ r)
+    return cost if np.isfinite(cost) else np.inf
+
+
+def with_suited_effects(model: Model, runs: Sequence[Experiment]) -> Model:
+    """Return the model with starting values of its effects' parameters that suit the data."""
+    if not model.effects:
+        return model
+    sizes = natural_sizes(runs, model.values)
+    untouched = (p for e in model.effects for p in _untouched(model, e))
+    return model.start_at({p.name: suited(p, sizes).value for p in untouched})
+
+
+def _untouched(model: Model, effect: Effect) -> list[Parameter]:
+    """Parameters of an effect that still have the value they were declared with."""
+    here = ((model.parameters[p.name], p) for p in effect.parameters)
+    return [now for now, declared in here if now.value == declared.value and not now.given]
+
+
+def _shaped(problem: Problem, effect: Effect, asked: Model) -> Problem:
+    """Return the problem started at the best of the shapes of `effect`: one step from each, more from a few.
+
+    A knee current, a resonance or a phase far from the truth can leave the descent in a side valley.
+    """
+    shapes = list(_shapes(problem, effect, asked))[:MOST_SHAPES]
+    if len(shapes) < 2:
+        return problem
+    problem = problem.refined(problem.start)
+    looks = [_look(problem.for_model(problem.model.start_at(s)), 1) for s in shapes]
+    for iterations in (2, 4):
+        looks = sorted(looks, key=lambda look: look[0])[:FEW]
+        looks = [_look(here, iterations) for _, here in looks]
+    return replace(min(looks, key=lambda look: look[0])[1], _runs=None)
+
+
+def _look(problem: Problem, iterations: int) -> tuple[float, Problem]:
+    """Return the cost after a few steps, and the problem started there."""
+    options = LevenbergMarquardt(max_iterations=iterations)
+    try:
+        found = levenberg_marquardt(problem.residual, problem.residual_and_jacobian, problem.start,
+                                    problem.scaling.bounds, options, None, problem.scaling.log)
+    except (FitError, SimulationError):
+        return np.inf, problem
+    return found.history[-1], problem.for_model(problem.model.start_at(problem.values(found.q)))
+
+
+def _shapes(problem: Problem, effect: Effect, asked: Model) -> Iterator[dict[str, float]]:
+    sizes = natural_sizes(problem.experiments, problem.model.values)
+    axes = []
+    for p in _untouched(asked, effect):
+        if p.vary and (p.grid or p.periodic):
+            values = [g * sizes.get(p.unit, 1.0) for g in p.grid] or PHASES
+            axes.append([(p.name, float(np.clip(v, p.lower, p.upper))) for v in values])
+    return (dict(choice) for choice in product(*axes)) if axes else iter(())
