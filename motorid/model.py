@@ -89,7 +89,8 @@ class Model(Shown):
 
     def start_at(self, values: Mapping[str, float]) -> Model:
         """Return the model with values of a result; unlike after `replace`, a fit may start elsewhere."""
-        return self._change({n: {"value": float(v)} for n, v in values.items() if n in self.parameters})
+        known = {n: float(v) for n, v in values.items() if n in self.parameters}
+        return self._change({n: {"value": _within(self.parameters[n], v)} for n, v in known.items()})
 
     def fix(self, *names: str, **values: float) -> Model:
         """Return the model with parameters held: ``fix("L")`` at its value, ``fix(R=1.2)`` at a new one."""
@@ -237,3 +238,9 @@ def torque_driven(axis: str = "rotary", **values: float) -> Model:
 
 
 __all__ = ["Effect", "Model", "dc_motor", "effect", "torque_driven"]
+
+
+def _within(parameter: Parameter, value: float) -> float:
+    """Undo the rounding that a value at its limit suffers on the way through the solver's coordinates."""
+    limit = min(max(value, parameter.lower), parameter.upper)
+    return limit if abs(value - limit) <= 1e-9 * abs(limit) else value

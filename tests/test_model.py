@@ -329,3 +329,12 @@ def test_shows_what_it_is():
     model = mi.dc_motor() + mi.effects.coulomb
     assert repr(model) == "<model dc_motor + coulomb: R, L, K, b, J, tau_c>"
     assert repr(mi.effects.coulomb) == "<effect coulomb (torque): tau_c>"
+
+
+def test_a_result_at_a_limit_may_be_off_by_rounding_but_not_by_more():
+    model = mi.dc_motor()
+    model = model._change({"R": {"lower": 1.0, "upper": 3.0, "value": 2.0}})
+    assert model.start_at({"R": 1.0 - 1e-15}).parameters["R"].value == 1.0
+    assert model.start_at({"R": 3.0 + 1e-12}).parameters["R"].value == 3.0
+    with pytest.raises(mi.ModelError, match="lies outside its limits"):
+        model.start_at({"R": 0.9})
