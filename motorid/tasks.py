@@ -1,0 +1,106 @@
+"""Many independent pieces of work over any `map`: shipped once, kept when done, finished without the pool.
+
+`map` is anything with the signature of the built-in one: ``executor.map`` of `concurrent.futures`,
+``client.get_executor().map`` of Dask, ``lambda f, xs: joblib.Parallel(2)(joblib.delayed(f)(x) for x in xs)``.
+"""
+
+from __future__ import annotations
+
+import builtins
+import hashlib
+import pickle
+import sys
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+from motorid.progress import progress
+
+Map = Callable[..., Iterable[Any]]
+MOST_TASKS = 64  # when many small pieces go to a pool together: few enough to ship, many enough to share out
+
+
+@dataclass(frozen=True)
+class Parcel:
+    """An object pickled once; a process that gets it many times unpacks it once.
+
+    A model whose law was written in a notebook travels as its CasADi functions, since `Problem` carries them.
+    """
+
+    key: str
+    data: bytes = field(compare=False, repr=False)
+
+    @staticmethod
+    def of(content: Any) -> Parcel:
+        """Pack `content`."""
+        data = pickle.dumps(content, protocol=pickle.HIGHEST_PROTOCOL)
+        return Parcel(hashlib.sha256(data).hexdigest(), data)
+
+    def open(self) -> Any:
+        """Return the content; one object per process, so it must not be changed."""
+        return _opened(self)
+
+
+@lru_cache(maxsize=8)
+def _opened(parcel: Parcel) -> Any:
+    return pickle.loads(parcel.data)
+
+
+class Done(NamedTuple):
+    """Results in the order of the tasks, and why there are not all of them (empty if there are)."""
+
+    results: list[Any]
+    interrupted: str
+
+
+def run_tasks(function: Callable[[Any], Any], tasks: Sequence[Any], map: Map | None, text: str, *,
+              quiet: bool = False, each: Callable[[Any], object] | None = None) -> Done:
+    """Return ``[function(task) for task in tasks]`` by way of `map`, with a progress bar.
+
+    An interruption (Ctrl-C) keeps what is done. If the pool breaks, for instance because a worker was killed
+    and its pool cannot replace it, the rest is done in this process: that costs time, not results.
+
+    Parameters
+    ----------
+    function : callable
+        Of a module's top level; it must return failures instead of raising them.
+    tasks : sequence
+    map : callable or None
+        None: the built-in `map`.
+    text : str
+        What the progress bar says.
+    quiet : bool
+    each : callable, optional
+        Called with every result as it comes, for instance to save it.
+    """
+    results: list[Any] = []
+    with progress(text, total=len(tasks), quiet=quiet) as advance:
+        try:
+            for way in ([map] if map is not None else []) + [builtins.map]:
+                try:
+                    for result in way(function, tasks[len(results):]):
+                        results.append(result)
+                        if each is not None:
+                            each(result)
+                        advance()
+                    break
+                except Exception as error:
+                    if way is builtins.map:
+                        raise
+                    print(f"motorid: the pool failed ({type(error).__name__}: {_first_line(error)}); doing "
+                          f"the remaining {len(tasks) - len(results)} of {len(tasks)} tasks in this process.",
+                          file=sys.stderr)
+        except KeyboardInterrupt:
+            return Done(results, f"interrupted after {len(results)} of {len(tasks)}")
+    return Done(results, "")
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).splitlines() or ["no message"])[0]
+
+
+def in_chunks(items: Sequence[Any], map: Map | None) -> list[Sequence[Any]]:
+    """Cut `items` into pieces: single ones for the built-in map, at most `MOST_TASKS` for a pool."""
+    size = 1 if map is None or map is builtins.map else -(-len(items) // MOST_TASKS)
+    return [items[k:k + size] for k in range(0, len(items), size)]
