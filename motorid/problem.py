@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from motorid.errors import ModelError, SimulationError, UsageError, one_of
 from motorid.experiment import Experiment
 from motorid.integrate import Engine, Trajectory, engine_of
-from motorid.integrate.grid import Array, Grid
+from motorid.integrate.grid import Array
 from motorid.model import Model
 from motorid.parameters import Parameter, Scaling
 from motorid.prepared import Run, channels_of, noise_of, prepare_run, smoothing, with_inputs
@@ -171,45 +171,52 @@ class Problem:
     def refined(self, q: Array) -> Problem:
         """Return the problem with sub-steps that keep the integration error below noise and misfit at `q`."""
         at = self.unknowns.point(np.asarray(q, float))
-        return self._keeping(tuple(self._refined_run(run, self.unknowns.first_state(at, k), at.p)
-                                   for k, run in enumerate(self.runs)))
+        return self._keeping(tuple(self._refined_run(k, at) for k in range(len(self.runs))))
 
-    def _refined_run(self, run: Run, x0: Array, p: Array) -> Run:
+    def _refined_run(self, k: int, at: Point) -> Run:
         # From one step per sample on, so that the grid depends on q alone and not on the way there.
+        run, x0 = self.runs[k], self.unknowns.first_state(at, k)
         coarse = run.grid.with_substeps(np.ones_like(run.grid.substeps))
-        tolerance = self._tolerance(run, x0, p, coarse)
-        grid = self._engine.prepare(self.system, coarse, x0, p, tolerance)
+        grid = self._engine.prepare(self.system, coarse, x0, at.p, self._tolerance(k))
         if grid is coarse and np.any(run.grid.substeps > 1):
             try:
-                self._engine.run(self.system, coarse, x0, p)
+                self._engine.run(self.system, coarse, x0, at.p)
             except SimulationError:  # only finer steps get through
-                grid = self._engine.prepare(self.system, run.grid, x0, p, tolerance)
+                grid = self._engine.prepare(self.system, run.grid, x0, at.p, self._tolerance(k))
         return run if np.array_equal(grid.substeps, run.grid.substeps) else replace(run, grid=grid)
 
     def _keeping(self, runs: tuple[Run, ...]) -> Problem:
         """Return a copy with other grids that keeps everything else already made."""
         other = replace(self, _runs=runs)
-        for name in ("outputs", "system", "unknowns", "_engine", "_weights"):
+        for name in ("outputs", "system", "unknowns", "_engine", "_weights", "_levels"):
             if name in self.__dict__:
                 other.__dict__[name] = self.__dict__[name]
         return other
 
-    def _tolerance(self, run: Run, x0: Array, p: Array, coarse: Grid) -> float:
+    def _tolerance(self, k: int) -> float | Callable[[Trajectory], float]:
         """Local error relative to the largest state: a small part of the noise, or of a far larger misfit."""
-        out = run.experiment.outputs
-        top = {c: max(float(np.nanmax(np.abs(out[c]))), 1e-300) for c in run.sigma}
-        finest = NOISE_SHARE * min(s / top[c] for c, s in run.sigma.items())
-        if finest >= LOOSEST:
+        y, noise, count = self._levels[k]
+        if NOISE_SHARE * noise.min() >= LOOSEST:
             return LOOSEST
-        try:
-            grid = self._engine.prepare(self.system, coarse, x0, p, LOOSEST)
-            y = self._engine.run(self.system, grid, x0, p).y
-        except SimulationError:
-            return max(finest, TIGHTEST)
-        misfit = {c: out[c] - y[:, j] for j, c in enumerate(self.outputs) if c in top}
-        rms = {c: float(np.sqrt(np.nanmean(e**2))) for c, e in misfit.items()}
-        level = NOISE_SHARE * min(max(run.sigma[c], MISFIT_SHARE * rms[c]) / top[c] for c in top)
-        return float(np.clip(level, TIGHTEST, LOOSEST))
+
+        def level(traj: Trajectory) -> float:
+            e = np.nan_to_num(traj.y - y[0]) / y[1]
+            rms = np.sqrt(np.einsum("ij,ij->j", e, e) / count)
+            share = np.maximum(noise, MISFIT_SHARE * rms).min()
+            return float(np.clip(NOISE_SHARE * share, TIGHTEST, LOOSEST))
+
+        return level
+
+    @cached_property
+    def _levels(self) -> list[tuple[tuple[Array, Array], Array, Array]]:
+        """Per run: measured (N, ny) and its largest sizes, noise over those sizes, numbers of samples."""
+        found = []
+        for run, (y, _, _) in zip(self.runs, self._weights, strict=True):
+            count = np.isfinite(y).sum(axis=0)
+            top = np.maximum(np.nan_to_num(np.abs(y)).max(axis=0), 1e-300)
+            noise = np.array([run.sigma.get(c, np.inf) for c in self.outputs]) / top
+            found.append(((y, top), noise, np.maximum(count, 1)))
+        return found
 
     # -- residual --------------------------------------------------------------------------------------
     @cached_property

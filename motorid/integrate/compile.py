@@ -33,7 +33,7 @@ DRIVER = r"""
 #include <stdlib.h>
 #include <string.h>
 
-/* out = A S + B Pq, column-major A and B with `rows` rows; Pq by its nonzeros, one or none per unknown mostly. */
+/* out = A S + B Pq; A and B column-major with `rows` rows, Pq by its nonzeros, mostly one per unknown. */
 static void propagate(double* out, int rows, const double* A, const double* B, const double* S, long long nq,
                       long long nz, const long long* param, const long long* unknown, const double* slope) {
   long long j;

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple, Protocol
@@ -98,6 +99,10 @@ class Engine(Protocol):
         """
         ...
 
-    def prepare(self, system: System, grid: Grid, x0: Array, p: Array, tolerance: float) -> Grid:
-        """Return the grid with its sub-steps chosen for a relative local error of `tolerance`."""
+    def prepare(self, system: System, grid: Grid, x0: Array, p: Array,
+                tolerance: float | Callable[[Trajectory], float]) -> Grid:
+        """Return the grid with its sub-steps chosen for a relative local error of `tolerance`.
+
+        The tolerance may depend on the trajectory reached so far.
+        """
         ...

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -39,7 +40,8 @@ class Rosenbrock:
         """See `Engine.run`; on request with the local error of each state."""
         return stepper(system).run(grid, x0, p, dx0, dp, local_error, self.compiled)
 
-    def prepare(self, system: System, grid: Grid, x0: Array, p: Array, tolerance: float) -> Grid:
+    def prepare(self, system: System, grid: Grid, x0: Array, p: Array,
+                tolerance: float | Callable[[Trajectory], float]) -> Grid:
         """See `Engine.prepare`. Errors are relative to the largest size of each state on the record.
 
         Where the run fails, so does every later one on this grid: coarse steps would jump over what happens.
@@ -50,10 +52,11 @@ class Rosenbrock:
             except SimulationError:
                 break
             assert traj.error is not None
+            level = tolerance(traj) if callable(tolerance) else tolerance
             error = (traj.error / np.maximum(np.abs(traj.x).max(axis=0), 1e-12)).max(axis=1)
-            if not np.max(error, initial=0.0) > 2 * tolerance:  # or not a number
+            if not np.max(error, initial=0.0) > 2 * level:  # or not a number
                 break
-            factor = np.ceil(1.1 * (np.maximum(error, 1e-300) / tolerance) ** (1 / ERROR_ORDER))
+            factor = np.ceil(1.1 * (np.maximum(error, 1e-300) / level) ** (1 / ERROR_ORDER))
             finer = np.clip(grid.substeps * np.clip(factor, 1, 16), 1, MOST_SUBSTEPS).astype(np.int64)
             if np.array_equal(finer, grid.substeps):
                 break

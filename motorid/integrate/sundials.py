@@ -9,7 +9,7 @@ integrators then serve every record. Derivatives are taken in forward mode only,
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
@@ -60,7 +60,8 @@ class _Sundials:
                 raise SimulationError(f"{self.name} left the finite numbers after t = {grid.t[first]:.6g} s.")
         return observe(system, grid, x, dx if nq else None, p, dp)
 
-    def prepare(self, system: System, grid: Grid, x0: Array, p: Array, tolerance: float) -> Grid:
+    def prepare(self, system: System, grid: Grid, x0: Array, p: Array,
+                tolerance: float | Callable[[Trajectory], float]) -> Grid:
         """See `Engine.prepare`; these engines choose their own steps."""
         return grid
 
