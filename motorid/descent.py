@@ -68,7 +68,7 @@ def descend(problem: Problem, options: LevenbergMarquardt, callback: Callback = 
         history += found.history
         moved = np.max(np.abs(found.q - q), initial=0.0) > 1e-3
         q = found.q
-        if found.status == "limit" or not moved or _same_grid(problem, problem.refined(q)):
+        if found.status == "limit" or not moved or problem.fine_enough(q):
             break
     return Descent(problem, found, tuple(history))
 
@@ -236,10 +236,6 @@ def _cheaper(*problems: Problem) -> Problem:
             r = np.array([np.inf])
         costs.append(float(r @ r) if np.isfinite(r).all() else np.inf)
     return problems[int(np.argmin(costs))] if costs else problems[0]
-
-
-def _same_grid(a: Problem, b: Problem) -> bool:
-    return all(np.array_equal(x.grid.substeps, y.grid.substeps) for x, y in zip(a.runs, b.runs, strict=True))
 
 
 def integration_error(problem: Problem, q: Array) -> float:

@@ -186,7 +186,8 @@ class _Search:
             gain = drop / predicted if predicted > 0 else -1.0
             if drop > 0 and gain > 1e-4:
                 break
-            if small or predicted <= 1e-3 * o.ftol * self.cost:
+            full = self.lam < SLACK  # hardly shortened: what it promises is what is left to gain
+            if small or predicted <= (1.0 if full else 1e-3) * o.ftol * self.cost:
                 return "step" if small or predicted <= o.ftol * self.cost else "stalled"
             self.lam, self.growth = (self.lam * self.growth if self.lam > 0 else 1e-3), self.growth * 2
             if self.lam > 1e16:

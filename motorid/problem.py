@@ -60,6 +60,8 @@ class Problem:
     engine : str or Engine
     balance : mapping of str to float
         Factors on the noise per channel where the misfit, not the noise, decides; see `motorid.descent`.
+    accuracy : float, optional
+        Local error of the integration relative to the largest state; by default a small part of the noise.
     """
 
     model: Model
@@ -72,6 +74,7 @@ class Problem:
     initial: str = "auto"
     engine: str | Engine = "rosenbrock"
     balance: Mapping[str, float] = field(default_factory=dict)
+    accuracy: float | None = None
     _runs: tuple[Run, ...] | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
@@ -173,6 +176,12 @@ class Problem:
         at = self.unknowns.point(np.asarray(q, float))
         return self._keeping(tuple(self._refined_run(k, at) for k in range(len(self.runs))))
 
+    def fine_enough(self, q: Array) -> bool:
+        """Tell whether the present sub-steps keep, within a factor of two, what `refined` asks for at `q`."""
+        at = self.unknowns.point(np.asarray(q, float))
+        return all(self._engine.prepare(self.system, run.grid, self.unknowns.first_state(at, k), at.p,
+                                        self._tolerance(k, 2.0)) is run.grid for k, run in enumerate(self.runs))
+
     def _refined_run(self, k: int, at: Point) -> Run:
         # From one step per sample on, so that the grid depends on q alone and not on the way there.
         run, x0 = self.runs[k], self.unknowns.first_state(at, k)
@@ -193,17 +202,19 @@ class Problem:
                 other.__dict__[name] = self.__dict__[name]
         return other
 
-    def _tolerance(self, k: int) -> float | Callable[[Trajectory], float]:
+    def _tolerance(self, k: int, slack: float = 1.0) -> float | Callable[[Trajectory], float]:
         """Local error relative to the largest state: a small part of the noise, or of a far larger misfit."""
+        if self.accuracy is not None:
+            return self.accuracy
         y, noise, count = self._levels[k]
         if NOISE_SHARE * noise.min() >= LOOSEST:
-            return LOOSEST
+            return slack * LOOSEST
 
         def level(traj: Trajectory) -> float:
             e = np.nan_to_num(traj.y - y[0]) / y[1]
             rms = np.sqrt(np.einsum("ij,ij->j", e, e) / count)
             share = np.maximum(noise, MISFIT_SHARE * rms).min()
-            return float(np.clip(NOISE_SHARE * share, TIGHTEST, LOOSEST))
+            return slack * float(np.clip(NOISE_SHARE * share, TIGHTEST, LOOSEST))
 
         return level
 
@@ -308,6 +319,10 @@ class Problem:
     def balanced(self, factors: Mapping[str, float]) -> Problem:
         """Return the problem with other factors on the noise per channel, keeping the rest."""
         return replace(self, balance=dict(factors), _runs=self.runs)
+
+    def with_accuracy(self, accuracy: float | None) -> Problem:
+        """Return the problem with another accuracy of the integration, keeping the rest."""
+        return replace(self, accuracy=accuracy, _runs=self.runs)
 
     def with_(self, **fields: Any) -> Problem:
         """Return a copy with some fields changed, e.g. ``with_(model=…)``."""
