@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from plant_truth import NUMBERS
+from plant_truth import NUMBERS, in_library_words
 from scipy.integrate import solve_ivp
 
 from motorid.effects import LIBRARY
@@ -14,23 +14,6 @@ from motorid.model import dc_motor
 # sgn is smoothed; the delay is a Padé approximation; in a smoothed gap the damping can pull for a moment.
 INEXACT = {"coulomb": 5e-4, "coulomb_asymmetric": 5e-4, "stribeck": 5e-4, "load_friction": 2e-4,
            "viscous_asymmetric": 1e-5, "current_lag": 2e-5, "speed_delay": 0.04, "backlash": 0.04}
-
-
-def in_library_words(name, numbers, motor):
-    """Numbers of the plant's effect as the library's parameters, and the total inertia."""
-    n, J = dict(numbers), motor.J
-    if name in ("compliance", "backlash"):
-        J_l, k_s, c_s = n.pop("J_l"), n.pop("k_s"), n.pop("c_s")
-        J = motor.J + J_l
-        resonance = np.sqrt(k_s / motor.J + k_s / J_l)
-        shaft = (J_l / J, resonance, c_s * resonance / (2 * k_s))
-        words = ("r_load", "omega_r", "zeta_r") if name == "compliance" else ("r_gap", "omega_c", "zeta_c")
-        n |= dict(zip(words, shaft, strict=True))
-    if name == "lugre":
-        theta_s = n["tau_c"] / n.pop("sigma_0")
-        n |= {"s_b": n.pop("tau_s") / n["tau_c"], "theta_s": theta_s}
-        assert n.pop("sigma_1") * n["omega_s"] == pytest.approx(n["tau_c"])  # the library's bristle damping
-    return n, J
 
 
 def by_library(model, t, v):

@@ -1,0 +1,91 @@
+"""What the cases of the battery share: how a motor is driven, and what its sensors make of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from motorid.datasets import load_plant
+from motorid.experiment import Experiment
+
+P = load_plant()
+DT = {"micro": 1e-3, "lab": 1e-3, "servo": 2e-3, "wheel": 2e-3, "big": 1e-3}
+STAIRS = np.array([0.5, 1, 0.25, -0.4, -1, -0.2, 0.3, 0.12, -0.12, 0.7])
+FORWARD = np.array([0.5, 1, 0.35, 0.7, 0.3, 0.9, 0.4, 0.6])
+
+
+def level(motor) -> float:
+    """Voltage at which a reversal just reaches the largest current, V, with four decimals."""
+    return round(motor.i_max * motor.R / 2, 4)
+
+
+def time_constant(motor) -> float:
+    """Mechanical time constant, s."""
+    return motor.R * motor.J / motor.K**2
+
+
+def voltages(words: str, motor, n: int, dt: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Time (n,) and voltage (n,) for words such as ``"stairs"`` or ``"prbs 0.8"`` (share of the level)."""
+    name, *share = words.split()
+    u, T, tau = level(motor) * float((share or ["1"])[0]), n * dt, time_constant(motor)
+    onset = 0.02 * T
+    make: dict[str, Callable] = {
+        "stairs": lambda: P.staircase(u * STAIRS, (T - onset) / len(STAIRS), onset, dt),
+        "forward": lambda: P.staircase(u * FORWARD, (T - onset) / len(FORWARD), onset, dt),
+        "prbs": lambda: P.prbs(u, T, 3 * tau, rng, dt),
+        "steps": lambda: P.random_steps(u, T, T / 14, rng, dt),
+        "chirp": lambda: P.chirp(u, T, 1.5 / T, min(1 / (np.pi * tau), 0.1 / dt), dt),
+        "ramps": lambda: P.triangle(u, T, T / 2.5, dt),
+        "multisine": lambda: P.multisine(u, T, np.array([1.3, 2.9, 4.7, 7.9, 12.1]) / T, rng, dt),
+        "slow": lambda: P.multisine(u, T, np.array([0.7, 1.3, 2.1]) / T, rng, dt),
+        "coast": lambda: P.coast_down(u, 0.4 * T, T, dt),
+        "lift": lambda: _above_zero(P.multisine(u / 3, T, np.array([1.3, 2.9, 4.7]) / T, rng, dt), 2 * u / 3),
+    }
+    t, v = make[name]()
+    return t[:n], v[:n]
+
+
+def _above_zero(excitation, middle):
+    """The same about a voltage, reached in a ramp from zero."""
+    t, v = excitation
+    return t, np.round((v + middle) * np.clip(t / (0.1 * t[-1]), 0, 1), 4)
+
+
+def driven(motor, effects, words: str, n: int, dt: float, rng: np.random.Generator, jitter: float = 0.0) -> dict:
+    """What the plant does, open loop, or following random speeds under a PI controller (``"loop"``)."""
+    if not words.startswith("loop"):
+        t, v = voltages(words, motor, n, dt, rng)
+        return P.simulate(motor, effects, P.uneven(t, jitter, rng) if jitter else t, v, substep=None)
+    _, reference = P.random_steps(0.6 * level(motor) / motor.K, n * dt, n * dt / 10, rng, dt)
+    gains = {"kp": 1.5 * motor.K, "ki": 1.5 * motor.K / time_constant(motor)}
+    return P.closed_loop(P.Plant(motor, effects), reference, gains, dt)
+
+
+def _rms(x) -> float:
+    return float(np.sqrt(np.mean(np.square(x))))
+
+
+def sensed(r: dict, chain: str, motor, rng: np.random.Generator, noise: float = 0.01) -> dict[str, np.ndarray]:
+    """Current, speed and angle as written by the logger.
+
+    Chains: ``logger`` white noise and a 12-bit converter; ``coloured`` noise of correlation 0.85;
+    ``encoder`` of 2000 counts, speed by differences; ``coarse`` the same with 240 counts; ``spikes``.
+    """
+    s = {c: noise * (2 if c == "i" else 1) * _rms(r[c]) for c in ("i", "omega")}
+    if chain == "coloured":
+        return {c: P.coloured(r[c], s[c], 0.85, rng) for c in s} | {"theta": P.encoder(r["theta"], 4096)}
+    counts = 240 if chain == "coarse" else 4096
+    y = {"i": P.adc(P.white(r["i"], s["i"], rng), motor.i_max), "omega": P.white(r["omega"], s["omega"], rng),
+         "theta": P.encoder(r["theta"], counts)}
+    if chain in ("encoder", "coarse"):
+        y["omega"] = P.encoder_speed(r["theta"], r["t"], counts)
+    if chain == "spikes":
+        y |= {c: P.outliers(y[c], 0.01, 20 * s[c], rng) for c in s}
+    return y
+
+
+def record(r: dict, chain: str, channels, motor, rng: np.random.Generator, name: str, noise: float = 0.01) -> Experiment:
+    """The record of one run with the `channels` that were logged."""
+    y = sensed(r, chain, motor, rng, noise)
+    return Experiment(r["t"], {"v": r["v"]}, {c: y[c] for c in channels}, name=name)
