@@ -21,10 +21,11 @@ from motorid.problem import Problem
 
 WIDEST = 0.03  # first width of sgn over the highest speed
 NARROWER = 6.0  # at most, from one stage to the next
+ON_THE_WAY = ((1e-7, 60), (1e-4, 30))  # ftol and iterations of the first stage, and of those between
 ROUNDS = 4  # of refining the sub-steps
 IMBALANCE = 3.0  # between channels, in misfit over noise, above which the misfit decides the weights
 
-# Looks again from the start: by the other weights first?, first damping, start moved by up to e to this power.
+# Looks again from the start: by the other weights first?, first damping, start moved by e to this power.
 LOOKS = ((True, 0.1, 0.0), (False, 10.0, 0.0), (True, 10.0, 0.0), (False, 1.0, 1.5), (True, 1.0, 1.5))
 EXPLAINED = 0.25  # NRMSE above which a channel counts as hardly explained
 FAR = 1.0  # on the logarithmic scale: how far a descent goes before its sub-steps are chosen again
@@ -43,7 +44,7 @@ class Descent:
 
 
 def descend(problem: Problem, options: LevenbergMarquardt, callback: Callback = None, *,
-            stages: bool = True) -> Descent:
+            stages: bool = True, surely: bool = False) -> Descent:
     """Solve `problem` from the values of its model.
 
     Parameters
@@ -53,6 +54,8 @@ def descend(problem: Problem, options: LevenbergMarquardt, callback: Callback = 
     callback : callable, optional
     stages : bool
         Begin with a wide sgn, where the model has one whose width was not given.
+    surely : bool
+        Look again where the first of these stages ends in doubt.
 
     Raises
     ------
@@ -61,7 +64,7 @@ def descend(problem: Problem, options: LevenbergMarquardt, callback: Callback = 
     """
     history: list[float] = []
     if stages:
-        problem = _narrowing(problem, replace(options, ftol=max(options.ftol, 1e-7)), callback, history)
+        problem = _narrowing(problem, options, callback, history, surely)
     q = problem.start
     for _ in range(ROUNDS):
         problem, found = _solve(problem, q, options, callback)
@@ -106,6 +109,8 @@ def descend_surely(problem: Problem, options: LevenbergMarquardt, callback: Call
     by smaller first steps; what resists both is begun from a place nearby. With this, 8 series of 1000 starts
     within a factor of ten of either shipped motor with noise all ended in its optimum.
     """
+    if stages and _smooths(problem):
+        return descend(problem, options, callback, surely=True)
     done = descend(problem, options, callback, stages=stages)
     for k, (other, damping, shift) in enumerate(LOOKS[:options.looks]):
         if not doubtful(problem, done):
@@ -178,12 +183,12 @@ def descend_balanced(problem: Problem, options: LevenbergMarquardt, callback: Ca
     if problem.weights != "noise" or problem.loss is not None or len(problem.outputs) < 2:
         return done
     begin = problem
-    for _ in range(3):
+    for k in range(3):
         factors = misfit_over_noise(done.problem, done.solution.q)
         relative = [factors[c] / done.problem.balance.get(c, 1.0) for c in factors]
         if max(relative) < IMBALANCE * min(relative):
             break
-        again = descend(begin.balanced(factors), options, callback, stages=stages)
+        again = descend(begin.balanced(factors), options, callback, stages=stages and k == 0)
         done = replace(again, history=done.history + again.history)
         begin = done.problem.for_model(done.problem.model.start_at(done.problem.values(done.solution.q)))
     return done
@@ -203,27 +208,40 @@ def misfit_over_noise(problem: Problem, q: Array) -> dict[str, float]:
     return {c: max(float(np.sqrt(s / max(n, 1))), 1.0) for c, (s, n) in sums.items()}
 
 
-def _narrowing(problem: Problem, options: LevenbergMarquardt, callback: Callback,
-               history: list[float]) -> Problem:
-    """Return the problem with the values that a wide sgn leads to, made narrower step by step."""
+def _smooths(problem: Problem) -> bool:
     width = problem.model.parameters.get("sgn_width")
-    if width is None or width.given or width.vary:
+    return width is not None and not width.given and not width.vary
+
+
+def _narrowing(problem: Problem, options: LevenbergMarquardt, callback: Callback, history: list[float],
+               surely: bool) -> Problem:
+    """Return the problem with the values that a wide sgn leads to, made narrower step by step."""
+    if not _smooths(problem):
         return problem
-    options = replace(options, max_iterations=min(options.max_iterations, 60))
-    ratio = WIDEST * top_speed(problem.experiments) / width.value
-    steps = int(np.ceil(np.log(max(ratio, 1.0)) / np.log(NARROWER)))
+    width = problem.model.values["sgn_width"]
+    ratio = max(WIDEST * top_speed(problem.experiments) / width, 1.0)
+    steps = int(np.ceil(np.log(ratio) / np.log(NARROWER)))
     begin = problem
-    for factor in np.geomspace(max(ratio, 1.0), 1.0, steps + 1)[:-1]:
-        wide = _cheaper(*(p.for_model(p.model.replace(sgn_width=factor * width.value))
+    for k, factor in enumerate(np.geomspace(ratio, 1.0, steps + 1)[:-1]):
+        wide = _cheaper(*(p.for_model(p.model.replace(sgn_width=factor * width))
                           for p in dict.fromkeys((problem, begin))))
         try:
-            wide, found = _solve(wide, wide.start, options, callback)
+            if k == 0 and surely:
+                done = descend_surely(wide, _sooner(options, ON_THE_WAY[0]), callback)
+                wide, found, costs = done.problem, done.solution, done.history
+            else:
+                wide, found = _solve(wide, wide.start, _sooner(options, ON_THE_WAY[min(k, 1)]), callback)
+                costs = found.history
         except (FitError, SimulationError):
             continue
-        history += found.history
-        values = wide.values(found.q) | {"sgn_width": width.value}
-        problem = problem.for_model(begin.model.start_at(values))
+        history += costs
+        problem = problem.for_model(begin.model.start_at(wide.values(found.q) | {"sgn_width": width}))
     return _cheaper(*dict.fromkeys((problem, begin)))
+
+
+def _sooner(options: LevenbergMarquardt, ends: tuple[float, int]) -> LevenbergMarquardt:
+    ftol, iterations = ends
+    return replace(options, ftol=max(options.ftol, ftol), max_iterations=min(options.max_iterations, iterations))
 
 
 def _cheaper(*problems: Problem) -> Problem:

@@ -82,7 +82,8 @@ def multistart(
 robustness = multistart  # the name of the study in the source paper and on the command line
 
 
-def _draw(reference: Fit, names: Sequence[str], starts: int, spread: float, seed: int) -> list[dict[str, float]]:
+def _draw(reference: Fit, names: Sequence[str], starts: int, spread: float,
+          seed: int) -> list[dict[str, float]]:
     rng = np.random.default_rng(np.random.SeedSequence(seed))
     factors = spread ** rng.uniform(-1, 1, (starts, len(names)))
     pars = reference.problem.model.parameters
