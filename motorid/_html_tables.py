@@ -66,31 +66,25 @@ def error_table(evaluations: Sequence[tuple[str, Any]], units: Mapping[str, str]
 
 
 def ranking_table(candidates: Sequence[Any], most: int = 10) -> Table:
-    """The effects tried, best first."""
+    """The effects tried, best first; the held-out error only where there is one."""
+    held_out = any(c.held_out_gain is not None for c in candidates[:most])
+    header = [
+        "effect",
+        "predicted drop",
+        "drop after a refit",
+        *(["held-out error falls by"] if held_out else []),
+    ]
     rows = []
     for c in candidates[:most]:
+        # Non-breaking blanks: a line may end between parameters only.
+        sizes = [f"{n}\u00a0=\u00a0{number(v, 3)}" for n, v in c.parameters.items() if n != "sgn_width"]
+        gain = [percent(c.held_out_gain)] if held_out else []
         verdict = Flag("accepted", "good") if c.accepted else (c.reason or "not refitted")
-        values = ", ".join(f"{n} = {number(v, 3)}" for n, v in c.parameters.items() if n != "sgn_width")
         rows.append(
-            [
-                c.effect,
-                percent(c.predicted_drop, 3),
-                percent(c.refit_drop, 3),
-                percent(c.held_out_gain, 3),
-                values,
-                verdict,
-            ]
+            [c.effect, percent(c.predicted_drop), percent(c.refit_drop), *gain, ", ".join(sizes), verdict]
         )
     return Table(
-        [
-            "effect",
-            "misfit taken away, predicted",
-            "refitted",
-            "held-out error falls by",
-            "size (SI)",
-            "verdict",
-        ],
-        rows,
+        [*header, "size (SI)", "verdict"], rows, "Drop: share of the misfit that the effect takes away."
     )
 
 

@@ -91,8 +91,8 @@ def fitted(fit: Fit, title: str, *, key: str = "fit", before: Fit | None = None)
         fit
     )
     units = {c: u for r in fit.problem.experiments for c, u in r.units.items()}
-    effort = f"{counted(fit.iterations, 'iteration')}, {duration(fit.seconds)}"
-    text = [f"{model_name(fit.model)}: {effort}. {_sentence(fit.message)}"]
+    effort = f": {counted(fit.iterations, 'iteration')}, {duration(fit.seconds)}" if fit.seconds else ""
+    text = [f"{model_name(fit.model)}{effort}. {_sentence(fit.message)}"]
     figure = _figure(key, caption, alt, plot_fit, fit, before=before)
     return Section(key, title, text, (), [figure], [parameter_table(fit), error_table([("", fit)], units)])
 
@@ -158,7 +158,7 @@ def ladder(steps: Ladder) -> Section:
     caption = "Error of each model, on the records of the fit and on those it never saw."
     alt = f"Error of each model in turn: {names}"
     figure = _figure("ladder", caption, alt, plot_ladder, steps, small=True)
-    return Section("ladder", "The error falls", [steps.text], (), [figure], [ladder_table(steps)])
+    return Section("ladder", "The error falls", [_sentence(steps.text)], (), [figure], [ladder_table(steps)])
 
 
 def parameters(before: Fit, after: Fit) -> Section:
@@ -232,4 +232,5 @@ def _errors_in_words(judged: Any) -> str:
 
 
 def _sentence(text: str) -> str:
-    return text[:1].upper() + text[1:]
+    """Return a message as a sentence."""
+    return text[:1].upper() + text[1:] + ("" if text.endswith((".", "!", "?")) else ".") if text else ""

@@ -1,6 +1,7 @@
 """Figures: they say what they show, hide no peak, overlap nothing, and leave the user's settings alone."""
 
 import itertools
+import re
 import subprocess
 import sys
 
@@ -273,6 +274,12 @@ def test_a_figure_for_a_page_has_its_own_names_follows_the_colours_and_opens_no_
     assert 'id="ladder-' in svg
     assert all(part.startswith("ladder-") for part in svg.split('id="')[1:])
     assert "plain motor" in svg
+
+
+def test_numbers_in_words_are_not_shortened_with_the_coordinates(found):
+    svg = svg_of(plots.plot_parameters, found.before, found.after, names=["K"], name="k", alt="K")
+    assert re.search(r">0\.04\d+<", svg)
+    assert not re.search(r'd="[^"]*\d\.\d{3}', svg)
 
 
 def test_detached_figures_need_no_closing(found):

@@ -19,6 +19,7 @@ from motorid.diagnosis.evidence import autocorrelation, effective_samples
 from motorid.diagnosis.rank import Score
 from motorid.diagnosis.results import Adequacy
 from motorid.fit import Fit
+from motorid.formatting import number
 from motorid.integrate.grid import Array
 from motorid.prepared import angle_signal
 
@@ -167,7 +168,7 @@ def _score_tests(fit: Fit, scores: Sequence[Score]) -> list[dict[str, Any]]:
 
 def _text(adequate: bool, channels: Mapping[str, Mapping[str, float]], material: Sequence[Mapping[str, Any]],
           false_alarm: float) -> str:
-    sizes = ", ".join(f"{c} {f['ratio']:.2g} times its noise" for c, f in channels.items())
+    sizes = ", ".join(f"{c} {number(f['ratio'], 2)} times its noise" for c, f in channels.items())
     if adequate:
         coloured = [c for c, f in channels.items() if f["autocorrelation"] > 0.3]
         colour = f" The noise of {' and '.join(coloured)} is coloured." if coloured else ""

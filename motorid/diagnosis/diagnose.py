@@ -10,7 +10,7 @@ from motorid.diagnosis.adequacy import FALSE_ALARM, adequacy
 from motorid.diagnosis.evidence import compare_errors
 from motorid.diagnosis.improve import Climb, climb, ladder_of
 from motorid.diagnosis.locate import locate
-from motorid.diagnosis.results import Diagnosis, Missing
+from motorid.diagnosis.results import Candidate, Diagnosis, Missing
 from motorid.diagnosis.search import Search, library
 from motorid.diagnosis.suggest import suggest_experiment
 from motorid.diagnosis.verdict import adequate_text, balance_of, closed_loop_remark, missing_text, unexplained_text
@@ -75,7 +75,7 @@ def diagnose(
     elif _not_the_form(found, missing):
         verdict, where = "unexplained", missing.where
         text = unexplained_text(judged, missing, ranking)
-        names, ladder = (), ladder_of(_cut(found), validate is not None)
+        names, ladder, ranking = (), ladder_of(_cut(found), validate is not None), _none_accepted(ranking)
     else:
         verdict, where = "missing", balance_of(names[0], own)
         text = missing_text(ladder.rungs, found.remaining, found.groups, validate is not None)
@@ -102,6 +102,13 @@ def _not_the_form(found: Climb, before: Missing) -> bool:
         if any(b.explained > SAME_DEPENDENCE and was.get(b.against, 0.0) > SAME_DEPENDENCE for b in bins):
             return True
     return False
+
+
+def _none_accepted(ranking: tuple[Candidate, ...]) -> tuple[Candidate, ...]:
+    from dataclasses import replace
+
+    reason = "takes part of it away; what is left still depends on the same quantity"
+    return tuple(replace(c, accepted=False, reason=reason) if c.accepted else c for c in ranking)
 
 
 def _cut(found: Climb) -> Climb:

@@ -15,7 +15,6 @@ from motorid.integrate.grid import Array
 from motorid.plots.residuals import scatter
 from motorid.plots.style import (
     CYCLE,
-    FAINT,
     INK,
     MUTED,
     PALETTE,
@@ -25,6 +24,7 @@ from motorid.plots.style import (
     line,
     new_figure,
     only,
+    plain_decades,
     scaled_title,
     styled,
     tidy,
@@ -102,8 +102,12 @@ def _binned(
         ok = np.isfinite(x) & np.isfinite(y) & (x >= b.centre.min()) & (x <= b.centre.max())
         if ok.any():
             scatter(ax, x[ok], y[ok], most=800, color=MUTED)
-    ax.fill_between(b.centre, b.low * factor, b.high * factor, color=colour, alpha=0.3, lw=0)
-    ax.plot(b.centre, b.mean * factor, color=colour, lw=1.5)
+    gaps = np.diff(b.centre)
+    cuts = np.flatnonzero(gaps > max(4 * float(np.median(gaps)), 0.15 * float(np.ptp(b.centre)))) + 1
+    for part in np.split(np.arange(len(b.centre)), cuts):  # no curve where there are no samples
+        x = b.centre[part]
+        ax.fill_between(x, b.low[part] * factor, b.high[part] * factor, color=colour, alpha=0.3, lw=0)
+        ax.plot(x, b.mean[part] * factor, "-" if len(part) > 1 else "o", ms=3, color=colour, lw=1.5)
     ax.axhline(0, color=MUTED, lw=0.6)
     label = axis_label(b.against)
     tidy(
@@ -198,7 +202,7 @@ def plot_ladder(result: Ladder | Diagnosis, ax: Axes | None = None) -> Axes:
         if all(r.validation_nrmse and c in r.validation_nrmse for r in rungs):
             _falling(ax, x, [100 * (r.validation_nrmse or {})[c] for r in rungs], c, CYCLE[k], held_out=True)
     ax.set_yscale("log")
-    _decades(ax)
+    plain_decades(ax)
     first = "plain motor" if rungs[0].fit.model.base == "dc_motor" else "plain drive"
     started = " + ".join([first, *rungs[0].fit.model.effect_names])
     ax.set_xticks(x, [started if r.added is None else "+ " + r.added.replace(" + ", "\n+ ") for r in rungs])
@@ -232,15 +236,3 @@ def _falling(
             textcoords="offset points",
             fontsize=8,
         )
-
-
-def _decades(ax: Axes) -> None:
-    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
-
-    low, high = ax.get_ylim()
-    ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if high < 200 * low else (1,)))
-    ax.yaxis.set_major_formatter(FuncFormatter(lambda v, _: f"{v:g}"))
-    ax.yaxis.set_minor_formatter(NullFormatter())
-    ax.grid(which="minor", visible=False)
-    ax.set_facecolor("none")
-    ax.tick_params(which="minor", color=FAINT)

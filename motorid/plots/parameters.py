@@ -43,7 +43,7 @@ def plot_parameters(
         ax.set_axis_off()
     notes = [f"{k + 1}: {_added(f, fits[k - 1] if k else None)}" for k, f in enumerate(fits)]
     notes += ["dashed: true value"] * bool(truth) + ["bars: ±2σ"]
-    axes[0].figure.supxlabel("     ".join(notes), fontsize=8, color=MUTED)
+    axes[0].figure.supxlabel("   ·   ".join(notes), fontsize=8, color=MUTED)
     return axes[: len(chosen)]
 
 

@@ -99,9 +99,9 @@ _NAMES = {
     "i": "current i",
     "omega": "speed ω",
     "theta": "angle θ",
-    "heat": "heating ∫i²dt",
+    "heat": "heat in the winding",
 }
-_UNITS = {"t": "s", "v": "V", "i": "A", "omega": "rad/s", "theta": "rad", "heat": "A²·s"}
+_UNITS = {"t": "s", "v": "V", "i": "A", "omega": "rad/s", "theta": "rad", "heat": "J"}
 
 _detached: ContextVar[bool] = ContextVar("motorid_detached_figures", default=False)
 
@@ -212,6 +212,18 @@ def above(ax: Axes) -> None:
         loc="lower right", bbox_to_anchor=(1.02, 0.97), borderpad=0.1, ncols=4, handlelength=1.6
     )
     legend.set_in_layout(False)  # the title's line has room for it
+
+
+def plain_decades(ax: Axes) -> None:
+    """Write the ticks of a logarithmic axis as plain numbers, with some in between where there is room."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    low, high = ax.get_ylim()
+    ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if high < 200 * low else (1,)))
+    ax.yaxis.set_major_formatter(FuncFormatter(lambda v, _: f"{v:g}"))
+    ax.yaxis.set_minor_formatter(NullFormatter())
+    ax.grid(which="minor", visible=False)
+    ax.tick_params(which="minor", color=FAINT)
 
 
 def decade(size: float) -> int:

@@ -44,6 +44,11 @@ def svg_of(draw: Callable[..., Any], *args: Any, name: str, alt: str, **options:
     return clean(buffer.getvalue(), name, alt)
 
 
+def _shortened(tag: re.Match[str]) -> str:
+    """Round coordinates, which stand inside tags, to a tenth of a point; words outside are left alone."""
+    return re.sub(r"(\d+\.\d)\d{2,}", r"\1", tag[0])
+
+
 def clean(svg: str, name: str, alt: str) -> str:
     """Return the ``<svg>`` element alone, shortened, with colours as variables and unique names."""
     svg = svg[svg.index("<svg") :]
@@ -53,7 +58,7 @@ def clean(svg: str, name: str, alt: str) -> str:
     svg = re.sub(r'\sid="([^"]+)"', lambda m: f' id="{name}-{m[1]}"' if m[1] in used else "", svg)
     svg = re.sub(r"url\(#([^)]+)\)", rf"url(#{name}-\1)", svg)
     svg = re.sub(r'xlink:href="#([^"]+)"', rf'href="#{name}-\1"', svg).replace("xlink:href", "href")
-    svg = re.sub(r"(\d+\.\d)\d{2,}", r"\1", svg)  # a tenth of a point is finer than any screen
+    svg = re.sub(r"<[^>]+>", _shortened, svg)
     for colour, variable in VARIABLES.items():
         svg = svg.replace(colour, f"var(--{variable})")
     svg = svg.replace("font-family: 'DejaVu Sans'", "font-family: var(--font)")
