@@ -24,8 +24,9 @@ Port = Annotated[str, typer.Option(
 Out = Annotated[Path, typer.Option(help="The CSV to write.")]
 Baud = Annotated[int, typer.Option(min=300, help="Bits per second; a board on USB does not care.")]
 Excite = Annotated[str | None, typer.Option(
-    help="Voltage to apply: rest:T step:V:T stairs:V1:V2:N:T ramp:V1:V2:T chirp:A:F1:F2:T prbs:A:BIT:T "
-         "coast:T standard, joined by commas (V, s, Hz). Without it the motor is held at 0 V.")]
+    help="Voltage to apply, in words joined by commas: rest:s step:volt:s stairs:from:to:levels:s "
+         "ramp:from:to:s chirp:volt:Hz:Hz:s prbs:volt:bit:s coast:s standard. Without it the motor is "
+         "held at 0 V.")]
 Duration = Annotated[float | None, typer.Option(help="Stop after so many seconds.")]
 Volts = Annotated[float | None, typer.Option(help="Never more than so many V, of either sign.")]
 Amperes = Annotated[float | None, typer.Option(help="Switch the motor off beyond so many A.")]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import json
 import math
 import os
 import re
@@ -440,28 +441,16 @@ def test_nothing_in_the_record_gives_the_secret_away(out):
 
 # --------------------------------------------------------------------- processes and real pseudo-terminals
 
-MAIN = """
-import sys, typer
-from motorid import cli_bench
-from motorid.errors import DataError, MotoridError, UsageError
-app = typer.Typer()
-app.command()(cli_bench.record)
-app.command()(cli_bench.bench)
-try:
-    app()
-except MotoridError as error:
-    print(error, file=sys.stderr)
-    sys.exit(2 if isinstance(error, (UsageError, DataError)) else 1)
-"""
+MAIN = (sys.executable, "-W", "error", "-m", "motorid.cli")
 
 
 def start(*words: object) -> subprocess.Popen[str]:
-    return subprocess.Popen([sys.executable, "-W", "error", "-c", MAIN, *map(str, words)], text=True,
+    return subprocess.Popen([*MAIN, *map(str, words)], text=True,
                             stdout=subprocess.PIPE, stderr=subprocess.PIPE)
 
 
-def finish(process: subprocess.Popen[str]) -> tuple[int, str, str]:
-    stdout, stderr = process.communicate(timeout=60)
+def finish(process: subprocess.Popen[str], seconds: float = 120) -> tuple[int, str, str]:
+    stdout, stderr = process.communicate(timeout=seconds)
     return process.returncode, stdout, stderr
 
 
@@ -469,7 +458,8 @@ class Bench:
     """A `bench` process, and the port it printed."""
 
     def __init__(self, *words: object) -> None:
-        self.process = start("bench", "--effect", "none", "--seed", 1, *words)
+        hidden = () if "--effect" in words else ("--effect", "none", "--seed", 1)
+        self.process = start("bench", *hidden, *words)
         assert self.process.stdout is not None
         self.first = self.process.stdout.readline()
         if not self.first.startswith("port: "):
@@ -505,6 +495,7 @@ def test_bench_and_record_over_a_pseudo_terminal_in_real_time(out):
 
 
 @needs_pty
+@pytest.mark.slow
 def test_a_slow_disk_holds_up_nothing(out, monkeypatch):
     real, calls = os.fsync, []
 
@@ -520,6 +511,7 @@ def test_a_slow_disk_holds_up_nothing(out, monkeypatch):
 
 
 @needs_pty
+@pytest.mark.slow
 def test_a_recorder_that_was_held_up_itself_blames_nobody(out):
     with Bench() as bench:
         process = start("record", "--port", bench.port, "--out", out, "--excite", "rest:2", "--quiet",
@@ -553,6 +545,7 @@ def test_lines_are_in_the_file_while_the_run_goes_on(out):
 
 
 @needs_pty
+@pytest.mark.slow
 def test_a_killed_recorder_leaves_a_record_and_a_motor_that_stops(out):
     with Bench() as bench:
         process = start("record", "--port", bench.port, "--out", out, "--excite", "step:6:30", "--quiet")
@@ -570,6 +563,7 @@ def test_a_killed_recorder_leaves_a_record_and_a_motor_that_stops(out):
 
 
 @needs_pty
+@pytest.mark.slow
 def test_a_second_recorder_on_the_same_port_is_turned_away(tmp_path):
     with Bench() as bench:
         a = tmp_path / "a.csv"
@@ -587,6 +581,7 @@ def test_a_second_recorder_on_the_same_port_is_turned_away(tmp_path):
 
 
 @needs_pty
+@pytest.mark.slow
 def test_unplugged_plugged_in_again_and_resumed(out, tmp_path):
     port = tmp_path / "motor"
     with Bench("--link", port, "--unplug-after", 0.5, "--plug-after", 0.5, "--speed", 2) as bench:
@@ -636,6 +631,7 @@ def test_where_there_are_no_pseudo_terminals_a_loopback_socket_serves(out, monke
         thread.join()
 
 
+@pytest.mark.slow
 def test_a_second_recorder_on_the_socket_is_turned_away(tmp_path):
     with Bench("--socket", 0) as bench:
         assert bench.port.startswith("socket://127.0.0.1:")
@@ -685,9 +681,31 @@ def test_ctrl_c_while_nobody_answers_is_one_sentence(tmp_path):
     (("bench", "--drop", "2"), 2, "drop"),
 ])
 def test_a_users_mistake_is_one_sentence_and_a_status(words, code, said, tmp_path):
-    process = subprocess.run([sys.executable, "-c", MAIN, *words], capture_output=True, text=True, timeout=60,
+    process = subprocess.run([*MAIN, *words], capture_output=True, text=True, timeout=60,
                              cwd=tmp_path, check=False)
     assert process.returncode == code
     assert said in process.stderr
     assert "Traceback" not in process.stderr
     assert list(tmp_path.iterdir()) == []
+
+
+@needs_pty
+@pytest.mark.slow
+def test_from_the_bench_to_the_verdict_the_hidden_effect_is_found(tmp_path):
+    hidden = ("--effect", "coulomb", "--seed", 3, "--reveal")
+    run, check, found = tmp_path / "run.csv", tmp_path / "check.csv", tmp_path / "found.json"
+    with Bench(*hidden, "--rate", 250, "--speed", 0, "--drop", 0.01) as bench:
+        for out, excite in ((run, "rest:0.1,step:6:0.4,coast:0.3,step:-5:0.4,coast:0.2,prbs:4:0.05:0.8"),
+                            (check, "rest:0.1,chirp:5:1:6:1,coast:0.2")):
+            code, _, said = finish(start("record", "--port", bench.port, "--out", out, "--excite", excite,
+                                         "--quiet"))
+            assert code == 0, said
+        assert "coulomb" not in run.read_text()
+    code, _, said = finish(start("diagnose", run, "--validate", check, "--max-effects", 1, "--json", found),
+                           seconds=500)
+    assert code == 0, said
+    told = json.loads(found.read_text())
+    assert (told["verdict"], told["effects"]) == ("missing", ["coulomb"])
+    truth = dict(re.findall(r"(\w+) = ([\d.e-]+)", bench.said[1]))
+    for name in ("tau_c", "R", "K", "J"):
+        assert told["parameters_after"][name] == pytest.approx(float(truth[name]), rel=0.01)

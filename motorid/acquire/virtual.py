@@ -183,10 +183,11 @@ def _converted(value: float, step: float, noise: float) -> int:
     return min(4095, max(0, round(value / step + 2048 + noise)))
 
 
+# At the start of a run the shaft stands in the middle of an encoder count.
 # One raw value: (motor, commanded mV, what the sensors see, noise of the two converters) -> counts.
 _CONVERT: dict[str, Callable[[Any, int, dict[str, float], list[float]], int]] = {
     "v": lambda m, mv, seen, noise: mv,
     "i": lambda m, mv, seen, noise: _converted(seen["i"], _steps(m)[0], noise[0]),
     "omega": lambda m, mv, seen, noise: _converted(seen["omega"], _steps(m)[1], noise[1]),
-    "theta": lambda m, mv, seen, noise: math.floor(seen["theta"] * LINES_PER_TURN / (2 * math.pi)),
+    "theta": lambda m, mv, seen, noise: round(seen["theta"] * LINES_PER_TURN / (2 * math.pi)),
 }

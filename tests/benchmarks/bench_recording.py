@@ -17,14 +17,7 @@ import tempfile
 import time
 from pathlib import Path
 
-BENCH = """
-import sys, typer
-from motorid import cli_bench
-app = typer.Typer()
-app.command()(cli_bench.record)
-app.command()(cli_bench.bench)
-app()
-"""
+MAIN = (sys.executable, "-m", "motorid.cli")
 
 
 def cpu(pid: int) -> float:
@@ -36,12 +29,12 @@ def cpu(pid: int) -> float:
 def measure(rate: int, seconds: float, folder: Path) -> str:
     """Record once; return a line of figures."""
     words = ("bench", "--effect", "coulomb", "--seed", "1", "--rate", str(rate))
-    bench = subprocess.Popen([sys.executable, "-c", BENCH, *words], stdout=subprocess.PIPE, text=True)
+    bench = subprocess.Popen([*MAIN, *words], stdout=subprocess.PIPE, text=True)
     assert bench.stdout is not None
     port, out = bench.stdout.readline().split()[1], folder / f"{rate}.csv"
     before, begun = resource.getrusage(resource.RUSAGE_CHILDREN), time.monotonic()
     words = ("record", "--port", port, "--out", str(out), "--quiet", "--excite", f"prbs:6:0.05:{seconds}")
-    done = subprocess.run([sys.executable, "-c", BENCH, *words], capture_output=True, text=True, check=False)
+    done = subprocess.run([*MAIN, *words], capture_output=True, text=True, check=False)
     wall, after = time.monotonic() - begun, resource.getrusage(resource.RUSAGE_CHILDREN)
     used, bench_used = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime, cpu(bench.pid)
     bench.send_signal(signal.SIGTERM)
