@@ -179,8 +179,9 @@ class Problem:
     def fine_enough(self, q: Array) -> bool:
         """Tell whether the present sub-steps keep, within a factor of two, what `refined` asks for at `q`."""
         at = self.unknowns.point(np.asarray(q, float))
-        return all(self._engine.prepare(self.system, run.grid, self.unknowns.first_state(at, k), at.p,
-                                        self._tolerance(k, 2.0)) is run.grid for k, run in enumerate(self.runs))
+        starts = (self.unknowns.first_state(at, k) for k in range(len(self.runs)))
+        return all(self._engine.prepare(self.system, run.grid, x0, at.p, self._tolerance(k, 2.0)) is run.grid
+                   for k, (run, x0) in enumerate(zip(self.runs, starts, strict=True)))
 
     def _refined_run(self, k: int, at: Point) -> Run:
         # From one step per sample on, so that the grid depends on q alone and not on the way there.
@@ -204,29 +205,31 @@ class Problem:
 
     def _tolerance(self, k: int, slack: float = 1.0) -> float | Callable[[Trajectory], float]:
         """Local error relative to the largest state: a small part of the noise, or of a far larger misfit."""
-        if self.accuracy is not None:
-            return self.accuracy
-        y, noise, count = self._levels[k]
+        y, missing, top, noise, count = self._levels[k]
         if NOISE_SHARE * noise.min() >= LOOSEST:
             return slack * LOOSEST
 
         def level(traj: Trajectory) -> float:
-            e = np.nan_to_num(traj.y - y[0]) / y[1]
-            rms = np.sqrt(np.einsum("ij,ij->j", e, e) / count)
+            e = traj.y - y
+            if missing is not None:
+                e[missing] = 0.0
+            rms = np.sqrt(np.einsum("ij,ij->j", e, e) / count) / top
             share = np.maximum(noise, MISFIT_SHARE * rms).min()
-            return slack * float(np.clip(NOISE_SHARE * share, TIGHTEST, LOOSEST))
+            return slack * min(max(NOISE_SHARE * share, TIGHTEST), LOOSEST)
 
         return level
 
     @cached_property
-    def _levels(self) -> list[tuple[tuple[Array, Array], Array, Array]]:
-        """Per run: measured (N, ny) and its largest sizes, noise over those sizes, numbers of samples."""
+    def _levels(self) -> list[tuple[Array, NDArray[np.bool_] | None, Array, Array, Array]]:
+        """Per run: measured (N, ny), what is missing, and by channel: largest size, noise over it, samples."""
         found = []
-        for run, (y, _, _) in zip(self.runs, self._weights, strict=True):
-            count = np.isfinite(y).sum(axis=0)
-            top = np.maximum(np.nan_to_num(np.abs(y)).max(axis=0), 1e-300)
+        for run, (y, _, index) in zip(self.runs, self._weights, strict=True):
+            missing = None if index is None else ~np.isfinite(y)
+            there = y if missing is None else np.where(missing, 0.0, y)
+            top = np.maximum(np.maximum(there.max(axis=0), -there.min(axis=0)), 1e-300)
             noise = np.array([run.sigma.get(c, np.inf) for c in self.outputs]) / top
-            found.append(((y, top), noise, np.maximum(count, 1)))
+            count = np.full(y.shape[1], len(y)) if missing is None else np.maximum((~missing).sum(axis=0), 1)
+            found.append((y, missing, top, noise, count))
         return found
 
     # -- residual --------------------------------------------------------------------------------------
