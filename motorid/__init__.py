@@ -3,6 +3,7 @@
 from typing import TYPE_CHECKING as _TYPE_CHECKING
 
 from motorid import effects
+from motorid.acquire import record
 from motorid.checks import check_runs
 from motorid.comparison import compare
 from motorid.datasets import data_path
