@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -282,7 +282,10 @@ def solve(problem: Problem, solver: Any = None, *, start: str = "auto",
         return solver.solve(problem)
     if problem.constraints:
         raise UsageError("LevenbergMarquardt has no true constraints; use solver=mi.MultipleShooting().")
-    return _least_squares(problem, solver or LevenbergMarquardt(), callback, formulation, start == "auto", began)
+    options = solver or LevenbergMarquardt()
+    if start == "auto":  # a guess from the data needs no looks from elsewhere; a misfit then is the model's
+        options = replace(options, looks=min(options.looks, 1))
+    return _least_squares(problem, options, callback, formulation, start == "auto", began)
 
 
 def _least_squares(problem: Problem, options: LevenbergMarquardt, callback, formulation: str, stages: bool,

@@ -21,7 +21,7 @@ from motorid.system import System
 from motorid.unknowns import Point, Unknowns
 
 NOISE_SHARE = 0.03  # local integration error over the noise
-MISFIT_SHARE = 0.01  # of the misfit, where it is what the noise would be
+MISFIT_SHARE = 0.1  # of the misfit, where it is what the noise would be
 TIGHTEST, LOOSEST = 1e-7, 1e-4  # local integration error over the largest state
 
 
@@ -205,6 +205,8 @@ class Problem:
 
     def _tolerance(self, k: int, slack: float = 1.0) -> float | Callable[[Trajectory], float]:
         """Local error relative to the largest state: a small part of the noise, or of a far larger misfit."""
+        if self.accuracy is not None:
+            return self.accuracy
         y, missing, top, noise, count = self._levels[k]
         if NOISE_SHARE * noise.min() >= LOOSEST:
             return slack * LOOSEST

@@ -26,6 +26,7 @@ POLISH = LevenbergMarquardt(max_iterations=60, ftol=1e-7, xtol=1e-7)
 BLOCKS = 10  # contiguous parts of each run; every other one is held out where there are no held-out runs
 WORST_CONDITION = 1e4  # of the column-scaled Jacobian
 SIGNIFICANT = 3.0  # standard deviations
+ROUGH = 1e-4  # accuracy of the integration while starts are compared
 ROOM = 10.0  # factor beyond its grid that a shape parameter may run to
 FAILURES = (FitError, SimulationError, ModelError, np.linalg.LinAlgError)
 LEAST_FALL = 0.01  # of the held-out error that makes an effect worth having
@@ -75,7 +76,7 @@ class HeldOut:
             return Errors.of(simulated(self.validation.for_model(fit.model)))
         parts = []
         for problem, test in self.folds:
-            start = problem.for_model(fit.model).balanced(fit.problem.balance)
+            start = problem.for_model(fit.model).balanced(fit.problem.balance).with_accuracy(ROUGH)
             q = start.scaling.scaled([fit.initial.get(p.name, p.value) for p in start.unknown])
             done = descend(_from(start, q), QUICK, stages=False)
             parts.append(Errors.of(at(done.problem, done.solution.q), test))
@@ -115,7 +116,7 @@ def refit(fit: Fit, model: Model, starts: Sequence[Mapping[str, float]]) -> Fit 
     raced = []
     for start in starts or ({},):
         names = [n for n in start if n in model.parameters]
-        problem = fit.problem.for_model(_within(model, {n: start[n] for n in names}))
+        problem = fit.problem.for_model(_within(model, {n: start[n] for n in names})).with_accuracy(ROUGH)
         q = problem.scaling.scaled([fit.initial.get(p.name, p.value) for p in problem.unknown])
         problem = _from(problem, q)
         if angular:
@@ -154,6 +155,7 @@ def _bounded(fit: Fit, model: Model) -> Model:
 def _polished(fit: Fit, problem: Problem) -> Fit | None:
     """Converge from a good start, channels weighed anew where the misfit has changed."""
     try:
+        problem = problem.with_accuracy(fit.problem.accuracy)
         done = descend(problem, POLISH, stages=False)
         if problem.balance:
             factors = misfit_over_noise(done.problem, done.solution.q)

@@ -20,6 +20,8 @@ from motorid.system import System
 
 PATIENCE = 0.15  # s in the virtual machine before a step is worth compiling
 MOST_SUBSTEPS = 256
+MOST_PASSES = 6
+ASTRAY = 0.3  # local error, relative to the state so far, at which a step is lost
 
 
 @dataclass(frozen=True)
@@ -40,28 +42,62 @@ class Rosenbrock:
         """See `Engine.run`; on request with the local error of each state."""
         return stepper(system).run(grid, x0, p, dx0, dp, local_error, self.compiled)
 
+    @staticmethod
+    def _sizes(system: System, grid: Grid, traj: Trajectory, p: Array) -> Array:
+        """Size of each state, at least that of the output which shows it: a small correction need not be exact."""
+        middle = len(traj.x) // 2
+        shown = np.abs(np.asarray(stepper(system).functions.out(traj.x[middle], grid.u[middle], p)[1]))
+        tops = np.abs(traj.y).max(axis=0)
+        share = np.where(shown > 1e-6, tops[:, None] / np.maximum(shown, 1e-6), 0.0).max(axis=0)
+        return np.maximum(np.maximum(np.abs(traj.x).max(axis=0), share), 1e-12)
+
     def prepare(self, system: System, grid: Grid, x0: Array, p: Array,
                 tolerance: float | Callable[[Trajectory], float]) -> Grid:
         """See `Engine.prepare`. Errors are relative to the largest size of each state on the record.
 
         Where the run fails, so does every later one on this grid: coarse steps would jump over what happens.
+        A step that goes astray spoils everything after it, which is then neither refined for nor a measure of size.
         """
-        for _ in range(6):
+        passes = MOST_PASSES
+        while passes > 0:
             try:
                 traj = self.run(system, grid, x0, p, local_error=True)
             except SimulationError:
                 break
             assert traj.error is not None
             level = tolerance(traj) if callable(tolerance) else tolerance
-            error = (traj.error / np.maximum(np.abs(traj.x).max(axis=0), 1e-12)).max(axis=1)
+            astray = _astray(traj)
+            sizes = self._sizes(system, grid, traj if astray is None else _beginning(traj, astray), p)
+            error = (traj.error / sizes).max(axis=1)
+            if astray is not None:
+                error[astray + 1:] = 0.0
             if not np.max(error, initial=0.0) > 2 * level:  # or not a number
                 break
+            passes -= 1 if astray is None else 1 / 16
             factor = np.ceil(1.1 * (np.maximum(error, 1e-300) / level) ** (1 / ERROR_ORDER))
             finer = np.clip(grid.substeps * np.clip(factor, 1, 16), 1, MOST_SUBSTEPS).astype(np.int64)
             if np.array_equal(finer, grid.substeps):
                 break
             grid = grid.with_substeps(finer)
         return grid
+
+
+def _astray(traj: Trajectory) -> int | None:
+    """Return the first interval whose error is as large as the state so far, if the state leaves its size there."""
+    assert traj.error is not None
+    size = np.maximum.accumulate(np.abs(traj.x), axis=0)
+    lost = (traj.error > ASTRAY * np.maximum(size[1:], 1e-12)).any(axis=1)
+    if not lost.any():
+        return None
+    k = int(np.argmax(lost))
+    before, after = np.maximum(size[k], 1e-12), np.maximum(size[k + 1], 1e-12)
+    jumped = (after > 10 * before) & (before > 1e-12)
+    return k if np.any(jumped | (size[-1] > 10 * after)) else None
+
+
+def _beginning(traj: Trajectory, k: int) -> Trajectory:
+    """Return the trajectory up to the end of interval `k`."""
+    return traj._replace(x=traj.x[:k + 2], y=traj.y[:k + 2])
 
 
 class Stepper:
