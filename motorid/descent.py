@@ -21,7 +21,7 @@ from motorid.problem import Problem
 
 WIDEST = 0.03  # first width of sgn over the highest speed
 NARROWER = 6.0  # at most, from one stage to the next
-ON_THE_WAY = ((1e-7, 60), (1e-4, 30))  # ftol and iterations of the first stage, and of those between
+ON_THE_WAY = ((1e-7, 60), (1e-6, 60))  # ftol and iterations of the first stage, and of those between
 ROUNDS = 4  # of refining the sub-steps
 IMBALANCE = 3.0  # between channels, in misfit over noise, above which the misfit decides the weights
 
@@ -240,8 +240,8 @@ def _narrowing(problem: Problem, options: LevenbergMarquardt, callback: Callback
 
 
 def _sooner(options: LevenbergMarquardt, ends: tuple[float, int]) -> LevenbergMarquardt:
-    ftol, iterations = ends
-    return replace(options, ftol=max(options.ftol, ftol), max_iterations=min(options.max_iterations, iterations))
+    ftol, most = ends
+    return replace(options, ftol=max(options.ftol, ftol), max_iterations=min(options.max_iterations, most))
 
 
 def _cheaper(*problems: Problem) -> Problem:
