@@ -1,0 +1,267 @@
+"""Problem: what enters the residual, with which weights, and what is refused."""
+
+from __future__ import annotations
+
+import pickle
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from lab_records import NOISE, VALUES, drive, noisy, pair, simulated
+
+import motorid as mi
+from motorid.errors import DataError, ModelError, UsageError
+from motorid.problem import as_problem
+
+TRUE = mi.dc_motor(**VALUES)
+
+
+@pytest.fixture
+def runs(rng):
+    return pair(rng)
+
+
+def holed(run, channel, rng, share=0.3):
+    y = np.array(run.outputs[channel])
+    y[rng.random(run.n) < share] = np.nan
+    return run.with_(outputs={**run.outputs, channel: y})
+
+
+# -- residuals -----------------------------------------------------------------------------------------------
+def test_at_the_truth_the_residual_is_white_noise_of_size_one(runs):
+    problem = as_problem(TRUE, runs)
+    r = problem.refined(problem.start).residual(problem.start)
+    assert len(r) == problem.n_outputs == 2 * 2 * 500
+    assert np.std(r) == pytest.approx(1.0, abs=0.1)
+    assert abs(np.mean(r)) < 0.1
+
+
+def test_missing_samples_are_left_out_and_nothing_else_changes(runs, rng):
+    gaps = [holed(r, "i", rng) for r in runs]
+    whole, part = as_problem(TRUE, runs), as_problem(TRUE, gaps)
+    sigma = [run.sigma for run in whole.runs]
+    part = replace(part, _runs=tuple(replace(r, sigma=s) for r, s in zip(part.runs, sigma, strict=True)))
+    q = whole.start + 0.05
+    r, jac = whole.residual_and_jacobian(q)
+    r2, jac2 = part.residual_and_jacobian(q)
+    there = np.concatenate(
+        [np.isfinite(np.column_stack([g.outputs["i"], g.outputs["omega"]])).ravel() for g in gaps]
+    )
+    assert part.n_outputs == there.sum() < whole.n_outputs
+    assert np.array_equal(r2, r[there])
+    assert np.array_equal(jac2, jac[there])
+
+
+def test_runs_may_lack_different_channels(runs):
+    first, second = runs[0].without("omega"), runs[1].without("i")
+    problem = as_problem(TRUE, [first, second])
+    assert problem.outputs == ("i", "omega")
+    assert problem.n_outputs == 1000
+    both = as_problem(TRUE, runs)
+    r, whole = problem.residual(problem.start), both.residual(both.start).reshape(2, 500, 2)
+    scale = [both.runs[k].sigma[c] / problem.runs[k].sigma[c] for k, c in ((0, "i"), (1, "omega"))]
+    assert r[:500] == pytest.approx(whole[0, :, 0] * scale[0], abs=1e-9)
+    assert r[500:] == pytest.approx(whole[1, :, 1] * scale[1], abs=1e-9)
+    assert mi.check_derivatives(problem).ok
+
+
+def test_noise_that_is_stated_counts_and_noise_that_is_not_is_estimated(runs):
+    stated = [r.with_(sigma={"i": 0.1}) for r in runs]
+    problem = as_problem(TRUE, stated)
+    assert [r.sigma["i"] for r in problem.runs] == [0.1, 0.1]
+    assert problem.runs[0].sigma["omega"] == pytest.approx(NOISE["omega"], rel=0.1)
+    one = as_problem(TRUE, [stated[0], runs[1]])
+    assert one.runs[0].sigma["i"] == 0.1
+
+
+def test_weights_by_rms_make_channels_count_alike(runs):
+    problem = as_problem(TRUE, runs, weights="rms")
+    problem = problem.refined(problem.start)
+    r = problem.residual(problem.start)
+    sim = mi.simulate(TRUE, runs[0])[0]
+    expected = (sim.outputs["omega"] - runs[0].outputs["omega"]) / np.sqrt(
+        np.mean(runs[0].outputs["omega"] ** 2)
+    )
+    assert r[1:1000:2] == pytest.approx(expected, abs=1e-5)
+
+
+# -- priors and loss -----------------------------------------------------------------------------------------
+def test_a_prior_is_one_more_residual_in_standard_deviations(runs):
+    priors = {"R": (1.0, 0.1), "J": (2e-5, 1e-6)}
+    problem = as_problem(TRUE, runs, priors=priors)
+    r, jac = problem.residual_and_jacobian(problem.start)
+    assert len(r) == problem.n_outputs + 2
+    assert r[-2:] == pytest.approx([(1.38 - 1.0) / 0.1, 3.5])
+    names = [p.name for p in problem.unknown]
+    slopes = jac[-2:] / problem.scaling.slope(problem.start)
+    assert slopes[0, names.index("R")] == pytest.approx(10.0)
+    assert slopes[1, names.index("J")] == pytest.approx(1e6)
+    assert np.count_nonzero(slopes) == 2
+
+
+def test_a_prior_on_a_held_parameter_is_no_residual(runs):
+    problem = as_problem(TRUE.fix("R"), runs, priors={"R": (1.0, 0.1)})
+    assert len(problem.residual(problem.start)) == problem.n_outputs
+
+
+def test_huber_is_quadratic_inside_linear_outside_and_its_derivative_is_right():
+    huber = mi.Huber(delta=1.5)
+    r = np.linspace(-6, 6, 241)
+    pseudo, slope = huber.pseudo(r)
+    rho = np.where(np.abs(r) <= 1.5, r**2 / 2, 1.5 * np.abs(r) - 1.5**2 / 2)
+    assert pseudo**2 / 2 == pytest.approx(rho, abs=1e-12)
+    assert np.all(np.sign(pseudo) == np.sign(r))
+    h = 1e-6
+    numeric = (huber.pseudo(r + h)[0] - huber.pseudo(r - h)[0]) / (2 * h)
+    assert slope == pytest.approx(numeric, abs=1e-5)
+
+
+def test_the_loss_acts_on_outputs_and_not_on_priors(runs):
+    plain = as_problem(TRUE, runs, priors={"R": (1.0, 0.01)})
+    robust = replace(plain, loss=mi.Huber())
+    r, r2 = plain.residual(plain.start), robust.residual(robust.start)
+    assert r2[-1] == r[-1] == pytest.approx(38)
+    far = np.abs(r[:-1]) > 1.345
+    assert far.any()
+    assert np.array_equal(r2[:-1][~far], r[:-1][~far])
+    assert (np.abs(r2[:-1][far]) < np.abs(r[:-1][far])).all()
+
+
+# -- coordinates ---------------------------------------------------------------------------------------------
+def test_a_linear_parameter_is_measured_in_natural_sizes_so_zero_may_be_a_start(runs):
+    model = TRUE + mi.effects.constant_load(tau_0=0.0) + mi.effects.quadratic_drag
+    problem = as_problem(model, runs)
+    size = dict(zip([p.name for p in problem.unknown], problem.scaling.scale, strict=True))
+    assert size["R"] == 1.38
+    assert 0.05 < size["tau_0"] < 1.0  # what the motor makes at its highest current, N·m
+    assert 1e-6 < size["c_2"] < 1e-4
+    assert problem.values(problem.start) == pytest.approx(problem.model.values)
+
+
+def test_values_and_simulation_follow_the_coordinates(runs):
+    problem = as_problem(TRUE.fix("L"), runs)
+    q = problem.start + np.array([np.log(2), 0, 0, 0])
+    values = problem.values(q)
+    assert values["R"] == pytest.approx(2 * 1.38)
+    assert values["L"] == VALUES["L"]
+    there = problem.refined(q).simulate(q, 1, derivatives=False)
+    model = TRUE.replace(R=2 * 1.38)
+    assert there.y[:, 1] == pytest.approx(mi.simulate(model, runs[1])[0].outputs["omega"], abs=0.05)
+    assert there.dy is None
+    assert problem.simulate(q, 1).dy.shape == (500, 2, 4)
+
+
+# -- how records begin ---------------------------------------------------------------------------------------
+def moving(rng, channels=("i", "omega", "theta")):
+    t = np.arange(800) * 1e-3
+    whole = noisy(simulated(t, drive(t, 6.0), channels), rng)
+    return whole.select(slice(300, None))
+
+
+def test_a_record_from_rest_has_no_unknown_beginning(runs):
+    assert [p.name for p in as_problem(TRUE, runs).unknown] == list(VALUES)
+
+
+@pytest.mark.parametrize(
+    ("initial", "names"),
+    [
+        ("auto", ["i_0[0]", "omega_0[0]", "theta_0[0]"]),
+        ("estimate", ["i_0[0]", "omega_0[0]", "theta_0[0]"]),
+        ("measured", []),
+        ("rest", []),
+    ],
+)
+def test_a_record_that_begins_in_motion(rng, initial, names):
+    run = moving(rng)
+    problem = as_problem(TRUE, run, initial=initial)
+    assert [p.name for p in problem.unknown[5:]] == names
+    start = problem.runs[0].start
+    if initial == "rest":
+        assert start[:2] == pytest.approx([0, 0])
+    else:
+        assert start == pytest.approx([run.outputs[c][0] for c in ("i", "omega", "theta")], abs=1.5)
+    if initial == "auto":  # within what the first samples allow, so that it hides nothing
+        low, high = problem.scaling.bounds
+        assert np.isfinite([low[5:], high[5:]]).all()
+        assert (problem.start[5:] > low[5:]).all()
+
+
+def test_the_speed_at_the_start_may_come_from_the_angle_alone(rng):
+    run = moving(rng, ("theta",))
+    problem = as_problem(TRUE, run)
+    found = {p.name: p.value for p in problem.unknown[5:]}
+    assert set(found) == {"omega_0[0]", "theta_0[0]"}
+    assert found["omega_0[0]"] == pytest.approx(
+        simulated(np.arange(800) * 1e-3, drive(np.arange(800) * 1e-3, 6.0)).outputs["omega"][300], rel=0.1
+    )
+
+
+def test_an_angle_that_is_not_measured_starts_at_zero_and_is_no_unknown(runs):
+    problem = as_problem(TRUE + mi.effects.gravity, runs)
+    assert "theta" in problem.system.states
+    assert all("theta_0" not in p.name for p in problem.unknown)
+
+
+# -- sub-steps -----------------------------------------------------------------------------------------------
+def test_refined_keeps_the_integration_error_well_below_the_noise(runs):
+    from motorid.descent import integration_error
+
+    coarse = as_problem(TRUE, runs)
+    fine = coarse.refined(coarse.start)
+    assert integration_error(coarse, coarse.start) > 0.5  # L/R is about one sample
+    assert integration_error(fine, fine.start) < 0.1
+    assert fine.fine_enough(fine.start)
+    assert not coarse.fine_enough(coarse.start)
+    assert fine.refined(fine.start).runs[0] is fine.runs[0]
+
+
+def test_a_problem_for_another_model_keeps_noise_and_beginnings(runs):
+    problem = as_problem(TRUE, runs)
+    other = problem.for_model(TRUE + mi.effects.coulomb)
+    assert other.runs == problem.runs
+    assert other.model.effect_names == ("coulomb",)
+    assert problem.with_(initial="estimate").runs[0].estimated == ("i", "omega")
+
+
+def test_a_problem_travels_to_another_process(runs):
+    problem = as_problem(TRUE + mi.effects.coulomb, runs, priors={"R": (1.3, 0.1)}, loss=mi.Huber())
+    problem = problem.refined(problem.start)
+    expected = problem.residual(problem.start)
+    there = pickle.loads(pickle.dumps(problem))
+    assert there.residual(there.start) == pytest.approx(expected, abs=1e-12)
+
+
+# -- refused -------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize(
+    ("options", "error", "words"),
+    [
+        ({"weights": "sigma"}, UsageError, "unknown weights 'sigma'"),
+        ({"initial": "standstill"}, UsageError, "unknown initial state"),
+        ({"engine": "rk4"}, UsageError, "unknown engine 'rk4'.*Known: rosenbrock"),
+        ({"priors": {"r": (1, 1)}}, UsageError, "prior: unknown parameter 'r'"),
+    ],
+)
+def test_unknown_words_are_answered_with_the_known_ones(runs, options, error, words):
+    def work():
+        problem = as_problem(TRUE, runs, **options)
+        problem.residual(problem.start)
+
+    with pytest.raises(error, match=words):
+        work()
+
+
+@pytest.mark.parametrize("records", [[], ["run.csv"]])
+def test_records_must_be_experiments(records):
+    with pytest.raises(UsageError, match=r"mi\.read_runs"):
+        as_problem(TRUE, records)
+
+
+def test_a_torque_drive_cannot_explain_a_current(runs):
+    only = [r.without("omega") for r in runs]
+    with pytest.raises(ModelError, match=r"at least one of i, omega, theta"):
+        as_problem(mi.torque_driven(), only)
+
+
+def test_a_record_without_any_output_is_no_record(runs):
+    with pytest.raises(DataError):
+        runs[0].without("i", "omega")
