@@ -277,6 +277,9 @@ def solve(problem: Problem, solver: Any = None, *, start: str = "auto",
     began = time.perf_counter()
     if start not in ("auto", "model"):
         raise UsageError(one_of(start, ("auto", "model"), "start"))
+    if not problem.unknown:
+        raise UsageError("every parameter is held, there is nothing to fit. Free one, model.free('R'), or judge "
+                         "the model as it is: mi.evaluate(model, runs).")
     problem = started(problem) if start == "auto" else problem
     if hasattr(solver, "solve"):
         return solver.solve(problem)
