@@ -12,14 +12,18 @@ from motorid.diagnosis import diagnose, improve, locate, suggest_experiment
 from motorid.errors import DataError, FitError, ModelError, MotoridError, SimulationError, UsageError
 from motorid.experiment import Experiment
 from motorid.fit import Failure, Fit, fit, solve
+from motorid.identifiability import identifiability
 from motorid.integrate import Cvodes, Idas, Rosenbrock
 from motorid.least_squares import LevenbergMarquardt
 from motorid.model import Effect, Model, dc_motor, effect, torque_driven
+from motorid.multistart import multistart
 from motorid.parameters import P, Parameter
 from motorid.problem import Huber, Problem
 from motorid.reading import read_csv, read_mat, read_runs
+from motorid.remedies import planned
 from motorid.report import report
 from motorid.simulate import evaluate, simulate
+from motorid.uncertainty import covariance
 
 if _TYPE_CHECKING:
     from motorid.plots import (
@@ -32,6 +36,7 @@ if _TYPE_CHECKING:
         plot_residuals,
         plot_runs,
         plot_sensitivities,
+        plot_waterfall,
     )
 
 _FIGURES = (
@@ -44,6 +49,7 @@ _FIGURES = (
     "plot_residuals",
     "plot_runs",
     "plot_sensitivities",
+    "plot_waterfall",
 )
 
 

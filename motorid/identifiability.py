@@ -1,0 +1,223 @@
+"""Which parameters do the data determine? Singular values of the sensitivities, weak directions in words.
+
+A record determines a direction in parameter space when a step along it changes the outputs by more than the
+noise. The Jacobian of the fit says so without a fit: its columns scaled to relative changes, its rows by
+the noise, its singular values are the signal-to-noise ratios of such steps (Golub & Van Loan, Matrix
+Computations; Miao et al., "On identifiability of nonlinear ODE models", SIAM Review 53, 2011). It works on
+planned experiments too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from motorid.combinations import basis_in_words, monomials
+from motorid.errors import SimulationError, UsageError
+from motorid.fit import UNDETERMINED, Fit
+from motorid.formatting import number, quantity
+from motorid.integrate.grid import Array
+from motorid.problem import Problem
+from motorid.remedies import remedies
+from motorid.sensitivity import relative_jacobian, relative_sensitivities
+from motorid.starting import started
+from motorid.tables import Table
+
+STRUCTURAL = 1e-7  # of the largest singular value, columns of equal length: less is no influence
+LEVEL = 1.0 / UNDETERMINED  # singular value below which a factor of e drowns in the noise
+
+
+@dataclass(frozen=True)
+class WeakDirection:
+    """A change of parameters that the data hardly show.
+
+    Attributes
+    ----------
+    parameters : dict of str to float
+        Relative changes (in units of the natural size where a parameter may be zero), the largest being 1.
+    seen : float
+        What this change does to all outputs together, in units of the noise.
+    text : str
+    """
+
+    parameters: Mapping[str, float]
+    seen: float
+    text: str
+
+
+@dataclass(frozen=True, eq=False)
+class Identifiability:
+    """What records can tell about parameters, at one point.
+
+    Attributes
+    ----------
+    names : tuple of str
+    values, sizes : ndarray, shape (k,)
+        Parameters and what a relative change of one means: the value, or the natural size where it may be
+        zero.
+    units : tuple of str
+    t : tuple of ndarray
+        Per run, s.
+    sensitivities : tuple of dict of str to ndarray (N, k)
+        Per run and channel: change over the channel's RMS per relative change of a parameter.
+    singular_values : ndarray, shape (k,)
+        Of the stacked matrix, whitened by the noise, initial states projected out.
+    directions : ndarray, shape (k, k)
+        Rows: right singular vectors.
+    structural_rank : int
+        Largest rank at random points: what any such experiment without noise determines.
+    weak : tuple of WeakDirection
+    combinations : tuple of str
+        Products that are determined although their factors are not, e.g. ``"R·J"``.
+    remedies : tuple of str
+        What to fix or to measure for full rank.
+    """
+
+    names: tuple[str, ...]
+    values: Array
+    sizes: Array
+    units: tuple[str, ...]
+    t: tuple[Array, ...]
+    sensitivities: tuple[Mapping[str, Array], ...]
+    singular_values: Array
+    directions: Array
+    structural_rank: int
+    weak: tuple[WeakDirection, ...]
+    combinations: tuple[str, ...]
+    remedies: tuple[str, ...]
+
+    @property
+    def rank(self) -> int:
+        """Number of directions in which a change by 100 % (a factor of e) stands out of the noise."""
+        return int(np.sum(self.singular_values > LEVEL))
+
+    @property
+    def condition_number(self) -> float:
+        """Largest over smallest singular value; infinite where one is zero."""
+        s = self.singular_values
+        return float(s[0] / s[-1]) if s.size and s[-1] > 0 else float("inf")
+
+    @property
+    def std(self) -> dict[str, float | None]:
+        """Standard deviation that a fit with white noise would have; None where it is not determined."""
+        weak = self.singular_values <= LEVEL
+        parts = np.where(weak, 0.0, 1.0 / np.maximum(self.singular_values, 1e-300))
+        relative = np.sqrt((self.directions.T**2) @ parts**2)
+        lost = (self.directions[weak] ** 2).sum(axis=0) > 1e-4
+        return {n: None if lost[j] or relative[j] > UNDETERMINED else float(relative[j] * self.sizes[j])
+                for j, n in enumerate(self.names)}
+
+    @property
+    def full(self) -> bool:
+        """Whether every parameter is determined."""
+        return self.rank == len(self.names)
+
+    @property
+    def text(self) -> str:
+        """The verdict in words."""
+        k = len(self.names)
+        if self.full:
+            return (f"These records determine all {k} parameters ({', '.join(self.names)}): full rank, "
+                    f"condition number {self.condition_number:.3g}.")
+        said = [f"These records determine {self.rank} combinations of the {k} parameters "
+                f"{', '.join(self.names)}, not each of them."]
+        if self.structural_rank <= self.rank:
+            said.append("That is so for any voltage and without noise: it is in the equations and channels.")
+        elif self.structural_rank == k:
+            said.append("The equations would allow all; these records excite too little, or are too noisy.")
+        if self.combinations:
+            said.append(f"What they tell, nearly, is {', '.join(self.combinations)}.")
+        said += [w.text for w in self.weak]
+        said += self.remedies
+        return " ".join(said)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the contents of ``identifiability --json``."""
+        condition = self.condition_number
+        return {"singular_values": self.singular_values.tolist(),
+                "condition_number": condition if np.isfinite(condition) else None, "rank": self.rank,
+                "structural_rank": self.structural_rank, "parameters": list(self.names),
+                "weak_directions": [{"parameters": dict(w.parameters), "text": w.text} for w in self.weak],
+                "combinations": list(self.combinations), "remedies": list(self.remedies), "std": self.std,
+                "text": self.text}
+
+    def __str__(self) -> str:
+        std = self.std
+        rows = []
+        for n, v, u, s in zip(self.names, self.values, self.units, self.sizes, strict=True):
+            sd = std[n]
+            known = ("not determined", "–") if sd is None else (quantity(sd, u, 2), f"{100 * sd / s:.2g} %")
+            rows.append((n, quantity(v, u, 4), *known))
+        table = Table("What a fit would know", ("", "value", "std", "relative"), tuple(rows))
+        values = ", ".join(number(s, 3) for s in self.singular_values)
+        sums = (f"Singular values {values}; condition number {number(self.condition_number, 3)}; "
+                f"rank {self.rank} of {len(self.names)}, structural rank {self.structural_rank}.")
+        return "\n".join([self.text, "", str(table), "", sums])
+
+    __repr__ = __str__
+
+
+def identifiability(problem_or_fit: Problem | Fit, *, points: int = 5, seed: int = 0) -> Identifiability:
+    """Say which parameters, and which combinations of them, records determine.
+
+    Parameters
+    ----------
+    problem_or_fit : Problem or Fit
+        A fit is judged at its values; a problem at its model's values, or at the automatic first guess
+        where none were given. For an experiment not yet made, see `planned`.
+    points : int
+        Random points at which the structural rank is sought.
+    seed : int
+
+    Raises
+    ------
+    SimulationError
+        If the model cannot be simulated there.
+    """
+    problem, q = _place(problem_or_fit)
+    names = problem.model.free_names
+    if not names:
+        raise UsageError("the model has no free parameter; free some with model.free(…).")
+    k = len(names)
+    matrix = relative_jacobian(problem, q)
+    _, s, v = np.linalg.svd(np.asarray(np.linalg.qr(matrix, mode="r")), full_matrices=True)
+    s = np.concatenate([s, np.zeros(k - len(s))])
+    weak = v[s <= LEVEL]
+    shown = [WeakDirection(*words) for words in basis_in_words(names, weak, matrix)]
+    return Identifiability(
+        names, problem.scaling.physical(q)[:k], problem.scaling.slope(q)[:k],
+        tuple(p.unit for p in problem.unknown[:k]), tuple(r.grid.t for r in problem.runs),
+        relative_sensitivities(problem, q), s, v, _structural_rank(problem, q, points, seed), tuple(shown),
+        tuple(monomials(names, weak)) if len(weak) else (),
+        tuple(remedies(problem, q, matrix, len(weak), LEVEL)) if len(weak) else ())
+
+
+def _place(problem_or_fit: Problem | Fit) -> tuple[Problem, Array]:
+    if isinstance(problem_or_fit, Fit):
+        return problem_or_fit.problem, problem_or_fit.q
+    problem = problem_or_fit
+    if not any(p.given for p in problem.model.parameters.values()):
+        problem = started(problem)
+    return problem.refined(problem.start), problem.start
+
+
+def _structural_rank(problem: Problem, q: Array, points: int, seed: int) -> int:
+    """Return the largest rank at `q` and at random points within a factor of three, noise not counting."""
+    rng, k, best = np.random.default_rng(seed), len(problem.model.free_names), 0
+    reach = np.where(problem.scaling.log[:k], np.log(3.0), 0.5)
+    for trial in range(points + 1):
+        at = q.copy()
+        at[:k] += reach * rng.uniform(-1, 1, k) * (trial > 0)
+        try:
+            jac = relative_jacobian(problem.refined(at), at)
+        except SimulationError:
+            continue
+        norms = np.linalg.norm(jac, axis=0)
+        s = np.linalg.svd(jac / np.where(norms > 0, norms, 1.0), compute_uv=False)
+        best = max(best, int(np.sum(s > STRUCTURAL * max(s[0], 1e-300))))
+        if best == k:
+            break
+    return best
