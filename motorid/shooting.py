@@ -29,7 +29,10 @@ IMBALANCE = 3.0  # as in the least-squares fit
 FARTHEST = 25.0  # change of a logarithm beyond which no physical parameter lies
 POOR = 0.5  # NRMSE at the start above which the intervals are first joined loosely
 LOOSE = 10, 0.05  # then: samples per interval, and gaps in sizes of the states
-AWAY = 3.0  # change of a logarithm in the loose fit that may mean that a parameter got lost
+QUICK = 60  # iterations of a fit that only shows where to go on
+BLUNT = 0.01  # of the RMS of a channel: the least noise that counts in the loose fit
+AWAY = 3.5  # largest change of a logarithm in one such fit
+LOST = 3.0  # change of a logarithm that may mean that a parameter got lost
 
 
 @dataclass(frozen=True)
@@ -107,23 +110,25 @@ class MultipleShooting:
         """Solve from the values of the model; from poor ones by way of a fit whose intervals join loosely."""
         if self.process_noise is not None or self.warm == "model" or not _poor(problem):
             return self._refining(problem)
-        # One step per sample is enough to choose by: a lost parameter may ask for very many.
-        found = [self._solve(mesh := Mesh(p, self.every), mesh.joined(p.start, self._nodes(mesh, p.start)))
-                 for p in self._loosely(problem)]
-        best = min([d for d in found if d.status == "converged"] or found, key=lambda d: d.cost)
+        done = self._loose(problem)
+        found = [self._quick(problem, q) for q in _put_back(problem, done.q)]
+        best = _cheapest(found)
+        # Once the others are right, a parameter that ran off to where nothing depends on it finds its way back.
+        best = _cheapest([best, *(self._quick(problem, q) for q in _put_back(problem, best.q)[1:])])
         return self._refining(best.problem, best)
 
-    def _loosely(self, problem: Problem) -> list[Problem]:
-        """Return the problem started where a loose fit ends, and with lost parameters put back."""
+    def _loose(self, problem: Problem) -> Solved:
+        """Solve with short intervals that need not join."""
         every, size = LOOSE
-        mesh = Mesh(problem, every)
+        mesh = Mesh(problem.balanced(_blunted(problem)), every)
         step = float(np.median([run.experiment.dt for run in problem.runs]))
         mesh = replace(mesh, noise=size * mesh.scale / np.sqrt(every * step))
-        z = mesh.joined(problem.start, nodes_from_data(mesh, problem.start))
-        done = self._solve(mesh, z, tol=1e-6)
-        lost = problem.scaling.log & (np.abs(done.q - problem.start) > AWAY)
-        starts = [done.q] + ([np.where(lost, problem.start, done.q)] if lost.any() else [])
-        return [problem.for_model(problem.model.start_at(problem.values(q))) for q in starts]
+        return self._solve(mesh, mesh.joined(problem.start, nodes_from_data(mesh, problem.start)), quick=True)
+
+    def _quick(self, problem: Problem, q: Array) -> Solved:
+        """Solve from `q` not very far, with one step per sample: a lost parameter may ask for very many."""
+        mesh = Mesh(problem, self.every)
+        return self._solve(mesh, mesh.joined(q, self._nodes(mesh, q)), quick=True)
 
     def _refining(self, problem: Problem, before: Solved | None = None) -> Solved:
         """Solve, refine the sub-steps at the solution, and again while they change."""
@@ -159,9 +164,9 @@ class MultipleShooting:
         return np.array([self.process_noise.get(n, 1e-6 * s) for n, s in zip(states, Mesh(problem).scale, strict=True)])
 
     def _solve(self, mesh: Mesh, z: Array, warm: NlpResult | None = None, history: tuple[float, ...] = (),
-               tol: float | None = None) -> Solved:
+               quick: bool = False) -> Solved:
         low, high = mesh.problem.scaling.bounds
-        far = np.where(mesh.problem.scaling.log, FARTHEST, np.inf)
+        far = np.where(mesh.problem.scaling.log, AWAY if quick else FARTHEST, np.inf)
         low, high = np.maximum(low, z[:mesh.nq] - far), np.minimum(high, z[:mesh.nq] + far)
         free = np.full(len(z) - mesh.nq, np.inf)
         try:
@@ -169,7 +174,8 @@ class MultipleShooting:
         except SimulationError as error:
             raise FitError(f"the model cannot be simulated at the start: {error} Give other starting values with "
                            "model.replace(…), or leave them out.") from None
-        ipopt = Ipopt(self.max_iterations, tol or self.tol, self.verbose)
+        most, tol = (min(QUICK, self.max_iterations), 1e-6) if quick else (self.max_iterations, self.tol)
+        ipopt = Ipopt(most, tol, self.verbose)
         result = ipopt.solve(nlp, z, (np.concatenate([low, -free]), np.concatenate([high, free])), warm)
         return Solved(mesh, nlp, result, history + result.history)
 
@@ -180,6 +186,26 @@ def _check(problem: Problem) -> None:
             raise UsageError(f"MultipleShooting takes CurrentLimit, SteadyState and Constraint, not "
                              f"{type(c).__name__}.")
         c.parts(problem)
+
+
+def _blunted(problem: Problem) -> dict[str, float]:
+    """Return factors for the noise of each channel, so that a nearly noise-free one does not rule the loose fit."""
+    found: dict[str, float] = {}
+    for run in problem.runs:
+        for c, sigma in run.sigma.items():
+            rms = float(np.sqrt(np.nanmean(run.experiment.outputs[c] ** 2)))
+            found[c] = max(found.get(c, 1.0), BLUNT * rms / sigma)
+    return found
+
+
+def _put_back(problem: Problem, q: Array) -> list[Array]:
+    """Return `q`, and `q` with the parameters that went very far put back to their start."""
+    lost = problem.scaling.log & (np.abs(q - problem.start) > LOST)
+    return [q, np.where(lost, problem.start, q)] if lost.any() else [q]
+
+
+def _cheapest(found: list[Solved]) -> Solved:
+    return min([d for d in found if d.status == "converged"] or found, key=lambda d: d.cost)
 
 
 def _poor(problem: Problem) -> bool:
