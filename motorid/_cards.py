@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+from motorid._cards_trust import WRITERS
 from motorid._html import Card, Flag, Table
 from motorid._html_tables import (
     NAMES,
@@ -24,9 +25,10 @@ _STATUS = {"converged": "good", "stalled": "note", "limit": "note", "failed": "b
 def card_of(result: Any) -> Card:
     """Return the card of any result, by its kind."""
     for kind in type(result).__mro__:
-        if kind.__name__ in _WRITERS:
-            return _WRITERS[kind.__name__](result)
-    return Card(type(result).__name__, text=(repr(result),))
+        write = _WRITERS.get(kind.__name__) or WRITERS.get(kind.__name__)
+        if write is not None:
+            return write(result)
+    return Card(type(result).__name__)
 
 
 def _experiment(run: Any) -> Card:

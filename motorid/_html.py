@@ -19,7 +19,7 @@ _COLOURS = {
 _STYLE = """
 .motorid{font-size:13px;line-height:1.45;max-width:60rem}
 .motorid table{border-collapse:collapse;margin:.5em 0 .5em 0;font-variant-numeric:tabular-nums}
-.motorid caption{text-align:left;font-weight:600;padding:.2em 0}
+.motorid caption{text-align:left;padding:.2em 0}
 .motorid table th,.motorid table td{text-align:left!important;padding:.2em .9em .2em 0}
 .motorid table th,.motorid table td{border-bottom:1px solid rgba(128,128,128,.35)}
 .motorid thead th{border-bottom:2px solid rgba(128,128,128,.6);font-weight:600}

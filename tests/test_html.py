@@ -190,5 +190,5 @@ def test_showing_a_result_computes_nothing(monkeypatch):
         assert repr(r)
 
 
-def test_a_result_without_a_card_shows_its_line():
-    assert card_of(3) == Card("int", text=("3",))
+def test_a_result_without_a_card_shows_its_kind():
+    assert card_of(3) == Card("int")

@@ -4,6 +4,7 @@ import itertools
 import re
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import hand_made
 import matplotlib as mpl
@@ -210,6 +211,13 @@ def test_parameters_show_two_standard_deviations_and_what_is_not_determined(foun
     assert None in vague.std.values()
     texts = [t.get_text() for ax in plots.plot_parameters(vague) for t in ax.texts]
     assert "not\ndetermined" in texts
+
+
+def test_a_true_angle_is_drawn_beside_its_estimate_whatever_the_turn(found):
+    model = (found.after.model + mi.effects.gravity).start_at({"phi_g": 4.2})
+    fit = SimpleNamespace(model=model, values=model.values, std={"phi_g": 0.1}, formulation="plain")
+    axes = plots.plot_parameters(fit, truth={"phi_g": -2.0}, names=["phi_g"])
+    assert axes[0].get_lines()[0].get_ydata()[0] == pytest.approx(-2.0 + 2 * np.pi)
 
 
 def test_sensitivities_are_what_one_per_cent_of_a_parameter_does(found):

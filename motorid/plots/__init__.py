@@ -5,7 +5,7 @@ from motorid.plots.fits import plot_fit, plot_runs
 from motorid.plots.formulations import plot_current_limit
 from motorid.plots.parameters import plot_parameters
 from motorid.plots.residuals import plot_residuals
-from motorid.plots.trust import plot_sensitivities
+from motorid.plots.trust import plot_sensitivities, plot_waterfall
 
 __all__ = [
     "plot_current_limit",
@@ -17,4 +17,5 @@ __all__ = [
     "plot_residuals",
     "plot_runs",
     "plot_sensitivities",
+    "plot_waterfall",
 ]
