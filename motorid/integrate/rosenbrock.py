@@ -6,9 +6,10 @@ import hashlib
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any
 
+import casadi as ca
 import numpy as np
 
 from motorid.errors import SimulationError
@@ -42,21 +43,12 @@ class Rosenbrock:
         """See `Engine.run`; on request with the local error of each state."""
         return stepper(system).run(grid, x0, p, dx0, dp, local_error, self.compiled)
 
-    @staticmethod
-    def _sizes(system: System, grid: Grid, traj: Trajectory, p: Array) -> Array:
-        """Size of each state, at least that of the output which shows it: a small correction need not be exact."""
-        middle = len(traj.x) // 2
-        shown = np.abs(np.asarray(stepper(system).functions.out(traj.x[middle], grid.u[middle], p)[1]))
-        tops = np.abs(traj.y).max(axis=0)
-        share = np.where(shown > 1e-6, tops[:, None] / np.maximum(shown, 1e-6), 0.0).max(axis=0)
-        return np.maximum(np.maximum(np.abs(traj.x).max(axis=0), share), 1e-12)
-
     def prepare(self, system: System, grid: Grid, x0: Array, p: Array,
                 tolerance: float | Callable[[Trajectory], float]) -> Grid:
         """See `Engine.prepare`. Errors are relative to the largest size of each state on the record.
 
         Where the run fails, so does every later one on this grid: coarse steps would jump over what happens.
-        A step that goes astray spoils everything after it, which is then neither refined for nor a measure of size.
+        A step that goes astray spoils all after it, which is then neither refined for nor a measure of size.
         """
         passes = MOST_PASSES
         while passes > 0:
@@ -64,17 +56,18 @@ class Rosenbrock:
                 traj = self.run(system, grid, x0, p, local_error=True)
             except SimulationError:
                 break
-            assert traj.error is not None
             level = tolerance(traj) if callable(tolerance) else tolerance
-            astray = _astray(traj)
-            sizes = self._sizes(system, grid, traj if astray is None else _beginning(traj, astray), p)
-            error = (traj.error / sizes).max(axis=1)
+            size, error = _by_state(traj)
+            astray = _astray(size, error)
             if astray is not None:
-                error[astray + 1:] = 0.0
-            if not np.max(error, initial=0.0) > 2 * level:  # or not a number
+                traj = traj._replace(x=traj.x[:astray + 2], y=traj.y[:astray + 2])
+                size, error[:, astray + 1:] = size[:, :astray + 2], 0.0
+            sizes = np.maximum(size[:, -1], stepper(system).shown_sizes(grid, traj, p))
+            relative = (error / np.maximum(sizes, 1e-12)[:, None]).max(axis=0)
+            if not np.max(relative, initial=0.0) > 2 * level:  # or not a number
                 break
             passes -= 1 if astray is None else 1 / 16
-            factor = np.ceil(1.1 * (np.maximum(error, 1e-300) / level) ** (1 / ERROR_ORDER))
+            factor = np.ceil(1.1 * (np.maximum(relative, 1e-300) / level) ** (1 / ERROR_ORDER))
             finer = np.clip(grid.substeps * np.clip(factor, 1, 16), 1, MOST_SUBSTEPS).astype(np.int64)
             if np.array_equal(finer, grid.substeps):
                 break
@@ -82,22 +75,22 @@ class Rosenbrock:
         return grid
 
 
-def _astray(traj: Trajectory) -> int | None:
-    """Return the first interval whose error is as large as the state so far, if the state leaves its size there."""
+def _by_state(traj: Trajectory) -> tuple[Array, Array]:
+    """Return the size so far (nx, N) and the local error (nx, N-1); NumPy reduces long rows faster."""
     assert traj.error is not None
-    size = np.maximum.accumulate(np.abs(traj.x), axis=0)
-    lost = (traj.error > ASTRAY * np.maximum(size[1:], 1e-12)).any(axis=1)
+    size = np.abs(np.ascontiguousarray(traj.x.T))
+    return np.maximum.accumulate(size, axis=1, out=size), np.ascontiguousarray(traj.error.T)
+
+
+def _astray(size: Array, error: Array) -> int | None:
+    """Return the first interval whose error is as large as the state, if the state leaves its size there."""
+    lost = (error > ASTRAY * np.maximum(size[:, 1:], 1e-12)).any(axis=0)
     if not lost.any():
         return None
     k = int(np.argmax(lost))
-    before, after = np.maximum(size[k], 1e-12), np.maximum(size[k + 1], 1e-12)
+    before, after = np.maximum(size[:, k], 1e-12), np.maximum(size[:, k + 1], 1e-12)
     jumped = (after > 10 * before) & (before > 1e-12)
-    return k if np.any(jumped | (size[-1] > 10 * after)) else None
-
-
-def _beginning(traj: Trajectory, k: int) -> Trajectory:
-    """Return the trajectory up to the end of interval `k`."""
-    return traj._replace(x=traj.x[:k + 2], y=traj.y[:k + 2])
+    return k if np.any(jumped | (size[:, -1] > 10 * after)) else None
 
 
 class Stepper:
@@ -131,6 +124,22 @@ class Stepper:
             raise SimulationError(f"the simulation left the finite numbers at t = {grid.t[bad]:.6g} s; the "
                                   "parameters make the model unstable or stiff beyond the step.")
         return traj
+
+    def shown_sizes(self, grid: Grid, traj: Trajectory, p: Array) -> Array:
+        """Size (nx,) that the largest output lends the states it shows: a small part need not be exact."""
+        slopes = self._constant_slopes
+        if slopes is None:
+            middle = len(traj.x) // 2
+            slopes = np.abs(np.asarray(self.functions.out(traj.x[middle], grid.u[middle], p)[1]))
+        tops = np.abs(traj.y.T).max(axis=1)
+        return np.where(slopes > 1e-6, tops[:, None] / np.maximum(slopes, 1e-6), 0.0).max(axis=0)
+
+    @cached_property
+    def _constant_slopes(self) -> Array | None:
+        """|dy/dx|, if it is the same everywhere."""
+        sizes = (self.functions.out.size1_in(k) for k in range(3))
+        slopes = self.functions.out(*(ca.SX.sym(n, k) for n, k in zip("xup", sizes, strict=True)))[1]
+        return None if ca.symvar(slopes) else np.abs(np.asarray(ca.DM(ca.evalf(slopes))))
 
     def _load(self, compiled: bool | None) -> Any:
         """Return the compiled driver if it is there, or worth making now; else None."""
