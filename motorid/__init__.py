@@ -4,6 +4,7 @@ from typing import TYPE_CHECKING as _TYPE_CHECKING
 
 from motorid import effects
 from motorid.acquire import record
+from motorid.bootstrap import bootstrap
 from motorid.checks import check_runs
 from motorid.comparison import compare
 from motorid.datasets import data_path
@@ -11,14 +12,17 @@ from motorid.derivatives import check_derivatives
 from motorid.diagnosis import diagnose, improve, locate, suggest_experiment
 from motorid.errors import DataError, FitError, ModelError, MotoridError, SimulationError, UsageError
 from motorid.experiment import Experiment
+from motorid.explore import explore
 from motorid.fit import Failure, Fit, fit, solve
 from motorid.identifiability import identifiability
 from motorid.integrate import Cvodes, Idas, Rosenbrock
+from motorid.intervals import intervals
 from motorid.least_squares import LevenbergMarquardt
 from motorid.model import Effect, Model, dc_motor, effect, torque_driven
 from motorid.multistart import multistart
 from motorid.parameters import P, Parameter
 from motorid.problem import Huber, Problem
+from motorid.profiling import profile, profiles
 from motorid.reading import read_csv, read_mat, read_runs
 from motorid.remedies import planned
 from motorid.report import report

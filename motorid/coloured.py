@@ -52,13 +52,15 @@ class Colour:
         gain = 1.0 / (1.0 - float(np.sum(self.a))) ** 2
         return float(np.clip(self.variance / max(self.innovation * gain, 1e-300), 0.0, 1.0))
 
-    def innovations(self, r: Array) -> Array:
-        """Return e of r (N,); the first values are scaled to the same variance."""
-        e = np.array(r, float)
-        for k, a in enumerate(self.a, 1):
-            e[k:] -= a * r[:-k]
-        e[:len(self.a)] = r[:len(self.a)] * np.sqrt(self.innovation / max(self.variance, 1e-300))
-        return e
+    def draw(self, n: int, rng: np.random.Generator) -> Array:
+        """Return noise of this colour (n,), Gaussian."""
+        if not self.a.size:
+            return np.sqrt(self.variance) * rng.standard_normal(n)
+        # Through the spectrum, on twice the length so that the ends are not alike.
+        m = 1 << int(np.ceil(np.log2(max(2 * n, 4096))))
+        response = np.fft.rfft(np.concatenate([[1.0], -self.a]), m)
+        white = np.fft.rfft(np.sqrt(self.innovation) * rng.standard_normal(m))
+        return np.fft.irfft(white / response, m)[:n]
 
 
 def colour_of(parts: Sequence[Array], spent: float = 0.0) -> Colour:

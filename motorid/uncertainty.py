@@ -18,6 +18,7 @@ from motorid.integrate.grid import Array
 from motorid.least_squares import gauss_newton_covariance
 from motorid.tables import Table
 
+WIDE = 0.8  # of the value: an interval that reaches farther down is made on the logarithmic scale
 METHODS = ("coloured", "white")
 Blocks = Mapping[str, Sequence[tuple[Array, Array]]]
 
@@ -36,7 +37,7 @@ class Covariance:
     status : mapping of str to str
         ``"determined"``, ``"not determined"``, ``"at its lower limit"`` or ``"at its upper limit"``.
     positive : tuple of bool
-        Which intervals are made on the logarithmic scale.
+        Which unknowns cannot be zero or negative.
     method : str
     dof : float
         Effective degrees of freedom of the residuals.
@@ -71,7 +72,8 @@ class Covariance:
     def interval(self, name: str, level: float = 0.95) -> tuple[float, float] | None:
         """Return the two-sided confidence interval of one unknown; None where the data do not determine it.
 
-        Student's t on the effective degrees of freedom; for positive parameters on the logarithmic scale.
+        Student's t on the effective degrees of freedom; on the logarithmic scale where a positive parameter's
+        interval would come near zero.
         """
         if name not in self.names:
             raise UsageError(one_of(name, self.names, "unknown"))
@@ -82,7 +84,7 @@ class Covariance:
             return None
         reach = float(stdtrit(self.dof, 0.5 + level / 2)) * sd
         value = float(self.values[j])
-        if self.positive[j]:
+        if self.positive[j] and reach > WIDE * value:
             return value * float(np.exp(-reach / value)), value * float(np.exp(reach / value))
         return value - reach, value + reach
 
@@ -116,8 +118,14 @@ class Covariance:
 
 
 def interval_text(limits: tuple[float, float] | None) -> str:
-    """Return an interval for a table; an open end is infinite, an unknown interval a dash."""
-    return f"{number(limits[0])} … {number(limits[1])}" if limits else "–"
+    """Return an interval with the digits that its width asks for; an unknown one as a dash."""
+    if limits is None:
+        return "–"
+    low, high = limits
+    finite = [abs(x) for x in limits if np.isfinite(x)]
+    width = (high - low) / max(finite) if np.isfinite(high - low) and any(finite) else 1.0
+    digits = int(np.clip(2 - np.floor(np.log10(max(width, 1e-12))), 3, 10))
+    return f"{number(low, digits)} … {number(high, digits)}"
 
 
 def covariance(fit: Fit, *, method: str = "coloured") -> Covariance:

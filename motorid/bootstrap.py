@@ -1,0 +1,244 @@
+"""The spread of refits to records that might as well have been measured.
+
+Efron & Tibshirani, An Introduction to the Bootstrap, 1993; blocks: Künsch, Annals of Statistics 17, 1989.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from motorid.coloured import Colour, colour_of
+from motorid.descent import descend
+from motorid.errors import FitError, MotoridError, UsageError, one_of
+from motorid.experiment import Experiment
+from motorid.fit import Failure, Fit
+from motorid.formatting import number, with_error
+from motorid.integrate.grid import Array
+from motorid.least_squares import LevenbergMarquardt
+from motorid.problem import Problem
+from motorid.tables import Table
+from motorid.tasks import Map, Parcel, in_chunks, run_tasks
+from motorid.uncertainty import covariance, interval_text
+
+KINDS = ("blocks", "parametric", "runs")
+FEWEST_RUNS = 4  # resampled as wholes: with fewer there are hardly any different samples
+SOLVER = LevenbergMarquardt(max_iterations=60, ftol=1e-7, xtol=1e-7)  # from the fit, next to the optimum
+
+
+@dataclass(frozen=True, eq=False)
+class Bootstrap:
+    """Refits to resampled records.
+
+    Attributes
+    ----------
+    kind : str
+    names : tuple of str
+    reference : ndarray, shape (k,)
+        The fit's values.
+    samples : ndarray, shape (n, k)
+    failures : tuple of Failure
+    limited : dict of str to float
+        Share of the refits that ended at a limit of the parameter.
+    units : tuple of str
+    status : mapping of str to str
+        As in `Covariance`. Refits start from the fit, so what the data do not determine hardly moves: their
+        spread says nothing then, and neither a standard deviation nor an interval is given.
+    block : int
+        Length of the blocks, in samples.
+    interrupted : str
+        Empty, or how far it came.
+    """
+
+    kind: str
+    names: tuple[str, ...]
+    reference: Array
+    samples: Array
+    failures: tuple[Failure, ...]
+    limited: Mapping[str, float]
+    units: tuple[str, ...]
+    status: Mapping[str, str]
+    block: int = 0
+    interrupted: str = ""
+
+    @property
+    def std(self) -> dict[str, float | None]:
+        """Standard deviation of the refits per parameter; None where the data do not determine it."""
+        spread = np.std(self.samples, axis=0, ddof=1)
+        return {n: float(s) if self.status[n] == "determined" else None
+                for n, s in zip(self.names, spread, strict=True)}
+
+    def interval(self, name: str, level: float = 0.95) -> tuple[float, float] | None:
+        """Return the percentile interval of a parameter; None where the data do not determine it."""
+        if name not in self.names:
+            raise UsageError(one_of(name, self.names, "parameter"))
+        if self.status[name] == "not determined":
+            return None
+        tail = 50 * (1 - level)
+        low, high = np.percentile(self.samples[:, self.names.index(name)], [tail, 100 - tail])
+        return float(low), float(high)
+
+    def to_dict(self, level: float = 0.95) -> dict[str, Any]:
+        """Return plain data."""
+        return {"kind": self.kind, "refits": len(self.samples), "failed": len(self.failures), "std": self.std,
+                "level": level, "intervals": {n: self.interval(n, level) for n in self.names},
+                "at_limit": dict(self.limited), "block": self.block, "interrupted": self.interrupted or None}
+
+    def __str__(self) -> str:
+        rows = []
+        for n, value, unit in zip(self.names, self.reference, self.units, strict=True):
+            share = f"{self.limited[n]:.0%} at its limit" if self.limited[n] else ""
+            said = f"{number(value, 3)} {unit} ({self.status[n]})"
+            said = said if self.std[n] is None else with_error(value, self.std[n], unit)
+            rows.append((n, said, interval_text(self.interval(n)), share))
+        note = f"{len(self.samples)} refits, {len(self.failures)} failed. {self.interrupted}".strip()
+        return str(Table(f"Bootstrap ({self.kind})", ("", "value ± std", "95 %", ""), tuple(rows),
+                         left=(0, 1, 2, 3), note=note))
+
+    __repr__ = __str__
+
+
+@dataclass(frozen=True, eq=False)
+class _Source:
+    """What a refit needs: the problem at the fit, and per run model outputs and residuals by channel (N,)."""
+
+    problem: Problem
+    predicted: tuple[dict[str, Array], ...]
+    residuals: tuple[dict[str, Array], ...]
+    colours: dict[str, Colour]
+    kind: str
+    block: int
+
+
+def bootstrap(fit: Fit, *, kind: str = "blocks", n: int = 200, block: int | None = None, seed: int = 0,
+              map: Map | None = None, quiet: bool = False) -> Bootstrap:
+    """Refit to resampled records, from the fitted values, and collect the parameters.
+
+    Parameters
+    ----------
+    fit : Fit
+    kind : {"blocks", "parametric", "runs"}
+        ``"blocks"``: model plus blocks of its residuals, which keeps their colour and the likeness of
+        channels. ``"parametric"``: model plus noise of the autoregression fitted to the residuals.
+        ``"runs"``: whole runs drawn with replacement, which also covers what differs from run to run.
+    n : int
+        Number of refits.
+    block : int, optional
+        Length of a block in samples; default from the residuals' correlation.
+    seed : int
+        The result depends on it alone, not on the pool.
+    map : callable, optional
+        Anything with the signature of `map`.
+    quiet : bool
+        No progress bar.
+
+    Raises
+    ------
+    UsageError
+        If there are too few runs to resample them, or the kind is unknown.
+    FitError
+        If fewer than two refits worked.
+    """
+    if kind not in KINDS:
+        raise UsageError(one_of(kind, KINDS, "kind of bootstrap"))
+    if n < 2:
+        raise UsageError(f"a bootstrap takes at least two refits; got {n}.")
+    if kind == "runs" and len(fit.problem.experiments) < FEWEST_RUNS:
+        raise UsageError(f"resampling runs needs at least {FEWEST_RUNS} of them; this fit has "
+                         f"{len(fit.problem.experiments)}. Use kind='blocks', or cut runs with "
+                         "motorid.experiment.split.")
+    source = _source(fit, kind, block)
+    parcel = Parcel.of(source)
+    chunks = in_chunks(np.random.SeedSequence(seed).spawn(n), map)
+    done = run_tasks(_refits, [(parcel, c) for c in chunks], map, "Refitting resampled records", quiet=quiet)
+    found = [r for part in done.results for r in part]
+    names = fit.problem.model.free_names
+    rows = [[r[k] for k in names] for r in found if not isinstance(r, Failure)]
+    failures = tuple(r for r in found if isinstance(r, Failure))
+    if len(rows) < 2:
+        why = f"; the first failure: {failures[0].message}" if failures else " before the interruption."
+        raise FitError(f"fewer than two refits worked{why}")
+    samples, pars = np.array(rows), fit.problem.model.parameters
+    limited = {k: float(np.mean((samples[:, j] <= pars[k].lower) | (samples[:, j] >= pars[k].upper)))
+               for j, k in enumerate(names)}
+    said = f"Interrupted after {len(found)} of {n}." if done.interrupted else ""
+    return Bootstrap(kind, names, np.array([fit.values[k] for k in names]), samples, failures, limited,
+                     tuple(pars[k].unit for k in names), covariance(fit).status, source.block, said)
+
+
+def _source(fit: Fit, kind: str, block: int | None) -> _Source:
+    problem = fit.problem
+    predicted = tuple(dict(s.outputs) for s in fit.simulations)
+    residuals = tuple({c: s.residual(c) for c in s.experiment.outputs if c in s.outputs}
+                      for s in fit.simulations)
+    spent = len(problem.unknown) / len(problem.outputs)
+    colours, scale = {}, {}
+    for c in problem.outputs:
+        parts = [r[c] for r in residuals if c in r]
+        colours[c] = colour_of(parts, spent)
+        count = sum(int(np.isfinite(p).sum()) for p in parts)
+        scale[c] = np.sqrt(count / max(count - spent, 1.0))
+    residuals = tuple({c: scale[c] * (e - np.nanmean(e)) for c, e in r.items()} for r in residuals)
+    at_fit = problem.for_model(problem.model.start_at(fit.values))
+    return _Source(at_fit, predicted, residuals, colours, kind, block or _block_length(colours, residuals))
+
+
+def _block_length(colours: Mapping[str, Colour], residuals: Sequence[Mapping[str, Array]]) -> int:
+    """Several correlation times, at least the cube root of the samples, at most a fifth of a run."""
+    n = min(len(e) for r in residuals for e in r.values())
+    times = [1.0 / max(c.effective_share, 1e-3) for c in colours.values()]
+    return int(np.clip(4 * max(times), np.ceil(n ** (1 / 3)), max(n // 5, 1)))
+
+
+def _refits(task: tuple[Parcel, Sequence[np.random.SeedSequence]]) -> list[dict[str, float] | Failure]:
+    source = task[0].open()
+    return [_refit(source, np.random.default_rng(seed)) for seed in task[1]]
+
+
+def _refit(source: _Source, rng: np.random.Generator) -> dict[str, float] | Failure:
+    problem = source.problem
+    try:
+        if source.kind == "runs":
+            drawn = rng.integers(0, len(problem.runs), len(problem.runs))
+            again = replace(problem, experiments=tuple(problem.experiments[k] for k in drawn),
+                            _runs=tuple(problem.runs[k] for k in drawn))
+        else:
+            runs = tuple(_resampled(source, k, rng) for k in range(len(problem.runs)))
+            again = problem.with_(experiments=runs)
+        done = descend(again, SOLVER, stages=False)
+    except (MotoridError, np.linalg.LinAlgError) as error:
+        return Failure(problem.model.values, "failed", str(error))
+    return done.problem.values(done.solution.q)
+
+
+def _resampled(source: _Source, k: int, rng: np.random.Generator) -> Experiment:
+    run = source.problem.runs[k]
+    e = _noise(source, k, rng) if source.kind == "parametric" else _blocks(source, k, rng)
+    outputs = {c: np.where(np.isfinite(y), source.predicted[k][c] + e[c], np.nan) if c in e else y
+               for c, y in run.experiment.outputs.items()}
+    return run.experiment.with_(outputs=outputs, sigma=dict(run.sigma))
+
+
+def _noise(source: _Source, k: int, rng: np.random.Generator) -> dict[str, Array]:
+    return {c: source.colours[c].draw(len(e), rng) for c, e in source.residuals[k].items()}
+
+
+def _blocks(source: _Source, k: int, rng: np.random.Generator) -> dict[str, Array]:
+    """Blocks of residuals from any run with the same channels, the same stretch for all channels."""
+    here = source.residuals[k]
+    n = len(next(iter(here.values())))
+    donors = [r for r in source.residuals if set(r) == set(here)]
+    pieces: dict[str, list[Array]] = {c: [] for c in here}
+    length = 0
+    while length < n:
+        donor = donors[rng.integers(len(donors))]
+        size = len(next(iter(donor.values())))
+        at = (rng.integers(size) + np.arange(source.block)) % size
+        for c in here:
+            pieces[c].append(donor[c][at])
+        length += source.block
+    joined = {c: np.concatenate(p)[:n] for c, p in pieces.items()}
+    return {c: np.where(np.isfinite(e), e, 0.0) for c, e in joined.items()}

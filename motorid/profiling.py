@@ -1,0 +1,218 @@
+"""Profile likelihood: how much worse does the best fit become when one parameter is held elsewhere?
+
+The only interval that can say "no upper end": where the cost stays low however far the parameter moves, the
+data do not limit it on that side (Raue et al., Bioinformatics 25, 2009). Coloured residuals are allowed for
+by dividing the rise of the cost by the factor by which they enlarge the parameter's variance (Kent,
+Biometrika 69, 1982).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.special import stdtrit
+
+from motorid.descent import descend
+from motorid.errors import MotoridError, UsageError, one_of
+from motorid.fit import Fit
+from motorid.formatting import number
+from motorid.integrate.grid import Array
+from motorid.least_squares import LevenbergMarquardt, gauss_newton_covariance
+from motorid.problem import Problem
+from motorid.tasks import Map, Parcel, run_tasks
+from motorid.uncertainty import covariance, interval_text
+
+FARTHEST = np.log(1e4)  # on the logarithmic scale; beyond it a parameter counts as not limited
+MOST = 30  # points per side
+Point = tuple[float, float, dict[str, float]]  # value held, rise, all values
+SOLVER = LevenbergMarquardt(max_iterations=60, ftol=1e-8, xtol=1e-8)
+
+
+@dataclass(frozen=True, eq=False)
+class Profile:
+    """The profile of one parameter.
+
+    Attributes
+    ----------
+    name, unit : str
+    value : float
+        The fit's.
+    values : ndarray, shape (m,)
+        Where it was held, increasing.
+    rise : ndarray, shape (m,)
+        Rise of twice the cost over that of the fit, in units of the variance; compared with t².
+    others : dict of str to ndarray (m,)
+        How the other parameters followed.
+    dof : float
+        Effective degrees of freedom.
+    positive : bool
+    """
+
+    name: str
+    unit: str
+    value: float
+    values: Array
+    rise: Array
+    others: dict[str, Array]
+    dof: float
+    positive: bool
+
+    @property
+    def best(self) -> float:
+        """Lowest `rise`; clearly below zero means that the fit was not at the optimum."""
+        return float(self.rise.min())
+
+    def interval(self, level: float = 0.95) -> tuple[float, float]:
+        """Return where the profile crosses the level; an open end is infinite (0 below for positive ones)."""
+        if not 0 < level < 1:
+            raise UsageError(f"a confidence level lies between 0 and 1; got {level!r}.")
+        reach = float(stdtrit(self.dof, 0.5 + level / 2))
+        start = int(np.argmin(np.abs(self.values - self.value)))
+        low = _crossing(self._scale(self.values[start::-1]), self.rise[start::-1], reach)
+        high = _crossing(self._scale(self.values[start:]), self.rise[start:], reach)
+        return ((0.0 if self.positive else -np.inf) if low is None else self._back(low),
+                np.inf if high is None else self._back(high))
+
+    def _scale(self, p: Array) -> Array:
+        return np.log(p) if self.positive else p
+
+    def _back(self, x: float) -> float:
+        return float(np.exp(x)) if self.positive else float(x)
+
+    def to_dict(self, level: float = 0.95) -> dict[str, Any]:
+        """Return plain data; an open end is null."""
+        low, high = self.interval(level)
+        return {"name": self.name, "value": self.value, "level": level, "values": self.values.tolist(),
+                "rise": self.rise.tolist(), "interval": [low if np.isfinite(low) and low != 0 else None,
+                                                         high if np.isfinite(high) else None]}
+
+    def __str__(self) -> str:
+        low, high = self.interval()
+        below = low == 0 if self.positive else not np.isfinite(low)
+        if below and not np.isfinite(high):
+            said = "not limited on either side"
+        elif below:
+            said = f"below {number(high)} {self.unit} (95 %), no lower limit"
+        elif not np.isfinite(high):
+            said = f"above {number(low)} {self.unit} (95 %), no upper limit"
+        else:
+            said = f"{interval_text((low, high))} {self.unit} (95 %)"
+        better = " The profile found a better fit than the one given." if self.best < -1.0 else ""
+        return f"{self.name} = {number(self.value, 5)} {self.unit}: {said}.{better}"
+
+    __repr__ = __str__
+
+
+def _crossing(x: Array, rise: Array, reach: float) -> float | None:
+    """Where sqrt(rise), interpolated, first exceeds `reach` going outward; None if it never does."""
+    root = np.sqrt(np.maximum(rise, 0.0))
+    above = np.flatnonzero(root > reach)
+    if not above.size:
+        return None
+    j = int(above[0])
+    if j == 0:
+        return float(x[0])
+    return float(np.interp(reach, root[j - 1:j + 1], x[j - 1:j + 1]))
+
+
+def profile(fit: Fit, name: str, *, level: float = 0.95, map: Map | None = None,
+            quiet: bool = False) -> Profile:
+    """Return the profile likelihood of one parameter, far enough out for intervals at `level`.
+
+    Parameters
+    ----------
+    fit : Fit
+    name : str
+        A free parameter.
+    level : float
+    map : callable, optional
+        Anything with the signature of `map`; the two sides are two tasks.
+    quiet : bool
+        No progress bar.
+
+    Raises
+    ------
+    UsageError
+        If the parameter is unknown or held.
+    """
+    return profiles(fit, [name], level=level, map=map, quiet=quiet)[name]
+
+
+def profiles(fit: Fit, names: Sequence[str] | None = None, *, level: float = 0.95, map: Map | None = None,
+             quiet: bool = False) -> dict[str, Profile]:
+    """Return the profiles of several parameters, by default of all free ones; see `profile`."""
+    free = fit.problem.model.free_names
+    for n in names or ():
+        if n not in free:
+            raise UsageError(one_of(n, free, "free parameter"))
+    chosen = tuple(names or free)
+    parcel = Parcel.of((fit.problem, dict(fit.values), fit.cost))
+    plans = {n: _plan(fit, n, level) for n in chosen}
+    tasks = [(parcel, n, side, *plans[n][:3]) for n in chosen for side in (-1.0, 1.0)]
+    done = run_tasks(_side, tasks, map, "Profiling", quiet=quiet)
+    sides = done.results + [[]] * (len(tasks) - len(done.results))
+    return {n: _joined(fit, n, sides[2 * k], sides[2 * k + 1], plans[n][3]) for k, n in enumerate(chosen)}
+
+
+def _plan(fit: Fit, name: str, level: float) -> tuple[float, float, float, float]:
+    """Return first step in q, variance factor, height to reach, degrees of freedom."""
+    found = covariance(fit)
+    j = found.names.index(name)
+    slope = fit.problem.scaling.slope(fit.q)[j]
+    plain = gauss_newton_covariance(fit.jacobian)[0]
+    overall = np.median([c.variance for c in found.colours.values()])
+    sd = found.std[name]
+    factor = float(found.matrix[j, j] / plain[j, j]) if sd else float(overall)
+    step = float(np.clip(0.7 * sd / abs(slope), 1e-6, 0.5)) if sd else 0.25
+    height = 1.3 * float(stdtrit(found.dof, 0.5 + level / 2)) ** 2
+    return step, factor, height, found.dof
+
+
+def _side(task: tuple[Parcel, str, float, float, float, float]) -> list[Point]:
+    """Walk outward from the fit until the cost has risen enough, the limit is reached, or nothing changes."""
+    parcel, name, side, step, factor, height = task
+    problem, values, cost = parcel.open()
+    j = [p.name for p in problem.unknown].index(name)
+    parameter, scale = problem.model.parameters[name], problem.scaling
+    q0 = float(scale.scaled([values.get(p.name, p.value) for p in problem.unknown])[j])
+    low, high = scale.bounds[0][j], scale.bounds[1][j]
+    farthest = FARTHEST if parameter.positive else max(1e3 * step, 10 * abs(q0))
+    points: list[Point] = []
+    at, before = q0, 0.0
+    while len(points) < MOST and abs(at - q0) < farthest:
+        at = float(np.clip(at + side * step, low, high))
+        p = float(scale.scale[j] * np.exp(at) if scale.log[j] else scale.scale[j] * at)
+        found = _held(problem, values, name, p)
+        if found is None:
+            break
+        rise, values = 2 * (found[0] - cost) / factor, found[1]
+        points.append((p, rise, values))
+        if rise > height or at in (low, high):
+            break
+        # Twice as far where little happens, so that an open end is seen soon.
+        step *= 2.0 if np.sqrt(max(rise, 0.0)) - np.sqrt(max(before, 0.0)) < 0.35 else 1.0
+        before = rise
+    return points
+
+
+def _held(problem: Problem, values: dict[str, float], name: str,
+          p: float) -> tuple[float, dict[str, float]] | None:
+    here = problem.for_model(problem.model.start_at(values).fix(**{name: p}))
+    try:
+        done = descend(here, SOLVER, stages=False)
+    except (MotoridError, np.linalg.LinAlgError):
+        return None
+    r = done.solution.residual
+    return 0.5 * float(r @ r), done.problem.values(done.solution.q)
+
+
+def _joined(fit: Fit, name: str, left: list[Point], right: list[Point], dof: float) -> Profile:
+    middle = (fit.values[name], 0.0, dict(fit.values))
+    points = [*reversed(left), middle, *right]
+    p = fit.problem.model.parameters[name]
+    others = {n: np.array([v[n] for _, _, v in points]) for n in fit.problem.model.free_names if n != name}
+    return Profile(name, p.unit, fit.values[name], np.array([v for v, _, _ in points]),
+                   np.array([r for _, r, _ in points]), others, dof, p.positive)
