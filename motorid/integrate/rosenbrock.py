@@ -23,6 +23,7 @@ PATIENCE = 0.15  # s in the virtual machine before a step is worth compiling
 MOST_SUBSTEPS = 256
 MOST_PASSES = 6
 ASTRAY = 0.3  # local error, relative to the state so far, at which a step is lost
+STRAY = 1e3  # growth of a state that shows it
 
 
 @dataclass(frozen=True)
@@ -89,8 +90,8 @@ def _astray(size: Array, error: Array) -> int | None:
         return None
     k = int(np.argmax(lost))
     before, after = np.maximum(size[:, k], 1e-12), np.maximum(size[:, k + 1], 1e-12)
-    jumped = (after > 10 * before) & (before > 1e-12)
-    return k if np.any(jumped | (size[:, -1] > 10 * after)) else None
+    jumped = (after > STRAY * before) & (before > 1e-12)
+    return k if np.any(jumped | (size[:, -1] > STRAY * after)) else None
 
 
 class Stepper:
