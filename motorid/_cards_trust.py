@@ -40,7 +40,8 @@ def _entry(entry: tuple[float, float | None] | None, unit: str) -> str | Flag:
 
 def _suggestion(s: Any) -> Card:
     best = sorted(s.discrimination.items(), key=lambda p: -p[1])
-    rows: list[Sequence[str | Flag]] = [[Flag(n, "good") if n == s.name else n, number(v, 3)] for n, v in best]
+    rows: list[Sequence[str | Flag]] = []
+    rows += [[Flag(n, "good") if n == s.name else n, number(v, 3)] for n, v in best]
     table = Table(["experiment", "expected χ² per sample between the models"], rows)
     return Card(
         "Next experiment",

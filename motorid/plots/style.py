@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -138,6 +139,13 @@ def new_figure(width: float, height: float) -> Figure:
     import matplotlib.pyplot as plt
 
     return plt.figure(figsize=(width, height), layout="constrained")
+
+
+def png_of(axes: Any) -> bytes:
+    """Return the figure of some axes as a PNG."""
+    buffer = io.BytesIO()
+    np.atleast_1d(np.asarray(axes, object)).ravel()[0].figure.savefig(buffer, format="png", dpi=90)
+    return buffer.getvalue()
 
 
 def grid(rows: int, columns: int, *, row: float = 1.6, width: float = WIDTH, **options: Any) -> np.ndarray:

@@ -1,0 +1,260 @@
+"""A model to play with in a notebook: tick effects, move parameters, see curves and errors change, refit."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from motorid._html import render_table
+from motorid._html_tables import counted, error_table, model_name
+from motorid.effects import LIBRARY, get
+from motorid.errors import MissingDependency, ModelError, MotoridError, UsageError
+from motorid.experiment import Experiment
+from motorid.fit import Fit, fit
+from motorid.formatting import duration
+from motorid.model import Effect, Model
+from motorid.parameters import Parameter
+from motorid.problem import Problem
+from motorid.simulate import evaluate
+from motorid.starting import with_suited_effects
+
+__all__ = ["Explorer", "explore"]
+
+REACH = 10.0  # a slider goes from a tenth to ten times the value it begins with
+
+
+class Explorer:
+    """What `explore` shows. Everything that the mouse can do is a method, too.
+
+    Attributes
+    ----------
+    fit : Fit
+        The last one: that given, or that of the last refit.
+    model : Model
+        As ticked and set at present.
+    evaluation : Evaluation
+        Errors of `model` on the records.
+    message : str
+        Why the last action could not be done, or what it did.
+    widget : ipywidgets.Widget
+        The controls and the figure.
+    """
+
+    def __init__(self, start: Fit, effects: Sequence[Effect], runs: Sequence[Experiment]) -> None:
+        self.fit, self.runs, self._first = start, tuple(runs), start
+        self.model, self.evaluation, self.message = start.model, evaluate(start, runs), ""
+        self._effects = {e.name: e for e in effects}
+        self._quiet = False
+        self._build()
+
+    # -- what can be done --------------------------------------------------------------------------------
+    def tick(self, name: str, on: bool = True) -> None:
+        """Put the effect `name` into the model, at a size that suits the records, or take it out."""
+        try:
+            model = self.model + self._effects[name] if on else self.model.without(name)
+            self._try(with_suited_effects(model, self.runs), f"{'with' if on else 'without'} {name}")
+        except (MotoridError, KeyError) as error:
+            self._say(str(error) if isinstance(error, MotoridError) else f"there is no effect '{name}' here.")
+        self._show_controls()
+
+    def move(self, **values: float) -> None:
+        """Set parameters, in SI units."""
+        try:
+            self._try(self.model.start_at(self._known(values)), "moved")
+        except MotoridError as error:
+            self._say(str(error))
+        self._show_values()
+
+    def refit(self) -> None:
+        """Fit the model as it is ticked, from its present values."""
+        try:
+            found = fit(self.model, self.runs, **self._options)
+        except MotoridError as error:
+            self._say(str(error))
+            return
+        self.fit = found
+        self._try(found.model, f"refitted: {found.status} in {duration(found.seconds)}")
+        self._show_controls()
+
+    def reset(self) -> None:
+        """Go back to the fit that it began with."""
+        self.fit = self._first
+        self._try(self._first.model, "back to the beginning")
+        self._show_controls()
+
+    @property
+    def _options(self) -> dict[str, Any]:
+        problem = self._first.problem
+        return {
+            "engine": problem.engine,
+            "initial": problem.initial,
+            "weights": problem.weights,
+            "loss": problem.loss,
+        }
+
+    def _known(self, values: Mapping[str, float]) -> Mapping[str, float]:
+        for name in values:
+            if name not in self.model.parameters:
+                raise UsageError(
+                    f"the model has no parameter '{name}'; it has {', '.join(self.model.parameters)}."
+                )
+        return values
+
+    def _try(self, model: Model, done: str) -> None:
+        """Take `model` if it can be simulated; else say why and stay."""
+        problem = self._first.problem
+        try:
+            judged = evaluate(model, self.runs, engine=problem.engine, initial=problem.initial)
+        except MotoridError as error:
+            self._say(str(error))
+            return
+        self.model, self.evaluation = model, judged
+        self._say(done)
+        self._draw()
+
+    # -- the widgets -------------------------------------------------------------------------------------
+    def _build(self) -> None:
+        import ipywidgets as w
+
+        self._picture = w.Image(format="png", layout=w.Layout(max_width="100%"))
+        self._errors, self._status = w.HTML(), w.HTML()
+        self.boxes = {n: self._box(n) for n in self._effects}
+        self._sliders = w.VBox()
+        self.sliders: dict[str, Any] = {}
+        refit = w.Button(description="Refit", button_style="primary", tooltip="Fit the model as it is ticked")
+        reset = w.Button(description="Reset", tooltip="Back to the fit it began with")
+        refit.on_click(lambda _: self.refit())
+        reset.on_click(lambda _: self.reset())
+        self.buttons = {"refit": refit, "reset": reset}
+        ticks = w.GridBox(list(self.boxes.values()), layout=w.Layout(grid_template_columns="1fr 1fr"))
+        titles = w.HTML("<b>Effects</b>"), w.HTML("<b>Parameters</b>")
+        parts = [titles[0], ticks, titles[1], self._sliders, w.HBox([refit, reset]), self._status]
+        controls = w.VBox(parts, layout=w.Layout(width="25rem", flex="0 0 auto"))
+        shown = w.VBox([self._errors, self._picture], layout=w.Layout(flex="1 1 30rem"))
+        self.widget = w.HBox([controls, shown], layout=w.Layout(flex_flow="row wrap", width="100%"))
+        self._draw()
+        self._show_controls()
+
+    def _box(self, name: str) -> Any:
+        import ipywidgets as w
+
+        box = w.Checkbox(value=name in self.model.effect_names, description=name, indent=False,
+                         layout=w.Layout(width="auto"))  # fmt: skip
+        box.observe(lambda change: self._quiet or self.tick(name, change["new"]), "value")
+        return box
+
+    def _slider(self, p: Parameter) -> Any:
+        import ipywidgets as w
+
+        size = abs(p.value) or 1e-3
+        common: dict[str, Any] = {"description": p.name, "continuous_update": False, "disabled": False}
+        if p.positive:
+            power = float(np.log10(p.value))
+            slider = w.FloatLogSlider(value=p.value, base=10, min=power - 1, max=power + 1, step=0.002,
+                                      readout_format=".3g", **common)  # fmt: skip
+        else:
+            low, high = max(p.lower, p.value - REACH * size), min(p.upper, p.value + REACH * size)
+            step = 1.0 if p.order else (high - low) / 2000
+            slider = w.FloatSlider(
+                value=p.value, min=low, max=high, step=step, readout_format=".3g", **common
+            )
+        slider.observe(lambda change: self._quiet or self.move(**{p.name: change["new"]}), "value")
+        slider.tooltip = f"{p.doc} ({p.unit})" if p.unit else p.doc
+        return slider
+
+    def _show_controls(self) -> None:
+        """Make ticks and sliders agree with the model."""
+        self._quiet = True
+        for name, box in self.boxes.items():
+            box.value = name in self.model.effect_names
+        wanted = [p for p in self.model.parameters.values() if p.name != "sgn_width"]
+        self.sliders = {p.name: self._slider(p) for p in wanted}
+        self._sliders.children = tuple(self.sliders.values())
+        self._quiet = False
+
+    def _show_values(self) -> None:
+        self._quiet = True
+        for name, slider in self.sliders.items():
+            value = self.model.parameters[name].value
+            slider.max, slider.min = (
+                max(slider.max, _place(slider, value)),
+                min(slider.min, _place(slider, value)),
+            )
+            slider.value = value
+        self._quiet = False
+
+    def _draw(self) -> None:
+        from motorid.plots import plot_fit
+        from motorid.plots.style import detached, png_of
+
+        with detached():
+            axes = plot_fit(self.evaluation, before=self._first)
+        self._picture.value = png_of(axes)
+        units = {c: u for r in self.runs for c, u in r.units.items()}
+        table = render_table(error_table([("now", self.evaluation), ("at first", self._first)], units))
+        self._errors.value = f"<b>{model_name(self.model)}</b>{table}"
+
+    def _say(self, message: str) -> None:
+        self.message = message
+        if hasattr(self, "_status"):
+            from html import escape
+
+            self._status.value = f"<span>{escape(message)}</span>"
+
+    def _repr_mimebundle_(self, **options: Any) -> Any:
+        return self.widget._repr_mimebundle_(**options)
+
+    def __repr__(self) -> str:
+        return f"<explorer of {model_name(self.model)} on {counted(len(self.runs), 'run')}>"
+
+
+def explore(fit: Fit, *, effects: Iterable[Effect | str] | None = None) -> Explorer:
+    """Play with a fit in a notebook: tick effects, move parameters, see the curves and the error, refit.
+
+    Parameters
+    ----------
+    fit : Fit
+    effects : iterable of Effect or str, optional
+        What can be ticked; by default every effect of the library that the measured channels can see.
+
+    Returns
+    -------
+    Explorer
+        Shows itself at the end of a cell. ``explorer.fit`` is the last refit, ``explorer.model`` the model
+        as ticked.
+
+    Raises
+    ------
+    MissingDependency
+        Without ipywidgets.
+    """
+    if not isinstance(fit, Fit):
+        raise UsageError(
+            f"explore takes a fit, mi.explore(mi.fit(mi.dc_motor(), runs)); got {type(fit).__name__}."
+        )
+    try:
+        import ipywidgets  # noqa: F401
+    except ImportError:
+        raise MissingDependency("mi.explore needs ipywidgets: pip install 'motorid[notebooks]'.") from None
+    chosen = LIBRARY.values() if effects is None else [get(e) if isinstance(e, str) else e for e in effects]
+    own = [e for e in fit.model.effects if e.name not in {c.name for c in chosen}]
+    runs = fit.problem.experiments
+    return Explorer(fit, [e for e in (*own, *chosen) if effects is not None or _can_be_seen(fit, e)], runs)
+
+
+def _can_be_seen(fit: Fit, effect: Effect) -> bool:
+    if effect.name in fit.model.effect_names:
+        return True
+    try:
+        Problem(fit.model + effect, fit.problem.experiments)
+    except ModelError as error:
+        return "same friction" in str(error) or "takes" in str(
+            error
+        )  # it may be ticked once the other is not
+    return True
+
+
+def _place(slider: Any, value: float) -> float:
+    return float(np.log10(value)) if type(slider).__name__ == "FloatLogSlider" else value
