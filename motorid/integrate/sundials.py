@@ -1,10 +1,10 @@
 """CVODES and IDAS through CasADi: the reference engines, with forward sensitivities.
 
 A call never spans a jump of the input (CVODES stops there): the record is cut where the input changes. Parts
-of evenly spaced samples under one constant input are walked in pieces of 2^k samples over scaled time: a few
-integrators then serve every record. Derivatives are taken in forward mode only, over scaled states;
-`quad_err_con` is set because without it CasADi's CVODES interface can return wrong derivatives silently
-(casadi issue 4383).
+of evenly spaced samples under one constant input are walked in one go over scaled time, by the next larger of
+a few integrators (2, 3, 4, 6, 8, 12 … samples), which then serve every record. Derivatives are taken in
+forward mode only, over scaled states; `quad_err_con` is set because without it CasADi's CVODES interface can
+return wrong derivatives silently (casadi issue 4383).
 """
 
 from __future__ import annotations
@@ -23,9 +23,10 @@ from motorid.integrate.grid import Array, Grid, Trajectory
 from motorid.integrate.rosenbrock import Rosenbrock, stepper
 from motorid.system import System
 
+NOT_FINITE = "numbers no longer finite"
 REASONS = ("CV_ERR_FAILURE", "CV_CONV_FAILURE", "CV_TOO_MUCH_WORK", "IDA_ERR_FAIL", "IDA_CONV_FAIL",
-           "IDA_TOO_MUCH_WORK")
-LONGEST = 10  # pieces of at most 2**10 samples
+           "IDA_TOO_MUCH_WORK", NOT_FINITE)
+LENGTHS = sorted([1 << k for k in range(12)] + [3 << k for k in range(10)])  # samples per call
 
 
 @dataclass(frozen=True)
@@ -50,15 +51,24 @@ class _Sundials:
         if not integrators:
             integrators.append(_Integrators(self.name, self.rtol, self.atol, system, nq))
         for first, count in _pieces(grid):
-            try:
-                integrators[0].walk(grid, first, count, x, dx, p, dp, scale)
-            except RuntimeError as error:
-                reason = next((w for w in REASONS if w in str(error)), "no convergence")
-                raise SimulationError(f"{self.name} stopped after t = {grid.t[first]:.6g} s ({reason}). Try "
-                                      "engine='rosenbrock', or parameters nearer to the motor's.") from None
-            if not np.isfinite(x[first + 1:first + count + 1]).all():
-                raise SimulationError(f"{self.name} left the finite numbers after t = {grid.t[first]:.6g} s.")
+            self._walk(integrators[0], grid, first, count, x, dx, p, dp, scale)
         return observe(system, grid, x, dx if nq else None, p, dp)
+
+    def _walk(self, integrators: _Integrators, grid: Grid, first: int, count: int, *rest: Any) -> None:
+        x = rest[0]
+        try:
+            integrators.walk(grid, first, count, *rest)
+            if not np.isfinite(x[first + 1:first + count + 1]).all():
+                raise RuntimeError(NOT_FINITE)
+        except RuntimeError as error:
+            if count not in LENGTHS:  # it may have stopped beyond the end of the piece
+                part = max(n for n in LENGTHS if n < count)
+                self._walk(integrators, grid, first, part, *rest)
+                self._walk(integrators, grid, first + part, count - part, *rest)
+                return
+            reason = next((w for w in REASONS if w in str(error)), "no convergence")
+            raise SimulationError(f"{self.name} stopped after t = {grid.t[first]:.6g} s ({reason}). Try "
+                                  "engine='rosenbrock', or parameters nearer to the motor's.") from None
 
     def prepare(self, system: System, grid: Grid, x0: Array, p: Array,
                 tolerance: float | Callable[[Trajectory], float]) -> Grid:
@@ -93,7 +103,10 @@ class _Integrators:
 
     def __init__(self, plugin: str, rtol: float, atol: float, system: System, nq: int) -> None:
         self.system, self.plugin, self.nq = system, plugin, nq
-        self.options = {"reltol": rtol, "abstol": atol, "quad_err_con": True, "max_num_steps": 100000}
+        # Without second-order correction Newton's matrix is one block for all sensitivities: exact too, faster;
+        # CasADi cannot do so with algebraic states.
+        self.options = {"reltol": rtol, "abstol": atol, "quad_err_con": True, "max_num_steps": 100000,
+                        "second_order_correction": not all(system.stored)}
         self.made: dict[int, tuple[ca.Function, ca.Function | None]] = {}
         self.stored = np.array(system.stored)
 
@@ -124,7 +137,8 @@ class _Integrators:
     def walk(self, grid: Grid, first: int, count: int, x: Array, dx: Array, p: Array, dp: Array | None,
              scale: Array) -> None:
         """Fill x and dx for `count` intervals from sample `first`."""
-        main, forward = self._integrator(count)
+        length = next(n for n in LENGTHS if n >= count)
+        main, forward = self._integrator(length)
         h = (grid.t[first + count] - grid.t[first]) / count
         theta = np.concatenate([p, grid.u0[first], grid.u1[first], [h], scale])
         d, a = self.stored, ~self.stored
@@ -133,9 +147,9 @@ class _Integrators:
         if a.any():
             given["z0"] = x[first, a] / scale[a]
         res = main(**given)
-        x[ks][:, d] = np.asarray(res["xf"]).T * scale[d]
+        x[ks][:, d] = np.asarray(res["xf"]).T[:count] * scale[d]
         if a.any():
-            x[ks][:, a] = np.asarray(res["zf"]).T * scale[a]
+            x[ks][:, a] = np.asarray(res["zf"]).T[:count] * scale[a]
         if forward is None or dp is None:
             return
         seeds = np.zeros((theta.size, self.nq))
@@ -145,7 +159,7 @@ class _Integrators:
         sens = forward(**given)
         for which, key in ((d, "fwd_xf"), (a, "fwd_zf")):
             if which.any():
-                raw = np.asarray(sens[key]).reshape(which.sum(), self.nq, count)
+                raw = np.asarray(sens[key]).reshape(which.sum(), self.nq, length)[:, :, :count]
                 dx[ks][:, which, :] = raw.transpose(2, 0, 1) * scale[which][None, :, None]
 
 
@@ -164,7 +178,7 @@ def _pieces(grid: Grid) -> Iterator[tuple[int, int]]:
     starts = np.append(np.flatnonzero(~same), len(dt))
     for a, b in pairwise(starts.tolist()):
         while a < b:
-            count = 1 << min((b - a).bit_length() - 1, LONGEST)
+            count = min(b - a, LENGTHS[-1])
             yield a, count
             a += count
 
