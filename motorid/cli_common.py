@@ -28,11 +28,13 @@ class Command(TyperCommand):
 class Group(TyperGroup):
     """Turns errors into one sentence on standard error and the exit status."""
 
-    def main(self, args: Sequence[str] | None = None, prog_name: str | None = None, complete_var: str | None = None,
-             standalone_mode: bool = True, windows_expand_args: bool = True, **extra: Any) -> Any:
+    def main(self, args: Sequence[str] | None = None, prog_name: str | None = None,
+             complete_var: str | None = None, standalone_mode: bool = True, windows_expand_args: bool = True,
+             **extra: Any) -> Any:
         """See click; leaves by `SystemExit`."""
         try:
-            status = super().main(args, prog_name or "motorid", complete_var, False, windows_expand_args, **extra)
+            status = super().main(args, prog_name or "motorid", complete_var, standalone_mode=False,
+                                  windows_expand_args=windows_expand_args, **extra)
         except MotoridError as error:
             _say(str(error))
             status = WRONG if isinstance(error, DataError | ModelError | UsageError) else FAILED
@@ -66,8 +68,8 @@ def show(*parts: Table | str | None) -> None:
         if isinstance(part, str):
             console.print(Text(part))
             continue
-        drawn = RichTable(title=part.title or None, box=box.SIMPLE_HEAD, title_justify="left", title_style="bold",
-                          caption=part.note or None)
+        drawn = RichTable(title=part.title or None, box=box.SIMPLE_HEAD, title_justify="left",
+                          title_style="bold", caption=part.note or None)
         for k, head in enumerate(part.heads):
             drawn.add_column(head, justify="left" if k in part.left else "right", overflow="fold")
         for row in part.rows:

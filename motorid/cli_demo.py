@@ -5,42 +5,65 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from motorid import effects
 from motorid.cli_common import show
 from motorid.datasets import data_path
-from motorid.errors import DataError
+from motorid.diagnosis import diagnose
+from motorid.diagnosis.results import Diagnosis
+from motorid.errors import UsageError
 from motorid.fit import fit
 from motorid.model import dc_motor
+from motorid.progress import progress
 from motorid.reading import read_runs
-from motorid.simulate import evaluate
-from motorid.summary import fit_dict
-from motorid.tables import comparison_table
+from motorid.tables import comparison_table, error_table, ladder_table, parameter_table, ranking_table
+
+SET = "hidden_friction"
 
 
 def tell(out: Path) -> dict[str, Any]:
-    """Fit the plain motor to `hidden_friction`, add Coulomb friction, show the error fall; return the figures."""
-    runs = read_runs(str(data_path("hidden_friction") / "run*.csv"))
-    check = read_runs(str(data_path("hidden_friction") / "check*.csv"))
-    show(f"{len(runs)} records of a motor, and one held out. The textbook model first.\n")
+    """Fit the plain motor, find what it lacks, add it; print it, save figures and the report.
+
+    Returns
+    -------
+    dict
+        The diagnosis as in ``diagnose --json``, and the files written.
+
+    Raises
+    ------
+    UsageError
+        If the folder cannot be written.
+    """
+    _make(out)
+    runs, check = (read_runs(str(data_path(SET) / pattern)) for pattern in ("run*.csv", "check*.csv"))
+    show(f"1. Records: {len(runs)} of a motor ({data_path(SET)}), and one held out that no fit will see.\n",
+         "2. The textbook model, fitted without a first guess:")
     plain = fit(dc_motor(), runs)
-    better = fit(plain.model + effects.coulomb, runs)
-    judged = [evaluate(plain, check), evaluate(better, check)]
-    show(comparison_table([("plain motor", plain), ("+ coulomb", better)], judged))
-    show("The plain motor fails, on the records it was fitted to and on the one it never saw. One effect more, "
-         f"Coulomb friction, and the held-out error of the speed falls from {100 * judged[0].nrmse['omega']:.1f} % "
-         f"to {100 * judged[1].nrmse['omega']:.1f} %.")
-    figure = _figure(plain, better, out)
-    show(f"Figure: {figure}")
-    return {"before": fit_dict(plain, judged[0]), "after": fit_dict(better, judged[1]), "figure": str(figure)}
+    show(parameter_table(plain), error_table(plain),
+         "   Its errors are far above the noise: something is missing.\n", "3. What?")
+    with progress("Trying the effects of the library") as advance:
+        found = diagnose(plain, check, progress=lambda _: advance(1))
+    show(found.missing.text, ranking_table(found.ranking, 4), found.text, "",
+         "4. Added, one line of code: fit.model + mi.effects." + (found.effects or ("…",))[0],
+         ladder_table(found.ladder), comparison_table([("before", found.before), ("after", found.after)]))
+    files = _files(found, check, out)
+    show("Written: " + ", ".join(files), "Now your own: motorid diagnose RUN... --report yours.html")
+    return found.to_dict() | {"files": files}
 
 
-def _figure(plain: Any, better: Any, out: Path) -> Path:
-    from motorid.plots import plot_fit
-
+def _make(out: Path) -> None:
     try:
         out.mkdir(parents=True, exist_ok=True)
-        path = out / "fit.png"
-        plot_fit(better, before=plain).flat[0].figure.savefig(path, dpi=120)
     except OSError as error:
-        raise DataError(f"cannot write to {out}: {error.strerror or error}. Choose another folder: --out DIR") from None
-    return path
+        raise UsageError(f"cannot write to {out}: {error.strerror or error}. Choose another folder: --out "
+                         "DIR") from None
+
+
+def _files(found: Diagnosis, check: Any, out: Path) -> list[str]:
+    from motorid.plots import plot_fit, plot_ladder
+    from motorid.report import report
+
+    drawn = {"fit.png": plot_fit(found.after, before=found.before).flat[0],
+             "ladder.png": plot_ladder(found)}
+    for name, axes in drawn.items():
+        axes.figure.savefig(out / name, dpi=120)
+    page = report(found, out / "report.html", command=f"motorid demo --out {out}", validate=check)
+    return [str(page), *(str(out / name) for name in drawn)]

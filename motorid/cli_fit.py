@@ -31,7 +31,9 @@ GOOD = ("converged", "limit", "stalled")
 
 
 @with_choices(Choices)
-def fit(runs: Runs, choices: Choices, validate: Validate = None, json: Json = None, report: Report = None) -> None:
+def fit(
+    runs: Runs, choices: Choices, validate: Validate = None, json: Json = None, report: Report = None,
+) -> None:
     """Fit a motor model to records, and say how far the numbers can be trusted.
 
     Example: motorid fit run*.csv --effects coulomb --validate check*.csv --json fit.json
@@ -56,9 +58,11 @@ def simulate(
     fit_json: Annotated[Path, typer.Argument(metavar="FIT.json", help="What fit --json or export wrote.")],
     runs: Runs,
     choices: Reading,
-    out: Annotated[Path | None, typer.Option(metavar="DIR", help="Write the simulated channels as CSV.")] = None,
+    out: Annotated[Path | None, typer.Option(
+        metavar="DIR", help="Write the simulated channels as CSV.")] = None,
     engine: Annotated[str, typer.Option(metavar="rosenbrock|cvodes|idas")] = "rosenbrock",
-    effects_from: Annotated[Path | None, typer.Option(metavar="FILE.py", help="Effects of your own.")] = None,
+    effects_from: Annotated[Path | None, typer.Option(metavar="FILE.py",
+                                                      help="Effects of your own.")] = None,
     json: Json = None,
 ) -> None:
     """Simulate a fitted model on records, and compare where something was measured.
@@ -72,41 +76,47 @@ def simulate(
     judged = evaluate(model, records, engine=engine)
     files = _write_simulations(judged, out) if out else []
     if json:
+        pairs = zip(records, judged.by_run, strict=True)
         write_json({"model": {"base": model.base, "axis": model.axis, "effects": list(model.effect_names)},
                     "nrmse": judged.nrmse, "rmse": judged.rmse, "files": files,
-                    "runs": [run_dict(r) | {"nrmse": e} for r, e in zip(records, judged.by_run, strict=True)]}, json)
+                    "runs": [run_dict(r) | {"nrmse": e} for r, e in pairs]}, json)
     if json != "-":
         show(f"{describe(model)}, values of {fit_json}", run_table(judged))
         show(*(f"Written: {f}" for f in files))
 
 
 def demo(
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Where the figures go.")] = Path("motorid-demo"),
+    out: Annotated[Path, typer.Option(
+        metavar="DIR", help="Where figures and report go.")] = Path("motorid-demo"),
     json: Json = None,
 ) -> None:
-    """Show the whole story on shipped records: fit, see that it fails, add what is missing, see the error fall.
+    """Show the story on shipped records: fit, see that it fails, add what is missing, see the error fall.
 
     Example: motorid demo --out demo
     """
     from motorid.cli_demo import tell
 
-    write = tell(out)
+    told = tell(out)
     if json:
-        write_json(write, json)
+        write_json(told, json)
 
 
-def show_fit(found: Fit, records: list[Experiment], notes: list[str], judged: Evaluation | None = None) -> None:
+def show_fit(
+    found: Fit, records: list[Experiment], notes: list[str], judged: Evaluation | None = None,
+) -> None:
     """Print a fit: remarks, parameters, errors, what follows from them, and how it ended."""
     show(f"{describe(found.problem.model)}, {_amount(records)}\n")
     say_notes(notes, "About the records")
     show(parameter_table(found))
     say_notes(remarks(found), "What these records cannot tell")
+    several = judged is not None and len(judged.simulations) > 1
     show(error_table(found, judged), run_table(found.evaluation) if len(records) > 1 else None,
-         run_table(judged, "Held-out NRMSE run by run") if judged and len(judged.simulations) > 1 else None,
+         run_table(judged, "Held-out NRMSE run by run") if judged and several else None,
          derived_table(found))
     show(*_constraints(found))
     engine = found.problem.engine
-    show(f"{found.status}: {found.message}\n{found.iterations} iterations, {duration(found.seconds)}, engine "
+    message = found.message.removeprefix(f"{found.status}: ")
+    show(f"{found.status}: {message}\n{found.iterations} iterations, {duration(found.seconds)}, engine "
          f"{engine if isinstance(engine, str) else engine.name}, formulation {found.formulation}")
 
 

@@ -17,6 +17,7 @@ from motorid.cli_options import (
     own_effects,
     with_choices,
 )
+from motorid.progress import progress
 from motorid.summary import write_json
 from motorid.tables import comparison_table, ladder_table, ranking_table
 
@@ -40,8 +41,9 @@ def diagnose(
     notes = notes_of(records, held_out)
     before = choices.fit(records)
     own = list(own_effects(choices.effects_from).values()) if choices.effects_from else []
-    more: dict[str, Any] = {"effects": _candidates(own)} if own else {}
-    found = look(before, validate=held_out or None, max_effects=max_effects, **more)
+    with progress("Looking for what is missing") as advance:
+        found = look(before, held_out or None, also=own, max_effects=max_effects,
+                     progress=lambda _: advance(1))
     if json:
         write_json(found.to_dict() | {"notes": notes}, json)
     if json != "-":
@@ -70,7 +72,8 @@ def identifiability(runs: Runs, choices: Choices, json: Json = None, report: Rep
 @with_choices(Choices)
 def robustness(
     runs: Runs, choices: Choices,
-    starts: Annotated[int, typer.Option(min=1, metavar="N", help="How many fits.", rich_help_panel=OUT)] = 30,
+    starts: Annotated[int, typer.Option(min=1, metavar="N", help="How many fits.",
+                                        rich_help_panel=OUT)] = 100,
     spread: Annotated[float, typer.Option(min=1.0, help="Every start is off by up to this factor.",
                                           rich_help_panel=OUT)] = 10.0,
     seed: Annotated[int, typer.Option(min=0, help="Of the drawn starts.", rich_help_panel=OUT)] = 0,
@@ -92,7 +95,7 @@ def robustness(
 
 
 def show_diagnosis(found: Any) -> None:
-    """Print a diagnosis: verdict, where, ranking, ladder, how the parameters moved, what cannot be told apart."""
+    """Print a diagnosis: verdict, place, ranking, ladder, how the parameters moved, what stays open."""
     show(f"{found.text}\n")
     show(f"Where: {found.missing.text}\n" if found.missing.text else None)
     show(ranking_table(found.ranking) if found.ranking else None)
@@ -103,8 +106,3 @@ def show_diagnosis(found: Any) -> None:
         show(f"These records cannot tell apart: {', '.join(group)}.")
     show(found.suggestion)
 
-
-def _candidates(own: list[Any]) -> list[Any]:
-    from motorid.effects import LIBRARY
-
-    return [*LIBRARY.values(), *own]

@@ -25,16 +25,17 @@ def model_of(path: Path, effects_from: Path | None = None) -> Model:
     try:
         contents = json.loads(Path(path).expanduser().read_text(encoding="utf-8"))
     except OSError as error:
-        raise DataError(f"cannot read {path}: {error.strerror or error}. Write it with: motorid fit RUN... --json "
-                        f"{path}") from None
+        raise DataError(f"cannot read {path}: {error.strerror or error}. Write it with: motorid fit RUN... "
+                        f"--json {path}") from None
     except ValueError:
-        raise DataError(f"{path} is not JSON; expected what `motorid fit RUN... --json {path}` writes.") from None
+        raise DataError(f"{path} is not JSON; expected what `motorid fit RUN... --json {path}` "
+                        "writes.") from None
     own = own_effects(effects_from) if effects_from else {}
     try:
         return model_from(contents, own)
     except (KeyError, TypeError, AttributeError) as error:
-        raise DataError(f"{path} is JSON, but not of a fit (what it lacks: {error}); expected what `motorid fit RUN... "
-                        f"--json {path}` writes.") from None
+        raise DataError(f"{path} is JSON, but not of a fit (it lacks {error}); expected what `motorid fit "
+                        f"RUN... --json {path}` writes.") from None
 
 
 def model_from(contents: dict[str, Any], own: dict[str, Effect]) -> Model:
@@ -42,11 +43,13 @@ def model_from(contents: dict[str, Any], own: dict[str, Effect]) -> Model:
     base = contents["model"]["base"]
     if base not in BASES:
         raise ModelError(one_of(str(base), BASES, "base"))
-    model = torque_driven(axis=contents["model"].get("axis", "rotary")) if base == "torque_driven" else dc_motor()
+    axis = contents["model"].get("axis", "rotary")
+    model = torque_driven(axis=axis) if base == "torque_driven" else dc_motor()
     for name in contents["model"]["effects"]:
         if name not in own and name not in library.LIBRARY:
-            raise ModelError(f"{one_of(name, [*own, *library.LIBRARY], 'effect')} If it is one of your own, name its "
-                             "file: --effects-from FILE.py")
+            known = [*own, *library.LIBRARY]
+            raise ModelError(f"{one_of(name, known, 'effect')} If it is one of your own, name its file: "
+                             "--effects-from FILE.py")
         model = model + (own[name] if name in own else library.get(name))
     pars = contents["parameters"]
     model = model.fix(**{n: float(p["value"]) for n, p in pars.items() if p["fixed"]})

@@ -27,17 +27,18 @@ from motorid.reading import read_runs
 DRIVES = ("voltage", "torque")
 SOLVERS = ("lm", "multiple-shooting")
 FORMULATIONS = ("plain", "penalty", "hard")
+LOSSES = ("squares", "huber")
 MODEL, SOLVE, READ, OUT = "Model", "Estimation", "Reading", "Results"
 
-Runs = Annotated[list[str], typer.Argument(metavar="RUN...", help="Records: files, directories or patterns.",
-                                           show_default=False)]
-Json = Annotated[str | None, typer.Option("--json", metavar="PATH", rich_help_panel=OUT,
-                                          help="Write the result as JSON; - for standard output.")]
-Report = Annotated[Path | None, typer.Option("--report", metavar="PATH.html", rich_help_panel=OUT,
-                                             help="Write one page with figures.")]
-Validate = Annotated[list[str] | None, typer.Option("--validate", metavar="RUN...", rich_help_panel=OUT,
-                                                    help="Held-out records, never fitted; after the records, "
-                                                         "since it takes all names that follow.")]
+Runs = Annotated[list[str], typer.Argument(
+    metavar="RUN...", show_default=False, help="Records: files, directories or patterns.")]
+Json = Annotated[str | None, typer.Option(
+    "--json", metavar="PATH", rich_help_panel=OUT, help="Write the result as JSON; - for standard output.")]
+Report = Annotated[Path | None, typer.Option(
+    "--report", metavar="PATH.html", rich_help_panel=OUT, help="Write one page with figures.")]
+Validate = Annotated[list[str] | None, typer.Option(
+    "--validate", metavar="RUN...", rich_help_panel=OUT,
+    help="Held-out records, never fitted; put it after the records, since it takes all names that follow.")]
 
 
 @dataclass(frozen=True)
@@ -46,11 +47,13 @@ class Reading:
 
     columns: Annotated[str | None, typer.Option(
         metavar="t=…,v=…", rich_help_panel=READ,
-        help="Which column is which channel, where the header does not tell: t=time,v=u_volt,omega=speed.")] = None
+        help="Which column is which channel, where the header does not tell: t=time,v=u_volt.")] = None
     units: Annotated[str | None, typer.Option(
-        metavar="omega=rpm", rich_help_panel=READ, help="Units of channels, where the header does not tell.")] = None
+        metavar="omega=rpm", rich_help_panel=READ,
+        help="Units of channels, where the header does not tell.")] = None
     hold: Annotated[str | None, typer.Option(
-        metavar="zoh|linear", rich_help_panel=READ, help="The input between samples: held or joined by lines.")] = None
+        metavar="zoh|linear", rich_help_panel=READ,
+        help="The input between samples: held or joined by lines.")] = None
 
     def read(self, paths: Sequence[str]) -> list[Experiment]:
         """Return the runs."""
@@ -66,7 +69,8 @@ class Choices(Reading):
     effects: Annotated[str | None, typer.Option(
         metavar="a,b", rich_help_panel=MODEL, help="Effects in the model beside the plain motor.")] = None
     fix: Annotated[list[str] | None, typer.Option(
-        metavar="L", rich_help_panel=MODEL, help="Hold parameters: L, or L=0 to leave the inductance out.")] = None
+        metavar="L", rich_help_panel=MODEL,
+        help="Hold parameters: L, or L=0 to leave the inductance out.")] = None
     set_: Annotated[list[str] | None, typer.Option(
         "--set", metavar="R=1.2", rich_help_panel=MODEL, help="Values to start from (SI units).")] = None
     free: Annotated[list[str] | None, typer.Option(
@@ -75,10 +79,11 @@ class Choices(Reading):
         metavar="voltage|torque", rich_help_panel=MODEL,
         help="torque: a drive that closes its own current loop; v is its command.")] = "voltage"
     effects_from: Annotated[Path | None, typer.Option(
-        metavar="FILE.py", rich_help_panel=MODEL, help="Python file with effects of your own (@mi.effect).")] = None
+        metavar="FILE.py", rich_help_panel=MODEL,
+        help="Python file with effects of your own (@mi.effect).")] = None
     solver: Annotated[str | None, typer.Option(
-        metavar="lm|multiple-shooting", rich_help_panel=SOLVE, help="By default lm; multiple-shooting for hard.",
-        show_default=False)] = None
+        metavar="lm|multiple-shooting", rich_help_panel=SOLVE, show_default=False,
+        help="By default lm; multiple-shooting for hard.")] = None
     formulation: Annotated[str, typer.Option(
         metavar="plain|penalty|hard", rich_help_panel=SOLVE,
         help="What is asked beside the data: nothing, weighted penalties, or true constraints.")] = "plain"
@@ -131,8 +136,9 @@ class Choices(Reading):
             return fit(model, runs, callback=lambda *_: advance(1), **self.options())
 
     def _check_words(self) -> None:
-        for word, known, what in ((self.drive, DRIVES, "drive"), (self.formulation, FORMULATIONS, "formulation"),
-                                  (self.solver or "lm", SOLVERS, "solver"), (self.loss, ("squares", "huber"), "loss")):
+        for word, known, what in ((self.drive, DRIVES, "drive"),
+                                  (self.formulation, FORMULATIONS, "formulation"),
+                                  (self.solver or "lm", SOLVERS, "solver"), (self.loss, LOSSES, "loss")):
             if word not in known:
                 raise UsageError(f"--{what}: {one_of(word, known, what)}")
         if self.formulation == "hard" and self.solver == "lm":
@@ -141,7 +147,7 @@ class Choices(Reading):
         if self.formulation == "penalty" and self.solver == "multiple-shooting":
             raise UsageError("--formulation penalty is a least-squares problem: take --solver lm, or "
                              "--formulation hard for true constraints.")
-        if self.current_limit is not None and self.formulation == "plain" and self.solver != "multiple-shooting":
+        if self.current_limit is not None and self.formulation == "plain" and self.solver in (None, "lm"):
             raise UsageError("--current-limit needs --formulation penalty (weighted) or hard (a true limit).")
 
 
@@ -150,8 +156,8 @@ def with_choices(kind: type) -> Callable[[Callable[..., None]], Callable[..., No
 
     def wrap(command: Callable[..., None]) -> Callable[..., None]:
         hints, own = get_type_hints(kind, include_extras=True), get_type_hints(command, include_extras=True)
-        parts = [inspect.Parameter(f.name, inspect.Parameter.KEYWORD_ONLY, default=f.default, annotation=hints[f.name])
-                 for f in fields(kind)]
+        parts = [inspect.Parameter(f.name, inspect.Parameter.KEYWORD_ONLY, default=f.default,
+                                   annotation=hints[f.name]) for f in fields(kind)]
         mine = [p.replace(annotation=own[p.name], kind=inspect.Parameter.KEYWORD_ONLY)
                 for p in inspect.signature(command).parameters.values() if p.name != "choices"]
 
@@ -189,11 +195,13 @@ def own_effects(path: Path) -> dict[str, Effect]:
     try:
         spec.loader.exec_module(module)
     except Exception as error:  # whatever the user's own code raises
-        raise UsageError(f"--effects-from: {path} cannot be run: {type(error).__name__}: {error}.") from None
-    found = {e.name: e for e in vars(module).values() if isinstance(e, Effect) and e.name not in library.LIBRARY}
+        what = f"{type(error).__name__}: {error}"
+        raise UsageError(f"--effects-from: {path} cannot be run: {what}.") from None
+    effects = [e for e in vars(module).values() if isinstance(e, Effect)]
+    found = {e.name: e for e in effects if e.name not in library.LIBRARY}
     if not found:
-        raise UsageError(f"--effects-from: {path} defines no effect of its own. Write a function and decorate it with "
-                         "@mi.effect(balance=\"torque\").")
+        raise UsageError(f"--effects-from: {path} defines no effect of its own. Write a function and "
+                         "decorate it with @mi.effect(balance=\"torque\").")
     return found
 
 
@@ -236,7 +244,8 @@ def _numbers(texts: Sequence[str], option: str) -> dict[str, float]:
             try:
                 found[name] = float(value)
             except ValueError:
-                raise UsageError(f"{option}: '{value}' is not a number; expected e.g. {name}=1.2, in SI units.") from None
+                raise UsageError(f"{option}: '{value}' is not a number; expected e.g. {name}=1.2, in SI "
+                                 "units.") from None
     return found
 
 

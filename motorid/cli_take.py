@@ -12,7 +12,7 @@ from motorid.cli_options import Choices, Json, with_choices
 
 @with_choices(Choices)
 def fit_many(
-    directory: Annotated[Path, typer.Argument(metavar="DIR", help="A folder with one folder, or file, per motor.")],
+    directory: Annotated[Path, typer.Argument(metavar="DIR", help="One folder, or file, per motor.")],
     choices: Choices,
     out: Annotated[Path | None, typer.Option(metavar="TABLE.csv", help="Write the table as CSV.")] = None,
     json: Json = None,

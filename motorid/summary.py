@@ -33,7 +33,8 @@ def fit_dict(fit: Fit, held_out: Evaluation | None = None) -> dict[str, Any]:
         "validation_nrmse": dict(held_out.nrmse) if held_out else None,
         "validation_rmse": dict(held_out.rmse) if held_out else None,
         "chi2": fit.chi2, "dof": fit.dof, "status": fit.status, "message": fit.message,
-        "iterations": fit.iterations, "seconds": fit.seconds, "engine": engine, "formulation": fit.formulation,
+        "iterations": fit.iterations, "seconds": fit.seconds, "engine": engine,
+        "formulation": fit.formulation,
         "integration_error": fit.integration_error,
         "derived": {"tau_e": fit.tau_e, "tau_m": fit.tau_m, "damping": fit.damping},
         "steady_state_error": dict(fit.steady_state_error),
@@ -60,21 +61,21 @@ def remarks(fit: Fit) -> list[str]:
     said = []
     motor = [n for n in vague if n in MOTOR]
     if model.base == "dc_motor" and motor and "i" not in measured:
-        said.append(f"The current was not measured, so {_listed(motor)} cannot be told apart: only combinations such "
-                    "as R·J/K and K + R·b/K are determined. Measure the current, or fix R where it is known "
-                    "(--fix R=1.2).")
+        said.append(f"The current was not measured, so {_listed(motor)} cannot be told apart: only "
+                    "combinations such as R·J/K and K + R·b/K are determined. Measure the current, or fix R "
+                    "where it is known (--fix R=1.2).")
         vague = [n for n in vague if n not in ("R", "L", "K", "b", "J") and not _a_torque(model, n)]
     elif model.base == "dc_motor" and motor and "omega" not in measured and "theta" not in measured:
-        said.append(f"Neither speed nor angle was measured, so {_listed(motor)} cannot be told apart. Measure one of "
-                    "them, or fix K (--fix K=0.05).")
+        said.append(f"Neither speed nor angle was measured, so {_listed(motor)} cannot be told apart. "
+                    "Measure one of them, or fix K (--fix K=0.05).")
         vague = [n for n in vague if n not in MOTOR and not _a_torque(model, n)]
     if vague:
         said.append(f"The records do not determine {_listed(vague)}: another value fits them as well. Hold "
                     f"{'it' if len(vague) == 1 else 'one of them'} (--fix {vague[0]}), or look at "
                     "`motorid identifiability`.")
     for n in at_limit:
-        said.append(f"{n} ended at {fit.values[n]:.3g}, the limit of what is physical: these records show no sign "
-                    "of it.")
+        said.append(f"{n} ended at {fit.values[n]:.3g}, the limit of what is physical: these records show no "
+                    "sign of it.")
     return said
 
 

@@ -18,7 +18,7 @@ MOST_RUNS = 12  # shown one by one
 
 @dataclass(frozen=True)
 class Table:
-    """A title, column heads and rows of text; `str` lays it out, columns in `left` flush left, others right."""
+    """A title, column heads and rows of text; `str` lays it out, columns in `left` flush left."""
 
     title: str
     heads: tuple[str, ...]
@@ -30,13 +30,14 @@ class Table:
         lines = [self.heads, *self.rows]
         widths = [max(len(line[k]) for line in lines) for k in range(len(self.heads))]
         body = ["  ".join(cell.ljust(w) if k in self.left else cell.rjust(w)
-                          for k, (cell, w) in enumerate(zip(line, widths, strict=True))).rstrip() for line in lines]
+                          for k, (cell, w) in enumerate(zip(line, widths, strict=True))).rstrip()
+                for line in lines]
         body.insert(1, "  ".join("─" * w for w in widths))
-        return "\n".join([*([self.title] if self.title else []), *body, *([self.note] if self.note else [])])
+        return "\n".join([part for part in (self.title, *body, self.note) if part])
 
 
 def parameter_table(fit: Fit) -> Table:
-    """Return the parameters with value ± standard deviation; what is held or not determined is said in words."""
+    """Return the parameters as value ± standard deviation; held or not determined is said in words."""
     rows = []
     for name, p in fit.problem.model.parameters.items():
         rows.append((name, parameter_text(fit, name), p.doc))
@@ -52,7 +53,7 @@ def parameter_text(fit: Fit, name: str) -> str:
 
 
 def error_table(fit: Fit, held_out: Evaluation | None = None) -> Table:
-    """Return the errors per channel: RMSE in its unit and as a share of the channel's RMS, fitted and held out."""
+    """Return the errors per channel, in its unit and as a share of its RMS, fitted and held out."""
     units = channel_units(fit.problem.experiments)
     heads = ["channel", "RMSE", "NRMSE", "noise"]
     heads += ["held-out RMSE", "held-out NRMSE"] if held_out else []
@@ -110,11 +111,10 @@ def ranking_table(ranking: Sequence[Any], show: int = 8) -> Table:
     """Return the candidates of a diagnosis, best first."""
     rows = []
     for c in ranking[:show]:
-        held_out = None if c.held_out_gain is None else c.held_out_gain
-        rows.append((("→ " if c.accepted else "  ") + c.effect, percent(c.predicted_drop), percent(c.refit_drop),
-                     percent(held_out), c.reason))
-    heads = ("effect", "predicted drop", "refitted drop", "held-out error falls by", "")
-    return Table("Which effect is missing?", heads, tuple(rows), left=(0, 4))
+        name = ("→ " if c.accepted else "  ") + c.effect
+        rows.append((name, percent(c.predicted_drop), percent(c.refit_drop), c.reason))
+    heads = ("effect", "misfit falls by (predicted)", "(refitted)", "")
+    return Table("Which effect is missing?", heads, tuple(rows), left=(0, 3))
 
 
 def ladder_table(ladder: Any) -> Table:
