@@ -4,6 +4,7 @@ from typing import TYPE_CHECKING as _TYPE_CHECKING
 
 from motorid import effects
 from motorid.acquire import record
+from motorid.batch import fit_many, motors_in
 from motorid.bootstrap import bootstrap
 from motorid.checks import check_runs
 from motorid.comparison import compare

@@ -41,13 +41,17 @@ def _signals(run: Experiment) -> dict[str, Array | None]:
     t = run.t
     found: dict[str, Array | None] = {"t": t, "v": run.inputs["v"], "i": None, "omega": None}
     for c in ("i", "omega"):
-        if c in run.outputs:
+        if _measured(run, c):
             found[c] = _bridged(t, run.outputs[c])
-    if found["omega"] is None and "theta" in run.outputs:
+    if found["omega"] is None and _measured(run, "theta"):
         found["omega"] = _speed_of(t, _bridged(t, run.outputs["theta"]))
     if run.hold == "zoh" and found["v"] is not None:
         found["held"] = np.ones(1)
     return found
+
+
+def _measured(run: Experiment, channel: str) -> bool:
+    return channel in run.outputs and bool(np.isfinite(run.outputs[channel]).any())
 
 
 def _bridged(t: Array, y: Array) -> Array:

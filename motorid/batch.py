@@ -1,0 +1,223 @@
+"""One model fitted to the records of many motors: a table, failures included, and which motors stand out."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import combinations
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from motorid.errors import DataError, FitError, MissingDependency, UsageError
+from motorid.experiment import Experiment
+from motorid.fit import Fit, fit
+from motorid.journal import Journal, fingerprint
+from motorid.model import Model
+from motorid.outliers import Outlier, outliers
+from motorid.reading import find_records, read_runs
+from motorid.tables import Table
+from motorid.tasks import Map, Parcel, run_tasks
+from motorid.uncertainty import covariance
+
+Records = Sequence[Experiment] | Experiment | str | Path | Sequence[str | Path]
+POOR = 3.0  # misfit over noise from which a row is flagged
+
+
+@dataclass(frozen=True, eq=False)
+class Batch:
+    """What came of many motors.
+
+    Attributes
+    ----------
+    rows : tuple of dict
+        One per motor, in the order given: ``motor``, ``status`` (``"converged"``, … or ``"failed"``),
+        ``message``, ``flags``, ``seconds``, per parameter its value and ``<name>_std`` (None: not
+        determined), ``nrmse_<channel>``, ``chi2``, ``dof``.
+    parameters : tuple of str
+        The free ones.
+    positive : frozenset of str
+        Those compared on the logarithmic scale.
+    interrupted : str
+        Empty, or how far it came.
+    """
+
+    rows: tuple[dict[str, Any], ...]
+    parameters: tuple[str, ...]
+    positive: frozenset[str]
+    interrupted: str = ""
+
+    @cached_property
+    def table(self) -> Any:
+        """The rows as a `pandas.DataFrame`, one line per motor."""
+        import pandas as pd
+
+        return pd.DataFrame([r | {"flags": "; ".join(r["flags"])} for r in self.rows]).set_index("motor")
+
+    @property
+    def failed(self) -> dict[str, str]:
+        """Motors without a result, and why."""
+        return {r["motor"]: r["message"] for r in self.rows if r["status"] == "failed"}
+
+    @cached_property
+    def outliers(self) -> tuple[Outlier, ...]:
+        """Motors that differ from the others by more than scatter and own uncertainty explain."""
+        return outliers([r for r in self.rows if r["status"] != "failed"], self.parameters, self.positive)
+
+    def save(self, path: str | Path) -> Path:
+        """Write the table; the ending says how: ``.csv``, ``.parquet`` or ``.json``."""
+        target = Path(path)
+        if target.suffix == ".csv":
+            self.table.to_csv(target)
+        elif target.suffix == ".json":
+            self.table.reset_index().to_json(target, orient="records", indent=1, force_ascii=False)
+        elif target.suffix in (".parquet", ".pq"):
+            try:
+                self.table.to_parquet(target)
+            except ImportError as error:
+                raise MissingDependency("writing Parquet needs pyarrow: pip install 'motorid[parquet]', or "
+                                        "save the table as .csv.") from error
+        else:
+            raise UsageError(f"a table is saved as .csv, .parquet or .json; got '{target.name}'.")
+        return target
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain data: rows, outliers, counts."""
+        return {"motors": len(self.rows), "failed": len(self.failed), "rows": [dict(r) for r in self.rows],
+                "outliers": [o.to_dict() for o in self.outliers], "interrupted": self.interrupted or None}
+
+    def __str__(self) -> str:
+        good = [r for r in self.rows if r["status"] != "failed"]
+        rows = []
+        for n in self.parameters:
+            v = np.array([r[n] for r in good if r.get(f"{n}_std") is not None], float)
+            if v.size:
+                low, middle, high = np.percentile(v, [5, 50, 95])
+                rows.append((n, f"{middle:.4g}", f"{low:.4g} … {high:.4g}", str(v.size)))
+        table = Table(f"{len(good)} of {len(self.rows)} motors fitted",
+                      ("", "median", "5 % … 95 %", "determined in"), tuple(rows), left=(0, 2))
+        said = [str(table), *(f"{name}: failed. {why}" for name, why in self.failed.items())]
+        said += [o.text for o in self.outliers]
+        return "\n".join([*said, *([self.interrupted] if self.interrupted else [])])
+
+    __repr__ = __str__
+
+
+def fit_many(model: Model, motors: Mapping[str, Records], *, journal: str | Path | None = None,
+             map: Map | None = None, reading: Mapping[str, Any] | None = None, quiet: bool = False,
+             **options: Any) -> Batch:
+    """Fit one model to the records of many motors. A motor that fails is a row that says why.
+
+    Parameters
+    ----------
+    model : Model
+    motors : mapping of str to records
+        Per motor its runs, or where they are: a path, a pattern, several of these; read by the worker.
+    journal : path, optional
+        Results are added to this file as they come; what is there for the same model, options and records is
+        not done again. So an interrupted batch goes on where it was.
+    map : callable, optional
+        Anything with the signature of `map`; one motor is one task.
+    reading : mapping, optional
+        Keyword arguments of `read_runs`.
+    quiet : bool
+        No progress bar.
+    **options
+        As in `fit`.
+
+    Raises
+    ------
+    UsageError
+        If there are no motors.
+    """
+    if not motors:
+        raise UsageError("fit_many takes a mapping {name: runs}; it is empty. See motors_in(folder).")
+    _carry_laws(model)
+    done = Journal(Path(journal)) if journal is not None else None
+    marks = {n: fingerprint(model, options, reading, runs) for n, runs in motors.items()} if done else {}
+    known = {n: done.rows[m] for n, m in marks.items() if m in done.rows} if done else {}
+    parcel = Parcel.of((model, options, dict(reading or {})))
+    todo = [(parcel, n, Parcel.of(runs)) for n, runs in motors.items() if n not in known]
+    found = run_tasks(_fit_one, todo, map, "Fitting motors", quiet=quiet,
+                      each=None if done is None else lambda row: done.add(marks[row["motor"]], row))
+    rows = known | {row["motor"]: row for row in found.results}
+    said = f"Interrupted after {len(rows)} of {len(motors)} motors." if found.interrupted else ""
+    return Batch(tuple(rows[name] for name in motors if name in rows), model.free_names,
+                 frozenset(n for n, p in model.parameters.items() if p.positive), said)
+
+
+def motors_in(folder: str | Path) -> dict[str, list[Path]]:
+    """Return the records in a folder by motor: every subfolder is one, and so is every file beside them.
+
+    Raises
+    ------
+    DataError
+        If the folder does not exist or holds no records.
+    """
+    place = Path(folder)
+    if not place.is_dir():
+        raise DataError(f"'{place}' is not a folder; fit-many takes one with a folder, or a file, per motor.")
+    found: dict[str, list[Path]] = {}
+    for entry in sorted(place.iterdir()):
+        if entry.name.startswith("."):
+            continue
+        try:
+            files = find_records(entry)
+        except DataError:
+            continue
+        name = entry.name if entry.is_dir() or entry.stem in found else entry.stem
+        found[name] = [Path(f) for f in files]
+    if not found:
+        raise DataError(f"'{place}' holds no records: expected a folder, or a file, per motor.")
+    return found
+
+
+def _carry_laws(model: Model) -> None:
+    """Make the model's functions now, where a law cannot be imported by another process."""
+    if all(e.__reduce__()[1][0] is not None for e in model.effects):
+        return
+    for n in (1, 2, 3):
+        for outputs in combinations(("i", "omega", "theta"), n):
+            try:
+                model.system(outputs)
+            except Exception:
+                continue  # a channel that this model does not have
+
+
+def _fit_one(task: tuple[Parcel, str, Parcel]) -> dict[str, Any]:
+    parcel, name, records = task
+    model, options, reading = parcel.open()
+    began = time.perf_counter()
+    try:
+        row = _row(fit(model, _runs(records.open(), reading), **options))
+    except Exception as error:  # one motor's trouble, whatever it is, must not end the batch
+        row = {"status": "failed", "message": f"{type(error).__name__}: {error}", "flags": ["failed"]}
+    return {"motor": name, **row, "seconds": time.perf_counter() - began}
+
+
+def _runs(records: Records, reading: Mapping[str, Any]) -> list[Experiment]:
+    if isinstance(records, Experiment):
+        return [records]
+    if not isinstance(records, str | Path) and all(isinstance(r, Experiment) for r in records):
+        return list(records)  # type: ignore[arg-type]
+    return read_runs(records, **reading)  # type: ignore[arg-type]
+
+
+def _row(found: Fit) -> dict[str, Any]:
+    if found.status == "failed":
+        raise FitError(found.message)
+    certain = covariance(found)
+    values: dict[str, Any] = {}
+    for n in found.problem.model.free_names:
+        values |= {n: found.values[n], f"{n}_std": certain.std[n]}
+    flags = [] if found.status == "converged" else [found.status]
+    flags += [f"{n} {certain.status[n]}" for n in found.problem.model.free_names
+              if certain.status[n] != "determined"]
+    misfit = float(np.sqrt(found.chi2 / found.dof))
+    if found.problem.weights == "noise" and misfit > POOR:
+        flags.append(f"misfit {misfit:.2g} times the noise")
+    return {"status": found.status, "message": found.message, "flags": flags, **values,
+            **{f"nrmse_{c}": e for c, e in found.nrmse.items()}, "chi2": found.chi2, "dof": found.dof}
