@@ -21,15 +21,19 @@ if TYPE_CHECKING:
 
 CHUNK = 40
 HIGHEST = 240
+SLOW_PART = 0.2  # of the motion that must be slow enough to show an order
 
 
 def highest_order(tangent: Tangent) -> int:
-    """Highest order that the sampling can show: less than half a period per sample for half of the motion."""
+    """Highest order that the samples can show: less than a period per sample for a part of the motion.
+
+    Beyond half a period the samples alias, but along a measured angle each order still has its own pattern.
+    """
     steps = np.concatenate([np.abs(np.diff(angle_signal(r))) for r in tangent.fit.problem.experiments])
     moving = steps[steps > 1e-6 * max(steps.max(initial=0.0), 1e-300)]
     if not moving.size:
         return 0
-    return int(np.clip(0.8 * np.pi / np.quantile(moving, 0.5), 0, HIGHEST))
+    return int(np.clip(1.8 * np.pi / np.quantile(moving, SLOW_PART), 0, HIGHEST))
 
 
 def likely_orders(tangent: Tangent, effect: Effect, most: int) -> list[float]:
@@ -68,7 +72,9 @@ def _columns(fit, k: int, answer: Response, orders: Array, relative: bool) -> Ar
     run = fit.problem.runs[k]
     angle = angle_signal(run.experiment)
     middle = (angle[1:] + angle[:-1]) / 2
-    drive = np.concatenate([np.sin(np.outer(middle, orders)), np.cos(np.outer(middle, orders))], axis=1)
+    # Averaged over the sample, so that orders too fast for the sampling fade instead of posing as slower ones.
+    fade = np.sinc(np.outer(np.diff(angle), orders) / (2 * np.pi))
+    drive = np.concatenate([np.sin(np.outer(middle, orders)) * fade, np.cos(np.outer(middle, orders)) * fade], axis=1)
     if relative:
         drive *= (fit.values["K"] * answer.states["i"][:-1])[:, None]
     _, weights, index = fit.problem._weights[k]

@@ -17,7 +17,7 @@ import numpy as np
 from motorid.diagnosis.evidence import Errors, Gain, compare_errors
 from motorid.diagnosis.rank import Score, rank
 from motorid.diagnosis.results import Candidate
-from motorid.diagnosis.trial import LEAST_FALL, WORST_CONDITION, HeldOut, condition, objections, refit, train_errors
+from motorid.diagnosis.trial import LEAST_FALL, WORST_CONDITION, HeldOut, ambiguity, objections, refit, train_errors
 from motorid.effects import LIBRARY
 from motorid.errors import ModelError, SimulationError
 from motorid.experiment import Experiment
@@ -27,6 +27,8 @@ from motorid.prepared import natural_sizes
 
 SHORTLIST = 6
 ALWAYS = ("compliance", "speed_lag", "speed_delay")  # their score at null says little
+COMMON = ("coulomb", "gravity", "brush_drop", "winding_heating", "cogging", "load_friction", "quadratic_drag",
+          "constant_load", "speed_lag", "driver_dead_band")  # what is met most, first
 EVIDENCE = 4.0  # log likelihood ratio beyond the price of the parameters
 TIE = 3.0  # log likelihood ratio below which two models count as equal
 CLOSE = 0.01  # relative error below which two models count as equal
@@ -146,7 +148,9 @@ class Search:
         why = objections(fit, effect)
         if why:
             return None, replace(candidate, reason=why)
-        worse, was = condition(fit), condition(node.fit)
+        (open_now, worse), (open_before, was) = ambiguity(fit), ambiguity(node.fit)
+        if open_now > open_before:
+            return None, replace(candidate, reason="not identifiable with these data beside the other parameters")
         if worse > WORST_CONDITION and worse > 10 * was:
             return None, replace(candidate, reason=f"not identifiable with these data: the condition number of the "
                                                    f"sensitivities rises from {was:.0f} to {worse:.0f}")
@@ -186,7 +190,7 @@ class Search:
         ordered = sorted(children, key=lambda n: -self._worth(n))
         top = ordered[0]
         tied = [n for n in ordered if n is top or self.tied(top, n)]
-        chosen = min(tied, key=lambda n: (n.size, -self._worth(n)))
+        chosen = min(tied, key=lambda n: (n.size, _rarity(n.added), -self._worth(n)))
         return chosen, ordered
 
     def _worth(self, node: Node) -> float:
@@ -234,6 +238,11 @@ class Search:
         return tuple(n.added for n in siblings if n is not chosen and n.added and n.parent is chosen.parent
                      and chosen.added not in includes.get(n.added, ()) and self.tied(n, chosen)
                      and self.tied(chosen, n))
+
+
+def _rarity(name: str | None) -> int:
+    """Rank of an effect by how rarely it is met; decides between equals."""
+    return COMMON.index(name) if name in COMMON else len(COMMON)
 
 
 def _held_out_objection(gain: Gain) -> str:

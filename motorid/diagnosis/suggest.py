@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from motorid.display import Shown
 from motorid.errors import FitError, MotoridError, UsageError
 from motorid.experiment import Experiment
 from motorid.fit import Fit
@@ -21,8 +22,8 @@ from motorid.simulate import simulate
 SAMPLES = 2000
 
 
-@dataclass(frozen=True, eq=False)
-class Suggestion:
+@dataclass(frozen=True, eq=False, repr=False)
+class Suggestion(Shown):
     """An experiment that would tell rival models apart.
 
     Attributes

@@ -25,6 +25,7 @@ QUICK = LevenbergMarquardt(max_iterations=25, ftol=1e-4, xtol=1e-5)
 POLISH = LevenbergMarquardt(max_iterations=60, ftol=1e-7, xtol=1e-7)
 BLOCKS = 10  # contiguous parts of each run; every other one is held out where there are no held-out runs
 WORST_CONDITION = 1e4  # of the column-scaled Jacobian
+HOPELESS = 1e6  # condition number beyond which a direction counts as open
 SIGNIFICANT = 3.0  # standard deviations
 ROUGH = 1e-4  # accuracy of the integration while starts are compared
 ROOM = 10.0  # factor beyond its grid that a shape parameter may run to
@@ -194,20 +195,19 @@ def objections(fit: Fit, added: Effect) -> str:
         value, j = fit.values[p.name], names.index(p.name)
         if value <= p.lower and p.lower == p.null:
             return f"{p.name} goes to {p.null:g}: the data do not want it, or only with the wrong sign"
-        if not determined[j]:
-            return f"{p.name} cannot be determined beside the other parameters"
-        if abs(value - p.null) < SIGNIFICANT * np.sqrt(covariance[j, j]) and len(pars) == 1:
+        if determined[j] and abs(value - p.null) < SIGNIFICANT * np.sqrt(covariance[j, j]) and len(pars) == 1:
             return f"{p.name} is not significant ({value:.3g} ± {np.sqrt(covariance[j, j]):.2g})"
     return ""
 
 
-def condition(fit: Fit) -> float:
-    """Return the condition number of the column-scaled Jacobian of the model's parameters."""
+def ambiguity(fit: Fit) -> tuple[int, float]:
+    """Return how many directions of the parameters the data leave open, and the condition of the others."""
     n = len([p for p in fit.problem.model.parameters.values() if p.vary])
     jac = fit.jacobian[:, :n]
     norms = np.linalg.norm(jac, axis=0)
     s = np.linalg.svd(np.linalg.qr(jac / np.where(norms > 0, norms, 1.0), mode="r"), compute_uv=False)
-    return float(s[0] / max(s[-1], 1e-300))
+    clear = s[s > s[0] / HOPELESS]
+    return len(s) - len(clear), float(clear[0] / clear[-1])
 
 
 def _covariance(fit: Fit) -> tuple[Any, Any]:
