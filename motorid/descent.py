@@ -244,16 +244,16 @@ def _sooner(options: LevenbergMarquardt, ends: tuple[float, int]) -> LevenbergMa
     return replace(options, ftol=max(options.ftol, ftol), max_iterations=min(options.max_iterations, most))
 
 
-def _cheaper(*problems: Problem) -> Problem:
+def _cheaper(first: Problem, *others: Problem) -> Problem:
     """Return the problem that starts nearest to its data: what one sgn likes a narrower one may refuse."""
     costs = []
-    for p in problems if len(problems) > 1 else ():
+    for p in (first, *others) if others else ():
         try:
             r = p.residual(p.start)
         except SimulationError:
             r = np.array([np.inf])
         costs.append(float(r @ r) if np.isfinite(r).all() else np.inf)
-    return problems[int(np.argmin(costs))] if costs else problems[0]
+    return (first, *others)[int(np.argmin(costs))] if costs else first
 
 
 def integration_error(problem: Problem, q: Array) -> float:
