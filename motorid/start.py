@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from scipy.optimize import nnls
 
 from motorid.experiment import Experiment
 from motorid.integrate.grid import Array
@@ -81,6 +80,8 @@ def _windowed(t: Array, columns: Sequence[Array], target: Array, windows: int = 
 
 def _solve(rows: list[tuple[Array, Array]], names: Sequence[str], held: Mapping[str, float]) -> dict[str, float]:
     """Non-negative least squares with some coefficients known; zeros become small positive numbers."""
+    from scipy.optimize import nnls  # slow to import, and not needed before
+
     a, b = np.vstack([r[0] for r in rows]), np.concatenate([r[1] for r in rows])
     known = [n in held for n in names]
     b = b - a[:, known] @ np.array([held[n] for n in names if n in held])

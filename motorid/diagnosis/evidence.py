@@ -11,7 +11,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.signal import fftconvolve
 
 from motorid.experiment import Experiment
 from motorid.integrate.grid import Array
@@ -22,6 +21,8 @@ CLIP = 6.0  # robust standard deviations beyond which a residual counts as an ou
 
 def autocorrelation(r: Array, lags: int | None = None) -> Array:
     """Return the autocorrelation of `r` (N,) at lags 0, 1, …; missing samples count as zero."""
+    from scipy.signal import fftconvolve  # slow to import, and not needed before
+
     r = np.where(np.isfinite(r), r, 0.0)
     n = len(r)
     lags = min(lags or n // 2, n - 1)

@@ -14,8 +14,8 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
-from scipy.optimize import nnls
 
+from motorid.diagnosis.evidence import effective_samples
 from motorid.diagnosis.orders import likely_orders
 from motorid.errors import ModelError, SimulationError
 from motorid.fit import Fit
@@ -27,18 +27,21 @@ from motorid.problem import Problem
 
 NUDGE = 1e-9  # of the natural size: where sizes start, so that fmax(tau_s - tau_c, 0) has a slope
 ORDERS_TRIED = 3
+Tried = tuple[float, dict[str, float], Array]  # share of chi² explained, values, what is left of the residual
 
 
 @dataclass(frozen=True, eq=False)
 class Score:
     """One effect scored: share of chi² that it would take away, and starting values for a refit.
 
-    `starts` are tried in turn, the most promising first.
+    `starts` are tried in turn, the most promising first. `effective` is how many independent samples the residual
+    would be worth with the effect taken out: what a misfit makes smooth is no evidence of coloured noise.
     """
 
     effect: Effect
     drop: float
     starts: tuple[Mapping[str, float], ...]
+    effective: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,9 +64,25 @@ class Tangent:
         basis = q @ u[:, s > 1e-7 * max(s.max(initial=0.0), 1e-300)]
         return Tangent(fit, basis, r - basis @ (basis.T @ r), natural_sizes(fit.problem.experiments, fit.values))
 
+    def effective(self, residual: Array) -> float:
+        """Return how many independent samples a stacked residual is worth."""
+        return sum(effective_samples(column) for part in unstacked(self.fit, residual) for column in part.T)
+
     def off(self, columns: Array) -> Array:
         """Return `columns` (n, k) projected off the tangent space."""
         return columns - self.basis @ (self.basis.T @ columns)
+
+
+def unstacked(fit: Fit, residual: Array) -> list[Array]:
+    """Return a stacked output residual as one (N, ny) per run, NaN where missing."""
+    parts, first = [], 0
+    for y, _, index in fit.problem._weights:
+        n = y.size if index is None else len(index)
+        full = np.full(y.size, np.nan)
+        full[slice(None) if index is None else index] = residual[first:first + n]
+        parts.append(full.reshape(y.shape))
+        first += n
+    return parts
 
 
 @lru_cache(maxsize=256)
@@ -103,13 +122,13 @@ def score(tangent: Tangent, effect: Effect) -> Score:
     if uses_angle(effect) and not model.angle_input and not any(uses_angle(e) for e in fit.model.effects):
         model = replace(model, angle_input=True, _systems={})
     pars = [model.parameters[p.name] for p in effect.parameters]
-    tried: list[tuple[float, dict[str, float]]] = []
+    tried: list[Tried] = []
     for shape in _shapes(tangent, effect, pars):
         tried += _score_shape(tangent, model, pars, shape)
     if not tried:
         return Score(effect, 0.0, ({},))
     tried.sort(key=lambda t: -t[0])
-    return Score(effect, tried[0][0], tuple(_distinct([t[1] for t in tried])))
+    return Score(effect, tried[0][0], tuple(_distinct([t[1] for t in tried])), tangent.effective(tried[0][2]))
 
 
 def _distinct(starts: list[dict[str, float]], most: int = 4) -> list[dict[str, float]]:
@@ -142,7 +161,7 @@ def _shapes(tangent: Tangent, effect: Effect, pars: Sequence[Parameter]) -> Iter
 
 
 def _score_shape(tangent: Tangent, model: Model, pars: Sequence[Parameter],
-                 shape: Mapping[str, float]) -> list[tuple[float, dict[str, float]]]:
+                 shape: Mapping[str, float]) -> list[Tried]:
     linear, finite, _ = _kinds(pars)
     if finite or any(p.name in shape for p in linear):
         return _score_finite(tangent, model, pars, shape)
@@ -152,17 +171,17 @@ def _score_shape(tangent: Tangent, model: Model, pars: Sequence[Parameter],
     if phases:
         quarter = {phases[0].name: np.pi / 2}
         columns.append(_null_columns(tangent, model, sizes, {**shape, **quarter}))
-        drop, a = _project(tangent, np.column_stack(columns), [False] * 2)
+        drop, a, left = _project(tangent, np.column_stack(columns), [False] * 2)
         value = {sizes[0].name: float(np.hypot(*a)), phases[0].name: float(np.arctan2(a[1], a[0]))}
     else:
-        drop, a = _project(tangent, columns[0], [p.lower == 0 for p in sizes])
+        drop, a, left = _project(tangent, columns[0], [p.lower == 0 for p in sizes])
         value = {p.name: float(v) for p, v in zip(sizes, a, strict=True)}
     held = {p.name: p.value for p in sizes if not p.vary}
     if held:  # e.g. copper's temperature coefficient: only near its physical value does the shape make sense
         ratio = min((v / h for (n, h) in held.items() if (v := value[n]) > 0 and h), default=0.0)
         drop *= float(np.exp(-0.1 * np.log(max(ratio, 1e-3)) ** 2))
         value |= held
-    return [(drop, {**shape, **value})]
+    return [(drop, {**shape, **value}, left)]
 
 
 def _null_columns(tangent: Tangent, model: Model, sizes: Sequence[Parameter], shape: Mapping[str, float]) -> Array:
@@ -188,8 +207,10 @@ def _coordinates(problem: Problem, fit: Fit) -> Array:
     return problem.scaling.scaled([initial.get(p.name, p.value) for p in problem.unknown])
 
 
-def _project(tangent: Tangent, columns: Array, nonnegative: Sequence[bool]) -> tuple[float, Array]:
-    """Return the share of chi² explained by `columns` and the coefficients, signs enforced."""
+def _project(tangent: Tangent, columns: Array, nonnegative: Sequence[bool]) -> tuple[float, Array, Array]:
+    """Return the share of chi² explained by `columns`, the coefficients, signs enforced, and what is left."""
+    from scipy.optimize import nnls  # slow to import, and not needed before
+
     c = tangent.off(columns)
     norms = np.linalg.norm(c, axis=0)
     raw = np.linalg.norm(columns, axis=0)
@@ -204,11 +225,12 @@ def _project(tangent: Tangent, columns: Array, nonnegative: Sequence[bool]) -> t
     coefficients[signed] -= z[c.shape[1]:]
     total = float(tangent.fit.residuals[:len(tangent.residual)] @ tangent.fit.residuals[:len(tangent.residual)])
     inside = float(tangent.residual @ tangent.residual)
-    return max(inside - rest**2, 0.0) / max(total, 1e-300), coefficients / scale
+    left = tangent.residual + c @ coefficients
+    return max(inside - rest**2, 0.0) / max(total, 1e-300), coefficients / scale, left
 
 
 def _score_finite(tangent: Tangent, model: Model, pars: Sequence[Parameter],
-                  shape: Mapping[str, float]) -> list[tuple[float, dict[str, float]]]:
+                  shape: Mapping[str, float]) -> list[Tried]:
     """Score an effect at a finite shape: the difference that it makes, in a free amount."""
     at = model.start_at(dict(shape)).fix(*model.parameters)
     problem = tangent.fit.problem.for_model(at)
@@ -221,8 +243,10 @@ def _score_finite(tangent: Tangent, model: Model, pars: Sequence[Parameter],
     change = np.concatenate(parts) - plain_residual(tangent.fit)[:n]
     if not np.any(change):
         return []
-    drop, a = _project(tangent, change[:, None], [True])
-    return [(drop * min(1.0, 1.0 / max(a[0] / 3, 1e-9)), dict(shape))] if a[0] > 0.05 else [(0.2 * drop, dict(shape))]
+    drop, a, left = _project(tangent, change[:, None], [True])
+    # An amount far from one means that the shape itself is wrong: the drop promises more than it can keep.
+    keeps = 0.2 if a[0] < 0.05 else min(1.0, 3.0 / a[0])
+    return [(keeps * drop, dict(shape), left)]
 
 
 def plain_residual(fit: Fit) -> Array:
