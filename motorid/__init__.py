@@ -37,10 +37,12 @@ if _TYPE_CHECKING:
         plot_ladder,
         plot_missing,
         plot_parameters,
+        plot_profile,
         plot_ranking,
         plot_residuals,
         plot_runs,
         plot_sensitivities,
+        plot_singular_values,
         plot_waterfall,
     )
 
@@ -50,10 +52,12 @@ _FIGURES = (
     "plot_ladder",
     "plot_missing",
     "plot_parameters",
+    "plot_profile",
     "plot_ranking",
     "plot_residuals",
     "plot_runs",
     "plot_sensitivities",
+    "plot_singular_values",
     "plot_waterfall",
 )
 

@@ -8,6 +8,7 @@ from typing import Any
 from motorid._html import Card, Flag, Table
 from motorid._html_tables import NAMES, counted
 from motorid.formatting import duration, number, percent, quantity, with_error
+from motorid.uncertainty import interval_text
 
 
 def _comparison(c: Any) -> Card:
@@ -102,8 +103,14 @@ def _covariance(c: Any) -> Card:
         said: str | Flag = with_error(float(value), std, unit)
         if std is None:
             said = Flag(f"{quantity(float(value), unit, 3)} ({c.status[name]})", "note")
-        reach = f"{number(limits[0])} … {number(limits[1])}" if limits else "–"
-        rows.append([name, said, reach, *(_correlation(x) for x in c.correlation[c.names.index(name)])])
+        rows.append(
+            [
+                name,
+                said,
+                interval_text(limits),
+                *(_correlation(x) for x in c.correlation[c.names.index(name)]),
+            ]
+        )
     table = Table(["unknown", "value ± std", "95 %", *(f"ρ {n}" for n in c.names)], rows)
     share = ", ".join(f"{NAMES.get(k, k)} {percent(v.effective_share, 2)}" for k, v in c.colours.items())
     text = (f"Effective samples per sample: {share}.",) if share else ()
@@ -119,10 +126,61 @@ def _correlation(value: float) -> str | Flag:
     return Flag(text, "note") if 0.95 < abs(value) < 0.9999 else text
 
 
+def _bootstrap(b: Any) -> Card:
+    rows: list[Sequence[str | Flag]] = []
+    for name, value, unit in zip(b.names, b.reference, b.units, strict=True):
+        said: str | Flag = with_error(float(value), b.std[name], unit)
+        if b.std[name] is None:
+            said = Flag(f"{quantity(float(value), unit, 3)} ({b.status[name]})", "note")
+        limited = b.limited[name]
+        rows.append(
+            [
+                name,
+                said,
+                interval_text(b.interval(name)),
+                Flag(percent(limited, 2), "note") if limited else "none",
+            ]
+        )
+    flags = [Flag(f"{len(b.samples)} refits")]
+    flags += [Flag(f"{len(b.failures)} failed", "bad")] if b.failures else []
+    header = ["parameter", "value ± std", "95 %", "at its limit"]
+    words = {"blocks": "Blocks of the residuals, put back in random order on the model's curves."}
+    text = [words.get(b.kind, f"Resampled: {b.kind}."), b.interrupted]
+    return Card(
+        "Bootstrap", flags, text, (Table(header, rows),), (("mi.plot_profile(mi.intervals(fit))", "compare"),)
+    )
+
+
+def _profile(p: Any) -> Card:
+    low, high = p.interval()
+    row = [p.name, quantity(p.value, p.unit, 5), number(low), number(high)]
+    flags = [Flag("the profile found a better fit than the one given", "bad")] if p.best < -1.0 else []
+    table = Table(["parameter", "value", "95 %, from", "to"], [row])
+    return Card(
+        f"Profile of {p.name}", flags, (), (table,), (("mi.plot_profile(profile)", "see it"),), "plot_profile"
+    )
+
+
+def _intervals(r: Any) -> Card:
+    rows: list[Sequence[str | Flag]] = []
+    for name, p in r.profiles.items():
+        known = r.covariance.interval(name, r.level)
+        first = interval_text(known) if known else Flag(r.covariance.status[name], "note")
+        others = (r.bootstrap.interval(name, r.level), p.interval(r.level))
+        rows.append([name, quantity(p.value, p.unit), first, *(interval_text(x) for x in others)])
+    header = ["parameter", "value", "covariance", f"bootstrap ({r.bootstrap.kind})", "profile"]
+    text = ("Where the three agree, any will do; where they do not, believe the profile.",)
+    return Card(f"Intervals of {percent(r.level)}", (), text, (Table(header, rows),),
+                (("mi.plot_profile(intervals)", "see them"),), "plot_profile")  # fmt: skip
+
+
 WRITERS: dict[str, Callable[[Any], Card]] = {
     "Comparison": _comparison,
     "Suggestion": _suggestion,
     "Multistart": _multistart,
     "Identifiability": _identifiability,
     "Covariance": _covariance,
+    "Bootstrap": _bootstrap,
+    "Profile": _profile,
+    "Intervals": _intervals,
 }

@@ -13,6 +13,7 @@ import numpy as np
 
 from motorid.coloured import Colour, colour_of
 from motorid.descent import descend
+from motorid.display import Shown
 from motorid.errors import FitError, MotoridError, UsageError, one_of
 from motorid.experiment import Experiment
 from motorid.fit import Failure, Fit
@@ -29,8 +30,8 @@ FEWEST_RUNS = 4  # resampled as wholes: with fewer there are hardly any differen
 SOLVER = LevenbergMarquardt(max_iterations=60, ftol=1e-7, xtol=1e-7)  # from the fit, next to the optimum
 
 
-@dataclass(frozen=True, eq=False)
-class Bootstrap:
+@dataclass(frozen=True, eq=False, repr=False)
+class Bootstrap(Shown):
     """Refits to resampled records.
 
     Attributes
@@ -97,8 +98,6 @@ class Bootstrap:
         note = f"{len(self.samples)} refits, {len(self.failures)} failed. {self.interrupted}".strip()
         return str(Table(f"Bootstrap ({self.kind})", ("", "value ± std", "95 %", ""), tuple(rows),
                          left=(0, 1, 2, 3), note=note))
-
-    __repr__ = __str__
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from motorid.display import Shown
 from motorid.fit import Failure, Fit
 from motorid.formatting import duration, number, percent
 from motorid.tables import Table
@@ -31,8 +32,8 @@ class Ending:
     seconds: float
 
 
-@dataclass(frozen=True, eq=False)
-class Multistart:
+@dataclass(frozen=True, eq=False, repr=False)
+class Multistart(Shown):
     """Many fits of one problem from random starts.
 
     Attributes
@@ -171,8 +172,6 @@ class Multistart:
             said.append(f"{self.interrupted[0].upper()}{self.interrupted[1:]}.")
         table = Table("Good fits", ("", "reference", "mean", "std"), tuple(rows))
         return "\n".join([" ".join(said), "", str(table)])
-
-    __repr__ = __str__
 
 
 def _together(a: Ending, b: Ending) -> bool:

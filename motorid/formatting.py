@@ -67,7 +67,9 @@ def number(value: float | None, digits: int = 4) -> str:
 
 
 def quantity(value: float | None, unit: str = "", digits: int = 4) -> str:
-    """Return a number with its unit."""
+    """Return a number with its unit; what is not known has none."""
+    if value is None or math.isnan(value):
+        return number(value)
     return f"{number(value, digits)} {unit}".rstrip()
 
 

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from motorid.combinations import basis_in_words, monomials
+from motorid.display import Shown
 from motorid.errors import SimulationError, UsageError
 from motorid.fit import UNDETERMINED, Fit
 from motorid.formatting import number, quantity
@@ -48,8 +49,8 @@ class WeakDirection:
     text: str
 
 
-@dataclass(frozen=True, eq=False)
-class Identifiability:
+@dataclass(frozen=True, eq=False, repr=False)
+class Identifiability(Shown):
     """What records can tell about parameters, at one point.
 
     Attributes
@@ -156,8 +157,6 @@ class Identifiability:
         sums = (f"Singular values {values}; condition number {number(self.condition_number, 3)}; "
                 f"rank {self.rank} of {len(self.names)}, structural rank {self.structural_rank}.")
         return "\n".join([self.text, "", str(table), "", sums])
-
-    __repr__ = __str__
 
 
 def identifiability(problem_or_fit: Problem | Fit, *, points: int = 5, seed: int = 0) -> Identifiability:

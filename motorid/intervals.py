@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from motorid.bootstrap import Bootstrap, bootstrap
+from motorid.display import Shown
 from motorid.fit import Fit
 from motorid.formatting import number
 from motorid.profiling import Profile, profiles
@@ -15,8 +16,8 @@ from motorid.tasks import Map
 from motorid.uncertainty import Covariance, covariance, interval_text
 
 
-@dataclass(frozen=True, eq=False)
-class Intervals:
+@dataclass(frozen=True, eq=False, repr=False)
+class Intervals(Shown):
     """Three answers to one question. Where they agree, any will do; where not, believe the profile.
 
     Attributes
@@ -50,8 +51,6 @@ class Intervals:
                          interval_text(p.interval(self.level))))
         heads = ("", "value", "covariance", f"bootstrap ({self.bootstrap.kind})", "profile")
         return str(Table(f"Intervals of {self.level:.0%}", heads, tuple(rows), left=(0, 1, 2, 3, 4)))
-
-    __repr__ = __str__
 
 
 def intervals(fit: Fit, *, level: float = 0.95, kind: str = "blocks", n: int = 200, seed: int = 0,

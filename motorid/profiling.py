@@ -16,6 +16,7 @@ import numpy as np
 from scipy.special import stdtrit
 
 from motorid.descent import descend
+from motorid.display import Shown
 from motorid.errors import MotoridError, UsageError, one_of
 from motorid.fit import Fit
 from motorid.formatting import number
@@ -31,8 +32,8 @@ Point = tuple[float, float, dict[str, float]]  # value held, rise, all values
 SOLVER = LevenbergMarquardt(max_iterations=60, ftol=1e-8, xtol=1e-8)
 
 
-@dataclass(frozen=True, eq=False)
-class Profile:
+@dataclass(frozen=True, eq=False, repr=False)
+class Profile(Shown):
     """The profile of one parameter.
 
     Attributes
@@ -102,8 +103,6 @@ class Profile:
             said = f"{interval_text((low, high))} {self.unit} (95 %)"
         better = " The profile found a better fit than the one given." if self.best < -1.0 else ""
         return f"{self.name} = {number(self.value, 5)} {self.unit}: {said}.{better}"
-
-    __repr__ = __str__
 
 
 def _crossing(x: Array, rise: Array, reach: float) -> float | None:

@@ -11,6 +11,7 @@ import numpy as np
 from scipy.special import stdtrit
 
 from motorid.coloured import Colour, colour_of, weighed
+from motorid.display import Shown
 from motorid.errors import UsageError, one_of
 from motorid.fit import UNDETERMINED, Fit
 from motorid.formatting import number, with_error
@@ -23,8 +24,8 @@ METHODS = ("coloured", "white")
 Blocks = Mapping[str, Sequence[tuple[Array, Array]]]
 
 
-@dataclass(frozen=True, eq=False)
-class Covariance:
+@dataclass(frozen=True, eq=False, repr=False)
+class Covariance(Shown):
     """What the data say about the unknowns of a fit.
 
     Attributes
@@ -107,8 +108,6 @@ class Covariance:
         heads = ("", "value ± std", "95 %", "most correlated with")
         return str(Table(f"Uncertainty, {self.method} residuals", heads, tuple(rows), left=(0, 1, 2, 3),
                          note=f"Effective samples per sample: {share}."))
-
-    __repr__ = __str__
 
     def _closest(self, name: str) -> str:
         row = np.abs(np.where(np.isfinite(self.correlation), self.correlation, 0.0))[self.names.index(name)]

@@ -49,5 +49,6 @@ def test_numbers_keep_four_significant_digits(value, text):
 def test_words_for_shares_units_and_times():
     assert percent(0.0123) == "1.23 %"
     assert percent(None) == "–"
+    assert quantity(None, "Ω") == "–"
     assert quantity(5e-3, "N·m") == "0.005 N·m"
     assert [duration(s) for s in (0.0352, 1.234, 59.99, 200)] == ["35 ms", "1.23 s", "1 min", "3 min 20 s"]

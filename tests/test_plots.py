@@ -16,6 +16,9 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 import motorid as mi
 from motorid import plots
 from motorid.errors import UsageError
+from motorid.identifiability import identifiability
+from motorid.intervals import intervals
+from motorid.multistart import multistart
 from motorid.plots.residuals import autocorrelation, binned_means
 from motorid.plots.style import axis_label, detached, envelope
 from motorid.plots.svg import svg_of
@@ -48,6 +51,9 @@ FIGURES = {
     "plot_ladder": lambda d, check: plots.plot_ladder(d),
     "plot_parameters": lambda d, check: plots.plot_parameters(d, truth={"R": 1.38, "b": 6.5e-5}),
     "plot_sensitivities": lambda d, check: plots.plot_sensitivities(d.after),
+    "plot_singular_values": lambda d, check: plots.plot_singular_values(identifiability(d.after)),
+    "plot_profile": lambda d, check: plots.plot_profile(intervals(d.after, n=12, quiet=True)),
+    "plot_waterfall": lambda d, check: plots.plot_waterfall(multistart(d.after, starts=6, quiet=True)),
     "plot_current_limit": lambda d, check: plots.plot_current_limit(
         d.before, d.after, limit=1.0, labels=["plain", "better"]
     ),
@@ -70,8 +76,9 @@ def test_every_axis_says_what_it_shows_and_in_which_unit(drawn):
         text for ax in axes for text in (ax.get_xlabel(), ax.get_ylabel(), ax.get_title(loc="left")) if text
     ]
     told.append(figure.get_supxlabel())
-    units = {"plot_ranking": "%", "plot_ladder": "%", "plot_parameters": "Ω"}
-    assert any(f"({units.get(name, 'A')})" in t for t in told), told
+    units = {"plot_ranking": "(%)", "plot_ladder": "(%)", "plot_parameters": "(Ω)", "plot_profile": "(Ω)"}
+    units |= {"plot_waterfall": "ratio", "plot_singular_values": "singular value"}  # numbers without a unit
+    assert any(units.get(name, "(A)") in t for t in told), told
     bottom = [ax for ax in axes if ax.get_subplotspec() is not None and ax.get_subplotspec().is_last_row()]
     if name not in ("plot_parameters", "plot_ladder"):  # theirs are named below the figure, and by the ticks
         assert all(ax.get_xlabel() for ax in bottom if ax.axison)
@@ -263,7 +270,10 @@ def test_binned_means_follow_the_curve(rng):
         (lambda d: plots.plot_residuals(d.before, ["omega", "speed"]), "unknown channel 'speed'"),
         (lambda d: plots.plot_sensitivities(d.before, names=["tau_c"]), "unknown estimated parameter"),
         (lambda d: plots.plot_sensitivities(d.before, run=7), "numbered from 0"),
-        (lambda d: plots.plot_current_limit(d.before), "no CurrentLimit"),
+        (lambda d: plots.plot_profile(d.before), "plot_profile takes"),
+    (lambda d: plots.plot_singular_values(d.before), "plot_singular_values takes"),
+    (lambda d: plots.plot_waterfall(d.before), "plot_waterfall takes"),
+    (lambda d: plots.plot_current_limit(d.before), "no CurrentLimit"),
         (lambda d: plots.plot_current_limit(), "plot_current_limit takes fits"),
     ],
 )

@@ -3,6 +3,7 @@
 from motorid.plots.diagnosis import plot_ladder, plot_missing, plot_ranking
 from motorid.plots.fits import plot_fit, plot_runs
 from motorid.plots.formulations import plot_current_limit
+from motorid.plots.intervals import plot_profile, plot_singular_values
 from motorid.plots.parameters import plot_parameters
 from motorid.plots.residuals import plot_residuals
 from motorid.plots.trust import plot_sensitivities, plot_waterfall
@@ -13,9 +14,11 @@ __all__ = [
     "plot_ladder",
     "plot_missing",
     "plot_parameters",
+    "plot_profile",
     "plot_ranking",
     "plot_residuals",
     "plot_runs",
     "plot_sensitivities",
+    "plot_singular_values",
     "plot_waterfall",
 ]

@@ -1,0 +1,172 @@
+"""Figures of what the data determine: singular values, profiles, intervals."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.ticker import MaxNLocator
+from scipy.interpolate import PchipInterpolator
+from scipy.special import stdtrit
+
+from motorid.errors import UsageError
+from motorid.formatting import number
+from motorid.identifiability import Identifiability
+from motorid.integrate.grid import Array
+from motorid.intervals import Intervals
+from motorid.plots.style import (
+    INK,
+    MUTED,
+    PALETTE,
+    WIDTH,
+    decade,
+    grid,
+    new_figure,
+    plain_decades,
+    scaled_title,
+    styled,
+    tidy,
+)
+from motorid.profiling import Profile
+
+LEVEL = 0.95
+
+
+@styled
+def plot_singular_values(result: Identifiability) -> np.ndarray:
+    """Draw how well each direction of the parameters is seen, and which parameters make it up.
+
+    A direction whose singular value is below one (shaded) changes the outputs by less than the noise even
+    where the parameters change by 100 %. Circles: share of each parameter in a direction, blue and orange for
+    opposite signs.
+
+    Parameters
+    ----------
+    result : Identifiability
+
+    Returns
+    -------
+    ndarray of Axes, shape (2,)
+    """
+    if not isinstance(result, Identifiability):
+        raise UsageError(f"plot_singular_values takes mi.identifiability(fit), got {type(result).__name__}.")
+    k = len(result.names)
+    axes = new_figure(min(WIDTH, 4.6 + 0.6 * k), 3.2).subplots(1, 2, width_ratios=[1.0, max(0.8, 0.16 * k)])
+    rows = np.arange(1, k + 1)
+    values = np.maximum(result.singular_values, 1e-12 * max(float(result.singular_values[0]), 1e-300))
+    colours = [PALETTE["blue"] if v > 1 else PALETTE["orange"] for v in values]
+    axes[0].vlines(rows, min(0.1, 0.5 * float(values.min())), values, color=colours, lw=2)
+    axes[0].scatter(rows, values, color=colours, s=24, zorder=3)
+    axes[0].set_yscale("log")
+    axes[0].set_ylim(min(0.1, 0.5 * float(values.min())), 2.5 * float(values[0]))
+    axes[0].axhspan(axes[0].get_ylim()[0], 1, color=MUTED, alpha=0.16, lw=0, zorder=0)
+    axes[0].set_xticks(rows)
+    plain_decades(axes[0])
+    words = f"rank {result.rank} of {k}, condition number {number(result.condition_number, 3)}"
+    tidy(axes[0], x="direction", y="singular value", title=words)
+    _directions(axes[1], result)
+    return axes
+
+
+def _directions(ax: Axes, result: Identifiability) -> None:
+    for row, direction in enumerate(result.directions, 1):
+        for column, weight in enumerate(direction):
+            colour = PALETTE["blue"] if weight > 0 else PALETTE["orange"]
+            ax.scatter(column, row, s=180 * abs(float(weight)) ** 1.5, color=colour, alpha=0.85, lw=0)
+    k = len(result.names)
+    ax.set_xticks(range(k), result.names)
+    ax.set_yticks(range(1, k + 1))
+    ax.set_ylim(k + 0.6, 0.4)
+    ax.set_xlim(-0.6, k - 0.4)
+    tidy(ax, y="direction", title="What each direction is made of")
+
+
+@styled
+def plot_profile(result: Profile | Mapping[str, Profile] | Intervals) -> np.ndarray:
+    """Draw how the misfit rises as a parameter is held away from its value, all others refitted.
+
+    Where the curve crosses the dashed line the interval of 95 % ends. An even valley is what the covariance
+    assumes; a curve that never reaches the line says that the data set no limit there. Of `Intervals` the
+    covariance's and the bootstrap's are drawn below the curve.
+
+    Parameters
+    ----------
+    result : Profile, mapping of str to Profile, or Intervals
+
+    Returns
+    -------
+    ndarray of Axes
+        One per parameter.
+    """
+    profiles = _profiles(result)
+    columns = min(len(profiles), 3)
+    rows = -(-len(profiles) // columns)
+    axes = grid(rows, columns, row=2.2, width=WIDTH if columns == 3 else 4.2 * columns).ravel()
+    both = result if isinstance(result, Intervals) else None
+    for ax, p in zip(axes, profiles, strict=False):
+        _one_profile(ax, p, both)
+    for ax in axes[len(profiles) :]:
+        ax.set_axis_off()
+    for k in range(0, len(profiles), columns):
+        axes[k].set_ylabel("rise of the misfit (t²)")
+    handles, labels = axes[0].get_legend_handles_labels()
+    axes[0].figure.legend(handles, labels, loc="outside upper center", ncols=5)
+    return axes[: len(profiles)]
+
+
+def _one_profile(ax: Axes, p: Profile, both: Intervals | None) -> None:
+    level = both.level if both is not None else LEVEL
+    height = float(stdtrit(p.dof, 0.5 + level / 2)) ** 2
+    scale = 10.0 ** -decade(abs(p.value))
+    ax.plot(*_smooth(p.values * scale, p.rise, p.value * scale), "-", color=PALETTE["blue"], label="profile")
+    ax.plot(p.values * scale, p.rise, ".", ms=4, color=PALETTE["blue"])
+    ax.axhline(height, color=INK, lw=0.9, ls=(0, (4, 2)), label=f"{100 * level:g} %")
+    ax.plot(p.value * scale, 0, "o", ms=6, color=PALETTE["blue"])
+    ends = np.clip(p.interval(level), float(p.values.min()), float(p.values.max()))
+    ax.axvspan(ends[0] * scale, ends[1] * scale, color=PALETTE["blue"], alpha=0.1, lw=0)
+    if both is not None:
+        known, drawn = both.covariance.interval(p.name, level), both.bootstrap.interval(p.name, level)
+        for y, limits, name, colour in (
+            (-0.8, known, "covariance", "purple"),
+            (-1.7, drawn, "bootstrap", "green"),
+        ):
+            if limits is not None:
+                ax.plot(np.array(limits) * scale, [y, y], "|-", color=PALETTE[colour], lw=2, ms=6, label=name)
+    ax.set_ylim(-2.4 if both is not None else -0.4, max(1.5 * height, 2.0))
+    ax.set_yticks([y for y in ax.get_yticks() if 0 <= y <= ax.get_ylim()[1]])
+    _reach(ax, p, height, scale)
+    tidy(ax, x=scaled_title(p.name, p.unit, decade(abs(p.value))))
+
+
+def _reach(ax: Axes, p: Profile, height: float, scale: float) -> None:
+    """Show the valley and some of its sides; a valley over decades on a logarithmic axis."""
+    inside = p.values[p.rise <= 1.6 * height] * scale
+    low, high = float(inside.min()), float(inside.max())
+    if low > 0 and high > 20 * low:
+        ax.set_xscale("log")
+        ax.set_xlim(low / 1.5, high * 1.5)
+        return
+    room = 0.08 * (high - low) or 0.1 * abs(high)
+    ax.set_xlim(low - room, high + room)
+    ax.xaxis.set_major_locator(MaxNLocator(4))
+
+
+def _smooth(x: Array, rise: Array, at: float) -> tuple[Array, Array]:
+    """Return the curve between the points; the root of the rise is nearly straight, so that is joined."""
+    root = np.sign(x - at) * np.sqrt(np.maximum(rise, 0.0))
+    if len(x) < 3 or np.any(np.diff(root) <= 0) or x.max() > 20 * max(x.min(), 1e-300):
+        return x, rise
+    fine = np.linspace(x[0], x[-1], 200)
+    return fine, PchipInterpolator(x, root)(fine) ** 2
+
+
+def _profiles(result: Any) -> Sequence[Profile]:
+    found = result.profiles if isinstance(result, Intervals) else result
+    chosen = list(found.values()) if isinstance(found, Mapping) else [found]
+    if not chosen or not all(isinstance(p, Profile) for p in chosen):
+        raise UsageError(
+            f"plot_profile takes mi.profile(fit, 'R') or mi.intervals(fit), got {type(result).__name__}."
+        )
+    return chosen
