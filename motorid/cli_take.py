@@ -2,36 +2,86 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
-from motorid.cli_options import Choices, Json, with_choices
+from motorid.batch import fit_many as fit_all
+from motorid.batch import motors_in
+from motorid.cli_common import FAILED, show
+from motorid.cli_model import model_of
+from motorid.cli_options import OUT, Choices, Json, with_choices
+from motorid.errors import DataError, UsageError, one_of
+from motorid.experiment import Experiment
+from motorid.layout import parse_pairs
+from motorid.summary import write_json
+
+FORMS = ("casadi", "c", "json")
 
 
 @with_choices(Choices)
 def fit_many(
     directory: Annotated[Path, typer.Argument(metavar="DIR", help="One folder, or file, per motor.")],
     choices: Choices,
-    out: Annotated[Path | None, typer.Option(metavar="TABLE.csv", help="Write the table as CSV.")] = None,
+    out: Annotated[Path | None, typer.Option(
+        metavar="TABLE.csv", rich_help_panel=OUT, help="Write the table: .csv, .parquet or .json.")] = None,
+    journal: Annotated[Path | None, typer.Option(
+        metavar="FILE", rich_help_panel=OUT, help="Keep results here, to go on after an interruption.")] = None,
+    jobs: Annotated[int, typer.Option(min=1, metavar="N", rich_help_panel=OUT, help="Processes.")] = 1,
     json: Json = None,
 ) -> None:
     """Fit one model to the records of many motors; a motor that fails is a row that says why.
 
     Example: motorid fit-many motors/ --effects coulomb --out table.csv
     """
-    raise NotImplementedError
+    from concurrent.futures import ProcessPoolExecutor
+
+    motors = motors_in(directory)
+    model = choices.model(_sample(choices, motors.values()))
+    reading: dict[str, Any] = {k: parse_pairs(v, f"--{k}") for k in ("columns", "units")
+                               if (v := getattr(choices, k))}
+    reading |= {"hold": choices.hold} if choices.hold else {}
+    options = {"journal": journal, "reading": reading, **choices.options()}
+    if jobs == 1:
+        found = fit_all(model, motors, **options)
+    else:
+        with ProcessPoolExecutor(jobs) as pool:
+            found = fit_all(model, motors, map=pool.map, **options)
+    if json:
+        write_json(found.to_dict(), json)
+    if json != "-":
+        show(str(found))
+    if out:
+        show(f"Table: {found.save(out)}")
+    if len(found.failed) == len(found.rows):
+        raise typer.Exit(FAILED)
 
 
 def export(
     fit_json: Annotated[Path, typer.Argument(metavar="FIT.json", help="What fit --json wrote.")],
     path: Annotated[Path, typer.Argument(metavar="PATH", help="What to write.")],
     to: Annotated[str, typer.Option(metavar="casadi|c|json", help="Form of the model.")] = "casadi",
-    effects_from: Annotated[Path | None, typer.Option(metavar="FILE.py", help="Effects of your own.")] = None,
+    effects_from: Annotated[Path | None, typer.Option(
+        metavar="FILE.py", help="Effects of your own.")] = None,
 ) -> None:
     """Take a fitted model along: as a CasADi function, as C source, as JSON.
 
     Example: motorid export fit.json --to c motor.c
     """
-    raise NotImplementedError
+    if to not in FORMS:
+        raise UsageError(f"--to: {one_of(to, FORMS, 'form')}")
+    from motorid.export import export as write  # pyright: ignore[reportMissingImports]
+
+    show(f"Written: {write(model_of(fit_json, effects_from), path, to=to)}")
+
+
+def _sample(choices: Choices, motors: Iterable[list[Path]]) -> list[Experiment]:
+    """Return the records of the first motor that can be read: they tell a rotary from a linear axis."""
+    for files in motors:
+        try:
+            return choices.read([str(f) for f in files])
+        except DataError:
+            continue
+    return []
