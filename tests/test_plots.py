@@ -80,7 +80,8 @@ def test_every_axis_says_what_it_shows_and_in_which_unit(drawn):
     units |= {"plot_waterfall": "ratio", "plot_singular_values": "singular value"}  # numbers without a unit
     assert any(units.get(name, "(A)") in t for t in told), told
     bottom = [ax for ax in axes if ax.get_subplotspec() is not None and ax.get_subplotspec().is_last_row()]
-    if name not in ("plot_parameters", "plot_ladder"):  # theirs are named below the figure, and by the ticks
+    named_by_ticks = ("plot_parameters", "plot_ladder", "plot_singular_values", "plot_waterfall")
+    if name not in named_by_ticks:
         assert all(ax.get_xlabel() for ax in bottom if ax.axison)
 
 
@@ -271,9 +272,9 @@ def test_binned_means_follow_the_curve(rng):
         (lambda d: plots.plot_sensitivities(d.before, names=["tau_c"]), "unknown estimated parameter"),
         (lambda d: plots.plot_sensitivities(d.before, run=7), "numbered from 0"),
         (lambda d: plots.plot_profile(d.before), "plot_profile takes"),
-    (lambda d: plots.plot_singular_values(d.before), "plot_singular_values takes"),
-    (lambda d: plots.plot_waterfall(d.before), "plot_waterfall takes"),
-    (lambda d: plots.plot_current_limit(d.before), "no CurrentLimit"),
+        (lambda d: plots.plot_singular_values(d.before), "plot_singular_values takes"),
+        (lambda d: plots.plot_waterfall(d.before), "plot_waterfall takes"),
+        (lambda d: plots.plot_current_limit(d.before), "no CurrentLimit"),
         (lambda d: plots.plot_current_limit(), "plot_current_limit takes fits"),
     ],
 )
