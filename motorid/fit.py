@@ -296,8 +296,9 @@ def _least_squares(problem: Problem, options: LevenbergMarquardt, callback, form
     done = descend_balanced(problem, options, callback, stages=stages)
     problem, found = done.problem, done.solution
     error = integration_error(problem, found.q)
-    fit = Fit(problem, problem.values(found.q), found.residual, found.jac / problem.scaling.slope(found.q), found.q,
-              found.status, _advice(found, error, problem.n_outputs), done.history, time.perf_counter() - began,
+    q = problem.unknowns.principal(found.q)
+    fit = Fit(problem, problem.values(q), found.residual, found.jac / problem.scaling.slope(q), q, found.status,
+              _advice(found, error, problem.n_outputs), done.history, time.perf_counter() - began,
               error, formulation)
     _ = fit.simulations  # nothing is computed for them now
     problem.forget()

@@ -1,0 +1,86 @@
+"""Every effect of the library, added to a motor, is found again from its own data by one plain fit.
+
+Nothing is told to the fit but the effect (and the order of cogging and ripple): no start, no size, no shape.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from lab_records import VALUES, noisy, simulated
+
+import motorid as mi
+from motorid.effects import LIBRARY
+
+TRUTH = {
+    "brush_drop": {"V_b": 0.6, "i_b": 0.15},
+    "winding_heating": {"R_th": 20.0, "C_th": 0.3},
+    "inductance_saturation": {"i_L": 3.0},
+    "magnetic_saturation": {"i_K": 8.0},
+    "driver_dead_band": {"V_d": 0.3},
+    "voltage_offset": {"V_0": 0.1},
+    "coulomb": {"tau_c": 5e-3},
+    "coulomb_asymmetric": {"tau_cp": 6e-3, "tau_cn": 3e-3},
+    "stribeck": {"tau_c": 4e-3, "tau_s": 9e-3, "omega_s": 8.0},
+    "quadratic_drag": {"c_2": 6e-7},
+    "constant_load": {"tau_0": 4e-3},
+    "gravity": {"mgl": 5e-3, "phi_g": 0.7},
+    "cogging": {"A": 3e-3, "phi": -2.0},
+    "torque_ripple": {"a_r": 0.1, "phi_r": 1.0},
+    "load_friction": {"mu": 0.08},
+    "viscous_asymmetric": {"b_a": 2e-5},
+    "lugre": {"tau_c": 5e-3, "s_b": 1.6, "omega_s": 8.0, "theta_s": 0.02},
+    "compliance": {"r_load": 0.4, "omega_r": 250.0, "zeta_r": 0.05},
+    "backlash": {"r_gap": 0.5, "gap": 0.05, "omega_c": 400.0, "zeta_c": 0.3},
+    "speed_lag": {"T_w": 4e-3},
+    "current_lag": {"T_i": 8e-4},
+    "speed_delay": {"T_d": 5e-3},
+    "current_offset": {"i_0": 0.05},
+    "speed_gain": {"k_w": 0.04},
+}
+NOISE = {"i": 5e-3, "omega": 0.2, "theta": 1e-3}
+LEVELS = np.array([0, 3, 6, 0, -4, -8, 2, 8, -2, 0.5, 1, -1, -6, 6, 0], float)
+
+
+def volts(t: np.ndarray, kind: int) -> np.ndarray:
+    """A staircase with reversals and standstills, or random steps over a slow wave."""
+    if kind == 0:
+        return LEVELS[np.minimum((t / t[-1] * len(LEVELS)).astype(int), len(LEVELS) - 1)]
+    steps = np.random.default_rng(5).choice([-3.5, -1.4, 0.7, 2.1, 4.2, 6.3], size=200)
+    return np.where(t < 0.02, 0, steps[np.minimum((t / 0.06).astype(int), 199)] + 2 * np.sin(4.4 * t))
+
+
+def records(effect, rng):
+    t = np.arange(2400) * 1e-3
+    model = (mi.dc_motor(**VALUES) + effect).replace(**TRUTH[effect.name])
+    channels = tuple(NOISE)
+    clean = [simulated(t, volts(t, k), channels, model) for k in (0, 1)]
+    if "sgn_width" in model.parameters:  # the width that a fit of these records will choose
+        width = mi.Problem(mi.dc_motor() + effect, tuple(noisy(c, rng, NOISE) for c in clean)).model.values[
+            "sgn_width"
+        ]
+        clean = [simulated(t, volts(t, k), channels, model.replace(sgn_width=width)) for k in (0, 1)]
+    return [noisy(c, rng, NOISE) for c in clean]
+
+
+def test_every_effect_of_the_library_is_tried():
+    assert set(TRUTH) == set(LIBRARY)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", TRUTH)
+def test_is_found_again_from_its_own_data(name, rng):
+    effect = LIBRARY[name]
+    runs = records(effect, rng)
+    fit = mi.fit(mi.dc_motor() + effect, runs)
+    assert fit.chi2 / fit.dof < 1.1
+    assert fit.integration_error < 0.2
+    for n, value in TRUTH[name].items():
+        std = fit.std[n]
+        assert std is not None, n
+        # The smooth sgn of data and fit differs a little, which noise as small as this shows: 2 %.
+        assert abs(fit.values[n] - value) < max(4.5 * std, 0.02 * abs(value)), n
+    for n, value in VALUES.items():
+        assert fit.values[n] == pytest.approx(value, rel=0.01), n
+    plain = mi.fit(mi.dc_motor(), runs)
+    assert plain.chi2 > 1.05 * fit.chi2  # the effect was there to be found
