@@ -23,6 +23,7 @@ WIDEST = 0.03  # first width of sgn over the highest speed
 NARROWER = 6.0  # at most, from one stage to the next
 ON_THE_WAY = ((1e-7, 60), (1e-6, 60))  # ftol and iterations of the first stage, and of those between
 ROUNDS = 4  # of refining the sub-steps
+LEAST_FACTOR = 0.02  # a quick channel with few samples per time constant passes for noisy
 IMBALANCE = 3.0  # between channels, in misfit over noise, above which the misfit decides the weights
 
 # Looks again from the start: by the other weights first?, first damping, start moved by e to this power.
@@ -195,7 +196,7 @@ def descend_balanced(problem: Problem, options: LevenbergMarquardt, callback: Ca
 
 
 def misfit_over_noise(problem: Problem, q: Array) -> dict[str, float]:
-    """Return the RMS of the residual over the noise per channel, at least 1."""
+    """Return the RMS of the residual over the noise per channel; far below 1 where the noise was overestimated."""
     sums = {c: [0.0, 0] for c in problem.outputs}
     for k, run in enumerate(problem.runs):
         y = problem.simulate(q, k, derivatives=False).y
@@ -205,7 +206,7 @@ def misfit_over_noise(problem: Problem, q: Array) -> dict[str, float]:
                 e = e[np.isfinite(e)]
                 sums[c][0] += float(e @ e)
                 sums[c][1] += e.size
-    return {c: max(float(np.sqrt(s / max(n, 1))), 1.0) for c, (s, n) in sums.items()}
+    return {c: max(float(np.sqrt(s / max(n, 1))), LEAST_FACTOR) for c, (s, n) in sums.items()}
 
 
 def _smooths(problem: Problem) -> bool:

@@ -28,6 +28,8 @@ WORST_CONDITION = 1e4  # of the column-scaled Jacobian
 HOPELESS = 1e6  # condition number beyond which a direction counts as open
 SIGNIFICANT = 3.0  # standard deviations
 ROUGH = 1e-4  # accuracy of the integration while starts are compared
+ALIVE = 3.0  # standard deviations that a change by a factor of e makes
+SUBSTEPS = 24  # per sample: what needs more cannot be seen in these samples
 ROOM = 10.0  # factor beyond its grid that a shape parameter may run to
 FAILURES = (FitError, SimulationError, ModelError, np.linalg.LinAlgError)
 LEAST_FALL = 0.01  # of the held-out error that makes an effect worth having
@@ -112,7 +114,7 @@ def refit(fit: Fit, model: Model, starts: Sequence[Mapping[str, float]]) -> Fit 
     Effects of the angle start along the measured angle, which the model's own angle, still wrong, would lead
     astray; then the model's angle takes over.
     """
-    model = _bounded(fit, model)
+    model = _revived(fit, _bounded(fit, model))
     angular = any(uses_angle(e) for e in model.effects) and not any(uses_angle(e) for e in fit.model.effects)
     raced = []
     for start in starts or ({},):
@@ -126,6 +128,8 @@ def refit(fit: Fit, model: Model, starts: Sequence[Mapping[str, float]]) -> Fit 
             done = descend(problem, RACE, stages=False)
         except FAILURES:
             continue
+        if sum(int(r.grid.substeps.sum()) for r in done.problem.runs) > SUBSTEPS * sum(r.experiment.n for r in problem.runs):
+            continue
         raced.append((done.solution.history[-1], _from(done.problem, done.solution.q)))
     if not raced:
         return None
@@ -137,6 +141,22 @@ def refit(fit: Fit, model: Model, starts: Sequence[Mapping[str, float]]) -> Fit 
     except FAILURES:
         return None
     return _polished(fit, _from(done.problem, done.solution.q))
+
+
+def _revived(fit: Fit, model: Model) -> Model:
+    """Return the model with collapsed parameters put back to where they matter.
+
+    A plain fit may drive a logarithmic parameter (friction, inductance) to nothing; there its gradient vanishes, and
+    no refit would ever bring it back.
+    """
+    names = [p.name for p in fit.problem.unknown]
+    back = {}
+    for p in model.parameters.values():
+        if p.positive and p.vary and p.name in names:
+            slope = float(np.linalg.norm(fit.jacobian[:, names.index(p.name)]))
+            if 0 < p.value * slope < ALIVE:
+                back[p.name] = float(np.clip(3 * ALIVE / slope, p.lower, min(p.upper, 1e6 * p.value)))
+    return model.start_at(back)
 
 
 def _bounded(fit: Fit, model: Model) -> Model:
@@ -165,6 +185,8 @@ def _polished(fit: Fit, problem: Problem) -> Fit | None:
     except FAILURES:
         return None
     found, problem = done.solution, done.problem
+    if not np.isfinite(found.jac).all():
+        return None
     return Fit(problem, problem.values(found.q), found.residual, found.jac / problem.scaling.slope(found.q), found.q,
                found.status, found.message, done.history)
 
