@@ -82,7 +82,8 @@ MESSAGES = {
                "engine",
     "limit": "stopped after {} iterations; raise max_iterations or look at identifiability()",
 }
-VALLEY = (30, 3e-4)  # so many iterations that lower the cost by less than this share are enough
+VALLEY = (30, 3e5)  # so many iterations that lower the cost by less than this, times ftol, are enough
+PROMISED = 1e-3  # share of the cost that the undamped step may promise at an end without a step
 SLACK = 1.0  # λ above which a small gain does not mean the end: the step was short, not the way
 
 
@@ -127,17 +128,17 @@ def levenberg_marquardt(
             history.append(search.cost)
             if callback is not None:
                 callback(iteration, search.cost, search.q)
-        if status or _crawls(history):
+        if status or _crawls(history, o.ftol):
             break
-    reason = status or ("valley" if _crawls(history) else "limit")
+    reason = status or ("valley" if _crawls(history, o.ftol) else "limit")
     ends = {"valley": "stalled", "stalled": "stalled", "limit": "limit"}
     return Solution(search.q, search.r, search.jac, ends.get(reason, "converged"),
                     MESSAGES[reason].format(o.max_iterations), tuple(history), search.evaluations)
 
 
-def _crawls(history: list[float]) -> bool:
+def _crawls(history: list[float], ftol: float) -> bool:
     back, share = VALLEY
-    return len(history) > back and 0 <= history[-1 - back] - history[-1] < share * history[-1]
+    return len(history) > back and 0 <= history[-1 - back] - history[-1] < share * ftol * history[-1]
 
 
 class _Search:
@@ -174,6 +175,8 @@ class _Search:
             return "gradient"
         weight = np.where(self.log, misfit, np.minimum(size, misfit))[free]
         triangle, rotated = _reduce(self.jac[:, free], self.r)
+        # The undamped step promises ½‖Qᵀr‖²: while that is much, a place without a better one is no minimum.
+        end = "step" if 0.5 * float(rotated @ rotated) <= PROMISED * self.cost else "stalled"
         while True:
             step = np.zeros(len(self.q))
             step[free] = _inside(triangle, rotated, weight, self.lam, (self.low - self.q)[free],
@@ -187,16 +190,14 @@ class _Search:
             if drop > 0 and gain > 1e-4:
                 break
             full = self.lam < SLACK  # hardly shortened: what it promises is what is left to gain
-            if small or predicted <= (1.0 if full else 1e-3) * o.ftol * self.cost:
-                return "step" if small or predicted <= o.ftol * self.cost else "stalled"
+            if small or predicted <= (1.0 if full else 1e-3) * o.ftol * self.cost or self.lam > 1e16:
+                return end
             self.lam, self.growth = (self.lam * self.growth if self.lam > 0 else 1e-3), self.growth * 2
-            if self.lam > 1e16:
-                return "step" if predicted <= o.ftol * self.cost else "stalled"
         self.lam = max(self.lam * max(1 / 3, 1 - (2 * min(gain, 1.0) - 1) ** 3), 1e-12) if o.damping else 0.0
         self.growth = 2.0
         enough = drop <= o.ftol * self.cost and self.lam < SLACK
         self._move(self.q + step)
-        return "step" if small else "cost" if enough else ""
+        return end if small else "cost" if enough else ""
 
     def _shortened(self, step: Array) -> Array:
         """Return the step, no coordinate changing by more than is trusted, within the bounds."""
@@ -243,7 +244,8 @@ def _cost(residual: Callable[[Array], Array], q: Array) -> float:
         r = residual(q)
     except SimulationError:
         return np.inf
-    cost = 0.5 * float(r @ r)
+    with np.errstate(over="ignore", invalid="ignore"):
+        cost = 0.5 * float(r @ r)
     return cost if np.isfinite(cost) else np.inf
 
 

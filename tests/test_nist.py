@@ -1,0 +1,147 @@
+"""The least-squares core on the certified problems of NIST: values to six digits, standard errors to four."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from motorid.errors import SimulationError
+from motorid.least_squares import LevenbergMarquardt, gauss_newton_covariance, levenberg_marquardt
+from motorid.parameters import Parameter, Scaling
+
+FOLDER = Path(__file__).parent / "nist"
+POSITIVE = {"MGH10"}  # lives on the logarithmic scale, as resistances and time constants do in a motor
+STRICT = LevenbergMarquardt(max_iterations=2000, ftol=1e-15, xtol=1e-13)
+
+
+def gauss(b, x):
+    return b[0] * ca.exp(-b[1] * x) + sum(b[k] * ca.exp(-(((x - b[k + 1]) / b[k + 2]) ** 2)) for k in (2, 5))
+
+
+def lanczos(b, x):
+    return sum(b[k] * ca.exp(-b[k + 1] * x) for k in (0, 2, 4))
+
+
+def cubic(b, x):
+    return (b[0] + b[1] * x + b[2] * x**2 + b[3] * x**3) / (1 + b[4] * x + b[5] * x**2 + b[6] * x**3)
+
+
+def chwirut(b, x):
+    return ca.exp(-b[0] * x) / (b[1] + b[2] * x)
+
+
+def saturating(b, x):
+    return b[0] * (1 - ca.exp(-b[1] * x))
+
+
+def enso(b, x):
+    turns = [(b[1], b[2], 12), (b[4], b[5], b[3]), (b[7], b[8], b[6])]
+    return b[0] + sum(c * ca.cos(2 * np.pi * x / p) + s * ca.sin(2 * np.pi * x / p) for c, s, p in turns)
+
+
+MODELS = {
+    "Bennett5": lambda b, x: b[0] * (b[1] + x) ** (-1 / b[2]),
+    "BoxBOD": saturating,
+    "Chwirut1": chwirut,
+    "Chwirut2": chwirut,
+    "DanWood": lambda b, x: b[0] * x ** b[1],
+    "ENSO": enso,
+    "Eckerle4": lambda b, x: b[0] / b[1] * ca.exp(-0.5 * ((x - b[2]) / b[1]) ** 2),
+    "Gauss1": gauss,
+    "Gauss2": gauss,
+    "Gauss3": gauss,
+    "Hahn1": cubic,
+    "Kirby2": lambda b, x: (b[0] + b[1] * x + b[2] * x**2) / (1 + b[3] * x + b[4] * x**2),
+    "Lanczos1": lanczos,
+    "Lanczos2": lanczos,
+    "Lanczos3": lanczos,
+    "MGH09": lambda b, x: b[0] * (x**2 + x * b[1]) / (x**2 + x * b[2] + b[3]),
+    "MGH10": lambda b, x: b[0] * ca.exp(b[1] / (x + b[2])),
+    "MGH17": lambda b, x: b[0] + b[1] * ca.exp(-x * b[3]) + b[2] * ca.exp(-x * b[4]),
+    "Misra1a": saturating,
+    "Misra1b": lambda b, x: b[0] * (1 - (1 + b[1] * x / 2) ** (-2)),
+    "Misra1c": lambda b, x: b[0] * (1 - (1 + 2 * b[1] * x) ** (-0.5)),
+    "Misra1d": lambda b, x: b[0] * b[1] * x / (1 + b[1] * x),
+    "Nelson": lambda b, x: b[0] - b[1] * x[:, 0] * ca.exp(-b[2] * x[:, 1]),
+    "Rat42": lambda b, x: b[0] / (1 + ca.exp(b[1] - b[2] * x)),
+    "Rat43": lambda b, x: b[0] / (1 + ca.exp(b[1] - b[2] * x)) ** (1 / b[3]),
+    "Roszman1": lambda b, x: b[0] - b[1] * x - ca.atan(b[2] / (x - b[3])) / np.pi,
+    "Thurber": cubic,
+}
+
+
+@dataclass
+class Certified:
+    starts: np.ndarray
+    values: np.ndarray
+    errors: np.ndarray
+    squares: float
+    y: np.ndarray
+    x: np.ndarray
+
+
+def certified(name):
+    lines = (FOLDER / f"{name}.txt").read_text().splitlines()
+    table = np.array([line.split()[2:] for line in lines if line.startswith("# b ")], float).T
+    squares = next(float(line.split()[-1]) for line in lines if line.startswith("# residual sum"))
+    data = np.array([line.split() for line in lines if not line.startswith("#")], float)
+    y = np.log(data[:, 0]) if name == "Nelson" else data[:, 0]
+    return Certified(table[:2], table[2], table[3], squares, y, data[:, 1:])
+
+
+def solved(name, problem, start):
+    """Solve from `start` in solver coordinates; return values, standard errors, sum of squares."""
+    b, x = ca.SX.sym("b", len(start)), ca.DM(problem.x)
+    r = MODELS[name](b, x) - ca.DM(problem.y)
+    f = ca.Function("f", [b], [r, ca.densify(ca.jacobian(r, b))])
+    scaling = Scaling.of([Parameter(f"b{k}", v, positive=name in POSITIVE) for k, v in enumerate(start)])
+
+    def both(q):
+        out = [np.asarray(a) for a in f(scaling.physical(q))]
+        if not np.isfinite(out[0]).all() or not np.isfinite(out[1]).all():
+            raise SimulationError("not finite")
+        return out[0].ravel(), out[1] * scaling.slope(q)
+
+    found = levenberg_marquardt(lambda q: both(q)[0], both, scaling.scaled(start), options=STRICT,
+                                log=scaling.log)
+    assert found.status == "converged", found.message
+    squares = float(found.residual @ found.residual)
+    jac = found.jac / scaling.slope(found.q)
+    covariance, determined = gauss_newton_covariance(jac, squares / (len(problem.y) - len(start)))
+    assert determined.all()
+    return scaling.physical(found.q), np.sqrt(np.diag(covariance)), squares
+
+
+@pytest.mark.parametrize("start", [0, 1], ids=["far", "near"])
+@pytest.mark.parametrize("name", sorted(MODELS))
+def test_certified_values_and_standard_errors(name, start):
+    problem = certified(name)
+    values, errors, squares = solved(name, problem, problem.starts[start])
+    np.testing.assert_allclose(values, problem.values, rtol=1e-6)
+    if name == "Lanczos1":  # the residuals are rounding errors of the data, 1e-13
+        assert squares < 1e-20
+        return
+    np.testing.assert_allclose(squares, problem.squares, rtol=1e-6)
+    np.testing.assert_allclose(errors, problem.errors, rtol=1e-4)
+
+
+def test_an_end_far_from_a_minimum_is_not_called_converged():
+    # Without the logarithmic scale the far start of MGH10 leads to a pole, where no step lowers the cost.
+    problem = certified("MGH10")
+    b, x = ca.SX.sym("b", 3), ca.DM(problem.x)
+    r = MODELS["MGH10"](b, x) - ca.DM(problem.y)
+    f = ca.Function("f", [b], [r, ca.densify(ca.jacobian(r, b))])
+    start = problem.starts[0]
+
+    def both(q):
+        out = [np.asarray(a) for a in f(start * q)]
+        if not np.isfinite(out[0]).all() or not np.isfinite(out[1]).all():
+            raise SimulationError("not finite")
+        return out[0].ravel(), out[1] * start
+
+    found = levenberg_marquardt(lambda q: both(q)[0], both, np.ones(3), options=STRICT)
+    assert 2 * found.history[-1] > 10 * problem.squares
+    assert found.status == "stalled"
+    assert "Try another start" in found.message
