@@ -14,6 +14,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from motorid.diagnosis.evidence import autocorrelation, effective_samples
 from motorid.diagnosis.rank import Score
@@ -28,8 +29,13 @@ SHIFTS = 60
 BINS = 8
 LARGEST_RATIO = 10.0  # of residual to noise: coloured noise with a correlation of 0.99 between neighbours
 MATERIAL = 0.03  # share of the residual's variance below which a dependence is not worth a word
-NAMES = {"v": "the voltage", "i": "the current", "omega": "the speed", "theta": "the angle within a turn",
-         "acceleration": "the acceleration"}
+NAMES = {
+    "v": "the voltage",
+    "i": "the current",
+    "omega": "the speed",
+    "theta": "the angle within a turn",
+    "acceleration": "the acceleration",
+}
 
 
 def adequacy(fit: Fit, scores: Sequence[Score] = (), false_alarm: float = FALSE_ALARM) -> Adequacy:
@@ -57,7 +63,9 @@ def adequacy(fit: Fit, scores: Sequence[Score] = (), false_alarm: float = FALSE_
     tests += _score_tests(fit, scores)
     material = [t for t in tests if t["share"] > MATERIAL]
     p_value = min([1.0, *(t["p"] * len(tests) for t in material)])
-    far = [c for c, facts in channels.items() if facts["ratio"] > (LARGEST_RATIO if c != "theta" else LARGEST_RATIO / 2)]
+    far = [
+        c for c, facts in channels.items() if facts["ratio"] > (LARGEST_RATIO if c != "theta" else LARGEST_RATIO / 2)
+    ]
     adequate = p_value > false_alarm and not far
     for c, facts in channels.items():
         facts["p_value"] = min([1.0, *(t["p"] for t in tests if t["channel"] == c)])
@@ -66,8 +74,11 @@ def adequacy(fit: Fit, scores: Sequence[Score] = (), false_alarm: float = FALSE_
 
 
 def _residuals(fit: Fit, channel: str) -> list[tuple[int, Array]]:
-    return [(k, s.residual(channel)) for k, s in enumerate(fit.simulations)
-            if channel in s.experiment.outputs and channel in s.outputs]
+    return [
+        (k, s.residual(channel))
+        for k, s in enumerate(fit.simulations)
+        if channel in s.experiment.outputs and channel in s.outputs
+    ]
 
 
 def _channel(fit: Fit, channel: str) -> dict[str, float]:
@@ -80,8 +91,14 @@ def _channel(fit: Fit, channel: str) -> dict[str, float]:
     linked = max((_largest_cross_correlation(u, p) for u, (_, p) in zip(v, parts, strict=True)), default=0.0)
     rms = float(np.sqrt(np.mean(r**2))) if r.size else 0.0
     typical = 1.4826 * float(np.median(np.abs(r))) if r.size else 0.0
-    return {"noise": noise, "rms": rms, "ratio": min(rms, 2 * typical) / noise, "autocorrelation": rho, "input_correlation": linked,
-            "effective_samples": sum(effective_samples(p) for _, p in parts)}
+    return {
+        "noise": noise,
+        "rms": rms,
+        "ratio": min(rms, 2 * typical) / noise,
+        "autocorrelation": rho,
+        "input_correlation": linked,
+        "effective_samples": sum(effective_samples(p) for _, p in parts),
+    }
 
 
 def _largest_cross_correlation(u: Array, r: Array) -> float:
@@ -93,7 +110,7 @@ def _largest_cross_correlation(u: Array, r: Array) -> float:
     if size <= 0:
         return 0.0
     n = len(u)
-    return float(np.abs(correlate(b, a, method="fft"))[n - 1:n + n // 4].max() / size)
+    return float(np.abs(correlate(b, a, method="fft"))[n - 1 : n + n // 4].max() / size)
 
 
 def motion_of(fit: Fit, k: int) -> dict[str, Array]:
@@ -130,7 +147,7 @@ def _winsorised(r: Array) -> Array:
     return np.where(np.isfinite(r), np.clip(r, -6 * size, 6 * size), 0.0)
 
 
-def _labels(signals: Sequence[Array], bins: int) -> list[Array] | None:
+def _labels(signals: Sequence[Array], bins: int) -> list[NDArray[np.intp]] | None:
     """Return bin numbers by quantiles of the signal over all runs."""
     edges = np.unique(np.quantile(np.concatenate(list(signals)), np.linspace(0, 1, bins + 1)[1:-1]))
     if edges.size == 0:
@@ -138,7 +155,7 @@ def _labels(signals: Sequence[Array], bins: int) -> list[Array] | None:
     return [np.searchsorted(edges, s, side="right") for s in signals]
 
 
-def _shift_test(labels: Sequence[Array], residuals: Sequence[Array]) -> tuple[float, float]:
+def _shift_test(labels: Sequence[NDArray[np.intp]], residuals: Sequence[Array]) -> tuple[float, float]:
     """Return the share of variance that bins explain beyond chance, and its p-value against shifted residuals."""
     count = int(max(lab.max() for lab in labels)) + 1
     total = sum(float(r @ r) for r in residuals)
@@ -147,7 +164,9 @@ def _shift_test(labels: Sequence[Array], residuals: Sequence[Array]) -> tuple[fl
     sizes = sum(np.bincount(lab, minlength=count) for lab in labels)
 
     def explained(shift: float) -> float:
-        sums = sum(np.bincount(lab, np.roll(r, int(shift * len(r))), count) for lab, r in zip(labels, residuals, strict=True))
+        sums = sum(
+            np.bincount(lab, np.roll(r, int(shift * len(r))), count) for lab, r in zip(labels, residuals, strict=True)
+        )
         return float(np.sum(sums**2 / np.maximum(sizes, 1))) / total
 
     actual = explained(0.0)
@@ -168,25 +187,36 @@ def _score_tests(fit: Fit, scores: Sequence[Score]) -> list[dict[str, Any]]:
     found = []
     for s in scores:
         k = len(s.effect.parameters)
-        searched = 200 if any(p.order for p in s.effect.parameters) else 1 + 3 * sum(bool(p.grid) for p in s.effect.parameters)
+        searched = 1 + 3 * sum(bool(p.grid) for p in s.effect.parameters)
+        if any(p.order for p in s.effect.parameters):
+            searched = 200
         p = min(1.0, searched * float(chi2.sf(-s.effective * np.log1p(-min(s.drop, 1 - 1e-12)), k)))
         found.append({"channel": None, "on": s.effect.name, "share": s.drop, "p": p})
     return found
 
 
-def _text(adequate: bool, channels: Mapping[str, Mapping[str, float]], material: Sequence[Mapping[str, Any]],
-          far: Sequence[str], false_alarm: float) -> str:
+def _text(
+    adequate: bool,
+    channels: Mapping[str, Mapping[str, float]],
+    material: Sequence[Mapping[str, Any]],
+    far: Sequence[str],
+    false_alarm: float,
+) -> str:
     sizes = ", ".join(f"{c} {number(f['ratio'], 2)} times its noise" for c, f in channels.items())
     if adequate:
         coloured = [c for c, f in channels.items() if f["autocorrelation"] > 0.3]
         colour = f" The noise of {' and '.join(coloured)} is coloured." if coloured else ""
-        return (f"The model is adequate: its errors ({sizes}) do not depend on the motion "
-                f"(rate of false alarms {100 * false_alarm:g} %).{colour}")
+        return (
+            f"The model is adequate: its errors ({sizes}) do not depend on the motion "
+            f"(rate of false alarms {100 * false_alarm:g} %).{colour}"
+        )
     if not material:
-        return f"Something is missing: the errors ({sizes}) are too large for noise in {' and '.join(far)}, coloured or not."
+        large = f"too large for noise in {' and '.join(far)}, coloured or not"
+        return f"Something is missing: the errors ({sizes}) are {large}."
     worst = min(material, key=lambda t: (t["p"], -t["share"]))
     if worst["channel"] is None:
         why = f"adding '{worst['on']}' would explain {100 * worst['share']:.0f} % of them"
     else:
-        why = f"those of {worst['channel']} depend on {worst['on']} ({100 * worst['share']:.0f} % of their variance)"
+        part = f"{100 * worst['share']:.0f} % of their variance"
+        why = f"those of {worst['channel']} depend on {worst['on']} ({part})"
     return f"Something is missing: the errors ({sizes}) are not noise; {why}."

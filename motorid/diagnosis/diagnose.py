@@ -6,14 +6,20 @@ import builtins
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
-from motorid.diagnosis.adequacy import FALSE_ALARM, adequacy
+from motorid.diagnosis.adequacy import adequacy
 from motorid.diagnosis.evidence import compare_errors
 from motorid.diagnosis.improve import Climb, climb, ladder_of
 from motorid.diagnosis.locate import locate
 from motorid.diagnosis.results import Candidate, Diagnosis, Missing
 from motorid.diagnosis.search import Search, library
 from motorid.diagnosis.suggest import suggest_experiment
-from motorid.diagnosis.verdict import adequate_text, balance_of, closed_loop_remark, missing_text, unexplained_text
+from motorid.diagnosis.verdict import (
+    adequate_text,
+    balance_of,
+    closed_loop_remark,
+    missing_text,
+    unexplained_text,
+)
 from motorid.errors import MotoridError
 from motorid.experiment import Experiment
 from motorid.fit import Fit
@@ -81,8 +87,21 @@ def diagnose(
         text = missing_text(ladder.rungs, found.remaining, found.groups, validate is not None)
         suggestion = _suggestion(found)
     text = " ".join(t for t in (text, closed_loop_remark(fit), suggestion) if t)
-    return Diagnosis(verdict, text, where, names, judged, missing, ranking, ladder, found.groups if names else (),
-                     suggestion, fit, ladder.best, found.remaining if names else judged)
+    return Diagnosis(
+        verdict,
+        text,
+        where,
+        names,
+        judged,
+        missing,
+        ranking,
+        ladder,
+        found.groups if names else (),
+        suggestion,
+        fit,
+        ladder.best,
+        found.remaining if names else judged,
+    )
 
 
 def _not_the_form(found: Climb, before: Missing) -> bool:

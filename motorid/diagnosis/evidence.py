@@ -11,6 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.fft
 
 from motorid.experiment import Experiment
 from motorid.integrate.grid import Array
@@ -21,12 +22,11 @@ CLIP = 6.0  # robust standard deviations beyond which a residual counts as an ou
 
 def autocorrelation(r: Array, lags: int | None = None) -> Array:
     """Return the autocorrelation of `r` (N,) at lags 0, 1, …; missing samples count as zero."""
-    from scipy.signal import fftconvolve  # slow to import, and not needed before
-
     r = np.where(np.isfinite(r), r, 0.0)
     n = len(r)
     lags = min(lags or n // 2, n - 1)
-    full = fftconvolve(r, r[::-1], mode="full")[n - 1:n + lags]
+    size = scipy.fft.next_fast_len(2 * n, real=True)
+    full: Array = np.fft.irfft(np.abs(np.fft.rfft(r, size)) ** 2, size)[: lags + 1]
     return full / full[0] if full[0] > 0 else np.eye(1, lags + 1)[0]
 
 
@@ -36,7 +36,7 @@ def effective_samples(r: Array) -> float:
     if n < 8:
         return float(n)
     rho = autocorrelation(r)
-    pairs = rho[1:len(rho) - (len(rho) - 1) % 2].reshape(-1, 2).sum(axis=1)
+    pairs = rho[1 : len(rho) - (len(rho) - 1) % 2].reshape(-1, 2).sum(axis=1)
     stop = int(np.argmax(pairs < 0)) if (pairs < 0).any() else len(pairs)
     return float(np.clip(n / (1 + 2 * pairs[:stop].sum()), 2.0, n))
 
@@ -71,8 +71,10 @@ class Errors:
 
     def limits(self) -> dict[str, float]:
         """Size per channel beyond which a residual is an outlier for this model."""
-        return {c: CLIP * 1.4826 * float(np.nanmedian(np.abs(np.concatenate(list(rs))))) + 1e-300
-                for c, rs in self.residuals.items()}
+        return {
+            c: CLIP * 1.4826 * float(np.nanmedian(np.abs(np.concatenate(list(rs))))) + 1e-300
+            for c, rs in self.residuals.items()
+        }
 
     def squares(self, limits: Mapping[str, float] | None = None) -> dict[str, tuple[float, int]]:
         """Return (sum of squares, count) per channel, residuals cut at `limits`."""
@@ -91,8 +93,9 @@ class Errors:
 
     def nrmse(self) -> dict[str, float]:
         """RMSE over the RMS of the measured channel."""
-        return {c: float(np.sqrt(ss / max(n, 1))) / max(self.measured[c], 1e-300)
-                for c, (ss, n) in self.squares().items()}
+        return {
+            c: float(np.sqrt(ss / max(n, 1))) / max(self.measured[c], 1e-300) for c, (ss, n) in self.squares().items()
+        }
 
 
 @dataclass(frozen=True)
@@ -132,5 +135,9 @@ def compare_errors(old: Errors, new: Errors, floor: Mapping[str, float] | None =
         weights.append(effective[c])
     if not logs:
         return Gain(0.0, 0.0, 0.0, 0.0)
-    return Gain(0.5 * float(np.dot(weights, logs)), 1 - float(np.exp(-0.5 * np.mean(logs))),
-                1 - float(np.exp(-0.5 * min(logs))), float(np.sum(weights)))
+    return Gain(
+        0.5 * float(np.dot(weights, logs)),
+        1 - float(np.exp(-0.5 * np.mean(logs))),
+        1 - float(np.exp(-0.5 * min(logs))),
+        float(np.sum(weights)),
+    )

@@ -72,8 +72,13 @@ def climb(search: Search, max_effects: int, advance: Callable[[str], None]) -> C
 def _runners_up(search: Search, best: Node, ordered: Sequence[Node]) -> list[Node]:
     """Children that came near enough to be grown too, those of another kind than the best."""
     goal = compare_errors(search.root.train, best.train, search.held.noise).fall
-    return [n for n in ordered if n.key != best.key and not search.tied(n, best)
-            and compare_errors(search.root.train, n.train, search.held.noise).fall > HALF_AS_GOOD * goal]
+    return [
+        n
+        for n in ordered
+        if n.key != best.key
+        and not search.tied(n, best)
+        and compare_errors(search.root.train, n.train, search.held.noise).fall > HALF_AS_GOOD * goal
+    ]
 
 
 def _marked(listed: Sequence[Candidate], name: str | None, group: tuple[str, ...]) -> tuple[Candidate, ...]:
@@ -100,8 +105,16 @@ def ladder_of(found: Climb, validated: bool) -> Ladder:
         names = [n for n in node.fit.problem.model.effect_names if n not in before]
         removed = tuple(sorted(before - search_key(node)))
         candidates = found.rounds[k] if k < len(found.rounds) else ()
-        rungs.append(Rung(" + ".join(names) or None, node.fit, node.train.nrmse(),
-                          node.held.nrmse() if validated else None, removed, candidates))
+        rungs.append(
+            Rung(
+                " + ".join(names) or None,
+                node.fit,
+                node.train.nrmse(),
+                node.held.nrmse() if validated else None,
+                removed,
+                candidates,
+            )
+        )
         before = search_key(node)
     return Ladder(tuple(rungs), found.text)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from motorid.diagnosis.evidence import effective_samples
 from motorid.diagnosis.results import Binned, Missing
@@ -16,8 +17,13 @@ from motorid.prepared import angle_signal, natural_sizes
 WALKS = (0.03, 0.1, 0.3, 1.0, 3.0)  # of the natural size per √s, the smallest that explains the data is taken
 BINS = 24
 UNITS = {"i": "A", "omega": "rad/s", "theta": "rad", "heat": "J", "t": "s"}
-WORDS = {"i": "the current", "omega": "the speed", "theta": "the angle within a turn", "heat": "the heat put in",
-         "t": "the time"}
+WORDS = {
+    "i": "the current",
+    "omega": "the speed",
+    "theta": "the angle within a turn",
+    "heat": "the heat put in",
+    "t": "the time",
+}
 REGIONS = ("standstill", "reversal", "acceleration", "high current", "steady")
 
 
@@ -46,15 +52,27 @@ def locate(fit: Fit) -> Missing:
         shares = {"electrical": 0.5, "mechanical": 0.5}
     signals = tuple(_signals(fit, k, s) for k, s in enumerate(both))
     voltage, torque = tuple(s.d[:, 0] for s in both), tuple(s.d[:, 1] for s in both)
-    bins = {name: _against(d, signals) for name, d in (("voltage", voltage), ("torque", torque)) if any(x.any() for x in d)}
+    bins = {
+        name: _against(d, signals) for name, d in (("voltage", voltage), ("torque", torque)) if any(x.any() for x in d)
+    }
     regions = _regions(fit, signals)
     where = None
     if len(shares) > 1 and apart:
         where = max(shares, key=lambda s: shares[s])
     elif len(shares) == 1:
         where = "mechanical"
-    return Missing(where, tuple(r.experiment.t for r in fit.problem.runs), voltage, torque, signals, shares, regions,
-                   bins, _text(where, shares, regions, bins, apart), unit)
+    return Missing(
+        where,
+        tuple(r.experiment.t for r in fit.problem.runs),
+        voltage,
+        torque,
+        signals,
+        shares,
+        regions,
+        bins,
+        _text(where, shares, regions, bins, apart),
+        unit,
+    )
 
 
 def _walk(fit: Fit, size: Array) -> tuple[float, list[Smoothed]]:
@@ -108,7 +126,9 @@ def _against(unknown: Sequence[Array], signals: Sequence[Mapping[str, Array]]) -
 
 def _binned(name: str, z: Array, d: Array, worth: float) -> Binned:
     # Half of the edges by count, half by distance: rest is one value, and rare speeds matter too.
-    inner = np.concatenate([np.quantile(z, np.linspace(0, 1, BINS // 2 + 1)), np.linspace(z.min(), z.max(), BINS // 2 + 1)])
+    inner = np.concatenate(
+        [np.quantile(z, np.linspace(0, 1, BINS // 2 + 1)), np.linspace(z.min(), z.max(), BINS // 2 + 1)]
+    )
     edges = np.unique(inner)
     label = np.clip(np.searchsorted(edges, z, side="right") - 1, 0, len(edges) - 2)
     count = np.bincount(label, minlength=len(edges) - 1)
@@ -122,25 +142,33 @@ def _binned(name: str, z: Array, d: Array, worth: float) -> Binned:
     between = float(np.sum(count * (mean - d.mean()) ** 2))
     inside = (total - between) / max(len(d) - keep.sum(), 1)
     explained = max(between - keep.sum() * inside, 0.0) / max(total, 1e-300)
-    return Binned(name, UNITS[name], centre[keep], mean[keep], (mean - half)[keep], (mean + half)[keep], count[keep],
-                  float(min(explained, 1.0)))
+    return Binned(
+        name,
+        UNITS[name],
+        centre[keep],
+        mean[keep],
+        (mean - half)[keep],
+        (mean + half)[keep],
+        count[keep].astype(float),
+        float(min(explained, 1.0)),
+    )
 
 
 def _regions(fit: Fit, signals: Sequence[Mapping[str, Array]]) -> dict[str, float]:
     """Share of the squared, whitened misfit by region of operation."""
     top_speed = max((float(np.abs(s["omega"]).max()) for s in signals if "omega" in s), default=0.0) or 1.0
     top_current = max((float(np.abs(s["i"]).max()) for s in signals if "i" in s), default=0.0) or np.inf
-    sums = dict.fromkeys(REGIONS, 0.0)
+    sums: dict[str, float] = dict.fromkeys(REGIONS, 0.0)
     for k, s in enumerate(signals):
-        r2 = sum(np.nan_to_num(fit.simulations[k].residual(c) / fit.problem.runs[k].sigma[c]) ** 2
-                 for c in fit.problem.runs[k].sigma)
+        sigma, sim = fit.problem.runs[k].sigma, fit.simulations[k]
+        r2 = np.sum([np.nan_to_num(sim.residual(c) / sigma[c]) ** 2 for c in sigma], axis=0)
         for name, mask in _masks(s, top_speed, top_current).items():
             sums[name] += float(np.sum(r2[mask]))
     total = sum(sums.values()) or 1.0
     return {name: v / total for name, v in sums.items()}
 
 
-def _masks(s: Mapping[str, Array], top_speed: float, top_current: float) -> dict[str, Array]:
+def _masks(s: Mapping[str, Array], top_speed: float, top_current: float) -> dict[str, NDArray[np.bool_]]:
     """Return one mask per region; every sample is in just one."""
     omega = s.get("omega", np.zeros_like(s["t"]))
     n = len(omega)
@@ -150,20 +178,30 @@ def _masks(s: Mapping[str, Array], top_speed: float, top_current: float) -> dict
     window = max(n // 200, 2)
     for c in crossing:
         if omega[max(c - window, 0)] * omega[min(c + window, n - 1)] < 0:
-            reversal[max(c - window, 0):c + window] = True
+            reversal[max(c - window, 0) : c + window] = True
     rate = np.abs(np.gradient(omega, s["t"]))
     fast = rate > 0.2 * max(np.quantile(rate, 0.99), 1e-300)
     strong = np.abs(s["i"]) > 0.6 * top_current if "i" in s else np.zeros(n, bool)
     masks, taken = {}, np.zeros(n, bool)
-    for name, mask in (("reversal", reversal), ("standstill", still), ("high current", strong), ("acceleration", fast),
-                       ("steady", np.ones(n, bool))):
+    for name, mask in (
+        ("reversal", reversal),
+        ("standstill", still),
+        ("high current", strong),
+        ("acceleration", fast),
+        ("steady", np.ones(n, bool)),
+    ):
         masks[name] = mask & ~taken
         taken |= mask
     return masks
 
 
-def _text(where: str | None, shares: Mapping[str, float], regions: Mapping[str, float],
-          bins: Mapping[str, Sequence[Binned]], apart: bool) -> str:
+def _text(
+    where: str | None,
+    shares: Mapping[str, float],
+    regions: Mapping[str, float],
+    bins: Mapping[str, Sequence[Binned]],
+    apart: bool,
+) -> str:
     first = max(regions, key=lambda r: regions[r])
     region = f"Most of the misfit ({100 * regions[first]:.0f} %) lies in {first}."
     if not apart and len(shares) > 1:
@@ -174,5 +212,6 @@ def _text(where: str | None, shares: Mapping[str, float], regions: Mapping[str, 
         lead = f"The {name} balance fails ({100 * shares.get(where or '', 0):.0f} % of the misfit)."
     best = bins.get(name, ())
     if best and best[0].explained > 0.2:
-        return f"{lead} What is missing depends on {WORDS[best[0].against]} ({100 * best[0].explained:.0f} % explained). {region}"
+        on = f"{WORDS[best[0].against]} ({100 * best[0].explained:.0f} % explained)"
+        return f"{lead} What is missing depends on {on}. {region}"
     return f"{lead} {region}"

@@ -54,7 +54,7 @@ def _ranked(tangent: Tangent, relative: bool) -> tuple[float, ...]:
     answers, found = responses(fit), []
     lowest = 1 if relative else 2  # a torque that repeats once per turn is gravity's
     for first in range(lowest, top + 1, CHUNK):
-        orders = np.arange(first, min(first + CHUNK, top + 1))
+        orders = np.arange(float(first), min(first + CHUNK, top + 1))
         columns = np.vstack([_columns(fit, k, answer, orders, relative) for k, answer in enumerate(answers)])
         inside = tangent.basis.T @ columns
         slope = columns.T @ tangent.residual

@@ -8,6 +8,7 @@ that cannot be differentiated at their null are simulated at a few finite shapes
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -79,7 +80,7 @@ def unstacked(fit: Fit, residual: Array) -> list[Array]:
     for y, _, index in fit.problem._weights:
         n = y.size if index is None else len(index)
         full = np.full(y.size, np.nan)
-        full[slice(None) if index is None else index] = residual[first:first + n]
+        full[slice(None) if index is None else index] = residual[first : first + n]
         parts.append(full.reshape(y.shape))
         first += n
     return parts
@@ -101,10 +102,8 @@ def rank(fit: Fit, effects: Sequence[Effect], advance=lambda: None) -> list[Scor
     tangent = Tangent.of(fit)
     scores = []
     for e in effects:
-        try:
+        with contextlib.suppress(ModelError, SimulationError):
             scores.append(score(tangent, e))
-        except (ModelError, SimulationError):
-            pass
         advance()
     return sorted(scores, key=lambda s: -s.drop)
 
@@ -160,13 +159,12 @@ def _shapes(tangent: Tangent, effect: Effect, pars: Sequence[Parameter]) -> Iter
     yield from (dict(point) for point in itertools.product(*axes))
 
 
-def _score_shape(tangent: Tangent, model: Model, pars: Sequence[Parameter],
-                 shape: Mapping[str, float]) -> list[Tried]:
+def _score_shape(tangent: Tangent, model: Model, pars: Sequence[Parameter], shape: Mapping[str, float]) -> list[Tried]:
     linear, finite, _ = _kinds(pars)
     if finite or any(p.name in shape for p in linear):
         return _score_finite(tangent, model, pars, shape)
     phases = [p for p in pars if p.periodic and not p.given]
-    sizes = [p for p in linear]
+    sizes = linear
     columns = [_null_columns(tangent, model, sizes, shape)]
     if phases:
         quarter = {phases[0].name: np.pi / 2}
@@ -186,7 +184,7 @@ def _score_shape(tangent: Tangent, model: Model, pars: Sequence[Parameter],
 
 def _null_columns(tangent: Tangent, model: Model, sizes: Sequence[Parameter], shape: Mapping[str, float]) -> Array:
     """Sensitivities of the whitened outputs to the sizes at their null, (n, len(sizes))."""
-    null = {p.name: p.null + NUDGE * (k + 1) * tangent.sizes.get(p.unit, 1.0) for k, p in enumerate(sizes)}
+    null = {p.name: (p.null or 0.0) + NUDGE * (k + 1) * tangent.sizes.get(p.unit, 1.0) for k, p in enumerate(sizes)}
     names = [p.name for p in sizes]
     at = model.start_at({**shape, **null}).fix(*model.parameters).free(*names)
     problem = tangent.fit.problem.for_model(at)
@@ -194,9 +192,10 @@ def _null_columns(tangent: Tangent, model: Model, sizes: Sequence[Parameter], sh
     parts = []
     for k in range(len(problem.runs)):
         _, jac = problem.run_residual(k, problem.simulate(q, k))
-        parts.append(jac[:, :len(names)])
-    slope = problem.scaling.slope(q)[:len(names)]
-    order = [names.index(p.name) for p in problem.unknown[:len(names)]]
+        assert jac is not None
+        parts.append(jac[:, : len(names)])
+    slope = problem.scaling.slope(q)[: len(names)]
+    order = [names.index(p.name) for p in problem.unknown[: len(names)]]
     columns = np.vstack(parts) / slope
     return columns[:, np.argsort(order)] if order != sorted(order) else columns
 
@@ -220,24 +219,25 @@ def _project(tangent: Tangent, columns: Array, nonnegative: Sequence[bool]) -> t
     signed = [j for j, positive in enumerate(nonnegative) if not positive]
     a = np.column_stack([c, -c[:, signed]])
     triangle = np.linalg.qr(np.column_stack([a, -tangent.residual]), mode="r")
-    z, rest = nnls(triangle[:, :-1], triangle[:, -1])
-    coefficients = z[:c.shape[1]].copy()
-    coefficients[signed] -= z[c.shape[1]:]
-    total = float(tangent.fit.residuals[:len(tangent.residual)] @ tangent.fit.residuals[:len(tangent.residual)])
+    z, rest = nnls(np.asarray(triangle)[:, :-1], np.asarray(triangle)[:, -1])
+    coefficients = z[: c.shape[1]].copy()
+    coefficients[signed] -= z[c.shape[1] :]
+    total = float(tangent.fit.residuals[: len(tangent.residual)] @ tangent.fit.residuals[: len(tangent.residual)])
     inside = float(tangent.residual @ tangent.residual)
     left = tangent.residual + c @ coefficients
     return max(inside - rest**2, 0.0) / max(total, 1e-300), coefficients / scale, left
 
 
-def _score_finite(tangent: Tangent, model: Model, pars: Sequence[Parameter],
-                  shape: Mapping[str, float]) -> list[Tried]:
+def _score_finite(tangent: Tangent, model: Model, pars: Sequence[Parameter], shape: Mapping[str, float]) -> list[Tried]:
     """Score an effect at a finite shape: the difference that it makes, in a free amount."""
     at = model.start_at(dict(shape)).fix(*model.parameters)
     problem = tangent.fit.problem.for_model(at)
     q = _coordinates(problem, tangent.fit)
     n = tangent.fit.problem.n_outputs
     try:
-        parts = [problem.run_residual(k, problem.simulate(q, k, derivatives=False))[0] for k in range(len(problem.runs))]
+        parts = [
+            problem.run_residual(k, problem.simulate(q, k, derivatives=False))[0] for k in range(len(problem.runs))
+        ]
     except SimulationError:
         return []
     change = np.concatenate(parts) - plain_residual(tangent.fit)[:n]
@@ -254,5 +254,6 @@ def plain_residual(fit: Fit) -> Array:
     if fit.problem.loss is None:
         return fit.residuals
     problem = fit.problem
-    return np.concatenate([problem.run_residual(k, problem.simulate(fit.q, k, derivatives=False))[0]
-                           for k in range(len(problem.runs))])
+    return np.concatenate(
+        [problem.run_residual(k, problem.simulate(fit.q, k, derivatives=False))[0] for k in range(len(problem.runs))]
+    )

@@ -56,8 +56,11 @@ def linear_steps(system: System, grid, x: Array, p: Array, d: Array) -> tuple[Ar
     step, _ = _disturbed(system)
     n, nx = len(grid.dt), len(system.states)
     x_next, a, b = step.map(n)(x[:-1].T, grid.u0.T, grid.u1.T, grid.dt[None, :], np.tile(p[:, None], (1, n)), d.T)
-    return (np.asarray(x_next).T, np.asarray(a).reshape(nx, n, nx).transpose(1, 0, 2),
-            np.asarray(b).reshape(nx, n, 2).transpose(1, 0, 2))
+    return (
+        np.asarray(x_next).T,
+        np.asarray(a).reshape(nx, n, nx).transpose(1, 0, 2),
+        np.asarray(b).reshape(nx, n, 2).transpose(1, 0, 2),
+    )
 
 
 def shown(system: System, grid, x: Array, p: Array) -> tuple[Array, Array]:

@@ -187,18 +187,39 @@ class Diagnosis(Shown):
         """Return the contents of ``diagnose --json``."""
         m = self.missing
         return {
-            "verdict": self.verdict, "text": self.text, "where": self.where,
-            "location": {"shares": dict(m.shares), "regions": dict(m.regions), "text": m.text,
-                         "depends_on": {k: [{"on": b.against, "explained": b.explained} for b in v]
-                                        for k, v in m.bins.items()}},
-            "ranking": [{"effect": c.effect, "predicted_drop": c.predicted_drop, "refit_drop": c.refit_drop,
-                         "validation_nrmse": dict(c.validation_nrmse) if c.validation_nrmse else None,
-                         "group": list(c.group), "parameters": dict(c.parameters), "accepted": c.accepted,
-                         "reason": c.reason} for c in self.ranking],
+            "verdict": self.verdict,
+            "text": self.text,
+            "where": self.where,
+            "location": {
+                "shares": dict(m.shares),
+                "regions": dict(m.regions),
+                "text": m.text,
+                "depends_on": {k: [{"on": b.against, "explained": b.explained} for b in v] for k, v in m.bins.items()},
+            },
+            "ranking": [
+                {
+                    "effect": c.effect,
+                    "predicted_drop": c.predicted_drop,
+                    "refit_drop": c.refit_drop,
+                    "validation_nrmse": dict(c.validation_nrmse) if c.validation_nrmse else None,
+                    "group": list(c.group),
+                    "parameters": dict(c.parameters),
+                    "accepted": c.accepted,
+                    "reason": c.reason,
+                }
+                for c in self.ranking
+            ],
             "effects": list(self.effects),
-            "ladder": [{"added": r.added, "nrmse": dict(r.nrmse),
-                        "validation_nrmse": dict(r.validation_nrmse) if r.validation_nrmse else None}
-                       for r in self.ladder.rungs],
-            "parameters_before": dict(self.before.values), "parameters_after": dict(self.after.values),
-            "groups": [list(g) for g in self.groups], "suggestion": self.suggestion,
+            "ladder": [
+                {
+                    "added": r.added,
+                    "nrmse": dict(r.nrmse),
+                    "validation_nrmse": dict(r.validation_nrmse) if r.validation_nrmse else None,
+                }
+                for r in self.ladder.rungs
+            ],
+            "parameters_before": dict(self.before.values),
+            "parameters_after": dict(self.after.values),
+            "groups": [list(g) for g in self.groups],
+            "suggestion": self.suggestion,
         }

@@ -17,7 +17,15 @@ import numpy as np
 from motorid.diagnosis.evidence import Errors, Gain, compare_errors
 from motorid.diagnosis.rank import Score, rank
 from motorid.diagnosis.results import Candidate
-from motorid.diagnosis.trial import LEAST_FALL, WORST_CONDITION, HeldOut, ambiguity, objections, refit, train_errors
+from motorid.diagnosis.trial import (
+    LEAST_FALL,
+    WORST_CONDITION,
+    HeldOut,
+    ambiguity,
+    objections,
+    refit,
+    train_errors,
+)
 from motorid.effects import LIBRARY
 from motorid.errors import ModelError, SimulationError
 from motorid.experiment import Experiment
@@ -27,8 +35,18 @@ from motorid.prepared import natural_sizes
 
 SHORTLIST = 6
 ALWAYS = ("compliance", "speed_lag", "speed_delay")  # their score at null says little
-COMMON = ("coulomb", "gravity", "brush_drop", "winding_heating", "cogging", "load_friction", "quadratic_drag",
-          "constant_load", "speed_lag", "driver_dead_band")  # what is met most, first
+COMMON = (
+    "coulomb",
+    "gravity",
+    "brush_drop",
+    "winding_heating",
+    "cogging",
+    "load_friction",
+    "quadratic_drag",
+    "constant_load",
+    "speed_lag",
+    "driver_dead_band",
+)  # what is met most, first
 EVIDENCE = 4.0  # log likelihood ratio beyond the price of the parameters
 TIE = 3.0  # log likelihood ratio below which two models count as equal
 CLOSE = 0.01  # relative error below which two models count as equal
@@ -50,10 +68,12 @@ class Node:
 
     @property
     def key(self) -> frozenset[str]:
+        """Names of the effects."""
         return frozenset(self.fit.problem.model.effect_names)
 
     @property
     def size(self) -> int:
+        """Number of free parameters."""
         return len(self.fit.problem.model.free_names)
 
 
@@ -79,8 +99,14 @@ def library(effects: Iterable[Effect | str] | None, also: Iterable[Effect] = ())
 class Search:
     """One search over models; `expand` and `choose` are its two moves."""
 
-    def __init__(self, fit: Fit, validate: Sequence[Experiment] | Experiment | None, effects: Sequence[Effect],
-                 map_: Callable[..., Iterable[Any]], advance: Advance) -> None:
+    def __init__(
+        self,
+        fit: Fit,
+        validate: Sequence[Experiment] | Experiment | None,
+        effects: Sequence[Effect],
+        map_: Callable[..., Iterable[Any]],
+        advance: Advance,
+    ) -> None:
         self.held = HeldOut.of(fit, validate)
         self.effects, self.map, self.advance = list(effects), map_, advance
         self.root = node_of(fit, self.held)
@@ -106,7 +132,7 @@ class Search:
         names = [s.effect for s in short if s.drop > 0 or s.effect.name in ALWAYS]
         for e in wider:
             model, start = _widened(node.fit, e)
-            tasks.append((node.fit, model, start))
+            tasks.append((node.fit, model, tuple(start)))
             names.append(e)
         fits = list(self.map(_refit_task, tasks))
         self.advance(f"refitted {len(fits)}")
@@ -152,8 +178,11 @@ class Search:
         if open_now > open_before:
             return None, replace(candidate, reason="not identifiable with these data beside the other parameters")
         if worse > WORST_CONDITION and worse > 10 * was:
-            return None, replace(candidate, reason=f"not identifiable with these data: the condition number of the "
-                                                   f"sensitivities rises from {was:.0f} to {worse:.0f}")
+            return None, replace(
+                candidate,
+                reason=f"not identifiable with these data: the condition number of the "
+                f"sensitivities rises from {was:.0f} to {worse:.0f}",
+            )
         gain = compare_errors(node.train, train, self.held.noise)
         price = EVIDENCE + 0.5 * _extra(node, fit) * np.log(max(gain.effective, 2.0))
         if gain.log_ratio < price:
@@ -176,8 +205,12 @@ class Search:
         for s in scores:
             c = judged.get(s.effect.name)
             if c is None:
-                c = Candidate(s.effect.name, s.drop, parameters=dict(s.starts[0]) if s.starts else {},
-                              reason="too little to gain for a refit")
+                c = Candidate(
+                    s.effect.name,
+                    s.drop,
+                    parameters=dict(s.starts[0]) if s.starts else {},
+                    reason="too little to gain for a refit",
+                )
             listed.append(replace(c, predicted_drop=s.drop))
         rest = [c for n, c in judged.items() if n not in {s.effect.name for s in scores}]
         return listed + rest
@@ -235,9 +268,16 @@ class Search:
     def group(self, chosen: Node, siblings: Sequence[Node]) -> tuple[str, ...]:
         """Names of the siblings that these data cannot tell from `chosen`."""
         includes = {e.name: e.includes for e in self.effects}
-        return tuple(n.added for n in siblings if n is not chosen and n.added and n.parent is chosen.parent
-                     and chosen.added not in includes.get(n.added, ()) and self.tied(n, chosen)
-                     and self.tied(chosen, n))
+        return tuple(
+            n.added
+            for n in siblings
+            if n is not chosen
+            and n.added
+            and n.parent is chosen.parent
+            and chosen.added not in includes.get(n.added, ())
+            and self.tied(n, chosen)
+            and self.tied(chosen, n)
+        )
 
 
 def _rarity(name: str | None) -> int:
@@ -262,7 +302,9 @@ def _extra(node: Node, fit: Fit) -> int:
 def _drop(node: Node, train: Errors) -> float:
     """Share of chi² that vanishes, with the weights of the smaller model."""
     noise = {c: s * node.fit.problem.balance.get(c, 1.0) for run in node.fit.problem.runs for c, s in run.sigma.items()}
-    old, new = (sum(ss / noise[c] ** 2 for c, (ss, _) in e.squares().items() if c in noise) for e in (node.train, train))
+    old, new = (
+        sum(ss / noise[c] ** 2 for c, (ss, _) in e.squares().items() if c in noise) for e in (node.train, train)
+    )
     return float(1 - new / max(old, 1e-300))
 
 
@@ -276,8 +318,9 @@ def _widened(fit: Fit, effect: Effect) -> tuple[Model, list[dict[str, float]]]:
     model = model + effect
     natural = natural_sizes(fit.problem.experiments, fit.values)
     sizes = {p.name: level * (1.3 if p.at_least else 1.0) for p in effect.parameters if p.null == 0}
-    shapes = [[(p.name, g * natural.get(p.unit, 1.0)) for g in p.grid] for p in effect.parameters
-              if p.null is None and p.grid]
+    shapes = [
+        [(p.name, g * natural.get(p.unit, 1.0)) for g in p.grid] for p in effect.parameters if p.null is None and p.grid
+    ]
     return model, [{**sizes, **dict(point)} for point in itertools.product(*shapes)][:6]
 
 

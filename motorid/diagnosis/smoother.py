@@ -51,9 +51,20 @@ def smooth(fit: Fit, k: int, walk: Array) -> Smoothed:
     for _ in range(STEPS):
         x_next, a, b = linear_steps(system, run.grid, x, p, d[:-1])
         out, c = shown(system, run.grid, x, p)
-        step = _banded_step(n, nx, (y - out) * weights, c * weights[None, :, None], x_next - x[1:], a, b,
-                            MODEL_ERROR * size * np.sqrt(np.median(run.grid.dt) / run.grid.dt.sum() * 100), d, hold,
-                            run.grid.dt, walk > 0)
+        step = _banded_step(
+            n,
+            nx,
+            (y - out) * weights,
+            c * weights[None, :, None],
+            x_next - x[1:],
+            a,
+            b,
+            MODEL_ERROR * size * np.sqrt(np.median(run.grid.dt) / run.grid.dt.sum() * 100),
+            d,
+            hold,
+            run.grid.dt,
+            walk > 0,
+        )
         x, d = x + step[:, :nx], d + step[:, nx:]
         if np.max(np.abs(step[:, :nx]) / size) < 1e-4:
             break
@@ -104,7 +115,7 @@ def _solve_blocks(diagonal: Array, below: Array, rhs: Array) -> Array:
         for c in range(m):
             if r >= c:
                 band[r - c, c::m] = diagonal[:, r, c]
-            band[m + r - c, c:(n - 1) * m:m] = below[:, r, c]
+            band[m + r - c, c : (n - 1) * m : m] = below[:, r, c]
     band[0] += 1e-12
     try:
         z = solveh_banded(band, (rhs * scale).ravel(), lower=True, check_finite=False)

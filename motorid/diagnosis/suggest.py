@@ -41,8 +41,13 @@ class Suggestion(Shown):
     discrimination: Mapping[str, float]
 
 
-def suggest_experiment(fits: Sequence[Fit], *, v_max: float | None = None, i_max: float | None = None,
-                       duration: float | None = None) -> Suggestion:
+def suggest_experiment(
+    fits: Sequence[Fit],
+    *,
+    v_max: float | None = None,
+    i_max: float | None = None,
+    duration: float | None = None,
+) -> Suggestion:
     """Choose the experiment that best tells the models of `fits` apart.
 
     Parameters
@@ -74,7 +79,7 @@ def suggest_experiment(fits: Sequence[Fit], *, v_max: float | None = None, i_max
         predicted = _predictions(fits, t, v, name)
         if predicted is None or (i_max and _over(predicted, i_max)):
             continue
-        scores[name] = min(_difference(a, b, fits[0]) for k, a in enumerate(predicted) for b in predicted[k + 1:])
+        scores[name] = min(_difference(a, b, fits[0]) for k, a in enumerate(predicted) for b in predicted[k + 1 :])
         kept[name] = Experiment(t, {"v": v}, predicted[0], name=name)
     if not scores:
         raise FitError("no candidate experiment stays within the limits with all models; raise i_max or v_max.")
@@ -96,8 +101,14 @@ def candidates(t: Array, v_max: float) -> dict[str, tuple[Array, str]]:
         "low speed": (0.25 * v_max * np.sin(2 * np.pi * 3 * s), "slow reversals at a quarter of the voltage"),
         "coast-down": (v_max * (s < 0.4), "run up and coast down at zero voltage"),
         "chirp": (0.7 * v_max * chirp / max(np.abs(chirp).max(), 1e-12), "a chirp"),
-        "warm-up": (np.where((10 * s) % 1 < 0.8, v_max, -v_max), "a long run with hard reversals, to warm up"),
-        "small steps": (v_max * (0.5 + 0.1 * np.sign(np.sin(2 * np.pi * 10 * s + 1e-9))), "small steps at half speed"),
+        "warm-up": (
+            np.where((10 * s) % 1 < 0.8, v_max, -v_max),
+            "a long run with hard reversals, to warm up",
+        ),
+        "small steps": (
+            v_max * (0.5 + 0.1 * np.sign(np.sin(2 * np.pi * 10 * s + 1e-9))),
+            "small steps at half speed",
+        ),
     }
 
 

@@ -58,8 +58,11 @@ class HeldOut:
         noise = {c: s for run in fit.problem.runs for c, s in run.sigma.items()}
         if validate is not None:
             runs = (validate,) if isinstance(validate, Experiment) else tuple(validate)
-            return HeldOut(fit.problem.with_(experiments=runs, model=fit.model, priors={}, penalties=(), balance={}),
-                           (), noise)
+            return HeldOut(
+                fit.problem.with_(experiments=runs, model=fit.model, priors={}, penalties=(), balance={}),
+                (),
+                noise,
+            )
         folds = []
         for odd in (0, 1):
             train, test = zip(*(_blocked(r, odd) for r in fit.problem.experiments), strict=True)
@@ -128,7 +131,9 @@ def refit(fit: Fit, model: Model, starts: Sequence[Mapping[str, float]]) -> Fit 
             done = descend(problem, RACE, stages=False)
         except FAILURES:
             continue
-        if sum(int(r.grid.substeps.sum()) for r in done.problem.runs) > SUBSTEPS * sum(r.experiment.n for r in problem.runs):
+        if sum(int(r.grid.substeps.sum()) for r in done.problem.runs) > SUBSTEPS * sum(
+            r.experiment.n for r in problem.runs
+        ):
             continue
         raced.append((done.solution.history[-1], _from(done.problem, done.solution.q)))
     if not raced:
@@ -167,7 +172,10 @@ def _bounded(fit: Fit, model: Model) -> Model:
         for p in (model.parameters[q.name] for q in e.parameters):
             if p.grid and p.null is None and p.vary and not p.given:
                 size = natural.get(p.unit, 1.0)
-                limits[p.name] = (max(p.lower, min(p.grid) * size / ROOM), min(p.upper, max(p.grid) * size * ROOM))
+                limits[p.name] = (
+                    max(p.lower, min(p.grid) * size / ROOM),
+                    min(p.upper, max(p.grid) * size * ROOM),
+                )
     inside = {n: float(np.clip(model.parameters[n].value, *limits[n])) for n in limits}
     pars = {n: replace(model.parameters[n], value=inside[n], lower=lo, upper=hi) for n, (lo, hi) in limits.items()}
     return model._with(parameters={**model.parameters, **pars})
@@ -187,8 +195,16 @@ def _polished(fit: Fit, problem: Problem) -> Fit | None:
     found, problem = done.solution, done.problem
     if not np.isfinite(found.jac).all():
         return None
-    return Fit(problem, problem.values(found.q), found.residual, found.jac / problem.scaling.slope(found.q), found.q,
-               found.status, found.message, done.history)
+    return Fit(
+        problem,
+        problem.values(found.q),
+        found.residual,
+        found.jac / problem.scaling.slope(found.q),
+        found.q,
+        found.status,
+        found.message,
+        done.history,
+    )
 
 
 def _within(model: Model, values: Mapping[str, float]) -> Model:
@@ -235,13 +251,15 @@ def ambiguity(fit: Fit) -> tuple[int, float]:
 def _covariance(fit: Fit) -> tuple[Any, Any]:
     """Gauss-Newton covariance with the residual's effective samples."""
     covariance, determined = fit._covariance
-    n = sum(int(np.isfinite(s.residual(c)).sum()) for s in fit.simulations for c in s.experiment.outputs if c in s.outputs)
-    worth = sum(effective_samples(s.residual(c)) for s in fit.simulations for c in s.experiment.outputs if c in s.outputs)
+    n = sum(
+        int(np.isfinite(s.residual(c)).sum()) for s in fit.simulations for c in s.experiment.outputs if c in s.outputs
+    )
+    worth = sum(
+        effective_samples(s.residual(c)) for s in fit.simulations for c in s.experiment.outputs if c in s.outputs
+    )
     return covariance * max(n / max(worth, 1.0), 1.0), determined
 
 
 def train_errors(fit: Fit) -> Errors:
     """Return the errors of a fit on its own records."""
     return Errors.of(fit.simulations)
-
-

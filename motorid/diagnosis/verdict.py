@@ -28,8 +28,10 @@ def unexplained_text(judged: Adequacy, missing: Missing, ranking: Sequence[Candi
     best = next((c for c in ranking if c.refit_drop is not None), None)
     near = ""
     if best is not None and (best.refit_drop or 0) > 0.05:
-        near = (f" The nearest, '{best.effect}', takes away {percent(best.refit_drop, 2)} of the squared misfit, but "
-                f"{best.reason or 'leaves the rest with the same dependence'}.")
+        near = (
+            f" The nearest, '{best.effect}', takes away {percent(best.refit_drop, 2)} of the squared misfit, but "
+            f"{best.reason or 'leaves the rest with the same dependence'}."
+        )
     return f"{judged.text} {missing.text} None of the library's effects explains it.{near}"
 
 
@@ -43,7 +45,11 @@ def missing_text(rungs: Sequence[Rung], remaining: Adequacy, groups: Sequence[Se
     moved = moves(rungs[0].fit, after)
     if moved:
         parts.append(moved)
-    parts.append("What is left is noise." if remaining.adequate else f"Not all is explained: {remaining.text[0].lower()}{remaining.text[1:]}")
+    parts.append(
+        "What is left is noise."
+        if remaining.adequate
+        else f"Not all is explained: {remaining.text[0].lower()}{remaining.text[1:]}"
+    )
     return " ".join(parts)
 
 
@@ -67,7 +73,10 @@ def _errors(before: Rung, after: Rung, validated: bool) -> str:
     falls = [f"{c} from {percent(e, 3)} to {percent(after.nrmse[c], 3)}" for c, e in before.nrmse.items()]
     text = f"With it the error falls: {', '.join(falls)}"
     if validated and before.validation_nrmse and after.validation_nrmse:
-        held = [f"{c} {percent(e, 3)} to {percent(after.validation_nrmse[c], 3)}" for c, e in before.validation_nrmse.items()]
+        held = [
+            f"{c} {percent(e, 3)} to {percent(after.validation_nrmse[c], 3)}"
+            for c, e in before.validation_nrmse.items()
+        ]
         text += f"; on the held-out runs {', '.join(held)}"
     return text + "."
 
@@ -78,15 +87,23 @@ def moves(before: Fit, after: Fit) -> str:
     moved = [n for n in base if abs(after.values[n] / max(before.values[n], 1e-300) - 1) > MOVED]
     if not moved:
         return ""
-    said = [f"{n} from {with_error(before.values[n], before.std[n])} to "
-            f"{with_error(after.values[n], after.std[n], after.problem.model.parameters[n].unit)}" for n in moved]
+    said = [
+        f"{n} from {with_error(before.values[n], before.std[n])} to "
+        f"{with_error(after.values[n], after.std[n], after.problem.model.parameters[n].unit)}"
+        for n in moved
+    ]
     return f"The motor's own parameters had absorbed it: {', '.join(said)}."
 
 
 def balance_of(name: str, also: Sequence[Effect] = ()) -> str:
     """Return where an effect acts: electrical, mechanical or sensor."""
     known = {**LIBRARY, **{e.name: e for e in also}}
-    return {"voltage": "electrical", "torque": "mechanical", "transmission": "mechanical", "sensor": "sensor"}[known[name].balance]
+    return {
+        "voltage": "electrical",
+        "torque": "mechanical",
+        "transmission": "mechanical",
+        "sensor": "sensor",
+    }[known[name].balance]
 
 
 def closed_loop_remark(fit: Fit) -> str:
@@ -95,9 +112,11 @@ def closed_loop_remark(fit: Fit) -> str:
         feedback = _noise_feedback(run.inputs["v"], run.outputs.get("omega", run.outputs.get("theta")))
         extra = run.meta.get("extra", {})
         if feedback > 0.5 or any("ref" in str(n).lower() or "goal" in str(n).lower() for n in extra):
-            return ("The records seem to come from a closed loop: the controller works against every disturbance, so an "
-                    "open-loop simulation drifts and part of what is missing hides in the voltage. Open-loop records "
-                    "show it better.")
+            return (
+                "The records seem to come from a closed loop: the controller works against every disturbance, so an "
+                "open-loop simulation drifts and part of what is missing hides in the voltage. Open-loop records "
+                "show it better."
+            )
     return ""
 
 
