@@ -84,7 +84,7 @@ def _columns(fit, k: int, answer: Response, orders: Array, relative: bool) -> Ar
     out[0] = 0.0
     for i in range(n - 1):
         s = a[i] @ s
-        s += np.outer(b[i], drive[i])
+        s += b[i][:, None] * drive[i]
         out[i + 1] = c[i + 1] @ s
     flat = out.reshape(n * ny, -1)
     return flat if index is None else flat[index]
