@@ -249,7 +249,7 @@ def _cost(residual: Callable[[Array], Array], q: Array) -> float:
     return cost if np.isfinite(cost) else np.inf
 
 
-def gauss_newton_covariance(jac: Array, variance: float = 1.0) -> tuple[Array, Array]:
+def gauss_newton_covariance(jac: Array, variance: float = 1.0) -> tuple[Array, np.ndarray]:
     """Return the covariance (JᵀJ)⁻¹·variance, and which coordinates the data determine.
 
     Columns are scaled to unit length first; directions with singular values below 1e-8 of the largest are

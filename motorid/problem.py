@@ -8,36 +8,19 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from motorid.accuracy import Levels
 from motorid.errors import ModelError, SimulationError, UsageError, one_of
 from motorid.experiment import Experiment
 from motorid.integrate import Engine, Trajectory, engine_of
 from motorid.integrate.grid import Array
+from motorid.loss import Huber
 from motorid.model import Model
 from motorid.parameters import Parameter, Scaling
 from motorid.prepared import Run, channels_of, noise_of, prepare_run, smoothing, with_inputs
+from motorid.residuals import Measured, prior_residual
 from motorid.system import System
 from motorid.unknowns import Point, Unknowns
-
-NOISE_SHARE = 0.03  # local integration error over the noise
-MISFIT_SHARE = 0.1  # of the misfit, where it is what the noise would be
-LARGEST_SLOPE = 1e100  # of an output; beyond it the numbers mean nothing
-TIGHTEST, LOOSEST = 1e-7, 1e-4  # local integration error over the largest state
-
-
-@dataclass(frozen=True)
-class Huber:
-    """Robust loss: quadratic within `delta` sigma, linear beyond (Huber, Ann. Math. Stat. 35, 1964)."""
-
-    delta: float = 1.345
-
-    def pseudo(self, r: Array) -> tuple[Array, Array]:
-        """Return r̃ with r̃² = 2ρ(r), and dr̃/dr, so that least squares of r̃ minimise the robust loss."""
-        size = np.abs(r)
-        far = size > self.delta
-        root = np.sqrt(np.where(far, 2 * self.delta * size - self.delta**2, 1.0))
-        return np.where(far, np.sign(r) * root, r), np.where(far, self.delta / root, 1.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -215,70 +198,32 @@ class Problem:
     def _keeping(self, runs: tuple[Run, ...]) -> Problem:
         """Return a copy with other grids that keeps everything else already made."""
         other = replace(self, _runs=runs)
-        for name in ("outputs", "system", "unknowns", "_engine", "_weights", "_levels"):
+        for name in ("outputs", "system", "unknowns", "_engine", "_measured", "_levels"):
             if name in self.__dict__:
                 other.__dict__[name] = self.__dict__[name]
         return other
 
     def _tolerance(self, k: int, slack: float = 1.0) -> float | Callable[[Trajectory], float]:
-        """Local error relative to the largest state: a small part of the noise, or of a far larger misfit."""
-        if self.accuracy is not None:
-            return self.accuracy
-        y, missing, top, noise, count = self._levels[k]
-        if NOISE_SHARE * noise.min() >= LOOSEST:
-            return slack * LOOSEST
-
-        def level(traj: Trajectory) -> float:
-            e = traj.y - y
-            if missing is not None:
-                e[missing] = 0.0
-            rms = np.sqrt(np.einsum("ij,ij->j", e, e) / count) / top
-            share = np.maximum(noise, MISFIT_SHARE * rms).min()
-            return slack * min(max(NOISE_SHARE * share, TIGHTEST), LOOSEST)
-
-        return level
+        """Local error relative to the largest state."""
+        return self.accuracy if self.accuracy is not None else self._levels[k].tolerance(slack)
 
     @cached_property
-    def _levels(self) -> list[tuple[Array, NDArray[np.bool_] | None, Array, Array, Array]]:
-        """Per run: measured (N, ny), what is missing, and by channel: largest size, noise over it, samples."""
-        found = []
-        for run, (y, _, index) in zip(self.runs, self._weights, strict=True):
-            missing = None if index is None else ~np.isfinite(y)
-            there = y if missing is None else np.where(missing, 0.0, y)
-            top = np.maximum(np.maximum(there.max(axis=0), -there.min(axis=0)), 1e-300)
-            noise = np.array([run.sigma.get(c, np.inf) for c in self.outputs]) / top
-            count = np.full(y.shape[1], len(y)) if missing is None else np.maximum((~missing).sum(axis=0), 1)
-            found.append((y, missing, top, noise, count))
-        return found
+    def _levels(self) -> tuple[Levels, ...]:
+        return tuple(Levels.of(m) for m in self._measured)
 
     # -- residual --------------------------------------------------------------------------------------
     @cached_property
-    def _weights(self) -> list[tuple[Array, Array, NDArray[np.int64] | None]]:
-        """Per run: measured (N, ny), weights (ny,), index of finite samples (None: all)."""
-        prepared = []
-        for run in self.runs:
-            out = run.experiment.outputs
-            n = len(run.experiment.t)
-            y = np.column_stack([out.get(c, np.full(n, np.nan)) for c in self.outputs])
-            w = np.array([self._weight(run, c) if c in out else 0.0 for c in self.outputs])
-            finite = np.isfinite(y)
-            prepared.append((y, w, None if finite.all() else np.flatnonzero(finite.ravel())))
-        return prepared
+    def _measured(self) -> tuple[Measured, ...]:
+        return tuple(Measured.of(run, self.outputs, self.weights, self.balance) for run in self.runs)
 
-    def _weight(self, run: Run, channel: str) -> float:
-        if self.weights == "noise":
-            return 1.0 / (run.sigma[channel] * self.balance.get(channel, 1.0))
-        return 1.0 / max(float(np.sqrt(np.nanmean(run.experiment.outputs[channel] ** 2))), 1e-300)
+    @property
+    def _weights(self) -> list[tuple[Array, Array, Any]]:
+        """Per run: measured (N, ny), weights (ny,), index of finite samples (None: all)."""
+        return [m[:3] for m in self._measured]
 
     def run_residual(self, k: int, traj: Trajectory) -> tuple[Array, Array | None]:
         """Return whitened residual and Jacobian, before the loss, of run `k`, without missing samples."""
-        y, w, index = self._weights[k]
-        if traj.dy is not None and not np.abs(traj.dy).max(initial=0.0) < LARGEST_SLOPE:
-            raise SimulationError(f"{self.experiments[k].name}: the sensitivities grow without bound; the model is "
-                                  "unstable with these parameters.")
-        r = ((traj.y - y) * w).ravel()
-        jac = None if traj.dy is None else (traj.dy * w[:, None]).reshape(r.size, -1)
-        return (r, jac) if index is None else (r[index], None if jac is None else jac[index])
+        return self._measured[k].residual(traj)
 
     def residual(self, q: Array) -> Array:
         """Return the whitened residual: outputs run by run, then priors, then penalties.
@@ -304,7 +249,7 @@ class Problem:
         at = self.unknowns.point(q)
         trajs = [self._simulate(at, k, derivatives) for k in range(len(self.runs))]
         parts: list[tuple[Array, Any]] = [self._lossy(*self.run_residual(k, t)) for k, t in enumerate(trajs)]
-        parts += [self._prior_part(q)] if self.priors else []
+        parts += [prior_residual(self.priors, self.unknowns, at)] if self.priors else []
         parts += [penalty.evaluate(self, q, trajs) for penalty in self.penalties]
         if len(parts) == 1:
             return parts[0]
@@ -317,21 +262,10 @@ class Problem:
         pseudo, slope = self.loss.pseudo(r)
         return pseudo, None if jac is None else jac * slope[:, None]
 
-    def _prior_part(self, q: Array) -> tuple[Array, Array]:
-        names = [p.name for p in self.unknown]
-        physical, slope = self.scaling.physical(q), self.scaling.slope(q)
-        held = [n for n in self.priors if n in names]
-        r, jac = np.zeros(len(held)), np.zeros((len(held), len(names)))
-        for row, name in enumerate(held):
-            mean, std = self.priors[name]
-            j = names.index(name)
-            r[row], jac[row, j] = (physical[j] - mean) / std, slope[j] / std
-        return r, jac
-
     @property
     def n_outputs(self) -> int:
         """Number of output residuals (finite measured samples)."""
-        return sum(y.size if index is None else len(index) for y, _, index in self._weights)
+        return sum(m.size for m in self._measured)
 
     def for_model(self, model: Model) -> Problem:
         """Return the problem for another model on the same records; noise, grids, initial states stay."""
@@ -358,3 +292,6 @@ def as_problem(model: Model, runs: Sequence[Experiment] | Experiment, **fields: 
     """Return a `Problem` of a model and one or several runs."""
     experiments = (runs,) if isinstance(runs, Experiment) else tuple(runs)
     return Problem(model, experiments, **fields)
+
+
+__all__ = ["Huber", "Problem", "as_problem"]

@@ -1,0 +1,72 @@
+"""Residuals of one record and of priors: model minus what is known, in standard deviations."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from motorid.errors import SimulationError
+from motorid.integrate.grid import Array, Trajectory
+from motorid.prepared import Run
+from motorid.unknowns import Point, Unknowns
+
+LARGEST_SLOPE = 1e100  # of an output; beyond it the numbers mean nothing
+
+
+class Measured(NamedTuple):
+    """One record as residuals see it.
+
+    y (N, ny), NaN where missing; weights (ny,), 0 for channels not measured; `index` of the finite samples in
+    the flattened y, None for all; noise (ny,), infinite for channels not measured.
+    """
+
+    y: Array
+    weights: Array
+    index: NDArray[np.int64] | None
+    noise: Array
+    name: str
+
+    @staticmethod
+    def of(run: Run, outputs: Sequence[str], weights: str, balance: Mapping[str, float]) -> Measured:
+        """Return `run` with `weights` ``"noise"``, times what `balance` tells of each channel, or ``"rms"``."""
+        out = run.experiment.outputs
+        y = np.column_stack([out.get(c, np.full(run.experiment.n, np.nan)) for c in outputs])
+        noise = np.array([run.sigma.get(c, np.inf) for c in outputs])
+        if weights == "noise":
+            size = noise * [balance.get(c, 1.0) for c in outputs]
+        else:
+            squares = [float(np.nanmean(out[c] ** 2)) if c in out else np.inf for c in outputs]
+            size = np.sqrt(np.maximum(squares, 1e-300))
+        finite = np.isfinite(y)
+        index = None if finite.all() else np.flatnonzero(finite.ravel())
+        return Measured(y, 1.0 / size, index, noise, run.experiment.name)
+
+    @property
+    def size(self) -> int:
+        """Number of residuals."""
+        return self.y.size if self.index is None else len(self.index)
+
+    def residual(self, traj: Trajectory) -> tuple[Array, Array | None]:
+        """Return the whitened residual (n,) and its Jacobian (n, nq), if the trajectory has one."""
+        if traj.dy is not None and not np.abs(traj.dy).max(initial=0.0) < LARGEST_SLOPE:
+            raise SimulationError(f"{self.name}: the sensitivities grow without bound; the model is unstable with "
+                                  "these parameters.")
+        r = ((traj.y - self.y) * self.weights).ravel()
+        jac = None if traj.dy is None else (traj.dy * self.weights[:, None]).reshape(r.size, -1)
+        if self.index is None:
+            return r, jac
+        return r[self.index], None if jac is None else jac[self.index]
+
+
+def prior_residual(priors: Mapping[str, tuple[float, float]], unknowns: Unknowns,
+                   at: Point) -> tuple[Array, Array]:
+    """Return (value − mean)/std of each free parameter with a prior, and the derivatives with respect to q."""
+    names = [p.name for p in unknowns.all]
+    columns = [names.index(n) for n in priors if n in names]
+    mean, std = np.array([priors[names[j]] for j in columns]).reshape(-1, 2).T
+    jac = np.zeros((len(columns), len(names)))
+    jac[np.arange(len(columns)), columns] = at.slope[columns] / std
+    return (at.physical[columns] - mean) / std, jac
