@@ -33,7 +33,7 @@ def model_of(path: Path, effects_from: Path | None = None) -> Model:
     own = own_effects(effects_from) if effects_from else {}
     try:
         return model_from(contents, own)
-    except (KeyError, TypeError, AttributeError) as error:
+    except (KeyError, TypeError, AttributeError, ValueError) as error:
         raise DataError(f"{path} is JSON, but not of a fit (it lacks {error}); expected what `motorid fit "
                         f"RUN... --json {path}` writes.") from None
 

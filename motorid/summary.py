@@ -59,6 +59,8 @@ def remarks(fit: Fit) -> list[str]:
     at_limit = [n for n in vague if _vanished(fit, n)]
     vague = [n for n in vague if n not in at_limit]
     said = []
+    if model.base == "dc_motor" and any("m" in r.units.values() for r in fit.problem.experiments):
+        said.append("The record moves in m: read K in N/A, b in N·s/m, J as a mass in kg, torques as forces in N.")
     motor = [n for n in vague if n in MOTOR]
     if model.base == "dc_motor" and motor and "i" not in measured:
         said.append(f"The current was not measured, so {_listed(motor)} cannot be told apart: only "

@@ -1,0 +1,334 @@
+"""The commands do what section by section their help says: JSON, tables, exit status."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command import motorid, motorid_json
+
+from motorid.cli import app
+from motorid.cli_common import _spread
+from motorid.datasets import data_path, truth
+from motorid.reading import read_runs, write_csv
+
+FRICTION = data_path("hidden_friction")
+STEPS = data_path("two_step")
+NOISY = data_path("two_step_noisy")
+
+OWN_EFFECT = '''
+import motorid as mi
+
+@mi.effect(balance="torque")
+def square_root_drag(m, c_r=mi.P(1e-4, "N·m", null=0.0, lower=0.0)):
+    """A made-up drag that grows with the root of the speed."""
+    m.torque -= c_r * m.sign(m.omega) * (m.omega**2 + 1e-6) ** 0.25
+'''
+
+
+@pytest.fixture(scope="module")
+def fitted(tmp_path_factory) -> tuple[Path, dict]:
+    """``fit --json`` of Coulomb friction on the records that hide it, with a held-out record."""
+    folder = tmp_path_factory.mktemp("fitted")
+    contents = motorid_json(folder, "fit", FRICTION / "run*.csv", "--effects", "coulomb",
+                            "--validate", FRICTION / "check*.csv")
+    return folder / "result.json", contents
+
+
+@pytest.fixture(scope="module")
+def speed_only(tmp_path_factory) -> Path:
+    """The noisy steps without their current."""
+    folder = tmp_path_factory.mktemp("speed")
+    for run in read_runs(NOISY):
+        write_csv(run.without("i"), folder / f"{run.name}.csv")
+    return folder
+
+
+# -- fit ---------------------------------------------------------------------------------------------------
+def test_fit_json_has_the_fields_of_the_contract(fitted):
+    _, found = fitted
+    assert found["model"]["base"] == "dc_motor"
+    assert found["model"]["effects"] == ["coulomb"]
+    for name, p in found["parameters"].items():
+        assert {"value", "std", "unit", "fixed"} <= set(p), name
+    assert set(found["nrmse"]) == set(found["rmse"]) == set(found["validation_nrmse"]) == {"i", "omega"}
+    assert set(found["derived"]) == {"tau_e", "tau_m", "damping"}
+    assert found["violations"] == {}
+    assert (found["engine"], found["formulation"], found["status"]) == ("rosenbrock", "plain", "converged")
+    for key in ("chi2", "dof", "iterations", "seconds"):
+        assert found[key] > 0, key
+    assert isinstance(found["message"], str)
+
+
+def test_fit_finds_the_hidden_friction_and_says_how_certain_it_is(fitted):
+    _, found = fitted
+    hidden = truth("hidden_friction")
+    tau_c = found["parameters"]["tau_c"]
+    assert tau_c["value"] == pytest.approx(hidden["effects"]["coulomb"]["tau_c"], abs=4 * tau_c["std"])
+    for name in "RLKbJ":
+        p = found["parameters"][name]
+        assert p["value"] == pytest.approx(hidden["parameters"][name], abs=5 * p["std"]), name
+    assert found["parameters"]["sgn_width"]["fixed"]
+    assert max(found["validation_nrmse"].values()) < 0.02
+
+
+def test_fit_prints_values_with_errors_units_and_the_held_out_error():
+    done = motorid("fit", FRICTION / "run*.csv", "--effects", "coulomb",
+                   "--validate", FRICTION / "check1.csv")
+    assert done.status == 0
+    assert re.search(r"R\s+1\.37\d+ ± 0\.000\d+ Ω\s+winding resistance", done.out)
+    assert re.search(r"tau_c\s+\(8\.0\d+ ± 0\.0\d+\)·10⁻³ N·m", done.out)
+    for word in ("NRMSE", "RMSE", "held-out", "electrical time constant", "damping ratio",
+                 "steady-state error", "run1", "run2", "converged", "chosen from the data"):
+        assert word in done.out, word
+    assert done.err == ""
+
+
+def test_held_parameters_are_said_to_be_held(tmp_path):
+    found = motorid_json(tmp_path, "fit", STEPS, "--fix", "L=0.0017,K", "--set", "K=0.0462")
+    assert {n for n, p in found["parameters"].items() if p["fixed"]} == {"L", "K"}
+    assert found["parameters"]["L"]["value"] == 0.0017
+    assert found["parameters"]["K"] == {"value": 0.0462, "std": 0.0, "unit": "N·m/A", "fixed": True}
+    assert "(held)" in motorid("fit", STEPS, "--fix", "L=0.0017").out
+
+
+def test_two_step_without_noise_gives_the_truth_from_the_automatic_guess(tmp_path):
+    found = motorid_json(tmp_path, "fit", STEPS)
+    for name, value in truth("two_step")["parameters"].items():
+        assert found["parameters"][name]["value"] == pytest.approx(value, rel=1e-3), name
+
+
+@pytest.mark.parametrize("engine", ["cvodes", "idas"])
+def test_the_engine_can_be_chosen(tmp_path, engine):
+    found = motorid_json(tmp_path, "fit", STEPS / "step_6V.csv", "--engine", engine)
+    assert found["engine"] == engine
+    assert found["parameters"]["R"]["value"] == pytest.approx(1.38, rel=1e-3)
+
+
+def test_json_goes_to_standard_output_and_nothing_else_does():
+    done = motorid("fit", STEPS / "step_6V.csv", "--json", "-")
+    assert json.loads(done.out)["status"] == "converged"
+
+
+def test_without_current_the_fit_says_that_r_and_k_cannot_be_told_apart(tmp_path, speed_only):
+    """A record of voltage and speed alone determines three numbers; no confident R, b, J may come of it."""
+    found = motorid_json(tmp_path, "fit", speed_only)
+    assert all(found["parameters"][n]["std"] is None for n in ("R", "b", "J"))
+    said = " ".join(motorid("fit", speed_only).out.split())
+    assert "The current was not measured" in said
+    assert "--fix R=1.2" in said
+    assert "(not determined)" in said
+
+
+def test_with_r_and_friction_given_the_speed_alone_determines_the_rest(tmp_path, speed_only):
+    found = motorid_json(tmp_path, "fit", speed_only, "--fix", "R=1.38,L=0.00172,b=6.5e-5")
+    for name, value in (("K", 0.0462), ("J", 2.35e-5)):
+        p = found["parameters"][name]
+        assert p["value"] == pytest.approx(value, rel=0.01)
+        assert p["std"] is not None, name
+
+
+def test_set_is_a_start_and_not_a_hold(tmp_path):
+    found = motorid_json(tmp_path, "fit", STEPS / "step_6V.csv", "--set", "R=5", "--set", "K=0.2,L=0.01")
+    assert found["parameters"]["R"]["value"] == pytest.approx(1.38, rel=1e-3)
+
+
+def test_a_torque_drive_on_a_linear_axis_is_shown_as_mass_and_force(tmp_path):
+    t = np.arange(0, 2, 0.01)
+    u = np.where(t < 1, 2.0, -2.0)
+    speed = np.where(t < 1, 1 - np.exp(-t), (1 - np.exp(-1)) * np.exp(-(t - 1)) - (1 - np.exp(-(t - 1))))
+    path = tmp_path / "axis.csv"
+    path.write_text("time_s,voltage_V,speed_m_s\n" + "".join(
+        f"{a:.3f},{b:g},{c:.9f}\n" for a, b, c in zip(t, u, speed, strict=True)))
+    found = motorid_json(tmp_path, "fit", path, "--drive", "torque", "--set", "g=10")
+    assert found["model"] == {"base": "torque_driven", "axis": "linear", "effects": []}
+    assert [found["parameters"][n]["unit"] for n in ("g", "b", "J")] == ["N/V", "N·s/m", "kg"]
+    assert found["parameters"]["J"]["value"] == pytest.approx(20, rel=0.01)  # 20 N for 1 m/s², 1 s
+    assert found["parameters"]["g"]["fixed"]
+    assert found["derived"]["tau_e"] is None
+
+
+def test_columns_and_units_are_taken_as_named(tmp_path):
+    run = read_runs(STEPS / "step_6V.csv")[0]
+    path = tmp_path / "odd.csv"
+    rows = zip(run.t * 1e3, run.inputs["v"], run.outputs["omega"] * 30 / np.pi, run.outputs["i"], strict=True)
+    path.write_text("a,b,c,d\n" + "".join(f"{a:.6f},{b:.6f},{c:.9f},{d:.9f}\n" for a, b, c, d in rows))
+    found = motorid_json(tmp_path, "fit", path, "--columns", "t=a,v=b,omega=c,i=d",
+                         "--units", "t=ms,omega=rpm")
+    assert found["parameters"]["K"]["value"] == pytest.approx(0.0462, rel=1e-3)
+
+
+def test_an_effect_of_ones_own_takes_part(tmp_path):
+    (tmp_path / "own.py").write_text(OWN_EFFECT)
+    own = ("--effects-from", tmp_path / "own.py")
+    found = motorid_json(tmp_path, "fit", FRICTION / "run1.csv", "--effects", "square_root_drag", *own)
+    assert found["model"]["effects"] == ["square_root_drag"]
+    assert found["parameters"]["c_r"]["value"] > 0
+    again = motorid("simulate", tmp_path / "result.json", FRICTION / "run1.csv", *own)
+    assert again.status == 0
+    alone = motorid("simulate", tmp_path / "result.json", FRICTION / "run1.csv")
+    assert alone.status == 2
+    assert "--effects-from" in alone.err
+
+
+def test_penalty_formulation_weighs_the_current_limit(tmp_path):
+    words = ("fit", STEPS / "step_6V.csv", "--formulation", "penalty")
+    free, held = motorid_json(tmp_path, *words), motorid_json(tmp_path, *words, "--current-limit", "2.5")
+    assert (free["formulation"], held["formulation"]) == ("penalty", "penalty")
+    assert held["parameters"]["R"]["value"] > 1.05 * free["parameters"]["R"]["value"]
+
+
+def test_huber_loss_forgives_outliers(tmp_path):
+    run = read_runs(NOISY / "run1.csv")[0]
+    speed = run.outputs["omega"].copy()
+    speed[40::37] = 250.0
+    write_csv(run.with_(outputs={**run.outputs, "omega": speed}), tmp_path / "spikes.csv")
+    error = {}
+    for loss in ("squares", "huber"):
+        found = motorid_json(tmp_path, "fit", tmp_path / "spikes.csv", "--loss", loss)
+        error[loss] = abs(found["parameters"]["K"]["value"] / 0.0462 - 1)
+    assert error["huber"] < 0.5 * error["squares"]
+
+
+def test_a_record_fitted_and_held_out_at_once_is_remarked():
+    done = motorid("fit", STEPS / "step_6V.csv", "--validate", STEPS / "step_6V.csv")
+    assert "both fitted and held out" in " ".join(done.out.split())
+
+
+def test_a_report_is_written(tmp_path):
+    page = tmp_path / "fit.html"
+    done = motorid("fit", STEPS / "step_6V.csv", "--report", page)
+    assert done.status == 0
+    assert "winding resistance" in page.read_text(encoding="utf-8")
+
+
+# -- simulate ----------------------------------------------------------------------------------------------
+def test_simulate_repeats_the_held_out_error_of_the_fit(fitted, tmp_path):
+    path, found = fitted
+    again = motorid_json(tmp_path, "simulate", path, FRICTION / "check1.csv", "--out", tmp_path / "sim")
+    for channel, error in found["validation_nrmse"].items():
+        assert again["nrmse"][channel] == pytest.approx(error, rel=1e-3), channel
+    written = read_runs(again["files"])[0]
+    measured = read_runs(FRICTION / "check1.csv")[0]
+    e = written.outputs["omega"] - measured.outputs["omega"]
+    rms = np.sqrt(np.mean(e**2) / np.mean(measured.outputs["omega"] ** 2))
+    assert rms == pytest.approx(again["nrmse"]["omega"], rel=1e-2)
+
+
+# -- diagnose, identifiability, robustness, fit-many ---------------------------------------------------------
+@pytest.mark.slow
+def test_diagnose_names_the_missing_effect(tmp_path):
+    page = tmp_path / "found.html"
+    found = motorid_json(tmp_path, "diagnose", FRICTION / "run*.csv", "--validate", FRICTION / "check*.csv",
+                         "--max-effects", "1", "--report", page)
+    assert (found["verdict"], found["where"], found["effects"]) == ("missing", "mechanical", ["coulomb"])
+    assert [step["added"] for step in found["ladder"]] == [None, "coulomb"]
+    assert found["ladder"][1]["validation_nrmse"]["omega"] < 0.2 * found["ladder"][0]["validation_nrmse"]["omega"]
+    assert {"effect", "predicted_drop", "refit_drop", "validation_nrmse", "group", "parameters",
+            "accepted"} <= set(found["ranking"][0])
+    assert {"text", "location", "parameters_before", "parameters_after", "suggestion"} <= set(found)
+    assert "coulomb" in page.read_text(encoding="utf-8")
+
+
+def test_identifiability_tells_what_is_determined(tmp_path, speed_only):
+    full = motorid_json(tmp_path, "identifiability", STEPS)
+    assert {"singular_values", "condition_number", "rank", "parameters", "weak_directions",
+            "std"} <= set(full)
+    assert (full["rank"], full["weak_directions"]) == (5, [])
+    lost = motorid_json(tmp_path, "identifiability", speed_only)
+    assert lost["rank"] < 5
+    assert lost["weak_directions"][0]["text"]
+    assert None in lost["std"].values()
+
+
+def test_robustness_counts_where_the_starts_end(tmp_path):
+    found = motorid_json(tmp_path, "robustness", NOISY, "--starts", "6", "--spread", "5")
+    assert (found["starts"], found["spread"]) == (6, 5)
+    assert found["good"] + found["poor"] + found["failed"] == 6
+    assert found["good"] == 6
+    assert set(found["parameters"]["R"]) == {"reference", "mean", "std"}
+    assert set(found["nrmse"]) == {"i", "omega"}
+
+
+def test_fit_many_keeps_a_failed_motor_as_a_row(tmp_path):
+    for name, source in (("one", STEPS), ("two", NOISY)):
+        (tmp_path / "motors" / name).mkdir(parents=True)
+        for file in source.glob("*.csv"):
+            (tmp_path / "motors" / name / file.name).write_bytes(file.read_bytes())
+    (tmp_path / "motors" / "three.csv").write_text("no record at all\n")
+    found = motorid_json(tmp_path, "fit-many", tmp_path / "motors", "--out", tmp_path / "table.csv")
+    rows = {r["motor"]: r for r in found["rows"]}
+    assert rows["one"]["R"] == pytest.approx(1.38, rel=1e-3)
+    assert rows["three"]["status"] == "failed"
+    assert "rows of at least two numbers" in rows["three"]["message"]
+    assert len((tmp_path / "table.csv").read_text().splitlines()) == 4
+
+
+# -- the whole ---------------------------------------------------------------------------------------------
+@pytest.mark.slow
+def test_demo_tells_the_story_and_leaves_figures_and_report(tmp_path):
+    out = tmp_path / "story"
+    found = motorid_json(tmp_path, "demo", "--out", out)
+    assert found["effects"] == ["coulomb"]
+    held_out = [step["validation_nrmse"]["omega"] for step in found["ladder"]]
+    assert held_out[-1] < 0.2 * held_out[0]
+    assert {Path(f).name for f in found["files"]} == {"report.html", "fit.png", "ladder.png"}
+    assert all(Path(f).stat().st_size > 5000 for f in found["files"])
+
+
+@pytest.mark.parametrize("command", ["demo", "fit", "simulate", "diagnose", "identifiability", "robustness",
+                                     "fit-many", "export", "record", "bench"])
+def test_every_command_has_help_with_an_example(command):
+    done = motorid(command, "--help")
+    text = " ".join(done.out.split())
+    assert done.status == 0
+    assert "Usage:" in text
+    if command not in ("record", "bench"):
+        assert f"Example: motorid {command}" in text
+
+
+def test_every_command_that_fits_takes_all_of_fits_options():
+    group = app
+    from typer.main import get_command
+
+    commands = get_command(group).commands  # type: ignore[attr-defined]
+    options = {name: {o for p in c.params for o in p.opts} for name, c in commands.items()}
+    shared = {"--effects", "--fix", "--set", "--drive", "--solver", "--formulation", "--current-limit",
+              "--engine", "--columns", "--units", "--effects-from", "--json"}
+    for name in ("fit", "diagnose", "identifiability", "robustness", "fit-many"):
+        assert shared <= options[name], name
+    for name in ("fit", "diagnose", "identifiability", "robustness"):
+        assert "--report" in options[name], name
+    assert "--validate" in options["fit"] & options["diagnose"]
+    assert {"--starts", "--spread"} <= options["robustness"]
+    assert "--max-effects" in options["diagnose"]
+
+
+@pytest.mark.parametrize(("words", "spread"), [
+    ("a --validate b c --json d", "a --validate b --validate c --json d"),
+    ("a --validate b", "a --validate b"),
+    ("--validate b --validate c", "--validate b --validate c"),
+    ("a --validate --json d", "a --validate --json d"),
+    ("a -- --validate b c", "a -- --validate b c"),
+])
+def test_validate_takes_all_names_up_to_the_next_option(words, spread):
+    assert _spread(words.split()) == spread.split()
+
+
+def test_without_a_command_the_help_comes_and_with_version_the_version():
+    assert "Commands" in motorid().out
+    assert re.fullmatch(r"motorid \S+", motorid("--version").out.strip())
+
+
+def test_it_runs_as_a_process_of_its_own(tmp_path):
+    """The installed script's way in, from another folder, output piped."""
+    command = [sys.executable, "-m", "motorid", "fit", str(STEPS / "step_6V.csv"), "--json", "f.json"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, encoding="utf-8", timeout=300)
+    assert done.returncode == 0, done.stderr
+    assert "winding resistance" in done.stdout
+    assert json.loads((tmp_path / "f.json").read_text(encoding="utf-8"))["status"] == "converged"

@@ -1,0 +1,169 @@
+"""A user's mistake gives one clear sentence on standard error and exit status 2; failed work gives 1."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from broken_inputs import BROKEN, Broken
+from command import Done, motorid
+
+from motorid import cli_options
+from motorid.datasets import data_path
+from motorid.errors import FitError, MissingDependency, SimulationError
+
+RUN = data_path("two_step") / "step_6V.csv"
+
+
+def wrong(done: Done, *says: str) -> None:
+    """Assert that one clear sentence about the user's mistake came, and nothing else."""
+    assert done.status == 2, (done.out, done.err)
+    assert done.out == ""
+    assert done.err.startswith("motorid: ")
+    assert len(done.err.splitlines()) == 1
+    assert 25 < len(done.err) < 1200
+    for word in says:
+        assert word in done.err
+
+
+@pytest.mark.parametrize("broken", BROKEN, ids=lambda b: b.name)
+def test_broken_records(broken: Broken, tmp_path):
+    """Sixty kinds of files and descriptions of files that cannot be used."""
+    words = [broken.make(tmp_path)]
+    words += ["--columns", broken.columns] if broken.columns else []
+    words += ["--units", broken.units] if broken.units else []
+    wrong(motorid("fit", *words), broken.says)
+
+
+@pytest.mark.parametrize(("words", "says"), [
+    (["fit"], "Missing argument"),
+    (["fti"], "Did you mean 'fit'"),
+    (["fit", RUN, "--efects", "coulomb"], "--effects"),
+    (["fit", RUN, "--effects"], "requires an argument"),
+    (["fit", RUN, "--validate"], "requires an argument"),
+    (["fit", RUN, "--validate", "nowhere.csv"], "no file nowhere.csv"),
+    (["fit", RUN, "--effects", "coulom"], "Did you mean 'coulomb'"),
+    (["fit", RUN, "--effects", "coulomb,coulomb"], "already has 'coulomb'"),
+    (["fit", RUN, "--effects", "coulomb,stribeck"], "same friction twice"),
+    (["fit", RUN, "--set", "R"], "name=value"),
+    (["fit", RUN, "--set", "R=one"], "'one' is not a number"),
+    (["fit", RUN, "--set", "Q=1"], "unknown parameter 'Q'"),
+    (["fit", RUN, "--set", "R=-1"], "must be positive"),
+    (["fit", RUN, "--set", "R=nan"], "finite"),
+    (["fit", RUN, "--fix", "M"], "unknown parameter 'M'"),
+    (["fit", RUN, "--free", "x"], "unknown parameter 'x'"),
+    (["fit", RUN, "--fix", "R,L,K,b,J"], "nothing"),
+    (["fit", RUN, "--drive", "steam"], "unknown drive 'steam'"),
+    (["fit", RUN, "--drive", "torque", "--effects", "brush_drop"], "brush_drop"),
+    (["fit", RUN, "--solver", "simplex"], "unknown solver 'simplex'"),
+    (["fit", RUN, "--formulation", "soft"], "unknown formulation 'soft'"),
+    (["fit", RUN, "--formulation", "hard", "--solver", "lm"], "multiple-shooting"),
+    (["fit", RUN, "--formulation", "penalty", "--solver", "multiple-shooting"], "--solver lm"),
+    (["fit", RUN, "--current-limit", "5"], "--formulation"),
+    (["fit", RUN, "--current-limit", "much", "--formulation", "penalty"], "--current-limit"),
+    (["fit", RUN, "--current-limit", "-3", "--formulation", "penalty"], "positive current"),
+    (["fit", RUN, "--engine", "steam"], "unknown engine 'steam'"),
+    (["fit", RUN, "--initial", "maybe"], "unknown initial state 'maybe'"),
+    (["fit", RUN, "--loss", "heavy"], "unknown loss 'heavy'"),
+    (["fit", RUN, "--hold", "spline"], "hold"),
+    (["fit", RUN, "--columns", "t:time"], "name=value"),
+    (["fit", RUN, "--units", "omega=furlong"], "unknown unit 'furlong'"),
+    (["fit", RUN, "--effects-from", "nowhere.py"], "no file nowhere.py"),
+    (["fit", RUN, "--json", "no/such/folder/fit.json"], "cannot write"),
+    (["fit", RUN, "--report", "no/such/folder/fit.html"], "cannot be written"),
+    (["simulate", "nowhere.json", RUN], "cannot read nowhere.json"),
+    (["simulate", RUN, RUN], "is not JSON"),
+    (["diagnose", RUN, "--max-effects", "-1"], "max-effects"),
+    (["robustness", RUN, "--starts", "0"], "starts"),
+    (["robustness", RUN, "--spread", "0.5"], "spread"),
+    (["fit-many", "nowhere"], "not a folder"),
+    (["export", "nowhere.json", "x", "--to", "fortran"], "unknown form 'fortran'"),
+    (["demo", "--out", RUN], "cannot write"),
+], ids=lambda v: "-".join(Path(str(w)).name for w in v) if isinstance(v, list) else "")
+def test_wrong_words(words, says, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    done = motorid(*words)
+    if "--report" in words:  # the work was done before the page could not be written
+        done = Done(done.status, "", done.err)
+    wrong(done, says)
+
+
+@pytest.mark.parametrize(("text", "says"), [
+    ("def f(:\n", "SyntaxError"),
+    ("import nothing_like_this\n", "ModuleNotFoundError"),
+    ("1 / 0\n", "ZeroDivisionError"),
+    ("x = 1\n", "defines no effect"),
+    ("import motorid as mi\n@mi.effect(balance='torque')\ndef f(m, a=1.0):\n    pass\n", "needs a default P("),
+    ("import motorid as mi\n@mi.effect(balance='heat')\ndef f(m):\n    pass\n", "unknown balance 'heat'"),
+])
+def test_broken_files_of_effects(tmp_path, text, says):
+    path = tmp_path / "own.py"
+    path.write_text(text)
+    wrong(motorid("fit", RUN, "--effects-from", path), says, str(path))
+
+
+def test_an_effect_that_writes_nonsense_is_named(tmp_path):
+    path = tmp_path / "own.py"
+    path.write_text("import motorid as mi\n@mi.effect(balance='torque')\ndef odd(m, a=mi.P(1.0, 'N·m')):\n"
+                    "    m.torque -= a * m.temperature\n")
+    wrong(motorid("fit", RUN, "--effects", "odd", "--effects-from", path), "odd", "temperature")
+
+
+@pytest.mark.parametrize(("contents", "says"), [
+    ({}, "not of a fit"),
+    ([1, 2], "not of a fit"),
+    ({"model": {"base": "steam_engine", "effects": []}, "parameters": {}}, "steam_engine"),
+    ({"model": {"base": "dc_motor", "effects": ["coulom"]}, "parameters": {}}, "Did you mean 'coulomb'"),
+    ({"model": {"base": "dc_motor", "effects": []}, "parameters": {"R": {"value": "x", "fixed": False}}}, "x"),
+    ({"model": {"base": "dc_motor", "effects": []}, "parameters": {"Q": {"value": 1, "fixed": False}}}, "'Q'"),
+], ids=str)
+def test_json_that_is_no_fit(tmp_path, contents, says):
+    path = tmp_path / "fit.json"
+    path.write_text(json.dumps(contents))
+    wrong(motorid("simulate", path, RUN), says)
+
+
+def failing(error: Exception) -> Callable[..., None]:
+    def fail(*_: object, **__: object) -> None:
+        raise error
+    return fail
+
+
+@pytest.mark.parametrize("error", [FitError("the solver gave up: try another start."),
+                                   SimulationError("it left the finite numbers at t = 1 s."),
+                                   MissingDependency("this needs pyarrow: pip install 'motorid[parquet]'.")])
+def test_work_that_fails_gives_one_sentence_and_status_1(monkeypatch, error):
+    monkeypatch.setattr(cli_options, "fit", failing(error))
+    done = motorid("fit", RUN)
+    assert (done.status, done.err) == (1, f"motorid: {error}\n")
+
+
+def test_a_mistake_of_ours_is_not_hidden(monkeypatch):
+    monkeypatch.setattr(cli_options, "fit", failing(RuntimeError("a bug")))
+    with pytest.raises(RuntimeError, match="a bug"):
+        motorid("fit", RUN)
+
+
+def test_a_fit_that_ends_badly_gives_status_1(monkeypatch):
+    from dataclasses import replace
+
+    real = cli_options.fit
+    monkeypatch.setattr(cli_options, "fit", lambda *a, **k: replace(real(*a, **k), status="failed"))
+    done = motorid("fit", RUN)
+    assert done.status == 1
+    assert "failed" in done.out
+
+
+@pytest.mark.parametrize(("words", "says"), [
+    (["fit", "nowhere.csv"], "no file nowhere.csv"),
+    (["fit", str(RUN), "--effects", "coulom"], "Did you mean 'coulomb'"),
+    (["fit", "--nonsense"], "No such option"),
+])
+def test_a_real_process_shows_no_traceback(tmp_path, words, says):
+    command = [sys.executable, "-m", "motorid", *words]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, encoding="utf-8", timeout=300)
+    wrong(Done(done.returncode, done.stdout, done.stderr), says)
