@@ -32,34 +32,59 @@ def voltages(words: str, motor, n: int, dt: float, rng: np.random.Generator) -> 
     onset = 0.02 * T
     make: dict[str, Callable] = {
         "stairs": lambda: P.staircase(u * STAIRS, (T - onset) / len(STAIRS), onset, dt),
-        "forward": lambda: P.staircase(u * FORWARD, (T - onset) / len(FORWARD), onset, dt),
+        "forward": lambda: P.staircase(u * FORWARD, T / len(FORWARD), 0.0, dt),
         "prbs": lambda: P.prbs(u, T, 3 * tau, rng, dt),
+        "hard": lambda: P.prbs(u, T, 1.2 * tau, rng, dt),
         "steps": lambda: P.random_steps(u, T, T / 14, rng, dt),
         "chirp": lambda: P.chirp(u, T, 1.5 / T, min(1 / (np.pi * tau), 0.1 / dt), dt),
         "ramps": lambda: P.triangle(u, T, T / 2.5, dt),
         "multisine": lambda: P.multisine(u, T, np.array([1.3, 2.9, 4.7, 7.9, 12.1]) / T, rng, dt),
         "slow": lambda: P.multisine(u, T, np.array([0.7, 1.3, 2.1]) / T, rng, dt),
         "coast": lambda: P.coast_down(u, 0.4 * T, T, dt),
-        "lift": lambda: _above_zero(P.multisine(u / 3, T, np.array([1.3, 2.9, 4.7]) / T, rng, dt), 2 * u / 3),
+        "waves": lambda: _raised(P.multisine(u / 3, T, np.array([1.3, 2.9, 4.7]) / T, rng, dt), 2 * u / 3),
     }
     t, v = make[name]()
     return t[:n], v[:n]
 
 
-def _above_zero(excitation, middle):
-    """The same about a voltage, reached in a ramp from zero."""
+def _raised(excitation, middle):
     t, v = excitation
-    return t, np.round((v + middle) * np.clip(t / (0.1 * t[-1]), 0, 1), 4)
+    return t, np.round(v + middle, 4)
+
+
+MOVING = ("forward", "waves")  # never at rest: recorded from when the motor runs
 
 
 def driven(motor, effects, words: str, n: int, dt: float, rng: np.random.Generator, jitter: float = 0.0) -> dict:
-    """What the plant does, open loop, or following random speeds under a PI controller (``"loop"``)."""
+    """What the plant does: open loop, or following random speeds under a PI controller (``"loop"``).
+
+    The controller sees a noisy speed, and what it saw is what was logged.
+    """
+    if words.split()[0] in MOVING:
+        lead = n // 4
+        t, v = voltages(words, motor, n, dt, rng)
+        t, v = np.arange(n + lead) * dt, np.concatenate([np.full(lead, v[0]), v])
+        r = P.simulate(motor, effects, t, v, substep=None)
+        return {c: y[lead:] - (y[lead] if c in ("t", "theta") else 0) for c, y in r.items()}
     if not words.startswith("loop"):
         t, v = voltages(words, motor, n, dt, rng)
         return P.simulate(motor, effects, P.uneven(t, jitter, rng) if jitter else t, v, substep=None)
-    _, reference = P.random_steps(0.6 * level(motor) / motor.K, n * dt, n * dt / 10, rng, dt)
+    top = 0.6 * level(motor) / motor.K
+    _, reference = P.random_steps(top, n * dt, n * dt / 10, rng, dt)
     gains = {"kp": 1.5 * motor.K, "ki": 1.5 * motor.K / time_constant(motor)}
-    return P.closed_loop(P.Plant(motor, effects), reference, gains, dt)
+    noise = {"i": 0.004 * motor.i_max, "omega": 0.006 * top, "theta": 0.0}
+    return P.closed_loop(Noisy(motor, effects, noise, rng), reference, gains, dt) | {"noisy": np.ones(1)}
+
+
+class Noisy(P.Plant):
+    """A plant whose sensors are noisy, for whatever listens to them."""
+
+    def __init__(self, motor, effects, noise: dict[str, float], rng: np.random.Generator) -> None:
+        super().__init__(motor, effects)
+        self.noise, self.rng = noise, rng
+
+    def measured(self) -> dict[str, float]:
+        return {c: y + self.noise[c] * self.rng.standard_normal() for c, y in super().measured().items()}
 
 
 def _rms(x) -> float:
@@ -72,12 +97,17 @@ def sensed(r: dict, chain: str, motor, rng: np.random.Generator, noise: float = 
     Chains: ``logger`` white noise and a 12-bit converter; ``coloured`` noise of correlation 0.85;
     ``encoder`` of 2000 counts, speed by differences; ``coarse`` the same with 240 counts; ``spikes``.
     """
+    if "noisy" in r:
+        return {c: r[c] for c in ("i", "omega")} | {"theta": P.encoder(r["theta"], 4096)}
     s = {c: noise * (2 if c == "i" else 1) * _rms(r[c]) for c in ("i", "omega")}
     if chain == "coloured":
         return {c: P.coloured(r[c], s[c], 0.85, rng) for c in s} | {"theta": P.encoder(r["theta"], 4096)}
     counts = 240 if chain == "coarse" else 4096
-    y = {"i": P.adc(P.white(r["i"], s["i"], rng), motor.i_max), "omega": P.white(r["omega"], s["omega"], rng),
-         "theta": P.encoder(r["theta"], counts)}
+    y = {
+        "i": P.adc(P.white(r["i"], s["i"], rng), motor.i_max),
+        "omega": P.white(r["omega"], s["omega"], rng),
+        "theta": P.encoder(r["theta"], counts),
+    }
     if chain in ("encoder", "coarse"):
         y["omega"] = P.encoder_speed(r["theta"], r["t"], counts)
     if chain == "spikes":
@@ -85,7 +115,9 @@ def sensed(r: dict, chain: str, motor, rng: np.random.Generator, noise: float = 
     return y
 
 
-def record(r: dict, chain: str, channels, motor, rng: np.random.Generator, name: str, noise: float = 0.01) -> Experiment:
+def record(
+    r: dict, chain: str, channels, motor, rng: np.random.Generator, name: str, noise: float = 0.01
+) -> Experiment:
     """The record of one run with the `channels` that were logged."""
     y = sensed(r, chain, motor, rng, noise)
     return Experiment(r["t"], {"v": r["v"]}, {c: y[c] for c in channels}, name=name)

@@ -1,0 +1,364 @@
+"""What a diagnosis rests on: evidence, adequacy, ranking, orders, location, the loop, the next experiment."""
+
+from __future__ import annotations
+
+import json
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+
+import numpy as np
+import pytest
+from battery.excite import driven, record
+
+import motorid as mi
+from motorid.diagnosis import adequacy
+from motorid.diagnosis.evidence import Errors, autocorrelation, compare_errors, effective_samples
+from motorid.diagnosis.orders import highest_order, likely_orders
+from motorid.diagnosis.rank import Tangent, rank, score
+from motorid.effects import LIBRARY
+from motorid.errors import FitError, ModelError, UsageError
+from motorid.experiment import Experiment
+
+FEW = ("coulomb", "brush_drop", "constant_load", "quadratic_drag", "speed_lag")
+ANGLE = ("i", "omega", "theta")
+
+
+def runs_of(motor, effects, drives, channels=("i", "omega"), n=700, seed=1, **how) -> list[Experiment]:
+    rng = np.random.default_rng(seed)
+    return [
+        record(
+            driven(motor, effects, words, n, how.get("dt", 1e-3), rng),
+            how.get("chain", "logger"),
+            channels,
+            motor,
+            rng,
+            f"run{k + 1}",
+            how.get("noise", 0.01),
+        )
+        for k, words in enumerate(drives)
+    ]
+
+
+@pytest.fixture(scope="module")
+def rubbing(lab):
+    """Two training runs and a held-out one of a motor with Coulomb friction."""
+    runs = runs_of(lab, {"coulomb": {"tau_c": 8e-3}}, ("stairs", "ramps", "steps"))
+    return runs[:2], runs[2:]
+
+
+@pytest.fixture(scope="module")
+def plain(rubbing):
+    return mi.fit(mi.dc_motor(), rubbing[0])
+
+
+@pytest.fixture(scope="module")
+def found(rubbing, plain):
+    words: list[str] = []
+    return mi.diagnose(plain, rubbing[1], effects=FEW, progress=words.append), words
+
+
+# -- evidence ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("rho", [0.0, 0.6, 0.9])
+def test_coloured_samples_count_for_fewer(plant, rng, rho):
+    worth = np.mean([effective_samples(plant.coloured(np.zeros(4000), 1.0, rho, rng)) for _ in range(5)])
+    assert worth == pytest.approx(4000 * (1 - rho) / (1 + rho), rel=0.2)
+
+
+def test_missing_samples_count_for_nothing(rng):
+    r = rng.normal(size=1000)
+    r[500:] = np.nan
+    assert effective_samples(r) == pytest.approx(500, rel=0.15)
+    assert autocorrelation(r, 3) == pytest.approx([1, 0, 0, 0], abs=0.15)
+
+
+def _errors(**residuals) -> Errors:
+    return Errors({c: [r] for c, r in residuals.items()}, dict.fromkeys(residuals, 1.0))
+
+
+def test_half_the_error_is_a_fall_of_one_half(rng):
+    r = rng.normal(size=2000)
+    gain = compare_errors(_errors(i=r), _errors(i=r / 2))
+    assert gain.fall == pytest.approx(0.5, abs=0.01)
+    assert gain.log_ratio == pytest.approx(0.5 * gain.effective * np.log(4), rel=0.02)
+
+
+def test_one_outlier_does_not_decide_between_models(rng):
+    r = 0.1 * rng.normal(size=2000)
+    spiked = r.copy()
+    spiked[7] = 100.0
+    lucky = r * 1.05
+    lucky[7] = 0.0  # a worse model that happens to meet the spike
+    assert compare_errors(_errors(i=spiked), _errors(i=lucky)).fall < 0
+
+
+def test_the_channel_that_loses_is_told(rng):
+    a, b = rng.normal(size=(2, 1000))
+    gain = compare_errors(_errors(i=a, omega=b), _errors(i=a / 10, omega=2 * b))
+    assert gain.fall > 0.5
+    assert gain.worst == pytest.approx(-1.0, abs=0.05)
+
+
+def test_ratios_of_errors_far_below_the_noise_do_not_count(rng):
+    r = 1e-6 * rng.normal(size=1000)
+    assert compare_errors(_errors(i=r), _errors(i=r / 100), {"i": 1.0}).fall < 0.01
+
+
+# -- adequacy ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("rho", [0.0, 0.85])
+def test_noise_alone_raises_few_alarms(plant, lab, rng, rho):
+    t, v = plant.staircase([3, -3, 1, 4, -2, 0.5], 0.08)
+    clean = plant.simulate_linear(lab, t, v)
+    alarms = 0
+    for _ in range(30):
+        noisy = {c: plant.coloured(clean[c], s, rho, rng) for c, s in (("i", 0.03), ("omega", 0.8))}
+        fit = mi.fit(mi.dc_motor(), Experiment(t, {"v": v}, noisy))
+        judged = adequacy(fit)
+        alarms += not judged.adequate
+        assert judged.false_alarm == 0.02
+    assert alarms <= 3
+
+
+def test_the_colour_of_the_noise_is_told(plant, lab, rng):
+    t, v = plant.staircase([3, -3, 1, 4, -2, 0.5], 0.1)
+    clean = plant.simulate_linear(lab, t, v)
+    noisy = {"i": plant.white(clean["i"], 0.03, rng), "omega": plant.coloured(clean["omega"], 0.8, 0.85, rng)}
+    judged = adequacy(mi.fit(mi.dc_motor(), Experiment(t, {"v": v}, noisy)))
+    assert judged.adequate, judged.text
+    assert judged.channels["omega"]["autocorrelation"] == pytest.approx(0.85, abs=0.1)
+    assert judged.channels["i"]["autocorrelation"] == pytest.approx(0.0, abs=0.15)
+    assert "noise of omega is coloured" in judged.text
+
+
+def test_a_model_that_lacks_friction_is_not_adequate(plain):
+    judged = adequacy(plain, rank(plain, [LIBRARY[n] for n in FEW]))
+    assert not judged.adequate
+    assert judged.p_value < judged.false_alarm
+    assert "not noise" in judged.text
+
+
+def test_errors_that_drift_far_beyond_the_noise_are_not_called_noise(plant):
+    runs = runs_of(plant.MOTORS["servo"], {"coulomb": {"tau_c": 0.03}}, ("stairs", "ramps"), ("theta",), dt=2e-3)
+    judged = adequacy(mi.fit(mi.dc_motor(), runs))
+    assert judged.channels["theta"]["ratio"] > 20
+    assert not judged.adequate, judged.text
+
+
+# -- ranking -----------------------------------------------------------------------------------------------
+
+
+def test_the_predicted_drop_is_what_a_refit_gives(found):
+    best = found[0].ranking[0]
+    assert best.effect == "coulomb"
+    assert best.predicted_drop == pytest.approx(best.refit_drop, abs=0.08)
+    assert best.predicted_drop > 0.5
+
+
+def test_what_the_fitted_parameters_absorb_scores_nothing(plain):
+    @mi.effect(balance="torque")
+    def more_viscous(m, b_x=mi.P(1e-6, "N·m·s/rad", null=0.0)):
+        """More of what b already is."""
+        m.torque -= b_x * m.omega
+
+    scores = {s.effect.name: s.drop for s in rank(plain, [more_viscous, LIBRARY["coulomb"]])}
+    assert scores["more_viscous"] < 1e-3 < scores["coulomb"]
+
+
+def test_the_predicted_size_is_near_the_truth_where_nothing_absorbs_it(lab):
+    runs = runs_of(lab, {"constant_load": {"tau_0": 5e-3}}, ("stairs", "ramps"))
+    fit = mi.fit(mi.dc_motor(), runs)
+    s = score(Tangent.of(fit), LIBRARY["constant_load"])
+    assert s.starts[0]["tau_0"] == pytest.approx(5e-3, rel=0.1)
+    assert s.drop > 0.5
+
+
+def test_effects_that_the_channels_cannot_see_are_left_out(plant):
+    runs = runs_of(plant.MOTORS["wheel"], {}, ("stairs",), ("omega",), dt=2e-3, n=400)
+    names = {s.effect.name for s in rank(mi.fit(mi.dc_motor(), runs), list(LIBRARY.values()))}
+    assert "current_lag" not in names
+    assert "current_offset" not in names
+    assert "speed_lag" in names
+
+
+def test_the_order_of_cogging_is_found_from_the_misfit(lab):
+    hidden = {"cogging": {"A": 8e-3, "N": 16, "phi": 0.7}}
+    runs = runs_of(lab, hidden, ("stairs 0.3", "ramps 0.3"), ANGLE)
+    tangent = Tangent.of(mi.fit(mi.dc_motor(), runs))
+    assert likely_orders(tangent, LIBRARY["cogging"], 3)[0] == 16
+    assert 16 <= highest_order(tangent) < 2 * np.pi / (1e-3 * 20)
+
+
+# -- location ----------------------------------------------------------------------------------------------
+
+
+def _known(motor, **given):
+    """The motor with its true numbers; only L is fitted."""
+    values = {n: getattr(motor, n) for n in ("R", "L", "K", "b", "J")} | given
+    return mi.dc_motor().fix(**{n: v for n, v in values.items() if n != "L"})
+
+
+def test_the_missing_torque_is_the_friction_that_was_hidden(rubbing, lab):
+    missing = mi.locate(mi.fit(_known(lab), rubbing[0]))
+    assert missing.where == "mechanical"
+    torque, omega = np.concatenate(missing.torque), np.concatenate([s["omega"] for s in missing.signals])
+    for side in (1, -1):
+        assert np.median(torque[side * omega > 20]) == pytest.approx(-side * 8e-3, rel=0.15)
+    assert missing.bins["torque"][0].against == "omega"
+    assert sum(missing.regions.values()) == pytest.approx(1)
+    assert sum(missing.shares.values()) == pytest.approx(1)
+    assert "depends on the speed" in missing.text
+
+
+def test_the_missing_voltage_is_the_drop_that_was_hidden(plant):
+    micro = plant.MOTORS["micro"]
+    runs = runs_of(micro, {"brush_drop": {"V_b": 0.5, "i_b": 0.01}}, ("stairs", "ramps"))
+    missing = mi.locate(mi.fit(_known(micro), runs))
+    assert missing.where == "electrical"
+    voltage, current = np.concatenate(missing.voltage), np.concatenate([s["i"] for s in missing.signals])
+    assert np.median(voltage[current > 0.08]) == pytest.approx(-0.5, rel=0.15)
+    assert missing.bins["voltage"][0].against == "i"
+
+
+def test_a_torque_of_the_angle_is_located_over_the_angle(lab):
+    runs = runs_of(lab, {"cam": {"A": 2.5e-2}}, ("stairs 0.5", "ramps 0.6"), ANGLE)
+    missing = mi.locate(mi.fit(mi.dc_motor(), runs))
+    best = missing.bins["torque"][0]
+    assert best.against == "theta"
+    assert best.explained > 0.4
+    assert np.all(best.low <= best.mean)
+    assert np.all(best.mean <= best.high)
+
+
+def test_without_a_current_voltage_and_torque_look_the_same(plant):
+    wheel = plant.MOTORS["wheel"]
+    runs = runs_of(wheel, {"coulomb": {"tau_c": 0.05}}, ("stairs", "ramps"), ("omega",), dt=2e-3)
+    missing = mi.locate(mi.fit(mi.dc_motor(), runs))
+    assert missing.where is None
+    assert "look the same" in missing.text
+
+
+# -- the whole answer --------------------------------------------------------------------------------------
+
+
+def test_friction_is_found_sized_and_said(found):
+    diagnosis, _ = found
+    assert (diagnosis.verdict, diagnosis.effects, diagnosis.where) == ("missing", ("coulomb",), "mechanical")
+    assert diagnosis.after.values["tau_c"] == pytest.approx(8e-3, rel=0.05)
+    assert diagnosis.remaining.adequate
+    assert "tau_c = " in diagnosis.text
+    assert "b from" in diagnosis.text  # what had absorbed it
+    first, last = diagnosis.ladder.rungs[0], diagnosis.ladder.rungs[-1]
+    assert last.validation_nrmse["omega"] < 0.5 * first.validation_nrmse["omega"]
+
+
+def test_every_candidate_has_a_reason(found):
+    for c in found[0].ranking:
+        assert c.accepted == (c.effect == "coulomb")
+        assert c.reason
+
+
+def test_the_progress_is_told(found):
+    words = found[1]
+    assert words[0].startswith("ranked 5")
+    assert any(w.startswith("refitted") for w in words)
+    assert "accepted coulomb" in words
+
+
+def test_the_json_is_plain_and_as_agreed(found):
+    whole = json.loads(json.dumps(found[0].to_dict()))
+    assert {
+        "verdict",
+        "text",
+        "where",
+        "location",
+        "ranking",
+        "effects",
+        "ladder",
+        "parameters_before",
+        "parameters_after",
+        "suggestion",
+    } <= set(whole)
+    assert {"effect", "predicted_drop", "refit_drop", "validation_nrmse", "group", "parameters", "accepted"} <= set(
+        whole["ranking"][0]
+    )
+    assert [r["added"] for r in whole["ladder"]] == [None, "coulomb"]
+
+
+def test_the_same_records_give_the_same_answer(rubbing, plain, found):
+    again = mi.diagnose(plain, rubbing[1], effects=FEW)
+    assert again.to_dict() == found[0].to_dict()
+
+
+@pytest.mark.slow
+def test_a_process_pool_gives_the_same_answer(rubbing, plain, found):
+    with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
+        apart = mi.diagnose(plain, rubbing[1], effects=FEW, map=pool.map)
+    assert apart.effects == found[0].effects
+    assert apart.after.values == pytest.approx(found[0].after.values, rel=1e-9)
+
+
+def test_without_held_out_runs_blocks_of_the_records_judge(rubbing, plain):
+    ladder = mi.improve(plain, effects=("coulomb", "brush_drop"))
+    assert [r.added for r in ladder.rungs] == [None, "coulomb"]
+    assert all(r.validation_nrmse is None for r in ladder.rungs)
+    on = mi.fit(ladder.best.model + mi.effects.brush_drop, rubbing[0])  # each rung is a fit to go on from
+    assert on.chi2 <= ladder.best.chi2 * 1.001
+
+
+def test_nothing_is_added_beyond_the_limit(rubbing, plain):
+    found = mi.diagnose(plain, rubbing[1], effects=("coulomb",), max_effects=0)
+    assert found.effects == ()
+    assert len(found.ladder.rungs) == 1
+
+
+def test_an_effect_that_is_not_known_is_named_with_the_nearest(plain):
+    with pytest.raises(ModelError, match="coulomb"):
+        mi.diagnose(plain, effects=("coulom",))
+
+
+def test_the_users_own_effect_wins_where_it_is_the_truth(lab):
+    @mi.effect(balance="torque")
+    def seal_drag(m, c_r=mi.P(1e-4, "N·m·s½/rad½", null=0.0, lower=0.0)):
+        """A drag that grows as the square root of the speed."""
+        m.torque -= c_r * m.omega / (m.omega**2 + 1e-2) ** 0.25
+
+    runs = runs_of(lab, {"root_drag": {"c_r": 1.5e-3}}, ("stairs", "ramps", "steps"))
+    fit = mi.fit(mi.dc_motor(), runs[:2])
+    found = mi.diagnose(fit, runs[2:], effects=("coulomb", "quadratic_drag", "constant_load"), also=[seal_drag])
+    assert found.effects == ("seal_drag",)
+    assert found.after.values["c_r"] == pytest.approx(1.5e-3, rel=0.05)
+    assert found.where == "mechanical"
+
+
+# -- the next experiment -----------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def rivals(plant):
+    """Coulomb friction and a constant load, both fitted to forward runs that cannot tell them apart."""
+    servo = plant.MOTORS["servo"]
+    runs = runs_of(servo, {"constant_load": {"tau_0": 0.04}}, ("forward", "waves"), dt=2e-3)
+    return [mi.fit(mi.dc_motor() + e, runs) for e in (mi.effects.coulomb, mi.effects.constant_load)]
+
+
+def test_the_next_experiment_reverses_where_that_separates(rivals):
+    best = mi.suggest_experiment(rivals)
+    v = best.experiment.inputs["v"]
+    assert v.min() < 0 < v.max()
+    assert np.abs(v).max() <= np.abs(rivals[0].problem.experiments[0].inputs["v"]).max() * (1 + 1e-9)
+    assert best.discrimination[best.name] == max(best.discrimination.values())
+    assert best.discrimination[best.name] > 100 * min(best.discrimination.values())
+
+
+def test_the_next_experiment_keeps_to_the_limits(rivals):
+    best = mi.suggest_experiment(rivals, v_max=1.0, duration=0.5)
+    assert np.abs(best.experiment.inputs["v"]).max() <= 1.0
+    assert best.experiment.duration <= 0.5
+    with pytest.raises(FitError, match="i_max"):
+        mi.suggest_experiment(rivals, i_max=1e-3)
+    with pytest.raises(UsageError, match="two"):
+        mi.suggest_experiment(rivals[:1])

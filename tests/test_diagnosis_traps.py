@@ -1,0 +1,141 @@
+"""What a diagnosis must not fall for: every trap has a record that invites the wrong answer."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from battery.excite import driven, record
+
+import motorid as mi
+from motorid.diagnosis.rank import Tangent, score
+from motorid.effects import LIBRARY
+from motorid.experiment import Experiment
+
+ANGLE = ("i", "omega", "theta")
+
+
+def runs_of(
+    motor, effects, drives, channels=("i", "omega"), n=800, seed=3, dt=1e-3, chain="logger"
+) -> list[Experiment]:
+    rng = np.random.default_rng(seed)
+    return [
+        record(driven(motor, effects, words, n, dt, rng), chain, channels, motor, rng, f"run{k + 1}")
+        for k, words in enumerate(drives)
+    ]
+
+
+def diagnosed(runs, effects=None, base=None, **how):
+    """Fit all runs but the last and diagnose with that one held out."""
+    return mi.diagnose(mi.fit(base or mi.dc_motor(), runs[:-1]), runs[-1:], effects=effects, **how)
+
+
+def candidate(found, name):
+    return next(c for c in found.ranking if c.effect == name)
+
+
+@pytest.fixture(scope="module")
+def loaded(plant):
+    """A geared servo whose friction grows with the torque it carries."""
+    return runs_of(plant.MOTORS["servo"], {"load_friction": {"mu": 0.15}}, ("stairs", "prbs", "steps"), dt=2e-3)
+
+
+def test_coulomb_scores_but_load_friction_is_the_answer(loaded):
+    found = diagnosed(loaded, ("coulomb", "coulomb_asymmetric", "load_friction", "quadratic_drag", "brush_drop"))
+    assert candidate(found, "coulomb").predicted_drop > 0.05  # the bait
+    assert found.effects == ("load_friction",)
+    assert found.after.values["mu"] == pytest.approx(0.15, rel=0.1)
+
+
+def test_a_wrong_first_choice_is_undone(loaded):
+    """Coulomb is in the model already; load friction takes its place instead of standing beside it."""
+    found = diagnosed(loaded, ("load_friction", "quadratic_drag", "constant_load"), mi.dc_motor() + mi.effects.coulomb)
+    assert "load_friction" in found.effects
+    left = found.after.values.get("tau_c", 0.0)
+    assert left < 0.2 * found.before.values["tau_c"]
+
+
+def test_a_constant_offset_that_fits_forward_runs_is_refused_on_a_reversed_one(plant):
+    runs = runs_of(plant.MOTORS["servo"], {"coulomb": {"tau_c": 0.04}}, ("forward", "waves", "stairs"), dt=2e-3)
+    both = ("constant_load", "voltage_offset", "coulomb")
+    found = diagnosed(runs, both)
+    assert candidate(found, "constant_load").refit_drop > 0.5  # on the forward runs it is as good
+    assert found.effects == ("coulomb",)
+    assert "held-out" in candidate(found, "constant_load").reason
+    blind = mi.diagnose(mi.fit(mi.dc_motor(), runs[:-1]), effects=both)  # nothing reversed was ever seen
+    assert set(blind.groups[0]) >= {"coulomb", "constant_load"}
+    assert "cannot tell" in blind.text
+    assert "revers" in (blind.suggestion or "") or "through zero" in (blind.suggestion or "")
+
+
+def test_a_drag_with_the_wrong_sign_scores_nothing(plant):
+    """Drag that is smaller than linear at high speed: a negative c_2 would explain it well."""
+    runs = runs_of(plant.MOTORS["wheel"], {"quadratic_drag": {"c_2": -1.5e-6}}, ("stairs", "ramps", "steps"), dt=2e-3)
+    fit = mi.fit(mi.dc_motor(), runs[:-1])
+    drag = LIBRARY["quadratic_drag"]
+    assert score(Tangent.of(fit), drag).drop < 0.01
+
+    @mi.effect(balance="torque")
+    def any_drag(m, c_x=mi.P(1e-7, "N·m·s²/rad²", null=0.0)):
+        """The same without a sign."""
+        m.torque -= c_x * m.omega * (m.omega**2 + 1e-6) ** 0.5
+
+    assert score(Tangent.of(fit), any_drag).drop > 0.2  # the bait
+    found = mi.diagnose(fit, runs[-1:], effects=("quadratic_drag",))
+    assert found.effects == ()
+
+
+def test_at_a_single_operating_point_friction_is_not_told_from_b(lab, plant):
+    """The motor runs at one speed all the time; only b + tau_c/omega can be known."""
+    rng = np.random.default_rng(5)
+    t = np.arange(900) * 1e-3
+    v = np.round(5 + 0.02 * rng.normal(size=900), 4)
+    runs = []
+    for k in range(3):
+        start = plant.simulate(lab, {"coulomb": {"tau_c": 4e-3}}, np.arange(300) * 1e-3, np.full(300, 5.0))
+        r = plant.simulate(lab, {"coulomb": {"tau_c": 4e-3}}, t, v, omega0=float(start["omega"][-1]))
+        y = {c: plant.white(r[c], s, rng)[100:] for c, s in (("i", 0.01), ("omega", 0.3))}
+        runs.append(Experiment(t[100:] - t[100], {"v": v[100:]}, y, name=f"run{k + 1}"))
+    found = diagnosed(
+        runs, ("coulomb", "constant_load", "quadratic_drag", "load_friction", "voltage_offset", "brush_drop")
+    )
+    assert found.effects == () or len(found.groups[0]) > 1
+
+
+def test_a_closed_loop_is_said(plant):
+    runs = runs_of(plant.MOTORS["wheel"], {"coulomb": {"tau_c": 0.05}}, ("loop", "loop", "stairs"), dt=2e-3)
+    found = diagnosed(runs, ("coulomb", "constant_load"))
+    assert "coulomb" in found.effects
+    assert "closed loop" in found.text
+    open_loop = runs_of(plant.MOTORS["wheel"], {}, ("prbs", "stairs", "steps"), dt=2e-3)
+    assert "closed loop" not in diagnosed(open_loop, ("coulomb",)).text
+
+
+def test_a_speed_in_rpm_is_recognised(plant):
+    """An angle beside it gives the scale away."""
+    runs = runs_of(
+        plant.MOTORS["servo"], {"speed_gain": {"k_w": 30 / np.pi - 1}}, ("stairs", "multisine", "steps"), ANGLE, dt=2e-3
+    )
+    found = diagnosed(runs, ("speed_gain", "speed_lag", "coulomb", "gravity"))
+    assert found.effects == ("speed_gain",)
+    assert found.where == "sensor"
+    assert "rpm" in found.text
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("chain", ["logger", "coloured", "coarse", "spikes"])
+def test_noise_alone_gets_no_effect(plant, chain):
+    runs = runs_of(plant.MOTORS["wheel"], {}, ("stairs", "multisine", "steps"), ANGLE, dt=2e-3, chain=chain)
+    found = diagnosed(runs)
+    assert found.effects == ()
+    assert found.verdict == "adequate", found.text
+
+
+@pytest.mark.slow
+def test_the_smaller_of_two_effects_is_found_behind_the_larger(plant):
+    hidden = {"gravity": {"mgl": 1.5, "phi_g": 0.5}, "cogging": {"A": 0.35, "N": 8, "phi": 1.0}}
+    runs = runs_of(plant.MOTORS["big"], hidden, ("stairs 0.4", "ramps 0.5", "steps 0.4"), ANGLE)
+    found = diagnosed(runs, ("gravity", "cogging", "coulomb", "torque_ripple", "constant_load"))
+    assert set(found.effects) == {"gravity", "cogging"}
+    assert found.effects[0] == "gravity"
+    assert found.after.values["N"] == 8
+    assert found.after.values["A"] == pytest.approx(0.35, rel=0.1)
