@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from motorid.descent import descend, misfit_over_noise
-from motorid.diagnosis.evidence import Errors, effective_samples
+from motorid.diagnosis.evidence import Errors
 from motorid.diagnosis.rank import uses_angle
 from motorid.errors import FitError, ModelError, SimulationError
 from motorid.experiment import Experiment
@@ -26,7 +26,6 @@ POLISH = LevenbergMarquardt(max_iterations=60, ftol=1e-7, xtol=1e-7)
 BLOCKS = 10  # contiguous parts of each run; every other one is held out where there are no held-out runs
 WORST_CONDITION = 1e4  # of the column-scaled Jacobian
 HOPELESS = 1e6  # condition number beyond which a direction counts as open
-SIGNIFICANT = 3.0  # standard deviations
 ROUGH = 1e-4  # accuracy of the integration while starts are compared
 ALIVE = 3.0  # standard deviations that a change by a factor of e makes
 SUBSTEPS = 24  # per sample: what needs more cannot be seen in these samples
@@ -218,23 +217,15 @@ def _within(model: Model, values: Mapping[str, float]) -> Model:
 
 
 def objections(fit: Fit, added: Effect) -> str:
-    """Say why the refit must not be believed: signs, bounds, significance, identifiability; empty if it may be."""
+    """Say why the refit must not be believed: a wrong sign, a shape at its limit; empty if it may be."""
     pars = [fit.problem.model.parameters[p.name] for p in added.parameters]
     for p in pars:
         if p.at_least and fit.values[p.name] < 0.98 * fit.values[p.at_least]:
             return f"{p.name} came out below {p.at_least}, which is not physical"
         if added.includes and p.grid and p.vary and not 1.02 * p.lower < fit.values[p.name] < 0.98 * p.upper:
             return f"{p.name} runs to its limit: nothing of this shape is in the data"
-    covariance, determined = _covariance(fit)
-    names = [p.name for p in fit.problem.unknown]
-    for p in pars:
-        if p.name not in names or p.null is None or p.positive:
-            continue
-        value, j = fit.values[p.name], names.index(p.name)
-        if value <= p.lower and p.lower == p.null:
+        if p.vary and p.null is not None and not p.positive and fit.values[p.name] <= p.lower == p.null:
             return f"{p.name} goes to {p.null:g}: the data do not want it, or only with the wrong sign"
-        if determined[j] and abs(value - p.null) < SIGNIFICANT * np.sqrt(covariance[j, j]) and len(pars) == 1:
-            return f"{p.name} is not significant ({value:.3g} ± {np.sqrt(covariance[j, j]):.2g})"
     return ""
 
 
@@ -246,18 +237,6 @@ def ambiguity(fit: Fit) -> tuple[int, float]:
     s = np.linalg.svd(np.linalg.qr(jac / np.where(norms > 0, norms, 1.0), mode="r"), compute_uv=False)
     clear = s[s > s[0] / HOPELESS]
     return len(s) - len(clear), float(clear[0] / clear[-1])
-
-
-def _covariance(fit: Fit) -> tuple[Any, Any]:
-    """Gauss-Newton covariance with the residual's effective samples."""
-    covariance, determined = fit._covariance
-    n = sum(
-        int(np.isfinite(s.residual(c)).sum()) for s in fit.simulations for c in s.experiment.outputs if c in s.outputs
-    )
-    worth = sum(
-        effective_samples(s.residual(c)) for s in fit.simulations for c in s.experiment.outputs if c in s.outputs
-    )
-    return covariance * max(n / max(worth, 1.0), 1.0), determined
 
 
 def train_errors(fit: Fit) -> Errors:
