@@ -54,12 +54,27 @@ class Reading:
     hold: Annotated[str | None, typer.Option(
         metavar="zoh|linear", rich_help_panel=READ,
         help="The input between samples: held or joined by lines.")] = None
+    ignore: Annotated[str | None, typer.Option(
+        metavar="i,theta", rich_help_panel=READ, help="Measured channels to leave out.")] = None
 
     def read(self, paths: Sequence[str]) -> list[Experiment]:
         """Return the runs."""
         columns = parse_pairs(self.columns, "--columns") if self.columns else None
         units = parse_pairs(self.units, "--units") if self.units else None
-        return read_runs(paths, columns=columns, units=units, hold=self.hold)
+        return self.chosen(read_runs(paths, columns=columns, units=units, hold=self.hold))
+
+    def chosen(self, runs: Sequence[Experiment]) -> list[Experiment]:
+        """Return `runs` without the channels to leave out."""
+        out = _words([self.ignore] if self.ignore else [])
+        known = [c for c in ("i", "omega", "theta") if any(c in r.outputs for r in runs)]
+        for channel in out:
+            if channel not in known:
+                raise UsageError(f"--ignore: {one_of(channel, known, 'measured channel')}")
+        for r in runs:
+            if set(r.outputs) <= set(out):
+                raise UsageError(f"--ignore {self.ignore} leaves nothing measured in {r.name}; keep one of "
+                                 f"{', '.join(r.channels)}.")
+        return [r.without(*(c for c in out if c in r.outputs)) for r in runs]
 
 
 @dataclass(frozen=True)

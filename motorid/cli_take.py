@@ -28,7 +28,7 @@ def fit_many(
     out: Annotated[Path | None, typer.Option(
         metavar="TABLE.csv", rich_help_panel=OUT, help="Write the table: .csv, .parquet or .json.")] = None,
     journal: Annotated[Path | None, typer.Option(
-        metavar="FILE", rich_help_panel=OUT, help="Keep results here, to go on after an interruption.")] = None,
+        metavar="FILE", rich_help_panel=OUT, help="Results as they come, to go on from.")] = None,
     jobs: Annotated[int, typer.Option(min=1, metavar="N", rich_help_panel=OUT, help="Processes.")] = 1,
     json: Json = None,
 ) -> None:
@@ -38,8 +38,10 @@ def fit_many(
     """
     from concurrent.futures import ProcessPoolExecutor
 
-    motors = motors_in(directory)
+    motors: dict[str, Any] = dict(motors_in(directory))
     model = choices.model(_sample(choices, motors.values()))
+    if choices.ignore:
+        motors = {name: _read(choices, files) for name, files in motors.items()}
     reading: dict[str, Any] = {k: parse_pairs(v, f"--{k}") for k in ("columns", "units")
                                if (v := getattr(choices, k))}
     reading |= {"hold": choices.hold} if choices.hold else {}
@@ -75,6 +77,14 @@ def export(
     from motorid.export import export as write  # pyright: ignore[reportMissingImports]
 
     show(f"Written: {write(model_of(fit_json, effects_from), path, to=to)}")
+
+
+def _read(choices: Choices, files: list[Path]) -> list[Any]:
+    """Return the records of one motor, or their names where they cannot be read: its row says why."""
+    try:
+        return list(choices.read([str(f) for f in files]))
+    except DataError:
+        return list(files)
 
 
 def _sample(choices: Choices, motors: Iterable[list[Path]]) -> list[Experiment]:

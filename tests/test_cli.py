@@ -133,6 +133,14 @@ def test_with_r_and_friction_given_the_speed_alone_determines_the_rest(tmp_path,
         assert p["std"] is not None, name
 
 
+def test_a_channel_can_be_left_out(tmp_path, speed_only):
+    words = ("fit", "--fix", "R=1.38,L=0.00172,b=6.5e-5")
+    without = motorid_json(tmp_path, *words, NOISY, "--ignore", "i")
+    assert set(without["nrmse"]) == {"omega"}
+    absent = motorid_json(tmp_path, *words, speed_only)
+    assert without["parameters"]["J"]["value"] == pytest.approx(absent["parameters"]["J"]["value"], rel=1e-6)
+
+
 def test_set_is_a_start_and_not_a_hold(tmp_path):
     found = motorid_json(tmp_path, "fit", STEPS / "step_6V.csv", "--set", "R=5", "--set", "K=0.2,L=0.01")
     assert found["parameters"]["R"]["value"] == pytest.approx(1.38, rel=1e-3)
