@@ -77,7 +77,7 @@ class Covariance(Shown):
         interval would come near zero.
         """
         if name not in self.names:
-            raise UsageError(one_of(name, self.names, "unknown"))
+            raise UsageError(one_of(name, self.names, "parameter"))
         if not 0 < level < 1:
             raise UsageError(f"a confidence level lies between 0 and 1; got {level!r}.")
         sd, j = self.std[name], self.names.index(name)
