@@ -16,7 +16,7 @@ import numpy as np
 from motorid.errors import FitError, SimulationError
 from motorid.integrate.grid import Array
 from motorid.least_squares import LevenbergMarquardt, Solution, levenberg_marquardt
-from motorid.prepared import Run, top_speed
+from motorid.prepared import top_speed
 from motorid.problem import Problem
 
 WIDEST = 0.03  # first width of sgn over the highest speed
@@ -265,17 +265,12 @@ def integration_error(problem: Problem, q: Array) -> float:
             return 0.0
         try:
             coarse = problem.simulate(q, k, derivatives=False).y
-            finer = problem._keeping(tuple(r if j != k else _halved(r) for j, r in enumerate(problem.runs)))
-            fine = finer.simulate(q, k, derivatives=False).y
+            fine = problem.with_finer_steps(2).simulate(q, k, derivatives=False).y
         except SimulationError:
             return float("inf")
         sigma = np.array([run.sigma.get(c, np.inf) for c in problem.outputs])
         worst = max(worst, float(np.max(np.abs(fine - coarse) / sigma)))
     return worst
-
-
-def _halved(run: Run) -> Run:
-    return replace(run, grid=run.grid.with_substeps(2 * run.grid.substeps))
 
 
 __all__ = ["Descent", "descend", "descend_balanced", "descend_surely", "doubtful", "integration_error",

@@ -9,19 +9,21 @@ from typing import Any
 
 import numpy as np
 
-from motorid.descent import descend_balanced, integration_error
+from motorid.descent import Descent, descend_balanced, integration_error
 from motorid.errors import FitError, UsageError, one_of
 from motorid.experiment import Experiment
 from motorid.integrate import Engine
 from motorid.integrate.grid import Array
-from motorid.least_squares import LevenbergMarquardt, Solution
+from motorid.least_squares import LevenbergMarquardt, Solution, levenberg_marquardt
 from motorid.model import Model
 from motorid.problem import Problem, as_problem
 from motorid.result import UNDETERMINED, Failure, Fit
 from motorid.simulate import Evaluation, evaluate
 from motorid.starting import started
 
-MISFIT_SHARE = 0.2  # integration error accepted beside the misfit
+ERROR_SHARE = 0.2  # integration error accepted beside noise or misfit
+MOST_FINER = 4  # times as many steps, where that is not kept
+POLISH = 20  # iterations with them
 
 
 def fit(
@@ -117,8 +119,8 @@ def solve(problem: Problem, solver: Any = None, *, start: str = "auto",
 def _least_squares(problem: Problem, options: LevenbergMarquardt, callback, formulation: str, stages: bool,
                    began: float) -> Fit:
     done = descend_balanced(problem, options, callback, stages=stages)
+    done, error = _exact_enough(done, options, callback)
     problem, found = done.problem, done.solution
-    error = integration_error(problem, found.q)
     q = problem.unknowns.principal(found.q)
     fit = Fit(problem, problem.values(q), found.residual, found.jac / problem.scaling.slope(q), q, found.status,
               _advice(found, error, problem.n_outputs), done.history, time.perf_counter() - began,
@@ -128,13 +130,36 @@ def _least_squares(problem: Problem, options: LevenbergMarquardt, callback, form
     return fit
 
 
+def _exact_enough(done: Descent, options: LevenbergMarquardt, callback) -> tuple[Descent, float]:
+    """Return the descent and its integration error; with finer steps all over where small errors added up."""
+    problem, q = done.problem, done.solution.q
+    error = integration_error(problem, q)
+    allowed = ERROR_SHARE * max(_misfit(done.solution, problem.n_outputs), 1.0)
+    finer = np.ceil((2 * error / allowed) ** (1 / 3)) if np.isfinite(error) else np.inf
+    if error <= allowed or finer > MOST_FINER or done.solution.status != "converged":
+        return done, error
+    problem, options = problem.with_finer_steps(int(finer)), replace(options, max_iterations=POLISH)
+    try:
+        found = levenberg_marquardt(problem.residual, problem.residual_and_jacobian, q, problem.scaling.bounds, options,
+                                    callback, problem.scaling.log)
+    except FitError:
+        return done, error
+    if found.status == "limit":
+        found = replace(found, status="converged", message=done.solution.message)
+    return Descent(problem, found, done.history + found.history), integration_error(problem, found.q)
+
+
+def _misfit(found: Solution, n: int) -> float:
+    return float(np.sqrt(np.mean(found.residual[:n] ** 2)))
+
+
 def _advice(found: Solution, error: float, n: int) -> str:
     """Return the solver's message, with what to try where the integration error matters beside noise and misfit."""
-    misfit = float(np.sqrt(np.mean(found.residual[:n] ** 2)))
-    if found.status == "converged" and error > max(1.0, MISFIT_SHARE * misfit):
+    if found.status == "converged" and error > max(1.0, ERROR_SHARE * _misfit(found, n)):
         return (f"{found.message}; but the integration error is {error:.2g} times the noise: try engine='cvodes' or "
                 "a finer record.")
     return f"{found.message}."
 
 
-__all__ = ["UNDETERMINED", "Evaluation", "Failure", "Fit", "FitError", "evaluate", "fit", "integration_error", "solve", "started"]
+__all__ = ["UNDETERMINED", "Evaluation", "Failure", "Fit", "FitError", "evaluate", "fit", "integration_error",
+           "solve", "started"]

@@ -195,6 +195,10 @@ class Problem:
                 grid = self._engine.prepare(self.system, run.grid, x0, at.p, self._tolerance(k))
         return run if np.array_equal(grid.substeps, run.grid.substeps) else replace(run, grid=grid)
 
+    def with_finer_steps(self, factor: int) -> Problem:
+        """Return the problem with `factor` times as many sub-steps everywhere."""
+        return self._keeping(tuple(replace(r, grid=r.grid.with_substeps(factor * r.grid.substeps)) for r in self.runs))
+
     def _keeping(self, runs: tuple[Run, ...]) -> Problem:
         """Return a copy with other grids that keeps everything else already made."""
         other = replace(self, _runs=runs)
@@ -211,7 +215,6 @@ class Problem:
     def _levels(self) -> tuple[Levels, ...]:
         return tuple(Levels.of(m) for m in self._measured)
 
-    # -- residual --------------------------------------------------------------------------------------
     @cached_property
     def _measured(self) -> tuple[Measured, ...]:
         return tuple(Measured.of(run, self.outputs, self.weights, self.balance) for run in self.runs)
