@@ -37,13 +37,9 @@ def _experiment(run: Any) -> Card:
         good = y[y == y]
         missing = len(y) - len(good)
         reach = (
-            f"{number(float(good.min()), 3)} … {number(float(good.max()), 3)} {run.units[name]}"
-            if len(good)
-            else "–"
+            f"{number(float(good.min()), 3)} … {number(float(good.max()), 3)} {run.units[name]}" if len(good) else "–"
         )
-        rows.append(
-            [f"{NAMES[name]} {name}", reach, Flag(f"{missing} of {len(y)}", "note") if missing else "none"]
-        )
+        rows.append([f"{NAMES[name]} {name}", reach, Flag(f"{missing} of {len(y)}", "note") if missing else "none"])
     notes = [str(n) for n in run.meta.get("notes", ())]
     return Card(
         f"Run {run.name}",
@@ -170,9 +166,7 @@ def _missing(m: Any) -> Card:
         Table(["balance", "share of the misfit"], [[k, percent(v, 2)] for k, v in m.shares.items()]),
         Table(["region", "share of the misfit"], [[k, percent(v, 2)] for k, v in m.regions.items()]),
     ]
-    best = [
-        [balance, b.against, percent(b.explained, 2)] for balance, bins in m.bins.items() for b in bins[:3]
-    ]
+    best = [[balance, b.against, percent(b.explained, 2)] for balance, bins in m.bins.items() for b in bins[:3]]
     tables.append(Table(["missing", "depends on", "explained"], best))
     return Card(
         "Where the model fails",
@@ -194,8 +188,10 @@ def _ladder(ladder: Any) -> Card:
 
 def _diagnosis(d: Any) -> Card:
     mood = {"adequate": "good", "missing": "note", "unexplained": "bad"}.get(d.verdict, "plain")
-    text = [d.text, f"Next experiment: {d.suggestion}" if d.suggestion else ""]
-    text += [f"These data cannot tell apart: {', '.join(g)}." for g in d.groups if len(g) > 1]
+    text = [d.text]  # which may say already what these add
+    text += [f"Next experiment: {d.suggestion}"] if d.suggestion and d.suggestion not in d.text else []
+    alike = [f"These data cannot tell apart: {', '.join(g)}." for g in d.groups if len(g) > 1]
+    text += [] if "cannot tell" in d.text else alike
     tables = [ranking_table(d.ranking, 6), ladder_table(d.ladder)] if d.ranking else [ladder_table(d.ladder)]
     if d.after is not d.before:
         tables.append(parameter_table(d.after, d.before))

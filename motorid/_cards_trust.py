@@ -6,20 +6,21 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from motorid._html import Card, Flag, Table
-from motorid._html_tables import NAMES, counted
+from motorid._html_tables import NAMES, channel_name, counted
 from motorid.formatting import duration, number, percent, quantity, with_error
 from motorid.uncertainty import interval_text
 
 
 def _comparison(c: Any) -> Card:
     channels = list(dict.fromkeys(k for e in c.nrmse for k in e))
+    units = {k: u for r in c.fits[0].problem.experiments for k, u in r.units.items()}
     titles = [name.replace("dc_motor", "DC motor").replace("torque_driven", "drive") for name in c.names]
     rows: list[Sequence[str | Flag]] = [
-        [f"NRMSE {NAMES[k]}", *(percent(e.get(k)) for e in c.nrmse)] for k in channels
+        [f"NRMSE {channel_name(k, units)}", *(percent(e.get(k)) for e in c.nrmse)] for k in channels
     ]
     if any(c.validation_nrmse):
         rows += [
-            [f"held-out {NAMES[k]}", *(percent((e or {}).get(k)) for e in c.validation_nrmse)]
+            [f"held-out {channel_name(k, units)}", *(percent((e or {}).get(k)) for e in c.validation_nrmse)]
             for k in channels
         ]
     for name, entries in c.parameters.items():
@@ -57,9 +58,7 @@ def _multistart(m: Any) -> Card:
     n = len(m.endings)
     flags = [Flag(f"{m.good} good", "good"), *([Flag(f"{m.poor} poor", "note")] if m.poor else [])]
     flags += [Flag(f"{m.failed} failed", "bad")] if m.failed else []
-    text = [
-        f"{counted(n, 'start')}, off by up to {m.spread:g} times in every parameter, {duration(m.seconds)}."
-    ]
+    text = [f"{counted(n, 'start')}, off by up to {m.spread:g} times in every parameter, {duration(m.seconds)}."]
     text.append(f"{m.interrupted[0].upper()}{m.interrupted[1:]}." if m.interrupted else "")
     units = m.reference.model.parameters
     rows = [
@@ -83,9 +82,7 @@ def _multistart(m: Any) -> Card:
 
 def _identifiability(r: Any) -> Card:
     k = len(r.names)
-    flag = (
-        Flag("all determined", "good") if r.full else Flag(f"{r.rank} of {k} directions determined", "note")
-    )
+    flag = Flag("all determined", "good") if r.full else Flag(f"{r.rank} of {k} directions determined", "note")
     rows: list[Sequence[str | Flag]] = []
     for name, value, unit, size in zip(r.names, r.values, r.units, r.sizes, strict=True):
         std = r.std[name]
@@ -114,9 +111,7 @@ def _covariance(c: Any) -> Card:
     table = Table(["unknown", "value ± std", "95 %", *(f"ρ {n}" for n in c.names)], rows)
     share = ", ".join(f"{NAMES.get(k, k)} {percent(v.effective_share, 2)}" for k, v in c.colours.items())
     text = (f"Effective samples per sample: {share}.",) if share else ()
-    return Card(
-        "Uncertainty", (Flag(f"{c.method} residuals"),), text, (table,), (("mi.bootstrap(fit)", "check it"),)
-    )
+    return Card("Uncertainty", (Flag(f"{c.method} residuals"),), text, (table,), (("mi.bootstrap(fit)", "check it"),))
 
 
 def _correlation(value: float) -> str | Flag:
@@ -146,9 +141,7 @@ def _bootstrap(b: Any) -> Card:
     header = ["parameter", "value ± std", "95 %", "at its limit"]
     words = {"blocks": "Blocks of the residuals, put back in random order on the model's curves."}
     text = [words.get(b.kind, f"Resampled: {b.kind}."), b.interrupted]
-    return Card(
-        "Bootstrap", flags, text, (Table(header, rows),), (("mi.plot_profile(mi.intervals(fit))", "compare"),)
-    )
+    return Card("Bootstrap", flags, text, (Table(header, rows),), (("mi.plot_profile(mi.intervals(fit))", "compare"),))
 
 
 def _profile(p: Any) -> Card:
@@ -156,9 +149,7 @@ def _profile(p: Any) -> Card:
     row = [p.name, quantity(p.value, p.unit, 5), number(low), number(high)]
     flags = [Flag("the profile found a better fit than the one given", "bad")] if p.best < -1.0 else []
     table = Table(["parameter", "value", "95 %, from", "to"], [row])
-    return Card(
-        f"Profile of {p.name}", flags, (), (table,), (("mi.plot_profile(profile)", "see it"),), "plot_profile"
-    )
+    return Card(f"Profile of {p.name}", flags, (), (table,), (("mi.plot_profile(profile)", "see it"),), "plot_profile")
 
 
 def _intervals(r: Any) -> Card:

@@ -18,6 +18,11 @@ def model_name(model: Any) -> str:
     return " + ".join([base, *model.effect_names])
 
 
+def channel_name(channel: str, units: Mapping[str, str]) -> str:
+    """Return what a channel is called: the angle of a linear axis is a position."""
+    return "position" if channel == "theta" and units.get("theta") == "m" else NAMES[channel]
+
+
 def counted(n: int, noun: str) -> str:
     """Return ``1 run``, ``2 runs``."""
     return f"{n} {noun}" + ("" if n == 1 else "s")
@@ -53,7 +58,7 @@ def error_table(evaluations: Sequence[tuple[str, Any]], units: Mapping[str, str]
     ]
     rows = [
         [
-            f"{NAMES[c]} {c}",
+            f"{channel_name(c, units)} {c}",
             *(
                 text
                 for _, e in evaluations
@@ -80,12 +85,8 @@ def ranking_table(candidates: Sequence[Any], most: int = 10) -> Table:
         sizes = [f"{n}\u00a0=\u00a0{number(v, 3)}" for n, v in c.parameters.items() if n != "sgn_width"]
         gain = [percent(c.held_out_gain)] if held_out else []
         verdict = Flag("accepted", "good") if c.accepted else (c.reason or "not refitted")
-        rows.append(
-            [c.effect, percent(c.predicted_drop), percent(c.refit_drop), *gain, ", ".join(sizes), verdict]
-        )
-    return Table(
-        [*header, "size (SI)", "verdict"], rows, "Drop: share of the misfit that the effect takes away."
-    )
+        rows.append([c.effect, percent(c.predicted_drop), percent(c.refit_drop), *gain, ", ".join(sizes), verdict])
+    return Table([*header, "size (SI)", "verdict"], rows, "Drop: share of the misfit that the effect takes away.")
 
 
 def ladder_table(ladder: Any) -> Table:

@@ -87,9 +87,7 @@ def fitted(fit: Fit, title: str, *, key: str = "fit", before: Fit | None = None)
 
     caption = "Measured, model, and what is left over beside the band of the noise."
     caption += " The thin curve is the model it began with." if before is not None else ""
-    alt = f"Measured and modelled channels of {model_name(fit.model)}, with residuals. " + _errors_in_words(
-        fit
-    )
+    alt = f"Measured and modelled channels of {model_name(fit.model)}, with residuals. " + _errors_in_words(fit)
     units = {c: u for r in fit.problem.experiments for c, u in r.units.items()}
     effort = f": {counted(fit.iterations, 'iteration')}, {duration(fit.seconds)}" if fit.seconds else ""
     text = [f"{model_name(fit.model)}{effort}. {_sentence(fit.message)}"]
@@ -118,9 +116,7 @@ def held_out(fit: Fit, validate: Sequence[Experiment]) -> Section:
     units = {c: u for r in validate for c, u in r.units.items()}
     alt = "Measured and modelled channels of records that the fit never saw. " + _errors_in_words(judged)
     figure = _figure("held-out", "Records that the fit never saw.", alt, plot_fit, judged)
-    return Section(
-        "held-out", "On records it never saw", (), (), [figure], [error_table([("", judged)], units)]
-    )
+    return Section("held-out", "On records it never saw", (), (), [figure], [error_table([("", judged)], units)])
 
 
 def where(d: Diagnosis) -> Section:
@@ -135,17 +131,13 @@ def where(d: Diagnosis) -> Section:
     ]
     caption = "The voltage and torque that would make the model match, and what explains them."
     figure = _figure("missing", caption, "Missing voltage and torque. " + "; ".join(best), plot_missing, d)
-    return Section(
-        "where", "Where it fails", [d.adequacy.text, m.text], (), [figure], [regions] if m.regions else []
-    )
+    return Section("where", "Where it fails", [d.adequacy.text, m.text], (), [figure], [regions] if m.regions else [])
 
 
 def which(d: Diagnosis) -> Section:
     from motorid.plots import plot_ranking
 
-    alt = "Bars of the misfit that each effect would take away; best: " + ", ".join(
-        c.effect for c in d.ranking[:3]
-    )
+    alt = "Bars of the misfit that each effect would take away; best: " + ", ".join(c.effect for c in d.ranking[:3])
     caption = "Outline: predicted from sensitivities. Bar: refitted. Diamond: fall of the held-out error."
     figure = _figure("ranking", caption, alt, plot_ranking, d, small=True)
     return Section("which", "Which effect is missing", (), (), [figure], [ranking_table(d.ranking)])
@@ -174,19 +166,15 @@ def parameters(before: Fit, after: Fit) -> Section:
         small=True,
     )
     text = ["What the parameters had absorbed of the missing effect, they give back once it is in the model."]
-    return Section(
-        "parameters", "How the parameters moved", text, (), [figure], [parameter_table(after, before)]
-    )
+    return Section("parameters", "How the parameters moved", text, (), [figure], [parameter_table(after, before)])
 
 
 def apart(d: Diagnosis) -> Section:
     groups = [f"{', '.join(g)}" for g in d.groups if len(g) > 1]
     text = (
-        ["These data cannot tell apart:"]
-        if groups
-        else ["No two of the effects that matter look alike in these data."]
+        ["These data cannot tell apart:"] if groups else ["No two of the effects that matter look alike in these data."]
     )
-    closing = [d.remaining.text, f"Next experiment: {d.suggestion}" if d.suggestion else ""]
+    closing = [d.remaining.text, d.suggestion or ""]
     return Section("apart", "What cannot be told apart, and what to do next", [*closing, *text], groups)
 
 

@@ -56,7 +56,7 @@ def plot_missing(result: Missing | Diagnosis, *, show: int = 3, run: int | None 
     missing = result.missing if isinstance(result, Diagnosis) else result
     if not isinstance(missing, Missing):
         raise UsageError(f"plot_missing takes a diagnosis, mi.diagnose(fit), got {type(result).__name__}.")
-    balances = [b for b in ("voltage", "torque") if any(np.isfinite(x).any() for x in getattr(missing, b))]
+    balances = [b for b in ("voltage", "torque") if any(np.any(np.nan_to_num(x)) for x in getattr(missing, b))]
     if missing.where == "mechanical":
         balances.reverse()
     show = min(show, max((len(missing.bins.get(b, ())) for b in balances), default=0))
