@@ -250,7 +250,7 @@ def _cheaper(first: Problem, *others: Problem) -> Problem:
     costs = []
     for p in (first, *others) if others else ():
         try:
-            r = p.residual(p.start)
+            r = p.refined(p.start).residual(p.start)  # at steps that fit each, or the coarse ones decide
         except SimulationError:
             r = np.array([np.inf])
         costs.append(float(r @ r) if np.isfinite(r).all() else np.inf)
