@@ -63,9 +63,7 @@ def _of_diagnosis(d: Diagnosis, validate: Sequence[Experiment]) -> Story:
         story.sections.append(sections.which(d))
     if len(d.ladder.rungs) > 1:
         story.sections += [sections.ladder(d.ladder), sections.parameters(d.before, d.after)]
-        story.sections.append(
-            sections.fitted(d.after, "The model it ended with", key="after", before=d.before)
-        )
+        story.sections.append(sections.fitted(d.after, "The model it ended with", key="after", before=d.before))
     if validate:
         story.sections.append(sections.held_out(d.after, validate))
     story.sections.append(sections.apart(d))
@@ -77,9 +75,7 @@ def _of_ladder(ladder: Ladder) -> Story:
     story = Story("Models of growing detail", ladder.text, runs=first.problem.experiments)
     story.facts = sections.error_facts(ladder)
     story.sections += [sections.data(story.runs), sections.ladder(ladder), sections.parameters(first, best)]
-    story.sections.append(
-        sections.fitted(best, "The last model", before=first if best is not first else None)
-    )
+    story.sections.append(sections.fitted(best, "The last model", before=first if best is not first else None))
     return story
 
 
