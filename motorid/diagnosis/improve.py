@@ -13,8 +13,9 @@ from typing import Any
 
 from motorid.diagnosis.adequacy import adequacy
 from motorid.diagnosis.evidence import compare_errors
+from motorid.diagnosis.judging import Node
 from motorid.diagnosis.results import Adequacy, Candidate, Ladder, Rung
-from motorid.diagnosis.search import Node, Search, library
+from motorid.diagnosis.search import Search, library
 from motorid.experiment import Experiment
 from motorid.fit import Fit
 from motorid.model import Effect
@@ -52,12 +53,12 @@ def climb(search: Search, max_effects: int, advance: Callable[[str], None]) -> C
             if k == 0:
                 rounds.append(tuple(listed))
             children |= {c.key: c for c in grown if c.key not in children}
-        chosen = search.choose(list(children.values()))
-        if chosen is None or not search.beats(chosen[0], best):
+        chosen = search.judge.choose(list(children.values()))
+        if chosen is None or not search.judge.beats(chosen[0], best):
             text = "stopped: no further effect lowers the error on data it was not fitted to"
             break
         new, ordered = chosen
-        group = search.group(new, ordered)
+        group = search.judge.group(new, ordered, {e.name: e.includes for e in search.effects})
         search.nodes |= children
         if new.parent is frontier[0]:
             rounds[-1] = _marked(rounds[-1], new.added, group)
@@ -76,7 +77,7 @@ def _runners_up(search: Search, best: Node, ordered: Sequence[Node]) -> list[Nod
         n
         for n in ordered
         if n.key != best.key
-        and not search.tied(n, best)
+        and not search.judge.tied(n, best)
         and compare_errors(search.root.train, n.train, search.held.noise).fall > HALF_AS_GOOD * goal
     ]
 

@@ -1,24 +1,21 @@
-"""Growing a model by one effect, judging the children, choosing among them, pruning.
+"""Growing a model by one effect, judging the children, pruning: the moves of the search.
 
-Every addition must lower
-the error on data it was not fitted to, be worth its parameters on effective samples (BIC, Schwarz 1978), be
-identifiable and have its physical sign; on a tie the smaller model wins.
+A child must lower the error on data it was not fitted to, be worth its parameters, be identifiable and have its
+physical sign; see `judging`.
 """
 
 from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
-import numpy as np
-
-from motorid.diagnosis.evidence import Errors, Gain, compare_errors
+from motorid.diagnosis.evidence import Errors, compare_errors
+from motorid.diagnosis.judging import Judge, Node, held_out_objection, node_of, price_of
 from motorid.diagnosis.rank import Score, rank
 from motorid.diagnosis.results import Candidate
 from motorid.diagnosis.trial import (
-    LEAST_FALL,
     WORST_CONDITION,
     HeldOut,
     ambiguity,
@@ -35,57 +32,7 @@ from motorid.prepared import natural_sizes
 
 SHORTLIST = 6
 ALWAYS = ("compliance", "speed_lag", "speed_delay")  # their score at null says little
-COMMON = (
-    "coulomb",
-    "gravity",
-    "brush_drop",
-    "winding_heating",
-    "cogging",
-    "load_friction",
-    "quadratic_drag",
-    "constant_load",
-    "speed_lag",
-    "driver_dead_band",
-)  # what is met most, first
-EVIDENCE = 4.0  # log likelihood ratio beyond the price of the parameters
-TIE = 3.0  # log likelihood ratio below which two models count as equal
-CLOSE = 0.01  # relative error below which two models count as equal
-
 Advance = Callable[[str], None]
-
-
-@dataclass(frozen=True, eq=False)
-class Node:
-    """One model in the search: its fit and its errors, on the records and held out."""
-
-    fit: Fit
-    added: str | None
-    train: Errors
-    held: Errors
-    parent: Node | None = None
-    candidate: Candidate | None = None
-    children: tuple[Candidate, ...] = ()
-
-    @property
-    def key(self) -> frozenset[str]:
-        """Names of the effects."""
-        return frozenset(self.fit.problem.model.effect_names)
-
-    @property
-    def size(self) -> int:
-        """Number of free parameters."""
-        return len(self.fit.problem.model.free_names)
-
-
-def node_of(fit: Fit, held: HeldOut, added: str | None = None, parent: Node | None = None) -> Node:
-    """Judge a fit.
-
-    Raises
-    ------
-    SimulationError
-        If it cannot be simulated on the held-out runs.
-    """
-    return Node(fit, added, train_errors(fit), held.errors(fit), parent)
 
 
 def library(effects: Iterable[Effect | str] | None, also: Iterable[Effect] = ()) -> list[Effect]:
@@ -110,6 +57,7 @@ class Search:
         self.held = HeldOut.of(fit, validate)
         self.effects, self.map, self.advance = list(effects), map_, advance
         self.root = node_of(fit, self.held)
+        self.judge = Judge(self.root, self.held.noise)
         self._scores: dict[frozenset[str], list[Score]] = {}
         self.nodes: dict[frozenset[str], Node] = {self.root.key: self.root}
 
@@ -184,8 +132,7 @@ class Search:
                 f"sensitivities rises from {was:.0f} to {worse:.0f}",
             )
         gain = compare_errors(node.train, train, self.held.noise)
-        price = EVIDENCE + 0.5 * _extra(node, fit) * np.log(max(gain.effective, 2.0))
-        if gain.log_ratio < price:
+        if gain.log_ratio < price_of(max(len(fit.problem.model.free_names) - node.size, 1), gain):
             return None, replace(candidate, reason="the improvement is within what noise and chance would give")
         try:
             held = self.held.errors(fit)
@@ -193,7 +140,7 @@ class Search:
             return None, replace(candidate, reason=f"fails on held-out data: {error}")
         gain = compare_errors(node.held, held, self.held.noise)
         candidate = replace(candidate, validation_nrmse=held.nrmse())
-        why = _held_out_objection(gain)
+        why = held_out_objection(gain)
         if why:
             return None, replace(candidate, reason=why)
         candidate = replace(candidate, reason=f"lowers the held-out error by {100 * gain.fall:.1f} %")
@@ -215,40 +162,11 @@ class Search:
         rest = [c for n, c in judged.items() if n not in {s.effect.name for s in scores}]
         return listed + rest
 
-    # -- choosing --------------------------------------------------------------------------------------
-    def choose(self, children: Sequence[Node]) -> tuple[Node, list[Node]] | None:
-        """Return the best child, the smaller on a tie, and the children in order; None without any."""
-        if not children:
-            return None
-        ordered = sorted(children, key=lambda n: -self._worth(n))
-        top = ordered[0]
-        tied = [n for n in ordered if n is top or self.tied(top, n)]
-        chosen = min(tied, key=lambda n: (n.size, _rarity(n.added), -self._worth(n)))
-        return chosen, ordered
-
-    def _worth(self, node: Node) -> float:
-        held = compare_errors(self.root.held, node.held, self.held.noise)
-        train = compare_errors(self.root.train, node.train, self.held.noise)
-        return -float(np.log(max(1 - held.fall, 1e-12)) + 0.5 * np.log(max(1 - train.fall, 1e-12)))
-
-    def tied(self, best: Node, other: Node) -> bool:
-        """Tell whether `best` is better than `other` by no more than chance or a trifle."""
-        held = compare_errors(other.held, best.held, self.held.noise)
-        train = compare_errors(other.train, best.train, self.held.noise)
-        return (held.log_ratio < TIE or held.fall < CLOSE) and (train.log_ratio < TIE or train.fall < CLOSE)
-
-    def beats(self, new: Node, old: Node) -> bool:
-        """Tell whether `new` is worth its extra parameters over `old`."""
-        gain = compare_errors(old.train, new.train, self.held.noise)
-        price = EVIDENCE + 0.5 * max(new.size - old.size, 0) * np.log(max(gain.effective, 2.0))
-        held = compare_errors(old.held, new.held, self.held.noise)
-        return gain.log_ratio > price and not _held_out_objection(held)
-
     def pruned(self, node: Node) -> Node:
         """Return `node` without the effects that have become superfluous."""
         for name in node.fit.problem.model.effect_names[:-1]:
             smaller = self._without(node, name)
-            if smaller is not None and not self.beats(node, smaller):
+            if smaller is not None and not self.judge.beats(node, smaller):
                 return self.pruned(smaller)
         return node
 
@@ -264,39 +182,6 @@ class Search:
             except SimulationError:
                 return None
         return self.nodes[key]
-
-    def group(self, chosen: Node, siblings: Sequence[Node]) -> tuple[str, ...]:
-        """Names of the siblings that these data cannot tell from `chosen`."""
-        includes = {e.name: e.includes for e in self.effects}
-        return tuple(
-            n.added
-            for n in siblings
-            if n is not chosen
-            and n.added
-            and n.parent is chosen.parent
-            and chosen.added not in includes.get(n.added, ())
-            and self.tied(n, chosen)
-            and self.tied(chosen, n)
-        )
-
-
-def _rarity(name: str | None) -> int:
-    """Rank of an effect by how rarely it is met; decides between equals."""
-    return COMMON.index(name) if name in COMMON else len(COMMON)
-
-
-def _held_out_objection(gain: Gain) -> str:
-    if gain.fall < LEAST_FALL:
-        return f"the held-out error does not fall ({100 * gain.fall:+.1f} %)"
-    if gain.log_ratio < TIE:
-        return "the held-out error falls by no more than chance would give"
-    if gain.worst < -0.05 - 0.5 * gain.fall:
-        return f"one channel's held-out error grows by {-100 * gain.worst:.0f} %"
-    return ""
-
-
-def _extra(node: Node, fit: Fit) -> int:
-    return max(len(fit.problem.model.free_names) - node.size, 1)
 
 
 def _drop(node: Node, train: Errors) -> float:

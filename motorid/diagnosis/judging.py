@@ -1,0 +1,138 @@
+"""Which of two models is to be preferred, and whether an addition is worth its parameters.
+
+Every addition must lower the error on data it was not fitted to and be worth its parameters on effective samples
+(BIC, Schwarz 1978); on a tie the smaller model wins, then the effect that is met more often.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from motorid.diagnosis.evidence import Errors, Gain, compare_errors
+from motorid.diagnosis.results import Candidate
+from motorid.diagnosis.trial import LEAST_FALL, HeldOut, train_errors
+from motorid.fit import Fit
+
+COMMON = (
+    "coulomb",
+    "gravity",
+    "brush_drop",
+    "winding_heating",
+    "cogging",
+    "load_friction",
+    "quadratic_drag",
+    "constant_load",
+    "speed_lag",
+    "driver_dead_band",
+)  # what is met most, first
+EVIDENCE = 4.0  # log likelihood ratio beyond the price of the parameters
+TIE = 3.0  # log likelihood ratio below which two models count as equal
+CLOSE = 0.01  # relative error below which two models count as equal
+
+
+@dataclass(frozen=True, eq=False)
+class Node:
+    """One model in the search: its fit and its errors, on the records and held out."""
+
+    fit: Fit
+    added: str | None
+    train: Errors
+    held: Errors
+    parent: Node | None = None
+    candidate: Candidate | None = None
+    children: tuple[Candidate, ...] = ()
+
+    @property
+    def key(self) -> frozenset[str]:
+        """Names of the effects."""
+        return frozenset(self.fit.problem.model.effect_names)
+
+    @property
+    def size(self) -> int:
+        """Number of free parameters."""
+        return len(self.fit.problem.model.free_names)
+
+
+def node_of(fit: Fit, held: HeldOut, added: str | None = None, parent: Node | None = None) -> Node:
+    """Judge a fit.
+
+    Raises
+    ------
+    SimulationError
+        If it cannot be simulated on the held-out runs.
+    """
+    return Node(fit, added, train_errors(fit), held.errors(fit), parent)
+
+
+@dataclass(frozen=True, eq=False)
+class Judge:
+    """Compares models by their errors; `root` is the model to begin with, `noise` the noise per channel."""
+
+    root: Node
+    noise: Mapping[str, float]
+
+    def choose(self, children: Sequence[Node]) -> tuple[Node, list[Node]] | None:
+        """Return the best child, the smaller on a tie, and the children in order; None without any."""
+        if not children:
+            return None
+        ordered = sorted(children, key=lambda n: -self.worth(n))
+        top = ordered[0]
+        tied = [n for n in ordered if n is top or self.tied(top, n)]
+        chosen = min(tied, key=lambda n: (n.size, rarity(n.added), -self.worth(n)))
+        return chosen, ordered
+
+    def worth(self, node: Node) -> float:
+        """Return how much smaller the errors are than those of the first model, held-out errors first."""
+        held = compare_errors(self.root.held, node.held, self.noise)
+        train = compare_errors(self.root.train, node.train, self.noise)
+        return -float(np.log(max(1 - held.fall, 1e-12)) + 0.5 * np.log(max(1 - train.fall, 1e-12)))
+
+    def tied(self, best: Node, other: Node) -> bool:
+        """Tell whether `best` is better than `other` by no more than chance or a trifle."""
+        held = compare_errors(other.held, best.held, self.noise)
+        train = compare_errors(other.train, best.train, self.noise)
+        return (held.log_ratio < TIE or held.fall < CLOSE) and (train.log_ratio < TIE or train.fall < CLOSE)
+
+    def beats(self, new: Node, old: Node) -> bool:
+        """Tell whether `new` is worth its extra parameters over `old`."""
+        gain = compare_errors(old.train, new.train, self.noise)
+        price = price_of(new.size - old.size, gain)
+        held = compare_errors(old.held, new.held, self.noise)
+        return gain.log_ratio > price and not held_out_objection(held)
+
+    def group(self, chosen: Node, siblings: Sequence[Node], includes: Mapping[str, tuple[str, ...]]) -> tuple[str, ...]:
+        """Names of the siblings that these data cannot tell from `chosen`."""
+        return tuple(
+            n.added
+            for n in siblings
+            if n is not chosen
+            and n.added
+            and n.parent is chosen.parent
+            and chosen.added not in includes.get(n.added, ())
+            and self.tied(n, chosen)
+            and self.tied(chosen, n)
+        )
+
+
+def price_of(extra: int, gain: Gain) -> float:
+    """Return the log likelihood ratio that `extra` parameters must be worth."""
+    return EVIDENCE + 0.5 * max(extra, 0) * float(np.log(max(gain.effective, 2.0)))
+
+
+def rarity(name: str | None) -> int:
+    """Rank of an effect by how rarely it is met; decides between equals."""
+    return COMMON.index(name) if name in COMMON else len(COMMON)
+
+
+def held_out_objection(gain: Gain) -> str:
+    """Say why the held-out error speaks against a model; empty if it does not."""
+    if gain.fall < LEAST_FALL:
+        return f"the held-out error does not fall ({100 * gain.fall:+.1f} %)"
+    if gain.log_ratio < TIE:
+        return "the held-out error falls by no more than chance would give"
+    if gain.worst < -0.05 - 0.5 * gain.fall:
+        return f"one channel's held-out error grows by {-100 * gain.worst:.0f} %"
+    return ""
