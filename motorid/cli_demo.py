@@ -58,11 +58,11 @@ def _make(out: Path) -> None:
 
 
 def _files(found: Diagnosis, check: Any, out: Path) -> list[str]:
-    from motorid.plots import plot_fit, plot_ladder
+    from motorid.plots import plot_fit, plot_ladder, plot_missing
     from motorid.report import report
 
     drawn = {"fit.png": plot_fit(found.after, before=found.before).flat[0],
-             "ladder.png": plot_ladder(found)}
+             "missing.png": plot_missing(found).flat[0], "ladder.png": plot_ladder(found)}
     for name, axes in drawn.items():
         axes.figure.savefig(out / name, dpi=120)
     page = report(found, out / "report.html", command=f"motorid demo --out {out}", validate=check)
