@@ -285,7 +285,7 @@ def test_demo_tells_the_story_and_leaves_figures_and_report(tmp_path):
     assert found["effects"] == ["coulomb"]
     held_out = [step["validation_nrmse"]["omega"] for step in found["ladder"]]
     assert held_out[-1] < 0.2 * held_out[0]
-    assert {Path(f).name for f in found["files"]} == {"report.html", "fit.png", "ladder.png"}
+    assert {Path(f).name for f in found["files"]} == {"report.html", "fit.png", "missing.png", "ladder.png"}
     assert all(Path(f).stat().st_size > 5000 for f in found["files"])
 
 
