@@ -137,17 +137,24 @@ def test_without_current_no_confident_r_comes_out(real, folder, words):
 
 # -- xl330: a servo lifting a pendulum ---------------------------------------------------------------------
 def xl330(real: Path, folder: Path, *words: str) -> float:
-    """Mean absolute error of the angle over all eight records, rad, of a model fitted to four of them."""
-    runs = [r.without("omega") for r in read_runs(real / "xl330" / "*.csv")]
-    found = motorid_json(folder, "fit", real / "xl330" / "kp400_*.csv", "--ignore", "omega", *BARE, *words)
-    judged = evaluate(model_from(found, {}), runs)
+    """Mean absolute error of the angle over the records, rad.
+
+    Such a mean is what the robust loss asks for, where the misfit is far above the noise.
+    """
+    records = real / "xl330" / "*.csv"
+    found = motorid_json(folder, "fit", records, "--ignore", "omega", "--loss", "huber", *words)
+    judged = evaluate(model_from(found, {}), [r.without("omega") for r in read_runs(records)])
     return float(np.mean([np.nanmean(np.abs(s.residual("theta"))) for s in judged.simulations]))
 
 
 @pytest.mark.slow
 def test_xl330_needs_friction_that_grows_with_the_load(real, tmp_path):
-    """The README has 0.099 rad with gravity alone and 0.053 with load friction, fitted to all eight records."""
-    alone = xl330(real, tmp_path, "--effects", "gravity")
-    loaded = xl330(real, tmp_path, "--effects", "gravity,load_friction", "--set", "K=0.001")
-    assert alone < 0.115
-    assert loaded < 0.0535
+    """The README has 0.099 rad with gravity alone and 0.053 with load friction.
+
+    Only that friction tells back-EMF from viscous friction here; the fit begins with little of the former, since
+    beginning with much of it ends in another valley, at 0.06 rad.
+    """
+    alone = xl330(real, tmp_path, "--effects", "gravity", "--fix", "R=1")
+    loaded = xl330(real, tmp_path, "--effects", "gravity,load_friction", *BARE, "--set", "K=0.001")
+    assert alone < 0.099
+    assert loaded < 0.053
