@@ -111,9 +111,19 @@ def _fit(fit: Any) -> Card:
         f"Fit of {model_name(fit.model)}",
         flags,
         text,
-        (parameter_table(fit), error_table([("", fit)], units)),
+        [parameter_table(fit), error_table([("", fit)], units), *_multipliers(fit.extra.get("multipliers", ()))],
         after,
     )
+
+
+def _multipliers(found: Any) -> list[Table]:
+    """What each constraint costs: only of fits with true constraints."""
+    rows = [
+        [m.name, Flag(m.label, "note") if m.active else m.label, f"{number(m.value, 3)} per {m.unit or 'unit'}"]
+        for m in found
+    ]
+    header = ["constraint", "at the solution", "multiplier (fall of the cost if it gave way)"]
+    return [Table(header, rows)] if rows else []
 
 
 def _failure(failure: Any) -> Card:

@@ -28,9 +28,11 @@ def fake_fit():
     )
     std = {"R": 0.0041, "L": None, "K": 1.2e-5, "b": 3e-7, "J": 0.0, "tau_c": 6e-6, "sgn_width": 0.0}
     run = SimpleNamespace(units={"v": "V", "i": "A", "omega": "rad/s"})
+    limit = SimpleNamespace(name="CurrentLimit(8 A)", label="2 rows at the limit", value=31.4, unit="A", active=2)
     return SimpleNamespace(
         model=model.fix("J"), values=model.values, std=std, status="stalled", message="no step is better.",
-        formulation="penalty", problem=SimpleNamespace(experiments=(run, run), n_outputs=7640), iterations=12,
+        formulation="hard", extra={"multipliers": (limit,)},
+        problem=SimpleNamespace(experiments=(run, run), n_outputs=7640), iterations=12,
         seconds=0.231, nrmse={"i": 0.0168, "omega": 0.00815}, rmse={"i": 0.0042, "omega": 0.149},
         tau_e=1.25e-3, tau_m=15.2e-3, damping=1.71,
     )  # fmt: skip
@@ -62,9 +64,7 @@ def fake_diagnosis():
 def experiment():
     t = np.arange(10) * 1e-3
     i = np.where(np.arange(10) == 3, np.nan, 0.5)
-    return mi.Experiment(
-        t, {"v": np.ones(10)}, {"i": i, "omega": t}, name="run1", meta={"notes": ["rpm <converted>."]}
-    )
+    return mi.Experiment(t, {"v": np.ones(10)}, {"i": i, "omega": t}, name="run1", meta={"notes": ["rpm <converted>."]})
 
 
 CARDS = {

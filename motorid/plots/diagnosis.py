@@ -61,9 +61,7 @@ def plot_missing(result: Missing | Diagnosis, *, show: int = 3, run: int | None 
         balances.reverse()
     show = min(show, max((len(missing.bins.get(b, ())) for b in balances), default=0))
     figure = new_figure(WIDTH, 2.3 * len(balances) + 0.2)
-    axes = figure.subplots(
-        len(balances), 1 + show, squeeze=False, sharey="row", width_ratios=[1.7] + [1.0] * show
-    )
+    axes = figure.subplots(len(balances), 1 + show, squeeze=False, sharey="row", width_ratios=[1.7] + [1.0] * show)
     for row, balance in zip(axes, balances, strict=True):
         _balance(row, missing, balance, run)
     figure.align_ylabels(axes[:, 0])
@@ -174,9 +172,7 @@ def _ranking_legend(ax: Axes, chosen: Sequence[Candidate]) -> None:
     if any(not c.accepted and c.refit_drop is not None for c in chosen):
         handles.append(Patch(color=PALETTE["grey"], alpha=0.85, label="refitted, not taken"))
     if any(c.held_out_gain is not None for c in chosen):
-        handles.append(
-            Line2D([], [], marker="D", ls="", color=PALETTE["orange"], label="fall of the held-out error")
-        )
+        handles.append(Line2D([], [], marker="D", ls="", color=PALETTE["orange"], label="fall of the held-out error"))
     ax.legend(handles=handles, loc="upper left", bbox_to_anchor=(1.0, 1.0))
 
 
@@ -191,9 +187,7 @@ def plot_ladder(result: Ladder | Diagnosis, ax: Axes | None = None) -> Axes:
     """
     ladder = result.ladder if isinstance(result, Diagnosis) else result
     if not isinstance(ladder, Ladder) or not ladder.rungs:
-        raise UsageError(
-            f"plot_ladder takes mi.improve(fit) or mi.diagnose(fit), got {type(result).__name__}."
-        )
+        raise UsageError(f"plot_ladder takes mi.improve(fit) or mi.diagnose(fit), got {type(result).__name__}.")
     rungs = ladder.rungs
     ax = only(ax, width=max(5.6, 1.5 + 1.25 * len(rungs)), height=3.4)
     x = np.arange(len(rungs), dtype=float)
@@ -212,9 +206,7 @@ def plot_ladder(result: Ladder | Diagnosis, ax: Axes | None = None) -> Axes:
     return ax
 
 
-def _falling(
-    ax: Axes, x: Array, errors: Sequence[float], channel: str, colour: str, *, held_out: bool
-) -> None:
+def _falling(ax: Axes, x: Array, errors: Sequence[float], channel: str, colour: str, *, held_out: bool) -> None:
     name = axis_label(channel).split(" (")[0]
     ax.plot(
         x,

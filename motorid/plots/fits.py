@@ -94,9 +94,7 @@ def plot_fit(result: Any, *, before: Any = None) -> np.ndarray:
     old = _simulations(before)[:COLUMNS] if before is not None else []
     shown = every[:COLUMNS]
     names = [c for c in CHANNELS if any(c in s.outputs and c in s.experiment.outputs for s in shown)]
-    axes = grid(
-        2 * len(names), len(shown), row=1.0, sharex="col", sharey="row", height_ratios=[1.6, 1.0] * len(names)
-    )
+    axes = grid(2 * len(names), len(shown), row=1.0, sharex="col", sharey="row", height_ratios=[1.6, 1.0] * len(names))
     for k, s in enumerate(shown):
         for j, c in enumerate(names):
             if c in s.experiment.outputs:
@@ -143,8 +141,7 @@ def _simulations(result: Any) -> list[Simulation]:
         found = [result]
     if not found or not all(isinstance(s, Simulation) for s in found):
         raise UsageError(
-            f"plot_fit takes a fit, mi.evaluate(fit, runs) or mi.simulate(model, runs); got "
-            f"{type(result).__name__}."
+            f"plot_fit takes a fit, mi.evaluate(fit, runs) or mi.simulate(model, runs); got {type(result).__name__}."
         )
     return list(found)
 
@@ -162,9 +159,7 @@ def _label_rows(axes: np.ndarray, names: Sequence[str], runs: Sequence[Experimen
 
 
 def _absent(ax: Axes, channel: str) -> None:
-    ax.text(
-        0.5, 0.5, f"{channel} not measured", transform=ax.transAxes, ha="center", va="center", color=MUTED
-    )
+    ax.text(0.5, 0.5, f"{channel} not measured", transform=ax.transAxes, ha="center", va="center", color=MUTED)
     ax.grid(visible=False)
 
 

@@ -13,11 +13,11 @@ from motorid.fit import Fit
 from motorid.plots.style import INK, MEASURED, MODEL, MUTED, PALETTE, axis_label, grid, line, styled, tidy
 from motorid.simulate import Simulation
 
+NEAR = 0.5  # of the limit: what is worth a closer look
+
 
 @styled
-def plot_current_limit(
-    *fits: Fit, limit: float | None = None, labels: Sequence[str] | None = None
-) -> np.ndarray:
+def plot_current_limit(*fits: Fit, limit: float | None = None, labels: Sequence[str] | None = None) -> np.ndarray:
     """Draw the current of one or several fits against the limit, what lies beyond it shaded.
 
     Parameters
@@ -32,7 +32,7 @@ def plot_current_limit(
     Returns
     -------
     ndarray of Axes, shape (fits, runs)
-        At most three runs.
+        At most three runs, each where the current comes near the limit.
     """
     if not fits or not all(isinstance(f, Fit) for f in fits):
         raise UsageError("plot_current_limit takes fits: mi.plot_current_limit(fit, hard, limit=8.0).")
@@ -48,8 +48,9 @@ def plot_current_limit(
         tidy(row[0], y=f"{word}\n{axis_label('i')}")
     for ax, s in zip(axes[0], fits[0].simulations, strict=False):
         tidy(ax, title=s.experiment.name)
-    for ax in axes[-1]:
+    for k, ax in enumerate(axes[-1]):
         tidy(ax, x="time (s)")
+        _zoom(ax, [f.simulations[k] for f in fits], limit)
     figure = axes[0, 0].figure
     figure.align_ylabels(axes[:, 0])
     figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper center", ncols=4)
@@ -64,12 +65,22 @@ def _against_limit(ax: Axes, s: Simulation, limit: float) -> None:
     for side in (-limit, limit):
         if float(np.max(np.sign(side) * i)) > 0.5 * limit:
             ax.axhline(side, color=INK, lw=1.0, ls=(0, (4, 2)), label="limit" if side > 0 else None)
-    ax.fill_between(
-        t, np.clip(i, -limit, limit), i, color=PALETTE["orange"], alpha=0.6, lw=0, label="beyond it"
-    )
+    ax.fill_between(t, np.clip(i, -limit, limit), i, color=PALETTE["orange"], alpha=0.6, lw=0, label="beyond it")
     beyond = float(np.max(np.abs(i)) - limit)
     words = f"{beyond:.2g} A beyond" if beyond > 1e-6 * limit else "kept"
     ax.set_title(words, loc="right", fontsize=8, color=MUTED)
+
+
+def _zoom(ax: Axes, simulations: Sequence[Simulation], limit: float) -> None:
+    """Show the part of a record where the current comes near its limit, if that is a small part."""
+    t = simulations[0].experiment.t
+    near = np.max([np.abs(s.outputs["i"]) for s in simulations], axis=0) > NEAR * limit
+    if not near.any():
+        return
+    first, last = t[near][0], t[near][-1]
+    room = max(last - first, 10 * float(np.median(np.diff(t))))
+    if last - first + 2 * room < 0.5 * (t[-1] - t[0]):
+        ax.set_xlim(max(first - room, t[0]), min(last + 2 * room, t[-1]))
 
 
 def _limit_of(fits: Sequence[Fit]) -> float:
@@ -77,6 +88,4 @@ def _limit_of(fits: Sequence[Fit]) -> float:
         for c in (*f.problem.constraints, *f.problem.penalties):
             if isinstance(c, CurrentLimit):
                 return c.limit
-    raise UsageError(
-        "no CurrentLimit in these fits; say which one to draw: mi.plot_current_limit(fit, limit=8.0)."
-    )
+    raise UsageError("no CurrentLimit in these fits; say which one to draw: mi.plot_current_limit(fit, limit=8.0).")

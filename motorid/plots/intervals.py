@@ -166,7 +166,5 @@ def _profiles(result: Any) -> Sequence[Profile]:
     found = result.profiles if isinstance(result, Intervals) else result
     chosen = list(found.values()) if isinstance(found, Mapping) else [found]
     if not chosen or not all(isinstance(p, Profile) for p in chosen):
-        raise UsageError(
-            f"plot_profile takes mi.profile(fit, 'R') or mi.intervals(fit), got {type(result).__name__}."
-        )
+        raise UsageError(f"plot_profile takes mi.profile(fit, 'R') or mi.intervals(fit), got {type(result).__name__}.")
     return chosen

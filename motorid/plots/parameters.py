@@ -51,9 +51,7 @@ def _one_parameter(ax: Axes, fits: Sequence[Any], name: str, truth: float | None
     held = [k for k, f in enumerate(fits) if name in f.values]
     parameter = next((f.model.parameters[name] for f in reversed(fits) if name in f.values), None)
     unit = parameter.unit if parameter else ""
-    if (
-        parameter is not None and parameter.periodic and truth is not None
-    ):  # the same angle, some turns further
+    if parameter is not None and parameter.periodic and truth is not None:  # the same angle, some turns further
         truth += 2 * np.pi * round((fits[held[-1]].values[name] - truth) / (2 * np.pi))
     values = np.array([fits[k].values[name] for k in held] + ([] if truth is None else [truth]))
     power = decade(float(np.max(np.abs(values))))

@@ -216,9 +216,7 @@ def tidy(ax: Axes, *, x: str = "", y: str = "", title: str = "") -> None:
 
 def above(ax: Axes) -> None:
     """Put the legend at the right above the axes, where it covers no data."""
-    legend = ax.legend(
-        loc="lower right", bbox_to_anchor=(1.02, 0.97), borderpad=0.1, ncols=4, handlelength=1.6
-    )
+    legend = ax.legend(loc="lower right", bbox_to_anchor=(1.02, 0.97), borderpad=0.1, ncols=4, handlelength=1.6)
     legend.set_in_layout(False)  # the title's line has room for it
 
 

@@ -38,9 +38,7 @@ def svg_of(draw: Callable[..., Any], *args: Any, name: str, alt: str, **options:
         figure.set_layout_engine("none")
     buffer = io.StringIO()
     with mpl.rc_context({"svg.fonttype": "none", "svg.hashsalt": name}):
-        figure.savefig(
-            buffer, format="svg", transparent=True, dpi=120, metadata={"Date": None, "Creator": None}
-        )
+        figure.savefig(buffer, format="svg", transparent=True, dpi=120, metadata={"Date": None, "Creator": None})
     return clean(buffer.getvalue(), name, alt)
 
 

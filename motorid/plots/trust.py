@@ -129,9 +129,7 @@ def _starts_and_ends(ax: Axes, result: Multistart, ends: Sequence[tuple[Ending, 
         middle = result.reference.values[name]
         starts = np.array([e.start[name] / middle for e in result.endings if name in e.start])
         shift = np.linspace(-0.3, 0.0, max(len(starts), 1))[: len(starts)]
-        ax.plot(
-            j + shift, starts, ".", ms=3, color=PALETTE["grey"], alpha=0.7, label="start" if j == 0 else None
-        )
+        ax.plot(j + shift, starts, ".", ms=3, color=PALETTE["grey"], alpha=0.7, label="start" if j == 0 else None)
         for kind, colour in _KINDS.items():
             there = [e.values[name] / middle for e, k in ends if k == kind]
             ax.plot(np.full(len(there), j + 0.2), there, "o", ms=4, color=colour, alpha=0.8)
