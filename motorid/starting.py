@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -20,7 +19,7 @@ from motorid.start import first_guess
 from motorid.term import Effect
 
 FEW = 3  # shapes that are looked at more closely
-MOST_SHAPES = 24
+RESONANCE = "1/s"
 PHASES = tuple(np.arange(4) * np.pi / 2)
 
 
@@ -71,9 +70,9 @@ def _untouched(model: Model, effect: Effect) -> list[Parameter]:
 def _shaped(problem: Problem, effect: Effect, asked: Model) -> Problem:
     """Return the problem started at the best of the shapes of `effect`: one step from each, more from a few.
 
-    A knee current, a resonance or a phase far from the truth can leave the descent in a side valley.
+    Phases and resonances have side valleys; a descent finds knees, lags and heat capacities by itself.
     """
-    shapes = list(_shapes(problem, effect, asked))[:MOST_SHAPES]
+    shapes = list(_shapes(problem, effect, asked))
     if len(shapes) < 2:
         return problem
     problem = problem.refined(problem.start)
@@ -81,7 +80,7 @@ def _shaped(problem: Problem, effect: Effect, asked: Model) -> Problem:
     for iterations in (2, 4):
         looks = sorted(looks, key=lambda look: look[0])[:FEW]
         looks = [_look(here, iterations) for _, here in looks]
-    return replace(min(looks, key=lambda look: look[0])[1], _runs=None)
+    return min(looks, key=lambda look: look[0])[1]
 
 
 def _look(problem: Problem, iterations: int) -> tuple[float, Problem]:
@@ -99,7 +98,7 @@ def _shapes(problem: Problem, effect: Effect, asked: Model) -> Iterator[dict[str
     sizes = natural_sizes(problem.experiments, problem.model.values)
     axes = []
     for p in _untouched(asked, effect):
-        if p.vary and (p.grid or p.periodic):
-            values = [g * sizes.get(p.unit, 1.0) for g in p.grid] or PHASES
+        if p.vary and (p.periodic or p.unit == RESONANCE):
+            values = PHASES if p.periodic else [g * sizes[p.unit] for g in p.grid]
             axes.append([(p.name, float(np.clip(v, p.lower, p.upper))) for v in values])
     return (dict(choice) for choice in product(*axes)) if axes else iter(())

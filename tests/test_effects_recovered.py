@@ -26,7 +26,7 @@ TRUTH = {
     "constant_load": {"tau_0": 4e-3},
     "gravity": {"mgl": 5e-3, "phi_g": 0.7},
     "cogging": {"A": 3e-3, "phi": -2.0},
-    "torque_ripple": {"a_r": 0.1, "phi_r": 1.0},
+    "torque_ripple": {"a_r": 0.1, "phi_r": -2.5},
     "load_friction": {"mu": 0.08},
     "viscous_asymmetric": {"b_a": 2e-5},
     "lugre": {"tau_c": 5e-3, "s_b": 1.6, "omega_s": 8.0, "theta_s": 0.02},

@@ -286,6 +286,18 @@ def test_a_start_that_cannot_be_simulated_is_an_error_that_says_what_to_do(runs)
         mi.fit(mi.dc_motor(**VALUES), runs, start="model", engine=Fragile(limit=1e-5))
 
 
+def test_integration_errors_that_add_up_are_mended_by_finer_steps(runs, monkeypatch):
+    from motorid import accuracy
+
+    monkeypatch.setattr(accuracy, "LOOSEST", 2e-2)
+    monkeypatch.setattr(accuracy, "NOISE_SHARE", 1.0)
+    coarse = mi.Problem(mi.dc_motor(**VALUES), tuple(runs))
+    coarse = coarse.refined(coarse.start)
+    assert mi.fit(mi.dc_motor(**VALUES), runs, start="model").integration_error < 0.2
+    r = [p.residual(p.start) for p in (coarse, coarse.with_finer_steps(4))]
+    assert np.abs(r[0] - r[1]).max() > 0.3  # what there was to mend
+
+
 # -- afterwards ----------------------------------------------------------------------------------------------
 def test_evaluate_judges_unseen_runs_and_estimates_no_parameter(runs, rng):
     fit = mi.fit(mi.dc_motor(), runs)
