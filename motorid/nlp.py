@@ -210,8 +210,9 @@ class Ipopt:
     tol: float = 1e-9
     verbose: bool = False
 
-    def solve(self, nlp: ShootingNlp, z0: Array, bounds: tuple[Array, Array], warm: NlpResult | None = None) -> NlpResult:
-        """Solve from `z0`, or from an earlier result of the same size."""
+    def solve(self, nlp: ShootingNlp, z0: Array, bounds: tuple[Array, Array], warm: NlpResult | None = None,
+              near: bool = False) -> NlpResult:
+        """Solve from `z0`, which may be near a solution, or from an earlier result of the same size."""
         function, derivatives = nlp.functions()
         options: dict[str, Any] = {
             "max_iter": self.max_iterations, "tol": self.tol, "constr_viol_tol": 1e-10, "dual_inf_tol": 1e-6,
@@ -219,9 +220,12 @@ class Ipopt:
             "print_level": 5 if self.verbose else 0, "sb": "yes", "mu_strategy": "adaptive",
         }
         start = {"x0": z0}
+        if near:
+            options |= {"mu_strategy": "monotone", "mu_init": 1e-6, "bound_push": 1e-8, "bound_frac": 1e-8,
+                        "slack_bound_push": 1e-8, "slack_bound_frac": 1e-8}
         if warm is not None:
-            options |= {"warm_start_init_point": "yes", "mu_init": 1e-7, "warm_start_bound_push": 1e-9,
-                        "warm_start_mult_bound_push": 1e-9, "mu_strategy": "monotone",
+            options |= {"mu_strategy": "monotone", "mu_init": 1e-7, "warm_start_init_point": "yes",
+                        "warm_start_bound_push": 1e-9, "warm_start_mult_bound_push": 1e-9,
                         "warm_start_slack_bound_push": 1e-9}
             start |= {"lam_g0": warm.lam_g * nlp.scale, "lam_x0": warm.lam_x * nlp.scale}
         solver = ca.nlpsol("solver", "ipopt", function, {

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -20,7 +20,12 @@ from motorid.relations import Part
 
 GOOD = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
 JOINED = 1e-8  # violation of a row that counts as kept
+SAME = 1e-8  # difference of the scaled cost below which two points are as good
+KEPT = "Start_Kept"
 SAID = {
+    KEPT: ("stalled", "stalled: the interior-point solver found nothing better than the least-squares fit that it "
+                      "started from, which is kept; identifiability() shows which parameters cannot be told apart"),
+
     "Maximum_Iterations_Exceeded": (
         "limit", "stopped at the largest number of iterations; raise max_iterations, or start from a least-squares "
                  "fit: mi.fit(fit.model, …, solver=mi.MultipleShooting(warm='model'))"),
@@ -57,6 +62,17 @@ class Solved:
     def cost(self) -> float:
         """½rᵀr on the mesh."""
         return float(self.nlp.values(self.result.z)[0]) / self.nlp.scale
+
+    def worse_than(self, z: Array) -> bool:
+        """Tell whether a point `z` that the intervals join at is better than the end."""
+        start = self.nlp.at(z, False)
+        if start is None or np.abs(start.g).max(initial=0.0) > JOINED:
+            return False
+        return self.status != "converged" or (self.cost - start.f) * self.nlp.scale > SAME * max(1, start.f)
+
+    def kept(self, z: Array) -> Solved:
+        """Return the start instead of the end."""
+        return replace(self, result=self.result._replace(z=z, status=KEPT))
 
     @property
     def violation(self) -> float:

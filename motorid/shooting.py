@@ -13,10 +13,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from motorid.descent import misfit_over_noise
+from motorid.descent import descend_balanced, misfit_over_noise
 from motorid.errors import FitError, SimulationError, UsageError, one_of
 from motorid.fit import Fit
 from motorid.integrate.grid import Array
+from motorid.least_squares import LevenbergMarquardt
 from motorid.mesh import Mesh
 from motorid.nlp import Ipopt, NlpResult, ShootingNlp
 from motorid.nodes import nodes_from_data, nodes_from_simulation
@@ -25,11 +26,11 @@ from motorid.problem import Problem
 from motorid.relations import Relation
 
 ROUNDS = 4  # of refining the sub-steps
-IMBALANCE = 3.0  # as in the least-squares fit
+TIGHT = 1e-13  # share of the cost at which the least-squares fit on the way stops
 FARTHEST = 25.0  # change of a logarithm beyond which no physical parameter lies
 POOR = 0.5  # NRMSE at the start above which the intervals are first joined loosely
 LOOSE = 10, 0.05  # then: samples per interval, and gaps in sizes of the states
-QUICK = 60  # iterations of a fit that only shows where to go on
+QUICK = 40  # iterations of a fit that only shows where to go on
 BLUNT = 0.01  # of the RMS of a channel: the least noise that counts in the loose fit
 AWAY = 3.5  # largest change of a logarithm in one such fit
 LOST = 3.0  # change of a logarithm that may mean that a parameter got lost
@@ -43,9 +44,10 @@ class MultipleShooting:
     ----------
     every : int, optional
         Samples per interval. By default 50, more on long runs so that there are at most 200 intervals.
-    warm : {"data", "model"}
-        States at the nodes at the start: from the measured channels, or from a simulation with the starting
-        values (after a least-squares fit).
+    warm : {"auto", "data", "model"}
+        States at the nodes at the start: from the measured channels, and nothing else goes before; or from a
+        least-squares fit from the starting values. ``"auto"``: the latter, from poor values after a fit whose
+        intervals join loosely.
     process_noise : mapping of str to float, optional
         Standard deviation per state and √s (``{"omega": 3.0}``: rad/s per √s); gaps at the nodes are weighed by
         it instead of forbidden. States not named get next to none.
@@ -57,22 +59,23 @@ class MultipleShooting:
     """
 
     every: int | None = None
-    warm: str = "data"
+    warm: str = "auto"
     process_noise: Mapping[str, float] | None = None
-    max_iterations: int = 300
+    max_iterations: int = 150
     tol: float = 1e-9
     verbose: bool = False
 
     def __post_init__(self) -> None:
-        if self.warm not in ("data", "model"):
-            raise UsageError(one_of(str(self.warm), ("data", "model"), "warm start"))
+        if self.warm not in ("auto", "data", "model"):
+            raise UsageError(one_of(str(self.warm), ("auto", "data", "model"), "warm start"))
         if self.every is not None and (int(self.every) != self.every or self.every < 2):
             raise UsageError(f"MultipleShooting(every=…) takes a whole number of at least 2; got {self.every!r}.")
 
     def solve(self, problem: Problem) -> Fit:
         """Return the fit of `problem` from the values of its model.
 
-        Without the constraints first, which settles sub-steps and weights; then with them from there.
+        First without the constraints, by least squares, which settles sub-steps and weights; from poor values
+        by way of a fit whose intervals need not join. Then all together, from there.
 
         Raises
         ------
@@ -84,38 +87,31 @@ class MultipleShooting:
         """
         began = time.perf_counter()
         _check(problem)
-        done = self._balanced(replace(problem, constraints=()))
-        if problem.constraints:
-            done = self._refining(replace(done.problem, constraints=problem.constraints), done)
-        return fit_of(done, time.perf_counter() - began)
+        plain = replace(problem, constraints=())
+        near, q = self._near(plain)
+        return fit_of(self._refining(replace(near, constraints=problem.constraints), q), time.perf_counter() - began)
 
     # -- stages ----------------------------------------------------------------------------------------
-    def _balanced(self, problem: Problem) -> Solved:
-        """Weigh channels by their misfit where the model fails, as the least-squares fit does."""
-        done = self._from_anywhere(problem)
-        if problem.balance or problem.weights != "noise" or problem.loss is not None or len(problem.outputs) < 2:
-            return done
-        for _ in range(3):
-            try:
-                factors = misfit_over_noise(done.problem, done.q)
-            except SimulationError:
-                break
-            relative = [f / done.problem.balance.get(c, 1.0) for c, f in factors.items()]
-            if max(relative) < IMBALANCE * min(relative):
-                break
-            done = self._refining(done.problem.balanced(factors), done)
-        return done
+    def _near(self, problem: Problem) -> tuple[Problem, Array]:
+        """Return the problem with weights settled, and values near its solution without constraints."""
+        if self.process_noise is not None:
+            return problem, problem.start
+        if self.warm == "data":
+            return (problem, problem.start) if not _poor(problem, problem.start) else (problem, self._joined(problem))
+        if self.warm == "model" or not _poor(problem, problem.start):
+            return _least_squares(problem, True)
+        q = self._joined(problem)
+        near = _least_squares(problem.for_model(problem.model.start_at(problem.values(q))), False)
+        if not _poor(*near):
+            return near
+        return min(near, _least_squares(problem, True), key=lambda found: _misfit(*found))
 
-    def _from_anywhere(self, problem: Problem) -> Solved:
-        """Solve from the values of the model; from poor ones by way of a fit whose intervals join loosely."""
-        if self.process_noise is not None or self.warm == "model" or not _poor(problem):
-            return self._refining(problem)
-        done = self._loose(problem)
-        found = [self._quick(problem, q) for q in _put_back(problem, done.q)]
+    def _joined(self, problem: Problem) -> Array:
+        """Return values that a fit finds whose intervals join loosely, then tightly, from poor ones."""
+        found = [self._quick(problem, q) for q in _put_back(problem, self._loose(problem).q)]
         best = _cheapest(found)
         # Once the others are right, a parameter that ran off to where nothing depends on it finds its way back.
-        best = _cheapest([best, *(self._quick(problem, q) for q in _put_back(problem, best.q)[1:])])
-        return self._refining(best.problem, best)
+        return _cheapest([best, *(self._quick(problem, q) for q in _put_back(problem, best.q)[1:])]).q
 
     def _loose(self, problem: Problem) -> Solved:
         """Solve with short intervals that need not join."""
@@ -128,20 +124,23 @@ class MultipleShooting:
     def _quick(self, problem: Problem, q: Array) -> Solved:
         """Solve from `q` not very far, with one step per sample: a lost parameter may ask for very many."""
         mesh = Mesh(problem, self.every)
-        return self._solve(mesh, mesh.joined(q, self._nodes(mesh, q)), quick=True)
+        nodes = nodes_from_data if _poor(problem, q) else nodes_from_simulation
+        return self._solve(mesh, mesh.joined(q, nodes(mesh, q)), quick=True)
 
-    def _refining(self, problem: Problem, before: Solved | None = None) -> Solved:
-        """Solve, refine the sub-steps at the solution, and again while they change."""
-        q = problem.start if before is None else before.q
-        mesh = Mesh(problem.refined(q), self.every, self._noise(problem))
-        z = mesh.joined(q, self._nodes(mesh, q)) if before is None else before.result.z
-        done = self._solve(mesh, z, history=() if before is None else before.history)
+    def _refining(self, problem: Problem, q: Array) -> Solved:
+        """Solve, refine the sub-steps at the solution, and again while they do not suffice."""
+        if not problem.fine_enough(q):
+            problem = problem.refined(q)
+        mesh = Mesh(problem, self.every, self._noise(problem))
+        z = mesh.joined(q, self._nodes(mesh, q))
+        done = self._solve(mesh, z)
+        if not problem.constraints and mesh.noise is None and done.worse_than(z):
+            return done.kept(z)
         for _ in range(ROUNDS - 1):
-            finer = done.problem.refined(done.q)
-            if all(np.array_equal(a.grid.substeps, b.grid.substeps)
-                   for a, b in zip(finer.runs, done.problem.runs, strict=True)):
+            if done.problem.fine_enough(done.q):
                 break
-            done = self._solve(replace(done.mesh, problem=finer), done.result.z, done.result, done.history)
+            finer = replace(done.mesh, problem=done.problem.refined(done.q))
+            done = self._solve(finer, done.result.z, done.result, done.history)
         return done
 
     def _nodes(self, mesh: Mesh, q: Array) -> Array:
@@ -149,8 +148,8 @@ class MultipleShooting:
             return nodes_from_data(mesh, q)
         try:
             return nodes_from_simulation(mesh, q)
-        except SimulationError as error:
-            raise FitError(f"the model cannot be simulated at the start: {error} Take warm='data'.") from None
+        except SimulationError:
+            return nodes_from_data(mesh, q)
 
     def _noise(self, problem: Problem) -> Array | None:
         if self.process_noise is None:
@@ -176,7 +175,8 @@ class MultipleShooting:
                            "model.replace(…), or leave them out.") from None
         most, tol = (min(QUICK, self.max_iterations), 1e-6) if quick else (self.max_iterations, self.tol)
         ipopt = Ipopt(most, tol, self.verbose)
-        result = ipopt.solve(nlp, z, (np.concatenate([low, -free]), np.concatenate([high, free])), warm)
+        result = ipopt.solve(nlp, z, (np.concatenate([low, -free]), np.concatenate([high, free])), warm,
+                             near=not quick and self.warm != "data")
         return Solved(mesh, nlp, result, history + result.history)
 
 
@@ -198,6 +198,23 @@ def _blunted(problem: Problem) -> dict[str, float]:
     return found
 
 
+def _least_squares(problem: Problem, stages: bool) -> tuple[Problem, Array]:
+    """Return the problem with weights settled and its solution without constraints, in one piece."""
+    try:
+        done = descend_balanced(problem, LevenbergMarquardt(ftol=TIGHT), stages=stages)
+    except FitError:  # the intervals will have to find it
+        return problem, problem.start
+    return done.problem, done.solution.q
+
+
+def _misfit(problem: Problem, q: Array) -> float:
+    """Return the misfit over all channels, on a scale that does not depend on their weights."""
+    try:
+        return float(np.sum(np.log(list(misfit_over_noise(problem, q).values()))))
+    except SimulationError:
+        return np.inf
+
+
 def _put_back(problem: Problem, q: Array) -> list[Array]:
     """Return `q`, and `q` with the parameters that went very far put back to their start."""
     lost = problem.scaling.log & (np.abs(q - problem.start) > LOST)
@@ -208,11 +225,11 @@ def _cheapest(found: list[Solved]) -> Solved:
     return min([d for d in found if d.status == "converged"] or found, key=lambda d: d.cost)
 
 
-def _poor(problem: Problem) -> bool:
-    """Tell whether the starting values explain less than half of some channel."""
+def _poor(problem: Problem, q: Array) -> bool:
+    """Tell whether the model explains less than half of some channel at `q`."""
     for k, run in enumerate(problem.runs):
         try:
-            y = problem.simulate(problem.start, k, derivatives=False).y
+            y = problem.simulate(q, k, derivatives=False).y
         except SimulationError:
             return True
         for j, c in enumerate(problem.outputs):
