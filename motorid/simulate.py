@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from motorid.display import Shown
+from motorid.equations import CHANNELS
 from motorid.experiment import Experiment
 from motorid.integrate import Engine
 from motorid.integrate.grid import Array
@@ -105,13 +106,14 @@ def at(problem: Problem, q: Array) -> tuple[Simulation, ...]:
     for k, run in enumerate(problem.runs):
         traj = problem.simulate(q, k, derivatives=False)
         outputs = {c: traj.y[:, j] for j, c in enumerate(problem.outputs)}
-        found.append(Simulation(run.experiment, outputs, {s: traj.x[:, j] for j, s in enumerate(problem.system.states)}))
+        states = {s: traj.x[:, j] for j, s in enumerate(problem.system.states)}
+        found.append(Simulation(run.experiment, outputs, states))
     return tuple(found)
 
 
 def judge(simulations: Sequence[Simulation]) -> Evaluation:
     """Return the errors of `simulations` against what was measured."""
-    channels = [c for c in ("i", "omega", "theta") if any(c in s.experiment.outputs and c in s.outputs for s in simulations)]
+    channels = [c for c in CHANNELS if any(c in s.experiment.outputs and c in s.outputs for s in simulations)]
     squares: dict[str, list[Any]] = {c: [] for c in channels}
     by_run = []
     for s in simulations:

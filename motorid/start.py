@@ -91,7 +91,7 @@ def _solve(rows: list[tuple[Array, Array]], names: Sequence[str], held: Mapping[
         return {n: held[n] for n in names}
     norms = np.linalg.norm(a, axis=0)
     norms = np.where(norms > 0, norms, 1.0)
-    triangle = np.linalg.qr(np.column_stack([a / norms, b]), mode="r")
+    triangle: Array = np.asarray(np.linalg.qr(np.column_stack([a / norms, b]), mode="r"))
     z, _ = nnls(triangle[:, :-1], triangle[:, -1])
     # A coefficient that comes out as zero starts where its term would carry a thousandth of the right-hand side.
     z = np.maximum(z, FLOOR * np.linalg.norm(b)) / norms
