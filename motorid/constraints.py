@@ -53,14 +53,17 @@ class CurrentLimit(Relation):
         if "i" not in system.states:
             raise UsageError(f"{self.name}: the base '{problem.model.base}' has no current. Leave the limit out, "
                              "or use dc_motor() with a record of the applied voltage.")
-        rows_of = local(system, lambda x, u, p, d: x[system.states.index("i")] / self.limit, 0)
+        place = system.states.index("i")
+        rows_of = local(system, lambda x, u, p, d: x[place] / self.limit, 0)
+        gradient = np.eye(len(system.states))[place] / self.limit
         found = []
         for k, run in enumerate(problem.runs):
             n = len(run.experiment.t)
             one, every = np.ones(n), np.arange(n)
             labels = tuple(f"{self.name}, run {k}, t = {t:.6g} s" for t in run.experiment.t)
             found.append(Part(k, rows_of, every, every, np.zeros((n, 0)), run.grid.u, np.ones(n, bool), -one, one,
-                              self.limit * one, self.weight * share(problem, k) * one, labels, ("A",) * n))
+                              self.limit * one, self.weight * share(problem, k) * one, labels, ("A",) * n,
+                              gradient))
         return tuple(found)
 
 

@@ -10,7 +10,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple
+from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 
@@ -83,7 +84,7 @@ class Mesh:
         for k, run in enumerate(self.problem.runs):
             last = len(run.grid.t) - 1
             cuts = _cuts(last, self.every)
-            for a, b in zip(cuts[:-1], cuts[1:], strict=True):
+            for a, b in pairwise(cuts):
                 node = -1 if a == 0 else nodes - 1
                 nodes += b < last
                 found.append(Interval(k, a, b, node, nodes - 1 if b < last else -1, _cut(run.grid, a, b)))
@@ -251,7 +252,7 @@ class Mesh:
         cuts = [0, *(np.flatnonzero(np.diff(owner)) + 1).tolist(), len(values)]
         wide = np.zeros((len(values), 0)) if jac is None else jac
         return [_present(Block(values[a:b], wide[a:b], self.columns(self.intervals[owner[a]])))
-                for a, b in zip(cuts[:-1], cuts[1:], strict=True) if b > a]
+                for a, b in pairwise(cuts) if b > a]
 
 
 def _present(b: Block) -> Block:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from motorid.errors import SimulationError
 from motorid.integrate.grid import Array
 from motorid.problem import Problem
 from motorid.relations import Part
@@ -48,8 +48,11 @@ class Multiplier:
                 "(to first order).")
 
 
-def rows_at(problem: Problem, q: Array) -> list[tuple[str, Part, Array, Array]]:
-    """Return (constraint, part, rows, d rows/dq) of all constraints on the simulated trajectories at `q`.
+def rows_at(problem: Problem, q: Array,
+            relations: Sequence[Any] | None = None) -> list[tuple[str, Part, Array, Array]]:
+    """Return (name, part, rows, d rows/dq) of `relations` on the simulated trajectories at `q`.
+
+    `relations` are the problem's constraints unless given.
 
     Raises
     ------
@@ -58,7 +61,7 @@ def rows_at(problem: Problem, q: Array) -> list[tuple[str, Part, Array, Array]]:
     at = problem.unknowns.point(q)
     trajs = [problem.simulate(q, k) for k in range(len(problem.runs))]
     found = []
-    for c in problem.constraints:
+    for c in problem.constraints if relations is None else relations:
         for part in c.parts(problem):
             traj = trajs[part.run]
             assert traj.dx is not None
@@ -66,6 +69,28 @@ def rows_at(problem: Problem, q: Array) -> list[tuple[str, Part, Array, Array]]:
             assert jac is not None
             found.append((c.name, part, values, jac))
     return found
+
+
+def violations(problem: Problem, q: Array, relations: Sequence[Any] | None = None) -> dict[str, float]:
+    """Return the largest violation of each relation, beyond its limits, in the unit of its rows.
+
+    Where a relation has rows in several units (voltage and torque), there is one entry for each.
+    """
+    found: dict[str, float] = {}
+    for name, part, values, _ in rows_at(problem, q, relations):
+        beyond = np.abs(part.violation(values)) * part.size
+        several = len(set(part.units)) > 1
+        for unit in dict.fromkeys(part.units):
+            key = f"{name}, {unit}" if several or unit else name
+            mine = np.array([u == unit for u in part.units])
+            found[key] = max(found.get(key, 0.0), float(beyond[mine].max(initial=0.0)))
+    return found
+
+
+def steady_residual(problem: Problem, q: Array, relations: Sequence[Any] | None = None) -> float | None:
+    """Return the largest balance left over at the measured steady state, relative; None without such a part."""
+    rows = [np.abs(values) for name, _, values, _ in rows_at(problem, q, relations) if name == "SteadyState()"]
+    return float(np.max(np.concatenate(rows), initial=0.0)) if rows else None
 
 
 def summed(found: Sequence[tuple[str, Part, Array, Array]]) -> tuple[tuple[Multiplier, ...], tuple[Multiplier, ...]]:
@@ -100,4 +125,4 @@ def _count(active: int) -> str:
     return "not active" if not active else f"{active} row{'s' if active > 1 else ''} at the limit"
 
 
-__all__ = ["Multiplier", "free_directions", "rows_at", "summed"]
+__all__ = ["Multiplier", "free_directions", "rows_at", "steady_residual", "summed", "violations"]

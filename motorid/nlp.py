@@ -36,8 +36,8 @@ class NlpResult(NamedTuple):
 class _Point(NamedTuple):
     f: float
     g: Array
-    residual: list[Block] | None
-    rows: list[Block] | None
+    residual: list[Block]
+    rows: list[Block]
 
 
 class ShootingNlp:
@@ -54,7 +54,6 @@ class ShootingNlp:
         self.mesh = mesh
         self._kept: dict[bool, tuple[bytes, _Point | None]] = {}
         at = self._evaluate(z, True)
-        assert at.residual is not None and at.rows is not None
         self.n, self.m = len(z), len(at.g)
         self.scale = STEEPEST / max(_steepest(at.residual, self.n), 1e-300)
         self.jac_pattern, self._jac_order = _jacobian_pattern(at.rows, self.m, self.n)
@@ -98,7 +97,7 @@ class ShootingNlp:
     def gradient(self, z: Array) -> list[Any]:
         """Return f and its gradient."""
         point = self.at(z, True)
-        if point is None or point.residual is None:
+        if point is None:
             return [np.nan, np.full(self.n, np.nan)]
         found = np.zeros(self.n)
         for b in point.residual:
@@ -108,7 +107,7 @@ class ShootingNlp:
     def jacobian(self, z: Array) -> list[Any]:
         """Return g and its sparse Jacobian."""
         point = self.at(z, True)
-        if point is None or point.rows is None:
+        if point is None:
             return [np.full(self.m, np.nan), np.full(self.jac_pattern.nnz(), np.nan)]
         entries = np.concatenate([np.zeros(0), *(b.jac.ravel() for b in point.rows)])
         return [point.g, entries[self._jac_order]]
@@ -116,7 +115,7 @@ class ShootingNlp:
     def hessian(self, z: Array, lam_f: float) -> Array:
         """Return the entries of the Gauss-Newton Hessian's upper triangle."""
         point = self.at(z, True)
-        if point is None or point.residual is None:
+        if point is None:
             return np.full(self.hess_pattern.nnz(), np.nan)
         entries = np.concatenate([(b.jac.T @ b.jac).ravel() for b in point.residual])[self._hess_mask]
         return np.bincount(self._hess_place, entries, self.hess_pattern.nnz()) * (self.scale * lam_f)

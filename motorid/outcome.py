@@ -13,7 +13,7 @@ from motorid.errors import FitError
 from motorid.fit import Fit
 from motorid.integrate.grid import Array
 from motorid.mesh import Mesh
-from motorid.multipliers import free_directions, rows_at, summed
+from motorid.multipliers import free_directions, rows_at, summed, violations
 from motorid.nlp import NlpResult, ShootingNlp
 from motorid.problem import Problem
 from motorid.relations import Part
@@ -130,7 +130,7 @@ def _extra(done: Solved) -> dict[str, Any]:
     if problem.constraints:
         totals, rows = summed(_with_multipliers(done))
         active = [jac[part.at_limit(values)] for _, part, values, jac in rows_at(problem, done.q)]
-        extra |= {"multipliers": totals, "active": rows,
+        extra |= {"multipliers": totals, "active": rows, "violations": violations(problem, done.q),
                   "free": free_directions(np.concatenate(active), problem.scaling.slope(done.q))}
     return extra
 

@@ -17,17 +17,20 @@ from motorid.descent import descend_balanced, misfit_over_noise
 from motorid.errors import FitError, SimulationError, UsageError, one_of
 from motorid.fit import Fit
 from motorid.integrate.grid import Array
-from motorid.least_squares import LevenbergMarquardt
+from motorid.least_squares import LevenbergMarquardt, levenberg_marquardt
 from motorid.mesh import Mesh
+from motorid.multipliers import violations
 from motorid.nlp import Ipopt, NlpResult, ShootingNlp
 from motorid.nodes import nodes_from_data, nodes_from_simulation
 from motorid.outcome import Solved, fit_of
 from motorid.problem import Problem
-from motorid.relations import Relation
+from motorid.relations import Relation, Weighed
 
 ROUNDS = 4  # of refining the sub-steps
 TIGHT = 1e-13  # share of the cost at which the least-squares fit on the way stops
-FARTHEST = 25.0  # change of a logarithm beyond which no physical parameter lies
+FARTHEST = 14.0  # largest change of a logarithm; a parameter at 1e-6 of where it was has no effect any more
+HEAVIER = (1.0, 10.0, 100.0)  # times the penalties' own weights, on the way to true constraints
+VALLEY = 1.5  # on the logarithmic scale: to the other valley of the inductance
 POOR = 0.5  # NRMSE at the start above which the intervals are first joined loosely
 LOOSE = 10, 0.05  # then: samples per interval, and gaps in sizes of the states
 QUICK = 40  # iterations of a fit that only shows where to go on
@@ -89,7 +92,8 @@ class MultipleShooting:
         _check(problem)
         plain = replace(problem, constraints=())
         near, q = self._near(plain)
-        return fit_of(self._refining(replace(near, constraints=problem.constraints), q), time.perf_counter() - began)
+        bound = replace(near, constraints=problem.constraints)
+        return fit_of(self._refining(bound, _pulled(bound, q)), time.perf_counter() - began)
 
     # -- stages ----------------------------------------------------------------------------------------
     def _near(self, problem: Problem) -> tuple[Problem, Array]:
@@ -205,6 +209,37 @@ def _least_squares(problem: Problem, stages: bool) -> tuple[Problem, Array]:
     except FitError:  # the intervals will have to find it
         return problem, problem.start
     return done.problem, done.solution.q
+
+
+def _pulled(problem: Problem, q: Array) -> Array:
+    """Return values near the constrained solution: penalties on what is violated at `q`, heavier and heavier.
+
+    A current peak is lowered by resistance or by inductance, and the cost has a valley for each.
+    """
+    try:
+        if max(violations(problem, q).values(), default=0.0) == 0.0:
+            return q
+    except SimulationError:
+        return q
+    names = [p.name for p in problem.unknown]
+    starts = [q, q + VALLEY * np.array([n == "L" for n in names])] if "L" in names else [q]
+    found = [_under_penalties(problem, start) for start in starts]
+    return min(found, key=lambda f: f[0])[1]
+
+
+def _under_penalties(problem: Problem, q: Array) -> tuple[float, Array]:
+    """Return the cost and the solution under the heaviest penalties, each reached from the one before."""
+    cost = np.inf
+    for factor in HEAVIER:
+        weighed = tuple(Weighed(c, factor) for c in problem.constraints)
+        step = replace(problem, penalties=(*problem.penalties, *weighed))
+        try:
+            found = levenberg_marquardt(step.residual, step.residual_and_jacobian, q, step.scaling.bounds,
+                                        LevenbergMarquardt(max_iterations=60), None, step.scaling.log)
+        except (FitError, SimulationError):
+            return np.inf, q
+        q, cost = found.q, 0.5 * float(found.residual @ found.residual)
+    return cost, q
 
 
 def _misfit(problem: Problem, q: Array) -> float:

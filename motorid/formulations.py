@@ -1,0 +1,195 @@
+"""The same fit in three formulations: plain, constraints as penalties, constraints kept exactly."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from motorid.constraints import SteadyState
+from motorid.display import Shown
+from motorid.errors import FitError, MotoridError, SimulationError
+from motorid.fit import Failure, Fit, solve
+from motorid.formatting import duration, number, percent, with_error
+from motorid.least_squares import LevenbergMarquardt, levenberg_marquardt
+from motorid.multipliers import Multiplier, steady_residual, violations
+from motorid.problem import Problem
+from motorid.relations import Relation, Weighed
+from motorid.shooting import MultipleShooting
+from motorid.tables import NAMES, Table
+
+WEIGHTS = tuple(10.0 ** np.arange(-2, 5))
+NONE = "–"
+
+
+@dataclass(frozen=True, eq=False)
+class Formulation:
+    """One column of the comparison.
+
+    Attributes
+    ----------
+    name : {"plain", "penalty", "hard"}
+    result : Fit or Failure
+    violations : dict of str to float
+        Largest violation of each constraint, in the unit that its name ends with.
+    steady_residual : float or None
+        Largest balance left over at the measured steady state, relative.
+    multipliers : tuple of Multiplier
+        Of the hard formulation.
+    """
+
+    name: str
+    result: Fit | Failure
+    violations: Mapping[str, float]
+    steady_residual: float | None
+    multipliers: tuple[Multiplier, ...]
+
+    @property
+    def fit(self) -> Fit | None:
+        """The fit, None where it failed."""
+        return self.result if isinstance(self.result, Fit) else None
+
+
+@dataclass(frozen=True)
+class PathPoint:
+    """A penalty solution on the way to the hard one: weight, values, violations, distance.
+
+    `distance` is the largest relative difference from the hard solution, of the parameters determined there.
+    """
+
+    weight: float
+    values: Mapping[str, float]
+    violations: Mapping[str, float]
+    distance: float
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Formulations(Shown):
+    """Plain, penalty and hard side by side, and the walk of the penalty solution.
+
+    Attributes
+    ----------
+    plain, penalty, hard : Formulation
+    path : tuple of PathPoint
+        Penalties on what lies beyond the limits, weights as in the plain fit, from light to heavy.
+    """
+
+    plain: Formulation
+    penalty: Formulation
+    hard: Formulation
+    path: tuple[PathPoint, ...]
+
+    @property
+    def all(self) -> tuple[Formulation, ...]:
+        """The three of them."""
+        return self.plain, self.penalty, self.hard
+
+    @property
+    def table(self) -> Table:
+        """Everything side by side, as text."""
+        heads = ("", *(f.name for f in self.all))
+        note = " ".join([m.text for m in self.hard.multipliers if m.active]
+                        + [f.result.message for f in self.all if isinstance(f.result, Failure)])
+        return Table("Formulations", heads, tuple(self._rows()), note=note)
+
+    def _rows(self) -> list[tuple[str, ...]]:
+        fits = [f.fit for f in self.all]
+        first = next((f for f in fits if f is not None), None)
+        if first is None:
+            return []
+        units = {n: p.unit for n, p in first.problem.model.parameters.items()}
+        rows = [(n, *(with_error(f.values[n], f.std[n], units[n]) if f else NONE for f in fits))
+                for n in first.problem.model.free_names]
+        rows += [(f"NRMSE {NAMES[c]}", *(percent(f.nrmse[c]) if f else NONE for f in fits)) for c in first.nrmse]
+        rows.append(("steady-state residual", *(percent(f.steady_residual) for f in self.all)))
+        for name in dict.fromkeys(n for f in self.all for n in f.violations):
+            rows.append((f"beyond {name}", *(number(f.violations.get(name), 3) for f in self.all)))
+        for k, m in enumerate(self.hard.multipliers):
+            rows.append((f"multiplier {m.name}, 1/{m.unit or 'unit'}", NONE, NONE,
+                         number(self.hard.multipliers[k].value, 3)))
+        rows.append(("iterations", *(str(f.iterations) if f else NONE for f in fits)))
+        rows.append(("time", *(duration(f.seconds) if f else NONE for f in fits)))
+        rows.append(("status", *(f.result.status for f in self.all)))
+        return rows
+
+    def __str__(self) -> str:
+        return str(self.table)
+
+
+def compare_formulations(problem: Problem | Fit, constraints: Sequence[Relation] | None = None, *,
+                         weights: Sequence[float] = WEIGHTS) -> Formulations:
+    """Fit the same data three times: plain, with penalties, with true constraints.
+
+    *Plain* leaves the constraints out. *Penalty* is the source paper's: errors over the RMS of each channel,
+    penalties with their own weights. *Hard* is multiple shooting with true constraints and the weights of the
+    plain fit. Along the path penalties on what lies beyond the limits grow heavier, so that their solution
+    walks from the plain to the hard one.
+
+    Parameters
+    ----------
+    problem : Problem or Fit
+    constraints : sequence of CurrentLimit, SteadyState, Constraint, optional
+        Default: those of the problem, else the steady state.
+    weights : sequence of float
+        Factors on the penalties' own weights along the path; none for no path.
+
+    Returns
+    -------
+    Formulations
+        A formulation that fails is in it as a `Failure` that says why.
+
+    Raises
+    ------
+    FitError
+        If not even the plain fit can be carried out.
+    """
+    given = problem.problem if isinstance(problem, Fit) else problem
+    relations = tuple(constraints if constraints is not None else given.constraints) or (SteadyState(),)
+    bare = replace(given, constraints=(), balance={})
+    plain = solve(bare)
+    penalty = _tried(lambda: solve(bare.with_(penalties=(*bare.penalties, *relations), weights="rms"),
+                                   formulation="penalty"), plain)
+    near = plain.problem.for_model(plain.model)
+    hard = _tried(lambda: MultipleShooting(warm="model").solve(replace(near, constraints=relations)), plain)
+    path = _path(near, relations, weights, hard) if isinstance(hard, Fit) else ()
+    return Formulations(*(_column(n, f, relations) for n, f in
+                          (("plain", plain), ("penalty", penalty), ("hard", hard))), path)
+
+
+def _tried(attempt: Any, plain: Fit) -> Fit | Failure:
+    try:
+        return attempt()
+    except MotoridError as error:
+        return Failure(plain.values, "failed", str(error))
+
+
+def _column(name: str, result: Fit | Failure, relations: Sequence[Relation]) -> Formulation:
+    if isinstance(result, Failure):
+        return Formulation(name, result, {}, None, ())
+    problem, q = result.problem, result.q
+    return Formulation(name, result, violations(problem, q, relations), steady_residual(problem, q, relations),
+                       tuple(result.extra.get("multipliers", ())))
+
+
+def _path(problem: Problem, relations: Sequence[Relation], weights: Sequence[float],
+          hard: Fit) -> tuple[PathPoint, ...]:
+    """Follow the penalty solution back from the hard one as the penalties grow lighter: the same valley."""
+    found, q = [], hard.q
+    options = LevenbergMarquardt(ftol=1e-12)
+    free = [n for n in problem.model.free_names if hard.std[n] is not None and hard.values[n] != 0]
+    for weight in sorted(weights, reverse=True):
+        step = replace(problem, _runs=hard.problem.runs,
+                       penalties=(*problem.penalties, *(Weighed(c, float(weight)) for c in relations)))
+        try:
+            q = levenberg_marquardt(step.residual, step.residual_and_jacobian, q, step.scaling.bounds, options).q
+        except (FitError, SimulationError):
+            break
+        values = step.values(q)
+        distance = max((abs(values[n] / hard.values[n] - 1) for n in free), default=np.nan)
+        found.append(PathPoint(float(weight), values, violations(step, q, relations), float(distance)))
+    return tuple(reversed(found))
+
+
+__all__ = ["Formulation", "Formulations", "PathPoint", "compare_formulations"]
