@@ -164,6 +164,13 @@ def test_a_wrong_derivative_is_found():
     assert check.table().loc["R", "i"] < 1e-8
 
 
+def test_a_check_of_nothing_or_of_the_wrong_length_is_refused():
+    with pytest.raises(UsageError, match="at least one"):
+        mi.check_derivatives(mi.Problem(mi.dc_motor(**VALUES).fix(*VALUES), (experiment(),)))
+    with pytest.raises(UsageError, match="q has 3"):
+        mi.check_derivatives(mi.Problem(mi.dc_motor(**VALUES), (experiment(),)), np.zeros(3))
+
+
 def test_compiled_and_virtual_machine_give_the_same_numbers():
     model = mi.dc_motor(**VALUES) + mi.effects.stribeck + mi.effects.backlash
     problem = mi.Problem(model, (experiment("linear", True),))
