@@ -20,7 +20,7 @@ from motorid.model import Model
 from motorid.outliers import Outlier, outliers
 from motorid.reading import find_records, read_runs
 from motorid.tables import Table
-from motorid.tasks import Map, Parcel, run_tasks
+from motorid.tasks import Map, Parcel, in_chunks, run_tasks
 from motorid.uncertainty import covariance
 
 Records = Sequence[Experiment] | Experiment | str | Path | Sequence[str | Path]
@@ -120,7 +120,7 @@ def fit_many(model: Model, motors: Mapping[str, Records], *, journal: str | Path
         Results are added to this file as they come; what is there for the same model, options and records is
         not done again. So an interrupted batch goes on where it was.
     map : callable, optional
-        Anything with the signature of `map`; one motor is one task.
+        Anything with the signature of `map`; a task is one motor, or a few of many.
     reading : mapping, optional
         Keyword arguments of `read_runs`.
     quiet : bool
@@ -140,10 +140,10 @@ def fit_many(model: Model, motors: Mapping[str, Records], *, journal: str | Path
     marks = {n: fingerprint(model, options, reading, runs) for n, runs in motors.items()} if done else {}
     known = {n: done.rows[m] for n, m in marks.items() if m in done.rows} if done else {}
     parcel = Parcel.of((model, options, dict(reading or {})))
-    todo = [(parcel, n, Parcel.of(runs)) for n, runs in motors.items() if n not in known]
-    found = run_tasks(_fit_one, todo, map, "Fitting motors", quiet=quiet,
-                      each=None if done is None else lambda row: done.add(marks[row["motor"]], row))
-    rows = known | {row["motor"]: row for row in found.results}
+    todo = in_chunks([(n, runs) for n, runs in motors.items() if n not in known], map)
+    found = run_tasks(_fit_some, [(parcel, Parcel.of(some)) for some in todo], map, "Fitting motors", quiet=quiet,
+                      each=None if done is None else lambda rows: done.add({marks[r["motor"]]: r for r in rows}))
+    rows = known | {row["motor"]: row for some in found.results for row in some}
     said = f"Interrupted after {len(rows)} of {len(motors)} motors." if found.interrupted else ""
     return Batch(tuple(rows[name] for name in motors if name in rows), model.free_names,
                  frozenset(n for n, p in model.parameters.items() if p.positive), said)
@@ -187,12 +187,16 @@ def _carry_laws(model: Model) -> None:
                 continue  # a channel that this model does not have
 
 
-def _fit_one(task: tuple[Parcel, str, Parcel]) -> dict[str, Any]:
-    parcel, name, records = task
-    model, options, reading = parcel.open()
+def _fit_some(task: tuple[Parcel, Parcel]) -> list[dict[str, Any]]:
+    what = task[0].open()
+    return [_fit_one(name, records, *what) for name, records in task[1].open()]
+
+
+def _fit_one(name: str, records: Records, model: Model, options: Mapping[str, Any],
+             reading: Mapping[str, Any]) -> dict[str, Any]:
     began = time.perf_counter()
     try:
-        row = _row(fit(model, _runs(records.open(), reading), **options))
+        row = _row(fit(model, _runs(records, reading), **options))
     except Exception as error:  # one motor's trouble, whatever it is, must not end the batch
         row = {"status": "failed", "message": f"{type(error).__name__}: {error}", "flags": ["failed"]}
     return {"motor": name, **row, "seconds": time.perf_counter() - began}

@@ -42,9 +42,10 @@ class Journal:
             if text and not text.endswith("\n"):
                 self._append("\n")
 
-    def add(self, mark: str, row: Mapping[str, Any]) -> None:
-        """Write one result, at once."""
-        self._append(json.dumps({"fingerprint": mark, "row": dict(row)}, ensure_ascii=False) + "\n")
+    def add(self, rows: Mapping[str, Mapping[str, Any]]) -> None:
+        """Write results by fingerprint, at once."""
+        lines = (json.dumps({"fingerprint": m, "row": dict(r)}, ensure_ascii=False) for m, r in rows.items())
+        self._append("".join(line + "\n" for line in lines))
 
     def _append(self, text: str) -> None:
         self.path.parent.mkdir(parents=True, exist_ok=True)

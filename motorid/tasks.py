@@ -1,7 +1,8 @@
 """Many independent pieces of work over any `map`: shipped once, kept when done, finished without the pool.
 
 `map` is anything with the signature of the built-in one: ``executor.map`` of `concurrent.futures`,
-``client.get_executor().map`` of Dask, ``lambda f, xs: joblib.Parallel(2)(joblib.delayed(f)(x) for x in xs)``.
+``client.get_executor(pure=False).map`` of Dask, ``lambda f, xs: joblib.Parallel(2)(joblib.delayed(f)(x) for
+x in xs)``.
 """
 
 from __future__ import annotations
@@ -10,7 +11,8 @@ import builtins
 import hashlib
 import pickle
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -18,6 +20,7 @@ from typing import Any, NamedTuple
 from motorid.progress import progress
 
 Map = Callable[..., Iterable[Any]]
+WAVE = 4e6  # bytes of records handed to a pool at once; two waves are under way
 MOST_TASKS = 64  # when many small pieces go to a pool together: few enough to ship, many enough to share out
 
 
@@ -79,7 +82,7 @@ def run_tasks(function: Callable[[Any], Any], tasks: Sequence[Any], map: Map | N
         try:
             for way in ([map] if map is not None else []) + [builtins.map]:
                 try:
-                    for result in way(function, tasks[len(results):]):
+                    for result in _in_waves(way, function, tasks[len(results):]):
                         results.append(result)
                         if each is not None:
                             each(result)
@@ -94,6 +97,34 @@ def run_tasks(function: Callable[[Any], Any], tasks: Sequence[Any], map: Map | N
         except KeyboardInterrupt:
             return Done(results, f"interrupted after {len(results)} of {len(tasks)}")
     return Done(results, "")
+
+
+def _in_waves(way: Map, function: Callable[[Any], Any], tasks: Sequence[Any]) -> Iterator[Any]:
+    """Yield the results in order, handing over the tasks in waves so that a pool need not hold all records."""
+    under_way: deque[Iterator[Any]] = deque()
+    for wave in _waves(tasks):
+        under_way.append(iter(way(function, wave)))
+        if len(under_way) > 1:
+            yield from under_way.popleft()
+    while under_way:
+        yield from under_way.popleft()
+
+
+def _waves(tasks: Sequence[Any]) -> Iterator[list[Any]]:
+    wave: list[Any] = []
+    shipped: set[str] = set()
+    size = 0
+    for task in tasks:
+        wave.append(task)
+        for part in task if isinstance(task, tuple) else (task,):
+            if isinstance(part, Parcel) and part.key not in shipped:
+                shipped.add(part.key)
+                size += len(part.data)
+        if size > WAVE:
+            yield wave
+            wave, shipped, size = [], set(), 0
+    if wave:
+        yield wave
 
 
 def _first_line(error: Exception) -> str:
