@@ -133,5 +133,5 @@ def _first_line(error: Exception) -> str:
 
 def in_chunks(items: Sequence[Any], map: Map | None) -> list[Sequence[Any]]:
     """Cut `items` into pieces: single ones for the built-in map, at most `MOST_TASKS` for a pool."""
-    size = 1 if map is None or map is builtins.map else -(-len(items) // MOST_TASKS)
+    size = 1 if map is None or map is builtins.map else max(-(-len(items) // MOST_TASKS), 1)
     return [items[k:k + size] for k in range(0, len(items), size)]
