@@ -30,6 +30,8 @@ COMMON = (
 )  # what is met most, first
 EVIDENCE = 4.0  # log likelihood ratio beyond the price of the parameters
 TIE = 3.0  # log likelihood ratio below which two models count as equal
+PLAIN = 0.1  # fall of the error that needs no statistics: what is left may be smooth for other reasons
+INDIFFERENT = 0.03  # change of the held-out error that says nothing where the error on the records falls plainly
 CLOSE = 0.01  # relative error below which two models count as equal
 
 
@@ -69,10 +71,27 @@ def node_of(fit: Fit, held: HeldOut, added: str | None = None, parent: Node | No
 
 @dataclass(frozen=True, eq=False)
 class Judge:
-    """Compares models by their errors; `root` is the model to begin with, `noise` the noise per channel."""
+    """Compares models by their errors; `root` is the model to begin with."""
 
     root: Node
-    noise: Mapping[str, float]
+    data: HeldOut
+
+    @property
+    def noise(self) -> Mapping[str, float]:
+        """Noise per channel."""
+        return self.data.noise
+
+    def held_gain(self, old: Node, new: Node) -> Gain:
+        """Return what `new` gains over `old` on held-out data.
+
+        Held-out runs in which an effect hardly shows (a steady run, for a lag) say nothing about it; then blocks of
+        the fitted runs are held out in turn.
+        """
+        gain = compare_errors(old.held, new.held, self.noise)
+        here = compare_errors(old.train, new.train, self.noise)
+        if self.data.validation is None or abs(gain.fall) > INDIFFERENT or here.fall < PLAIN:
+            return gain
+        return compare_errors(self.data.block_errors(old.fit), self.data.block_errors(new.fit), self.noise)
 
     def choose(self, children: Sequence[Node]) -> tuple[Node, list[Node]] | None:
         """Return the best child, the smaller on a tie, and the children in order; None without any."""
@@ -99,9 +118,8 @@ class Judge:
     def beats(self, new: Node, old: Node) -> bool:
         """Tell whether `new` is worth its extra parameters over `old`."""
         gain = compare_errors(old.train, new.train, self.noise)
-        price = price_of(new.size - old.size, gain)
-        held = compare_errors(old.held, new.held, self.noise)
-        return gain.log_ratio > price and not held_out_objection(held)
+        held = self.held_gain(old, new)
+        return worth_it(new.size - old.size, gain) and not held_out_objection(held)
 
     def group(self, chosen: Node, siblings: Sequence[Node], includes: Mapping[str, tuple[str, ...]]) -> tuple[str, ...]:
         """Names of the siblings that these data cannot tell from `chosen`."""
@@ -117,9 +135,10 @@ class Judge:
         )
 
 
-def price_of(extra: int, gain: Gain) -> float:
-    """Return the log likelihood ratio that `extra` parameters must be worth."""
-    return EVIDENCE + 0.5 * max(extra, 0) * float(np.log(max(gain.effective, 2.0)))
+def worth_it(extra: int, gain: Gain) -> bool:
+    """Tell whether a gain pays for `extra` parameters: by its evidence, or by a fall of the error that anyone sees."""
+    price = EVIDENCE + 0.5 * max(extra, 0) * float(np.log(max(gain.effective, 2.0)))
+    return gain.log_ratio > price or gain.fall > PLAIN
 
 
 def rarity(name: str | None) -> int:
@@ -131,7 +150,7 @@ def held_out_objection(gain: Gain) -> str:
     """Say why the held-out error speaks against a model; empty if it does not."""
     if gain.fall < LEAST_FALL:
         return f"the held-out error does not fall ({100 * gain.fall:+.1f} %)"
-    if gain.log_ratio < TIE:
+    if gain.log_ratio < TIE and gain.fall < PLAIN:
         return "the held-out error falls by no more than chance would give"
     if gain.worst < -0.05 - 0.5 * gain.fall:
         return f"one channel's held-out error grows by {-100 * gain.worst:.0f} %"

@@ -11,8 +11,8 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from motorid.diagnosis.evidence import Errors, compare_errors
-from motorid.diagnosis.judging import Judge, Node, held_out_objection, node_of, price_of
+from motorid.diagnosis.evidence import Errors, Gain, compare_errors
+from motorid.diagnosis.judging import COMMON, PLAIN, Judge, Node, held_out_objection, node_of, worth_it
 from motorid.diagnosis.rank import Score, rank
 from motorid.diagnosis.results import Candidate
 from motorid.diagnosis.trial import (
@@ -31,6 +31,7 @@ from motorid.model import Effect, Model
 from motorid.prepared import natural_sizes
 
 SHORTLIST = 6
+NEAR = 0.4  # of the best score: what a common effect must reach to be refitted too
 ALWAYS = ("compliance", "speed_lag", "speed_delay")  # their score at null says little
 Advance = Callable[[str], None]
 
@@ -57,7 +58,7 @@ class Search:
         self.held = HeldOut.of(fit, validate)
         self.effects, self.map, self.advance = list(effects), map_, advance
         self.root = node_of(fit, self.held)
-        self.judge = Judge(self.root, self.held.noise)
+        self.judge = Judge(self.root, self.held)
         self._scores: dict[frozenset[str], list[Score]] = {}
         self.nodes: dict[frozenset[str], Node] = {self.root.key: self.root}
 
@@ -75,9 +76,9 @@ class Search:
         present = node.fit.model
         _, wider = self._takeable(present)
         scores = self.scores(node)
-        short = scores[:SHORTLIST] + [s for s in scores[SHORTLIST:] if s.effect.name in ALWAYS]
-        tasks = [(node.fit, present + s.effect, s.starts[:3]) for s in short if s.drop > 0 or s.effect.name in ALWAYS]
-        names = [s.effect for s in short if s.drop > 0 or s.effect.name in ALWAYS]
+        short = _shortlist(scores)
+        tasks = [(node.fit, present + s.effect, s.starts[:3]) for s in short]
+        names = [s.effect for s in short]
         for e in wider:
             model, start = _widened(node.fit, e)
             tasks.append((node.fit, model, tuple(start)))
@@ -122,29 +123,35 @@ class Search:
         why = objections(fit, effect)
         if why:
             return None, replace(candidate, reason=why)
-        (open_now, worse), (open_before, was) = ambiguity(fit), ambiguity(node.fit)
-        if open_now > open_before:
-            return None, replace(candidate, reason="not identifiable with these data beside the other parameters")
-        if worse > WORST_CONDITION and worse > 10 * was:
-            return None, replace(
-                candidate,
-                reason=f"not identifiable with these data: the condition number of the "
-                f"sensitivities rises from {was:.0f} to {worse:.0f}",
-            )
         gain = compare_errors(node.train, train, self.held.noise)
-        if gain.log_ratio < price_of(max(len(fit.problem.model.free_names) - node.size, 1), gain):
+        if not worth_it(max(len(fit.problem.model.free_names) - node.size, 1), gain):
             return None, replace(candidate, reason="the improvement is within what noise and chance would give")
         try:
-            held = self.held.errors(fit)
+            child = Node(fit, effect.name, train, self.held.errors(fit), node)
         except SimulationError as error:
             return None, replace(candidate, reason=f"fails on held-out data: {error}")
-        gain = compare_errors(node.held, held, self.held.noise)
-        candidate = replace(candidate, validation_nrmse=held.nrmse())
-        why = held_out_objection(gain)
+        candidate = replace(candidate, validation_nrmse=child.held.nrmse())
+        held = self.judge.held_gain(node, child)
+        why = held_out_objection(held) or self._ambiguous(node, fit, held)
         if why:
             return None, replace(candidate, reason=why)
-        candidate = replace(candidate, reason=f"lowers the held-out error by {100 * gain.fall:.1f} %")
-        return Node(fit, effect.name, train, held, node, candidate), candidate
+        candidate = replace(candidate, reason=f"lowers the held-out error by {100 * held.fall:.1f} %")
+        return replace(child, candidate=candidate), candidate
+
+    @staticmethod
+    def _ambiguous(node: Node, fit: Fit, held: Gain) -> str:
+        """Say so when the effect adds what these data cannot determine; a plain fall held out outweighs it."""
+        (open_now, worse), (open_before, was) = ambiguity(fit), ambiguity(node.fit)
+        if held.fall > PLAIN:
+            return ""
+        if open_now > open_before:
+            return "not identifiable with these data beside the other parameters"
+        if worse > WORST_CONDITION and worse > 10 * was:
+            return (
+                "not identifiable with these data: the condition number of the sensitivities rises from "
+                f"{was:.0f} to {worse:.0f}"
+            )
+        return ""
 
     @staticmethod
     def _listed(scores: Sequence[Score], judged: Mapping[str, Candidate]) -> list[Candidate]:
@@ -182,6 +189,16 @@ class Search:
             except SimulationError:
                 return None
         return self.nodes[key]
+
+
+def _shortlist(scores: Sequence[Score]) -> list[Score]:
+    """Return what is worth a refit: the best, what is common and near the best, and what a score cannot show."""
+    near = NEAR * max((s.drop for s in scores), default=0.0)
+    return [
+        s
+        for k, s in enumerate(scores)
+        if (s.drop > 0 and (k < SHORTLIST or (s.effect.name in COMMON and s.drop > near))) or s.effect.name in ALWAYS
+    ]
 
 
 def _drop(node: Node, train: Errors) -> float:

@@ -40,9 +40,9 @@ class HeldOut:
     Attributes
     ----------
     validation : Problem or None
-        Held-out runs, of the model to begin with.
+        Held-out runs, of the model to begin with; None: blocks instead.
     folds : tuple of (training Problem, test Experiments)
-        Without held-out runs: every other block of the records, twice.
+        Every other block of the fitted records held out, and the others.
     noise : dict of str to float
     """
 
@@ -54,23 +54,20 @@ class HeldOut:
     def of(fit: Fit, validate: Sequence[Experiment] | Experiment | None) -> HeldOut:
         """Prepare the judgement for models of `fit`'s records."""
         noise = {c: s for run in fit.problem.runs for c, s in run.sigma.items()}
+        validation = None
         if validate is not None:
             runs = (validate,) if isinstance(validate, Experiment) else tuple(validate)
-            return HeldOut(
-                fit.problem.with_(experiments=runs, model=fit.model, priors={}, penalties=(), balance={}),
-                (),
-                noise,
-            )
+            validation = fit.problem.with_(experiments=runs, model=fit.model, priors={}, penalties=(), balance={})
         folds = []
         for odd in (0, 1):
             train, test = zip(*(_blocked(r, odd) for r in fit.problem.experiments), strict=True)
             prepared = tuple(replace(run, experiment=e) for run, e in zip(fit.problem.runs, train, strict=True))
             problem = fit.problem.with_(experiments=train, priors={}, penalties=())
             folds.append((replace(problem, _runs=prepared), test))
-        return HeldOut(None, tuple(folds), noise)
+        return HeldOut(validation, tuple(folds), noise)
 
     def errors(self, fit: Fit) -> Errors:
-        """Return the held-out errors of `fit`, refitted to the training part of each fold where there are folds.
+        """Return the errors of `fit` on the held-out runs, or on blocks where there are none.
 
         Raises
         ------
@@ -78,6 +75,15 @@ class HeldOut:
         """
         if self.validation is not None:
             return Errors.of(simulated(self.validation.for_model(fit.model)))
+        return self.block_errors(fit)
+
+    def block_errors(self, fit: Fit) -> Errors:
+        """Return the errors of `fit` on every other block, refitted to the rest, and the other way round.
+
+        Raises
+        ------
+        SimulationError
+        """
         parts = []
         for problem, test in self.folds:
             start = problem.for_model(fit.model).balanced(fit.problem.balance).with_accuracy(ROUGH)
@@ -95,7 +101,8 @@ def _from(problem: Problem, q) -> Problem:
     for k, run in enumerate(problem.runs):
         start = run.start.copy()
         for j, c in enumerate(("i", "omega", "theta")):
-            start[j] = physical.get(f"{c}_0[{k}]", start[j])
+            if f"{c}_0[{k}]" in physical:  # rounding must not put it outside its limits
+                start[j] = np.clip(physical[f"{c}_0[{k}]"], *run.limits[c])
         runs.append(replace(run, start=start))
     return replace(problem, model=problem.model.start_at(values), _runs=tuple(runs))
 

@@ -131,5 +131,7 @@ def _noise_feedback(v, y) -> float:
     calm = (np.abs(dv) < 6 * np.median(np.abs(dv)) + 1e-300) & (np.abs(dy) < 6 * np.median(np.abs(dy)) + 1e-300)
     if calm.sum() < 50:
         return 0.0
+    if min(np.ptp(dv[calm]), np.ptp(dy[calm])) == 0:
+        return 0.0
     both = [np.corrcoef(dv[1:][calm[1:]], dy[:-1][calm[1:]])[0, 1], np.corrcoef(dv[calm], dy[calm])[0, 1]]
     return float(np.nanmax(np.abs(both)))
