@@ -8,6 +8,7 @@ from motorid.batch import fit_many, motors_in
 from motorid.bootstrap import bootstrap
 from motorid.checks import check_runs
 from motorid.comparison import compare
+from motorid.constraints import Constraint, CurrentLimit, SteadyState
 from motorid.datasets import data_path
 from motorid.derivatives import check_derivatives
 from motorid.diagnosis import diagnose, improve, locate, suggest_experiment
@@ -15,6 +16,7 @@ from motorid.errors import DataError, FitError, ModelError, MotoridError, Simula
 from motorid.experiment import Experiment
 from motorid.explore import explore
 from motorid.fit import Failure, Fit, fit, solve
+from motorid.formulations import compare_formulations
 from motorid.identifiability import identifiability
 from motorid.integrate import Cvodes, Idas, Rosenbrock
 from motorid.intervals import intervals
@@ -27,6 +29,7 @@ from motorid.profiling import profile, profiles
 from motorid.reading import read_csv, read_mat, read_runs
 from motorid.remedies import planned
 from motorid.report import report
+from motorid.shooting import MultipleShooting
 from motorid.simulate import evaluate, simulate
 from motorid.uncertainty import covariance
 
@@ -34,6 +37,7 @@ if _TYPE_CHECKING:
     from motorid.plots import (
         plot_current_limit,
         plot_fit,
+        plot_formulations,
         plot_ladder,
         plot_missing,
         plot_parameters,
@@ -49,6 +53,7 @@ if _TYPE_CHECKING:
 _FIGURES = (
     "plot_current_limit",
     "plot_fit",
+    "plot_formulations",
     "plot_ladder",
     "plot_missing",
     "plot_parameters",

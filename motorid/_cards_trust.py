@@ -165,6 +165,23 @@ def _intervals(r: Any) -> Card:
                 (("mi.plot_profile(intervals)", "see them"),), "plot_profile")  # fmt: skip
 
 
+def _formulations(r: Any) -> Card:
+    table = r.table
+    failed = [Flag(f"{f.name} failed", "bad") for f in r.all if f.fit is None]
+    shown = Table([h or "quantity" for h in table.heads], table.rows)
+    after = [("mi.plot_formulations(three)", "see it")]
+    if any(name.startswith("CurrentLimit") for f in r.all for name in f.violations):
+        after.append(("mi.plot_current_limit(three)", "the current and its limit"))
+    return Card(
+        "Plain, penalties, hard constraints",
+        failed,
+        (table.note,),
+        (shown,),
+        after,
+        "plot_formulations",
+    )
+
+
 WRITERS: dict[str, Callable[[Any], Card]] = {
     "Comparison": _comparison,
     "Suggestion": _suggestion,
@@ -174,4 +191,5 @@ WRITERS: dict[str, Callable[[Any], Card]] = {
     "Bootstrap": _bootstrap,
     "Profile": _profile,
     "Intervals": _intervals,
+    "Formulations": _formulations,
 }

@@ -30,7 +30,7 @@ ROWS = (
     "least_squares descent starting simulate result fit comparison multipliers conflict nlp nodes outcome shooting "
     "remedies",
     # 5 how far it can be trusted, and what it lacks
-    "identifiability uncertainty bootstrap profiling intervals endings multistart batch diagnosis",
+    "identifiability uncertainty bootstrap profiling intervals endings multistart batch formulations diagnosis",
     # 6 taking it along and showing it
     "export plots acquire summary explore report _html _html_tables _cards _cards_trust _sections _story",
     # 7 the command line and the public names

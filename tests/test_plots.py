@@ -4,6 +4,7 @@ import itertools
 import re
 import subprocess
 import sys
+from functools import lru_cache
 from types import SimpleNamespace
 
 import hand_made
@@ -15,7 +16,9 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 import motorid as mi
 from motorid import plots
+from motorid.constraints import CurrentLimit
 from motorid.errors import UsageError
+from motorid.formulations import compare_formulations
 from motorid.identifiability import identifiability
 from motorid.intervals import intervals
 from motorid.multistart import multistart
@@ -54,10 +57,18 @@ FIGURES = {
     "plot_singular_values": lambda d, check: plots.plot_singular_values(identifiability(d.after)),
     "plot_profile": lambda d, check: plots.plot_profile(intervals(d.after, n=12, quiet=True)),
     "plot_waterfall": lambda d, check: plots.plot_waterfall(multistart(d.after, starts=6, quiet=True)),
+    "plot_formulations": lambda d, check: plots.plot_formulations(formulations(d)),
+    "plot_current_limit, formulations": lambda d, check: plots.plot_current_limit(formulations(d)),
     "plot_current_limit": lambda d, check: plots.plot_current_limit(
         d.before, d.after, limit=1.0, labels=["plain", "better"]
     ),
 }
+
+
+@lru_cache
+def formulations(d):
+    run = d.before.problem.experiments[0]
+    return compare_formulations(mi.fit(mi.dc_motor(), run), [CurrentLimit(1.5)], weights=(0.1, 1.0))
 
 
 @pytest.fixture(scope="module", params=FIGURES)
@@ -72,15 +83,17 @@ def drawn(request, found, check):
 
 def test_every_axis_says_what_it_shows_and_in_which_unit(drawn):
     name, figure, axes = drawn
-    told = [
-        text for ax in axes for text in (ax.get_xlabel(), ax.get_ylabel(), ax.get_title(loc="left")) if text
-    ]
+    told = [text for ax in axes for text in (ax.get_xlabel(), ax.get_ylabel(), ax.get_title(loc="left")) if text]
     told.append(figure.get_supxlabel())
     units = {"plot_ranking": "(%)", "plot_ladder": "(%)", "plot_parameters": "(Ω)", "plot_profile": "(Ω)"}
-    units |= {"plot_waterfall": "ratio", "plot_singular_values": "singular value"}  # numbers without a unit
+    units |= {
+        "plot_waterfall": "ratio",
+        "plot_singular_values": "singular value",
+        "plot_formulations": "(%)",
+    }  # numbers without a unit
     assert any(units.get(name, "(A)") in t for t in told), told
     bottom = [ax for ax in axes if ax.get_subplotspec() is not None and ax.get_subplotspec().is_last_row()]
-    named_by_ticks = ("plot_parameters", "plot_ladder", "plot_singular_values", "plot_waterfall")
+    named_by_ticks = ("plot_parameters", "plot_ladder", "plot_singular_values", "plot_waterfall", "plot_formulations")
     if name not in named_by_ticks:
         assert all(ax.get_xlabel() for ax in bottom if ax.axison)
 
@@ -92,9 +105,7 @@ def test_no_words_overlap(drawn):
     for ax in figure.axes:
         words = [ax.title, ax._left_title, ax._right_title, ax.xaxis.label, ax.yaxis.label]
         words += [t for t in ax.get_xticklabels() + ax.get_yticklabels() if _in_view(ax, t)]
-        boxes += [
-            (w.get_text(), w.get_window_extent(renderer)) for w in words if w.get_text() and w.get_visible()
-        ]
+        boxes += [(w.get_text(), w.get_window_extent(renderer)) for w in words if w.get_text() and w.get_visible()]
         if ax.get_legend() is not None:
             boxes.append(("legend", ax.get_legend().get_window_extent(renderer)))
     for (a, p), (b, q) in itertools.combinations([x for x in boxes if x[1].width > 0], 2):
@@ -187,9 +198,7 @@ def test_a_channel_that_one_run_lacks_is_said_so(found):
 
 
 def test_a_linear_axis_is_labelled_in_metres(found):
-    run = mi.Experiment(
-        np.arange(10.0), {"v": np.ones(10)}, {"theta": np.arange(10.0)}, units={"theta": "m", "v": "A"}
-    )
+    run = mi.Experiment(np.arange(10.0), {"v": np.ones(10)}, {"theta": np.arange(10.0)}, units={"theta": "m", "v": "A"})
     assert axis_label("theta", run) == "position x (m)"
     assert axis_label("v", run) == "command u (A)"
 
@@ -233,9 +242,7 @@ def test_sensitivities_are_what_one_per_cent_of_a_parameter_does(found):
     axes = plots.plot_sensitivities(fit, names=["K"])
     t, drawn = axes[1].get_lines()[0].get_data()
     run = fit.problem.experiments[0]
-    moved = [
-        mi.simulate(fit.model.replace(K=fit.values["K"] * s), run)[0].outputs["omega"] for s in (1.001, 0.999)
-    ]
+    moved = [mi.simulate(fit.model.replace(K=fit.values["K"] * s), run)[0].outputs["omega"] for s in (1.001, 0.999)]
     finite = (moved[0] - moved[1]) / 0.002 * 0.01
     at = np.searchsorted(run.t, t)
     assert np.max(np.abs(drawn - finite[at])) < 0.05 * np.max(np.abs(finite))  # where it stops, steps differ
@@ -273,6 +280,7 @@ def test_binned_means_follow_the_curve(rng):
         (lambda d: plots.plot_sensitivities(d.before, run=7), "numbered from 0"),
         (lambda d: plots.plot_profile(d.before), "plot_profile takes"),
         (lambda d: plots.plot_singular_values(d.before), "plot_singular_values takes"),
+        (lambda d: plots.plot_formulations(d.before), "plot_formulations takes"),
         (lambda d: plots.plot_waterfall(d.before), "plot_waterfall takes"),
         (lambda d: plots.plot_current_limit(d.before), "no CurrentLimit"),
         (lambda d: plots.plot_current_limit(), "plot_current_limit takes fits"),

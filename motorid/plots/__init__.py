@@ -2,7 +2,7 @@
 
 from motorid.plots.diagnosis import plot_ladder, plot_missing, plot_ranking
 from motorid.plots.fits import plot_fit, plot_runs
-from motorid.plots.formulations import plot_current_limit
+from motorid.plots.formulations import plot_current_limit, plot_formulations
 from motorid.plots.intervals import plot_profile, plot_singular_values
 from motorid.plots.parameters import plot_parameters
 from motorid.plots.residuals import plot_residuals
@@ -11,6 +11,7 @@ from motorid.plots.trust import plot_sensitivities, plot_waterfall
 __all__ = [
     "plot_current_limit",
     "plot_fit",
+    "plot_formulations",
     "plot_ladder",
     "plot_missing",
     "plot_parameters",

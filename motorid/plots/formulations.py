@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -10,19 +11,37 @@ from matplotlib.axes import Axes
 from motorid.constraints import CurrentLimit
 from motorid.errors import UsageError
 from motorid.fit import Fit
-from motorid.plots.style import INK, MEASURED, MODEL, MUTED, PALETTE, axis_label, grid, line, styled, tidy
+from motorid.formulations import Formulations
+from motorid.plots.style import (
+    CYCLE,
+    INK,
+    MEASURED,
+    MODEL,
+    MUTED,
+    PALETTE,
+    WIDTH,
+    axis_label,
+    grid,
+    line,
+    new_figure,
+    plain_decades,
+    styled,
+    tidy,
+)
 from motorid.simulate import Simulation
 
 NEAR = 0.5  # of the limit: what is worth a closer look
 
 
 @styled
-def plot_current_limit(*fits: Fit, limit: float | None = None, labels: Sequence[str] | None = None) -> np.ndarray:
+def plot_current_limit(
+    *results: Fit | Formulations, limit: float | None = None, labels: Sequence[str] | None = None
+) -> np.ndarray:
     """Draw the current of one or several fits against the limit, what lies beyond it shaded.
 
     Parameters
     ----------
-    *fits : Fit
+    *results : Fit or Formulations
         Of the same records, e.g. plain, with penalties, with hard constraints.
     limit : float, optional
         In A; default: that of the first `CurrentLimit` found in the fits.
@@ -34,6 +53,9 @@ def plot_current_limit(*fits: Fit, limit: float | None = None, labels: Sequence[
     ndarray of Axes, shape (fits, runs)
         At most three runs, each where the current comes near the limit.
     """
+    fits: list[Fit] = []
+    for r in results:
+        fits += [f.fit for f in r.all if f.fit is not None] if isinstance(r, Formulations) else [r]
     if not fits or not all(isinstance(f, Fit) for f in fits):
         raise UsageError("plot_current_limit takes fits: mi.plot_current_limit(fit, hard, limit=8.0).")
     limit = limit if limit is not None else _limit_of(fits)
@@ -89,3 +111,62 @@ def _limit_of(fits: Sequence[Fit]) -> float:
             if isinstance(c, CurrentLimit):
                 return c.limit
     raise UsageError("no CurrentLimit in these fits; say which one to draw: mi.plot_current_limit(fit, limit=8.0).")
+
+
+@styled
+def plot_formulations(result: Formulations) -> np.ndarray:
+    """Draw the same fit plain, with penalties and with hard constraints: parameters, errors, and the walk between.
+
+    Parameters
+    ----------
+    result : Formulations
+
+    Returns
+    -------
+    ndarray of Axes, shape (3,)
+        Change of the parameters against the plain fit with two standard deviations; error per channel; distance
+        of the penalty solution from the hard one as the penalties grow heavier.
+    """
+    if not isinstance(result, Formulations):
+        raise UsageError(f"plot_formulations takes mi.compare_formulations(fit), got {type(result).__name__}.")
+    axes = new_figure(WIDTH, 3.0).subplots(1, 3, width_ratios=[1.5, 1.0, 1.0])
+    shown = [(f.name, f.fit, CYCLE[k]) for k, f in enumerate(result.all) if f.fit is not None]
+    _changes(axes[0], shown)
+    _errors(axes[1], shown)
+    _walk(axes[2], result)
+    handles, labels = axes[0].get_legend_handles_labels()
+    axes[0].figure.legend(handles, labels, loc="outside upper center", ncols=3)
+    return axes
+
+
+def _changes(ax: Axes, shown: Sequence[tuple[str, Any, str]]) -> None:
+    plain = shown[0][1]
+    names = [n for n in plain.problem.model.free_names if plain.values[n]]
+    for k, (word, fit, colour) in enumerate(shown):
+        place = np.arange(len(names)) + 0.22 * (k - 1)
+        change = [100 * (fit.values[n] / plain.values[n] - 1) for n in names]
+        spread = [200 * (fit.std[n] or 0.0) / abs(plain.values[n]) for n in names]
+        ax.errorbar(place, change, yerr=spread, fmt="o", ms=4.5, capsize=2.5, lw=1.2, color=colour, label=word)
+    ax.axhline(0, color=MUTED, lw=0.7)
+    ax.set_xticks(range(len(names)), names)
+    tidy(ax, y="change against the plain fit (%)", title="Parameters, ±2σ")
+
+
+def _errors(ax: Axes, shown: Sequence[tuple[str, Any, str]]) -> None:
+    channels = list(shown[0][1].nrmse)
+    for k, (_, fit, colour) in enumerate(shown):
+        place = np.arange(len(channels)) + 0.26 * (k - 1)
+        ax.bar(place, [100 * fit.nrmse[c] for c in channels], width=0.24, color=colour)
+    ax.set_xticks(range(len(channels)), [axis_label(c).split(" (")[0] for c in channels])
+    ax.grid(axis="x", visible=False)
+    tidy(ax, y="NRMSE (%)", title="Error")
+
+
+def _walk(ax: Axes, result: Formulations) -> None:
+    tidy(ax, x="weight of the penalties", y="distance from the hard fit (%)", title="Heavier penalties")
+    points = [(p.weight, 100 * p.distance) for p in result.path if p.distance > 0]
+    if not points:
+        ax.text(0.5, 0.5, "no path", transform=ax.transAxes, ha="center", color=MUTED)
+        return
+    ax.loglog(*zip(*points, strict=True), "o-", ms=4, color=CYCLE[1])
+    plain_decades(ax)
