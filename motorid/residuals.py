@@ -51,9 +51,10 @@ class Measured(NamedTuple):
 
     def residual(self, traj: Trajectory) -> tuple[Array, Array | None]:
         """Return the whitened residual (n,) and its Jacobian (n, nq), if the trajectory has one."""
-        if traj.dy is not None and not np.abs(traj.dy).max(initial=0.0) < LARGEST_SLOPE:
-            raise SimulationError(f"{self.name}: the sensitivities grow without bound; the model is unstable with "
-                                  "these parameters.")
+        for numbers in (traj.y, traj.dy):
+            if numbers is not None and not np.abs(numbers).max(initial=0.0) < LARGEST_SLOPE:
+                raise SimulationError(f"{self.name}: the simulation grows without bound; the model is unstable with "
+                                      "these parameters.")
         r = ((traj.y - self.y) * self.weights).ravel()
         jac = None if traj.dy is None else (traj.dy * self.weights[:, None]).reshape(r.size, -1)
         if self.index is None:

@@ -98,9 +98,13 @@ class Judge:
         if not children:
             return None
         ordered = sorted(children, key=lambda n: -self.worth(n))
-        top = ordered[0]
-        tied = [n for n in ordered if n is top or self.tied(top, n)]
-        chosen = min(tied, key=lambda n: (n.size, rarity(n.added), -self.worth(n)))
+        chosen = ordered[0]
+        while True:  # ties are not transitive: what is tied with the smaller model may be smaller still
+            tied = [n for n in ordered if n is chosen or self.tied(chosen, n)]
+            smaller = min(tied, key=lambda n: (n.size, rarity(n.added), -self.worth(n)))
+            if smaller is chosen or (smaller.size, rarity(smaller.added)) >= (chosen.size, rarity(chosen.added)):
+                break
+            chosen = smaller
         return chosen, ordered
 
     def worth(self, node: Node) -> float:
