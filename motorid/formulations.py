@@ -154,8 +154,8 @@ def compare_formulations(problem: Problem | Fit, constraints: Sequence[Relation]
     near = plain.problem.for_model(plain.model)
     hard = _tried(lambda: MultipleShooting(warm="model").solve(replace(near, constraints=relations)), plain)
     path = _path(near, relations, weights, hard) if isinstance(hard, Fit) else ()
-    return Formulations(*(_column(n, f, relations) for n, f in
-                          (("plain", plain), ("penalty", penalty), ("hard", hard))), path)
+    return Formulations(_column("plain", plain, relations), _column("penalty", penalty, relations),
+                        _column("hard", hard, relations), path)
 
 
 def _tried(attempt: Any, plain: Fit) -> Fit | Failure:

@@ -18,6 +18,7 @@ import numpy as np
 from motorid.integrate.grid import Array, Grid, Trajectory
 from motorid.problem import Problem
 from motorid.relations import Part, Relation
+from motorid.residuals import prior_residual
 from motorid.unknowns import Point
 
 FEWEST = 50  # samples per interval, unless a run is so long that it would need more intervals than
@@ -175,13 +176,14 @@ class Mesh:
         blocks = []
         for k in range(len(problem.runs)):
             r, jac = problem._lossy(*problem.run_residual(k, walk.runs[k]))
-            index = problem._weights[k][2]
+            index = problem._measured[k].index
             rows = np.arange(len(r)) if index is None else index
             blocks += self._by_interval(r, jac, self.owner[k][rows // len(problem.outputs)])
         if self.noise is not None:
             blocks += self.gaps(z, walk, weighed=True)
         if problem.priors:
-            blocks.append(Block(*problem._prior_part(z[:self.nq]), np.arange(self.nq)))
+            r, jac = prior_residual(problem.priors, problem.unknowns, walk.at)
+            blocks.append(Block(r, jac, np.arange(self.nq)))
         for penalty in problem.penalties:
             for part in penalty.parts(problem):
                 blocks += self._penalty(penalty, part, walk)

@@ -118,7 +118,8 @@ class ShootingNlp:
         if point is None:
             return np.full(self.hess_pattern.nnz(), np.nan)
         entries = np.concatenate([(b.jac.T @ b.jac).ravel() for b in point.residual])[self._hess_mask]
-        return np.bincount(self._hess_place, entries, self.hess_pattern.nnz()) * (self.scale * lam_f)
+        summed = np.bincount(self._hess_place, entries, self.hess_pattern.nnz())
+        return np.asarray(summed * (self.scale * lam_f), float)
 
     def functions(self) -> tuple[ca.Callback, dict[str, ca.Callback]]:
         """Return the NLP and its derivatives in CasADi's naming."""

@@ -71,7 +71,7 @@ class Part:
         found = self._mapped(x.T, self.u.T, wide, self.data.T)
         c = np.asarray(found[0]).T
         mean = self._mean(c).ravel()[self.keep]
-        if dx is None:
+        if dx is None or dp is None:
             return mean, None
         cx = np.asarray(found[1]).reshape(nc, m, -1).transpose(1, 0, 2)
         cp = np.asarray(found[2]).reshape(nc, m, -1).transpose(1, 0, 2)
