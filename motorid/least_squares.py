@@ -60,6 +60,7 @@ class LevenbergMarquardt:
 class Solution:
     """Where the solver ended: q, residual, jac (in q), status, message, history of costs, evaluations.
 
+    jac is that of the last step but one where the last one changed next to nothing.
     `status` is ``"converged"``, ``"stalled"`` (no step lowers the cost) or ``"limit"`` (of iterations).
     """
 
@@ -184,7 +185,8 @@ class _Search:
             step = self._shortened(step)
             predicted = -float(g @ step) - 0.5 * float(np.sum((triangle @ step[free]) ** 2))
             small = bool(np.max(np.abs(step) / (np.abs(self.q) + 1.0)) < o.xtol)
-            drop = self.cost - _cost(self.residual, self.q + step)
+            r, cost = _cost(self.residual, self.q + step)
+            drop = self.cost - cost
             self.evaluations += 1
             gain = drop / predicted if predicted > 0 else -1.0
             if drop > 0 and gain > 1e-4:
@@ -196,8 +198,11 @@ class _Search:
         self.lam = max(self.lam * max(1 / 3, 1 - (2 * min(gain, 1.0) - 1) ** 3), 1e-12) if o.damping else 0.0
         self.growth = 2.0
         enough = drop <= o.ftol * self.cost and self.lam < SLACK
+        if enough or small:  # so near that the Jacobian is still that of the solution
+            self.q, self.r, self.cost = self.q + step, r, cost
+            return end if small else "cost"
         self._move(self.q + step)
-        return end if small else "cost" if enough else ""
+        return ""
 
     def _shortened(self, step: Array) -> Array:
         """Return the step, no coordinate changing by more than is trusted, within the bounds."""
@@ -239,14 +244,14 @@ def _damped(triangle: Array, rotated: Array, size: Array, lam: float) -> Array:
     return -np.linalg.solve(small, q[:len(rotated)].T @ rotated) / size
 
 
-def _cost(residual: Callable[[Array], Array], q: Array) -> float:
+def _cost(residual: Callable[[Array], Array], q: Array) -> tuple[Array, float]:
     try:
         r = residual(q)
     except SimulationError:
-        return np.inf
+        return np.empty(0), np.inf
     with np.errstate(over="ignore", invalid="ignore"):
         cost = 0.5 * float(r @ r)
-    return cost if np.isfinite(cost) else np.inf
+    return r, cost if np.isfinite(cost) else np.inf
 
 
 def gauss_newton_covariance(jac: Array, variance: float = 1.0) -> tuple[Array, np.ndarray]:
