@@ -28,11 +28,9 @@ def numbers(text):
 
 
 @pytest.mark.slow
-def test_the_story_runs_and_prints_what_the_readme_shows(text, tmp_path, monkeypatch):
+def test_the_story_runs_and_prints_what_the_readme_shows(text):
     story, shown = blocks(text, "python")[0], blocks(text, "text")[0]
     assert len([line for line in story.splitlines() if line and not line.startswith(("import", "print"))]) <= 10
-    (tmp_path / "data").symlink_to(mi.data_path())
-    monkeypatch.chdir(tmp_path)
     said = io.StringIO()
     with contextlib.redirect_stdout(said):
         exec(compile(story, "README.md", "exec"), {})
