@@ -68,6 +68,7 @@ class Problem:
         object.__setattr__(self, "experiments", tuple(runs))
         if not self.experiments or not all(isinstance(r, Experiment) for r in self.experiments):
             raise UsageError("a problem needs at least one Experiment: runs = mi.read_runs('run*.csv').")
+        object.__setattr__(self, "experiments", tuple(_without_empty(r) for r in self.experiments))
         if self.weights not in ("noise", "rms"):
             raise UsageError(one_of(self.weights, ("noise", "rms"), "weights"))
         if not self.outputs:
@@ -289,6 +290,12 @@ class Problem:
     def with_(self, **fields: Any) -> Problem:
         """Return a copy with some fields changed, e.g. ``with_(model=…)``."""
         return replace(self, **{"_runs": None, **fields})
+
+
+def _without_empty(run: Experiment) -> Experiment:
+    """Leave out channels that have not a single sample."""
+    empty = [c for c, y in run.outputs.items() if not (np.isfinite(y[0]) or np.isfinite(y).any())]
+    return run.without(*empty) if empty else run
 
 
 def as_problem(model: Model, runs: Sequence[Experiment] | Experiment, **fields: Any) -> Problem:

@@ -298,3 +298,11 @@ def test_three_intervals_stand_side_by_side(fit):
         assert max(widths) < 1.8 * min(widths), name
     assert json.dumps(found.to_dict())
     assert all(word in str(found) for word in ("covariance", "bootstrap (blocks)", "profile"))
+
+
+def test_channel_without_a_single_sample_is_as_good_as_absent(runs):
+    empty = [r.with_(outputs={**r.outputs, "omega": np.full(r.n, np.nan)}) for r in runs]
+    absent = covariance(mi.fit(mi.dc_motor(), [r.without("omega") for r in runs]))
+    assert covariance(mi.fit(mi.dc_motor(), empty)).std == absent.std
+    mixed = mi.fit(mi.dc_motor(), [empty[0], runs[1]])
+    assert covariance(mixed).std["K"] > 0
