@@ -146,10 +146,10 @@ def test_rich_is_for_terminals_only(imports):
     assert all(i.late for i in imports if i.name.split(".")[0] == "rich")
 
 
-def test_importing_motorid_loads_nothing_heavy():
+def test_importing_motorid_loads_nothing_heavy(tmp_path):
     code = f"import sys, motorid; print([m for m in {NOT_ON_IMPORT!r} if m in sys.modules])"
     command = [sys.executable, "-c", code]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120, check=True)
     assert done.stdout.strip() == "[]"
 
 
