@@ -82,7 +82,69 @@ CARDS = {
         regions={"steady": 0.6}, bins={"torque": (SimpleNamespace(against="omega", explained=0.93),)}))),
     "ladder": lambda: card_of(_as("Ladder", fake_ladder())),
     "diagnosis": lambda: card_of(_as("Diagnosis", fake_diagnosis())),
+    "covariance": lambda: card_of(_as("Covariance", trusted()[0])),
+    "bootstrap": lambda: card_of(_as("Bootstrap", trusted()[1])),
+    "profile": lambda: card_of(_as("Profile", trusted()[2])),
+    "intervals": lambda: card_of(_as("Intervals", trusted()[3])),
+    "identifiability": lambda: card_of(_as("Identifiability", identifiability())),
+    "multistart": lambda: card_of(_as("Multistart", multistart())),
+    "comparison": lambda: card_of(_as("Comparison", comparison())),
+    "formulations": lambda: card_of(_as("Formulations", formulations())),
+    "suggestion": lambda: card_of(_as("Suggestion", SimpleNamespace(
+        name="reversals", text="Reverse the voltage every 0.2 s.", discrimination={"chirp": 3.0, "reversals": 41.2}))),
 }  # fmt: skip
+
+
+def trusted():
+    """What says how far to trust a fit, as cards read it."""
+    reach = {"R": (1.372, 1.388), "b": None}
+    covariance = SimpleNamespace(
+        names=("R", "b"), values=(1.38, 6.5e-5), units=("Ω", "N·m·s/rad"), std={"R": 0.004, "b": None},
+        status={"R": "determined", "b": "at its lower limit"}, interval=lambda n, level=0.95: reach[n],
+        correlation=[[1.0, -0.97], [-0.97, 1.0]], method="coloured",
+        colours={"i": SimpleNamespace(effective_share=0.87)},
+    )  # fmt: skip
+    bootstrap = SimpleNamespace(
+        kind="blocks", names=("R", "b"), reference=(1.38, 6.5e-5), units=("Ω", "N·m·s/rad"), samples=[0] * 100,
+        std={"R": 0.0041, "b": None}, status={"R": "determined", "b": "not determined"}, interrupted="",
+        interval=lambda n, level=0.95: reach[n], limited={"R": 0.0, "b": 0.12}, failures=(Failure({}, "failed", ""),),
+    )  # fmt: skip
+    profile = SimpleNamespace(name="R", unit="Ω", value=1.38, best=-2.0, interval=lambda level=0.95: (1.372, np.inf))
+    intervals = SimpleNamespace(level=0.95, covariance=covariance, bootstrap=bootstrap, profiles={"R": profile})
+    return covariance, bootstrap, profile, intervals
+
+
+def identifiability():
+    return SimpleNamespace(
+        names=("R", "K"), values=(1.38, 0.046), sizes=(1.38, 0.046), units=("Ω", "N·m/A"), rank=1, full=False,
+        std={"R": None, "K": 1e-5}, text="These records determine 1 combination.",
+    )  # fmt: skip
+
+
+def multistart():
+    statistics = {
+        "R": {"reference": 1.38, "mean": 1.38, "std": 1e-9},
+        "K": {"reference": 0.046, "mean": None, "std": None},
+    }
+    return SimpleNamespace(
+        endings=[0] * 10, good=8, poor=1, failed=1, spread=10.0, seconds=3.2, interrupted="stopped after 10 of 20 starts",
+        reference=SimpleNamespace(model=mi.dc_motor()), statistics=lambda: statistics,
+    )  # fmt: skip
+
+
+def comparison():
+    plain, better = fake_ladder().rungs[0].fit, fake_fit()
+    names = ("dc_motor", "dc_motor + coulomb")
+    entries = {"R": ((1.4, 0.01), (1.38, 0.004)), "L": ((1.6e-3, 1e-5), (1.72e-3, None)), "tau_c": (None, (8e-3, 6e-6))}
+    errors = (plain.nrmse, better.nrmse)
+    return SimpleNamespace(fits=(plain, better), names=names, nrmse=errors, validation_nrmse=errors, parameters=entries)
+
+
+def formulations():
+    table = SimpleNamespace(heads=("", "plain", "hard"), rows=(("R", "1.38 Ω", "–"),), note="The limit cannot be kept.")
+    columns = [SimpleNamespace(name="plain", fit=1, violations={"CurrentLimit(4 A), A": 0.4}),
+               SimpleNamespace(name="hard", fit=None, violations={})]  # fmt: skip
+    return SimpleNamespace(table=table, all=columns)
 
 
 def _as(kind, fake):
