@@ -127,8 +127,8 @@ def multistart():
         "K": {"reference": 0.046, "mean": None, "std": None},
     }
     return SimpleNamespace(
-        endings=[0] * 10, good=8, poor=1, failed=1, spread=10.0, seconds=3.2, interrupted="stopped after 10 of 20 starts",
-        reference=SimpleNamespace(model=mi.dc_motor()), statistics=lambda: statistics,
+        endings=[0] * 10, good=8, poor=1, failed=1, spread=10.0, seconds=3.2,
+        interrupted="stopped after 10 of 20 starts", reference=SimpleNamespace(model=mi.dc_motor()), statistics=lambda: statistics,
     )  # fmt: skip
 
 
