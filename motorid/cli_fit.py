@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -24,8 +24,8 @@ from motorid.experiment import Experiment
 from motorid.fit import Fit
 from motorid.formatting import duration
 from motorid.simulate import Evaluation, evaluate
-from motorid.summary import fit_dict, plain, remarks, run_dict, write_json
-from motorid.tables import derived_table, error_table, parameter_table, run_table
+from motorid.summary import constraint_violations, fit_dict, remarks, run_dict, write_json
+from motorid.tables import constraint_table, derived_table, error_table, parameter_table, run_table
 
 GOOD = ("converged", "limit", "stalled")
 
@@ -113,7 +113,7 @@ def show_fit(
     show(error_table(found, judged), run_table(found.evaluation) if len(records) > 1 else None,
          run_table(judged, "Held-out NRMSE run by run") if judged and several else None,
          derived_table(found))
-    show(*_constraints(found))
+    show(constraint_table(found, constraint_violations(found)))
     engine = found.problem.engine
     message = found.message.removeprefix(f"{found.status}: ")
     show(f"{found.status}: {message}\n{found.iterations} iterations, {duration(found.seconds)}, engine "
@@ -124,11 +124,6 @@ def _amount(records: list[Experiment]) -> str:
     samples, seconds = sum(r.n for r in records), sum(r.duration for r in records)
     runs = "1 run" if len(records) == 1 else f"{len(records)} runs"
     return f"{runs}, {samples} samples, {duration(seconds)}"
-
-
-def _constraints(found: Fit) -> list[str]:
-    violations: dict[str, Any] = dict(found.extra.get("violations", {}))
-    return [f"{name}: largest violation {plain(value)}" for name, value in violations.items()]
 
 
 def _write_simulations(judged: Evaluation, out: Path) -> list[str]:

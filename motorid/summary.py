@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from motorid.errors import UsageError
+from motorid.multipliers import violations
+from motorid.relations import Relation
 
 if TYPE_CHECKING:
     from motorid.fit import Fit
@@ -38,12 +40,21 @@ def fit_dict(fit: Fit, held_out: Evaluation | None = None) -> dict[str, Any]:
         "integration_error": fit.integration_error,
         "derived": {"tau_e": fit.tau_e, "tau_m": fit.tau_m, "damping": fit.damping},
         "steady_state_error": dict(fit.steady_state_error),
-        "violations": dict(fit.extra.get("violations", {})),
+        "violations": constraint_violations(fit),
+        "multipliers": [{"constraint": m.name, "value": m.value, "unit": m.unit, "active": m.active}
+                        for m in fit.extra.get("multipliers", ())],
         "initial": dict(fit.initial),
         "runs": [run_dict(r) | {"nrmse": dict(e)}
                  for r, e in zip(problem.experiments, fit.evaluation.by_run, strict=True)],
         "remarks": remarks(fit),
     }
+
+
+def constraint_violations(fit: Fit) -> dict[str, float]:
+    """Return the largest violation of each constraint or weighted relation; empty for a plain fit."""
+    problem = fit.problem
+    relations = [r for r in (*problem.constraints, *problem.penalties) if isinstance(r, Relation)]
+    return violations(problem, fit.q, relations) if relations else {}
 
 
 def run_dict(run: Any) -> dict[str, Any]:

@@ -93,6 +93,18 @@ def derived_table(fit: Fit) -> Table | None:
     return Table("", ("derived", ""), tuple(rows), left=(0, 1)) if rows else None
 
 
+def constraint_table(fit: Fit, violations: Mapping[str, float]) -> Table | None:
+    """Return how far each constraint is violated and, of true constraints, what it costs to keep it."""
+    multipliers = {f"{m.name}, {m.unit}": m for m in fit.extra.get("multipliers", ())}
+    rows = []
+    for name, beyond in violations.items():
+        m = multipliers.get(name)
+        rows.append((name.rpartition(", ")[0] or name, quantity(beyond, name.rpartition(", ")[2], 3),
+                     m.text if m is not None else "weighed, not enforced"))
+    heads = ("constraint", "largest violation", "")
+    return Table("Constraints", heads, tuple(rows), left=(0, 2)) if rows else None
+
+
 def comparison_table(fits: Sequence[tuple[str, Fit]], held_out: Sequence[Evaluation | None] = ()) -> Table:
     """Return models side by side: errors of the fit, held-out errors, parameters."""
     channels = list(fits[0][1].nrmse)

@@ -189,6 +189,26 @@ def test_penalty_formulation_weighs_the_current_limit(tmp_path):
     free, held = motorid_json(tmp_path, *words), motorid_json(tmp_path, *words, "--current-limit", "2.5")
     assert (free["formulation"], held["formulation"]) == ("penalty", "penalty")
     assert held["parameters"]["R"]["value"] > 1.05 * free["parameters"]["R"]["value"]
+    assert held["violations"]["CurrentLimit(2.5 A), A"] > 0.01
+    assert not any(name.startswith("Current") for name in free["violations"])
+
+
+def test_hard_formulation_keeps_the_current_limit(tmp_path):
+    found = motorid_json(tmp_path, "fit", STEPS / "step_6V.csv", "--formulation", "hard", "--current-limit", "2.5")
+    assert (found["formulation"], found["status"]) == ("hard", "converged")
+    assert max(found["violations"].values()) < 1e-6
+    assert found["multipliers"][0]["constraint"] == "CurrentLimit(2.5 A)"
+    assert found["multipliers"][0]["value"] > 0
+    text = motorid("fit", STEPS / "step_6V.csv", "--formulation", "hard", "--current-limit", "2.5").out
+    assert "Constraints" in text
+
+
+def test_multiple_shooting_without_constraints_agrees_with_least_squares(tmp_path):
+    shot = motorid_json(tmp_path, "fit", NOISY, "--solver", "multiple-shooting")
+    plain = motorid_json(tmp_path, "fit", NOISY)
+    assert shot["formulation"] == plain["formulation"] == "plain"
+    for name, p in plain["parameters"].items():
+        assert shot["parameters"][name]["value"] == pytest.approx(p["value"], abs=0.05 * p["std"]), name
 
 
 def test_huber_loss_forgives_outliers(tmp_path):
