@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from motorid.descent import descend, misfit_over_noise
+from motorid.descent import Descent, descend, misfit_over_noise
 from motorid.diagnosis.evidence import Errors
 from motorid.diagnosis.rank import uses_angle
 from motorid.errors import FitError, ModelError, SimulationError
@@ -122,25 +122,17 @@ def refit(fit: Fit, model: Model, starts: Sequence[Mapping[str, float]]) -> Fit 
     Effects of the angle start along the measured angle, which the model's own angle, still wrong, would lead
     astray; then the model's angle takes over.
     """
-    model = _revived(fit, _bounded(fit, model))
+    model = _bounded(fit, model)
+    alive = _revived(fit, model)
     angular = any(uses_angle(e) for e in model.effects) and not any(uses_angle(e) for e in fit.model.effects)
     raced = []
     for start in starts or ({},):
-        names = [n for n in start if n in model.parameters]
-        problem = fit.problem.for_model(_within(model, {n: start[n] for n in names})).with_accuracy(ROUGH)
-        q = problem.scaling.scaled([fit.initial.get(p.name, p.value) for p in problem.unknown])
-        problem = _from(problem, q)
-        if angular:
-            problem = problem.for_model(replace(problem.model, angle_input=True, _systems={}))
-        try:
-            done = descend(problem, RACE, stages=False)
-        except FAILURES:
-            continue
-        if sum(int(r.grid.substeps.sum()) for r in done.problem.runs) > SUBSTEPS * sum(
-            r.experiment.n for r in problem.runs
-        ):
-            continue
-        raced.append((done.solution.history[-1], _from(done.problem, done.solution.q)))
+        # As it is where a parameter put back (an inductance that no sample shows) makes the model too stiff.
+        for each in (alive,) if alive is model else (alive, model):
+            done = _race(fit, each, start, angular)
+            if done is not None:
+                raced.append((done.solution.history[-1], _from(done.problem, done.solution.q)))
+                break
     if not raced:
         return None
     best = min(raced, key=lambda c: c[0])[1]
@@ -151,6 +143,22 @@ def refit(fit: Fit, model: Model, starts: Sequence[Mapping[str, float]]) -> Fit 
     except FAILURES:
         return None
     return _polished(fit, _from(done.problem, done.solution.q))
+
+
+def _race(fit: Fit, model: Model, start: Mapping[str, float], angular: bool) -> Descent | None:
+    """Go a few steps from `start`; None where that fails or needs more sub-steps than the samples are worth."""
+    names = [n for n in start if n in model.parameters]
+    problem = fit.problem.for_model(_within(model, {n: start[n] for n in names})).with_accuracy(ROUGH)
+    q = problem.scaling.scaled([fit.initial.get(p.name, p.value) for p in problem.unknown])
+    problem = _from(problem, q)
+    if angular:
+        problem = problem.for_model(replace(problem.model, angle_input=True, _systems={}))
+    try:
+        done = descend(problem, RACE, stages=False)
+    except FAILURES:
+        return None
+    spent = sum(int(r.grid.substeps.sum()) for r in done.problem.runs)
+    return done if spent <= SUBSTEPS * sum(r.experiment.n for r in problem.runs) else None
 
 
 def _revived(fit: Fit, model: Model) -> Model:
@@ -166,7 +174,7 @@ def _revived(fit: Fit, model: Model) -> Model:
             slope = float(np.linalg.norm(fit.jacobian[:, names.index(p.name)]))
             if 0 < p.value * slope < ALIVE:
                 back[p.name] = float(np.clip(3 * ALIVE / slope, p.lower, min(p.upper, 1e6 * p.value)))
-    return model.start_at(back)
+    return model.start_at(back) if back else model
 
 
 def _bounded(fit: Fit, model: Model) -> Model:
