@@ -1,0 +1,257 @@
+"""A fitted model as C: source, header and an example program, with no dependency but the C library."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from motorid.fit import Fit
+from motorid.integrate.step import step_functions
+from motorid.model import Model
+from motorid.portable import description, held_inputs, runs_of, system_of, values_of, words
+
+HEADER = """/* {title}
+ *
+{about}
+ */
+#ifndef {NAME}_H
+#define {NAME}_H
+
+#ifdef __cplusplus
+extern "C" {{
+#endif
+
+/* States x, inputs u, outputs y, parameters p: SI units, in this order. */
+{sizes}
+
+extern const char* const {name}_state_names[{NAME}_NX];
+extern const char* const {name}_input_names[{NAME}_NU];
+extern const char* const {name}_output_names[{NAME}_NY];
+extern const char* const {name}_parameter_names[{NAME}_NP];
+extern const double {name}_parameters[{NAME}_NP];
+extern const int {name}_held[{NAME}_NU]; /* 1: the input stays constant between samples, 0: straight lines */
+{starts_declared}
+/* x at the start from s = (current, speed, angle) there. */
+void {name}_initial(const double s[3], const double* p, double* x);
+/* dx/dt; of a balance without storage, the balance itself. */
+void {name}_rhs(const double* x, const double* u, const double* p, double* dx);
+/* What the sensors show. */
+void {name}_outputs(const double* x, const double* u, const double* p, double* y);
+/* x over dt in equal sub-steps, the input running from u0 to u1. An L-stable step: stiffness does no harm. */
+void {name}_step(double* x, const double* u0, const double* u1, double dt, int substeps, const double* p);
+
+#ifdef __cplusplus
+}}
+#endif
+#endif
+"""
+
+WRAPPER = """
+#include "{name}.h"
+
+const char* const {name}_state_names[{NAME}_NX] = {{{states}}};
+const char* const {name}_input_names[{NAME}_NU] = {{{inputs}}};
+const char* const {name}_output_names[{NAME}_NY] = {{{outputs}}};
+const char* const {name}_parameter_names[{NAME}_NP] = {{{parameter_names}}};
+const double {name}_parameters[{NAME}_NP] = {{
+  {parameters}
+}};
+const int {name}_held[{NAME}_NU] = {{{held}}};
+{starts}
+static void {name}_call(int (*f)(const double**, double**, int*, double*, int), const double** given, int n_given,
+                        double* result, double* other) {{
+  const double* arg[{sz_arg}];
+  double* res[{sz_res}];
+  int iw[{sz_iw}];
+  double w[{sz_w}];
+  int k;
+  for (k = 0; k < {sz_arg}; k++) arg[k] = k < n_given ? given[k] : 0;
+  for (k = 0; k < {sz_res}; k++) res[k] = 0;
+  res[0] = result;
+  res[1] = other;
+  f(arg, res, iw, w, 0);
+}}
+
+void {name}_initial(const double s[3], const double* p, double* x) {{
+  const double* given[2];
+  given[0] = s; given[1] = p;
+  {name}_f_initial_call(given, 2, x);
+}}
+
+void {name}_rhs(const double* x, const double* u, const double* p, double* dx) {{
+  const double* given[3];
+  given[0] = x; given[1] = u; given[2] = p;
+  {name}_f_rhs_call(given, 3, dx);
+}}
+
+void {name}_outputs(const double* x, const double* u, const double* p, double* y) {{
+  const double* given[3];
+  given[0] = x; given[1] = u; given[2] = p;
+  {name}_f_outputs_call(given, 3, y);
+}}
+
+void {name}_step(double* x, const double* u0, const double* u1, double dt, int substeps, const double* p) {{
+  double a[{NAME}_NU], b[{NAME}_NU], next[{NAME}_NX], error[{NAME}_NX], h = dt / substeps;
+  const double* given[5];
+  int s, j;
+  for (s = 0; s < substeps; s++) {{
+    for (j = 0; j < {NAME}_NU; j++) {{
+      a[j] = u0[j] + (u1[j] - u0[j]) * s / substeps;
+      b[j] = u0[j] + (u1[j] - u0[j]) * (s + 1) / substeps;
+    }}
+    given[0] = x; given[1] = a; given[2] = b; given[3] = &h; given[4] = p;
+    {name}_call({name}_f_step, given, 5, next, error);
+    for (j = 0; j < {NAME}_NX; j++) x[j] = next[j];
+  }}
+}}
+"""
+
+MAIN = r"""/* Example: walk the model over a record.
+ *
+ *   cc -O2 {name}_main.c {name}.c -lm -o {name}
+ *   ./{name} RECORD.csv [RUN] > out.csv
+ *
+ * RECORD.csv has one heading line, then per sample: time (s), the inputs, and the sub-steps to the next sample.
+ * RUN counts the records of the fit from 0; it picks the state at the start (all zero where there is none).
+ */
+#include <stdio.h>
+#include <stdlib.h>
+#include "{name}.h"
+
+static int read_row(FILE* file, double* t, double* u, int* substeps) {{
+  int j;
+  if (fscanf(file, "%lf", t) != 1) return 0;
+  for (j = 0; j < {NAME}_NU; j++) if (fscanf(file, " ,%lf", &u[j]) != 1) return 0;
+  return fscanf(file, " ,%d", substeps) == 1 && *substeps > 0;
+}}
+
+int main(int argc, char** argv) {{
+  double s[3] = {{0, 0, 0}}, x[{NAME}_NX], y[{NAME}_NY], u[{NAME}_NU], v[{NAME}_NU], t, later;
+  int run = argc > 2 ? atoi(argv[2]) : 0, m, next, j, c;
+  FILE* file = argc > 1 ? fopen(argv[1], "r") : 0;
+  if (!file) {{ fprintf(stderr, "usage: %s RECORD.csv [RUN]\n", argv[0]); return 2; }}
+  while ((c = fgetc(file)) != '\n' && c != EOF) {{}}
+#ifdef {NAME}_RUNS
+  if (run < 0 || run >= {NAME}_RUNS) {{ fprintf(stderr, "runs are 0 to %d\n", {NAME}_RUNS - 1); return 2; }}
+  for (j = 0; j < 3; j++) s[j] = {name}_starts[run][j];
+#else
+  (void)run;
+#endif
+  if (!read_row(file, &t, u, &m)) {{ fprintf(stderr, "%s has no rows of t, inputs, sub-steps\n", argv[1]); return 2; }}
+  {name}_initial(s, {name}_parameters, x);
+  printf("t");
+  for (j = 0; j < {NAME}_NY; j++) printf(",%s", {name}_output_names[j]);
+  for (;;) {{
+    {name}_outputs(x, u, {name}_parameters, y);
+    printf("\n%.17g", t);
+    for (j = 0; j < {NAME}_NY; j++) printf(",%.17g", y[j]);
+    if (!read_row(file, &later, v, &next)) break;
+    {{
+      double end[{NAME}_NU];
+      for (j = 0; j < {NAME}_NU; j++) end[j] = {name}_held[j] ? u[j] : v[j];
+      {name}_step(x, u, end, later - t, m, {name}_parameters);
+    }}
+    for (j = 0; j < {NAME}_NU; j++) u[j] = v[j];
+    t = later; m = next;
+  }}
+  printf("\n");
+  fclose(file);
+  return 0;
+}}
+"""
+
+
+def write_c(found: Fit | Model, path: Path) -> list[Path]:
+    """Write ``NAME.c``, ``NAME.h``, ``NAME_main.c``, and of a fit its records ``NAME_run0.csv`` …; return the paths.
+
+    NAME is the stem of `path`, made a C identifier. See the header for the functions.
+    """
+    name = identifier(path.stem)
+    folder = path.parent
+    fields = _fields(found, name)
+    files = {f"{name}.h": HEADER.format_map(fields), f"{name}.c": fields["generated"] + _wrapper(fields),
+             f"{name}_main.c": MAIN.format_map(fields)}
+    if isinstance(found, Fit):
+        for k, (run, _) in enumerate(runs_of(found)):
+            files[f"{name}_run{k}.csv"] = _record(run.grid, found.problem.system.inputs)
+    for file, text in files.items():
+        (folder / file).write_text(text, encoding="utf-8")
+    return [folder / f"{name}.c", *(folder / f for f in files if f != f"{name}.c")]
+
+
+def identifier(stem: str) -> str:
+    """Return a C identifier like `stem`."""
+    name = re.sub(r"\W", "_", stem, flags=re.ASCII)
+    return name if name[:1].isalpha() else f"motor_{name}"
+
+
+def _wrapper(fields: dict[str, Any]) -> str:
+    text = WRAPPER
+    for f in ("initial", "rhs", "outputs"):  # one result each
+        n = {"initial": 2}.get(f, 3)
+        result = {"initial": "x", "rhs": "dx", "outputs": "y"}[f]
+        text = text.replace(f"{{name}}_f_{f}_call(given, {n}, {result});",
+                            f"{{name}}_call({{name}}_f_{f}, given, {n}, {result}, 0);")
+    return text.format_map(fields)
+
+
+def _fields(found: Fit | Model, name: str) -> dict[str, Any]:
+    system = system_of(found)
+    functions = [_as(system.initial, f"{name}_f_initial"), _as(system.rhs, f"{name}_f_rhs"),
+                 _as(system.out, f"{name}_f_outputs"), _as(step_functions(system).light, f"{name}_f_step")]
+    sizes = dict(zip(("NX", "NU", "NP", "NY"), system.sizes, strict=True))
+    starts = [s for _, s in runs_of(found)] if isinstance(found, Fit) else []
+    held = held_inputs(system.inputs, found.problem.experiments[0]) if isinstance(found, Fit) else [
+        n != "theta_in" for n in system.inputs]
+    runs = f"#define {name.upper()}_RUNS {len(starts)}\n" if starts else ""
+    return {
+        "name": name, "NAME": name.upper(), "title": f"{name}: a motor model as C", "generated": _generated(functions),
+        "about": "\n".join(f" * {line}".rstrip() for line in words(description(found))),
+        "sizes": "\n".join(f"#define {name.upper()}_{k} {v}" for k, v in sizes.items()),
+        "states": _strings(system.states), "inputs": _strings(system.inputs), "outputs": _strings(system.outputs),
+        "parameter_names": _strings(system.parameters), "held": ", ".join(str(int(h)) for h in held),
+        "parameters": ",\n  ".join(f"{v!r}" for v in values_of(found, system).tolist()),
+        "starts_declared": f"{runs}extern const double {name}_starts[{len(starts)}][3];"
+                           " /* (current, speed, angle) at the start of the records of the fit */\n" if starts else "",
+        "starts": _starts(name, starts),
+        "sz_arg": max(max(f.sz_arg() for f in functions), 1), "sz_res": max(max(f.sz_res() for f in functions), 2),
+        "sz_iw": max(max(f.sz_iw() for f in functions), 1), "sz_w": max(max(f.sz_w() for f in functions), 1),
+    }
+
+
+def _as(f: ca.Function, name: str) -> ca.Function:
+    args = f.sx_in()
+    return ca.Function(name, args, f.call(args))
+
+
+def _generated(functions: Sequence[ca.Function]) -> str:
+    code = ca.CodeGenerator("model", {"casadi_int": "int", "casadi_real": "double", "with_header": False})
+    for f in functions:
+        code.add(f)
+    return code.dump()
+
+
+def _strings(names: Sequence[str]) -> str:
+    return ", ".join(f'"{n}"' for n in names)
+
+
+def _starts(name: str, starts: Sequence[np.ndarray]) -> str:
+    if not starts:
+        return ""
+    rows = ",\n".join("  {" + ", ".join(repr(v) for v in s.tolist()) + "}" for s in starts)
+    return f"const double {name}_starts[{len(starts)}][3] = {{\n{rows}\n}};\n"
+
+
+def _record(grid: Any, inputs: Sequence[str]) -> str:
+    substeps = np.append(grid.substeps, 1)
+    rows = [",".join([repr(t), *map(repr, u), str(m)])
+            for t, u, m in zip(grid.t.tolist(), grid.u.tolist(), substeps.tolist(), strict=True)]
+    return "\n".join([",".join(["t", *inputs, "substeps"]), *rows, ""])
+
+
+__all__ = ["identifier", "write_c"]

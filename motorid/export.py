@@ -1,0 +1,262 @@
+"""Taking a fitted model along: a file of CasADi functions, C source, JSON, an FMU; and back."""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from motorid.effects import LIBRARY
+from motorid.errors import DataError, ModelError, UsageError, one_of
+from motorid.fit import Fit
+from motorid.integrate.grid import Array
+from motorid.model import Effect, Model, dc_motor, torque_driven
+from motorid.portable import description, functions_of, model_of
+
+FORMS = {".casadi": "casadi", ".c": "c", ".json": "json", ".fmu": "fmu"}
+NOT_OURS = "it is not a file that mi.export wrote"
+
+
+@dataclass(frozen=True, eq=False)
+class Exported:
+    """A ``.casadi`` file read back.
+
+    Attributes
+    ----------
+    functions : dict of str to casadi.Function
+        ``rhs``, ``outputs``, ``initial``, ``step``, ``parameters``; per record of the fit ``record_k`` and
+        ``simulate_k``. See `export`.
+    info : dict
+        What ``fit --json`` holds, with covariance, fingerprints of the records and versions.
+    """
+
+    functions: Mapping[str, ca.Function]
+    info: Mapping[str, Any]
+
+    @property
+    def values(self) -> dict[str, float]:
+        """Parameter values, SI."""
+        return {n: p["value"] for n, p in self.info["parameters"].items()}
+
+    @property
+    def model(self) -> Model:
+        """The model, if all its effects are in the library; else see `model_from_json`."""
+        return model_from_json(self.info)
+
+    def simulate(self, k: int = 0, u: Array | None = None) -> Array:
+        """Return the outputs (N, ny) on record `k` of the fit, with its own inputs or others of the same length."""
+        if f"simulate_{k}" not in self.functions:
+            known = [n for n in self.functions if n.startswith("simulate_")]
+            raise UsageError(f"no simulation of record {k} in this file; it has {', '.join(known) or 'none'}.")
+        record = self.functions[f"record_{k}"]()
+        drive = record["u"] if u is None else np.asarray(u, float).reshape(-1, record["u"].shape[0]).T
+        found = self.functions[f"simulate_{k}"](s=record["s"], u=drive, p=self.functions["parameters"]()["p"])
+        return np.asarray(found["y"]).T
+
+
+def export(found: Fit | Model | Exported, path: str | os.PathLike[str], to: str | None = None) -> Path:
+    """Write a fitted model in a form that works without motorid.
+
+    Parameters
+    ----------
+    found : Fit, Model or Exported
+        A fit brings its uncertainty, its records' inputs and the very steps of its simulation along.
+    path : path
+        ``motor.casadi``, ``motor.c``, ``motor.json`` or ``motor.fmu``. C makes ``motor.h``, ``motor_main.c`` and
+        the records ``motor_run0.csv`` … beside it.
+    to : {"casadi", "c", "json", "fmu"}, optional
+        Default: by the ending of `path`.
+
+    Returns
+    -------
+    Path
+        The file written (of several, the main one).
+
+    Notes
+    -----
+    A ``.casadi`` file is read with CasADi alone::
+
+        file = casadi.FileDeserializer("motor.casadi")
+        functions, about = {f.name(): f for f in file.unpack()}, file.unpack()
+        record, p = functions["record_0"](), functions["parameters"]()["p"]
+        y = functions["simulate_0"](s=record["s"], u=record["u"], p=p)["y"]
+
+    Raises
+    ------
+    UsageError
+        If the form is not known.
+    DataError
+        If the file cannot be written.
+    """
+    target = Path(path).expanduser()
+    form = to or FORMS.get(target.suffix.lower())
+    if form is None:
+        raise UsageError(f"what to write is not clear from '{target.name}': end it with {', '.join(FORMS)}, or say "
+                         "to='casadi'.")
+    if form not in _WRITERS:
+        raise UsageError(one_of(form, _WRITERS, "form"))
+    if isinstance(found, Exported):
+        found = found.model
+    model_of(found)
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        return _WRITERS[form](found, target)
+    except OSError as error:
+        raise DataError(f"cannot write {target}: {error.strerror or error}.") from None
+
+
+def _write_json(found: Fit | Model, path: Path) -> Path:
+    _whole(path, json.dumps(description(found), indent=1, ensure_ascii=False, allow_nan=False) + "\n")
+    return path
+
+
+def _write_casadi(found: Fit | Model, path: Path) -> Path:
+    about = json.dumps(description(found), ensure_ascii=True)
+    with tempfile.TemporaryDirectory(dir=path.parent) as folder:
+        written = Path(folder) / "functions"
+        file = ca.FileSerializer(str(written), {})
+        file.pack(functions_of(found))
+        file.pack(about)
+        del file  # closes it
+        os.replace(written, path)
+    return path
+
+
+def _write_c(found: Fit | Model, path: Path) -> Path:
+    from motorid.csource import write_c
+
+    return write_c(found, path)[0]
+
+
+def _write_fmu(found: Fit | Model, path: Path) -> Path:
+    from motorid.fmu import write_fmu
+
+    return write_fmu(found, path)
+
+
+_WRITERS = {"casadi": _write_casadi, "c": _write_c, "json": _write_json, "fmu": _write_fmu}
+
+
+def _whole(path: Path, text: str) -> None:
+    """Write all or nothing."""
+    with tempfile.TemporaryDirectory(dir=path.parent) as folder:
+        written = Path(folder) / path.name
+        written.write_text(text, encoding="utf-8")
+        os.replace(written, path)
+
+
+def load(path: str | os.PathLike[str], effects: Iterable[Effect] = ()) -> Model | Exported:
+    """Read back what `export` wrote.
+
+    Parameters
+    ----------
+    path : path
+        JSON gives the `Model` at its values, a ``.casadi`` file an `Exported`.
+    effects : sequence of Effect, optional
+        Effects of your own that the model uses.
+
+    Raises
+    ------
+    DataError
+        If the file cannot be read, or is none of these.
+    ModelError
+        If an effect is not known; the message says what is needed.
+    """
+    source = Path(path).expanduser()
+    if source.suffix.lower() in (".c", ".h", ".fmu"):
+        raise UsageError(f"{source.name} goes to other programs; load reads .json and .casadi files.")
+    try:
+        with source.open("rb") as file:
+            head = file.read(1)
+    except OSError as error:
+        raise DataError(f"cannot read {source}: {error.strerror or error}.") from None
+    return _read_json(source, effects) if head == b"{" else _read_casadi(source)
+
+
+def _read_json(source: Path, effects: Iterable[Effect]) -> Model:
+    try:
+        contents = json.loads(source.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise DataError(f"{source.name} is not JSON: {error}.") from None
+    return model_from_json(contents, effects)
+
+
+def _read_casadi(source: Path) -> Exported:
+    try:
+        file = ca.FileDeserializer(str(source))
+        functions = file.unpack()
+        about = json.loads(file.unpack())
+        named = {f.name(): f for f in functions}
+    except (RuntimeError, ValueError, TypeError, AttributeError):
+        raise DataError(f"cannot read {source.name}: {NOT_OURS}, or a version of CasADi older than the one that "
+                        "wrote it reads it.") from None
+    return Exported(named, about)
+
+
+def model_from_json(contents: Mapping[str, Any], effects: Iterable[Effect] = ()) -> Model:
+    """Return the `Model`, at its values, of what ``fit --json`` or `export` wrote.
+
+    Parameters
+    ----------
+    contents : mapping
+        Needs ``model.base``, ``model.effects`` and ``parameters``; more does no harm.
+    effects : sequence of Effect, optional
+        Effects of your own that the model uses; they go before the library's of the same name.
+
+    Raises
+    ------
+    DataError
+        If something is missing in `contents`.
+    ModelError
+        If an effect is not known.
+    """
+    try:
+        head, pars = contents["model"], contents["parameters"]
+        base, names = head["base"], list(head["effects"])
+        values = {n: float(p["value"]) for n, p in pars.items()}
+        held = [n for n, p in pars.items() if p["fixed"]]
+    except (KeyError, TypeError, ValueError) as error:
+        raise DataError(f"this is not a fitted model: {error!s} is missing or wrong; expected model.base, "
+                        "model.effects and parameters with value and fixed.") from None
+    model = _base(base, head.get("axis", "rotary"))
+    own = {e.name: e for e in effects}
+    for name in names:
+        model = model + _effect(name, own, head.get("own_effects", {}).get(name))
+    missing = set(model.parameters) ^ set(values)
+    if missing:
+        raise DataError(f"the parameters {', '.join(sorted(missing))} are in only one of the file and the model: an "
+                        "effect has changed since the file was written.")
+    limits = {n: (p.get("lower", -np.inf), p.get("upper", np.inf)) for n, p in pars.items()
+              if "lower" in p or "upper" in p}
+    return model.free(*values).bounded(**limits).replace(**values).fix(*held)
+
+
+def _base(base: str, axis: str) -> Model:
+    if base == "dc_motor":
+        return dc_motor()
+    if base == "torque_driven":
+        return torque_driven(axis)
+    raise DataError(one_of(str(base), ("dc_motor", "torque_driven"), "base"))
+
+
+def _effect(name: str, own: Mapping[str, Effect], about: Mapping[str, Any] | None) -> Effect:
+    if name in own:
+        return own[name]
+    if about is not None:
+        raise ModelError(f"the effect '{name}' is not in the library: it was defined in {about['defined_in']}, acts on "
+                         f"the {about['balance']} and takes {', '.join(about['parameters'])}. Define it again and "
+                         f"pass it on: mi.load(path, effects=[{name}]).")
+    if name not in LIBRARY:
+        raise ModelError(f"{one_of(name, LIBRARY, 'effect')} If it is one of your own, pass it on: "
+                         f"mi.load(path, effects=[{name}]).")
+    return LIBRARY[name]
+
+
+__all__ = ["Exported", "export", "load", "model_from_json"]
