@@ -57,6 +57,8 @@ def beginning(run: Experiment, sigma: Mapping[str, float], initial: str) -> Begi
             reach[c] = _reach(y, sigma[c])
     if "omega" not in run.outputs and "theta" in run.outputs and not known:
         start[1], reach["omega"] = _first_speed(run.outputs["theta"], run.t, sigma["theta"])
+    if "i" not in run.outputs and not known:
+        reach["i"] = np.inf  # to assume none would be a measurement that was never made
     if initial in ("rest", "measured"):
         reach = {}
     free = initial == "estimate"

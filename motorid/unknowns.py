@@ -54,9 +54,10 @@ class Unknowns:
     def initial(self) -> tuple[tuple[str, int, Parameter], ...]:
         """(channel, run, parameter) of each estimated initial state."""
         found = []
+        free = {c for c, stored in zip(self.system.states, self.system.stored, strict=True) if stored}
         for k, run in enumerate(self.runs):
             for c in run.estimated:
-                if c in self.system.states:
+                if c in free:  # an algebraic current follows from the rest
                     unit = run.experiment.units.get(c, STATE_UNITS[c])
                     low, high = run.limits[c]
                     value = float(run.start[CHANNELS.index(c)])
