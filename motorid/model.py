@@ -184,6 +184,19 @@ class Model(Shown):
             self._systems[key] = _shared_system(self, chosen)
         return self._systems[key]
 
+    def check_visible(self, outputs: Iterable[str]) -> None:
+        """Refuse an effect of which nothing can be seen in the measured `outputs`.
+
+        Raises
+        ------
+        ModelError
+        """
+        system = self.system(outputs)
+        for e in self.effects:
+            if e.parameters and not any(p.name in system.visible for p in e.parameters):
+                raise ModelError(f"'{e.name}' cannot be seen in the measured channels ({', '.join(system.outputs)}). "
+                                 f"Leave it out: model.without('{e.name}'), or add a record of its channel.")
+
     def __getstate__(self) -> dict[str, Any]:
         return {f: getattr(self, f) for f in self.__dataclass_fields__}
 

@@ -77,18 +77,10 @@ class Problem:
         for name in self.priors:
             if name not in self.model.parameters:
                 raise UsageError(f"prior: {one_of(name, self.model.parameters, 'parameter')}")
-        self._check_visible()
+        self.model.check_visible(self.outputs)
         width = smoothing(self.experiments, self.model.parameters)
         if width is not None:
             object.__setattr__(self, "model", self.model.start_at({"sgn_width": width}))
-
-    def _check_visible(self) -> None:
-        visible = self.system.visible
-        for e in self.model.effects:
-            if e.parameters and not any(p.name in visible for p in e.parameters):
-                channels = ", ".join(self.outputs)
-                raise ModelError(f"'{e.name}' cannot be seen in the measured channels ({channels}). "
-                                 f"Leave it out: model.without('{e.name}'), or add a record of its channel.")
 
     # -- what is fitted --------------------------------------------------------------------------------
     @cached_property
