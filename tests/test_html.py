@@ -122,13 +122,12 @@ def identifiability():
 
 
 def multistart():
-    statistics = {
-        "R": {"reference": 1.38, "mean": 1.38, "std": 1e-9},
-        "K": {"reference": 0.046, "mean": None, "std": None},
-    }
+    lost = {"reference": 0.046, "mean": None, "std": None}
+    statistics = {"R": {"reference": 1.38, "mean": 1.38, "std": 1e-9}, "K": lost}
+    words = "stopped after 10 of 20 starts"
     return SimpleNamespace(
-        endings=[0] * 10, good=8, poor=1, failed=1, spread=10.0, seconds=3.2,
-        interrupted="stopped after 10 of 20 starts", reference=SimpleNamespace(model=mi.dc_motor()), statistics=lambda: statistics,
+        endings=[0] * 10, good=8, poor=1, failed=1, spread=10.0, seconds=3.2, interrupted=words,
+        reference=SimpleNamespace(model=mi.dc_motor()), statistics=lambda: statistics,
     )  # fmt: skip
 
 
