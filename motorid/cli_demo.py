@@ -14,6 +14,7 @@ from motorid.fit import fit
 from motorid.model import dc_motor
 from motorid.progress import progress
 from motorid.reading import read_runs
+from motorid.summary import deviations
 from motorid.tables import comparison_table, error_table, ladder_table, parameter_table, ranking_table
 
 SET = "hidden_friction"
@@ -37,13 +38,14 @@ def tell(out: Path) -> dict[str, Any]:
     show(f"1. Records: {len(runs)} of a motor ({data_path(SET)}), and one held out that no fit will see.\n",
          "2. The textbook model, fitted without a first guess:")
     plain = fit(dc_motor(), runs)
-    show(parameter_table(plain), error_table(plain),
+    show(parameter_table(plain, deviations(plain)), error_table(plain),
          "   Its errors are far above the noise: something is missing.\n", "3. What?")
     with progress("Trying the effects of the library") as advance:
         found = diagnose(plain, check, progress=lambda _: advance(1))
     show(found.missing.text, ranking_table(found.ranking, 4), found.text, "",
          "4. Added, one line of code: fit.model + mi.effects." + (found.effects or ("…",))[0],
-         ladder_table(found.ladder), comparison_table([("before", found.before), ("after", found.after)]))
+         ladder_table(found.ladder),
+         comparison_table([("before", found.before), ("after", found.after)], std=deviations))
     files = _files(found, check, out)
     show("Written: " + ", ".join(files), "Now your own: motorid diagnose RUN... --report yours.html")
     return found.to_dict() | {"files": files}

@@ -24,7 +24,7 @@ from motorid.experiment import Experiment
 from motorid.fit import Fit
 from motorid.formatting import duration
 from motorid.simulate import Evaluation, evaluate
-from motorid.summary import constraint_violations, fit_dict, remarks, run_dict, write_json
+from motorid.summary import constraint_violations, deviations, fit_dict, remarks, run_dict, write_json
 from motorid.tables import constraint_table, derived_table, error_table, parameter_table, run_table
 
 GOOD = ("converged", "limit", "stalled")
@@ -107,7 +107,7 @@ def show_fit(
     """Print a fit: remarks, parameters, errors, what follows from them, and how it ended."""
     show(f"{describe(found.problem.model)}, {_amount(records)}\n")
     say_notes(notes, "About the records")
-    show(parameter_table(found))
+    show(parameter_table(found, deviations(found)))
     say_notes(remarks(found), "What these records cannot tell")
     several = judged is not None and len(judged.simulations) > 1
     show(error_table(found, judged), run_table(found.evaluation) if len(records) > 1 else None,

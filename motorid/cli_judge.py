@@ -18,7 +18,7 @@ from motorid.cli_options import (
     with_choices,
 )
 from motorid.progress import progress
-from motorid.summary import write_json
+from motorid.summary import deviations, write_json
 from motorid.tables import comparison_table, ladder_table, ranking_table
 
 OUT = "Results"
@@ -61,12 +61,13 @@ def identifiability(runs: Runs, choices: Choices, json: Json = None, report: Rep
     from motorid.identifiability import identifiability as study
 
     records = choices.read(runs)
-    found = study(choices.fit(records))
+    fitted = choices.fit(records)
+    found = study(fitted)
     if json:
         write_json(found.to_dict(), json)
     if json != "-":
         show(str(found))
-    save_report(found, report)
+    save_report([fitted, found], report)
 
 
 @with_choices(Choices)
@@ -86,12 +87,13 @@ def robustness(
     from motorid.multistart import robustness as study
 
     records = choices.read(runs)
-    found = study(choices.fit(records), starts=starts, spread=spread, seed=seed)
+    fitted = choices.fit(records)
+    found = study(fitted, starts=starts, spread=spread, seed=seed)
     if json:
         write_json(found.to_dict(), json)
     if json != "-":
         show(str(found))
-    save_report(found, report)
+    save_report([fitted, found], report)
 
 
 def show_diagnosis(found: Any) -> None:
@@ -101,7 +103,7 @@ def show_diagnosis(found: Any) -> None:
     show(ranking_table(found.ranking) if found.ranking else None)
     show(ladder_table(found.ladder), found.ladder.text)
     if found.after is not found.before:
-        show(comparison_table([("before", found.before), ("after", found.after)]))
+        show(comparison_table([("before", found.before), ("after", found.after)], std=deviations))
     for group in found.groups:
         show(f"These records cannot tell apart: {', '.join(group)}.")
     show(found.suggestion)

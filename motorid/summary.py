@@ -12,6 +12,7 @@ import numpy as np
 from motorid.errors import UsageError
 from motorid.multipliers import violations
 from motorid.relations import Relation
+from motorid.uncertainty import covariance
 
 if TYPE_CHECKING:
     from motorid.fit import Fit
@@ -23,13 +24,14 @@ MOTOR = ("R", "L", "K", "b", "J")
 def fit_dict(fit: Fit, held_out: Evaluation | None = None) -> dict[str, Any]:
     """Return the contents of ``fit --json``.
 
-    Standard deviations are null where the data do not determine the value, 0 where it was held.
+    Standard deviations are those of `deviations`: null where the data do not determine the value, 0 where it was
+    held.
     """
-    model, problem = fit.problem.model, fit.problem
+    model, problem, std = fit.problem.model, fit.problem, deviations(fit)
     engine = problem.engine if isinstance(problem.engine, str) else problem.engine.name
     return {
         "model": {"base": model.base, "axis": model.axis, "effects": list(model.effect_names)},
-        "parameters": {n: {"value": fit.values[n], "std": fit.std[n] if p.vary else 0.0, "unit": p.unit,
+        "parameters": {n: {"value": fit.values[n], "std": std[n] if p.vary else 0.0, "unit": p.unit,
                            "fixed": not p.vary} for n, p in model.parameters.items()},
         "nrmse": dict(fit.nrmse), "rmse": dict(fit.rmse),
         "validation_nrmse": dict(held_out.nrmse) if held_out else None,
@@ -50,6 +52,18 @@ def fit_dict(fit: Fit, held_out: Evaluation | None = None) -> dict[str, Any]:
     }
 
 
+def deviations(fit: Fit) -> dict[str, float | None]:
+    """Return one standard deviation per parameter, the residuals taken as coloured as they are.
+
+    A model that lacks something leaves residuals that go with the motion; as white noise they would make its
+    parameters far too certain. True constraints carry information of their own: then it is the fit's.
+    """
+    if fit.problem.constraints or not fit.problem.unknown:
+        return dict(fit.std)
+    found = covariance(fit).std
+    return {n: found.get(n, std) for n, std in fit.std.items()}
+
+
 def constraint_violations(fit: Fit) -> dict[str, float]:
     """Return the largest violation of each constraint or weighted relation; empty for a plain fit."""
     problem = fit.problem
@@ -65,8 +79,8 @@ def run_dict(run: Any) -> dict[str, Any]:
 
 def remarks(fit: Fit) -> list[str]:
     """Say in words what the numbers of a fit cannot: what is not determined, and what would determine it."""
-    model, measured = fit.problem.model, fit.problem.outputs
-    vague = [n for n in model.free_names if fit.std[n] is None]
+    model, measured, std = fit.problem.model, fit.problem.outputs, deviations(fit)
+    vague = [n for n in model.free_names if std[n] is None]
     at_limit = [n for n in vague if _vanished(fit, n)]
     vague = [n for n in vague if n not in at_limit]
     said = []

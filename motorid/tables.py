@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +14,8 @@ if TYPE_CHECKING:
 
 NAMES = {"i": "current", "omega": "speed", "theta": "angle"}
 MOST_RUNS = 12  # shown one by one
+
+Std = Mapping[str, float | None]
 
 
 @dataclass(frozen=True)
@@ -36,20 +38,23 @@ class Table:
         return "\n".join([part for part in (self.title, *body, self.note) if part])
 
 
-def parameter_table(fit: Fit) -> Table:
-    """Return the parameters as value ± standard deviation; held or not determined is said in words."""
+def parameter_table(fit: Fit, std: Std | None = None) -> Table:
+    """Return the parameters as value ± standard deviation; held or not determined is said in words.
+
+    `std` gives other standard deviations than the fit's own, which take the residuals as white.
+    """
     rows = []
     for name, p in fit.problem.model.parameters.items():
-        rows.append((name, parameter_text(fit, name), p.doc))
+        rows.append((name, parameter_text(fit, name, std), p.doc))
     return Table("Parameters", ("", "value ± std", "meaning"), tuple(rows), left=(0, 1, 2))
 
 
-def parameter_text(fit: Fit, name: str) -> str:
+def parameter_text(fit: Fit, name: str, std: Std | None = None) -> str:
     """Return one parameter as ``1.302 ± 0.004 Ω``, or with ``(held)``, ``(chosen)``, ``(not determined)``."""
     p = fit.problem.model.parameters[name]
     if name == "sgn_width" and not p.given:
         return f"{quantity(fit.values[name], p.unit, 2)} (chosen from the data)"
-    return with_error(fit.values[name], fit.std[name] if p.vary else 0.0, p.unit)
+    return with_error(fit.values[name], (std or fit.std)[name] if p.vary else 0.0, p.unit)
 
 
 def error_table(fit: Fit, held_out: Evaluation | None = None) -> Table:
@@ -60,7 +65,7 @@ def error_table(fit: Fit, held_out: Evaluation | None = None) -> Table:
     rows = []
     for c in fit.nrmse:
         noise = min(r.sigma[c] for r in fit.problem.runs if c in r.sigma)
-        row = [f"{NAMES[c]} ({c})", quantity(fit.rmse[c], units[c], 3), percent(fit.nrmse[c]),
+        row = [f"{channel_name(c, units[c])} ({c})", quantity(fit.rmse[c], units[c], 3), percent(fit.nrmse[c]),
                quantity(noise, units[c], 2)]
         if held_out:
             known = c in held_out.nrmse
@@ -75,7 +80,8 @@ def run_table(evaluation: Evaluation, title: str = "NRMSE run by run") -> Table:
     shown = list(zip(evaluation.simulations, evaluation.by_run, strict=True))
     rows = [(s.experiment.name, *(percent(e.get(c)) for c in channels)) for s, e in shown[:MOST_RUNS]]
     note = f"and {len(shown) - MOST_RUNS} more runs" if len(shown) > MOST_RUNS else ""
-    return Table(title, ("run", *(NAMES[c] for c in channels)), tuple(rows), note=note)
+    units = channel_units([s.experiment for s, _ in shown])
+    return Table(title, ("run", *(channel_name(c, units[c]) for c in channels)), tuple(rows), note=note)
 
 
 def derived_table(fit: Fit) -> Table | None:
@@ -89,7 +95,7 @@ def derived_table(fit: Fit) -> Table | None:
         rows.append(("damping ratio", number(fit.damping, 3)))
     units = channel_units(fit.problem.experiments)
     for c, error in fit.steady_state_error.items():
-        rows.append((f"steady-state error of the {NAMES[c]}", quantity(error, units[c], 3)))
+        rows.append((f"steady-state error of the {channel_name(c, units[c])}", quantity(error, units[c], 3)))
     return Table("", ("derived", ""), tuple(rows), left=(0, 1)) if rows else None
 
 
@@ -105,7 +111,8 @@ def constraint_table(fit: Fit, violations: Mapping[str, float]) -> Table | None:
     return Table("Constraints", heads, tuple(rows), left=(0, 2)) if rows else None
 
 
-def comparison_table(fits: Sequence[tuple[str, Fit]], held_out: Sequence[Evaluation | None] = ()) -> Table:
+def comparison_table(fits: Sequence[tuple[str, Fit]], held_out: Sequence[Evaluation | None] = (),
+                     std: Callable[[Fit], Std] = lambda fit: fit.std) -> Table:
     """Return models side by side: errors of the fit, held-out errors, parameters."""
     channels = list(fits[0][1].nrmse)
     judged = list(held_out) or [None] * len(fits)
@@ -115,7 +122,9 @@ def comparison_table(fits: Sequence[tuple[str, Fit]], held_out: Sequence[Evaluat
         rows += [(f"held-out {NAMES[c]}", *(percent(e.nrmse.get(c)) if e else "–" for e in judged))
                  for c in channels]
     names = dict.fromkeys(n for _, f in fits for n in f.values if n != "sgn_width")
-    rows += [(n, *(parameter_text(f, n) if n in f.values else "–" for _, f in fits)) for n in names]
+    stds = [std(f) for _, f in fits]
+    rows += [(n, *(parameter_text(f, n, s) if n in f.values else "–" for (_, f), s in zip(fits, stds, strict=True)))
+             for n in names]
     return Table("", heads, tuple(rows))
 
 
@@ -148,6 +157,11 @@ def ladder_table(ladder: Any) -> Table:
 def values_table(title: str, heads: Sequence[str], rows: Mapping[str, Sequence[str]]) -> Table:
     """Return a table with one named row per entry."""
     return Table(title, tuple(heads), tuple((k, *v) for k, v in rows.items()))
+
+
+def channel_name(channel: str, unit: str) -> str:
+    """Return what people call a channel: the angle of a linear axis is its position."""
+    return "position" if unit == "m" else NAMES[channel]
 
 
 def channel_units(runs: Sequence[Any]) -> dict[str, str]:
