@@ -19,9 +19,7 @@ __all__ = ["report"]
 PACKAGES = ("motorid", "casadi", "numpy", "scipy", "pandas", "matplotlib")
 
 
-def report(
-    result: Any, path: str | Path, *, title: str = "", command: str = "", validate: Sequence[Any] = ()
-) -> Path:
+def report(result: Any, path: str | Path, *, title: str = "", command: str = "", validate: Sequence[Any] = ()) -> Path:
     """Write the story of a result as one HTML page: no network, no script, figures inside.
 
     Data and their checks, the fit, where it fails, which effect is missing, the ladder, parameters before and
@@ -88,7 +86,7 @@ def _provenance(story: Story, command: str) -> Section:
     return Section(
         "provenance",
         "Where it comes from",
-        ["The files are named by the fingerprint of their contents, so that the page can be traced to them."],
+        ["The files are named by the fingerprint of their contents: the page can be traced to them."] * bool(files),
         tables=tables,
         code=command,
     )
