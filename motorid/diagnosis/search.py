@@ -16,6 +16,7 @@ from motorid.diagnosis.judging import COMMON, PLAIN, Judge, Node, held_out_objec
 from motorid.diagnosis.rank import Score, rank
 from motorid.diagnosis.results import Candidate
 from motorid.diagnosis.trial import (
+    FAILURES,
     WORST_CONDITION,
     HeldOut,
     ambiguity,
@@ -24,7 +25,7 @@ from motorid.diagnosis.trial import (
     train_errors,
 )
 from motorid.effects import LIBRARY
-from motorid.errors import ModelError, SimulationError
+from motorid.errors import ModelError
 from motorid.experiment import Experiment
 from motorid.fit import Fit
 from motorid.model import Effect, Model
@@ -128,10 +129,10 @@ class Search:
             return None, replace(candidate, reason="the improvement is within what noise and chance would give")
         try:
             child = Node(fit, effect.name, train, self.held.errors(fit), node)
-        except SimulationError as error:
+            held = self.judge.held_gain(node, child)
+        except FAILURES as error:
             return None, replace(candidate, reason=f"fails on held-out data: {error}")
         candidate = replace(candidate, validation_nrmse=child.held.nrmse())
-        held = self.judge.held_gain(node, child)
         why = held_out_objection(held) or self._ambiguous(node, fit, held)
         if why:
             return None, replace(candidate, reason=why)
@@ -186,7 +187,7 @@ class Search:
                 return None
             try:
                 self.nodes[key] = node_of(fit, self.held, node.added, node.parent)
-            except SimulationError:
+            except FAILURES:
                 return None
         return self.nodes[key]
 
