@@ -44,7 +44,8 @@ def multistart(
     starts : int
     spread : float
         Starts are log-uniform within this factor on either side of the reference, in every free parameter; a
-        parameter that may be negative is moved by the same factors, and its sign is kept.
+        parameter that may be negative is moved by the same factors, and its sign is kept; a phase is drawn
+        from the whole circle.
     seed : int
         The starts depend on it alone, not on the pool.
     guess : bool
@@ -89,7 +90,10 @@ def _draw(reference: Fit, names: Sequence[str], starts: int, spread: float,
     pars = reference.problem.model.parameters
     scale = reference.problem.scaling.scale
     sizes = np.array([reference.values[n] or 1e-3 * s for n, s in zip(names, scale, strict=False)])
-    drawn = np.clip(factors * sizes, [pars[n].lower for n in names], [pars[n].upper for n in names])
+    turning = np.array([pars[n].periodic for n in names], bool)
+    phases = sizes + np.pi * np.log(factors) / max(np.log(spread), 1e-300)  # anywhere on the circle
+    drawn = np.where(turning & (spread > 1), phases, factors * sizes)
+    drawn = np.clip(drawn, [pars[n].lower for n in names], [pars[n].upper for n in names])
     return [dict(zip(names, row, strict=True)) for row in drawn.tolist()]
 
 
