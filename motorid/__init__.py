@@ -15,6 +15,7 @@ from motorid.diagnosis import diagnose, improve, locate, suggest_experiment
 from motorid.errors import DataError, FitError, ModelError, MotoridError, SimulationError, UsageError
 from motorid.experiment import Experiment
 from motorid.explore import explore
+from motorid.export import export, load
 from motorid.fit import Failure, Fit, fit, solve
 from motorid.formulations import compare_formulations
 from motorid.identifiability import identifiability

@@ -219,6 +219,14 @@ def _diagnosis(d: Any) -> Card:
     )
 
 
+def _recording(r: Any) -> Card:
+    made = r.received + r.lost
+    flags = [Flag(r.ended, "good" if r.complete else "bad")]
+    flags += [Flag(f"{r.lost} of {made} samples lost", "note")] if r.lost else []
+    return Card(f"Recording {r.path.name}", flags, str(r).splitlines(), (),
+                ((f'mi.read_runs("{r.path.name}")', "read it"),))  # fmt: skip
+
+
 _WRITERS: dict[str, Callable[[Any], Card]] = {
     "Experiment": _experiment,
     "Model": _model,
@@ -230,4 +238,5 @@ _WRITERS: dict[str, Callable[[Any], Card]] = {
     "Missing": _missing,
     "Ladder": _ladder,
     "Diagnosis": _diagnosis,
+    "Recording": _recording,
 }

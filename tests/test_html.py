@@ -15,6 +15,7 @@ import pytest
 import motorid as mi
 from motorid._cards import card_of
 from motorid._html import Card, Flag, Table, render, render_table
+from motorid.acquire import Recording
 from motorid.fit import Failure
 from motorid.problem import Problem
 
@@ -82,6 +83,8 @@ CARDS = {
         regions={"steady": 0.6}, bins={"torque": (SimpleNamespace(against="omega", explained=0.93),)}))),
     "ladder": lambda: card_of(_as("Ladder", fake_ladder())),
     "diagnosis": lambda: card_of(_as("Diagnosis", fake_diagnosis())),
+    "recording": lambda: card_of(Recording(
+        Path("run1.csv"), None, "unplugged", "", 990, 10, False, 1.0, {}, {"i": 3})),
     "covariance": lambda: card_of(_as("Covariance", trusted()[0])),
     "bootstrap": lambda: card_of(_as("Bootstrap", trusted()[1])),
     "profile": lambda: card_of(_as("Profile", trusted()[2])),

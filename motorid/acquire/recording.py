@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from motorid.acquire.protocol import Header
+from motorid.display import Shown
 
 __all__ = ["COMPLETE", "Progress", "Recording"]
 
@@ -41,8 +42,8 @@ class Progress:
     last: Mapping[str, float]  # latest value per channel, SI
 
 
-@dataclass(frozen=True, eq=False)
-class Recording:
+@dataclass(frozen=True, eq=False, repr=False)
+class Recording(Shown):
     """The outcome of `record`; the data are in the file.
 
     Attributes
