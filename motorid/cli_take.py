@@ -18,7 +18,7 @@ from motorid.experiment import Experiment
 from motorid.layout import parse_pairs
 from motorid.summary import write_json
 
-FORMS = ("casadi", "c", "json")
+FORMS = ("casadi", "c", "json", "fmu")
 
 
 @with_choices(Choices)
@@ -64,19 +64,20 @@ def fit_many(
 def export(
     fit_json: Annotated[Path, typer.Argument(metavar="FIT.json", help="What fit --json wrote.")],
     path: Annotated[Path, typer.Argument(metavar="PATH", help="What to write.")],
-    to: Annotated[str, typer.Option(metavar="casadi|c|json", help="Form of the model.")] = "casadi",
+    to: Annotated[str | None, typer.Option(
+        metavar="casadi|c|json|fmu", show_default=False, help="Form of the model; by default PATH's ending.")] = None,
     effects_from: Annotated[Path | None, typer.Option(
         metavar="FILE.py", help="Effects of your own.")] = None,
 ) -> None:
-    """Take a fitted model along: as a CasADi function, as C source, as JSON.
+    """Take a fitted model along: as CasADi functions, as C source, as JSON, as an FMU.
 
     Example: motorid export fit.json --to c motor.c
     """
-    if to not in FORMS:
-        raise UsageError(f"--to: {one_of(to, FORMS, 'form')}")
-    from motorid.export import export as write  # pyright: ignore[reportMissingImports]
+    from motorid.export import export as write
 
-    show(f"Written: {write(model_of(fit_json, effects_from), path, to=to)}")
+    if to is not None and to not in FORMS:
+        raise UsageError(f"--to: {one_of(to, FORMS, 'form')}")
+    show(f"Written: {write(model_of(fit_json, effects_from), path, to)}")
 
 
 def _read(choices: Choices, files: list[Path]) -> list[Any]:

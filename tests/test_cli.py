@@ -248,6 +248,23 @@ def test_simulate_repeats_the_held_out_error_of_the_fit(fitted, tmp_path):
     assert rms == pytest.approx(again["nrmse"]["omega"], rel=1e-2)
 
 
+@pytest.mark.parametrize("name", ["motor.casadi", "motor.c", "motor.json"])
+def test_export_writes_every_form(fitted, tmp_path, name):
+    path, _ = fitted
+    done = motorid("export", path, tmp_path / name)
+    assert done.status == 0, done.err
+    assert (tmp_path / name).stat().st_size > 500
+    assert name in " ".join(done.out.split())
+
+
+def test_export_to_json_and_casadi_come_back(fitted, tmp_path):
+    path, found = fitted
+    for form in ("json", "casadi"):
+        assert motorid("export", path, tmp_path / "motor", "--to", form).status == 0
+        again = motorid_json(tmp_path, "simulate", tmp_path / "motor", FRICTION / "check1.csv")
+        assert again["nrmse"]["omega"] == pytest.approx(found["validation_nrmse"]["omega"], rel=1e-3)
+
+
 # -- diagnose, identifiability, robustness, fit-many ---------------------------------------------------------
 @pytest.mark.slow
 def test_diagnose_names_the_missing_effect(tmp_path):

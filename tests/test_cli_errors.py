@@ -78,7 +78,7 @@ def test_broken_records(broken: Broken, tmp_path):
     (["fit", RUN, "--json", "no/such/folder/fit.json"], "cannot write"),
     (["fit", RUN, "--report", "no/such/folder/fit.html"], "cannot be written"),
     (["simulate", "nowhere.json", RUN], "cannot read nowhere.json"),
-    (["simulate", RUN, RUN], "is not JSON"),
+    (["simulate", RUN, RUN], "cannot read step_6V.csv"),
     (["diagnose", RUN, "--max-effects", "-1"], "max-effects"),
     (["robustness", RUN, "--starts", "0"], "starts"),
     (["robustness", RUN, "--spread", "0.5"], "spread"),
@@ -116,12 +116,12 @@ def test_an_effect_that_writes_nonsense_is_named(tmp_path):
 
 
 @pytest.mark.parametrize(("contents", "says"), [
-    ({}, "not of a fit"),
-    ([1, 2], "not of a fit"),
+    ({}, "not a fitted model"),
+    ([1, 2], "cannot read fit.json"),
     ({"model": {"base": "steam_engine", "effects": []}, "parameters": {}}, "steam_engine"),
     ({"model": {"base": "dc_motor", "effects": ["coulom"]}, "parameters": {}}, "Did you mean 'coulomb'"),
     ({"model": {"base": "dc_motor", "effects": []}, "parameters": {"R": {"value": "x", "fixed": False}}}, "x"),
-    ({"model": {"base": "dc_motor", "effects": []}, "parameters": {"Q": {"value": 1, "fixed": False}}}, "'Q'"),
+    ({"model": {"base": "dc_motor", "effects": []}, "parameters": {"Q": {"value": 1, "fixed": False}}}, "Q"),
 ], ids=str)
 def test_json_that_is_no_fit(tmp_path, contents, says):
     path = tmp_path / "fit.json"

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from command import motorid, motorid_json
 
-from motorid.cli_model import model_from
+from motorid.export import model_from_json
 from motorid.reading import read_runs
 from motorid.simulate import evaluate
 
@@ -143,7 +143,7 @@ def xl330(real: Path, folder: Path, *words: str) -> float:
     """
     records = real / "xl330" / "*.csv"
     found = motorid_json(folder, "fit", records, "--ignore", "omega", "--loss", "huber", *words)
-    judged = evaluate(model_from(found, {}), [r.without("omega") for r in read_runs(records)])
+    judged = evaluate(model_from_json(found), [r.without("omega") for r in read_runs(records)])
     return float(np.mean([np.nanmean(np.abs(s.residual("theta"))) for s in judged.simulations]))
 
 
