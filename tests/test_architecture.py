@@ -27,12 +27,13 @@ ROWS = (
     # 3 the problem
     "problem derivatives sensitivity mesh",
     # 4 solving it, and looking at the solution
-    "least_squares descent starting simulate result fit comparison multipliers conflict nlp nodes outcome shooting "
+    "least_squares descent starting simulate result fit comparison multipliers conflict nlp nodes outcome gaps shooting "
     "remedies",
     # 5 how far it can be trusted, and what it lacks
-    "identifiability uncertainty bootstrap profiling intervals endings multistart batch formulations gaps diagnosis",
+    "identifiability uncertainty bootstrap profiling intervals endings multistart batch formulations diagnosis",
     # 6 taking it along and showing it
-    "export portable csource fmu plots acquire summary explore report _html _html_tables _cards _cards_trust _sections _story",
+    "export portable csource fmu plots acquire summary explore report "
+    "_html _html_tables _cards _cards_trust _sections _story",
     # 7 the command line and the public names
     "cli __main__ __init__",
 )
