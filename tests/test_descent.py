@@ -1,0 +1,86 @@
+"""Friction makes the misfit rugged; the descent gets through it by a wide sgn that becomes narrow."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import motorid as mi
+from motorid.descent import _cheaper, descend
+from motorid.experiment import Experiment
+from motorid.problem import Problem, as_problem
+
+TRUE = {"b": 0.3, "J": 0.1, "tau_c": 0.5, "tau_0": 0.1}
+
+
+@pytest.fixture(scope="module")
+def stuck() -> Experiment:
+    """A drive that sticks at every reversal, its angle alone measured, with drag that the model will not have."""
+    rng = np.random.default_rng(0)
+    t = np.arange(0, 6, 2e-3)
+    u = np.sin(1.2 * np.pi * t) + 0.7 * np.sin(3.4 * np.pi * t + 1) + 0.3 * np.repeat(rng.normal(size=60), 50)
+    plain = mi.torque_driven(g=1.0, b=TRUE["b"], J=TRUE["J"])
+    friction = mi.effects.coulomb(tau_c=TRUE["tau_c"]), mi.effects.constant_load(tau_0=TRUE["tau_0"])
+    model = plain + friction[0] + friction[1] + mi.effects.quadratic_drag(c_2=0.01)
+    still = Experiment(t, {"v": u}, {"theta": np.zeros_like(t)})
+    angle = mi.simulate(model.replace(sgn_width=1e-3), still, initial="rest")[0].outputs["theta"]
+    return still.with_(outputs={"theta": angle + rng.normal(0, 1e-4, len(t))})
+
+
+def problem(run: Experiment, seed: int) -> Problem:
+    """The model without the drag, its start off by up to a factor of three in every parameter."""
+    off = 3.0 ** np.random.default_rng(seed).uniform(-1, 1, len(TRUE))
+    start = {n: v * f for (n, v), f in zip(TRUE.items(), off, strict=True)}
+    model = mi.torque_driven(g=1.0) + mi.effects.coulomb + mi.effects.constant_load
+    return as_problem(model.start_at(start), run, initial="rest")
+
+
+def ends(run: Experiment, *, stages: bool) -> list[float]:
+    """RMS of the whitened residual where the descent ends, from three starts."""
+    solutions = [descend(problem(run, k), mi.LevenbergMarquardt(), stages=stages).solution for k in (0, 2, 4)]
+    return [float(np.sqrt(np.mean(s.residual**2))) for s in solutions]
+
+
+def test_stages_lead_every_start_to_one_place_where_the_narrow_sgn_alone_does_not(stuck):
+    staged, alone = ends(stuck, stages=True), ends(stuck, stages=False)
+    assert np.ptp(staged) < 1e-3 * staged[0]
+    assert max(alone) > 5 * staged[0]
+
+
+def test_a_width_that_was_given_is_kept_and_nothing_is_staged(stuck):
+    begin = problem(stuck, 0)
+    given = begin.for_model(begin.model.replace(sgn_width=0.05))
+    done = descend(given, mi.LevenbergMarquardt(max_iterations=1), stages=True)
+    assert done.problem.model.values["sgn_width"] == 0.05
+    assert len(done.history) == 2  # the start and one step
+
+
+def test_what_a_wide_sgn_likes_is_left_where_a_narrow_one_refuses_it(stuck):
+    """Under a wide sgn a breakaway torque without limits may fit; a narrow one would stand still with it."""
+    good = problem(stuck, 0)
+    good = good.for_model(good.model.start_at(TRUE))
+    bad = good.for_model(good.model.start_at({"tau_c": 50.0}))
+    assert _cheaper(bad, good) is good
+    assert _cheaper(good, bad) is good
+    assert _cheaper(bad) is bad
+
+
+def test_sub_steps_follow_the_solution(stuck):
+    """The grid at the end is the one that the end asks for, not the one that the start asked for."""
+    done = descend(problem(stuck, 2), mi.LevenbergMarquardt())
+    again = done.problem.refined(done.solution.q)
+    r = again.residual(done.solution.q)
+    assert float(r @ r) == pytest.approx(float(done.solution.residual @ done.solution.residual), rel=0.02)
+
+
+def test_an_initial_state_cannot_hide_what_the_model_lacks(stuck):
+    """Left to itself the fit would begin far from where the record begins, to make up for missing friction."""
+    model = mi.torque_driven(g=1.0)
+    run = replace(stuck, inputs={"v": stuck.inputs["v"] + 0.01})  # so that it does not count as beginning at rest
+    held, free = mi.fit(model, run), mi.fit(model, run, initial="estimate")
+    first = float(np.median(run.outputs["theta"][:3]))
+    assert abs(held.initial["theta_0[0]"] - first) < 20e-4
+    assert abs(free.initial["theta_0[0]"] - first) > 0.05
+    assert free.rmse["theta"] < held.rmse["theta"]
