@@ -11,6 +11,7 @@ from motorid.conflict import conflict
 from motorid.descent import integration_error
 from motorid.errors import FitError
 from motorid.fit import Fit
+from motorid.gaps import gaps_of, reduced
 from motorid.integrate.grid import Array
 from motorid.mesh import Mesh
 from motorid.multipliers import free_directions, rows_at, summed, violations
@@ -115,18 +116,20 @@ def fit_of(done: Solved, seconds: float) -> Fit:
         found = conflict(problem, q)
         if found:
             raise FitError(found)
-    residuals, jac = problem.residual_and_jacobian(q)
+    noisy = done.mesh.noise is not None
+    residuals, jac = reduced(done.mesh, done.result.z) if noisy else problem.residual_and_jacobian(q)
+    name = "process noise" if noisy else "hard" if problem.constraints else "plain"
     return Fit(problem, problem.values(q), residuals, jac / problem.scaling.slope(q), q, done.status, done.message,
-               done.history, seconds, integration_error(problem, q), "hard" if problem.constraints else "plain",
-               _extra(done))
+               done.history, seconds, integration_error(problem, q), name, _extra(done))
 
 
 def _extra(done: Solved) -> dict[str, Any]:
     problem, mesh = done.problem, done.mesh
-    walk = mesh.walk(done.result.z, False)
-    gaps = [b.values for b in mesh.gaps(done.result.z, walk, weighed=False)]
+    gaps = gaps_of(mesh, done.result.z)
     extra: dict[str, Any] = {"solver_status": done.result.status, "intervals": len(mesh.intervals),
-                             "largest_gap": float(np.abs(np.concatenate([np.zeros(1), *gaps])).max())}
+                             "largest_gap": float(np.max(np.abs(gaps.values / mesh.scale), initial=0.0))}
+    if mesh.noise is not None:
+        extra |= {"gaps": gaps, "process_noise": dict(zip(problem.system.states, mesh.noise.tolist(), strict=True))}
     if problem.constraints:
         totals, rows = summed(_with_multipliers(done))
         active = [jac[part.at_limit(values)] for _, part, values, jac in rows_at(problem, done.q)]

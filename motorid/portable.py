@@ -146,7 +146,7 @@ def runs_of(fit: Fit) -> list[tuple[Run, Array]]:
 
 def simulation(name: str, system: System, step: ca.Function, run: Run) -> ca.Function:
     """Return ``(s, u, p) -> (y, x)`` on the samples and sub-steps of `run`: s (3,), u (nu, N), y (ny, N)."""
-    nx, nu, np_, _ = system.sizes
+    _, nu, np_, _ = system.sizes
     grid: Grid = run.grid
     m = grid.substeps
     interval = np.repeat(np.arange(len(m)), m)

@@ -21,6 +21,7 @@ from motorid.least_squares import LevenbergMarquardt, levenberg_marquardt
 from motorid.mesh import Mesh
 from motorid.multipliers import violations
 from motorid.nlp import Ipopt, NlpResult, ShootingNlp
+from motorid.gaps import first_noise, given_noise, noise_of_gaps
 from motorid.nodes import nodes_from_data, nodes_from_simulation
 from motorid.outcome import Solved, fit_of
 from motorid.problem import Problem
@@ -32,6 +33,9 @@ FARTHEST = 14.0  # largest change of a logarithm; a parameter at 1e-6 of where i
 HEAVIER = (1.0, 10.0, 100.0)  # times the penalties' own weights, on the way to true constraints
 VALLEY = 1.5  # on the logarithmic scale: to the other valley of the inductance
 POOR = 0.5  # NRMSE at the start above which the intervals are first joined loosely
+NOISY = 25  # samples per interval with process noise
+NOISE_ROUNDS = 4  # of finding how much
+NOISE_KNOWN = 0.2  # change of its logarithm that is small enough
 LOOSE = 10, 0.05  # then: samples per interval, and gaps in sizes of the states
 QUICK = 40  # iterations of a fit that only shows where to go on
 BLUNT = 0.01  # of the RMS of a channel: the least noise that counts in the loose fit
@@ -51,9 +55,10 @@ class MultipleShooting:
         States at the nodes at the start: from the measured channels, and nothing else goes before; or from a
         least-squares fit from the starting values. ``"auto"``: the latter, from poor values after a fit whose
         intervals join loosely.
-    process_noise : mapping of str to float, optional
+    process_noise : mapping of str to float, or "auto", optional
         Standard deviation per state and √s (``{"omega": 3.0}``: rad/s per √s); gaps at the nodes are weighed by
-        it instead of forbidden. States not named get next to none.
+        it instead of forbidden. States not named get next to none. ``"auto"``: of current and speed, so large
+        as their gaps turn out to be. Intervals have 25 samples then.
     max_iterations : int
     tol : float
         IPOPT's tolerance on the scaled problem.
@@ -63,7 +68,7 @@ class MultipleShooting:
 
     every: int | None = None
     warm: str = "auto"
-    process_noise: Mapping[str, float] | None = None
+    process_noise: Mapping[str, float] | str | None = None
     max_iterations: int = 150
     tol: float = 1e-9
     verbose: bool = False
@@ -71,6 +76,8 @@ class MultipleShooting:
     def __post_init__(self) -> None:
         if self.warm not in ("auto", "data", "model"):
             raise UsageError(one_of(str(self.warm), ("auto", "data", "model"), "warm start"))
+        if isinstance(self.process_noise, str) and self.process_noise != "auto":
+            raise UsageError(one_of(self.process_noise, ("auto",), "process noise"))
         if self.every is not None and (int(self.every) != self.every or self.every < 2):
             raise UsageError(f"MultipleShooting(every=…) takes a whole number of at least 2; got {self.every!r}.")
 
@@ -93,6 +100,8 @@ class MultipleShooting:
         plain = replace(problem, constraints=())
         near, q = self._near(plain)
         bound = replace(near, constraints=problem.constraints)
+        if self.process_noise is not None:
+            return fit_of(self._noisy(bound, q), time.perf_counter() - began)
         return fit_of(self._refining(bound, _pulled(bound, q)), time.perf_counter() - began)
 
     # -- stages ----------------------------------------------------------------------------------------
@@ -135,10 +144,10 @@ class MultipleShooting:
         """Solve, refine the sub-steps at the solution, and again while they do not suffice."""
         if not problem.fine_enough(q):
             problem = problem.refined(q)
-        mesh = Mesh(problem, self.every, self._noise(problem))
+        mesh = Mesh(problem, self.every)
         z = mesh.joined(q, self._nodes(mesh, q))
         done = self._solve(mesh, z)
-        if not problem.constraints and mesh.noise is None and done.worse_than(z):
+        if not problem.constraints and done.worse_than(z):
             return done.kept(z)
         for _ in range(ROUNDS - 1):
             if done.problem.fine_enough(done.q):
@@ -155,16 +164,23 @@ class MultipleShooting:
         except SimulationError:
             return nodes_from_data(mesh, q)
 
-    def _noise(self, problem: Problem) -> Array | None:
-        if self.process_noise is None:
-            return None
-        states = problem.system.states
-        for name, value in self.process_noise.items():
-            if name not in states:
-                raise UsageError(f"process_noise: {one_of(name, states, 'state')}")
-            if not value > 0:
-                raise UsageError(f"process_noise: '{name}' must be positive, got {value!r}.")
-        return np.array([self.process_noise.get(n, 1e-6 * s) for n, s in zip(states, Mesh(problem).scale, strict=True)])
+    def _noisy(self, problem: Problem, q: Array) -> Solved:
+        """Solve with process noise; with ``"auto"`` again until the gaps are as large as was taken."""
+        problem = problem.refined(q)
+        mesh = Mesh(problem, self.every or NOISY)
+        if isinstance(self.process_noise, Mapping):
+            noise = given_noise(self.process_noise, mesh)
+        else:
+            noise = first_noise(mesh)
+        mesh = replace(mesh, noise=noise)
+        done = self._solve(mesh, mesh.joined(q, nodes_from_data(mesh, q)), quick=self.process_noise == "auto")
+        for _ in range(NOISE_ROUNDS if self.process_noise == "auto" else 0):
+            noise = noise_of_gaps(done)
+            near = bool(np.all(np.abs(np.log(noise / done.mesh.noise)) < NOISE_KNOWN))
+            done = self._solve(replace(done.mesh, noise=noise), done.result.z, history=done.history)
+            if near:
+                break
+        return done
 
     def _solve(self, mesh: Mesh, z: Array, warm: NlpResult | None = None, history: tuple[float, ...] = (),
                quick: bool = False) -> Solved:
