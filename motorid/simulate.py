@@ -158,4 +158,6 @@ def evaluate(fit_or_model: Any, runs: Sequence[Experiment] | Experiment, **optio
     model = fit_or_model if isinstance(fit_or_model, Model) else fit_or_model.model
     if not isinstance(fit_or_model, Model):
         options = {"engine": fit_or_model.problem.engine, "initial": fit_or_model.problem.initial, **options}
+        if "sgn_width" in model.parameters:  # it was chosen for the fitted runs; it is part of what is judged
+            model = model.replace(sgn_width=model.values["sgn_width"])
     return judge(simulate(model, runs, **options))

@@ -240,7 +240,7 @@ def test_simulate_repeats_the_held_out_error_of_the_fit(fitted, tmp_path):
     path, found = fitted
     again = motorid_json(tmp_path, "simulate", path, FRICTION / "check1.csv", "--out", tmp_path / "sim")
     for channel, error in found["validation_nrmse"].items():
-        assert again["nrmse"][channel] == pytest.approx(error, rel=1e-3), channel
+        assert again["nrmse"][channel] == pytest.approx(error, rel=1e-6), channel
     written = read_runs(again["files"])[0]
     measured = read_runs(FRICTION / "check1.csv")[0]
     e = written.outputs["omega"] - measured.outputs["omega"]
