@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from motorid._html import render_table
+from motorid._html import Card, render
 from motorid._html_tables import counted, error_table, model_name
 from motorid.effects import LIBRARY, get
 from motorid.errors import MissingDependency, ModelError, MotoridError, UsageError
@@ -97,9 +97,7 @@ class Explorer:
     def _known(self, values: Mapping[str, float]) -> Mapping[str, float]:
         for name in values:
             if name not in self.model.parameters:
-                raise UsageError(
-                    f"the model has no parameter '{name}'; it has {', '.join(self.model.parameters)}."
-                )
+                raise UsageError(f"the model has no parameter '{name}'; it has {', '.join(self.model.parameters)}.")
         return values
 
     def _try(self, model: Model, done: str) -> None:
@@ -149,7 +147,9 @@ class Explorer:
         import ipywidgets as w
 
         size = abs(p.value) or 1e-3
-        common: dict[str, Any] = {"description": p.name, "continuous_update": False, "disabled": False}
+        common: dict[str, Any] = {"description": f"{p.name} ({p.unit})" if p.unit else p.name,
+                                  "continuous_update": False, "style": {"description_width": "7.5rem"},
+                                  "layout": w.Layout(width="24rem")}  # fmt: skip
         if p.positive:
             power = float(np.log10(p.value))
             slider = w.FloatLogSlider(value=p.value, base=10, min=power - 1, max=power + 1, step=0.002,
@@ -157,11 +157,9 @@ class Explorer:
         else:
             low, high = max(p.lower, p.value - REACH * size), min(p.upper, p.value + REACH * size)
             step = 1.0 if p.order else (high - low) / 2000
-            slider = w.FloatSlider(
-                value=p.value, min=low, max=high, step=step, readout_format=".3g", **common
-            )
+            slider = w.FloatSlider(value=p.value, min=low, max=high, step=step, readout_format=".3g", **common)
         slider.observe(lambda change: self._quiet or self.move(**{p.name: change["new"]}), "value")
-        slider.tooltip = f"{p.doc} ({p.unit})" if p.unit else p.doc
+        slider.tooltip = p.doc
         return slider
 
     def _show_controls(self) -> None:
@@ -193,8 +191,8 @@ class Explorer:
             axes = plot_fit(self.evaluation, before=self._first)
         self._picture.value = png_of(axes)
         units = {c: u for r in self.runs for c, u in r.units.items()}
-        table = render_table(error_table([("now", self.evaluation), ("at first", self._first)], units))
-        self._errors.value = f"<b>{model_name(self.model)}</b>{table}"
+        table = error_table([("now", self.evaluation), ("at first", self._first)], units)
+        self._errors.value = render(Card(model_name(self.model), tables=(table,)))
 
     def _say(self, message: str) -> None:
         self.message = message
@@ -231,9 +229,7 @@ def explore(fit: Fit, *, effects: Iterable[Effect | str] | None = None) -> Explo
         Without ipywidgets.
     """
     if not isinstance(fit, Fit):
-        raise UsageError(
-            f"explore takes a fit, mi.explore(mi.fit(mi.dc_motor(), runs)); got {type(fit).__name__}."
-        )
+        raise UsageError(f"explore takes a fit, mi.explore(mi.fit(mi.dc_motor(), runs)); got {type(fit).__name__}.")
     try:
         import ipywidgets  # noqa: F401
     except ImportError:
@@ -250,9 +246,7 @@ def _can_be_seen(fit: Fit, effect: Effect) -> bool:
     try:
         Problem(fit.model + effect, fit.problem.experiments)
     except ModelError as error:
-        return "same friction" in str(error) or "takes" in str(
-            error
-        )  # it may be ticked once the other is not
+        return "same friction" in str(error) or "takes" in str(error)  # it may be ticked once the other is not
     return True
 
 
