@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from motorid.constraints import CurrentLimit, SteadyState
 from motorid.errors import FitError, SimulationError
 from motorid.integrate.grid import Array
 from motorid.least_squares import LevenbergMarquardt, levenberg_marquardt
@@ -37,6 +38,27 @@ def conflict(problem: Problem, q: Array) -> str | None:
     if len(members) == 1:
         return f"{names} cannot be kept by any values of the parameters; loosen it or leave it out."
     return (f"{names} contradict one another: each can be kept, not all together. Loosen or leave out one of them.")
+
+
+def below_steady(problem: Problem) -> str | None:
+    """Return a sentence if a current limit lies below a current that the records hold steadily; else None.
+
+    Values that keep such a limit exist, but they describe another motor.
+    """
+    limits = [c for c in problem.constraints if isinstance(c, CurrentLimit)]
+    if not limits:
+        return None
+    lowest = min(limits, key=lambda c: c.limit)
+    steady = [c for c in problem.constraints if isinstance(c, SteadyState)]
+    segments = (steady[0] if steady else SteadyState()).segments(problem)
+    for s in sorted(segments, key=lambda s: -abs(s.means.get("i", 0.0))):
+        noise = 3 * problem.runs[s.run].sigma.get("i", 0.0) / np.sqrt(s.n)
+        if abs(s.means.get("i", 0.0)) > lowest.limit + noise:
+            names = " and ".join(c.name for c in (lowest, *steady[:1]))
+            return (f"{names} {'contradict one another' if steady else 'contradicts the records'}: run {s.run} holds "
+                    f"{abs(s.means['i']):.4g} A from {s.begin:.4g} to {s.end:.4g} s. Raise the limit above that, or "
+                    "leave the run out.")
+    return None
 
 
 def _possible(problem: Problem, members: Sequence[Any], starts: Sequence[Array]) -> bool:
@@ -77,4 +99,4 @@ def _rows(problem: Problem, relations: Sequence[Any], q: Array, derivatives: boo
     return np.concatenate(rs), np.concatenate(jacs)
 
 
-__all__ = ["conflict"]
+__all__ = ["below_steady", "conflict"]

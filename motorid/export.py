@@ -235,7 +235,7 @@ def model_from_json(contents: Mapping[str, Any], effects: Iterable[Effect] = ())
                         "effect has changed since the file was written.")
     limits = {n: (p.get("lower", -np.inf), p.get("upper", np.inf)) for n, p in pars.items()
               if "lower" in p or "upper" in p}
-    return model.free(*values).bounded(**limits).replace(**values).fix(*held)
+    return model.free(*values).replace(**values).bounded(**limits).fix(*held)
 
 
 def _base(base: str, axis: str) -> Model:

@@ -13,15 +13,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from motorid.conflict import below_steady
 from motorid.descent import descend_balanced, misfit_over_noise
 from motorid.errors import FitError, SimulationError, UsageError, one_of
 from motorid.fit import Fit
+from motorid.gaps import first_noise, given_noise, noise_of_gaps
 from motorid.integrate.grid import Array
 from motorid.least_squares import LevenbergMarquardt, levenberg_marquardt
 from motorid.mesh import Mesh
 from motorid.multipliers import violations
 from motorid.nlp import Ipopt, NlpResult, ShootingNlp
-from motorid.gaps import first_noise, given_noise, noise_of_gaps
 from motorid.nodes import nodes_from_data, nodes_from_simulation
 from motorid.outcome import Solved, fit_of
 from motorid.problem import Problem
@@ -168,15 +169,13 @@ class MultipleShooting:
         """Solve with process noise; with ``"auto"`` again until the gaps are as large as was taken."""
         problem = problem.refined(q)
         mesh = Mesh(problem, self.every or NOISY)
-        if isinstance(self.process_noise, Mapping):
-            noise = given_noise(self.process_noise, mesh)
-        else:
-            noise = first_noise(mesh)
+        given = self.process_noise
+        noise = given_noise(given, mesh) if isinstance(given, Mapping) else first_noise(mesh)
         mesh = replace(mesh, noise=noise)
         done = self._solve(mesh, mesh.joined(q, nodes_from_data(mesh, q)), quick=self.process_noise == "auto")
         for _ in range(NOISE_ROUNDS if self.process_noise == "auto" else 0):
-            noise = noise_of_gaps(done)
-            near = bool(np.all(np.abs(np.log(noise / done.mesh.noise)) < NOISE_KNOWN))
+            before, noise = noise, noise_of_gaps(done)
+            near = bool(np.all(np.abs(np.log(noise / before)) < NOISE_KNOWN))
             done = self._solve(replace(done.mesh, noise=noise), done.result.z, history=done.history)
             if near:
                 break
@@ -206,6 +205,9 @@ def _check(problem: Problem) -> None:
             raise UsageError(f"MultipleShooting takes CurrentLimit, SteadyState and Constraint, not "
                              f"{type(c).__name__}.")
         c.parts(problem)
+    contradiction = below_steady(problem)
+    if contradiction:
+        raise FitError(contradiction)
 
 
 def _blunted(problem: Problem) -> dict[str, float]:
