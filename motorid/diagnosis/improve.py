@@ -67,7 +67,7 @@ def climb(search: Search, max_effects: int, advance: Callable[[str], None]) -> C
         frontier = [best, *_runners_up(search, best, ordered)][:BEAM]
         judged = adequacy(best.fit, search.scores(best))
         advance(f"accepted {new.added}")
-    return Climb(search, tuple(_path(search, best)), tuple(rounds), tuple(g for g in groups if g), text, judged)
+    return Climb(search, tuple(_path(best)), tuple(rounds), tuple(g for g in groups if g), text, judged)
 
 
 def _runners_up(search: Search, best: Node, ordered: Sequence[Node]) -> list[Node]:
@@ -86,15 +86,11 @@ def _marked(listed: Sequence[Candidate], name: str | None, group: tuple[str, ...
     return tuple(replace(c, accepted=True, group=group) if c.effect == name else c for c in listed)
 
 
-def _path(search: Search, last: Node) -> list[Node]:
-    """Return the models from the root to `last`, one effect at a time, most helpful first where the way was pruned."""
-    path, node = [last], last
-    while node.parent is not None and len(path) < 10:
-        node = node.parent
-        if len(node.key) < len(path[0].key) and node.key < path[0].key:
-            path.insert(0, node)
-    if path[0] is not search.root:
-        path.insert(0, search.root)
+def _path(last: Node) -> list[Node]:
+    """Return the models from the root to `last`, as they were grown."""
+    path = [last]
+    while path[0].parent is not None:
+        path.insert(0, path[0].parent)
     return path
 
 

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 CHUNK = 40
 HIGHEST = 240
+PERIODS = 3  # within the travel
 SLOW_PART = 0.2  # of the motion that must be slow enough to show an order
 
 
@@ -43,7 +44,7 @@ def likely_orders(tangent: Tangent, effect: Effect, most: int) -> list[float]:
     (a relative amplitude).
     """
     relative = any(p.null == 0 and p.unit == "" for p in effect.parameters)
-    return list(_ranked(tangent, relative)[:most]) or [1.0]
+    return list(_ranked(tangent, relative)[:most])
 
 
 @lru_cache(maxsize=4)
@@ -52,7 +53,8 @@ def _ranked(tangent: Tangent, relative: bool) -> tuple[float, ...]:
     if relative and "i" not in fit.problem.system.states:
         return ()
     answers, found = responses(fit), []
-    lowest = 1 if relative else 2  # a torque that repeats once per turn is gravity's
+    # A torque that repeats once per turn is gravity's, and what is to repeat must do so within the travel.
+    lowest = max(1 if relative else 2, int(np.ceil(PERIODS * 2 * np.pi / max(_travel(fit), 1e-9))))
     for first in range(lowest, top + 1, CHUNK):
         orders = np.arange(float(first), min(first + CHUNK, top + 1))
         columns = np.vstack([_columns(fit, k, answer, orders, relative) for k, answer in enumerate(answers)])
@@ -88,6 +90,10 @@ def _columns(fit, k: int, answer: Response, orders: Array, relative: bool) -> Ar
         out[i + 1] = c[i + 1] @ s
     flat = out.reshape(n * ny, -1)
     return flat if index is None else flat[index]
+
+
+def _travel(fit) -> float:
+    return max(float(np.ptp(angle_signal(r))) for r in fit.problem.experiments)
 
 
 def _explained(gram: Array, slope: Array) -> float:

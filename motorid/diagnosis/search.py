@@ -102,6 +102,8 @@ class Search:
         for e in self.effects:
             if e.name in have or e.name in contained:
                 continue
+            if model.axis == "linear" and any(p.periodic for p in e.parameters):
+                continue  # a phase in metres is none
             if have & set(e.includes):
                 wider.append(e)
                 continue
