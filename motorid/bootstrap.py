@@ -26,6 +26,8 @@ from motorid.tasks import Map, Parcel, in_chunks, run_tasks
 from motorid.uncertainty import covariance, interval_text
 
 KINDS = ("blocks", "parametric", "runs")
+# Blocks lose the likeness across their joints: the variance comes out too small by about one over this.
+CORRELATIONS = 8
 FEWEST_RUNS = 4  # resampled as wholes: with fewer there are hardly any different samples
 SOLVER = LevenbergMarquardt(max_iterations=60, ftol=1e-7, xtol=1e-7)  # from the fit, next to the optimum
 
@@ -189,7 +191,7 @@ def _block_length(colours: Mapping[str, Colour], residuals: Sequence[Mapping[str
     """Several correlation times, at least the cube root of the samples, at most a fifth of a run."""
     n = min(len(e) for r in residuals for e in r.values())
     times = [1.0 / max(c.effective_share, 1e-3) for c in colours.values()]
-    return int(np.clip(4 * max(times), np.ceil(n ** (1 / 3)), max(n // 5, 1)))
+    return int(np.clip(CORRELATIONS * max(times), np.ceil(n ** (1 / 3)), max(n // 5, 1)))
 
 
 def _refits(task: tuple[Parcel, Sequence[np.random.SeedSequence]]) -> list[dict[str, float] | Failure]:

@@ -265,6 +265,13 @@ def test_profile_of_a_well_determined_parameter_is_the_covariances_interval(fit)
         assert p.best > -0.1
 
 
+def test_profile_allows_for_coloured_noise(clean):
+    fit = mi.fit(mi.dc_motor(), measured(clean, np.random.default_rng(3), 0.9))
+    width = np.ptp(covariance(fit).interval("R"))
+    assert width > 2 * np.ptp(covariance(fit, method="white").interval("R"))
+    assert np.ptp(profile(fit, "R", quiet=True).interval()) == pytest.approx(width, rel=0.1)
+
+
 def test_profile_says_when_a_side_is_open(speed_only):
     # Friction and K trade off: K is largest where there is no friction at all, and nothing limits it below.
     k = profile(speed_only, "K", quiet=True)
