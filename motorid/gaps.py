@@ -32,7 +32,8 @@ class Gaps:
         Length of the interval before, s.
     states : tuple of str
     values : ndarray, shape (n, nx)
-        SI. J·gap/span of the speed is the mean torque that was missing in the interval.
+        SI. J·gap/span of the speed is the mean torque that was missing in the interval, where the interval is
+        short beside the mechanical time constant.
     """
 
     run: np.ndarray

@@ -1,0 +1,189 @@
+"""Export: the same trajectories elsewhere, without motorid; and back."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+import motorid as mi
+from motorid.errors import DataError, ModelError, UsageError
+from motorid.export import Exported, export, load, model_from_json
+
+COMPILER = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
+ALONE = """
+import json, sys
+import casadi
+file = casadi.FileDeserializer(sys.argv[1])
+functions, about = {f.name(): f for f in file.unpack()}, json.loads(file.unpack())
+p = functions["parameters"]()["p"]
+found = []
+for k in range(2):
+    record = functions[f"record_{k}"]()
+    found.append(functions[f"simulate_{k}"](s=record["s"], u=record["u"], p=p)["y"].full().T.tolist())
+assert not any(m.split(".")[0] == "motorid" for m in sys.modules)
+print(json.dumps({"y": found, "R": about["parameters"]["R"]["value"]}))
+"""
+
+
+@mi.effect(balance="torque")
+def my_drag(m, c_3=mi.P(1e-10, "N·m·s³/rad³", null=0.0, lower=0.0)):
+    """Drag with the cube of the speed."""
+    m.torque -= c_3 * m.omega**3
+
+
+def runs_of(name: str) -> list[mi.Experiment]:
+    return mi.read_runs(sorted(str(p) for p in mi.data_path(name).glob("*.csv") if not p.name.startswith("check")))
+
+
+@pytest.fixture(scope="module", params=["plain", "friction", "heating"])
+def fit(request) -> mi.Fit:
+    name, effects = {"plain": ("two_step_noisy", ()), "friction": ("hidden_friction", ("coulomb",)),
+                     "heating": ("hidden_heating", ("winding_heating",))}[request.param]
+    model = mi.dc_motor()
+    for e in effects:
+        model = model + mi.effects.get(e)
+    return mi.fit(model, runs_of(name))
+
+
+def trajectories(fit: mi.Fit) -> list[np.ndarray]:
+    return [np.column_stack([s.outputs[c] for c in fit.problem.outputs]) for s in fit.simulations]
+
+
+def assert_close(found, wanted, tolerance):
+    for a, b in zip(found, wanted, strict=True):
+        assert np.abs(np.asarray(a) - b).max() <= tolerance * np.abs(b).max()
+
+
+def test_casadi_file_alone_reproduces_the_fit(fit, tmp_path):
+    path = export(fit, tmp_path / "motor.casadi")
+    done = subprocess.run([sys.executable, "-c", ALONE, str(path)], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout)
+    assert_close(found["y"], trajectories(fit), 1e-9)
+    assert found["R"] == fit.values["R"]
+
+
+@pytest.mark.skipif(COMPILER is None, reason="no C compiler on this machine")
+def test_c_program_reproduces_the_fit(fit, tmp_path):
+    export(fit, tmp_path / "my-motor.c")
+    build = [COMPILER, "-O2", "-std=c99", "-Wall", "-Werror", "-pedantic", "my_motor_main.c", "my_motor.c", "-lm",
+             "-o", "walk"]
+    done = subprocess.run(build, cwd=tmp_path, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    for k, wanted in enumerate(trajectories(fit)):
+        walked = subprocess.run([tmp_path / "walk", f"my_motor_run{k}.csv", str(k)], cwd=tmp_path,
+                                capture_output=True, text=True, timeout=60)
+        assert walked.returncode == 0, walked.stderr
+        lines = walked.stdout.strip().splitlines()
+        assert lines[0] == ",".join(["t", *fit.problem.outputs])
+        assert_close([np.array([line.split(",")[1:] for line in lines[1:]], float)], [wanted], 1e-7)
+    refused = subprocess.run([tmp_path / "walk", "my_motor_run0.csv", "9"], cwd=tmp_path, capture_output=True,
+                             timeout=60)
+    assert refused.returncode == 2
+
+
+def test_json_reloads_into_the_same_model(fit, tmp_path):
+    again = load(export(fit, tmp_path / "motor.json"))
+    assert isinstance(again, mi.Model)
+    assert again.values == fit.model.values
+    assert again.free_names == fit.model.free_names
+    assert again.effect_names == fit.model.effect_names
+    problem = fit.problem.for_model(again)
+    q = problem.scaling.scaled(fit.problem.scaling.physical(fit.q))  # coordinates are relative to the start values
+    for k, wanted in enumerate(trajectories(fit)):
+        assert_close([problem.simulate(q, k, derivatives=False).y], [wanted], 1e-9)
+
+
+def test_what_travels_along_is_complete(fit, tmp_path):
+    info = json.loads(export(fit, tmp_path / "motor.json").read_text(encoding="utf-8"))
+    assert {d["name"] for d in info["data"]} == {r.name for r in fit.problem.experiments}
+    assert all(len(d["sha256"]) == 64 for d in info["data"])
+    assert np.array(info["covariance"]["matrix"]) == pytest.approx(fit.covariance)
+    assert set(info["versions"]) == {"motorid", "casadi", "numpy", "python"}
+    for name, p in info["parameters"].items():
+        assert p["unit"] == fit.problem.model.parameters[name].unit
+    file = load(export(fit, tmp_path / "motor.casadi"))
+    assert isinstance(file, Exported)
+    assert file.info == info
+    assert file.values == fit.model.values
+    assert file.model.values == fit.model.values
+
+
+def test_exported_step_follows_other_inputs(tmp_path):
+    """The file is a model, not a recording: another voltage gives what motorid gives."""
+    fit = mi.fit(mi.dc_motor(), runs_of("two_step_noisy"))
+    file = load(export(fit, tmp_path / "motor.casadi"))
+    run = fit.problem.experiments[0]
+    other = run.with_(inputs={"v": 0.5 * run.inputs["v"]})
+    found = file.simulate(0, u=other.inputs["v"])
+    fine = mi.simulate(fit.model, other)[0]
+    assert_close([found], [np.column_stack([fine.outputs[c] for c in fit.problem.outputs])], 1e-4)
+    with pytest.raises(UsageError, match="simulate_0"):
+        file.simulate(5)
+
+
+def test_fit_with_another_engine_exports_our_step(tmp_path):
+    fit = mi.fit(mi.dc_motor(), runs_of("two_step_noisy")[:1], engine="cvodes")
+    file = load(export(fit, tmp_path / "motor.casadi"))
+    assert_close([file.simulate(0)], trajectories(fit), 1e-3)
+
+
+def test_a_model_without_a_fit_can_be_exported(tmp_path):
+    model = mi.dc_motor(R=2.0) + mi.effects.coulomb
+    file = load(export(model, tmp_path / "m.casadi"))
+    assert sorted(file.functions) == ["initial", "outputs", "parameters", "rhs", "step"]
+    assert load(export(model, tmp_path / "m.json")).values == model.values
+    assert "m_main.c" in {p.name for p in export(model, tmp_path / "m.c").parent.iterdir()}
+
+
+def test_own_effect_says_what_is_needed_and_loads_with_it(tmp_path):
+    model = mi.dc_motor() + my_drag
+    path = export(model, tmp_path / "own.json")
+    with pytest.raises(ModelError, match=r"my_drag.*c_3.*effects=\[my_drag\]"):
+        load(path)
+    assert load(path, effects=[my_drag]).values == model.values
+
+
+def test_limits_and_held_values_come_back(tmp_path):
+    model = mi.dc_motor().replace(R=2.0).bounded(R=(1.5, 3.0)).fix(L=1e-3)
+    again = load(export(model, tmp_path / "m.json"))
+    assert (again.parameters["R"].lower, again.parameters["R"].upper) == (1.5, 3.0)
+    assert "L" not in again.free_names
+    held = mi.torque_driven("linear", g=35.0) + mi.effects.coulomb
+    assert load(export(held, tmp_path / "t.json")).axis == "linear"
+
+
+def test_fit_json_of_the_command_line_reloads():
+    contents = {"model": {"base": "dc_motor", "effects": ["coulomb"]}, "something": "else", "parameters": {
+        n: {"value": v, "std": None, "unit": "", "fixed": n in ("L", "sgn_width")}
+        for n, v in {"R": 1.0, "L": 1e-3, "K": 0.05, "b": 1e-5, "J": 1e-5, "tau_c": 1e-3, "sgn_width": 0.1}.items()}}
+    model = model_from_json(contents)
+    assert model.values["tau_c"] == 1e-3
+    assert "L" not in model.free_names
+
+
+def test_bad_files_and_words_are_refused(tmp_path):
+    model = mi.dc_motor()
+    with pytest.raises(UsageError, match="not clear"):
+        export(model, tmp_path / "motor.txt")
+    with pytest.raises(UsageError, match="unknown form"):
+        export(model, tmp_path / "motor.c", to="cpp")
+    with pytest.raises(UsageError, match="a fit or a model"):
+        export("motor", tmp_path / "motor.c")
+    with pytest.raises(DataError, match="cannot read"):
+        load(tmp_path / "none.json")
+    (tmp_path / "bad.json").write_text("{ not json", encoding="utf-8")
+    with pytest.raises(DataError, match="not JSON"):
+        load(tmp_path / "bad.json")
+    (tmp_path / "bad.casadi").write_text("rubbish", encoding="utf-8")
+    with pytest.raises(DataError, match=r"bad\.casadi"):
+        load(tmp_path / "bad.casadi")
+    with pytest.raises(DataError, match="not a fitted model"):
+        model_from_json({"model": {"base": "dc_motor"}})
+    with pytest.raises(DataError, match="only one of the file and the model"):
+        model_from_json({"model": {"base": "dc_motor", "effects": []}, "parameters": {}})
