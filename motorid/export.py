@@ -235,7 +235,9 @@ def model_from_json(contents: Mapping[str, Any], effects: Iterable[Effect] = ())
                         "effect has changed since the file was written.")
     limits = {n: (p.get("lower", -np.inf), p.get("upper", np.inf)) for n, p in pars.items()
               if "lower" in p or "upper" in p}
-    return model.free(*values).replace(**values).bounded(**limits).fix(*held)
+    fixed = {n: values[n] for n in held}  # first: what is held may be zero, what is free may not
+    free = {n: v for n, v in values.items() if n not in fixed}
+    return model.fix(**fixed).replace(**free).bounded(**limits).free(*free)
 
 
 def _base(base: str, axis: str) -> Model:

@@ -265,6 +265,13 @@ def test_export_to_json_and_casadi_come_back(fitted, tmp_path):
         assert again["nrmse"]["omega"] == pytest.approx(found["validation_nrmse"]["omega"], rel=1e-3)
 
 
+def test_a_held_inductance_of_zero_comes_back(tmp_path):
+    found = motorid_json(tmp_path, "fit", STEPS / "step_6V.csv", "--fix", "L=0")
+    (tmp_path / "fit.json").write_text((tmp_path / "result.json").read_text())
+    again = motorid_json(tmp_path, "simulate", tmp_path / "fit.json", STEPS / "step_6V.csv")
+    assert again["nrmse"]["omega"] == pytest.approx(found["nrmse"]["omega"], rel=1e-3)
+
+
 # -- diagnose, identifiability, robustness, fit-many ---------------------------------------------------------
 @pytest.mark.slow
 def test_diagnose_names_the_missing_effect(tmp_path):
