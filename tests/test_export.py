@@ -40,14 +40,18 @@ def runs_of(name: str) -> list[mi.Experiment]:
     return mi.read_runs(sorted(str(p) for p in mi.data_path(name).glob("*.csv") if not p.name.startswith("check")))
 
 
-@pytest.fixture(scope="module", params=["plain", "friction", "heating"])
+@pytest.fixture(scope="module", params=["plain", "friction", "heating", "linear"])
 def fit(request) -> mi.Fit:
     name, effects = {"plain": ("two_step_noisy", ()), "friction": ("hidden_friction", ("coulomb",)),
-                     "heating": ("hidden_heating", ("winding_heating",))}[request.param]
+                     "heating": ("hidden_heating", ("winding_heating",)),
+                     "linear": ("two_step_noisy", ())}[request.param]
     model = mi.dc_motor()
     for e in effects:
         model = model + mi.effects.get(e)
-    return mi.fit(model, runs_of(name))
+    runs = runs_of(name)
+    if request.param == "linear":  # a ramp that begins slowly, the input joined by lines between the samples
+        runs = [r.with_(hold="linear", inputs={"v": np.convolve(r.inputs["v"], np.ones(5) / 5, "same")}) for r in runs]
+    return mi.fit(model, runs)
 
 
 def trajectories(fit: mi.Fit) -> list[np.ndarray]:

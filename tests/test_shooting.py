@@ -70,9 +70,11 @@ def test_multiplier_is_the_slope_of_the_cost():
         found = mi.fit(mi.dc_motor(), runs, solver=MultipleShooting(), constraints=[CurrentLimit(limit)])
         costs.append(found.cost)
         if limit == 4.0:
-            (multiplier,) = found.extra["multipliers"]
+            (multiplier,), rows = found.extra["multipliers"], found.extra["active"]
     assert multiplier.value == pytest.approx((costs[0] - costs[2]) / 0.02, rel=0.02)
     assert multiplier.unit == "A"
+    assert sum(row.value for row in rows) == pytest.approx(multiplier.value)
+    assert all("t = " in row.label for row in rows)
     assert "1 A would lower the cost by" in multiplier.text
 
 
