@@ -18,7 +18,7 @@ from motorid.experiment import Experiment
 from motorid.layout import parse_pairs
 from motorid.summary import write_json
 
-FORMS = ("casadi", "c", "json", "fmu")
+FORMS = ("casadi", "c", "json")
 
 
 @with_choices(Choices)
@@ -65,7 +65,7 @@ def export(
     fit_json: Annotated[Path, typer.Argument(metavar="FIT.json", help="What fit --json wrote.")],
     path: Annotated[Path, typer.Argument(metavar="PATH", help="What to write.")],
     to: Annotated[str | None, typer.Option(
-        metavar="casadi|c|json|fmu", show_default=False, help="Form of the model; by default PATH's ending.")] = None,
+        metavar="casadi|c|json", show_default=False, help="Form of the model; by default PATH's ending.")] = None,
     effects_from: Annotated[Path | None, typer.Option(
         metavar="FILE.py", help="Effects of your own.")] = None,
 ) -> None:

@@ -20,7 +20,7 @@ from motorid.integrate.grid import Array
 from motorid.model import Effect, Model, dc_motor, torque_driven
 from motorid.portable import description, functions_of, model_of
 
-FORMS = {".casadi": "casadi", ".c": "c", ".json": "json", ".fmu": "fmu"}
+FORMS = {".casadi": "casadi", ".c": "c", ".json": "json"}
 NOT_OURS = "it is not a file that mi.export wrote"
 
 
@@ -69,9 +69,9 @@ def export(found: Fit | Model | Exported, path: str | os.PathLike[str], to: str 
     found : Fit, Model or Exported
         A fit brings its uncertainty, its records' inputs and the very steps of its simulation along.
     path : path
-        ``motor.casadi``, ``motor.c``, ``motor.json`` or ``motor.fmu``. C makes ``motor.h``, ``motor_main.c`` and
+        ``motor.casadi``, ``motor.c`` or ``motor.json``. C makes ``motor.h``, ``motor_main.c`` and
         the records ``motor_run0.csv`` … beside it.
-    to : {"casadi", "c", "json", "fmu"}, optional
+    to : {"casadi", "c", "json"}, optional
         Default: by the ending of `path`.
 
     Returns
@@ -135,13 +135,7 @@ def _write_c(found: Fit | Model, path: Path) -> Path:
     return write_c(found, path)[0]
 
 
-def _write_fmu(found: Fit | Model, path: Path) -> Path:
-    from motorid.fmu import write_fmu
-
-    return write_fmu(found, path)
-
-
-_WRITERS = {"casadi": _write_casadi, "c": _write_c, "json": _write_json, "fmu": _write_fmu}
+_WRITERS = {"casadi": _write_casadi, "c": _write_c, "json": _write_json}
 
 
 def _whole(path: Path, text: str) -> None:
@@ -170,7 +164,7 @@ def load(path: str | os.PathLike[str], effects: Iterable[Effect] = ()) -> Model 
         If an effect is not known; the message says what is needed.
     """
     source = Path(path).expanduser()
-    if source.suffix.lower() in (".c", ".h", ".fmu"):
+    if source.suffix.lower() in (".c", ".h"):
         raise UsageError(f"{source.name} goes to other programs; load reads .json and .casadi files.")
     try:
         with source.open("rb") as file:
