@@ -1,4 +1,4 @@
-"""Taking a fitted model along: a file of CasADi functions, C source, JSON, an FMU; and back."""
+"""Taking a fitted model along: a file of CasADi functions, C source, JSON; and back."""
 
 from __future__ import annotations
 
@@ -21,6 +21,8 @@ from motorid.model import Effect, Model, dc_motor, torque_driven
 from motorid.portable import description, functions_of, model_of
 
 FORMS = {".casadi": "casadi", ".c": "c", ".json": "json"}
+NO_FMU = ("an FMU is not offered: those that CasADi 3.8.2 writes do not pass FMPy's checker (names of variables, initial "
+          "unknowns), and FMPy simulates them with other trajectories. Take to='c' or to='casadi'.")
 NOT_OURS = "it is not a file that mi.export wrote"
 
 
@@ -97,6 +99,8 @@ def export(found: Fit | Model | Exported, path: str | os.PathLike[str], to: str 
     """
     target = Path(path).expanduser()
     form = to or FORMS.get(target.suffix.lower())
+    if "fmu" in (form, target.suffix.lower().lstrip(".")):
+        raise UsageError(NO_FMU)
     if form is None:
         raise UsageError(f"what to write is not clear from '{target.name}': end it with {', '.join(FORMS)}, or say "
                          "to='casadi'.")

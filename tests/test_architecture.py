@@ -32,7 +32,7 @@ ROWS = (
     # 5 how far it can be trusted, and what it lacks
     "identifiability uncertainty bootstrap profiling intervals endings multistart batch formulations diagnosis",
     # 6 taking it along and showing it
-    "export portable csource fmu plots acquire summary explore report "
+    "export portable csource plots acquire summary explore report "
     "_html _html_tables _cards _cards_trust _sections _story",
     # 7 the command line and the public names
     "cli __main__ __init__",

@@ -175,6 +175,8 @@ def test_bad_files_and_words_are_refused(tmp_path):
     model = mi.dc_motor()
     with pytest.raises(UsageError, match="not clear"):
         export(model, tmp_path / "motor.txt")
+    with pytest.raises(UsageError, match="FMU is not offered"):
+        export(model, tmp_path / "motor.fmu")
     with pytest.raises(UsageError, match="unknown form"):
         export(model, tmp_path / "motor.c", to="cpp")
     with pytest.raises(UsageError, match="a fit or a model"):
