@@ -21,8 +21,8 @@ from motorid.model import Effect, Model, dc_motor, torque_driven
 from motorid.portable import description, functions_of, model_of
 
 FORMS = {".casadi": "casadi", ".c": "c", ".json": "json"}
-NO_FMU = ("an FMU is not offered: those that CasADi 3.8.2 writes do not pass FMPy's checker (names of variables, initial "
-          "unknowns), and FMPy simulates them with other trajectories. Take to='c' or to='casadi'.")
+NO_FMU = ("an FMU is not offered: those that CasADi 3.8.2 writes do not pass FMPy's checker (names of variables, "
+          "initial unknowns), and FMPy simulates them with other trajectories. Take to='c' or to='casadi'.")
 NOT_OURS = "it is not a file that mi.export wrote"
 
 
