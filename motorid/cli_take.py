@@ -69,7 +69,7 @@ def export(
     effects_from: Annotated[Path | None, typer.Option(
         metavar="FILE.py", help="Effects of your own.")] = None,
 ) -> None:
-    """Take a fitted model along: as CasADi functions, as C source, as JSON, as an FMU.
+    """Take a fitted model along: as CasADi functions, as C source, as JSON.
 
     Example: motorid export fit.json --to c motor.c
     """
