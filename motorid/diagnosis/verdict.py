@@ -38,7 +38,8 @@ def unexplained_text(judged: Adequacy, missing: Missing, ranking: Sequence[Candi
 def missing_text(rungs: Sequence[Rung], remaining: Adequacy, groups: Sequence[Sequence[str]], validated: bool) -> str:
     """Return the verdict when effects were found."""
     after = rungs[-1].fit
-    names = [n for r in rungs[1:] if r.added for n in r.added.split(" + ")]
+    added = (n for r in rungs[1:] if r.added for n in r.added.split(" + "))
+    names = [n for n in added if n in after.problem.model.effect_names]  # not what a later effect made superfluous
     parts = [f"Missing: {'; '.join(_described(after, n) for n in names)}."]
     parts.append(_errors(rungs[0], rungs[-1], validated))
     parts += [f"These data cannot tell {g[0]} from {' or '.join(g[1:])}." for g in groups]
