@@ -58,15 +58,16 @@ def climb(search: Search, max_effects: int, advance: Callable[[str], None]) -> C
             text = "stopped: no further effect lowers the error on data it was not fitted to"
             break
         new, ordered = chosen
-        group = search.judge.group(new, ordered, {e.name: e.includes for e in search.effects})
         search.nodes |= children
-        if new.parent is frontier[0]:
-            rounds[-1] = _marked(rounds[-1], new.added, group)
-        groups.append((new.added or "", *group) if group else ())
         best = search.pruned(new)
+        chosen_of = best if best.added != new.added and best.parent is new.parent else new
+        group = search.judge.group(chosen_of, ordered, {e.name: e.includes for e in search.effects})
+        if new.parent is frontier[0]:
+            rounds[-1] = _marked(rounds[-1], chosen_of.added, group)
+        groups.append((chosen_of.added or "", *group) if group else ())
         frontier = [best, *_runners_up(search, best, ordered)][:BEAM]
         judged = adequacy(best.fit, search.scores(best))
-        advance(f"accepted {new.added}")
+        advance(f"accepted {chosen_of.added}")
     return Climb(search, tuple(_path(best)), tuple(rounds), tuple(g for g in groups if g), text, judged)
 
 

@@ -173,25 +173,47 @@ class Search:
         return listed + rest
 
     def pruned(self, node: Node) -> Node:
-        """Return `node` without the effects that have become superfluous."""
-        for name in node.fit.problem.model.effect_names[:-1]:
-            smaller = self._without(node, name)
-            if smaller is not None and not self.judge.beats(node, smaller):
-                return self.pruned(smaller)
+        """Return `node` without the effects that have become superfluous, and with the simplest of each kind.
+
+        A later effect may have taken over what made an earlier one special: then its simple relative will do.
+        """
+        for e in node.fit.problem.model.effects:
+            simpler = [node.fit.model.without(e.name) + r for r in self._relatives(node, e)]
+            smaller = simpler if e.name == node.added else [*simpler, node.fit.model.without(e.name)]
+            for model in sorted(smaller, key=lambda m: len(m.free_names)):
+                other = self._smaller(node, model)
+                if other is not None and not self.judge.beats(node, other):
+                    return self.pruned(other)
         return node
 
-    def _without(self, node: Node, name: str) -> Node | None:
-        model = node.fit.model.without(name)
+    def _relatives(self, node: Node, effect: Effect) -> list[Effect]:
+        """Return the simpler effects, not in the model yet, that `effect` contains."""
+        have = set(node.fit.model.effect_names)
+        known = {e.name: e for e in self.effects}
+        return [known[n] for n in effect.includes if n in known and n not in have]
+
+    def _smaller(self, node: Node, model: Model) -> Node | None:
+        """Return the judged model, one that is contained in `node`'s; None where it is no model by itself."""
         key = frozenset(model.effect_names)
         if key not in self.nodes:
-            fit = refit(node.fit, model, ({n: node.fit.values[n] for n in model.parameters},))
-            if fit is None:
+            values = {n: node.fit.values[n] for n in model.parameters if n in node.fit.values}
+            new = [e for e in model.effects if e.name not in node.fit.model.effect_names]
+            level = [v for e in node.fit.model.effects if e.name not in model.effect_names for v in _sizes(node.fit, e)]
+            values |= {p.name: max(level) for e in new for p in e.parameters if p.null == 0 and p.name not in values}
+            fit = refit(node.fit, model, (values,))
+            if fit is None or any(objections(fit, e) for e in new):
                 return None
             try:
-                self.nodes[key] = node_of(fit, self.held, node.added, node.parent)
+                added = node.added if node.added in model.effect_names or not new else new[0].name
+                self.nodes[key] = node_of(fit, self.held, added, node.parent)
             except FAILURES:
                 return None
         return self.nodes[key]
+
+
+def _sizes(fit: Fit, effect: Effect) -> list[float]:
+    """Sizes of an effect, those that vanish with it."""
+    return [fit.values[p.name] for p in effect.parameters if p.null == 0]
 
 
 def _shortlist(scores: Sequence[Score]) -> list[Score]:
@@ -218,7 +240,7 @@ def _widened(fit: Fit, effect: Effect) -> tuple[Model, list[dict[str, float]]]:
     model, level = fit.model, 0.0
     for e in model.effects:
         if e.name in effect.includes:
-            level = max([level, *(fit.values[p.name] for p in e.parameters if p.null == 0)])
+            level = max([level, *_sizes(fit, e)])
             model = model.without(e.name)
     model = model + effect
     natural = natural_sizes(fit.problem.experiments, fit.values)

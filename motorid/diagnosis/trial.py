@@ -10,11 +10,13 @@ import numpy as np
 from motorid.descent import Descent, descend, misfit_over_noise
 from motorid.diagnosis.evidence import Errors
 from motorid.diagnosis.rank import uses_angle
+from motorid.diagnosis.resolvable import unresolved
 from motorid.errors import FitError, ModelError, SimulationError
 from motorid.experiment import Experiment
 from motorid.fit import Fit
 from motorid.least_squares import LevenbergMarquardt
 from motorid.model import Effect, Model
+from motorid.parameters import Parameter
 from motorid.prepared import natural_sizes
 from motorid.problem import Problem
 from motorid.simulate import at, simulated
@@ -30,6 +32,7 @@ ALIVE = 3.0  # standard deviations that a change by a factor of e makes
 SUBSTEPS = 24  # per sample: what needs more cannot be seen in these samples
 ROOM = 10.0  # factor beyond its grid that a shape parameter may run to
 FAILURES = (FitError, SimulationError, ModelError, np.linalg.LinAlgError)
+PHASE_KNOWN = 0.5  # rad, standard deviation: beyond it an amplitude is not told from none
 LEAST_FALL = 0.01  # of the held-out error that makes an effect worth having
 
 
@@ -240,6 +243,21 @@ def objections(fit: Fit, added: Effect) -> str:
             return f"{p.name} runs to its limit: nothing of this shape is in the data"
         if p.vary and p.null is not None and not p.positive and fit.values[p.name] <= p.lower == p.null:
             return f"{p.name} goes to {p.null:g}: the data do not want it, or only with the wrong sign"
+        if p.vary and np.isfinite(p.upper) and fit.values[p.name] > 0.98 * p.upper and not _was_narrowed(p, added):
+            return f"{p.name} runs to {p.upper:g}, the limit of what is physical"
+    return _adrift(fit, pars) or unresolved(fit, added)
+
+
+def _was_narrowed(p: Parameter, added: Effect) -> bool:
+    """Tell whether the limit is one set for these records, and not one of physics."""
+    return next(q.upper for q in added.parameters if q.name == p.name) != p.upper
+
+
+def _adrift(fit: Fit, pars: Sequence[Parameter]) -> str:
+    """Say so where a phase is not determined: what has no phase has no amplitude."""
+    for p in pars:
+        if p.periodic and p.vary and ((std := fit.std.get(p.name)) is None or std > PHASE_KNOWN):
+            return f"{p.name} is not determined, so neither is the amplitude that goes with it"
     return ""
 
 
