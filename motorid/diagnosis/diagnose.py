@@ -17,6 +17,7 @@ from motorid.diagnosis.verdict import (
     adequate_text,
     balance_of,
     closed_loop_remark,
+    inseparable_remark,
     missing_text,
     unexplained_text,
 )
@@ -85,6 +86,8 @@ def diagnose(
     else:
         verdict, where = "missing", balance_of(names[0], own)
         text = missing_text(ladder.rungs, found.remaining, found.groups, validate is not None)
+        same = {name: p for node in found.path[1:] for name, p in search.inseparable(node).items()}
+        text = f"{text} {inseparable_remark(same)}".rstrip()
         suggestion = _suggestion(found)
     text = " ".join(t for t in (text, closed_loop_remark(fit), suggestion) if t)
     return Diagnosis(

@@ -28,7 +28,8 @@ from motorid.problem import Problem
 
 NUDGE = 1e-9  # of the natural size: where sizes start, so that fmax(tau_s - tau_c, 0) has a slope
 ORDERS_TRIED = 3
-Tried = tuple[float, dict[str, float], Array]  # share of chi² explained, values, what is left of the residual
+SHARED = 0.1  # of the largest share in a combination that is worth a name
+INSEPARABLE = 1e-3  # share of an effect's answer that the fitted parameters do not make up together
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,12 +38,24 @@ class Score:
 
     `starts` are tried in turn, the most promising first. `effective` is how many independent samples the residual
     would be worth with the effect taken out: what a misfit makes smooth is no evidence of coloured noise.
+    `same_as` are the parameters that together do what the effect does, if these data cannot tell it from them.
     """
 
     effect: Effect
     drop: float
     starts: tuple[Mapping[str, float], ...]
     effective: float = 0.0
+    same_as: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Tried:
+    """One shape scored: share of chi² explained, values, what is left of the residual, what does the same."""
+
+    drop: float
+    values: dict[str, float]
+    left: Array
+    same_as: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,6 +85,18 @@ class Tangent:
     def off(self, columns: Array) -> Array:
         """Return `columns` (n, k) projected off the tangent space."""
         return columns - self.basis @ (self.basis.T @ columns)
+
+    def same_as(self, columns: Array) -> tuple[str, ...]:
+        """Return the parameters that together make up all of `columns` (n, k); none if something is left of them."""
+        size = np.linalg.norm(columns, axis=0)
+        if np.any(np.linalg.norm(self.off(columns), axis=0) > INSEPARABLE * size) or not size.all():
+            return ()
+        names = [p.name for p in self.fit.problem.unknown]
+        jac = self.fit.jacobian[: len(columns)]
+        norms = np.linalg.norm(jac, axis=0)
+        parts = np.linalg.lstsq(jac / np.where(norms > 0, norms, 1.0), columns / size, rcond=1e-7)[0]
+        part = {n: float(np.abs(a).max()) for n, a in zip(names, parts, strict=True) if n in self.fit.values}
+        return tuple(n for n, a in part.items() if a > SHARED * max(part.values()))
 
 
 def unstacked(fit: Fit, residual: Array) -> list[Array]:
@@ -126,8 +151,11 @@ def score(tangent: Tangent, effect: Effect) -> Score:
         tried += _score_shape(tangent, model, pars, shape)
     if not tried:
         return Score(effect, 0.0, ({},))
-    tried.sort(key=lambda t: -t[0])
-    return Score(effect, tried[0][0], tuple(_distinct([t[1] for t in tried])), tangent.effective(tried[0][2]))
+    tried.sort(key=lambda t: -t.drop)
+    best = tried[0]
+    same_as = best.same_as if all(t.same_as for t in tried) else ()
+    starts = tuple(_distinct([t.values for t in tried]))
+    return Score(effect, 0.0 if same_as else best.drop, starts, tangent.effective(best.left), same_as)
 
 
 def _distinct(starts: list[dict[str, float]], most: int = 4) -> list[dict[str, float]]:
@@ -179,7 +207,7 @@ def _score_shape(tangent: Tangent, model: Model, pars: Sequence[Parameter], shap
         ratio = min((v / h for (n, h) in held.items() if (v := value[n]) > 0 and h), default=0.0)
         drop *= float(np.exp(-0.1 * np.log(max(ratio, 1e-3)) ** 2))
         value |= held
-    return [(drop, {**shape, **value}, left)]
+    return [Tried(drop, {**shape, **value}, left, tangent.same_as(np.column_stack(columns)))]
 
 
 def _null_columns(tangent: Tangent, model: Model, sizes: Sequence[Parameter], shape: Mapping[str, float]) -> Array:
@@ -246,7 +274,7 @@ def _score_finite(tangent: Tangent, model: Model, pars: Sequence[Parameter], sha
     drop, a, left = _project(tangent, change[:, None], [True])
     # An amount far from one means that the shape itself is wrong: the drop promises more than it can keep.
     keeps = 0.2 if a[0] < 0.05 else min(1.0, 3.0 / a[0])
-    return [(keeps * drop, dict(shape), left)]
+    return [Tried(keeps * drop, dict(shape), left)]
 
 
 def plain_residual(fit: Fit) -> Array:

@@ -71,6 +71,11 @@ class Search:
             self.advance(f"ranked {len(fresh)} effects")
         return self._scores[node.key]
 
+    def inseparable(self, node: Node) -> dict[str, tuple[str, ...]]:
+        """Return the effects that do no more than a combination of `node`'s parameters, those of effects among them."""
+        added = {p.name for e in node.fit.model.effects for p in e.parameters}
+        return {s.effect.name: s.same_as for s in self.scores(node) if added & set(s.same_as)}
+
     # -- expanding -------------------------------------------------------------------------------------
     def expand(self, node: Node) -> tuple[list[Node], list[Candidate]]:
         """Return the judged models one effect larger, and a candidate for every effect, best score first."""
@@ -166,7 +171,7 @@ class Search:
                     s.effect.name,
                     s.drop,
                     parameters=dict(s.starts[0]) if s.starts else {},
-                    reason="too little to gain for a refit",
+                    reason=_unseen(s),
                 )
             listed.append(replace(c, predicted_drop=s.drop))
         rest = [c for n, c in judged.items() if n not in {s.effect.name for s in scores}]
@@ -224,6 +229,13 @@ def _shortlist(scores: Sequence[Score]) -> list[Score]:
         for k, s in enumerate(scores)
         if (s.drop > 0 and (k < SHORTLIST or (s.effect.name in COMMON and s.drop > near))) or s.effect.name in ALWAYS
     ]
+
+
+def _unseen(score: Score) -> str:
+    """Say why an effect was not refitted."""
+    if score.same_as:
+        return f"not identifiable with these data beside {' and '.join(score.same_as)}, which together do the same"
+    return "too little to gain for a refit"
 
 
 def _drop(node: Node, train: Errors) -> float:

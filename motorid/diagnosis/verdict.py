@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -94,6 +94,18 @@ def moves(before: Fit, after: Fit) -> str:
         for n in moved
     ]
     return f"The motor's own parameters had absorbed it: {', '.join(said)}."
+
+
+def inseparable_remark(same: Mapping[str, tuple[str, ...]]) -> str:
+    """Say which effects were refused since parameters of the model together do the same."""
+    by_parameters: dict[tuple[str, ...], list[str]] = {}
+    for name, parameters in same.items():
+        by_parameters.setdefault(parameters, []).append(name)
+    return " ".join(
+        f"{' or '.join(names)} beside {' and '.join(parameters)} is not identifiable with these data and was refused: "
+        "together they do the same."
+        for parameters, names in by_parameters.items()
+    )
 
 
 def balance_of(name: str, also: Sequence[Effect] = ()) -> str:
