@@ -183,7 +183,7 @@ class Search:
         A later effect may have taken over what made an earlier one special: then its simple relative will do.
         """
         for e in node.fit.problem.model.effects:
-            simpler = [node.fit.model.without(e.name) + r for r in self._relatives(node, e)]
+            simpler = [_in_place(node.fit.model, e, r) for r in self._relatives(node, e)]
             smaller = simpler if e.name == node.added else [*simpler, node.fit.model.without(e.name)]
             for model in sorted(smaller, key=lambda m: len(m.free_names)):
                 other = self._smaller(node, model)
@@ -214,6 +214,12 @@ class Search:
             except FAILURES:
                 return None
         return self.nodes[key]
+
+
+def _in_place(model: Model, old: Effect, new: Effect) -> Model:
+    """Return the model with `new` where `old` was, so that the order in which effects were found stays."""
+    effects = tuple(new if e is old else e for e in model.effects)
+    return (model.without(old.name) + new)._with(effects=effects)
 
 
 def _sizes(fit: Fit, effect: Effect) -> list[float]:
