@@ -11,6 +11,7 @@ effective samples, see what bins cannot.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -71,6 +72,18 @@ def adequacy(fit: Fit, scores: Sequence[Score] = (), false_alarm: float = FALSE_
         facts["p_value"] = min([1.0, *(t["p"] for t in tests if t["channel"] == c)])
     text = _text(adequate, channels, material, far, false_alarm)
     return Adequacy(adequate, float(p_value), false_alarm, channels, text)
+
+
+def following(judged: Adequacy, what: str) -> Adequacy:
+    """Return a judgement that knows what the errors follow, e.g. "a load that changes with the time"."""
+    if judged.adequate:
+        text = f"Something is missing: the errors ({_sizes(judged.channels)}) follow {what}."
+        return replace(judged, adequate=False, text=text)
+    return replace(judged, text=f"{judged.text} They follow {what}.")
+
+
+def _sizes(channels: Mapping[str, Mapping[str, float]]) -> str:
+    return ", ".join(f"{c} {number(f['ratio'], 2)} times its noise" for c, f in channels.items())
 
 
 def _residuals(fit: Fit, channel: str) -> list[tuple[int, Array]]:
@@ -202,7 +215,7 @@ def _text(
     far: Sequence[str],
     false_alarm: float,
 ) -> str:
-    sizes = ", ".join(f"{c} {number(f['ratio'], 2)} times its noise" for c, f in channels.items())
+    sizes = _sizes(channels)
     if adequate:
         coloured = [c for c, f in channels.items() if f["autocorrelation"] > 0.3]
         colour = f" The noise of {' and '.join(coloured)} is coloured." if coloured else ""

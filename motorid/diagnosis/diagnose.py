@@ -6,11 +6,10 @@ import builtins
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
-from motorid.diagnosis.adequacy import adequacy
-from motorid.diagnosis.evidence import compare_errors
-from motorid.diagnosis.improve import Climb, climb, ladder_of
-from motorid.diagnosis.locate import locate
-from motorid.diagnosis.results import Candidate, Diagnosis, Missing
+from motorid.diagnosis.adequacy import adequacy, following
+from motorid.diagnosis.improve import Climb, climb, ladder_of, settled
+from motorid.diagnosis.locate import acting_like, locate
+from motorid.diagnosis.results import Diagnosis
 from motorid.diagnosis.search import Search, library
 from motorid.diagnosis.suggest import suggest_experiment
 from motorid.diagnosis.verdict import (
@@ -25,9 +24,6 @@ from motorid.errors import MotoridError
 from motorid.experiment import Experiment
 from motorid.fit import Fit
 from motorid.model import Effect
-
-ENOUGH = 0.5  # fall of the error above which effects explain what is missing, even if something is left
-SAME_DEPENDENCE = 0.3  # share of the variance that still follows the quantity an effect was to explain
 
 
 def diagnose(
@@ -68,24 +64,24 @@ def diagnose(
     own = tuple(also)
     search = Search(fit, validate, library(effects, own), map, say)
     judged = adequacy(fit, search.scores(search.root))
-    found = climb(search, max_effects, say)
+    found, other = settled(climb(search, max_effects, say))
     missing = locate(fit)
     say("located what is missing")
     ladder = ladder_of(found, validate is not None)
     names = tuple(n for n in ladder.best.problem.model.effect_names if n not in fit.problem.model.effect_names)
     ranking = found.rounds[0] if found.rounds else ()
-    suggestion = None
+    remaining, suggestion = found.remaining, None
+    if other is not None:
+        remaining = following(remaining, other.form.text)
+        judged = following(judged, other.form.text) if judged.adequate else judged
+        missing = missing if names else acting_like(missing, other.form)
     if not names:
         verdict = "adequate" if judged.adequate else "unexplained"
         text = adequate_text(judged, ranking) if judged.adequate else unexplained_text(judged, missing, ranking)
-        where = None if judged.adequate else missing.where
-    elif _not_the_form(found, missing):
-        verdict, where = "unexplained", missing.where
-        text = unexplained_text(judged, missing, ranking)
-        names, ladder, ranking = (), ladder_of(_cut(found), validate is not None), _none_accepted(ranking)
+        where, remaining = None if judged.adequate else missing.where, judged
     else:
         verdict, where = "missing", balance_of(names[0], own)
-        text = missing_text(ladder.rungs, found.remaining, found.groups, validate is not None)
+        text = missing_text(ladder.rungs, remaining, found.groups, validate is not None)
         same = {name: p for node in found.path[1:] for name, p in search.inseparable(node).items()}
         text = f"{text} {inseparable_remark(same)}".rstrip()
         suggestion = _suggestion(found)
@@ -99,44 +95,12 @@ def diagnose(
         missing,
         ranking,
         ladder,
-        found.groups if names else (),
+        found.groups,
         suggestion,
         fit,
         ladder.best,
-        found.remaining if names else judged,
+        remaining,
     )
-
-
-def _not_the_form(found: Climb, before: Missing) -> bool:
-    """Tell whether the effects only approximate something outside the library.
-
-    They do if much of the error is left and what is missing still depends on the same quantity as strongly as an
-    effect of the right form would not leave it.
-    """
-    if found.remaining.adequate:
-        return False
-    root, last = found.path[0], found.path[-1]
-    if compare_errors(root.held, last.held, found.search.held.noise).fall > ENOUGH:
-        return False
-    after = locate(last.fit)
-    for name, bins in after.bins.items():
-        was = {b.against: b.explained for b in before.bins.get(name, ())}
-        if any(b.explained > SAME_DEPENDENCE and was.get(b.against, 0.0) > SAME_DEPENDENCE for b in bins):
-            return True
-    return False
-
-
-def _none_accepted(ranking: tuple[Candidate, ...]) -> tuple[Candidate, ...]:
-    from dataclasses import replace
-
-    reason = "takes part of it away; what is left still depends on the same quantity"
-    return tuple(replace(c, accepted=False, reason=reason) if c.accepted else c for c in ranking)
-
-
-def _cut(found: Climb) -> Climb:
-    from dataclasses import replace
-
-    return replace(found, path=found.path[:1])
 
 
 def _suggestion(found: Climb) -> str | None:

@@ -14,6 +14,7 @@ from typing import Any
 from motorid.diagnosis.adequacy import adequacy
 from motorid.diagnosis.evidence import compare_errors
 from motorid.diagnosis.judging import Node
+from motorid.diagnosis.outside import Outside, outside
 from motorid.diagnosis.results import Adequacy, Candidate, Ladder, Rung
 from motorid.diagnosis.search import Search, library
 from motorid.experiment import Experiment
@@ -69,6 +70,24 @@ def climb(search: Search, max_effects: int, advance: Callable[[str], None]) -> C
         judged = adequacy(best.fit, search.scores(best))
         advance(f"accepted {chosen_of.added}")
     return Climb(search, tuple(_path(best)), tuple(rounds), tuple(g for g in groups if g), text, judged)
+
+
+def settled(found: Climb) -> tuple[Climb, Outside | None]:
+    """Return a climb without effects that only stand in for what the library lacks, and what that is like."""
+    other = outside([n.fit for n in found.path], found.search.held)
+    if other is None or other.kept == len(found.path) - 1:
+        return found, other
+    path = found.path[: other.kept + 1]
+    names = path[-1].key
+    why = f"only stands in for {other.form.text}, of a form that the library lacks"
+    rounds = tuple(
+        tuple(c if not c.accepted or c.effect in names else replace(c, accepted=False, group=(), reason=why) for c in r)
+        for r in found.rounds
+    )
+    groups = tuple(g for g in found.groups if g[0] in names)
+    judged = adequacy(path[-1].fit, found.search.scores(path[-1]))
+    text = f"stopped: what is left is like {other.form.text}, of a form that the library lacks"
+    return Climb(found.search, path, rounds, groups, text, judged), other
 
 
 def _runners_up(search: Search, best: Node, ordered: Sequence[Node]) -> list[Node]:
@@ -157,4 +176,5 @@ def improve(
     """
     say = progress or (lambda word: None)
     search = Search(fit, validate, library(effects, also), map, say)
-    return ladder_of(climb(search, max_effects, say), validate is not None)
+    found, _ = settled(climb(search, max_effects, say))
+    return ladder_of(found, validate is not None)

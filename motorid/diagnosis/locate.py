@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from motorid.diagnosis.evidence import effective_samples
+from motorid.diagnosis.forms import Form
 from motorid.diagnosis.results import Binned, Missing
 from motorid.diagnosis.smoother import Smoothed, smooth
 from motorid.fit import Fit
@@ -73,6 +75,20 @@ def locate(fit: Fit) -> Missing:
         _text(where, shares, regions, bins, apart),
         unit,
     )
+
+
+def acting_like(missing: Missing, form: Form) -> Missing:
+    """Return `missing` with what is known of its form: which balance it acts in, and what it changes with."""
+    apart = missing.where is not None
+    where = {"torque": "mechanical", "voltage": "electrical"}[form.balance]
+    lead = f"The {form.balance} balance fails." if apart else missing.text.split(".")[0] + "."
+    first = max(missing.regions, key=lambda r: missing.regions[r])
+    text = f"{lead} What is missing acts like {form.text}. {_region(first, missing.regions)}"
+    return replace(missing, where=where if apart else None, acts_like=form.text, text=text)
+
+
+def _region(first: str, regions: Mapping[str, float]) -> str:
+    return f"Most of the misfit ({100 * regions[first]:.0f} %) lies in {first}."
 
 
 def _walk(fit: Fit, size: Array) -> tuple[float, list[Smoothed]]:
@@ -203,7 +219,7 @@ def _text(
     apart: bool,
 ) -> str:
     first = max(regions, key=lambda r: regions[r])
-    region = f"Most of the misfit ({100 * regions[first]:.0f} %) lies in {first}."
+    region = _region(first, regions)
     if not apart and len(shares) > 1:
         lead = "Without current and speed both measured, a missing voltage and a missing torque look the same."
         name = "torque"

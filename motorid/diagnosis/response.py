@@ -6,6 +6,7 @@ sample. Both the search for angle orders and the estimate of what is missing res
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -15,6 +16,8 @@ import numpy as np
 from motorid.fit import Fit
 from motorid.integrate.grid import Array
 from motorid.integrate.step import rosenbrock_step
+from motorid.problem import Problem
+from motorid.simulate import Simulation
 from motorid.system import System
 
 
@@ -78,11 +81,15 @@ def parameter_vector(fit: Fit) -> Array:
 
 def responses(fit: Fit) -> list[Response]:
     """Return the linear response of every run of `fit`."""
-    system, p = fit.problem.system, parameter_vector(fit)
+    return responses_of(fit.problem, parameter_vector(fit), fit.simulations)
+
+
+def responses_of(problem: Problem, p: Array, simulations: Sequence[Simulation]) -> list[Response]:
+    """Return the linear response of every run of `problem`, simulated with the parameters `p`."""
     found = []
-    for run, sim in zip(fit.problem.runs, fit.simulations, strict=True):
-        x = np.column_stack([sim.states[s] for s in system.states])
-        _, a, b = linear_steps(system, run.grid, x, p, np.zeros((len(x) - 1, 2)))
-        _, c = shown(system, run.grid, x, p)
+    for run, sim in zip(problem.runs, simulations, strict=True):
+        x = np.column_stack([sim.states[s] for s in problem.system.states])
+        _, a, b = linear_steps(problem.system, run.grid, x, p, np.zeros((len(x) - 1, 2)))
+        _, c = shown(problem.system, run.grid, x, p)
         found.append(Response(a, b, c, dict(sim.states)))
     return found

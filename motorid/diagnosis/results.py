@@ -67,6 +67,9 @@ class Missing(Shown):
     bins : dict of str to tuple of Binned
         ``"voltage"`` and ``"torque"`` against i, omega, theta, heat, t; the best explanation first.
     text : str
+    torque_unit : str
+    acts_like : str
+        What it is like where the library lacks it, e.g. "a load that changes with the angle"; else empty.
     """
 
     where: str | None
@@ -79,6 +82,7 @@ class Missing(Shown):
     bins: Mapping[str, tuple[Binned, ...]]
     text: str
     torque_unit: str = "N·m"
+    acts_like: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,6 +198,7 @@ class Diagnosis(Shown):
                 "shares": dict(m.shares),
                 "regions": dict(m.regions),
                 "text": m.text,
+                "acts_like": m.acts_like or None,
                 "depends_on": {k: [{"on": b.against, "explained": b.explained} for b in v] for k, v in m.bins.items()},
             },
             "ranking": [

@@ -25,13 +25,13 @@ def adequate_text(judged: Adequacy, ranking: Sequence[Candidate]) -> str:
 
 def unexplained_text(judged: Adequacy, missing: Missing, ranking: Sequence[Candidate]) -> str:
     """Return the verdict when something is missing that the library does not have."""
-    best = next((c for c in ranking if c.refit_drop is not None), None)
+    tried = [c for c in ranking if c.refit_drop is not None]
+    best = max(tried, key=lambda c: c.refit_drop or 0.0, default=None)
     near = ""
     if best is not None and (best.refit_drop or 0) > 0.05:
-        near = (
-            f" The nearest, '{best.effect}', takes away {percent(best.refit_drop, 2)} of the squared misfit, but "
-            f"{best.reason or 'leaves the rest with the same dependence'}."
-        )
+        why = "only stands in for it" if missing.acts_like else best.reason or "leaves the rest as it is"
+        taken = percent(best.refit_drop, 2)
+        near = f" The nearest, '{best.effect}', takes away {taken} of the squared misfit, but {why}."
     return f"{judged.text} {missing.text} None of the library's effects explains it.{near}"
 
 
