@@ -98,7 +98,8 @@ class Candidate:
     validation_nrmse : dict of str to float or None
         Held-out errors after refitting.
     held_out_gain : float or None
-        Relative fall of the held-out error.
+        Relative fall of the error on held-out runs, or on held-out blocks without them; None where it came to no
+        such test.
     parameters : dict of str to float
         Of the effect, SI: refitted values where there was a refit, else predicted.
     group : tuple of str
@@ -207,6 +208,7 @@ class Diagnosis(Shown):
                     "predicted_drop": c.predicted_drop,
                     "refit_drop": c.refit_drop,
                     "validation_nrmse": dict(c.validation_nrmse) if c.validation_nrmse else None,
+                    "held_out_gain": c.held_out_gain,
                     "group": list(c.group),
                     "parameters": dict(c.parameters),
                     "accepted": c.accepted,

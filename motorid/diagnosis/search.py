@@ -139,7 +139,7 @@ class Search:
             held = self.judge.held_gain(node, child)
         except FAILURES as error:
             return None, replace(candidate, reason=f"fails on held-out data: {error}")
-        candidate = replace(candidate, validation_nrmse=child.held.nrmse())
+        candidate = replace(candidate, validation_nrmse=child.held.nrmse(), held_out_gain=held.fall)
         why = held_out_objection(held) or self._ambiguous(node, fit, held)
         if why:
             return None, replace(candidate, reason=why)

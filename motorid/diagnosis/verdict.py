@@ -84,7 +84,8 @@ def _errors(before: Rung, after: Rung, validated: bool) -> str:
 
 def moves(before: Fit, after: Fit) -> str:
     """Say how the motor's own parameters moved, since they had absorbed what was missing."""
-    base = [n for n in ("R", "L", "K", "b", "J") if n in before.values and n in after.values]
+    free = set(before.problem.model.free_names) & set(after.problem.model.free_names)
+    base = [n for n in ("R", "L", "K", "b", "J") if n in free]
     moved = [n for n in base if abs(after.values[n] / max(before.values[n], 1e-300) - 1) > MOVED]
     if not moved:
         return ""
