@@ -108,6 +108,7 @@ def _suggestion(found: Climb) -> str | None:
     if not found.groups:
         return None
     names = found.groups[0]
+    listed = f"{', '.join(names[:-1])} and {names[-1]}"
     fits = [c.fit for c in found.rounds[0] if c.effect in names and c.fit is not None]
     if len(fits) < 2:
         return None
@@ -116,5 +117,5 @@ def _suggestion(found: Climb) -> str | None:
     except MotoridError:
         return None
     if best.discrimination[best.name] < 1e-3:
-        return f"No voltage record within the limits would tell {' from '.join(names)}."
-    return f"To tell {' from '.join(names)}, try {best.text}."
+        return f"No voltage record within the limits would tell {listed} apart."
+    return f"To tell {listed} apart, try {best.text}."

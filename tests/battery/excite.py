@@ -41,6 +41,7 @@ def voltages(words: str, motor, n: int, dt: float, rng: np.random.Generator) -> 
         "multisine": lambda: P.multisine(u, T, np.array([1.3, 2.9, 4.7, 7.9, 12.1]) / T, rng, dt),
         "slow": lambda: P.multisine(u, T, np.array([0.7, 1.3, 2.1]) / T, rng, dt),
         "coast": lambda: P.coast_down(u, 0.4 * T, T, dt),
+        "gentle": lambda: _raised(P.multisine(u / 3, T, np.array([0.7, 1.3, 2.1]) / T, rng, dt), 2 * u / 3),
         "waves": lambda: _raised(P.multisine(u / 3, T, np.array([1.3, 2.9, 4.7]) / T, rng, dt), 2 * u / 3),
     }
     t, v = make[name]()
@@ -52,7 +53,7 @@ def _raised(excitation, middle):
     return t, np.round(v + middle, 4)
 
 
-MOVING = ("forward", "waves")  # never at rest: recorded from when the motor runs
+MOVING = ("forward", "waves", "gentle")  # never at rest: recorded from when the motor runs
 
 
 def driven(motor, effects, words: str, n: int, dt: float, rng: np.random.Generator, jitter: float = 0.0) -> dict:
