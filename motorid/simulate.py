@@ -10,6 +10,7 @@ import numpy as np
 
 from motorid.display import Shown
 from motorid.equations import CHANNELS
+from motorid.errors import FitError
 from motorid.experiment import Experiment
 from motorid.integrate import Engine
 from motorid.integrate.grid import Array
@@ -94,8 +95,11 @@ def simulated(problem: Problem, estimate_initial: bool = True) -> tuple[Simulati
     if len(q) and estimate_initial:
         from motorid.least_squares import LevenbergMarquardt, levenberg_marquardt
 
-        q = levenberg_marquardt(held.residual, held.residual_and_jacobian, q,
-                                options=LevenbergMarquardt(max_iterations=20)).q
+        try:
+            q = levenberg_marquardt(held.residual, held.residual_and_jacobian, q,
+                                    options=LevenbergMarquardt(max_iterations=20)).q
+        except FitError:  # slopes that cannot be followed (a stick that hangs by a hair): the first samples stand
+            held.residual(q)
         held = held.refined(q)
     return at(held, q)
 

@@ -1,50 +1,87 @@
-"""A first guess of the motor from the data alone.
+"""A first guess of the motor, and of the loads on it, from the data alone.
 
 The balances are integrated over time, so nothing is differentiated, and solved as non-negative linear least
 squares: ``∫v dt = L Δi + R ∫i dt + K ∫ω dt`` and ``K ∫i dt = J Δω + b ∫ω dt`` (Garnier & Wang, Identification of
 Continuous-time Models from Sampled Data, 2008, ch. 1). Where the current or the speed was not measured, it is
-eliminated and what the record cannot tell is taken from the values given, or from round numbers.
+eliminated and what the record cannot tell is taken from the values given, or from round numbers. Torques of
+the model's effects enter as further columns, see `motorid.loads`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from motorid.experiment import Experiment
 from motorid.integrate.grid import Array
+from motorid.loads import Load, columns, loads_of, values
 from motorid.model import Model
 
+BASE = ("R", "L", "K", "b", "J", "g")
+BACK_EMF = 0.9
 FLOOR = 1e-3  # share of its natural size given to a parameter that comes out as zero
 
 
-def first_guess(model: Model, runs: Sequence[Experiment]) -> dict[str, float]:
-    """Return values of the base parameters, SI, that suit `runs`; given and held ones keep their value."""
+def first_guess(model: Model, runs: Sequence[Experiment], *, loaded: bool = False,
+                back_emf: float = BACK_EMF) -> dict[str, float]:
+    """Return values of the base parameters, SI, that suit `runs`; given and held ones keep their value.
+
+    Parameters
+    ----------
+    model : Model
+    runs : sequence of Experiment
+    loaded : bool
+        Look for the sizes of the model's torque effects as well, and return them too.
+    back_emf : float
+        Share of the voltage per speed that is taken for back-EMF where no current tells it from viscous friction.
+    """
     held = {n: p.value for n, p in model.parameters.items() if p.given or not p.vary}
     signals = [_signals(r) for r in runs]
+    loads = _Loads(model, loads_of(model) if loaded else ())
     if model.base == "torque_driven":
-        found = _torque_driven(signals, held)
-    elif any(s["i"] is not None and s["omega"] is not None for s in signals):
-        found = _full([s for s in signals if s["i"] is not None and s["omega"] is not None], held)
-    elif any(s["omega"] is not None for s in signals):
-        found = _without_current([s for s in signals if s["omega"] is not None], held)
+        found = _torque_driven(signals, held, loads)
+    elif any("i" in s and "omega" in s for s in signals):
+        found = _full([s for s in signals if "i" in s and "omega" in s], held, loads)
+    elif any("omega" in s for s in signals):
+        found = _without_current([s for s in signals if "omega" in s], held, loads, back_emf)
     else:
-        found = _without_speed([s for s in signals if s["i"] is not None], held)
-    found |= {n: v for n, v in held.items() if n in found}
-    return {n: v for n, v in found.items() if n in model.parameters and np.isfinite(v) and v > 0}
+        found = _without_speed([s for s in signals if "i" in s], held)
+    base = {n: held.get(n, v) for n, v in found.items() if n in model.parameters and np.isfinite(v)}
+    return {n: v for n, v in base.items() if v > 0 or n not in BASE}
 
 
-def _signals(run: Experiment) -> dict[str, Array | None]:
-    """Return t, v, i, omega of a run on all samples, gaps bridged; omega from the angle where need be."""
+class _Loads(NamedTuple):
+    """The model's torques to be found along with the motor."""
+
+    model: Model
+    loads: tuple[Load, ...]
+
+    def integrals(self, s: Mapping[str, Array], base: Mapping[str, float]) -> list[Array]:
+        """Return the integral over time of each torque along the signals `s`."""
+        if not self.loads:
+            return []
+        along = dict(s) | {"theta": s["theta"] if "theta" in s else _integral(s["t"], s["omega"])}
+        return [_integral(s["t"], c) for c in columns(self.model, self.loads, along, base).T]
+
+    def split(self, found: dict[str | Load, float], per_ratio: float = 1.0) -> dict[str, float]:
+        """Return the motor's values, and the parameters of the loads."""
+        motor = {n: v for n, v in found.items() if isinstance(n, str)}
+        sizes = {n: v for n, v in found.items() if isinstance(n, Load)}
+        return values(self.loads, sizes, per_ratio) | motor
+
+
+def _signals(run: Experiment) -> dict[str, Array]:
+    """Return t, v and what was measured of i, omega, theta on all samples, gaps bridged; omega from the angle."""
     t = run.t
-    found: dict[str, Array | None] = {"t": t, "v": run.inputs["v"], "i": None, "omega": None}
-    for c in ("i", "omega"):
+    found: dict[str, Array] = {"t": t, "v": run.inputs["v"]}
+    for c in ("i", "omega", "theta"):
         if _measured(run, c):
             found[c] = _bridged(t, run.outputs[c])
-    if found["omega"] is None and _measured(run, "theta"):
-        found["omega"] = _speed_of(t, _bridged(t, run.outputs["theta"]))
-    if run.hold == "zoh" and found["v"] is not None:
+    if "omega" not in found and "theta" in found:
+        found["omega"] = _speed_of(t, found["theta"])
+    if run.hold == "zoh":
         found["held"] = np.ones(1)
     return found
 
@@ -78,9 +115,10 @@ def _windowed(t: Array, columns: Sequence[Array], target: Array, windows: int = 
     return np.column_stack([c[w:] - c[:-w] for c in columns]), target[w:] - target[:-w]
 
 
-def _solve(rows: list[tuple[Array, Array]], names: Sequence[str], held: Mapping[str, float]) -> dict[str, float]:
-    """Non-negative least squares with some coefficients known; zeros become small positive numbers."""
-    from scipy.optimize import nnls  # slow to import, and not needed before
+def _solve(rows: list[tuple[Array, Array]], names: Sequence[str | Load],
+           held: Mapping[Any, float]) -> dict[Any, float]:
+    """Non-negative least squares with some coefficients known; zeros of the motor become small positive numbers."""
+    from scipy.optimize import lsq_linear, nnls  # slow to import, and not needed before
 
     a, b = np.vstack([r[0] for r in rows]), np.concatenate([r[1] for r in rows])
     known = [n in held for n in names]
@@ -92,13 +130,18 @@ def _solve(rows: list[tuple[Array, Array]], names: Sequence[str], held: Mapping[
     norms = np.linalg.norm(a, axis=0)
     norms = np.where(norms > 0, norms, 1.0)
     triangle: Array = np.asarray(np.linalg.qr(np.column_stack([a / norms, b]), mode="r"))
-    z, _ = nnls(triangle[:, :-1], triangle[:, -1])
+    lowest = np.array([-np.inf if isinstance(n, Load) and n.signed else 0.0 for n in free])
+    if np.all(lowest == 0):
+        z, _ = nnls(triangle[:, :-1], triangle[:, -1])
+    else:
+        z = np.asarray(lsq_linear(triangle[:, :-1], triangle[:, -1], (lowest, np.inf)).x)
     # A coefficient that comes out as zero starts where its term would carry a thousandth of the right-hand side.
-    z = np.maximum(z, FLOOR * np.linalg.norm(b)) / norms
+    motor = np.array([isinstance(n, str) for n in free])
+    z = np.where(motor, np.maximum(z, FLOOR * np.linalg.norm(b)), z) / norms
     return {n: held[n] for n in names if n in held} | dict(zip(free, z.tolist(), strict=True))
 
 
-def _full(signals: list[dict], held: Mapping[str, float]) -> dict[str, float]:
+def _full(signals: list[dict], held: Mapping[str, float], loads: _Loads) -> dict[str, float]:
     electrical, mechanical = [], []
     for s in signals:
         t, held_v = s["t"], "held" in s
@@ -108,27 +151,32 @@ def _full(signals: list[dict], held: Mapping[str, float]) -> dict[str, float]:
     for s in signals:
         t = s["t"]
         qi, qw = _integral(t, s["i"]), _integral(t, s["omega"])
-        mechanical.append(_windowed(t, [s["omega"], qw], found["K"] * qi))
-    return found | _solve(mechanical, ["J", "b"], held)
+        known = [s["omega"], qw, *loads.integrals(s, {**found, "b": 0.0, "J": 1.0})]
+        mechanical.append(_windowed(t, known, found["K"] * qi))
+    return found | loads.split(_solve(mechanical, ["J", "b", *loads.loads], held))
 
 
-def _torque_driven(signals: list[dict], held: Mapping[str, float]) -> dict[str, float]:
+def _torque_driven(signals: list[dict], held: Mapping[str, float], loads: _Loads) -> dict[str, float]:
     g = held.get("g", 1.0)
-    rows = [_windowed(s["t"], [s["omega"], _integral(s["t"], s["omega"])], g * _integral(s["t"], s["v"], "held" in s))
-            for s in signals]
-    return {"g": g} | _solve(rows, ["J", "b"], held)
+    rows = [_windowed(s["t"], [s["omega"], _integral(s["t"], s["omega"]),
+                               *loads.integrals(s, {"g": g, "b": 0.0, "J": 1.0})],
+                      g * _integral(s["t"], s["v"], "held" in s)) for s in signals]
+    return {"g": g} | loads.split(_solve(rows, ["J", "b", *loads.loads], held))
 
 
-def _without_current(signals: list[dict], held: Mapping[str, float]) -> dict[str, float]:
-    """``∫v = (RJ/K) Δω + (K + Rb/K) ∫ω``: two numbers; R, the split of friction and L are assumed."""
-    rows = [_windowed(s["t"], [s["omega"], _integral(s["t"], s["omega"])], _integral(s["t"], s["v"], "held" in s))
-            for s in signals]
-    two = _solve(rows, ["slope", "gain"], {})
+def _without_current(signals: list[dict], held: Mapping[str, float], loads: _Loads,
+                     back_emf: float) -> dict[str, float]:
+    """``∫v = (RJ/K) Δω + (K + Rb/K) ∫ω + (R/K) ∫load``: two numbers and the loads; the rest is assumed."""
+    unit = {"R": 1.0, "L": 1.0, "K": 1.0, "b": 0.0, "J": 1.0}
+    rows = [_windowed(s["t"], [s["omega"], _integral(s["t"], s["omega"]),
+                               *loads.integrals({**s, "i": s["v"]}, unit)],
+                      _integral(s["t"], s["v"], "held" in s)) for s in signals]
+    two = _solve(rows, ["slope", "gain", *loads.loads], {})
     r = held.get("R", 1.0)
-    k = held.get("K", 0.9 * two["gain"])
+    k = held.get("K", back_emf * two["gain"])
     b = held.get("b", max(two["gain"] - k, 0.05 * two["gain"]) * k / r)
     dt = float(np.median(np.diff(signals[0]["t"])))
-    return {"R": r, "L": r * dt, "K": k, "b": b, "J": held.get("J", two["slope"] * k / r)}
+    return loads.split(two, k / r) | {"R": r, "L": r * dt, "K": k, "b": b, "J": held.get("J", two["slope"] * k / r)}
 
 
 def _without_speed(signals: list[dict], held: Mapping[str, float]) -> dict[str, float]:

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import product
 
 import numpy as np
 
 from motorid.bases import BASES
+from motorid.descent import descend
 from motorid.errors import FitError, SimulationError
 from motorid.experiment import Experiment
 from motorid.least_squares import LevenbergMarquardt, levenberg_marquardt
+from motorid.loads import loads_of
 from motorid.model import Model
 from motorid.parameters import Parameter
 from motorid.prepared import natural_sizes, suited
@@ -18,29 +20,65 @@ from motorid.problem import Problem
 from motorid.start import first_guess
 from motorid.term import Effect
 
+THOROUGH = LevenbergMarquardt(ftol=1e-5, max_iterations=60)
 FEW = 3  # shapes that are looked at more closely
 RESONANCE = "1/s"
+BACK_EMF_SHARES = (0.3, 0.03)
 PHASES = tuple(np.arange(4) * np.pi / 2)
 
 
 def started(problem: Problem) -> Problem:
     """Return the problem with starting values that suit the data: the best of a few candidates by cost."""
-    model = problem.model
-    guess = first_guess(model, problem.experiments)
-    bounded = {n: float(np.clip(v, model.parameters[n].lower, model.parameters[n].upper))
-               for n, v in guess.items()}
-    candidates = [with_suited_effects(model.start_at(bounded), problem.experiments)]
+    model, runs = problem.model, problem.experiments
+    candidates = [_at(model, first_guess(model, runs))]
     if any(p.given for p in model.parameters.values()) or _was_fitted(model):
-        candidates.append(with_suited_effects(model, problem.experiments))
-    problems = [problem.for_model(m) for m in candidates]
-    best = min(problems, key=_cost_of) if len(problems) > 1 else problems[0]
+        candidates.append(model)
+    loaded = any(e.balance == "torque" for e in model.effects)
+    if loaded:
+        candidates.append(_at(model, first_guess(model, runs, loaded=True)))
+    problems = [problem.for_model(with_suited_effects(m, runs)) for m in candidates]
+    k = int(np.argmin([_cost_of(p) for p in problems])) if len(problems) > 1 else 0
+    best = problems[k]
     for effect in model.effects:
-        best = _shaped(best, effect, model)
-    return best
+        best = _shaped(best, effect, candidates[k])
+    return _split(best, model) if loaded else best
+
+
+def _split(problem: Problem, asked: Model) -> Problem:
+    """Return the problem with back-EMF and viscous friction shared out as suits the data best.
+
+    Without a current a linear motor leaves this open; a loss that is a share of the motor's torque does not.
+    """
+    model, runs = problem.model, problem.experiments
+    open_ = model.base == "dc_motor" and "i" not in problem.outputs and not _was_fitted(asked)
+    if not open_ or asked.parameters["K"].given or not any(load.ratio for load in loads_of(asked)):
+        return problem
+    others = [problem.for_model(_at(model, first_guess(asked, runs, loaded=True, back_emf=share)))
+              for share in BACK_EMF_SHARES]
+    ends = []
+    for begin in (problem, *others):
+        try:
+            ends.append(descend(begin.for_model(begin.model.fix("R")), THOROUGH))
+        except FitError:
+            continue
+    if not ends:
+        return problem
+    best = min(ends, key=lambda done: done.history[-1])
+    return problem.for_model(problem.model.start_at(_without_width(best.problem.values(best.solution.q))))
+
+
+def _without_width(values: Mapping[str, float]) -> dict[str, float]:
+    return {n: v for n, v in values.items() if n != "sgn_width"}
+
+
+def _at(model: Model, values: Mapping[str, float]) -> Model:
+    limits = model.parameters
+    return model.start_at({n: float(np.clip(v, limits[n].lower, limits[n].upper)) for n, v in values.items()})
 
 
 def _was_fitted(model: Model) -> bool:
-    return any(model.parameters[p.name].value != p.value for p in BASES[model.base])
+    present = ((model.parameters[p.name], p) for p in BASES[model.base])
+    return any(now.value != declared.value and not now.given for now, declared in present)
 
 
 def _cost_of(problem: Problem) -> float:

@@ -22,7 +22,7 @@ ROWS = (
     "equations bases system model effects "
     "units headers dialect matfile table layout formats rows experiment reading plausibility checks datasets",
     # 2 integration, and what is read from records before a problem is posed
-    "integrate beginning steady prepared accuracy loss residuals unknowns relations constraints start coloured "
+    "integrate beginning steady prepared accuracy loss residuals unknowns relations constraints loads start coloured "
     "combinations outliers journal",
     # 3 the problem
     "problem derivatives sensitivity mesh",

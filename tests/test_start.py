@@ -1,0 +1,80 @@
+"""The first guess: near the truth from the records alone, loads on the shaft included."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import motorid as mi
+from motorid.start import first_guess
+
+TRUTH = {"R": 2.0, "L": 1e-3, "K": 0.05, "b": 1e-5, "J": 2e-5}
+T = np.arange(0, 4, 2e-3)
+
+
+def record(model: mi.Model, channels: str, v: np.ndarray, seed: int = 0) -> mi.Experiment:
+    """Simulated, with 0.5 % noise."""
+    bare = mi.Experiment(T, {"v": v}, {c: np.zeros(len(T)) for c in channels.split()})
+    rng = np.random.default_rng(seed)
+    outputs = mi.simulate(model, bare, initial="rest")[0].outputs
+    noisy = {c: y + 5e-3 * np.abs(y).max() * rng.standard_normal(len(T)) for c, y in outputs.items()}
+    return mi.Experiment(T, {"v": v}, noisy)
+
+
+def swinging() -> np.ndarray:
+    return 3.0 * np.sin(2 * np.pi * 0.5 * T) + 2.0 * np.sign(np.sin(2 * np.pi * 1.3 * T))
+
+
+def arm(*effects: mi.Effect) -> mi.Model:
+    model = mi.dc_motor() + mi.effects.gravity
+    for e in effects:
+        model = model + e
+    return model
+
+
+@pytest.mark.parametrize("channels", ["i omega theta", "i theta", "theta"])
+def test_weight_on_the_shaft_is_part_of_the_guess(channels):
+    """An arm that never turns over moves by its weight: without it inertia and friction come out as nothing."""
+    truth = arm().replace(**TRUTH, mgl=0.12, phi_g=0.2)
+    run = record(truth, channels, swinging())
+    guess = first_guess(arm() if "i" in run.outputs else arm().fix(R=TRUTH["R"], K=TRUTH["K"]), [run], loaded=True)
+    assert guess["mgl"] == pytest.approx(0.12, rel=0.15)
+    assert guess["phi_g"] == pytest.approx(0.2, abs=0.1)
+    assert 0.3 < guess["J"] / TRUTH["J"] < 3
+
+
+def test_friction_drag_and_offset_are_part_of_the_guess():
+    truth = mi.dc_motor() + mi.effects.coulomb + mi.effects.constant_load + mi.effects.quadratic_drag
+    values = {"tau_c": 0.01, "tau_0": -0.004, "c_2": 2e-7}
+    v = 12 * np.sin(2 * np.pi * 0.4 * T) + 4 * np.sign(np.sin(2 * np.pi * 1.7 * T))
+    run = record(truth.replace(**TRUTH, **values), "i omega", v)
+    guess = first_guess(truth, [run], loaded=True)
+    for name, value in values.items():
+        assert guess[name] == pytest.approx(value, rel=0.3), name
+
+
+@mi.effect(balance="torque")
+def spring(m, k_s=mi.P(1e-3, "N·m/rad", null=0.0, lower=0.0)):
+    """A torsion spring on the shaft."""
+    m.torque -= k_s * m.theta
+
+
+def test_effect_of_the_user_takes_part_in_the_guess():
+    truth = (mi.dc_motor() + spring).replace(**TRUTH, k_s=0.03)
+    guess = first_guess(mi.dc_motor() + spring, [record(truth, "i theta", swinging())], loaded=True)
+    assert guess["k_s"] == pytest.approx(0.03, rel=0.15)
+
+
+def test_given_sizes_and_orders_without_a_number_are_left_alone():
+    model = arm(mi.effects.cogging).replace(mgl=0.5)
+    guess = first_guess(model, [record(arm().replace(**TRUTH, mgl=0.12), "i theta", swinging())], loaded=True)
+    assert not {"mgl", "phi_g", "A", "N", "phi"} & set(guess)
+
+
+def test_arm_is_fitted_from_the_angle_alone():
+    truth = arm(mi.effects.coulomb).replace(**TRUTH, mgl=0.12, phi_g=0.2, tau_c=0.01)
+    run = record(truth, "theta", swinging())
+    fit = mi.fit(arm(mi.effects.coulomb).fix(R=TRUTH["R"], K=TRUTH["K"], L=TRUTH["L"]), run)
+    assert fit.status == "converged", fit.message
+    assert fit.values["mgl"] == pytest.approx(0.12, rel=0.02)
+    assert fit.values["tau_c"] == pytest.approx(0.01, rel=0.05)
