@@ -21,6 +21,8 @@ from motorid.integrate.grid import Array
 
 FAR = 1.5  # times the noise: what is left below this is not worth a form
 MUCH_LESS = 0.5  # of the squared misfit that the effects leave: what a form in their place may leave
+LITTLE = 0.1  # of the squared misfit: forms that leave less are equals
+NEARLY = 3.0  # times what the best form leaves: what others may leave to be believed too
 CONTAINS = 0.7  # of what an effect does: what a form must do in its place
 NO_TRIFLE = 0.03  # of what an effect does: what it must miss
 VOID = 100.0  # times the misfit: a linear answer that went astray
@@ -69,6 +71,7 @@ def outside(steps: Sequence[Fit], held: HeldOut) -> Outside | None:
             rivals = _rivals(steps, kept, held, channels)
         except FAILURES:
             continue
+        rivals = _believed(rivals)
         instead = [r for r in rivals if r.instead]
         if instead and len(steps) > 1:
             return _best(instead, kept)
@@ -77,8 +80,14 @@ def outside(steps: Sequence[Fit], held: HeldOut) -> Outside | None:
     return earnest or (_best(beside, len(steps) - 1) if beside else None)
 
 
+def _believed(rivals: Sequence[Rival]) -> list[Rival]:
+    """Return the forms that explain about as much as the best of them: the others imitate it."""
+    least = min((max(r.leaves, r.judged, LITTLE) for r in rivals), default=0.0)
+    return [r for r in rivals if max(r.leaves, r.judged) <= NEARLY * least]
+
+
 def _best(rivals: Sequence[Rival], kept: int) -> Outside:
-    best = min(rivals, key=lambda r: r.judged * (0.5 if r.form.on == "turn" else 1.0))  # the more telling on a tie
+    best = min(rivals, key=lambda r: (max(r.judged, LITTLE), r.form.on != "turn", r.judged))
     return Outside(best.form, kept, best.judged)
 
 

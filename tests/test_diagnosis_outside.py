@@ -1,0 +1,163 @@
+"""What the library lacks must not be forced into it: the verdict says where it acts and what it is like."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from battery.excite import driven, record
+
+import motorid as mi
+from motorid.diagnosis.forms import linearised
+from motorid.diagnosis.outside import far, outside
+from motorid.diagnosis.trial import HeldOut
+from motorid.experiment import Experiment
+
+ANGLE = ("i", "omega", "theta")
+FRICTION = ("coulomb", "coulomb_asymmetric", "constant_load", "quadratic_drag")
+SLOW = ("stairs 0.5", "ramps 0.6", "steps 0.5")
+
+
+def runs_of(motor, effects, drives=SLOW, channels=ANGLE, n=800, seed=4, chain="logger") -> list[Experiment]:
+    rng = np.random.default_rng(seed)
+    return [
+        record(driven(motor, effects, words, n, 1e-3, rng), chain, channels, motor, rng, f"run{k + 1}")
+        for k, words in enumerate(drives)
+    ]
+
+
+def diagnosed(runs, effects=FRICTION, validated=True):
+    fit = mi.fit(mi.dc_motor(), runs[:-1] if validated else runs)
+    return mi.diagnose(fit, runs[-1:] if validated else None, effects=effects)
+
+
+def is_like(found, form, where="mechanical"):
+    """The verdict where something acts like `form`, and nothing of the library is taken for it."""
+    assert (found.verdict, found.effects, found.groups) == ("unexplained", (), ())
+    assert (found.where, found.missing.where) == (where, where)
+    assert found.missing.acts_like.startswith(form)
+    assert f"acts like {form}" in found.text
+    assert "None of the library's effects explains it" in found.text
+    assert not any(c.accepted for c in found.ranking)
+    assert [r.added for r in found.ladder.rungs] == [None]
+    assert not found.adequacy.adequate
+    assert not found.remaining.adequate
+
+
+def stands_in(found, *names):
+    """Whether the first of `names` that was refitted is said to stand in for something else."""
+    return any(c.effect in names and "only stands in" in c.reason for c in found.ranking)
+
+
+@pytest.fixture(scope="module")
+def beyond(plant):
+    """Effects made up here, put into the plant."""
+    effects = plant.effects.BEYOND
+    effects["ageing"] = lambda m, tau_c, rise: {"dry": lambda i, w, th, s, t: tau_c * (1 + rise * t)}
+    effects["spring"] = lambda m, k: {"torque": lambda i, w, th, t: -k * th * abs(th)}
+    effects["dip"] = lambda m, s: {"drive": lambda v, w: v * (1 - s * abs(v) / (m.i_max * m.R / 2))}
+    yield plant
+    for name in ("ageing", "spring", "dip"):
+        effects.pop(name)
+
+
+@pytest.mark.parametrize("validated", [True, False])
+def test_friction_that_changes_along_a_turn_is_not_called_coulomb(lab, validated):
+    found = diagnosed(runs_of(lab, {"angle_friction": {"tau_c": 8e-3, "c": 0.7}}), validated=validated)
+    is_like(found, "a friction that changes with the angle")
+    assert stands_in(found, "coulomb", "coulomb_asymmetric")
+
+
+def test_friction_that_fades_is_not_called_coulomb(lab):
+    grease = {"grease_warm_up": {"tau_c": 3e-3, "extra": 4.0, "t_g": 0.3}}
+    found = diagnosed(runs_of(lab, grease, ("stairs", "ramps", "steps"), ("i", "omega")))
+    is_like(found, "a friction that changes with the time")
+    assert stands_in(found, "coulomb", "coulomb_asymmetric")
+    assert json.loads(json.dumps(found.to_dict()))["location"]["acts_like"] == found.missing.acts_like
+
+
+def test_friction_that_grows_is_not_called_coulomb(beyond, lab):
+    found = diagnosed(runs_of(lab, {"ageing": {"tau_c": 4e-3, "rise": 4.0}}, ("stairs", "ramps", "steps")))
+    is_like(found, "a friction that changes with the time")
+
+
+def test_a_spring_is_not_called_a_constant_load(beyond, lab):
+    found = diagnosed(runs_of(lab, {"spring": {"k": 3e-5}}), ("constant_load", "coulomb", "viscous_asymmetric"))
+    is_like(found, "a load that changes with the angle")
+
+
+def test_a_supply_that_dips_is_found_in_the_voltage(beyond, lab):
+    effects = ("brush_drop", "quadratic_drag", "voltage_offset", "coulomb")
+    found = diagnosed(runs_of(lab, {"dip": {"s": 0.25}}, ("stairs", "ramps", "steps"), ("i", "omega")), effects)
+    is_like(found, "a loss of voltage that changes with the voltage", "electrical")
+
+
+def test_a_cam_is_neither_called_cogging_nor_gravity(lab):
+    found = diagnosed(runs_of(lab, {"cam": {"A": 2.5e-2}}), ("cogging", "gravity", "coulomb"))
+    is_like(found, "a load that changes with the angle within a turn")
+    assert stands_in(found, "cogging", "gravity")
+    assert "The nearest, '" in found.text
+
+
+def test_what_is_needed_beside_it_is_kept_and_the_rest_is_said(lab):
+    both = {"coulomb": {"tau_c": 1e-2}, "cam": {"A": 5e-3}}
+    found = diagnosed(runs_of(lab, both), ("coulomb", "cogging", "constant_load"))
+    assert (found.verdict, found.effects) == ("missing", ("coulomb",))
+    assert found.after.values["tau_c"] == pytest.approx(1e-2, rel=0.1)
+    assert "They follow a load that changes with the angle" in found.text
+    assert "of a form that the library lacks" in found.ladder.text
+    assert not found.remaining.adequate
+
+
+def test_the_ladder_does_not_climb_what_only_stands_in(lab):
+    runs = runs_of(lab, {"angle_friction": {"tau_c": 8e-3, "c": 0.7}})
+    ladder = mi.improve(mi.fit(mi.dc_motor(), runs[:-1]), runs[-1:], effects=FRICTION)
+    assert [r.added for r in ladder.rungs] == [None]
+    assert "a friction that changes with the angle" in ladder.text
+
+
+@pytest.mark.parametrize("chain", ["logger", "coloured", "coarse"])
+def test_true_friction_is_kept(lab, chain):
+    found = diagnosed(runs_of(lab, {"coulomb": {"tau_c": 8e-3}}, chain=chain))
+    assert found.effects[0] == "coulomb"
+    assert found.missing.acts_like == ""
+
+
+def test_true_friction_is_kept_although_more_than_noise_is_left(lab):
+    """A little of the cam remains, many times the noise of the angle, but it is a trifle beside the friction."""
+    runs = runs_of(lab, {"coulomb": {"tau_c": 1e-2}, "cam": {"A": 2e-3}})
+    plain = mi.fit(mi.dc_motor(), runs[:-1])
+    rubbing = mi.fit(plain.model + mi.effects.coulomb, runs[:-1])
+    assert far(rubbing)
+    other = outside([plain, rubbing], HeldOut.of(plain, runs[-1:]))
+    assert other is None or other.kept == 1
+
+
+def test_a_form_answers_as_the_plant_does(lab):
+    """The columns of a load over a turn hold what a small torque does to the outputs."""
+    runs = runs_of(lab, {}, n=500)
+    plain = mi.fit(mi.dc_motor(), runs)
+    with_it = plain.model + mi.effects.gravity(mgl=2e-5, phi_g=0.0)
+    linear = linearised(plain, None)[0]
+    shifts = []
+    both = mi.simulate(plain.model, runs), mi.simulate(with_it, runs)
+    for s, t, run in zip(*both, plain.problem.runs, strict=True):
+        shifts.append(np.column_stack([(t.outputs[c] - s.outputs[c]) / run.sigma[c] for c in ANGLE]).ravel())
+    factors = [plain.problem.balance.get(c, 1.0) for c in ANGLE]
+    change = np.concatenate(shifts) / np.tile(factors, sum(r.n for r in runs))
+    form = next(f for f in linear.forms if (f.on, f.carrier) == ("turn", ""))
+    columns = np.concatenate([linear.forms[form], linear.own], axis=1)
+    left = change - columns @ np.linalg.lstsq(columns, change, rcond=None)[0]
+    assert np.linalg.norm(left) < 0.02 * np.linalg.norm(change)
+
+
+@pytest.mark.slow
+def test_where_the_errors_are_too_large_to_be_linear_the_form_is_fitted(plant):
+    """A belt whose splice all but stops the wheel: the plain model is off by half of the current."""
+    splice = {"belt_splice": {"tau": 0.15, "width": 3.0, "ratio": 2.7}}
+    wheel, rng = plant.MOTORS["wheel"], np.random.default_rng(8)
+    runs = [record(driven(wheel, splice, w, 1000, 2e-3, rng), "logger", ANGLE, wheel, rng, w) for w in SLOW]
+    found = diagnosed(runs, ("coulomb", "coulomb_asymmetric", "constant_load"))
+    is_like(found, "a friction that changes with the angle")
+    assert stands_in(found, "coulomb", "coulomb_asymmetric")
