@@ -1,17 +1,21 @@
 """Orders of angle-periodic effects (cogging, torque ripple) from the model's response to every order.
 
 The answer of the outputs to sin(Nθ) and cos(Nθ) torques along the measured angle, for all N at once, projected off
-the tangent space of the fit like any other score; no signal is differentiated.
+the tangent space of the fit like any other score, both without their colour (`whitening`); no signal is
+differentiated. Each order is looked for where the motion is slow enough to show it: at less than a quarter of a
+period per sample no alias and no delay of a sensor can pose as it.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from motorid.diagnosis.response import Response, responses
+from motorid.diagnosis.whitening import Whitening, unstacked
 from motorid.integrate.grid import Array
 from motorid.model import Effect
 from motorid.prepared import angle_signal
@@ -23,6 +27,30 @@ CHUNK = 40
 HIGHEST = 240
 PERIODS = 3  # within the travel
 SLOW_PART = 0.2  # of the motion that must be slow enough to show an order
+QUARTER = np.pi / 2  # of a period per sample: slow enough to be sure
+SURE_PART = 0.02  # of the motion that must be slower than that, or faster parts are used too
+SAMPLES = 50  # and so many samples
+NEAR = 0.6  # of the best line: another order that may be the true one
+STANDS_OUT = 6.0  # times the usual order: a line
+SURE = 30.0  # chi² of two degrees of freedom: the highest of 240 orders of noise reaches about 11
+
+
+@dataclass(frozen=True)
+class Line:
+    """One order in the spectrum of the misfit: torque −A·sin(Nθ+φ), or the motor's torque by 1+a·sin(Nθ+φ)."""
+
+    order: float
+    share: float  # of the squared residual without its colour
+    amplitude: float
+    phase: float
+
+
+@dataclass(frozen=True)
+class Spectrum:
+    """Lines, the strongest first, and whether it is far stronger than orders usually are."""
+
+    lines: tuple[Line, ...]
+    stands_out: bool
 
 
 def highest_order(tangent: Tangent) -> int:
@@ -30,78 +58,120 @@ def highest_order(tangent: Tangent) -> int:
 
     Beyond half a period the samples alias, but along a measured angle each order still has its own pattern.
     """
-    steps = np.concatenate([np.abs(np.diff(angle_signal(r))) for r in tangent.fit.problem.experiments])
-    moving = steps[steps > 1e-6 * max(steps.max(initial=0.0), 1e-300)]
+    moving = _moving(tangent)
     if not moving.size:
         return 0
     return int(np.clip(1.8 * np.pi / np.quantile(moving, SLOW_PART), 0, HIGHEST))
 
 
+def _moving(tangent: Tangent) -> Array:
+    """Changes of the angle per sample, where there are any."""
+    steps = np.concatenate([np.abs(np.diff(angle_signal(r))) for r in tangent.fit.problem.experiments])
+    return steps[steps > 1e-6 * max(steps.max(initial=0.0), 1e-300)]
+
+
 def likely_orders(tangent: Tangent, effect: Effect, most: int) -> list[float]:
-    """Return the orders that explain most of the misfit, best first.
+    """Return the orders that explain most of the misfit, best first."""
+    return [line.order for line in likely_lines(tangent, effect, most)]
+
+
+def likely_lines(tangent: Tangent, effect: Effect, most: int) -> list[Line]:
+    """Return the strongest lines, best first, those that come near the best."""
+    lines = spectrum(tangent, effect).lines[:most]
+    return [line for line in lines if line.share > NEAR * lines[0].share]
+
+
+def spectrum(tangent: Tangent, effect: Effect) -> Spectrum:
+    """Return what each order explains of the misfit.
 
     `effect` tells what is modulated: the torque itself (an amplitude in N·m), or the torque made by the current
     (a relative amplitude).
     """
-    relative = any(p.null == 0 and p.unit == "" for p in effect.parameters)
-    return list(_ranked(tangent, relative)[:most])
+    return _spectrum(tangent, any(p.null == 0 and p.unit == "" for p in effect.parameters))
 
 
 @lru_cache(maxsize=4)
-def _ranked(tangent: Tangent, relative: bool) -> tuple[float, ...]:
+def _spectrum(tangent: Tangent, relative: bool) -> Spectrum:
     fit, top = tangent.fit, highest_order(tangent)
-    if relative and "i" not in fit.problem.system.states:
-        return ()
-    answers, found = responses(fit), []
     # A torque that repeats once per turn is gravity's, and what is to repeat must do so within the travel.
     lowest = max(1 if relative else 2, int(np.ceil(PERIODS * 2 * np.pi / max(_travel(fit), 1e-9))))
+    if top < lowest or (relative and "i" not in fit.problem.system.states):
+        return Spectrum((), False)
+    white, basis, residual = _whitened(tangent)
+    # The residual is model less measurement: what is fitted to it counts against the motor's torque.
+    residual = -residual if relative else residual
+    moving, answers, found = _moving(tangent), responses(fit), []
     for first in range(lowest, top + 1, CHUNK):
         orders = np.arange(float(first), min(first + CHUNK, top + 1))
-        columns = np.vstack([_columns(fit, k, answer, orders, relative) for k, answer in enumerate(answers)])
-        inside = tangent.basis.T @ columns
-        slope = columns.T @ tangent.residual
+        slow = np.array([QUARTER / n if _is_seen(moving, n) else np.inf for n in orders])
+        columns = white([_columns(fit, k, answer, orders, slow, relative) for k, answer in enumerate(answers)])
+        columns -= basis @ (basis.T @ columns)
         m = len(orders)
-        for j, n in enumerate(orders):
-            pair = [j, j + m]
-            gram = columns[:, pair].T @ columns[:, pair] - inside[:, pair].T @ inside[:, pair]
-            found.append((_explained(gram, slope[pair]), float(n)))
-    found.sort(reverse=True)
-    return tuple(n for _, n in found)
+        found += [_line(float(n), columns[:, [j, j + m]], residual) for j, n in enumerate(orders)]
+    found.sort(key=lambda line: -line.share)
+    shares = np.array([line.share for line in found])
+    sure = shares[0] * len(residual) > SURE and shares[0] > STANDS_OUT * float(np.median(shares))
+    return Spectrum(tuple(line for line in found if line.share > 0), bool(sure))
 
 
-def _columns(fit, k: int, answer: Response, orders: Array, relative: bool) -> Array:
-    """Whitened outputs of run `k` to unit sine and cosine torques of all `orders`, (n, 2 len(orders))."""
+def _is_seen(moving: Array, order: float) -> bool:
+    slow = int((moving < QUARTER / order).sum())
+    return slow > max(SAMPLES, SURE_PART * moving.size)
+
+
+def _whitened(tangent: Tangent) -> tuple[Whitening, Array, Array]:
+    """Return the filters, the tangent space behind them, and the residual off it."""
+    fit = tangent.fit
+    white = Whitening.of(unstacked(fit, tangent.residual))
+    slopes = zip(*(unstacked(fit, column) for column in tangent.basis.T), strict=True)
+    columns = white([np.stack(run, axis=2) for run in slopes])
+    basis, triangle = np.linalg.qr(columns)
+    u, s, _ = np.linalg.svd(triangle)
+    basis = basis @ u[:, s > 1e-7 * max(s.max(initial=0.0), 1e-300)]
+    residual = white(unstacked(fit, tangent.residual))
+    return white, basis, residual - basis @ (basis.T @ residual)
+
+
+def _line(order: float, columns: Array, residual: Array) -> Line:
+    """Fit A·sin(Nθ+φ) to the residual."""
+    size = np.linalg.norm(columns, axis=0)
+    if not np.all(size > 1e-12):
+        return Line(order, 0.0, 0.0, 0.0)
+    a, _, full, _ = np.linalg.lstsq(columns / size, residual, rcond=1e-4)
+    if full < 2:
+        return Line(order, 0.0, 0.0, 0.0)
+    explained = float(np.sum((columns @ (a / size)) ** 2) / max(float(residual @ residual), 1e-300))
+    a = a / size
+    return Line(order, explained, float(np.hypot(*a)), float(np.arctan2(a[1], a[0])))
+
+
+def _columns(fit, k: int, answer: Response, orders: Array, slow: Array, relative: bool) -> Array:
+    """Whitened outputs of run `k` to unit sine and cosine torques of all `orders`, (N, ny, 2 len(orders)).
+
+    `slow` is the change of the angle per sample up to which each order acts.
+    """
     run = fit.problem.runs[k]
     angle = angle_signal(run.experiment)
-    middle = (angle[1:] + angle[:-1]) / 2
+    middle, step = (angle[1:] + angle[:-1]) / 2, np.diff(angle)
     # Averaged over the sample, so that orders too fast for the sampling fade instead of posing as slower ones.
-    fade = np.sinc(np.outer(np.diff(angle), orders) / (2 * np.pi))
+    fade = np.sinc(np.outer(step, orders) / (2 * np.pi)) * (np.abs(step)[:, None] <= slow)
     drive = np.concatenate([np.sin(np.outer(middle, orders)) * fade, np.cos(np.outer(middle, orders)) * fade], axis=1)
     if relative:
         drive *= (fit.values["K"] * answer.states["i"][:-1])[:, None]
-    _, weights, index = fit.problem._weights[k]
+    y, weights, index = fit.problem._weights[k]
     n, ny, nx = answer.c.shape
-    s, out = np.zeros((nx, drive.shape[1])), np.empty((n, ny, drive.shape[1]))
+    s, out = np.zeros((nx, drive.shape[1])), np.zeros((n, ny, drive.shape[1]))
     a, b, c = answer.a, answer.b[:, :, 1], answer.c * weights[None, :, None]
-    out[0] = 0.0
     for i in range(n - 1):
         s = a[i] @ s
         s += b[i][:, None] * drive[i]
         out[i + 1] = c[i + 1] @ s
-    flat = out.reshape(n * ny, -1)
-    return flat if index is None else flat[index]
+    if index is not None:
+        missing = np.ones(y.size, bool)
+        missing[index] = False
+        out[missing.reshape(y.shape)] = 0.0
+    return out
 
 
 def _travel(fit) -> float:
     return max(float(np.ptp(angle_signal(r))) for r in fit.problem.experiments)
-
-
-def _explained(gram: Array, slope: Array) -> float:
-    """Squared residual that a pair of columns takes away, from its Gram matrix."""
-    size = np.sqrt(np.maximum(np.diag(gram), 0.0))
-    if not np.all(size > 0):
-        return 0.0
-    scaled = gram / np.outer(size, size)
-    if np.linalg.det(scaled) < 1e-8:
-        return 0.0
-    return float(slope / size @ np.linalg.solve(scaled, slope / size))

@@ -17,7 +17,8 @@ from functools import lru_cache
 import numpy as np
 
 from motorid.diagnosis.evidence import effective_samples
-from motorid.diagnosis.orders import likely_orders
+from motorid.diagnosis.orders import Line, likely_lines, spectrum
+from motorid.diagnosis.whitening import unstacked
 from motorid.errors import ModelError, SimulationError
 from motorid.fit import Fit
 from motorid.integrate.grid import Array
@@ -38,6 +39,7 @@ class Score:
 
     `starts` are tried in turn, the most promising first. `effective` is how many independent samples the residual
     would be worth with the effect taken out: what a misfit makes smooth is no evidence of coloured noise.
+    `stands_out` says that its order is a line in the spectrum of the misfit, however small beside the rest of it.
     `same_as` are the parameters that together do what the effect does, if these data cannot tell it from them.
     """
 
@@ -46,6 +48,7 @@ class Score:
     starts: tuple[Mapping[str, float], ...]
     effective: float = 0.0
     same_as: tuple[str, ...] = ()
+    stands_out: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,18 +102,6 @@ class Tangent:
         return tuple(n for n, a in part.items() if a > SHARED * max(part.values()))
 
 
-def unstacked(fit: Fit, residual: Array) -> list[Array]:
-    """Return a stacked output residual as one (N, ny) per run, NaN where missing."""
-    parts, first = [], 0
-    for y, _, index in fit.problem._weights:
-        n = y.size if index is None else len(index)
-        full = np.full(y.size, np.nan)
-        full[slice(None) if index is None else index] = residual[first : first + n]
-        parts.append(full.reshape(y.shape))
-        first += n
-    return parts
-
-
 @lru_cache(maxsize=256)
 def uses_angle(effect: Effect) -> bool:
     """Tell whether the effect reads the angle."""
@@ -146,8 +137,10 @@ def score(tangent: Tangent, effect: Effect) -> Score:
     if uses_angle(effect) and not model.angle_input and not any(uses_angle(e) for e in fit.model.effects):
         model = replace(model, angle_input=True, _systems={})
     pars = [model.parameters[p.name] for p in effect.parameters]
+    if any(p.order and not p.given for p in pars):
+        return _score_orders(tangent, model, effect, pars)
     tried: list[Tried] = []
-    for shape in _shapes(tangent, effect, pars):
+    for shape in _shapes(tangent, pars):
         tried += _score_shape(tangent, model, pars, shape)
     if not tried:
         return Score(effect, 0.0, ({},))
@@ -156,6 +149,27 @@ def score(tangent: Tangent, effect: Effect) -> Score:
     same_as = best.same_as if all(t.same_as for t in tried) else ()
     starts = tuple(_distinct([t.values for t in tried]))
     return Score(effect, 0.0 if same_as else best.drop, starts, tangent.effective(best.left), same_as)
+
+
+def _score_orders(tangent: Tangent, model: Model, effect: Effect, pars: Sequence[Parameter]) -> Score:
+    """Score an effect of the angle at its likely orders, which the misfit without its colour tells."""
+    lines = likely_lines(tangent, effect, ORDERS_TRIED)
+    if not lines:
+        return Score(effect, 0.0, ({},))
+    order = next(p.name for p in pars if p.order)
+    best = _score_shape(tangent, model, pars, {order: lines[0].order})[0]
+    starts = tuple(_start(line, pars) for line in lines)
+    out = spectrum(tangent, effect).stands_out
+    return Score(effect, best.drop, starts, tangent.effective(best.left), best.same_as, out)
+
+
+def _start(line: Line, pars: Sequence[Parameter]) -> dict[str, float]:
+    """Return the values of an effect that a line stands for."""
+    return {
+        p.name: line.order if p.order else line.phase if p.periodic else line.amplitude
+        for p in pars
+        if p.order or p.periodic or p.null == 0
+    }
 
 
 def _distinct(starts: list[dict[str, float]], most: int = 4) -> list[dict[str, float]]:
@@ -174,15 +188,11 @@ def _kinds(pars: Sequence[Parameter]) -> tuple[list[Parameter], list[Parameter],
     return linear, finite, [p for p in pars if p.null is None]
 
 
-def _shapes(tangent: Tangent, effect: Effect, pars: Sequence[Parameter]) -> Iterator[dict[str, float]]:
-    """Yield the shape values to try: grids, orders from the misfit's spectrum."""
+def _shapes(tangent: Tangent, pars: Sequence[Parameter]) -> Iterator[dict[str, float]]:
+    """Yield the shape values to try: grids."""
     axes: list[list[tuple[str, float]]] = []
     for p in pars:
-        if p.given or p.periodic or not (p.grid or p.order):
-            continue
-        if p.order:
-            axes.append([(p.name, n) for n in likely_orders(tangent, effect, ORDERS_TRIED)])
-        else:
+        if p.grid and not p.given:
             axes.append([(p.name, g * tangent.sizes.get(p.unit, 1.0)) for g in p.grid])
     yield from (dict(point) for point in itertools.product(*axes))
 

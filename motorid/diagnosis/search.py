@@ -228,12 +228,16 @@ def _sizes(fit: Fit, effect: Effect) -> list[float]:
 
 
 def _shortlist(scores: Sequence[Score]) -> list[Score]:
-    """Return what is worth a refit: the best, what is common and near the best, and what a score cannot show."""
+    """Return what is worth a refit: the best, what is common and near the best, and what a score cannot show.
+
+    A line in the spectrum over the angle is no accident, however small beside the rest of the misfit.
+    """
     near = NEAR * max((s.drop for s in scores), default=0.0)
     return [
         s
         for k, s in enumerate(scores)
-        if (s.drop > 0 and (k < SHORTLIST or (s.effect.name in COMMON and s.drop > near))) or s.effect.name in ALWAYS
+        if (s.drop > 0 and (k < SHORTLIST or s.stands_out or (s.effect.name in COMMON and s.drop > near)))
+        or s.effect.name in ALWAYS
     ]
 
 
