@@ -50,6 +50,12 @@ def without_seconds(found):
     return [{k: v for k, v in row.items() if k != "seconds"} for row in found.rows]
 
 
+def same_rows(found):
+    """Equal to the rows of `found` but for their times; sums in threads differ in the last digits."""
+    return [{k: pytest.approx(v, rel=1e-9, nan_ok=True) if isinstance(v, float) else v for k, v in row.items()}
+            for row in without_seconds(found)]
+
+
 def test_table_has_values_errors_and_misfit_of_every_motor(fitted):
     table = fitted.table
     assert table.index.tolist() == [f"m{k:03d}" for k in range(10)]
@@ -134,7 +140,7 @@ def test_interrupted_batch_goes_on_where_it_was(ten, fitted, tmp_path):
 
     second = fit_many(mi.dc_motor(), ten, journal=path, map=counting, quiet=True)
     assert done == [f"m{k:03d}" for k in range(4, 10)]
-    assert without_seconds(second) == without_seconds(fitted)
+    assert without_seconds(second) == same_rows(fitted)
 
 
 def test_journal_cut_off_by_a_crash_is_still_read(ten, tmp_path):
@@ -225,7 +231,7 @@ def test_uncertain_motor_is_no_outlier():
 def test_spawned_pool_gives_the_same_table(ten, fitted):
     with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
         found = fit_many(mi.dc_motor(), ten, map=pool.map, quiet=True)
-    assert without_seconds(found) == without_seconds(fitted)
+    assert without_seconds(found) == same_rows(fitted)
 
 
 @pytest.mark.slow
@@ -235,7 +241,7 @@ def test_dask_gives_the_same_table_even_when_a_worker_is_killed(ten, fitted):
     with (distributed.LocalCluster(n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None) as farm,
           distributed.Client(farm) as client):
         way = client.get_executor().map
-        assert without_seconds(fit_many(mi.dc_motor(), ten, map=way, quiet=True)) == without_seconds(fitted)
+        assert without_seconds(fit_many(mi.dc_motor(), ten, map=way, quiet=True)) == same_rows(fitted)
         more = {f"{k}-{copy}": v for copy in range(8) for k, v in ten.items()}
         victim = next(iter(client.run(os.getpid).values()))
         threading.Timer(0.5, os.kill, (victim, signal.SIGKILL)).start()
