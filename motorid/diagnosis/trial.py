@@ -20,6 +20,7 @@ from motorid.parameters import Parameter
 from motorid.prepared import natural_sizes
 from motorid.problem import Problem
 from motorid.simulate import at, simulated
+from motorid.start import first_guess
 
 RACE = LevenbergMarquardt(max_iterations=6, ftol=1e-3, xtol=1e-4)
 QUICK = LevenbergMarquardt(max_iterations=25, ftol=1e-4, xtol=1e-5)
@@ -28,10 +29,12 @@ BLOCKS = 10  # contiguous parts of each run; every other one is held out where t
 WORST_CONDITION = 1e4  # of the column-scaled Jacobian
 HOPELESS = 1e6  # condition number beyond which a direction counts as open
 ROUGH = 1e-4  # accuracy of the integration while starts are compared
+LOST = 0.2  # NRMSE of a channel
 ALIVE = 3.0  # standard deviations that a change by a factor of e makes
 SUBSTEPS = 24  # per sample: what needs more cannot be seen in these samples
 ROOM = 10.0  # factor beyond its grid that a shape parameter may run to
 FAILURES = (FitError, SimulationError, ModelError, np.linalg.LinAlgError)
+WORSE = 1.02  # of the cost along the measured angle: the model's own angle must do as well
 PHASE_KNOWN = 0.5  # rad, standard deviation: beyond it an amplitude is not told from none
 LEAST_FALL = 0.01  # of the held-out error that makes an effect worth having
 
@@ -90,6 +93,9 @@ class HeldOut:
         parts = []
         for problem, test in self.folds:
             start = problem.for_model(fit.model).balanced(fit.problem.balance).with_accuracy(ROUGH)
+            if fit.model.angle_input:  # the measured angle, where it is hidden from the judgement too
+                runs = zip(fit.problem.runs, problem.runs, strict=True)
+                start = replace(start, _runs=tuple(replace(whole, experiment=r.experiment) for whole, r in runs))
             q = start.scaling.scaled([fit.initial.get(p.name, p.value) for p in start.unknown])
             done = descend(_from(start, q), QUICK, stages=False)
             parts.append(Errors.of(at(done.problem, done.solution.q), test))
@@ -123,13 +129,13 @@ def refit(fit: Fit, model: Model, starts: Sequence[Mapping[str, float]]) -> Fit 
     """Return the best refit of `model` on the records of `fit` from several starts; None if none can be simulated.
 
     Effects of the angle start along the measured angle, which the model's own angle, still wrong, would lead
-    astray; then the model's angle takes over.
+    astray; then the model's angle takes over, unless it drifts too far for them (periods of the angle pass).
     """
     model = _bounded(fit, model)
     alive = _revived(fit, model)
     angular = any(uses_angle(e) for e in model.effects) and not any(uses_angle(e) for e in fit.model.effects)
     raced = []
-    for start in starts or ({},):
+    for start in (*(starts or ({},)), *_own_starts(fit, model)):
         # As it is where a parameter put back (an inductance that no sample shows) makes the model too stiff.
         for each in (alive,) if alive is model else (alive, model):
             done = _race(fit, each, start, angular)
@@ -139,13 +145,46 @@ def refit(fit: Fit, model: Model, starts: Sequence[Mapping[str, float]]) -> Fit 
     if not raced:
         return None
     best = min(raced, key=lambda c: c[0])[1]
+    stages = "sgn_width" in model.parameters and not fit.model.effects
     try:
-        if angular:
-            best = best.for_model(replace(best.model, angle_input=False, _systems={}))
-        done = descend(best, QUICK, stages="sgn_width" in model.parameters and not fit.model.effects)
+        done = _released(best) if angular else descend(best, QUICK, stages=stages)
     except FAILURES:
         return None
     return _polished(fit, _from(done.problem, done.solution.q))
+
+
+def _released(measured: Problem) -> Descent:
+    """Let the model's own angle take the place of the measured one, if it is good enough.
+
+    Raises
+    ------
+    FitError, SimulationError
+    """
+    own = measured.for_model(replace(measured.model, angle_input=False, _systems={}))
+    if not all("theta" in run.outputs for run in measured.experiments):
+        return descend(own, QUICK, stages=False)
+    along = descend(measured, QUICK, stages=False)
+    own = _from(along.problem, along.solution.q).for_model(own.model.start_at(along.problem.values(along.solution.q)))
+    try:
+        free = descend(own, QUICK, stages=False)
+    except FAILURES:
+        return along
+    return free if free.solution.history[-1] < WORSE * along.solution.history[-1] else along
+
+
+def lost(fit: Fit) -> bool:
+    """Tell whether a fit is so far from its records that neither its values nor slopes there lead anywhere."""
+    return max(fit.nrmse.values(), default=0.0) > LOST
+
+
+def _own_starts(fit: Fit, model: Model) -> list[dict[str, float]]:
+    """Return the larger model's own first guess, where the smaller one's fit is no place to begin.
+
+    An arm without its weight is fitted by a motor that hardly moves; from there nothing leads back.
+    """
+    if not lost(fit):
+        return []
+    return [first_guess(model, fit.problem.experiments, loaded=True)]
 
 
 def _race(fit: Fit, model: Model, start: Mapping[str, float], angular: bool) -> Descent | None:
