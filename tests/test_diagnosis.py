@@ -8,6 +8,7 @@ from multiprocessing import get_context
 
 import numpy as np
 import pytest
+from battery.cases import CASES
 from battery.excite import driven, record
 
 import motorid as mi
@@ -15,12 +16,14 @@ from motorid.diagnosis import adequacy
 from motorid.diagnosis.evidence import Errors, autocorrelation, compare_errors, effective_samples
 from motorid.diagnosis.orders import highest_order, likely_orders
 from motorid.diagnosis.rank import Tangent, rank, score
+from motorid.diagnosis.verdict import moves
 from motorid.effects import LIBRARY
 from motorid.errors import FitError, ModelError, UsageError
 from motorid.experiment import Experiment
 
 FEW = ("coulomb", "brush_drop", "constant_load", "quadratic_drag", "speed_lag")
 ANGLE = ("i", "omega", "theta")
+PURE_TWINS = ("coulomb", "speed_lag", "voltage_offset", "brush_drop")
 
 
 def runs_of(motor, effects, drives, channels=("i", "omega"), n=700, seed=1, **how) -> list[Experiment]:
@@ -261,6 +264,25 @@ def test_every_candidate_has_a_reason(found):
         assert c.reason
 
 
+def test_what_was_judged_on_held_out_runs_says_by_how_much(found):
+    judged = [c for c in found[0].ranking if c.held_out_gain is not None]
+    assert "coulomb" in [c.effect for c in judged]
+    assert all((c.held_out_gain is None) == (c.validation_nrmse is None) for c in found[0].ranking)
+    best = next(c for c in judged if c.effect == "coulomb")
+    plain = found[0].ladder.rungs[0].validation_nrmse
+    ratio = np.sqrt(np.prod([best.validation_nrmse[c] / plain[c] for c in plain]))
+    assert best.held_out_gain == pytest.approx(1 - ratio, abs=0.02)
+    assert found[0].to_dict()["ranking"][0]["held_out_gain"] is not None
+
+
+def test_a_parameter_that_is_held_does_not_move(rubbing):
+    before = mi.fit(mi.dc_motor().fix(L=0), rubbing[0])
+    after = mi.fit(before.model + mi.effects.coulomb, rubbing[0])
+    said = moves(before, after)
+    assert "b from" in said
+    assert "L from" not in said
+
+
 def test_the_progress_is_told(found):
     words = found[1]
     assert words[0].startswith("ranked 5")
@@ -332,6 +354,23 @@ def test_the_users_own_effect_wins_where_it_is_the_truth(lab):
     assert found.effects == ("seal_drag",)
     assert found.after.values["c_r"] == pytest.approx(1.5e-3, rel=0.05)
     assert found.where == "mechanical"
+
+
+# -- what cannot be told apart -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", [c.name for c in CASES.values() if c.kind == "twins"])
+def test_twins_are_said_as_a_group_with_an_experiment_that_parts_them(name):
+    case = CASES[name]
+    runs, check = case.records()
+    alike = (*case.effects, *(t for t in case.twins if t in PURE_TWINS))
+    found = mi.diagnose(mi.fit(mi.dc_motor(), runs), check, effects=alike, max_effects=1)
+    assert found.verdict == "missing"
+    assert set(found.groups[0]) == set(alike)
+    assert found.effects == found.groups[0][:1]
+    assert "These data cannot tell" in found.text
+    assert "apart, try" in found.suggestion
+    assert found.suggestion in found.text
 
 
 # -- the next experiment -----------------------------------------------------------------------------------
