@@ -9,6 +9,7 @@ from typing import Any
 from motorid.diagnosis.adequacy import adequacy, following
 from motorid.diagnosis.improve import Climb, climb, ladder_of, settled
 from motorid.diagnosis.locate import acting_like, locate
+from motorid.diagnosis.parts import affordable, parts_remark
 from motorid.diagnosis.results import Diagnosis
 from motorid.diagnosis.search import Search, library
 from motorid.diagnosis.suggest import suggest_experiment
@@ -62,6 +63,7 @@ def diagnose(
     """
     say = progress or (lambda word: None)
     own = tuple(also)
+    whole, fit = fit, affordable(fit)
     search = Search(fit, validate, library(effects, own), map, say)
     judged = adequacy(fit, search.scores(search.root))
     found, other = settled(climb(search, max_effects, say))
@@ -85,7 +87,7 @@ def diagnose(
         same = {name: p for node in found.path[1:] for name, p in search.inseparable(node).items()}
         text = f"{text} {inseparable_remark(same)}".rstrip()
         suggestion = _suggestion(found)
-    text = " ".join(t for t in (text, closed_loop_remark(fit), suggestion) if t)
+    text = " ".join(t for t in (text, parts_remark(whole, fit), closed_loop_remark(fit), suggestion) if t)
     return Diagnosis(
         verdict,
         text,

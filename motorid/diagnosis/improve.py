@@ -15,6 +15,7 @@ from motorid.diagnosis.adequacy import adequacy
 from motorid.diagnosis.evidence import compare_errors
 from motorid.diagnosis.judging import Node
 from motorid.diagnosis.outside import Outside, outside
+from motorid.diagnosis.parts import affordable
 from motorid.diagnosis.results import Adequacy, Candidate, Ladder, Rung
 from motorid.diagnosis.search import Search, library
 from motorid.experiment import Experiment
@@ -175,6 +176,6 @@ def improve(
         The models with training and held-out error; ``ladder.best`` is the last fit, to go on from.
     """
     say = progress or (lambda word: None)
-    search = Search(fit, validate, library(effects, also), map, say)
+    search = Search(affordable(fit), validate, library(effects, also), map, say)
     found, _ = settled(climb(search, max_effects, say))
     return ladder_of(found, validate is not None)

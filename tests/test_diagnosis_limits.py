@@ -1,0 +1,185 @@
+"""What a diagnosis leaves alone: what samples cannot show, what parameters do already, what has no limit in physics."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from battery.excite import driven, record
+
+import motorid as mi
+from motorid.diagnosis import parts
+from motorid.diagnosis.orders import likely_lines, spectrum
+from motorid.diagnosis.rank import Tangent, score
+from motorid.diagnosis.resolvable import samples_within, unresolved
+from motorid.diagnosis.search import Search, library
+from motorid.diagnosis.trial import objections, refit
+from motorid.diagnosis.whitening import Whitening
+from motorid.effects import LIBRARY
+
+ANGLE = ("i", "omega", "theta")
+
+
+def runs_of(motor, effects, drives, channels=ANGLE, n=800, seed=5, dt=1e-3, chain="logger"):
+    rng = np.random.default_rng(seed)
+    return [
+        record(driven(motor, effects, words, n, dt, rng), chain, channels, motor, rng, f"run{k + 1}")
+        for k, words in enumerate(drives)
+    ]
+
+
+@pytest.fixture(scope="module")
+def lab(plant):
+    return plant.MOTORS["lab"]
+
+
+@pytest.fixture(scope="module")
+def rubbing(lab):
+    return runs_of(lab, {"coulomb": {"tau_c": 8e-3}}, ("stairs 0.5", "waves"))
+
+
+def searched(fit, effects=None):
+    return Search(fit, None, library(effects), map, lambda word: None)
+
+
+# -- what samples cannot show ------------------------------------------------------------------------------
+
+
+def test_samples_of_a_passage_are_counted_from_each_turning_point():
+    there = np.linspace(0, 1, 101)
+    angle = np.concatenate([there, there[::-1][1:]])
+    assert samples_within(angle, 0.205) == [18, 18]  # from a tenth of the width on, after the start and after the turn
+
+
+@pytest.mark.parametrize(("theta_s", "seen"), [(1e-5, False), (0.05, True)])
+def test_bristles_finer_than_the_samples_are_refused(rubbing, theta_s, seen):
+    fit = mi.fit(mi.dc_motor() + mi.effects.coulomb, rubbing)
+    bristles = replace(fit, values={**fit.values, "tau_c": 8e-3, "s_b": 1.2, "omega_s": 5.0, "theta_s": theta_s})
+    model = mi.dc_motor() + mi.effects.lugre
+    bristles = replace(bristles, problem=fit.problem.for_model(model))
+    assert (unresolved(bristles, LIBRARY["lugre"]) == "") is seen
+
+
+def test_an_effect_that_replaces_nothing_may_be_as_quick_as_it_likes(rubbing):
+    assert unresolved(mi.fit(mi.dc_motor() + mi.effects.coulomb, rubbing), LIBRARY["coulomb"]) == ""
+
+
+# -- what parameters do already ----------------------------------------------------------------------------
+
+
+def test_an_offset_beside_two_frictions_is_refused_and_said(lab):
+    runs = runs_of(lab, {"coulomb": {"tau_c": 8e-3}, "constant_load": {"tau_0": 4e-3}}, ("stairs 0.5", "waves"))
+    fit = mi.fit(mi.dc_motor() + mi.effects.coulomb_asymmetric, runs)
+    offset = score(Tangent.of(fit), LIBRARY["constant_load"])
+    assert set(offset.same_as) == {"tau_cp", "tau_cn"}
+    assert offset.drop == 0
+    search = searched(fit, ("constant_load", "brush_drop", "coulomb_asymmetric"))
+    children, listed = search.expand(search.root)
+    assert "constant_load" not in {c.added for c in children}
+    why = next(c.reason for c in listed if c.effect == "constant_load")
+    assert "not identifiable" in why
+    assert "tau_cp and tau_cn" in why
+
+
+def test_an_offset_beside_one_friction_is_told(rubbing):
+    fit = mi.fit(mi.dc_motor() + mi.effects.coulomb, rubbing)
+    assert score(Tangent.of(fit), LIBRARY["constant_load"]).same_as == ()
+
+
+@pytest.mark.slow
+def test_what_made_a_special_effect_special_may_be_taken_over(rubbing):
+    """Asymmetric friction on a motor that rubs alike both ways is Coulomb's, in the same place."""
+    start = mi.fit(mi.dc_motor() + mi.effects.coulomb_asymmetric + mi.effects.constant_load, rubbing)
+    search = searched(start)
+    assert search.pruned(search.root).fit.model.effect_names == ("coulomb",)
+
+
+# -- limits of physics -------------------------------------------------------------------------------------
+
+
+def test_an_amplitude_without_a_phase_is_refused(rubbing):
+    fit = refit(
+        mi.fit(mi.dc_motor() + mi.effects.coulomb, rubbing),
+        mi.dc_motor() + mi.effects.coulomb + mi.effects.cogging,
+        ({"A": 1e-6, "N": 37.0, "phi": 0.0},),
+    )
+    assert fit is not None
+    assert objections(fit, LIBRARY["cogging"])
+
+
+def test_a_size_at_the_limit_of_what_is_physical_is_refused(rubbing):
+    fit = mi.fit(mi.dc_motor() + mi.effects.load_friction, rubbing)
+    assert "limit" not in objections(fit, LIBRARY["load_friction"])
+    at_limit = replace(fit, values={**fit.values, "mu": 1.0})
+    assert "the limit of what is physical" in objections(at_limit, LIBRARY["load_friction"])
+
+
+def test_what_turns_is_not_tried_on_a_linear_axis(lab):
+    runs = runs_of(lab, {"coulomb": {"tau_c": 8e-3}}, ("stairs 0.5",), ("theta",))
+    runs = [r.with_(units={**r.units, "theta": "m"}) for r in runs]
+    fit = mi.fit(mi.torque_driven(axis="linear", g=1.0), runs)
+    search = searched(fit)
+    names = {s.effect.name for s in search.scores(search.root)}
+    assert names & {"coulomb", "constant_load"}
+    assert not names & {"gravity", "cogging", "torque_ripple"}
+
+
+# -- orders ------------------------------------------------------------------------------------------------
+
+
+def test_an_order_needs_some_periods_within_the_travel(lab):
+    (run,) = runs_of(lab, {"cogging": {"A": 8e-3, "N": 16, "phi": 0.7}}, ("ramps 0.3",))
+    angle = run.outputs["theta"]
+    short = run.select(np.abs(angle - angle[0]) < 1.0).with_(name="short")
+    orders = [line.order for line in spectrum(Tangent.of(mi.fit(mi.dc_motor(), [short])), LIBRARY["cogging"]).lines]
+    assert min(orders) >= 3 * 2 * np.pi / np.ptp(short.outputs["theta"])
+
+
+@pytest.mark.parametrize("effect", ["cogging", "torque_ripple"])
+def test_a_line_tells_order_size_and_phase(lab, effect):
+    size, order, phase = {"cogging": ("A", "N", "phi"), "torque_ripple": ("a_r", "N_r", "phi_r")}[effect]
+    value = {"cogging": 8e-3, "torque_ripple": 0.15}[effect]
+    runs = runs_of(lab, {effect: {size: value, order: 14, phase: 0.7}}, ("stairs 0.3", "ramps 0.3"))
+    best = likely_lines(Tangent.of(mi.fit(mi.dc_motor(), runs)), LIBRARY[effect], 3)[0]
+    assert best.order == 14
+    assert best.amplitude == pytest.approx(value, rel=0.25)
+    assert best.phase == pytest.approx(0.7, abs=0.2)
+
+
+@pytest.mark.slow
+def test_a_small_line_beside_a_large_misfit_gets_its_refit(lab):
+    hidden = {"coulomb": {"tau_c": 1.2e-2}, "cogging": {"A": 1.5e-3, "N": 22, "phi": 0.3}}
+    fit = mi.fit(mi.dc_motor(), runs_of(lab, hidden, ("stairs 0.4", "waves"), n=1200))
+    line = score(Tangent.of(fit), LIBRARY["cogging"])
+    assert line.starts[0]["N"] == 22
+    assert line.stands_out
+    rubbing = score(
+        Tangent.of(mi.fit(mi.dc_motor(), runs_of(lab, {"coulomb": {"tau_c": 1.2e-2}}, ("stairs 0.4",)))),
+        LIBRARY["cogging"],
+    )
+    assert not rubbing.stands_out
+
+
+def test_a_drift_has_no_colour_left(rng):
+    drift = np.cumsum(rng.normal(size=(2000, 1)), axis=0)
+    white = Whitening.of([drift])([drift])
+    assert abs(np.corrcoef(white[1:], white[:-1])[0, 1]) < 0.1
+    assert white.std() == pytest.approx(1.0, rel=0.05)
+
+
+# -- long records ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_a_long_record_is_looked_at_in_parts_and_that_is_said(lab, monkeypatch):
+    (run,) = runs_of(lab, {"coulomb": {"tau_c": 8e-3}}, ("waves",), n=3000)
+    whole = mi.fit(mi.dc_motor(), [run])
+    assert parts.affordable(whole) is whole
+    monkeypatch.setattr(parts, "AFFORDABLE", 100)
+    monkeypatch.setattr(parts, "PART", 500)
+    monkeypatch.setattr(parts, "WANTED", sum(int(r.grid.substeps.sum()) for r in whole.problem.runs) / 3)
+    found = mi.diagnose(whole, effects=("coulomb", "brush_drop"))
+    assert found.effects == ("coulomb",)
+    assert found.after.values["tau_c"] == pytest.approx(8e-3, rel=0.1)
+    assert "2 parts of 0.5 s, 33 % of the samples" in found.text
