@@ -74,7 +74,8 @@ def outside(steps: Sequence[Fit], held: HeldOut) -> Outside | None:
         rivals = _believed(rivals)
         instead = [r for r in rivals if r.instead]
         if instead and len(steps) > 1:
-            return _best(instead, kept)
+            nearer = _in_earnest(steps, held, channels) if kept else None  # the first may have been judged too early
+            return nearer or _best(instead, kept)
     beside = [r for r in rivals if r.explains]
     earnest = _in_earnest(steps, held, channels) if len(steps) > 1 else None
     return earnest or (_best(beside, len(steps) - 1) if beside else None)
