@@ -16,12 +16,13 @@ import numpy as np
 from motorid.errors import FitError, SimulationError
 from motorid.integrate.grid import Array
 from motorid.least_squares import LevenbergMarquardt, Solution, levenberg_marquardt
-from motorid.prepared import top_speed
+from motorid.prepared import SGN_WIDTH_SHARE, top_speed
 from motorid.problem import Problem
 
 WIDEST = 0.03  # first width of sgn over the highest speed
 NARROWER = 6.0  # at most, from one stage to the next
 ON_THE_WAY = ((1e-7, 60), (1e-6, 60))  # ftol and iterations of the first stage, and of those between
+CLEARLY = 1.5  # factor between widths of sgn that is worth another descent
 ROUNDS = 4  # of refining the sub-steps
 LEAST_FACTOR = 0.02  # a quick channel with few samples per time constant passes for noisy
 IMBALANCE = 3.0  # between channels, in misfit over noise, above which the misfit decides the weights
@@ -66,6 +67,17 @@ def descend(problem: Problem, options: LevenbergMarquardt, callback: Callback = 
     history: list[float] = []
     if stages:
         problem = _narrowing(problem, options, callback, history, surely)
+    done = _settled(problem, options, callback)
+    history += done.history
+    while (narrower := _narrower(done)) is not None:
+        done = _settled(narrower, options, callback)
+        history += done.history
+    return replace(done, history=tuple(history))
+
+
+def _settled(problem: Problem, options: LevenbergMarquardt, callback: Callback) -> Descent:
+    """Solve, and again with other sub-steps, until they suit the end."""
+    history: list[float] = []
     q = problem.start
     for _ in range(ROUNDS):
         problem, found = _solve(problem, q, options, callback)
@@ -220,16 +232,15 @@ def _narrowing(problem: Problem, options: LevenbergMarquardt, callback: Callback
     """Return the problem with the values that a wide sgn leads to, made narrower step by step."""
     if not _smooths(problem):
         return problem
-    width = problem.model.values["sgn_width"]
+    width = _narrow_enough(problem)
+    problem = begin = problem.widened(width)
     ratio = max(WIDEST * top_speed(problem.experiments) / width, 1.0)
     steps = int(np.ceil(np.log(ratio) / np.log(NARROWER)))
-    begin = problem
     for k, factor in enumerate(np.geomspace(ratio, 1.0, steps + 1)[:-1]):
-        wide = _cheaper(*(p.for_model(p.model.replace(sgn_width=factor * width))
-                          for p in dict.fromkeys((problem, begin))))
+        wide = _cheaper(*(p.widened(factor * width) for p in dict.fromkeys((problem, begin))))
         try:
             if k == 0 and surely:
-                done = descend_surely(wide, _sooner(options, ON_THE_WAY[0]), callback)
+                done = descend_surely(wide, _sooner(options, ON_THE_WAY[0]), callback, stages=False)
                 wide, found, costs = done.problem, done.solution, done.history
             else:
                 wide, found = _solve(wide, wide.start, _sooner(options, ON_THE_WAY[min(k, 1)]), callback)
@@ -237,8 +248,39 @@ def _narrowing(problem: Problem, options: LevenbergMarquardt, callback: Callback
         except (FitError, SimulationError):
             continue
         history += costs
-        problem = problem.for_model(begin.model.start_at(wide.values(found.q) | {"sgn_width": width}))
+        problem = begin.for_model(begin.model.start_at(_without_width(wide, found.q)))
     return _cheaper(*dict.fromkeys((problem, begin)))
+
+
+def _narrowest(problem: Problem) -> float:
+    """Return the width of sgn that the noise of the records asks for."""
+    return problem.widened(None).model.values["sgn_width"]
+
+
+def _narrow_enough(problem: Problem) -> float:
+    """Return the width of sgn that the speeds of the records ask for, whatever their noise."""
+    return max(SGN_WIDTH_SHARE * top_speed(problem.experiments), _narrowest(problem))
+
+
+def _without_width(problem: Problem, q: Array) -> dict[str, float]:
+    return {n: v for n, v in problem.values(q).items() if n != "sgn_width"}
+
+
+def _narrower(done: Descent) -> Problem | None:
+    """Return the problem with a narrower sgn, where a loaded, stuck motor's creep would show.
+
+    The noise of the angle sets the width of a model that reaches the noise. Beside a misfit many times as large
+    the same creep does not show, and a sgn so narrow would only make the model stiff and its slopes wild.
+    """
+    problem = done.problem
+    if problem.width is None or not _smooths(problem) or problem.width > 1.01 * _narrow_enough(problem):
+        return None
+    least = _narrowest(problem)
+    width = max(least, min(least * misfit_over_noise(problem, done.solution.q).get("theta", 1.0), problem.width))
+    if width > problem.width / CLEARLY:
+        return None
+    width = max(width, problem.width / NARROWER)
+    return problem.for_model(problem.model.start_at(_without_width(problem, done.solution.q))).widened(width)
 
 
 def _sooner(options: LevenbergMarquardt, ends: tuple[float, int]) -> LevenbergMarquardt:

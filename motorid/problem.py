@@ -46,6 +46,8 @@ class Problem:
         Factors on the noise per channel where the misfit, not the noise, decides; see `motorid.descent`.
     accuracy : float, optional
         Local error of the integration relative to the largest state; by default a small part of the noise.
+    width : float, optional
+        Width of sgn, rad/s, in place of the model's or the one that suits the records; see `motorid.descent`.
     """
 
     model: Model
@@ -59,6 +61,7 @@ class Problem:
     engine: str | Engine = "rosenbrock"
     balance: Mapping[str, float] = field(default_factory=dict)
     accuracy: float | None = None
+    width: float | None = None
     _runs: tuple[Run, ...] | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
@@ -78,7 +81,7 @@ class Problem:
             if name not in self.model.parameters:
                 raise UsageError(f"prior: {one_of(name, self.model.parameters, 'parameter')}")
         self.model.check_visible(self.outputs)
-        width = smoothing(self.experiments, self.model.parameters)
+        width = self.width or smoothing(self.experiments, self.model.parameters)
         if width is not None:
             object.__setattr__(self, "model", self.model.start_at({"sgn_width": width}))
 
@@ -274,6 +277,10 @@ class Problem:
     def balanced(self, factors: Mapping[str, float]) -> Problem:
         """Return the problem with other factors on the noise per channel, keeping the rest."""
         return replace(self, balance=dict(factors), _runs=self.runs)
+
+    def widened(self, width: float | None) -> Problem:
+        """Return the problem with another width of sgn, keeping the rest; None: as it suits the records' noise."""
+        return replace(self, width=width, _runs=self.runs)
 
     def with_accuracy(self, accuracy: float | None) -> Problem:
         """Return the problem with another accuracy of the integration, keeping the rest."""

@@ -20,6 +20,7 @@ from motorid.diagnosis.trial import (
     WORST_CONDITION,
     HeldOut,
     ambiguity,
+    lost,
     objections,
     refit,
     train_errors,
@@ -82,7 +83,7 @@ class Search:
         present = node.fit.model
         _, wider = self._takeable(present)
         scores = self.scores(node)
-        short = _shortlist(scores)
+        short = _shortlist(scores, lost(node.fit))
         tasks = [(node.fit, present + s.effect, s.starts[:3]) for s in short]
         names = [s.effect for s in short]
         for e in wider:
@@ -227,8 +228,10 @@ def _sizes(fit: Fit, effect: Effect) -> list[float]:
     return [fit.values[p.name] for p in effect.parameters if p.null == 0]
 
 
-def _shortlist(scores: Sequence[Score]) -> list[Score]:
+def _shortlist(scores: Sequence[Score], astray: bool) -> list[Score]:
     """Return what is worth a refit: the best, what is common and near the best, and what a score cannot show.
+
+    Far from the records (`astray`) slopes say little, and everything that is common is tried.
 
     A line in the spectrum over the angle is no accident, however small beside the rest of the misfit.
     """
@@ -238,6 +241,7 @@ def _shortlist(scores: Sequence[Score]) -> list[Score]:
         for k, s in enumerate(scores)
         if (s.drop > 0 and (k < SHORTLIST or s.stands_out or (s.effect.name in COMMON and s.drop > near)))
         or s.effect.name in ALWAYS
+        or (astray and s.effect.name in COMMON)
     ]
 
 
