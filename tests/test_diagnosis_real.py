@@ -5,10 +5,16 @@ from __future__ import annotations
 import pytest
 
 import motorid as mi
+from motorid.diagnosis.orders import likely_orders
+from motorid.diagnosis.rank import Tangent, score
+from motorid.effects import LIBRARY
 from motorid.experiment import split
 
 pytestmark = pytest.mark.slow
 FRICTION = ("coulomb", "coulomb_asymmetric", "constant_load", "driver_dead_band", "load_friction", "quadratic_drag")
+
+
+EMPS = {"columns": {"t": "t_s", "v": "voltage_V", "theta": "position_m"}, "units": {"theta": "m"}}
 
 
 def diagnosed(train, check, model=None, effects=FRICTION):
@@ -35,8 +41,7 @@ def test_unmotor_loses_voltage_or_torque_and_forward_records_cannot_tell_which(r
 
 
 def test_emps_has_coulomb_friction_that_differs_with_the_direction(real):
-    words = {"columns": {"t": "t_s", "v": "voltage_V", "theta": "position_m"}, "units": {"theta": "m"}}
-    run = mi.read_runs([real / "emps" / "run.csv"], **words)[0].decimate(4)
+    run = mi.read_runs([real / "emps" / "run.csv"], **EMPS)[0].decimate(4)
     train, check = split(run)
     model = mi.torque_driven(axis="linear", g=35.15065)
     found = diagnosed([train], [check], model, ("coulomb", "coulomb_asymmetric", "constant_load", "quadratic_drag"))
@@ -49,3 +54,26 @@ def test_emps_has_coulomb_friction_that_differs_with_the_direction(real):
     assert level == pytest.approx(20.4, rel=0.2)
     assert found.ladder.rungs[-1].nrmse["theta"] < 0.1 * found.ladder.rungs[0].nrmse["theta"]
     assert "closed loop" in found.text
+
+
+def test_emps_has_no_bristles_that_seven_reversals_could_show(real):
+    """Dynamic friction fits best, within a few micrometres that the motion passes in five samples."""
+    run = mi.read_runs([real / "emps" / "run.csv"], **EMPS)[0]
+    fit = mi.fit(mi.torque_driven(axis="linear", g=35.15065) + mi.effects.coulomb + mi.effects.viscous_asymmetric, run)
+    after = fit.values  # published: 166.7 and 240.4 N·s/m, 20.1 and 20.6 N, 95.1 kg
+    assert after["b"] + after["b_a"] == pytest.approx(166.7, rel=0.1)
+    assert after["b"] - after["b_a"] == pytest.approx(240.4, rel=0.1)
+    assert after["tau_c"] == pytest.approx(20.4, rel=0.1)
+    found = mi.diagnose(fit, effects=("lugre", "constant_load"))
+    assert found.effects == ()
+    lugre = next(c for c in found.ranking if c.effect == "lugre")
+    assert lugre.refit_drop > 0.5
+    assert "cannot be seen in these samples" in lugre.reason
+
+
+def test_odri_cogs_72_times_a_turn(real):
+    run = mi.read_runs([real / "odri_mn4004" / "sine_current.txt"])[0].select(slice(7000, 11000))
+    for model in (mi.dc_motor(), mi.dc_motor() + mi.effects.coulomb):
+        tangent = Tangent.of(mi.fit(model, run))
+        assert likely_orders(tangent, LIBRARY["cogging"], 3)[0] == 72
+        assert score(tangent, LIBRARY["cogging"]).stands_out

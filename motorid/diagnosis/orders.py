@@ -103,20 +103,25 @@ def _spectrum(tangent: Tangent, relative: bool) -> Spectrum:
     moving, answers, found = _moving(tangent), responses(fit), []
     for first in range(lowest, top + 1, CHUNK):
         orders = np.arange(float(first), min(first + CHUNK, top + 1))
-        slow = np.array([QUARTER / n if _is_seen(moving, n) else np.inf for n in orders])
+        slow = np.array([_slow_enough(moving, n) for n in orders])
         columns = white([_columns(fit, k, answer, orders, slow, relative) for k, answer in enumerate(answers)])
         columns -= basis @ (basis.T @ columns)
         m = len(orders)
         found += [_line(float(n), columns[:, [j, j + m]], residual) for j, n in enumerate(orders)]
-    found.sort(key=lambda line: -line.share)
+    found = sorted((line for line in found if line.share > 0), key=lambda line: -line.share)
+    if not found:
+        return Spectrum((), False)
     shares = np.array([line.share for line in found])
     sure = shares[0] * len(residual) > SURE and shares[0] > STANDS_OUT * float(np.median(shares))
-    return Spectrum(tuple(line for line in found if line.share > 0), bool(sure))
+    return Spectrum(tuple(found), bool(sure))
 
 
-def _is_seen(moving: Array, order: float) -> bool:
-    slow = int((moving < QUARTER / order).sum())
-    return slow > max(SAMPLES, SURE_PART * moving.size)
+def _slow_enough(moving: Array, order: float) -> float:
+    """Return the change of the angle per sample up to which an order is looked for; 0 where it would be an alias."""
+    sure = int((moving <= QUARTER / order).sum())
+    if sure > max(SAMPLES, SURE_PART * moving.size):
+        return QUARTER / order
+    return np.pi / order if float(np.mean(moving <= np.pi / order)) > SLOW_PART else 0.0
 
 
 def _whitened(tangent: Tangent) -> tuple[Whitening, Array, Array]:
