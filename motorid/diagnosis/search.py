@@ -13,15 +13,13 @@ from typing import Any
 
 from motorid.diagnosis.evidence import Errors, Gain, compare_errors
 from motorid.diagnosis.judging import COMMON, PLAIN, Judge, Node, held_out_objection, node_of, worth_it
+from motorid.diagnosis.objections import WORST_CONDITION, ambiguity, objections
 from motorid.diagnosis.rank import Score, rank
 from motorid.diagnosis.results import Candidate
 from motorid.diagnosis.trial import (
     FAILURES,
-    WORST_CONDITION,
     HeldOut,
-    ambiguity,
     lost,
-    objections,
     refit,
     train_errors,
 )

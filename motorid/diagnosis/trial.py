@@ -10,13 +10,11 @@ import numpy as np
 from motorid.descent import Descent, descend, misfit_over_noise
 from motorid.diagnosis.evidence import Errors
 from motorid.diagnosis.rank import uses_angle
-from motorid.diagnosis.resolvable import unresolved
 from motorid.errors import FitError, ModelError, SimulationError
 from motorid.experiment import Experiment
 from motorid.fit import Fit
 from motorid.least_squares import LevenbergMarquardt
-from motorid.model import Effect, Model
-from motorid.parameters import Parameter
+from motorid.model import Model
 from motorid.prepared import natural_sizes
 from motorid.problem import Problem
 from motorid.simulate import at, simulated
@@ -26,8 +24,6 @@ RACE = LevenbergMarquardt(max_iterations=6, ftol=1e-3, xtol=1e-4)
 QUICK = LevenbergMarquardt(max_iterations=25, ftol=1e-4, xtol=1e-5)
 POLISH = LevenbergMarquardt(max_iterations=60, ftol=1e-7, xtol=1e-7)
 BLOCKS = 10  # contiguous parts of each run; every other one is held out where there are no held-out runs
-WORST_CONDITION = 1e4  # of the column-scaled Jacobian
-HOPELESS = 1e6  # condition number beyond which a direction counts as open
 ROUGH = 1e-4  # accuracy of the integration while starts are compared
 LOST = 0.2  # NRMSE of a channel
 ALIVE = 3.0  # standard deviations that a change by a factor of e makes
@@ -35,7 +31,6 @@ SUBSTEPS = 24  # per sample: what needs more cannot be seen in these samples
 ROOM = 10.0  # factor beyond its grid that a shape parameter may run to
 FAILURES = (FitError, SimulationError, ModelError, np.linalg.LinAlgError)
 WORSE = 1.02  # of the cost along the measured angle: the model's own angle must do as well
-PHASE_KNOWN = 0.5  # rad, standard deviation: beyond it an amplitude is not told from none
 LEAST_FALL = 0.01  # of the held-out error that makes an effect worth having
 
 
@@ -270,44 +265,6 @@ def _within(model: Model, values: Mapping[str, float]) -> Model:
         v = float(np.clip(v, p.lower, p.upper))
         inside[n] = max(v, 1e-12) if p.positive else v
     return model.start_at(inside)
-
-
-def objections(fit: Fit, added: Effect) -> str:
-    """Say why the refit must not be believed: a wrong sign, a shape at its limit; empty if it may be."""
-    pars = [fit.problem.model.parameters[p.name] for p in added.parameters]
-    for p in pars:
-        if p.at_least and fit.values[p.name] < 0.98 * fit.values[p.at_least]:
-            return f"{p.name} came out below {p.at_least}, which is not physical"
-        if added.includes and p.grid and p.vary and not 1.02 * p.lower < fit.values[p.name] < 0.98 * p.upper:
-            return f"{p.name} runs to its limit: nothing of this shape is in the data"
-        if p.vary and p.null is not None and not p.positive and fit.values[p.name] <= p.lower == p.null:
-            return f"{p.name} goes to {p.null:g}: the data do not want it, or only with the wrong sign"
-        if p.vary and np.isfinite(p.upper) and fit.values[p.name] > 0.98 * p.upper and not _was_narrowed(p, added):
-            return f"{p.name} runs to {p.upper:g}, the limit of what is physical"
-    return _adrift(fit, pars) or unresolved(fit, added)
-
-
-def _was_narrowed(p: Parameter, added: Effect) -> bool:
-    """Tell whether the limit is one set for these records, and not one of physics."""
-    return next(q.upper for q in added.parameters if q.name == p.name) != p.upper
-
-
-def _adrift(fit: Fit, pars: Sequence[Parameter]) -> str:
-    """Say so where a phase is not determined: what has no phase has no amplitude."""
-    for p in pars:
-        if p.periodic and p.vary and ((std := fit.std.get(p.name)) is None or std > PHASE_KNOWN):
-            return f"{p.name} is not determined, so neither is the amplitude that goes with it"
-    return ""
-
-
-def ambiguity(fit: Fit) -> tuple[int, float]:
-    """Return how many directions of the parameters the data leave open, and the condition of the others."""
-    n = len([p for p in fit.problem.model.parameters.values() if p.vary])
-    jac = fit.jacobian[:, :n]
-    norms = np.linalg.norm(jac, axis=0)
-    s = np.linalg.svd(np.linalg.qr(jac / np.where(norms > 0, norms, 1.0), mode="r"), compute_uv=False)
-    clear = s[s > s[0] / HOPELESS]
-    return len(s) - len(clear), float(clear[0] / clear[-1])
 
 
 def train_errors(fit: Fit) -> Errors:

@@ -1,0 +1,54 @@
+"""Why a refit must not be believed, whatever its error: signs, limits, phases, what the data leave open."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from motorid.diagnosis.resolvable import unresolved
+from motorid.fit import Fit
+from motorid.model import Effect
+from motorid.parameters import Parameter
+
+WORST_CONDITION = 1e4  # of the column-scaled Jacobian
+HOPELESS = 1e6  # condition number beyond which a direction counts as open
+PHASE_KNOWN = 0.5  # rad, standard deviation: beyond it an amplitude is not told from none
+
+
+def objections(fit: Fit, added: Effect) -> str:
+    """Say why the refit must not be believed: a wrong sign, a shape at its limit; empty if it may be."""
+    pars = [fit.problem.model.parameters[p.name] for p in added.parameters]
+    for p in pars:
+        if p.at_least and fit.values[p.name] < 0.98 * fit.values[p.at_least]:
+            return f"{p.name} came out below {p.at_least}, which is not physical"
+        if added.includes and p.grid and p.vary and not 1.02 * p.lower < fit.values[p.name] < 0.98 * p.upper:
+            return f"{p.name} runs to its limit: nothing of this shape is in the data"
+        if p.vary and p.null is not None and not p.positive and fit.values[p.name] <= p.lower == p.null:
+            return f"{p.name} goes to {p.null:g}: the data do not want it, or only with the wrong sign"
+        if p.vary and np.isfinite(p.upper) and fit.values[p.name] > 0.98 * p.upper and not _was_narrowed(p, added):
+            return f"{p.name} runs to {p.upper:g}, the limit of what is physical"
+    return _adrift(fit, pars) or unresolved(fit, added)
+
+
+def _was_narrowed(p: Parameter, added: Effect) -> bool:
+    """Tell whether the limit is one set for these records, and not one of physics."""
+    return next(q.upper for q in added.parameters if q.name == p.name) != p.upper
+
+
+def _adrift(fit: Fit, pars: Sequence[Parameter]) -> str:
+    """Say so where a phase is not determined: what has no phase has no amplitude."""
+    for p in pars:
+        if p.periodic and p.vary and ((std := fit.std.get(p.name)) is None or std > PHASE_KNOWN):
+            return f"{p.name} is not determined, so neither is the amplitude that goes with it"
+    return ""
+
+
+def ambiguity(fit: Fit) -> tuple[int, float]:
+    """Return how many directions of the parameters the data leave open, and the condition of the others."""
+    n = len([p for p in fit.problem.model.parameters.values() if p.vary])
+    jac = fit.jacobian[:, :n]
+    norms = np.linalg.norm(jac, axis=0)
+    s = np.linalg.svd(np.linalg.qr(jac / np.where(norms > 0, norms, 1.0), mode="r"), compute_uv=False)
+    clear = s[s > s[0] / HOPELESS]
+    return len(s) - len(clear), float(clear[0] / clear[-1])
