@@ -84,9 +84,18 @@ def at_rest(run: Experiment, sigma: Mapping[str, float]) -> tuple[bool, int]:
     if "omega" not in run.outputs and "theta" in run.outputs:
         y, t = run.outputs["theta"], run.t
         speed, _ = _first_speed(y, t, sigma["theta"])
-        if abs(speed) > 0.05 * np.max(np.abs(slopes(y, t)), initial=0.0):
+        moving = abs(speed) > 0.05 * np.max(np.abs(slopes(y, t)), initial=0.0)
+        if moving and not _starts_from_rest(y, t, sigma["theta"], speed):
             return False, 1
     return True, max(lead, 1)
+
+
+def _starts_from_rest(theta: Array, t: Array, sigma: float, speed: float) -> bool:
+    """Tell whether the first samples of an angle speak for rest and against `speed`, which later ones suggest."""
+    moved, after = theta[1:FIRST] - theta[0], t[1:FIRST] - t[0]
+    first = moved[:2]
+    noise = 4 * np.sqrt(2) * sigma
+    return bool(np.all(np.abs(first) <= noise) and np.any(np.abs(moved - speed * after) > noise))
 
 
 def slopes(theta: Array, t: Array, parts: int = 200) -> Array:
@@ -116,7 +125,10 @@ def _reach(y: Array, sigma: float) -> float:
 
 
 def _first_speed(theta: Array, t: Array, sigma: float) -> tuple[float, float]:
-    """Return the first speed and its reach, over the shortest window that noise leaves useful."""
+    """Return the first speed and its reach, over the shortest window that noise leaves useful.
+
+    The mean speed of a window is that of its middle; a motor started at the first sample is still at rest there.
+    """
     good = np.isfinite(theta)
     y, s = theta[good], t[good]
     if len(y) < 4:
@@ -127,4 +139,5 @@ def _first_speed(theta: Array, t: Array, sigma: float) -> tuple[float, float]:
         w *= 2
     noise = np.sqrt(2) * sigma / (s[w] - s[0])
     pair = np.diff(y[[0, w, min(2 * w, len(y) - 1)]]) / np.diff(s[[0, w, min(2 * w, len(y) - 1)]])
-    return float(pair[0]), float(REACH * noise + abs(pair[1] - pair[0]))
+    gained = pair[1] - pair[0]
+    return float(pair[0] - gained / 2), float(REACH * noise + abs(gained))

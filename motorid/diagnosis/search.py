@@ -123,7 +123,10 @@ class Search:
         candidate = Candidate(effect.name, 0.0)
         if fit is None:
             return None, replace(candidate, reason="its refit could not be simulated")
-        train = train_errors(fit)
+        try:
+            train = train_errors(fit)
+        except FAILURES:
+            return None, replace(candidate, reason="its refit could not be simulated")
         drop = _drop(node, train)
         values = {p.name: fit.values[p.name] for p in effect.parameters}
         candidate = replace(candidate, refit_drop=drop, parameters=values, fit=fit)
