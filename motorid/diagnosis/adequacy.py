@@ -5,7 +5,8 @@ their size nor their autocorrelation decides. What does is whether they depend o
 over speed, current, voltage and angle, and the share of variance that the bins explain is compared with the same
 after shifting the residuals in time against the motion, which keeps the colour of both and breaks every real
 dependence (a circular-shift surrogate test, Theiler et al., Physica D 58, 1992). The library's scores, judged on
-effective samples, see what bins cannot.
+effective samples, see what bins cannot. Where both are silent but the errors exceed the noise, `outside.judgement`
+asks whether a free form predicts them on data that it was not fitted to: coloured noise cannot be predicted.
 """
 
 from __future__ import annotations
@@ -17,12 +18,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from motorid.diagnosis.evidence import autocorrelation, effective_samples
+from motorid.diagnosis.evidence import autocorrelation, despiked, effective_samples
 from motorid.diagnosis.rank import Score
 from motorid.diagnosis.results import Adequacy
 from motorid.fit import Fit
 from motorid.formatting import number
 from motorid.integrate.grid import Array
+from motorid.noise import quantum
 from motorid.prepared import angle_signal
 
 FALSE_ALARM = 0.02
@@ -30,6 +32,9 @@ SHIFTS = 60
 BINS = 8
 LARGEST_RATIO = 10.0  # of residual to noise: coloured noise with a correlation of 0.99 between neighbours
 MATERIAL = 0.03  # share of the residual's variance below which a dependence is not worth a word
+ROUNDED = 0.15  # the same where errors are no larger than rounding: that repeats itself at a steady speed
+AT_ROUNDING = 1.2  # times the noise of rounding, step/√12
+LARGER = 1.5  # of residual to noise: beyond it the noise must be coloured, or something is missing
 NAMES = {
     "v": "the voltage",
     "i": "the current",
@@ -62,7 +67,7 @@ def adequacy(fit: Fit, scores: Sequence[Score] = (), false_alarm: float = FALSE_
     channels = {c: _channel(fit, c) for c in fit.problem.outputs}
     tests = [t for c in channels for t in _dependences(fit, c)]
     tests += _score_tests(fit, scores)
-    material = [t for t in tests if t["share"] > MATERIAL]
+    material = [t for t in tests if t["share"] > _material(channels, t["channel"])]
     p_value = min([1.0, *(t["p"] * len(tests) for t in material)])
     far = [
         c for c, facts in channels.items() if facts["ratio"] > (LARGEST_RATIO if c != "theta" else LARGEST_RATIO / 2)
@@ -74,12 +79,24 @@ def adequacy(fit: Fit, scores: Sequence[Score] = (), false_alarm: float = FALSE_
     return Adequacy(adequate, float(p_value), false_alarm, channels, text)
 
 
-def following(judged: Adequacy, what: str) -> Adequacy:
-    """Return a judgement that knows what the errors follow, e.g. "a load that changes with the time"."""
+def _material(channels: Mapping[str, Mapping[str, float]], channel: str | None) -> float:
+    """Return the share below which a dependence of `channel` (None: of all together) is not worth a word."""
+    own = [f["rounded"] for c, f in channels.items() if channel in (c, None)]
+    return MATERIAL + (ROUNDED - MATERIAL) * float(np.mean(own))
+
+
+def following(judged: Adequacy, what: str, share: float | None = None) -> Adequacy:
+    """Return a judgement that knows what the errors follow, e.g. "a load that changes with the time".
+
+    `share` is how much of their variance that explains on data it was not fitted to.
+    """
+    if what in judged.text:
+        return judged
+    held = "" if share is None else f" ({100 * share:.0f} % of their variance on data held out)"
     if judged.adequate:
-        text = f"Something is missing: the errors ({_sizes(judged.channels)}) follow {what}."
+        text = f"Something is missing: the errors ({_sizes(judged.channels)}) follow {what}{held}."
         return replace(judged, adequate=False, text=text)
-    return replace(judged, text=f"{judged.text} They follow {what}.")
+    return replace(judged, text=f"{judged.text} They follow {what}{held}.")
 
 
 def _sizes(channels: Mapping[str, Mapping[str, float]]) -> str:
@@ -103,15 +120,23 @@ def _channel(fit: Fit, channel: str) -> dict[str, float]:
     v = [fit.problem.experiments[k].inputs["v"] for k, _ in parts]
     linked = max((_largest_cross_correlation(u, p) for u, (_, p) in zip(v, parts, strict=True)), default=0.0)
     rms = float(np.sqrt(np.mean(r**2))) if r.size else 0.0
-    typical = 1.4826 * float(np.median(np.abs(r))) if r.size else 0.0
+    alone = np.concatenate([despiked(p) for _, p in parts])
+    ratio = float(np.sqrt(np.mean(alone**2))) / noise if alone.size else 0.0
     return {
         "noise": noise,
         "rms": rms,
-        "ratio": min(rms, 2 * typical) / noise,
+        "ratio": ratio,
+        "rounded": float(ratio < AT_ROUNDING and _by_rounding(fit, channel, noise)),
         "autocorrelation": rho,
         "input_correlation": linked,
         "effective_samples": sum(effective_samples(p) for _, p in parts),
     }
+
+
+def _by_rounding(fit: Fit, channel: str, noise: float) -> bool:
+    """Tell whether the noise of a channel is that of the steps in which it moves."""
+    steps = [quantum(run.outputs[channel]) for run in fit.problem.experiments if channel in run.outputs]
+    return noise < AT_ROUNDING * float(np.sqrt(np.mean(np.square(steps)) / 12))
 
 
 def _largest_cross_correlation(u: Array, r: Array) -> float:
@@ -217,7 +242,7 @@ def _text(
 ) -> str:
     sizes = _sizes(channels)
     if adequate:
-        coloured = [c for c, f in channels.items() if f["autocorrelation"] > 0.3]
+        coloured = [c for c, f in channels.items() if f["autocorrelation"] > 0.3 or f["ratio"] > LARGER]
         colour = f" The noise of {' and '.join(coloured)} is coloured." if coloured else ""
         return (
             f"The model is adequate: its errors ({sizes}) do not depend on the motion "

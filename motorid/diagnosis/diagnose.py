@@ -6,7 +6,7 @@ import builtins
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
-from motorid.diagnosis.adequacy import adequacy, following
+from motorid.diagnosis.adequacy import following
 from motorid.diagnosis.improve import Climb, climb, ladder_of, settled
 from motorid.diagnosis.locate import acting_like, locate
 from motorid.diagnosis.parts import affordable, parts_remark
@@ -65,8 +65,8 @@ def diagnose(
     own = tuple(also)
     whole, fit = fit, affordable(fit)
     search = Search(fit, validate, library(effects, own), map, say)
-    judged = adequacy(fit, search.scores(search.root))
     found, other = settled(climb(search, max_effects, say))
+    judged = found.first
     missing = locate(fit)
     say("located what is missing")
     ladder = ladder_of(found, validate is not None)

@@ -41,6 +41,20 @@ def effective_samples(r: Array) -> float:
     return float(np.clip(n / (1 + 2 * pairs[:stop].sum()), 2.0, n))
 
 
+def despiked(r: Array) -> Array:
+    """Return `r` (N,) without NaN, samples that stand alone far from both neighbours replaced by the middle of three.
+
+    A few large samples in a row are no outliers: there the model fails.
+    """
+    r = r[np.isfinite(r)]
+    if len(r) < 3:
+        return r
+    padded = np.concatenate([r[1:2], r, r[-2:-1]])
+    middle = np.median(np.stack([padded[:-2], r, padded[2:]]), axis=0)
+    limit = CLIP * 1.4826 * float(np.median(np.abs(r)))
+    return np.where(np.abs(r - middle) > limit, middle, r)
+
+
 @dataclass(frozen=True, eq=False)
 class Errors:
     """Residuals of a model on records, per channel.

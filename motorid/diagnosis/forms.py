@@ -1,8 +1,9 @@
-"""Free forms: a torque or a voltage that may be any smooth function of one quantity.
+"""Free forms: a torque, a voltage or a sensor's error that may be any smooth function of one quantity.
 
-A load or a friction that changes with the angle or with time, a voltage lost at high speed: whatever the library
-lacks follows one of them more or less. The answer of the outputs is linear in the function's coefficients, through
-the model's own response along its trajectory; nothing is integrated anew.
+A load or a friction that changes with the angle or with time, a voltage lost at high speed, a tachometer that
+ripples once per turn: whatever the library lacks follows one of them more or less. The answer of the outputs is
+linear in the function's coefficients, through the model's own response along its trajectory; nothing is integrated
+anew.
 """
 
 from __future__ import annotations
@@ -41,12 +42,16 @@ WORDS = {
 
 @dataclass(frozen=True)
 class Form:
-    """A free function of the quantity `on` times `carrier`, in one balance; `words` says what that is."""
+    """A free function of the quantity `on` times `carrier`, in one balance; `words` says what that is.
+
+    In the balance ``"sensor"`` it is added to the output `channel`.
+    """
 
     words: str
     balance: str
     on: str
     carrier: str = ""
+    channel: str = ""
 
     @property
     def text(self) -> str:
@@ -69,6 +74,8 @@ FORMS = (
     Form("a loss of voltage", "voltage", "i"),
     Form("a loss of voltage", "voltage", "t"),
     Form("a resistance", "voltage", "t", "i"),
+    Form("a gain of the speed sensor", "sensor", "turn", "omega", "omega"),
+    Form("an error of the angle sensor", "sensor", "turn", "", "theta"),
 )
 
 
@@ -165,6 +172,8 @@ def _ranges(signals: Sequence[Mapping[str, Array]]) -> dict[str, tuple[float, fl
 
 def _fits(form: Form, fit: Fit, ranges: Mapping[str, tuple[float, float]]) -> bool:
     """Tell whether the records can show a form: its quantity is known, its balance is in the model."""
+    if form.channel and form.channel not in fit.problem.outputs:
+        return False
     if form.on not in ranges or ranges[form.on][0] == ranges[form.on][1]:
         return False
     if form.balance == "voltage" and "i" not in fit.problem.outputs:
@@ -209,19 +218,39 @@ def _answers(problem: Problem, k: int, answer: Response, bases: Mapping[Form, Ar
     """Return the whitened outputs of run `k` to every function of every form."""
     if not bases:
         return {}
+    _, weights, index = problem._weights[k]
+    c = answer.c * weights[None, :, None]
+    inside = {f: b for f, b in bases.items() if f.balance != "sensor"}
+    flat = np.concatenate(
+        [_driven(answer, c, inside), *(_read(problem, f, b, weights) for f, b in bases.items() if f not in inside)],
+        axis=1,
+    )
+    flat = flat if index is None else flat[index]
+    order = [*inside, *(f for f in bases if f not in inside)]
+    ends = np.cumsum([bases[f].shape[1] for f in order])[:-1]
+    return dict(zip(order, np.split(flat, ends, axis=1), strict=True))
+
+
+def _driven(answer: Response, c: Array, bases: Mapping[Form, Array]) -> Array:
+    """Return the outputs, (N·ny, m), to functions in the balances."""
+    n, ny, nx = c.shape
+    if not bases:
+        return np.zeros((n * ny, 0))
     drive = np.concatenate([b[:-1] for b in bases.values()], axis=1)
     which = np.concatenate([np.full(b.shape[1], f.balance == "torque", int) for f, b in bases.items()])
-    _, weights, index = problem._weights[k]
-    n, ny, nx = answer.c.shape
-    c = answer.c * weights[None, :, None]
     state, out = np.zeros((nx, drive.shape[1])), np.zeros((n, ny, drive.shape[1]))
     for j in range(n - 1):
         state = answer.a[j] @ state + answer.b[j][:, which] * drive[j]
         out[j + 1] = c[j + 1] @ state
-    flat = out.reshape(n * ny, -1)
-    flat = flat if index is None else flat[index]
-    ends = np.cumsum([b.shape[1] for b in bases.values()])[:-1]
-    return dict(zip(bases, np.split(flat, ends, axis=1), strict=True))
+    return out.reshape(n * ny, -1)
+
+
+def _read(problem: Problem, form: Form, basis: Array, weights: Array) -> Array:
+    """Return the outputs, (N·ny, m), to functions added to one output."""
+    out = np.zeros((len(basis), len(problem.outputs), basis.shape[1]))
+    j = problem.outputs.index(form.channel)
+    out[:, j] = basis * weights[j]
+    return out.reshape(-1, basis.shape[1])
 
 
 def _labels(problem: Problem, k: int) -> Array:

@@ -11,10 +11,9 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from motorid.diagnosis.adequacy import adequacy
 from motorid.diagnosis.evidence import compare_errors
 from motorid.diagnosis.judging import Node
-from motorid.diagnosis.outside import Outside, outside
+from motorid.diagnosis.outside import Outside, judgement, outside
 from motorid.diagnosis.parts import affordable
 from motorid.diagnosis.results import Adequacy, Candidate, Ladder, Rung
 from motorid.diagnosis.search import Search, library
@@ -35,13 +34,14 @@ class Climb:
     rounds: tuple[tuple[Candidate, ...], ...]
     groups: tuple[tuple[str, ...], ...]
     text: str
+    first: Adequacy
     remaining: Adequacy
 
 
 def climb(search: Search, max_effects: int, advance: Callable[[str], None]) -> Climb:
     """Run the loop until nothing more is worth adding."""
     best, frontier = search.root, [search.root]
-    judged = adequacy(best.fit, search.scores(best))
+    judged = first = judgement(best.fit, search.scores(best), search.held)
     rounds: list[tuple[Candidate, ...]] = []
     groups: list[tuple[str, ...]] = []
     text = f"stopped at the limit of {max_effects} effects"
@@ -68,9 +68,9 @@ def climb(search: Search, max_effects: int, advance: Callable[[str], None]) -> C
             rounds[-1] = _marked(rounds[-1], chosen_of.added, group)
         groups.append((chosen_of.added or "", *group) if group else ())
         frontier = [best, *_runners_up(search, best, ordered)][:BEAM]
-        judged = adequacy(best.fit, search.scores(best))
+        judged = judgement(best.fit, search.scores(best), search.held)
         advance(f"accepted {chosen_of.added}")
-    return Climb(search, tuple(_path(best)), tuple(rounds), tuple(g for g in groups if g), text, judged)
+    return Climb(search, tuple(_path(best)), tuple(rounds), tuple(g for g in groups if g), text, first, judged)
 
 
 def settled(found: Climb) -> tuple[Climb, Outside | None]:
@@ -86,9 +86,9 @@ def settled(found: Climb) -> tuple[Climb, Outside | None]:
         for r in found.rounds
     )
     groups = tuple(g for g in found.groups if g[0] in names)
-    judged = adequacy(path[-1].fit, found.search.scores(path[-1]))
+    judged = judgement(path[-1].fit, found.search.scores(path[-1]), found.search.held)
     text = f"stopped: what is left is like {other.form.text}, of a form that the library lacks"
-    return Climb(found.search, path, rounds, groups, text, judged), other
+    return Climb(found.search, path, rounds, groups, text, found.first, judged), other
 
 
 def _runners_up(search: Search, best: Node, ordered: Sequence[Node]) -> list[Node]:

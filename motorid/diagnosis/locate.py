@@ -79,9 +79,10 @@ def locate(fit: Fit) -> Missing:
 
 def acting_like(missing: Missing, form: Form) -> Missing:
     """Return `missing` with what is known of its form: which balance it acts in, and what it changes with."""
-    apart = missing.where is not None
-    where = {"torque": "mechanical", "voltage": "electrical"}[form.balance]
+    apart = missing.where is not None or form.balance == "sensor"
+    where = {"torque": "mechanical", "voltage": "electrical", "sensor": "sensor"}[form.balance]
     lead = f"The {form.balance} balance fails." if apart else missing.text.split(".")[0] + "."
+    lead = "The measurement fails." if form.balance == "sensor" else lead
     first = max(missing.regions, key=lambda r: missing.regions[r])
     text = f"{lead} What is missing acts like {form.text}. {_region(first, missing.regions)}"
     return replace(missing, where=where if apart else None, acts_like=form.text, text=text)

@@ -4,6 +4,8 @@ They stand in if a free form (see `forms`) does what they do and leaves far less
 either, and what they miss is no trifle beside what they explain: a test of a parametric against a nonparametric form
 (Härdle & Mammen, Ann. Statist. 21(4), 1993), with held-out data for a judge. An effect that no such form can do without
 is kept. All is linear, about the fitted model; where its errors are too large for that, the form is fitted in earnest.
+
+The same forms tell whether errors larger than the noise are coloured noise: that cannot be predicted.
 """
 
 from __future__ import annotations
@@ -13,14 +15,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from motorid.diagnosis.evidence import compare_errors
+from motorid.diagnosis.adequacy import LARGER, adequacy, following
+from motorid.diagnosis.evidence import compare_errors, despiked
 from motorid.diagnosis.forms import Form, Linear, as_effect, halves, linearised
+from motorid.diagnosis.rank import Score
+from motorid.diagnosis.results import Adequacy
 from motorid.diagnosis.trial import BLOCKS, FAILURES, HeldOut, refit, train_errors
 from motorid.fit import Fit
 from motorid.integrate.grid import Array
 
-FAR = 1.5  # times the noise: what is left below this is not worth a form
 MUCH_LESS = 0.5  # of the squared misfit that the effects leave: what a form in their place may leave
+PREDICTED = 0.2  # of the squared misfit: what a form must explain, on data held out too, that is no noise
 LITTLE = 0.1  # of the squared misfit: forms that leave less are equals
 NEARLY = 3.0  # times what the best form leaves: what others may leave to be believed too
 CONTAINS = 0.7  # of what an effect does: what a form must do in its place
@@ -81,6 +86,38 @@ def outside(steps: Sequence[Fit], held: HeldOut) -> Outside | None:
     return earnest or (_best(beside, len(steps) - 1) if beside else None)
 
 
+def judgement(fit: Fit, scores: Sequence[Score], held: HeldOut) -> Adequacy:
+    """Judge whether the residuals of `fit` are noise; errors larger than it must not be predictable by any form."""
+    judged = adequacy(fit, scores)
+    found = predicted(fit, held) if judged.adequate else None
+    return following(judged, found[0].text, found[1]) if found else judged
+
+
+def predicted(fit: Fit, held: HeldOut) -> tuple[Form, float] | None:
+    """Return the free form that explains most of errors larger than the noise, and how much, on data held out too.
+
+    It must do so on the records, on blocks of them held out and, if there are any, on held-out runs.
+    """
+    channels = far(fit)
+    if not channels:
+        return None
+    try:
+        train, *test = linearised(fit, held.validation)
+    except FAILURES:
+        return None
+    before = _by_channel(_left(train.residual, train.slopes, train.own), train)
+    found = []
+    for form in train.forms:
+        after = _by_channel(_left(train.residual, train.slopes, train.own, train.forms[form]), train)
+        left = _fraction(after, before, channels)
+        for parts in ([(train, test[0])] if test and form.on != "theta" else [], list(halves(train, BLOCKS))):
+            if parts and left < 1 - PREDICTED:
+                left = max(left, _fraction_of(form, parts, channels))
+        found.append((form, 1 - left))
+    best = max(found, key=lambda f: f[1], default=None)
+    return best if best is not None and best[1] > PREDICTED else None
+
+
 def _believed(rivals: Sequence[Rival]) -> list[Rival]:
     """Return the forms that explain about as much as the best of them: the others imitate it."""
     least = min((max(r.leaves, r.judged, LITTLE) for r in rivals), default=0.0)
@@ -97,8 +134,8 @@ def far(fit: Fit) -> list[int]:
     found = []
     for j, c in enumerate(fit.problem.outputs):
         pairs = zip(fit.simulations, fit.problem.runs, strict=True)
-        parts = [s.residual(c) / run.sigma[c] for s, run in pairs if c in run.sigma]
-        if float(np.sqrt(np.nanmean(np.concatenate(parts) ** 2))) > FAR:
+        parts = [despiked(s.residual(c)) / run.sigma[c] for s, run in pairs if c in run.sigma]
+        if float(np.sqrt(np.mean(np.concatenate(parts) ** 2))) > LARGER:
             found.append(j)
     return found
 
