@@ -16,20 +16,17 @@ import numpy as np
 from motorid.errors import FitError, SimulationError
 from motorid.integrate.grid import Array
 from motorid.least_squares import LevenbergMarquardt, Solution, levenberg_marquardt
-from motorid.prepared import SGN_WIDTH_SHARE, top_speed
+from motorid.misfit import hardly_explained, misfit_over_noise
+from motorid.narrowing import NARROWER, WIDEST, narrow_enough, narrower, smooths, without_width
+from motorid.prepared import top_speed
 from motorid.problem import Problem
 
-WIDEST = 0.03  # first width of sgn over the highest speed
-NARROWER = 6.0  # at most, from one stage to the next
 ON_THE_WAY = ((1e-7, 60), (1e-6, 60))  # ftol and iterations of the first stage, and of those between
-CLEARLY = 1.5  # factor between widths of sgn that is worth another descent
 ROUNDS = 4  # of refining the sub-steps
-LEAST_FACTOR = 0.02  # a quick channel with few samples per time constant passes for noisy
 IMBALANCE = 3.0  # between channels, in misfit over noise, above which the misfit decides the weights
 
 # Looks again from the start: by the other weights first?, first damping, start moved by e to this power.
 LOOKS = ((True, 0.1, 0.0), (False, 10.0, 0.0), (True, 10.0, 0.0), (False, 1.0, 1.5), (True, 1.0, 1.5))
-EXPLAINED = 0.25  # NRMSE above which a channel counts as hardly explained
 FAR = 1.0  # on the logarithmic scale: how far a descent goes before its sub-steps are chosen again
 FLAT = 0.03  # of the misfit: what a change by a factor of e does at least, if the data have a say in it
 
@@ -69,8 +66,8 @@ def descend(problem: Problem, options: LevenbergMarquardt, callback: Callback = 
         problem = _narrowing(problem, options, callback, history, surely)
     done = _settled(problem, options, callback)
     history += done.history
-    while (narrower := _narrower(done)) is not None:
-        done = _settled(narrower, options, callback)
+    while (other := narrower(done.problem, done.solution.q)) is not None:
+        done = _settled(other, options, callback)
         history += done.history
     return replace(done, history=tuple(history))
 
@@ -123,7 +120,7 @@ def descend_surely(problem: Problem, options: LevenbergMarquardt, callback: Call
     starts within a factor of ten of each shipped motor with noise all ended in its optimum; within a factor
     of a hundred 975 and 964 of 1000 did, and all with the automatic first guess (bench_starts.py).
     """
-    if stages and _smooths(problem):
+    if stages and smooths(problem):
         return descend(problem, options, callback, surely=True)
     done = descend(problem, options, callback, stages=stages)
     for k, (other, damping, shift) in enumerate(LOOKS[:options.looks]):
@@ -151,21 +148,12 @@ def doubtful(problem: Problem, done: Descent) -> bool:
     moved = np.log(found[log] / problem.scaling.physical(problem.start)[log])
     if np.max(np.abs(moved), initial=0.0) < 1.0:
         return False
-    if done.solution.status != "converged" or _hardly_explained(done.problem, done.solution.q):
+    if done.solution.status != "converged" or hardly_explained(done.problem, done.solution.q):
         return True
     jac = done.solution.jac[:, log]
     s, directions = np.linalg.svd(np.linalg.qr(jac, mode="r"))[1:]
     flat = directions[:len(s)][s < FLAT * np.linalg.norm(done.solution.residual)]
     return bool(np.max(np.abs(flat.T @ (flat @ moved)), initial=0.0) > 1.0)
-
-
-def _hardly_explained(problem: Problem, q: Array) -> bool:
-    for c, factor in misfit_over_noise(problem, q).items():
-        runs = [r for r in problem.runs if c in r.sigma]
-        rms = np.sqrt(np.mean([np.nanmean((r.experiment.outputs[c] / r.sigma[c]) ** 2) for r in runs]))
-        if factor > max(3.0, EXPLAINED * rms):
-            return True
-    return False
 
 
 def _shifted(problem: Problem, shift: float, seed: int) -> Problem:
@@ -202,42 +190,23 @@ def descend_balanced(problem: Problem, options: LevenbergMarquardt, callback: Ca
         relative = [factors[c] / done.problem.balance.get(c, 1.0) for c in factors]
         if max(relative) < IMBALANCE * min(relative):
             break
-        again = descend(begin.balanced(factors), options, callback, stages=stages and k == 0)
+        again = descend(begin.tuned(balance=factors), options, callback, stages=stages and k == 0)
         done = replace(again, history=done.history + again.history)
         begin = done.problem.for_model(done.problem.model.start_at(done.problem.values(done.solution.q)))
     return done
 
 
-def misfit_over_noise(problem: Problem, q: Array) -> dict[str, float]:
-    """Return the RMS of the residual over the noise per channel; far below 1 where the noise was overestimated."""
-    sums = {c: [0.0, 0] for c in problem.outputs}
-    for k, run in enumerate(problem.runs):
-        y = problem.simulate(q, k, derivatives=False).y
-        for j, c in enumerate(problem.outputs):
-            if c in run.sigma:
-                e = (run.experiment.outputs[c] - y[:, j]) / run.sigma[c]
-                e = e[np.isfinite(e)]
-                sums[c][0] += float(e @ e)
-                sums[c][1] += e.size
-    return {c: max(float(np.sqrt(s / max(n, 1))), LEAST_FACTOR) for c, (s, n) in sums.items()}
-
-
-def _smooths(problem: Problem) -> bool:
-    width = problem.model.parameters.get("sgn_width")
-    return width is not None and not width.given and not width.vary
-
-
 def _narrowing(problem: Problem, options: LevenbergMarquardt, callback: Callback, history: list[float],
                surely: bool) -> Problem:
     """Return the problem with the values that a wide sgn leads to, made narrower step by step."""
-    if not _smooths(problem):
+    if not smooths(problem):
         return problem
-    width = _narrow_enough(problem)
-    problem = begin = problem.widened(width)
+    width = narrow_enough(problem)
+    problem = begin = problem.tuned(width=width)
     ratio = max(WIDEST * top_speed(problem.experiments) / width, 1.0)
     steps = int(np.ceil(np.log(ratio) / np.log(NARROWER)))
     for k, factor in enumerate(np.geomspace(ratio, 1.0, steps + 1)[:-1]):
-        wide = _cheaper(*(p.widened(factor * width) for p in dict.fromkeys((problem, begin))))
+        wide = _cheaper(*(p.tuned(width=factor * width) for p in dict.fromkeys((problem, begin))))
         try:
             if k == 0 and surely:
                 done = descend_surely(wide, _sooner(options, ON_THE_WAY[0]), callback, stages=False)
@@ -248,39 +217,8 @@ def _narrowing(problem: Problem, options: LevenbergMarquardt, callback: Callback
         except (FitError, SimulationError):
             continue
         history += costs
-        problem = begin.for_model(begin.model.start_at(_without_width(wide, found.q)))
+        problem = begin.for_model(begin.model.start_at(without_width(wide, found.q)))
     return _cheaper(*dict.fromkeys((problem, begin)))
-
-
-def _narrowest(problem: Problem) -> float:
-    """Return the width of sgn that the noise of the records asks for."""
-    return problem.widened(None).model.values["sgn_width"]
-
-
-def _narrow_enough(problem: Problem) -> float:
-    """Return the width of sgn that the speeds of the records ask for, whatever their noise."""
-    return max(SGN_WIDTH_SHARE * top_speed(problem.experiments), _narrowest(problem))
-
-
-def _without_width(problem: Problem, q: Array) -> dict[str, float]:
-    return {n: v for n, v in problem.values(q).items() if n != "sgn_width"}
-
-
-def _narrower(done: Descent) -> Problem | None:
-    """Return the problem with a narrower sgn, where a loaded, stuck motor's creep would show.
-
-    The noise of the angle sets the width of a model that reaches the noise. Beside a misfit many times as large
-    the same creep does not show, and a sgn so narrow would only make the model stiff and its slopes wild.
-    """
-    problem = done.problem
-    if problem.width is None or not _smooths(problem) or problem.width > 1.01 * _narrow_enough(problem):
-        return None
-    least = _narrowest(problem)
-    width = max(least, min(least * misfit_over_noise(problem, done.solution.q).get("theta", 1.0), problem.width))
-    if width > problem.width / CLEARLY:
-        return None
-    width = max(width, problem.width / NARROWER)
-    return problem.for_model(problem.model.start_at(_without_width(problem, done.solution.q))).widened(width)
 
 
 def _sooner(options: LevenbergMarquardt, ends: tuple[float, int]) -> LevenbergMarquardt:
@@ -300,21 +238,4 @@ def _cheaper(first: Problem, *others: Problem) -> Problem:
     return (first, *others)[int(np.argmin(costs))] if costs else first
 
 
-def integration_error(problem: Problem, q: Array) -> float:
-    """Return the largest change of an output when every step is halved, in units of the noise."""
-    worst = 0.0
-    for k, run in enumerate(problem.runs):
-        if not hasattr(problem._engine, "compiled"):
-            return 0.0
-        try:
-            coarse = problem.simulate(q, k, derivatives=False).y
-            fine = problem.with_finer_steps(2).simulate(q, k, derivatives=False).y
-        except SimulationError:
-            return float("inf")
-        sigma = np.array([run.sigma.get(c, np.inf) for c in problem.outputs])
-        worst = max(worst, float(np.max(np.abs(fine - coarse) / sigma)))
-    return worst
-
-
-__all__ = ["Descent", "descend", "descend_balanced", "descend_surely", "doubtful", "integration_error",
-           "misfit_over_noise"]
+__all__ = ["Descent", "descend", "descend_balanced", "descend_surely", "doubtful"]

@@ -9,12 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from motorid.descent import Descent, descend_balanced, integration_error
+from motorid.descent import Descent, descend_balanced
 from motorid.errors import FitError, UsageError, one_of
 from motorid.experiment import Experiment
 from motorid.integrate import Engine
 from motorid.integrate.grid import Array
 from motorid.least_squares import LevenbergMarquardt, Solution, levenberg_marquardt
+from motorid.misfit import integration_error
 from motorid.model import Model
 from motorid.problem import Problem, as_problem
 from motorid.result import UNDETERMINED, Failure, Fit

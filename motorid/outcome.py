@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 
 from motorid.conflict import conflict
-from motorid.descent import integration_error
 from motorid.errors import FitError
 from motorid.fit import Fit
 from motorid.gaps import gaps_of, reduced
 from motorid.integrate.grid import Array
 from motorid.mesh import Mesh
+from motorid.misfit import integration_error
 from motorid.multipliers import free_directions, rows_at, summed, violations
 from motorid.nlp import NlpResult, ShootingNlp
 from motorid.problem import Problem

@@ -274,17 +274,9 @@ class Problem:
             runs = tuple(with_inputs(run, names) for run in runs)
         return replace(self, model=model, _runs=runs)
 
-    def balanced(self, factors: Mapping[str, float]) -> Problem:
-        """Return the problem with other factors on the noise per channel, keeping the rest."""
-        return replace(self, balance=dict(factors), _runs=self.runs)
-
-    def widened(self, width: float | None) -> Problem:
-        """Return the problem with another width of sgn, keeping the rest; None: as it suits the records' noise."""
-        return replace(self, width=width, _runs=self.runs)
-
-    def with_accuracy(self, accuracy: float | None) -> Problem:
-        """Return the problem with another accuracy of the integration, keeping the rest."""
-        return replace(self, accuracy=accuracy, _runs=self.runs)
+    def tuned(self, **fields: Any) -> Problem:
+        """Return the problem with another `balance`, `accuracy` or `width`; the prepared records stay."""
+        return replace(self, **{"_runs": self.runs, **fields})
 
     def with_(self, **fields: Any) -> Problem:
         """Return a copy with some fields changed, e.g. ``with_(model=…)``."""

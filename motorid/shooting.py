@@ -14,13 +14,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from motorid.conflict import below_steady
-from motorid.descent import descend_balanced, misfit_over_noise
+from motorid.descent import descend_balanced
 from motorid.errors import FitError, SimulationError, UsageError, one_of
 from motorid.fit import Fit
 from motorid.gaps import first_noise, given_noise, noise_of_gaps
 from motorid.integrate.grid import Array
 from motorid.least_squares import LevenbergMarquardt, levenberg_marquardt
 from motorid.mesh import Mesh
+from motorid.misfit import misfit_over_noise
 from motorid.multipliers import violations
 from motorid.nlp import Ipopt, NlpResult, ShootingNlp
 from motorid.nodes import nodes_from_data, nodes_from_simulation
@@ -130,7 +131,7 @@ class MultipleShooting:
     def _loose(self, problem: Problem) -> Solved:
         """Solve with short intervals that need not join."""
         every, size = LOOSE
-        mesh = Mesh(problem.balanced(_blunted(problem)), every)
+        mesh = Mesh(problem.tuned(balance=_blunted(problem)), every)
         step = float(np.median([run.experiment.dt for run in problem.runs]))
         mesh = replace(mesh, noise=size * mesh.scale / np.sqrt(every * step))
         return self._solve(mesh, mesh.joined(problem.start, nodes_from_data(mesh, problem.start)), quick=True)

@@ -14,6 +14,7 @@ from motorid.experiment import Experiment
 from motorid.least_squares import LevenbergMarquardt, levenberg_marquardt
 from motorid.loads import loads_of
 from motorid.model import Model
+from motorid.narrowing import without_width
 from motorid.parameters import Parameter
 from motorid.prepared import natural_sizes, suited
 from motorid.problem import Problem
@@ -64,11 +65,7 @@ def _split(problem: Problem, asked: Model) -> Problem:
     if not ends:
         return problem
     best = min(ends, key=lambda done: done.history[-1])
-    return problem.for_model(problem.model.start_at(_without_width(best.problem.values(best.solution.q))))
-
-
-def _without_width(values: Mapping[str, float]) -> dict[str, float]:
-    return {n: v for n, v in values.items() if n != "sgn_width"}
+    return problem.for_model(problem.model.start_at(without_width(best.problem, best.solution.q)))
 
 
 def _at(model: Model, values: Mapping[str, float]) -> Model:

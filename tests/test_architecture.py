@@ -25,7 +25,7 @@ ROWS = (
     "integrate beginning steady prepared accuracy loss residuals unknowns relations constraints loads start coloured "
     "combinations outliers journal",
     # 3 the problem
-    "problem derivatives sensitivity mesh",
+    "problem derivatives sensitivity mesh misfit narrowing",
     # 4 solving it, and looking at the solution
     "least_squares descent starting simulate result fit comparison multipliers conflict nlp nodes outcome gaps "
     "shooting remedies",

@@ -121,10 +121,10 @@ def linearised(fit: Fit, validation: Problem | None, balance: Mapping[str, float
     ------
     SimulationError
     """
-    problem = fit.problem.balanced(fit.problem.balance if balance is None else balance)
+    problem = fit.problem.tuned(balance=fit.problem.balance if balance is None else balance)
     known = [_on(problem, fit, fit.simulations)]
     if validation is not None:
-        other = validation.for_model(fit.model).balanced(problem.balance)
+        other = validation.for_model(fit.model).tuned(balance=problem.balance)
         known.append(_on(other, fit, simulated(other)))
     signals = [[_signals(p, s, k) for k, s in enumerate(sims)] for p, sims, _, _ in known]
     ranges, orders = _ranges(signals[0]), _orders(fit)

@@ -7,13 +7,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from motorid.descent import Descent, descend, misfit_over_noise
+from motorid.descent import Descent, descend
 from motorid.diagnosis.evidence import Errors
 from motorid.diagnosis.rank import uses_angle
 from motorid.errors import FitError, ModelError, SimulationError
 from motorid.experiment import Experiment
 from motorid.fit import Fit
 from motorid.least_squares import LevenbergMarquardt
+from motorid.misfit import misfit_over_noise
 from motorid.model import Model
 from motorid.prepared import natural_sizes
 from motorid.problem import Problem
@@ -87,7 +88,7 @@ class HeldOut:
         """
         parts = []
         for problem, test in self.folds:
-            start = problem.for_model(fit.model).balanced(fit.problem.balance).with_accuracy(ROUGH)
+            start = problem.for_model(fit.model).tuned(balance=fit.problem.balance, accuracy=ROUGH)
             if fit.model.angle_input:  # the measured angle, where it is hidden from the judgement too
                 runs = zip(fit.problem.runs, problem.runs, strict=True)
                 start = replace(start, _runs=tuple(replace(whole, experiment=r.experiment) for whole, r in runs))
@@ -185,7 +186,7 @@ def _own_starts(fit: Fit, model: Model) -> list[dict[str, float]]:
 def _race(fit: Fit, model: Model, start: Mapping[str, float], angular: bool) -> Descent | None:
     """Go a few steps from `start`; None where that fails or needs more sub-steps than the samples are worth."""
     names = [n for n in start if n in model.parameters]
-    problem = fit.problem.for_model(_within(model, {n: start[n] for n in names})).with_accuracy(ROUGH)
+    problem = fit.problem.for_model(_within(model, {n: start[n] for n in names})).tuned(accuracy=ROUGH)
     q = problem.scaling.scaled([fit.initial.get(p.name, p.value) for p in problem.unknown])
     problem = _from(problem, q)
     if angular:
@@ -234,12 +235,12 @@ def _bounded(fit: Fit, model: Model) -> Model:
 def _polished(fit: Fit, problem: Problem) -> Fit | None:
     """Converge from a good start, channels weighed anew where the misfit has changed."""
     try:
-        problem = problem.with_accuracy(fit.problem.accuracy)
+        problem = problem.tuned(accuracy=fit.problem.accuracy)
         done = descend(problem, POLISH, stages=False)
         if problem.balance:
             factors = misfit_over_noise(done.problem, done.solution.q)
             if max(abs(np.log(factors[c] / problem.balance.get(c, 1.0))) for c in factors) > 0.1:
-                done = descend(_from(done.problem, done.solution.q).balanced(factors), POLISH, stages=False)
+                done = descend(_from(done.problem, done.solution.q).tuned(balance=factors), POLISH, stages=False)
     except FAILURES:
         return None
     found, problem = done.solution, done.problem
