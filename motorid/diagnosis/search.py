@@ -71,7 +71,12 @@ class Search:
         return self._scores[node.key]
 
     def inseparable(self, node: Node) -> dict[str, tuple[str, ...]]:
-        """Return the effects that do no more than a combination of `node`'s parameters, those of effects among them."""
+        """Return the effects that do no more than a combination of `node`'s parameters, those of effects among them.
+
+        Only of a model that was expanded: one with nothing but noise left has no use for them.
+        """
+        if node.key not in self._scores:
+            return {}
         added = {p.name for e in node.fit.model.effects for p in e.parameters}
         return {s.effect.name: s.same_as for s in self.scores(node) if added & set(s.same_as)}
 
