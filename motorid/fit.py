@@ -22,6 +22,7 @@ from motorid.result import UNDETERMINED, Failure, Fit
 from motorid.simulate import Evaluation, evaluate
 from motorid.starting import started
 
+NOISE = 1.2  # RMS of the residual over the noise that may be called noise
 ERROR_SHARE = 0.2  # integration error accepted beside noise or misfit
 MOST_FINER = 4  # times as many steps, where that is not kept
 POLISH = 20  # iterations with them
@@ -122,6 +123,7 @@ def _least_squares(problem: Problem, options: LevenbergMarquardt, callback, form
     done = descend_balanced(problem, options, callback, stages=stages)
     done, error = _exact_enough(done, options, callback)
     problem, found = done.problem, done.solution
+    found = _at_noise(found, problem)
     q = problem.unknowns.principal(found.q)
     fit = Fit(problem, problem.values(q), found.residual, found.jac / problem.scaling.slope(q), q, found.status,
               _advice(found, error, problem.n_outputs), done.history, time.perf_counter() - began,
@@ -152,6 +154,13 @@ def _exact_enough(done: Descent, options: LevenbergMarquardt, callback) -> tuple
 
 def _misfit(found: Solution, n: int) -> float:
     return float(np.sqrt(np.mean(found.residual[:n] ** 2)))
+
+
+def _at_noise(found: Solution, problem: Problem) -> Solution:
+    """Return the solution, as converged where the misfit is noise: friction makes the cost too rugged to go lower."""
+    if found.status != "stalled" or problem.weights != "noise" or _misfit(found, problem.n_outputs) > NOISE:
+        return found
+    return replace(found, status="converged", message="converged: no step lowers a misfit that is noise")
 
 
 def _advice(found: Solution, error: float, n: int) -> str:
