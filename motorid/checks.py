@@ -17,13 +17,14 @@ __all__ = ["check_runs"]
 Array = NDArray[np.float64]
 Check = Callable[[Experiment], str | None]
 
+_PEAK = 6  # samples after a jump of the voltage
 _NAMES = {"i": "current", "omega": "speed", "theta": "angle"}
 
 
 def check_runs(runs: Sequence[Experiment]) -> list[str]:
     """Look for what is wrong with records, and for what they cannot show.
 
-    Swapped signs and columns, wrong units, clipped or coarse channels, too slow sampling, missing samples, a
+    Swapped signs and columns, wrong units, clipped or coarse channels, spikes, too slow sampling, missing samples, a
     motor that never settles or is never excited, a voltage that never reverses.
 
     Parameters
@@ -82,6 +83,30 @@ def _clipped(run: Experiment) -> str | None:
     return None
 
 
+def _limited(run: Experiment) -> str | None:
+    """A current that stays while the voltage does and the speed changes: something else than the winding holds it."""
+    i, omega, v = run.outputs.get("i"), run.outputs.get("omega"), run.inputs["v"]
+    if i is None or omega is None or run.units["v"] != "V" or _clipped(run):
+        return None
+    top = float(np.nanmedian(np.abs(i)[np.abs(i) > 0.95 * np.nanquantile(np.abs(i), 0.995)]))
+    near = 4 * noise_level(i, run.t)
+    if near > 0.1 * top:
+        return None
+    flat = np.abs(np.abs(i) - top) < near
+    ends = np.flatnonzero(np.diff(np.r_[0, flat.astype(int), 0]))
+    held = 0
+    for a, b in zip(ends[::2], ends[1::2], strict=True):
+        steady = np.ptp(v[a:b]) < 0.02 * np.ptp(v)
+        if b - a >= 10 and steady and np.isfinite(omega[a:b]).all() and np.ptp(omega[a:b]) > 0.2 * np.nanmax(
+                np.abs(omega)):
+            held += b - a
+    if held < 0.02 * run.n:
+        return None
+    return (f"the current is held at {top:.3g} {run.units['i']} while the voltage stays and the speed changes "
+            f"({100 * held / run.n:.0f} % of the samples): a current limit of the driver? Then the motor does not get "
+            "the voltage that was logged. Use a lower voltage, or log the voltage at the motor's terminals.")
+
+
 def _at_stop(y: Array, top: float) -> bool:
     """Tell a channel that has run into a limit from one that rests, or reaches a level by itself."""
     there = y == top
@@ -105,6 +130,33 @@ def _coarse(run: Experiment) -> str | None:
                     f"covers only {reach / step:.0f} of them, too few counts to fit well. Use more of "
                     "the range, a finer sensor or a longer counting time.")
     return None
+
+
+def _spikes(run: Experiment) -> str | None:
+    for channel, y in run.outputs.items():
+        far = _alone(run.inputs["v"], y, noise_level(y, run.t))
+        if 3 <= len(far) <= 0.05 * run.n:
+            size = float(np.median(np.abs(far)))
+            return (f"{len(far)} single samples of the {_NAMES[channel]} stand about {size:.2g} {run.units[channel]} "
+                    "away from both neighbours: spikes of the sensor or the logger. Mark them as missing, or fit with "
+                    "a loss that forgives outliers (--loss huber, or loss=mi.Huber()).")
+    return None
+
+
+def _alone(v: Array, y: Array, noise: float) -> Array:
+    """Return how far samples stand from the middle of neighbours that agree; not where the voltage jumps."""
+    if len(y) < 20:
+        return np.empty(0)
+    before, here, after = y[:-2], y[1:-1], y[2:]
+    off, apart = here - (before + after) / 2, np.abs(after - before)
+    jumps = np.flatnonzero(np.abs(np.diff(v)) > 0.02 * np.ptp(v))
+    steady = np.ones(len(off), bool)
+    for k in range(-1, _PEAK):  # the current has a peak there
+        steady[np.clip(jumps + k, 0, len(off) - 1)] = False
+    # Smooth or not, a channel bends everywhere alike; nine in ten tell how much.
+    usual = float(np.nanquantile(np.abs(off[steady]), 0.9)) if steady.any() else np.inf
+    large = np.abs(off) > max(12 * noise, 8 * usual)
+    return off[steady & large & (apart < 0.3 * np.abs(off))]
 
 
 def _noisy(run: Experiment) -> str | None:
@@ -180,5 +232,5 @@ def _never_reverses(runs: Sequence[Experiment]) -> str | None:
 
 _CHECKS: tuple[Check, ...] = (
     signs, angle_against_speed, magnitudes, implied_constants, swapped_columns,
-    _excitation, _missing, _clipped, _coarse, _noisy, _uneven, _slow_sampling, _never_settles,
+    _excitation, _missing, _clipped, _limited, _coarse, _spikes, _noisy, _uneven, _slow_sampling, _never_settles,
 )

@@ -63,7 +63,7 @@ def test_nothing_is_said_about_nothing():
 
 def test_real_records_are_remarked_on_with_reason(real):
     expected = {
-        "emps": [], "fibo": [], "frc": ["never reverses"], "furuta_base": ["the angle advances 1.26"],
+        "emps": [], "fibo": ["17 single samples of the speed"], "frc": ["never reverses"], "furuta_base": ["the angle advances 1.26"],
         "odri_mn4004": ["is 1 V from beginning to end", "uneven"], "xl330": ["uneven"],
         "unmotor": ["never reverses"],
     }
@@ -166,6 +166,37 @@ def test_too_few_counts_are_told(steps):
 
 def test_a_channel_of_noise_is_told(steps, rng):
     assert "mostly noise" in said(steps.with_(outputs={"i": rng.normal(size=steps.n)}))
+
+
+def test_spikes_are_told_and_what_forgives_them(steps, rng):
+    y = steps.outputs["i"].copy()
+    where = rng.choice(steps.n, 9, replace=False)
+    y[where] += 20.0 * rng.choice([-1, 1], 9)
+    remarks = said(steps.with_(outputs={**steps.outputs, "i": y}))
+    assert "single samples of the current stand about 20 A away" in remarks
+    assert "--loss huber" in remarks
+    pair = steps.outputs["i"].copy()
+    for k in where:
+        pair[k:k + 3] += 20.0  # three in a row are no spike
+    assert "single samples" not in said(steps.with_(outputs={**steps.outputs, "i": pair}))
+
+
+def test_a_current_held_by_the_driver_is_told(plant, rng):
+    machine = plant.MOTORS["wheel"]
+    t, v = plant.staircase([20, -20, 12, -20], hold=0.5, dt=1e-3)
+    limit = 0.5 * float(np.abs(plant.simulate(machine, {}, t, v)["i"]).max())
+    i, omega, held = 0.0, 0.0, {"i": [], "omega": []}
+    for u in v:  # the driver takes the voltage back as soon as the current reaches its limit
+        held["i"].append(i)
+        held["omega"].append(omega)
+        for _ in range(20):
+            i += 5e-5 * (u - machine.R * i - machine.K * omega) / machine.L
+            i = float(np.clip(i, -limit, limit))
+            omega += 5e-5 * (machine.K * i - machine.b * omega) / machine.J
+    noisy = {c: np.array(y) + 0.003 * np.std(y) * rng.normal(size=len(t)) for c, y in held.items()}
+    assert f"the current is held at {limit:.3g} A" in said(Experiment(t, {"v": v}, noisy))
+    free = plant.simulate(machine, {}, t, v)
+    assert "held at" not in said(Experiment(t, {"v": v}, {c: free[c] for c in noisy}))
 
 
 def test_missing_samples_are_told(steps, rng):

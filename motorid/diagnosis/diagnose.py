@@ -19,6 +19,7 @@ from motorid.diagnosis.verdict import (
     closed_loop_remark,
     inseparable_remark,
     missing_text,
+    outliers_remark,
     unexplained_text,
 )
 from motorid.errors import MotoridError
@@ -87,7 +88,8 @@ def diagnose(
         same = {name: p for node in found.path[1:] for name, p in search.inseparable(node).items()}
         text = f"{text} {inseparable_remark(same)}".rstrip()
         suggestion = _suggestion(found)
-    text = " ".join(t for t in (text, parts_remark(whole, fit), closed_loop_remark(fit), suggestion) if t)
+    remarks = (parts_remark(whole, fit), outliers_remark(ladder.best), closed_loop_remark(fit), suggestion)
+    text = " ".join(t for t in (text, *remarks) if t)
     return Diagnosis(
         verdict,
         text,

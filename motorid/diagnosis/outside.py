@@ -25,7 +25,7 @@ from motorid.fit import Fit
 from motorid.integrate.grid import Array
 
 MUCH_LESS = 0.5  # of the squared misfit that the effects leave: what a form in their place may leave
-PREDICTED = 0.2  # of the squared misfit: what a form must explain, on data held out too, that is no noise
+PREDICTED = 0.1  # of the squared misfit: what a form must explain, on data held out too, that is no noise
 LITTLE = 0.1  # of the squared misfit: forms that leave less are equals
 NEARLY = 3.0  # times what the best form leaves: what others may leave to be believed too
 CONTAINS = 0.7  # of what an effect does: what a form must do in its place

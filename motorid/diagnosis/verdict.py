@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from motorid.diagnosis.evidence import despiked
 from motorid.diagnosis.results import Adequacy, Candidate, Missing, Rung
 from motorid.effects import LIBRARY
 from motorid.fit import Fit
@@ -13,6 +14,7 @@ from motorid.formatting import percent, with_error
 from motorid.model import Effect
 
 MOVED = 0.1  # relative change of a motor parameter that is worth a word
+SPIKED = 0.5  # of a channel's squared error: what outliers must make to be worth a word
 RPM = 30 / np.pi
 
 
@@ -120,10 +122,30 @@ def balance_of(name: str, also: Sequence[Effect] = ()) -> str:
     }[known[name].balance]
 
 
+def outliers_remark(fit: Fit) -> str:
+    """Say so when a few samples that stand alone make most of a channel's error: they hide the rest."""
+    for c in fit.problem.outputs:
+        parts = [s.residual(c) for s in fit.simulations if c in s.experiment.outputs]
+        r = np.concatenate([p[np.isfinite(p)] for p in parts])
+        kept = np.concatenate([despiked(p) for p in parts])
+        spikes = int(np.count_nonzero(r != kept))
+        if spikes and kept @ kept < (1 - SPIKED) * (r @ r):
+            share = percent(1 - float(kept @ kept) / float(r @ r), 2)
+            return (
+                f"{spikes} samples of {c} that stand alone make {share} of its squared error: outliers, which a fit "
+                "by least squares follows. A loss that forgives them (--loss huber, loss=mi.Huber()) will show the "
+                "rest better."
+            )
+    return ""
+
+
 def closed_loop_remark(fit: Fit) -> str:
     """Say so when a controller made the voltage from the measurement: it hides errors of the model."""
-    for run in fit.problem.experiments:
-        feedback = _noise_feedback(run.inputs["v"], run.outputs.get("omega", run.outputs.get("theta")))
+    for run, sim in zip(fit.problem.experiments, fit.simulations, strict=True):
+        c = "omega" if "omega" in run.outputs else "theta"
+        # What the controller passes on is the measurement, its noise included; a smooth drive follows no noise.
+        both = [run.outputs.get(c), sim.residual(c) if c in run.outputs and c in sim.outputs else None]
+        feedback = min(_noise_feedback(run.inputs["v"], y) for y in both)
         extra = run.meta.get("extra", {})
         if feedback > 0.5 or any("ref" in str(n).lower() or "goal" in str(n).lower() for n in extra):
             return (
