@@ -107,7 +107,10 @@ def solve(problem: Problem, solver: Any = None, *, start: str = "auto",
     if not problem.unknown:
         raise UsageError("every parameter is held, there is nothing to fit. Free one, model.free('R'), or judge "
                          "the model as it is: mi.evaluate(model, runs).")
-    problem = started(problem) if start == "auto" else problem
+    if start == "auto":
+        from motorid.numbering import numbered  # it fits smaller models first, by this very function
+
+        problem = started(numbered(problem, solve))
     if hasattr(solver, "solve"):
         return solver.solve(problem)
     if problem.constraints:

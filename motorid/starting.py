@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -39,10 +40,29 @@ def started(problem: Problem) -> Problem:
         candidates.append(_at(model, first_guess(model, runs, loaded=True)))
     problems = [problem.for_model(with_suited_effects(m, runs)) for m in candidates]
     k = int(np.argmin([_cost_of(p) for p in problems])) if len(problems) > 1 else 0
-    best = problems[k]
+    best = _along_measured_angle(problems[k], candidates[k])
     for effect in model.effects:
         best = _shaped(best, effect, candidates[k])
     return _split(best, model) if loaded else best
+
+
+def _along_measured_angle(problem: Problem, asked: Model) -> Problem:
+    """Return the problem started where the measured angle leads, if an effect repeats over a turn.
+
+    While the model's own angle is still wrong by a period, its cogging pushes the wrong way.
+    """
+    orders = any(p.order for e in problem.model.effects for p in e.parameters)
+    if not orders or not all("theta" in r.outputs for r in problem.experiments):
+        return problem
+    led = problem.for_model(replace(problem.model, angle_input=True, _systems={}))
+    for effect in problem.model.effects:
+        led = _shaped(led, effect, asked)
+    try:
+        done = descend(led, THOROUGH)
+    except FitError:
+        return problem
+    found = problem.for_model(problem.model.start_at(without_width(done.problem, done.solution.q)))
+    return min(found, problem, key=_cost_of)
 
 
 def _split(problem: Problem, asked: Model) -> Problem:

@@ -30,15 +30,17 @@ ROWS = (
     "least_squares descent starting simulate result fit comparison multipliers conflict nlp nodes outcome gaps "
     "shooting remedies",
     # 5 how far it can be trusted, and what it lacks
-    "identifiability uncertainty bootstrap profiling intervals endings multistart batch formulations diagnosis",
+    "identifiability uncertainty bootstrap profiling intervals endings multistart batch formulations diagnosis "
+    "numbering",
     # 6 taking it along and showing it
     "export portable csource plots acquire summary explore report "
     "_html _html_tables _cards _cards_trust _sections _story",
     # 7 the command line and the public names
     "cli __main__ __init__",
 )
-# The one way down: an object shows itself in a notebook by the module that draws such cards.
-DRAWN_LATE = {("display", "_html"), ("_html", "_cards")}
+# The two ways down: an object shows itself in a notebook by the module that draws such cards, and a fit asks the
+# diagnosis for the order of an effect that repeats over a turn.
+DRAWN_LATE = {("display", "_html"), ("_html", "_cards"), ("fit", "numbering")}
 ONLY_IN = {"matplotlib": "plots", "serial": "acquire", "typer": "cli", "jinja2": "report"}
 NOT_ON_IMPORT = ("matplotlib", "serial", "scipy.stats", "typer", "rich", "jinja2", "pandas", "distributed")
 
