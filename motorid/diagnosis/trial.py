@@ -25,10 +25,12 @@ RACE = LevenbergMarquardt(max_iterations=6, ftol=1e-3, xtol=1e-4)
 QUICK = LevenbergMarquardt(max_iterations=25, ftol=1e-4, xtol=1e-5)
 POLISH = LevenbergMarquardt(max_iterations=60, ftol=1e-7, xtol=1e-7)
 BLOCKS = 10  # contiguous parts of each run; every other one is held out where there are no held-out runs
+GOING_ON = 4  # times, where the last descent ends at its limit
 ROUGH = 1e-4  # accuracy of the integration while starts are compared
 LOST = 0.2  # NRMSE of a channel
-ALIVE = 3.0  # standard deviations that a change by a factor of e makes
-SUBSTEPS = 24  # per sample: what needs more cannot be seen in these samples
+ALIVE = 10.0  # standard deviations that a change by a factor of e makes
+SUBSTEPS = 24  # per sample: what needs more cannot be seen in these samples, unless it is cheap
+CHEAP = 200_000  # steps of integration
 ROOM = 10.0  # factor beyond its grid that a shape parameter may run to
 FAILURES = (FitError, SimulationError, ModelError, np.linalg.LinAlgError)
 WORSE = 1.02  # of the cost along the measured angle: the model's own angle must do as well
@@ -196,7 +198,7 @@ def _race(fit: Fit, model: Model, start: Mapping[str, float], angular: bool) -> 
     except FAILURES:
         return None
     spent = sum(int(r.grid.substeps.sum()) for r in done.problem.runs)
-    return done if spent <= SUBSTEPS * sum(r.experiment.n for r in problem.runs) else None
+    return done if spent <= max(SUBSTEPS * sum(r.experiment.n for r in problem.runs), CHEAP) else None
 
 
 def _revived(fit: Fit, model: Model) -> Model:
@@ -236,11 +238,11 @@ def _polished(fit: Fit, problem: Problem) -> Fit | None:
     """Converge from a good start, channels weighed anew where the misfit has changed."""
     try:
         problem = problem.tuned(accuracy=fit.problem.accuracy)
-        done = descend(problem, POLISH, stages=False)
+        done = _converged(problem)
         if problem.balance:
             factors = misfit_over_noise(done.problem, done.solution.q)
             if max(abs(np.log(factors[c] / problem.balance.get(c, 1.0))) for c in factors) > 0.1:
-                done = descend(_from(done.problem, done.solution.q).tuned(balance=factors), POLISH, stages=False)
+                done = _converged(_from(done.problem, done.solution.q).tuned(balance=factors))
     except FAILURES:
         return None
     found, problem = done.solution, done.problem
@@ -256,6 +258,22 @@ def _polished(fit: Fit, problem: Problem) -> Fit | None:
         found.message,
         done.history,
     )
+
+
+def _converged(problem: Problem) -> Descent:
+    """Descend, and go on where that ends at its limit: what is unfinished would be judged worse than it is.
+
+    Raises
+    ------
+    FitError, SimulationError
+    """
+    done = descend(problem, POLISH, stages=False)
+    for _ in range(GOING_ON):
+        if done.solution.status != "limit":
+            break
+        again = descend(_from(done.problem, done.solution.q), POLISH, stages=False)
+        done = replace(again, history=done.history + again.history)
+    return done
 
 
 def _within(model: Model, values: Mapping[str, float]) -> Model:
