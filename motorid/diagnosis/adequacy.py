@@ -99,6 +99,16 @@ def following(judged: Adequacy, what: str, share: float | None = None) -> Adequa
     return replace(judged, text=f"{judged.text} They follow {what}{held}.")
 
 
+def unpredicted(judged: Adequacy) -> Adequacy:
+    """Return a judgement that knows that no free form predicts errors larger than the noise."""
+    larger = " and ".join(c for c, f in judged.channels.items() if f["ratio"] > LARGER)
+    why = (
+        f"Those of {larger} are larger than fast noise, but no smooth function of time, angle, speed, current or "
+        "voltage predicts them on data held out."
+    )
+    return replace(judged, text=f"{judged.text} {why}")
+
+
 def _sizes(channels: Mapping[str, Mapping[str, float]]) -> str:
     return ", ".join(f"{c} {number(f['ratio'], 2)} times its noise" for c, f in channels.items())
 

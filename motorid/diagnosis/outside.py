@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from motorid.diagnosis.adequacy import LARGER, adequacy, following
+from motorid.diagnosis.adequacy import LARGER, adequacy, following, unpredicted
 from motorid.diagnosis.evidence import compare_errors, despiked
 from motorid.diagnosis.forms import Form, Linear, as_effect, halves, linearised
 from motorid.diagnosis.rank import Score
@@ -89,33 +89,42 @@ def outside(steps: Sequence[Fit], held: HeldOut) -> Outside | None:
 def judgement(fit: Fit, scores: Sequence[Score], held: HeldOut) -> Adequacy:
     """Judge whether the residuals of `fit` are noise; errors larger than it must not be predictable by any form."""
     judged = adequacy(fit, scores)
-    found = predicted(fit, held) if judged.adequate else None
-    return following(judged, found[0].text, found[1]) if found else judged
+    if not judged.adequate or not far(fit):
+        return judged
+    try:
+        found = predicted(fit, held)
+    except FAILURES:
+        return judged
+    return following(judged, found[0].text, found[1]) if found else unpredicted(judged)
 
 
 def predicted(fit: Fit, held: HeldOut) -> tuple[Form, float] | None:
     """Return the free form that explains most of errors larger than the noise, and how much, on data held out too.
 
     It must do so on the records, on blocks of them held out and, if there are any, on held-out runs.
+
+    Raises
+    ------
+    SimulationError
     """
     channels = far(fit)
     if not channels:
         return None
-    try:
-        train, *test = linearised(fit, held.validation)
-    except FAILURES:
-        return None
-    before = _by_channel(_left(train.residual, train.slopes, train.own), train)
-    found = []
-    for form in train.forms:
-        after = _by_channel(_left(train.residual, train.slopes, train.own, train.forms[form]), train)
-        left = _fraction(after, before, channels)
-        for parts in ([(train, test[0])] if test and form.on != "theta" else [], list(halves(train, BLOCKS))):
-            if parts and left < 1 - PREDICTED:
-                left = max(left, _fraction_of(form, parts, channels))
-        found.append((form, 1 - left))
-    best = max(found, key=lambda f: f[1], default=None)
+    train, *test = linearised(fit, held.validation)
+    best = max(((f, _share(f, train, test, channels)) for f in train.forms), key=lambda f: f[1], default=None)
     return best if best is not None and best[1] > PREDICTED else None
+
+
+def _share(form: Form, train: Linear, test: Sequence[Linear], channels: Sequence[int]) -> float:
+    """Return how much a form explains of the squared misfit, where it explains least."""
+    before = _by_channel(_left(train.residual, train.slopes, train.own), train)
+    after = _by_channel(_left(train.residual, train.slopes, train.own, train.forms[form]), train)
+    left = _fraction(after, before, channels)
+    if left < 1 - PREDICTED:
+        left = max(left, _fraction_of(form, list(halves(train, BLOCKS)), channels))
+    if left < 1 - PREDICTED and test and form.on != "theta":
+        left = max(left, _fraction_of(form, [(train, test[0])], channels))
+    return 1 - left
 
 
 def _believed(rivals: Sequence[Rival]) -> list[Rival]:

@@ -1,0 +1,129 @@
+"""Errors larger than the noise: coloured noise, or something missing that coloured noise would look like?"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from battery.excite import P, driven, record
+
+import motorid as mi
+from motorid.diagnosis.adequacy import adequacy
+from motorid.diagnosis.evidence import despiked
+from motorid.diagnosis.outside import judgement, predicted
+from motorid.diagnosis.rank import Score
+from motorid.diagnosis.trial import HeldOut
+from motorid.diagnosis.verdict import _noise_feedback, closed_loop_remark
+from motorid.effects import LIBRARY
+from motorid.experiment import Experiment
+
+DRIVES = ("stairs", "multisine", "steps")
+
+
+def runs_of(motor, effects, drives=DRIVES, n=800, seed=4, dt=1e-3, rho=0.0, size=0.005) -> list[Experiment]:
+    """Records of current, speed and an angle of 4096 counts, with noise of correlation `rho`."""
+    rng, runs = np.random.default_rng(seed), []
+    for k, words in enumerate(drives):
+        r = driven(motor, effects, words, n, dt, rng)
+        y = {c: P.coloured(r[c], size * float(np.std(r[c])), rho, rng) for c in ("i", "omega")}
+        y["theta"] = P.encoder(r["theta"], 4096)
+        runs.append(Experiment(r["t"], {"v": r["v"]}, y, name=f"run{k + 1}"))
+    return runs
+
+
+def rippled(run: Experiment, share: float = 0.05) -> Experiment:
+    """The same with a tachometer that ripples once per turn."""
+    gain = 1 + share * np.sin(run.outputs["theta"] + 0.4)
+    return run.with_(outputs={**run.outputs, "omega": run.outputs["omega"] * gain})
+
+
+def test_friction_and_drag_that_bend_against_one_another_are_both_found(lab, rng):
+    """Long steps of constant voltage: the residual is constant on each, and few samples of it count."""
+    both, runs = {"coulomb": {"tau_c": 5e-3}, "quadratic_drag": {"c_2": 1e-7}}, []
+    for levels in ([2.4, 4.8, -3.6, 8.4, -14.4, 12], [14.4, 3.6, -10.8], [13.2, 6, -3, -9]):
+        t, v = P.staircase(levels, 0.4)
+        r = P.simulate(lab, both, t, v, substep=None)
+        y = {c: P.white(r[c], 0.005 * float(np.std(r[c])), rng) for c in ("i", "omega")}
+        runs.append(Experiment(t, {"v": v}, y, name=f"run{len(runs) + 1}"))
+    fit = mi.fit(mi.dc_motor(), runs[:2])
+    assert adequacy(fit).adequate  # bins alone do not see it
+    judged = judgement(fit, (), HeldOut.of(fit, runs[2:]))
+    assert not judged.adequate
+    assert "follow a torque that changes with the speed" in judged.text
+    found = mi.diagnose(fit, runs[2:], effects=("coulomb", "quadratic_drag", "constant_load", "brush_drop"))
+    assert set(found.effects) == {"coulomb", "quadratic_drag"}
+    assert found.remaining.adequate
+
+
+def test_a_tachometer_that_ripples_is_found_in_the_measurement(lab):
+    runs = [rippled(r) for r in runs_of(lab, {})]
+    found = mi.diagnose(mi.fit(mi.dc_motor(), runs[:2]), runs[2:], effects=("coulomb", "cogging", "speed_gain"))
+    assert (found.verdict, found.effects, found.where) == ("unexplained", (), "sensor")
+    assert found.missing.acts_like == "a gain of the speed sensor that changes with the angle within a turn"
+    assert "of their variance on data held out" in found.text
+    assert "The measurement fails" in found.text
+
+
+@pytest.mark.parametrize("validated", [True, False])
+def test_no_form_predicts_coloured_noise(lab, validated):
+    for seed in range(4):
+        runs = runs_of(lab, {}, seed=seed, rho=0.93, size=0.02)
+        fit = mi.fit(mi.dc_motor(), runs[:2])
+        held = HeldOut.of(fit, runs[2:] if validated else None)
+        assert adequacy(fit).channels["omega"]["ratio"] > 2
+        assert predicted(fit, held) is None
+
+
+def test_adequate_although_larger_than_the_noise_says_what_was_tried(lab):
+    runs = runs_of(lab, {}, seed=2, rho=0.93, size=0.02)
+    found = mi.diagnose(mi.fit(mi.dc_motor(), runs[:2]), runs[2:], effects=("coulomb", "brush_drop"))
+    assert found.verdict == "adequate", found.text
+    assert "no smooth function of time, angle, speed, current or voltage predicts them" in found.text
+    assert "coloured" in found.text
+
+
+def test_what_is_a_tenth_of_rounding_is_not_worth_a_word(lab, rng):
+    """Rounding repeats itself at a steady speed, as coloured as anything: the same share of true noise is."""
+    runs = [r.without("i", "omega") for r in runs_of(lab, {}, ("stairs", "ramps"))]
+    small = Score(LIBRARY["coulomb"], 0.1, (), 400.0)
+    fit = mi.fit(mi.dc_motor(), runs)
+    assert adequacy(fit).channels["theta"]["rounded"] == 1.0
+    assert adequacy(fit, [small]).adequate
+    assert not adequacy(fit, [replace(small, drop=0.3)]).adequate
+    noisy = [r.with_(outputs={"theta": r.outputs["theta"] + 0.01 * rng.normal(size=r.n)}) for r in runs]
+    fit = mi.fit(mi.dc_motor(), noisy)
+    assert adequacy(fit).channels["theta"]["rounded"] == 0.0
+    assert adequacy(fit).adequate
+    assert not adequacy(fit, [small]).adequate
+
+
+def test_spikes_are_no_misfit_but_a_few_samples_in_a_row_are(rng):
+    r = rng.normal(size=500)
+    spiked, failing = r.copy(), r.copy()
+    spiked[[20, 100, 300]] = 50.0
+    failing[200:210] += 50.0
+    assert np.std(despiked(spiked)) == pytest.approx(np.std(r), rel=0.05)
+    assert np.array_equal(despiked(failing), failing)
+    assert np.array_equal(despiked(r), r)
+
+
+def test_outliers_that_make_the_error_are_said(lab, rng):
+    runs = []
+    for run in runs_of(lab, {"coulomb": {"tau_c": 8e-3}}):
+        i = run.outputs["i"].copy()
+        i[rng.choice(run.n, 12, replace=False)] += 60.0
+        runs.append(run.with_(outputs={**run.outputs, "i": i}))
+    found = mi.diagnose(mi.fit(mi.dc_motor(), runs[:2]), runs[2:], effects=("coulomb", "constant_load"))
+    assert "24 samples of i that stand alone make" in found.text
+    assert "--loss huber" in found.text
+
+
+def test_an_angle_that_follows_a_smooth_drive_is_no_closed_loop(lab, plant):
+    rng = np.random.default_rng(2)
+    smooth = record(driven(lab, {}, "multisine", 900, 1e-3, rng), "logger", ("theta",), lab, rng, "smooth")
+    assert _noise_feedback(smooth.inputs["v"], smooth.outputs["theta"]) > 0.5  # the bait
+    assert closed_loop_remark(mi.fit(mi.dc_motor(), smooth)) == ""
+    wheel = plant.MOTORS["wheel"]
+    looped = record(driven(wheel, {}, "loop", 900, 2e-3, rng), "logger", ("i", "omega"), wheel, rng, "loop")
+    assert "closed loop" in closed_loop_remark(mi.fit(mi.dc_motor(), looped))
