@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from motorid.diagnosis.evidence import compare_errors
+from motorid.diagnosis.hardly import hardly_moved
 from motorid.diagnosis.judging import Node
 from motorid.diagnosis.outside import Outside, judgement, outside
 from motorid.diagnosis.parts import affordable
@@ -76,19 +77,24 @@ def climb(search: Search, max_effects: int, advance: Callable[[str], None]) -> C
 def settled(found: Climb) -> tuple[Climb, Outside | None]:
     """Return a climb without effects that only stand in for what the library lacks, and what that is like."""
     other = outside([n.fit for n in found.path], found.search.held)
-    if other is None or other.kept == len(found.path) - 1:
-        return found, other
-    path = found.path[: other.kept + 1]
+    if other is not None and other.kept < len(found.path) - 1:
+        what = f"{other.form.text}, of a form that the library lacks"
+        return _cut(found, other.kept, f"only stands in for {what}", f"is like {what}"), other
+    poor = "" if found.remaining.adequate else hardly_moved(found.path, dict(found.search.held.noise))
+    return (_cut(found, 0, poor, "is nothing that the library has") if poor else found), other
+
+
+def _cut(found: Climb, kept: int, why: str, what: str) -> Climb:
+    """Return a climb with the first `kept` effects; `why` the others are not, and what is left."""
+    path = found.path[: kept + 1]
     names = path[-1].key
-    why = f"only stands in for {other.form.text}, of a form that the library lacks"
     rounds = tuple(
         tuple(c if not c.accepted or c.effect in names else replace(c, accepted=False, group=(), reason=why) for c in r)
         for r in found.rounds
     )
     groups = tuple(g for g in found.groups if g[0] in names)
     judged = judgement(path[-1].fit, found.search.scores(path[-1]), found.search.held)
-    text = f"stopped: what is left is like {other.form.text}, of a form that the library lacks"
-    return Climb(found.search, path, rounds, groups, text, found.first, judged), other
+    return Climb(found.search, path, rounds, groups, f"stopped: what is left {what}", found.first, judged)
 
 
 def _runners_up(search: Search, best: Node, ordered: Sequence[Node]) -> list[Node]:
