@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,7 +11,8 @@ from battery.excite import P, driven, record
 
 import motorid as mi
 from motorid.diagnosis.adequacy import adequacy
-from motorid.diagnosis.evidence import despiked
+from motorid.diagnosis.evidence import Errors, despiked
+from motorid.diagnosis.hardly import hardly_moved
 from motorid.diagnosis.outside import judgement, predicted
 from motorid.diagnosis.rank import Score
 from motorid.diagnosis.trial import HeldOut
@@ -127,3 +129,20 @@ def test_an_angle_that_follows_a_smooth_drive_is_no_closed_loop(lab, plant):
     wheel = plant.MOTORS["wheel"]
     looped = record(driven(wheel, {}, "loop", 900, 2e-3, rng), "logger", ("i", "omega"), wheel, rng, "loop")
     assert "closed loop" in closed_loop_remark(mi.fit(mi.dc_motor(), looped))
+
+
+def _node(effects, **errors):
+    fit = SimpleNamespace(model=SimpleNamespace(effects=[LIBRARY[e] for e in effects]))
+    held = Errors({c: [size * np.ones(50)] for c, size in errors.items()}, dict.fromkeys(errors, 1.0))
+    return SimpleNamespace(fit=fit, key=frozenset(effects), held=held)
+
+
+def test_an_effect_that_leaves_one_channel_where_it_was_is_only_the_nearest():
+    noise = {"i": 0.1, "omega": 0.1}
+    first = _node((), i=2.0, omega=5.0)
+    bent = hardly_moved([first, _node(("magnetic_saturation",), i=1.7, omega=0.5)], noise)
+    assert bent == "leaves the error of i at 17 times its noise, where it hardly falls"
+    assert hardly_moved([first, _node(("coulomb",), i=1.5, omega=0.5)], noise) == ""  # it falls
+    assert hardly_moved([_node((), i=0.4, omega=5.0), _node(("coulomb",), i=0.4, omega=0.5)], noise) == ""  # noise
+    assert hardly_moved([first, _node(("speed_lag",), i=2.0, omega=0.5)], noise) == ""  # no matter of the current
+    assert hardly_moved([first], noise) == ""
