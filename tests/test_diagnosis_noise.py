@@ -13,7 +13,7 @@ import motorid as mi
 from motorid.diagnosis.adequacy import adequacy
 from motorid.diagnosis.evidence import Errors, despiked
 from motorid.diagnosis.hardly import hardly_moved
-from motorid.diagnosis.outside import judgement, predicted
+from motorid.diagnosis.judgement import judgement, predicted
 from motorid.diagnosis.rank import Score
 from motorid.diagnosis.trial import HeldOut
 from motorid.diagnosis.verdict import _noise_feedback, closed_loop_remark

@@ -10,7 +10,8 @@ from battery.excite import driven, record
 
 import motorid as mi
 from motorid.diagnosis.forms import linearised
-from motorid.diagnosis.outside import far, outside
+from motorid.diagnosis.outside import outside
+from motorid.diagnosis.remainders import far
 from motorid.diagnosis.trial import HeldOut
 from motorid.experiment import Experiment
 

@@ -5,7 +5,7 @@ their size nor their autocorrelation decides. What does is whether they depend o
 over speed, current, voltage and angle, and the share of variance that the bins explain is compared with the same
 after shifting the residuals in time against the motion, which keeps the colour of both and breaks every real
 dependence (a circular-shift surrogate test, Theiler et al., Physica D 58, 1992). The library's scores, judged on
-effective samples, see what bins cannot. Where both are silent but the errors exceed the noise, `outside.judgement`
+effective samples, see what bins cannot. Where both are silent but the errors exceed the noise, `judgement`
 asks whether a free form predicts them on data that it was not fitted to: coloured noise cannot be predicted.
 """
 

@@ -8,6 +8,7 @@ from typing import Any
 
 from motorid.diagnosis.adequacy import following
 from motorid.diagnosis.improve import Climb, climb, ladder_of, settled
+from motorid.diagnosis.judgement import pursued
 from motorid.diagnosis.locate import acting_like, locate
 from motorid.diagnosis.parts import affordable, parts_remark
 from motorid.diagnosis.results import Diagnosis
@@ -78,6 +79,9 @@ def diagnose(
         remaining = following(remaining, other.form.text)
         judged = following(judged, other.form.text) if judged.adequate else judged
         missing = missing if names else acting_like(missing, other.form)
+    else:
+        remaining = pursued(remaining, ladder.best, search.held)
+        judged = judged if names else remaining
     if not names:
         verdict = "adequate" if judged.adequate else "unexplained"
         text = adequate_text(judged, ranking) if judged.adequate else unexplained_text(judged, missing, ranking)

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from motorid.diagnosis.response import Response, responses_of
+from motorid.diagnosis.shapes import FORMS, KNOTS, Form, basis_of, orders_of, ranges_of, shown
 from motorid.equations import Equations
 from motorid.fit import Fit
 from motorid.integrate.grid import Array
@@ -26,57 +27,7 @@ from motorid.prepared import angle_signal, natural_sizes
 from motorid.problem import Problem
 from motorid.simulate import Simulation, simulated
 
-KNOTS = 9  # cosines over the range of a quantity
-HARMONICS = 8  # of a turn
 START = 0.01  # of the natural torque
-SHARP = 1e-3  # of the highest speed: below it a direction is not known
-WORDS = {
-    "t": "the time",
-    "turn": "the angle within a turn",
-    "theta": "the angle",
-    "omega": "the speed",
-    "i": "the current",
-    "v": "the voltage",
-}
-
-
-@dataclass(frozen=True)
-class Form:
-    """A free function of the quantity `on` times `carrier`, in one balance; `words` says what that is.
-
-    In the balance ``"sensor"`` it is added to the output `channel`.
-    """
-
-    words: str
-    balance: str
-    on: str
-    carrier: str = ""
-    channel: str = ""
-
-    @property
-    def text(self) -> str:
-        """What it is, in words."""
-        return f"{self.words} that changes with {WORDS[self.on]}"
-
-
-FORMS = (
-    Form("a friction", "torque", "turn", "direction"),
-    Form("a friction", "torque", "theta", "direction"),
-    Form("a friction", "torque", "t", "direction"),
-    Form("a load", "torque", "turn"),
-    Form("a load", "torque", "theta"),
-    Form("a load", "torque", "t"),
-    Form("a drag", "torque", "t", "omega"),
-    Form("a drag", "torque", "turn", "omega"),
-    Form("a torque", "torque", "omega"),
-    Form("a loss of voltage", "voltage", "omega"),
-    Form("a loss of voltage", "voltage", "v"),
-    Form("a loss of voltage", "voltage", "i"),
-    Form("a loss of voltage", "voltage", "t"),
-    Form("a resistance", "voltage", "t", "i"),
-    Form("a gain of the speed sensor", "sensor", "turn", "omega", "omega"),
-    Form("an error of the angle sensor", "sensor", "turn", "", "theta"),
-)
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,14 +78,14 @@ def linearised(fit: Fit, validation: Problem | None, balance: Mapping[str, float
         other = validation.for_model(fit.model).tuned(balance=problem.balance)
         known.append(_on(other, fit, simulated(other)))
     signals = [[_signals(p, s, k) for k, s in enumerate(sims)] for p, sims, _, _ in known]
-    ranges, orders = _ranges(signals[0]), _orders(fit)
-    forms = [f for f in FORMS if _fits(f, fit, ranges)]
+    ranges, orders = ranges_of(signals[0]), orders_of(fit)
+    forms = [f for f in FORMS if shown(f, fit, ranges)]
     free, p = len(fit.problem.model.free_names), np.array([fit.values[p] for p in problem.system.parameters])
     found = []
     for (problem, sims, residual, jac), signal in zip(known, signals, strict=True):
         n, runs = problem.n_outputs, range(len(sims))
         answers = responses_of(problem, p, sims)
-        bases = [{f: _basis(f, s, ranges, orders) for f in forms} for s in signal]
+        bases = [{f: basis_of(f, s, ranges, orders) for f in forms} for s in signal]
         parts = [_answers(problem, k, answers[k], bases[k]) for k in runs]
         columns = {f: np.vstack([part[f] for part in parts]) for f in forms}
         place, channel = np.concatenate([_labels(problem, k) for k in runs], axis=1)
@@ -165,55 +116,6 @@ def _signals(problem: Problem, sim: Simulation, k: int) -> dict[str, Array]:
     return found
 
 
-def _ranges(signals: Sequence[Mapping[str, Array]]) -> dict[str, tuple[float, float]]:
-    names = set.intersection(*(set(s) for s in signals))
-    return {n: (min(float(s[n].min()) for s in signals), max(float(s[n].max()) for s in signals)) for n in names}
-
-
-def _fits(form: Form, fit: Fit, ranges: Mapping[str, tuple[float, float]]) -> bool:
-    """Tell whether the records can show a form: its quantity is known, its balance is in the model."""
-    if form.channel and form.channel not in fit.problem.outputs:
-        return False
-    if form.on not in ranges or ranges[form.on][0] == ranges[form.on][1]:
-        return False
-    if form.balance == "voltage" and "i" not in fit.problem.outputs:
-        return False  # there a torque says the same
-    return form.on != "turn" or fit.problem.model.axis != "linear"
-
-
-def _orders(fit: Fit) -> list[float]:
-    """Return orders of a turn: the lowest, and the harmonics of those in the model."""
-    known = [fit.values[p.name] for e in fit.model.effects for p in e.parameters if p.order]
-    return sorted({*range(1, HARMONICS + 1), *(round(k * n) for n in known for k in range(1, 5))})
-
-
-def _basis(
-    form: Form, signal: Mapping[str, Array], ranges: Mapping[str, tuple[float, float]], orders: Sequence[float]
-) -> Array:
-    """Return the form's functions along one run, (N, m)."""
-    low, high = ranges[form.on]
-    z = signal[form.on] if form.on == "turn" else np.clip(signal[form.on], low, high)  # nothing is known beyond
-    if form.on == "turn":
-        waves = [f(k * z) for k in orders for f in (np.sin, np.cos)]
-        functions = np.column_stack([np.ones_like(z), *waves])
-    elif form.on in ("omega", "i", "v"):
-        functions = _through_zero(z, max(abs(low), abs(high)))
-    else:
-        count = KNOTS if form.on == "t" else 2 * KNOTS
-        functions = np.column_stack([np.cos(np.pi * k * (z - low) / (high - low)) for k in range(count)])
-    if form.carrier == "direction":
-        top = max(abs(x) for x in ranges["omega"])
-        return functions * np.clip(signal["omega"] / (SHARP * top), -1, 1)[:, None]
-    return functions * signal[form.carrier][:, None] if form.carrier else functions
-
-
-def _through_zero(z: Array, top: float) -> Array:
-    """Return odd and even functions of a quantity with a sign, kinks and jumps at zero included."""
-    size, side = np.abs(z) / top, np.clip(z / (SHARP * top), -1, 1)
-    powers = np.column_stack([size**p for p in (0.0, 0.5, 1.0, 2.0, 3.0, 4.0)])
-    return np.column_stack([powers * side[:, None], powers])
-
-
 def _answers(problem: Problem, k: int, answer: Response, bases: Mapping[Form, Array]) -> dict[Form, Array]:
     """Return the whitened outputs of run `k` to every function of every form."""
     if not bases:
@@ -236,13 +138,20 @@ def _driven(answer: Response, c: Array, bases: Mapping[Form, Array]) -> Array:
     n, ny, nx = c.shape
     if not bases:
         return np.zeros((n * ny, 0))
-    drive = np.concatenate([b[:-1] for b in bases.values()], axis=1)
-    which = np.concatenate([np.full(b.shape[1], f.balance == "torque", int) for f, b in bases.items()])
-    state, out = np.zeros((nx, drive.shape[1])), np.zeros((n, ny, drive.shape[1]))
+    volts = np.concatenate([_share(f, b, answer, "voltage")[:-1] for f, b in bases.items()], axis=1)
+    torques = np.concatenate([_share(f, b, answer, "torque")[:-1] for f, b in bases.items()], axis=1)
+    state, out = np.zeros((nx, volts.shape[1])), np.zeros((n, ny, volts.shape[1]))
     for j in range(n - 1):
-        state = answer.a[j] @ state + answer.b[j][:, which] * drive[j]
+        state = answer.a[j] @ state + answer.b[j, :, :1] * volts[j] + answer.b[j, :, 1:] * torques[j]
         out[j + 1] = c[j + 1] @ state
     return out.reshape(n * ny, -1)
+
+
+def _share(form: Form, basis: Array, answer: Response, balance: str) -> Array:
+    """Return what a form puts in a balance, (N, m)."""
+    if form.balance == "both":
+        return basis * (answer.states["i"] if balance == "torque" else -answer.states["omega"])[:, None]
+    return basis if form.balance == balance else np.zeros_like(basis)
 
 
 def _read(problem: Problem, form: Form, basis: Array, weights: Array) -> Array:
@@ -272,7 +181,7 @@ def as_effect(form: Form, fit: Fit) -> Effect | None:
     """Return a form of the angle or of time as an effect that can be fitted; None for the others."""
     if form.on not in ("turn", "theta", "t") or form.balance != "torque" or form.carrier == "omega":
         return None
-    low, high = _ranges([_signals(fit.problem, s, k) for k, s in enumerate(fit.simulations)])[form.on]
+    low, high = ranges_of([_signals(fit.problem, s, k) for k, s in enumerate(fit.simulations)])[form.on]
     size = natural_sizes(fit.problem.experiments, fit.values)["N" if fit.model.axis == "linear" else "N·m"]
     names = [f"form_{k}" for k in range(KNOTS)]
 

@@ -13,8 +13,9 @@ from typing import Any
 
 from motorid.diagnosis.evidence import compare_errors
 from motorid.diagnosis.hardly import hardly_moved
+from motorid.diagnosis.judgement import judgement
 from motorid.diagnosis.judging import Node
-from motorid.diagnosis.outside import Outside, judgement, outside
+from motorid.diagnosis.outside import Outside, outside
 from motorid.diagnosis.parts import affordable
 from motorid.diagnosis.results import Adequacy, Candidate, Ladder, Rung
 from motorid.diagnosis.search import Search, library

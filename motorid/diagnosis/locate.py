@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from motorid.diagnosis.evidence import effective_samples
-from motorid.diagnosis.forms import Form
 from motorid.diagnosis.results import Binned, Missing
+from motorid.diagnosis.shapes import Form
 from motorid.diagnosis.smoother import Smoothed, smooth
 from motorid.fit import Fit
 from motorid.integrate.grid import Array
@@ -80,9 +80,10 @@ def locate(fit: Fit) -> Missing:
 def acting_like(missing: Missing, form: Form) -> Missing:
     """Return `missing` with what is known of its form: which balance it acts in, and what it changes with."""
     apart = missing.where is not None or form.balance == "sensor"
-    where = {"torque": "mechanical", "voltage": "electrical", "sensor": "sensor"}[form.balance]
-    lead = f"The {form.balance} balance fails." if apart else missing.text.split(".")[0] + "."
-    lead = "The measurement fails." if form.balance == "sensor" else lead
+    where = {"torque": "mechanical", "voltage": "electrical", "both": "electrical", "sensor": "sensor"}[form.balance]
+    fails = {"both": "Both balances fail.", "sensor": "The measurement fails."}
+    lead = fails.get(form.balance, f"The {form.balance} balance fails.")
+    lead = lead if apart else missing.text.split(".")[0] + "."
     first = max(missing.regions, key=lambda r: missing.regions[r])
     text = f"{lead} What is missing acts like {form.text}. {_region(first, missing.regions)}"
     return replace(missing, where=where if apart else None, acts_like=form.text, text=text)
