@@ -13,6 +13,7 @@ from motorid.parameters import Parameter
 
 WORST_CONDITION = 1e4  # of the column-scaled Jacobian
 HOPELESS = 1e6  # condition number beyond which a direction counts as open
+LENGTHS = ("rad", "m")  # a gap that runs to its limit is none
 PHASE_KNOWN = 0.5  # rad, standard deviation: beyond it an amplitude is not told from none
 
 
@@ -22,7 +23,8 @@ def objections(fit: Fit, added: Effect) -> str:
     for p in pars:
         if p.at_least and fit.values[p.name] < 0.98 * fit.values[p.at_least]:
             return f"{p.name} came out below {p.at_least}, which is not physical"
-        if added.includes and p.grid and p.vary and not 1.02 * p.lower < fit.values[p.name] < 0.98 * p.upper:
+        inside = 1.02 * p.lower < fit.values[p.name] < 0.98 * p.upper
+        if p.grid and p.vary and not inside and (added.includes or p.unit in LENGTHS):
             return f"{p.name} runs to its limit: nothing of this shape is in the data"
         if p.vary and p.null is not None and not p.positive and fit.values[p.name] <= p.lower == p.null:
             return f"{p.name} goes to {p.null:g}: the data do not want it, or only with the wrong sign"

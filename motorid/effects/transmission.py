@@ -8,6 +8,8 @@ from motorid.equations import Equations
 from motorid.model import effect
 from motorid.parameters import P
 
+CORNER = 0.01  # of half a gap: a stiff shaft is twisted by much less than the gap, and a wide corner is a soft shaft
+
 
 def _two_inertias(m: Equations, share, resonance, zeta, twist_of, name: str) -> None:
     """Split J into motor and load joined by a shaft; `twist_of` shapes the elastic twist (a gap).
@@ -48,7 +50,7 @@ def backlash(
 ):
     """Free play between two inertias, elastic in contact. Nordin & Gutman, Automatica 38(10), 2002."""
     half = gap / 2
-    width = 0.1 * half
+    width = CORNER * half
 
     def in_contact(twist):
         # Smooth dead zone (softplus of square-root type) and its slope.
