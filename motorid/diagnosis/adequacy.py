@@ -44,7 +44,9 @@ NAMES = {
 }
 
 
-def adequacy(fit: Fit, scores: Sequence[Score] = (), false_alarm: float = FALSE_ALARM) -> Adequacy:
+def adequacy(
+    fit: Fit, scores: Sequence[Score] = (), false_alarm: float = FALSE_ALARM, level: float | None = None
+) -> Adequacy:
     """Judge whether the residuals of `fit` are noise.
 
     Parameters
@@ -54,6 +56,8 @@ def adequacy(fit: Fit, scores: Sequence[Score] = (), false_alarm: float = FALSE_
         Of the effects that might be added, see `rank`.
     false_alarm : float
         Probability of calling an adequate model inadequate.
+    level : float, optional
+        The p-value that does so, where another test has a say too; by default `false_alarm`.
 
     Returns
     -------
@@ -72,7 +76,7 @@ def adequacy(fit: Fit, scores: Sequence[Score] = (), false_alarm: float = FALSE_
     far = [
         c for c, facts in channels.items() if facts["ratio"] > (LARGEST_RATIO if c != "theta" else LARGEST_RATIO / 2)
     ]
-    adequate = p_value > false_alarm and not far
+    adequate = p_value > (false_alarm if level is None else level) and not far
     for c, facts in channels.items():
         facts["p_value"] = min([1.0, *(t["p"] for t in tests if t["channel"] == c)])
     text = _text(adequate, channels, material, far, false_alarm)

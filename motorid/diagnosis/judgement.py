@@ -17,18 +17,22 @@ from motorid.diagnosis.trial import BLOCKS, FAILURES, HeldOut
 from motorid.fit import Fit
 
 PREDICTED = 0.1  # of the squared misfit: what a form must explain, on data held out too, that is no noise
+CLEAR = 1e-3  # p-value of errors larger than the noise that needs no second test: few coloured samples tell little
 
 
 def judgement(fit: Fit, scores: Sequence[Score], held: HeldOut) -> Adequacy:
-    """Judge whether the residuals of `fit` are noise; errors larger than it must not be predictable by any form."""
+    """Judge whether the residuals of `fit` are noise; errors larger than it are, if no form predicts them.
+
+    Unless what they depend on is beyond doubt.
+    """
     judged = adequacy(fit, scores)
-    if not judged.adequate or not far(fit):
+    if not far(fit) or not (doubtful := adequacy(fit, scores, level=CLEAR)).adequate:
         return judged
     try:
         found = predicted(fit, held)
     except FAILURES:
         return judged
-    return following(judged, found[0].text, found[1]) if found else unpredicted(judged)
+    return following(judged, found[0].text, found[1]) if found else unpredicted(doubtful)
 
 
 def predicted(fit: Fit, held: HeldOut) -> tuple[Form, float] | None:
