@@ -10,6 +10,7 @@ import numpy as np
 from motorid.descent import Descent, descend
 from motorid.diagnosis.evidence import Errors
 from motorid.diagnosis.rank import uses_angle
+from motorid.diagnosis.revival import let_go, revived
 from motorid.errors import FitError, ModelError, SimulationError
 from motorid.experiment import Experiment
 from motorid.fit import Fit
@@ -28,7 +29,6 @@ BLOCKS = 10  # contiguous parts of each run; every other one is held out where t
 GOING_ON = 4  # times, where the last descent ends at its limit
 ROUGH = 1e-4  # accuracy of the integration while starts are compared
 LOST = 0.2  # NRMSE of a channel
-ALIVE = 10.0  # standard deviations that a change by a factor of e makes
 SUBSTEPS = 24  # per sample: what needs more cannot be seen in these samples, unless it is cheap
 CHEAP = 200_000  # steps of integration
 ROOM = 10.0  # factor beyond its grid that a shape parameter may run to
@@ -130,7 +130,7 @@ def refit(fit: Fit, model: Model, starts: Sequence[Mapping[str, float]]) -> Fit 
     astray; then the model's angle takes over, unless it drifts too far for them (periods of the angle pass).
     """
     model = _bounded(fit, model)
-    alive = _revived(fit, model)
+    alive = revived(fit, model)
     angular = any(uses_angle(e) for e in model.effects) and not any(uses_angle(e) for e in fit.model.effects)
     raced = []
     for start in (*(starts or ({},)), *_own_starts(fit, model)):
@@ -148,7 +148,7 @@ def refit(fit: Fit, model: Model, starts: Sequence[Mapping[str, float]]) -> Fit 
         done = _released(best) if angular else descend(best, QUICK, stages=stages)
     except FAILURES:
         return None
-    return _polished(fit, _from(done.problem, done.solution.q))
+    return _polished(fit, let_go(_from(done.problem, done.solution.q), fit))
 
 
 def _released(measured: Problem) -> Descent:
@@ -199,22 +199,6 @@ def _race(fit: Fit, model: Model, start: Mapping[str, float], angular: bool) -> 
         return None
     spent = sum(int(r.grid.substeps.sum()) for r in done.problem.runs)
     return done if spent <= max(SUBSTEPS * sum(r.experiment.n for r in problem.runs), CHEAP) else None
-
-
-def _revived(fit: Fit, model: Model) -> Model:
-    """Return the model with collapsed parameters put back to where they matter.
-
-    A plain fit may drive a logarithmic parameter (friction, inductance) to nothing; there its gradient vanishes, and
-    no refit would ever bring it back.
-    """
-    names = [p.name for p in fit.problem.unknown]
-    back = {}
-    for p in model.parameters.values():
-        if p.positive and p.vary and p.name in names:
-            slope = float(np.linalg.norm(fit.jacobian[:, names.index(p.name)]))
-            if 0 < p.value * slope < ALIVE:
-                back[p.name] = float(np.clip(3 * ALIVE / slope, p.lower, min(p.upper, 1e6 * p.value)))
-    return model.start_at(back) if back else model
 
 
 def _bounded(fit: Fit, model: Model) -> Model:
