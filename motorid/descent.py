@@ -22,11 +22,13 @@ from motorid.prepared import top_speed
 from motorid.problem import Problem
 
 ON_THE_WAY = ((1e-7, 60), (1e-6, 60))  # ftol and iterations of the first stage, and of those between
+LOWER = 0.98  # of the cost with a wider sgn, or the narrower one is not worth it
 ROUNDS = 4  # of refining the sub-steps
 IMBALANCE = 3.0  # between channels, in misfit over noise, above which the misfit decides the weights
 
 # Looks again from the start: by the other weights first?, first damping, start moved by e to this power.
 LOOKS = ((True, 0.1, 0.0), (False, 10.0, 0.0), (True, 10.0, 0.0), (False, 1.0, 1.5), (True, 1.0, 1.5))
+WILD = 1e7  # times the whole residual: more than any change by a factor of e does to one sample
 FAR = 1.0  # on the logarithmic scale: how far a descent goes before its sub-steps are chosen again
 FLAT = 0.03  # of the misfit: what a change by a factor of e does at least, if the data have a say in it
 
@@ -67,8 +69,11 @@ def descend(problem: Problem, options: LevenbergMarquardt, callback: Callback = 
     done = _settled(problem, options, callback)
     history += done.history
     while (other := narrower(done.problem, done.solution.q)) is not None:
-        done = _settled(other, options, callback)
-        history += done.history
+        again = _settled(other, options, callback)
+        history += again.history
+        if again.solution.history[-1] > LOWER * done.solution.history[-1]:
+            break  # the creep did not matter, and a sgn so narrow only makes the model stiff and its slopes wild
+        done = again
     return replace(done, history=tuple(history))
 
 
@@ -81,7 +86,7 @@ def _settled(problem: Problem, options: LevenbergMarquardt, callback: Callback) 
         history += found.history
         moved = np.max(np.abs(found.q - q), initial=0.0) > 1e-3
         q = found.q
-        if found.status == "limit" or not moved or problem.fine_enough(q):
+        if found.status == "limit" or problem.fine_enough(q) or not (moved or found.status == "stalled"):
             break
     return Descent(problem, found, tuple(history))
 
@@ -105,8 +110,15 @@ class _Following:
 
     def both(self, q: Array) -> tuple[Array, Array]:
         if np.max(np.abs(q - self._chosen_at), initial=0.0) > FAR:
-            self.problem, self._chosen_at = self.problem.refined(q), q
-        return self.problem.residual_and_jacobian(q)
+            self._choose(q)
+        r, jac = self.problem.residual_and_jacobian(q)
+        if np.max(np.abs(jac), initial=0.0) > WILD * np.linalg.norm(r) and not np.array_equal(q, self._chosen_at):
+            self._choose(q)  # a sgn that these steps jump over makes slopes of nothing
+            r, jac = self.problem.residual_and_jacobian(q)
+        return r, jac
+
+    def _choose(self, q: Array) -> None:
+        self.problem, self._chosen_at = self.problem.refined(q), q
 
 
 def descend_surely(problem: Problem, options: LevenbergMarquardt, callback: Callback = None, *,

@@ -9,6 +9,7 @@ from motorid.problem import Problem
 
 WIDEST = 0.03  # first width of sgn over the highest speed
 NARROWER = 6.0  # at most, from one stage to the next
+NOISE = 1.1  # misfit over noise of an angle that has no creep left in it
 CLEARLY = 1.5  # factor between widths that is worth another descent
 
 
@@ -29,18 +30,15 @@ def narrow_enough(problem: Problem) -> float:
 
 
 def narrower(problem: Problem, q: Array) -> Problem | None:
-    """Return the problem with a narrower sgn, where a loaded, stuck motor's creep would show.
+    """Return the problem with a narrower sgn, where a loaded, stuck motor's creep may show in the angle.
 
-    The noise of the angle sets the width of a model that reaches the noise. Beside a misfit many times as large
-    the same creep does not show, and a sgn so narrow would only make the model stiff and its slopes wild.
+    None where the angle's misfit is noise already, or the width is what that noise asks for.
     """
     if problem.width is None or not smooths(problem) or problem.width > 1.01 * narrow_enough(problem):
         return None
-    least = narrowest(problem)
-    width = max(least, min(least * misfit_over_noise(problem, q).get("theta", 1.0), problem.width))
-    if width > problem.width / CLEARLY:
+    width = max(narrowest(problem), problem.width / NARROWER)
+    if width > problem.width / CLEARLY or misfit_over_noise(problem, q).get("theta", 0.0) < NOISE:
         return None
-    width = max(width, problem.width / NARROWER)
     return problem.for_model(problem.model.start_at(without_width(problem, q))).tuned(width=width)
 
 

@@ -22,6 +22,7 @@ from motorid.parameters import Parameter
 _levels: WeakKeyDictionary[Experiment, dict[str, float]] = WeakKeyDictionary()
 CREEP_SHARE = 0.2  # of the angle's noise that a stuck motor may creep
 NARROWEST = 1e-5  # of the highest speed
+FINEST = 256  # sub-steps per sample
 SGN_WIDTH_SHARE = 1e-3  # of the highest speed: wider smoothing looks like one more missing effect
 
 
@@ -193,7 +194,19 @@ def _suited_width(runs: tuple[Experiment, ...]) -> float | None:
     # the angle, or the creep looks like an effect of its own.
     creep = min((CREEP_SHARE * noise_level(r.outputs["theta"], r.t) / still for r in runs if "theta" in r.outputs
                  and (still := _longest_standstill(r, speed)) > 0), default=np.inf)
-    return float(np.clip(creep, NARROWEST * speed, SGN_WIDTH_SHARE * speed))
+    # Narrower than the finest sub-step's change of speed, it is jumped over, and slopes come out wild.
+    jump = max(_speed_gained(r) for r in runs) / FINEST
+    return float(np.clip(creep, max(NARROWEST * speed, jump), SGN_WIDTH_SHARE * speed))
+
+
+def _speed_gained(run: Experiment) -> float:
+    """Change of speed per sample where the angle is accelerated most, rad/s; 0 without an angle."""
+    if "theta" not in run.outputs:
+        return 0.0
+    speeds = slopes(run.outputs["theta"], run.t)
+    if len(speeds) < 3:
+        return 0.0
+    return float(np.percentile(np.abs(np.diff(speeds)), 95)) * len(speeds) / run.n
 
 
 def _longest_standstill(run: Experiment, speed: float) -> float:
