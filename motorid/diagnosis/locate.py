@@ -90,7 +90,8 @@ def acting_like(missing: Missing, form: Form) -> Missing:
 
 
 def _region(first: str, regions: Mapping[str, float]) -> str:
-    return f"Most of the misfit ({100 * regions[first]:.0f} %) lies in {first}."
+    place = "steady motion" if first == "steady" else first
+    return f"Most of the misfit ({100 * regions[first]:.0f} %) lies in {place}."
 
 
 def _walk(fit: Fit, size: Array) -> tuple[float, list[Smoothed]]:
