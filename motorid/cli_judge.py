@@ -35,11 +35,12 @@ def diagnose(
     Example: motorid diagnose run*.csv --validate check*.csv --report found.html
     """
     from motorid.diagnosis import diagnose as look
+    from motorid.diagnosis.parts import fit_affordably
 
     records = choices.read(runs)
     held_out = choices.read(validate) if validate else []
     notes = notes_of(records, held_out)
-    before = choices.fit(records)
+    before = fit_affordably(records, choices.fit)
     own = list(own_effects(choices.effects_from).values()) if choices.effects_from else []
     with progress("Looking for what is missing") as advance:
         found = look(before, held_out or None, also=own, max_effects=max_effects,

@@ -65,7 +65,7 @@ def diagnose(
     """
     say = progress or (lambda word: None)
     own = tuple(also)
-    whole, fit = fit, affordable(fit)
+    fit = affordable(fit)
     search = Search(fit, validate, library(effects, own), map, say)
     found, other = settled(climb(search, max_effects, say))
     judged = found.first
@@ -92,7 +92,7 @@ def diagnose(
         same = {name: p for node in found.path[1:] for name, p in search.inseparable(node).items()}
         text = f"{text} {inseparable_remark(same)}".rstrip()
         suggestion = _suggestion(found)
-    remarks = (parts_remark(whole, fit), outliers_remark(ladder.best), closed_loop_remark(fit), suggestion)
+    remarks = (parts_remark(fit), outliers_remark(ladder.best), closed_loop_remark(fit), suggestion)
     text = " ".join(t for t in (text, *remarks) if t)
     return Diagnosis(
         verdict,

@@ -13,12 +13,17 @@ from motorid.parameters import Parameter
 
 WORST_CONDITION = 1e4  # of the column-scaled Jacobian
 HOPELESS = 1e6  # condition number beyond which a direction counts as open
+KNOWN = 0.3  # of a parameter, its standard deviation: determined
+EMPTIED = 1e-2  # of its value before: it has vanished
 LENGTHS = ("rad", "m")  # a gap that runs to its limit is none
 PHASE_KNOWN = 0.5  # rad, standard deviation: beyond it an amplitude is not told from none
 
 
-def objections(fit: Fit, added: Effect) -> str:
-    """Say why the refit must not be believed: a wrong sign, a shape at its limit; empty if it may be."""
+def objections(fit: Fit, added: Effect, before: Fit | None = None) -> str:
+    """Say why the refit must not be believed: a wrong sign, a shape at its limit; empty if it may be.
+
+    `before` is the fit without the effect.
+    """
     pars = [fit.problem.model.parameters[p.name] for p in added.parameters]
     for p in pars:
         if p.at_least and fit.values[p.name] < 0.98 * fit.values[p.at_least]:
@@ -30,12 +35,27 @@ def objections(fit: Fit, added: Effect) -> str:
             return f"{p.name} goes to {p.null:g}: the data do not want it, or only with the wrong sign"
         if p.vary and np.isfinite(p.upper) and fit.values[p.name] > 0.98 * p.upper and not _was_narrowed(p, added):
             return f"{p.name} runs to {p.upper:g}, the limit of what is physical"
-    return _adrift(fit, pars) or unresolved(fit, added)
+    return _adrift(fit, pars) or unresolved(fit, added) or (_emptied(fit, added, before) if before else "")
 
 
 def _was_narrowed(p: Parameter, added: Effect) -> bool:
     """Tell whether the limit is one set for these records, and not one of physics."""
     return next(q.upper for q in added.parameters if q.name == p.name) != p.upper
+
+
+def _emptied(fit: Fit, added: Effect, before: Fit) -> str:
+    """Say so where a sensor's effect does away with a parameter of the motor that the data had determined.
+
+    Friction of another kind may well take the place of all of the viscous one; a sensor cannot take the place of an
+    inductance, it only buys its gain there.
+    """
+    if added.balance != "sensor":
+        return ""
+    for p in before.problem.unknown:
+        known = p.positive and before.std.get(p.name, np.inf) < KNOWN * before.values.get(p.name, 0.0)
+        if known and fit.values[p.name] < EMPTIED * before.values[p.name]:
+            return f"{p.name} goes to nothing with it, though the data determine it without"
+    return ""
 
 
 def _adrift(fit: Fit, pars: Sequence[Parameter]) -> str:

@@ -135,7 +135,7 @@ class Search:
         drop = _drop(node, train)
         values = {p.name: fit.values[p.name] for p in effect.parameters}
         candidate = replace(candidate, refit_drop=drop, parameters=values, fit=fit)
-        why = objections(fit, effect)
+        why = objections(fit, effect, node.fit)
         if why:
             return None, replace(candidate, reason=why)
         gain = compare_errors(node.train, train, self.held.noise)

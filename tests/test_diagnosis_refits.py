@@ -1,0 +1,92 @@
+"""Refits are judged only when they are finished, where they mean something, and on parts that show what is there."""
+
+from dataclasses import replace
+
+import numpy as np
+
+import motorid as mi
+from motorid.diagnosis import parts, trial
+from motorid.diagnosis.objections import objections
+from motorid.diagnosis.revival import ALIVE, let_go, revived
+from motorid.effects import LIBRARY
+from motorid.problem import Problem
+from motorid.simulate import simulate
+
+TRUE = {"R": 1.2, "L": 2e-3, "K": 0.05, "b": 2e-5, "J": 3e-5}
+
+
+def _run(model, seed=0, n=600, dt=1e-3):
+    t, rng = dt * np.arange(n), np.random.default_rng(seed)
+    blank = mi.Experiment(t, {"v": 6 * np.sign(np.sin(14 * t + 0.1))}, {"i": np.zeros(n), "omega": np.zeros(n)},
+                          sigma={"i": 0.01, "omega": 0.1})
+    clean = simulate(model, blank, initial="rest", estimate_initial=False)[0].outputs
+    return blank.with_(outputs={c: clean[c] + s * rng.normal(size=n) for c, s in blank.sigma.items()})
+
+
+def test_a_refit_goes_on_beyond_its_limit_of_iterations(monkeypatch):
+    run = _run(mi.dc_motor(**TRUE))
+    monkeypatch.setattr(trial, "POLISH", replace(trial.POLISH, max_iterations=2))
+    far = Problem(mi.dc_motor(R=3.0, L=5e-3, K=0.08, b=1e-4, J=8e-5), (run,))
+    once = trial.descend(far, trial.POLISH, stages=False)
+    on = trial._converged(far)
+    assert once.solution.status == "limit"
+    assert on.history[-1] < 0.5 * once.history[-1]
+
+
+def test_what_stays_without_a_say_is_let_go_and_what_matters_is_kept():
+    run = _run(mi.dc_motor(**TRUE))
+    fit = mi.fit(mi.dc_motor(), run)
+    dead = replace(fit, jacobian=fit.jacobian * np.where([p.name == "L" for p in fit.problem.unknown], 1e-9, 1.0))
+    assert revived(fit, fit.model).values["L"] == fit.values["L"]
+    assert revived(dead, fit.model).values["L"] > 10 * ALIVE * fit.values["L"]
+    # Where the fit had a dead inductance, but the records now want one, that is kept.
+    had = replace(dead, values={**fit.values, "L": 1e-8},
+                  problem=fit.problem.for_model(fit.model.start_at({"L": 1e-8})))
+    assert let_go(fit.problem.for_model(fit.model), had).model.values["L"] == fit.values["L"]
+    # And where it makes no difference, it goes back.
+    same = replace(dead, values={**fit.values, "L": fit.values["L"] * 1.0001},
+                   problem=fit.problem.for_model(fit.model.start_at({"L": fit.values["L"] * 1.0001})))
+    assert let_go(fit.problem.for_model(fit.model), same).model.values["L"] == same.values["L"]
+
+
+def test_a_gap_at_its_limit_is_refused():
+    run = _run(mi.dc_motor(**TRUE))
+    fit = mi.fit(mi.dc_motor(), run)
+    model = (fit.model + mi.effects.backlash).start_at({"r_gap": 0.5, "gap": 0.02})
+    problem = trial._bounded(fit, model)
+    low = problem.parameters["gap"].lower
+    values = {**problem.values, "gap": low}
+    at_limit = replace(fit, problem=fit.problem.for_model(problem), values=values)
+    assert "gap runs to its limit" in objections(at_limit, LIBRARY["backlash"])
+    inside = replace(at_limit, values={**values, "gap": 3 * low})
+    assert "gap" not in objections(inside, LIBRARY["backlash"])
+
+
+def test_a_sensor_that_empties_a_known_parameter_is_refused():
+    run = _run(mi.dc_motor(**TRUE))
+    before = mi.fit(mi.dc_motor(), run)
+    after = trial.refit(before, before.model + mi.effects.current_lag, ({"T_i": 5e-4},))
+    assert after is not None
+    assert "goes to nothing" not in objections(after, LIBRARY["current_lag"], before)
+    emptied = replace(after, values={**after.values, "L": 1e-9})
+    assert "L goes to nothing" in objections(emptied, LIBRARY["current_lag"], before)
+
+
+def test_parts_show_both_directions_and_what_is_rare():
+    n, dt = 12000, 1e-3
+    t = dt * np.arange(n)
+    omega = np.where(t < 9.0, 50.0, -50.0) * (1 + 0.02 * np.sin(7 * t))
+    run = mi.Experiment(t, {"v": omega / 10}, {"omega": omega})
+    chosen = parts.parts_of([run], 2000 / n)
+    assert chosen is not None
+    assert len(chosen) == 2
+    speeds = np.concatenate([p.outputs["omega"] for p in chosen])
+    assert speeds.min() < -40
+    assert speeds.max() > 40
+    assert all(p.n == parts.PART for p in chosen)
+
+
+def test_parts_that_are_nearly_all_are_not_taken():
+    t = 1e-3 * np.arange(2500)
+    run = mi.Experiment(t, {"v": np.sin(t)}, {"omega": np.sin(t)})
+    assert parts.parts_of([run], 0.9) is None
