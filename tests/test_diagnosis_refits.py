@@ -90,3 +90,15 @@ def test_parts_that_are_nearly_all_are_not_taken():
     t = 1e-3 * np.arange(2500)
     run = mi.Experiment(t, {"v": np.sin(t)}, {"omega": np.sin(t)})
     assert parts.parts_of([run], 0.9) is None
+
+
+def test_a_parameter_that_was_open_before_may_be_emptied():
+    run = _run(mi.dc_motor(**TRUE))
+    before = mi.fit(mi.dc_motor(), run)
+    names = [p.name for p in before.problem.unknown]
+    open_ = replace(before, jacobian=before.jacobian * np.where(np.array(names) == "L", 0.0, 1.0))
+    assert open_.std["L"] is None
+    after = trial.refit(before, before.model + mi.effects.current_lag, ({"T_i": 5e-4},))
+    assert after is not None
+    emptied = replace(after, values={**after.values, "L": 1e-9})
+    assert "goes to nothing" not in objections(emptied, LIBRARY["current_lag"], open_)

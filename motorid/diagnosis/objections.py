@@ -52,8 +52,9 @@ def _emptied(fit: Fit, added: Effect, before: Fit) -> str:
     if added.balance != "sensor":
         return ""
     for p in before.problem.unknown:
-        known = p.positive and before.std.get(p.name, np.inf) < KNOWN * before.values.get(p.name, 0.0)
-        if known and fit.values[p.name] < EMPTIED * before.values[p.name]:
+        std = before.std.get(p.name) if p.positive else None
+        was, now = (f.values.get(p.name, 0.0) for f in (before, fit))
+        if std is not None and std < KNOWN * was and now < EMPTIED * was:
             return f"{p.name} goes to nothing with it, though the data determine it without"
     return ""
 

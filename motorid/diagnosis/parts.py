@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from motorid.errors import MotoridError
 from motorid.experiment import Experiment
@@ -91,7 +92,7 @@ def _telling(run: Experiment, count: int) -> list[int]:
     return sorted(int(begins[k]) for k in chosen)
 
 
-def _kinds(run: Experiment) -> list[tuple[Array, int]]:
+def _kinds(run: Experiment) -> list[tuple[NDArray[np.int_], int]]:
     """Return to which of n levels of speed, of voltage and of time each sample belongs, with n."""
     speed = np.gradient(angle_signal(run), run.t)
     if "omega" in run.outputs:
@@ -99,7 +100,7 @@ def _kinds(run: Experiment) -> list[tuple[Array, int]]:
     return [(_level(speed), LEVELS), (_level(run.inputs["v"]), LEVELS), (TIMES * np.arange(run.n) // run.n, TIMES)]
 
 
-def _level(y: Array) -> Array:
+def _level(y: Array) -> NDArray[np.int_]:
     """Return in which of `LEVELS` equal steps between its extremes each sample lies."""
     low, high = np.quantile(y, [0.005, 0.995])
     return np.clip(LEVELS * (y - low) / max(high - low, 1e-300), 0, LEVELS - 1).astype(int)
