@@ -71,14 +71,15 @@ class Search:
         return self._scores[node.key]
 
     def inseparable(self, node: Node) -> dict[str, tuple[str, ...]]:
-        """Return the effects that do no more than a combination of `node`'s parameters, those of effects among them.
+        """Return the effects that do no more than a combination of parameters of effects that `node` has.
 
-        Only of a model that was expanded: one with nothing but noise left has no use for them.
+        Only of a model that was expanded: one with nothing but noise left has no use for them. A combination with
+        the motor's own parameters (the gain of a sensor among them) is nothing that a reader would ask for.
         """
         if node.key not in self._scores:
             return {}
         added = {p.name for e in node.fit.model.effects for p in e.parameters}
-        return {s.effect.name: s.same_as for s in self.scores(node) if added & set(s.same_as)}
+        return {s.effect.name: s.same_as for s in self.scores(node) if s.same_as and added >= set(s.same_as)}
 
     # -- expanding -------------------------------------------------------------------------------------
     def expand(self, node: Node) -> tuple[list[Node], list[Candidate]]:
