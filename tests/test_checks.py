@@ -63,7 +63,8 @@ def test_nothing_is_said_about_nothing():
 
 def test_real_records_are_remarked_on_with_reason(real):
     expected = {
-        "emps": [], "fibo": ["17 single samples of the speed"], "frc": ["never reverses"], "furuta_base": ["the angle advances 1.26"],
+        "emps": [], "fibo": ["17 single samples of the speed"], "frc": ["never reverses"],
+        "furuta_base": ["the angle advances 1.26"],
         "odri_mn4004": ["is 1 V from beginning to end", "uneven"], "xl330": ["uneven"],
         "unmotor": ["never reverses"],
     }
