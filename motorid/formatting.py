@@ -43,6 +43,8 @@ def with_error(value: float, std: float | None, unit: str = "") -> str:
     if std == 0:
         return f"{number(value, 6)}{tail} (held)"
     place = _place(std)
+    if 0.01 * std < abs(value) < std:  # rounded to so large an error, nothing of it would be left
+        place = max(min(place, _place(abs(value))), place - 2)
     power = _power(max(abs(value), std), -2)
     exact, error = _rounded(value, place, power), _rounded(std, place, power)
     if power:

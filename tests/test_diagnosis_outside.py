@@ -162,3 +162,11 @@ def test_where_the_errors_are_too_large_to_be_linear_the_form_is_fitted(plant):
     found = diagnosed(runs, ("coulomb", "coulomb_asymmetric", "constant_load"))
     is_like(found, "a friction that changes with the angle")
     assert stands_in(found, "coulomb", "coulomb_asymmetric")
+
+
+def test_a_sensor_is_blamed_only_where_another_contradicts_it(lab):
+    """With an angle and nothing else of the motion, any error of the model would be one of the sensor."""
+    both, alone = (mi.fit(mi.dc_motor(), runs_of(lab, {}, channels=c)) for c in (ANGLE, ("i", "theta")))
+    balances = [{f.balance for f in linearised(fit, None)[0].forms} for fit in (both, alone)]
+    assert "sensor" in balances[0]
+    assert "sensor" not in balances[1]

@@ -77,3 +77,16 @@ def test_odri_cogs_72_times_a_turn(real):
         tangent = Tangent.of(mi.fit(model, run))
         assert likely_orders(tangent, LIBRARY["cogging"], 3)[0] == 72
         assert score(tangent, LIBRARY["cogging"]).stands_out
+
+
+def test_xl330_rubs_more_the_more_it_carries(real):
+    """Coulomb friction alone does not help this servo."""
+    columns = {"t": "t_s", "v": "voltage_V", "theta": "position_rad"}
+    soft, stiff = (mi.read_runs([real / "xl330" / f"{k}_*.csv"], columns=columns) for k in ("kp100", "kp400"))
+    soft, stiff = ([r.without("omega") for r in runs] for runs in (soft, stiff))
+    found = diagnosed(soft, stiff, mi.torque_driven() + mi.effects.gravity)
+    assert found.effects == ("load_friction",)
+    refits = {c.effect: c.refit_drop for c in found.ranking if c.refit_drop is not None}
+    assert refits["load_friction"] > 2 * refits["coulomb"]
+    first, last = found.ladder.rungs[0], found.ladder.rungs[-1]
+    assert last.validation_nrmse["theta"] < 0.25 * first.validation_nrmse["theta"]

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from motorid.diagnosis.response import Response, responses_of
 from motorid.diagnosis.shapes import FORMS, KNOTS, Form, basis_of, orders_of, ranges_of, shown
 from motorid.equations import Equations
+from motorid.errors import SimulationError
 from motorid.fit import Fit
 from motorid.integrate.grid import Array
 from motorid.model import Effect
@@ -28,6 +29,7 @@ from motorid.problem import Problem
 from motorid.simulate import Simulation, simulated
 
 START = 0.01  # of the natural torque
+UNBOUNDED = 1e9  # in units of the noise, per unit of a form
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,9 +143,12 @@ def _driven(answer: Response, c: Array, bases: Mapping[Form, Array]) -> Array:
     volts = np.concatenate([_share(f, b, answer, "voltage")[:-1] for f, b in bases.items()], axis=1)
     torques = np.concatenate([_share(f, b, answer, "torque")[:-1] for f, b in bases.items()], axis=1)
     state, out = np.zeros((nx, volts.shape[1])), np.zeros((n, ny, volts.shape[1]))
-    for j in range(n - 1):
-        state = answer.a[j] @ state + answer.b[j, :, :1] * volts[j] + answer.b[j, :, 1:] * torques[j]
-        out[j + 1] = c[j + 1] @ state
+    with np.errstate(over="ignore", invalid="ignore"):
+        for j in range(n - 1):
+            state = answer.a[j] @ state + answer.b[j, :, :1] * volts[j] + answer.b[j, :, 1:] * torques[j]
+            out[j + 1] = c[j + 1] @ state
+    if not np.all(np.abs(out) < UNBOUNDED):  # or not a number
+        raise SimulationError("the model's answer to small changes grows without bound along these records.")
     return out.reshape(n * ny, -1)
 
 

@@ -75,8 +75,8 @@ def ranges_of(signals: Sequence[Mapping[str, Array]]) -> dict[str, tuple[float, 
 
 def shown(form: Form, fit: Fit, ranges: Mapping[str, tuple[float, float]]) -> bool:
     """Tell whether the records can show a form: its quantity is known, its balance is in the model."""
-    if form.channel and form.channel not in fit.problem.outputs:
-        return False
+    if form.channel and not {"omega", "theta"} <= set(fit.problem.outputs):
+        return False  # one measure of the motion needs the other to be told wrong
     if form.on not in ranges or ranges[form.on][0] == ranges[form.on][1]:
         return False
     if form.balance in ("voltage", "both") and "i" not in fit.problem.outputs:
