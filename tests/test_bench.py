@@ -446,8 +446,12 @@ MAIN = (sys.executable, "-W", "error", "-m", "motorid.cli")
 
 
 def start(*words: object) -> subprocess.Popen[str]:
-    return subprocess.Popen([*MAIN, *map(str, words)], text=True,
-                            stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    """Start a command that hears Ctrl-C, even where the tests run in the background of a shell, which silences it."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        return subprocess.Popen([*MAIN, *map(str, words)], text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def finish(process: subprocess.Popen[str], seconds: float = 120) -> tuple[int, str, str]:

@@ -84,7 +84,7 @@ def test_xl330_rubs_more_the_more_it_carries(real):
     columns = {"t": "t_s", "v": "voltage_V", "theta": "position_rad"}
     soft, stiff = (mi.read_runs([real / "xl330" / f"{k}_*.csv"], columns=columns) for k in ("kp100", "kp400"))
     soft, stiff = ([r.without("omega") for r in runs] for runs in (soft, stiff))
-    found = diagnosed(soft, stiff, mi.torque_driven() + mi.effects.gravity)
+    found = diagnosed(soft, stiff, mi.torque_driven() + mi.effects.gravity, ("coulomb", "load_friction"))
     assert found.effects[0] == "load_friction"
     refits = {c.effect: c.refit_drop for c in found.ranking if c.refit_drop is not None}
     assert refits["load_friction"] > 2 * refits["coulomb"]
