@@ -205,9 +205,10 @@ def _fit_one(name: str, records: Records, model: Model, options: Mapping[str, An
 def _runs(records: Records, reading: Mapping[str, Any]) -> list[Experiment]:
     if isinstance(records, Experiment):
         return [records]
-    if not isinstance(records, str | Path) and all(isinstance(r, Experiment) for r in records):
-        return list(records)  # type: ignore[arg-type]
-    return read_runs(records, **reading)  # type: ignore[arg-type]
+    if isinstance(records, str | Path):
+        return read_runs(records, **reading)
+    paths = [r for r in records if not isinstance(r, Experiment)]
+    return [r for r in records if isinstance(r, Experiment)] + (read_runs(paths, **reading) if paths else [])
 
 
 def _row(found: Fit) -> dict[str, Any]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 
 class MotoridError(Exception):
     """Base of every error that motorid raises on purpose; its text is one clear message for the user."""
@@ -35,11 +37,11 @@ class MissingDependency(MotoridError):
     """An optional package is needed and not installed; the message names the extra to install."""
 
 
-def one_of(word: str, known: object, what: str) -> str:
+def one_of(word: str, known: Iterable[object], what: str) -> str:
     """Say that `word` is not among the `known` names of `what`, and which one may have been meant."""
     import difflib
 
-    names = [str(k) for k in known]  # type: ignore[attr-defined]
+    names = [str(k) for k in known]
     near = difflib.get_close_matches(word, names, n=1, cutoff=0.5)
     hint = f" Did you mean '{near[0]}'?" if near else ""
     return f"unknown {what} '{word}'.{hint} Known: {', '.join(names)}."

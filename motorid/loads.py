@@ -88,7 +88,7 @@ def values(loads: Sequence[Load], sizes: Mapping[Load, float], per_ratio: float 
             other = sizes[load._replace(angle=np.pi / 2)] * (1.0 if load.ratio else per_ratio)
             found[load.name] = float(np.hypot(size, other))
             found[load.phase] = float(np.arctan2(other, size))
-    return {n: v for n, v in found.items() if v != 0.0 or n.startswith("phi")}
+    return {n: v for n, v in found.items() if v != 0.0 or n in {load.phase for load in loads}}
 
 
 __all__ = ["Load", "columns", "loads_of", "values"]

@@ -32,10 +32,13 @@ def numbered(problem: Problem, solve: Callable[[Problem], Fit]) -> Problem:
     for e in waiting:
         present = present.without(e.name)
     while waiting:
+        smaller = problem.for_model(present).tuned(constraints=())  # an order shows without them
+        if not smaller.unknown:
+            break
         try:
-            fit = solve(problem.for_model(present))
+            fit = solve(smaller)
         except FitError:
-            return problem
+            break
         tangent = Tangent.of(fit)
         lines = [(e, line) for e in waiting for line in likely_lines(tangent, e, 1)]
         if not lines:

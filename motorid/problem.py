@@ -275,7 +275,7 @@ class Problem:
         return replace(self, model=model, _runs=runs)
 
     def tuned(self, **fields: Any) -> Problem:
-        """Return the problem with another `balance`, `accuracy` or `width`; the prepared records stay."""
+        """Return the problem with another `balance`, `width` …; the records stay as prepared."""
         return replace(self, **{"_runs": self.runs, **fields})
 
     def with_(self, **fields: Any) -> Problem:

@@ -7,6 +7,7 @@ Each relation is used in two ways. As a *penalty* it adds rows to the least-squa
 from __future__ import annotations
 
 import weakref
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -98,16 +99,17 @@ class Part:
         return np.add.reduceat(values, starts, axis=0) / counts.reshape(-1, *[1] * (values.ndim - 1))
 
 
-class Relation:
+class Relation(ABC):
     """What all constraints share: parts once per problem, and their use as penalties."""
 
+    @abstractmethod
     def _parts(self, problem: Any) -> tuple[Part, ...]:
-        raise NotImplementedError
+        """Return the rows on each run of `problem`."""
 
     @property
+    @abstractmethod
     def name(self) -> str:
         """What messages call it."""
-        raise NotImplementedError
 
     def parts(self, problem: Any) -> tuple[Part, ...]:
         """Return the rows on each run of `problem`, made once."""
@@ -148,8 +150,7 @@ class Weighed(Relation):
         """What messages call it."""
         return self.relation.name
 
-    def parts(self, problem: Any) -> tuple[Part, ...]:
-        """Return the rows of the relation."""
+    def _parts(self, problem: Any) -> tuple[Part, ...]:
         return self.relation.parts(problem)
 
     def penalty(self, c: Array, part: Part) -> tuple[Array, Array]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,7 +63,7 @@ def build(columns: Mapping[str, Array], texts: Texts, layout: Layout, *, name: s
     facts = {**(meta or {}), **_origin(layout), "notes": said, "extra": extra}
     units = {c: places[c].unit.symbol for c in ("v", *outputs)}
     try:
-        return Experiment(t, {"v": v}, outputs, sigma or {}, hold, units, name, facts)  # type: ignore[arg-type]
+        return Experiment(t, {"v": v}, outputs, sigma or {}, cast(Any, hold), units, name, facts)
     except DataError as error:
         raise DataError(str(error).removeprefix(f"{name}: ")) from None
 

@@ -69,7 +69,7 @@ def numbers(values: object, decimal: str = ".") -> tuple[NDArray[np.float64], in
     """Turn a column into float64; count the cells that are neither a finite number nor marked as missing."""
     import pandas as pd
 
-    series = pd.Series(values)  # type: ignore[call-overload]
+    series = pd.Series(values)
     missing = np.array(series.isna(), dtype=bool)
     if pd.api.types.is_numeric_dtype(series.dtype) and not pd.api.types.is_complex_dtype(series.dtype):
         array = series.to_numpy(dtype=float, na_value=np.nan).copy()

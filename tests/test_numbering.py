@@ -57,3 +57,17 @@ def test_order_found_once_stays():
     again = mi.fit(mi.fit(asked, runs[0]).model, runs[1])
     assert again.values["N"] == 9
     assert again.values["A"] == pytest.approx(3e-3, rel=0.05)
+
+
+def test_order_is_found_under_true_constraints_too():
+    asked = mi.dc_motor() + mi.effects.cogging
+    runs = records(asked.replace(**TRUTH, A=3e-3, N=9.0, phi=0.5))[:1]
+    fit = mi.fit(asked, runs, constraints=[mi.CurrentLimit(50.0)], solver=mi.MultipleShooting())
+    assert fit.values["N"] == 9
+    assert fit.values["A"] == pytest.approx(3e-3, rel=0.05)
+
+
+def test_nothing_but_the_effect_left_to_fit():
+    asked = (mi.dc_motor() + mi.effects.cogging).fix(**TRUTH)
+    runs = [r.without("theta") for r in records(asked.replace(A=3e-3, N=12.0, phi=0.5))]
+    assert mi.fit(asked, runs).values["A"] == pytest.approx(3e-3, rel=0.1)

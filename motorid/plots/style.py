@@ -54,7 +54,7 @@ MEASURED, MODEL, RESIDUAL, HELD_OUT = PALETTE["grey"], PALETTE["blue"], PALETTE[
 WIDTH = 9.2  # inches: the text width of a notebook
 POINTS = 1200  # drawn per curve at most: more than a page has pixels for it
 
-STYLE: Mapping[str, Any] = {
+STYLE: Mapping[Any, Any] = {
     "font.size": 9,
     "axes.titlesize": 9,
     "axes.labelsize": 9,
@@ -116,7 +116,7 @@ def styled(draw: Callable[_P, _R]) -> Callable[_P, _R]:
             import matplotlib.pyplot as plt
 
             plt.draw_if_interactive()  # loads the backend: inside the context its set-up would be undone
-        with mpl.rc_context(dict(STYLE)):  # type: ignore[arg-type]
+        with mpl.rc_context(dict(STYLE)):
             return draw(*args, **kwargs)
 
     return inner

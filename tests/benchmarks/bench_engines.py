@@ -14,6 +14,7 @@ import os
 import tempfile
 import time
 from collections.abc import Callable
+from functools import partial
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
@@ -83,8 +84,8 @@ def table(name: str, effects: tuple[str, ...], runs: list[mi.Experiment], repeat
             problem.forget()
             return work(q)
 
-        light = milliseconds(lambda: anew(problem.residual), repeat)  # noqa: B023
-        full = milliseconds(lambda: anew(problem.residual_and_jacobian), repeat)  # noqa: B023
+        light = milliseconds(partial(anew, problem.residual), repeat)
+        full = milliseconds(partial(anew, problem.residual_and_jacobian), repeat)
         error = np.abs(problem.residual(q) - reference).max()
         steps = sum(int(r.grid.substeps.sum()) for r in problem.runs) if "compiled" in vars(engine) else 0
         lines.append(f"  {label:<18}{light:>15.2f}{full:>18.2f}{steps or '':>8}{error:>13.1e}")
