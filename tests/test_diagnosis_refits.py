@@ -8,6 +8,7 @@ import motorid as mi
 from motorid.diagnosis import parts, trial
 from motorid.diagnosis.objections import objections
 from motorid.diagnosis.revival import ALIVE, let_go, revived
+from motorid.diagnosis.verdict import measured_angle_remark
 from motorid.effects import LIBRARY
 from motorid.problem import Problem
 from motorid.simulate import simulate
@@ -102,3 +103,11 @@ def test_a_parameter_that_was_open_before_may_be_emptied():
     assert after is not None
     emptied = replace(after, values={**after.values, "L": 1e-9})
     assert "goes to nothing" not in objections(emptied, LIBRARY["current_lag"], open_)
+
+
+def test_a_model_that_rests_on_the_measured_angle_says_so():
+    run = _run(mi.dc_motor(**TRUE))
+    own = mi.fit(mi.dc_motor() + mi.effects.cogging(N=12), run)
+    led = mi.fit(replace(own.model, angle_input=True, _systems={}), run, start="model")
+    assert measured_angle_remark(own) == ""
+    assert "follows the measured angle" in measured_angle_remark(led)

@@ -19,6 +19,7 @@ from motorid.diagnosis.verdict import (
     balance_of,
     closed_loop_remark,
     inseparable_remark,
+    measured_angle_remark,
     missing_text,
     outliers_remark,
     unexplained_text,
@@ -92,7 +93,9 @@ def diagnose(
         same = {name: p for node in found.path[1:] for name, p in search.inseparable(node).items()}
         text = f"{text} {inseparable_remark(same)}".rstrip()
         suggestion = _suggestion(found)
-    remarks = (parts_remark(fit), outliers_remark(ladder.best), closed_loop_remark(fit), suggestion)
+    last = ladder.best
+    of_last = (measured_angle_remark(last), outliers_remark(last))
+    remarks = (parts_remark(fit), *of_last, closed_loop_remark(fit), suggestion)
     text = " ".join(t for t in (text, *remarks) if t)
     return Diagnosis(
         verdict,

@@ -99,6 +99,16 @@ def moves(before: Fit, after: Fit) -> str:
     return f"The motor's own parameters had absorbed it: {', '.join(said)}."
 
 
+def measured_angle_remark(fit: Fit) -> str:
+    """Say so where effects take the angle from the record, since the model's own drifts too far for them."""
+    if not fit.model.angle_input:
+        return ""
+    return (
+        "What repeats over a turn follows the measured angle here, in the held-out error too, since the model's own "
+        "angle drifts by too much; without a measured angle this model predicts nothing."
+    )
+
+
 def inseparable_remark(same: Mapping[str, tuple[str, ...]]) -> str:
     """Say which effects were refused since parameters of the model together do the same."""
     by_parameters: dict[tuple[str, ...], list[str]] = {}
