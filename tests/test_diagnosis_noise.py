@@ -14,6 +14,7 @@ from motorid.diagnosis.adequacy import adequacy
 from motorid.diagnosis.evidence import Errors, despiked
 from motorid.diagnosis.hardly import hardly_moved
 from motorid.diagnosis.judgement import judgement, predicted
+from motorid.diagnosis.judging import Judge, Node
 from motorid.diagnosis.rank import Score
 from motorid.diagnosis.trial import HeldOut
 from motorid.diagnosis.verdict import _noise_feedback, closed_loop_remark
@@ -133,8 +134,14 @@ def test_an_angle_that_follows_a_smooth_drive_is_no_closed_loop(lab, plant):
 
 def _node(effects, **errors):
     fit = SimpleNamespace(model=SimpleNamespace(effects=[LIBRARY[e] for e in effects]))
-    held = Errors({c: [size * np.ones(50)] for c, size in errors.items()}, dict.fromkeys(errors, 1.0))
-    return SimpleNamespace(fit=fit, key=frozenset(effects), held=held)
+    return SimpleNamespace(fit=fit, key=frozenset(effects), held=_errors(1e3, **errors))
+
+
+def _errors(measured, **sizes):
+    """Errors of those RMS, of channels that measure `measured`."""
+    rng = np.random.default_rng(1)
+    found = {c: [size * rng.choice((-1.0, 1.0), 400)] for c, size in sizes.items()}
+    return Errors(found, dict.fromkeys(sizes, measured))
 
 
 def test_an_effect_that_leaves_one_channel_where_it_was_is_only_the_nearest():
@@ -146,3 +153,29 @@ def test_an_effect_that_leaves_one_channel_where_it_was_is_only_the_nearest():
     assert hardly_moved([_node((), i=0.4, omega=5.0), _node(("coulomb",), i=0.4, omega=0.5)], noise) == ""  # noise
     assert hardly_moved([first, _node(("speed_lag",), i=2.0, omega=0.5)], noise) == ""  # no matter of the current
     assert hardly_moved([first], noise) == ""
+
+
+def test_held_out_runs_that_both_models_lose_decide_nothing():
+    """A pendulum falls over the top, or not, by a hair: then blocks of the fitted runs are held out."""
+    blocks = {"root": _errors(1.0, theta=0.25), "new": _errors(1.0, theta=0.12)}
+    data = SimpleNamespace(validation=True, noise={}, block_errors=lambda fit: blocks[fit])
+    root = Node("root", None, _errors(1.0, theta=0.25), _errors(1.0, theta=2.7))
+    worse = Node("new", "load_friction", _errors(1.0, theta=0.1), _errors(1.0, theta=3.1))
+    judge = Judge(root, data)
+    assert judge.held_gain(root, worse).fall == pytest.approx(1 - 0.12 / 0.25)
+    within_reach = replace(root, held=_errors(1.0, theta=0.7))
+    assert judge.held_gain(within_reach, replace(worse, held=_errors(1.0, theta=0.9))).fall < -0.2
+    fit = SimpleNamespace(model=SimpleNamespace(effects=[LIBRARY["load_friction"]]))
+    path = [replace(root, fit=SimpleNamespace(problem=SimpleNamespace(model=SimpleNamespace(effect_names=()))))]
+    assert hardly_moved([*path, replace(worse, fit=fit)], {"theta": 0.01}) == ""  # it falls on the fitted runs
+
+
+def test_what_the_records_need_is_not_superfluous_for_a_held_out_run_that_says_nothing():
+    size = SimpleNamespace(problem=SimpleNamespace(model=SimpleNamespace(free_names=("b", "J"))))
+    data = SimpleNamespace(validation=None, noise={})
+    root = Node(size, None, _errors(1.0, theta=0.9), _errors(1.0, theta=0.5))
+    both = Node(size, "load_friction", _errors(1.0, theta=0.1), _errors(1.0, theta=0.5))
+    judge = Judge(root, data)
+    assert not judge.superfluous(both, replace(root, held=_errors(1.0, theta=0.49)))
+    assert judge.superfluous(both, replace(root, held=_errors(1.0, theta=0.3)))  # it fails where it was not fitted
+    assert judge.superfluous(both, replace(root, train=_errors(1.0, theta=0.1)))

@@ -17,6 +17,7 @@ from motorid.experiment import Experiment
 from motorid.integrate.grid import Array
 from motorid.simulate import Simulation
 
+ASTRAY = 1.0  # NRMSE: zero is nearer to the channel than the model is
 CLIP = 6.0  # robust standard deviations beyond which a residual counts as an outlier
 
 
@@ -110,6 +111,11 @@ class Errors:
         return {
             c: float(np.sqrt(ss / max(n, 1))) / max(self.measured[c], 1e-300) for c, (ss, n) in self.squares().items()
         }
+
+
+def astray(before: Mapping[str, float], after: Mapping[str, float]) -> tuple[str, ...]:
+    """Return the channels that two models, with these NRMSE, both lose: which loses more says nothing."""
+    return tuple(c for c, e in before.items() if min(e, after.get(c, 0.0)) > ASTRAY)
 
 
 @dataclass(frozen=True)

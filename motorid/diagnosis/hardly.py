@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from motorid.diagnosis.evidence import Errors, despiked
+from motorid.diagnosis.evidence import Errors, astray, despiked
 from motorid.diagnosis.judging import Node
 from motorid.formatting import number
 
@@ -20,6 +20,8 @@ HARDLY = 0.2  # fall of the error
 
 def hardly_moved(path: Sequence[Node], noise: dict[str, float]) -> str:
     """Say which channel's held-out error the effects of the last model leave as it is; empty if none.
+
+    Held-out runs that both lose say nothing; there the error on the fitted runs counts.
 
     Parameters
     ----------
@@ -33,6 +35,8 @@ def hardly_moved(path: Sequence[Node], noise: dict[str, float]) -> str:
     if not any(e.balance != "sensor" for e in added):
         return ""  # a sensor's effect need not show in other channels
     before, after = _sizes(first.held), _sizes(last.held)
+    for c in astray(first.held.nrmse(), last.held.nrmse()):
+        before[c], after[c] = _sizes(first.train)[c], _sizes(last.train)[c]
     for c in before:
         far = after.get(c, 0.0) / noise.get(c, np.inf)
         if far > STAYS and after[c] > (1 - HARDLY) * before[c]:

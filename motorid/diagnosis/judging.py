@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from motorid.diagnosis.evidence import Errors, Gain, compare_errors
+from motorid.diagnosis.evidence import Errors, Gain, astray, compare_errors
 from motorid.diagnosis.results import Candidate
 from motorid.diagnosis.trial import LEAST_FALL, HeldOut, train_errors
 from motorid.fit import Fit
@@ -84,12 +84,14 @@ class Judge:
     def held_gain(self, old: Node, new: Node) -> Gain:
         """Return what `new` gains over `old` on held-out data.
 
-        Held-out runs in which an effect hardly shows (a steady run, for a lag) say nothing about it; then blocks of
-        the fitted runs are held out in turn.
+        Held-out runs in which an effect hardly shows (a steady run, for a lag) say nothing about it, nor do those on
+        which both go astray (a pendulum that falls over the top, or not, by a hair); then blocks of the fitted runs
+        are held out in turn.
         """
         gain = compare_errors(old.held, new.held, self.noise)
         here = compare_errors(old.train, new.train, self.noise)
-        if self.data.validation is None or abs(gain.fall) > INDIFFERENT or here.fall < PLAIN:
+        telling = abs(gain.fall) > INDIFFERENT and not astray(old.held.nrmse(), new.held.nrmse())
+        if self.data.validation is None or telling or here.fall < PLAIN:
             return gain
         return compare_errors(self.data.block_errors(old.fit), self.data.block_errors(new.fit), self.noise)
 
@@ -124,6 +126,12 @@ class Judge:
         gain = compare_errors(old.train, new.train, self.noise)
         held = self.held_gain(old, new)
         return worth_it(new.size - old.size, gain) and not held_out_objection(held)
+
+    def superfluous(self, node: Node, smaller: Node) -> bool:
+        """Tell whether `smaller`, contained in `node`, does as well: on the records, or plainly better held out."""
+        lost = compare_errors(smaller.train, node.train, self.noise).fall
+        won = compare_errors(node.held, smaller.held, self.noise).fall
+        return not self.beats(node, smaller) and (lost < PLAIN or won > PLAIN)
 
     def group(self, chosen: Node, siblings: Sequence[Node], includes: Mapping[str, tuple[str, ...]]) -> tuple[str, ...]:
         """Names of the siblings that these data cannot tell from `chosen`."""

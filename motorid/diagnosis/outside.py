@@ -164,7 +164,8 @@ def _in_earnest(steps: Sequence[Fit], held: HeldOut, channels: Sequence[int]) ->
         if not made:
             return None
         form, effect = made[0]
-        fit = refit(root, root.model.start_at({n: last.values[n] for n in root.values}) + effect, ({},))
+        values = {n: last.values.get(n, v) for n, v in root.values.items()}  # an effect of the first may be gone
+        fit = refit(root, root.model.start_at(values) + effect, ({},))
         if fit is None:
             return None
         leaves = compare_errors(train_errors(last), train_errors(fit), held.noise)

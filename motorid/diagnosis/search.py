@@ -195,7 +195,7 @@ class Search:
             smaller = simpler if e.name == node.added else [*simpler, node.fit.model.without(e.name)]
             for model in sorted(smaller, key=lambda m: len(m.free_names)):
                 other = self._smaller(node, model)
-                if other is not None and not self.judge.beats(node, other):
+                if other is not None and self.judge.superfluous(node, other):
                     return self.pruned(other)
         return node
 

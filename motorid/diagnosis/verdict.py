@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from motorid.diagnosis.evidence import despiked
+from motorid.diagnosis.evidence import astray, despiked
 from motorid.diagnosis.results import Adequacy, Candidate, Missing, Rung
 from motorid.effects import LIBRARY
 from motorid.fit import Fit
@@ -81,6 +81,8 @@ def _errors(before: Rung, after: Rung, validated: bool) -> str:
             for c, e in before.validation_nrmse.items()
         ]
         text += f"; on the held-out runs {', '.join(held)}"
+        if lost := astray(before.validation_nrmse, after.validation_nrmse):
+            text += f" (both lose {' and '.join(lost)} there: blocks of the fitted runs were held out instead)"
     return text + "."
 
 
