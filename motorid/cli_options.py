@@ -54,6 +54,9 @@ class Reading:
     hold: Annotated[str | None, typer.Option(
         metavar="zoh|linear", rich_help_panel=READ,
         help="The input between samples: held or joined by lines.")] = None
+    median: Annotated[int | None, typer.Option(
+        metavar="N", rich_help_panel=READ,
+        help="Running median over N samples (odd) of a voltage that was measured with noise.")] = None
     ignore: Annotated[str | None, typer.Option(
         metavar="i,theta", rich_help_panel=READ, help="Measured channels to leave out.")] = None
 
@@ -64,7 +67,7 @@ class Reading:
         return self.chosen(read_runs(paths, columns=columns, units=units, hold=self.hold))
 
     def chosen(self, runs: Sequence[Experiment]) -> list[Experiment]:
-        """Return `runs` without the channels to leave out."""
+        """Return `runs` without the channels to leave out, the voltage filtered if that is wanted."""
         out = _words([self.ignore] if self.ignore else [])
         known = [c for c in ("i", "omega", "theta") if any(c in r.outputs for r in runs)]
         for channel in out:
@@ -74,7 +77,10 @@ class Reading:
             if set(r.outputs) <= set(out):
                 raise UsageError(f"--ignore {self.ignore} leaves nothing measured in {r.name}; keep one of "
                                  f"{', '.join(r.channels)}.")
-        return [r.without(*(c for c in out if c in r.outputs)) for r in runs]
+        if self.median is not None and (self.median < 1 or self.median % 2 == 0):
+            raise UsageError(f"--median takes an odd number of samples, 1 or more; got {self.median}.")
+        kept = [r.without(*(c for c in out if c in r.outputs)) for r in runs]
+        return [r.running_median(self.median) for r in kept] if self.median else kept
 
 
 @dataclass(frozen=True)

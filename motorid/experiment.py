@@ -153,6 +153,19 @@ class Experiment(Shown):
             return coarse
         return coarse.with_(inputs={c: _held_mean(self.t, a, int(k)) for c, a in self.inputs.items()})
 
+    def running_median(self, samples: int) -> Experiment:
+        """Return the run with its voltage replaced by the running median over an odd number of samples.
+
+        For a voltage that was measured and is noisy: the motor never saw that noise. Steps stay where they are; what
+        changes within the window is lost.
+        """
+        if int(samples) != samples or samples < 1 or samples % 2 == 0:
+            raise UsageError(f"running_median() takes an odd number of samples, 1 or more; got {samples!r}.")
+        from scipy.ndimage import median_filter
+
+        quiet = {c: median_filter(a, int(samples), mode="nearest") for c, a in self.inputs.items()}
+        return self.with_(inputs=quiet)
+
     def __reduce__(self) -> tuple[Any, ...]:
         # A mappingproxy cannot be pickled, so hand plain dicts to the constructor of the other process.
         values = (getattr(self, f.name) for f in dataclasses.fields(self))

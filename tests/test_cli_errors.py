@@ -70,6 +70,7 @@ def test_broken_records(broken: Broken, tmp_path):
     (["fit", RUN, "--initial", "maybe"], "unknown initial state 'maybe'"),
     (["fit", RUN, "--loss", "heavy"], "unknown loss 'heavy'"),
     (["fit", RUN, "--hold", "spline"], "hold"),
+    (["fit", RUN, "--median", "4"], "odd number"),
     (["fit", RUN, "--ignore", "theta"], "unknown measured channel 'theta'"),
     (["fit", RUN, "--ignore", "i,omega"], "measured"),
     (["fit", RUN, "--columns", "t:time"], "name=value"),

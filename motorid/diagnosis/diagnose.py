@@ -7,12 +7,12 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 from motorid.diagnosis.adequacy import following
-from motorid.diagnosis.improve import Climb, climb, ladder_of, settled
+from motorid.diagnosis.improve import Climb, explored, ladder_of
 from motorid.diagnosis.judgement import pursued
 from motorid.diagnosis.locate import acting_like, locate
-from motorid.diagnosis.parts import affordable, parts_remark
+from motorid.diagnosis.parts import parts_remark
 from motorid.diagnosis.results import Diagnosis
-from motorid.diagnosis.search import Search, library
+from motorid.diagnosis.search import library
 from motorid.diagnosis.suggest import suggest_experiment
 from motorid.diagnosis.verdict import (
     adequate_text,
@@ -66,10 +66,8 @@ def diagnose(
     """
     say = progress or (lambda word: None)
     own = tuple(also)
-    fit = affordable(fit)
-    search = Search(fit, validate, library(effects, own), map, say)
-    found, other = settled(climb(search, max_effects, say))
-    judged = found.first
+    found, other, driven = explored(fit, validate, library(effects, own), map, say, max_effects)
+    fit, search, judged = found.search.root.fit, found.search, found.first
     missing = locate(fit)
     say("located what is missing")
     ladder = ladder_of(found, validate is not None)
@@ -95,7 +93,7 @@ def diagnose(
         suggestion = _suggestion(found)
     last = ladder.best
     of_last = (measured_angle_remark(last), outliers_remark(last))
-    remarks = (parts_remark(fit), *of_last, closed_loop_remark(fit), suggestion)
+    remarks = (driven, parts_remark(fit), *of_last, closed_loop_remark(fit), suggestion)
     text = " ".join(t for t in (text, *remarks) if t)
     return Diagnosis(
         verdict,

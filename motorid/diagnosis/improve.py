@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+from motorid.diagnosis.driving import Reading, better_reading
 from motorid.diagnosis.evidence import compare_errors
 from motorid.diagnosis.hardly import hardly_moved
 from motorid.diagnosis.judgement import judgement
@@ -83,6 +84,39 @@ def settled(found: Climb) -> tuple[Climb, Outside | None]:
         return _cut(found, other.kept, f"only stands in for {what}", f"is like {what}"), other
     poor = "" if found.remaining.adequate else hardly_moved(found.path, dict(found.search.held.noise))
     return (_cut(found, 0, poor, "is nothing that the library has") if poor else found), other
+
+
+def explored(
+    fit: Fit,
+    validate: Sequence[Experiment] | Experiment | None,
+    effects: Sequence[Effect],
+    map_: Callable[..., Iterable[Any]],
+    advance: Callable[[str], None],
+    max_effects: int,
+) -> tuple[Climb, Outside | None, str]:
+    """Return the settled climb, and what to say of how the voltage was read.
+
+    A misfit that something missing dominates may hide a better reading of the voltage; then it is climbed again.
+    """
+    fit, remark = affordable(fit), ""
+    held_out = [validate] if isinstance(validate, Experiment) else validate
+
+    def climbed() -> tuple[Climb, Outside | None]:
+        return settled(climb(Search(fit, held_out, effects, map_, advance), max_effects, advance))
+
+    def read(reading: Reading) -> None:
+        nonlocal fit, held_out, remark
+        before, fit = fit, reading.fitted(fit)
+        held_out = held_out and [reading.of(r) for r in held_out]
+        remark = reading.remark(before, fit)
+
+    if early := better_reading(fit):
+        read(early)
+    found, other = climbed()
+    if not early and len(found.path) > 1 and (late := better_reading(found.path[-1].fit)):
+        read(late)
+        found, other = climbed()
+    return found, other, remark
 
 
 def _cut(found: Climb, kept: int, why: str, what: str) -> Climb:
@@ -183,6 +217,5 @@ def improve(
         The models with training and held-out error; ``ladder.best`` is the last fit, to go on from.
     """
     say = progress or (lambda word: None)
-    search = Search(affordable(fit), validate, library(effects, also), map, say)
-    found, _ = settled(climb(search, max_effects, say))
+    found, _, _ = explored(fit, validate, library(effects, also), map, say, max_effects)
     return ladder_of(found, validate is not None)

@@ -1,0 +1,88 @@
+"""How the voltage is read: held or straight between samples, as commanded or measured with noise."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from battery.excite import P
+from command import motorid_json
+
+import motorid as mi
+from motorid.diagnosis.driving import better_reading
+from motorid.reading import write_csv
+
+FINE = 8  # steps of the plant per sample
+
+
+def recorded(motor, effects, v, dt, rng, measured=0.0, name="run"):
+    """A record of what the plant does under the voltage `v` at every fine step, read once per sample."""
+    t = dt / FINE * np.arange(len(v))
+    s = P.simulate(motor, effects, t, v)
+    i, omega, t, v = s["i"][::FINE], s["omega"][::FINE], t[::FINE], v[::FINE]
+    noisy = {"i": i + rng.normal(0, 0.01, t.size), "omega": omega + rng.normal(0, 0.2, t.size)}
+    return mi.Experiment(t, {"v": v + measured * rng.normal(size=t.size)}, noisy, name=name)
+
+
+def waves(n, dt, rng):
+    """A smooth voltage at every fine step."""
+    t = dt / FINE * np.arange(FINE * n)
+    return sum(2.2 * np.sin(2 * np.pi * f * t + p) for f, p in zip((1.7, 6.1, 17.0), rng.uniform(0, 6, 3), strict=True))
+
+
+def stairs(n, rng):
+    """A voltage that is held for 150 samples at a time."""
+    return np.repeat(rng.uniform(-6, 6, n // 150), 150 * FINE)
+
+
+def test_an_amplifier_s_voltage_goes_on_between_samples(lab):
+    """Read as held it is half a sample late, which lags and heating would make up for."""
+    rng = np.random.default_rng(3)
+    runs = [recorded(lab, {}, waves(1200, 2e-3, rng), 2e-3, rng) for _ in range(3)]
+    fit = mi.fit(mi.dc_motor(), runs[:2])
+    read_so = mi.fit(mi.dc_motor(), [r.with_(hold="linear") for r in runs[:2]])
+    assert max(fit.nrmse.values()) > 1.3 * max(read_so.nrmse.values())
+    found = mi.diagnose(fit, runs[2:], effects=("speed_lag", "winding_heating"))
+    assert found.verdict == "adequate"
+    assert "--hold linear" in found.text
+    first = found.ladder.rungs[0].fit
+    assert first.problem.experiments[0].hold == "linear"
+    assert better_reading(first) is None
+
+
+def test_noise_of_a_measured_voltage_is_no_effect(lab):
+    rng = np.random.default_rng(4)
+    friction = {"coulomb": {"tau_c": 0.008}}
+    runs = [recorded(lab, friction, stairs(1500, rng), 1e-3, rng, measured=0.08) for _ in range(3)]
+    found = mi.diagnose(mi.fit(mi.dc_motor(), runs[:2]), runs[2:], effects=("coulomb", "brush_drop", "quadratic_drag"))
+    assert found.effects == ("coulomb",)
+    assert "measured with noise" in found.text
+    assert found.ladder.best.values["tau_c"] == pytest.approx(0.008, rel=0.02)
+
+
+@pytest.mark.parametrize("drive", ["held waves", "steps", "noise"])
+def test_a_voltage_that_is_what_it_says_is_left_alone(lab, drive):
+    rng = np.random.default_rng(5)
+    sampled = waves(900, 2e-3, rng)[::FINE] if drive == "held waves" else 3 * rng.normal(size=900)
+    v = stairs(900, rng) if drive == "steps" else np.repeat(sampled, FINE)
+    fit = mi.fit(mi.dc_motor(), [recorded(lab, {}, v, 2e-3, rng)])
+    assert better_reading(fit) is None
+
+
+def test_a_running_median_keeps_steps_and_loses_noise():
+    rng, v = np.random.default_rng(6), np.repeat([0.0, 5.0, -3.0], 200)
+    run = mi.Experiment(1e-3 * np.arange(600), {"v": v + rng.normal(0, 0.1, 600)}, {"omega": v}, name="run")
+    quiet = run.running_median(15)
+    assert np.std(quiet.inputs["v"] - v) < 0.05
+    assert np.array_equal(quiet.outputs["omega"], v)
+    assert abs(quiet.inputs["v"][199]) < 1 < 4 < quiet.inputs["v"][200]
+    for wrong in (4, 0, 2.5):
+        with pytest.raises(mi.UsageError, match="odd number of samples"):
+            run.running_median(wrong)
+
+
+def test_the_command_line_filters_a_voltage(tmp_path, lab):
+    rng = np.random.default_rng(7)
+    run = recorded(lab, {}, stairs(900, rng), 1e-3, rng, measured=0.1)
+    write_csv(run, tmp_path / "run.csv")
+    raw, quiet = (motorid_json(tmp_path, "fit", tmp_path / "run.csv", "--median", n)["nrmse"] for n in ("1", "15"))
+    assert quiet["i"] < 0.8 * raw["i"]
