@@ -28,6 +28,7 @@ from motorid.errors import ModelError
 from motorid.experiment import Experiment
 from motorid.fit import Fit
 from motorid.model import Effect, Model
+from motorid.parameters import Parameter
 from motorid.prepared import natural_sizes
 
 SHORTLIST = 6
@@ -211,8 +212,10 @@ class Search:
         if key not in self.nodes:
             values = {n: node.fit.values[n] for n in model.parameters if n in node.fit.values}
             new = [e for e in model.effects if e.name not in node.fit.model.effect_names]
-            level = [v for e in node.fit.model.effects if e.name not in model.effect_names for v in _sizes(node.fit, e)]
-            values |= {p.name: max(level) for e in new for p in e.parameters if p.null == 0 and p.name not in values}
+            gone = [e for e in node.fit.model.effects if e.name not in model.effect_names]
+            for p in (p for e in new for p in e.parameters if p.name not in values):
+                if alike := [node.fit.values[o.name] for e in gone for o in e.parameters if _alike(p, o)]:
+                    values[p.name] = max(alike)
             fit = refit(node.fit, model, (values,))
             if fit is None or any(objections(fit, e) for e in new):
                 return None
@@ -228,6 +231,11 @@ def _in_place(model: Model, old: Effect, new: Effect) -> Model:
     """Return the model with `new` where `old` was, so that the order in which effects were found stays."""
     effects = tuple(new if e is old else e for e in model.effects)
     return (model.without(old.name) + new)._with(effects=effects)
+
+
+def _alike(p: Parameter, other: Parameter) -> bool:
+    """Tell whether two effects' parameters play the same part: a size, or a shape of the same unit."""
+    return p.null == other.null == 0 or (p.null is None and other.null is None and p.unit == other.unit)
 
 
 def _sizes(fit: Fit, effect: Effect) -> list[float]:

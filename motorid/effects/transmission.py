@@ -40,7 +40,7 @@ def compliance(
     _two_inertias(m, r_load, omega_r, zeta_r, lambda twist: (twist, 1.0), "load")
 
 
-@effect(balance="transmission")
+@effect(balance="transmission", includes=("compliance",))
 def backlash(
     m: Equations,
     r_gap=P(0.3, "", null=0.0, lower=0.0, upper=0.98, grid=(0.3, 0.7), doc="load's share of the inertia"),
