@@ -50,8 +50,8 @@ def despiked(r: Array) -> Array:
     r = r[np.isfinite(r)]
     if len(r) < 3:
         return r
-    padded = np.concatenate([r[1:2], r, r[-2:-1]])
-    middle = np.median(np.stack([padded[:-2], r, padded[2:]]), axis=0)
+    before, after = np.concatenate([r[1:2], r[:-1]]), np.concatenate([r[1:], r[-2:-1]])
+    middle = np.maximum(np.minimum(before, r), np.minimum(np.maximum(before, r), after))
     limit = CLIP * 1.4826 * float(np.median(np.abs(r)))
     return np.where(np.abs(r - middle) > limit, middle, r)
 
@@ -84,21 +84,11 @@ class Errors:
                     squares.setdefault(c, []).append(float(np.nanmean(y**2)))
         return Errors(residuals, {c: float(np.sqrt(np.mean(v))) for c, v in squares.items()})
 
-    def limits(self) -> dict[str, float]:
-        """Size per channel beyond which a residual is an outlier for this model."""
-        return {
-            c: CLIP * 1.4826 * float(np.nanmedian(np.abs(np.concatenate(list(rs))))) + 1e-300
-            for c, rs in self.residuals.items()
-        }
-
-    def squares(self, limits: Mapping[str, float] | None = None) -> dict[str, tuple[float, int]]:
-        """Return (sum of squares, count) per channel, residuals cut at `limits`."""
+    def squares(self, quiet: bool = False) -> dict[str, tuple[float, int]]:
+        """Return (sum of squares, count) per channel, samples that stand alone left aside if `quiet`."""
         found = {}
         for c, rs in self.residuals.items():
-            r = np.concatenate(list(rs))
-            r = r[np.isfinite(r)]
-            if limits is not None:
-                r = np.clip(r, -limits[c], limits[c])
+            r = np.concatenate([despiked(r) if quiet else r[np.isfinite(r)] for r in rs])
             found[c] = (float(r @ r), len(r))
         return found
 
@@ -142,8 +132,7 @@ class Gain:
 
 def compare_errors(old: Errors, new: Errors, floor: Mapping[str, float] | None = None) -> Gain:
     """Return what `new` gains over `old`; `floor` is the noise per channel, below which nothing is gained."""
-    limits = old.limits()
-    before, after, effective = old.squares(limits), new.squares(limits), new.effective()
+    before, after, effective = old.squares(quiet=True), new.squares(quiet=True), new.effective()
     logs, weights = [], []
     for c in before:
         if c not in after:

@@ -22,9 +22,9 @@ STARTED = 0.1  # of the width that counts as having left the turning point
 
 
 def unresolved(fit: Fit, effect: Effect) -> str:
-    """Say which shape of an effect that takes a simpler one's place these samples cannot show; empty if none."""
-    if not effect.includes:
-        return ""
+    """Say which shape of a friction that takes a simpler one's place these samples cannot show; empty if none."""
+    if not effect.includes or effect.balance != "torque":
+        return ""  # a gap shows in how its far side strikes, however quickly the near side passes through it
     for p in (fit.problem.model.parameters[q.name] for q in effect.parameters):
         if not (p.positive and p.vary and p.null is None):
             continue

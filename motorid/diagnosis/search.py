@@ -16,13 +16,8 @@ from motorid.diagnosis.judging import COMMON, PLAIN, Judge, Node, held_out_objec
 from motorid.diagnosis.objections import WORST_CONDITION, ambiguity, objections
 from motorid.diagnosis.rank import Score, rank
 from motorid.diagnosis.results import Candidate
-from motorid.diagnosis.trial import (
-    FAILURES,
-    HeldOut,
-    lost,
-    refit,
-    train_errors,
-)
+from motorid.diagnosis.tournament import Behind, Task, refits
+from motorid.diagnosis.trial import FAILURES, HeldOut, lost, refit, train_errors
 from motorid.effects import LIBRARY
 from motorid.errors import ModelError
 from motorid.experiment import Experiment
@@ -89,16 +84,12 @@ class Search:
         _, wider = self._takeable(present)
         scores = self.scores(node)
         short = _shortlist(scores, lost(node.fit))
-        tasks = [(node.fit, present + s.effect, s.starts[:3]) for s in short]
-        names = [s.effect for s in short]
-        for e in wider:
-            model, start = _widened(node.fit, e)
-            tasks.append((node.fit, model, tuple(start)))
-            names.append(e)
-        fits = list(self.map(_refit_task, tasks))
+        tasks = [Task(node.fit, present + s.effect, s.effect.name, s.starts[:3]) for s in short]
+        tasks += [_widened(node.fit, e) for e in wider]
+        fits = refits(tasks, self.map)
         self.advance(f"refitted {len(fits)}")
         children, judged = [], {}
-        for e, fit in zip(names, fits, strict=True):
+        for e, fit in zip([*(s.effect for s in short), *wider], fits, strict=True):
             child, candidate = self._judge(node, e, fit)
             judged[e.name] = candidate
             if child is not None:
@@ -126,8 +117,11 @@ class Search:
             fresh.append(e)
         return fresh, wider
 
-    def _judge(self, node: Node, effect: Effect, fit: Fit | None) -> tuple[Node | None, Candidate]:
+    def _judge(self, node: Node, effect: Effect, fit: Fit | Behind | None) -> tuple[Node | None, Candidate]:
         candidate = Candidate(effect.name, 0.0)
+        if isinstance(fit, Behind):
+            why = f"far behind {fit.winner}, which leaves only noise"
+            return None, replace(candidate, refit_drop=fit.drop, reason=why)
         if fit is None:
             return None, replace(candidate, reason="its refit could not be simulated")
         try:
@@ -276,8 +270,8 @@ def _drop(node: Node, train: Errors) -> float:
     return float(1 - new / max(old, 1e-300))
 
 
-def _widened(fit: Fit, effect: Effect) -> tuple[Model, list[dict[str, float]]]:
-    """Return the model with `effect` in the place of those that it includes, and starts that begin where they were."""
+def _widened(fit: Fit, effect: Effect) -> Task:
+    """Return the refit with `effect` in the place of those that it includes, from where they were."""
     model, level = fit.model, 0.0
     for e in model.effects:
         if e.name in effect.includes:
@@ -289,9 +283,5 @@ def _widened(fit: Fit, effect: Effect) -> tuple[Model, list[dict[str, float]]]:
     shapes = [
         [(p.name, g * natural.get(p.unit, 1.0)) for g in p.grid] for p in effect.parameters if p.null is None and p.grid
     ]
-    return model, [{**sizes, **dict(point)} for point in itertools.product(*shapes)][:6]
-
-
-def _refit_task(task: tuple[Fit, Model, Sequence[Mapping[str, float]]]) -> Fit | None:
-    fit, model, starts = task
-    return refit(fit, model, starts)
+    starts = [{**sizes, **dict(point)} for point in itertools.product(*shapes)][:6]
+    return Task(fit, model, effect.name, starts)

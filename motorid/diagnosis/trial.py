@@ -123,32 +123,53 @@ def _blocked(run: Experiment, odd: int) -> tuple[Experiment, Experiment]:
     return run.with_(outputs=keep or run.outputs), run.with_(outputs=judged)
 
 
-def refit(fit: Fit, model: Model, starts: Sequence[Mapping[str, float]]) -> Fit | None:
-    """Return the best refit of `model` on the records of `fit` from several starts; None if none can be simulated.
+@dataclass(frozen=True, eq=False)
+class Raced:
+    """The best of several starts of one model after a few steps, and the cost it has reached."""
 
-    Effects of the angle start along the measured angle, which the model's own angle, still wrong, would lead
-    astray; then the model's angle takes over, unless it drifts too far for them (periods of the angle pass).
+    problem: Problem
+    cost: float
+    angular: bool
+
+
+def raced(fit: Fit, model: Model, starts: Sequence[Mapping[str, float]]) -> Raced | None:
+    """Go a few steps from each start with `model` on the records of `fit`; None if none can be simulated.
+
+    Effects of the angle start along the measured angle, which the model's own angle, still wrong, would lead astray.
     """
     model = _bounded(fit, model)
     alive = revived(fit, model)
     angular = any(uses_angle(e) for e in model.effects) and not any(uses_angle(e) for e in fit.model.effects)
-    raced = []
+    found = []
     for start in (*(starts or ({},)), *_own_starts(fit, model)):
         # As it is where a parameter put back (an inductance that no sample shows) makes the model too stiff.
         for each in (alive,) if alive is model else (alive, model):
             done = _race(fit, each, start, angular)
             if done is not None:
-                raced.append((done.solution.history[-1], _from(done.problem, done.solution.q)))
+                problem = _from(done.problem, done.solution.q)
+                found.append(Raced(problem, float(done.solution.history[-1]), angular))
                 break
-    if not raced:
-        return None
-    best = min(raced, key=lambda c: c[0])[1]
-    stages = "sgn_width" in model.parameters and not fit.model.effects
+    return min(found, key=lambda r: r.cost, default=None)
+
+
+def finished(fit: Fit, best: Raced) -> Fit | None:
+    """Return the refit that a race began, converged; None if it fails.
+
+    Where it went along the measured angle the model's own takes over, unless it drifts too far (periods of the
+    angle pass).
+    """
+    stages = "sgn_width" in best.problem.model.parameters and not fit.model.effects
     try:
-        done = _released(best) if angular else descend(best, QUICK, stages=stages)
+        done = _released(best.problem) if best.angular else descend(best.problem, QUICK, stages=stages)
     except FAILURES:
         return None
     return _polished(fit, let_go(_from(done.problem, done.solution.q), fit))
+
+
+def refit(fit: Fit, model: Model, starts: Sequence[Mapping[str, float]]) -> Fit | None:
+    """Return the best refit of `model` on the records of `fit` from several starts; None if none can be simulated."""
+    best = raced(fit, model, starts)
+    return None if best is None else finished(fit, best)
 
 
 def _released(measured: Problem) -> Descent:
