@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -18,8 +18,9 @@ from motorid.integrate.grid import Array, Grid
 from motorid.noise import noise_level
 from motorid.parameters import Parameter
 
-# A record is frozen, and so is its noise.
+# A record is frozen, and so are its noise and its size.
 _levels: WeakKeyDictionary[Experiment, dict[str, float]] = WeakKeyDictionary()
+_sizes: WeakKeyDictionary[Experiment, _Sizes] = WeakKeyDictionary()
 CREEP_SHARE = 0.2  # of the angle's noise that a stuck motor may creep
 NARROWEST = 1e-5  # of the highest speed
 FINEST = 256  # sub-steps per sample
@@ -104,14 +105,7 @@ def _grid(run: Experiment, inputs: Sequence[str]) -> Grid:
 
 def top_speed(runs: Sequence[Experiment]) -> float:
     """Highest speed in the runs (99.5th percentile), from speed or angle; 0 where neither is there."""
-    top = 0.0
-    for r in runs:
-        if "omega" in r.outputs:
-            top = max(top, float(np.nanpercentile(np.abs(r.outputs["omega"]), 99.5)))
-        elif "theta" in r.outputs:
-            s = np.abs(slopes(r.outputs["theta"], r.t))
-            top = max(top, float(np.percentile(s, 99.5)) if s.size else 0.0)
-    return top
+    return max((_sizes_of(r).speed for r in runs), default=0.0)
 
 
 def angle_signal(run: Experiment) -> Array:
@@ -134,18 +128,18 @@ def natural_sizes(runs: Sequence[Experiment], values: Mapping[str, float]) -> di
     Torque is what the motor makes at its highest current, time is the sample time, heat is what the winding
     loses during the longest run for a rise of 30 K.
     """
-    volt = max(float(np.abs(r.inputs["v"]).max()) for r in runs) or 1.0
-    speed = top_speed(runs) or volt / max(values.get("K", 1.0), 1e-9)
+    seen = [_sizes_of(r) for r in runs]
+    volt = max(s.volt for s in seen) or 1.0
+    speed = max(s.speed for s in seen) or volt / max(values.get("K", 1.0), 1e-9)
     gain = values.get("g")
     resistance = values.get("R", 1.0)
-    amps = [float(np.nanpercentile(np.abs(r.outputs["i"]), 99.5)) for r in runs if "i" in r.outputs]
+    amps = [s.ampere for s in seen if s.ampere is not None]
     ampere = max(amps) if amps else volt / resistance
     torque = gain * volt if gain is not None else values.get("K", 1.0) * ampere
     second = float(np.median([r.dt for r in runs]))
-    heats = [(r.duration, resistance * _mean_square_current(r, values)) for r in runs]
+    heats = [(r.duration, resistance * s.mean_square_current(values)) for r, s in zip(runs, seen, strict=True)]
     duration, power = max(heats, key=lambda h: h[0] * h[1])
-    span = max((float(np.nanmax(r.outputs["theta"]) - np.nanmin(r.outputs["theta"])) for r in runs
-                if "theta" in r.outputs), default=1.0)
+    span = max((s.span for s in seen if s.span is not None), default=1.0)
     sizes = {"V": volt, "A": ampere, "rad/s": speed, "m/s": speed, "N·m": torque, "N": torque, "s": second,
              "1/s": 1 / second, "m": 0.01 * span, "K/W": 30 / max(power, 1e-9), "J/K": max(power * duration, 1e-9) / 30}
     for unit in ("N·m·s/rad", "N·s/m"):
@@ -155,10 +149,43 @@ def natural_sizes(runs: Sequence[Experiment], values: Mapping[str, float]) -> di
     return {k: v if np.isfinite(v) and v > 0 else 1.0 for k, v in sizes.items()}
 
 
-def _mean_square_current(run: Experiment, values: Mapping[str, float]) -> float:
-    if "i" in run.outputs:
-        return float(np.nanmean(run.outputs["i"] ** 2))
-    return float(np.mean(run.inputs["v"] ** 2)) / max(values.get("R", 1.0), 1e-9) ** 2 / 4
+class _Sizes(NamedTuple):
+    """How large the signals of a record are; None where a channel was not measured."""
+
+    volt: float
+    speed: float
+    ampere: float | None
+    span: float | None
+    squared_volt: float
+    squared_ampere: float | None
+    spread: Mapping[str, float]
+
+    def mean_square_current(self, values: Mapping[str, float]) -> float:
+        """Mean square of the current, or about what the voltage would make."""
+        if self.squared_ampere is not None:
+            return self.squared_ampere
+        return self.squared_volt / max(values.get("R", 1.0), 1e-9) ** 2 / 4
+
+
+def spread_of(run: Experiment, channel: str) -> float:
+    """Return the standard deviation of a channel; 1 where it was not measured."""
+    return _sizes_of(run).spread.get(channel, 1.0)
+
+
+def _sizes_of(run: Experiment) -> _Sizes:
+    if run not in _sizes:
+        v, (i, omega, theta) = run.inputs.get("v", np.zeros(1)), (run.outputs.get(c) for c in CHANNELS)
+        speeds = omega if omega is not None else slopes(theta, run.t) if theta is not None else np.zeros(1)
+        _sizes[run] = _Sizes(
+            float(np.abs(v).max()),
+            float(np.nanpercentile(np.abs(speeds), 99.5)) if speeds.size else 0.0,
+            None if i is None else float(np.nanpercentile(np.abs(i), 99.5)),
+            None if theta is None else float(np.nanmax(theta) - np.nanmin(theta)),
+            float(np.mean(v**2)),
+            None if i is None else float(np.nanmean(i**2)),
+            {c: float(np.nanstd(y)) for c, y in run.outputs.items()},
+        )
+    return _sizes[run]
 
 
 def suited(parameter: Parameter, sizes: Mapping[str, float]) -> Parameter:

@@ -197,10 +197,11 @@ class Problem:
 
     def _keeping(self, runs: tuple[Run, ...]) -> Problem:
         """Return a copy with other grids that keeps everything else already made."""
-        other = replace(self, _runs=runs)
-        for name in ("outputs", "system", "unknowns", "_engine", "_measured", "_levels"):
-            if name in self.__dict__:
-                other.__dict__[name] = self.__dict__[name]
+        made = ("outputs", "system", "unknowns", "_engine", "_measured", "_levels")
+        return self._lending(replace(self, _runs=runs), made)
+
+    def _lending(self, other: Problem, made: Sequence[str]) -> Problem:
+        other.__dict__.update({n: self.__dict__[n] for n in made if n in self.__dict__})
         return other
 
     def _tolerance(self, k: int, slack: float = 1.0) -> float | Callable[[Trajectory], float]:
@@ -272,7 +273,8 @@ class Problem:
         if model.angle_input != self.model.angle_input:
             names = self.system.inputs[:1] + (("theta_in",) if model.angle_input else ())
             runs = tuple(with_inputs(run, names) for run in runs)
-        return replace(self, model=model, _runs=runs)
+        other = replace(self, model=model, _runs=runs)
+        return self._lending(other, ("_engine", "_measured", "_levels")) if other.outputs == self.outputs else other
 
     def tuned(self, **fields: Any) -> Problem:
         """Return the problem with another `balance`, `width` …; the records stay as prepared."""

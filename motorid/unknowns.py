@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from motorid.equations import CHANNELS
 from motorid.integrate.grid import Array
 from motorid.parameters import Parameter, Scaling
-from motorid.prepared import Run, natural_sizes
+from motorid.prepared import Run, natural_sizes, spread_of
 from motorid.system import System
 
 STATE_UNITS = {"i": "A", "omega": "rad/s", "theta": "rad"}
@@ -78,11 +78,7 @@ class Unknowns:
             natural = natural_sizes([r.experiment for r in self.runs], values)
             sizes = [s if p.positive else max(s, natural.get(p.unit, 0.0))
                      for p, s in zip(self.free, sizes, strict=True)]
-        return Scaling.of(self.all, [*sizes, *(self._spread(c, k) for c, k, _ in self.initial)])
-
-    def _spread(self, channel: str, run: int) -> float:
-        y = self.runs[run].experiment.outputs.get(channel)
-        return 1.0 if y is None else float(np.nanstd(y))
+        return Scaling.of(self.all, [*sizes, *(spread_of(self.runs[k].experiment, c) for c, k, _ in self.initial)])
 
     @cached_property
     def start(self) -> Array:

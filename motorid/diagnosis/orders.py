@@ -23,7 +23,7 @@ from motorid.prepared import angle_signal
 if TYPE_CHECKING:
     from motorid.diagnosis.rank import Tangent
 
-CHUNK = 40
+WIDEST = 4e6  # numbers in the answers to all orders that are looked at together
 HIGHEST = 240
 PERIODS = 3  # within the travel
 SLOW_PART = 0.2  # of the motion that must be slow enough to show an order
@@ -32,6 +32,7 @@ SURE_PART = 0.02  # of the motion that must be slower than that, or faster parts
 SAMPLES = 50  # and so many samples
 NEAR = 0.6  # of the best line: another order that may be the true one
 STANDS_OUT = 6.0  # times the usual order: a line
+ALIKE = 1e-7  # below one, the correlation at which the answers to sine and cosine are one
 SURE = 30.0  # chi² of two degrees of freedom: the highest of 240 orders of noise reaches about 11
 
 
@@ -101,13 +102,13 @@ def _spectrum(tangent: Tangent, relative: bool) -> Spectrum:
     # The residual is model less measurement: what is fitted to it counts against the motor's torque.
     residual = -residual if relative else residual
     moving, answers, found = _moving(tangent), responses(fit), []
-    for first in range(lowest, top + 1, CHUNK):
-        orders = np.arange(float(first), min(first + CHUNK, top + 1))
+    chunk = int(np.clip(WIDEST / (2 * len(residual)), 10, HIGHEST))
+    for first in range(lowest, top + 1, chunk):
+        orders = np.arange(float(first), min(first + chunk, top + 1))
         slow = np.array([_slow_enough(moving, n) for n in orders])
         columns = white([_columns(fit, k, answer, orders, slow, relative) for k, answer in enumerate(answers)])
         columns -= basis @ (basis.T @ columns)
-        m = len(orders)
-        found += [_line(float(n), columns[:, [j, j + m]], residual) for j, n in enumerate(orders)]
+        found += _lines(orders, columns[:, : len(orders)], columns[:, len(orders) :], residual)
     found = sorted((line for line in found if line.share > 0), key=lambda line: -line.share)
     if not found:
         return Spectrum((), False)
@@ -137,17 +138,21 @@ def _whitened(tangent: Tangent) -> tuple[Whitening, Array, Array]:
     return white, basis, residual - basis @ (basis.T @ residual)
 
 
-def _line(order: float, columns: Array, residual: Array) -> Line:
-    """Fit A·sin(Nθ+φ) to the residual."""
-    size = np.linalg.norm(columns, axis=0)
-    if not np.all(size > 1e-12):
-        return Line(order, 0.0, 0.0, 0.0)
-    a, _, full, _ = np.linalg.lstsq(columns / size, residual, rcond=1e-4)
-    if full < 2:
-        return Line(order, 0.0, 0.0, 0.0)
-    explained = float(np.sum((columns @ (a / size)) ** 2) / max(float(residual @ residual), 1e-300))
-    a = a / size
-    return Line(order, explained, float(np.hypot(*a)), float(np.arctan2(a[1], a[0])))
+def _lines(orders: Array, sines: Array, cosines: Array, residual: Array) -> list[Line]:
+    """Fit A·sin(Nθ+φ) to the residual at each order, from the answers (n, orders) to either; no line without both."""
+    sizes = np.linalg.norm(sines, axis=0), np.linalg.norm(cosines, axis=0)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        overlap = np.einsum("ij,ij->j", sines, cosines) / (sizes[0] * sizes[1])
+        seen = (np.minimum(*sizes) > 1e-12) & (np.abs(overlap) < 1 - ALIKE)
+        on_sine, on_cosine = residual @ sines / sizes[0], residual @ cosines / sizes[1]
+        a, b = (on_sine - overlap * on_cosine) / (1 - overlap**2), (on_cosine - overlap * on_sine) / (1 - overlap**2)
+        share = (a * on_sine + b * on_cosine) / max(float(residual @ residual), 1e-300)
+        a, b = a / sizes[0], b / sizes[1]
+    return [
+        Line(float(n), float(share[j]), float(np.hypot(a[j], b[j])), float(np.arctan2(b[j], a[j])))
+        for j, n in enumerate(orders)
+        if seen[j]
+    ]
 
 
 def _columns(fit, k: int, answer: Response, orders: Array, slow: Array, relative: bool) -> Array:

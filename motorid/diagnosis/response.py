@@ -79,6 +79,7 @@ def parameter_vector(fit: Fit) -> Array:
     return np.array([fit.values[n] for n in fit.problem.system.parameters])
 
 
+@lru_cache(maxsize=2)
 def responses(fit: Fit) -> list[Response]:
     """Return the linear response of every run of `fit`."""
     return responses_of(fit.problem, parameter_vector(fit), fit.simulations)
