@@ -16,7 +16,7 @@ import numpy as np
 from motorid.errors import FitError, SimulationError
 from motorid.integrate.grid import Array
 from motorid.least_squares import LevenbergMarquardt, Solution, levenberg_marquardt
-from motorid.misfit import hardly_explained, misfit_over_noise
+from motorid.misfit import hardly_explained
 from motorid.narrowing import NARROWER, WIDEST, narrow_enough, narrower, smooths, without_width
 from motorid.prepared import top_speed
 from motorid.problem import Problem
@@ -24,7 +24,6 @@ from motorid.problem import Problem
 ON_THE_WAY = ((1e-7, 60), (1e-6, 60))  # ftol and iterations of the first stage, and of those between
 LOWER = 0.98  # of the cost with a wider sgn, or the narrower one is not worth it
 ROUNDS = 4  # of refining the sub-steps
-IMBALANCE = 3.0  # between channels, in misfit over noise, above which the misfit decides the weights
 
 # Looks again from the start: by the other weights first?, first damping, start moved by e to this power.
 LOOKS = ((True, 0.1, 0.0), (False, 10.0, 0.0), (True, 10.0, 0.0), (False, 1.0, 1.5), (True, 1.0, 1.5))
@@ -184,30 +183,6 @@ def _by_other_weights(problem: Problem, options: LevenbergMarquardt) -> Problem:
     return problem.for_model(problem.model.start_at(problem.values(found.solution.q)))
 
 
-def descend_balanced(problem: Problem, options: LevenbergMarquardt, callback: Callback = None, *,
-                     stages: bool = True) -> Descent:
-    """Like `descend`, and where the model fails, weigh channels by their misfit instead of their noise.
-
-    A model that cannot reach the noise would otherwise spend itself on the channel with the smallest noise
-    (an encoder), at any price in the others. Noise and misfit together give the maximum of the likelihood
-    with the channels' variances as unknowns, ``Σ n·ln(SSR)`` (Seber & Wild, Nonlinear Regression, 1989, ch.
-    11); a model that reaches the noise keeps the weights of the noise.
-    """
-    done = descend_surely(problem, options, callback, stages=stages)
-    if problem.weights != "noise" or problem.loss is not None or len(problem.outputs) < 2:
-        return done
-    begin = problem
-    for k in range(3):
-        factors = misfit_over_noise(done.problem, done.solution.q)
-        relative = [factors[c] / done.problem.balance.get(c, 1.0) for c in factors]
-        if max(relative) < IMBALANCE * min(relative):
-            break
-        again = descend(begin.tuned(balance=factors), options, callback, stages=stages and k == 0)
-        done = replace(again, history=done.history + again.history)
-        begin = done.problem.for_model(done.problem.model.start_at(done.problem.values(done.solution.q)))
-    return done
-
-
 def _narrowing(problem: Problem, options: LevenbergMarquardt, callback: Callback, history: list[float],
                surely: bool) -> Problem:
     """Return the problem with the values that a wide sgn leads to, made narrower step by step."""
@@ -250,4 +225,4 @@ def _cheaper(first: Problem, *others: Problem) -> Problem:
     return (first, *others)[int(np.argmin(costs))] if costs else first
 
 
-__all__ = ["Descent", "descend", "descend_balanced", "descend_surely", "doubtful"]
+__all__ = ["Descent", "descend", "descend_surely", "doubtful"]

@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from motorid.descent import Descent, descend_balanced
+from motorid.balancing import descend_balanced
+from motorid.descent import Descent
 from motorid.errors import FitError, UsageError, one_of
 from motorid.experiment import Experiment
 from motorid.integrate import Engine

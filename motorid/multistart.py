@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from motorid.descent import descend_balanced
+from motorid.balancing import descend_balanced
 from motorid.endings import Ending, Multistart
 from motorid.errors import MotoridError, SimulationError, UsageError
 from motorid.fit import Failure, Fit, solve, started

@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from motorid.balancing import descend_balanced
 from motorid.conflict import below_steady
-from motorid.descent import descend_balanced
 from motorid.errors import FitError, SimulationError, UsageError, one_of
 from motorid.fit import Fit
 from motorid.gaps import first_noise, given_noise, noise_of_gaps

@@ -27,8 +27,8 @@ ROWS = (
     # 3 the problem
     "problem derivatives sensitivity mesh misfit narrowing",
     # 4 solving it, and looking at the solution
-    "least_squares descent starting simulate result fit comparison multipliers conflict nlp nodes outcome gaps "
-    "shooting remedies",
+    "least_squares descent plateaus balancing starting simulate result fit comparison multipliers conflict nlp nodes "
+    "outcome gaps shooting remedies",
     # 5 how far it can be trusted, and what it lacks
     "identifiability uncertainty bootstrap profiling intervals endings multistart batch formulations diagnosis "
     "numbering",

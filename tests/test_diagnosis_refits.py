@@ -7,9 +7,10 @@ import numpy as np
 import motorid as mi
 from motorid.diagnosis import parts, trial
 from motorid.diagnosis.objections import objections
-from motorid.diagnosis.revival import ALIVE, let_go, revived
+from motorid.diagnosis.revival import let_go, revived
 from motorid.diagnosis.verdict import measured_angle_remark
 from motorid.effects import LIBRARY
+from motorid.plateaus import ALIVE
 from motorid.problem import Problem
 from motorid.simulate import simulate
 

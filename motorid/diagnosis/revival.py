@@ -12,21 +12,18 @@ import numpy as np
 from motorid.errors import SimulationError
 from motorid.fit import Fit
 from motorid.model import Model
+from motorid.plateaus import put_back
 from motorid.problem import Problem
 
-ALIVE = 10.0  # standard deviations that a change by a factor of e makes
 NO_LOSS = 2.0  # of the cost, half of chi²: two standard deviations
 
 
 def revived(fit: Fit, model: Model) -> Model:
     """Return the model with collapsed parameters put back to where they matter."""
     names = [p.name for p in fit.problem.unknown]
-    back = {}
-    for p in model.parameters.values():
-        if p.positive and p.vary and p.name in names:
-            slope = float(np.linalg.norm(fit.jacobian[:, names.index(p.name)]))
-            if 0 < p.value * slope < ALIVE:
-                back[p.name] = float(np.clip(3 * ALIVE / slope, p.lower, min(p.upper, 1e6 * p.value)))
+    slopes = dict(zip(names, np.linalg.norm(fit.jacobian, axis=0), strict=True))
+    known = [p for p in model.parameters.values() if p.name in slopes]
+    back = put_back(known, {p.name: p.value * slopes[p.name] for p in known})
     return model.start_at(back) if back else model
 
 
