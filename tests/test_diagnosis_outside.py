@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -108,6 +109,22 @@ def test_what_is_needed_beside_it_is_kept_and_the_rest_is_said(lab):
     assert found.after.values["tau_c"] == pytest.approx(1e-2, rel=0.1)
     assert "They follow a load that changes with the angle" in found.text
     assert not found.remaining.adequate
+
+
+@pytest.mark.parametrize(
+    ("name", "factors", "form", "where"),
+    [
+        ("R", (0.8, 1.0, 1.25, 0.9), "a resistance that differs from run to run", "electrical"),
+        ("K", (0.97, 1.0, 1.04, 1.0), "a motor constant that differs from run to run", "electrical"),
+        ("J", (0.8, 1.0, 1.3, 1.0), "an inertia that differs from run to run", "mechanical"),
+    ],
+)
+def test_a_motor_that_is_another_in_every_run_lacks_no_effect(lab, name, factors, form, where):
+    """Warm and cold, another supply, another load: no effect fits the runs together, each alone has no misfit."""
+    motors = [replace(lab, **{name: getattr(lab, name) * k}) for k in factors]
+    drives = ("stairs 0.5", "ramps 0.6", "prbs 0.5", "steps 0.5")
+    runs = [runs_of(m, {}, (d,), seed=4 + k)[0] for k, (m, d) in enumerate(zip(motors, drives, strict=True))]
+    is_like(diagnosed(runs, ("brush_drop", "coulomb", "load_friction")), form, where)
 
 
 def test_the_ladder_does_not_climb_what_only_stands_in(lab):

@@ -22,7 +22,7 @@ from motorid.formatting import percent
 CHANGING = 0.5  # of the samples at which the voltage must change for its reading to matter
 NOISY = -0.25  # correlation of successive changes: noise has -0.5, a smooth course +1
 WINDOWS = (5, 15, 45)  # samples of a running median
-PLAIN = 0.05  # fall of the error with another reading
+PLAIN = 0.1  # fall of the error with another reading
 OTHER = {"zoh": "linear", "linear": "zoh"}
 
 

@@ -111,8 +111,10 @@ def _on(problem: Problem, fit: Fit, sims: Sequence[Simulation]) -> Judged:
 
 def _signals(problem: Problem, sim: Simulation, k: int) -> dict[str, Array]:
     run = problem.experiments[k]
-    found = {"t": run.t - run.t[0], "v": run.inputs["v"]}
+    found = {"t": run.t - run.t[0], "v": run.inputs["v"], "run": np.full(run.n, float(k))}
     found |= {c: np.asarray(sim.states[c]) for c in ("i", "omega") if c in sim.states}
+    if "omega" in found:
+        found["acceleration"] = np.gradient(found["omega"], run.t)
     if "theta" in run.outputs or "omega" in run.outputs:
         found["theta"] = found["turn"] = angle_signal(run)
     return found

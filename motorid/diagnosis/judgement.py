@@ -59,7 +59,7 @@ def _share(form: Form, train: Linear, test: Sequence[Linear], channels: Sequence
     most = fraction(after, before, channels)
     if most < 1 - PREDICTED:
         most = max(most, fraction_of(form, list(halves(train, BLOCKS)), channels))
-    if most < 1 - PREDICTED and test and form.on != "theta":
+    if most < 1 - PREDICTED and test and not form.local:
         most = max(most, fraction_of(form, [(train, test[0])], channels))
     return 1 - most
 

@@ -192,7 +192,7 @@ def _judged(form: Form, train: Linear, test: Sequence[Linear], channels: Sequenc
     Held-out runs may turn through angles that were never seen, or carry a linear answer too far; then blocks of the
     fitted runs are held out.
     """
-    if test and form.on != "theta":
+    if test and not form.local:
         fraction = fraction_of(form, [(train, test[0])], channels)
         if fraction < VOID:
             return fraction

@@ -16,13 +16,14 @@ from motorid.integrate.grid import Array
 KNOTS = 9  # cosines over the range of a quantity
 HARMONICS = 8  # of a turn
 SHARP = 1e-3  # of the highest speed: below it a direction is not known
-WORDS = {
-    "t": "the time",
-    "turn": "the angle within a turn",
-    "theta": "the angle",
-    "omega": "the speed",
-    "i": "the current",
-    "v": "the voltage",
+CHANGES = {
+    "t": "changes with the time",
+    "turn": "changes with the angle within a turn",
+    "theta": "changes with the angle",
+    "omega": "changes with the speed",
+    "i": "changes with the current",
+    "v": "changes with the voltage",
+    "run": "differs from run to run",
 }
 
 
@@ -43,7 +44,12 @@ class Form:
     @property
     def text(self) -> str:
         """What it is, in words."""
-        return f"{self.words} that changes with {WORDS[self.on]}"
+        return f"{self.words} that {CHANGES[self.on]}"
+
+    @property
+    def local(self) -> bool:
+        """Tell whether what is learnt of it on some runs says nothing of others."""
+        return self.on in ("theta", "run")
 
 
 FORMS = (
@@ -62,6 +68,13 @@ FORMS = (
     Form("a loss of voltage", "voltage", "t"),
     Form("a resistance", "voltage", "t", "i"),
     Form("a motor constant", "both", "t"),
+    Form("a friction", "torque", "run", "direction"),
+    Form("a load", "torque", "run"),
+    Form("a drag", "torque", "run", "omega"),
+    Form("an inertia", "torque", "run", "acceleration"),
+    Form("a loss of voltage", "voltage", "run"),
+    Form("a resistance", "voltage", "run", "i"),
+    Form("a motor constant", "both", "run"),
     Form("a gain of the speed sensor", "sensor", "turn", "omega", "omega"),
     Form("an error of the angle sensor", "sensor", "turn", "", "theta"),
 )
@@ -95,8 +108,12 @@ def basis_of(
 ) -> Array:
     """Return the form's functions along one run, (N, m)."""
     low, high = ranges[form.on]
-    z = signal[form.on] if form.on == "turn" else np.clip(signal[form.on], low, high)  # nothing is known beyond
-    if form.on == "turn":
+    z = signal[form.on]
+    if form.on not in ("turn", "run"):
+        z = np.clip(z, low, high)  # nothing is known beyond
+    if form.on == "run":
+        functions = (signal["run"][:, None] == np.arange(int(high) + 1)).astype(float)
+    elif form.on == "turn":
         waves = [f(k * z) for k in orders for f in (np.sin, np.cos)]
         functions = np.column_stack([np.ones_like(z), *waves])
     elif form.on in ("omega", "i", "v"):
