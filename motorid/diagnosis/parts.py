@@ -17,10 +17,13 @@ from motorid.experiment import Experiment
 from motorid.fit import Fit, solve
 from motorid.integrate.grid import Array
 from motorid.prepared import angle_signal
+from motorid.problem import Problem
 
 AFFORDABLE = 150_000  # steps of integration per simulation of all records
 WANTED = 36_000  # of what is longer
 PART = 1000  # samples
+SUBSTEPS = 24  # per sample: what needs more cannot be seen in these samples, unless it is cheap
+CHEAP = 200_000  # steps of integration
 LONG = 20_000  # samples: a first fit of their parts tells whether all of them are affordable
 FEW = 4 * PART  # samples of that first fit
 NEARLY_ALL = 0.7  # of the samples: no reason to leave out the rest
@@ -41,6 +44,12 @@ def affordable(fit: Fit) -> Fit:
         return solve(problem.with_(experiments=parts, model=fit.model, balance={}), start="model")
     except MotoridError:
         return fit
+
+
+def worth_its_steps(problem: Problem) -> bool:
+    """Tell whether a problem takes no more sub-steps than its samples are worth."""
+    spent = sum(int(r.grid.substeps.sum()) for r in problem.runs)
+    return spent <= max(SUBSTEPS * _samples(problem.experiments), CHEAP)
 
 
 def fit_affordably(runs: Sequence[Experiment], fit: Callable[[Sequence[Experiment]], Fit]) -> Fit:

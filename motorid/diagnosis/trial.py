@@ -9,6 +9,7 @@ import numpy as np
 
 from motorid.descent import Descent, descend
 from motorid.diagnosis.evidence import Errors
+from motorid.diagnosis.parts import worth_its_steps
 from motorid.diagnosis.rank import uses_angle
 from motorid.diagnosis.revival import let_go, revived
 from motorid.errors import FitError, ModelError, SimulationError
@@ -29,8 +30,6 @@ BLOCKS = 10  # contiguous parts of each run; every other one is held out where t
 GOING_ON = 4  # times, where the last descent ends at its limit
 ROUGH = 1e-4  # accuracy of the integration while starts are compared
 LOST = 0.2  # NRMSE of a channel
-SUBSTEPS = 24  # per sample: what needs more cannot be seen in these samples, unless it is cheap
-CHEAP = 200_000  # steps of integration
 ROOM = 10.0  # factor beyond its grid that a shape parameter may run to
 FAILURES = (FitError, SimulationError, ModelError, np.linalg.LinAlgError)
 WORSE = 1.02  # of the cost along the measured angle: the model's own angle must do as well
@@ -218,8 +217,7 @@ def _race(fit: Fit, model: Model, start: Mapping[str, float], angular: bool) -> 
         done = descend(problem, RACE, stages=False)
     except FAILURES:
         return None
-    spent = sum(int(r.grid.substeps.sum()) for r in done.problem.runs)
-    return done if spent <= max(SUBSTEPS * sum(r.experiment.n for r in problem.runs), CHEAP) else None
+    return done if worth_its_steps(done.problem) else None
 
 
 def _bounded(fit: Fit, model: Model) -> Model:
@@ -240,9 +238,13 @@ def _bounded(fit: Fit, model: Model) -> Model:
 
 
 def _polished(fit: Fit, problem: Problem) -> Fit | None:
-    """Converge from a good start, channels weighed anew where the misfit has changed."""
+    """Converge from a good start, channels weighed anew where the misfit has changed.
+
+    Where that takes more sub-steps than the samples are worth, it is done as roughly as the race.
+    """
     try:
-        problem = problem.tuned(accuracy=fit.problem.accuracy)
+        exact = problem.tuned(accuracy=fit.problem.accuracy)
+        problem = exact if worth_its_steps(exact.refined(exact.start)) else problem.tuned(accuracy=ROUGH)
         done = _converged(problem)
         if problem.balance:
             factors = misfit_over_noise(done.problem, done.solution.q)
