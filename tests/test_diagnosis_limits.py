@@ -99,6 +99,14 @@ def test_what_made_a_special_effect_special_may_be_taken_over(rubbing):
 # -- limits of physics -------------------------------------------------------------------------------------
 
 
+def test_an_offset_of_the_size_of_the_voltage_is_refused(rubbing):
+    fit = mi.fit(mi.dc_motor() + mi.effects.voltage_offset, rubbing)
+    top = max(np.abs(r.inputs["v"]).max() for r in rubbing)
+    for share, refused in ((0.1, False), (0.5, True), (-0.5, True)):
+        far = replace(fit, values={**fit.values, "V_0": share * top})
+        assert ("not plausible" in objections(far, LIBRARY["voltage_offset"])) == refused
+
+
 def test_an_amplitude_without_a_phase_is_refused(rubbing):
     fit = refit(
         mi.fit(mi.dc_motor() + mi.effects.coulomb, rubbing),

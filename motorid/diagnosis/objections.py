@@ -8,12 +8,14 @@ import numpy as np
 
 from motorid.diagnosis.resolvable import unresolved
 from motorid.fit import Fit
+from motorid.formatting import percent
 from motorid.model import Effect
 from motorid.parameters import Parameter
 
 WORST_CONDITION = 1e4  # of the column-scaled Jacobian
 HOPELESS = 1e6  # condition number beyond which a direction counts as open
 KNOWN = 0.3  # of a parameter, its standard deviation: determined
+MOST_VOLTAGE = 0.4  # of the largest voltage that an offset, a drop or a dead band may be
 EMPTIED = 1e-2  # of its value before: it has vanished
 LENGTHS = ("rad", "m")  # a gap that runs to its limit is none
 PHASE_KNOWN = 0.5  # rad, standard deviation: beyond it an amplitude is not told from none
@@ -35,7 +37,18 @@ def objections(fit: Fit, added: Effect, before: Fit | None = None) -> str:
             return f"{p.name} goes to {p.null:g}: the data do not want it, or only with the wrong sign"
         if p.vary and np.isfinite(p.upper) and fit.values[p.name] > 0.98 * p.upper and not _was_narrowed(p, added):
             return f"{p.name} runs to {p.upper:g}, the limit of what is physical"
-    return _adrift(fit, pars) or unresolved(fit, added) or (_emptied(fit, added, before) if before else "")
+    why = _too_large(fit, pars) or _adrift(fit, pars) or unresolved(fit, added)
+    return why or (_emptied(fit, added, before) if before else "")
+
+
+def _too_large(fit: Fit, pars: Sequence[Parameter]) -> str:
+    """Say so where a voltage that is lost is of the size of what is applied: another parameter has paid for it."""
+    top = max(float(np.abs(r.inputs["v"]).max()) for r in fit.problem.experiments)
+    for p in pars:
+        if p.unit == "V" and p.null == 0 and abs(fit.values[p.name]) > MOST_VOLTAGE * top:
+            share = percent(abs(fit.values[p.name]) / top, 2)
+            return f"{p.name} = {fit.values[p.name]:.3g} V is {share} of the largest voltage, which is not plausible"
+    return ""
 
 
 def _was_narrowed(p: Parameter, added: Effect) -> bool:
