@@ -29,6 +29,7 @@ ROUNDS = 4  # of refining the sub-steps
 LOOKS = ((True, 0.1, 0.0), (False, 10.0, 0.0), (True, 10.0, 0.0), (False, 1.0, 1.5), (True, 1.0, 1.5))
 WILD = 1e7  # times the whole residual: more than any change by a factor of e does to one sample
 FAR = 1.0  # on the logarithmic scale: how far a descent goes before its sub-steps are chosen again
+NEAR = 0.05  # and how far they suit without a look
 FLAT = 0.03  # of the misfit: what a change by a factor of e does at least, if the data have a say in it
 
 Callback = Callable[[int, float, Array], object] | None
@@ -81,21 +82,22 @@ def _settled(problem: Problem, options: LevenbergMarquardt, callback: Callback) 
     history: list[float] = []
     q = problem.start
     for _ in range(ROUNDS):
-        problem, found = _solve(problem, q, options, callback)
+        following, found = _solve(problem, q, options, callback)
+        problem = following.problem
         history += found.history
         moved = np.max(np.abs(found.q - q), initial=0.0) > 1e-3
         q = found.q
-        if found.status == "limit" or problem.fine_enough(q) or not (moved or found.status == "stalled"):
+        if found.status == "limit" or following.suits(q) or not (moved or found.status == "stalled"):
             break
     return Descent(problem, found, tuple(history))
 
 
 def _solve(problem: Problem, q: Array, options: LevenbergMarquardt,
-           callback: Callback) -> tuple[Problem, Solution]:
+           callback: Callback) -> tuple[_Following, Solution]:
     following = _Following(problem)
     found = levenberg_marquardt(following.residual, following.both, q, problem.scaling.bounds, options,
                                 callback, problem.scaling.log)
-    return following.problem, found
+    return following, found
 
 
 class _Following:
@@ -115,6 +117,10 @@ class _Following:
             self._choose(q)  # a sgn that these steps jump over makes slopes of nothing
             r, jac = self.problem.residual_and_jacobian(q)
         return r, jac
+
+    def suits(self, q: Array) -> bool:
+        """Tell whether the sub-steps are right at `q` too: chosen nearby, or still fine enough."""
+        return bool(np.max(np.abs(q - self._chosen_at), initial=0.0) < NEAR) or self.problem.fine_enough(q)
 
     def _choose(self, q: Array) -> None:
         self.problem, self._chosen_at = self.problem.refined(q), q
@@ -199,8 +205,8 @@ def _narrowing(problem: Problem, options: LevenbergMarquardt, callback: Callback
                 done = descend_surely(wide, _sooner(options, ON_THE_WAY[0]), callback, stages=False)
                 wide, found, costs = done.problem, done.solution, done.history
             else:
-                wide, found = _solve(wide, wide.start, _sooner(options, ON_THE_WAY[min(k, 1)]), callback)
-                costs = found.history
+                following, found = _solve(wide, wide.start, _sooner(options, ON_THE_WAY[min(k, 1)]), callback)
+                wide, costs = following.problem, found.history
         except (FitError, SimulationError):
             continue
         history += costs

@@ -45,10 +45,13 @@ def off_plateaus(done: Descent, options: LevenbergMarquardt, callback: Callback 
 
     All are put back together first, then one by one.
     """
-    names = [p.name for p in done.problem.unknown]
+    jac, log = done.solution.jac, done.problem.scaling.log
+    size = np.sqrt(np.einsum("ij,ij->j", jac, jac))
+    if not (size[log] < ALIVE).any():
+        return done
     values = done.problem.values(done.solution.q)
     parameters = [replace(p, value=values[p.name]) for p in done.problem.model.parameters.values() if p.vary]
-    says = dict(zip(names, np.linalg.norm(done.solution.jac, axis=0), strict=True))
+    says = dict(zip((p.name for p in done.problem.unknown), size, strict=True))
     back = {n: v for n, v in put_back(parameters, says).items() if v != values[n]}
     each = [{n: v} for n, v in back.items()][:MOST] if len(back) > 1 else []
     for start in [back, *each] if back else []:
