@@ -13,10 +13,10 @@ import motorid as mi
 from motorid.diagnosis.adequacy import adequacy
 from motorid.diagnosis.evidence import Errors, despiked
 from motorid.diagnosis.hardly import hardly_moved
+from motorid.diagnosis.held import HeldOut
 from motorid.diagnosis.judgement import judgement, predicted
 from motorid.diagnosis.judging import Judge, Node
 from motorid.diagnosis.rank import Score
-from motorid.diagnosis.trial import HeldOut
 from motorid.diagnosis.verdict import _noise_feedback, closed_loop_remark
 from motorid.effects import LIBRARY
 from motorid.experiment import Experiment

@@ -11,9 +11,9 @@ from battery.excite import driven, record
 
 import motorid as mi
 from motorid.diagnosis.forms import linearised
+from motorid.diagnosis.held import HeldOut
 from motorid.diagnosis.outside import outside
 from motorid.diagnosis.remainders import far
-from motorid.diagnosis.trial import HeldOut
 from motorid.experiment import Experiment
 
 ANGLE = ("i", "omega", "theta")

@@ -13,8 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from motorid.diagnosis.evidence import compare_errors
+from motorid.diagnosis.held import train_errors
 from motorid.diagnosis.judging import worth_it
-from motorid.diagnosis.trial import FAILURES, train_errors
+from motorid.diagnosis.trial import FAILURES
 from motorid.experiment import Experiment
 from motorid.fit import Fit, solve
 from motorid.formatting import percent

@@ -9,11 +9,12 @@ from collections.abc import Sequence
 
 from motorid.diagnosis.adequacy import adequacy, following, unpredicted
 from motorid.diagnosis.forms import Linear, halves, linearised
+from motorid.diagnosis.held import BLOCKS, HeldOut
 from motorid.diagnosis.rank import Score
 from motorid.diagnosis.remainders import by_channel, far, fraction, fraction_of, left
 from motorid.diagnosis.results import Adequacy
 from motorid.diagnosis.shapes import Form
-from motorid.diagnosis.trial import BLOCKS, FAILURES, HeldOut
+from motorid.diagnosis.trial import FAILURES
 from motorid.fit import Fit
 
 PREDICTED = 0.1  # of the squared misfit: what a form must explain, on data held out too, that is no noise

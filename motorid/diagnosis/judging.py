@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from motorid.diagnosis.evidence import Errors, Gain, astray, compare_errors
+from motorid.diagnosis.held import LEAST_FALL, HeldOut, train_errors
 from motorid.diagnosis.results import Candidate
-from motorid.diagnosis.trial import LEAST_FALL, HeldOut, train_errors
 from motorid.fit import Fit
 
 COMMON = (

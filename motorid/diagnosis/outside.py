@@ -15,9 +15,10 @@ import numpy as np
 
 from motorid.diagnosis.evidence import compare_errors
 from motorid.diagnosis.forms import Linear, as_effect, halves, linearised
+from motorid.diagnosis.held import BLOCKS, HeldOut, train_errors
 from motorid.diagnosis.remainders import by_channel, far, fraction, fraction_of, left
 from motorid.diagnosis.shapes import Form
-from motorid.diagnosis.trial import BLOCKS, FAILURES, HeldOut, refit, train_errors
+from motorid.diagnosis.trial import FAILURES, refit
 from motorid.fit import Fit
 from motorid.integrate.grid import Array
 

@@ -12,12 +12,13 @@ from dataclasses import replace
 from typing import Any
 
 from motorid.diagnosis.evidence import Errors, Gain, compare_errors
+from motorid.diagnosis.held import HeldOut, train_errors
 from motorid.diagnosis.judging import COMMON, PLAIN, Judge, Node, held_out_objection, node_of, worth_it
 from motorid.diagnosis.objections import WORST_CONDITION, ambiguity, objections
 from motorid.diagnosis.rank import Score, rank
 from motorid.diagnosis.results import Candidate
-from motorid.diagnosis.tournament import Behind, Task, refits
-from motorid.diagnosis.trial import FAILURES, HeldOut, lost, refit, train_errors
+from motorid.diagnosis.tournament import GivenUp, Task, refits
+from motorid.diagnosis.trial import FAILURES, lost, refit
 from motorid.effects import LIBRARY
 from motorid.errors import ModelError
 from motorid.experiment import Experiment
@@ -84,7 +85,7 @@ class Search:
         _, wider = self._takeable(present)
         scores = self.scores(node)
         short = _shortlist(scores, lost(node.fit))
-        tasks = [Task(node.fit, present + s.effect, s.effect.name, s.starts[:3]) for s in short]
+        tasks = [Task(node.fit, present + s.effect, s.effect, s.starts[:3]) for s in short]
         tasks += [_widened(node.fit, e) for e in wider]
         fits = refits(tasks, self.map)
         self.advance(f"refitted {len(fits)}")
@@ -117,11 +118,10 @@ class Search:
             fresh.append(e)
         return fresh, wider
 
-    def _judge(self, node: Node, effect: Effect, fit: Fit | Behind | None) -> tuple[Node | None, Candidate]:
+    def _judge(self, node: Node, effect: Effect, fit: Fit | GivenUp | None) -> tuple[Node | None, Candidate]:
         candidate = Candidate(effect.name, 0.0)
-        if isinstance(fit, Behind):
-            why = f"far behind {fit.winner}, which leaves only noise"
-            return None, replace(candidate, refit_drop=fit.drop, reason=why)
+        if isinstance(fit, GivenUp):
+            return None, replace(candidate, refit_drop=fit.drop, reason=fit.why)
         if fit is None:
             return None, replace(candidate, reason="its refit could not be simulated")
         try:
@@ -284,4 +284,4 @@ def _widened(fit: Fit, effect: Effect) -> Task:
         [(p.name, g * natural.get(p.unit, 1.0)) for g in p.grid] for p in effect.parameters if p.null is None and p.grid
     ]
     starts = [{**sizes, **dict(point)} for point in itertools.product(*shapes)][:6]
-    return Task(fit, model, effect.name, starts)
+    return Task(fit, model, effect, starts)

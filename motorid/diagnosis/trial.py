@@ -8,118 +8,26 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from motorid.descent import Descent, descend
-from motorid.diagnosis.evidence import Errors
+from motorid.diagnosis.held import QUICK, ROUGH, restarted
 from motorid.diagnosis.parts import worth_its_steps
 from motorid.diagnosis.rank import uses_angle
 from motorid.diagnosis.revival import let_go, revived
 from motorid.errors import FitError, ModelError, SimulationError
-from motorid.experiment import Experiment
 from motorid.fit import Fit
 from motorid.least_squares import LevenbergMarquardt
 from motorid.misfit import misfit_over_noise
 from motorid.model import Model
 from motorid.prepared import natural_sizes
 from motorid.problem import Problem
-from motorid.simulate import at, simulated
 from motorid.start import first_guess
 
 RACE = LevenbergMarquardt(max_iterations=6, ftol=1e-3, xtol=1e-4)
-QUICK = LevenbergMarquardt(max_iterations=25, ftol=1e-4, xtol=1e-5)
 POLISH = LevenbergMarquardt(max_iterations=60, ftol=1e-7, xtol=1e-7)
-BLOCKS = 10  # contiguous parts of each run; every other one is held out where there are no held-out runs
 GOING_ON = 4  # times, where the last descent ends at its limit
-ROUGH = 1e-4  # accuracy of the integration while starts are compared
 LOST = 0.2  # NRMSE of a channel
 ROOM = 10.0  # factor beyond its grid that a shape parameter may run to
 FAILURES = (FitError, SimulationError, ModelError, np.linalg.LinAlgError)
 WORSE = 1.02  # of the cost along the measured angle: the model's own angle must do as well
-LEAST_FALL = 0.01  # of the held-out error that makes an effect worth having
-
-
-@dataclass(frozen=True, eq=False)
-class HeldOut:
-    """Where models are judged.
-
-    Attributes
-    ----------
-    validation : Problem or None
-        Held-out runs, of the model to begin with; None: blocks instead.
-    folds : tuple of (training Problem, test Experiments)
-        Every other block of the fitted records held out, and the others.
-    noise : dict of str to float
-    """
-
-    validation: Problem | None
-    folds: tuple[tuple[Problem, tuple[Experiment, ...]], ...]
-    noise: Mapping[str, float]
-
-    @staticmethod
-    def of(fit: Fit, validate: Sequence[Experiment] | Experiment | None) -> HeldOut:
-        """Prepare the judgement for models of `fit`'s records."""
-        noise = {c: s for run in fit.problem.runs for c, s in run.sigma.items()}
-        validation = None
-        if validate is not None:
-            runs = (validate,) if isinstance(validate, Experiment) else tuple(validate)
-            validation = fit.problem.with_(experiments=runs, model=fit.model, priors={}, penalties=(), balance={})
-        folds = []
-        for odd in (0, 1):
-            train, test = zip(*(_blocked(r, odd) for r in fit.problem.experiments), strict=True)
-            prepared = tuple(replace(run, experiment=e) for run, e in zip(fit.problem.runs, train, strict=True))
-            problem = fit.problem.with_(experiments=train, priors={}, penalties=())
-            folds.append((replace(problem, _runs=prepared), test))
-        return HeldOut(validation, tuple(folds), noise)
-
-    def errors(self, fit: Fit) -> Errors:
-        """Return the errors of `fit` on the held-out runs, or on blocks where there are none.
-
-        Raises
-        ------
-        SimulationError
-        """
-        if self.validation is not None:
-            return Errors.of(simulated(self.validation.for_model(fit.model)))
-        return self.block_errors(fit)
-
-    def block_errors(self, fit: Fit) -> Errors:
-        """Return the errors of `fit` on every other block, refitted to the rest, and the other way round.
-
-        Raises
-        ------
-        SimulationError
-        """
-        parts = []
-        for problem, test in self.folds:
-            start = problem.for_model(fit.model).tuned(balance=fit.problem.balance, accuracy=ROUGH)
-            if fit.model.angle_input:  # the measured angle, where it is hidden from the judgement too
-                runs = zip(fit.problem.runs, problem.runs, strict=True)
-                start = replace(start, _runs=tuple(replace(whole, experiment=r.experiment) for whole, r in runs))
-            q = start.scaling.scaled([fit.initial.get(p.name, p.value) for p in start.unknown])
-            done = descend(_from(start, q), QUICK, stages=False)
-            parts.append(Errors.of(at(done.problem, done.solution.q), test))
-        return Errors({c: [r for e in parts for r in e.residuals[c]] for c in parts[0].residuals}, parts[0].measured)
-
-
-def _from(problem: Problem, q) -> Problem:
-    """Return the problem with the values at `q` as its start, initial states too."""
-    values = problem.values(q)
-    physical = dict(zip([p.name for p in problem.unknown], problem.scaling.physical(q), strict=True))
-    runs = []
-    for k, run in enumerate(problem.runs):
-        start = run.start.copy()
-        for j, c in enumerate(("i", "omega", "theta")):
-            if f"{c}_0[{k}]" in physical:  # rounding must not put it outside its limits
-                start[j] = np.clip(physical[f"{c}_0[{k}]"], *run.limits[c])
-        runs.append(replace(run, start=start))
-    return replace(problem, model=problem.model.start_at(values), _runs=tuple(runs))
-
-
-def _blocked(run: Experiment, odd: int) -> tuple[Experiment, Experiment]:
-    """Return the run with every other block missing, and with the others missing."""
-    block = np.minimum(np.arange(run.n) * BLOCKS // run.n, BLOCKS - 1) % 2 == odd
-    hidden = {c: np.where(block, np.nan, y) for c, y in run.outputs.items()}
-    judged = {c: np.where(block, y, np.nan) for c, y in run.outputs.items()}
-    keep = {c: y for c, y in hidden.items() if np.isfinite(y).any()}
-    return run.with_(outputs=keep or run.outputs), run.with_(outputs=judged)
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,10 +51,10 @@ def raced(fit: Fit, model: Model, starts: Sequence[Mapping[str, float]]) -> Race
     for start in (*(starts or ({},)), *_own_starts(fit, model)):
         # As it is where a parameter put back (an inductance that no sample shows) makes the model too stiff.
         for each in (alive,) if alive is model else (alive, model):
-            done = _race(fit, each, start, angular)
+            done = _race(_started(fit, each, start, angular))
             if done is not None:
-                problem = _from(done.problem, done.solution.q)
-                found.append(Raced(problem, float(done.solution.history[-1]), angular))
+                problem, cost = restarted(done.problem, done.solution.q), float(done.solution.history[-1])
+                found.append(Raced(problem, cost, angular))
                 break
     return min(found, key=lambda r: r.cost, default=None)
 
@@ -162,7 +70,7 @@ def finished(fit: Fit, best: Raced) -> Fit | None:
         done = _released(best.problem) if best.angular else descend(best.problem, QUICK, stages=stages)
     except FAILURES:
         return None
-    return _polished(fit, let_go(_from(done.problem, done.solution.q), fit))
+    return _polished(fit, let_go(restarted(done.problem, done.solution.q), fit))
 
 
 def refit(fit: Fit, model: Model, starts: Sequence[Mapping[str, float]]) -> Fit | None:
@@ -182,7 +90,8 @@ def _released(measured: Problem) -> Descent:
     if not all("theta" in run.outputs for run in measured.experiments):
         return descend(own, QUICK, stages=False)
     along = descend(measured, QUICK, stages=False)
-    own = _from(along.problem, along.solution.q).for_model(own.model.start_at(along.problem.values(along.solution.q)))
+    values = along.problem.values(along.solution.q)
+    own = restarted(along.problem, along.solution.q).for_model(own.model.start_at(values))
     try:
         free = descend(own, QUICK, stages=False)
     except FAILURES:
@@ -205,14 +114,16 @@ def _own_starts(fit: Fit, model: Model) -> list[dict[str, float]]:
     return [first_guess(model, fit.problem.experiments, loaded=True)]
 
 
-def _race(fit: Fit, model: Model, start: Mapping[str, float], angular: bool) -> Descent | None:
-    """Go a few steps from `start`; None where that fails or needs more sub-steps than the samples are worth."""
+def _started(fit: Fit, model: Model, start: Mapping[str, float], angular: bool) -> Problem:
+    """Return the problem of a refit, at its start."""
     names = [n for n in start if n in model.parameters]
     problem = fit.problem.for_model(_within(model, {n: start[n] for n in names})).tuned(accuracy=ROUGH)
-    q = problem.scaling.scaled([fit.initial.get(p.name, p.value) for p in problem.unknown])
-    problem = _from(problem, q)
-    if angular:
-        problem = problem.for_model(replace(problem.model, angle_input=True, _systems={}))
+    problem = restarted(problem, problem.scaling.scaled([fit.initial.get(p.name, p.value) for p in problem.unknown]))
+    return problem.for_model(replace(problem.model, angle_input=True, _systems={})) if angular else problem
+
+
+def _race(problem: Problem) -> Descent | None:
+    """Go a few steps; None where that fails or needs more sub-steps than the samples are worth."""
     try:
         done = descend(problem, RACE, stages=False)
     except FAILURES:
@@ -249,7 +160,7 @@ def _polished(fit: Fit, problem: Problem) -> Fit | None:
         if problem.balance:
             factors = misfit_over_noise(done.problem, done.solution.q)
             if max(abs(np.log(factors[c] / problem.balance.get(c, 1.0))) for c in factors) > 0.1:
-                done = _converged(_from(done.problem, done.solution.q).tuned(balance=factors))
+                done = _converged(restarted(done.problem, done.solution.q).tuned(balance=factors))
     except FAILURES:
         return None
     found, problem = done.solution, done.problem
@@ -278,7 +189,7 @@ def _converged(problem: Problem) -> Descent:
     for _ in range(GOING_ON):
         if done.solution.status != "limit":
             break
-        again = descend(_from(done.problem, done.solution.q), POLISH, stages=False)
+        again = descend(restarted(done.problem, done.solution.q), POLISH, stages=False)
         done = replace(again, history=done.history + again.history)
     return done
 
@@ -291,8 +202,3 @@ def _within(model: Model, values: Mapping[str, float]) -> Model:
         v = float(np.clip(v, p.lower, p.upper))
         inside[n] = max(v, 1e-12) if p.positive else v
     return model.start_at(inside)
-
-
-def train_errors(fit: Fit) -> Errors:
-    """Return the errors of a fit on its own records."""
-    return Errors.of(fit.simulations)
