@@ -10,11 +10,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from motorid.diagnosis.orders import likely_orders
+from motorid.diagnosis.rank import Tangent
+from motorid.effects import LIBRARY
 from motorid.fit import Fit
 from motorid.integrate.grid import Array
 
 KNOTS = 9  # cosines over the range of a quantity
 HARMONICS = 8  # of a turn
+LINES = 2  # of the spectrum of the misfit over the angle
 SHARP = 1e-3  # of the highest speed: below it a direction is not known
 CHANGES = {
     "t": "changes with the time",
@@ -98,9 +102,10 @@ def shown(form: Form, fit: Fit, ranges: Mapping[str, tuple[float, float]]) -> bo
 
 
 def orders_of(fit: Fit) -> list[float]:
-    """Return orders of a turn: the lowest, and the harmonics of those in the model."""
+    """Return orders of a turn: the lowest, the harmonics of those in the model, and what stands out of the misfit."""
     known = [fit.values[p.name] for e in fit.model.effects for p in e.parameters if p.order]
-    return sorted({*range(1, HARMONICS + 1), *(round(k * n) for n in known for k in range(1, 5))})
+    seen = likely_orders(Tangent.of(fit), LIBRARY["cogging"], LINES) if "theta" in fit.problem.outputs else []
+    return sorted({*range(1, HARMONICS + 1), *(round(k * n) for n in known for k in range(1, 5)), *map(round, seen)})
 
 
 def basis_of(
