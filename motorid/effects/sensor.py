@@ -37,13 +37,14 @@ def speed_delay(
     m: Equations,
     T_d=P(5e-3, "s", null=0.0, positive=True, grid=(1.0, 4.0, 16.0), doc="delay of the speed measurement"),
 ):
-    """Pure delay of the speed measurement, Padé of order 2. Golub & Van Loan, 2013, sec. 9.3."""
+    """Pure delay of the speed measurement, Padé of orders 2 and 3. Golub & Van Loan, 2013, sec. 9.3."""
+    # (60 − 24Ts + 3T²s²)/(60 + 36Ts + 9T²s² + T³s³): with fewer zeros than poles, a jump does not pass at once.
     reaching = m.measured("omega")
-    # (12 − 6Ts + T²s²)/(12 + 6Ts + T²s²) = 1 − Ts·G with G = 12/(12 + 6Ts + T²s²): z1 = G·ω, z2 = T·dz1/dt.
-    z1, z2 = m.state("omega_delayed", m.start["omega"]), m.state("omega_delayed_2")
-    m.rate(z1, z2 / T_d)
-    m.rate(z2, (12 * (reaching - z1) - 6 * z2) / T_d)
-    m.measure("omega", reaching - z2)
+    z = [m.state("omega_delayed", m.start["omega"]), m.state("omega_delayed_2"), m.state("omega_delayed_3")]
+    m.rate(z[0], z[1] / T_d)
+    m.rate(z[1], z[2] / T_d)
+    m.rate(z[2], (60 * (reaching - z[0]) - 36 * z[1] - 9 * z[2]) / T_d)
+    m.measure("omega", z[0] - 0.4 * z[1] + 0.05 * z[2])
 
 
 @effect(balance="sensor")
