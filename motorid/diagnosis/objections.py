@@ -15,7 +15,7 @@ from motorid.parameters import Parameter
 WORST_CONDITION = 1e4  # of the column-scaled Jacobian
 HOPELESS = 1e6  # condition number beyond which a direction counts as open
 KNOWN = 0.3  # of a parameter, its standard deviation: determined
-MOST_VOLTAGE = 0.4  # of the largest voltage that an offset, a drop or a dead band may be
+MOST_VOLTAGE = 0.6  # of the largest voltage that an offset, a drop or a dead band may be
 EMPTIED = 1e-2  # of its value before: it has vanished
 LENGTHS = ("rad", "m")  # a gap that runs to its limit is none
 PHASE_KNOWN = 0.5  # rad, standard deviation: beyond it an amplitude is not told from none

@@ -78,7 +78,7 @@ def _beaten(tasks: Sequence[Task], costs: Sequence[float], first: int) -> dict[i
         if k == first or not np.isfinite(costs[k]):
             continue
         if costs[k] > BEHIND * costs[first]:
-            why[k] = f"far behind {winner.effect.name}, which leaves only noise"
+            why[k] = "far behind the best, which leaves only noise"
         elif winner.effect.name in task.effect.includes and costs[k] > costs[first] - (task.price - winner.price):
             why[k] = f"does no more than {winner.effect.name}, which it contains"
     return why
