@@ -11,7 +11,7 @@ from battery.excite import P, driven, record
 
 import motorid as mi
 from motorid.diagnosis.adequacy import adequacy
-from motorid.diagnosis.evidence import Errors, despiked
+from motorid.diagnosis.evidence import Errors, compare_errors, despiked
 from motorid.diagnosis.hardly import hardly_moved
 from motorid.diagnosis.held import HeldOut
 from motorid.diagnosis.judgement import judgement, predicted
@@ -153,6 +153,21 @@ def test_an_effect_that_leaves_one_channel_where_it_was_is_only_the_nearest():
     assert hardly_moved([_node((), i=0.4, omega=5.0), _node(("coulomb",), i=0.4, omega=0.5)], noise) == ""  # noise
     assert hardly_moved([first, _node(("speed_lag",), i=2.0, omega=0.5)], noise) == ""  # no matter of the current
     assert hardly_moved([first], noise) == ""
+
+
+def test_a_gain_must_be_one_whether_or_not_large_errors_are_cut(rng):
+    steady = rng.normal(0, 1.0, 400)
+    peaks, spikes = np.zeros(400), np.zeros(400)
+    peaks[100:120], spikes[::50] = 60.0, 60.0
+
+    def errors(r):
+        return Errors({"i": [r]}, {"i": 1.0})
+
+    spoilt = compare_errors(errors(2 * steady + 0.5 * peaks), errors(steady + peaks))
+    assert spoilt.fall < -0.3  # twice as good where it is calm, but the peaks, which are no outliers, are worse
+    assert compare_errors(errors(2 * steady), errors(steady)).fall == pytest.approx(0.5)
+    assert compare_errors(errors(2 * steady + spikes), errors(steady + spikes)).fall > 0.2  # nor do they hide one
+    assert compare_errors(errors(steady + 2 * spikes), errors(steady + spikes)).fall < 0.01  # spikes make no effect
 
 
 def test_held_out_runs_that_both_models_lose_decide_nothing():

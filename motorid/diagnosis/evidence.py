@@ -84,11 +84,19 @@ class Errors:
                     squares.setdefault(c, []).append(float(np.nanmean(y**2)))
         return Errors(residuals, {c: float(np.sqrt(np.mean(v))) for c, v in squares.items()})
 
-    def squares(self, quiet: bool = False) -> dict[str, tuple[float, int]]:
-        """Return (sum of squares, count) per channel, samples that stand alone left aside if `quiet`."""
+    def limits(self) -> dict[str, float]:
+        """Size per channel beyond which a residual is far from what is usual for this model."""
+        return {
+            c: CLIP * 1.4826 * float(np.nanmedian(np.abs(np.concatenate(list(rs))))) + 1e-300
+            for c, rs in self.residuals.items()
+        }
+
+    def squares(self, quiet: bool = False, limits: Mapping[str, float] | None = None) -> dict[str, tuple[float, int]]:
+        """Return (sum of squares, count) per channel, lone samples left aside if `quiet`, residuals cut at `limits`."""
         found = {}
         for c, rs in self.residuals.items():
             r = np.concatenate([despiked(r) if quiet else r[np.isfinite(r)] for r in rs])
+            r = r if limits is None else np.clip(r, -limits[c], limits[c])
             found[c] = (float(r @ r), len(r))
         return found
 
@@ -131,15 +139,27 @@ class Gain:
 
 
 def compare_errors(old: Errors, new: Errors, floor: Mapping[str, float] | None = None) -> Gain:
-    """Return what `new` gains over `old`; `floor` is the noise per channel, below which nothing is gained."""
-    before, after, effective = old.squares(quiet=True), new.squares(quiet=True), new.effective()
+    """Return what `new` gains over `old`; `floor` is the noise per channel, below which nothing is gained.
+
+    What is gained must be gained whether or not large errors are cut: a few of them must not make an effect, and an
+    effect must not hide what it spoils in them.
+    """
+    effective, limits = new.effective(), old.limits()
+    whole = _gain(old.squares(quiet=True), new.squares(quiet=True), effective, floor or {})
+    cut = _gain(old.squares(limits=limits), new.squares(limits=limits), effective, floor or {})
+    return Gain(
+        min(whole.log_ratio, cut.log_ratio), min(whole.fall, cut.fall), min(whole.worst, cut.worst), whole.effective
+    )
+
+
+Squares = Mapping[str, tuple[float, int]]
+
+
+def _gain(before: Squares, after: Squares, effective: Mapping[str, float], floor: Mapping[str, float]) -> Gain:
     logs, weights = [], []
-    for c in before:
-        if c not in after:
-            continue
-        n = max(before[c][1], 1)
+    for c in (c for c in before if c in after):
         # A tenth of the noise is as good as none: ratios of tiny numbers must not decide.
-        small = n * (0.1 * (floor or {}).get(c, 0.0)) ** 2 + 1e-300
+        small = max(before[c][1], 1) * (0.1 * floor.get(c, 0.0)) ** 2 + 1e-300
         logs.append(np.log((before[c][0] + small) / (after[c][0] + small)))
         weights.append(effective[c])
     if not logs:
