@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from battery.cases import CASES
 from battery.excite import driven, record
 
 import motorid as mi
@@ -139,3 +140,14 @@ def test_the_smaller_of_two_effects_is_found_behind_the_larger(plant):
     assert found.effects[0] == "gravity"
     assert found.after.values["N"] == 8
     assert found.after.values["A"] == pytest.approx(0.35, rel=0.1)
+
+
+@pytest.mark.slow
+def test_what_is_found_later_is_no_rival_any_more():
+    """In the first round either explains what both do together; in the end both are there."""
+    runs, check = CASES["quadratic_drag+voltage_offset"].records()
+    found = mi.diagnose(mi.fit(mi.dc_motor(), runs), check, effects=("quadratic_drag", "voltage_offset", "coulomb"))
+    assert set(found.effects) == {"quadratic_drag", "voltage_offset"}
+    assert found.groups == ()
+    assert "cannot tell" not in found.text
+    assert not any(set(c.group) & set(found.effects) for c in found.ranking)

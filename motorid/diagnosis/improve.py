@@ -73,7 +73,9 @@ def climb(search: Search, max_effects: int, advance: Callable[[str], None]) -> C
         frontier = [best, *_runners_up(search, best, ordered)][:BEAM]
         judged = judgement(best.fit, search.scores(best), search.held)
         advance(f"accepted {chosen_of.added}")
-    return Climb(search, tuple(_path(best)), tuple(rounds), tuple(g for g in groups if g), text, first, judged)
+    told = [tuple(replace(c, group=_without(c.group, best.key)) for c in r) for r in rounds]
+    groups = [(g[0], *_without(g[1:], best.key)) for g in groups if g]
+    return Climb(search, tuple(_path(best)), tuple(told), tuple(g for g in groups if g[1:]), text, first, judged)
 
 
 def settled(found: Climb) -> tuple[Climb, Outside | None]:
@@ -130,6 +132,11 @@ def _cut(found: Climb, kept: int, why: str, what: str) -> Climb:
     groups = tuple(g for g in found.groups if g[0] in names)
     judged = judgement(path[-1].fit, found.search.scores(path[-1]), found.search.held)
     return Climb(found.search, path, rounds, groups, f"stopped: what is left {what}", found.first, judged)
+
+
+def _without(group: Sequence[str], found: frozenset[str]) -> tuple[str, ...]:
+    """Return a group without what was found, too: that is no longer a rival."""
+    return tuple(n for n in group if n not in found)
 
 
 def _runners_up(search: Search, best: Node, ordered: Sequence[Node]) -> list[Node]:
