@@ -3,11 +3,14 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
+from battery.excite import driven, record
 
 import motorid as mi
-from motorid.diagnosis import parts, trial
+from motorid.diagnosis import held, parts, trial
 from motorid.diagnosis.objections import objections
 from motorid.diagnosis.revival import let_go, revived
+from motorid.diagnosis.tournament import Task, refits
 from motorid.diagnosis.verdict import measured_angle_remark
 from motorid.effects import LIBRARY
 from motorid.plateaus import ALIVE
@@ -112,3 +115,37 @@ def test_a_model_that_rests_on_the_measured_angle_says_so():
     led = mi.fit(replace(own.model, angle_input=True, _systems={}), run, start="model")
     assert measured_angle_remark(own) == ""
     assert "follows the measured angle" in measured_angle_remark(led)
+
+
+def test_refits_that_cannot_win_are_given_up(lab):
+    """Coulomb leaves only noise: what contains it gains nothing, and the others are far behind."""
+    rng = np.random.default_rng(8)
+    moves = [driven(lab, {"coulomb": {"tau_c": 8e-3}}, words, 800, 1e-3, rng) for words in ("stairs", "steps")]
+    runs = [record(m, "logger", ("i", "omega"), lab, rng, f"run{k}") for k, m in enumerate(moves)]
+    names = ("coulomb", "stribeck", "coulomb_asymmetric", "speed_lag", "brush_drop")
+    found = mi.diagnose(mi.fit(mi.dc_motor(), runs[:1]), runs[1:], effects=names)
+    assert found.effects == ("coulomb",)
+    why = {c.effect: c for c in found.ranking}
+    assert "does no more than coulomb" in why["stribeck"].reason
+    assert why["speed_lag"].reason == "far behind the best, which leaves only noise"
+    assert why["stribeck"].refit_drop > 0.9 > 0.5 > why["speed_lag"].refit_drop
+
+
+def test_nothing_is_given_up_while_more_than_noise_is_left(lab):
+    rng = np.random.default_rng(8)
+    hidden = {"coulomb": {"tau_c": 8e-3}, "speed_lag": {"T_w": 8e-3}}
+    run = record(driven(lab, hidden, "stairs", 800, 1e-3, rng), "logger", ("i", "omega"), lab, rng, "run")
+    fit = mi.fit(mi.dc_motor(), run)
+    effects = (mi.effects.coulomb, mi.effects.stribeck, mi.effects.speed_lag)
+    tasks = [Task(fit, fit.model + e, e, ({},)) for e in effects]
+    assert all(isinstance(f, mi.Fit) for f in refits(tasks, map))
+
+
+def test_what_takes_too_many_steps_is_polished_roughly(monkeypatch):
+    fit = mi.fit(mi.dc_motor(), _run(mi.dc_motor(**TRUE)))
+    problem = fit.problem.for_model(fit.model)
+    assert trial._polished(fit, problem).problem.accuracy is None
+    monkeypatch.setattr(trial, "worth_its_steps", lambda problem: False)
+    rough = trial._polished(fit, problem)
+    assert rough.problem.accuracy == held.ROUGH
+    assert rough.values["K"] == pytest.approx(fit.values["K"], rel=1e-3)
