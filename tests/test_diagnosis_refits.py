@@ -136,7 +136,7 @@ def test_nothing_is_given_up_while_more_than_noise_is_left(lab):
     hidden = {"coulomb": {"tau_c": 8e-3}, "speed_lag": {"T_w": 8e-3}}
     run = record(driven(lab, hidden, "stairs", 800, 1e-3, rng), "logger", ("i", "omega"), lab, rng, "run")
     fit = mi.fit(mi.dc_motor(), run)
-    effects = (mi.effects.coulomb, mi.effects.stribeck, mi.effects.speed_lag)
+    effects = (mi.effects.coulomb, mi.effects.coulomb_asymmetric)
     tasks = [Task(fit, fit.model + e, e, ({},)) for e in effects]
     assert all(isinstance(f, mi.Fit) for f in refits(tasks, map))
 
