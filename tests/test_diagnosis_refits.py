@@ -7,10 +7,9 @@ import pytest
 from battery.excite import driven, record
 
 import motorid as mi
-from motorid.diagnosis import held, parts, trial
+from motorid.diagnosis import held, parts, tournament, trial
 from motorid.diagnosis.objections import objections
 from motorid.diagnosis.revival import let_go, revived
-from motorid.diagnosis.tournament import Task, refits
 from motorid.diagnosis.verdict import measured_angle_remark
 from motorid.effects import LIBRARY
 from motorid.plateaus import ALIVE
@@ -131,14 +130,15 @@ def test_refits_that_cannot_win_are_given_up(lab):
     assert why["stribeck"].refit_drop > 0.9 > 0.5 > why["speed_lag"].refit_drop
 
 
-def test_nothing_is_given_up_while_more_than_noise_is_left(lab):
+@pytest.mark.parametrize("left", [[], [0]])
+def test_refits_are_given_up_only_where_the_best_leaves_noise(lab, left, monkeypatch):
     rng = np.random.default_rng(8)
-    hidden = {"coulomb": {"tau_c": 8e-3}, "speed_lag": {"T_w": 8e-3}}
-    run = record(driven(lab, hidden, "stairs", 800, 1e-3, rng), "logger", ("i", "omega"), lab, rng, "run")
-    fit = mi.fit(mi.dc_motor(), run)
-    effects = (mi.effects.coulomb, mi.effects.coulomb_asymmetric)
-    tasks = [Task(fit, fit.model + e, e, ({},)) for e in effects]
-    assert all(isinstance(f, mi.Fit) for f in refits(tasks, map))
+    moves = driven(lab, {"coulomb": {"tau_c": 8e-3}}, "stairs", 800, 1e-3, rng)
+    fit = mi.fit(mi.dc_motor(), record(moves, "logger", ("i", "omega"), lab, rng, "run"))
+    effects = (mi.effects.coulomb, mi.effects.coulomb_asymmetric, mi.effects.speed_lag)
+    monkeypatch.setattr(tournament, "far", lambda fit: left)
+    found = tournament.refits([tournament.Task(fit, fit.model + e, e, ({},)) for e in effects], map)
+    assert [isinstance(f, mi.Fit) for f in found] == [True, bool(left), bool(left)]
 
 
 def test_what_takes_too_many_steps_is_polished_roughly(monkeypatch):
