@@ -310,9 +310,21 @@ def test_the_json_is_plain_and_as_agreed(found):
     assert [r["added"] for r in whole["ladder"]] == [None, "coulomb"]
 
 
+def same(one, other):
+    """Whether two JSON values are the same but for rounding, which compiling on the way changes."""
+    if isinstance(one, dict):
+        return one.keys() == other.keys() and all(same(v, other[k]) for k, v in one.items())
+    if isinstance(one, list):
+        return len(one) == len(other) and all(map(same, one, other))
+    if isinstance(one, float) and isinstance(other, float):
+        return one == pytest.approx(other, rel=1e-5, abs=1e-9)
+    return one == other
+
+
 def test_the_same_records_give_the_same_answer(rubbing, plain, found):
     again = mi.diagnose(plain, rubbing[1], effects=FEW)
-    assert again.to_dict() == found[0].to_dict()
+    assert same(again.to_dict(), found[0].to_dict())
+    assert not same({**again.to_dict(), "where": "sensor"}, found[0].to_dict())
 
 
 @pytest.mark.slow
