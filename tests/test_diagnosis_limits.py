@@ -102,7 +102,7 @@ def test_what_made_a_special_effect_special_may_be_taken_over(rubbing):
 def test_an_offset_of_the_size_of_the_voltage_is_refused(rubbing):
     fit = mi.fit(mi.dc_motor() + mi.effects.voltage_offset, rubbing)
     top = max(np.abs(r.inputs["v"]).max() for r in rubbing)
-    for share, refused in ((0.3, False), (0.7, True), (-0.7, True)):
+    for share, refused in ((0.2, False), (0.4, True), (-0.4, True)):
         far = replace(fit, values={**fit.values, "V_0": share * top})
         assert ("not plausible" in objections(far, LIBRARY["voltage_offset"])) == refused
 

@@ -15,7 +15,8 @@ from motorid.parameters import Parameter
 WORST_CONDITION = 1e4  # of the column-scaled Jacobian
 HOPELESS = 1e6  # condition number beyond which a direction counts as open
 KNOWN = 0.3  # of a parameter, its standard deviation: determined
-MOST_VOLTAGE = 0.6  # of the largest voltage that an offset, a drop or a dead band may be
+MOST_LOST = 0.6  # of the largest voltage that a drop or a dead band may be
+MOST_OFFSET = 0.3  # and an offset, which turns the motor by itself
 EMPTIED = 1e-2  # of its value before: it has vanished
 LENGTHS = ("rad", "m")  # a gap that runs to its limit is none
 PHASE_KNOWN = 0.5  # rad, standard deviation: beyond it an amplitude is not told from none
@@ -42,10 +43,11 @@ def objections(fit: Fit, added: Effect, before: Fit | None = None) -> str:
 
 
 def _too_large(fit: Fit, pars: Sequence[Parameter]) -> str:
-    """Say so where a voltage that is lost is of the size of what is applied: another parameter has paid for it."""
+    """Say so where a voltage lost or added is of the size of what is applied: another parameter has paid for it."""
     top = max(float(np.abs(r.inputs["v"]).max()) for r in fit.problem.experiments)
     for p in pars:
-        if p.unit == "V" and p.null == 0 and abs(fit.values[p.name]) > MOST_VOLTAGE * top:
+        most = MOST_OFFSET if p.lower < 0 else MOST_LOST
+        if p.unit == "V" and p.null == 0 and abs(fit.values[p.name]) > most * top:
             share = percent(abs(fit.values[p.name]) / top, 2)
             return f"{p.name} = {fit.values[p.name]:.3g} V is {share} of the largest voltage, which is not plausible"
     return ""
