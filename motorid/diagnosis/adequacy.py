@@ -214,20 +214,22 @@ def _shift_test(labels: Sequence[NDArray[np.intp]], residuals: Sequence[Array]) 
     if total <= 0:
         return 0.0, 1.0
     sizes = sum(np.bincount(lab, minlength=count) for lab in labels)
-
-    def explained(shift: float) -> float:
-        sums = sum(
-            np.bincount(lab, np.roll(r, int(shift * len(r))), count) for lab, r in zip(labels, residuals, strict=True)
-        )
-        return float(np.sum(sums**2 / np.maximum(sizes, 1))) / total
-
-    actual = explained(0.0)
-    surrogate = np.log(np.array([explained(s) for s in np.linspace(0.05, 0.95, SHIFTS)]) + 1e-6)
+    sums = sum(_sums(lab, r, count) for lab, r in zip(labels, residuals, strict=True))
+    actual, *shares = np.sum(sums**2 / np.maximum(sizes, 1), axis=1) / total
+    surrogate = np.log(np.array(shares) + 1e-6)
     # Shares of surrogates are nearly log-normal; a tail beyond their number is read from that.
     from scipy.stats import t as student
 
     z = (np.log(actual + 1e-6) - surrogate.mean()) / max(float(surrogate.std(ddof=1)), 0.1)
     return max(actual - float(np.exp(surrogate.mean())), 0.0), float(student.sf(z, 8))
+
+
+def _sums(labels: NDArray[np.intp], r: Array, count: int) -> Array:
+    """Return the sums of `r` in each bin, as it is and shifted round by parts of its length, (1 + SHIFTS, count)."""
+    n = len(r)
+    shifts = np.array([0, *(int(part * n) for part in np.linspace(0.05, 0.95, SHIFTS))])
+    inside = np.fft.rfft(labels == np.arange(count)[:, None], axis=1)
+    return np.fft.irfft(inside * np.conj(np.fft.rfft(r)), n, axis=1)[:, shifts].T
 
 
 def _score_tests(fit: Fit, scores: Sequence[Score]) -> list[dict[str, Any]]:

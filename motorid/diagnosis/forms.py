@@ -29,6 +29,7 @@ from motorid.problem import Problem
 from motorid.simulate import Simulation, simulated
 
 START = 0.01  # of the natural torque
+BALANCES = ("voltage", "torque")
 UNBOUNDED = 1e9  # in units of the noise, per unit of a form
 
 
@@ -125,10 +126,10 @@ def _answers(problem: Problem, k: int, answer: Response, bases: Mapping[Form, Ar
     if not bases:
         return {}
     _, weights, index = problem._weights[k]
-    c = answer.c * weights[None, :, None]
+    answer = replace(answer, c=answer.c * weights[None, :, None])
     inside = {f: b for f, b in bases.items() if f.balance != "sensor"}
     flat = np.concatenate(
-        [_driven(answer, c, inside), *(_read(problem, f, b, weights) for f, b in bases.items() if f not in inside)],
+        [_driven(answer, inside), *(_read(problem, f, b, weights) for f, b in bases.items() if f not in inside)],
         axis=1,
     )
     flat = flat if index is None else flat[index]
@@ -137,18 +138,14 @@ def _answers(problem: Problem, k: int, answer: Response, bases: Mapping[Form, Ar
     return dict(zip(order, np.split(flat, ends, axis=1), strict=True))
 
 
-def _driven(answer: Response, c: Array, bases: Mapping[Form, Array]) -> Array:
+def _driven(answer: Response, bases: Mapping[Form, Array]) -> Array:
     """Return the outputs, (N·ny, m), to functions in the balances."""
-    n, ny, nx = c.shape
+    n, ny, _ = answer.c.shape
     if not bases:
         return np.zeros((n * ny, 0))
-    volts = np.concatenate([_share(f, b, answer, "voltage")[:-1] for f, b in bases.items()], axis=1)
-    torques = np.concatenate([_share(f, b, answer, "torque")[:-1] for f, b in bases.items()], axis=1)
-    state, out = np.zeros((nx, volts.shape[1])), np.zeros((n, ny, volts.shape[1]))
+    forces = [np.stack([_share(f, b, answer, on)[:-1] for on in BALANCES], axis=2) for f, b in bases.items()]
     with np.errstate(over="ignore", invalid="ignore"):
-        for j in range(n - 1):
-            state = answer.a[j] @ state + answer.b[j, :, :1] * volts[j] + answer.b[j, :, 1:] * torques[j]
-            out[j + 1] = c[j + 1] @ state
+        out = answer.driven(np.einsum("nxf,nmf->mnx", answer.b, np.concatenate(forces, axis=1), optimize=True))
     if not np.all(np.abs(out) < UNBOUNDED):  # or not a number
         raise SimulationError("the model's answer to small changes grows without bound along these records.")
     return out.reshape(n * ny, -1)

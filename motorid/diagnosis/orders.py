@@ -8,7 +8,8 @@ period per sample no alias and no delay of a sensor can pose as it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import TYPE_CHECKING
 
@@ -16,6 +17,7 @@ import numpy as np
 
 from motorid.diagnosis.response import Response, responses
 from motorid.diagnosis.whitening import Whitening, unstacked
+from motorid.fit import Fit
 from motorid.integrate.grid import Array
 from motorid.model import Effect
 from motorid.prepared import angle_signal
@@ -33,6 +35,9 @@ SAMPLES = 50  # and so many samples
 NEAR = 0.6  # of the best line: another order that may be the true one
 STANDS_OUT = 6.0  # times the usual order: a line
 ALIKE = 1e-7  # below one, the correlation at which the answers to sine and cosine are one
+SAMPLED = 10  # orders whose answers are worked out to know about how strong all are
+LOOKED_AT = 12  # of the best then
+STILL = 1e-6  # rad of the order per sample: no motion
 SURE = 30.0  # chi² of two degrees of freedom: the highest of 240 orders of noise reaches about 11
 
 
@@ -98,23 +103,124 @@ def _spectrum(tangent: Tangent, relative: bool) -> Spectrum:
     lowest = max(1 if relative else 2, int(np.ceil(PERIODS * 2 * np.pi / max(_travel(fit), 1e-9))))
     if top < lowest or (relative and "i" not in fit.problem.system.states):
         return Spectrum((), False)
-    white, basis, residual = _whitened(tangent)
-    # The residual is model less measurement: what is fitted to it counts against the motor's torque.
-    residual = -residual if relative else residual
-    moving, answers, found = _moving(tangent), responses(fit), []
-    chunk = int(np.clip(WIDEST / (2 * len(residual)), 10, HIGHEST))
-    for first in range(lowest, top + 1, chunk):
-        orders = np.arange(float(first), min(first + chunk, top + 1))
-        slow = np.array([_slow_enough(moving, n) for n in orders])
-        columns = white([_columns(fit, k, answer, orders, slow, relative) for k, answer in enumerate(answers)])
-        columns -= basis @ (basis.T @ columns)
-        found += _lines(orders, columns[:, : len(orders)], columns[:, len(orders) :], residual)
-    found = sorted((line for line in found if line.share > 0), key=lambda line: -line.share)
-    if not found:
+    moving, orders = _moving(tangent), np.arange(float(lowest), top + 1)
+    slow = np.array([_slow_enough(moving, n) for n in orders])
+    shares, lines = _Looking.of(tangent, relative).shares(orders, slow)
+    if not lines:
         return Spectrum((), False)
-    shares = np.array([line.share for line in found])
-    sure = shares[0] * len(residual) > SURE and shares[0] > STANDS_OUT * float(np.median(shares))
+    found = sorted(lines, key=lambda line: -line.share)
+    n = tangent.residual.size
+    sure = found[0].share * n > SURE and found[0].share > STANDS_OUT * float(np.median(shares))
     return Spectrum(tuple(found), bool(sure))
+
+
+@dataclass(frozen=True, eq=False)
+class _Looking:
+    """What is looked into for orders: a residual without its colour, off the tangent space, and the model's answers."""
+
+    fit: Fit
+    relative: bool
+    white: Whitening
+    basis: Array
+    residual: Array
+    answers: Sequence[Response]
+
+    @staticmethod
+    def of(tangent: Tangent, relative: bool) -> _Looking:
+        """Return what is there to be looked into; outputs count in units of their noise."""
+        white, basis, residual = _whitened(tangent)
+        answers = [
+            replace(answer, c=answer.c * weights[None, :, None])
+            for answer, (_, weights, _) in zip(responses(tangent.fit), tangent.fit.problem._weights, strict=True)
+        ]
+        # The residual is model less measurement: what is fitted to it counts against the motor's torque.
+        return _Looking(tangent.fit, relative, white, basis, -residual if relative else residual, answers)
+
+    def shares(self, orders: Array, slow: Array) -> tuple[Array, list[Line]]:
+        """Return about what each order explains, and exactly the lines of those that explain most.
+
+        How much the outputs answer is worked out for a few orders; between them it follows what is put in.
+        """
+        few = np.unique(np.geomspace(1, len(orders), SAMPLED).round().astype(int) - 1)
+        lines, sizes = self.exact(orders[few], slow[few])
+        if len(few) == len(orders) or not (sizes > 0).any():
+            return np.array([line.share for line in lines]), lines
+        pulls, put_in, squares = self.pulls(orders, slow)
+        seen = few[sizes > 0]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            answer = np.interp(np.log(orders), np.log(orders[seen]), np.log(sizes[sizes > 0] / put_in[seen]))
+            # The normal equations of sine and cosine, as alike in the outputs as they are in what is put in.
+            alike = squares / put_in
+            turned = np.real(np.conj(alike) * pulls**2)
+            shares = (np.abs(pulls) ** 2 - turned) / np.maximum(1 - np.abs(alike) ** 2, ALIKE)
+            shares /= np.exp(answer) * put_in * float(self.residual @ self.residual)
+        shares = np.where(put_in > 0, shares, 0.0)
+        best = [k for k in np.argsort(-shares)[:LOOKED_AT] if k not in few]
+        lines += self.exact(orders[best], slow[best])[0]
+        for line in lines:
+            shares[int(line.order - orders[0])] = line.share
+        return shares[shares > 0], lines
+
+    def exact(self, orders: Array, slow: Array) -> tuple[list[Line], Array]:
+        """Return the lines at `orders`, and the mean square of the answers to sine and cosine, 0 for none."""
+        lines: list[Line] = []
+        sizes = np.zeros(len(orders))
+        chunk = int(np.clip(WIDEST / (2 * len(self.residual)), 10, HIGHEST))
+        for first in range(0, len(orders), chunk):
+            part = slice(first, first + chunk)
+            columns = self.white([self._columns(k, orders[part], slow[part]) for k in range(len(self.answers))])
+            columns -= self.basis @ (self.basis.T @ columns)
+            sines, cosines = np.split(columns, 2, axis=1)
+            sizes[part] = (np.einsum("ij,ij->j", sines, sines) + np.einsum("ij,ij->j", cosines, cosines)) / 2
+            lines += _lines(orders[part], sines, cosines, self.residual)
+        return [line for line in lines if line.share > 0], sizes
+
+    def pulls(self, orders: Array, slow: Array) -> tuple[Array, Array, Array]:
+        """Return the products of the residual with the answers to exp(jNθ), and the sums Σ|z|² and Σz² put in."""
+        pulls, squares, put_in = np.zeros(len(orders), complex), np.zeros(len(orders), complex), np.zeros(len(orders))
+        residuals = self.white.transposed(self.residual, [len(a.c) for a in self.answers])
+        for k, answer in enumerate(self.answers):
+            angle = angle_signal(self.fit.problem.runs[k].experiment)
+            carrier = self._carrier(k)
+            pull = (answer.pulled(self._measured(k, residuals[k])) * answer.b[:, :, 1]).sum(axis=1) * carrier
+            first, step = np.exp(1j * angle), np.diff(angle)
+            turning = first ** int(orders[0])
+            for j, n in enumerate(orders):
+                # the mean of exp(jNθ) over the sample, unless it hardly moves
+                moves = np.abs(n * step) > STILL
+                mean = np.where(moves, np.diff(turning) / np.where(moves, 1j * n * step, 1.0), turning[1:])
+                mean[np.abs(step) > slow[j]] = 0.0
+                pulls[j] += pull @ mean
+                put_in[j] += float(np.vdot(carrier * mean, carrier * mean).real)
+                squares[j] += (carrier * mean) @ (carrier * mean)
+                turning = turning * first
+        return pulls, put_in, squares
+
+    def _columns(self, k: int, orders: Array, slow: Array) -> Array:
+        """Whitened outputs of run `k` to unit sine and cosine torques of all `orders`, (N, ny, 2 len(orders)).
+
+        `slow` is the change of the angle per sample up to which each order acts.
+        """
+        angle = angle_signal(self.fit.problem.runs[k].experiment)
+        middle, step = (angle[1:] + angle[:-1]) / 2, np.diff(angle)
+        # Averaged over the sample, so that orders too fast for the sampling fade instead of posing as slower ones.
+        fade = np.sinc(np.outer(orders, step) / (2 * np.pi)) * (np.abs(step) <= slow[:, None]) * self._carrier(k)
+        turning = np.outer(orders, middle)
+        drive = np.concatenate([np.sin(turning) * fade, np.cos(turning) * fade])
+        return self._measured(k, self.answers[k].driven(drive[:, :, None] * self.answers[k].b[:, :, 1]))
+
+    def _carrier(self, k: int) -> Array | float:
+        """What the order modulates: the motor's torque, or nothing but itself."""
+        return self.fit.values["K"] * self.answers[k].states["i"][:-1] if self.relative else 1.0
+
+    def _measured(self, k: int, outputs: Array) -> Array:
+        """Return outputs (N, ny, …) with nothing where nothing was measured."""
+        y, _, index = self.fit.problem._weights[k]
+        if index is not None:
+            missing = np.ones(y.size, bool)
+            missing[index] = False
+            outputs[missing.reshape(y.shape)] = 0.0
+        return outputs
 
 
 def _slow_enough(moving: Array, order: float) -> float:
@@ -153,34 +259,6 @@ def _lines(orders: Array, sines: Array, cosines: Array, residual: Array) -> list
         for j, n in enumerate(orders)
         if seen[j]
     ]
-
-
-def _columns(fit, k: int, answer: Response, orders: Array, slow: Array, relative: bool) -> Array:
-    """Whitened outputs of run `k` to unit sine and cosine torques of all `orders`, (N, ny, 2 len(orders)).
-
-    `slow` is the change of the angle per sample up to which each order acts.
-    """
-    run = fit.problem.runs[k]
-    angle = angle_signal(run.experiment)
-    middle, step = (angle[1:] + angle[:-1]) / 2, np.diff(angle)
-    # Averaged over the sample, so that orders too fast for the sampling fade instead of posing as slower ones.
-    fade = np.sinc(np.outer(step, orders) / (2 * np.pi)) * (np.abs(step)[:, None] <= slow)
-    drive = np.concatenate([np.sin(np.outer(middle, orders)) * fade, np.cos(np.outer(middle, orders)) * fade], axis=1)
-    if relative:
-        drive *= (fit.values["K"] * answer.states["i"][:-1])[:, None]
-    y, weights, index = fit.problem._weights[k]
-    n, ny, nx = answer.c.shape
-    s, out = np.zeros((nx, drive.shape[1])), np.zeros((n, ny, drive.shape[1]))
-    a, b, c = answer.a, answer.b[:, :, 1], answer.c * weights[None, :, None]
-    for i in range(n - 1):
-        s = a[i] @ s
-        s += b[i][:, None] * drive[i]
-        out[i + 1] = c[i + 1] @ s
-    if index is not None:
-        missing = np.ones(y.size, bool)
-        missing[index] = False
-        out[missing.reshape(y.shape)] = 0.0
-    return out
 
 
 def _travel(fit) -> float:

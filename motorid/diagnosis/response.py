@@ -8,10 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import casadi as ca
 import numpy as np
+from scipy.linalg.lapack import dtbtrs
 
 from motorid.fit import Fit
 from motorid.integrate.grid import Array
@@ -39,6 +40,40 @@ class Response:
     c: Array
     states: dict[str, Array]
 
+    def driven(self, pushes: Array) -> Array:
+        """Return the outputs, (N, ny, m), to m histories of pushes on the states at the end of each sample.
+
+        Parameters
+        ----------
+        pushes : ndarray, shape (m, N-1, nx)
+        """
+        m, n, nx = pushes.shape
+        right = np.zeros((m, n + 1, nx))
+        right[:, 1:] = pushes
+        solved = dtbtrs(self._band, right.reshape(m, -1).T, uplo="L", diag="U", overwrite_b=True)[0]
+        return np.einsum("nyx,mnx->nym", self.c, solved.T.reshape(m, n + 1, nx), optimize=True)
+
+    def pulled(self, weights: Array) -> Array:
+        """Return by how much a push on each state at the end of each sample, (N-1, nx), moves the weighted outputs.
+
+        Parameters
+        ----------
+        weights : ndarray, shape (N, ny)
+        """
+        right = np.einsum("nyx,ny->nx", self.c, weights)
+        solved = dtbtrs(self._band, right.reshape(-1, 1), uplo="L", trans="T", diag="U", overwrite_b=True)[0]
+        return np.asarray(solved).reshape(right.shape)[1:]
+
+    @cached_property
+    def _band(self) -> Array:
+        """The matrix of x⁺ − A x = pushes over all samples, lower bands (2 nx, N nx), its diagonal left out."""
+        n, nx, _ = self.a.shape
+        band = np.zeros((2 * nx, (n + 1) * nx), order="F")
+        for r in range(nx):
+            for c in range(nx):
+                band[nx + r - c, c : n * nx : nx] = -self.a[:, r, c]
+        return band
+
 
 @lru_cache(maxsize=64)
 def _disturbed(system: System) -> tuple[ca.Function, ca.Function]:
@@ -54,11 +89,19 @@ def _disturbed(system: System) -> tuple[ca.Function, ca.Function]:
     return step, ca.Function("shown", [xs, us, ps], [ca.densify(y), ca.densify(ca.jacobian(y, xs))])
 
 
+@lru_cache(maxsize=64)
+def _mapped(system: System, n: int) -> tuple[ca.Function, ca.Function]:
+    """Return step and outputs for `n` samples at once."""
+    step, out = _disturbed(system)
+    return step.map(n), out.map(n)
+
+
 def linear_steps(system: System, grid, x: Array, p: Array, d: Array) -> tuple[Array, Array, Array]:
     """Return one step from every sample, (x⁺, A, B), vectorised; `d` (N-1, 2), `x` (N, nx)."""
-    step, _ = _disturbed(system)
     n, nx = len(grid.dt), len(system.states)
-    x_next, a, b = step.map(n)(x[:-1].T, grid.u0.T, grid.u1.T, grid.dt[None, :], np.tile(p[:, None], (1, n)), d.T)
+    x_next, a, b = _mapped(system, n)[0](
+        x[:-1].T, grid.u0.T, grid.u1.T, grid.dt[None, :], np.tile(p[:, None], (1, n)), d.T
+    )
     return (
         np.asarray(x_next).T,
         np.asarray(a).reshape(nx, n, nx).transpose(1, 0, 2),
@@ -68,9 +111,8 @@ def linear_steps(system: System, grid, x: Array, p: Array, d: Array) -> tuple[Ar
 
 def shown(system: System, grid, x: Array, p: Array) -> tuple[Array, Array]:
     """Return (y, C) at every sample."""
-    _, out = _disturbed(system)
     n, (nx, _, _, ny) = len(x), system.sizes
-    y, c = out.map(n)(x.T, grid.u.T, np.tile(p[:, None], (1, n)))
+    y, c = _mapped(system, n)[1](x.T, grid.u.T, np.tile(p[:, None], (1, n)))
     return np.asarray(y).T, np.asarray(c).reshape(ny, n, nx).transpose(1, 0, 2)
 
 

@@ -6,7 +6,6 @@ physical sign; see `judging`.
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -17,7 +16,7 @@ from motorid.diagnosis.judging import COMMON, PLAIN, Judge, Node, held_out_objec
 from motorid.diagnosis.objections import WORST_CONDITION, ambiguity, objections
 from motorid.diagnosis.rank import Score, rank
 from motorid.diagnosis.results import Candidate
-from motorid.diagnosis.tournament import GivenUp, Task, refits
+from motorid.diagnosis.tournament import GivenUp, Task, refits, widened
 from motorid.diagnosis.trial import FAILURES, lost, refit
 from motorid.effects import LIBRARY
 from motorid.errors import ModelError
@@ -25,7 +24,6 @@ from motorid.experiment import Experiment
 from motorid.fit import Fit
 from motorid.model import Effect, Model
 from motorid.parameters import Parameter
-from motorid.prepared import natural_sizes
 
 SHORTLIST = 6
 NEAR = 0.4  # of the best score: what a common effect must reach to be refitted too
@@ -85,8 +83,8 @@ class Search:
         _, wider = self._takeable(present)
         scores = self.scores(node)
         short = _shortlist(scores, lost(node.fit))
-        tasks = [Task(node.fit, present + s.effect, s.effect, s.starts[:3]) for s in short]
-        tasks += [_widened(node.fit, e) for e in wider]
+        tasks = [Task(node.fit, present + s.effect, s.effect, s.starts[:3], s.drop) for s in short]
+        tasks += [widened(node.fit, e) for e in wider]
         fits = refits(tasks, self.map)
         self.advance(f"refitted {len(fits)}")
         children, judged = [], {}
@@ -232,11 +230,6 @@ def _alike(p: Parameter, other: Parameter) -> bool:
     return p.null == other.null == 0 or (p.null is None and other.null is None and p.unit == other.unit)
 
 
-def _sizes(fit: Fit, effect: Effect) -> list[float]:
-    """Sizes of an effect, those that vanish with it."""
-    return [fit.values[p.name] for p in effect.parameters if p.null == 0]
-
-
 def _shortlist(scores: Sequence[Score], astray: bool) -> list[Score]:
     """Return what is worth a refit: the best, what is common and near the best, and what a score cannot show.
 
@@ -268,20 +261,3 @@ def _drop(node: Node, train: Errors) -> float:
         sum(ss / noise[c] ** 2 for c, (ss, _) in e.squares().items() if c in noise) for e in (node.train, train)
     )
     return float(1 - new / max(old, 1e-300))
-
-
-def _widened(fit: Fit, effect: Effect) -> Task:
-    """Return the refit with `effect` in the place of those that it includes, from where they were."""
-    model, level = fit.model, 0.0
-    for e in model.effects:
-        if e.name in effect.includes:
-            level = max([level, *_sizes(fit, e)])
-            model = model.without(e.name)
-    model = model + effect
-    natural = natural_sizes(fit.problem.experiments, fit.values)
-    sizes = {p.name: level * (1.3 if p.at_least else 1.0) for p in effect.parameters if p.null == 0}
-    shapes = [
-        [(p.name, g * natural.get(p.unit, 1.0)) for g in p.grid] for p in effect.parameters if p.null is None and p.grid
-    ]
-    starts = [{**sizes, **dict(point)} for point in itertools.product(*shapes)][:6]
-    return Task(fit, model, effect, starts)

@@ -1,4 +1,4 @@
-"""Refits of a short list: all go a few steps, the best is finished, then those that are not hopelessly behind it.
+"""Refits of a short list: the favourite is finished, the others go a few steps and are finished unless beaten.
 
 Where one effect explains all but noise, one that is left many times as far has nothing to say any more, nor has one
 that contains it and gains less than its parameters cost.
@@ -6,6 +6,7 @@ that contains it and gains less than its parameters cost.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -14,21 +15,30 @@ import numpy as np
 
 from motorid.diagnosis.judging import EVIDENCE
 from motorid.diagnosis.remainders import far
-from motorid.diagnosis.trial import Raced, finished, raced
+from motorid.diagnosis.trial import Raced, finished, promised, raced
 from motorid.fit import Fit
 from motorid.model import Effect, Model
+from motorid.prepared import natural_sizes
 
 BEHIND = 10.0  # times the cost of a model that explains all but noise
+HARDLY = 1.01  # times: near enough that a slope tells what more would do
+FAR_LESS = 0.3  # of the promise that was kept
+FAR_BEHIND = "far behind the best, which leaves only noise"
+NEARLY = 0.9  # of the best promise: a smaller model with that is the favourite
 
 
 @dataclass(frozen=True)
 class Task:
-    """A model to be refitted on the records of `fit`, for an effect, from several starts."""
+    """A model to be refitted on the records of `fit`, for an effect, from several starts.
+
+    `promise` is the share of the squared misfit that a score says it takes away, None without a score.
+    """
 
     fit: Fit
     model: Model
     effect: Effect
     starts: Sequence[Mapping[str, float]]
+    promise: float | None = None
 
     @property
     def price(self) -> float:
@@ -54,40 +64,114 @@ def refits(tasks: Sequence[Task], map_: Callable[..., Iterable[Any]]) -> list[Fi
     map_ : callable
         Anything with the signature of `map`.
     """
-    races: list[Raced | None] = list(map_(_race, tasks))
-    costs = np.array([np.inf if race is None else race.cost for race in races])
-    found: list[Fit | GivenUp | None] = [None] * len(tasks)
-    if not np.isfinite(costs).any():
-        return found
-    first = int(np.argmin(costs + [task.price for task in tasks]))
-    found[first] = best = _finish((tasks[first], races[first]))
-    if best is not None and not far(best):
-        before = 0.5 * float(np.sum(tasks[0].fit.residuals ** 2))
-        for k, why in _beaten(tasks, costs.tolist(), first).items():
-            found[k] = GivenUp(1 - float(costs[k]) / max(before, 1e-300), why)
-    rest = [k for k, race in enumerate(races) if race is not None and found[k] is None and k != first]
-    for k, fit in zip(rest, map_(_finish, [(tasks[k], races[k]) for k in rest]), strict=True):
-        found[k] = fit
-    return found
+    found: dict[int, Fit | GivenUp | None] = {}
+    races: dict[int, Raced] = {}
+    leader, reach = _favourite(tasks), np.inf
+    if leader is not None and (race := _race((tasks[leader], reach))) is not None:
+        races[leader], found[leader] = race, _finish((tasks[leader], race))
+        if (best := _quiet(found[leader])) is not None:
+            found |= _needless(tasks, leader, best, race, map_)
+            found |= _unpromising(tasks, leader)
+    entered = [k for k in range(len(tasks)) if k not in races and k not in found]
+    done = map_(_race, [(tasks[k], reach) for k in entered])
+    races |= {k: race for k, race in zip(entered, done, strict=True) if race is not None}
+    if races:
+        first = min(races, key=lambda k: races[k].cost + tasks[k].price)
+        if first not in found:
+            found[first] = _finish((tasks[first], races[first]))
+        if _quiet(found[first]) is not None:
+            found = _beaten(tasks, {k: race.cost for k, race in races.items()}, first) | found
+    rest = [k for k in races if k not in found]
+    found |= zip(rest, map_(_finish, [(tasks[k], races[k]) for k in rest]), strict=True)
+    return [found.get(k) for k in range(len(tasks))]
 
 
-def _beaten(tasks: Sequence[Task], costs: Sequence[float], first: int) -> dict[int, str]:
+def _favourite(tasks: Sequence[Task]) -> int | None:
+    """Return which task promises most, the smallest of those that promise nearly as much; None if none does."""
+    promises = {k: task.promise for k, task in enumerate(tasks) if task.promise is not None}
+    near = [k for k, promise in promises.items() if promise > NEARLY * max(promises.values())]
+    return min(near, key=lambda k: (len(tasks[k].model.free_names), -promises[k]), default=None)
+
+
+def _quiet(fit: Fit | GivenUp | None) -> Fit | None:
+    """Return a fit that leaves hardly more than noise, or None."""
+    return fit if isinstance(fit, Fit) and not far(fit) else None
+
+
+def _unpromising(tasks: Sequence[Task], leader: int) -> dict[int, GivenUp]:
+    """Return the tasks of which far less is promised than of an effect that leaves only noise."""
+    promises = {k: task.promise for k, task in enumerate(tasks) if task.promise is not None}
+    return {k: GivenUp(p, FAR_BEHIND) for k, p in promises.items() if p < FAR_LESS * promises[leader]}
+
+
+def _needless(
+    tasks: Sequence[Task], leader: int, best: Fit, race: Raced, map_: Callable[..., Iterable[Any]]
+) -> dict[int, GivenUp]:
+    """Return the tasks that contain an effect that leaves only noise, and from there promise too little."""
+    winner = tasks[leader]
+    wider = [k for k, task in enumerate(tasks) if winner.effect.name in task.effect.includes]
+    gains = map_(_gain, [widened(best, tasks[k].effect, HARDLY) for k in wider])
+    return {
+        k: _given_up(winner, race.cost - gain, f"does no more than {winner.effect.name}, which it contains")
+        for k, gain in zip(wider, gains, strict=True)
+        if gain < tasks[k].price - winner.price
+    }
+
+
+def _given_up(task: Task, cost: float, why: str) -> GivenUp:
+    before = 0.5 * float(np.sum(task.fit.residuals**2))
+    return GivenUp(1 - cost / max(before, 1e-300), why)
+
+
+def _beaten(tasks: Sequence[Task], costs: Mapping[int, float], first: int) -> dict[int, GivenUp]:
     """Return which tasks need not be finished beside the one that explains all but noise, and why."""
-    winner, why = tasks[first], {}
-    for k, task in enumerate(tasks):
-        if k == first or not np.isfinite(costs[k]):
+    winner, given_up = tasks[first], {}
+    for k, cost in costs.items():
+        if k == first:
             continue
-        if costs[k] > BEHIND * costs[first]:
-            why[k] = "far behind the best, which leaves only noise"
-        elif winner.effect.name in task.effect.includes and costs[k] > costs[first] - (task.price - winner.price):
-            why[k] = f"does no more than {winner.effect.name}, which it contains"
-    return why
+        if cost > BEHIND * costs[first]:
+            given_up[k] = _given_up(winner, cost, FAR_BEHIND)
+        elif winner.effect.name in tasks[k].effect.includes and cost > costs[first] - (tasks[k].price - winner.price):
+            given_up[k] = _given_up(winner, cost, f"does no more than {winner.effect.name}, which it contains")
+    return given_up
 
 
-def _race(task: Task) -> Raced | None:
-    return raced(task.fit, task.model, task.starts)
+def _race(entry: tuple[Task, float]) -> Raced | None:
+    """Race a task; where only those `within` reach of a winner matter, its best start alone."""
+    task, within = entry
+    starts = task.starts if np.isinf(within) else task.starts[:1]
+    return raced(task.fit, task.model, starts, within)
 
 
-def _finish(begun: tuple[Task, Raced | None]) -> Fit | None:
-    task, race = begun
-    return None if race is None else finished(task.fit, race)
+def _finish(begun: tuple[Task, Raced]) -> Fit | None:
+    return finished(begun[0].fit, begun[1])
+
+
+def _gain(task: Task) -> float:
+    """Return by how much one step promises to lower the cost, not less than nothing."""
+    return max(task.fit.cost - promised(task.fit, task.model, task.starts), 0.0)
+
+
+def _sizes(fit: Fit, effect: Effect) -> list[float]:
+    """Sizes of an effect, those that vanish with it."""
+    return [fit.values[p.name] for p in effect.parameters if p.null == 0]
+
+
+def widened(fit: Fit, effect: Effect, above: float = 1.3) -> Task:
+    """Return the refit with `effect` in the place of those that it includes, from where they were.
+
+    Sizes that are at least another start at `above` times that.
+    """
+    model, level = fit.model, 0.0
+    for e in model.effects:
+        if e.name in effect.includes:
+            level = max([level, *_sizes(fit, e)])
+            model = model.without(e.name)
+    model = model + effect
+    natural = natural_sizes(fit.problem.experiments, fit.values)
+    sizes = {p.name: level * (above if p.at_least else 1.0) for p in effect.parameters if p.null == 0}
+    shapes = [
+        [(p.name, g * natural.get(p.unit, 1.0)) for g in p.grid] for p in effect.parameters if p.null is None and p.grid
+    ]
+    starts = [{**sizes, **dict(point)} for point in itertools.product(*shapes)][:6]
+    return Task(fit, model, effect, starts)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -39,10 +40,11 @@ class Raced:
     angular: bool
 
 
-def raced(fit: Fit, model: Model, starts: Sequence[Mapping[str, float]]) -> Raced | None:
+def raced(fit: Fit, model: Model, starts: Sequence[Mapping[str, float]], within: float = np.inf) -> Raced | None:
     """Go a few steps from each start with `model` on the records of `fit`; None if none can be simulated.
 
-    Effects of the angle start along the measured angle, which the model's own angle, still wrong, would lead astray.
+    A start from which no cost `within` reach is promised is given up earlier. Effects of the angle start along the
+    measured angle, which the model's own angle, still wrong, would lead astray.
     """
     model = _bounded(fit, model)
     alive = revived(fit, model)
@@ -51,12 +53,25 @@ def raced(fit: Fit, model: Model, starts: Sequence[Mapping[str, float]]) -> Race
     for start in (*(starts or ({},)), *_own_starts(fit, model)):
         # As it is where a parameter put back (an inductance that no sample shows) makes the model too stiff.
         for each in (alive,) if alive is model else (alive, model):
-            done = _race(_started(fit, each, start, angular))
+            done = _race(_started(fit, each, start, angular), replace(RACE, within=within))
             if done is not None:
                 problem, cost = restarted(done.problem, done.solution.q), float(done.solution.history[-1])
                 found.append(Raced(problem, cost, angular))
                 break
     return min(found, key=lambda r: r.cost, default=None)
+
+
+def promised(fit: Fit, model: Model, starts: Sequence[Mapping[str, float]]) -> float:
+    """Return the lowest cost that one undamped step from any of the starts promises `model`; infinite for none."""
+    lowest = np.inf
+    for start in starts:
+        with contextlib.suppress(*FAILURES):
+            problem = _started(fit, _bounded(fit, model), start, angular=False)
+            problem = problem.refined(problem.start)
+            r, jac = problem.residual_and_jacobian(problem.start)
+            triangle = np.linalg.qr(np.column_stack([jac, r]), mode="r")
+            lowest = min(lowest, 0.5 * float(np.sum(triangle[jac.shape[1] :, -1] ** 2)))
+    return lowest
 
 
 def finished(fit: Fit, best: Raced) -> Fit | None:
@@ -122,10 +137,10 @@ def _started(fit: Fit, model: Model, start: Mapping[str, float], angular: bool) 
     return problem.for_model(replace(problem.model, angle_input=True, _systems={})) if angular else problem
 
 
-def _race(problem: Problem) -> Descent | None:
+def _race(problem: Problem, options: LevenbergMarquardt) -> Descent | None:
     """Go a few steps; None where that fails or needs more sub-steps than the samples are worth."""
     try:
-        done = descend(problem, RACE, stages=False)
+        done = descend(problem, options, stages=False)
     except FAILURES:
         return None
     return done if worth_its_steps(done.problem) else None

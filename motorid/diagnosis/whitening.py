@@ -46,6 +46,20 @@ class Whitening:
             parts.append(np.stack(done, axis=1).reshape(-1, *y.shape[2:]))
         return np.concatenate(parts)
 
+    def transposed(self, rows: Array, lengths: Sequence[int]) -> list[Array]:
+        """Return the transposed filters on stacked `rows`, (N, ny) for each run of N samples in `lengths`."""
+        found, first = [], 0
+        for n in lengths:
+            shape = max(n - ORDER, 0), len(self.filters)
+            part = rows[first : first + shape[0] * shape[1]].reshape(shape)
+            first += part.size
+            out = np.zeros((n, shape[1]))
+            for j, a in enumerate(self.filters):
+                for k, c in enumerate(a):
+                    out[ORDER - k : ORDER - k + shape[0], j] += c * part[:, j]
+            found.append(out)
+        return found
+
 
 def _filtered(a: Array, x: Array) -> Array:
     """Return Σ a_k·x[n−k] along the first axis for n from ORDER on."""
