@@ -71,6 +71,7 @@ def refits(tasks: Sequence[Task], map_: Callable[..., Iterable[Any]]) -> list[Fi
         races[leader], found[leader] = race, _finish((tasks[leader], race))
         if (best := _quiet(found[leader])) is not None:
             found |= _needless(tasks, leader, best, race, map_)
+            reach = BEHIND * race.cost
             found |= _unpromising(tasks, leader)
     entered = [k for k in range(len(tasks)) if k not in races and k not in found]
     done = map_(_race, [(tasks[k], reach) for k in entered])

@@ -15,6 +15,7 @@ from motorid.diagnosis.rank import uses_angle
 from motorid.diagnosis.revival import let_go, revived
 from motorid.errors import FitError, ModelError, SimulationError
 from motorid.fit import Fit
+from motorid.integrate.grid import Array
 from motorid.least_squares import LevenbergMarquardt
 from motorid.misfit import misfit_over_noise
 from motorid.model import Model
@@ -69,7 +70,7 @@ def promised(fit: Fit, model: Model, starts: Sequence[Mapping[str, float]]) -> f
             problem = _started(fit, _bounded(fit, model), start, angular=False)
             problem = problem.refined(problem.start)
             r, jac = problem.residual_and_jacobian(problem.start)
-            triangle = np.linalg.qr(np.column_stack([jac, r]), mode="r")
+            triangle: Array = np.asarray(np.linalg.qr(np.column_stack([jac, r]), mode="r"))
             lowest = min(lowest, 0.5 * float(np.sum(triangle[jac.shape[1] :, -1] ** 2)))
     return lowest
 
