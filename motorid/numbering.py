@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from motorid.diagnosis.orders import Line, likely_lines
-from motorid.diagnosis.rank import Tangent
+from motorid.diagnosis.tangent import Tangent
 from motorid.errors import FitError
 from motorid.model import Effect, Model
 from motorid.problem import Problem

@@ -134,9 +134,11 @@ class Unknowns:
         """Return x0 (nx,) of run `k`."""
         return self.system.first_state(self._sensed(at, k), at.p)
 
-    def first_slopes(self, at: Point, k: int) -> Array:
-        """Return dx0/dq (nx, nq) of run `k`."""
+    def first_slopes(self, at: Point, k: int, along: Array | None = None) -> Array:
+        """Return dx0/dq (nx, nq) of run `k`, or the slopes (nx, m) along other directions of p (np, m)."""
         js, jp = self.system.first_slopes(self._sensed(at, k), at.p)
+        if along is not None:
+            return jp @ along
         rows, columns = self._places[k]
         dx0 = jp @ at.dp
         if rows:

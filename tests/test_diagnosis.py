@@ -15,7 +15,8 @@ import motorid as mi
 from motorid.diagnosis import adequacy
 from motorid.diagnosis.evidence import Errors, autocorrelation, compare_errors, effective_samples
 from motorid.diagnosis.orders import highest_order, likely_orders
-from motorid.diagnosis.rank import Tangent, rank, score
+from motorid.diagnosis.rank import rank, score
+from motorid.diagnosis.tangent import Tangent
 from motorid.diagnosis.verdict import moves
 from motorid.effects import LIBRARY
 from motorid.errors import FitError, ModelError, UsageError

@@ -12,9 +12,10 @@ import motorid as mi
 from motorid.diagnosis import parts
 from motorid.diagnosis.objections import objections
 from motorid.diagnosis.orders import likely_lines, spectrum
-from motorid.diagnosis.rank import Tangent, score
+from motorid.diagnosis.rank import score
 from motorid.diagnosis.resolvable import samples_within, unresolved
 from motorid.diagnosis.search import Search, library
+from motorid.diagnosis.tangent import Tangent
 from motorid.diagnosis.trial import refit
 from motorid.diagnosis.whitening import Whitening
 from motorid.effects import LIBRARY

@@ -6,7 +6,8 @@ import pytest
 
 import motorid as mi
 from motorid.diagnosis.orders import likely_orders
-from motorid.diagnosis.rank import Tangent, score
+from motorid.diagnosis.rank import score
+from motorid.diagnosis.tangent import Tangent
 from motorid.effects import LIBRARY
 from motorid.experiment import split
 

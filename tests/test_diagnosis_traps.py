@@ -8,7 +8,8 @@ from battery.cases import CASES
 from battery.excite import driven, record
 
 import motorid as mi
-from motorid.diagnosis.rank import Tangent, score
+from motorid.diagnosis.rank import score
+from motorid.diagnosis.tangent import Tangent
 from motorid.effects import LIBRARY
 from motorid.experiment import Experiment
 

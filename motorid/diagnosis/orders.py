@@ -23,7 +23,7 @@ from motorid.model import Effect
 from motorid.prepared import angle_signal
 
 if TYPE_CHECKING:
-    from motorid.diagnosis.rank import Tangent
+    from motorid.diagnosis.tangent import Tangent
 
 WIDEST = 4e6  # numbers in the answers to all orders that are looked at together
 HIGHEST = 240
@@ -231,6 +231,7 @@ def _slow_enough(moving: Array, order: float) -> float:
     return np.pi / order if float(np.mean(moving <= np.pi / order)) > SLOW_PART else 0.0
 
 
+@lru_cache(maxsize=2)
 def _whitened(tangent: Tangent) -> tuple[Whitening, Array, Array]:
     """Return the filters, the tangent space behind them, and the residual off it."""
     fit = tangent.fit

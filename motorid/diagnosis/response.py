@@ -12,7 +12,7 @@ from functools import cached_property, lru_cache
 
 import casadi as ca
 import numpy as np
-from scipy.linalg.lapack import dtbtrs
+from scipy.linalg import get_lapack_funcs
 
 from motorid.fit import Fit
 from motorid.integrate.grid import Array
@@ -20,6 +20,8 @@ from motorid.integrate.step import rosenbrock_step
 from motorid.problem import Problem
 from motorid.simulate import Simulation
 from motorid.system import System
+
+(TRIANGULAR,) = get_lapack_funcs(("tbtrs",), dtype=float)  # banded; SciPy has no other name for it
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +52,7 @@ class Response:
         m, n, nx = pushes.shape
         right = np.zeros((m, n + 1, nx))
         right[:, 1:] = pushes
-        solved = dtbtrs(self._band, right.reshape(m, -1).T, uplo="L", diag="U", overwrite_b=True)[0]
+        solved = TRIANGULAR(self._band, right.reshape(m, -1).T, uplo="L", diag="U", overwrite_b=True)[0]
         return np.einsum("nyx,mnx->nym", self.c, solved.T.reshape(m, n + 1, nx), optimize=True)
 
     def pulled(self, weights: Array) -> Array:
@@ -61,7 +63,7 @@ class Response:
         weights : ndarray, shape (N, ny)
         """
         right = np.einsum("nyx,ny->nx", self.c, weights)
-        solved = dtbtrs(self._band, right.reshape(-1, 1), uplo="L", trans="T", diag="U", overwrite_b=True)[0]
+        solved = TRIANGULAR(self._band, right.reshape(-1, 1), uplo="L", trans="T", diag="U", overwrite_b=True)[0]
         return np.asarray(solved).reshape(right.shape)[1:]
 
     @cached_property

@@ -15,6 +15,7 @@ from motorid.diagnosis.held import HeldOut, train_errors
 from motorid.diagnosis.judging import COMMON, PLAIN, Judge, Node, held_out_objection, node_of, worth_it
 from motorid.diagnosis.objections import WORST_CONDITION, ambiguity, objections
 from motorid.diagnosis.rank import Score, rank
+from motorid.diagnosis.remainders import far
 from motorid.diagnosis.results import Candidate
 from motorid.diagnosis.tournament import GivenUp, Task, refits, widened
 from motorid.diagnosis.trial import FAILURES, lost, refit
@@ -61,9 +62,13 @@ class Search:
         """Return the scores of all effects that `node` can take, best first; ranked once per model."""
         if node.key not in self._scores:
             fresh, _ = self._takeable(node.fit.model)
-            self._scores[node.key] = rank(node.fit, fresh)
+            self._scores[node.key] = rank(node.fit, fresh, self._scores_before(node))
             self.advance(f"ranked {len(fresh)} effects")
         return self._scores[node.key]
+
+    def _scores_before(self, node: Node) -> Sequence[Score]:
+        """Return the scores of the model that `node` came from, if it leaves hardly more than noise."""
+        return () if node.parent is None or far(node.fit) else self._scores.get(node.parent.key, ())
 
     def inseparable(self, node: Node) -> dict[str, tuple[str, ...]]:
         """Return the effects that do no more than a combination of parameters of effects that `node` has.

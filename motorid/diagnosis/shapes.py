@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from motorid.diagnosis.orders import likely_orders
-from motorid.diagnosis.rank import Tangent
+from motorid.diagnosis.tangent import Tangent
 from motorid.effects import LIBRARY
 from motorid.fit import Fit
 from motorid.integrate.grid import Array

@@ -106,6 +106,7 @@ class Stepper:
         self._library: Any = None
         self._refused = False
         self._spent = 0
+        self._next_look = 0
 
     def run(self, grid: Grid, x0: Array, p: Array, dx0: Array | None, dp: Array | None, local_error: bool,
             compiled: bool | None) -> Trajectory:
@@ -146,7 +147,8 @@ class Stepper:
         """Return the compiled driver if it is there, or worth making now; else None."""
         if compiled is False or self._refused:
             return None
-        if self._library is None:
+        if self._library is None and (compiled or self._spent >= self._next_look):
+            self._next_look = min(2 * self._spent + 1, PATIENCE + 1)  # another process may have made it meanwhile
             mark = cc.mark_of(self.key)
             if mark is None:
                 self._refused = True
