@@ -65,8 +65,7 @@ class Model(Shown):
                                  "rename it in the effect, or leave one of the two effects out.")
         added = {p.name: self._in_units(p) for p in other.parameters}
         model = self._with(effects=(*self.effects, other), parameters={**self.parameters, **added})
-        equations = model.write()
-        if equations.sgn_width is not None and "sgn_width" not in model.parameters:
+        if _smooths(model) and "sgn_width" not in model.parameters:
             width = replace(SGN_WIDTH, unit="m/s" if self.axis == "linear" else SGN_WIDTH.unit)
             model = model._with(parameters={**model.parameters, "sgn_width": width})
         return model
@@ -204,15 +203,35 @@ class Model(Shown):
         return f"<model {' + '.join([self.base, *self.effect_names])}: {', '.join(self.free_names)}>"
 
 
-@lru_cache(maxsize=256)
-def _systems_of(structure: Any) -> list[System]:
+@lru_cache(maxsize=512)
+def _known_of(structure: Any) -> list[Any]:
+    """What is known of models of one structure: filled when it is first asked for."""
     return []
+
+
+def _structure(model: Model) -> tuple[Any, ...]:
+    """All that the equations depend on; values are no part of it."""
+    laws = tuple((e.name, e.law) for e in model.effects)
+    return (model.base, laws, tuple(model.parameters), model.angle_input)
+
+
+def _smooths(model: Model) -> bool:
+    """Tell whether an effect uses a smooth sgn.
+
+    Raises
+    ------
+    ModelError
+        If the effects contradict one another.
+    """
+    slot = _known_of(_structure(model))
+    if not slot:
+        slot.append(model.write().sgn_width is not None)
+    return slot[0]
 
 
 def _shared_system(model: Model, outputs: tuple[str, ...]) -> System:
     """Return the system of the model's structure, shared by all models that differ in values only."""
-    laws = tuple((e.name, e.law) for e in model.effects)
-    slot = _systems_of((model.base, laws, tuple(model.parameters), model.angle_input, outputs, model.stored))
+    slot = _known_of((*_structure(model), outputs, model.stored))
     if not slot:
         slot.append(build_system(model.write(), tuple(model.parameters), outputs, model.stored))
     return slot[0]

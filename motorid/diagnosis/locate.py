@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from motorid.diagnosis.evidence import effective_samples
 from motorid.diagnosis.results import Binned, Missing
 from motorid.diagnosis.shapes import Form
-from motorid.diagnosis.smoother import Smoothed, smooth
+from motorid.diagnosis.smoother import Begun, Smoothed, begin, smooth
 from motorid.fit import Fit
 from motorid.integrate.grid import Array
 from motorid.prepared import angle_signal, natural_sizes
@@ -48,8 +48,9 @@ def locate(fit: Fit) -> Missing:
     apart = "i" in fit.problem.outputs and len(fit.problem.outputs) > 1
     if not apart and "i" in fit.problem.system.states:
         size[0] = 0.0  # one of them stands for both
-    walk, both = _walk(fit, size)
-    shares = _shares(fit, walk * size, both) if apart else {"mechanical": 1.0}
+    begun = [begin(fit, k) for k in range(len(fit.problem.runs))]
+    walk, both = _walk(fit, size, begun)
+    shares = _shares(fit, walk * size, both, begun) if apart else {"mechanical": 1.0}
     if "i" in fit.problem.system.states and not apart:
         shares = {"electrical": 0.5, "mechanical": 0.5}
     signals = tuple(_signals(fit, k, s) for k, s in enumerate(both))
@@ -94,20 +95,20 @@ def _region(first: str, regions: Mapping[str, float]) -> str:
     return f"Most of the misfit ({100 * regions[first]:.0f} %) lies in {place}."
 
 
-def _walk(fit: Fit, size: Array) -> tuple[float, list[Smoothed]]:
+def _walk(fit: Fit, size: Array, begun: Sequence[Begun]) -> tuple[float, list[Smoothed]]:
     """Return the smallest random walk that explains the measurements, and the smoothed runs."""
     found: list[Smoothed] = []
     for walk in WALKS:
-        found = [smooth(fit, k, walk * size) for k in range(len(fit.problem.runs))]
+        found = [smooth(fit, k, walk * size, at) for k, at in enumerate(begun)]
         if np.mean([s.chi2 for s in found]) <= 1.0:
             return walk, found
     return WALKS[-1], found
 
 
-def _shares(fit: Fit, walk: Array, both: Sequence[Smoothed]) -> dict[str, float]:
+def _shares(fit: Fit, walk: Array, both: Sequence[Smoothed], begun: Sequence[Begun]) -> dict[str, float]:
     """Share of the misfit by balance: what one unknown input alone leaves, the other has to explain."""
-    runs = range(len(fit.problem.runs))
-    left = [float(np.mean([smooth(fit, k, walk * keep).chi2 for k in runs])) for keep in ([1, 0], [0, 1])]
+    alone = [[smooth(fit, k, walk * keep, at).chi2 for k, at in enumerate(begun)] for keep in ([1, 0], [0, 1])]
+    left = [float(np.mean(chi2)) for chi2 in alone]
     rest = float(np.mean([s.chi2 for s in both]))
     missed = [max(c - max(rest, 1.0), 0.0) + 1e-3 for c in left]
     total = sum(missed)

@@ -29,36 +29,55 @@ class Smoothed(NamedTuple):
     chi2: float
 
 
-def smooth(fit: Fit, k: int, walk: Array) -> Smoothed:
-    """Return the smoothed run `k`; `walk` (2,) is the step size of the random walk per √s, 0 to hold it at zero.
+class Linear(NamedTuple):
+    """One step from every sample, x⁺ (N-1, nx) with its slopes A and B, and the outputs (N, ny) with theirs."""
 
-    V/√s and N·m/√s.
+    x_next: Array
+    a: Array
+    b: Array
+    out: Array
+    c: Array
+
+
+class Begun(NamedTuple):
+    """States (N, nx) to begin at, and the model linearised there."""
+
+    x: Array
+    linear: Linear
+
+
+def smooth(fit: Fit, k: int, walk: Array, begun: Begun) -> Smoothed:
+    """Return the smoothed run `k`.
+
+    Parameters
+    ----------
+    fit : Fit
+    k : int
+    walk : ndarray, shape (2,)
+        Step size of the random walk, V/√s and N·m/√s; 0 holds it at zero.
+    begun : Begun
+        Where to begin, see `begin`; the same for every walk.
     """
-    run, sim, system = fit.problem.runs[k], fit.simulations[k], fit.problem.system
+    run, system = fit.problem.runs[k], fit.problem.system
     p = parameter_vector(fit)
     y, _, _ = fit.problem._weights[k]
     weights = np.array([1.0 / run.sigma[c] if c in run.sigma else 0.0 for c in fit.problem.outputs])
-    x = np.column_stack([sim.states[s] for s in system.states])
-    for j, s in enumerate(system.states):  # linearised about what was measured, where it was
-        if s in run.experiment.outputs:
-            seen = run.experiment.outputs[s]
-            good = np.isfinite(seen)
-            x[:, j] = np.interp(run.experiment.t, run.experiment.t[good], seen[good])
+    x, linear = begun
     n, nx = x.shape
     d = np.zeros((n, 2))
     size = np.maximum(np.abs(x).max(axis=0), 1e-9)
     hold = np.where(walk > 0, 1.0 / np.maximum(walk, 1e-300), 0.0)
-    for _ in range(STEPS):
-        x_next, a, b = linear_steps(system, run.grid, x, p, d[:-1])
-        out, c = shown(system, run.grid, x, p)
+    for again in range(STEPS):
+        if again:
+            linear = _linear(fit, k, x, d)
         step = _banded_step(
             n,
             nx,
-            (y - out) * weights,
-            c * weights[None, :, None],
-            x_next - x[1:],
-            a,
-            b,
+            (y - linear.out) * weights,
+            linear.c * weights[None, :, None],
+            linear.x_next - x[1:],
+            linear.a,
+            linear.b,
             MODEL_ERROR * size * np.sqrt(np.median(run.grid.dt) / run.grid.dt.sum() * 100),
             d,
             hold,
@@ -71,6 +90,24 @@ def smooth(fit: Fit, k: int, walk: Array) -> Smoothed:
     out, _ = shown(system, run.grid, x, p)
     e = (y - out) * weights
     return Smoothed(d, x, float(np.nanmean(e[:, weights > 0] ** 2)))
+
+
+def begin(fit: Fit, k: int) -> Begun:
+    """Return where to begin, (N, nx), what was measured where it was, and the model linearised about that."""
+    run, sim = fit.problem.runs[k], fit.simulations[k]
+    x = np.column_stack([sim.states[s] for s in fit.problem.system.states])
+    for j, s in enumerate(fit.problem.system.states):
+        if s in run.experiment.outputs:
+            seen = run.experiment.outputs[s]
+            good = np.isfinite(seen)
+            x[:, j] = np.interp(run.experiment.t, run.experiment.t[good], seen[good])
+    return Begun(x, _linear(fit, k, x, np.zeros((len(x), 2))))
+
+
+def _linear(fit: Fit, k: int, x: Array, d: Array) -> Linear:
+    """Return the model linearised at the states `x` and the inputs `d`."""
+    grid, system, p = fit.problem.runs[k].grid, fit.problem.system, parameter_vector(fit)
+    return Linear(*linear_steps(system, grid, x, p, d[:-1]), *shown(system, grid, x, p))
 
 
 def _banded_step(n, nx, misfit, c, defect, a, b, model, d, hold, dt, free) -> Array:
