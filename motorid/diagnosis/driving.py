@@ -19,10 +19,12 @@ from motorid.diagnosis.trial import FAILURES
 from motorid.experiment import Experiment
 from motorid.fit import Fit, solve
 from motorid.formatting import percent
+from motorid.misfit import misfit_over_noise
 
 CHANGING = 0.5  # of the samples at which the voltage must change for its reading to matter
 NOISY = -0.25  # correlation of successive changes: noise has -0.5, a smooth course +1
 WINDOWS = (5, 15, 45)  # samples of a running median
+NOISE = (0.9, 1.05)  # times what fast changes tell of the noise: errors that are all noise
 PLAIN = 0.1  # fall of the error with another reading
 OTHER = {"zoh": "linear", "linear": "zoh"}
 
@@ -54,9 +56,12 @@ class Reading:
 def better_reading(fit: Fit) -> Reading | None:
     """Return the reading of the voltage that the records ask for; None if it is the one they have.
 
-    It must make the error of `fit` plainly smaller, and that of no channel larger.
+    It must make the error of `fit` plainly smaller, and that of no channel larger; errors that are all noise cannot
+    become so.
     """
     chosen, fall = None, PLAIN
+    if all(NOISE[0] < ratio < NOISE[1] for ratio in misfit_over_noise(fit.problem, fit.q).values()):
+        return None
     for reading in _readings(fit.problem.experiments):
         try:
             gain = compare_errors(train_errors(fit), train_errors(reading.fitted(fit)))

@@ -64,11 +64,12 @@ def raced(fit: Fit, model: Model, starts: Sequence[Mapping[str, float]], within:
 
 def promised(fit: Fit, model: Model, starts: Sequence[Mapping[str, float]]) -> float:
     """Return the lowest cost that one undamped step from any of the starts promises `model`; infinite for none."""
-    lowest = np.inf
+    lowest, like = np.inf, None
     for start in starts:
         with contextlib.suppress(*FAILURES):
             problem = _started(fit, _bounded(fit, model), start, angular=False)
-            problem = problem.refined(problem.start)
+            problem = problem.refined(problem.start) if like is None else replace(problem, _runs=like.runs)
+            like = problem
             r, jac = problem.residual_and_jacobian(problem.start)
             triangle: Array = np.asarray(np.linalg.qr(np.column_stack([jac, r]), mode="r"))
             lowest = min(lowest, 0.5 * float(np.sum(triangle[jac.shape[1] :, -1] ** 2)))
