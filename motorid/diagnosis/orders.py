@@ -10,8 +10,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
-from typing import TYPE_CHECKING
+from functools import cached_property, lru_cache
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -35,9 +35,9 @@ SAMPLES = 50  # and so many samples
 NEAR = 0.6  # of the best line: another order that may be the true one
 STANDS_OUT = 6.0  # times the usual order: a line
 ALIKE = 1e-7  # below one, the correlation at which the answers to sine and cosine are one
-SAMPLED = 10  # orders whose answers are worked out to know about how strong all are
+SAMPLED = 8  # orders whose answers are worked out to know about how strong all are
 LOOKED_AT = 12  # of the best then
-STILL = 1e-6  # rad of the order per sample: no motion
+STILL = 1e-9  # rad per sample: no motion
 SURE = 30.0  # chi² of two degrees of freedom: the highest of 240 orders of noise reaches about 11
 
 
@@ -103,9 +103,7 @@ def _spectrum(tangent: Tangent, relative: bool) -> Spectrum:
     lowest = max(1 if relative else 2, int(np.ceil(PERIODS * 2 * np.pi / max(_travel(fit), 1e-9))))
     if top < lowest or (relative and "i" not in fit.problem.system.states):
         return Spectrum((), False)
-    moving, orders = _moving(tangent), np.arange(float(lowest), top + 1)
-    slow = np.array([_slow_enough(moving, n) for n in orders])
-    shares, lines = _Looking.of(tangent, relative).shares(orders, slow)
+    shares, lines = _looking(tangent).shares(lowest, relative)
     if not lines:
         return Spectrum((), False)
     found = sorted(lines, key=lambda line: -line.share)
@@ -114,38 +112,37 @@ def _spectrum(tangent: Tangent, relative: bool) -> Spectrum:
     return Spectrum(tuple(found), bool(sure))
 
 
+class Moments(NamedTuple):
+    """Of exp(jNθ) put in, per order: the product with the residual of what it answers, and the sums Σ|z|² and Σz²."""
+
+    pulls: Array
+    sizes: Array
+    squares: Array
+
+
 @dataclass(frozen=True, eq=False)
 class _Looking:
     """What is looked into for orders: a residual without its colour, off the tangent space, and the model's answers."""
 
     fit: Fit
-    relative: bool
     white: Whitening
     basis: Array
     residual: Array
     answers: Sequence[Response]
+    orders: Array
+    slow: Array
 
-    @staticmethod
-    def of(tangent: Tangent, relative: bool) -> _Looking:
-        """Return what is there to be looked into; outputs count in units of their noise."""
-        white, basis, residual = _whitened(tangent)
-        answers = [
-            replace(answer, c=answer.c * weights[None, :, None])
-            for answer, (_, weights, _) in zip(responses(tangent.fit), tangent.fit.problem._weights, strict=True)
-        ]
-        # The residual is model less measurement: what is fitted to it counts against the motor's torque.
-        return _Looking(tangent.fit, relative, white, basis, -residual if relative else residual, answers)
-
-    def shares(self, orders: Array, slow: Array) -> tuple[Array, list[Line]]:
+    def shares(self, lowest: int, relative: bool) -> tuple[Array, list[Line]]:
         """Return about what each order explains, and exactly the lines of those that explain most.
 
         How much the outputs answer is worked out for a few orders; between them it follows what is put in.
         """
+        orders = self.orders[lowest - 1 :]
         few = np.unique(np.geomspace(1, len(orders), SAMPLED).round().astype(int) - 1)
-        lines, sizes = self.exact(orders[few], slow[few])
+        lines, sizes = self.exact(orders[few], relative)
         if len(few) == len(orders) or not (sizes > 0).any():
             return np.array([line.share for line in lines]), lines
-        pulls, put_in, squares = self.pulls(orders, slow)
+        pulls, put_in, squares = (m[lowest - 1 :] for m in self.moments[relative])
         seen = few[sizes > 0]
         with np.errstate(divide="ignore", invalid="ignore"):
             answer = np.interp(np.log(orders), np.log(orders[seen]), np.log(sizes[sizes > 0] / put_in[seen]))
@@ -156,62 +153,71 @@ class _Looking:
             shares /= np.exp(answer) * put_in * float(self.residual @ self.residual)
         shares = np.where(put_in > 0, shares, 0.0)
         best = [k for k in np.argsort(-shares)[:LOOKED_AT] if k not in few]
-        lines += self.exact(orders[best], slow[best])[0]
+        lines += self.exact(orders[best], relative)[0]
         for line in lines:
-            shares[int(line.order - orders[0])] = line.share
+            shares[int(line.order) - lowest] = line.share
         return shares[shares > 0], lines
 
-    def exact(self, orders: Array, slow: Array) -> tuple[list[Line], Array]:
+    def exact(self, orders: Array, relative: bool) -> tuple[list[Line], Array]:
         """Return the lines at `orders`, and the mean square of the answers to sine and cosine, 0 for none."""
         lines: list[Line] = []
         sizes = np.zeros(len(orders))
-        chunk = int(np.clip(WIDEST / (2 * len(self.residual)), 10, HIGHEST))
+        # The residual is model less measurement: what is fitted to it counts against the motor's torque.
+        residual = -self.residual if relative else self.residual
+        chunk = int(np.clip(WIDEST / (2 * len(residual)), 10, HIGHEST))
         for first in range(0, len(orders), chunk):
             part = slice(first, first + chunk)
-            columns = self.white([self._columns(k, orders[part], slow[part]) for k in range(len(self.answers))])
+            columns = self.white([self._columns(k, orders[part], relative) for k in range(len(self.answers))])
             columns -= self.basis @ (self.basis.T @ columns)
             sines, cosines = np.split(columns, 2, axis=1)
             sizes[part] = (np.einsum("ij,ij->j", sines, sines) + np.einsum("ij,ij->j", cosines, cosines)) / 2
-            lines += _lines(orders[part], sines, cosines, self.residual)
+            lines += _lines(orders[part], sines, cosines, residual)
         return [line for line in lines if line.share > 0], sizes
 
-    def pulls(self, orders: Array, slow: Array) -> tuple[Array, Array, Array]:
-        """Return the products of the residual with the answers to exp(jNθ), and the sums Σ|z|² and Σz² put in."""
-        pulls, squares, put_in = np.zeros(len(orders), complex), np.zeros(len(orders), complex), np.zeros(len(orders))
+    @cached_property
+    def moments(self) -> dict[bool, Moments]:
+        """The moments of all orders, of the torque itself (False) and relative to the motor's (True)."""
+        n = len(self.orders)
+        found = {
+            relative: Moments(np.zeros(n, complex), np.zeros(n), np.zeros(n, complex)) for relative in (False, True)
+        }
         residuals = self.white.transposed(self.residual, [len(a.c) for a in self.answers])
         for k, answer in enumerate(self.answers):
             angle = angle_signal(self.fit.problem.runs[k].experiment)
-            carrier = self._carrier(k)
-            pull = (answer.pulled(self._measured(k, residuals[k])) * answer.b[:, :, 1]).sum(axis=1) * carrier
-            first, step = np.exp(1j * angle), np.diff(angle)
-            turning = first ** int(orders[0])
-            for j, n in enumerate(orders):
-                # the mean of exp(jNθ) over the sample, unless it hardly moves
-                moves = np.abs(n * step) > STILL
-                mean = np.where(moves, np.diff(turning) / np.where(moves, 1j * n * step, 1.0), turning[1:])
-                mean[np.abs(step) > slow[j]] = 0.0
-                pulls[j] += pull @ mean
-                put_in[j] += float(np.vdot(carrier * mean, carrier * mean).real)
-                squares[j] += (carrier * mean) @ (carrier * mean)
-                turning = turning * first
-        return pulls, put_in, squares
+            pull = (answer.pulled(self._measured(k, residuals[k])) * answer.b[:, :, 1]).sum(axis=1)
+            once, step = np.exp(1j * angle), np.diff(angle)
+            still = np.abs(step) < STILL
+            per_step = 1 / np.where(still, 1.0, 1j * step)
+            carriers = {relative: self._carrier(k, relative) for relative in found}
+            wave = np.ones_like(once)
+            for j, n in enumerate(self.orders):
+                wave = wave * once
+                mean = np.where(still, wave[1:], np.diff(wave) * (per_step / n))  # of exp(jNθ) over each sample
+                mean[np.abs(step) > self.slow[j]] = 0.0
+                for relative, m in found.items():
+                    put = carriers[relative] * mean
+                    m.pulls[j] += pull @ put
+                    m.sizes[j] += np.vdot(put, put).real
+                    m.squares[j] += put @ put
+        return found
 
-    def _columns(self, k: int, orders: Array, slow: Array) -> Array:
-        """Whitened outputs of run `k` to unit sine and cosine torques of all `orders`, (N, ny, 2 len(orders)).
-
-        `slow` is the change of the angle per sample up to which each order acts.
-        """
+    def _columns(self, k: int, orders: Array, relative: bool) -> Array:
+        """Whitened outputs of run `k` to unit sine and cosine torques of all `orders`, (N, ny, 2 len(orders))."""
         angle = angle_signal(self.fit.problem.runs[k].experiment)
+        slow = self.slow[orders.astype(int) - 1]
         middle, step = (angle[1:] + angle[:-1]) / 2, np.diff(angle)
         # Averaged over the sample, so that orders too fast for the sampling fade instead of posing as slower ones.
-        fade = np.sinc(np.outer(orders, step) / (2 * np.pi)) * (np.abs(step) <= slow[:, None]) * self._carrier(k)
+        fade = (
+            np.sinc(np.outer(orders, step) / (2 * np.pi)) * (np.abs(step) <= slow[:, None]) * self._carrier(k, relative)
+        )
         turning = np.outer(orders, middle)
         drive = np.concatenate([np.sin(turning) * fade, np.cos(turning) * fade])
         return self._measured(k, self.answers[k].driven(drive[:, :, None] * self.answers[k].b[:, :, 1]))
 
-    def _carrier(self, k: int) -> Array | float:
+    def _carrier(self, k: int, relative: bool) -> Array | float:
         """What the order modulates: the motor's torque, or nothing but itself."""
-        return self.fit.values["K"] * self.answers[k].states["i"][:-1] if self.relative else 1.0
+        states = self.answers[k].states
+        return self.fit.values["K"] * states["i"][:-1] if relative and "i" in states else 1.0
 
     def _measured(self, k: int, outputs: Array) -> Array:
         """Return outputs (N, ny, …) with nothing where nothing was measured."""
@@ -223,15 +229,26 @@ class _Looking:
         return outputs
 
 
-def _slow_enough(moving: Array, order: float) -> float:
-    """Return the change of the angle per sample up to which an order is looked for; 0 where it would be an alias."""
-    sure = int((moving <= QUARTER / order).sum())
-    if sure > max(SAMPLES, SURE_PART * moving.size):
-        return QUARTER / order
-    return np.pi / order if float(np.mean(moving <= np.pi / order)) > SLOW_PART else 0.0
-
-
 @lru_cache(maxsize=2)
+def _looking(tangent: Tangent) -> _Looking:
+    """Return what is there to be looked into; outputs count in units of their noise."""
+    white, basis, residual = _whitened(tangent)
+    answers = [
+        replace(answer, c=answer.c * weights[None, :, None])
+        for answer, (_, weights, _) in zip(responses(tangent.fit), tangent.fit.problem._weights, strict=True)
+    ]
+    orders = np.arange(1.0, highest_order(tangent) + 1)
+    return _Looking(tangent.fit, white, basis, residual, answers, orders, _slow_enough(_moving(tangent), orders))
+
+
+def _slow_enough(moving: Array, orders: Array) -> Array:
+    """Return the change of the angle per sample up to which each order is looked for; 0 where it would be an alias."""
+    counted = np.sort(moving)
+    sure, some = (np.searchsorted(counted, part / orders, side="right") for part in (QUARTER, np.pi))
+    slow = np.where(some > SLOW_PART * moving.size, np.pi / orders, 0.0)
+    return np.where(sure > max(SAMPLES, SURE_PART * moving.size), QUARTER / orders, slow)
+
+
 def _whitened(tangent: Tangent) -> tuple[Whitening, Array, Array]:
     """Return the filters, the tangent space behind them, and the residual off it."""
     fit = tangent.fit

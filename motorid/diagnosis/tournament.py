@@ -110,12 +110,18 @@ def _needless(
 ) -> dict[int, GivenUp]:
     """Return the tasks that contain an effect that leaves only noise, and from there promise too little."""
     winner = tasks[leader]
-    wider = [k for k, task in enumerate(tasks) if winner.effect.name in task.effect.includes]
-    gains = map_(_gain, [widened(best, tasks[k].effect, HARDLY) for k in wider])
+    wider = {
+        k: widened(best, task.effect, HARDLY)
+        for k, task in enumerate(tasks)
+        if winner.effect.name in task.effect.includes
+    }
+    gains = dict(zip(wider, map_(_gain, wider.values()), strict=True))
+    why = f"does no more than {winner.effect.name}, which it contains"
     return {
-        k: _given_up(winner, race.cost - gain, f"does no more than {winner.effect.name}, which it contains")
-        for k, gain in zip(wider, gains, strict=True)
-        if gain < tasks[k].price - winner.price
+        k: _given_up(winner, race.cost - gains[k], why)
+        for k, task in wider.items()
+        if gains[k]
+        < task.price - winner.price + float(np.log(len(task.starts)))  # the search over starts has its price
     }
 
 
