@@ -10,7 +10,8 @@ import numpy as np
 
 from motorid.bases import BASES
 from motorid.descent import descend
-from motorid.errors import FitError, SimulationError
+from motorid.effects import LIBRARY
+from motorid.errors import FitError, ModelError, SimulationError
 from motorid.experiment import Experiment
 from motorid.least_squares import LevenbergMarquardt, levenberg_marquardt
 from motorid.loads import loads_of
@@ -23,6 +24,8 @@ from motorid.start import first_guess
 from motorid.term import Effect
 
 THOROUGH = LevenbergMarquardt(ftol=1e-5, max_iterations=60)
+ABOVE = 1.3  # times: where a size starts that is at least another
+STEPS = 4  # that tell which of two starts is the nearer
 FEW = 3  # shapes that are looked at more closely
 RESONANCE = "1/s"
 BACK_EMF_SHARES = (0.3, 0.03)
@@ -43,6 +46,7 @@ def started(problem: Problem) -> Problem:
     best = _along_measured_angle(problems[k], candidates[k])
     for effect in model.effects:
         best = _shaped(best, effect, candidates[k])
+    best = _from_simpler(best, candidates[k])
     return _split(best, model) if loaded else best
 
 
@@ -63,6 +67,35 @@ def _along_measured_angle(problem: Problem, asked: Model) -> Problem:
         return problem
     found = problem.for_model(problem.model.start_at(without_width(done.problem, done.solution.q)))
     return min(found, problem, key=_cost_of)
+
+
+def _from_simpler(problem: Problem, asked: Model) -> Problem:
+    """Return the problem started where a simpler effect leads that one of the model's contains, if that is nearer.
+
+    From a first guess that takes all friction for viscous, bristles or a Stribeck curve find no way; Coulomb does.
+    """
+    for effect in asked.effects:
+        simpler = next((LIBRARY[n] for n in effect.includes if all(p.null == 0 for p in LIBRARY[n].parameters)), None)
+        if simpler is None or len(_untouched(asked, effect)) < len(effect.parameters):
+            continue
+        try:
+            done = descend(started(problem.for_model(asked.without(effect.name) + simpler)), THOROUGH)
+        except (FitError, ModelError):
+            continue
+        values = without_width(done.problem, done.solution.q)
+        level = max(values[p.name] for p in simpler.parameters)
+        other = problem.for_model(problem.model.start_at({**values, **sizes_like(effect, level)}))
+        looks = [_look(begin.refined(begin.start), STEPS) for begin in (problem, other)]
+        problem = min(looks, key=lambda look: look[0])[1]
+    return problem
+
+
+def sizes_like(effect: Effect, level: float, above: float = ABOVE) -> dict[str, float]:
+    """Return the sizes of an effect in the place of a simpler one of size `level`.
+
+    Sizes that are at least another start at `above` times that.
+    """
+    return {p.name: level * (above if p.at_least else 1.0) for p in effect.parameters if p.null == 0}
 
 
 def _split(problem: Problem, asked: Model) -> Problem:

@@ -19,6 +19,7 @@ from motorid.diagnosis.trial import Raced, finished, promised, raced
 from motorid.fit import Fit
 from motorid.model import Effect, Model
 from motorid.prepared import natural_sizes
+from motorid.starting import ABOVE, sizes_like
 
 BEHIND = 10.0  # times the cost of a model that explains all but noise
 HARDLY = 1.01  # times: near enough that a slope tells what more would do
@@ -164,7 +165,7 @@ def _sizes(fit: Fit, effect: Effect) -> list[float]:
     return [fit.values[p.name] for p in effect.parameters if p.null == 0]
 
 
-def widened(fit: Fit, effect: Effect, above: float = 1.3) -> Task:
+def widened(fit: Fit, effect: Effect, above: float = ABOVE) -> Task:
     """Return the refit with `effect` in the place of those that it includes, from where they were.
 
     Sizes that are at least another start at `above` times that.
@@ -176,7 +177,7 @@ def widened(fit: Fit, effect: Effect, above: float = 1.3) -> Task:
             model = model.without(e.name)
     model = model + effect
     natural = natural_sizes(fit.problem.experiments, fit.values)
-    sizes = {p.name: level * (above if p.at_least else 1.0) for p in effect.parameters if p.null == 0}
+    sizes = sizes_like(effect, level, above)
     shapes = [
         [(p.name, g * natural.get(p.unit, 1.0)) for g in p.grid] for p in effect.parameters if p.null is None and p.grid
     ]
