@@ -51,12 +51,12 @@ def started(problem: Problem) -> Problem:
 
 
 def _along_measured_angle(problem: Problem, asked: Model) -> Problem:
-    """Return the problem started where the measured angle leads, if an effect repeats over a turn.
+    """Return the problem started where the measured angle, or the integral of the speed, leads an effect of the turn.
 
     While the model's own angle is still wrong by a period, its cogging pushes the wrong way.
     """
     orders = any(p.order for e in problem.model.effects for p in e.parameters)
-    if not orders or not all("theta" in r.outputs for r in problem.experiments):
+    if not orders or not all({"theta", "omega"} & set(r.outputs) for r in problem.experiments):
         return problem
     led = problem.for_model(replace(problem.model, angle_input=True, _systems={}))
     for effect in problem.model.effects:
