@@ -17,7 +17,6 @@ __all__ = ["check_runs"]
 Array = NDArray[np.float64]
 Check = Callable[[Experiment], str | None]
 
-_PEAK = 6  # samples after a jump of the voltage
 _NAMES = {"i": "current", "omega": "speed", "theta": "angle"}
 
 
@@ -133,30 +132,17 @@ def _coarse(run: Experiment) -> str | None:
 
 
 def _spikes(run: Experiment) -> str | None:
+    left = run.without_spikes()
     for channel, y in run.outputs.items():
-        far = _alone(run.inputs["v"], y, noise_level(y, run.t))
-        if 3 <= len(far) <= 0.05 * run.n:
-            size = float(np.median(np.abs(far)))
-            return (f"{len(far)} single samples of the {_NAMES[channel]} stand about {size:.2g} {run.units[channel]} "
-                    "away from both neighbours: spikes of the sensor or the logger. Mark them as missing, or fit with "
-                    "a loss that forgives outliers (--loss huber, or loss=mi.Huber()).")
+        kept = np.isfinite(left.outputs[channel])
+        far = np.flatnonzero(np.isfinite(y) & ~kept)
+        if far.size:
+            size = float(np.median(np.abs(y[far] - np.interp(run.t[far], run.t[kept], y[kept]))))
+            return (f"{far.size} single samples of the {_NAMES[channel]} stand about {size:.2g} {run.units[channel]} "
+                    "away from both neighbours: spikes of the sensor or the logger. Leave them out (--no-spikes, "
+                    "run.without_spikes()), or fit with a loss that forgives outliers (--loss huber, "
+                    "loss=mi.Huber()).")
     return None
-
-
-def _alone(v: Array, y: Array, noise: float) -> Array:
-    """Return how far samples stand from the middle of neighbours that agree; not where the voltage jumps."""
-    if len(y) < 20:
-        return np.empty(0)
-    before, here, after = y[:-2], y[1:-1], y[2:]
-    off, apart = here - (before + after) / 2, np.abs(after - before)
-    jumps = np.flatnonzero(np.abs(np.diff(v)) > 0.02 * np.ptp(v))
-    steady = np.ones(len(off), bool)
-    for k in range(-1, _PEAK):  # the current has a peak there
-        steady[np.clip(jumps + k, 0, len(off) - 1)] = False
-    # Smooth or not, a channel bends everywhere alike; nine in ten tell how much.
-    usual = float(np.nanquantile(np.abs(off[steady]), 0.9)) if steady.any() else np.inf
-    large = np.abs(off) > max(12 * noise, 8 * usual)
-    return off[steady & large & (apart < 0.3 * np.abs(off))]
 
 
 def _noisy(run: Experiment) -> str | None:

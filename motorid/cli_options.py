@@ -57,6 +57,12 @@ class Reading:
     median: Annotated[int | None, typer.Option(
         metavar="N", rich_help_panel=READ,
         help="Running median over N samples (odd) of a voltage that was measured with noise.")] = None
+    delay: Annotated[float | None, typer.Option(
+        metavar="S", rich_help_panel=READ,
+        help="Seconds by which the voltage acts later than its column says.")] = None
+    no_spikes: Annotated[bool, typer.Option(
+        "--no-spikes", rich_help_panel=READ,
+        help="Leave out single samples that stand far from both neighbours.")] = False
     ignore: Annotated[str | None, typer.Option(
         metavar="i,theta", rich_help_panel=READ, help="Measured channels to leave out.")] = None
 
@@ -65,6 +71,11 @@ class Reading:
         columns = parse_pairs(self.columns, "--columns") if self.columns else None
         units = parse_pairs(self.units, "--units") if self.units else None
         return self.chosen(read_runs(paths, columns=columns, units=units, hold=self.hold))
+
+    @property
+    def changes(self) -> bool:
+        """Whether runs are to be other than their files say."""
+        return bool(self.ignore or self.median or self.delay or self.no_spikes)
 
     def chosen(self, runs: Sequence[Experiment]) -> list[Experiment]:
         """Return `runs` without the channels to leave out, the voltage filtered if that is wanted."""
@@ -80,7 +91,9 @@ class Reading:
         if self.median is not None and (self.median < 1 or self.median % 2 == 0):
             raise UsageError(f"--median takes an odd number of samples, 1 or more; got {self.median}.")
         kept = [r.without(*(c for c in out if c in r.outputs)) for r in runs]
-        return [r.running_median(self.median) for r in kept] if self.median else kept
+        kept = [r.running_median(self.median) for r in kept] if self.median else kept
+        kept = [r.delayed(self.delay) for r in kept] if self.delay else kept
+        return [r.without_spikes() for r in kept] if self.no_spikes else kept
 
 
 @dataclass(frozen=True)

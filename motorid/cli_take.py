@@ -40,7 +40,7 @@ def fit_many(
 
     motors: dict[str, Any] = dict(motors_in(directory))
     model = choices.model(_sample(choices, motors.values()))
-    if choices.ignore or choices.median:
+    if choices.changes:
         motors = {name: _read(choices, files) for name, files in motors.items()}
     reading: dict[str, Any] = {k: parse_pairs(v, f"--{k}") for k in ("columns", "units")
                                if (v := getattr(choices, k))}

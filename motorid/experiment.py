@@ -13,6 +13,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from motorid import repairs
 from motorid.display import Shown
 from motorid.errors import DataError, UsageError, one_of
 
@@ -159,12 +160,21 @@ class Experiment(Shown):
         For a voltage that was measured and is noisy: the motor never saw that noise. Steps stay where they are; what
         changes within the window is lost.
         """
-        if int(samples) != samples or samples < 1 or samples % 2 == 0:
-            raise UsageError(f"running_median() takes an odd number of samples, 1 or more; got {samples!r}.")
-        from scipy.ndimage import median_filter
+        return repairs.running_median(self, samples)
 
-        quiet = {c: median_filter(a, int(samples), mode="nearest") for c, a in self.inputs.items()}
-        return self.with_(inputs=quiet)
+    def delayed(self, seconds: float) -> Experiment:
+        """Return the run with a voltage that acts later than its column says, earlier if `seconds` is negative.
+
+        Before the record it is as at its beginning; a held one that moves by parts of a sample is averaged over each.
+        """
+        return repairs.delayed(self, seconds)
+
+    def without_spikes(self) -> Experiment:
+        """Return the run with single samples that stand far from both neighbours marked as missing.
+
+        Not next to jumps of the voltage, where the motor is quick; at least three, at most 5 % of a channel.
+        """
+        return repairs.without_spikes(self)
 
     def __reduce__(self) -> tuple[Any, ...]:
         # A mappingproxy cannot be pickled, so hand plain dicts to the constructor of the other process.

@@ -20,7 +20,7 @@ ROWS = (
     "errors formatting progress display parameters term noise tables tasks",
     # 1 models and records
     "equations bases system model effects "
-    "units headers dialect matfile table layout formats rows experiment reading plausibility checks datasets",
+    "units headers dialect matfile table layout formats rows repairs experiment reading plausibility checks datasets",
     # 2 integration, and what is read from records before a problem is posed
     "integrate beginning steady prepared accuracy loss residuals unknowns relations constraints loads start coloured "
     "combinations outliers journal",

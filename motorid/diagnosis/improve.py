@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from motorid.diagnosis.driving import Reading, better_reading
+from motorid.diagnosis.driving import Reading, better_reading, without_spikes
 from motorid.diagnosis.evidence import compare_errors
 from motorid.diagnosis.hardly import hardly_moved
 from motorid.diagnosis.judgement import judgement
@@ -88,6 +88,21 @@ def settled(found: Climb) -> tuple[Climb, Outside | None]:
     return (_cut(found, 0, poor, "is nothing that the library has") if poor else found), other
 
 
+@dataclass(frozen=True, eq=False)
+class Records:
+    """What a climb begins with: a fit to the records, held-out runs, and what was done to either."""
+
+    fit: Fit
+    held_out: Sequence[Experiment] | None
+    remarks: tuple[str, ...] = ()
+
+    def read(self, reading: Reading) -> Records:
+        """Return all records read in another way."""
+        after = reading.fitted(self.fit)
+        held_out = self.held_out and [reading.of(r) for r in self.held_out]
+        return Records(after, held_out, (*self.remarks, reading.remark(self.fit, after)))
+
+
 def explored(
     fit: Fit,
     validate: Sequence[Experiment] | Experiment | None,
@@ -96,29 +111,27 @@ def explored(
     advance: Callable[[str], None],
     max_effects: int,
 ) -> tuple[Climb, Outside | None, str]:
-    """Return the settled climb, and what to say of how the voltage was read.
+    """Return the settled climb, and what to say of how the records were read.
 
     A misfit that something missing dominates may hide a better reading of the voltage; then it is climbed again.
     """
-    fit, remark = affordable(fit), ""
-    held_out = [validate] if isinstance(validate, Experiment) else validate
 
-    def climbed() -> tuple[Climb, Outside | None]:
-        return settled(climb(Search(fit, held_out, effects, map_, advance), max_effects, advance))
+    def climbed(records: Records) -> tuple[Climb, Outside | None]:
+        return settled(climb(Search(records.fit, records.held_out, effects, map_, advance), max_effects, advance))
 
-    def read(reading: Reading) -> None:
-        nonlocal fit, held_out, remark
-        before, fit = fit, reading.fitted(fit)
-        held_out = held_out and [reading.of(r) for r in held_out]
-        remark = reading.remark(before, fit)
-
-    if early := better_reading(fit):
-        read(early)
-    found, other = climbed()
-    if not early and len(found.path) > 1 and (late := better_reading(found.path[-1].fit)):
-        read(late)
-        found, other = climbed()
-    return found, other, remark
+    records = Records(affordable(fit), [validate] if isinstance(validate, Experiment) else validate)
+    for better in (without_spikes, better_reading):
+        if reading := better(records.fit):
+            records = records.read(reading)
+    found, other = climbed(records)
+    last = found.path[-1]
+    doubtful = len(found.path) > 1 or not found.remaining.adequate
+    if doubtful and (reading := better_reading(last.fit, late=True)):
+        again = records.read(reading)
+        anew, other_anew = climbed(again)
+        if compare_errors(last.train, anew.path[-1].train).fall > 0:
+            records, found, other = again, anew, other_anew
+    return found, other, " ".join(records.remarks)
 
 
 def _cut(found: Climb, kept: int, why: str, what: str) -> Climb:

@@ -1,0 +1,82 @@
+"""Records read otherwise: a voltage that acts later, or was measured with noise; spikes of a sensor left out."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from motorid.errors import UsageError
+from motorid.noise import noise_level
+
+if TYPE_CHECKING:
+    from motorid.experiment import Experiment
+
+Array = NDArray[np.float64]
+
+PEAK = 6  # samples after a jump of the voltage, where the current has a peak
+FEWEST = 20  # finite samples among which one can stand out
+LEAST, MOST = 3, 0.05  # spikes of a channel: fewer may be chance, a larger share is no accident
+
+
+def running_median(run: Experiment, samples: int) -> Experiment:
+    """Return the run with its inputs replaced by the running median; see `Experiment.running_median`."""
+    if int(samples) != samples or samples < 1 or samples % 2 == 0:
+        raise UsageError(f"running_median() takes an odd number of samples, 1 or more; got {samples!r}.")
+    from scipy.ndimage import median_filter
+
+    quiet = {c: median_filter(a, int(samples), mode="nearest") for c, a in run.inputs.items()}
+    return run.with_(inputs=quiet)
+
+
+def delayed(run: Experiment, seconds: float) -> Experiment:
+    """Return the run with its inputs acting later; see `Experiment.delayed`."""
+    if not np.isfinite(seconds) or abs(seconds) >= run.duration:
+        raise UsageError(f"{run.name}: a voltage can be delayed by less than the {run.duration:.4g} s of the run; "
+                         f"got {seconds!r}.")
+    t = run.t - seconds
+    if run.hold == "linear":
+        return run.with_(inputs={c: np.interp(t, run.t, a) for c, a in run.inputs.items()})
+    return run.with_(inputs={c: _held_means(run.t, a, t) for c, a in run.inputs.items()})
+
+
+def _held_means(t: Array, v: Array, at: Array) -> Array:
+    """Return the means of a held input between the times `at`; before the record it is as at its beginning."""
+    before, after = min(at[0] - t[0], 0.0), max(at[-1] - t[-1], 0.0)
+    ends = np.concatenate([[t[0] + before], t, [t[-1] + after]])
+    held = np.concatenate([v[:1], v])
+    integral = np.concatenate([[0.0], np.cumsum(held * np.diff(ends))])
+    means = np.diff(np.interp(at, ends, integral)) / np.diff(at)
+    return np.append(means, v[np.searchsorted(t, at[-1], side="right") - 1])
+
+
+def without_spikes(run: Experiment) -> Experiment:
+    """Return the run with single samples that no motor makes marked as missing; see `Experiment.without_spikes`."""
+    marked = {}
+    for c, y in run.outputs.items():
+        at = spikes(run, c)
+        if LEAST <= len(at) <= MOST * run.n:
+            marked[c] = y.copy()
+            marked[c][at] = np.nan
+    return run.with_(outputs={**run.outputs, **marked}) if marked else run
+
+
+def spikes(run: Experiment, channel: str) -> NDArray[np.intp]:
+    """Return which samples of an output stand far from neighbours that agree, not where the voltage jumps."""
+    y, v = run.outputs[channel], run.inputs["v"]
+    seen = np.flatnonzero(np.isfinite(y))
+    if len(seen) < FEWEST:
+        return np.empty(0, int)
+    noise = noise_level(y, run.t)
+    before, here, after = y[seen[:-2]], y[seen[1:-1]], y[seen[2:]]
+    off, apart = here - (before + after) / 2, np.abs(after - before)
+    jumps = np.flatnonzero(np.abs(np.diff(v)) > 0.02 * np.ptp(v))
+    steady = np.ones(run.n, bool)
+    for k in range(PEAK + 1):
+        steady[np.clip(jumps + k, 0, run.n - 1)] = False
+    calm = steady[seen[1:-1]]
+    # Smooth or not, a channel bends everywhere alike; nine in ten tell how much.
+    usual = float(np.quantile(np.abs(off[calm]), 0.9)) if calm.any() else np.inf
+    large = np.abs(off) > max(12 * noise, 8 * usual)
+    return seen[1:-1][calm & large & (apart < 0.3 * np.abs(off))]
