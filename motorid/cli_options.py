@@ -57,6 +57,9 @@ class Reading:
     median: Annotated[int | None, typer.Option(
         metavar="N", rich_help_panel=READ,
         help="Running median over N samples (odd) of a voltage that was measured with noise.")] = None
+    levels: Annotated[bool, typer.Option(
+        "--levels", rich_help_panel=READ,
+        help="Mean between steps of a voltage that was measured with noise.")] = False
     delay: Annotated[float | None, typer.Option(
         metavar="S", rich_help_panel=READ,
         help="Seconds by which the voltage acts later than its column says.")] = None
@@ -75,7 +78,7 @@ class Reading:
     @property
     def changes(self) -> bool:
         """Whether runs are to be other than their files say."""
-        return bool(self.ignore or self.median or self.delay or self.no_spikes)
+        return bool(self.ignore or self.median or self.levels or self.delay or self.no_spikes)
 
     def chosen(self, runs: Sequence[Experiment]) -> list[Experiment]:
         """Return `runs` without the channels to leave out, the voltage filtered if that is wanted."""
@@ -92,6 +95,7 @@ class Reading:
             raise UsageError(f"--median takes an odd number of samples, 1 or more; got {self.median}.")
         kept = [r.without(*(c for c in out if c in r.outputs)) for r in runs]
         kept = [r.running_median(self.median) for r in kept] if self.median else kept
+        kept = [r.levelled() for r in kept] if self.levels else kept
         kept = [r.delayed(self.delay) for r in kept] if self.delay else kept
         return [r.without_spikes() for r in kept] if self.no_spikes else kept
 

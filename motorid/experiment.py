@@ -157,10 +157,13 @@ class Experiment(Shown):
     def running_median(self, samples: int) -> Experiment:
         """Return the run with its voltage replaced by the running median over an odd number of samples.
 
-        For a voltage that was measured and is noisy: the motor never saw that noise. Steps stay where they are; what
-        changes within the window is lost.
+        For a voltage measured with noise that the motor never saw. Steps stay; what changes in the window is lost.
         """
         return repairs.running_median(self, samples)
+
+    def levelled(self) -> Experiment:
+        """Return the run with a voltage that is constant between its steps, but was measured with noise, made so."""
+        return repairs.levelled(self)
 
     def delayed(self, seconds: float) -> Experiment:
         """Return the run with a voltage that acts later than its column says, earlier if `seconds` is negative.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,6 +16,8 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
+JUMP = 7.0  # times the noise of the voltage: a step
+SHORTEST = 6  # samples that have a level
 PEAK = 6  # samples after a jump of the voltage, where the current has a peak
 FEWEST = 20  # finite samples among which one can stand out
 LEAST, MOST = 3, 0.05  # spikes of a channel: fewer may be chance, a larger share is no accident
@@ -28,6 +31,25 @@ def running_median(run: Experiment, samples: int) -> Experiment:
 
     quiet = {c: median_filter(a, int(samples), mode="nearest") for c, a in run.inputs.items()}
     return run.with_(inputs=quiet)
+
+
+def levelled(run: Experiment) -> Experiment:
+    """Return the run with a noisy voltage between its steps replaced by its mean; see `Experiment.levelled`."""
+    return run.with_(inputs={c: _levels(a) for c, a in run.inputs.items()})
+
+
+def _levels(v: Array) -> Array:
+    """Return the means between jumps, where what lies between two jumps is no more than noise."""
+    changes = np.diff(v)
+    noise = 1.4826 * float(np.median(np.abs(changes))) / np.sqrt(2)
+    ends = np.concatenate([[0], np.flatnonzero(np.abs(changes) > JUMP * noise) + 1, [len(v)]])
+    level = v.copy()
+    for a, b in pairwise(ends.tolist()):
+        part = v[a:b]
+        halves = np.mean(part[: len(part) // 2]), np.mean(part[len(part) // 2 :])
+        if len(part) >= SHORTEST and np.std(part) < 1.5 * noise and abs(np.subtract(*halves)) < noise:
+            level[a:b] = part.mean()
+    return level
 
 
 def delayed(run: Experiment, seconds: float) -> Experiment:

@@ -203,12 +203,10 @@ def _readings(runs: Sequence[Experiment]) -> Iterator[Reading]:
     how = "goes on straight from sample to sample" if hold == "linear" else "is held from sample to sample"
     yield Reading(f"The voltage {how}", f"--hold {hold}", lambda r: r.with_(hold=hold) if _changes(r) else r)
     if any(_noisy(r) for r in moving):
+        noise = "The voltage was measured with noise that the motor did not see"
+        yield Reading(f"{noise}, and is constant between its steps", "--levels", Experiment.levelled)
         for n in WINDOWS:
-            yield Reading(
-                "The voltage was measured with noise that the motor did not see",
-                f"--median {n}",
-                lambda r, n=n: r.running_median(n),
-            )
+            yield Reading(noise, f"--median {n}", lambda r, n=n: r.running_median(n))
 
 
 def _changes(run: Experiment) -> bool:
