@@ -12,7 +12,7 @@ from motorid.experiment import Experiment
 from motorid.noise import noise_level, quantum
 from motorid.plausibility import angle_against_speed, implied_constants, magnitudes, signs, swapped_columns
 
-__all__ = ["check_runs"]
+__all__ = ["check_runs", "current_limit"]
 
 Array = NDArray[np.float64]
 Check = Callable[[Experiment], str | None]
@@ -82,8 +82,8 @@ def _clipped(run: Experiment) -> str | None:
     return None
 
 
-def _limited(run: Experiment) -> str | None:
-    """A current that stays while the voltage does and the speed changes: something else than the winding holds it."""
+def current_limit(run: Experiment) -> str | None:
+    """Say so where the current stays while the voltage does and the speed changes: not the winding holds it there."""
     i, omega, v = run.outputs.get("i"), run.outputs.get("omega"), run.inputs["v"]
     if i is None or omega is None or run.units["v"] != "V" or _clipped(run):
         return None
@@ -218,5 +218,5 @@ def _never_reverses(runs: Sequence[Experiment]) -> str | None:
 
 _CHECKS: tuple[Check, ...] = (
     signs, angle_against_speed, magnitudes, implied_constants, swapped_columns,
-    _excitation, _missing, _clipped, _limited, _coarse, _spikes, _noisy, _uneven, _slow_sampling, _never_settles,
+    _excitation, _missing, _clipped, current_limit, _coarse, _spikes, _noisy, _uneven, _slow_sampling, _never_settles,
 )

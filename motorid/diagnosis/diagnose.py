@@ -6,6 +6,7 @@ import builtins
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
+from motorid.checks import current_limit
 from motorid.diagnosis.adequacy import following
 from motorid.diagnosis.improve import Climb, explored, ladder_of
 from motorid.diagnosis.judgement import pursued
@@ -93,7 +94,8 @@ def diagnose(
         suggestion = _suggestion(found)
     last = ladder.best
     of_last = (measured_angle_remark(last), outliers_remark(last))
-    remarks = (driven, parts_remark(fit), *of_last, closed_loop_remark(fit), suggestion)
+    limits = (f"In {run.name} {limit}" for run in fit.problem.experiments if (limit := current_limit(run)))
+    remarks = (driven, next(limits, ""), parts_remark(fit), *of_last, closed_loop_remark(fit), suggestion)
     text = " ".join(t for t in (text, *remarks) if t)
     return Diagnosis(
         verdict,

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+from motorid.checks import current_limit
 from motorid.diagnosis.driving import Reading, better_reading, without_spikes
 from motorid.diagnosis.evidence import compare_errors
 from motorid.diagnosis.hardly import hardly_moved
@@ -84,7 +85,13 @@ def settled(found: Climb) -> tuple[Climb, Outside | None]:
     if other is not None and other.kept < len(found.path) - 1:
         what = f"{other.form.text}, of a form that the library lacks"
         return _cut(found, other.kept, f"only stands in for {what}", f"is like {what}"), other
-    poor = "" if found.remaining.adequate else hardly_moved(found.path, dict(found.search.held.noise))
+    if found.remaining.adequate or len(found.path) == 1:
+        return found, other
+    if any(current_limit(run) for run in found.search.root.fit.problem.experiments):
+        return _cut(
+            found, 0, "may only stand in for the driver's current limit", "is what the driver's limit makes"
+        ), other
+    poor = hardly_moved(found.path, dict(found.search.held.noise))
     return (_cut(found, 0, poor, "is nothing that the library has") if poor else found), other
 
 
