@@ -21,6 +21,7 @@ from motorid.diagnosis.shapes import Form
 from motorid.diagnosis.trial import FAILURES, refit
 from motorid.fit import Fit
 from motorid.integrate.grid import Array
+from motorid.misfit import misfit_over_noise
 
 MUCH_LESS = 0.5  # of the squared misfit that the effects leave: what a form in their place may leave
 LITTLE = 0.1  # of the squared misfit: forms that leave less are equals
@@ -29,6 +30,7 @@ CONTAINS = 0.7  # of what an effect does: what a form must do in its place
 NO_TRIFLE = 0.03  # of what an effect does: what it must miss
 VOID = 100.0  # times the misfit: a linear answer that went astray
 ROUGH = 0.1  # NRMSE beyond which a linear answer is not trusted
+FAR_OFF = 30.0  # times the noise, the same
 
 
 @dataclass(frozen=True)
@@ -157,7 +159,9 @@ def _against(form: Form, train: Linear, was: Linear, gained: Array, channels: Se
 def _in_earnest(steps: Sequence[Fit], held: HeldOut, channels: Sequence[int]) -> Outside | None:
     """Fit the form that promises most in place of all effects, where errors are too large to be linear."""
     root, last = steps[0], steps[-1]
-    if max(last.nrmse[last.problem.outputs[c]] for c in channels) < ROUGH:
+    over_noise = misfit_over_noise(last.problem, last.q)
+    names = [last.problem.outputs[c] for c in channels]
+    if max(last.nrmse[c] for c in names) < ROUGH and max(over_noise[c] for c in names) < FAR_OFF:
         return None
     try:
         rivals = sorted(_rivals(steps, 0, held, channels), key=lambda r: r.leaves)
