@@ -1,4 +1,4 @@
-"""Records read otherwise: a voltage that acts later, or was measured with noise; spikes of a sensor left out."""
+"""Records read otherwise: an angle taken modulo a turn, a voltage that is late or noisy, a sensor's spikes."""
 
 from __future__ import annotations
 
@@ -16,11 +16,37 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
+CLEAR = np.pi / 2  # rad: a step of the angle this far from what is expected may be a turn or none
 JUMP = 7.0  # times the noise of the voltage: a step
 SHORTEST = 6  # samples that have a level
 PEAK = 6  # samples after a jump of the voltage, where the current has a peak
 FEWEST = 20  # finite samples among which one can stand out
 LEAST, MOST = 3, 0.05  # spikes of a channel: fewer may be chance, a larger share is no accident
+
+
+def unwrapped(theta: Array, t: Array, omega: Array | None = None) -> tuple[Array, int]:
+    """Return an angle that was taken modulo a turn as it went on, and how often it had jumped; 0 where it never did.
+
+    Parameters
+    ----------
+    theta, t, omega : ndarray, shape (N,)
+        rad, s and, if the speed was measured, rad/s: then it may turn by more than half a turn from sample to sample.
+    """
+    seen = np.flatnonzero(np.isfinite(theta))
+    turn, y = 2 * np.pi, theta[seen]
+    if len(seen) < FEWEST or not np.pi < np.ptp(y) < 1.01 * turn:
+        return theta, 0
+    steps = np.diff(y)
+    expected = np.zeros_like(steps)
+    if omega is not None and np.isfinite(omega[seen]).all():
+        expected = (omega[seen][1:] + omega[seen][:-1]) / 2 * np.diff(t[seen])
+    jumps = np.round((expected - steps) / turn)
+    left = np.abs(steps + jumps * turn - expected)
+    if not jumps.any() or np.quantile(left, 0.99) > CLEAR:
+        return theta, 0
+    on = theta.copy()
+    on[seen[1:]] += turn * np.cumsum(jumps)
+    return on, int(np.count_nonzero(jumps))
 
 
 def running_median(run: Experiment, samples: int) -> Experiment:

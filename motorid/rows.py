@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from motorid.errors import DataError
 from motorid.experiment import MIN_SAMPLES, Experiment
 from motorid.layout import Layout, Place
+from motorid.repairs import unwrapped
 from motorid.table import counted
 
 __all__ = ["build"]
@@ -56,6 +57,11 @@ def build(columns: Mapping[str, Array], texts: Texts, layout: Layout, *, name: s
         raise DataError(f"every sample of {', '.join(repr(places[c].column) for c in values)} is "
                         "missing; there is nothing measured to fit.")
     _note_gaps(t, said)
+    if "theta" in outputs and places["theta"].unit.symbol == "rad":
+        outputs["theta"], turns = unwrapped(outputs["theta"], t, outputs.get("omega"))
+        if turns:
+            said.append(f"the angle '{places['theta'].column}' jumps by a turn {turns} times: taken modulo a turn, "
+                        "it goes on here.")
     used = {p.column for p in layout.places.values()}
     extra = {c: a[rows] for c, a in columns.items() if c not in used}
     if set(texts) - used:
