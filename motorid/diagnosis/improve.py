@@ -53,14 +53,20 @@ def climb(search: Search, max_effects: int, advance: Callable[[str], None]) -> C
         if judged.adequate:
             text = "stopped: what is left is noise"
             break
+        room = max_effects - len(best.key) + len(search.root.key)
+        if room < 1:  # two effects may have come at once
+            break
         children: dict[frozenset[str], Node] = {}
         for k, node in enumerate(frontier):
             grown, listed = search.expand(node)
             if k == 0:
                 rounds.append(tuple(listed))
             children |= {c.key: c for c in grown if c.key not in children}
-        chosen = search.judge.choose(list(children.values()))
-        if chosen is None or not search.judge.beats(chosen[0], best):
+        chosen = _better(search, children.values(), best)
+        if chosen is None and room > 1:
+            children = {c.key: c for c in search.expand_by_two(best)}
+            chosen = _better(search, children.values(), best)
+        if chosen is None:
             text = "stopped: no further effect lowers the error on data it was not fitted to"
             break
         new, ordered = chosen
@@ -69,7 +75,7 @@ def climb(search: Search, max_effects: int, advance: Callable[[str], None]) -> C
         chosen_of = best if best.added != new.added and best.parent is new.parent else new
         group = search.judge.group(chosen_of, ordered, {e.name: e.includes for e in search.effects})
         if new.parent is frontier[0]:
-            rounds[-1] = _marked(rounds[-1], chosen_of.added, group)
+            rounds[-1] = _marked(rounds[-1], chosen_of, group)
         groups.append((chosen_of.added or "", *group) if group else ())
         frontier = [best, *_runners_up(search, best, ordered)][:BEAM]
         judged = judgement(best.fit, search.scores(best), search.held)
@@ -77,6 +83,12 @@ def climb(search: Search, max_effects: int, advance: Callable[[str], None]) -> C
     told = [tuple(replace(c, group=_without(c.group, best.key)) for c in r) for r in rounds]
     groups = [(g[0], *_without(g[1:], best.key)) for g in groups if g]
     return Climb(search, tuple(_path(best)), tuple(told), tuple(g for g in groups if g[1:]), text, first, judged)
+
+
+def _better(search: Search, children: Iterable[Node], best: Node) -> tuple[Node, list[Node]] | None:
+    """Return the best child, if it beats the best model so far, and all in order."""
+    chosen = search.judge.choose(list(children))
+    return chosen if chosen is not None and search.judge.beats(chosen[0], best) else None
 
 
 def settled(found: Climb) -> tuple[Climb, Outside | None]:
@@ -171,8 +183,18 @@ def _runners_up(search: Search, best: Node, ordered: Sequence[Node]) -> list[Nod
     ]
 
 
-def _marked(listed: Sequence[Candidate], name: str | None, group: tuple[str, ...]) -> tuple[Candidate, ...]:
-    return tuple(replace(c, accepted=True, group=group) if c.effect == name else c for c in listed)
+def _marked(listed: Sequence[Candidate], node: Node, group: tuple[str, ...]) -> tuple[Candidate, ...]:
+    """Return the candidates with what was added marked, one effect or two that help only together."""
+    names = node.key - node.parent.key if node.parent is not None else frozenset()
+    if len(names) < 2 or node.candidate is None:
+        return tuple(replace(c, accepted=True, group=group) if c.effect == node.added else c for c in listed)
+    told = []
+    for c in listed:
+        if c.effect in names:
+            why = f"together with {' and '.join(sorted(names - {c.effect}))} {node.candidate.reason}"
+            c = replace(c, accepted=True, group=group if c.effect == node.added else (), reason=why)
+        told.append(c)
+    return tuple(told)
 
 
 def _path(last: Node) -> list[Node]:

@@ -139,7 +139,7 @@ class Judge:
             n.added
             for n in siblings
             if n is not chosen
-            and n.added
+            and n.added not in (None, chosen.added)
             and n.parent is chosen.parent
             and chosen.added not in includes.get(n.added, ())
             and self.tied(n, chosen)

@@ -9,6 +9,7 @@ that cannot be differentiated at their null are simulated at a few finite shapes
 from __future__ import annotations
 
 import contextlib
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -25,6 +26,7 @@ from motorid.model import Effect, dc_motor, torque_driven
 from motorid.parameters import Parameter
 
 ORDERS_TRIED = 3
+MORE = 0.1  # that a pair must promise beyond the better of the two
 NOTHING = 6.0  # chi² that an effect takes away by the slopes of a smaller model: too little for a closer look
 
 
@@ -36,7 +38,7 @@ class Score:
     would be worth with the effect taken out: what a misfit makes smooth is no evidence of coloured noise.
     `stands_out` says that its order is a line in the spectrum of the misfit, however small beside the rest of it.
     `same_as` are the parameters that together do what the effect does, if these data cannot tell it from them.
-    `shapes` are what it was scored by.
+    `shapes` are what it was scored by, the best first.
     """
 
     effect: Effect
@@ -89,9 +91,20 @@ def rank(fit: Fit, effects: Sequence[Effect], known: Sequence[Score] = ()) -> li
     return sorted(scores, key=lambda s: -s.drop)
 
 
+def pairs_of(fit: Fit, scores: Sequence[Score], most: int) -> list[tuple[Score, Score]]:
+    """Return the pairs of effects that together explain most, more than either alone, best first."""
+    tangent, found = Tangent.of(fit), []
+    for a, b in itertools.combinations([s for s in scores if s.shapes and not s.same_as], 2):
+        columns = np.hstack([a.shapes[0].columns, b.shapes[0].columns])
+        drop = tangent.explained(columns, [*a.shapes[0].nonnegative, *b.shapes[0].nonnegative]).share
+        if drop > (1 + MORE) * max(a.drop, b.drop):
+            found.append((drop, a, b))
+    return [(a, b) for _, a, b in sorted(found, key=lambda pair: -pair[0])[:most]]
+
+
 def _nothing(tangent: Tangent, known: Score | None) -> Score | None:
     """Return the score by what an effect added to a smaller model, if that is next to nothing here."""
-    if known is None or not known.shapes:
+    if known is None or not known.shapes or any(p.order for p in known.effect.parameters):
         return None
     shapes = tuple(s.weighed_like(tangent.fit) for s in known.shapes)
     found = _scored(tangent, known.effect, shapes)
@@ -118,10 +131,11 @@ def score(tangent: Tangent, effect: Effect) -> Score:
 
 def _scored(tangent: Tangent, effect: Effect, shapes: tuple[Shape, ...]) -> Score:
     """Score an effect by what it adds at several shapes."""
-    tried = sorted((_tried(tangent, s) for s in shapes), key=lambda t: -t.drop)
-    if not tried:
+    pairs = sorted(((_tried(tangent, s), s) for s in shapes), key=lambda pair: -pair[0].drop)
+    if not pairs:
         return Score(effect, 0.0, ({},))
-    best = tried[0]
+    tried = [t for t, _ in pairs]
+    best, shapes = tried[0], tuple(s for _, s in pairs)
     same_as = best.same_as if all(t.same_as for t in tried) else ()
     starts = tuple(_distinct([t.values for t in tried]))
     drop = 0.0 if same_as else best.drop
@@ -137,7 +151,7 @@ def _score_orders(tangent: Tangent, added: Added, effect: Effect) -> Score:
         return Score(effect, 0.0, ({},))
     best, starts = _tried(tangent, shape), tuple(_start(line, added.pars) for line in lines)
     out = spectrum(tangent, effect).stands_out
-    return Score(effect, best.drop, starts, tangent.effective(best.left), best.same_as, out)
+    return Score(effect, best.drop, starts, tangent.effective(best.left), best.same_as, out, (shape,))
 
 
 def _start(line: Line, pars: Sequence[Parameter]) -> dict[str, float]:
@@ -161,15 +175,15 @@ def _distinct(starts: list[dict[str, float]], most: int = 4) -> list[dict[str, f
 def _tried(tangent: Tangent, shape: Shape) -> Tried:
     """Score one shape, physical signs enforced."""
     if not shape.sizes:
-        drop, amount, left = tangent.explained(shape.columns, [True])
+        drop, amount, left = tangent.explained(shape.columns, shape.nonnegative)
         # An amount far from one means that the shape itself is wrong: the drop promises more than it can keep.
         keeps = 0.2 if amount[0] < 0.05 else min(1.0, 3.0 / amount[0])
         return Tried(keeps * drop, dict(shape.values), left)
     if shape.phase is not None:
-        drop, a, left = tangent.explained(shape.columns, [False] * 2)
+        drop, a, left = tangent.explained(shape.columns, shape.nonnegative)
         found = {shape.sizes[0].name: float(np.hypot(*a)), shape.phase.name: float(np.arctan2(a[1], a[0]))}
     else:
-        drop, a, left = tangent.explained(shape.columns, [p.lower == 0 for p in shape.sizes])
+        drop, a, left = tangent.explained(shape.columns, shape.nonnegative)
         found = {p.name: float(v) for p, v in zip(shape.sizes, a, strict=True)}
     held = {p.name: p.value for p in shape.sizes if not p.vary}
     if held:  # e.g. copper's temperature coefficient: only near its physical value does the shape make sense

@@ -6,6 +6,7 @@ physical sign; see `judging`.
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -14,7 +15,7 @@ from motorid.diagnosis.evidence import Errors, Gain, compare_errors
 from motorid.diagnosis.held import HeldOut, train_errors
 from motorid.diagnosis.judging import COMMON, PLAIN, Judge, Node, held_out_objection, node_of, worth_it
 from motorid.diagnosis.objections import WORST_CONDITION, ambiguity, objections
-from motorid.diagnosis.rank import Score, rank
+from motorid.diagnosis.rank import Score, pairs_of, rank
 from motorid.diagnosis.remainders import far
 from motorid.diagnosis.results import Candidate
 from motorid.diagnosis.tournament import GivenUp, Task, refits, widened
@@ -27,6 +28,7 @@ from motorid.model import Effect, Model
 from motorid.parameters import Parameter
 
 SHORTLIST = 6
+PAIRS = 3  # refitted where no single effect helps
 NEAR = 0.4  # of the best score: what a common effect must reach to be refitted too
 ALWAYS = ("compliance", "speed_lag", "speed_delay")  # their score at null says little
 Advance = Callable[[str], None]
@@ -94,7 +96,7 @@ class Search:
         self.advance(f"refitted {len(fits)}")
         children, judged = [], {}
         for e, fit in zip([*(s.effect for s in short), *wider], fits, strict=True):
-            child, candidate = self._judge(node, e, fit)
+            child, candidate = self._judge(node, (e,), fit)
             judged[e.name] = candidate
             if child is not None:
                 children.append(child)
@@ -121,7 +123,22 @@ class Search:
             fresh.append(e)
         return fresh, wider
 
-    def _judge(self, node: Node, effect: Effect, fit: Fit | GivenUp | None) -> tuple[Node | None, Candidate]:
+    def expand_by_two(self, node: Node) -> list[Node]:
+        """Return the judged models larger by two effects that only together show: each alone was refused."""
+        present, scores = node.fit.model, _shortlist(self.scores(node), lost(node.fit))
+        tasks = []
+        for a, b in pairs_of(node.fit, scores, PAIRS):
+            with contextlib.suppress(ModelError):
+                tasks.append(Task(node.fit, present + a.effect + b.effect, a.effect, _merged(a, b)))
+        children = []
+        for task, fit in zip(tasks, refits(tasks, self.map), strict=True):
+            child, _ = self._judge(node, task.model.effects[len(present.effects) :], fit)
+            children += [child] if child is not None else []
+        self.advance(f"refitted {len(tasks)} pairs")
+        return children
+
+    def _judge(self, node: Node, effects: Sequence[Effect], fit: Fit | GivenUp | None) -> tuple[Node | None, Candidate]:
+        effect = effects[0]
         candidate = Candidate(effect.name, 0.0)
         if isinstance(fit, GivenUp):
             return None, replace(candidate, refit_drop=fit.drop, reason=fit.why)
@@ -132,9 +149,9 @@ class Search:
         except FAILURES:
             return None, replace(candidate, reason="its refit could not be simulated")
         drop = _drop(node, train)
-        values = {p.name: fit.values[p.name] for p in effect.parameters}
+        values = {p.name: fit.values[p.name] for e in effects for p in e.parameters}
         candidate = replace(candidate, refit_drop=drop, parameters=values, fit=fit)
-        why = objections(fit, effect, node.fit)
+        why = next((w for e in effects if (w := objections(fit, e, node.fit))), "")
         if why:
             return None, replace(candidate, reason=why)
         gain = compare_errors(node.train, train, self.held.noise)
@@ -190,7 +207,8 @@ class Search:
         """
         for e in node.fit.problem.model.effects:
             simpler = [_in_place(node.fit.model, e, r) for r in self._relatives(node, e)]
-            smaller = simpler if e.name == node.added else [*simpler, node.fit.model.without(e.name)]
+            alone = e.name == node.added and node.parent is not None and len(node.key - node.parent.key) == 1
+            smaller = simpler if alone else [*simpler, node.fit.model.without(e.name)]
             for model in sorted(smaller, key=lambda m: len(m.free_names)):
                 other = self._smaller(node, model)
                 if other is not None and self.judge.superfluous(node, other):
@@ -250,6 +268,12 @@ def _shortlist(scores: Sequence[Score], astray: bool) -> list[Score]:
         or s.effect.name in ALWAYS
         or (astray and s.effect.name in COMMON)
     ]
+
+
+def _merged(a: Score, b: Score) -> list[dict[str, float]]:
+    """Return starts of two effects together: the best of both, and the next best of either."""
+    best = [{**dict(a.starts[0]), **dict(b.starts[0])}]
+    return best + [{**best[0], **dict(s.starts[1])} for s in (a, b) if len(s.starts) > 1]
 
 
 def _unseen(score: Score) -> str:
