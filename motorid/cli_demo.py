@@ -14,8 +14,8 @@ from motorid.fit import fit
 from motorid.model import dc_motor
 from motorid.progress import progress
 from motorid.reading import read_runs
-from motorid.summary import deviations
 from motorid.tables import comparison_table, error_table, ladder_table, parameter_table, ranking_table
+from motorid.uncertainty import deviations
 
 SET = "hidden_friction"
 

@@ -24,8 +24,9 @@ from motorid.experiment import Experiment
 from motorid.fit import Fit
 from motorid.formatting import duration
 from motorid.simulate import Evaluation, evaluate
-from motorid.summary import constraint_violations, deviations, fit_dict, remarks, run_dict, write_json
+from motorid.summary import constraint_violations, fit_dict, remarks, run_dict, write_json
 from motorid.tables import constraint_table, derived_table, error_table, parameter_table, run_table
+from motorid.uncertainty import deviations
 
 GOOD = ("converged", "limit", "stalled")
 

@@ -18,8 +18,9 @@ from motorid.cli_options import (
     with_choices,
 )
 from motorid.progress import progress
-from motorid.summary import deviations, write_json
+from motorid.summary import write_json
 from motorid.tables import comparison_table, ladder_table, ranking_table
+from motorid.uncertainty import deviations
 
 OUT = "Results"
 
@@ -100,7 +101,7 @@ def robustness(
 def show_diagnosis(found: Any) -> None:
     """Print a diagnosis: verdict, place, ranking, ladder, how the parameters moved, what stays open."""
     show(f"{found.text}\n")
-    show(f"Where: {found.missing.text}\n" if found.missing.text else None)
+    show(f"Where: {found.missing.text}\n" if found.missing.text and found.verdict != "adequate" else None)
     show(ranking_table(found.ranking) if found.ranking else None)
     show(ladder_table(found.ladder), found.ladder.text)
     if found.after is not found.before:

@@ -16,7 +16,7 @@ from motorid.experiment import Experiment
 from motorid.integrate import Engine
 from motorid.integrate.grid import Array
 from motorid.least_squares import LevenbergMarquardt, Solution, levenberg_marquardt
-from motorid.misfit import integration_error
+from motorid.misfit import integration_error, misfit_over_noise
 from motorid.model import Model
 from motorid.problem import Problem, as_problem
 from motorid.result import UNDETERMINED, Failure, Fit
@@ -162,7 +162,9 @@ def _misfit(found: Solution, n: int) -> float:
 
 def _at_noise(found: Solution, problem: Problem) -> Solution:
     """Return the solution, as converged where the misfit is noise: friction makes the cost too rugged to go lower."""
-    if found.status != "stalled" or problem.weights != "noise" or _misfit(found, problem.n_outputs) > NOISE:
+    if found.status != "stalled" or problem.weights != "noise":
+        return found
+    if max(misfit_over_noise(problem, found.q).values(), default=np.inf) > NOISE:
         return found
     return replace(found, status="converged", message="converged: no step lowers a misfit that is noise")
 

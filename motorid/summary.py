@@ -12,7 +12,7 @@ import numpy as np
 from motorid.errors import UsageError
 from motorid.multipliers import violations
 from motorid.relations import Relation
-from motorid.uncertainty import covariance
+from motorid.uncertainty import deviations
 
 if TYPE_CHECKING:
     from motorid.fit import Fit
@@ -50,18 +50,6 @@ def fit_dict(fit: Fit, held_out: Evaluation | None = None) -> dict[str, Any]:
                  for r, e in zip(problem.experiments, fit.evaluation.by_run, strict=True)],
         "remarks": remarks(fit),
     }
-
-
-def deviations(fit: Fit) -> dict[str, float | None]:
-    """Return one standard deviation per parameter, the residuals taken as coloured as they are.
-
-    A model that lacks something leaves residuals that go with the motion; as white noise they would make its
-    parameters far too certain. True constraints carry information of their own: then it is the fit's.
-    """
-    if fit.problem.constraints or not fit.problem.unknown:
-        return dict(fit.std)
-    found = covariance(fit).std
-    return {n: found.get(n, std) for n, std in fit.std.items()}
 
 
 def constraint_violations(fit: Fit) -> dict[str, float]:

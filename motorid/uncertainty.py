@@ -227,3 +227,15 @@ def _held_priors(fit: Fit) -> int:
 
 def _samples(parts: Sequence[tuple[Array, Array]]) -> int:
     return int(sum(np.isfinite(r).sum() for r, _ in parts))
+
+
+def deviations(fit: Fit) -> dict[str, float | None]:
+    """Return one standard deviation per parameter, the residuals taken as coloured as they are.
+
+    A model that lacks something leaves residuals that go with the motion; as white noise they would make its
+    parameters far too certain. True constraints carry information of their own: then it is the fit's.
+    """
+    if fit.problem.constraints or not fit.problem.unknown:
+        return dict(fit.std)
+    found = covariance(fit).std
+    return {n: found.get(n, std) for n, std in fit.std.items()}

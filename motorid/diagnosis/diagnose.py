@@ -74,7 +74,7 @@ def diagnose(
     ladder = ladder_of(found, validate is not None)
     names = tuple(n for n in ladder.best.problem.model.effect_names if n not in fit.problem.model.effect_names)
     ranking = found.rounds[0] if found.rounds else ()
-    remaining, suggestion = found.remaining, None
+    remaining, suggestion, groups = found.remaining, None, found.groups
     if other is not None:
         remaining = following(remaining, other.form.text)
         judged = following(judged, other.form.text) if judged.adequate else judged
@@ -91,6 +91,7 @@ def diagnose(
         text = missing_text(ladder.rungs, remaining, found.groups, validate is not None)
         same = {name: p for node in found.path[1:] for name, p in search.inseparable(node).items()}
         text = f"{text} {inseparable_remark(same)}".rstrip()
+        groups = (*groups, *(_sharing(ladder.best, name, parameters) for name, parameters in same.items()))
         suggestion = _suggestion(found)
     last = ladder.best
     of_last = (measured_angle_remark(last), outliers_remark(last))
@@ -106,12 +107,18 @@ def diagnose(
         missing,
         ranking,
         ladder,
-        found.groups,
+        groups,
         suggestion,
         fit,
         ladder.best,
         remaining,
     )
+
+
+def _sharing(fit: Fit, name: str, parameters: Sequence[str]) -> tuple[str, ...]:
+    """Return the effects whose parameters together do what another effect does, and that one."""
+    inside = (e.name for e in fit.model.effects if {p.name for p in e.parameters} & set(parameters))
+    return (*inside, name)
 
 
 def _suggestion(found: Climb) -> str | None:

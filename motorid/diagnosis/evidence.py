@@ -76,13 +76,13 @@ class Errors:
         """Return the errors of `simulations`; `judged` gives other measurements on the same samples (a fold)."""
         runs = judged if judged is not None else [s.experiment for s in simulations]
         residuals: dict[str, list[Array]] = {}
-        squares: dict[str, list[float]] = {}
+        squares: dict[str, list[Array]] = {}
         for s, run in zip(simulations, runs, strict=True):
             for c, y in run.outputs.items():
                 if c in s.outputs and np.isfinite(y).any():
                     residuals.setdefault(c, []).append(y - s.outputs[c])
-                    squares.setdefault(c, []).append(float(np.nanmean(y**2)))
-        return Errors(residuals, {c: float(np.sqrt(np.mean(v))) for c, v in squares.items()})
+                    squares.setdefault(c, []).append(y[np.isfinite(y)] ** 2)
+        return Errors(residuals, {c: float(np.sqrt(np.mean(np.concatenate(v)))) for c, v in squares.items()})
 
     def limits(self) -> dict[str, float]:
         """Size per channel beyond which a residual is far from what is usual for this model."""

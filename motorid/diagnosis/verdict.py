@@ -12,6 +12,7 @@ from motorid.effects import LIBRARY
 from motorid.fit import Fit
 from motorid.formatting import percent, with_error
 from motorid.model import Effect
+from motorid.uncertainty import deviations
 
 MOVED = 0.1  # relative change of a motor parameter that is worth a word
 SPIKED = 0.5  # of a channel's squared error: what outliers must make to be worth a word
@@ -62,10 +63,10 @@ def _described(fit: Fit, name: str) -> str:
 
 
 def _valued(fit: Fit, effect: Effect) -> list[str]:
-    found = []
+    found, std = [], deviations(fit)
     for p in effect.parameters:
         unit = fit.problem.model.parameters[p.name].unit
-        text = f"{p.name} = {with_error(fit.values[p.name], fit.std.get(p.name), unit)}"
+        text = f"{p.name} = {with_error(fit.values[p.name], std.get(p.name), unit)}"
         if p.name == "k_w" and abs(1 + fit.values[p.name] - RPM) < 0.3:
             text += ", the ratio of rpm to rad/s: the speed is probably in rpm"
         found.append(text)
@@ -93,9 +94,10 @@ def moves(before: Fit, after: Fit) -> str:
     moved = [n for n in base if abs(after.values[n] / max(before.values[n], 1e-300) - 1) > MOVED]
     if not moved:
         return ""
+    was, is_ = deviations(before), deviations(after)
     said = [
-        f"{n} from {with_error(before.values[n], before.std[n])} to "
-        f"{with_error(after.values[n], after.std[n], after.problem.model.parameters[n].unit)}"
+        f"{n} from {with_error(before.values[n], was[n])} to "
+        f"{with_error(after.values[n], is_[n], after.problem.model.parameters[n].unit)}"
         for n in moved
     ]
     return f"The motor's own parameters had absorbed it: {', '.join(said)}."
@@ -136,6 +138,8 @@ def balance_of(name: str, also: Sequence[Effect] = ()) -> str:
 
 def outliers_remark(fit: Fit) -> str:
     """Say so when a few samples that stand alone make most of a channel's error: they hide the rest."""
+    if fit.problem.loss is not None:
+        return ""
     for c in fit.problem.outputs:
         parts = [s.residual(c) for s in fit.simulations if c in s.experiment.outputs]
         r = np.concatenate([p[np.isfinite(p)] for p in parts])
