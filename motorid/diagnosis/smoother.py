@@ -18,7 +18,7 @@ from motorid.fit import Fit
 from motorid.integrate.grid import Array
 
 STEPS = 4  # Gauss-Newton iterations
-MODEL_ERROR = 1e-3  # of a state's size: how exactly one step of the model must hold
+MODEL_ERROR = 1e-5  # of a state's size: how exactly one step of the model must hold
 
 
 class Smoothed(NamedTuple):
