@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from motorid.experiment import Experiment
 from motorid.noise import noise_level, quantum
-from motorid.plausibility import angle_against_speed, implied_constants, magnitudes, signs, swapped_columns
+from motorid.plausibility import angle_against_speed, implied_constants, magnitudes, signs, swapped_columns, unsigned
 
 __all__ = ["check_runs", "current_limit"]
 
@@ -217,6 +217,6 @@ def _never_reverses(runs: Sequence[Experiment]) -> str | None:
 
 
 _CHECKS: tuple[Check, ...] = (
-    signs, angle_against_speed, magnitudes, implied_constants, swapped_columns,
+    signs, unsigned, angle_against_speed, magnitudes, implied_constants, swapped_columns,
     _excitation, _missing, _clipped, current_limit, _coarse, _spikes, _noisy, _uneven, _slow_sampling, _never_settles,
 )

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from motorid.experiment import Experiment
 from motorid.noise import noise_level
 
-__all__ = ["angle_against_speed", "implied_constants", "magnitudes", "signs", "swapped_columns"]
+__all__ = ["angle_against_speed", "implied_constants", "magnitudes", "signs", "swapped_columns", "unsigned"]
 
 Array = NDArray[np.float64]
 
@@ -43,6 +43,20 @@ def signs(run: Experiment) -> str | None:
     else_ = " (or of the voltage)" if measured == against else ""
     return (f"a positive voltage goes with a negative {against[0]}: the sign of the {against[0]}{else_} "
             f"is probably swapped. Turn it round, e.g. units={{'{channel}': '-1 {unit}'}}.")
+
+
+def unsigned(run: Experiment) -> str | None:
+    """A motor that is driven both ways draws current both ways."""
+    v = run.inputs["v"]
+    for c, name in (("i", "current"), ("omega", "speed")):
+        y = run.outputs.get(c)
+        if y is None or min(-v.min(), v.max()) < 0.2 * np.abs(v).max():
+            continue
+        backward, noise = v < -0.2 * np.abs(v).max(), noise_level(y, run.t)
+        if np.nanmin(y) > -2 * noise and np.mean(backward) > 0.05 and np.nanmedian(y[backward]) > 5 * noise:
+            return (f"the {name} is never negative although the voltage is in {100 * np.mean(v < 0):.0f} % of the "
+                    f"samples: logged without its sign? A fit needs the sign; leave it out with --ignore {c}.")
+    return None
 
 
 def angle_against_speed(run: Experiment) -> str | None:

@@ -17,8 +17,8 @@ from motorid.diagnosis.evidence import compare_errors
 from motorid.diagnosis.forms import Linear, as_effect, halves, linearised
 from motorid.diagnosis.held import BLOCKS, HeldOut, train_errors
 from motorid.diagnosis.remainders import by_channel, far, fraction, fraction_of, left
-from motorid.diagnosis.shapes import Form
-from motorid.diagnosis.trial import FAILURES, refit
+from motorid.diagnosis.shapes import FORMS, Form
+from motorid.diagnosis.trial import FAILURES, Raced, finished, lost, raced
 from motorid.fit import Fit
 from motorid.integrate.grid import Array
 from motorid.misfit import misfit_over_noise
@@ -80,7 +80,7 @@ def outside(steps: Sequence[Fit], held: HeldOut) -> Outside | None:
             nearer = _in_earnest(steps, held, channels) if kept else None  # the first may have been judged too early
             return nearer or _best(instead, kept)
     beside = [r for r in rivals if r.explains]
-    earnest = _in_earnest(steps, held, channels) if len(steps) > 1 else None
+    earnest = _in_earnest(steps, held, channels) if len(steps) > 1 or lost(steps[-1]) else None
     return earnest or (_best(beside, len(steps) - 1) if beside else None)
 
 
@@ -164,13 +164,11 @@ def _in_earnest(steps: Sequence[Fit], held: HeldOut, channels: Sequence[int]) ->
     if max(last.nrmse[c] for c in names) < ROUGH and max(over_noise[c] for c in names) < FAR_OFF:
         return None
     try:
-        rivals = sorted(_rivals(steps, 0, held, channels), key=lambda r: r.leaves)
-        made = [(r.form, e) for r in rivals if (e := as_effect(r.form, last)) is not None]
-        if not made:
+        found = _nearest(steps, held, channels)
+        if found is None:
             return None
-        form, effect = made[0]
-        values = {n: last.values.get(n, v) for n, v in root.values.items()}  # an effect of the first may be gone
-        fit = refit(root, root.model.start_at(values) + effect, ({},))
+        form, race = found
+        fit = finished(root, race)
         if fit is None:
             return None
         leaves = compare_errors(train_errors(last), train_errors(fit), held.noise)
@@ -179,6 +177,22 @@ def _in_earnest(steps: Sequence[Fit], held: HeldOut, channels: Sequence[int]) ->
         return None
     fraction = (1 - min(leaves.fall, judged.fall)) ** 2
     return Outside(form, 0, fraction) if fraction < MUCH_LESS else None
+
+
+def _nearest(steps: Sequence[Fit], held: HeldOut, channels: Sequence[int]) -> tuple[Form, Raced] | None:
+    """Return the form that promises most, begun to be fitted: by slopes, or after a few steps where those are lost."""
+    root, last = steps[0], steps[-1]
+    values = {n: last.values.get(n, v) for n, v in root.values.items()}  # an effect of the first may be gone
+    if lost(last):
+        forms = list(FORMS)
+    else:
+        forms = [r.form for r in sorted(_rivals(steps, 0, held, channels), key=lambda r: r.leaves)]
+    made = [(form, e) for form in forms if (e := as_effect(form, last)) is not None]
+    races = []
+    for form, effect in made if lost(last) else made[:1]:
+        race = raced(root, root.model.start_at(values) + effect, ({},))
+        races += [(form, race)] if race is not None else []
+    return min(races, key=lambda found: found[1].cost, default=None)
 
 
 def _weighed(last: Fit, fit: Fit) -> Array:
