@@ -42,7 +42,7 @@ def unwrapped(theta: Array, t: Array, omega: Array | None = None) -> tuple[Array
         expected = (omega[seen][1:] + omega[seen][:-1]) / 2 * np.diff(t[seen])
     jumps = np.round((expected - steps) / turn)
     left = np.abs(steps + jumps * turn - expected)
-    if not jumps.any() or np.quantile(left, 0.99) > CLEAR:
+    if not jumps.any() or max(np.quantile(left, 0.99), left[jumps != 0].max()) > CLEAR:
         return theta, 0
     on = theta.copy()
     on[seen[1:]] += turn * np.cumsum(jumps)

@@ -1,0 +1,174 @@
+"""Records read otherwise: a wrapped angle, a late or noisy voltage, spikes, a current without its sign."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from command import motorid_json
+from lab_records import simulated
+
+import motorid as mi
+from motorid.plausibility import unsigned
+from motorid.reading import write_csv
+from motorid.repairs import spikes, unwrapped
+
+T = 1e-3 * np.arange(800)
+TURN = 2 * np.pi
+
+
+def swinging(t=T):
+    """An angle over some turns, both ways, with the noise of a resolver."""
+    return 1.0 + 12.0 * np.sin(7 * t) + 2e-3 * np.random.default_rng(1).normal(size=t.size)
+
+
+# -- an angle modulo a turn --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("low", [0.0, -np.pi])
+def test_an_angle_taken_modulo_a_turn_goes_on(low):
+    theta = swinging()
+    on, jumps = unwrapped(np.mod(theta - low, TURN) + low, T)
+    assert jumps >= 6
+    assert np.allclose(on - on[0], theta - theta[0], atol=1e-12)
+
+
+def test_missing_samples_do_not_stop_it():
+    theta = swinging()
+    wrapped = np.mod(theta, TURN)
+    wrapped[100:110] = np.nan
+    on, _ = unwrapped(wrapped, T)
+    seen = np.isfinite(wrapped)
+    assert np.array_equal(np.isfinite(on), seen)
+    assert np.allclose((on - theta)[seen], (on - theta)[0], atol=1e-12)
+
+
+def test_with_the_speed_it_may_turn_by_more_than_half_a_turn_per_sample():
+    t = 0.01 * np.arange(300)
+    theta, omega = 400 * t**2, 800 * t  # 24 rad per sample at the end
+    assert np.diff(theta).max() > 3 * TURN
+    on, _ = unwrapped(np.mod(theta, TURN), t, omega)
+    assert np.allclose(on, theta, atol=1e-6)
+
+
+@pytest.mark.parametrize("theta", [swinging(), 0.3 * np.sin(7 * T), np.where(T < 0.4, 0.0, 4.0)])
+def test_an_angle_that_is_whole_is_left_alone(theta):
+    on, jumps = unwrapped(theta, T)
+    assert jumps == 0  # one jump of 4 rad is none of 2.3 rad the other way, either
+    assert on is theta
+
+
+def test_a_file_with_a_wrapped_angle_says_so_and_is_whole(tmp_path):
+    theta = swinging()
+    file = tmp_path / "run.csv"
+    rows = np.column_stack([T, np.sin(7 * T), np.degrees(np.mod(theta, TURN))])
+    np.savetxt(file, rows, delimiter=",", header="time_s,voltage_V,angle_deg", comments="")
+    run = mi.read_csv(file)
+    assert np.allclose(np.diff(run.outputs["theta"]), np.diff(theta), atol=1e-6)
+    assert any("jumps by a turn" in note for note in run.meta["notes"])
+
+
+# -- a voltage that is late --------------------------------------------------------------------------------
+
+
+def held(v, dt=1e-3, hold="zoh"):
+    return mi.Experiment(dt * np.arange(len(v)), {"v": v}, {"omega": np.zeros(len(v))}, hold=hold, name="run")
+
+
+def test_a_delay_of_whole_samples_moves_the_voltage():
+    v = np.random.default_rng(2).normal(size=50)
+    assert np.allclose(held(v).delayed(3e-3).inputs["v"], np.concatenate([[v[0]] * 3, v[:-3]]))
+    assert np.allclose(held(v).delayed(-2e-3).inputs["v"][:-2], v[2:])
+    assert np.allclose(held(v).delayed(0.0).inputs["v"], v)
+
+
+def test_a_delay_of_part_of_a_sample_keeps_the_integral_of_a_held_voltage():
+    v = np.repeat([0.0, 6.0, -2.0], 40)
+    late = held(v).delayed(0.3e-3).inputs["v"]
+    assert late[40] == pytest.approx(0.7 * 6.0)
+    assert late[80] == pytest.approx(0.3 * 6.0 + 0.7 * -2.0)
+    assert np.sum(late[:90]) == pytest.approx(np.sum(v[:90]) - 0.3 * (v[89] - v[0]))
+
+
+def test_a_voltage_that_goes_on_is_read_between_its_samples():
+    run = held(np.sin(0.1 * np.arange(60)), hold="linear")
+    assert np.allclose(run.delayed(0.5e-3).inputs["v"][1:], (run.inputs["v"][1:] + run.inputs["v"][:-1]) / 2)
+
+
+@pytest.mark.parametrize("seconds", [np.nan, np.inf, 1.0, -1.0])
+def test_a_delay_longer_than_the_run_is_refused(seconds):
+    with pytest.raises(mi.UsageError, match="less than the"):
+        held(np.zeros(60)).delayed(seconds)
+
+
+# -- a voltage with noise ----------------------------------------------------------------------------------
+
+
+def test_a_noisy_voltage_is_its_mean_between_steps_and_nowhere_else():
+    rng = np.random.default_rng(3)
+    v = np.concatenate([np.repeat([0.0, 5.0, -3.0, 2.0], 100), 5 + 4 * np.sin(0.05 * np.arange(300))])
+    level = held(v + rng.normal(0, 0.1, v.size)).levelled().inputs["v"]
+    assert np.abs(level[:400] - v[:400]).max() < 0.04
+    assert len(np.unique(level[:400])) == 4
+    assert np.std(level[400:] - v[400:]) == pytest.approx(0.1, rel=0.2)
+
+
+def test_a_commanded_voltage_stays_as_it_is():
+    v = np.repeat([0.0, 5.0, -3.0], 100)
+    assert np.array_equal(held(v).levelled().inputs["v"], v)
+
+
+# -- spikes ------------------------------------------------------------------------------------------------
+
+
+def spiked(count=8, size=40.0):
+    t = 1e-3 * np.arange(1000)
+    run = simulated(t, np.where(t < 0.1, 0.0, np.where(t < 0.6, 6.0, -3.0)), ("i", "omega"))
+    i = run.outputs["i"] + 0.02 * np.random.default_rng(4).normal(size=t.size)
+    at = np.array([150, 222, 301, 377, 480, 555, 700, 901][:count], int)
+    i[at] += size * np.where(np.arange(count) % 2, -1, 1)
+    return run.with_(outputs={**run.outputs, "i": i}), at
+
+
+def test_spikes_are_left_out_and_nothing_else():
+    run, at = spiked()
+    assert np.array_equal(spikes(run, "i"), at)
+    quiet = run.without_spikes()
+    assert np.array_equal(np.flatnonzero(np.isnan(quiet.outputs["i"])), at)
+    assert np.array_equal(quiet.outputs["omega"], run.outputs["omega"])
+
+
+def test_a_peak_of_the_current_at_a_step_is_no_spike():
+    run, _ = spiked(0)
+    assert run.without_spikes() is run
+    few, _ = spiked(2)
+    assert few.without_spikes() is few
+
+
+def test_spikes_beside_missing_samples_are_found():
+    run, at = spiked()
+    i = run.outputs["i"].copy()
+    i[at - 1] = np.nan
+    assert np.array_equal(spikes(run.with_(outputs={**run.outputs, "i": i}), "i"), at)
+
+
+def test_the_command_line_leaves_them_out(tmp_path):
+    run, _ = spiked()
+    file = str(write_csv(run, tmp_path / "run.csv"))
+    whole = motorid_json(tmp_path, "fit", file)
+    without = motorid_json(tmp_path, "fit", file, "--no-spikes")
+    assert any("--no-spikes" in note for note in whole["notes"])
+    assert without["nrmse"]["i"] < 0.1 * whole["nrmse"]["i"]
+    late = motorid_json(tmp_path, "fit", file, "--no-spikes", "--delay", "0.005")
+    assert late["nrmse"]["i"] > 2 * without["nrmse"]["i"]
+
+
+# -- a current without its sign ----------------------------------------------------------------------------
+
+
+def test_a_current_logged_without_its_sign_is_told():
+    run, _ = spiked(0)
+    assert unsigned(run) is None
+    rectified = run.with_(outputs={**run.outputs, "i": np.abs(run.outputs["i"])})
+    assert "without its sign" in (unsigned(rectified) or "")
+    forward = run.with_(inputs={"v": np.abs(run.inputs["v"])}, outputs={"i": np.abs(run.outputs["i"])})
+    assert unsigned(forward) is None
