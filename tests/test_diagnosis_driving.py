@@ -86,3 +86,59 @@ def test_the_command_line_filters_a_voltage(tmp_path, lab):
     write_csv(run, tmp_path / "run.csv")
     raw, quiet = (motorid_json(tmp_path, "fit", tmp_path / "run.csv", "--median", n)["nrmse"] for n in ("1", "15"))
     assert quiet["i"] < 0.8 * raw["i"]
+
+
+# -- a voltage that is late, and spikes --------------------------------------------------------------------
+
+
+def late(run, samples):
+    """The record with its voltage logged `samples` before it acts."""
+    v = run.inputs["v"]
+    return run.with_(inputs={"v": np.concatenate([v[samples:], np.repeat(v[-1:], samples)])})
+
+
+@pytest.mark.parametrize("hidden", [{}, {"coulomb": {"tau_c": 0.008}}])
+def test_a_voltage_that_acts_late_is_no_effect(lab, hidden):
+    rng = np.random.default_rng(7)
+    runs = [late(recorded(lab, hidden, stairs(1500, rng), 1e-3, rng, name=f"r{k}"), 3) for k in range(3)]
+    tried = ("coulomb", "speed_lag", "speed_delay", "current_lag", "inductance_saturation")
+    found = mi.diagnose(mi.fit(mi.dc_motor(), runs[:2]), runs[2:], effects=tried)
+    assert found.effects == tuple(hidden)
+    assert found.remaining.adequate
+    assert "acts 3 ms later than it was logged" in found.text
+    assert "--delay 0.003" in found.text
+
+
+def test_a_late_speed_is_not_taken_for_a_late_voltage(lab):
+    rng = np.random.default_rng(8)
+    runs = [recorded(lab, {}, stairs(1500, rng), 1e-3, rng, name=f"r{k}") for k in range(3)]
+    runs = [r.with_(outputs={**r.outputs, "omega": np.roll(r.outputs["omega"], 4)}) for r in runs]
+    found = mi.diagnose(mi.fit(mi.dc_motor(), runs[:2]), runs[2:], effects=("speed_delay", "speed_lag", "coulomb"))
+    assert found.effects == ("speed_delay",)
+    assert "--delay" not in found.text
+
+
+def test_a_noisy_voltage_between_steps_is_its_mean(lab):
+    rng = np.random.default_rng(9)
+    runs = [recorded(lab, {}, stairs(1500, rng), 1e-3, rng, measured=0.15, name=f"r{k}") for k in range(2)]
+    chosen = better_reading(mi.fit(mi.dc_motor(), runs))
+    assert chosen is not None
+    assert chosen.option == "--levels"
+
+
+def test_spikes_of_a_sensor_do_not_hide_what_is_missing(lab):
+    rng = np.random.default_rng(10)
+    runs = [recorded(lab, {"coulomb": {"tau_c": 0.008}}, stairs(1500, rng), 1e-3, rng, name=f"r{k}") for k in range(3)]
+    spoilt = []
+    for run in runs:
+        i = run.outputs["i"].copy()
+        at = 40 + 150 * np.arange(10) + rng.integers(0, 60, 10)
+        i[at] += 60.0 * rng.choice([-1, 1], 10)
+        spoilt.append(run.with_(outputs={**run.outputs, "i": i}))
+    found = mi.diagnose(mi.fit(mi.dc_motor(), spoilt[:2]), spoilt[2:], effects=("coulomb", "brush_drop", "speed_lag"))
+    assert found.effects == ("coulomb",)
+    assert found.ladder.best.values["tau_c"] == pytest.approx(0.008, rel=0.03)
+    assert "--no-spikes" in found.text
+    forgiven = mi.diagnose(mi.fit(mi.dc_motor(), spoilt[:2], loss=mi.Huber()), effects=("coulomb",))
+    assert "--no-spikes" not in forgiven.text
+    assert "--loss huber" not in forgiven.text

@@ -145,12 +145,20 @@ def explored(
     found, other = climbed(records)
     last = found.path[-1]
     doubtful = len(found.path) > 1 or not found.remaining.adequate
-    if doubtful and (reading := better_reading(last.fit, late=True)):
+    if doubtful and (reading := _late_reading(found.path)):
         again = records.read(reading)
         anew, other_anew = climbed(again)
         if compare_errors(last.train, anew.path[-1].train).fall > 0:
             records, found, other = again, anew, other_anew
     return found, other, " ".join(records.remarks)
+
+
+def _late_reading(path: Sequence[Node]) -> Reading | None:
+    """Return the reading that the model before any effect of a sensor asks for, since lags imitate one, or the last."""
+    balances = [[e.balance for e in node.fit.model.effects if e.name not in path[0].key] for node in path]
+    plain = max(k for k, kinds in enumerate(balances) if "sensor" not in kinds)
+    asked = (better_reading(path[k].fit, late=True) for k in dict.fromkeys((plain, len(path) - 1)))
+    return next((reading for reading in asked if reading is not None), None)
 
 
 def _cut(found: Climb, kept: int, why: str, what: str) -> Climb:

@@ -1,0 +1,70 @@
+"""Orders over a turn are looked at roughly all, and exactly where it matters; the answers are those of plain loops."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from battery.excite import driven, record
+
+import motorid as mi
+from motorid.diagnosis import orders
+from motorid.diagnosis.response import Response, responses
+from motorid.diagnosis.tangent import Tangent
+from motorid.diagnosis.whitening import ORDER, Whitening
+from motorid.effects import LIBRARY
+
+
+def some(rng, n=40, nx=3, ny=2):
+    """A response that means nothing."""
+    a = rng.normal(0, 0.4, (n - 1, nx, nx))
+    return Response(a, rng.normal(size=(n - 1, nx, 2)), rng.normal(size=(n, ny, nx)), {})
+
+
+def test_the_answer_to_pushes_is_that_of_the_recursion(rng):
+    answer, pushes = some(rng), rng.normal(size=(5, 39, 3))
+    x, y = np.zeros((5, 3)), np.zeros((40, 2, 5))
+    for k in range(39):
+        x = x @ answer.a[k].T + pushes[:, k]
+        y[k + 1] = answer.c[k + 1] @ x.T
+    assert np.allclose(answer.driven(pushes), y, atol=1e-12)
+
+
+def test_what_pulls_is_the_transpose_of_what_pushes(rng):
+    answer, pushes, weights = some(rng), rng.normal(size=(1, 39, 3)), rng.normal(size=(40, 2))
+    forward = float(np.sum(answer.driven(pushes)[:, :, 0] * weights))
+    assert float(np.sum(answer.pulled(weights) * pushes[0])) == pytest.approx(forward, rel=1e-12)
+
+
+def test_the_transposed_filters_are_the_transpose(rng):
+    white = Whitening.of([rng.normal(size=(60, 2)).cumsum(axis=0), rng.normal(size=(50, 2))])
+    runs = [rng.normal(size=(60, 2)), rng.normal(size=(50, 2))]
+    rows = rng.normal(size=2 * (60 + 50 - 2 * ORDER))
+    back = white.transposed(rows, [60, 50])
+    assert sum(float(np.sum(b * r)) for b, r in zip(back, runs, strict=True)) == pytest.approx(
+        float(white(runs) @ rows), rel=1e-12
+    )
+
+
+@pytest.mark.parametrize(("effect", "hidden"), [
+    ("cogging", {"cogging": {"A": 8e-3, "N": 16, "phi": 0.7}}),
+    ("torque_ripple", {"torque_ripple": {"a_r": 0.15, "N_r": 9, "phi_r": 0.7}}),
+    ("cogging", {"coulomb": {"tau_c": 0.012}}),
+])
+def test_the_best_orders_are_those_of_a_look_at_all(lab, effect, hidden):
+    rng = np.random.default_rng(6)
+    runs = [
+        record(driven(lab, hidden, words, 900, 1e-3, rng), "logger", ("i", "omega", "theta"), lab, rng, f"run{k}")
+        for k, words in enumerate(("stairs 0.4", "ramps 0.3"))
+    ]
+    tangent = Tangent.of(mi.fit(mi.dc_motor(), runs))
+    looking, relative = orders._looking(tangent), effect == "torque_ripple"
+    every = looking.orders[1:]
+    assert len(every) > 2 * (orders.SAMPLED + orders.LOOKED_AT)
+    exact = {line.order: line for line in looking.exact(every, relative)[0]}
+    found = orders.spectrum(tangent, LIBRARY[effect])
+    best = max(exact.values(), key=lambda line: line.share)
+    assert found.lines[0].order == best.order
+    for line in found.lines:
+        assert line.share == pytest.approx(exact[line.order].share, rel=1e-6)
+    rough, _ = looking.shares(2, relative)
+    assert np.median(rough) == pytest.approx(np.median([line.share for line in exact.values()]), rel=0.3)
