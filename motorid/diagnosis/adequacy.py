@@ -17,6 +17,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.fft import next_fast_len
+from scipy.special import chdtrc, stdtr
 
 from motorid.diagnosis.evidence import autocorrelation, despiked, effective_samples
 from motorid.diagnosis.rank import Score
@@ -155,14 +157,14 @@ def _by_rounding(fit: Fit, channel: str, noise: float) -> bool:
 
 def _largest_cross_correlation(u: Array, r: Array) -> float:
     """Largest correlation of the residual with the input at any lag up to a quarter of the run."""
-    from scipy.signal import correlate
-
     a, b = u - u.mean(), np.where(np.isfinite(r), r, 0.0)
     size = np.linalg.norm(a) * np.linalg.norm(b)
     if size <= 0:
         return 0.0
     n = len(u)
-    return float(np.abs(correlate(b, a, method="fft"))[n - 1 : n + n // 4].max() / size)
+    length = next_fast_len(2 * n, real=True)
+    lags = np.fft.irfft(np.fft.rfft(b, length) * np.conj(np.fft.rfft(a, length)), length)
+    return float(np.abs(lags[: n // 4 + 1]).max() / size)
 
 
 def motion_of(fit: Fit, k: int) -> dict[str, Array]:
@@ -217,11 +219,9 @@ def _shift_test(labels: Sequence[NDArray[np.intp]], residuals: Sequence[Array]) 
     sums = sum(_sums(lab, r, count) for lab, r in zip(labels, residuals, strict=True))
     actual, *shares = np.sum(sums**2 / np.maximum(sizes, 1), axis=1) / total
     surrogate = np.log(np.array(shares) + 1e-6)
-    # Shares of surrogates are nearly log-normal; a tail beyond their number is read from that.
-    from scipy.stats import t as student
-
+    # Shares of surrogates are nearly log-normal; a tail beyond their number is read from that, Student's t.
     z = (np.log(actual + 1e-6) - surrogate.mean()) / max(float(surrogate.std(ddof=1)), 0.1)
-    return max(actual - float(np.exp(surrogate.mean())), 0.0), float(student.sf(z, 8))
+    return max(actual - float(np.exp(surrogate.mean())), 0.0), float(stdtr(8, -z))
 
 
 def _sums(labels: NDArray[np.intp], r: Array, count: int) -> Array:
@@ -234,8 +234,6 @@ def _sums(labels: NDArray[np.intp], r: Array, count: int) -> Array:
 
 def _score_tests(fit: Fit, scores: Sequence[Score]) -> list[dict[str, Any]]:
     """Turn predicted drops into p-values on effective samples, the search over shapes paid for."""
-    from scipy.stats import chi2
-
     if not scores:
         return []
     found = []
@@ -244,7 +242,7 @@ def _score_tests(fit: Fit, scores: Sequence[Score]) -> list[dict[str, Any]]:
         searched = 1 + 3 * sum(bool(p.grid) for p in s.effect.parameters)
         if any(p.order for p in s.effect.parameters):
             searched = 200
-        p = min(1.0, searched * float(chi2.sf(-s.effective * np.log1p(-min(s.drop, 1 - 1e-12)), k)))
+        p = min(1.0, searched * float(chdtrc(k, -s.effective * np.log1p(-min(s.drop, 1 - 1e-12)))))
         found.append({"channel": None, "on": s.effect.name, "share": s.drop, "p": p})
     return found
 

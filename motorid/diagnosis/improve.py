@@ -19,6 +19,7 @@ from motorid.diagnosis.judgement import judgement
 from motorid.diagnosis.judging import Node
 from motorid.diagnosis.outside import Outside, outside
 from motorid.diagnosis.parts import affordable
+from motorid.diagnosis.remainders import far
 from motorid.diagnosis.results import Adequacy, Candidate, Ladder, Rung
 from motorid.diagnosis.search import Search, library
 from motorid.experiment import Experiment
@@ -63,7 +64,7 @@ def climb(search: Search, max_effects: int, advance: Callable[[str], None]) -> C
                 rounds.append(tuple(listed))
             children |= {c.key: c for c in grown if c.key not in children}
         chosen = _better(search, children.values(), best)
-        if chosen is None and room > 1:
+        if chosen is None and room > 1 and far(best.fit):
             children = {c.key: c for c in search.expand_by_two(best)}
             chosen = _better(search, children.values(), best)
         if chosen is None:
@@ -144,8 +145,7 @@ def explored(
             records = records.read(reading)
     found, other = climbed(records)
     last = found.path[-1]
-    doubtful = len(found.path) > 1 or not found.remaining.adequate
-    if doubtful and (reading := _late_reading(found.path)):
+    if reading := _late_reading(found.path):
         again = records.read(reading)
         anew, other_anew = climbed(again)
         if compare_errors(last.train, anew.path[-1].train).fall > 0:
@@ -154,10 +154,14 @@ def explored(
 
 
 def _late_reading(path: Sequence[Node]) -> Reading | None:
-    """Return the reading that the model before any effect of a sensor asks for, since lags imitate one, or the last."""
+    """Return the reading that the model before any effect of a sensor asks for, since lags imitate one, or the last.
+
+    None where neither leaves more than noise.
+    """
     balances = [[e.balance for e in node.fit.model.effects if e.name not in path[0].key] for node in path]
     plain = max(k for k, kinds in enumerate(balances) if "sensor" not in kinds)
-    asked = (better_reading(path[k].fit, late=True) for k in dict.fromkeys((plain, len(path) - 1)))
+    fits = (path[k].fit for k in dict.fromkeys((plain, len(path) - 1)))
+    asked = (better_reading(fit, late=True) for fit in fits if far(fit))
     return next((reading for reading in asked if reading is not None), None)
 
 

@@ -30,6 +30,7 @@ CONTAINS = 0.7  # of what an effect does: what a form must do in its place
 NO_TRIFLE = 0.03  # of what an effect does: what it must miss
 VOID = 100.0  # times the misfit: a linear answer that went astray
 ROUGH = 0.1  # NRMSE beyond which a linear answer is not trusted
+FINISHED = 3  # forms, of those that a few steps put first
 FAR_OFF = 30.0  # times the noise, the same
 
 
@@ -158,7 +159,7 @@ def _against(form: Form, train: Linear, was: Linear, gained: Array, channels: Se
 
 def _in_earnest(steps: Sequence[Fit], held: HeldOut, channels: Sequence[int]) -> Outside | None:
     """Fit the form that promises most in place of all effects, where errors are too large to be linear."""
-    root, last = steps[0], steps[-1]
+    last = steps[-1]
     over_noise = misfit_over_noise(last.problem, last.q)
     names = [last.problem.outputs[c] for c in channels]
     if max(last.nrmse[c] for c in names) < ROUGH and max(over_noise[c] for c in names) < FAR_OFF:
@@ -167,10 +168,7 @@ def _in_earnest(steps: Sequence[Fit], held: HeldOut, channels: Sequence[int]) ->
         found = _nearest(steps, held, channels)
         if found is None:
             return None
-        form, race = found
-        fit = finished(root, race)
-        if fit is None:
-            return None
+        form, fit = found
         leaves = compare_errors(train_errors(last), train_errors(fit), held.noise)
         judged = compare_errors(held.block_errors(last), held.block_errors(fit), held.noise)
     except FAILURES:
@@ -179,20 +177,24 @@ def _in_earnest(steps: Sequence[Fit], held: HeldOut, channels: Sequence[int]) ->
     return Outside(form, 0, fraction) if fraction < MUCH_LESS else None
 
 
-def _nearest(steps: Sequence[Fit], held: HeldOut, channels: Sequence[int]) -> tuple[Form, Raced] | None:
-    """Return the form that promises most, begun to be fitted: by slopes, or after a few steps where those are lost."""
+def _nearest(steps: Sequence[Fit], held: HeldOut, channels: Sequence[int]) -> tuple[Form, Fit] | None:
+    """Return the form that explains most, and its fit: the one that slopes tell, or the best of all where they cannot.
+
+    A few steps from a fit that is lost do not tell either; the best few are finished.
+    """
     root, last = steps[0], steps[-1]
     values = {n: last.values.get(n, v) for n, v in root.values.items()}  # an effect of the first may be gone
-    if lost(last):
+    if lost(root):
         forms = list(FORMS)
     else:
         forms = [r.form for r in sorted(_rivals(steps, 0, held, channels), key=lambda r: r.leaves)]
     made = [(form, e) for form in forms if (e := as_effect(form, last)) is not None]
-    races = []
-    for form, effect in made if lost(last) else made[:1]:
+    races: list[tuple[Form, Raced]] = []
+    for form, effect in made if lost(root) else made[:1]:
         race = raced(root, root.model.start_at(values) + effect, ({},))
         races += [(form, race)] if race is not None else []
-    return min(races, key=lambda found: found[1].cost, default=None)
+    fits = [(form, finished(root, race)) for form, race in sorted(races, key=lambda found: found[1].cost)[:FINISHED]]
+    return min(((form, fit) for form, fit in fits if fit is not None), key=lambda found: found[1].chi2, default=None)
 
 
 def _weighed(last: Fit, fit: Fit) -> Array:
