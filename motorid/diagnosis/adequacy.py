@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,7 @@ from scipy.special import chdtrc, stdtr
 from motorid.diagnosis.evidence import autocorrelation, despiked, effective_samples
 from motorid.diagnosis.rank import Score
 from motorid.diagnosis.results import Adequacy
+from motorid.experiment import Experiment
 from motorid.fit import Fit
 from motorid.formatting import number
 from motorid.integrate.grid import Array
@@ -151,8 +153,13 @@ def _channel(fit: Fit, channel: str) -> dict[str, float]:
 
 def _by_rounding(fit: Fit, channel: str, noise: float) -> bool:
     """Tell whether the noise of a channel is that of the steps in which it moves."""
-    steps = [quantum(run.outputs[channel]) for run in fit.problem.experiments if channel in run.outputs]
-    return noise < AT_ROUNDING * float(np.sqrt(np.mean(np.square(steps)) / 12))
+    return noise < AT_ROUNDING * _rounding(fit.problem.experiments, channel)
+
+
+@lru_cache(maxsize=8)
+def _rounding(runs: tuple[Experiment, ...], channel: str) -> float:
+    steps = [quantum(run.outputs[channel]) for run in runs if channel in run.outputs]
+    return float(np.sqrt(np.mean(np.square(steps)) / 12))
 
 
 def _largest_cross_correlation(u: Array, r: Array) -> float:

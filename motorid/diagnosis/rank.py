@@ -35,7 +35,8 @@ class Score:
     """One effect scored: share of chi² that it would take away, and starting values for a refit.
 
     `starts` are tried in turn, the most promising first. `effective` is how many independent samples the residual
-    would be worth with the effect taken out: what a misfit makes smooth is no evidence of coloured noise.
+    would be worth with the effect taken out: what a misfit makes smooth is no evidence of coloured noise; 0 where it
+    does not matter, since the effect takes away less than one.
     `stands_out` says that its order is a line in the spectrum of the misfit, however small beside the rest of it.
     `same_as` are the parameters that together do what the effect does, if these data cannot tell it from them.
     `shapes` are what it was scored by, the best first.
@@ -139,7 +140,8 @@ def _scored(tangent: Tangent, effect: Effect, shapes: tuple[Shape, ...]) -> Scor
     same_as = best.same_as if all(t.same_as for t in tried) else ()
     starts = tuple(_distinct([t.values for t in tried]))
     drop = 0.0 if same_as else best.drop
-    return Score(effect, drop, starts, tangent.effective(best.left), same_as, shapes=shapes)
+    effective = tangent.effective(best.left) if drop * tangent.chi2 > 1 else 0.0
+    return Score(effect, drop, starts, effective, same_as, shapes=shapes)
 
 
 def _score_orders(tangent: Tangent, added: Added, effect: Effect) -> Score:
