@@ -17,7 +17,7 @@ from motorid.diagnosis.held import HeldOut
 from motorid.diagnosis.judgement import judgement, predicted
 from motorid.diagnosis.judging import Judge, Node
 from motorid.diagnosis.rank import Score
-from motorid.diagnosis.verdict import _noise_feedback, closed_loop_remark
+from motorid.diagnosis.verdict import _noise_feedback, closed_loop_remark, outliers_remark
 from motorid.effects import LIBRARY
 from motorid.experiment import Experiment
 
@@ -111,15 +111,20 @@ def test_spikes_are_no_misfit_but_a_few_samples_in_a_row_are(rng):
     assert np.array_equal(despiked(r), r)
 
 
-def test_outliers_that_make_the_error_are_said(lab, rng):
+def test_outliers_are_left_out_and_what_is_not_is_said(lab, rng):
     runs = []
     for run in runs_of(lab, {"coulomb": {"tau_c": 8e-3}}):
         i = run.outputs["i"].copy()
         i[rng.choice(run.n, 12, replace=False)] += 60.0
         runs.append(run.with_(outputs={**run.outputs, "i": i}))
-    found = mi.diagnose(mi.fit(mi.dc_motor(), runs[:2]), runs[2:], effects=("coulomb", "constant_load"))
-    assert "24 samples of i that stand alone make" in found.text
-    assert "--loss huber" in found.text
+    fit = mi.fit(mi.dc_motor(), runs[:2])
+    assert "24 samples of i that stand alone make" in outliers_remark(fit)
+    assert "--loss huber" in outliers_remark(fit)
+    assert outliers_remark(mi.fit(mi.dc_motor(), runs[:2], loss=mi.Huber())) == ""  # it is used already
+    found = mi.diagnose(fit, runs[2:], effects=("coulomb", "constant_load"))
+    assert found.effects == ("coulomb",)
+    assert "single samples stand far from both neighbours" in found.text
+    assert "--no-spikes" in found.text
 
 
 def test_an_angle_that_follows_a_smooth_drive_is_no_closed_loop(lab, plant):

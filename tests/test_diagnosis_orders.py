@@ -8,7 +8,7 @@ from battery.excite import driven, record
 
 import motorid as mi
 from motorid.diagnosis import orders
-from motorid.diagnosis.response import Response, responses
+from motorid.diagnosis.response import Response
 from motorid.diagnosis.tangent import Tangent
 from motorid.diagnosis.whitening import ORDER, Whitening
 from motorid.effects import LIBRARY
