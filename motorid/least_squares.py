@@ -46,8 +46,6 @@ class LevenbergMarquardt:
         Largest change of one coordinate per iteration: e² on the logarithmic scale.
     looks : int
         How often a doubtful end is looked at again from the start; see `motorid.descent`.
-    within : float
-        Give up, after two steps, where even the undamped step promises a higher cost than this.
     """
 
     max_iterations: int = 200
@@ -56,7 +54,6 @@ class LevenbergMarquardt:
     damping: float = 0.1
     longest_step: float = 2.0
     looks: int = 5
-    within: float = np.inf
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +81,6 @@ MESSAGES = {
               "whether parameters cannot be told apart",
     "stalled": "stalled: no step lowers the cost; the model may be too stiff here. Try another start or "
                "engine",
-    "hopeless": "given up: no step promises a cost as low as asked for",
     "limit": "stopped after {} iterations; raise max_iterations or look at identifiability()",
 }
 VALLEY = (30, 3e5)  # so many iterations that lower the cost by less than this, times ftol, are enough
@@ -136,7 +132,7 @@ def levenberg_marquardt(
         if status or _crawls(history, o.ftol):
             break
     reason = status or ("valley" if _crawls(history, o.ftol) else "limit")
-    ends = {"valley": "stalled", "stalled": "stalled", "limit": "limit", "hopeless": "limit"}
+    ends = {"valley": "stalled", "stalled": "stalled", "limit": "limit"}
     return Solution(search.q, search.r, search.jac, ends.get(reason, "converged"),
                     MESSAGES[reason].format(o.max_iterations), tuple(history), search.evaluations)
 
@@ -155,7 +151,7 @@ class _Search:
         self.low, self.high = bounds if bounds is not None else (np.full(n, -np.inf), np.full(n, np.inf))
         self.log = np.zeros(n, bool) if log is None else np.asarray(log, bool)
         self.q = np.clip(q0, self.low, self.high)
-        self.lam, self.growth, self.evaluations, self.steps = options.damping, 2.0, 0, 0
+        self.lam, self.growth, self.evaluations = options.damping, 2.0, 0
         self.size = np.zeros(n)
         try:
             self._move(self.q)
@@ -181,11 +177,7 @@ class _Search:
         weight = np.where(self.log, misfit, np.minimum(size, misfit))[free]
         triangle, rotated = _reduce(self.jac[:, free], self.r)
         # The undamped step promises ½‖Qᵀr‖²: while that is much, a place without a better one is no minimum.
-        promised = 0.5 * float(rotated @ rotated)
-        end = "step" if promised <= PROMISED * self.cost else "stalled"
-        self.steps += 1
-        if self.steps > 2 and self.cost - promised > o.within:
-            return "hopeless"
+        end = "step" if 0.5 * float(rotated @ rotated) <= PROMISED * self.cost else "stalled"
         while True:
             step = np.zeros(len(self.q))
             step[free] = _inside(triangle, rotated, weight, self.lam, (self.low - self.q)[free],

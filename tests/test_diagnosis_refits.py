@@ -8,6 +8,7 @@ from battery.excite import driven, record
 
 import motorid as mi
 from motorid.diagnosis import held, parts, tournament, trial
+from motorid.diagnosis import rank as ranking
 from motorid.diagnosis.objections import objections
 from motorid.diagnosis.revival import let_go, revived
 from motorid.diagnosis.verdict import measured_angle_remark
@@ -128,6 +129,107 @@ def test_refits_that_cannot_win_are_given_up(lab):
     assert "does no more than coulomb" in why["stribeck"].reason
     assert why["speed_lag"].reason == "far behind the best, which leaves only noise"
     assert why["stribeck"].refit_drop > 0.9 > 0.5 > why["speed_lag"].refit_drop
+
+
+def test_beside_an_effect_that_leaves_noise_what_promises_little_is_not_even_begun(lab, monkeypatch):
+    """The favourite is finished first; what contains it is judged by one step from there."""
+    rng = np.random.default_rng(8)
+    moves = driven(lab, {"coulomb": {"tau_c": 8e-3}}, "stairs", 800, 1e-3, rng)
+    fit = mi.fit(mi.dc_motor(), record(moves, "logger", ("i", "omega"), lab, rng, "run"))
+    promises = {"coulomb_asymmetric": 0.97, "coulomb": 0.95, "speed_lag": 0.01, "brush_drop": 0.6}
+    tasks = [tournament.Task(fit, fit.model + LIBRARY[n], LIBRARY[n], ({},), p) for n, p in promises.items()]
+    begun, race = [], tournament.raced
+
+    def seen(fit, model, *starts):
+        begun.append(model.effect_names)
+        return race(fit, model, *starts)
+
+    monkeypatch.setattr(tournament, "raced", seen)
+    asymmetric, coulomb, lag, drop = tournament.refits(tasks, map)
+    assert begun == [("coulomb",), ("brush_drop",)]
+    assert isinstance(coulomb, mi.Fit)
+    assert asymmetric.why == "does no more than coulomb, which it contains"
+    assert (lag.drop, lag.why) == (0.01, drop.why) == (0.01, tournament.FAR_BEHIND)
+
+
+def test_what_contains_the_favourite_is_tried_where_one_step_promises_more():
+    names = [p.name for p in LIBRARY["coulomb_asymmetric"].parameters]
+    values = dict(zip(names, (8e-3, 7.2e-3), strict=True))
+    run = _run((mi.dc_motor() + LIBRARY["coulomb_asymmetric"]).replace(**TRUE, **values), seed=9)
+    fit = mi.fit(mi.dc_motor(), run)
+    pair = ("coulomb_asymmetric", "coulomb")
+    tasks = [tournament.Task(fit, fit.model + LIBRARY[n], LIBRARY[n], ({},), 0.9) for n in pair]
+    wider, _ = tournament.refits(tasks, map)
+    assert isinstance(wider, mi.Fit)
+    assert wider.values[names[1]] == pytest.approx(7.2e-3, rel=0.02)
+
+
+def test_what_added_nothing_to_a_smaller_model_is_not_looked_at_again(lab, monkeypatch):
+    """What a smaller model's ranking knows spares the look, and never hides an effect that is there."""
+    rng = np.random.default_rng(3)
+    hidden = {"coulomb": {"tau_c": 8e-3}, "quadratic_drag": {"c_2": 6e-8}}
+    moves = {words: driven(lab, hidden, words, 900, 1e-3, rng) for words in ("stairs", "steps")}
+    runs = [record(m, "logger", ("i", "omega"), lab, rng, words) for words, m in moves.items()]
+    plain, larger = mi.fit(mi.dc_motor(), runs), mi.fit(mi.dc_motor() + mi.effects.coulomb, runs)
+    known = ranking.rank(plain, list(LIBRARY.values()))
+    fresh = [e for e in LIBRARY.values() if e.name not in ("coulomb", "coulomb_asymmetric", "stribeck", "lugre")]
+    exact = {s.effect.name: s for s in ranking.rank(larger, fresh)}
+    looked, score = [], ranking.score
+    monkeypatch.setattr(ranking, "score", lambda tangent, effect: looked.append(effect.name) or score(tangent, effect))
+    quick = {s.effect.name: s for s in ranking.rank(larger, fresh, known)}
+    assert "quadratic_drag" in looked
+    assert len(looked) < len(fresh)
+    chi2 = larger.chi2
+    for name, s in quick.items():
+        assert s.drop == exact[name].drop if name in looked else s.drop * chi2 < ranking.NOTHING, name
+        assert name in looked or exact[name].drop * chi2 < 3 * ranking.NOTHING, name
+
+
+@pytest.mark.slow
+def test_two_effects_that_only_together_help_are_tried_together(plant):
+    """Cogging alone slips against the measured angle as long as the ripple is missing, and the other way round."""
+    motor = plant.Motor("traction", R=0.08, L=2e-4, K=0.14, b=0.03, J=6e-3, v_max=12.0, i_max=150.0)
+    hidden = {"cogging": {"A": 0.5, "N": 12, "phi": 0.2}, "torque_ripple": {"a_r": 0.2, "N_r": 5, "phi_r": 1.0}}
+    rng, runs = np.random.default_rng(4), []
+    for k, levels in enumerate(([0, 3, 6, 9, 4, 7, 2], [0, -2, 4, -1, 5.5, 2, -2], [0, 6, -9, 3, 7, -4, 1])):
+        v = np.repeat(np.array(levels, float), 400)
+        r = plant.simulate(motor, hidden, 1e-3 * np.arange(v.size), v, substep=None)
+        runs.append(record(r, "logger", ("i", "omega", "theta"), motor, rng, f"run{k}"))
+    tried = ("cogging", "torque_ripple", "coulomb", "gravity")
+    found = mi.diagnose(mi.fit(mi.dc_motor(), runs[:2]), runs[2:], effects=tried)
+    assert set(found.effects) == {"cogging", "torque_ripple"}
+    assert found.ladder.best.values["A"] == pytest.approx(0.5, rel=0.02)
+    marked = {c.effect: c.reason for c in found.ranking if c.accepted}
+    if len(found.ladder.rungs) == 2:  # at once
+        assert set(marked) == {"cogging", "torque_ripple"}
+        assert all("together with" in why for why in marked.values())
+
+
+def limited(limit, seed, volts, n=1500, dt=1e-3):
+    """A motor whose driver holds the current below `limit`, by an integrator of its own."""
+    R, L, K, b, J, fine = 0.4, 1e-3, 0.08, 1e-4, 2e-3, 50
+    i = w = 0.0
+    rows, h = [], dt / fine
+    for v in np.repeat(volts, n // len(volts)):
+        rows.append((i, w))
+        for _ in range(fine):
+            e = v - R * i - K * w
+            e = min(e, 0.0) if i >= limit else max(e, 0.0) if i <= -limit else e
+            i, w = i + h * e / L, w + h * (K * i - b * w) / J
+    y, rng = np.array(rows), np.random.default_rng(seed)
+    noisy = {"i": y[:, 0] + 0.05 * rng.normal(size=len(y)), "omega": y[:, 1] + 0.1 * rng.normal(size=len(y))}
+    return mi.Experiment(dt * np.arange(len(y)), {"v": np.repeat(volts, n // len(volts))}, noisy, name=f"run{seed}")
+
+
+def test_a_driver_that_limits_the_current_is_no_effect_of_the_motor():
+    drives = ([0, 20, 8, -16, 4], [0, 12, 24, -6, 10], [0, -18, 6, 22, 2])
+    runs = [limited(25.0, k, volts) for k, volts in enumerate(drives)]
+    tried = ("magnetic_saturation", "winding_heating", "coulomb", "brush_drop")
+    found = mi.diagnose(mi.fit(mi.dc_motor(), runs[:2]), runs[2:], effects=tried)
+    assert (found.verdict, found.effects) == ("unexplained", ())
+    assert "a current limit of the driver?" in found.text
+    free = [limited(1e9, k, volts) for k, volts in enumerate(drives[:2])]
+    assert "current limit" not in mi.diagnose(mi.fit(mi.dc_motor(), free), effects=tried).text
 
 
 @pytest.mark.parametrize("left", [[], [0]])

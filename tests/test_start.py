@@ -77,3 +77,30 @@ def test_arm_is_fitted_from_the_angle_alone():
     fit = mi.fit(arm(mi.effects.coulomb).fix(R=TRUTH["R"], K=TRUTH["K"], L=TRUTH["L"]), run)
     assert fit.values["mgl"] == pytest.approx(0.12, rel=0.02)
     assert fit.values["tau_c"] == pytest.approx(0.01, rel=0.05)
+
+
+GEARED = {"R": 2.1, "L": 1.6e-3, "K": 0.045, "b": 4e-5, "J": 2e-5}
+
+
+def test_bristles_begin_where_coulomb_friction_leads():
+    """The first guess takes such friction for viscous, far from where bristles could be told."""
+    truth = {**GEARED, "tau_c": 0.05, "s_b": 1.5, "omega_s": 8.0, "theta_s": 0.08}
+    v = 2.2 * np.sin(2 * np.pi * 0.8 * T) + 1.2 * np.sign(np.sin(2 * np.pi * 1.7 * T))
+    model = mi.dc_motor() + mi.effects.lugre
+    run = record(model.replace(**truth), "i theta", v)
+    guess = first_guess(model, [run])
+    assert guess["b"] > 10 * truth["b"]  # the bait
+    found = mi.fit(model, run)
+    for name in ("R", "K", "J", "tau_c", "s_b"):
+        assert found.values[name] == pytest.approx(truth[name], rel=0.05), name
+
+
+def test_cogging_begins_along_the_integral_of_the_speed():
+    truth = {"R": 0.6, "L": 9e-4, "K": 0.032, "b": 2e-4, "J": 1.2e-4, "A": 0.025, "N": 5.0, "phi": 0.5}
+    v = np.where(T < 0.1, 0.0, 2.0 + 1.5 * np.sign(np.sin(2 * np.pi * 0.7 * T)) + 2.0 * np.sin(2 * np.pi * 0.3 * T))
+    model = mi.dc_motor() + mi.effects.cogging
+    run = record(model.replace(**truth), "i omega", v)
+    found = mi.fit(model, run)
+    assert found.values["N"] == 5
+    assert found.values["A"] == pytest.approx(0.025, rel=0.03)
+    assert found.cost < 1.5 * mi.fit(model.replace(**truth), run).cost

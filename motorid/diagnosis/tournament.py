@@ -67,15 +67,15 @@ def refits(tasks: Sequence[Task], map_: Callable[..., Iterable[Any]]) -> list[Fi
     """
     found: dict[int, Fit | GivenUp | None] = {}
     races: dict[int, Raced] = {}
-    leader, reach = _favourite(tasks), np.inf
-    if leader is not None and (race := _race((tasks[leader], reach))) is not None:
+    leader, alone = _favourite(tasks), False
+    if leader is not None and (race := _race((tasks[leader], alone))) is not None:
         races[leader], found[leader] = race, _finish((tasks[leader], race))
         if (best := _quiet(found[leader])) is not None:
             found |= _needless(tasks, leader, best, race, map_)
-            reach = BEHIND * race.cost
+            alone = True
             found |= _unpromising(tasks, leader)
     entered = [k for k in range(len(tasks)) if k not in races and k not in found]
-    done = map_(_race, [(tasks[k], reach) for k in entered])
+    done = map_(_race, [(tasks[k], alone) for k in entered])
     races |= {k: race for k, race in zip(entered, done, strict=True) if race is not None}
     if races:
         first = min(races, key=lambda k: races[k].cost + tasks[k].price)
@@ -144,11 +144,10 @@ def _beaten(tasks: Sequence[Task], costs: Mapping[int, float], first: int) -> di
     return given_up
 
 
-def _race(entry: tuple[Task, float]) -> Raced | None:
-    """Race a task; where only those `within` reach of a winner matter, its best start alone."""
-    task, within = entry
-    starts = task.starts if np.isinf(within) else task.starts[:1]
-    return raced(task.fit, task.model, starts, within)
+def _race(entry: tuple[Task, bool]) -> Raced | None:
+    """Race a task; its best start alone, where only what comes near a winner matters."""
+    task, alone = entry
+    return raced(task.fit, task.model, task.starts[:1] if alone else task.starts)
 
 
 def _finish(begun: tuple[Task, Raced]) -> Fit | None:

@@ -41,11 +41,10 @@ class Raced:
     angular: bool
 
 
-def raced(fit: Fit, model: Model, starts: Sequence[Mapping[str, float]], within: float = np.inf) -> Raced | None:
+def raced(fit: Fit, model: Model, starts: Sequence[Mapping[str, float]]) -> Raced | None:
     """Go a few steps from each start with `model` on the records of `fit`; None if none can be simulated.
 
-    A start from which no cost `within` reach is promised is given up earlier. Effects of the angle start along the
-    measured angle, which the model's own angle, still wrong, would lead astray.
+    Effects of the angle start along the measured angle, which the model's own angle, still wrong, would lead astray.
     """
     model = _bounded(fit, model)
     alive = revived(fit, model)
@@ -54,7 +53,7 @@ def raced(fit: Fit, model: Model, starts: Sequence[Mapping[str, float]], within:
     for start in (*(starts or ({},)), *_own_starts(fit, model)):
         # As it is where a parameter put back (an inductance that no sample shows) makes the model too stiff.
         for each in (alive,) if alive is model else (alive, model):
-            done = _race(_started(fit, each, start, angular), replace(RACE, within=within))
+            done = _race(_started(fit, each, start, angular))
             if done is not None:
                 problem, cost = restarted(done.problem, done.solution.q), float(done.solution.history[-1])
                 found.append(Raced(problem, cost, angular))
@@ -139,10 +138,10 @@ def _started(fit: Fit, model: Model, start: Mapping[str, float], angular: bool) 
     return problem.for_model(replace(problem.model, angle_input=True, _systems={})) if angular else problem
 
 
-def _race(problem: Problem, options: LevenbergMarquardt) -> Descent | None:
+def _race(problem: Problem) -> Descent | None:
     """Go a few steps; None where that fails or needs more sub-steps than the samples are worth."""
     try:
-        done = descend(problem, options, stages=False)
+        done = descend(problem, RACE, stages=False)
     except FAILURES:
         return None
     return done if worth_its_steps(done.problem) else None
