@@ -17,6 +17,7 @@ from motorid.diagnosis.search import library
 from motorid.diagnosis.suggest import suggest_experiment
 from motorid.diagnosis.verdict import (
     adequate_text,
+    averaging_remark,
     balance_of,
     closed_loop_remark,
     inseparable_remark,
@@ -94,7 +95,7 @@ def diagnose(
         groups = (*groups, *(_sharing(ladder.best, name, parameters) for name, parameters in same.items()))
         suggestion = _suggestion(found)
     last = ladder.best
-    of_last = (measured_angle_remark(last), outliers_remark(last))
+    of_last = (measured_angle_remark(last), averaging_remark(last), outliers_remark(last))
     limits = (f"In {run.name} {limit}" for run in fit.problem.experiments if (limit := current_limit(run)))
     remarks = (driven, next(limits, ""), parts_remark(fit), *of_last, closed_loop_remark(fit), suggestion)
     text = " ".join(t for t in (text, *remarks) if t)

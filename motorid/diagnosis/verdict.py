@@ -10,7 +10,7 @@ from motorid.diagnosis.evidence import astray, despiked
 from motorid.diagnosis.results import Adequacy, Candidate, Missing, Rung
 from motorid.effects import LIBRARY
 from motorid.fit import Fit
-from motorid.formatting import percent, with_error
+from motorid.formatting import number, percent, with_error
 from motorid.model import Effect
 from motorid.uncertainty import deviations
 
@@ -32,7 +32,8 @@ def unexplained_text(judged: Adequacy, missing: Missing, ranking: Sequence[Candi
     best = max(tried, key=lambda c: c.refit_drop or 0.0, default=None)
     near = ""
     if best is not None and (best.refit_drop or 0) > 0.05:
-        why = "only stands in for it" if missing.acts_like else best.reason or "leaves the rest as it is"
+        why = best.reason if best.reason and not best.reason.startswith("lowers") else "leaves the rest as it is"
+        why = "only stands in for it" if missing.acts_like else why
         taken = percent(best.refit_drop, 2)
         near = f" The nearest, '{best.effect}', takes away {taken} of the squared misfit, but {why}."
     return f"{judged.text} {missing.text} None of the library's effects explains it.{near}"
@@ -110,6 +111,22 @@ def measured_angle_remark(fit: Fit) -> str:
     return (
         "What repeats over a turn follows the measured angle here, in the held-out error too, since the model's own "
         "angle drifts by too much; without a measured angle this model predicts nothing."
+    )
+
+
+def averaging_remark(fit: Fit) -> str:
+    """Say so where a delay and a lag of the speed are what an average over some samples makes of it.
+
+    A mean over W is late by W/2 and has a variance of W²/12; so have a delay of 0.21 W and a lag of 0.29 W.
+    """
+    v = fit.values
+    if not {"T_d", "T_w"} <= set(v) or not 0.3 < v["T_d"] / max(v["T_w"], 1e-300) < 2.0:
+        return ""
+    window = 2 * (v["T_d"] + v["T_w"])
+    samples = window / fit.problem.experiments[0].dt
+    return (
+        f"Delay and lag together are what a mean over {number(1e3 * window, 2)} ms (about {number(samples, 2)} "
+        "samples) does: a speed counted or averaged so?"
     )
 
 
