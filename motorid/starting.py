@@ -66,7 +66,17 @@ def _along_measured_angle(problem: Problem, asked: Model) -> Problem:
     except FitError:
         return problem
     found = problem.for_model(problem.model.start_at(without_width(done.problem, done.solution.q)))
-    return min(found, problem, key=_cost_of)
+    if all("theta" in r.outputs for r in problem.experiments):
+        return min(found, problem, key=_cost_of)
+    return min(found, problem, key=_end_of)  # an integral drifts: where either leads decides
+
+
+def _end_of(problem: Problem) -> float:
+    """Return the cost to which a descent from here leads."""
+    try:
+        return descend(problem, THOROUGH).history[-1]
+    except FitError:
+        return np.inf
 
 
 def _from_simpler(problem: Problem, asked: Model) -> Problem:

@@ -17,7 +17,6 @@ from motorid.descent import descend
 from motorid.diagnosis.evidence import Errors, compare_errors
 from motorid.diagnosis.held import ROUGH, train_errors
 from motorid.diagnosis.judging import worth_it
-from motorid.diagnosis.revival import revived
 from motorid.diagnosis.trial import FAILURES, RACE
 from motorid.experiment import Experiment
 from motorid.fit import Fit, solve
@@ -51,8 +50,7 @@ class Reading:
     def problem(self, fit: Fit) -> Problem:
         """Return the problem of the same model on records read so."""
         runs = tuple(self.of(r) for r in fit.problem.experiments)
-        model = revived(fit, fit.model)  # an inductance that a wrong reading had emptied
-        return fit.problem.with_(experiments=runs, model=model, balance={})
+        return fit.problem.with_(experiments=runs, model=fit.model, balance={})
 
     def fitted(self, fit: Fit) -> Fit:
         """Return the fit of the same model to records read so.
