@@ -217,6 +217,14 @@ def test_the_missing_torque_is_the_friction_that_was_hidden(rubbing, lab):
     assert "depends on the speed" in missing.text
 
 
+def test_a_missing_torque_is_no_missing_voltage_beside_a_precise_angle(lab):
+    """Were the model's own steps to hold only roughly, the angle would need no torque and the current a voltage."""
+    runs = runs_of(lab, {"cogging": {"A": 8e-3, "N": 16, "phi": 0.7}}, ("stairs 0.5", "steps 0.6"), ("i", "theta"))
+    missing = mi.locate(mi.fit(mi.dc_motor(), runs))
+    assert missing.where == "mechanical"
+    assert missing.shares["mechanical"] > 0.8
+
+
 def test_the_missing_voltage_is_the_drop_that_was_hidden(plant):
     micro = plant.MOTORS["micro"]
     runs = runs_of(micro, {"brush_drop": {"V_b": 0.5, "i_b": 0.01}}, ("stairs", "ramps"))
