@@ -155,7 +155,7 @@ def test_beside_an_effect_that_leaves_noise_what_promises_little_is_not_even_beg
 
 def test_what_contains_the_favourite_is_tried_where_one_step_promises_more():
     names = [p.name for p in LIBRARY["coulomb_asymmetric"].parameters]
-    values = dict(zip(names, (8e-3, 7.85e-3), strict=True))
+    values = dict(zip(names, (8e-3, 7.7e-3), strict=True))
     run = _run((mi.dc_motor() + LIBRARY["coulomb_asymmetric"]).replace(**TRUE, **values), seed=9)
     fit = mi.fit(mi.dc_motor(), run)
     assert not tournament.far(mi.fit(mi.dc_motor() + LIBRARY["coulomb"], run))  # so it is quiet
@@ -163,7 +163,7 @@ def test_what_contains_the_favourite_is_tried_where_one_step_promises_more():
     tasks = [tournament.Task(fit, fit.model + LIBRARY[n], LIBRARY[n], ({},), 0.9) for n in pair]
     wider, _ = tournament.refits(tasks, map)
     assert isinstance(wider, mi.Fit)
-    assert wider.values[names[1]] == pytest.approx(7.85e-3, rel=0.01)
+    assert wider.values[names[1]] == pytest.approx(7.7e-3, rel=0.02)
 
 
 def test_what_added_nothing_to_a_smaller_model_is_not_looked_at_again(lab, monkeypatch):
