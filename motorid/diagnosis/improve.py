@@ -148,7 +148,8 @@ def explored(
     if reading := _late_reading(found.path):
         again = records.read(reading)
         anew, other_anew = climbed(again)
-        if compare_errors(last.train, anew.path[-1].train).fall > 0:
+        new = anew.path[-1]
+        if min(compare_errors(last.train, new.train).fall, compare_errors(last.held, new.held).fall) > 0:
             records, found, other = again, anew, other_anew
     return found, other, " ".join(records.remarks)
 
