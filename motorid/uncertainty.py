@@ -238,4 +238,4 @@ def deviations(fit: Fit) -> dict[str, float | None]:
     if fit.problem.constraints or not fit.problem.unknown:
         return dict(fit.std)
     found = covariance(fit).std
-    return {n: found.get(n, std) for n, std in fit.std.items()}
+    return {n: None if std is None else found.get(n, std) for n, std in fit.std.items()}

@@ -64,7 +64,7 @@ def _described(fit: Fit, name: str) -> str:
 
 
 def _valued(fit: Fit, effect: Effect) -> list[str]:
-    found, std = [], deviations(fit)
+    found, std = [], _certain(fit)
     for p in effect.parameters:
         unit = fit.problem.model.parameters[p.name].unit
         text = f"{p.name} = {with_error(fit.values[p.name], std.get(p.name), unit)}"
@@ -72,6 +72,13 @@ def _valued(fit: Fit, effect: Effect) -> list[str]:
             text += ", the ratio of rpm to rad/s: the speed is probably in rpm"
         found.append(text)
     return found
+
+
+def _certain(fit: Fit) -> dict[str, float | None]:
+    """Return one standard deviation per parameter; None for a size that is not known even to itself."""
+    sizes = {n for n, p in fit.model.parameters.items() if p.positive or p.null == 0}
+    std = deviations(fit)
+    return {n: None if n in sizes and s is not None and s > abs(fit.values[n]) else s for n, s in std.items()}
 
 
 def _errors(before: Rung, after: Rung, validated: bool) -> str:
@@ -95,7 +102,7 @@ def moves(before: Fit, after: Fit) -> str:
     moved = [n for n in base if abs(after.values[n] / max(before.values[n], 1e-300) - 1) > MOVED]
     if not moved:
         return ""
-    was, is_ = deviations(before), deviations(after)
+    was, is_ = _certain(before), _certain(after)
     said = [
         f"{n} from {with_error(before.values[n], was[n])} to "
         f"{with_error(after.values[n], is_[n], after.problem.model.parameters[n].unit)}"
