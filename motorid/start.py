@@ -134,7 +134,7 @@ def _solve(rows: list[tuple[Array, Array]], names: Sequence[str | Load],
     if np.all(lowest == 0):
         z, _ = nnls(triangle[:, :-1], triangle[:, -1])
     else:
-        z = np.asarray(lsq_linear(triangle[:, :-1], triangle[:, -1], (lowest, np.inf)).x)
+        z = np.asarray(lsq_linear(triangle[:, :-1], triangle[:, -1], (lowest, np.inf), method="bvls").x)
     # A coefficient that comes out as zero starts where its term would carry a thousandth of the right-hand side.
     motor = np.array([isinstance(n, str) for n in free])
     z = np.where(motor, np.maximum(z, FLOOR * np.linalg.norm(b)), z) / norms

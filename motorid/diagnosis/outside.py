@@ -158,42 +158,50 @@ def _against(form: Form, train: Linear, was: Linear, gained: Array, channels: Se
 
 
 def _in_earnest(steps: Sequence[Fit], held: HeldOut, channels: Sequence[int]) -> Outside | None:
-    """Fit the form that promises most in place of all effects, where errors are too large to be linear."""
+    """Fit the form that promises most in place of all effects, where errors are too large to be linear.
+
+    Beside the first effect, if it leaves far less there.
+    """
     last = steps[-1]
     over_noise = misfit_over_noise(last.problem, last.q)
     names = [last.problem.outputs[c] for c in channels]
     if max(last.nrmse[c] for c in names) < ROUGH and max(over_noise[c] for c in names) < FAR_OFF:
         return None
     try:
-        found = _nearest(steps, held, channels)
-        if found is None:
+        tried = [_nearest(steps, kept, held, channels) for kept in range(min(len(steps), 2))]
+        found = [(kept, *pair) for kept, pair in enumerate(tried) if pair is not None]
+        if not found:
             return None
-        form, fit = found
+        kept, form, fit = found[0]
+        if found[-1][2].chi2 < MUCH_LESS * fit.chi2:
+            kept, form, fit = found[-1]
         leaves = compare_errors(train_errors(last), train_errors(fit), held.noise)
         judged = compare_errors(held.block_errors(last), held.block_errors(fit), held.noise)
     except FAILURES:
         return None
     fraction = (1 - min(leaves.fall, judged.fall)) ** 2
-    return Outside(form, 0, fraction) if fraction < MUCH_LESS else None
+    return Outside(form, kept, fraction) if fraction < MUCH_LESS else None
 
 
-def _nearest(steps: Sequence[Fit], held: HeldOut, channels: Sequence[int]) -> tuple[Form, Fit] | None:
-    """Return the form that explains most, and its fit: the one that slopes tell, or the best of all where they cannot.
+def _nearest(steps: Sequence[Fit], kept: int, held: HeldOut, channels: Sequence[int]) -> tuple[Form, Fit] | None:
+    """Return the form that explains most beside the first `kept` effects, and its fit.
 
-    A few steps from a fit that is lost do not tell either; the best few are finished.
+    It is the one that slopes tell, or the best of all where they cannot, nor a few steps: the best few are finished.
     """
-    root, last = steps[0], steps[-1]
-    values = {n: last.values.get(n, v) for n, v in root.values.items()}  # an effect of the first may be gone
-    if lost(root):
+    base, last = steps[kept], steps[-1]
+    values = {n: last.values.get(n, v) for n, v in base.values.items()}  # an effect of the first may be gone
+    if lost(steps[0]):
         forms = list(FORMS)
     else:
-        forms = [r.form for r in sorted(_rivals(steps, 0, held, channels), key=lambda r: r.leaves)]
+        forms = [
+            r.form for r in sorted(_rivals(steps, min(kept, len(steps) - 2), held, channels), key=lambda r: r.leaves)
+        ]
     made = [(form, e) for form in forms if (e := as_effect(form, last)) is not None]
     races: list[tuple[Form, Raced]] = []
-    for form, effect in made if lost(root) else made[:1]:
-        race = raced(root, root.model.start_at(values) + effect, ({},))
+    for form, effect in made if lost(steps[0]) else made[:1]:
+        race = raced(base, base.model.start_at(values) + effect, ({},))
         races += [(form, race)] if race is not None else []
-    fits = [(form, finished(root, race)) for form, race in sorted(races, key=lambda found: found[1].cost)[:FINISHED]]
+    fits = [(form, finished(base, race)) for form, race in sorted(races, key=lambda found: found[1].cost)[:FINISHED]]
     return min(((form, fit) for form, fit in fits if fit is not None), key=lambda found: found[1].chi2, default=None)
 
 
