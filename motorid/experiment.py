@@ -155,10 +155,7 @@ class Experiment(Shown):
         return coarse.with_(inputs={c: _held_mean(self.t, a, int(k)) for c, a in self.inputs.items()})
 
     def running_median(self, samples: int) -> Experiment:
-        """Return the run with its voltage replaced by the running median over an odd number of samples.
-
-        For a voltage measured with noise that the motor never saw. Steps stay; what changes in the window is lost.
-        """
+        """Return the run with its voltage, noisy as it was measured, replaced by the median over `samples` (odd)."""
         return repairs.running_median(self, samples)
 
     def levelled(self) -> Experiment:

@@ -82,17 +82,16 @@ def test_arm_is_fitted_from_the_angle_alone():
 GEARED = {"R": 2.1, "L": 1.6e-3, "K": 0.045, "b": 4e-5, "J": 2e-5}
 
 
-def test_bristles_begin_where_coulomb_friction_leads():
-    """The first guess takes such friction for viscous, far from where bristles could be told."""
+@pytest.mark.parametrize("seed", [0, 1])
+def test_bristles_begin_where_coulomb_friction_leads(seed):
+    """From the first guess of such a gear alone, bristles end at some hundred times the cost."""
     truth = {**GEARED, "tau_c": 0.05, "s_b": 1.5, "omega_s": 8.0, "theta_s": 0.08}
-    v = 2.2 * np.sin(2 * np.pi * 0.8 * T) + 1.2 * np.sign(np.sin(2 * np.pi * 1.7 * T))
+    v = np.repeat([0.0, 3.0, -3.2, 4.0, -2.8, 3.5, -4.0, 3.0, 0.0, -3.0], len(T) // 10)
     model = mi.dc_motor() + mi.effects.lugre
-    run = record(model.replace(**truth), "i theta", v)
-    guess = first_guess(model, [run])
-    assert guess["b"] > 10 * truth["b"]  # the bait
+    run = record(model.replace(**truth), "i theta", v, seed)
     found = mi.fit(model, run)
-    for name in ("R", "K", "J", "tau_c", "s_b"):
-        assert found.values[name] == pytest.approx(truth[name], rel=0.05), name
+    assert found.cost < 20 * mi.fit(model.replace(**truth), run).cost
+    assert found.values["tau_c"] == pytest.approx(0.05, rel=0.1)
 
 
 def test_cogging_begins_along_the_integral_of_the_speed():
