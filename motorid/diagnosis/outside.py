@@ -173,7 +173,7 @@ def _in_earnest(steps: Sequence[Fit], held: HeldOut, channels: Sequence[int]) ->
         if not found:
             return None
         kept, form, fit = found[0]
-        if found[-1][2].chi2 < MUCH_LESS * fit.chi2:
+        if found[-1][2].chi2 < LITTLE * fit.chi2:
             kept, form, fit = found[-1]
         leaves = compare_errors(train_errors(last), train_errors(fit), held.noise)
         judged = compare_errors(held.block_errors(last), held.block_errors(fit), held.noise)
