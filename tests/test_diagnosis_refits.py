@@ -228,7 +228,7 @@ def limited(limit, seed, volts, n=1500, dt=1e-3):
 def test_a_driver_that_limits_the_current_is_no_effect_of_the_motor(monkeypatch):
     drives = ([0, 20, 8, -16, 4], [0, 12, 24, -6, 10], [0, -18, 6, 22, 2])
     runs = [limited(25.0, k, volts) for k, volts in enumerate(drives)]
-    fit, tried = mi.fit(mi.dc_motor(), runs[:2]), ("magnetic_saturation", "winding_heating", "coulomb", "brush_drop")
+    fit, tried = mi.fit(mi.dc_motor(), runs[:2]), ("magnetic_saturation", "coulomb")
     found = mi.diagnose(fit, runs[2:], effects=tried)
     assert (found.verdict, found.effects) == ("unexplained", ())
     assert "a current limit of the driver?" in found.text
