@@ -23,7 +23,10 @@ def by_library(model, t, v):
     x, rows = np.array(system.initial([0, 0, 0], p)).ravel(), []
     for volts, dt in zip(v, np.diff(t, append=2 * t[-1] - t[-2]), strict=True):
         rows.append(np.array(system.out(x, volts, p)).ravel())
-        rhs = lambda _, x, u=volts: np.array(system.rhs(x, u, p)).ravel()  # noqa: E731
+
+        def rhs(_, x, u=volts):
+            return np.array(system.rhs(x, u, p)).ravel()
+
         x = solve_ivp(rhs, (0, dt), x, method="LSODA", rtol=1e-7, atol=1e-10).y[:, -1]
     return np.array(rows).T
 

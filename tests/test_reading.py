@@ -80,10 +80,12 @@ def test_damaged_binary_formats_give_a_data_error_or_a_run(tmp_path, kind, start
     data = bytearray(good.read_bytes())
     data[start:start + len(junk)] = junk
     path = write(tmp_path, bytes(data), f"bad{kind}")
+    told = str(path)  # that of a run that is long enough needs no check
     try:
         assert read_runs(path)[0].n >= MIN_SAMPLES
     except DataError as error:
-        assert str(path) in str(error)  # noqa: PT017
+        told = str(error)
+    assert str(path) in told
 
 
 def test_a_mat_file_that_would_end_the_process_is_refused(tmp_path):
