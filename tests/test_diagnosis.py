@@ -21,6 +21,8 @@ from motorid.diagnosis.verdict import moves
 from motorid.effects import LIBRARY
 from motorid.errors import FitError, ModelError, UsageError
 from motorid.experiment import Experiment
+from motorid.formatting import with_error
+from motorid.uncertainty import deviations
 
 FEW = ("coulomb", "brush_drop", "constant_load", "quadratic_drag", "speed_lag")
 ANGLE = ("i", "omega", "theta")
@@ -422,3 +424,20 @@ def test_the_next_experiment_keeps_to_the_limits(rivals):
         mi.suggest_experiment(rivals, i_max=1e-3)
     with pytest.raises(UsageError, match="two"):
         mi.suggest_experiment(rivals[:1])
+
+
+# -- one number, said once ---------------------------------------------------------------------------------
+
+
+def test_text_tables_and_fit_give_the_same_errors_and_deviations(lab):
+    """Over runs of unequal length, too; deviations are those of residuals as coloured as they are."""
+    runs = runs_of(lab, {"coulomb": {"tau_c": 8e-3}}, ("stairs", "steps", "prbs"), ("i", "omega"))
+    runs[1] = runs[1].select(slice(0, runs[1].n // 3))
+    found = mi.diagnose(mi.fit(mi.dc_motor(), runs[:2]), runs[2:], effects=("coulomb", "brush_drop"))
+    for rung in found.ladder.rungs:
+        assert rung.nrmse == pytest.approx(dict(rung.fit.nrmse), rel=1e-9)
+        assert rung.validation_nrmse == pytest.approx(dict(mi.evaluate(rung.fit, runs[2:]).nrmse), rel=1e-4)
+    std = deviations(found.before)["b"]
+    assert std is not None
+    assert std > 2 * found.before.std["b"]  # the bait
+    assert f"b from {with_error(found.before.values['b'], std)} to" in found.text
