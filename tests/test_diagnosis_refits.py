@@ -129,7 +129,8 @@ def test_refits_that_cannot_win_are_given_up(lab):
     why = {c.effect: c for c in found.ranking}
     assert "does no more than coulomb" in why["stribeck"].reason
     assert why["speed_lag"].reason == "far behind the best, which leaves only noise"
-    assert why["stribeck"].refit_drop > 0.9 > 0.5 > why["speed_lag"].refit_drop
+    assert why["stribeck"].predicted_drop > 0.9 > 0.5 > why["speed_lag"].predicted_drop
+    assert why["stribeck"].refit_drop is why["speed_lag"].refit_drop is None  # neither was refitted
 
 
 def test_beside_an_effect_that_leaves_noise_what_promises_little_is_not_even_begun(lab, monkeypatch):
@@ -150,7 +151,9 @@ def test_beside_an_effect_that_leaves_noise_what_promises_little_is_not_even_beg
     assert begun == [("coulomb",), ("brush_drop",)]
     assert isinstance(coulomb, mi.Fit)
     assert asymmetric.why == "does no more than coulomb, which it contains"
-    assert (lag.drop, lag.why) == (0.01, drop.why) == (0.01, tournament.FAR_BEHIND)
+    assert lag.why == drop.why == tournament.FAR_BEHIND
+    assert asymmetric.drop is lag.drop is None  # neither was refitted, and no table may say so
+    assert 0 < drop.drop < 1
 
 
 def test_what_contains_the_favourite_is_tried_where_one_step_promises_more():

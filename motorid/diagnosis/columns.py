@@ -56,6 +56,8 @@ class Shape:
     def weighed_like(self, fit: Fit) -> Shape:
         """Return the shape with the channels weighed as in another fit of the same records."""
         new = weights_of(fit.problem)
+        if all(map(np.array_equal, new, self.weights)):
+            return self
         rows = []
         for k, (w, old) in enumerate(zip(new, self.weights, strict=True)):
             y, _, index = fit.problem._weights[k]

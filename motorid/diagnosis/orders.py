@@ -11,19 +11,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from motorid.diagnosis.response import Response, responses
+from motorid.diagnosis.tangent import Tangent
 from motorid.diagnosis.whitening import Whitening, unstacked
 from motorid.fit import Fit
 from motorid.integrate.grid import Array
 from motorid.model import Effect
 from motorid.prepared import angle_signal
-
-if TYPE_CHECKING:
-    from motorid.diagnosis.tangent import Tangent
 
 WIDEST = 4e6  # numbers in the answers to all orders that are looked at together
 HIGHEST = 240

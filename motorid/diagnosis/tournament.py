@@ -49,10 +49,10 @@ class Task:
 
 @dataclass(frozen=True)
 class GivenUp:
-    """A refit that was not finished: share of the squared misfit that it had taken away by then, and why."""
+    """A refit that was not finished: why, and which share of the squared misfit it had taken away, if it was begun."""
 
-    drop: float
     why: str
+    drop: float | None = None
 
 
 def refits(tasks: Sequence[Task], map_: Callable[..., Iterable[Any]]) -> list[Fit | GivenUp | None]:
@@ -71,9 +71,8 @@ def refits(tasks: Sequence[Task], map_: Callable[..., Iterable[Any]]) -> list[Fi
     if leader is not None and (race := _race((tasks[leader], alone))) is not None:
         races[leader], found[leader] = race, _finish((tasks[leader], race))
         if (best := _quiet(found[leader])) is not None:
-            found |= _needless(tasks, leader, best, race, map_)
             alone = True
-            found |= _unpromising(tasks, leader)
+            found |= _unpromising(tasks, leader) | _needless(tasks, leader, best, map_)
     entered = [k for k in range(len(tasks)) if k not in races and k not in found]
     done = map_(_race, [(tasks[k], alone) for k in entered])
     races |= {k: race for k, race in zip(entered, done, strict=True) if race is not None}
@@ -103,12 +102,10 @@ def _quiet(fit: Fit | GivenUp | None) -> Fit | None:
 def _unpromising(tasks: Sequence[Task], leader: int) -> dict[int, GivenUp]:
     """Return the tasks of which far less is promised than of an effect that leaves only noise."""
     promises = {k: task.promise for k, task in enumerate(tasks) if task.promise is not None}
-    return {k: GivenUp(p, FAR_BEHIND) for k, p in promises.items() if p < FAR_LESS * promises[leader]}
+    return {k: GivenUp(FAR_BEHIND) for k, p in promises.items() if p < FAR_LESS * promises[leader]}
 
 
-def _needless(
-    tasks: Sequence[Task], leader: int, best: Fit, race: Raced, map_: Callable[..., Iterable[Any]]
-) -> dict[int, GivenUp]:
+def _needless(tasks: Sequence[Task], leader: int, best: Fit, map_: Callable[..., Iterable[Any]]) -> dict[int, GivenUp]:
     """Return the tasks that contain an effect that leaves only noise, and from there promise too little."""
     winner = tasks[leader]
     wider = {
@@ -119,7 +116,7 @@ def _needless(
     gains = dict(zip(wider, map_(_gain, wider.values()), strict=True))
     why = f"does no more than {winner.effect.name}, which it contains"
     return {
-        k: _given_up(winner, race.cost - gains[k], why)
+        k: GivenUp(why)
         for k, task in wider.items()
         if gains[k]
         < task.price - winner.price + float(np.log(len(task.starts)))  # the search over starts has its price
@@ -128,7 +125,7 @@ def _needless(
 
 def _given_up(task: Task, cost: float, why: str) -> GivenUp:
     before = 0.5 * float(np.sum(task.fit.residuals**2))
-    return GivenUp(1 - cost / max(before, 1e-300), why)
+    return GivenUp(why, 1 - cost / max(before, 1e-300))
 
 
 def _beaten(tasks: Sequence[Task], costs: Mapping[int, float], first: int) -> dict[int, GivenUp]:
