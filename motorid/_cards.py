@@ -204,7 +204,7 @@ def _diagnosis(d: Any) -> Card:
     text += [] if "cannot tell" in d.text else alike
     tables = [ranking_table(d.ranking, 6), ladder_table(d.ladder)] if d.ranking else [ladder_table(d.ladder)]
     if d.after is not d.before:
-        tables.append(parameter_table(d.after, d.before))
+        tables.append(parameter_table(d.after, d.before, d.std_of))
     return Card(
         "Diagnosis",
         (Flag(d.verdict, mood), *([Flag(d.where)] if d.where else [])),

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from motorid._html import Flag, Table
 from motorid.formatting import number, percent, quantity, with_error
+from motorid.tables import Std
 
 NAMES = {"v": "voltage", "i": "current", "omega": "speed", "theta": "angle"}
 UNITS = {"i": "A", "omega": "rad/s", "theta": "rad"}
@@ -28,23 +29,24 @@ def counted(n: int, noun: str) -> str:
     return f"{n} {noun}" + ("" if n == 1 else "s")
 
 
-def parameter_table(fit: Any, before: Any = None) -> Table:
-    """Values with standard deviations; beside them those of another fit."""
-    rows = []
+def parameter_table(fit: Any, before: Any = None, std: Callable[[Any], Std] = lambda fit: fit.std) -> Table:
+    """Values with standard deviations as `std` tells them; beside them those of another fit."""
+    rows, known = [], std(fit)
+    earlier = {} if before is None else std(before)
     for name, p in fit.model.parameters.items():
         if name == "sgn_width":
             continue
-        cell = _value(fit, name)
-        rows.append([name, *([_value(before, name)] if before is not None else []), cell, p.doc])
+        was = [] if before is None else [_value(before, name, earlier)]
+        rows.append([name, *was, _value(fit, name, known), p.doc])
     header = ["parameter", *(["before", "after"] if before is not None else ["value ± std"]), "meaning"]
     return Table(header, rows)
 
 
-def _value(fit: Any, name: str) -> str | Flag:
+def _value(fit: Any, name: str, known: Std) -> str | Flag:
     if name not in fit.values:
         return "–"
     p = fit.model.parameters[name]
-    std = fit.std.get(name, 0.0) if p.vary else 0.0
+    std = known.get(name, 0.0) if p.vary else 0.0
     text = with_error(fit.values[name], std, p.unit)
     return Flag(text, "note") if std is None else text
 

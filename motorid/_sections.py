@@ -23,6 +23,7 @@ from motorid.experiment import Experiment
 from motorid.fit import Fit
 from motorid.formatting import duration, number, percent
 from motorid.simulate import evaluate
+from motorid.uncertainty import deviations
 
 
 @dataclass(frozen=True)
@@ -92,7 +93,8 @@ def fitted(fit: Fit, title: str, *, key: str = "fit", before: Fit | None = None)
     effort = f": {counted(fit.iterations, 'iteration')}, {duration(fit.seconds)}" if fit.seconds else ""
     text = [f"{model_name(fit.model)}{effort}. {_sentence(fit.message)}"]
     figure = _figure(key, caption, alt, plot_fit, fit, before=before)
-    return Section(key, title, text, (), [figure], [parameter_table(fit), error_table([("", fit)], units)])
+    tables = [parameter_table(fit, std=deviations), error_table([("", fit)], units)]
+    return Section(key, title, text, (), [figure], tables)
 
 
 def residuals(fit: Fit) -> Section:
@@ -158,7 +160,7 @@ def parameters(before: Fit, after: Fit) -> Section:
 
     figure = _figure(
         "parameters",
-        "Bars: two standard deviations.",
+        "Bars: two standard deviations, of residuals taken as white.",
         "Parameters before and after",
         plot_parameters,
         before,
@@ -166,7 +168,8 @@ def parameters(before: Fit, after: Fit) -> Section:
         small=True,
     )
     text = ["What the parameters had absorbed of the missing effect, they give back once it is in the model."]
-    return Section("parameters", "How the parameters moved", text, (), [figure], [parameter_table(after, before)])
+    table = parameter_table(after, before, deviations)
+    return Section("parameters", "How the parameters moved", text, (), [figure], [table])
 
 
 def apart(d: Diagnosis) -> Section:

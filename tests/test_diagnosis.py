@@ -441,3 +441,4 @@ def test_text_tables_and_fit_give_the_same_errors_and_deviations(lab):
     assert std is not None
     assert std > 2 * found.before.std["b"]  # the bait
     assert f"b from {with_error(found.before.values['b'], std)} to" in found.text
+    assert with_error(found.before.values["b"], std, "N·m·s/rad") in found._repr_html_()

@@ -55,6 +55,7 @@ def fake_ladder():
 def fake_diagnosis():
     ladder = fake_ladder()
     return SimpleNamespace(
+        std_of=lambda fit: fit.std,
         verdict="missing", text="Coulomb friction is missing.", where="mechanical",
         suggestion="Reverse slowly.",
         groups=(("coulomb", "stribeck"),), ranking=hand_made.candidates(), ladder=ladder,

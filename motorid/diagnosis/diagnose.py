@@ -30,6 +30,7 @@ from motorid.errors import MotoridError
 from motorid.experiment import Experiment
 from motorid.fit import Fit
 from motorid.model import Effect
+from motorid.uncertainty import deviations
 
 
 def diagnose(
@@ -113,6 +114,7 @@ def diagnose(
         fit,
         ladder.best,
         remaining,
+        (deviations(fit), deviations(ladder.best)),
     )
 
 

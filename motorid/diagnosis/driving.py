@@ -100,7 +100,7 @@ def better_reading(fit: Fit, late: bool = False) -> Reading | None:
     chosen, fall = None, PLAIN
     readings = list(_readings(fit.problem.experiments))
     if late and _tells_delays(fit):
-        readings.append(_best_delay(fit))
+        readings += _best_delay(fit)
     for reading in readings:
         try:
             gain = compare_errors(train_errors(fit), train_errors(reading.fitted(fit)))
@@ -116,8 +116,8 @@ def _tells_delays(fit: Fit) -> bool:
     return len({"i", "omega", "theta"} & set(fit.problem.outputs)) > 1 and "i" in fit.problem.outputs
 
 
-def _best_delay(fit: Fit) -> Reading:
-    """Return the delay that lowers the error most after a few steps, tried ever more closely."""
+def _best_delay(fit: Fit) -> list[Reading]:
+    """Return the delay that lowers the error most after a few steps, tried ever more closely; nothing for none."""
     falls = {0.0: 0.0}
     best = 0.0
     for moves in DELAYS:
@@ -125,7 +125,7 @@ def _best_delay(fit: Fit) -> Reading:
             if samples not in falls:
                 falls[samples] = _fall(fit, _delay(fit, samples))
         best = max(falls, key=lambda n: falls[n])
-    return _delay(fit, best)
+    return [_delay(fit, best)] if best else []
 
 
 def _fall(fit: Fit, reading: Reading) -> float:

@@ -9,6 +9,7 @@ from typing import Any
 from motorid.display import Shown
 from motorid.fit import Fit
 from motorid.integrate.grid import Array
+from motorid.tables import Std
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -172,6 +173,8 @@ class Diagnosis(Shown):
     before, after : Fit
     remaining : Adequacy
         Of the model after the last rung.
+    std : pair of dict, or None
+        One standard deviation per parameter of `before` and `after`, the residuals taken as coloured as they are.
     """
 
     verdict: str
@@ -187,6 +190,11 @@ class Diagnosis(Shown):
     before: Fit
     after: Fit
     remaining: Adequacy
+    std: tuple[Std, Std] | None = None
+
+    def std_of(self, fit: Fit) -> Std:
+        """Return the standard deviations of `before` or `after`, as the text gives them."""
+        return fit.std if self.std is None else self.std[fit is self.after]
 
     def to_dict(self) -> dict[str, Any]:
         """Return the contents of ``diagnose --json``."""
