@@ -4,35 +4,38 @@ from typing import TYPE_CHECKING as _TYPE_CHECKING
 
 from motorid import effects
 from motorid.acquire import record
-from motorid.batch import fit_many, motors_in
-from motorid.bootstrap import bootstrap
-from motorid.checks import check_runs
-from motorid.comparison import compare
-from motorid.constraints import Constraint, CurrentLimit, SteadyState
-from motorid.datasets import data_path
-from motorid.derivatives import check_derivatives
-from motorid.diagnosis import diagnose, improve, locate, suggest_experiment
+from motorid.diagnosis.diagnose import diagnose
+from motorid.diagnosis.experiment_design import suggest_experiment
+from motorid.diagnosis.locate import locate
+from motorid.diagnosis.stepwise import improve
 from motorid.errors import DataError, FitError, ModelError, MotoridError, SimulationError, UsageError
-from motorid.experiment import Experiment
-from motorid.explore import explore
-from motorid.export import export, load
-from motorid.fit import Failure, Fit, fit, solve
-from motorid.formulations import compare_formulations
-from motorid.identifiability import identifiability
+from motorid.estimation.comparison import compare
+from motorid.estimation.fit import Failure, Fit, fit, solve
+from motorid.estimation.shooting.formulations import compare_formulations
+from motorid.estimation.shooting.multiple_shooting import MultipleShooting
+from motorid.exporters.export import export, load
 from motorid.integrate import Cvodes, Idas, Rosenbrock
-from motorid.intervals import intervals
-from motorid.least_squares import LevenbergMarquardt
-from motorid.model import Effect, Model, dc_motor, effect, torque_driven
-from motorid.multistart import multistart
-from motorid.parameters import P, Parameter
-from motorid.problem import Huber, Problem
-from motorid.profiling import profile, profiles
-from motorid.reading import read_csv, read_mat, read_runs
-from motorid.remedies import planned
-from motorid.report import report
-from motorid.shooting import MultipleShooting
-from motorid.simulate import evaluate, simulate
-from motorid.uncertainty import covariance
+from motorid.model.definition import P, Parameter
+from motorid.model.model import Effect, Model, dc_motor, effect, torque_driven
+from motorid.numerics.least_squares import LevenbergMarquardt
+from motorid.problem.constraints import Constraint, CurrentLimit, SteadyState
+from motorid.problem.problem import Huber, Problem
+from motorid.problem.sensitivity import check_derivatives
+from motorid.problem.simulate import evaluate, simulate
+from motorid.records.checks import check_runs
+from motorid.records.datasets import data_path
+from motorid.records.experiment import Experiment
+from motorid.records.reading import read_csv, read_mat, read_runs
+from motorid.reports.explorer import explore
+from motorid.reports.report import report
+from motorid.uncertainty.batch import fit_many, motors_in
+from motorid.uncertainty.bootstrap import bootstrap
+from motorid.uncertainty.covariance import covariance
+from motorid.uncertainty.identifiability import identifiability
+from motorid.uncertainty.intervals import intervals
+from motorid.uncertainty.multistart import multistart
+from motorid.uncertainty.profile import profile, profiles
+from motorid.uncertainty.remedies import planned
 
 if _TYPE_CHECKING:
     from motorid.plots import (

@@ -1,6 +1,6 @@
 """``python -m motorid``."""
 
-from motorid.cli import main
+from motorid.cli.app import main
 
 if __name__ == "__main__":
     main()

@@ -9,7 +9,7 @@ from typing import Any
 
 from typer.testing import CliRunner
 
-from motorid.cli import app
+from motorid.cli.app import app
 
 
 @dataclass(frozen=True)

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from motorid import dc_motor, effects, evaluate, fit
-from motorid.datasets import data_path
 from motorid.diagnosis.results import Adequacy, Binned, Candidate, Diagnosis, Ladder, Missing, Rung
-from motorid.reading import read_runs
+from motorid.records.datasets import data_path
+from motorid.records.reading import read_runs
 
 
 def friction():

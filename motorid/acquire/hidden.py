@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from motorid.datasets import load_plant
 from motorid.errors import UsageError, one_of
+from motorid.records.datasets import load_plant
 
 __all__ = ["SIZES", "Truth", "hide"]
 

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 from motorid.acquire.disk import Appender
-from motorid.acquire.ledger import Row
 from motorid.acquire.protocol import Channel
+from motorid.acquire.timeline import Row
 from motorid.errors import DataError, UsageError
 
 __all__ = ["RunFile", "Tail", "check_target", "column", "read_tail"]

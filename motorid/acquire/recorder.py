@@ -14,10 +14,10 @@ from motorid.acquire.client import Client
 from motorid.acquire.excitation import Program, program
 from motorid.acquire.link import Link, SerialLink
 from motorid.acquire.protocol import VERSION, Header
+from motorid.acquire.record_file import Commanded, RunFile, check_target
 from motorid.acquire.recording import Progress, Recording
 from motorid.acquire.resume import Part, plan
-from motorid.acquire.run import Run, Setup
-from motorid.acquire.runfile import Commanded, RunFile, check_target
+from motorid.acquire.session import Run, Setup
 from motorid.errors import UsageError
 
 __all__ = ["record"]

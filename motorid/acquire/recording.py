@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from motorid.acquire.protocol import Header
-from motorid.display import Shown
+from motorid.display.display import Shown
 
 __all__ = ["COMPLETE", "Progress", "Recording"]
 

@@ -8,7 +8,7 @@ from datetime import datetime
 from pathlib import Path
 
 from motorid.acquire.excitation import Program
-from motorid.acquire.runfile import RunFile, Tail, read_tail
+from motorid.acquire.record_file import RunFile, Tail, read_tail
 from motorid.errors import UsageError
 
 __all__ = ["Part", "plan"]

@@ -12,11 +12,11 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 from motorid.acquire.client import Client
-from motorid.acquire.ledger import Ledger, Row
 from motorid.acquire.link import LinkLost
 from motorid.acquire.protocol import Header, Message, Sample, frame
+from motorid.acquire.record_file import Commanded, RunFile
 from motorid.acquire.recording import Progress, Recording
-from motorid.acquire.runfile import Commanded, RunFile
+from motorid.acquire.timeline import Ledger, Row
 
 __all__ = ["Run", "Setup"]
 

@@ -15,8 +15,8 @@ import numpy as np
 from motorid.acquire.excitation import Program, Segment
 from motorid.acquire.hidden import Truth
 from motorid.acquire.protocol import SILENCE, Channel, Decoder, Header, Message, frame
-from motorid.datasets import load_plant
 from motorid.errors import UsageError, one_of
+from motorid.records.datasets import load_plant
 
 __all__ = ["VirtualDevice"]
 

@@ -8,8 +8,8 @@ from typing import Annotated
 
 import typer
 
-from motorid import cli_bench, cli_fit, cli_judge, cli_take
-from motorid.cli_common import Command, Group
+from motorid.cli import bench, fit, take, trust
+from motorid.cli.console import Command, Group
 
 app = typer.Typer(cls=Group, add_completion=False, rich_markup_mode="rich", pretty_exceptions_enable=False,
                   context_settings={"help_option_names": ["-h", "--help"]})
@@ -38,16 +38,16 @@ def _version() -> str:
 
 
 for _name, _command in (
-    ("demo", cli_fit.demo),
-    ("fit", cli_fit.fit),
-    ("simulate", cli_fit.simulate),
-    ("diagnose", cli_judge.diagnose),
-    ("identifiability", cli_judge.identifiability),
-    ("robustness", cli_judge.robustness),
-    ("fit-many", cli_take.fit_many),
-    ("export", cli_take.export),
-    ("record", cli_bench.record),
-    ("bench", cli_bench.bench),
+    ("demo", fit.demo),
+    ("fit", fit.fit),
+    ("simulate", fit.simulate),
+    ("diagnose", trust.diagnose),
+    ("identifiability", trust.identifiability),
+    ("robustness", trust.robustness),
+    ("fit-many", take.fit_many),
+    ("export", take.export),
+    ("record", bench.record),
+    ("bench", bench.bench),
 ):
     app.command(_name, cls=Command)(_command)
 

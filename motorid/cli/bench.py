@@ -116,7 +116,7 @@ def bench(
 
     from motorid.acquire.ends import open_end
     from motorid.acquire.hidden import hide
-    from motorid.acquire.serve import Pace, serve
+    from motorid.acquire.server import Pace, serve
     from motorid.acquire.virtual import VirtualDevice
 
     seed = secrets.randbelow(1_000_000) if seed is None else seed

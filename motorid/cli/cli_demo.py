@@ -5,17 +5,17 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from motorid.cli_common import show
-from motorid.datasets import data_path
-from motorid.diagnosis import diagnose
+from motorid.cli.console import show
+from motorid.diagnosis.diagnose import diagnose
 from motorid.diagnosis.results import Diagnosis
+from motorid.display.tables import comparison_table, error_table, ladder_table, parameter_table, ranking_table
 from motorid.errors import UsageError
-from motorid.fit import fit
-from motorid.model import dc_motor
-from motorid.progress import progress
-from motorid.reading import read_runs
-from motorid.tables import comparison_table, error_table, ladder_table, parameter_table, ranking_table
-from motorid.uncertainty import deviations
+from motorid.estimation.fit import fit
+from motorid.model.model import dc_motor
+from motorid.numerics.progress import progress
+from motorid.records.datasets import data_path
+from motorid.records.reading import read_runs
+from motorid.uncertainty.covariance import deviations
 
 SET = "hidden_friction"
 
@@ -61,7 +61,7 @@ def _make(out: Path) -> None:
 
 def _files(found: Diagnosis, check: Any, out: Path) -> list[str]:
     from motorid.plots import plot_fit, plot_ladder, plot_missing
-    from motorid.report import report
+    from motorid.reports.report import report
 
     drawn = {"fit.png": plot_fit(found.after, before=found.before).flat[0],
              "missing.png": plot_missing(found).flat[0], "ladder.png": plot_ladder(found)}

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from motorid.cli_options import own_effects
+from motorid.cli.options import own_effects
 from motorid.errors import ModelError
-from motorid.export import load
-from motorid.model import Model
+from motorid.exporters.export import load
+from motorid.model.model import Model
 
 
 def model_of(path: Path, effects_from: Path | None = None) -> Model:

@@ -9,8 +9,8 @@ from typing import Any
 import typer
 from typer.core import TyperCommand, TyperGroup
 
+from motorid.display.tables import Table
 from motorid.errors import DataError, ModelError, MotoridError, UsageError
-from motorid.tables import Table
 
 DONE, FAILED, WRONG = 0, 1, 2
 MANY = ("--validate",)  # options that take all names up to the next option
@@ -88,7 +88,7 @@ def save_report(result: Any, path: Any, held_out: Sequence[Any] = ()) -> None:
     """Write the page of a result, if a path was given."""
     if path is None:
         return
-    from motorid.report import report
+    from motorid.reports.report import report
 
     command = " ".join(["motorid", *sys.argv[1:]])
     show(f"Report: {report(result, path, command=command, validate=held_out)}")

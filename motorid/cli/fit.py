@@ -7,8 +7,8 @@ from typing import Annotated
 
 import typer
 
-from motorid.cli_common import FAILED, save_report, say_notes, show
-from motorid.cli_options import (
+from motorid.cli.console import FAILED, save_report, say_notes, show
+from motorid.cli.options import (
     Choices,
     Json,
     Reading,
@@ -19,14 +19,14 @@ from motorid.cli_options import (
     notes_of,
     with_choices,
 )
+from motorid.display.numbers import duration
+from motorid.display.tables import constraint_table, derived_table, error_table, parameter_table, run_table
 from motorid.errors import DataError
-from motorid.experiment import Experiment
-from motorid.fit import Fit
-from motorid.formatting import duration
-from motorid.simulate import Evaluation, evaluate
-from motorid.summary import constraint_violations, fit_dict, remarks, run_dict, write_json
-from motorid.tables import constraint_table, derived_table, error_table, parameter_table, run_table
-from motorid.uncertainty import deviations
+from motorid.estimation.fit import Fit
+from motorid.exporters.json_file import constraint_violations, fit_dict, remarks, run_dict, write_json
+from motorid.problem.simulate import Evaluation, evaluate
+from motorid.records.experiment import Experiment
+from motorid.uncertainty.covariance import deviations
 
 GOOD = ("converged", "limit", "stalled")
 
@@ -70,7 +70,7 @@ def simulate(
 
     Example: motorid simulate fit.json check*.csv --out simulated
     """
-    from motorid.cli_model import model_of
+    from motorid.cli.cli_model import model_of
 
     model = model_of(fit_json, effects_from)
     records = choices.read(runs)
@@ -95,7 +95,7 @@ def demo(
 
     Example: motorid demo --out demo
     """
-    from motorid.cli_demo import tell
+    from motorid.cli.cli_demo import tell
 
     told = tell(out)
     if json:
@@ -128,7 +128,7 @@ def _amount(records: list[Experiment]) -> str:
 
 
 def _write_simulations(judged: Evaluation, out: Path) -> list[str]:
-    from motorid.reading import write_csv
+    from motorid.records.reading import write_csv
 
     files = []
     try:

@@ -14,15 +14,15 @@ from typing import Annotated, Any, get_type_hints
 import typer
 
 from motorid import effects as library
-from motorid.checks import check_runs
 from motorid.errors import ModelError, UsageError, one_of
-from motorid.experiment import Experiment
-from motorid.fit import Fit, fit
-from motorid.layout import parse_pairs
-from motorid.model import Effect, Model, dc_motor, torque_driven
-from motorid.problem import Huber
-from motorid.progress import progress
-from motorid.reading import read_runs
+from motorid.estimation.fit import Fit, fit
+from motorid.model.model import Effect, Model, dc_motor, torque_driven
+from motorid.numerics.progress import progress
+from motorid.problem.problem import Huber
+from motorid.records.checks import check_runs
+from motorid.records.experiment import Experiment
+from motorid.records.layout import parse_pairs
+from motorid.records.reading import read_runs
 
 DRIVES = ("voltage", "torque")
 SOLVERS = ("lm", "multiple-shooting")
@@ -155,13 +155,13 @@ class Choices(Reading):
         found: dict[str, Any] = {"engine": self.engine, "initial": self.initial,
                                  "loss": Huber() if self.loss == "huber" else None}
         if self.current_limit is not None or hard:
-            from motorid.constraints import CurrentLimit, SteadyState
+            from motorid.problem.constraints import CurrentLimit, SteadyState
 
             limits = [CurrentLimit(self.current_limit)] if self.current_limit is not None else []
             # A plain penalty fit adds the steady state by itself only where no constraint is named.
             found["constraints"] = [*limits, SteadyState()] if self.formulation != "plain" else limits
         if hard or self.solver == "multiple-shooting":
-            from motorid.shooting import MultipleShooting
+            from motorid.estimation.shooting.multiple_shooting import MultipleShooting
 
             found["solver"] = MultipleShooting()
         found["formulation"] = "plain" if hard else self.formulation

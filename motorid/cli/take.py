@@ -8,15 +8,15 @@ from typing import Annotated, Any
 
 import typer
 
-from motorid.batch import fit_many as fit_all
-from motorid.batch import motors_in
-from motorid.cli_common import FAILED, show
-from motorid.cli_model import model_of
-from motorid.cli_options import OUT, Choices, Json, with_choices
+from motorid.cli.cli_model import model_of
+from motorid.cli.console import FAILED, show
+from motorid.cli.options import OUT, Choices, Json, with_choices
 from motorid.errors import DataError, UsageError, one_of
-from motorid.experiment import Experiment
-from motorid.layout import parse_pairs
-from motorid.summary import write_json
+from motorid.exporters.json_file import write_json
+from motorid.records.experiment import Experiment
+from motorid.records.layout import parse_pairs
+from motorid.uncertainty.batch import fit_many as fit_all
+from motorid.uncertainty.batch import motors_in
 
 FORMS = ("casadi", "c", "json")
 
@@ -73,7 +73,7 @@ def export(
 
     Example: motorid export fit.json --to c motor.c
     """
-    from motorid.export import export as write
+    from motorid.exporters.export import export as write
 
     if to is not None and to not in FORMS:
         raise UsageError(f"--to: {one_of(to, FORMS, 'form')}")

@@ -6,8 +6,8 @@ from typing import Annotated, Any
 
 import typer
 
-from motorid.cli_common import save_report, say_notes, show
-from motorid.cli_options import (
+from motorid.cli.console import save_report, say_notes, show
+from motorid.cli.options import (
     Choices,
     Json,
     Report,
@@ -17,10 +17,10 @@ from motorid.cli_options import (
     own_effects,
     with_choices,
 )
-from motorid.progress import progress
-from motorid.summary import write_json
-from motorid.tables import comparison_table, ladder_table, ranking_table
-from motorid.uncertainty import deviations
+from motorid.display.tables import comparison_table, ladder_table, ranking_table
+from motorid.exporters.json_file import write_json
+from motorid.numerics.progress import progress
+from motorid.uncertainty.covariance import deviations
 
 OUT = "Results"
 
@@ -35,7 +35,7 @@ def diagnose(
 
     Example: motorid diagnose run*.csv --validate check*.csv --report found.html
     """
-    from motorid.diagnosis import diagnose as look
+    from motorid.diagnosis.diagnose import diagnose as look
     from motorid.diagnosis.parts import fit_affordably
 
     records = choices.read(runs)
@@ -60,7 +60,7 @@ def identifiability(runs: Runs, choices: Choices, json: Json = None, report: Rep
 
     Example: motorid identifiability run*.csv --effects coulomb
     """
-    from motorid.identifiability import identifiability as study
+    from motorid.uncertainty.identifiability import identifiability as study
 
     records = choices.read(runs)
     fitted = choices.fit(records)
@@ -86,7 +86,7 @@ def robustness(
 
     Example: motorid robustness run*.csv --starts 50 --spread 10
     """
-    from motorid.multistart import robustness as study
+    from motorid.uncertainty.multistart import robustness as study
 
     records = choices.read(runs)
     fitted = choices.fit(records)

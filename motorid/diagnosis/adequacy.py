@@ -21,15 +21,15 @@ from numpy.typing import NDArray
 from scipy.fft import next_fast_len
 from scipy.special import chdtrc, stdtr
 
-from motorid.diagnosis.evidence import autocorrelation, despiked, effective_samples
-from motorid.diagnosis.rank import Score
+from motorid.diagnosis.residual_analysis import autocorrelation, despiked, effective_samples
 from motorid.diagnosis.results import Adequacy
-from motorid.experiment import Experiment
-from motorid.fit import Fit
-from motorid.formatting import number
-from motorid.integrate.grid import Array
-from motorid.noise import quantum
-from motorid.prepared import angle_signal
+from motorid.diagnosis.score_test import Score
+from motorid.display.numbers import number
+from motorid.estimation.fit import Fit
+from motorid.integrate.engine import Array
+from motorid.numerics.noise import quantum
+from motorid.problem.runs import angle_signal
+from motorid.records.experiment import Experiment
 
 FALSE_ALARM = 0.02
 SHIFTS = 60

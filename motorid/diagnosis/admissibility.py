@@ -7,10 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from motorid.diagnosis.resolvable import unresolved
-from motorid.fit import Fit
-from motorid.formatting import percent
-from motorid.model import Effect
-from motorid.parameters import Parameter
+from motorid.display.numbers import percent
+from motorid.estimation.fit import Fit
+from motorid.model.definition import Parameter
+from motorid.model.model import Effect
 
 WORST_CONDITION = 1e4  # of the column-scaled Jacobian
 HOPELESS = 1e6  # condition number beyond which a direction counts as open

@@ -11,21 +11,21 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from motorid.diagnosis.evidence import Errors, Gain, compare_errors
-from motorid.diagnosis.held import HeldOut, train_errors
-from motorid.diagnosis.judging import COMMON, PLAIN, Judge, Node, held_out_objection, node_of, worth_it
-from motorid.diagnosis.objections import WORST_CONDITION, ambiguity, objections
-from motorid.diagnosis.rank import Score, pairs_of, rank
+from motorid.diagnosis.admissibility import WORST_CONDITION, ambiguity, objections
+from motorid.diagnosis.cross_validation import HeldOut, train_errors
+from motorid.diagnosis.model_comparison import COMMON, PLAIN, Judge, Node, held_out_objection, node_of, worth_it
+from motorid.diagnosis.refit import FAILURES, lost, refit
 from motorid.diagnosis.remainders import far
+from motorid.diagnosis.residual_analysis import Errors, Gain, compare_errors
 from motorid.diagnosis.results import Candidate
+from motorid.diagnosis.score_test import Score, pairs_of, rank
 from motorid.diagnosis.tournament import GivenUp, Task, refits, widened
-from motorid.diagnosis.trial import FAILURES, lost, refit
 from motorid.effects import LIBRARY
 from motorid.errors import ModelError
-from motorid.experiment import Experiment
-from motorid.fit import Fit
-from motorid.model import Effect, Model
-from motorid.parameters import Parameter
+from motorid.estimation.fit import Fit
+from motorid.model.definition import Parameter
+from motorid.model.model import Effect, Model
+from motorid.records.experiment import Experiment
 
 SHORTLIST = 6
 PAIRS = 3  # refitted where no single effect helps

@@ -13,12 +13,12 @@ from functools import cached_property
 import numpy as np
 
 from motorid.errors import SimulationError
-from motorid.fit import Fit
-from motorid.integrate.grid import Array, Trajectory
-from motorid.model import Effect, Model
-from motorid.parameters import Parameter
-from motorid.problem import Problem
-from motorid.unknowns import Point
+from motorid.estimation.fit import Fit
+from motorid.integrate.engine import Array, Trajectory
+from motorid.model.definition import Parameter
+from motorid.model.model import Effect, Model
+from motorid.problem.problem import Problem
+from motorid.problem.unknowns import Point
 
 NUDGE = 1e-9  # of the natural size: where sizes start, so that fmax(tau_s - tau_c, 0) has a slope
 

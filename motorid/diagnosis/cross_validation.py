@@ -7,13 +7,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from motorid.descent import descend
-from motorid.diagnosis.evidence import Errors
-from motorid.experiment import Experiment
-from motorid.fit import Fit
-from motorid.least_squares import LevenbergMarquardt
-from motorid.problem import Problem
-from motorid.simulate import at, simulated
+from motorid.diagnosis.residual_analysis import Errors
+from motorid.estimation.continuation import descend
+from motorid.estimation.fit import Fit
+from motorid.numerics.least_squares import LevenbergMarquardt
+from motorid.problem.problem import Problem
+from motorid.problem.simulate import at, simulated
+from motorid.records.experiment import Experiment
 
 QUICK = LevenbergMarquardt(max_iterations=25, ftol=1e-4, xtol=1e-5)
 BLOCKS = 10  # contiguous parts of each run; every other one is held out where there are no held-out runs

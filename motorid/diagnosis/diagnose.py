@@ -6,15 +6,14 @@ import builtins
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
-from motorid.checks import current_limit
 from motorid.diagnosis.adequacy import following
-from motorid.diagnosis.improve import Climb, explored, ladder_of
+from motorid.diagnosis.candidates import library
+from motorid.diagnosis.experiment_design import suggest_experiment
 from motorid.diagnosis.judgement import pursued
 from motorid.diagnosis.locate import acting_like, locate
 from motorid.diagnosis.parts import parts_remark
 from motorid.diagnosis.results import Diagnosis
-from motorid.diagnosis.search import library
-from motorid.diagnosis.suggest import suggest_experiment
+from motorid.diagnosis.stepwise import Climb, explored, ladder_of
 from motorid.diagnosis.verdict import (
     adequate_text,
     averaging_remark,
@@ -27,10 +26,11 @@ from motorid.diagnosis.verdict import (
     unexplained_text,
 )
 from motorid.errors import MotoridError
-from motorid.experiment import Experiment
-from motorid.fit import Fit
-from motorid.model import Effect
-from motorid.uncertainty import deviations
+from motorid.estimation.fit import Fit
+from motorid.model.model import Effect
+from motorid.records.checks import current_limit
+from motorid.records.experiment import Experiment
+from motorid.uncertainty.covariance import deviations
 
 
 def diagnose(

@@ -12,12 +12,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from motorid.display import Shown
+from motorid.display.display import Shown
 from motorid.errors import FitError, MotoridError, UsageError
-from motorid.experiment import Experiment
-from motorid.fit import Fit
-from motorid.integrate.grid import Array
-from motorid.simulate import simulate
+from motorid.estimation.fit import Fit
+from motorid.integrate.engine import Array
+from motorid.problem.simulate import simulate
+from motorid.records.experiment import Experiment
 
 SAMPLES = 2000
 

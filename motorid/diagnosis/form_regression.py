@@ -16,17 +16,17 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from motorid.diagnosis.response import Response, responses_of
-from motorid.diagnosis.shapes import FORMS, KNOTS, Form, basis_of, orders_of, ranges_of, shown
-from motorid.equations import Equations
+from motorid.diagnosis.free_forms import FORMS, KNOTS, Form, basis_of, orders_of, ranges_of, shown
 from motorid.errors import SimulationError
-from motorid.fit import Fit
-from motorid.integrate.grid import Array
-from motorid.model import Effect
-from motorid.parameters import P
-from motorid.prepared import angle_signal, natural_sizes
-from motorid.problem import Problem
-from motorid.simulate import Simulation, simulated
+from motorid.estimation.fit import Fit
+from motorid.estimation.linearisation import Response, responses_of
+from motorid.integrate.engine import Array
+from motorid.model.definition import P
+from motorid.model.equations import Equations
+from motorid.model.model import Effect
+from motorid.problem.problem import Problem
+from motorid.problem.runs import angle_signal, natural_sizes
+from motorid.problem.simulate import Simulation, simulated
 
 START = 0.01  # of the natural torque
 BALANCES = ("voltage", "torque")

@@ -10,11 +10,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from motorid.diagnosis.orders import likely_orders
-from motorid.diagnosis.tangent import Tangent
 from motorid.effects import LIBRARY
-from motorid.fit import Fit
-from motorid.integrate.grid import Array
+from motorid.estimation.angle_orders import likely_orders
+from motorid.estimation.fit import Fit
+from motorid.estimation.tangent import Tangent
+from motorid.integrate.engine import Array
 
 KNOTS = 9  # cosines over the range of a quantity
 HARMONICS = 8  # of a turn

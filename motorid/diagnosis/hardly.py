@@ -10,9 +10,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from motorid.diagnosis.evidence import Errors, astray, despiked
-from motorid.diagnosis.judging import Node
-from motorid.formatting import number
+from motorid.diagnosis.model_comparison import Node
+from motorid.diagnosis.residual_analysis import Errors, astray, despiked
+from motorid.display.numbers import number
 
 STAYS = 5.0  # times the noise, held out
 HARDLY = 0.2  # fall of the error

@@ -13,17 +13,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from motorid.descent import descend
-from motorid.diagnosis.evidence import Errors, compare_errors
-from motorid.diagnosis.held import ROUGH, train_errors
-from motorid.diagnosis.judging import worth_it
-from motorid.diagnosis.trial import FAILURES, RACE
-from motorid.experiment import Experiment
-from motorid.fit import Fit, solve
-from motorid.formatting import number, percent
-from motorid.misfit import misfit_over_noise
-from motorid.problem import Problem
-from motorid.simulate import at
+from motorid.diagnosis.cross_validation import ROUGH, train_errors
+from motorid.diagnosis.model_comparison import worth_it
+from motorid.diagnosis.refit import FAILURES, RACE
+from motorid.diagnosis.residual_analysis import Errors, compare_errors
+from motorid.display.numbers import number, percent
+from motorid.estimation.continuation import descend
+from motorid.estimation.fit import Fit, solve
+from motorid.problem.misfit import misfit_over_noise
+from motorid.problem.problem import Problem
+from motorid.problem.simulate import at
+from motorid.records.experiment import Experiment
 
 CHANGING = 0.5  # of the samples at which the voltage must change for its reading to matter
 NOISY = -0.25  # correlation of successive changes: noise has -0.5, a smooth course +1

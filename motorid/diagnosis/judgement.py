@@ -8,14 +8,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from motorid.diagnosis.adequacy import adequacy, following, unpredicted
-from motorid.diagnosis.forms import Linear, halves, linearised
-from motorid.diagnosis.held import BLOCKS, HeldOut
-from motorid.diagnosis.rank import Score
+from motorid.diagnosis.cross_validation import BLOCKS, HeldOut
+from motorid.diagnosis.form_regression import Linear, halves, linearised
+from motorid.diagnosis.free_forms import Form
+from motorid.diagnosis.refit import FAILURES
 from motorid.diagnosis.remainders import by_channel, far, fraction, fraction_of, left
 from motorid.diagnosis.results import Adequacy
-from motorid.diagnosis.shapes import Form
-from motorid.diagnosis.trial import FAILURES
-from motorid.fit import Fit
+from motorid.diagnosis.score_test import Score
+from motorid.estimation.fit import Fit
 
 PREDICTED = 0.1  # of the squared misfit: what a form must explain, on data held out too, that is no noise
 CLEAR = 1e-3  # p-value of errors larger than the noise that needs no second test: few coloured samples tell little

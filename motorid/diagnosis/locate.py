@@ -8,13 +8,13 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from motorid.diagnosis.evidence import effective_samples
+from motorid.diagnosis.free_forms import Form
+from motorid.diagnosis.residual_analysis import effective_samples
 from motorid.diagnosis.results import Binned, Missing
-from motorid.diagnosis.shapes import Form
 from motorid.diagnosis.smoother import Begun, Smoothed, begin, smooth
-from motorid.fit import Fit
-from motorid.integrate.grid import Array
-from motorid.prepared import angle_signal, natural_sizes
+from motorid.estimation.fit import Fit
+from motorid.integrate.engine import Array
+from motorid.problem.runs import angle_signal, natural_sizes
 
 WALKS = (0.03, 0.1, 0.3, 1.0, 3.0)  # of the natural size per √s, the smallest that explains the data is taken
 BINS = 24

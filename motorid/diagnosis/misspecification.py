@@ -13,15 +13,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from motorid.diagnosis.evidence import compare_errors
-from motorid.diagnosis.forms import Linear, as_effect, halves, linearised
-from motorid.diagnosis.held import BLOCKS, HeldOut, train_errors
+from motorid.diagnosis.cross_validation import BLOCKS, HeldOut, train_errors
+from motorid.diagnosis.form_regression import Linear, as_effect, halves, linearised
+from motorid.diagnosis.free_forms import FORMS, Form
+from motorid.diagnosis.refit import FAILURES, Raced, finished, lost, raced
 from motorid.diagnosis.remainders import by_channel, far, fraction, fraction_of, left
-from motorid.diagnosis.shapes import FORMS, Form
-from motorid.diagnosis.trial import FAILURES, Raced, finished, lost, raced
-from motorid.fit import Fit
-from motorid.integrate.grid import Array
-from motorid.misfit import misfit_over_noise
+from motorid.diagnosis.residual_analysis import compare_errors
+from motorid.estimation.fit import Fit
+from motorid.integrate.engine import Array
+from motorid.problem.misfit import misfit_over_noise
 
 MUCH_LESS = 0.5  # of the squared misfit that the effects leave: what a form in their place may leave
 LITTLE = 0.1  # of the squared misfit: forms that leave less are equals

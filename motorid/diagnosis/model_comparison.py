@@ -11,10 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from motorid.diagnosis.evidence import Errors, Gain, astray, compare_errors
-from motorid.diagnosis.held import LEAST_FALL, HeldOut, train_errors
+from motorid.diagnosis.cross_validation import LEAST_FALL, HeldOut, train_errors
+from motorid.diagnosis.residual_analysis import Errors, Gain, astray, compare_errors
 from motorid.diagnosis.results import Candidate
-from motorid.fit import Fit
+from motorid.estimation.fit import Fit
 
 COMMON = (
     "coulomb",

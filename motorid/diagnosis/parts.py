@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from motorid.errors import MotoridError
-from motorid.experiment import Experiment
-from motorid.fit import Fit, solve
-from motorid.integrate.grid import Array
-from motorid.prepared import angle_signal
-from motorid.problem import Problem
+from motorid.estimation.fit import Fit, solve
+from motorid.integrate.engine import Array
+from motorid.problem.problem import Problem
+from motorid.problem.runs import angle_signal
+from motorid.records.experiment import Experiment
 
 AFFORDABLE = 150_000  # steps of integration per simulation of all records
 WANTED = 36_000  # of what is longer

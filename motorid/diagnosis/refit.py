@@ -8,20 +8,20 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from motorid.descent import Descent, descend
-from motorid.diagnosis.held import QUICK, ROUGH, restarted
+from motorid.diagnosis.cross_validation import QUICK, ROUGH, restarted
 from motorid.diagnosis.parts import worth_its_steps
-from motorid.diagnosis.rank import uses_angle
-from motorid.diagnosis.revival import let_go, revived
+from motorid.diagnosis.score_test import uses_angle
 from motorid.errors import FitError, ModelError, SimulationError
-from motorid.fit import Fit
-from motorid.integrate.grid import Array
-from motorid.least_squares import LevenbergMarquardt
-from motorid.misfit import misfit_over_noise
-from motorid.model import Model
-from motorid.prepared import natural_sizes
-from motorid.problem import Problem
-from motorid.start import first_guess
+from motorid.estimation.continuation import Descent, descend
+from motorid.estimation.first_guess import first_guess
+from motorid.estimation.fit import Fit
+from motorid.estimation.revival import let_go, revived
+from motorid.integrate.engine import Array
+from motorid.model.model import Model
+from motorid.numerics.least_squares import LevenbergMarquardt
+from motorid.problem.misfit import misfit_over_noise
+from motorid.problem.problem import Problem
+from motorid.problem.runs import natural_sizes
 
 RACE = LevenbergMarquardt(max_iterations=6, ftol=1e-3, xtol=1e-4)
 POLISH = LevenbergMarquardt(max_iterations=60, ftol=1e-7, xtol=1e-7)

@@ -7,11 +7,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from motorid.diagnosis.adequacy import LARGER
-from motorid.diagnosis.evidence import despiked
-from motorid.diagnosis.forms import Linear
-from motorid.diagnosis.shapes import Form
-from motorid.fit import Fit
-from motorid.integrate.grid import Array
+from motorid.diagnosis.form_regression import Linear
+from motorid.diagnosis.free_forms import Form
+from motorid.diagnosis.residual_analysis import despiked
+from motorid.estimation.fit import Fit
+from motorid.integrate.engine import Array
 
 RIDGE = 1e-7  # of the largest singular value; smaller ones are left out
 

@@ -13,9 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.fft
 
-from motorid.experiment import Experiment
-from motorid.integrate.grid import Array
-from motorid.simulate import Simulation
+from motorid.integrate.engine import Array
+from motorid.problem.simulate import Simulation
+from motorid.records.experiment import Experiment
 
 ASTRAY = 1.0  # NRMSE: zero is nearer to the channel than the model is
 CLIP = 6.0  # robust standard deviations beyond which a residual counts as an outlier

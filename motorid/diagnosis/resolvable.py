@@ -9,11 +9,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from motorid.fit import Fit
-from motorid.integrate.grid import Array
-from motorid.model import Effect
-from motorid.noise import noise_level, quantum
-from motorid.prepared import angle_signal, slopes
+from motorid.estimation.fit import Fit
+from motorid.integrate.engine import Array
+from motorid.model.model import Effect
+from motorid.numerics.noise import noise_level, quantum
+from motorid.problem.runs import angle_signal, slopes
 
 PASSAGE = 10  # samples that a motion through the shape must give
 FINEST = 4.0  # steps or standard deviations of the angle that it must be wide

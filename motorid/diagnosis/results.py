@@ -6,10 +6,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from motorid.display import Shown
-from motorid.fit import Fit
-from motorid.integrate.grid import Array
-from motorid.tables import Std
+from motorid.display.display import Shown
+from motorid.display.tables import Std
+from motorid.estimation.fit import Fit
+from motorid.integrate.engine import Array
 
 
 @dataclass(frozen=True, eq=False, repr=False)

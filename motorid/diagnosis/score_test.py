@@ -17,13 +17,13 @@ from functools import lru_cache
 import numpy as np
 
 from motorid.diagnosis.columns import Added, Shape
-from motorid.diagnosis.orders import Line, likely_lines, spectrum
-from motorid.diagnosis.tangent import Tangent
 from motorid.errors import ModelError, SimulationError
-from motorid.fit import Fit
-from motorid.integrate.grid import Array
-from motorid.model import Effect, dc_motor, torque_driven
-from motorid.parameters import Parameter
+from motorid.estimation.angle_orders import Line, likely_lines, spectrum
+from motorid.estimation.fit import Fit
+from motorid.estimation.tangent import Tangent
+from motorid.integrate.engine import Array
+from motorid.model.definition import Parameter
+from motorid.model.model import Effect, dc_motor, torque_driven
 
 ORDERS_TRIED = 3
 MORE = 0.1  # that a pair must promise beyond the better of the two

@@ -13,9 +13,9 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import LinAlgError, solveh_banded
 
-from motorid.diagnosis.response import linear_steps, parameter_vector, shown
-from motorid.fit import Fit
-from motorid.integrate.grid import Array
+from motorid.estimation.fit import Fit
+from motorid.estimation.linearisation import linear_steps, parameter_vector, shown
+from motorid.integrate.engine import Array
 
 STEPS = 4  # Gauss-Newton iterations
 MODEL_ERROR = 1e-5  # of a state's size: how exactly one step of the model must hold

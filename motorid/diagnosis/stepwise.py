@@ -11,20 +11,20 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from motorid.checks import current_limit
-from motorid.diagnosis.driving import Reading, better_reading, without_spikes
-from motorid.diagnosis.evidence import compare_errors
+from motorid.diagnosis.candidates import Search, library
 from motorid.diagnosis.hardly import hardly_moved
+from motorid.diagnosis.input_hypotheses import Reading, better_reading, without_spikes
 from motorid.diagnosis.judgement import judgement
-from motorid.diagnosis.judging import Node
-from motorid.diagnosis.outside import Outside, outside
+from motorid.diagnosis.misspecification import Outside, outside
+from motorid.diagnosis.model_comparison import Node
 from motorid.diagnosis.parts import affordable
 from motorid.diagnosis.remainders import far
+from motorid.diagnosis.residual_analysis import compare_errors
 from motorid.diagnosis.results import Adequacy, Candidate, Ladder, Rung
-from motorid.diagnosis.search import Search, library
-from motorid.experiment import Experiment
-from motorid.fit import Fit
-from motorid.model import Effect
+from motorid.estimation.fit import Fit
+from motorid.model.model import Effect
+from motorid.records.checks import current_limit
+from motorid.records.experiment import Experiment
 
 BEAM = 2
 HALF_AS_GOOD = 0.5  # of the best child's fall: what a second model must reach to be carried along

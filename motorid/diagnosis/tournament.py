@@ -13,13 +13,13 @@ from typing import Any
 
 import numpy as np
 
-from motorid.diagnosis.judging import EVIDENCE
+from motorid.diagnosis.model_comparison import EVIDENCE
+from motorid.diagnosis.refit import Raced, finished, promised, raced
 from motorid.diagnosis.remainders import far
-from motorid.diagnosis.trial import Raced, finished, promised, raced
-from motorid.fit import Fit
-from motorid.model import Effect, Model
-from motorid.prepared import natural_sizes
-from motorid.starting import ABOVE, sizes_like
+from motorid.estimation.fit import Fit
+from motorid.estimation.start_values import ABOVE, sizes_like
+from motorid.model.model import Effect, Model
+from motorid.problem.runs import natural_sizes
 
 BEHIND = 10.0  # times the cost of a model that explains all but noise
 HARDLY = 1.01  # times: near enough that a slope tells what more would do

@@ -6,13 +6,13 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from motorid.diagnosis.evidence import astray, despiked
+from motorid.diagnosis.residual_analysis import astray, despiked
 from motorid.diagnosis.results import Adequacy, Candidate, Missing, Rung
+from motorid.display.numbers import number, percent, with_error
 from motorid.effects import LIBRARY
-from motorid.fit import Fit
-from motorid.formatting import number, percent, with_error
-from motorid.model import Effect
-from motorid.uncertainty import deviations
+from motorid.estimation.fit import Fit
+from motorid.model.model import Effect
+from motorid.uncertainty.covariance import deviations
 
 MOVED = 0.1  # relative change of a motor parameter that is worth a word
 SPIKED = 0.5  # of a channel's squared error: what outliers must make to be worth a word

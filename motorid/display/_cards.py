@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from motorid._cards_trust import WRITERS
-from motorid._html import Card, Flag, Table
-from motorid._html_tables import (
+from motorid.display._cards_trust import WRITERS
+from motorid.display._html_tables import (
     NAMES,
     UNITS,
     counted,
@@ -17,7 +16,8 @@ from motorid._html_tables import (
     parameter_table,
     ranking_table,
 )
-from motorid.formatting import duration, number, percent, quantity
+from motorid.display.cards import Card, Flag, Table
+from motorid.display.numbers import duration, number, percent, quantity
 
 _STATUS = {"converged": "good", "stalled": "note", "limit": "note", "failed": "bad"}
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from motorid._html import Card, Flag, Table
-from motorid._html_tables import NAMES, channel_name, counted
-from motorid.formatting import duration, number, percent, quantity, with_error
-from motorid.uncertainty import interval_text
+from motorid.display._html_tables import NAMES, channel_name, counted
+from motorid.display.cards import Card, Flag, Table
+from motorid.display.numbers import duration, number, percent, quantity, with_error
+from motorid.uncertainty.covariance import interval_text
 
 
 def _comparison(c: Any) -> Card:

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from motorid._html import Flag, Table
-from motorid.formatting import number, percent, quantity, with_error
-from motorid.tables import Std
+from motorid.display.cards import Flag, Table
+from motorid.display.numbers import number, percent, quantity, with_error
+from motorid.display.tables import Std
 
 NAMES = {"v": "voltage", "i": "current", "omega": "speed", "theta": "angle"}
 UNITS = {"i": "A", "omega": "rad/s", "theta": "rad"}

@@ -64,14 +64,14 @@ class Card:
 
 def html_of(result: object) -> str:
     """Return the HTML of any result of motorid."""
-    from motorid._cards import card_of
+    from motorid.display._cards import card_of
 
     return render(card_of(result))
 
 
 def line_of(result: object) -> str:
     """Return the one line that stands for a result in plain text."""
-    from motorid._cards import card_of
+    from motorid.display._cards import card_of
 
     card = card_of(result)
     return f"<{', '.join([card.title, *(f.text for f in card.flags)])}>"

@@ -11,11 +11,11 @@ class Shown:
 
     def _repr_html_(self) -> str:
         # Showing comes last in the story, so the modules that do it are imported late.
-        from motorid._html import html_of
+        from motorid.display.cards import html_of
 
         return html_of(self)
 
     def __repr__(self) -> str:
-        from motorid._html import line_of
+        from motorid.display.cards import line_of
 
         return line_of(self)

@@ -6,11 +6,11 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from motorid.formatting import duration, number, percent, quantity, with_error
+from motorid.display.numbers import duration, number, percent, quantity, with_error
 
 if TYPE_CHECKING:
-    from motorid.fit import Fit
-    from motorid.simulate import Evaluation
+    from motorid.estimation.fit import Fit
+    from motorid.problem.simulate import Evaluation
 
 NAMES = {"i": "current", "omega": "speed", "theta": "angle"}
 MOST_RUNS = 12  # shown one by one

@@ -26,7 +26,7 @@ from motorid.effects.sensor import current_lag, current_offset, speed_delay, spe
 from motorid.effects.thermal import winding_heating
 from motorid.effects.transmission import backlash, compliance
 from motorid.errors import ModelError, one_of
-from motorid.model import Effect
+from motorid.model.model import Effect
 
 LIBRARY: dict[str, Effect] = {
     e.name: e

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from motorid.equations import Equations
-from motorid.model import effect
-from motorid.parameters import P
+from motorid.model.definition import P
+from motorid.model.equations import Equations
+from motorid.model.model import effect
 
 
 @effect(balance="voltage")

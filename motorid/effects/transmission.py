@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import casadi as ca
 
-from motorid.equations import Equations
-from motorid.model import effect
-from motorid.parameters import P
+from motorid.model.definition import P
+from motorid.model.equations import Equations
+from motorid.model.model import effect
 
 CORNER = 0.01  # of half a gap: a stiff shaft is twisted by much less than the gap, and a wide corner is a soft shaft
 

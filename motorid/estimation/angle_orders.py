@@ -15,13 +15,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from motorid.diagnosis.response import Response, responses
-from motorid.diagnosis.tangent import Tangent
-from motorid.diagnosis.whitening import Whitening, unstacked
-from motorid.fit import Fit
-from motorid.integrate.grid import Array
-from motorid.model import Effect
-from motorid.prepared import angle_signal
+from motorid.estimation.fit import Fit
+from motorid.estimation.linearisation import Response, responses
+from motorid.estimation.tangent import Tangent
+from motorid.integrate.engine import Array
+from motorid.model.model import Effect
+from motorid.numerics.whitening import Whitening, unstacked
+from motorid.problem.runs import angle_signal
 
 WIDEST = 4e6  # numbers in the answers to all orders that are looked at together
 HIGHEST = 240

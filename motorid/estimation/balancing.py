@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from motorid.descent import Callback, Descent, descend, descend_surely
-from motorid.least_squares import LevenbergMarquardt
-from motorid.misfit import misfit_over_noise
-from motorid.plateaus import off_plateaus
-from motorid.problem import Problem
+from motorid.estimation.continuation import Callback, Descent, descend, descend_surely
+from motorid.estimation.restarts import off_plateaus
+from motorid.numerics.least_squares import LevenbergMarquardt
+from motorid.problem.misfit import misfit_over_noise
+from motorid.problem.problem import Problem
 
 IMBALANCE = 3.0  # between channels, in misfit over noise, above which the misfit decides the weights
 

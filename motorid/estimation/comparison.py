@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from motorid.display import Shown
+from motorid.display.display import Shown
 from motorid.errors import UsageError
-from motorid.experiment import Experiment
-from motorid.fit import Fit
-from motorid.simulate import evaluate
+from motorid.estimation.fit import Fit
+from motorid.problem.simulate import evaluate
+from motorid.records.experiment import Experiment
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -14,12 +14,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from motorid.errors import FitError, SimulationError
-from motorid.integrate.grid import Array
-from motorid.least_squares import LevenbergMarquardt, Solution, levenberg_marquardt
-from motorid.misfit import hardly_explained
-from motorid.narrowing import NARROWER, WIDEST, narrow_enough, narrower, smooths, without_width
-from motorid.prepared import top_speed
-from motorid.problem import Problem
+from motorid.estimation.narrowing import NARROWER, WIDEST, narrow_enough, narrower, smooths, without_width
+from motorid.integrate.engine import Array
+from motorid.numerics.least_squares import LevenbergMarquardt, Solution, levenberg_marquardt
+from motorid.problem.misfit import hardly_explained
+from motorid.problem.problem import Problem
+from motorid.problem.runs import top_speed
 
 ON_THE_WAY = ((1e-7, 60), (1e-6, 60))  # ftol and iterations of the first stage, and of those between
 LOWER = 0.98  # of the cost with a wider sgn, or the narrower one is not worth it

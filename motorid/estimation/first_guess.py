@@ -14,10 +14,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from motorid.experiment import Experiment
-from motorid.integrate.grid import Array
-from motorid.loads import Load, columns, loads_of, values
-from motorid.model import Model
+from motorid.estimation.loads import Load, columns, loads_of, values
+from motorid.integrate.engine import Array
+from motorid.model.model import Model
+from motorid.records.experiment import Experiment
 
 BASE = ("R", "L", "K", "b", "J", "g")
 BACK_EMF = 0.9

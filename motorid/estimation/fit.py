@@ -9,19 +9,19 @@ from typing import Any
 
 import numpy as np
 
-from motorid.balancing import descend_balanced
-from motorid.descent import Descent
 from motorid.errors import FitError, UsageError, one_of
-from motorid.experiment import Experiment
+from motorid.estimation.balancing import descend_balanced
+from motorid.estimation.continuation import Descent
+from motorid.estimation.result import UNDETERMINED, Failure, Fit
+from motorid.estimation.start_values import started
 from motorid.integrate import Engine
-from motorid.integrate.grid import Array
-from motorid.least_squares import LevenbergMarquardt, Solution, levenberg_marquardt
-from motorid.misfit import integration_error, misfit_over_noise
-from motorid.model import Model
-from motorid.problem import Problem, as_problem
-from motorid.result import UNDETERMINED, Failure, Fit
-from motorid.simulate import Evaluation, evaluate
-from motorid.starting import started
+from motorid.integrate.engine import Array
+from motorid.model.model import Model
+from motorid.numerics.least_squares import LevenbergMarquardt, Solution, levenberg_marquardt
+from motorid.problem.misfit import integration_error, misfit_over_noise
+from motorid.problem.problem import Problem, as_problem
+from motorid.problem.simulate import Evaluation, evaluate
+from motorid.records.experiment import Experiment
 
 NOISE = 1.2  # RMS of the residual over the noise that may be called noise
 ERROR_SHARE = 0.2  # integration error accepted beside noise or misfit
@@ -87,7 +87,7 @@ def fit(
                          "formulation='penalty' to weigh them.")
     penalties = tuple(penalties)
     if formulation == "penalty":
-        from motorid.constraints import SteadyState
+        from motorid.problem.constraints import SteadyState
 
         penalties += tuple(constraints) or (SteadyState(),)
         constraints = ()
@@ -109,7 +109,7 @@ def solve(problem: Problem, solver: Any = None, *, start: str = "auto",
         raise UsageError("every parameter is held, there is nothing to fit. Free one, model.free('R'), or judge "
                          "the model as it is: mi.evaluate(model, runs).")
     if start == "auto":
-        from motorid.numbering import numbered  # it fits smaller models first, by this very function
+        from motorid.estimation.numbering import numbered  # it fits smaller models first, by this very function
 
         problem = started(numbered(problem, solve))
     if hasattr(solver, "solve"):

@@ -14,12 +14,12 @@ import casadi as ca
 import numpy as np
 from scipy.linalg import get_lapack_funcs
 
-from motorid.fit import Fit
-from motorid.integrate.grid import Array
-from motorid.integrate.step import rosenbrock_step
-from motorid.problem import Problem
-from motorid.simulate import Simulation
-from motorid.system import System
+from motorid.estimation.fit import Fit
+from motorid.integrate.engine import Array
+from motorid.integrate.rodas3 import rosenbrock_step
+from motorid.model.system import System
+from motorid.problem.problem import Problem
+from motorid.problem.simulate import Simulation
 
 (TRIANGULAR,) = get_lapack_funcs(("tbtrs",), dtype=float)  # banded; SciPy has no other name for it
 

@@ -12,8 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from motorid.integrate.grid import Array
-from motorid.model import Model
+from motorid.integrate.engine import Array
+from motorid.model.model import Model
 
 WIDE = 0.02  # width of sgn over the highest speed: a measured speed is noise around standstill
 

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from motorid.integrate.grid import Array
-from motorid.misfit import misfit_over_noise
-from motorid.prepared import SGN_WIDTH_SHARE, top_speed
-from motorid.problem import Problem
+from motorid.integrate.engine import Array
+from motorid.problem.misfit import misfit_over_noise
+from motorid.problem.problem import Problem
+from motorid.problem.runs import SGN_WIDTH_SHARE, top_speed
 
 WIDEST = 0.03  # first width of sgn over the highest speed
 NARROWER = 6.0  # at most, from one stage to the next

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from motorid.diagnosis.orders import Line, likely_lines
-from motorid.diagnosis.tangent import Tangent
 from motorid.errors import FitError
-from motorid.model import Effect, Model
-from motorid.problem import Problem
-from motorid.result import Fit
+from motorid.estimation.angle_orders import Line, likely_lines
+from motorid.estimation.result import Fit
+from motorid.estimation.tangent import Tangent
+from motorid.model.model import Effect, Model
+from motorid.problem.problem import Problem
 
 
 def numbered(problem: Problem, solve: Callable[[Problem], Fit]) -> Problem:

@@ -11,10 +11,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from motorid.descent import Callback, Descent, descend
 from motorid.errors import FitError, SimulationError
-from motorid.least_squares import LevenbergMarquardt
-from motorid.parameters import Parameter
+from motorid.estimation.continuation import Callback, Descent, descend
+from motorid.model.definition import Parameter
+from motorid.numerics.least_squares import LevenbergMarquardt
 
 ALIVE = 10.0  # standard deviations that a change by a factor of e makes
 FURTHEST = 1e12  # times its value, that a parameter is put back

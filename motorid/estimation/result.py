@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from motorid.display import Shown
-from motorid.integrate.grid import Array
-from motorid.least_squares import gauss_newton_covariance
-from motorid.model import Model
-from motorid.problem import Problem
-from motorid.simulate import Evaluation, Simulation, at, judge, steady_errors
+from motorid.display.display import Shown
+from motorid.integrate.engine import Array
+from motorid.model.model import Model
+from motorid.numerics.least_squares import gauss_newton_covariance
+from motorid.problem.problem import Problem
+from motorid.problem.simulate import Evaluation, Simulation, at, judge, steady_errors
 
 UNDETERMINED = 1.0  # relative standard deviation above which a value is not shown as determined
 

@@ -10,10 +10,10 @@ from __future__ import annotations
 import numpy as np
 
 from motorid.errors import SimulationError
-from motorid.fit import Fit
-from motorid.model import Model
-from motorid.plateaus import put_back
-from motorid.problem import Problem
+from motorid.estimation.fit import Fit
+from motorid.estimation.restarts import put_back
+from motorid.model.model import Model
+from motorid.problem.problem import Problem
 
 NO_LOSS = 2.0  # of the cost, half of chi²: two standard deviations
 

@@ -8,20 +8,20 @@ from itertools import product
 
 import numpy as np
 
-from motorid.bases import BASES
-from motorid.descent import descend
 from motorid.effects import LIBRARY
 from motorid.errors import FitError, ModelError, SimulationError
-from motorid.experiment import Experiment
-from motorid.least_squares import LevenbergMarquardt, levenberg_marquardt
-from motorid.loads import loads_of
-from motorid.model import Model
-from motorid.narrowing import without_width
-from motorid.parameters import Parameter
-from motorid.prepared import natural_sizes, suited
-from motorid.problem import Problem
-from motorid.start import first_guess
-from motorid.term import Effect
+from motorid.estimation.continuation import descend
+from motorid.estimation.first_guess import first_guess
+from motorid.estimation.loads import loads_of
+from motorid.estimation.narrowing import without_width
+from motorid.model.bases import BASES
+from motorid.model.definition import Parameter
+from motorid.model.model import Model
+from motorid.model.term import Effect
+from motorid.numerics.least_squares import LevenbergMarquardt, levenberg_marquardt
+from motorid.problem.problem import Problem
+from motorid.problem.runs import natural_sizes, suited
+from motorid.records.experiment import Experiment
 
 THOROUGH = LevenbergMarquardt(ftol=1e-5, max_iterations=60)
 ABOVE = 1.3  # times: where a size starts that is at least another

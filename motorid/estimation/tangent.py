@@ -8,11 +8,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from motorid.diagnosis.evidence import effective_samples
-from motorid.diagnosis.whitening import unstacked
-from motorid.fit import Fit
-from motorid.integrate.grid import Array
-from motorid.prepared import natural_sizes
+from motorid.diagnosis.residual_analysis import effective_samples
+from motorid.estimation.fit import Fit
+from motorid.integrate.engine import Array
+from motorid.numerics.whitening import unstacked
+from motorid.problem.runs import natural_sizes
 
 SHARED = 0.1  # of the largest share in a combination that is worth a name
 INSEPARABLE = 1e-3  # share of an effect's answer that the fitted parameters do not make up together

@@ -10,10 +10,10 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from motorid.fit import Fit
-from motorid.integrate.step import step_functions
-from motorid.model import Model
-from motorid.portable import description, held_inputs, runs_of, system_of, values_of, words
+from motorid.estimation.fit import Fit
+from motorid.exporters.casadi_file import description, held_inputs, runs_of, system_of, values_of, words
+from motorid.integrate.rodas3 import step_functions
+from motorid.model.model import Model
 
 HEADER = """/* {title}
  *

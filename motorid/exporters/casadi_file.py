@@ -11,17 +11,17 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from motorid.equations import CHANNELS
 from motorid.errors import UsageError
-from motorid.experiment import Experiment
-from motorid.fit import Fit
-from motorid.integrate.grid import Array, Grid
-from motorid.integrate.step import step_functions
-from motorid.model import Model
-from motorid.prepared import Run
-from motorid.problem import Problem
-from motorid.summary import fit_dict
-from motorid.system import System
+from motorid.estimation.fit import Fit
+from motorid.exporters.json_file import fit_dict
+from motorid.integrate.engine import Array, Grid
+from motorid.integrate.rodas3 import step_functions
+from motorid.model.equations import CHANNELS
+from motorid.model.model import Model
+from motorid.model.system import System
+from motorid.problem.problem import Problem
+from motorid.problem.runs import Run
+from motorid.records.experiment import Experiment
 
 FORMAT = 1
 MOST_RUNS = 20  # of a fit, that travel along as whole simulations

@@ -15,10 +15,10 @@ import numpy as np
 
 from motorid.effects import LIBRARY
 from motorid.errors import DataError, ModelError, UsageError, one_of
-from motorid.fit import Fit
-from motorid.integrate.grid import Array
-from motorid.model import Effect, Model, dc_motor, torque_driven
-from motorid.portable import description, functions_of, model_of
+from motorid.estimation.fit import Fit
+from motorid.exporters.casadi_file import description, functions_of, model_of
+from motorid.integrate.engine import Array
+from motorid.model.model import Effect, Model, dc_motor, torque_driven
 
 FORMS = {".casadi": "casadi", ".c": "c", ".json": "json"}
 NO_FMU = ("an FMU is not offered: those that CasADi 3.8.2 writes do not pass FMPy's checker (names of variables, "
@@ -134,7 +134,7 @@ def _write_casadi(found: Fit | Model, path: Path) -> Path:
 
 
 def _write_c(found: Fit | Model, path: Path) -> Path:
-    from motorid.csource import write_c
+    from motorid.exporters.c_code import write_c
 
     return write_c(found, path)[0]
 

@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from motorid.errors import UsageError
-from motorid.multipliers import violations
-from motorid.relations import Relation
-from motorid.uncertainty import deviations
+from motorid.estimation.shooting.multipliers import violations
+from motorid.problem.relations import Relation
+from motorid.uncertainty.covariance import deviations
 
 if TYPE_CHECKING:
-    from motorid.fit import Fit
-    from motorid.simulate import Evaluation
+    from motorid.estimation.fit import Fit
+    from motorid.problem.simulate import Evaluation
 
 MOTOR = ("R", "L", "K", "b", "J")
 

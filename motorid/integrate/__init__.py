@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from motorid.errors import UsageError, one_of
-from motorid.integrate.grid import Engine, Grid, Trajectory
+from motorid.integrate.engine import Engine, Grid, Trajectory
 from motorid.integrate.rosenbrock import Rosenbrock
 from motorid.integrate.sundials import Cvodes, Idas
 

@@ -20,7 +20,7 @@ from typing import Any
 
 import casadi as ca
 
-from motorid.integrate.step import StepFunctions
+from motorid.integrate.rodas3 import StepFunctions
 
 # -Bsymbolic: a name of ours must never be taken from another library. The last two let divisions by one pivot
 # share its reciprocal; results stay within rounding of the virtual machine's.

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from motorid.system import System
+from motorid.model.system import System
 
 Array = NDArray[np.float64]
 

@@ -12,8 +12,8 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from motorid.integrate.grid import Array, Grid, Trajectory
-from motorid.integrate.step import StepFunctions
+from motorid.integrate.engine import Array, Grid, Trajectory
+from motorid.integrate.rodas3 import StepFunctions
 
 CHUNK = 256
 

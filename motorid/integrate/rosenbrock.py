@@ -12,11 +12,11 @@ import casadi as ca
 import numpy as np
 
 from motorid.errors import SimulationError
-from motorid.integrate import compile as cc
-from motorid.integrate.grid import Array, Grid, Trajectory, address
+from motorid.integrate import compiled as cc
+from motorid.integrate.engine import Array, Grid, Trajectory, address
 from motorid.integrate.machine import Machine
-from motorid.integrate.step import ERROR_ORDER, StepFunctions, step_functions
-from motorid.system import System
+from motorid.integrate.rodas3 import ERROR_ORDER, StepFunctions, step_functions
+from motorid.model.system import System
 
 # Instructions of the virtual machine (0.15 s) before a step is worth compiling. No clock decides: the two round
 # differently, and the last digits would depend on what else the machine does.

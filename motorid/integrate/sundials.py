@@ -19,9 +19,9 @@ import casadi as ca
 import numpy as np
 
 from motorid.errors import ModelError, SimulationError
-from motorid.integrate.grid import Array, Grid, Trajectory
+from motorid.integrate.engine import Array, Grid, Trajectory
 from motorid.integrate.rosenbrock import Rosenbrock, stepper
-from motorid.system import System
+from motorid.model.system import System
 
 NOT_FINITE = "numbers no longer finite"
 REASONS = ("CV_ERR_FAILURE", "CV_CONV_FAILURE", "CV_TOO_MUCH_WORK", "IDA_ERR_FAIL", "IDA_CONV_FAIL",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from motorid.parameters import Parameter
+from motorid.model.definition import Parameter
 
 STATES = {"dc_motor": ("i", "omega"), "torque_driven": ("omega",)}
 QUANTITIES = {"dc_motor": ("R", "L", "K", "K_t", "K_e", "b", "J"), "torque_driven": ("g", "b", "J")}

@@ -9,13 +9,13 @@ from typing import Any
 
 import casadi as ca
 
-from motorid.bases import BASES, DERIVED, QUANTITIES, STATES
-from motorid.display import Shown
-from motorid.equations import CHANNELS, Equations
+from motorid.display.display import Shown
 from motorid.errors import ModelError, one_of
-from motorid.parameters import Parameter
-from motorid.system import System, build_system
-from motorid.term import Effect, effect
+from motorid.model.bases import BASES, DERIVED, QUANTITIES, STATES
+from motorid.model.definition import Parameter
+from motorid.model.equations import CHANNELS, Equations
+from motorid.model.system import System, build_system
+from motorid.model.term import Effect, effect
 
 SGN_WIDTH = Parameter("sgn_width", 1e-2, "rad/s", positive=True, vary=False,
                       doc="speed over which sgn(omega) is smoothed; chosen from the data unless given")

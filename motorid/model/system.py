@@ -10,8 +10,8 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from motorid.equations import Equations
 from motorid.errors import ModelError
+from motorid.model.equations import Equations
 
 Array = NDArray[np.float64]
 

@@ -8,9 +8,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
-from motorid.display import Shown
+from motorid.display.display import Shown
 from motorid.errors import ModelError, one_of
-from motorid.parameters import Declared, Parameter
+from motorid.model.definition import Declared, Parameter
 
 BALANCES = ("voltage", "torque", "transmission", "sensor")
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import matmul_toeplitz
 
-from motorid.integrate.grid import Array
+from motorid.integrate.engine import Array
 
 HIGHEST_ORDER = 30
 

@@ -26,7 +26,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from motorid.errors import FitError, SimulationError
-from motorid.integrate.grid import Array
+from motorid.integrate.engine import Array
 
 
 @dataclass(frozen=True)

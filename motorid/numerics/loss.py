@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from motorid.integrate.grid import Array
+from motorid.integrate.engine import Array
 
 
 @dataclass(frozen=True)

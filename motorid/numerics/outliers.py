@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from scipy.special import stdtrit
 
-from motorid.integrate.grid import Array
+from motorid.integrate.engine import Array
 
 FEWEST = 5  # motors that make a batch
 LEVEL = 0.01  # chance of any false alarm in the whole batch

@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Any, NamedTuple
 
-from motorid.progress import progress
+from motorid.numerics.progress import progress
 
 Map = Callable[..., Iterable[Any]]
 WAVE = 4e6  # bytes of records handed to a pool at once; two waves are under way

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import LinAlgError, solve_toeplitz
 
-from motorid.fit import Fit
-from motorid.integrate.grid import Array
+from motorid.estimation.fit import Fit
+from motorid.integrate.engine import Array
 
 ORDER = 8  # of the autoregressive models
 CLIP = 6.0  # robust standard deviations beyond which a residual is an outlier

@@ -1,12 +1,12 @@
 """Figures, one function per result; the only place that imports matplotlib."""
 
+from motorid.plots.constraints import plot_current_limit, plot_formulations
 from motorid.plots.diagnosis import plot_ladder, plot_missing, plot_ranking
 from motorid.plots.fits import plot_fit, plot_runs
-from motorid.plots.formulations import plot_current_limit, plot_formulations
-from motorid.plots.intervals import plot_profile, plot_singular_values
 from motorid.plots.parameters import plot_parameters
 from motorid.plots.residuals import plot_residuals
 from motorid.plots.trust import plot_sensitivities, plot_waterfall
+from motorid.plots.uncertainty import plot_profile, plot_singular_values
 
 __all__ = [
     "plot_current_limit",

@@ -8,10 +8,9 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
-from motorid.constraints import CurrentLimit
 from motorid.errors import UsageError
-from motorid.fit import Fit
-from motorid.formulations import Formulations
+from motorid.estimation.fit import Fit
+from motorid.estimation.shooting.formulations import Formulations
 from motorid.plots.style import (
     CYCLE,
     INK,
@@ -28,7 +27,8 @@ from motorid.plots.style import (
     styled,
     tidy,
 )
-from motorid.simulate import Simulation
+from motorid.problem.constraints import CurrentLimit
+from motorid.problem.simulate import Simulation
 
 NEAR = 0.5  # of the limit: what is worth a closer look
 

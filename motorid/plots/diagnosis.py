@@ -9,9 +9,9 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from motorid.diagnosis.results import Binned, Candidate, Diagnosis, Ladder, Missing
+from motorid.display.numbers import number
 from motorid.errors import UsageError
-from motorid.formatting import number
-from motorid.integrate.grid import Array
+from motorid.integrate.engine import Array
 from motorid.plots.residuals import scatter
 from motorid.plots.style import (
     CYCLE,

@@ -8,11 +8,10 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
-from motorid.equations import CHANNELS
+from motorid.display.numbers import percent
 from motorid.errors import UsageError
-from motorid.experiment import Experiment
-from motorid.formatting import percent
-from motorid.noise import noise_level
+from motorid.model.equations import CHANNELS
+from motorid.numerics.noise import noise_level
 from motorid.plots.style import (
     INK,
     MEASURED,
@@ -27,7 +26,8 @@ from motorid.plots.style import (
     styled,
     tidy,
 )
-from motorid.simulate import Simulation
+from motorid.problem.simulate import Simulation
+from motorid.records.experiment import Experiment
 
 COLUMNS = 3  # runs side by side at most: more would be unreadable
 

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
-from motorid.equations import CHANNELS
 from motorid.errors import UsageError, one_of
-from motorid.fit import Fit
-from motorid.integrate.grid import Array
+from motorid.estimation.fit import Fit
+from motorid.integrate.engine import Array
+from motorid.model.equations import CHANNELS
 from motorid.plots.style import (
     INK,
     MUTED,
@@ -28,7 +28,7 @@ from motorid.plots.style import (
     styled,
     tidy,
 )
-from motorid.simulate import Simulation
+from motorid.problem.simulate import Simulation
 
 LAGS = 60
 BINS = 24

@@ -16,8 +16,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from motorid.errors import DataError
-from motorid.experiment import Experiment
-from motorid.integrate.grid import Array
+from motorid.integrate.engine import Array
+from motorid.records.experiment import Experiment
 
 __all__ = [
     "CYCLE",

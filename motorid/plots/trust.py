@@ -7,9 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.axes import Axes
 
-from motorid.endings import Ending, Multistart
 from motorid.errors import UsageError, one_of
-from motorid.fit import Fit
+from motorid.estimation.fit import Fit
 from motorid.plots.style import (
     CYCLE,
     MUTED,
@@ -23,6 +22,7 @@ from motorid.plots.style import (
     styled,
     tidy,
 )
+from motorid.uncertainty.endings import Ending, Multistart
 
 _KINDS = {"good": PALETTE["blue"], "poor": PALETTE["orange"], "failed": PALETTE["grey"]}
 

@@ -11,11 +11,9 @@ from matplotlib.ticker import MaxNLocator
 from scipy.interpolate import PchipInterpolator
 from scipy.special import stdtrit
 
+from motorid.display.numbers import number
 from motorid.errors import UsageError
-from motorid.formatting import number
-from motorid.identifiability import Identifiability
-from motorid.integrate.grid import Array
-from motorid.intervals import Intervals
+from motorid.integrate.engine import Array
 from motorid.plots.style import (
     INK,
     MUTED,
@@ -29,7 +27,9 @@ from motorid.plots.style import (
     styled,
     tidy,
 )
-from motorid.profiling import Profile
+from motorid.uncertainty.identifiability import Identifiability
+from motorid.uncertainty.intervals import Intervals
+from motorid.uncertainty.profile import Profile
 
 LEVEL = 0.95
 

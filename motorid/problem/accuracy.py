@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from motorid.integrate.grid import Array, Trajectory
-from motorid.residuals import Measured
+from motorid.integrate.engine import Array, Trajectory
+from motorid.problem.residuals import Measured
 
 NOISE_SHARE = 0.03  # local integration error over the noise
 MISFIT_SHARE = 0.1  # of the misfit, where it is what the noise would be

@@ -7,10 +7,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from motorid.equations import CHANNELS
 from motorid.errors import UsageError, one_of
-from motorid.experiment import Experiment
-from motorid.integrate.grid import Array
+from motorid.integrate.engine import Array
+from motorid.model.equations import CHANNELS
+from motorid.records.experiment import Experiment
 
 INITIAL = ("auto", "rest", "measured", "estimate")
 REACH = 8.0  # standard deviations that an estimated initial state may lie away from its first samples

@@ -15,9 +15,9 @@ import casadi as ca
 import numpy as np
 
 from motorid.errors import ModelError, UsageError
-from motorid.integrate.grid import Array
-from motorid.relations import Part, Relation, check_weight, local, share
-from motorid.steady import Segment, find_segments, segment_between
+from motorid.integrate.engine import Array
+from motorid.problem.relations import Part, Relation, check_weight, local, share
+from motorid.records.steady_state import Segment, find_segments, segment_between
 
 FEWEST = 64  # samples of a steady segment that are looked at; its means use all
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from motorid.errors import SimulationError
-from motorid.integrate.grid import Array
-from motorid.problem import Problem
+from motorid.integrate.engine import Array
+from motorid.problem.problem import Problem
 
 LEAST_FACTOR = 0.02  # a quick channel with few samples per time constant passes for noisy
 EXPLAINED = 0.25  # NRMSE above which a channel counts as hardly explained

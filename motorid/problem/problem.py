@@ -9,18 +9,18 @@ from typing import Any
 
 import numpy as np
 
-from motorid.accuracy import Levels
 from motorid.errors import ModelError, SimulationError, UsageError, one_of
-from motorid.experiment import Experiment
 from motorid.integrate import Engine, Trajectory, engine_of
-from motorid.integrate.grid import Array
-from motorid.loss import Huber
-from motorid.model import Model
-from motorid.parameters import Parameter, Scaling
-from motorid.prepared import Run, channels_of, noise_of, prepare_run, smoothing, with_inputs
-from motorid.residuals import Measured, prior_residual
-from motorid.system import System
-from motorid.unknowns import Point, Unknowns
+from motorid.integrate.engine import Array
+from motorid.model.definition import Parameter, Scaling
+from motorid.model.model import Model
+from motorid.model.system import System
+from motorid.numerics.loss import Huber
+from motorid.problem.accuracy import Levels
+from motorid.problem.residuals import Measured, prior_residual
+from motorid.problem.runs import Run, channels_of, noise_of, prepare_run, smoothing, with_inputs
+from motorid.problem.unknowns import Point, Unknowns
+from motorid.records.experiment import Experiment
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,7 +17,7 @@ import casadi as ca
 import numpy as np
 
 from motorid.errors import UsageError
-from motorid.integrate.grid import Array, Trajectory
+from motorid.integrate.engine import Array, Trajectory
 
 
 @dataclass(frozen=True, eq=False)

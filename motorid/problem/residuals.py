@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from motorid.errors import SimulationError
-from motorid.integrate.grid import Array, Trajectory
-from motorid.prepared import Run
-from motorid.unknowns import Point, Unknowns
+from motorid.integrate.engine import Array, Trajectory
+from motorid.problem.runs import Run
+from motorid.problem.unknowns import Point, Unknowns
 
 LARGEST_SLOPE = 1e100  # of an output; beyond it the numbers mean nothing
 

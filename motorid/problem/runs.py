@@ -10,13 +10,13 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from motorid.beginning import beginning, slopes
-from motorid.equations import CHANNELS
 from motorid.errors import ModelError
-from motorid.experiment import Experiment
-from motorid.integrate.grid import Array, Grid
-from motorid.noise import noise_level
-from motorid.parameters import Parameter
+from motorid.integrate.engine import Array, Grid
+from motorid.model.definition import Parameter
+from motorid.model.equations import CHANNELS
+from motorid.numerics.noise import noise_level
+from motorid.problem.beginning import beginning, slopes
+from motorid.records.experiment import Experiment
 
 # A record is frozen, and so are its noise and its size.
 _levels: WeakKeyDictionary[Experiment, dict[str, float]] = WeakKeyDictionary()

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from motorid.errors import UsageError
-from motorid.integrate.grid import Array
-from motorid.problem import Problem
+from motorid.integrate.engine import Array
+from motorid.problem.problem import Problem
 
 if TYPE_CHECKING:
     from pandas import DataFrame

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from motorid.integrate.grid import Array
-from motorid.problem import Problem
+from motorid.integrate.engine import Array
+from motorid.problem.problem import Problem
 
 
 def relative_jacobian(problem: Problem, q: Array) -> Array:

@@ -8,15 +8,15 @@ from typing import Any
 
 import numpy as np
 
-from motorid.display import Shown
-from motorid.equations import CHANNELS
+from motorid.display.display import Shown
 from motorid.errors import FitError
-from motorid.experiment import Experiment
 from motorid.integrate import Engine
-from motorid.integrate.grid import Array
-from motorid.model import Model
-from motorid.problem import Problem, as_problem
-from motorid.steady import find_segments
+from motorid.integrate.engine import Array
+from motorid.model.equations import CHANNELS
+from motorid.model.model import Model
+from motorid.problem.problem import Problem, as_problem
+from motorid.records.experiment import Experiment
+from motorid.records.steady_state import find_segments
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +93,7 @@ def simulated(problem: Problem, estimate_initial: bool = True) -> tuple[Simulati
     q = held.start
     held = held.refined(q)
     if len(q) and estimate_initial:
-        from motorid.least_squares import LevenbergMarquardt, levenberg_marquardt
+        from motorid.numerics.least_squares import LevenbergMarquardt, levenberg_marquardt
 
         try:
             q = levenberg_marquardt(held.residual, held.residual_and_jacobian, q,

@@ -10,11 +10,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from motorid.equations import CHANNELS
-from motorid.integrate.grid import Array
-from motorid.parameters import Parameter, Scaling
-from motorid.prepared import Run, natural_sizes, spread_of
-from motorid.system import System
+from motorid.integrate.engine import Array
+from motorid.model.definition import Parameter, Scaling
+from motorid.model.equations import CHANNELS
+from motorid.model.system import System
+from motorid.problem.runs import Run, natural_sizes, spread_of
 
 STATE_UNITS = {"i": "A", "omega": "rad/s", "theta": "rad"}
 

@@ -10,9 +10,9 @@ from collections.abc import Iterator
 import numpy as np
 
 from motorid.errors import DataError, MissingDependency
-from motorid.experiment import MIN_SAMPLES
-from motorid.matfile import check_whole
-from motorid.table import Table, counted, numbers, unique_labels
+from motorid.records.experiment import MIN_SAMPLES
+from motorid.records.matfile import check_whole
+from motorid.records.text_tables import Table, counted, numbers, unique_labels
 
 __all__ = ["mat_table", "parquet_table"]
 

@@ -8,9 +8,16 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from motorid.experiment import Experiment
-from motorid.noise import noise_level, quantum
-from motorid.plausibility import angle_against_speed, implied_constants, magnitudes, signs, swapped_columns, unsigned
+from motorid.numerics.noise import noise_level, quantum
+from motorid.records.experiment import Experiment
+from motorid.records.plausibility import (
+    angle_against_speed,
+    implied_constants,
+    magnitudes,
+    signs,
+    swapped_columns,
+    unsigned,
+)
 
 __all__ = ["check_runs", "current_limit"]
 

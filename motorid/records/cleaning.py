@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from motorid.errors import DataError
-from motorid.experiment import MIN_SAMPLES, Experiment
-from motorid.layout import Layout, Place
-from motorid.repairs import unwrapped
-from motorid.table import counted
+from motorid.records.experiment import MIN_SAMPLES, Experiment
+from motorid.records.layout import Layout, Place
+from motorid.records.preprocessing import unwrapped
+from motorid.records.text_tables import counted
 
 __all__ = ["build"]
 

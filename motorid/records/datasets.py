@@ -9,14 +9,14 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from .errors import DataError, one_of
+from motorid.errors import DataError, one_of
 
 _PLANT = "motorid_plant"
 
 
 def _root() -> Path:
     """The data folder of a checkout (beside the package) or of an installed wheel (inside it)."""
-    package = Path(__file__).resolve().parent
+    package = Path(__file__).resolve().parents[1]
     places = (package.parent / "data", package / "data")
     for place in places:
         if (place / "truth.json").is_file():

@@ -13,9 +13,9 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from motorid import repairs
-from motorid.display import Shown
+from motorid.display.display import Shown
 from motorid.errors import DataError, UsageError, one_of
+from motorid.records import preprocessing as repairs
 
 __all__ = ["INPUTS", "MIN_SAMPLES", "OUTPUTS", "UNITS", "Experiment", "split"]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 
-from motorid.units import DIMENSIONS, Unit, parse_unit
+from motorid.records.units import DIMENSIONS, Unit, parse_unit
 
 __all__ = ["Candidate", "classify", "is_duty", "is_supply", "unit_in"]
 

@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from motorid.errors import DataError, UsageError, one_of
-from motorid.headers import classify, is_duty, is_supply, unit_in
-from motorid.units import DIMENSIONS, SI, Unit, parse_unit, require_unit
+from motorid.records.headers import classify, is_duty, is_supply, unit_in
+from motorid.records.units import DIMENSIONS, SI, Unit, parse_unit, require_unit
 
 __all__ = ["Layout", "Place", "assign", "parse_pairs"]
 

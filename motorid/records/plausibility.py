@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from motorid.experiment import Experiment
-from motorid.noise import noise_level
+from motorid.numerics.noise import noise_level
+from motorid.records.experiment import Experiment
 
 __all__ = ["angle_against_speed", "implied_constants", "magnitudes", "signs", "swapped_columns", "unsigned"]
 

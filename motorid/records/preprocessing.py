@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from motorid.errors import UsageError
-from motorid.noise import noise_level
+from motorid.numerics.noise import noise_level
 
 if TYPE_CHECKING:
-    from motorid.experiment import Experiment
+    from motorid.records.experiment import Experiment
 
 Array = NDArray[np.float64]
 

@@ -13,11 +13,11 @@ from pathlib import Path
 import numpy as np
 
 from motorid.errors import DataError, UsageError, one_of
-from motorid.experiment import Experiment
-from motorid.formats import mat_table, parquet_table
-from motorid.layout import assign, parse_pairs
-from motorid.rows import build
-from motorid.table import Table, parse_table
+from motorid.records.binary_tables import mat_table, parquet_table
+from motorid.records.cleaning import build
+from motorid.records.experiment import Experiment
+from motorid.records.layout import assign, parse_pairs
+from motorid.records.text_tables import Table, parse_table
 
 __all__ = ["RECORDS", "find_records", "read_csv", "read_mat", "read_parquet", "read_runs", "write_csv"]
 

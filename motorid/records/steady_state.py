@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from motorid.experiment import Experiment
-from motorid.integrate.grid import Array
+from motorid.integrate.engine import Array
+from motorid.records.experiment import Experiment
 
 LEAST = 16  # samples
 INPUT_SHARE = 0.02  # of the largest input: how far a held input may wander, and below which it counts as off

@@ -12,9 +12,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from motorid.dialect import MISSING, Dialect, decode, is_data, sniff
 from motorid.errors import DataError
-from motorid.units import parse_unit
+from motorid.records.dialect import MISSING, Dialect, decode, is_data, sniff
+from motorid.records.units import parse_unit
 
 __all__ = ["Table", "counted", "numbers", "parse_table", "unique_labels"]
 

@@ -6,15 +6,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from motorid import _sections as sections
-from motorid._cards import card_of
-from motorid._html import Flag
-from motorid._html_tables import NAMES
-from motorid._sections import Section
 from motorid.diagnosis.results import Diagnosis, Ladder
-from motorid.experiment import Experiment
-from motorid.fit import Fit
-from motorid.formatting import duration, percent
+from motorid.display._cards import card_of
+from motorid.display._html_tables import NAMES
+from motorid.display.cards import Flag
+from motorid.display.numbers import duration, percent
+from motorid.estimation.fit import Fit
+from motorid.records.experiment import Experiment
+from motorid.reports import sections
+from motorid.reports.sections import Section
 
 
 @dataclass

@@ -7,18 +7,18 @@ from typing import Any
 
 import numpy as np
 
-from motorid._html import Card, render
-from motorid._html_tables import counted, error_table, model_name
+from motorid.display._html_tables import counted, error_table, model_name
+from motorid.display.cards import Card, render
+from motorid.display.numbers import duration
 from motorid.effects import LIBRARY, get
 from motorid.errors import MissingDependency, ModelError, MotoridError, UsageError
-from motorid.experiment import Experiment
-from motorid.fit import Fit, fit
-from motorid.formatting import duration
-from motorid.model import Effect, Model
-from motorid.parameters import Parameter
-from motorid.problem import Problem
-from motorid.simulate import evaluate
-from motorid.starting import with_suited_effects
+from motorid.estimation.fit import Fit, fit
+from motorid.estimation.start_values import with_suited_effects
+from motorid.model.definition import Parameter
+from motorid.model.model import Effect, Model
+from motorid.problem.problem import Problem
+from motorid.problem.simulate import evaluate
+from motorid.records.experiment import Experiment
 
 __all__ = ["Explorer", "explore"]
 

@@ -10,9 +10,9 @@ from importlib.metadata import version as version_of
 from pathlib import Path
 from typing import Any
 
-from motorid._html import Table
-from motorid._story import Section, Story, tell
+from motorid.display.cards import Table
 from motorid.errors import UsageError
+from motorid.reports._story import Section, Story, tell
 
 __all__ = ["report"]
 
@@ -64,7 +64,7 @@ def _page(story: Story) -> str:
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
     environment = Environment(
-        loader=PackageLoader("motorid", "templates"),
+        loader=PackageLoader("motorid.reports", "templates"),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,

@@ -6,9 +6,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from motorid._cards import card_of
-from motorid._html import Table
-from motorid._html_tables import (
+from motorid.diagnosis.results import Diagnosis, Ladder
+from motorid.display._cards import card_of
+from motorid.display._html_tables import (
     NAMES,
     counted,
     error_table,
@@ -17,13 +17,13 @@ from motorid._html_tables import (
     parameter_table,
     ranking_table,
 )
-from motorid.checks import check_runs
-from motorid.diagnosis.results import Diagnosis, Ladder
-from motorid.experiment import Experiment
-from motorid.fit import Fit
-from motorid.formatting import duration, number, percent
-from motorid.simulate import evaluate
-from motorid.uncertainty import deviations
+from motorid.display.cards import Table
+from motorid.display.numbers import duration, number, percent
+from motorid.estimation.fit import Fit
+from motorid.problem.simulate import evaluate
+from motorid.records.checks import check_runs
+from motorid.records.experiment import Experiment
+from motorid.uncertainty.covariance import deviations
 
 
 @dataclass(frozen=True)
@@ -203,7 +203,7 @@ def _figure(
     small: bool = False,
     **options: Any,
 ) -> Figure:
-    from motorid.plots.svg import svg_of
+    from motorid.reports.svg import svg_of
 
     return Figure(svg_of(draw, *args, name=name, alt=alt, **options), caption, small)
 

@@ -12,16 +12,16 @@ from typing import Any
 
 import numpy as np
 
+from motorid.display.tables import Table
 from motorid.errors import DataError, FitError, MissingDependency, UsageError
-from motorid.experiment import Experiment
-from motorid.fit import Fit, fit
-from motorid.journal import Journal, fingerprint
-from motorid.model import Model
-from motorid.outliers import Outlier, outliers
-from motorid.reading import find_records, read_runs
-from motorid.tables import Table
-from motorid.tasks import Map, Parcel, in_chunks, run_tasks
-from motorid.uncertainty import covariance
+from motorid.estimation.fit import Fit, fit
+from motorid.model.model import Model
+from motorid.numerics.outliers import Outlier, outliers
+from motorid.numerics.parallel import Map, Parcel, in_chunks, run_tasks
+from motorid.records.experiment import Experiment
+from motorid.records.reading import find_records, read_runs
+from motorid.uncertainty.covariance import covariance
+from motorid.uncertainty.journal import Journal, fingerprint
 
 Records = Sequence[Experiment] | Experiment | str | Path | Sequence[str | Path]
 POOR = 3.0  # misfit over noise from which a row is flagged

@@ -11,19 +11,19 @@ from typing import Any
 
 import numpy as np
 
-from motorid.coloured import Colour, colour_of
-from motorid.descent import descend
-from motorid.display import Shown
+from motorid.display.display import Shown
+from motorid.display.numbers import number, with_error
+from motorid.display.tables import Table
 from motorid.errors import FitError, MotoridError, UsageError, one_of
-from motorid.experiment import Experiment
-from motorid.fit import Failure, Fit
-from motorid.formatting import number, with_error
-from motorid.integrate.grid import Array
-from motorid.least_squares import LevenbergMarquardt
-from motorid.problem import Problem
-from motorid.tables import Table
-from motorid.tasks import Map, Parcel, in_chunks, run_tasks
-from motorid.uncertainty import covariance, interval_text
+from motorid.estimation.continuation import descend
+from motorid.estimation.fit import Failure, Fit
+from motorid.integrate.engine import Array
+from motorid.numerics.autoregression import Colour, colour_of
+from motorid.numerics.least_squares import LevenbergMarquardt
+from motorid.numerics.parallel import Map, Parcel, in_chunks, run_tasks
+from motorid.problem.problem import Problem
+from motorid.records.experiment import Experiment
+from motorid.uncertainty.covariance import covariance, interval_text
 
 KINDS = ("blocks", "parametric", "runs")
 # Blocks lose the likeness across their joints: the variance comes out too small by about one over this.

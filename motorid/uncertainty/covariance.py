@@ -10,14 +10,14 @@ from typing import Any
 import numpy as np
 from scipy.special import stdtrit
 
-from motorid.coloured import Colour, colour_of, weighed
-from motorid.display import Shown
+from motorid.display.display import Shown
+from motorid.display.numbers import number, with_error
+from motorid.display.tables import Table
 from motorid.errors import UsageError, one_of
-from motorid.fit import UNDETERMINED, Fit
-from motorid.formatting import number, with_error
-from motorid.integrate.grid import Array
-from motorid.least_squares import gauss_newton_covariance
-from motorid.tables import Table
+from motorid.estimation.fit import UNDETERMINED, Fit
+from motorid.integrate.engine import Array
+from motorid.numerics.autoregression import Colour, colour_of, weighed
+from motorid.numerics.least_squares import gauss_newton_covariance
 
 WIDE = 0.8  # of the value: an interval that reaches farther down is made on the logarithmic scale
 METHODS = ("coloured", "white")

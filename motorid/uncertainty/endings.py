@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from motorid.display import Shown
-from motorid.fit import Failure, Fit
-from motorid.formatting import duration, number, percent
-from motorid.tables import Table
+from motorid.display.display import Shown
+from motorid.display.numbers import duration, number, percent
+from motorid.display.tables import Table
+from motorid.estimation.fit import Failure, Fit
 
 COST_SHARE = 1e-3  # a good fit's cost is at most this much above the best
 # A good fit's parameters are within this many standard deviations of the best: the integration, accurate to a

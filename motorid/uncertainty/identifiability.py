@@ -15,17 +15,17 @@ from typing import Any
 
 import numpy as np
 
-from motorid.combinations import basis_in_words, monomials
-from motorid.display import Shown
+from motorid.display.display import Shown
+from motorid.display.numbers import number, quantity
+from motorid.display.tables import Table
 from motorid.errors import SimulationError, UsageError
-from motorid.fit import UNDETERMINED, Fit
-from motorid.formatting import number, quantity
-from motorid.integrate.grid import Array
-from motorid.problem import Problem
-from motorid.remedies import remedies
-from motorid.sensitivity import relative_jacobian, relative_sensitivities
-from motorid.starting import started
-from motorid.tables import Table
+from motorid.estimation.fit import UNDETERMINED, Fit
+from motorid.estimation.start_values import started
+from motorid.integrate.engine import Array
+from motorid.problem.problem import Problem
+from motorid.problem.sensitivity_part import relative_jacobian, relative_sensitivities
+from motorid.uncertainty.remedies import remedies
+from motorid.uncertainty.weak_directions import basis_in_words, monomials
 
 STRUCTURAL = 1e-7  # of the largest singular value, columns of equal length: less is no influence
 LEVEL = 1.0 / UNDETERMINED  # singular value below which a factor of e drowns in the noise

@@ -6,14 +6,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from motorid.bootstrap import Bootstrap, bootstrap
-from motorid.display import Shown
-from motorid.fit import Fit
-from motorid.formatting import number
-from motorid.profiling import Profile, profiles
-from motorid.tables import Table
-from motorid.tasks import Map
-from motorid.uncertainty import Covariance, covariance, interval_text
+from motorid.display.display import Shown
+from motorid.display.numbers import number
+from motorid.display.tables import Table
+from motorid.estimation.fit import Fit
+from motorid.numerics.parallel import Map
+from motorid.uncertainty.bootstrap import Bootstrap, bootstrap
+from motorid.uncertainty.covariance import Covariance, covariance, interval_text
+from motorid.uncertainty.profile import Profile, profiles
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 
 from motorid.errors import DataError
-from motorid.experiment import Experiment
-from motorid.model import Model
-from motorid.reading import find_records
+from motorid.model.model import Model
+from motorid.records.experiment import Experiment
+from motorid.records.reading import find_records
 
 
 class Journal:

@@ -13,15 +13,15 @@ from typing import Any
 
 import numpy as np
 
-from motorid.balancing import descend_balanced
-from motorid.endings import Ending, Multistart
 from motorid.errors import MotoridError, SimulationError, UsageError
-from motorid.fit import Failure, Fit, solve, started
-from motorid.integrate.grid import Array
-from motorid.least_squares import LevenbergMarquardt
-from motorid.problem import Problem
-from motorid.simulate import at, judge
-from motorid.tasks import Map, Parcel, in_chunks, run_tasks
+from motorid.estimation.balancing import descend_balanced
+from motorid.estimation.fit import Failure, Fit, solve, started
+from motorid.integrate.engine import Array
+from motorid.numerics.least_squares import LevenbergMarquardt
+from motorid.numerics.parallel import Map, Parcel, in_chunks, run_tasks
+from motorid.problem.problem import Problem
+from motorid.problem.simulate import at, judge
+from motorid.uncertainty.endings import Ending, Multistart
 
 
 def multistart(

@@ -15,16 +15,16 @@ from typing import Any
 import numpy as np
 from scipy.special import stdtrit
 
-from motorid.descent import descend
-from motorid.display import Shown
+from motorid.display.display import Shown
+from motorid.display.numbers import number
 from motorid.errors import MotoridError, UsageError, one_of
-from motorid.fit import Fit
-from motorid.formatting import number
-from motorid.integrate.grid import Array
-from motorid.least_squares import LevenbergMarquardt, gauss_newton_covariance
-from motorid.problem import Problem
-from motorid.tasks import Map, Parcel, run_tasks
-from motorid.uncertainty import covariance, interval_text
+from motorid.estimation.continuation import descend
+from motorid.estimation.fit import Fit
+from motorid.integrate.engine import Array
+from motorid.numerics.least_squares import LevenbergMarquardt, gauss_newton_covariance
+from motorid.numerics.parallel import Map, Parcel, run_tasks
+from motorid.problem.problem import Problem
+from motorid.uncertainty.covariance import covariance, interval_text
 
 FARTHEST = np.log(1e4)  # on the logarithmic scale; beyond it a parameter counts as not limited
 MOST = 30  # points per side

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 
 from motorid.errors import MotoridError
-from motorid.experiment import Experiment
-from motorid.integrate.grid import Array
-from motorid.model import Model
-from motorid.problem import Problem
-from motorid.sensitivity import relative_jacobian
-from motorid.simulate import simulate
+from motorid.integrate.engine import Array
+from motorid.model.model import Model
+from motorid.problem.problem import Problem
+from motorid.problem.sensitivity_part import relative_jacobian
+from motorid.problem.simulate import simulate
+from motorid.records.experiment import Experiment
 
 ASSUMED_NOISE = 0.01  # of a channel's RMS, where a plan does not say
 EASY = ("R", "K", "g", "L", "b", "J")  # in the order in which they are usually known beforehand

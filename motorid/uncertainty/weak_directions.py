@@ -7,7 +7,7 @@ from itertools import combinations, product
 
 import numpy as np
 
-from motorid.integrate.grid import Array
+from motorid.integrate.engine import Array
 
 SHOWN = 0.05  # relative to the largest: smaller parts of a direction do not make it another one
 SPOKEN = 0.005  # smaller parts are not worth a word

@@ -15,9 +15,9 @@ from hypothesis import strategies as st
 
 from motorid.acquire.calibration import calibrate, read_calibration
 from motorid.acquire.excitation import Program, Segment, lfsr_bits, program
-from motorid.acquire.ledger import Ledger, Row
 from motorid.acquire.protocol import Channel, Decoder, Header, Message, Sample, crc16, frame
-from motorid.acquire.runfile import RunFile, check_target, column, read_tail
+from motorid.acquire.record_file import RunFile, check_target, column, read_tail
+from motorid.acquire.timeline import Ledger, Row
 from motorid.errors import DataError, DeviceError, UsageError
 
 CHANNELS = (Channel("v", "V", 1e-3), Channel("i", "A", 0.005, 2048, "a12"),
@@ -443,9 +443,9 @@ def test_only_a_record_of_ours_is_continued(tmp_path):
 FULL_DISK = """
 import resource, signal, sys
 from pathlib import Path
-from motorid.acquire.ledger import Row
+from motorid.acquire.timeline import Row
 from motorid.acquire.protocol import Channel
-from motorid.acquire.runfile import RunFile
+from motorid.acquire.record_file import RunFile
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))
 file = RunFile(Path(sys.argv[1]), (Channel("v", "V"), Channel("i", "A")), 1000.0, {})

@@ -328,7 +328,7 @@ def test_a_bug_in_the_progress_function_stops_the_motor(out):
 
 
 def test_progress_tells_rate_losses_and_last_values(out, monkeypatch):
-    monkeypatch.setattr("motorid.acquire.run.LOOK", 0.0)
+    monkeypatch.setattr("motorid.acquire.session.LOOK", 0.0)
     seen = []
     wire = Wire(Faults(drop=0.1), np.random.default_rng(0))
     record(MemoryLink(device(), wire, step=20), out, excite="step:6:0.5", progress=seen.append)
@@ -442,7 +442,7 @@ def test_nothing_in_the_record_gives_the_secret_away(out):
 
 # --------------------------------------------------------------------- processes and real pseudo-terminals
 
-MAIN = (sys.executable, "-W", "error", "-m", "motorid.cli")
+MAIN = (sys.executable, "-W", "error", "-m", "motorid.cli.app")
 
 
 def start(*words: object) -> subprocess.Popen[str]:
@@ -618,7 +618,7 @@ def test_faults_on_the_wire_are_counted_over_the_pseudo_terminal_too(out):
 
 def test_where_there_are_no_pseudo_terminals_a_loopback_socket_serves(out, monkeypatch):
     from motorid.acquire.ends import LOOPBACK, Socket, open_end
-    from motorid.acquire.serve import Pace, serve
+    from motorid.acquire.server import Pace, serve
 
     monkeypatch.delattr(os, "openpty", raising=False)
     end = open_end()

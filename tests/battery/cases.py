@@ -14,8 +14,8 @@ from plant_truth import in_library_words
 
 from battery.excite import DT, P, driven, record
 from motorid.effects import LIBRARY
-from motorid.experiment import Experiment
-from motorid.model import Model, dc_motor
+from motorid.model.model import Model, dc_motor
+from motorid.records.experiment import Experiment
 
 ANGLE = ("i", "omega", "theta")
 

@@ -21,9 +21,9 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import numpy as np
 
 import motorid as mi
-from motorid.integrate import compile as cc
+from motorid.integrate import compiled as cc
 from motorid.integrate.rosenbrock import stepper
-from motorid.problem import Problem
+from motorid.problem.problem import Problem
 
 VALUES = {"R": 1.38, "L": 1.72e-3, "K": 0.0462, "b": 6.5e-5, "J": 2.35e-5}
 MODELS = {

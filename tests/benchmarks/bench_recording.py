@@ -17,7 +17,7 @@ import tempfile
 import time
 from pathlib import Path
 
-MAIN = (sys.executable, "-m", "motorid.cli")
+MAIN = (sys.executable, "-m", "motorid.cli.app")
 
 
 def cpu(pid: int) -> float:

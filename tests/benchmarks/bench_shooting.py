@@ -8,8 +8,8 @@ import time
 import numpy as np
 
 import motorid as mi
-from motorid.datasets import truth
 from motorid.errors import FitError
+from motorid.records.datasets import truth
 
 SHIPPED = ("two_step_noisy", "two_step_small")
 

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 from command import motorid, motorid_json
 
-from motorid.cli import app
-from motorid.cli_common import _spread
-from motorid.datasets import data_path, truth
-from motorid.reading import read_runs, write_csv
+from motorid.cli.app import app
+from motorid.cli.console import _spread
+from motorid.records.datasets import data_path, truth
+from motorid.records.reading import read_runs, write_csv
 
 FRICTION = data_path("hidden_friction")
 STEPS = data_path("two_step")

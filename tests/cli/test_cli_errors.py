@@ -12,9 +12,9 @@ import pytest
 from broken_inputs import BROKEN, Broken
 from command import Done, motorid
 
-from motorid import cli_options
-from motorid.datasets import data_path
+from motorid.cli import options as cli_options
 from motorid.errors import FitError, MissingDependency, SimulationError
+from motorid.records.datasets import data_path
 
 RUN = data_path("two_step") / "step_6V.csv"
 

@@ -8,7 +8,7 @@ from plant_truth import NUMBERS, in_library_words
 from scipy.integrate import solve_ivp
 
 from motorid.effects import LIBRARY
-from motorid.model import dc_motor
+from motorid.model.model import dc_motor
 
 # Root mean square of the difference over that of the signal. What is not exact in the library, and why:
 # sgn is smoothed; the delay is a Padé approximation; in a smoothed gap the damping can pull for a moment.

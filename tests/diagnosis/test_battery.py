@@ -14,7 +14,7 @@ from battery.score import figures, run_case
 
 from motorid.effects import LIBRARY
 
-HERE = Path(__file__).parent
+HERE = Path(__file__).parents[1]
 PART = ("magnetic_saturation", "coulomb_coloured", "driver_dead_band+magnetic_saturation", "none_outliers", "cam")
 
 

@@ -12,17 +12,17 @@ from battery.cases import CASES
 from battery.excite import driven, record
 
 import motorid as mi
-from motorid.diagnosis import adequacy
-from motorid.diagnosis.evidence import Errors, autocorrelation, compare_errors, effective_samples
-from motorid.diagnosis.orders import highest_order, likely_orders
-from motorid.diagnosis.rank import rank, score
-from motorid.diagnosis.tangent import Tangent
+from motorid.diagnosis.adequacy import adequacy
+from motorid.diagnosis.residual_analysis import Errors, autocorrelation, compare_errors, effective_samples
+from motorid.diagnosis.score_test import rank, score
 from motorid.diagnosis.verdict import moves
+from motorid.display.numbers import with_error
 from motorid.effects import LIBRARY
 from motorid.errors import FitError, ModelError, UsageError
-from motorid.experiment import Experiment
-from motorid.formatting import with_error
-from motorid.uncertainty import deviations
+from motorid.estimation.angle_orders import highest_order, likely_orders
+from motorid.estimation.tangent import Tangent
+from motorid.records.experiment import Experiment
+from motorid.uncertainty.covariance import deviations
 
 FEW = ("coulomb", "brush_drop", "constant_load", "quadratic_drag", "speed_lag")
 ANGLE = ("i", "omega", "theta")

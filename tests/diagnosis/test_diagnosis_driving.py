@@ -10,8 +10,8 @@ from battery.excite import P
 from command import motorid_json
 
 import motorid as mi
-from motorid.diagnosis.driving import better_reading
-from motorid.reading import write_csv
+from motorid.diagnosis.input_hypotheses import better_reading
+from motorid.records.reading import write_csv
 
 FINE = 8  # steps of the plant per sample
 

@@ -10,15 +10,15 @@ from battery.excite import driven, record
 
 import motorid as mi
 from motorid.diagnosis import parts
-from motorid.diagnosis.objections import objections
-from motorid.diagnosis.orders import likely_lines, spectrum
-from motorid.diagnosis.rank import score
+from motorid.diagnosis.admissibility import objections
+from motorid.diagnosis.candidates import Search, library
+from motorid.diagnosis.refit import refit
 from motorid.diagnosis.resolvable import samples_within, unresolved
-from motorid.diagnosis.search import Search, library
-from motorid.diagnosis.tangent import Tangent
-from motorid.diagnosis.trial import refit
-from motorid.diagnosis.whitening import Whitening
+from motorid.diagnosis.score_test import score
 from motorid.effects import LIBRARY
+from motorid.estimation.angle_orders import likely_lines, spectrum
+from motorid.estimation.tangent import Tangent
+from motorid.numerics.whitening import Whitening
 
 ANGLE = ("i", "omega", "theta")
 

@@ -7,11 +7,11 @@ import pytest
 from battery.excite import driven, record
 
 import motorid as mi
-from motorid.diagnosis import orders
-from motorid.diagnosis.response import Response
-from motorid.diagnosis.tangent import Tangent
-from motorid.diagnosis.whitening import ORDER, Whitening
 from motorid.effects import LIBRARY
+from motorid.estimation import angle_orders as orders
+from motorid.estimation.linearisation import Response
+from motorid.estimation.tangent import Tangent
+from motorid.numerics.whitening import ORDER, Whitening
 
 
 def some(rng, n=40, nx=3, ny=2):

@@ -10,11 +10,11 @@ import pytest
 from battery.excite import driven, record
 
 import motorid as mi
-from motorid.diagnosis.forms import linearised
-from motorid.diagnosis.held import HeldOut
-from motorid.diagnosis.outside import outside
+from motorid.diagnosis.cross_validation import HeldOut
+from motorid.diagnosis.form_regression import linearised
+from motorid.diagnosis.misspecification import outside
 from motorid.diagnosis.remainders import far
-from motorid.experiment import Experiment
+from motorid.records.experiment import Experiment
 
 ANGLE = ("i", "omega", "theta")
 FRICTION = ("coulomb", "coulomb_asymmetric", "constant_load", "quadratic_drag")

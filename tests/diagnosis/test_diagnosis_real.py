@@ -5,11 +5,11 @@ from __future__ import annotations
 import pytest
 
 import motorid as mi
-from motorid.diagnosis.orders import likely_orders
-from motorid.diagnosis.rank import score
-from motorid.diagnosis.tangent import Tangent
+from motorid.diagnosis.score_test import score
 from motorid.effects import LIBRARY
-from motorid.experiment import split
+from motorid.estimation.angle_orders import likely_orders
+from motorid.estimation.tangent import Tangent
+from motorid.records.experiment import split
 
 pytestmark = pytest.mark.slow
 FRICTION = ("coulomb", "coulomb_asymmetric", "constant_load", "driver_dead_band", "load_friction", "quadratic_drag")

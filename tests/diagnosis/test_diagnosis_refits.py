@@ -8,15 +8,18 @@ import pytest
 from battery.excite import driven, record
 
 import motorid as mi
-from motorid.diagnosis import held, parts, search, tournament, trial
-from motorid.diagnosis import rank as ranking
-from motorid.diagnosis.objections import objections
-from motorid.diagnosis.revival import let_go, revived
+from motorid.diagnosis import candidates as search
+from motorid.diagnosis import cross_validation as held
+from motorid.diagnosis import parts, tournament
+from motorid.diagnosis import refit as trial
+from motorid.diagnosis import score_test as ranking
+from motorid.diagnosis.admissibility import objections
 from motorid.diagnosis.verdict import measured_angle_remark
 from motorid.effects import LIBRARY
-from motorid.plateaus import ALIVE
-from motorid.problem import Problem
-from motorid.simulate import simulate
+from motorid.estimation.restarts import ALIVE
+from motorid.estimation.revival import let_go, revived
+from motorid.problem.problem import Problem
+from motorid.problem.simulate import simulate
 
 TRUE = {"R": 1.2, "L": 2e-3, "K": 0.05, "b": 2e-5, "J": 3e-5}
 
@@ -236,7 +239,7 @@ def test_a_driver_that_limits_the_current_is_no_effect_of_the_motor(monkeypatch)
     assert (found.verdict, found.effects) == ("unexplained", ())
     assert "a current limit of the driver?" in found.text
     # Whatever the other rules say of what then seems to help.
-    improve = importlib.import_module("motorid.diagnosis.improve")
+    improve = importlib.import_module("motorid.diagnosis.stepwise")
     monkeypatch.setattr(improve, "outside", lambda steps, held: None)
     monkeypatch.setattr(improve, "hardly_moved", lambda path, noise: "")
     again = mi.diagnose(fit, runs[2:], effects=tried)

@@ -8,10 +8,10 @@ from battery.cases import CASES
 from battery.excite import driven, record
 
 import motorid as mi
-from motorid.diagnosis.rank import score
-from motorid.diagnosis.tangent import Tangent
+from motorid.diagnosis.score_test import score
 from motorid.effects import LIBRARY
-from motorid.experiment import Experiment
+from motorid.estimation.tangent import Tangent
+from motorid.records.experiment import Experiment
 
 ANGLE = ("i", "omega", "theta")
 

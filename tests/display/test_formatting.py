@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from motorid.formatting import duration, number, percent, quantity, with_error
+from motorid.display.numbers import duration, number, percent, quantity, with_error
 
 
 @pytest.mark.parametrize(("value", "std", "unit", "text"), [

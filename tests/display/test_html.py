@@ -1,6 +1,6 @@
 """Display in notebooks: what is shown is in golden files, nothing is computed to show it.
 
-After a wanted change: ``MOTORID_UPDATE_GOLDEN=1 pytest tests/test_html.py``, then look at the difference.
+After a wanted change: ``MOTORID_UPDATE_GOLDEN=1 pytest tests/display/test_html.py``, then look at the difference.
 """
 
 import os
@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 
 import motorid as mi
-from motorid._cards import card_of
-from motorid._html import Card, Flag, Table, render, render_table
 from motorid.acquire import Recording
-from motorid.fit import Failure
-from motorid.problem import Problem
+from motorid.display._cards import card_of
+from motorid.display.cards import Card, Flag, Table, render, render_table
+from motorid.estimation.fit import Failure
+from motorid.problem.problem import Problem
 
 GOLDEN = Path(__file__).parent / "golden"
 
@@ -192,7 +192,7 @@ def _tags(html):
 
 
 def test_flags_are_told_apart_by_words_and_by_a_colour_of_enough_contrast():
-    from motorid._html import _COLOURS
+    from motorid.display.cards import _COLOURS
 
     for ink, paper in _COLOURS.values():
         light, dark = sorted((luminance(ink), luminance(paper)), reverse=True)

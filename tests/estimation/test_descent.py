@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 import motorid as mi
-from motorid.descent import _cheaper, descend
-from motorid.experiment import Experiment
-from motorid.problem import Problem, as_problem
+from motorid.estimation.continuation import _cheaper, descend
+from motorid.problem.problem import Problem, as_problem
+from motorid.records.experiment import Experiment
 
 TRUE = {"b": 0.3, "J": 0.1, "tau_c": 0.5, "tau_0": 0.1}
 

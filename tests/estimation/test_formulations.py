@@ -7,9 +7,9 @@ from itertools import pairwise
 import pytest
 
 import motorid as mi
-from motorid.constraints import CurrentLimit, SteadyState
-from motorid.fit import Failure
-from motorid.formulations import compare_formulations
+from motorid.estimation.fit import Failure
+from motorid.estimation.shooting.formulations import compare_formulations
+from motorid.problem.constraints import CurrentLimit, SteadyState
 
 
 def runs_of(name: str) -> list[mi.Experiment]:

@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 from command import motorid, motorid_json
 
-from motorid.export import model_from_json
-from motorid.reading import read_runs
-from motorid.simulate import evaluate
+from motorid.exporters.export import model_from_json
+from motorid.problem.simulate import evaluate
+from motorid.records.reading import read_runs
 
 BARE = ("--fix", "R=1,L=0")  # no inductance; without the current R is a matter of choice
 GEAR = ("--columns", "t=t,v=u,omega=y", "--units", "omega=deg/s")

@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 
 import motorid as mi
-from motorid.constraints import Constraint, CurrentLimit, SteadyState
-from motorid.datasets import truth
 from motorid.errors import FitError, UsageError
-from motorid.mesh import Mesh
-from motorid.multipliers import steady_residual
-from motorid.nlp import ShootingNlp
-from motorid.nodes import nodes_from_data, nodes_from_simulation
-from motorid.shooting import MultipleShooting
+from motorid.estimation.shooting.mesh import Mesh
+from motorid.estimation.shooting.multiple_shooting import MultipleShooting
+from motorid.estimation.shooting.multipliers import steady_residual
+from motorid.estimation.shooting.nlp import ShootingNlp
+from motorid.estimation.shooting.nodes import nodes_from_data, nodes_from_simulation
+from motorid.problem.constraints import Constraint, CurrentLimit, SteadyState
+from motorid.records.datasets import truth
 
 SHIPPED = ("two_step_noisy", "two_step_small")
 STARTS = int(os.environ.get("MOTORID_TEST_STARTS", "12"))  # per motor; the full count is in the benchmark

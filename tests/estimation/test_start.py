@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import motorid as mi
-from motorid.start import first_guess
+from motorid.estimation.first_guess import first_guess
 
 TRUTH = {"R": 2.0, "L": 1e-3, "K": 0.05, "b": 1e-5, "J": 2e-5}
 T = np.arange(0, 4, 2e-3)

@@ -12,7 +12,7 @@ import pytest
 
 import motorid as mi
 from motorid.errors import DataError, ModelError, UsageError
-from motorid.export import Exported, export, load, model_from_json
+from motorid.exporters.export import Exported, export, load, model_from_json
 
 COMPILER = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
 ALONE = """

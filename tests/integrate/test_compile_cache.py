@@ -12,7 +12,7 @@ import pytest
 
 import motorid as mi
 from motorid.integrate import Grid, Rosenbrock
-from motorid.integrate import compile as cc
+from motorid.integrate import compiled as cc
 from motorid.integrate import rosenbrock as rb
 
 needs_compiler = pytest.mark.skipif(cc.compiler() is None, reason="no C compiler on this machine")

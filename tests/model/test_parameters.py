@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from motorid.errors import ModelError
-from motorid.parameters import P, Parameter, Scaling
+from motorid.model.definition import P, Parameter, Scaling
 
 MIXED = [
     Parameter("R", 1.4, "Ω", positive=True),

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from motorid.errors import SimulationError
-from motorid.least_squares import LevenbergMarquardt, gauss_newton_covariance, levenberg_marquardt
-from motorid.parameters import Parameter, Scaling
+from motorid.model.definition import Parameter, Scaling
+from motorid.numerics.least_squares import LevenbergMarquardt, gauss_newton_covariance, levenberg_marquardt
 
 FOLDER = Path(__file__).parent / "nist"
 POSITIVE = {"MGH10"}  # lives on the logarithmic scale, as resistances and time constants do in a motor

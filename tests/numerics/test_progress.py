@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from motorid.progress import progress
+from motorid.numerics.progress import progress
 
 
 class Screen(io.StringIO):

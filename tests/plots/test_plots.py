@@ -16,15 +16,15 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 import motorid as mi
 from motorid import plots
-from motorid.constraints import CurrentLimit
 from motorid.errors import UsageError
-from motorid.formulations import compare_formulations
-from motorid.identifiability import identifiability
-from motorid.intervals import intervals
-from motorid.multistart import multistart
+from motorid.estimation.shooting.formulations import compare_formulations
 from motorid.plots.residuals import autocorrelation, binned_means
 from motorid.plots.style import axis_label, detached, envelope
-from motorid.plots.svg import svg_of
+from motorid.problem.constraints import CurrentLimit
+from motorid.reports.svg import svg_of
+from motorid.uncertainty.identifiability import identifiability
+from motorid.uncertainty.intervals import intervals
+from motorid.uncertainty.multistart import multistart
 
 
 @pytest.fixture(scope="module")

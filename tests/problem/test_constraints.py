@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import motorid as mi
-from motorid.constraints import Constraint, CurrentLimit, SteadyState
 from motorid.errors import ModelError, UsageError
-from motorid.problem import as_problem
+from motorid.problem.constraints import Constraint, CurrentLimit, SteadyState
+from motorid.problem.problem import as_problem
 
 
 def runs_of(name: str) -> list[mi.Experiment]:

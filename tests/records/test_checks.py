@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from motorid.checks import check_runs
-from motorid.datasets import data_path, datasets
-from motorid.experiment import OUTPUTS, Experiment
-from motorid.reading import read_csv, read_runs
+from motorid.records.checks import check_runs
+from motorid.records.datasets import data_path, datasets
+from motorid.records.experiment import OUTPUTS, Experiment
+from motorid.records.reading import read_csv, read_runs
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from motorid.errors import DataError, UsageError
-from motorid.experiment import Experiment, split
+from motorid.records.experiment import Experiment, split
 
 N = 40
 T = np.arange(N) * 0.01

@@ -11,9 +11,9 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from motorid.errors import DataError, MissingDependency, UsageError
-from motorid.experiment import MIN_SAMPLES, OUTPUTS, UNITS, Experiment
-from motorid.layout import parse_pairs
-from motorid.reading import find_records, read_csv, read_mat, read_parquet, read_runs, write_csv
+from motorid.records.experiment import MIN_SAMPLES, OUTPUTS, UNITS, Experiment
+from motorid.records.layout import parse_pairs
+from motorid.records.reading import find_records, read_csv, read_mat, read_parquet, read_runs, write_csv
 
 
 def write(folder: Path, content: str | bytes, name: str = "run.csv") -> Path:

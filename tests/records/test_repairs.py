@@ -8,9 +8,9 @@ from command import motorid_json
 from lab_records import simulated
 
 import motorid as mi
-from motorid.plausibility import unsigned
-from motorid.reading import write_csv
-from motorid.repairs import spikes, unwrapped
+from motorid.records.plausibility import unsigned
+from motorid.records.preprocessing import spikes, unwrapped
+from motorid.records.reading import write_csv
 
 T = 1e-3 * np.arange(800)
 TURN = 2 * np.pi

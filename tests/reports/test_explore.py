@@ -81,7 +81,7 @@ def test_a_model_that_cannot_be_simulated_is_not_taken(playing, monkeypatch):
     def fails(*_args, **_kwargs):
         raise mi.SimulationError("the integration stopped at 0.1 s.")
 
-    monkeypatch.setattr(sys.modules["motorid.explore"], "evaluate", fails)
+    monkeypatch.setattr(sys.modules["motorid.reports.explorer"], "evaluate", fails)
     before = playing.model
     playing.move(R=3.0)
     assert playing.model is before

@@ -265,4 +265,4 @@ def test_the_browser_check_itself_sees_errors_and_requests(tmp_path):
 
 
 def test_the_template_is_shipped_with_the_package():
-    assert (Path(mi.__file__).parent / "templates" / "report.html").is_file()
+    assert (Path(mi.__file__).parent / "reports" / "templates" / "report.html").is_file()

@@ -12,12 +12,12 @@ import pandas as pd
 import pytest
 
 import motorid as mi
-from motorid import batch as batch_module
-from motorid.batch import fit_many, motors_in
-from motorid.datasets import truth
 from motorid.errors import DataError, UsageError
-from motorid.outliers import outliers
-from motorid.reading import write_csv
+from motorid.numerics.outliers import outliers
+from motorid.records.datasets import truth
+from motorid.records.reading import write_csv
+from motorid.uncertainty import batch as batch_module
+from motorid.uncertainty.batch import fit_many, motors_in
 
 MOTOR, NOISE = truth("two_step_noisy")["parameters"], {"i": 0.02, "omega": 0.4}
 

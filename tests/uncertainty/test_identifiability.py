@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 import motorid as mi
-from motorid.combinations import monomials, sparse_basis
-from motorid.datasets import truth
 from motorid.errors import UsageError
-from motorid.identifiability import identifiability
-from motorid.problem import Problem
-from motorid.remedies import planned
-from motorid.sensitivity import relative_jacobian
+from motorid.problem.problem import Problem
+from motorid.problem.sensitivity_part import relative_jacobian
+from motorid.records.datasets import truth
+from motorid.uncertainty.identifiability import identifiability
+from motorid.uncertainty.remedies import planned
+from motorid.uncertainty.weak_directions import monomials, sparse_basis
 
 MOTOR = truth("two_step_noisy")["parameters"]
 

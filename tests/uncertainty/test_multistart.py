@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 import motorid as mi
-from motorid.endings import Ending, Multistart
 from motorid.errors import UsageError
-from motorid.fit import Failure
-from motorid.least_squares import LevenbergMarquardt, levenberg_marquardt
-from motorid.multistart import multistart
+from motorid.estimation.fit import Failure
+from motorid.numerics.least_squares import LevenbergMarquardt, levenberg_marquardt
+from motorid.uncertainty.endings import Ending, Multistart
+from motorid.uncertainty.multistart import multistart
 
 BOTH = ("two_step_noisy", "two_step_small")
 

@@ -8,13 +8,13 @@ from scipy.linalg import toeplitz
 from scipy.signal import lfilter
 
 import motorid as mi
-from motorid.bootstrap import bootstrap
-from motorid.coloured import Colour, colour_of, weighed
-from motorid.datasets import truth
 from motorid.errors import UsageError
-from motorid.intervals import intervals
-from motorid.profiling import profile, profiles
-from motorid.uncertainty import covariance
+from motorid.numerics.autoregression import Colour, colour_of, weighed
+from motorid.records.datasets import truth
+from motorid.uncertainty.bootstrap import bootstrap
+from motorid.uncertainty.covariance import covariance
+from motorid.uncertainty.intervals import intervals
+from motorid.uncertainty.profile import profile, profiles
 
 MOTOR, NOISE = truth("two_step_noisy")["parameters"], {"i": 0.02, "omega": 0.4}
 

@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from motorid.constraints import CurrentLimit, SteadyState
 from motorid.errors import FitError, SimulationError
-from motorid.integrate.grid import Array
-from motorid.least_squares import LevenbergMarquardt, levenberg_marquardt
-from motorid.problem import Problem
+from motorid.integrate.engine import Array
+from motorid.numerics.least_squares import LevenbergMarquardt, levenberg_marquardt
+from motorid.problem.constraints import CurrentLimit, SteadyState
+from motorid.problem.problem import Problem
 
 KEPT = 1e-5  # largest violation, in sizes of the rows, that counts as kept
 LIMITS = "the limits of the parameters"

@@ -8,17 +8,17 @@ from typing import Any
 
 import numpy as np
 
-from motorid.constraints import SteadyState
-from motorid.display import Shown
+from motorid.display.display import Shown
+from motorid.display.numbers import duration, number, percent, with_error
+from motorid.display.tables import NAMES, Table
 from motorid.errors import FitError, MotoridError, SimulationError
-from motorid.fit import Failure, Fit, solve
-from motorid.formatting import duration, number, percent, with_error
-from motorid.least_squares import LevenbergMarquardt, levenberg_marquardt
-from motorid.multipliers import Multiplier, steady_residual, violations
-from motorid.problem import Problem
-from motorid.relations import Relation, Weighed
-from motorid.shooting import MultipleShooting
-from motorid.tables import NAMES, Table
+from motorid.estimation.fit import Failure, Fit, solve
+from motorid.estimation.shooting.multiple_shooting import MultipleShooting
+from motorid.estimation.shooting.multipliers import Multiplier, steady_residual, violations
+from motorid.numerics.least_squares import LevenbergMarquardt, levenberg_marquardt
+from motorid.problem.constraints import SteadyState
+from motorid.problem.problem import Problem
+from motorid.problem.relations import Relation, Weighed
 
 WEIGHTS = tuple(10.0 ** np.arange(-2, 5))
 NONE = "–"

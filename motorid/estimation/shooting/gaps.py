@@ -11,8 +11,8 @@ from scipy import sparse
 from scipy.sparse.linalg import splu
 
 from motorid.errors import UsageError, one_of
-from motorid.integrate.grid import Array
-from motorid.mesh import Mesh
+from motorid.estimation.shooting.mesh import Mesh
+from motorid.integrate.engine import Array
 
 NEXT_TO_NONE = 1e-6  # of a state's size per √s: states that no unknown voltage or torque acts on
 FIRST = 0.03  # of a state's size per √s

@@ -15,11 +15,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from motorid.integrate.grid import Array, Grid, Trajectory
-from motorid.problem import Problem
-from motorid.relations import Part, Relation
-from motorid.residuals import prior_residual
-from motorid.unknowns import Point
+from motorid.integrate.engine import Array, Grid, Trajectory
+from motorid.problem.problem import Problem
+from motorid.problem.relations import Part, Relation
+from motorid.problem.residuals import prior_residual
+from motorid.problem.unknowns import Point
 
 FEWEST = 50  # samples per interval, unless a run is so long that it would need more intervals than
 MOST = 200

@@ -13,21 +13,21 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from motorid.balancing import descend_balanced
-from motorid.conflict import below_steady
 from motorid.errors import FitError, SimulationError, UsageError, one_of
-from motorid.fit import Fit
-from motorid.gaps import first_noise, given_noise, noise_of_gaps
-from motorid.integrate.grid import Array
-from motorid.least_squares import LevenbergMarquardt, levenberg_marquardt
-from motorid.mesh import Mesh
-from motorid.misfit import misfit_over_noise
-from motorid.multipliers import violations
-from motorid.nlp import Ipopt, NlpResult, ShootingNlp
-from motorid.nodes import nodes_from_data, nodes_from_simulation
-from motorid.outcome import Solved, fit_of
-from motorid.problem import Problem
-from motorid.relations import Relation, Weighed
+from motorid.estimation.balancing import descend_balanced
+from motorid.estimation.fit import Fit
+from motorid.estimation.shooting.conflict import below_steady
+from motorid.estimation.shooting.gaps import first_noise, given_noise, noise_of_gaps
+from motorid.estimation.shooting.mesh import Mesh
+from motorid.estimation.shooting.multipliers import violations
+from motorid.estimation.shooting.nlp import Ipopt, NlpResult, ShootingNlp
+from motorid.estimation.shooting.nodes import nodes_from_data, nodes_from_simulation
+from motorid.estimation.shooting.outcome import Solved, fit_of
+from motorid.integrate.engine import Array
+from motorid.numerics.least_squares import LevenbergMarquardt, levenberg_marquardt
+from motorid.problem.misfit import misfit_over_noise
+from motorid.problem.problem import Problem
+from motorid.problem.relations import Relation, Weighed
 
 ROUNDS = 4  # of refining the sub-steps
 TIGHT = 1e-13  # share of the cost at which the least-squares fit on the way stops

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from motorid.integrate.grid import Array
-from motorid.problem import Problem
-from motorid.relations import Part
+from motorid.integrate.engine import Array
+from motorid.problem.problem import Problem
+from motorid.problem.relations import Part
 
 WEAK = 1e-6  # share of the largest multiplier below which a row only touches its limit
 

@@ -15,8 +15,8 @@ import casadi as ca
 import numpy as np
 
 from motorid.errors import SimulationError
-from motorid.integrate.grid import Array
-from motorid.mesh import Block, Mesh
+from motorid.estimation.shooting.mesh import Block, Mesh
+from motorid.integrate.engine import Array
 
 D = ca.Sparsity.dense
 STEEPEST = 1e4  # largest diagonal entry of the scaled Hessian at the start; IPOPT's tolerances are absolute

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from motorid.errors import SimulationError
-from motorid.experiment import Experiment
-from motorid.integrate.grid import Array
-from motorid.mesh import Mesh
+from motorid.estimation.shooting.mesh import Mesh
+from motorid.integrate.engine import Array
+from motorid.records.experiment import Experiment
 
 
 def nodes_from_simulation(mesh: Mesh, q: Array) -> Array:

@@ -7,17 +7,17 @@ from typing import Any
 
 import numpy as np
 
-from motorid.conflict import conflict
 from motorid.errors import FitError
-from motorid.fit import Fit
-from motorid.gaps import gaps_of, reduced
-from motorid.integrate.grid import Array
-from motorid.mesh import Mesh
-from motorid.misfit import integration_error
-from motorid.multipliers import free_directions, rows_at, summed, violations
-from motorid.nlp import NlpResult, ShootingNlp
-from motorid.problem import Problem
-from motorid.relations import Part
+from motorid.estimation.fit import Fit
+from motorid.estimation.shooting.conflict import conflict
+from motorid.estimation.shooting.gaps import gaps_of, reduced
+from motorid.estimation.shooting.mesh import Mesh
+from motorid.estimation.shooting.multipliers import free_directions, rows_at, summed, violations
+from motorid.estimation.shooting.nlp import NlpResult, ShootingNlp
+from motorid.integrate.engine import Array
+from motorid.problem.misfit import integration_error
+from motorid.problem.problem import Problem
+from motorid.problem.relations import Part
 
 GOOD = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
 JOINED = 1e-8  # violation of a row that counts as kept

@@ -1,0 +1,1 @@
+"""From a problem to a fit: `fit.fit`, and `fit.solve` for a problem that is already posed; see there for the plan."""

@@ -1,0 +1,1 @@
+"""Algorithms that know no motor: `least_squares`, `autoregression`, `noise`, `signals`, `parallel`."""

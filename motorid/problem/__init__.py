@@ -1,0 +1,1 @@
+"""A model on records: `problem.Problem` gives whitened residuals and their exact Jacobian; `simulate.simulate`."""

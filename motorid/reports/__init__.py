@@ -1,0 +1,1 @@
+"""What a reader takes home: one page of a result (`report.report`), and the fit to play with (`explorer.explore`)."""
