@@ -3,39 +3,39 @@
 from typing import TYPE_CHECKING as _TYPE_CHECKING
 
 from motorid import effects
-from motorid.acquire import record
+from motorid.acquire.recorder import record
 from motorid.diagnosis.diagnose import diagnose
 from motorid.diagnosis.experiment_design import suggest_experiment
 from motorid.diagnosis.locate import locate
 from motorid.diagnosis.stepwise import improve
 from motorid.errors import DataError, FitError, ModelError, MotoridError, SimulationError, UsageError
-from motorid.estimation.comparison import compare
-from motorid.estimation.fit import Failure, Fit, fit, solve
+from motorid.estimation.fit import fit, solve
+from motorid.estimation.result import Failure, Fit, compare
 from motorid.estimation.shooting.formulations import compare_formulations
 from motorid.estimation.shooting.multiple_shooting import MultipleShooting
 from motorid.exporters.export import export, load
-from motorid.integrate import Cvodes, Idas, Rosenbrock
-from motorid.model.definition import P, Parameter
-from motorid.model.model import Effect, Model, dc_motor, effect, torque_driven
+from motorid.integrate.rosenbrock import Rosenbrock
+from motorid.integrate.sundials import Cvodes, Idas
+from motorid.model.definition import Effect, P, Parameter, effect
+from motorid.model.model import Model, dc_motor, torque_driven
 from motorid.numerics.least_squares import LevenbergMarquardt
+from motorid.numerics.noise import Huber
 from motorid.problem.constraints import Constraint, CurrentLimit, SteadyState
-from motorid.problem.problem import Huber, Problem
+from motorid.problem.problem import Problem
 from motorid.problem.sensitivity import check_derivatives
 from motorid.problem.simulate import evaluate, simulate
 from motorid.records.checks import check_runs
-from motorid.records.datasets import data_path
 from motorid.records.experiment import Experiment
-from motorid.records.reading import read_csv, read_mat, read_runs
+from motorid.records.reading import data_path, read_csv, read_mat, read_runs
 from motorid.reports.explorer import explore
 from motorid.reports.report import report
 from motorid.uncertainty.batch import fit_many, motors_in
 from motorid.uncertainty.bootstrap import bootstrap
 from motorid.uncertainty.covariance import covariance
 from motorid.uncertainty.identifiability import identifiability
-from motorid.uncertainty.intervals import intervals
 from motorid.uncertainty.multistart import multistart
-from motorid.uncertainty.profile import profile, profiles
-from motorid.uncertainty.remedies import planned
+from motorid.uncertainty.profile import intervals, profile, profiles
+from motorid.uncertainty.weak_directions import planned
 
 if _TYPE_CHECKING:
     from motorid.plots import (

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
+import numpy as np
+
 
 class MotoridError(Exception):
     """Base of every error that motorid raises on purpose; its text is one clear message for the user."""
@@ -35,6 +37,10 @@ class DeviceError(MotoridError):
 
 class MissingDependency(MotoridError):
     """An optional package is needed and not installed; the message names the extra to install."""
+
+
+# What may go wrong with one of many models without stopping the others.
+FAILURES = (FitError, SimulationError, ModelError, np.linalg.LinAlgError)
 
 
 def one_of(word: str, known: Iterable[object], what: str) -> str:

@@ -6,8 +6,8 @@ import time
 
 import numpy as np
 
-from motorid.acquire.faults import Faults, Wire
-from motorid.acquire.link import LinkLost
+from motorid.acquire.client import LinkLost
+from motorid.acquire.server import Faults, Wire
 from motorid.acquire.virtual import VirtualDevice
 
 

@@ -7,6 +7,6 @@ port opens.
 
 from motorid.acquire.excitation import Program, program
 from motorid.acquire.recorder import record
-from motorid.acquire.recording import Progress, Recording
+from motorid.acquire.session import Progress, Recording
 
 __all__ = ["Program", "Progress", "Recording", "program", "record"]

@@ -29,8 +29,6 @@ from numpy.typing import NDArray
 
 from motorid.errors import UsageError, one_of
 
-__all__ = ["Program", "Segment", "lfsr_bits", "program"]
-
 LONGEST = 3600.0  # s of one segment
 _SHAPES = {"R": 2, "C": 4, "P": 4}  # numbers after the duration
 

@@ -44,8 +44,6 @@ from typing import NamedTuple
 
 from motorid.errors import DeviceError
 
-__all__ = ["VERSION", "Channel", "Decoder", "Header", "Message", "Sample", "crc16", "frame"]
-
 VERSION = 1
 LONGEST = 240
 SILENCE = 1.0  # s without a word from the computer after which a device switches the motor off

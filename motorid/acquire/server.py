@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
+import select
+import socket
 import time
+from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Protocol
 
-from motorid.acquire.ends import End
-from motorid.acquire.faults import Wire
+import numpy as np
+
 from motorid.acquire.protocol import SILENCE
 from motorid.acquire.virtual import VirtualDevice
-
-__all__ = ["Pace", "serve"]
+from motorid.errors import UsageError
 
 BUFFER = 65_536  # bytes a device keeps for a computer that does not read; what is more is lost, as in reality
 STALLED = 0.5  # s without a byte taken after which the computer counts as one that does not read
@@ -124,3 +130,209 @@ class _Bench:
         self.device, self.ran = self.make(), False
         self.end.plug()
         self.plugged = True
+
+
+LOOPBACK = "127.0.0.1"
+
+
+class End(Protocol):
+    """The device's end of a wire."""
+
+    name: str  # what the recorder is told as --port
+
+    def wait(self, writing: bool, timeout: float) -> None:
+        """Wait until there is something to read (or room to write)."""
+        ...
+
+    def read(self) -> bytes:
+        """Return what the computer sent; nothing is an answer."""
+        ...
+
+    def write(self, data: bytes) -> int:
+        """Return how many bytes were taken."""
+        ...
+
+    def unplug(self) -> None:
+        """Vanish."""
+        ...
+
+    def plug(self) -> None:
+        """Appear again."""
+        ...
+
+
+class Pty:
+    """A pseudo-terminal; `link` is a symbolic link that follows it from one plugging to the next."""
+
+    def __init__(self, link: Path | None = None) -> None:
+        self.link = link
+        if link and link.exists() and not link.is_symlink():
+            raise UsageError(f"{link} exists and is not a link; choose another name for the port.")
+        self.plug()
+
+    def plug(self) -> None:
+        """Open a new pseudo-terminal."""
+        import tty
+
+        self._master, self._slave = os.openpty()
+        tty.setraw(self._slave)  # no echo; holding this end open keeps the line up between users
+        os.set_blocking(self._master, False)
+        self.name = os.ttyname(self._slave)
+        if self.link:
+            self.link.unlink(missing_ok=True)
+            self.link.symlink_to(self.name)
+            self.name = str(self.link)
+
+    def unplug(self) -> None:
+        """Close it; whoever reads it gets an error, as from a device that was pulled out."""
+        os.close(self._master)
+        os.close(self._slave)
+        if self.link:
+            self.link.unlink(missing_ok=True)
+
+    def wait(self, writing: bool, timeout: float) -> None:
+        """Wait until there is something to read (or room to write)."""
+        select.select([self._master], [self._master] if writing else [], [], timeout)
+
+    def read(self) -> bytes:
+        """Return what the computer sent."""
+        try:
+            return os.read(self._master, 4096)
+        except OSError:
+            return b""
+
+    def write(self, data: bytes) -> int:
+        """Return how many bytes were taken."""
+        try:
+            return os.write(self._master, data)
+        except BlockingIOError:
+            return 0
+
+
+class Socket:
+    """A socket on the loopback address, for one recorder at a time, as pyserial's ``socket://``."""
+
+    def __init__(self, port: int = 0) -> None:
+        self._port = port
+        self._peer: socket.socket | None = None
+        self.plug()
+
+    def plug(self) -> None:
+        """Listen, always on the same port."""
+        self._server = socket.create_server((LOOPBACK, self._port))
+        self._server.setblocking(False)
+        self._port = self._server.getsockname()[1]
+        self.name = f"socket://{LOOPBACK}:{self._port}"
+
+    def unplug(self) -> None:
+        """Hang up and listen no more."""
+        self._hang_up()
+        self._server.close()
+
+    def wait(self, writing: bool, timeout: float) -> None:
+        """Wait until somebody knocks, or there is something to read (or room to write)."""
+        peer = [self._peer] if self._peer else []
+        ready, _, _ = select.select([self._server, *peer], peer if writing else [], [], timeout)
+        if self._server in ready:
+            with contextlib.suppress(OSError):
+                self._answer(self._server.accept()[0])
+
+    def read(self) -> bytes:
+        """Return what the computer sent."""
+        if self._peer is None:
+            return b""
+        try:
+            data = self._peer.recv(4096)
+        except BlockingIOError:
+            return b""
+        except OSError:
+            data = b""
+        if not data:
+            self._hang_up()
+        return data
+
+    def write(self, data: bytes) -> int:
+        """Return how many bytes were taken; all of them where nobody listens."""
+        if self._peer is None:
+            return len(data)
+        try:
+            return self._peer.send(data)
+        except BlockingIOError:
+            return 0
+        except OSError:
+            self._hang_up()
+            return len(data)
+
+    def _answer(self, peer: socket.socket) -> None:
+        if self._peer is None:
+            peer.setblocking(False)
+            self._peer = peer
+        else:
+            peer.close()
+
+    def _hang_up(self) -> None:
+        if self._peer:
+            self._peer.close()
+            self._peer = None
+
+
+def open_end(link: Path | None = None, port: int | None = None) -> End:
+    """Open a pseudo-terminal, or a loopback socket where `port` is given or the system has no terminals."""
+    return Pty(link) if port is None and hasattr(os, "openpty") else Socket(port or 0)
+
+
+@dataclass(frozen=True)
+class Faults:
+    """Probability of each fault per sample line."""
+
+    drop: float = 0.0  # the line never comes
+    garbage: float = 0.0  # 1 to 40 random bytes before it
+    cut: float = 0.0  # only its beginning or only its end comes
+    flip: float = 0.0  # one to three of its bytes are altered
+    repeat: float = 0.0  # it comes twice
+    swap: float = 0.0  # an older line comes once more, late
+    glue: float = 0.0  # its newline is missing
+
+    def __post_init__(self) -> None:
+        for f in fields(self):
+            if not 0 <= getattr(self, f.name) <= 1:
+                raise UsageError(f"--{f.name} is a probability from 0 to 1; got {getattr(self, f.name)}.")
+
+
+class Wire:
+    """Carries frames to the computer, not always whole; only sample lines are harmed."""
+
+    def __init__(self, faults: Faults, rng: np.random.Generator) -> None:
+        self.faults, self.rng = faults, rng
+        self._faulty = any(vars(faults).values())
+        self._lately: deque[bytes] = deque(maxlen=5)
+
+    def carry(self, frames: list[bytes]) -> bytes:
+        """Return the bytes that arrive of these frames."""
+        if not self._faulty:
+            return b"".join(frames)
+        return b"".join([self._one(f) if f.startswith(b"$D") else f for f in frames])
+
+    def _one(self, line: bytes) -> bytes:
+        f, hit = self.faults, self.rng.random(7)
+        before = self.rng.bytes(int(self.rng.integers(1, 41))) if hit[0] < f.garbage else b""
+        if hit[1] < f.drop:
+            return before
+        if hit[2] < f.cut:
+            return before + self._cut(line)
+        if hit[3] < f.flip:
+            return before + self._flip(line)
+        late = self._lately[self.rng.integers(len(self._lately))] if hit[4] < f.swap and self._lately else b""
+        self._lately.append(line)
+        came = line[:-1] if hit[5] < f.glue else line
+        return before + came + (came if hit[6] < f.repeat else b"") + late
+
+    def _cut(self, line: bytes) -> bytes:
+        at = int(self.rng.integers(1, len(line) - 2))
+        return line[:at] if self.rng.random() < 0.5 else line[at:]
+
+    def _flip(self, line: bytes) -> bytes:
+        altered = bytearray(line)
+        for at in self.rng.choice(len(line) - 1, size=int(self.rng.integers(1, 4)), replace=False):
+            altered[at] ^= int(self.rng.integers(1, 256))
+        return bytes(altered)

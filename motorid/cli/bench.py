@@ -13,11 +13,9 @@ from typing import Annotated
 
 import typer
 
-from motorid.acquire.faults import Faults, Wire
 from motorid.acquire.recorder import record as record_run
-from motorid.acquire.recording import Progress, Recording
-
-__all__ = ["bench", "record"]
+from motorid.acquire.server import Faults, Wire
+from motorid.acquire.session import Progress, Recording
 
 Port = Annotated[str, typer.Option(
     help="Serial port of the bench: /dev/ttyACM0, COM3, socket://127.0.0.1:7000.")]
@@ -114,10 +112,8 @@ def bench(
     """
     import numpy as np
 
-    from motorid.acquire.ends import open_end
-    from motorid.acquire.hidden import hide
-    from motorid.acquire.server import Pace, serve
-    from motorid.acquire.virtual import VirtualDevice
+    from motorid.acquire.server import Pace, open_end, serve
+    from motorid.acquire.virtual import VirtualDevice, hide
 
     seed = secrets.randbelow(1_000_000) if seed is None else seed
     truth, names = hide(effect, motor, seed), tuple(channels.replace(" ", "").split(","))
@@ -179,4 +175,3 @@ def _line(p: Progress) -> str:
     end = f" of {p.total:.4g}" if p.total else ""
     values = "  ".join(f"{name} {value:.4g}" for name, value in p.last.items())
     return f"{p.elapsed:7.2f}{end} s  {p.rate:.0f} samples/s  {p.lost} lost  {values}"
-

@@ -12,9 +12,8 @@ from motorid.display.tables import comparison_table, error_table, ladder_table, 
 from motorid.errors import UsageError
 from motorid.estimation.fit import fit
 from motorid.model.model import dc_motor
-from motorid.numerics.progress import progress
-from motorid.records.datasets import data_path
-from motorid.records.reading import read_runs
+from motorid.numerics.parallel import progress
+from motorid.records.reading import data_path, read_runs
 from motorid.uncertainty.covariance import deviations
 
 SET = "hidden_friction"

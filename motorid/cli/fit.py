@@ -22,7 +22,7 @@ from motorid.cli.options import (
 from motorid.display.numbers import duration
 from motorid.display.tables import constraint_table, derived_table, error_table, parameter_table, run_table
 from motorid.errors import DataError
-from motorid.estimation.fit import Fit
+from motorid.estimation.result import Fit
 from motorid.exporters.json_file import constraint_violations, fit_dict, remarks, run_dict, write_json
 from motorid.problem.simulate import Evaluation, evaluate
 from motorid.records.experiment import Experiment
@@ -70,7 +70,7 @@ def simulate(
 
     Example: motorid simulate fit.json check*.csv --out simulated
     """
-    from motorid.cli.cli_model import model_of
+    from motorid.cli.options import model_of
 
     model = model_of(fit_json, effects_from)
     records = choices.read(runs)

@@ -15,10 +15,13 @@ import typer
 
 from motorid import effects as library
 from motorid.errors import ModelError, UsageError, one_of
-from motorid.estimation.fit import Fit, fit
-from motorid.model.model import Effect, Model, dc_motor, torque_driven
-from motorid.numerics.progress import progress
-from motorid.problem.problem import Huber
+from motorid.estimation.fit import fit
+from motorid.estimation.result import Fit
+from motorid.exporters.export import load
+from motorid.model.definition import Effect
+from motorid.model.model import Model, dc_motor, torque_driven
+from motorid.numerics.noise import Huber
+from motorid.numerics.parallel import progress
 from motorid.records.checks import check_runs
 from motorid.records.experiment import Experiment
 from motorid.records.layout import parse_pairs
@@ -291,3 +294,23 @@ def _fixed(model: Model, texts: Sequence[str]) -> Model:
     for word in _words(texts):
         model = model.fix(**_numbers([word], "--fix")) if "=" in word else model.fix(word)
     return model
+
+
+def model_of(path: Path, effects_from: Path | None = None) -> Model:
+    """Return the model that ``fit --json`` or ``export`` wrote, at its values.
+
+    Raises
+    ------
+    DataError
+        If the file is not there, or no such file.
+    ModelError
+        If it has an effect of the user's own, whose file was not named.
+    """
+    own = own_effects(effects_from) if effects_from else {}
+    try:
+        found = load(path, own.values())
+        return found if isinstance(found, Model) else found.model
+    except ModelError as error:
+        if effects_from is not None:
+            raise
+        raise ModelError(f"{error} On the command line: --effects-from FILE.py") from None

@@ -8,9 +8,8 @@ from typing import Annotated, Any
 
 import typer
 
-from motorid.cli.cli_model import model_of
 from motorid.cli.console import FAILED, show
-from motorid.cli.options import OUT, Choices, Json, with_choices
+from motorid.cli.options import OUT, Choices, Json, model_of, with_choices
 from motorid.errors import DataError, UsageError, one_of
 from motorid.exporters.json_file import write_json
 from motorid.records.experiment import Experiment

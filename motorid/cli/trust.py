@@ -19,7 +19,7 @@ from motorid.cli.options import (
 )
 from motorid.display.tables import comparison_table, ladder_table, ranking_table
 from motorid.exporters.json_file import write_json
-from motorid.numerics.progress import progress
+from motorid.numerics.parallel import progress
 from motorid.uncertainty.covariance import deviations
 
 OUT = "Results"
@@ -35,8 +35,8 @@ def diagnose(
 
     Example: motorid diagnose run*.csv --validate check*.csv --report found.html
     """
+    from motorid.diagnosis.cross_validation import fit_affordably
     from motorid.diagnosis.diagnose import diagnose as look
-    from motorid.diagnosis.parts import fit_affordably
 
     records = choices.read(runs)
     held_out = choices.read(validate) if validate else []

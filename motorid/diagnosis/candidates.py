@@ -14,17 +14,15 @@ from typing import Any
 from motorid.diagnosis.admissibility import WORST_CONDITION, ambiguity, objections
 from motorid.diagnosis.cross_validation import HeldOut, train_errors
 from motorid.diagnosis.model_comparison import COMMON, PLAIN, Judge, Node, held_out_objection, node_of, worth_it
-from motorid.diagnosis.refit import FAILURES, lost, refit
-from motorid.diagnosis.remainders import far
-from motorid.diagnosis.residual_analysis import Errors, Gain, compare_errors
+from motorid.diagnosis.refit import GivenUp, Task, lost, refit, refits, widened
+from motorid.diagnosis.residual_analysis import Errors, Gain, compare_errors, far
 from motorid.diagnosis.results import Candidate
 from motorid.diagnosis.score_test import Score, pairs_of, rank
-from motorid.diagnosis.tournament import GivenUp, Task, refits, widened
 from motorid.effects import LIBRARY
-from motorid.errors import ModelError
-from motorid.estimation.fit import Fit
-from motorid.model.definition import Parameter
-from motorid.model.model import Effect, Model
+from motorid.errors import FAILURES, ModelError
+from motorid.estimation.result import Fit
+from motorid.model.definition import Effect, Parameter
+from motorid.model.model import Model
 from motorid.records.experiment import Experiment
 
 SHORTLIST = 6

@@ -6,12 +6,11 @@ import builtins
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
-from motorid.diagnosis.adequacy import following
+from motorid.diagnosis.adequacy import following, pursued
 from motorid.diagnosis.candidates import library
+from motorid.diagnosis.cross_validation import parts_remark
 from motorid.diagnosis.experiment_design import suggest_experiment
-from motorid.diagnosis.judgement import pursued
 from motorid.diagnosis.locate import acting_like, locate
-from motorid.diagnosis.parts import parts_remark
 from motorid.diagnosis.results import Diagnosis
 from motorid.diagnosis.stepwise import Climb, explored, ladder_of
 from motorid.diagnosis.verdict import (
@@ -26,8 +25,8 @@ from motorid.diagnosis.verdict import (
     unexplained_text,
 )
 from motorid.errors import MotoridError
-from motorid.estimation.fit import Fit
-from motorid.model.model import Effect
+from motorid.estimation.result import Fit
+from motorid.model.definition import Effect
 from motorid.records.checks import current_limit
 from motorid.records.experiment import Experiment
 from motorid.uncertainty.covariance import deviations

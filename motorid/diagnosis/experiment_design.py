@@ -14,8 +14,8 @@ import numpy as np
 
 from motorid.display.display import Shown
 from motorid.errors import FitError, MotoridError, UsageError
-from motorid.estimation.fit import Fit
-from motorid.integrate.engine import Array
+from motorid.estimation.result import Fit
+from motorid.numerics.signals import Array
 from motorid.problem.simulate import simulate
 from motorid.records.experiment import Experiment
 

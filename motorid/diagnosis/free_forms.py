@@ -12,9 +12,9 @@ import numpy as np
 
 from motorid.effects import LIBRARY
 from motorid.estimation.angle_orders import likely_orders
-from motorid.estimation.fit import Fit
-from motorid.estimation.tangent import Tangent
-from motorid.integrate.engine import Array
+from motorid.estimation.linearisation import Tangent
+from motorid.estimation.result import Fit
+from motorid.numerics.signals import Array
 
 KNOTS = 9  # cosines over the range of a quantity
 HARMONICS = 8  # of a turn

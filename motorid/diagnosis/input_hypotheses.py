@@ -15,14 +15,15 @@ import numpy as np
 
 from motorid.diagnosis.cross_validation import ROUGH, train_errors
 from motorid.diagnosis.model_comparison import worth_it
-from motorid.diagnosis.refit import FAILURES, RACE
+from motorid.diagnosis.refit import RACE
 from motorid.diagnosis.residual_analysis import Errors, compare_errors
 from motorid.display.numbers import number, percent
+from motorid.errors import FAILURES
 from motorid.estimation.continuation import descend
-from motorid.estimation.fit import Fit, solve
-from motorid.problem.misfit import misfit_over_noise
+from motorid.estimation.fit import solve
+from motorid.estimation.result import Fit
 from motorid.problem.problem import Problem
-from motorid.problem.simulate import at
+from motorid.problem.simulate import at, misfit_over_noise
 from motorid.records.experiment import Experiment
 
 CHANGING = 0.5  # of the samples at which the voltage must change for its reading to matter

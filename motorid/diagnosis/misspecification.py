@@ -14,14 +14,26 @@ from dataclasses import dataclass
 import numpy as np
 
 from motorid.diagnosis.cross_validation import BLOCKS, HeldOut, train_errors
-from motorid.diagnosis.form_regression import Linear, as_effect, halves, linearised
+from motorid.diagnosis.form_regression import (
+    Linear,
+    as_effect,
+    by_channel,
+    fraction,
+    fraction_of,
+    halves,
+    left,
+    linearised,
+)
 from motorid.diagnosis.free_forms import FORMS, Form
-from motorid.diagnosis.refit import FAILURES, Raced, finished, lost, raced
-from motorid.diagnosis.remainders import by_channel, far, fraction, fraction_of, left
-from motorid.diagnosis.residual_analysis import compare_errors
-from motorid.estimation.fit import Fit
-from motorid.integrate.engine import Array
-from motorid.problem.misfit import misfit_over_noise
+from motorid.diagnosis.model_comparison import Node
+from motorid.diagnosis.refit import Raced, finished, lost, raced
+from motorid.diagnosis.residual_analysis import Errors, astray, compare_errors, far
+from motorid.display.numbers import number
+from motorid.errors import FAILURES
+from motorid.estimation.result import Fit
+from motorid.numerics.noise import despiked
+from motorid.numerics.signals import Array
+from motorid.problem.simulate import misfit_over_noise
 
 MUCH_LESS = 0.5  # of the squared misfit that the effects leave: what a form in their place may leave
 LITTLE = 0.1  # of the squared misfit: forms that leave less are equals
@@ -226,3 +238,41 @@ def _judged(form: Form, train: Linear, test: Sequence[Linear], channels: Sequenc
         if fraction < VOID:
             return fraction
     return fraction_of(form, list(halves(train, BLOCKS)), channels)
+
+
+STAYS = 5.0  # times the noise, held out
+HARDLY = 0.2  # fall of the error
+
+
+def hardly_moved(path: Sequence[Node], noise: dict[str, float]) -> str:
+    """Say which channel's held-out error the effects of the last model leave as it is; empty if none.
+
+    Held-out runs that both lose say nothing; there the error on the fitted runs counts.
+
+    Parameters
+    ----------
+    path : sequence of Node
+        From the first model to the last.
+    noise : dict of str to float
+        Per channel, SI.
+    """
+    first, last = path[0], path[-1]
+    added = [e for e in last.fit.model.effects if e.name not in first.key]
+    if not any(e.balance != "sensor" for e in added):
+        return ""  # a sensor's effect need not show in other channels
+    before, after = _sizes(first.held), _sizes(last.held)
+    for c in astray(first.held.nrmse(), last.held.nrmse()):
+        before[c], after[c] = _sizes(first.train)[c], _sizes(last.train)[c]
+    for c in before:
+        far = after.get(c, 0.0) / noise.get(c, np.inf)
+        if far > STAYS and after[c] > (1 - HARDLY) * before[c]:
+            return f"leaves the error of {c} at {number(far, 2)} times its noise, where it hardly falls"
+    return ""
+
+
+def _sizes(errors: Errors) -> dict[str, float]:
+    found = {}
+    for c, parts in errors.residuals.items():
+        r = np.concatenate([despiked(p) for p in parts])
+        found[c] = float(np.sqrt(np.mean(r**2))) if r.size else 0.0
+    return found

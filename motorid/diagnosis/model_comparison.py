@@ -14,7 +14,7 @@ import numpy as np
 from motorid.diagnosis.cross_validation import LEAST_FALL, HeldOut, train_errors
 from motorid.diagnosis.residual_analysis import Errors, Gain, astray, compare_errors
 from motorid.diagnosis.results import Candidate
-from motorid.estimation.fit import Fit
+from motorid.estimation.result import Fit
 
 COMMON = (
     "coulomb",

@@ -11,49 +11,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.fft
 
-from motorid.integrate.engine import Array
+from motorid.estimation.result import Fit
+from motorid.numerics.autoregression import effective_samples
+from motorid.numerics.noise import CLIP, despiked
+from motorid.numerics.signals import Array
 from motorid.problem.simulate import Simulation
 from motorid.records.experiment import Experiment
 
 ASTRAY = 1.0  # NRMSE: zero is nearer to the channel than the model is
-CLIP = 6.0  # robust standard deviations beyond which a residual counts as an outlier
-
-
-def autocorrelation(r: Array, lags: int | None = None) -> Array:
-    """Return the autocorrelation of `r` (N,) at lags 0, 1, …; missing samples count as zero."""
-    r = np.where(np.isfinite(r), r, 0.0)
-    n = len(r)
-    lags = min(lags or n // 2, n - 1)
-    size = scipy.fft.next_fast_len(2 * n, real=True)
-    full: Array = np.fft.irfft(np.abs(np.fft.rfft(r, size)) ** 2, size)[: lags + 1]
-    return full / full[0] if full[0] > 0 else np.eye(1, lags + 1)[0]
-
-
-def effective_samples(r: Array) -> float:
-    """Return how many independent samples `r` (N,) is worth."""
-    n = int(np.isfinite(r).sum())
-    if n < 8:
-        return float(n)
-    rho = autocorrelation(r)
-    pairs = rho[1 : len(rho) - (len(rho) - 1) % 2].reshape(-1, 2).sum(axis=1)
-    stop = int(np.argmax(pairs < 0)) if (pairs < 0).any() else len(pairs)
-    return float(np.clip(n / (1 + 2 * pairs[:stop].sum()), 2.0, n))
-
-
-def despiked(r: Array) -> Array:
-    """Return `r` (N,) without NaN, samples that stand alone far from both neighbours replaced by the middle of three.
-
-    A few large samples in a row are no outliers: there the model fails.
-    """
-    r = r[np.isfinite(r)]
-    if len(r) < 3:
-        return r
-    before, after = np.concatenate([r[1:2], r[:-1]]), np.concatenate([r[1:], r[-2:-1]])
-    middle = np.maximum(np.minimum(before, r), np.minimum(np.maximum(before, r), after))
-    limit = CLIP * 1.4826 * float(np.median(np.abs(r)))
-    return np.where(np.abs(r - middle) > limit, middle, r)
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,3 +136,15 @@ def _gain(before: Squares, after: Squares, effective: Mapping[str, float], floor
         1 - float(np.exp(-0.5 * min(logs))),
         float(np.sum(weights)),
     )
+LARGER = 1.5  # of residual to noise: beyond it the noise must be coloured, or something is missing
+
+
+def far(fit: Fit) -> list[int]:
+    """Return which channels' errors are plainly larger than their noise."""
+    found = []
+    for j, c in enumerate(fit.problem.outputs):
+        pairs = zip(fit.simulations, fit.problem.runs, strict=True)
+        parts = [despiked(s.residual(c)) / run.sigma[c] for s, run in pairs if c in run.sigma]
+        if float(np.sqrt(np.mean(np.concatenate(parts) ** 2))) > LARGER:
+            found.append(j)
+    return found

@@ -8,8 +8,8 @@ from typing import Any
 
 from motorid.display.display import Shown
 from motorid.display.tables import Std
-from motorid.estimation.fit import Fit
-from motorid.integrate.engine import Array
+from motorid.estimation.result import Fit
+from motorid.numerics.signals import Array
 
 
 @dataclass(frozen=True, eq=False, repr=False)

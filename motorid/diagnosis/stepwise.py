@@ -11,18 +11,16 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+from motorid.diagnosis.adequacy import judgement
 from motorid.diagnosis.candidates import Search, library
-from motorid.diagnosis.hardly import hardly_moved
+from motorid.diagnosis.cross_validation import affordable
 from motorid.diagnosis.input_hypotheses import Reading, better_reading, without_spikes
-from motorid.diagnosis.judgement import judgement
-from motorid.diagnosis.misspecification import Outside, outside
+from motorid.diagnosis.misspecification import Outside, hardly_moved, outside
 from motorid.diagnosis.model_comparison import Node
-from motorid.diagnosis.parts import affordable
-from motorid.diagnosis.remainders import far
-from motorid.diagnosis.residual_analysis import compare_errors
+from motorid.diagnosis.residual_analysis import compare_errors, far
 from motorid.diagnosis.results import Adequacy, Candidate, Ladder, Rung
-from motorid.estimation.fit import Fit
-from motorid.model.model import Effect
+from motorid.estimation.result import Fit
+from motorid.model.definition import Effect
 from motorid.records.checks import current_limit
 from motorid.records.experiment import Experiment
 

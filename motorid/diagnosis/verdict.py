@@ -6,12 +6,13 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from motorid.diagnosis.residual_analysis import astray, despiked
+from motorid.diagnosis.residual_analysis import astray
 from motorid.diagnosis.results import Adequacy, Candidate, Missing, Rung
 from motorid.display.numbers import number, percent, with_error
 from motorid.effects import LIBRARY
-from motorid.estimation.fit import Fit
-from motorid.model.model import Effect
+from motorid.estimation.result import Fit
+from motorid.model.definition import Effect
+from motorid.numerics.noise import despiked
 from motorid.uncertainty.covariance import deviations
 
 MOVED = 0.1  # relative change of a motor parameter that is worth a word

@@ -6,8 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
 
-__all__ = ["Card", "Flag", "Table", "html_of", "line_of", "render", "render_table"]
-
 # Words first, colour second: each pair has a contrast of 5.5 or more, on a light page and on a dark one.
 _COLOURS = {
     "good": ("#0b5a26", "#d7f5df"),

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from motorid.display.numbers import duration, number, percent, quantity, with_error
 
 if TYPE_CHECKING:
-    from motorid.estimation.fit import Fit
+    from motorid.estimation.result import Fit
     from motorid.problem.simulate import Evaluation
 
 NAMES = {"i": "current", "omega": "speed", "theta": "angle"}

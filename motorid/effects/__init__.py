@@ -8,9 +8,12 @@ from motorid.effects.electrical import (
     inductance_saturation,
     magnetic_saturation,
     voltage_offset,
+    winding_heating,
 )
 from motorid.effects.mechanical import (
+    backlash,
     cogging,
+    compliance,
     constant_load,
     coulomb,
     coulomb_asymmetric,
@@ -23,10 +26,8 @@ from motorid.effects.mechanical import (
     viscous_asymmetric,
 )
 from motorid.effects.sensor import current_lag, current_offset, speed_delay, speed_gain, speed_lag
-from motorid.effects.thermal import winding_heating
-from motorid.effects.transmission import backlash, compliance
 from motorid.errors import ModelError, one_of
-from motorid.model.model import Effect
+from motorid.model.definition import Effect
 
 LIBRARY: dict[str, Effect] = {
     e.name: e

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from motorid.model.definition import P
+from motorid.model.definition import P, effect
 from motorid.model.equations import Equations
-from motorid.model.model import effect
 
 
 def _lag(m: Equations, channel: str, time_constant) -> None:

@@ -15,12 +15,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from motorid.estimation.fit import Fit
-from motorid.estimation.linearisation import Response, responses
-from motorid.estimation.tangent import Tangent
-from motorid.integrate.engine import Array
-from motorid.model.model import Effect
-from motorid.numerics.whitening import Whitening, unstacked
+from motorid.estimation.linearisation import Response, Tangent, responses, unstacked
+from motorid.estimation.result import Fit
+from motorid.model.definition import Effect
+from motorid.numerics.autoregression import Whitening
+from motorid.numerics.signals import Array
 from motorid.problem.runs import angle_signal
 
 WIDEST = 4e6  # numbers in the answers to all orders that are looked at together

@@ -14,12 +14,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from motorid.errors import FitError, SimulationError
-from motorid.estimation.narrowing import NARROWER, WIDEST, narrow_enough, narrower, smooths, without_width
-from motorid.integrate.engine import Array
 from motorid.numerics.least_squares import LevenbergMarquardt, Solution, levenberg_marquardt
-from motorid.problem.misfit import hardly_explained
+from motorid.numerics.signals import Array
 from motorid.problem.problem import Problem
-from motorid.problem.runs import top_speed
+from motorid.problem.runs import SGN_WIDTH_SHARE, top_speed
+from motorid.problem.simulate import hardly_explained, misfit_over_noise
 
 ON_THE_WAY = ((1e-7, 60), (1e-6, 60))  # ftol and iterations of the first stage, and of those between
 LOWER = 0.98  # of the cost with a wider sgn, or the narrower one is not worth it
@@ -231,4 +230,41 @@ def _cheaper(first: Problem, *others: Problem) -> Problem:
     return (first, *others)[int(np.argmin(costs))] if costs else first
 
 
-__all__ = ["Descent", "descend", "descend_surely", "doubtful"]
+WIDEST = 0.03  # first width of sgn over the highest speed
+NARROWER = 6.0  # at most, from one stage to the next
+NOISE = 1.1  # misfit over noise of an angle that has no creep left in it
+CLEARLY = 1.5  # factor between widths that is worth another descent
+
+
+def smooths(problem: Problem) -> bool:
+    """Tell whether the model has a sgn whose width was left to the records."""
+    width = problem.model.parameters.get("sgn_width")
+    return width is not None and not width.given and not width.vary
+
+
+def narrowest(problem: Problem) -> float:
+    """Return the width of sgn that the noise of the records asks for."""
+    return problem.tuned(width=None).model.values["sgn_width"]
+
+
+def narrow_enough(problem: Problem) -> float:
+    """Return the width of sgn that the speeds of the records ask for, whatever their noise."""
+    return max(SGN_WIDTH_SHARE * top_speed(problem.experiments), narrowest(problem))
+
+
+def narrower(problem: Problem, q: Array) -> Problem | None:
+    """Return the problem with a narrower sgn, where a loaded, stuck motor's creep may show in the angle.
+
+    None where the angle's misfit is noise already, or the width is what that noise asks for.
+    """
+    if problem.width is None or not smooths(problem) or problem.width > 1.01 * narrow_enough(problem):
+        return None
+    width = max(narrowest(problem), problem.width / NARROWER)
+    if width > problem.width / CLEARLY or misfit_over_noise(problem, q).get("theta", 0.0) < NOISE:
+        return None
+    return problem.for_model(problem.model.start_at(without_width(problem, q))).tuned(width=width)
+
+
+def without_width(problem: Problem, q: Array) -> dict[str, float]:
+    """Return the parameter values at `q`, but for the width of sgn."""
+    return {n: v for n, v in problem.values(q).items() if n != "sgn_width"}

@@ -10,17 +10,16 @@ from typing import Any
 import numpy as np
 
 from motorid.errors import FitError, UsageError, one_of
-from motorid.estimation.balancing import descend_balanced
 from motorid.estimation.continuation import Descent
-from motorid.estimation.result import UNDETERMINED, Failure, Fit
+from motorid.estimation.restarts import descend_balanced
+from motorid.estimation.result import Fit
 from motorid.estimation.start_values import started
-from motorid.integrate import Engine
-from motorid.integrate.engine import Array
+from motorid.integrate.engine import Engine
 from motorid.model.model import Model
 from motorid.numerics.least_squares import LevenbergMarquardt, Solution, levenberg_marquardt
-from motorid.problem.misfit import integration_error, misfit_over_noise
+from motorid.numerics.signals import Array
 from motorid.problem.problem import Problem, as_problem
-from motorid.problem.simulate import Evaluation, evaluate
+from motorid.problem.simulate import integration_error, misfit_over_noise
 from motorid.records.experiment import Experiment
 
 NOISE = 1.2  # RMS of the residual over the noise that may be called noise
@@ -109,7 +108,7 @@ def solve(problem: Problem, solver: Any = None, *, start: str = "auto",
         raise UsageError("every parameter is held, there is nothing to fit. Free one, model.free('R'), or judge "
                          "the model as it is: mi.evaluate(model, runs).")
     if start == "auto":
-        from motorid.estimation.numbering import numbered  # it fits smaller models first, by this very function
+        from motorid.estimation.start_values import numbered  # it fits smaller models first, by this very function
 
         problem = started(numbered(problem, solve))
     if hasattr(solver, "solve"):
@@ -175,7 +174,3 @@ def _advice(found: Solution, error: float, n: int) -> str:
         return (f"{found.message}; but the integration error is {error:.2g} times the noise: try engine='cvodes' or "
                 "a finer record.")
     return f"{found.message}."
-
-
-__all__ = ["UNDETERMINED", "Evaluation", "Failure", "Fit", "FitError", "evaluate", "fit", "integration_error",
-           "solve", "started"]

@@ -10,7 +10,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from motorid.estimation.fit import Fit
+from motorid.estimation.result import Fit
 from motorid.exporters.casadi_file import description, held_inputs, runs_of, system_of, values_of, words
 from motorid.integrate.rodas3 import step_functions
 from motorid.model.model import Model
@@ -252,6 +252,3 @@ def _record(grid: Any, inputs: Sequence[str]) -> str:
     rows = [",".join([repr(t), *map(repr, u), str(m)])
             for t, u, m in zip(grid.t.tolist(), grid.u.tolist(), substeps.tolist(), strict=True)]
     return "\n".join([",".join(["t", *inputs, "substeps"]), *rows, ""])
-
-
-__all__ = ["identifier", "write_c"]

@@ -12,13 +12,13 @@ import casadi as ca
 import numpy as np
 
 from motorid.errors import UsageError
-from motorid.estimation.fit import Fit
+from motorid.estimation.result import Fit
 from motorid.exporters.json_file import fit_dict
-from motorid.integrate.engine import Array, Grid
+from motorid.integrate.engine import Grid
 from motorid.integrate.rodas3 import step_functions
-from motorid.model.equations import CHANNELS
+from motorid.model.equations import CHANNELS, System
 from motorid.model.model import Model
-from motorid.model.system import System
+from motorid.numerics.signals import Array
 from motorid.problem.problem import Problem
 from motorid.problem.runs import Run
 from motorid.records.experiment import Experiment
@@ -183,7 +183,3 @@ def words(contents: Mapping[str, Any]) -> list[str]:
     lines += ["", *(f"fitted to {d['name']}: {d['samples']} samples, SHA-256 {d['sha256']}" for d in contents["data"])]
     lines.append("written by " + ", ".join(f"{k} {v}" for k, v in contents["versions"].items()))
     return lines
-
-
-__all__ = ["description", "functions_of", "held_inputs", "model_of", "runs_of", "simulation", "system_of",
-           "values_of", "words"]

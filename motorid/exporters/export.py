@@ -15,10 +15,11 @@ import numpy as np
 
 from motorid.effects import LIBRARY
 from motorid.errors import DataError, ModelError, UsageError, one_of
-from motorid.estimation.fit import Fit
+from motorid.estimation.result import Fit
 from motorid.exporters.casadi_file import description, functions_of, model_of
-from motorid.integrate.engine import Array
-from motorid.model.model import Effect, Model, dc_motor, torque_driven
+from motorid.model.definition import Effect
+from motorid.model.model import Model, dc_motor, torque_driven
+from motorid.numerics.signals import Array
 
 FORMS = {".casadi": "casadi", ".c": "c", ".json": "json"}
 NO_FMU = ("an FMU is not offered: those that CasADi 3.8.2 writes do not pass FMPy's checker (names of variables, "
@@ -257,6 +258,3 @@ def _effect(name: str, own: Mapping[str, Effect], about: Mapping[str, Any] | Non
         raise ModelError(f"{one_of(name, LIBRARY, 'effect')} If it is one of your own, pass it on: "
                          f"mi.load(path, effects=[{name}]).")
     return LIBRARY[name]
-
-
-__all__ = ["Exported", "export", "load", "model_from_json"]

@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from motorid.errors import UsageError
-from motorid.estimation.shooting.multipliers import violations
+from motorid.estimation.shooting.outcome import violations
 from motorid.problem.relations import Relation
 from motorid.uncertainty.covariance import deviations
 
 if TYPE_CHECKING:
-    from motorid.estimation.fit import Fit
+    from motorid.estimation.result import Fit
     from motorid.problem.simulate import Evaluation
 
 MOTOR = ("R", "L", "K", "b", "J")

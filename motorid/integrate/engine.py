@@ -10,9 +10,8 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from motorid.model.system import System
-
-Array = NDArray[np.float64]
+from motorid.model.equations import System
+from motorid.numerics.signals import Array
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import casadi as ca
 
-from motorid.model.system import System
+from motorid.model.equations import System
 
 GAMMA = 0.5
 A = ((), (0.0,), (2.0, 0.0), (2.0, 0.0, 1.0))

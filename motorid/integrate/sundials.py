@@ -19,9 +19,10 @@ import casadi as ca
 import numpy as np
 
 from motorid.errors import ModelError, SimulationError
-from motorid.integrate.engine import Array, Grid, Trajectory
+from motorid.integrate.engine import Grid, Trajectory
 from motorid.integrate.rosenbrock import Rosenbrock, stepper
-from motorid.model.system import System
+from motorid.model.equations import System
+from motorid.numerics.signals import Array
 
 NOT_FINITE = "numbers no longer finite"
 REASONS = ("CV_ERR_FAILURE", "CV_CONV_FAILURE", "CV_TOO_MUCH_WORK", "IDA_ERR_FAIL", "IDA_CONV_FAIL",

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+import importlib
+import inspect
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
-from motorid.errors import ModelError
+from motorid.display.display import Shown
+from motorid.errors import ModelError, one_of
 
 
 @dataclass(frozen=True)
@@ -114,54 +116,109 @@ def P(
                      "order": order, "at_least": at_least, "doc": doc})
 
 
+BALANCES = ("voltage", "torque", "transmission", "sensor")
+
+
 @dataclass(frozen=True, eq=False)
-class Scaling:
-    """Solver coordinates q of the physical values p: ``p = s·exp(q)`` where `log`, else ``p = s·q``.
+class Effect(Shown):
+    """One physical effect: a law that writes on the `Equations` sheet.
 
     Attributes
     ----------
-    scale : ndarray, shape (n,)
-        Positive sizes s.
-    log : ndarray of bool, shape (n,)
-    lower, upper : ndarray, shape (n,)
-        Limits of p.
+    name : str
+    law : callable
+        ``law(m, **symbols)``.
+    parameters : tuple of Parameter
+    balance : str
+        ``"voltage"``, ``"torque"``, ``"transmission"`` or ``"sensor"``.
+    doc : str
+        What it is, with its source.
+    includes : tuple of str
+        Effects that this one contains as a special case (Stribeck friction contains Coulomb's).
     """
 
-    scale: NDArray[np.float64]
-    log: NDArray[np.bool_]
-    lower: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
-    upper: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
-
-    @staticmethod
-    def of(parameters: Iterable[Parameter], sizes: ArrayLike | None = None) -> Scaling:
-        """Return the scaling of `parameters`; `sizes` (n,) replaces the size read from their values."""
-        pars = list(parameters)
-        values = np.array([p.value for p in pars], float)
-        scale = np.abs(values if sizes is None else np.asarray(sizes, float))
-        scale = np.where((scale > 0) & np.isfinite(scale), scale, 1.0)
-        log = np.array([p.positive for p in pars], bool)
-        lower, upper = ([getattr(p, side) for p in pars] for side in ("lower", "upper"))
-        return Scaling(scale, log, np.array(lower, float), np.array(upper, float))
-
-    def physical(self, q: ArrayLike) -> NDArray[np.float64]:
-        """Return p of q."""
-        q = np.asarray(q, float)
-        return self.scale * np.where(self.log, np.exp(np.where(self.log, np.clip(q, -200, 200), 0.0)), q)
-
-    def scaled(self, p: ArrayLike) -> NDArray[np.float64]:
-        """Return q of p."""
-        ratio = np.asarray(p, float) / self.scale
-        tiny = np.finfo(float).tiny
-        return np.where(self.log, np.log(np.maximum(ratio, tiny)), ratio)
-
-    def slope(self, q: ArrayLike) -> NDArray[np.float64]:
-        """Return dp/dq at q, shape (n,)."""
-        return np.where(self.log, self.physical(q), self.scale)
+    name: str
+    law: Callable[..., None] | None
+    parameters: tuple[Parameter, ...]
+    balance: str
+    doc: str = ""
+    includes: tuple[str, ...] = ()
 
     @property
-    def bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Limits in q."""
-        with np.errstate(divide="ignore"):
-            low, high = (np.where(self.log, np.log(np.maximum(p, 0.0) / self.scale), p / self.scale)
-                         for p in (self.lower, self.upper))
-        return low, high
+    def size(self) -> Parameter | None:
+        """The parameter that makes the effect vanish at its null value, if there is just one such."""
+        sizes = [p for p in self.parameters if p.null is not None]
+        return sizes[0] if sizes else None
+
+    def __call__(self, **values: float) -> Effect:
+        """Return the effect with some parameters given, e.g. ``cogging(N=12)`` (held if it is an order)."""
+        known = {p.name: p for p in self.parameters}
+        for name in values:
+            if name not in known:
+                raise ModelError(f"effect '{self.name}': {one_of(name, known, 'parameter')}")
+        pars = tuple(replace(p, value=float(values[p.name]), given=True, vary=p.vary and not p.order)
+                     if p.name in values else p for p in self.parameters)
+        return replace(self, parameters=pars)
+
+    def __repr__(self) -> str:
+        return f"<effect {self.name} ({self.balance}): {', '.join(p.name for p in self.parameters)}>"
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # Only plain data crosses a process boundary: the law goes by the name of its module, if it has one.
+        module = getattr(self.law, "__module__", None)
+        qualname = getattr(self.law, "__qualname__", "")
+        importable = module not in (None, "__main__") and "<locals>" not in qualname
+        place = (module, qualname) if importable else None
+        return _restore_effect, (place, self.name, self.parameters, self.balance, self.doc,
+                                 self.includes)
+
+
+def _restore_effect(place: tuple[str, str] | None, name: str, parameters: tuple[Parameter, ...], balance: str,
+                    doc: str, includes: tuple[str, ...]) -> Effect:
+    law = None
+    if place is not None:
+        try:
+            law = getattr(importlib.import_module(place[0]), place[1]).law
+        except (ImportError, AttributeError):
+            law = None
+    return Effect(name, law, parameters, balance, doc, includes)
+
+
+def effect(*, balance: str, name: str | None = None,
+           includes: tuple[str, ...] = ()) -> Callable[[Callable[..., None]], Effect]:
+    """Make an `Effect` of a function ``law(m, size=P(...), shape=P(...))``.
+
+    Parameters
+    ----------
+    balance : {"voltage", "torque", "transmission", "sensor"}
+        The balance (or the sensor) that the effect acts on.
+    name : str, optional
+        Default: the function's name.
+    includes : tuple of str, optional
+        Effects that this one contains as a special case; it refuses to stand beside them.
+
+    Raises
+    ------
+    ModelError
+        If an argument has no `P` default or the balance is unknown.
+
+    Examples
+    --------
+    >>> @effect(balance="torque")
+    ... def coulomb(m, tau_c=P(2e-3, "N·m", null=0)):
+    ...     m.torque -= tau_c * m.sign(m.omega)
+    """
+    if balance not in BALANCES:
+        raise ModelError(one_of(balance, BALANCES, "balance"))
+
+    def make(law: Callable[..., None]) -> Effect:
+        title = name or law.__name__
+        pars = []
+        for arg in list(inspect.signature(law).parameters.values())[1:]:
+            if not isinstance(arg.default, Declared):
+                raise ModelError(f"effect '{title}': argument '{arg.name}' needs a default "
+                                 "P(value, unit, null=…).")
+            pars.append(arg.default.named(arg.name))
+        return Effect(title, law, tuple(pars), balance, inspect.cleandoc(law.__doc__ or ""), includes)
+
+    return make

@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
 
 from motorid.errors import ModelError, one_of
+from motorid.numerics.signals import Array
 
 CHANNELS = ("i", "omega", "theta")
 
@@ -162,3 +167,154 @@ class Equations:
         circle = ", ".join(sorted(s[1:] for s in used & marks))
         raise ModelError(f"the definitions of {circle} go in a circle: an effect scales or replaces a "
                          "quantity by an expression that needs that same quantity.")
+
+
+
+
+@dataclass(frozen=True, eq=False)
+class System:
+    """Functions of one model for one choice of outputs; holds no Python code and can be pickled.
+
+    Attributes
+    ----------
+    states, inputs, outputs, parameters : tuple of str
+        Names, in the order of the vectors x, u, y, p.
+    stored : tuple of bool
+        Per state: True for a differential equation, False for an algebraic balance (zero storage).
+    rhs : casadi.Function
+        ``(x, u, p) -> f``: dx/dt of differential states, the balance itself of algebraic ones.
+    out : casadi.Function
+        ``(x, u, p) -> y``: what the sensors show.
+    initial : casadi.Function
+        ``(s, p) -> x0`` with s = (i, omega, theta) at the first sample.
+    balances : casadi.Function
+        ``(x, u, p) -> (voltage, torque)`` left over, V and N·m, at zero rates.
+    forces : casadi.Function
+        ``(x, u, p, d) -> f`` with d = (voltage, torque) added to the balances: `diagnose`'s unknown inputs.
+    """
+
+    states: tuple[str, ...]
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+    parameters: tuple[str, ...]
+    stored: tuple[bool, ...]
+    rhs: ca.Function
+    out: ca.Function
+    initial: ca.Function
+    balances: ca.Function
+    forces: ca.Function
+
+    @property
+    def sizes(self) -> tuple[int, int, int, int]:
+        """Numbers of states, inputs, parameters, outputs."""
+        return len(self.states), len(self.inputs), len(self.parameters), len(self.outputs)
+
+    @cached_property
+    def visible(self) -> frozenset[str]:
+        """Parameters that can be seen in the outputs, by the structure of the equations."""
+        nx, nu, np_, _ = self.sizes
+        x, u, p, s = ca.SX.sym("x", nx), ca.SX.sym("u", nu), ca.SX.sym("p", np_), ca.SX.sym("s", 3)
+        f, y, x0 = self.rhs(x, u, p), self.out(x, u, p), self.initial(s, p)
+        f_x, f_p, y_x, y_p, x0_p = (_pattern(a, b) for a, b in ((f, x), (f, p), (y, x), (y, p), (x0, p)))
+        seen = y_x.any(axis=0)  # states that act on an output, directly or through other states
+        for _ in range(nx):
+            seen = seen | f_x[seen].any(axis=0)
+        shown = np.vstack([y_p, f_p[seen], x0_p[seen]]).any(axis=0)
+        return frozenset(self.parameters[k] for k in np.flatnonzero(shown))
+
+    def first_state(self, s: Array, p: Array) -> Array:
+        """Return x0 (nx,) from s = (i, omega, theta) at the first sample and p."""
+        if self._affine is None:
+            return np.asarray(self.initial(s, p)).ravel()
+        constant, by_s, by_p = self._affine
+        return constant + by_s @ s + by_p @ p
+
+    def first_slopes(self, s: Array, p: Array) -> tuple[Array, Array]:
+        """Return dx0/ds (nx, 3) and dx0/dp (nx, np)."""
+        if self._affine is not None:
+            return self._affine[1], self._affine[2]
+        by_s, by_p = self._initial_jacobian(s, p, np.zeros(len(self.states)))
+        return np.asarray(by_s), np.asarray(by_p)
+
+    @cached_property
+    def _initial_jacobian(self) -> ca.Function:
+        return self.initial.jacobian()
+
+    @cached_property
+    def _affine(self) -> tuple[Array, Array, Array] | None:
+        """x0 = c + S s + P p, where it is so (as in the whole library): then no CasADi call is needed."""
+        z = ca.SX.sym("z", 3 + len(self.parameters))
+        slopes = ca.jacobian(self.initial(z[:3], z[3:]), z)
+        if ca.symvar(slopes):
+            return None
+        matrix = np.asarray(ca.DM(ca.evalf(slopes)))
+        constant = np.asarray(self.initial(np.zeros(3), np.zeros(z.numel() - 3))).ravel()
+        return constant, np.ascontiguousarray(matrix[:, :3]), np.ascontiguousarray(matrix[:, 3:])
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {f: getattr(self, f) for f in self.__dataclass_fields__}
+
+
+def _pattern(f: ca.SX, z: ca.SX) -> NDArray[np.bool_]:
+    return np.asarray(ca.DM(ca.jacobian_sparsity(f, z), 1).full(), bool)
+
+
+def build_system(m: Equations, parameters: tuple[str, ...], outputs: tuple[str, ...],
+                 stored: tuple[str, ...]) -> System:
+    """Close the sheet `m` and return its `System`."""
+    electrical = "i" in m.states
+    if electrical:
+        voltage = m.v - m.R * m.i - m.K_e * m.omega + m.voltage
+        torque = m.K_t * m.i - m.b * m.omega + m.torque
+    else:
+        voltage = ca.SX(0)
+        torque = m.g * m.v - m.b * m.omega + m.torque
+        if not m.voltage.is_zero():
+            raise ModelError("a torque-driven model has no voltage balance: leave the electrical effects "
+                             "out, or use dc_motor() with a record of the applied voltage.")
+    shown = [m.measured(c) for c in outputs]
+    for name in m.states:
+        if name not in ("i", "omega") and name not in m.rates:
+            raise ModelError(f"the state '{name}' has no rate: call m.rate({name}, …) in the effect that "
+                             "adds it.")
+    d = ca.SX.sym("d", 2)
+    rates: dict[str, Any] = dict(m.rates)
+    rates["omega"] = (torque + d[1]) / m.J
+    if electrical:
+        rates["i"] = (voltage + d[0]) / m.L if "i" in stored else voltage + d[0]
+    names = tuple(m.states)
+    initial = {"i": m.start["i"], "omega": m.start["omega"], **m.initial}
+    filled = m.fill([*[ca.SX(rates[n]) for n in names], *shown, *[ca.SX(initial[n]) for n in names],
+                     voltage, torque])
+    n = len(names)
+    f, y = ca.vertcat(*filled[:n]), ca.vertcat(*filled[n:n + len(shown)])
+    x0, balances = ca.vertcat(*filled[n + len(shown):-2]), ca.vertcat(*filled[-2:])
+    x, u = ca.vertcat(*m.states.values()), ca.vertcat(*m.inputs.values())
+    p = ca.vertcat(*_symbols(m, parameters))
+    s = ca.vertcat(*m.start.values())
+    quiet = ca.substitute(f, d, ca.DM.zeros(2))
+    _check_closed(ca.vertcat(quiet, y, balances), ca.vertcat(x, u, p))
+    return System(
+        names, tuple(m.inputs), outputs, parameters,
+        tuple(k in stored or k not in ("i", "omega") for k in names),
+        ca.Function("rhs", [x, u, p], [ca.densify(quiet)], ["x", "u", "p"], ["f"]),
+        ca.Function("out", [x, u, p], [ca.densify(y)], ["x", "u", "p"], ["y"]),
+        ca.Function("initial", [s, p], [ca.densify(x0)], ["s", "p"], ["x0"]),
+        ca.Function("balances", [x, u, p], [ca.densify(balances)], ["x", "u", "p"], ["balance"]),
+        ca.Function("forces", [x, u, p, d], [ca.densify(f)], ["x", "u", "p", "d"], ["f"]),
+    )
+
+
+def _symbols(m: Equations, parameters: tuple[str, ...]) -> list[ca.SX]:
+    symbols = dict(m.symbols)
+    if m.sgn_width is not None:
+        symbols["sgn_width"] = m.sgn_width
+    return [symbols.get(n, ca.SX.sym(n)) for n in parameters]
+
+
+def _check_closed(expression: ca.SX, known: ca.SX) -> None:
+    names = {s.name() for s in ca.symvar(known)}
+    stray = sorted({s.name() for s in ca.symvar(expression)} - names)
+    if stray:
+        raise ModelError(f"the model uses {', '.join(stray)}, which nothing defines. Effects may use only "
+                         "the sheet m and their own parameters.")

@@ -11,11 +11,8 @@ import casadi as ca
 
 from motorid.display.display import Shown
 from motorid.errors import ModelError, one_of
-from motorid.model.bases import BASES, DERIVED, QUANTITIES, STATES
-from motorid.model.definition import Parameter
-from motorid.model.equations import CHANNELS, Equations
-from motorid.model.system import System, build_system
-from motorid.model.term import Effect, effect
+from motorid.model.definition import Effect, Parameter
+from motorid.model.equations import CHANNELS, Equations, System, build_system
 
 SGN_WIDTH = Parameter("sgn_width", 1e-2, "rad/s", positive=True, vary=False,
                       doc="speed over which sgn(omega) is smoothed; chosen from the data unless given")
@@ -269,10 +266,28 @@ def torque_driven(axis: str = "rotary", **values: float) -> Model:
     return Model("torque_driven", parameters=pars, axis=axis).replace(**values)
 
 
-__all__ = ["Effect", "Model", "dc_motor", "effect", "torque_driven"]
 
 
 def _within(parameter: Parameter, value: float) -> float:
     """Undo the rounding that a value at its limit suffers on the way through the solver's coordinates."""
     limit = min(max(value, parameter.lower), parameter.upper)
     return limit if abs(value - limit) <= 1e-9 * abs(limit) else value
+
+
+STATES = {"dc_motor": ("i", "omega"), "torque_driven": ("omega",)}
+QUANTITIES = {"dc_motor": ("R", "L", "K", "K_t", "K_e", "b", "J"), "torque_driven": ("g", "b", "J")}
+DERIVED = {"K_t": lambda m: m.K, "K_e": lambda m: m.K}
+BASES = {
+    "dc_motor": (
+        Parameter("R", 1.0, "Ω", positive=True, doc="winding resistance"),
+        Parameter("L", 1e-3, "H", positive=True, doc="winding inductance"),
+        Parameter("K", 0.05, "N·m/A", positive=True, doc="torque and back-EMF constant (V·s/rad)"),
+        Parameter("b", 1e-5, "N·m·s/rad", positive=True, doc="viscous friction"),
+        Parameter("J", 1e-5, "kg·m²", positive=True, doc="moment of inertia"),
+    ),
+    "torque_driven": (
+        Parameter("g", 1.0, "N·m/V", positive=True, vary=False, doc="torque per unit of the command; held"),
+        Parameter("b", 1e-3, "N·m·s/rad", positive=True, doc="viscous friction"),
+        Parameter("J", 1e-3, "kg·m²", positive=True, doc="moment of inertia"),
+    ),
+}

@@ -26,7 +26,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from motorid.errors import FitError, SimulationError
-from motorid.integrate.engine import Array
+from motorid.numerics.signals import Array
 
 
 @dataclass(frozen=True)
@@ -274,6 +274,3 @@ def gauss_newton_covariance(jac: Array, variance: float = 1.0) -> tuple[Array, n
     half = vt[good].T / s[good] / size[:, None]
     lost = np.sum(vt[~good] ** 2, axis=0) > 1e-6
     return variance * half @ half.T, (norms > 0) & ~lost
-
-
-__all__ = ["LevenbergMarquardt", "Solution", "gauss_newton_covariance", "levenberg_marquardt"]

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import ArrayLike, NDArray
+from scipy.special import stdtrit
 
-__all__ = ["noise_level", "quantum"]
-
-Array = NDArray[np.float64]
+from motorid.numerics.signals import Array
 
 ORDERS = (2, 3, 4, 5, 6)
 _SMALLER_HALF = 0.3240277  # mean of |z| over the smaller half, z standard normal: 4·(φ(0) − φ(0.67449))
@@ -127,3 +130,96 @@ def _typical(size: Array) -> float:
     # The mean of the smaller half is as robust as the median and smoother where values come in steps.
     half = (len(size) + 1) // 2
     return float(np.partition(size, half - 1)[:half].mean()) / _SMALLER_HALF
+
+
+FEWEST = 5  # motors that make a batch
+LEVEL = 0.01  # chance of any false alarm in the whole batch
+
+
+@dataclass(frozen=True)
+class Outlier:
+    """One parameter of one motor that stands out: value, the batch's median, z, and a sentence."""
+
+    motor: str
+    parameter: str
+    value: float
+    median: float
+    z: float
+    text: str
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain data."""
+        return {"motor": self.motor, "parameter": self.parameter, "value": self.value, "median": self.median,
+                "z": self.z}
+
+
+def outliers(rows: Sequence[Mapping[str, Any]], names: Sequence[str], positive: frozenset[str],
+             level: float = LEVEL) -> tuple[Outlier, ...]:
+    """Return the outliers of a batch, the most extreme first.
+
+    Parameters
+    ----------
+    rows : sequence of mapping
+        With ``motor`` and per parameter its value and ``<name>_std``.
+    names : sequence of str
+    positive : set of str
+        Parameters compared on the logarithmic scale.
+    level : float
+        Chance of a false alarm anywhere in a batch of equal scatter.
+    """
+    found = []
+    for n in names:
+        known = [r for r in rows if r.get(f"{n}_std") is not None]
+        if len(known) < FEWEST:
+            continue
+        value = np.array([r[n] for r in known], float)
+        std = np.array([r[f"{n}_std"] for r in known], float)
+        x, sd = (np.log(value), std / value) if n in positive else (value, std)
+        z = scores(x, sd)
+        limit = float(stdtrit(max(len(known) - 2, 1), 1 - level / (2 * len(known) * len(names))))
+        for j in np.flatnonzero(np.abs(z) > limit):
+            middle = float(np.median(value))
+            side = "above" if z[j] > 0 else "below"
+            share = f"{abs(value[j] / middle - 1):.1%} {side}" if middle else side
+            found.append(Outlier(known[j]["motor"], n, float(value[j]), middle, float(z[j]),
+                                 f"{known[j]['motor']}: {n} = {value[j]:.4g} is {share} the batch's median "
+                                 f"{middle:.4g} (z = {z[j]:.1f})."))
+    return tuple(sorted(found, key=lambda o: -abs(o.z)))
+
+
+def scores(x: Array, std: Array) -> Array:
+    """Return robust z of values (n,): distance from the median over scatter and own uncertainty together."""
+    middle = np.median(x)
+    scatter = 1.4826 * np.median(np.abs(x - middle))
+    own = np.median(std)
+    between = np.sqrt(max(scatter**2 - own**2, 0.0))
+    return (x - middle) / np.maximum(np.hypot(between, std), 1e-12 * max(abs(middle), 1e-300))
+
+
+@dataclass(frozen=True)
+class Huber:
+    """Robust loss: quadratic within `delta` sigma, linear beyond (Huber, Ann. Math. Stat. 35, 1964)."""
+
+    delta: float = 1.345
+
+    def pseudo(self, r: Array) -> tuple[Array, Array]:
+        """Return r̃ with r̃² = 2ρ(r), and dr̃/dr, so that least squares of r̃ minimise the robust loss."""
+        size = np.abs(r)
+        far = size > self.delta
+        root = np.sqrt(np.where(far, 2 * self.delta * size - self.delta**2, 1.0))
+        return np.where(far, np.sign(r) * root, r), np.where(far, self.delta / root, 1.0)
+CLIP = 6.0  # robust standard deviations beyond which a residual counts as an outlier
+
+
+def despiked(r: Array) -> Array:
+    """Return `r` (N,) without NaN, samples that stand alone far from both neighbours replaced by the middle of three.
+
+    A few large samples in a row are no outliers: there the model fails.
+    """
+    r = r[np.isfinite(r)]
+    if len(r) < 3:
+        return r
+    before, after = np.concatenate([r[1:2], r[:-1]]), np.concatenate([r[1:], r[-2:-1]])
+    middle = np.maximum(np.minimum(before, r), np.minimum(np.maximum(before, r), after))
+    limit = CLIP * 1.4826 * float(np.median(np.abs(r)))
+    return np.where(np.abs(r - middle) > limit, middle, r)

@@ -2,11 +2,9 @@
 
 from motorid.plots.constraints import plot_current_limit, plot_formulations
 from motorid.plots.diagnosis import plot_ladder, plot_missing, plot_ranking
-from motorid.plots.fits import plot_fit, plot_runs
-from motorid.plots.parameters import plot_parameters
+from motorid.plots.fits import plot_fit, plot_parameters, plot_runs
 from motorid.plots.residuals import plot_residuals
-from motorid.plots.trust import plot_sensitivities, plot_waterfall
-from motorid.plots.uncertainty import plot_profile, plot_singular_values
+from motorid.plots.uncertainty import plot_profile, plot_sensitivities, plot_singular_values, plot_waterfall
 
 __all__ = [
     "plot_current_limit",

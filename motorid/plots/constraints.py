@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from motorid.errors import UsageError
-from motorid.estimation.fit import Fit
+from motorid.estimation.result import Fit
 from motorid.estimation.shooting.formulations import Formulations
 from motorid.plots.style import (
     CYCLE,

@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from motorid.diagnosis.results import Binned, Candidate, Diagnosis, Ladder, Missing
 from motorid.display.numbers import number
 from motorid.errors import UsageError
-from motorid.integrate.engine import Array
+from motorid.numerics.signals import Array
 from motorid.plots.residuals import scatter
 from motorid.plots.style import (
     CYCLE,

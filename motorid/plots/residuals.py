@@ -9,9 +9,9 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from motorid.errors import UsageError, one_of
-from motorid.estimation.fit import Fit
-from motorid.integrate.engine import Array
+from motorid.estimation.result import Fit
 from motorid.model.equations import CHANNELS
+from motorid.numerics.signals import Array
 from motorid.plots.style import (
     INK,
     MUTED,

@@ -16,25 +16,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from motorid.errors import DataError
-from motorid.integrate.engine import Array
+from motorid.numerics.signals import Array
 from motorid.records.experiment import Experiment
-
-__all__ = [
-    "CYCLE",
-    "INK",
-    "MUTED",
-    "PALETTE",
-    "axis_label",
-    "band",
-    "detached",
-    "envelope",
-    "finite",
-    "grid",
-    "line",
-    "only",
-    "styled",
-    "tidy",
-]
 
 _P = ParamSpec("_P")
 _R = TypeVar("_R")

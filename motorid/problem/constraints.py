@@ -15,7 +15,7 @@ import casadi as ca
 import numpy as np
 
 from motorid.errors import ModelError, UsageError
-from motorid.integrate.engine import Array
+from motorid.numerics.signals import Array
 from motorid.problem.relations import Part, Relation, check_weight, local, share
 from motorid.records.steady_state import Segment, find_segments, segment_between
 
@@ -261,6 +261,3 @@ class Constraint(Relation):
                               self.lower / self.size * one, self.upper / self.size * one, self.size * one,
                               self.weight * share(problem, k) * one, tuple(labels), (self.unit,) * n))
         return tuple(found)
-
-
-__all__ = ["Constraint", "CurrentLimit", "Segment", "SteadyState"]

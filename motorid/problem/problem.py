@@ -10,16 +10,16 @@ from typing import Any
 import numpy as np
 
 from motorid.errors import ModelError, SimulationError, UsageError, one_of
-from motorid.integrate import Engine, Trajectory, engine_of
-from motorid.integrate.engine import Array
-from motorid.model.definition import Parameter, Scaling
+from motorid.integrate import engine_of
+from motorid.integrate.engine import Engine, Trajectory
+from motorid.model.definition import Parameter
+from motorid.model.equations import System
 from motorid.model.model import Model
-from motorid.model.system import System
-from motorid.numerics.loss import Huber
-from motorid.problem.accuracy import Levels
-from motorid.problem.residuals import Measured, prior_residual
+from motorid.numerics.noise import Huber
+from motorid.numerics.signals import Array
+from motorid.problem.residuals import Levels, Measured, prior_residual
 from motorid.problem.runs import Run, channels_of, noise_of, prepare_run, smoothing, with_inputs
-from motorid.problem.unknowns import Point, Unknowns
+from motorid.problem.unknowns import Point, Scaling, Unknowns
 from motorid.records.experiment import Experiment
 
 
@@ -295,6 +295,3 @@ def as_problem(model: Model, runs: Sequence[Experiment] | Experiment, **fields: 
     """Return a `Problem` of a model and one or several runs."""
     experiments = (runs,) if isinstance(runs, Experiment) else tuple(runs)
     return Problem(model, experiments, **fields)
-
-
-__all__ = ["Huber", "Problem", "as_problem"]

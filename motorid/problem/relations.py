@@ -17,7 +17,8 @@ import casadi as ca
 import numpy as np
 
 from motorid.errors import UsageError
-from motorid.integrate.engine import Array, Trajectory
+from motorid.integrate.engine import Trajectory
+from motorid.numerics.signals import Array
 
 
 @dataclass(frozen=True, eq=False)

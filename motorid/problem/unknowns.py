@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from motorid.integrate.engine import Array
-from motorid.model.definition import Parameter, Scaling
-from motorid.model.equations import CHANNELS
-from motorid.model.system import System
+from motorid.model.definition import Parameter
+from motorid.model.equations import CHANNELS, System
+from motorid.numerics.signals import Array
 from motorid.problem.runs import Run, natural_sizes, spread_of
 
 STATE_UNITS = {"i": "A", "omega": "rad/s", "theta": "rad"}
@@ -152,3 +151,56 @@ class Unknowns:
             start = start.copy()
             start[rows] = at.physical[columns]
         return start
+
+
+@dataclass(frozen=True, eq=False)
+class Scaling:
+    """Solver coordinates q of the physical values p: ``p = s·exp(q)`` where `log`, else ``p = s·q``.
+
+    Attributes
+    ----------
+    scale : ndarray, shape (n,)
+        Positive sizes s.
+    log : ndarray of bool, shape (n,)
+    lower, upper : ndarray, shape (n,)
+        Limits of p.
+    """
+
+    scale: NDArray[np.float64]
+    log: NDArray[np.bool_]
+    lower: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
+    upper: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
+
+    @staticmethod
+    def of(parameters: Iterable[Parameter], sizes: ArrayLike | None = None) -> Scaling:
+        """Return the scaling of `parameters`; `sizes` (n,) replaces the size read from their values."""
+        pars = list(parameters)
+        values = np.array([p.value for p in pars], float)
+        scale = np.abs(values if sizes is None else np.asarray(sizes, float))
+        scale = np.where((scale > 0) & np.isfinite(scale), scale, 1.0)
+        log = np.array([p.positive for p in pars], bool)
+        lower, upper = ([getattr(p, side) for p in pars] for side in ("lower", "upper"))
+        return Scaling(scale, log, np.array(lower, float), np.array(upper, float))
+
+    def physical(self, q: ArrayLike) -> NDArray[np.float64]:
+        """Return p of q."""
+        q = np.asarray(q, float)
+        return self.scale * np.where(self.log, np.exp(np.where(self.log, np.clip(q, -200, 200), 0.0)), q)
+
+    def scaled(self, p: ArrayLike) -> NDArray[np.float64]:
+        """Return q of p."""
+        ratio = np.asarray(p, float) / self.scale
+        tiny = np.finfo(float).tiny
+        return np.where(self.log, np.log(np.maximum(ratio, tiny)), ratio)
+
+    def slope(self, q: ArrayLike) -> NDArray[np.float64]:
+        """Return dp/dq at q, shape (n,)."""
+        return np.where(self.log, self.physical(q), self.scale)
+
+    @property
+    def bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Limits in q."""
+        with np.errstate(divide="ignore"):
+            low, high = (np.where(self.log, np.log(np.maximum(p, 0.0) / self.scale), p / self.scale)
+                         for p in (self.lower, self.upper))
+        return low, high

@@ -6,9 +6,9 @@ from collections.abc import Callable, Sequence
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
 from motorid.numerics.noise import noise_level, quantum
+from motorid.numerics.signals import Array
 from motorid.records.experiment import Experiment
 from motorid.records.plausibility import (
     angle_against_speed,
@@ -19,9 +19,6 @@ from motorid.records.plausibility import (
     unsigned,
 )
 
-__all__ = ["check_runs", "current_limit"]
-
-Array = NDArray[np.float64]
 Check = Callable[[Experiment], str | None]
 
 _NAMES = {"i": "current", "omega": "speed", "theta": "angle"}

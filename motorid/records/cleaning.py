@@ -10,14 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from motorid.errors import DataError
+from motorid.numerics.signals import Array
 from motorid.records.experiment import MIN_SAMPLES, Experiment
 from motorid.records.layout import Layout, Place
 from motorid.records.preprocessing import unwrapped
 from motorid.records.text_tables import counted
 
-__all__ = ["build"]
-
-Array = NDArray[np.float64]
 Texts = Mapping[str, Sequence[object]]
 
 _LATE = 2  # this many rows in a row may come late before it counts as a new start of time

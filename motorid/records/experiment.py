@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from itertools import pairwise
 from numbers import Real
@@ -11,13 +11,12 @@ from types import MappingProxyType
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from motorid.display.display import Shown
 from motorid.errors import DataError, UsageError, one_of
-from motorid.records import preprocessing as repairs
-
-__all__ = ["INPUTS", "MIN_SAMPLES", "OUTPUTS", "UNITS", "Experiment", "split"]
+from motorid.numerics.signals import Array
+from motorid.records import preprocessing
 
 INPUTS = ("v",)
 OUTPUTS = ("i", "omega", "theta")
@@ -31,7 +30,6 @@ UNITS: Mapping[str, tuple[str, ...]] = MappingProxyType({
 })
 MIN_SAMPLES = 8
 
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,25 +154,33 @@ class Experiment(Shown):
 
     def running_median(self, samples: int) -> Experiment:
         """Return the run with its voltage, noisy as it was measured, replaced by the median over `samples` (odd)."""
-        return repairs.running_median(self, samples)
+        return self._with_inputs(lambda v: preprocessing.running_median(v, samples))
 
     def levelled(self) -> Experiment:
         """Return the run with a voltage that is constant between its steps, but was measured with noise, made so."""
-        return repairs.levelled(self)
+        return self._with_inputs(preprocessing.levelled)
 
     def delayed(self, seconds: float) -> Experiment:
         """Return the run with a voltage that acts later than its column says, earlier if `seconds` is negative.
 
         Before the record it is as at its beginning; a held one that moves by parts of a sample is averaged over each.
         """
-        return repairs.delayed(self, seconds)
+        if not np.isfinite(seconds) or abs(seconds) >= self.duration:
+            raise UsageError(f"{self.name}: a voltage can be delayed by less than the {self.duration:.4g} s of the "
+                             f"run; got {seconds!r}.")
+        return self._with_inputs(lambda v: preprocessing.delayed(self.t, v, self.hold, seconds))
 
     def without_spikes(self) -> Experiment:
         """Return the run with single samples that stand far from both neighbours marked as missing.
 
         Not next to jumps of the voltage, where the motor is quick; at least three, at most 5 % of a channel.
         """
-        return repairs.without_spikes(self)
+        v = self.inputs["v"]
+        outputs = {c: preprocessing.without_spikes(self.t, y, v) for c, y in self.outputs.items()}
+        return self.with_(outputs=outputs) if any(outputs[c] is not y for c, y in self.outputs.items()) else self
+
+    def _with_inputs(self, read: Callable[[Array], Array]) -> Experiment:
+        return self.with_(inputs={c: read(v) for c, v in self.inputs.items()})
 
     def __reduce__(self) -> tuple[Any, ...]:
         # A mappingproxy cannot be pickled, so hand plain dicts to the constructor of the other process.

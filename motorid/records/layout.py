@@ -7,10 +7,17 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from motorid.errors import DataError, UsageError, one_of
-from motorid.records.headers import classify, is_duty, is_supply, unit_in
-from motorid.records.units import DIMENSIONS, SI, Unit, parse_unit, require_unit
-
-__all__ = ["Layout", "Place", "assign", "parse_pairs"]
+from motorid.records.headers import (
+    DIMENSIONS,
+    SI,
+    Unit,
+    classify,
+    is_duty,
+    is_supply,
+    parse_unit,
+    require_unit,
+    unit_in,
+)
 
 _CHANNELS = tuple(DIMENSIONS)
 _MEANING = {"t": "the time", "v": "the drive voltage", "i": "the current", "omega": "the speed",

@@ -6,11 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from motorid.numerics.noise import noise_level
+from motorid.numerics.signals import Array
 from motorid.records.experiment import Experiment
-
-__all__ = ["angle_against_speed", "implied_constants", "magnitudes", "signs", "swapped_columns", "unsigned"]
-
-Array = NDArray[np.float64]
 
 _BLOCKS = 40
 # Ratio of the angle's rate to the speed, and what was then mistaken for SI.

@@ -3,18 +3,13 @@
 from __future__ import annotations
 
 from itertools import pairwise
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from motorid.errors import UsageError
 from motorid.numerics.noise import noise_level
-
-if TYPE_CHECKING:
-    from motorid.records.experiment import Experiment
-
-Array = NDArray[np.float64]
+from motorid.numerics.signals import Array
 
 CLEAR = np.pi / 2  # rad: a step of the angle this far from what is expected may be a turn or none
 JUMP = 7.0  # times the noise of the voltage: a step
@@ -49,23 +44,17 @@ def unwrapped(theta: Array, t: Array, omega: Array | None = None) -> tuple[Array
     return on, int(np.count_nonzero(jumps))
 
 
-def running_median(run: Experiment, samples: int) -> Experiment:
-    """Return the run with its inputs replaced by the running median; see `Experiment.running_median`."""
+def running_median(v: Array, samples: int) -> Array:
+    """Return the running median of an input over an odd number of samples."""
     if int(samples) != samples or samples < 1 or samples % 2 == 0:
         raise UsageError(f"running_median() takes an odd number of samples, 1 or more; got {samples!r}.")
     from scipy.ndimage import median_filter
 
-    quiet = {c: median_filter(a, int(samples), mode="nearest") for c, a in run.inputs.items()}
-    return run.with_(inputs=quiet)
+    return median_filter(v, int(samples), mode="nearest")
 
 
-def levelled(run: Experiment) -> Experiment:
-    """Return the run with a noisy voltage between its steps replaced by its mean; see `Experiment.levelled`."""
-    return run.with_(inputs={c: _levels(a) for c, a in run.inputs.items()})
-
-
-def _levels(v: Array) -> Array:
-    """Return the means between jumps, where what lies between two jumps is no more than noise."""
+def levelled(v: Array) -> Array:
+    """Return an input as its means between jumps, where what lies between two jumps is no more than noise."""
     changes = np.diff(v)
     noise = 1.4826 * float(np.median(np.abs(changes))) / np.sqrt(2)
     ends = np.concatenate([[0], np.flatnonzero(np.abs(changes) > JUMP * noise) + 1, [len(v)]])
@@ -78,15 +67,10 @@ def _levels(v: Array) -> Array:
     return level
 
 
-def delayed(run: Experiment, seconds: float) -> Experiment:
-    """Return the run with its inputs acting later; see `Experiment.delayed`."""
-    if not np.isfinite(seconds) or abs(seconds) >= run.duration:
-        raise UsageError(f"{run.name}: a voltage can be delayed by less than the {run.duration:.4g} s of the run; "
-                         f"got {seconds!r}.")
-    t = run.t - seconds
-    if run.hold == "linear":
-        return run.with_(inputs={c: np.interp(t, run.t, a) for c, a in run.inputs.items()})
-    return run.with_(inputs={c: _held_means(run.t, a, t) for c, a in run.inputs.items()})
+def delayed(t: Array, v: Array, hold: str, seconds: float) -> Array:
+    """Return an input that acts `seconds` later; `hold` says how it goes on between samples."""
+    at = t - seconds
+    return np.interp(at, t, v) if hold == "linear" else _held_means(t, v, at)
 
 
 def _held_means(t: Array, v: Array, at: Array) -> Array:
@@ -99,30 +83,31 @@ def _held_means(t: Array, v: Array, at: Array) -> Array:
     return np.append(means, v[np.searchsorted(t, at[-1], side="right") - 1])
 
 
-def without_spikes(run: Experiment) -> Experiment:
-    """Return the run with single samples that no motor makes marked as missing; see `Experiment.without_spikes`."""
-    marked = {}
-    for c, y in run.outputs.items():
-        at = spikes(run, c)
-        if LEAST <= len(at) <= MOST * run.n:
-            marked[c] = y.copy()
-            marked[c][at] = np.nan
-    return run.with_(outputs={**run.outputs, **marked}) if marked else run
+def without_spikes(t: Array, y: Array, v: Array) -> Array:
+    """Return an output with single samples that no motor makes marked as missing; the same array where there are none.
+
+    A few may be chance, and a large share is no accident: both are left.
+    """
+    at = spikes(t, y, v)
+    if not LEAST <= len(at) <= MOST * len(t):
+        return y
+    y = y.copy()
+    y[at] = np.nan
+    return y
 
 
-def spikes(run: Experiment, channel: str) -> NDArray[np.intp]:
+def spikes(t: Array, y: Array, v: Array) -> NDArray[np.intp]:
     """Return which samples of an output stand far from neighbours that agree, not where the voltage jumps."""
-    y, v = run.outputs[channel], run.inputs["v"]
     seen = np.flatnonzero(np.isfinite(y))
     if len(seen) < FEWEST:
         return np.empty(0, int)
-    noise = noise_level(y, run.t)
+    noise = noise_level(y, t)
     before, here, after = y[seen[:-2]], y[seen[1:-1]], y[seen[2:]]
     off, apart = here - (before + after) / 2, np.abs(after - before)
     jumps = np.flatnonzero(np.abs(np.diff(v)) > 0.02 * np.ptp(v))
-    steady = np.ones(run.n, bool)
+    steady = np.ones(len(t), bool)
     for k in range(PEAK + 1):
-        steady[np.clip(jumps + k, 0, run.n - 1)] = False
+        steady[np.clip(jumps + k, 0, len(t) - 1)] = False
     calm = steady[seen[1:-1]]
     # Smooth or not, a channel bends everywhere alike; nine in ten tell how much.
     usual = float(np.quantile(np.abs(off[calm]), 0.9)) if calm.any() else np.inf

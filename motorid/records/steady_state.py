@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from motorid.integrate.engine import Array
+from motorid.numerics.signals import Array
 from motorid.records.experiment import Experiment
 
 LEAST = 16  # samples

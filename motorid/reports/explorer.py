@@ -12,15 +12,14 @@ from motorid.display.cards import Card, render
 from motorid.display.numbers import duration
 from motorid.effects import LIBRARY, get
 from motorid.errors import MissingDependency, ModelError, MotoridError, UsageError
-from motorid.estimation.fit import Fit, fit
+from motorid.estimation.fit import fit
+from motorid.estimation.result import Fit
 from motorid.estimation.start_values import with_suited_effects
-from motorid.model.definition import Parameter
-from motorid.model.model import Effect, Model
+from motorid.model.definition import Effect, Parameter
+from motorid.model.model import Model
 from motorid.problem.problem import Problem
 from motorid.problem.simulate import evaluate
 from motorid.records.experiment import Experiment
-
-__all__ = ["Explorer", "explore"]
 
 REACH = 10.0  # a slider goes from a tenth to ten times the value it begins with
 

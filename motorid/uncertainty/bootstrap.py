@@ -16,11 +16,11 @@ from motorid.display.numbers import number, with_error
 from motorid.display.tables import Table
 from motorid.errors import FitError, MotoridError, UsageError, one_of
 from motorid.estimation.continuation import descend
-from motorid.estimation.fit import Failure, Fit
-from motorid.integrate.engine import Array
+from motorid.estimation.result import Failure, Fit
 from motorid.numerics.autoregression import Colour, colour_of
 from motorid.numerics.least_squares import LevenbergMarquardt
 from motorid.numerics.parallel import Map, Parcel, in_chunks, run_tasks
+from motorid.numerics.signals import Array
 from motorid.problem.problem import Problem
 from motorid.records.experiment import Experiment
 from motorid.uncertainty.covariance import covariance, interval_text

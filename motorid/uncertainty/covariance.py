@@ -14,10 +14,10 @@ from motorid.display.display import Shown
 from motorid.display.numbers import number, with_error
 from motorid.display.tables import Table
 from motorid.errors import UsageError, one_of
-from motorid.estimation.fit import UNDETERMINED, Fit
-from motorid.integrate.engine import Array
+from motorid.estimation.result import UNDETERMINED, Fit
 from motorid.numerics.autoregression import Colour, colour_of, weighed
 from motorid.numerics.least_squares import gauss_newton_covariance
+from motorid.numerics.signals import Array
 
 WIDE = 0.8  # of the value: an interval that reaches farther down is made on the logarithmic scale
 METHODS = ("coloured", "white")

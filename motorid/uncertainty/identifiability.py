@@ -19,13 +19,12 @@ from motorid.display.display import Shown
 from motorid.display.numbers import number, quantity
 from motorid.display.tables import Table
 from motorid.errors import SimulationError, UsageError
-from motorid.estimation.fit import UNDETERMINED, Fit
+from motorid.estimation.result import UNDETERMINED, Fit
 from motorid.estimation.start_values import started
-from motorid.integrate.engine import Array
+from motorid.numerics.signals import Array
 from motorid.problem.problem import Problem
-from motorid.problem.sensitivity_part import relative_jacobian, relative_sensitivities
-from motorid.uncertainty.remedies import remedies
-from motorid.uncertainty.weak_directions import basis_in_words, monomials
+from motorid.problem.sensitivity import relative_jacobian, relative_sensitivities
+from motorid.uncertainty.weak_directions import basis_in_words, monomials, remedies
 
 STRUCTURAL = 1e-7  # of the largest singular value, columns of equal length: less is no influence
 LEVEL = 1.0 / UNDETERMINED  # singular value below which a factor of e drowns in the noise

@@ -8,7 +8,7 @@ Biometrika 69, 1982).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,14 +17,16 @@ from scipy.special import stdtrit
 
 from motorid.display.display import Shown
 from motorid.display.numbers import number
+from motorid.display.tables import Table
 from motorid.errors import MotoridError, UsageError, one_of
 from motorid.estimation.continuation import descend
-from motorid.estimation.fit import Fit
-from motorid.integrate.engine import Array
+from motorid.estimation.result import Fit
 from motorid.numerics.least_squares import LevenbergMarquardt, gauss_newton_covariance
 from motorid.numerics.parallel import Map, Parcel, run_tasks
+from motorid.numerics.signals import Array
 from motorid.problem.problem import Problem
-from motorid.uncertainty.covariance import covariance, interval_text
+from motorid.uncertainty.bootstrap import Bootstrap, bootstrap
+from motorid.uncertainty.covariance import Covariance, covariance, interval_text
 
 FARTHEST = np.log(1e4)  # on the logarithmic scale; beyond it a parameter counts as not limited
 MOST = 30  # points per side
@@ -215,3 +217,59 @@ def _joined(fit: Fit, name: str, left: list[Point], right: list[Point], dof: flo
     others = {n: np.array([v[n] for _, _, v in points]) for n in fit.problem.model.free_names if n != name}
     return Profile(name, p.unit, fit.values[name], np.array([v for v, _, _ in points]),
                    np.array([r for _, r, _ in points]), others, dof, p.positive)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Intervals(Shown):
+    """Three answers to one question. Where they agree, any will do; where not, believe the profile.
+
+    Attributes
+    ----------
+    covariance : Covariance
+    bootstrap : Bootstrap
+    profiles : mapping of str to Profile
+    level : float
+    """
+
+    covariance: Covariance
+    bootstrap: Bootstrap
+    profiles: Mapping[str, Profile]
+    level: float
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain data: per parameter value, status and the three intervals."""
+        return {"level": self.level, "parameters": {
+            n: {"value": p.value, "unit": p.unit, "status": self.covariance.status[n],
+                "covariance": self.covariance.interval(n, self.level),
+                "bootstrap": self.bootstrap.interval(n, self.level),
+                "profile": p.to_dict(self.level)["interval"]} for n, p in self.profiles.items()}}
+
+    def __str__(self) -> str:
+        rows = []
+        for n, p in self.profiles.items():
+            known = self.covariance.interval(n, self.level)
+            rows.append((n, f"{number(p.value)} {p.unit}",
+                         interval_text(known) if known else self.covariance.status[n],
+                         interval_text(self.bootstrap.interval(n, self.level)),
+                         interval_text(p.interval(self.level))))
+        heads = ("", "value", "covariance", f"bootstrap ({self.bootstrap.kind})", "profile")
+        return str(Table(f"Intervals of {self.level:.0%}", heads, tuple(rows), left=(0, 1, 2, 3, 4)))
+
+
+def intervals(fit: Fit, *, level: float = 0.95, kind: str = "blocks", n: int = 200, seed: int = 0,
+              map: Map | None = None, quiet: bool = False) -> Intervals:
+    """Return the intervals of the free parameters from covariance, bootstrap and profile, in one table.
+
+    Parameters
+    ----------
+    fit : Fit
+    level : float
+    kind, n, seed
+        As in `bootstrap`.
+    map : callable, optional
+        Anything with the signature of `map`.
+    quiet : bool
+        No progress bars.
+    """
+    refits = bootstrap(fit, kind=kind, n=n, seed=seed, map=map, quiet=quiet)
+    return Intervals(covariance(fit), refits, profiles(fit, level=level, map=map, quiet=quiet), level)

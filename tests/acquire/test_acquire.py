@@ -13,11 +13,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from motorid.acquire.calibration import calibrate, read_calibration
 from motorid.acquire.excitation import Program, Segment, lfsr_bits, program
 from motorid.acquire.protocol import Channel, Decoder, Header, Message, Sample, crc16, frame
 from motorid.acquire.record_file import RunFile, check_target, column, read_tail
-from motorid.acquire.timeline import Ledger, Row
+from motorid.acquire.timeline import Ledger, Row, calibrate, read_calibration
 from motorid.errors import DataError, DeviceError, UsageError
 
 CHANNELS = (Channel("v", "V", 1e-3), Channel("i", "A", 0.005, 2048, "a12"),
@@ -398,7 +397,7 @@ def test_trouble_in_the_background_is_told_at_the_next_line(tmp_path, monkeypatc
     def broken(fd):
         raise OSError(5, "Input/output error")
 
-    monkeypatch.setattr("motorid.acquire.disk.SYNC_EVERY", 0.01)
+    monkeypatch.setattr("motorid.acquire.record_file.SYNC_EVERY", 0.01)
     file = RunFile(tmp_path / "run.csv", CHANNELS, 1000.0, {})
     monkeypatch.setattr(os, "fsync", broken)
     file.add(rows(0))

@@ -21,10 +21,9 @@ import pytest
 from memory_link import MemoryLink
 
 from motorid.acquire import record
-from motorid.acquire.faults import Faults, Wire
-from motorid.acquire.hidden import SIZES, hide
 from motorid.acquire.protocol import frame
-from motorid.acquire.virtual import VirtualDevice
+from motorid.acquire.server import Faults, Wire
+from motorid.acquire.virtual import SIZES, VirtualDevice, hide
 from motorid.errors import DeviceError, UsageError
 
 needs_pty = pytest.mark.skipif(not hasattr(os, "openpty"), reason="this system has no pseudo-terminals")
@@ -617,8 +616,7 @@ def test_faults_on_the_wire_are_counted_over_the_pseudo_terminal_too(out):
 
 
 def test_where_there_are_no_pseudo_terminals_a_loopback_socket_serves(out, monkeypatch):
-    from motorid.acquire.ends import LOOPBACK, Socket, open_end
-    from motorid.acquire.server import Pace, serve
+    from motorid.acquire.server import LOOPBACK, Pace, Socket, open_end, serve
 
     monkeypatch.delattr(os, "openpty", raising=False)
     end = open_end()

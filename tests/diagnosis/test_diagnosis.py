@@ -13,14 +13,15 @@ from battery.excite import driven, record
 
 import motorid as mi
 from motorid.diagnosis.adequacy import adequacy
-from motorid.diagnosis.residual_analysis import Errors, autocorrelation, compare_errors, effective_samples
+from motorid.diagnosis.residual_analysis import Errors, compare_errors
 from motorid.diagnosis.score_test import rank, score
 from motorid.diagnosis.verdict import moves
 from motorid.display.numbers import with_error
 from motorid.effects import LIBRARY
 from motorid.errors import FitError, ModelError, UsageError
 from motorid.estimation.angle_orders import highest_order, likely_orders
-from motorid.estimation.tangent import Tangent
+from motorid.estimation.linearisation import Tangent
+from motorid.numerics.autoregression import autocorrelation, effective_samples
 from motorid.records.experiment import Experiment
 from motorid.uncertainty.covariance import deviations
 

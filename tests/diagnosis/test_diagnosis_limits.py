@@ -9,16 +9,15 @@ import pytest
 from battery.excite import driven, record
 
 import motorid as mi
-from motorid.diagnosis import parts
-from motorid.diagnosis.admissibility import objections
+from motorid.diagnosis import cross_validation as parts
+from motorid.diagnosis.admissibility import objections, samples_within, unresolved
 from motorid.diagnosis.candidates import Search, library
 from motorid.diagnosis.refit import refit
-from motorid.diagnosis.resolvable import samples_within, unresolved
 from motorid.diagnosis.score_test import score
 from motorid.effects import LIBRARY
 from motorid.estimation.angle_orders import likely_lines, spectrum
-from motorid.estimation.tangent import Tangent
-from motorid.numerics.whitening import Whitening
+from motorid.estimation.linearisation import Tangent
+from motorid.numerics.autoregression import Whitening
 
 ANGLE = ("i", "omega", "theta")
 

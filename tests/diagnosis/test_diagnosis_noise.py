@@ -10,15 +10,15 @@ import pytest
 from battery.excite import P, driven, record
 
 import motorid as mi
-from motorid.diagnosis.adequacy import adequacy
+from motorid.diagnosis.adequacy import adequacy, judgement, predicted
 from motorid.diagnosis.cross_validation import HeldOut
-from motorid.diagnosis.hardly import hardly_moved
-from motorid.diagnosis.judgement import judgement, predicted
+from motorid.diagnosis.misspecification import hardly_moved
 from motorid.diagnosis.model_comparison import Judge, Node
-from motorid.diagnosis.residual_analysis import Errors, compare_errors, despiked
+from motorid.diagnosis.residual_analysis import Errors, compare_errors
 from motorid.diagnosis.score_test import Score
 from motorid.diagnosis.verdict import _noise_feedback, closed_loop_remark, outliers_remark
 from motorid.effects import LIBRARY
+from motorid.numerics.noise import despiked
 from motorid.records.experiment import Experiment
 
 DRIVES = ("stairs", "multisine", "steps")

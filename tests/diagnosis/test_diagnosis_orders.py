@@ -9,9 +9,8 @@ from battery.excite import driven, record
 import motorid as mi
 from motorid.effects import LIBRARY
 from motorid.estimation import angle_orders as orders
-from motorid.estimation.linearisation import Response
-from motorid.estimation.tangent import Tangent
-from motorid.numerics.whitening import ORDER, Whitening
+from motorid.estimation.linearisation import Response, Tangent
+from motorid.numerics.autoregression import ORDER, Whitening
 
 
 def some(rng, n=40, nx=3, ny=2):

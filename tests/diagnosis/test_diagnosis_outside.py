@@ -13,7 +13,7 @@ import motorid as mi
 from motorid.diagnosis.cross_validation import HeldOut
 from motorid.diagnosis.form_regression import linearised
 from motorid.diagnosis.misspecification import outside
-from motorid.diagnosis.remainders import far
+from motorid.diagnosis.residual_analysis import far
 from motorid.records.experiment import Experiment
 
 ANGLE = ("i", "omega", "theta")

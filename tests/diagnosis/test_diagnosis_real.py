@@ -8,7 +8,7 @@ import motorid as mi
 from motorid.diagnosis.score_test import score
 from motorid.effects import LIBRARY
 from motorid.estimation.angle_orders import likely_orders
-from motorid.estimation.tangent import Tangent
+from motorid.estimation.linearisation import Tangent
 from motorid.records.experiment import split
 
 pytestmark = pytest.mark.slow

@@ -10,14 +10,12 @@ from battery.excite import driven, record
 import motorid as mi
 from motorid.diagnosis import candidates as search
 from motorid.diagnosis import cross_validation as held
-from motorid.diagnosis import parts, tournament
 from motorid.diagnosis import refit as trial
 from motorid.diagnosis import score_test as ranking
 from motorid.diagnosis.admissibility import objections
 from motorid.diagnosis.verdict import measured_angle_remark
 from motorid.effects import LIBRARY
-from motorid.estimation.restarts import ALIVE
-from motorid.estimation.revival import let_go, revived
+from motorid.estimation.restarts import ALIVE, let_go, revived
 from motorid.problem.problem import Problem
 from motorid.problem.simulate import simulate
 
@@ -86,19 +84,19 @@ def test_parts_show_both_directions_and_what_is_rare():
     t = dt * np.arange(n)
     omega = np.where(t < 9.0, 50.0, -50.0) * (1 + 0.02 * np.sin(7 * t))
     run = mi.Experiment(t, {"v": omega / 10}, {"omega": omega})
-    chosen = parts.parts_of([run], 2000 / n)
+    chosen = held.parts_of([run], 2000 / n)
     assert chosen is not None
     assert len(chosen) == 2
     speeds = np.concatenate([p.outputs["omega"] for p in chosen])
     assert speeds.min() < -40
     assert speeds.max() > 40
-    assert all(p.n == parts.PART for p in chosen)
+    assert all(p.n == held.PART for p in chosen)
 
 
 def test_parts_that_are_nearly_all_are_not_taken():
     t = 1e-3 * np.arange(2500)
     run = mi.Experiment(t, {"v": np.sin(t)}, {"omega": np.sin(t)})
-    assert parts.parts_of([run], 0.9) is None
+    assert held.parts_of([run], 0.9) is None
 
 
 def test_a_parameter_that_was_open_before_may_be_emptied():
@@ -142,19 +140,19 @@ def test_beside_an_effect_that_leaves_noise_what_promises_little_is_not_even_beg
     moves = driven(lab, {"coulomb": {"tau_c": 8e-3}}, "stairs", 800, 1e-3, rng)
     fit = mi.fit(mi.dc_motor(), record(moves, "logger", ("i", "omega"), lab, rng, "run"))
     promises = {"coulomb_asymmetric": 0.97, "coulomb": 0.95, "speed_lag": 0.01, "brush_drop": 0.6}
-    tasks = [tournament.Task(fit, fit.model + LIBRARY[n], LIBRARY[n], ({},), p) for n, p in promises.items()]
-    begun, race = [], tournament.raced
+    tasks = [trial.Task(fit, fit.model + LIBRARY[n], LIBRARY[n], ({},), p) for n, p in promises.items()]
+    begun, race = [], trial.raced
 
     def seen(fit, model, *starts):
         begun.append(model.effect_names)
         return race(fit, model, *starts)
 
-    monkeypatch.setattr(tournament, "raced", seen)
-    asymmetric, coulomb, lag, drop = tournament.refits(tasks, map)
+    monkeypatch.setattr(trial, "raced", seen)
+    asymmetric, coulomb, lag, drop = trial.refits(tasks, map)
     assert begun == [("coulomb",), ("brush_drop",)]
     assert isinstance(coulomb, mi.Fit)
     assert asymmetric.why == "does no more than coulomb, which it contains"
-    assert lag.why == drop.why == tournament.FAR_BEHIND
+    assert lag.why == drop.why == trial.FAR_BEHIND
     assert asymmetric.drop is lag.drop is None  # neither was refitted, and no table may say so
     assert 0 < drop.drop < 1
 
@@ -164,10 +162,10 @@ def test_what_contains_the_favourite_is_tried_where_one_step_promises_more():
     values = dict(zip(names, (8e-3, 7.7e-3), strict=True))
     run = _run((mi.dc_motor() + LIBRARY["coulomb_asymmetric"]).replace(**TRUE, **values), seed=9)
     fit = mi.fit(mi.dc_motor(), run)
-    assert not tournament.far(mi.fit(mi.dc_motor() + LIBRARY["coulomb"], run))  # so it is quiet
+    assert not trial.far(mi.fit(mi.dc_motor() + LIBRARY["coulomb"], run))  # so it is quiet
     pair = ("coulomb_asymmetric", "coulomb")
-    tasks = [tournament.Task(fit, fit.model + LIBRARY[n], LIBRARY[n], ({},), 0.9) for n in pair]
-    wider, _ = tournament.refits(tasks, map)
+    tasks = [trial.Task(fit, fit.model + LIBRARY[n], LIBRARY[n], ({},), 0.9) for n in pair]
+    wider, _ = trial.refits(tasks, map)
     assert isinstance(wider, mi.Fit)
     assert wider.values[names[1]] == pytest.approx(7.7e-3, rel=0.02)
 
@@ -257,8 +255,8 @@ def test_refits_are_given_up_only_where_the_best_leaves_noise(lab, left, monkeyp
     moves = driven(lab, {"coulomb": {"tau_c": 8e-3}}, "stairs", 800, 1e-3, rng)
     fit = mi.fit(mi.dc_motor(), record(moves, "logger", ("i", "omega"), lab, rng, "run"))
     effects = (mi.effects.coulomb, mi.effects.coulomb_asymmetric, mi.effects.speed_lag)
-    monkeypatch.setattr(tournament, "far", lambda fit: left)
-    found = tournament.refits([tournament.Task(fit, fit.model + e, e, ({},)) for e in effects], map)
+    monkeypatch.setattr(trial, "far", lambda fit: left)
+    found = trial.refits([trial.Task(fit, fit.model + e, e, ({},)) for e in effects], map)
     assert [isinstance(f, mi.Fit) for f in found] == [True, bool(left), bool(left)]
 
 

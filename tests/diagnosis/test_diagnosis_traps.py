@@ -10,7 +10,7 @@ from battery.excite import driven, record
 import motorid as mi
 from motorid.diagnosis.score_test import score
 from motorid.effects import LIBRARY
-from motorid.estimation.tangent import Tangent
+from motorid.estimation.linearisation import Tangent
 from motorid.records.experiment import Experiment
 
 ANGLE = ("i", "omega", "theta")

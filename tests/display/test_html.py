@@ -16,7 +16,7 @@ import motorid as mi
 from motorid.acquire import Recording
 from motorid.display._cards import card_of
 from motorid.display.cards import Card, Flag, Table, render, render_table
-from motorid.estimation.fit import Failure
+from motorid.estimation.result import Failure
 from motorid.problem.problem import Problem
 
 GOLDEN = Path(__file__).parent / "golden"

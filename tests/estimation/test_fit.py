@@ -299,7 +299,7 @@ def test_a_start_that_cannot_be_simulated_is_an_error_that_says_what_to_do(runs)
 
 
 def test_integration_errors_that_add_up_are_mended_by_finer_steps(runs, monkeypatch):
-    from motorid.problem import accuracy
+    from motorid.problem import residuals as accuracy
 
     monkeypatch.setattr(accuracy, "LOOSEST", 2e-2)
     monkeypatch.setattr(accuracy, "NOISE_SHARE", 1.0)

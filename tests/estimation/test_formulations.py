@@ -7,7 +7,7 @@ from itertools import pairwise
 import pytest
 
 import motorid as mi
-from motorid.estimation.fit import Failure
+from motorid.estimation.result import Failure
 from motorid.estimation.shooting.formulations import compare_formulations
 from motorid.problem.constraints import CurrentLimit, SteadyState
 

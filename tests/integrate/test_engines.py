@@ -15,7 +15,7 @@ from scipy.linalg import expm
 import motorid as mi
 from motorid.errors import FitError, ModelError, SimulationError, UsageError
 from motorid.integrate import Cvodes, Grid, Idas, Rosenbrock, engine_of
-from motorid.model.system import System
+from motorid.model.equations import System
 
 VALUES = {"R": 1.38, "L": 1.72e-3, "K": 0.0462, "b": 6.5e-5, "J": 2.35e-5}
 TIGHT = {

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from motorid.errors import ModelError
-from motorid.model.definition import P, Parameter, Scaling
+from motorid.model.definition import P, Parameter
+from motorid.problem.unknowns import Scaling
 
 MIXED = [
     Parameter("R", 1.4, "Ω", positive=True),

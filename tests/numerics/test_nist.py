@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from motorid.errors import SimulationError
-from motorid.model.definition import Parameter, Scaling
+from motorid.model.definition import Parameter
 from motorid.numerics.least_squares import LevenbergMarquardt, gauss_newton_covariance, levenberg_marquardt
+from motorid.problem.unknowns import Scaling
 
 FOLDER = Path(__file__).parent / "nist"
 POSITIVE = {"MGH10"}  # lives on the logarithmic scale, as resistances and time constants do in a motor

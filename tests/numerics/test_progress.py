@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from motorid.numerics.progress import progress
+from motorid.numerics.parallel import progress
 
 
 class Screen(io.StringIO):

@@ -21,10 +21,10 @@ from motorid.estimation.shooting.formulations import compare_formulations
 from motorid.plots.residuals import autocorrelation, binned_means
 from motorid.plots.style import axis_label, detached, envelope
 from motorid.problem.constraints import CurrentLimit
-from motorid.reports.svg import svg_of
+from motorid.reports.sections import svg_of
 from motorid.uncertainty.identifiability import identifiability
-from motorid.uncertainty.intervals import intervals
 from motorid.uncertainty.multistart import multistart
+from motorid.uncertainty.profile import intervals
 
 
 @pytest.fixture(scope="module")

@@ -204,7 +204,7 @@ def test_an_angle_that_is_not_measured_starts_at_zero_and_is_no_unknown(runs):
 
 # -- sub-steps -----------------------------------------------------------------------------------------------
 def test_refined_keeps_the_integration_error_well_below_the_noise(runs):
-    from motorid.problem.misfit import integration_error
+    from motorid.problem.simulate import integration_error
 
     coarse = as_problem(TRUE, runs)
     fine = coarse.refined(coarse.start)
@@ -217,7 +217,7 @@ def test_refined_keeps_the_integration_error_well_below_the_noise(runs):
 
 @pytest.mark.parametrize("quiet", [0.1, 1e-3])
 def test_less_noise_asks_for_finer_steps(rng, quiet):
-    from motorid.problem.misfit import integration_error
+    from motorid.problem.simulate import integration_error
 
     noise = {c: s * quiet for c, s in NOISE.items()}
     t = np.arange(500) * 1e-3

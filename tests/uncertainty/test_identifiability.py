@@ -8,11 +8,10 @@ import pytest
 import motorid as mi
 from motorid.errors import UsageError
 from motorid.problem.problem import Problem
-from motorid.problem.sensitivity_part import relative_jacobian
-from motorid.records.datasets import truth
+from motorid.problem.sensitivity import relative_jacobian
+from motorid.records.reading import truth
 from motorid.uncertainty.identifiability import identifiability
-from motorid.uncertainty.remedies import planned
-from motorid.uncertainty.weak_directions import monomials, sparse_basis
+from motorid.uncertainty.weak_directions import monomials, planned, sparse_basis
 
 MOTOR = truth("two_step_noisy")["parameters"]
 

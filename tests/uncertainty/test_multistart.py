@@ -11,10 +11,9 @@ import pytest
 
 import motorid as mi
 from motorid.errors import UsageError
-from motorid.estimation.fit import Failure
+from motorid.estimation.result import Failure
 from motorid.numerics.least_squares import LevenbergMarquardt, levenberg_marquardt
-from motorid.uncertainty.endings import Ending, Multistart
-from motorid.uncertainty.multistart import multistart
+from motorid.uncertainty.multistart import Ending, Multistart, multistart
 
 BOTH = ("two_step_noisy", "two_step_small")
 

@@ -10,11 +10,10 @@ from scipy.signal import lfilter
 import motorid as mi
 from motorid.errors import UsageError
 from motorid.numerics.autoregression import Colour, colour_of, weighed
-from motorid.records.datasets import truth
+from motorid.records.reading import truth
 from motorid.uncertainty.bootstrap import bootstrap
 from motorid.uncertainty.covariance import covariance
-from motorid.uncertainty.intervals import intervals
-from motorid.uncertainty.profile import profile, profiles
+from motorid.uncertainty.profile import intervals, profile, profiles
 
 MOTOR, NOISE = truth("two_step_noisy")["parameters"], {"i": 0.02, "omega": 0.4}
 

@@ -12,9 +12,10 @@ from motorid.display.display import Shown
 from motorid.display.numbers import duration, number, percent, with_error
 from motorid.display.tables import NAMES, Table
 from motorid.errors import FitError, MotoridError, SimulationError
-from motorid.estimation.fit import Failure, Fit, solve
+from motorid.estimation.fit import solve
+from motorid.estimation.result import Failure, Fit
 from motorid.estimation.shooting.multiple_shooting import MultipleShooting
-from motorid.estimation.shooting.multipliers import Multiplier, steady_residual, violations
+from motorid.estimation.shooting.outcome import Multiplier, steady_residual, violations
 from motorid.numerics.least_squares import LevenbergMarquardt, levenberg_marquardt
 from motorid.problem.constraints import SteadyState
 from motorid.problem.problem import Problem
@@ -190,6 +191,3 @@ def _path(problem: Problem, relations: Sequence[Relation], weights: Sequence[flo
         distance = max((abs(values[n] / hard.values[n] - 1) for n in free), default=np.nan)
         found.append(PathPoint(float(weight), values, violations(step, q, relations), float(distance)))
     return tuple(reversed(found))
-
-
-__all__ = ["Formulation", "Formulations", "PathPoint", "compare_formulations"]

@@ -15,7 +15,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from motorid.integrate.engine import Array, Grid, Trajectory
+from motorid.integrate.engine import Grid, Trajectory
+from motorid.numerics.signals import Array
 from motorid.problem.problem import Problem
 from motorid.problem.relations import Part, Relation
 from motorid.problem.residuals import prior_residual
@@ -284,6 +285,3 @@ def _fill(whole: Trajectory, traj: Trajectory, first: int) -> None:
     whole.y[rows], whole.x[rows] = traj.y, traj.x
     if whole.dy is not None and whole.dx is not None and traj.dy is not None and traj.dx is not None:
         whole.dy[rows], whole.dx[rows] = traj.dy, traj.dx
-
-
-__all__ = ["Block", "Interval", "Mesh", "Relation", "Walk"]

@@ -14,20 +14,23 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from motorid.errors import FitError, SimulationError, UsageError, one_of
-from motorid.estimation.balancing import descend_balanced
-from motorid.estimation.fit import Fit
-from motorid.estimation.shooting.conflict import below_steady
-from motorid.estimation.shooting.gaps import first_noise, given_noise, noise_of_gaps
+from motorid.estimation.restarts import descend_balanced
+from motorid.estimation.result import Fit
 from motorid.estimation.shooting.mesh import Mesh
-from motorid.estimation.shooting.multipliers import violations
 from motorid.estimation.shooting.nlp import Ipopt, NlpResult, ShootingNlp
-from motorid.estimation.shooting.nodes import nodes_from_data, nodes_from_simulation
-from motorid.estimation.shooting.outcome import Solved, fit_of
-from motorid.integrate.engine import Array
+from motorid.estimation.shooting.nodes import (
+    first_noise,
+    given_noise,
+    nodes_from_data,
+    nodes_from_simulation,
+    noise_of_gaps,
+)
+from motorid.estimation.shooting.outcome import Solved, below_steady, fit_of, violations
 from motorid.numerics.least_squares import LevenbergMarquardt, levenberg_marquardt
-from motorid.problem.misfit import misfit_over_noise
+from motorid.numerics.signals import Array
 from motorid.problem.problem import Problem
 from motorid.problem.relations import Relation, Weighed
+from motorid.problem.simulate import misfit_over_noise
 
 ROUNDS = 4  # of refining the sub-steps
 TIGHT = 1e-13  # share of the cost at which the least-squares fit on the way stops
@@ -291,6 +294,3 @@ def _poor(problem: Problem, q: Array) -> bool:
             if shown is not None and not np.nanmean((y[:, j] - shown) ** 2) < POOR**2 * np.nanmean(shown**2):
                 return True
     return False
-
-
-__all__ = ["MultipleShooting"]

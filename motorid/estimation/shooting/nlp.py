@@ -16,7 +16,7 @@ import numpy as np
 
 from motorid.errors import SimulationError
 from motorid.estimation.shooting.mesh import Block, Mesh
-from motorid.integrate.engine import Array
+from motorid.numerics.signals import Array
 
 D = ca.Sparsity.dense
 STEEPEST = 1e4  # largest diagonal entry of the scaled Hessian at the start; IPOPT's tolerances are absolute
@@ -237,6 +237,3 @@ class Ipopt:
         return NlpResult(np.asarray(found["x"]).ravel(), np.asarray(found["lam_g"]).ravel() / nlp.scale,
                          np.asarray(found["lam_x"]).ravel() / nlp.scale, stats["return_status"],
                          int(stats["iter_count"]), costs)
-
-
-__all__ = ["Ipopt", "NlpResult", "ShootingNlp"]

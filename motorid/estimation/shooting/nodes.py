@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
-import numpy as np
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
 
-from motorid.errors import SimulationError
+import numpy as np
+from scipy import sparse
+from scipy.sparse.linalg import splu
+
+from motorid.errors import SimulationError, UsageError, one_of
 from motorid.estimation.shooting.mesh import Mesh
-from motorid.integrate.engine import Array
+from motorid.numerics.signals import Array
 from motorid.records.experiment import Experiment
 
 
@@ -68,4 +74,92 @@ def _bridged(t: Array, y: Array) -> Array:
     return y if good.all() else np.interp(t, t[good], y[good])
 
 
-__all__ = ["measured_states", "nodes_from_data", "nodes_from_simulation", "slope_of"]
+NEXT_TO_NONE = 1e-6  # of a state's size per √s: states that no unknown voltage or torque acts on
+FIRST = 0.03  # of a state's size per √s
+DISTURBED = ("i", "omega")  # an unknown voltage, an unknown torque
+
+
+@dataclass(frozen=True, eq=False)
+class Gaps:
+    """What is missing at each node: the state there minus the end of the interval before.
+
+    Attributes
+    ----------
+    run : ndarray of int, shape (n,)
+    t : ndarray, shape (n,)
+        s.
+    span : ndarray, shape (n,)
+        Length of the interval before, s.
+    states : tuple of str
+    values : ndarray, shape (n, nx)
+        SI. J·gap/span of the speed is the mean torque that was missing in the interval, where the interval is
+        short beside the mechanical time constant.
+    """
+
+    run: np.ndarray
+    t: Array
+    span: Array
+    states: tuple[str, ...]
+    values: Array
+
+
+def gaps_of(mesh: Mesh, z: Array) -> Gaps:
+    """Return the gaps at `z`."""
+    before = [v for v in mesh.intervals if v.next >= 0]
+    blocks = mesh.gaps(z, mesh.walk(z, False), weighed=False)
+    values = np.array([b.values * mesh.scale for b in blocks]).reshape(-1, mesh.nx)
+    return Gaps(np.array([v.run for v in before], int), np.array([v.grid.t[-1] for v in before]),
+                np.array([v.grid.t[-1] - v.grid.t[0] for v in before]), mesh.problem.system.states, values)
+
+
+def first_noise(mesh: Mesh) -> Array:
+    """Return process noise to begin with, (nx,)."""
+    share = [FIRST if n in DISTURBED else NEXT_TO_NONE for n in mesh.problem.system.states]
+    return mesh.scale * share
+
+
+def given_noise(given: Mapping[str, float], mesh: Mesh) -> Array:
+    """Return the user's process noise, (nx,).
+
+    Raises
+    ------
+    UsageError
+        If a state is not known or a value not positive.
+    """
+    states = mesh.problem.system.states
+    for name, value in given.items():
+        if name not in states:
+            raise UsageError(f"process_noise: {one_of(name, states, 'state')}")
+        if not value > 0:
+            raise UsageError(f"process_noise: '{name}' must be positive, got {value!r}.")
+    return np.array([given.get(n, NEXT_TO_NONE * s) for n, s in zip(states, mesh.scale, strict=True)])
+
+
+def noise_of_gaps(done: Any) -> Array:
+    """Return the process noise that the gaps of a solved mesh show, (nx,); of undisturbed states as it was."""
+    mesh: Mesh = done.mesh
+    assert mesh.noise is not None
+    gaps = gaps_of(mesh, done.result.z)
+    shown = np.sqrt(np.mean(gaps.values**2 / gaps.span[:, None], axis=0))
+    acted_on = np.array([n in DISTURBED for n in gaps.states])
+    return np.where(acted_on, np.maximum(shown, NEXT_TO_NONE * mesh.scale), mesh.noise)
+
+
+def reduced(mesh: Mesh, z: Array) -> tuple[Array, Array]:
+    """Return residuals (n,) at `z`, and what of their Jacobian (n, nq) the nodes cannot take over.
+
+    The columns of q are projected off those of the nodes, so that JᵀJ is the Schur complement and its inverse
+    the covariance of q with the nodes unknown.
+    """
+    blocks = mesh.residual(z, mesh.walk(z, True))
+    starts = np.cumsum([0, *(len(b.values) for b in blocks)])
+    rows = np.concatenate([np.repeat(np.arange(a, a + len(b.values)), len(b.columns))
+                           for a, b in zip(starts[:-1], blocks, strict=True)])
+    columns = np.concatenate([np.tile(b.columns, len(b.values)) for b in blocks])
+    entries = np.concatenate([b.jac.ravel() for b in blocks])
+    whole = sparse.csc_matrix((entries, (rows, columns)), shape=(int(starts[-1]), len(z)))
+    residual = np.concatenate([b.values for b in blocks])
+    jac, nodes = whole[:, :mesh.nq].toarray(), whole[:, mesh.nq:]
+    if not nodes.shape[1]:
+        return residual, jac
+    return residual, jac - nodes @ splu((nodes.T @ nodes).tocsc()).solve(nodes.T @ jac)

@@ -2,22 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from motorid.errors import FitError
-from motorid.estimation.fit import Fit
-from motorid.estimation.shooting.conflict import conflict
-from motorid.estimation.shooting.gaps import gaps_of, reduced
+from motorid.errors import FitError, SimulationError
+from motorid.estimation.result import Fit
 from motorid.estimation.shooting.mesh import Mesh
-from motorid.estimation.shooting.multipliers import free_directions, rows_at, summed, violations
 from motorid.estimation.shooting.nlp import NlpResult, ShootingNlp
-from motorid.integrate.engine import Array
-from motorid.problem.misfit import integration_error
+from motorid.estimation.shooting.nodes import gaps_of, reduced
+from motorid.numerics.least_squares import LevenbergMarquardt, levenberg_marquardt
+from motorid.numerics.signals import Array
+from motorid.problem.constraints import CurrentLimit, SteadyState
 from motorid.problem.problem import Problem
 from motorid.problem.relations import Part
+from motorid.problem.simulate import integration_error
 
 GOOD = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
 JOINED = 1e-8  # violation of a row that counts as kept
@@ -152,4 +153,200 @@ def _with_multipliers(done: Solved) -> list[tuple[str, Part, Array, Array]]:
     return [(c.name, part, *collected[id(part)]) for c in problem.constraints for part in c.parts(problem)]
 
 
-__all__ = ["Solved", "fit_of"]
+WEAK = 1e-6  # share of the largest multiplier below which a row only touches its limit
+
+
+@dataclass(frozen=True)
+class Multiplier:
+    """One constraint at the solution, or one row of it.
+
+    Attributes
+    ----------
+    name : str
+        The constraint's.
+    label : str
+        Which row, where and when; of a sum over rows: how many are active.
+    value : float
+        −d cost/d limit, cost = ½rᵀr, per `unit`: by how much the cost falls when the limit gives way by one unit.
+    unit : str
+    active : int
+        Rows that stand at their limit.
+    """
+
+    name: str
+    label: str
+    value: float
+    unit: str
+    active: int
+
+    @property
+    def text(self) -> str:
+        """The multiplier in words."""
+        if not self.active:
+            return f"{self.name} is not active: without it the fit would be the same."
+        unit = "one unit" if self.unit in ("", "1") else f"1 {self.unit}"
+        return (f"{self.name}: {self.label}; giving way by {unit} would lower the cost by {self.value:.4g} "
+                "(to first order).")
+
+
+def rows_at(problem: Problem, q: Array,
+            relations: Sequence[Any] | None = None) -> list[tuple[str, Part, Array, Array]]:
+    """Return (name, part, rows, d rows/dq) of `relations` on the simulated trajectories at `q`.
+
+    `relations` are the problem's constraints unless given.
+
+    Raises
+    ------
+    SimulationError
+    """
+    at = problem.unknowns.point(q)
+    trajs = [problem.simulate(q, k) for k in range(len(problem.runs))]
+    found = []
+    for c in problem.constraints if relations is None else relations:
+        for part in c.parts(problem):
+            traj = trajs[part.run]
+            assert traj.dx is not None
+            values, jac = part.rows(traj.x[part.samples], at.p, traj.dx[part.samples], at.dp)
+            assert jac is not None
+            found.append((c.name, part, values, jac))
+    return found
+
+
+def violations(problem: Problem, q: Array, relations: Sequence[Any] | None = None) -> dict[str, float]:
+    """Return the largest violation of each relation, beyond its limits, in the unit of its rows.
+
+    Where a relation has rows in several units (voltage and torque), there is one entry for each.
+    """
+    found: dict[str, float] = {}
+    for name, part, values, _ in rows_at(problem, q, relations):
+        beyond = np.abs(part.violation(values)) * part.size
+        several = len(set(part.units)) > 1
+        for unit in dict.fromkeys(part.units):
+            key = f"{name}, {unit}" if several or unit else name
+            mine = np.array([u == unit for u in part.units])
+            found[key] = max(found.get(key, 0.0), float(beyond[mine].max(initial=0.0)))
+    return found
+
+
+def steady_residual(problem: Problem, q: Array, relations: Sequence[Any] | None = None) -> float | None:
+    """Return the largest balance left over at the measured steady state, relative; None without such a part."""
+    rows = [np.abs(values) for name, _, values, _ in rows_at(problem, q, relations) if name == "SteadyState()"]
+    return float(np.max(np.concatenate(rows), initial=0.0)) if rows else None
+
+
+def summed(found: Sequence[tuple[str, Part, Array, Array]]) -> tuple[tuple[Multiplier, ...], tuple[Multiplier, ...]]:
+    """Return multipliers per constraint and unit, and per active row, from (name, part, rows, multipliers)."""
+    rows: list[Multiplier] = []
+    sums: dict[tuple[str, str], tuple[float, int]] = {}
+    largest = max((float(np.abs(lam).max(initial=0.0)) for *_, lam in found), default=0.0)
+    for name, part, values, lam in found:
+        on = part.at_limit(values) & (np.abs(lam) > WEAK * largest)
+        for j in np.flatnonzero(on):
+            rows.append(Multiplier(name, part.labels[j], float(abs(lam[j]) / part.size[j]), part.units[j], 1))
+        for unit in dict.fromkeys(part.units):
+            mine = on & np.array([u == unit for u in part.units])
+            value, active = sums.get((name, unit), (0.0, 0))
+            sums[name, unit] = value + float(np.sum(np.abs(lam / part.size)[mine])), active + int(mine.sum())
+    totals = tuple(Multiplier(name, _count(active), value, unit, active)
+                   for (name, unit), (value, active) in sums.items())
+    return totals, tuple(sorted(rows, key=lambda m: -m.value))
+
+
+def free_directions(jac: Array, slope: Array) -> Array:
+    """Return a basis (nq, n) of the physical unknowns' changes that keep active rows (m, nq in q) as they are."""
+    if not len(jac):
+        return np.diag(slope)
+    size = np.maximum(np.linalg.norm(jac, axis=1, keepdims=True), 1e-300)
+    _, s, vt = np.linalg.svd(jac / size, full_matrices=True)
+    rank = int(np.sum(s > 1e-8))
+    return slope[:, None] * vt[rank:].T
+
+
+def _count(active: int) -> str:
+    return "not active" if not active else f"{active} row{'s' if active > 1 else ''} at the limit"
+
+
+KEPT_CONFLICT = 1e-5  # largest violation, in sizes of the rows, that counts as kept
+LIMITS = "the limits of the parameters"
+
+
+def conflict(problem: Problem, q: Array) -> str | None:
+    """Return a sentence naming the constraints in conflict; None if all can be kept together.
+
+    Each is left out in turn, and stays out when the others still contradict one another (deletion filter,
+    Chinneck & Dravnieks, ORSA Journal on Computing 3(2), 1991).
+    """
+    members: list[Any] = [*problem.constraints]
+    low, high = problem.scaling.bounds
+    if np.isfinite(low).any() or np.isfinite(high).any():
+        members.append(LIMITS)
+    starts = (q, problem.start)
+    if _possible(problem, members, starts):
+        return None
+    for member in list(members):
+        rest = [m for m in members if m is not member]
+        if not _possible(problem, rest, starts):
+            members = rest
+    names = " and ".join(m if isinstance(m, str) else m.name for m in members)
+    if len(members) == 1:
+        return f"{names} cannot be kept by any values of the parameters; loosen it or leave it out."
+    return (f"{names} contradict one another: each can be kept, not all together. Loosen or leave out one of them.")
+
+
+def below_steady(problem: Problem) -> str | None:
+    """Return a sentence if a current limit lies below a current that the records hold steadily; else None.
+
+    Values that keep such a limit exist, but they describe another motor.
+    """
+    limits = [c for c in problem.constraints if isinstance(c, CurrentLimit)]
+    if not limits:
+        return None
+    lowest = min(limits, key=lambda c: c.limit)
+    steady = [c for c in problem.constraints if isinstance(c, SteadyState)]
+    segments = (steady[0] if steady else SteadyState()).segments(problem)
+    for s in sorted(segments, key=lambda s: -abs(s.means.get("i", 0.0))):
+        noise = 3 * problem.runs[s.run].sigma.get("i", 0.0) / np.sqrt(s.n)
+        if abs(s.means.get("i", 0.0)) > lowest.limit + noise:
+            names = " and ".join(c.name for c in (lowest, *steady[:1]))
+            return (f"{names} {'contradict one another' if steady else 'contradicts the records'}: run {s.run} holds "
+                    f"{abs(s.means['i']):.4g} A from {s.begin:.4g} to {s.end:.4g} s. Raise the limit above that, or "
+                    "leave the run out.")
+    return None
+
+
+def _possible(problem: Problem, members: Sequence[Any], starts: Sequence[Array]) -> bool:
+    return any(_violation(problem, members, q) < KEPT_CONFLICT for q in starts)
+
+
+def _violation(problem: Problem, members: Sequence[Any], q: Array) -> float:
+    """Return the smallest reachable violation of `members`, by least squares from `q`."""
+    relations = [m for m in members if not isinstance(m, str)]
+    bounds = problem.scaling.bounds if LIMITS in members else None
+    if not relations:
+        return 0.0
+
+    def residual(z: Array) -> Array:
+        return _rows(problem, relations, z, False)[0]
+
+    def both(z: Array) -> tuple[Array, Array]:
+        return _rows(problem, relations, z, True)
+
+    try:
+        found = levenberg_marquardt(residual, both, q, bounds, LevenbergMarquardt(max_iterations=60, damping=1e-2))
+    except (FitError, SimulationError):
+        return np.inf
+    return float(np.abs(found.residual).max(initial=0.0))
+
+
+def _rows(problem: Problem, relations: Sequence[Any], q: Array, derivatives: bool) -> tuple[Array, Array]:
+    trajs = [problem.simulate(q, k, derivatives=derivatives) for k in range(len(problem.runs))]
+    at = problem.unknowns.point(q)
+    rs, jacs = [np.zeros(1)], [np.zeros((1, len(q)))]
+    for part in (part for c in relations for part in c.parts(problem)):
+        t, s = trajs[part.run], part.samples
+        c, jac = part.rows(t.x[s], at.p, None if t.dx is None else t.dx[s], at.dp)
+        out = part.violation(c)
+        rs.append(out)
+        if jac is not None:
+            jacs.append(jac * (out != 0)[:, None])
+    return np.concatenate(rs), np.concatenate(jacs)
