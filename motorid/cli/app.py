@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from motorid.cli import bench, fit, take, trust
+from motorid.cli import bench, diagnose, fit, trust
 from motorid.cli.console import Command, Group
 
 app = typer.Typer(cls=Group, add_completion=False, rich_markup_mode="rich", pretty_exceptions_enable=False,
@@ -38,16 +38,16 @@ def _version() -> str:
 
 
 for _name, _command in (
-    ("demo", fit.demo),
-    ("fit", fit.fit),
-    ("simulate", fit.simulate),
-    ("diagnose", trust.diagnose),
-    ("identifiability", trust.identifiability),
-    ("robustness", trust.robustness),
-    ("fit-many", take.fit_many),
-    ("export", take.export),
-    ("record", bench.record),
-    ("bench", bench.bench),
+    ("demo", diagnose.demo_command),
+    ("fit", fit.fit_command),
+    ("simulate", fit.simulate_command),
+    ("diagnose", diagnose.diagnose_command),
+    ("identifiability", trust.identifiability_command),
+    ("robustness", trust.robustness_command),
+    ("fit-many", fit.fit_many_command),
+    ("export", fit.export_command),
+    ("record", bench.record_command),
+    ("bench", bench.bench_command),
 ):
     app.command(_name, cls=Command)(_command)
 

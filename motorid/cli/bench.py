@@ -1,4 +1,4 @@
-"""The sub-commands `record` and `bench`; registered by `motorid.cli`."""
+"""The commands `record`, which records from a bench, and `bench`, which serves a virtual one."""
 
 from __future__ import annotations
 
@@ -11,11 +11,14 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 import typer
 
-from motorid.acquire.recorder import record as record_run
-from motorid.acquire.server import Faults, Wire
-from motorid.acquire.session import Progress, Recording
+from motorid.acquire.recorder import record
+from motorid.acquire.server import Faults, Pace, Wire, open_end, serve
+from motorid.acquire.session import Progress
+from motorid.acquire.virtual import VirtualDevice, hide
+from motorid.cli.console import FAILED
 
 Port = Annotated[str, typer.Option(
     help="Serial port of the bench: /dev/ttyACM0, COM3, socket://127.0.0.1:7000.")]
@@ -28,20 +31,20 @@ Excite = Annotated[str | None, typer.Option(
 Duration = Annotated[float | None, typer.Option(help="Stop after so many seconds.")]
 Volts = Annotated[float | None, typer.Option(help="Never more than so many V, of either sign.")]
 Amperes = Annotated[float | None, typer.Option(help="Switch the motor off beyond so many A.")]
-Calibration = Annotated[Path | None, typer.Option(help="TOML with scale, offset, gain … per channel.")]
+CalibrationFile = Annotated[Path | None, typer.Option(help="TOML with scale, offset, gain … per channel.")]
 Resume = Annotated[bool, typer.Option("--resume", help="Go on with a record that was cut short.")]
 Force = Annotated[bool, typer.Option("--force", help="Replace a file that exists.")]
 Timeout = Annotated[float, typer.Option(help="Silence in s that ends the recording.")]
 Quiet = Annotated[bool, typer.Option("--quiet", help="No live progress.")]
 
-Effect = Annotated[str, typer.Option(
+HiddenEffect = Annotated[str, typer.Option(
     help="What is hidden: none, random, or effects joined by commas, bare or with numbers as in "
          "coulomb:tau_c=0.01.")]
 MotorName = Annotated[str, typer.Option(help="Which motor: micro, lab, servo, wheel, big.")]
 Seed = Annotated[int | None, typer.Option(
     min=0, help="Draws the hidden effect, the motor's constants, the noise and the faults.")]
 Rate = Annotated[float, typer.Option(min=1.0, max=20_000.0, help="Samples per second.")]
-Channels = Annotated[str, typer.Option(help="What it sends.")]
+SentChannels = Annotated[str, typer.Option(help="What it sends.")]
 Speed = Annotated[float, typer.Option(min=0.0, help="Times real time; 0 as fast as it is read.")]
 Probability = Annotated[float, typer.Option(min=0.0, max=1.0, help="Probability of this fault, per line.")]
 UnplugAfter = Annotated[float | None, typer.Option(help="Pull the plug after so many s of a run.")]
@@ -54,7 +57,7 @@ Once = Annotated[bool, typer.Option("--once", help="End after the first run.")]
 Reveal = Annotated[bool, typer.Option("--reveal", help="At the end, tell what was hidden.")]
 
 
-def record(
+def record_command(
     port: Port,
     out: Out,
     baud: Baud = 115_200,
@@ -62,7 +65,7 @@ def record(
     duration: Duration = None,
     limit_voltage: Volts = None,
     limit_current: Amperes = None,
-    calibration: Calibration = None,
+    calibration: CalibrationFile = None,
     resume: Resume = False,
     force: Force = False,
     timeout: Timeout = 2.0,
@@ -76,22 +79,63 @@ def record(
     """
     with _live(quiet) as progress:
         try:
-            outcome = record_run(port, out, baud=baud, excite=excite, duration=duration,
-                                 limit_voltage=_limit(limit_voltage), limit_current=_limit(limit_current),
-                                 calibration=calibration, resume=resume, force=force, timeout=timeout,
-                                 progress=progress)
+            outcome = record(port, out, baud=baud, excite=excite, duration=duration,
+                             limit_voltage=_limit(limit_voltage), limit_current=_limit(limit_current),
+                             calibration=calibration, resume=resume, force=force, timeout=timeout,
+                             progress=progress)
         except KeyboardInterrupt:
             typer.echo("Stopped before anything was recorded.", err=True)
-            raise typer.Exit(1) from None
-    _say(outcome)
+            raise typer.Exit(FAILED) from None
+    typer.echo(str(outcome), err=not outcome.complete)
+    if not outcome.complete:
+        raise typer.Exit(FAILED)
+    typer.echo(f"Now: motorid diagnose {outcome.path}")
 
 
-def bench(
-    effect: Effect = "random",
+def _limit(value: float | None) -> float:
+    return math.inf if value is None else value
+
+
+@contextmanager
+def _live(quiet: bool) -> Iterator[Callable[[Progress], None] | None]:
+    """Progress on one line of the terminal, or a line every few seconds where there is none."""
+    if quiet:
+        yield None
+        return
+    from rich.console import Console
+    from rich.live import Live
+    from rich.text import Text
+
+    console = Console(stderr=True)
+    if not console.is_terminal:
+        yield _PlainProgress().show
+        return
+    with Live(console=console, refresh_per_second=4, transient=True) as live:
+        yield lambda p: live.update(Text(_line(p)))
+
+
+class _PlainProgress:
+    def __init__(self) -> None:
+        self.next = 0.0
+
+    def show(self, p: Progress) -> None:
+        if p.elapsed >= self.next:
+            typer.echo(_line(p), err=True)
+            self.next = p.elapsed + 5.0
+
+
+def _line(p: Progress) -> str:
+    end = f" of {p.total:.4g}" if p.total else ""
+    values = "  ".join(f"{name} {value:.4g}" for name, value in p.last.items())
+    return f"{p.elapsed:7.2f}{end} s  {p.rate:.0f} samples/s  {p.lost} lost  {values}"
+
+
+def bench_command(
+    effect: HiddenEffect = "random",
     motor: MotorName = "lab",
     seed: Seed = None,
     rate: Rate = 1000.0,
-    channels: Channels = "v,i,omega,theta",
+    channels: SentChannels = "v,i,omega,theta",
     speed: Speed = 1.0,
     drop: Probability = 0.0,
     garbage: Probability = 0.0,
@@ -110,11 +154,6 @@ def bench(
 
     Example: motorid bench --effect random --seed 7 --reveal
     """
-    import numpy as np
-
-    from motorid.acquire.server import Pace, open_end, serve
-    from motorid.acquire.virtual import VirtualDevice, hide
-
     seed = secrets.randbelow(1_000_000) if seed is None else seed
     truth, names = hide(effect, motor, seed), tuple(channels.replace(" ", "").split(","))
     VirtualDevice(truth, rate, names)  # complain before anything opens
@@ -130,48 +169,3 @@ def bench(
     serve(lambda: VirtualDevice(truth, rate, names), end, wire, Pace(speed, unplug_after, plug_after, once),
           lambda: bool(stopped))
     typer.echo(str(truth) if reveal else f"seed: {seed} (the same seed with --reveal tells what was hidden)")
-
-
-def _limit(value: float | None) -> float:
-    return math.inf if value is None else value
-
-
-def _say(outcome: Recording) -> None:
-    typer.echo(str(outcome), err=not outcome.complete)
-    if not outcome.complete:
-        raise typer.Exit(1)
-    typer.echo(f"Now: motorid diagnose {outcome.path}")
-
-
-@contextmanager
-def _live(quiet: bool) -> Iterator[Callable[[Progress], None] | None]:
-    """Progress on one line of the terminal, or a line every few seconds where there is none."""
-    if quiet:
-        yield None
-        return
-    from rich.console import Console
-    from rich.live import Live
-    from rich.text import Text
-
-    console = Console(stderr=True)
-    if not console.is_terminal:
-        yield _Plain().show
-        return
-    with Live(console=console, refresh_per_second=4, transient=True) as live:
-        yield lambda p: live.update(Text(_line(p)))
-
-
-class _Plain:
-    def __init__(self) -> None:
-        self.next = 0.0
-
-    def show(self, p: Progress) -> None:
-        if p.elapsed >= self.next:
-            typer.echo(_line(p), err=True)
-            self.next = p.elapsed + 5.0
-
-
-def _line(p: Progress) -> str:
-    end = f" of {p.total:.4g}" if p.total else ""
-    values = "  ".join(f"{name} {value:.4g}" for name, value in p.last.items())
-    return f"{p.elapsed:7.2f}{end} s  {p.rate:.0f} samples/s  {p.lost} lost  {values}"

@@ -1,108 +1,69 @@
-"""The commands `fit`, `simulate` and `demo`."""
+"""The commands `fit`, `fit-many`, `simulate` and `export`: a model fitted, used on other records, and taken along."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from motorid.cli.console import FAILED, save_report, say_notes, show
 from motorid.cli.options import (
-    Choices,
+    OUT,
+    FitOptions,
     Json,
-    Reading,
+    ReadingOptions,
     Report,
     Runs,
     Validate,
     describe,
     notes_of,
-    with_choices,
+    saved_model,
+    with_options,
 )
 from motorid.display.numbers import duration
 from motorid.display.tables import constraint_table, derived_table, error_table, parameter_table, run_table
-from motorid.errors import DataError
+from motorid.errors import DataError, UsageError, one_of
 from motorid.estimation.result import Fit
+from motorid.exporters.export import FORMS, export
 from motorid.exporters.json_file import constraint_violations, fit_dict, remarks, run_dict, write_json
 from motorid.problem.simulate import Evaluation, evaluate
 from motorid.records.experiment import Experiment
+from motorid.records.layout import parse_pairs
+from motorid.records.reading import write_csv
+from motorid.uncertainty.batch import fit_many, motors_in
 from motorid.uncertainty.covariance import deviations
 
-GOOD = ("converged", "limit", "stalled")
+SavedModel = Annotated[Path, typer.Argument(metavar="FIT.json", help="What fit --json or export wrote.")]
+EffectsFrom = Annotated[Path | None, typer.Option(metavar="FILE.py", help="Effects of your own.")]
 
 
-@with_choices(Choices)
-def fit(
-    runs: Runs, choices: Choices, validate: Validate = None, json: Json = None, report: Report = None,
+@with_options(FitOptions)
+def fit_command(
+    runs: Runs, options: FitOptions, validate: Validate = None, json: Json = None, report: Report = None,
 ) -> None:
     """Fit a motor model to records, and say how far the numbers can be trusted.
 
     Example: motorid fit run*.csv --effects coulomb --validate check*.csv --json fit.json
     """
-    records = choices.read(runs)
-    held_out = choices.read(validate) if validate else []
-    model = choices.model(records)
+    records = options.read(runs)
+    held_out = options.read(validate) if validate else []
+    model = options.model(records)
     notes = notes_of(records, held_out)
-    found = choices.fit(records, model)
+    found = options.fit(records, model)
     judged = evaluate(found, held_out) if held_out else None
     if json:
         write_json(fit_dict(found, judged) | {"notes": notes}, json)
     if json != "-":
-        show_fit(found, records, notes, judged)
+        _show_fit(found, records, notes, judged)
     save_report(found, report, held_out)
     if found.status == "failed":
         raise typer.Exit(FAILED)
 
 
-@with_choices(Reading)
-def simulate(
-    fit_json: Annotated[Path, typer.Argument(metavar="FIT.json", help="What fit --json or export wrote.")],
-    runs: Runs,
-    choices: Reading,
-    out: Annotated[Path | None, typer.Option(
-        metavar="DIR", help="Write the simulated channels as CSV.")] = None,
-    engine: Annotated[str, typer.Option(metavar="rosenbrock|cvodes|idas")] = "rosenbrock",
-    effects_from: Annotated[Path | None, typer.Option(metavar="FILE.py",
-                                                      help="Effects of your own.")] = None,
-    json: Json = None,
-) -> None:
-    """Simulate a fitted model on records, and compare where something was measured.
-
-    Example: motorid simulate fit.json check*.csv --out simulated
-    """
-    from motorid.cli.options import model_of
-
-    model = model_of(fit_json, effects_from)
-    records = choices.read(runs)
-    judged = evaluate(model, records, engine=engine)
-    files = _write_simulations(judged, out) if out else []
-    if json:
-        pairs = zip(records, judged.by_run, strict=True)
-        write_json({"model": {"base": model.base, "axis": model.axis, "effects": list(model.effect_names)},
-                    "nrmse": judged.nrmse, "rmse": judged.rmse, "files": files,
-                    "runs": [run_dict(r) | {"nrmse": e} for r, e in pairs]}, json)
-    if json != "-":
-        show(f"{describe(model)}, values of {fit_json}", run_table(judged))
-        show(*(f"Written: {f}" for f in files))
-
-
-def demo(
-    out: Annotated[Path, typer.Option(
-        metavar="DIR", help="Where figures and report go.")] = Path("motorid-demo"),
-    json: Json = None,
-) -> None:
-    """Show the story on shipped records: fit, see that it fails, add what is missing, see the error fall.
-
-    Example: motorid demo --out demo
-    """
-    from motorid.cli.cli_demo import tell
-
-    told = tell(out)
-    if json:
-        write_json(told, json)
-
-
-def show_fit(
+def _show_fit(
     found: Fit, records: list[Experiment], notes: list[str], judged: Evaluation | None = None,
 ) -> None:
     """Print a fit: remarks, parameters, errors, what follows from them, and how it ended."""
@@ -127,9 +88,92 @@ def _amount(records: list[Experiment]) -> str:
     return f"{runs}, {samples} samples, {duration(seconds)}"
 
 
-def _write_simulations(judged: Evaluation, out: Path) -> list[str]:
-    from motorid.records.reading import write_csv
+@with_options(FitOptions)
+def fit_many_command(
+    directory: Annotated[Path, typer.Argument(metavar="DIR", help="One folder, or file, per motor.")],
+    options: FitOptions,
+    out: Annotated[Path | None, typer.Option(
+        metavar="TABLE.csv", rich_help_panel=OUT, help="Write the table: .csv, .parquet or .json.")] = None,
+    journal: Annotated[Path | None, typer.Option(
+        metavar="FILE", rich_help_panel=OUT, help="Results as they come, to go on from.")] = None,
+    jobs: Annotated[int, typer.Option(min=1, metavar="N", rich_help_panel=OUT, help="Processes.")] = 1,
+    json: Json = None,
+) -> None:
+    """Fit one model to the records of many motors; a motor that fails is a row that says why.
 
+    Example: motorid fit-many motors/ --effects coulomb --out table.csv
+    """
+    motors: dict[str, Any] = dict(motors_in(directory))
+    model = options.model(_first_readable(options, motors.values()))
+    if options.preprocesses:
+        motors = {name: _read_or_names(options, files) for name, files in motors.items()}
+    reading: dict[str, Any] = {k: parse_pairs(v, f"--{k}") for k in ("columns", "units")
+                               if (v := getattr(options, k))}
+    reading |= {"hold": options.hold} if options.hold else {}
+    given = {"journal": journal, "reading": reading, **options.keywords()}
+    if jobs == 1:
+        found = fit_many(model, motors, **given)
+    else:
+        with ProcessPoolExecutor(jobs) as pool:
+            found = fit_many(model, motors, map=pool.map, **given)
+    if json:
+        write_json(found.to_dict(), json)
+    if json != "-":
+        show(str(found))
+    if out:
+        show(f"Table: {found.save(out)}")
+    if len(found.failed) == len(found.rows):
+        raise typer.Exit(FAILED)
+
+
+def _first_readable(options: FitOptions, motors: Iterable[list[Path]]) -> list[Experiment]:
+    """Return the records of the first motor that can be read: they tell a rotary from a linear axis."""
+    for files in motors:
+        try:
+            return options.read([str(f) for f in files])
+        except DataError:
+            continue
+    return []
+
+
+def _read_or_names(options: FitOptions, files: list[Path]) -> list[Any]:
+    """Return the records of one motor, or their names where they cannot be read: its row says why."""
+    try:
+        return list(options.read([str(f) for f in files]))
+    except DataError:
+        return list(files)
+
+
+@with_options(ReadingOptions)
+def simulate_command(
+    fit_json: SavedModel,
+    runs: Runs,
+    options: ReadingOptions,
+    out: Annotated[Path | None, typer.Option(
+        metavar="DIR", help="Write the simulated channels as CSV.")] = None,
+    engine: Annotated[str, typer.Option(metavar="rosenbrock|cvodes|idas")] = "rosenbrock",
+    effects_from: EffectsFrom = None,
+    json: Json = None,
+) -> None:
+    """Simulate a fitted model on records, and compare where something was measured.
+
+    Example: motorid simulate fit.json check*.csv --out simulated
+    """
+    model = saved_model(fit_json, effects_from)
+    records = options.read(runs)
+    judged = evaluate(model, records, engine=engine)
+    files = _write_simulations(judged, out) if out else []
+    if json:
+        pairs = zip(records, judged.by_run, strict=True)
+        write_json({"model": {"base": model.base, "axis": model.axis, "effects": list(model.effect_names)},
+                    "nrmse": judged.nrmse, "rmse": judged.rmse, "files": files,
+                    "runs": [run_dict(r) | {"nrmse": e} for r, e in pairs]}, json)
+    if json != "-":
+        show(f"{describe(model)}, values of {fit_json}", run_table(judged))
+        show(*(f"Written: {f}" for f in files))
+
+
+def _write_simulations(judged: Evaluation, out: Path) -> list[str]:
     files = []
     try:
         out.mkdir(parents=True, exist_ok=True)
@@ -140,3 +184,19 @@ def _write_simulations(judged: Evaluation, out: Path) -> list[str]:
         kept = {c: s.outputs[c] for c in s.experiment.channels if c in s.outputs}
         files.append(str(write_csv(s.experiment.with_(outputs=kept, meta={}), path)))
     return files
+
+
+def export_command(
+    fit_json: SavedModel,
+    path: Annotated[Path, typer.Argument(metavar="PATH", help="What to write.")],
+    to: Annotated[str | None, typer.Option(
+        metavar="casadi|c|json", show_default=False, help="Form of the model; by default PATH's ending.")] = None,
+    effects_from: EffectsFrom = None,
+) -> None:
+    """Take a fitted model along: as CasADi functions, as C source, as JSON.
+
+    Example: motorid export fit.json --to c motor.c
+    """
+    if to is not None and to not in FORMS.values():
+        raise UsageError(f"--to: {one_of(to, FORMS.values(), 'form')}")
+    show(f"Written: {export(saved_model(fit_json, effects_from), path, to)}")

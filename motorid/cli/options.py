@@ -1,4 +1,8 @@
-"""The options that every command which fits has in common, and how they become a model and a solver."""
+"""The options that commands have in common, and what they become: records, a model, a fit.
+
+`FitOptions` holds those of every command that fits, `ReadingOptions` those of every command that reads records;
+`with_options` puts them on a command. Below them: effects and models from the user's files, and remarks on records.
+"""
 
 from __future__ import annotations
 
@@ -17,11 +21,13 @@ from motorid import effects as library
 from motorid.errors import ModelError, UsageError, one_of
 from motorid.estimation.fit import fit
 from motorid.estimation.result import Fit
+from motorid.estimation.shooting.multiple_shooting import MultipleShooting
 from motorid.exporters.export import load
 from motorid.model.definition import Effect
 from motorid.model.model import Model, dc_motor, torque_driven
 from motorid.numerics.noise import Huber
 from motorid.numerics.parallel import progress
+from motorid.problem.constraints import CurrentLimit, SteadyState
 from motorid.records.checks import check_runs
 from motorid.records.experiment import Experiment
 from motorid.records.layout import parse_pairs
@@ -45,7 +51,7 @@ Validate = Annotated[list[str] | None, typer.Option(
 
 
 @dataclass(frozen=True)
-class Reading:
+class ReadingOptions:
     """How to read records."""
 
     columns: Annotated[str | None, typer.Option(
@@ -76,15 +82,15 @@ class Reading:
         """Return the runs."""
         columns = parse_pairs(self.columns, "--columns") if self.columns else None
         units = parse_pairs(self.units, "--units") if self.units else None
-        return self.chosen(read_runs(paths, columns=columns, units=units, hold=self.hold))
+        return self._preprocessed(read_runs(paths, columns=columns, units=units, hold=self.hold))
 
     @property
-    def changes(self) -> bool:
-        """Whether runs are to be other than their files say."""
+    def preprocesses(self) -> bool:
+        """Whether the runs differ from what their files say."""
         return bool(self.ignore or self.median or self.levels or self.delay or self.no_spikes)
 
-    def chosen(self, runs: Sequence[Experiment]) -> list[Experiment]:
-        """Return `runs` without the channels to leave out, the voltage filtered if that is wanted."""
+    def _preprocessed(self, runs: Sequence[Experiment]) -> list[Experiment]:
+        """Return `runs` without the ignored channels, filtered, delayed and without spikes as asked."""
         out = _words([self.ignore] if self.ignore else [])
         known = [c for c in ("i", "omega", "theta") if any(c in r.outputs for r in runs)]
         for channel in out:
@@ -104,18 +110,18 @@ class Reading:
 
 
 @dataclass(frozen=True)
-class Choices(Reading):
-    """Everything a command that fits may be told."""
+class FitOptions(ReadingOptions):
+    """What a command that fits may be told: how to read, which model, how to estimate."""
 
     effects: Annotated[str | None, typer.Option(
         metavar="a,b", rich_help_panel=MODEL, help="Effects in the model beside the plain motor.")] = None
     fix: Annotated[list[str] | None, typer.Option(
         metavar="L", rich_help_panel=MODEL,
-        help="Hold parameters: L, or L=0 to leave the inductance out.")] = None
+        help="Fix parameters: L, or L=0 to leave the inductance out.")] = None
     set_: Annotated[list[str] | None, typer.Option(
         "--set", metavar="R=1.2", rich_help_panel=MODEL, help="Values to start from (SI units).")] = None
     free: Annotated[list[str] | None, typer.Option(
-        metavar="g", rich_help_panel=MODEL, help="Estimate parameters that are held by themselves.")] = None
+        metavar="g", rich_help_panel=MODEL, help="Estimate parameters that are fixed by default.")] = None
     drive: Annotated[str, typer.Option(
         metavar="voltage|torque", rich_help_panel=MODEL,
         help="torque: a drive that closes its own current loop; v is its command.")] = "voltage"
@@ -144,28 +150,25 @@ class Choices(Reading):
         own = own_effects(self.effects_from) if self.effects_from else {}
         model = dc_motor()
         if self.drive == "torque":
-            model = torque_driven(axis="linear" if any(_is_linear(r) for r in runs) else "rotary")
+            linear = any(r.units.get("theta") == "m" or r.units.get("omega") == "m/s" for r in runs)
+            model = torque_driven(axis="linear" if linear else "rotary")
         for name in _words([self.effects] if self.effects else []):
             model = model + named_effect(name, own)
         model = model.replace(**_numbers(self.set_ or [], "--set"))
         model = _fixed(model, self.fix or [])
         return model.free(*_words(self.free or []))
 
-    def options(self) -> dict[str, Any]:
-        """Return the keyword arguments of `fit`."""
+    def keywords(self) -> dict[str, Any]:
+        """Return the keyword arguments of `motorid.fit`."""
         self._check_words()
         hard = self.formulation == "hard"
         found: dict[str, Any] = {"engine": self.engine, "initial": self.initial,
                                  "loss": Huber() if self.loss == "huber" else None}
         if self.current_limit is not None or hard:
-            from motorid.problem.constraints import CurrentLimit, SteadyState
-
             limits = [CurrentLimit(self.current_limit)] if self.current_limit is not None else []
             # A plain penalty fit adds the steady state by itself only where no constraint is named.
             found["constraints"] = [*limits, SteadyState()] if self.formulation != "plain" else limits
         if hard or self.solver == "multiple-shooting":
-            from motorid.estimation.shooting.multiple_shooting import MultipleShooting
-
             found["solver"] = MultipleShooting()
         found["formulation"] = "plain" if hard else self.formulation
         return found
@@ -174,7 +177,7 @@ class Choices(Reading):
         """Fit the model to `runs`."""
         model = self.model(runs) if model is None else model
         with progress(f"Fitting {describe(model)}") as advance:
-            return fit(model, runs, callback=lambda *_: advance(1), **self.options())
+            return fit(model, runs, callback=lambda *_: advance(1), **self.keywords())
 
     def _check_words(self) -> None:
         for word, known, what in ((self.drive, DRIVES, "drive"),
@@ -192,20 +195,20 @@ class Choices(Reading):
             raise UsageError("--current-limit needs --formulation penalty (weighted) or hard (a true limit).")
 
 
-def with_choices(kind: type) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Give a command whose last parameter is ``choices`` the options of `kind` as its own."""
+def with_options(kind: type) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Give a command with a parameter ``options`` the fields of `kind` as options of its own."""
 
     def wrap(command: Callable[..., None]) -> Callable[..., None]:
         hints, own = get_type_hints(kind, include_extras=True), get_type_hints(command, include_extras=True)
         parts = [inspect.Parameter(f.name, inspect.Parameter.KEYWORD_ONLY, default=f.default,
                                    annotation=hints[f.name]) for f in fields(kind)]
         mine = [p.replace(annotation=own[p.name], kind=inspect.Parameter.KEYWORD_ONLY)
-                for p in inspect.signature(command).parameters.values() if p.name != "choices"]
+                for p in inspect.signature(command).parameters.values() if p.name != "options"]
 
         @functools.wraps(command)
         def run(**given: Any) -> None:
             taken = {f.name: given.pop(f.name) for f in fields(kind)}
-            command(**given, choices=kind(**taken))
+            command(**given, options=kind(**taken))
 
         required = [p for p in mine if p.default is inspect.Parameter.empty]
         rest = [p for p in mine if p.default is not inspect.Parameter.empty]
@@ -255,6 +258,26 @@ def named_effect(name: str, own: dict[str, Effect]) -> Effect:
     return library.get(name)
 
 
+def saved_model(path: Path, effects_from: Path | None = None) -> Model:
+    """Return the model that ``fit --json`` or ``export`` wrote, at its values.
+
+    Raises
+    ------
+    DataError
+        If the file is not there, or no such file.
+    ModelError
+        If it has an effect of the user's own, whose file was not named.
+    """
+    own = own_effects(effects_from) if effects_from else {}
+    try:
+        found = load(path, own.values())
+        return found if isinstance(found, Model) else found.model
+    except ModelError as error:
+        if effects_from is not None:
+            raise
+        raise ModelError(f"{error} On the command line: --effects-from FILE.py") from None
+
+
 def describe(model: Model) -> str:
     """Return a model in words: ``dc_motor + coulomb``."""
     return " + ".join([model.base, *model.effect_names])
@@ -268,10 +291,6 @@ def notes_of(runs: Sequence[Experiment], held_out: Sequence[Experiment] = ()) ->
     if same:
         notes.append(f"{', '.join(same)} is both fitted and held out: its held-out error means nothing.")
     return [*dict.fromkeys(notes), *check_runs(runs)]
-
-
-def _is_linear(run: Experiment) -> bool:
-    return run.units.get("theta") == "m" or run.units.get("omega") == "m/s"
 
 
 def _words(texts: Sequence[str]) -> list[str]:
@@ -294,23 +313,3 @@ def _fixed(model: Model, texts: Sequence[str]) -> Model:
     for word in _words(texts):
         model = model.fix(**_numbers([word], "--fix")) if "=" in word else model.fix(word)
     return model
-
-
-def model_of(path: Path, effects_from: Path | None = None) -> Model:
-    """Return the model that ``fit --json`` or ``export`` wrote, at its values.
-
-    Raises
-    ------
-    DataError
-        If the file is not there, or no such file.
-    ModelError
-        If it has an effect of the user's own, whose file was not named.
-    """
-    own = own_effects(effects_from) if effects_from else {}
-    try:
-        found = load(path, own.values())
-        return found if isinstance(found, Model) else found.model
-    except ModelError as error:
-        if effects_from is not None:
-            raise
-        raise ModelError(f"{error} On the command line: --effects-from FILE.py") from None

@@ -85,9 +85,6 @@ def multistart(
     return Multistart(reference, endings, float(spread), guess, time.perf_counter() - began, said)
 
 
-robustness = multistart  # the name of the study in the source paper and on the command line
-
-
 def _draw(reference: Fit, names: Sequence[str], starts: int, spread: float,
           seed: int) -> list[dict[str, float]]:
     rng = np.random.default_rng(np.random.SeedSequence(seed))

@@ -1,0 +1,115 @@
+"""The command `diagnose`, and `demo`, which tells the whole story on shipped records."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from motorid.cli.console import save_report, say_notes, show
+from motorid.cli.options import OUT, FitOptions, Json, Report, Runs, Validate, notes_of, own_effects, with_options
+from motorid.diagnosis.cross_validation import fit_affordably
+from motorid.diagnosis.diagnose import diagnose
+from motorid.diagnosis.results import Diagnosis
+from motorid.display.tables import comparison_table, error_table, ladder_table, parameter_table, ranking_table
+from motorid.errors import UsageError
+from motorid.estimation.fit import fit
+from motorid.exporters.json_file import write_json
+from motorid.model.model import dc_motor
+from motorid.numerics.parallel import progress
+from motorid.records.experiment import Experiment
+from motorid.records.reading import data_path, read_runs
+from motorid.uncertainty.covariance import deviations
+
+DEMO_SET = "hidden_friction"
+
+
+@with_options(FitOptions)
+def diagnose_command(
+    runs: Runs, options: FitOptions, validate: Validate = None,
+    max_effects: Annotated[int, typer.Option(
+        min=0, metavar="N", rich_help_panel=OUT, help="Add at most so many effects.")] = 3,
+    json: Json = None, report: Report = None,
+) -> None:
+    """Say where the model fails, which physical effect is missing, and whether adding it holds up.
+
+    Example: motorid diagnose run*.csv --validate check*.csv --report found.html
+    """
+    records = options.read(runs)
+    held_out = options.read(validate) if validate else []
+    notes = notes_of(records, held_out)
+    before = fit_affordably(records, options.fit)
+    own = list(own_effects(options.effects_from).values()) if options.effects_from else []
+    with progress("Looking for what is missing") as advance:
+        found = diagnose(before, held_out or None, also=own, max_effects=max_effects,
+                         progress=lambda _: advance(1))
+    if json:
+        write_json(found.to_dict() | {"notes": notes}, json)
+    if json != "-":
+        say_notes(notes, "About the records")
+        _show_diagnosis(found)
+    save_report(found, report, held_out)
+
+
+def _show_diagnosis(found: Diagnosis) -> None:
+    """Print a diagnosis: verdict, place, ranking, ladder, how the parameters moved, what stays open."""
+    show(f"{found.text}\n")
+    show(f"Where: {found.missing.text}\n" if found.missing.text and found.verdict != "adequate" else None)
+    show(ranking_table(found.ranking) if found.ranking else None)
+    show(ladder_table(found.ladder), found.ladder.text)
+    if found.after is not found.before:
+        show(comparison_table([("before", found.before), ("after", found.after)], std=deviations))
+    for group in found.groups:
+        show(f"These records cannot tell apart: {', '.join(group)}.")
+    show(found.suggestion)
+
+
+def demo_command(
+    out: Annotated[Path, typer.Option(
+        metavar="DIR", help="Where figures and report go.")] = Path("motorid-demo"),
+    json: Json = None,
+) -> None:
+    """Show the story on shipped records: fit, see that it fails, add what is missing, see the error fall.
+
+    Example: motorid demo --out demo
+    """
+    _make_folder(out)
+    runs, check = (read_runs(str(data_path(DEMO_SET) / pattern)) for pattern in ("run*.csv", "check*.csv"))
+    show(f"1. Records: {len(runs)} of a motor ({data_path(DEMO_SET)}), and one held out that no fit will see.\n",
+         "2. The textbook model, fitted without a first guess:")
+    plain = fit(dc_motor(), runs)
+    show(parameter_table(plain, deviations(plain)), error_table(plain),
+         "   Its errors are far above the noise: something is missing.\n", "3. What?")
+    with progress("Trying the effects of the library") as advance:
+        found = diagnose(plain, check, progress=lambda _: advance(1))
+    show(found.missing.text, ranking_table(found.ranking, 4), found.text, "",
+         "4. Added, one line of code: fit.model + mi.effects." + (found.effects or ("…",))[0],
+         ladder_table(found.ladder),
+         comparison_table([("before", found.before), ("after", found.after)], std=deviations))
+    files = _write_demo(found, check, out)
+    show("Written: " + ", ".join(files), "Now your own: motorid diagnose RUN... --report yours.html")
+    if json:
+        write_json(found.to_dict() | {"files": files}, json)
+
+
+def _make_folder(out: Path) -> None:
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UsageError(f"cannot write to {out}: {error.strerror or error}. Choose another folder: --out "
+                         "DIR") from None
+
+
+def _write_demo(found: Diagnosis, check: Sequence[Experiment], out: Path) -> list[str]:
+    """Save the report and three figures; return their paths."""
+    from motorid.plots import plot_fit, plot_ladder, plot_missing
+    from motorid.reports.report import report
+
+    drawn: dict[str, Any] = {"fit.png": plot_fit(found.after, before=found.before).flat[0],
+                             "missing.png": plot_missing(found).flat[0], "ladder.png": plot_ladder(found)}
+    for name, axes in drawn.items():
+        axes.figure.savefig(out / name, dpi=120)
+    page = report(found, out / "report.html", command=f"motorid demo --out {out}", validate=check)
+    return [str(page), *(str(out / name) for name in drawn)]
