@@ -132,7 +132,8 @@ def tell(results: Sequence[Any], *, title: str = "", validate: Sequence[Experime
         story.sections.append(sections.of_card(main, 0))
     for k, r in enumerate(results):
         if r is not main:
-            story.sections.append(sections.fit_again(r, k) if isinstance(r, Fit) else sections.of_card(r, k))
+            again = sections.fitted(r, card_of(r).title, key=f"result-{k + 1}") if isinstance(r, Fit) else None
+            story.sections.append(again or sections.of_card(r, k))
     story.title = title or story.title
     return story
 

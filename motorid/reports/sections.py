@@ -1,4 +1,4 @@
-"""Sections of a report, each with its text, figures and tables."""
+"""Sections of a report, each with its text, figures and tables; at the end, a figure as inline SVG."""
 
 from __future__ import annotations
 
@@ -56,41 +56,22 @@ class Section:
 
 
 def data(runs: Sequence[Experiment]) -> Section:
+    """The records and what the checks say of them."""
     from motorid.plots import plot_runs
 
-    rows = [
-        [
-            r.name,
-            str(r.n),
-            duration(r.duration),
-            f"{number(1e3 * r.dt, 3)} ms",
-            ", ".join(NAMES[c] for c in r.channels),
-        ]
-        for r in runs
-    ]
+    rows = [[r.name, str(r.n), duration(r.duration), f"{number(1e3 * r.dt, 3)} ms",
+             ", ".join(NAMES[c] for c in r.channels)] for r in runs]
     remarks = [*check_runs(runs), *(f"{r.name}: {n}" for r in runs for n in r.meta.get("notes", ()))]
     text = [f"{counted(len(runs), 'record')} were used." if len(runs) > 1 else "One record was used."]
     text.append("Remarks of the checks:" if remarks else "The checks found nothing to remark.")
     names = ", ".join(r.name for r in runs)
-    return Section(
-        "data",
-        "The data",
-        text,
-        remarks,
-        [
-            _figure(
-                "data",
-                "Input and measured channels over time.",
-                f"Records {names} over time",
-                plot_runs,
-                runs,
-            )
-        ],
-        [Table(["record", "samples", "duration", "interval", "measured"], rows)],
-    )
+    figure = _figure("data", "Input and measured channels over time.", f"Records {names} over time", plot_runs, runs)
+    table = Table(["record", "samples", "duration", "interval", "measured"], rows)
+    return Section("data", "The data", text, remarks, [figure], [table])
 
 
 def fitted(fit: Fit, title: str, *, key: str = "fit", before: Fit | None = None) -> Section:
+    """A fit: curves, parameters, errors; beside it the model `before`."""
     from motorid.plots import plot_fit
 
     caption = "Measured, model, and what is left over beside the band of the noise."
@@ -105,20 +86,17 @@ def fitted(fit: Fit, title: str, *, key: str = "fit", before: Fit | None = None)
 
 
 def residuals(fit: Fit) -> Section:
+    """What the fit leaves over."""
     from motorid.plots import plot_residuals
 
     caption = "Noise alone would leave means of zero against every quantity and no correlation in time."
-    figure = _figure(
-        "residuals",
-        caption,
-        "Residuals of each channel over time and against speed and current",
-        plot_residuals,
-        fit,
-    )
+    alt = "Residuals of each channel over time and against speed and current"
+    figure = _figure("residuals", caption, alt, plot_residuals, fit)
     return Section("residuals", "What is left over", (), (), [figure])
 
 
 def held_out(fit: Fit, validate: Sequence[Experiment]) -> Section:
+    """The model on records that it was not fitted to."""
     from motorid.plots import plot_fit
 
     judged = evaluate(fit, validate)
@@ -129,21 +107,20 @@ def held_out(fit: Fit, validate: Sequence[Experiment]) -> Section:
 
 
 def where(d: Diagnosis) -> Section:
+    """Where the model fails: the missing voltage and torque."""
     from motorid.plots import plot_missing
 
     m = d.missing
     regions = Table(["region", "share of the misfit"], [[k, percent(v, 2)] for k, v in m.regions.items()])
-    best = [
-        f"{balance}: {b.against} explains {percent(b.explained, 2)}"
-        for balance, bins in m.bins.items()
-        for b in bins[:1]
-    ]
+    best = [f"{balance}: {b.against} explains {percent(b.explained, 2)}"
+            for balance, bins in m.bins.items() for b in bins[:1]]
     caption = "The voltage and torque that would make the model match, and what explains them."
     figure = _figure("missing", caption, "Missing voltage and torque. " + "; ".join(best), plot_missing, d)
     return Section("where", "Where it fails", [d.adequacy.text, m.text], (), [figure], [regions] if m.regions else [])
 
 
 def which(d: Diagnosis) -> Section:
+    """The effects that may be missing, ranked."""
     from motorid.plots import plot_ranking
 
     alt = "Bars of the misfit that each effect would take away; best: " + ", ".join(c.effect for c in d.ranking[:3])
@@ -153,6 +130,7 @@ def which(d: Diagnosis) -> Section:
 
 
 def ladder(steps: Ladder) -> Section:
+    """The error of each model of a ladder."""
     from motorid.plots import plot_ladder
 
     names = ", ".join(r.added or model_name(r.fit.model) for r in steps.rungs)
@@ -163,36 +141,27 @@ def ladder(steps: Ladder) -> Section:
 
 
 def parameters(before: Fit, after: Fit) -> Section:
+    """The parameters before and after."""
     from motorid.plots import plot_parameters
 
-    figure = _figure(
-        "parameters",
-        "Bars: two standard deviations, of residuals taken as white.",
-        "Parameters before and after",
-        plot_parameters,
-        before,
-        after,
-        small=True,
-    )
-    text = ["What the parameters had absorbed of the missing effect, they give back once it is in the model."]
+    caption = "Bars: two standard deviations, of residuals taken as white."
+    figure = _figure("parameters", caption, "Parameters before and after", plot_parameters, before, after, small=True)
+    text = ["Without the missing effect, other parameters had compensated for it."]
     table = parameter_table(after, before, deviations)
     return Section("parameters", "How the parameters moved", text, (), [figure], [table])
 
 
 def apart(d: Diagnosis) -> Section:
+    """What the records cannot distinguish, and the next step."""
     groups = [f"{', '.join(g)}" for g in d.groups if len(g) > 1]
-    text = (
-        ["These data cannot tell apart:"] if groups else ["No two of the effects that matter look alike in these data."]
-    )
+    text = ("These data cannot tell apart:" if groups
+            else "No two of the effects that matter look alike in these data.")
     closing = [d.remaining.text, d.suggestion or ""]
-    return Section("apart", "What cannot be told apart, and what to do next", [*closing, *text], groups)
-
-
-def fit_again(fit: Fit, k: int) -> Section:
-    return fitted(fit, card_of(fit).title, key=f"result-{k + 1}")
+    return Section("apart", "What cannot be told apart, and what to do next", [*closing, text], groups)
 
 
 def of_card(result: Any, k: int) -> Section:
+    """A result that has no section of its own, from its card."""
     from motorid import plots
 
     card = card_of(result)
@@ -201,16 +170,8 @@ def of_card(result: Any, k: int) -> Section:
     return Section(f"result-{k + 1}", card.title, [t for t in card.text if t], (), figures, card.tables)
 
 
-def _figure(
-    name: str,
-    caption: str,
-    alt: str,
-    draw: Callable[..., Any],
-    *args: Any,
-    small: bool = False,
-    **options: Any,
-) -> Figure:
-
+def _figure(name: str, caption: str, alt: str, draw: Callable[..., Any], *args: Any, small: bool = False,
+            **options: Any) -> Figure:
     return Figure(svg_of(draw, *args, name=name, alt=alt, **options), caption, small)
 
 
@@ -259,17 +220,12 @@ def svg_of(draw: Callable[..., Any], *args: Any, name: str, alt: str, **options:
     buffer = io.StringIO()
     with mpl.rc_context({"svg.fonttype": "none", "svg.hashsalt": name}):
         figure.savefig(buffer, format="svg", transparent=True, dpi=120, metadata={"Date": None, "Creator": None})
-    return clean(buffer.getvalue(), name, alt)
+    return _cleaned(buffer.getvalue(), name, alt)
 
 
-def _shortened(tag: re.Match[str]) -> str:
-    """Round coordinates, which stand inside tags, to a tenth of a point; words outside are left alone."""
-    return re.sub(r"(\d+\.\d)\d{2,}", r"\1", tag[0])
-
-
-def clean(svg: str, name: str, alt: str) -> str:
+def _cleaned(svg: str, name: str, alt: str) -> str:
     """Return the ``<svg>`` element alone, shortened, with colours as variables and unique names."""
-    svg = svg[svg.index("<svg") :]
+    svg = svg[svg.index("<svg"):]
     svg = re.sub(r"<metadata>.*?</metadata>|<style.*?</style>|<!--.*?-->", "", svg, flags=re.S)
     svg = re.sub(r"<defs>\s*</defs>", "", svg)
     used = set(re.findall(r'(?:url\(#|xlink:href="#)([^)"]+)', svg))
@@ -282,6 +238,11 @@ def clean(svg: str, name: str, alt: str) -> str:
     svg = svg.replace("font-family: 'DejaVu Sans'", "font-family: var(--font)")
     svg = re.sub(r"\n\s*", "\n", svg)
     box = re.search(r'viewBox="([^"]+)"', svg)
-    body = svg[svg.index(">") + 1 :]
+    body = svg[svg.index(">") + 1:]
     view = box[1] if box else "0 0 600 400"
     return f'<svg viewBox="{view}" role="img" aria-label="{escape(alt)}">{body.strip()}'
+
+
+def _shortened(tag: re.Match[str]) -> str:
+    """Round coordinates, which stand inside tags, to a tenth of a point; words outside are left alone."""
+    return re.sub(r"(\d+\.\d)\d{2,}", r"\1", tag[0])
