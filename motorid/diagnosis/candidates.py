@@ -243,7 +243,7 @@ class Search:
 def _in_place(model: Model, old: Effect, new: Effect) -> Model:
     """Return the model with `new` where `old` was, so that the order in which effects were found stays."""
     effects = tuple(new if e is old else e for e in model.effects)
-    return (model.without(old.name) + new)._with(effects=effects)
+    return (model.without(old.name) + new).with_(effects=effects)
 
 
 def _alike(p: Parameter, other: Parameter) -> bool:

@@ -124,7 +124,7 @@ def _answers(problem: Problem, k: int, answer: Response, bases: Mapping[Form, Ar
     """Return the whitened outputs of run `k` to every function of every form."""
     if not bases:
         return {}
-    _, weights, index = problem._weights[k]
+    _, weights, index = problem.measured[k][:3]
     answer = replace(answer, c=answer.c * weights[None, :, None])
     inside = {f: b for f, b in bases.items() if f.balance != "sensor"}
     flat = np.concatenate(
@@ -167,7 +167,7 @@ def _read(problem: Problem, form: Form, basis: Array, weights: Array) -> Array:
 
 def _labels(problem: Problem, k: int) -> Array:
     """Return place in the run and channel of every residual of run `k`, (2, n)."""
-    y, _, index = problem._weights[k]
+    y, _, index = problem.measured[k][:3]
     place = np.repeat(np.arange(len(y)) / len(y), y.shape[1])
     both = np.stack([place, np.tile(np.arange(y.shape[1]), len(y))])
     return both if index is None else both[:, index]

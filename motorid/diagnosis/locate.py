@@ -282,7 +282,7 @@ def smooth(fit: Fit, k: int, walk: Array, begun: Begun) -> Smoothed:
     """
     run, system = fit.problem.runs[k], fit.problem.system
     p = parameter_vector(fit)
-    y, _, _ = fit.problem._weights[k]
+    y = fit.problem.measured[k].y
     weights = np.array([1.0 / run.sigma[c] if c in run.sigma else 0.0 for c in fit.problem.outputs])
     x, linear = begun
     n, nx = x.shape

@@ -219,12 +219,8 @@ def _nearest(steps: Sequence[Fit], kept: int, held: HeldOut, channels: Sequence[
 
 def _weighed(last: Fit, fit: Fit) -> Array:
     """Return the residual of `last` in the weights of `fit`."""
-    problem, parts = fit.problem, []
-    for k, sim in enumerate(last.simulations):
-        y, weights, index = problem._weights[k]
-        r = ((np.column_stack([sim.outputs[c] for c in problem.outputs]) - y) * weights).ravel()
-        parts.append(r if index is None else r[index])
-    return np.concatenate(parts)
+    channels = fit.problem.outputs
+    return fit.problem.whiten([np.column_stack([sim.outputs[c] for c in channels]) for sim in last.simulations])
 
 
 def _judged(form: Form, train: Linear, test: Sequence[Linear], channels: Sequence[int]) -> float:

@@ -165,7 +165,7 @@ def _bounded(fit: Fit, model: Model) -> Model:
                 )
     inside = {n: float(np.clip(model.parameters[n].value, *limits[n])) for n in limits}
     pars = {n: replace(model.parameters[n], value=inside[n], lower=lo, upper=hi) for n, (lo, hi) in limits.items()}
-    return model._with(parameters={**model.parameters, **pars})
+    return model.with_(parameters={**model.parameters, **pars})
 
 
 def _polished(fit: Fit, problem: Problem) -> Fit | None:

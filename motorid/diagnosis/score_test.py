@@ -237,7 +237,7 @@ class Shape:
             return self
         rows = []
         for k, (w, old) in enumerate(zip(new, self.weights, strict=True)):
-            y, _, index = fit.problem._weights[k]
+            y, _, index = fit.problem.measured[k][:3]
             ratio = np.broadcast_to(np.where(old > 0, w / np.where(old > 0, old, 1.0), 0.0), y.shape).ravel()
             rows.append(ratio if index is None else ratio[index])
         return replace(self, columns=self.columns * np.concatenate(rows)[:, None], weights=new)
@@ -245,7 +245,7 @@ class Shape:
 
 def weights_of(problem: Problem) -> tuple[Array, ...]:
     """Return the weights of the channels, per run."""
-    return tuple(w for _, w, _ in problem._weights)
+    return tuple(m.weights for m in problem.measured)
 
 
 @dataclass(frozen=True, eq=False)
@@ -346,7 +346,7 @@ class Added:
     def _run(self, k: int, at: Point, *slopes: Array) -> Trajectory:
         problem = self._problem
         x0 = problem.unknowns.first_state(at, k)
-        return problem._engine.run(problem.system, problem.runs[k].grid, x0, at.p, *slopes)
+        return problem.integrator.run(problem.system, problem.runs[k].grid, x0, at.p, *slopes)
 
 
 def plain_residual(fit: Fit) -> Array:

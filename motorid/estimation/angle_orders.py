@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from motorid.estimation.linearisation import Response, Tangent, responses, unstacked
+from motorid.estimation.linearisation import Response, Tangent, responses
 from motorid.estimation.result import Fit
 from motorid.model.definition import Effect
 from motorid.numerics.autoregression import Whitening
@@ -218,11 +218,9 @@ class _Looking:
 
     def _measured(self, k: int, outputs: Array) -> Array:
         """Return outputs (N, ny, …) with nothing where nothing was measured."""
-        y, _, index = self.fit.problem._weights[k]
-        if index is not None:
-            missing = np.ones(y.size, bool)
-            missing[index] = False
-            outputs[missing.reshape(y.shape)] = 0.0
+        run = self.fit.problem.measured[k]
+        if run.index is not None:
+            outputs[~np.isfinite(run.y)] = 0.0
         return outputs
 
 
@@ -231,8 +229,8 @@ def _looking(tangent: Tangent) -> _Looking:
     """Return what is there to be looked into; outputs count in units of their noise."""
     white, basis, residual = _whitened(tangent)
     answers = [
-        replace(answer, c=answer.c * weights[None, :, None])
-        for answer, (_, weights, _) in zip(responses(tangent.fit), tangent.fit.problem._weights, strict=True)
+        replace(answer, c=answer.c * run.weights[None, :, None])
+        for answer, run in zip(responses(tangent.fit), tangent.fit.problem.measured, strict=True)
     ]
     orders = np.arange(1.0, highest_order(tangent) + 1)
     return _Looking(tangent.fit, white, basis, residual, answers, orders, _slow_enough(_moving(tangent), orders))
@@ -249,13 +247,13 @@ def _slow_enough(moving: Array, orders: Array) -> Array:
 def _whitened(tangent: Tangent) -> tuple[Whitening, Array, Array]:
     """Return the filters, the tangent space behind them, and the residual off it."""
     fit = tangent.fit
-    white = Whitening.of(unstacked(fit, tangent.residual))
-    slopes = zip(*(unstacked(fit, column) for column in tangent.basis.T), strict=True)
+    white = Whitening.of(fit.problem.unstack(tangent.residual))
+    slopes = zip(*(fit.problem.unstack(column) for column in tangent.basis.T), strict=True)
     columns = white([np.stack(run, axis=2) for run in slopes])
     basis, triangle = np.linalg.qr(columns)
     u, s, _ = np.linalg.svd(triangle)
     basis = basis @ u[:, s > 1e-7 * max(s.max(initial=0.0), 1e-300)]
-    residual = white(unstacked(fit, tangent.residual))
+    residual = white(fit.problem.unstack(tangent.residual))
     return white, basis, residual - basis @ (basis.T @ residual)
 
 

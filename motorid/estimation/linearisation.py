@@ -196,7 +196,7 @@ class Tangent:
 
     def effective(self, residual: Array) -> float:
         """Return how many independent samples a stacked residual is worth."""
-        return sum(effective_samples(column) for part in unstacked(self.fit, residual) for column in part.T)
+        return sum(effective_samples(column) for part in self.fit.problem.unstack(residual) for column in part.T)
 
     def off(self, columns: Array) -> Array:
         """Return `columns` (n, k) projected off the tangent space."""
@@ -233,15 +233,3 @@ class Tangent:
         parts = np.linalg.lstsq(jac / np.where(norms > 0, norms, 1.0), columns / size, rcond=1e-7)[0]
         part = {n: float(np.abs(a).max()) for n, a in zip(names, parts, strict=True) if n in self.fit.values}
         return tuple(n for n, a in part.items() if a > SHARED * max(part.values()))
-
-
-def unstacked(fit: Fit, residual: Array) -> list[Array]:
-    """Return a stacked output residual as one (N, ny) per run, NaN where missing."""
-    parts, first = [], 0
-    for y, _, index in fit.problem._weights:
-        n = y.size if index is None else len(index)
-        full = np.full(y.size, np.nan)
-        full[slice(None) if index is None else index] = residual[first : first + n]
-        parts.append(full.reshape(y.shape))
-        first += n
-    return parts

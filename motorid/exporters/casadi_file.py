@@ -132,7 +132,7 @@ def _named(f: ca.Function, name: str) -> ca.Function:
 def runs_of(fit: Fit) -> list[tuple[Run, Array]]:
     """Return the records with the steps of the fit, and (i, omega, theta) at their start, (3,)."""
     problem: Problem = fit.problem
-    if getattr(problem._engine, "name", "") != "rosenbrock":
+    if getattr(problem.integrator, "name", "") != "rosenbrock":
         # Another engine chose its own steps: take those that suit ours.
         problem = replace(problem, engine="rosenbrock").refined(fit.q)
     found = []

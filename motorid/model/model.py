@@ -61,10 +61,10 @@ class Model(Shown):
                 raise ModelError(f"'{other.name}' brings a parameter '{p.name}' that the model already has; "
                                  "rename it in the effect, or leave one of the two effects out.")
         added = {p.name: self._in_units(p) for p in other.parameters}
-        model = self._with(effects=(*self.effects, other), parameters={**self.parameters, **added})
+        model = self.with_(effects=(*self.effects, other), parameters={**self.parameters, **added})
         if _smooths(model) and "sgn_width" not in model.parameters:
             width = replace(SGN_WIDTH, unit="m/s" if self.axis == "linear" else SGN_WIDTH.unit)
-            model = model._with(parameters={**model.parameters, "sgn_width": width})
+            model = model.with_(parameters={**model.parameters, "sgn_width": width})
         return model
 
     def without(self, name: str) -> Model:
@@ -72,12 +72,12 @@ class Model(Shown):
         if name not in self.effect_names:
             raise ModelError(one_of(name, self.effect_names, "effect in this model"))
         base = {k: v for k, v in self.parameters.items() if k in self._base_names}
-        model = self._with(effects=(), parameters=base)
+        model = self.with_(effects=(), parameters=base)
         for e in self.effects:
             if e.name != name:
                 model = model + e
         kept = {k: self.parameters[k] for k in model.parameters if k in self.parameters}
-        return model._with(parameters={**model.parameters, **kept})
+        return model.with_(parameters={**model.parameters, **kept})
 
     def replace(self, **values: float) -> Model:
         """Return the model with parameter values set (in SI units); a fit starts from them."""
@@ -130,9 +130,10 @@ class Model(Shown):
             if name not in pars:
                 raise ModelError(one_of(name, pars, "parameter"))
             pars[name] = replace(pars[name], **fields)
-        return self._with(parameters=pars)
+        return self.with_(parameters=pars)
 
-    def _with(self, **fields: Any) -> Model:
+    def with_(self, **fields: Any) -> Model:
+        """Return a copy with some fields changed; equations already made stay where they are the same."""
         new = replace(self, **fields, _systems={})
         if new.effect_names == self.effect_names and new.angle_input == self.angle_input:
             # The equations depend on values only through "L is zero and held", which is part of the key.

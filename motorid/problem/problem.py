@@ -132,7 +132,8 @@ class Problem:
 
     # -- simulation ------------------------------------------------------------------------------------
     @cached_property
-    def _engine(self) -> Engine:
+    def integrator(self) -> Engine:
+        """The engine itself."""
         return engine_of(self.engine)
 
     def simulate(self, q: Array, k: int, *, derivatives: bool = True) -> Trajectory:
@@ -151,7 +152,7 @@ class Problem:
             return known[1]
         x0, grid = self.unknowns.first_state(at, k), self.runs[k].grid
         slopes = (self.unknowns.first_slopes(at, k), at.dp) if derivatives else ()
-        traj = self._engine.run(self.system, grid, x0, at.p, *slopes)
+        traj = self.integrator.run(self.system, grid, x0, at.p, *slopes)
         self._latest[k] = (at.q.copy(), traj)
         return traj
 
@@ -176,19 +177,19 @@ class Problem:
         """Tell whether the present sub-steps keep, within a factor of two, what `refined` asks for at `q`."""
         at = self.unknowns.point(np.asarray(q, float))
         starts = (self.unknowns.first_state(at, k) for k in range(len(self.runs)))
-        return all(self._engine.prepare(self.system, run.grid, x0, at.p, self._tolerance(k, 2.0)) is run.grid
+        return all(self.integrator.prepare(self.system, run.grid, x0, at.p, self._tolerance(k, 2.0)) is run.grid
                    for k, (run, x0) in enumerate(zip(self.runs, starts, strict=True)))
 
     def _refined_run(self, k: int, at: Point) -> Run:
         # From one step per sample on, so that the grid depends on q alone and not on the way there.
         run, x0 = self.runs[k], self.unknowns.first_state(at, k)
         coarse = run.grid.with_substeps(np.ones_like(run.grid.substeps))
-        grid = self._engine.prepare(self.system, coarse, x0, at.p, self._tolerance(k))
+        grid = self.integrator.prepare(self.system, coarse, x0, at.p, self._tolerance(k))
         if grid is coarse and np.any(run.grid.substeps > 1):
             try:
-                self._engine.run(self.system, coarse, x0, at.p)
+                self.integrator.run(self.system, coarse, x0, at.p)
             except SimulationError:  # only finer steps get through
-                grid = self._engine.prepare(self.system, run.grid, x0, at.p, self._tolerance(k))
+                grid = self.integrator.prepare(self.system, run.grid, x0, at.p, self._tolerance(k))
         return run if np.array_equal(grid.substeps, run.grid.substeps) else replace(run, grid=grid)
 
     def with_finer_steps(self, factor: int) -> Problem:
@@ -197,7 +198,7 @@ class Problem:
 
     def _keeping(self, runs: tuple[Run, ...]) -> Problem:
         """Return a copy with other grids that keeps everything else already made."""
-        made = ("outputs", "system", "unknowns", "_engine", "_measured", "_levels")
+        made = ("outputs", "system", "unknowns", "integrator", "measured", "_levels")
         return self._lending(replace(self, _runs=runs), made)
 
     def _lending(self, other: Problem, made: Sequence[str]) -> Problem:
@@ -210,20 +211,26 @@ class Problem:
 
     @cached_property
     def _levels(self) -> tuple[Levels, ...]:
-        return tuple(Levels.of(m) for m in self._measured)
+        return tuple(Levels.of(m) for m in self.measured)
 
     @cached_property
-    def _measured(self) -> tuple[Measured, ...]:
+    def measured(self) -> tuple[Measured, ...]:
+        """The records as residuals see them, one per run."""
         return tuple(Measured.of(run, self.outputs, self.weights, self.balance) for run in self.runs)
-
-    @property
-    def _weights(self) -> list[tuple[Array, Array, Any]]:
-        """Per run: measured (N, ny), weights (ny,), index of finite samples (None: all)."""
-        return [m[:3] for m in self._measured]
 
     def run_residual(self, k: int, traj: Trajectory) -> tuple[Array, Array | None]:
         """Return whitened residual and Jacobian, before the loss, of run `k`, without missing samples."""
-        return self._measured[k].residual(traj)
+        return self.measured[k].residual(traj)
+
+    def whiten(self, outputs: Sequence[Array]) -> Array:
+        """Return model outputs, (N, ny) per run, minus what was measured, whitened and stacked, before the loss."""
+        return np.concatenate([m.stack((y - m.y) * m.weights) for m, y in zip(self.measured, outputs, strict=True)])
+
+    def unstack(self, residual: Array) -> list[Array]:
+        """Return a stacked output residual as one (N, ny) per run, NaN where missing."""
+        ends = np.cumsum([m.size for m in self.measured])
+        parts = np.split(residual[:ends[-1]], ends[:-1])
+        return [m.unstack(part) for m, part in zip(self.measured, parts, strict=True)]
 
     def residual(self, q: Array) -> Array:
         """Return the whitened residual: outputs run by run, then priors, then penalties.
@@ -248,7 +255,7 @@ class Problem:
         q = np.asarray(q, float)
         at = self.unknowns.point(q)
         trajs = [self._simulate(at, k, derivatives) for k in range(len(self.runs))]
-        parts: list[tuple[Array, Any]] = [self._lossy(*self.run_residual(k, t)) for k, t in enumerate(trajs)]
+        parts: list[tuple[Array, Any]] = [self.with_loss(*self.run_residual(k, t)) for k, t in enumerate(trajs)]
         parts += [prior_residual(self.priors, self.unknowns, at)] if self.priors else []
         parts += [penalty.evaluate(self, q, trajs) for penalty in self.penalties]
         if len(parts) == 1:
@@ -256,7 +263,8 @@ class Problem:
         r = np.concatenate([p[0] for p in parts])
         return r, np.concatenate([p[1] for p in parts]) if derivatives else None
 
-    def _lossy(self, r: Array, jac: Array | None) -> tuple[Array, Array | None]:
+    def with_loss(self, r: Array, jac: Array | None) -> tuple[Array, Array | None]:
+        """Return residual and Jacobian with the robust loss, if there is one."""
         if self.loss is None:
             return r, jac
         pseudo, slope = self.loss.pseudo(r)
@@ -265,7 +273,7 @@ class Problem:
     @property
     def n_outputs(self) -> int:
         """Number of output residuals (finite measured samples)."""
-        return sum(m.size for m in self._measured)
+        return sum(m.size for m in self.measured)
 
     def for_model(self, model: Model) -> Problem:
         """Return the problem for another model on the same records; noise, grids, initial states stay."""
@@ -274,7 +282,7 @@ class Problem:
             names = self.system.inputs[:1] + (("theta_in",) if model.angle_input else ())
             runs = tuple(with_inputs(run, names) for run in runs)
         other = replace(self, model=model, _runs=runs)
-        return self._lending(other, ("_engine", "_measured", "_levels")) if other.outputs == self.outputs else other
+        return self._lending(other, ("integrator", "measured", "_levels")) if other.outputs == self.outputs else other
 
     def tuned(self, **fields: Any) -> Problem:
         """Return the problem with another `balance`, `width` …; the records stay as prepared."""

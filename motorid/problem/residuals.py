@@ -56,11 +56,19 @@ class Measured(NamedTuple):
             if numbers is not None and not np.abs(numbers).max(initial=0.0) < LARGEST_SLOPE:
                 raise SimulationError(f"{self.name}: the simulation grows without bound; the model is unstable with "
                                       "these parameters.")
-        r = ((traj.y - self.y) * self.weights).ravel()
-        jac = None if traj.dy is None else (traj.dy * self.weights[:, None]).reshape(r.size, -1)
-        if self.index is None:
-            return r, jac
-        return r[self.index], None if jac is None else jac[self.index]
+        jac = None if traj.dy is None else self.stack(traj.dy * self.weights[:, None])
+        return self.stack((traj.y - self.y) * self.weights), jac
+
+    def stack(self, values: Array) -> Array:
+        """Return (N, ny, …) as rows (n, …), without the missing samples."""
+        rows = values.reshape(-1, *values.shape[2:])
+        return rows if self.index is None else rows[self.index]
+
+    def unstack(self, rows: Array) -> Array:
+        """Return rows (n,) as (N, ny), NaN where missing."""
+        full = np.full(self.y.size, np.nan)
+        full[slice(None) if self.index is None else self.index] = rows
+        return full.reshape(self.y.shape)
 
 
 def prior_residual(priors: Mapping[str, tuple[float, float]], unknowns: Unknowns,

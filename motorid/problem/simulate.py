@@ -199,7 +199,7 @@ def integration_error(problem: Problem, q: Array) -> float:
     """Return the largest change of an output when every step is halved, in units of the noise."""
     worst = 0.0
     for k, run in enumerate(problem.runs):
-        if not hasattr(problem._engine, "compiled"):
+        if not hasattr(problem.integrator, "compiled"):
             return 0.0
         try:
             coarse = problem.simulate(q, k, derivatives=False).y

@@ -11,6 +11,7 @@ from lab_records import NOISE, VALUES, drive, noisy, pair, simulated
 import motorid as mi
 from motorid.errors import FitError, SimulationError, UsageError
 from motorid.integrate import Rosenbrock
+from motorid.records.reading import truth
 
 NAMES = tuple(VALUES)
 
@@ -35,7 +36,7 @@ def off(fit, truth=VALUES):
 def test_shipped_noisy_steps_give_the_motor_within_its_uncertainty(name):
     fit = mi.fit(mi.dc_motor(), mi.read_runs(sorted(mi.data_path(name).glob("*.csv"))))
     assert fit.status == "converged"
-    assert max(off(fit, mi.datasets.truth(name)["parameters"]).values()) < 4
+    assert max(off(fit, truth(name)["parameters"]).values()) < 4
     assert fit.chi2 / fit.dof == pytest.approx(1.0, abs=0.15)
     assert fit.integration_error < 0.1
 

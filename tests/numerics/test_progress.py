@@ -59,7 +59,7 @@ def test_error_in_the_block_passes_and_ends_the_bar(monkeypatch):
 
 
 def test_pipe_stays_clean_and_rich_is_not_loaded():
-    code = ("import sys; from motorid.progress import progress\n"
+    code = ("import sys; from motorid.numerics.parallel import progress\n"
             "with progress('Refitting', total=2) as a: a(); a()\n"
             "assert 'rich' not in sys.modules")
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)

@@ -20,8 +20,8 @@ from motorid.errors import UsageError
 from motorid.estimation.shooting.formulations import compare_formulations
 from motorid.plots.residuals import autocorrelation, binned_means
 from motorid.plots.style import axis_label, detached, envelope
+from motorid.plots.svg import svg_of
 from motorid.problem.constraints import CurrentLimit
-from motorid.reports.sections import svg_of
 from motorid.uncertainty.identifiability import identifiability
 from motorid.uncertainty.multistart import multistart
 from motorid.uncertainty.profile import intervals

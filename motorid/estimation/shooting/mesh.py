@@ -161,9 +161,9 @@ class Mesh:
                 dx0 = inner
                 if v.node < 0:
                     dx0 = np.hstack([np.zeros((nx, nx)), problem.unknowns.first_slopes(at, v.run)])
-                traj = problem._engine.run(problem.system, v.grid, x0, at.p, dx0, dp)
+                traj = problem.integrator.run(problem.system, v.grid, x0, at.p, dx0, dp)
             else:
-                traj = problem._engine.run(problem.system, v.grid, x0, at.p)
+                traj = problem.integrator.run(problem.system, v.grid, x0, at.p)
             _fill(runs[v.run], traj, v.first)
             ends[j] = traj.x[-1]
             if dends is not None and traj.dx is not None:
@@ -176,8 +176,8 @@ class Mesh:
         problem = self.problem
         blocks = []
         for k in range(len(problem.runs)):
-            r, jac = problem._lossy(*problem.run_residual(k, walk.runs[k]))
-            index = problem._measured[k].index
+            r, jac = problem.with_loss(*problem.run_residual(k, walk.runs[k]))
+            index = problem.measured[k].index
             rows = np.arange(len(r)) if index is None else index
             blocks += self._by_interval(r, jac, self.owner[k][rows // len(problem.outputs)])
         if self.noise is not None:

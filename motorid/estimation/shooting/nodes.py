@@ -41,7 +41,7 @@ def nodes_from_data(mesh: Mesh, q: Array) -> Array:
         if v.next < 0:
             continue
         try:
-            end = problem._engine.run(problem.system, v.grid, x, at.p).x[-1]
+            end = problem.integrator.run(problem.system, v.grid, x, at.p).x[-1]
         except SimulationError:
             end = x
         x = end.copy()
