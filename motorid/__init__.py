@@ -24,9 +24,11 @@ from motorid.problem.constraints import Constraint, CurrentLimit, SteadyState
 from motorid.problem.problem import Problem
 from motorid.problem.sensitivity import check_derivatives
 from motorid.problem.simulate import evaluate, simulate
+from motorid.records import datasets
 from motorid.records.checks import check_runs
+from motorid.records.datasets import data_path
 from motorid.records.experiment import Experiment
-from motorid.records.reading import data_path, read_csv, read_mat, read_runs
+from motorid.records.reading import read_csv, read_mat, read_runs
 from motorid.reports.explorer import explore
 from motorid.reports.report import report
 from motorid.uncertainty.batch import fit_many, motors_in

@@ -13,7 +13,7 @@ import pytest
 
 os.environ.setdefault("MPLBACKEND", "Agg")  # figures without a display, for processes started by tests too
 
-from motorid.records.reading import load_plant
+from motorid.records.datasets import load_plant
 
 
 @pytest.fixture

@@ -6,7 +6,8 @@ import numpy as np
 
 from motorid import dc_motor, effects, evaluate, fit
 from motorid.diagnosis.results import Adequacy, Binned, Candidate, Diagnosis, Ladder, Missing, Rung
-from motorid.records.reading import data_path, read_runs
+from motorid.records.datasets import data_path
+from motorid.records.reading import read_runs
 
 
 def friction():

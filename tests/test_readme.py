@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 from command import motorid
 
-from motorid.records.reading import data_path
+from motorid.records.datasets import data_path
 
 ROOT = Path(__file__).resolve().parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")

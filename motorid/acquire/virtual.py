@@ -16,7 +16,7 @@ import numpy as np
 from motorid.acquire.excitation import Program, Segment
 from motorid.acquire.protocol import SILENCE, Channel, Decoder, Header, Message, frame
 from motorid.errors import UsageError, one_of
-from motorid.records.reading import load_plant
+from motorid.records.datasets import load_plant
 
 LINES_PER_TURN = 4096  # encoder counts, after quadrature
 NOISE = 0.5  # standard deviation of the converters' noise, in counts

@@ -441,7 +441,7 @@ def test_nothing_in_the_record_gives_the_secret_away(out):
 
 # --------------------------------------------------------------------- processes and real pseudo-terminals
 
-MAIN = (sys.executable, "-W", "error", "-m", "motorid.cli.app")
+MAIN = (sys.executable, "-W", "error", "-m", "motorid")
 
 
 def start(*words: object) -> subprocess.Popen[str]:

@@ -17,7 +17,7 @@ from motorid.acquire import record
 from motorid.acquire.excitation import program
 from motorid.acquire.protocol import Decoder, Header, Message, Sample, crc16, frame
 from motorid.errors import DeviceError
-from motorid.records.reading import data_path
+from motorid.records.datasets import data_path
 
 COMPILER = shutil.which("c++") or shutil.which("g++") or shutil.which("clang++")
 pytestmark = pytest.mark.skipif(COMPILER is None, reason="no C++ compiler on this machine")

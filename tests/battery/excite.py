@@ -6,8 +6,8 @@ from collections.abc import Callable
 
 import numpy as np
 
+from motorid.records.datasets import load_plant
 from motorid.records.experiment import Experiment
-from motorid.records.reading import load_plant
 
 P = load_plant()
 DT = {"micro": 1e-3, "lab": 1e-3, "servo": 2e-3, "wheel": 2e-3, "big": 1e-3}

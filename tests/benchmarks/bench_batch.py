@@ -17,7 +17,7 @@ import numpy as np
 from distributed import Client, LocalCluster
 
 import motorid as mi
-from motorid.records.reading import truth
+from motorid.records.datasets import truth
 
 NOISE = {"i": 0.02, "omega": 0.4}
 

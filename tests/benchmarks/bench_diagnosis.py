@@ -12,7 +12,7 @@ from collections.abc import Callable
 import numpy as np
 
 import motorid as mi
-from motorid.records.reading import load_plant
+from motorid.records.datasets import load_plant
 
 PLANT = load_plant()
 N, DT, FITS, TURNS = 2400, 1e-3, 8, 5

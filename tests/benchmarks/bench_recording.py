@@ -17,7 +17,7 @@ import tempfile
 import time
 from pathlib import Path
 
-MAIN = (sys.executable, "-m", "motorid.cli.app")
+MAIN = (sys.executable, "-m", "motorid")
 
 
 def cpu(pid: int) -> float:

@@ -9,7 +9,7 @@ import numpy as np
 
 import motorid as mi
 from motorid.errors import FitError
-from motorid.records.reading import truth
+from motorid.records.datasets import truth
 
 SHIPPED = ("two_step_noisy", "two_step_small")
 

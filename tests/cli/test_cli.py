@@ -14,7 +14,8 @@ from command import motorid, motorid_json
 
 from motorid.cli.app import app
 from motorid.cli.console import _spread
-from motorid.records.reading import data_path, read_runs, truth, write_csv
+from motorid.records.datasets import data_path, truth
+from motorid.records.reading import read_runs, write_csv
 
 FRICTION = data_path("hidden_friction")
 STEPS = data_path("two_step")

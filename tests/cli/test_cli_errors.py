@@ -14,7 +14,7 @@ from command import Done, motorid
 
 from motorid.cli import options as cli_options
 from motorid.errors import FitError, MissingDependency, SimulationError
-from motorid.records.reading import data_path
+from motorid.records.datasets import data_path
 
 RUN = data_path("two_step") / "step_6V.csv"
 

@@ -14,7 +14,7 @@ import pytest
 from plant_truth import by_expm
 
 from motorid.errors import DataError
-from motorid.records import reading as datasets
+from motorid.records import datasets
 
 DATA = datasets.data_path()
 
@@ -123,7 +123,7 @@ def test_a_wrong_name_is_answered_with_the_near_one():
 def test_an_installed_wheel_finds_the_data_inside_the_package(tmp_path, monkeypatch):
     package = tmp_path / "site" / "motorid"
     (package / "data").mkdir(parents=True)
-    monkeypatch.setattr(datasets, "__file__", str(package / "records" / "reading.py"))
+    monkeypatch.setattr(datasets, "__file__", str(package / "records" / "datasets.py"))
     with pytest.raises(DataError, match=r"looked for truth\.json in"):
         datasets.datasets()
     (package / "data" / "truth.json").write_text("{}", encoding="utf-8")

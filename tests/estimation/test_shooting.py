@@ -16,7 +16,7 @@ from motorid.estimation.shooting.nlp import ShootingNlp
 from motorid.estimation.shooting.nodes import nodes_from_data, nodes_from_simulation
 from motorid.estimation.shooting.outcome import steady_residual
 from motorid.problem.constraints import Constraint, CurrentLimit, SteadyState
-from motorid.records.reading import truth
+from motorid.records.datasets import truth
 
 SHIPPED = ("two_step_noisy", "two_step_small")
 STARTS = int(os.environ.get("MOTORID_TEST_STARTS", "12"))  # per motor; the full count is in the benchmark

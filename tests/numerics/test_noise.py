@@ -112,7 +112,8 @@ def test_smooth_noise_is_underestimated_by_the_documented_factor(rng):
 @pytest.mark.parametrize("name", ["two_step_noisy", "two_step_small", "hidden_friction", "hidden_cogging",
                                   "hidden_brush", "hidden_two"])
 def test_the_stated_noise_of_shipped_records_is_found(name):
-    from motorid.records.reading import data_path, read_runs, truth
+    from motorid.records.datasets import data_path, truth
+    from motorid.records.reading import read_runs
 
     for run in read_runs(data_path(name)):
         for channel, stated in truth(name)["sigma"].items():
@@ -120,7 +121,8 @@ def test_the_stated_noise_of_shipped_records_is_found(name):
 
 
 def test_the_step_of_a_fast_encoder_is_found():
-    from motorid.records.reading import data_path, read_runs
+    from motorid.records.datasets import data_path
+    from motorid.records.reading import read_runs
 
     for run in read_runs(data_path("hidden_cogging")):  # up to 27 counts from sample to sample
         assert quantum(run.outputs["theta"]) == pytest.approx(2 * np.pi / 4096, rel=0.01)

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from motorid.records.checks import check_runs
+from motorid.records.datasets import data_path, datasets
 from motorid.records.experiment import OUTPUTS, Experiment
-from motorid.records.reading import data_path, datasets, read_csv, read_runs
+from motorid.records.reading import read_csv, read_runs
 
 
 @pytest.fixture(scope="module")

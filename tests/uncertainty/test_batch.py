@@ -14,7 +14,8 @@ import pytest
 import motorid as mi
 from motorid.errors import DataError, UsageError
 from motorid.numerics.noise import outliers
-from motorid.records.reading import truth, write_csv
+from motorid.records.datasets import truth
+from motorid.records.reading import write_csv
 from motorid.uncertainty import batch as batch_module
 from motorid.uncertainty.batch import fit_many, motors_in
 

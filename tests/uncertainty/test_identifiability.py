@@ -9,7 +9,7 @@ import motorid as mi
 from motorid.errors import UsageError
 from motorid.problem.problem import Problem
 from motorid.problem.sensitivity import relative_jacobian
-from motorid.records.reading import truth
+from motorid.records.datasets import truth
 from motorid.uncertainty.identifiability import identifiability
 from motorid.uncertainty.weak_directions import monomials, planned, sparse_basis
 

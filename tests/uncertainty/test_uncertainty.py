@@ -10,7 +10,7 @@ from scipy.signal import lfilter
 import motorid as mi
 from motorid.errors import UsageError
 from motorid.numerics.autoregression import Colour, colour_of, weighed
-from motorid.records.reading import truth
+from motorid.records.datasets import truth
 from motorid.uncertainty.bootstrap import bootstrap
 from motorid.uncertainty.covariance import covariance
 from motorid.uncertainty.profile import intervals, profile, profiles

@@ -1,0 +1,96 @@
+"""Where the shipped records are, what is hidden in them, and the plant they come from."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import sys
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from motorid.errors import DataError, one_of
+
+_PLANT = "motorid_plant"
+
+
+def _root() -> Path:
+    """The data folder of a checkout (beside the package) or of an installed wheel (inside it)."""
+    package = Path(__file__).resolve().parents[1]
+    places = (package.parent / "data", package / "data")
+    for place in places:
+        if (place / "truth.json").is_file():
+            return place
+    looked = " and ".join(str(place) for place in places)
+    raise DataError(
+        f"the shipped records were not found; looked for truth.json in {looked}. "
+        "Install motorid from a wheel, or work in a checkout that has its data folder."
+    )
+
+
+def data_path(name: str = "") -> Path:
+    """Path of a shipped set or file.
+
+    Parameters
+    ----------
+    name : str
+        As ``"hidden_friction"`` or ``"two_step/step_6V.csv"``; empty for the data folder itself.
+
+    Raises
+    ------
+    DataError
+        If there is no such set or file.
+    """
+    root = _root()
+    path = root / name
+    if not path.exists():
+        raise DataError(one_of(name, datasets() if "/" not in name else _files(), "shipped data"))
+    return path
+
+
+def datasets() -> list[str]:
+    """Names of the shipped sets."""
+    return sorted(_truths())
+
+
+def truth(name: str) -> dict[str, Any]:
+    """What is true of a shipped set: motor, parameters in SI, hidden effects, noise, seed.
+
+    Raises
+    ------
+    DataError
+        If there is no such set.
+    """
+    known = _truths()
+    if name not in known:
+        raise DataError(one_of(name, sorted(known), "shipped set"))
+    return known[name]
+
+
+def load_plant() -> ModuleType:
+    """The independent motor plant in ``data/plant``: Motor, MOTORS, Plant, simulate, excitations and sensors.
+
+    It is loaded by path, since it is data, not part of the library: it shares no code with the models.
+    """
+    if _PLANT in sys.modules:
+        return sys.modules[_PLANT]
+    path = _root() / "plant" / "__init__.py"
+    spec = importlib.util.spec_from_file_location(_PLANT, path, submodule_search_locations=[str(path.parent)])
+    if not path.is_file() or spec is None or spec.loader is None:
+        raise DataError(f"the motor plant was expected at {path} and is not there; reinstall motorid.")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[_PLANT] = module  # before running it: its parts import each other relatively
+    try:
+        spec.loader.exec_module(module)
+    except BaseException:
+        del sys.modules[_PLANT]
+        raise
+    return module
+
+
+def _truths() -> dict[str, Any]:
+    return json.loads((_root() / "truth.json").read_text(encoding="utf-8"))
+
+
+def _files() -> list[str]:
+    return sorted(file for known in _truths().values() for file in known["files"])
