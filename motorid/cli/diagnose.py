@@ -19,8 +19,8 @@ from motorid.estimation.fit import fit
 from motorid.exporters.json_file import write_json
 from motorid.model.model import dc_motor
 from motorid.numerics.parallel import progress
-from motorid.records.experiment import Experiment
 from motorid.records.datasets import data_path
+from motorid.records.experiment import Experiment
 from motorid.records.reading import read_runs
 from motorid.uncertainty.covariance import deviations
 
