@@ -11,7 +11,7 @@ from lab_records import NOISE, VALUES, drive, noisy, pair, simulated
 import motorid as mi
 from motorid.errors import FitError, SimulationError, UsageError
 from motorid.integrate import Rosenbrock
-from motorid.records.reading import truth
+from motorid.records.datasets import truth
 
 NAMES = tuple(VALUES)
 
