@@ -10,6 +10,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 import pytest
+from real_cases import real_folder
 
 os.environ.setdefault("MPLBACKEND", "Agg")  # figures without a display, for processes started by tests too
 
@@ -32,18 +33,6 @@ def plant():
 def lab(plant):
     """The plant's motor of a teaching bench."""
     return plant.MOTORS["lab"]
-
-
-def real_folder() -> Path | None:
-    """MOTORID_REAL_DATA, or else shared/data/real in a folder above this file; None if there is none."""
-    named = os.environ.get("MOTORID_REAL_DATA")
-    if named:
-        return Path(named) if Path(named).is_dir() else None
-    for folder in Path(__file__).resolve().parents:
-        place = folder / "shared" / "data" / "real"
-        if place.is_dir():
-            return place
-    return None
 
 
 @pytest.fixture(scope="session")
