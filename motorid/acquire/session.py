@@ -16,7 +16,8 @@ from motorid.acquire.client import Client, LinkLost
 from motorid.acquire.protocol import Header, Message, Sample, frame
 from motorid.acquire.record_file import Commanded, RunFile
 from motorid.acquire.timeline import Ledger, Row
-from motorid.display.display import Shown
+from motorid.display.cards import Card, Shown
+from motorid.display.tables import Flag
 
 OVER_LIMIT = 3  # samples in a row beyond the current limit that make the computer stop the motor too
 EMPTY = 5  # readings in a row without a valid line, at least, that make a silence
@@ -290,6 +291,13 @@ class Recording(Shown):
         return {"ended": self.ended, "samples received": self.received, "samples lost": lost,
                 **({"not valid": _list(self.bad)} if self.bad else {}),
                 **({"clipped": _list(self.clipped)} if self.clipped else {})}
+
+    def card(self) -> Card:
+        """Return how it ended and what was received."""
+        flags = [Flag(self.ended, "good" if self.complete else "bad")]
+        flags += [Flag(f"{self.lost} of {self.received + self.lost} samples lost", "note")] if self.lost else []
+        name = self.path.name
+        return Card(f"Recording {name}", flags, str(self).splitlines(), (), ((f'mi.read_runs("{name}")', "read it"),))
 
     def __str__(self) -> str:
         made = self.received + self.lost

@@ -70,10 +70,10 @@ def show(*parts: Table | str | None) -> None:
             continue
         drawn = RichTable(title=part.title or None, box=box.SIMPLE_HEAD, title_justify="left",
                           title_style="bold", caption=part.note or None)
-        for k, head in enumerate(part.heads):
+        for k, head in enumerate(part.header):
             drawn.add_column(head, justify="left" if k in part.left else "right", overflow="fold")
         for row in part.rows:
-            drawn.add_row(*(Text(cell) for cell in row))
+            drawn.add_row(*(Text(str(cell)) for cell in row))
         console.print(drawn)
 
 

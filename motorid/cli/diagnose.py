@@ -12,13 +12,15 @@ from motorid.cli.console import save_report, say_notes, show
 from motorid.cli.options import OUT, FitOptions, Json, Report, Runs, Validate, notes_of, own_effects, with_options
 from motorid.diagnosis.cross_validation import fit_affordably
 from motorid.diagnosis.diagnose import diagnose
-from motorid.diagnosis.results import Diagnosis
-from motorid.display.tables import comparison_table, error_table, ladder_table, parameter_table, ranking_table
+from motorid.diagnosis.results import Diagnosis, ladder_table, ranking_table
 from motorid.errors import UsageError
+from motorid.estimation.comparison import comparison_table
 from motorid.estimation.fit import fit
+from motorid.estimation.result import parameter_table
 from motorid.exporters.json_file import write_json
 from motorid.model.model import dc_motor
 from motorid.numerics.parallel import progress
+from motorid.problem.simulate import error_table
 from motorid.records.datasets import data_path
 from motorid.records.experiment import Experiment
 from motorid.records.reading import read_runs
@@ -58,7 +60,7 @@ def _show_diagnosis(found: Diagnosis) -> None:
     """Print a diagnosis: verdict, place, ranking, ladder, how the parameters moved, what stays open."""
     show(f"{found.text}\n")
     show(f"Where: {found.missing.text}\n" if found.missing.text and found.verdict != "adequate" else None)
-    show(ranking_table(found.ranking) if found.ranking else None)
+    show(ranking_table(found.ranking, 8) if found.ranking else None)
     show(ladder_table(found.ladder), found.ladder.text)
     if found.after is not found.before:
         show(comparison_table([("before", found.before), ("after", found.after)], std=deviations))
@@ -81,7 +83,7 @@ def demo_command(
     show(f"1. Records: {len(runs)} of a motor ({data_path(DEMO_SET)}), and one held out that no fit will see.\n",
          "2. The textbook model, fitted without a first guess:")
     plain = fit(dc_motor(), runs)
-    show(parameter_table(plain, deviations(plain)), error_table(plain),
+    show(parameter_table(plain, std=deviations), error_table({"": plain.evaluation}, plain.noise),
          "   Its errors are far above the noise: something is missing.\n", "3. What?")
     with progress("Trying the effects of the library") as advance:
         found = diagnose(plain, check, progress=lambda _: advance(1))

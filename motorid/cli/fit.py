@@ -23,13 +23,12 @@ from motorid.cli.options import (
     saved_model,
     with_options,
 )
-from motorid.display.numbers import duration
-from motorid.display.tables import constraint_table, derived_table, error_table, parameter_table, run_table
+from motorid.display.numbers import counted, duration
 from motorid.errors import DataError, UsageError, one_of
-from motorid.estimation.result import Fit
+from motorid.estimation.result import Fit, constraint_table, derived_table, parameter_table
 from motorid.exporters.export import FORMS, export
 from motorid.exporters.json_file import constraint_violations, fit_dict, remarks, run_dict, write_json
-from motorid.problem.simulate import Evaluation, evaluate
+from motorid.problem.simulate import Evaluation, error_table, evaluate, run_table
 from motorid.records.experiment import Experiment
 from motorid.records.layout import parse_pairs
 from motorid.records.reading import write_csv
@@ -69,11 +68,12 @@ def _show_fit(
     """Print a fit: remarks, parameters, errors, what follows from them, and how it ended."""
     show(f"{describe(found.problem.model)}, {_amount(records)}\n")
     say_notes(notes, "About the records")
-    show(parameter_table(found, deviations(found)))
+    show(parameter_table(found, std=deviations))
     say_notes(remarks(found), "What these records cannot tell")
     several = judged is not None and len(judged.simulations) > 1
-    show(error_table(found, judged), run_table(found.evaluation) if len(records) > 1 else None,
-         run_table(judged, "Held-out NRMSE run by run") if judged and several else None,
+    show(error_table({"": found.evaluation, "held-out": judged}, found.noise),
+         run_table(found.evaluation) if len(records) > 1 else None,
+         run_table(judged, "Held-out errors run by run") if judged and several else None,
          derived_table(found))
     show(constraint_table(found, constraint_violations(found)))
     engine = found.problem.engine
@@ -84,8 +84,7 @@ def _show_fit(
 
 def _amount(records: list[Experiment]) -> str:
     samples, seconds = sum(r.n for r in records), sum(r.duration for r in records)
-    runs = "1 run" if len(records) == 1 else f"{len(records)} runs"
-    return f"{runs}, {samples} samples, {duration(seconds)}"
+    return f"{counted(len(records), 'run')}, {samples} samples, {duration(seconds)}"
 
 
 @with_options(FitOptions)

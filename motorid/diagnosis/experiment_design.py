@@ -12,7 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from motorid.display.display import Shown
+from motorid.display.cards import Card, Shown
+from motorid.display.numbers import number
+from motorid.display.tables import Flag, Table
 from motorid.errors import FitError, MotoridError, UsageError
 from motorid.estimation.result import Fit
 from motorid.numerics.signals import Array
@@ -39,6 +41,18 @@ class Suggestion(Shown):
     text: str
     experiment: Experiment
     discrimination: Mapping[str, float]
+
+    def card(self) -> Card:
+        """Return the experiment chosen, and how well each candidate would do."""
+        best = sorted(self.discrimination.items(), key=lambda p: -p[1])
+        rows = [[Flag(n, "good") if n == self.name else n, number(v, 3)] for n, v in best]
+        return Card(
+            "Next experiment",
+            (Flag(self.name, "good"),),
+            (self.text,),
+            (Table(["experiment", "expected χ² per sample between the models"], rows),),
+            (("mi.plot_runs(suggestion.experiment)", "see it"),),
+        )
 
 
 def suggest_experiment(

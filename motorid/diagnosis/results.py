@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from motorid.display.display import Shown
-from motorid.display.tables import Std
-from motorid.estimation.result import Fit
+from motorid.channels import UNITS, channel_name
+from motorid.display.cards import Card, Shown
+from motorid.display.numbers import Std, number, percent, quantity
+from motorid.display.tables import Cell, Flag, Table
+from motorid.estimation.result import Fit, parameter_table
 from motorid.numerics.signals import Array
+from motorid.records.experiment import units_of
+
+VERDICT_MOODS = {"adequate": "good", "missing": "note", "unexplained": "bad"}
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -34,6 +39,19 @@ class Adequacy(Shown):
     false_alarm: float
     channels: Mapping[str, Mapping[str, float]]
     text: str
+
+    def card(self) -> Card:
+        """Return the verdict, and what it rests on per channel."""
+        rows = [[f"{channel_name(c)} {c}", *(quantity(d.get(k), UNITS[c][0], 3) for k in ("noise", "rms")),
+                 number(d.get("ratio"), 3), number(d.get("autocorrelation"), 2), number(d.get("p_value"), 2)]
+                for c, d in self.channels.items()]
+        return Card(
+            "Is anything missing?",
+            (Flag("adequate", "good") if self.adequate else Flag("something is missing", "bad"),),
+            (self.text,),
+            (Table(["channel", "noise", "residual", "ratio", "autocorrelation", "p"], rows),),
+            () if self.adequate else (("mi.diagnose(fit)", "what is missing"),),
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,6 +102,18 @@ class Missing(Shown):
     text: str
     torque_unit: str = "N·m"
     acts_like: str = ""
+
+    def card(self) -> Card:
+        """Return the shares of balances and regions, and what the missing depends on."""
+        best = [[balance, b.against, percent(b.explained, 2)] for balance, bins in self.bins.items() for b in bins[:3]]
+        return Card(
+            "Where the model fails",
+            (Flag(self.where, "note"),) if self.where else (),
+            (self.text,),
+            (share_table("balance", self.shares), share_table("region", self.regions),
+             Table(["missing", "depends on", "explained"], best)),
+            (("mi.plot_missing(missing)", "see it"),),
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,6 +181,15 @@ class Ladder(Shown):
         """The fit of the last rung."""
         return self.rungs[-1].fit
 
+    def card(self) -> Card:
+        """Return the errors rung by rung, and why it stopped."""
+        return Card(
+            "Ladder of models",
+            text=(self.text,),
+            tables=(ladder_table(self),),
+            after=(("mi.plot_ladder(ladder)", "see it"), ("ladder.best", "the last fit")),
+        )
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Diagnosis(Shown):
@@ -196,6 +235,29 @@ class Diagnosis(Shown):
         """Return the standard deviations of `before` or `after`, as the text gives them."""
         return fit.std if self.std is None else self.std[fit is self.after]
 
+    def card(self) -> Card:
+        """Return the verdict, the effects tried, how the error fell and the parameters moved."""
+        text = [self.text]  # which may say already what these add
+        text += [f"Next experiment: {self.suggestion}"] if self.suggestion and self.suggestion not in self.text else []
+        alike = [f"These data cannot tell apart: {', '.join(g)}." for g in self.groups if len(g) > 1]
+        text += [] if "cannot tell" in self.text else alike
+        tables = [ranking_table(self.ranking, 6)] if self.ranking else []
+        tables.append(ladder_table(self.ladder))
+        if self.after is not self.before:
+            tables.append(parameter_table(self.after, self.before, self.std_of))
+        return Card(
+            "Diagnosis",
+            (Flag(self.verdict, VERDICT_MOODS[self.verdict]), *([Flag(self.where)] if self.where else [])),
+            text,
+            tables,
+            (
+                ("mi.plot_missing(found)", "where"),
+                ("mi.plot_ranking(found)", "which"),
+                ("found.after", "the better fit"),
+                ('mi.report(found, "report.html")', "the whole story on one page"),
+            ),
+        )
+
     def to_dict(self) -> dict[str, Any]:
         """Return the contents of ``diagnose --json``."""
         m = self.missing
@@ -238,3 +300,41 @@ class Diagnosis(Shown):
             "groups": [list(g) for g in self.groups],
             "suggestion": self.suggestion,
         }
+
+
+def share_table(what: str, shares: Mapping[str, float]) -> Table:
+    """Return the share of the misfit of each balance or region."""
+    return Table([what, "share of the misfit"], [[k, percent(v, 2)] for k, v in shares.items()])
+
+
+def ranking_table(candidates: Sequence[Candidate], most: int = 10) -> Table:
+    """Return the effects tried, best first; the held-out error only where there is one."""
+    held_out = any(c.held_out_gain is not None for c in candidates[:most])
+    header = ["effect", "predicted drop", "drop after a refit", *(["held-out error falls by"] if held_out else []),
+              "size (SI)", "verdict"]
+    rows: list[list[Cell]] = []
+    for c in candidates[:most]:
+        # Non-breaking blanks: a line may end between parameters only.
+        sizes = [f"{n}\u00a0=\u00a0{number(v, 3)}" for n, v in c.parameters.items() if n != "sgn_width"]
+        gain = [percent(c.held_out_gain)] if held_out else []
+        verdict = Flag("accepted", "good") if c.accepted else (c.reason or "not refitted")
+        rows.append([c.effect, percent(c.predicted_drop), percent(c.refit_drop), *gain, ", ".join(sizes), verdict])
+    note = "Drop: share of the misfit that the effect takes away."
+    return Table(header, rows, "Which effect is missing?", note, left=(0, len(header) - 2, len(header) - 1))
+
+
+def ladder_table(ladder: Ladder) -> Table:
+    """Return the errors of the model on each rung, as fitted and held out."""
+    first = ladder.rungs[0]
+    units = units_of(first.fit.problem.experiments)
+    channels = {c: channel_name(c, units.get(c, "")) for c in first.nrmse}
+    held_out = any(r.validation_nrmse for r in ladder.rungs)
+    header = ["model", *(f"{name}, fitted" for name in channels.values()),
+              *(f"{name}, held out" for name in channels.values() if held_out)]
+    rows = []
+    for r in ladder.rungs:
+        name = first.fit.model.title if r.added is None else f"+ {r.added}"
+        name += "".join(f" − {gone}" for gone in r.removed)
+        held = [percent((r.validation_nrmse or {}).get(c)) for c in channels] if held_out else []
+        rows.append([name, *(percent(r.nrmse.get(c)) for c in channels), *held])
+    return Table(header, rows, "The error falls")

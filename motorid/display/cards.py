@@ -1,4 +1,4 @@
-"""HTML for notebooks: one helper for every `_repr_html_`. It only writes down what a result already holds."""
+"""Cards: what a result shows of itself. `Shown` gives every result its card in a notebook and its line anywhere."""
 
 from __future__ import annotations
 
@@ -6,13 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
 
-# Words first, colour second: each pair has a contrast of 5.5 or more, on a light page and on a dark one.
-_COLOURS = {
-    "good": ("#0b5a26", "#d7f5df"),
-    "note": ("#6b4100", "#fdf0c8"),
-    "bad": ("#8f1220", "#ffe3e4"),
-    "plain": ("#3a444f", "#e6eaef"),
-}
+from motorid.display.tables import Flag, Table
 
 _STYLE = """
 .motorid{font-size:13px;line-height:1.45;max-width:60rem}
@@ -29,28 +23,22 @@ _STYLE = """
 
 
 @dataclass(frozen=True)
-class Flag:
-    """A word with a colour: ``good``, ``note``, ``bad`` or ``plain``."""
-
-    text: str
-    mood: str = "plain"
-
-    def __contains__(self, part: str) -> bool:
-        return part in self.text
-
-
-@dataclass(frozen=True)
-class Table:
-    """Rows under headers; the first cell of a row names it. Cells are text or flags."""
-
-    header: Sequence[str]
-    rows: Sequence[Sequence[str | Flag]]
-    caption: str = ""
-
-
-@dataclass(frozen=True)
 class Card:
-    """What a result shows: title, flags, sentences, tables, what to do next (code and its use), its plot."""
+    """What a result shows.
+
+    Attributes
+    ----------
+    title : str
+    flags : sequence of Flag
+        The verdict in a word or two.
+    text : sequence of str
+        Sentences; empty ones are left out.
+    tables : sequence of Table
+    after : sequence of (str, str)
+        What to do next: code, and its use.
+    figure : str
+        Name of the function of `motorid.plots` that draws the result, if one tells more than the tables.
+    """
 
     title: str
     flags: Sequence[Flag] = ()
@@ -59,52 +47,42 @@ class Card:
     after: Sequence[tuple[str, str]] = ()
     figure: str = ""
 
+    @property
+    def line(self) -> str:
+        """Title and flags in one line."""
+        return ", ".join([self.title, *(f.text for f in self.flags)])
 
-def html_of(result: object) -> str:
-    """Return the HTML of any result of motorid."""
-    from motorid.display._cards import card_of
+    def __str__(self) -> str:
+        head = "\n".join([self.line, *(t for t in self.text if t)])
+        return "\n\n".join([head, *(str(t) for t in self.tables)])
 
-    return render(card_of(result))
-
-
-def line_of(result: object) -> str:
-    """Return the one line that stands for a result in plain text."""
-    from motorid.display._cards import card_of
-
-    card = card_of(result)
-    return f"<{', '.join([card.title, *(f.text for f in card.flags)])}>"
-
-
-def render(card: Card) -> str:
-    """Return a card as HTML that stands by itself, readable on light and dark pages."""
-    flags = " ".join(render_flag(f) for f in card.flags)
-    parts = [
-        f'<div class="motorid">\n<style>{_STYLE}</style>',
-        f"<p><strong>{escape(card.title)}</strong> {flags}</p>",
-    ]
-    parts += [f"<p>{escape(t)}</p>" for t in card.text if t]
-    parts += [render_table(t) for t in card.tables]
-    if card.after:
-        steps = " · ".join(f"{escape(what)}: <code>{escape(code)}</code>" for code, what in card.after)
-        parts.append(f'<p class="muted">Next: {steps}</p>')
-    return "\n".join([*parts, "</div>"])
+    def to_html(self) -> str:
+        """Return HTML that stands by itself, readable on light and dark pages."""
+        flags = " ".join(f.to_html() for f in self.flags)
+        parts = [
+            f'<div class="motorid">\n<style>{_STYLE}</style>',
+            f"<p><strong>{escape(self.title)}</strong> {flags}</p>",
+        ]
+        parts += [f"<p>{escape(t)}</p>" for t in self.text if t]
+        parts += [t.to_html() for t in self.tables]
+        if self.after:
+            steps = " · ".join(f"{escape(what)}: <code>{escape(code)}</code>" for code, what in self.after)
+            parts.append(f'<p class="muted">Next: {steps}</p>')
+        return "\n".join([*parts, "</div>"])
 
 
-def render_flag(flag: Flag) -> str:
-    """Return a flag as a small pill."""
-    ink, paper = _COLOURS[flag.mood]
-    return f'<span class="flag" style="color:{ink};background:{paper}">{escape(flag.text)}</span>'
+class Shown:
+    """Base of results: each writes its own `card`, shown in a notebook, in a report and as one line anywhere.
 
+    Nothing is computed to show a result. Dataclasses need ``repr=False`` to keep the line.
+    """
 
-def render_table(table: Table) -> str:
-    """Return a table with its headers marked as such."""
-    head = "".join(f'<th scope="col">{escape(h)}</th>' for h in table.header)
-    caption = f"<caption>{escape(table.caption)}</caption>" if table.caption else ""
-    rows = "\n".join(_row(r) for r in table.rows)
-    return f"<table>{caption}\n<thead><tr>{head}</tr></thead>\n<tbody>\n{rows}\n</tbody></table>"
+    def card(self) -> Card:
+        """Return what the result shows of itself."""
+        return Card(type(self).__name__)
 
+    def _repr_html_(self) -> str:
+        return self.card().to_html()
 
-def _row(cells: Sequence[str | Flag]) -> str:
-    texts = [render_flag(c) if isinstance(c, Flag) else escape(c) for c in cells]
-    rest = "".join(f"<td>{t}</td>" for t in texts[1:])
-    return f'<tr><th scope="row">{texts[0]}</th>{rest}</tr>'
+    def __repr__(self) -> str:
+        return f"<{self.card().line}>"

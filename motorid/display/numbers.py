@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from decimal import ROUND_HALF_EVEN, Decimal
+
+Std = Mapping[str, float | None]  # one standard deviation per name; None: not determined
 
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 _LARGEST = 5  # decades below it are written out, from 1e-3 on (with an error: from 1e-2 on)
 
 
-def with_error(value: float, std: float | None, unit: str = "") -> str:
+def with_error(value: float, std: float | None, unit: str = "", why: str = "not determined") -> str:
     """Return a value with its standard deviation, both rounded to what the error allows.
 
     The error keeps one or two digits by the rule of the Particle Data Group (Review of Particle Physics):
@@ -21,6 +24,8 @@ def with_error(value: float, std: float | None, unit: str = "") -> str:
     std : float or None
         0: held, not estimated. None (or not finite): the data do not determine it.
     unit : str
+    why : str
+        Said where there is no standard deviation.
 
     Examples
     --------
@@ -37,7 +42,7 @@ def with_error(value: float, std: float | None, unit: str = "") -> str:
     if not math.isfinite(value):
         return number(value) + tail
     if std is None or not math.isfinite(std) or std < 0:
-        return f"{number(value, 3)}{tail} (not determined)"
+        return f"{number(value, 3)}{tail} ({why})"
     if std == 0:
         return f"{number(value, 6)}{tail} (held)"
     place = _place(std)
@@ -88,6 +93,27 @@ def duration(seconds: float) -> str:
         return f"{number(seconds, 3)} s"
     minutes, rest = divmod(round(seconds), 60)
     return f"{minutes} min {rest} s" if rest else f"{minutes} min"
+
+
+def interval_text(limits: tuple[float, float] | None) -> str:
+    """Return an interval with the digits that its width asks for; an unknown one as a dash."""
+    if limits is None:
+        return "–"
+    low, high = limits
+    finite = [abs(x) for x in limits if math.isfinite(x)]
+    width = (high - low) / max(finite) if math.isfinite(high - low) and any(finite) else 1.0
+    digits = min(max(2 - math.floor(math.log10(max(width, 1e-12))), 3), 10)
+    return f"{number(low, digits)} … {number(high, digits)}"
+
+
+def counted(n: int, noun: str) -> str:
+    """Return ``1 run``, ``2 runs``."""
+    return f"{n} {noun}" + ("" if n == 1 else "s")
+
+
+def sentence(text: str) -> str:
+    """Return a message as a sentence: a capital first, a full stop last."""
+    return text[:1].upper() + text[1:] + ("" if text.endswith((".", "!", "?")) else ".") if text else ""
 
 
 def _place(std: float) -> int:

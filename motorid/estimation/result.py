@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
-from motorid.display.display import Shown
-from motorid.errors import UsageError
+from motorid.channels import channel_name
+from motorid.display.cards import Card, Shown
+from motorid.display.numbers import Std, counted, duration, number, quantity, sentence
+from motorid.display.tables import Cell, Flag, Table, value_cell
 from motorid.model.model import Model
 from motorid.numerics.least_squares import gauss_newton_covariance
 from motorid.numerics.signals import Array
 from motorid.problem.problem import Problem
-from motorid.problem.simulate import Evaluation, Simulation, at, evaluate, judge, steady_errors
-from motorid.records.experiment import Experiment
+from motorid.problem.simulate import Evaluation, Simulation, at, error_table, judge, steady_errors
+from motorid.records.experiment import units_of
 
+STATUS_MOODS = {"converged": "good", "stalled": "note", "limit": "note", "failed": "bad"}
 UNDETERMINED = 1.0  # relative standard deviation above which a value is not shown as determined
 
 
@@ -182,6 +186,32 @@ class Fit(Shown):
         natural = np.sqrt((v["K"] ** 2 + v["R"] * v["b"]) / (v["L"] * v["J"]))
         return float((v["R"] / v["L"] + v["b"] / v["J"]) / (2 * natural))
 
+    @property
+    def noise(self) -> dict[str, float]:
+        """Standard deviation of the sensor's noise per channel, SI; of several runs the smallest."""
+        sigmas = [run.sigma for run in self.problem.runs]
+        return {c: min(s[c] for s in sigmas if c in s) for c in self.nrmse}
+
+    def card(self) -> Card:
+        """Return how it ended, parameters, errors, and what constraints cost."""
+        runs = self.problem.experiments
+        vague = [n for n, s in self.std.items() if s is None]
+        flags = [Flag(self.status, STATUS_MOODS.get(self.status, "plain"))]
+        flags += [Flag(self.formulation)] if self.formulation != "plain" else []
+        flags += [Flag(f"{len(vague)} not determined", "note")] if vague else []
+        times = [f"{what} {duration(t)}" for what, t in (("τ_e", self.tau_e), ("τ_m", self.tau_m)) if t]
+        times += [f"damping {number(self.damping, 3)}"] if self.damping else []
+        steps = counted(self.iterations, "iteration")
+        text = (
+            f"{counted(len(runs), 'run')}, {self.problem.n_outputs} samples, {steps} in {duration(self.seconds)}. "
+            + ", ".join(times),
+            "" if self.status == "converged" else sentence(self.message),
+        )
+        after = [("mi.plot_fit(fit)", "see it"), ("mi.diagnose(fit)", "what is missing")]
+        after += [("mi.identifiability(fit)", f"why {', '.join(vague)} cannot be determined")] if vague else []
+        tables = (parameter_table(self), error_table({"": self.evaluation}, self.noise), constraint_table(self))
+        return Card(f"Fit of {self.model.title}", flags, text, [t for t in tables if t], after)
+
     def __repr__(self) -> str:
         errors = ", ".join(f"{c} {100 * e:.2f} %" for c, e in self.nrmse.items())
         name = " + ".join([self.problem.model.base, *self.problem.model.effect_names])
@@ -196,47 +226,67 @@ class Failure(Shown):
     status: str
     message: str
 
+    def card(self) -> Card:
+        """Return why it failed, and where it started."""
+        start = ", ".join(f"{n} = {number(v)}" for n, v in self.start.items())
+        text = (self.message, f"It started from {start}." if start else "")
+        return Card("Failed run", (Flag(self.status, "bad"),), text)
 
-@dataclass(frozen=True, eq=False, repr=False)
-class Comparison(Shown):
-    """Fits side by side: errors on their records, held-out errors, how the parameters moved.
 
-    Attributes
-    ----------
-    fits : tuple of Fit
-    names : tuple of str
-        ``base + effects`` of each.
-    nrmse : tuple of dict of str to float
-    validation_nrmse : tuple of (dict of str to float or None)
-    parameters : dict of str to tuple of (value, std) or None
-        Per parameter, one entry per fit; None where a model lacks it.
+def own_std(fit: Fit) -> Std:
+    """Return a fit's own standard deviations, which take the residuals as white."""
+    return fit.std
+
+
+def parameter_table(fit: Fit, before: Fit | None = None, std: Callable[[Fit], Std] = own_std) -> Table:
+    """Return the parameters as value ± standard deviation, beside those of another fit where one is given.
+
+    Held or not determined is said in words. `std` gives other standard deviations than the fits' own.
     """
+    fits = [f for f in (before, fit) if f is not None]
+    known = [std(f) for f in fits]
+    rows = [[name, *(parameter_cell(f, name, s) for f, s in zip(fits, known, strict=True)), p.doc]
+            for name, p in fit.model.parameters.items()]
+    heads = ["value ± std"] if before is None else ["before", "after"]
+    return Table(["parameter", *heads, "meaning"], rows, "Parameters", left=(0, 1, len(heads) + 1))
 
-    fits: tuple[Fit, ...]
-    names: tuple[str, ...]
-    nrmse: tuple[Mapping[str, float], ...]
-    validation_nrmse: tuple[Mapping[str, float] | None, ...]
-    parameters: Mapping[str, tuple[tuple[float, float | None] | None, ...]]
+
+def parameter_cell(fit: Fit, name: str, std: Std) -> Cell:
+    """Return one parameter as ``1.302 ± 0.004 Ω``, or with ``(held)``, ``(chosen …)``, ``(not determined)``."""
+    if name not in fit.values:
+        return "–"
+    p = fit.model.parameters[name]
+    if name == "sgn_width" and not p.given:
+        return f"{quantity(fit.values[name], p.unit, 2)} (chosen from the data)"
+    return value_cell(fit.values[name], std[name] if p.vary else 0.0, p.unit)
 
 
-def compare(fits: Sequence[Fit], validate: Sequence[Experiment] | Experiment | None = None) -> Comparison:
-    """Put fits side by side.
+def derived_table(fit: Fit) -> Table | None:
+    """Return time constants, damping ratio and the error at the steady state, as far as there are any."""
+    units = units_of(fit.problem.experiments)
+    times = (("electrical time constant", fit.tau_e), ("mechanical time constant", fit.tau_m))
+    rows = [(name, duration(t)) for name, t in times if t is not None]
+    if fit.damping is not None:
+        rows.append(("damping ratio", number(fit.damping, 3)))
+    rows += [(f"steady-state error of the {channel_name(c, units[c])}", quantity(error, units[c], 3))
+             for c, error in fit.steady_state_error.items()]
+    return Table(("derived", "value"), rows, left=(0, 1)) if rows else None
 
-    Parameters
-    ----------
-    fits : sequence of Fit
-    validate : Experiment or sequence of Experiment, optional
-        Held-out runs to judge each fit on.
 
-    Raises
-    ------
-    UsageError
-        If no fit is given.
+def constraint_table(fit: Fit, violations: Mapping[str, float] = MappingProxyType({})) -> Table | None:
+    """Return what each true constraint costs to keep, and how far each is violated where that is given.
+
+    `violations` is by name and unit, ``"CurrentLimit(8 A), A"``; relations that are only weighed stand there too.
     """
-    if not fits:
-        raise UsageError("compare() takes a list of fits: mi.compare([fit, better]).")
-    held = tuple(None if validate is None else dict(evaluate(f, validate).nrmse) for f in fits)
-    names = list(dict.fromkeys(n for f in fits for n in f.values if n != "sgn_width"))
-    parameters = {n: tuple((f.values[n], f.std[n]) if n in f.values else None for f in fits) for n in names}
-    titles = tuple(" + ".join([f.problem.model.base, *f.problem.model.effect_names]) for f in fits)
-    return Comparison(tuple(fits), titles, tuple(dict(f.nrmse) for f in fits), held, parameters)
+    multipliers = {f"{m.name}, {m.unit}": m for m in fit.extra.get("multipliers", ())}
+    rows = []
+    for name in dict.fromkeys([*violations, *multipliers]):
+        label, _, unit = name.rpartition(", ")
+        m = multipliers.get(name)
+        beyond = [quantity(violations.get(name), unit, 3)] if violations else []
+        place = "weighed, not enforced" if m is None else Flag(m.label, "note") if m.active else m.label
+        cost = "–" if m is None else f"{number(m.value, 3)} per {m.unit or 'unit'}"
+        rows.append([label or name, *beyond, place, cost])
+    header = ["constraint", *(["largest violation"] if violations else []), "at the solution",
+              "multiplier (fall of the cost if it gave way)"]
+    return Table(header, rows, "Constraints", left=(0, len(header) - 2)) if rows else None

@@ -11,12 +11,13 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from motorid.channels import CHANNELS
 from motorid.errors import UsageError
 from motorid.estimation.result import Fit
 from motorid.exporters.json_file import fit_dict
 from motorid.integrate.engine import Grid
 from motorid.integrate.rodas3 import step_functions
-from motorid.model.equations import CHANNELS, System
+from motorid.model.equations import System
 from motorid.model.model import Model
 from motorid.numerics.signals import Array
 from motorid.problem.problem import Problem

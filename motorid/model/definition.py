@@ -10,7 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from motorid.display.display import Shown
+from motorid.display.cards import Card, Shown
+from motorid.display.numbers import quantity
+from motorid.display.tables import Flag, Table
 from motorid.errors import ModelError, one_of
 
 
@@ -159,6 +161,18 @@ class Effect(Shown):
         pars = tuple(replace(p, value=float(values[p.name]), given=True, vary=p.vary and not p.order)
                      if p.name in values else p for p in self.parameters)
         return replace(self, parameters=pars)
+
+    def card(self) -> Card:
+        """Return what the effect acts on, where it comes from, and its parameters."""
+        rows = [[p.name, quantity(p.value, p.unit), "–" if p.null is None else quantity(p.null, p.unit), p.doc]
+                for p in self.parameters]
+        return Card(
+            f"Effect: {self.name}",
+            (Flag(self.balance),),
+            (self.doc,),
+            (Table(["parameter", "start", "vanishes at", "meaning"], rows),),
+            (("model + effect", "use it"),),
+        )
 
     def __repr__(self) -> str:
         return f"<effect {self.name} ({self.balance}): {', '.join(p.name for p in self.parameters)}>"

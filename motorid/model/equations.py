@@ -11,10 +11,9 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from motorid.channels import CHANNELS
 from motorid.errors import ModelError, one_of
 from motorid.numerics.signals import Array
-
-CHANNELS = ("i", "omega", "theta")
 
 
 class Equations:

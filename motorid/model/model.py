@@ -9,10 +9,13 @@ from typing import Any
 
 import casadi as ca
 
-from motorid.display.display import Shown
+from motorid.channels import CHANNELS
+from motorid.display.cards import Card, Shown
+from motorid.display.numbers import quantity
+from motorid.display.tables import Table
 from motorid.errors import ModelError, one_of
 from motorid.model.definition import Effect, Parameter
-from motorid.model.equations import CHANNELS, Equations, System, build_system
+from motorid.model.equations import Equations, System, build_system
 
 SGN_WIDTH = Parameter("sgn_width", 1e-2, "rad/s", positive=True, vary=False,
                       doc="speed over which sgn(omega) is smoothed; chosen from the data unless given")
@@ -108,6 +111,11 @@ class Model(Shown):
         return tuple(e.name for e in self.effects)
 
     @property
+    def title(self) -> str:
+        """What it is, for people: ``DC motor + coulomb``."""
+        return " + ".join([TITLES[self.base], *self.effect_names])
+
+    @property
     def values(self) -> dict[str, float]:
         """Present parameter values, in SI units."""
         return {n: p.value for n, p in self.parameters.items()}
@@ -197,6 +205,17 @@ class Model(Shown):
     def __getstate__(self) -> dict[str, Any]:
         return {f: getattr(self, f) for f in self.__dataclass_fields__}
 
+    def card(self) -> Card:
+        """Return the parameters, whether a fit varies them, and where they come from."""
+        owner = {p.name: e.name for e in self.effects for p in e.parameters}
+        rows = [[p.name, quantity(p.value, p.unit), "estimated" if p.vary else "held", owner.get(p.name, "base"), p.doc]
+                for p in self.parameters.values()]
+        return Card(
+            f"Model: {self.title}",
+            tables=(Table(["parameter", "value", "in a fit", "of", "meaning"], rows),),
+            after=(("mi.fit(model, runs)", "fit it"), ("model + mi.effects.coulomb", "add an effect")),
+        )
+
     def __repr__(self) -> str:
         return f"<model {' + '.join([self.base, *self.effect_names])}: {', '.join(self.free_names)}>"
 
@@ -275,6 +294,7 @@ def _within(parameter: Parameter, value: float) -> float:
     return limit if abs(value - limit) <= 1e-9 * abs(limit) else value
 
 
+TITLES = {"dc_motor": "DC motor", "torque_driven": "torque-driven axis"}
 STATES = {"dc_motor": ("i", "omega"), "torque_driven": ("omega",)}
 QUANTITIES = {"dc_motor": ("R", "L", "K", "K_t", "K_e", "b", "J"), "torque_driven": ("g", "b", "J")}
 DERIVED = {"K_t": lambda m: m.K, "K_e": lambda m: m.K}

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
+from motorid.channels import CHANNELS
 from motorid.display.numbers import percent
 from motorid.errors import UsageError
-from motorid.model.equations import CHANNELS
 from motorid.numerics.noise import noise_level
 from motorid.plots.style import (
     CYCLE,

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
+from motorid.channels import CHANNELS
 from motorid.errors import UsageError, one_of
 from motorid.estimation.result import Fit
-from motorid.model.equations import CHANNELS
 from motorid.numerics.signals import Array
 from motorid.plots.style import (
     INK,

@@ -10,10 +10,10 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
+from motorid.channels import CHANNELS
 from motorid.errors import ModelError, UsageError, one_of
 from motorid.integrate.engine import Grid
 from motorid.model.definition import Parameter
-from motorid.model.equations import CHANNELS
 from motorid.numerics.noise import noise_level
 from motorid.numerics.signals import Array
 from motorid.records.experiment import Experiment

@@ -4,19 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
-from motorid.display.display import Shown
+from motorid.channels import CHANNELS, UNITS, channel_name
+from motorid.display.cards import Card, Shown
+from motorid.display.numbers import counted, percent, quantity
+from motorid.display.tables import Table
 from motorid.errors import FitError, SimulationError
 from motorid.integrate.engine import Engine
-from motorid.model.equations import CHANNELS
 from motorid.model.model import Model
 from motorid.numerics.signals import Array
 from motorid.problem.problem import Problem, as_problem
-from motorid.records.experiment import Experiment
+from motorid.records.experiment import Experiment, units_of
 from motorid.records.steady_state import find_segments
+
+MOST_RUNS = 12  # shown one by one
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,9 +64,51 @@ class Evaluation(Shown):
         """Quadratic mean of the channels' NRMSE."""
         return float(np.sqrt(np.mean(np.square(list(self.nrmse.values())))))
 
+    def card(self) -> Card:
+        """Return the errors over all runs and run by run."""
+        return Card(
+            f"Evaluation on {counted(len(self.simulations), 'run')}",
+            tables=(error_table({"": self}), run_table(self)),
+            after=(("mi.plot_fit(evaluation)", "see it"),),
+        )
+
     def __repr__(self) -> str:
         errors = ", ".join(f"{c} {100 * e:.2f} %" for c, e in self.nrmse.items())
         return f"<evaluation of {len(self.simulations)} runs: NRMSE {errors}>"
+
+
+def error_table(evaluations: Mapping[str, Evaluation | None], noise: Mapping[str, float] = MappingProxyType({})
+                ) -> Table:
+    """Return RMSE and NRMSE per channel of each named evaluation, side by side.
+
+    Parameters
+    ----------
+    evaluations : mapping of str to Evaluation
+        The name goes before the heads of its columns, e.g. ``held-out``; None is left out.
+    noise : mapping of str to float, optional
+        Standard deviation of the sensor's noise per channel, SI, as a column of its own.
+    """
+    shown = {name: e for name, e in evaluations.items() if e is not None}
+    units = units_of(s.experiment for e in shown.values() for s in e.simulations)
+    header = ["channel", *(f"{name} {what}".strip() for name in shown for what in ("RMSE", "NRMSE"))]
+    rows = []
+    for c in dict.fromkeys(c for e in shown.values() for c in e.nrmse):
+        unit = units.get(c, UNITS[c][0])
+        row = [f"{channel_name(c, unit)} {c}"]
+        for e in shown.values():
+            row += [quantity(e.rmse.get(c), unit, 3), percent(e.nrmse.get(c))]
+        rows.append([*row, quantity(noise.get(c), unit, 2)] if noise else row)
+    return Table([*header, "noise"] if noise else header, rows, "Errors")
+
+
+def run_table(evaluation: Evaluation, title: str = "Errors run by run") -> Table:
+    """Return the NRMSE of each run per channel; of many runs the first ones."""
+    shown = list(zip(evaluation.simulations, evaluation.by_run, strict=True))
+    units = units_of(s.experiment for s, _ in shown)
+    header = ["run", *(f"NRMSE {channel_name(c, units.get(c, ''))}" for c in evaluation.nrmse)]
+    rows = [[s.experiment.name, *(percent(e.get(c)) for c in evaluation.nrmse)] for s, e in shown[:MOST_RUNS]]
+    note = f"and {counted(len(shown) - MOST_RUNS, 'more run')}" if len(shown) > MOST_RUNS else ""
+    return Table(header, rows, title, note)
 
 
 def simulate(model: Model, runs: Sequence[Experiment] | Experiment, *, engine: str | Engine = "rosenbrock",

@@ -10,8 +10,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from motorid.channels import CHANNELS
 from motorid.model.definition import Parameter
-from motorid.model.equations import CHANNELS, System
+from motorid.model.equations import System
 from motorid.numerics.signals import Array
 from motorid.problem.runs import Run, natural_sizes, spread_of
 

@@ -14,10 +14,10 @@ import numpy as np
 
 from motorid.errors import DataError, MissingDependency
 from motorid.records.experiment import MIN_SAMPLES
-from motorid.records.text_tables import Table, counted, numbers, unique_labels
+from motorid.records.text_tables import TextTable, counted, numbers, unique_labels
 
 
-def mat_table(data: bytes) -> Table:
+def mat_table(data: bytes) -> TextTable:
     """Read the numeric arrays of one length from the bytes of a MATLAB file (up to version 7).
 
     Fields of structures and columns of matrices become columns of their own; of several lengths the most
@@ -42,10 +42,10 @@ def mat_table(data: bytes) -> Table:
     short = [k.rpartition(".")[2] for k in kept]
     labels = short if len(set(short)) == len(short) and "Data" not in short else unique_labels(list(kept))
     columns = {label: numbers(a)[0] for label, a in zip(labels, kept.values(), strict=True)}
-    return Table(columns, labels=labels, notes=notes)
+    return TextTable(columns, labels=labels, notes=notes)
 
 
-def parquet_table(data: bytes) -> Table:
+def parquet_table(data: bytes) -> TextTable:
     """Read a table from the bytes of a Parquet file; a named index counts as a column.
 
     Raises
@@ -75,7 +75,7 @@ def parquet_table(data: bytes) -> Table:
             notes += [f"{counted(bad, 'cell')} of '{label}' infinite; taken as missing."] if bad else []
         else:
             texts[label] = series.astype(str).tolist()
-    return Table(columns, texts, labels, notes=notes)
+    return TextTable(columns, texts, labels, notes=notes)
 
 
 def _load(data: bytes) -> dict[str, object]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from itertools import pairwise
 from numbers import Real
@@ -13,21 +13,15 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from motorid.display.display import Shown
+from motorid.channels import CHANNELS, NAMES, UNITS
+from motorid.display.cards import Card, Shown
+from motorid.display.numbers import duration, number
+from motorid.display.tables import Flag, Table
 from motorid.errors import DataError, UsageError, one_of
 from motorid.numerics.signals import Array
 from motorid.records import preprocessing
 
 INPUTS = ("v",)
-OUTPUTS = ("i", "omega", "theta")
-# The first unit of each channel is its default. A linear axis is measured in m and m/s; the command of a
-# current- or torque-controlled drive need not be a voltage.
-UNITS: Mapping[str, tuple[str, ...]] = MappingProxyType({
-    "v": ("V", "A", "N·m", "N", "1"),
-    "i": ("A",),
-    "omega": ("rad/s", "m/s"),
-    "theta": ("rad", "m"),
-})
 MIN_SAMPLES = 8
 
 
@@ -81,7 +75,7 @@ class Experiment(Shown):
         _check_time(t, self.name)
         _freeze(self, "t", t)
         _freeze(self, "inputs", _channels(self.inputs, INPUTS, "input", t, self.name))
-        _freeze(self, "outputs", _channels(self.outputs, OUTPUTS, "output", t, self.name))
+        _freeze(self, "outputs", _channels(self.outputs, CHANNELS, "output", t, self.name))
         _check_values(self)
         _freeze(self, "sigma", _sigmas(self))
         _freeze(self, "units", _units(self))
@@ -106,7 +100,7 @@ class Experiment(Shown):
     @property
     def channels(self) -> tuple[str, ...]:
         """Names of the measured output channels, in the order i, omega, theta."""
-        return tuple(name for name in OUTPUTS if name in self.outputs)
+        return tuple(name for name in CHANNELS if name in self.outputs)
 
     def with_(self, **changes: Any) -> Experiment:
         """Return a copy with some fields replaced, validated again."""
@@ -187,9 +181,37 @@ class Experiment(Shown):
         values = (getattr(self, f.name) for f in dataclasses.fields(self))
         return Experiment, tuple(dict(v) if isinstance(v, MappingProxyType) else v for v in values)
 
+    def card(self) -> Card:
+        """Return the channels with their ranges and missing samples."""
+        rows = []
+        for name, y in (*self.inputs.items(), *self.outputs.items()):
+            good = y[np.isfinite(y)]
+            missing = len(y) - len(good)
+            limits = [number(float(limit), 3) for limit in (good.min(), good.max())] if len(good) else []
+            rows.append([
+                f"{NAMES[name]} {name}",
+                f"{limits[0]} … {limits[1]} {self.units[name]}" if limits else "–",
+                Flag(f"{missing} of {len(y)}", "note") if missing else "none",
+            ])
+        return Card(
+            f"Run {self.name}",
+            text=(
+                f"{self.n} samples in {duration(self.duration)}, {number(1e3 * self.dt, 3)} ms apart; "
+                f"input {'held' if self.hold == 'zoh' else 'linear'} between samples.",
+                *(str(n) for n in self.meta.get("notes", ())),
+            ),
+            tables=(Table(["channel", "range", "missing samples"], rows),),
+            after=(("mi.plot_runs(run)", "see it"), ("mi.fit(mi.dc_motor(), [run])", "fit a model")),
+        )
+
     def __repr__(self) -> str:
         shown = ", ".join((*self.inputs, "→", *self.channels)).replace(", →,", " →")
         return f"<Experiment {self.name!r}: {shown}; {self.n} samples, {self.duration:.4g} s>"
+
+
+def units_of(runs: Iterable[Experiment]) -> dict[str, str]:
+    """Return the SI unit of each channel in `runs`."""
+    return {c: unit for run in runs for c, unit in run.units.items()}
 
 
 def split(experiment: Experiment, n: int = 2) -> list[Experiment]:
@@ -275,8 +297,8 @@ def _check_values(run: Experiment) -> None:
 
 def _sigmas(run: Experiment) -> Mapping[str, float]:
     for name, value in run.sigma.items():
-        if name not in OUTPUTS:
-            raise DataError(f"{run.name}: {one_of(str(name), OUTPUTS, 'channel in sigma')}")
+        if name not in CHANNELS:
+            raise DataError(f"{run.name}: {one_of(str(name), CHANNELS, 'channel in sigma')}")
         if not (isinstance(value, Real) and np.isfinite(value) and value > 0):
             raise DataError(f"{run.name}: sigma of '{name}' must be a positive number; got {value!r}.")
     return MappingProxyType({k: float(s) for k, s in run.sigma.items() if k in run.outputs})

@@ -17,7 +17,7 @@ from motorid.records.binary_tables import mat_table, parquet_table
 from motorid.records.cleaning import build
 from motorid.records.experiment import Experiment
 from motorid.records.layout import assign, parse_pairs
-from motorid.records.text_tables import Table, parse_table
+from motorid.records.text_tables import TextTable, parse_table
 
 Path_ = str | os.PathLike[str]
 RECORDS = (".csv", ".txt", ".tsv", ".dat", ".log", ".mat", ".parquet", ".pq")
@@ -177,7 +177,7 @@ def _natural(path: Path) -> list[tuple[int, int, str]]:
     return [(0, int(p), "") if p.isdecimal() else (1, 0, p) for p in parts if p]
 
 
-def _read(path: Path_, to_table: Callable[[bytes], Table], columns: Mapping[str, object] | None,
+def _read(path: Path_, to_table: Callable[[bytes], TextTable], columns: Mapping[str, object] | None,
           units: Mapping[str, object] | None, hold: str | None, name: str | None) -> Experiment:
     path = Path(path).expanduser()
     try:

@@ -20,7 +20,7 @@ _COMMENT = ("#", "%", "//")
 _LARGEST = 1e30  # what is larger, or infinite, was not measured
 
 @dataclass(frozen=True)
-class Table:
+class TextTable:
     """A file as columns.
 
     `columns` holds (N,) numbers, NaN where a cell is missing; `texts` the columns that are no numbers;
@@ -35,7 +35,7 @@ class Table:
     notes: Sequence[str] = ()
 
 
-def parse_table(data: bytes) -> Table:
+def parse_table(data: bytes) -> TextTable:
     """Read a table of numbers from the bytes of a text file.
 
     Delimiter (comma, semicolon, tab, white space), decimal mark, encoding, comment lines, header and row of
@@ -60,7 +60,7 @@ def parse_table(data: bytes) -> Table:
     labels, unit_row = _header(body[:first], comments, dialect, width, notes)
     rows = _rows(body[first:], dialect, len(labels), notes)
     columns, texts = _parse(rows, dialect, labels, notes)
-    return Table(columns, texts, labels, dict(zip(labels, unit_row, strict=False)), comments, notes)
+    return TextTable(columns, texts, labels, dict(zip(labels, unit_row, strict=False)), comments, notes)
 
 
 def numbers(values: object, decimal: str = ".") -> tuple[NDArray[np.float64], int]:

@@ -7,9 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from motorid.display._html_tables import counted, error_table, model_name
-from motorid.display.cards import Card, render
-from motorid.display.numbers import duration
+from motorid.display.cards import Card
+from motorid.display.numbers import counted, duration
 from motorid.effects import LIBRARY, get
 from motorid.errors import MissingDependency, ModelError, MotoridError, UsageError
 from motorid.estimation.fit import fit
@@ -18,7 +17,7 @@ from motorid.estimation.start_values import with_suited_effects
 from motorid.model.definition import Effect, Parameter
 from motorid.model.model import Model
 from motorid.problem.problem import Problem
-from motorid.problem.simulate import evaluate
+from motorid.problem.simulate import error_table, evaluate
 from motorid.records.experiment import Experiment
 
 REACH = 10.0  # a slider goes from a tenth to ten times the value it begins with
@@ -189,9 +188,8 @@ class Explorer:
         with detached():
             axes = plot_fit(self.evaluation, before=self._first)
         self._picture.value = png_of(axes)
-        units = {c: u for r in self.runs for c, u in r.units.items()}
-        table = error_table([("now", self.evaluation), ("at first", self._first)], units)
-        self._errors.value = render(Card(model_name(self.model), tables=(table,)))
+        table = error_table({"now": self.evaluation, "at first": self._first.evaluation})
+        self._errors.value = Card(self.model.title, tables=(table,)).to_html()
 
     def _say(self, message: str) -> None:
         self.message = message
@@ -204,7 +202,7 @@ class Explorer:
         return self.widget._repr_mimebundle_(**options)
 
     def __repr__(self) -> str:
-        return f"<explorer of {model_name(self.model)} on {counted(len(self.runs), 'run')}>"
+        return f"<explorer of {self.model.title} on {counted(len(self.runs), 'run')}>"
 
 
 def explore(fit: Fit, *, effects: Iterable[Effect | str] | None = None) -> Explorer:

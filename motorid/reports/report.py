@@ -11,11 +11,11 @@ from importlib.metadata import version as version_of
 from pathlib import Path
 from typing import Any
 
+from motorid.channels import NAMES
 from motorid.diagnosis.results import Diagnosis, Ladder
-from motorid.display._cards import card_of
-from motorid.display._html_tables import NAMES
-from motorid.display.cards import Flag, Table
+from motorid.display.cards import Shown
 from motorid.display.numbers import duration, percent
+from motorid.display.tables import Flag, Table
 from motorid.errors import UsageError
 from motorid.estimation.result import Fit
 from motorid.records.experiment import Experiment
@@ -56,6 +56,9 @@ def report(result: Any, path: str | Path, *, title: str = "", command: str = "",
     results = list(result) if isinstance(result, list | tuple) else [result]
     if not results:
         raise UsageError("report needs a result: mi.report(mi.diagnose(fit), 'report.html').")
+    for r in results:
+        if not isinstance(r, Shown):
+            raise UsageError(f"report takes results of motorid, such as a fit or a diagnosis; got {type(r).__name__}.")
     story = tell(results, title=title, validate=list(validate))
     story.sections.append(_provenance(story, command))
     target = Path(path)
@@ -117,7 +120,7 @@ class Story:
     runs: Sequence[Experiment] = ()
 
 
-def tell(results: Sequence[Any], *, title: str = "", validate: Sequence[Experiment] = ()) -> Story:
+def tell(results: Sequence[Shown], *, title: str = "", validate: Sequence[Experiment] = ()) -> Story:
     """Return the story of `results`, told from the richest of them on."""
     main = next((r for kind in (Diagnosis, Ladder, Fit) for r in results if isinstance(r, kind)), results[0])
     if isinstance(main, Diagnosis):
@@ -127,12 +130,12 @@ def tell(results: Sequence[Any], *, title: str = "", validate: Sequence[Experime
     elif isinstance(main, Fit):
         story = _of_fit(main, validate)
     else:
-        card = card_of(main)
+        card = main.card()
         story = Story(card.title, " ".join(card.text[:1]), card.flags)
         story.sections.append(sections.of_card(main, 0))
     for k, r in enumerate(results):
         if r is not main:
-            again = sections.fitted(r, card_of(r).title, key=f"result-{k + 1}") if isinstance(r, Fit) else None
+            again = sections.fitted(r, r.card().title, key=f"result-{k + 1}") if isinstance(r, Fit) else None
             story.sections.append(again or sections.of_card(r, k))
     story.title = title or story.title
     return story
@@ -140,8 +143,7 @@ def tell(results: Sequence[Any], *, title: str = "", validate: Sequence[Experime
 
 def _of_diagnosis(d: Diagnosis, validate: Sequence[Experiment]) -> Story:
     runs = d.before.problem.experiments
-    mood = {"adequate": "good", "missing": "note", "unexplained": "bad"}.get(d.verdict, "plain")
-    story = Story("What is missing in the motor's model?", d.text, [Flag(d.verdict, mood)], runs=runs)
+    story = Story("What is missing in the motor's model?", d.text, d.card().flags[:1], runs=runs)
     story.facts = [*sections.error_facts(d.ladder), ("Effects added", ", ".join(d.effects) or "none")]
     story.sections += [
         sections.data(runs),
@@ -169,7 +171,7 @@ def _of_ladder(ladder: Ladder) -> Story:
 
 
 def _of_fit(fit: Fit, validate: Sequence[Experiment]) -> Story:
-    card = card_of(fit)
+    card = fit.card()
     story = Story(card.title, " ".join(t for t in card.text if t), card.flags, runs=fit.problem.experiments)
     story.facts = [(f"Error of the {NAMES[c]}", percent(e)) for c, e in fit.nrmse.items()]
     if fit.tau_m:

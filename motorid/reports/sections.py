@@ -6,21 +6,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from motorid.diagnosis.results import Diagnosis, Ladder
-from motorid.display._cards import card_of
-from motorid.display._html_tables import (
-    NAMES,
-    counted,
-    error_table,
-    ladder_table,
-    model_name,
-    parameter_table,
-    ranking_table,
-)
-from motorid.display.cards import Table
-from motorid.display.numbers import duration, number, percent
-from motorid.estimation.result import Fit
-from motorid.problem.simulate import evaluate
+from motorid.channels import NAMES
+from motorid.diagnosis.results import Diagnosis, Ladder, ladder_table, ranking_table, share_table
+from motorid.display.cards import Shown
+from motorid.display.numbers import counted, duration, number, percent, sentence
+from motorid.display.tables import Table
+from motorid.estimation.result import Fit, parameter_table
+from motorid.problem.simulate import error_table, evaluate
 from motorid.records.checks import check_runs
 from motorid.records.experiment import Experiment
 from motorid.uncertainty.covariance import deviations
@@ -69,12 +61,11 @@ def fitted(fit: Fit, title: str, *, key: str = "fit", before: Fit | None = None)
 
     caption = "Measured, model, and what is left over beside the band of the noise."
     caption += " The thin curve is the model it began with." if before is not None else ""
-    alt = f"Measured and modelled channels of {model_name(fit.model)}, with residuals. " + _errors_in_words(fit)
-    units = {c: u for r in fit.problem.experiments for c, u in r.units.items()}
+    alt = f"Measured and modelled channels of {fit.model.title}, with residuals. " + _errors_in_words(fit)
     effort = f": {counted(fit.iterations, 'iteration')}, {duration(fit.seconds)}" if fit.seconds else ""
-    text = [f"{model_name(fit.model)}{effort}. {_sentence(fit.message)}"]
+    text = [f"{fit.model.title}{effort}. {sentence(fit.message)}"]
     figure = _figure(key, caption, alt, plot_fit, fit, before=before)
-    tables = [parameter_table(fit, std=deviations), error_table([("", fit)], units)]
+    tables = [parameter_table(fit, std=deviations), error_table({"": fit.evaluation}, fit.noise)]
     return Section(key, title, text, (), [figure], tables)
 
 
@@ -93,10 +84,9 @@ def held_out(fit: Fit, validate: Sequence[Experiment]) -> Section:
     from motorid.plots import plot_fit
 
     judged = evaluate(fit, validate)
-    units = {c: u for r in validate for c, u in r.units.items()}
     alt = "Measured and modelled channels of records that the fit never saw. " + _errors_in_words(judged)
     figure = _figure("held-out", "Records that the fit never saw.", alt, plot_fit, judged)
-    return Section("held-out", "On records it never saw", (), (), [figure], [error_table([("", judged)], units)])
+    return Section("held-out", "On records it never saw", (), (), [figure], [error_table({"": judged})])
 
 
 def where(d: Diagnosis) -> Section:
@@ -104,12 +94,12 @@ def where(d: Diagnosis) -> Section:
     from motorid.plots import plot_missing
 
     m = d.missing
-    regions = Table(["region", "share of the misfit"], [[k, percent(v, 2)] for k, v in m.regions.items()])
     best = [f"{balance}: {b.against} explains {percent(b.explained, 2)}"
             for balance, bins in m.bins.items() for b in bins[:1]]
     caption = "The voltage and torque that would make the model match, and what explains them."
     figure = _figure("missing", caption, "Missing voltage and torque. " + "; ".join(best), plot_missing, d)
-    return Section("where", "Where it fails", [d.adequacy.text, m.text], (), [figure], [regions] if m.regions else [])
+    tables = [share_table("region", m.regions)] if m.regions else []
+    return Section("where", "Where it fails", [d.adequacy.text, m.text], (), [figure], tables)
 
 
 def which(d: Diagnosis) -> Section:
@@ -126,11 +116,11 @@ def ladder(steps: Ladder) -> Section:
     """The error of each model of a ladder."""
     from motorid.plots import plot_ladder
 
-    names = ", ".join(r.added or model_name(r.fit.model) for r in steps.rungs)
+    names = ", ".join(r.added or r.fit.model.title for r in steps.rungs)
     caption = "Error of each model, on the records of the fit and on those it never saw."
     alt = f"Error of each model in turn: {names}"
     figure = _figure("ladder", caption, alt, plot_ladder, steps, small=True)
-    return Section("ladder", "The error falls", [_sentence(steps.text)], (), [figure], [ladder_table(steps)])
+    return Section("ladder", "The error falls", [sentence(steps.text)], (), [figure], [ladder_table(steps)])
 
 
 def parameters(before: Fit, after: Fit) -> Section:
@@ -153,11 +143,11 @@ def apart(d: Diagnosis) -> Section:
     return Section("apart", "What cannot be told apart, and what to do next", [*closing, text], groups)
 
 
-def of_card(result: Any, k: int) -> Section:
+def of_card(result: Shown, k: int) -> Section:
     """A result that has no section of its own, from its card."""
     from motorid import plots
 
-    card = card_of(result)
+    card = result.card()
     draw: Callable[..., Any] | None = getattr(plots, card.figure, None) if card.figure else None
     figures = [_figure(f"result-{k + 1}", "", card.title, draw, result, small=True)] if draw else []
     return Section(f"result-{k + 1}", card.title, [t for t in card.text if t], (), figures, card.tables)
@@ -182,8 +172,3 @@ def error_facts(steps: Ladder) -> list[tuple[str, str]]:
 
 def _errors_in_words(judged: Any) -> str:
     return ", ".join(f"error of the {NAMES[c]} {percent(e)}" for c, e in judged.nrmse.items())
-
-
-def _sentence(text: str) -> str:
-    """Return a message as a sentence."""
-    return text[:1].upper() + text[1:] + ("" if text.endswith((".", "!", "?")) else ".") if text else ""

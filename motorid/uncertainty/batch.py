@@ -100,8 +100,8 @@ class Batch:
             if v.size:
                 low, middle, high = np.percentile(v, [5, 50, 95])
                 rows.append((n, f"{middle:.4g}", f"{low:.4g} … {high:.4g}", str(v.size)))
-        table = Table(f"{len(good)} of {len(self.rows)} motors fitted",
-                      ("", "median", "5 % … 95 %", "determined in"), tuple(rows), left=(0, 2))
+        table = Table(("parameter", "median", "5 % … 95 %", "determined in"), rows,
+                      f"{len(good)} of {len(self.rows)} motors fitted", left=(0, 2))
         said = [str(table), *(f"{name}: failed. {why}" for name, why in self.failed.items())]
         said += [o.text for o in self.outliers]
         return "\n".join([*said, *([self.interrupted] if self.interrupted else [])])

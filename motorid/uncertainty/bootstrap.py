@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from motorid.display.display import Shown
-from motorid.display.numbers import number, with_error
-from motorid.display.tables import Table
+from motorid.display.cards import Card, Shown
+from motorid.display.numbers import interval_text, percent
+from motorid.display.tables import Flag, Table, value_cell
 from motorid.errors import FitError, MotoridError, UsageError, one_of
 from motorid.estimation.continuation import descend
 from motorid.estimation.result import Failure, Fit
@@ -23,7 +23,7 @@ from motorid.numerics.parallel import Map, Parcel, in_chunks, run_tasks
 from motorid.numerics.signals import Array
 from motorid.problem.problem import Problem
 from motorid.records.experiment import Experiment
-from motorid.uncertainty.covariance import covariance, interval_text
+from motorid.uncertainty.covariance import covariance
 
 KINDS = ("blocks", "parametric", "runs")
 # Blocks lose the likeness across their joints: the variance comes out too small by about one over this.
@@ -90,16 +90,26 @@ class Bootstrap(Shown):
                 "level": level, "intervals": {n: self.interval(n, level) for n in self.names},
                 "at_limit": dict(self.limited), "block": self.block, "interrupted": self.interrupted or None}
 
-    def __str__(self) -> str:
+    def card(self) -> Card:
+        """Return values with the spread of the refits."""
+        flags = [Flag(f"{len(self.samples)} refits")]
+        flags += [Flag(f"{len(self.failures)} failed", "bad")] if self.failures else []
+        words = {"blocks": "Blocks of the residuals, put back in random order on the model's curves."}
         rows = []
         for n, value, unit in zip(self.names, self.reference, self.units, strict=True):
-            share = f"{self.limited[n]:.0%} at its limit" if self.limited[n] else ""
-            said = f"{number(value, 3)} {unit} ({self.status[n]})"
-            said = said if self.std[n] is None else with_error(value, self.std[n], unit)
-            rows.append((n, said, interval_text(self.interval(n)), share))
-        note = f"{len(self.samples)} refits, {len(self.failures)} failed. {self.interrupted}".strip()
-        return str(Table(f"Bootstrap ({self.kind})", ("", "value ± std", "95 %", ""), tuple(rows),
-                         left=(0, 1, 2, 3), note=note))
+            limited = Flag(percent(self.limited[n], 2), "note") if self.limited[n] else "none"
+            said = value_cell(float(value), self.std[n], unit, self.status[n])
+            rows.append([n, said, interval_text(self.interval(n)), limited])
+        return Card(
+            "Bootstrap",
+            flags,
+            (words.get(self.kind, f"Resampled: {self.kind}."), self.interrupted),
+            (Table(["parameter", "value ± std", "95 %", "at its limit"], rows, left=(0, 1, 2)),),
+            (("mi.plot_profile(mi.intervals(fit))", "compare"),),
+        )
+
+    def __str__(self) -> str:
+        return str(self.card())
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 from scipy.special import stdtrit
 
-from motorid.display.display import Shown
-from motorid.display.numbers import number, with_error
-from motorid.display.tables import Table
+from motorid.channels import channel_name
+from motorid.display.cards import Card, Shown
+from motorid.display.numbers import interval_text, percent
+from motorid.display.tables import Cell, Flag, Table, value_cell
 from motorid.errors import UsageError, one_of
 from motorid.estimation.result import UNDETERMINED, Fit
 from motorid.numerics.autoregression import Colour, colour_of, weighed
@@ -97,34 +98,31 @@ class Covariance(Shown):
                 "intervals": {n: self.interval(n, level) for n in self.names}, "correlation": correlation,
                 "effective_share": {c: k.effective_share for c, k in self.colours.items()}}
 
+    def card(self) -> Card:
+        """Return values, intervals and correlations."""
+        rows = [[n, value_cell(float(value), self.std[n], unit, self.status[n]), interval_text(self.interval(n)),
+                 *(_correlation_cell(x) for x in correlations)]
+                for n, value, unit, correlations in zip(
+                    self.names, self.values, self.units, self.correlation, strict=True)]
+        header = ["unknown", "value ± std", "95 %", *(f"ρ {n}" for n in self.names)]
+        share = ", ".join(f"{channel_name(c)} {percent(v.effective_share, 2)}" for c, v in self.colours.items())
+        return Card(
+            "Uncertainty",
+            (Flag(f"{self.method} residuals"),),
+            (f"Effective samples per sample: {share}.",) if share else (),
+            (Table(header, rows, left=(0, 1, 2)),),
+            (("mi.bootstrap(fit)", "check it"),),
+        )
+
     def __str__(self) -> str:
-        rows = []
-        for n, value, unit in zip(self.names, self.values, self.units, strict=True):
-            said = with_error(value, self.std[n], unit)
-            if self.std[n] is None:
-                said = f"{number(value, 3)} {unit} ({self.status[n]})"
-            rows.append((n, said, interval_text(self.interval(n)), self._closest(n)))
-        share = ", ".join(f"{c} {k.effective_share:.0%}" for c, k in self.colours.items())
-        heads = ("", "value ± std", "95 %", "most correlated with")
-        return str(Table(f"Uncertainty, {self.method} residuals", heads, tuple(rows), left=(0, 1, 2, 3),
-                         note=f"Effective samples per sample: {share}."))
-
-    def _closest(self, name: str) -> str:
-        row = np.abs(np.where(np.isfinite(self.correlation), self.correlation, 0.0))[self.names.index(name)]
-        row[self.names.index(name)] = 0.0
-        j = int(np.argmax(row))
-        return f"{self.names[j]} {self.correlation[self.names.index(name), j]:+.2f}" if row[j] > 0 else "–"
+        return str(self.card())
 
 
-def interval_text(limits: tuple[float, float] | None) -> str:
-    """Return an interval with the digits that its width asks for; an unknown one as a dash."""
-    if limits is None:
+def _correlation_cell(value: float) -> Cell:
+    if not np.isfinite(value):
         return "–"
-    low, high = limits
-    finite = [abs(x) for x in limits if np.isfinite(x)]
-    width = (high - low) / max(finite) if np.isfinite(high - low) and any(finite) else 1.0
-    digits = int(np.clip(2 - np.floor(np.log10(max(width, 1e-12))), 3, 10))
-    return f"{number(low, digits)} … {number(high, digits)}"
+    text = f"{value:+.2f}".replace("-", "−")
+    return Flag(text, "note") if 0.95 < abs(value) < 0.9999 else text
 
 
 def covariance(fit: Fit, *, method: str = "coloured") -> Covariance:

@@ -15,9 +15,9 @@ from typing import Any
 
 import numpy as np
 
-from motorid.display.display import Shown
-from motorid.display.numbers import number, quantity
-from motorid.display.tables import Table
+from motorid.display.cards import Card, Shown
+from motorid.display.numbers import number, percent, quantity
+from motorid.display.tables import Flag, Table
 from motorid.errors import SimulationError, UsageError
 from motorid.estimation.result import UNDETERMINED, Fit
 from motorid.estimation.start_values import started
@@ -144,18 +144,29 @@ class Identifiability(Shown):
                 "combinations": list(self.combinations), "remedies": list(self.remedies), "std": self.std,
                 "text": self.text}
 
-    def __str__(self) -> str:
+    def card(self) -> Card:
+        """Return the verdict, and what a fit would know of each parameter."""
         std = self.std
         rows = []
-        for n, v, u, s in zip(self.names, self.values, self.units, self.sizes, strict=True):
+        for n, value, unit, size in zip(self.names, self.values, self.units, self.sizes, strict=True):
             sd = std[n]
-            known = ("not determined", "–") if sd is None else (quantity(sd, u, 2), f"{100 * sd / s:.2g} %")
-            rows.append((n, quantity(v, u, 4), *known))
-        table = Table("What a fit would know", ("", "value", "std", "relative"), tuple(rows))
+            share = Flag("not determined", "note") if sd is None else percent(sd / size, 2)
+            rows.append([n, quantity(float(value), unit), quantity(sd, unit, 2), share])
+        k = len(self.names)
+        partly = Flag(f"{self.rank} of {k} directions determined", "note")
         values = ", ".join(number(s, 3) for s in self.singular_values)
-        sums = (f"Singular values {values}; condition number {number(self.condition_number, 3)}; "
-                f"rank {self.rank} of {len(self.names)}, structural rank {self.structural_rank}.")
-        return "\n".join([self.text, "", str(table), "", sums])
+        return Card(
+            "What the data determine",
+            (Flag("all determined", "good") if self.full else partly,),
+            (self.text, f"Singular values {values}; condition number {number(self.condition_number, 3)}; "
+                        f"rank {self.rank} of {k}, structural rank {self.structural_rank}."),
+            (Table(["parameter", "value", "std in a fit", "relative"], rows),),
+            (("mi.plot_singular_values(result)", "see it"),),
+            "plot_singular_values",
+        )
+
+    def __str__(self) -> str:
+        return str(self.card())
 
 
 def identifiability(problem_or_fit: Problem | Fit, *, points: int = 5, seed: int = 0) -> Identifiability:

@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from motorid.display.display import Shown
-from motorid.display.numbers import duration, number, percent
-from motorid.display.tables import Table
+from motorid.display.cards import Card, Shown
+from motorid.display.numbers import duration, percent, quantity, sentence
+from motorid.display.tables import Flag, Table
 from motorid.errors import MotoridError, SimulationError, UsageError
 from motorid.estimation.fit import solve
 from motorid.estimation.restarts import descend_balanced
@@ -292,9 +292,9 @@ class Multistart(Shown):
             "interrupted": self.interrupted or None,
         }
 
-    def __str__(self) -> str:
-        rows = [(n, number(s["reference"]), number(s["mean"]), number(s["std"], 2))
-                for n, s in self.statistics().items()]
+    @property
+    def text(self) -> str:
+        """The verdict in words."""
         said = [f"{self.good} of {len(self.endings)} starts within a factor of {self.spread:g} end in the "
                 f"best fit (cost within {percent(COST_SHARE)}, parameters within {DISTANCE:g} standard "
                 f"deviations); {self.poor} elsewhere, {self.failed} failed; {duration(self.seconds)}."]
@@ -304,7 +304,23 @@ class Multistart(Shown):
         if self.poor and len(self.basins) > 1:
             said.append(f"The fits end in {len(self.basins)} places; the cost of the second is "
                         f"{self.basins['cost_ratio'].iloc[1]:.4g} times the best.")
-        if self.interrupted:
-            said.append(f"{self.interrupted[0].upper()}{self.interrupted[1:]}.")
-        table = Table("Good fits", ("", "reference", "mean", "std"), tuple(rows))
-        return "\n".join([" ".join(said), "", str(table)])
+        return " ".join([*said, sentence(self.interrupted)]).strip()
+
+    def card(self) -> Card:
+        """Return how many starts ended where, and the spread of the good fits."""
+        flags = [Flag(f"{self.good} good", "good"), *([Flag(f"{self.poor} poor", "note")] if self.poor else [])]
+        flags += [Flag(f"{self.failed} failed", "bad")] if self.failed else []
+        units = {n: p.unit for n, p in self.reference.model.parameters.items()}
+        rows = [[n, *(quantity(s[k], units[n], 5) for k in ("reference", "mean")), quantity(s["std"], units[n], 2)]
+                for n, s in self.statistics().items()]
+        return Card(
+            "Fits from random starts",
+            flags,
+            (self.text,),
+            (Table(["parameter", "reference", "mean of the good fits", "spread"], rows),),
+            (("mi.plot_waterfall(study)", "see it"),),
+            "plot_waterfall",
+        )
+
+    def __str__(self) -> str:
+        return str(self.card())

@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 from scipy.special import stdtrit
 
-from motorid.display.display import Shown
-from motorid.display.numbers import number
-from motorid.display.tables import Table
+from motorid.display.cards import Card, Shown
+from motorid.display.numbers import interval_text, percent, quantity
+from motorid.display.tables import Flag, Table
 from motorid.errors import MotoridError, UsageError, one_of
 from motorid.estimation.continuation import descend
 from motorid.estimation.result import Fit
@@ -26,7 +26,7 @@ from motorid.numerics.parallel import Map, Parcel, run_tasks
 from motorid.numerics.signals import Array
 from motorid.problem.problem import Problem
 from motorid.uncertainty.bootstrap import Bootstrap, bootstrap
-from motorid.uncertainty.covariance import Covariance, covariance, interval_text
+from motorid.uncertainty.covariance import Covariance, covariance
 
 FARTHEST = np.log(1e4)  # on the logarithmic scale; beyond it a parameter counts as not limited
 MOST = 30  # points per side
@@ -92,19 +92,29 @@ class Profile(Shown):
                 "rise": self.rise.tolist(), "interval": [low if np.isfinite(low) and low != 0 else None,
                                                          high if np.isfinite(high) else None]}
 
-    def __str__(self) -> str:
+    @property
+    def text(self) -> str:
+        """Value and interval in words."""
         low, high = self.interval()
         below = low == 0 if self.positive else not np.isfinite(low)
         if below and not np.isfinite(high):
             said = "not limited on either side"
         elif below:
-            said = f"below {number(high)} {self.unit} (95 %), no lower limit"
+            said = f"below {quantity(high, self.unit)} (95 %), no lower limit"
         elif not np.isfinite(high):
-            said = f"above {number(low)} {self.unit} (95 %), no upper limit"
+            said = f"above {quantity(low, self.unit)} (95 %), no upper limit"
         else:
             said = f"{interval_text((low, high))} {self.unit} (95 %)"
-        better = " The profile found a better fit than the one given." if self.best < -1.0 else ""
-        return f"{self.name} = {number(self.value, 5)} {self.unit}: {said}.{better}"
+        return f"{self.name} = {quantity(self.value, self.unit, 5)}: {said}."
+
+    def card(self) -> Card:
+        """Return the interval in words, and whether the fit was at the optimum."""
+        flags = [Flag("the profile found a better fit than the one given", "bad")] if self.best < -1.0 else []
+        after = (("mi.plot_profile(profile)", "see it"),)
+        return Card(f"Profile of {self.name}", flags, (self.text,), (), after, "plot_profile")
+
+    def __str__(self) -> str:
+        return str(self.card())
 
 
 def _crossing(x: Array, rise: Array, reach: float) -> float | None:
@@ -244,16 +254,25 @@ class Intervals(Shown):
                 "bootstrap": self.bootstrap.interval(n, self.level),
                 "profile": p.to_dict(self.level)["interval"]} for n, p in self.profiles.items()}}
 
-    def __str__(self) -> str:
+    def card(self) -> Card:
+        """Return the three intervals of each parameter side by side."""
         rows = []
         for n, p in self.profiles.items():
             known = self.covariance.interval(n, self.level)
-            rows.append((n, f"{number(p.value)} {p.unit}",
-                         interval_text(known) if known else self.covariance.status[n],
-                         interval_text(self.bootstrap.interval(n, self.level)),
-                         interval_text(p.interval(self.level))))
-        heads = ("", "value", "covariance", f"bootstrap ({self.bootstrap.kind})", "profile")
-        return str(Table(f"Intervals of {self.level:.0%}", heads, tuple(rows), left=(0, 1, 2, 3, 4)))
+            first = interval_text(known) if known else Flag(self.covariance.status[n], "note")
+            others = (self.bootstrap.interval(n, self.level), p.interval(self.level))
+            rows.append([n, quantity(p.value, p.unit), first, *(interval_text(x) for x in others)])
+        header = ["parameter", "value", "covariance", f"bootstrap ({self.bootstrap.kind})", "profile"]
+        return Card(
+            f"Intervals of {percent(self.level)}",
+            text=("Where the three agree, any will do; where they do not, believe the profile.",),
+            tables=(Table(header, rows, left=(0, 1, 2, 3, 4)),),
+            after=(("mi.plot_profile(intervals)", "see them"),),
+            figure="plot_profile",
+        )
+
+    def __str__(self) -> str:
+        return str(self.card())
 
 
 def intervals(fit: Fit, *, level: float = 0.95, kind: str = "blocks", n: int = 200, seed: int = 0,

@@ -8,9 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from motorid.display.display import Shown
-from motorid.display.numbers import duration, number, percent, with_error
-from motorid.display.tables import NAMES, Table
+from motorid.channels import channel_name
+from motorid.display.cards import Card, Shown
+from motorid.display.numbers import duration, number, percent
+from motorid.display.tables import Cell, Flag, Table, value_cell
 from motorid.errors import FitError, MotoridError, SimulationError
 from motorid.estimation.fit import solve
 from motorid.estimation.result import Failure, Fit
@@ -20,6 +21,7 @@ from motorid.numerics.least_squares import LevenbergMarquardt, levenberg_marquar
 from motorid.problem.constraints import SteadyState
 from motorid.problem.problem import Problem
 from motorid.problem.relations import Relation, Weighed
+from motorid.records.experiment import units_of
 
 WEIGHTS = tuple(10.0 ** np.arange(-2, 5))
 NONE = "–"
@@ -89,31 +91,39 @@ class Formulations(Shown):
 
     @property
     def table(self) -> Table:
-        """Everything side by side, as text."""
-        heads = ("", *(f.name for f in self.all))
+        """Everything side by side."""
         note = " ".join([m.text for m in self.hard.multipliers if m.active]
                         + [f.result.message for f in self.all if isinstance(f.result, Failure)])
-        return Table("Formulations", heads, tuple(self._rows()), note=note)
+        return Table(["quantity", *(f.name for f in self.all)], self._rows(), "Formulations", note)
 
-    def _rows(self) -> list[tuple[str, ...]]:
+    def _rows(self) -> list[Sequence[Cell]]:
         fits = [f.fit for f in self.all]
         first = next((f for f in fits if f is not None), None)
         if first is None:
             return []
-        units = {n: p.unit for n, p in first.problem.model.parameters.items()}
-        rows = [(n, *(with_error(f.values[n], f.std[n], units[n]) if f else NONE for f in fits))
-                for n in first.problem.model.free_names]
-        rows += [(f"NRMSE {NAMES[c]}", *(percent(f.nrmse[c]) if f else NONE for f in fits)) for c in first.nrmse]
-        rows.append(("steady-state residual", *(percent(f.steady_residual) for f in self.all)))
+        model, units = first.problem.model, units_of(first.problem.experiments)
+        rows: list[Sequence[Cell]] = [
+            [n, *(value_cell(f.values[n], f.std[n], model.parameters[n].unit) if f else NONE for f in fits)]
+            for n in model.free_names]
+        rows += [[f"NRMSE {channel_name(c, units.get(c, ''))}", *(percent(f.nrmse[c]) if f else NONE for f in fits)]
+                 for c in first.nrmse]
+        rows.append(["steady-state residual", *(percent(f.steady_residual) for f in self.all)])
         for name in dict.fromkeys(n for f in self.all for n in f.violations):
-            rows.append((f"beyond {name}", *(number(f.violations.get(name), 3) for f in self.all)))
-        for k, m in enumerate(self.hard.multipliers):
-            rows.append((f"multiplier {m.name}, 1/{m.unit or 'unit'}", NONE, NONE,
-                         number(self.hard.multipliers[k].value, 3)))
-        rows.append(("iterations", *(str(f.iterations) if f else NONE for f in fits)))
-        rows.append(("time", *(duration(f.seconds) if f else NONE for f in fits)))
-        rows.append(("status", *(f.result.status for f in self.all)))
+            rows.append([f"beyond {name}", *(number(f.violations.get(name), 3) for f in self.all)])
+        rows += [[f"multiplier {m.name}, 1/{m.unit or 'unit'}", NONE, NONE, number(m.value, 3)]
+                 for m in self.hard.multipliers]
+        rows.append(["iterations", *(str(f.iterations) if f else NONE for f in fits)])
+        rows.append(["time", *(duration(f.seconds) if f else NONE for f in fits)])
+        rows.append(["status", *(f.result.status for f in self.all)])
         return rows
+
+    def card(self) -> Card:
+        """Return the three side by side."""
+        after = [("mi.plot_formulations(three)", "see it")]
+        if any(name.startswith("CurrentLimit") for f in self.all for name in f.violations):
+            after.append(("mi.plot_current_limit(three)", "the current and its limit"))
+        failed = [Flag(f"{f.name} failed", "bad") for f in self.all if f.fit is None]
+        return Card("Plain, penalties, hard constraints", failed, (), (self.table,), after, "plot_formulations")
 
     def __str__(self) -> str:
         return str(self.table)

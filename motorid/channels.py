@@ -1,0 +1,23 @@
+"""The channels of a record: their names, what people call them, their SI units, their order."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
+
+CHANNELS = ("i", "omega", "theta")  # what can be measured, in the order of states, tables and figures
+NAMES = {"t": "time", "v": "voltage", "i": "current", "omega": "speed", "theta": "angle"}
+# The first unit of each channel is its default. A linear axis is measured in m and m/s; the command of a
+# current- or torque-controlled drive need not be a voltage.
+UNITS: Mapping[str, tuple[str, ...]] = MappingProxyType({
+    "t": ("s",),
+    "v": ("V", "A", "N·m", "N", "1"),
+    "i": ("A",),
+    "omega": ("rad/s", "m/s"),
+    "theta": ("rad", "m"),
+})
+
+
+def channel_name(channel: str, unit: str = "") -> str:
+    """Return what people call a channel: the angle of a linear axis, in m, is its position."""
+    return "position" if channel == "theta" and unit == "m" else NAMES.get(channel, channel)
