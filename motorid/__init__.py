@@ -19,8 +19,7 @@ from motorid.integrate.rosenbrock import Rosenbrock
 from motorid.integrate.sundials import Cvodes, Idas
 from motorid.model.definition import Effect, P, Parameter, effect
 from motorid.model.model import Model, dc_motor, torque_driven
-from motorid.numerics.least_squares import LevenbergMarquardt
-from motorid.numerics.noise import Huber
+from motorid.numerics.least_squares import Huber, LevenbergMarquardt
 from motorid.problem.constraints import Constraint, CurrentLimit, SteadyState
 from motorid.problem.problem import Problem
 from motorid.problem.sensitivity import check_derivatives

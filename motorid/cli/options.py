@@ -25,7 +25,7 @@ from motorid.estimation.shooting.multiple_shooting import MultipleShooting
 from motorid.exporters.export import load
 from motorid.model.definition import Effect
 from motorid.model.model import Model, dc_motor, torque_driven
-from motorid.numerics.noise import Huber
+from motorid.numerics.least_squares import Huber
 from motorid.numerics.parallel import progress
 from motorid.problem.constraints import CurrentLimit, SteadyState
 from motorid.records.checks import check_runs

@@ -18,7 +18,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.fft import next_fast_len
 from scipy.special import chdtrc, stdtr
 
 from motorid.diagnosis.cross_validation import BLOCKS, HeldOut
@@ -31,7 +30,7 @@ from motorid.display.numbers import number
 from motorid.errors import FAILURES
 from motorid.estimation.result import Fit
 from motorid.numerics.autoregression import autocorrelation, effective_samples
-from motorid.numerics.noise import despiked, quantum
+from motorid.numerics.noise import despiked, outlier_limit, quantum
 from motorid.numerics.signals import Array
 from motorid.problem.runs import angle_signal
 from motorid.records.experiment import Experiment
@@ -173,7 +172,7 @@ def _largest_cross_correlation(u: Array, r: Array) -> float:
     if size <= 0:
         return 0.0
     n = len(u)
-    length = next_fast_len(2 * n, real=True)
+    length = 1 << (2 * n).bit_length()
     lags = np.fft.irfft(np.fft.rfft(b, length) * np.conj(np.fft.rfft(a, length)), length)
     return float(np.abs(lags[: n // 4 + 1]).max() / size)
 
@@ -208,8 +207,8 @@ def _dependences(fit: Fit, channel: str) -> list[dict[str, Any]]:
 
 
 def _winsorised(r: Array) -> Array:
-    size = 1.4826 * np.nanmedian(np.abs(r)) + 1e-300
-    return np.where(np.isfinite(r), np.clip(r, -6 * size, 6 * size), 0.0)
+    limit = outlier_limit(r) + 1e-300
+    return np.where(np.isfinite(r), np.clip(r, -limit, limit), 0.0)
 
 
 def _labels(signals: Sequence[Array], bins: int) -> list[NDArray[np.intp]] | None:

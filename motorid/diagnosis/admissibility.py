@@ -10,8 +10,8 @@ from motorid.display.numbers import percent
 from motorid.estimation.result import Fit
 from motorid.model.definition import Effect, Parameter
 from motorid.numerics.noise import noise_level, quantum
-from motorid.numerics.signals import Array
-from motorid.problem.runs import angle_signal, slopes
+from motorid.numerics.signals import Array, window_slopes
+from motorid.problem.runs import angle_signal
 
 WORST_CONDITION = 1e4  # of the column-scaled Jacobian
 HOPELESS = 1e6  # condition number beyond which a direction counts as open
@@ -141,7 +141,7 @@ def _moving(speed: Array) -> Array:
 
 def _speed(run) -> Array:
     y = run.outputs.get("omega")
-    return y[np.isfinite(y)] if y is not None else slopes(angle_signal(run), run.t)
+    return y[np.isfinite(y)] if y is not None else window_slopes(run.t, angle_signal(run))
 
 
 def samples_within(angle: Array, width: float) -> list[int]:

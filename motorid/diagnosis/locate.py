@@ -15,7 +15,7 @@ from motorid.diagnosis.results import Binned, Missing
 from motorid.estimation.linearisation import linear_steps, parameter_vector, shown
 from motorid.estimation.result import Fit
 from motorid.numerics.autoregression import effective_samples
-from motorid.numerics.signals import Array
+from motorid.numerics.signals import Array, bridged, integral
 from motorid.problem.runs import angle_signal, natural_sizes
 
 WALKS = (0.03, 0.1, 0.3, 1.0, 3.0)  # of the natural size per √s, the smallest that explains the data is taken
@@ -127,7 +127,7 @@ def _signals(fit: Fit, k: int, s: Smoothed) -> Mapping[str, Array]:
         found["theta"] = angle_signal(run)
     if "i" in found:
         power = fit.values["R"] * found["i"] ** 2
-        found["heat"] = np.concatenate([[0.0], np.cumsum((power[1:] + power[:-1]) / 2 * np.diff(run.t))])
+        found["heat"] = integral(run.t, power)
     return found
 
 
@@ -320,9 +320,7 @@ def begin(fit: Fit, k: int) -> Begun:
     x = np.column_stack([sim.states[s] for s in fit.problem.system.states])
     for j, s in enumerate(fit.problem.system.states):
         if s in run.experiment.outputs:
-            seen = run.experiment.outputs[s]
-            good = np.isfinite(seen)
-            x[:, j] = np.interp(run.experiment.t, run.experiment.t[good], seen[good])
+            x[:, j] = bridged(run.experiment.t, run.experiment.outputs[s])
     return Begun(x, _linear(fit, k, x, np.zeros((len(x), 2))))
 
 

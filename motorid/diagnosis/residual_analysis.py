@@ -14,7 +14,7 @@ import numpy as np
 
 from motorid.estimation.result import Fit
 from motorid.numerics.autoregression import effective_samples
-from motorid.numerics.noise import CLIP, despiked
+from motorid.numerics.noise import despiked, outlier_limit
 from motorid.numerics.signals import Array
 from motorid.problem.simulate import Simulation
 from motorid.records.experiment import Experiment
@@ -52,10 +52,7 @@ class Errors:
 
     def limits(self) -> dict[str, float]:
         """Size per channel beyond which a residual is far from what is usual for this model."""
-        return {
-            c: CLIP * 1.4826 * float(np.nanmedian(np.abs(np.concatenate(list(rs))))) + 1e-300
-            for c, rs in self.residuals.items()
-        }
+        return {c: outlier_limit(np.concatenate(list(rs))) + 1e-300 for c, rs in self.residuals.items()}
 
     def squares(self, quiet: bool = False, limits: Mapping[str, float] | None = None) -> dict[str, tuple[float, int]]:
         """Return (sum of squares, count) per channel, lone samples left aside if `quiet`, residuals cut at `limits`."""

@@ -18,7 +18,7 @@ from motorid.numerics.least_squares import LevenbergMarquardt, Solution, levenbe
 from motorid.numerics.signals import Array
 from motorid.problem.problem import Problem
 from motorid.problem.runs import SGN_WIDTH_SHARE, top_speed
-from motorid.problem.simulate import hardly_explained, misfit_over_noise
+from motorid.problem.simulate import misfit_over_noise, poorly_explained
 
 ON_THE_WAY = ((1e-7, 60), (1e-6, 60))  # ftol and iterations of the first stage, and of those between
 LOWER = 0.98  # of the cost with a wider sgn, or the narrower one is not worth it
@@ -164,7 +164,7 @@ def doubtful(problem: Problem, done: Descent) -> bool:
     moved = np.log(found[log] / problem.scaling.physical(problem.start)[log])
     if np.max(np.abs(moved), initial=0.0) < 1.0:
         return False
-    if done.solution.status != "converged" or hardly_explained(done.problem, done.solution.q):
+    if done.solution.status != "converged" or poorly_explained(done.problem, done.solution.q):
         return True
     jac = done.solution.jac[:, log]
     s, directions = np.linalg.svd(np.linalg.qr(jac, mode="r"))[1:]

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from motorid.model.model import Model
-from motorid.numerics.signals import Array
+from motorid.numerics.signals import Array, bridged, integral, slope
 from motorid.records.experiment import Experiment
 
 BASE = ("R", "L", "K", "b", "J", "g")
@@ -61,8 +61,8 @@ class _Loads(NamedTuple):
         """Return the integral over time of each torque along the signals `s`."""
         if not self.loads:
             return []
-        along = dict(s) | {"theta": s["theta"] if "theta" in s else _integral(s["t"], s["omega"])}
-        return [_integral(s["t"], c) for c in columns(self.model, self.loads, along, base).T]
+        along = dict(s) | {"theta": s["theta"] if "theta" in s else integral(s["t"], s["omega"])}
+        return [integral(s["t"], c) for c in columns(self.model, self.loads, along, base).T]
 
     def split(self, found: dict[str | Load, float], per_ratio: float = 1.0) -> dict[str, float]:
         """Return the motor's values, and the parameters of the loads."""
@@ -77,9 +77,9 @@ def _signals(run: Experiment) -> dict[str, Array]:
     found: dict[str, Array] = {"t": t, "v": run.inputs["v"]}
     for c in ("i", "omega", "theta"):
         if _measured(run, c):
-            found[c] = _bridged(t, run.outputs[c])
+            found[c] = bridged(t, run.outputs[c])
     if "omega" not in found and "theta" in found:
-        found["omega"] = _speed_of(t, found["theta"])
+        found["omega"] = slope(t, found["theta"], max(2, min(10, len(t) // 200)))
     if run.hold == "zoh":
         found["held"] = np.ones(1)
     return found
@@ -87,24 +87,6 @@ def _signals(run: Experiment) -> dict[str, Array]:
 
 def _measured(run: Experiment, channel: str) -> bool:
     return channel in run.outputs and bool(np.isfinite(run.outputs[channel]).any())
-
-
-def _bridged(t: Array, y: Array) -> Array:
-    good = np.isfinite(y)
-    return y if good.all() else np.interp(t, t[good], y[good])
-
-
-def _speed_of(t: Array, theta: Array) -> Array:
-    """Speed by local straight lines over a few samples."""
-    half = max(2, min(10, len(t) // 200))
-    a, b = np.arange(len(t)) - half, np.arange(len(t)) + half
-    a, b = np.clip(a, 0, len(t) - 1), np.clip(b, 0, len(t) - 1)
-    return (theta[b] - theta[a]) / (t[b] - t[a])
-
-
-def _integral(t: Array, y: Array, held: bool = False) -> Array:
-    steps = np.diff(t) * (y[:-1] if held else (y[1:] + y[:-1]) / 2)
-    return np.concatenate([[0.0], np.cumsum(steps)])
 
 
 def _windowed(t: Array, columns: Sequence[Array], target: Array, windows: int = 20) -> tuple[Array, Array]:
@@ -144,12 +126,12 @@ def _full(signals: list[dict], held: Mapping[str, float], loads: _Loads) -> dict
     electrical, mechanical = [], []
     for s in signals:
         t, held_v = s["t"], "held" in s
-        qi, qw = _integral(t, s["i"]), _integral(t, s["omega"])
-        electrical.append(_windowed(t, [s["i"], qi, qw], _integral(t, s["v"], held_v), 200))
+        qi, qw = integral(t, s["i"]), integral(t, s["omega"])
+        electrical.append(_windowed(t, [s["i"], qi, qw], integral(t, s["v"], held_v), 200))
     found = _solve(electrical, ["L", "R", "K"], held)
     for s in signals:
         t = s["t"]
-        qi, qw = _integral(t, s["i"]), _integral(t, s["omega"])
+        qi, qw = integral(t, s["i"]), integral(t, s["omega"])
         known = [s["omega"], qw, *loads.integrals(s, {**found, "b": 0.0, "J": 1.0})]
         mechanical.append(_windowed(t, known, found["K"] * qi))
     return found | loads.split(_solve(mechanical, ["J", "b", *loads.loads], held))
@@ -157,9 +139,9 @@ def _full(signals: list[dict], held: Mapping[str, float], loads: _Loads) -> dict
 
 def _torque_driven(signals: list[dict], held: Mapping[str, float], loads: _Loads) -> dict[str, float]:
     g = held.get("g", 1.0)
-    rows = [_windowed(s["t"], [s["omega"], _integral(s["t"], s["omega"]),
+    rows = [_windowed(s["t"], [s["omega"], integral(s["t"], s["omega"]),
                                *loads.integrals(s, {"g": g, "b": 0.0, "J": 1.0})],
-                      g * _integral(s["t"], s["v"], "held" in s)) for s in signals]
+                      g * integral(s["t"], s["v"], "held" in s)) for s in signals]
     return {"g": g} | loads.split(_solve(rows, ["J", "b", *loads.loads], held))
 
 
@@ -167,9 +149,9 @@ def _without_current(signals: list[dict], held: Mapping[str, float], loads: _Loa
                      back_emf: float) -> dict[str, float]:
     """``∫v = (RJ/K) Δω + (K + Rb/K) ∫ω + (R/K) ∫load``: two numbers and the loads; the rest is assumed."""
     unit = {"R": 1.0, "L": 1.0, "K": 1.0, "b": 0.0, "J": 1.0}
-    rows = [_windowed(s["t"], [s["omega"], _integral(s["t"], s["omega"]),
+    rows = [_windowed(s["t"], [s["omega"], integral(s["t"], s["omega"]),
                                *loads.integrals({**s, "i": s["v"]}, unit)],
-                      _integral(s["t"], s["v"], "held" in s)) for s in signals]
+                      integral(s["t"], s["v"], "held" in s)) for s in signals]
     two = _solve(rows, ["slope", "gain", *loads.loads], {})
     r = held.get("R", 1.0)
     k = held.get("K", back_emf * two["gain"])
@@ -183,8 +165,8 @@ def _without_speed(signals: list[dict], held: Mapping[str, float]) -> dict[str, 
     rows = []
     for s in signals:
         t = s["t"]
-        qv, qi = _integral(t, s["v"], "held" in s), _integral(t, s["i"])
-        rows.append(_windowed(t, [s["i"], qi, _integral(t, qi), -_integral(t, qv)], qv))
+        qv, qi = integral(t, s["v"], "held" in s), integral(t, s["i"])
+        rows.append(_windowed(t, [s["i"], qi, integral(t, qi), -integral(t, qv)], qv))
     z = _solve(rows, ["L", "R", "stiff", "rate"], {})
     k = held.get("K", 0.05)
     j = k**2 / max(z["stiff"] - z["R"] * z["rate"], 0.1 * z["stiff"])

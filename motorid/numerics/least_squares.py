@@ -15,7 +15,7 @@ converge globally and quadratically even where J is singular (Yamashita & Fukush
 report IMM-REP-1999-05). Of
 400 random starts within a factor of ten in each of five parameters, 399 and 398 ended in the optimum of the
 two shipped motors, in 8 and 11 steps (median); with the column norms it was 94 and 75 of 100, in 9 and 17.
-What is left is caught by a second look, see `motorid.descent`.
+What is left is caught by a second look, see `motorid.estimation.continuation`.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class LevenbergMarquardt:
     longest_step : float
         Largest change of one coordinate per iteration: e² on the logarithmic scale.
     looks : int
-        How often a doubtful end is looked at again from the start; see `motorid.descent`.
+        How often a doubtful end is looked at again from the start; see `motorid.estimation.continuation`.
     """
 
     max_iterations: int = 200
@@ -54,6 +54,20 @@ class LevenbergMarquardt:
     damping: float = 0.1
     longest_step: float = 2.0
     looks: int = 5
+
+
+@dataclass(frozen=True)
+class Huber:
+    """Robust loss: quadratic within `delta` sigma, linear beyond (Huber, Ann. Math. Stat. 35, 1964)."""
+
+    delta: float = 1.345
+
+    def pseudo(self, r: Array) -> tuple[Array, Array]:
+        """Return r̃ with r̃² = 2ρ(r), and dr̃/dr, so that least squares of r̃ minimise the robust loss."""
+        size = np.abs(r)
+        far = size > self.delta
+        root = np.sqrt(np.where(far, 2 * self.delta * size - self.delta**2, 1.0))
+        return np.where(far, np.sign(r) * root, r), np.where(far, self.delta / root, 1.0)
 
 
 @dataclass(frozen=True, eq=False)

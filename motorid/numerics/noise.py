@@ -1,4 +1,4 @@
-"""How noisy is a channel? Estimated from its samples alone, before there is a model."""
+"""How noisy is a channel, before there is a model; what is an outlier, among samples and in a batch."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ ORDERS = (2, 3, 4, 5, 6)
 _SMALLER_HALF = 0.3240277  # mean of |z| over the smaller half, z standard normal: 4·(φ(0) − φ(0.67449))
 _FLOOR = 1e-5  # of the channel's own variation: what a noise-free simulation is given
 _REST = 12  # equal samples in a row that count as standstill
+CLIP = 6.0  # robust standard deviations beyond which a residual counts as an outlier
 _DITHERED = 0.6  # noise that is to be seen through the steps leaves fewer neighbours equal than this
 
 
@@ -132,6 +133,30 @@ def _typical(size: Array) -> float:
     return float(np.partition(size, half - 1)[:half].mean()) / _SMALLER_HALF
 
 
+def robust_std(r: Array) -> float:
+    """Return the standard deviation about zero of what is normal in `r`, from its median size; NaN left out."""
+    size = np.abs(r[np.isfinite(r)])
+    return 1.4826 * float(np.median(size)) if size.size else 0.0
+
+
+def outlier_limit(r: Array) -> float:
+    """Return the size beyond which a residual counts as an outlier."""
+    return CLIP * robust_std(r)
+
+
+def despiked(r: Array) -> Array:
+    """Return `r` (N,) without NaN, samples that stand alone far from both neighbours replaced by the middle of three.
+
+    A few large samples in a row are no outliers: there the model fails.
+    """
+    r = r[np.isfinite(r)]
+    if len(r) < 3:
+        return r
+    before, after = np.concatenate([r[1:2], r[:-1]]), np.concatenate([r[1:], r[-2:-1]])
+    middle = np.maximum(np.minimum(before, r), np.minimum(np.maximum(before, r), after))
+    return np.where(np.abs(r - middle) > outlier_limit(r), middle, r)
+
+
 FEWEST = 5  # motors that make a batch
 LEVEL = 0.01  # chance of any false alarm in the whole batch
 
@@ -190,36 +215,7 @@ def outliers(rows: Sequence[Mapping[str, Any]], names: Sequence[str], positive: 
 def scores(x: Array, std: Array) -> Array:
     """Return robust z of values (n,): distance from the median over scatter and own uncertainty together."""
     middle = np.median(x)
-    scatter = 1.4826 * np.median(np.abs(x - middle))
+    scatter = robust_std(x - middle)
     own = np.median(std)
     between = np.sqrt(max(scatter**2 - own**2, 0.0))
     return (x - middle) / np.maximum(np.hypot(between, std), 1e-12 * max(abs(middle), 1e-300))
-
-
-@dataclass(frozen=True)
-class Huber:
-    """Robust loss: quadratic within `delta` sigma, linear beyond (Huber, Ann. Math. Stat. 35, 1964)."""
-
-    delta: float = 1.345
-
-    def pseudo(self, r: Array) -> tuple[Array, Array]:
-        """Return r̃ with r̃² = 2ρ(r), and dr̃/dr, so that least squares of r̃ minimise the robust loss."""
-        size = np.abs(r)
-        far = size > self.delta
-        root = np.sqrt(np.where(far, 2 * self.delta * size - self.delta**2, 1.0))
-        return np.where(far, np.sign(r) * root, r), np.where(far, self.delta / root, 1.0)
-CLIP = 6.0  # robust standard deviations beyond which a residual counts as an outlier
-
-
-def despiked(r: Array) -> Array:
-    """Return `r` (N,) without NaN, samples that stand alone far from both neighbours replaced by the middle of three.
-
-    A few large samples in a row are no outliers: there the model fails.
-    """
-    r = r[np.isfinite(r)]
-    if len(r) < 3:
-        return r
-    before, after = np.concatenate([r[1:2], r[:-1]]), np.concatenate([r[1:], r[-2:-1]])
-    middle = np.maximum(np.minimum(before, r), np.minimum(np.maximum(before, r), after))
-    limit = CLIP * 1.4826 * float(np.median(np.abs(r)))
-    return np.where(np.abs(r - middle) > limit, middle, r)

@@ -11,6 +11,7 @@ from matplotlib.axes import Axes
 from motorid.channels import CHANNELS
 from motorid.errors import UsageError, one_of
 from motorid.estimation.result import Fit
+from motorid.numerics.autoregression import autocorrelation
 from motorid.numerics.signals import Array
 from motorid.plots.style import (
     INK,
@@ -139,8 +140,9 @@ def _histogram(ax: Axes, r: Array, sigma: float) -> None:
 
 def _autocorrelation(ax: Axes, residuals: Sequence[Array]) -> None:
     lags = min(LAGS, min(len(r) for r in residuals) // 3)
-    rho, count = autocorrelation(residuals, lags)
-    half = 1.96 / np.sqrt(max(count, 1))
+    every = np.concatenate(list(residuals))
+    rho = autocorrelation([r - np.nanmean(every) for r in residuals], lags)
+    half = 1.96 / np.sqrt(np.isfinite(every).sum())
     band(ax, half, "white noise, 95 %")
     k = np.arange(1, lags + 1)
     ax.vlines(k, 0, rho[1:], color=PALETTE["purple"], lw=1.2)
@@ -148,20 +150,6 @@ def _autocorrelation(ax: Axes, residuals: Sequence[Array]) -> None:
     ax.set_ylim(min(-0.25, float(rho.min()) * 1.1), max(0.4, min(1.05, float(rho[1:].max(initial=0)) * 1.25)))
     tidy(ax, x="lag (samples)", y="correlation", title="Autocorrelation")
     above(ax)
-
-
-def autocorrelation(residuals: Sequence[Array], lags: int) -> tuple[Array, int]:
-    """Return the autocorrelation at 0…lags over all runs, gaps left out, and the number of samples."""
-    sums, counts = np.zeros(lags + 1), np.zeros(lags + 1)
-    mean = float(np.nanmean(np.concatenate(list(residuals))))
-    for r in residuals:
-        r = r - mean
-        for k in range(lags + 1):
-            products = r[k:] * r[: len(r) - k]
-            sums[k] += np.nansum(products)
-            counts[k] += np.count_nonzero(np.isfinite(products))
-    covariance = sums / np.maximum(counts, 1)
-    return covariance / (covariance[0] or 1.0), int(counts[0])
 
 
 def _against(ax: Axes, x: Sequence[Array], r: Sequence[Array], sigma: float) -> None:

@@ -15,7 +15,7 @@ from motorid.integrate.engine import Engine, Trajectory
 from motorid.model.definition import Parameter
 from motorid.model.equations import System
 from motorid.model.model import Model
-from motorid.numerics.noise import Huber
+from motorid.numerics.least_squares import Huber
 from motorid.numerics.signals import Array
 from motorid.problem.residuals import Levels, Measured, prior_residual
 from motorid.problem.runs import Run, channels_of, noise_of, prepare_run, smoothing, with_inputs
@@ -34,7 +34,7 @@ class Problem:
     priors : mapping of str to (mean, std)
         What is known of a parameter beforehand, in its unit.
     penalties, constraints : tuple
-        See `motorid.constraints`; penalties enter the residual, constraints are for `MultipleShooting`.
+        See `motorid.problem.constraints`; penalties enter the residual, constraints are for `MultipleShooting`.
     loss : Huber or None
         None: least squares.
     weights : {"noise", "rms"}
@@ -43,11 +43,11 @@ class Problem:
         What is known of the state at the first sample.
     engine : str or Engine
     balance : mapping of str to float
-        Factors on the noise per channel where the misfit, not the noise, decides; see `motorid.descent`.
+        Factors on the noise per channel where the misfit, not the noise, decides (reweighting).
     accuracy : float, optional
         Local error of the integration relative to the largest state; by default a small part of the noise.
     width : float, optional
-        Width of sgn, rad/s, in place of the model's or the one that suits the records; see `motorid.descent`.
+        Width of sgn, rad/s, in place of the model's or the one that suits the records (continuation).
     """
 
     model: Model

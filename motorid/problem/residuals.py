@@ -1,4 +1,4 @@
-"""Residuals of one record and of priors: model minus what is known, in standard deviations."""
+"""Residuals of one record and of priors, in standard deviations; how exact an integration they ask for."""
 
 from __future__ import annotations
 

@@ -1,4 +1,8 @@
-"""Records made ready for estimation: noise, input grids, initial states, natural sizes."""
+"""Records made ready for estimation: `prepare_run` gives a record its noise, its grid and its initial state.
+
+After that come what is known of the state at the first sample, the natural sizes of the units in these records, and the
+width of sgn that suits them.
+"""
 
 from __future__ import annotations
 
@@ -15,16 +19,21 @@ from motorid.errors import ModelError, UsageError, one_of
 from motorid.integrate.engine import Grid
 from motorid.model.definition import Parameter
 from motorid.numerics.noise import noise_level
-from motorid.numerics.signals import Array
+from motorid.numerics.signals import Array, bridged, integral, window_slopes
 from motorid.records.experiment import Experiment
+
+INITIAL = ("auto", "rest", "measured", "estimate")
+FIRST = 5  # samples that tell it
+REACH = 8.0  # standard deviations that an estimated initial state may lie away from its first samples
+FREE_OF_NOISE = 2e-5  # of an angle's variation: what `noise_level` gives a simulation is half of it
+SGN_WIDTH_SHARE = 1e-3  # of the highest speed: wider smoothing looks like one more missing effect
+CREEP_SHARE = 0.2  # of the angle's noise that a stuck motor may creep
+NARROWEST = 1e-5  # of the highest speed
+FINEST = 256  # sub-steps per sample
 
 # A record is frozen, and so are its noise and its size.
 _levels: WeakKeyDictionary[Experiment, dict[str, float]] = WeakKeyDictionary()
 _sizes: WeakKeyDictionary[Experiment, _Sizes] = WeakKeyDictionary()
-CREEP_SHARE = 0.2  # of the angle's noise that a stuck motor may creep
-NARROWEST = 1e-5  # of the highest speed
-FINEST = 256  # sub-steps per sample
-SGN_WIDTH_SHARE = 1e-3  # of the highest speed: wider smoothing looks like one more missing effect
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,32 +64,11 @@ class Run:
         return tuple(self.limits)
 
 
-def channels_of(runs: Sequence[Experiment]) -> tuple[str, ...]:
-    """Channels measured in at least one run."""
-    return tuple(c for c in CHANNELS if any(c in r.outputs for r in runs))
-
-
-def noise_of(runs: Sequence[Experiment], channels: Sequence[str]) -> dict[str, float]:
-    """Noise per channel, estimated once for all runs (quadratic mean) where no run states it."""
-    levels = {}
-    for c in channels:
-        each = [r.sigma.get(c) or _level(r, c) for r in runs if c in r.outputs]
-        levels[c] = float(np.sqrt(np.mean(np.square(each))))
-    return levels
-
-
-def _level(run: Experiment, channel: str) -> float:
-    known = _levels.setdefault(run, {})
-    if channel not in known:
-        known[channel] = noise_level(run.outputs[channel], run.t)
-    return known[channel]
-
-
 def prepare_run(run: Experiment, channels: Sequence[str], noise: Mapping[str, float], inputs: Sequence[str],
                 initial: str) -> Run:
     """Return `run` ready for a system with `inputs`."""
     sigma = {c: float(run.sigma.get(c, noise[c])) for c in channels if c in run.outputs}
-    start, limits = beginning(run, sigma, initial)
+    start, limits = initial_state(run, sigma, initial)
     return Run(run, _grid(run, inputs), sigma, start, limits)
 
 
@@ -103,162 +91,45 @@ def _grid(run: Experiment, inputs: Sequence[str]) -> Grid:
     return Grid.of(run.t, np.column_stack(columns), np.array(held))
 
 
-def top_speed(runs: Sequence[Experiment]) -> float:
-    """Highest speed in the runs (99.5th percentile), from speed or angle; 0 where neither is there."""
-    return max((_sizes_of(r).speed for r in runs), default=0.0)
-
-
 def angle_signal(run: Experiment) -> Array:
     """Return the angle from the measurements, (N,): the measured one, bridged over gaps, or ∫ω dt."""
     if "theta" in run.outputs:
-        y = run.outputs["theta"]
-        good = np.isfinite(y)
-        return np.interp(run.t, run.t[good], y[good])
+        return bridged(run.t, run.outputs["theta"])
     if "omega" in run.outputs:
-        y = run.outputs["omega"]
-        good = np.isfinite(y)
-        filled = np.interp(run.t, run.t[good], y[good])
-        return np.concatenate([[0.0], np.cumsum((filled[1:] + filled[:-1]) / 2 * np.diff(run.t))])
+        return integral(run.t, bridged(run.t, run.outputs["omega"]))
     return np.zeros(len(run.t))
 
 
-def natural_sizes(runs: Sequence[Experiment], values: Mapping[str, float]) -> dict[str, float]:
-    """Return the natural size of each unit in these records, for starting values and grids of effects.
-
-    Torque is what the motor makes at its highest current, time is the sample time, heat is what the winding
-    loses during the longest run for a rise of 30 K.
-    """
-    seen = [_sizes_of(r) for r in runs]
-    volt = max(s.volt for s in seen) or 1.0
-    speed = max(s.speed for s in seen) or volt / max(values.get("K", 1.0), 1e-9)
-    gain = values.get("g")
-    resistance = values.get("R", 1.0)
-    amps = [s.ampere for s in seen if s.ampere is not None]
-    ampere = max(amps) if amps else volt / resistance
-    torque = gain * volt if gain is not None else values.get("K", 1.0) * ampere
-    second = float(np.median([r.dt for r in runs]))
-    heats = [(r.duration, resistance * s.mean_square_current(values)) for r, s in zip(runs, seen, strict=True)]
-    duration, power = max(heats, key=lambda h: h[0] * h[1])
-    span = max((s.span for s in seen if s.span is not None), default=1.0)
-    sizes = {"V": volt, "A": ampere, "rad/s": speed, "m/s": speed, "N·m": torque, "N": torque, "s": second,
-             "1/s": 1 / second, "m": 0.01 * span, "K/W": 30 / max(power, 1e-9), "J/K": max(power * duration, 1e-9) / 30}
-    for unit in ("N·m·s/rad", "N·s/m"):
-        sizes[unit] = torque / speed
-    for unit in ("N·m·s²/rad²", "N·s²/m²"):
-        sizes[unit] = torque / speed**2
-    return {k: v if np.isfinite(v) and v > 0 else 1.0 for k, v in sizes.items()}
+def channels_of(runs: Sequence[Experiment]) -> tuple[str, ...]:
+    """Channels measured in at least one run."""
+    return tuple(c for c in CHANNELS if any(c in r.outputs for r in runs))
 
 
-class _Sizes(NamedTuple):
-    """How large the signals of a record are; None where a channel was not measured."""
-
-    volt: float
-    speed: float
-    ampere: float | None
-    span: float | None
-    squared_volt: float
-    squared_ampere: float | None
-    spread: Mapping[str, float]
-
-    def mean_square_current(self, values: Mapping[str, float]) -> float:
-        """Mean square of the current, or about what the voltage would make."""
-        if self.squared_ampere is not None:
-            return self.squared_ampere
-        return self.squared_volt / max(values.get("R", 1.0), 1e-9) ** 2 / 4
+def noise_of(runs: Sequence[Experiment], channels: Sequence[str]) -> dict[str, float]:
+    """Noise per channel, estimated once for all runs (quadratic mean) where no run states it."""
+    levels = {}
+    for c in channels:
+        each = [r.sigma.get(c) or _level(r, c) for r in runs if c in r.outputs]
+        levels[c] = float(np.sqrt(np.mean(np.square(each))))
+    return levels
 
 
-def spread_of(run: Experiment, channel: str) -> float:
-    """Return the standard deviation of a channel; 1 where it was not measured."""
-    return _sizes_of(run).spread.get(channel, 1.0)
+def _level(run: Experiment, channel: str) -> float:
+    known = _levels.setdefault(run, {})
+    if channel not in known:
+        known[channel] = noise_level(run.outputs[channel], run.t)
+    return known[channel]
 
 
-def _sizes_of(run: Experiment) -> _Sizes:
-    if run not in _sizes:
-        v, (i, omega, theta) = run.inputs.get("v", np.zeros(1)), (run.outputs.get(c) for c in CHANNELS)
-        speeds = omega if omega is not None else slopes(theta, run.t) if theta is not None else np.zeros(1)
-        _sizes[run] = _Sizes(
-            float(np.abs(v).max()),
-            float(np.nanpercentile(np.abs(speeds), 99.5)) if speeds.size else 0.0,
-            None if i is None else float(np.nanpercentile(np.abs(i), 99.5)),
-            None if theta is None else float(np.nanmax(theta) - np.nanmin(theta)),
-            float(np.mean(v**2)),
-            None if i is None else float(np.nanmean(i**2)),
-            {c: float(np.nanstd(y)) for c, y in run.outputs.items()},
-        )
-    return _sizes[run]
-
-
-def suited(parameter: Parameter, sizes: Mapping[str, float]) -> Parameter:
-    """Return a parameter of an effect with a starting value that suits the data, unless the user gave one."""
-    if parameter.given or parameter.name == "sgn_width":
-        return parameter
-    size = sizes.get(parameter.unit)
-    if parameter.null is None and parameter.grid:
-        value = parameter.grid[len(parameter.grid) // 2] * (size or 1.0)
-    elif parameter.null == 0 and size is not None and not parameter.positive:
-        value = 0.02 * size
-    elif parameter.grid and size is not None:
-        value = parameter.grid[len(parameter.grid) // 2] * size
-    else:
-        value = parameter.value
-    return replace(parameter, value=float(np.clip(value, parameter.lower, parameter.upper)))
-
-
-def smoothing(runs: Sequence[Experiment], parameters: Mapping[str, Any]) -> float | None:
-    """Return the width of sgn that suits the data; None where it is given or not used."""
-    p = parameters.get("sgn_width")
-    if p is None or p.given:
-        return None
-    return _suited_width(tuple(runs))
-
-
-@lru_cache(maxsize=64)
-def _suited_width(runs: tuple[Experiment, ...]) -> float | None:
-    speed = top_speed(runs)
-    if speed <= 0:
-        return None
-    # A smooth sgn lets a loaded, stuck motor creep; over the longest standstill that must stay below the noise of
-    # the angle, or the creep looks like an effect of its own.
-    creep = min((CREEP_SHARE * noise_level(r.outputs["theta"], r.t) / still for r in runs if "theta" in r.outputs
-                 and (still := _longest_standstill(r, speed)) > 0), default=np.inf)
-    # Narrower than the finest sub-step's change of speed, it is jumped over, and slopes come out wild.
-    jump = max(_speed_gained(r) for r in runs) / FINEST
-    return float(np.clip(creep, max(NARROWEST * speed, jump), SGN_WIDTH_SHARE * speed))
-
-
-def _speed_gained(run: Experiment) -> float:
-    """Change of speed per sample where the angle is accelerated most, rad/s; 0 without an angle."""
-    if "theta" not in run.outputs:
-        return 0.0
-    speeds = slopes(run.outputs["theta"], run.t)
-    if len(speeds) < 3:
-        return 0.0
-    return float(np.percentile(np.abs(np.diff(speeds)), 95)) * len(speeds) / run.n
-
-
-def _longest_standstill(run: Experiment, speed: float) -> float:
-    """Longest time without motion, s, from the angle."""
-    s = np.abs(slopes(run.outputs["theta"], run.t)) < 0.01 * speed
-    if not s.any():
-        return 0.0
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], s.astype(int), [0]])))
-    return float(np.max(edges[1::2] - edges[::2])) * run.duration / len(s)
-
-
-INITIAL = ("auto", "rest", "measured", "estimate")
-REACH = 8.0  # standard deviations that an estimated initial state may lie away from its first samples
-FIRST = 5  # samples that tell it
-FREE_OF_NOISE = 2e-5  # of an angle's variation: what `noise_level` gives a simulation is half of it
-
-
-class Beginning(NamedTuple):
+# -- the state at the first sample -----------------------------------------------------------------------
+class InitialState(NamedTuple):
     """`start` (3,): i, omega, theta at the first sample; `limits`: those to estimate, and how far they go."""
 
     start: Array
     limits: dict[str, tuple[float, float]]
 
 
-def beginning(run: Experiment, sigma: Mapping[str, float], initial: str) -> Beginning:
+def initial_state(run: Experiment, sigma: Mapping[str, float], initial: str) -> InitialState:
     """Return the state at the first sample, and which parts of it are to be estimated.
 
     ``auto``: known zeros where nothing moves yet, otherwise estimated; a measured angle is estimated too (its
@@ -296,7 +167,7 @@ def beginning(run: Experiment, sigma: Mapping[str, float], initial: str) -> Begi
         reach = {}
     free = initial == "estimate"
     places = {c: start[CHANNELS.index(c)] for c in reach}
-    return Beginning(start, {c: (-np.inf, np.inf) if free else (x - reach[c], x + reach[c])
+    return InitialState(start, {c: (-np.inf, np.inf) if free else (x - reach[c], x + reach[c])
                              for c, x in places.items()})
 
 
@@ -317,7 +188,7 @@ def at_rest(run: Experiment, sigma: Mapping[str, float]) -> tuple[bool, int]:
     if "omega" not in run.outputs and "theta" in run.outputs:
         y, t = run.outputs["theta"], run.t
         speed, _ = _first_speed(y, t, sigma["theta"])
-        moving = abs(speed) > 0.05 * np.max(np.abs(slopes(y, t)), initial=0.0)
+        moving = abs(speed) > 0.05 * np.max(np.abs(window_slopes(t, y)), initial=0.0)
         if moving and not _starts_from_rest(y, t, sigma["theta"], speed):
             return False, 1
     return True, max(lead, 1)
@@ -329,16 +200,6 @@ def _starts_from_rest(theta: Array, t: Array, sigma: float, speed: float) -> boo
     first = moved[:2]
     noise = 4 * np.sqrt(2) * sigma
     return bool(np.all(np.abs(first) <= noise) and np.any(np.abs(moved - speed * after) > noise))
-
-
-def slopes(theta: Array, t: Array, parts: int = 200) -> Array:
-    """Mean speeds over `parts` windows of the record, from the angle."""
-    good = np.isfinite(theta)
-    y, s = theta[good], t[good]
-    if len(y) < 4:
-        return np.zeros(0)
-    step = max(len(y) // parts, 1)
-    return np.diff(y[::step]) / np.diff(s[::step])
 
 
 def _first(y: Array) -> float:
@@ -366,7 +227,7 @@ def _first_speed(theta: Array, t: Array, sigma: float) -> tuple[float, float]:
     y, s = theta[good], t[good]
     if len(y) < 4:
         return 0.0, np.inf
-    top = float(np.max(np.abs(slopes(theta, t)), initial=0.0))
+    top = float(np.max(np.abs(window_slopes(t, theta)), initial=0.0))
     w, longest = 1, max(len(y) // 50, 1)
     while w < longest and np.sqrt(2) * sigma > 0.01 * top * (s[w] - s[0]):
         w *= 2
@@ -374,3 +235,133 @@ def _first_speed(theta: Array, t: Array, sigma: float) -> tuple[float, float]:
     pair = np.diff(y[[0, w, min(2 * w, len(y) - 1)]]) / np.diff(s[[0, w, min(2 * w, len(y) - 1)]])
     gained = pair[1] - pair[0]
     return float(pair[0] - gained / 2), float(REACH * noise + abs(gained))
+
+
+# -- natural sizes ---------------------------------------------------------------------------------------
+def natural_sizes(runs: Sequence[Experiment], values: Mapping[str, float]) -> dict[str, float]:
+    """Return the natural size of each unit in these records, for starting values and grids of effects.
+
+    Torque is what the motor makes at its highest current, time is the sample time, heat is what the winding
+    loses during the longest run for a rise of 30 K.
+    """
+    seen = [_sizes_of(r) for r in runs]
+    volt = max(s.volt for s in seen) or 1.0
+    speed = max(s.speed for s in seen) or volt / max(values.get("K", 1.0), 1e-9)
+    gain = values.get("g")
+    resistance = values.get("R", 1.0)
+    amps = [s.ampere for s in seen if s.ampere is not None]
+    ampere = max(amps) if amps else volt / resistance
+    torque = gain * volt if gain is not None else values.get("K", 1.0) * ampere
+    second = float(np.median([r.dt for r in runs]))
+    heats = [(r.duration, resistance * s.mean_square_current(values)) for r, s in zip(runs, seen, strict=True)]
+    duration, power = max(heats, key=lambda h: h[0] * h[1])
+    span = max((s.span for s in seen if s.span is not None), default=1.0)
+    sizes = {"V": volt, "A": ampere, "rad/s": speed, "m/s": speed, "N·m": torque, "N": torque, "s": second,
+             "1/s": 1 / second, "m": 0.01 * span, "K/W": 30 / max(power, 1e-9), "J/K": max(power * duration, 1e-9) / 30}
+    for unit in ("N·m·s/rad", "N·s/m"):
+        sizes[unit] = torque / speed
+    for unit in ("N·m·s²/rad²", "N·s²/m²"):
+        sizes[unit] = torque / speed**2
+    return {k: v if np.isfinite(v) and v > 0 else 1.0 for k, v in sizes.items()}
+
+
+def spread_of(run: Experiment, channel: str) -> float:
+    """Return the standard deviation of a channel; 1 where it was not measured."""
+    return _sizes_of(run).spread.get(channel, 1.0)
+
+
+def top_speed(runs: Sequence[Experiment]) -> float:
+    """Highest speed in the runs (99.5th percentile), from speed or angle; 0 where neither is there."""
+    return max((_sizes_of(r).speed for r in runs), default=0.0)
+
+
+def suited(parameter: Parameter, sizes: Mapping[str, float]) -> Parameter:
+    """Return a parameter of an effect with a starting value that suits the data, unless the user gave one."""
+    if parameter.given or parameter.name == "sgn_width":
+        return parameter
+    size = sizes.get(parameter.unit)
+    if parameter.null is None and parameter.grid:
+        value = parameter.grid[len(parameter.grid) // 2] * (size or 1.0)
+    elif parameter.null == 0 and size is not None and not parameter.positive:
+        value = 0.02 * size
+    elif parameter.grid and size is not None:
+        value = parameter.grid[len(parameter.grid) // 2] * size
+    else:
+        value = parameter.value
+    return replace(parameter, value=float(np.clip(value, parameter.lower, parameter.upper)))
+
+
+class _Sizes(NamedTuple):
+    """How large the signals of a record are; None where a channel was not measured."""
+
+    volt: float
+    speed: float
+    ampere: float | None
+    span: float | None
+    squared_volt: float
+    squared_ampere: float | None
+    spread: Mapping[str, float]
+
+    def mean_square_current(self, values: Mapping[str, float]) -> float:
+        """Mean square of the current, or about what the voltage would make."""
+        if self.squared_ampere is not None:
+            return self.squared_ampere
+        return self.squared_volt / max(values.get("R", 1.0), 1e-9) ** 2 / 4
+
+
+def _sizes_of(run: Experiment) -> _Sizes:
+    if run not in _sizes:
+        v, (i, omega, theta) = run.inputs.get("v", np.zeros(1)), (run.outputs.get(c) for c in CHANNELS)
+        speeds = omega if omega is not None else window_slopes(run.t, theta) if theta is not None else np.zeros(1)
+        _sizes[run] = _Sizes(
+            float(np.abs(v).max()),
+            float(np.nanpercentile(np.abs(speeds), 99.5)) if speeds.size else 0.0,
+            None if i is None else float(np.nanpercentile(np.abs(i), 99.5)),
+            None if theta is None else float(np.nanmax(theta) - np.nanmin(theta)),
+            float(np.mean(v**2)),
+            None if i is None else float(np.nanmean(i**2)),
+            {c: float(np.nanstd(y)) for c, y in run.outputs.items()},
+        )
+    return _sizes[run]
+
+
+# -- the width of sgn ------------------------------------------------------------------------------------
+def smoothing(runs: Sequence[Experiment], parameters: Mapping[str, Any]) -> float | None:
+    """Return the width of sgn that suits the data; None where it is given or not used."""
+    p = parameters.get("sgn_width")
+    if p is None or p.given:
+        return None
+    return _suited_width(tuple(runs))
+
+
+@lru_cache(maxsize=64)
+def _suited_width(runs: tuple[Experiment, ...]) -> float | None:
+    speed = top_speed(runs)
+    if speed <= 0:
+        return None
+    # A smooth sgn lets a loaded, stuck motor creep; over the longest standstill that must stay below the noise of
+    # the angle, or the creep looks like an effect of its own.
+    creep = min((CREEP_SHARE * noise_level(r.outputs["theta"], r.t) / still for r in runs if "theta" in r.outputs
+                 and (still := _longest_standstill(r, speed)) > 0), default=np.inf)
+    # Narrower than the finest sub-step's change of speed, it is jumped over, and slopes come out wild.
+    jump = max(_speed_gained(r) for r in runs) / FINEST
+    return float(np.clip(creep, max(NARROWEST * speed, jump), SGN_WIDTH_SHARE * speed))
+
+
+def _speed_gained(run: Experiment) -> float:
+    """Change of speed per sample where the angle is accelerated most, rad/s; 0 without an angle."""
+    if "theta" not in run.outputs:
+        return 0.0
+    speeds = window_slopes(run.t, run.outputs["theta"])
+    if len(speeds) < 3:
+        return 0.0
+    return float(np.percentile(np.abs(np.diff(speeds)), 95)) * len(speeds) / run.n
+
+
+def _longest_standstill(run: Experiment, speed: float) -> float:
+    """Longest time without motion, s, from the angle."""
+    s = np.abs(window_slopes(run.t, run.outputs["theta"])) < 0.01 * speed
+    if not s.any():
+        return 0.0
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], s.astype(int), [0]])))
+    return float(np.max(edges[1::2] - edges[::2])) * run.duration / len(s)

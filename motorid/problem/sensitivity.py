@@ -1,4 +1,4 @@
-"""check_derivatives: the exact Jacobian of a problem beside central finite differences."""
+"""Sensitivities in units that people compare, and `check_derivatives`: the exact Jacobian beside finite differences."""
 
 from __future__ import annotations
 

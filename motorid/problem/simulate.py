@@ -1,4 +1,4 @@
-"""Simulating a model on records, and judging a model on records that it never saw."""
+"""Simulating a model on records: `simulate`; judging it there: `evaluate`; and how far a problem is from its noise."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from motorid.display.tables import Table
 from motorid.errors import FitError, SimulationError
 from motorid.integrate.engine import Engine
 from motorid.model.model import Model
+from motorid.numerics.least_squares import LevenbergMarquardt, levenberg_marquardt
 from motorid.numerics.signals import Array
 from motorid.problem.problem import Problem, as_problem
 from motorid.records.experiment import Experiment, units_of
@@ -140,8 +141,6 @@ def simulated(problem: Problem, estimate_initial: bool = True) -> tuple[Simulati
     q = held.start
     held = held.refined(q)
     if len(q) and estimate_initial:
-        from motorid.numerics.least_squares import LevenbergMarquardt, levenberg_marquardt
-
         try:
             q = levenberg_marquardt(held.residual, held.residual_and_jacobian, q,
                                     options=LevenbergMarquardt(max_iterations=20)).q
@@ -215,7 +214,7 @@ def evaluate(fit_or_model: Any, runs: Sequence[Experiment] | Experiment, **optio
 
 
 LEAST_FACTOR = 0.02  # a quick channel with few samples per time constant passes for noisy
-EXPLAINED = 0.25  # NRMSE above which a channel counts as hardly explained
+EXPLAINED = 0.25  # NRMSE above which a channel counts as poorly explained
 
 
 def misfit_over_noise(problem: Problem, q: Array) -> dict[str, float]:
@@ -232,7 +231,7 @@ def misfit_over_noise(problem: Problem, q: Array) -> dict[str, float]:
     return {c: max(float(np.sqrt(s / max(n, 1))), LEAST_FACTOR) for c, (s, n) in sums.items()}
 
 
-def hardly_explained(problem: Problem, q: Array) -> bool:
+def poorly_explained(problem: Problem, q: Array) -> bool:
     """Tell whether some channel is far above its noise and not followed at all."""
     for c, factor in misfit_over_noise(problem, q).items():
         runs = [r for r in problem.runs if c in r.sigma]

@@ -36,19 +36,19 @@ class Unknowns:
     Attributes
     ----------
     system : System
-    held : mapping of str to Parameter
-        All parameters of the model.
+    parameters : mapping of str to Parameter
+        All of the model, fixed ones too.
     runs : tuple of Run
     """
 
     system: System
-    held: Mapping[str, Parameter]
+    parameters: Mapping[str, Parameter]
     runs: tuple[Run, ...]
 
     @cached_property
     def free(self) -> tuple[Parameter, ...]:
         """Free parameters of the model."""
-        return tuple(p for p in self.held.values() if p.vary)
+        return tuple(p for p in self.parameters.values() if p.vary)
 
     @cached_property
     def initial(self) -> tuple[tuple[str, int, Parameter], ...]:
@@ -74,7 +74,7 @@ class Unknowns:
         """Solver coordinates: logarithmic for positive parameters, else in natural sizes of the records."""
         sizes = [abs(p.value) for p in self.free]
         if not all(p.positive for p in self.free):
-            values = {n: p.value for n, p in self.held.items()}
+            values = {n: p.value for n, p in self.parameters.items()}
             natural = natural_sizes([r.experiment for r in self.runs], values)
             sizes = [s if p.positive else max(s, natural.get(p.unit, 0.0))
                      for p, s in zip(self.free, sizes, strict=True)]
@@ -87,7 +87,7 @@ class Unknowns:
 
     def values(self, physical: Array) -> dict[str, float]:
         """Return all parameter values of the model, SI, for `physical` values of the unknowns."""
-        found = {n: p.value for n, p in self.held.items()}
+        found = {n: p.value for n, p in self.parameters.items()}
         for p, value in zip(self.free, physical.tolist(), strict=False):
             found[p.name] = value
         return found
@@ -109,7 +109,7 @@ class Unknowns:
 
     @cached_property
     def _fixed(self) -> Array:
-        return np.array([self.held[n].value for n in self.system.parameters])
+        return np.array([self.parameters[n].value for n in self.system.parameters])
 
     @cached_property
     def _places(self) -> Sequence[tuple[list[int], list[int]]]:

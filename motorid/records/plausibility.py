@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from motorid.numerics.noise import noise_level
-from motorid.numerics.signals import Array
+from motorid.numerics.signals import Array, bridged, integral
 from motorid.records.experiment import Experiment
 
 _BLOCKS = 40
@@ -155,7 +155,7 @@ def _speed_cosine(run: Experiment) -> float:
     if "theta" not in run.outputs or len(edges := _edges(run, "theta")) < 6:
         return 0.0
     travel = np.diff(run.outputs["theta"][edges])
-    pushed = np.diff(_integral(run.t, run.inputs["v"])[edges])
+    pushed = np.diff(integral(run.t, run.inputs["v"])[edges])
     return _cosine(pushed, travel)
 
 
@@ -163,20 +163,15 @@ def _block_travel(run: Experiment) -> tuple[Array, Array]:
     """Advance of the angle and integral of the speed over blocks long enough to average noise and delay."""
     edges = _edges(run, "theta")
     omega = run.outputs["omega"]
-    good = np.isfinite(omega)
-    if good.sum() < 2:
+    if np.isfinite(omega).sum() < 2:
         return np.empty(0), np.empty(0)
-    filled = np.interp(run.t, run.t[good], omega[good])
-    return np.diff(run.outputs["theta"][edges]), np.diff(_integral(run.t, filled)[edges])
+    filled = bridged(run.t, omega)
+    return np.diff(run.outputs["theta"][edges]), np.diff(integral(run.t, filled)[edges])
 
 
 def _edges(run: Experiment, channel: str) -> NDArray[np.intp]:
     known = np.flatnonzero(np.isfinite(run.outputs[channel]))
     return known[np.unique(np.linspace(0, len(known) - 1, min(_BLOCKS, len(known) // 5) + 1).astype(int))]
-
-
-def _integral(t: Array, values: Array) -> Array:
-    return np.r_[0.0, np.cumsum(np.diff(t) * (values[1:] + values[:-1]) / 2)]
 
 
 def _holds(values: Array) -> float:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from motorid.errors import UsageError
-from motorid.numerics.noise import noise_level
+from motorid.numerics.noise import noise_level, robust_std
 from motorid.numerics.signals import Array
 
 CLEAR = np.pi / 2  # rad: a step of the angle this far from what is expected may be a turn or none
@@ -56,7 +56,7 @@ def running_median(v: Array, samples: int) -> Array:
 def levelled(v: Array) -> Array:
     """Return an input as its means between jumps, where what lies between two jumps is no more than noise."""
     changes = np.diff(v)
-    noise = 1.4826 * float(np.median(np.abs(changes))) / np.sqrt(2)
+    noise = robust_std(changes) / np.sqrt(2)
     ends = np.concatenate([[0], np.flatnonzero(np.abs(changes) > JUMP * noise) + 1, [len(v)]])
     level = v.copy()
     for a, b in pairwise(ends.tolist()):

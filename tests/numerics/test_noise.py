@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from motorid.numerics.autoregression import autocorrelation
 from motorid.numerics.noise import noise_level, quantum
 
 N = 2000
@@ -128,3 +129,13 @@ def test_the_step_of_a_fast_encoder_is_found():
         assert quantum(run.outputs["theta"]) == pytest.approx(2 * np.pi / 4096, rel=0.01)
         level = noise_level(run.outputs["theta"], run.t)
         assert level == pytest.approx(2 * np.pi / 4096 / np.sqrt(12), rel=0.15)
+
+
+def test_autocorrelation_leaves_gaps_out(rng):
+    r = rng.normal(size=4000)
+    coloured = np.convolve(r, np.ones(2) / 2, "valid")
+    coloured[500:700] = np.nan
+    rho = autocorrelation([coloured], 5)
+    assert rho[0] == 1
+    assert rho[1] == pytest.approx(0.5, abs=0.05)
+    assert np.abs(rho[2:]).max() < 0.06

@@ -18,7 +18,7 @@ import motorid as mi
 from motorid import plots
 from motorid.errors import UsageError
 from motorid.estimation.shooting.formulations import compare_formulations
-from motorid.plots.residuals import autocorrelation, binned_means
+from motorid.plots.residuals import binned_means
 from motorid.plots.style import axis_label, detached, envelope
 from motorid.plots.svg import svg_of
 from motorid.problem.constraints import CurrentLimit
@@ -246,17 +246,6 @@ def test_sensitivities_are_what_one_per_cent_of_a_parameter_does(found):
     finite = (moved[0] - moved[1]) / 0.002 * 0.01
     at = np.searchsorted(run.t, t)
     assert np.max(np.abs(drawn - finite[at])) < 0.05 * np.max(np.abs(finite))  # where it stops, steps differ
-
-
-def test_autocorrelation_leaves_gaps_out(rng):
-    r = rng.normal(size=4000)
-    coloured = np.convolve(r, np.ones(2) / 2, "valid")
-    coloured[500:700] = np.nan
-    rho, n = autocorrelation([coloured], 5)
-    assert n == len(coloured) - 200
-    assert rho[0] == 1
-    assert rho[1] == pytest.approx(0.5, abs=0.05)
-    assert np.abs(rho[2:]).max() < 0.06
 
 
 def test_binned_means_follow_the_curve(rng):

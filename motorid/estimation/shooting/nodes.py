@@ -12,7 +12,7 @@ from scipy.sparse.linalg import splu
 
 from motorid.errors import SimulationError, UsageError, one_of
 from motorid.estimation.shooting.mesh import Mesh
-from motorid.numerics.signals import Array
+from motorid.numerics.signals import Array, bridged, slope
 from motorid.records.experiment import Experiment
 
 
@@ -56,22 +56,10 @@ def measured_states(run: Experiment, states: tuple[str, ...]) -> dict[int, Array
     found = {}
     for j, name in enumerate(states):
         if name in run.outputs:
-            found[j] = _bridged(run.t, run.outputs[name])
+            found[j] = bridged(run.t, run.outputs[name])
         elif name == "omega" and "theta" in run.outputs:
-            found[j] = slope_of(run.t, _bridged(run.t, run.outputs["theta"]))
+            found[j] = slope(run.t, bridged(run.t, run.outputs["theta"]), half=5)
     return found
-
-
-def slope_of(t: Array, y: Array, half: int = 5) -> Array:
-    """Return dy/dt (N,) over windows of 2·half samples."""
-    k = np.arange(len(t))
-    a, b = np.maximum(k - half, 0), np.minimum(k + half, len(t) - 1)
-    return (y[b] - y[a]) / (t[b] - t[a])
-
-
-def _bridged(t: Array, y: Array) -> Array:
-    good = np.isfinite(y)
-    return y if good.all() else np.interp(t, t[good], y[good])
 
 
 NEXT_TO_NONE = 1e-6  # of a state's size per √s: states that no unknown voltage or torque acts on
