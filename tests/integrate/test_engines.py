@@ -16,7 +16,7 @@ import motorid as mi
 from motorid.errors import FitError, ModelError, SimulationError, UsageError
 from motorid.integrate import Cvodes, Grid, Idas, Rosenbrock, engine_of
 from motorid.model.equations import System
-from motorid.records import reading
+from motorid.records.datasets import truth as truth_of
 
 VALUES = {"R": 1.38, "L": 1.72e-3, "K": 0.0462, "b": 6.5e-5, "J": 2.35e-5}
 TIGHT = {
@@ -296,7 +296,7 @@ def test_the_derivatives_of_casadi_issue_4383_are_right(engine):
 
 @every_engine
 def test_two_steps_without_noise_give_back_the_motor(engine):
-    truth = reading.truth("two_step")["parameters"]
+    truth = truth_of("two_step")["parameters"]
     runs = mi.read_runs(sorted(mi.data_path("two_step").glob("*.csv")))
     plain = engine if isinstance(engine, Rosenbrock) else type(engine)()
     fit = mi.fit(mi.dc_motor(), runs, engine=plain)
