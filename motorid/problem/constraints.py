@@ -17,7 +17,7 @@ import numpy as np
 from motorid.errors import ModelError, UsageError
 from motorid.numerics.signals import Array
 from motorid.problem.relations import Part, Relation, check_weight, local, share
-from motorid.records.steady_state import Segment, find_segments, segment_between
+from motorid.records.steady_state import SteadySegment, find_segments, segment_between
 
 FEWEST = 64  # samples of a steady segment that are looked at; its means use all
 
@@ -104,7 +104,7 @@ class SteadyState(Relation):
         """What messages call it."""
         return "SteadyState()"
 
-    def segments(self, problem: Any) -> tuple[Segment, ...]:
+    def segments(self, problem: Any) -> tuple[SteadySegment, ...]:
         """Return the steady parts of the records of `problem`: found in the data, or those given by `at`."""
         if self.at is None:
             return find_segments(problem.experiments, [run.sigma for run in problem.runs])
@@ -126,7 +126,7 @@ class SteadyState(Relation):
                           "the parts, SteadyState(at=[(run, begin, end)]), or leave it out.", stacklevel=4)
         return tuple(part for s in segments if (part := self._part(problem, s)) is not None)
 
-    def _part(self, problem: Any, s: Segment) -> Part | None:
+    def _part(self, problem: Any, s: SteadySegment) -> Part | None:
         system, run = problem.system, problem.runs[s.run]
         known = tuple(c for c in ("i", "omega") if c in s.means)
         wanted = self._wanted(system, s)
@@ -146,7 +146,7 @@ class SteadyState(Relation):
                     weight, labels, tuple({"voltage": "V", "torque": torque}[n] for n in names))
 
     @staticmethod
-    def _wanted(system: Any, s: Segment) -> tuple[bool, bool]:
+    def _wanted(system: Any, s: SteadySegment) -> tuple[bool, bool]:
         """Tell which of the voltage and the torque balance this segment can be held to."""
         electrical = "i" in system.states
         current = "i" in s.means
@@ -181,12 +181,12 @@ def _steady_rows(system: Any, known: Sequence[str]) -> Callable[..., Any]:
     return rows
 
 
-def _drive(values: Mapping[str, float], s: Segment) -> float:
+def _drive(values: Mapping[str, float], s: SteadySegment) -> float:
     """Torque of the motor on this segment, at the present values."""
     return abs(values["K"] * s.means["i"] if "K" in values else values["g"] * s.v) or 1.0
 
 
-def _relative_error(run: Any, s: Segment, channel: str) -> float:
+def _relative_error(run: Any, s: SteadySegment, channel: str) -> float:
     """Standard error of a measured mean over its size."""
     size = max(abs(s.means[channel]), 1e-300)
     if channel in run.sigma:

@@ -21,10 +21,10 @@ Texts = Mapping[str, Sequence[object]]
 _LATE = 2  # this many rows in a row may come late before it counts as a new start of time
 
 
-def build(columns: Mapping[str, Array], texts: Texts, layout: Layout, *, name: str, hold: str,
-          sigma: Mapping[str, float] | None = None, meta: Mapping[str, Any] | None = None,
-          notes: Sequence[str] = ()) -> Experiment:
-    """Make one run of raw columns.
+def run_from_columns(columns: Mapping[str, Array], texts: Texts, layout: Layout, *, name: str, hold: str,
+                     sigma: Mapping[str, float] | None = None, meta: Mapping[str, Any] | None = None,
+                     notes: Sequence[str] = ()) -> Experiment:
+    """Make a valid run of the columns of a file.
 
     Parameters
     ----------
@@ -49,7 +49,7 @@ def build(columns: Mapping[str, Array], texts: Texts, layout: Layout, *, name: s
     rows = _rows_in_order(t, layout.places["t"].column, said)
     rows = rows[_first_input(values["v"][rows], places["v"].column, said):]
     t, values = t[rows], {c: a[rows] for c, a in values.items()}
-    v = _held(values.pop("v"), places["v"].column, said)
+    v = _filled_forward(values.pop("v"), places["v"].column, said)
     outputs = {c: a for c, a in values.items() if _has_values(c, a, places[c].column, said)}
     if not outputs:
         raise DataError(f"every sample of {', '.join(repr(places[c].column) for c in values)} is "
@@ -179,7 +179,7 @@ def _first_input(v: Array, column: str, said: list[str]) -> int:
     return int(known[0])
 
 
-def _held(v: Array, column: str, said: list[str]) -> Array:
+def _filled_forward(v: Array, column: str, said: list[str]) -> Array:
     missing = ~np.isfinite(v)
     if not missing.any():
         return v

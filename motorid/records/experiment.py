@@ -25,7 +25,6 @@ INPUTS = ("v",)
 MIN_SAMPLES = 8
 
 
-
 @dataclass(frozen=True, eq=False)
 class Experiment(Shown):
     """One run: what went in and what was measured, on one time axis.

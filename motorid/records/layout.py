@@ -1,4 +1,4 @@
-"""Which column is which channel, in which unit: the user's words, then the header's, and every guess told."""
+"""Which column is which channel, in which unit: as the user says, then as the header says; every guess is noted."""
 
 from __future__ import annotations
 
@@ -44,28 +44,6 @@ class Layout:
     notes: Sequence[str]
 
 
-def parse_pairs(text: str, what: str) -> dict[str, str]:
-    """Read ``t=time,v=u_volt,omega=speed`` as it is written on a command line.
-
-    Raises
-    ------
-    UsageError
-        If a part is not of the form name=value, or a name comes twice; `what` names the option.
-    """
-    pairs: dict[str, str] = {}
-    for part in filter(None, (p.strip() for p in text.split(","))):
-        name, equals, value = (s.strip() for s in part.partition("="))
-        if not (equals and name and value):
-            raise UsageError(f"{what}: expected name=value pairs with commas between, like t=time,v=u_volt; "
-                             f"cannot read '{part}'.")
-        if name in pairs:
-            raise UsageError(f"{what}: '{name}' is given twice, as '{pairs[name]}' and as '{value}'.")
-        pairs[name] = value
-    if not pairs:
-        raise UsageError(f"{what}: expected name=value pairs like t=time,v=u_volt; got nothing.")
-    return pairs
-
-
 def assign(labels: Sequence[str], *, columns: Mapping[str, object] | None = None,
            units: Mapping[str, object] | None = None, unit_row: Mapping[str, str] | None = None) -> Layout:
     """Decide which column holds which channel.
@@ -89,9 +67,9 @@ def assign(labels: Sequence[str], *, columns: Mapping[str, object] | None = None
     """
     row = {label: parse_unit((unit_row or {}).get(label, "")) for label in labels}
     units = units or {}
-    places = _said(labels, columns or {}, units, row)
+    places = _named_by_user(labels, columns or {}, units, row)
     notes: list[str] = []
-    _recognised(places, [c for c in labels if c not in {p.column for p in places.values()}], row)
+    _named_by_header(places, [c for c in labels if c not in {p.column for p in places.values()}], row)
     _last_resorts(places, labels, notes)
     _apply_units(places, labels, units)
     _settle_counts(places, notes)
@@ -99,7 +77,7 @@ def assign(labels: Sequence[str], *, columns: Mapping[str, object] | None = None
     return Layout({c: places[c] for c in _CHANNELS if c in places}, [*notes, *_assumed(places)])
 
 
-def _said(labels: Sequence[str], columns: Mapping[str, object], units: Mapping[str, object],
+def _named_by_user(labels: Sequence[str], columns: Mapping[str, object], units: Mapping[str, object],
           row: Units) -> dict[str, Place]:
     places = {}
     for channel, column in columns.items():
@@ -133,7 +111,7 @@ def _find(labels: Sequence[str], column: object) -> str:
                     "counted from 1.")
 
 
-def _recognised(places: dict[str, Place], labels: Sequence[str], row: Units) -> None:
+def _named_by_header(places: dict[str, Place], labels: Sequence[str], row: Units) -> None:
     """Add the channels that the header names, where the user has not named them."""
     found: dict[str, list[Place]] = {}
     for hit in filter(None, (classify(c, row[c]) for c in labels)):
@@ -216,11 +194,32 @@ def _say_which(labels: Sequence[str], channel: str, example: str) -> str:
 def _assumed(places: Mapping[str, Place]) -> list[str]:
     guesses = [f"'{p.column}' as {_MEANING[c]}" for c, p in places.items() if p.score <= 1]
     plain = [f"{c} ('{p.column}') in {p.unit.symbol}" for c, p in places.items() if not p.stated]
-    told = [f"took {', '.join(guesses)} by the look of it; say otherwise with columns."] if guesses else []
-    return told + ([f"no unit stated, taken as it is: {', '.join(plain)}; say otherwise with units."]
-                   if plain else [])
+    told = [f"took {', '.join(guesses)} by the look of it; override with columns."] if guesses else []
+    return told + ([f"no unit stated, assuming {', '.join(plain)}; override with units."] if plain else [])
 
 
 def _default(channel: str) -> Unit:
     dimension = DIMENSIONS[channel][0]
     return Unit(dimension, 1.0, SI[dimension], SI[dimension])
+
+
+def parse_pairs(text: str, what: str) -> dict[str, str]:
+    """Read ``t=time,v=u_volt,omega=speed`` as it is written on a command line.
+
+    Raises
+    ------
+    UsageError
+        If a part is not of the form name=value, or a name comes twice; `what` names the option.
+    """
+    pairs: dict[str, str] = {}
+    for part in filter(None, (p.strip() for p in text.split(","))):
+        name, equals, value = (s.strip() for s in part.partition("="))
+        if not (equals and name and value):
+            raise UsageError(f"{what}: expected name=value pairs with commas between, like t=time,v=u_volt; "
+                             f"cannot read '{part}'.")
+        if name in pairs:
+            raise UsageError(f"{what}: '{name}' is given twice, as '{pairs[name]}' and as '{value}'.")
+        pairs[name] = value
+    if not pairs:
+        raise UsageError(f"{what}: expected name=value pairs like t=time,v=u_volt; got nothing.")
+    return pairs

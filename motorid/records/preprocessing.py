@@ -1,4 +1,4 @@
-"""Records read otherwise: an angle taken modulo a turn, a voltage that is late or noisy, a sensor's spikes."""
+"""Preprocessing of signals: unwrap an angle, filter or delay the voltage, mark the spikes of a sensor as missing."""
 
 from __future__ import annotations
 

@@ -1,4 +1,8 @@
-"""Read and write records: CSV and its kin, MATLAB, Parquet. Units and names are settled here, once."""
+"""Read and write records: text tables, MATLAB, Parquet; `read_runs` is the entry.
+
+Bytes become a table (`text_tables`, `binary_tables`), its columns channels in SI units (`layout`, from `headers`), and
+these a valid run (`cleaning`).
+"""
 
 from __future__ import annotations
 
@@ -14,7 +18,7 @@ import numpy as np
 
 from motorid.errors import DataError, UsageError, one_of
 from motorid.records.binary_tables import mat_table, parquet_table
-from motorid.records.cleaning import build
+from motorid.records.cleaning import run_from_columns
 from motorid.records.experiment import Experiment
 from motorid.records.layout import assign, parse_pairs
 from motorid.records.text_tables import TextTable, parse_table
@@ -193,7 +197,7 @@ def _read(path: Path_, to_table: Callable[[bytes], TextTable], columns: Mapping[
             columns = parse_pairs(own["columns"], "columns")
             labels = [c for c in labels if c in columns.values()]
         layout = assign(labels, columns=columns, units=units, unit_row=table.unit_row)
-        return build(table.columns, table.texts, layout, name=name or path.stem, notes=table.notes,
+        return run_from_columns(table.columns, table.texts, layout, name=name or path.stem, notes=table.notes,
                      hold=hold or own.get("hold", "zoh"), sigma=_sigma(own.get("sigma")),
                      meta={"source": str(path), "sha256": hashlib.sha256(data).hexdigest()})
     except (DataError, UsageError) as error:

@@ -17,7 +17,7 @@ MOVING_SHARE = 0.01  # of the top speed: slower than this is standstill
 
 
 @dataclass(frozen=True)
-class Segment:
+class SteadySegment:
     """One steady part: run (index), first and last sample, times (s), mean input, mean of each channel.
 
     `means` holds i (A), omega (rad/s) where measured; without a speed, omega is the slope of the angle.
@@ -43,7 +43,7 @@ class Segment:
         return f"run {self.run}, {self.begin:.4g} to {self.end:.4g} s: v = {self.v:.4g}, {shown}"
 
 
-def find_segments(runs: Sequence[Experiment], sigma: Sequence[Mapping[str, float]]) -> tuple[Segment, ...]:
+def find_segments(runs: Sequence[Experiment], sigma: Sequence[Mapping[str, float]]) -> tuple[SteadySegment, ...]:
     """Return the steady parts of `runs`, at most one per stretch of held input, the longest that ends it.
 
     A stretch counts where the two halves of its tail agree in every channel within four standard errors or
@@ -58,7 +58,7 @@ def find_segments(runs: Sequence[Experiment], sigma: Sequence[Mapping[str, float
     return tuple(found)
 
 
-def segment_between(k: int, run: Experiment, begin: float, end: float) -> Segment | None:
+def segment_between(k: int, run: Experiment, begin: float, end: float) -> SteadySegment | None:
     """Return the segment of run `k` between two times the user names; None if it has too few samples."""
     inside = np.flatnonzero((run.t >= begin) & (run.t <= end))
     return _segment(k, run, int(inside[0]), int(inside[-1])) if inside.size >= 2 else None
@@ -81,7 +81,7 @@ def _held_stretches(v: Array) -> list[tuple[int, int]]:
 
 
 def _steady_tail(k: int, run: Experiment, sigma: Mapping[str, float], first: int,
-                 last: int) -> Segment | None:
+                 last: int) -> SteadySegment | None:
     length = last - first + 1
     for share in (0.75, 0.5, 0.25, 0.125):
         n = int(share * length)
@@ -114,7 +114,7 @@ def _level(run: Experiment, channel: str, sigma: Mapping[str, float], first: int
     return bool(abs(a.mean() - b.mean()) <= max(4 * error, DRIFT_SHARE * float(np.nanmax(np.abs(y)))))
 
 
-def _segment(k: int, run: Experiment, first: int, last: int) -> Segment:
+def _segment(k: int, run: Experiment, first: int, last: int) -> SteadySegment:
     part = slice(first, last + 1)
     means = {c: float(np.nanmean(run.outputs[c][part])) for c in ("i", "omega")
              if c in run.outputs and np.isfinite(run.outputs[c][part]).any()}
@@ -123,7 +123,7 @@ def _segment(k: int, run: Experiment, first: int, last: int) -> Segment:
         means |= {"omega": slope} if np.isfinite(slope) else {}
     top = float(np.nanmax(np.abs(run.outputs["omega"]))) if "omega" in run.outputs else _top_slope(run)
     moving = abs(means["omega"]) > MOVING_SHARE * top if "omega" in means else True
-    return Segment(k, first, last, float(run.t[first]), float(run.t[last]),
+    return SteadySegment(k, first, last, float(run.t[first]), float(run.t[last]),
                    float(np.mean(run.inputs["v"][part])), means, bool(moving))
 
 
