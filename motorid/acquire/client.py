@@ -1,4 +1,4 @@
-"""The computer's half of the conversation: ask, wait for the answer, ask again if it got lost."""
+"""The computer's end of the protocol: ask, wait, ask again if an answer got lost; and the serial link under it."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ BOOT = 4.0  # s: opening the port resets many boards
 AGAIN = 0.4  # s after which an unanswered command is repeated
 ANSWER = 3.0  # s after which it is given up
 KEEP_ALIVE = 0.2  # s
+BATCH = 0.004  # s between two reads: bytes are gathered, so that 5,000 lines do not cost 5,000 wake-ups
 
 
 class Client:
@@ -132,9 +133,6 @@ def _complete(fields: list[str]) -> bool:
 
 def _milli(value: float) -> int:
     return min(2_000_000_000, math.floor(value * 1e3 + 1e-6)) if math.isfinite(value) else 2_000_000_000
-
-
-BATCH = 0.004  # s between two reads: bytes are gathered, so that 5,000 lines do not cost 5,000 wake-ups
 
 
 class LinkLost(DeviceError):

@@ -15,10 +15,10 @@ from motorid.acquire.timeline import Row
 from motorid.errors import DataError, UsageError
 
 FILL_UP_TO = 60.0  # s; a longer gap is marked by its first and last sample alone
+SYNC_EVERY = 0.5  # s between two calls of fsync: what is older than that survives a power cut
 _COLUMNS = {("v", "V"): "voltage_V", ("i", "A"): "current_A", ("omega", "rad/s"): "speed_rad_s",
             ("omega", "m/s"): "speed_m_s", ("theta", "rad"): "angle_rad", ("theta", "m"): "position_m"}
 _ORDER = ("v", "i", "omega", "theta")
-
 
 Commanded = Callable[[int], float | None]  # voltage (V) commanded at a sample, None where nobody knows
 
@@ -90,11 +90,11 @@ def read_tail(out: Path) -> Tail:
                         "name for --out.") from None
 
 
-class RunFile:
+class RecordFile:
     """Appends rows to a record; gaps become rows whose measured cells are empty.
 
     Every call of `flush` hands whole lines to the operating system, and a thread hands them to the disk every
-    0.5 s; see `motorid.acquire.disk` for what happens when it refuses.
+    0.5 s; see `Appender` for what happens when it refuses.
 
     Parameters
     ----------
@@ -198,9 +198,6 @@ class RunFile:
             values = [math.nan] * len(self._order)
             values[self._v] = held
             self._pending.append(self._line(first + k, start + (k + 1) * step, tuple(values)))
-
-
-SYNC_EVERY = 0.5  # s between two calls of fsync: what is older than that survives a power cut
 
 
 class Appender:

@@ -10,12 +10,12 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
+from motorid.acquire.calibration import calibrate, read_calibration
 from motorid.acquire.client import Client, Link, SerialLink
 from motorid.acquire.excitation import Program, program
 from motorid.acquire.protocol import VERSION, Header
-from motorid.acquire.record_file import Commanded, RunFile, Tail, check_target, read_tail
-from motorid.acquire.session import Progress, Recording, Run, Setup
-from motorid.acquire.timeline import calibrate, read_calibration
+from motorid.acquire.record_file import Commanded, RecordFile, Tail, check_target, read_tail
+from motorid.acquire.session import Progress, Recording, Session, Setup
 from motorid.errors import UsageError
 
 
@@ -83,25 +83,25 @@ def record(
     check_target(out, resume, force)
     _check_numbers(duration, limit_voltage, limit_current, timeout)
     entries = _entries(calibration)
-    part = plan(out, excite, resume)
-    if not _asks_the_device(part):
-        program(part.excite).check(limit_voltage, 1 << 30, "the limit you gave")
+    plan = _planned(out, excite, resume)
+    if not (isinstance(plan.excite, str) and "standard" in plan.excite):  # that one asks the device for its limit
+        program(plan.excite).check(limit_voltage, 1 << 30, "the limit you gave")
     link = SerialLink(port, baud) if isinstance(port, str) else port
     try:
         client = Client(link)
         device = client.hello()
         header = calibrate(device, entries)
-        todo, done = part.todo(program(part.excite, min(limit_voltage, device.v_max)))
+        todo, done = plan.todo(program(plan.excite, min(limit_voltage, device.v_max)))
         todo.check(*_limit(limit_voltage, device))
         limits = client.prepare(device, limit_voltage, limit_current, todo)
-        head = _head(port, header, program(part.excite, limits[0]), limits, entries) | dict(meta or {})
-        mode = "resume" if part.tail else "replace" if force else "new"
-        file = RunFile(out, header.channels, header.rate, head if not part.tail else {}, mode)
+        head = _head(port, header, program(plan.excite, limits[0]), limits, entries) | dict(meta or {})
+        mode = "resume" if plan.tail else "replace" if force else "new"
+        file = RecordFile(out, header.channels, header.rate, head if not plan.tail else {}, mode)
         try:
             setup = Setup(client, header, file, len(todo.segments), _commanded(device, header, todo),
                           limits[1], _total(todo, duration), duration, max(timeout, 4 / header.rate),
                           progress)
-            return Run(setup, lambda: part.begin(file, done)).go()
+            return Session(setup, lambda: plan.begin(file, done)).run()
         finally:
             with contextlib.suppress(OSError):  # told already, where it matters
                 file.close()
@@ -117,14 +117,18 @@ def _check_numbers(duration: float | None, volts: float, amperes: float, timeout
             raise UsageError(f"{name} must be positive, in {unit}; got {value!r}.")
 
 
+def _planned(out: Path, excite: str | Program | None, resume: bool) -> RecordingPlan:
+    """Say what this recorder adds to `out`; without an excitation, a resumed record goes on with its own."""
+    if not (resume and out.exists()):
+        return RecordingPlan(excite)
+    tail = read_tail(out)
+    return RecordingPlan(excite if excite is not None else tail.meta.get("excitation"), tail)
+
+
 def _entries(calibration: str | Path | Mapping[str, Any] | None) -> dict[str, Any]:
     if isinstance(calibration, str | Path):
         return read_calibration(calibration)
     return dict(calibration or {})
-
-
-def _asks_the_device(part: Part) -> bool:
-    return isinstance(part.excite, str) and "standard" in part.excite
 
 
 def _limit(asked: float, device: Header) -> tuple[float, int, str]:
@@ -166,7 +170,7 @@ def _head(port: str | Link, header: Header, whole: Program, limits: tuple[float,
 
 
 @dataclass(frozen=True)
-class Part:
+class RecordingPlan:
     """What this recorder adds to the file: all of it, or (with a tail) what is left."""
 
     excite: str | Program | None
@@ -193,7 +197,7 @@ class Part:
                              "--out.")
         return left, len(whole.segments) - len(left.segments)
 
-    def begin(self, file: RunFile, done: int) -> None:
+    def begin(self, file: RecordFile, done: int) -> None:
         """Set the time axis, by the clock of this computer, and mark the pause."""
         if self.tail is None:
             return
@@ -207,11 +211,3 @@ class Part:
                    "segments done": done,
                    "pause": f"{at - tail.time:.3f} s, the motor taken to be off; the angle may count from "
                             "another zero after it"})
-
-
-def plan(out: Path, excite: str | Program | None, resume: bool) -> Part:
-    """Say what this recorder adds to `out`; without an excitation, a resumed record goes on with its own."""
-    if not (resume and out.exists()):
-        return Part(excite)
-    tail = read_tail(out)
-    return Part(excite if excite is not None else tail.meta.get("excitation"), tail)

@@ -1,4 +1,4 @@
-"""Serve a virtual device in real time, with the faults that were asked for."""
+"""Serve a virtual device in real time: the loop, its transport (pseudo-terminal or socket), and faults on the wire."""
 
 from __future__ import annotations
 
@@ -22,6 +22,7 @@ from motorid.errors import UsageError
 BUFFER = 65_536  # bytes a device keeps for a computer that does not read; what is more is lost, as in reality
 STALLED = 0.5  # s without a byte taken after which the computer counts as one that does not read
 TICK = 0.002  # s
+LOOPBACK = "127.0.0.1"
 
 
 @dataclass(frozen=True)
@@ -44,24 +45,24 @@ class Pace:
     once: bool = False
 
 
-def serve(make: Callable[[], VirtualDevice], end: End, wire: Wire, pace: Pace,
+def serve(make: Callable[[], VirtualDevice], transport: Transport, wire: Wire, pace: Pace,
           stop: Callable[[], bool] = lambda: False) -> VirtualDevice:
     """Serve devices made by `make` until `stop()` says so; return the last one."""
-    bench = _Bench(make, end, wire, pace)
+    bench = _Bench(make, transport, wire, pace)
     try:
         while not stop() and not bench.over:
             bench.turn()
     finally:
         if bench.plugged:
-            end.unplug()
+            transport.unplug()
     return bench.device
 
 
 class _Bench:
     """One turn after the other: hear, run, speak."""
 
-    def __init__(self, make: Callable[[], VirtualDevice], end: End, wire: Wire, pace: Pace) -> None:
-        self.make, self.end, self.wire, self.pace = make, end, wire, pace
+    def __init__(self, make: Callable[[], VirtualDevice], transport: Transport, wire: Wire, pace: Pace) -> None:
+        self.make, self.transport, self.wire, self.pace = make, transport, wire, pace
         self.device = make()
         self.plugged, self.over = True, False
         self.unplug_at = pace.unplug_after
@@ -72,9 +73,9 @@ class _Bench:
     def turn(self) -> None:
         """Do what is due."""
         was_running = self.device.running
-        self.end.wait(bool(self.out), TICK if was_running and self.pace.speed else 0.05 * (not was_running))
+        self.transport.wait(bool(self.out), TICK if was_running and self.pace.speed else 0.05 * (not was_running))
         now = time.monotonic()
-        self.out += self.device.receive(self.end.read(), now) + self.device.watch(now)
+        self.out += self.device.receive(self.transport.read(), now) + self.device.watch(now)
         if self.device.running and not was_running:
             self.began, self.sent, self.ran = now, 0, True
         if self.device.running:
@@ -84,7 +85,7 @@ class _Bench:
             self.over = True
 
     def _speak(self, now: float) -> None:
-        taken = self.end.write(self.out) if self.out else 0
+        taken = self.transport.write(self.out) if self.out else 0
         if taken or not self.out:
             self.read_at = now
         self.out = self.out[taken:]
@@ -118,24 +119,21 @@ class _Bench:
         """Say what is in the buffer, vanish, and come back as a device that was just switched on."""
         end = time.monotonic() + 1.0
         while self.out and time.monotonic() < end:
-            self.end.wait(True, 0.05)
-            self.out = self.out[self.end.write(self.out):]
+            self.transport.wait(True, 0.05)
+            self.out = self.out[self.transport.write(self.out):]
         time.sleep(0.05)  # a pseudo-terminal forgets what was not yet read when it closes
-        self.end.unplug()
+        self.transport.unplug()
         self.plugged, self.out, self.unplug_at = False, b"", None
         if self.pace.plug_after is None:
             self.over = True
             return
         time.sleep(self.pace.plug_after)
         self.device, self.ran = self.make(), False
-        self.end.plug()
+        self.transport.plug()
         self.plugged = True
 
 
-LOOPBACK = "127.0.0.1"
-
-
-class End(Protocol):
+class Transport(Protocol):
     """The device's end of a wire."""
 
     name: str  # what the recorder is told as --port
@@ -276,7 +274,7 @@ class Socket:
             self._peer = None
 
 
-def open_end(link: Path | None = None, port: int | None = None) -> End:
+def open_transport(link: Path | None = None, port: int | None = None) -> Transport:
     """Open a pseudo-terminal, or a loopback socket where `port` is given or the system has no terminals."""
     return Pty(link) if port is None and hasattr(os, "openpty") else Socket(port or 0)
 

@@ -1,5 +1,7 @@
-"""A recording that is going on: take what comes, keep the device awake, notice every way in which it can
-end."""
+"""A recording session: take what comes, keep the device awake, notice every way in which it can end.
+
+`Session` leads from a `Setup` to a `Recording`; `Progress` is what the user sees meanwhile.
+"""
 
 from __future__ import annotations
 
@@ -14,8 +16,8 @@ from pathlib import Path
 
 from motorid.acquire.client import Client, LinkLost
 from motorid.acquire.protocol import Header, Message, Sample, frame
-from motorid.acquire.record_file import Commanded, RunFile
-from motorid.acquire.timeline import Ledger, Row
+from motorid.acquire.record_file import Commanded, RecordFile
+from motorid.acquire.timeline import Row, Timeline
 from motorid.display.cards import Card, Shown
 from motorid.display.tables import Flag
 
@@ -25,186 +27,6 @@ LAST_WORDS = 1.5  # s to wait for the device to say how many samples it made
 LOOK = 0.25  # s between two reports of progress
 # The device's word for why it ended -> ours; else done.
 REASONS = {"limit": "limit", "emergency": "emergency", "silent": "watchdog", "stop": "interrupted"}
-
-
-@dataclass(frozen=True, eq=False)
-class Setup:
-    """Everything that is settled before the motor moves."""
-
-    client: Client
-    header: Header  # channels calibrated
-    file: RunFile
-    segments: int
-    commanded: Commanded
-    i_max: float
-    total: float | None  # s, of the program or until stopped
-    duration: float | None  # s after which to stop
-    timeout: float
-    progress: Callable[[Progress], None] | None
-
-
-class Run:
-    """Starts the device, records until something ends it, stops it, and says what came of it."""
-
-    def __init__(self, setup: Setup, begin: Callable[[], None]) -> None:
-        self.s = setup
-        self.ended, self.detail = "", ""
-        self.made: int | None = None  # samples that the device made, once it has said so
-        self.last: Row | None = None
-        names = [c.name for c in setup.header.channels]
-        self._current = names.index("i") if "i" in names and math.isfinite(setup.i_max) else None
-        self._over, self._empty = 0, 0
-        setup.client.decoder.bad.clear()
-        counter, micros = setup.client.go(setup.segments)
-        self._heard = time.monotonic()
-        self._look = _Look(setup, self._heard)
-        self.ledger = Ledger(setup.header, counter, micros, self._heard)
-        begin()
-
-    def go(self) -> Recording:
-        """Record to the end."""
-        try:
-            with _by_hand(lambda: self._end("interrupted")):
-                self._record()
-                self._last_words()
-        except BaseException:
-            with contextlib.suppress(LinkLost):
-                self.s.client.link.write(frame("X"))
-            raise
-        return self._close()
-
-    def _record(self) -> None:
-        items, now = self.s.client.inbox, self._heard
-        try:
-            while True:
-                self._take(items, now)
-                self.s.file.flush()
-                self._watch(now)
-                if self.ended:  # only here: what was received is on its way to the disk
-                    return
-                self.s.client.keep_alive()
-                items, now = self.s.client.receive(0.05), time.monotonic()
-                self._empty = 0 if items else self._empty + 1
-        except LinkLost as error:
-            self._end("unplugged", str(error))
-        except OSError as error:
-            self._end("disk", f"{error.strerror}; {self.s.file.lines} whole lines are in the file")
-
-    def _take(self, items: list[Sample | Message], now: float) -> None:
-        for item in items:
-            if isinstance(item, Message):
-                self._message(item.fields)
-            elif rows := self.ledger.accept(item, now):
-                self.s.file.add(rows, self.s.commanded)
-                self.last, self._heard = rows[-1], now
-                if self._current is not None:
-                    self._check_current(rows, self._current)
-
-    def _check_current(self, rows: list[Row], k: int) -> None:
-        for row in rows:
-            self._over = self._over + 1 if abs(row.values[k]) > self.s.i_max else 0
-            if self._over >= OVER_LIMIT:
-                self._end("limit")
-
-    def _message(self, fields: list[str]) -> None:
-        if fields[0] == "H":
-            self._end("restarted")
-        elif fields[:2] == ["E", "done"] and len(fields) > 2 and fields[2].isdigit():
-            if int(fields[2]) < self.ledger.next_index:
-                self._end("restarted")
-            else:
-                self.made = int(fields[2])
-                self._end(REASONS.get("".join(fields[3:4]), "done"))
-
-    def _end(self, why: str, detail: str = "") -> None:
-        if not self.ended:
-            self.ended, self.detail = why, detail
-
-    def _watch(self, now: float) -> None:
-        elapsed = self.last.time if self.last else 0.0
-        if self.s.duration is not None and elapsed >= self.s.duration - 1.5 / self.s.header.rate:
-            self._end("duration")
-        # Of a computer that was held up itself nothing can be said; hence the empty readings.
-        if now - self._heard > self.s.timeout and self._empty >= EMPTY:
-            self._end("silent", f"no valid line for {self.s.timeout:g} s")
-        self._look.at(self.ledger, self.last, bool(self.ended))
-
-    def _last_words(self) -> None:
-        """Switch the motor off and learn how many samples there were."""
-        if self.ended in ("unplugged", "restarted"):
-            return
-        end, ask = time.monotonic() + LAST_WORDS, 0.0
-        with contextlib.suppress(LinkLost):
-            while self.made is None and time.monotonic() < end:
-                if time.monotonic() > ask:
-                    self.s.client.link.write(frame("X"))
-                    ask = time.monotonic() + 0.3
-                items = self.s.client.receive(0.05)
-                wanted = [i for i in items if self.ended != "disk" or isinstance(i, Message)]
-                self._take(wanted, time.monotonic())
-
-    def _close(self) -> Recording:
-        self.s.client.decoder.close()
-        if self.ended == "disk":
-            return self._outcome()
-        try:
-            self.s.file.add(self.ledger.finish(self.made), self.s.commanded)
-            self.s.file.mark_missing(self.made or 0, self.s.commanded)
-            self.s.file.note(self._outcome().meta)
-            self.s.file.flush()
-            self.s.file.close()
-        except OSError as error:
-            self.ended, self.detail = "disk", error.strerror or str(error)
-        return self._outcome()
-
-    def _outcome(self) -> Recording:
-        ledger, received = self.ledger, self.ledger.received
-        lost = max(ledger.lost, (self.made or 0) - received)
-        seconds = self.last.time + 1 / self.s.header.rate if self.last else 0.0
-        bad = self.s.client.decoder.bad + ledger.bad
-        return Recording(self.s.file.out, self.s.header, self.ended, self.detail, received, lost,
-                         self.made is not None, seconds, dict(bad), dict(ledger.clipped))
-
-
-class _Look:
-    """Calls the user's function with a `Progress`, a few times a second."""
-
-    def __init__(self, setup: Setup, now: float) -> None:
-        self.s, self.before = setup, (now, 0, 0.0)
-
-    def at(self, ledger: Ledger, last: Row | None, final: bool) -> None:
-        now, (looked, samples, seconds) = time.monotonic(), self.before
-        if self.s.progress is None or last is None or (now - looked < LOOK and not final):
-            return
-        passed = last.time - seconds
-        rate = (ledger.received - samples) / passed if passed > 0 else 0.0
-        names = (c.name for c in self.s.header.channels)
-        self.before = (now, ledger.received, last.time)
-        self.s.progress(Progress(last.time, self.s.total, rate, ledger.received, ledger.lost,
-                                 dict(zip(names, last.values, strict=True))))
-
-
-@contextlib.contextmanager
-def _by_hand(stop: Callable[[], None]) -> Iterator[None]:
-    """Turn Ctrl-C and a polite kill into an orderly end; a second Ctrl-C is not so patient."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = {s: signal.getsignal(s) for s in (signal.SIGINT, signal.SIGTERM)}
-
-    def handler(number: int, _: object) -> None:
-        signal.signal(number, before[signal.Signals(number)])
-        stop()
-
-    for number in before:
-        signal.signal(number, handler)
-    try:
-        yield
-    finally:
-        for number, old in before.items():
-            signal.signal(number, old)
-
-
 # Why a recording ended -> the sentence that says so.
 SENTENCES = {
     "done": "The excitation ran to its end.",
@@ -222,6 +44,184 @@ SENTENCES = {
     "disk": "The disk refused the data; the motor was stopped. Make room, then go on with --resume.",
 }
 COMPLETE = ("done", "duration", "interrupted")
+
+
+@dataclass(frozen=True, eq=False)
+class Setup:
+    """Everything that is settled before the motor moves."""
+
+    client: Client
+    header: Header  # channels calibrated
+    file: RecordFile
+    segments: int
+    commanded: Commanded
+    i_max: float
+    total: float | None  # s, of the program or until stopped
+    duration: float | None  # s after which to stop
+    timeout: float
+    progress: Callable[[Progress], None] | None
+
+
+class Session:
+    """Starts the device, records until something ends it, stops it, and says what came of it."""
+
+    def __init__(self, setup: Setup, begin: Callable[[], None]) -> None:
+        self.setup = setup
+        self.ended, self.detail = "", ""
+        self.made: int | None = None  # samples that the device made, once it has said so
+        self.last: Row | None = None
+        names = [c.name for c in setup.header.channels]
+        self._current = names.index("i") if "i" in names and math.isfinite(setup.i_max) else None
+        self._over, self._empty = 0, 0
+        setup.client.decoder.bad.clear()
+        counter, micros = setup.client.go(setup.segments)
+        self._heard = time.monotonic()
+        self._reports = _ProgressReports(setup, self._heard)
+        self.timeline = Timeline(setup.header, counter, micros, self._heard)
+        begin()
+
+    def run(self) -> Recording:
+        """Record to the end."""
+        try:
+            with _stop_by_signal(lambda: self._end("interrupted")):
+                self._record()
+                self._last_words()
+        except BaseException:
+            with contextlib.suppress(LinkLost):
+                self.setup.client.link.write(frame("X"))
+            raise
+        return self._close()
+
+    def _record(self) -> None:
+        items, now = self.setup.client.inbox, self._heard
+        try:
+            while True:
+                self._take(items, now)
+                self.setup.file.flush()
+                self._watch(now)
+                if self.ended:  # only here: what was received is on its way to the disk
+                    return
+                self.setup.client.keep_alive()
+                items, now = self.setup.client.receive(0.05), time.monotonic()
+                self._empty = 0 if items else self._empty + 1
+        except LinkLost as error:
+            self._end("unplugged", str(error))
+        except OSError as error:
+            self._end("disk", f"{error.strerror}; {self.setup.file.lines} whole lines are in the file")
+
+    def _take(self, items: list[Sample | Message], now: float) -> None:
+        for item in items:
+            if isinstance(item, Message):
+                self._message(item.fields)
+            elif rows := self.timeline.accept(item, now):
+                self.setup.file.add(rows, self.setup.commanded)
+                self.last, self._heard = rows[-1], now
+                if self._current is not None:
+                    self._check_current(rows, self._current)
+
+    def _check_current(self, rows: list[Row], k: int) -> None:
+        for row in rows:
+            self._over = self._over + 1 if abs(row.values[k]) > self.setup.i_max else 0
+            if self._over >= OVER_LIMIT:
+                self._end("limit")
+
+    def _message(self, fields: list[str]) -> None:
+        if fields[0] == "H":
+            self._end("restarted")
+        elif fields[:2] == ["E", "done"] and len(fields) > 2 and fields[2].isdigit():
+            if int(fields[2]) < self.timeline.next_index:
+                self._end("restarted")
+            else:
+                self.made = int(fields[2])
+                self._end(REASONS.get("".join(fields[3:4]), "done"))
+
+    def _end(self, why: str, detail: str = "") -> None:
+        if not self.ended:
+            self.ended, self.detail = why, detail
+
+    def _watch(self, now: float) -> None:
+        elapsed = self.last.time if self.last else 0.0
+        if self.setup.duration is not None and elapsed >= self.setup.duration - 1.5 / self.setup.header.rate:
+            self._end("duration")
+        # Of a computer that was held up itself nothing can be said; hence the empty readings.
+        if now - self._heard > self.setup.timeout and self._empty >= EMPTY:
+            self._end("silent", f"no valid line for {self.setup.timeout:g} s")
+        self._reports.at(self.timeline, self.last, bool(self.ended))
+
+    def _last_words(self) -> None:
+        """Switch the motor off and learn how many samples there were."""
+        if self.ended in ("unplugged", "restarted"):
+            return
+        end, ask = time.monotonic() + LAST_WORDS, 0.0
+        with contextlib.suppress(LinkLost):
+            while self.made is None and time.monotonic() < end:
+                if time.monotonic() > ask:
+                    self.setup.client.link.write(frame("X"))
+                    ask = time.monotonic() + 0.3
+                items = self.setup.client.receive(0.05)
+                wanted = [i for i in items if self.ended != "disk" or isinstance(i, Message)]
+                self._take(wanted, time.monotonic())
+
+    def _close(self) -> Recording:
+        self.setup.client.decoder.close()
+        if self.ended == "disk":
+            return self._outcome()
+        try:
+            self.setup.file.add(self.timeline.finish(self.made), self.setup.commanded)
+            self.setup.file.mark_missing(self.made or 0, self.setup.commanded)
+            self.setup.file.note(self._outcome().meta)
+            self.setup.file.flush()
+            self.setup.file.close()
+        except OSError as error:
+            self.ended, self.detail = "disk", error.strerror or str(error)
+        return self._outcome()
+
+    def _outcome(self) -> Recording:
+        timeline, received = self.timeline, self.timeline.received
+        lost = max(timeline.lost, (self.made or 0) - received)
+        seconds = self.last.time + 1 / self.setup.header.rate if self.last else 0.0
+        bad = self.setup.client.decoder.bad + timeline.bad
+        return Recording(self.setup.file.out, self.setup.header, self.ended, self.detail, received, lost,
+                         self.made is not None, seconds, dict(bad), dict(timeline.clipped))
+
+
+class _ProgressReports:
+    """Calls the user's function with a `Progress`, a few times a second."""
+
+    def __init__(self, setup: Setup, now: float) -> None:
+        self.setup, self.before = setup, (now, 0, 0.0)
+
+    def at(self, timeline: Timeline, last: Row | None, final: bool) -> None:
+        now, (looked, samples, seconds) = time.monotonic(), self.before
+        if self.setup.progress is None or last is None or (now - looked < LOOK and not final):
+            return
+        passed = last.time - seconds
+        rate = (timeline.received - samples) / passed if passed > 0 else 0.0
+        names = (c.name for c in self.setup.header.channels)
+        self.before = (now, timeline.received, last.time)
+        self.setup.progress(Progress(last.time, self.setup.total, rate, timeline.received, timeline.lost,
+                                 dict(zip(names, last.values, strict=True))))
+
+
+@contextlib.contextmanager
+def _stop_by_signal(stop: Callable[[], None]) -> Iterator[None]:
+    """Turn Ctrl-C and a polite kill into an orderly end; a second Ctrl-C is not so patient."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = {s: signal.getsignal(s) for s in (signal.SIGINT, signal.SIGTERM)}
+
+    def handler(number: int, _: object) -> None:
+        signal.signal(number, before[signal.Signals(number)])
+        stop()
+
+    for number in before:
+        signal.signal(number, handler)
+    try:
+        yield
+    finally:
+        for number, old in before.items():
+            signal.signal(number, old)
 
 
 @dataclass(frozen=True)

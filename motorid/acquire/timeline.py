@@ -3,14 +3,10 @@
 from __future__ import annotations
 
 import math
-import tomllib
 from collections import Counter
-from dataclasses import replace
-from pathlib import Path
 from typing import NamedTuple
 
 from motorid.acquire.protocol import Channel, Header, Sample
-from motorid.errors import DataError, one_of
 
 
 class Row(NamedTuple):
@@ -29,8 +25,8 @@ class _Mark(NamedTuple):
     host: float  # clock of the computer, s
 
 
-class Ledger:
-    """Places samples on the axis of a run and keeps account of what is lost.
+class Timeline:
+    """Places samples on the time axis of a run and counts what is lost.
 
     A gap is the step of the counter. Where the counter may have wrapped more than once the timer decides, and
     where the timer may have wrapped too, the clock of the computer. A sample whose counter and time
@@ -57,7 +53,7 @@ class Ledger:
         period = round(1e6 / header.rate)
         self._last = _Mark((counter - 1) % self._wrap[0], (time - period) % self._wrap[1], -1, -period, host)
         self._doubtful: tuple[_Mark, Sample] | None = None
-        self._turns = {k: _Turns(c.span) for k, c in enumerate(header.channels) if c.wraps}
+        self._unwrappers = {k: _Unwrapper(c.span) for k, c in enumerate(header.channels) if c.wraps}
 
     @property
     def next_index(self) -> int:
@@ -131,15 +127,15 @@ class Ledger:
         self.received += 1
         values = []
         for k, (channel, raw) in enumerate(zip(self.header.channels, sample.raw, strict=True)):
-            if k in self._turns:
-                raw = self._turns[k].unwrap(raw, step)
+            if k in self._unwrappers:
+                raw = self._unwrappers[k].unwrap(raw, step)
             elif channel.kind != "n" and not 0 < raw < channel.span - 1 and not math.isnan(raw):
                 self.clipped[channel.name] += 1
             values.append(_si(channel, raw))
         return Row(mark.index, mark.micros * 1e-6, tuple(values))
 
 
-class _Turns:
+class _Unwrapper:
     """Unwraps one counter, carrying its last rate on across a gap."""
 
     def __init__(self, span: int) -> None:
@@ -160,53 +156,3 @@ class _Turns:
 
 def _si(channel: Channel, raw: float) -> float:
     return channel.scale * (raw - channel.offset)
-
-
-_ENTRIES = ("scale", "offset", "gain", "zero", "sign")
-
-
-def read_calibration(path: str | Path) -> dict[str, dict[str, float]]:
-    """Read a calibration file: entries by channel.
-
-    Raises
-    ------
-    DataError
-        If it cannot be read, or holds an entry that is not known or not a finite number.
-    """
-    try:
-        tables = tomllib.loads(Path(path).read_text(encoding="utf-8"))
-    except OSError as error:
-        raise DataError(f"the calibration file {path} cannot be read: {error.strerror}.") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise DataError(f"the calibration file {path} is not TOML: {error}.") from None
-    for channel, entries in tables.items():
-        if not isinstance(entries, dict):
-            raise DataError(f"{path}: expected a table [channel] with entries; '{channel}' stands alone.")
-        for name, value in entries.items():
-            if name not in _ENTRIES:
-                raise DataError(f"{path}, [{channel}]: {one_of(name, _ENTRIES, 'entry')}")
-            if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-                raise DataError(f"{path}, [{channel}]: {name} must be a number; got {value!r}.")
-            if name == "sign" and value not in (1, -1):
-                raise DataError(f"{path}, [{channel}]: sign is 1 or -1; got {value}.")
-            if name in ("scale", "gain") and value == 0:
-                raise DataError(f"{path}, [{channel}]: {name} must not be zero.")
-    return tables
-
-
-def calibrate(header: Header, calibration: dict[str, dict[str, float]]) -> Header:
-    """Return the header with the channels' scales and offsets as the calibration wants them."""
-    names = [c.name for c in header.channels]
-    for name in calibration:
-        if name not in names:
-            raise DataError(f"the calibration speaks of a channel that the device does not send: "
-                            f"{one_of(name, names, 'channel')}")
-    channels = tuple(_calibrated(c, calibration.get(c.name, {})) for c in header.channels)
-    return replace(header, channels=channels)
-
-
-def _calibrated(channel: Channel, entries: dict[str, float]) -> Channel:
-    offset = entries.get("offset", channel.offset)
-    scale = entries.get("scale", channel.scale) * entries.get("gain", 1.0) * entries.get("sign", 1)
-    # zero + scale·(raw − offset) is scale·(raw − (offset − zero/scale)).
-    return replace(channel, scale=scale, offset=offset - entries.get("zero", 0.0) / scale)

@@ -1,7 +1,8 @@
-"""A bench made of software: the plant behind a converter and an encoder, speaking the protocol.
+"""A bench made of software: a motor with a hidden effect behind a converter and an encoder, speaking the protocol.
 
 `VirtualDevice` knows nothing of wires or clocks: bytes go in, bytes come out, and `run` makes the next
-samples. What serves it over a pseudo-terminal in real time is in `motorid.acquire.serve`.
+samples. What serves it over a pseudo-terminal in real time is in `motorid.acquire.server`. `hide` chooses the motor
+and what is hidden in it; its equations are those of the plant, which shares no code with the models.
 """
 
 from __future__ import annotations
@@ -22,6 +23,8 @@ LINES_PER_TURN = 4096  # encoder counts, after quadrature
 NOISE = 0.5  # standard deviation of the converters' noise, in counts
 BLOCK = 256  # samples whose noise is drawn at once
 OVER_LIMIT = 3  # samples in a row beyond the current limit that switch the motor off
+
+Draw = Callable[[float, float], float]  # a number between two, evenly on a log scale
 
 
 class VirtualDevice:
@@ -191,51 +194,6 @@ _CONVERT: dict[str, Callable[[Any, int, dict[str, float], list[float]], int]] = 
 }
 
 
-Draw = Callable[[float, float], float]  # a number between two, evenly on a log scale
-
-
-def _stall(m: Any) -> float:
-    return m.K * m.v_max / m.R  # N·m at v_max with the shaft held
-
-
-def _friction(m: Any, draw: Draw) -> dict[str, float]:
-    return {"tau_c": _stall(m) * draw(0.02, 0.06)}
-
-
-def _stribeck(m: Any, draw: Draw) -> dict[str, float]:
-    tau_c = _stall(m) * draw(0.02, 0.04)
-    return {"tau_c": tau_c, "tau_s": tau_c * draw(1.6, 2.2), "omega_s": m.no_load_speed * draw(0.02, 0.05)}
-
-
-def _asymmetric(m: Any, draw: Draw) -> dict[str, float]:
-    tau = _stall(m) * draw(0.02, 0.05)
-    return {"tau_cp": tau, "tau_cn": tau * draw(1.6, 2.5)}
-
-
-def _cogging(m: Any, draw: Draw) -> dict[str, float]:
-    return {"A": _stall(m) * draw(0.03, 0.06), "N": float(round(draw(3.6, 12.4))), "phi": 0.5}
-
-
-# Sizes by effect, from the motor's own scales. An effect that is not here needs its numbers spelt out.
-SIZES: Mapping[str, Callable[[Any, Draw], dict[str, float]]] = {
-    "coulomb": _friction,
-    "coulomb_asymmetric": _asymmetric,
-    "stribeck": _stribeck,
-    "quadratic_drag": lambda m, draw: {"c_2": _stall(m) * draw(0.05, 0.15) / (0.6 * m.no_load_speed) ** 2},
-    "constant_load": lambda m, draw: {"tau_0": _stall(m) * draw(0.03, 0.08)},
-    "gravity": lambda m, draw: {"mgl": _stall(m) * draw(0.04, 0.1)},
-    "cogging": _cogging,
-    "load_friction": lambda m, draw: {"mu": draw(0.06, 0.15)},
-    "brush_drop": lambda m, draw: {"V_b": m.v_max * draw(0.04, 0.08), "i_b": m.v_max / m.R * 0.01},
-    "driver_dead_band": lambda m, draw: {"V_d": m.v_max * draw(0.03, 0.07)},
-    "voltage_offset": lambda m, draw: {"V_0": m.v_max * draw(0.02, 0.05)},
-    "magnetic_saturation": lambda m, draw: {"i_K": m.v_max / m.R * draw(0.6, 1.0)},
-    "current_offset": lambda m, draw: {"i_0": m.v_max / m.R * draw(0.02, 0.05)},
-    "speed_lag": lambda m, draw: {"T_w": m.J * m.R / m.K**2 * draw(0.1, 0.25)},
-    "speed_delay": lambda m, draw: {"T_d": m.J * m.R / m.K**2 * draw(0.1, 0.2)},
-}
-
-
 @dataclass(frozen=True, eq=False)
 class Truth:
     """The motor and what is hidden in it."""
@@ -305,3 +263,45 @@ def _effect(word: str, motor: Any, draw: Draw) -> tuple[str, dict[str, float]]:
         raise UsageError(f"no size is drawn for '{name}'; spell its numbers out, as in {name}:name=value. "
                          f"Drawn are: {', '.join(SIZES)}.")
     return name, SIZES[name](motor, draw)
+
+
+def _stall(m: Any) -> float:
+    return m.K * m.v_max / m.R  # N·m at v_max with the shaft held
+
+
+def _friction(m: Any, draw: Draw) -> dict[str, float]:
+    return {"tau_c": _stall(m) * draw(0.02, 0.06)}
+
+
+def _stribeck(m: Any, draw: Draw) -> dict[str, float]:
+    tau_c = _stall(m) * draw(0.02, 0.04)
+    return {"tau_c": tau_c, "tau_s": tau_c * draw(1.6, 2.2), "omega_s": m.no_load_speed * draw(0.02, 0.05)}
+
+
+def _asymmetric(m: Any, draw: Draw) -> dict[str, float]:
+    tau = _stall(m) * draw(0.02, 0.05)
+    return {"tau_cp": tau, "tau_cn": tau * draw(1.6, 2.5)}
+
+
+def _cogging(m: Any, draw: Draw) -> dict[str, float]:
+    return {"A": _stall(m) * draw(0.03, 0.06), "N": float(round(draw(3.6, 12.4))), "phi": 0.5}
+
+
+# Sizes by effect, from the motor's own scales. An effect that is not here needs its numbers spelt out.
+SIZES: Mapping[str, Callable[[Any, Draw], dict[str, float]]] = {
+    "coulomb": _friction,
+    "coulomb_asymmetric": _asymmetric,
+    "stribeck": _stribeck,
+    "quadratic_drag": lambda m, draw: {"c_2": _stall(m) * draw(0.05, 0.15) / (0.6 * m.no_load_speed) ** 2},
+    "constant_load": lambda m, draw: {"tau_0": _stall(m) * draw(0.03, 0.08)},
+    "gravity": lambda m, draw: {"mgl": _stall(m) * draw(0.04, 0.1)},
+    "cogging": _cogging,
+    "load_friction": lambda m, draw: {"mu": draw(0.06, 0.15)},
+    "brush_drop": lambda m, draw: {"V_b": m.v_max * draw(0.04, 0.08), "i_b": m.v_max / m.R * 0.01},
+    "driver_dead_band": lambda m, draw: {"V_d": m.v_max * draw(0.03, 0.07)},
+    "voltage_offset": lambda m, draw: {"V_0": m.v_max * draw(0.02, 0.05)},
+    "magnetic_saturation": lambda m, draw: {"i_K": m.v_max / m.R * draw(0.6, 1.0)},
+    "current_offset": lambda m, draw: {"i_0": m.v_max / m.R * draw(0.02, 0.05)},
+    "speed_lag": lambda m, draw: {"T_w": m.J * m.R / m.K**2 * draw(0.1, 0.25)},
+    "speed_delay": lambda m, draw: {"T_d": m.J * m.R / m.K**2 * draw(0.1, 0.2)},
+}

@@ -15,7 +15,7 @@ import numpy as np
 import typer
 
 from motorid.acquire.recorder import record
-from motorid.acquire.server import Faults, Pace, Wire, open_end, serve
+from motorid.acquire.server import Faults, Pace, Wire, open_transport, serve
 from motorid.acquire.session import Progress
 from motorid.acquire.virtual import VirtualDevice, hide
 from motorid.cli.console import FAILED
@@ -158,7 +158,7 @@ def bench_command(
     truth, names = hide(effect, motor, seed), tuple(channels.replace(" ", "").split(","))
     VirtualDevice(truth, rate, names)  # complain before anything opens
     wire = Wire(Faults(drop, garbage, cut, flip), np.random.default_rng([seed, 2]))
-    end = open_end(link, socket)
+    end = open_transport(link, socket)
     typer.echo(f"port: {end.name}")
     typer.echo(f"A virtual motor '{motor}' at {rate:g} samples per second; now, in another terminal:\n"
                f"  motorid record --port {end.name} --out run.csv --excite standard\nCtrl-C ends it.")

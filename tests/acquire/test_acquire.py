@@ -13,10 +13,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from motorid.acquire.calibration import calibrate, read_calibration
 from motorid.acquire.excitation import Program, Segment, lfsr_bits, program
 from motorid.acquire.protocol import Channel, Decoder, Header, Message, Sample, crc16, frame
-from motorid.acquire.record_file import RunFile, check_target, column, read_tail
-from motorid.acquire.timeline import Ledger, Row, calibrate, read_calibration
+from motorid.acquire.record_file import RecordFile, check_target, column, read_tail
+from motorid.acquire.timeline import Row, Timeline
 from motorid.errors import DataError, DeviceError, UsageError
 
 CHANNELS = (Channel("v", "V", 1e-3), Channel("i", "A", 0.005, 2048, "a12"),
@@ -119,106 +120,106 @@ def test_a_header_that_cannot_be_is_refused_with_the_reason(field, value, said):
         Header.read(fields)
 
 
-# --------------------------------------------------------------------------------------------------- ledger
+# --------------------------------------------------------------------------------------------------- timeline
 
 
-def told(ledger: Ledger, *marks: tuple[int, int], host: float = 0.0) -> list[Row]:
+def told(timeline: Timeline, *marks: tuple[int, int], host: float = 0.0) -> list[Row]:
     """Feed samples by unwrapped counter and time."""
     out = []
     for counter, micros in marks:
         wrapped = Sample(counter % 2**16, micros % 2**32, (1000.0, 2048.0, 0.0))
-        out += ledger.accept(wrapped, host)
+        out += timeline.accept(wrapped, host)
     return out
 
 
 def test_counter_and_timer_wrap_without_a_trace():
     c0, t0 = 2**16 - 3, 2**32 - 2500
-    ledger = Ledger(HEADER, c0, t0)
-    rows = told(ledger, *((c0 + k, t0 + 1000 * k) for k in range(10)))
+    timeline = Timeline(HEADER, c0, t0)
+    rows = told(timeline, *((c0 + k, t0 + 1000 * k) for k in range(10)))
     assert [r.index for r in rows] == list(range(10))
     assert [r.time for r in rows] == pytest.approx([k * 1e-3 for k in range(10)])
-    assert ledger.lost == 0
+    assert timeline.lost == 0
 
 
 @quick
 @given(st.sets(st.integers(0, 400), min_size=1), st.integers(0, 2**16 - 1), st.integers(0, 2**32 - 1))
 def test_every_gap_is_counted_and_every_row_in_its_place(kept, c0, t0):
-    ledger = Ledger(HEADER, c0, t0)
-    rows = told(ledger, *((c0 + k, t0 + 1000 * k) for k in sorted(kept)))
-    rows += ledger.finish()
+    timeline = Timeline(HEADER, c0, t0)
+    rows = told(timeline, *((c0 + k, t0 + 1000 * k) for k in sorted(kept)))
+    rows += timeline.finish()
     assert [r.index for r in rows] == sorted(kept)
-    assert ledger.lost == max(kept) + 1 - len(kept)
+    assert timeline.lost == max(kept) + 1 - len(kept)
 
 
 def test_a_gap_of_several_turns_of_the_counter_is_told_by_the_timer():
-    ledger = Ledger(HEADER, 0, 0)
-    rows = told(ledger, (0, 0), (200_000, 200_000_000), (200_001, 200_001_000))
+    timeline = Timeline(HEADER, 0, 0)
+    rows = told(timeline, (0, 0), (200_000, 200_000_000), (200_001, 200_001_000))
     assert [r.index for r in rows] == [0, 200_000, 200_001]
 
 
 def test_a_gap_of_more_than_a_turn_of_the_timer_is_told_by_the_computers_clock():
     hours = 3 * 3600
-    ledger = Ledger(HEADER, 0, 0, host=10.0)
-    told(ledger, (0, 0), host=10.0)
+    timeline = Timeline(HEADER, 0, 0, host=10.0)
+    told(timeline, (0, 0), host=10.0)
     n = hours * 1000
-    rows = told(ledger, (n, n * 1000), (n + 1, n * 1000 + 1000), host=10.0 + hours)
+    rows = told(timeline, (n, n * 1000), (n + 1, n * 1000 + 1000), host=10.0 + hours)
     assert [r.index for r in rows] == [n, n + 1]
     assert rows[0].time == pytest.approx(hours)
 
 
 def test_repeated_and_late_lines_are_dropped_and_counted():
-    ledger = Ledger(HEADER, 0, 0)
-    rows = told(ledger, (0, 0), (1, 1000), (1, 1000), (2, 2000), (0, 0), (3, 3000))
+    timeline = Timeline(HEADER, 0, 0)
+    rows = told(timeline, (0, 0), (1, 1000), (1, 1000), (2, 2000), (0, 0), (3, 3000))
     assert [r.index for r in rows] == [0, 1, 2, 3]
-    assert ledger.bad == {"repeated": 1, "out of order": 1}
-    assert ledger.lost == 0
+    assert timeline.bad == {"repeated": 1, "out of order": 1}
+    assert timeline.lost == 0
 
 
 def test_a_false_line_with_a_valid_crc_opens_no_gap():
-    ledger = Ledger(HEADER, 0, 0)
-    rows = told(ledger, (0, 0), (1, 1000), (30_000, 2000), (2, 2000), (3, 3000))
+    timeline = Timeline(HEADER, 0, 0)
+    rows = told(timeline, (0, 0), (1, 1000), (30_000, 2000), (2, 2000), (3, 3000))
     assert [r.index for r in rows] == [0, 1, 2, 3]
-    assert ledger.bad == {"implausible": 1}
+    assert timeline.bad == {"implausible": 1}
 
 
 def test_a_device_that_paused_is_believed_when_it_goes_on():
-    ledger = Ledger(HEADER, 0, 0)
-    rows = told(ledger, (0, 0), (1, 1000), (2, 900_000), (3, 901_000))
+    timeline = Timeline(HEADER, 0, 0)
+    rows = told(timeline, (0, 0), (1, 1000), (2, 900_000), (3, 901_000))
     assert [r.time for r in rows] == pytest.approx([0, 1e-3, 0.9, 0.901])
 
 
 def test_the_last_line_is_not_lost_for_being_odd():
-    ledger = Ledger(HEADER, 0, 0)
-    assert len(told(ledger, (0, 0), (1, 900_000))) == 1
-    assert [r.index for r in ledger.finish(2)] == [1]
-    assert ledger.lost == 0
+    timeline = Timeline(HEADER, 0, 0)
+    assert len(told(timeline, (0, 0), (1, 900_000))) == 1
+    assert [r.index for r in timeline.finish(2)] == [1]
+    assert timeline.lost == 0
 
 
 def test_encoder_wraps_at_speed_and_across_gaps(rng):
-    ledger = Ledger(HEADER, 0, 0)
+    timeline = Timeline(HEADER, 0, 0)
     angle = np.cumsum(np.full(3000, 9_000.0) + rng.normal(0, 50, 3000)).round()  # 7 samples a turn of 16 bits
     rows = []
     for k in range(3000):
         if not 1000 <= k < 1040:  # the angle turns five times in the gap
             raw = (angle[k] + 2**15) % 2**16 - 2**15 if k % 2 else angle[k] % 2**16  # signed or not
-            rows += ledger.accept(Sample(k % 2**16, k * 1000, (0.0, 2048.0, raw)))
+            rows += timeline.accept(Sample(k % 2**16, k * 1000, (0.0, 2048.0, raw)))
     got = np.array([r.values[2] for r in rows]) / 0.01
     kept = np.r_[0:1000, 1040:3000]
     assert got == pytest.approx(angle[kept])
 
 
 def test_clipped_samples_are_counted():
-    ledger = Ledger(HEADER, 0, 0)
+    timeline = Timeline(HEADER, 0, 0)
     for k, raw in enumerate((0.0, 1.0, 4094.0, 4095.0, math.nan)):
-        ledger.accept(Sample(k, k * 1000, (0.0, raw, 0.0)))
-    assert ledger.clipped == {"i": 2}
+        timeline.accept(Sample(k, k * 1000, (0.0, raw, 0.0)))
+    assert timeline.clipped == {"i": 2}
 
 
 def test_a_line_with_the_wrong_number_of_values_is_not_understood():
-    ledger = Ledger(HEADER, 0, 0)
-    assert ledger.accept(Sample(0, 0, (1.0, 2.0))) == []
-    assert ledger.accept(Sample(2**16, 0, (1.0, 2.0, 3.0))) == []
-    assert ledger.bad == {"not understood": 2}
+    timeline = Timeline(HEADER, 0, 0)
+    assert timeline.accept(Sample(0, 0, (1.0, 2.0))) == []
+    assert timeline.accept(Sample(2**16, 0, (1.0, 2.0, 3.0))) == []
+    assert timeline.bad == {"not understood": 2}
 
 
 # ----------------------------------------------------------------------------------------------- excitation
@@ -310,7 +311,7 @@ def test_calibration_replaces_and_corrects(tmp_path):
     path = tmp_path / "bench.toml"
     path.write_text("[i]\noffset = 2000\nscale = 0.01\nsign = -1\n[v]\ngain = 0.5\nzero = 0.25\n")
     header = calibrate(HEADER, read_calibration(path))
-    row = Ledger(header, 0, 0).accept(Sample(0, 0, (8000.0, 2100.0, 7.0)))[0]
+    row = Timeline(header, 0, 0).accept(Sample(0, 0, (8000.0, 2100.0, 7.0)))[0]
     assert row.values == pytest.approx((0.5 * 8 + 0.25, -1.0, 0.07))
 
 
@@ -343,7 +344,7 @@ def data_lines(path) -> list[str]:
 
 
 def test_gaps_become_rows_with_the_command_and_nothing_measured(tmp_path):
-    file = RunFile(tmp_path / "run.csv", CHANNELS, 1000.0, {"device": "a\nb"})
+    file = RecordFile(tmp_path / "run.csv", CHANNELS, 1000.0, {"device": "a\nb"})
     file.add(rows(0, 1, 4), lambda k: {2: 3.0}.get(k))
     file.mark_missing(6)
     file.flush()
@@ -355,7 +356,7 @@ def test_gaps_become_rows_with_the_command_and_nothing_measured(tmp_path):
 
 
 def test_a_gap_at_the_very_start_is_marked_too(tmp_path):
-    file = RunFile(tmp_path / "run.csv", CHANNELS, 1000.0, {})
+    file = RecordFile(tmp_path / "run.csv", CHANNELS, 1000.0, {})
     file.add(rows(2), lambda k: 1.5)
     file.flush()
     file.close()
@@ -364,7 +365,7 @@ def test_a_gap_at_the_very_start_is_marked_too(tmp_path):
 
 
 def test_a_gap_of_hours_is_marked_by_its_ends(tmp_path):
-    file = RunFile(tmp_path / "run.csv", CHANNELS, 1000.0, {})
+    file = RecordFile(tmp_path / "run.csv", CHANNELS, 1000.0, {})
     file.add(rows(0, 10_000_000))
     file.flush()
     file.close()
@@ -378,7 +379,7 @@ def test_nothing_is_overwritten_unasked(tmp_path):
     with pytest.raises(UsageError, match="exists and is left alone"):
         check_target(path, resume=False, force=False)
     with pytest.raises(UsageError, match="appeared meanwhile"):
-        RunFile(path, CHANNELS, 1000.0, {})
+        RecordFile(path, CHANNELS, 1000.0, {})
     assert path.read_text() == "precious"
     for out, resume, force, said in ((path, True, True, "give one"), (tmp_path, False, True, "not a file"),
                                      (tmp_path / "a" / "b.csv", False, False, "folder")):
@@ -387,9 +388,9 @@ def test_nothing_is_overwritten_unasked(tmp_path):
 
 
 def test_two_recorders_cannot_write_one_file(tmp_path):
-    first = RunFile(tmp_path / "run.csv", CHANNELS, 1000.0, {})
+    first = RecordFile(tmp_path / "run.csv", CHANNELS, 1000.0, {})
     with pytest.raises(UsageError, match="another recorder"):
-        RunFile(tmp_path / "run.csv", CHANNELS, 1000.0, {}, "resume")
+        RecordFile(tmp_path / "run.csv", CHANNELS, 1000.0, {}, "resume")
     first.close()
 
 
@@ -398,7 +399,7 @@ def test_trouble_in_the_background_is_told_at_the_next_line(tmp_path, monkeypatc
         raise OSError(5, "Input/output error")
 
     monkeypatch.setattr("motorid.acquire.record_file.SYNC_EVERY", 0.01)
-    file = RunFile(tmp_path / "run.csv", CHANNELS, 1000.0, {})
+    file = RecordFile(tmp_path / "run.csv", CHANNELS, 1000.0, {})
     monkeypatch.setattr(os, "fsync", broken)
     file.add(rows(0))
     file.flush()
@@ -412,7 +413,7 @@ def test_trouble_in_the_background_is_told_at_the_next_line(tmp_path, monkeypatc
 
 def test_a_line_cut_off_by_a_power_cut_is_cut_away_on_resuming(tmp_path):
     path = tmp_path / "run.csv"
-    file = RunFile(path, CHANNELS, 1000.0, {"started": "2024-01-01T00:00:00+00:00"})
+    file = RecordFile(path, CHANNELS, 1000.0, {"started": "2024-01-01T00:00:00+00:00"})
     file.add(rows(0, 1))
     file.flush()
     file.close()
@@ -420,7 +421,7 @@ def test_a_line_cut_off_by_a_power_cut_is_cut_away_on_resuming(tmp_path):
         cut.write("0.002000,6,0.")
     tail = read_tail(path)
     assert (tail.index, tail.time) == (1, 0.001)
-    file = RunFile(path, CHANNELS, 1000.0, {}, "resume")
+    file = RecordFile(path, CHANNELS, 1000.0, {}, "resume")
     file.pause(tail, 5.0)
     file.add(rows(0))
     file.flush()
@@ -434,9 +435,9 @@ def test_only_a_record_of_ours_is_continued(tmp_path):
     with pytest.raises(DataError, match="not a record that motorid made"):
         read_tail(path)
     path.unlink()
-    RunFile(path, CHANNELS[:2], 1000.0, {}).close()
+    RecordFile(path, CHANNELS[:2], 1000.0, {}).close()
     with pytest.raises(DataError, match="has the columns"):
-        RunFile(path, CHANNELS, 1000.0, {}, "resume")
+        RecordFile(path, CHANNELS, 1000.0, {}, "resume")
 
 
 FULL_DISK = """
@@ -444,10 +445,10 @@ import resource, signal, sys
 from pathlib import Path
 from motorid.acquire.timeline import Row
 from motorid.acquire.protocol import Channel
-from motorid.acquire.record_file import RunFile
+from motorid.acquire.record_file import RecordFile
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))
-file = RunFile(Path(sys.argv[1]), (Channel("v", "V"), Channel("i", "A")), 1000.0, {})
+file = RecordFile(Path(sys.argv[1]), (Channel("v", "V"), Channel("i", "A")), 1000.0, {})
 try:
     for k in range(1000):
         file.add([Row(k, k * 1e-3, (6.0, 0.123456))])

@@ -616,10 +616,10 @@ def test_faults_on_the_wire_are_counted_over_the_pseudo_terminal_too(out):
 
 
 def test_where_there_are_no_pseudo_terminals_a_loopback_socket_serves(out, monkeypatch):
-    from motorid.acquire.server import LOOPBACK, Pace, Socket, open_end, serve
+    from motorid.acquire.server import LOOPBACK, Pace, Socket, open_transport, serve
 
     monkeypatch.delattr(os, "openpty", raising=False)
-    end = open_end()
+    end = open_transport()
     assert isinstance(end, Socket)
     assert end._server.getsockname()[0] == LOOPBACK == "127.0.0.1"
     stop = threading.Event()
