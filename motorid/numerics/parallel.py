@@ -132,7 +132,31 @@ def _first_line(error: Exception) -> str:
     return (str(error).splitlines() or ["no message"])[0]
 
 
-def in_chunks(items: Sequence[Any], map: Map | None) -> list[Sequence[Any]]:
+def map_items(function: Callable[[Any, Any], Any], shared: Any, items: Sequence[Any], map: Map | None, text: str, *,
+              quiet: bool = False, each: Callable[[Any], object] | None = None) -> Done:
+    """Return ``[function(shared, item) for item in items]`` by way of `map`: small items travel in chunks.
+
+    `shared` travels once per process. The other parameters are those of `run_tasks`; `each` is called per item.
+    """
+    parcel = Parcel.of(shared)
+    tasks = [(function, parcel, Parcel.of(chunk)) for chunk in _in_chunks(items, map)]
+
+    def for_each(results: list[Any]) -> None:
+        for result in results:
+            if each is not None:
+                each(result)
+
+    done = run_tasks(_apply, tasks, map, text, quiet=quiet, each=for_each)
+    results = [result for chunk in done.results for result in chunk]
+    return Done(results, f"interrupted after {len(results)} of {len(items)}" if done.interrupted else "")
+
+
+def _apply(task: tuple[Callable[[Any, Any], Any], Parcel, Parcel]) -> list[Any]:
+    function, shared, items = task
+    return [function(shared.open(), item) for item in items.open()]
+
+
+def _in_chunks(items: Sequence[Any], map: Map | None) -> list[Sequence[Any]]:
     """Cut `items` into pieces: single ones for the built-in map, at most `MOST_TASKS` for a pool."""
     size = 1 if map is None or map is builtins.map else max(-(-len(items) // MOST_TASKS), 1)
     return [items[k:k + size] for k in range(0, len(items), size)]

@@ -33,7 +33,7 @@ from motorid.plots.style import (
     tidy,
 )
 from motorid.uncertainty.identifiability import Identifiability
-from motorid.uncertainty.multistart import Ending, Multistart
+from motorid.uncertainty.multistart import Multistart, StartResult
 from motorid.uncertainty.profile import Intervals, Profile
 
 LEVEL = 0.95
@@ -251,14 +251,14 @@ def plot_waterfall(result: Multistart) -> np.ndarray:
     if not isinstance(result, Multistart):
         raise UsageError(f"plot_waterfall takes mi.multistart(fit), got {type(result).__name__}.")
     axes = new_figure(WIDTH, 3.1).subplots(1, 2, width_ratios=[1.0, 1.2])
-    ends = [(e, k) for e, k in zip(result.endings, result.kinds, strict=True) if isinstance(e, Ending)]
+    ends = [(e, k) for e, k in zip(result.results, result.kinds, strict=True) if isinstance(e, StartResult)]
     ends = sorted(((e, k) for e, k in ends if np.isfinite(e.cost)), key=lambda p: p[0].cost)
     _sorted_costs(axes[0], result, ends)
     _starts_and_ends(axes[1], result, ends)
     return axes
 
 
-def _sorted_costs(ax: Axes, result: Multistart, ends: Sequence[tuple[Ending, str]]) -> None:
+def _sorted_costs(ax: Axes, result: Multistart, ends: Sequence[tuple[StartResult, str]]) -> None:
     lowest = min([result.reference.cost, *(e.cost for e, _ in ends)])
     ratio = np.array([e.cost / lowest for e, _ in ends])
     for kind, colour in _KINDS.items():
@@ -268,17 +268,17 @@ def _sorted_costs(ax: Axes, result: Multistart, ends: Sequence[tuple[Ending, str
     ax.set_yscale("log")
     ax.set_ylim(0.9, max(2.2, float(ratio.max(initial=1.0)) * 1.5))
     plain_decades(ax)
-    words = f"{len(result.endings)} starts, off by up to {result.spread:g} times"
+    words = f"{len(result.results)} starts, off by up to {result.spread:g} times"
     words += f", {result.failed} failed" if result.failed else ""
     tidy(ax, x="fits, best first", y="misfit over the best (χ² ratio)", title=words)
     ax.legend(loc="upper left")
 
 
-def _starts_and_ends(ax: Axes, result: Multistart, ends: Sequence[tuple[Ending, str]]) -> None:
+def _starts_and_ends(ax: Axes, result: Multistart, ends: Sequence[tuple[StartResult, str]]) -> None:
     names = [n for n in result.reference.problem.model.free_names if result.reference.values[n]]
     for j, name in enumerate(names):
         middle = result.reference.values[name]
-        starts = np.array([e.start[name] / middle for e in result.endings if name in e.start])
+        starts = np.array([e.start[name] / middle for e in result.results if name in e.start])
         shift = np.linspace(-0.3, 0.0, max(len(starts), 1))[: len(starts)]
         ax.plot(j + shift, starts, ".", ms=3, color=PALETTE["grey"], alpha=0.7, label="start" if j == 0 else None)
         for kind, colour in _KINDS.items():

@@ -1,4 +1,4 @@
-"""One model fitted to the records of many motors: a table, failures included, and which motors stand out."""
+"""One model fitted to the records of many motors: a table with failures and outliers, kept in a checkpoint file."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from motorid.estimation.fit import fit
 from motorid.estimation.result import Fit
 from motorid.model.model import Model
 from motorid.numerics.noise import Outlier, outliers
-from motorid.numerics.parallel import Map, Parcel, in_chunks, run_tasks
+from motorid.numerics.parallel import Map, map_items
 from motorid.records.experiment import Experiment
 from motorid.records.reading import find_records, read_runs
 from motorid.uncertainty.covariance import covariance
@@ -139,43 +139,16 @@ def fit_many(model: Model, motors: Mapping[str, Records], *, journal: str | Path
     if not motors:
         raise UsageError("fit_many takes a mapping {name: runs}; it is empty. See motors_in(folder).")
     _carry_laws(model)
-    done = Journal(Path(journal)) if journal is not None else None
+    done = Checkpoint(Path(journal)) if journal is not None else None
     marks = {n: fingerprint(model, options, reading, runs) for n, runs in motors.items()} if done else {}
     known = {n: done.rows[m] for n, m in marks.items() if m in done.rows} if done else {}
-    parcel = Parcel.of((model, options, dict(reading or {})))
-    todo = in_chunks([(n, runs) for n, runs in motors.items() if n not in known], map)
-    found = run_tasks(_fit_some, [(parcel, Parcel.of(some)) for some in todo], map, "Fitting motors", quiet=quiet,
-                      each=None if done is None else lambda rows: done.add({marks[r["motor"]]: r for r in rows}))
-    rows = known | {row["motor"]: row for some in found.results for row in some}
+    todo = [(n, runs) for n, runs in motors.items() if n not in known]
+    found = map_items(_fit_one, (model, options, dict(reading or {})), todo, map, "Fitting motors", quiet=quiet,
+                      each=None if done is None else lambda row: done.add(marks[row["motor"]], row))
+    rows = known | {row["motor"]: row for row in found.results}
     said = f"Interrupted after {len(rows)} of {len(motors)} motors." if found.interrupted else ""
     return Batch(tuple(rows[name] for name in motors if name in rows), model.free_names,
                  frozenset(n for n, p in model.parameters.items() if p.positive), said)
-
-
-def motors_in(folder: str | Path) -> dict[str, list[Path]]:
-    """Return the records in a folder by motor: every subfolder is one, and so is every file beside them.
-
-    Raises
-    ------
-    DataError
-        If the folder does not exist or holds no records.
-    """
-    place = Path(folder)
-    if not place.is_dir():
-        raise DataError(f"'{place}' is not a folder; fit-many takes one with a folder, or a file, per motor.")
-    found: dict[str, list[Path]] = {}
-    for entry in sorted(place.iterdir()):
-        if entry.name.startswith("."):
-            continue
-        try:
-            files = find_records(entry)
-        except DataError:
-            continue
-        name = entry.name if entry.is_dir() or entry.stem in found else entry.stem
-        found[name] = [Path(f) for f in files]
-    if not found:
-        raise DataError(f"'{place}' holds no records: expected a folder, or a file, per motor.")
-    return found
 
 
 def _carry_laws(model: Model) -> None:
@@ -190,14 +163,8 @@ def _carry_laws(model: Model) -> None:
                 continue  # a channel that this model does not have
 
 
-def _fit_some(task: tuple[Parcel, Parcel]) -> list[dict[str, Any]]:
-    what = task[0].open()
-    return [_fit_one(name, records, *what) for name, records in task[1].open()]
-
-
-def _fit_one(name: str, records: Records, model: Model, options: Mapping[str, Any],
-             reading: Mapping[str, Any]) -> dict[str, Any]:
-    began = time.perf_counter()
+def _fit_one(task: tuple[Model, Mapping[str, Any], Mapping[str, Any]], motor: tuple[str, Records]) -> dict[str, Any]:
+    (model, options, reading), (name, records), began = task, motor, time.perf_counter()
     try:
         row = _row(fit(model, _runs(records, reading), **options))
     except Exception as error:  # one motor's trouble, whatever it is, must not end the batch
@@ -231,7 +198,33 @@ def _row(found: Fit) -> dict[str, Any]:
             **{f"nrmse_{c}": e for c, e in found.nrmse.items()}, "chi2": found.chi2, "dof": found.dof}
 
 
-class Journal:
+def motors_in(folder: str | Path) -> dict[str, list[Path]]:
+    """Return the records in a folder by motor: every subfolder is one, and so is every file beside them.
+
+    Raises
+    ------
+    DataError
+        If the folder does not exist or holds no records.
+    """
+    place = Path(folder)
+    if not place.is_dir():
+        raise DataError(f"'{place}' is not a folder; fit-many takes one with a folder, or a file, per motor.")
+    found: dict[str, list[Path]] = {}
+    for entry in sorted(place.iterdir()):
+        if entry.name.startswith("."):
+            continue
+        try:
+            files = find_records(entry)
+        except DataError:
+            continue
+        name = entry.name if entry.is_dir() or entry.stem in found else entry.stem
+        found[name] = [Path(f) for f in files]
+    if not found:
+        raise DataError(f"'{place}' holds no records: expected a folder, or a file, per motor.")
+    return found
+
+
+class Checkpoint:
     """A file of JSON lines, one result each; a line cut off by a crash is ignored.
 
     Attributes
@@ -256,10 +249,9 @@ class Journal:
             if text and not text.endswith("\n"):
                 self._append("\n")
 
-    def add(self, rows: Mapping[str, Mapping[str, Any]]) -> None:
-        """Write results by fingerprint, at once."""
-        lines = (json.dumps({"fingerprint": m, "row": dict(r)}, ensure_ascii=False) for m, r in rows.items())
-        self._append("".join(line + "\n" for line in lines))
+    def add(self, mark: str, row: Mapping[str, Any]) -> None:
+        """Write a result under its fingerprint, at once."""
+        self._append(json.dumps({"fingerprint": mark, "row": dict(row)}, ensure_ascii=False) + "\n")
 
     def _append(self, text: str) -> None:
         self.path.parent.mkdir(parents=True, exist_ok=True)

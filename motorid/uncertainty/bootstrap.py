@@ -1,4 +1,4 @@
-"""The spread of refits to records that might as well have been measured.
+"""Bootstrap: the spread of refits to records that might as well have been measured.
 
 Efron & Tibshirani, An Introduction to the Bootstrap, 1993; blocks: Künsch, Annals of Statistics 17, 1989.
 """
@@ -19,7 +19,7 @@ from motorid.estimation.continuation import descend
 from motorid.estimation.result import Failure, Fit
 from motorid.numerics.autoregression import Colour, colour_of
 from motorid.numerics.least_squares import LevenbergMarquardt
-from motorid.numerics.parallel import Map, Parcel, in_chunks, run_tasks
+from motorid.numerics.parallel import Map, map_items
 from motorid.numerics.signals import Array
 from motorid.problem.problem import Problem
 from motorid.records.experiment import Experiment
@@ -28,7 +28,7 @@ from motorid.uncertainty.covariance import covariance
 KINDS = ("blocks", "parametric", "runs")
 # Blocks lose the likeness across their joints: the variance comes out too small by about one over this.
 CORRELATIONS = 8
-FEWEST_RUNS = 4  # resampled as wholes: with fewer there are hardly any different samples
+FEWEST_RUNS = 4  # resampled as wholes: fewer make too few different samples
 SOLVER = LevenbergMarquardt(max_iterations=60, ftol=1e-7, xtol=1e-7)  # from the fit, next to the optimum
 
 
@@ -134,7 +134,7 @@ def bootstrap(fit: Fit, *, kind: str = "blocks", n: int = 200, block: int | None
     kind : {"blocks", "parametric", "runs"}
         ``"blocks"``: model plus blocks of its residuals, which keeps their colour and the likeness of
         channels. Where neighbours are much alike it is a little too narrow: on two runs of 1.2 s with a
-        correlation of 0.9 between samples its 95 % held the truth in 91 %, those of `covariance` in 94 %.
+        correlation of 0.9 between samples its 95 % covered the truth in 91 %, those of `covariance` in 94 %.
         ``"parametric"``: model plus noise of the autoregression fitted to the residuals. ``"runs"``: whole
         runs drawn with replacement, which also covers what differs from run to run.
     n : int
@@ -162,12 +162,11 @@ def bootstrap(fit: Fit, *, kind: str = "blocks", n: int = 200, block: int | None
     if kind == "runs" and len(fit.problem.experiments) < FEWEST_RUNS:
         raise UsageError(f"resampling runs needs at least {FEWEST_RUNS} of them; this fit has "
                          f"{len(fit.problem.experiments)}. Use kind='blocks', or cut runs with "
-                         "motorid.experiment.split.")
+                         "motorid.records.experiment.split.")
     source = _source(fit, kind, block)
-    parcel = Parcel.of(source)
-    chunks = in_chunks(np.random.SeedSequence(seed).spawn(n), map)
-    done = run_tasks(_refits, [(parcel, c) for c in chunks], map, "Refitting resampled records", quiet=quiet)
-    found = [r for part in done.results for r in part]
+    seeds = np.random.SeedSequence(seed).spawn(n)
+    done = map_items(_refit, source, seeds, map, "Refitting resampled records", quiet=quiet)
+    found = done.results
     names = fit.problem.model.free_names
     rows = [[r[k] for k in names] for r in found if not isinstance(r, Failure)]
     failures = tuple(r for r in found if isinstance(r, Failure))
@@ -206,13 +205,8 @@ def _block_length(colours: Mapping[str, Colour], residuals: Sequence[Mapping[str
     return int(np.clip(CORRELATIONS * max(times), np.ceil(n ** (1 / 3)), max(n // 5, 1)))
 
 
-def _refits(task: tuple[Parcel, Sequence[np.random.SeedSequence]]) -> list[dict[str, float] | Failure]:
-    source = task[0].open()
-    return [_refit(source, np.random.default_rng(seed)) for seed in task[1]]
-
-
-def _refit(source: _Source, rng: np.random.Generator) -> dict[str, float] | Failure:
-    problem = source.problem
+def _refit(source: _Source, seed: np.random.SeedSequence) -> dict[str, float] | Failure:
+    problem, rng = source.problem, np.random.default_rng(seed)
     try:
         if source.kind == "runs":
             drawn = rng.integers(0, len(problem.runs), len(problem.runs))

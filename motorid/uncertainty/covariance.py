@@ -213,14 +213,9 @@ def _meat(fit: Fit, blocks: Blocks, colours: Mapping[str, Colour]) -> Array:
     for c, parts in blocks.items():
         for _, jac in parts:
             total += weighed(jac, colours[c].autocovariance(len(jac)))
-    n = fit.problem.n_outputs
-    prior = fit.jacobian[n:n + _held_priors(fit)]
+    n, unknown = fit.problem.n_outputs, {p.name for p in fit.problem.unknown}
+    prior = fit.jacobian[n:n + len(unknown & set(fit.problem.priors))]
     return total + prior.T @ prior
-
-
-def _held_priors(fit: Fit) -> int:
-    names = {p.name for p in fit.problem.unknown}
-    return sum(n in names for n in fit.problem.priors)
 
 
 def _samples(parts: Sequence[tuple[Array, Array]]) -> int:

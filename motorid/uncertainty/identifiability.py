@@ -24,7 +24,7 @@ from motorid.estimation.start_values import started
 from motorid.numerics.signals import Array
 from motorid.problem.problem import Problem
 from motorid.problem.sensitivity import relative_jacobian, relative_sensitivities
-from motorid.uncertainty.weak_directions import basis_in_words, monomials, remedies
+from motorid.uncertainty.weak_directions import basis_in_words, monomials, suggestions
 
 STRUCTURAL = 1e-7  # of the largest singular value, columns of equal length: less is no influence
 LEVEL = 1.0 / UNDETERMINED  # singular value below which a factor of e drowns in the noise
@@ -32,7 +32,7 @@ LEVEL = 1.0 / UNDETERMINED  # singular value below which a factor of e drowns in
 
 @dataclass(frozen=True)
 class WeakDirection:
-    """A change of parameters that the data hardly show.
+    """A change of parameters that shows little in the data.
 
     Attributes
     ----------
@@ -186,7 +186,7 @@ def identifiability(problem_or_fit: Problem | Fit, *, points: int = 5, seed: int
     SimulationError
         If the model cannot be simulated there.
     """
-    problem, q = _place(problem_or_fit)
+    problem, q = _problem_at(problem_or_fit)
     names = problem.model.free_names
     if not names:
         raise UsageError("the model has no free parameter; free some with model.free(…).")
@@ -201,10 +201,10 @@ def identifiability(problem_or_fit: Problem | Fit, *, points: int = 5, seed: int
         tuple(p.unit for p in problem.unknown[:k]), tuple(r.grid.t for r in problem.runs),
         relative_sensitivities(problem, q), s, v, _structural_rank(problem, q, points, seed), tuple(shown),
         tuple(monomials(names, weak)) if len(weak) else (),
-        tuple(remedies(problem, q, matrix, len(weak), LEVEL)) if len(weak) else ())
+        tuple(suggestions(problem, q, matrix, len(weak), LEVEL)) if len(weak) else ())
 
 
-def _place(problem_or_fit: Problem | Fit) -> tuple[Problem, Array]:
+def _problem_at(problem_or_fit: Problem | Fit) -> tuple[Problem, Array]:
     if isinstance(problem_or_fit, Fit):
         return problem_or_fit.problem, problem_or_fit.q
     problem = problem_or_fit

@@ -1,4 +1,4 @@
-"""Does every start lead to the same place? Fits from many random starts.
+"""Fits from many random starts: do they all lead to the same place?
 
 The study of the source paper: starts drawn log-uniformly within a factor `spread` of the best fit, the error
 and the parameters of every fit, and how many of them are good.
@@ -23,10 +23,15 @@ from motorid.estimation.restarts import descend_balanced
 from motorid.estimation.result import Failure, Fit
 from motorid.estimation.start_values import started
 from motorid.numerics.least_squares import LevenbergMarquardt
-from motorid.numerics.parallel import Map, Parcel, in_chunks, run_tasks
+from motorid.numerics.parallel import Map, map_items
 from motorid.numerics.signals import Array
 from motorid.problem.problem import Problem
 from motorid.problem.simulate import at, judge
+
+COST_SHARE = 1e-3  # a good fit's cost is at most this much above the best
+# A good fit's parameters are within this many standard deviations of the best: the integration, accurate to a
+# part of the noise, already moves them by some tenths.
+DISTANCE = 0.5
 
 
 def multistart(
@@ -40,7 +45,7 @@ def multistart(
     map: Map | None = None,
     quiet: bool = False,
 ) -> Multistart:
-    """Fit from many random starts and say where they end.
+    """Fit from many random starts and count how many reach the best fit.
 
     Parameters
     ----------
@@ -58,7 +63,7 @@ def multistart(
     solver : optional
         As in `fit`; default `LevenbergMarquardt`.
     map : callable, optional
-        Anything with the signature of `map`; see `motorid.tasks`.
+        Anything with the signature of `map`; see `motorid.numerics.parallel`.
     quiet : bool
         No progress bar.
 
@@ -76,13 +81,10 @@ def multistart(
     if not names:
         raise UsageError("the model has no free parameter to start from; free some with model.free(…).")
     drawn = _draw(reference, names, starts, spread, seed)
-    parcel = Parcel.of((reference.problem, dict(reference.values), solver, guess))
-    chunks = in_chunks(drawn, map)
-    done = run_tasks(_from_starts, [(parcel, c) for c in chunks], map, "Fitting from random starts",
-                     quiet=quiet)
-    endings = tuple(e for part in done.results for e in part)
-    said = f"interrupted after {len(endings)} of {starts} starts" if done.interrupted else ""
-    return Multistart(reference, endings, float(spread), guess, time.perf_counter() - began, said)
+    task = (reference.problem, dict(reference.values), solver, guess)
+    done = map_items(_from_start, task, drawn, map, "Fitting from random starts", quiet=quiet)
+    said = f"{done.interrupted} starts" if done.interrupted else ""
+    return Multistart(reference, tuple(done.results), float(spread), guess, time.perf_counter() - began, said)
 
 
 def _draw(reference: Fit, names: Sequence[str], starts: int, spread: float,
@@ -99,14 +101,8 @@ def _draw(reference: Fit, names: Sequence[str], starts: int, spread: float,
     return [dict(zip(names, row, strict=True)) for row in drawn.tolist()]
 
 
-def _from_starts(task: tuple[Parcel, Sequence[dict[str, float]]]) -> list[Ending | Failure]:
-    problem, values, solver, guess = task[0].open()
-    return [_from_start(problem, values, solver, guess, start) for start in task[1]]
-
-
-def _from_start(problem: Problem, values: dict[str, float], solver: Any, guess: bool,
-                start: dict[str, float]) -> Ending | Failure:
-    began = time.perf_counter()
+def _from_start(task: tuple[Problem, dict[str, float], Any, bool], start: dict[str, float]) -> StartResult | Failure:
+    (problem, values, solver, guess), began = task, time.perf_counter()
     here = problem.for_model(problem.model.start_at(values | start))
     try:
         here = replace(started(here), _runs=here.runs) if guess else here
@@ -120,12 +116,12 @@ def _from_start(problem: Problem, values: dict[str, float], solver: Any, guess: 
     except (MotoridError, np.linalg.LinAlgError) as error:
         return Failure(start, "failed", str(error))
     physical = solved.scaling.physical(q)
-    return Ending(start, solved.values(q), _cost_like(problem, physical), judge(at(solved, q)).nrmse, status,
+    return StartResult(start, solved.values(q), _reference_cost(problem, physical), judge(at(solved, q)).nrmse, status,
                   message, len(history) - 1, time.perf_counter() - began)
 
 
-def _cost_like(problem: Problem, physical: Array) -> float:
-    """Cost with the weights and steps of the reference, so that different endings can be compared."""
+def _reference_cost(problem: Problem, physical: Array) -> float:
+    """Cost with the weights and steps of the reference, so that the results of all starts can be compared."""
     try:
         r = problem.residual(problem.scaling.scaled(physical))
     except SimulationError:
@@ -133,14 +129,8 @@ def _cost_like(problem: Problem, physical: Array) -> float:
     return 0.5 * float(r @ r)
 
 
-COST_SHARE = 1e-3  # a good fit's cost is at most this much above the best
-# A good fit's parameters are within this many standard deviations of the best: the integration, accurate to a
-# part of the noise, already moves them by some tenths.
-DISTANCE = 0.5
-
-
 @dataclass(frozen=True, eq=False)
-class Ending:
+class StartResult:
     """Where one start led: values and errors there, cost ½ rᵀr judged like the reference, solver's status."""
 
     start: Mapping[str, float]
@@ -161,7 +151,7 @@ class Multistart(Shown):
     ----------
     reference : Fit
         The fit around which the starts were drawn.
-    endings : tuple of Ending or Failure
+    results : tuple of StartResult or Failure
         In the order of drawing.
     spread : float
         Every start is off by up to this factor in each free parameter.
@@ -173,16 +163,16 @@ class Multistart(Shown):
     """
 
     reference: Fit
-    endings: tuple[Ending | Failure, ...]
+    results: tuple[StartResult | Failure, ...]
     spread: float
     guess: bool
     seconds: float
     interrupted: str = ""
 
     @cached_property
-    def best(self) -> Ending | None:
-        """The ending with the lowest cost, if it is lower than the reference's by more than the tolerance."""
-        ends = [e for e in self.endings if isinstance(e, Ending)]
+    def best(self) -> StartResult | None:
+        """The result with the lowest cost, if it is lower than the reference's by more than the tolerance."""
+        ends = [e for e in self.results if isinstance(e, StartResult)]
         best = min(ends, key=lambda e: e.cost, default=None)
         return best if best is not None and best.cost < self.reference.cost * (1 - COST_SHARE) else None
 
@@ -193,17 +183,17 @@ class Multistart(Shown):
         Good: the cost is at most 0.1 % above the best, and every parameter that the data determine is
         within half its standard deviation of the best. Failed: no result, or a solver that gave up.
         """
-        return tuple(self._kind(e) for e in self.endings)
+        return tuple(self._kind(e) for e in self.results)
 
-    def _kind(self, end: Ending | Failure) -> str:
+    def _kind(self, end: StartResult | Failure) -> str:
         if isinstance(end, Failure) or not np.isfinite(end.cost):
             return "failed"
         best = self.best or self.reference
-        far = any(abs(self._apart(n, end.values[n], best.values[n])) > DISTANCE * sd
+        far = any(abs(self._difference(n, end.values[n], best.values[n])) > DISTANCE * sd
                   for n, sd in self._determined.items())
         return "poor" if end.cost > best.cost * (1 + COST_SHARE) or far else "good"
 
-    def _apart(self, name: str, a: float, b: float) -> float:
+    def _difference(self, name: str, a: float, b: float) -> float:
         """Difference of two values; phases are compared on the circle."""
         periodic = self.reference.problem.model.parameters[name].periodic
         return (a - b + np.pi) % (2 * np.pi) - np.pi if periodic else a - b
@@ -213,9 +203,9 @@ class Multistart(Shown):
         return {n: sd for n, sd in self.reference.std.items() if sd}
 
     @property
-    def _good(self) -> list[Ending]:
-        return [e for e, k in zip(self.endings, self.kinds, strict=True)
-                if k == "good" and isinstance(e, Ending)]
+    def _good(self) -> list[StartResult]:
+        return [e for e, k in zip(self.results, self.kinds, strict=True)
+                if k == "good" and isinstance(e, StartResult)]
 
     @property
     def good(self) -> int:
@@ -238,10 +228,10 @@ class Multistart(Shown):
         import pandas as pd
 
         rows = []
-        for end, kind in zip(self.endings, self.kinds, strict=True):
+        for end, kind in zip(self.results, self.kinds, strict=True):
             row: dict[str, Any] = {"kind": kind, "status": end.status, "message": end.message}
             row |= {f"start_{n}": v for n, v in end.start.items()}
-            if isinstance(end, Ending):
+            if isinstance(end, StartResult):
                 row |= {n: end.values[n] for n in end.start} | {f"nrmse_{c}": e for c, e in end.nrmse.items()}
                 row |= {"cost": end.cost, "iterations": end.iterations, "seconds": end.seconds}
             rows.append(row)
@@ -252,22 +242,22 @@ class Multistart(Shown):
         """One row per place where fits ended (`pandas.DataFrame`), best first: fits, cost ratio, values."""
         import pandas as pd
 
-        ends = sorted((e for e in self.endings if isinstance(e, Ending) and np.isfinite(e.cost)),
+        ends = sorted((e for e in self.results if isinstance(e, StartResult) and np.isfinite(e.cost)),
                       key=lambda e: e.cost)
-        places: list[list[Ending]] = []
+        places: list[list[StartResult]] = []
         for end in ends:
-            home = next((p for p in places if self._together(p[0], end)), None)
+            home = next((p for p in places if self._same_place(p[0], end)), None)
             places.append([end]) if home is None else home.append(end)
         lowest = min([self.reference.cost, *(e.cost for e in ends)])
         return pd.DataFrame([{"fits": len(p), "cost_ratio": p[0].cost / lowest, **dict(p[0].nrmse),
                               **{n: p[0].values[n] for n in p[0].start}} for p in places])
 
-    def _together(self, a: Ending, b: Ending) -> bool:
+    def _same_place(self, a: StartResult, b: StartResult) -> bool:
         """Tell whether two fits ended in the same place: cost within 1 %, values within 5 %."""
         if abs(a.cost - b.cost) > 10 * COST_SHARE * a.cost:
             return False
         sizes = [max(abs(a.values[n]), abs(b.values[n]), 1e-300) for n in a.start]
-        return all(abs(self._apart(n, a.values[n], b.values[n])) < 0.05 * s
+        return all(abs(self._difference(n, a.values[n], b.values[n])) < 0.05 * s
                    for n, s in zip(a.start, sizes, strict=True))
 
     def statistics(self) -> dict[str, dict[str, float | None]]:
@@ -275,7 +265,7 @@ class Multistart(Shown):
         found = {}
         for n in self.reference.problem.model.free_names:
             middle = self.reference.values[n]
-            v = np.array([middle + self._apart(n, e.values[n], middle) for e in self._good])
+            v = np.array([middle + self._difference(n, e.values[n], middle) for e in self._good])
             found[n] = {"reference": self.reference.values[n], "mean": float(v.mean()) if v.size else None,
                         "std": float(v.std()) if v.size else None}
         return found
@@ -283,7 +273,7 @@ class Multistart(Shown):
     def to_dict(self) -> dict[str, Any]:
         """Return the contents of ``robustness --json``."""
         return {
-            "starts": len(self.endings), "spread": self.spread, "guess": self.guess,
+            "starts": len(self.results), "spread": self.spread, "guess": self.guess,
             "good": self.good, "poor": self.poor, "failed": self.failed, "seconds": self.seconds,
             "parameters": self.statistics(),
             "nrmse": {c: float(np.mean([e.nrmse[c] for e in self._good])) if self._good else None
@@ -295,7 +285,7 @@ class Multistart(Shown):
     @property
     def text(self) -> str:
         """The verdict in words."""
-        said = [f"{self.good} of {len(self.endings)} starts within a factor of {self.spread:g} end in the "
+        said = [f"{self.good} of {len(self.results)} starts within a factor of {self.spread:g} end in the "
                 f"best fit (cost within {percent(COST_SHARE)}, parameters within {DISTANCE:g} standard "
                 f"deviations); {self.poor} elsewhere, {self.failed} failed; {duration(self.seconds)}."]
         if self.best is not None:

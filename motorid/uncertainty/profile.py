@@ -1,9 +1,9 @@
-"""Profile likelihood: how much worse does the best fit become when one parameter is held elsewhere?
+"""Profile likelihood: how much worse does the best fit become when one parameter is fixed elsewhere?
 
 The only interval that can say "no upper end": where the cost stays low however far the parameter moves, the
 data do not limit it on that side (Raue et al., Bioinformatics 25, 2009). Coloured residuals are allowed for
 by dividing the rise of the cost by the factor by which they enlarge the parameter's variance (Kent,
-Biometrika 69, 1982).
+Biometrika 69, 1982). At the end, `intervals` puts it beside covariance and bootstrap.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from motorid.uncertainty.covariance import Covariance, covariance
 
 FARTHEST = np.log(1e4)  # on the logarithmic scale; beyond it a parameter counts as not limited
 MOST = 30  # points per side
-Point = tuple[float, float, dict[str, float]]  # value held, rise, all values
+Point = tuple[float, float, dict[str, float]]  # fixed value, rise, all values
 SOLVER = LevenbergMarquardt(max_iterations=60, ftol=1e-8, xtol=1e-8)
 
 
@@ -44,7 +44,7 @@ class Profile(Shown):
     value : float
         The fit's.
     values : ndarray, shape (m,)
-        Where it was held, increasing.
+        Where it was fixed, increasing.
     rise : ndarray, shape (m,)
         Rise of twice the cost over that of the fit, in units of the variance; compared with t².
     others : dict of str to ndarray (m,)
@@ -147,7 +147,7 @@ def profile(fit: Fit, name: str, *, level: float = 0.95, map: Map | None = None,
     Raises
     ------
     UsageError
-        If the parameter is unknown or held.
+        If the parameter is unknown or fixed.
     """
     return profiles(fit, [name], level=level, map=map, quiet=quiet)[name]
 
@@ -196,7 +196,7 @@ def _side(task: tuple[Parcel, str, float, float, float, float]) -> list[Point]:
     while len(points) < MOST and abs(at - q0) < farthest:
         at = float(np.clip(at + side * step, low, high))
         p = float(scale.scale[j] * np.exp(at) if scale.log[j] else scale.scale[j] * at)
-        found = _held(problem, values, name, p)
+        found = _refit_with(problem, values, name, p)
         if found is None:
             break
         rise, values = 2 * (found[0] - cost) / factor, found[1]
@@ -209,7 +209,7 @@ def _side(task: tuple[Parcel, str, float, float, float, float]) -> list[Point]:
     return points
 
 
-def _held(problem: Problem, values: dict[str, float], name: str,
+def _refit_with(problem: Problem, values: dict[str, float], name: str,
           p: float) -> tuple[float, dict[str, float]] | None:
     here = problem.for_model(problem.model.start_at(values).fix(**{name: p}))
     try:

@@ -1,4 +1,7 @@
-"""Weak directions in words: a sparse basis of them, and the products of parameters that they leave alone."""
+"""Weak directions in words: a sparse basis, the products of parameters that they leave alone, and what would help.
+
+`planned` makes the experiment that was not made, to ask the same of it.
+"""
 
 from __future__ import annotations
 
@@ -22,6 +25,9 @@ UNMOVED = 1e-6  # standard deviations of the noise that count as nothing
 ALIKE = 0.1  # change of a product, per factor of e along a weak direction, that still counts as determined
 STEP = 0.1  # relative change that is spoken of
 MOST = 300  # pivots tried
+ASSUMED_NOISE = 0.01  # of a channel's RMS, where a plan does not say
+EASY = ("R", "K", "g", "L", "b", "J")  # in the order in which they are usually known beforehand
+CHANNELS = {"i": "the current", "omega": "the speed"}
 
 
 def basis_in_words(names: Sequence[str], weak: Array,
@@ -112,12 +118,7 @@ def _product(names: Sequence[str], powers: Array) -> str:
     return f"{above}/{below[0]}" if len(below) == 1 else f"{above}/({'·'.join(below)})"
 
 
-ASSUMED_NOISE = 0.01  # of a channel's RMS, where a plan does not say
-EASY = ("R", "K", "g", "L", "b", "J")  # in the order in which they are usually known beforehand
-CHANNELS = {"i": "the current", "omega": "the speed"}
-
-
-def remedies(problem: Problem, q: Array, matrix: Array, missing: int, level: float) -> list[str]:
+def suggestions(problem: Problem, q: Array, matrix: Array, missing: int, level: float) -> list[str]:
     """Return sentences on what to fix or to measure so that every singular value exceeds `level`."""
     names = problem.model.free_names
     said = []
@@ -125,7 +126,7 @@ def remedies(problem: Problem, q: Array, matrix: Array, missing: int, level: flo
     if sets:
         first = " and ".join(sets[0])
         other = f" (or {' and '.join(sets[1])})" if len(sets) > 1 else ""
-        said.append(f"Hold {first}{other} where known, model.fix(…), and the rest is determined.")
+        said.append(f"Fix {first}{other} where known, model.fix(…), and the rest is determined.")
     for channel, title in CHANNELS.items():
         if _would_do(problem, q, channel, level):
             said.append(f"Measure {title} as well: with 1 % of noise all of them are determined.")
@@ -133,14 +134,14 @@ def remedies(problem: Problem, q: Array, matrix: Array, missing: int, level: flo
 
 
 def fixable(names: Sequence[str], matrix: Array, missing: int, level: float) -> list[tuple[str, ...]]:
-    """Return the sets of `missing` parameters that, held, leave the others determined; the best set first."""
+    """Return the sets of `missing` parameters that, once fixed, leave the others determined; the best set first."""
     found = []
     triangle = np.asarray(np.linalg.qr(matrix, mode="r"))
-    for held in combinations(range(len(names)), missing):
-        s = np.linalg.svd(np.delete(triangle, held, axis=1), compute_uv=False)
+    for fixed in combinations(range(len(names)), missing):
+        s = np.linalg.svd(np.delete(triangle, fixed, axis=1), compute_uv=False)
         if s.size and s[-1] > level:
-            ease = sum(EASY.index(names[j]) if names[j] in EASY else len(EASY) for j in held)
-            found.append((-round(np.log10(s[-1])), ease, tuple(names[j] for j in held)))
+            ease = sum(EASY.index(names[j]) if names[j] in EASY else len(EASY) for j in fixed)
+            found.append((-round(np.log10(s[-1])), ease, tuple(names[j] for j in fixed)))
     return [f[2] for f in sorted(found)]
 
 

@@ -71,7 +71,7 @@ def test_weak_direction_of_speed_alone_does_leave_the_speed_unchanged(speed_only
 
 def test_fixing_what_the_remedy_says_makes_the_rank_full(speed_only):
     found = identifiability(Problem(mi.dc_motor(**MOTOR), speed_only))
-    assert any("Hold R and" in r for r in found.remedies)
+    assert any("Fix R and" in r for r in found.remedies)
     only_r = identifiability(Problem(mi.dc_motor(**MOTOR).fix("R"), speed_only))
     assert (only_r.rank, len(only_r.names)) == (3, 4)
     both = identifiability(Problem(mi.dc_motor(**MOTOR).fix("R", "b"), speed_only))

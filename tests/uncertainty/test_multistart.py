@@ -13,7 +13,7 @@ import motorid as mi
 from motorid.errors import UsageError
 from motorid.estimation.result import Failure
 from motorid.numerics.least_squares import LevenbergMarquardt, levenberg_marquardt
-from motorid.uncertainty.multistart import Ending, Multistart, multistart
+from motorid.uncertainty.multistart import Multistart, StartResult, multistart
 
 BOTH = ("two_step_noisy", "two_step_small")
 
@@ -97,8 +97,8 @@ def test_bounds_are_kept_and_said_by_the_values():
 # -- the study's report -------------------------------------------------------------------------------------
 def ending(reference, cost, **changes):
     values = {**reference.values, **changes}
-    return Ending({n: reference.values[n] for n in reference.model.free_names}, values, cost, dict(reference.nrmse),
-                  "converged", "", 5, 0.01)
+    start = {n: reference.values[n] for n in reference.model.free_names}
+    return StartResult(start, values, cost, dict(reference.nrmse), "converged", "", 5, 0.01)
 
 
 @pytest.fixture
@@ -146,7 +146,7 @@ def test_table_has_one_row_per_start_failures_included(mixed):
 
 # -- pools ---------------------------------------------------------------------------------------------------
 def same(a, b):
-    return [e.values for e in a.endings] == [e.values for e in b.endings]
+    return [e.values for e in a.results] == [e.values for e in b.results]
 
 
 @pytest.mark.slow
@@ -172,7 +172,7 @@ if __name__ == "__main__":
     near = mi.multistart(fit, starts=2, spread=1.2)
     many = mi.fit_many(mi.dc_motor() + syrup, {"a": runs}, map=pool.map)
     pool.shutdown()
-    for a, b in zip(far.endings, near.endings):  # to rounding: the one ran compiled, the other perhaps not yet
+    for a, b in zip(far.results, near.results):  # to rounding: the one ran compiled, the other perhaps not yet
         np.testing.assert_allclose([*a.values.values()], [*b.values.values()], rtol=1e-6)
     assert many.failed == {}, many.failed
     assert abs(many.rows[0]["k_s"] / fit.values["k_s"] - 1) < 1e-3
@@ -195,7 +195,7 @@ def test_interruption_keeps_what_is_done(fits):
             yield function(task)
 
     found = multistart(fits["two_step_small"], starts=9, map=stopped, quiet=True)
-    assert len(found.endings) == 3
+    assert len(found.results) == 3
     assert "Interrupted after 3 of 9 starts" in str(found)
     assert same(found, multistart(fits["two_step_small"], starts=3, quiet=True))
 
@@ -216,8 +216,8 @@ def test_broken_pool_costs_time_and_not_results(fits, capsys):
 def test_starts_depend_on_the_seed_alone(fits):
     best = fits["two_step_small"]
     a, b, c = (multistart(best, starts=2, seed=s, quiet=True) for s in (4, 4, 5))
-    assert [e.start for e in a.endings] == [e.start for e in b.endings] != [e.start for e in c.endings]
-    logs = np.log([list(e.start.values()) for e in a.endings]) - np.log([best.values[n] for n in best.model.free_names])
+    assert [e.start for e in a.results] == [e.start for e in b.results] != [e.start for e in c.results]
+    logs = np.log([list(e.start.values()) for e in a.results]) - np.log([best.values[n] for n in best.model.free_names])
     assert np.abs(logs).max() <= np.log(10)
 
 
