@@ -55,7 +55,3 @@ for _name, _command in (
 def main() -> None:
     """Run the command line; leaves by `SystemExit`."""
     app()
-
-
-if __name__ == "__main__":
-    main()
