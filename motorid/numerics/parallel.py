@@ -139,7 +139,7 @@ def map_items(function: Callable[[Any, Any], Any], shared: Any, items: Sequence[
     `shared` travels once per process. The other parameters are those of `run_tasks`; `each` is called per item.
     """
     parcel = Parcel.of(shared)
-    tasks = [(function, parcel, Parcel.of(chunk)) for chunk in _in_chunks(items, map)]
+    tasks = [(parcel, Parcel.of(chunk), function) for chunk in _in_chunks(items, map)]
 
     def for_each(results: list[Any]) -> None:
         for result in results:
@@ -151,8 +151,8 @@ def map_items(function: Callable[[Any, Any], Any], shared: Any, items: Sequence[
     return Done(results, f"interrupted after {len(results)} of {len(items)}" if done.interrupted else "")
 
 
-def _apply(task: tuple[Callable[[Any, Any], Any], Parcel, Parcel]) -> list[Any]:
-    function, shared, items = task
+def _apply(task: tuple[Parcel, Parcel, Callable[[Any, Any], Any]]) -> list[Any]:
+    shared, items, function = task
     return [function(shared.open(), item) for item in items.open()]
 
 

@@ -1,4 +1,4 @@
-"""Figures of records and of a fit."""
+"""Figures of records, of a fit, and of how the parameters moved from fit to fit."""
 
 from __future__ import annotations
 
@@ -64,14 +64,8 @@ def plot_runs(runs: Sequence[Experiment] | Experiment, channels: Sequence[str] |
             if y is None:
                 _absent(axes[j, k], c)
             else:
-                line(
-                    axes[j, k],
-                    run.t,
-                    y,
-                    held=c == "v" and run.hold == "zoh",
-                    lw=1.0,
-                    color=INK if c == "v" else MODEL,
-                )
+                line(axes[j, k], run.t, y, held=c == "v" and run.hold == "zoh", lw=1.0,
+                     color=INK if c == "v" else MODEL)
         tidy(axes[0, k], title=_run_title(run, k, every))
         tidy(axes[-1, k], x="time (s)")
     _label_rows(axes, names, shown)
@@ -168,9 +162,8 @@ def _absent(ax: Axes, channel: str) -> None:
 
 
 @styled
-def plot_parameters(
-    *results: Any, truth: Mapping[str, float] | None = None, names: Sequence[str] | None = None
-) -> np.ndarray:
+def plot_parameters(*results: Any, truth: Mapping[str, float] | None = None,
+                    names: Sequence[str] | None = None) -> np.ndarray:
     """Draw how the parameters moved from fit to fit, each with an interval of two standard deviations.
 
     Parameters
@@ -194,7 +187,7 @@ def plot_parameters(
     axes = grid(rows, columns, row=1.75, width=WIDTH * max(columns, 3) / 5).ravel()
     for ax, name in zip(axes, chosen, strict=False):
         _one_parameter(ax, fits, name, (truth or {}).get(name))
-    for ax in axes[len(chosen) :]:
+    for ax in axes[len(chosen):]:
         ax.set_axis_off()
     notes = [f"{k + 1}: {_added(f, fits[k - 1] if k else None)}" for k, f in enumerate(fits)]
     notes += ["dashed: true value"] * bool(truth) + ["bars: ±2σ"]
@@ -203,38 +196,22 @@ def plot_parameters(
 
 
 def _one_parameter(ax: Axes, fits: Sequence[Any], name: str, truth: float | None) -> None:
-    held = [k for k, f in enumerate(fits) if name in f.values]
+    known = [k for k, f in enumerate(fits) if name in f.values]
     parameter = next((f.model.parameters[name] for f in reversed(fits) if name in f.values), None)
     unit = parameter.unit if parameter else ""
     if parameter is not None and parameter.periodic and truth is not None:  # the same angle, some turns further
-        truth += 2 * np.pi * round((fits[held[-1]].values[name] - truth) / (2 * np.pi))
-    values = np.array([fits[k].values[name] for k in held] + ([] if truth is None else [truth]))
+        truth += 2 * np.pi * round((fits[known[-1]].values[name] - truth) / (2 * np.pi))
+    values = np.array([fits[k].values[name] for k in known] + ([] if truth is None else [truth]))
     power = decade(float(np.max(np.abs(values))))
     if truth is not None:
         ax.axhline(truth / 10.0**power, color=PALETTE["green"], lw=1.2, ls=(0, (4, 2)))
-    for k in held:
+    for k in known:
         value, std, colour = fits[k].values[name], fits[k].std.get(name), CYCLE[k % len(CYCLE)]
-        ax.errorbar(
-            k + 1,
-            value / 10.0**power,
-            yerr=2 * (std or 0.0) / 10.0**power,
-            fmt="o",
-            ms=5,
-            capsize=3 if std else 0,
-            lw=1.4,
-            color=colour,
-            mfc="none" if std is None else colour,
-        )
+        ax.errorbar(k + 1, value / 10.0**power, yerr=2 * (std or 0.0) / 10.0**power, fmt="o", ms=5,
+                    capsize=3 if std else 0, lw=1.4, color=colour, mfc="none" if std is None else colour)
         if std is None:
-            ax.annotate(
-                "not\ndetermined",
-                (k + 1, value / 10.0**power),
-                (0, 6),
-                textcoords="offset points",
-                ha="center",
-                fontsize=7,
-                color=MUTED,
-            )
+            ax.annotate("not\ndetermined", (k + 1, value / 10.0**power), (0, 6), textcoords="offset points",
+                        ha="center", fontsize=7, color=MUTED)
     ax.set_xlim(0.4, len(fits) + 0.6)
     ax.set_xticks(range(1, len(fits) + 1))
     _around(ax, values / 10.0**power)

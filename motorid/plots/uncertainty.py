@@ -1,4 +1,4 @@
-"""Figures of what the data determine: singular values, profiles, intervals."""
+"""Figures of how far to trust a fit: singular values, profiles and intervals, sensitivities, multistart."""
 
 from __future__ import annotations
 
@@ -37,6 +37,7 @@ from motorid.uncertainty.multistart import Multistart, StartResult
 from motorid.uncertainty.profile import Intervals, Profile
 
 LEVEL = 0.95
+_KINDS = {"good": PALETTE["blue"], "poor": PALETTE["orange"], "failed": PALETTE["grey"]}
 
 
 @styled
@@ -90,7 +91,7 @@ def _directions(ax: Axes, result: Identifiability) -> None:
 
 @styled
 def plot_profile(result: Profile | Mapping[str, Profile] | Intervals) -> np.ndarray:
-    """Draw how the misfit rises as a parameter is held away from its value, all others refitted.
+    """Draw how the misfit rises as a parameter is fixed away from its value, all others refitted.
 
     Where the curve crosses the dashed line the interval of 95 % ends. An even valley is what the covariance
     assumes; a curve that never reaches the line says that the data set no limit there. Of `Intervals` the
@@ -133,10 +134,7 @@ def _one_profile(ax: Axes, p: Profile, both: Intervals | None) -> None:
     ax.axvspan(ends[0] * scale, ends[1] * scale, color=PALETTE["blue"], alpha=0.1, lw=0)
     if both is not None:
         known, drawn = both.covariance.interval(p.name, level), both.bootstrap.interval(p.name, level)
-        for y, limits, name, colour in (
-            (-0.8, known, "covariance", "purple"),
-            (-1.7, drawn, "bootstrap", "green"),
-        ):
+        for y, limits, name, colour in ((-0.8, known, "covariance", "purple"), (-1.7, drawn, "bootstrap", "green")):
             if limits is not None:
                 ax.plot(np.array(limits) * scale, [y, y], "|-", color=PALETTE[colour], lw=2, ms=6, label=name)
     ax.set_ylim(-2.4 if both is not None else -0.4, max(1.5 * height, 2.0))
@@ -175,15 +173,12 @@ def _profiles(result: Any) -> Sequence[Profile]:
     return chosen
 
 
-_KINDS = {"good": PALETTE["blue"], "poor": PALETTE["orange"], "failed": PALETTE["grey"]}
-
-
 @styled
 def plot_sensitivities(fit: Fit, *, run: int = 0, names: Sequence[str] | None = None) -> np.ndarray:
     """Draw what one per cent of each parameter does to the outputs, beside the noise.
 
-    Curves of the same shape cannot be told apart; a curve within the band of the noise can hardly be seen by
-    the fit.
+    Curves of the same shape cannot be distinguished; a curve within the band of the noise tells the fit next to
+    nothing.
 
     Parameters
     ----------
@@ -217,14 +212,8 @@ def plot_sensitivities(fit: Fit, *, run: int = 0, names: Sequence[str] | None = 
             j = free.index(name)
             step = 0.01 * (abs(fit.values[name]) or problem.scaling.scale[j])
             change = trajectory.dy[:, problem.outputs.index(c), j] / slope[j] * step
-            line(
-                ax,
-                record.t,
-                change,
-                color=CYCLE[k % len(CYCLE)],
-                ls=("-", "--", ":")[k // len(CYCLE) % 3],
-                label=name,
-            )
+            style = ("-", "--", ":")[k // len(CYCLE) % 3]
+            line(ax, record.t, change, color=CYCLE[k % len(CYCLE)], ls=style, label=name)
         tidy(ax, y=f"change of {axis_label(c, record).replace(' (', chr(10) + '(')}")
     tidy(axes[0], title=f"What +1 % of each parameter does, {record.name}")
     tidy(axes[-1], x="time (s)")

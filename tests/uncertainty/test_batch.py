@@ -14,6 +14,7 @@ import pytest
 import motorid as mi
 from motorid.errors import DataError, UsageError
 from motorid.numerics.noise import outliers
+from motorid.numerics.parallel import Parcel
 from motorid.records.datasets import truth
 from motorid.records.reading import write_csv
 from motorid.uncertainty import batch as batch_module
@@ -92,8 +93,7 @@ def test_a_bug_in_one_motors_fit_does_not_end_the_batch(ten, monkeypatch):
         return real(model, runs, **options)
 
     monkeypatch.setattr(batch_module, "fit", fit)
-    monkeypatch.setattr(batch_module.Parcel, "open", lambda self: self.content)
-    monkeypatch.setattr(batch_module.Parcel, "of", staticmethod(_unpacked))
+    monkeypatch.setattr(Parcel, "of", staticmethod(_unpacked))
     found = fit_many(mi.dc_motor(), {k: ten[k] for k in ("m000", "m001", "m002")}, quiet=True)
     assert found.failed == {"m001": "ZeroDivisionError: by zero"}
 

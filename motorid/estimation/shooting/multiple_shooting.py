@@ -62,7 +62,7 @@ class MultipleShooting:
         intervals join loosely.
     process_noise : mapping of str to float, or "auto", optional
         Standard deviation per state and √s (``{"omega": 3.0}``: rad/s per √s); gaps at the nodes are weighed by
-        it instead of forbidden. States not named get next to none. ``"auto"``: of current and speed, so large
+        it instead of forbidden. States not named get next to none. ``"auto"``: of current and speed, as large
         as their gaps turn out to be. Intervals have 25 samples then.
     max_iterations : int
     tol : float
@@ -103,49 +103,49 @@ class MultipleShooting:
         began = time.perf_counter()
         _check(problem)
         plain = replace(problem, constraints=())
-        near, q = self._near(plain)
+        near, q = self._unconstrained(plain)
         bound = replace(near, constraints=problem.constraints)
         if self.process_noise is not None:
-            return fit_of(self._noisy(bound, q), time.perf_counter() - began)
-        return fit_of(self._refining(bound, _pulled(bound, q)), time.perf_counter() - began)
+            return fit_of(self._with_process_noise(bound, q), time.perf_counter() - began)
+        return fit_of(self._with_refinement(bound, _under_heavier_penalties(bound, q)), time.perf_counter() - began)
 
     # -- stages ----------------------------------------------------------------------------------------
-    def _near(self, problem: Problem) -> tuple[Problem, Array]:
+    def _unconstrained(self, problem: Problem) -> tuple[Problem, Array]:
         """Return the problem with weights settled, and values near its solution without constraints."""
         if self.process_noise is not None:
             return problem, problem.start
         if self.warm == "data":
-            return (problem, problem.start) if not _poor(problem, problem.start) else (problem, self._joined(problem))
+            return problem, self._from_poor_values(problem) if _poor(problem, problem.start) else problem.start
         if self.warm == "model" or not _poor(problem, problem.start):
             return _least_squares(problem, True)
-        q = self._joined(problem)
+        q = self._from_poor_values(problem)
         near = _least_squares(problem.for_model(problem.model.start_at(problem.values(q))), False)
         if not _poor(*near):
             return near
         return min(near, _least_squares(problem, True), key=lambda found: _misfit(*found))
 
-    def _joined(self, problem: Problem) -> Array:
+    def _from_poor_values(self, problem: Problem) -> Array:
         """Return values that a fit finds whose intervals join loosely, then tightly, from poor ones."""
-        found = [self._quick(problem, q) for q in _put_back(problem, self._loose(problem).q)]
-        best = _cheapest(found)
+        found = [self._roughly(problem, q) for q in _with_resets(problem, self._loosely_joined(problem).q)]
+        best = _lowest(found)
         # Once the others are right, a parameter that ran off to where nothing depends on it finds its way back.
-        return _cheapest([best, *(self._quick(problem, q) for q in _put_back(problem, best.q)[1:])]).q
+        return _lowest([best, *(self._roughly(problem, q) for q in _with_resets(problem, best.q)[1:])]).q
 
-    def _loose(self, problem: Problem) -> Solved:
+    def _loosely_joined(self, problem: Problem) -> Solved:
         """Solve with short intervals that need not join."""
         every, size = LOOSE
-        mesh = Mesh(problem.tuned(balance=_blunted(problem)), every)
+        mesh = Mesh(problem.tuned(balance=_least_noise(problem)), every)
         step = float(np.median([run.experiment.dt for run in problem.runs]))
         mesh = replace(mesh, noise=size * mesh.scale / np.sqrt(every * step))
         return self._solve(mesh, mesh.joined(problem.start, nodes_from_data(mesh, problem.start)), quick=True)
 
-    def _quick(self, problem: Problem, q: Array) -> Solved:
+    def _roughly(self, problem: Problem, q: Array) -> Solved:
         """Solve from `q` not very far, with one step per sample: a lost parameter may ask for very many."""
         mesh = Mesh(problem, self.every)
         nodes = nodes_from_data if _poor(problem, q) else nodes_from_simulation
         return self._solve(mesh, mesh.joined(q, nodes(mesh, q)), quick=True)
 
-    def _refining(self, problem: Problem, q: Array) -> Solved:
+    def _with_refinement(self, problem: Problem, q: Array) -> Solved:
         """Solve, refine the sub-steps at the solution, and again while they do not suffice."""
         if not problem.fine_enough(q):
             problem = problem.refined(q)
@@ -169,7 +169,7 @@ class MultipleShooting:
         except SimulationError:
             return nodes_from_data(mesh, q)
 
-    def _noisy(self, problem: Problem, q: Array) -> Solved:
+    def _with_process_noise(self, problem: Problem, q: Array) -> Solved:
         """Solve with process noise; with ``"auto"`` again until the gaps are as large as was taken."""
         problem = problem.refined(q)
         mesh = Mesh(problem, self.every or NOISY)
@@ -214,7 +214,7 @@ def _check(problem: Problem) -> None:
         raise FitError(contradiction)
 
 
-def _blunted(problem: Problem) -> dict[str, float]:
+def _least_noise(problem: Problem) -> dict[str, float]:
     """Return factors for the noise of each channel, so that a nearly noise-free one does not rule the loose fit."""
     found: dict[str, float] = {}
     for run in problem.runs:
@@ -233,7 +233,7 @@ def _least_squares(problem: Problem, stages: bool) -> tuple[Problem, Array]:
     return done.problem, done.solution.q
 
 
-def _pulled(problem: Problem, q: Array) -> Array:
+def _under_heavier_penalties(problem: Problem, q: Array) -> Array:
     """Return values near the constrained solution: penalties on what is violated at `q`, heavier and heavier.
 
     A current peak is lowered by resistance or by inductance, and the cost has a valley for each.
@@ -272,13 +272,13 @@ def _misfit(problem: Problem, q: Array) -> float:
         return np.inf
 
 
-def _put_back(problem: Problem, q: Array) -> list[Array]:
+def _with_resets(problem: Problem, q: Array) -> list[Array]:
     """Return `q`, and `q` with the parameters that went very far put back to their start."""
     lost = problem.scaling.log & (np.abs(q - problem.start) > LOST)
     return [q, np.where(lost, problem.start, q)] if lost.any() else [q]
 
 
-def _cheapest(found: list[Solved]) -> Solved:
+def _lowest(found: list[Solved]) -> Solved:
     return min([d for d in found if d.status == "converged"] or found, key=lambda d: d.cost)
 
 

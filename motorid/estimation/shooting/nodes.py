@@ -1,4 +1,4 @@
-"""First guesses of the states at shooting nodes: from the measured channels, or from a simulation."""
+"""States at the shooting nodes: initialised from measured channels or a simulation; their gaps as process noise."""
 
 from __future__ import annotations
 
@@ -14,6 +14,10 @@ from motorid.errors import SimulationError, UsageError, one_of
 from motorid.estimation.shooting.mesh import Mesh
 from motorid.numerics.signals import Array, bridged, slope
 from motorid.records.experiment import Experiment
+
+NEXT_TO_NONE = 1e-6  # of a state's size per √s: states that no unknown voltage or torque acts on
+FIRST = 0.03  # of a state's size per √s
+DISTURBED = ("i", "omega")  # an unknown voltage, an unknown torque
 
 
 def nodes_from_simulation(mesh: Mesh, q: Array) -> Array:
@@ -60,11 +64,6 @@ def measured_states(run: Experiment, states: tuple[str, ...]) -> dict[int, Array
         elif name == "omega" and "theta" in run.outputs:
             found[j] = slope(run.t, bridged(run.t, run.outputs["theta"]), half=5)
     return found
-
-
-NEXT_TO_NONE = 1e-6  # of a state's size per √s: states that no unknown voltage or torque acts on
-FIRST = 0.03  # of a state's size per √s
-DISTURBED = ("i", "omega")  # an unknown voltage, an unknown torque
 
 
 @dataclass(frozen=True, eq=False)

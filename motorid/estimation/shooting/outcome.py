@@ -1,4 +1,8 @@
-"""What multiple shooting found, as a `Fit`: status in words, multipliers, gaps, directions left free."""
+"""The solution of multiple shooting as a `Fit`: status in words, multipliers, gaps, constraints that cannot be kept.
+
+`Solved` is a mesh with the solver's result, `fit_of` makes the fit of it. Below: violations and multipliers of the
+constraints, and what is said when they contradict one another or the records.
+"""
 
 from __future__ import annotations
 
@@ -23,11 +27,13 @@ from motorid.problem.simulate import integration_error
 GOOD = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
 JOINED = 1e-8  # violation of a row that counts as kept
 SAME = 1e-8  # difference of the scaled cost below which two points are as good
+WEAK = 1e-6  # share of the largest multiplier below which a row only touches its limit
+MISSED = 1e-5  # violation, in sizes of the rows, from which a constraint cannot be kept
+AT_LIMIT = 1e-9  # distance of a solver coordinate from a limit of its parameter that is rounding
 KEPT = "Start_Kept"
 SAID = {
     KEPT: ("stalled", "stalled: the interior-point solver found nothing better than the least-squares fit that it "
                       "started from, which is kept; identifiability() shows which parameters cannot be told apart"),
-
     "Maximum_Iterations_Exceeded": (
         "limit", "stopped at the largest number of iterations; raise max_iterations, or start from a least-squares "
                  "fit: mi.fit(fit.model, …, solver=mi.MultipleShooting(warm='model'))"),
@@ -114,7 +120,7 @@ def fit_of(done: Solved, seconds: float) -> Fit:
     """
     problem, q = done.problem, done.q
     if done.status == "failed" and problem.constraints:
-        found = conflict(problem, q)
+        found = contradiction(problem, q)
         if found:
             raise FitError(found)
     noisy = done.mesh.noise is not None
@@ -151,9 +157,6 @@ def _with_multipliers(done: Solved) -> list[tuple[str, Part, Array, Array]]:
         values[rows], multipliers[rows] = block.values, lam[first:first + len(rows)]
         first += len(rows)
     return [(c.name, part, *collected[id(part)]) for c in problem.constraints for part in c.parts(problem)]
-
-
-WEAK = 1e-6  # share of the largest multiplier below which a row only touches its limit
 
 
 @dataclass(frozen=True)
@@ -247,7 +250,7 @@ def summed(found: Sequence[tuple[str, Part, Array, Array]]) -> tuple[tuple[Multi
             mine = on & np.array([u == unit for u in part.units])
             value, active = sums.get((name, unit), (0.0, 0))
             sums[name, unit] = value + float(np.sum(np.abs(lam / part.size)[mine])), active + int(mine.sum())
-    totals = tuple(Multiplier(name, _count(active), value, unit, active)
+    totals = tuple(Multiplier(name, _rows_at_limit(active), value, unit, active)
                    for (name, unit), (value, active) in sums.items())
     return totals, tuple(sorted(rows, key=lambda m: -m.value))
 
@@ -262,35 +265,8 @@ def free_directions(jac: Array, slope: Array) -> Array:
     return slope[:, None] * vt[rank:].T
 
 
-def _count(active: int) -> str:
+def _rows_at_limit(active: int) -> str:
     return "not active" if not active else f"{active} row{'s' if active > 1 else ''} at the limit"
-
-
-KEPT_CONFLICT = 1e-5  # largest violation, in sizes of the rows, that counts as kept
-LIMITS = "the limits of the parameters"
-
-
-def conflict(problem: Problem, q: Array) -> str | None:
-    """Return a sentence naming the constraints in conflict; None if all can be kept together.
-
-    Each is left out in turn, and stays out when the others still contradict one another (deletion filter,
-    Chinneck & Dravnieks, ORSA Journal on Computing 3(2), 1991).
-    """
-    members: list[Any] = [*problem.constraints]
-    low, high = problem.scaling.bounds
-    if np.isfinite(low).any() or np.isfinite(high).any():
-        members.append(LIMITS)
-    starts = (q, problem.start)
-    if _possible(problem, members, starts):
-        return None
-    for member in list(members):
-        rest = [m for m in members if m is not member]
-        if not _possible(problem, rest, starts):
-            members = rest
-    names = " and ".join(m if isinstance(m, str) else m.name for m in members)
-    if len(members) == 1:
-        return f"{names} cannot be kept by any values of the parameters; loosen it or leave it out."
-    return (f"{names} contradict one another: each can be kept, not all together. Loosen or leave out one of them.")
 
 
 def below_steady(problem: Problem) -> str | None:
@@ -314,31 +290,39 @@ def below_steady(problem: Problem) -> str | None:
     return None
 
 
-def _possible(problem: Problem, members: Sequence[Any], starts: Sequence[Array]) -> bool:
-    return any(_violation(problem, members, q) < KEPT_CONFLICT for q in starts)
+def contradiction(problem: Problem, q: Array) -> str | None:
+    """Return a sentence naming the constraints that no values near keep together, and by how much; None if all can be.
+
+    At the least sum of squared violations those that are left push against one another, or against the limits of
+    the parameters; the others have no part in it.
+    """
+    found = [_least_violations(problem, start) for start in (q, problem.start)]
+    at = min((f for f in found if f is not None), key=lambda f: f[0], default=None)
+    if at is None or at[0] < MISSED:
+        return None
+    left = [c for c in problem.constraints if np.abs(_violation_rows(problem, [c], at[1], False)[0]).max() >= MISSED]
+    beyond = "; ".join(f"{n}: {v:.3g}" for n, v in violations(problem, at[1], left).items() if v)
+    low, high = problem.scaling.bounds
+    limits = ["the limits of the parameters"] if (np.minimum(at[1] - low, high - at[1]) < AT_LIMIT).any() else []
+    names = " and ".join([*(c.name for c in left), *limits])
+    why = "contradict one another" if len(left) + len(limits) > 1 else "cannot be kept by any values of the parameters"
+    return f"{names} {why}. Beyond its limits at the best compromise: {beyond}. Loosen one, or leave it out."
 
 
-def _violation(problem: Problem, members: Sequence[Any], q: Array) -> float:
-    """Return the smallest reachable violation of `members`, by least squares from `q`."""
-    relations = [m for m in members if not isinstance(m, str)]
-    bounds = problem.scaling.bounds if LIMITS in members else None
-    if not relations:
-        return 0.0
-
-    def residual(z: Array) -> Array:
-        return _rows(problem, relations, z, False)[0]
-
-    def both(z: Array) -> tuple[Array, Array]:
-        return _rows(problem, relations, z, True)
-
+def _least_violations(problem: Problem, q: Array) -> tuple[float, Array] | None:
+    """Return the largest violation and the point at the least sum of squares that is reached from `q`."""
+    options = LevenbergMarquardt(max_iterations=60, damping=1e-2)
     try:
-        found = levenberg_marquardt(residual, both, q, bounds, LevenbergMarquardt(max_iterations=60, damping=1e-2))
+        found = levenberg_marquardt(lambda z: _violation_rows(problem, problem.constraints, z, False)[0],
+                                    lambda z: _violation_rows(problem, problem.constraints, z, True),
+                                    q, problem.scaling.bounds, options)
     except (FitError, SimulationError):
-        return np.inf
-    return float(np.abs(found.residual).max(initial=0.0))
+        return None
+    return float(np.abs(found.residual).max(initial=0.0)), found.q
 
 
-def _rows(problem: Problem, relations: Sequence[Any], q: Array, derivatives: bool) -> tuple[Array, Array]:
+def _violation_rows(problem: Problem, relations: Sequence[Any], q: Array, derivatives: bool) -> tuple[Array, Array]:
+    """Return violations of all rows, in their sizes, and their Jacobian."""
     trajs = [problem.simulate(q, k, derivatives=derivatives) for k in range(len(problem.runs))]
     at = problem.unknowns.point(q)
     rs, jacs = [np.zeros(1)], [np.zeros((1, len(q)))]
