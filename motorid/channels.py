@@ -7,6 +7,7 @@ from types import MappingProxyType
 
 CHANNELS = ("i", "omega", "theta")  # what can be measured, in the order of states, tables and figures
 NAMES = {"t": "time", "v": "voltage", "i": "current", "omega": "speed", "theta": "angle"}
+SYMBOLS = {"t": "t", "v": "v", "i": "i", "omega": "ω", "theta": "θ"}
 # The first unit of each channel is its default. A linear axis is measured in m and m/s; the command of a
 # current- or torque-controlled drive need not be a voltage.
 UNITS: Mapping[str, tuple[str, ...]] = MappingProxyType({

@@ -41,7 +41,7 @@ KNOWS = {
     "model": ("errors", "channels", "display", "numerics"),
     "effects": ("errors", "model"),
     "integrate": ("errors", "numerics", "model.equations"),
-    "acquire": ("errors", "display", "records.datasets"),
+    "acquire": ("errors", "channels", "display", "records.datasets"),
 }
 HOMES = {"matplotlib": "plots", "serial": "acquire", "typer": "cli", "jinja2": "reports.report",
          "rich": "cli numerics.parallel", "threadpoolctl": "numerics.threads"}

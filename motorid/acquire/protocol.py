@@ -42,12 +42,13 @@ from collections import Counter
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
+from motorid.channels import UNITS
 from motorid.errors import DeviceError
 
 VERSION = 1
 LONGEST = 240
 SILENCE = 1.0  # s without a word from the computer after which a device switches the motor off
-UNITS = {"v": ("V",), "i": ("A",), "omega": ("rad/s", "m/s"), "theta": ("rad", "m")}
+PERMITTED = {**UNITS, "v": UNITS["v"][:1]}  # what drives the motor is a voltage
 
 _FRAME = re.compile(rb"\$([^$*\r\n]{1,240})\*([0-9A-F]{4})")
 _UNFINISHED = re.compile(rb"\$[^$*\r\n]{0,240}(?:\*[0-9A-F]{0,3})?")  # may still become a frame
@@ -86,8 +87,8 @@ class Channel:
     def __post_init__(self) -> None:
         if not _NAME.fullmatch(self.name):
             raise DeviceError(f"'{self.name}' is not a channel name (letters, digits, at most 16 of them).")
-        if self.unit not in UNITS.get(self.name, (self.unit,)):
-            raise DeviceError(f"channel {self.name} must be scaled to {' or '.join(UNITS[self.name])}; "
+        if self.unit not in PERMITTED.get(self.name, (self.unit,)):
+            raise DeviceError(f"channel {self.name} must be scaled to {' or '.join(PERMITTED[self.name])}; "
                               f"the device says '{self.unit}'.")
         if not (math.isfinite(self.scale) and self.scale != 0 and math.isfinite(self.offset)):
             raise DeviceError(f"channel {self.name}: scale {self.scale} and offset {self.offset} must be "

@@ -12,13 +12,13 @@ from typing import NamedTuple
 
 from motorid.acquire.protocol import Channel
 from motorid.acquire.timeline import Row
+from motorid.channels import CHANNELS
 from motorid.errors import DataError, UsageError
 
 FILL_UP_TO = 60.0  # s; a longer gap is marked by its first and last sample alone
 SYNC_EVERY = 0.5  # s between two calls of fsync: what is older than that survives a power cut
 _COLUMNS = {("v", "V"): "voltage_V", ("i", "A"): "current_A", ("omega", "rad/s"): "speed_rad_s",
             ("omega", "m/s"): "speed_m_s", ("theta", "rad"): "angle_rad", ("theta", "m"): "position_m"}
-_ORDER = ("v", "i", "omega", "theta")
 
 Commanded = Callable[[int], float | None]  # voltage (V) commanded at a sample, None where nobody knows
 
@@ -108,7 +108,7 @@ class RecordFile:
     def __init__(self, out: Path, channels: tuple[Channel, ...], rate: float, meta: Mapping[str, object],
                  mode: str = "new") -> None:
         self.out, self.rate = out, rate
-        known = [k for name in _ORDER for k, c in enumerate(channels) if c.name == name]
+        known = [k for name in ("v", *CHANNELS) for k, c in enumerate(channels) if c.name == name]
         self._order = known + [k for k in range(len(channels)) if k not in known]
         self._v = next(k for k, c in enumerate(channels) if c.name == "v")
         self.columns = ",".join(["time_s", *(column(channels[k]) for k in self._order), "sample"])

@@ -16,6 +16,7 @@ import numpy as np
 
 from motorid.acquire.excitation import Program, Segment
 from motorid.acquire.protocol import SILENCE, Channel, Decoder, Header, Message, frame
+from motorid.channels import CHANNELS
 from motorid.errors import UsageError, one_of
 from motorid.records.datasets import load_plant
 
@@ -45,7 +46,7 @@ class VirtualDevice:
     """
 
     def __init__(self, truth: Truth, rate: float = 1000.0,
-                 channels: tuple[str, ...] = ("v", "i", "omega", "theta"), counter_bits: int = 32,
+                 channels: tuple[str, ...] = ("v", *CHANNELS), counter_bits: int = 32,
                  timer_bits: int = 32, counter0: int = 0, time0: int = 0, encoder_bits: int = 32) -> None:
         self.truth, m = truth, truth.motor
         known = _channels(m, encoder_bits)

@@ -18,6 +18,7 @@ from typing import Annotated, Any, get_type_hints
 import typer
 
 from motorid import effects as library
+from motorid.channels import CHANNELS
 from motorid.errors import ModelError, UsageError, one_of
 from motorid.estimation.fit import fit
 from motorid.estimation.result import Fit
@@ -92,7 +93,7 @@ class ReadingOptions:
     def _preprocessed(self, runs: Sequence[Experiment]) -> list[Experiment]:
         """Return `runs` without the ignored channels, filtered, delayed and without spikes as asked."""
         out = _words([self.ignore] if self.ignore else [])
-        known = [c for c in ("i", "omega", "theta") if any(c in r.outputs for r in runs)]
+        known = [c for c in CHANNELS if any(c in r.outputs for r in runs)]
         for channel in out:
             if channel not in known:
                 raise UsageError(f"--ignore: {one_of(channel, known, 'measured channel')}")

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import LinAlgError, solveh_banded
 
+from motorid.channels import UNITS
 from motorid.diagnosis.free_forms import Form
 from motorid.diagnosis.results import Binned, Missing
 from motorid.estimation.linearisation import linear_steps, parameter_vector, shown
@@ -20,7 +21,6 @@ from motorid.problem.runs import angle_signal, natural_sizes
 
 WALKS = (0.03, 0.1, 0.3, 1.0, 3.0)  # of the natural size per √s, the smallest that explains the data is taken
 BINS = 24
-UNITS = {"i": "A", "omega": "rad/s", "theta": "rad", "heat": "J", "t": "s"}
 WORDS = {
     "i": "the current",
     "omega": "the speed",
@@ -166,7 +166,7 @@ def _binned(name: str, z: Array, d: Array, worth: float) -> Binned:
     explained = max(between - keep.sum() * inside, 0.0) / max(total, 1e-300)
     return Binned(
         name,
-        UNITS[name],
+        "J" if name == "heat" else UNITS[name][0],
         centre[keep],
         mean[keep],
         (mean - half)[keep],

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from motorid.channels import CHANNELS
 from motorid.model.model import Model
 from motorid.numerics.signals import Array, bridged, integral, slope
 from motorid.records.experiment import Experiment
@@ -75,7 +76,7 @@ def _signals(run: Experiment) -> dict[str, Array]:
     """Return t, v and what was measured of i, omega, theta on all samples, gaps bridged; omega from the angle."""
     t = run.t
     found: dict[str, Array] = {"t": t, "v": run.inputs["v"]}
-    for c in ("i", "omega", "theta"):
+    for c in CHANNELS:
         if _measured(run, c):
             found[c] = bridged(t, run.outputs[c])
     if "omega" not in found and "theta" in found:

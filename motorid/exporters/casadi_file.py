@@ -47,7 +47,7 @@ def system_of(found: Fit | Model) -> System:
     """Return the model's functions for the channels of the fit; of a model, for all that it can show."""
     if isinstance(found, Fit):
         return found.problem.system
-    return found.system(("i", "omega", "theta") if found.base == "dc_motor" else ("omega", "theta"))
+    return found.system(CHANNELS if found.base == "dc_motor" else ("omega", "theta"))
 
 
 def values_of(found: Fit | Model, system: System) -> Array:

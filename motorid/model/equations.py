@@ -129,7 +129,7 @@ class Equations:
     def rate(self, state: ca.SX, expression: Any) -> None:
         """Set the time derivative of a state that was added with `state`."""
         name = state.name()
-        if name not in self.states or name in ("i", "omega", "theta"):
+        if name not in self.states or name in CHANNELS:
             raise ModelError(f"{self.writer}: rate() takes a state made with m.state(), got '{name}'.")
         self.rates[name] = ca.SX(expression)
 

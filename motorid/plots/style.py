@@ -15,6 +15,7 @@ from cycler import cycler
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from motorid.channels import NAMES, SYMBOLS, UNITS, channel_name
 from motorid.errors import DataError
 from motorid.numerics.signals import Array
 from motorid.records.experiment import Experiment
@@ -77,16 +78,6 @@ STYLE: Mapping[Any, Any] = {
     "font.family": ["DejaVu Sans"],
 }
 
-_NAMES = {
-    "t": "time",
-    "v": "voltage v",
-    "i": "current i",
-    "omega": "speed ω",
-    "theta": "angle θ",
-    "heat": "heat in the winding",
-}
-_UNITS = {"t": "s", "v": "V", "i": "A", "omega": "rad/s", "theta": "rad", "heat": "J"}
-
 _detached: ContextVar[bool] = ContextVar("motorid_detached_figures", default=False)
 
 
@@ -145,13 +136,16 @@ def only(ax: Axes | None, *, width: float = 5.6, height: float = 3.2) -> Axes:
 
 def axis_label(channel: str, run: Experiment | None = None) -> str:
     """Return a label with its unit: ``speed ω (rad/s)``."""
-    unit = _UNITS.get(channel, "")
-    unit = run.units.get(channel, unit) if run is not None else unit
-    linear = run is not None and run.units.get(channel) in ("m", "m/s")
-    name = {"theta": "position x", "omega": "speed v"}[channel] if linear else _NAMES.get(channel, channel)
+    if channel == "heat":
+        return "heat in the winding (J)"
+    if channel not in NAMES:
+        return channel
+    unit = UNITS[channel][0] if run is None else run.units.get(channel, UNITS[channel][0])
+    symbol = {"m": "x", "m/s": "v"}.get(unit, SYMBOLS[channel])
+    name = "time" if channel == "t" else f"{channel_name(channel, unit)} {symbol}"
     if channel == "v" and unit != "V":
         name = "command u"
-    return f"{name} ({unit})" if unit and unit != "1" else name
+    return f"{name} ({unit})" if unit != "1" else name
 
 
 def envelope(x: Array, y: Array, points: int = POINTS) -> tuple[Array, Array]:

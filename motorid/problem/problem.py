@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from motorid.channels import CHANNELS
 from motorid.errors import ModelError, SimulationError, UsageError, one_of
 from motorid.integrate import engine_of
 from motorid.integrate.engine import Engine, Trajectory
@@ -89,7 +90,7 @@ class Problem:
     @cached_property
     def outputs(self) -> tuple[str, ...]:
         """Measured channels that the model can show."""
-        shown = ("i", "omega", "theta") if self.model.base == "dc_motor" else ("omega", "theta")
+        shown = CHANNELS if self.model.base == "dc_motor" else ("omega", "theta")
         return tuple(c for c in channels_of(self.experiments) if c in shown)
 
     @cached_property

@@ -10,13 +10,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from motorid.channels import CHANNELS
+from motorid.channels import CHANNELS, UNITS
 from motorid.model.definition import Parameter
 from motorid.model.equations import System
 from motorid.numerics.signals import Array
 from motorid.problem.runs import Run, natural_sizes, spread_of
-
-STATE_UNITS = {"i": "A", "omega": "rad/s", "theta": "rad"}
 
 
 class Point(NamedTuple):
@@ -58,7 +56,7 @@ class Unknowns:
         for k, run in enumerate(self.runs):
             for c in run.estimated:
                 if c in free:  # an algebraic current follows from the rest
-                    unit = run.experiment.units.get(c, STATE_UNITS[c])
+                    unit = run.experiment.units.get(c, UNITS[c][0])
                     low, high = run.limits[c]
                     value = float(run.start[CHANNELS.index(c)])
                     found.append((c, k, Parameter(f"{c}_0[{k}]", value, unit, low, high)))

@@ -7,6 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from motorid.channels import NAMES
 from motorid.numerics.noise import noise_level, quantum
 from motorid.numerics.signals import Array
 from motorid.records.experiment import Experiment
@@ -21,7 +22,6 @@ from motorid.records.plausibility import (
 
 Check = Callable[[Experiment], str | None]
 
-_NAMES = {"i": "current", "omega": "speed", "theta": "angle"}
 
 
 def check_runs(runs: Sequence[Experiment]) -> list[str]:
@@ -57,7 +57,7 @@ def _excitation(run: Experiment) -> str | None:
                 "cannot tell the parameters apart. Add runs with steps or a sweep of the voltage.")
     still = [c for c, y in run.outputs.items() if np.nanmax(y) == np.nanmin(y)]
     if still:
-        return (f"the {_NAMES[still[0]]} never changes although the voltage does; a dead sensor, a "
+        return (f"the {NAMES[still[0]]} never changes although the voltage does; a dead sensor, a "
                 "locked rotor, or too little voltage to move?")
     return None
 
@@ -66,7 +66,7 @@ def _missing(run: Experiment) -> str | None:
     share = {c: float(np.mean(np.isnan(y))) for c, y in run.outputs.items()}
     worst = max(share, key=lambda c: share[c])
     if share[worst] > 0.2:
-        return (f"{100 * share[worst]:.0f} % of the {_NAMES[worst]} samples are missing; the fit uses "
+        return (f"{100 * share[worst]:.0f} % of the {NAMES[worst]} samples are missing; the fit uses "
                 "the others. Look whether the logger drops them at certain moments.")
     return None
 
@@ -80,7 +80,7 @@ def _clipped(run: Experiment) -> str | None:
         for top in (y.max(), y.min()):
             if _at_stop(y, float(top)):
                 share = 100 * float(np.mean(y == top))
-                return (f"the {_NAMES[channel]} stays at exactly {top:.4g} {run.units[channel]} in "
+                return (f"the {NAMES[channel]} stays at exactly {top:.4g} {run.units[channel]} in "
                         f"{share:.0f} % of the samples: clipped at the limit of the sensor or the drive. Use "
                         "a lower voltage, or mark these samples as missing.")
     return None
@@ -129,7 +129,7 @@ def _coarse(run: Experiment) -> str | None:
     for channel, y in run.outputs.items():
         step, reach = quantum(y), float(np.nanmax(y) - np.nanmin(y))
         if 0 < reach < 16 * step:
-            return (f"the {_NAMES[channel]} moves in steps of {step:.3g} {run.units[channel]} and "
+            return (f"the {NAMES[channel]} moves in steps of {step:.3g} {run.units[channel]} and "
                     f"covers only {reach / step:.0f} of them, too few counts to fit well. Use more of "
                     "the range, a finer sensor or a longer counting time.")
     return None
@@ -142,7 +142,7 @@ def _spikes(run: Experiment) -> str | None:
         far = np.flatnonzero(np.isfinite(y) & ~kept)
         if far.size:
             size = float(np.median(np.abs(y[far] - np.interp(run.t[far], run.t[kept], y[kept]))))
-            return (f"{far.size} single samples of the {_NAMES[channel]} stand about {size:.2g} {run.units[channel]} "
+            return (f"{far.size} single samples of the {NAMES[channel]} stand about {size:.2g} {run.units[channel]} "
                     "away from both neighbours: spikes of the sensor or the logger. Leave them out (--no-spikes, "
                     "run.without_spikes()), or fit with a loss that forgives outliers (--loss huber, "
                     "loss=mi.Huber()).")
@@ -153,7 +153,7 @@ def _noisy(run: Experiment) -> str | None:
     for channel, y in run.outputs.items():
         size, noise = float(np.nanstd(y)), noise_level(y, run.t)
         if noise > 0.5 * size > 0:
-            return (f"the {_NAMES[channel]} is mostly noise ({noise:.2g} of {size:.2g} {run.units[channel]}) "
+            return (f"the {NAMES[channel]} is mostly noise ({noise:.2g} of {size:.2g} {run.units[channel]}) "
                     "and will tell the fit little. Drive the motor harder or filter before sampling.")
     return None
 
@@ -204,7 +204,7 @@ def _never_settles(run: Experiment) -> str | None:
             drifts.append(abs(float(np.nanmean(late) - np.nanmean(early))))
     spread = 5 * noise_level(y, run.t) / np.sqrt(run.n / 10 / (len(drifts) + 1))
     if drifts and min(drifts) > max(0.05 * reach, spread):
-        return (f"the {_NAMES[channel]} never settles while the voltage is constant; friction and "
+        return (f"the {NAMES[channel]} never settles while the voltage is constant; friction and "
                 "steady state will be uncertain. Hold the voltage longer in at least one run.")
     return None
 

@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
+from motorid.channels import NAMES
 from motorid.errors import DataError, UsageError, one_of
 from motorid.records.headers import (
     DIMENSIONS,
@@ -20,8 +21,7 @@ from motorid.records.headers import (
 )
 
 _CHANNELS = tuple(DIMENSIONS)
-_MEANING = {"t": "the time", "v": "the drive voltage", "i": "the current", "omega": "the speed",
-            "theta": "the angle"}
+_MEANING = {c: f"the {name}" for c, name in NAMES.items()} | {"v": "the drive voltage"}
 Units = Mapping[str, Unit | None]
 
 

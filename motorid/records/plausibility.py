@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from motorid.channels import NAMES
 from motorid.numerics.noise import noise_level
 from motorid.numerics.signals import Array, bridged, integral
 from motorid.records.experiment import Experiment
@@ -45,13 +46,13 @@ def signs(run: Experiment) -> str | None:
 def unsigned(run: Experiment) -> str | None:
     """A motor that is driven both ways draws current both ways."""
     v = run.inputs["v"]
-    for c, name in (("i", "current"), ("omega", "speed")):
+    for c in ("i", "omega"):
         y = run.outputs.get(c)
         if y is None or min(-v.min(), v.max()) < 0.2 * np.abs(v).max():
             continue
         backward, noise = v < -0.2 * np.abs(v).max(), noise_level(y, run.t)
         if np.nanmin(y) > -2 * noise and np.mean(backward) > 0.05 and np.nanmedian(y[backward]) > 5 * noise:
-            return (f"the {name} is never negative although the voltage is in {100 * np.mean(v < 0):.0f} % of the "
+            return (f"the {NAMES[c]} is never negative although the voltage is in {100 * np.mean(v < 0):.0f} % of the "
                     f"samples: logged without its sign? A fit needs the sign; leave it out with --ignore {c}.")
     return None
 

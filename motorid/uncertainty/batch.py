@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from motorid.channels import CHANNELS
 from motorid.display.tables import Table
 from motorid.errors import DataError, FitError, MissingDependency, UsageError
 from motorid.estimation.fit import fit
@@ -156,7 +157,7 @@ def _carry_laws(model: Model) -> None:
     if all(e.__reduce__()[1][0] is not None for e in model.effects):
         return
     for n in (1, 2, 3):
-        for outputs in combinations(("i", "omega", "theta"), n):
+        for outputs in combinations(CHANNELS, n):
             try:
                 model.system(outputs)
             except Exception:

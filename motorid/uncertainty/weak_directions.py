@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from motorid.channels import NAMES
 from motorid.errors import MotoridError
 from motorid.model.model import Model
 from motorid.numerics.signals import Array
@@ -27,7 +28,6 @@ STEP = 0.1  # relative change that is spoken of
 MOST = 300  # pivots tried
 ASSUMED_NOISE = 0.01  # of a channel's RMS, where a plan does not say
 EASY = ("R", "K", "g", "L", "b", "J")  # in the order in which they are usually known beforehand
-CHANNELS = {"i": "the current", "omega": "the speed"}
 
 
 def basis_in_words(names: Sequence[str], weak: Array,
@@ -127,9 +127,9 @@ def suggestions(problem: Problem, q: Array, matrix: Array, missing: int, level: 
         first = " and ".join(sets[0])
         other = f" (or {' and '.join(sets[1])})" if len(sets) > 1 else ""
         said.append(f"Fix {first}{other} where known, model.fix(…), and the rest is determined.")
-    for channel, title in CHANNELS.items():
+    for channel in ("i", "omega"):
         if _would_do(problem, q, channel, level):
-            said.append(f"Measure {title} as well: with 1 % of noise all of them are determined.")
+            said.append(f"Measure the {NAMES[channel]} as well: with 1 % of noise all of them are determined.")
     return said
 
 

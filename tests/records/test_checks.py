@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from motorid.channels import CHANNELS
 from motorid.records.checks import check_runs
 from motorid.records.datasets import data_path, datasets
-from motorid.records.experiment import OUTPUTS, Experiment
+from motorid.records.experiment import Experiment
 from motorid.records.reading import read_csv, read_runs
 
 
@@ -52,7 +53,7 @@ def test_a_plain_motor_raises_no_false_alarm(motor, drive, plant, rng):
         t = np.arange(2000) * 1e-3
         v = 5 * np.sin(2 * np.pi * (0.5 + 2 * t) * t)
     record = plant.simulate(machine, {}, t, v)
-    noisy = {c: record[c] + 0.003 * np.std(record[c]) * rng.normal(size=len(t)) for c in OUTPUTS}
+    noisy = {c: record[c] + 0.003 * np.std(record[c]) * rng.normal(size=len(t)) for c in CHANNELS}
     remarks = check_runs([Experiment(t, {"v": v}, noisy)])
     assert [r for r in remarks if "too slow for the inductance" not in r] == []
 

@@ -10,8 +10,9 @@ from broken_inputs import BROKEN, GOOD, HEADER, Broken, rows
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
+from motorid.channels import CHANNELS, UNITS
 from motorid.errors import DataError, MissingDependency, UsageError
-from motorid.records.experiment import MIN_SAMPLES, OUTPUTS, UNITS, Experiment
+from motorid.records.experiment import MIN_SAMPLES, Experiment
 from motorid.records.layout import parse_pairs
 from motorid.records.reading import find_records, read_csv, read_mat, read_parquet, read_runs, write_csv
 
@@ -413,7 +414,7 @@ def test_parquet_without_pyarrow_names_the_extra(tmp_path, monkeypatch):
 # -- writing ------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("channels", [("i",), ("omega",), ("theta",), OUTPUTS])
+@pytest.mark.parametrize("channels", [("i",), ("omega",), ("theta",), CHANNELS])
 @pytest.mark.parametrize("linear", [False, True])
 @pytest.mark.parametrize("drive", UNITS["v"])
 def test_writing_and_reading_gives_the_same_run(channels, linear, drive, tmp_path, rng):
@@ -457,8 +458,8 @@ REAL = {
     "emps": ({}, ("theta",), {"v": "V", "theta": "m"}, [24841]),
     "fibo": ({}, ("omega",), {"v": "V", "omega": "rad/s"}, [25502] * 3),
     "frc": ({}, ("omega", "theta"), {"v": "V", "omega": "rad/s", "theta": "rad"}, [1287, 4211]),
-    "furuta_base": ({}, OUTPUTS, {"v": "V", "i": "A", "omega": "rad/s", "theta": "rad"}, [8001, 5001]),
-    "odri_mn4004": ({}, OUTPUTS, {"v": "V", "i": "A", "omega": "rad/s", "theta": "rad"}, [3717, 26999]),
+    "furuta_base": ({}, CHANNELS, {"v": "V", "i": "A", "omega": "rad/s", "theta": "rad"}, [8001, 5001]),
+    "odri_mn4004": ({}, CHANNELS, {"v": "V", "i": "A", "omega": "rad/s", "theta": "rad"}, [3717, 26999]),
     "unmotor": ({"units": {"omega": "deg/s"}}, ("omega",), {"v": "V", "omega": "rad/s"}, [4093, 302]),
     "xl330": ({}, ("omega", "theta"), {"v": "V", "omega": "rad/s", "theta": "rad"},
               [1510, 1124, 1116, 1116, 1499, 1125, 1131, 1123]),
