@@ -23,7 +23,7 @@ from motorid.numerics.least_squares import Huber, LevenbergMarquardt
 from motorid.problem.constraints import Constraint, CurrentLimit, SteadyState
 from motorid.problem.problem import Problem
 from motorid.problem.sensitivity import check_derivatives
-from motorid.problem.simulate import evaluate, simulate
+from motorid.problem.simulate import evaluate, planned, simulate
 from motorid.records import datasets
 from motorid.records.checks import check_runs
 from motorid.records.datasets import data_path
@@ -37,7 +37,6 @@ from motorid.uncertainty.covariance import covariance
 from motorid.uncertainty.identifiability import identifiability
 from motorid.uncertainty.multistart import multistart
 from motorid.uncertainty.profile import intervals, profile, profiles
-from motorid.uncertainty.weak_directions import planned
 
 if _TYPE_CHECKING:
     from motorid.plots import (

@@ -11,7 +11,7 @@ import casadi as ca
 import numpy as np
 
 from motorid.estimation.result import Fit
-from motorid.exporters.casadi_file import description, held_inputs, runs_of, system_of, values_of, words
+from motorid.exporters.casadi_file import description, runs_of, system_of, values_of, words, zoh_inputs
 from motorid.integrate.rodas3 import step_functions
 from motorid.model.model import Model
 
@@ -206,7 +206,7 @@ def _fields(found: Fit | Model, name: str) -> dict[str, Any]:
                  _as(system.out, f"{name}_f_outputs"), _as(step_functions(system).light, f"{name}_f_step")]
     sizes = dict(zip(("NX", "NU", "NP", "NY"), system.sizes, strict=True))
     starts = [s for _, s in runs_of(found)] if isinstance(found, Fit) else []
-    held = held_inputs(system.inputs, found.problem.experiments[0]) if isinstance(found, Fit) else [
+    held = zoh_inputs(system.inputs, found.problem.experiments[0]) if isinstance(found, Fit) else [
         n != "theta_in" for n in system.inputs]
     runs = f"#define {name.upper()}_RUNS {len(starts)}\n" if starts else ""
     return {

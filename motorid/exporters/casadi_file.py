@@ -154,7 +154,7 @@ def simulation(name: str, system: System, step: ca.Function, run: Run) -> ca.Fun
     first = np.concatenate([[0], np.cumsum(m)])
     part = np.arange(len(interval)) - first[:-1][interval]
     share = 1.0 / m[interval]
-    held = held_inputs(system.inputs, run.experiment)
+    held = zoh_inputs(system.inputs, run.experiment)
     s, u, p = ca.MX.sym("s", 3), ca.MX.sym("u", nu, len(grid.t)), ca.MX.sym("p", np_)
     before = u[:, interval.tolist()]
     after = ca.vertcat(*[u[j, (interval if hold else interval + 1).tolist()] for j, hold in enumerate(held)])
@@ -169,7 +169,7 @@ def simulation(name: str, system: System, step: ca.Function, run: Run) -> ca.Fun
     return ca.Function(name, [s, u, p], [y, x], ["s", "u", "p"], ["y", "x"])
 
 
-def held_inputs(inputs: Sequence[str], run: Experiment) -> list[bool]:
+def zoh_inputs(inputs: Sequence[str], run: Experiment) -> list[bool]:
     """Tell which inputs stay constant between samples."""
     return [run.hold == "zoh" and n != "theta_in" for n in inputs]
 
@@ -180,7 +180,7 @@ def words(contents: Mapping[str, Any]) -> list[str]:
     lines = [" + ".join([model["base"], *model["effects"]]), ""]
     for name, p in contents["parameters"].items():
         spread = f" ± {p['std']:.3g}" if p["std"] else ""
-        lines.append(f"{name} = {p['value']:.17g}{spread} {p['unit']}" + (" (held)" if p["fixed"] else ""))
+        lines.append(f"{name} = {p['value']:.17g}{spread} {p['unit']}" + (" (fixed)" if p["fixed"] else ""))
     lines += ["", *(f"fitted to {d['name']}: {d['samples']} samples, SHA-256 {d['sha256']}" for d in contents["data"])]
     lines.append("written by " + ", ".join(f"{k} {v}" for k, v in contents["versions"].items()))
     return lines

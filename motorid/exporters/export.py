@@ -220,7 +220,7 @@ def model_from_json(contents: Mapping[str, Any], effects: Iterable[Effect] = ())
         head, pars = contents["model"], contents["parameters"]
         base, names = head["base"], list(head["effects"])
         values = {n: float(p["value"]) for n, p in pars.items()}
-        held = [n for n, p in pars.items() if p["fixed"]]
+        fixed_names = [n for n, p in pars.items() if p["fixed"]]
     except (KeyError, TypeError, ValueError) as error:
         raise DataError(f"this is not a fitted model: {error!s} is missing or wrong; expected model.base, "
                         "model.effects and parameters with value and fixed.") from None
@@ -234,7 +234,7 @@ def model_from_json(contents: Mapping[str, Any], effects: Iterable[Effect] = ())
                         "effect has changed since the file was written.")
     limits = {n: (p.get("lower", -np.inf), p.get("upper", np.inf)) for n, p in pars.items()
               if "lower" in p or "upper" in p}
-    fixed = {n: values[n] for n in held}  # first: what is held may be zero, what is free may not
+    fixed = {n: values[n] for n in fixed_names}  # first: what is fixed may be zero, what is free may not
     free = {n: v for n, v in values.items() if n not in fixed}
     return model.fix(**fixed).replace(**free).bounded(**limits).free(*free)
 

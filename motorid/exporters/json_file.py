@@ -1,4 +1,4 @@
-"""Results as plain data for JSON, and what a person should hear about a fit beside its numbers."""
+"""Results as plain data for JSON, written to a file; and remarks on a fit: what its numbers do not say."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def fit_dict(fit: Fit, held_out: Evaluation | None = None) -> dict[str, Any]:
     """Return the contents of ``fit --json``.
 
     Standard deviations are those of `deviations`: null where the data do not determine the value, 0 where it was
-    held.
+    fixed.
     """
     model, problem, std = fit.problem.model, fit.problem, deviations(fit)
     engine = problem.engine if isinstance(problem.engine, str) else problem.engine.name
@@ -79,13 +79,13 @@ def remarks(fit: Fit) -> list[str]:
         said.append(f"The current was not measured, so {_listed(motor)} cannot be told apart: only "
                     "combinations such as R·J/K and K + R·b/K are determined. Measure the current, or fix R "
                     "where it is known (--fix R=1.2).")
-        vague = [n for n in vague if n not in ("R", "L", "K", "b", "J") and not _a_torque(model, n)]
+        vague = [n for n in vague if n not in MOTOR and not _a_torque(model, n)]
     elif model.base == "dc_motor" and motor and "omega" not in measured and "theta" not in measured:
         said.append(f"Neither speed nor angle was measured, so {_listed(motor)} cannot be told apart. "
                     "Measure one of them, or fix K (--fix K=0.05).")
         vague = [n for n in vague if n not in MOTOR and not _a_torque(model, n)]
     if vague:
-        said.append(f"The records do not determine {_listed(vague)}: another value fits them as well. Hold "
+        said.append(f"The records do not determine {_listed(vague)}: another value fits them as well. Fix "
                     f"{'it' if len(vague) == 1 else 'one of them'} (--fix {vague[0]}), or look at "
                     "`motorid identifiability`.")
     for n in at_limit:

@@ -22,6 +22,8 @@ from motorid.problem.problem import Problem, as_problem
 from motorid.records.experiment import Experiment, units_of
 from motorid.records.steady_state import find_segments
 
+ASSUMED_NOISE = 0.01  # of a channel's RMS, where a plan does not say
+
 MOST_RUNS = 12  # shown one by one
 
 
@@ -133,6 +135,46 @@ def simulate(model: Model, runs: Sequence[Experiment] | Experiment, *, engine: s
     """
     problem = as_problem(model, runs, engine=engine, initial=initial)
     return list(simulated(problem, estimate_initial))
+
+
+def planned(model: Model, t: Sequence[float] | Array, v: Sequence[float] | Array, *,
+            channels: Sequence[str] = ("i", "omega"), sigma: Mapping[str, float] | None = None,
+            hold: Any = "zoh", name: str = "plan") -> Experiment:
+    """Return an experiment that was not made: what `model`, at its values, would show.
+
+    Parameters
+    ----------
+    model : Model
+    t, v : array (N,)
+        Time (s) and voltage (V) as they would be applied, from rest.
+    channels : sequence of str
+        What would be measured.
+    sigma : mapping of str to float, optional
+        Noise per channel, SI; default one per cent of the channel's RMS.
+    hold : {"zoh", "linear"}
+    name : str
+
+    Examples
+    --------
+    >>> plan = planned(dc_motor(R=1.4, L=2e-3, K=0.046, b=6e-5, J=2e-5), t, v, channels=["omega"])
+    >>> identifiability(Problem(model, [plan]))
+    """
+    t = np.asarray(t, float)
+    blank = Experiment(t, {"v": np.asarray(v, float)}, {c: np.zeros(len(t)) for c in channels}, hold=hold,
+                       name=name)
+    return with_channels(model, blank, channels, sigma)
+
+
+def with_channels(model: Model, run: Experiment, channels: Sequence[str],
+                  sigma: Mapping[str, float] | None = None) -> Experiment:
+    """Return the run with `channels` filled in from the model, with their noise (default 1 % of the RMS)."""
+    blank = run.with_(outputs={**run.outputs, **{c: np.zeros(run.n) for c in channels}},
+                      sigma={**run.sigma, **dict.fromkeys(channels, 1.0)})
+    shown = simulate(model, [blank], initial="rest", estimate_initial=False)[0].outputs
+    noise = {c: (sigma or {}).get(c) or ASSUMED_NOISE * float(np.sqrt(np.mean(shown[c] ** 2))) or 1.0
+             for c in channels}
+    filled = {c: shown[c] for c in channels}
+    return blank.with_(outputs={**run.outputs, **filled}, sigma={**run.sigma, **noise})
 
 
 def simulated(problem: Problem, estimate_initial: bool = True) -> tuple[Simulation, ...]:

@@ -12,9 +12,10 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from motorid.display.numbers import counted
 from motorid.errors import DataError, MissingDependency
 from motorid.records.experiment import MIN_SAMPLES
-from motorid.records.text_tables import TextTable, counted, numbers, unique_labels
+from motorid.records.text_tables import TextTable, numbers, unique_labels
 
 # Numbers of the MAT-file format, version 5.
 _MATRIX, _COMPRESSED, _UINT32 = 14, 15, 6

@@ -9,12 +9,12 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from motorid.display.numbers import counted
 from motorid.errors import DataError
 from motorid.numerics.signals import Array
 from motorid.records.experiment import MIN_SAMPLES, Experiment
 from motorid.records.layout import Layout, Place
 from motorid.records.preprocessing import unwrapped
-from motorid.records.text_tables import counted
 
 Texts = Mapping[str, Sequence[object]]
 

@@ -143,7 +143,7 @@ class Experiment(Shown):
         coarse = self.select(slice(None, None, int(k)))
         if self.hold == "linear" or k == 1:
             return coarse
-        return coarse.with_(inputs={c: _held_mean(self.t, a, int(k)) for c, a in self.inputs.items()})
+        return coarse.with_(inputs={c: _zoh_mean(self.t, a, int(k)) for c, a in self.inputs.items()})
 
     def running_median(self, samples: int) -> Experiment:
         """Return the run with its voltage, noisy as it was measured, replaced by the median over `samples` (odd)."""
@@ -319,7 +319,7 @@ def _units(run: Experiment) -> Mapping[str, str]:
                              for c in present} | given)
 
 
-def _held_mean(t: Array, values: Array, k: int) -> Array:
+def _zoh_mean(t: Array, values: Array, k: int) -> Array:
     starts = np.arange(0, len(t), k)
     width = np.diff(t, append=t[-1])
     width[-1] = width[-2]  # the last sample is held for as long as the one before

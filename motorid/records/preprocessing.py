@@ -70,10 +70,10 @@ def levelled(v: Array) -> Array:
 def delayed(t: Array, v: Array, hold: str, seconds: float) -> Array:
     """Return an input that acts `seconds` later; `hold` says how it goes on between samples."""
     at = t - seconds
-    return np.interp(at, t, v) if hold == "linear" else _held_means(t, v, at)
+    return np.interp(at, t, v) if hold == "linear" else _zoh_means(t, v, at)
 
 
-def _held_means(t: Array, v: Array, at: Array) -> Array:
+def _zoh_means(t: Array, v: Array, at: Array) -> Array:
     """Return the means of a held input between the times `at`; before the record it is as at its beginning."""
     before, after = min(at[0] - t[0], 0.0), max(at[-1] - t[-1], 0.0)
     ends = np.concatenate([[t[0] + before], t, [t[-1] + after]])

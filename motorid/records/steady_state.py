@@ -51,7 +51,7 @@ def find_segments(runs: Sequence[Experiment], sigma: Sequence[Mapping[str, float
     """
     found = []
     for k, run in enumerate(runs):
-        for first, last in _held_stretches(run.inputs["v"]):
+        for first, last in _constant_stretches(run.inputs["v"]):
             segment = _steady_tail(k, run, sigma[k], first, last)
             if segment is not None:
                 found.append(segment)
@@ -64,7 +64,7 @@ def segment_between(k: int, run: Experiment, begin: float, end: float) -> Steady
     return _segment(k, run, int(inside[0]), int(inside[-1])) if inside.size >= 2 else None
 
 
-def _held_stretches(v: Array) -> list[tuple[int, int]]:
+def _constant_stretches(v: Array) -> list[tuple[int, int]]:
     """Longest stretches (first, last) in which the input stays within a band around its running mean."""
     band = INPUT_SHARE * max(float(np.abs(v).max()), 1e-300)
     stretches, first = [], 0

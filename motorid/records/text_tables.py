@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from motorid.display.numbers import counted
 from motorid.errors import DataError
 from motorid.records.headers import parse_unit
 
@@ -269,11 +270,6 @@ def numbers(values: object, decimal: str = ".") -> tuple[NDArray[np.float64], in
         missing |= text.str.lower().isin(MISSING).to_numpy()
     array[np.abs(array) > _LARGEST] = np.nan
     return array, int(np.count_nonzero(np.isnan(array) & ~missing))
-
-
-def counted(n: int, noun: str) -> str:
-    """Write a number with its noun: 1 row, 2 rows."""
-    return f"{n} {noun}" + ("" if n == 1 else "s")
 
 
 def unique_labels(labels: Sequence[str]) -> list[str]:

@@ -141,7 +141,7 @@ def fit_many(model: Model, motors: Mapping[str, Records], *, journal: str | Path
         raise UsageError("fit_many takes a mapping {name: runs}; it is empty. See motors_in(folder).")
     _carry_laws(model)
     done = Checkpoint(Path(journal)) if journal is not None else None
-    marks = {n: fingerprint(model, options, reading, runs) for n, runs in motors.items()} if done else {}
+    marks = {n: checkpoint_key(model, options, reading, runs) for n, runs in motors.items()} if done else {}
     known = {n: done.rows[m] for n, m in marks.items() if m in done.rows} if done else {}
     todo = [(n, runs) for n, runs in motors.items() if n not in known]
     found = map_items(_fit_one, (model, options, dict(reading or {})), todo, map, "Fitting motors", quiet=quiet,
@@ -260,8 +260,8 @@ class Checkpoint:
             file.write(text)
 
 
-def fingerprint(model: Model, options: Mapping[str, Any], reading: Mapping[str, Any] | None,
-                records: Any) -> str:
+def checkpoint_key(model: Model, options: Mapping[str, Any], reading: Mapping[str, Any] | None,
+                   records: Any) -> str:
     """Return a hash of all that a result depends on: model and values, options, contents of the records."""
     mark = hashlib.sha256()
     for e in model.effects:

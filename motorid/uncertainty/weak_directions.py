@@ -1,24 +1,18 @@
-"""Weak directions in words: a sparse basis, the products of parameters that they leave alone, and what would help.
-
-`planned` makes the experiment that was not made, to ask the same of it.
-"""
+"""Weak directions in words: a sparse basis, the products of parameters that they leave alone, and what would help."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from itertools import combinations, product
-from typing import Any
 
 import numpy as np
 
 from motorid.channels import NAMES
 from motorid.errors import MotoridError
-from motorid.model.model import Model
 from motorid.numerics.signals import Array
 from motorid.problem.problem import Problem
 from motorid.problem.sensitivity import relative_jacobian
-from motorid.problem.simulate import simulate
-from motorid.records.experiment import Experiment
+from motorid.problem.simulate import with_channels
 
 SHOWN = 0.05  # relative to the largest: smaller parts of a direction do not make it another one
 SPOKEN = 0.005  # smaller parts are not worth a word
@@ -26,7 +20,6 @@ UNMOVED = 1e-6  # standard deviations of the noise that count as nothing
 ALIKE = 0.1  # change of a product, per factor of e along a weak direction, that still counts as determined
 STEP = 0.1  # relative change that is spoken of
 MOST = 300  # pivots tried
-ASSUMED_NOISE = 0.01  # of a channel's RMS, where a plan does not say
 EASY = ("R", "K", "g", "L", "b", "J")  # in the order in which they are usually known beforehand
 
 
@@ -157,43 +150,3 @@ def _would_do(problem: Problem, q: Array, channel: str, level: float) -> bool:
     except MotoridError:
         return False
     return bool(np.linalg.svd(matrix, compute_uv=False)[-1] > level)
-
-
-def with_channels(model: Model, run: Experiment, channels: Sequence[str],
-                  sigma: Mapping[str, float] | None = None) -> Experiment:
-    """Return the run with `channels` filled in from the model, with their noise (default 1 % of the RMS)."""
-    blank = run.with_(outputs={**run.outputs, **{c: np.zeros(run.n) for c in channels}},
-                      sigma={**run.sigma, **dict.fromkeys(channels, 1.0)})
-    shown = simulate(model, [blank], initial="rest", estimate_initial=False)[0].outputs
-    noise = {c: (sigma or {}).get(c) or ASSUMED_NOISE * float(np.sqrt(np.mean(shown[c] ** 2))) or 1.0
-             for c in channels}
-    filled = {c: shown[c] for c in channels}
-    return blank.with_(outputs={**run.outputs, **filled}, sigma={**run.sigma, **noise})
-
-
-def planned(model: Model, t: Sequence[float] | Array, v: Sequence[float] | Array, *,
-            channels: Sequence[str] = ("i", "omega"), sigma: Mapping[str, float] | None = None,
-            hold: Any = "zoh", name: str = "plan") -> Experiment:
-    """Return an experiment that was not made: what `model`, at its values, would show.
-
-    Parameters
-    ----------
-    model : Model
-    t, v : array (N,)
-        Time (s) and voltage (V) as they would be applied, from rest.
-    channels : sequence of str
-        What would be measured.
-    sigma : mapping of str to float, optional
-        Noise per channel, SI; default one per cent of the channel's RMS.
-    hold : {"zoh", "linear"}
-    name : str
-
-    Examples
-    --------
-    >>> plan = planned(dc_motor(R=1.4, L=2e-3, K=0.046, b=6e-5, J=2e-5), t, v, channels=["omega"])
-    >>> identifiability(Problem(model, [plan]))
-    """
-    t = np.asarray(t, float)
-    blank = Experiment(t, {"v": np.asarray(v, float)}, {c: np.zeros(len(t)) for c in channels}, hold=hold,
-                       name=name)
-    return with_channels(model, blank, channels, sigma)

@@ -11,7 +11,7 @@ from motorid.problem.problem import Problem
 from motorid.problem.sensitivity import relative_jacobian
 from motorid.records.datasets import truth
 from motorid.uncertainty.identifiability import identifiability
-from motorid.uncertainty.weak_directions import monomials, planned, sparse_basis
+from motorid.uncertainty.weak_directions import monomials, sparse_basis
 
 MOTOR = truth("two_step_noisy")["parameters"]
 
@@ -109,15 +109,15 @@ def test_sensitivities_agree_with_differences(noisy):
 def test_plan_is_judged_before_anything_is_measured():
     model, t = mi.dc_motor(**MOTOR), np.arange(0, 1, 1e-3)
     step = np.where(t > 0.05, 6.0, 0.0)
-    good = identifiability(Problem(model, [planned(model, t, step)]))
+    good = identifiability(Problem(model, [mi.planned(model, t, step)]))
     assert good.full
-    blind = identifiability(Problem(model, [planned(model, t, step, channels=["omega"])]))
+    blind = identifiability(Problem(model, [mi.planned(model, t, step, channels=["omega"])]))
     assert blind.rank == 3
 
 
 def test_too_much_noise_lowers_the_rank_but_not_the_structural_one():
     model, t = mi.dc_motor(**MOTOR), np.arange(0, 0.2, 1e-2)
-    plan = planned(model, t, np.full(len(t), 6.0), sigma={"i": 3.0, "omega": 30.0})
+    plan = mi.planned(model, t, np.full(len(t), 6.0), sigma={"i": 3.0, "omega": 30.0})
     found = identifiability(Problem(model, [plan]))
     assert found.rank < 5
     assert found.structural_rank == 5
