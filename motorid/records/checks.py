@@ -23,7 +23,6 @@ from motorid.records.plausibility import (
 Check = Callable[[Experiment], str | None]
 
 
-
 def check_runs(runs: Sequence[Experiment]) -> list[str]:
     """Look for what is wrong with records, and for what they cannot show.
 

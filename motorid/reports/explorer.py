@@ -1,4 +1,4 @@
-"""A model to play with in a notebook: tick effects, move parameters, see curves and errors change, refit."""
+"""The explorer of a model in a notebook: tick effects, move parameters, see curves and errors change, refit."""
 
 from __future__ import annotations
 
@@ -21,6 +21,38 @@ from motorid.problem.simulate import error_table, evaluate
 from motorid.records.experiment import Experiment
 
 REACH = 10.0  # a slider goes from a tenth to ten times the value it begins with
+
+
+def explore(fit: Fit, *, effects: Iterable[Effect | str] | None = None) -> Explorer:
+    """Play with a fit in a notebook: tick effects, move parameters, see the curves and the error, refit.
+
+    Parameters
+    ----------
+    fit : Fit
+    effects : iterable of Effect or str, optional
+        What can be ticked; by default every effect of the library that the measured channels can see.
+
+    Returns
+    -------
+    Explorer
+        Shows itself at the end of a cell. ``explorer.fit`` is the last refit, ``explorer.model`` the model
+        as ticked.
+
+    Raises
+    ------
+    MissingDependency
+        Without ipywidgets.
+    """
+    if not isinstance(fit, Fit):
+        raise UsageError(f"explore takes a fit, mi.explore(mi.fit(mi.dc_motor(), runs)); got {type(fit).__name__}.")
+    try:
+        import ipywidgets  # noqa: F401
+    except ImportError:
+        raise MissingDependency("mi.explore needs ipywidgets: pip install 'motorid[notebooks]'.") from None
+    chosen = LIBRARY.values() if effects is None else [get(e) if isinstance(e, str) else e for e in effects]
+    own = [e for e in fit.model.effects if e.name not in {c.name for c in chosen}]
+    runs = fit.problem.experiments
+    return Explorer(fit, [e for e in (*own, *chosen) if effects is not None or _can_be_seen(fit, e)], runs)
 
 
 class Explorer:
@@ -79,18 +111,13 @@ class Explorer:
     def reset(self) -> None:
         """Go back to the fit that it began with."""
         self.fit = self._first
-        self._try(self._first.model, "back to the beginning")
+        self._try(self._first.model, "back to the first fit")
         self._show_controls()
 
     @property
     def _options(self) -> dict[str, Any]:
         problem = self._first.problem
-        return {
-            "engine": problem.engine,
-            "initial": problem.initial,
-            "weights": problem.weights,
-            "loss": problem.loss,
-        }
+        return {"engine": problem.engine, "initial": problem.initial, "weights": problem.weights, "loss": problem.loss}
 
     def _known(self, values: Mapping[str, float]) -> Mapping[str, float]:
         for name in values:
@@ -137,7 +164,7 @@ class Explorer:
         import ipywidgets as w
 
         box = w.Checkbox(value=name in self.model.effect_names, description=name, indent=False,
-                         layout=w.Layout(width="auto"))  # fmt: skip
+                         layout=w.Layout(width="auto"))
         box.observe(lambda change: self._quiet or self.tick(name, change["new"]), "value")
         return box
 
@@ -147,11 +174,11 @@ class Explorer:
         size = abs(p.value) or 1e-3
         common: dict[str, Any] = {"description": f"{p.name} ({p.unit})" if p.unit else p.name,
                                   "continuous_update": False, "style": {"description_width": "7.5rem"},
-                                  "layout": w.Layout(width="24rem")}  # fmt: skip
+                                  "layout": w.Layout(width="24rem")}
         if p.positive:
             power = float(np.log10(p.value))
             slider = w.FloatLogSlider(value=p.value, base=10, min=power - 1, max=power + 1, step=0.002,
-                                      readout_format=".3g", **common)  # fmt: skip
+                                      readout_format=".3g", **common)
         else:
             low, high = max(p.lower, p.value - REACH * size), min(p.upper, p.value + REACH * size)
             step = 1.0 if p.order else (high - low) / 2000
@@ -174,10 +201,8 @@ class Explorer:
         self._quiet = True
         for name, slider in self.sliders.items():
             value = self.model.parameters[name].value
-            slider.max, slider.min = (
-                max(slider.max, _place(slider, value)),
-                min(slider.min, _place(slider, value)),
-            )
+            slider.max = max(slider.max, _position(slider, value))
+            slider.min = min(slider.min, _position(slider, value))
             slider.value = value
         self._quiet = False
 
@@ -205,38 +230,6 @@ class Explorer:
         return f"<explorer of {self.model.title} on {counted(len(self.runs), 'run')}>"
 
 
-def explore(fit: Fit, *, effects: Iterable[Effect | str] | None = None) -> Explorer:
-    """Play with a fit in a notebook: tick effects, move parameters, see the curves and the error, refit.
-
-    Parameters
-    ----------
-    fit : Fit
-    effects : iterable of Effect or str, optional
-        What can be ticked; by default every effect of the library that the measured channels can see.
-
-    Returns
-    -------
-    Explorer
-        Shows itself at the end of a cell. ``explorer.fit`` is the last refit, ``explorer.model`` the model
-        as ticked.
-
-    Raises
-    ------
-    MissingDependency
-        Without ipywidgets.
-    """
-    if not isinstance(fit, Fit):
-        raise UsageError(f"explore takes a fit, mi.explore(mi.fit(mi.dc_motor(), runs)); got {type(fit).__name__}.")
-    try:
-        import ipywidgets  # noqa: F401
-    except ImportError:
-        raise MissingDependency("mi.explore needs ipywidgets: pip install 'motorid[notebooks]'.") from None
-    chosen = LIBRARY.values() if effects is None else [get(e) if isinstance(e, str) else e for e in effects]
-    own = [e for e in fit.model.effects if e.name not in {c.name for c in chosen}]
-    runs = fit.problem.experiments
-    return Explorer(fit, [e for e in (*own, *chosen) if effects is not None or _can_be_seen(fit, e)], runs)
-
-
 def _can_be_seen(fit: Fit, effect: Effect) -> bool:
     if effect.name in fit.model.effect_names:
         return True
@@ -247,5 +240,5 @@ def _can_be_seen(fit: Fit, effect: Effect) -> bool:
     return True
 
 
-def _place(slider: Any, value: float) -> float:
+def _position(slider: Any, value: float) -> float:
     return float(np.log10(value)) if type(slider).__name__ == "FloatLogSlider" else value

@@ -42,10 +42,10 @@ NOISY = 25  # samples per interval with process noise
 NOISE_ROUNDS = 4  # of finding how much
 NOISE_KNOWN = 0.2  # change of its logarithm that is small enough
 LOOSE = 10, 0.05  # then: samples per interval, and gaps in sizes of the states
-QUICK = 40  # iterations of a fit that only shows where to go on
-BLUNT = 0.01  # of the RMS of a channel: the least noise that counts in the loose fit
+ROUGH_ITERATIONS = 40  # iterations of a fit that only shows where to go on
+LEAST_NOISE = 0.01  # of the RMS of a channel: the least noise that counts in the loose fit
 AWAY = 3.5  # largest change of a logarithm in one such fit
-LOST = 3.0  # change of a logarithm that may mean that a parameter got lost
+FAR_OFF = 3.0  # change of a logarithm that may mean that a parameter got lost
 
 
 @dataclass(frozen=True)
@@ -137,13 +137,13 @@ class MultipleShooting:
         mesh = Mesh(problem.tuned(balance=_least_noise(problem)), every)
         step = float(np.median([run.experiment.dt for run in problem.runs]))
         mesh = replace(mesh, noise=size * mesh.scale / np.sqrt(every * step))
-        return self._solve(mesh, mesh.joined(problem.start, nodes_from_data(mesh, problem.start)), quick=True)
+        return self._solve(mesh, mesh.joined(problem.start, nodes_from_data(mesh, problem.start)), rough=True)
 
     def _roughly(self, problem: Problem, q: Array) -> Solved:
         """Solve from `q` not very far, with one step per sample: a lost parameter may ask for very many."""
         mesh = Mesh(problem, self.every)
         nodes = nodes_from_data if _poor(problem, q) else nodes_from_simulation
-        return self._solve(mesh, mesh.joined(q, nodes(mesh, q)), quick=True)
+        return self._solve(mesh, mesh.joined(q, nodes(mesh, q)), rough=True)
 
     def _with_refinement(self, problem: Problem, q: Array) -> Solved:
         """Solve, refine the sub-steps at the solution, and again while they do not suffice."""
@@ -176,7 +176,7 @@ class MultipleShooting:
         given = self.process_noise
         noise = given_noise(given, mesh) if isinstance(given, Mapping) else first_noise(mesh)
         mesh = replace(mesh, noise=noise)
-        done = self._solve(mesh, mesh.joined(q, nodes_from_data(mesh, q)), quick=self.process_noise == "auto")
+        done = self._solve(mesh, mesh.joined(q, nodes_from_data(mesh, q)), rough=self.process_noise == "auto")
         for _ in range(NOISE_ROUNDS if self.process_noise == "auto" else 0):
             before, noise = noise, noise_of_gaps(done)
             near = bool(np.all(np.abs(np.log(noise / before)) < NOISE_KNOWN))
@@ -186,9 +186,9 @@ class MultipleShooting:
         return done
 
     def _solve(self, mesh: Mesh, z: Array, warm: NlpResult | None = None, history: tuple[float, ...] = (),
-               quick: bool = False) -> Solved:
+               rough: bool = False) -> Solved:
         low, high = mesh.problem.scaling.bounds
-        far = np.where(mesh.problem.scaling.log, AWAY if quick else FARTHEST, np.inf)
+        far = np.where(mesh.problem.scaling.log, AWAY if rough else FARTHEST, np.inf)
         low, high = np.maximum(low, z[:mesh.nq] - far), np.minimum(high, z[:mesh.nq] + far)
         free = np.full(len(z) - mesh.nq, np.inf)
         try:
@@ -196,10 +196,10 @@ class MultipleShooting:
         except SimulationError as error:
             raise FitError(f"the model cannot be simulated at the start: {error} Give other starting values with "
                            "model.replace(…), or leave them out.") from None
-        most, tol = (min(QUICK, self.max_iterations), 1e-6) if quick else (self.max_iterations, self.tol)
+        most, tol = (min(ROUGH_ITERATIONS, self.max_iterations), 1e-6) if rough else (self.max_iterations, self.tol)
         ipopt = Ipopt(most, tol, self.verbose)
         result = ipopt.solve(nlp, z, (np.concatenate([low, -free]), np.concatenate([high, free])), warm,
-                             near=not quick and self.warm != "data")
+                             near=not rough and self.warm != "data")
         return Solved(mesh, nlp, result, history + result.history)
 
 
@@ -220,7 +220,7 @@ def _least_noise(problem: Problem) -> dict[str, float]:
     for run in problem.runs:
         for c, sigma in run.sigma.items():
             rms = float(np.sqrt(np.nanmean(run.experiment.outputs[c] ** 2)))
-            found[c] = max(found.get(c, 1.0), BLUNT * rms / sigma)
+            found[c] = max(found.get(c, 1.0), LEAST_NOISE * rms / sigma)
     return found
 
 
@@ -274,7 +274,7 @@ def _misfit(problem: Problem, q: Array) -> float:
 
 def _with_resets(problem: Problem, q: Array) -> list[Array]:
     """Return `q`, and `q` with the parameters that went very far put back to their start."""
-    lost = problem.scaling.log & (np.abs(q - problem.start) > LOST)
+    lost = problem.scaling.log & (np.abs(q - problem.start) > FAR_OFF)
     return [q, np.where(lost, problem.start, q)] if lost.any() else [q]
 
 

@@ -136,7 +136,7 @@ class ShootingNlp:
 
 
 class _Function(ca.Callback):
-    """A Python function in CasADi's clothes; results are dense arrays or the entries of a sparse one."""
+    """A Python function as a CasADi callback; results are dense arrays or the entries of a sparse one."""
 
     def __init__(self, name: str, names_in: Sequence[str], names_out: Sequence[str], given: Sequence[ca.Sparsity],
                  results: Sequence[ca.Sparsity], call: Callable[..., list[Any]]) -> None:
