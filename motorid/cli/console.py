@@ -69,7 +69,7 @@ def show(*parts: Table | str | None) -> None:
             console.print(Text(part))
             continue
         drawn = RichTable(title=part.title or None, box=box.SIMPLE_HEAD, title_justify="left",
-                          title_style="bold", caption=part.note or None)
+                          title_style="bold", caption=part.note or None, caption_justify="left")
         for k, head in enumerate(part.header):
             drawn.add_column(head, justify="left" if k in part.left else "right", overflow="fold")
         for row in part.rows:

@@ -248,7 +248,7 @@ def parameter_table(fit: Fit, before: Fit | None = None, std: Callable[[Fit], St
     rows = [[name, *(parameter_cell(f, name, s) for f, s in zip(fits, known, strict=True)), p.doc]
             for name, p in fit.model.parameters.items()]
     heads = ["value ± std"] if before is None else ["before", "after"]
-    return Table(["parameter", *heads, "meaning"], rows, "Parameters", left=(0, 1, len(heads) + 1))
+    return Table(["parameter", *heads, "meaning"], rows, "Parameters", left=tuple(range(len(heads) + 2)))
 
 
 def parameter_cell(fit: Fit, name: str, std: Std) -> Cell:

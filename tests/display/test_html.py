@@ -191,6 +191,30 @@ def test_text_from_files_cannot_become_markup():
     assert not {"<a>", "<b>", "<c>", "<d>"} & set(_tags(table.to_html()))
 
 
+def test_one_table_is_text_in_a_terminal_and_html_on_a_page():
+    table = Table(["part", "value", "verdict"], [["R", "1.38 Ω", Flag("good fit", "good")], ["L", "2 H", "–"]],
+                  "Parts", "All of them.", left=(0, 2))  # fmt: skip
+    assert str(table).splitlines() == [
+        "Parts",
+        "part   value  verdict",
+        "────  ──────  ────────",
+        "R     1.38 Ω  good fit",
+        "L        2 H  –",
+        "All of them.",
+    ]
+    for words in ("part", "1.38 Ω", ">good fit</span>", "<caption>All of them.</caption>"):
+        assert words in table.to_html()
+
+
+@pytest.mark.parametrize("name", CARDS)
+def test_a_card_says_the_same_in_a_terminal_as_on_a_page(name):
+    card = CARDS[name]()
+    said = " ".join(str(card).split())
+    cells = [str(cell) for t in card.tables for row in t.rows for cell in row]
+    for words in (card.title, *(f.text for f in card.flags), *card.text, *cells):
+        assert " ".join(words.split()) in said
+
+
 def _tags(html):
     return [f"<{part.split('>')[0]}>" for part in html.split("<")[1:]]
 

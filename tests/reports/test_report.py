@@ -211,6 +211,8 @@ def test_a_file_that_cannot_be_written_or_nothing_to_tell_is_said_in_words(found
         mi.report(found.before, tmp_path / "no" / "such" / "folder.html")
     with pytest.raises(UsageError, match="needs a result"):
         mi.report([], tmp_path / "x.html")
+    with pytest.raises(UsageError, match="got int"):
+        mi.report([found.before, 3], tmp_path / "x.html")
 
 
 @pytest.fixture(scope="module", params=["wide", "dark", "phone"])
