@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from motorid.diagnosis.residual_analysis import Errors
 from motorid.errors import MotoridError
-from motorid.estimation.continuation import descend
 from motorid.estimation.fit import solve
+from motorid.estimation.least_squares import least_squares
 from motorid.estimation.result import Fit
 from motorid.numerics.least_squares import LevenbergMarquardt
 from motorid.numerics.signals import Array
@@ -20,7 +20,7 @@ from motorid.problem.runs import angle_signal
 from motorid.problem.simulate import at, simulated
 from motorid.records.experiment import Experiment
 
-QUICK = LevenbergMarquardt(max_iterations=25, ftol=1e-4, xtol=1e-5)
+QUICK = LevenbergMarquardt(max_iterations=25, ftol=1e-4, xtol=1e-5, looks=0)
 BLOCKS = 10  # contiguous parts of each run; every other one is held out where there are no held-out runs
 ROUGH = 1e-4  # accuracy of the integration while starts are compared
 LEAST_FALL = 0.01  # of the held-out error that makes an effect worth having
@@ -84,7 +84,7 @@ class HeldOut:
                 runs = zip(fit.problem.runs, problem.runs, strict=True)
                 start = replace(start, _runs=tuple(replace(whole, experiment=r.experiment) for whole, r in runs))
             q = start.scaling.scaled([fit.initial.get(p.name, p.value) for p in start.unknown])
-            done = descend(restarted(start, q), QUICK, stages=False)
+            done = least_squares(restarted(start, q), QUICK)
             parts.append(Errors.of(at(done.problem, done.solution.q), test))
         return Errors({c: [r for e in parts for r in e.residuals[c]] for c in parts[0].residuals}, parts[0].measured)
 

@@ -15,9 +15,10 @@ from motorid.diagnosis.model_comparison import EVIDENCE
 from motorid.diagnosis.residual_analysis import far
 from motorid.diagnosis.score_test import uses_angle
 from motorid.errors import FAILURES
-from motorid.estimation.continuation import Descent, descend
+from motorid.estimation.continuation import by_continuation
 from motorid.estimation.first_guess import first_guess
-from motorid.estimation.restarts import let_go, revived
+from motorid.estimation.least_squares import Estimate, least_squares
+from motorid.estimation.restarts import collapsed_again, restored
 from motorid.estimation.result import Fit
 from motorid.estimation.start_values import ABOVE, sizes_like
 from motorid.model.definition import Effect
@@ -51,7 +52,7 @@ def raced(fit: Fit, model: Model, starts: Sequence[Mapping[str, float]]) -> Race
     Effects of the angle start along the measured angle, which the model's own angle, still wrong, would lead astray.
     """
     model = _bounded(fit, model)
-    alive = revived(fit, model)
+    alive = restored(fit, model)
     angular = any(uses_angle(e) for e in model.effects) and not any(uses_angle(e) for e in fit.model.effects)
     found = []
     for start in (*(starts or ({},)), *_own_starts(fit, model)):
@@ -87,10 +88,10 @@ def finished(fit: Fit, best: Raced) -> Fit | None:
     """
     stages = "sgn_width" in best.problem.model.parameters and not fit.model.effects
     try:
-        done = _released(best.problem) if best.angular else descend(best.problem, QUICK, stages=stages)
+        done = _released(best.problem) if best.angular else by_continuation(best.problem, QUICK, wide=stages)
     except FAILURES:
         return None
-    return _polished(fit, let_go(restarted(done.problem, done.solution.q), fit))
+    return _polished(fit, collapsed_again(restarted(done.problem, done.solution.q), fit))
 
 
 def refit(fit: Fit, model: Model, starts: Sequence[Mapping[str, float]]) -> Fit | None:
@@ -99,7 +100,7 @@ def refit(fit: Fit, model: Model, starts: Sequence[Mapping[str, float]]) -> Fit 
     return None if best is None else finished(fit, best)
 
 
-def _released(measured: Problem) -> Descent:
+def _released(measured: Problem) -> Estimate:
     """Let the model's own angle take the place of the measured one, if it is good enough.
 
     Raises
@@ -108,12 +109,12 @@ def _released(measured: Problem) -> Descent:
     """
     own = measured.for_model(replace(measured.model, angle_input=False, _systems={}))
     if not all("theta" in run.outputs for run in measured.experiments):
-        return descend(own, QUICK, stages=False)
-    along = descend(measured, QUICK, stages=False)
+        return least_squares(own, QUICK)
+    along = least_squares(measured, QUICK)
     values = along.problem.values(along.solution.q)
     own = restarted(along.problem, along.solution.q).for_model(own.model.start_at(values))
     try:
-        free = descend(own, QUICK, stages=False)
+        free = least_squares(own, QUICK)
     except FAILURES:
         return along
     return free if free.solution.history[-1] < WORSE * along.solution.history[-1] else along
@@ -142,10 +143,10 @@ def _started(fit: Fit, model: Model, start: Mapping[str, float], angular: bool) 
     return problem.for_model(replace(problem.model, angle_input=True, _systems={})) if angular else problem
 
 
-def _race(problem: Problem) -> Descent | None:
+def _race(problem: Problem) -> Estimate | None:
     """Go a few steps; None where that fails or needs more sub-steps than the samples are worth."""
     try:
-        done = descend(problem, RACE, stages=False)
+        done = least_squares(problem, RACE)
     except FAILURES:
         return None
     return done if worth_its_steps(done.problem) else None
@@ -198,18 +199,18 @@ def _polished(fit: Fit, problem: Problem) -> Fit | None:
     )
 
 
-def _converged(problem: Problem) -> Descent:
+def _converged(problem: Problem) -> Estimate:
     """Descend, and go on where that ends at its limit: what is unfinished would be judged worse than it is.
 
     Raises
     ------
     FitError, SimulationError
     """
-    done = descend(problem, POLISH, stages=False)
+    done = least_squares(problem, POLISH)
     for _ in range(GOING_ON):
         if done.solution.status != "limit":
             break
-        again = descend(restarted(done.problem, done.solution.q), POLISH, stages=False)
+        again = least_squares(restarted(done.problem, done.solution.q), POLISH)
         done = replace(again, history=done.history + again.history)
     return done
 

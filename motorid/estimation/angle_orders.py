@@ -18,6 +18,7 @@ import numpy as np
 from motorid.estimation.linearisation import Response, Tangent, responses
 from motorid.estimation.result import Fit
 from motorid.model.definition import Effect
+from motorid.model.model import Model
 from motorid.numerics.autoregression import Whitening
 from motorid.numerics.signals import Array
 from motorid.problem.runs import angle_signal
@@ -82,6 +83,34 @@ def likely_lines(tangent: Tangent, effect: Effect, most: int) -> list[Line]:
     """Return the strongest lines, best first, those that come near the best."""
     lines = spectrum(tangent, effect).lines[:most]
     return [line for line in lines if line.share > NEAR * lines[0].share]
+
+
+def effects_of_unknown_order(model: Model) -> list[Effect]:
+    """Return the effects with an order that nobody has set."""
+    pairs = {e: [(p, model.parameters[p.name]) for p in e.parameters] for e in model.effects}
+    return [e for e in pairs if any(p.order and not now.given and now.value == p.value for p, now in pairs[e])]
+
+
+def strongest_order(fit: Fit, effects: Sequence[Effect]) -> tuple[Effect, dict[str, float]] | None:
+    """Return which of `effects` has the strongest line in the misfit, with its order, size and phase; None for none."""
+    tangent = Tangent.of(fit)
+    lines = [(e, line) for e in effects for line in likely_lines(tangent, e, 1)]
+    if not lines:
+        return None
+    effect, line = max(lines, key=lambda pair: pair[1].share)
+    return effect, _values(effect, line)
+
+
+def _values(effect: Effect, line: Line) -> dict[str, float]:
+    found = {}
+    for p in effect.parameters:
+        if p.order:
+            found[p.name] = line.order
+        elif p.periodic:
+            found[p.name] = line.phase
+        elif p.null == 0:
+            found[p.name] = line.amplitude
+    return found
 
 
 def spectrum(tangent: Tangent, effect: Effect) -> Spectrum:

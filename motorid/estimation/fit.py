@@ -1,28 +1,31 @@
-"""fit(): from a model and records to parameter values, and `Fit`, what came out."""
+"""fit(): from a model and records to parameter values; the stages of a fit, in their order."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from motorid.errors import FitError, UsageError, one_of
-from motorid.estimation.continuation import Descent
-from motorid.estimation.restarts import descend_balanced
+from motorid.errors import FAILURES, FitError, UsageError, one_of
+from motorid.estimation.angle_orders import effects_of_unknown_order, strongest_order
+from motorid.estimation.continuation import by_continuation
+from motorid.estimation.least_squares import FINISH, Callback, Estimate, least_squares
+from motorid.estimation.restarts import restore_collapsed
 from motorid.estimation.result import Fit
-from motorid.estimation.start_values import started
+from motorid.estimation.start_values import with_start_values
 from motorid.integrate.engine import Engine
 from motorid.model.model import Model
-from motorid.numerics.least_squares import LevenbergMarquardt, Solution, levenberg_marquardt
-from motorid.numerics.signals import Array
+from motorid.numerics.least_squares import LevenbergMarquardt
 from motorid.problem.problem import Problem, as_problem
 from motorid.problem.simulate import integration_error, misfit_over_noise
 from motorid.records.experiment import Experiment
 
 NOISE = 1.2  # RMS of the residual over the noise that may be called noise
+IMBALANCE = 3.0  # between channels, in misfit over noise, above which the misfit decides the weights
+REWEIGHTINGS = 3  # at most
 ERROR_SHARE = 0.2  # integration error accepted beside noise or misfit
 MOST_FINER = 4  # times as many steps, where that is not kept
 POLISH = 20  # iterations with them
@@ -42,7 +45,7 @@ def fit(
     loss: Any = None,
     weights: str | None = None,
     initial: str = "auto",
-    callback: Callable[[int, float, Array], object] | None = None,
+    callback: Callback = None,
 ) -> Fit:
     """Estimate the free parameters of `model` from `runs`; no first guess is asked for.
 
@@ -98,8 +101,8 @@ def fit(
     return found
 
 
-def solve(problem: Problem, solver: Any = None, *, start: str = "auto",
-          callback: Callable[[int, float, Array], object] | None = None, formulation: str = "plain") -> Fit:
+def solve(problem: Problem, solver: Any = None, *, start: str = "auto", callback: Callback = None,
+          formulation: str = "plain") -> Fit:
     """Solve a `Problem`; `fit` is this with the problem made on the way. See there."""
     began = time.perf_counter()
     if start not in ("auto", "model"):
@@ -107,70 +110,117 @@ def solve(problem: Problem, solver: Any = None, *, start: str = "auto",
     if not problem.unknown:
         raise UsageError("every parameter is held, there is nothing to fit. Free one, model.free('R'), or judge "
                          "the model as it is: mi.evaluate(model, runs).")
-    if start == "auto":
-        from motorid.estimation.start_values import numbered  # it fits smaller models first, by this very function
-
-        problem = started(numbered(problem, solve))
-    if hasattr(solver, "solve"):
-        return solver.solve(problem)
+    auto, effort = start == "auto", solver or FINISH
+    if auto:
+        problem = with_start_values(_with_orders(problem))
+    if hasattr(effort, "solve"):
+        return effort.solve(problem)
     if problem.constraints:
         raise UsageError("LevenbergMarquardt has no true constraints; use solver=mi.MultipleShooting().")
-    options = solver or LevenbergMarquardt()
-    if start == "auto":  # a guess from the data needs no looks from elsewhere; a misfit then is the model's
-        options = replace(options, looks=min(options.looks, 1))
-    return _least_squares(problem, options, callback, formulation, start == "auto", began)
+    if auto:
+        effort = replace(effort, looks=min(effort.looks, 1))  # a misfit from a guess by the data is the model's
+    return _fit_of(problem, effort, callback, wide=auto, formulation=formulation, began=began)
 
 
-def _least_squares(problem: Problem, options: LevenbergMarquardt, callback, formulation: str, stages: bool,
-                   began: float) -> Fit:
-    done = descend_balanced(problem, options, callback, stages=stages)
-    done, error = _exact_enough(done, options, callback)
-    problem, found = done.problem, done.solution
-    found = _at_noise(found, problem)
-    q = problem.unknowns.principal(found.q)
-    fit = Fit(problem, problem.values(q), found.residual, found.jac / problem.scaling.slope(q), q, found.status,
-              _advice(found, error, problem.n_outputs), done.history, time.perf_counter() - began,
-              error, formulation)
+def _with_orders(problem: Problem) -> Problem:
+    """Return the problem with the orders over the angle that the records show, started at them.
+
+    The model is fitted without the effects of unknown order; the strongest line of what is left over the angle
+    gives the order, size and phase of one of them, and so on with the next.
+    """
+    model = present = problem.model
+    waiting = effects_of_unknown_order(model)
+    for effect in waiting:
+        present = present.without(effect.name)
+    while waiting:
+        smaller = problem.for_model(present).tuned(constraints=())  # an order shows without them
+        if not smaller.unknown:
+            break
+        try:
+            fit = _fit_of(with_start_values(smaller), replace(FINISH, looks=1))
+        except FitError:
+            break
+        found = strongest_order(fit, waiting)
+        if found is None:
+            break
+        effect, values = found
+        model, present = model.start_at({**fit.values, **values}), (fit.model + effect).start_at(values)
+        waiting.remove(effect)
+    return problem.for_model(model)
+
+
+def _fit_of(problem: Problem, effort: LevenbergMarquardt, callback: Callback = None, *, wide: bool = True,
+            formulation: str = "plain", began: float | None = None) -> Fit:
+    """Return the fit from the values of the model."""
+    began = time.perf_counter() if began is None else began
+    found, error = _polished(minimise(problem, effort, callback, wide=wide), effort, callback)
+    problem, q = found.problem, found.problem.unknowns.principal(found.q)
+    status, message = _said(found, error)
+    fit = Fit(problem, problem.values(q), found.solution.residual, found.solution.jac / problem.scaling.slope(q), q,
+              status, message, found.history, time.perf_counter() - began, error, formulation)
     _ = fit.simulations  # nothing is computed for them now
     problem.forget()
     return fit
 
 
-def _exact_enough(done: Descent, options: LevenbergMarquardt, callback) -> tuple[Descent, float]:
-    """Return the descent and its integration error; with finer steps all over where small errors added up."""
-    problem, q = done.problem, done.solution.q
-    error = integration_error(problem, q)
-    allowed = ERROR_SHARE * max(_misfit(done.solution, problem.n_outputs), 1.0)
+def minimise(problem: Problem, effort: LevenbergMarquardt, callback: Callback = None, *,
+             wide: bool = True) -> Estimate:
+    """Minimise the cost, and where the model fails, weigh channels by their misfit instead of their noise.
+
+    A model that cannot reach the noise would otherwise spend itself on the channel with the smallest noise
+    (an encoder), at any price in the others. Noise and misfit together give the maximum of the likelihood
+    with the channels' variances as unknowns, ``Σ n·ln(SSR)`` (Seber & Wild, Nonlinear Regression, 1989, ch.
+    11); a model that reaches the noise keeps the weights of the noise.
+    """
+    found = restore_collapsed(by_continuation(problem, effort, callback, wide=wide), effort, callback)
+    if problem.weights != "noise" or problem.loss is not None or len(problem.outputs) < 2:
+        return found
+    effort = replace(effort, looks=0)
+    for k in range(REWEIGHTINGS):
+        factors = misfit_over_noise(found.problem, found.q)
+        relative = [factors[c] / found.problem.balance.get(c, 1.0) for c in factors]
+        if max(relative) < IMBALANCE * min(relative):
+            break
+        begin = found.problem.start_at(found.values) if k else problem
+        again = by_continuation(begin.tuned(balance=factors), effort, callback, wide=wide and k == 0)
+        again = restore_collapsed(again, effort, callback)
+        found = replace(again, history=found.history + again.history)
+    return found
+
+
+def _polished(found: Estimate, effort: LevenbergMarquardt, callback: Callback) -> tuple[Estimate, float]:
+    """Return the estimate and its integration error; with finer steps all over where small errors added up."""
+    error = integration_error(found.problem, found.q)
+    allowed = ERROR_SHARE * max(_misfit(found), 1.0)
     finer = np.ceil((2 * error / allowed) ** (1 / 3)) if np.isfinite(error) else np.inf
-    if error <= allowed or finer > MOST_FINER or done.solution.status != "converged":
-        return done, error
-    problem, options = problem.with_finer_steps(int(finer)), replace(options, max_iterations=POLISH)
+    if error <= allowed or finer > MOST_FINER or found.solution.status != "converged":
+        return found, error
+    problem = found.problem.with_finer_steps(int(finer))
     try:
-        found = levenberg_marquardt(problem.residual, problem.residual_and_jacobian, q, problem.scaling.bounds, options,
-                                    callback, problem.scaling.log)
-    except FitError:
-        return done, error
-    if found.status == "limit":
-        found = replace(found, status="converged", message=done.solution.message)
-    return Descent(problem, found, done.history + found.history), integration_error(problem, found.q)
+        again = least_squares(problem, replace(effort, max_iterations=POLISH), callback, q=found.q, refine=False)
+    except FAILURES:
+        return found, error
+    solution = again.solution
+    if solution.status == "limit":
+        solution = replace(solution, status="converged", message=found.solution.message)
+    return Estimate(problem, solution, found.history + again.history), integration_error(problem, again.q)
 
 
-def _misfit(found: Solution, n: int) -> float:
-    return float(np.sqrt(np.mean(found.residual[:n] ** 2)))
+def _misfit(found: Estimate) -> float:
+    return float(np.sqrt(np.mean(found.solution.residual[:found.problem.n_outputs] ** 2)))
 
 
-def _at_noise(found: Solution, problem: Problem) -> Solution:
-    """Return the solution, as converged where the misfit is noise: friction makes the cost too rugged to go lower."""
-    if found.status != "stalled" or problem.weights != "noise":
-        return found
-    if max(misfit_over_noise(problem, found.q).values(), default=np.inf) > NOISE:
-        return found
-    return replace(found, status="converged", message="converged: no step lowers a misfit that is noise")
+def _said(found: Estimate, error: float) -> tuple[str, str]:
+    """Return the status, and the message with what to try.
 
-
-def _advice(found: Solution, error: float, n: int) -> str:
-    """Return the solver's message, with what to try where the integration error matters beside noise and misfit."""
-    if found.status == "converged" and error > max(1.0, ERROR_SHARE * _misfit(found, n)):
-        return (f"{found.message}; but the integration error is {error:.2g} times the noise: try engine='cvodes' or "
-                "a finer record.")
-    return f"{found.message}."
+    Friction makes the cost too rugged to go lower: a misfit that is noise is converged all the same.
+    """
+    status, message = found.solution.status, found.solution.message
+    problem = found.problem
+    if status == "stalled" and problem.weights == "noise" and \
+            max(misfit_over_noise(problem, found.q).values(), default=np.inf) <= NOISE:
+        status, message = "converged", "converged: no step lowers a misfit that is noise"
+    if status == "converged" and error > max(1.0, ERROR_SHARE * _misfit(found)):
+        return status, (f"{message}; but the integration error is {error:.2g} times the noise: try engine='cvodes' or "
+                        "a finer record.")
+    return status, f"{message}."

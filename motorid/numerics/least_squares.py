@@ -15,13 +15,13 @@ converge globally and quadratically even where J is singular (Yamashita & Fukush
 report IMM-REP-1999-05). Of
 400 random starts within a factor of ten in each of five parameters, 399 and 398 ended in the optimum of the
 two shipped motors, in 8 and 11 steps (median); with the column norms it was 94 and 75 of 100, in 9 and 17.
-What is left is caught by a second look, see `motorid.estimation.continuation`.
+What is left is caught by restarts, see `motorid.estimation.restarts`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -45,7 +45,7 @@ class LevenbergMarquardt:
     longest_step : float
         Largest change of one coordinate per iteration: e² on the logarithmic scale.
     looks : int
-        How often a doubtful end is looked at again from the start; see `motorid.estimation.continuation`.
+        How often a fit restarts where its end is in doubt; see `motorid.estimation.restarts`.
     """
 
     max_iterations: int = 200
@@ -54,6 +54,11 @@ class LevenbergMarquardt:
     damping: float = 0.1
     longest_step: float = 2.0
     looks: int = 5
+
+    def at_most(self, other: LevenbergMarquardt) -> LevenbergMarquardt:
+        """Return these options, ending no later than `other`."""
+        return replace(self, max_iterations=min(self.max_iterations, other.max_iterations),
+                       ftol=max(self.ftol, other.ftol), xtol=max(self.xtol, other.xtol))
 
 
 @dataclass(frozen=True)

@@ -285,6 +285,12 @@ class Problem:
         other = replace(self, model=model, _runs=runs)
         return self._lending(other, ("integrator", "measured", "_levels")) if other.outputs == self.outputs else other
 
+    def start_at(self, values: Mapping[str, float]) -> Problem:
+        """Return the problem with `values` as its start, each inside the limits of its parameter."""
+        limits = self.model.parameters
+        inside = {n: float(np.clip(v, limits[n].lower, limits[n].upper)) for n, v in values.items() if n in limits}
+        return self.for_model(self.model.start_at(inside))
+
     def tuned(self, **fields: Any) -> Problem:
         """Return the problem with another `balance`, `width` …; the records stay as prepared."""
         return replace(self, **{"_runs": self.runs, **fields})

@@ -15,7 +15,7 @@ from motorid.display.cards import Card, Shown
 from motorid.display.numbers import interval_text, percent
 from motorid.display.tables import Flag, Table, value_cell
 from motorid.errors import FitError, MotoridError, UsageError, one_of
-from motorid.estimation.continuation import descend
+from motorid.estimation.least_squares import least_squares
 from motorid.estimation.result import Failure, Fit
 from motorid.numerics.autoregression import Colour, colour_of
 from motorid.numerics.least_squares import LevenbergMarquardt
@@ -215,7 +215,7 @@ def _refit(source: _Source, seed: np.random.SeedSequence) -> dict[str, float] | 
         else:
             runs = tuple(_resampled(source, k, rng) for k in range(len(problem.runs)))
             again = problem.with_(experiments=runs)
-        done = descend(again, SOLVER, stages=False)
+        done = least_squares(again, SOLVER)
     except (MotoridError, np.linalg.LinAlgError) as error:
         return Failure(problem.model.values, "failed", str(error))
     return done.problem.values(done.solution.q)

@@ -20,7 +20,7 @@ from motorid.display.numbers import number, percent, quantity
 from motorid.display.tables import Flag, Table
 from motorid.errors import SimulationError, UsageError
 from motorid.estimation.result import UNDETERMINED, Fit
-from motorid.estimation.start_values import started
+from motorid.estimation.start_values import with_start_values
 from motorid.numerics.signals import Array
 from motorid.problem.problem import Problem
 from motorid.problem.sensitivity import relative_jacobian, relative_sensitivities
@@ -209,7 +209,7 @@ def _problem_at(problem_or_fit: Problem | Fit) -> tuple[Problem, Array]:
         return problem_or_fit.problem, problem_or_fit.q
     problem = problem_or_fit
     if not any(p.given for p in problem.model.parameters.values()):
-        problem = started(problem)
+        problem = with_start_values(problem)
     return problem.refined(problem.start), problem.start
 
 

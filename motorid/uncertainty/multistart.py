@@ -18,11 +18,10 @@ from motorid.display.cards import Card, Shown
 from motorid.display.numbers import duration, percent, quantity, sentence
 from motorid.display.tables import Flag, Table
 from motorid.errors import MotoridError, SimulationError, UsageError
-from motorid.estimation.fit import solve
-from motorid.estimation.restarts import descend_balanced
+from motorid.estimation.fit import minimise, solve
+from motorid.estimation.least_squares import FINISH
 from motorid.estimation.result import Failure, Fit
-from motorid.estimation.start_values import started
-from motorid.numerics.least_squares import LevenbergMarquardt
+from motorid.estimation.start_values import with_start_values
 from motorid.numerics.parallel import Map, map_items
 from motorid.numerics.signals import Array
 from motorid.problem.problem import Problem
@@ -105,12 +104,12 @@ def _from_start(task: tuple[Problem, dict[str, float], Any, bool], start: dict[s
     (problem, values, solver, guess), began = task, time.perf_counter()
     here = problem.for_model(problem.model.start_at(values | start))
     try:
-        here = replace(started(here), _runs=here.runs) if guess else here
+        here = replace(with_start_values(here), _runs=here.runs) if guess else here
         if hasattr(solver, "solve"):
             fit = solver.solve(here)
             solved, q, status, message, history = fit.problem, fit.q, fit.status, fit.message, fit.history
         else:
-            done = descend_balanced(here, solver or LevenbergMarquardt())
+            done = minimise(here, solver or FINISH)
             solved, q, history = done.problem, done.solution.q, done.history
             status, message = done.solution.status, done.solution.message
     except (MotoridError, np.linalg.LinAlgError) as error:

@@ -19,7 +19,7 @@ from motorid.display.cards import Card, Shown
 from motorid.display.numbers import interval_text, percent, quantity
 from motorid.display.tables import Flag, Table
 from motorid.errors import MotoridError, UsageError, one_of
-from motorid.estimation.continuation import descend
+from motorid.estimation.least_squares import least_squares
 from motorid.estimation.result import Fit
 from motorid.numerics.least_squares import LevenbergMarquardt, gauss_newton_covariance
 from motorid.numerics.parallel import Map, Parcel, run_tasks
@@ -213,7 +213,7 @@ def _refit_with(problem: Problem, values: dict[str, float], name: str,
           p: float) -> tuple[float, dict[str, float]] | None:
     here = problem.for_model(problem.model.start_at(values).fix(**{name: p}))
     try:
-        done = descend(here, SOLVER, stages=False)
+        done = least_squares(here, SOLVER)
     except (MotoridError, np.linalg.LinAlgError):
         return None
     r = done.solution.residual

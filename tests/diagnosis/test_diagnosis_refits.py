@@ -15,7 +15,7 @@ from motorid.diagnosis import score_test as ranking
 from motorid.diagnosis.admissibility import objections
 from motorid.diagnosis.verdict import measured_angle_remark
 from motorid.effects import LIBRARY
-from motorid.estimation.restarts import ALIVE, let_go, revived
+from motorid.estimation.restarts import MATTERS, collapsed_again, restored
 from motorid.problem.problem import Problem
 from motorid.problem.simulate import simulate
 
@@ -34,26 +34,26 @@ def test_a_refit_goes_on_beyond_its_limit_of_iterations(monkeypatch):
     run = _run(mi.dc_motor(**TRUE))
     monkeypatch.setattr(trial, "POLISH", replace(trial.POLISH, max_iterations=2))
     far = Problem(mi.dc_motor(R=3.0, L=5e-3, K=0.08, b=1e-4, J=8e-5), (run,))
-    once = trial.descend(far, trial.POLISH, stages=False)
+    once = trial.least_squares(far, trial.POLISH)
     on = trial._converged(far)
     assert once.solution.status == "limit"
     assert on.history[-1] < 0.5 * once.history[-1]
 
 
-def test_what_stays_without_a_say_is_let_go_and_what_matters_is_kept():
+def test_what_does_not_matter_collapses_again_and_what_matters_is_kept():
     run = _run(mi.dc_motor(**TRUE))
     fit = mi.fit(mi.dc_motor(), run)
     dead = replace(fit, jacobian=fit.jacobian * np.where([p.name == "L" for p in fit.problem.unknown], 1e-9, 1.0))
-    assert revived(fit, fit.model).values["L"] == fit.values["L"]
-    assert revived(dead, fit.model).values["L"] > 10 * ALIVE * fit.values["L"]
+    assert restored(fit, fit.model).values["L"] == fit.values["L"]
+    assert restored(dead, fit.model).values["L"] > 10 * MATTERS * fit.values["L"]
     # Where the fit had a dead inductance, but the records now want one, that is kept.
     had = replace(dead, values={**fit.values, "L": 1e-8},
                   problem=fit.problem.for_model(fit.model.start_at({"L": 1e-8})))
-    assert let_go(fit.problem.for_model(fit.model), had).model.values["L"] == fit.values["L"]
+    assert collapsed_again(fit.problem.for_model(fit.model), had).model.values["L"] == fit.values["L"]
     # And where it makes no difference, it goes back.
     same = replace(dead, values={**fit.values, "L": fit.values["L"] * 1.0001},
                    problem=fit.problem.for_model(fit.model.start_at({"L": fit.values["L"] * 1.0001})))
-    assert let_go(fit.problem.for_model(fit.model), same).model.values["L"] == same.values["L"]
+    assert collapsed_again(fit.problem.for_model(fit.model), same).model.values["L"] == same.values["L"]
 
 
 def test_a_gap_at_its_limit_is_refused():

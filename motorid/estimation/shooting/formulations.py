@@ -14,10 +14,10 @@ from motorid.display.numbers import duration, number, percent
 from motorid.display.tables import Cell, Flag, Table, value_cell
 from motorid.errors import FitError, MotoridError, SimulationError
 from motorid.estimation.fit import solve
+from motorid.estimation.least_squares import FINISH, least_squares
 from motorid.estimation.result import Failure, Fit
 from motorid.estimation.shooting.multiple_shooting import MultipleShooting
 from motorid.estimation.shooting.outcome import Multiplier, steady_residual, violations
-from motorid.numerics.least_squares import LevenbergMarquardt, levenberg_marquardt
 from motorid.problem.constraints import SteadyState
 from motorid.problem.problem import Problem
 from motorid.problem.relations import Relation, Weighed
@@ -188,13 +188,13 @@ def _path(problem: Problem, relations: Sequence[Relation], weights: Sequence[flo
           hard: Fit) -> tuple[PathPoint, ...]:
     """Follow the penalty solution back from the hard one as the penalties grow lighter: the same valley."""
     found, q = [], hard.q
-    options = LevenbergMarquardt(ftol=1e-12)
+    effort = replace(FINISH, ftol=1e-12)
     free = [n for n in problem.model.free_names if hard.std[n] is not None and hard.values[n] != 0]
     for weight in sorted(weights, reverse=True):
         step = replace(problem, _runs=hard.problem.runs,
                        penalties=(*problem.penalties, *(Weighed(c, float(weight)) for c in relations)))
         try:
-            q = levenberg_marquardt(step.residual, step.residual_and_jacobian, q, step.scaling.bounds, options).q
+            q = least_squares(step, effort, q=q, refine=False).q
         except (FitError, SimulationError):
             break
         values = step.values(q)

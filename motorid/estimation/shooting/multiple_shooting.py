@@ -14,7 +14,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from motorid.errors import FitError, SimulationError, UsageError, one_of
-from motorid.estimation.restarts import descend_balanced
+from motorid.estimation.fit import minimise
+from motorid.estimation.least_squares import FINISH, least_squares
 from motorid.estimation.result import Fit
 from motorid.estimation.shooting.mesh import Mesh
 from motorid.estimation.shooting.nlp import Ipopt, NlpResult, ShootingNlp
@@ -26,7 +27,6 @@ from motorid.estimation.shooting.nodes import (
     noise_of_gaps,
 )
 from motorid.estimation.shooting.outcome import Solved, below_steady, fit_of, violations
-from motorid.numerics.least_squares import LevenbergMarquardt, levenberg_marquardt
 from motorid.numerics.signals import Array
 from motorid.problem.problem import Problem
 from motorid.problem.relations import Relation, Weighed
@@ -227,7 +227,7 @@ def _least_noise(problem: Problem) -> dict[str, float]:
 def _least_squares(problem: Problem, stages: bool) -> tuple[Problem, Array]:
     """Return the problem with weights settled and its solution without constraints, in one piece."""
     try:
-        done = descend_balanced(problem, LevenbergMarquardt(ftol=TIGHT), stages=stages)
+        done = minimise(problem, replace(FINISH, ftol=TIGHT), wide=stages)
     except FitError:  # the intervals will have to find it
         return problem, problem.start
     return done.problem, done.solution.q
@@ -256,11 +256,10 @@ def _under_penalties(problem: Problem, q: Array) -> tuple[float, Array]:
         weighed = tuple(Weighed(c, factor) for c in problem.constraints)
         step = replace(problem, penalties=(*problem.penalties, *weighed))
         try:
-            found = levenberg_marquardt(step.residual, step.residual_and_jacobian, q, step.scaling.bounds,
-                                        LevenbergMarquardt(max_iterations=60), None, step.scaling.log)
+            found = least_squares(step, replace(FINISH, max_iterations=60), q=q, refine=False)
         except (FitError, SimulationError):
             return np.inf, q
-        q, cost = found.q, 0.5 * float(found.residual @ found.residual)
+        q, cost = found.q, found.cost
     return cost, q
 
 

@@ -1,0 +1,124 @@
+"""One least-squares run on a problem: every stage of a fit, every start of a race is this one call.
+
+Sub-steps chosen far from the solution hide what rings between samples, so they are chosen again where the run
+goes, and the run is repeated while they do not suit its end. Three efforts serve all purposes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from motorid.errors import SimulationError
+from motorid.numerics.least_squares import LevenbergMarquardt, Solution, levenberg_marquardt
+from motorid.numerics.signals import Array
+from motorid.problem.problem import Problem
+
+LOOK = LevenbergMarquardt(max_iterations=6, ftol=1e-3, xtol=1e-4, looks=0)  # which starts are worth more?
+RACE = LevenbergMarquardt(max_iterations=60, ftol=1e-5, xtol=1e-6, looks=0)  # which start leads lowest?
+FINISH = LevenbergMarquardt()  # to the optimum, restarted where that is in doubt
+
+ROUNDS = 4  # of choosing the sub-steps again at the end
+FAR = 1.0  # on the logarithmic scale: how far a run goes before its sub-steps are chosen again
+NEAR = 0.05  # and how far they suit without a look
+MOVED = 1e-3  # less than this is no other place
+WILD = 1e7  # times the whole residual: more than any change by a factor of e does to one sample
+
+Callback = Callable[[int, float, Array], object] | None
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """Where least squares ended: the problem with its last sub-steps, the solution, all costs on the way."""
+
+    problem: Problem
+    solution: Solution
+    history: tuple[float, ...]
+
+    @property
+    def q(self) -> Array:
+        """Solver coordinates of the end."""
+        return self.solution.q
+
+    @property
+    def cost(self) -> float:
+        """½ rᵀr at the end."""
+        return self.solution.history[-1]
+
+    @property
+    def values(self) -> dict[str, float]:
+        """Parameter values at the end, SI."""
+        return self.problem.values(self.q)
+
+
+def least_squares(problem: Problem, effort: LevenbergMarquardt, callback: Callback = None, *,
+                  q: Array | None = None, refine: bool = True) -> Estimate:
+    """Minimise the cost of `problem` from the values of its model.
+
+    Parameters
+    ----------
+    problem : Problem
+    effort : LevenbergMarquardt
+        `LOOK`, `RACE`, `FINISH`, or options of the user's.
+    callback : callable, optional
+    q : ndarray, optional
+        Another start.
+    refine : bool
+        Choose the sub-steps anew where the solution goes; otherwise they stay as they are.
+
+    Raises
+    ------
+    FitError
+        If the model cannot be simulated at the start.
+    """
+    q, history = problem.start if q is None else q, ()
+    for _ in range(ROUNDS):
+        here = _Refining(problem) if refine else problem
+        found = levenberg_marquardt(here.residual, here.residual_and_jacobian, q, problem.scaling.bounds, effort,
+                                    callback, problem.scaling.log)
+        history += found.history
+        moved = np.max(np.abs(found.q - q), initial=0.0) > MOVED
+        q = found.q
+        if not isinstance(here, _Refining):
+            break
+        problem = here.problem
+        if found.status == "limit" or here.suits(q) or not (moved or found.status == "stalled"):
+            break
+    return Estimate(problem, found, history)
+
+
+def start_cost(problem: Problem) -> float:
+    """Return the cost at the values of the model, at sub-steps that suit them; infinite where it has none."""
+    try:
+        r = problem.refined(problem.start).residual(problem.start)
+    except SimulationError:
+        return np.inf
+    return 0.5 * float(r @ r) if np.isfinite(r).all() else np.inf
+
+
+class _Refining:
+    """A problem whose sub-steps follow the solution."""
+
+    def __init__(self, problem: Problem) -> None:
+        self.problem, self._chosen_at = problem, np.full(len(problem.start), np.inf)
+
+    def residual(self, q: Array) -> Array:
+        return self.problem.residual(q)
+
+    def residual_and_jacobian(self, q: Array) -> tuple[Array, Array]:
+        if np.max(np.abs(q - self._chosen_at), initial=0.0) > FAR:
+            self._choose(q)
+        r, jac = self.problem.residual_and_jacobian(q)
+        if np.max(np.abs(jac), initial=0.0) > WILD * np.linalg.norm(r) and not np.array_equal(q, self._chosen_at):
+            self._choose(q)  # a sgn that these steps jump over makes slopes of nothing
+            r, jac = self.problem.residual_and_jacobian(q)
+        return r, jac
+
+    def suits(self, q: Array) -> bool:
+        """Tell whether the sub-steps are right at `q` too: chosen nearby, or still fine enough."""
+        return bool(np.max(np.abs(q - self._chosen_at), initial=0.0) < NEAR) or self.problem.fine_enough(q)
+
+    def _choose(self, q: Array) -> None:
+        self.problem, self._chosen_at = self.problem.refined(q), q
