@@ -4,7 +4,7 @@ The balances are integrated over time, so nothing is differentiated, and solved 
 squares: ``∫v dt = L Δi + R ∫i dt + K ∫ω dt`` and ``K ∫i dt = J Δω + b ∫ω dt`` (Garnier & Wang, Identification of
 Continuous-time Models from Sampled Data, 2008, ch. 1). Where the current or the speed was not measured, it is
 eliminated and what the record cannot tell is taken from the values given, or from round numbers. Torques of
-the model's effects enter as further columns, see `motorid.loads`.
+the model's effects enter as further columns.
 """
 
 from __future__ import annotations

@@ -28,7 +28,6 @@ IMBALANCE = 3.0  # between channels, in misfit over noise, above which the misfi
 REWEIGHTINGS = 3  # at most
 ERROR_SHARE = 0.2  # integration error accepted beside noise or misfit
 MOST_FINER = 4  # times as many steps, where that is not kept
-POLISH = 20  # iterations with them
 
 
 def fit(
@@ -80,6 +79,15 @@ def fit(
         The words or the data were wrong.
     FitError
         The model cannot be simulated at any starting point.
+
+    Notes
+    -----
+    A plain motor takes one least-squares run. A model with a smooth sgn (friction) takes one per width of it,
+    usually three. An effect over the angle whose order is not given takes the fit without it, one along the
+    measured angle, and its own: three, or nine with friction. An effect that contains a simpler one takes the fit
+    with that, and a short run from either start. Further runs come only where an end is in doubt, a parameter has
+    collapsed, the model does not reach the noise in one channel far more than in another, or the sub-steps do not
+    suit the end.
     """
     if formulation not in ("plain", "penalty"):
         raise UsageError(one_of(formulation, ("plain", "penalty"), "formulation") + " For hard constraints use "
@@ -103,7 +111,11 @@ def fit(
 
 def solve(problem: Problem, solver: Any = None, *, start: str = "auto", callback: Callback = None,
           formulation: str = "plain") -> Fit:
-    """Solve a `Problem`; `fit` is this with the problem made on the way. See there."""
+    """Solve a `Problem`; `fit` is this with the problem made on the way. See there.
+
+    The stages: orders over the angle, start values (first guess, race of starts), continuation in the width of sgn,
+    reweighting, polish. The covariance follows from the Jacobian at the end.
+    """
     began = time.perf_counter()
     if start not in ("auto", "model"):
         raise UsageError(one_of(start, ("auto", "model"), "start"))
@@ -197,13 +209,10 @@ def _polished(found: Estimate, effort: LevenbergMarquardt, callback: Callback) -
         return found, error
     problem = found.problem.with_finer_steps(int(finer))
     try:
-        again = least_squares(problem, replace(effort, max_iterations=POLISH), callback, q=found.q, refine=False)
+        again = least_squares(problem, effort, callback, q=found.q, refine=False)
     except FAILURES:
         return found, error
-    solution = again.solution
-    if solution.status == "limit":
-        solution = replace(solution, status="converged", message=found.solution.message)
-    return Estimate(problem, solution, found.history + again.history), integration_error(problem, again.q)
+    return replace(again, history=found.history + again.history), integration_error(problem, again.q)
 
 
 def _misfit(found: Estimate) -> float:

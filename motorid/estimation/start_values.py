@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -99,7 +98,7 @@ def _along_measured_angle(problem: Problem, asked: Model) -> Problem:
     orders = any(p.order for e in problem.model.effects for p in e.parameters)
     if not orders or not all({"theta", "omega"} & set(r.outputs) for r in problem.experiments):
         return problem
-    led = problem.for_model(replace(problem.model, angle_input=True, _systems={}))
+    led = problem.for_model(problem.model.with_(angle_input=True))
     for effect in problem.model.effects:
         led = _shaped(led, effect, asked)
     found = race([led], RACE, solve=by_continuation).best

@@ -9,7 +9,9 @@ import pytest
 from lab_records import NOISE, VALUES, drive, noisy, pair, simulated
 
 import motorid as mi
+from motorid.effects import LIBRARY
 from motorid.errors import FitError, SimulationError, UsageError
+from motorid.estimation import least_squares
 from motorid.integrate import Rosenbrock
 from motorid.records.datasets import truth
 
@@ -328,6 +330,40 @@ def test_evaluate_judges_unseen_runs_and_estimates_no_parameter(runs, rng):
     )
     again = mi.evaluate(fit, runs)
     assert again.nrmse == pytest.approx(fit.nrmse, rel=1e-3)
+
+
+TURNING = {"A": 3e-3, "N": 9.0, "phi": 0.5}
+
+
+@pytest.mark.parametrize(("effects", "hidden", "most"), [
+    ((), {}, 1),
+    (("coulomb",), {"tau_c": 4e-3}, 3),
+    (("cogging",), TURNING, 3),
+    (("coulomb", "cogging"), {"tau_c": 4e-3, **TURNING}, 9),
+])
+def test_a_fit_takes_no_more_least_squares_runs_than_its_docstring_says(effects, hidden, most, rng, monkeypatch):
+    model = mi.dc_motor()
+    for name in effects:
+        model = model + LIBRARY[name]
+    t = np.arange(0, 3, 1e-3)
+    truth = model.replace(R=2.0, L=1e-3, K=0.05, b=1e-5, J=2e-5, **hidden)
+    records = []
+    for v in (6 * np.sin(np.pi * t) + np.sign(np.sin(2.2 * np.pi * t)), 4 * np.sign(np.sin(1.6 * np.pi * t + 0.3))):
+        blank = mi.Experiment(t, {"v": v}, {c: np.zeros(len(t)) for c in ("i", "omega", "theta")})
+        clean = mi.simulate(truth, blank, initial="rest")[0].outputs
+        noise = {c: 2e-3 * np.abs(y).max() * rng.standard_normal(len(t)) for c, y in clean.items()}
+        records.append(blank.with_(outputs={c: clean[c] + noise[c] for c in clean}))
+    solve, ends = least_squares.levenberg_marquardt, []
+
+    def counted(*arguments):
+        ends.append(solve(*arguments))
+        return ends[-1]
+
+    monkeypatch.setattr(least_squares, "levenberg_marquardt", counted)
+    fit = mi.fit(model, records)
+    assert {n: fit.values[n] for n in hidden} == pytest.approx(hidden, rel=0.1)
+    assert len(ends) == most
+    assert len(fit.history) <= sum(len(end.history) for end in ends)
 
 
 def test_a_fit_can_go_on_from_a_fit(runs):
