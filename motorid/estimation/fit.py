@@ -111,11 +111,7 @@ def fit(
 
 def solve(problem: Problem, solver: Any = None, *, start: str = "auto", callback: Callback = None,
           formulation: str = "plain") -> Fit:
-    """Solve a `Problem`; `fit` is this with the problem made on the way. See there.
-
-    The stages: orders over the angle, start values (first guess, race of starts), continuation in the width of sgn,
-    reweighting, polish. The covariance follows from the Jacobian at the end.
-    """
+    """Solve a `Problem`; `fit` is this with the problem made on the way. See there."""
     began = time.perf_counter()
     if start not in ("auto", "model"):
         raise UsageError(one_of(start, ("auto", "model"), "start"))
@@ -124,14 +120,32 @@ def solve(problem: Problem, solver: Any = None, *, start: str = "auto", callback
                          "the model as it is: mi.evaluate(model, runs).")
     auto, effort = start == "auto", solver or FINISH
     if auto:
-        problem = with_start_values(_with_orders(problem))
+        problem = _with_orders(problem)
     if hasattr(effort, "solve"):
-        return effort.solve(problem)
+        return effort.solve(with_start_values(problem) if auto else problem)
     if problem.constraints:
         raise UsageError("LevenbergMarquardt has no true constraints; use solver=mi.MultipleShooting().")
+    return _fit(problem, effort, callback, auto=auto, formulation=formulation, began=began)
+
+
+def _fit(problem: Problem, effort: LevenbergMarquardt, callback: Callback = None, *, auto: bool = True,
+         formulation: str = "plain", began: float = 0.0) -> Fit:
+    """Fit with the orders over the angle that the model has: start values, minimum, polish.
+
+    The covariance follows from the Jacobian there.
+    """
     if auto:
-        effort = replace(effort, looks=min(effort.looks, 1))  # a misfit from a guess by the data is the model's
-    return _fit_of(problem, effort, callback, wide=auto, formulation=formulation, began=began)
+        problem = with_start_values(problem)  # first guess, race of starts
+        effort = replace(effort, looks=min(effort.looks, 1))  # a misfit from there is the model's, not the start's
+    found = minimise(problem, effort, callback, wide=auto)  # continuation, restarts, reweighting
+    found, error = _polished(found, effort, callback)  # finer sub-steps
+    problem, q = found.problem, found.problem.unknowns.principal(found.q)
+    status, message = _said(found, error)
+    fit = Fit(problem, problem.values(q), found.solution.residual, found.solution.jac / problem.scaling.slope(q), q,
+              status, message, found.history, time.perf_counter() - began, error, formulation)
+    _ = fit.simulations  # nothing is computed for them now
+    problem.forget()
+    return fit
 
 
 def _with_orders(problem: Problem) -> Problem:
@@ -149,7 +163,7 @@ def _with_orders(problem: Problem) -> Problem:
         if not smaller.unknown:
             break
         try:
-            fit = _fit_of(with_start_values(smaller), replace(FINISH, looks=1))
+            fit = _fit(smaller, FINISH)
         except FitError:
             break
         found = strongest_order(fit, waiting)
@@ -161,43 +175,45 @@ def _with_orders(problem: Problem) -> Problem:
     return problem.for_model(model)
 
 
-def _fit_of(problem: Problem, effort: LevenbergMarquardt, callback: Callback = None, *, wide: bool = True,
-            formulation: str = "plain", began: float | None = None) -> Fit:
-    """Return the fit from the values of the model."""
-    began = time.perf_counter() if began is None else began
-    found, error = _polished(minimise(problem, effort, callback, wide=wide), effort, callback)
-    problem, q = found.problem, found.problem.unknowns.principal(found.q)
-    status, message = _said(found, error)
-    fit = Fit(problem, problem.values(q), found.solution.residual, found.solution.jac / problem.scaling.slope(q), q,
-              status, message, found.history, time.perf_counter() - began, error, formulation)
-    _ = fit.simulations  # nothing is computed for them now
-    problem.forget()
-    return fit
-
-
 def minimise(problem: Problem, effort: LevenbergMarquardt, callback: Callback = None, *,
              wide: bool = True) -> Estimate:
-    """Minimise the cost, and where the model fails, weigh channels by their misfit instead of their noise.
+    """Minimise the cost from the values of the model: continuation, restarts, reweighting.
+
+    Parameters
+    ----------
+    problem : Problem
+    effort : LevenbergMarquardt
+    callback : callable, optional
+    wide : bool
+        Begin with a wide sgn, see `by_continuation`.
+    """
+    found = restore_collapsed(by_continuation(problem, effort, callback, wide=wide), effort, callback)
+    effort = replace(effort, looks=0)
+    for k in range(REWEIGHTINGS):
+        balance = _rebalanced(found)
+        if balance is None:
+            break
+        begin = found.problem.start_at(found.values) if k else problem
+        again = by_continuation(begin.tuned(balance=balance), effort, callback, wide=wide and k == 0)
+        again = restore_collapsed(again, effort, callback)
+        found = replace(again, history=found.history + again.history)
+    return found
+
+
+def _rebalanced(found: Estimate) -> dict[str, float] | None:
+    """Return factors on the noise of each channel where the model fails: their misfit; None where the weights suit.
 
     A model that cannot reach the noise would otherwise spend itself on the channel with the smallest noise
     (an encoder), at any price in the others. Noise and misfit together give the maximum of the likelihood
     with the channels' variances as unknowns, ``Σ n·ln(SSR)`` (Seber & Wild, Nonlinear Regression, 1989, ch.
     11); a model that reaches the noise keeps the weights of the noise.
     """
-    found = restore_collapsed(by_continuation(problem, effort, callback, wide=wide), effort, callback)
+    problem = found.problem
     if problem.weights != "noise" or problem.loss is not None or len(problem.outputs) < 2:
-        return found
-    effort = replace(effort, looks=0)
-    for k in range(REWEIGHTINGS):
-        factors = misfit_over_noise(found.problem, found.q)
-        relative = [factors[c] / found.problem.balance.get(c, 1.0) for c in factors]
-        if max(relative) < IMBALANCE * min(relative):
-            break
-        begin = found.problem.start_at(found.values) if k else problem
-        again = by_continuation(begin.tuned(balance=factors), effort, callback, wide=wide and k == 0)
-        again = restore_collapsed(again, effort, callback)
-        found = replace(again, history=found.history + again.history)
-    return found
+        return None
+    factors = misfit_over_noise(problem, found.q)
+    relative = [factors[c] / problem.balance.get(c, 1.0) for c in factors]
+    return factors if max(relative) >= IMBALANCE * min(relative) else None
 
 
 def _polished(found: Estimate, effort: LevenbergMarquardt, callback: Callback) -> tuple[Estimate, float]:
