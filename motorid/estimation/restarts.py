@@ -26,9 +26,8 @@ from motorid.estimation.result import Fit
 from motorid.model.definition import Parameter
 from motorid.model.model import Model
 from motorid.numerics.least_squares import LevenbergMarquardt
-from motorid.numerics.signals import Array
 from motorid.problem.problem import Problem
-from motorid.problem.simulate import misfit_over_noise
+from motorid.problem.simulate import poorly_explained
 
 
 class Restart(NamedTuple):
@@ -43,7 +42,6 @@ RESTARTS = (Restart(True, 0.1), Restart(False, 10.0), Restart(True, 10.0), Resta
             Restart(True, 1.0, 1.5))
 FLAT = 0.03  # of the misfit: what a change by a factor of e does at least, if the data have a say in it
 FAR = 1.0  # on the logarithmic scale: an end nearer to its start is in no doubt
-NOT_EXPLAINED = 0.25  # NRMSE of a channel that the model does not follow
 MATTERS = 10.0  # standard deviations that a change by a factor of e makes
 FURTHEST = 1e12  # times its value, that a collapsed parameter is put back
 GAIN = 2.0  # of the cost, half of chi²: two standard deviations
@@ -70,27 +68,17 @@ def restarted_where_doubtful(found: Estimate, begin: Problem, effort: LevenbergM
 def doubtful(found: Estimate, begin: Problem) -> bool:
     """Tell whether an estimate went far from where it began and ended where it should not.
 
-    That is: without convergence, with a channel not explained, or in a direction that the data do not ask for.
+    That is: without convergence, with a channel poorly explained, or in a direction that the data do not ask for.
     """
     log, physical = begin.scaling.log, found.problem.scaling.physical(found.q)
     moved = np.log(physical[log] / begin.scaling.physical(begin.start)[log])
     if np.max(np.abs(moved), initial=0.0) < FAR:
         return False
-    if found.solution.status != "converged" or _not_explained(found.problem, found.q):
+    if found.solution.status != "converged" or poorly_explained(found.problem, found.q):
         return True
     s, directions = np.linalg.svd(np.linalg.qr(found.solution.jac[:, log], mode="r"))[1:]
     flat = directions[:len(s)][s < FLAT * np.linalg.norm(found.solution.residual)]
     return bool(np.max(np.abs(flat.T @ (flat @ moved)), initial=0.0) > FAR)
-
-
-def _not_explained(problem: Problem, q: Array) -> bool:
-    """Tell whether some channel is far above its noise and not followed at all."""
-    for c, factor in misfit_over_noise(problem, q).items():
-        runs = [r for r in problem.runs if c in r.sigma]
-        rms = np.sqrt(np.mean([np.nanmean((r.experiment.outputs[c] / r.sigma[c]) ** 2) for r in runs]))
-        if factor > max(3.0, NOT_EXPLAINED * rms):
-            return True
-    return False
 
 
 def _shifted(problem: Problem, shift: float, seed: int) -> Problem:
