@@ -90,6 +90,11 @@ def _frc(folder: Path) -> Parts:
     return [slow], [fast]
 
 
+def _frc_back(folder: Path) -> Parts:
+    slow, fast = _frc(folder)
+    return fast, slow
+
+
 def _frc_halves(folder: Path) -> Parts:
     return _halves([r for runs in _frc(folder) for r in runs])
 
@@ -127,6 +132,7 @@ CASES = {
         Case("unmotor", "PRBS → step", _unmotor, MOTOR, 2),
         Case("emps", "every 4th sample: first half → second", _emps, AXIS, 2),
         Case("frc", "omega: slow → fast", _frc, MOTOR, 3),
+        Case("frc_back", "omega: fast → slow", _frc_back, MOTOR),
         Case("frc_halves", "omega: first halves of both → second halves", _frc_halves, MOTOR, 2),
         Case("furuta_speed", "omega alone: random → step", lambda f: _furuta(f, "i", "theta"), MOTOR, 4),
         Case("fibo", "every 5th sample: chirp and stair → ramp", _fibo, MOTOR, 4),

@@ -27,7 +27,7 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import numpy as np
-from brute_force import OutOfTime, figure, grown, judged, processor_time, search_all, within
+from brute_force import WIDTHS, OutOfTime, figure, grown, judged, processor_time, search_all, within
 from real_cases import CASES, Case, Parts, real_folder
 
 import motorid as mi
@@ -62,7 +62,8 @@ def diagnosed(case: Case, parts: Parts) -> Row:
     row |= {"verdict": found.verdict, "effects": list(found.effects), "groups": [list(g) for g in found.groups]}
     row["text"] = found.text
     row["ladder"] = [
-        {"added": r.added, "nrmse": dict(r.nrmse), "held_out": dict(r.validation_nrmse or {})}
+        {"added": r.added, "removed": list(r.removed), "nrmse": dict(r.nrmse),
+         "held_out": dict(r.validation_nrmse or {})}
         for r in found.ladder.rungs
     ]
     row["as_recorded"] = recorded(found.after, held)
@@ -129,7 +130,7 @@ def lines(row: Row) -> list[str]:
     first = row["first_answer_s"]
     found = [title, f"  {row['verdict']}: {named}" + (f" ({groups})" if groups else "")]
     for rung in row["ladder"]:
-        added = "plain" if rung["added"] is None else f"+ {rung['added']}"
+        added = "plain" if rung["added"] is None else f"+ {rung['added']}" + "".join(f" − {n}" for n in rung["removed"])
         found.append(f"    {added:<32} fitted {percent(rung['nrmse'])}, held out {percent(rung['held_out'])}")
     found.append(f"  processor time {row['processor_s']:.1f} s, first answer "
                  + (f"{first:.1f} s" if first is not None else "none"))
@@ -175,6 +176,8 @@ def main() -> None:
     options.add_argument("--brute", action="store_true", help="make the table of brute force")
     options.add_argument("--table", type=Path, default=TABLE, help="table of brute force")
     options.add_argument("--journal", type=Path, default=Path("real_brute.jsonl"), help="fits of brute force so far")
+    options.add_argument("--width", choices=[w.name for w in WIDTHS],
+                         help="how far brute force goes (default: to the end)")
     given = options.parse_args()
     folder = real_folder()
     if folder is None:
@@ -182,7 +185,7 @@ def main() -> None:
     cases = chosen(given.records)
     parts = {case.name: case.parts(folder) for case in cases}
     if given.brute:
-        return search_all(cases, parts, given.journal, given.table)
+        return search_all(cases, parts, given.journal, given.table, given.width)
     table = json.loads(given.table.read_text()) if given.table.exists() else {}
     rows = []
     for case in cases:

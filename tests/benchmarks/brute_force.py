@@ -271,13 +271,14 @@ def _short(row: Row) -> Row:
     return {"effects": row["effects"], **percent, "figure": float(f"{row['figure']:.5g}"), "bic": round(row["bic"], 1)}
 
 
-def search_all(cases: Sequence[Case], parts: Mapping[str, Parts], journal: Path, table: Path) -> None:
-    """Search every case, one width after the other; write the table after each."""
+def search_all(cases: Sequence[Case], parts: Mapping[str, Parts], journal: Path, table: Path,
+               last: str | None = None) -> None:
+    """Search every case, one width after the other up to the `last`; write the table after each."""
     book = Journal.at(journal)
     searches = {c.name: BruteForce.on(c, parts[c.name], book) for c in cases}
     known = json.loads(table.read_text()) if table.exists() else {}
     order = [w.name for w in WIDTHS]
-    for width in WIDTHS:
+    for width in WIDTHS[:order.index(last) + 1 if last else None]:
         for name, search in searches.items():
             began = time.perf_counter()
             search.go(width)
