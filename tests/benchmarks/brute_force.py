@@ -31,6 +31,7 @@ from motorid.errors import ModelError, MotoridError
 
 LIMIT = 20.0  # processor time of one fit, s
 KEPT = 3  # best of each size that are fitted to all samples in the end
+TIED = 1e-3  # relative difference of two figures within which the smaller model is the better
 STALLED = 1e-3  # relative fall of the criterion below which a larger model is started elsewhere too
 Row = dict[str, Any]
 T = TypeVar("T")
@@ -234,7 +235,9 @@ def summary(search: BruteForce, parts: Parts) -> Row:
     plain = journal.rows[case.name, frozenset()]
     finalists = {frozenset(r["effects"]): r for r in [plain, *(r for found in kept.values() for r in found), fair]}
     whole = {key: _on_all(search, r, parts) for key, r in finalists.items()}
-    best = min((r for r in whole.values() if "failed" not in r), key=lambda r: r["figure"])
+    good = [r for r in whole.values() if "failed" not in r]
+    least = min(r["figure"] for r in good)
+    best = min((r for r in good if r["figure"] <= (1 + TIED) * least), key=lambda r: (len(r["effects"]), r["figure"]))
     return {
         "thin": case.thin,
         "tried": {str(size): len(t) for size, t in tried.items()},
@@ -271,6 +274,19 @@ def _short(row: Row) -> Row:
     return {"effects": row["effects"], **percent, "figure": float(f"{row['figure']:.5g}"), "bic": round(row["bic"], 1)}
 
 
+def text_of(table: Mapping[str, Row]) -> str:
+    """Return the table as JSON with a line for each entry of a case, and for each row of its lists."""
+
+    def entry(value: Any) -> str:
+        if isinstance(value, list) and value and isinstance(value[0], dict):
+            return "[\n   " + ",\n   ".join(json.dumps(row) for row in value) + "\n  ]"
+        return json.dumps(value)
+
+    cases = (f' "{name}": {{\n  ' + ",\n  ".join(f'"{k}": {entry(v)}' for k, v in row.items()) + "\n }"
+             for name, row in table.items())
+    return "{\n" + ",\n".join(cases) + "\n}\n"
+
+
 def search_all(cases: Sequence[Case], parts: Mapping[str, Parts], journal: Path, table: Path,
                last: str | None = None) -> None:
     """Search every case, one width after the other up to the `last`; write the table after each."""
@@ -284,7 +300,7 @@ def search_all(cases: Sequence[Case], parts: Mapping[str, Parts], journal: Path,
             search.go(width)
             reached = max(width.name, known.get(name, {}).get("width", width.name), key=order.index)
             known[name] = {"width": reached, **summary(search, parts[name])}
-            table.write_text(json.dumps(known, indent=1) + "\n")
+            table.write_text(text_of(known))
             best = known[name]["best"]
             print(f"{name}, {width.name}: {time.perf_counter() - began:.0f} s; best "
                   f"{' + '.join(best['effects']) or 'plain'}, {100 * best['figure']:.4g} %", flush=True)
