@@ -178,6 +178,7 @@ def main() -> None:
     options.add_argument("--journal", type=Path, default=Path("real_brute.jsonl"), help="fits of brute force so far")
     options.add_argument("--width", choices=[w.name for w in WIDTHS],
                          help="how far brute force goes (default: to the end)")
+    options.add_argument("--found", type=Path, help="an --out file: brute force tries the models of its ladders, too")
     given = options.parse_args()
     folder = real_folder()
     if folder is None:
@@ -185,7 +186,8 @@ def main() -> None:
     cases = chosen(given.records)
     parts = {case.name: case.parts(folder) for case in cases}
     if given.brute:
-        return search_all(cases, parts, given.journal, given.table, given.width)
+        found = json.loads(given.found.read_text()) if given.found else ()
+        return search_all(cases, parts, given.journal, given.table, given.width, found)
     table = json.loads(given.table.read_text()) if given.table.exists() else {}
     rows = []
     for case in cases:

@@ -191,6 +191,15 @@ class BruteForce:
             for key in [(*pair, n) for n in names if n not in pair]:
                 self._row(key, lambda key=key: self._starts(key))
 
+    def ladders(self, rows: Iterable[Row]) -> None:
+        """Try the models along the ladders of diagnoses, too."""
+        for row in rows:
+            names: list[str] = []
+            for rung in row.get("ladder", ()) if row["case"] == self.case.name else ():
+                kept = [n for n in names if n not in rung.get("removed", ())]
+                names = [*kept, *(rung["added"].split(" + ") if rung["added"] else ())]
+                self._row(names, lambda names=tuple(names): self._starts(names))
+
     def best(self, size: int, count: int) -> list[Row]:
         """Return the best rows with `size` effects: by held-out error and by BIC, in turn."""
         rows = self.journal.of(self.case.name, size)
@@ -288,8 +297,11 @@ def text_of(table: Mapping[str, Row]) -> str:
 
 
 def search_all(cases: Sequence[Case], parts: Mapping[str, Parts], journal: Path, table: Path,
-               last: str | None = None) -> None:
-    """Search every case, one width after the other up to the `last`; write the table after each."""
+               last: str | None = None, found: Sequence[Row] = ()) -> None:
+    """Search every case, one width after the other up to the `last`; write the table after each.
+
+    `found`: rows of `bench_real.py --out`, the models of whose ladders are tried too.
+    """
     book = Journal.at(journal)
     searches = {c.name: BruteForce.on(c, parts[c.name], book) for c in cases}
     known = json.loads(table.read_text()) if table.exists() else {}
@@ -298,6 +310,7 @@ def search_all(cases: Sequence[Case], parts: Mapping[str, Parts], journal: Path,
         for name, search in searches.items():
             began = time.perf_counter()
             search.go(width)
+            search.ladders(found)
             reached = max(width.name, known.get(name, {}).get("width", width.name), key=order.index)
             known[name] = {"width": reached, **summary(search, parts[name])}
             table.write_text(text_of(known))
