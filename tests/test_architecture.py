@@ -44,7 +44,7 @@ KNOWS = {
     "acquire": ("errors", "channels", "display", "records.datasets"),
 }
 HOMES = {"matplotlib": "plots", "serial": "acquire", "typer": "cli", "jinja2": "reports.report",
-         "rich": "cli numerics.parallel", "threadpoolctl": "numerics.threads"}
+         "rich": "cli numerics.parallel", "threadpoolctl": "numerics.parallel"}
 LATE = ("matplotlib", "serial", "typer", "jinja2", "rich", "pandas", "scipy.stats", "distributed", "threadpoolctl")
 FACES = {".", "effects", "integrate", "acquire", "plots", "cli"}  # their __init__ hands names on
 MOODS = {"held", "revival", "revived", "hardly", "endings", "ending", "beginning", "narrowing", "remedies", "surely",

@@ -27,11 +27,13 @@ from motorid.diagnosis.verdict import (
 from motorid.errors import MotoridError
 from motorid.estimation.result import Fit
 from motorid.model.definition import Effect
+from motorid.numerics.parallel import one_thread
 from motorid.records.checks import current_limit
 from motorid.records.experiment import Experiment
 from motorid.uncertainty.covariance import deviations
 
 
+@one_thread
 def diagnose(
     fit: Fit,
     validate: Sequence[Experiment] | Experiment | None = None,

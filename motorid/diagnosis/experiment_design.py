@@ -17,6 +17,7 @@ from motorid.display.numbers import number
 from motorid.display.tables import Flag, Table
 from motorid.errors import FitError, MotoridError, UsageError
 from motorid.estimation.result import Fit
+from motorid.numerics.parallel import one_thread
 from motorid.numerics.signals import Array
 from motorid.problem.simulate import simulate
 from motorid.records.experiment import Experiment
@@ -55,6 +56,7 @@ class Suggestion(Shown):
         )
 
 
+@one_thread
 def suggest_experiment(
     fits: Sequence[Fit],
     *,

@@ -16,6 +16,7 @@ from motorid.diagnosis.results import Binned, Missing
 from motorid.estimation.linearisation import linear_steps, parameter_vector, shown
 from motorid.estimation.result import Fit
 from motorid.numerics.autoregression import effective_samples
+from motorid.numerics.parallel import one_thread
 from motorid.numerics.signals import Array, bridged, integral
 from motorid.problem.runs import angle_signal, natural_sizes
 
@@ -31,6 +32,7 @@ WORDS = {
 REGIONS = ("standstill", "reversal", "acceleration", "high current", "steady")
 
 
+@one_thread
 def locate(fit: Fit) -> Missing:
     """Estimate the unknown voltage and torque that would make the model match, and say where they act.
 

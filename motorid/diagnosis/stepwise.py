@@ -21,6 +21,7 @@ from motorid.diagnosis.residual_analysis import compare_errors, far
 from motorid.diagnosis.results import Adequacy, Candidate, Ladder, Rung
 from motorid.estimation.result import Fit
 from motorid.model.definition import Effect
+from motorid.numerics.parallel import one_thread
 from motorid.records.checks import current_limit
 from motorid.records.experiment import Experiment
 
@@ -243,6 +244,7 @@ def search_key(node: Node) -> frozenset[str]:
     return node.key
 
 
+@one_thread
 def improve(
     fit: Fit,
     validate: Sequence[Experiment] | Experiment | None = None,

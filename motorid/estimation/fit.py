@@ -19,6 +19,7 @@ from motorid.estimation.start_values import with_start_values
 from motorid.integrate.engine import Engine
 from motorid.model.model import Model
 from motorid.numerics.least_squares import LevenbergMarquardt
+from motorid.numerics.parallel import one_thread
 from motorid.problem.problem import Problem, as_problem
 from motorid.problem.simulate import integration_error, misfit_over_noise
 from motorid.records.experiment import Experiment
@@ -30,6 +31,7 @@ ERROR_SHARE = 0.2  # integration error accepted beside noise or misfit
 MOST_FINER = 4  # times as many steps, where that is not kept
 
 
+@one_thread
 def fit(
     model: Model,
     runs: Sequence[Experiment] | Experiment,
@@ -109,6 +111,7 @@ def fit(
     return found
 
 
+@one_thread
 def solve(problem: Problem, solver: Any = None, *, start: str = "auto", callback: Callback = None,
           formulation: str = "plain") -> Fit:
     """Solve a `Problem`; `fit` is this with the problem made on the way. See there."""

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from motorid.errors import UsageError
+from motorid.numerics.parallel import one_thread
 from motorid.numerics.signals import Array
 from motorid.problem.problem import Problem
 
@@ -69,6 +70,7 @@ class DerivativeCheck:
         return "\n".join(lines)
 
 
+@one_thread
 def check_derivatives(
     problem: Problem,
     q: Array | None = None,

@@ -17,6 +17,7 @@ from motorid.errors import FitError, SimulationError
 from motorid.integrate.engine import Engine
 from motorid.model.model import Model
 from motorid.numerics.least_squares import LevenbergMarquardt, levenberg_marquardt
+from motorid.numerics.parallel import one_thread
 from motorid.numerics.signals import Array
 from motorid.problem.problem import Problem, as_problem
 from motorid.records.experiment import Experiment, units_of
@@ -114,6 +115,7 @@ def run_table(evaluation: Evaluation, title: str = "Errors run by run") -> Table
     return Table(header, rows, title, note)
 
 
+@one_thread
 def simulate(model: Model, runs: Sequence[Experiment] | Experiment, *, engine: str | Engine = "rosenbrock",
              initial: str = "auto", estimate_initial: bool = True) -> list[Simulation]:
     """Simulate `model`, at its present values, on the inputs of `runs`.
@@ -137,6 +139,7 @@ def simulate(model: Model, runs: Sequence[Experiment] | Experiment, *, engine: s
     return list(simulated(problem, estimate_initial))
 
 
+@one_thread
 def planned(model: Model, t: Sequence[float] | Array, v: Sequence[float] | Array, *,
             channels: Sequence[str] = ("i", "omega"), sigma: Mapping[str, float] | None = None,
             hold: Any = "zoh", name: str = "plan") -> Experiment:
@@ -235,6 +238,7 @@ def steady_errors(simulations: Sequence[Simulation], sigma: Sequence[Mapping[str
     return {c: float(np.sqrt(np.mean(np.square(e)))) for c, e in errors.items()}
 
 
+@one_thread
 def evaluate(fit_or_model: Any, runs: Sequence[Experiment] | Experiment, **options: Any) -> Evaluation:
     """Judge a fit (or a model at its values) on `runs` that it may never have seen.
 

@@ -22,7 +22,7 @@ from motorid.estimation.fit import fit
 from motorid.estimation.result import Fit
 from motorid.model.model import Model
 from motorid.numerics.noise import Outlier, outliers
-from motorid.numerics.parallel import Map, map_items
+from motorid.numerics.parallel import Map, map_items, one_thread
 from motorid.records.experiment import Experiment
 from motorid.records.reading import find_records, read_runs
 from motorid.uncertainty.covariance import covariance
@@ -110,6 +110,7 @@ class Batch:
     __repr__ = __str__
 
 
+@one_thread
 def fit_many(model: Model, motors: Mapping[str, Records], *, journal: str | Path | None = None,
              map: Map | None = None, reading: Mapping[str, Any] | None = None, quiet: bool = False,
              **options: Any) -> Batch:

@@ -19,7 +19,7 @@ from motorid.estimation.least_squares import least_squares
 from motorid.estimation.result import Failure, Fit
 from motorid.numerics.autoregression import Colour, colour_of
 from motorid.numerics.least_squares import LevenbergMarquardt
-from motorid.numerics.parallel import Map, map_items
+from motorid.numerics.parallel import Map, map_items, one_thread
 from motorid.numerics.signals import Array
 from motorid.problem.problem import Problem
 from motorid.records.experiment import Experiment
@@ -124,6 +124,7 @@ class _Source:
     block: int
 
 
+@one_thread
 def bootstrap(fit: Fit, *, kind: str = "blocks", n: int = 200, block: int | None = None, seed: int = 0,
               map: Map | None = None, quiet: bool = False) -> Bootstrap:
     """Refit to resampled records, from the fitted values, and collect the parameters.

@@ -18,6 +18,7 @@ from motorid.errors import UsageError, one_of
 from motorid.estimation.result import UNDETERMINED, Fit
 from motorid.numerics.autoregression import Colour, colour_of, weighed
 from motorid.numerics.least_squares import gauss_newton_covariance
+from motorid.numerics.parallel import one_thread
 from motorid.numerics.signals import Array
 
 WIDE = 0.8  # of the value: an interval that reaches farther down is made on the logarithmic scale
@@ -125,6 +126,7 @@ def _correlation_cell(value: float) -> Cell:
     return Flag(text, "note") if 0.95 < abs(value) < 0.9999 else text
 
 
+@one_thread
 def covariance(fit: Fit, *, method: str = "coloured") -> Covariance:
     """Return the covariance of the unknowns of a fit, in physical units.
 

@@ -21,6 +21,7 @@ from motorid.display.tables import Flag, Table
 from motorid.errors import SimulationError, UsageError
 from motorid.estimation.result import UNDETERMINED, Fit
 from motorid.estimation.start_values import with_start_values
+from motorid.numerics.parallel import one_thread
 from motorid.numerics.signals import Array
 from motorid.problem.problem import Problem
 from motorid.problem.sensitivity import relative_jacobian, relative_sensitivities
@@ -169,6 +170,7 @@ class Identifiability(Shown):
         return str(self.card())
 
 
+@one_thread
 def identifiability(problem_or_fit: Problem | Fit, *, points: int = 5, seed: int = 0) -> Identifiability:
     """Say which parameters, and which combinations of them, records determine.
 

@@ -22,7 +22,7 @@ from motorid.estimation.fit import minimise, solve
 from motorid.estimation.least_squares import FINISH
 from motorid.estimation.result import Failure, Fit
 from motorid.estimation.start_values import with_start_values
-from motorid.numerics.parallel import Map, map_items
+from motorid.numerics.parallel import Map, map_items, one_thread
 from motorid.numerics.signals import Array
 from motorid.problem.problem import Problem
 from motorid.problem.simulate import at, judge
@@ -33,6 +33,7 @@ COST_SHARE = 1e-3  # a good fit's cost is at most this much above the best
 DISTANCE = 0.5
 
 
+@one_thread
 def multistart(
     problem_or_fit: Problem | Fit,
     *,

@@ -22,7 +22,7 @@ from motorid.errors import MotoridError, UsageError, one_of
 from motorid.estimation.least_squares import least_squares
 from motorid.estimation.result import Fit
 from motorid.numerics.least_squares import LevenbergMarquardt, gauss_newton_covariance
-from motorid.numerics.parallel import Map, Parcel, run_tasks
+from motorid.numerics.parallel import Map, Parcel, one_thread, run_tasks
 from motorid.numerics.signals import Array
 from motorid.problem.problem import Problem
 from motorid.uncertainty.bootstrap import Bootstrap, bootstrap
@@ -129,6 +129,7 @@ def _crossing(x: Array, rise: Array, reach: float) -> float | None:
     return float(np.interp(reach, root[j - 1:j + 1], x[j - 1:j + 1]))
 
 
+@one_thread
 def profile(fit: Fit, name: str, *, level: float = 0.95, map: Map | None = None,
             quiet: bool = False) -> Profile:
     """Return the profile likelihood of one parameter, far enough out for intervals at `level`.
@@ -152,6 +153,7 @@ def profile(fit: Fit, name: str, *, level: float = 0.95, map: Map | None = None,
     return profiles(fit, [name], level=level, map=map, quiet=quiet)[name]
 
 
+@one_thread
 def profiles(fit: Fit, names: Sequence[str] | None = None, *, level: float = 0.95, map: Map | None = None,
              quiet: bool = False) -> dict[str, Profile]:
     """Return the profiles of several parameters, by default of all free ones; see `profile`."""
@@ -275,6 +277,7 @@ class Intervals(Shown):
         return str(self.card())
 
 
+@one_thread
 def intervals(fit: Fit, *, level: float = 0.95, kind: str = "blocks", n: int = 200, seed: int = 0,
               map: Map | None = None, quiet: bool = False) -> Intervals:
     """Return the intervals of the free parameters from covariance, bootstrap and profile, in one table.

@@ -11,8 +11,6 @@ import signal
 import threading
 import time
 
-os.environ.setdefault("OMP_NUM_THREADS", "1")
-
 import numpy as np
 from distributed import Client, LocalCluster
 

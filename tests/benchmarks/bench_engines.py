@@ -16,8 +16,6 @@ import time
 from collections.abc import Callable
 from functools import partial
 
-os.environ.setdefault("OMP_NUM_THREADS", "1")
-
 import numpy as np
 
 import motorid as mi

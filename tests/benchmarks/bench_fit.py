@@ -13,13 +13,10 @@ process times, the least of several rounds in which everybody takes a turn. With
 from __future__ import annotations
 
 import argparse
-import os
 import time
 from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
-
-os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
 from scipy.integrate import solve_ivp

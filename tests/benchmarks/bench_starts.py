@@ -9,11 +9,8 @@ from __future__ import annotations
 
 import argparse
 import multiprocessing
-import os
 import time
 from concurrent.futures import ProcessPoolExecutor
-
-os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import motorid as mi
 

@@ -351,7 +351,7 @@ print(fit.chi2.hex())
 """
     told = {}
     for cc in ("none", ""):
-        env = {**os.environ, "MOTORID_CC": cc, "MOTORID_CACHE": str(tmp_path), "OMP_NUM_THREADS": "1"}
+        env = {**os.environ, "MOTORID_CC": cc, "MOTORID_CACHE": str(tmp_path)}
         if not cc:
             del env["MOTORID_CC"]
         done = subprocess.run(

@@ -18,6 +18,7 @@ from motorid.estimation.least_squares import FINISH, least_squares
 from motorid.estimation.result import Failure, Fit
 from motorid.estimation.shooting.multiple_shooting import MultipleShooting
 from motorid.estimation.shooting.outcome import Multiplier, steady_residual, violations
+from motorid.numerics.parallel import one_thread
 from motorid.problem.constraints import SteadyState
 from motorid.problem.problem import Problem
 from motorid.problem.relations import Relation, Weighed
@@ -129,6 +130,7 @@ class Formulations(Shown):
         return str(self.table)
 
 
+@one_thread
 def compare_formulations(problem: Problem | Fit, constraints: Sequence[Relation] | None = None, *,
                          weights: Sequence[float] = WEIGHTS) -> Formulations:
     """Fit the same data three times: plain, with penalties, with true constraints.
