@@ -61,7 +61,7 @@ class Rosenbrock:
                 break
             level = tolerance(traj) if callable(tolerance) else tolerance
             size, error = _by_state(traj)
-            astray = _astray(size, error)
+            astray = _first_inaccurate(size, error)
             if astray is not None:
                 traj = traj._replace(x=traj.x[:astray + 2], y=traj.y[:astray + 2])
                 size, error[:, astray + 1:] = size[:, :astray + 2], 0.0
@@ -85,7 +85,7 @@ def _by_state(traj: Trajectory) -> tuple[Array, Array]:
     return np.maximum.accumulate(size, axis=1, out=size), np.ascontiguousarray(traj.error.T)
 
 
-def _astray(size: Array, error: Array) -> int | None:
+def _first_inaccurate(size: Array, error: Array) -> int | None:
     """Return the first interval whose error is as large as the state, if the state leaves its size there."""
     lost = (error > ASTRAY * np.maximum(size[:, 1:], 1e-12)).any(axis=0)
     if not lost.any():
