@@ -171,6 +171,7 @@ class BruteForce:
     case: Case
     parts: Parts
     journal: Journal
+    given: list[Row] = field(default_factory=list)  # of the models along ladders
 
     @classmethod
     def on(cls, case: Case, parts: Parts, journal: Journal) -> BruteForce:
@@ -198,7 +199,7 @@ class BruteForce:
             for rung in row.get("ladder", ()) if row["case"] == self.case.name else ():
                 kept = [n for n in names if n not in rung.get("removed", ())]
                 names = [*kept, *(rung["added"].split(" + ") if rung["added"] else ())]
-                self._row(names, lambda names=tuple(names): self._starts(names))
+                self.given.append(self._row(names, lambda names=tuple(names): self._starts(names)))
 
     def best(self, size: int, count: int) -> list[Row]:
         """Return the best rows with `size` effects: by held-out error and by BIC, in turn."""
@@ -242,7 +243,8 @@ def summary(search: BruteForce, parts: Parts) -> Row:
     fair = min((r for size in (0, 1, 2, 3) for r in journal.of(case.name, size)), key=lambda r: r["bic"])
     kept = {size: sorted(found, key=lambda r: r["figure"])[:KEPT] for size, found in rows.items()}
     plain = journal.rows[case.name, frozenset()]
-    finalists = {frozenset(r["effects"]): r for r in [plain, *(r for found in kept.values() for r in found), fair]}
+    asked = [r for r in search.given if "failed" not in r]
+    finalists = {frozenset(r["effects"]): r for r in (plain, *(r for f in kept.values() for r in f), fair, *asked)}
     whole = {key: _on_all(search, r, parts) for key, r in finalists.items()}
     good = [r for r in whole.values() if "failed" not in r]
     least = min(r["figure"] for r in good)
