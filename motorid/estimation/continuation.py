@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from motorid.errors import FAILURES
-from motorid.estimation.least_squares import RACE, Callback, Estimate, least_squares, start_cost
+from motorid.estimation.least_squares import RACE, ROUNDS, Callback, Estimate, least_squares, start_cost
 from motorid.estimation.restarts import restarted_where_doubtful
 from motorid.numerics.least_squares import LevenbergMarquardt
 from motorid.problem.problem import Problem
@@ -55,7 +55,7 @@ def by_continuation(problem: Problem, effort: LevenbergMarquardt, callback: Call
         stage = min((_at(p, width) for p in dict.fromkeys((here, problem))), key=start_cost) if k else _at(here, width)
         rough = effort if k == last else effort.at_most(RACE)
         try:
-            found = least_squares(stage, rough, callback)
+            found = least_squares(stage, rough, callback, rounds=ROUNDS if k in (0, last) else 1)
             found = found if k else restarted_where_doubtful(found, stage, rough, callback)
         except FAILURES:
             if k == last:

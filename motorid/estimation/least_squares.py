@@ -20,7 +20,7 @@ LOOK = LevenbergMarquardt(max_iterations=6, ftol=1e-3, xtol=1e-4, looks=0)  # wh
 RACE = LevenbergMarquardt(max_iterations=60, ftol=1e-5, xtol=1e-6, looks=0)  # which start leads lowest?
 FINISH = LevenbergMarquardt()  # to the optimum, restarted where that is in doubt
 
-ROUNDS = 4  # of choosing the sub-steps again at the end
+ROUNDS = 4  # of a run, the sub-steps chosen again at its end
 FAR = 1.0  # on the logarithmic scale: how far a run goes before its sub-steps are chosen again
 NEAR = 0.05  # and how far they suit without a look
 MOVED = 1e-3  # less than this is no other place
@@ -54,7 +54,7 @@ class Estimate:
 
 
 def least_squares(problem: Problem, effort: LevenbergMarquardt, callback: Callback = None, *,
-                  q: Array | None = None, refine: bool = True) -> Estimate:
+                  q: Array | None = None, refine: bool = True, rounds: int = ROUNDS) -> Estimate:
     """Minimise the cost of `problem` from the values of its model.
 
     Parameters
@@ -67,6 +67,8 @@ def least_squares(problem: Problem, effort: LevenbergMarquardt, callback: Callba
         Another start.
     refine : bool
         Choose the sub-steps anew where the solution goes; otherwise they stay as they are.
+    rounds : int
+        How often at most the run is repeated where the sub-steps do not suit its end.
 
     Raises
     ------
@@ -74,7 +76,7 @@ def least_squares(problem: Problem, effort: LevenbergMarquardt, callback: Callba
         If the model cannot be simulated at the start.
     """
     q, history = problem.start if q is None else q, ()
-    for _ in range(ROUNDS):
+    for _ in range(rounds):
         here = _Refining(problem) if refine else problem
         found = levenberg_marquardt(here.residual, here.residual_and_jacobian, q, problem.scaling.bounds, effort,
                                     callback, problem.scaling.log)
