@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from motorid.diagnosis.residual_analysis import Errors
 from motorid.errors import MotoridError
+from motorid.estimation.continuation import by_continuation
 from motorid.estimation.fit import solve
-from motorid.estimation.least_squares import least_squares
 from motorid.estimation.result import Fit
 from motorid.numerics.least_squares import LevenbergMarquardt
 from motorid.numerics.signals import Array
@@ -84,7 +84,7 @@ class HeldOut:
                 runs = zip(fit.problem.runs, problem.runs, strict=True)
                 start = replace(start, _runs=tuple(replace(whole, experiment=r.experiment) for whole, r in runs))
             q = start.scaling.scaled([fit.initial.get(p.name, p.value) for p in start.unknown])
-            done = least_squares(restarted(start, q), QUICK)
+            done = by_continuation(restarted(start, q), QUICK, wide=False)
             parts.append(Errors.of(at(done.problem, done.solution.q), test))
         return Errors({c: [r for e in parts for r in e.residuals[c]] for c in parts[0].residuals}, parts[0].measured)
 

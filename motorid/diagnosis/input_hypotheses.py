@@ -19,8 +19,8 @@ from motorid.diagnosis.refit import RACE
 from motorid.diagnosis.residual_analysis import Errors, compare_errors
 from motorid.display.numbers import number, percent
 from motorid.errors import FAILURES
+from motorid.estimation.continuation import by_continuation
 from motorid.estimation.fit import solve
-from motorid.estimation.least_squares import least_squares
 from motorid.estimation.result import Fit
 from motorid.problem.problem import Problem
 from motorid.problem.simulate import at, misfit_over_noise
@@ -132,7 +132,7 @@ def _best_delay(fit: Fit) -> list[Reading]:
 def _fall(fit: Fit, reading: Reading) -> float:
     """Return about how much a reading lowers the error: after a few steps from where the fit is."""
     try:
-        done = least_squares(reading.problem(fit).tuned(accuracy=ROUGH), RACE)
+        done = by_continuation(reading.problem(fit).tuned(accuracy=ROUGH), RACE, wide=False)
         return compare_errors(train_errors(fit), Errors.of(at(done.problem, done.solution.q))).fall
     except FAILURES:
         return -np.inf

@@ -17,7 +17,7 @@ from motorid.diagnosis.score_test import uses_angle
 from motorid.errors import FAILURES
 from motorid.estimation.continuation import by_continuation
 from motorid.estimation.first_guess import first_guess
-from motorid.estimation.least_squares import Estimate, least_squares
+from motorid.estimation.least_squares import Estimate
 from motorid.estimation.restarts import collapsed_again, restored
 from motorid.estimation.result import Fit
 from motorid.estimation.start_values import ABOVE, sizes_like
@@ -29,8 +29,8 @@ from motorid.problem.problem import Problem
 from motorid.problem.runs import natural_sizes
 from motorid.problem.simulate import misfit_over_noise
 
-RACE = LevenbergMarquardt(max_iterations=6, ftol=1e-3, xtol=1e-4)
-POLISH = LevenbergMarquardt(max_iterations=60, ftol=1e-7, xtol=1e-7)
+RACE = LevenbergMarquardt(max_iterations=6, ftol=1e-3, xtol=1e-4, looks=0)
+POLISH = LevenbergMarquardt(max_iterations=60, ftol=1e-7, xtol=1e-7, looks=0)
 GOING_ON = 4  # times, where the last descent ends at its limit
 LOST = 0.2  # NRMSE of a channel
 ROOM = 10.0  # factor beyond its grid that a shape parameter may run to
@@ -109,12 +109,12 @@ def _released(measured: Problem) -> Estimate:
     """
     own = measured.for_model(replace(measured.model, angle_input=False, _systems={}))
     if not all("theta" in run.outputs for run in measured.experiments):
-        return least_squares(own, QUICK)
-    along = least_squares(measured, QUICK)
+        return by_continuation(own, QUICK, wide=False)
+    along = by_continuation(measured, QUICK, wide=False)
     values = along.problem.values(along.solution.q)
     own = restarted(along.problem, along.solution.q).for_model(own.model.start_at(values))
     try:
-        free = least_squares(own, QUICK)
+        free = by_continuation(own, QUICK, wide=False)
     except FAILURES:
         return along
     return free if free.solution.history[-1] < WORSE * along.solution.history[-1] else along
@@ -146,7 +146,7 @@ def _started(fit: Fit, model: Model, start: Mapping[str, float], angular: bool) 
 def _race(problem: Problem) -> Estimate | None:
     """Go a few steps; None where that fails or needs more sub-steps than the samples are worth."""
     try:
-        done = least_squares(problem, RACE)
+        done = by_continuation(problem, RACE, wide=False)
     except FAILURES:
         return None
     return done if worth_its_steps(done.problem) else None
@@ -206,11 +206,11 @@ def _converged(problem: Problem) -> Estimate:
     ------
     FitError, SimulationError
     """
-    done = least_squares(problem, POLISH)
+    done = by_continuation(problem, POLISH, wide=False)
     for _ in range(GOING_ON):
         if done.solution.status != "limit":
             break
-        again = least_squares(restarted(done.problem, done.solution.q), POLISH)
+        again = by_continuation(restarted(done.problem, done.solution.q), POLISH, wide=False)
         done = replace(again, history=done.history + again.history)
     return done
 

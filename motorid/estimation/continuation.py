@@ -40,7 +40,7 @@ def by_continuation(problem: Problem, effort: LevenbergMarquardt, callback: Call
         Of the last width; `looks` counts the restarts at the first.
     callback : callable, optional
     wide : bool
-        Begin with a wide sgn; otherwise with the width that the problem has.
+        Begin with a wide sgn; otherwise with the width that the problem has, from where it may still become narrower.
 
     Raises
     ------

@@ -15,6 +15,7 @@ from motorid.diagnosis import score_test as ranking
 from motorid.diagnosis.admissibility import objections
 from motorid.diagnosis.verdict import measured_angle_remark
 from motorid.effects import LIBRARY
+from motorid.estimation.continuation import by_continuation
 from motorid.estimation.restarts import MATTERS, collapsed_again, restored
 from motorid.problem.problem import Problem
 from motorid.problem.simulate import simulate
@@ -34,7 +35,7 @@ def test_a_refit_goes_on_beyond_its_limit_of_iterations(monkeypatch):
     run = _run(mi.dc_motor(**TRUE))
     monkeypatch.setattr(trial, "POLISH", replace(trial.POLISH, max_iterations=2))
     far = Problem(mi.dc_motor(R=3.0, L=5e-3, K=0.08, b=1e-4, J=8e-5), (run,))
-    once = trial.least_squares(far, trial.POLISH)
+    once = by_continuation(far, trial.POLISH, wide=False)
     on = trial._converged(far)
     assert once.solution.status == "limit"
     assert on.history[-1] < 0.5 * once.history[-1]
