@@ -19,22 +19,11 @@ from motorid.acquire.session import Progress, Recording, Session, Setup
 from motorid.errors import UsageError
 
 
-def record(
-    port: str | Link,
-    out: str | Path,
-    *,
-    baud: int = 115_200,
-    excite: str | Program | None = None,
-    duration: float | None = None,
-    limit_voltage: float = math.inf,
-    limit_current: float = math.inf,
-    calibration: str | Path | Mapping[str, Any] | None = None,
-    resume: bool = False,
-    force: bool = False,
-    timeout: float = 2.0,
-    progress: Callable[[Progress], None] | None = None,
-    meta: Mapping[str, object] | None = None,
-) -> Recording:
+def record(port: str | Link, out: str | Path, *, baud: int = 115_200, excite: str | Program | None = None,
+           duration: float | None = None, limit_voltage: float = math.inf, limit_current: float = math.inf,
+           calibration: str | Path | Mapping[str, Any] | None = None, resume: bool = False, force: bool = False,
+           timeout: float = 2.0, progress: Callable[[Progress], None] | None = None,
+           meta: Mapping[str, object] | None = None) -> Recording:
     """Record one run from a bench that speaks `motorid.acquire.protocol`, into a CSV that `read_runs` opens.
 
     Every valid line is in the file within a tenth of a second and on the disk within one; lost samples are
@@ -156,13 +145,11 @@ def _commanded(device: Header, header: Header, todo: Program) -> Commanded:
 
 def _head(port: str | Link, header: Header, whole: Program, limits: tuple[float, float],
           entries: Mapping[str, Any]) -> dict[str, object]:
-    head: dict[str, object] = {
-        "motorid record": f"protocol {VERSION}", "device": header.name,
-        "port": port if isinstance(port, str) else type(port).__name__,
-        "started": datetime.now().astimezone().isoformat(timespec="milliseconds"),
-        "rate_Hz": f"{header.rate:g}", "limits": f"{limits[0]:g} V, {limits[1]:g} A",
-        "excitation": whole.words,
-    }
+    head: dict[str, object] = {"motorid record": f"protocol {VERSION}", "device": header.name,
+                               "port": port if isinstance(port, str) else type(port).__name__,
+                               "started": datetime.now().astimezone().isoformat(timespec="milliseconds"),
+                               "rate_Hz": f"{header.rate:g}", "limits": f"{limits[0]:g} V, {limits[1]:g} A",
+                               "excitation": whole.words}
     for channel in header.channels:
         head[f"channel {channel.name}"] = (f"{channel.scale:.9g} {channel.unit} per count, zero at "
                                            f"{channel.offset:.9g}, kind {channel.kind}")
@@ -193,8 +180,7 @@ class RecordingPlan:
         ran = self.tail.time - float(meta.get("part begins", 0))
         left = Program(whole.segments[before:], whole.words).after(ran)
         if meta.get("ended") == "done" or (whole.segments and not left.segments):
-            raise UsageError("this record is complete; there is nothing to resume. Choose another name for "
-                             "--out.")
+            raise UsageError("this record is complete; there is nothing to resume. Choose another name for --out.")
         return left, len(whole.segments) - len(left.segments)
 
     def begin(self, file: RecordFile, done: int) -> None:

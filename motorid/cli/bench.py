@@ -20,8 +20,7 @@ from motorid.acquire.session import Progress
 from motorid.acquire.virtual import VirtualDevice, hide
 from motorid.cli.console import FAILED
 
-Port = Annotated[str, typer.Option(
-    help="Serial port of the bench: /dev/ttyACM0, COM3, socket://127.0.0.1:7000.")]
+Port = Annotated[str, typer.Option(help="Serial port of the bench: /dev/ttyACM0, COM3, socket://127.0.0.1:7000.")]
 Out = Annotated[Path, typer.Option(help="The CSV to write.")]
 Baud = Annotated[int, typer.Option(min=300, help="Bits per second; a board on USB does not care.")]
 Excite = Annotated[str | None, typer.Option(
@@ -57,20 +56,9 @@ Once = Annotated[bool, typer.Option("--once", help="End after the first run.")]
 Reveal = Annotated[bool, typer.Option("--reveal", help="At the end, tell what was hidden.")]
 
 
-def record_command(
-    port: Port,
-    out: Out,
-    baud: Baud = 115_200,
-    excite: Excite = None,
-    duration: Duration = None,
-    limit_voltage: Volts = None,
-    limit_current: Amperes = None,
-    calibration: CalibrationFile = None,
-    resume: Resume = False,
-    force: Force = False,
-    timeout: Timeout = 2.0,
-    quiet: Quiet = False,
-) -> None:
+def record_command(port: Port, out: Out, baud: Baud = 115_200, excite: Excite = None, duration: Duration = None,
+                   limit_voltage: Volts = None, limit_current: Amperes = None, calibration: CalibrationFile = None,
+                   resume: Resume = False, force: Force = False, timeout: Timeout = 2.0, quiet: Quiet = False) -> None:
     """Record a run from a bench on a serial port. KEEP CLEAR OF THE SHAFT: the motor will move.
 
     Ctrl-C stops the motor and keeps the data. Limits are checked here and enforced by the device.
@@ -130,24 +118,11 @@ def _line(p: Progress) -> str:
     return f"{p.elapsed:7.2f}{end} s  {p.rate:.0f} samples/s  {p.lost} lost  {values}"
 
 
-def bench_command(
-    effect: HiddenEffect = "random",
-    motor: MotorName = "lab",
-    seed: Seed = None,
-    rate: Rate = 1000.0,
-    channels: SentChannels = "v,i,omega,theta",
-    speed: Speed = 1.0,
-    drop: Probability = 0.0,
-    garbage: Probability = 0.0,
-    cut: Probability = 0.0,
-    flip: Probability = 0.0,
-    unplug_after: UnplugAfter = None,
-    plug_after: PlugAfter = None,
-    link: LinkName = None,
-    socket: SocketPort = None,
-    once: Once = False,
-    reveal: Reveal = False,
-) -> None:
+def bench_command(effect: HiddenEffect = "random", motor: MotorName = "lab", seed: Seed = None, rate: Rate = 1000.0,
+                  channels: SentChannels = "v,i,omega,theta", speed: Speed = 1.0, drop: Probability = 0.0,
+                  garbage: Probability = 0.0, cut: Probability = 0.0, flip: Probability = 0.0,
+                  unplug_after: UnplugAfter = None, plug_after: PlugAfter = None, link: LinkName = None,
+                  socket: SocketPort = None, once: Once = False, reveal: Reveal = False) -> None:
     """Serve a virtual motor with a hidden effect, for `motorid record` to be tried on without hardware.
 
     --drop, --garbage, --cut and --flip are probabilities, per line, of faults on the wire.

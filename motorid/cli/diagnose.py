@@ -46,8 +46,7 @@ def diagnose_command(
     before = fit_affordably(records, options.fit)
     own = list(own_effects(options.effects_from).values()) if options.effects_from else []
     with progress("Looking for what is missing") as advance:
-        found = diagnose(before, held_out or None, also=own, max_effects=max_effects,
-                         progress=lambda _: advance(1))
+        found = diagnose(before, held_out or None, also=own, max_effects=max_effects, progress=lambda _: advance(1))
     if json:
         write_json(found.to_dict() | {"notes": notes}, json)
     if json != "-":
@@ -70,8 +69,7 @@ def _show_diagnosis(found: Diagnosis) -> None:
 
 
 def demo_command(
-    out: Annotated[Path, typer.Option(
-        metavar="DIR", help="Where figures and report go.")] = Path("motorid-demo"),
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Where figures and report go.")] = Path("motorid-demo"),
     json: Json = None,
 ) -> None:
     """Show the story on shipped records: fit, see that it fails, add what is missing, see the error fall.

@@ -62,9 +62,7 @@ def fit_command(
         raise typer.Exit(FAILED)
 
 
-def _show_fit(
-    found: Fit, records: list[Experiment], notes: list[str], judged: Evaluation | None = None,
-) -> None:
+def _show_fit(found: Fit, records: list[Experiment], notes: list[str], judged: Evaluation | None = None) -> None:
     """Print a fit: remarks, parameters, errors, what follows from them, and how it ended."""
     show(f"{describe(found.problem.model)}, {_amount(records)}\n")
     say_notes(notes, "About the records")
@@ -106,8 +104,7 @@ def fit_many_command(
     model = options.model(_first_readable(options, motors.values()))
     if options.preprocesses:
         motors = {name: _read_or_names(options, files) for name, files in motors.items()}
-    reading: dict[str, Any] = {k: parse_pairs(v, f"--{k}") for k in ("columns", "units")
-                               if (v := getattr(options, k))}
+    reading: dict[str, Any] = {k: parse_pairs(v, f"--{k}") for k in ("columns", "units") if (v := getattr(options, k))}
     reading |= {"hold": options.hold} if options.hold else {}
     given = {"journal": journal, "reading": reading, **options.keywords()}
     if jobs == 1:
@@ -148,8 +145,7 @@ def simulate_command(
     fit_json: SavedModel,
     runs: Runs,
     options: ReadingOptions,
-    out: Annotated[Path | None, typer.Option(
-        metavar="DIR", help="Write the simulated channels as CSV.")] = None,
+    out: Annotated[Path | None, typer.Option(metavar="DIR", help="Write the simulated channels as CSV.")] = None,
     engine: Annotated[str, typer.Option(metavar="rosenbrock|cvodes|idas")] = "rosenbrock",
     effects_from: EffectsFrom = None,
     json: Json = None,

@@ -15,9 +15,7 @@ from motorid.uncertainty.multistart import Multistart, multistart
 
 
 @with_options(FitOptions)
-def identifiability_command(
-    runs: Runs, options: FitOptions, json: Json = None, report: Report = None,
-) -> None:
+def identifiability_command(runs: Runs, options: FitOptions, json: Json = None, report: Report = None) -> None:
     """Say which parameters, and which combinations of them, the records determine.
 
     Example: motorid identifiability run*.csv --effects coulomb
@@ -29,8 +27,7 @@ def identifiability_command(
 @with_options(FitOptions)
 def robustness_command(
     runs: Runs, options: FitOptions,
-    starts: Annotated[int, typer.Option(
-        min=1, metavar="N", rich_help_panel=OUT, help="How many fits.")] = 100,
+    starts: Annotated[int, typer.Option(min=1, metavar="N", rich_help_panel=OUT, help="How many fits.")] = 100,
     spread: Annotated[float, typer.Option(
         min=1.0, rich_help_panel=OUT, help="Every start is off by up to this factor.")] = 10.0,
     seed: Annotated[int, typer.Option(min=0, rich_help_panel=OUT, help="Of the drawn starts.")] = 0,

@@ -59,10 +59,8 @@ class Card:
     def to_html(self) -> str:
         """Return HTML that stands by itself, readable on light and dark pages."""
         flags = " ".join(f.to_html() for f in self.flags)
-        parts = [
-            f'<div class="motorid">\n<style>{_STYLE}</style>',
-            f"<p><strong>{escape(self.title)}</strong> {flags}</p>",
-        ]
+        parts = [f'<div class="motorid">\n<style>{_STYLE}</style>',
+                 f"<p><strong>{escape(self.title)}</strong> {flags}</p>"]
         parts += [f"<p>{escape(t)}</p>" for t in self.text if t]
         parts += [t.to_html() for t in self.tables]
         if self.after:

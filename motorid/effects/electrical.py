@@ -37,19 +37,13 @@ def magnetic_saturation(
 
 
 @effect(balance="voltage")
-def driver_dead_band(
-    m: Equations,
-    V_d=P(0.2, "V", null=0.0, lower=0.0, doc="half-width of the dead band"),
-):
+def driver_dead_band(m: Equations, V_d=P(0.2, "V", null=0.0, lower=0.0, doc="half-width of the dead band")):
     """Dead band of the driver: within ±V_d nothing comes, larger commands lose V_d. Tao & Kokotović, 1996."""
     m.replace("v", m.command - ca.fmax(-V_d, ca.fmin(V_d, m.command)))
 
 
 @effect(balance="voltage")
-def voltage_offset(
-    m: Equations,
-    V_0=P(0.05, "V", null=0.0, doc="added to the applied voltage"),
-):
+def voltage_offset(m: Equations, V_0=P(0.05, "V", null=0.0, doc="added to the applied voltage")):
     """Constant error of the voltage as recorded. Isermann, Identification of Dynamic Systems, 2011."""
     m.voltage += V_0
 

@@ -38,10 +38,7 @@ def stribeck(
 
 
 @effect(balance="torque")
-def quadratic_drag(
-    m: Equations,
-    c_2=P(1e-7, "N·m·s²/rad²", null=0.0, lower=0.0, doc="drag coefficient"),
-):
+def quadratic_drag(m: Equations, c_2=P(1e-7, "N·m·s²/rad²", null=0.0, lower=0.0, doc="drag coefficient")):
     """Fan or windage drag, c_2·ω·abs(ω). White, Fluid Mechanics, 2011."""
     m.torque -= c_2 * m.omega * ca.fabs(m.omega)
 
@@ -85,10 +82,7 @@ def torque_ripple(
 
 
 @effect(balance="torque")
-def load_friction(
-    m: Equations,
-    mu=P(0.1, "", null=0.0, lower=0.0, upper=1.0, doc="share of the motor torque lost"),
-):
+def load_friction(m: Equations, mu=P(0.1, "", null=0.0, lower=0.0, upper=1.0, doc="share of the motor torque lost")):
     """Friction growing with the torque carried, μ·abs(K·i)·sgn ω. Duclusaud et al., BAM, 2025."""
     carried = m.K_t * m.i if "i" in m.states else m.g * m.v
     m.torque -= mu * ca.fabs(carried) * m.sign(m.omega)

@@ -53,10 +53,7 @@ def current_offset(m: Equations, i_0=P(0.02, "A", null=0.0, doc="added by the cu
 
 
 @effect(balance="sensor")
-def speed_gain(
-    m: Equations,
-    k_w=P(0.01, "", null=0.0, lower=-0.9, upper=9.0, doc="relative error of the speed scale"),
-):
+def speed_gain(m: Equations, k_w=P(0.01, "", null=0.0, lower=-0.9, upper=9.0, doc="relative error of the speed scale")):
     """Wrong scale of the speed sensor. Isermann, Identification of Dynamic Systems, 2011.
 
     Needs an angle, or held motor constants, to be told from K and J.

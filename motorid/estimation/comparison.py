@@ -38,11 +38,9 @@ class Comparison(Shown):
 
     def card(self) -> Card:
         """Return errors and parameters side by side."""
-        return Card(
-            f"Comparison of {counted(len(self.fits), 'fit')}",
-            tables=(comparison_table([(f.model.title, f) for f in self.fits], self.validation_nrmse),),
-            after=(("mi.plot_parameters(*comparison.fits)", "how the parameters moved"),),
-        )
+        return Card(f"Comparison of {counted(len(self.fits), 'fit')}",
+                    tables=(comparison_table([(f.model.title, f) for f in self.fits], self.validation_nrmse),),
+                    after=(("mi.plot_parameters(*comparison.fits)", "how the parameters moved"),))
 
 
 def compare(fits: Sequence[Fit], validate: Sequence[Experiment] | Experiment | None = None) -> Comparison:

@@ -97,8 +97,7 @@ def _windowed(t: Array, columns: Sequence[Array], target: Array, windows: int = 
     return np.column_stack([c[w:] - c[:-w] for c in columns]), target[w:] - target[:-w]
 
 
-def _solve(rows: list[tuple[Array, Array]], names: Sequence[str | Load],
-           held: Mapping[Any, float]) -> dict[Any, float]:
+def _solve(rows: list[tuple[Array, Array]], names: Sequence[str | Load], held: Mapping[Any, float]) -> dict[Any, float]:
     """Non-negative least squares with some coefficients known; zeros of the motor become small positive numbers."""
     from scipy.optimize import lsq_linear, nnls  # slow to import, and not needed before
 
@@ -150,8 +149,7 @@ def _without_current(signals: list[dict], held: Mapping[str, float], loads: _Loa
                      back_emf: float) -> dict[str, float]:
     """``∫v = (RJ/K) Δω + (K + Rb/K) ∫ω + (R/K) ∫load``: two numbers and the loads; the rest is assumed."""
     unit = {"R": 1.0, "L": 1.0, "K": 1.0, "b": 0.0, "J": 1.0}
-    rows = [_windowed(s["t"], [s["omega"], integral(s["t"], s["omega"]),
-                               *loads.integrals({**s, "i": s["v"]}, unit)],
+    rows = [_windowed(s["t"], [s["omega"], integral(s["t"], s["omega"]), *loads.integrals({**s, "i": s["v"]}, unit)],
                       integral(s["t"], s["v"], "held" in s)) for s in signals]
     two = _solve(rows, ["slope", "gain", *loads.loads], {})
     r = held.get("R", 1.0)

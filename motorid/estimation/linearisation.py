@@ -107,11 +107,8 @@ def linear_steps(system: System, grid, x: Array, p: Array, d: Array) -> tuple[Ar
     x_next, a, b = _mapped(system, n)[0](
         x[:-1].T, grid.u0.T, grid.u1.T, grid.dt[None, :], np.tile(p[:, None], (1, n)), d.T
     )
-    return (
-        np.asarray(x_next).T,
-        np.asarray(a).reshape(nx, n, nx).transpose(1, 0, 2),
-        np.asarray(b).reshape(nx, n, 2).transpose(1, 0, 2),
-    )
+    return (np.asarray(x_next).T, np.asarray(a).reshape(nx, n, nx).transpose(1, 0, 2),
+            np.asarray(b).reshape(nx, n, 2).transpose(1, 0, 2))
 
 
 @lru_cache(maxsize=64)

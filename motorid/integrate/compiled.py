@@ -138,8 +138,7 @@ def compiler() -> tuple[str, str] | None:
         path = shutil.which(name)
         if path:
             try:
-                done = subprocess.run([path, "--version"], capture_output=True, text=True, timeout=20,
-                                      check=True)
+                done = subprocess.run([path, "--version"], capture_output=True, text=True, timeout=20, check=True)
             except (OSError, subprocess.SubprocessError):
                 continue
             return path, (done.stdout.splitlines() or [""])[0]

@@ -48,13 +48,11 @@ def step_functions(system: System) -> StepFunctions:
     full = _dense("motorid_full", args, [x_next, error, slopes[:, :nx], slopes[:, nx:]], names,
                   ["x_next", "error", "A", "B"])
     y = system.out(x, u0, p)
-    out = _dense("motorid_out", [x, u0, p], [y, ca.jacobian(y, x), ca.jacobian(y, p)], ["x", "u", "p"],
-                 ["y", "C", "D"])
+    out = _dense("motorid_out", [x, u0, p], [y, ca.jacobian(y, x), ca.jacobian(y, p)], ["x", "u", "p"], ["y", "C", "D"])
     return StepFunctions(light, full, out)
 
 
-def _dense(name: str, args: list[ca.SX], results: list[ca.SX], names: list[str],
-           shown: list[str]) -> ca.Function:
+def _dense(name: str, args: list[ca.SX], results: list[ca.SX], names: list[str], shown: list[str]) -> ca.Function:
     return ca.Function(name, args, ca.cse([ca.densify(r) for r in results]), names, shown)
 
 

@@ -153,8 +153,7 @@ class Stepper:
             mark = cc.mark_of(self.key)
             if mark is None:
                 self._refused = True
-                cc.say_once("motorid: no C compiler found; using CasADi's virtual machine, same results, "
-                            "slower.")
+                cc.say_once("motorid: no C compiler found; using CasADi's virtual machine, same results, slower.")
                 return None
             path = cc.find(mark)
             if path is None and (compiled or self._spent > PATIENCE):
@@ -171,8 +170,7 @@ class Stepper:
         y, x = np.empty((n, self.ny)), np.empty((n, self.nx))
         dy, dx = (np.empty((n, self.ny, nq)), np.empty((n, self.nx, nq))) if nq else (None, None)
         error = np.empty((n - 1, self.nx)) if local_error else None
-        bad = library(n, *grid.addresses, address(x0), address(p), nq,
-                      *map(address, (dx0, dp, y, dy, x, dx, error)))
+        bad = library(n, *grid.addresses, address(x0), address(p), nq, *map(address, (dx0, dp, y, dy, x, dx, error)))
         return Trajectory(y, dy, x, dx, error), int(bad)
 
 
@@ -261,8 +259,7 @@ class Machine:
         y, dy = self.observe(grid, x[ends], s[ends] if nq else None, p, dp)
         return Trajectory(y, dy, x[ends], s[ends] if nq else None, error)
 
-    def observe(self, grid: Grid, x: Array, dx: Array | None, p: Array,
-                dp: Array | None) -> tuple[Array, Array | None]:
+    def observe(self, grid: Grid, x: Array, dx: Array | None, p: Array, dp: Array | None) -> tuple[Array, Array | None]:
         """Return what the sensors show along a state trajectory, y (N, ny) and dy/dq (N, ny, nq)."""
         n = len(x)
         full = -(-n // CHUNK) * CHUNK

@@ -74,8 +74,7 @@ class Parameter:
                 f"To leave it out of the model, set it to zero and fix it: model.fix({self.name}=0)."
             )
         if self.lower > self.upper:
-            raise ModelError(f"parameter '{self.name}': lower limit {self.lower:g} above upper "
-                             f"{self.upper:g}.")
+            raise ModelError(f"parameter '{self.name}': lower limit {self.lower:g} above upper {self.upper:g}.")
         if not self.lower <= self.value <= self.upper:
             raise ModelError(
                 f"parameter '{self.name}' = {self.value:g} {self.unit} lies outside its limits "
@@ -94,21 +93,9 @@ class Declared:
         return Parameter(name, **self.fields)
 
 
-def P(
-    value: float,
-    unit: str = "",
-    null: float | None = None,
-    *,
-    lower: float = -np.inf,
-    upper: float = np.inf,
-    positive: bool = False,
-    vary: bool = True,
-    grid: Iterable[float] = (),
-    periodic: bool = False,
-    order: bool = False,
-    at_least: str = "",
-    doc: str = "",
-) -> Any:
+def P(value: float, unit: str = "", null: float | None = None, *, lower: float = -np.inf, upper: float = np.inf,
+      positive: bool = False, vary: bool = True, grid: Iterable[float] = (), periodic: bool = False,
+      order: bool = False, at_least: str = "", doc: str = "") -> Any:
     """Declare a parameter of an effect as a default argument: ``tau_c=P(2e-3, "N·m", null=0)``.
 
     The name comes from the argument; what the others mean is told at `Parameter`.
@@ -166,13 +153,8 @@ class Effect(Shown):
         """Return what the effect acts on, where it comes from, and its parameters."""
         rows = [[p.name, quantity(p.value, p.unit), "–" if p.null is None else quantity(p.null, p.unit), p.doc]
                 for p in self.parameters]
-        return Card(
-            f"Effect: {self.name}",
-            (Flag(self.balance),),
-            (self.doc,),
-            (Table(["parameter", "start", "vanishes at", "meaning"], rows),),
-            (("model + effect", "use it"),),
-        )
+        return Card(f"Effect: {self.name}", (Flag(self.balance),), (self.doc,),
+                    (Table(["parameter", "start", "vanishes at", "meaning"], rows),), (("model + effect", "use it"),))
 
     def __repr__(self) -> str:
         return f"<effect {self.name} ({self.balance}): {', '.join(p.name for p in self.parameters)}>"
@@ -183,8 +165,7 @@ class Effect(Shown):
         qualname = getattr(self.law, "__qualname__", "")
         importable = module not in (None, "__main__") and "<locals>" not in qualname
         place = (module, qualname) if importable else None
-        return _restore_effect, (place, self.name, self.parameters, self.balance, self.doc,
-                                 self.includes)
+        return _restore_effect, (place, self.name, self.parameters, self.balance, self.doc, self.includes)
 
 
 def _restore_effect(place: tuple[str, str] | None, name: str, parameters: tuple[Parameter, ...], balance: str,
@@ -230,8 +211,7 @@ def effect(*, balance: str, name: str | None = None,
         pars = []
         for arg in list(inspect.signature(law).parameters.values())[1:]:
             if not isinstance(arg.default, Declared):
-                raise ModelError(f"effect '{title}': argument '{arg.name}' needs a default "
-                                 "P(value, unit, null=…).")
+                raise ModelError(f"effect '{title}': argument '{arg.name}' needs a default P(value, unit, null=…).")
             pars.append(arg.default.named(arg.name))
         return Effect(title, law, tuple(pars), balance, inspect.cleandoc(law.__doc__ or ""), includes)
 

@@ -274,8 +274,7 @@ def build_system(m: Equations, parameters: tuple[str, ...], outputs: tuple[str, 
     shown = [m.measured(c) for c in outputs]
     for name in m.states:
         if name not in ("i", "omega") and name not in m.rates:
-            raise ModelError(f"the state '{name}' has no rate: call m.rate({name}, …) in the effect that "
-                             "adds it.")
+            raise ModelError(f"the state '{name}' has no rate: call m.rate({name}, …) in the effect that adds it.")
     d = ca.SX.sym("d", 2)
     rates: dict[str, Any] = dict(m.rates)
     rates["omega"] = (torque + d[1]) / m.J
@@ -283,8 +282,7 @@ def build_system(m: Equations, parameters: tuple[str, ...], outputs: tuple[str, 
         rates["i"] = (voltage + d[0]) / m.L if "i" in stored else voltage + d[0]
     names = tuple(m.states)
     initial = {"i": m.start["i"], "omega": m.start["omega"], **m.initial}
-    filled = m.fill([*[ca.SX(rates[n]) for n in names], *shown, *[ca.SX(initial[n]) for n in names],
-                     voltage, torque])
+    filled = m.fill([*[ca.SX(rates[n]) for n in names], *shown, *[ca.SX(initial[n]) for n in names], voltage, torque])
     n = len(names)
     f, y = ca.vertcat(*filled[:n]), ca.vertcat(*filled[n:n + len(shown)])
     x0, balances = ca.vertcat(*filled[n + len(shown):-2]), ca.vertcat(*filled[-2:])

@@ -182,8 +182,7 @@ class Model(Shown):
         for c in set(outputs) - set(chosen):
             raise ModelError(one_of(c, CHANNELS, "channel"))
         if "i" in chosen and "i" not in STATES[self.base]:
-            raise ModelError(f"the base '{self.base}' has no current: leave the channel 'i' out, or use "
-                             "dc_motor().")
+            raise ModelError(f"the base '{self.base}' has no current: leave the channel 'i' out, or use dc_motor().")
         key = (chosen, self.stored)
         if key not in self._systems:
             self._systems[key] = _shared_system(self, chosen)
@@ -210,11 +209,8 @@ class Model(Shown):
         owner = {p.name: e.name for e in self.effects for p in e.parameters}
         rows = [[p.name, quantity(p.value, p.unit), "estimated" if p.vary else "held", owner.get(p.name, "base"), p.doc]
                 for p in self.parameters.values()]
-        return Card(
-            f"Model: {self.title}",
-            tables=(Table(["parameter", "value", "in a fit", "of", "meaning"], rows),),
-            after=(("mi.fit(model, runs)", "fit it"), ("model + mi.effects.coulomb", "add an effect")),
-        )
+        return Card(f"Model: {self.title}", tables=(Table(["parameter", "value", "in a fit", "of", "meaning"], rows),),
+                    after=(("mi.fit(model, runs)", "fit it"), ("model + mi.effects.coulomb", "add an effect")))
 
     def __repr__(self) -> str:
         return f"<model {' + '.join([self.base, *self.effect_names])}: {', '.join(self.free_names)}>"

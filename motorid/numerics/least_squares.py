@@ -107,15 +107,10 @@ PROMISED = 1e-3  # share of the cost that the undamped step may promise at an en
 SLACK = 1.0  # λ above which a small gain does not mean the end: the step was short, not the way
 
 
-def levenberg_marquardt(
-    residual: Callable[[Array], Array],
-    both: Callable[[Array], tuple[Array, Array]],
-    q0: Array,
-    bounds: tuple[Array, Array] | None = None,
-    options: LevenbergMarquardt | None = None,
-    callback: Callable[[int, float, Array], object] | None = None,
-    log: np.ndarray | None = None,
-) -> Solution:
+def levenberg_marquardt(residual: Callable[[Array], Array], both: Callable[[Array], tuple[Array, Array]], q0: Array,
+                        bounds: tuple[Array, Array] | None = None, options: LevenbergMarquardt | None = None,
+                        callback: Callable[[int, float, Array], object] | None = None,
+                        log: np.ndarray | None = None) -> Solution:
     """Minimise ½‖r(q)‖² from `q0`.
 
     Parameters

@@ -86,14 +86,8 @@ def _balance(row: np.ndarray, missing: Missing, balance: str, run: int | None) -
         ax.set_axis_off()
 
 
-def _binned(
-    ax: Axes,
-    b: Binned,
-    signals: Sequence[Mapping[str, Array]],
-    values: Sequence[Array],
-    factor: float,
-    colour: str,
-) -> None:
+def _binned(ax: Axes, b: Binned, signals: Sequence[Mapping[str, Array]], values: Sequence[Array], factor: float,
+            colour: str) -> None:
     pairs = [(np.asarray(s[b.against]), v) for s, v in zip(signals, values, strict=True) if b.against in s]
     if pairs:
         x, y = np.concatenate([p[0] for p in pairs]), np.concatenate([p[1] for p in pairs]) * factor
@@ -108,11 +102,7 @@ def _binned(
         ax.plot(x, b.mean[part] * factor, "-" if len(part) > 1 else "o", ms=3, color=colour, lw=1.5)
     ax.axhline(0, color=MUTED, lw=0.6)
     label = axis_label(b.against)
-    tidy(
-        ax,
-        x=f"{label.split(' (')[0]} ({b.unit})" if b.unit else label,
-        title=f"{100 * b.explained:.0f} % explained",
-    )
+    tidy(ax, x=f"{label.split(' (')[0]} ({b.unit})" if b.unit else label, title=f"{100 * b.explained:.0f} % explained")
 
 
 @styled
@@ -141,16 +131,8 @@ def plot_ranking(result: Diagnosis | Sequence[Candidate], ax: Axes | None = None
         ax.barh(k, 100 * c.predicted_drop, height=0.62, fill=False, edgecolor=INK, lw=0.9)
         if c.held_out_gain is not None:
             clipped = c.held_out_gain < LOWEST_GAIN
-            ax.plot(
-                100 * max(c.held_out_gain, LOWEST_GAIN),
-                k,
-                "<" if clipped else "D",
-                ms=6,
-                mew=0.7,
-                color=PALETTE["orange"],
-                mec="white",
-                zorder=3,
-            )
+            ax.plot(100 * max(c.held_out_gain, LOWEST_GAIN), k, "<" if clipped else "D", ms=6, mew=0.7,
+                    color=PALETTE["orange"], mec="white", zorder=3)
     ax.set_yticks(range(len(chosen)), [c.effect for c in chosen])
     ax.set_ylim(len(chosen) - 0.4, -0.6)
     lowest = min([0.0, *(100 * max(c.held_out_gain or 0.0, LOWEST_GAIN) for c in chosen)])
@@ -208,23 +190,9 @@ def plot_ladder(result: Ladder | Diagnosis, ax: Axes | None = None) -> Axes:
 
 def _falling(ax: Axes, x: Array, errors: Sequence[float], channel: str, colour: str, *, held_out: bool) -> None:
     name = axis_label(channel).split(" (")[0]
-    ax.plot(
-        x,
-        errors,
-        "s--" if held_out else "o-",
-        color=colour,
-        mfc="white" if held_out else colour,
-        ms=5.5,
-        label=f"{name}, {'held out' if held_out else 'fitted'}",
-    )
+    ax.plot(x, errors, "s--" if held_out else "o-", color=colour, mfc="white" if held_out else colour, ms=5.5,
+            label=f"{name}, {'held out' if held_out else 'fitted'}")
     ends = {0: "right", len(x) - 1: "left"} if not held_out else {}
     for k, side in ends.items():
-        ax.annotate(
-            number(errors[k], 2),
-            (float(x[k]), errors[k]),
-            (-8 if side == "right" else 8, 0),
-            va="center",
-            ha=side,
-            textcoords="offset points",
-            fontsize=8,
-        )
+        ax.annotate(number(errors[k], 2), (float(x[k]), errors[k]), (-8 if side == "right" else 8, 0), va="center",
+                    ha=side, textcoords="offset points", fontsize=8)

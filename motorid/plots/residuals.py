@@ -81,12 +81,8 @@ def _channel(axes: np.ndarray, fit: Fit, channel: str, against: Sequence[str]) -
     unit = run.units[channel]
     sigma = float(np.mean([r.sigma[channel] for r in fit.problem.runs if channel in r.sigma]))
     _over_time(axes[0], sims, channel, sigma)
-    tidy(
-        axes[0],
-        x="time, runs one after the other (s)",
-        y=f"residual ({unit})",
-        title=f"Residual of the {axis_label(channel, run)}",
-    )
+    tidy(axes[0], x="time, runs one after the other (s)", y=f"residual ({unit})",
+         title=f"Residual of the {axis_label(channel, run)}")
     every = np.concatenate([s.residual(channel) for s in sims])
     _histogram(axes[1], finite(every, f"the residual of {channel}"), sigma)
     _autocorrelation(axes[2], [s.residual(channel) for s in sims])
@@ -107,17 +103,9 @@ def _over_time(ax: Axes, sims: Sequence[Simulation], channel: str, sigma: float)
         t = s.experiment.t - s.experiment.t[0]
         line(ax, t + shift, s.residual(channel), color=RESIDUAL, lw=0.8)
         if len(sims) <= 6:
-            ax.annotate(
-                s.experiment.name,
-                (shift, 1),
-                (3, -2),
-                xycoords=("data", "axes fraction"),
-                textcoords="offset points",
-                va="top",
-                fontsize=7,
-                color=MUTED,
-                bbox={"facecolor": PAPER, "alpha": 0.8, "lw": 0, "pad": 1},
-            )
+            ax.annotate(s.experiment.name, (shift, 1), (3, -2), xycoords=("data", "axes fraction"),
+                        textcoords="offset points", va="top", fontsize=7, color=MUTED,
+                        bbox={"facecolor": PAPER, "alpha": 0.8, "lw": 0, "pad": 1})
         shift += float(t[-1])
         if k + 1 < len(sims):
             ax.axvline(shift, color=MUTED, lw=0.7)

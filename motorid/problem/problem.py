@@ -104,8 +104,7 @@ class Problem:
         if self._runs is not None:
             return self._runs
         noise = noise_of(self.experiments, self.outputs)
-        return tuple(prepare_run(r, self.outputs, noise, self.system.inputs, self.initial)
-                     for r in self.experiments)
+        return tuple(prepare_run(r, self.outputs, noise, self.system.inputs, self.initial) for r in self.experiments)
 
     @cached_property
     def unknowns(self) -> Unknowns:

@@ -71,8 +71,7 @@ class Measured(NamedTuple):
         return full.reshape(self.y.shape)
 
 
-def prior_residual(priors: Mapping[str, tuple[float, float]], unknowns: Unknowns,
-                   at: Point) -> tuple[Array, Array]:
+def prior_residual(priors: Mapping[str, tuple[float, float]], unknowns: Unknowns, at: Point) -> tuple[Array, Array]:
     """Return (value − mean)/std of each free parameter with a prior, and the derivatives with respect to q."""
     names = [p.name for p in unknowns.all]
     columns = [names.index(n) for n in priors if n in names]

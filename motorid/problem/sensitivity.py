@@ -71,13 +71,8 @@ class DerivativeCheck:
 
 
 @one_thread
-def check_derivatives(
-    problem: Problem,
-    q: Array | None = None,
-    *,
-    steps: Sequence[float] = (5e-3, 3e-4, 2e-5),
-    tolerance: float = 1e-3,
-) -> DerivativeCheck:
+def check_derivatives(problem: Problem, q: Array | None = None, *, steps: Sequence[float] = (5e-3, 3e-4, 2e-5),
+                      tolerance: float = 1e-3) -> DerivativeCheck:
     """Compare the exact Jacobian with central finite differences of order four.
 
     Parameters

@@ -70,11 +70,8 @@ class Evaluation(Shown):
 
     def card(self) -> Card:
         """Return the errors over all runs and run by run."""
-        return Card(
-            f"Evaluation on {counted(len(self.simulations), 'run')}",
-            tables=(error_table({"": self}), run_table(self)),
-            after=(("mi.plot_fit(evaluation)", "see it"),),
-        )
+        return Card(f"Evaluation on {counted(len(self.simulations), 'run')}",
+                    tables=(error_table({"": self}), run_table(self)), after=(("mi.plot_fit(evaluation)", "see it"),))
 
     def __repr__(self) -> str:
         errors = ", ".join(f"{c} {100 * e:.2f} %" for c, e in self.nrmse.items())
@@ -163,8 +160,7 @@ def planned(model: Model, t: Sequence[float] | Array, v: Sequence[float] | Array
     >>> identifiability(Problem(model, [plan]))
     """
     t = np.asarray(t, float)
-    blank = Experiment(t, {"v": np.asarray(v, float)}, {c: np.zeros(len(t)) for c in channels}, hold=hold,
-                       name=name)
+    blank = Experiment(t, {"v": np.asarray(v, float)}, {c: np.zeros(len(t)) for c in channels}, hold=hold, name=name)
     return with_channels(model, blank, channels, sigma)
 
 
@@ -174,8 +170,7 @@ def with_channels(model: Model, run: Experiment, channels: Sequence[str],
     blank = run.with_(outputs={**run.outputs, **{c: np.zeros(run.n) for c in channels}},
                       sigma={**run.sigma, **dict.fromkeys(channels, 1.0)})
     shown = simulate(model, [blank], initial="rest", estimate_initial=False)[0].outputs
-    noise = {c: (sigma or {}).get(c) or ASSUMED_NOISE * float(np.sqrt(np.mean(shown[c] ** 2))) or 1.0
-             for c in channels}
+    noise = {c: (sigma or {}).get(c) or ASSUMED_NOISE * float(np.sqrt(np.mean(shown[c] ** 2))) or 1.0 for c in channels}
     filled = {c: shown[c] for c in channels}
     return blank.with_(outputs={**run.outputs, **filled}, sigma={**run.sigma, **noise})
 

@@ -129,8 +129,7 @@ def _rows_in_order(t: Array, column: str, said: list[str]) -> NDArray[np.intp]:
         raise DataError(f"a run needs at least {MIN_SAMPLES} samples; here {counted(len(rows), 'row')} of "
                         f"{len(t)} hold a time in '{column}'.")
     if np.ptp(t[rows]) == 0:
-        raise DataError(f"time does not move: '{column}' is {t[rows[0]]:g} s in every row. "
-                        "Is it the right column?")
+        raise DataError(f"time does not move: '{column}' is {t[rows[0]]:g} s in every row. Is it the right column?")
     total = len(rows)
     now = t[rows]
     ahead = (now[1:-1] > now[2:]) & (now[2:] > now[:-2])  # a stamp that jumps ahead and is not followed
@@ -174,8 +173,7 @@ def _first_input(v: Array, column: str, said: list[str]) -> int:
     if not known.size:
         raise DataError(f"every sample of the input '{column}' is missing; no simulation can do without it.")
     if known[0]:
-        said.append(f"left out the first {counted(int(known[0]), 'row')}: the input '{column}' is not "
-                    "known there.")
+        said.append(f"left out the first {counted(int(known[0]), 'row')}: the input '{column}' is not known there.")
     return int(known[0])
 
 

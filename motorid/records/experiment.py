@@ -187,11 +187,8 @@ class Experiment(Shown):
             good = y[np.isfinite(y)]
             missing = len(y) - len(good)
             limits = [number(float(limit), 3) for limit in (good.min(), good.max())] if len(good) else []
-            rows.append([
-                f"{NAMES[name]} {name}",
-                f"{limits[0]} … {limits[1]} {self.units[name]}" if limits else "–",
-                Flag(f"{missing} of {len(y)}", "note") if missing else "none",
-            ])
+            rows.append([f"{NAMES[name]} {name}", f"{limits[0]} … {limits[1]} {self.units[name]}" if limits else "–",
+                         Flag(f"{missing} of {len(y)}", "note") if missing else "none"])
         return Card(
             f"Run {self.name}",
             text=(

@@ -40,8 +40,7 @@ _SPELLINGS = {
              1e-6: "us usec micros microsecond microseconds",
              1e-9: "ns nanoseconds", 60.0: "min minute minutes", 3600.0: "h hour hours"},
     "voltage": {1.0: "v volt volts", 1e-3: "mv millivolt millivolts", 1e3: "kv"},
-    "current": {1.0: "a amp amps ampere amperes", 1e-3: "ma milliamp milliamps milliampere", 1e-6: "ua",
-                1e3: "ka"},
+    "current": {1.0: "a amp amps ampere amperes", 1e-3: "ma milliamp milliamps milliampere", 1e-6: "ua", 1e3: "ka"},
     "speed": {1.0: "rad/s rad/sec rad/second rads rads-1 radps", 1e-3: "mrad/s", 1e3: "krad/s",
               _TURN / 60: "rpm 1/min u/min upm umin tr/min min-1 rev/min r/min turns/min umdr/min",
               1e3 * _TURN / 60: "krpm", _TURN: "rev/s rps turn/s turns/s hz r/s u/s tr/s",
@@ -162,8 +161,7 @@ _BRACKETS = re.compile(r"(.*?)[\s_,:/]*[\[({<]([^\])}>]*)[\])}>]\s*")
 _IN = re.compile(r"(.*\S)(?:\s+in\s+|\s+/\s*|\s*,\s+|:\s*)(\S.*)", re.IGNORECASE)
 _SEPARATORS = re.compile(r"[\s_.\-:/]+")
 _CAMEL = re.compile(r"(?<=[a-zäöü][a-zäöü])(?=[A-ZÄÖÜ])")
-_BY_UNIT = {"time": "t", "voltage": "v", "current": "i", "speed": "omega", "linear speed": "omega",
-            "angle": "theta"}
+_BY_UNIT = {"time": "t", "voltage": "v", "current": "i", "speed": "omega", "linear speed": "omega", "angle": "theta"}
 
 
 @dataclass(frozen=True)

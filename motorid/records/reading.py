@@ -110,8 +110,7 @@ def write_csv(experiment: Experiment, path: Path_) -> Path:
     taken = set(headers.values())
     table = {headers[c]: a for c, a in channels.items()}
     table |= {f"{k} (extra)" if k in taken else k: np.asarray(a) for k, a in extra.items()}
-    about = ["# motorid columns: " + ",".join(f"{c}={h}" for c, h in headers.items()),
-             f"# motorid hold: {run.hold}"]
+    about = ["# motorid columns: " + ",".join(f"{c}={h}" for c, h in headers.items()), f"# motorid hold: {run.hold}"]
     about += ["# motorid sigma: " + ",".join(f"{c}={s!r}" for c, s in run.sigma.items())] if run.sigma else []
     path = Path(path).expanduser()
     try:

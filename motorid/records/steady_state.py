@@ -80,8 +80,7 @@ def _constant_stretches(v: Array) -> list[tuple[int, int]]:
     return stretches
 
 
-def _steady_tail(k: int, run: Experiment, sigma: Mapping[str, float], first: int,
-                 last: int) -> SteadySegment | None:
+def _steady_tail(k: int, run: Experiment, sigma: Mapping[str, float], first: int, last: int) -> SteadySegment | None:
     length = last - first + 1
     for share in (0.75, 0.5, 0.25, 0.125):
         n = int(share * length)

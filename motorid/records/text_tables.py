@@ -23,8 +23,7 @@ MISSING = frozenset(["", "nan", "na", "n/a", "null", "none", "-", "--", "---", "
 _NUMBER = re.compile(r"[-+]?(?:(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?|inf)", re.IGNORECASE)
 _CONTROL = re.compile(r"[\x00-\x08\x0e-\x1f\x7f]")
 # Delimiter (None: white space) and decimal mark, in the order in which a tie is decided.
-_DIALECTS = (("\t", "."), (";", "."), (",", "."), ("\t", ","), (";", ","), (",", ","),
-             (None, "."), (None, ","))
+_DIALECTS = (("\t", "."), (";", "."), (",", "."), ("\t", ","), (";", ","), (",", ","), (None, "."), (None, ","))
 _MAGIC = {
     b"PK\x03\x04": "an Excel or zip file; export the sheet as CSV",
     b"\xd0\xcf\x11\xe0": "an old Excel file; export the sheet as CSV",

@@ -72,13 +72,8 @@ def report(result: Any, path: str | Path, *, title: str = "", command: str = "",
 def _page(story: Story) -> str:
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
-    environment = Environment(
-        loader=PackageLoader("motorid.reports", "templates"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
+    environment = Environment(loader=PackageLoader("motorid.reports", "templates"), autoescape=True,
+                              undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     date = datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z")
     return environment.get_template("report.html").render(story=story, version=_version("motorid"), date=date)
 
@@ -145,11 +140,7 @@ def _of_diagnosis(d: Diagnosis, validate: Sequence[Experiment]) -> Story:
     runs = d.before.problem.experiments
     story = Story("What is missing in the motor's model?", d.text, d.card().flags[:1], runs=runs)
     story.facts = [*sections.error_facts(d.ladder), ("Effects added", ", ".join(d.effects) or "none")]
-    story.sections += [
-        sections.data(runs),
-        sections.fitted(d.before, "The model it began with"),
-        sections.where(d),
-    ]
+    story.sections += [sections.data(runs), sections.fitted(d.before, "The model it began with"), sections.where(d)]
     if d.ranking:
         story.sections.append(sections.which(d))
     if len(d.ladder.rungs) > 1:

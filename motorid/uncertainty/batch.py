@@ -191,8 +191,7 @@ def _row(found: Fit) -> dict[str, Any]:
     for n in found.problem.model.free_names:
         values |= {n: found.values[n], f"{n}_std": certain.std[n]}
     flags = [] if found.status == "converged" else [found.status]
-    flags += [f"{n} {certain.status[n]}" for n in found.problem.model.free_names
-              if certain.status[n] != "determined"]
+    flags += [f"{n} {certain.status[n]}" for n in found.problem.model.free_names if certain.status[n] != "determined"]
     misfit = float(np.sqrt(found.chi2 / found.dof))
     if misfit > POOR:
         flags.append(f"misfit {misfit:.2g} times the noise")
@@ -261,8 +260,7 @@ class Checkpoint:
             file.write(text)
 
 
-def checkpoint_key(model: Model, options: Mapping[str, Any], reading: Mapping[str, Any] | None,
-                   records: Any) -> str:
+def checkpoint_key(model: Model, options: Mapping[str, Any], reading: Mapping[str, Any] | None, records: Any) -> str:
     """Return a hash of all that a result depends on: model and values, options, contents of the records."""
     mark = hashlib.sha256()
     for e in model.effects:

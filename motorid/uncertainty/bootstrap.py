@@ -100,13 +100,9 @@ class Bootstrap(Shown):
             limited = Flag(percent(self.limited[n], 2), "note") if self.limited[n] else "none"
             said = value_cell(float(value), self.std[n], unit, self.status[n])
             rows.append([n, said, interval_text(self.interval(n)), limited])
-        return Card(
-            "Bootstrap",
-            flags,
-            (words.get(self.kind, f"Resampled: {self.kind}."), self.interrupted),
-            (Table(["parameter", "value ± std", "95 %", "at its limit"], rows, left=(0, 1, 2)),),
-            (("mi.plot_profile(mi.intervals(fit))", "compare"),),
-        )
+        return Card("Bootstrap", flags, (words.get(self.kind, f"Resampled: {self.kind}."), self.interrupted),
+                    (Table(["parameter", "value ± std", "95 %", "at its limit"], rows, left=(0, 1, 2)),),
+                    (("mi.plot_profile(mi.intervals(fit))", "compare"),))
 
     def __str__(self) -> str:
         return str(self.card())
@@ -185,8 +181,7 @@ def bootstrap(fit: Fit, *, kind: str = "blocks", n: int = 200, block: int | None
 def _source(fit: Fit, kind: str, block: int | None) -> _Source:
     problem = fit.problem
     predicted = tuple(dict(s.outputs) for s in fit.simulations)
-    residuals = tuple({c: s.residual(c) for c in s.experiment.outputs if c in s.outputs}
-                      for s in fit.simulations)
+    residuals = tuple({c: s.residual(c) for c in s.experiment.outputs if c in s.outputs} for s in fit.simulations)
     spent = len(problem.unknown) / len(problem.outputs)
     colours, scale = {}, {}
     for c in problem.outputs:

@@ -34,17 +34,8 @@ DISTANCE = 0.5
 
 
 @one_thread
-def multistart(
-    problem_or_fit: Problem | Fit,
-    *,
-    starts: int = 100,
-    spread: float = 10.0,
-    seed: int = 0,
-    guess: bool = False,
-    solver: Any = None,
-    map: Map | None = None,
-    quiet: bool = False,
-) -> Multistart:
+def multistart(problem_or_fit: Problem | Fit, *, starts: int = 100, spread: float = 10.0, seed: int = 0,
+               guess: bool = False, solver: Any = None, map: Map | None = None, quiet: bool = False) -> Multistart:
     """Fit from many random starts and count how many reach the best fit.
 
     Parameters
@@ -87,8 +78,7 @@ def multistart(
     return Multistart(reference, tuple(done.results), float(spread), guess, time.perf_counter() - began, said)
 
 
-def _draw(reference: Fit, names: Sequence[str], starts: int, spread: float,
-          seed: int) -> list[dict[str, float]]:
+def _draw(reference: Fit, names: Sequence[str], starts: int, spread: float, seed: int) -> list[dict[str, float]]:
     rng = np.random.default_rng(np.random.SeedSequence(seed))
     factors = spread ** rng.uniform(-1, 1, (starts, len(names)))
     pars = reference.problem.model.parameters
@@ -204,8 +194,7 @@ class Multistart(Shown):
 
     @property
     def _good(self) -> list[StartResult]:
-        return [e for e, k in zip(self.results, self.kinds, strict=True)
-                if k == "good" and isinstance(e, StartResult)]
+        return [e for e, k in zip(self.results, self.kinds, strict=True) if k == "good" and isinstance(e, StartResult)]
 
     @property
     def good(self) -> int:
@@ -303,14 +292,9 @@ class Multistart(Shown):
         units = {n: p.unit for n, p in self.reference.model.parameters.items()}
         rows = [[n, *(quantity(s[k], units[n], 5) for k in ("reference", "mean")), quantity(s["std"], units[n], 2)]
                 for n, s in self.statistics().items()]
-        return Card(
-            "Fits from random starts",
-            flags,
-            (self.text,),
-            (Table(["parameter", "reference", "mean of the good fits", "spread"], rows),),
-            (("mi.plot_waterfall(study)", "see it"),),
-            "plot_waterfall",
-        )
+        return Card("Fits from random starts", flags, (self.text,),
+                    (Table(["parameter", "reference", "mean of the good fits", "spread"], rows),),
+                    (("mi.plot_waterfall(study)", "see it"),), "plot_waterfall")
 
     def __str__(self) -> str:
         return str(self.card())

@@ -130,8 +130,7 @@ def _crossing(x: Array, rise: Array, reach: float) -> float | None:
 
 
 @one_thread
-def profile(fit: Fit, name: str, *, level: float = 0.95, map: Map | None = None,
-            quiet: bool = False) -> Profile:
+def profile(fit: Fit, name: str, *, level: float = 0.95, map: Map | None = None, quiet: bool = False) -> Profile:
     """Return the profile likelihood of one parameter, far enough out for intervals at `level`.
 
     Parameters
@@ -265,13 +264,10 @@ class Intervals(Shown):
             others = (self.bootstrap.interval(n, self.level), p.interval(self.level))
             rows.append([n, quantity(p.value, p.unit), first, *(interval_text(x) for x in others)])
         header = ["parameter", "value", "covariance", f"bootstrap ({self.bootstrap.kind})", "profile"]
-        return Card(
-            f"Intervals of {percent(self.level)}",
-            text=("Where the three agree, any will do; where they do not, believe the profile.",),
-            tables=(Table(header, rows, left=(0, 1, 2, 3, 4)),),
-            after=(("mi.plot_profile(intervals)", "see them"),),
-            figure="plot_profile",
-        )
+        return Card(f"Intervals of {percent(self.level)}",
+                    text=("Where the three agree, any will do; where they do not, believe the profile.",),
+                    tables=(Table(header, rows, left=(0, 1, 2, 3, 4)),),
+                    after=(("mi.plot_profile(intervals)", "see them"),), figure="plot_profile")
 
     def __str__(self) -> str:
         return str(self.card())

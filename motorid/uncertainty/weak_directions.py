@@ -23,8 +23,7 @@ MOST = 300  # pivots tried
 EASY = ("R", "K", "g", "L", "b", "J")  # in the order in which they are usually known beforehand
 
 
-def basis_in_words(names: Sequence[str], weak: Array,
-                   matrix: Array) -> list[tuple[dict[str, float], float, str]]:
+def basis_in_words(names: Sequence[str], weak: Array, matrix: Array) -> list[tuple[dict[str, float], float, str]]:
     """Return per weak direction its parts (largest 1), what a step of 10 % does in units of noise, and words.
 
     Parameters

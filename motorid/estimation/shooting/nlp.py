@@ -126,10 +126,8 @@ class ShootingNlp:
         x, p, f, g = D(self.n, 1), D(0, 0), D(1, 1), D(self.m, 1)
         jac, hess = self.jac_pattern, self.hess_pattern
         nlp = _Function("nlp", ["x", "p"], ["f", "g"], [x, p], [f, g], lambda z, _: self.values(z))
-        grad_f = _Function("nlp_grad_f", ["x", "p"], ["f", "grad:f:x"], [x, p], [f, x],
-                           lambda z, _: self.gradient(z))
-        jac_g = _Function("nlp_jac_g", ["x", "p"], ["g", "jac:g:x"], [x, p], [g, jac],
-                          lambda z, _: self.jacobian(z))
+        grad_f = _Function("nlp_grad_f", ["x", "p"], ["f", "grad:f:x"], [x, p], [f, x], lambda z, _: self.gradient(z))
+        jac_g = _Function("nlp_jac_g", ["x", "p"], ["g", "jac:g:x"], [x, p], [g, jac], lambda z, _: self.jacobian(z))
         hess_lag = _Function("nlp_hess_l", ["x", "p", "lam:f", "lam:g"], ["triu:hess:gamma:x:x"], [x, p, f, g],
                              [hess], lambda z, _, lam_f, __: [self.hessian(z, float(lam_f[0]))])
         return nlp, {"grad_f": grad_f, "jac_g": jac_g, "hess_lag": hess_lag}

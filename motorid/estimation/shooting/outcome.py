@@ -192,8 +192,7 @@ class Multiplier:
                 "(to first order).")
 
 
-def rows_at(problem: Problem, q: Array,
-            relations: Sequence[Any] | None = None) -> list[tuple[str, Part, Array, Array]]:
+def rows_at(problem: Problem, q: Array, relations: Sequence[Any] | None = None) -> list[tuple[str, Part, Array, Array]]:
     """Return (name, part, rows, d rows/dq) of `relations` on the simulated trajectories at `q`.
 
     `relations` are the problem's constraints unless given.
