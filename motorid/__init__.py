@@ -9,9 +9,8 @@ from motorid.diagnosis.experiment_design import suggest_experiment
 from motorid.diagnosis.locate import locate
 from motorid.diagnosis.stepwise import improve
 from motorid.errors import DataError, FitError, ModelError, MotoridError, SimulationError, UsageError
-from motorid.estimation.comparison import compare
 from motorid.estimation.fit import fit, solve
-from motorid.estimation.result import Failure, Fit
+from motorid.estimation.result import Failure, Fit, compare
 from motorid.estimation.shooting.formulations import compare_formulations
 from motorid.estimation.shooting.multiple_shooting import MultipleShooting
 from motorid.exporters.export import export, load

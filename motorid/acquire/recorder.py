@@ -1,22 +1,24 @@
-"""Record a run from a bench: check, connect, start, write down, stop."""
+"""Record a run from a bench: check, connect, calibrate, start, write down, stop; see `record`."""
 
 from __future__ import annotations
 
 import contextlib
 import math
+import tomllib
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from motorid.acquire.calibration import calibrate, read_calibration
 from motorid.acquire.client import Client, Link, SerialLink
 from motorid.acquire.excitation import Program, program
-from motorid.acquire.protocol import VERSION, Header
+from motorid.acquire.protocol import VERSION, Channel, Header
 from motorid.acquire.record_file import Commanded, RecordFile, Tail, check_target, read_tail
 from motorid.acquire.session import Progress, Recording, Session, Setup
-from motorid.errors import UsageError
+from motorid.errors import DataError, UsageError, one_of
+
+_ENTRIES = ("scale", "offset", "gain", "zero", "sign")  # of a calibration, per channel
 
 
 def record(port: str | Link, out: str | Path, *, baud: int = 115_200, excite: str | Program | None = None,
@@ -46,7 +48,7 @@ def record(port: str | Link, out: str | Path, *, baud: int = 115_200, excite: st
     limit_voltage, limit_current : float
         In V and A; the device's own limits hold as well.
     calibration : path or mapping, optional
-        See `motorid.acquire.calibration`.
+        See `read_calibration`.
     resume, force : bool
         Go on with, or replace, a file that exists. Neither: it is left alone and an error raised.
     timeout : float
@@ -197,3 +199,50 @@ class RecordingPlan:
                    "segments done": done,
                    "pause": f"{at - tail.time:.3f} s, the motor taken to be off; the angle may count from "
                             "another zero after it"})
+
+
+def read_calibration(path: str | Path) -> dict[str, dict[str, float]]:
+    """Read the user's calibration of a bench, a TOML file: per channel scale, offset, gain, zero and sign.
+
+    Raises
+    ------
+    DataError
+        If it cannot be read, or holds an entry that is not known or not a finite number.
+    """
+    try:
+        tables = tomllib.loads(Path(path).read_text(encoding="utf-8"))
+    except OSError as error:
+        raise DataError(f"the calibration file {path} cannot be read: {error.strerror}.") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise DataError(f"the calibration file {path} is not TOML: {error}.") from None
+    for channel, entries in tables.items():
+        if not isinstance(entries, dict):
+            raise DataError(f"{path}: expected a table [channel] with entries; '{channel}' stands alone.")
+        for name, value in entries.items():
+            if name not in _ENTRIES:
+                raise DataError(f"{path}, [{channel}]: {one_of(name, _ENTRIES, 'entry')}")
+            if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+                raise DataError(f"{path}, [{channel}]: {name} must be a number; got {value!r}.")
+            if name == "sign" and value not in (1, -1):
+                raise DataError(f"{path}, [{channel}]: sign is 1 or -1; got {value}.")
+            if name in ("scale", "gain") and value == 0:
+                raise DataError(f"{path}, [{channel}]: {name} must not be zero.")
+    return tables
+
+
+def calibrate(header: Header, calibration: dict[str, dict[str, float]]) -> Header:
+    """Return the header with the channels' scales and offsets as the calibration wants them."""
+    names = [c.name for c in header.channels]
+    for name in calibration:
+        if name not in names:
+            raise DataError(f"the calibration speaks of a channel that the device does not send: "
+                            f"{one_of(name, names, 'channel')}")
+    channels = tuple(_calibrated(c, calibration.get(c.name, {})) for c in header.channels)
+    return replace(header, channels=channels)
+
+
+def _calibrated(channel: Channel, entries: dict[str, float]) -> Channel:
+    offset = entries.get("offset", channel.offset)
+    scale = entries.get("scale", channel.scale) * entries.get("gain", 1.0) * entries.get("sign", 1)
+    # zero + scale·(raw − offset) is scale·(raw − (offset − zero/scale)).
+    return replace(channel, scale=scale, offset=offset - entries.get("zero", 0.0) / scale)

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from motorid.cli import bench, diagnose, fit, trust
+from motorid.cli import bench, diagnose, fit
 from motorid.cli.console import Command, Group
 
 app = typer.Typer(cls=Group, add_completion=False, rich_markup_mode="rich", pretty_exceptions_enable=False,
@@ -40,8 +40,8 @@ for _name, _command in (
     ("fit", fit.fit_command),
     ("simulate", fit.simulate_command),
     ("diagnose", diagnose.diagnose_command),
-    ("identifiability", trust.identifiability_command),
-    ("robustness", trust.robustness_command),
+    ("identifiability", fit.identifiability_command),
+    ("robustness", fit.robustness_command),
     ("fit-many", fit.fit_many_command),
     ("export", fit.export_command),
     ("record", bench.record_command),

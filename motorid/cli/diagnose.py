@@ -14,9 +14,8 @@ from motorid.diagnosis.cross_validation import fit_affordably
 from motorid.diagnosis.diagnose import diagnose
 from motorid.diagnosis.results import Diagnosis, ladder_table, ranking_table
 from motorid.errors import UsageError
-from motorid.estimation.comparison import comparison_table
 from motorid.estimation.fit import fit
-from motorid.estimation.result import parameter_table
+from motorid.estimation.result import comparison_table, parameter_table
 from motorid.exporters.json_file import write_json
 from motorid.model.model import dc_motor
 from motorid.numerics.parallel import progress

@@ -1,4 +1,4 @@
-"""The commands `fit`, `fit-many`, `simulate` and `export`: a model fitted, used on other records, and taken along."""
+"""The commands on one model: `fit`, `fit-many`, how far to trust it, `simulate` and `export`."""
 
 from __future__ import annotations
 
@@ -34,6 +34,8 @@ from motorid.records.layout import parse_pairs
 from motorid.records.reading import write_csv
 from motorid.uncertainty.batch import fit_many, motors_in
 from motorid.uncertainty.covariance import deviations
+from motorid.uncertainty.identifiability import Identifiability, identifiability
+from motorid.uncertainty.multistart import Multistart, multistart
 
 SavedModel = Annotated[Path, typer.Argument(metavar="FIT.json", help="What fit --json or export wrote.")]
 EffectsFrom = Annotated[Path | None, typer.Option(metavar="FILE.py", help="Effects of your own.")]
@@ -195,3 +197,38 @@ def export_command(
     if to is not None and to not in FORMS.values():
         raise UsageError(f"--to: {one_of(to, FORMS.values(), 'form')}")
     show(f"Written: {export(saved_model(fit_json, effects_from), path, to)}")
+
+
+@with_options(FitOptions)
+def identifiability_command(runs: Runs, options: FitOptions, json: Json = None, report: Report = None) -> None:
+    """Say which parameters, and which combinations of them, the records determine.
+
+    Example: motorid identifiability run*.csv --effects coulomb
+    """
+    fitted = options.fit(options.read(runs))
+    _hand_over(fitted, identifiability(fitted), json, report)
+
+
+@with_options(FitOptions)
+def robustness_command(
+    runs: Runs, options: FitOptions,
+    starts: Annotated[int, typer.Option(min=1, metavar="N", rich_help_panel=OUT, help="How many fits.")] = 100,
+    spread: Annotated[float, typer.Option(
+        min=1.0, rich_help_panel=OUT, help="Every start is off by up to this factor.")] = 10.0,
+    seed: Annotated[int, typer.Option(min=0, rich_help_panel=OUT, help="Of the drawn starts.")] = 0,
+    json: Json = None, report: Report = None,
+) -> None:
+    """Fit from many poor starts, and say whether all end in the same place.
+
+    Example: motorid robustness run*.csv --starts 50 --spread 10
+    """
+    fitted = options.fit(options.read(runs))
+    _hand_over(fitted, multistart(fitted, starts=starts, spread=spread, seed=seed), json, report)
+
+
+def _hand_over(fitted: Fit, found: Identifiability | Multistart, json: Json, report: Report) -> None:
+    if json:
+        write_json(found.to_dict(), json)
+    if json != "-":
+        show(str(found))
+    save_report([fitted, found], report)

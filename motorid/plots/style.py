@@ -1,12 +1,14 @@
-"""One restrained style for all figures: colours, labels, sizes, decimation that keeps peaks."""
+"""One restrained style for all figures: colours, labels, sizes, decimation that keeps peaks; figures as PNG and SVG."""
 
 from __future__ import annotations
 
 import io
+import re
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
 from functools import wraps
+from html import escape
 from typing import Any, ParamSpec, TypeVar
 
 import matplotlib as mpl
@@ -35,47 +37,21 @@ PALETTE = {
 }
 CYCLE = (*(PALETTE[c] for c in ("blue", "orange", "green", "purple", "yellow")), INK, PALETTE["grey"])
 MEASURED, MODEL, RESIDUAL, HELD_OUT = PALETTE["grey"], PALETTE["blue"], PALETTE["orange"], PALETTE["green"]
+# Colours of a figure become variables of the page, so that a dark page has a dark figure.
+VARIABLES = {INK: "ink", MUTED: "muted", FAINT: "line", PAPER: "paper", **{c: n for n, c in PALETTE.items()}}
 WIDTH = 9.2  # inches: the text width of a notebook
 POINTS = 1200  # drawn per curve at most: more than a page has pixels for it
 
 STYLE: Mapping[Any, Any] = {
-    "font.size": 9,
-    "axes.titlesize": 9,
-    "axes.labelsize": 9,
-    "xtick.labelsize": 8,
-    "ytick.labelsize": 8,
-    "legend.fontsize": 8,
-    "figure.titlesize": 10,
-    "legend.frameon": False,
-    "axes.titlelocation": "left",
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "axes.axisbelow": True,
-    "grid.color": FAINT,
-    "grid.linewidth": 0.6,
-    "axes.edgecolor": MUTED,
-    "axes.linewidth": 0.7,
-    "xtick.color": MUTED,
-    "ytick.color": MUTED,
-    "xtick.labelcolor": INK,
-    "ytick.labelcolor": INK,
-    "axes.labelcolor": INK,
-    "axes.titlecolor": INK,
-    "text.color": INK,
-    "figure.facecolor": PAPER,
-    "axes.facecolor": PAPER,
-    "savefig.facecolor": PAPER,
-    "lines.linewidth": 1.3,
-    "figure.dpi": 100,
-    "savefig.dpi": 150,
-    "axes.prop_cycle": cycler(color=CYCLE),
-    "axes.formatter.useoffset": False,
-    "axes.formatter.limits": (-4, 5),
-    "axes.unicode_minus": True,
-    "svg.fonttype": "none",
+    "font.family": ["DejaVu Sans"], "font.size": 9, "figure.titlesize": 10, "axes.titlesize": 9, "axes.labelsize": 9,
+    "xtick.labelsize": 8, "ytick.labelsize": 8, "legend.fontsize": 8, "legend.frameon": False,
+    "axes.titlelocation": "left", "axes.spines.top": False, "axes.spines.right": False, "axes.linewidth": 0.7,
+    "axes.grid": True, "axes.axisbelow": True, "grid.color": FAINT, "grid.linewidth": 0.6, "lines.linewidth": 1.3,
+    "text.color": INK, "axes.labelcolor": INK, "axes.titlecolor": INK, "xtick.labelcolor": INK, "ytick.labelcolor": INK,
+    "axes.edgecolor": MUTED, "xtick.color": MUTED, "ytick.color": MUTED, "axes.prop_cycle": cycler(color=CYCLE),
+    "figure.facecolor": PAPER, "axes.facecolor": PAPER, "savefig.facecolor": PAPER, "figure.dpi": 100,
+    "savefig.dpi": 150, "svg.fonttype": "none", "axes.formatter.useoffset": False, "axes.formatter.limits": (-4, 5), "axes.unicode_minus": True,
     "axes.xmargin": 0.02,
-    "font.family": ["DejaVu Sans"],
 }
 
 _detached: ContextVar[bool] = ContextVar("motorid_detached_figures", default=False)
@@ -120,6 +96,56 @@ def png_of(axes: Any) -> bytes:
     buffer = io.BytesIO()
     np.atleast_1d(np.asarray(axes, object)).ravel()[0].figure.savefig(buffer, format="png", dpi=90)
     return buffer.getvalue()
+
+
+def svg_of(draw: Callable[..., Any], *args: Any, name: str, alt: str, **options: Any) -> str:
+    """Draw with one of the plot functions and return an inline ``<svg>`` element.
+
+    Parameters
+    ----------
+    draw : callable
+        E.g. `plot_fit`; called with `args` and `options`.
+    name : str
+        Prefix of the names inside, unique on the page.
+    alt : str
+        What the figure shows, for those who cannot see it.
+    """
+    with detached():
+        drawn = draw(*args, **options)
+    figure = np.atleast_1d(np.asarray(drawn, object)).ravel()[0].figure
+    engine = figure.get_layout_engine()
+    if engine is not None:  # once, and not again while saving
+        engine.execute(figure)
+        figure.set_layout_engine("none")
+    buffer = io.StringIO()
+    with mpl.rc_context({"svg.fonttype": "none", "svg.hashsalt": name}):
+        figure.savefig(buffer, format="svg", transparent=True, dpi=120, metadata={"Date": None, "Creator": None})
+    return _cleaned(buffer.getvalue(), name, alt)
+
+
+def _cleaned(svg: str, name: str, alt: str) -> str:
+    """Return the ``<svg>`` element alone, shortened, with colours as variables and unique names."""
+    svg = svg[svg.index("<svg"):]
+    svg = re.sub(r"<metadata>.*?</metadata>|<style.*?</style>|<!--.*?-->", "", svg, flags=re.S)
+    svg = re.sub(r"<defs>\s*</defs>", "", svg)
+    used = set(re.findall(r'(?:url\(#|xlink:href="#)([^)"]+)', svg))
+    svg = re.sub(r'\sid="([^"]+)"', lambda m: f' id="{name}-{m[1]}"' if m[1] in used else "", svg)
+    svg = re.sub(r"url\(#([^)]+)\)", rf"url(#{name}-\1)", svg)
+    svg = re.sub(r'xlink:href="#([^"]+)"', rf'href="#{name}-\1"', svg).replace("xlink:href", "href")
+    svg = re.sub(r"<[^>]+>", _shortened, svg)
+    for colour, variable in VARIABLES.items():
+        svg = svg.replace(colour, f"var(--{variable})")
+    svg = svg.replace("font-family: 'DejaVu Sans'", "font-family: var(--font)")
+    svg = re.sub(r"\n\s*", "\n", svg)
+    box = re.search(r'viewBox="([^"]+)"', svg)
+    body = svg[svg.index(">") + 1:]
+    view = box[1] if box else "0 0 600 400"
+    return f'<svg viewBox="{view}" role="img" aria-label="{escape(alt)}">{body.strip()}'
+
+
+def _shortened(tag: re.Match[str]) -> str:
+    """Round coordinates, which stand inside tags, to a tenth of a point; words outside are left alone."""
+    return re.sub(r"(\d+\.\d)\d{2,}", r"\1", tag[0])
 
 
 def grid(rows: int, columns: int, *, row: float = 1.6, width: float = WIDTH, **options: Any) -> np.ndarray:

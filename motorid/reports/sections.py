@@ -155,7 +155,7 @@ def of_card(result: Shown, k: int) -> Section:
 
 def _figure(name: str, caption: str, alt: str, draw: Callable[..., Any], *args: Any, small: bool = False,
             **options: Any) -> Figure:
-    from motorid.plots.svg import svg_of
+    from motorid.plots.style import svg_of
 
     return Figure(svg_of(draw, *args, name=name, alt=alt, **options), caption, small)
 

@@ -13,10 +13,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from motorid.acquire.calibration import calibrate, read_calibration
 from motorid.acquire.excitation import Program, Segment, lfsr_bits, program
 from motorid.acquire.protocol import Channel, Decoder, Header, Message, Sample, crc16, frame
 from motorid.acquire.record_file import RecordFile, check_target, column, read_tail
+from motorid.acquire.recorder import calibrate, read_calibration
 from motorid.acquire.timeline import Row, Timeline
 from motorid.errors import DataError, DeviceError, UsageError
 

@@ -17,8 +17,7 @@ from motorid.acquire import Recording
 from motorid.diagnosis.experiment_design import Suggestion
 from motorid.diagnosis.results import Diagnosis, Ladder, Missing
 from motorid.display.tables import COLOURS, Flag, Table
-from motorid.estimation.comparison import Comparison
-from motorid.estimation.result import Failure, Fit
+from motorid.estimation.result import Comparison, Failure, Fit
 from motorid.estimation.shooting.formulations import Formulations
 from motorid.problem.problem import Problem
 from motorid.problem.simulate import Evaluation

@@ -19,8 +19,7 @@ from motorid import plots
 from motorid.errors import UsageError
 from motorid.estimation.shooting.formulations import compare_formulations
 from motorid.plots.residuals import binned_means
-from motorid.plots.style import axis_label, detached, envelope
-from motorid.plots.svg import svg_of
+from motorid.plots.style import axis_label, detached, envelope, svg_of
 from motorid.problem.constraints import CurrentLimit
 from motorid.uncertainty.identifiability import identifiability
 from motorid.uncertainty.multistart import multistart

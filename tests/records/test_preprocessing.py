@@ -8,7 +8,7 @@ from command import motorid_json
 from lab_records import simulated
 
 import motorid as mi
-from motorid.records.plausibility import unsigned
+from motorid.records.checks import unsigned
 from motorid.records.preprocessing import spikes, unwrapped
 from motorid.records.reading import write_csv
 

@@ -10,8 +10,7 @@ from motorid.errors import UsageError
 from motorid.problem.problem import Problem
 from motorid.problem.sensitivity import relative_jacobian
 from motorid.records.datasets import truth
-from motorid.uncertainty.identifiability import identifiability
-from motorid.uncertainty.weak_directions import monomials, sparse_basis
+from motorid.uncertainty.identifiability import identifiability, monomials, sparse_basis
 
 MOTOR = truth("two_step_noisy")["parameters"]
 
