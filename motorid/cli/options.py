@@ -40,6 +40,10 @@ FORMULATIONS = ("plain", "penalty", "hard")
 LOSSES = ("squares", "huber")
 MODEL, SOLVE, READ, OUT = "Model", "Estimation", "Reading", "Results"
 
+_reading = functools.partial(typer.Option, rich_help_panel=READ)
+_model = functools.partial(typer.Option, rich_help_panel=MODEL)
+_solving = functools.partial(typer.Option, rich_help_panel=SOLVE)
+
 Runs = Annotated[list[str], typer.Argument(
     metavar="RUN...", show_default=False, help="Records: files, directories or patterns.")]
 Json = Annotated[str | None, typer.Option(
@@ -55,29 +59,22 @@ Validate = Annotated[list[str] | None, typer.Option(
 class ReadingOptions:
     """How to read records."""
 
-    columns: Annotated[str | None, typer.Option(
-        metavar="t=…,v=…", rich_help_panel=READ,
+    columns: Annotated[str | None, _reading(
+        metavar="t=…,v=…",
         help="Which column is which channel, where the header does not tell: t=time,v=u_volt.")] = None
-    units: Annotated[str | None, typer.Option(
-        metavar="omega=rpm", rich_help_panel=READ,
-        help="Units of channels, where the header does not tell.")] = None
-    hold: Annotated[str | None, typer.Option(
-        metavar="zoh|linear", rich_help_panel=READ,
-        help="The input between samples: held or joined by lines.")] = None
-    median: Annotated[int | None, typer.Option(
-        metavar="N", rich_help_panel=READ,
-        help="Running median over N samples (odd) of a voltage that was measured with noise.")] = None
-    levels: Annotated[bool, typer.Option(
-        "--levels", rich_help_panel=READ,
-        help="Mean between steps of a voltage that was measured with noise.")] = False
-    delay: Annotated[float | None, typer.Option(
-        metavar="S", rich_help_panel=READ,
-        help="Seconds by which the voltage acts later than its column says.")] = None
-    no_spikes: Annotated[bool, typer.Option(
-        "--no-spikes", rich_help_panel=READ,
-        help="Leave out single samples that stand far from both neighbours.")] = False
-    ignore: Annotated[str | None, typer.Option(
-        metavar="i,theta", rich_help_panel=READ, help="Measured channels to leave out.")] = None
+    units: Annotated[str | None, _reading(
+        metavar="omega=rpm", help="Units of channels, where the header does not tell.")] = None
+    hold: Annotated[str | None, _reading(
+        metavar="zoh|linear", help="The input between samples: held or joined by lines.")] = None
+    median: Annotated[int | None, _reading(
+        metavar="N", help="Running median over N samples (odd) of a voltage that was measured with noise.")] = None
+    levels: Annotated[bool, _reading(
+        "--levels", help="Mean between steps of a voltage that was measured with noise.")] = False
+    delay: Annotated[float | None, _reading(
+        metavar="S", help="Seconds by which the voltage acts later than its column says.")] = None
+    no_spikes: Annotated[bool, _reading(
+        "--no-spikes", help="Leave out single samples that stand far from both neighbours.")] = False
+    ignore: Annotated[str | None, _reading(metavar="i,theta", help="Measured channels to leave out.")] = None
 
     def read(self, paths: Sequence[str]) -> list[Experiment]:
         """Return the runs."""
@@ -114,36 +111,27 @@ class ReadingOptions:
 class FitOptions(ReadingOptions):
     """What a command that fits may be told: how to read, which model, how to estimate."""
 
-    effects: Annotated[str | None, typer.Option(
-        metavar="a,b", rich_help_panel=MODEL, help="Effects in the model beside the plain motor.")] = None
-    fix: Annotated[list[str] | None, typer.Option(
-        metavar="L", rich_help_panel=MODEL,
-        help="Fix parameters: L, or L=0 to leave the inductance out.")] = None
-    set_: Annotated[list[str] | None, typer.Option(
-        "--set", metavar="R=1.2", rich_help_panel=MODEL, help="Values to start from (SI units).")] = None
-    free: Annotated[list[str] | None, typer.Option(
-        metavar="g", rich_help_panel=MODEL, help="Estimate parameters that are fixed by default.")] = None
-    drive: Annotated[str, typer.Option(
-        metavar="voltage|torque", rich_help_panel=MODEL,
+    effects: Annotated[str | None, _model(metavar="a,b", help="Effects in the model beside the plain motor.")] = None
+    fix: Annotated[list[str] | None, _model(
+        metavar="L", help="Fix parameters: L, or L=0 to leave the inductance out.")] = None
+    set_: Annotated[list[str] | None, _model("--set", metavar="R=1.2", help="Values to start from (SI units).")] = None
+    free: Annotated[list[str] | None, _model(metavar="g", help="Estimate parameters that are fixed by default.")] = None
+    drive: Annotated[str, _model(
+        metavar="voltage|torque",
         help="torque: a drive that closes its own current loop; v is its command.")] = "voltage"
-    effects_from: Annotated[Path | None, typer.Option(
-        metavar="FILE.py", rich_help_panel=MODEL,
-        help="Python file with effects of your own (@mi.effect).")] = None
-    solver: Annotated[str | None, typer.Option(
-        metavar="lm|multiple-shooting", rich_help_panel=SOLVE, show_default=False,
-        help="By default lm; multiple-shooting for hard.")] = None
-    formulation: Annotated[str, typer.Option(
-        metavar="plain|penalty|hard", rich_help_panel=SOLVE,
+    effects_from: Annotated[Path | None, _model(
+        metavar="FILE.py", help="Python file with effects of your own (@mi.effect).")] = None
+    solver: Annotated[str | None, _solving(
+        metavar="lm|multiple-shooting", show_default=False, help="By default lm; multiple-shooting for hard.")] = None
+    formulation: Annotated[str, _solving(
+        metavar="plain|penalty|hard",
         help="What is asked beside the data: nothing, weighted penalties, or true constraints.")] = "plain"
-    current_limit: Annotated[float | None, typer.Option(
-        metavar="A", rich_help_panel=SOLVE, help="The current never exceeds this (penalty, hard).")] = None
-    engine: Annotated[str, typer.Option(
-        metavar="rosenbrock|cvodes|idas", rich_help_panel=SOLVE, help="Integrator.")] = "rosenbrock"
-    initial: Annotated[str, typer.Option(
-        metavar="auto|rest|measured|estimate", rich_help_panel=SOLVE,
-        help="What is known of the state at the first sample.")] = "auto"
-    loss: Annotated[str, typer.Option(
-        metavar="squares|huber", rich_help_panel=SOLVE, help="huber forgives outliers.")] = "squares"
+    current_limit: Annotated[float | None, _solving(
+        metavar="A", help="The current never exceeds this (penalty, hard).")] = None
+    engine: Annotated[str, _solving(metavar="rosenbrock|cvodes|idas", help="Integrator.")] = "rosenbrock"
+    initial: Annotated[str, _solving(
+        metavar="auto|rest|measured|estimate", help="What is known of the state at the first sample.")] = "auto"
+    loss: Annotated[str, _solving(metavar="squares|huber", help="huber forgives outliers.")] = "squares"
 
     def model(self, runs: Sequence[Experiment]) -> Model:
         """Return the model that was asked for."""

@@ -11,29 +11,14 @@ from matplotlib.axes import Axes
 from motorid.errors import UsageError
 from motorid.estimation.result import Fit
 from motorid.estimation.shooting.formulations import Formulations
-from motorid.plots.style import (
-    CYCLE,
-    INK,
-    MEASURED,
-    MODEL,
-    MUTED,
-    PALETTE,
-    WIDTH,
-    axis_label,
-    grid,
-    line,
-    new_figure,
-    plain_decades,
-    styled,
-    tidy,
-)
+from motorid.plots import style
 from motorid.problem.constraints import CurrentLimit
 from motorid.problem.simulate import Simulation
 
 NEAR = 0.5  # of the limit: what is worth a closer look
 
 
-@styled
+@style.styled
 def plot_current_limit(
     *results: Fit | Formulations, limit: float | None = None, labels: Sequence[str] | None = None
 ) -> np.ndarray:
@@ -63,15 +48,15 @@ def plot_current_limit(
         raise UsageError("these fits have no current: it was not measured, or the model has none.")
     words = list(labels or [f.formulation for f in fits])
     runs = min(len(fits[0].simulations), 3)
-    axes = grid(len(fits), runs, row=1.5, sharex="col", sharey="row")
+    axes = style.grid(len(fits), runs, row=1.5, sharex="col", sharey="row")
     for row, fit, word in zip(axes, fits, words, strict=False):
         for ax, s in zip(row, fit.simulations, strict=False):
             _against_limit(ax, s, limit)
-        tidy(row[0], y=f"{word}\n{axis_label('i')}")
+        style.tidy(row[0], y=f"{word}\n{style.axis_label('i')}")
     for ax, s in zip(axes[0], fits[0].simulations, strict=False):
-        tidy(ax, title=s.experiment.name)
+        style.tidy(ax, title=s.experiment.name)
     for k, ax in enumerate(axes[-1]):
-        tidy(ax, x="time (s)")
+        style.tidy(ax, x="time (s)")
         _zoom(ax, [f.simulations[k] for f in fits], limit)
     figure = axes[0, 0].figure
     figure.align_ylabels(axes[:, 0])
@@ -82,15 +67,15 @@ def plot_current_limit(
 def _against_limit(ax: Axes, s: Simulation, limit: float) -> None:
     t, i = s.experiment.t, s.outputs["i"]
     if "i" in s.experiment.outputs:
-        line(ax, t, s.experiment.outputs["i"], color=MEASURED, lw=3, alpha=0.5, label="measured")
-    line(ax, t, i, color=MODEL, label="model")
+        style.line(ax, t, s.experiment.outputs["i"], color=style.MEASURED, lw=3, alpha=0.5, label="measured")
+    style.line(ax, t, i, color=style.MODEL, label="model")
     for side in (-limit, limit):
         if float(np.max(np.sign(side) * i)) > 0.5 * limit:
-            ax.axhline(side, color=INK, lw=1.0, ls=(0, (4, 2)), label="limit" if side > 0 else None)
-    ax.fill_between(t, np.clip(i, -limit, limit), i, color=PALETTE["orange"], alpha=0.6, lw=0, label="beyond it")
+            ax.axhline(side, color=style.INK, lw=1.0, ls=(0, (4, 2)), label="limit" if side > 0 else None)
+    ax.fill_between(t, np.clip(i, -limit, limit), i, color=style.PALETTE["orange"], alpha=0.6, lw=0, label="beyond it")
     beyond = float(np.max(np.abs(i)) - limit)
     words = f"{beyond:.2g} A beyond" if beyond > 1e-6 * limit else "kept"
-    ax.set_title(words, loc="right", fontsize=8, color=MUTED)
+    ax.set_title(words, loc="right", fontsize=8, color=style.MUTED)
 
 
 def _zoom(ax: Axes, simulations: Sequence[Simulation], limit: float) -> None:
@@ -113,7 +98,7 @@ def _limit_of(fits: Sequence[Fit]) -> float:
     raise UsageError("no CurrentLimit in these fits; say which one to draw: mi.plot_current_limit(fit, limit=8.0).")
 
 
-@styled
+@style.styled
 def plot_formulations(result: Formulations) -> np.ndarray:
     """Draw the same fit plain, with penalties and with hard constraints: parameters, errors, and the walk between.
 
@@ -129,8 +114,8 @@ def plot_formulations(result: Formulations) -> np.ndarray:
     """
     if not isinstance(result, Formulations):
         raise UsageError(f"plot_formulations takes mi.compare_formulations(fit), got {type(result).__name__}.")
-    axes = new_figure(WIDTH, 3.0).subplots(1, 3, width_ratios=[1.5, 1.0, 1.0])
-    shown = [(f.name, f.fit, CYCLE[k]) for k, f in enumerate(result.all) if f.fit is not None]
+    axes = style.new_figure(style.WIDTH, 3.0).subplots(1, 3, width_ratios=[1.5, 1.0, 1.0])
+    shown = [(f.name, f.fit, style.CYCLE[k]) for k, f in enumerate(result.all) if f.fit is not None]
     _changes(axes[0], shown)
     _errors(axes[1], shown)
     _walk(axes[2], result)
@@ -147,9 +132,9 @@ def _changes(ax: Axes, shown: Sequence[tuple[str, Any, str]]) -> None:
         change = [100 * (fit.values[n] / plain.values[n] - 1) for n in names]
         spread = [200 * (fit.std[n] or 0.0) / abs(plain.values[n]) for n in names]
         ax.errorbar(place, change, yerr=spread, fmt="o", ms=4.5, capsize=2.5, lw=1.2, color=colour, label=word)
-    ax.axhline(0, color=MUTED, lw=0.7)
+    ax.axhline(0, color=style.MUTED, lw=0.7)
     ax.set_xticks(range(len(names)), names)
-    tidy(ax, y="change against the plain fit (%)", title="Parameters, ±2σ")
+    style.tidy(ax, y="change against the plain fit (%)", title="Parameters, ±2σ")
 
 
 def _errors(ax: Axes, shown: Sequence[tuple[str, Any, str]]) -> None:
@@ -157,16 +142,16 @@ def _errors(ax: Axes, shown: Sequence[tuple[str, Any, str]]) -> None:
     for k, (_, fit, colour) in enumerate(shown):
         place = np.arange(len(channels)) + 0.26 * (k - 1)
         ax.bar(place, [100 * fit.nrmse[c] for c in channels], width=0.24, color=colour)
-    ax.set_xticks(range(len(channels)), [axis_label(c).split(" (")[0] for c in channels])
+    ax.set_xticks(range(len(channels)), [style.axis_label(c).split(" (")[0] for c in channels])
     ax.grid(axis="x", visible=False)
-    tidy(ax, y="NRMSE (%)", title="Error")
+    style.tidy(ax, y="NRMSE (%)", title="Error")
 
 
 def _walk(ax: Axes, result: Formulations) -> None:
-    tidy(ax, x="weight of the penalties", y="distance from the hard fit (%)", title="Heavier penalties")
+    style.tidy(ax, x="weight of the penalties", y="distance from the hard fit (%)", title="Heavier penalties")
     points = [(p.weight, 100 * p.distance) for p in result.path if p.distance > 0]
     if not points:
-        ax.text(0.5, 0.5, "no path", transform=ax.transAxes, ha="center", color=MUTED)
+        ax.text(0.5, 0.5, "no path", transform=ax.transAxes, ha="center", color=style.MUTED)
         return
-    ax.loglog(*zip(*points, strict=True), "o-", ms=4, color=CYCLE[1])
-    plain_decades(ax)
+    ax.loglog(*zip(*points, strict=True), "o-", ms=4, color=style.CYCLE[1])
+    style.plain_decades(ax)

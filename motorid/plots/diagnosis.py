@@ -12,29 +12,14 @@ from motorid.diagnosis.results import Binned, Candidate, Diagnosis, Ladder, Miss
 from motorid.display.numbers import number
 from motorid.errors import UsageError
 from motorid.numerics.signals import Array
+from motorid.plots import style
 from motorid.plots.residuals import scatter
-from motorid.plots.style import (
-    CYCLE,
-    INK,
-    MUTED,
-    PALETTE,
-    WIDTH,
-    axis_label,
-    decade,
-    line,
-    new_figure,
-    only,
-    plain_decades,
-    scaled_title,
-    styled,
-    tidy,
-)
 
 LOWEST_GAIN = -0.12  # drawn; what lies below is shown by an arrow
-_COLOUR = {"voltage": PALETTE["purple"], "torque": PALETTE["blue"]}
+_COLOUR = {"voltage": style.PALETTE["purple"], "torque": style.PALETTE["blue"]}
 
 
-@styled
+@style.styled
 def plot_missing(result: Missing | Diagnosis, *, show: int = 3, run: int | None = None) -> np.ndarray:
     """Draw the missing voltage and torque over time, and against what explains them best.
 
@@ -60,7 +45,7 @@ def plot_missing(result: Missing | Diagnosis, *, show: int = 3, run: int | None 
     if missing.where == "mechanical":
         balances.reverse()
     show = min(show, max((len(missing.bins.get(b, ())) for b in balances), default=0))
-    figure = new_figure(WIDTH, 2.3 * len(balances) + 0.2)
+    figure = style.new_figure(style.WIDTH, 2.3 * len(balances) + 0.2)
     axes = figure.subplots(len(balances), 1 + show, squeeze=False, sharey="row", width_ratios=[1.7] + [1.0] * show)
     for row, balance in zip(axes, balances, strict=True):
         _balance(row, missing, balance, run)
@@ -71,15 +56,16 @@ def plot_missing(result: Missing | Diagnosis, *, show: int = 3, run: int | None 
 def _balance(row: np.ndarray, missing: Missing, balance: str, run: int | None) -> None:
     values: Sequence[Array] = getattr(missing, balance)
     size = float(np.nanmax([np.nanmax(np.abs(v), initial=0.0) for v in values]))
-    power = decade(size)
+    power = style.decade(size)
     factor = 10.0**-power
     k = run if run is not None else int(np.argmax([np.nanmean(np.square(v)) for v in values]))
-    line(row[0], missing.t[k], values[k] * factor, color=_COLOUR[balance], lw=0.9)
+    style.line(row[0], missing.t[k], values[k] * factor, color=_COLOUR[balance], lw=0.9)
     unit = "V" if balance == "voltage" else missing.torque_unit
     noun = "force" if unit == "N" else balance
     share = missing.shares.get({"voltage": "electrical", "torque": "mechanical"}[balance])
     part = "" if share is None else f": {100 * share:.0f} % of the misfit"
-    tidy(row[0], x="time (s)", y=scaled_title(f"missing {noun}", unit, power), title=f"Missing {noun}{part}")
+    title = style.scaled_title(f"missing {noun}", unit, power)
+    style.tidy(row[0], x="time (s)", y=title, title=f"Missing {noun}{part}")
     for ax, b in zip(row[1:], missing.bins.get(balance, ()), strict=False):
         _binned(ax, b, missing.signals, values, factor, _COLOUR[balance])
     for ax in row[1 + len(missing.bins.get(balance, ())) :]:
@@ -93,19 +79,20 @@ def _binned(ax: Axes, b: Binned, signals: Sequence[Mapping[str, Array]], values:
         x, y = np.concatenate([p[0] for p in pairs]), np.concatenate([p[1] for p in pairs]) * factor
         ok = np.isfinite(x) & np.isfinite(y) & (x >= b.centre.min()) & (x <= b.centre.max())
         if ok.any():
-            scatter(ax, x[ok], y[ok], most=800, color=MUTED)
+            scatter(ax, x[ok], y[ok], most=800, color=style.MUTED)
     gaps = np.diff(b.centre)
     cuts = np.flatnonzero(gaps > max(4 * float(np.median(gaps)), 0.15 * float(np.ptp(b.centre)))) + 1
     for part in np.split(np.arange(len(b.centre)), cuts):  # no curve where there are no samples
         x = b.centre[part]
         ax.fill_between(x, b.low[part] * factor, b.high[part] * factor, color=colour, alpha=0.3, lw=0)
         ax.plot(x, b.mean[part] * factor, "-" if len(part) > 1 else "o", ms=3, color=colour, lw=1.5)
-    ax.axhline(0, color=MUTED, lw=0.6)
-    label = axis_label(b.against)
-    tidy(ax, x=f"{label.split(' (')[0]} ({b.unit})" if b.unit else label, title=f"{100 * b.explained:.0f} % explained")
+    ax.axhline(0, color=style.MUTED, lw=0.6)
+    label = style.axis_label(b.against)
+    label = f"{label.split(' (')[0]} ({b.unit})" if b.unit else label
+    style.tidy(ax, x=label, title=f"{100 * b.explained:.0f} % explained")
 
 
-@styled
+@style.styled
 def plot_ranking(result: Diagnosis | Sequence[Candidate], ax: Axes | None = None, *, show: int = 10) -> Axes:
     """Draw the effects tried, best first: the share of the misfit that each would take away.
 
@@ -123,23 +110,23 @@ def plot_ranking(result: Diagnosis | Sequence[Candidate], ax: Axes | None = None
     chosen = every[:show]
     if not chosen or not all(isinstance(c, Candidate) for c in chosen):
         raise UsageError("plot_ranking takes a diagnosis with a ranking: mi.plot_ranking(mi.diagnose(fit)).")
-    ax = only(ax, width=6.4, height=0.6 + 0.3 * len(chosen))
+    ax = style.only(ax, width=6.4, height=0.6 + 0.3 * len(chosen))
     for k, c in enumerate(chosen):
-        colour = PALETTE["blue"] if c.accepted else PALETTE["grey"]
+        colour = style.PALETTE["blue"] if c.accepted else style.PALETTE["grey"]
         if c.refit_drop is not None:
             ax.barh(k, 100 * c.refit_drop, height=0.62, color=colour, alpha=0.85)
-        ax.barh(k, 100 * c.predicted_drop, height=0.62, fill=False, edgecolor=INK, lw=0.9)
+        ax.barh(k, 100 * c.predicted_drop, height=0.62, fill=False, edgecolor=style.INK, lw=0.9)
         if c.held_out_gain is not None:
             clipped = c.held_out_gain < LOWEST_GAIN
             ax.plot(100 * max(c.held_out_gain, LOWEST_GAIN), k, "<" if clipped else "D", ms=6, mew=0.7,
-                    color=PALETTE["orange"], mec="white", zorder=3)
+                    color=style.PALETTE["orange"], mec="white", zorder=3)
     ax.set_yticks(range(len(chosen)), [c.effect for c in chosen])
     ax.set_ylim(len(chosen) - 0.4, -0.6)
     lowest = min([0.0, *(100 * max(c.held_out_gain or 0.0, LOWEST_GAIN) for c in chosen)])
     ax.set_xlim(lowest - 3 if lowest < 0 else 0, 103)
     ax.grid(axis="y", visible=False)
     more = f" (first {len(chosen)} of {len(every)})" if len(every) > len(chosen) else ""
-    tidy(ax, x="share of the misfit taken away (%)", title=f"Which effect is missing?{more}")
+    style.tidy(ax, x="share of the misfit taken away (%)", title=f"Which effect is missing?{more}")
     _ranking_legend(ax, chosen)
     return ax
 
@@ -148,17 +135,18 @@ def _ranking_legend(ax: Axes, chosen: Sequence[Candidate]) -> None:
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
-    handles: list[Any] = [Patch(fill=False, edgecolor=INK, label="predicted")]
+    handles: list[Any] = [Patch(fill=False, edgecolor=style.INK, label="predicted")]
     if any(c.accepted and c.refit_drop is not None for c in chosen):
-        handles.append(Patch(color=PALETTE["blue"], alpha=0.85, label="refitted, accepted"))
+        handles.append(Patch(color=style.PALETTE["blue"], alpha=0.85, label="refitted, accepted"))
     if any(not c.accepted and c.refit_drop is not None for c in chosen):
-        handles.append(Patch(color=PALETTE["grey"], alpha=0.85, label="refitted, not taken"))
+        handles.append(Patch(color=style.PALETTE["grey"], alpha=0.85, label="refitted, not taken"))
     if any(c.held_out_gain is not None for c in chosen):
-        handles.append(Line2D([], [], marker="D", ls="", color=PALETTE["orange"], label="fall of the held-out error"))
+        orange = style.PALETTE["orange"]
+        handles.append(Line2D([], [], marker="D", ls="", color=orange, label="fall of the held-out error"))
     ax.legend(handles=handles, loc="upper left", bbox_to_anchor=(1.0, 1.0))
 
 
-@styled
+@style.styled
 def plot_ladder(result: Ladder | Diagnosis, ax: Axes | None = None) -> Axes:
     """Draw how the error falls as effects are added: on the records of the fit, and on those it never saw.
 
@@ -171,25 +159,25 @@ def plot_ladder(result: Ladder | Diagnosis, ax: Axes | None = None) -> Axes:
     if not isinstance(ladder, Ladder) or not ladder.rungs:
         raise UsageError(f"plot_ladder takes mi.improve(fit) or mi.diagnose(fit), got {type(result).__name__}.")
     rungs = ladder.rungs
-    ax = only(ax, width=max(5.6, 1.5 + 1.25 * len(rungs)), height=3.4)
+    ax = style.only(ax, width=max(5.6, 1.5 + 1.25 * len(rungs)), height=3.4)
     x = np.arange(len(rungs), dtype=float)
     for k, c in enumerate(rungs[0].nrmse):
-        _falling(ax, x, [100 * r.nrmse[c] for r in rungs], c, CYCLE[k], held_out=False)
+        _falling(ax, x, [100 * r.nrmse[c] for r in rungs], c, style.CYCLE[k], held_out=False)
         if all(r.validation_nrmse and c in r.validation_nrmse for r in rungs):
-            _falling(ax, x, [100 * (r.validation_nrmse or {})[c] for r in rungs], c, CYCLE[k], held_out=True)
+            _falling(ax, x, [100 * (r.validation_nrmse or {})[c] for r in rungs], c, style.CYCLE[k], held_out=True)
     ax.set_yscale("log")
-    plain_decades(ax)
+    style.plain_decades(ax)
     first = "plain motor" if rungs[0].fit.model.base == "dc_motor" else "plain drive"
     started = " + ".join([first, *rungs[0].fit.model.effect_names])
     ax.set_xticks(x, [started if r.added is None else "+ " + r.added.replace(" + ", "\n+ ") for r in rungs])
     ax.set_xlim(-0.45, len(rungs) - 0.55)
-    tidy(ax, y="NRMSE (%)", title="Error as effects are added")
+    style.tidy(ax, y="NRMSE (%)", title="Error as effects are added")
     ax.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
     return ax
 
 
 def _falling(ax: Axes, x: Array, errors: Sequence[float], channel: str, colour: str, *, held_out: bool) -> None:
-    name = axis_label(channel).split(" (")[0]
+    name = style.axis_label(channel).split(" (")[0]
     ax.plot(x, errors, "s--" if held_out else "o-", color=colour, mfc="white" if held_out else colour, ms=5.5,
             label=f"{name}, {'held out' if held_out else 'fitted'}")
     ends = {0: "right", len(x) - 1: "left"} if not held_out else {}

@@ -12,31 +12,14 @@ from motorid.channels import CHANNELS
 from motorid.display.numbers import percent
 from motorid.errors import UsageError
 from motorid.numerics.noise import noise_level
-from motorid.plots.style import (
-    CYCLE,
-    INK,
-    MEASURED,
-    MODEL,
-    MUTED,
-    PALETTE,
-    RESIDUAL,
-    WIDTH,
-    axis_label,
-    band,
-    decade,
-    grid,
-    line,
-    scaled_title,
-    styled,
-    tidy,
-)
+from motorid.plots import style
 from motorid.problem.simulate import Simulation
 from motorid.records.experiment import Experiment
 
 COLUMNS = 3  # runs side by side at most: more would be unreadable
 
 
-@styled
+@style.styled
 def plot_runs(runs: Sequence[Experiment] | Experiment, channels: Sequence[str] | None = None) -> np.ndarray:
     """Draw records: the input and every measured channel over time, one column per run.
 
@@ -57,22 +40,22 @@ def plot_runs(runs: Sequence[Experiment] | Experiment, channels: Sequence[str] |
     shown = every[:COLUMNS]
     measured = [c for c in CHANNELS if any(c in r.outputs for r in shown)]
     names = list(channels or ["v", *measured])
-    axes = grid(len(names), len(shown), row=1.35, sharex="col", sharey="row")
+    axes = style.grid(len(names), len(shown), row=1.35, sharex="col", sharey="row")
     for k, run in enumerate(shown):
         for j, c in enumerate(names):
             y = run.inputs.get(c, run.outputs.get(c))
             if y is None:
                 _absent(axes[j, k], c)
             else:
-                line(axes[j, k], run.t, y, held=c == "v" and run.hold == "zoh", lw=1.0,
-                     color=INK if c == "v" else MODEL)
-        tidy(axes[0, k], title=_run_title(run, k, every))
-        tidy(axes[-1, k], x="time (s)")
+                style.line(axes[j, k], run.t, y, held=c == "v" and run.hold == "zoh", lw=1.0,
+                           color=style.INK if c == "v" else style.MODEL)
+        style.tidy(axes[0, k], title=_run_title(run, k, every))
+        style.tidy(axes[-1, k], x="time (s)")
     _label_rows(axes, names, shown)
     return axes
 
 
-@styled
+@style.styled
 def plot_fit(result: Any, *, before: Any = None) -> np.ndarray:
     """Draw measured and model over time, and below each channel the residual with the band of the noise.
 
@@ -92,7 +75,8 @@ def plot_fit(result: Any, *, before: Any = None) -> np.ndarray:
     old = _simulations(before)[:COLUMNS] if before is not None else []
     shown = every[:COLUMNS]
     names = [c for c in CHANNELS if any(c in s.outputs and c in s.experiment.outputs for s in shown)]
-    axes = grid(2 * len(names), len(shown), row=1.0, sharex="col", sharey="row", height_ratios=[1.6, 1.0] * len(names))
+    ratios = [1.6, 1.0] * len(names)
+    axes = style.grid(2 * len(names), len(shown), row=1.0, sharex="col", sharey="row", height_ratios=ratios)
     for k, s in enumerate(shown):
         for j, c in enumerate(names):
             if c in s.experiment.outputs:
@@ -101,11 +85,11 @@ def plot_fit(result: Any, *, before: Any = None) -> np.ndarray:
             else:
                 _absent(axes[2 * j, k], c)
                 axes[2 * j + 1, k].set_axis_off()
-        tidy(axes[0, k], title=_run_title(s.experiment, k, [e.experiment for e in every]))
-        tidy(axes[-1, k], x="time (s)")
+        style.tidy(axes[0, k], title=_run_title(s.experiment, k, [e.experiment for e in every]))
+        style.tidy(axes[-1, k], x="time (s)")
     for j, c in enumerate(names):
         run = next(s.experiment for s in shown if c in s.experiment.outputs)
-        axes[2 * j, 0].set_ylabel(axis_label(c, run))
+        axes[2 * j, 0].set_ylabel(style.axis_label(c, run))
         axes[2 * j + 1, 0].set_ylabel(f"residual\n({run.units[c]})")
     axes[0, 0].figure.align_ylabels(axes[:, 0])
     handles, labels = axes[0, 0].get_legend_handles_labels()
@@ -116,21 +100,21 @@ def plot_fit(result: Any, *, before: Any = None) -> np.ndarray:
 
 def _curves(ax: Axes, s: Simulation, channel: str, old: Simulation | None) -> None:
     y = s.experiment.outputs[channel]
-    line(ax, s.experiment.t, y, color=MEASURED, lw=3.2, alpha=0.5, label="measured")
+    style.line(ax, s.experiment.t, y, color=style.MEASURED, lw=3.2, alpha=0.5, label="measured")
     if old is not None and channel in old.outputs:
-        line(ax, s.experiment.t, old.outputs[channel], color=PALETTE["yellow"], lw=1.0, label="before")
-    line(ax, s.experiment.t, s.outputs[channel], color=MODEL, lw=1.2, label="model")
+        style.line(ax, s.experiment.t, old.outputs[channel], color=style.PALETTE["yellow"], lw=1.0, label="before")
+    style.line(ax, s.experiment.t, s.outputs[channel], color=style.MODEL, lw=1.2, label="model")
     good = np.isfinite(y)
     error = np.sqrt(np.sum(s.residual(channel)[good] ** 2) / max(float(np.sum(y[good] ** 2)), 1e-300))
-    ax.set_title(f"NRMSE {percent(error)}", loc="right", fontsize=8, color=MUTED)
+    ax.set_title(f"NRMSE {percent(error)}", loc="right", fontsize=8, color=style.MUTED)
 
 
 def _residual(ax: Axes, s: Simulation, channel: str, old: Simulation | None) -> None:
     sigma = s.experiment.sigma.get(channel) or noise_level(s.experiment.outputs[channel], s.experiment.t)
-    band(ax, 2 * sigma, "noise, ±2σ")
+    style.band(ax, 2 * sigma, "noise, ±2σ")
     if old is not None and channel in old.outputs:
-        line(ax, s.experiment.t, old.residual(channel), color=PALETTE["yellow"], lw=0.8)
-    line(ax, s.experiment.t, s.residual(channel), color=RESIDUAL, lw=0.9, label="residual")
+        style.line(ax, s.experiment.t, old.residual(channel), color=style.PALETTE["yellow"], lw=0.8)
+    style.line(ax, s.experiment.t, s.residual(channel), color=style.RESIDUAL, lw=0.9, label="residual")
 
 
 def _simulations(result: Any) -> list[Simulation]:
@@ -152,16 +136,16 @@ def _run_title(run: Experiment, k: int, every: Sequence[Experiment]) -> str:
 def _label_rows(axes: np.ndarray, names: Sequence[str], runs: Sequence[Experiment]) -> None:
     for j, c in enumerate(names):
         run = next((r for r in runs if c in r.outputs or c in r.inputs), runs[0])
-        axes[j, 0].set_ylabel(axis_label(c, run))
+        axes[j, 0].set_ylabel(style.axis_label(c, run))
     axes[0, 0].figure.align_ylabels(axes[:, 0])
 
 
 def _absent(ax: Axes, channel: str) -> None:
-    ax.text(0.5, 0.5, f"{channel} not measured", transform=ax.transAxes, ha="center", va="center", color=MUTED)
+    ax.text(0.5, 0.5, f"{channel} not measured", transform=ax.transAxes, ha="center", va="center", color=style.MUTED)
     ax.grid(visible=False)
 
 
-@styled
+@style.styled
 def plot_parameters(*results: Any, truth: Mapping[str, float] | None = None,
                     names: Sequence[str] | None = None) -> np.ndarray:
     """Draw how the parameters moved from fit to fit, each with an interval of two standard deviations.
@@ -184,14 +168,14 @@ def plot_parameters(*results: Any, truth: Mapping[str, float] | None = None,
     chosen = list(names or dict.fromkeys(n for f in fits for n, p in f.model.parameters.items() if p.vary))
     columns = {6: 3, 7: 4, 8: 4}.get(len(chosen), min(len(chosen), 5))
     rows = -(-len(chosen) // columns)
-    axes = grid(rows, columns, row=1.75, width=WIDTH * max(columns, 3) / 5).ravel()
+    axes = style.grid(rows, columns, row=1.75, width=style.WIDTH * max(columns, 3) / 5).ravel()
     for ax, name in zip(axes, chosen, strict=False):
         _one_parameter(ax, fits, name, (truth or {}).get(name))
     for ax in axes[len(chosen):]:
         ax.set_axis_off()
     notes = [f"{k + 1}: {_added(f, fits[k - 1] if k else None)}" for k, f in enumerate(fits)]
     notes += ["dashed: true value"] * bool(truth) + ["bars: ±2σ"]
-    axes[0].figure.supxlabel("   ·   ".join(notes), fontsize=8, color=MUTED)
+    axes[0].figure.supxlabel("   ·   ".join(notes), fontsize=8, color=style.MUTED)
     return axes[: len(chosen)]
 
 
@@ -202,20 +186,20 @@ def _one_parameter(ax: Axes, fits: Sequence[Any], name: str, truth: float | None
     if parameter is not None and parameter.periodic and truth is not None:  # the same angle, some turns further
         truth += 2 * np.pi * round((fits[known[-1]].values[name] - truth) / (2 * np.pi))
     values = np.array([fits[k].values[name] for k in known] + ([] if truth is None else [truth]))
-    power = decade(float(np.max(np.abs(values))))
+    power = style.decade(float(np.max(np.abs(values))))
     if truth is not None:
-        ax.axhline(truth / 10.0**power, color=PALETTE["green"], lw=1.2, ls=(0, (4, 2)))
+        ax.axhline(truth / 10.0**power, color=style.PALETTE["green"], lw=1.2, ls=(0, (4, 2)))
     for k in known:
-        value, std, colour = fits[k].values[name], fits[k].std.get(name), CYCLE[k % len(CYCLE)]
+        value, std, colour = fits[k].values[name], fits[k].std.get(name), style.CYCLE[k % len(style.CYCLE)]
         ax.errorbar(k + 1, value / 10.0**power, yerr=2 * (std or 0.0) / 10.0**power, fmt="o", ms=5,
                     capsize=3 if std else 0, lw=1.4, color=colour, mfc="none" if std is None else colour)
         if std is None:
             ax.annotate("not\ndetermined", (k + 1, value / 10.0**power), (0, 6), textcoords="offset points",
-                        ha="center", fontsize=7, color=MUTED)
+                        ha="center", fontsize=7, color=style.MUTED)
     ax.set_xlim(0.4, len(fits) + 0.6)
     ax.set_xticks(range(1, len(fits) + 1))
     _around(ax, values / 10.0**power)
-    tidy(ax, title=scaled_title(name, unit, power))
+    style.tidy(ax, title=style.scaled_title(name, unit, power))
     ax.grid(axis="x", visible=False)
 
 

@@ -13,29 +13,14 @@ from motorid.errors import UsageError, one_of
 from motorid.estimation.result import Fit
 from motorid.numerics.autoregression import autocorrelation
 from motorid.numerics.signals import Array
-from motorid.plots.style import (
-    INK,
-    MUTED,
-    PALETTE,
-    PAPER,
-    RESIDUAL,
-    WIDTH,
-    above,
-    axis_label,
-    band,
-    finite,
-    line,
-    new_figure,
-    styled,
-    tidy,
-)
+from motorid.plots import style
 from motorid.problem.simulate import Simulation
 
 LAGS = 60
 BINS = 24
 
 
-@styled
+@style.styled
 def plot_residuals(fit: Fit, channels: Sequence[str] | None = None) -> np.ndarray:
     """Draw the residuals of each channel: over time, their histogram and autocorrelation, against
     the model's ω, i, θ.
@@ -61,7 +46,7 @@ def plot_residuals(fit: Fit, channels: Sequence[str] | None = None) -> np.ndarra
             raise UsageError(one_of(c, present, "channel"))
     names = list(channels or present)
     against = [c for c in ("omega", "i", "theta") if c in present]
-    figure = new_figure(WIDTH, 3.3 * len(names) + 0.2)
+    figure = style.new_figure(style.WIDTH, 3.3 * len(names) + 0.2)
     rows = figure.add_gridspec(2 * len(names), 12)
     axes = np.empty((len(names), 3 + len(against)), object)
     for j, c in enumerate(names):
@@ -81,16 +66,16 @@ def _channel(axes: np.ndarray, fit: Fit, channel: str, against: Sequence[str]) -
     unit = run.units[channel]
     sigma = float(np.mean([r.sigma[channel] for r in fit.problem.runs if channel in r.sigma]))
     _over_time(axes[0], sims, channel, sigma)
-    tidy(axes[0], x="time, runs one after the other (s)", y=f"residual ({unit})",
-         title=f"Residual of the {axis_label(channel, run)}")
+    style.tidy(axes[0], x="time, runs one after the other (s)", y=f"residual ({unit})",
+               title=f"Residual of the {style.axis_label(channel, run)}")
     every = np.concatenate([s.residual(channel) for s in sims])
-    _histogram(axes[1], finite(every, f"the residual of {channel}"), sigma)
+    _histogram(axes[1], style.finite(every, f"the residual of {channel}"), sigma)
     _autocorrelation(axes[2], [s.residual(channel) for s in sims])
     for ax, other in zip(axes[3:], against, strict=True):
         # The model's own: the measured one shares its noise with the residual, which then seems to depend.
         with_other = [s for s in sims if other in s.outputs]
         _against(ax, [s.outputs[other] for s in with_other], [s.residual(channel) for s in with_other], sigma)
-        tidy(ax, x=axis_label(other, run), title=f"Against {axis_label(other, run).split(' (')[0]}")
+        style.tidy(ax, x=style.axis_label(other, run), title=f"Against {style.axis_label(other, run).split(' (')[0]}")
         ax.sharey(axes[3])
     if len(axes) > 3:
         axes[3].set_ylabel(f"residual ({unit})")
@@ -98,32 +83,32 @@ def _channel(axes: np.ndarray, fit: Fit, channel: str, against: Sequence[str]) -
 
 def _over_time(ax: Axes, sims: Sequence[Simulation], channel: str, sigma: float) -> None:
     shift = 0.0
-    band(ax, 2 * sigma, "noise, ±2σ")
+    style.band(ax, 2 * sigma, "noise, ±2σ")
     for k, s in enumerate(sims):
         t = s.experiment.t - s.experiment.t[0]
-        line(ax, t + shift, s.residual(channel), color=RESIDUAL, lw=0.8)
+        style.line(ax, t + shift, s.residual(channel), color=style.RESIDUAL, lw=0.8)
         if len(sims) <= 6:
             ax.annotate(s.experiment.name, (shift, 1), (3, -2), xycoords=("data", "axes fraction"),
-                        textcoords="offset points", va="top", fontsize=7, color=MUTED,
-                        bbox={"facecolor": PAPER, "alpha": 0.8, "lw": 0, "pad": 1})
+                        textcoords="offset points", va="top", fontsize=7, color=style.MUTED,
+                        bbox={"facecolor": style.PAPER, "alpha": 0.8, "lw": 0, "pad": 1})
         shift += float(t[-1])
         if k + 1 < len(sims):
-            ax.axvline(shift, color=MUTED, lw=0.7)
-    above(ax)
+            ax.axvline(shift, color=style.MUTED, lw=0.7)
+    style.above(ax)
 
 
 def _histogram(ax: Axes, r: Array, sigma: float) -> None:
     edges = np.linspace(r.min(), r.max(), 41) if np.ptp(r) > 0 else np.linspace(-1, 1, 41)
-    ax.hist(r, edges.tolist(), density=True, orientation="horizontal", color=RESIDUAL, alpha=0.55)
+    ax.hist(r, edges.tolist(), density=True, orientation="horizontal", color=style.RESIDUAL, alpha=0.55)
     y = np.linspace(-4 * sigma, 4 * sigma, 121)
     top = float(np.max(np.histogram(r, edges, density=True)[0]))
     bell = np.exp(-0.5 * (y / sigma) ** 2) / (sigma * np.sqrt(2 * np.pi))
-    ax.plot(bell, y, color=INK, lw=1.0, label="noise")
+    ax.plot(bell, y, color=style.INK, lw=1.0, label="noise")
     ax.set_xlim(0, 1.25 * max(top, float(bell.max()) if bell.max() < 4 * top else top))
     ax.set_xticks([])
     ax.tick_params(labelleft=False)
-    tidy(ax, x="density", title="Histogram")
-    above(ax)
+    style.tidy(ax, x="density", title="Histogram")
+    style.above(ax)
 
 
 def _autocorrelation(ax: Axes, residuals: Sequence[Array]) -> None:
@@ -131,13 +116,13 @@ def _autocorrelation(ax: Axes, residuals: Sequence[Array]) -> None:
     every = np.concatenate(list(residuals))
     rho = autocorrelation([r - np.nanmean(every) for r in residuals], lags)
     half = 1.96 / np.sqrt(np.isfinite(every).sum())
-    band(ax, half, "white noise, 95 %")
+    style.band(ax, half, "white noise, 95 %")
     k = np.arange(1, lags + 1)
-    ax.vlines(k, 0, rho[1:], color=PALETTE["purple"], lw=1.2)
-    ax.axhline(0, color=MUTED, lw=0.6)
+    ax.vlines(k, 0, rho[1:], color=style.PALETTE["purple"], lw=1.2)
+    ax.axhline(0, color=style.MUTED, lw=0.6)
     ax.set_ylim(min(-0.25, float(rho.min()) * 1.1), max(0.4, min(1.05, float(rho[1:].max(initial=0)) * 1.25)))
-    tidy(ax, x="lag (samples)", y="correlation", title="Autocorrelation")
-    above(ax)
+    style.tidy(ax, x="lag (samples)", y="correlation", title="Autocorrelation")
+    style.above(ax)
 
 
 def _against(ax: Axes, x: Sequence[Array], r: Sequence[Array], sigma: float) -> None:
@@ -147,15 +132,15 @@ def _against(ax: Axes, x: Sequence[Array], r: Sequence[Array], sigma: float) -> 
     xs, rs = np.concatenate(list(x)), np.concatenate(list(r))
     ok = np.isfinite(xs) & np.isfinite(rs)
     xs, rs = xs[ok], rs[ok]
-    band(ax, 2 * sigma)
+    style.band(ax, 2 * sigma)
     scatter(ax, xs, rs)
     centre, mean, half = binned_means(xs, rs)
-    ax.errorbar(centre, mean, yerr=half, fmt="o", ms=2.5, lw=1.1, color=INK)
+    ax.errorbar(centre, mean, yerr=half, fmt="o", ms=2.5, lw=1.1, color=style.INK)
     gaps = np.flatnonzero(np.diff(centre) > 1.5 * np.ptp(xs) / BINS) + 1  # no line over empty bins
-    ax.plot(np.insert(centre, gaps, np.nan), np.insert(mean, gaps, np.nan), lw=1.1, color=INK)
+    ax.plot(np.insert(centre, gaps, np.nan), np.insert(mean, gaps, np.nan), lw=1.1, color=style.INK)
 
 
-def scatter(ax: Axes, x: Any, y: Any, most: int = 1500, color: str = RESIDUAL) -> None:
+def scatter(ax: Axes, x: Any, y: Any, most: int = 1500, color: str = style.RESIDUAL) -> None:
     """Draw points, every so many of them where there are too many, the extreme ones always."""
     keep = np.arange(len(x))[:: max(1, len(x) // most)]
     extreme = np.argsort(y)[[*range(min(5, len(y))), *range(-min(5, len(y)), 0)]]

@@ -15,32 +15,16 @@ from motorid.display.numbers import number
 from motorid.errors import UsageError, one_of
 from motorid.estimation.result import Fit
 from motorid.numerics.signals import Array
-from motorid.plots.style import (
-    CYCLE,
-    INK,
-    MUTED,
-    PALETTE,
-    WIDTH,
-    axis_label,
-    band,
-    decade,
-    grid,
-    line,
-    new_figure,
-    plain_decades,
-    scaled_title,
-    styled,
-    tidy,
-)
+from motorid.plots import style
 from motorid.uncertainty.identifiability import Identifiability
 from motorid.uncertainty.multistart import Multistart, StartResult
 from motorid.uncertainty.profile import Intervals, Profile
 
 LEVEL = 0.95
-_KINDS = {"good": PALETTE["blue"], "poor": PALETTE["orange"], "failed": PALETTE["grey"]}
+_KINDS = {"good": style.PALETTE["blue"], "poor": style.PALETTE["orange"], "failed": style.PALETTE["grey"]}
 
 
-@styled
+@style.styled
 def plot_singular_values(result: Identifiability) -> np.ndarray:
     """Draw how well each direction of the parameters is seen, and which parameters make it up.
 
@@ -59,19 +43,19 @@ def plot_singular_values(result: Identifiability) -> np.ndarray:
     if not isinstance(result, Identifiability):
         raise UsageError(f"plot_singular_values takes mi.identifiability(fit), got {type(result).__name__}.")
     k = len(result.names)
-    axes = new_figure(min(WIDTH, 4.6 + 0.6 * k), 3.2).subplots(1, 2, width_ratios=[1.0, max(0.8, 0.16 * k)])
+    axes = style.new_figure(min(style.WIDTH, 4.6 + 0.6 * k), 3.2).subplots(1, 2, width_ratios=[1.0, max(0.8, 0.16 * k)])
     rows = np.arange(1, k + 1)
     values = np.maximum(result.singular_values, 1e-12 * max(float(result.singular_values[0]), 1e-300))
-    colours = [PALETTE["blue"] if v > 1 else PALETTE["orange"] for v in values]
+    colours = [style.PALETTE["blue"] if v > 1 else style.PALETTE["orange"] for v in values]
     axes[0].vlines(rows, min(0.1, 0.5 * float(values.min())), values, color=colours, lw=2)
     axes[0].scatter(rows, values, color=colours, s=24, zorder=3)
     axes[0].set_yscale("log")
     axes[0].set_ylim(min(0.1, 0.5 * float(values.min())), 2.5 * float(values[0]))
-    axes[0].axhspan(axes[0].get_ylim()[0], 1, color=MUTED, alpha=0.16, lw=0, zorder=0)
+    axes[0].axhspan(axes[0].get_ylim()[0], 1, color=style.MUTED, alpha=0.16, lw=0, zorder=0)
     axes[0].set_xticks(rows)
-    plain_decades(axes[0])
+    style.plain_decades(axes[0])
     words = f"rank {result.rank} of {k}, condition number {number(result.condition_number, 3)}"
-    tidy(axes[0], x="direction", y="singular value", title=words)
+    style.tidy(axes[0], x="direction", y="singular value", title=words)
     _directions(axes[1], result)
     return axes
 
@@ -79,17 +63,17 @@ def plot_singular_values(result: Identifiability) -> np.ndarray:
 def _directions(ax: Axes, result: Identifiability) -> None:
     for row, direction in enumerate(result.directions, 1):
         for column, weight in enumerate(direction):
-            colour = PALETTE["blue"] if weight > 0 else PALETTE["orange"]
+            colour = style.PALETTE["blue"] if weight > 0 else style.PALETTE["orange"]
             ax.scatter(column, row, s=180 * abs(float(weight)) ** 1.5, color=colour, alpha=0.85, lw=0)
     k = len(result.names)
     ax.set_xticks(range(k), result.names)
     ax.set_yticks(range(1, k + 1))
     ax.set_ylim(k + 0.6, 0.4)
     ax.set_xlim(-0.6, k - 0.4)
-    tidy(ax, y="direction", title="What each direction is made of")
+    style.tidy(ax, y="direction", title="What each direction is made of")
 
 
-@styled
+@style.styled
 def plot_profile(result: Profile | Mapping[str, Profile] | Intervals) -> np.ndarray:
     """Draw how the misfit rises as a parameter is fixed away from its value, all others refitted.
 
@@ -109,7 +93,7 @@ def plot_profile(result: Profile | Mapping[str, Profile] | Intervals) -> np.ndar
     profiles = _profiles(result)
     columns = min(len(profiles), 3)
     rows = -(-len(profiles) // columns)
-    axes = grid(rows, columns, row=2.2, width=WIDTH if columns == 3 else 4.2 * columns).ravel()
+    axes = style.grid(rows, columns, row=2.2, width=style.WIDTH if columns == 3 else 4.2 * columns).ravel()
     both = result if isinstance(result, Intervals) else None
     for ax, p in zip(axes, profiles, strict=False):
         _one_profile(ax, p, both)
@@ -125,22 +109,22 @@ def plot_profile(result: Profile | Mapping[str, Profile] | Intervals) -> np.ndar
 def _one_profile(ax: Axes, p: Profile, both: Intervals | None) -> None:
     level = both.level if both is not None else LEVEL
     height = float(stdtrit(p.dof, 0.5 + level / 2)) ** 2
-    scale = 10.0 ** -decade(abs(p.value))
-    ax.plot(*_smooth(p.values * scale, p.rise, p.value * scale), "-", color=PALETTE["blue"], label="profile")
-    ax.plot(p.values * scale, p.rise, ".", ms=4, color=PALETTE["blue"])
-    ax.axhline(height, color=INK, lw=0.9, ls=(0, (4, 2)), label=f"{100 * level:g} %")
-    ax.plot(p.value * scale, 0, "o", ms=6, color=PALETTE["blue"])
+    scale = 10.0 ** -style.decade(abs(p.value))
+    ax.plot(*_smooth(p.values * scale, p.rise, p.value * scale), "-", color=style.PALETTE["blue"], label="profile")
+    ax.plot(p.values * scale, p.rise, ".", ms=4, color=style.PALETTE["blue"])
+    ax.axhline(height, color=style.INK, lw=0.9, ls=(0, (4, 2)), label=f"{100 * level:g} %")
+    ax.plot(p.value * scale, 0, "o", ms=6, color=style.PALETTE["blue"])
     ends = np.clip(p.interval(level), float(p.values.min()), float(p.values.max()))
-    ax.axvspan(ends[0] * scale, ends[1] * scale, color=PALETTE["blue"], alpha=0.1, lw=0)
+    ax.axvspan(ends[0] * scale, ends[1] * scale, color=style.PALETTE["blue"], alpha=0.1, lw=0)
     if both is not None:
         known, drawn = both.covariance.interval(p.name, level), both.bootstrap.interval(p.name, level)
         for y, limits, name, colour in ((-0.8, known, "covariance", "purple"), (-1.7, drawn, "bootstrap", "green")):
             if limits is not None:
-                ax.plot(np.array(limits) * scale, [y, y], "|-", color=PALETTE[colour], lw=2, ms=6, label=name)
+                ax.plot(np.array(limits) * scale, [y, y], "|-", color=style.PALETTE[colour], lw=2, ms=6, label=name)
     ax.set_ylim(-2.4 if both is not None else -0.4, max(1.5 * height, 2.0))
     ax.set_yticks([y for y in ax.get_yticks() if 0 <= y <= ax.get_ylim()[1]])
     _reach(ax, p, height, scale)
-    tidy(ax, x=scaled_title(p.name, p.unit, decade(abs(p.value))))
+    style.tidy(ax, x=style.scaled_title(p.name, p.unit, style.decade(abs(p.value))))
 
 
 def _reach(ax: Axes, p: Profile, height: float, scale: float) -> None:
@@ -173,7 +157,7 @@ def _profiles(result: Any) -> Sequence[Profile]:
     return chosen
 
 
-@styled
+@style.styled
 def plot_sensitivities(fit: Fit, *, run: int = 0, names: Sequence[str] | None = None) -> np.ndarray:
     """Draw what one per cent of each parameter does to the outputs, beside the noise.
 
@@ -203,26 +187,26 @@ def plot_sensitivities(fit: Fit, *, run: int = 0, names: Sequence[str] | None = 
     assert trajectory.dy is not None
     record = problem.experiments[run]
     channels = [c for c in problem.outputs if c in record.outputs]
-    figure = new_figure(WIDTH, 1.9 * len(channels) + 0.3)
+    figure = style.new_figure(style.WIDTH, 1.9 * len(channels) + 0.3)
     axes = figure.subplots(len(channels), 1, sharex=True, squeeze=False).ravel()
     slope = problem.scaling.slope(fit.q)
     for ax, c in zip(axes, channels, strict=True):
-        band(ax, problem.runs[run].sigma[c], "noise, ±σ")
+        style.band(ax, problem.runs[run].sigma[c], "noise, ±σ")
         for k, name in enumerate(names or free):
             j = free.index(name)
             step = 0.01 * (abs(fit.values[name]) or problem.scaling.scale[j])
             change = trajectory.dy[:, problem.outputs.index(c), j] / slope[j] * step
-            style = ("-", "--", ":")[k // len(CYCLE) % 3]
-            line(ax, record.t, change, color=CYCLE[k % len(CYCLE)], ls=style, label=name)
-        tidy(ax, y=f"change of {axis_label(c, record).replace(' (', chr(10) + '(')}")
-    tidy(axes[0], title=f"What +1 % of each parameter does, {record.name}")
-    tidy(axes[-1], x="time (s)")
+            dashes = ("-", "--", ":")[k // len(style.CYCLE) % 3]
+            style.line(ax, record.t, change, color=style.CYCLE[k % len(style.CYCLE)], ls=dashes, label=name)
+        style.tidy(ax, y=f"change of {style.axis_label(c, record).replace(' (', chr(10) + '(')}")
+    style.tidy(axes[0], title=f"What +1 % of each parameter does, {record.name}")
+    style.tidy(axes[-1], x="time (s)")
     axes[0].legend(loc="upper left", bbox_to_anchor=(1.0, 1.05))
     figure.align_ylabels(axes)
     return axes
 
 
-@styled
+@style.styled
 def plot_waterfall(result: Multistart) -> np.ndarray:
     """Draw where fits from random starts ended: their errors in order, and how far the parameters came.
 
@@ -239,7 +223,7 @@ def plot_waterfall(result: Multistart) -> np.ndarray:
     """
     if not isinstance(result, Multistart):
         raise UsageError(f"plot_waterfall takes mi.multistart(fit), got {type(result).__name__}.")
-    axes = new_figure(WIDTH, 3.1).subplots(1, 2, width_ratios=[1.0, 1.2])
+    axes = style.new_figure(style.WIDTH, 3.1).subplots(1, 2, width_ratios=[1.0, 1.2])
     ends = [(e, k) for e, k in zip(result.results, result.kinds, strict=True) if isinstance(e, StartResult)]
     ends = sorted(((e, k) for e, k in ends if np.isfinite(e.cost)), key=lambda p: p[0].cost)
     _sorted_costs(axes[0], result, ends)
@@ -256,10 +240,10 @@ def _sorted_costs(ax: Axes, result: Multistart, ends: Sequence[tuple[StartResult
             ax.plot(where + 1, ratio[where], "o", ms=4, color=colour, label=f"{kind} ({where.size})")
     ax.set_yscale("log")
     ax.set_ylim(0.9, max(2.2, float(ratio.max(initial=1.0)) * 1.5))
-    plain_decades(ax)
+    style.plain_decades(ax)
     words = f"{len(result.results)} starts, off by up to {result.spread:g} times"
     words += f", {result.failed} failed" if result.failed else ""
-    tidy(ax, x="fits, best first", y="misfit over the best (χ² ratio)", title=words)
+    style.tidy(ax, x="fits, best first", y="misfit over the best (χ² ratio)", title=words)
     ax.legend(loc="upper left")
 
 
@@ -269,14 +253,14 @@ def _starts_and_ends(ax: Axes, result: Multistart, ends: Sequence[tuple[StartRes
         middle = result.reference.values[name]
         starts = np.array([e.start[name] / middle for e in result.results if name in e.start])
         shift = np.linspace(-0.3, 0.0, max(len(starts), 1))[: len(starts)]
-        ax.plot(j + shift, starts, ".", ms=3, color=PALETTE["grey"], alpha=0.7, label="start" if j == 0 else None)
+        ax.plot(j + shift, starts, ".", ms=3, color=style.PALETTE["grey"], alpha=0.7, label="start" if j == 0 else None)
         for kind, colour in _KINDS.items():
             there = [e.values[name] / middle for e, k in ends if k == kind]
             ax.plot(np.full(len(there), j + 0.2), there, "o", ms=4, color=colour, alpha=0.8)
-    ax.axhline(1, color=MUTED, lw=0.7)
+    ax.axhline(1, color=style.MUTED, lw=0.7)
     if all(result.reference.values[n] > 0 for n in names):
         ax.set_yscale("log")
-        plain_decades(ax)
+        style.plain_decades(ax)
     ax.set_xticks(range(len(names)), names)
     ax.set_xlim(-0.6, len(names) - 0.4)
-    tidy(ax, y="value over the reference", title="Where they began (dots) and ended (circles)")
+    style.tidy(ax, y="value over the reference", title="Where they began (dots) and ended (circles)")

@@ -38,8 +38,6 @@ class Simulation:
     outputs : dict of str to ndarray
         Model outputs at the samples, SI.
     states : dict of str to ndarray
-    initial : dict of str to float
-        Initial state used.
     """
 
     experiment: Experiment

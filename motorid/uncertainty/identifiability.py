@@ -9,9 +9,9 @@ planned experiments too.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import combinations, product
+from itertools import combinations, islice, product
 from typing import Any
 
 import numpy as np
@@ -272,8 +272,8 @@ def sparse_basis(weak: Array) -> Array:
     if d == 0:
         return weak
     best, fewest = weak, np.inf
-    for pivots in _some(combinations(range(k), d)):
-        block = weak[:, pivots]
+    for pivots in islice(combinations(range(k), d), MOST):
+        block = weak[:, list(pivots)]
         if abs(np.linalg.det(block)) < 1e-3:
             continue
         rows = np.linalg.solve(block, weak)
@@ -285,11 +285,6 @@ def sparse_basis(weak: Array) -> Array:
         if entries < fewest:
             best, fewest = rows, entries
     return best
-
-
-def _some(choices: Iterator[tuple[int, ...]]) -> Iterator[list[int]]:
-    for _, choice in zip(range(MOST), choices, strict=False):
-        yield list(choice)
 
 
 def monomials(names: Sequence[str], weak: Array) -> list[str]:
