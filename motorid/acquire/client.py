@@ -73,8 +73,7 @@ class Client:
         _, _, mv, ma = self.ask(f"L,{_milli(v)},{_milli(i)}", "A,L")
         if int(mv) > _milli(v) or int(ma) > _milli(i):
             raise DeviceError(f"the device was told to stay within {v:g} V and {i:g} A and answers with "
-                              f"{int(mv) / 1e3:g} V and {int(ma) / 1e3:g} A. Nothing was applied to the "
-                              "motor.")
+                              f"{int(mv) / 1e3:g} V and {int(ma) / 1e3:g} A. Nothing was applied to the motor.")
         for k, segment in enumerate(program.segments):
             self.ask(",".join(map(str, ("S", k, *segment.fields))), f"A,S,{k}")
         return int(mv) / 1e3, int(ma) / 1e3

@@ -175,8 +175,7 @@ def program(words: str | Program | None, v_max: float = math.inf) -> Program:
         values = [_number(n, word) for n in numbers]
         if not least <= len(values) <= most:
             many = f"{least} to {most}" if most > least else f"{least}"
-            raise UsageError(f"'{word}': {name} takes {many} numbers, as in '{_EXAMPLES[name]}'; "
-                             f"got {len(values)}.")
+            raise UsageError(f"'{word}': {name} takes {many} numbers, as in '{_EXAMPLES[name]}'; got {len(values)}.")
         segments += make(*values)
     return Program(tuple(segments), words)
 

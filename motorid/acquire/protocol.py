@@ -4,10 +4,9 @@ Everything, both ways, is a frame of printable ASCII on a line of its own::
 
     $<kind>,<field>,<field>…*<CRC>\\n
 
-with the CRC-16/CCITT-FALSE (polynomial 0x1021, start 0xFFFF, check value 29B1 for "123456789") of the bytes
-between ``$`` and ``*``, as four upper-case hexadecimal digits. A frame ends with its CRC; the newline is for
-the eye. A body has 1 to 240 bytes and holds neither ``$`` nor ``*``, so a reader finds its feet at the next
-``$``.
+with the CRC-16/CCITT-FALSE (polynomial 0x1021, start 0xFFFF, check value 29B1 for "123456789") of the bytes between
+``$`` and ``*``, as four upper-case hexadecimal digits. A frame ends with its CRC; the newline is for the eye. A body
+has 1 to 240 bytes and holds neither ``$`` nor ``*``, so a reader finds its feet at the next ``$``.
 
 From the device
     ``H,1,<name>,<rate_Hz>,<counter bits>,<timer bits>,<V_max V>,<I_max A>,<most segments>,<channel>…``
@@ -15,9 +14,8 @@ From the device
         kind is ``n`` (a number), ``a12`` (a 12-bit converter, whose end values mean *clipped*) or ``w16`` (a
         counter that wraps after 16 bits, two's complement or not).
     ``D,<counter>,<time µs>,<raw>…``
-        One sample, raw values in the order of the channels, integer or decimal, empty where missing. ``v`` is
-        the voltage commanded *from* this instant on, the other channels are measured *at* it. Counter and
-        timer wrap.
+        One sample, raw values in the order of the channels, integer or decimal, empty where missing. ``v`` is the
+        voltage commanded *from* this instant on, the other channels are measured *at* it. Counter and timer wrap.
     ``A,<command>,…``
         A command was carried out: ``A,L,<mV>,<mA>`` (the limits now in force), ``A,S,<index>``,
         ``A,G,<counter of the first sample>,<its time µs>``.

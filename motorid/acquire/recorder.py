@@ -89,9 +89,8 @@ def record(port: str | Link, out: str | Path, *, baud: int = 115_200, excite: st
         mode = "resume" if plan.tail else "replace" if force else "new"
         file = RecordFile(out, header.channels, header.rate, head if not plan.tail else {}, mode)
         try:
-            setup = Setup(client, header, file, len(todo.segments), _commanded(device, header, todo),
-                          limits[1], _total(todo, duration), duration, max(timeout, 4 / header.rate),
-                          progress)
+            setup = Setup(client, header, file, len(todo.segments), _commanded(device, header, todo), limits[1],
+                          _total(todo, duration), duration, max(timeout, 4 / header.rate), progress)
             return Session(setup, lambda: plan.begin(file, done)).run()
         finally:
             with contextlib.suppress(OSError):  # told already, where it matters

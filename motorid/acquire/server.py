@@ -11,7 +11,6 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 
@@ -133,32 +132,6 @@ class _Bench:
         self.plugged = True
 
 
-class Transport(Protocol):
-    """The device's end of a wire."""
-
-    name: str  # what the recorder is told as --port
-
-    def wait(self, writing: bool, timeout: float) -> None:
-        """Wait until there is something to read (or room to write)."""
-        ...
-
-    def read(self) -> bytes:
-        """Return what the computer sent; nothing is an answer."""
-        ...
-
-    def write(self, data: bytes) -> int:
-        """Return how many bytes were taken."""
-        ...
-
-    def unplug(self) -> None:
-        """Vanish."""
-        ...
-
-    def plug(self) -> None:
-        """Appear again."""
-        ...
-
-
 class Pty:
     """A pseudo-terminal; `link` is a symbolic link that follows it from one plugging to the next."""
 
@@ -272,6 +245,9 @@ class Socket:
         if self._peer:
             self._peer.close()
             self._peer = None
+
+
+Transport = Pty | Socket  # the device's end of a wire; `name` is what the recorder is told as --port
 
 
 def open_transport(link: Path | None = None, port: int | None = None) -> Transport:

@@ -32,12 +32,10 @@ SENTENCES = {
     "done": "The excitation ran to its end.",
     "duration": "The time asked for is over; the motor was stopped.",
     "interrupted": "Stopped by hand; the motor was stopped.",
-    "limit": "The current limit was reached; the motor was switched off. Lower the voltage or raise the "
-             "limit.",
+    "limit": "The current limit was reached; the motor was switched off. Lower the voltage or raise the limit.",
     "emergency": "The emergency stop of the bench was opened; the motor was switched off.",
     "watchdog": "The device heard nothing from this computer for a second and switched the motor off.",
-    "unplugged": "The device is gone (unplugged, or its port was closed). Plug it in again and go on with "
-                 "--resume.",
+    "unplugged": "The device is gone (unplugged, or its port was closed). Plug it in again and go on with --resume.",
     "silent": "The device stopped talking. See whether it is powered, then go on with --resume.",
     "restarted": "The device restarted in the middle of the run (a reset, or its supply broke down). Go on "
                  "with --resume.",

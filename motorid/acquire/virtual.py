@@ -207,9 +207,8 @@ class Truth:
         m = self.motor
         hidden = [f"{name} ({', '.join(f'{k} = {v:.4g}' for k, v in values.items())})"
                   for name, values in self.effects.items()]
-        return (f"hidden: {'; '.join(hidden) or 'nothing'}\n"
-                f"motor '{m.name}', seed {self.seed}: R = {m.R:.5g} Ω, L = {m.L:.5g} H, "
-                f"K = {m.K:.5g} V·s/rad, b = {m.b:.5g} N·m·s/rad, J = {m.J:.5g} kg·m²")
+        return (f"hidden: {'; '.join(hidden) or 'nothing'}\nmotor '{m.name}', seed {self.seed}: R = {m.R:.5g} Ω, L = "
+                f"{m.L:.5g} H, K = {m.K:.5g} V·s/rad, b = {m.b:.5g} N·m·s/rad, J = {m.J:.5g} kg·m²")
 
 
 def hide(words: str = "random", motor: str = "lab", seed: int = 0) -> Truth:

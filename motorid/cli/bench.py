@@ -24,9 +24,8 @@ Port = Annotated[str, typer.Option(help="Serial port of the bench: /dev/ttyACM0,
 Out = Annotated[Path, typer.Option(help="The CSV to write.")]
 Baud = Annotated[int, typer.Option(min=300, help="Bits per second; a board on USB does not care.")]
 Excite = Annotated[str | None, typer.Option(
-    help="Voltage to apply, in words joined by commas: rest:s step:volt:s stairs:from:to:levels:s "
-         "ramp:from:to:s chirp:volt:Hz:Hz:s prbs:volt:bit:s coast:s standard. Without it the motor is "
-         "held at 0 V.")]
+    help="Voltage to apply, in words joined by commas: rest:s step:volt:s stairs:from:to:levels:s ramp:from:to:s "
+         "chirp:volt:Hz:Hz:s prbs:volt:bit:s coast:s standard. Without it the motor is held at 0 V.")]
 Duration = Annotated[float | None, typer.Option(help="Stop after so many seconds.")]
 Volts = Annotated[float | None, typer.Option(help="Never more than so many V, of either sign.")]
 Amperes = Annotated[float | None, typer.Option(help="Switch the motor off beyond so many A.")]
@@ -37,8 +36,7 @@ Timeout = Annotated[float, typer.Option(help="Silence in s that ends the recordi
 Quiet = Annotated[bool, typer.Option("--quiet", help="No live progress.")]
 
 HiddenEffect = Annotated[str, typer.Option(
-    help="What is hidden: none, random, or effects joined by commas, bare or with numbers as in "
-         "coulomb:tau_c=0.01.")]
+    help="What is hidden: none, random, or effects joined by commas, bare or with numbers as in coulomb:tau_c=0.01.")]
 MotorName = Annotated[str, typer.Option(help="Which motor: micro, lab, servo, wheel, big.")]
 Seed = Annotated[int | None, typer.Option(
     min=0, help="Draws the hidden effect, the motor's constants, the noise and the faults.")]
@@ -69,8 +67,7 @@ def record_command(port: Port, out: Out, baud: Baud = 115_200, excite: Excite = 
         try:
             outcome = record(port, out, baud=baud, excite=excite, duration=duration,
                              limit_voltage=_limit(limit_voltage), limit_current=_limit(limit_current),
-                             calibration=calibration, resume=resume, force=force, timeout=timeout,
-                             progress=progress)
+                             calibration=calibration, resume=resume, force=force, timeout=timeout, progress=progress)
         except KeyboardInterrupt:
             typer.echo("Stopped before anything was recorded.", err=True)
             raise typer.Exit(FAILED) from None

@@ -28,9 +28,8 @@ class Command(TyperCommand):
 class Group(TyperGroup):
     """Turns errors into one sentence on standard error and the exit status."""
 
-    def main(self, args: Sequence[str] | None = None, prog_name: str | None = None,
-             complete_var: str | None = None, standalone_mode: bool = True, windows_expand_args: bool = True,
-             **extra: Any) -> Any:
+    def main(self, args: Sequence[str] | None = None, prog_name: str | None = None, complete_var: str | None = None,
+             standalone_mode: bool = True, windows_expand_args: bool = True, **extra: Any) -> Any:
         """See click; leaves by `SystemExit`."""
         try:
             status = super().main(args, prog_name or "motorid", complete_var, standalone_mode=False,

@@ -73,8 +73,7 @@ def _show_fit(found: Fit, records: list[Experiment], notes: list[str], judged: E
     several = judged is not None and len(judged.simulations) > 1
     show(error_table({"": found.evaluation, "held-out": judged}, found.noise),
          run_table(found.evaluation) if len(records) > 1 else None,
-         run_table(judged, "Held-out errors run by run") if judged and several else None,
-         derived_table(found))
+         run_table(judged, "Held-out errors run by run") if judged and several else None, derived_table(found))
     show(constraint_table(found, constraint_violations(found)))
     engine = found.problem.engine
     message = found.message.removeprefix(f"{found.status}: ")

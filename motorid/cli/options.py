@@ -169,8 +169,7 @@ class FitOptions(ReadingOptions):
             return fit(model, runs, callback=lambda *_: advance(1), **self.keywords())
 
     def _check_words(self) -> None:
-        for word, known, what in ((self.drive, DRIVES, "drive"),
-                                  (self.formulation, FORMULATIONS, "formulation"),
+        for word, known, what in ((self.drive, DRIVES, "drive"), (self.formulation, FORMULATIONS, "formulation"),
                                   (self.solver or "lm", SOLVERS, "solver"), (self.loss, LOSSES, "loss")):
             if word not in known:
                 raise UsageError(f"--{what}: {one_of(word, known, what)}")

@@ -31,14 +31,10 @@ from motorid.model.definition import Effect
 
 LIBRARY: dict[str, Effect] = {
     e.name: e
-    for e in (
-        brush_drop, winding_heating, inductance_saturation, magnetic_saturation, driver_dead_band,
-        voltage_offset,
-        coulomb, coulomb_asymmetric, stribeck, quadratic_drag, constant_load, gravity, cogging, torque_ripple,
-        load_friction, viscous_asymmetric, lugre,
-        compliance, backlash,
-        speed_lag, current_lag, speed_delay, current_offset, speed_gain,
-    )
+    for e in (brush_drop, winding_heating, inductance_saturation, magnetic_saturation, driver_dead_band, voltage_offset,
+              coulomb, coulomb_asymmetric, stribeck, quadratic_drag, constant_load, gravity, cogging, torque_ripple,
+              load_friction, viscous_asymmetric, lugre, compliance, backlash,
+              speed_lag, current_lag, speed_delay, current_offset, speed_gain)
 }
 
 

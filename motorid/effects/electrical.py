@@ -9,11 +9,8 @@ from motorid.model.equations import Equations
 
 
 @effect(balance="voltage")
-def brush_drop(
-    m: Equations,
-    V_b=P(0.5, "V", null=0.0, lower=0.0, doc="voltage lost at the brushes"),
-    i_b=P(0.1, "A", positive=True, grid=(0.01, 0.03, 0.1, 0.3), doc="knee current"),
-):
+def brush_drop(m: Equations, V_b=P(0.5, "V", null=0.0, lower=0.0, doc="voltage lost at the brushes"),
+               i_b=P(0.1, "A", positive=True, grid=(0.01, 0.03, 0.1, 0.3), doc="knee current")):
     """Brush contact drop, V_b·tanh(i/i_b). Shobert, Carbon Brushes, 1965."""
     m.voltage -= V_b * ca.tanh(m.i / i_b)
 
@@ -49,12 +46,10 @@ def voltage_offset(m: Equations, V_0=P(0.05, "V", null=0.0, doc="added to the ap
 
 
 @effect(balance="voltage")
-def winding_heating(
-    m: Equations,
-    alpha=P(0.00393, "1/K", null=0.0, vary=False, doc="temperature coefficient of copper, held"),
-    R_th=P(10.0, "K/W", positive=True, grid=(0.3, 1.0, 3.0), doc="thermal resistance to ambient"),
-    C_th=P(10.0, "J/K", positive=True, grid=(0.3, 1.0, 3.0), doc="heat capacity of the winding"),
-):
+def winding_heating(m: Equations,
+                    alpha=P(0.00393, "1/K", null=0.0, vary=False, doc="temperature coefficient of copper, held"),
+                    R_th=P(10.0, "K/W", positive=True, grid=(0.3, 1.0, 3.0), doc="thermal resistance to ambient"),
+                    C_th=P(10.0, "J/K", positive=True, grid=(0.3, 1.0, 3.0), doc="heat capacity of the winding")):
     """Winding resistance that grows with its own heat, R(1+αΔT). Kirtley, Electric Power Principles, 2010.
 
     ``C_th dΔT/dt = R i² − ΔT/R_th``, ΔT = 0 at the start of each run. Only α·R_th and α/C_th act on the

@@ -15,23 +15,17 @@ def coulomb(m: Equations, tau_c=P(2e-3, "N·m", null=0.0, lower=0.0, doc="Coulom
 
 
 @effect(balance="torque", includes=("coulomb",))
-def coulomb_asymmetric(
-    m: Equations,
-    tau_cp=P(2e-3, "N·m", null=0.0, lower=0.0, doc="Coulomb friction turning forward"),
-    tau_cn=P(2e-3, "N·m", null=0.0, lower=0.0, doc="Coulomb friction turning backward"),
-):
+def coulomb_asymmetric(m: Equations, tau_cp=P(2e-3, "N·m", null=0.0, lower=0.0, doc="Coulomb friction turning forward"),
+                       tau_cn=P(2e-3, "N·m", null=0.0, lower=0.0, doc="Coulomb friction turning backward")):
     """Coulomb friction that differs with the direction. Armstrong-Hélouvry et al., Automatica 30(7), 1994."""
     s = m.sign(m.omega)
     m.torque -= s * (tau_cp * (1 + s) + tau_cn * (1 - s)) / 2
 
 
 @effect(balance="torque", includes=("coulomb", "coulomb_asymmetric"))
-def stribeck(
-    m: Equations,
-    tau_c=P(2e-3, "N·m", null=0.0, lower=0.0, doc="Coulomb friction torque at speed"),
-    tau_s=P(3e-3, "N·m", null=0.0, lower=0.0, at_least="tau_c", doc="breakaway torque"),
-    omega_s=P(5.0, "rad/s", positive=True, grid=(0.01, 0.03, 0.1, 0.3), doc="Stribeck speed"),
-):
+def stribeck(m: Equations, tau_c=P(2e-3, "N·m", null=0.0, lower=0.0, doc="Coulomb friction torque at speed"),
+             tau_s=P(3e-3, "N·m", null=0.0, lower=0.0, at_least="tau_c", doc="breakaway torque"),
+             omega_s=P(5.0, "rad/s", positive=True, grid=(0.01, 0.03, 0.1, 0.3), doc="Stribeck speed")):
     """Stribeck friction, (tau_c + (tau_s−tau_c)·exp(−(ω/ω_s)²))·sgn ω. Armstrong-Hélouvry et al., 1994."""
     level = tau_c + (tau_s - tau_c) * ca.exp(-((m.omega / omega_s) ** 2))
     m.torque -= level * m.sign(m.omega)
@@ -50,22 +44,16 @@ def constant_load(m: Equations, tau_0=P(1e-3, "N·m", null=0.0, doc="load torque
 
 
 @effect(balance="torque")
-def gravity(
-    m: Equations,
-    mgl=P(1e-3, "N·m", null=0.0, lower=0.0, doc="weight times lever arm"),
-    phi_g=P(0.0, "rad", periodic=True, doc="angle of the lever at theta = 0, from hanging"),
-):
+def gravity(m: Equations, mgl=P(1e-3, "N·m", null=0.0, lower=0.0, doc="weight times lever arm"),
+            phi_g=P(0.0, "rad", periodic=True, doc="angle of the lever at theta = 0, from hanging")):
     """Unbalanced load, m·g·l·sin(θ+φ). Any textbook of mechanics; Duclusaud et al., BAM, 2025."""
     m.torque -= mgl * ca.sin(m.theta + phi_g)
 
 
 @effect(balance="torque")
-def cogging(
-    m: Equations,
-    A=P(1e-3, "N·m", null=0.0, lower=0.0, doc="amplitude of the cogging torque"),
-    N=P(12.0, "", order=True, vary=False, lower=1.0, doc="periods per turn, from the misfit, then held"),
-    phi=P(0.0, "rad", periodic=True, doc="phase at theta = 0"),
-):
+def cogging(m: Equations, A=P(1e-3, "N·m", null=0.0, lower=0.0, doc="amplitude of the cogging torque"),
+            N=P(12.0, "", order=True, vary=False, lower=1.0, doc="periods per turn, from the misfit, then held"),
+            phi=P(0.0, "rad", periodic=True, doc="phase at theta = 0")):
     """Cogging torque, A·sin(N·θ+φ). Hendershot & Miller, Brushless Permanent-Magnet Machines, 2010."""
     m.torque -= A * ca.sin(N * m.theta + phi)
 
@@ -98,13 +86,10 @@ def viscous_asymmetric(
 
 
 @effect(balance="torque", includes=("coulomb", "coulomb_asymmetric", "stribeck"))
-def lugre(
-    m: Equations,
-    tau_c=P(2e-3, "N·m", null=0.0, lower=0.0, doc="Coulomb friction torque at speed"),
-    s_b=P(1.5, "", lower=1.0, upper=10.0, doc="breakaway over Coulomb torque"),
-    omega_s=P(5.0, "rad/s", positive=True, grid=(0.03, 0.1), doc="Stribeck speed"),
-    theta_s=P(0.01, "rad", positive=True, grid=(0.003, 0.03), doc="presliding angle tau_c/σ0"),
-):
+def lugre(m: Equations, tau_c=P(2e-3, "N·m", null=0.0, lower=0.0, doc="Coulomb friction torque at speed"),
+          s_b=P(1.5, "", lower=1.0, upper=10.0, doc="breakaway over Coulomb torque"),
+          omega_s=P(5.0, "rad/s", positive=True, grid=(0.03, 0.1), doc="Stribeck speed"),
+          theta_s=P(0.01, "rad", positive=True, grid=(0.003, 0.03), doc="presliding angle tau_c/σ0")):
     """Bristle friction with presliding (LuGre). Canudas de Wit et al., IEEE TAC 40(3), 1995.
 
     The bristle damping σ1 is σ0 times the time to cross the presliding angle at the Stribeck speed.
@@ -138,24 +123,20 @@ def _two_inertias(m: Equations, share, resonance, zeta, twist_of, name: str) -> 
 
 
 @effect(balance="transmission")
-def compliance(
-    m: Equations,
-    r_load=P(0.3, "", null=0.0, lower=0.0, upper=0.98, grid=(0.3, 0.7), doc="load's share of the inertia"),
-    omega_r=P(200.0, "1/s", positive=True, grid=(0.02, 0.06, 0.2, 0.6), doc="resonance of the two inertias"),
-    zeta_r=P(0.05, "", positive=True, upper=2.0, grid=(0.05, 0.3), doc="damping ratio of the resonance"),
-):
+def compliance(m: Equations,
+               r_load=P(0.3, "", null=0.0, lower=0.0, upper=0.98, grid=(0.3, 0.7), doc="load's share of the inertia"),
+               omega_r=P(200.0, "1/s", positive=True, grid=(0.02, 0.06, 0.2, 0.6), doc="resonance of the two inertias"),
+               zeta_r=P(0.05, "", positive=True, upper=2.0, grid=(0.05, 0.3), doc="damping ratio of the resonance")):
     """Elastic shaft between two inertias. Ellis, Control System Design Guide, ch. 16, 2012."""
     _two_inertias(m, r_load, omega_r, zeta_r, lambda twist: (twist, 1.0), "load")
 
 
 @effect(balance="transmission", includes=("compliance",))
-def backlash(
-    m: Equations,
-    r_gap=P(0.3, "", null=0.0, lower=0.0, upper=0.98, grid=(0.3, 0.7), doc="load's share of the inertia"),
-    gap=P(0.02, "rad", positive=True, grid=(0.01, 0.03, 0.1), doc="total free play"),
-    omega_c=P(500.0, "1/s", positive=True, grid=(0.1, 0.4), doc="resonance while in contact"),
-    zeta_c=P(0.2, "", positive=True, upper=2.0, grid=(0.1, 0.5), doc="damping ratio while in contact"),
-):
+def backlash(m: Equations,
+             r_gap=P(0.3, "", null=0.0, lower=0.0, upper=0.98, grid=(0.3, 0.7), doc="load's share of the inertia"),
+             gap=P(0.02, "rad", positive=True, grid=(0.01, 0.03, 0.1), doc="total free play"),
+             omega_c=P(500.0, "1/s", positive=True, grid=(0.1, 0.4), doc="resonance while in contact"),
+             zeta_c=P(0.2, "", positive=True, upper=2.0, grid=(0.1, 0.5), doc="damping ratio while in contact")):
     """Free play between two inertias, elastic in contact. Nordin & Gutman, Automatica 38(10), 2002."""
     half = gap / 2
     width = CORNER * half

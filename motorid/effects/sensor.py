@@ -23,19 +23,15 @@ def speed_lag(
 
 
 @effect(balance="sensor")
-def current_lag(
-    m: Equations,
-    T_i=P(1e-3, "s", null=0.0, positive=True, grid=(0.5, 2.0, 8.0), doc="time constant of current filter"),
-):
+def current_lag(m: Equations,
+                T_i=P(1e-3, "s", null=0.0, positive=True, grid=(0.5, 2.0, 8.0), doc="time constant of current filter")):
     """First-order filter in the current measurement. Åström & Murray, Feedback Systems, 2008."""
     _lag(m, "i", T_i)
 
 
 @effect(balance="sensor")
-def speed_delay(
-    m: Equations,
-    T_d=P(5e-3, "s", null=0.0, positive=True, grid=(1.0, 4.0, 16.0), doc="delay of the speed measurement"),
-):
+def speed_delay(m: Equations,
+                T_d=P(5e-3, "s", null=0.0, positive=True, grid=(1.0, 4.0, 16.0), doc="delay of the speed measurement")):
     """Pure delay of the speed measurement, Padé of orders 2 and 3. Golub & Van Loan, 2013, sec. 9.3."""
     # (60 − 24Ts + 3T²s²)/(60 + 36Ts + 9T²s² + T³s³): with fewer zeros than poles, a jump does not pass at once.
     reaching = m.measured("omega")

@@ -86,10 +86,9 @@ def export(found: Fit | Model | Exported, path: str | os.PathLike[str], to: str 
     -----
     A ``.casadi`` file is read with CasADi alone::
 
-        file = casadi.FileDeserializer("motor.casadi")
-        functions, about = {f.name(): f for f in file.unpack()}, file.unpack()
-        record, p = functions["record_0"](), functions["parameters"]()["p"]
-        y = functions["simulate_0"](s=record["s"], u=record["u"], p=p)["y"]
+        file = casadi.FileDeserializer("motor.casadi") functions, about = {f.name(): f for f in file.unpack()},
+        file.unpack() record, p = functions["record_0"](), functions["parameters"]()["p"] y =
+        functions["simulate_0"](s=record["s"], u=record["u"], p=p)["y"]
 
     Raises
     ------

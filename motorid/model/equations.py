@@ -291,15 +291,13 @@ def build_system(m: Equations, parameters: tuple[str, ...], outputs: tuple[str, 
     s = ca.vertcat(*m.start.values())
     quiet = ca.substitute(f, d, ca.DM.zeros(2))
     _check_closed(ca.vertcat(quiet, y, balances), ca.vertcat(x, u, p))
-    return System(
-        names, tuple(m.inputs), outputs, parameters,
-        tuple(k in stored or k not in ("i", "omega") for k in names),
-        ca.Function("rhs", [x, u, p], [ca.densify(quiet)], ["x", "u", "p"], ["f"]),
-        ca.Function("out", [x, u, p], [ca.densify(y)], ["x", "u", "p"], ["y"]),
-        ca.Function("initial", [s, p], [ca.densify(x0)], ["s", "p"], ["x0"]),
-        ca.Function("balances", [x, u, p], [ca.densify(balances)], ["x", "u", "p"], ["balance"]),
-        ca.Function("forces", [x, u, p, d], [ca.densify(f)], ["x", "u", "p", "d"], ["f"]),
-    )
+    return System(names, tuple(m.inputs), outputs, parameters,
+                  tuple(k in stored or k not in ("i", "omega") for k in names),
+                  ca.Function("rhs", [x, u, p], [ca.densify(quiet)], ["x", "u", "p"], ["f"]),
+                  ca.Function("out", [x, u, p], [ca.densify(y)], ["x", "u", "p"], ["y"]),
+                  ca.Function("initial", [s, p], [ca.densify(x0)], ["s", "p"], ["x0"]),
+                  ca.Function("balances", [x, u, p], [ca.densify(balances)], ["x", "u", "p"], ["balance"]),
+                  ca.Function("forces", [x, u, p, d], [ca.densify(f)], ["x", "u", "p", "d"], ["f"]))
 
 
 def _symbols(m: Equations, parameters: tuple[str, ...]) -> list[ca.SX]:

@@ -50,11 +50,9 @@ class Model(Shown):
     def __add__(self, other: Effect) -> Model:
         """Return the model with one more effect."""
         if not isinstance(other, Effect):
-            raise ModelError(f"a model takes effects, got {type(other).__name__}. Use mi.effects.<name> or "
-                             "@mi.effect.")
+            raise ModelError(f"a model takes effects, got {type(other).__name__}. Use mi.effects.<name> or @mi.effect.")
         if other.name in self.effect_names:
-            raise ModelError(f"the model already has '{other.name}'. Take it out first: "
-                             f"model.without('{other.name}').")
+            raise ModelError(f"the model already has '{other.name}'. Take it out first: model.without('{other.name}').")
         for e in self.effects:
             if e.name in other.includes or other.name in e.includes:
                 raise ModelError(f"'{other.name}' and '{e.name}' describe the same friction twice; one "
@@ -282,8 +280,6 @@ def torque_driven(axis: str = "rotary", **values: float) -> Model:
     return Model("torque_driven", parameters=pars, axis=axis).replace(**values)
 
 
-
-
 def _within(parameter: Parameter, value: float) -> float:
     """Undo the rounding that a value at its limit suffers on the way through the solver's coordinates."""
     limit = min(max(value, parameter.lower), parameter.upper)
@@ -295,13 +291,11 @@ STATES = {"dc_motor": ("i", "omega"), "torque_driven": ("omega",)}
 QUANTITIES = {"dc_motor": ("R", "L", "K", "K_t", "K_e", "b", "J"), "torque_driven": ("g", "b", "J")}
 DERIVED = {"K_t": lambda m: m.K, "K_e": lambda m: m.K}
 BASES = {
-    "dc_motor": (
-        Parameter("R", 1.0, "Ω", positive=True, doc="winding resistance"),
-        Parameter("L", 1e-3, "H", positive=True, doc="winding inductance"),
-        Parameter("K", 0.05, "N·m/A", positive=True, doc="torque and back-EMF constant (V·s/rad)"),
-        Parameter("b", 1e-5, "N·m·s/rad", positive=True, doc="viscous friction"),
-        Parameter("J", 1e-5, "kg·m²", positive=True, doc="moment of inertia"),
-    ),
+    "dc_motor": (Parameter("R", 1.0, "Ω", positive=True, doc="winding resistance"),
+                 Parameter("L", 1e-3, "H", positive=True, doc="winding inductance"),
+                 Parameter("K", 0.05, "N·m/A", positive=True, doc="torque and back-EMF constant (V·s/rad)"),
+                 Parameter("b", 1e-5, "N·m·s/rad", positive=True, doc="viscous friction"),
+                 Parameter("J", 1e-5, "kg·m²", positive=True, doc="moment of inertia")),
     "torque_driven": (
         Parameter("g", 1.0, "N·m/V", positive=True, vary=False, doc="torque per unit of the command; held"),
         Parameter("b", 1e-3, "N·m·s/rad", positive=True, doc="viscous friction"),

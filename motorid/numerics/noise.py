@@ -24,12 +24,11 @@ _DITHERED = 0.6  # noise that is to be seen through the steps leaves fewer neigh
 def noise_level(y: ArrayLike, t: ArrayLike | None = None) -> float:
     """Estimate the standard deviation of the measurement noise of one channel.
 
-    High-order differences remove the signal, which is smooth over a few samples, and keep the noise;
-    averaging the smaller half of them ignores outliers and the few samples after a voltage step. On uneven
-    samples the weights are those of divided differences, so missing and jittering samples do no harm. The
-    order starts at two and grows as long as that removes more signal. Parts in which nothing changes at all
-    are left out. The result is never below what rounding alone does (step/√12, where the channel moves in
-    steps), nor below 1e-5 of the channel's variation.
+    High-order differences remove the signal, which is smooth over a few samples, and keep the noise; averaging the
+    smaller half of them ignores outliers and the few samples after a voltage step. On uneven samples the weights are
+    those of divided differences, so missing and jittering samples do no harm. The order starts at two and grows as
+    long as that removes more signal. Parts in which nothing changes at all are left out. The result is never below
+    what rounding alone does (step/√12, where the channel moves in steps), nor below 1e-5 of the channel's variation.
 
     Parameters
     ----------

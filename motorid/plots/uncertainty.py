@@ -28,9 +28,8 @@ _KINDS = {"good": style.PALETTE["blue"], "poor": style.PALETTE["orange"], "faile
 def plot_singular_values(result: Identifiability) -> np.ndarray:
     """Draw how well each direction of the parameters is seen, and which parameters make it up.
 
-    A direction whose singular value is below one (shaded) changes the outputs by less than the noise even
-    where the parameters change by 100 %. Circles: share of each parameter in a direction, blue and orange for
-    opposite signs.
+    A direction whose singular value is below one (shaded) changes the outputs by less than the noise even where the
+    parameters change by 100 %. Circles: share of each parameter in a direction, blue and orange for opposite signs.
 
     Parameters
     ----------

@@ -62,8 +62,7 @@ class CurrentLimit(Relation):
             one, every = np.ones(n), np.arange(n)
             labels = tuple(f"{self.name}, run {k}, t = {t:.6g} s" for t in run.experiment.t)
             found.append(Part(k, rows_of, every, every, np.zeros((n, 0)), run.grid.u, np.ones(n, bool), -one, one,
-                              self.limit * one, self.weight * share(problem, k) * one, labels, ("A",) * n,
-                              gradient))
+                              self.limit * one, self.weight * share(problem, k) * one, labels, ("A",) * n, gradient))
         return tuple(found)
 
 
@@ -201,9 +200,8 @@ class Constraint(Relation):
     Attributes
     ----------
     expression : callable
-        Of one argument with the states, inputs and parameters as CasADi symbols, e.g.
-        ``lambda m: m.K * m.omega``.
-        Of parameters alone: one row. With states or inputs: one row at every sample of every run.
+        Of one argument with the states, inputs and parameters as CasADi symbols, e.g. ``lambda m: m.K * m.omega``. Of
+        parameters alone: one row. With states or inputs: one row at every sample of every run.
     lower, upper : float
     size : float
         Natural size of the expression, in its unit; scales the row.

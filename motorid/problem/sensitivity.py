@@ -147,8 +147,7 @@ def _groups(problem: Problem, n: int) -> tuple[tuple[str, ...], Array]:
 def relative_jacobian(problem: Problem, q: Array) -> Array:
     """Return d(outputs over noise)/d(relative parameters), shape (n, k), initial states projected out.
 
-    A relative change of one is a factor of e for positive parameters, the natural size of the unit for
-    others.
+    A relative change of one is a factor of e for positive parameters, the natural size of the unit for others.
     """
     k = len(problem.model.free_names)
     parts = []

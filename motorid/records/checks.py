@@ -149,8 +149,7 @@ def _spikes(run: Experiment) -> str | None:
             size = float(np.median(np.abs(y[far] - np.interp(run.t[far], run.t[kept], y[kept]))))
             return (f"{far.size} single samples of the {NAMES[channel]} stand about {size:.2g} {run.units[channel]} "
                     "away from both neighbours: spikes of the sensor or the logger. Leave them out (--no-spikes, "
-                    "run.without_spikes()), or fit with a loss that forgives outliers (--loss huber, "
-                    "loss=mi.Huber()).")
+                    "run.without_spikes()), or fit with a loss that forgives outliers (--loss huber, loss=mi.Huber()).")
     return None
 
 
@@ -186,9 +185,8 @@ def _slow_sampling(run: Experiment) -> str | None:
     first, full = rise[:, :2].max(axis=1), rise.max(axis=1)  # the step itself may lie between two samples
     clear = full > 10 * noise_level(i, run.t)
     if clear.any() and float(np.median(first[clear] / full[clear])) > 0.9:
-        return (f"after a voltage step the current is there within one sample ({1e3 * run.dt:.3g} ms): "
-                "the sampling is too slow for the inductance, so L will be uncertain. Sample faster, or "
-                "fix L: it hardly matters here.")
+        return (f"after a voltage step the current is there within one sample ({1e3 * run.dt:.3g} ms): the sampling is "
+                "too slow for the inductance, so L will be uncertain. Sample faster, or fix L: it hardly matters here.")
     return None
 
 
@@ -219,9 +217,8 @@ def _never_reverses(runs: Sequence[Experiment]) -> str | None:
         return None
     low, high = min(r.inputs["v"].min() for r in runs), max(r.inputs["v"].max() for r in runs)
     if low > -0.02 * high or high < -0.02 * low:
-        return ("the voltage never reverses in any run: effects that depend on the direction (dry "
-                "friction against a constant load, asymmetry, backlash) cannot be told apart. Add a run "
-                "with both signs.")
+        return ("the voltage never reverses in any run: effects that depend on the direction (dry friction against a "
+                "constant load, asymmetry, backlash) cannot be told apart. Add a run with both signs.")
     return None
 
 

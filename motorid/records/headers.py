@@ -35,10 +35,9 @@ DIMENSIONS: Mapping[str, tuple[str, ...]] = {
 _TURN = 2 * math.pi
 _DEGREE = math.pi / 180
 _SPELLINGS = {
-    "time": {1.0: "s sec secs second seconds sek sekunde sekunden",
-             1e-3: "ms msec millis millisecond milliseconds",
-             1e-6: "us usec micros microsecond microseconds",
-             1e-9: "ns nanoseconds", 60.0: "min minute minutes", 3600.0: "h hour hours"},
+    "time": {1.0: "s sec secs second seconds sek sekunde sekunden", 1e-3: "ms msec millis millisecond milliseconds",
+             1e-6: "us usec micros microsecond microseconds", 1e-9: "ns nanoseconds", 60.0: "min minute minutes",
+             3600.0: "h hour hours"},
     "voltage": {1.0: "v volt volts", 1e-3: "mv millivolt millivolts", 1e3: "kv"},
     "current": {1.0: "a amp amps ampere amperes", 1e-3: "ma milliamp milliamps milliampere", 1e-6: "ua", 1e3: "ka"},
     "speed": {1.0: "rad/s rad/sec rad/second rads rads-1 radps", 1e-3: "mrad/s", 1e3: "krad/s",
@@ -134,8 +133,7 @@ _WORDS = {
     "t": "t time timestamp timestamps zeit temps tiempo tempo clock sec seconds millis micros elapsed",
     "v": "v u volt volts voltage spannung tension voltaje uq vq ua va um vm vin uin vmot umot vmotor umotor "
          "ankerspannung motorspannung klemmenspannung",
-    "i": "i current strom courant corriente iq ia im imot imotor amp amps ampere amperes ankerstrom "
-         "motorstrom",
+    "i": "i current strom courant corriente iq ia im imot imotor amp amps ampere amperes ankerstrom motorstrom",
     "omega": "omega w speed velocity vel rpm drehzahl geschwindigkeit winkelgeschwindigkeit vitesse "
              "velocidad thetadot phidot qdot posdot dtheta dphi dq qd ω",
     "theta": "theta angle position pos phi q winkel lage drehwinkel posicion encoder enc x weg stroke "

@@ -66,9 +66,8 @@ def read_runs(paths: Path_ | Iterable[Path_], *, columns: Mapping[str, object] |
             for f, name in zip(files, names, strict=True)]
 
 
-def read_csv(path: Path_, *, columns: Mapping[str, object] | None = None,
-             units: Mapping[str, object] | None = None, hold: str | None = None,
-             name: str | None = None) -> Experiment:
+def read_csv(path: Path_, *, columns: Mapping[str, object] | None = None, units: Mapping[str, object] | None = None,
+             hold: str | None = None, name: str | None = None) -> Experiment:
     """Read one text file of whatever dialect (delimiter, decimal comma, comments, row of units, encoding).
 
     Parameters and errors are those of `read_runs`; `name` is used instead of the name of the file.
@@ -76,16 +75,14 @@ def read_csv(path: Path_, *, columns: Mapping[str, object] | None = None,
     return _read(path, parse_table, columns, units, hold, name)
 
 
-def read_mat(path: Path_, *, columns: Mapping[str, object] | None = None,
-             units: Mapping[str, object] | None = None, hold: str | None = None,
-             name: str | None = None) -> Experiment:
+def read_mat(path: Path_, *, columns: Mapping[str, object] | None = None, units: Mapping[str, object] | None = None,
+             hold: str | None = None, name: str | None = None) -> Experiment:
     """Read one MATLAB file (up to version 7); otherwise like `read_csv`."""
     return _read(path, mat_table, columns, units, hold, name)
 
 
-def read_parquet(path: Path_, *, columns: Mapping[str, object] | None = None,
-                 units: Mapping[str, object] | None = None, hold: str | None = None,
-                 name: str | None = None) -> Experiment:
+def read_parquet(path: Path_, *, columns: Mapping[str, object] | None = None, units: Mapping[str, object] | None = None,
+                 hold: str | None = None, name: str | None = None) -> Experiment:
     """Read one Parquet file, which needs ``motorid[parquet]``; otherwise like `read_csv`."""
     return _read(path, parquet_table, columns, units, hold, name)
 

@@ -35,8 +35,7 @@ def explore(fit: Fit, *, effects: Iterable[Effect | str] | None = None) -> Explo
     Returns
     -------
     Explorer
-        Shows itself at the end of a cell. ``explorer.fit`` is the last refit, ``explorer.model`` the model
-        as ticked.
+        Shows itself at the end of a cell. ``explorer.fit`` is the last refit, ``explorer.model`` the model as ticked.
 
     Raises
     ------

@@ -111,9 +111,8 @@ class Batch:
 
 
 @one_thread
-def fit_many(model: Model, motors: Mapping[str, Records], *, journal: str | Path | None = None,
-             map: Map | None = None, reading: Mapping[str, Any] | None = None, quiet: bool = False,
-             **options: Any) -> Batch:
+def fit_many(model: Model, motors: Mapping[str, Records], *, journal: str | Path | None = None, map: Map | None = None,
+             reading: Mapping[str, Any] | None = None, quiet: bool = False, **options: Any) -> Batch:
     """Fit one model to the records of many motors. A motor that fails is a row that says why.
 
     Parameters

@@ -126,12 +126,11 @@ def _correlation_cell(value: float) -> Cell:
 def covariance(fit: Fit, *, method: str = "coloured") -> Covariance:
     """Return the covariance of the unknowns of a fit, in physical units.
 
-    ``H⁻¹ M H⁻¹`` with ``H = JᵀJ`` (Gauss-Newton) and ``M`` the covariance of ``Jᵀr``: the residuals of each
-    channel are taken as stationary, with the variance they have and the autocovariance of an autoregression
-    fitted to them, so neither the assumed noise level nor its whiteness matters (sandwich: White,
-    Econometrica 50, 1982; Newey & West, Econometrica 55, 1987; here with a parametric Γ, since transients
-    leave few samples to average over). Residuals that depend on the motion, of a model that lacks
-    something, are not noise; then it is an indication.
+    ``H⁻¹ M H⁻¹`` with ``H = JᵀJ`` (Gauss-Newton) and ``M`` the covariance of ``Jᵀr``: the residuals of each channel
+    are taken as stationary, with the variance they have and the autocovariance of an autoregression fitted to them,
+    so neither the assumed noise level nor its whiteness matters (sandwich: White, Econometrica 50, 1982; Newey &
+    West, Econometrica 55, 1987; here with a parametric Γ, since transients leave few samples to average over).
+    Residuals that depend on the motion, of a model that lacks something, are not noise; then it is an indication.
 
     Parameters
     ----------

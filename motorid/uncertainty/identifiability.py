@@ -1,10 +1,9 @@
 """Which parameters do the data determine? Singular values of the sensitivities, weak directions in words.
 
-A record determines a direction in parameter space when a step along it changes the outputs by more than the
-noise. The Jacobian of the fit says so without a fit: its columns scaled to relative changes, its rows by
-the noise, its singular values are the signal-to-noise ratios of such steps (Golub & Van Loan, Matrix
-Computations; Miao et al., "On identifiability of nonlinear ODE models", SIAM Review 53, 2011). It works on
-planned experiments too.
+A record determines a direction in parameter space when a step along it changes the outputs by more than the noise.
+The Jacobian of the fit says so without a fit: its columns scaled to relative changes, its rows by the noise, its
+singular values are the signal-to-noise ratios of such steps (Golub & Van Loan, Matrix Computations; Miao et al., "On
+identifiability of nonlinear ODE models", SIAM Review 53, 2011). It works on planned experiments too.
 """
 
 from __future__ import annotations
@@ -66,8 +65,7 @@ class Identifiability(Shown):
     ----------
     names : tuple of str
     values, sizes : ndarray, shape (k,)
-        Parameters and what a relative change of one means: the value, or the natural size where it may be
-        zero.
+        Parameters and what a relative change of one means: the value, or the natural size where it may be zero.
     units : tuple of str
     t : tuple of ndarray
         Per run, s.

@@ -107,7 +107,7 @@ def _from_start(task: tuple[Problem, dict[str, float], Any, bool], start: dict[s
         return Failure(start, "failed", str(error))
     physical = solved.scaling.physical(q)
     return StartResult(start, solved.values(q), _reference_cost(problem, physical), judge(at(solved, q)).nrmse, status,
-                  message, len(history) - 1, time.perf_counter() - began)
+                       message, len(history) - 1, time.perf_counter() - began)
 
 
 def _reference_cost(problem: Problem, physical: Array) -> float:
