@@ -112,8 +112,8 @@ class VirtualDevice:
 
     def _answer(self, fields: list[str]) -> bytes:
         handlers: dict[str, Callable[..., bytes]] = {
-            "?": self._say_header, "L": self._set_limits, "S": self._add_segment, "G": self._go,
-            "X": self._halt, "K": self._alive}
+            "?": lambda: frame(*self.header.fields), "L": self._set_limits, "S": self._add_segment, "G": self._go,
+            "X": lambda: self._stop("stop"), "K": lambda: b"" if self.running else self._done()}
         handler = handlers.get(fields[0])
         if handler is None:
             return frame("E", "refused", "unknown command")
@@ -121,9 +121,6 @@ class VirtualDevice:
             return handler(*fields[1:])
         except (TypeError, ValueError, UsageError):
             return frame("E", "refused", "the numbers make no sense")
-
-    def _say_header(self) -> bytes:
-        return frame(*self.header.fields)
 
     def _set_limits(self, mv: str, ma: str) -> bytes:
         if self.running:
@@ -152,12 +149,6 @@ class VirtualDevice:
             self._start, self._made, self._over = (self._counter, self._time), 0, 0
             self._armed, self.running = False, True
         return frame("A", "G", *self._start)
-
-    def _halt(self) -> bytes:
-        return self._stop("stop")
-
-    def _alive(self) -> bytes:
-        return b"" if self.running else self._done()
 
     def _stop(self, why: str) -> bytes:
         if self.running:
@@ -269,10 +260,6 @@ def _stall(m: Any) -> float:
     return m.K * m.v_max / m.R  # N·m at v_max with the shaft held
 
 
-def _friction(m: Any, draw: Draw) -> dict[str, float]:
-    return {"tau_c": _stall(m) * draw(0.02, 0.06)}
-
-
 def _stribeck(m: Any, draw: Draw) -> dict[str, float]:
     tau_c = _stall(m) * draw(0.02, 0.04)
     return {"tau_c": tau_c, "tau_s": tau_c * draw(1.6, 2.2), "omega_s": m.no_load_speed * draw(0.02, 0.05)}
@@ -283,19 +270,15 @@ def _asymmetric(m: Any, draw: Draw) -> dict[str, float]:
     return {"tau_cp": tau, "tau_cn": tau * draw(1.6, 2.5)}
 
 
-def _cogging(m: Any, draw: Draw) -> dict[str, float]:
-    return {"A": _stall(m) * draw(0.03, 0.06), "N": float(round(draw(3.6, 12.4))), "phi": 0.5}
-
-
 # Sizes by effect, from the motor's own scales. An effect that is not here needs its numbers spelt out.
 SIZES: Mapping[str, Callable[[Any, Draw], dict[str, float]]] = {
-    "coulomb": _friction,
+    "coulomb": lambda m, draw: {"tau_c": _stall(m) * draw(0.02, 0.06)},
     "coulomb_asymmetric": _asymmetric,
     "stribeck": _stribeck,
     "quadratic_drag": lambda m, draw: {"c_2": _stall(m) * draw(0.05, 0.15) / (0.6 * m.no_load_speed) ** 2},
     "constant_load": lambda m, draw: {"tau_0": _stall(m) * draw(0.03, 0.08)},
     "gravity": lambda m, draw: {"mgl": _stall(m) * draw(0.04, 0.1)},
-    "cogging": _cogging,
+    "cogging": lambda m, draw: {"A": _stall(m) * draw(0.03, 0.06), "N": float(round(draw(3.6, 12.4))), "phi": 0.5},
     "load_friction": lambda m, draw: {"mu": draw(0.06, 0.15)},
     "brush_drop": lambda m, draw: {"V_b": m.v_max * draw(0.04, 0.08), "i_b": m.v_max / m.R * 0.01},
     "driver_dead_band": lambda m, draw: {"V_d": m.v_max * draw(0.03, 0.07)},

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from importlib.metadata import PackageNotFoundError
-from importlib.metadata import version as version_of
 from typing import Annotated
 
 import typer
 
 from motorid.cli import bench, diagnose, fit
 from motorid.cli.console import Command, Group
+from motorid.reports.report import package_version
 
 app = typer.Typer(cls=Group, add_completion=False, rich_markup_mode="rich", pretty_exceptions_enable=False,
                   context_settings={"help_option_names": ["-h", "--help"]})
@@ -23,16 +22,9 @@ def motorid(context: typer.Context,
     Start with: motorid demo
     """
     if version:
-        typer.echo(f"motorid {_version()}")
+        typer.echo(f"motorid {package_version('motorid')}")
     elif context.invoked_subcommand is None:
         typer.echo(context.get_help())
-
-
-def _version() -> str:
-    try:
-        return version_of("motorid")
-    except PackageNotFoundError:
-        return "(not installed)"
 
 
 for _name, _command in (

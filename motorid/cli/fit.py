@@ -205,7 +205,7 @@ def identifiability_command(runs: Runs, options: FitOptions, json: Json = None, 
     Example: motorid identifiability run*.csv --effects coulomb
     """
     fitted = options.fit(options.read(runs))
-    _hand_over(fitted, identifiability(fitted), json, report)
+    _write_and_show(fitted, identifiability(fitted), json, report)
 
 
 @with_options(FitOptions)
@@ -222,10 +222,10 @@ def robustness_command(
     Example: motorid robustness run*.csv --starts 50 --spread 10
     """
     fitted = options.fit(options.read(runs))
-    _hand_over(fitted, multistart(fitted, starts=starts, spread=spread, seed=seed), json, report)
+    _write_and_show(fitted, multistart(fitted, starts=starts, spread=spread, seed=seed), json, report)
 
 
-def _hand_over(fitted: Fit, found: Identifiability | Multistart, json: Json, report: Report) -> None:
+def _write_and_show(fitted: Fit, found: Identifiability | Multistart, json: Json, report: Report) -> None:
     if json:
         write_json(found.to_dict(), json)
     if json != "-":

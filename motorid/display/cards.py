@@ -84,3 +84,10 @@ class Shown:
 
     def __repr__(self) -> str:
         return f"<{self.card().line}>"
+
+
+class Printed(Shown):
+    """Base of results whose whole card is what `print` shows."""
+
+    def __str__(self) -> str:
+        return str(self.card())

@@ -1,4 +1,4 @@
-"""The library of physical effects, by name; a user's own effect has the same form."""
+"""The library of physical effects: `get` gives one by its name; a user's own effect has the same form."""
 
 from __future__ import annotations
 

@@ -129,7 +129,7 @@ def _spectrum(tangent: Tangent, relative: bool) -> Spectrum:
     lowest = max(1 if relative else 2, int(np.ceil(PERIODS * 2 * np.pi / max(_travel(fit), 1e-9))))
     if top < lowest or (relative and "i" not in fit.problem.system.states):
         return Spectrum((), False)
-    shares, lines = _looking(tangent).shares(lowest, relative)
+    shares, lines = _order_search(tangent).shares(lowest, relative)
     if not lines:
         return Spectrum((), False)
     found = sorted(lines, key=lambda line: -line.share)
@@ -147,7 +147,7 @@ class Moments(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class _Looking:
+class _OrderSearch:
     """What is looked into for orders: a residual without its colour, off the tangent space, and the model's answers."""
 
     fit: Fit
@@ -204,9 +204,7 @@ class _Looking:
     def moments(self) -> dict[bool, Moments]:
         """The moments of all orders, of the torque itself (False) and relative to the motor's (True)."""
         n = len(self.orders)
-        found = {
-            relative: Moments(np.zeros(n, complex), np.zeros(n), np.zeros(n, complex)) for relative in (False, True)
-        }
+        found = {kind: Moments(np.zeros(n, complex), np.zeros(n), np.zeros(n, complex)) for kind in (False, True)}
         residuals = self.white.transposed(self.residual, [len(a.c) for a in self.answers])
         for k, answer in enumerate(self.answers):
             angle = angle_signal(self.fit.problem.runs[k].experiment)
@@ -233,9 +231,8 @@ class _Looking:
         slow = self.slow[orders.astype(int) - 1]
         middle, step = (angle[1:] + angle[:-1]) / 2, np.diff(angle)
         # Averaged over the sample, so that orders too fast for the sampling fade instead of posing as slower ones.
-        fade = (
-            np.sinc(np.outer(orders, step) / (2 * np.pi)) * (np.abs(step) <= slow[:, None]) * self._carrier(k, relative)
-        )
+        fade = np.sinc(np.outer(orders, step) / (2 * np.pi)) * (np.abs(step) <= slow[:, None])
+        fade = fade * self._carrier(k, relative)
         turning = np.outer(orders, middle)
         drive = np.concatenate([np.sin(turning) * fade, np.cos(turning) * fade])
         return self._measured(k, self.answers[k].driven(drive[:, :, None] * self.answers[k].b[:, :, 1]))
@@ -254,15 +251,13 @@ class _Looking:
 
 
 @lru_cache(maxsize=2)
-def _looking(tangent: Tangent) -> _Looking:
+def _order_search(tangent: Tangent) -> _OrderSearch:
     """Return what is there to be looked into; outputs count in units of their noise."""
     white, basis, residual = _whitened(tangent)
-    answers = [
-        replace(answer, c=answer.c * run.weights[None, :, None])
-        for answer, run in zip(responses(tangent.fit), tangent.fit.problem.measured, strict=True)
-    ]
+    answers = [replace(answer, c=answer.c * run.weights[None, :, None])
+               for answer, run in zip(responses(tangent.fit), tangent.fit.problem.measured, strict=True)]
     orders = np.arange(1.0, highest_order(tangent) + 1)
-    return _Looking(tangent.fit, white, basis, residual, answers, orders, _slow_enough(_moving(tangent), orders))
+    return _OrderSearch(tangent.fit, white, basis, residual, answers, orders, _slow_enough(_moving(tangent), orders))
 
 
 def _slow_enough(moving: Array, orders: Array) -> Array:
@@ -296,11 +291,8 @@ def _lines(orders: Array, sines: Array, cosines: Array, residual: Array) -> list
         a, b = (on_sine - overlap * on_cosine) / (1 - overlap**2), (on_cosine - overlap * on_sine) / (1 - overlap**2)
         share = (a * on_sine + b * on_cosine) / max(float(residual @ residual), 1e-300)
         a, b = a / sizes[0], b / sizes[1]
-    return [
-        Line(float(n), float(share[j]), float(np.hypot(a[j], b[j])), float(np.arctan2(b[j], a[j])))
-        for j, n in enumerate(orders)
-        if seen[j]
-    ]
+    return [Line(float(n), float(share[j]), float(np.hypot(a[j], b[j])), float(np.arctan2(b[j], a[j])))
+            for j, n in enumerate(orders) if seen[j]]
 
 
 def _travel(fit) -> float:

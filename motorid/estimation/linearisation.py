@@ -104,9 +104,8 @@ def _mapped(system: System, n: int) -> tuple[ca.Function, ca.Function]:
 def linear_steps(system: System, grid, x: Array, p: Array, d: Array) -> tuple[Array, Array, Array]:
     """Return one step from every sample, (x⁺, A, B), vectorised; `d` (N-1, 2), `x` (N, nx)."""
     n, nx = len(grid.dt), len(system.states)
-    x_next, a, b = _mapped(system, n)[0](
-        x[:-1].T, grid.u0.T, grid.u1.T, grid.dt[None, :], np.tile(p[:, None], (1, n)), d.T
-    )
+    x_next, a, b = _mapped(system, n)[0](x[:-1].T, grid.u0.T, grid.u1.T, grid.dt[None, :],
+                                         np.tile(p[:, None], (1, n)), d.T)
     return (np.asarray(x_next).T, np.asarray(a).reshape(nx, n, nx).transpose(1, 0, 2),
             np.asarray(b).reshape(nx, n, 2).transpose(1, 0, 2))
 

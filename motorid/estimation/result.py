@@ -203,11 +203,8 @@ class Fit(Shown):
         times = [f"{what} {duration(t)}" for what, t in (("τ_e", self.tau_e), ("τ_m", self.tau_m)) if t]
         times += [f"damping {number(self.damping, 3)}"] if self.damping else []
         steps = counted(self.iterations, "iteration")
-        text = (
-            f"{counted(len(runs), 'run')}, {self.problem.n_outputs} samples, {steps} in {duration(self.seconds)}. "
-            + ", ".join(times),
-            "" if self.status == "converged" else sentence(self.message),
-        )
+        head = f"{counted(len(runs), 'run')}, {self.problem.n_outputs} samples, {steps} in {duration(self.seconds)}. "
+        text = (head + ", ".join(times), "" if self.status == "converged" else sentence(self.message))
         after = [("mi.plot_fit(fit)", "see it"), ("mi.diagnose(fit)", "what is missing")]
         after += [("mi.identifiability(fit)", f"why {', '.join(vague)} cannot be determined")] if vague else []
         tables = (parameter_table(self), error_table({"": self.evaluation}, self.noise), constraint_table(self))

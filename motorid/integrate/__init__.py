@@ -1,4 +1,4 @@
-"""Engines: Rosenbrock (fast, compiled) and SUNDIALS' CVODES and IDAS (reference), one interface."""
+"""Engines: Rosenbrock (fast, compiled) and SUNDIALS' CVODES and IDAS (reference); `engine_of` gives one by name."""
 
 from __future__ import annotations
 

@@ -24,8 +24,8 @@ from motorid.numerics.signals import Array
 PATIENCE = 4e7
 MOST_SUBSTEPS = 256
 MOST_PASSES = 6
-ASTRAY = 0.3  # local error, relative to the state so far, at which a step is lost
-STRAY = 1e3  # growth of a state that shows it
+LOST_ERROR = 0.3  # local error, relative to the state so far, at which a step is lost
+LOST_GROWTH = 1e3  # growth of a state that shows it
 
 
 @dataclass(frozen=True)
@@ -87,13 +87,13 @@ def _by_state(traj: Trajectory) -> tuple[Array, Array]:
 
 def _first_inaccurate(size: Array, error: Array) -> int | None:
     """Return the first interval whose error is as large as the state, if the state leaves its size there."""
-    lost = (error > ASTRAY * np.maximum(size[:, 1:], 1e-12)).any(axis=0)
+    lost = (error > LOST_ERROR * np.maximum(size[:, 1:], 1e-12)).any(axis=0)
     if not lost.any():
         return None
     k = int(np.argmax(lost))
     before, after = np.maximum(size[:, k], 1e-12), np.maximum(size[:, k + 1], 1e-12)
-    jumped = (after > STRAY * before) & (before > 1e-12)
-    return k if np.any(jumped | (size[:, -1] > STRAY * after)) else None
+    jumped = (after > LOST_GROWTH * before) & (before > 1e-12)
+    return k if np.any(jumped | (size[:, -1] > LOST_GROWTH * after)) else None
 
 
 class Stepper:

@@ -69,17 +69,13 @@ class Parameter:
         if not np.isfinite(self.value):
             raise ModelError(f"parameter '{self.name}' needs a finite value, got {self.value}.")
         if self.positive and self.vary and self.value <= 0:
-            raise ModelError(
-                f"parameter '{self.name}' must be positive, got {self.value:g}. "
-                f"To leave it out of the model, set it to zero and fix it: model.fix({self.name}=0)."
-            )
+            raise ModelError(f"parameter '{self.name}' must be positive, got {self.value:g}. "
+                             f"To leave it out of the model, set it to zero and fix it: model.fix({self.name}=0).")
         if self.lower > self.upper:
             raise ModelError(f"parameter '{self.name}': lower limit {self.lower:g} above upper {self.upper:g}.")
         if not self.lower <= self.value <= self.upper:
-            raise ModelError(
-                f"parameter '{self.name}' = {self.value:g} {self.unit} lies outside its limits "
-                f"[{self.lower:g}, {self.upper:g}]."
-            )
+            raise ModelError(f"parameter '{self.name}' = {self.value:g} {self.unit} lies outside its limits "
+                             f"[{self.lower:g}, {self.upper:g}].")
 
 
 @dataclass(frozen=True)

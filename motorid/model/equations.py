@@ -111,10 +111,8 @@ class Equations:
         """Define the quantity `name` anew; only one effect may do so."""
         self._known(name)
         if name in self._replaced:
-            raise ModelError(
-                f"'{self.writer}' and '{self._replaced[name]}' both replace '{name}'. "
-                f"Keep one of them: model.without('{self._replaced[name]}')."
-            )
+            raise ModelError(f"'{self.writer}' and '{self._replaced[name]}' both replace '{name}'. "
+                             f"Keep one of them: model.without('{self._replaced[name]}').")
         self._replaced[name] = self.writer
         self.definitions[name] = ca.SX(expression)
 
@@ -166,8 +164,6 @@ class Equations:
         circle = ", ".join(sorted(s[1:] for s in used & marks))
         raise ModelError(f"the definitions of {circle} go in a circle: an effect scales or replaces a "
                          "quantity by an expression that needs that same quantity.")
-
-
 
 
 @dataclass(frozen=True, eq=False)

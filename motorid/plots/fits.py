@@ -47,7 +47,7 @@ def plot_runs(runs: Sequence[Experiment] | Experiment, channels: Sequence[str] |
             if y is None:
                 _absent(axes[j, k], c)
             else:
-                style.line(axes[j, k], run.t, y, held=c == "v" and run.hold == "zoh", lw=1.0,
+                style.line(axes[j, k], run.t, y, zoh=c == "v" and run.hold == "zoh", lw=1.0,
                            color=style.INK if c == "v" else style.MODEL)
         style.tidy(axes[0, k], title=_run_title(run, k, every))
         style.tidy(axes[-1, k], x="time (s)")

@@ -27,14 +27,8 @@ _R = TypeVar("_R")
 
 INK, MUTED, FAINT, PAPER = "#1f2328", "#59636e", "#d1d9e0", "#ffffff"
 # Okabe & Ito, "Color universal design", 2008: distinct to all common kinds of colour vision.
-PALETTE = {
-    "blue": "#0072b2",
-    "orange": "#d55e00",
-    "green": "#009e73",
-    "purple": "#a4507d",
-    "yellow": "#b98500",
-    "grey": "#7a848e",
-}
+PALETTE = {"blue": "#0072b2", "orange": "#d55e00", "green": "#009e73", "purple": "#a4507d", "yellow": "#b98500",
+           "grey": "#7a848e"}
 CYCLE = (*(PALETTE[c] for c in ("blue", "orange", "green", "purple", "yellow")), INK, PALETTE["grey"])
 MEASURED, MODEL, RESIDUAL, HELD_OUT = PALETTE["grey"], PALETTE["blue"], PALETTE["orange"], PALETTE["green"]
 # Colours of a figure become variables of the page, so that a dark page has a dark figure.
@@ -196,10 +190,10 @@ def envelope(x: Array, y: Array, points: int = POINTS) -> tuple[Array, Array]:
     return x[index], y[index]
 
 
-def line(ax: Axes, x: Array, y: Array, *, held: bool = False, **options: Any) -> None:
-    """Draw a curve, decimated without hiding its peaks; `held` as a staircase."""
+def line(ax: Axes, x: Array, y: Array, *, zoh: bool = False, **options: Any) -> None:
+    """Draw a curve, decimated without hiding its peaks; with `zoh` as a staircase."""
     a, b = envelope(x, y)
-    ax.plot(a, b, drawstyle="steps-post" if held and len(x) <= POINTS else "default", **options)
+    ax.plot(a, b, drawstyle="steps-post" if zoh and len(x) <= POINTS else "default", **options)
 
 
 def band(ax: Axes, half: float, label: str | None = None) -> None:

@@ -22,10 +22,8 @@ def _root() -> Path:
         if (place / "truth.json").is_file():
             return place
     looked = " and ".join(str(place) for place in places)
-    raise DataError(
-        f"the shipped records were not found; looked for truth.json in {looked}. "
-        "Install motorid from a wheel, or work in a checkout that has its data folder."
-    )
+    raise DataError(f"the shipped records were not found; looked for truth.json in {looked}. "
+                    "Install motorid from a wheel, or work in a checkout that has its data folder.")
 
 
 def data_path(name: str = "") -> Path:

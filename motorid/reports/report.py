@@ -75,15 +75,13 @@ def _page(story: Story) -> str:
     environment = Environment(loader=PackageLoader("motorid.reports", "templates"), autoescape=True,
                               undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     date = datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z")
-    return environment.get_template("report.html").render(story=story, version=_version("motorid"), date=date)
+    return environment.get_template("report.html").render(story=story, version=package_version("motorid"), date=date)
 
 
 def _provenance(story: Story, command: str) -> Section:
-    files = [
-        [run.name, Path(str(run.meta.get("source", "–"))).name, str(run.meta.get("sha256", "–"))[:16]]
-        for run in story.runs
-    ]
-    versions = [["Python", platform.python_version()], *([p, _version(p)] for p in PACKAGES)]
+    files = [[run.name, Path(str(run.meta.get("source", "–"))).name, str(run.meta.get("sha256", "–"))[:16]]
+             for run in story.runs]
+    versions = [["Python", platform.python_version()], *([p, package_version(p)] for p in PACKAGES)]
     tables = [Table(["software", "version"], versions)]
     if files:
         tables.insert(0, Table(["run", "file", "SHA-256 (first 16 digits)"], files))
@@ -96,7 +94,8 @@ def _provenance(story: Story, command: str) -> Section:
     )
 
 
-def _version(package: str) -> str:
+def package_version(package: str) -> str:
+    """Return the version of an installed package."""
     try:
         return version_of(package)
     except PackageNotFoundError:

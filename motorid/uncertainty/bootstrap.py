@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from motorid.display.cards import Card, Shown
+from motorid.display.cards import Card, Printed
 from motorid.display.numbers import interval_text, percent
 from motorid.display.tables import Flag, Table, value_cell
 from motorid.errors import FitError, MotoridError, UsageError, one_of
@@ -33,7 +33,7 @@ SOLVER = LevenbergMarquardt(max_iterations=60, ftol=1e-7, xtol=1e-7)  # from the
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Bootstrap(Shown):
+class Bootstrap(Printed):
     """Refits to resampled records.
 
     Attributes
@@ -103,9 +103,6 @@ class Bootstrap(Shown):
         return Card("Bootstrap", flags, (words.get(self.kind, f"Resampled: {self.kind}."), self.interrupted),
                     (Table(["parameter", "value ± std", "95 %", "at its limit"], rows, left=(0, 1, 2)),),
                     (("mi.plot_profile(mi.intervals(fit))", "compare"),))
-
-    def __str__(self) -> str:
-        return str(self.card())
 
 
 @dataclass(frozen=True, eq=False)

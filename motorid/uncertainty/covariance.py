@@ -11,7 +11,7 @@ import numpy as np
 from scipy.special import stdtrit
 
 from motorid.channels import channel_name
-from motorid.display.cards import Card, Shown
+from motorid.display.cards import Card, Printed
 from motorid.display.numbers import interval_text, percent
 from motorid.display.tables import Cell, Flag, Table, value_cell
 from motorid.errors import UsageError, one_of
@@ -27,7 +27,7 @@ Blocks = Mapping[str, Sequence[tuple[Array, Array]]]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Covariance(Shown):
+class Covariance(Printed):
     """What the data say about the unknowns of a fit.
 
     Attributes
@@ -110,9 +110,6 @@ class Covariance(Shown):
         return Card("Uncertainty", (Flag(f"{self.method} residuals"),),
                     (f"Effective samples per sample: {share}.",) if share else (),
                     (Table(header, rows, left=(0, 1, 2)),), (("mi.bootstrap(fit)", "check it"),))
-
-    def __str__(self) -> str:
-        return str(self.card())
 
 
 def _correlation_cell(value: float) -> Cell:

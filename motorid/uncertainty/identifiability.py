@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from motorid.channels import NAMES
-from motorid.display.cards import Card, Shown
+from motorid.display.cards import Card, Printed
 from motorid.display.numbers import number, percent, quantity
 from motorid.display.tables import Flag, Table
 from motorid.errors import MotoridError, SimulationError, UsageError
@@ -58,7 +58,7 @@ class WeakDirection:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Identifiability(Shown):
+class Identifiability(Printed):
     """What records can tell about parameters, at one point.
 
     Attributes
@@ -163,18 +163,11 @@ class Identifiability(Shown):
         k = len(self.names)
         partly = Flag(f"{self.rank} of {k} directions determined", "note")
         values = ", ".join(number(s, 3) for s in self.singular_values)
-        return Card(
-            "What the data determine",
-            (Flag("all determined", "good") if self.full else partly,),
-            (self.text, f"Singular values {values}; condition number {number(self.condition_number, 3)}; "
-                        f"rank {self.rank} of {k}, structural rank {self.structural_rank}."),
-            (Table(["parameter", "value", "std in a fit", "relative"], rows),),
-            (("mi.plot_singular_values(result)", "see it"),),
-            "plot_singular_values",
-        )
-
-    def __str__(self) -> str:
-        return str(self.card())
+        return Card("What the data determine", (Flag("all determined", "good") if self.full else partly,),
+                    (self.text, f"Singular values {values}; condition number {number(self.condition_number, 3)}; "
+                                f"rank {self.rank} of {k}, structural rank {self.structural_rank}."),
+                    (Table(["parameter", "value", "std in a fit", "relative"], rows),),
+                    (("mi.plot_singular_values(result)", "see it"),), "plot_singular_values")
 
 
 @one_thread

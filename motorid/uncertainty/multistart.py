@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from motorid.display.cards import Card, Shown
+from motorid.display.cards import Card, Printed
 from motorid.display.numbers import duration, percent, quantity, sentence
 from motorid.display.tables import Flag, Table
 from motorid.errors import MotoridError, SimulationError, UsageError
@@ -134,7 +134,7 @@ class StartResult:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Multistart(Shown):
+class Multistart(Printed):
     """Many fits of one problem from random starts.
 
     Attributes
@@ -295,6 +295,3 @@ class Multistart(Shown):
         return Card("Fits from random starts", flags, (self.text,),
                     (Table(["parameter", "reference", "mean of the good fits", "spread"], rows),),
                     (("mi.plot_waterfall(study)", "see it"),), "plot_waterfall")
-
-    def __str__(self) -> str:
-        return str(self.card())

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from scipy.special import stdtrit
 
-from motorid.display.cards import Card, Shown
+from motorid.display.cards import Card, Printed
 from motorid.display.numbers import interval_text, percent, quantity
 from motorid.display.tables import Flag, Table
 from motorid.errors import MotoridError, UsageError, one_of
@@ -35,7 +35,7 @@ SOLVER = LevenbergMarquardt(max_iterations=60, ftol=1e-8, xtol=1e-8)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Profile(Shown):
+class Profile(Printed):
     """The profile of one parameter.
 
     Attributes
@@ -112,9 +112,6 @@ class Profile(Shown):
         flags = [Flag("the profile found a better fit than the one given", "bad")] if self.best < -1.0 else []
         after = (("mi.plot_profile(profile)", "see it"),)
         return Card(f"Profile of {self.name}", flags, (self.text,), (), after, "plot_profile")
-
-    def __str__(self) -> str:
-        return str(self.card())
 
 
 def _crossing(x: Array, rise: Array, reach: float) -> float | None:
@@ -231,7 +228,7 @@ def _joined(fit: Fit, name: str, left: list[Point], right: list[Point], dof: flo
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Intervals(Shown):
+class Intervals(Printed):
     """Three answers to one question. Where they agree, any will do; where not, believe the profile.
 
     Attributes
@@ -268,9 +265,6 @@ class Intervals(Shown):
                     text=("Where the three agree, any will do; where they do not, believe the profile.",),
                     tables=(Table(header, rows, left=(0, 1, 2, 3, 4)),),
                     after=(("mi.plot_profile(intervals)", "see them"),), figure="plot_profile")
-
-    def __str__(self) -> str:
-        return str(self.card())
 
 
 @one_thread

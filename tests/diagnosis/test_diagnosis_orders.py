@@ -56,7 +56,7 @@ def test_the_best_orders_are_those_of_a_look_at_all(lab, effect, hidden):
         for k, words in enumerate(("stairs 0.4", "ramps 0.3"))
     ]
     tangent = Tangent.of(mi.fit(mi.dc_motor(), runs))
-    looking, relative = orders._looking(tangent), effect == "torque_ripple"
+    looking, relative = orders._order_search(tangent), effect == "torque_ripple"
     every = looking.orders[1:]
     assert len(every) > 2 * (orders.SAMPLED + orders.LOOKED_AT)
     exact = {line.order: line for line in looking.exact(every, relative)[0]}
