@@ -198,7 +198,7 @@ class _ProgressReports:
         names = (c.name for c in self.setup.header.channels)
         self.before = (now, timeline.received, last.time)
         self.setup.progress(Progress(last.time, self.setup.total, rate, timeline.received, timeline.lost,
-                                 dict(zip(names, last.values, strict=True))))
+                                     dict(zip(names, last.values, strict=True))))
 
 
 @contextlib.contextmanager

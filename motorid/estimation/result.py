@@ -347,7 +347,7 @@ def comparison_table(fits: Sequence[tuple[str, Fit]], held_out: Sequence[Mapping
     units = units_of(run for _, f in fits for run in f.problem.experiments)
     channels = {c: channel_name(c, units.get(c, "")) for _, f in fits for c in f.nrmse}
     rows: list[Sequence[Cell]] = [[f"NRMSE {name}", *(percent(f.nrmse.get(c)) for _, f in fits)]
-                              for c, name in channels.items()]
+                                  for c, name in channels.items()]
     if any(held_out):
         rows += [[f"held-out {name}", *(percent((e or {}).get(c)) for e in held_out)] for c, name in channels.items()]
     known = [std(f) for _, f in fits]

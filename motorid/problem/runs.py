@@ -168,7 +168,7 @@ def initial_state(run: Experiment, sigma: Mapping[str, float], initial: str) -> 
     free = initial == "estimate"
     places = {c: start[CHANNELS.index(c)] for c in reach}
     return InitialState(start, {c: (-np.inf, np.inf) if free else (x - reach[c], x + reach[c])
-                             for c, x in places.items()})
+                                for c, x in places.items()})
 
 
 def at_rest(run: Experiment, sigma: Mapping[str, float]) -> tuple[bool, int]:

@@ -78,7 +78,7 @@ def assign(labels: Sequence[str], *, columns: Mapping[str, object] | None = None
 
 
 def _named_by_user(labels: Sequence[str], columns: Mapping[str, object], units: Mapping[str, object],
-          row: Units) -> dict[str, Place]:
+                   row: Units) -> dict[str, Place]:
     places = {}
     for channel, column in columns.items():
         if channel not in _CHANNELS:

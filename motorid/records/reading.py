@@ -194,8 +194,8 @@ def _read(path: Path_, to_table: Callable[[bytes], TextTable], columns: Mapping[
             labels = [c for c in labels if c in columns.values()]
         layout = assign(labels, columns=columns, units=units, unit_row=table.unit_row)
         return run_from_columns(table.columns, table.texts, layout, name=name or path.stem, notes=table.notes,
-                     hold=hold or own.get("hold", "zoh"), sigma=_sigma(own.get("sigma")),
-                     meta={"source": str(path), "sha256": hashlib.sha256(data).hexdigest()})
+                                hold=hold or own.get("hold", "zoh"), sigma=_sigma(own.get("sigma")),
+                                meta={"source": str(path), "sha256": hashlib.sha256(data).hexdigest()})
     except (DataError, UsageError) as error:
         raise DataError(f"{path}: {error}") from None
 

@@ -123,7 +123,7 @@ def _segment(k: int, run: Experiment, first: int, last: int) -> SteadySegment:
     top = float(np.nanmax(np.abs(run.outputs["omega"]))) if "omega" in run.outputs else _top_slope(run)
     moving = abs(means["omega"]) > MOVING_SHARE * top if "omega" in means else True
     return SteadySegment(k, first, last, float(run.t[first]), float(run.t[last]),
-                   float(np.mean(run.inputs["v"][part])), means, bool(moving))
+                         float(np.mean(run.inputs["v"][part])), means, bool(moving))
 
 
 def _slope(run: Experiment, first: int, last: int) -> float:

@@ -208,7 +208,7 @@ def _side(task: tuple[Parcel, str, float, float, float, float]) -> list[Point]:
 
 
 def _refit_with(problem: Problem, values: dict[str, float], name: str,
-          p: float) -> tuple[float, dict[str, float]] | None:
+                p: float) -> tuple[float, dict[str, float]] | None:
     here = problem.for_model(problem.model.start_at(values).fix(**{name: p}))
     try:
         done = least_squares(here, SOLVER)
