@@ -10,8 +10,8 @@ import typer
 
 from motorid.cli.console import save_report, say_notes, show
 from motorid.cli.options import OUT, FitOptions, Json, Report, Runs, Validate, notes_of, own_effects, with_options
-from motorid.diagnosis.cross_validation import fit_affordably
 from motorid.diagnosis.diagnose import diagnose
+from motorid.diagnosis.record_parts import fit_affordably
 from motorid.diagnosis.results import Diagnosis, ladder_table, ranking_table
 from motorid.errors import UsageError
 from motorid.estimation.fit import fit

@@ -20,14 +20,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtrc, stdtr
 
-from motorid.diagnosis.cross_validation import BLOCKS, HeldOut
-from motorid.diagnosis.form_regression import Linear, by_channel, fraction, fraction_of, halves, left, linearised
-from motorid.diagnosis.free_forms import Form
-from motorid.diagnosis.residual_analysis import LARGER, far
+from motorid.diagnosis.misspecification import best_form
+from motorid.diagnosis.model_comparison import Node, far
+from motorid.diagnosis.predictive_score import Predictions
 from motorid.diagnosis.results import Adequacy
 from motorid.diagnosis.score_test import Score
+from motorid.diagnosis.thresholds import LARGER
 from motorid.display.numbers import number
-from motorid.errors import FAILURES
 from motorid.estimation.result import Fit
 from motorid.numerics.autoregression import autocorrelation, effective_samples
 from motorid.numerics.noise import despiked, outlier_limit, quantum
@@ -42,13 +41,8 @@ LARGEST_RATIO = 10.0  # of residual to noise: coloured noise with a correlation 
 MATERIAL = 0.03  # share of the residual's variance below which a dependence is not worth a word
 ROUNDED = 0.15  # the same where errors are no larger than rounding: that repeats itself at a steady speed
 AT_ROUNDING = 1.2  # times the noise of rounding, step/√12
-NAMES = {
-    "v": "the voltage",
-    "i": "the current",
-    "omega": "the speed",
-    "theta": "the angle within a turn",
-    "acceleration": "the acceleration",
-}
+NAMES = {"v": "the voltage", "i": "the current", "omega": "the speed", "theta": "the angle within a turn",
+         "acceleration": "the acceleration"}
 
 
 def adequacy(
@@ -96,18 +90,14 @@ def _material(channels: Mapping[str, Mapping[str, float]], channel: str | None) 
     return MATERIAL + (ROUNDED - MATERIAL) * float(np.mean(own))
 
 
-def following(judged: Adequacy, what: str, share: float | None = None) -> Adequacy:
-    """Return a judgement that knows what the errors follow, e.g. "a load that changes with the time".
-
-    `share` is how much of their variance that explains on data it was not fitted to.
-    """
+def following(judged: Adequacy, what: str) -> Adequacy:
+    """Return a judgement that knows what the errors follow, e.g. "a load that changes with the time"."""
     if what in judged.text:
         return judged
-    held = "" if share is None else f" ({100 * share:.0f} % of their variance on data held out)"
     if judged.adequate:
-        text = f"Something is missing: the errors ({_sizes(judged.channels)}) follow {what}{held}."
+        text = f"Something is missing: the errors ({_sizes(judged.channels)}) follow {what}."
         return replace(judged, adequate=False, text=text)
-    return replace(judged, text=f"{judged.text} They follow {what}{held}.")
+    return replace(judged, text=f"{judged.text} They follow {what}.")
 
 
 def unpredicted(judged: Adequacy) -> Adequacy:
@@ -143,15 +133,9 @@ def _channel(fit: Fit, channel: str) -> dict[str, float]:
     rms = float(np.sqrt(np.mean(r**2))) if r.size else 0.0
     alone = np.concatenate([despiked(p) for _, p in parts])
     ratio = float(np.sqrt(np.mean(alone**2))) / noise if alone.size else 0.0
-    return {
-        "noise": noise,
-        "rms": rms,
-        "ratio": ratio,
-        "rounded": float(ratio < AT_ROUNDING and _by_rounding(fit, channel, noise)),
-        "autocorrelation": rho,
-        "input_correlation": linked,
-        "effective_samples": sum(effective_samples(p) for _, p in parts),
-    }
+    return {"noise": noise, "rms": rms, "ratio": ratio,
+            "rounded": float(ratio < AT_ROUNDING and _by_rounding(fit, channel, noise)), "autocorrelation": rho,
+            "input_correlation": linked, "effective_samples": sum(effective_samples(p) for _, p in parts)}
 
 
 def _by_rounding(fit: Fit, channel: str, noise: float) -> bool:
@@ -257,13 +241,8 @@ def _score_tests(fit: Fit, scores: Sequence[Score]) -> list[dict[str, Any]]:
     return found
 
 
-def _text(
-    adequate: bool,
-    channels: Mapping[str, Mapping[str, float]],
-    material: Sequence[Mapping[str, Any]],
-    far: Sequence[str],
-    false_alarm: float,
-) -> str:
+def _text(adequate: bool, channels: Mapping[str, Mapping[str, float]], material: Sequence[Mapping[str, Any]],
+          far: Sequence[str], false_alarm: float) -> str:
     sizes = _sizes(channels)
     if adequate:
         coloured = [c for c, f in channels.items() if f["autocorrelation"] > 0.3 or f["ratio"] > LARGER]
@@ -284,60 +263,18 @@ def _text(
     return f"Something is missing: the errors ({sizes}) are not noise; {why}."
 
 
-PREDICTED = 0.1  # of the squared misfit: what a form must explain, on data held out too, that is no noise
 CLEAR = 1e-3  # p-value of errors larger than the noise that needs no second test: few coloured samples tell little
 
 
-def judgement(fit: Fit, scores: Sequence[Score], held: HeldOut) -> Adequacy:
-    """Judge whether the residuals of `fit` are noise; errors larger than it are, if no form predicts them.
+def judge_adequacy(node: Node, scores: Sequence[Score]) -> Adequacy:
+    """Judge whether the residuals of a model are noise; errors larger than it are, if no free form predicts them.
 
     Unless what they depend on is beyond doubt.
     """
-    judged = adequacy(fit, scores)
-    if not far(fit) or not (doubtful := adequacy(fit, scores, level=CLEAR)).adequate:
+    judged = adequacy(node.fit, scores)
+    if not far(node.fit) or not (doubtful := adequacy(node.fit, scores, level=CLEAR)).adequate:
         return judged
-    try:
-        found = predicted(fit, held)
-    except FAILURES:
-        return judged
-    return following(judged, found[0].text, found[1]) if found else unpredicted(doubtful)
-
-
-def predicted(fit: Fit, held: HeldOut) -> tuple[Form, float] | None:
-    """Return the free form that explains most of errors larger than the noise, and how much, on data held out too.
-
-    It must do so on the records, on blocks of them held out and, if there are any, on held-out runs.
-
-    Raises
-    ------
-    SimulationError
-    """
-    channels = far(fit)
-    if not channels:
-        return None
-    train, *test = linearised(fit, held.validation)
-    best = max(((f, _share(f, train, test, channels)) for f in train.forms), key=lambda f: f[1], default=None)
-    return best if best is not None and best[1] > PREDICTED else None
-
-
-def _share(form: Form, train: Linear, test: Sequence[Linear], channels: Sequence[int]) -> float:
-    """Return how much a form explains of the squared misfit, where it explains least."""
-    before = by_channel(left(train.residual, train.slopes, train.own), train)
-    after = by_channel(left(train.residual, train.slopes, train.own, train.forms[form]), train)
-    most = fraction(after, before, channels)
-    if most < 1 - PREDICTED:
-        most = max(most, fraction_of(form, list(halves(train, BLOCKS)), channels))
-    if most < 1 - PREDICTED and test and not form.local:
-        most = max(most, fraction_of(form, [(train, test[0])], channels))
-    return 1 - most
-
-
-def pursued(judged: Adequacy, fit: Fit, held: HeldOut) -> Adequacy:
-    """Return the judgement of an inadequate model with what its errors follow, as far as a free form tells."""
-    if judged.adequate:
-        return judged
-    try:
-        found = predicted(fit, held)
-    except FAILURES:
-        return judged
-    return following(judged, found[0].text, found[1]) if found else judged
+    larger = {node.fit.problem.outputs[j] for j in far(node.fit)}  # a form that helps the others explains nothing here
+    errors = {c: e for c, e in node.predictions.blocks.items() if c in larger}
+    found = best_form(node.fit, Predictions(errors, {})) if errors else None
+    return following(judged, found.form.text) if found else unpredicted(doubtful)

@@ -13,14 +13,11 @@ from motorid.numerics.noise import noise_level, quantum
 from motorid.numerics.signals import Array, window_slopes
 from motorid.problem.runs import angle_signal
 
-WORST_CONDITION = 1e4  # of the column-scaled Jacobian
-HOPELESS = 1e6  # condition number beyond which a direction counts as open
 KNOWN = 0.3  # of a parameter, its standard deviation: determined
 MOST_LOST = 0.6  # of the largest voltage that a drop or a dead band may be
 MOST_OFFSET = 0.3  # and an offset, which turns the motor by itself
 EMPTIED = 1e-2  # of its value before: it has vanished
 LENGTHS = ("rad", "m")  # a gap that runs to its limit is none
-PHASE_KNOWN = 0.5  # rad, standard deviation: beyond it an amplitude is not told from none
 
 
 def objections(fit: Fit, added: Effect, before: Fit | None = None) -> str:
@@ -39,7 +36,7 @@ def objections(fit: Fit, added: Effect, before: Fit | None = None) -> str:
             return f"{p.name} goes to {p.null:g}: the data do not want it, or only with the wrong sign"
         if p.vary and np.isfinite(p.upper) and fit.values[p.name] > 0.98 * p.upper and not _was_narrowed(p, added):
             return f"{p.name} runs to {p.upper:g}, the limit of what is physical"
-    why = _too_large(fit, pars) or _adrift(fit, pars) or unresolved(fit, added)
+    why = _too_large(fit, pars) or unresolved(fit, added)
     return why or (_emptied(fit, added, before) if before else "")
 
 
@@ -73,24 +70,6 @@ def _emptied(fit: Fit, added: Effect, before: Fit) -> str:
         if std is not None and std < KNOWN * was and now < EMPTIED * was:
             return f"{p.name} goes to nothing with it, though the data determine it without"
     return ""
-
-
-def _adrift(fit: Fit, pars: Sequence[Parameter]) -> str:
-    """Say so where a phase is not determined: what has no phase has no amplitude."""
-    for p in pars:
-        if p.periodic and p.vary and ((std := fit.std.get(p.name)) is None or std > PHASE_KNOWN):
-            return f"{p.name} is not determined, so neither is the amplitude that goes with it"
-    return ""
-
-
-def ambiguity(fit: Fit) -> tuple[int, float]:
-    """Return how many directions of the parameters the data leave open, and the condition of the others."""
-    n = len([p for p in fit.problem.model.parameters.values() if p.vary])
-    jac = fit.jacobian[:, :n]
-    norms = np.linalg.norm(jac, axis=0)
-    s = np.linalg.svd(np.linalg.qr(jac / np.where(norms > 0, norms, 1.0), mode="r"), compute_uv=False)
-    clear = s[s > s[0] / HOPELESS]
-    return len(s) - len(clear), float(clear[0] / clear[-1])
 
 
 PASSAGE = 10  # samples that a motion through the shape must give

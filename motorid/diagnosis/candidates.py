@@ -1,7 +1,7 @@
 """Growing a model by one effect, judging the children, pruning: the moves of the search.
 
-A child must lower the error on data it was not fitted to, be worth its parameters, be identifiable and have its
-physical sign; see `judging`.
+A child must predict data that it was not fitted to better, by more than chance and by an amount that matters; see
+`predictive_score`. What else speaks against its effect is kept with it, and tells what it may be called.
 """
 
 from __future__ import annotations
@@ -11,13 +11,16 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from motorid.diagnosis.admissibility import WORST_CONDITION, ambiguity, objections
-from motorid.diagnosis.cross_validation import HeldOut, train_errors
-from motorid.diagnosis.model_comparison import COMMON, PLAIN, Judge, Node, held_out_objection, node_of, worth_it
+import numpy as np
+
+from motorid.diagnosis.admissibility import objections
+from motorid.diagnosis.cross_validation import HeldOut
+from motorid.diagnosis.model_comparison import COMMON, Node, beats, evidence, far, node_of
+from motorid.diagnosis.predictive_score import Evidence
 from motorid.diagnosis.refit import GivenUp, Task, lost, refit, refits, widened
-from motorid.diagnosis.residual_analysis import Errors, Gain, compare_errors, far
 from motorid.diagnosis.results import Candidate
 from motorid.diagnosis.score_test import Score, pairs_of, rank
+from motorid.diagnosis.thresholds import MATERIAL
 from motorid.effects import LIBRARY
 from motorid.errors import FAILURES, ModelError
 from motorid.estimation.result import Fit
@@ -43,18 +46,11 @@ def library(effects: Iterable[Effect | str] | None, also: Iterable[Effect] = ())
 class Search:
     """One search over models; `expand` and `choose` are its two moves."""
 
-    def __init__(
-        self,
-        fit: Fit,
-        validate: Sequence[Experiment] | Experiment | None,
-        effects: Sequence[Effect],
-        map_: Callable[..., Iterable[Any]],
-        advance: Advance,
-    ) -> None:
+    def __init__(self, fit: Fit, validate: Sequence[Experiment] | Experiment | None, effects: Sequence[Effect],
+                 map_: Callable[..., Iterable[Any]], advance: Advance) -> None:
         self.held = HeldOut.of(fit, validate)
         self.effects, self.map, self.advance = list(effects), map_, advance
         self.root = node_of(fit, self.held)
-        self.judge = Judge(self.root, self.held)
         self._scores: dict[frozenset[str], list[Score]] = {}
         self.nodes: dict[frozenset[str], Node] = {self.root.key: self.root}
 
@@ -143,44 +139,21 @@ class Search:
         if fit is None:
             return None, replace(candidate, reason="its refit could not be simulated")
         try:
-            train = train_errors(fit)
-        except FAILURES:
-            return None, replace(candidate, reason="its refit could not be simulated")
-        drop = _drop(node, train)
-        values = {p.name: fit.values[p.name] for e in effects for p in e.parameters}
-        candidate = replace(candidate, refit_drop=drop, parameters=values, fit=fit)
-        why = next((w for e in effects if (w := objections(fit, e, node.fit))), "")
-        if why:
-            return None, replace(candidate, reason=why)
-        gain = compare_errors(node.train, train, self.held.noise)
-        if not worth_it(max(len(fit.problem.model.free_names) - node.size, 1), gain):
-            return None, replace(candidate, reason="the improvement is within what noise and chance would give")
-        try:
-            child = Node(fit, effect.name, train, self.held.errors(fit), node)
-            held = self.judge.held_gain(node, child)
+            drop, predictions = _drop(node, fit), self.held.predictions(fit)
         except FAILURES as error:
             return None, replace(candidate, reason=f"fails on held-out data: {error}")
-        candidate = replace(candidate, validation_nrmse=child.held.nrmse(), held_out_gain=held.fall)
-        why = held_out_objection(held) or self._ambiguous(node, fit, held)
-        if why:
-            return None, replace(candidate, reason=why)
-        candidate = replace(candidate, reason=f"lowers the held-out error by {100 * held.fall:.1f} %")
+        objection = next((w for e in effects if (w := objections(fit, e, node.fit))), "")
+        values = {p.name: fit.values[p.name] for e in effects for p in e.parameters}
+        child = Node(fit, effect.name, predictions, node, objection=objection)
+        found = evidence(node, child)
+        candidate = replace(candidate, refit_drop=drop, parameters=values, fit=fit,
+                            validation_nrmse={c: e.nrmse for c, e in predictions.held_out.items()} or None,
+                            held_out_gain=found.fall if found.held_out_fall is None else found.held_out_fall,
+                            gain=found.gain, gain_se=found.se, reason=_said(found))
+        if not found.worth_it:
+            return None, candidate
+        candidate = replace(candidate, reason=f"{candidate.reason}, but {objection}") if objection else candidate
         return replace(child, candidate=candidate), candidate
-
-    @staticmethod
-    def _ambiguous(node: Node, fit: Fit, held: Gain) -> str:
-        """Say so when the effect adds what these data cannot determine; a plain fall held out outweighs it."""
-        (open_now, worse), (open_before, was) = ambiguity(fit), ambiguity(node.fit)
-        if held.fall > PLAIN:
-            return ""
-        if open_now > open_before:
-            return "not identifiable with these data beside the other parameters"
-        if worse > WORST_CONDITION and worse > 10 * was:
-            return (
-                "not identifiable with these data: the condition number of the sensitivities rises from "
-                f"{was:.0f} to {worse:.0f}"
-            )
-        return ""
 
     @staticmethod
     def _listed(scores: Sequence[Score], judged: Mapping[str, Candidate]) -> list[Candidate]:
@@ -188,12 +161,8 @@ class Search:
         for s in scores:
             c = judged.get(s.effect.name)
             if c is None:
-                c = Candidate(
-                    s.effect.name,
-                    s.drop,
-                    parameters=dict(s.starts[0]) if s.starts else {},
-                    reason=_unseen(s),
-                )
+                c = Candidate(s.effect.name, s.drop, parameters=dict(s.starts[0]) if s.starts else {},
+                              reason=_unseen(s))
             listed.append(replace(c, predicted_drop=s.drop))
         rest = [c for n, c in judged.items() if n not in {s.effect.name for s in scores}]
         return listed + rest
@@ -208,8 +177,8 @@ class Search:
             alone = e.name == node.added and node.parent is not None and len(node.key - node.parent.key) == 1
             smaller = simpler if alone else [*simpler, node.fit.model.without(e.name)]
             for model in sorted(smaller, key=lambda m: len(m.free_names)):
-                other = self._smaller(node, model)
-                if other is not None and self.judge.superfluous(node, other):
+                other = self.smaller(node, model)
+                if other is not None and not beats(node, other):
                     return self.pruned(other)
         return node
 
@@ -219,7 +188,7 @@ class Search:
         known = {e.name: e for e in self.effects}
         return [known[n] for n in effect.includes if n in known and n not in have]
 
-    def _smaller(self, node: Node, model: Model) -> Node | None:
+    def smaller(self, node: Node, model: Model) -> Node | None:
         """Return the judged model, one that is contained in `node`'s; None where it is no model by itself."""
         key = frozenset(model.effect_names)
         if key not in self.nodes:
@@ -230,7 +199,7 @@ class Search:
                 if alike := [node.fit.values[o.name] for e in gone for o in e.parameters if _alike(p, o)]:
                     values[p.name] = max(alike)
             fit = refit(node.fit, model, (values,))
-            if fit is None or any(objections(fit, e) for e in new):
+            if fit is None or any(objections(fit, e) for e in new):  # what takes its place must be sound
                 return None
             try:
                 added = node.added if node.added in model.effect_names or not new else new[0].name
@@ -281,10 +250,25 @@ def _unseen(score: Score) -> str:
     return "too little to gain for a refit"
 
 
-def _drop(node: Node, train: Errors) -> float:
+def _said(found: Evidence) -> str:
+    """Say what an effect does for data that it was not fitted to."""
+    where = "prediction error" if found.held_out_fall is None else "held-out error"
+    if found.held_out_fall is not None and found.held_out_fall < -MATERIAL:
+        return f"the held-out error rises by {-100 * found.held_out_fall:.1f} %"
+    if not found.sure:
+        return f"predicts no better than chance would (gain {found.gain:.1f} ± {found.se:.1f})"
+    if not found.worth_it:
+        return f"lowers the {where} by less than {100 * MATERIAL:g} %"
+    return f"lowers the {where} by {100 * found.fall:.1f} %"
+
+
+def _drop(node: Node, fit: Fit) -> float:
     """Share of chi² that vanishes, with the weights of the smaller model."""
-    noise = {c: s * node.fit.problem.balance.get(c, 1.0) for run in node.fit.problem.runs for c, s in run.sigma.items()}
+    problem = node.fit.problem
+    noise = {c: s * problem.balance.get(c, 1.0) for run in problem.runs for c, s in run.sigma.items()}
     old, new = (
-        sum(ss / noise[c] ** 2 for c, (ss, _) in e.squares().items() if c in noise) for e in (node.train, train)
+        sum(float(np.nansum((s.residual(c) / noise[c]) ** 2)) for s in f.simulations for c in s.experiment.outputs
+            if c in noise and c in s.outputs)
+        for f in (node.fit, fit)
     )
     return float(1 - new / max(old, 1e-300))

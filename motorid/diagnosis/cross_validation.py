@@ -1,29 +1,24 @@
-"""Where models are judged: on held-out runs, or on blocks of the fitted ones."""
+"""Where models are judged: on blocks of the fitted records left out in turn, and on held-out runs."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from motorid.diagnosis.residual_analysis import Errors
-from motorid.errors import MotoridError
+from motorid.diagnosis.predictive_score import Channels, Errors, Predictions, errors_of, predictions_left_out
+from motorid.errors import FAILURES
 from motorid.estimation.continuation import by_continuation
-from motorid.estimation.fit import solve
 from motorid.estimation.result import Fit
 from motorid.numerics.least_squares import LevenbergMarquardt
-from motorid.numerics.signals import Array
 from motorid.problem.problem import Problem
-from motorid.problem.runs import angle_signal
 from motorid.problem.simulate import at, simulated
 from motorid.records.experiment import Experiment
 
 QUICK = LevenbergMarquardt(max_iterations=25, ftol=1e-4, xtol=1e-5, looks=0)
-BLOCKS = 10  # contiguous parts of each run; every other one is held out where there are no held-out runs
+FOLD = 10  # contiguous parts of each run, every other one held out, where slopes cannot tell what a block left out does
 ROUGH = 1e-4  # accuracy of the integration while starts are compared
-LEAST_FALL = 0.01  # of the held-out error that makes an effect worth having
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,60 +28,74 @@ class HeldOut:
     Attributes
     ----------
     validation : Problem or None
-        Held-out runs, of the model to begin with; None: blocks instead.
-    folds : tuple of (training Problem, test Experiments)
-        Every other block of the fitted records held out, and the others.
+        Held-out runs, of the model to begin with.
     noise : dict of str to float
+        Of each channel's sensor, SI.
     """
 
     validation: Problem | None
-    folds: tuple[tuple[Problem, tuple[Experiment, ...]], ...]
     noise: Mapping[str, float]
 
     @staticmethod
     def of(fit: Fit, validate: Sequence[Experiment] | Experiment | None) -> HeldOut:
         """Prepare the judgement for models of `fit`'s records."""
         noise = {c: s for run in fit.problem.runs for c, s in run.sigma.items()}
-        validation = None
-        if validate is not None:
-            runs = (validate,) if isinstance(validate, Experiment) else tuple(validate)
-            validation = fit.problem.with_(experiments=runs, model=fit.model, priors={}, penalties=(), balance={})
-        folds = []
-        for odd in (0, 1):
-            train, test = zip(*(_blocked(r, odd) for r in fit.problem.experiments), strict=True)
-            prepared = tuple(replace(run, experiment=e) for run, e in zip(fit.problem.runs, train, strict=True))
-            problem = fit.problem.with_(experiments=train, priors={}, penalties=())
-            folds.append((replace(problem, _runs=prepared), test))
-        return HeldOut(validation, tuple(folds), noise)
+        if validate is None:
+            return HeldOut(None, noise)
+        runs = (validate,) if isinstance(validate, Experiment) else tuple(validate)
+        problem = fit.problem.with_(experiments=runs, model=fit.model, priors={}, penalties=(), balance={})
+        return HeldOut(problem, noise)
 
-    def errors(self, fit: Fit) -> Errors:
-        """Return the errors of `fit` on the held-out runs, or on blocks where there are none.
+    def predictions(self, fit: Fit) -> Predictions:
+        """Return what `fit` predicts of data that it was not fitted to.
 
         Raises
         ------
         SimulationError
+            If it cannot be simulated on the held-out runs.
         """
+        held_out: Channels = {}
         if self.validation is not None:
-            return Errors.of(simulated(self.validation.for_model(fit.model)))
-        return self.block_errors(fit)
+            held_out = errors_of(simulated(self.validation.for_model(fit.model)), self.noise)
+        blocks = predictions_left_out(fit)
+        if blocks is None and not held_out:
+            blocks = self._refitted(fit)
+        return Predictions(blocks or {}, held_out)
 
-    def block_errors(self, fit: Fit) -> Errors:
-        """Return the errors of `fit` on every other block, refitted to the rest, and the other way round.
+    def _refitted(self, fit: Fit) -> Channels:
+        """Return the errors on every other part of each run, the model refitted to the rest, both ways round."""
+        found: dict[str, list[Errors]] = {}
+        for odd in (0, 1):
+            try:
+                problem, test = _fold(fit.problem.for_model(fit.model), odd)
+                q = problem.scaling.scaled([fit.initial.get(p.name, p.value) for p in problem.unknown])
+                done = by_continuation(restarted(problem, q), QUICK, wide=False)
+                for c, e in errors_of(at(done.problem, done.solution.q), self.noise, test).items():
+                    found.setdefault(c, []).append(e)
+            except FAILURES:
+                return {}
+        return {
+            c: Errors(tuple(v for e in both for v in e.values), tuple(b for e in both for b in e.blocks),
+                      both[0].measured, both[0].noise)
+            for c, both in found.items()
+        }
 
-        Raises
-        ------
-        SimulationError
-        """
-        parts = []
-        for problem, test in self.folds:
-            start = problem.for_model(fit.model).tuned(balance=fit.problem.balance, accuracy=ROUGH)
-            if fit.model.angle_input:  # the measured angle, where it is hidden from the judgement too
-                runs = zip(fit.problem.runs, problem.runs, strict=True)
-                start = replace(start, _runs=tuple(replace(whole, experiment=r.experiment) for whole, r in runs))
-            q = start.scaling.scaled([fit.initial.get(p.name, p.value) for p in start.unknown])
-            done = by_continuation(restarted(start, q), QUICK, wide=False)
-            parts.append(Errors.of(at(done.problem, done.solution.q), test))
-        return Errors({c: [r for e in parts for r in e.residuals[c]] for c in parts[0].residuals}, parts[0].measured)
+
+def _fold(problem: Problem, odd: int) -> tuple[Problem, tuple[Experiment, ...]]:
+    """Return the problem without every other part of its records, and those parts."""
+    train, test = zip(*(_parted(r, odd) for r in problem.experiments), strict=True)
+    runs = tuple(replace(run, experiment=e) for run, e in zip(problem.runs, train, strict=True))
+    other = problem.with_(experiments=train, priors={}, penalties=())
+    return replace(other, _runs=runs).tuned(balance=problem.balance, accuracy=ROUGH), test
+
+
+def _parted(run: Experiment, odd: int) -> tuple[Experiment, Experiment]:
+    """Return the run with every other part missing, and with the others missing."""
+    part = np.minimum(np.arange(run.n) * FOLD // run.n, FOLD - 1) % 2 == odd
+    hidden = {c: np.where(part, np.nan, y) for c, y in run.outputs.items()}
+    judged = {c: np.where(part, y, np.nan) for c, y in run.outputs.items()}
+    keep = {c: y for c, y in hidden.items() if np.isfinite(y).any()}
+    return run.with_(outputs=keep or run.outputs), run.with_(outputs=judged)
 
 
 def restarted(problem: Problem, q) -> Problem:
@@ -103,137 +112,3 @@ def restarted(problem: Problem, q) -> Problem:
     return replace(problem, model=problem.model.start_at(values), _runs=tuple(runs))
 
 
-def _blocked(run: Experiment, odd: int) -> tuple[Experiment, Experiment]:
-    """Return the run with every other block missing, and with the others missing."""
-    block = np.minimum(np.arange(run.n) * BLOCKS // run.n, BLOCKS - 1) % 2 == odd
-    hidden = {c: np.where(block, np.nan, y) for c, y in run.outputs.items()}
-    judged = {c: np.where(block, y, np.nan) for c, y in run.outputs.items()}
-    keep = {c: y for c, y in hidden.items() if np.isfinite(y).any()}
-    return run.with_(outputs=keep or run.outputs), run.with_(outputs=judged)
-
-
-def train_errors(fit: Fit) -> Errors:
-    """Return the errors of a fit on its own records."""
-    return Errors.of(fit.simulations)
-
-
-AFFORDABLE = 150_000  # steps of integration per simulation of all records
-WANTED = 36_000  # of what is longer
-PART = 1000  # samples
-SUBSTEPS = 24  # per sample: what needs more cannot be seen in these samples, unless it is cheap
-CHEAP = 200_000  # steps of integration
-LONG = 20_000  # samples: a first fit of their parts tells whether all of them are affordable
-FEW = 4 * PART  # samples of that first fit
-NEARLY_ALL = 0.7  # of the samples: no reason to leave out the rest
-LEVELS = 8  # of speed and of voltage that parts are to show
-TIMES = 4  # and parts of the record
-
-
-def affordable(fit: Fit) -> Fit:
-    """Return `fit`, or the fit of the same model to parts of its records if these are too long for many refits."""
-    problem = fit.problem
-    work = sum(int(r.grid.substeps.sum()) for r in problem.runs)
-    if work <= AFFORDABLE or problem.initial != "auto":
-        return fit
-    parts = parts_of(problem.experiments, WANTED / work)
-    if parts is None:
-        return fit
-    try:
-        return solve(problem.with_(experiments=parts, model=fit.model, balance={}), start="model")
-    except MotoridError:
-        return fit
-
-
-def worth_its_steps(problem: Problem) -> bool:
-    """Tell whether a problem takes no more sub-steps than its samples are worth."""
-    spent = sum(int(r.grid.substeps.sum()) for r in problem.runs)
-    return spent <= max(SUBSTEPS * _samples(problem.experiments), CHEAP)
-
-
-def fit_affordably(runs: Sequence[Experiment], fit: Callable[[Sequence[Experiment]], Fit]) -> Fit:
-    """Return the fit of `runs` to begin a diagnosis with: of parts, where to fit all would take long."""
-    total = _samples(runs)
-    parts = parts_of(runs, FEW / total) if total > LONG else None
-    if parts is None:
-        return fit(runs)
-    few = fit(parts)
-    work = sum(int(r.grid.substeps.sum()) for r in few.problem.runs) * total / _samples(parts)
-    if work <= AFFORDABLE or few.problem.initial != "auto":
-        return fit(runs)
-    wanted = parts_of(runs, WANTED / work)
-    return few if wanted is None or len(wanted) == len(parts) else fit(wanted)
-
-
-def parts_of(runs: Sequence[Experiment], share: float) -> list[Experiment] | None:
-    """Return parts of records that together are about a `share` of them; None where that is nearly all."""
-    parts = [p for run in runs for p in _parts(run, share)]
-    return parts if _samples(parts) < NEARLY_ALL * _samples(runs) else None
-
-
-def _parts(run: Experiment, share: float) -> list[Experiment]:
-    """Return parts of a run that together are about a `share` of it."""
-    count = max(1, round(run.n * share / PART))
-    if run.n < 2 * PART * count:
-        return [run]
-    return [
-        run.select(slice(a, a + PART)).with_(
-            name=f"{run.name}[{k + 1}]", meta={**run.meta, "part of": (run.name, run.n)}
-        )
-        for k, a in enumerate(_telling(run, count))
-    ]
-
-
-def _telling(run: Experiment, count: int) -> list[int]:
-    """Return where `count` parts begin that show as much as they can of what the record shows, in order of time."""
-    begins = np.unique(np.linspace(0, run.n - PART, 4 * (run.n // PART)).astype(int))
-    flags = _flags(run)
-    counted = np.concatenate([np.zeros((1, flags.shape[1])), np.cumsum(flags, axis=0)])
-    shown = counted[begins + PART] - counted[begins]
-    chosen: list[int] = []
-    for _ in range(count):
-        have = shown[chosen].sum(axis=0) if chosen else np.zeros(shown.shape[1])
-        free = [k for k, a in enumerate(begins) if all(abs(a - begins[c]) >= PART for c in chosen)]
-        if not free:
-            break
-        chosen.append(max(free, key=lambda k: float(np.sqrt(have + shown[k]).sum())))
-    return sorted(int(begins[k]) for k in chosen)
-
-
-def _kinds(run: Experiment) -> list[tuple[NDArray[np.int_], int]]:
-    """Return to which of n levels of speed, of voltage and of time each sample belongs, with n."""
-    speed = np.gradient(angle_signal(run), run.t)
-    if "omega" in run.outputs:
-        speed = np.where(np.isfinite(run.outputs["omega"]), run.outputs["omega"], speed)
-    return [(_level(speed), LEVELS), (_level(run.inputs["v"]), LEVELS), (TIMES * np.arange(run.n) // run.n, TIMES)]
-
-
-def _level(y: Array) -> NDArray[np.int_]:
-    """Return in which of `LEVELS` equal steps between its extremes each sample lies."""
-    low, high = np.quantile(y, [0.005, 0.995])
-    return np.clip(LEVELS * (y - low) / max(high - low, 1e-300), 0, LEVELS - 1).astype(int)
-
-
-def _flags(run: Experiment) -> Array:
-    """Return which levels each sample shows, (N, levels of all kinds)."""
-    return np.concatenate([np.eye(n)[k] for k, n in _kinds(run)], axis=1)
-
-
-def parts_remark(fit: Fit) -> str:
-    """Say which part of the records a fit looked at, if not all."""
-    used = fit.problem.experiments
-    whole = dict(r.meta.get("part of", (r.name, r.n)) for r in used)
-    if not any("part of" in r.meta for r in used):
-        return ""
-    share = _samples(used) / sum(whole.values())
-    return (
-        f"The records are long: this rests on {len(used)} parts of {_seconds(used):.2g} s, {100 * share:.0f} % of the "
-        "samples; fit the model to all of them."
-    )
-
-
-def _samples(runs: Sequence[Experiment]) -> int:
-    return sum(r.n for r in runs)
-
-
-def _seconds(runs: Sequence[Experiment]) -> float:
-    return float(np.median([r.duration for r in runs]))

@@ -6,11 +6,13 @@ import builtins
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
-from motorid.diagnosis.adequacy import following, pursued
+from motorid.diagnosis.adequacy import following
 from motorid.diagnosis.candidates import library
-from motorid.diagnosis.cross_validation import parts_remark
 from motorid.diagnosis.experiment_design import suggest_experiment
 from motorid.diagnosis.locate import acting_like, locate
+from motorid.diagnosis.model_comparison import far
+from motorid.diagnosis.record_parts import parts_remark
+from motorid.diagnosis.remainder import Remainder
 from motorid.diagnosis.results import Diagnosis
 from motorid.diagnosis.stepwise import Climb, explored, ladder_of
 from motorid.diagnosis.verdict import (
@@ -18,11 +20,13 @@ from motorid.diagnosis.verdict import (
     averaging_remark,
     balance_of,
     closed_loop_remark,
+    held_out_remark,
     inseparable_remark,
     measured_angle_remark,
     missing_text,
     outliers_remark,
     unexplained_text,
+    unfinished_remark,
 )
 from motorid.errors import MotoridError
 from motorid.estimation.result import Fit
@@ -34,16 +38,10 @@ from motorid.uncertainty.covariance import deviations
 
 
 @one_thread
-def diagnose(
-    fit: Fit,
-    validate: Sequence[Experiment] | Experiment | None = None,
-    *,
-    effects: Iterable[Effect | str] | None = None,
-    also: Iterable[Effect] = (),
-    max_effects: int = 3,
-    map: Callable[..., Iterable[Any]] = builtins.map,
-    progress: Callable[[str], None] | None = None,
-) -> Diagnosis:
+def diagnose(fit: Fit, validate: Sequence[Experiment] | Experiment | None = None, *,
+             effects: Iterable[Effect | str] | None = None, also: Iterable[Effect] = (), max_effects: int = 3,
+             map: Callable[..., Iterable[Any]] = builtins.map,
+             progress: Callable[[str], None] | None = None) -> Diagnosis:
     """Say where a fitted model fails and which physical effect it lacks.
 
     Parameters
@@ -51,8 +49,7 @@ def diagnose(
     fit : Fit
         Of the model as it is, e.g. ``mi.fit(mi.dc_motor(), runs)``.
     validate : Experiment or sequence of Experiment, optional
-        Held-out runs; every effect must lower the error there. Without them, blocks of the fitted runs are held
-        out in turn.
+        Held-out runs: no effect may raise the error there. Blocks of the fitted runs are left out in turn, too.
     effects : iterable of Effect or str, optional
         What to try; by default the whole library.
     also : iterable of Effect, optional
@@ -70,53 +67,50 @@ def diagnose(
     """
     say = progress or (lambda word: None)
     own = tuple(also)
-    found, other, driven = explored(fit, validate, library(effects, own), map, say, max_effects)
-    fit, search, judged = found.search.root.fit, found.search, found.first
-    missing = locate(fit)
+    found, driven = explored(fit, validate, library(effects, own), map, say, max_effects)
     say("located what is missing")
-    ladder = ladder_of(found, validate is not None)
-    names = tuple(n for n in ladder.best.problem.model.effect_names if n not in fit.problem.model.effect_names)
+    return _told(found, driven, validate is not None, own)
+
+
+def _told(found: Climb, driven: str, validated: bool, own: Sequence[Effect]) -> Diagnosis:
+    """Return what a climb found, in words and as a result."""
+    fit, ladder, remaining = found.search.root.fit, ladder_of(found, validated), found.remaining
+    missing, judged = locate(fit), found.first
+    names = tuple(g.effect for g in found.grades if g.grade != "approximates")
     ranking = found.rounds[0] if found.rounds else ()
-    remaining, suggestion, groups = found.remaining, None, found.groups
-    if other is not None:
-        remaining = following(remaining, other.form.text)
-        judged = following(judged, other.form.text) if judged.adequate else judged
-        missing = missing if names else acting_like(missing, other.form)
-    else:
-        remaining = pursued(remaining, ladder.best, search.held)
-        judged = judged if names else remaining
-    if not names:
-        verdict = "adequate" if judged.adequate else "unexplained"
-        text = adequate_text(judged, ranking) if judged.adequate else unexplained_text(judged, missing, ranking)
-        where, remaining = None if judged.adequate else missing.where, judged
-    else:
+    groups = tuple(g for g in found.groups if g[0] in names)
+    suggestion, form = None, found.form.form if found.form else None
+    if form is not None:
+        remaining = following(remaining, form.text)
+    like = next((g.form for g in found.grades if g.form is not None), form)
+    if like is not None and not names:
+        missing = acting_like(missing, like)
+    if names:
         verdict, where = "missing", balance_of(names[0], own)
-        text = missing_text(ladder.rungs, remaining, found.groups, validate is not None)
-        same = {name: p for node in found.path[1:] for name, p in search.inseparable(node).items()}
+        text = missing_text(ladder.rungs, remaining, groups, found.grades)
+        same = {name: p for node in found.path[1:] for name, p in found.search.inseparable(node).items()}
         text = f"{text} {inseparable_remark(same)}".rstrip()
         groups = (*groups, *(_sharing(ladder.best, name, parameters) for name, parameters in same.items()))
         suggestion = _suggestion(found)
-    last = ladder.best
-    of_last = (measured_angle_remark(last), averaging_remark(last), outliers_remark(last))
-    limits = (f"In {run.name} {limit}" for run in fit.problem.experiments if (limit := current_limit(run)))
-    remarks = (driven, next(limits, ""), parts_remark(fit), *of_last, closed_loop_remark(fit), suggestion)
-    text = " ".join(t for t in (text, *remarks) if t)
-    return Diagnosis(
-        verdict,
-        text,
-        where,
-        names,
-        judged,
-        missing,
-        ranking,
-        ladder,
-        groups,
-        suggestion,
-        fit,
-        ladder.best,
-        remaining,
-        (deviations(fit), deviations(ladder.best)),
-    )
+    elif len(found.path) > 1 or not remaining.adequate:
+        verdict, where = "unexplained", missing.where
+        judged = judged if len(found.path) > 1 else remaining
+        text = unexplained_text(judged, missing, ranking, ladder.rungs, found.grades)
+    else:
+        verdict, where, text = "adequate", None, adequate_text(judged, ranking)
+    kind = "structure" if not remaining.adequate else "fluctuation" if far(ladder.best) else "noise"
+    text = " ".join(t for t in (text, *_remarks(found, driven), suggestion) if t)
+    std = deviations(fit), deviations(ladder.best)
+    return Diagnosis(verdict, text, where, names, judged, missing, ranking, ladder, groups, suggestion, fit,
+                     ladder.best, remaining, std, Remainder(kind, ladder.best, form))
+
+
+def _remarks(found: Climb, driven: str) -> list[str]:
+    """Return what else a reader should know: of the records, of the last fit, of the held-out runs."""
+    first, last = found.path[0].fit, found.path[-1].fit
+    limits = (f"In {run.name} {limit}" for run in first.problem.experiments if (limit := current_limit(run)))
+    return [driven, next(limits, ""), parts_remark(first), unfinished_remark(last), held_out_remark(found.path[-1]),
+            measured_angle_remark(last), averaging_remark(last), outliers_remark(last), closed_loop_remark(first)]
 
 
 def _sharing(fit: Fit, name: str, parameters: Sequence[str]) -> tuple[str, ...]:

@@ -47,23 +47,14 @@ class Suggestion(Shown):
         """Return the experiment chosen, and how well each candidate would do."""
         best = sorted(self.discrimination.items(), key=lambda p: -p[1])
         rows = [[Flag(n, "good") if n == self.name else n, number(v, 3)] for n, v in best]
-        return Card(
-            "Next experiment",
-            (Flag(self.name, "good"),),
-            (self.text,),
-            (Table(["experiment", "expected χ² per sample between the models"], rows),),
-            (("mi.plot_runs(suggestion.experiment)", "see it"),),
-        )
+        return Card("Next experiment", (Flag(self.name, "good"),), (self.text,),
+                    (Table(["experiment", "expected χ² per sample between the models"], rows),),
+                    (("mi.plot_runs(suggestion.experiment)", "see it"),))
 
 
 @one_thread
-def suggest_experiment(
-    fits: Sequence[Fit],
-    *,
-    v_max: float | None = None,
-    i_max: float | None = None,
-    duration: float | None = None,
-) -> Suggestion:
+def suggest_experiment(fits: Sequence[Fit], *, v_max: float | None = None, i_max: float | None = None,
+                       duration: float | None = None) -> Suggestion:
     """Choose the experiment that best tells the models of `fits` apart.
 
     Parameters
@@ -117,14 +108,9 @@ def candidates(t: Array, v_max: float) -> dict[str, tuple[Array, str]]:
         "low speed": (0.25 * v_max * np.sin(2 * np.pi * 3 * s), "slow reversals at a quarter of the voltage"),
         "coast-down": (v_max * (s < 0.4), "run up and coast down at zero voltage"),
         "chirp": (0.7 * v_max * chirp / max(np.abs(chirp).max(), 1e-12), "a chirp"),
-        "warm-up": (
-            np.where((10 * s) % 1 < 0.8, v_max, -v_max),
-            "full voltage with short hard reversals, which also warms the winding",
-        ),
-        "small steps": (
-            v_max * (0.5 + 0.1 * np.sign(np.sin(2 * np.pi * 10 * s + 1e-9))),
-            "small steps at half speed",
-        ),
+        "warm-up": (np.where((10 * s) % 1 < 0.8, v_max, -v_max),
+                    "full voltage with short hard reversals, which also warms the winding"),
+        "small steps": (v_max * (0.5 + 0.1 * np.sign(np.sin(2 * np.pi * 10 * s + 1e-9))), "small steps at half speed"),
     }
 
 

@@ -13,17 +13,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from motorid.diagnosis.cross_validation import ROUGH, train_errors
-from motorid.diagnosis.model_comparison import worth_it
+from motorid.diagnosis.cross_validation import ROUGH
+from motorid.diagnosis.predictive_score import Predictions, compare, predictions_left_out
 from motorid.diagnosis.refit import RACE
-from motorid.diagnosis.residual_analysis import Errors, compare_errors
+from motorid.diagnosis.thresholds import MATERIAL
 from motorid.display.numbers import number, percent
 from motorid.errors import FAILURES
 from motorid.estimation.continuation import by_continuation
 from motorid.estimation.fit import solve
 from motorid.estimation.result import Fit
 from motorid.problem.problem import Problem
-from motorid.problem.simulate import at, misfit_over_noise
+from motorid.problem.simulate import at, judge, misfit_over_noise
 from motorid.records.experiment import Experiment
 
 CHANGING = 0.5  # of the samples at which the voltage must change for its reading to matter
@@ -104,11 +104,13 @@ def better_reading(fit: Fit, late: bool = False) -> Reading | None:
         readings += _best_delay(fit)
     for reading in readings:
         try:
-            gain = compare_errors(train_errors(fit), train_errors(reading.fitted(fit)))
+            after = reading.fitted(fit)
+            found = compare(*(Predictions(predictions_left_out(f) or {}, {}) for f in (fit, after)))
         except FAILURES:
             continue
-        if gain.fall > fall and gain.worst > -PLAIN and worth_it(1, gain):
-            chosen, fall = reading, gain.fall
+        rises = max(e / max(fit.nrmse[c], 1e-300) for c, e in after.nrmse.items()) > 1 + MATERIAL
+        if found.fall > fall and found.worth_it and not rises:
+            chosen, fall = reading, found.fall
     return chosen
 
 
@@ -133,7 +135,8 @@ def _fall(fit: Fit, reading: Reading) -> float:
     """Return about how much a reading lowers the error: after a few steps from where the fit is."""
     try:
         done = by_continuation(reading.problem(fit).tuned(accuracy=ROUGH), RACE, wide=False)
-        return compare_errors(train_errors(fit), Errors.of(at(done.problem, done.solution.q))).fall
+        after = judge(at(done.problem, done.solution.q)).nrmse
+        return 1 - float(np.exp(np.mean([np.log(after[c] / e) for c, e in fit.nrmse.items()])))
     except FAILURES:
         return -np.inf
 

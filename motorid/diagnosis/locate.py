@@ -22,13 +22,8 @@ from motorid.problem.runs import angle_signal, natural_sizes
 
 WALKS = (0.03, 0.1, 0.3, 1.0, 3.0)  # of the natural size per √s, the smallest that explains the data is taken
 BINS = 24
-WORDS = {
-    "i": "the current",
-    "omega": "the speed",
-    "theta": "the angle within a turn",
-    "heat": "the heat put in",
-    "t": "the time",
-}
+WORDS = {"i": "the current", "omega": "the speed", "theta": "the angle within a turn", "heat": "the heat put in",
+         "t": "the time"}
 REGIONS = ("standstill", "reversal", "acceleration", "high current", "steady")
 
 
@@ -68,18 +63,8 @@ def locate(fit: Fit) -> Missing:
         where = max(shares, key=lambda s: shares[s])
     elif len(shares) == 1:
         where = "mechanical"
-    return Missing(
-        where,
-        tuple(r.experiment.t for r in fit.problem.runs),
-        voltage,
-        torque,
-        signals,
-        shares,
-        regions,
-        bins,
-        _text(where, shares, regions, bins, apart),
-        unit,
-    )
+    return Missing(where, tuple(r.experiment.t for r in fit.problem.runs), voltage, torque, signals, shares, regions,
+                   bins, _text(where, shares, regions, bins, apart), unit)
 
 
 def acting_like(missing: Missing, form: Form) -> Missing:
@@ -166,16 +151,8 @@ def _binned(name: str, z: Array, d: Array, worth: float) -> Binned:
     between = float(np.sum(count * (mean - d.mean()) ** 2))
     inside = (total - between) / max(len(d) - keep.sum(), 1)
     explained = max(between - keep.sum() * inside, 0.0) / max(total, 1e-300)
-    return Binned(
-        name,
-        "J" if name == "heat" else UNITS[name][0],
-        centre[keep],
-        mean[keep],
-        (mean - half)[keep],
-        (mean + half)[keep],
-        count[keep].astype(float),
-        float(min(explained, 1.0)),
-    )
+    return Binned(name, "J" if name == "heat" else UNITS[name][0], centre[keep], mean[keep], (mean - half)[keep],
+                  (mean + half)[keep], count[keep].astype(float), float(min(explained, 1.0)))
 
 
 def _regions(fit: Fit, signals: Sequence[Mapping[str, Array]]) -> dict[str, float]:
@@ -207,25 +184,15 @@ def _masks(s: Mapping[str, Array], top_speed: float, top_current: float) -> dict
     fast = rate > 0.2 * max(np.quantile(rate, 0.99), 1e-300)
     strong = np.abs(s["i"]) > 0.6 * top_current if "i" in s else np.zeros(n, bool)
     masks, taken = {}, np.zeros(n, bool)
-    for name, mask in (
-        ("reversal", reversal),
-        ("standstill", still),
-        ("high current", strong),
-        ("acceleration", fast),
-        ("steady", np.ones(n, bool)),
-    ):
+    for name, mask in (("reversal", reversal), ("standstill", still), ("high current", strong), ("acceleration", fast),
+                       ("steady", np.ones(n, bool))):
         masks[name] = mask & ~taken
         taken |= mask
     return masks
 
 
-def _text(
-    where: str | None,
-    shares: Mapping[str, float],
-    regions: Mapping[str, float],
-    bins: Mapping[str, Sequence[Binned]],
-    apart: bool,
-) -> str:
+def _text(where: str | None, shares: Mapping[str, float], regions: Mapping[str, float],
+          bins: Mapping[str, Sequence[Binned]], apart: bool) -> str:
     first = max(regions, key=lambda r: regions[r])
     region = _region(first, regions)
     if not apart and len(shares) > 1:
@@ -294,20 +261,10 @@ def smooth(fit: Fit, k: int, walk: Array, begun: Begun) -> Smoothed:
     for again in range(STEPS):
         if again:
             linear = _linear(fit, k, x, d)
-        step = _banded_step(
-            n,
-            nx,
-            (y - linear.out) * weights,
-            linear.c * weights[None, :, None],
-            linear.x_next - x[1:],
-            linear.a,
-            linear.b,
-            MODEL_ERROR * size * np.sqrt(np.median(run.grid.dt) / run.grid.dt.sum() * 100),
-            d,
-            hold,
-            run.grid.dt,
-            walk > 0,
-        )
+        step = _banded_step(n, nx, (y - linear.out) * weights, linear.c * weights[None, :, None], linear.x_next - x[1:],
+                            linear.a, linear.b,
+                            MODEL_ERROR * size * np.sqrt(np.median(run.grid.dt) / run.grid.dt.sum() * 100), d, hold,
+                            run.grid.dt, walk > 0)
         x, d = x + step[:, :nx], d + step[:, nx:]
         if np.max(np.abs(step[:, :nx]) / size) < 1e-4:
             break

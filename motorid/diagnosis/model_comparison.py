@@ -1,51 +1,38 @@
-"""Which of two models is to be preferred, and whether an addition is worth its parameters.
+"""Which of two models is to be preferred: by what they predict of data that they were not fitted to.
 
-Every addition must lower the error on data it was not fitted to and be worth its parameters on effective samples
-(BIC, Schwarz 1978); on a tie the smaller model wins, then the effect that is met more often.
+On a tie the smaller model wins, then the effect that is met more often.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
-import numpy as np
-
-from motorid.diagnosis.cross_validation import LEAST_FALL, HeldOut, train_errors
-from motorid.diagnosis.residual_analysis import Errors, Gain, astray, compare_errors
+from motorid.diagnosis.cross_validation import HeldOut
+from motorid.diagnosis.predictive_score import Evidence, Predictions, compare
 from motorid.diagnosis.results import Candidate
+from motorid.diagnosis.thresholds import LARGER
 from motorid.estimation.result import Fit
 
-COMMON = (
-    "coulomb",
-    "gravity",
-    "brush_drop",
-    "winding_heating",
-    "cogging",
-    "load_friction",
-    "quadratic_drag",
-    "constant_load",
-    "speed_lag",
-    "driver_dead_band",
-)  # what is met most, first
-EVIDENCE = 4.0  # log likelihood ratio beyond the price of the parameters
-TIE = 3.0  # log likelihood ratio below which two models count as equal
-PLAIN = 0.1  # fall of the error that needs no statistics: what is left may be smooth for other reasons
-INDIFFERENT = 0.03  # change of the held-out error that says nothing where the error on the records falls plainly
-CLOSE = 0.01  # relative error below which two models count as equal
+COMMON = ("coulomb", "gravity", "brush_drop", "winding_heating", "cogging", "load_friction", "quadratic_drag",
+          "constant_load", "speed_lag", "driver_dead_band")  # what is met most, first
 
 
 @dataclass(frozen=True, eq=False)
 class Node:
-    """One model in the search: its fit and its errors, on the records and held out."""
+    """One model in the search: its fit, and what it predicts of data that it was not fitted to.
+
+    `objection` says why its last effect is not the thing itself, whatever it predicts: a wrong sign, a shape at its
+    limit; empty if it may be.
+    """
 
     fit: Fit
     added: str | None
-    train: Errors
-    held: Errors
+    predictions: Predictions
     parent: Node | None = None
     candidate: Candidate | None = None
-    children: tuple[Candidate, ...] = ()
+    objection: str = ""
 
     @property
     def key(self) -> frozenset[str]:
@@ -66,91 +53,55 @@ def node_of(fit: Fit, held: HeldOut, added: str | None = None, parent: Node | No
     SimulationError
         If it cannot be simulated on the held-out runs.
     """
-    return Node(fit, added, train_errors(fit), held.errors(fit), parent)
+    return Node(fit, added, held.predictions(fit), parent)
 
 
-@dataclass(frozen=True, eq=False)
-class Judge:
-    """Compares models by their errors; `root` is the model to begin with."""
-
-    root: Node
-    data: HeldOut
-
-    @property
-    def noise(self) -> Mapping[str, float]:
-        """Noise per channel."""
-        return self.data.noise
-
-    def held_gain(self, old: Node, new: Node) -> Gain:
-        """Return what `new` gains over `old` on held-out data.
-
-        Held-out runs in which an effect hardly shows (a steady run, for a lag) say nothing about it, nor do those on
-        which both go astray (a pendulum that falls over the top, or not, by a hair); then blocks of the fitted runs
-        are held out in turn.
-        """
-        gain = compare_errors(old.held, new.held, self.noise)
-        here = compare_errors(old.train, new.train, self.noise)
-        telling = abs(gain.fall) > INDIFFERENT and not astray(old.held.nrmse(), new.held.nrmse())
-        if self.data.validation is None or telling or here.fall < PLAIN:
-            return gain
-        return compare_errors(self.data.block_errors(old.fit), self.data.block_errors(new.fit), self.noise)
-
-    def choose(self, children: Sequence[Node]) -> tuple[Node, list[Node]] | None:
-        """Return the best child, the smaller on a tie, and the children in order; None without any."""
-        if not children:
-            return None
-        ordered = sorted(children, key=lambda n: -self.worth(n))
-        chosen = ordered[0]
-        while True:  # ties are not transitive: what is tied with the smaller model may be smaller still
-            tied = [n for n in ordered if n is chosen or self.tied(chosen, n)]
-            smaller = min(tied, key=lambda n: (n.size, rarity(n.added), -self.worth(n)))
-            if smaller is chosen or (smaller.size, rarity(smaller.added)) >= (chosen.size, rarity(chosen.added)):
-                break
-            chosen = smaller
-        return chosen, ordered
-
-    def worth(self, node: Node) -> float:
-        """Return how much smaller the errors are than those of the first model, held-out errors first."""
-        held = compare_errors(self.root.held, node.held, self.noise)
-        train = compare_errors(self.root.train, node.train, self.noise)
-        return -float(np.log(max(1 - held.fall, 1e-12)) + 0.5 * np.log(max(1 - train.fall, 1e-12)))
-
-    def tied(self, best: Node, other: Node) -> bool:
-        """Tell whether `best` is better than `other` by no more than chance or a trifle."""
-        held = compare_errors(other.held, best.held, self.noise)
-        train = compare_errors(other.train, best.train, self.noise)
-        return (held.log_ratio < TIE or held.fall < CLOSE) and (train.log_ratio < TIE or train.fall < CLOSE)
-
-    def beats(self, new: Node, old: Node) -> bool:
-        """Tell whether `new` is worth its extra parameters over `old`."""
-        gain = compare_errors(old.train, new.train, self.noise)
-        held = self.held_gain(old, new)
-        return worth_it(new.size - old.size, gain) and not held_out_objection(held)
-
-    def superfluous(self, node: Node, smaller: Node) -> bool:
-        """Tell whether `smaller`, contained in `node`, does as well: on the records, or plainly better held out."""
-        lost = compare_errors(smaller.train, node.train, self.noise).fall
-        won = compare_errors(node.held, smaller.held, self.noise).fall
-        return not self.beats(node, smaller) and (lost < PLAIN or won > PLAIN)
-
-    def group(self, chosen: Node, siblings: Sequence[Node], includes: Mapping[str, tuple[str, ...]]) -> tuple[str, ...]:
-        """Names of the siblings that these data cannot tell from `chosen`."""
-        return tuple(
-            n.added
-            for n in siblings
-            if n is not chosen
-            and n.added not in (None, chosen.added)
-            and n.parent is chosen.parent
-            and chosen.added not in includes.get(n.added, ())
-            and self.tied(n, chosen)
-            and self.tied(chosen, n)
-        )
+@lru_cache(maxsize=4096)
+def _compared(old: Predictions, new: Predictions) -> Evidence:
+    return compare(old, new)
 
 
-def worth_it(extra: int, gain: Gain) -> bool:
-    """Tell whether a gain pays for `extra` parameters: by its evidence, or by a fall of the error that anyone sees."""
-    price = EVIDENCE + 0.5 * max(extra, 0) * float(np.log(max(gain.effective, 2.0)))
-    return gain.log_ratio > price or gain.fall > PLAIN
+def evidence(old: Node, new: Node) -> Evidence:
+    """Return what `new` predicts better than `old`."""
+    return _compared(old.predictions, new.predictions)
+
+
+def beats(new: Node, old: Node) -> bool:
+    """Tell whether `new` is to be preferred to `old`, which may be smaller."""
+    return evidence(old, new).worth_it
+
+
+def tied(a: Node, b: Node) -> bool:
+    """Tell whether neither of two models is to be preferred."""
+    return not beats(a, b) and not beats(b, a)
+
+
+def choose(children: Sequence[Node], parent: Node) -> tuple[Node, list[Node]] | None:
+    """Return the best child, the smaller on a tie, and the children in order; None without any."""
+    if not children:
+        return None
+    ordered = sorted(children, key=lambda n: -evidence(parent, n).gain)
+    chosen = ordered[0]
+    while True:  # ties are not transitive: what is tied with the smaller model may be smaller still
+        near = [n for n in ordered if n is chosen or not beats(chosen, n)]
+        smaller = min(near, key=lambda n: (n.size, rarity(n.added), -evidence(parent, n).gain))
+        if smaller is chosen or (smaller.size, rarity(smaller.added)) >= (chosen.size, rarity(chosen.added)):
+            return chosen, ordered
+        chosen = smaller
+
+
+def group_of(chosen: Node, siblings: Sequence[Node], includes: Mapping[str, tuple[str, ...]]) -> tuple[str, ...]:
+    """Names of the siblings that these data cannot distinguish from `chosen`, what contains it left out."""
+    return tuple(
+        n.added
+        for n in siblings
+        if n is not chosen
+        and n.added not in (None, chosen.added)
+        and n.parent is chosen.parent
+        and chosen.added not in includes.get(n.added, ())
+        and not n.objection
+        and tied(n, chosen)
+    )
 
 
 def rarity(name: str | None) -> int:
@@ -158,12 +109,11 @@ def rarity(name: str | None) -> int:
     return COMMON.index(name) if name in COMMON else len(COMMON)
 
 
-def held_out_objection(gain: Gain) -> str:
-    """Say why the held-out error speaks against a model; empty if it does not."""
-    if gain.fall < LEAST_FALL:
-        return f"the held-out error does not fall ({100 * gain.fall:+.1f} %)"
-    if gain.log_ratio < TIE and gain.fall < PLAIN:
-        return "the held-out error falls by no more than chance would give"
-    if gain.worst < -0.05 - 0.5 * gain.fall:
-        return f"one channel's held-out error grows by {-100 * gain.worst:.0f} %"
-    return ""
+def far(fit: Fit) -> list[int]:
+    """Return which channels' errors are plainly larger than their noise."""
+    return [j for j, c in enumerate(fit.problem.outputs) if fit.misfit[c] > LARGER]
+
+
+def at_noise(node: Node) -> bool:
+    """Tell whether a model leaves hardly more than noise, on the held-out runs too."""
+    return not far(node.fit) and all(e.misfit < LARGER for e in node.predictions.held_out.values())

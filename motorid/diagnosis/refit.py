@@ -10,10 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from motorid.diagnosis.cross_validation import QUICK, ROUGH, restarted, worth_its_steps
-from motorid.diagnosis.model_comparison import EVIDENCE
-from motorid.diagnosis.residual_analysis import far
+from motorid.diagnosis.cross_validation import QUICK, ROUGH, restarted
+from motorid.diagnosis.model_comparison import far
+from motorid.diagnosis.record_parts import worth_its_steps
 from motorid.diagnosis.score_test import uses_angle
+from motorid.diagnosis.thresholds import NATS
 from motorid.errors import FAILURES
 from motorid.estimation.continuation import by_continuation
 from motorid.estimation.first_guess import first_guess
@@ -160,10 +161,7 @@ def _bounded(fit: Fit, model: Model) -> Model:
         for p in (model.parameters[q.name] for q in e.parameters):
             if p.grid and p.null is None and p.vary and not p.given:
                 size = natural.get(p.unit, 1.0)
-                limits[p.name] = (
-                    max(p.lower, min(p.grid) * size / ROOM),
-                    min(p.upper, max(p.grid) * size * ROOM),
-                )
+                limits[p.name] = (max(p.lower, min(p.grid) * size / ROOM), min(p.upper, max(p.grid) * size * ROOM))
     inside = {n: float(np.clip(model.parameters[n].value, *limits[n])) for n in limits}
     pars = {n: replace(model.parameters[n], value=inside[n], lower=lo, upper=hi) for n, (lo, hi) in limits.items()}
     return model.with_(parameters={**model.parameters, **pars})
@@ -187,16 +185,8 @@ def _polished(fit: Fit, problem: Problem) -> Fit | None:
     found, problem = done.solution, done.problem
     if not np.isfinite(found.jac).all():
         return None
-    return Fit(
-        problem,
-        problem.values(found.q),
-        found.residual,
-        found.jac / problem.scaling.slope(found.q),
-        found.q,
-        found.status,
-        found.message,
-        done.history,
-    )
+    return Fit(problem, problem.values(found.q), found.residual, found.jac / problem.scaling.slope(found.q), found.q,
+               found.status, found.message, done.history)
 
 
 def _converged(problem: Problem) -> Estimate:
@@ -248,7 +238,7 @@ class Task:
     @property
     def price(self) -> float:
         """What the free parameters must gain, in units of the cost (half of chi²)."""
-        return EVIDENCE + 0.5 * len(self.model.free_names) * float(np.log(len(self.fit.residuals)))
+        return NATS + 0.5 * len(self.model.free_names) * float(np.log(len(self.fit.residuals)))
 
 
 @dataclass(frozen=True)
@@ -271,7 +261,7 @@ def refits(tasks: Sequence[Task], map_: Callable[..., Iterable[Any]]) -> list[Fi
     """
     found: dict[int, Fit | GivenUp | None] = {}
     races: dict[int, Raced] = {}
-    leader, alone = _favourite(tasks), False
+    leader, alone = _leader(tasks), False
     if leader is not None and (race := _race_tournament((tasks[leader], alone))) is not None:
         races[leader], found[leader] = race, _finish((tasks[leader], race))
         if (best := _quiet(found[leader])) is not None:
@@ -291,7 +281,7 @@ def refits(tasks: Sequence[Task], map_: Callable[..., Iterable[Any]]) -> list[Fi
     return [found.get(k) for k in range(len(tasks))]
 
 
-def _favourite(tasks: Sequence[Task]) -> int | None:
+def _leader(tasks: Sequence[Task]) -> int | None:
     """Return which task promises most, the smallest of those that promise nearly as much; None if none does."""
     promises = {k: task.promise for k, task in enumerate(tasks) if task.promise is not None}
     near = [k for k, promise in promises.items() if promise > NEARLY * max(promises.values())]

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from motorid.channels import UNITS, channel_name
+from motorid.diagnosis.remainder import Remainder
 from motorid.display.cards import Card, Shown
 from motorid.display.numbers import Std, number, percent, quantity
 from motorid.display.tables import Cell, Flag, Table
@@ -45,13 +46,10 @@ class Adequacy(Shown):
         rows = [[f"{channel_name(c)} {c}", *(quantity(d.get(k), UNITS[c][0], 3) for k in ("noise", "rms")),
                  number(d.get("ratio"), 3), number(d.get("autocorrelation"), 2), number(d.get("p_value"), 2)]
                 for c, d in self.channels.items()]
-        return Card(
-            "Is anything missing?",
-            (Flag("adequate", "good") if self.adequate else Flag("something is missing", "bad"),),
-            (self.text,),
-            (Table(["channel", "noise", "residual", "ratio", "autocorrelation", "p"], rows),),
-            () if self.adequate else (("mi.diagnose(fit)", "what is missing"),),
-        )
+        return Card("Is anything missing?",
+                    (Flag("adequate", "good") if self.adequate else Flag("something is missing", "bad"),), (self.text,),
+                    (Table(["channel", "noise", "residual", "ratio", "autocorrelation", "p"], rows),),
+                    () if self.adequate else (("mi.diagnose(fit)", "what is missing"),))
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,6 +129,8 @@ class Candidate:
     held_out_gain : float or None
         Relative fall of the error on held-out runs, or on held-out blocks without them; None where it came to no
         such test.
+    gain, gain_se : float or None
+        Difference of the log predictive density on data left out (nats), and its standard error.
     parameters : dict of str to float
         Of the effect, SI: refitted values where there was a refit, else predicted.
     group : tuple of str
@@ -149,12 +149,31 @@ class Candidate:
     group: tuple[str, ...] = ()
     accepted: bool = False
     reason: str = ""
+    gain: float | None = None
+    gain_se: float | None = None
     fit: Fit | None = field(default=None, repr=False)
 
 
 @dataclass(frozen=True, eq=False)
 class Rung:
-    """One step of the ladder: what was added (None: the model to begin with), the fit, its errors."""
+    """One step of the ladder: what was added (None: the model to begin with), the fit, its errors.
+
+    Attributes
+    ----------
+    added : str or None
+    fit : Fit
+    nrmse, validation_nrmse : dict of str to float
+        Per channel, on the fitted and on the held-out runs.
+    removed : tuple of str
+        Earlier effects that it made superfluous.
+    candidates : tuple of Candidate
+    grade : {"named", "group", "approximates"} or None
+        ``named``: the thing itself; ``group``: one of several that these data cannot distinguish; ``approximates``: it
+        helps, and `why` says what speaks against its name.
+    why : str
+    gain, gain_se : float or None
+        Difference of the log predictive density on data left out (nats) from the rung before, and its standard error.
+    """
 
     added: str | None
     fit: Fit
@@ -162,6 +181,10 @@ class Rung:
     validation_nrmse: Mapping[str, float] | None
     removed: tuple[str, ...] = ()
     candidates: tuple[Candidate, ...] = ()
+    grade: str | None = None
+    why: str = ""
+    gain: float | None = None
+    gain_se: float | None = None
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -183,12 +206,8 @@ class Ladder(Shown):
 
     def card(self) -> Card:
         """Return the errors rung by rung, and why it stopped."""
-        return Card(
-            "Ladder of models",
-            text=(self.text,),
-            tables=(ladder_table(self),),
-            after=(("mi.plot_ladder(ladder)", "see it"), ("ladder.best", "the last fit")),
-        )
+        return Card("Ladder of models", text=(self.text,), tables=(ladder_table(self),),
+                    after=(("mi.plot_ladder(ladder)", "see it"), ("ladder.best", "the last fit")))
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -202,7 +221,7 @@ class Diagnosis(Shown):
         The answer in words.
     where : {"electrical", "mechanical", "sensor"} or None
     effects : tuple of str
-        Accepted effects, in order.
+        Effects that are named or one of a group, in order; what only approximates stands in the ladder.
     adequacy, missing, ranking, ladder
         What it rests on; `ranking` is of the first round, best first.
     groups : tuple of tuple of str
@@ -212,6 +231,8 @@ class Diagnosis(Shown):
     before, after : Fit
     remaining : Adequacy
         Of the model after the last rung.
+    remainder : Remainder or None
+        What is left beside all effects: noise, fluctuation or structure, and what structure follows.
     std : pair of dict, or None
         One standard deviation per parameter of `before` and `after`, the residuals taken as coloured as they are.
     """
@@ -230,6 +251,12 @@ class Diagnosis(Shown):
     after: Fit
     remaining: Adequacy
     std: tuple[Std, Std] | None = None
+    remainder: Remainder | None = None
+
+    @property
+    def best(self) -> Fit:
+        """The fit of the last rung: the model that predicts best."""
+        return self.after
 
     def std_of(self, fit: Fit) -> Std:
         """Return the standard deviations of `before` or `after`, as the text gives them."""
@@ -250,12 +277,8 @@ class Diagnosis(Shown):
             (Flag(self.verdict, VERDICT_MOODS[self.verdict]), *([Flag(self.where)] if self.where else [])),
             text,
             tables,
-            (
-                ("mi.plot_missing(found)", "where"),
-                ("mi.plot_ranking(found)", "which"),
-                ("found.after", "the better fit"),
-                ('mi.report(found, "report.html")', "the whole story on one page"),
-            ),
+            (("mi.plot_missing(found)", "where"), ("mi.plot_ranking(found)", "which"),
+             ("found.after", "the better fit"), ('mi.report(found, "report.html")', "the whole story on one page")),
         )
 
     def to_dict(self) -> dict[str, Any]:
@@ -273,28 +296,21 @@ class Diagnosis(Shown):
                 "depends_on": {k: [{"on": b.against, "explained": b.explained} for b in v] for k, v in m.bins.items()},
             },
             "ranking": [
-                {
-                    "effect": c.effect,
-                    "predicted_drop": c.predicted_drop,
-                    "refit_drop": c.refit_drop,
-                    "validation_nrmse": dict(c.validation_nrmse) if c.validation_nrmse else None,
-                    "held_out_gain": c.held_out_gain,
-                    "group": list(c.group),
-                    "parameters": dict(c.parameters),
-                    "accepted": c.accepted,
-                    "reason": c.reason,
-                }
+                {"effect": c.effect, "predicted_drop": c.predicted_drop, "refit_drop": c.refit_drop,
+                 "validation_nrmse": dict(c.validation_nrmse) if c.validation_nrmse else None,
+                 "held_out_gain": c.held_out_gain, "group": list(c.group), "parameters": dict(c.parameters),
+                 "accepted": c.accepted, "reason": c.reason}
                 for c in self.ranking
             ],
             "effects": list(self.effects),
             "ladder": [
-                {
-                    "added": r.added,
-                    "nrmse": dict(r.nrmse),
-                    "validation_nrmse": dict(r.validation_nrmse) if r.validation_nrmse else None,
-                }
+                {"added": r.added, "grade": r.grade, "why": r.why, "gain": r.gain, "gain_se": r.gain_se,
+                 "nrmse": dict(r.nrmse), "validation_nrmse": dict(r.validation_nrmse) if r.validation_nrmse else None}
                 for r in self.ladder.rungs
             ],
+            "remaining": {"adequate": self.remaining.adequate, "kind": self.remainder.kind if self.remainder else None,
+                          "where": self.remainder.where if self.remainder else None,
+                          "follows": self.remainder.follows if self.remainder else None, "text": self.remaining.text},
             "parameters_before": dict(self.before.values),
             "parameters_after": dict(self.after.values),
             "groups": [list(g) for g in self.groups],

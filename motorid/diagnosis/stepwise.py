@@ -11,27 +11,29 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from motorid.diagnosis.adequacy import judgement
+from motorid.diagnosis.adequacy import judge_adequacy
 from motorid.diagnosis.candidates import Search, library
-from motorid.diagnosis.cross_validation import affordable
 from motorid.diagnosis.input_hypotheses import Reading, better_reading, without_spikes
-from motorid.diagnosis.misspecification import Outside, hardly_moved, outside
-from motorid.diagnosis.model_comparison import Node
-from motorid.diagnosis.residual_analysis import compare_errors, far
+from motorid.diagnosis.misspecification import FormGain, Grade, better_forms, grades_of
+from motorid.diagnosis.model_comparison import Node, at_noise, beats, choose, evidence, far, group_of, tied
+from motorid.diagnosis.record_parts import affordable
 from motorid.diagnosis.results import Adequacy, Candidate, Ladder, Rung
 from motorid.estimation.result import Fit
 from motorid.model.definition import Effect
 from motorid.numerics.parallel import one_thread
-from motorid.records.checks import current_limit
 from motorid.records.experiment import Experiment
 
 BEAM = 2
+ORDER = ("named", "group", "approximates")  # grades, the surest first
 HALF_AS_GOOD = 0.5  # of the best child's fall: what a second model must reach to be carried along
 
 
 @dataclass(frozen=True, eq=False)
 class Climb:
-    """What the loop went through: the final path, and per round the candidates and the group of the choice."""
+    """What the loop went through: the final path, per round the candidates, the groups of what was chosen.
+
+    `form` is the free form that predicts better beside all effects, if any; `grades` are of the effects, in order.
+    """
 
     search: Search
     path: tuple[Node, ...]
@@ -40,17 +42,19 @@ class Climb:
     text: str
     first: Adequacy
     remaining: Adequacy
+    form: FormGain | None = None
+    grades: tuple[Grade, ...] = ()
 
 
 def climb(search: Search, max_effects: int, advance: Callable[[str], None]) -> Climb:
     """Run the loop until nothing more is worth adding."""
     best, frontier = search.root, [search.root]
-    judged = first = judgement(best.fit, search.scores(best), search.held)
+    judged = first = judge_adequacy(best, search.scores(best))
     rounds: list[tuple[Candidate, ...]] = []
     groups: list[tuple[str, ...]] = []
     text = f"stopped at the limit of {max_effects} effects"
     for _ in range(max_effects):
-        if judged.adequate:
+        if judged.adequate and at_noise(best):
             text = "stopped: what is left is noise"
             break
         room = max_effects - len(best.key) + len(search.root.key)
@@ -62,10 +66,10 @@ def climb(search: Search, max_effects: int, advance: Callable[[str], None]) -> C
             if k == 0:
                 rounds.append(tuple(listed))
             children |= {c.key: c for c in grown if c.key not in children}
-        chosen = _better(search, children.values(), best)
+        chosen = _better(children.values(), best)
         if chosen is None and room > 1 and far(best.fit):
             children = {c.key: c for c in search.expand_by_two(best)}
-            chosen = _better(search, children.values(), best)
+            chosen = _better(children.values(), best)
         if chosen is None:
             text = "stopped: no further effect lowers the error on data it was not fitted to"
             break
@@ -73,38 +77,38 @@ def climb(search: Search, max_effects: int, advance: Callable[[str], None]) -> C
         search.nodes |= children
         best = search.pruned(new)
         chosen_of = best if best.added != new.added and best.parent is new.parent else new
-        group = search.judge.group(chosen_of, ordered, {e.name: e.includes for e in search.effects})
+        group = group_of(chosen_of, ordered, {e.name: e.includes for e in search.effects})
         if new.parent is frontier[0]:
             rounds[-1] = _marked(rounds[-1], chosen_of, group)
         groups.append((chosen_of.added or "", *group) if group else ())
-        frontier = [best, *_runners_up(search, best, ordered)][:BEAM]
-        judged = judgement(best.fit, search.scores(best), search.held)
+        frontier = [best, *_runners_up(best, ordered)][:BEAM]
+        judged = judge_adequacy(best, search.scores(best))
         advance(f"accepted {chosen_of.added}")
-    told = [tuple(replace(c, group=_without(c.group, best.key)) for c in r) for r in rounds]
-    groups = [(g[0], *_without(g[1:], best.key)) for g in groups if g]
-    return Climb(search, tuple(_path(best)), tuple(told), tuple(g for g in groups if g[1:]), text, first, judged)
+    return _finished(Climb(search, tuple(_path(best)), tuple(rounds), tuple(groups), text, first, judged))
 
 
-def _better(search: Search, children: Iterable[Node], best: Node) -> tuple[Node, list[Node]] | None:
-    """Return the best child, if it beats the best model so far, and all in order."""
-    chosen = search.judge.choose(list(children))
-    return chosen if chosen is not None and search.judge.beats(chosen[0], best) else None
+def _finished(found: Climb) -> Climb:
+    """Return a climb with the free form that predicts better beside all effects, and the grade of each effect."""
+    search, best = found.search, found.path[-1]
+    rounds = tuple(tuple(replace(c, group=_without(c.group, best.key)) for c in r) for r in found.rounds)
+    groups = tuple((g[0], *rest) for g in found.groups if g and (rest := _without(g[1:], best.key)))
+    structure = not found.remaining.adequate
+    forms = better_forms(best.fit, best.predictions) if structure else []
+    grades = grades_of(best, search.root, groups, forms, structure,
+                       lambda name: search.smaller(best, best.fit.model.without(name)))
+    return replace(found, rounds=rounds, groups=groups, form=next(iter(forms), None), grades=grades)
 
 
-def settled(found: Climb) -> tuple[Climb, Outside | None]:
-    """Return a climb without effects that only stand in for what the library lacks, and what that is like."""
-    other = outside([n.fit for n in found.path], found.search.held)
-    if other is not None and other.kept < len(found.path) - 1:
-        what = f"{other.form.text}, of a form that the library lacks"
-        return _cut(found, other.kept, f"only stands in for {what}", f"is like {what}"), other
-    if found.remaining.adequate or len(found.path) == 1:
-        return found, other
-    if any(current_limit(run) for run in found.search.root.fit.problem.experiments):
-        return _cut(
-            found, 0, "may only stand in for the driver's current limit", "is what the driver's limit makes"
-        ), other
-    poor = hardly_moved(found.path, dict(found.search.held.noise))
-    return (_cut(found, 0, poor, "is nothing that the library has") if poor else found), other
+def _better(children: Iterable[Node], best: Node) -> tuple[Node, list[Node]] | None:
+    """Return the best child, if it beats the best model so far, and all in order.
+
+    What physics speaks against is taken only where nothing else helps.
+    """
+    for objected in (False, True):
+        chosen = choose([c for c in children if bool(c.objection) == objected], best)
+        if chosen is not None and beats(chosen[0], best):
+            return chosen
+    return None
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,35 +126,30 @@ class Records:
         return Records(after, held_out, (*self.remarks, reading.remark(self.fit, after)))
 
 
-def explored(
-    fit: Fit,
-    validate: Sequence[Experiment] | Experiment | None,
-    effects: Sequence[Effect],
-    map_: Callable[..., Iterable[Any]],
-    advance: Callable[[str], None],
-    max_effects: int,
-) -> tuple[Climb, Outside | None, str]:
-    """Return the settled climb, and what to say of how the records were read.
+def explored(fit: Fit, validate: Sequence[Experiment] | Experiment | None, effects: Sequence[Effect],
+             map_: Callable[..., Iterable[Any]], advance: Callable[[str], None], max_effects: int) -> tuple[Climb, str]:
+    """Return the climb, and what to say of how the records were read.
 
     A misfit that something missing dominates may hide a better reading of the voltage; then it is climbed again.
     """
 
-    def climbed(records: Records) -> tuple[Climb, Outside | None]:
-        return settled(climb(Search(records.fit, records.held_out, effects, map_, advance), max_effects, advance))
+    def climbed(records: Records) -> Climb:
+        return climb(Search(records.fit, records.held_out, effects, map_, advance), max_effects, advance)
 
     records = Records(affordable(fit), [validate] if isinstance(validate, Experiment) else validate)
     for better in (without_spikes, better_reading):
         if reading := better(records.fit):
             records = records.read(reading)
-    found, other = climbed(records)
+    found = climbed(records)
     last = found.path[-1]
     if reading := _late_reading(found.path):
         again = records.read(reading)
-        anew, other_anew = climbed(again)
+        anew = climbed(again)
         new = anew.path[-1]
-        if min(compare_errors(last.train, new.train).fall, compare_errors(last.held, new.held).fall) > 0:
-            records, found, other = again, anew, other_anew
-    return found, other, " ".join(records.remarks)
+        better = evidence(last, new)
+        if better.gain > 0 and better.fall > 0:
+            records, found = again, anew
+    return found, " ".join(records.remarks)
 
 
 def _late_reading(path: Sequence[Node]) -> Reading | None:
@@ -165,33 +164,20 @@ def _late_reading(path: Sequence[Node]) -> Reading | None:
     return next((reading for reading in asked if reading is not None), None)
 
 
-def _cut(found: Climb, kept: int, why: str, what: str) -> Climb:
-    """Return a climb with the first `kept` effects; `why` the others are not, and what is left."""
-    path = found.path[: kept + 1]
-    names = path[-1].key
-    rounds = tuple(
-        tuple(c if not c.accepted or c.effect in names else replace(c, accepted=False, group=(), reason=why) for c in r)
-        for r in found.rounds
-    )
-    groups = tuple(g for g in found.groups if g[0] in names)
-    judged = judgement(path[-1].fit, found.search.scores(path[-1]), found.search.held)
-    return Climb(found.search, path, rounds, groups, f"stopped: what is left {what}", found.first, judged)
-
-
 def _without(group: Sequence[str], found: frozenset[str]) -> tuple[str, ...]:
     """Return a group without what was found, too: that is no longer a rival."""
     return tuple(n for n in group if n not in found)
 
 
-def _runners_up(search: Search, best: Node, ordered: Sequence[Node]) -> list[Node]:
+def _runners_up(best: Node, ordered: Sequence[Node]) -> list[Node]:
     """Children that came near enough to be grown too, those of another kind than the best."""
-    goal = compare_errors(search.root.train, best.train, search.held.noise).fall
+    if best.parent is None:
+        return []
+    goal = evidence(best.parent, best).fall
     return [
         n
         for n in ordered
-        if n.key != best.key
-        and not search.judge.tied(n, best)
-        and compare_errors(search.root.train, n.train, search.held.noise).fall > HALF_AS_GOOD * goal
+        if n.key != best.key and not tied(n, best) and evidence(best.parent, n).fall > HALF_AS_GOOD * goal
     ]
 
 
@@ -220,41 +206,29 @@ def _path(last: Node) -> list[Node]:
 def ladder_of(found: Climb, validated: bool) -> Ladder:
     """Return the rungs of a climb."""
     rungs: list[Rung] = []
-    before: frozenset[str] = search_key(found.path[0])
+    grades = {g.effect: g for g in found.grades}
+    before = found.path[0]
     for k, node in enumerate(found.path):
-        names = [n for n in node.fit.problem.model.effect_names if n not in before]
-        removed = tuple(sorted(before - search_key(node)))
-        candidates = found.rounds[k] if k < len(found.rounds) else ()
-        rungs.append(
-            Rung(
-                " + ".join(names) or None,
-                node.fit,
-                node.train.nrmse(),
-                node.held.nrmse() if validated else None,
-                removed,
-                candidates,
-            )
-        )
-        before = search_key(node)
+        names = [n for n in node.fit.problem.model.effect_names if n not in before.key]
+        rung = Rung(" + ".join(names) or None, node.fit, node.fit.nrmse,
+                    {c: e.nrmse for c, e in node.predictions.held_out.items()} if validated else None,
+                    tuple(sorted(before.key - node.key)), found.rounds[k] if k < len(found.rounds) else ())
+        if k:
+            known = [grades[n] for n in names if n in grades]
+            worst = max(known, key=lambda g: ORDER.index(g.grade), default=None)
+            gained = evidence(before, node)
+            rung = replace(rung, grade=worst.grade if worst else "approximates",
+                           why=worst.why if worst else "a later effect took its place", gain=gained.gain,
+                           gain_se=gained.se)
+        rungs.append(rung)
+        before = node
     return Ladder(tuple(rungs), found.text)
 
 
-def search_key(node: Node) -> frozenset[str]:
-    """Names of the effects of a node."""
-    return node.key
-
-
 @one_thread
-def improve(
-    fit: Fit,
-    validate: Sequence[Experiment] | Experiment | None = None,
-    *,
-    effects: Iterable[Effect | str] | None = None,
-    also: Iterable[Effect] = (),
-    max_effects: int = 3,
-    map: Callable[..., Iterable[Any]] = builtins.map,
-    progress: Callable[[str], None] | None = None,
-) -> Ladder:
+def improve(fit: Fit, validate: Sequence[Experiment] | Experiment | None = None, *,
+            effects: Iterable[Effect | str] | None = None, also: Iterable[Effect] = (), max_effects: int = 3,
+            map: Callable[..., Iterable[Any]] = builtins.map, progress: Callable[[str], None] | None = None) -> Ladder:
     """Add effects one by one, as long as the error on held-out data falls.
 
     Parameters
@@ -279,5 +253,5 @@ def improve(
         The models with training and held-out error; ``ladder.best`` is the last fit, to go on from.
     """
     say = progress or (lambda word: None)
-    found, _, _ = explored(fit, validate, library(effects, also), map, say, max_effects)
+    found, _ = explored(fit, validate, library(effects, also), map, say, max_effects)
     return ladder_of(found, validate is not None)

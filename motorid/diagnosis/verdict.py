@@ -6,8 +6,10 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from motorid.diagnosis.residual_analysis import astray
+from motorid.diagnosis.misspecification import Grade
+from motorid.diagnosis.model_comparison import Node
 from motorid.diagnosis.results import Adequacy, Candidate, Missing, Rung
+from motorid.diagnosis.thresholds import ELSEWHERE, LARGER, LOST
 from motorid.display.numbers import number, percent, with_error
 from motorid.effects import LIBRARY
 from motorid.estimation.result import Fit
@@ -27,27 +29,38 @@ def adequate_text(judged: Adequacy, ranking: Sequence[Candidate]) -> str:
     return f"{judged.text}{tried}" if near or ranking else judged.text
 
 
-def unexplained_text(judged: Adequacy, missing: Missing, ranking: Sequence[Candidate]) -> str:
-    """Return the verdict when something is missing that the library does not have."""
+def unexplained_text(judged: Adequacy, missing: Missing, ranking: Sequence[Candidate], rungs: Sequence[Rung],
+                     grades: Sequence[Grade]) -> str:
+    """Return the verdict when something is missing that the library does not have, or only something like it."""
+    parts = [judged.text, missing.text]
+    if grades:
+        parts += [approximations_text(grades), _errors(rungs[0], rungs[-1])]
+        return " ".join(parts)
+    parts.append("None of the library's effects explains it.")
     tried = [c for c in ranking if c.refit_drop is not None]
     best = max(tried, key=lambda c: c.refit_drop or 0.0, default=None)
-    near = ""
     if best is not None and (best.refit_drop or 0) > 0.05:
-        why = best.reason if best.reason and not best.reason.startswith("lowers") else "leaves the rest as it is"
-        why = "only stands in for it" if missing.acts_like else why
         taken = percent(best.refit_drop, 2)
-        near = f" The nearest, '{best.effect}', takes away {taken} of the squared misfit, but {why}."
-    return f"{judged.text} {missing.text} None of the library's effects explains it.{near}"
+        parts.append(f"The nearest, '{best.effect}', takes away {taken} of the squared misfit, but {best.reason}.")
+    return " ".join(parts)
 
 
-def missing_text(rungs: Sequence[Rung], remaining: Adequacy, groups: Sequence[Sequence[str]], validated: bool) -> str:
+def approximations_text(grades: Sequence[Grade]) -> str:
+    """Say which effects help without being the thing itself, and why."""
+    said = [f"'{g.effect}' helps, but only approximates it: {g.why}." for g in grades if g.grade == "approximates"]
+    return " ".join(said)
+
+
+def missing_text(
+    rungs: Sequence[Rung], remaining: Adequacy, groups: Sequence[Sequence[str]], grades: Sequence[Grade]
+) -> str:
     """Return the verdict when effects were found."""
     after = rungs[-1].fit
-    added = (n for r in rungs[1:] if r.added for n in r.added.split(" + "))
-    names = [n for n in added if n in after.problem.model.effect_names]  # not what a later effect made superfluous
+    names = [g.effect for g in grades if g.grade != "approximates"]
     parts = [f"Missing: {'; '.join(_described(after, n) for n in names)}."]
-    parts.append(_errors(rungs[0], rungs[-1], validated))
+    parts.append(_errors(rungs[0], rungs[-1]))
     parts += [f"These data cannot tell {g[0]} from {' or '.join(g[1:])}." for g in groups]
+    parts += [approximations_text(grades)] if len(names) < len(grades) else []
     moved = moves(rungs[0].fit, after)
     if moved:
         parts.append(moved)
@@ -68,7 +81,9 @@ def _valued(fit: Fit, effect: Effect) -> list[str]:
     found, std = [], _certain(fit)
     for p in effect.parameters:
         unit = fit.problem.model.parameters[p.name].unit
-        text = f"{p.name} = {with_error(fit.values[p.name], std.get(p.name), unit)}"
+        sd = std.get(p.name)
+        known = sd is not None or not fit.problem.model.parameters[p.name].vary
+        text = f"{p.name} = {with_error(fit.values[p.name], sd, unit)}" if known else f"{p.name} not determined"
         if p.name == "k_w" and abs(1 + fit.values[p.name] - RPM) < 0.3:
             text += ", the ratio of rpm to rad/s: the speed is probably in rpm"
         found.append(text)
@@ -82,18 +97,24 @@ def _certain(fit: Fit) -> dict[str, float | None]:
     return {n: None if n in sizes and s is not None and s > abs(fit.values[n]) else s for n, s in std.items()}
 
 
-def _errors(before: Rung, after: Rung, validated: bool) -> str:
-    falls = [f"{c} from {percent(e, 3)} to {percent(after.nrmse[c], 3)}" for c, e in before.nrmse.items()]
-    text = f"With it the error falls: {', '.join(falls)}"
-    if validated and before.validation_nrmse and after.validation_nrmse:
-        held = [
-            f"{c} {percent(e, 3)} to {percent(after.validation_nrmse[c], 3)}"
-            for c, e in before.validation_nrmse.items()
-        ]
-        text += f"; on the held-out runs {', '.join(held)}"
-        if lost := astray(before.validation_nrmse, after.validation_nrmse):
+def _errors(before: Rung, after: Rung) -> str:
+    text = f"With it the error falls: {_changes(before.nrmse, after.nrmse, 'from ')}"
+    was, is_ = before.validation_nrmse, after.validation_nrmse
+    if was and is_:
+        text += f"; on the held-out runs {_changes(was, is_)}"
+        if lost := [c for c, e in was.items() if min(e, is_[c]) > LOST]:
             text += f" (both lose {' and '.join(lost)} there: blocks of the fitted runs were held out instead)"
+        elif np.prod([is_[c] / max(e, 1e-300) for c, e in was.items()]) >= 1:
+            text += " (no lower there all in all: blocks of the fitted runs, left out in turn, decided)"
     return text + "."
+
+
+def _changes(before: Mapping[str, float], after: Mapping[str, float], of: str = "") -> str:
+    """Say how the error of each channel changes, those where it rises last."""
+    said = {c: f"{percent(e, 3)} to {percent(after[c], 3)}" for c, e in before.items()}
+    falls = [f"{c} {of}{text}" for c, text in said.items() if after[c] <= before[c]]
+    rises = [f"{c} rises from {text}" for c, text in said.items() if after[c] > before[c]]
+    return ", ".join(falls) + (f"{', but ' if falls else ''}{', '.join(rises)}" if rises else "")
 
 
 def moves(before: Fit, after: Fit) -> str:
@@ -120,6 +141,25 @@ def measured_angle_remark(fit: Fit) -> str:
         "What repeats over a turn follows the measured angle here, in the held-out error too, since the model's own "
         "angle drifts by too much; without a measured angle this model predicts nothing."
     )
+
+
+def unfinished_remark(fit: Fit) -> str:
+    """Say so where the last fit did not converge: its values, and what is said of them, are not the best there are."""
+    if fit.status == "converged" or max(fit.misfit.values(), default=0.0) < LARGER:
+        return ""
+    return f"The fit did not converge ({fit.status}): its values are no optimum, and this verdict rests on them."
+
+
+def held_out_remark(node: Node) -> str:
+    """Say so where the held-out runs are predicted far worse than the fitted ones."""
+    fitted = node.predictions.blocks
+    worse = {c: e.nrmse / max(fitted[c].nrmse, 1e-300) for c, e in node.predictions.held_out.items() if c in fitted}
+    said = [f"{c} {number(r, 2)} times" for c, r in worse.items()
+            if r > ELSEWHERE and node.predictions.held_out[c].misfit > LARGER]
+    if not said:
+        return ""
+    return (f"On the held-out runs the error is larger than on the fitted ones ({', '.join(said)}): the fitted records "
+            "do not determine the model there, or something acts there that they do not show.")
 
 
 def averaging_remark(fit: Fit) -> str:
@@ -153,12 +193,8 @@ def inseparable_remark(same: Mapping[str, tuple[str, ...]]) -> str:
 def balance_of(name: str, also: Sequence[Effect] = ()) -> str:
     """Return where an effect acts: electrical, mechanical or sensor."""
     known = {**LIBRARY, **{e.name: e for e in also}}
-    return {
-        "voltage": "electrical",
-        "torque": "mechanical",
-        "transmission": "mechanical",
-        "sensor": "sensor",
-    }[known[name].balance]
+    return {"voltage": "electrical", "torque": "mechanical", "transmission": "mechanical",
+            "sensor": "sensor"}[known[name].balance]
 
 
 def outliers_remark(fit: Fit) -> str:

@@ -32,22 +32,11 @@ MOST_FINER = 4  # times as many steps, where that is not kept
 
 
 @one_thread
-def fit(
-    model: Model,
-    runs: Sequence[Experiment] | Experiment,
-    *,
-    solver: Any = None,
-    start: str = "auto",
-    engine: str | Engine = "rosenbrock",
-    formulation: str = "plain",
-    priors: Mapping[str, tuple[float, float]] | None = None,
-    penalties: Sequence[Any] = (),
-    constraints: Sequence[Any] = (),
-    loss: Any = None,
-    weights: str | None = None,
-    initial: str = "auto",
-    callback: Callback = None,
-) -> Fit:
+def fit(model: Model, runs: Sequence[Experiment] | Experiment, *, solver: Any = None, start: str = "auto",
+        engine: str | Engine = "rosenbrock", formulation: str = "plain",
+        priors: Mapping[str, tuple[float, float]] | None = None, penalties: Sequence[Any] = (),
+        constraints: Sequence[Any] = (), loss: Any = None, weights: str | None = None, initial: str = "auto",
+        callback: Callback = None) -> Fit:
     """Estimate the free parameters of `model` from `runs`; no first guess is asked for.
 
     Parameters

@@ -17,6 +17,7 @@ from motorid.display.tables import Cell, Flag, Table, value_cell
 from motorid.errors import UsageError
 from motorid.model.model import Model
 from motorid.numerics.least_squares import gauss_newton_covariance
+from motorid.numerics.noise import despiked
 from motorid.numerics.signals import Array
 from motorid.problem.problem import Problem
 from motorid.problem.simulate import Evaluation, Simulation, at, error_table, evaluate, judge, steady_errors
@@ -116,7 +117,7 @@ class Fit(Shown):
         """One standard deviation per parameter, in its unit: 0 where held, None where the data do not determine it."""
         covariance, determined = self._covariance
         found: dict[str, float | None] = dict.fromkeys(self.values, 0.0)
-        at_bound = self._at_bound
+        at_bound = self.at_bound
         for j, p in enumerate(self.problem.unknown):
             if p.name in found:
                 sd = float(np.sqrt(max(covariance[j, j], 0.0)))
@@ -125,7 +126,8 @@ class Fit(Shown):
         return found
 
     @cached_property
-    def _at_bound(self) -> set[str]:
+    def at_bound(self) -> set[str]:
+        """Names of the parameters that ended at a limit: their slopes say nothing of what would be beyond."""
         names = set()
         for p in self.problem.unknown:
             value = self.values.get(p.name)
@@ -153,6 +155,16 @@ class Fit(Shown):
     def steady_state_error(self) -> dict[str, float]:
         """RMS difference of measured and simulated means over the steady parts of the records, SI, per channel."""
         return steady_errors(self.simulations, [run.sigma for run in self.problem.runs])
+
+    @cached_property
+    def misfit(self) -> Mapping[str, float]:
+        """RMS of the residual over the noise of the sensor, per channel, samples that stand alone left aside."""
+        found = {}
+        for c in self.problem.outputs:
+            pairs = zip(self.simulations, self.problem.runs, strict=True)
+            r = np.concatenate([despiked(s.residual(c)) / run.sigma[c] for s, run in pairs if c in run.sigma])
+            found[c] = float(np.sqrt(np.mean(r**2)))
+        return found
 
     @property
     def nrmse(self) -> Mapping[str, float]:

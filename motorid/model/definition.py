@@ -156,7 +156,10 @@ class Effect(Shown):
         return f"<effect {self.name} ({self.balance}): {', '.join(p.name for p in self.parameters)}>"
 
     def __reduce__(self) -> tuple[Any, ...]:
-        # Only plain data crosses a process boundary: the law goes by the name of its module, if it has one.
+        # Only plain data crosses a process boundary: the law goes by the name of its module, if it has one, or as it
+        # is if it is an object that carries its own source.
+        if not hasattr(self.law, "__qualname__"):
+            return Effect, (self.name, self.law, self.parameters, self.balance, self.doc, self.includes)
         module = getattr(self.law, "__module__", None)
         qualname = getattr(self.law, "__qualname__", "")
         importable = module not in (None, "__main__") and "<locals>" not in qualname

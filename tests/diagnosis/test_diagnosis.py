@@ -13,7 +13,6 @@ from battery.excite import driven, record
 
 import motorid as mi
 from motorid.diagnosis.adequacy import adequacy
-from motorid.diagnosis.residual_analysis import Errors, compare_errors
 from motorid.diagnosis.score_test import rank, score
 from motorid.diagnosis.verdict import moves
 from motorid.display.numbers import with_error
@@ -78,38 +77,6 @@ def test_missing_samples_count_for_nothing(rng):
     r[500:] = np.nan
     assert effective_samples(r) == pytest.approx(500, rel=0.15)
     assert autocorrelation(r, 3) == pytest.approx([1, 0, 0, 0], abs=0.15)
-
-
-def _errors(**residuals) -> Errors:
-    return Errors({c: [r] for c, r in residuals.items()}, dict.fromkeys(residuals, 1.0))
-
-
-def test_half_the_error_is_a_fall_of_one_half(rng):
-    r = rng.normal(size=2000)
-    gain = compare_errors(_errors(i=r), _errors(i=r / 2))
-    assert gain.fall == pytest.approx(0.5, abs=0.01)
-    assert gain.log_ratio == pytest.approx(0.5 * gain.effective * np.log(4), rel=0.02)
-
-
-def test_one_outlier_does_not_decide_between_models(rng):
-    r = 0.1 * rng.normal(size=2000)
-    spiked = r.copy()
-    spiked[7] = 100.0
-    lucky = r * 1.05
-    lucky[7] = 0.0  # a worse model that happens to meet the spike
-    assert compare_errors(_errors(i=spiked), _errors(i=lucky)).fall < 0
-
-
-def test_the_channel_that_loses_is_told(rng):
-    a, b = rng.normal(size=(2, 1000))
-    gain = compare_errors(_errors(i=a, omega=b), _errors(i=a / 10, omega=2 * b))
-    assert gain.fall > 0.5
-    assert gain.worst == pytest.approx(-1.0, abs=0.05)
-
-
-def test_ratios_of_errors_far_below_the_noise_do_not_count(rng):
-    r = 1e-6 * rng.normal(size=1000)
-    assert compare_errors(_errors(i=r), _errors(i=r / 100), {"i": 1.0}).fall < 0.01
 
 
 # -- adequacy ----------------------------------------------------------------------------------------------
@@ -319,7 +286,13 @@ def test_the_json_is_plain_and_as_agreed(found):
     assert {"effect", "predicted_drop", "refit_drop", "validation_nrmse", "group", "parameters", "accepted"} <= set(
         whole["ranking"][0]
     )
-    assert [r["added"] for r in whole["ladder"]] == [None, "coulomb"]
+    first, last = whole["ladder"]
+    assert (first["added"], first["grade"], first["gain"]) == (None, None, None)
+    assert (last["added"], last["grade"], last["why"]) == ("coulomb", "named", "")
+    assert last["gain"] > 2 * last["gain_se"] > 0
+    assert whole["remaining"]["kind"] == "noise"
+    assert whole["remaining"]["follows"] is None
+    assert whole["remaining"]["text"] == found[0].remaining.text
 
 
 def same(one, other):
@@ -392,6 +365,7 @@ def test_twins_are_said_as_a_group_with_an_experiment_that_parts_them(name):
     assert found.verdict == "missing"
     assert set(found.groups[0]) == set(alike)
     assert found.effects == found.groups[0][:1]
+    assert found.ladder.rungs[1].grade == "group"
     assert "These data cannot tell" in found.text
     assert "apart, try" in found.suggestion
     assert found.suggestion in found.text

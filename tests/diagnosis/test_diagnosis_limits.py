@@ -9,7 +9,7 @@ import pytest
 from battery.excite import driven, record
 
 import motorid as mi
-from motorid.diagnosis import cross_validation as parts
+from motorid.diagnosis import record_parts as parts
 from motorid.diagnosis.admissibility import objections, samples_within, unresolved
 from motorid.diagnosis.candidates import Search, library
 from motorid.diagnosis.refit import refit
@@ -114,7 +114,10 @@ def test_an_amplitude_without_a_phase_is_refused(rubbing):
         ({"A": 1e-6, "N": 37.0, "phi": 0.0},),
     )
     assert fit is not None
-    assert objections(fit, LIBRARY["cogging"])
+    column = np.array([p.name == "phi" for p in fit.problem.unknown])
+    for share, refused in ((3.0, False), (0.1, True)):  # how plainly the records show the phase
+        seen = replace(fit, jacobian=fit.jacobian * np.where(column, share, 1.0))
+        assert ("phi is not determined" in objections(seen, LIBRARY["cogging"])) is refused
 
 
 def test_a_size_at_the_limit_of_what_is_physical_is_refused(rubbing):

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
 from battery.excite import driven, record
 
 import motorid as mi
-from motorid.diagnosis.cross_validation import HeldOut
-from motorid.diagnosis.form_regression import linearised
-from motorid.diagnosis.misspecification import outside
-from motorid.diagnosis.residual_analysis import far
+from motorid.diagnosis.free_forms import linearised
+from motorid.diagnosis.model_comparison import far
+from motorid.display.numbers import percent
 from motorid.records.experiment import Experiment
 
 ANGLE = ("i", "omega", "theta")
@@ -35,21 +35,40 @@ def diagnosed(runs, effects=FRICTION, validated=True):
 
 
 def is_like(found, form, where="mechanical"):
-    """The verdict where something acts like `form`, and nothing of the library is taken for it."""
+    """The verdict where something acts like `form`: what helps stays in the ladder, and nothing is named after it."""
     assert (found.verdict, found.effects, found.groups) == ("unexplained", (), ())
     assert (found.where, found.missing.where) == (where, where)
     assert found.missing.acts_like.startswith(form)
     assert f"acts like {form}" in found.text
-    assert "None of the library's effects explains it" in found.text
-    assert not any(c.accepted for c in found.ranking)
-    assert [r.added for r in found.ladder.rungs] == [None]
+    assert (found.remainder.kind, found.remainder.where) == ("structure", where)
+    assert found.remainder.follows.startswith(form)
     assert not found.adequacy.adequate
     assert not found.remaining.adequate
+    approximates(found)
 
 
-def stands_in(found, *names):
-    """Whether the first of `names` that was refitted is said to stand in for something else."""
-    return any(c.effect in names and "only stands in" in c.reason for c in found.ranking)
+def approximates(found):
+    """Every rung beyond the first helps, and says why it is not the thing itself."""
+    rungs = found.ladder.rungs
+    assert [r.added for r in rungs if r.grade] == [r.added for r in rungs[1:]]
+    for before, rung in pairwise(rungs):
+        assert rung.grade == "approximates"
+        assert "which the library lacks, predicts better in its place" in rung.why
+        assert f"'{rung.added}' helps, but only approximates it: {rung.why}" in found.text
+        falls(before, rung, found.text)
+    if len(rungs) == 1:
+        assert "None of the library's effects explains it" in found.text
+
+
+def falls(before, rung, text):
+    """The rung predicts better, surely; where a printed error rises, the text says so, and what decided."""
+    assert rung.gain > 2 * rung.gain_se > 0
+    for was, now in ((before.nrmse, rung.nrmse), (before.validation_nrmse, rung.validation_nrmse)):
+        ratios = {c: now[c] / e for c, e in was.items()} if was else {}
+        for c, ratio in ratios.items():
+            assert ratio <= 1 or f"{c} rises from {percent(was[c], 3)} to {percent(now[c], 3)}" in text
+        decided = "blocks of the fitted runs, left out in turn, decided" in text
+        assert np.prod(list(ratios.values())) < 1 or decided or not was
 
 
 @pytest.fixture(scope="module")
@@ -68,15 +87,17 @@ def beyond(plant):
 def test_friction_that_changes_along_a_turn_is_not_called_coulomb(lab, validated):
     found = diagnosed(runs_of(lab, {"angle_friction": {"tau_c": 8e-3, "c": 0.7}}), validated=validated)
     is_like(found, "a friction that changes with the angle")
-    assert stands_in(found, "coulomb", "coulomb_asymmetric")
+    assert len(found.ladder.rungs) > 1  # something of the library helps
 
 
 def test_friction_that_fades_is_not_called_coulomb(lab):
     grease = {"grease_warm_up": {"tau_c": 3e-3, "extra": 4.0, "t_g": 0.3}}
     found = diagnosed(runs_of(lab, grease, ("stairs", "ramps", "steps"), ("i", "omega")))
     is_like(found, "a friction that changes with the time")
-    assert stands_in(found, "coulomb", "coulomb_asymmetric")
-    assert json.loads(json.dumps(found.to_dict()))["location"]["acts_like"] == found.missing.acts_like
+    assert [r.added for r in found.ladder.rungs] == [None, "coulomb"]
+    whole = json.loads(json.dumps(found.to_dict()))
+    assert whole["location"]["acts_like"] == whole["remaining"]["follows"] == found.missing.acts_like
+    assert (whole["effects"], whole["ladder"][1]["grade"]) == ([], "approximates")
 
 
 def test_friction_that_grows_is_not_called_coulomb(beyond, lab):
@@ -98,8 +119,7 @@ def test_a_supply_that_dips_is_found_in_the_voltage(beyond, lab):
 def test_a_cam_is_neither_called_cogging_nor_gravity(lab):
     found = diagnosed(runs_of(lab, {"cam": {"A": 2.5e-2}}), ("cogging", "gravity", "coulomb"))
     is_like(found, "a load that changes with the angle within a turn")
-    assert stands_in(found, "cogging", "gravity")
-    assert "The nearest, '" in found.text
+    assert {r.added for r in found.ladder.rungs} & {"cogging", "gravity"}
 
 
 def test_what_is_needed_beside_it_is_kept_and_the_rest_is_said(lab):
@@ -107,6 +127,8 @@ def test_what_is_needed_beside_it_is_kept_and_the_rest_is_said(lab):
     found = diagnosed(runs_of(lab, both), ("coulomb", "cogging", "constant_load"))
     assert (found.verdict, found.effects) == ("missing", ("coulomb",))
     assert found.after.values["tau_c"] == pytest.approx(1e-2, rel=0.1)
+    assert [(r.grade, r.why) for r in found.ladder.rungs[1:]] == [("named", "")]
+    falls(*found.ladder.rungs, found.text)
     assert "They follow a load that changes with the angle" in found.text
     assert not found.remaining.adequate
 
@@ -124,31 +146,37 @@ def test_a_motor_that_is_another_in_every_run_lacks_no_effect(lab, name, factors
     motors = [replace(lab, **{name: getattr(lab, name) * k}) for k in factors]
     drives = ("stairs 0.5", "ramps 0.6", "prbs 0.5", "steps 0.5")
     runs = [runs_of(m, {}, (d,), seed=4 + k)[0] for k, (m, d) in enumerate(zip(motors, drives, strict=True))]
-    is_like(diagnosed(runs, ("brush_drop", "coulomb", "load_friction")), form, where)
+    found = diagnosed(runs, ("brush_drop", "coulomb", "load_friction"))
+    is_like(found, form, where)
+    with pytest.raises(mi.UsageError, match="Fit the runs apart"):
+        found.remainder.as_effect()
 
 
-def test_the_ladder_does_not_climb_what_only_stands_in(lab):
+def test_improve_grades_its_rungs_too(lab):
     runs = runs_of(lab, {"angle_friction": {"tau_c": 8e-3, "c": 0.7}})
     ladder = mi.improve(mi.fit(mi.dc_motor(), runs[:-1]), runs[-1:], effects=FRICTION)
-    assert [r.added for r in ladder.rungs] == [None]
-    assert "a friction that changes with the angle" in ladder.text
+    assert [r.grade for r in ladder.rungs[1:]] == ["approximates"]
+    assert "a friction that changes with the angle" in ladder.rungs[1].why
+    assert ladder.best is ladder.rungs[1].fit  # what helps is not thrown away
 
 
 @pytest.mark.parametrize("chain", ["logger", "coloured", "coarse"])
 def test_true_friction_is_kept(lab, chain):
     found = diagnosed(runs_of(lab, {"coulomb": {"tau_c": 8e-3}}, chain=chain))
-    assert found.effects[0] == "coulomb"
+    assert found.effects == ("coulomb",)
+    assert found.ladder.rungs[1].grade == "named"
     assert found.missing.acts_like == ""
 
 
 def test_true_friction_is_kept_although_more_than_noise_is_left(lab):
     """A little of the cam remains, many times the noise of the angle, but it is a trifle beside the friction."""
     runs = runs_of(lab, {"coulomb": {"tau_c": 1e-2}, "cam": {"A": 2e-3}})
-    plain = mi.fit(mi.dc_motor(), runs[:-1])
-    rubbing = mi.fit(plain.model + mi.effects.coulomb, runs[:-1])
-    assert far(rubbing)
-    other = outside([plain, rubbing], HeldOut.of(plain, runs[-1:]))
-    assert other is None or other.kept == 1
+    found = diagnosed(runs)
+    assert far(found.best)
+    assert found.effects == ("coulomb",)
+    assert found.ladder.rungs[1].grade == "named"
+    assert not found.remaining.adequate
+    assert found.remainder.follows.startswith("a load that changes with the angle")
 
 
 def test_a_form_answers_as_the_plant_does(lab):
@@ -177,7 +205,6 @@ def test_where_the_errors_are_too_large_to_be_linear_the_form_is_fitted(plant):
     runs = [record(driven(wheel, splice, w, 1000, 2e-3, rng), "logger", ANGLE, wheel, rng, w) for w in SLOW]
     found = diagnosed(runs, ("coulomb", "coulomb_asymmetric", "constant_load"))
     is_like(found, "a friction that changes with the angle")
-    assert stands_in(found, "coulomb", "coulomb_asymmetric")
 
 
 def test_a_sensor_is_blamed_only_where_another_contradicts_it(lab):

@@ -1,0 +1,315 @@
+"""The one statistic behind every decision: how well a model predicts blocks of data that it was not fitted to.
+
+Each run is cut into contiguous blocks (block cross-validation: Racine, J. Econometrics 99, 2000). What a fit would have
+predicted without a block follows from its sensitivities, without a refit: ``r_b⁽⁻ᵇ⁾ = (I − H_bb)⁻¹ r_b`` with
+``H = J(JᵀJ + s²I)⁻¹Jᵀ`` (PRESS by blocks: Allen, Technometrics 16(1), 1974), J in solver coordinates, s the scale of
+the residual: a prior of one unit, a factor of e, keeps open directions finite. Blocks of held-out runs are predicted as
+they are.
+
+Two models are compared by the difference of their log predictive densities, summed over blocks, and its standard error
+from their scatter (Vehtari, Gelman & Gabry, Stat. Comput. 27, 2017; Sivula et al., arXiv 2008.10296). The density is
+Student's t, with each model's own scale per channel from the other blocks: the discrepancy of a model, not the noise of
+the sensor, sets what counts. Samples of coloured errors repeat one another; each channel counts by the effective share
+of its samples.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from motorid.diagnosis.thresholds import (
+    BLOCKS,
+    DEGREES_OF_FREEDOM,
+    LOST,
+    MATERIAL,
+    NATS,
+    STANDARD_ERRORS,
+    UNRELIABLE,
+)
+from motorid.estimation.result import Fit
+from motorid.numerics.autoregression import effective_samples
+from motorid.numerics.noise import despiked, outlier_limit
+from motorid.numerics.signals import Array
+from motorid.problem.problem import Problem
+from motorid.problem.simulate import Simulation
+from motorid.records.experiment import Experiment
+
+SETTLED = 1e-6  # relative change of the scale at which its iteration stops
+ROUNDS = 50
+
+
+@dataclass(frozen=True, eq=False)
+class Errors:
+    """Prediction errors of one channel, SI, with the block that each belongs to.
+
+    Attributes
+    ----------
+    values : tuple of ndarray
+        One per run, (N,), NaN where nothing was measured.
+    blocks : tuple of ndarray of int
+        Number of the block of each sample, counted over all runs.
+    measured : float
+        RMS of the measured samples.
+    noise : float
+        Standard deviation of the sensor's noise.
+    """
+
+    values: tuple[Array, ...]
+    blocks: tuple[NDArray[np.intp], ...]
+    measured: float
+    noise: float
+
+    @property
+    def misfit(self) -> float:
+        """RMS of the errors over the noise, samples that stand alone left aside."""
+        r = np.concatenate([despiked(v) for v in self.values])
+        return float(np.sqrt(np.mean(r**2))) / max(self.noise, 1e-300)
+
+    @property
+    def nrmse(self) -> float:
+        """RMS of the errors over that of the measured samples."""
+        r = np.concatenate(self.values)
+        return float(np.sqrt(np.nanmean(r**2))) / max(self.measured, 1e-300)
+
+
+Channels = Mapping[str, Errors]
+
+
+@dataclass(frozen=True, eq=False)
+class Predictions:
+    """What a model predicts of data that it was not fitted to.
+
+    Attributes
+    ----------
+    blocks : dict of str to Errors
+        Per channel, on blocks of the fitted runs left out in turn.
+    held_out : dict of str to Errors
+        Per channel, on held-out runs; empty without.
+    """
+
+    blocks: Channels
+    held_out: Channels
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """One model against another.
+
+    Attributes
+    ----------
+    gain : float
+        Difference of the log predictive densities (nats), positive for the new one.
+    se : float
+        Its standard error.
+    fall : float
+        Relative fall of the prediction error, geometric mean over channels: on held-out runs where they say something,
+        else on blocks left out.
+    held_out_fall : float or None
+        The same on held-out runs; None without any, or where both models lose them.
+    """
+
+    gain: float
+    se: float
+    fall: float
+    held_out_fall: float | None = None
+
+    @property
+    def sure(self) -> bool:
+        """Tell whether the difference is more than chance: `STANDARD_ERRORS` of it and at least `NATS`."""
+        return self.gain > max(STANDARD_ERRORS * self.se, NATS)
+
+    @property
+    def worth_it(self) -> bool:
+        """Tell whether the new model is to be preferred: surely better, by an amount that matters, and not worse there.
+
+        Held-out runs in which the change hardly shows decide nothing; a rise there refuses it.
+        """
+        if self.held_out_fall is not None and self.held_out_fall < -MATERIAL:
+            return False
+        return self.sure and self.fall > MATERIAL
+
+
+def compare(old: Predictions, new: Predictions) -> Evidence:
+    """Return what `new` predicts better than `old` on the same data."""
+    sums = [_differences(old.blocks, new.blocks, lost=False), _differences(old.held_out, new.held_out, lost=True)]
+    gain = sum(float(d.sum()) for d in sums)
+    variance = sum(len(d) * float(d.var(ddof=1)) for d in sums if len(d) > 1)
+    blocks = _fall(old.blocks, new.blocks) or 0.0
+    held_out = _fall(*(_kept(old.held_out, new.held_out, m) for m in (old.held_out, new.held_out)))
+    return Evidence(gain, float(np.sqrt(variance)), blocks if held_out is None else max(blocks, held_out), held_out)
+
+
+def lost_channels(old: Channels, new: Channels) -> tuple[str, ...]:
+    """Return the channels that both models lose: zero is nearer to what was measured than either."""
+    return tuple(c for c in old if c in new and min(old[c].nrmse, new[c].nrmse) > LOST)
+
+
+def _kept(old: Channels, new: Channels, channels: Channels) -> Channels:
+    gone = lost_channels(old, new)
+    return {c: e for c, e in channels.items() if c not in gone}
+
+
+def _fall(old: Channels, new: Channels) -> float | None:
+    """Return the relative fall of the error, geometric mean over channels: where lone samples are left aside, and
+    where large errors are cut, the smaller of the two.
+
+    A few large samples must neither make nor hide an effect, and an effect must not hide what it spoils in a row of
+    them.
+    """
+    both = [c for c in old if c in new]
+    if not both:
+        return None
+    limits = {c: outlier_limit(np.concatenate(old[c].values)) for c in both}
+    quiet = [np.log(_rms(new[c]) / _rms(old[c])) for c in both]
+    cut = [np.log(_rms(new[c], limits[c]) / _rms(old[c], limits[c])) for c in both]
+    return min(1 - float(np.exp(np.mean(ratios))) for ratios in (quiet, cut))
+
+
+def _rms(errors: Errors, limit: float | None = None) -> float:
+    """Return the RMS of errors cut at `limit`, or without one of all but lone samples."""
+    if limit is None:
+        r = np.concatenate([despiked(v) for v in errors.values])
+    else:
+        r = np.clip(np.concatenate([v[np.isfinite(v)] for v in errors.values]), -limit, limit)
+    return float(np.sqrt(np.mean(r**2) + (0.1 * errors.noise) ** 2)) + 1e-300
+
+
+def _differences(old: Channels, new: Channels, lost: bool) -> Array:
+    """Return the difference of log densities per block, summed over channels."""
+    gone = lost_channels(old, new) if lost else ()
+    both = [c for c in old if c in new and c not in gone]
+    if not both:
+        return np.zeros(0)
+    count = 1 + max(int(b.max()) for c in both for b in old[c].blocks)
+    total, seen = np.zeros(count), np.zeros(count, bool)
+    for c in both:
+        share = _effective_share(min((old[c], new[c]), key=lambda e: e.nrmse))
+        labels = np.concatenate(old[c].blocks)
+        was, now = np.concatenate(old[c].values), np.concatenate(new[c].values)
+        known = np.isfinite(was) & np.isfinite(now)
+        labels, was, now = labels[known], was[known], now[known]
+        each = [_log_densities(r, labels, count, 0.1 * old[c].noise) for r in (was, now)]
+        total += share * (each[1] - each[0])
+        seen |= np.bincount(labels, minlength=count) > 0
+    return total[seen]
+
+
+def _effective_share(errors: Errors) -> float:
+    n = sum(int(np.isfinite(r).sum()) for r in errors.values)
+    return sum(effective_samples(r) for r in errors.values) / max(n, 1)
+
+
+def _log_densities(r: Array, labels: NDArray[np.intp], count: int, floor: float) -> Array:
+    """Return the log density of each block of `r` under Student's t, its scale from the other blocks, (count,).
+
+    A tenth of the sensor's noise (`floor`) is as good as none: ratios of tiny numbers must not decide.
+    """
+    nu = DEGREES_OF_FREEDOM
+    scale2 = float(np.median(r**2)) + 1e-300
+    for _ in range(ROUNDS):  # expectation maximisation of the scale
+        weights = (nu + 1) / (nu + r**2 / scale2)
+        before, scale2 = scale2, float(np.mean(weights * r**2)) + 1e-300
+        if abs(scale2 - before) < SETTLED * before:
+            break
+    sizes = np.bincount(labels, minlength=count)
+    sums = np.bincount(labels, (nu + 1) / (nu + r**2 / scale2) * r**2, count)
+    others = np.maximum(len(r) - sizes, 1)
+    apart = np.where(sizes < len(r), (sums.sum() - sums) / others, scale2) + floor**2 + 1e-300
+    own = apart[labels]
+    weights = -0.5 * np.log(own) - 0.5 * (nu + 1) * np.log1p(r**2 / (nu * own))
+    return np.bincount(labels, weights, count).astype(float)
+
+
+def left_out(residual: Array, columns: Array, labels: NDArray[np.intp]) -> Array:
+    """Return what `residual` (n,) would be in each block, left out of the fit of `columns` (n, k)."""
+    scale2 = float(residual @ residual) / max(len(residual), 1)
+    normal = columns.T @ columns + scale2 * np.eye(columns.shape[1])
+    found = residual.copy()
+    for rows in _rows(labels):
+        j, r = columns[rows], residual[rows]
+        found[rows] = r + j @ np.linalg.solve(normal - j.T @ j, j.T @ r)
+    return found
+
+
+def _rows(labels: NDArray[np.intp]) -> Iterator[NDArray[np.intp]]:
+    """Yield the rows of each block."""
+    order = np.argsort(labels, kind="stable")
+    ends = np.flatnonzero(np.diff(labels[order])) + 1
+    for a, b in pairwise([0, *ends.tolist(), len(order)]):
+        yield order[a:b]
+
+
+def blocks_of(lengths: Sequence[int], count: int = BLOCKS) -> list[NDArray[np.intp]]:
+    """Return the block of each sample of runs of these lengths, `count` blocks a run."""
+    found, first = [], 0
+    for n in lengths:
+        parts = max(min(count, n // 2), 1)
+        found.append(first + np.minimum(np.arange(n) * parts // n, parts - 1))
+        first += parts
+    return found
+
+
+def predictions_left_out(fit: Fit) -> Channels | None:
+    """Return the errors of `fit` on blocks of its own records, each left out in turn; None where that cannot be told.
+
+    Initial states stay as they were fitted, and so do parameters at a limit. Where slopes lead nowhere (cogging far
+    from its phase) the linear prediction explodes, and tells nothing.
+    """
+    problem, n = fit.problem, fit.problem.n_outputs
+    free = [j for j, p in enumerate(problem.unknown) if p.name in fit.values and p.name not in fit.at_bound]
+    columns = (fit.jacobian[:n] * problem.scaling.slope(fit.q))[:, free]
+    blocks = blocks_of([run.n for run in problem.experiments])
+    residual = fit.residuals[:n]
+    try:
+        moved = left_out(residual, columns, stacked_labels(problem, blocks))
+    except np.linalg.LinAlgError:
+        return None
+    if not np.isfinite(moved).all() or moved @ moved > UNRELIABLE**2 * (residual @ residual):
+        return None
+    return by_channel(problem, moved, blocks)
+
+
+def stacked_labels(problem: Problem, blocks: Sequence[NDArray[np.intp]]) -> NDArray[np.intp]:
+    """Return the block of each output residual of a problem, (n,)."""
+    each = zip(problem.measured, blocks, strict=True)
+    stacked = [m.stack(np.repeat(block[:, None], m.y.shape[1], axis=1).astype(float)) for m, block in each]
+    return np.concatenate(stacked).astype(np.intp)
+
+
+def by_channel(problem: Problem, residual: Array, blocks: Sequence[NDArray[np.intp]]) -> Channels:
+    """Return a whitened output residual (n,) of a problem as errors per channel, SI."""
+    parts, weights = problem.unstack(residual), [m.weights for m in problem.measured]
+    found = {}
+    for j, c in enumerate(problem.outputs):
+        runs = [k for k, run in enumerate(problem.runs) if c in run.sigma]
+        if runs:
+            measured = np.concatenate([problem.experiments[k].outputs[c] for k in runs])
+            found[c] = Errors(tuple(parts[k][:, j] / weights[k][j] for k in runs), tuple(blocks[k] for k in runs),
+                              float(np.sqrt(np.nanmean(measured**2))),
+                              float(np.sqrt(np.mean([problem.runs[k].sigma[c] ** 2 for k in runs]))))
+    return found
+
+
+def errors_of(simulations: Sequence[Simulation], noise: Mapping[str, float],
+              judged: Sequence[Experiment] | None = None) -> Channels:
+    """Return the errors of `simulations` as they are, in blocks of each run.
+
+    `judged` gives other measurements on the same samples (a fold); `noise` is the sensor's per channel.
+    """
+    runs = judged if judged is not None else [s.experiment for s in simulations]
+    blocks = blocks_of([run.n for run in runs])
+    parts: dict[str, list[tuple[Array, NDArray[np.intp], Array]]] = {}
+    for sim, run, block in zip(simulations, runs, blocks, strict=True):
+        for c, y in run.outputs.items():
+            if c in sim.outputs and np.isfinite(y).any():
+                parts.setdefault(c, []).append((y - sim.outputs[c], block, y[np.isfinite(y)]))
+    return {
+        c: Errors(tuple(r for r, _, _ in found), tuple(b for _, b, _ in found),
+                  float(np.sqrt(np.mean(np.concatenate([y for _, _, y in found]) ** 2))), noise.get(c, 0.0))
+        for c, found in parts.items()
+    }

@@ -1,0 +1,142 @@
+"""Long records: a diagnosis refits dozens of models, so it looks at parts of what would take too long.
+
+Parts are contiguous and chosen so that together they show what the records show: both directions, slow and fast, all
+voltages, early and late. Every part begins where the motor then is, so that an angle drifts no longer than one part
+lasts. What takes longer than a part to show (heating) is seen between the parts only.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from motorid.errors import MotoridError
+from motorid.estimation.fit import solve
+from motorid.estimation.result import Fit
+from motorid.numerics.signals import Array
+from motorid.problem.problem import Problem
+from motorid.problem.runs import angle_signal
+from motorid.records.experiment import Experiment
+
+AFFORDABLE = 150_000  # steps of integration per simulation of all records
+WANTED = 36_000  # of what is longer
+PART = 1000  # samples
+SUBSTEPS = 24  # per sample: what needs more cannot be seen in these samples, unless it is cheap
+CHEAP = 200_000  # steps of integration
+LONG = 20_000  # samples: a first fit of their parts tells whether all of them are affordable
+FEW = 4 * PART  # samples of that first fit
+NEARLY_ALL = 0.7  # of the samples: no reason to leave out the rest
+LEVELS = 8  # of speed and of voltage that parts are to show
+TIMES = 4  # and parts of the record
+
+
+def affordable(fit: Fit) -> Fit:
+    """Return `fit`, or the fit of the same model to parts of its records if these are too long for many refits."""
+    problem = fit.problem
+    work = sum(int(r.grid.substeps.sum()) for r in problem.runs)
+    if work <= AFFORDABLE or problem.initial != "auto":
+        return fit
+    parts = parts_of(problem.experiments, WANTED / work)
+    if parts is None:
+        return fit
+    try:
+        return solve(problem.with_(experiments=parts, model=fit.model, balance={}), start="model")
+    except MotoridError:
+        return fit
+
+
+def worth_its_steps(problem: Problem) -> bool:
+    """Tell whether a problem takes no more sub-steps than its samples are worth."""
+    spent = sum(int(r.grid.substeps.sum()) for r in problem.runs)
+    return spent <= max(SUBSTEPS * _samples(problem.experiments), CHEAP)
+
+
+def fit_affordably(runs: Sequence[Experiment], fit: Callable[[Sequence[Experiment]], Fit]) -> Fit:
+    """Return the fit of `runs` to begin a diagnosis with: of parts, where to fit all would take long."""
+    total = _samples(runs)
+    parts = parts_of(runs, FEW / total) if total > LONG else None
+    if parts is None:
+        return fit(runs)
+    few = fit(parts)
+    work = sum(int(r.grid.substeps.sum()) for r in few.problem.runs) * total / _samples(parts)
+    if work <= AFFORDABLE or few.problem.initial != "auto":
+        return fit(runs)
+    wanted = parts_of(runs, WANTED / work)
+    return few if wanted is None or len(wanted) == len(parts) else fit(wanted)
+
+
+def parts_of(runs: Sequence[Experiment], share: float) -> list[Experiment] | None:
+    """Return parts of records that together are about a `share` of them; None where that is nearly all."""
+    parts = [p for run in runs for p in _parts(run, share)]
+    return parts if _samples(parts) < NEARLY_ALL * _samples(runs) else None
+
+
+def _parts(run: Experiment, share: float) -> list[Experiment]:
+    """Return parts of a run that together are about a `share` of it."""
+    count = max(1, round(run.n * share / PART))
+    if run.n < 2 * PART * count:
+        return [run]
+    return [
+        run.select(slice(a, a + PART)).with_(
+            name=f"{run.name}[{k + 1}]", meta={**run.meta, "part of": (run.name, run.n)}
+        )
+        for k, a in enumerate(_telling(run, count))
+    ]
+
+
+def _telling(run: Experiment, count: int) -> list[int]:
+    """Return where `count` parts begin that show as much as they can of what the record shows, in order of time."""
+    begins = np.unique(np.linspace(0, run.n - PART, 4 * (run.n // PART)).astype(int))
+    flags = _flags(run)
+    counted = np.concatenate([np.zeros((1, flags.shape[1])), np.cumsum(flags, axis=0)])
+    shown = counted[begins + PART] - counted[begins]
+    chosen: list[int] = []
+    for _ in range(count):
+        have = shown[chosen].sum(axis=0) if chosen else np.zeros(shown.shape[1])
+        free = [k for k, a in enumerate(begins) if all(abs(a - begins[c]) >= PART for c in chosen)]
+        if not free:
+            break
+        chosen.append(max(free, key=lambda k: float(np.sqrt(have + shown[k]).sum())))
+    return sorted(int(begins[k]) for k in chosen)
+
+
+def _kinds(run: Experiment) -> list[tuple[NDArray[np.int_], int]]:
+    """Return to which of n levels of speed, of voltage and of time each sample belongs, with n."""
+    speed = np.gradient(angle_signal(run), run.t)
+    if "omega" in run.outputs:
+        speed = np.where(np.isfinite(run.outputs["omega"]), run.outputs["omega"], speed)
+    return [(_level(speed), LEVELS), (_level(run.inputs["v"]), LEVELS), (TIMES * np.arange(run.n) // run.n, TIMES)]
+
+
+def _level(y: Array) -> NDArray[np.int_]:
+    """Return in which of `LEVELS` equal steps between its extremes each sample lies."""
+    low, high = np.quantile(y, [0.005, 0.995])
+    return np.clip(LEVELS * (y - low) / max(high - low, 1e-300), 0, LEVELS - 1).astype(int)
+
+
+def _flags(run: Experiment) -> Array:
+    """Return which levels each sample shows, (N, levels of all kinds)."""
+    return np.concatenate([np.eye(n)[k] for k, n in _kinds(run)], axis=1)
+
+
+def parts_remark(fit: Fit) -> str:
+    """Say which part of the records a fit looked at, if not all."""
+    used = fit.problem.experiments
+    whole = dict(r.meta.get("part of", (r.name, r.n)) for r in used)
+    if not any("part of" in r.meta for r in used):
+        return ""
+    share = _samples(used) / sum(whole.values())
+    return (
+        f"The records are long: this rests on {len(used)} parts of {_seconds(used):.2g} s, {100 * share:.0f} % of the "
+        "samples; fit the model to all of them."
+    )
+
+
+def _samples(runs: Sequence[Experiment]) -> int:
+    return sum(r.n for r in runs)
+
+
+def _seconds(runs: Sequence[Experiment]) -> float:
+    return float(np.median([r.duration for r in runs]))

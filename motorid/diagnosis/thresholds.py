@@ -1,0 +1,18 @@
+"""Every judgement of the diagnosis that is a number: its meaning, its unit, and the case or curve that fixes it."""
+
+# -- the predictive score (see `predictive_score`) -------------------------------------------------------------
+BLOCKS = 20  # per run: enough for a standard error of their scatter, each longer than a motor's memory
+DEGREES_OF_FREEDOM = 4  # of Student's t: a Gaussian takes offsets for friction on real records, whose errors have tails
+STANDARD_ERRORS = 2.0  # that a gain must be: chance lets 1 % of false effects in at 15 effective samples per run
+NATS = 4.0  # that a gain must be at least: 2 to 4 let the same in on 438 pairs of models
+MATERIAL = 0.01  # fall of the prediction error that matters: no false effect of 306 reached 0.1 %
+LOST = 1.0  # NRMSE beyond which a channel is lost: zero is nearer to what was measured
+UNRELIABLE = 1.5  # times the error of the fit: a prediction without a block by slopes is within 1.08 where it holds
+
+# -- noise ------------------------------------------------------------------------------------------------------
+LARGER = 1.5  # of residual to noise: beyond it the noise must be coloured, or something is missing
+
+# -- what an effect may be called -----------------------------------------------------------------------------------
+CONTAINED = 0.1  # of what an effect puts into its balance, RMS: what a free form may miss and still contain it
+TRIFLE = 0.1  # of an effect's torque or voltage, RMS: what a form that contains it must add to differ from it
+ELSEWHERE = 3.0  # times the error on blocks left out, on held-out runs: another regime, worth a word

@@ -1,0 +1,80 @@
+"""What an effect that helps may be called: the thing itself, one of several, or an approximation."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from battery.excite import driven, record
+
+import motorid as mi
+
+HIDDEN = {"coulomb": {"tau_c": 8e-3}}
+DRIVES = ("stairs", "ramps", "steps")
+
+
+@mi.effect(balance="torque")
+def weak_friction(m, tau_w=mi.P(1e-3, "N·m", null=0.0, lower=0.0, upper=5e-3)):
+    """Friction that physics would not let grow beyond 5 mN·m."""
+    m.torque -= tau_w * m.sign(m.omega)
+
+
+def runs_of(motor, hidden, drives=DRIVES, channels=("i", "omega"), n=600):
+    rng = np.random.default_rng(6)
+    return [record(driven(motor, hidden, w, n, 1e-3, rng), "logger", channels, motor, rng, w) for w in drives]
+
+
+@pytest.fixture(scope="module")
+def rubbing(lab):
+    runs = runs_of(lab, HIDDEN)
+    return mi.fit(mi.dc_motor(), runs[:2]), runs[2:]
+
+
+def test_what_no_rival_matches_is_named(rubbing):
+    found = mi.diagnose(*rubbing, effects=("coulomb", "quadratic_drag"))
+    first, rung = found.ladder.rungs
+    assert (first.grade, first.why, first.gain) == (None, "", None)
+    assert (rung.added, rung.grade, rung.why) == ("coulomb", "named", "")
+    assert rung.gain > 2 * rung.gain_se > 0
+    assert (found.verdict, found.effects, found.groups) == ("missing", ("coulomb",), ())
+
+
+def test_what_runs_to_a_limit_of_physics_helps_but_is_not_named(rubbing):
+    found = mi.diagnose(*rubbing, effects=(), also=[weak_friction])
+    rung = found.ladder.rungs[1]
+    assert (rung.added, rung.grade) == ("weak_friction", "approximates")
+    assert "tau_w runs to 0.005, the limit of what is physical" in rung.why
+    assert rung.validation_nrmse["omega"] < 0.8 * found.ladder.rungs[0].validation_nrmse["omega"]
+    assert (found.verdict, found.effects) == ("unexplained", ())
+    assert f"'weak_friction' helps, but only approximates it: {rung.why}" in found.text
+    assert found.best.model.effect_names == ("weak_friction",)  # the model that predicts best, whatever its name
+
+
+def test_what_physics_speaks_against_is_taken_only_where_nothing_else_helps(rubbing):
+    found = mi.diagnose(*rubbing, effects=("coulomb",), also=[weak_friction])
+    assert found.effects == ("coulomb",)
+    assert [r.grade for r in found.ladder.rungs] == [None, "named"]
+    refused = next(c for c in found.ranking if c.effect == "weak_friction")
+    assert not refused.accepted
+
+
+def test_what_a_rival_matches_is_one_of_a_group(plant):
+    """Forward runs alone: a constant load is as good as friction."""
+    servo, rng = plant.MOTORS["servo"], np.random.default_rng(1)
+    runs = [record(driven(servo, {"coulomb": {"tau_c": 0.04}}, w, 600, 2e-3, rng), "logger", ("i", "omega"), servo,
+                   rng, w) for w in ("forward", "waves")]
+    found = mi.diagnose(mi.fit(mi.dc_motor(), runs), effects=("coulomb", "constant_load"))
+    assert found.ladder.rungs[1].grade == "group"
+    assert set(found.groups[0]) == {"coulomb", "constant_load"}
+    assert found.effects == found.groups[0][:1]
+    assert found.verdict == "missing"
+
+
+def test_what_a_free_form_outdoes_in_its_place_approximates(lab):
+    runs = runs_of(lab, {"grease_warm_up": {"tau_c": 3e-3, "extra": 4.0, "t_g": 0.3}})
+    found = mi.diagnose(mi.fit(mi.dc_motor(), runs[:2]), runs[2:], effects=("coulomb",))
+    rung = found.ladder.rungs[1]
+    assert (rung.added, rung.grade) == ("coulomb", "approximates")
+    assert rung.why.startswith("a friction that changes with the time, which the library lacks")
+    assert found.effects == ()
+    accepted = next(c for c in found.ranking if c.effect == "coulomb")
+    assert accepted.accepted  # it stays in the ladder

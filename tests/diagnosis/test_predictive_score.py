@@ -1,0 +1,281 @@
+"""The statistic behind every decision: what blocks left out say, and when one model is preferred to another."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from battery.excite import driven, record
+
+import motorid as mi
+from motorid.diagnosis.cross_validation import HeldOut
+from motorid.diagnosis.predictive_score import (
+    Errors,
+    Evidence,
+    Predictions,
+    blocks_of,
+    compare,
+    left_out,
+    lost_channels,
+    predictions_left_out,
+)
+from motorid.diagnosis.thresholds import BLOCKS, MATERIAL, NATS, STANDARD_ERRORS
+from motorid.estimation.fit import solve
+from motorid.records.experiment import Experiment
+
+
+def errors(measured=1e3, noise=0.0, **residuals) -> dict[str, Errors]:
+    """Errors of one run, of channels that measure `measured`."""
+    return {c: Errors((r,), tuple(blocks_of([len(r)])), measured, noise) for c, r in residuals.items()}
+
+
+def left(**residuals) -> Predictions:
+    """The same on blocks left out."""
+    return Predictions(errors(**residuals), {})
+
+
+# -- blocks left out, without a refit ----------------------------------------------------------------------
+
+
+def test_every_sample_has_one_block_and_runs_share_none():
+    first, second, short = blocks_of([1000, 90, 7])
+    assert len(set(first)) == len(set(second)) == BLOCKS
+    assert len(set(short)) == 3  # of two samples at least
+    assert not set(first) & set(second)
+    assert np.ptp(np.bincount(first)) == 0
+    assert all(np.all(np.diff(b) >= 0) for b in (first, second, short))
+
+
+def test_a_linear_fit_without_a_block_is_known_exactly(rng):
+    columns, labels = rng.normal(size=(300, 4)), blocks_of([300])[0]
+    y = columns @ rng.normal(size=4) + np.sin(np.arange(300) / 20)
+    scaled = 1e4 * columns  # beside which the prior of one unit is nothing
+    residual = y - columns @ np.linalg.lstsq(columns, y, rcond=None)[0]
+    found = left_out(residual, scaled, labels)
+    for b in range(BLOCKS):
+        own = labels == b
+        apart = np.linalg.lstsq(columns[~own], y[~own], rcond=None)[0]
+        assert found[own] == pytest.approx(y[own] - columns[own] @ apart, rel=1e-6, abs=1e-9)
+    assert found @ found > 1.01 * (residual @ residual)
+
+
+def test_a_direction_that_only_one_block_shows_stays_finite(rng):
+    """Without that block the prior alone holds it, at the value of the whole fit."""
+    labels = blocks_of([200])[0]
+    columns = np.column_stack([np.ones(200), labels == 3])
+    residual = rng.normal(size=200)
+    residual -= columns @ np.linalg.lstsq(columns, residual, rcond=None)[0]
+    found = left_out(residual, columns, labels)
+    assert np.isfinite(found).all()
+    assert np.abs(found).max() < 20 * np.abs(residual).max()
+
+
+def without(fit, rows):
+    """The refit without some samples, from where `fit` ended."""
+    problem = fit.problem
+    (run,) = problem.experiments
+    hidden = run.with_(outputs={c: np.where(rows, np.nan, y) for c, y in run.outputs.items()})
+    other = replace(problem.with_(experiments=(hidden,)), _runs=(replace(problem.runs[0], experiment=hidden),))
+    return solve(other.tuned(balance=problem.balance).for_model(fit.model), start="model")
+
+
+def rms(r) -> float:
+    return float(np.sqrt(np.nanmean(r**2)))
+
+
+@pytest.mark.parametrize("hidden", [{}, {"coulomb": {"tau_c": 8e-3}}])
+def test_slopes_tell_what_refits_without_a_block_would_predict(lab, hidden):
+    rng = np.random.default_rng(1)
+    run = record(driven(lab, hidden, "stairs", 400, 2e-3, rng), "logger", ("i", "omega"), lab, rng, "run")
+    fit = mi.fit(mi.dc_motor(), run)
+    slopes, labels = predictions_left_out(fit), blocks_of([run.n])[0]
+    own = {c: fit.simulations[0].residual(c) for c in slopes}
+    true = {c: np.empty(run.n) for c in slopes}
+    for b in range(BLOCKS):
+        again = without(fit, labels == b).simulations[0]
+        for c, r in true.items():
+            r[labels == b] = (run.outputs[c] - again.outputs[c])[labels == b]
+    for c, e in slopes.items():
+        assert e.nrmse == pytest.approx(rms(true[c]) / rms(run.outputs[c]), rel=0.05)
+        beyond = [np.log(rms(r) / rms(own[c])) for r in (e.values[0], true[c])]
+        assert 0.005 < beyond[0] == pytest.approx(beyond[1], rel=0.2)  # what the fit owes to the block itself
+
+
+# -- one model against another -----------------------------------------------------------------------------
+
+
+def test_a_comparison_is_antisymmetric_and_a_model_gains_nothing_on_itself(rng):
+    a, b, c = rng.normal(size=(3, 1000))
+    one, other = left(i=a, omega=2 * b), left(i=b, omega=c)
+    there, back = compare(one, other), compare(other, one)
+    assert there.gain == pytest.approx(-back.gain, rel=1e-9)
+    assert there.se == pytest.approx(back.se, rel=1e-9)
+    assert there.gain > 0
+    same = compare(one, one)
+    assert (same.gain, same.se, same.fall) == (0, 0, 0)
+    assert not same.worth_it
+
+
+def test_half_the_error_gains_a_factor_of_two_per_sample(rng):
+    r = rng.normal(size=2000)
+    found = compare(left(i=r), left(i=r / 2))
+    assert found.fall == pytest.approx(0.5, abs=0.01)
+    assert found.gain == pytest.approx(2000 * np.log(2), rel=0.1)
+    assert found.worth_it
+
+
+@pytest.mark.parametrize("rho", [0.8, 0.95])
+def test_coloured_errors_count_for_less(plant, rng, rho):
+    white, coloured = rng.normal(size=4000), plant.coloured(np.zeros(4000), 1.0, rho, rng)
+    gains = [compare(left(i=r), left(i=0.9 * r)).gain for r in (white, coloured)]
+    assert gains[1] / gains[0] == pytest.approx((1 - rho) / (1 + rho), rel=0.35)
+
+
+def test_the_scatter_of_the_blocks_is_the_standard_error(rng):
+    """What is better in half of the blocks and worse in the others is no gain."""
+    r, labels = rng.normal(size=4000), blocks_of([4000])[0]
+    wavering = np.where(labels % 2, 0.7, 1 / 0.7) * r
+    found = compare(left(i=r), left(i=wavering))
+    assert abs(found.gain) < STANDARD_ERRORS * found.se
+    assert compare(left(i=r), left(i=0.7 * r)).se < 0.3 * found.se
+
+
+def test_one_outlier_does_not_decide_between_models(rng):
+    r = 0.1 * rng.normal(size=2000)
+    spiked, lucky = r.copy(), r * 1.05
+    spiked[7], lucky[7] = 100.0, 0.0  # a worse model that happens to meet the spike
+    found = compare(left(i=spiked), left(i=lucky))
+    assert found.fall < 0
+    assert not found.worth_it
+
+
+def test_a_gain_must_be_one_whether_or_not_large_errors_are_cut(rng):
+    steady = rng.normal(0, 1.0, 400)
+    peaks, spikes, few = np.zeros((3, 400))
+    peaks[100:120], spikes[::50], few[200:203] = 60.0, 60.0, 60.0
+
+    def fall(old, new):
+        return compare(left(i=old), left(i=new)).fall
+
+    # Twice as good where it is calm, but the peaks, which are no outliers, are worse.
+    assert fall(2 * steady + 0.5 * peaks, steady + peaks) < -0.3
+    assert fall(2 * steady, steady) == pytest.approx(0.5)
+    assert fall(2 * steady + spikes, steady + spikes) > 0.2  # nor do spikes hide a gain
+    assert fall(steady + 2 * spikes, steady + spikes) < MATERIAL  # and they make none
+    assert fall(steady + 2 * few, steady + few) < MATERIAL  # nor do three in a row
+
+
+def test_ratios_of_errors_far_below_the_noise_do_not_count(rng):
+    r = 1e-6 * rng.normal(size=1000)
+    old, new = (Predictions(errors(noise=1.0, i=e), {}) for e in (r, r / 100))
+    assert compare(old, new).fall < MATERIAL
+    assert abs(compare(old, new).gain) < 1e-3
+
+
+def test_a_channel_that_loses_counts_against_the_others(rng):
+    """It is weighed, and no veto: what is gained elsewhere may be more."""
+    a, b = rng.normal(size=(2, 1000))
+    alone = compare(left(i=a, omega=b), left(i=a / 10, omega=b))
+    less = compare(left(i=a, omega=b), left(i=a / 10, omega=2 * b))
+    assert 0 < less.gain < alone.gain
+    assert 0.5 < less.fall < alone.fall
+    assert less.worth_it
+    more = compare(left(i=a, omega=b), left(i=a / 10, omega=20 * b))
+    assert more.gain < 0 > more.fall
+
+
+# -- held-out runs -----------------------------------------------------------------------------------------
+
+
+def both(fitted, held_out, measured=1e3) -> Predictions:
+    return Predictions(errors(i=fitted), errors(measured, theta=held_out))
+
+
+def test_a_rise_on_held_out_runs_refuses(rng):
+    r, h = rng.normal(size=(2, 1000))
+    helps = compare(both(r, h), both(0.5 * r, h))
+    assert (helps.held_out_fall, helps.worth_it) == (pytest.approx(0, abs=1e-12), True)  # it hardly shows there
+    spoils = compare(both(r, h), both(0.5 * r, 1.03 * h))
+    assert spoils.held_out_fall == pytest.approx(-0.03, abs=1e-3)
+    assert spoils.sure  # all together it predicts better
+    assert not spoils.worth_it
+
+
+def test_a_gain_on_held_out_runs_alone_is_one(rng):
+    r, h = rng.normal(size=(2, 1000))
+    found = compare(both(r, h), both(r, 0.5 * h))
+    assert found.fall == found.held_out_fall == pytest.approx(0.5, abs=0.01)
+    assert found.worth_it
+
+
+def test_held_out_runs_that_both_models_lose_decide_nothing(rng):
+    """A pendulum falls over the top, or not, by a hair: then blocks of the fitted runs decide."""
+    r, h = rng.normal(size=(2, 1000))
+    old, worse = both(r, 2.7 * h, measured=1.0), both(0.5 * r, 3.1 * h, measured=1.0)
+    assert lost_channels(old.held_out, worse.held_out) == ("theta",)
+    found = compare(old, worse)
+    assert found.held_out_fall is None
+    assert found.gain == pytest.approx(compare(left(i=r), left(i=0.5 * r)).gain)
+    assert found.worth_it
+    within_reach = compare(both(r, 0.7 * h, measured=1.0), both(0.5 * r, 0.9 * h, measured=1.0))
+    assert within_reach.held_out_fall < -0.2
+    assert not within_reach.worth_it
+
+
+def test_what_the_records_need_is_not_superfluous_for_a_held_out_run_that_says_nothing(rng):
+    r, h = rng.normal(size=(2, 1000))
+    whole, smaller = both(0.1 * r, 0.5 * h), both(0.9 * r, 0.499 * h)
+    assert compare(smaller, whole).worth_it
+    assert not compare(both(0.9 * r, 0.3 * h), whole).worth_it  # it fails where it was not fitted
+    assert not compare(both(0.1 * r, 0.499 * h), whole).worth_it
+
+
+# -- when a model is preferred -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("gain", "se", "fall", "held_out", "worth"), [
+    (1.01 * NATS, 0.1, 0.1, None, True),
+    (0.99 * NATS, 0.1, 0.1, None, False),  # hardly anything, however sure
+    (100, 0.99 * 100 / STANDARD_ERRORS, 0.1, None, True),
+    (100, 1.01 * 100 / STANDARD_ERRORS, 0.1, None, False),  # by chance?
+    (100, 1, 1.01 * MATERIAL, None, True),
+    (100, 1, 0.99 * MATERIAL, None, False),  # sure, but of no matter
+    (100, 1, 0.1, -0.99 * MATERIAL, True),
+    (100, 1, 0.1, -1.01 * MATERIAL, False),
+    (-100, 1, 0.1, 0.1, False),
+])
+def test_a_model_is_preferred_that_is_surely_and_materially_better(gain, se, fall, held_out, worth):
+    assert Evidence(gain, se, fall, held_out).worth_it is worth
+
+
+@pytest.fixture(scope="module")
+def simulated_pairs(plant, lab):
+    """Gain of false and of true additions, over seeds: white and coloured noise, with and without held-out runs."""
+    t, v = plant.staircase([3, -3, 1, 4, -2, 0.5], 0.06)
+    false, true = [], []
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        for hidden, added, found in (
+            ({}, ("coulomb", "quadratic_drag", "brush_drop"), false),
+            ({"coulomb": {"tau_c": 4e-3}}, ("coulomb",), true),
+        ):
+            r = plant.simulate(lab, hidden, t, v)
+            runs = []
+            for k in range(2):
+                y = {c: plant.coloured(r[c], s, 0.9 * (seed % 2), rng) for c, s in (("i", 0.03), ("omega", 0.8))}
+                runs.append(Experiment(t, {"v": v}, y, name=f"run{k}"))
+            plain = mi.fit(mi.dc_motor(), runs[0])
+            held = HeldOut.of(plain, runs[1] if seed % 3 else None)
+            for name in added:
+                larger = mi.fit(plain.model + mi.effects.get(name), runs[0])
+                found.append(compare(held.predictions(plain), held.predictions(larger)))
+    return false, true
+
+
+def test_false_effects_are_refused_and_true_ones_taken(simulated_pairs):
+    false, true = simulated_pairs
+    assert [e for e in false if e.worth_it] == []
+    assert [e for e in true if not e.worth_it] == []
+    assert any(e.fall > MATERIAL for e in false)  # the bait: with coloured noise an amount alone says little
+    assert min(e.fall for e in true) > 10 * MATERIAL
