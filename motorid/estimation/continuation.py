@@ -62,7 +62,8 @@ def by_continuation(problem: Problem, effort: LevenbergMarquardt, callback: Call
                 raise
             continue
         history += found.history
-        here = found.problem.start_at(found.values)
+        if k < last:
+            here = found.problem.start_at(found.values)
     return _sharpened(replace(found, history=history), effort, callback)
 
 

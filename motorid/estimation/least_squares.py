@@ -17,7 +17,7 @@ from motorid.numerics.signals import Array
 from motorid.problem.problem import Problem
 
 LOOK = LevenbergMarquardt(max_iterations=6, ftol=1e-3, xtol=1e-4, looks=0)  # which starts are worth more?
-RACE = LevenbergMarquardt(max_iterations=60, ftol=1e-5, xtol=1e-6, looks=0)  # which start leads lowest?
+RACE = LevenbergMarquardt(max_iterations=60, ftol=1e-7, looks=0)  # which start leads lowest?
 FINISH = LevenbergMarquardt()  # to the optimum, restarted where that is in doubt
 
 ROUNDS = 4  # of a run, the sub-steps chosen again at its end
@@ -91,10 +91,10 @@ def least_squares(problem: Problem, effort: LevenbergMarquardt, callback: Callba
     return Estimate(problem, found, history)
 
 
-def start_cost(problem: Problem) -> float:
-    """Return the cost at the values of the model, at sub-steps that suit them; infinite where it has none."""
+def start_cost(problem: Problem, refine: bool = True) -> float:
+    """Return the cost at the values of the model, at sub-steps that suit them or as they are; infinite for none."""
     try:
-        r = problem.refined(problem.start).residual(problem.start)
+        r = (problem.refined(problem.start) if refine else problem).residual(problem.start)
     except SimulationError:
         return np.inf
     return 0.5 * float(r @ r) if np.isfinite(r).all() else np.inf

@@ -56,7 +56,7 @@ def _guessed(problem: Problem) -> Problem:
     if any(e.balance == "torque" for e in model.effects):
         candidates.append(_at(model, first_guess(model, runs, loaded=True)))
     problems = [problem.for_model(with_suited_effects(m, runs)) for m in candidates]
-    best = problems[0] if len(problems) == 1 else min(problems, key=start_cost)
+    best = problems[0] if len(problems) == 1 else min(problems, key=lambda p: start_cost(p, refine=False))
     asked = candidates[problems.index(best)]
     best = _along_measured_angle(best, asked)
     for effect in model.effects:
@@ -106,7 +106,7 @@ def _along_measured_angle(problem: Problem, asked: Model) -> Problem:
         return problem
     other = problem.start_at(found.values)
     if all("theta" in r.outputs for r in problem.experiments):
-        return min(other, problem, key=start_cost)
+        return min(other, problem, key=lambda p: start_cost(p, refine=False))
     # An integral drifts: where either leads decides.
     best = race([other, problem], RACE, solve=by_continuation).best
     return problem if best is None else problem.start_at(best.values)
