@@ -33,6 +33,9 @@ def diagnose_command(
     runs: Runs, options: FitOptions, validate: Validate = None,
     max_effects: Annotated[int, typer.Option(
         min=0, metavar="N", rich_help_panel=OUT, help="Add at most so many effects.")] = 3,
+    remainder_to: Annotated[Path | None, typer.Option(
+        metavar="FILE.py", rich_help_panel=OUT,
+        help="Write what no effect explains as an effect, for --effects-from.")] = None,
     json: Json = None, report: Report = None,
 ) -> None:
     """Say where the model fails, which physical effect is missing, and whether adding it holds up.
@@ -51,7 +54,23 @@ def diagnose_command(
     if json != "-":
         say_notes(notes, "About the records")
         _show_diagnosis(found)
+    if remainder_to:
+        _write_remainder(found, remainder_to)
     save_report(found, report, held_out)
+
+
+def _write_remainder(found: Diagnosis, path: Path) -> None:
+    """Write what is left as an effect to edit; never over a file that is there."""
+    assert found.remainder is not None
+    source = found.remainder.code(path.stem if path.stem.isidentifier() else "remainder")
+    try:
+        with path.open("x", encoding="utf-8") as file:
+            file.write(source)
+    except FileExistsError:
+        raise UsageError(f"'{path}' is there already; choose another name for --remainder-to.") from None
+    except OSError as error:
+        raise UsageError(f"cannot write to '{path}': {error.strerror or error}.") from None
+    show(f"Written: {path}. Fit with it: --effects-from {path} --effects {path.stem}")
 
 
 def _show_diagnosis(found: Diagnosis) -> None:

@@ -1,0 +1,28 @@
+"""`motorid diagnose --remainder-to FILE.py`: what no effect explains, as an effect for the next fit."""
+
+from __future__ import annotations
+
+from command import motorid, motorid_json
+
+from motorid.records.datasets import data_path
+
+RUNS = sorted(str(p) for p in data_path("hidden_friction").glob("run*.csv"))
+
+
+def test_what_is_left_is_written_and_fitted_again(tmp_path):
+    file = tmp_path / "left.py"
+    done = motorid("diagnose", *RUNS, "--max-effects", 0, "--remainder-to", file)
+    assert done.status == 0
+    assert "--effects left" in done.out
+    plain = motorid_json(tmp_path, "fit", *RUNS)
+    curved = motorid_json(tmp_path, "fit", *RUNS, "--effects-from", file, "--effects", "left")
+    assert curved["nrmse"]["omega"] < 0.3 * plain["nrmse"]["omega"]
+
+
+def test_a_file_that_is_there_is_not_written_over(tmp_path):
+    file = tmp_path / "left.py"
+    file.write_text("mine", encoding="utf-8")
+    done = motorid("diagnose", *RUNS, "--max-effects", 0, "--remainder-to", file)
+    assert done.status == 2
+    assert "is there already" in done.err
+    assert file.read_text(encoding="utf-8") == "mine"
