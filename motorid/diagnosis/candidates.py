@@ -15,7 +15,7 @@ import numpy as np
 
 from motorid.diagnosis.admissibility import objections
 from motorid.diagnosis.cross_validation import HeldOut
-from motorid.diagnosis.model_comparison import COMMON, Node, beats, evidence, far, node_of
+from motorid.diagnosis.model_comparison import COMMON, Node, evidence, far, node_of, superfluous
 from motorid.diagnosis.predictive_score import Evidence
 from motorid.diagnosis.refit import GivenUp, Task, lost, refit, refits, widened
 from motorid.diagnosis.results import Candidate
@@ -178,7 +178,7 @@ class Search:
             smaller = simpler if alone else [*simpler, node.fit.model.without(e.name)]
             for model in sorted(smaller, key=lambda m: len(m.free_names)):
                 other = self.smaller(node, model)
-                if other is not None and not beats(node, other):
+                if other is not None and superfluous(node, other):
                     return self.pruned(other)
         return node
 

@@ -25,7 +25,7 @@ from motorid.diagnosis.predictive_score import (
     left_out,
     stacked_labels,
 )
-from motorid.diagnosis.thresholds import TRIFLE
+from motorid.diagnosis.thresholds import SUPPLANTS, TRIFLE
 from motorid.errors import FAILURES
 from motorid.estimation.result import Fit
 from motorid.model.definition import Effect
@@ -89,7 +89,8 @@ def grades_of(last: Node, root: Node, groups: Sequence[Sequence[str]], beside: S
     """Return the grade of each effect that `last` has and `root` has not.
 
     A rung that predicts better stays, whatever it is. Its effect is *named* if its law is physical there, no rival
-    predicts as well, and no free form that contains it, or in its place, predicts better.
+    predicts as well, and no free form that contains it, or in its place, predicts far better: real motors always leave
+    something that a free curve follows.
 
     Parameters
     ----------
@@ -110,8 +111,8 @@ def grades_of(last: Node, root: Node, groups: Sequence[Sequence[str]], beside: S
         why, form = objections(last.fit, e, root.fit), None
         why = why or ("it may only stand in for the driver's current limit" if limited else "")
         if not why and structure and (smaller := without(e.name)) is not None:
-            better = next((b for b in beside if _swallows(last.fit, b.form, e)), None)
-            better = better or best_form(smaller.fit, last.predictions)
+            free = [b for b in beside if _swallows(last.fit, b.form, e)] or better_forms(smaller.fit, last.predictions)
+            better = next((b for b in free if b.evidence.fall > SUPPLANTS), None)
             if better is not None:
                 form, why = better.form, f"{better.form.text}, which the library lacks, predicts better in its place"
         kind = "approximates" if why else "group" if rivals.get(e.name) else "named"

@@ -71,6 +71,11 @@ def beats(new: Node, old: Node) -> bool:
     return evidence(old, new).worth_it
 
 
+def superfluous(node: Node, smaller: Node) -> bool:
+    """Tell whether a smaller model does as well: what is surely better on the whole stays, whatever one swing does."""
+    return not beats(node, smaller) and not evidence(smaller, node).sure
+
+
 def tied(a: Node, b: Node) -> bool:
     """Tell whether neither of two models is to be preferred."""
     return not beats(a, b) and not beats(b, a)

@@ -12,7 +12,6 @@ import motorid as mi
 from motorid.diagnosis import record_parts as parts
 from motorid.diagnosis.admissibility import objections, samples_within, unresolved
 from motorid.diagnosis.candidates import Search, library
-from motorid.diagnosis.refit import refit
 from motorid.diagnosis.score_test import score
 from motorid.effects import LIBRARY
 from motorid.estimation.angle_orders import likely_lines, spectrum
@@ -105,19 +104,6 @@ def test_an_offset_of_the_size_of_the_voltage_is_refused(rubbing):
     for share, refused in ((0.2, False), (0.4, True), (-0.4, True)):
         far = replace(fit, values={**fit.values, "V_0": share * top})
         assert ("not plausible" in objections(far, LIBRARY["voltage_offset"])) == refused
-
-
-def test_an_amplitude_without_a_phase_is_refused(rubbing):
-    fit = refit(
-        mi.fit(mi.dc_motor() + mi.effects.coulomb, rubbing),
-        mi.dc_motor() + mi.effects.coulomb + mi.effects.cogging,
-        ({"A": 1e-6, "N": 37.0, "phi": 0.0},),
-    )
-    assert fit is not None
-    column = np.array([p.name == "phi" for p in fit.problem.unknown])
-    for share, refused in ((3.0, False), (0.1, True)):  # how plainly the records show the phase
-        seen = replace(fit, jacobian=fit.jacobian * np.where(column, share, 1.0))
-        assert ("phi is not determined" in objections(seen, LIBRARY["cogging"])) is refused
 
 
 def test_a_size_at_the_limit_of_what_is_physical_is_refused(rubbing):
