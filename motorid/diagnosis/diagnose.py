@@ -82,7 +82,7 @@ def _told(found: Climb, driven: str, validated: bool, own: Sequence[Effect]) -> 
     suggestion, form = None, found.form.form if found.form else None
     if form is not None:
         remaining = following(remaining, form.text)
-    like = next((g.form for g in found.grades if g.form is not None), form)
+    like = form or next((g.form for g in found.grades if g.form is not None), None)
     if like is not None and not names:
         missing = acting_like(missing, like)
     if names:

@@ -89,8 +89,8 @@ def grades_of(last: Node, root: Node, groups: Sequence[Sequence[str]], beside: S
     """Return the grade of each effect that `last` has and `root` has not.
 
     A rung that predicts better stays, whatever it is. Its effect is *named* if its law is physical there, no rival
-    predicts as well, and no free form that contains it, or in its place, predicts far better: real motors always leave
-    something that a free curve follows.
+    predicts as well, and no free form that contains it, or in its place, predicts better by more than the trifle
+    that a free curve follows in any real motor.
 
     Parameters
     ----------
@@ -112,7 +112,8 @@ def grades_of(last: Node, root: Node, groups: Sequence[Sequence[str]], beside: S
         why = why or ("it may only stand in for the driver's current limit" if limited else "")
         if not why and structure and (smaller := without(e.name)) is not None:
             free = [b for b in beside if _swallows(last.fit, b.form, e)] or better_forms(smaller.fit, last.predictions)
-            better = next((b for b in free if b.evidence.fall > SUPPLANTS), None)
+            told = [b for b in free if b.evidence.fall > SUPPLANTS]
+            better = next((b for b in told if beside and b.form == beside[0].form), told[0] if told else None)
             if better is not None:
                 form, why = better.form, f"{better.form.text}, which the library lacks, predicts better in its place"
         kind = "approximates" if why else "group" if rivals.get(e.name) else "named"

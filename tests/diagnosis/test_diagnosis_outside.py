@@ -156,7 +156,7 @@ def test_improve_grades_its_rungs_too(lab):
     runs = runs_of(lab, {"angle_friction": {"tau_c": 8e-3, "c": 0.7}})
     ladder = mi.improve(mi.fit(mi.dc_motor(), runs[:-1]), runs[-1:], effects=FRICTION)
     assert [r.grade for r in ladder.rungs[1:]] == ["approximates"]
-    assert "a friction that changes with the angle" in ladder.rungs[1].why
+    assert "which the library lacks, predicts better in its place" in ladder.rungs[1].why
     assert ladder.best is ladder.rungs[1].fit  # what helps is not thrown away
 
 

@@ -13,6 +13,7 @@ from motorid.diagnosis import misspecification as grades
 from motorid.diagnosis import record_parts as parts
 from motorid.diagnosis import refit as trial
 from motorid.diagnosis import score_test as ranking
+from motorid.diagnosis import stepwise
 from motorid.diagnosis.admissibility import objections
 from motorid.diagnosis.verdict import measured_angle_remark
 from motorid.effects import LIBRARY
@@ -242,7 +243,8 @@ def test_a_driver_that_limits_the_current_is_no_effect_of_the_motor(monkeypatch)
     assert "the driver's current limit" in found.ladder.rungs[1].why
     # Were it not for the limit and for free forms, what then helps would have its name.
     monkeypatch.setattr(grades, "current_limit", lambda run: None)
-    monkeypatch.setattr(grades, "best_form", lambda fit, rival: None)
+    monkeypatch.setattr(grades, "better_forms", lambda fit, rival: [])
+    monkeypatch.setattr(stepwise, "better_forms", lambda fit, rival: [])
     assert mi.diagnose(fit, runs[2:], effects=tried).effects  # the bait
     free = [limited(1e9, k, volts) for k, volts in enumerate(drives[:2])]
     assert "current limit" not in mi.diagnose(mi.fit(mi.dc_motor(), free), effects=tried).text
