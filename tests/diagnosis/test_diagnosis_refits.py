@@ -190,7 +190,10 @@ def test_what_added_nothing_to_a_smaller_model_is_not_looked_at_again(lab, monke
     assert len(looked) < len(fresh)
     chi2 = larger.chi2
     for name, s in quick.items():
-        assert s.drop == exact[name].drop if name in looked else s.drop * chi2 < ranking.NOTHING, name
+        if name in looked:  # the same sum twice, but threads of the linear algebra may add it up in another order
+            assert s.drop == pytest.approx(exact[name].drop, rel=1e-6, abs=1e-9), name
+        else:
+            assert s.drop * chi2 < ranking.NOTHING, name
         assert name in looked or exact[name].drop * chi2 < 3 * ranking.NOTHING, name
 
 
