@@ -15,7 +15,7 @@ import numpy as np
 
 from motorid.diagnosis.admissibility import objections
 from motorid.diagnosis.cross_validation import HeldOut
-from motorid.diagnosis.model_comparison import COMMON, Node, evidence, far, node_of, superfluous
+from motorid.diagnosis.model_comparison import COMMON, Node, beats, evidence, far, node_of, superfluous
 from motorid.diagnosis.predictive_score import Evidence
 from motorid.diagnosis.refit import GivenUp, Task, lost, refit, refits, widened
 from motorid.diagnosis.results import Candidate
@@ -167,10 +167,11 @@ class Search:
         rest = [c for n, c in judged.items() if n not in {s.effect.name for s in scores}]
         return listed + rest
 
-    def pruned(self, node: Node) -> Node:
+    def pruned(self, node: Node, before: Node) -> Node:
         """Return `node` without the effects that have become superfluous, and with the simplest of each kind.
 
-        A later effect may have taken over what made an earlier one special: then its simple relative will do.
+        A later effect may have taken over what made an earlier one special: then its simple relative will do. What
+        is left still predicts better than the model `before`: small losses, each by chance, may add up.
         """
         for e in node.fit.problem.model.effects:
             simpler = [_in_place(node.fit.model, e, r) for r in self._relatives(node, e)]
@@ -178,8 +179,8 @@ class Search:
             smaller = simpler if alone else [*simpler, node.fit.model.without(e.name)]
             for model in sorted(smaller, key=lambda m: len(m.free_names)):
                 other = self.smaller(node, model)
-                if other is not None and superfluous(node, other):
-                    return self.pruned(other)
+                if other is not None and superfluous(node, other) and beats(other, before):
+                    return self.pruned(other, before)
         return node
 
     def _relatives(self, node: Node, effect: Effect) -> list[Effect]:

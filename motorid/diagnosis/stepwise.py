@@ -75,7 +75,7 @@ def climb(search: Search, max_effects: int, advance: Callable[[str], None]) -> C
             break
         new, ordered = chosen
         search.nodes |= children
-        best = search.pruned(new)
+        best = search.pruned(new, best)
         chosen_of = best if best.added != new.added and best.parent is new.parent else new
         group = group_of(chosen_of, ordered, {e.name: e.includes for e in search.effects})
         if new.parent is frontier[0]:

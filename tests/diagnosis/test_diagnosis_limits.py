@@ -12,6 +12,7 @@ import motorid as mi
 from motorid.diagnosis import record_parts as parts
 from motorid.diagnosis.admissibility import objections, samples_within, unresolved
 from motorid.diagnosis.candidates import Search, library
+from motorid.diagnosis.model_comparison import node_of
 from motorid.diagnosis.score_test import score
 from motorid.effects import LIBRARY
 from motorid.estimation.angle_orders import likely_lines, spectrum
@@ -92,7 +93,10 @@ def test_what_made_a_special_effect_special_may_be_taken_over(rubbing):
     """Asymmetric friction on a motor that rubs alike both ways is Coulomb's, in the same place."""
     start = mi.fit(mi.dc_motor() + mi.effects.coulomb_asymmetric + mi.effects.constant_load, rubbing)
     search = searched(start)
-    assert search.pruned(search.root).fit.model.effect_names == ("coulomb",)
+    plain = node_of(mi.fit(mi.dc_motor(), rubbing), search.held)
+    assert search.pruned(search.root, plain).fit.model.effect_names == ("coulomb",)
+    # Losses that may each be chance add up over a chain of prunings: never to less than the model before had.
+    assert search.pruned(search.root, search.root) is search.root
 
 
 # -- limits of physics -------------------------------------------------------------------------------------
