@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import sys
 from collections.abc import Iterable, Sequence
 from typing import Any
@@ -14,6 +15,7 @@ from motorid.errors import DataError, ModelError, MotoridError, UsageError
 
 DONE, FAILED, WRONG = 0, 1, 2
 MANY = ("--validate",)  # options that take all names up to the next option
+OUTPUTS = ("--json", "--report")  # options that write a file
 WIDTH = 110  # where the output is no terminal
 
 
@@ -68,12 +70,14 @@ def show(*parts: Table | str | None) -> None:
             console.print(Text(part))
             continue
         drawn = RichTable(title=part.title or None, box=box.SIMPLE_HEAD, title_justify="left",
-                          title_style="bold", caption=part.note or None, caption_justify="left")
+                          title_style="bold")
         for k, head in enumerate(part.header):
             drawn.add_column(head, justify="left" if k in part.left else "right", overflow="fold")
         for row in part.rows:
             drawn.add_row(*(Text(str(cell)) for cell in row))
         console.print(drawn)
+        if part.note:
+            console.print(Text(f"{part.note}\n"))
 
 
 def say_notes(notes: Iterable[str], title: str = "Remarks") -> None:
@@ -81,6 +85,14 @@ def say_notes(notes: Iterable[str], title: str = "Remarks") -> None:
     lines = [f"  • {note}" for note in notes]
     if lines:
         show("\n".join([title, *lines, ""]))
+
+
+def next_command(name: str) -> str:
+    """Return what to type next: this command line with another command, without what it writes."""
+    words = iter(sys.argv[2:])
+    kept = [w for w in words if not (w in OUTPUTS and next(words, None)) and w.partition("=")[0] not in OUTPUTS]
+    line = shlex.join(["motorid", name, *kept])
+    return line if kept and len(line) <= WIDTH else f"motorid {name} RUN... (the same records and options)"
 
 
 def save_report(result: Any, path: Any, held_out: Sequence[Any] = ()) -> None:

@@ -23,7 +23,6 @@ from motorid.problem.simulate import error_table
 from motorid.records.datasets import data_path
 from motorid.records.experiment import Experiment
 from motorid.records.reading import read_runs
-from motorid.uncertainty.covariance import deviations
 
 DEMO_SET = "hidden_friction"
 
@@ -80,7 +79,7 @@ def _show_diagnosis(found: Diagnosis) -> None:
     show(ranking_table(found.ranking, 8) if found.ranking else None)
     show(ladder_table(found.ladder), found.ladder.text)
     if found.after is not found.before:
-        show(comparison_table([("before", found.before), ("after", found.after)], std=deviations))
+        show(comparison_table([("before", found.before), ("after", found.after)]))
     for group in found.groups:
         show(f"These records cannot tell apart: {', '.join(group)}.")
     show(found.suggestion)
@@ -99,14 +98,14 @@ def demo_command(
     show(f"1. Records: {len(runs)} of a motor ({data_path(DEMO_SET)}), and one held out that no fit will see.\n",
          "2. The textbook model, fitted without a first guess:")
     plain = fit(dc_motor(), runs)
-    show(parameter_table(plain, std=deviations), error_table({"": plain.evaluation}, plain.noise),
+    show(parameter_table(plain), error_table({"": plain.evaluation}, plain.noise),
          "   Its errors are far above the noise: something is missing.\n", "3. What?")
     with progress("Trying the effects of the library") as advance:
         found = diagnose(plain, check, progress=lambda _: advance(1))
     show(found.missing.text, ranking_table(found.ranking, 4), found.text, "",
          "4. Added, one line of code: fit.model + mi.effects." + (found.effects or ("…",))[0],
          ladder_table(found.ladder),
-         comparison_table([("before", found.before), ("after", found.after)], std=deviations))
+         comparison_table([("before", found.before), ("after", found.after)]))
     files = _write_demo(found, check, out)
     show("Written: " + ", ".join(files), "Now your own: motorid diagnose RUN... --report yours.html")
     if json:

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
-from motorid.cli.console import FAILED, save_report, say_notes, show
+from motorid.cli.console import FAILED, next_command, save_report, say_notes, show
 from motorid.cli.options import (
     OUT,
     FitOptions,
@@ -25,7 +25,7 @@ from motorid.cli.options import (
 )
 from motorid.display.numbers import counted, duration
 from motorid.errors import DataError, UsageError, one_of
-from motorid.estimation.result import Fit, constraint_table, derived_table, parameter_table
+from motorid.estimation.result import Fit, constraint_table, ended, steady_table, value_tables
 from motorid.exporters.export import FORMS, export
 from motorid.exporters.json_file import constraint_violations, fit_dict, remarks, run_dict, write_json
 from motorid.problem.simulate import Evaluation, error_table, evaluate, run_table
@@ -33,7 +33,6 @@ from motorid.records.experiment import Experiment
 from motorid.records.layout import parse_pairs
 from motorid.records.reading import write_csv
 from motorid.uncertainty.batch import fit_many, motors_in
-from motorid.uncertainty.covariance import deviations
 from motorid.uncertainty.identifiability import Identifiability, identifiability
 from motorid.uncertainty.multistart import Multistart, multistart
 
@@ -66,19 +65,21 @@ def fit_command(
 
 def _show_fit(found: Fit, records: list[Experiment], notes: list[str], judged: Evaluation | None = None) -> None:
     """Print a fit: remarks, parameters, errors, what follows from them, and how it ended."""
-    show(f"{describe(found.problem.model)}, {_amount(records)}\n")
+    show(found.verdict, f"Held out: NRMSE {judged.words}." if judged else None,
+         None if found.fits == "noise" else f"Next: {next_command('diagnose')}",
+         f"\n{describe(found.problem.model)}, {_amount(records)}\n")
     say_notes(notes, "About the records")
-    show(parameter_table(found, std=deviations))
-    say_notes(remarks(found), "What these records cannot tell")
+    show(*value_tables(found))
+    say_notes(remarks(found), "What these records do not determine")
     several = judged is not None and len(judged.simulations) > 1
     show(error_table({"": found.evaluation, "held-out": judged}, found.noise),
          run_table(found.evaluation) if len(records) > 1 else None,
-         run_table(judged, "Held-out errors run by run") if judged and several else None, derived_table(found))
+         run_table(judged, "Held-out errors run by run") if judged and several else None,
+         steady_table(found))
     show(constraint_table(found, constraint_violations(found)))
     engine = found.problem.engine
-    message = found.message.removeprefix(f"{found.status}: ")
-    show(f"{found.status}: {message}\n{found.iterations} iterations, {duration(found.seconds)}, engine "
-         f"{engine if isinstance(engine, str) else engine.name}, formulation {found.formulation}")
+    show(f"{ended(found)} Engine "
+         f"{engine if isinstance(engine, str) else engine.name}, formulation {found.formulation}.")
 
 
 def _amount(records: list[Experiment]) -> str:

@@ -64,10 +64,9 @@ def _emptied(fit: Fit, added: Effect, before: Fit) -> str:
     """
     if added.balance != "sensor":
         return ""
-    for p in before.problem.unknown:
-        std = before.std.get(p.name) if p.positive else None
+    for p, std in zip(before.problem.unknown, before.certainty("white").std, strict=True):
         was, now = (f.values.get(p.name, 0.0) for f in (before, fit))
-        if std is not None and std < KNOWN * was and now < EMPTIED * was:
+        if p.positive and std is not None and std < KNOWN * was and now < EMPTIED * was:
             return f"{p.name} goes to nothing with it, though the data determine it without"
     return ""
 

@@ -34,7 +34,6 @@ from motorid.model.definition import Effect
 from motorid.numerics.parallel import one_thread
 from motorid.records.checks import current_limit
 from motorid.records.experiment import Experiment
-from motorid.uncertainty.covariance import deviations
 
 
 @one_thread
@@ -100,9 +99,8 @@ def _told(found: Climb, driven: str, validated: bool, own: Sequence[Effect]) -> 
         verdict, where, text = "adequate", None, adequate_text(judged, ranking)
     kind = "structure" if not remaining.adequate else "fluctuation" if far(ladder.best) else "noise"
     text = " ".join(t for t in (text, *_remarks(found, driven), suggestion) if t)
-    std = deviations(fit), deviations(ladder.best)
     return Diagnosis(verdict, text, where, names, judged, missing, ranking, ladder, groups, suggestion, fit,
-                     ladder.best, remaining, std, Remainder(kind, ladder.best, form))
+                     ladder.best, remaining, Remainder(kind, ladder.best, form))
 
 
 def _remarks(found: Climb, driven: str) -> list[str]:

@@ -9,7 +9,7 @@ from typing import Any
 from motorid.channels import UNITS, channel_name
 from motorid.diagnosis.remainder import Remainder
 from motorid.display.cards import Card, Shown
-from motorid.display.numbers import Std, number, percent, quantity
+from motorid.display.numbers import number, percent, quantity
 from motorid.display.tables import Cell, Flag, Table
 from motorid.estimation.result import Fit, parameter_table
 from motorid.numerics.signals import Array
@@ -233,8 +233,6 @@ class Diagnosis(Shown):
         Of the model after the last rung.
     remainder : Remainder or None
         What is left beside all effects: noise, fluctuation or structure, and what structure follows.
-    std : pair of dict, or None
-        One standard deviation per parameter of `before` and `after`, the residuals taken as coloured as they are.
     """
 
     verdict: str
@@ -250,17 +248,12 @@ class Diagnosis(Shown):
     before: Fit
     after: Fit
     remaining: Adequacy
-    std: tuple[Std, Std] | None = None
     remainder: Remainder | None = None
 
     @property
     def best(self) -> Fit:
         """The fit of the last rung: the model that predicts best."""
         return self.after
-
-    def std_of(self, fit: Fit) -> Std:
-        """Return the standard deviations of `before` or `after`, as the text gives them."""
-        return fit.std if self.std is None else self.std[fit is self.after]
 
     def card(self) -> Card:
         """Return the verdict, the effects tried, how the error fell and the parameters moved."""
@@ -271,7 +264,7 @@ class Diagnosis(Shown):
         tables = [ranking_table(self.ranking, 6)] if self.ranking else []
         tables.append(ladder_table(self.ladder))
         if self.after is not self.before:
-            tables.append(parameter_table(self.after, self.before, self.std_of))
+            tables.append(parameter_table(self.after, self.before))
         return Card(
             "Diagnosis",
             (Flag(self.verdict, VERDICT_MOODS[self.verdict]), *([Flag(self.where)] if self.where else [])),

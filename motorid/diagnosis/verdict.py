@@ -15,7 +15,6 @@ from motorid.effects import LIBRARY
 from motorid.estimation.result import Fit
 from motorid.model.definition import Effect
 from motorid.numerics.noise import despiked
-from motorid.uncertainty.covariance import deviations
 
 MOVED = 0.1  # relative change of a motor parameter that is worth a word
 SPIKED = 0.5  # of a channel's squared error: what outliers must make to be worth a word
@@ -93,7 +92,7 @@ def _valued(fit: Fit, effect: Effect) -> list[str]:
 def _certain(fit: Fit) -> dict[str, float | None]:
     """Return one standard deviation per parameter; None for a size that is not known even to itself."""
     sizes = {n for n, p in fit.model.parameters.items() if p.positive or p.null == 0}
-    std = deviations(fit)
+    std = fit.std
     return {n: None if n in sizes and s is not None and s > abs(fit.values[n]) else s for n, s in std.items()}
 
 

@@ -22,7 +22,7 @@ def with_error(value: float, std: float | None, unit: str = "", why: str = "not 
     ----------
     value : float
     std : float or None
-        0: held, not estimated. None (or not finite): the data do not determine it.
+        0: fixed, not estimated. None (or not finite): the data do not determine it.
     unit : str
     why : str
         Said where there is no standard deviation.
@@ -34,7 +34,7 @@ def with_error(value: float, std: float | None, unit: str = "", why: str = "not 
     >>> with_error(2.0344e-5, 1.23e-7, "kg·m²")
     '(2.034 ± 0.012)·10⁻⁵ kg·m²'
     >>> with_error(1.3, 0, "Ω")
-    '1.3 Ω (held)'
+    '1.3 Ω (fixed)'
     >>> with_error(1.3, None, "Ω")
     '1.3 Ω (not determined)'
     """
@@ -44,7 +44,7 @@ def with_error(value: float, std: float | None, unit: str = "", why: str = "not 
     if std is None or not math.isfinite(std) or std < 0:
         return f"{number(value, 3)}{tail} ({why})"
     if std == 0:
-        return f"{number(value, 6)}{tail} (held)"
+        return f"{number(value, 6)}{tail} (fixed)"
     place = _place(std)
     if 0.01 * std < abs(value) < std:  # rounded to so large an error, nothing of it would be left
         place = max(min(place, _place(abs(value))), place - 2)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from types import MappingProxyType
@@ -12,19 +12,20 @@ import numpy as np
 
 from motorid.channels import channel_name
 from motorid.display.cards import Card, Shown
-from motorid.display.numbers import Std, counted, duration, number, percent, quantity, sentence
-from motorid.display.tables import Cell, Flag, Table, value_cell
+from motorid.display.numbers import counted, duration, number, percent, quantity, sentence, with_error
+from motorid.display.tables import Cell, Flag, Table
 from motorid.errors import UsageError
+from motorid.estimation.covariance import Certainty, Quantity, certainty, combinations
 from motorid.model.model import Model
-from motorid.numerics.least_squares import gauss_newton_covariance
 from motorid.numerics.noise import despiked
 from motorid.numerics.signals import Array
 from motorid.problem.problem import Problem
 from motorid.problem.simulate import Evaluation, Simulation, at, error_table, evaluate, judge, steady_errors
 from motorid.records.experiment import Experiment, units_of
 
-STATUS_MOODS = {"converged": "good", "stalled": "note", "limit": "note", "failed": "bad"}
-UNDETERMINED = 1.0  # relative standard deviation above which a value is not shown as determined
+LOST = 1.0  # NRMSE at which zero is as near to what was measured
+COLOURED = 3.0  # times the noise from fast changes: what a correlation of 0.9 between neighbours makes of it
+FLAGS = {"noise": Flag("fits", "good"), "poor": Flag("fits poorly", "bad"), "lost": Flag("does not fit", "bad")}
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,35 +96,54 @@ class Fit(Shown):
         """Accepted steps."""
         return len(self.history) - 1
 
+    def certainty(self, method: str = "coloured") -> Certainty:
+        """Return what the data say of the unknowns; ``"white"`` takes the residuals of samples as independent."""
+        return certainty(self.problem, self.q, self.residuals, self.jacobian, self.extra.get("free"), method)
+
     @cached_property
-    def _covariance(self) -> tuple[Array, np.ndarray]:
-        # The noise was estimated beforehand; a model that does not reach it is less certain by that much.
-        r = self.residuals[:self.problem.n_outputs]
-        variance = float(r @ r) / self.dof
-        variance = max(variance, 1.0) if self.problem.weights == "noise" else variance
-        free = self.extra.get("free")  # directions that active constraints leave, (k, m)
-        if free is None:
-            return gauss_newton_covariance(self.jacobian, variance)
-        covariance, determined = gauss_newton_covariance(self.jacobian @ free, variance)
-        return free @ covariance @ free.T, ~np.any(np.abs(free[:, ~determined]) > 0, axis=1)
+    def _certainty(self) -> Certainty:
+        return self.certainty()
 
     @property
     def covariance(self) -> Array:
-        """Gauss-Newton covariance of the unknowns, physical units, white residuals assumed; see `covariance()`."""
-        return self._covariance[0]
+        """Covariance of the unknowns, physical units, along what the data determine; see `motorid.covariance`."""
+        return self._certainty.matrix
 
     @cached_property
     def std(self) -> dict[str, float | None]:
-        """One standard deviation per parameter, in its unit: 0 where held, None where the data do not determine it."""
-        covariance, determined = self._covariance
-        found: dict[str, float | None] = dict.fromkeys(self.values, 0.0)
-        at_bound = self.at_bound
-        for j, p in enumerate(self.problem.unknown):
-            if p.name in found:
-                sd = float(np.sqrt(max(covariance[j, j], 0.0)))
-                vague = p.positive and sd > UNDETERMINED * abs(self.values[p.name])
-                found[p.name] = None if not determined[j] or vague or p.name in at_bound else sd
-        return found
+        """One standard deviation per parameter, in its unit: 0 where fixed, None where the data do not determine it.
+
+        For coloured residuals: those of a model that lacks something go with the motion, and taken as white noise
+        they would make its parameters far too certain.
+        """
+        known = dict(zip((p.name for p in self.problem.unknown), self._certainty.std, strict=True))
+        return {n: known.get(n, 0.0) for n in self.values}
+
+    @cached_property
+    def determined(self) -> dict[str, Quantity]:
+        """Gain, time constants, friction as a voltage …: what the data determine even where parameters stay open."""
+        return combinations(self.problem, self.q, self._certainty)
+
+    @property
+    def fits(self) -> str:
+        """Whether the model explains the records.
+
+        ``"noise"``: no error is more than three times the noise, which colour can do; ``"poor"``: some is;
+        ``"lost"``: a channel is not followed at all, or there is no result.
+        """
+        if self.status == "failed" or any(not e < LOST for e in self.nrmse.values()):
+            return "lost"
+        return "poor" if max(self.misfit.values(), default=0.0) > COLOURED else "noise"
+
+    @property
+    def verdict(self) -> str:
+        """Whether it fits, in a sentence."""
+        times = max(self.misfit.values(), default=0.0)
+        said = {"noise": "Fits: errors at the level of the noise",
+                "poor": f"Fits poorly: errors up to {number(times, 2)} times the noise",
+                "lost": "Does not fit: a model that says zero would be nearer"}[self.fits]
+        end = "" if self.status == "converged" else f" Not converged ({self.status}): the values are no optimum."
+        return f"{said} (NRMSE {self.evaluation.words}).{end}"
 
     @cached_property
     def at_bound(self) -> set[str]:
@@ -209,23 +229,28 @@ class Fit(Shown):
         """Return how it ended, parameters, errors, and what constraints cost."""
         runs = self.problem.experiments
         vague = [n for n, s in self.std.items() if s is None]
-        flags = [Flag(self.status, STATUS_MOODS.get(self.status, "plain"))]
+        flags = [FLAGS[self.fits], *([] if self.status == "converged" else [Flag(self.status, "bad")])]
         flags += [Flag(self.formulation)] if self.formulation != "plain" else []
         flags += [Flag(f"{len(vague)} not determined", "note")] if vague else []
-        times = [f"{what} {duration(t)}" for what, t in (("τ_e", self.tau_e), ("τ_m", self.tau_m)) if t]
-        times += [f"damping {number(self.damping, 3)}"] if self.damping else []
-        steps = counted(self.iterations, "iteration")
-        head = f"{counted(len(runs), 'run')}, {self.problem.n_outputs} samples, {steps} in {duration(self.seconds)}. "
-        text = (head + ", ".join(times), "" if self.status == "converged" else sentence(self.message))
+        text = (self.verdict, f"{counted(len(runs), 'run')}, {self.problem.n_outputs} samples. {ended(self)}")
         after = [("mi.plot_fit(fit)", "see it"), ("mi.diagnose(fit)", "what is missing")]
+        after = after if self.fits == "noise" else after[::-1]
         after += [("mi.identifiability(fit)", f"why {', '.join(vague)} cannot be determined")] if vague else []
-        tables = (parameter_table(self), error_table({"": self.evaluation}, self.noise), constraint_table(self))
+        tables = (*value_tables(self), error_table({"": self.evaluation}, self.noise), constraint_table(self))
         return Card(f"Fit of {self.model.title}", flags, text, [t for t in tables if t], after)
 
     def __repr__(self) -> str:
         errors = ", ".join(f"{c} {100 * e:.2f} %" for c, e in self.nrmse.items())
         name = " + ".join([self.problem.model.base, *self.problem.model.effect_names])
-        return f"<fit {self.status}: {name}, NRMSE {errors}>"
+        end = "" if self.status == "converged" else f", {self.status}"
+        return f"<fit of {name}: {FLAGS[self.fits]}{end}, NRMSE {errors}>"
+
+
+def ended(fit: Fit) -> str:
+    """Say how the estimation ended: ``Converged in 5 iterations (97 ms).``, or why it did not."""
+    if fit.status == "converged":
+        return f"Converged in {counted(fit.iterations, 'iteration')} ({duration(fit.seconds)})."
+    return sentence(fit.message)
 
 
 @dataclass(frozen=True, repr=False)
@@ -243,44 +268,44 @@ class Failure(Shown):
         return Card("Failed run", (Flag(self.status, "bad"),), text)
 
 
-def own_std(fit: Fit) -> Std:
-    """Return a fit's own standard deviations, which take the residuals as white."""
-    return fit.std
-
-
-def parameter_table(fit: Fit, before: Fit | None = None, std: Callable[[Fit], Std] = own_std) -> Table:
-    """Return the parameters as value ± standard deviation, beside those of another fit where one is given.
-
-    Held or not determined is said in words. `std` gives other standard deviations than the fits' own.
-    """
+def parameter_table(fit: Fit, before: Fit | None = None) -> Table:
+    """Return the parameters as value ± standard deviation, beside those of another fit where one is given."""
     fits = [f for f in (before, fit) if f is not None]
-    known = [std(f) for f in fits]
-    rows = [[name, *(parameter_cell(f, name, s) for f, s in zip(fits, known, strict=True)), p.doc]
+    rows = [[name, *(parameter_cell(f, name) for f in fits), p.doc]
             for name, p in fit.model.parameters.items()]
     heads = ["value ± std"] if before is None else ["before", "after"]
     return Table(["parameter", *heads, "meaning"], rows, "Parameters", left=tuple(range(len(heads) + 2)))
 
 
-def parameter_cell(fit: Fit, name: str, std: Std) -> Cell:
-    """Return one parameter as ``1.302 ± 0.004 Ω``, or with ``(held)``, ``(chosen …)``, ``(not determined)``."""
+def parameter_cell(fit: Fit, name: str) -> Cell:
+    """Return one parameter as ``1.302 ± 0.004 Ω``, or with ``(fixed)``, ``(chosen …)``, ``(not determined)``."""
     if name not in fit.values:
         return "–"
     p = fit.model.parameters[name]
     if name == "sgn_width" and not p.given:
         return f"{quantity(fit.values[name], p.unit, 2)} (chosen from the data)"
-    return value_cell(fit.values[name], std[name] if p.vary else 0.0, p.unit)
+    if p.vary and fit.std[name] is None:
+        return Flag("not determined", "note")
+    return with_error(fit.values[name], fit.std[name] if p.vary else 0.0, p.unit)
 
 
-def derived_table(fit: Fit) -> Table | None:
-    """Return time constants, damping ratio and the error at the steady state, as far as there are any."""
+def value_tables(fit: Fit) -> list[Table]:
+    """Return the parameters and what follows from them; what is determined goes first."""
+    tables = parameter_table(fit), determined_table(fit)
+    return [t for t in (tables[::-1] if None in fit.std.values() else tables) if t is not None]
+
+
+def determined_table(fit: Fit) -> Table | None:
+    """Return gain, time constants, damping, torques as voltages, as far as the records determine them."""
+    rows = [(d.text, with_error(d.value, d.std, d.unit)) for d in fit.determined.values()]
+    return Table(("what the records determine", "value ± std"), rows, left=(0, 1)) if rows else None
+
+
+def steady_table(fit: Fit) -> Table | None:
+    """Return the error at the steady state, where the records have one."""
     units = units_of(fit.problem.experiments)
-    times = (("electrical time constant", fit.tau_e), ("mechanical time constant", fit.tau_m))
-    rows = [(name, duration(t)) for name, t in times if t is not None]
-    if fit.damping is not None:
-        rows.append(("damping ratio", number(fit.damping, 3)))
-    rows += [(f"steady-state error of the {channel_name(c, units[c])}", quantity(error, units[c], 3))
-             for c, error in fit.steady_state_error.items()]
-    return Table(("derived", "value"), rows, left=(0, 1)) if rows else None
+    rows = [(channel_name(c, units[c]), quantity(error, units[c], 3)) for c, error in fit.steady_state_error.items()]
+    return Table(("channel", "error at the steady state"), rows) if rows else None
 
 
 def constraint_table(fit: Fit, violations: Mapping[str, float] = MappingProxyType({})) -> Table | None:
@@ -353,16 +378,14 @@ def compare(fits: Sequence[Fit], validate: Sequence[Experiment] | Experiment | N
     return Comparison(tuple(fits), titles, tuple(dict(f.nrmse) for f in fits), held, parameters)
 
 
-def comparison_table(fits: Sequence[tuple[str, Fit]], held_out: Sequence[Mapping[str, float] | None] = (),
-                     std: Callable[[Fit], Std] = own_std) -> Table:
-    """Return fits side by side under their titles: NRMSE as fitted and `held_out`, parameters with their `std`."""
+def comparison_table(fits: Sequence[tuple[str, Fit]], held_out: Sequence[Mapping[str, float] | None] = ()) -> Table:
+    """Return fits side by side under their titles: NRMSE as fitted and `held_out`, parameters."""
     units = units_of(run for _, f in fits for run in f.problem.experiments)
     channels = {c: channel_name(c, units.get(c, "")) for _, f in fits for c in f.nrmse}
     rows: list[Sequence[Cell]] = [[f"NRMSE {name}", *(percent(f.nrmse.get(c)) for _, f in fits)]
                                   for c, name in channels.items()]
     if any(held_out):
         rows += [[f"held-out {name}", *(percent((e or {}).get(c)) for e in held_out)] for c, name in channels.items()]
-    known = [std(f) for _, f in fits]
     names = dict.fromkeys(n for _, f in fits for n in f.values if n != "sgn_width")
-    rows += [[n, *(parameter_cell(f, n, s) for (_, f), s in zip(fits, known, strict=True))] for n in names]
+    rows += [[n, *(parameter_cell(f, n) for _, f in fits)] for n in names]
     return Table(["quantity", *(title for title, _ in fits)], rows)

@@ -70,7 +70,7 @@ def description(found: Fit | Model) -> dict[str, Any]:
     contents["model"]["own_effects"] = _own(model)
     if isinstance(found, Fit):
         contents["covariance"] = {"unknowns": [p.name for p in found.problem.unknown],
-                                  "matrix": np.asarray(found.covariance).tolist()}
+                                  "matrix": found.covariance.tolist()}
     contents["data"] = [fingerprint(r) for r in found.problem.experiments] if isinstance(found, Fit) else []
     contents["versions"] = {"motorid": version("motorid"), "casadi": ca.__version__, "numpy": np.__version__,
                             "python": platform.python_version()}

@@ -12,7 +12,6 @@ import numpy as np
 from motorid.errors import UsageError
 from motorid.estimation.shooting.outcome import violations
 from motorid.problem.relations import Relation
-from motorid.uncertainty.covariance import deviations
 
 if TYPE_CHECKING:
     from motorid.estimation.result import Fit
@@ -24,15 +23,20 @@ MOTOR = ("R", "L", "K", "b", "J")
 def fit_dict(fit: Fit, held_out: Evaluation | None = None) -> dict[str, Any]:
     """Return the contents of ``fit --json``.
 
-    Standard deviations are those of `deviations`: null where the data do not determine the value, 0 where it was
+    Standard deviations are coloured: null where the data do not determine the value, 0 where it was
     fixed.
     """
-    model, problem, std = fit.problem.model, fit.problem, deviations(fit)
+    model, problem, std = fit.problem.model, fit.problem, fit.std
+    def known(*names: str) -> bool:
+        return all(std.get(n) is not None for n in names if n in std)
+
     engine = problem.engine if isinstance(problem.engine, str) else problem.engine.name
     return {
         "model": {"base": model.base, "axis": model.axis, "effects": list(model.effect_names)},
         "parameters": {n: {"value": fit.values[n], "std": std[n] if p.vary else 0.0, "unit": p.unit,
                            "fixed": not p.vary} for n, p in model.parameters.items()},
+        "fits": fit.fits, "verdict": fit.verdict,
+        "determined": {n: {"value": d.value, "std": d.std, "unit": d.unit} for n, d in fit.determined.items()},
         "nrmse": dict(fit.nrmse), "rmse": dict(fit.rmse),
         "validation_nrmse": dict(held_out.nrmse) if held_out else None,
         "validation_rmse": dict(held_out.rmse) if held_out else None,
@@ -40,7 +44,8 @@ def fit_dict(fit: Fit, held_out: Evaluation | None = None) -> dict[str, Any]:
         "iterations": fit.iterations, "seconds": fit.seconds, "engine": engine,
         "formulation": fit.formulation,
         "integration_error": fit.integration_error,
-        "derived": {"tau_e": fit.tau_e, "tau_m": fit.tau_m, "damping": fit.damping},
+        "derived": {"tau_e": fit.tau_e if known("R", "L") else None, "tau_m": fit.tau_m if known(*MOTOR) else None,
+                    "damping": fit.damping if known(*MOTOR) else None},
         "steady_state_error": dict(fit.steady_state_error),
         "violations": constraint_violations(fit),
         "multipliers": [{"constraint": m.name, "value": m.value, "unit": m.unit, "active": m.active}
@@ -67,7 +72,7 @@ def run_dict(run: Any) -> dict[str, Any]:
 
 def remarks(fit: Fit) -> list[str]:
     """Say in words what the numbers of a fit cannot: what is not determined, and what would determine it."""
-    model, measured, std = fit.problem.model, fit.problem.outputs, deviations(fit)
+    model, measured, std = fit.problem.model, fit.problem.outputs, fit.std
     vague = [n for n in model.free_names if std[n] is None]
     at_limit = [n for n in vague if _vanished(fit, n)]
     vague = [n for n in vague if n not in at_limit]

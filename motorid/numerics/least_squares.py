@@ -269,13 +269,22 @@ def _cost(residual: Callable[[Array], Array], q: Array) -> tuple[Array, float]:
 def gauss_newton_covariance(jac: Array, variance: float = 1.0) -> tuple[Array, np.ndarray]:
     """Return the covariance (JᵀJ)⁻¹·variance, and which coordinates the data determine.
 
-    Columns are scaled to unit length first; directions with singular values below 1e-8 of the largest are
-    left out, and a coordinate with a noticeable part in such a direction counts as not determined.
+    A coordinate with a noticeable part in a direction that is left out counts as not determined.
 
     Returns
     -------
     covariance : ndarray, shape (n, n)
     determined : ndarray of bool, shape (n,)
+    """
+    half, blind, _ = seen_directions(jac)
+    return variance * half @ half.T, np.sum(blind**2, axis=0) <= 1e-6
+
+
+def seen_directions(jac: Array) -> tuple[Array, Array, Array]:
+    """Return H (n, r) with (JᵀJ)⁻¹ = HHᵀ, the directions left out (m, n), and the columns' lengths (n,).
+
+    Columns are scaled to unit length first; directions with singular values below 1e-8 of the largest are left out,
+    and given in these units.
     """
     norms = np.sqrt(np.einsum("ij,ij->j", jac, jac))
     size = np.where(norms > 0, norms, 1.0)
@@ -283,6 +292,4 @@ def gauss_newton_covariance(jac: Array, variance: float = 1.0) -> tuple[Array, n
     _, s, vt = np.linalg.svd(triangle, full_matrices=True)
     s = np.concatenate([s, np.zeros(vt.shape[0] - len(s))])
     good = s > 1e-8 * max(s.max(initial=0.0), 1e-300)
-    half = vt[good].T / s[good] / size[:, None]
-    lost = np.sum(vt[~good] ** 2, axis=0) > 1e-6
-    return variance * half @ half.T, (norms > 0) & ~lost
+    return vt[good].T / s[good] / size[:, None], vt[~good], size

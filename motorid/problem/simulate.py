@@ -66,6 +66,12 @@ class Evaluation(Shown):
         """Quadratic mean of the channels' NRMSE."""
         return float(np.sqrt(np.mean(np.square(list(self.nrmse.values())))))
 
+    @property
+    def words(self) -> str:
+        """The NRMSE of each channel: ``current 1.68 %, speed 0.82 %``."""
+        units = units_of(s.experiment for s in self.simulations)
+        return ", ".join(f"{channel_name(c, units.get(c, ''))} {percent(e)}" for c, e in self.nrmse.items())
+
     def card(self) -> Card:
         """Return the errors over all runs and run by run."""
         return Card(f"Evaluation on {counted(len(self.simulations), 'run')}",
@@ -97,7 +103,7 @@ def error_table(evaluations: Mapping[str, Evaluation | None], noise: Mapping[str
         for e in shown.values():
             row += [quantity(e.rmse.get(c), unit, 3), percent(e.nrmse.get(c))]
         rows.append([*row, quantity(noise.get(c), unit, 2)] if noise else row)
-    return Table([*header, "noise"] if noise else header, rows, "Errors")
+    return Table([*header, "noise"] if noise else header, rows, "Errors", NRMSE)
 
 
 def run_table(evaluation: Evaluation, title: str = "Errors run by run") -> Table:
@@ -252,6 +258,7 @@ def evaluate(fit_or_model: Any, runs: Sequence[Experiment] | Experiment, **optio
     return judge(simulate(model, runs, **options))
 
 
+NRMSE = "NRMSE: RMS of the error over RMS of the measured channel."
 LEAST_FACTOR = 0.02  # a quick channel with few samples per time constant passes for noisy
 EXPLAINED = 0.25  # NRMSE above which a channel counts as poorly explained
 

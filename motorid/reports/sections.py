@@ -11,11 +11,10 @@ from motorid.diagnosis.results import Diagnosis, Ladder, ladder_table, ranking_t
 from motorid.display.cards import Shown
 from motorid.display.numbers import counted, duration, number, percent, sentence
 from motorid.display.tables import Table
-from motorid.estimation.result import Fit, parameter_table
+from motorid.estimation.result import Fit, ended, parameter_table, value_tables
 from motorid.problem.simulate import error_table, evaluate
 from motorid.records.checks import check_runs
 from motorid.records.experiment import Experiment
-from motorid.uncertainty.covariance import deviations
 
 
 @dataclass(frozen=True)
@@ -61,11 +60,10 @@ def fitted(fit: Fit, title: str, *, key: str = "fit", before: Fit | None = None)
 
     caption = "Measured, model, and what is left over beside the band of the noise."
     caption += " The thin curve is the model it began with." if before is not None else ""
-    alt = f"Measured and modelled channels of {fit.model.title}, with residuals. " + _errors_in_words(fit)
-    effort = f": {counted(fit.iterations, 'iteration')}, {duration(fit.seconds)}" if fit.seconds else ""
-    text = [f"{fit.model.title}{effort}. {sentence(fit.message)}"]
+    alt = f"Measured and modelled channels of {fit.model.title}, with residuals. " + f"NRMSE: {fit.evaluation.words}."
+    text = [f"{fit.model.title}: {fit.verdict[0].lower()}{fit.verdict[1:]} {ended(fit)}"]
     figure = _figure(key, caption, alt, plot_fit, fit, before=before)
-    tables = [parameter_table(fit, std=deviations), error_table({"": fit.evaluation}, fit.noise)]
+    tables = [*value_tables(fit), error_table({"": fit.evaluation}, fit.noise)]
     return Section(key, title, text, (), [figure], tables)
 
 
@@ -84,7 +82,7 @@ def held_out(fit: Fit, validate: Sequence[Experiment]) -> Section:
     from motorid.plots import plot_fit
 
     judged = evaluate(fit, validate)
-    alt = "Measured and modelled channels of records that the fit never saw. " + _errors_in_words(judged)
+    alt = "Measured and modelled channels of records that the fit never saw. " + f"NRMSE: {judged.words}."
     figure = _figure("held-out", "Records that the fit never saw.", alt, plot_fit, judged)
     return Section("held-out", "On records it never saw", (), (), [figure], [error_table({"": judged})])
 
@@ -127,10 +125,10 @@ def parameters(before: Fit, after: Fit) -> Section:
     """The parameters before and after."""
     from motorid.plots import plot_parameters
 
-    caption = "Bars: two standard deviations, of residuals taken as white."
+    caption = "Bars: two standard deviations."
     figure = _figure("parameters", caption, "Parameters before and after", plot_parameters, before, after, small=True)
     text = ["Without the missing effect, other parameters had compensated for it."]
-    table = parameter_table(after, before, deviations)
+    table = parameter_table(after, before)
     return Section("parameters", "How the parameters moved", text, (), [figure], [table])
 
 
@@ -168,7 +166,3 @@ def error_facts(steps: Ladder) -> list[tuple[str, str]]:
         kind, old, new = "held out", first.validation_nrmse, last.validation_nrmse
     arrow = [f"{percent(e)} → {percent(new[c])}" if last is not first else percent(e) for c, e in old.items()]
     return [(f"Error of the {NAMES[c]}, {kind}", text) for c, text in zip(old, arrow, strict=True)]
-
-
-def _errors_in_words(judged: Any) -> str:
-    return ", ".join(f"error of the {NAMES[c]} {percent(e)}" for c, e in judged.nrmse.items())

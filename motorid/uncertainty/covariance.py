@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -15,15 +15,13 @@ from motorid.display.cards import Card, Printed
 from motorid.display.numbers import interval_text, percent
 from motorid.display.tables import Cell, Flag, Table, value_cell
 from motorid.errors import UsageError, one_of
-from motorid.estimation.result import UNDETERMINED, Fit
-from motorid.numerics.autoregression import Colour, colour_of, weighed
-from motorid.numerics.least_squares import gauss_newton_covariance
+from motorid.estimation.result import Fit
+from motorid.numerics.autoregression import Colour
 from motorid.numerics.parallel import one_thread
 from motorid.numerics.signals import Array
 
 WIDE = 0.8  # of the value: an interval that reaches farther down is made on the logarithmic scale
 METHODS = ("coloured", "white")
-Blocks = Mapping[str, Sequence[tuple[Array, Array]]]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -123,11 +121,7 @@ def _correlation_cell(value: float) -> Cell:
 def covariance(fit: Fit, *, method: str = "coloured") -> Covariance:
     """Return the covariance of the unknowns of a fit, in physical units.
 
-    ``H⁻¹ M H⁻¹`` with ``H = JᵀJ`` (Gauss-Newton) and ``M`` the covariance of ``Jᵀr``: the residuals of each channel
-    are taken as stationary, with the variance they have and the autocovariance of an autoregression fitted to them,
-    so neither the assumed noise level nor its whiteness matters (sandwich: White, Econometrica 50, 1982; Newey &
-    West, Econometrica 55, 1987; here with a parametric Γ, since transients leave few samples to average over).
-    Residuals that depend on the motion, of a model that lacks something, are not noise; then it is an indication.
+    How it comes about is told in `motorid.estimation.covariance`; `Fit.std` is the square root of its diagonal.
 
     Parameters
     ----------
@@ -142,87 +136,11 @@ def covariance(fit: Fit, *, method: str = "coloured") -> Covariance:
     """
     if method not in METHODS:
         raise UsageError(one_of(method, METHODS, "method"))
-    problem = fit.problem
-    unknown = problem.unknown
-    physical = problem.scaling.physical(fit.q)
-    status = [_limit(p.lower, p.upper, v) for p, v in zip(unknown, physical, strict=True)]
-    loose = np.array([s == "" for s in status], bool)
-    blocks = channel_blocks(fit)
-    colours = _colours(blocks, int(loose.sum()), method)
-    bread, determined = gauss_newton_covariance(fit.jacobian[:, loose])
-    meat = _meat(fit, blocks, colours)[np.ix_(loose, loose)]
-    inner = bread @ meat @ bread
-    sd = np.sqrt(np.maximum(np.diag(inner), 0.0))
-    positive = np.array([p.positive for p in unknown], bool)
-    vague = np.logical_and(positive[loose], sd > UNDETERMINED * np.abs(physical[loose]))
-    known = determined & ~vague
-    inner[~known], inner[:, ~known] = np.nan, np.nan
-    matrix = np.full((len(unknown), len(unknown)), np.nan)
-    matrix[np.ix_(loose, loose)] = inner
-    settled = iter("determined" if k else "not determined" for k in known)
-    said = {p.name: s or next(settled) for p, s in zip(unknown, status, strict=True)}
-    effective = sum(_samples(parts) * colours[c].effective_share for c, parts in blocks.items())
-    dof = max(float(effective) - int(loose.sum()), 1.0)
-    return Covariance(tuple(p.name for p in unknown), physical, matrix, said, tuple(positive.tolist()),
-                      method, dof, colours, tuple(p.unit for p in unknown))
-
-
-def _limit(lower: float, upper: float, value: float) -> str:
-    if value <= lower:
-        return "at its lower limit"
-    return "at its upper limit" if value >= upper else ""
-
-
-def channel_blocks(fit: Fit) -> dict[str, list[tuple[Array, Array]]]:
-    """Return per channel and run the whitened residual (N,), NaN where missing, and its Jacobian (N, k)."""
-    problem, start = fit.problem, 0
-    blocks: dict[str, list[tuple[Array, Array]]] = {c: [] for c in problem.outputs}
-    ny = len(problem.outputs)
-    for run in problem.runs:
-        present = np.column_stack([np.isfinite(run.experiment.outputs[c]) if c in run.experiment.outputs
-                                   else np.zeros(len(run.grid.t), bool) for c in problem.outputs])
-        rows, n = np.flatnonzero(present.ravel()), present.size
-        r, jac = np.full(n, np.nan), np.zeros((n, fit.jacobian.shape[1]))
-        r[rows] = fit.residuals[start:start + len(rows)]
-        jac[rows] = fit.jacobian[start:start + len(rows)]
-        start += len(rows)
-        for j, c in enumerate(problem.outputs):
-            if c in run.sigma:
-                blocks[c].append((r[j::ny], jac[j::ny]))
-    return blocks
-
-
-def _colours(blocks: Blocks, unknowns: int, method: str) -> dict[str, Colour]:
-    found = {}
-    for c, parts in blocks.items():
-        colour = colour_of([r for r, _ in parts], unknowns / len(blocks))
-        found[c] = colour if method == "coloured" else Colour(np.zeros(0), colour.variance, colour.variance)
-    return found
-
-
-def _meat(fit: Fit, blocks: Blocks, colours: Mapping[str, Colour]) -> Array:
-    """Covariance of Jᵀr: outputs with their colour, priors as observations of variance 1, penalties fixed."""
-    k = fit.jacobian.shape[1]
-    total = np.zeros((k, k))
-    for c, parts in blocks.items():
-        for _, jac in parts:
-            total += weighed(jac, colours[c].autocovariance(len(jac)))
-    n, unknown = fit.problem.n_outputs, {p.name for p in fit.problem.unknown}
-    prior = fit.jacobian[n:n + len(unknown & set(fit.problem.priors))]
-    return total + prior.T @ prior
-
-
-def _samples(parts: Sequence[tuple[Array, Array]]) -> int:
-    return int(sum(np.isfinite(r).sum() for r, _ in parts))
-
-
-def deviations(fit: Fit) -> dict[str, float | None]:
-    """Return one standard deviation per parameter, the residuals taken as coloured as they are.
-
-    A model that lacks something leaves residuals that go with the motion; as white noise they would make its
-    parameters far too certain. True constraints carry information of their own: then it is the fit's.
-    """
-    if fit.problem.constraints or not fit.problem.unknown:
-        return dict(fit.std)
-    found = covariance(fit).std
-    return {n: None if std is None else found.get(n, std) for n, std in fit.std.items()}
+    known, unknown = fit.certainty(method), fit.problem.unknown
+    lost = np.array([s != "determined" for s in known.status], bool)
+    matrix = known.matrix.copy()
+    matrix[lost], matrix[:, lost] = np.nan, np.nan
+    names = tuple(p.name for p in unknown)
+    return Covariance(names, fit.problem.scaling.physical(fit.q), matrix, dict(zip(names, known.status, strict=True)),
+                      tuple(p.positive for p in unknown), method, known.dof, known.colours,
+                      tuple(p.unit for p in unknown))

@@ -20,7 +20,8 @@ from motorid.display.cards import Card, Printed
 from motorid.display.numbers import number, percent, quantity
 from motorid.display.tables import Flag, Table
 from motorid.errors import MotoridError, SimulationError, UsageError
-from motorid.estimation.result import UNDETERMINED, Fit
+from motorid.estimation.covariance import UNDETERMINED
+from motorid.estimation.result import Fit
 from motorid.estimation.start_values import with_start_values
 from motorid.numerics.parallel import one_thread
 from motorid.numerics.signals import Array
@@ -82,6 +83,8 @@ class Identifiability(Printed):
         Products that are determined although their factors are not, e.g. ``"R·J"``.
     remedies : tuple of str
         What to fix or to measure for full rank.
+    fitted_std : mapping of str to float or None, optional
+        Standard deviations of the fit, where there is one.
     """
 
     names: tuple[str, ...]
@@ -96,6 +99,7 @@ class Identifiability(Printed):
     weak: tuple[WeakDirection, ...]
     combinations: tuple[str, ...]
     remedies: tuple[str, ...]
+    fitted_std: Mapping[str, float | None] | None = None
 
     @property
     def rank(self) -> int:
@@ -110,7 +114,12 @@ class Identifiability(Printed):
 
     @property
     def std(self) -> dict[str, float | None]:
-        """Standard deviation that a fit with white noise would have; None where it is not determined."""
+        """One standard deviation per parameter: of the fit, else what noise alone will leave; None: not determined."""
+        return self.noise_std if self.fitted_std is None else {n: self.fitted_std[n] for n in self.names}
+
+    @property
+    def noise_std(self) -> dict[str, float | None]:
+        """Standard deviation if the model were exact and the noise white; None where it is not determined."""
         weak = self.singular_values <= LEVEL
         parts = np.where(weak, 0.0, 1.0 / np.maximum(self.singular_values, 1e-300))
         relative = np.sqrt((self.directions.T**2) @ parts**2)
@@ -150,6 +159,7 @@ class Identifiability(Printed):
                 "structural_rank": self.structural_rank, "parameters": list(self.names),
                 "weak_directions": [{"parameters": dict(w.parameters), "text": w.text} for w in self.weak],
                 "combinations": list(self.combinations), "remedies": list(self.remedies), "std": self.std,
+                "noise_std": self.noise_std,
                 "text": self.text}
 
     def card(self) -> Card:
@@ -166,7 +176,7 @@ class Identifiability(Printed):
         return Card("What the data determine", (Flag("all determined", "good") if self.full else partly,),
                     (self.text, f"Singular values {values}; condition number {number(self.condition_number, 3)}; "
                                 f"rank {self.rank} of {k}, structural rank {self.structural_rank}."),
-                    (Table(["parameter", "value", "std in a fit", "relative"], rows),),
+                    (Table(["parameter", "value", "std" if self.fitted_std else "expected std", "relative"], rows),),
                     (("mi.plot_singular_values(result)", "see it"),), "plot_singular_values")
 
 
@@ -203,7 +213,8 @@ def identifiability(problem_or_fit: Problem | Fit, *, points: int = 5, seed: int
         tuple(p.unit for p in problem.unknown[:k]), tuple(r.grid.t for r in problem.runs),
         relative_sensitivities(problem, q), s, v, _structural_rank(problem, q, points, seed), tuple(shown),
         tuple(monomials(names, weak)) if len(weak) else (),
-        tuple(suggestions(problem, q, matrix, len(weak), LEVEL)) if len(weak) else ())
+        tuple(suggestions(problem, q, matrix, len(weak), LEVEL)) if len(weak) else (),
+        problem_or_fit.std if isinstance(problem_or_fit, Fit) else None)
 
 
 def _problem_at(problem_or_fit: Problem | Fit) -> tuple[Problem, Array]:

@@ -17,7 +17,7 @@ from motorid.display.numbers import duration, number, percent, quantity, with_er
     (0.39, 12, "N·m", "0.4 ± 12.0 N·m"),
     (-1e-4, 0.2, "N", "0.00 ± 0.20 N"),
     (0.0, 0.02, "", "0.000 ± 0.020"),
-    (1.3, 0, "Ω", "1.3 Ω (held)"),
+    (1.3, 0, "Ω", "1.3 Ω (fixed)"),
     (1.3, None, "Ω", "1.3 Ω (not determined)"),
     (1.3, math.nan, "Ω", "1.3 Ω (not determined)"),
     (math.inf, 0.1, "A", "∞ A"),

@@ -42,7 +42,7 @@ def test_two_steps_determine_all_five_parameters(name, condition):
 @pytest.mark.parametrize("name", ["two_step_noisy", "two_step_small"])
 def test_promised_standard_deviations_are_those_of_the_fit(name):
     fit = mi.fit(mi.dc_motor(), records(name))
-    promised = identifiability(fit).std
+    promised = identifiability(fit).noise_std
     for parameter, sd in mi.covariance(fit, method="white").std.items():
         assert promised[parameter] == pytest.approx(sd, rel=0.1)
 

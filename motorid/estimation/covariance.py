@@ -1,0 +1,214 @@
+"""What data determine: the covariance of the unknowns for coloured residuals, and combinations of them.
+
+``H⁻¹ M H⁻¹`` with ``H = JᵀJ`` (Gauss-Newton) and ``M`` the covariance of ``Jᵀr``: the residuals of each channel
+are taken as stationary, with the variance they have and the autocovariance of an autoregression fitted to them,
+so neither the assumed noise level nor its whiteness matters (sandwich: White, Econometrica 50, 1982; Newey &
+West, Econometrica 55, 1987; here with a parametric Γ, since transients leave few samples to average over).
+Residuals that depend on the motion, of a model that lacks something, are not noise; then it is an indication.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from motorid.numerics.autoregression import Colour, colour_of, weighed
+from motorid.numerics.least_squares import seen_directions
+from motorid.numerics.signals import Array
+from motorid.problem.problem import Problem
+
+UNDETERMINED = 1.0  # relative standard deviation above which a value is not shown as determined
+BLIND = 1e-4  # share of a quantity's change along directions that the data do not determine: more, and neither is it
+Law = Callable[[Mapping[str, float]], float]
+Blocks = Mapping[str, Sequence[tuple[Array, Array]]]
+
+
+@dataclass(frozen=True, eq=False)
+class Certainty:
+    """What residuals and Jacobian say of the unknowns.
+
+    Attributes
+    ----------
+    matrix : ndarray, shape (k, k)
+        Covariance in physical units, along the directions that the data determine.
+    status : tuple of str
+        ``"determined"``, ``"not determined"``, ``"at its lower limit"`` or ``"at its upper limit"``.
+    dof : float
+        Effective degrees of freedom of the residuals.
+    colours : mapping of str to Colour
+        Per channel, of the whitened residuals.
+    blind : ndarray, shape (m, k)
+        Directions that the data do not determine, for unknowns of unit sensitivity.
+    scaling : ndarray, shape (k, k)
+        From a gradient in physical units to one for unknowns of unit sensitivity.
+    """
+
+    matrix: Array
+    status: tuple[str, ...]
+    dof: float
+    colours: Mapping[str, Colour]
+    blind: Array
+    scaling: Array
+
+    @property
+    def std(self) -> tuple[float | None, ...]:
+        """One standard deviation per unknown; None where it is not determined or at a limit."""
+        variances = np.maximum(np.diag(self.matrix), 0.0)
+        return tuple(float(np.sqrt(v)) if s == "determined" else None
+                     for s, v in zip(self.status, variances, strict=True))
+
+    def std_of(self, slope: Array) -> float | None:
+        """Return one standard deviation of a quantity with gradient `slope` (k,); None where it is not determined."""
+        scaled = self.scaling @ slope
+        if np.linalg.norm(self.blind @ scaled) > BLIND * np.linalg.norm(scaled):
+            return None
+        return float(np.sqrt(max(slope @ self.matrix @ slope, 0.0)))
+
+
+def certainty(problem: Problem, q: Array, residuals: Array, jacobian: Array, free: Array | None = None,
+              method: str = "coloured") -> Certainty:
+    """Return what `residuals` (n,) and `jacobian` (n, k) at solver coordinates `q` say of the unknowns.
+
+    `free` (k, m) are the directions that active constraints leave; ``method="white"`` takes samples as independent.
+    """
+    physical = problem.scaling.physical(q)
+    limits = [_limit(p.lower, p.upper, v) for p, v in zip(problem.unknown, physical, strict=True)]
+    loose = np.array([not s for s in limits], bool)
+    basis = np.eye(len(loose))[:, loose] if free is None else free
+    blocks = channel_blocks(problem, residuals, jacobian)
+    colours = _colours(blocks, basis.shape[1], method)
+    half, blind, size = seen_directions(jacobian @ basis)
+    slopes = basis @ half @ half.T @ basis.T
+    matrix = slopes @ _meat(problem, jacobian, blocks, colours) @ slopes
+    sd = np.sqrt(np.maximum(np.diag(matrix), 0.0))
+    lost = np.any(basis[:, np.sum(blind**2, axis=0) > 1e-6] != 0, axis=1)
+    vague = np.array([p.positive for p in problem.unknown], bool) & (sd > UNDETERMINED * np.abs(physical))
+    status = tuple(s or ("not determined" if no else "determined")
+                   for s, no in zip(limits, lost | vague, strict=True))
+    effective = sum(_samples(parts) * colours[c].effective_share for c, parts in blocks.items())
+    return Certainty(matrix, status, max(float(effective) - basis.shape[1], 1.0), colours, blind,
+                     basis.T / size[:, None])
+
+
+def _limit(lower: float, upper: float, value: float) -> str:
+    if value <= lower:
+        return "at its lower limit"
+    return "at its upper limit" if value >= upper else ""
+
+
+def channel_blocks(problem: Problem, residuals: Array, jacobian: Array) -> dict[str, list[tuple[Array, Array]]]:
+    """Return per channel and run the whitened residual (N,), NaN where missing, and its Jacobian (N, k)."""
+    start, ny = 0, len(problem.outputs)
+    blocks: dict[str, list[tuple[Array, Array]]] = {c: [] for c in problem.outputs}
+    for run in problem.runs:
+        present = np.column_stack([np.isfinite(run.experiment.outputs[c]) if c in run.experiment.outputs
+                                   else np.zeros(len(run.grid.t), bool) for c in problem.outputs])
+        rows, n = np.flatnonzero(present.ravel()), present.size
+        r, jac = np.full(n, np.nan), np.zeros((n, jacobian.shape[1]))
+        r[rows] = residuals[start:start + len(rows)]
+        jac[rows] = jacobian[start:start + len(rows)]
+        start += len(rows)
+        for j, c in enumerate(problem.outputs):
+            if c in run.sigma:
+                blocks[c].append((r[j::ny], jac[j::ny]))
+    return blocks
+
+
+def _colours(blocks: Blocks, unknowns: int, method: str) -> dict[str, Colour]:
+    found = {}
+    for c, parts in blocks.items():
+        colour = colour_of([r for r, _ in parts], unknowns / len(blocks))
+        found[c] = colour if method == "coloured" else Colour(np.zeros(0), colour.variance, colour.variance)
+    return found
+
+
+def _meat(problem: Problem, jacobian: Array, blocks: Blocks, colours: Mapping[str, Colour]) -> Array:
+    """Covariance of Jᵀr: outputs with their colour, priors as observations of variance 1, penalties fixed."""
+    k = jacobian.shape[1]
+    total = np.zeros((k, k))
+    for c, parts in blocks.items():
+        for _, jac in parts:
+            total += weighed(jac, colours[c].autocovariance(len(jac)))
+    n, unknown = problem.n_outputs, {p.name for p in problem.unknown}
+    prior = jacobian[n:n + len(unknown & set(problem.priors))]
+    return total + prior.T @ prior
+
+
+def _samples(parts: Sequence[tuple[Array, Array]]) -> int:
+    return int(sum(np.isfinite(r).sum() for r, _ in parts))
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A combination of parameters with its standard deviation; `text` is what people call it."""
+
+    value: float
+    std: float
+    unit: str
+    text: str
+
+
+def combinations(problem: Problem, q: Array, known: Certainty) -> dict[str, Quantity]:
+    """Return what engineers ask of a motor, as far as the data determine it, even where single parameters stay open."""
+    values, found = problem.values(q), {}
+    for name, (unit, text, law) in _laws(problem, values).items():
+        slope = np.array([_slope(law, values, p.name) for p in problem.unknown])
+        value, std = law(values), known.std_of(slope)
+        if std is not None and np.isfinite(value) and std < UNDETERMINED * abs(value):
+            found[name] = Quantity(value, std, unit, text)
+    return found
+
+
+def _slope(law: Law, values: Mapping[str, float], name: str) -> float:
+    h = 1e-5 * abs(values.get(name, 0.0))
+    if not h:
+        return 0.0
+    return (law({**values, name: values[name] + h}) - law({**values, name: values[name] - h})) / (2 * h)
+
+
+def _laws(problem: Problem, values: Mapping[str, float]) -> dict[str, tuple[str, str, Law]]:
+    """Return unit, words and law of the combinations that the model has.
+
+    Of ``ω/v = K/((L s + R)(J s + b) + K²)`` the gain and the poles; every torque as the voltage R·τ/K that overcomes
+    it; with dry friction alone the no-load speed.
+    """
+    model, runs, motor = problem.model, problem.experiments, problem.model.base == "dc_motor"
+    volt, linear = runs[0].units["v"], any("m" in run.units.values() for run in runs) or model.axis == "linear"
+    speed = "m/s" if linear else "rad/s"
+
+    def gain(p: Mapping[str, float]) -> float:
+        return p["K"] / (p["K"] ** 2 + p["R"] * p["b"]) if motor else p["g"] / (p["b"] or np.nan)
+
+    def times(p: Mapping[str, float]) -> tuple[float, float]:
+        """Half the sum of the time constants, and their product."""
+        if not motor:
+            return p["J"] / (p["b"] or np.nan) / 2, 0.0
+        stiff = p["K"] ** 2 + p["R"] * p["b"]
+        return (p["R"] * p["J"] + p["L"] * p["b"]) / (2 * stiff), p["L"] * p["J"] / stiff
+
+    def as_voltage(name: str) -> Law:
+        return lambda p: p[name] * (p["R"] / p["K"] if motor else 1 / p["g"])
+
+    laws: dict[str, tuple[str, str, Law]] = {"gain": (f"{speed} per {volt}", "speed per voltage, steady", gain)}
+    half, product = times(values)
+    if product <= half**2:
+        laws["time_constant"] = "s", "time constant, slow (mechanical)", lambda p: (
+            (m := times(p))[0] + np.sqrt(max(m[0] ** 2 - m[1], 0.0)))
+        if product > 0:
+            laws["time_constant_fast"] = "s", "time constant, fast (electrical)", lambda p: (
+                (m := times(p))[0] - np.sqrt(max(m[0] ** 2 - m[1], 0.0)))
+    else:
+        laws["natural_frequency"] = "rad/s", "natural frequency", lambda p: times(p)[1] ** -0.5
+    if product > 0:
+        laws["damping"] = "", "damping ratio", lambda p: times(p)[0] / np.sqrt(times(p)[1])
+    torques = [n for n, p in model.parameters.items() if p.unit in ("N·m", "N")]
+    for n in torques:
+        words = f"{model.parameters[n].doc or n} as a voltage" + (f", R·{n}/K" if motor else "")
+        laws[f"{n}_voltage"] = volt, words, as_voltage(n)
+    if model.effect_names in ((), ("coulomb",)):
+        most = max(float(np.abs(run.inputs["v"]).max()) for run in runs)
+        lost = as_voltage("tau_c") if "tau_c" in values else lambda p: 0.0
+        laws["no_load_speed"] = speed, f"no-load speed at {most:.3g} {volt}", lambda p: gain(p) * (most - lost(p))
+    return laws

@@ -1,0 +1,98 @@
+"""A fit says first whether it fits, and gives one standard deviation wherever it is asked."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from command import motorid, motorid_json
+
+import motorid as mi
+from motorid import plots
+from motorid.display.numbers import with_error
+from motorid.records.datasets import data_path, truth
+
+FRICTION = data_path("hidden_friction")
+
+
+@pytest.fixture(scope="module")
+def runs():
+    return mi.read_runs(FRICTION / "run*.csv")
+
+
+@pytest.fixture(scope="module")
+def plain(runs):
+    return mi.fit(mi.dc_motor(), runs)
+
+
+def test_the_same_fit_asked_in_six_ways_gives_one_standard_deviation(plain, tmp_path):
+    """Asked of b, whose deviation taken as white noise is ten times too small here."""
+    told = plain.std["b"]
+    shown = with_error(plain.values["b"], told, "N·m·s/rad")
+    assert told > 3 * plain.certainty("white").std[3]
+    # 1 and 2: the command line and its JSON
+    found = motorid_json(tmp_path, "fit", FRICTION / "run*.csv")
+    assert found["parameters"]["b"]["std"] == pytest.approx(told, rel=1e-3)
+    assert shown in motorid("fit", FRICTION / "run*.csv").out
+    # 3: the card, 4: the report
+    assert shown in plain.card().to_html()
+    assert shown in mi.report(plain, tmp_path / "fit.html").read_text(encoding="utf-8")
+    # 5: the covariance, and what the records can tell
+    assert mi.covariance(plain).std["b"] == pytest.approx(told)
+    assert np.sqrt(plain.covariance[3, 3]) == pytest.approx(told)
+    assert mi.identifiability(plain).to_dict()["std"]["b"] == pytest.approx(told)
+    # 6: the figure
+    (low, high) = plots.plot_parameters(plain, names=["b"])[0].collections[0].get_segments()[0]
+    assert (high[1] - low[1]) / 4 == pytest.approx(told * 1e6, rel=1e-6)
+    # and fits side by side
+    assert mi.compare([plain]).parameters["b"] == ((plain.values["b"], told),)
+    assert shown in mi.compare([plain]).card().to_html()
+
+
+def test_a_fit_that_misses_a_quarter_of_the_current_says_so_first(plain, tmp_path):
+    assert plain.status == "converged"
+    assert plain.fits == "poor"
+    assert plain.verdict.startswith("Fits poorly: errors up to 16 times the noise")
+    assert motorid("fit", FRICTION / "run*.csv").out.startswith(plain.verdict[:40])
+    found = motorid_json(tmp_path, "fit", FRICTION / "run*.csv")
+    assert (found["fits"], found["verdict"]) == ("poor", plain.verdict)
+    card = plain.card()
+    assert (card.flags[0].text, card.flags[0].mood) == ("fits poorly", "bad")
+    assert not [f for f in card.flags if f.mood == "good"]
+    assert card.text[0] == plain.verdict
+    assert "fits poorly" in repr(plain)
+
+
+def test_coloured_noise_is_no_poor_fit_and_the_missing_effect_makes_it_good(runs):
+    clean = mi.fit(mi.dc_motor(), mi.read_runs(data_path("clean") / "run*.csv"))
+    assert max(clean.misfit.values()) > 2
+    better = mi.fit(mi.dc_motor() + mi.effects.coulomb, runs)
+    for fit in (clean, better):
+        assert fit.fits == "noise"
+        assert fit.verdict.startswith("Fits: errors at the level of the noise")
+
+
+def test_a_channel_that_is_not_followed_at_all_is_lost(runs):
+    turned = [r.with_(inputs={"v": -r.inputs["v"]}) for r in runs]
+    fit = mi.fit(mi.dc_motor().fix(R=1.38, L=1.7e-3, K=0.0462, b=6.5e-5), turned)
+    assert fit.fits == "lost"
+    assert fit.verdict.startswith("Does not fit")
+
+
+def test_voltage_and_speed_alone_determine_gain_times_and_friction_in_volts(runs):
+    """They are the plant's, within what they claim, though no single parameter is determined."""
+    fit = mi.fit(mi.dc_motor() + mi.effects.coulomb, [r.without("i") for r in runs])
+    assert fit.std["R"] is None
+    hidden = truth("hidden_friction")
+    p, tau_c = hidden["parameters"], hidden["effects"]["coulomb"]["tau_c"]
+    stiff = p["K"] ** 2 + p["R"] * p["b"]
+    true = {"gain": p["K"] / stiff, "tau_c_voltage": p["R"] * tau_c / p["K"],
+            "no_load_speed": p["K"] / stiff * (2 - p["R"] * tau_c / p["K"])}
+    for name, value in true.items():
+        known = fit.determined[name]
+        assert known.value == pytest.approx(value, abs=4 * known.std), name
+        assert known.std < 0.01 * value
+    both = mi.fit(fit.model.without("coulomb"), runs)
+    assert set(fit.determined) >= {"time_constant", "damping"} <= set(both.determined)
+    assert json.dumps([d.value for d in fit.determined.values()])
