@@ -84,7 +84,7 @@ class Search:
         _, wider = self._takeable(present)
         scores = self.scores(node)
         short = _shortlist(scores, lost(node.fit))
-        tasks = [Task(node.fit, present + s.effect, s.effect, s.starts[:3], s.drop) for s in short]
+        tasks = [Task(node.fit, present + s.effect, s.effect, s.starts, s.drop) for s in short]
         tasks += [widened(node.fit, e) for e in wider]
         fits = refits(tasks, self.map)
         self.advance(f"refitted {len(fits)}")
@@ -254,8 +254,9 @@ def _unseen(score: Score) -> str:
 def _said(found: Evidence) -> str:
     """Say what an effect does for data that it was not fitted to."""
     where = "prediction error" if found.held_out_fall is None else "held-out error"
-    if found.held_out_fall is not None and found.held_out_fall < -MATERIAL:
-        return f"the held-out error rises by {-100 * found.held_out_fall:.1f} %"
+    if found.worse_there and found.held_out_fall is not None:
+        rises = f"the held-out error rises by {-100 * found.held_out_fall:.1f} %"
+        return rises if found.held_out_fall < 0 else "most of the held-out samples are predicted worse"
     if not found.sure:
         return f"predicts no better than chance would (gain {found.gain:.1f} ± {found.se:.1f})"
     if not found.worth_it:

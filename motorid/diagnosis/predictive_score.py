@@ -33,7 +33,7 @@ from motorid.diagnosis.thresholds import (
 )
 from motorid.estimation.result import Fit
 from motorid.numerics.autoregression import effective_samples
-from motorid.numerics.noise import despiked, outlier_limit
+from motorid.numerics.noise import despiked
 from motorid.numerics.signals import Array
 from motorid.problem.problem import Problem
 from motorid.problem.simulate import Simulation
@@ -111,17 +111,20 @@ class Evidence:
         else on blocks left out.
     held_out_fall : float or None
         The same on held-out runs; None without any, or where both models lose them.
+    worse_there : bool
+        Whether the new model surely predicts the held-out runs worse, by the score or by their error.
     """
 
     gain: float
     se: float
     fall: float
     held_out_fall: float | None = None
+    worse_there: bool = False
 
     @property
     def sure(self) -> bool:
         """Tell whether the difference is more than chance: `STANDARD_ERRORS` of it and at least `NATS`."""
-        return self.gain > max(STANDARD_ERRORS * self.se, NATS)
+        return _sure(self.gain, self.se)
 
     @property
     def worth_it(self) -> bool:
@@ -129,19 +132,29 @@ class Evidence:
 
         Held-out runs in which the change hardly shows decide nothing; a rise there refuses it.
         """
-        if self.held_out_fall is not None and self.held_out_fall < -MATERIAL:
-            return False
-        return self.sure and self.fall > MATERIAL
+        return self.sure and self.fall > MATERIAL and not self.worse_there
 
 
 def compare(old: Predictions, new: Predictions) -> Evidence:
     """Return what `new` predicts better than `old` on the same data."""
-    sums = [_differences(old.blocks, new.blocks, lost=False), _differences(old.held_out, new.held_out, lost=True)]
-    gain = sum(float(d.sum()) for d in sums)
-    variance = sum(len(d) * float(d.var(ddof=1)) for d in sums if len(d) > 1)
+    here, here_se = _summed(_differences(old.blocks, new.blocks, lost=False))
+    there, there_se = _summed(_differences(old.held_out, new.held_out, lost=True))
     blocks = _fall(old.blocks, new.blocks) or 0.0
     held_out = _fall(*(_kept(old.held_out, new.held_out, m) for m in (old.held_out, new.held_out)))
-    return Evidence(gain, float(np.sqrt(variance)), blocks if held_out is None else max(blocks, held_out), held_out)
+    worse = held_out is not None and (held_out < -MATERIAL or _sure(-there, there_se))
+    fall = blocks if held_out is None else max(blocks, held_out)
+    return Evidence(here + there, float(np.hypot(here_se, there_se)), fall, held_out, worse)
+
+
+def _sure(gain: float, se: float) -> bool:
+    """Tell whether a gain is more than chance."""
+    return gain > max(STANDARD_ERRORS * se, NATS)
+
+
+def _summed(differences: Array) -> tuple[float, float]:
+    """Return the sum over blocks and its standard error."""
+    n = len(differences)
+    return float(differences.sum()), float(np.sqrt(n * differences.var(ddof=1))) if n > 1 else 0.0
 
 
 def lost_channels(old: Channels, new: Channels) -> tuple[str, ...]:
@@ -155,27 +168,14 @@ def _kept(old: Channels, new: Channels, channels: Channels) -> Channels:
 
 
 def _fall(old: Channels, new: Channels) -> float | None:
-    """Return the relative fall of the error, geometric mean over channels: where lone samples are left aside, and
-    where large errors are cut, the smaller of the two.
-
-    A few large samples must neither make nor hide an effect, and an effect must not hide what it spoils in a row of
-    them.
-    """
+    """Return the relative fall of the error, lone samples left aside, geometric mean over channels."""
     both = [c for c in old if c in new]
-    if not both:
-        return None
-    limits = {c: outlier_limit(np.concatenate(old[c].values)) for c in both}
-    quiet = [np.log(_rms(new[c]) / _rms(old[c])) for c in both]
-    cut = [np.log(_rms(new[c], limits[c]) / _rms(old[c], limits[c])) for c in both]
-    return min(1 - float(np.exp(np.mean(ratios))) for ratios in (quiet, cut))
+    return 1 - float(np.exp(np.mean([np.log(_rms(new[c]) / _rms(old[c])) for c in both]))) if both else None
 
 
-def _rms(errors: Errors, limit: float | None = None) -> float:
-    """Return the RMS of errors cut at `limit`, or without one of all but lone samples."""
-    if limit is None:
-        r = np.concatenate([despiked(v) for v in errors.values])
-    else:
-        r = np.clip(np.concatenate([v[np.isfinite(v)] for v in errors.values]), -limit, limit)
+def _rms(errors: Errors) -> float:
+    """Return the RMS of errors without lone samples apart; a tenth of the noise is as good as none."""
+    r = np.concatenate([despiked(v) for v in errors.values])
     return float(np.sqrt(np.mean(r**2) + (0.1 * errors.noise) ** 2)) + 1e-300
 
 

@@ -27,7 +27,7 @@ from motorid.numerics.signals import Array
 from motorid.problem.problem import Problem
 from motorid.problem.unknowns import Point
 
-ORDERS_TRIED = 3
+ORDERS_TRIED = 8  # a race tells them apart: near friction and far from the optimum the highest line may be another
 MORE = 0.1  # that a pair must promise beyond the better of the two
 NOTHING = 6.0  # chi² that an effect takes away by the slopes of a smaller model: too little for a closer look
 
@@ -167,7 +167,7 @@ def _start(line: Line, pars: Sequence[Parameter]) -> dict[str, float]:
     }
 
 
-def _distinct(starts: list[dict[str, float]], most: int = 4) -> list[dict[str, float]]:
+def _distinct(starts: list[dict[str, float]], most: int = 3) -> list[dict[str, float]]:
     """Keep starts that differ in a shape by more than a third."""
     kept: list[dict[str, float]] = []
     for s in starts:
