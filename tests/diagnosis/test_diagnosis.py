@@ -22,7 +22,6 @@ from motorid.estimation.angle_orders import highest_order, likely_orders
 from motorid.estimation.linearisation import Tangent
 from motorid.numerics.autoregression import autocorrelation, effective_samples
 from motorid.records.experiment import Experiment
-from motorid.uncertainty.covariance import deviations
 
 FEW = ("coulomb", "brush_drop", "constant_load", "quadratic_drag", "speed_lag")
 ANGLE = ("i", "omega", "theta")
@@ -412,8 +411,9 @@ def test_text_tables_and_fit_give_the_same_errors_and_deviations(lab):
     for rung in found.ladder.rungs:
         assert rung.nrmse == pytest.approx(dict(rung.fit.nrmse), rel=1e-9)
         assert rung.validation_nrmse == pytest.approx(dict(mi.evaluate(rung.fit, runs[2:]).nrmse), rel=1e-4)
-    std = deviations(found.before)["b"]
+    std = found.before.std["b"]
     assert std is not None
-    assert std > 2 * found.before.std["b"]  # the bait
+    white = dict(zip(mi.covariance(found.before).names, found.before.certainty("white").std, strict=True))
+    assert std > 2 * white["b"]  # the bait
     assert f"b from {with_error(found.before.values['b'], std)} to" in found.text
     assert with_error(found.before.values["b"], std, "N·m·s/rad") in found._repr_html_()
