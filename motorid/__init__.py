@@ -2,13 +2,15 @@
 
 from typing import TYPE_CHECKING as _TYPE_CHECKING
 
+from motorid.errors import DataError, FitError, ModelError, MotoridError, SimulationError, UsageError
+
+# isort: split
 from motorid import effects
 from motorid.acquire.recorder import record
 from motorid.diagnosis.diagnose import diagnose
 from motorid.diagnosis.experiment_design import suggest_experiment
 from motorid.diagnosis.locate import locate
 from motorid.diagnosis.stepwise import improve
-from motorid.errors import DataError, FitError, ModelError, MotoridError, SimulationError, UsageError
 from motorid.estimation.fit import fit, solve
 from motorid.estimation.result import Failure, Fit, compare
 from motorid.estimation.shooting.formulations import compare_formulations

@@ -1,10 +1,25 @@
-"""Errors for people: every message says what was expected, what came, and what to do."""
+"""Errors for people: every message says what was expected, what came, and what to do; Ctrl-C while a command loads."""
 
 from __future__ import annotations
 
+import os
+import re
+import sys
 from collections.abc import Iterable
 
-import numpy as np
+
+def _leave(kind: type[BaseException], error: BaseException, trace: object) -> None:
+    if issubclass(kind, KeyboardInterrupt):
+        os.write(2, b"motorid: interrupted.\n")
+        os._exit(130)
+    sys.__excepthook__(kind, error, trace)  # type: ignore[arg-type]
+
+
+# As early as can be: what comes after this takes a second to load.
+if sys.argv[:1] == ["-m"] or os.path.basename("".join(sys.argv[:1])).startswith("motorid"):
+    sys.excepthook = _leave
+
+import numpy as np  # noqa: E402
 
 
 class MotoridError(Exception):
@@ -31,6 +46,10 @@ class FitError(MotoridError):
     """An estimation could not be carried out (exit status 1)."""
 
 
+class OutputError(MotoridError):
+    """The disk refuses an output, e.g. because it is full; what was there is as it was (exit status 1)."""
+
+
 class DeviceError(MotoridError):
     """A bench on a serial port does not answer, refuses, or says what cannot be (exit status 1)."""
 
@@ -41,6 +60,14 @@ class MissingDependency(MotoridError):
 
 # What may go wrong with one of many models without stopping the others.
 FAILURES = (FitError, SimulationError, ModelError, np.linalg.LinAlgError)
+
+
+_CONTROLS = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u202a-\u202e\u2066-\u2069]")
+
+
+def printable(text: str) -> str:
+    """Return `text` with control characters written out, so that no name gives orders to a terminal."""
+    return _CONTROLS.sub(lambda m: m[0].encode("unicode_escape").decode(), text)
 
 
 def one_of(word: str, known: Iterable[object], what: str) -> str:

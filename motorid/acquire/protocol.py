@@ -41,7 +41,7 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from motorid.channels import UNITS
-from motorid.errors import DeviceError
+from motorid.errors import DeviceError, printable
 
 VERSION = 1
 LONGEST = 240
@@ -231,7 +231,7 @@ class Decoder:
 def _read(body: bytes) -> Sample | Message | None:
     if not body.startswith(b"D,"):
         try:
-            return Message(body.decode("ascii").split(","))
+            return Message(printable(body.decode("ascii")).split(","))
         except UnicodeDecodeError:
             return None
     _, counter, time, *raw = body.split(b",") if body.count(b",") >= 3 else (b"", b"-", b"-")

@@ -275,12 +275,13 @@ class Recording(Shown):
     @property
     def complete(self) -> bool:
         """Whether the recording ended the way it was meant to, or by hand."""
-        return self.ended in COMPLETE
+        return self.ended in COMPLETE and self.received > 0
 
     @property
     def sentence(self) -> str:
         """Why it ended, for people."""
-        return SENTENCES[self.ended] + (f" ({self.detail})" if self.detail else "")
+        empty = "" if self.received else "Nothing was recorded: the device sent no sample. "
+        return empty + SENTENCES[self.ended] + (f" ({self.detail})" if self.detail else "")
 
     @property
     def meta(self) -> dict[str, object]:

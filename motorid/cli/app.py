@@ -7,8 +7,8 @@ from typing import Annotated
 import typer
 
 from motorid.cli import bench, diagnose, fit
-from motorid.cli.console import Command, Group
-from motorid.reports.report import package_version
+from motorid.cli.console import Command, Group, prepare_process
+from motorid.exporters.json_file import package_version
 
 app = typer.Typer(cls=Group, add_completion=False, rich_markup_mode="rich", pretty_exceptions_enable=False,
                   context_settings={"help_option_names": ["-h", "--help"]})
@@ -44,4 +44,5 @@ for _name, _command in (
 
 def main() -> None:
     """Run the command line; leaves by `SystemExit`."""
+    prepare_process()
     app()

@@ -18,7 +18,8 @@ from motorid.acquire.recorder import record
 from motorid.acquire.server import Faults, Pace, Wire, open_transport, serve
 from motorid.acquire.session import Progress
 from motorid.acquire.virtual import VirtualDevice, hide
-from motorid.cli.console import FAILED
+from motorid.cli.console import FAILED, INTERRUPTED
+from motorid.errors import printable
 
 Port = Annotated[str, typer.Option(help="Serial port of the bench: /dev/ttyACM0, COM3, socket://127.0.0.1:7000.")]
 Out = Annotated[Path, typer.Option(help="The CSV to write.")]
@@ -70,11 +71,11 @@ def record_command(port: Port, out: Out, baud: Baud = 115_200, excite: Excite = 
                              calibration=calibration, resume=resume, force=force, timeout=timeout, progress=progress)
         except KeyboardInterrupt:
             typer.echo("Stopped before anything was recorded.", err=True)
-            raise typer.Exit(FAILED) from None
-    typer.echo(str(outcome), err=not outcome.complete)
-    if not outcome.complete:
-        raise typer.Exit(FAILED)
-    typer.echo(f"Now: motorid diagnose {outcome.path}")
+            raise typer.Exit(INTERRUPTED) from None
+    typer.echo(printable(str(outcome)), err=not outcome.complete)
+    if outcome.ended == "interrupted" or not outcome.complete:
+        raise typer.Exit(INTERRUPTED if outcome.ended == "interrupted" else FAILED)
+    typer.echo(printable(f"Now: motorid diagnose {outcome.path}"))
 
 
 def _limit(value: float | None) -> float:
@@ -141,3 +142,5 @@ def bench_command(effect: HiddenEffect = "random", motor: MotorName = "lab", see
     serve(lambda: VirtualDevice(truth, rate, names), end, wire, Pace(speed, unplug_after, plug_after, once),
           lambda: bool(stopped))
     typer.echo(str(truth) if reveal else f"seed: {seed} (the same seed with --reveal tells what was hidden)")
+    if signal.SIGINT in stopped:
+        raise typer.Exit(INTERRUPTED)

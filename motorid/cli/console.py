@@ -2,18 +2,30 @@
 
 from __future__ import annotations
 
+import codecs
+import contextlib
 import shlex
 import sys
+import warnings
 from collections.abc import Iterable, Sequence
+from pathlib import Path
 from typing import Any
 
 import typer
 from typer.core import TyperCommand, TyperGroup
 
 from motorid.display.tables import Table
-from motorid.errors import DataError, ModelError, MotoridError, UsageError
+from motorid.errors import DataError, ModelError, MotoridError, UsageError, printable
+from motorid.numerics.parallel import interruption
+from motorid.records.files import check_output
+from motorid.records.reading import find_records
 
-DONE, FAILED, WRONG = 0, 1, 2
+DONE, FAILED, WRONG, INTERRUPTED = 0, 1, 2, 130
+RESULTS, INPUTS = ("json", "report", "path", "remainder_to"), ("runs", "validate", "fit_json", "effects_from")
+_ASCII = {"Ω": "Ohm", "ω": "omega", "τ": "tau", "θ": "theta", "φ": "phi", "α": "alpha", "Δ": "Delta", "µ": "u",
+          "μ": "mu", "·": "*", "×": "x", "±": "+-", "²": "^2", "°": "deg", "√": "sqrt", "…": "...", "→": "->",
+          "•": "*", "–": "-", "—": "-", "−": "-", "─": "-", "━": "-", "│": "|", "≈": "~", "≤": "<=", "≥": ">=",
+          "“": '"', "”": '"', "⁻": "^-", **dict(zip("⁰¹³⁴⁵⁶⁷⁸⁹", "013456789", strict=True))}
 MANY = ("--validate",)  # options that take all names up to the next option
 OUTPUTS = ("--json", "--report")  # options that write a file
 WIDTH = 110  # where the output is no terminal
@@ -25,6 +37,18 @@ class Command(TyperCommand):
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """See click."""
         return super().parse_args(ctx, _spread(args))
+
+    def invoke(self, ctx: Any) -> Any:
+        """Look at the outputs before the work; end it where Ctrl-C was pressed."""
+        try:
+            _check_outputs(ctx.params, ctx.info_name)
+            return super().invoke(ctx)
+        except (Exception, KeyboardInterrupt) as error:
+            if not interruption.behind(error):
+                raise
+            interruption.heard()
+            _say("interrupted before it was done; what was written before is kept.")
+            raise typer.Exit(INTERRUPTED) from None
 
 
 class Group(TyperGroup):
@@ -41,7 +65,7 @@ class Group(TyperGroup):
             status = WRONG if isinstance(error, DataError | ModelError | UsageError) else FAILED
         except typer.Abort:
             _say("stopped.")
-            status = FAILED
+            status = INTERRUPTED
         except BrokenPipeError:
             sys.stderr.close()  # nobody reads any more, e.g. `motorid fit … | head`
             status = FAILED
@@ -51,6 +75,39 @@ class Group(TyperGroup):
             _say(_usage(error))
             status = WRONG
         sys.exit(status if isinstance(status, int) else DONE)
+
+
+def prepare_process() -> None:
+    """Make a process one that answers to Ctrl-C, prints whatever a terminal can show, and warns in one line."""
+    codecs.register_error("motorid", _shown_otherwise)
+    for stream in (sys.stdout, sys.stderr):
+        if hasattr(stream, "reconfigure"):
+            stream.reconfigure(errors="motorid")  # type: ignore[union-attr]
+    warnings.formatwarning = lambda message, *_, **__: f"motorid: {message}\n"
+    interruption.listen()
+
+
+def _shown_otherwise(error: UnicodeError) -> tuple[str, int]:
+    assert isinstance(error, UnicodeEncodeError)
+    part = error.object[error.start:error.end]
+    return "".join(_ASCII.get(c) or c.encode("unicode_escape").decode() for c in part), error.end
+
+
+def _check_outputs(given: dict[str, Any], command: str) -> None:
+    """Refuse, before the work, an output that must not be written: an input, twice, or another program's file."""
+    wanted = [given[k] for k in (*RESULTS, *(["out"] if command == "fit-many" else [])) if given.get(k)]
+    targets = [check_output(path, given.get("force", False)) for path in wanted if path != "-"]
+    if len(set(targets)) < len(targets):
+        raise UsageError(f"two results cannot be written to one file, {targets[0]}.")
+    named = [n for k in INPUTS if given.get(k) for n in (given[k] if isinstance(given[k], list) else [given[k]])]
+    inputs: list[Path] = []
+    for name in named if targets and not given.get("force") else []:
+        with contextlib.suppress(MotoridError, OSError):  # said when it is read
+            inputs += find_records(name)
+    for target in targets:
+        if any(target.exists() and target.samefile(path) for path in inputs):
+            raise UsageError(f"cannot write {target}: it is read as well. Choose another name, or replace it with "
+                             "--force.")
 
 
 def show(*parts: Table | str | None) -> None:
@@ -67,17 +124,17 @@ def show(*parts: Table | str | None) -> None:
         if part is None:
             continue
         if isinstance(part, str):
-            console.print(Text(part))
+            console.print(Text(printable(part)))
             continue
         drawn = RichTable(title=part.title or None, box=box.SIMPLE_HEAD, title_justify="left",
                           title_style="bold")
         for k, head in enumerate(part.header):
             drawn.add_column(head, justify="left" if k in part.left else "right", overflow="fold")
         for row in part.rows:
-            drawn.add_row(*(Text(str(cell)) for cell in row))
+            drawn.add_row(*(Text(printable(str(cell))) for cell in row))
         console.print(drawn)
         if part.note:
-            console.print(Text(f"{part.note}\n"))
+            console.print(Text(printable(f"{part.note}\n")))
 
 
 def say_notes(notes: Iterable[str], title: str = "Remarks") -> None:
@@ -95,18 +152,18 @@ def next_command(name: str) -> str:
     return line if kept and len(line) <= WIDTH else f"motorid {name} RUN... (the same records and options)"
 
 
-def save_report(result: Any, path: Any, held_out: Sequence[Any] = ()) -> None:
+def save_report(result: Any, path: Any, held_out: Sequence[Any] = (), force: bool = False) -> None:
     """Write the page of a result, if a path was given."""
     if path is None:
         return
     from motorid.reports.report import report
 
     command = " ".join(["motorid", *sys.argv[1:]])
-    show(f"Report: {report(result, path, command=command, validate=held_out)}")
+    show(f"Report: {report(result, path, command=command, validate=held_out, force=force)}")
 
 
 def _say(text: str) -> None:
-    typer.echo(f"motorid: {' '.join(text.split())}", err=True)
+    typer.echo(f"motorid: {printable(' '.join(text.split()))}", err=True)
 
 
 def _usage(error: Any) -> str:

@@ -9,19 +9,31 @@ from typing import Annotated, Any
 import typer
 
 from motorid.cli.console import save_report, say_notes, show
-from motorid.cli.options import OUT, FitOptions, Json, Report, Runs, Validate, notes_of, own_effects, with_options
+from motorid.cli.options import (
+    OUT,
+    FitOptions,
+    Force,
+    Json,
+    Report,
+    Runs,
+    Validate,
+    make_folder,
+    notes_of,
+    own_effects,
+    with_options,
+)
 from motorid.diagnosis.diagnose import diagnose
 from motorid.diagnosis.record_parts import fit_affordably
 from motorid.diagnosis.results import Diagnosis, ladder_table, ranking_table
-from motorid.errors import UsageError
 from motorid.estimation.fit import fit
-from motorid.estimation.result import comparison_table, parameter_table
-from motorid.exporters.json_file import write_json
+from motorid.estimation.result import Fit, comparison_table, parameter_table
+from motorid.exporters.json_file import fit_dict, write_json
 from motorid.model.model import dc_motor
-from motorid.numerics.parallel import progress
+from motorid.numerics.parallel import interruption, progress
 from motorid.problem.simulate import error_table
 from motorid.records.datasets import data_path
 from motorid.records.experiment import Experiment
+from motorid.records.files import write_files
 from motorid.records.reading import read_runs
 
 DEMO_SET = "hidden_friction"
@@ -46,29 +58,40 @@ def diagnose_command(
     notes = notes_of(records, held_out)
     before = fit_affordably(records, options.fit)
     own = list(own_effects(options.effects_from).values()) if options.effects_from else []
-    with progress("Looking for what is missing") as advance:
-        found = diagnose(before, held_out or None, also=own, max_effects=max_effects, progress=lambda _: advance(1))
+    done: list[str] = []
+    try:
+        with progress("Looking for what is missing") as advance:
+            found = diagnose(before, held_out or None, also=own, max_effects=max_effects,
+                             progress=lambda word: advance(done.append(word) or 1))
+    except (Exception, KeyboardInterrupt) as error:
+        if interruption.behind(error):
+            _keep_fit(before, done, json, options.force)
+        raise
     if json:
-        write_json(found.to_dict() | {"notes": notes}, json)
+        write_json(found.to_dict() | {"notes": notes}, json, options.force)
     if json != "-":
         say_notes(notes, "About the records")
         _show_diagnosis(found)
     if remainder_to:
-        _write_remainder(found, remainder_to)
-    save_report(found, report, held_out)
+        _write_remainder(found, remainder_to, options.force)
+    save_report(found, report, held_out, options.force)
 
 
-def _write_remainder(found: Diagnosis, path: Path) -> None:
-    """Write what is left as an effect to edit; never over a file that is there."""
+def _keep_fit(before: Fit, done: Sequence[str], json: Json, force: bool) -> None:
+    """Show and write what an interrupted diagnosis began with, and how far it came."""
+    interruption.heard()
+    if json:
+        write_json(fit_dict(before) | {"interrupted": list(done)}, json, force)
+    if json != "-":
+        show(f"Interrupted after: {', '.join(done) or 'the fit'}. The model it began with:",
+             parameter_table(before))
+
+
+def _write_remainder(found: Diagnosis, path: Path, force: bool) -> None:
+    """Write what is left as an effect to edit; it may have been edited, so never over a file that is there."""
     assert found.remainder is not None
     source = found.remainder.code(path.stem if path.stem.isidentifier() else "remainder")
-    try:
-        with path.open("x", encoding="utf-8") as file:
-            file.write(source)
-    except FileExistsError:
-        raise UsageError(f"'{path}' is there already; choose another name for --remainder-to.") from None
-    except OSError as error:
-        raise UsageError(f"cannot write to '{path}': {error.strerror or error}.") from None
+    write_files({path: source}, force)
     show(f"Written: {path}. Fit with it: --effects-from {path} --effects {path.stem}")
 
 
@@ -87,13 +110,13 @@ def _show_diagnosis(found: Diagnosis) -> None:
 
 def demo_command(
     out: Annotated[Path, typer.Option(metavar="DIR", help="Where figures and report go.")] = Path("motorid-demo"),
-    json: Json = None,
+    json: Json = None, force: Force = False,
 ) -> None:
     """Show the story on shipped records: fit, see that it fails, add what is missing, see the error fall.
 
     Example: motorid demo --out demo
     """
-    _make_folder(out)
+    make_folder(out)
     runs, check = (read_runs(str(data_path(DEMO_SET) / pattern)) for pattern in ("run*.csv", "check*.csv"))
     show(f"1. Records: {len(runs)} of a motor ({data_path(DEMO_SET)}), and one held out that no fit will see.\n",
          "2. The textbook model, fitted without a first guess:")
@@ -106,28 +129,20 @@ def demo_command(
          "4. Added, one line of code: fit.model + mi.effects." + (found.effects or ("…",))[0],
          ladder_table(found.ladder),
          comparison_table([("before", found.before), ("after", found.after)]))
-    files = _write_demo(found, check, out)
+    files = _write_demo(found, check, out, force)
     show("Written: " + ", ".join(files), "Now your own: motorid diagnose RUN... --report yours.html")
     if json:
-        write_json(found.to_dict() | {"files": files}, json)
+        write_json(found.to_dict() | {"files": files}, json, force)
 
 
-def _make_folder(out: Path) -> None:
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UsageError(f"cannot write to {out}: {error.strerror or error}. Choose another folder: --out "
-                         "DIR") from None
-
-
-def _write_demo(found: Diagnosis, check: Sequence[Experiment], out: Path) -> list[str]:
+def _write_demo(found: Diagnosis, check: Sequence[Experiment], out: Path, force: bool) -> list[str]:
     """Save the report and three figures; return their paths."""
     from motorid.plots import plot_fit, plot_ladder, plot_missing
+    from motorid.plots.style import png_of
     from motorid.reports.report import report
 
     drawn: dict[str, Any] = {"fit.png": plot_fit(found.after, before=found.before).flat[0],
                              "missing.png": plot_missing(found).flat[0], "ladder.png": plot_ladder(found)}
-    for name, axes in drawn.items():
-        axes.figure.savefig(out / name, dpi=120)
-    page = report(found, out / "report.html", command=f"motorid demo --out {out}", validate=check)
-    return [str(page), *(str(out / name) for name in drawn)]
+    figures = write_files({out / name: png_of(axes, 120) for name, axes in drawn.items()}, force)
+    page = report(found, out / "report.html", command=f"motorid demo --out {out}", validate=check, force=force)
+    return [str(page), *map(str, figures)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Iterable
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
@@ -9,16 +10,18 @@ from typing import Annotated, Any
 
 import typer
 
-from motorid.cli.console import FAILED, next_command, save_report, say_notes, show
+from motorid.cli.console import FAILED, INTERRUPTED, next_command, save_report, say_notes, show
 from motorid.cli.options import (
     OUT,
     FitOptions,
+    Force,
     Json,
     ReadingOptions,
     Report,
     Runs,
     Validate,
     describe,
+    make_folder,
     notes_of,
     saved_model,
     with_options,
@@ -30,8 +33,9 @@ from motorid.exporters.export import FORMS, export
 from motorid.exporters.json_file import constraint_violations, fit_dict, remarks, run_dict, write_json
 from motorid.problem.simulate import Evaluation, error_table, evaluate, run_table
 from motorid.records.experiment import Experiment
+from motorid.records.files import write_files
 from motorid.records.layout import parse_pairs
-from motorid.records.reading import write_csv
+from motorid.records.reading import csv_text
 from motorid.uncertainty.batch import fit_many, motors_in
 from motorid.uncertainty.identifiability import Identifiability, identifiability
 from motorid.uncertainty.multistart import Multistart, multistart
@@ -55,10 +59,10 @@ def fit_command(
     found = options.fit(records, model)
     judged = evaluate(found, held_out) if held_out else None
     if json:
-        write_json(fit_dict(found, judged) | {"notes": notes}, json)
+        write_json(fit_dict(found, judged) | {"notes": notes}, json, options.force)
     if json != "-":
         _show_fit(found, records, notes, judged)
-    save_report(found, report, held_out)
+    save_report(found, report, held_out, options.force)
     if found.status == "failed":
         raise typer.Exit(FAILED)
 
@@ -112,14 +116,17 @@ def fit_many_command(
     if jobs == 1:
         found = fit_many(model, motors, **given)
     else:
-        with ProcessPoolExecutor(jobs) as pool:
+        with ProcessPoolExecutor(jobs, initializer=signal.signal, initargs=(signal.SIGINT, signal.SIG_IGN)) as pool:
             found = fit_many(model, motors, map=pool.map, **given)
+            pool.shutdown(wait=not found.interrupted, cancel_futures=True)
     if json:
-        write_json(found.to_dict(), json)
+        write_json(found.to_dict(), json, options.force)
     if json != "-":
         show(str(found))
     if out:
-        show(f"Table: {found.save(out)}")
+        show(f"Table: {found.save(out, options.force)}")
+    if found.interrupted:
+        raise typer.Exit(INTERRUPTED)
     if len(found.failed) == len(found.rows):
         raise typer.Exit(FAILED)
 
@@ -159,28 +166,26 @@ def simulate_command(
     model = saved_model(fit_json, effects_from)
     records = options.read(runs)
     judged = evaluate(model, records, engine=engine)
-    files = _write_simulations(judged, out) if out else []
+    files = _write_simulations(judged, out, options.force) if out else []
     if json:
         pairs = zip(records, judged.by_run, strict=True)
         write_json({"model": {"base": model.base, "axis": model.axis, "effects": list(model.effect_names)},
                     "nrmse": judged.nrmse, "rmse": judged.rmse, "files": files,
-                    "runs": [run_dict(r) | {"nrmse": e} for r, e in pairs]}, json)
+                    "runs": [run_dict(r) | {"nrmse": e} for r, e in pairs]}, json, options.force)
     if json != "-":
         show(f"{describe(model)}, values of {fit_json}", run_table(judged))
         show(*(f"Written: {f}" for f in files))
 
 
-def _write_simulations(judged: Evaluation, out: Path) -> list[str]:
-    files = []
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise DataError(f"cannot write to {out}: {error.strerror or error}.") from None
+def _write_simulations(judged: Evaluation, out: Path, force: bool) -> list[str]:
+    make_folder(out)
+    files: dict[Path, str] = {}
     for s in judged.simulations:
-        path = out / f"{s.experiment.name.replace('/', '_')}_simulated.csv"
+        name = s.experiment.name.replace("/", "_")
+        paths = (out / f"{name}{k}_simulated.csv" for k in ("", *(f"_{n}" for n in range(2, 10**6))))
         kept = {c: s.outputs[c] for c in s.experiment.channels if c in s.outputs}
-        files.append(str(write_csv(s.experiment.with_(outputs=kept, meta={}), path)))
-    return files
+        files[next(p for p in paths if p not in files)] = csv_text(s.experiment.with_(outputs=kept, meta={}))
+    return [str(f) for f in write_files(files, force)]
 
 
 def export_command(
@@ -188,7 +193,7 @@ def export_command(
     path: Annotated[Path, typer.Argument(metavar="PATH", help="What to write.")],
     to: Annotated[str | None, typer.Option(
         metavar="casadi|c|json", show_default=False, help="Form of the model; by default PATH's ending.")] = None,
-    effects_from: EffectsFrom = None,
+    effects_from: EffectsFrom = None, force: Force = False,
 ) -> None:
     """Take a fitted model along: as CasADi functions, as C source, as JSON.
 
@@ -196,7 +201,7 @@ def export_command(
     """
     if to is not None and to not in FORMS.values():
         raise UsageError(f"--to: {one_of(to, FORMS.values(), 'form')}")
-    show(f"Written: {export(saved_model(fit_json, effects_from), path, to)}")
+    show(f"Written: {export(saved_model(fit_json, effects_from), path, to, force=force)}")
 
 
 @with_options(FitOptions)
@@ -206,7 +211,7 @@ def identifiability_command(runs: Runs, options: FitOptions, json: Json = None, 
     Example: motorid identifiability run*.csv --effects coulomb
     """
     fitted = options.fit(options.read(runs))
-    _write_and_show(fitted, identifiability(fitted), json, report)
+    _write_and_show(fitted, identifiability(fitted), json, report, options.force)
 
 
 @with_options(FitOptions)
@@ -223,12 +228,15 @@ def robustness_command(
     Example: motorid robustness run*.csv --starts 50 --spread 10
     """
     fitted = options.fit(options.read(runs))
-    _write_and_show(fitted, multistart(fitted, starts=starts, spread=spread, seed=seed), json, report)
+    found = multistart(fitted, starts=starts, spread=spread, seed=seed)
+    _write_and_show(fitted, found, json, report, options.force)
+    if found.interrupted:
+        raise typer.Exit(INTERRUPTED)
 
 
-def _write_and_show(fitted: Fit, found: Identifiability | Multistart, json: Json, report: Report) -> None:
+def _write_and_show(fitted: Fit, found: Identifiability | Multistart, json: Json, report: Report, force: bool) -> None:
     if json:
-        write_json(found.to_dict(), json)
+        write_json(found.to_dict(), json, force)
     if json != "-":
         show(str(found))
-    save_report([fitted, found], report)
+    save_report([fitted, found], report, force=force)

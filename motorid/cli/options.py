@@ -50,6 +50,8 @@ Json = Annotated[str | None, typer.Option(
     "--json", metavar="PATH", rich_help_panel=OUT, help="Write the result as JSON; - for standard output.")]
 Report = Annotated[Path | None, typer.Option(
     "--report", metavar="PATH.html", rich_help_panel=OUT, help="Write one page with figures.")]
+Force = Annotated[bool, typer.Option(
+    "--force", rich_help_panel=OUT, help="Write over inputs and over files that motorid did not write.")]
 Validate = Annotated[list[str] | None, typer.Option(
     "--validate", metavar="RUN...", rich_help_panel=OUT,
     help="Held-out records, never fitted; put it after the records, since it takes all names that follow.")]
@@ -75,6 +77,7 @@ class ReadingOptions:
     no_spikes: Annotated[bool, _reading(
         "--no-spikes", help="Leave out single samples that stand far from both neighbours.")] = False
     ignore: Annotated[str | None, _reading(metavar="i,theta", help="Measured channels to leave out.")] = None
+    force: Force = False
 
     def read(self, paths: Sequence[str]) -> list[Experiment]:
         """Return the runs."""
@@ -226,7 +229,7 @@ def own_effects(path: Path) -> dict[str, Effect]:
     sys.modules[name] = module  # the laws are looked up there when a model goes to another process
     try:
         spec.loader.exec_module(module)
-    except Exception as error:  # whatever the user's own code raises
+    except (Exception, SystemExit) as error:  # whatever the user's own code raises
         what = f"{type(error).__name__}: {error}"
         raise UsageError(f"--effects-from: {path} cannot be run: {what}.") from None
     effects = [e for e in vars(module).values() if isinstance(e, Effect)]
@@ -264,6 +267,21 @@ def saved_model(path: Path, effects_from: Path | None = None) -> Model:
         if effects_from is not None:
             raise
         raise ModelError(f"{error} On the command line: --effects-from FILE.py") from None
+
+
+def make_folder(out: Path) -> None:
+    """Make a folder for results.
+
+    Raises
+    ------
+    UsageError
+        If that cannot be.
+    """
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UsageError(f"cannot write to {out}: {error.strerror or error}. Choose another folder: --out "
+                         "DIR") from None
 
 
 def describe(model: Model) -> str:

@@ -111,7 +111,7 @@ void {name}_step(double* x, const double* u0, const double* u1, double dt, int s
 }}
 """
 
-MAIN = r"""/* Example: walk the model over a record.
+MAIN = r"""/* Example, written by motorid: walk the model over a record.
  *
  *   cc -O2 {name}_main.c {name}.c -lm -o {name}
  *   ./{name} RECORD.csv [RUN] > out.csv
@@ -166,22 +166,20 @@ int main(int argc, char** argv) {{
 """
 
 
-def write_c(found: Fit | Model, path: Path) -> list[Path]:
-    """Write ``NAME.c``, ``NAME.h``, ``NAME_main.c``, and of a fit its records ``NAME_run0.csv`` …; return the paths.
+def c_files(found: Fit | Model, path: Path) -> dict[Path, str]:
+    """Return ``NAME.c``, ``NAME.h``, ``NAME_main.c``, and of a fit its records ``NAME_run0.csv`` …, by their paths.
 
     NAME is the stem of `path`, made a C identifier. See the header for the functions.
     """
     name = identifier(path.stem)
     folder = path.parent
     fields = _fields(found, name)
-    files = {f"{name}.h": HEADER.format_map(fields), f"{name}.c": fields["generated"] + _wrapper(fields),
-             f"{name}_main.c": MAIN.format_map(fields)}
+    files = {f"{name}.c": f"/* {fields['title']}, written by motorid */\n" + fields["generated"] + _wrapper(fields),
+             f"{name}.h": HEADER.format_map(fields), f"{name}_main.c": MAIN.format_map(fields)}
     if isinstance(found, Fit):
         for k, (run, _) in enumerate(runs_of(found)):
             files[f"{name}_run{k}.csv"] = _record(run.grid, found.problem.system.inputs)
-    for file, text in files.items():
-        (folder / file).write_text(text, encoding="utf-8")
-    return [folder / f"{name}.c", *(folder / f for f in files if f != f"{name}.c")]
+    return {folder / file: text for file, text in files.items()}
 
 
 def identifier(stem: str) -> str:

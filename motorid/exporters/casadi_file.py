@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import platform
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
 
 from motorid.channels import CHANNELS
 from motorid.errors import UsageError
 from motorid.estimation.result import Fit
-from motorid.exporters.json_file import fit_dict
-from motorid.integrate.engine import Grid
+from motorid.exporters.json_file import fit_dict, package_version
 from motorid.integrate.rodas3 import step_functions
 from motorid.model.equations import System
 from motorid.model.model import Model
@@ -26,6 +28,12 @@ from motorid.records.experiment import Experiment
 
 FORMAT = 1
 MOST_RUNS = 20  # of a fit, that travel along as whole simulations
+MOST_SCALARS = 10_000_000  # in one function or record of a file that is read
+PLAIN = "\nmotorid: the same as JSON, which CasADi does not read\n"
+UNARY, BINARY = (frozenset(f"OP_{n}" for n in names.split()) for names in (
+    "NEG EXP LOG SQRT SQ TWICE SIN COS TAN ASIN ACOS ATAN NOT FLOOR CEIL FABS SIGN ERF INV SINH COSH TANH ASINH ACOSH "
+    "ATANH ERFINV LOG1P EXPM1",
+    "ADD SUB MUL DIV POW CONSTPOW LT LE EQ NE AND OR FMOD REMAINDER COPYSIGN IF_ELSE_ZERO FMIN FMAX ATAN2 HYPOT"))
 
 
 def model_of(found: Fit | Model) -> Model:
@@ -59,8 +67,6 @@ def values_of(found: Fit | Model, system: System) -> Array:
 def description(found: Fit | Model) -> dict[str, Any]:
     """Return all that is known of the model as plain data: the contents of ``fit --json``, and what it takes to
     build it again: limits, covariance, fingerprints of the records, versions."""
-    from importlib.metadata import version
-
     model = model_of(found)
     contents: dict[str, Any] = fit_dict(found) if isinstance(found, Fit) else _model_dict(model)
     for name, p in model.parameters.items():
@@ -72,9 +78,10 @@ def description(found: Fit | Model) -> dict[str, Any]:
         contents["covariance"] = {"unknowns": [p.name for p in found.problem.unknown],
                                   "matrix": found.covariance.tolist()}
     contents["data"] = [fingerprint(r) for r in found.problem.experiments] if isinstance(found, Fit) else []
-    contents["versions"] = {"motorid": version("motorid"), "casadi": ca.__version__, "numpy": np.__version__,
+    contents["motorid"] = package_version("motorid")
+    contents["versions"] = {"motorid": contents["motorid"], "casadi": ca.__version__, "numpy": np.__version__,
                             "python": platform.python_version()}
-    contents["export"] = FORMAT
+    contents |= {"export": FORMAT, "order": list(system_of(found).parameters)}
     return contents
 
 
@@ -114,20 +121,103 @@ def functions_of(found: Fit | Model) -> list[ca.Function]:
     p = values_of(found, system)
     light = step_functions(system).light
     args = light.sx_in()
-    step = ca.Function("step", args, light.call(args), light.name_in(), light.name_out())
+    step = ca.Function("step", args, [ca.densify(r) for r in light.call(args)], light.name_in(), light.name_out())
     functions = [_named(system.rhs, "rhs"), _named(system.out, "outputs"), _named(system.initial, "initial"), step,
                  ca.Function("parameters", [], [ca.DM(p)], [], ["p"])]
-    if isinstance(found, Fit):
-        for k, (run, start) in enumerate(runs_of(found)[:MOST_RUNS]):
-            functions.append(ca.Function(f"record_{k}", [], [ca.DM(run.grid.t).T, ca.DM(start), ca.DM(run.grid.u.T)],
-                                         [], ["t", "s", "u"]))
-            functions.append(simulation(f"simulate_{k}", system, step, run))
-    return functions
+    return [*functions, *_simulations({f.name(): f for f in functions}, _records(found))]
+
+
+def casadi_file(found: Fit | Model, path: Path) -> dict[Path, str]:
+    """Return the contents of a ``.casadi`` file: for CasADi its functions and a text; for `read_casadi`, which runs
+    nothing, the same as JSON."""
+    functions, about = functions_of(found), description(found)
+    file = ca.StringSerializer({})
+    file.pack(functions)
+    file.pack(json.dumps(about))
+    plain = {"functions": [_instructions(f) for f in functions[:4]], "records": _records(found)}
+    return {path: f"{file.encode()}{PLAIN}{json.dumps({**plain, **about})}\n"}
+
+
+def read_casadi(data: bytes) -> tuple[dict[str, ca.Function], dict[str, Any]]:
+    """Return functions and description from the JSON in a ``.casadi`` file; CasADi's own part is not looked at.
+
+    Raises
+    ------
+    ValueError, KeyError, TypeError, IndexError, AttributeError, RuntimeError, RecursionError
+        If it holds no such JSON, or nonsense.
+    """
+    _, found, text = data.rpartition(PLAIN.encode())
+    if not found:
+        raise KeyError("JSON")
+    about = json.loads(text)
+    functions = {f.name(): f for f in map(_rebuilt, about.pop("functions"))}
+    p = [about["parameters"][n]["value"] for n in about["order"]]
+    functions["parameters"] = ca.Function("parameters", [], [ca.DM(p)], [], ["p"])
+    return functions | {f.name(): f for f in _simulations(functions, about.pop("records"))}, about
+
+
+def _records(found: Fit | Model) -> list[dict[str, Any]]:
+    """Return the records of a fit as plain data: samples, start, inputs (nu, N), sub-steps."""
+    if not isinstance(found, Fit):
+        return []
+    return [{"t": run.grid.t.tolist(), "s": start.tolist(), "u": run.grid.u.T.tolist(),
+             "substeps": run.grid.substeps.tolist(), "held": zoh_inputs(found.problem.system.inputs, run.experiment)}
+            for run, start in runs_of(found)[:MOST_RUNS]]
+
+
+def _instructions(f: ca.Function) -> dict[str, Any]:
+    """Return a function of scalars as plain data: shapes, and its elementary operations in their order."""
+    names = {getattr(ca, n): n for n in dir(ca) if n.startswith("OP_")}
+    code = [[names[op], f.instruction_constant(k) if op == ca.OP_CONST else None, f.instruction_input(k),
+             f.instruction_output(k)] for k in range(f.n_instructions()) for op in [f.instruction_id(k)]]
+    return {"name": f.name(), "code": code, "size": f.sz_w(),
+            "in": [[f.name_in(k), f.size1_in(k)] for k in range(f.n_in())],
+            "out": [[f.name_out(k), f.size1_out(k)] for k in range(f.n_out())]}
+
+
+def _rebuilt(told: Mapping[str, Any]) -> ca.Function:
+    """Return the function that `_instructions` told; of the operations only arithmetic is known."""
+    args = [ca.SX.sym(name, _bounded(n)) for name, n in told["in"]]
+    results = [[ca.SX(0.0)] * _bounded(n) for _, n in told["out"]]
+    work: list[Any] = [None] * _bounded(told["size"])
+    for name, constant, given, to in told["code"]:
+        if name == "OP_OUTPUT":
+            results[to[0]][to[1]] = work[given[0]]
+        elif name == "OP_INPUT":
+            work[to[0]] = args[given[0]][given[1]]
+        elif name == "OP_CONST":
+            work[to[0]] = ca.SX(float(constant))
+        elif name in UNARY and len(given) == 1:
+            work[to[0]] = ca.SX.unary(getattr(ca, name), work[given[0]])
+        elif name in BINARY and len(given) == 2:
+            work[to[0]] = ca.SX.binary(getattr(ca, name), work[given[0]], work[given[1]])
+        else:
+            raise ValueError(f"operation {name}")
+    return ca.Function(told["name"], args, [ca.vertcat(*r) for r in results], [n for n, _ in told["in"]],
+                       [n for n, _ in told["out"]])
+
+
+def _bounded(size: int) -> int:
+    if not 0 <= size <= MOST_SCALARS:
+        raise ValueError(f"{size} numbers")
+    return size
+
+
+def _simulations(functions: Mapping[str, ca.Function], records: Sequence[Mapping[str, Any]]) -> list[ca.Function]:
+    """Return ``record_k`` and ``simulate_k`` for each of the records."""
+    found = []
+    for k, r in enumerate(records):
+        t, u, m = np.array(r["t"], float), np.array(r["u"], float), np.array(r["substeps"], np.int64)
+        if m.min() < 1 or m.sum() > MOST_SCALARS or (len(t), len(m)) != (u.shape[1], len(t) - 1):
+            raise ValueError(f"record {k}")
+        found += [ca.Function(f"record_{k}", [], [ca.DM(t).T, ca.DM(r["s"]), ca.DM(u)], [], ["t", "s", "u"]),
+                  _simulation(f"simulate_{k}", functions, t, m, r["held"])]
+    return found
 
 
 def _named(f: ca.Function, name: str) -> ca.Function:
     args = f.sx_in()
-    return ca.Function(name, args, f.call(args), f.name_in(), f.name_out())
+    return ca.Function(name, args, [ca.densify(r) for r in f.call(args)], f.name_in(), f.name_out())
 
 
 def runs_of(fit: Fit) -> list[tuple[Run, Array]]:
@@ -145,27 +235,26 @@ def runs_of(fit: Fit) -> list[tuple[Run, Array]]:
     return found
 
 
-def simulation(name: str, system: System, step: ca.Function, run: Run) -> ca.Function:
-    """Return ``(s, u, p) -> (y, x)`` on the samples and sub-steps of `run`: s (3,), u (nu, N), y (ny, N)."""
-    _, nu, np_, _ = system.sizes
-    grid: Grid = run.grid
-    m = grid.substeps
+def _simulation(name: str, functions: Mapping[str, ca.Function], t: Array, m: NDArray[np.int64],
+                held: Sequence[bool]) -> ca.Function:
+    """Return ``(s, u, p) -> (y, x)`` on the samples t (N,) and sub-steps m (N-1,): s (3,), u (nu, N), y (ny, N)."""
+    initial, outputs, step = (functions[n] for n in ("initial", "outputs", "step"))
+    nu, np_ = step.size1_in(1), step.size1_in(4)
     interval = np.repeat(np.arange(len(m)), m)
     first = np.concatenate([[0], np.cumsum(m)])
     part = np.arange(len(interval)) - first[:-1][interval]
     share = 1.0 / m[interval]
-    held = zoh_inputs(system.inputs, run.experiment)
-    s, u, p = ca.MX.sym("s", 3), ca.MX.sym("u", nu, len(grid.t)), ca.MX.sym("p", np_)
+    s, u, p = ca.MX.sym("s", 3), ca.MX.sym("u", nu, len(t)), ca.MX.sym("p", np_)
     before = u[:, interval.tolist()]
     after = ca.vertcat(*[u[j, (interval if hold else interval + 1).tolist()] for j, hold in enumerate(held)])
     slope = after - before
     u0 = before + slope * ca.repmat(ca.DM(part * share).T, nu, 1)
     u1 = u0 + slope * ca.repmat(ca.DM(share).T, nu, 1)
-    h = ca.DM(grid.dt[interval] * share).T
-    x0 = system.initial(s, p)
+    h = ca.DM(np.diff(t)[interval] * share).T
+    x0 = initial(s, p)
     walked = step.mapaccum("walk", len(interval), 1)(x0, u0, u1, h, ca.repmat(p, 1, len(interval)))[0]
     x = ca.horzcat(x0, walked[:, (first[1:] - 1).tolist()])
-    y = system.out.map(len(grid.t))(x, u, ca.repmat(p, 1, len(grid.t)))
+    y = outputs.map(len(t))(x, u, ca.repmat(p, 1, len(t)))
     return ca.Function(name, [s, u, p], [y, x], ["s", "u", "p"], ["y", "x"])
 
 

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
-import tempfile
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,10 +16,13 @@ import numpy as np
 from motorid.effects import LIBRARY
 from motorid.errors import DataError, ModelError, UsageError, one_of
 from motorid.estimation.result import Fit
-from motorid.exporters.casadi_file import description, functions_of, model_of
+from motorid.exporters.c_code import c_files
+from motorid.exporters.casadi_file import casadi_file, description, model_of, read_casadi
+from motorid.exporters.json_file import json_text
 from motorid.model.definition import Effect
 from motorid.model.model import Model, dc_motor, torque_driven
 from motorid.numerics.signals import Array
+from motorid.records.files import read_bytes, write_files
 
 FORMS = {".casadi": "casadi", ".c": "c", ".json": "json"}
 NO_FMU = ("an FMU is not offered: those that CasADi 3.8.2 writes do not pass FMPy's checker (names of variables, "
@@ -64,7 +67,8 @@ class Exported:
         return np.asarray(found["y"]).T
 
 
-def export(found: Fit | Model | Exported, path: str | os.PathLike[str], to: str | None = None) -> Path:
+def export(found: Fit | Model | Exported, path: str | os.PathLike[str], to: str | None = None, *,
+           force: bool = False) -> Path:
     """Write a fitted model in a form that works without motorid.
 
     Parameters
@@ -76,6 +80,8 @@ def export(found: Fit | Model | Exported, path: str | os.PathLike[str], to: str 
         the records ``motor_run0.csv`` … beside it.
     to : {"casadi", "c", "json"}, optional
         Default: by the ending of `path`.
+    force : bool
+        Also over files that motorid did not write.
 
     Returns
     -------
@@ -93,9 +99,9 @@ def export(found: Fit | Model | Exported, path: str | os.PathLike[str], to: str 
     Raises
     ------
     UsageError
-        If the form is not known.
-    DataError
-        If the file cannot be written.
+        If the form is not known, or a file must not be written there.
+    OutputError
+        If the disk refuses.
     """
     target = Path(path).expanduser()
     form = to or FORMS.get(target.suffix.lower())
@@ -104,54 +110,26 @@ def export(found: Fit | Model | Exported, path: str | os.PathLike[str], to: str 
     if form is None:
         raise UsageError(f"what to write is not clear from '{target.name}': end it with {', '.join(FORMS)}, or say "
                          "to='casadi'.")
-    if form not in _WRITERS:
-        raise UsageError(one_of(form, _WRITERS, "form"))
+    if form not in _CONTENTS:
+        raise UsageError(one_of(form, _CONTENTS, "form"))
     if isinstance(found, Exported):
         found = found.model
     model_of(found)
-    try:
+    with contextlib.suppress(OSError):  # said when it is written
         target.parent.mkdir(parents=True, exist_ok=True)
-        return _WRITERS[form](found, target)
-    except OSError as error:
-        raise DataError(f"cannot write {target}: {error.strerror or error}.") from None
+    return write_files(_CONTENTS[form](found, target), force)[0]
 
 
-def _write_json(found: Fit | Model, path: Path) -> Path:
-    _whole(path, json.dumps(description(found), indent=1, ensure_ascii=False, allow_nan=False) + "\n")
-    return path
+def _json_file(found: Fit | Model, path: Path) -> dict[Path, str]:
+    return {path: json_text(description(found))}
 
 
-def _write_casadi(found: Fit | Model, path: Path) -> Path:
-    about = json.dumps(description(found), ensure_ascii=True)
-    with tempfile.TemporaryDirectory(dir=path.parent) as folder:
-        written = Path(folder) / "functions"
-        file = ca.FileSerializer(str(written), {})
-        file.pack(functions_of(found))
-        file.pack(about)
-        del file  # closes it
-        os.replace(written, path)
-    return path
+_CONTENTS: Mapping[str, Callable[[Fit | Model, Path], Mapping[Path, Any]]] = {
+    "casadi": casadi_file, "c": c_files, "json": _json_file}
 
 
-def _write_c(found: Fit | Model, path: Path) -> Path:
-    from motorid.exporters.c_code import write_c
-
-    return write_c(found, path)[0]
-
-
-_WRITERS = {"casadi": _write_casadi, "c": _write_c, "json": _write_json}
-
-
-def _whole(path: Path, text: str) -> None:
-    """Write all or nothing."""
-    with tempfile.TemporaryDirectory(dir=path.parent) as folder:
-        written = Path(folder) / path.name
-        written.write_text(text, encoding="utf-8")
-        os.replace(written, path)
-
-
-def load(path: str | os.PathLike[str], effects: Iterable[Effect] = ()) -> Model | Exported:
-    """Read back what `export` wrote.
+def load(path: str | os.PathLike[str], effects: Iterable[Effect] = (), *, trust: bool = False) -> Model | Exported:
+    """Read back what `export` wrote. Nothing in the file is run.
 
     Parameters
     ----------
@@ -159,6 +137,10 @@ def load(path: str | os.PathLike[str], effects: Iterable[Effect] = ()) -> Model 
         JSON gives the `Model` at its values, a ``.casadi`` file an `Exported`.
     effects : sequence of Effect, optional
         Effects of your own that the model uses.
+    trust : bool
+        Also take functions as CasADi serialized them (files that CasADi or an older motorid wrote). CasADi may then run
+        commands or load libraries that the file names: only for files whose origin you know. Without it only
+        arithmetic is built, from the JSON that `export` puts into a ``.casadi`` file.
 
     Raises
     ------
@@ -170,32 +152,24 @@ def load(path: str | os.PathLike[str], effects: Iterable[Effect] = ()) -> Model 
     source = Path(path).expanduser()
     if source.suffix.lower() in (".c", ".h"):
         raise UsageError(f"{source.name} goes to other programs; load reads .json and .casadi files.")
+    data = read_bytes(source)
+    if data[:1] == b"{":
+        try:
+            contents = json.loads(data)
+        except (ValueError, RecursionError) as error:
+            raise DataError(f"{source.name} is not JSON: {error}.") from None
+        return model_from_json(contents, effects)
     try:
-        with source.open("rb") as file:
-            head = file.read(1)
-    except OSError as error:
-        raise DataError(f"cannot read {source}: {error.strerror or error}.") from None
-    return _read_json(source, effects) if head == b"{" else _read_casadi(source)
+        return Exported(*(_serialized(source) if trust else read_casadi(data)))
+    except (RuntimeError, ValueError, TypeError, AttributeError, LookupError):  # RecursionError is a RuntimeError
+        raise DataError(f"cannot read {source.name}: {NOT_OURS}, or an older version did. If you know where it comes "
+                        "from, mi.load(path, trust=True) lets CasADi read it, and run what it holds.") from None
 
 
-def _read_json(source: Path, effects: Iterable[Effect]) -> Model:
-    try:
-        contents = json.loads(source.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise DataError(f"{source.name} is not JSON: {error}.") from None
-    return model_from_json(contents, effects)
-
-
-def _read_casadi(source: Path) -> Exported:
-    try:
-        file = ca.FileDeserializer(str(source))
-        functions = file.unpack()
-        about = json.loads(file.unpack())
-        named = {f.name(): f for f in functions}
-    except (RuntimeError, ValueError, TypeError, AttributeError):
-        raise DataError(f"cannot read {source.name}: {NOT_OURS}, or a version of CasADi older than the one that "
-                        "wrote it reads it.") from None
-    return Exported(named, about)
+def _serialized(source: Path) -> tuple[dict[str, ca.Function], dict[str, Any]]:
+    file = ca.FileDeserializer(str(source))
+    functions = file.unpack()
+    return {f.name(): f for f in functions}, json.loads(file.unpack())
 
 
 def model_from_json(contents: Mapping[str, Any], effects: Iterable[Effect] = ()) -> Model:

@@ -3,20 +3,25 @@
 from __future__ import annotations
 
 import json
+import re
+import sys
 from collections.abc import Mapping
+from importlib.metadata import PackageNotFoundError
+from importlib.metadata import version as version_of
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from motorid.errors import UsageError
 from motorid.estimation.shooting.outcome import violations
 from motorid.problem.relations import Relation
+from motorid.records.files import write_files
 
 if TYPE_CHECKING:
     from motorid.estimation.result import Fit
     from motorid.problem.simulate import Evaluation
 
+_ODD = re.compile("[\x7f-\x9f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
 MOTOR = ("R", "L", "K", "b", "J")
 
 
@@ -129,20 +134,33 @@ def plain(value: Any) -> Any:
     return value if value is None or isinstance(value, str) else str(value)
 
 
-def write_json(contents: Mapping[str, Any], path: str | Path) -> None:
+def package_version(package: str) -> str:
+    """Return the version of an installed package."""
+    try:
+        return version_of(package)
+    except PackageNotFoundError:
+        return "unknown"
+
+
+def json_text(contents: Mapping[str, Any]) -> str:
+    """Return JSON that says that motorid wrote it; control characters and lone surrogates are escaped."""
+    signed = {"motorid": package_version("motorid"), **contents}
+    text = json.dumps(plain(signed), indent=1, ensure_ascii=False, allow_nan=False)
+    return _ODD.sub(lambda m: f"\\u{ord(m[0]):04x}", text) + "\n"
+
+
+def write_json(contents: Mapping[str, Any], path: str | Path, force: bool = False) -> None:
     """Write a dictionary as JSON; ``-`` is standard output.
 
     Raises
     ------
-    UsageError
-        If the file cannot be written.
+    UsageError, OutputError
+        If the file cannot or must not be written, see `write_files`.
     """
-    text = json.dumps(plain(contents), indent=1, ensure_ascii=False, allow_nan=False)
-    if str(path) == "-":
-        print(text)
-        return
-    try:
-        Path(path).expanduser().write_text(text + "\n", encoding="utf-8")
-    except OSError as error:
-        raise UsageError(f"cannot write {path}: {error.strerror or error}. Choose a folder that can be "
-                         "written.") from None
+    text = json_text(contents)
+    if str(path) != "-":
+        write_files({Path(path): text}, force)
+    elif "utf" in (sys.stdout.encoding or "").lower():
+        print(text, end="")
+    else:
+        print(json.dumps(json.loads(text), indent=1))

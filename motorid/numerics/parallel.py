@@ -12,6 +12,7 @@ from __future__ import annotations
 import builtins
 import hashlib
 import pickle
+import signal
 import sys
 import threading
 from collections import deque
@@ -65,6 +66,41 @@ def _blas() -> Any:
     from threadpoolctl import ThreadpoolController  # late: not needed to import the package
 
     return ThreadpoolController().select(user_api="blas")
+
+
+class Interruption:
+    """Ctrl-C that arrives: C libraries swallow the exception at times, or make another one of it, so it is raised again
+    until someone says `heard`. `asked` tells that it was pressed. Only where `listen` was called, in the command line.
+    """
+
+    AGAIN = 0.5  # s
+
+    def __init__(self) -> None:
+        self.asked = False
+
+    def listen(self) -> None:
+        """Take over Ctrl-C."""
+        for name in ("SIGINT", "SIGALRM"):
+            if hasattr(signal, name):
+                signal.signal(getattr(signal, name), self._raise)
+
+    def behind(self, error: BaseException) -> bool:
+        """Tell whether Ctrl-C is what an exception comes from."""
+        return self.asked or isinstance(error, KeyboardInterrupt)
+
+    def heard(self) -> None:
+        """Stop raising it."""
+        if hasattr(signal, "setitimer") and self.asked:
+            signal.setitimer(signal.ITIMER_REAL, 0)
+
+    def _raise(self, number: int, frame: object) -> None:
+        self.asked = True
+        if hasattr(signal, "setitimer"):
+            signal.setitimer(signal.ITIMER_REAL, self.AGAIN)
+        raise KeyboardInterrupt
+
+
+interruption = Interruption()
 
 
 @dataclass(frozen=True)
@@ -144,12 +180,15 @@ def run_tasks(function: Callable[[Any], Any], tasks: Sequence[Any], map: Map | N
                         advance()
                     break
                 except Exception as error:
+                    if interruption.asked:
+                        raise KeyboardInterrupt from None
                     if way is builtins.map:
                         raise
                     print(f"motorid: the pool failed ({type(error).__name__}: {_first_line(error)}); doing "
                           f"the remaining {len(tasks) - len(results)} of {len(tasks)} tasks in this process.",
                           file=sys.stderr)
         except KeyboardInterrupt:
+            interruption.heard()
             return Done(results, f"interrupted after {len(results)} of {len(tasks)}")
     return Done(results, "")
 

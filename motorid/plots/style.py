@@ -85,10 +85,11 @@ def new_figure(width: float, height: float) -> Figure:
     return plt.figure(figsize=(width, height), layout="constrained")
 
 
-def png_of(axes: Any) -> bytes:
+def png_of(axes: Any, dpi: int = 90) -> bytes:
     """Return the figure of some axes as a PNG."""
     buffer = io.BytesIO()
-    np.atleast_1d(np.asarray(axes, object)).ravel()[0].figure.savefig(buffer, format="png", dpi=90)
+    figure = np.atleast_1d(np.asarray(axes, object)).ravel()[0].figure
+    figure.savefig(buffer, format="png", dpi=dpi, metadata={"Software": "motorid"})
     return buffer.getvalue()
 
 

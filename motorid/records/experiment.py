@@ -17,7 +17,7 @@ from motorid.channels import CHANNELS, NAMES, UNITS
 from motorid.display.cards import Card, Shown
 from motorid.display.numbers import duration, number
 from motorid.display.tables import Flag, Table
-from motorid.errors import DataError, UsageError, one_of
+from motorid.errors import DataError, UsageError, one_of, printable
 from motorid.numerics.signals import Array
 from motorid.records import preprocessing
 
@@ -67,7 +67,7 @@ class Experiment(Shown):
     meta: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        _freeze(self, "name", str(self.name))
+        _freeze(self, "name", printable(str(self.name)))
         for optional in ("sigma", "units", "meta"):
             _freeze(self, optional, _mapping(getattr(self, optional), optional, self.name))
         t = _frozen_array(self.t, "t", self.name)

@@ -20,6 +20,7 @@ from motorid.errors import DataError, UsageError, one_of
 from motorid.records.binary_tables import mat_table, parquet_table
 from motorid.records.cleaning import run_from_columns
 from motorid.records.experiment import Experiment
+from motorid.records.files import read_bytes, write_files
 from motorid.records.layout import assign, parse_pairs
 from motorid.records.text_tables import TextTable, parse_table
 
@@ -90,17 +91,21 @@ def read_parquet(path: Path_, *, columns: Mapping[str, object] | None = None, un
 _READERS = {".mat": read_mat, ".parquet": read_parquet, ".pq": read_parquet}
 
 
-def write_csv(experiment: Experiment, path: Path_) -> Path:
-    """Write a run so that `read_csv` gives the same run back: time, channels, extra columns, hold, sigma.
+def write_csv(experiment: Experiment, path: Path_, force: bool = False) -> Path:
+    """Write a run as `csv_text` has it, so that `read_csv` gives the same run back.
 
     Raises
     ------
-    DataError
-        If the file cannot be written.
+    UsageError, OutputError
+        If the file must not or cannot be written, see `write_files`.
     """
+    return write_files({Path(path).expanduser(): csv_text(experiment)}, force)[0]
+
+
+def csv_text(run: Experiment) -> str:
+    """Return a run as CSV: time, channels, extra columns, hold, sigma."""
     import pandas as pd
 
-    run = experiment
     channels = {"t": run.t, **run.inputs, **run.outputs}
     headers = {c: _HEADERS[c, {"t": "s", **run.units}[c]] for c in channels}
     extra = {str(k): a for k, a in run.meta.get("extra", {}).items() if np.shape(a) == run.t.shape}
@@ -109,14 +114,8 @@ def write_csv(experiment: Experiment, path: Path_) -> Path:
     table |= {f"{k} (extra)" if k in taken else k: np.asarray(a) for k, a in extra.items()}
     about = ["# motorid columns: " + ",".join(f"{c}={h}" for c, h in headers.items()), f"# motorid hold: {run.hold}"]
     about += ["# motorid sigma: " + ",".join(f"{c}={s!r}" for c, s in run.sigma.items())] if run.sigma else []
-    path = Path(path).expanduser()
-    try:
-        with path.open("w", encoding="utf-8", newline="") as file:
-            file.write("\n".join(about) + "\n")
-            pd.DataFrame(table).to_csv(file, index=False, na_rep="", lineterminator="\n")
-    except (OSError, ValueError) as error:
-        raise DataError(f"cannot write {path}: {error}. Choose a folder that can be written.") from None
-    return path
+    rows = pd.DataFrame(table).to_csv(index=False, na_rep="", lineterminator="\n")
+    return "\n".join([*about, rows])
 
 
 def find_records(paths: Path_ | Iterable[Path_]) -> list[Path]:
@@ -180,11 +179,7 @@ def _natural(path: Path) -> list[tuple[int, int, str]]:
 def _read(path: Path_, to_table: Callable[[bytes], TextTable], columns: Mapping[str, object] | None,
           units: Mapping[str, object] | None, hold: str | None, name: str | None) -> Experiment:
     path = Path(path).expanduser()
-    try:
-        data = path.read_bytes()
-    except (OSError, ValueError) as error:
-        reason = "it is a directory; use read_runs" if path.is_dir() else getattr(error, "strerror", error)
-        raise DataError(f"cannot read {path}: {reason}.") from None
+    data = read_bytes(path)
     try:
         table = to_table(data)
         own: dict[str, str] = {m[1]: m[2] for m in map(_OWN.fullmatch, table.comments) if m}

@@ -6,8 +6,6 @@ import platform
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
-from importlib.metadata import PackageNotFoundError
-from importlib.metadata import version as version_of
 from pathlib import Path
 from typing import Any
 
@@ -18,14 +16,17 @@ from motorid.display.numbers import duration, percent
 from motorid.display.tables import Flag, Table
 from motorid.errors import UsageError
 from motorid.estimation.result import Fit
+from motorid.exporters.json_file import package_version
 from motorid.records.experiment import Experiment
+from motorid.records.files import write_files
 from motorid.reports import sections
 from motorid.reports.sections import Section
 
 PACKAGES = ("motorid", "casadi", "numpy", "scipy", "pandas", "matplotlib")
 
 
-def report(result: Any, path: str | Path, *, title: str = "", command: str = "", validate: Sequence[Any] = ()) -> Path:
+def report(result: Any, path: str | Path, *, title: str = "", command: str = "", validate: Sequence[Any] = (),
+           force: bool = False) -> Path:
     """Write the story of a result as one HTML page: no network, no script, figures inside.
 
     Data and their checks, the fit, where it fails, which effect is missing, the ladder, parameters before and
@@ -42,6 +43,8 @@ def report(result: Any, path: str | Path, *, title: str = "", command: str = "",
         The command or code that made it, for the last section.
     validate : sequence of Experiment, optional
         Records that the fit never saw, to judge it on.
+    force : bool
+        Also over a file that motorid did not write.
 
     Returns
     -------
@@ -51,7 +54,9 @@ def report(result: Any, path: str | Path, *, title: str = "", command: str = "",
     Raises
     ------
     UsageError
-        If there is nothing to tell, or the file cannot be written.
+        If there is nothing to tell, or the file must not or cannot be written there.
+    OutputError
+        If the disk refuses.
     """
     results = list(result) if isinstance(result, list | tuple) else [result]
     if not results:
@@ -61,12 +66,7 @@ def report(result: Any, path: str | Path, *, title: str = "", command: str = "",
             raise UsageError(f"report takes results of motorid, such as a fit or a diagnosis; got {type(r).__name__}.")
     story = tell(results, title=title, validate=list(validate))
     story.sections.append(_provenance(story, command))
-    target = Path(path)
-    try:
-        target.write_text(_page(story), encoding="utf-8")
-    except OSError as error:
-        raise UsageError(f"the report cannot be written to '{target}': {error.strerror}.") from None
-    return target
+    return write_files({Path(path): _page(story)}, force)[0]
 
 
 def _page(story: Story) -> str:
@@ -92,14 +92,6 @@ def _provenance(story: Story, command: str) -> Section:
         tables=tables,
         code=command,
     )
-
-
-def package_version(package: str) -> str:
-    """Return the version of an installed package."""
-    try:
-        return version_of(package)
-    except PackageNotFoundError:
-        return "unknown"
 
 
 @dataclass

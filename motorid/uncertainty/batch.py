@@ -17,13 +17,14 @@ import numpy as np
 
 from motorid.channels import CHANNELS
 from motorid.display.tables import Table
-from motorid.errors import DataError, FitError, MissingDependency, UsageError
+from motorid.errors import DataError, FitError, MissingDependency, OutputError, UsageError, printable
 from motorid.estimation.fit import fit
 from motorid.estimation.result import Fit
 from motorid.model.model import Model
 from motorid.numerics.noise import Outlier, outliers
-from motorid.numerics.parallel import Map, map_items, one_thread
+from motorid.numerics.parallel import Map, interruption, map_items, one_thread
 from motorid.records.experiment import Experiment
+from motorid.records.files import read_bytes, write_files
 from motorid.records.reading import find_records, read_runs
 from motorid.uncertainty.covariance import covariance
 
@@ -71,22 +72,22 @@ class Batch:
         """Motors that differ from the others by more than scatter and own uncertainty explain."""
         return outliers([r for r in self.rows if r["status"] != "failed"], self.parameters, self.positive)
 
-    def save(self, path: str | Path) -> Path:
-        """Write the table; the ending says how: ``.csv``, ``.parquet`` or ``.json``."""
+    def save(self, path: str | Path, force: bool = False) -> Path:
+        """Write the table; the ending says how: ``.csv``, ``.parquet`` or ``.json``; see `write_files`."""
         target = Path(path)
         if target.suffix == ".csv":
-            self.table.to_csv(target)
+            content = self.table.to_csv()
         elif target.suffix == ".json":
-            self.table.reset_index().to_json(target, orient="records", indent=1, force_ascii=False)
+            content = self.table.reset_index().to_json(orient="records", indent=1, force_ascii=False)
         elif target.suffix in (".parquet", ".pq"):
             try:
-                self.table.to_parquet(target)
+                content = self.table.to_parquet()
             except ImportError as error:
                 raise MissingDependency("writing Parquet needs pyarrow: pip install 'motorid[parquet]', or "
                                         "save the table as .csv.") from error
         else:
             raise UsageError(f"a table is saved as .csv, .parquet or .json; got '{target.name}'.")
-        return target
+        return write_files({target: content}, force)[0]
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain data: rows, outliers, counts."""
@@ -169,6 +170,8 @@ def _fit_one(task: tuple[Model, Mapping[str, Any], Mapping[str, Any]], motor: tu
     try:
         row = _row(fit(model, _runs(records, reading), **options))
     except Exception as error:  # one motor's trouble, whatever it is, must not end the batch
+        if interruption.asked:
+            raise KeyboardInterrupt from None
         row = {"status": "failed", "message": f"{type(error).__name__}: {error}", "flags": ["failed"]}
     return {"motor": name, **row, "seconds": time.perf_counter() - began}
 
@@ -218,7 +221,7 @@ def motors_in(folder: str | Path) -> dict[str, list[Path]]:
         except DataError:
             continue
         name = entry.name if entry.is_dir() or entry.stem in found else entry.stem
-        found[name] = [Path(f) for f in files]
+        found[printable(name)] = [Path(f) for f in files]
     if not found:
         raise DataError(f"'{place}' holds no records: expected a folder, or a file, per motor.")
     return found
@@ -236,27 +239,29 @@ class Checkpoint:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.rows: dict[str, dict[str, Any]] = {}
-        if path.is_dir():
-            raise DataError(f"the journal '{path}' is a folder; name a file, e.g. batch.jsonl.")
-        if path.exists():
-            text = path.read_text(encoding="utf-8")
-            for line in text.splitlines():
-                try:
-                    entry = json.loads(line)
-                    self.rows[entry["fingerprint"]] = entry["row"]
-                except (ValueError, KeyError, TypeError):
-                    continue
-            if text and not text.endswith("\n"):
-                self._append("\n")
+        text = read_bytes(path).decode("utf-8", "replace") if path.exists() else ""
+        for line in text.splitlines():
+            try:
+                entry = json.loads(line)
+                self.rows[entry["fingerprint"]] = {"motor": entry["row"]["motor"], **entry["row"]}
+            except (ValueError, KeyError, TypeError, RecursionError):
+                continue
+        if text.strip() and not self.rows and '{"fingerprint"' not in text:
+            raise UsageError(f"'{path}' is not a journal of motorid, so nothing is added to it; name another file.")
+        self._append("" if text.endswith("\n") or not text else "\n")
 
     def add(self, mark: str, row: Mapping[str, Any]) -> None:
         """Write a result under its fingerprint, at once."""
         self._append(json.dumps({"fingerprint": mark, "row": dict(row)}, ensure_ascii=False) + "\n")
 
     def _append(self, text: str) -> None:
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        with self.path.open("a", encoding="utf-8") as file:
-            file.write(text)
+        try:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            with self.path.open("a", encoding="utf-8", errors="backslashreplace") as file:
+                file.write(text)
+        except OSError as error:
+            kind = UsageError if not text.strip() else OutputError
+            raise kind(f"cannot write the journal {self.path}: {error.strerror}.") from None
 
 
 def checkpoint_key(model: Model, options: Mapping[str, Any], reading: Mapping[str, Any] | None, records: Any) -> str:

@@ -24,5 +24,5 @@ def test_a_file_that_is_there_is_not_written_over(tmp_path):
     file.write_text("mine", encoding="utf-8")
     done = motorid("diagnose", *RUNS, "--max-effects", 0, "--remainder-to", file)
     assert done.status == 2
-    assert "is there already" in done.err
+    assert "did not write it" in done.err
     assert file.read_text(encoding="utf-8") == "mine"

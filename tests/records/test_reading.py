@@ -447,8 +447,8 @@ def test_hold_said_while_reading_wins(tmp_path):
         read_csv(path, hold="spline")
 
 
-def test_a_place_that_cannot_be_written_is_a_data_error(tmp_path):
-    with pytest.raises(DataError, match="cannot write"):
+def test_a_place_that_cannot_be_written_is_a_usage_error(tmp_path):
+    with pytest.raises(UsageError, match="cannot write"):
         write_csv(read_csv(write(tmp_path, GOOD)), tmp_path / "none" / "run.csv")
 
 

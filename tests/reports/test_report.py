@@ -207,7 +207,7 @@ def mi_ladder(found, rungs):
 
 
 def test_a_file_that_cannot_be_written_or_nothing_to_tell_is_said_in_words(found, tmp_path):
-    with pytest.raises(UsageError, match="cannot be written"):
+    with pytest.raises(UsageError, match="cannot write"):
         mi.report(found.before, tmp_path / "no" / "such" / "folder.html")
     with pytest.raises(UsageError, match="needs a result"):
         mi.report([], tmp_path / "x.html")

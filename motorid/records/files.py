@@ -1,0 +1,130 @@
+"""Files in and out: what is read is a file of bounded size; what is written is whole, and over nothing else."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import re
+import stat
+import tempfile
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+from motorid.errors import DataError, OutputError, UsageError
+
+MOST_BYTES = 256_000_000  # of a file that is read; a table takes about eight times as much memory
+_LOOK = 65_536  # bytes at either end in which an output says that motorid wrote it
+# What the outputs carry: JSON, page, C, table of motors, record of an export, simulated run, figure, CasADi file.
+_OURS = re.compile(rb'"motorid": ?"|name="generator" content="motorid|[Ww]ritten by motorid|\Amotor,status,message,'
+                   rb'|"motor":"[^"]*",\s*"status"|"index_columns": \["motor"\]|\At,[\w,]*substeps\n'
+                   rb"|\A# motorid columns: |Software\0motorid")
+_WRONG_PLACE = (errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.EACCES, errno.EPERM, errno.EROFS, errno.ENAMETOOLONG)
+
+
+def read_bytes(path: Path) -> bytes:
+    """Return the contents of a regular file of at most 256 MB.
+
+    Raises
+    ------
+    DataError
+        If it cannot be read, is larger, or is a device or a pipe, which may have no end.
+    """
+    try:
+        about = path.stat()
+        if stat.S_ISDIR(about.st_mode):
+            raise DataError(f"cannot read {path}: it is a directory; use read_runs.")
+        if not stat.S_ISREG(about.st_mode):
+            raise DataError(f"cannot read {path}: it is a device or a pipe, which may have no end; save what it gives "
+                            "in a file first.")
+        with path.open("rb") as file:
+            data = file.read(MOST_BYTES + 1) if about.st_size <= MOST_BYTES else b""
+    except (OSError, ValueError) as error:
+        raise DataError(f"cannot read {path}: {getattr(error, 'strerror', None) or error}.") from None
+    if max(about.st_size, len(data)) > MOST_BYTES:
+        raise DataError(f"cannot read {path}: it has {about.st_size / 1e6:.0f} MB, at most {MOST_BYTES / 1e6:.0f} MB "
+                        "are read. Cut it into runs, or leave out samples.")
+    return data
+
+
+def check_output(path: str | Path, force: bool = False) -> Path:
+    """Return the file to write: `path`, or what it links to.
+
+    Raises
+    ------
+    UsageError
+        If its folder is not there, or, without `force`, if there is a file that motorid did not write.
+    """
+    target = Path(path).expanduser()
+    try:
+        target = target.resolve() if target.is_symlink() else target
+        if target.is_dir() or not target.parent.is_dir():
+            raise UsageError(f"cannot write {path}: " + ("it is a folder." if target.is_dir() else
+                             f"there is no folder {target.parent}."))
+        if force or not target.is_file():
+            return target
+        with target.open("rb") as file:
+            ends = [file.read(_LOOK)]
+            file.seek(max(0, target.stat().st_size - _LOOK))
+            ends.append(file.read())
+    except (OSError, ValueError, RuntimeError) as error:  # RuntimeError: a loop of links
+        raise UsageError(f"cannot write {path}: {getattr(error, 'strerror', None) or error}.") from None
+    if ends[0] and not any(_OURS.search(end) for end in ends):
+        raise UsageError(f"cannot write {path}: that file exists and motorid did not write it. Choose another name, "
+                         "or replace it with --force (force=True).")
+    return target
+
+
+def write_files(files: Mapping[Path, str | bytes], force: bool = False) -> list[Path]:
+    """Write files whole or not at all: aside, carried to the disk, then renamed; the only way in which outputs are
+    written.
+
+    Parameters
+    ----------
+    files : mapping of Path to str or bytes
+        Text is written as UTF-8.
+    force : bool
+        Also over files that motorid did not write.
+
+    Raises
+    ------
+    UsageError
+        If one of them must not or cannot be written there, see `check_output`; then none is.
+    OutputError
+        If the disk refuses; what was there before is as it was.
+    """
+    targets = [check_output(path, force) for path in files]
+    try:
+        with contextlib.ExitStack() as aside:
+            parts = [aside.enter_context(_part(t, c)) for t, c in zip(targets, files.values(), strict=True)]
+            for part, target in zip(parts, targets, strict=True):
+                if part is not None:
+                    os.replace(part, target)
+    except OSError as error:
+        kind = UsageError if error.errno in _WRONG_PLACE else OutputError
+        raise kind(f"cannot write {', '.join(map(str, files))}: {error.strerror or error}. Choose a folder that can "
+                   "be written.") from None
+    return list(files)
+
+
+@contextlib.contextmanager
+def _part(target: Path, content: str | bytes) -> Iterator[Path | None]:
+    """Write `content` beside `target` and clear up afterwards; at once where `target` is a device or a pipe."""
+    data = content.encode("utf-8", "backslashreplace") if isinstance(content, str) else content
+    if target.exists() and not target.is_file():
+        target.write_bytes(data)
+        yield None
+        return
+    number, name = tempfile.mkstemp(prefix=f".{target.name[:60]}.", suffix=".part", dir=target.parent)
+    try:
+        with open(number, "wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(number)
+        umask = os.umask(0)
+        os.umask(umask)
+        os.chmod(name, stat.S_IMODE(target.stat().st_mode) if target.exists() else 0o666 & ~umask)
+        yield Path(name)
+    finally:
+        with contextlib.suppress(OSError):
+            os.unlink(name)

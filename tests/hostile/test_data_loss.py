@@ -1,0 +1,210 @@
+"""No output replaces a record, another program's file or half of itself; Ctrl-C and kill keep what was done."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command import motorid
+
+import motorid as mi
+from motorid.acquire.protocol import Channel, Header
+from motorid.acquire.session import Recording
+from motorid.errors import OutputError, UsageError
+from motorid.records.datasets import data_path
+from motorid.records.files import write_files
+from motorid.uncertainty.batch import Checkpoint
+
+RUN = data_path("two_step") / "step_6V.csv"
+SMALL = ("--fix", "L=0")
+
+
+@pytest.fixture
+def run(tmp_path) -> Path:
+    path = tmp_path / "run1.csv"
+    path.write_bytes(RUN.read_bytes())
+    return path
+
+
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("saved") / "fit.json"
+    assert motorid("fit", RUN, "--json", path).status == 0
+    return path
+
+
+@pytest.mark.parametrize("words", [
+    ("fit", "{run}", "--json", "{run}"), ("fit", "{run}", "--report", "{run}"), ("fit", "{run}", "--json", "{link}"),
+    ("diagnose", "{run}", "--json", "{run}"), ("diagnose", "{run}", "--remainder-to", "{run}"),
+    ("fit-many", "{folder}", "--out", "{run}"), ("fit-many", "{folder}", "--journal", "{run}"),
+    ("export", "{saved}", "{run}", "--to", "c"), ("export", "{saved}", "{run}", "--to", "json"),
+    ("export", "{saved}", "{saved}"), ("simulate", "{saved}", "{run}", "--json", "{saved}"),
+    ("identifiability", "{run}", "--json", "{run}"), ("robustness", "{run}", "--json", "{run}"),
+], ids=" ".join)
+def test_an_output_is_never_written_over_an_input(words, run, saved, tmp_path):
+    link = tmp_path / "link.json"
+    link.symlink_to(run)
+    before = run.read_bytes(), saved.read_bytes()
+    done = motorid(*(w.format(run=run, folder=tmp_path, saved=saved, link=link) for w in words))
+    assert done.status == 2, done
+    assert "cannot write" in done.err or "not a journal" in done.err
+    assert (run.read_bytes(), saved.read_bytes()) == before
+
+
+def test_an_output_is_written_over_ours_and_with_force_over_all(run, tmp_path):
+    out = tmp_path / "fit.json"
+    for _ in range(2):
+        assert motorid("fit", run, *SMALL, "--json", out, "--report", tmp_path / "fit.html").status == 0
+    out.write_text("my notes", encoding="utf-8")
+    assert motorid("fit", run, *SMALL, "--json", out).status == 2
+    assert out.read_text(encoding="utf-8") == "my notes"
+    assert motorid("fit", run, *SMALL, "--json", out, "--force").status == 0
+    assert json.loads(out.read_text(encoding="utf-8"))["motorid"]
+
+
+def test_every_output_can_be_renewed(saved, run, tmp_path):
+    """What motorid writes says that motorid wrote it."""
+    folder = tmp_path / "motors"
+    folder.mkdir()
+    (folder / "a.csv").write_bytes(RUN.read_bytes())
+    for _ in range(2):
+        for name in ("m.c", "m.json", "m.casadi"):
+            assert motorid("export", saved, tmp_path / name).status == 0
+        assert motorid("simulate", saved, run, "--out", tmp_path / "sim").status == 0
+        for name in ("t.csv", "t.json", "t.parquet"):
+            done = motorid("fit-many", folder, *SMALL, "--out", tmp_path / name)
+            assert done.status == 0, done.err
+
+
+def test_export_of_c_leaves_all_alone_where_one_file_is_somebody_elses(saved, tmp_path):
+    (tmp_path / "motor.h").write_text("/* mine */", encoding="utf-8")
+    done = motorid("export", saved, tmp_path / "motor.c")
+    assert done.status == 2
+    assert "motor.h" in done.err
+    assert [p.name for p in tmp_path.iterdir()] == ["motor.h"]
+
+
+@pytest.mark.parametrize("name", ["m.casadi", "m.json", "m.c"])
+def test_a_full_disk_is_a_sentence_status_1_and_the_old_file(saved, tmp_path, monkeypatch, name):
+    path = tmp_path / name
+    assert motorid("export", saved, path).status == 0
+    before = path.read_bytes()
+
+    def full(_: int) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    done = motorid("export", saved, path)
+    assert (done.status, done.out) == (1, "")
+    assert "No space left" in done.err
+    assert path.read_bytes() == before
+    assert not list(tmp_path.glob(".*"))
+    with pytest.raises(OutputError, match="No space"):
+        write_files({tmp_path / "x": "text"})
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full here")
+def test_a_device_that_refuses_is_said(run):
+    done = motorid("fit", run, *SMALL, "--json", "/dev/full")
+    assert done.status == 1
+    assert "No space left" in done.err
+
+
+def test_two_runs_of_one_name_are_simulated_into_two_files(saved, tmp_path):
+    for folder in ("a", "b"):
+        (tmp_path / folder / "x").mkdir(parents=True)
+        (tmp_path / folder / "x" / "run.csv").write_bytes(RUN.read_bytes())
+    done = motorid("simulate", saved, tmp_path / "a/x/run.csv", tmp_path / "b/x/run.csv", "--out", tmp_path / "out")
+    assert done.status == 0, done.err
+    assert len(list((tmp_path / "out").iterdir())) == 2
+
+
+def test_two_results_cannot_be_one_file(run, tmp_path):
+    done = motorid("fit", run, "--json", tmp_path / "x", "--report", tmp_path / "x")
+    assert done.status == 2
+    assert not (tmp_path / "x").exists()
+
+
+def test_a_journal_that_is_none_is_left_alone_and_a_damaged_one_goes_on(tmp_path):
+    path = tmp_path / "batch.jsonl"
+    path.write_text("t,v\n1,2\n", encoding="utf-8")
+    with pytest.raises(UsageError, match="not a journal"):
+        Checkpoint(path)
+    entry = json.dumps({"fingerprint": "a", "row": {"motor": "m"}})
+    path.write_bytes(b"\xff\xfe\n" + entry.encode() + b'\n{"fingerprint": "b", "ro')
+    again = Checkpoint(path)
+    again.add("c", {"motor": "n"})
+    assert list(Checkpoint(path).rows) == ["a", "c"]
+    with pytest.raises(UsageError, match="cannot write"):
+        Checkpoint(path / "below")
+
+
+def start(*words: object, **options: object) -> subprocess.Popen[str]:
+    return subprocess.Popen([sys.executable, "-m", "motorid", *map(str, words)], stdout=subprocess.PIPE,
+                            stderr=subprocess.PIPE, text=True, **options)  # type: ignore[call-overload]
+
+
+@pytest.mark.parametrize("after", [0.4, 2.5])
+def test_ctrl_c_is_status_130_in_the_first_second_and_later(after):
+    process = start("robustness", RUN, "--starts", 5000)
+    time.sleep(after)
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert "interrupted" in err.lower()
+    assert "Traceback" not in out + err
+
+
+def test_an_interrupted_diagnosis_keeps_its_fit(run, tmp_path, monkeypatch):
+    from motorid.cli import diagnose
+
+    def stop(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(diagnose, "diagnose", stop)
+    done = motorid("diagnose", run, "--json", tmp_path / "found.json")
+    assert done.status == 130
+    assert "interrupted" in done.err
+    assert json.loads((tmp_path / "found.json").read_text())["parameters"]["R"]["value"] > 0
+
+
+def test_a_recording_without_a_sample_is_no_success(tmp_path):
+    header = Header("d", 100.0, (Channel("v", "V"), Channel("i", "A")))
+    for received in (0, 5):
+        done = Recording(tmp_path / "x.csv", header, "done", "", received, 0, True, 0.0, {}, {})
+        assert done.complete == (received > 0)
+        assert ("Nothing was recorded" in str(done)) == (received == 0)
+
+
+def test_a_batch_killed_in_the_middle_of_its_journal_ends_in_the_same_table(tmp_path):
+    folder, journal = tmp_path / "motors", tmp_path / "batch.jsonl"
+    folder.mkdir()
+    base = mi.read_csv(RUN)
+    rng = np.random.default_rng(3)
+    for k in range(40):
+        noise = {c: y + rng.normal(0, 0.01 * np.ptp(y), y.shape) for c, y in base.outputs.items()}
+        mi.records.reading.write_csv(base.with_(outputs=noise), folder / f"m{k:02}.csv")
+    process = start("fit-many", folder, "--journal", journal)
+    while process.poll() is None and not (journal.exists() and journal.read_bytes().count(b"\n") >= 5):
+        time.sleep(0.002)
+    process.kill()
+    process.communicate()
+    done = journal.read_bytes().count(b"\n")
+    assert 5 <= done < 40, "it must be killed in the middle"
+    with journal.open("r+b") as file:  # as if it had died within a line
+        file.truncate(journal.stat().st_size - 20)
+    tables = [tmp_path / "resumed.csv", tmp_path / "whole.csv"]
+    assert motorid("fit-many", folder, "--journal", journal, "--out", tables[0]).status == 0
+    assert motorid("fit-many", folder, "--out", tables[1]).status == 0
+    rows = [[line.split(",") for line in t.read_text().splitlines()] for t in tables]
+    seconds = rows[0][0].index("seconds")
+    assert [[c for k, c in enumerate(r) if k != seconds] for r in rows[0]] == [
+        [c for k, c in enumerate(r) if k != seconds] for r in rows[1]]
