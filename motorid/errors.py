@@ -58,6 +58,10 @@ class MissingDependency(MotoridError):
     """An optional package is needed and not installed; the message names the extra to install."""
 
 
+class OutOfTime(Exception):
+    """A budget of time is spent; whoever set it keeps what there is so far, see `numerics.parallel.budget`."""
+
+
 # What may go wrong with one of many models without stopping the others.
 FAILURES = (FitError, SimulationError, ModelError, np.linalg.LinAlgError)
 

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from motorid.cli.console import save_report, say_notes, show
+from motorid.cli.console import INTERRUPTED, save_report, say_notes, show
 from motorid.cli.options import (
     OUT,
     FitOptions,
@@ -24,6 +24,7 @@ from motorid.cli.options import (
 )
 from motorid.diagnosis.diagnose import diagnose
 from motorid.diagnosis.record_parts import fit_affordably
+from motorid.diagnosis.refit import INTERRUPTED as STOPPED_BY_HAND
 from motorid.diagnosis.results import Diagnosis, ladder_table, ranking_table
 from motorid.estimation.fit import fit
 from motorid.estimation.result import Fit, comparison_table, parameter_table
@@ -44,6 +45,9 @@ def diagnose_command(
     runs: Runs, options: FitOptions, validate: Validate = None,
     max_effects: Annotated[int, typer.Option(
         min=0, metavar="N", rich_help_panel=OUT, help="Add at most so many effects.")] = 3,
+    budget: Annotated[float | None, typer.Option(
+        min=0, metavar="SECONDS", rich_help_panel=OUT,
+        help="Give the best answer so far after so long, as Ctrl-C does.")] = None,
     remainder_to: Annotated[Path | None, typer.Option(
         metavar="FILE.py", rich_help_panel=OUT,
         help="Write what no effect explains as an effect, for --effects-from.")] = None,
@@ -61,8 +65,8 @@ def diagnose_command(
     done: list[str] = []
     try:
         with progress("Looking for what is missing") as advance:
-            found = diagnose(before, held_out or None, also=own, max_effects=max_effects,
-                             progress=lambda word: advance(done.append(word) or 1))
+            found = diagnose(before, held_out or None, also=own, max_effects=max_effects, budget=budget,
+                             progress=lambda word: advance(_as_it_comes(word, done, quiet=json == "-")))
     except (Exception, KeyboardInterrupt) as error:
         if interruption.behind(error):
             _keep_fit(before, done, json, options.force)
@@ -75,6 +79,16 @@ def diagnose_command(
     if remainder_to:
         _write_remainder(found, remainder_to, options.force)
     save_report(found, report, held_out, options.force)
+    if found.stopped == STOPPED_BY_HAND:
+        raise typer.Exit(INTERRUPTED)
+
+
+def _as_it_comes(word: str, done: list[str], quiet: bool) -> int:
+    """Write down what was done; print the first answer at once."""
+    done.append(word)
+    if word.startswith("first answer") and not quiet:
+        show(f"{word[0].upper()}{word[1:]}\n")
+    return 1
 
 
 def _keep_fit(before: Fit, done: Sequence[str], json: Json, force: bool) -> None:

@@ -266,7 +266,7 @@ def _text(adequate: bool, channels: Mapping[str, Mapping[str, float]], material:
 CLEAR = 1e-3  # p-value of errors larger than the noise that needs no second test: few coloured samples tell little
 
 
-def judge_adequacy(node: Node, scores: Sequence[Score]) -> Adequacy:
+def judge_adequacy(node: Node, scores: Sequence[Score] = ()) -> Adequacy:
     """Judge whether the residuals of a model are noise; errors larger than it are, if no free form predicts them.
 
     Unless what they depend on is beyond doubt.

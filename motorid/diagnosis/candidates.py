@@ -94,7 +94,7 @@ class Search:
             judged[e.name] = candidate
             if child is not None:
                 children.append(child)
-        return children, self._listed(scores, judged)
+        return children, self.listed(scores, judged)
 
     def _takeable(self, model: Model) -> tuple[list[Effect], list[Effect]]:
         """Split the effects into those that can be added and those that would take an earlier one's place."""
@@ -156,13 +156,14 @@ class Search:
         return replace(child, candidate=candidate), candidate
 
     @staticmethod
-    def _listed(scores: Sequence[Score], judged: Mapping[str, Candidate]) -> list[Candidate]:
+    def listed(scores: Sequence[Score], judged: Mapping[str, Candidate], why: str = "") -> list[Candidate]:
+        """Return a candidate for every effect, best score first; `why` those that were not judged were not refitted."""
         listed = []
         for s in scores:
             c = judged.get(s.effect.name)
             if c is None:
                 c = Candidate(s.effect.name, s.drop, parameters=dict(s.starts[0]) if s.starts else {},
-                              reason=_unseen(s))
+                              reason=why or _unseen(s))
             listed.append(replace(c, predicted_drop=s.drop))
         rest = [c for n, c in judged.items() if n not in {s.effect.name for s in scores}]
         return listed + rest

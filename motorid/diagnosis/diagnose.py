@@ -39,7 +39,7 @@ from motorid.records.experiment import Experiment
 @one_thread
 def diagnose(fit: Fit, validate: Sequence[Experiment] | Experiment | None = None, *,
              effects: Iterable[Effect | str] | None = None, also: Iterable[Effect] = (), max_effects: int = 3,
-             map: Callable[..., Iterable[Any]] = builtins.map,
+             budget: float | None = None, map: Callable[..., Iterable[Any]] = builtins.map,
              progress: Callable[[str], None] | None = None) -> Diagnosis:
     """Say where a fitted model fails and which physical effect it lacks.
 
@@ -54,10 +54,12 @@ def diagnose(fit: Fit, validate: Sequence[Experiment] | Experiment | None = None
     also : iterable of Effect, optional
         Effects of your own, tried beside the library's.
     max_effects : int
+    budget : float, optional
+        Seconds after which the best answer so far is given; Ctrl-C gives it, too. `Diagnosis.stopped` says so.
     map : callable
         Anything with the signature of `map`, for the refits.
     progress : callable, optional
-        Called with a word on what was done.
+        Called with a word on what was done; ``"first answer: …"`` comes before any refit.
 
     Returns
     -------
@@ -66,7 +68,7 @@ def diagnose(fit: Fit, validate: Sequence[Experiment] | Experiment | None = None
     """
     say = progress or (lambda word: None)
     own = tuple(also)
-    found, driven = explored(fit, validate, library(effects, own), map, say, max_effects)
+    found, driven = explored(fit, validate, library(effects, own), map, say, max_effects, budget)
     say("located what is missing")
     return _told(found, driven, validate is not None, own)
 
@@ -94,21 +96,23 @@ def _told(found: Climb, driven: str, validated: bool, own: Sequence[Effect]) -> 
     elif len(found.path) > 1 or not remaining.adequate:
         verdict, where = "unexplained", missing.where
         judged = judged if len(found.path) > 1 else remaining
-        text = unexplained_text(judged, missing, ranking, ladder.rungs, found.grades)
+        text = unexplained_text(judged, missing, ranking, ladder.rungs, found.grades, done=not found.stopped)
     else:
         verdict, where, text = "adequate", None, adequate_text(judged, ranking)
     kind = "structure" if not remaining.adequate else "fluctuation" if far(ladder.best) else "noise"
     text = " ".join(t for t in (text, *_remarks(found, driven), suggestion) if t)
     return Diagnosis(verdict, text, where, names, judged, missing, ranking, ladder, groups, suggestion, fit,
-                     ladder.best, remaining, Remainder(kind, ladder.best, form))
+                     ladder.best, remaining, Remainder(kind, ladder.best, form), found.stopped)
 
 
 def _remarks(found: Climb, driven: str) -> list[str]:
     """Return what else a reader should know: of the records, of the last fit, of the held-out runs."""
     first, last = found.path[0].fit, found.path[-1].fit
     limits = (f"In {run.name} {limit}" for run in first.problem.experiments if (limit := current_limit(run)))
-    return [driven, next(limits, ""), parts_remark(first), unfinished_remark(last), held_out_remark(found.path[-1]),
-            measured_angle_remark(last), averaging_remark(last), outliers_remark(last), closed_loop_remark(first)]
+    stopped = f"Stopped early: {found.stopped}; more may be missing." if found.stopped else ""
+    return [stopped, driven, next(limits, ""), parts_remark(first), unfinished_remark(last),
+            held_out_remark(found.path[-1]), measured_angle_remark(last), averaging_remark(last), outliers_remark(last),
+            closed_loop_remark(first)]
 
 
 def _sharing(fit: Fit, name: str, parameters: Sequence[str]) -> tuple[str, ...]:

@@ -15,7 +15,7 @@ from motorid.diagnosis.model_comparison import far
 from motorid.diagnosis.record_parts import worth_its_steps
 from motorid.diagnosis.score_test import uses_angle
 from motorid.diagnosis.thresholds import NATS
-from motorid.errors import FAILURES
+from motorid.errors import FAILURES, OutOfTime
 from motorid.estimation.continuation import by_continuation
 from motorid.estimation.first_guess import first_guess
 from motorid.estimation.least_squares import Estimate
@@ -25,6 +25,7 @@ from motorid.estimation.start_values import ABOVE, sizes_like
 from motorid.model.definition import Effect
 from motorid.model.model import Model
 from motorid.numerics.least_squares import LevenbergMarquardt
+from motorid.numerics.parallel import interruption
 from motorid.numerics.signals import Array
 from motorid.problem.problem import Problem
 from motorid.problem.runs import natural_sizes
@@ -218,6 +219,8 @@ def _within(model: Model, values: Mapping[str, float]) -> Model:
 BEHIND = 10.0  # times the cost of a model that explains all but noise
 HARDLY = 1.01  # times: near enough that a slope tells what more would do
 FAR_LESS = 0.3  # of the promise that was kept
+OUT_OF_TIME = "the time is up"
+INTERRUPTED = "interrupted"
 FAR_BEHIND = "far behind the best, which leaves only noise"
 NEARLY = 0.9  # of the best promise: a smaller model with that is the favourite
 
@@ -250,7 +253,8 @@ class GivenUp:
 
 
 def refits(tasks: Sequence[Task], map_: Callable[..., Iterable[Any]]) -> list[Fit | GivenUp | None]:
-    """Return the refit of each task; None where none can be simulated.
+    """Return the refit of each task, None where none can be simulated; what is not done when the time is up, or when
+    it is interrupted, is given up.
 
     Parameters
     ----------
@@ -260,13 +264,25 @@ def refits(tasks: Sequence[Task], map_: Callable[..., Iterable[Any]]) -> list[Fi
         Anything with the signature of `map`.
     """
     found: dict[int, Fit | GivenUp | None] = {}
+    try:
+        _refit_all(tasks, map_, found)
+    except (OutOfTime, KeyboardInterrupt) as error:
+        interruption.heard()
+        why = GivenUp(OUT_OF_TIME if isinstance(error, OutOfTime) else INTERRUPTED)
+        found = {k: found.get(k, why) for k in range(len(tasks))}
+    return [found.get(k) for k in range(len(tasks))]
+
+
+def _refit_all(tasks: Sequence[Task], map_: Callable[..., Iterable[Any]],
+               found: dict[int, Fit | GivenUp | None]) -> None:
+    """Put the refit of each task into `found` as it comes: the one that promises most first, then by their races."""
     races: dict[int, Raced] = {}
     leader, alone = _leader(tasks), False
     if leader is not None and (race := _race_tournament((tasks[leader], alone))) is not None:
         races[leader], found[leader] = race, _finish((tasks[leader], race))
         if (best := _quiet(found[leader])) is not None:
             alone = True
-            found |= _unpromising(tasks, leader) | _needless(tasks, leader, best, map_)
+            found.update(_unpromising(tasks, leader) | _needless(tasks, leader, best, map_))
     entered = [k for k in range(len(tasks)) if k not in races and k not in found]
     done = map_(_race_tournament, [(tasks[k], alone) for k in entered])
     races |= {k: race for k, race in zip(entered, done, strict=True) if race is not None}
@@ -275,10 +291,10 @@ def refits(tasks: Sequence[Task], map_: Callable[..., Iterable[Any]]) -> list[Fi
         if first not in found:
             found[first] = _finish((tasks[first], races[first]))
         if _quiet(found[first]) is not None:
-            found = _beaten(tasks, {k: race.cost for k, race in races.items()}, first) | found
-    rest = [k for k in races if k not in found]
-    found |= zip(rest, map_(_finish, [(tasks[k], races[k]) for k in rest]), strict=True)
-    return [found.get(k) for k in range(len(tasks))]
+            found.update(_beaten(tasks, {k: race.cost for k, race in races.items()}, first) | found)
+    rest = sorted((k for k in races if k not in found), key=lambda k: races[k].cost)
+    for k, fit in zip(rest, map_(_finish, [(tasks[k], races[k]) for k in rest]), strict=True):
+        found[k] = fit
 
 
 def _leader(tasks: Sequence[Task]) -> int | None:

@@ -233,6 +233,8 @@ class Diagnosis(Shown):
         Of the model after the last rung.
     remainder : Remainder or None
         What is left beside all effects: noise, fluctuation or structure, and what structure follows.
+    stopped : str
+        Why it ended before it was done: the budget was spent, or it was interrupted; empty if it was done.
     """
 
     verdict: str
@@ -249,6 +251,7 @@ class Diagnosis(Shown):
     after: Fit
     remaining: Adequacy
     remainder: Remainder | None = None
+    stopped: str = ""
 
     @property
     def best(self) -> Fit:
@@ -308,6 +311,7 @@ class Diagnosis(Shown):
             "parameters_after": dict(self.after.values),
             "groups": [list(g) for g in self.groups],
             "suggestion": self.suggestion,
+            "stopped": self.stopped or None,
         }
 
 

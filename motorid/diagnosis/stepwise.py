@@ -7,7 +7,8 @@ load) can be overtaken, and after each addition the earlier effects are tried wi
 from __future__ import annotations
 
 import builtins
-from collections.abc import Callable, Iterable, Sequence
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -17,10 +18,13 @@ from motorid.diagnosis.input_hypotheses import Reading, better_reading, without_
 from motorid.diagnosis.misspecification import FormGain, Grade, better_forms, grades_of
 from motorid.diagnosis.model_comparison import Node, at_noise, beats, choose, evidence, far, group_of, tied
 from motorid.diagnosis.record_parts import affordable
+from motorid.diagnosis.refit import INTERRUPTED, OUT_OF_TIME
 from motorid.diagnosis.results import Adequacy, Candidate, Ladder, Rung
+from motorid.diagnosis.verdict import first_answer
+from motorid.errors import OutOfTime
 from motorid.estimation.result import Fit
 from motorid.model.definition import Effect
-from motorid.numerics.parallel import one_thread
+from motorid.numerics.parallel import budget, interruption, one_thread
 from motorid.records.experiment import Experiment
 
 BEAM = 2
@@ -33,6 +37,7 @@ class Climb:
     """What the loop went through: the final path, per round the candidates, the groups of what was chosen.
 
     `form` is the free form that predicts better beside all effects, if any; `grades` are of the effects, in order.
+    `stopped` says why it ended before it was done, if it did.
     """
 
     search: Search
@@ -44,47 +49,88 @@ class Climb:
     remaining: Adequacy
     form: FormGain | None = None
     grades: tuple[Grade, ...] = ()
+    stopped: str = ""
 
 
-def climb(search: Search, max_effects: int, advance: Callable[[str], None]) -> Climb:
-    """Run the loop until nothing more is worth adding."""
-    best, frontier = search.root, [search.root]
-    judged = first = judge_adequacy(best, search.scores(best))
-    rounds: list[tuple[Candidate, ...]] = []
-    groups: list[tuple[str, ...]] = []
-    text = f"stopped at the limit of {max_effects} effects"
+def climb(search: Search, max_effects: int, advance: Callable[[str], None], seconds: float | None = None) -> Climb:
+    """Run the loop until nothing more is worth adding, until the time is up, or until it is interrupted (Ctrl-C).
+
+    What was found by then is the answer; `stopped` says so.
+    """
+    scores = search.scores(search.root)
+    first = judge_adequacy(search.root, scores)
+    advance(first_answer(search.root.fit, first, scores))
+    found, stopped = Climb(search, (search.root,), (), (), "", first, first), ""
+    steps = _rounds(found, max_effects, advance)
+    try:
+        with budget(seconds):
+            while (further := next(steps, None)) is not None:
+                found = further
+    except (OutOfTime, KeyboardInterrupt) as error:
+        interruption.heard()
+        stopped = OUT_OF_TIME if isinstance(error, OutOfTime) else INTERRUPTED
+    stopped = stopped or found.stopped
+    if stopped:
+        found = replace(found, stopped=stopped, text=f"stopped early: {stopped}; more may be missing",
+                        rounds=found.rounds or (tuple(search.listed(scores, {}, stopped)),),
+                        remaining=judge_adequacy(found.path[-1]))
+    return _finished(found)
+
+
+def _rounds(found: Climb, max_effects: int, advance: Callable[[str], None]) -> Iterator[Climb]:
+    """Yield how far the loop is, after every step that may be the last."""
+    search, best = found.search, found.search.root
+    frontier = [best]
     for _ in range(max_effects):
-        if judged.adequate and at_noise(best):
-            text = "stopped: what is left is noise"
+        room = max_effects - len(best.key) + len(search.root.key)  # two effects may have come at once
+        if room < 1 or (found.remaining.adequate and at_noise(best)):
             break
-        room = max_effects - len(best.key) + len(search.root.key)
-        if room < 1:  # two effects may have come at once
-            break
-        children: dict[frozenset[str], Node] = {}
-        for k, node in enumerate(frontier):
-            grown, listed = search.expand(node)
-            if k == 0:
-                rounds.append(tuple(listed))
-            children |= {c.key: c for c in grown if c.key not in children}
+        children, listed, stopped = _grown(search, frontier)
+        found = replace(found, rounds=(*found.rounds, tuple(listed)), stopped=stopped)
         chosen = _better(children.values(), best)
-        if chosen is None and room > 1 and far(best.fit):
+        if chosen is None and room > 1 and not stopped and far(best.fit):
             children = {c.key: c for c in search.expand_by_two(best)}
             chosen = _better(children.values(), best)
         if chosen is None:
-            text = "stopped: no further effect lowers the error on data it was not fitted to"
-            break
+            yield replace(found, text="stopped: no further effect lowers the error on data it was not fitted to")
+            return
         new, ordered = chosen
         search.nodes |= children
-        best = search.pruned(new, best)
-        chosen_of = best if best.added != new.added and best.parent is new.parent else new
+        yield _with(found, new, new, new.parent is frontier[0], ())
+        if stopped:
+            return
+        pruned = search.pruned(new, best)
+        same = pruned.added != new.added and pruned.parent is new.parent
+        chosen_of = pruned if same else new
         group = group_of(chosen_of, ordered, {e.name: e.includes for e in search.effects})
-        if new.parent is frontier[0]:
-            rounds[-1] = _marked(rounds[-1], chosen_of, group)
-        groups.append((chosen_of.added or "", *group) if group else ())
-        frontier = [best, *_runners_up(best, ordered)][:BEAM]
-        judged = judge_adequacy(best, search.scores(best))
+        found = _with(found, pruned, chosen_of, new.parent is frontier[0], group)
+        found = replace(found, remaining=judge_adequacy(pruned, search.scores(pruned)))
+        best, frontier = pruned, [pruned, *_runners_up(pruned, ordered)][:BEAM]
         advance(f"accepted {chosen_of.added}")
-    return _finished(Climb(search, tuple(_path(best)), tuple(rounds), tuple(groups), text, first, judged))
+        yield found
+    done = found.remaining.adequate and at_noise(best)
+    yield replace(found, text="stopped: what is left is noise" if done
+                  else f"stopped at the limit of {max_effects} effects")
+
+
+def _grown(search: Search, frontier: Sequence[Node]) -> tuple[dict[frozenset[str], Node], list[Candidate], str]:
+    """Return the children of all models of a round, the candidates of the first, and why it ended early, if it did."""
+    children: dict[frozenset[str], Node] = {}
+    first: list[Candidate] = []
+    for node in frontier:
+        grown, listed = search.expand(node)
+        first = first or listed
+        children |= {c.key: c for c in grown if c.key not in children}
+        if stopped := next((c.reason for c in listed if c.reason in (OUT_OF_TIME, INTERRUPTED)), ""):
+            return children, first, stopped
+    return children, first, ""
+
+
+def _with(found: Climb, best: Node, chosen: Node, ranked: bool, group: tuple[str, ...]) -> Climb:
+    """Return a climb that has come to `best`; the candidate that was chosen is marked where it was `ranked`."""
+    rounds = (*found.rounds[:-1], _marked(found.rounds[-1], chosen, group)) if ranked else found.rounds
+    groups = (*found.groups, (chosen.added or "", *group)) if group else found.groups
+    return replace(found, path=tuple(_path(best)), rounds=rounds, groups=groups)
 
 
 def _finished(found: Climb) -> Climb:
@@ -95,7 +141,7 @@ def _finished(found: Climb) -> Climb:
     structure = not found.remaining.adequate
     forms = better_forms(best.fit, best.predictions) if structure else []
     grades = grades_of(best, search.root, groups, forms, structure,
-                       lambda name: search.smaller(best, best.fit.model.without(name)))
+                       lambda name: None if found.stopped else search.smaller(best, best.fit.model.without(name)))
     return replace(found, rounds=rounds, groups=groups, form=next(iter(forms), None), grades=grades)
 
 
@@ -127,14 +173,17 @@ class Records:
 
 
 def explored(fit: Fit, validate: Sequence[Experiment] | Experiment | None, effects: Sequence[Effect],
-             map_: Callable[..., Iterable[Any]], advance: Callable[[str], None], max_effects: int) -> tuple[Climb, str]:
+             map_: Callable[..., Iterable[Any]], advance: Callable[[str], None], max_effects: int,
+             seconds: float | None = None) -> tuple[Climb, str]:
     """Return the climb, and what to say of how the records were read.
 
     A misfit that something missing dominates may hide a better reading of the voltage; then it is climbed again.
     """
+    began = time.monotonic()
 
     def climbed(records: Records) -> Climb:
-        return climb(Search(records.fit, records.held_out, effects, map_, advance), max_effects, advance)
+        left = None if seconds is None else seconds - (time.monotonic() - began)
+        return climb(Search(records.fit, records.held_out, effects, map_, advance), max_effects, advance, left)
 
     records = Records(affordable(fit), [validate] if isinstance(validate, Experiment) else validate)
     for better in (without_spikes, better_reading):
@@ -142,7 +191,7 @@ def explored(fit: Fit, validate: Sequence[Experiment] | Experiment | None, effec
             records = records.read(reading)
     found = climbed(records)
     last = found.path[-1]
-    if reading := _late_reading(found.path):
+    if not found.stopped and (reading := _late_reading(found.path)):
         again = records.read(reading)
         anew = climbed(again)
         new = anew.path[-1]

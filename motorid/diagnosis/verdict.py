@@ -9,6 +9,7 @@ import numpy as np
 from motorid.diagnosis.misspecification import Grade
 from motorid.diagnosis.model_comparison import Node
 from motorid.diagnosis.results import Adequacy, Candidate, Missing, Rung
+from motorid.diagnosis.score_test import Score
 from motorid.diagnosis.thresholds import ELSEWHERE, LARGER, LOST
 from motorid.display.numbers import number, percent, with_error
 from motorid.effects import LIBRARY
@@ -21,6 +22,13 @@ SPIKED = 0.5  # of a channel's squared error: what outliers must make to be wort
 RPM = 30 / np.pi
 
 
+def first_answer(fit: Fit, judged: Adequacy, scores: Sequence[Score]) -> str:
+    """Return what a look without any refit says: whether the model fits, and what to try first."""
+    likely = [f"{s.effect.name} ({percent(s.drop, 2)})" for s in scores[:3] if s.drop > 0]
+    next_ = f"; most promising: {', '.join(likely)} of the squared misfit" if likely and not judged.adequate else ""
+    return f"first answer: {fit.verdict.rstrip('.')}{next_}"
+
+
 def adequate_text(judged: Adequacy, ranking: Sequence[Candidate]) -> str:
     """Return the verdict when nothing is missing."""
     near = [c for c in ranking if c.refit_drop]
@@ -29,13 +37,16 @@ def adequate_text(judged: Adequacy, ranking: Sequence[Candidate]) -> str:
 
 
 def unexplained_text(judged: Adequacy, missing: Missing, ranking: Sequence[Candidate], rungs: Sequence[Rung],
-                     grades: Sequence[Grade]) -> str:
-    """Return the verdict when something is missing that the library does not have, or only something like it."""
+                     grades: Sequence[Grade], done: bool = True) -> str:
+    """Return the verdict when something is missing that the library does not have, or only something like it.
+
+    Not `done`: the search was stopped before all effects were tried.
+    """
     parts = [judged.text, missing.text]
     if grades:
         parts += [approximations_text(grades), _errors(rungs[0], rungs[-1])]
         return " ".join(parts)
-    parts.append("None of the library's effects explains it.")
+    parts.append("None of the library's effects explains it." if done else "Not all effects were tried.")
     tried = [c for c in ranking if c.refit_drop is not None]
     best = max(tried, key=lambda c: c.refit_drop or 0.0, default=None)
     if best is not None and (best.refit_drop or 0) > 0.05:

@@ -25,6 +25,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from motorid.errors import FitError, SimulationError
+from motorid.numerics.parallel import check_time
 from motorid.numerics.signals import Array
 
 
@@ -130,11 +131,14 @@ def levenberg_marquardt(residual: Callable[[Array], Array], both: Callable[[Arra
     ------
     FitError
         If the residual cannot be computed at the start.
+    OutOfTime
+        If the budget of time around the call is spent.
     """
     o = options or LevenbergMarquardt()
     search = _Search(residual, both, np.asarray(q0, float), bounds, o, log)
     history, status = [search.cost], ""
     for iteration in range(1, o.max_iterations + 1):
+        check_time()
         before = search.q
         status = search.step()
         if search.q is not before:

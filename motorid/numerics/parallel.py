@@ -15,6 +15,7 @@ import pickle
 import signal
 import sys
 import threading
+import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, ContextDecorator, contextmanager
@@ -23,6 +24,8 @@ from dataclasses import dataclass, field
 from functools import lru_cache
 from importlib.util import find_spec
 from typing import Any, NamedTuple
+
+from motorid.errors import OutOfTime
 
 Map = Callable[..., Iterable[Any]]
 WAVE = 4e6  # bytes of records handed to a pool at once; two waves are under way
@@ -59,6 +62,28 @@ class OneThread(ContextDecorator):
 
 
 one_thread = OneThread()
+_deadline: ContextVar[float] = ContextVar("motorid_deadline", default=float("inf"))
+
+
+@contextmanager
+def budget(seconds: float | None) -> Iterator[None]:
+    """Let `check_time` raise `OutOfTime` once so many seconds have passed; never for None."""
+    token = _deadline.set(_deadline.get() if seconds is None else min(_deadline.get(), time.monotonic() + seconds))
+    try:
+        yield
+    finally:
+        _deadline.reset(token)
+
+
+def check_time() -> None:
+    """Raise `OutOfTime` if the budget around this call is spent; called once an iteration by whatever takes long.
+
+    Raises
+    ------
+    OutOfTime
+    """
+    if time.monotonic() > _deadline.get():
+        raise OutOfTime
 
 
 @lru_cache(maxsize=1)

@@ -1,0 +1,92 @@
+"""A diagnosis answers at any time: at once, when its budget is spent, when it is interrupted."""
+
+from __future__ import annotations
+
+import json
+import time
+
+import pytest
+from typer.testing import CliRunner
+
+import motorid as mi
+from motorid.cli.app import app
+from motorid.diagnosis import candidates, refit
+from motorid.errors import OutOfTime
+from motorid.numerics.parallel import budget, check_time
+from motorid.records.datasets import data_path
+
+RUNS, CHECK = (str(data_path("hidden_friction") / name) for name in ("run1.csv", "check1.csv"))
+
+
+@pytest.fixture(scope="module")
+def plain():
+    return mi.fit(mi.dc_motor(), mi.read_runs(RUNS))
+
+
+def interrupted_at(monkeypatch, count: int) -> None:
+    """Press Ctrl-C while the `count`-th refit is finished."""
+    finish, left = refit._finish, [count]
+
+    def pressed(task):
+        left[0] -= 1
+        if not left[0]:
+            raise KeyboardInterrupt
+        return finish(task)
+
+    monkeypatch.setattr(refit, "_finish", pressed)
+
+
+def test_the_first_answer_comes_before_any_refit(plain, monkeypatch):
+    words = []
+    monkeypatch.setattr(candidates, "refits", lambda tasks, map_: words.append("refits") or refit.refits(tasks, map_))
+    mi.diagnose(plain, max_effects=1, progress=words.append)
+    first = next(w for w in words if w.startswith("first answer"))
+    assert words.index(first) < words.index("refits")
+    assert "Fits poorly" in first
+    assert "coulomb (" in first
+
+
+def test_a_spent_budget_gives_the_ranking_and_says_what_was_not_done(plain):
+    found = mi.diagnose(plain, budget=0)
+    assert found.stopped == "the time is up"
+    assert found.verdict == "unexplained"
+    assert "Not all effects were tried" in found.text
+    assert "Stopped early: the time is up" in found.text
+    assert len(found.ranking) > 20
+    assert found.ranking[0].predicted_drop > 0.5
+    assert json.loads(json.dumps(found.to_dict()))["stopped"] == "the time is up"
+
+
+def test_a_budget_that_is_enough_changes_nothing(plain):
+    free, bounded = mi.diagnose(plain, max_effects=1), mi.diagnose(plain, max_effects=1, budget=600)
+    assert bounded.stopped == free.stopped == ""
+    assert bounded.text == free.text
+
+
+def test_what_was_refitted_before_an_interruption_is_the_answer(plain, monkeypatch):
+    interrupted_at(monkeypatch, 2)
+    found = mi.diagnose(plain)
+    assert found.stopped == "interrupted"
+    assert len(found.ladder.rungs) == 2  # the most promising effect was finished first
+    assert found.ladder.rungs[1].gain > 0
+    assert "Stopped early: interrupted" in found.text
+    assert any(c.reason == "interrupted" for c in found.ranking)
+
+
+def test_the_command_line_keeps_what_there_is_and_says_130(monkeypatch, tmp_path):
+    interrupted_at(monkeypatch, 2)
+    out = tmp_path / "found.json"
+    done = CliRunner().invoke(app, ["diagnose", RUNS, "--validate", CHECK, "--json", str(out)])
+    assert done.exit_code == 130
+    assert "First answer: Fits poorly" in done.output
+    assert json.loads(out.read_text())["stopped"] == "interrupted"
+
+
+def test_a_budget_ends_with_its_block_and_an_inner_one_is_no_longer():
+    with budget(0), budget(600):
+        time.sleep(1e-3)
+        with pytest.raises(OutOfTime):
+            check_time()
+    check_time()
+    with budget(600), budget(None):
+        check_time()
