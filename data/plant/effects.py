@@ -3,12 +3,16 @@
 An effect is a function of the motor and its own numbers that returns what it does:
 
     drive(v, w) -> v          the bridge: from the commanded voltage to the one at the terminals
+    bridge(v, i) -> v         the supply behind it: from the voltage of the bridge to the one at the terminals
+    diodes -> V               the bridge opens at command 0; what then stands against the dying current
+    limit -> A                the current that the bridge does not let grow any further
     drop(i) -> V              voltage lost in the winding circuit
     R(dT), L(i), K(i), Kt(th) -> factor on that constant (K in both balances, Kt in the torque alone)
     torque(i, w, th, t) -> N·m on the shaft, continuous in its arguments
     dry(i, w, th, s, t) -> N·m, level of dry friction when sliding (or about to slide) in direction s = ±1
     heat(i, dT) -> K/s        rate of the temperature rise
     part(i, w, th, x) -> (torque, rates)   something with states x of its own, which start at `x0`
+    flux(x) -> factor on K in both balances, of the states of the effect's part
     sensor -> (kind, number)  what happens between the shaft and the logger
     rate                      1/s, the fastest rate it adds, for the choice of the integration step
 """
@@ -86,6 +90,31 @@ def voltage_offset(m: Motor, V_0: float) -> Hooks:
     return {"drive": lambda v, w: v + V_0}
 
 
+@_known
+def driver_coast(m: Motor, V_c: float) -> Hooks:
+    return {"diodes": V_c}
+
+
+@_known
+def driver_current_limit(m: Motor, I_lim: float) -> Hooks:
+    return {"limit": I_lim}
+
+
+@_known
+def supply_sag(m: Motor, R_s: float, V_s: float) -> Hooks:
+    return {"bridge": lambda v, i: v / V_s * (V_s - R_s * v / V_s * i), "rate": (m.R + R_s) / m.L}
+
+
+@_known
+def magnet_heating(m: Motor, R_thm: float, C_thm: float, alpha_m: float = 0.002) -> Hooks:
+    """Magnets of one temperature rise x, with the copper's heat."""
+
+    def part(i: float, w: float, th: float, x: list[float]) -> tuple[float, tuple[float, ...]]:
+        return 0.0, ((m.R * i * i - x[0] / R_thm) / C_thm,)
+
+    return {"part": part, "x0": lambda w, th: (0.0,), "flux": lambda x: 1 / (1 + alpha_m * x[0])}
+
+
 # ---------------------------------------------------------------- torque
 
 
@@ -138,6 +167,28 @@ def load_friction(m: Motor, mu: float) -> Hooks:
 def viscous_asymmetric(m: Motor, b_a: float) -> Hooks:
     """Viscous friction b + b_a forward and b − b_a backward."""
     return {"torque": lambda i, w, th, t: -b_a * abs(w)}
+
+
+@_known
+def eddy_brake(m: Motor, c_e: float, omega_b: float) -> Hooks:
+    return {"torque": lambda i, w, th, t: -c_e * w / (1 + (w / omega_b) ** 2)}
+
+
+@_known
+def spring(m: Motor, k_s: float, theta_0: float = 0.0) -> Hooks:
+    return {"torque": lambda i, w, th, t: -k_s * (th - theta_0)}
+
+
+@_known
+def angular_friction(m: Motor, tau_m: float, a_f: float, N_f: float = 1, phi_f: float = 0.0) -> Hooks:
+    """A bent shaft or an oval bearing: dry friction that depends on the angle."""
+    return {"dry": lambda i, w, th, s, t: tau_m * (1 + a_f * sin(N_f * th + phi_f))}
+
+
+@_known
+def gear_efficiency(m: Motor, mu_d: float, mu_b: float) -> Hooks:
+    """Of the motor's torque a share is lost, another one when it brakes."""
+    return {"dry": lambda i, w, th, s, t: (mu_d if i * s > 0 else mu_b) * abs(m.K * i)}
 
 
 @_known
@@ -213,13 +264,35 @@ def speed_gain(m: Motor, k_w: float) -> Hooks:
     return {"sensor": ("speed_gain", 1 + k_w)}
 
 
+@_known
+def speed_average(m: Motor, T_a: float) -> Hooks:
+    """The angle now less that of T_a seconds ago, over T_a."""
+    return {"sensor": ("speed_average", T_a)}
+
+
+@_known
+def speed_offset(m: Motor, w_0: float) -> Hooks:
+    return {"sensor": ("speed_offset", w_0)}
+
+
+@_known
+def current_gain(m: Motor, k_i: float) -> Hooks:
+    return {"sensor": ("current_gain", 1 + k_i)}
+
+
+@_known
+def supply_side_current(m: Motor, V_dc: float, u_i: float = 0) -> Hooks:
+    """Times the duty; the supply's current, without the motor's sign, if u_i is 1."""
+    return {"sensor": ("duty", lambda v: (v if u_i else abs(v)) / V_dc)}
+
+
 # ---------------------------------------------------------------- beyond the library
 
 
 @_unknown
-def angle_friction(m: Motor, tau_c: float, c: float, phi: float = 0.0) -> Hooks:
-    """A bent shaft or an oval bearing: dry friction that depends on the angle."""
-    return {"dry": lambda i, w, th, s, t: tau_c * (1 + c * sin(th + phi))}
+def tight_spot(m: Motor, tau_c: float, c: float, kappa: float = 8.0, phi: float = 0.0) -> Hooks:
+    """A dent in the bearing: dry friction that is (1 + c) times as large in one narrow place."""
+    return {"dry": lambda i, w, th, s, t: tau_c * (1 + c * exp(kappa * (cos(th + phi) - 1)))}
 
 
 @_unknown
@@ -235,7 +308,7 @@ def grease_warm_up(m: Motor, tau_c: float, extra: float, t_g: float) -> Hooks:
 
 
 @_unknown
-def supply_sag(m: Motor, s: float) -> Hooks:
+def bridge_loss(m: Motor, s: float) -> Hooks:
     """The bridge loses the fraction s of its voltage at the no-load speed, and as speed³ below."""
     return {"drive": lambda v, w: v * (1 - s * abs(w / m.no_load_speed) ** 3)}
 

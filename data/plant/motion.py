@@ -8,7 +8,7 @@ breakaway level) or slides on. A stuck shaft stays at exactly zero speed until t
 from __future__ import annotations
 
 from collections.abc import Callable
-from math import ceil
+from math import ceil, copysign, inf
 
 import numpy as np
 
@@ -54,6 +54,8 @@ class Plant:
         self._y = [0.0, float(omega0), float(theta0), 0.0, *x0]  # i, omega, theta, dT, and states of parts
         self._s = (0 if omega0 == 0 else 1 if omega0 > 0 else -1) if self._level else FREE
         self._sensors = Chain(hooks, omega0)
+        self._v, self._coasts = 0.0, any("diodes" in h for h in hooks)
+        self._limit = min((h["limit"] for h in hooks if "limit" in h), default=inf)
 
     i = property(lambda self: self._y[0])
     omega = property(lambda self: self._y[1])
@@ -67,15 +69,24 @@ class Plant:
         h = dt / n
         slope = 0.0 if v_end is None else (v_end - v) / n
         t0 = self.t
+        self._v = v + n * slope
         for k in range(n):
+            i = self._y[0]
             self._advance(v + k * slope, v + (k + 1) * slope, h)
+            if self._coasts and v == 0 == slope and i * self._y[0] <= 0:
+                self._y[0] = 0.0  # the diodes let no current turn round
+            if abs(i) <= self._limit < abs(self._y[0]):
+                self._y[0] = copysign(self._limit, i)  # it is reached within the step
             self.t = t0 + (k + 1) * h
             self._sensors.sample(self.t, h, self._y[0], self._y[1])
         return self.measured()
 
-    def measured(self) -> dict[str, float]:
-        """Current, speed and angle as the sensors give them (no noise; see `sensors.py` for that)."""
-        return self._sensors.read(self.t, self._y)
+    def measured(self, v: float | None = None) -> dict[str, float]:
+        """Current, speed and angle as the sensors give them (no noise; see `sensors.py` for that).
+
+        With v volts commanded meanwhile, which a sensor before the bridge sees; by default the latest.
+        """
+        return self._sensors.read(self.t, self._y, self._v if v is None else v)
 
     def _advance(self, v0: float, v1: float, h: float) -> None:
         if self._s == FREE:
@@ -139,13 +150,15 @@ def _physics(m: Motor, hooks: list[dict], omega0: float, theta0: float) -> tuple
         return [h[kind] for h in hooks if kind in h]
 
     drives, drops, torques, dries, heats = (every(k) for k in ("drive", "drop", "torque", "dry", "heat"))
-    f_R, f_L, f_K, f_Kt = (every(k) for k in ("R", "L", "K", "Kt"))
-    parts, x0 = [], []
+    f_R, f_L, f_K, f_Kt, bridges = (every(k) for k in ("R", "L", "K", "Kt", "bridge"))
+    diodes, limit = every("diodes"), min(every("limit"), default=None)
+    parts, fluxes, x0 = [], [], []
     for h in hooks:
         if "part" in h:
             start = h["x0"](omega0, theta0)
             first = 4 + len(x0)
             parts.append((h["part"], first, first + len(start)))
+            fluxes += [(h["flux"], first, first + len(start))] if "flux" in h else []
             x0.extend(start)
     R0, L0, K0, b, J = m.R, m.L, m.K, m.b, m.J
 
@@ -155,8 +168,11 @@ def _physics(m: Motor, hooks: list[dict], omega0: float, theta0: float) -> tuple
     def rates(y: list[float], v: float, s: int, t: float) -> list[float]:
         i, w, th, dT = y[0], y[1], y[2], y[3]
         R, L, K, Kt = R0, L0, K0, 1.0
+        opened = diodes and v == 0
         for f in drives:
             v = f(v, w)
+        for f in bridges:
+            v = f(v, i)
         for f in drops:
             v -= f(i)
         for f in f_R:
@@ -165,12 +181,18 @@ def _physics(m: Motor, hooks: list[dict], omega0: float, theta0: float) -> tuple
             L *= f(i)
         for f in f_K:
             K *= f(i)
+        for f, a, z in fluxes:
+            K *= f(y[a:z])
         for f in f_Kt:
             Kt *= f(th)
+        if opened:
+            v = -diodes[0] if i > 0 else diodes[0] if i < 0 else K * w  # no current, no voltage across the winding
         torque = K * Kt * i - b * w
         for f in torques:
             torque += f(i, w, th, t)
         out = [(v - R * i - K * w) / L, 0.0, w, 0.0]
+        if limit is not None and abs(i) >= limit and out[0] * i > 0:
+            out[0] = 0.0
         for f in heats:
             out[3] += f(i, dT)
         for f, a, z in parts:
@@ -206,14 +228,14 @@ def simulate(
         raise ValueError(f"hold is 'zoh' or 'linear', not {hold!r}")
     plant = Plant(motor, effects, omega0, theta0)
     plant.substep = min(plant.substep, substep) if substep else plant.substep
-    rows = [_row(plant)]
+    rows = [_row(plant, float(v[0]))]
     for k in range(len(t) - 1):
         plant.step(float(v[k]), float(t[k + 1] - t[k]), float(v[k + 1]) if hold == "linear" else None)
-        rows.append(_row(plant))
+        rows.append(_row(plant, float(v[k + 1])))
     names = ("i", "omega", "theta", "true_i", "true_omega", "true_theta", "dT")
     columns = np.array(rows).T
     return {"t": t, "v": v} | dict(zip(names, columns, strict=True))
 
 
-def _row(plant: Plant) -> tuple[float, ...]:
-    return (*plant.measured().values(), plant.i, plant.omega, plant.theta, plant.dT)
+def _row(plant: Plant, v: float) -> tuple[float, ...]:
+    return (*plant.measured(v).values(), plant.i, plant.omega, plant.theta, plant.dT)

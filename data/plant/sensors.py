@@ -71,36 +71,45 @@ def resample(t_new: np.ndarray, t: np.ndarray, x: np.ndarray) -> np.ndarray:
 
 
 class Chain:
-    """What happens between the shaft and the logger: lags, a pure delay, a gain, an offset."""
+    """What happens between the shaft and the logger: lags, a pure delay, a mean, gains, offsets, the duty."""
 
     def __init__(self, hooks: list[dict], omega0: float) -> None:
         has = dict(h["sensor"] for h in hooks if "sensor" in h)
         self.lag_i, self.lag_w = has.get("current_lag"), has.get("speed_lag")
         self.delay, self.gain = has.get("speed_delay", 0.0), has.get("speed_gain", 1.0)
-        self.offset = has.get("current_offset", 0.0)
+        self.offset, self.window = has.get("current_offset", 0.0), has.get("speed_average", 0.0)
+        self.speed_offset, self.current_gain = has.get("speed_offset", 0.0), has.get("current_gain", 1.0)
+        self.duty = has.get("duty", lambda v: 1.0)
         self.i, self.w = 0.0, float(omega0)
         self._last = (0.0, float(omega0))
-        self._times, self._speeds = [0.0], [float(omega0)]
+        self._turned, self._omega0 = 0.0, float(omega0)  # the integral of the speed
+        self._times, self._speeds = [0.0], [0.0 if self.window else float(omega0)]
 
     def sample(self, t: float, h: float, i: float, w: float) -> None:
         """Follow the true current and speed, taken as straight lines over the last step of h seconds."""
         self.i = _lag(self.i, self._last[0], i, h, self.lag_i)
         self.w = _lag(self.w, self._last[1], w, h, self.lag_w)
+        if self.window:  # what is kept and looked up is the angle
+            self._turned += 0.5 * h * (self._last[1] + w)
         self._last = (i, w)
-        if self.delay:
+        if self.delay or self.window:
             self._times.append(t)
-            self._speeds.append(self.w)
-            if len(self._times) > 4096 and self._times[2048] < t - self.delay:
+            self._speeds.append(self._turned if self.window else self.w)
+            if len(self._times) > 4096 and self._times[2048] < t - self.delay - self.window:
                 del self._times[:2048], self._speeds[:2048]
 
-    def read(self, t: float, y: list[float]) -> dict[str, float]:
+    def read(self, t: float, y: list[float], v: float) -> dict[str, float]:
+        """Return what is seen at the time t of the state y, with v volts commanded."""
         w = self._delayed(t - self.delay) if self.delay else self.w
-        return {"i": self.i + self.offset, "omega": self.gain * w, "theta": y[2]}
+        if self.window:
+            w = (self._turned - self._delayed(t - self.window)) / self.window
+        i = self.current_gain * self.duty(v) * self.i + self.offset
+        return {"i": i, "omega": self.gain * w + self.speed_offset, "theta": y[2]}
 
     def _delayed(self, t: float) -> float:
         k = bisect_right(self._times, t + 1e-12)
         if k == 0:
-            return self._speeds[0]
+            return self._omega0 * t if self.window else self._speeds[0]
         if k == len(self._times):
             return self._speeds[-1]
         part = max(0.0, (t - self._times[k - 1]) / (self._times[k] - self._times[k - 1]))

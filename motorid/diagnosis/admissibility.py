@@ -45,7 +45,7 @@ def _too_large(fit: Fit, pars: Sequence[Parameter]) -> str:
     top = max(float(np.abs(r.inputs["v"]).max()) for r in fit.problem.experiments)
     for p in pars:
         most = MOST_OFFSET if p.lower < 0 else MOST_LOST
-        if p.unit == "V" and p.null == 0 and abs(fit.values[p.name]) > most * top:
+        if p.vary and p.unit == "V" and p.null == 0 and abs(fit.values[p.name]) > most * top:
             share = percent(abs(fit.values[p.name]) / top, 2)
             return f"{p.name} = {fit.values[p.name]:.3g} V is {share} of the largest voltage, which is not plausible"
     return ""

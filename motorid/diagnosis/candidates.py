@@ -15,6 +15,7 @@ import numpy as np
 
 from motorid.diagnosis.admissibility import objections
 from motorid.diagnosis.cross_validation import HeldOut
+from motorid.diagnosis.misspecification import LIMITER
 from motorid.diagnosis.model_comparison import COMMON, Node, beats, evidence, far, node_of, superfluous
 from motorid.diagnosis.predictive_score import Evidence
 from motorid.diagnosis.refit import GivenUp, Task, lost, refit, refits, widened
@@ -26,12 +27,13 @@ from motorid.errors import FAILURES, ModelError
 from motorid.estimation.result import Fit
 from motorid.model.definition import Effect, Parameter
 from motorid.model.model import Model
+from motorid.records.checks import current_limit
 from motorid.records.experiment import Experiment
 
 SHORTLIST = 6
 PAIRS = 3  # refitted where no single effect helps
 NEAR = 0.4  # of the best score: what a common effect must reach to be refitted too
-ALWAYS = ("compliance", "speed_lag", "speed_delay")  # their score at null says little
+ALWAYS = ("compliance", "speed_lag", "speed_delay", "driver_coast")  # their score at null says little
 Advance = Callable[[str], None]
 
 
@@ -52,6 +54,8 @@ class Search:
         self.effects, self.map, self.advance = list(effects), map_, advance
         self.root = node_of(fit, self.held)
         self._scores: dict[frozenset[str], list[Score]] = {}
+        limited = any(current_limit(run) for run in fit.problem.experiments)
+        self._always = (*ALWAYS, LIMITER) if limited else ALWAYS
         self.nodes: dict[frozenset[str], Node] = {self.root.key: self.root}
 
     def scores(self, node: Node) -> list[Score]:
@@ -83,7 +87,7 @@ class Search:
         present = node.fit.model
         _, wider = self._takeable(present)
         scores = self.scores(node)
-        short = _shortlist(scores, lost(node.fit))
+        short = self._shortlist(node)
         tasks = [Task(node.fit, present + s.effect, s.effect, s.starts, s.drop) for s in short]
         tasks += [widened(node.fit, e) for e in wider]
         fits = refits(tasks, self.map)
@@ -95,6 +99,22 @@ class Search:
             if child is not None:
                 children.append(child)
         return children, self.listed(scores, judged)
+
+    def _shortlist(self, node: Node) -> list[Score]:
+        """Return what is worth a refit: the best, what is common and near the best, and what a score cannot show.
+
+        Far from the records slopes say little, and everything that is common is tried. A line in the spectrum over the
+        angle is no accident, however small beside the rest of the misfit.
+        """
+        scores, astray = self.scores(node), lost(node.fit)
+        near = NEAR * max((s.drop for s in scores), default=0.0)
+        return [
+            s
+            for k, s in enumerate(scores)
+            if (s.drop > 0 and (k < SHORTLIST or s.stands_out or (s.effect.name in COMMON and s.drop > near)))
+            or (s.effect.name in self._always and s.shapes)
+            or (astray and s.effect.name in COMMON)
+        ]
 
     def _takeable(self, model: Model) -> tuple[list[Effect], list[Effect]]:
         """Split the effects into those that can be added and those that would take an earlier one's place."""
@@ -119,7 +139,7 @@ class Search:
 
     def expand_by_two(self, node: Node) -> list[Node]:
         """Return the judged models larger by two effects that only together show: each alone was refused."""
-        present, scores = node.fit.model, _shortlist(self.scores(node), lost(node.fit))
+        present, scores = node.fit.model, self._shortlist(node)
         tasks = []
         for a, b in pairs_of(node.fit, scores, PAIRS):
             with contextlib.suppress(ModelError):
@@ -220,23 +240,6 @@ def _in_place(model: Model, old: Effect, new: Effect) -> Model:
 def _alike(p: Parameter, other: Parameter) -> bool:
     """Tell whether two effects' parameters play the same part: a size, or a shape of the same unit."""
     return p.null == other.null == 0 or (p.null is None and other.null is None and p.unit == other.unit)
-
-
-def _shortlist(scores: Sequence[Score], astray: bool) -> list[Score]:
-    """Return what is worth a refit: the best, what is common and near the best, and what a score cannot show.
-
-    Far from the records (`astray`) slopes say little, and everything that is common is tried.
-
-    A line in the spectrum over the angle is no accident, however small beside the rest of the misfit.
-    """
-    near = NEAR * max((s.drop for s in scores), default=0.0)
-    return [
-        s
-        for k, s in enumerate(scores)
-        if (s.drop > 0 and (k < SHORTLIST or s.stands_out or (s.effect.name in COMMON and s.drop > near)))
-        or s.effect.name in ALWAYS
-        or (astray and s.effect.name in COMMON)
-    ]
 
 
 def _merged(a: Score, b: Score) -> list[dict[str, float]]:

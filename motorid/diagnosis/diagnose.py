@@ -17,7 +17,6 @@ from motorid.diagnosis.results import Diagnosis
 from motorid.diagnosis.stepwise import Climb, explored, ladder_of
 from motorid.diagnosis.verdict import (
     adequate_text,
-    averaging_remark,
     balance_of,
     closed_loop_remark,
     held_out_remark,
@@ -111,7 +110,7 @@ def _remarks(found: Climb, driven: str) -> list[str]:
     limits = (f"In {run.name} {limit}" for run in first.problem.experiments if (limit := current_limit(run)))
     stopped = f"Stopped early: {found.stopped}; more may be missing." if found.stopped else ""
     return [stopped, driven, next(limits, ""), parts_remark(first), unfinished_remark(last),
-            held_out_remark(found.path[-1]), measured_angle_remark(last), averaging_remark(last), outliers_remark(last),
+            held_out_remark(found.path[-1]), measured_angle_remark(last), outliers_remark(last),
             closed_loop_remark(first)]
 
 

@@ -31,6 +31,8 @@ from motorid.estimation.result import Fit
 from motorid.model.definition import Effect
 from motorid.records.checks import current_limit
 
+LIMITER = "driver_current_limit"
+
 
 @dataclass(frozen=True)
 class FormGain:
@@ -105,7 +107,7 @@ def grades_of(last: Node, root: Node, groups: Sequence[Sequence[str]], beside: S
         Gives the model without one of the effects; None where there is none.
     """
     rivals = {g[0]: g[1:] for g in groups}
-    limited = structure and any(current_limit(run) for run in root.fit.problem.experiments)
+    limited = structure and LIMITER not in last.key and any(current_limit(run) for run in root.fit.problem.experiments)
     found = []
     for e in (e for e in last.fit.model.effects if e.name not in root.key):
         why, form = objections(last.fit, e, root.fit), None

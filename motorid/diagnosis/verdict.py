@@ -172,22 +172,6 @@ def held_out_remark(node: Node) -> str:
             "do not determine the model there, or something acts there that they do not show.")
 
 
-def averaging_remark(fit: Fit) -> str:
-    """Say so where a delay and a lag of the speed are what an average over some samples makes of it.
-
-    A mean over W is late by W/2 and has a variance of W²/12; so have a delay of 0.21 W and a lag of 0.29 W.
-    """
-    v = fit.values
-    if not {"T_d", "T_w"} <= set(v) or not 0.3 < v["T_d"] / max(v["T_w"], 1e-300) < 2.0:
-        return ""
-    window = 2 * (v["T_d"] + v["T_w"])
-    samples = window / fit.problem.experiments[0].dt
-    return (
-        f"Delay and lag together are what a mean over {number(1e3 * window, 2)} ms (about {number(samples, 2)} "
-        "samples) does: a speed counted or averaged so?"
-    )
-
-
 def inseparable_remark(same: Mapping[str, tuple[str, ...]]) -> str:
     """Say which effects were refused since parameters of the model together do the same."""
     by_parameters: dict[tuple[str, ...], list[str]] = {}

@@ -4,37 +4,58 @@ from __future__ import annotations
 
 from motorid.effects.electrical import (
     brush_drop,
+    driver_coast,
+    driver_current_limit,
     driver_dead_band,
     inductance_saturation,
+    magnet_heating,
     magnetic_saturation,
+    supply_sag,
     voltage_offset,
     winding_heating,
 )
 from motorid.effects.mechanical import (
+    angular_friction,
     backlash,
     cogging,
     compliance,
     constant_load,
     coulomb,
     coulomb_asymmetric,
+    eddy_brake,
+    gear_efficiency,
     gravity,
     load_friction,
     lugre,
     quadratic_drag,
+    spring,
     stribeck,
     torque_ripple,
     viscous_asymmetric,
 )
-from motorid.effects.sensor import current_lag, current_offset, speed_delay, speed_gain, speed_lag
+from motorid.effects.sensor import (
+    current_gain,
+    current_lag,
+    current_offset,
+    speed_average,
+    speed_delay,
+    speed_gain,
+    speed_lag,
+    speed_offset,
+    supply_side_current,
+)
 from motorid.errors import ModelError, one_of
 from motorid.model.definition import Effect
 
 LIBRARY: dict[str, Effect] = {
     e.name: e
-    for e in (brush_drop, winding_heating, inductance_saturation, magnetic_saturation, driver_dead_band, voltage_offset,
-              coulomb, coulomb_asymmetric, stribeck, quadratic_drag, constant_load, gravity, cogging, torque_ripple,
-              load_friction, viscous_asymmetric, lugre, compliance, backlash,
-              speed_lag, current_lag, speed_delay, current_offset, speed_gain)
+    for e in (brush_drop, winding_heating, magnet_heating, inductance_saturation, magnetic_saturation, driver_dead_band,
+              driver_coast, driver_current_limit, supply_sag, voltage_offset,
+              coulomb, coulomb_asymmetric, stribeck, lugre, angular_friction, viscous_asymmetric, quadratic_drag,
+              eddy_brake, load_friction, gear_efficiency, constant_load, gravity, spring, cogging, torque_ripple,
+              compliance, backlash,
+              speed_lag, speed_delay, speed_average, speed_gain, speed_offset, current_lag, current_offset,
+              current_gain, supply_side_current)
 }
 
 

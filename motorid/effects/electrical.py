@@ -58,3 +58,53 @@ def winding_heating(m: Equations,
     dT = m.state("dT")
     m.scale("R", 1 + alpha * dT)
     m.rate(dT, (m.R * m.i**2 - dT / R_th) / C_th)
+
+
+@effect(balance="voltage")
+def magnet_heating(m: Equations,
+                   alpha_m=P(0.002, "1/K", null=0.0, vary=False, doc="temperature coefficient of ferrite, fixed"),
+                   R_thm=P(10.0, "K/W", positive=True, grid=(0.3, 1.0, 3.0), doc="thermal resistance to ambient"),
+                   C_thm=P(10.0, "J/K", positive=True, grid=(0.3, 1.0, 3.0), doc="heat capacity")):
+    """Flux that falls as the magnets get warm, K/(1+α·ΔT). Hendershot & Miller, Permanent-Magnet Machines, 2010.
+
+    ``C_th dΔT/dt = R i² − ΔT/R_th``, ΔT = 0 at the start of each run; neodymium has half of ferrite's coefficient.
+    """
+    dT = m.state("dT_magnet")
+    m.scale("K", 1 / (1 + alpha_m * dT))
+    m.rate(dT, (m.R * m.i**2 - dT / R_thm) / C_thm)
+
+
+@effect(balance="voltage")
+def supply_sag(m: Equations, R_s=P(0.1, "Ω", null=0.0, lower=0.0, doc="resistance of supply and leads"),
+               V_s=P(12.0, "V", positive=True, vary=False, grid=(1.0,), doc="supply without load, fixed")):
+    """Supply that sags behind the bridge, d·(V_s − R_s·d·i), d = v/V_s. Mohan, Electric Machines and Drives, 2012.
+
+    Only R_s/V_s² acts. Unless V_s is given it is the largest voltage of the records: the duty is one there.
+    """
+    m.voltage -= R_s * (m.command / V_s) ** 2 * m.i
+
+
+OPEN = 1e-3  # of V_c: a command that opens the bridge
+ENDS = 0.02  # of V_c/R: the current at which the diodes let go
+
+
+@effect(balance="voltage")
+def driver_coast(m: Equations, V_c=P(12.0, "V", null=0.0, positive=True, vary=False, grid=(1.0,),
+                                     doc="voltage against the dying current: supply and two diodes, fixed")):
+    """Bridge that opens at command 0: diodes end the current. Mohan, Electric Machines and Drives, 2012."""
+    flows = ca.tanh(m.i * m.R / (ENDS * V_c))  # no current, and the back-EMF stands against the bridge
+    m.voltage -= ca.if_else(ca.fabs(m.command) <= OPEN * V_c, V_c * flows - m.K_e * m.omega * (1 - flows**2), 0)
+
+
+STIFF = 1e3  # times R: what the limiter takes per ampere too much
+
+
+@effect(balance="voltage")
+def driver_current_limit(
+    m: Equations,
+    I_lim=P(5.0, "A", null=float("inf"), positive=True, grid=(0.8, 0.9, 0.97), doc="largest current of the driver"),
+):
+    """Driver that takes voltage away above a current. Mohan, Electric Machines and Drives, 2012."""
+    width = I_lim / STIFF
+    z = (ca.fabs(m.i) - I_lim) / width
+    m.voltage -= STIFF * m.R * width * (ca.fmax(z, 0) + ca.log1p(ca.exp(-ca.fabs(z)))) * ca.sign(m.i)

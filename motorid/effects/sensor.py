@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import casadi as ca
+
 from motorid.model.definition import P, effect
 from motorid.model.equations import Equations
 
@@ -55,3 +57,46 @@ def speed_gain(m: Equations, k_w=P(0.01, "", null=0.0, lower=-0.9, upper=9.0, do
     Needs an angle, or held motor constants, to be told from K and J.
     """
     m.measure("omega", m.measured("omega") * (1 + k_w))
+
+
+@effect(balance="sensor")
+def speed_average(m: Equations, T_a=P(5e-3, "s", null=0.0, positive=True, grid=(2.0, 6.0, 20.0), doc="window of mean")):
+    """Mean speed over a window (counts per interval), Padé of orders 2 and 3. Golub & Van Loan, 2013, sec. 9.3."""
+    # (1 − e⁻ˣ)/x = (120 + 2x²)/(120 + 60x + 12x² + x³) at x = Ts, exact up to x⁵.
+    reaching = m.measured("omega")
+    z = [m.state("omega_mean", m.start["omega"]), m.state("omega_mean_2"), m.state("omega_mean_3")]
+    m.rate(z[0], z[1] / T_a)
+    m.rate(z[1], z[2] / T_a)
+    m.rate(z[2], (120 * (reaching - z[0]) - 60 * z[1] - 12 * z[2]) / T_a)
+    m.measure("omega", z[0] + z[2] / 60)
+
+
+@effect(balance="sensor")
+def speed_offset(m: Equations, w_0=P(0.5, "rad/s", null=0.0, doc="added by the speed sensor")):
+    """Offset of the speed sensor (a tacho, a gyro). Isermann, Identification of Dynamic Systems, 2011.
+
+    While the motor turns, a voltage offset with a load does the same; records at standstill or an angle tell.
+    """
+    m.measure("omega", m.measured("omega") + w_0)
+
+
+@effect(balance="sensor")
+def current_gain(m: Equations, k_i=P(0.01, "", null=0.0, lower=-0.9, upper=9.0, doc="relative error of current scale")):
+    """Wrong scale of the current sensor. Isermann, Identification of Dynamic Systems, 2011.
+
+    R, L, b and J take it up: fix one of them (R by an ohmmeter) to determine it.
+    """
+    m.measure("i", m.measured("i") * (1 + k_i))
+
+
+@effect(balance="sensor")
+def supply_side_current(m: Equations, V_dc=P(12.0, "V", positive=True, vary=False, grid=(1.0,), doc="supply, fixed"),
+                        s_i=P(1.0, "", null=0.0, lower=0.0, upper=1.0, vary=False, doc="1: reads so, fixed"),
+                        u_i=P(0.0, "", vary=False, lower=0.0, upper=1.0, grid=(1.0, 0.0), doc="1: no sign, fixed")):
+    """Current measured before the bridge, d·i at the duty d = abs(v)/V_dc. Mohan, Electric Machines and Drives, 2012.
+
+    With u_i = 1 it has no sign, whichever way the motor is driven. Unless V_dc is given it is the largest voltage of
+    the records; where it is larger, R, L, b and J come out wrong by that factor.
+    """
+    duty = ca.fmin(ca.fabs(m.command) / V_dc, 1) * (1 + u_i * (ca.sign(m.command) - 1))
+    m.measure("i", m.measured("i") * (1 - s_i + s_i * duty))

@@ -112,7 +112,8 @@ def current_limit(run: Experiment) -> str | None:
         return None
     return (f"the current is held at {top:.3g} {run.units['i']} while the voltage stays and the speed changes "
             f"({100 * held / run.n:.0f} % of the samples): a current limit of the driver? Then the motor does not get "
-            "the voltage that was logged. Use a lower voltage, or log the voltage at the motor's terminals.")
+            "the voltage that was logged. Use a lower voltage, log the voltage at the motor's terminals, or model it: "
+            "mi.effects.driver_current_limit.")
 
 
 def _at_stop(y: Array, top: float) -> bool:

@@ -22,7 +22,7 @@ ANGLE = ("i", "omega", "theta")
 
 @dataclass(frozen=True)
 class Case:
-    """One case; `twins` are answers that these data cannot tell from the truth."""
+    """One case; `twins` are answers that these data cannot tell from the truth, `known` is fixed at its true value."""
 
     name: str
     kind: str
@@ -37,11 +37,12 @@ class Case:
     jitter: float = 0.0
     noise: float = 0.01
     twins: tuple[str, ...] = field(default=())
+    known: tuple[str, ...] = ()
 
     @property
     def sensor_effects(self) -> tuple[str, ...]:
-        """Effects that the sensors really have: differences of counts lag by half a sample."""
-        return ("speed_delay", "speed_lag") if self.chain in ("encoder", "coarse") else ()
+        """Effects that the sensors really have: differences of counts are means over a sample."""
+        return ("speed_delay", "speed_lag", "speed_average") if self.chain in ("encoder", "coarse") else ()
 
     def records(self) -> tuple[list[Experiment], list[Experiment]]:
         """Training runs and one held-out run of another kind."""
@@ -54,13 +55,17 @@ class Case:
             runs.append(record(r, self.chain, self.channels, motor, rng, name, self.noise))
         return runs[:-1], runs[-1:]
 
+    def base(self) -> Model:
+        """The motor without effects, `known` parameters fixed."""
+        return dc_motor().fix(**{n: getattr(P.MOTORS[self.motor], n) for n in self.known})
+
     def true_model(self) -> Model | None:
         """The library's model with the true numbers; None where the library lacks the effect."""
         if not set(self.effects) <= set(LIBRARY):
             return None
         motor = P.MOTORS[self.motor]
         values = {n: getattr(motor, n) for n in ("R", "L", "K", "b", "J")}
-        model = dc_motor()
+        model = self.base()
         for name, numbers in self.effects.items():
             words, inertia = in_library_words(name, numbers, motor)
             values |= words
@@ -139,6 +144,32 @@ SINGLES = [
     single("speed_delay", "lab", {"T_d": 6e-3}, train=("prbs", "chirp")),
     single("current_offset", "micro", {"i_0": 0.02}, train=("stairs", "multisine")),
     single("speed_gain", "servo", {"k_w": 0.04}, train=("stairs", "multisine"), channels=ANGLE),
+    single("driver_coast", "lab", {"V_c": 12.0}, train=("pulses", "pulses 0.7"), check="pulses 0.5"),
+    single("driver_current_limit", "lab", {"I_lim": 3.0}, train=("stairs", "prbs 0.8")),
+    single("supply_sag", "wheel", {"R_s": 0.15, "V_s": 13.0}, train=("stairs", "ramps")),
+    single(
+        "magnet_heating",
+        "wheel",
+        {"R_thm": 1.0, "C_thm": 3.0},
+        train=("hard", "hard 0.6"),
+        check="stairs",
+        n=2000,
+        dt=4e-3,
+    ),
+    single("eddy_brake", "wheel", {"c_e": 2e-3, "omega_b": 40.0}, train=("stairs", "ramps")),
+    single("spring", "servo", {"k_s": 0.06, "theta_0": 0.3}, train=("stairs", "chirp"), channels=ANGLE),
+    single(
+        "angular_friction",
+        "servo",
+        {"tau_m": 0.05, "a_f": 0.8, "phi_f": 0.4},
+        train=("stairs", "ramps"),
+        channels=ANGLE,
+    ),
+    single("gear_efficiency", "servo", {"mu_d": 0.1, "mu_b": 0.4}, train=("stairs", "prbs"), known=("J",)),
+    single("speed_average", "lab", {"T_a": 0.02}, train=("prbs", "stairs")),
+    single("speed_offset", "lab", {"w_0": 4.0}, train=("stairs", "chirp"), channels=ANGLE),
+    single("current_gain", "lab", {"k_i": 0.08}, train=("stairs", "multisine"), known=("R",)),
+    single("supply_side_current", "lab", {"V_dc": 6.0}, train=("stairs", "multisine")),
     # The same effects in other motors, with other sensors, channels and drives.
     single("coulomb", "big", {"tau_c": 0.5}, name="coulomb_coloured", chain="coloured", train=("multisine", "ramps")),
     single(
@@ -269,9 +300,9 @@ OUTSIDE = [
     ),
     _case(
         "outside",
-        "angle_friction",
+        "tight_spot",
         "servo",
-        {"angle_friction": {"tau_c": 0.05, "c": 0.8, "phi": 0.4}},
+        {"tight_spot": {"tau_c": 0.03, "c": 2.5, "phi": 0.4}},
         channels=ANGLE,
         train=("stairs", "ramps"),
     ),

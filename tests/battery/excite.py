@@ -12,6 +12,7 @@ from motorid.records.experiment import Experiment
 P = load_plant()
 DT = {"micro": 1e-3, "lab": 1e-3, "servo": 2e-3, "wheel": 2e-3, "big": 1e-3}
 STAIRS = np.array([0.5, 1, 0.25, -0.4, -1, -0.2, 0.3, 0.12, -0.12, 0.7])
+PULSES = np.array([0.6, 0, 1, 0, -0.5, 0, 0.25, 0, -1, 0])
 FORWARD = np.array([0.5, 1, 0.35, 0.7, 0.3, 0.9, 0.4, 0.6])
 
 
@@ -40,6 +41,7 @@ def voltages(words: str, motor, n: int, dt: float, rng: np.random.Generator) -> 
         "ramps": lambda: P.triangle(u, T, T / 2.5, dt),
         "multisine": lambda: P.multisine(u, T, np.array([1.3, 2.9, 4.7, 7.9, 12.1]) / T, rng, dt),
         "slow": lambda: P.multisine(u, T, np.array([0.7, 1.3, 2.1]) / T, rng, dt),
+        "pulses": lambda: P.staircase(u * PULSES, (T - onset) / len(PULSES), onset, dt),
         "coast": lambda: P.coast_down(u, 0.4 * T, T, dt),
         "gentle": lambda: _raised(P.multisine(u / 3, T, np.array([0.7, 1.3, 2.1]) / T, rng, dt), 2 * u / 3),
         "waves": lambda: _raised(P.multisine(u / 3, T, np.array([1.3, 2.9, 4.7]) / T, rng, dt), 2 * u / 3),

@@ -20,7 +20,7 @@ def run_case(case: Case) -> Row:
     """Fit, diagnose with the held-out run, and compare with what the true model reaches."""
     runs, check = case.records()
     began, cpu = time.perf_counter(), time.process_time()
-    fit = mi.fit(mi.dc_motor(), runs)
+    fit = mi.fit(case.base(), runs)
     fitted = time.perf_counter()
     found = mi.diagnose(fit, validate=check)
     ended, cpu = time.perf_counter(), time.process_time() - cpu

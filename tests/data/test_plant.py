@@ -55,9 +55,9 @@ def test_every_effect_acts_and_does_not_depend_on_the_integration_step(plant, la
     effects = {name: NUMBERS[name]}
     coarse, fine = (plant.simulate(lab, effects, t, v, substep=h) for h in (50e-6, 10e-6))
     plain = plant.simulate(lab, {}, t, v)
-    tolerance = 4e-4 if name == "backlash" else 1e-4  # backlash: contact is not searched for
+    tolerance = 5e-4 if name in ("backlash", "driver_coast") else 1e-4  # contact, end of current: not searched for
     moved = max(largest(fine[c] - plain[c], plain[c]) for c in ("i", "omega"))
-    assert moved > (1e-6 if name in ("winding_heating", "supply_sag") else 1e-3)
+    assert moved > (1e-6 if name in ("winding_heating", "magnet_heating", "bridge_loss") else 1e-3)
     for channel in ("i", "omega", "theta"):
         assert largest(coarse[channel] - fine[channel], fine[channel]) < min(tolerance, moved / 50)
 
@@ -158,7 +158,8 @@ def test_slow_positioning_with_static_friction_sticks_and_slips(plant):
 
 
 DISSIPATIVE = ["coulomb", "coulomb_asymmetric", "stribeck", "quadratic_drag", "load_friction",
-               "angle_friction", "grease_warm_up", "root_drag", "belt_splice"]  # fmt: skip
+               "angular_friction", "eddy_brake",
+               "gear_efficiency", "tight_spot", "grease_warm_up", "root_drag", "belt_splice"]  # fmt: skip
 
 
 @pytest.mark.parametrize("omega0", [60.0, -60.0])

@@ -76,16 +76,16 @@ def beyond(plant):
     """Effects made up here, put into the plant."""
     effects = plant.effects.BEYOND
     effects["ageing"] = lambda m, tau_c, rise: {"dry": lambda i, w, th, s, t: tau_c * (1 + rise * t)}
-    effects["spring"] = lambda m, k: {"torque": lambda i, w, th, t: -k * th * abs(th)}
+    effects["hard_spring"] = lambda m, k: {"torque": lambda i, w, th, t: -k * th * abs(th)}
     effects["dip"] = lambda m, s: {"drive": lambda v, w: v * (1 - s * abs(v) / (m.i_max * m.R / 2))}
     yield plant
-    for name in ("ageing", "spring", "dip"):
+    for name in ("ageing", "hard_spring", "dip"):
         effects.pop(name)
 
 
 @pytest.mark.parametrize("validated", [True, False])
 def test_friction_that_changes_along_a_turn_is_not_called_coulomb(lab, validated):
-    found = diagnosed(runs_of(lab, {"angle_friction": {"tau_c": 8e-3, "c": 0.7}}), validated=validated)
+    found = diagnosed(runs_of(lab, {"angular_friction": {"tau_m": 8e-3, "a_f": 0.7}}), validated=validated)
     is_like(found, "a friction that changes with the angle")
     assert len(found.ladder.rungs) > 1  # something of the library helps
 
@@ -106,7 +106,7 @@ def test_friction_that_grows_is_not_called_coulomb(beyond, lab):
 
 
 def test_a_spring_is_not_called_a_constant_load(beyond, lab):
-    found = diagnosed(runs_of(lab, {"spring": {"k": 3e-5}}), ("constant_load", "coulomb", "viscous_asymmetric"))
+    found = diagnosed(runs_of(lab, {"hard_spring": {"k": 3e-5}}), ("constant_load", "coulomb", "viscous_asymmetric"))
     is_like(found, "a load that changes with the angle")
 
 
@@ -153,7 +153,7 @@ def test_a_motor_that_is_another_in_every_run_lacks_no_effect(lab, name, factors
 
 
 def test_improve_grades_its_rungs_too(lab):
-    runs = runs_of(lab, {"angle_friction": {"tau_c": 8e-3, "c": 0.7}})
+    runs = runs_of(lab, {"angular_friction": {"tau_m": 8e-3, "a_f": 0.7}})
     ladder = mi.improve(mi.fit(mi.dc_motor(), runs[:-1]), runs[-1:], effects=FRICTION)
     assert [r.grade for r in ladder.rungs[1:]] == ["approximates"]
     assert "which the library lacks, predicts better in its place" in ladder.rungs[1].why

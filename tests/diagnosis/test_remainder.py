@@ -20,9 +20,10 @@ from motorid.records.reading import write_csv
 ANGLE = ("i", "omega", "theta")
 FAST, SLOW = ("stairs", "ramps", "steps"), ("stairs 0.5", "ramps 0.6", "steps 0.5")
 BRAKE = {"eddy": {"top": 2e-2, "w": 25.0}}
+BENT = {"angular_friction": {"tau_m": 8e-3, "a_f": 0.7}}
 CASES = {
     "eddy brake": (BRAKE, FAST, ("i", "omega"), ("coulomb", "quadratic_drag")),
-    "friction over a turn": ({"angle_friction": {"tau_c": 8e-3, "c": 0.7}}, SLOW, ANGLE, ("coulomb", "constant_load")),
+    "friction over a turn": (BENT, SLOW, ANGLE, ("coulomb", "constant_load")),
     "cam": ({"cam": {"A": 2.5e-2}}, SLOW, ANGLE, ("cogging", "gravity", "coulomb")),
     "dip": ({"dip": {"s": 0.25}}, FAST, ("i", "omega"), ("brush_drop", "quadratic_drag")),
     "fading friction": ({"grease_warm_up": {"tau_c": 3e-3, "extra": 4.0, "t_g": 0.3}}, FAST, ("i", "omega"),

@@ -24,8 +24,14 @@ FRICTION = (
     "load_friction",
     "viscous_asymmetric",
     "lugre",
+    "eddy_brake",
+    "angular_friction",
+    "gear_efficiency",
 )
-UNITS = {"V", "A", "rad/s", "rad", "N·m", "s", "1/s", "K/W", "J/K", "1/K", "N·m·s/rad", "N·m·s²/rad²", ""}
+UNITS = {
+    *("", "V", "A", "Ω", "s", "1/s", "rad", "rad/s", "1/K", "K/W", "J/K"),
+    *("N·m", "N·m/rad", "N·m·s/rad", "N·m·s²/rad²"),
+}
 every_effect = pytest.mark.parametrize("effect", LIBRARY.values(), ids=LIBRARY)
 
 
@@ -43,7 +49,7 @@ def parameters(model, **values):
 
 def simulated(model, p, x0=None, v=None):
     t = np.linspace(0, 0.3, 301)
-    v = np.where(t < 0.01, 0, np.where(t < 0.15, 6.0, -5.0)) if v is None else v
+    v = np.select([t < 0.01, t < 0.15, t < 0.25], [0, 6.0, -5.0], 0.0) if v is None else v  # coasts at last
     system = model.system(ALL)
     x0 = np.zeros(len(system.states)) if x0 is None else x0
     grid = Grid.of(t, v[:, None], np.array([True]))
@@ -143,7 +149,7 @@ def model_torque(model, x, p):
 
 
 def test_every_torque_effect_is_either_friction_or_known_to_do_work():
-    drives = {"constant_load", "gravity", "cogging", "torque_ripple"}
+    drives = {"constant_load", "gravity", "spring", "cogging", "torque_ripple"}
     assert {n for n, e in LIBRARY.items() if e.balance == "torque"} == drives | set(FRICTION)
 
 
@@ -165,6 +171,13 @@ def test_says_what_it_is_with_units_limits_and_source(effect):
             "N_r",
             "k_w",
             "s_b",
+            "a_f",
+            "N_f",
+            "mu_d",
+            "mu_b",
+            "k_i",
+            "s_i",
+            "u_i",
         )
     assert effect.balance in ("voltage", "torque", "transmission", "sensor")
 
@@ -178,7 +191,7 @@ def linear_record():
 @every_effect
 def test_a_linear_axis_shows_no_rotary_units(effect):
     electrical = effect.balance == "voltage" and effect.name != "driver_dead_band"  # any command has that
-    if electrical or effect.name.startswith("current"):
+    if electrical or "current" in effect.name:
         with pytest.raises(ModelError, match=r"dc_motor\(\)"):
             mi.Problem(mi.torque_driven("linear") + effect, linear_record())
         return
