@@ -41,6 +41,7 @@ def voltages(words: str, motor, n: int, dt: float, rng: np.random.Generator) -> 
         "ramps": lambda: P.triangle(u, T, T / 2.5, dt),
         "multisine": lambda: P.multisine(u, T, np.array([1.3, 2.9, 4.7, 7.9, 12.1]) / T, rng, dt),
         "slow": lambda: P.multisine(u, T, np.array([0.7, 1.3, 2.1]) / T, rng, dt),
+        "ternary": lambda: _thirds(P.random_steps(u, T, T / 25, rng, dt), u),
         "pulses": lambda: P.staircase(u * PULSES, (T - onset) / len(PULSES), onset, dt),
         "coast": lambda: P.coast_down(u, 0.4 * T, T, dt),
         "gentle": lambda: _raised(P.multisine(u / 3, T, np.array([0.7, 1.3, 2.1]) / T, rng, dt), 2 * u / 3),
@@ -53,6 +54,11 @@ def voltages(words: str, motor, n: int, dt: float, rng: np.random.Generator) -> 
 def _raised(excitation, middle):
     t, v = excitation
     return t, np.round(v + middle, 4)
+
+
+def _thirds(excitation, u):
+    t, v = excitation
+    return t, np.round(np.clip(np.round(1.5 * v / u), -1, 1) * u, 4)
 
 
 MOVING = ("forward", "waves", "gentle")  # never at rest: recorded from when the motor runs

@@ -47,6 +47,8 @@ def main() -> int:
     words = _parser().parse_args()
     from battery.cases import CASES
 
+    if words.wide:
+        from battery.wide import WIDE as CASES
     names = (
         words.cases.split(",")
         if words.cases
@@ -56,11 +58,11 @@ def main() -> int:
     if unknown:
         raise SystemExit(f"unknown cases {', '.join(unknown)}; there are {', '.join(CASES)}")
     if words.one:
-        return _one(names[0], words.out)
+        return _one(CASES[names[0]], words.out)
     words.out.mkdir(parents=True, exist_ok=True)
     todo = [n for n in names if words.again or not (words.out / f"{n}.json").exists()]
     with ThreadPoolExecutor(words.jobs) as pool:
-        for done in as_completed([pool.submit(_apart, n, words.out, words.limit) for n in todo]):
+        for done in as_completed([pool.submit(_apart, n, words) for n in todo]):
             print(_line(done.result()), flush=True)
     rows = [json.loads((words.out / f"{n}.json").read_text()) for n in names if (words.out / f"{n}.json").exists()]
     _report(rows, words)
@@ -72,6 +74,7 @@ def _parser() -> argparse.ArgumentParser:
     p.add_argument("--out", type=Path, required=True, help="folder of the results")
     p.add_argument("--cases", help="names, separated by commas (default: all)")
     p.add_argument("--kind", choices=("single", "pair", "none", "outside", "twins"))
+    p.add_argument("--wide", action="store_true", help="every effect of benches in three motors under three drives")
     p.add_argument("--jobs", type=int, default=1)
     p.add_argument("--limit", type=float, default=400, help="seconds per case")
     p.add_argument("--again", action="store_true", help="run cases again that have a result")
@@ -80,28 +83,28 @@ def _parser() -> argparse.ArgumentParser:
     return p
 
 
-def _one(name: str, out: Path) -> int:
-    from battery.cases import CASES
+def _one(case, out: Path) -> int:
     from battery.score import run_case
 
     try:
-        row = run_case(CASES[name])
+        row = run_case(case)
     except Exception as error:  # a case that fails is a row, not the end of the battery
         row = {
-            "case": name,
-            "kind": CASES[name].kind,
-            "truth": "+".join(CASES[name].effects),
+            "case": case.name,
+            "kind": case.kind,
+            "truth": "+".join(case.effects),
             "error": f"{type(error).__name__}: {error}",
             "traceback": traceback.format_exc(),
         }
-    (out / f"{name}.json").write_text(json.dumps(row, indent=1))
+    (out / f"{case.name}.json").write_text(json.dumps(row, indent=1))
     return 0
 
 
-def _apart(name: str, out: Path, limit: float) -> dict:
+def _apart(name: str, words: argparse.Namespace) -> dict:
+    out, limit = words.out, words.limit
     path = out / f"{name}.json"
     path.unlink(missing_ok=True)
-    command = [sys.executable, str(HERE), "--one", "--cases", name, "--out", str(out)]
+    command = [sys.executable, str(HERE), "--one", "--cases", name, "--out", str(out)] + ["--wide"] * words.wide
     error = "ended without a result"
     try:
         subprocess.run(command, timeout=limit, check=False)

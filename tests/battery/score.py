@@ -31,6 +31,7 @@ def run_case(case: Case) -> Row:
         "fit_seconds": round(fitted - began, 3),
         **_held_out(case, runs, check, found, plain),
         "ranking": _ranking(found),
+        "sizes": _sizes(case, found),
         "text": found.text,
     }
 
@@ -84,6 +85,15 @@ def _words(nrmse: Mapping[str, float]) -> str:
     return " ".join(f"{c} {100 * e:.3g}" for c, e in nrmse.items())
 
 
+def _sizes(case: Case, found: Diagnosis) -> dict[str, tuple[float, float | None, float]]:
+    """Value, standard deviation and truth of each free parameter of a true effect that was found."""
+    truth, fit = case.true_model(), found.after
+    if truth is None:
+        return {}
+    names = [p.name for e in truth.effects if e.name in found.effects for p in e.parameters if p.vary]
+    return {n: (fit.values[n], fit.std.get(n), truth.values[n]) for n in names if n in fit.values}
+
+
 def _ranking(found: Diagnosis) -> list[Row]:
     return [
         {
@@ -113,6 +123,8 @@ def figures(rows: Sequence[Row]) -> dict[str, str]:
         "group said on twins": _share([r["group_said"] for r in of["twins"]]),
         "held-out within 10 %": _share([r["ratio"] <= TARGETS["held_out"] for r in judged]),
     }
+    sizes = [s for r in done for s in r.get("sizes", {}).values() if s[1]]
+    said["sizes within 3 deviations"] = _share([abs(v - t) <= 3 * sd for v, sd, t in sizes])
     if judged:
         said["held-out over the true model's"] = (
             f"median {np.median([r['ratio'] for r in judged]):.3f}, worst {max(r['ratio'] for r in judged):.3f}"

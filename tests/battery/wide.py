@@ -1,0 +1,61 @@
+"""Each effect of benches (driver, supply, gear, sensors) alone, in three motors under three drives.
+
+``python tests/battery/run.py --wide --out DIR``. Sizes go with the motor: u is the voltage of the drive.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from battery.cases import ANGLE, Case
+from battery.excite import DT, P, level, time_constant
+
+DRIVES = {
+    "a": (("stairs", "prbs 0.8"), "steps"),
+    "b": (("ramps", "multisine"), "steps"),
+    "c": (("chirp", "steps"), "stairs"),
+}
+COASTING = {
+    "a": (("pulses", "ternary"), "ternary 0.8"),
+    "b": (("ternary", "ternary 0.6"), "pulses"),
+    "c": (("coast", "pulses 0.5"), "ternary 0.8"),
+}
+SIZES: dict[str, Callable[[P.Motor, float], dict[str, float]]] = {
+    "driver_coast": lambda m, u: {"V_c": m.v_max + 1.4},
+    "driver_current_limit": lambda m, u: {"I_lim": 0.2 * m.i_max},
+    "supply_sag": lambda m, u: {"R_s": 0.3 * m.R, "V_s": 1.05 * u},
+    "magnet_heating": lambda m, u: {"R_thm": 240 * m.R / u**2, "C_thm": u**2 / m.R * DT[m.name] / 0.6},
+    "eddy_brake": lambda m, u: {"c_e": 0.96 * m.K**2 / m.R, "omega_b": 0.25 * u / m.K},
+    "spring": lambda m, u: {
+        "k_s": 0.15 * m.J / time_constant(m) ** 2,
+        "theta_0": 0.6 * u / m.K * time_constant(m),
+    },
+    "angular_friction": lambda m, u: {"tau_m": 0.08 * m.K * u / m.R, "a_f": 0.7, "phi_f": 1.0},
+    "gear_efficiency": lambda m, u: {"mu_d": 0.1, "mu_b": 0.35},
+    "speed_average": lambda m, u: {"T_a": max(0.5 * time_constant(m), 4 * DT[m.name])},
+    "speed_offset": lambda m, u: {"w_0": 0.05 * u / m.K},
+    "current_gain": lambda m, u: {"k_i": 0.08},
+    "supply_side_current": lambda m, u: {"V_dc": 1.0 * u},
+}
+KNOWN = {"gear_efficiency": ("J",), "current_gain": ("R",)}
+SEES_ANGLE = ("spring", "angular_friction", "speed_offset")
+
+
+def _case(effect: str, motor: str, drive: str) -> Case:
+    train, check = (COASTING if effect == "driver_coast" else DRIVES)[drive]
+    m = P.MOTORS[motor]
+    return Case(
+        f"{effect}.{motor}.{drive}",
+        "single",
+        motor,
+        {effect: SIZES[effect](m, level(m))},
+        train,
+        check,
+        channels=ANGLE if effect in SEES_ANGLE else ("i", "omega"),
+        known=KNOWN.get(effect, ()),
+    )
+
+
+WIDE = {
+    c.name: c for c in (_case(e, m, d) for e in SIZES for m in ("lab", "servo", "wheel") for d in DRIVES)
+}
