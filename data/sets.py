@@ -213,6 +213,48 @@ def hidden_brush() -> tuple[Files, dict]:
 
 
 @_set
+def hidden_coast() -> tuple[Files, dict]:
+    """A hobby driver: at command 0 it opens its bridge, and the motor coasts instead of braking."""
+    seed, motor, sigma = 26, P.MOTORS["lab"], {"i": 0.02, "omega": 0.3}
+    effects = {"driver_coast": {"V_c": 8.4}}
+    rng = np.random.default_rng(seed)
+    excitations = {
+        "run1": P.staircase([4, 0, 7, 0, -3, 0, -6, 0, 2, 0], 0.16),
+        "run2": P.staircase([6, -4, 0, 5, 0, -7, 0, 3, -2, 0], 0.16),
+        "check1": P.staircase([-5, 0, 2.5, 6, 0, -3, 0, 4.5, 0], 0.16),
+    }
+    files = {}
+    for name, (t, v) in excitations.items():
+        r = P.simulate(motor, effects, t, v)
+        header = {
+            "t_ms": (t * 1e3, ".0f"),
+            "command_V": (v, ".5g"),
+            "motor_current_mA": (P.white(r["i"], sigma["i"], rng) * 1e3, ".0f"),
+            "speed_rpm": (P.white(r["omega"], sigma["omega"], rng) * RPM, ".0f"),
+        }
+        files[name] = table(header, ("toy car driver, 2 lithium cells; a command of 0 is 'stop'",))
+    return files, facts(motor, effects, seed, sigma)
+
+
+@_set
+def hidden_sag() -> tuple[Files, dict]:
+    """A cart on a tired battery: behind the bridge its voltage falls with the current it gives."""
+    seed, motor, sigma = 27, P.MOTORS["wheel"], {"i": 0.1, "omega": 0.5}
+    effects = {"supply_sag": {"R_s": 0.14, "V_s": 12.0}}
+    rng = np.random.default_rng(seed)
+    excitations = {
+        "run1": P.staircase([6, 12, 3, -5, -12, -2, 9, 0], 0.35),
+        "run2": P.triangle(12.0, 2.4, 1.2),
+        "check1": P.random_steps(12.0, 2.4, 0.2, rng),
+    }
+    files = {}
+    for name, (t, v) in excitations.items():
+        r = P.simulate(motor, effects, t, v)
+        files[name] = record(r, P.white(r["i"], sigma["i"], rng), P.white(r["omega"], sigma["omega"], rng))
+    return files, facts(motor, effects, seed, sigma)
+
+
+@_set
 def hidden_two() -> tuple[Files, dict]:
     """An arm on a geared servo under position control: gravity and dry friction together."""
     seed, motor, sigma = 24, P.MOTORS["servo"], {"i": 0.008, "omega": 0.03}

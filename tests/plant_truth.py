@@ -80,6 +80,8 @@ def in_library_words(name, numbers, motor):
         shaft = (J_l / J, resonance, c_s * resonance / (2 * k_s))
         words = ("r_load", "omega_r", "zeta_r") if name == "compliance" else ("r_gap", "omega_c", "zeta_c")
         n |= dict(zip(words, shaft, strict=True))
+    if name == "driver_coast":  # so soon that it does not matter how
+        n = {"R_c": 100 * motor.R}
     if name == "lugre":
         theta_s = n["tau_c"] / n.pop("sigma_0")
         n |= {"s_b": n.pop("tau_s") / n["tau_c"], "theta_s": theta_s}

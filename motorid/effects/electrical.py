@@ -84,16 +84,18 @@ def supply_sag(m: Equations, R_s=P(0.1, "Ω", null=0.0, lower=0.0, doc="resistan
     m.voltage -= R_s * (m.command / V_s) ** 2 * m.i
 
 
-OPEN = 1e-3  # of V_c: a command that opens the bridge
-ENDS = 0.02  # of V_c/R: the current at which the diodes let go
+OPEN = 1e-6  # V: a command that opens the bridge
 
 
 @effect(balance="voltage")
-def driver_coast(m: Equations, V_c=P(12.0, "V", null=0.0, positive=True, vary=False, grid=(1.0,),
-                                     doc="voltage against the dying current: supply and two diodes, fixed")):
-    """Bridge that opens at command 0: diodes end the current. Mohan, Electric Machines and Drives, 2012."""
-    flows = ca.tanh(m.i * m.R / (ENDS * V_c))  # no current, and the back-EMF stands against the bridge
-    m.voltage -= ca.if_else(ca.fabs(m.command) <= OPEN * V_c, V_c * flows - m.K_e * m.omega * (1 - flows**2), 0)
+def driver_coast(m: Equations, R_c=P(50.0, "Ω", null=0.0, positive=True, grid=(3.0, 30.0),
+                                     doc="resistance that ends the current as fast as the diodes do")):
+    """Bridge that opens at command 0: the current dies at once. Mohan, Electric Machines and Drives, 2012.
+
+    The diodes put the supply against the current; linear, that is L di/dt = −(R + R_c) i, without the back-EMF.
+    """
+    shorted = ca.exp(-3 * R_c / m.R)  # what is left of the back-EMF: 1 at R_c = 0, none behind an open bridge
+    m.voltage -= ca.if_else(ca.fabs(m.command) <= OPEN, R_c * m.i - (1 - shorted) * m.K_e * m.omega, 0)
 
 
 STIFF = 1e3  # times R: what the limiter takes per ampere too much

@@ -103,7 +103,7 @@ def test_the_plant_shares_no_code_with_the_models():
 
 
 def test_shipped_sets_are_found_by_name():
-    hidden = {"hidden_friction", "hidden_heating", "hidden_cogging", "hidden_brush", "hidden_two"}
+    hidden = {f"hidden_{n}" for n in ("friction", "heating", "cogging", "brush", "two", "coast", "sag")}
     assert hidden | {"two_step", "two_step_noisy", "clean"} <= set(datasets.datasets())
     assert (datasets.data_path() / "truth.json").is_file()
     assert datasets.data_path("two_step/step_6V.csv").is_file()

@@ -37,7 +37,7 @@ TRUTH = {
     "speed_delay": {"T_d": 5e-3},
     "current_offset": {"i_0": 0.05},
     "speed_gain": {"k_w": 0.04},
-    "driver_coast": {"V_c": 8.0},
+    "driver_coast": {"R_c": 9.0},
     "driver_current_limit": {"I_lim": 2.5},
     "supply_sag": {"R_s": 0.4, "V_s": 8.0},
     "magnet_heating": {"R_thm": 20.0, "C_thm": 0.3},
@@ -51,7 +51,6 @@ TRUTH = {
     "supply_side_current": {"V_dc": 9.0},
 }
 KNOWN = {  # what the records leave open
-    "driver_coast": {"V_c": 8.0},
     "supply_sag": {"V_s": 8.0},
     "supply_side_current": {"V_dc": 9.0},
     "current_gain": {"R": VALUES["R"]},
