@@ -6,8 +6,10 @@ from collections.abc import Mapping
 from types import MappingProxyType
 
 CHANNELS = ("i", "omega", "theta")  # what can be measured, in the order of states, tables and figures
-NAMES = {"t": "time", "v": "voltage", "i": "current", "omega": "speed", "theta": "angle"}
-SYMBOLS = {"t": "t", "v": "v", "i": "i", "omega": "ω", "theta": "θ"}
+MEASURED_INPUTS = ("v_supply", "tau_load", "temp")  # what may be recorded beside the voltage, and drive the model too
+NAMES = {"t": "time", "v": "voltage", "i": "current", "omega": "speed", "theta": "angle",
+         "v_supply": "supply voltage", "tau_load": "load torque", "temp": "temperature"}
+SYMBOLS = {"t": "t", "v": "v", "i": "i", "omega": "ω", "theta": "θ", "v_supply": "V", "tau_load": "τ", "temp": "T"}
 # The first unit of each channel is its default. A linear axis is measured in m and m/s; the command of a
 # current- or torque-controlled drive need not be a voltage.
 UNITS: Mapping[str, tuple[str, ...]] = MappingProxyType({
@@ -16,6 +18,9 @@ UNITS: Mapping[str, tuple[str, ...]] = MappingProxyType({
     "i": ("A",),
     "omega": ("rad/s", "m/s"),
     "theta": ("rad", "m"),
+    "v_supply": ("V",),
+    "tau_load": ("N·m", "N"),
+    "temp": ("°C",),
 })
 
 

@@ -40,13 +40,14 @@ from collections import Counter
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-from motorid.channels import UNITS
+from motorid.channels import MEASURED_INPUTS, UNITS
 from motorid.errors import DeviceError, printable
 
 VERSION = 1
 LONGEST = 240
 SILENCE = 1.0  # s without a word from the computer after which a device switches the motor off
-PERMITTED = {**UNITS, "v": UNITS["v"][:1]}  # what drives the motor is a voltage
+# What drives the motor is a voltage.
+PERMITTED = {c: u for c, u in UNITS.items() if c not in MEASURED_INPUTS} | {"v": UNITS["v"][:1]}
 
 _FRAME = re.compile(rb"\$([^$*\r\n]{1,240})\*([0-9A-F]{4})")
 _UNFINISHED = re.compile(rb"\$[^$*\r\n]{0,240}(?:\*[0-9A-F]{0,3})?")  # may still become a frame

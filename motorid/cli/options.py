@@ -233,7 +233,7 @@ def own_effects(path: Path) -> dict[str, Effect]:
         what = f"{type(error).__name__}: {error}"
         raise UsageError(f"--effects-from: {path} cannot be run: {what}.") from None
     effects = [e for e in vars(module).values() if isinstance(e, Effect)]
-    found = {e.name: e for e in effects if e.name not in library.LIBRARY}
+    found = {e.name: e for e in effects if library.EVERY.get(e.name) is not e}
     if not found:
         raise UsageError(f"--effects-from: {path} defines no effect of its own. Write a function and "
                          "decorate it with @mi.effect(balance=\"torque\").")
@@ -244,8 +244,8 @@ def named_effect(name: str, own: dict[str, Effect]) -> Effect:
     """Return an effect of the user's file, or of the library."""
     if name in own:
         return own[name]
-    if name not in library.LIBRARY:
-        raise ModelError(f"--effects: {one_of(name, [*own, *library.LIBRARY], 'effect')}")
+    if name not in library.EVERY:
+        raise ModelError(f"--effects: {one_of(name, [*own, *library.EVERY], 'effect')}")
     return library.get(name)
 
 

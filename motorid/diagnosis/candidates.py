@@ -22,7 +22,7 @@ from motorid.diagnosis.refit import GivenUp, Task, lost, refit, refits, widened
 from motorid.diagnosis.results import Candidate
 from motorid.diagnosis.score_test import Score, pairs_of, rank
 from motorid.diagnosis.thresholds import MATERIAL
-from motorid.effects import LIBRARY
+from motorid.effects import EVERY
 from motorid.errors import FAILURES, ModelError
 from motorid.estimation.result import Fit
 from motorid.model.definition import Effect, Parameter
@@ -41,8 +41,9 @@ def library(effects: Iterable[Effect | str] | None, also: Iterable[Effect] = ())
     """Return the effects to try: the whole library, or those named, and the user's own."""
     from motorid.effects import get
 
-    chosen = list(LIBRARY.values()) if effects is None else [get(e) if isinstance(e, str) else e for e in effects]
-    return chosen + [e for e in also if e.name not in {c.name for c in chosen}]
+    chosen = list(EVERY.values()) if effects is None else [get(e) if isinstance(e, str) else e for e in effects]
+    own = {e.name: e for e in also}  # in the place of one of the library with the same name
+    return [e for e in chosen if e.name not in own] + list(own.values())
 
 
 class Search:

@@ -12,7 +12,7 @@ from motorid.diagnosis.results import Adequacy, Candidate, Missing, Rung
 from motorid.diagnosis.score_test import Score
 from motorid.diagnosis.thresholds import ELSEWHERE, LARGER, LOST
 from motorid.display.numbers import number, percent, with_error
-from motorid.effects import LIBRARY
+from motorid.effects import EVERY
 from motorid.estimation.result import Fit
 from motorid.model.definition import Effect
 from motorid.numerics.noise import despiked
@@ -186,7 +186,7 @@ def inseparable_remark(same: Mapping[str, tuple[str, ...]]) -> str:
 
 def balance_of(name: str, also: Sequence[Effect] = ()) -> str:
     """Return where an effect acts: electrical, mechanical or sensor."""
-    known = {**LIBRARY, **{e.name: e for e in also}}
+    known = {**EVERY, **{e.name: e for e in also}}
     return {"voltage": "electrical", "torque": "mechanical", "transmission": "mechanical",
             "sensor": "sensor"}[known[name].balance]
 

@@ -14,6 +14,7 @@ from motorid.effects.electrical import (
     voltage_offset,
     winding_heating,
 )
+from motorid.effects.measured import measured_load, measured_supply, measured_temperature
 from motorid.effects.mechanical import (
     angular_friction,
     backlash,
@@ -57,6 +58,9 @@ LIBRARY: dict[str, Effect] = {
               speed_lag, speed_delay, speed_average, speed_gain, speed_offset, current_lag, current_offset,
               current_gain, supply_side_current)
 }
+# For records in which a supply voltage, a load torque or a temperature was measured beside the voltage.
+MEASURED: dict[str, Effect] = {e.name: e for e in (measured_supply, measured_temperature, measured_load)}
+EVERY = LIBRARY | MEASURED
 
 
 def get(name: str) -> Effect:
@@ -67,9 +71,9 @@ def get(name: str) -> Effect:
     ModelError
         If there is none; the message names the nearest.
     """
-    if name not in LIBRARY:
-        raise ModelError(one_of(name, LIBRARY, "effect"))
-    return LIBRARY[name]
+    if name not in EVERY:
+        raise ModelError(one_of(name, EVERY, "effect"))
+    return EVERY[name]
 
 
-__all__ = ["LIBRARY", "get", *LIBRARY]
+__all__ = ["EVERY", "LIBRARY", "MEASURED", "get", *EVERY]

@@ -75,7 +75,7 @@ class _Loads(NamedTuple):
 def _signals(run: Experiment) -> dict[str, Array]:
     """Return t, v and what was measured of i, omega, theta on all samples, gaps bridged; omega from the angle."""
     t = run.t
-    found: dict[str, Array] = {"t": t, "v": run.inputs["v"]}
+    found: dict[str, Array] = {"t": t, **run.inputs}
     for c in CHANNELS:
         if _measured(run, c):
             found[c] = bridged(t, run.outputs[c])

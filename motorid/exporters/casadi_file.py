@@ -93,9 +93,9 @@ def _model_dict(model: Model) -> dict[str, Any]:
 
 def _own(model: Model) -> dict[str, Any]:
     """Describe effects that are not in the library: where they were defined and what they take."""
-    from motorid.effects import LIBRARY
+    from motorid.effects import EVERY
 
-    own = [e for e in model.effects if e.name not in LIBRARY or LIBRARY[e.name].law is not e.law]
+    own = [e for e in model.effects if e.name not in EVERY or EVERY[e.name].law is not e.law]
     return {e.name: {"balance": e.balance, "parameters": [p.name for p in e.parameters],
                      "defined_in": getattr(e.law, "__module__", None), "doc": e.doc} for e in own}
 

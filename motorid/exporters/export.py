@@ -13,7 +13,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from motorid.effects import LIBRARY
+from motorid.effects import EVERY
 from motorid.errors import DataError, ModelError, UsageError, one_of
 from motorid.estimation.result import Fit
 from motorid.exporters.c_code import c_files
@@ -227,7 +227,7 @@ def _effect(name: str, own: Mapping[str, Effect], about: Mapping[str, Any] | Non
         raise ModelError(f"the effect '{name}' is not in the library: it was defined in {about['defined_in']}, acts on "
                          f"the {about['balance']} and takes {', '.join(about['parameters'])}. Define it again and "
                          f"pass it on: mi.load(path, effects=[{name}]).")
-    if name not in LIBRARY:
-        raise ModelError(f"{one_of(name, LIBRARY, 'effect')} If it is one of your own, pass it on: "
+    if name not in EVERY:
+        raise ModelError(f"{one_of(name, EVERY, 'effect')} If it is one of your own, pass it on: "
                          f"mi.load(path, effects=[{name}]).")
-    return LIBRARY[name]
+    return EVERY[name]

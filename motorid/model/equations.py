@@ -11,7 +11,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from motorid.channels import CHANNELS
+from motorid.channels import CHANNELS, MEASURED_INPUTS
 from motorid.errors import ModelError, one_of
 from motorid.numerics.signals import Array
 
@@ -100,6 +100,12 @@ class Equations:
         if channel in self.sensors:
             return self.sensors[channel]
         return self.angle_state() if channel == "theta" else self.__getattr__(channel)
+
+    def input(self, name: str) -> ca.SX:
+        """Return what was measured beside the voltage, e.g. ``"tau_load"``; the model's records must have it."""
+        if name not in MEASURED_INPUTS:
+            raise ModelError(f"{self.writer}: {one_of(name, MEASURED_INPUTS, 'input')}")
+        return self.inputs.setdefault(name, ca.SX.sym(name))
 
     # -- writing ---------------------------------------------------------------------------------------
     def scale(self, name: str, factor: Any) -> None:

@@ -277,11 +277,9 @@ class Problem:
 
     def for_model(self, model: Model) -> Problem:
         """Return the problem for another model on the same records; noise, grids, initial states stay."""
-        runs = self.runs
-        if model.angle_input != self.model.angle_input:
-            names = self.system.inputs[:1] + (("theta_in",) if model.angle_input else ())
-            runs = tuple(with_inputs(run, names) for run in runs)
-        other = replace(self, model=model, _runs=runs)
+        other = replace(self, model=model, _runs=self.runs)
+        if (inputs := other.system.inputs) != self.system.inputs:
+            other = replace(other, _runs=tuple(with_inputs(run, inputs) for run in self.runs))
         return self._lending(other, ("integrator", "measured", "_levels")) if other.outputs == self.outputs else other
 
     def start_at(self, values: Mapping[str, float]) -> Problem:

@@ -14,7 +14,7 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from motorid.channels import CHANNELS
+from motorid.channels import CHANNELS, NAMES
 from motorid.errors import ModelError, UsageError, one_of
 from motorid.integrate.engine import Grid
 from motorid.model.definition import Parameter
@@ -85,9 +85,10 @@ def _grid(run: Experiment, inputs: Sequence[str]) -> Grid:
             held.append(False)
         elif name in run.inputs:
             columns.append(run.inputs[name])
-            held.append(run.hold == "zoh")
+            held.append(run.hold == "zoh" and name == "v")
         else:
-            raise ModelError(f"{run.name}: the model needs the input '{name}', which the record lacks.")
+            raise ModelError(f"{run.name}: the model needs the input '{name}' ({NAMES[name]}), which the record lacks. "
+                             "Name its column with columns, or leave the effect out.")
     return Grid.of(run.t, np.column_stack(columns), np.array(held))
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from motorid.display.numbers import counted
 from motorid.errors import DataError
 from motorid.numerics.signals import Array
-from motorid.records.experiment import MIN_SAMPLES, Experiment
+from motorid.records.experiment import INPUTS, MIN_SAMPLES, Experiment
 from motorid.records.layout import Layout, Place
 from motorid.records.preprocessing import unwrapped
 
@@ -49,7 +49,9 @@ def run_from_columns(columns: Mapping[str, Array], texts: Texts, layout: Layout,
     rows = _rows_in_order(t, layout.places["t"].column, said)
     rows = rows[_first_input(values["v"][rows], places["v"].column, said):]
     t, values = t[rows], {c: a[rows] for c, a in values.items()}
-    v = _filled_forward(values.pop("v"), places["v"].column, said)
+    inputs = {c: _filled_forward(values.pop(c), places[c].column, said) for c in INPUTS if c in values
+              if c == "v" or _has_values(c, values[c], places[c].column, [])}
+    values = {c: a for c, a in values.items() if c not in INPUTS}
     outputs = {c: a for c, a in values.items() if _has_values(c, a, places[c].column, said)}
     if not outputs:
         raise DataError(f"every sample of {', '.join(repr(places[c].column) for c in values)} is "
@@ -65,9 +67,9 @@ def run_from_columns(columns: Mapping[str, Array], texts: Texts, layout: Layout,
     if set(texts) - used:
         said.append(f"left out columns of text: {', '.join(sorted(set(texts) - used))}.")
     facts = {**(meta or {}), **_origin(layout), "notes": said, "extra": extra}
-    units = {c: places[c].unit.symbol for c in ("v", *outputs)}
+    units = {c: places[c].unit.symbol for c in (*inputs, *outputs)}
     try:
-        return Experiment(t, {"v": v}, outputs, sigma or {}, cast(Any, hold), units, name, facts)
+        return Experiment(t, inputs, outputs, sigma or {}, cast(Any, hold), units, name, facts)
     except DataError as error:
         raise DataError(str(error).removeprefix(f"{name}: ")) from None
 
@@ -85,7 +87,7 @@ def _channel(columns: Mapping[str, Array], texts: Texts, place: Place, channel: 
             sample = next((str(c) for c in texts[column] if str(c).lower() != "nan"), "")
             raise DataError(f"column '{column}' should be the channel {channel} but holds "
                             + (f"text, e.g. '{sample[:40]}'." if sample else "nothing."))
-    array = columns[place.column] * place.unit.factor
+    array = columns[place.column] * place.unit.factor + place.unit.offset
     return array * columns[place.times] if place.times else array
 
 
@@ -183,7 +185,8 @@ def _filled_forward(v: Array, column: str, said: list[str]) -> Array:
         return v
     said.append(f"the input '{column}' is missing in {np.count_nonzero(missing)} of {len(v)} rows; "
                 "it was held from the last known value.")
-    return v[np.maximum.accumulate(np.where(missing, 0, np.arange(len(v))))]
+    first = int(np.argmin(missing))  # before it only what is measured beside the voltage may be missing
+    return v[np.maximum.accumulate(np.where(missing, first, np.arange(len(v))))]
 
 
 def _has_values(channel: str, values: Array, column: str, said: list[str]) -> bool:

@@ -13,7 +13,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from motorid.channels import CHANNELS, NAMES, UNITS
+from motorid.channels import CHANNELS, MEASURED_INPUTS, NAMES, UNITS
 from motorid.display.cards import Card, Shown
 from motorid.display.numbers import duration, number
 from motorid.display.tables import Flag, Table
@@ -21,7 +21,7 @@ from motorid.errors import DataError, UsageError, one_of, printable
 from motorid.numerics.signals import Array
 from motorid.records import preprocessing
 
-INPUTS = ("v",)
+INPUTS = ("v", *MEASURED_INPUTS)
 MIN_SAMPLES = 8
 
 
@@ -37,7 +37,8 @@ class Experiment(Shown):
     t : (N,) array
         Time in s, finite and strictly increasing; steps may be uneven.
     inputs : mapping of str to (N,) array
-        ``{"v": ...}``, the drive voltage in V (or the command of a torque-controlled drive). Finite.
+        ``{"v": ...}``, the drive voltage in V (or the command of a torque-controlled drive). Finite. Beside it, where
+        measured, ``"v_supply"`` (V), ``"tau_load"`` (N·m), ``"temp"`` (°C), for effects that read them.
     outputs : mapping of str to (N,) array
         Some of ``"i"`` (A), ``"omega"`` (rad/s or m/s), ``"theta"`` (rad or m). NaN marks a missing sample.
     sigma : mapping of str to float, optional
@@ -173,7 +174,7 @@ class Experiment(Shown):
         return self.with_(outputs=outputs) if any(outputs[c] is not y for c, y in self.outputs.items()) else self
 
     def _with_inputs(self, read: Callable[[Array], Array]) -> Experiment:
-        return self.with_(inputs={c: read(v) for c, v in self.inputs.items()})
+        return self.with_(inputs={**self.inputs, "v": read(self.inputs["v"])})
 
     def __reduce__(self) -> tuple[Any, ...]:
         # A mappingproxy cannot be pickled, so hand plain dicts to the constructor of the other process.
@@ -273,6 +274,8 @@ def _channels(given: object, known: tuple[str, ...], kind: str, t: Array, run: s
 
 
 def _check_values(run: Experiment) -> None:
+    if "v" not in run.inputs:
+        raise DataError(f"{run.name}: the input 'v' (drive voltage or command) is missing; a simulation needs it.")
     for name, array in run.inputs.items():
         bad = int(np.count_nonzero(~np.isfinite(array)))
         if bad:

@@ -18,10 +18,11 @@ class Unit:
     factor: float
     symbol: str
     label: str
+    offset: float = 0.0  # added after the factor: kelvins
 
 
 SI = {"time": "s", "voltage": "V", "current": "A", "speed": "rad/s", "linear speed": "m/s", "angle": "rad",
-      "length": "m", "torque": "N·m", "force": "N", "ratio": "1"}
+      "length": "m", "torque": "N·m", "force": "N", "ratio": "1", "temperature": "°C"}
 
 # What a channel may be measured in. The input of a torque-driven model is a current, torque or force command.
 DIMENSIONS: Mapping[str, tuple[str, ...]] = {
@@ -30,6 +31,9 @@ DIMENSIONS: Mapping[str, tuple[str, ...]] = {
     "i": ("current",),
     "omega": ("speed", "linear speed"),
     "theta": ("angle", "length"),
+    "v_supply": ("voltage",),
+    "tau_load": ("torque", "force"),
+    "temp": ("temperature",),
 }
 
 _TURN = 2 * math.pi
@@ -51,6 +55,7 @@ _SPELLINGS = {
     "torque": {1.0: "nm", 1e-3: "mnm", 1e-2: "ncm"},
     "force": {1.0: "n newton", 1e3: "kn"},
     "ratio": {1.0: "1 -", 1e-2: "% percent"},
+    "temperature": {1.0: "degc celsius c k kelvin"},
 }
 _KNOWN = {word: (dimension, factor) for dimension, sizes in _SPELLINGS.items()
           for factor, words in sizes.items() for word in words.split()}
@@ -86,7 +91,7 @@ def parse_unit(text: str) -> Unit | None:
     if word not in _KNOWN:
         return None
     dimension, factor = _KNOWN[word]
-    return Unit(dimension, factor, SI[dimension], label)
+    return Unit(dimension, factor, SI[dimension], label, -273.15 if word in ("k", "kelvin") else 0.0)
 
 
 def require_unit(text: object, channel: str) -> Unit:
@@ -152,6 +157,10 @@ _OTHER = _set("goal target set sp desired des wanted soll sollwert consigne erro
               "simulated sim model pred offset gain noise feedforward ff")
 _OTHER_ENDS = ("ref", "reference", "goal", "target", "setpoint", "soll")
 _SUPPLY_ENDS = ("bus", "supply", "bat", "batt", "battery", "vcc", "vdd", "link", "versorgung", "batterie")
+_TEMPERATURE = _set("temp temperature temperatur temperatura température")
+_ELECTRONICS = _set("mcu cpu chip board bridge driver controller fet mosfet ambient room umgebung")
+_LOAD = _set("load last brake external ext bremse lastmoment")
+_TORQUE = _set("torque moment drehmoment couple force lastmoment")
 _COMMAND = _set("command cmd commanded input eingang")
 _DUTY = _set("duty pwm dutycycle tastgrad")
 _DERIVATIVE = _set("dot rate dt derivative")
@@ -224,6 +233,11 @@ def is_supply(label: str) -> bool:
     return any(w.endswith(_SUPPLY_ENDS) for w in words) and not current
 
 
+def is_reference(label: str) -> bool:
+    """Tell whether a header names the reference of a controller."""
+    return any(w.endswith(_OTHER_ENDS) for w in _tokens(label))
+
+
 def is_duty(label: str) -> bool:
     """Tell whether a header names a duty cycle."""
     return bool(_DUTY & {*_tokens(label), *_tokens(_CAMEL.sub(" ", label))}) and classify(label) is None
@@ -233,7 +247,20 @@ def _tokens(name: str) -> list[str]:
     return [w for w in (p.strip("()[]{}<>\"'").lower() for p in _SEPARATORS.split(name)) if w]
 
 
+def _beside(words: set[str], unit: Unit | None, explicit: bool) -> tuple[str, Unit | None, float] | None:
+    """Tell the supply's voltage, a load torque and a temperature of the motor, which may be measured as well."""
+    warm = words & _TEMPERATURE or (explicit and unit is not None and unit.dimension == "temperature")
+    channel = ("temp" if warm and not words & _ELECTRONICS else
+               "tau_load" if words & _LOAD and words & _TORQUE | words & {"tau"} else
+               "v_supply" if any(w.endswith(_SUPPLY_ENDS) for w in words) and not words & _OTHER else None)
+    current = any("current" in w or "strom" in w for w in words)
+    fits = channel and (unit is None or unit.dimension in DIMENSIONS[channel]) and not current
+    return (channel, unit, 3.0) if channel and fits else None
+
+
 def _by_words(words: list[str], unit: Unit | None, explicit: bool) -> tuple[str, Unit | None, float] | None:
+    if beside := _beside(set(words), unit, explicit):
+        return beside
     if any(w in _OTHER or w.endswith(_OTHER_ENDS) or w.endswith(_SUPPLY_ENDS) for w in words):
         return None
     channel, score = _channel_of(words)

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from motorid.channels import NAMES
+from motorid.channels import MEASURED_INPUTS, NAMES
 from motorid.errors import DataError, UsageError, one_of
 from motorid.records.headers import (
     DIMENSIONS,
@@ -14,6 +14,7 @@ from motorid.records.headers import (
     Unit,
     classify,
     is_duty,
+    is_reference,
     is_supply,
     parse_unit,
     require_unit,
@@ -53,7 +54,7 @@ def assign(labels: Sequence[str], *, columns: Mapping[str, object] | None = None
     labels : sequence of str
         Column names, all different; their positions "1", "2", ... if the file has no header.
     columns : mapping, optional
-        Channel (t, v, i, omega, theta) to column name, or to its position counted from 1.
+        Channel (t, v, i, omega, theta, v_supply, tau_load, temp) to column name, or to its position counted from 1.
     units : mapping, optional
         Channel or column to unit.
     unit_row : mapping of str to str, optional
@@ -73,6 +74,8 @@ def assign(labels: Sequence[str], *, columns: Mapping[str, object] | None = None
     _last_resorts(places, labels, notes)
     _apply_units(places, labels, units)
     _settle_counts(places, notes)
+    notes += [f"'{c}' looks like the reference of a controller: what drives the model is the voltage; it is not used."
+              for c in labels if is_reference(c) and c not in {p.column for p in places.values()}]
     _require(places, labels)
     return Layout({c: places[c] for c in _CHANNELS if c in places}, [*notes, *_assumed(places)])
 
@@ -122,6 +125,8 @@ def _named_by_header(places: dict[str, Place], labels: Sequence[str], row: Units
         best = [p for p in best if p.unit.factor == 1.0] or best
         if channel in places or (len(best) > 1 and best[0].score <= 1 and channel not in ("t", "v")):
             continue
+        if len(best) > 1 and channel in MEASURED_INPUTS:
+            continue  # which of them acts on the motor is not known
         if len(best) > 1:
             names = " and ".join(f"'{p.column}'" for p in best)
             raise DataError(f"{names} look like {_MEANING[channel]} ({channel}) all the same; say which one "

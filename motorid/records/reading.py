@@ -29,7 +29,9 @@ RECORDS = (".csv", ".txt", ".tsv", ".dat", ".log", ".mat", ".parquet", ".pq")
 _HEADERS = {("t", "s"): "time_s", ("v", "V"): "voltage_V", ("v", "A"): "command_A",
             ("v", "N·m"): "command_Nm", ("v", "N"): "command_N", ("v", "1"): "command (1)",
             ("i", "A"): "current_A", ("omega", "rad/s"): "speed_rad_s", ("omega", "m/s"): "speed_m_s",
-            ("theta", "rad"): "angle_rad", ("theta", "m"): "position_m"}
+            ("theta", "rad"): "angle_rad", ("theta", "m"): "position_m",
+            ("v_supply", "V"): "supply_V", ("tau_load", "N·m"): "load_torque_Nm", ("tau_load", "N"): "load_force_N",
+            ("temp", "°C"): "temperature_degC"}
 _OWN = re.compile(r"#\s*motorid (columns|hold|sigma): (.*)")  # what write_csv says about its own file
 
 
@@ -42,8 +44,8 @@ def read_runs(paths: Path_ | Iterable[Path_], *, columns: Mapping[str, object] |
     paths : str, path, or iterable of these
         Files, directories, or patterns such as ``"data/run*.csv"``, each in natural order (run2, run10).
     columns : mapping, optional
-        Channel (t, v, i, omega, theta) to column, by name or by position counted from 1, where the header
-        does not tell: ``{"v": "u_volt"}``.
+        Channel (t, v, i, omega, theta, v_supply, tau_load, temp) to column, by name or by position counted from 1,
+        where the header does not tell: ``{"v": "u_volt"}``.
     units : mapping, optional
         Channel or column to unit: ``{"omega": "rpm", "theta": "counts:2048", "i": "-1 A"}``.
     hold : {"zoh", "linear"}, optional

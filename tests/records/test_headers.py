@@ -25,11 +25,15 @@ KNOWN = {
     "theta": "theta|angle_deg|position_rad|position_m|pos|Position|Winkel|Winkel [°]|encoder|"
              "encoder_counts|position_counts|theta_m|x_m|x [mm]|phi|q|angle|angular position|"
              "positionDeg|Weg in mm|rotor_angle_rad",
-    None: "position_ref_m|goal_rad|bus_V|Vsupply|Vbat|duty|pwm|temp_C|torque_enable|force_N|"
+    "v_supply": "bus_V|Vsupply|Vbat|battery_voltage|supply_mV|v_bus",
+    "tau_load": "tau_load|load_torque_Nm|brake_torque [mNm]|Lastmoment_Nm|load force (N)",
+    "temp": "temp_C|temperature|winding temperature (°C)|motor_temp_K|T (K)|case [degC]",
+    None: "position_ref_m|goal_rad|battery_current|mcu_temp|bridge_temperature|torque_Nm|duty|pwm|"
+          "torque_enable|force_N|"
           "speed_ref|speedRef|omega_ref|Solldrehzahl_soll|soll_drehzahl|Drehzahl_soll|"
           "current_limit|current_cmd|Id|Ud|T_motor|n|sample|index|target_speed|setpoint|"
-          "supply_current|torque_Nm|temperature|y|status|phase_deg|x|current_mV|power_W|vref|"
-          "battery_voltage|accel_rad_s2|position_error|time_voltage|speed_V",
+          "supply_current|y|status|phase_deg|x|current_mV|power_W|vref|"
+          "accel_rad_s2|position_error|time_voltage|speed_V",
 }
 CASES = [(channel, header) for channel, text in KNOWN.items() for header in text.split("|")]
 
@@ -102,7 +106,7 @@ def columns(header: str, **kw) -> dict[str, str]:
     ("t_s,voltage_V,force_N,position_m,position_ref_m",
      {"t": "t_s", "v": "voltage_V", "theta": "position_m"}),
     ("Time,Position,Velocity,Iq,Uq,Vsupply", {"t": "Time", "v": "Uq", "i": "Iq", "omega": "Velocity",
-                                              "theta": "Position"}),
+                                              "theta": "Position", "v_supply": "Vsupply"}),
     ("time,T,u,w", {"t": "time", "v": "u", "omega": "w"}),
     ("t,u,speed_rpm,speed_rad_s", {"t": "t", "v": "u", "omega": "speed_rad_s"}),
     ("t,u_cmd,u,w", {"t": "t", "v": "u", "omega": "w"}),
@@ -135,7 +139,7 @@ def test_units_go_by_channel_or_column():
         assert place.unit.factor == pytest.approx(math.pi / 180)
         assert place.stated
     with pytest.raises(DataError, match="not used as a channel"):
-        assign(["t", "u", "w", "temp"], units={"temp": "V"})
+        assign(["t", "u", "w", "power"], units={"power": "V"})
 
 
 @pytest.mark.parametrize(("text", "pairs"), [

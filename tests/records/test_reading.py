@@ -298,12 +298,12 @@ def test_negative_zero_is_zero_and_uneven_samples_are_kept(tmp_path):
 
 
 def test_other_columns_travel_with_the_run(tmp_path):
-    run = read_csv(write(tmp_path, "t,u,w,temp_C,state,omega_ref\n" + rows(
+    run = read_csv(write(tmp_path, "t,u,w,power_W,state,omega_ref\n" + rows(
         pattern="{t:.3f},{v},{w:.3f},25,on,{w:.3f}\n")))
-    assert sorted(run.meta["extra"]) == ["omega_ref", "temp_C"]
+    assert sorted(run.meta["extra"]) == ["omega_ref", "power_W"]
     assert "columns of text: state" in notes(run)
-    np.testing.assert_array_equal(run.meta["extra"]["temp_C"], np.full(30, 25.0))
-    assert len(run.select(slice(5, 20)).meta["extra"]["temp_C"]) == 15
+    np.testing.assert_array_equal(run.meta["extra"]["power_W"], np.full(30, 25.0))
+    assert len(run.select(slice(5, 20)).meta["extra"]["power_W"]) == 15
 
 
 def test_a_channel_that_is_missing_throughout_is_left_out(tmp_path):
