@@ -10,11 +10,12 @@ from motorid.effects.electrical import (
     inductance_saturation,
     magnet_heating,
     magnetic_saturation,
+    measured_supply,
+    measured_temperature,
     supply_sag,
     voltage_offset,
     winding_heating,
 )
-from motorid.effects.measured import measured_load, measured_supply, measured_temperature
 from motorid.effects.mechanical import (
     angular_friction,
     backlash,
@@ -28,6 +29,7 @@ from motorid.effects.mechanical import (
     gravity,
     load_friction,
     lugre,
+    measured_load,
     quadratic_drag,
     spring,
     stribeck,

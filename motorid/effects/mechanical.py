@@ -137,6 +137,12 @@ def spring(m: Equations, k_s=P(1e-3, "N·m/rad", null=0.0, lower=0.0, doc="stiff
     m.torque -= k_s * (m.theta - theta_0)
 
 
+@effect(balance="torque")
+def measured_load(m: Equations, k_l=P(1.0, "", null=0.0, doc="of the recorded torque that acts; 1: all of it")):
+    """Load torque as recorded, against positive speed. Isermann, Identification of Dynamic Systems, 2011."""
+    m.torque -= k_l * m.input("tau_load")
+
+
 CORNER = 0.01  # of half a gap: a stiff shaft is twisted by much less than the gap, and a wide corner is a soft shaft
 
 
