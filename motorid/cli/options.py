@@ -134,6 +134,9 @@ class FitOptions(ReadingOptions):
     engine: Annotated[str, _solving(metavar="rosenbrock|cvodes|idas", help="Integrator.")] = "rosenbrock"
     initial: Annotated[str, _solving(
         metavar="auto|rest|measured|estimate", help="What is known of the state at the first sample.")] = "auto"
+    window: Annotated[str, _solving(
+        metavar="auto|none|SECONDS", help="Simulate the records in windows, each from an estimated state; auto: where "
+        "the model would carry small errors too far over the whole.")] = "auto"
     loss: Annotated[str, _solving(metavar="squares|huber", help="huber forgives outliers.")] = "squares"
 
     def model(self, runs: Sequence[Experiment]) -> Model:
@@ -163,6 +166,8 @@ class FitOptions(ReadingOptions):
         if hard or self.solver == "multiple-shooting":
             found["solver"] = MultipleShooting()
         found["formulation"] = "plain" if hard else self.formulation
+        if self.window != "auto":
+            found["window"] = None if self.window == "none" else _seconds(self.window, "--window")
         return found
 
     def fit(self, runs: Sequence[Experiment], model: Model | None = None) -> Fit:
@@ -313,6 +318,13 @@ def _numbers(texts: Sequence[str], option: str) -> dict[str, float]:
                 raise UsageError(f"{option}: '{value}' is not a number; expected e.g. {name}=1.2, in SI "
                                  "units.") from None
     return found
+
+
+def _seconds(text: str, option: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise UsageError(f"{option}: '{text}' is not a time; expected auto, none, or seconds, e.g. 0.5.") from None
 
 
 def _fixed(model: Model, texts: Sequence[str]) -> Model:

@@ -13,7 +13,7 @@ from motorid.estimation.continuation import by_continuation
 from motorid.estimation.result import Fit
 from motorid.numerics.least_squares import LevenbergMarquardt
 from motorid.problem.problem import Problem
-from motorid.problem.simulate import at, simulated
+from motorid.problem.simulate import at, cut_alike, simulated
 from motorid.records.experiment import Experiment
 
 QUICK = LevenbergMarquardt(max_iterations=25, ftol=1e-4, xtol=1e-5, looks=0)
@@ -42,7 +42,7 @@ class HeldOut:
         noise = {c: s for run in fit.problem.runs for c, s in run.sigma.items()}
         if validate is None:
             return HeldOut(None, noise)
-        runs = (validate,) if isinstance(validate, Experiment) else tuple(validate)
+        runs = tuple(cut_alike(fit.problem.experiments, validate))
         problem = fit.problem.with_(experiments=runs, model=fit.model, priors={}, penalties=(), balance={})
         return HeldOut(problem, noise)
 

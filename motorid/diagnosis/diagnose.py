@@ -26,6 +26,7 @@ from motorid.diagnosis.verdict import (
     outliers_remark,
     unexplained_text,
     unfinished_remark,
+    window_remark,
 )
 from motorid.errors import MotoridError
 from motorid.estimation.result import Fit
@@ -109,7 +110,7 @@ def _remarks(found: Climb, driven: str) -> list[str]:
     first, last = found.path[0].fit, found.path[-1].fit
     limits = (f"In {run.name} {limit}" for run in first.problem.experiments if (limit := current_limit(run)))
     stopped = f"Stopped early: {found.stopped}; more may be missing." if found.stopped else ""
-    return [stopped, driven, next(limits, ""), parts_remark(first), unfinished_remark(last),
+    return [stopped, driven, window_remark(last), next(limits, ""), parts_remark(first), unfinished_remark(last),
             held_out_remark(found.path[-1]), measured_angle_remark(last), outliers_remark(last),
             closed_loop_remark(first)]
 

@@ -20,11 +20,11 @@ from motorid.problem.problem import Problem
 from motorid.problem.runs import angle_signal
 from motorid.records.experiment import Experiment
 
-AFFORDABLE = 150_000  # steps of integration per simulation of all records
-WANTED = 36_000  # of what is longer
+AFFORDABLE = 60_000  # steps of integration per simulation of all records
+WANTED = 24_000  # of what is longer
 PART = 1000  # samples
-SUBSTEPS = 24  # per sample: what needs more cannot be seen in these samples, unless it is cheap
-CHEAP = 200_000  # steps of integration
+SUBSTEPS = 10  # per sample: what needs more cannot be seen in these samples, unless it is cheap
+CHEAP = 60_000  # steps of integration
 LONG = 20_000  # samples: a first fit of their parts tells whether all of them are affordable
 FEW = 4 * PART  # samples of that first fit
 NEARLY_ALL = 0.7  # of the samples: no reason to leave out the rest

@@ -32,7 +32,7 @@ from motorid.problem.runs import natural_sizes
 from motorid.problem.simulate import misfit_over_noise
 
 RACE = LevenbergMarquardt(max_iterations=6, ftol=1e-3, xtol=1e-4, looks=0)
-POLISH = LevenbergMarquardt(max_iterations=60, ftol=1e-7, xtol=1e-7, looks=0)
+POLISH = LevenbergMarquardt(max_iterations=60, ftol=1e-5, xtol=1e-5, looks=0)
 GOING_ON = 4  # times, where the last descent ends at its limit
 LOST = 0.2  # NRMSE of a channel
 ROOM = 10.0  # factor beyond its grid that a shape parameter may run to

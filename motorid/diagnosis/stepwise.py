@@ -21,7 +21,8 @@ from motorid.diagnosis.record_parts import affordable
 from motorid.diagnosis.refit import INTERRUPTED, OUT_OF_TIME
 from motorid.diagnosis.results import Adequacy, Candidate, Ladder, Rung
 from motorid.diagnosis.verdict import first_answer
-from motorid.errors import OutOfTime
+from motorid.errors import FAILURES, OutOfTime
+from motorid.estimation.fit import TOO_FAR, follows, growth, in_windows, solve
 from motorid.estimation.result import Fit
 from motorid.model.definition import Effect
 from motorid.numerics.parallel import budget, interruption, one_thread
@@ -190,6 +191,9 @@ def explored(fit: Fit, validate: Sequence[Experiment] | Experiment | None, effec
         if reading := better(records.fit):
             records = records.read(reading)
     found = climbed(records)
+    if not found.stopped and (windowed := _in_windows(found)) is not None:
+        records = replace(records, fit=windowed)
+        found = climbed(records)
     last = found.path[-1]
     if not found.stopped and (reading := _late_reading(found.path)):
         again = records.read(reading)
@@ -199,6 +203,22 @@ def explored(fit: Fit, validate: Sequence[Experiment] | Experiment | None, effec
         if better.gain > 0 and better.fall > 0:
             records, found = again, anew
     return found, " ".join(records.remarks)
+
+
+def _in_windows(found: Climb) -> Fit | None:
+    """Return the first model's fit in windows, if the last one carries small errors too far over the whole records.
+
+    A pendulum upright says so only once its weight is in the model.
+    """
+    first, last = found.path[0].fit, found.path[-1].fit
+    if follows(last) and not last.model.angle_input:
+        return None
+    if growth(last) < TOO_FAR or (part := in_windows(last)) is None:
+        return None
+    try:
+        return solve(part.problem.with_(model=first.model, balance={}))
+    except FAILURES:
+        return None
 
 
 def _late_reading(path: Sequence[Node]) -> Reading | None:

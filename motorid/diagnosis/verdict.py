@@ -29,6 +29,14 @@ def first_answer(fit: Fit, judged: Adequacy, scores: Sequence[Score]) -> str:
     return f"first answer: {fit.verdict.rstrip('.')}{next_}"
 
 
+def window_remark(fit: Fit) -> str:
+    """Say that the records were simulated in windows, and why."""
+    if fit.window is None:
+        return ""
+    return (f"The records are simulated in windows of {number(fit.window, 2)} s, each from an estimated state: over "
+            "all of them this model carries small errors too far. Errors are those of a window ahead.")
+
+
 def adequate_text(judged: Adequacy, ranking: Sequence[Candidate]) -> str:
     """Return the verdict when nothing is missing."""
     near = [c for c in ranking if c.refit_drop]

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -22,12 +25,16 @@ from motorid.numerics.least_squares import LevenbergMarquardt
 from motorid.numerics.parallel import one_thread
 from motorid.problem.problem import Problem, as_problem
 from motorid.problem.simulate import integration_error, misfit_over_noise
-from motorid.records.experiment import Experiment
+from motorid.records.experiment import Experiment, windows
 
 NOISE = 1.2  # RMS of the residual over the noise that may be called noise
 IMBALANCE = 3.0  # between channels, in misfit over noise, above which the misfit decides the weights
 REWEIGHTINGS = 3  # at most
 ERROR_SHARE = 0.2  # integration error accepted beside noise or misfit
+WINDOWS = (8, 32)  # of the longest record, where it is not followed as a whole
+FEWEST = 50  # samples of a window
+UNFOLLOWED = 0.25  # share of a channel's variance left unexplained
+TOO_FAR = 100.0  # times that an error in the state grows: one of 1 % would be all of the motion
 MOST_FINER = 4  # times as many steps, where that is not kept
 
 
@@ -36,7 +43,7 @@ def fit(model: Model, runs: Sequence[Experiment] | Experiment, *, solver: Any = 
         engine: str | Engine = "rosenbrock", formulation: str = "plain",
         priors: Mapping[str, tuple[float, float]] | None = None, penalties: Sequence[Any] = (),
         constraints: Sequence[Any] = (), loss: Any = None, weights: str | None = None, initial: str = "auto",
-        callback: Callback = None) -> Fit:
+        window: str | float | None = "auto", callback: Callback = None) -> Fit:
     """Estimate the free parameters of `model` from `runs`; no first guess is asked for.
 
     Parameters
@@ -57,6 +64,11 @@ def fit(model: Model, runs: Sequence[Experiment] | Experiment, *, solver: Any = 
     loss : Huber, optional
     weights : {"noise", "rms"}, optional
     initial : {"auto", "rest", "measured", "estimate"}
+    window : {"auto"}, float or None
+        Simulate the records in windows of so many seconds, each from an estimated state; None: as a whole.
+        ``"auto"``: as a whole, unless the model does not follow them and would carry any small error too far, as
+        a pendulum does that a controller holds upright (truncated simulation error: Forgione & Piga, IFAC-PapersOnLine
+        54(7), 2021). `Fit.window` says what was done, `evaluate` and `diagnose` do the same.
     callback : callable, optional
         ``callback(iteration, cost, q)``.
 
@@ -86,6 +98,10 @@ def fit(model: Model, runs: Sequence[Experiment] | Experiment, *, solver: Any = 
     if constraints and formulation == "plain" and not hasattr(solver, "solve"):
         raise UsageError("constraints need a solver that honours them: solver=mi.MultipleShooting(), or "
                          "formulation='penalty' to weigh them.")
+    if isinstance(window, str) and window != "auto":
+        raise UsageError(one_of(window, ("auto",), "window") + " Or give a time in seconds, or None.")
+    if isinstance(window, int | float):
+        runs = [part for run in ([runs] if isinstance(runs, Experiment) else runs) for part in windows(run, window)]
     penalties = tuple(penalties)
     if formulation == "penalty":
         from motorid.problem.constraints import SteadyState
@@ -96,6 +112,9 @@ def fit(model: Model, runs: Sequence[Experiment] | Experiment, *, solver: Any = 
                          constraints=tuple(constraints), initial=initial,
                          weights=weights or ("rms" if formulation == "penalty" else "noise"))
     found = solve(problem, solver, start=start, callback=callback, formulation=formulation)
+    if window == "auto" and start == "auto" and not hasattr(solver, "solve"):
+        again = partial(solve, solver=solver, callback=callback, formulation=formulation)
+        found = found if follows(found) else in_windows(found, again) or found
     _ = found.evaluation, found.std  # kept with the fit: showing it then computes nothing
     return found
 
@@ -241,3 +260,63 @@ def _said(found: Estimate, error: float) -> tuple[str, str]:
         return status, (f"{message}; but the integration error is {error:.2g} times the noise: try engine='cvodes' or "
                         "a finer record.")
     return status, f"{message}."
+
+
+def follows(fit: Fit) -> bool:
+    """Tell whether a fit explains three quarters of the variance of each channel."""
+    left, whole = dict.fromkeys(fit.nrmse, 0.0), dict.fromkeys(fit.nrmse, 0.0)
+    for s in fit.simulations:
+        for c in (c for c in left if c in s.experiment.outputs):
+            y = s.experiment.outputs[c]
+            left[c] += float(np.nansum(s.residual(c) ** 2))
+            whole[c] += float(np.nansum((y - np.nanmean(y)) ** 2))
+    return all(left[c] < UNFOLLOWED * whole[c] for c in left)
+
+
+def in_windows(fit: Fit, solve: Callable[[Problem], Fit] = solve) -> Fit | None:
+    """Return the fit of the same model in the longest windows that it follows, if it amplifies errors; else None.
+
+    `solve` fits a problem.
+    """
+    problem = fit.problem
+    longest = max(r.duration for r in problem.experiments)
+    if fit.window is not None or problem.initial != "auto":
+        return None
+    for count in WINDOWS:
+        runs = tuple(p for r in problem.experiments for p in windows(r, longest / count) if r.n > FEWEST * count)
+        with contextlib.suppress(*FAILURES):
+            part = solve(problem.with_(experiments=runs, model=fit.model, balance={})) if runs else None
+            if part is not None and follows(part):
+                return part if growth(part) > TOO_FAR else None
+    return None
+
+
+def growth(fit: Fit) -> float:
+    """Return how many times a small error in the state grows at most along the records, each state in its RMS.
+
+    The model is followed in short windows, along what was measured, where it might be elsewhere without them.
+    """
+    runs, model = fit.problem.experiments, replace(fit.model, angle_input=False, _systems={})
+    longest = max(r.duration for r in runs)
+    parts = [windows(r, longest / max(WINDOWS)) if fit.window is None and r.n > FEWEST * max(WINDOWS) else [r]
+             for r in runs]
+    problem = fit.problem.with_(experiments=tuple(p for each in parts for p in each), model=model, priors={})
+    ends = set(np.cumsum([len(each) for each in parts])) if fit.window is None else {
+        k for k, (a, b) in enumerate(pairwise(runs), 1) if b.t[0] < a.t[-1]}
+    problem = problem.refined(problem.start)
+    at = problem.unknowns.point(problem.start)
+    states, slopes = [], []
+    for k, run in enumerate(problem.runs):
+        x0 = problem.unknowns.first_state(at, k)
+        moved = problem.integrator.run(problem.system, run.grid, x0, at.p, np.eye(len(x0)),
+                                       np.zeros((len(at.p), len(x0))))
+        assert moved.dx is not None
+        states.append(moved.x)
+        slopes.append(moved.dx[-1])
+    size = np.sqrt(np.mean(np.concatenate(states) ** 2, axis=0)) + 1e-300
+    worst, through = 1.0, np.eye(len(size))
+    for k, slope in enumerate(slopes, 1):
+        through = (slope * size / size[:, None]) @ through
+        worst = max(worst, float(np.linalg.norm(through, 2)))
+        through = np.eye(len(size)) if k in ends else through
+    return worst

@@ -142,8 +142,15 @@ class Fit(Shown):
         said = {"noise": "Fits: errors at the level of the noise",
                 "poor": f"Fits poorly: errors up to {number(times, 2)} times the noise",
                 "lost": "Does not fit: a model that says zero would be nearer"}[self.fits]
+        if self.window:
+            said += f", a window of {number(self.window, 2)} s ahead"
         end = "" if self.status == "converged" else f" Not converged ({self.status}): the values are no optimum."
         return f"{said} (NRMSE {self.evaluation.words}).{end}"
+
+    @property
+    def window(self) -> float | None:
+        """Length of the windows that the records are simulated in, s; None where they are simulated as a whole."""
+        return self.problem.experiments[0].meta.get("window")
 
     @cached_property
     def at_bound(self) -> set[str]:

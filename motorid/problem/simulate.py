@@ -20,7 +20,7 @@ from motorid.numerics.least_squares import LevenbergMarquardt, levenberg_marquar
 from motorid.numerics.parallel import one_thread
 from motorid.numerics.signals import Array
 from motorid.problem.problem import Problem, as_problem
-from motorid.records.experiment import Experiment, units_of
+from motorid.records.experiment import Experiment, units_of, windows
 from motorid.records.steady_state import find_segments
 
 ASSUMED_NOISE = 0.01  # of a channel's RMS, where a plan does not say
@@ -238,10 +238,18 @@ def steady_errors(simulations: Sequence[Simulation], sigma: Sequence[Mapping[str
 
 
 @one_thread
+def cut_alike(fitted: Sequence[Experiment], runs: Sequence[Experiment] | Experiment) -> list[Experiment]:
+    """Return `runs` in windows, if the `fitted` ones are."""
+    runs = [runs] if isinstance(runs, Experiment) else list(runs)
+    seconds = fitted[0].meta.get("window")
+    return runs if seconds is None else [part for run in runs for part in windows(run, seconds)]
+
+
 def evaluate(fit_or_model: Any, runs: Sequence[Experiment] | Experiment, **options: Any) -> Evaluation:
     """Judge a fit (or a model at its values) on `runs` that it may never have seen.
 
-    Unknown initial states of these runs are estimated from them; no parameter is.
+    Unknown initial states of these runs are estimated from them; no parameter is. A fit in windows is judged in
+    windows of the same length, by what it predicts a window ahead.
 
     Parameters
     ----------
@@ -255,6 +263,7 @@ def evaluate(fit_or_model: Any, runs: Sequence[Experiment] | Experiment, **optio
         options = {"engine": fit_or_model.problem.engine, "initial": fit_or_model.problem.initial, **options}
         if "sgn_width" in model.parameters:  # it was chosen for the fitted runs; it is part of what is judged
             model = model.replace(sgn_width=model.values["sgn_width"])
+        runs = cut_alike(fit_or_model.problem.experiments, runs)
     return judge(simulate(model, runs, **options))
 
 

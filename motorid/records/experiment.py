@@ -223,6 +223,22 @@ def split(experiment: Experiment, n: int = 2) -> list[Experiment]:
     return [b.with_(name=f"{experiment.name}[{j + 1}/{n}]") for j, b in enumerate(blocks)]
 
 
+def windows(experiment: Experiment, seconds: float) -> list[Experiment]:
+    """Cut a run into windows of about `seconds`, to be simulated each from a state of its own; what is cut stays so.
+
+    Raises
+    ------
+    UsageError, DataError
+        If a window would have too few samples.
+    """
+    if "window" in experiment.meta:
+        return [experiment]
+    if not 0 < seconds < np.inf:
+        raise UsageError(f"a window takes a time in seconds; got {seconds!r}.")
+    parts = split(experiment, max(round(experiment.duration / seconds), 1))
+    return [p.with_(meta={**experiment.meta, "window": seconds}) for p in parts]
+
+
 def _freeze(experiment: Experiment, name: str, value: object) -> None:
     object.__setattr__(experiment, name, value)
 

@@ -1,0 +1,111 @@
+"""Records that a model carries small errors too far in: a pendulum that a controller holds upright."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import motorid as mi
+from motorid.cli.app import app
+from motorid.errors import DataError, UsageError
+from motorid.estimation.fit import TOO_FAR, follows, growth
+from motorid.records.datasets import data_path
+from motorid.records.experiment import windows
+
+TRUE = {"J": 0.2, "b": 0.01, "mgl": 3.0}
+PENDULUM = mi.torque_driven() + mi.effects.gravity
+
+
+def upright(seed: int, seconds: float, tau_c: float = 0.0) -> mi.Experiment:
+    """A pendulum that a PD controller moves about its upper rest, simulated by small explicit steps."""
+    rng, dt, fine = np.random.default_rng(seed), 2e-3, 5
+    n = int(seconds / dt)
+    theta, omega = np.pi + 0.1, 0.0
+    t, v, y = np.arange(n) * dt, np.zeros(n), np.zeros((2, n))
+    for k in range(n):
+        wanted = np.pi + 0.3 * np.sign(np.sin(1.9 * t[k])) + 0.1 * np.sin(7 * t[k])
+        v[k] = np.clip(-12 * (theta + 2e-3 * rng.normal() - wanted) - 1.2 * omega, -8, 8)
+        y[:, k] = theta, omega
+        for _ in range(fine):
+            rubs = tau_c * np.tanh(omega / 1e-3)
+            omega += (v[k] - TRUE["b"] * omega - TRUE["mgl"] * np.sin(theta) - rubs) / TRUE["J"] * dt / fine
+            theta += omega * dt / fine
+    y += rng.normal(size=y.shape) * np.array([[2e-3], [0.02]])
+    return mi.Experiment(t=t, inputs={"v": v}, outputs={"theta": y[0], "omega": y[1]}, name=f"upright{seed}")
+
+
+@pytest.fixture(scope="module")
+def records():
+    return upright(0, 8), upright(5, 5)
+
+
+@pytest.fixture(scope="module")
+def fitted(records):
+    return mi.fit(PENDULUM, records[0])
+
+
+def test_what_the_whole_record_gives_absurdly_windows_give_truly(records, fitted):
+    whole = mi.fit(PENDULUM, records[0], window=None)
+    assert whole.window is None
+    assert not follows(whole)
+    assert abs(np.log(whole.values["J"] / TRUE["J"])) > 1  # this is what it is about
+    assert fitted.window == pytest.approx(1, rel=0.01)
+    assert fitted.fits == "noise"
+    assert "a window of 1 s ahead" in fitted.verdict
+    for name in ("J", "mgl"):
+        assert fitted.values[name] == pytest.approx(TRUE[name], rel=5e-3)
+
+
+def test_held_out_records_are_judged_in_the_same_windows(records, fitted):
+    judged = mi.evaluate(fitted, records[1])
+    assert len(judged.simulations) == 5
+    assert judged.nrmse["omega"] < 0.03
+
+
+def test_growth_is_that_of_the_unstable_pole(fitted):
+    pole = np.sqrt(TRUE["mgl"] / TRUE["J"])  # 1/s, over 8 s
+    assert np.log(growth(fitted)) == pytest.approx(8 * pole, rel=0.1)
+    assert growth(fitted) > TOO_FAR
+
+
+def test_a_motor_that_is_only_poorly_described_is_simulated_as_a_whole(lab):
+    """A model that lacks something must not be made to look well by short windows."""
+    runs = mi.read_runs(data_path("hidden_friction") / "run1.csv")
+    fit = mi.fit(mi.dc_motor(), runs)
+    assert fit.fits == "poor"
+    assert fit.window is None
+    assert growth(fit) < 10
+
+
+def test_a_diagnosis_finds_what_holds_a_pendulum_up_and_what_rubs_in_it():
+    fit = mi.fit(mi.torque_driven(), upright(1, 8, tau_c=0.03))
+    found = mi.diagnose(fit, upright(6, 5, tau_c=0.03))
+    assert found.effects == ("gravity", "coulomb")
+    assert found.best.window == pytest.approx(1, rel=0.01)
+    assert "in windows of 1 s" in found.text
+    assert found.best.values["J"] == pytest.approx(TRUE["J"], rel=0.01)
+    assert found.best.values["tau_c"] == pytest.approx(0.03, rel=0.15)
+
+
+def test_windows_of_a_length_that_was_asked_for(records):
+    fit = mi.fit(PENDULUM, records[1], window=0.5)
+    assert fit.window == 0.5
+    assert len(fit.problem.experiments) == 10
+    assert windows(fit.problem.experiments[0], 0.1) == [fit.problem.experiments[0]]  # what is cut stays so
+    with pytest.raises(UsageError, match="in seconds, or None"):
+        mi.fit(PENDULUM, records[1], window="long")
+    with pytest.raises(UsageError, match="takes a time in seconds"):
+        mi.fit(PENDULUM, records[1], window=-1.0)
+    with pytest.raises(DataError):
+        mi.fit(PENDULUM, records[1], window=1e-3)
+
+
+def test_the_option_of_the_command_line(tmp_path):
+    run, out = str(data_path("hidden_friction") / "run1.csv"), tmp_path / "fit.json"
+    done = CliRunner().invoke(app, ["fit", run, "--window", "0.2", "--json", str(out)])
+    assert done.exit_code == 0, done.output
+    assert json.loads(out.read_text())["window"] == 0.2
+    assert CliRunner().invoke(app, ["fit", run, "--window", "long"]).exit_code == 2
