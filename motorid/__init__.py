@@ -42,9 +42,9 @@ from motorid.uncertainty.profile import intervals, profile, profiles
 if _TYPE_CHECKING:
     from motorid.plots import *  # noqa: F403
 
-_FIGURES = ("plot_current_limit", "plot_fit", "plot_formulations", "plot_ladder", "plot_missing", "plot_parameters",
-            "plot_profile", "plot_ranking", "plot_residuals", "plot_runs", "plot_sensitivities", "plot_singular_values",
-            "plot_waterfall")
+_FIGURES = ("plot_answer", "plot_current_limit", "plot_fit", "plot_formulations", "plot_ladder", "plot_missing",
+            "plot_parameters", "plot_profile", "plot_ranking", "plot_residuals", "plot_runs", "plot_sensitivities",
+            "plot_singular_values", "plot_waterfall")
 
 
 def __getattr__(name: str) -> object:

@@ -6,6 +6,7 @@ import codecs
 import contextlib
 import shlex
 import sys
+import textwrap
 import warnings
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -28,6 +29,7 @@ _ASCII = {"Ω": "Ohm", "ω": "omega", "τ": "tau", "θ": "theta", "φ": "phi", "
           "“": '"', "”": '"', "⁻": "^-", **dict(zip("⁰¹³⁴⁵⁶⁷⁸⁹", "013456789", strict=True))}
 MANY = ("--validate",)  # options that take all names up to the next option
 OUTPUTS = ("--json", "--report")  # options that write a file
+MAY_WRAP = 32  # characters of a cell that is a sentence: shorter ones are names and numbers, and stay whole
 WIDTH = 110  # where the output is no terminal
 
 
@@ -113,13 +115,10 @@ def _check_outputs(given: dict[str, Any], command: str) -> None:
 def show(*parts: Table | str | None) -> None:
     """Print tables and text."""
     from rich import box
-    from rich.console import Console
     from rich.table import Table as RichTable
     from rich.text import Text
 
-    console = Console(highlight=False, soft_wrap=False)
-    if not console.is_terminal:
-        console = Console(highlight=False, width=WIDTH)
+    console = _console()
     for part in parts:
         if part is None:
             continue
@@ -129,7 +128,10 @@ def show(*parts: Table | str | None) -> None:
         drawn = RichTable(title=part.title or None, box=box.SIMPLE_HEAD, title_justify="left",
                           title_style="bold")
         for k, head in enumerate(part.header):
-            drawn.add_column(head, justify="left" if k in part.left else "right", overflow="fold")
+            words = k in part.left
+            longest = max((len(str(row[k])) for row in part.rows), default=0)
+            least = longest if longest <= MAY_WRAP else max(map(len, head.split()))
+            drawn.add_column(head, justify="left" if words else "right", overflow="fold", min_width=least)
         for row in part.rows:
             drawn.add_row(*(Text(printable(str(cell))) for cell in row))
         console.print(drawn)
@@ -137,11 +139,25 @@ def show(*parts: Table | str | None) -> None:
             console.print(Text(printable(f"{part.note}\n")))
 
 
+def _console() -> Any:
+    from rich.console import Console
+
+    console = Console(highlight=False, soft_wrap=False)
+    return console if console.is_terminal else Console(highlight=False, width=WIDTH)
+
+
 def say_notes(notes: Iterable[str], title: str = "Remarks") -> None:
     """Print remarks as a list, if there are any."""
-    lines = [f"  • {note}" for note in notes]
+    lines = [wrapped(note, "  • ") for note in notes]
     if lines:
         show("\n".join([title, *lines, ""]))
+
+
+def wrapped(text: str, first: str = "") -> str:
+    """Return a paragraph as wide as the screen, its further lines below the text of the first one."""
+    console = _console()
+    return textwrap.fill(text, console.width, initial_indent=first, subsequent_indent=" " * len(first),
+                         break_on_hyphens=False, break_long_words=False)
 
 
 def next_command(name: str) -> str:

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from motorid.cli.console import INTERRUPTED, save_report, say_notes, show
+from motorid.cli.console import INTERRUPTED, next_command, save_report, say_notes, show
 from motorid.cli.options import (
     OUT,
     FitOptions,
@@ -110,16 +110,23 @@ def _write_remainder(found: Diagnosis, path: Path, force: bool) -> None:
 
 
 def _show_diagnosis(found: Diagnosis) -> None:
-    """Print a diagnosis: verdict, place, ranking, ladder, how the parameters moved, what stays open."""
-    show(f"{found.text}\n")
-    show(f"Where: {found.missing.text}\n" if found.missing.text and found.verdict != "adequate" else None)
-    show(ranking_table(found.ranking, 8) if found.ranking else None)
-    show(ladder_table(found.ladder), found.ladder.text)
+    """Print a diagnosis: the answer, the errors before and after, the next step; then what it rests on."""
+    show(found.answer, "", ladder_table(found.ladder), f"Next: {_next_step(found)}", "")
+    say_notes(found.details, "Details")
     if found.after is not found.before:
-        show(comparison_table([("before", found.before), ("after", found.after)]))
-    for group in found.groups:
-        show(f"These records cannot tell apart: {', '.join(group)}.")
-    show(found.suggestion)
+        show(parameter_table(found.after, found.before))
+    show(ranking_table(found.ranking, 8) if found.ranking else None)
+
+
+def _next_step(found: Diagnosis) -> str:
+    """Return what to do next: the experiment that decides, what remains, or the model to go on with."""
+    if found.suggestion:
+        return found.suggestion
+    if found.remainder is not None and found.remainder.kind == "structure":
+        return f"look at what remains as an effect: {next_command('diagnose')} --remainder-to remainder.py"
+    if found.effects:
+        return f"{next_command('fit')} --effects {','.join(found.after.model.effect_names)} --json fit.json"
+    return f"{next_command('fit')} --json fit.json, then motorid export fit.json motor.casadi"
 
 
 def demo_command(

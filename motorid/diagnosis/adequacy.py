@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtrc, stdtr
 
+from motorid.channels import channel_name
 from motorid.diagnosis.misspecification import best_form
 from motorid.diagnosis.model_comparison import Node, far
 from motorid.diagnosis.predictive_score import Predictions
@@ -80,7 +81,7 @@ def adequacy(
     adequate = p_value > (false_alarm if level is None else level) and not far
     for c, facts in channels.items():
         facts["p_value"] = min([1.0, *(t["p"] for t in tests if t["channel"] == c)])
-    text = _text(adequate, channels, material, far, false_alarm)
+    text = _text(adequate, channels, material, false_alarm)
     return Adequacy(adequate, float(p_value), false_alarm, channels, text)
 
 
@@ -102,16 +103,16 @@ def following(judged: Adequacy, what: str) -> Adequacy:
 
 def unpredicted(judged: Adequacy) -> Adequacy:
     """Return a judgement that knows that no free form predicts errors larger than the noise."""
-    larger = " and ".join(c for c, f in judged.channels.items() if f["ratio"] > LARGER)
+    larger = " and ".join(channel_name(c) for c, f in judged.channels.items() if f["ratio"] > LARGER)
     why = (
-        f"Those of {larger} are larger than fast noise, but no smooth function of time, angle, speed, current or "
-        "voltage predicts them on data held out."
+        f"Those of {larger} are larger than the fast noise, but no smooth function of time, angle, speed, current or "
+        "voltage predicts them on data left out."
     )
     return replace(judged, text=f"{judged.text} {why}")
 
 
 def _sizes(channels: Mapping[str, Mapping[str, float]]) -> str:
-    return ", ".join(f"{c} {number(f['ratio'], 2)} times its noise" for c, f in channels.items())
+    return ", ".join(f"{channel_name(c)} {number(f['ratio'], 2)}" for c, f in channels.items()) + " times the noise"
 
 
 def _residuals(fit: Fit, channel: str) -> list[tuple[int, Array]]:
@@ -242,24 +243,22 @@ def _score_tests(fit: Fit, scores: Sequence[Score]) -> list[dict[str, Any]]:
 
 
 def _text(adequate: bool, channels: Mapping[str, Mapping[str, float]], material: Sequence[Mapping[str, Any]],
-          far: Sequence[str], false_alarm: float) -> str:
+          false_alarm: float) -> str:
     sizes = _sizes(channels)
     if adequate:
-        coloured = [c for c, f in channels.items() if f["autocorrelation"] > 0.3 or f["ratio"] > LARGER]
+        coloured = [channel_name(c) for c, f in channels.items() if f["autocorrelation"] > 0.3 or f["ratio"] > LARGER]
         colour = f" The noise of {' and '.join(coloured)} is coloured." if coloured else ""
         return (
-            f"The model is adequate: its errors ({sizes}) do not depend on the motion "
-            f"(rate of false alarms {100 * false_alarm:g} %).{colour}"
+            f"The errors ({sizes}) do not depend on the motion (false-alarm rate {100 * false_alarm:g} %).{colour}"
         )
     if not material:
-        large = f"too large for noise in {' and '.join(far)}, coloured or not"
-        return f"Something is missing: the errors ({sizes}) are {large}."
+        return f"Something is missing: the errors ({sizes}) are too large for noise, even coloured noise."
     worst = min(material, key=lambda t: (t["p"], -t["share"]))
     if worst["channel"] is None:
-        why = f"adding '{worst['on']}' would explain {100 * worst['share']:.0f} % of them"
+        why = f"'{worst['on']}' would explain {100 * worst['share']:.0f} % of them"
     else:
-        part = f"{100 * worst['share']:.0f} % of their variance"
-        why = f"those of {worst['channel']} depend on {worst['on']} ({part})"
+        part = f"{100 * worst['share']:.0f} % of the variance of the {channel_name(worst['channel'])} error"
+        why = f"{worst['on']} explains {part}"
     return f"Something is missing: the errors ({sizes}) are not noise; {why}."
 
 

@@ -28,10 +28,10 @@ def objections(fit: Fit, added: Effect, before: Fit | None = None) -> str:
     pars = [fit.problem.model.parameters[p.name] for p in added.parameters]
     for p in pars:
         if p.at_least and fit.values[p.name] < 0.98 * fit.values[p.at_least]:
-            return f"{p.name} came out below {p.at_least}, which is not physical"
+            return f"{p.name} < {p.at_least}, which is not physical"
         inside = 1.02 * p.lower < fit.values[p.name] < 0.98 * p.upper
         if p.grid and p.vary and not inside and (added.includes or p.unit in LENGTHS):
-            return f"{p.name} runs to its limit: nothing of this shape is in the data"
+            return f"{p.name} runs to its limit: nothing of this shape is in the records"
         if p.vary and p.null is not None and not p.positive and fit.values[p.name] <= p.lower == p.null:
             return f"{p.name} goes to {p.null:g}: the data do not want it, or only with the wrong sign"
         if p.vary and np.isfinite(p.upper) and fit.values[p.name] > 0.98 * p.upper and not _was_narrowed(p, added):

@@ -162,7 +162,7 @@ class Search:
         try:
             drop, predictions = _drop(node, fit), self.held.predictions(fit)
         except FAILURES as error:
-            return None, replace(candidate, reason=f"fails on held-out data: {error}")
+            return None, replace(candidate, reason=f"fails on the held-out runs: {error}")
         objection = next((w for e in effects if (w := objections(fit, e, node.fit))), "")
         values = {p.name: fit.values[p.name] for e in effects for p in e.parameters}
         child = Node(fit, effect.name, predictions, node, objection=objection)
@@ -252,8 +252,8 @@ def _merged(a: Score, b: Score) -> list[dict[str, float]]:
 def _unseen(score: Score) -> str:
     """Say why an effect was not refitted."""
     if score.same_as:
-        return f"not identifiable with these data beside {' and '.join(score.same_as)}, which together do the same"
-    return "too little to gain for a refit"
+        return f"these records do not distinguish it from {' and '.join(score.same_as)} together"
+    return "not refitted: too little to gain"
 
 
 def _said(found: Evidence) -> str:
@@ -263,7 +263,7 @@ def _said(found: Evidence) -> str:
         rises = f"the held-out error rises by {-100 * found.held_out_fall:.1f} %"
         return rises if found.held_out_fall < 0 else "most of the held-out samples are predicted worse"
     if not found.sure:
-        return f"predicts no better than chance would (gain {found.gain:.1f} ± {found.se:.1f})"
+        return f"no better than chance (gain {found.gain:.1f} ± {found.se:.1f})"
     if not found.worth_it:
         return f"lowers the {where} by less than {100 * MATERIAL:g} %"
     return f"lowers the {where} by {100 * found.fall:.1f} %"

@@ -1,4 +1,4 @@
-"""diagnose(): where does the model fail, which effect is missing, and what cannot be told apart."""
+"""diagnose(): where does the model fail, which effect is missing, and what do the records not distinguish."""
 
 from __future__ import annotations
 
@@ -23,6 +23,7 @@ from motorid.diagnosis.verdict import (
     inseparable_remark,
     measured_angle_remark,
     missing_text,
+    moves,
     outliers_remark,
     unexplained_text,
     unfinished_remark,
@@ -88,21 +89,23 @@ def _told(found: Climb, driven: str, validated: bool, own: Sequence[Effect]) -> 
         missing = acting_like(missing, like)
     if names:
         verdict, where = "missing", balance_of(names[0], own)
-        text = missing_text(ladder.rungs, remaining, groups, found.grades)
+        answer = missing_text(ladder.rungs, remaining, groups, found.grades)
         same = {name: p for node in found.path[1:] for name, p in found.search.inseparable(node).items()}
-        text = f"{text} {inseparable_remark(same)}".rstrip()
+        details = [moves(fit, ladder.best), inseparable_remark(same)]
         groups = (*groups, *(_sharing(ladder.best, name, parameters) for name, parameters in same.items()))
         suggestion = _suggestion(found)
     elif len(found.path) > 1 or not remaining.adequate:
         verdict, where = "unexplained", missing.where
         judged = judged if len(found.path) > 1 else remaining
-        text = unexplained_text(judged, missing, ranking, ladder.rungs, found.grades, done=not found.stopped)
+        answer = unexplained_text(ranking, ladder.rungs, found.grades, like.text if like else "", not found.stopped)
+        details = [judged.text, missing.text]
     else:
-        verdict, where, text = "adequate", None, adequate_text(judged, ranking)
+        verdict, where, (answer, *details) = "adequate", None, adequate_text(judged, ranking)
     kind = "structure" if not remaining.adequate else "fluctuation" if far(ladder.best) else "noise"
-    text = " ".join(t for t in (text, *_remarks(found, driven), suggestion) if t)
+    details = tuple(t for t in (*details, *_remarks(found, driven)) if t)
+    text = " ".join(t for t in (answer, *details, suggestion) if t)
     return Diagnosis(verdict, text, where, names, judged, missing, ranking, ladder, groups, suggestion, fit,
-                     ladder.best, remaining, Remainder(kind, ladder.best, form), found.stopped)
+                     ladder.best, remaining, Remainder(kind, ladder.best, form), found.stopped, answer, details)
 
 
 def _remarks(found: Climb, driven: str) -> list[str]:
@@ -135,5 +138,5 @@ def _suggestion(found: Climb) -> str | None:
     except MotoridError:
         return None
     if best.discrimination[best.name] < 1e-3:
-        return f"No voltage record within the limits would tell {listed} apart."
-    return f"To tell {listed} apart, try {best.text}."
+        return f"No voltage record within the limits would distinguish {listed}."
+    return f"To distinguish {listed}, record {best.text}."

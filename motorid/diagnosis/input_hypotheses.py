@@ -13,11 +13,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from motorid.channels import channel_name
 from motorid.diagnosis.cross_validation import ROUGH
 from motorid.diagnosis.predictive_score import Predictions, compare, predictions_left_out
 from motorid.diagnosis.refit import RACE
 from motorid.diagnosis.thresholds import MATERIAL
-from motorid.display.numbers import number, percent
+from motorid.display.numbers import arrow, number
 from motorid.errors import FAILURES
 from motorid.estimation.continuation import by_continuation
 from motorid.estimation.fit import solve
@@ -64,8 +65,8 @@ class Reading:
 
     def remark(self, before: Fit, after: Fit) -> str:
         """Say what was done to the records and what that did to the errors."""
-        falls = ", ".join(f"{c} from {percent(e, 3)} to {percent(after.nrmse[c], 3)}" for c, e in before.nrmse.items())
-        return f"{self.says}: so read ({self.option}), the error falls, {falls}, and so it is read here."
+        falls = ", ".join(f"{channel_name(c)} {arrow(e, after.nrmse[c])}" for c, e in before.nrmse.items())
+        return f"{self.says}: with {self.option} the error falls ({falls}), and this diagnosis uses it."
 
 
 def without_spikes(fit: Fit) -> Reading | None:
@@ -153,7 +154,7 @@ def _readings(runs: Sequence[Experiment]) -> Iterator[Reading]:
     if not moving:
         return
     hold = OTHER[moving[0].hold]
-    how = "goes on straight from sample to sample" if hold == "linear" else "is held from sample to sample"
+    how = f"is {'linear' if hold == 'linear' else 'constant'} between samples"
     yield Reading(f"The voltage {how}", f"--hold {hold}", lambda r: r.with_(hold=hold) if _changes(r) else r)
     if any(_noisy(r) for r in moving):
         noise = "The voltage was measured with noise that the motor did not see"

@@ -22,8 +22,8 @@ from motorid.problem.runs import angle_signal, natural_sizes
 
 WALKS = (0.03, 0.1, 0.3, 1.0, 3.0)  # of the natural size per √s, the smallest that explains the data is taken
 BINS = 24
-WORDS = {"i": "the current", "omega": "the speed", "theta": "the angle within a turn", "heat": "the heat put in",
-         "t": "the time"}
+WORDS = {"i": "the current", "omega": "the speed", "theta": "the angle within a turn", "t": "the time",
+         "heat": "the heat dissipated so far"}
 REGIONS = ("standstill", "reversal", "acceleration", "high current", "steady")
 
 
@@ -81,7 +81,7 @@ def acting_like(missing: Missing, form: Form) -> Missing:
 
 def _region(first: str, regions: Mapping[str, float]) -> str:
     place = "steady motion" if first == "steady" else first
-    return f"Most of the misfit ({100 * regions[first]:.0f} %) lies in {place}."
+    return f"{100 * regions[first]:.0f} % of the squared error lies in {place}."
 
 
 def _walk(fit: Fit, size: Array, begun: Sequence[Begun]) -> tuple[float, list[Smoothed]]:
@@ -200,12 +200,37 @@ def _text(where: str | None, shares: Mapping[str, float], regions: Mapping[str, 
         name = "torque"
     else:
         name = "voltage" if where == "electrical" else "torque"
-        lead = f"The {name} balance fails ({100 * shares.get(where or '', 0):.0f} % of the misfit)."
+        lead = f"The {name} balance fails ({100 * shares.get(where or '', 0):.0f} % of the squared error)."
     best = bins.get(name, ())
     if best and best[0].explained > 0.2:
-        on = f"{WORDS[best[0].against]} ({100 * best[0].explained:.0f} % explained)"
-        return f"{lead} What is missing depends on {on}. {region}"
+        what = WORDS[best[0].against]
+        share = f"{100 * best[0].explained:.0f} % of the missing {name}"
+        return f"{lead} {what[0].upper()}{what[1:]} explains {share}. {region}"
     return f"{lead} {region}"
+
+
+def accounted(before: Fit, after: Fit) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
+    """Return per run the voltage (V) and torque (N·m) missing in `before` that `after` has.
+
+    That is its effects and the shift of the parameters: what the balances of `before` lack along the motion of `after`.
+    """
+    voltages, torques = [], []
+    for k, run in enumerate(after.problem.runs):
+        states = after.simulations[k].states
+        new, old = (_rates(f, k, states) for f in (after, before))
+        scale = {"i": before.values.get("L", 0.0), "omega": before.values["J"]}
+        missing = {n: scale[n] * (new[n] - old[n]) if n in old else np.zeros(run.experiment.n) for n in scale}
+        voltages.append(missing["i"])
+        torques.append(missing["omega"])
+    return tuple(voltages), tuple(torques)
+
+
+def _rates(fit: Fit, k: int, states: Mapping[str, Array]) -> dict[str, Array]:
+    system, run = fit.problem.system, fit.problem.runs[k]
+    x = np.vstack([states.get(n, np.zeros(run.experiment.n)) for n in system.states])
+    p = np.array([fit.values[n] for n in system.parameters])
+    f = np.asarray(system.rhs(x, run.grid.u.T, p))
+    return {n: f[j] for j, n in enumerate(system.states) if n != "i" or system.stored[j]}
 
 
 STEPS = 4  # Gauss-Newton iterations

@@ -221,7 +221,7 @@ HARDLY = 1.01  # times: near enough that a slope tells what more would do
 FAR_LESS = 0.3  # of the promise that was kept
 OUT_OF_TIME = "the time is up"
 INTERRUPTED = "interrupted"
-FAR_BEHIND = "far behind the best, which leaves only noise"
+FAR_BEHIND = "rejected: {} alone already reaches the noise"
 NEARLY = 0.9  # of the best promise: a smaller model with that is the favourite
 
 
@@ -312,7 +312,8 @@ def _quiet(fit: Fit | GivenUp | None) -> Fit | None:
 def _unpromising(tasks: Sequence[Task], leader: int) -> dict[int, GivenUp]:
     """Return the tasks of which far less is promised than of an effect that leaves only noise."""
     promises = {k: task.promise for k, task in enumerate(tasks) if task.promise is not None}
-    return {k: GivenUp(FAR_BEHIND) for k, p in promises.items() if p < FAR_LESS * promises[leader]}
+    why = FAR_BEHIND.format(tasks[leader].effect.name)
+    return {k: GivenUp(why) for k, p in promises.items() if p < FAR_LESS * promises[leader]}
 
 
 def _needless(tasks: Sequence[Task], leader: int, best: Fit, map_: Callable[..., Iterable[Any]]) -> dict[int, GivenUp]:
@@ -324,7 +325,7 @@ def _needless(tasks: Sequence[Task], leader: int, best: Fit, map_: Callable[...,
         if winner.effect.name in task.effect.includes
     }
     gains = dict(zip(wider, map_(_gain, wider.values()), strict=True))
-    why = f"does no more than {winner.effect.name}, which it contains"
+    why = f"no better than {winner.effect.name}, its simpler special case"
     return {
         k: GivenUp(why)
         for k, task in wider.items()
@@ -345,9 +346,9 @@ def _beaten(tasks: Sequence[Task], costs: Mapping[int, float], first: int) -> di
         if k == first:
             continue
         if cost > BEHIND * costs[first]:
-            given_up[k] = _given_up(winner, cost, FAR_BEHIND)
+            given_up[k] = _given_up(winner, cost, FAR_BEHIND.format(winner.effect.name))
         elif winner.effect.name in tasks[k].effect.includes and cost > costs[first] - (tasks[k].price - winner.price):
-            given_up[k] = _given_up(winner, cost, f"does no more than {winner.effect.name}, which it contains")
+            given_up[k] = _given_up(winner, cost, f"no better than {winner.effect.name}, its simpler special case")
     return given_up
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from motorid.channels import UNITS, channel_name
@@ -13,6 +13,7 @@ from motorid.display.numbers import number, percent, quantity
 from motorid.display.tables import Cell, Flag, Table
 from motorid.estimation.result import Fit, parameter_table
 from motorid.numerics.signals import Array
+from motorid.problem.simulate import NRMSE
 from motorid.records.experiment import units_of
 
 VERDICT_MOODS = {"adequate": "good", "missing": "note", "unexplained": "bad"}
@@ -235,6 +236,10 @@ class Diagnosis(Shown):
         What is left beside all effects: noise, fluctuation or structure, and what structure follows.
     stopped : str
         Why it ended before it was done: the budget was spent, or it was interrupted; empty if it was done.
+    answer : str
+        The verdict in a few sentences: what is missing and how large, how the error changes, what remains.
+    details : tuple of str
+        What else a reader should know.
     """
 
     verdict: str
@@ -252,36 +257,42 @@ class Diagnosis(Shown):
     remaining: Adequacy
     remainder: Remainder | None = None
     stopped: str = ""
+    answer: str = ""
+    details: tuple[str, ...] = ()
 
     @property
     def best(self) -> Fit:
         """The fit of the last rung: the model that predicts best."""
         return self.after
 
+    def summary(self) -> Card:
+        """Return the answer alone: the verdict, the errors before and after, the next step."""
+        flags = (Flag(self.verdict, VERDICT_MOODS[self.verdict]), *([Flag(self.where)] if self.where else []))
+        return Card("Diagnosis", flags, (self.answer or self.text,), (ladder_table(self.ladder),), self._next())
+
+    def _next(self) -> tuple[tuple[str, str], ...]:
+        kind = self.remainder.kind if self.remainder else "noise"
+        after = [("found.best", "the better fit")] if self.after is not self.before else []
+        after += [("found.remainder.as_effect()", "what remains, as an effect to add")] if kind == "structure" else []
+        return (*after, ("mi.plot_missing(found)", "see it"), ('mi.report(found, "report.html")', "all on one page"))
+
     def card(self) -> Card:
-        """Return the verdict, the effects tried, how the error fell and the parameters moved."""
-        text = [self.text]  # which may say already what these add
-        text += [f"Next experiment: {self.suggestion}"] if self.suggestion and self.suggestion not in self.text else []
-        alike = [f"These data cannot tell apart: {', '.join(g)}." for g in self.groups if len(g) > 1]
-        text += [] if "cannot tell" in self.text else alike
-        tables = [ranking_table(self.ranking, 6)] if self.ranking else []
-        tables.append(ladder_table(self.ladder))
-        if self.after is not self.before:
-            tables.append(parameter_table(self.after, self.before))
-        return Card(
-            "Diagnosis",
-            (Flag(self.verdict, VERDICT_MOODS[self.verdict]), *([Flag(self.where)] if self.where else [])),
-            text,
-            tables,
-            (("mi.plot_missing(found)", "where"), ("mi.plot_ranking(found)", "which"),
-             ("found.after", "the better fit"), ('mi.report(found, "report.html")', "the whole story on one page")),
-        )
+        """Return the answer, then what it rests on: place, parameters before and after, the effects tried."""
+        first = self.summary()
+        text = [f"Next experiment: {self.suggestion}"] if self.suggestion else []
+        tables = [parameter_table(self.after, self.before)] if self.after is not self.before else []
+        tables += [ranking_table(self.ranking, 6)] if self.ranking else []
+        return replace(first, text=(*first.text, *text, *self.details), tables=(*first.tables, *tables))
+
+    def __str__(self) -> str:
+        return str(self.summary())
 
     def to_dict(self) -> dict[str, Any]:
         """Return the contents of ``diagnose --json``."""
         m = self.missing
         return {
             "verdict": self.verdict,
+            "answer": self.answer,
             "text": self.text,
             "where": self.where,
             "location": {
@@ -317,23 +328,20 @@ class Diagnosis(Shown):
 
 def share_table(what: str, shares: Mapping[str, float]) -> Table:
     """Return the share of the misfit of each balance or region."""
-    return Table([what, "share of the misfit"], [[k, percent(v, 2)] for k, v in shares.items()])
+    return Table([what, "share of the squared error"], [[k, percent(v, 2)] for k, v in shares.items()])
 
 
 def ranking_table(candidates: Sequence[Candidate], most: int = 10) -> Table:
     """Return the effects tried, best first; the held-out error only where there is one."""
     held_out = any(c.held_out_gain is not None for c in candidates[:most])
-    header = ["effect", "predicted drop", "drop after a refit", *(["held-out error falls by"] if held_out else []),
-              "size (SI)", "verdict"]
+    header = ["effect", "predicted", "refitted", *(["held out"] if held_out else []), "verdict"]
     rows: list[list[Cell]] = []
     for c in candidates[:most]:
-        # Non-breaking blanks: a line may end between parameters only.
-        sizes = [f"{n}\u00a0=\u00a0{number(v, 3)}" for n, v in c.parameters.items() if n != "sgn_width"]
         gain = [percent(c.held_out_gain)] if held_out else []
         verdict = Flag("accepted", "good") if c.accepted else (c.reason or "not refitted")
-        rows.append([c.effect, percent(c.predicted_drop), percent(c.refit_drop), *gain, ", ".join(sizes), verdict])
-    note = "Drop: share of the misfit that the effect takes away."
-    return Table(header, rows, "Which effect is missing?", note, left=(0, len(header) - 2, len(header) - 1))
+        rows.append([c.effect, percent(c.predicted_drop), percent(c.refit_drop), *gain, verdict])
+    note = "Fall of the squared error: predicted from sensitivities, refitted; held out: fall of the NRMSE."
+    return Table(header, rows, "Effects tried", note, left=(0, len(header) - 1))
 
 
 def ladder_table(ladder: Ladder) -> Table:
@@ -350,4 +358,4 @@ def ladder_table(ladder: Ladder) -> Table:
         name += "".join(f" − {gone}" for gone in r.removed)
         held = [percent((r.validation_nrmse or {}).get(c)) for c in channels] if held_out else []
         rows.append([name, *(percent(r.nrmse.get(c)) for c in channels), *held])
-    return Table(header, rows, "The error falls")
+    return Table(header, rows, "NRMSE before and after", NRMSE)

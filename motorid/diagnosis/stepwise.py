@@ -93,7 +93,7 @@ def _rounds(found: Climb, max_effects: int, advance: Callable[[str], None]) -> I
             children = {c.key: c for c in search.expand_by_two(best)}
             chosen = _better(children.values(), best)
         if chosen is None:
-            yield replace(found, text="stopped: no further effect lowers the error on data it was not fitted to")
+            yield replace(found, text="stopped: no further effect lowers the error on data left out")
             return
         new, ordered = chosen
         search.nodes |= children
@@ -110,7 +110,7 @@ def _rounds(found: Climb, max_effects: int, advance: Callable[[str], None]) -> I
         advance(f"accepted {chosen_of.added}")
         yield found
     done = found.remaining.adequate and at_noise(best)
-    yield replace(found, text="stopped: what is left is noise" if done
+    yield replace(found, text="stopped: what remains is noise" if done
                   else f"stopped at the limit of {max_effects} effects")
 
 

@@ -1,4 +1,4 @@
-"""The answer in words: what is missing, how large, how sure, what cannot be told apart, how the rest moved."""
+"""The answer in words: what is missing, how large, how sure, what the records do not distinguish, what moved."""
 
 from __future__ import annotations
 
@@ -6,16 +6,18 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from motorid.channels import channel_name
 from motorid.diagnosis.misspecification import Grade
 from motorid.diagnosis.model_comparison import Node
-from motorid.diagnosis.results import Adequacy, Candidate, Missing, Rung
+from motorid.diagnosis.results import Adequacy, Candidate, Rung
 from motorid.diagnosis.score_test import Score
 from motorid.diagnosis.thresholds import ELSEWHERE, LARGER, LOST
-from motorid.display.numbers import number, percent, with_error
+from motorid.display.numbers import arrow, number, percent, with_error
 from motorid.effects import EVERY
 from motorid.estimation.result import Fit
 from motorid.model.definition import Effect
 from motorid.numerics.noise import despiked
+from motorid.records.experiment import units_of
 
 MOVED = 0.1  # relative change of a motor parameter that is worth a word
 SPIKED = 0.5  # of a channel's squared error: what outliers must make to be worth a word
@@ -25,7 +27,7 @@ RPM = 30 / np.pi
 def first_answer(fit: Fit, judged: Adequacy, scores: Sequence[Score]) -> str:
     """Return what a look without any refit says: whether the model fits, and what to try first."""
     likely = [f"{s.effect.name} ({percent(s.drop, 2)})" for s in scores[:3] if s.drop > 0]
-    next_ = f"; most promising: {', '.join(likely)} of the squared misfit" if likely and not judged.adequate else ""
+    next_ = f"; most promising: {', '.join(likely)} of the squared error" if likely and not judged.adequate else ""
     return f"first answer: {fit.verdict.rstrip('.')}{next_}"
 
 
@@ -33,34 +35,32 @@ def window_remark(fit: Fit) -> str:
     """Say that the records were simulated in windows, and why."""
     if fit.window is None:
         return ""
-    return (f"The records are simulated in windows of {number(fit.window, 2)} s, each from an estimated state: over "
-            "all of them this model carries small errors too far. Errors are those of a window ahead.")
+    return (f"The records are simulated in windows of {number(fit.window, 2)} s, each from an estimated state, because "
+            "over whole records small errors of this model grow too large. Errors are those of a window ahead.")
 
 
-def adequate_text(judged: Adequacy, ranking: Sequence[Candidate]) -> str:
-    """Return the verdict when nothing is missing."""
-    near = [c for c in ranking if c.refit_drop]
-    tried = f" Of {len(ranking)} effects tried, none is worth adding." if ranking else ""
-    return f"{judged.text}{tried}" if near or ranking else judged.text
+def adequate_text(judged: Adequacy, ranking: Sequence[Candidate]) -> tuple[str, str]:
+    """Return the answer when nothing is missing, and how many effects were tried."""
+    tried = f"{judged.text} None of the {len(ranking)} effects tried is worth adding." if ranking else judged.text
+    return "Nothing is missing: the errors do not depend on the motion.", tried
 
 
-def unexplained_text(judged: Adequacy, missing: Missing, ranking: Sequence[Candidate], rungs: Sequence[Rung],
-                     grades: Sequence[Grade], done: bool = True) -> str:
-    """Return the verdict when something is missing that the library does not have, or only something like it.
+def unexplained_text(ranking: Sequence[Candidate], rungs: Sequence[Rung], grades: Sequence[Grade], like: str,
+                     done: bool = True) -> str:
+    """Return the answer when something is missing that the library does not have, or only something like it.
 
     Not `done`: the search was stopped before all effects were tried.
     """
-    parts = [judged.text, missing.text]
+    why = "and no effect of the library explains it" if done else "and not all effects were tried"
+    lead = f"Unexplained: {like}, which is no effect of the library." if like else (
+        f"Unexplained: something is missing, {why}.")
     if grades:
-        parts += [approximations_text(grades), _errors(rungs[0], rungs[-1])]
-        return " ".join(parts)
-    parts.append("None of the library's effects explains it." if done else "Not all effects were tried.")
-    tried = [c for c in ranking if c.refit_drop is not None]
-    best = max(tried, key=lambda c: c.refit_drop or 0.0, default=None)
-    if best is not None and (best.refit_drop or 0) > 0.05:
-        taken = percent(best.refit_drop, 2)
-        parts.append(f"The nearest, '{best.effect}', takes away {taken} of the squared misfit, but {best.reason}.")
-    return " ".join(parts)
+        return f"{lead} {approximations_text(grades)} {errors_text(rungs[0], rungs[-1])}"
+    best = max((c for c in ranking if c.refit_drop is not None), key=lambda c: c.refit_drop or 0.0, default=None)
+    if best is None or (best.refit_drop or 0) <= 0.05:
+        return lead
+    return (f"{lead} The nearest, '{best.effect}', takes away {percent(best.refit_drop, 2)} of the squared error, but "
+            f"{best.reason}.")
 
 
 def approximations_text(grades: Sequence[Grade]) -> str:
@@ -72,27 +72,21 @@ def approximations_text(grades: Sequence[Grade]) -> str:
 def missing_text(
     rungs: Sequence[Rung], remaining: Adequacy, groups: Sequence[Sequence[str]], grades: Sequence[Grade]
 ) -> str:
-    """Return the verdict when effects were found."""
+    """Return the answer when effects were found: what, how large, what the error becomes, what remains."""
     after = rungs[-1].fit
     names = [g.effect for g in grades if g.grade != "approximates"]
     parts = [f"Missing: {'; '.join(_described(after, n) for n in names)}."]
-    parts.append(_errors(rungs[0], rungs[-1]))
-    parts += [f"These data cannot tell {g[0]} from {' or '.join(g[1:])}." for g in groups]
+    parts += [f"These records do not distinguish {g[0]} from {' or '.join(g[1:])}." for g in groups]
     parts += [approximations_text(grades)] if len(names) < len(grades) else []
-    moved = moves(rungs[0].fit, after)
-    if moved:
-        parts.append(moved)
-    parts.append(
-        "What is left is noise."
-        if remaining.adequate
-        else f"Not all is explained: {remaining.text[0].lower()}{remaining.text[1:]}"
-    )
+    parts.append(errors_text(rungs[0], rungs[-1]))
+    left = remaining.text.removeprefix("Something is missing: ")
+    parts.append("What remains is noise." if remaining.adequate else f"Not everything is explained: {left}")
     return " ".join(parts)
 
 
 def _described(fit: Fit, name: str) -> str:
     effect = next(e for e in fit.problem.model.effects if e.name == name)
-    return f"{name} ({', '.join(_valued(fit, effect))})"
+    return ", ".join([effect.title if name in effect.title else f"{effect.title} [{name}]", *_valued(fit, effect)])
 
 
 def _valued(fit: Fit, effect: Effect) -> list[str]:
@@ -115,40 +109,42 @@ def _certain(fit: Fit) -> dict[str, float | None]:
     return {n: None if n in sizes and s is not None and s > abs(fit.values[n]) else s for n, s in std.items()}
 
 
-def _errors(before: Rung, after: Rung) -> str:
-    text = f"With it the error falls: {_changes(before.nrmse, after.nrmse, 'from ')}"
+def errors_text(before: Rung, after: Rung) -> str:
+    """Say how the error changed: on the held-out runs where there are any."""
     was, is_ = before.validation_nrmse, after.validation_nrmse
-    if was and is_:
-        text += f"; on the held-out runs {_changes(was, is_)}"
-        if lost := [c for c, e in was.items() if min(e, is_[c]) > LOST]:
-            text += f" (both lose {' and '.join(lost)} there: blocks of the fitted runs were held out instead)"
-        elif np.prod([is_[c] / max(e, 1e-300) for c, e in was.items()]) >= 1:
-            text += " (no lower there all in all: blocks of the fitted runs, left out in turn, decided)"
-    return text + "."
+    if not (was and is_):
+        return f"Error: {_changes(before, before.nrmse, after.nrmse)}."
+    text = f"Held-out error: {_changes(before, was, is_)}."
+    if risen := {c: e for c, e in before.nrmse.items() if after.nrmse[c] > e}:
+        text += f" On the fitted runs {_changes(before, risen, after.nrmse)}."
+    if lost := [c for c, e in was.items() if min(e, is_[c]) > LOST]:
+        return f"{text} Both models lose {' and '.join(lost)} there; blocks left out of the fitted runs decided."
+    if np.prod([is_[c] / max(e, 1e-300) for c, e in was.items()]) >= 1:
+        return f"{text} It does not fall overall; blocks left out of the fitted runs decided."
+    return text
 
 
-def _changes(before: Mapping[str, float], after: Mapping[str, float], of: str = "") -> str:
-    """Say how the error of each channel changes, those where it rises last."""
-    said = {c: f"{percent(e, 3)} to {percent(after[c], 3)}" for c, e in before.items()}
-    falls = [f"{c} {of}{text}" for c, text in said.items() if after[c] <= before[c]]
-    rises = [f"{c} rises from {text}" for c, text in said.items() if after[c] > before[c]]
-    return ", ".join(falls) + (f"{', but ' if falls else ''}{', '.join(rises)}" if rises else "")
+def _changes(rung: Rung, before: Mapping[str, float], after: Mapping[str, float]) -> str:
+    units = units_of(rung.fit.problem.experiments)
+    return ", ".join(f"{channel_name(c, units.get(c, ''))} {'rises ' * (after[c] > e)}{arrow(e, after[c])}"
+                     for c, e in before.items())
 
 
 def moves(before: Fit, after: Fit) -> str:
-    """Say how the motor's own parameters moved, since they had absorbed what was missing."""
+    """Say how the motor's own parameters had compensated for what was missing."""
     free = set(before.problem.model.free_names) & set(after.problem.model.free_names)
     base = [n for n in ("R", "L", "K", "b", "J") if n in free]
-    moved = [n for n in base if abs(after.values[n] / max(before.values[n], 1e-300) - 1) > MOVED]
+    was, is_ = _certain(before), _certain(after)
+    known = [n for n in base if was[n] is not None and is_[n] is not None]
+    moved = [n for n in known if abs(after.values[n] / max(before.values[n], 1e-300) - 1) > MOVED]
     if not moved:
         return ""
-    was, is_ = _certain(before), _certain(after)
     said = [
         f"{n} from {with_error(before.values[n], was[n])} to "
         f"{with_error(after.values[n], is_[n], after.problem.model.parameters[n].unit)}"
         for n in moved
     ]
-    return f"The motor's own parameters had absorbed it: {', '.join(said)}."
+    return f"Without it, other parameters had compensated: {', '.join(said)}."
 
 
 def measured_angle_remark(fit: Fit) -> str:
@@ -156,8 +152,8 @@ def measured_angle_remark(fit: Fit) -> str:
     if not fit.model.angle_input:
         return ""
     return (
-        "What repeats over a turn follows the measured angle here, in the held-out error too, since the model's own "
-        "angle drifts by too much; without a measured angle this model predicts nothing."
+        "Effects over the angle use the measured angle, on held-out runs too, because the simulated angle drifts too "
+        "far. Without a measured angle this model cannot predict."
     )
 
 
@@ -165,7 +161,7 @@ def unfinished_remark(fit: Fit) -> str:
     """Say so where the last fit did not converge: its values, and what is said of them, are not the best there are."""
     if fit.status == "converged" or max(fit.misfit.values(), default=0.0) < LARGER:
         return ""
-    return f"The fit did not converge ({fit.status}): its values are no optimum, and this verdict rests on them."
+    return f"The last fit did not converge ({fit.status}): its values, and this verdict, are provisional."
 
 
 def held_out_remark(node: Node) -> str:
@@ -176,8 +172,9 @@ def held_out_remark(node: Node) -> str:
             if r > ELSEWHERE and node.predictions.held_out[c].misfit > LARGER]
     if not said:
         return ""
-    return (f"On the held-out runs the error is larger than on the fitted ones ({', '.join(said)}): the fitted records "
-            "do not determine the model there, or something acts there that they do not show.")
+    return (f"The error is larger on the held-out runs than on the fitted ones ({', '.join(said)}): the fitted records "
+            "do not determine the model there, or another effect acts there.")
+
 
 
 def inseparable_remark(same: Mapping[str, tuple[str, ...]]) -> str:
@@ -186,8 +183,8 @@ def inseparable_remark(same: Mapping[str, tuple[str, ...]]) -> str:
     for name, parameters in same.items():
         by_parameters.setdefault(parameters, []).append(name)
     return " ".join(
-        f"{' or '.join(names)} beside {' and '.join(parameters)} is not identifiable with these data and was refused: "
-        "together they do the same."
+        f"{' or '.join(names)} was not added: these records do not distinguish it from {' and '.join(parameters)} "
+        "together."
         for parameters, names in by_parameters.items()
     )
 
@@ -211,9 +208,8 @@ def outliers_remark(fit: Fit) -> str:
         if spikes and kept @ kept < (1 - SPIKED) * (r @ r):
             share = percent(1 - float(kept @ kept) / float(r @ r), 2)
             return (
-                f"{spikes} samples of {c} that stand alone make {share} of its squared error: outliers, which a fit "
-                "by least squares follows. A loss that forgives them (--loss huber, loss=mi.Huber()) will show the "
-                "rest better."
+                f"{spikes} outliers (single samples) make {share} of the squared error of {c}, and least squares "
+                "follows them. A robust loss (--loss huber, loss=mi.Huber()) shows the rest better."
             )
     return ""
 
@@ -228,9 +224,8 @@ def closed_loop_remark(fit: Fit) -> str:
         extra = run.meta.get("extra", {})
         if feedback > 0.5 or any("ref" in str(n).lower() or "goal" in str(n).lower() for n in extra):
             return (
-                "The records seem to come from a closed loop: the controller works against every disturbance, so an "
-                "open-loop simulation drifts and part of what is missing hides in the voltage. Open-loop records "
-                "show it better."
+                "The records seem to come from a closed loop: the controller compensates what the model lacks, so "
+                "part of it hides in the voltage, and an open-loop simulation drifts. Open-loop records show it better."
             )
     return ""
 

@@ -83,6 +83,12 @@ def percent(share: float | None, digits: int = 3) -> str:
     return "–" if share is None or math.isnan(share) else f"{number(100 * share, digits)} %"
 
 
+def arrow(before: float, after: float) -> str:
+    """Return how a share changed: ``12.7 → 1.02 %``."""
+    first, last = percent(before), percent(after)
+    return f"{first.removesuffix(' %')} → {last}" if last.endswith("%") else f"{first} → {last}"
+
+
 def duration(seconds: float) -> str:
     """Return a time for people: ``35 ms``, ``1.2 s``, ``3 min 20 s``."""
     if not math.isfinite(seconds):

@@ -11,7 +11,7 @@ from motorid.model.equations import Equations
 @effect(balance="voltage")
 def brush_drop(m: Equations, V_b=P(0.5, "V", null=0.0, lower=0.0, doc="voltage lost at the brushes"),
                i_b=P(0.1, "A", positive=True, grid=(0.01, 0.03, 0.1, 0.3), doc="knee current")):
-    """Brush contact drop, V_b·tanh(i/i_b). Shobert, Carbon Brushes, 1965."""
+    """Voltage drop of the brushes, V_b·tanh(i/i_b). Shobert, Carbon Brushes, 1965."""
     m.voltage -= V_b * ca.tanh(m.i / i_b)
 
 
@@ -20,7 +20,7 @@ def inductance_saturation(
     m: Equations,
     i_L=P(5.0, "A", null=float("inf"), positive=True, grid=(0.3, 1.0, 3.0), doc="current that halves L"),
 ):
-    """Saturating inductance, L/(1+(i/i_L)²). Krause et al., Analysis of Electric Machinery, 2013."""
+    """Saturation of the inductance, L/(1+(i/i_L)²). Krause et al., Analysis of Electric Machinery, 2013."""
     m.scale("L", 1 / (1 + (m.i / i_L) ** 2))
 
 
@@ -29,7 +29,7 @@ def magnetic_saturation(
     m: Equations,
     i_K=P(5.0, "A", null=float("inf"), positive=True, grid=(0.7, 1.5, 3.0), doc="current that halves K"),
 ):
-    """Saturating flux, K/(1+(i/i_K)²) in torque and back-EMF. Krause et al., Electric Machinery, 2013."""
+    """Magnetic saturation, K/(1+(i/i_K)²) in torque and back-EMF. Krause et al., Electric Machinery, 2013."""
     m.scale("K", 1 / (1 + (m.i / i_K) ** 2))
 
 
@@ -41,19 +41,19 @@ def driver_dead_band(m: Equations, V_d=P(0.2, "V", null=0.0, lower=0.0, doc="hal
 
 @effect(balance="voltage")
 def voltage_offset(m: Equations, V_0=P(0.05, "V", null=0.0, doc="added to the applied voltage")):
-    """Constant error of the voltage as recorded. Isermann, Identification of Dynamic Systems, 2011."""
+    """Offset of the recorded voltage. Isermann, Identification of Dynamic Systems, 2011."""
     m.voltage += V_0
 
 
 @effect(balance="voltage")
 def winding_heating(m: Equations,
-                    alpha=P(0.00393, "1/K", null=0.0, vary=False, doc="temperature coefficient of copper, held"),
+                    alpha=P(0.00393, "1/K", null=0.0, vary=False, doc="temperature coefficient of copper, fixed"),
                     R_th=P(10.0, "K/W", positive=True, grid=(0.3, 1.0, 3.0), doc="thermal resistance to ambient"),
                     C_th=P(10.0, "J/K", positive=True, grid=(0.3, 1.0, 3.0), doc="heat capacity of the winding")):
-    """Winding resistance that grows with its own heat, R(1+αΔT). Kirtley, Electric Power Principles, 2010.
+    """Heating of the winding, R(1+αΔT). Kirtley, Electric Power Principles, 2010.
 
     ``C_th dΔT/dt = R i² − ΔT/R_th``, ΔT = 0 at the start of each run. Only α·R_th and α/C_th act on the
-    electrical signals, so α is held at copper's value.
+    electrical signals, so α is fixed at copper's value.
     """
     dT = m.state("dT")
     m.scale("R", 1 + alpha * dT)

@@ -13,14 +13,14 @@ QUARTERS = (0.0, math.pi / 2, math.pi, 3 * math.pi / 2)  # of a turn
 
 @effect(balance="torque")
 def coulomb(m: Equations, tau_c=P(2e-3, "N·m", null=0.0, lower=0.0, doc="Coulomb friction torque")):
-    """Coulomb friction, tau_c·sgn(omega). Armstrong-Hélouvry et al., Automatica 30(7), 1994."""
+    """Dry (Coulomb) friction, tau_c·sgn(omega). Armstrong-Hélouvry et al., Automatica 30(7), 1994."""
     m.torque -= tau_c * m.sign(m.omega)
 
 
 @effect(balance="torque", includes=("coulomb",))
 def coulomb_asymmetric(m: Equations, tau_cp=P(2e-3, "N·m", null=0.0, lower=0.0, doc="Coulomb friction turning forward"),
                        tau_cn=P(2e-3, "N·m", null=0.0, lower=0.0, doc="Coulomb friction turning backward")):
-    """Coulomb friction that differs with the direction. Armstrong-Hélouvry et al., Automatica 30(7), 1994."""
+    """Dry friction that differs with the direction. Armstrong-Hélouvry et al., Automatica 30(7), 1994."""
     s = m.sign(m.omega)
     m.torque -= s * (tau_cp * (1 + s) + tau_cn * (1 - s)) / 2
 
@@ -29,7 +29,7 @@ def coulomb_asymmetric(m: Equations, tau_cp=P(2e-3, "N·m", null=0.0, lower=0.0,
 def stribeck(m: Equations, tau_c=P(2e-3, "N·m", null=0.0, lower=0.0, doc="Coulomb friction torque at speed"),
              tau_s=P(3e-3, "N·m", null=0.0, lower=0.0, at_least="tau_c", doc="breakaway torque"),
              omega_s=P(5.0, "rad/s", positive=True, grid=(0.01, 0.03, 0.1, 0.3), doc="Stribeck speed")):
-    """Stribeck friction, (tau_c + (tau_s−tau_c)·exp(−(ω/ω_s)²))·sgn ω. Armstrong-Hélouvry et al., 1994."""
+    """Friction with breakaway (Stribeck), (tau_c + (tau_s−tau_c)·exp(−(ω/ω_s)²))·sgn ω. Armstrong et al., 1994."""
     level = tau_c + (tau_s - tau_c) * ca.exp(-((m.omega / omega_s) ** 2))
     m.torque -= level * m.sign(m.omega)
 
@@ -42,20 +42,20 @@ def quadratic_drag(m: Equations, c_2=P(1e-7, "N·m·s²/rad²", null=0.0, lower=
 
 @effect(balance="torque")
 def constant_load(m: Equations, tau_0=P(1e-3, "N·m", null=0.0, doc="load torque against positive speed")):
-    """Constant load torque (a hoist, the offset of a drive). Janot et al., EMPS benchmark, 2019."""
+    """Constant load torque: a hoist, the offset of a drive. Janot et al., EMPS benchmark, 2019."""
     m.torque -= tau_0
 
 
 @effect(balance="torque")
 def gravity(m: Equations, mgl=P(1e-3, "N·m", null=0.0, lower=0.0, doc="weight times lever arm"),
             phi_g=P(0.0, "rad", periodic=True, doc="angle of the lever at theta = 0, from hanging")):
-    """Unbalanced load, m·g·l·sin(θ+φ). Any textbook of mechanics; Duclusaud et al., BAM, 2025."""
+    """Gravity on an unbalanced load, m·g·l·sin(θ+φ). Any textbook of mechanics; Duclusaud et al., BAM, 2025."""
     m.torque -= mgl * ca.sin(m.theta + phi_g)
 
 
 @effect(balance="torque")
 def cogging(m: Equations, A=P(1e-3, "N·m", null=0.0, lower=0.0, doc="amplitude of the cogging torque"),
-            N=P(12.0, "", order=True, vary=False, lower=1.0, doc="periods per turn, from the misfit, then held"),
+            N=P(12.0, "", order=True, vary=False, lower=1.0, doc="periods per turn, from the misfit, then fixed"),
             phi=P(0.0, "rad", periodic=True, doc="phase at theta = 0")):
     """Cogging torque, A·sin(N·θ+φ). Hendershot & Miller, Brushless Permanent-Magnet Machines, 2010."""
     m.torque -= A * ca.sin(N * m.theta + phi)
@@ -65,7 +65,7 @@ def cogging(m: Equations, A=P(1e-3, "N·m", null=0.0, lower=0.0, doc="amplitude 
 def torque_ripple(
     m: Equations,
     a_r=P(0.05, "", null=0.0, lower=0.0, upper=1.0, doc="relative amplitude"),
-    N_r=P(12.0, "", order=True, vary=False, lower=1.0, doc="periods per turn, from the misfit, then held"),
+    N_r=P(12.0, "", order=True, vary=False, lower=1.0, doc="periods per turn, from the misfit, then fixed"),
     phi_r=P(0.0, "rad", periodic=True, doc="phase at theta = 0"),
 ):
     """Torque ripple, K·(1+a·sin(N·θ+φ)), or of a torque drive's gain. Jahns & Soong, IEEE TIE 43(2), 1996."""
@@ -74,7 +74,7 @@ def torque_ripple(
 
 @effect(balance="torque")
 def load_friction(m: Equations, mu=P(0.1, "", null=0.0, lower=0.0, upper=1.0, doc="share of the motor torque lost")):
-    """Friction growing with the torque carried, μ·abs(K·i)·sgn ω. Duclusaud et al., BAM, 2025."""
+    """Friction that grows with the torque carried, μ·abs(K·i)·sgn ω. Duclusaud et al., BAM, 2025."""
     carried = m.K_t * m.i if "i" in m.states else m.g * m.v
     m.torque -= mu * ca.fabs(carried) * m.sign(m.omega)
 
@@ -179,7 +179,7 @@ def backlash(m: Equations,
              gap=P(0.02, "rad", positive=True, grid=(0.01, 0.03, 0.1), doc="total free play"),
              omega_c=P(500.0, "1/s", positive=True, grid=(0.1, 0.4), doc="resonance while in contact"),
              zeta_c=P(0.2, "", positive=True, upper=2.0, grid=(0.1, 0.5), doc="damping ratio while in contact")):
-    """Free play between two inertias, elastic in contact. Nordin & Gutman, Automatica 38(10), 2002."""
+    """Backlash between two inertias, elastic in contact. Nordin & Gutman, Automatica 38(10), 2002."""
     half = gap / 2
     width = CORNER * half
 

@@ -239,7 +239,7 @@ class Fit(Shown):
         flags = [FLAGS[self.fits], *([] if self.status == "converged" else [Flag(self.status, "bad")])]
         flags += [Flag(self.formulation)] if self.formulation != "plain" else []
         flags += [Flag(f"{len(vague)} not determined", "note")] if vague else []
-        text = (self.verdict, f"{counted(len(runs), 'run')}, {self.problem.n_outputs} samples. {ended(self)}")
+        text = (self.verdict, f"{counted(len(runs), 'run')}, {self.problem.n_outputs} measured values. {ended(self)}")
         after = [("mi.plot_fit(fit)", "see it"), ("mi.diagnose(fit)", "what is missing")]
         after = after if self.fits == "noise" else after[::-1]
         after += [("mi.identifiability(fit)", f"why {', '.join(vague)} cannot be determined")] if vague else []
@@ -256,7 +256,8 @@ class Fit(Shown):
 def ended(fit: Fit) -> str:
     """Say how the estimation ended: ``Converged in 5 iterations (97 ms).``, or why it did not."""
     if fit.status == "converged":
-        return f"Converged in {counted(fit.iterations, 'iteration')} ({duration(fit.seconds)})."
+        took = f" ({duration(fit.seconds)})" if fit.seconds else ""
+        return f"Converged in {counted(fit.iterations, 'iteration')}{took}."
     return sentence(fit.message)
 
 
@@ -278,10 +279,10 @@ class Failure(Shown):
 def parameter_table(fit: Fit, before: Fit | None = None) -> Table:
     """Return the parameters as value ± standard deviation, beside those of another fit where one is given."""
     fits = [f for f in (before, fit) if f is not None]
-    rows = [[name, *(parameter_cell(f, name) for f in fits), p.doc]
+    rows = [[name, *(parameter_cell(f, name) for f in fits), *([p.doc] if before is None else [])]
             for name, p in fit.model.parameters.items()]
-    heads = ["value ± std"] if before is None else ["before", "after"]
-    return Table(["parameter", *heads, "meaning"], rows, "Parameters", left=tuple(range(len(heads) + 2)))
+    heads = ["value ± std", "meaning"] if before is None else ["before", "after"]
+    return Table(["parameter", *heads], rows, "Parameters", left=(0, 1, 2))
 
 
 def parameter_cell(fit: Fit, name: str) -> Cell:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import inspect
+import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
@@ -128,6 +129,12 @@ class Effect(Shown):
     balance: str
     doc: str = ""
     includes: tuple[str, ...] = ()
+
+    @property
+    def title(self) -> str:
+        """What people call it: the first words of its `doc`, else its name."""
+        words = re.split(r"[,.:;] ?|\n", self.doc, maxsplit=1)[0].strip()
+        return words[:1].lower() + words[1:] if 0 < len(words) <= 60 else self.name.replace("_", " ")
 
     @property
     def size(self) -> Parameter | None:

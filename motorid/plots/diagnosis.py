@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
+from motorid.diagnosis.locate import accounted
 from motorid.diagnosis.results import Binned, Candidate, Diagnosis, Ladder, Missing
 from motorid.display.numbers import number
 from motorid.errors import UsageError
@@ -90,6 +91,68 @@ def _binned(ax: Axes, b: Binned, signals: Sequence[Mapping[str, Array]], values:
     label = style.axis_label(b.against)
     label = f"{label.split(' (')[0]} ({b.unit})" if b.unit else label
     style.tidy(ax, x=label, title=f"{100 * b.explained:.0f} % explained")
+
+
+@style.styled
+def plot_answer(found: Diagnosis, ax: Axes | None = None) -> Axes:
+    """Draw the missing torque or voltage with what was added drawn over it, against the quantity that it acts on.
+
+    Dots are samples of what the first model lacks, their mean and its interval of 95 % in bins; the line is what the
+    last model has instead: the accepted effects and the shift of the parameters. An effect with so many periods per
+    turn is drawn over one of them.
+
+    Parameters
+    ----------
+    found : Diagnosis
+    ax : Axes, optional
+    """
+    if not isinstance(found, Diagnosis):
+        raise UsageError(f"plot_answer takes a diagnosis, mi.diagnose(fit), got {type(found).__name__}.")
+    m = found.missing
+    balance = "voltage" if found.where == "electrical" else "torque"
+    against, periods = _quantity(found, balance)
+    x = [np.asarray(s[against]) * periods for s in m.signals]
+    x = [np.mod(z, 2 * np.pi) if against == "theta" else z for z in x]
+    values = getattr(m, balance)
+    power = style.decade(float(np.nanmax([np.nanmax(np.abs(v), initial=0.0) for v in values])))
+    ax = style.only(ax, width=5.6, height=3.6)
+    every = np.concatenate(x)
+    scatter(ax, every, np.concatenate(values) * 10.0**-power, most=3000, color=style.MUTED)
+    centre, mean, low, high = _profile(every, np.concatenate(values) * 10.0**-power)
+    ax.fill_between(centre, low, high, color=_COLOUR[balance], alpha=0.3, lw=0)
+    ax.plot(centre, mean, color=_COLOUR[balance], lw=1.6, label="missing, mean ± 95 %")
+    if found.after is not found.before:
+        had = accounted(found.before, found.after)[balance == "torque"]
+        centre, mean, *_ = _profile(every, np.concatenate(had) * 10.0**-power)
+        added = " + ".join(n for n in found.after.model.effect_names if n not in found.before.model.effect_names)
+        label = f"{added}, with the shift of the parameters"
+        ax.plot(centre, mean, "--", color=style.PALETTE["orange"], lw=2.0, label=label)
+    ax.axhline(0, color=style.MUTED, lw=0.6)
+    unit = "V" if balance == "voltage" else m.torque_unit
+    noun = "force" if unit == "N" else balance
+    name = f"phase of {periods:g} periods per turn (rad)" if periods != 1 else style.axis_label(against)
+    style.tidy(ax, x=name, y=style.scaled_title(f"missing {noun}", unit, power), title=f"The missing {noun}")
+    ax.legend(loc="best")
+    return ax
+
+
+def _quantity(found: Diagnosis, balance: str) -> tuple[str, float]:
+    """Return the quantity to draw over: the phase of an effect with periods, else what explains most."""
+    values = found.after.values
+    orders = [values[p.name] for e in found.after.model.effects if e.name in found.effects for p in e.parameters
+              if p.order]
+    bins = found.missing.bins.get(balance, ())
+    return ("theta", orders[0]) if orders else (bins[0].against if bins else "t", 1.0)
+
+
+def _profile(x: Array, y: Array) -> tuple[Array, Array, Array, Array]:
+    """Return centres, means and their intervals of 95 % in bins, half of the edges by count, half by distance."""
+    edges = np.union1d(np.quantile(x, np.linspace(0, 1, 31)), np.linspace(x.min(), x.max(), 31))
+    label = np.searchsorted(edges[1:-1], x, side="right")
+    parts = [k for k in (np.flatnonzero(label == j) for j in range(len(edges) - 1)) if len(k) > 2]
+    centre, mean = (np.array([float(np.nanmean(z[k])) for k in parts]) for z in (x, y))
+    half = np.array([1.96 * float(np.nanstd(y[k])) / np.sqrt(len(k)) for k in parts])
+    return centre, mean, mean - half, mean + half
 
 
 @style.styled

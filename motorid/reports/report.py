@@ -12,7 +12,7 @@ from typing import Any
 from motorid.channels import NAMES
 from motorid.diagnosis.results import Diagnosis, Ladder
 from motorid.display.cards import Shown
-from motorid.display.numbers import duration, percent
+from motorid.display.numbers import percent, with_error
 from motorid.display.tables import Flag, Table
 from motorid.errors import UsageError
 from motorid.estimation.result import Fit
@@ -29,9 +29,9 @@ def report(result: Any, path: str | Path, *, title: str = "", command: str = "",
            force: bool = False) -> Path:
     """Write the story of a result as one HTML page: no network, no script, figures inside.
 
-    Data and their checks, the fit, where it fails, which effect is missing, the ladder, parameters before and
-    after, what cannot be told apart and the next experiment, and where it all comes from. A fit alone gives
-    its part of the story; several results, in a list, follow one another.
+    The answer first, with its figure, the errors before and after and the next step; then parameters, fits, held-out
+    records, where the model fails, the effects tried, the data and their checks, and where it all comes from. A fit
+    alone gives its part of the story; several results, in a list, follow one another.
 
     Parameters
     ----------
@@ -65,8 +65,11 @@ def report(result: Any, path: str | Path, *, title: str = "", command: str = "",
         if not isinstance(r, Shown):
             raise UsageError(f"report takes results of motorid, such as a fit or a diagnosis; got {type(r).__name__}.")
     story = tell(results, title=title, validate=list(validate))
-    story.sections.append(_provenance(story, command))
-    return write_files({Path(path): _page(story)}, force)[0]
+    story.sections.append(_provenance(story, command, list(validate)))
+    target = Path(path)
+    if target.suffix.lower() not in (".html", ".htm"):
+        raise UsageError(f"a report is an HTML page: '{target.name}' must end in .html. A browser prints it to PDF.")
+    return write_files({target: _page(story)}, force)[0]
 
 
 def _page(story: Story) -> str:
@@ -78,9 +81,10 @@ def _page(story: Story) -> str:
     return environment.get_template("report.html").render(story=story, version=package_version("motorid"), date=date)
 
 
-def _provenance(story: Story, command: str) -> Section:
-    files = [[run.name, Path(str(run.meta.get("source", "–"))).name, str(run.meta.get("sha256", "–"))[:16]]
-             for run in story.runs]
+def _provenance(story: Story, command: str, held_out: Sequence[Experiment]) -> Section:
+    named = [(r.name, r) for r in story.runs] + [(f"{r.name} (held out)", r) for r in held_out]
+    files = [[name, Path(str(run.meta.get("source", "–"))).name, str(run.meta.get("sha256", "–"))[:16]]
+             for name, run in named]
     versions = [["Python", platform.python_version()], *([p, package_version(p)] for p in PACKAGES)]
     tables = [Table(["software", "version"], versions)]
     if files:
@@ -129,17 +133,23 @@ def tell(results: Sequence[Shown], *, title: str = "", validate: Sequence[Experi
 
 def _of_diagnosis(d: Diagnosis, validate: Sequence[Experiment]) -> Story:
     runs = d.before.problem.experiments
-    story = Story("What is missing in the motor's model?", d.text, d.card().flags[:1], runs=runs)
-    story.facts = [*sections.error_facts(d.ladder), ("Effects added", ", ".join(d.effects) or "none")]
-    story.sections += [sections.data(runs), sections.fitted(d.before, "The model it began with"), sections.where(d)]
-    if d.ranking:
-        story.sections.append(sections.which(d))
+    story = Story("What is missing in the motor's model?", d.answer or d.text, runs=runs)
+    story.facts = sections.error_facts(d.ladder)
+    story.sections.append(sections.answer(d))
+    if d.details:
+        story.sections.append(Section("details", "Details", (), d.details))
     if len(d.ladder.rungs) > 1:
-        story.sections += [sections.ladder(d.ladder), sections.parameters(d.before, d.after)]
-        story.sections.append(sections.fitted(d.after, "The model it ended with", key="after", before=d.before))
+        story.sections += [sections.parameters(d.before, d.after),
+                           sections.fitted(d.after, "The model with it", key="after", before=d.before, values=False)]
     if validate:
         story.sections.append(sections.held_out(d.after, validate))
-    story.sections.append(sections.apart(d))
+    first = sections.fitted(d.before, "The model it began with", values=d.after is d.before)
+    story.sections += [first, sections.where(d)]
+    if d.ranking:
+        story.sections.append(sections.which(d))
+    if len(d.ladder.rungs) > 2:
+        story.sections.append(sections.ladder(d.ladder))
+    story.sections.append(sections.data(runs))
     return story
 
 
@@ -154,13 +164,12 @@ def _of_ladder(ladder: Ladder) -> Story:
 
 def _of_fit(fit: Fit, validate: Sequence[Experiment]) -> Story:
     card = fit.card()
-    story = Story(card.title, " ".join(t for t in card.text if t), card.flags, runs=fit.problem.experiments)
+    story = Story(card.title, " ".join(t for t in card.text if t), card.flags[1:], runs=fit.problem.experiments)
     story.facts = [(f"Error of the {NAMES[c]}", percent(e)) for c, e in fit.nrmse.items()]
-    if fit.tau_m:
-        story.facts.append(("Mechanical time constant", duration(fit.tau_m)))
-    if fit.tau_e:
-        story.facts.append(("Electrical time constant", duration(fit.tau_e)))
-    story.sections += [sections.data(story.runs), sections.fitted(fit, "The fit"), sections.residuals(fit)]
+    known = [fit.determined[n] for n in ("gain", "time_constant") if n in fit.determined]
+    story.facts += [(q.text.capitalize(), with_error(q.value, q.std, q.unit)) for q in known]
+    story.sections.append(sections.fitted(fit, "The fit"))
     if validate:
         story.sections.append(sections.held_out(fit, validate))
+    story.sections += [sections.residuals(fit), sections.data(story.runs)]
     return story

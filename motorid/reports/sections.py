@@ -47,23 +47,23 @@ def data(runs: Sequence[Experiment]) -> Section:
              ", ".join(NAMES[c] for c in r.channels)] for r in runs]
     remarks = [*check_runs(runs), *(f"{r.name}: {n}" for r in runs for n in r.meta.get("notes", ()))]
     text = [f"{counted(len(runs), 'record')} were used." if len(runs) > 1 else "One record was used."]
-    text.append("Remarks of the checks:" if remarks else "The checks found nothing to remark.")
+    text.append("What the checks found:" if remarks else "The checks found no problem.")
     names = ", ".join(r.name for r in runs)
     figure = _figure("data", "Input and measured channels over time.", f"Records {names} over time", plot_runs, runs)
     table = Table(["record", "samples", "duration", "interval", "measured"], rows)
     return Section("data", "The data", text, remarks, [figure], [table])
 
 
-def fitted(fit: Fit, title: str, *, key: str = "fit", before: Fit | None = None) -> Section:
-    """A fit: curves, parameters, errors; beside it the model `before`."""
+def fitted(fit: Fit, title: str, *, key: str = "fit", before: Fit | None = None, values: bool = True) -> Section:
+    """A fit: curves, errors, its `values` where no other section has them; beside it the model `before`."""
     from motorid.plots import plot_fit
 
-    caption = "Measured, model, and what is left over beside the band of the noise."
+    caption = "Measured, model, and residual beside the band of the noise."
     caption += " The thin curve is the model it began with." if before is not None else ""
     alt = f"Measured and modelled channels of {fit.model.title}, with residuals. " + f"NRMSE: {fit.evaluation.words}."
     text = [f"{fit.model.title}: {fit.verdict[0].lower()}{fit.verdict[1:]} {ended(fit)}"]
     figure = _figure(key, caption, alt, plot_fit, fit, before=before)
-    tables = [*value_tables(fit), error_table({"": fit.evaluation}, fit.noise)]
+    tables = [*(value_tables(fit) if values else ()), error_table({"": fit.evaluation}, fit.noise)]
     return Section(key, title, text, (), [figure], tables)
 
 
@@ -74,7 +74,7 @@ def residuals(fit: Fit) -> Section:
     caption = "Noise alone would leave means of zero against every quantity and no correlation in time."
     alt = "Residuals of each channel over time and against speed and current"
     figure = _figure("residuals", caption, alt, plot_residuals, fit)
-    return Section("residuals", "What is left over", (), (), [figure])
+    return Section("residuals", "Residuals", (), (), [figure])
 
 
 def held_out(fit: Fit, validate: Sequence[Experiment]) -> Section:
@@ -85,6 +85,18 @@ def held_out(fit: Fit, validate: Sequence[Experiment]) -> Section:
     alt = "Measured and modelled channels of records that the fit never saw. " + f"NRMSE: {judged.words}."
     figure = _figure("held-out", "Records that the fit never saw.", alt, plot_fit, judged)
     return Section("held-out", "On records it never saw", (), (), [figure], [error_table({"": judged})])
+
+
+def answer(d: Diagnosis) -> Section:
+    """What was found: the missing torque or voltage with what was added, errors before and after, the next step."""
+    from motorid.plots import plot_answer
+
+    caption = ("What the model lacks (dots, mean with 95 %), and what was added: the effect with the shift of the "
+               "parameters (dashed).") if d.after is not d.before else "What the model lacks: dots, mean with 95 %."
+    drawn = [] if d.verdict == "adequate" or d.where == "sensor" else [
+        _figure("answer", caption, d.answer or d.text, plot_answer, d, small=True)]
+    next_step = [f"Next: {d.suggestion}"] if d.suggestion else []
+    return Section("answer", "The answer", next_step, (), drawn, [ladder_table(d.ladder)])
 
 
 def where(d: Diagnosis) -> Section:
@@ -127,18 +139,8 @@ def parameters(before: Fit, after: Fit) -> Section:
 
     caption = "Bars: two standard deviations."
     figure = _figure("parameters", caption, "Parameters before and after", plot_parameters, before, after, small=True)
-    text = ["Without the missing effect, other parameters had compensated for it."]
     table = parameter_table(after, before)
-    return Section("parameters", "How the parameters moved", text, (), [figure], [table])
-
-
-def apart(d: Diagnosis) -> Section:
-    """What the records cannot distinguish, and the next step."""
-    groups = [f"{', '.join(g)}" for g in d.groups if len(g) > 1]
-    text = ("These data cannot tell apart:" if groups
-            else "No two of the effects that matter look alike in these data.")
-    closing = [d.remaining.text, d.suggestion or ""]
-    return Section("apart", "What cannot be told apart, and what to do next", [*closing, text], groups)
+    return Section("parameters", "How the parameters moved", (), (), [figure], [table])
 
 
 def of_card(result: Shown, k: int) -> Section:

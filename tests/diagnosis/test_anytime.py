@@ -50,7 +50,7 @@ def test_a_spent_budget_gives_the_ranking_and_says_what_was_not_done(plain):
     found = mi.diagnose(plain, budget=0)
     assert found.stopped == "the time is up"
     assert found.verdict == "unexplained"
-    assert "Not all effects were tried" in found.text
+    assert "not all effects were tried" in found.text
     assert "Stopped early: the time is up" in found.text
     assert len(found.ranking) > 20
     assert found.ranking[0].predicted_drop > 0.5

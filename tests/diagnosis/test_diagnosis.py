@@ -104,7 +104,7 @@ def test_the_colour_of_the_noise_is_told(plant, lab, rng):
     assert judged.adequate, judged.text
     assert judged.channels["omega"]["autocorrelation"] == pytest.approx(0.85, abs=0.1)
     assert judged.channels["i"]["autocorrelation"] == pytest.approx(0.0, abs=0.15)
-    assert "noise of omega is coloured" in judged.text
+    assert "noise of speed is coloured" in judged.text
 
 
 def test_a_model_that_lacks_friction_is_not_adequate(plain):
@@ -183,7 +183,7 @@ def test_the_missing_torque_is_the_friction_that_was_hidden(rubbing, lab):
     assert missing.bins["torque"][0].against == "omega"
     assert sum(missing.regions.values()) == pytest.approx(1)
     assert sum(missing.shares.values()) == pytest.approx(1)
-    assert "depends on the speed" in missing.text
+    assert "The speed explains" in missing.text
 
 
 def test_a_missing_torque_is_no_missing_voltage_beside_a_precise_angle(lab):
@@ -231,7 +231,7 @@ def test_friction_is_found_sized_and_said(found):
     assert diagnosis.after.values["tau_c"] == pytest.approx(8e-3, rel=0.05)
     assert diagnosis.remaining.adequate
     assert "tau_c = " in diagnosis.text
-    assert "b from" in diagnosis.text  # what had absorbed it
+    assert "b from" in diagnosis.text  # what had compensated for it
     first, last = diagnosis.ladder.rungs[0], diagnosis.ladder.rungs[-1]
     assert last.validation_nrmse["omega"] < 0.5 * first.validation_nrmse["omega"]
 
@@ -352,7 +352,7 @@ def test_the_users_own_effect_wins_where_it_is_the_truth(lab):
     assert found.where == "mechanical"
 
 
-# -- what cannot be told apart -----------------------------------------------------------------------------
+# -- what is not distinguished -----------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", [c.name for c in CASES.values() if c.kind == "twins"])
@@ -365,8 +365,8 @@ def test_twins_are_said_as_a_group_with_an_experiment_that_parts_them(name):
     assert set(found.groups[0]) == set(alike)
     assert found.effects == found.groups[0][:1]
     assert found.ladder.rungs[1].grade == "group"
-    assert "These data cannot tell" in found.text
-    assert "apart, try" in found.suggestion
+    assert "These records do not distinguish" in found.text
+    assert found.suggestion.startswith("To distinguish")
     assert found.suggestion in found.text
 
 

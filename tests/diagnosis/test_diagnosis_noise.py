@@ -115,7 +115,7 @@ def test_outliers_are_left_out_and_what_is_not_is_said(lab, rng):
         i[rng.choice(run.n, 12, replace=False)] += 60.0
         runs.append(run.with_(outputs={**run.outputs, "i": i}))
     fit = mi.fit(mi.dc_motor(), runs[:2])
-    assert "24 samples of i that stand alone make" in outliers_remark(fit)
+    assert "24 outliers (single samples) make" in outliers_remark(fit)
     assert "--loss huber" in outliers_remark(fit)
     assert outliers_remark(mi.fit(mi.dc_motor(), runs[:2], loss=mi.Huber())) == ""  # it is used already
     found = mi.diagnose(fit, runs[2:], effects=("coulomb", "constant_load"))

@@ -37,7 +37,7 @@ def test_unmotor_loses_voltage_or_torque_and_forward_records_cannot_tell_which(r
     found = diagnosed([prbs.select(slice(0, 2000))], [step])
     named = {*found.effects, *(n for g in found.groups for n in g)}
     assert "driver_dead_band" in named  # known: a dead zone of 0.2 V
-    assert "cannot tell" in found.text
+    assert "do not distinguish" in found.text
     assert found.ladder.rungs[-1].validation_nrmse["omega"] < 0.015
 
 
@@ -92,6 +92,6 @@ def test_xl330_rubs_more_the_more_it_carries(real):
     # Where a pendulum sticks and slips the last digits decide which of several near optima a refit ends in, and with
     # that whether the fastest held-out swing goes over the top.
     assert last.nrmse["theta"] < 0.6 * first.nrmse["theta"]
-    lost = "both lose theta there" in found.text
+    lost = "Both models lose theta there" in found.text
     assert lost == (last.validation_nrmse["theta"] > 1)
     assert lost or last.validation_nrmse["theta"] < 0.5 * first.validation_nrmse["theta"]

@@ -119,7 +119,7 @@ def test_a_model_that_rests_on_the_measured_angle_says_so():
     own = mi.fit(mi.dc_motor() + mi.effects.cogging(N=12), run)
     led = mi.fit(replace(own.model, angle_input=True, _systems={}), run, start="model")
     assert measured_angle_remark(own) == ""
-    assert "follows the measured angle" in measured_angle_remark(led)
+    assert "use the measured angle" in measured_angle_remark(led)
 
 
 def test_refits_that_cannot_win_are_given_up(lab):
@@ -131,8 +131,8 @@ def test_refits_that_cannot_win_are_given_up(lab):
     found = mi.diagnose(mi.fit(mi.dc_motor(), runs[:1]), runs[1:], effects=names)
     assert found.effects == ("coulomb",)
     why = {c.effect: c for c in found.ranking}
-    assert "does no more than coulomb" in why["stribeck"].reason
-    assert why["speed_lag"].reason == "far behind the best, which leaves only noise"
+    assert "no better than coulomb" in why["stribeck"].reason
+    assert why["speed_lag"].reason == "rejected: coulomb alone already reaches the noise"
     assert why["stribeck"].predicted_drop > 0.9 > 0.5 > why["speed_lag"].predicted_drop
     assert why["stribeck"].refit_drop is why["speed_lag"].refit_drop is None  # neither was refitted
 
@@ -154,8 +154,8 @@ def test_beside_an_effect_that_leaves_noise_what_promises_little_is_not_even_beg
     asymmetric, coulomb, lag, drop = trial.refits(tasks, map)
     assert begun == [("coulomb",), ("brush_drop",)]
     assert isinstance(coulomb, mi.Fit)
-    assert asymmetric.why == "does no more than coulomb, which it contains"
-    assert lag.why == drop.why == trial.FAR_BEHIND
+    assert asymmetric.why == "no better than coulomb, its simpler special case"
+    assert lag.why == drop.why == trial.FAR_BEHIND.format("coulomb")
     assert asymmetric.drop is lag.drop is None  # neither was refitted, and no table may say so
     assert 0 < drop.drop < 1
 

@@ -66,11 +66,10 @@ def fake_ladder():
 
 def fake_diagnosis():
     ladder = fake_ladder()
-    return SimpleNamespace(
-        verdict="missing", text="Coulomb friction is missing.", where="mechanical",
-        suggestion="Reverse slowly.",
-        groups=(("coulomb", "stribeck"),), ranking=hand_made.candidates(), ladder=ladder,
-        before=ladder.rungs[0].fit, after=ladder.rungs[1].fit,
+    return Diagnosis(
+        "missing", "", "mechanical", ("coulomb",), None, None, hand_made.candidates(), ladder,
+        (("coulomb", "stribeck"),), "Reverse slowly.", ladder.rungs[0].fit, ladder.rungs[1].fit, None,
+        answer="Missing: dry (Coulomb) friction. What remains is noise.", details=("The voltage was measured late.",),
     )  # fmt: skip
 
 
@@ -94,7 +93,7 @@ CARDS = {
         where="mechanical", text="The torque balance fails.", shares={"electrical": 0.04, "mechanical": 0.95},
         regions={"steady": 0.6}, bins={"torque": (SimpleNamespace(against="omega", explained=0.93),)})),
     "ladder": lambda: Ladder.card(fake_ladder()),
-    "diagnosis": lambda: Diagnosis.card(fake_diagnosis()),
+    "diagnosis": lambda: fake_diagnosis().card(),
     "recording": lambda: Recording(
         Path("run1.csv"), None, "unplugged", "", 990, 10, False, 1.0, {}, {"i": 3}).card(),
     "covariance": lambda: Covariance.card(trusted()[0]),

@@ -301,3 +301,16 @@ def test_detached_figures_need_no_closing(found):
     with detached():
         plots.plot_ladder(found)
     assert plt.get_fignums() == []
+
+
+@pytest.mark.parametrize(("effect", "folder", "axis"), [("coulomb", "hidden_friction", "speed"),
+                                                        ("cogging", "hidden_cogging", "phase of 12 periods")])
+def test_what_was_added_lies_on_what_was_missing(effect, folder, axis):
+    """Over the phase of the effect, so that nothing is aliased; the shift of the parameters is part of the line."""
+    runs = mi.read_runs(mi.data_path(folder) / "run1.csv")
+    ax = plots.plot_answer(mi.diagnose(mi.fit(mi.dc_motor(), runs), effects=[effect]))
+    assert axis in ax.get_xlabel()
+    missing, added = ax.get_lines()[1:3]
+    assert effect in added.get_label()
+    assert np.corrcoef(missing.get_ydata(), added.get_ydata())[0, 1] > 0.95
+    assert np.std(added.get_ydata()) == pytest.approx(np.std(missing.get_ydata()), rel=0.4)

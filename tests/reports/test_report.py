@@ -85,12 +85,11 @@ def test_it_needs_no_network_and_no_script(tree, text):
 def test_it_tells_the_whole_story(tree, found):
     titles = [words(h) for h in every(tree, "h2")]
     assert titles == [
-        "The data", "The model it began with", "Where it fails", "Which effect is missing",
-        "The error falls", "How the parameters moved", "The model it ended with", "On records it never saw",
-        "What cannot be told apart, and what to do next", "Where it comes from",
+        "The answer", "How the parameters moved", "The model with it", "On records it never saw",
+        "The model it began with", "Where it fails", "Which effect is missing", "The data", "Where it comes from",
     ]  # fmt: skip
     body = words(every(tree, "body")[0])
-    for told in (found.text, found.missing.text, found.suggestion, "coulomb, stribeck", "no better than",
+    for told in (found.text, found.missing.text, found.suggestion, "no better than",
                  "motorid diagnose run*.csv <here>", "run1.csv", "casadi"):  # fmt: skip
         assert told in body, told
     fingerprint = found.before.problem.experiments[0].meta["sha256"]
@@ -268,3 +267,13 @@ def test_the_browser_check_itself_sees_errors_and_requests(tmp_path):
 
 def test_the_template_is_shipped_with_the_package():
     assert (Path(mi.__file__).parent / "reports" / "templates" / "report.html").is_file()
+
+
+def test_the_held_out_records_are_fingerprinted_too(tree, text):
+    assert "check1 (held out)" in words(every(tree, "body")[0])
+
+
+def test_a_report_is_refused_under_the_name_of_another_format(found, tmp_path):
+    with pytest.raises(UsageError, match=r"must end in \.html"):
+        mi.report(found, tmp_path / "found.pdf")
+    assert not list(tmp_path.iterdir())
