@@ -51,9 +51,9 @@ def unexplained_text(ranking: Sequence[Candidate], rungs: Sequence[Rung], grades
 
     Not `done`: the search was stopped before all effects were tried.
     """
-    why = "and no effect of the library explains it" if done else "and not all effects were tried"
     lead = f"Unexplained: {like}, which is no effect of the library." if like else (
-        f"Unexplained: something is missing, {why}.")
+        "Unexplained: something is missing, and no effect of the library explains it.")
+    lead = lead if done else f"Unexplained so far: {like or 'something is missing'}; not all effects were tried."
     if grades:
         return f"{lead} {approximations_text(grades)} {errors_text(rungs[0], rungs[-1])}"
     best = max((c for c in ranking if c.refit_drop is not None), key=lambda c: c.refit_drop or 0.0, default=None)
