@@ -176,7 +176,6 @@ def held_out_remark(node: Node) -> str:
             "do not determine the model there, or another effect acts there.")
 
 
-
 def inseparable_remark(same: Mapping[str, tuple[str, ...]]) -> str:
     """Say which effects were refused since parameters of the model together do the same."""
     by_parameters: dict[tuple[str, ...], list[str]] = {}

@@ -122,7 +122,7 @@ def angular_friction(m: Equations, tau_m=P(2e-3, "N·m", null=0.0, lower=0.0, do
 @effect(balance="torque", includes=("load_friction",))
 def gear_efficiency(m: Equations, mu_d=P(0.1, "", null=0.0, lower=0.0, upper=1.0, doc="share lost when it drives"),
                     mu_b=P(0.2, "", null=0.0, lower=0.0, doc="share lost when it is driven back")):
-    """Gear that loses another share of the motor's torque when driven back. Wang & Kim, ICRA, 2015.
+    """Efficiency of the gear, another share of the torque when driven back. Wang & Kim, ICRA, 2015.
 
     Only with J known (fixed) can the two shares be determined; otherwise `load_friction` does the same with another J.
     """

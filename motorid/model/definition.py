@@ -133,7 +133,7 @@ class Effect(Shown):
     @property
     def title(self) -> str:
         """What people call it: the first words of its `doc`, else its name."""
-        words = re.split(r"[,.:;] ?|\n", self.doc, maxsplit=1)[0].strip()
+        words = re.split(r"[,.:;] ?|\n", re.sub(r" \([^)\s]* [^)]*\)", "", self.doc), maxsplit=1)[0].strip()
         return words[:1].lower() + words[1:] if 0 < len(words) <= 60 else self.name.replace("_", " ")
 
     @property
