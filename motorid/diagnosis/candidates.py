@@ -27,13 +27,14 @@ from motorid.errors import FAILURES, ModelError
 from motorid.estimation.result import Fit
 from motorid.model.definition import Effect, Parameter
 from motorid.model.model import Model
-from motorid.records.checks import current_limit
+from motorid.numerics.noise import noise_level
 from motorid.records.experiment import Experiment
 
 SHORTLIST = 6
 PAIRS = 3  # refitted where no single effect helps
 NEAR = 0.4  # of the best score: what a common effect must reach to be refitted too
 ALWAYS = ("compliance", "speed_lag", "speed_delay", "driver_coast")  # their score at null says little
+FLAT_TOP = 0.04  # of the samples: a current that is as large so often may have a limit
 Advance = Callable[[str], None]
 
 
@@ -55,8 +56,7 @@ class Search:
         self.effects, self.map, self.advance = list(effects), map_, advance
         self.root = node_of(fit, self.held)
         self._scores: dict[frozenset[str], list[Score]] = {}
-        limited = any(current_limit(run) for run in fit.problem.experiments)
-        self._always = (*ALWAYS, LIMITER) if limited else ALWAYS
+        self._always = (*ALWAYS, LIMITER) if any(map(_flat_topped, fit.problem.experiments)) else ALWAYS
         self.nodes: dict[frozenset[str], Node] = {self.root.key: self.root}
 
     def scores(self, node: Node) -> list[Score]:
@@ -230,6 +230,15 @@ class Search:
             except FAILURES:
                 return None
         return self.nodes[key]
+
+
+def _flat_topped(run: Experiment) -> bool:
+    """Tell whether the largest current comes often, as at a limit."""
+    if "i" not in run.outputs:
+        return False
+    size = np.abs(run.outputs["i"][np.isfinite(run.outputs["i"])])
+    near = 4 * noise_level(run.outputs["i"], run.t)
+    return bool(np.mean(size > np.quantile(size, 0.995) - near) > FLAT_TOP)
 
 
 def _in_place(model: Model, old: Effect, new: Effect) -> Model:

@@ -10,6 +10,7 @@ from motorid.diagnosis.adequacy import following
 from motorid.diagnosis.candidates import library
 from motorid.diagnosis.experiment_design import suggest_experiment
 from motorid.diagnosis.locate import acting_like, locate
+from motorid.diagnosis.misspecification import LIMITER
 from motorid.diagnosis.model_comparison import far
 from motorid.diagnosis.record_parts import parts_remark
 from motorid.diagnosis.remainder import Remainder
@@ -111,7 +112,8 @@ def _told(found: Climb, driven: str, validated: bool, own: Sequence[Effect]) -> 
 def _remarks(found: Climb, driven: str) -> list[str]:
     """Return what else a reader should know: of the records, of the last fit, of the held-out runs."""
     first, last = found.path[0].fit, found.path[-1].fit
-    limits = (f"In {run.name} {limit}" for run in first.problem.experiments if (limit := current_limit(run)))
+    limits = (f"In {run.name} {limit}" for run in first.problem.experiments if LIMITER not in found.path[-1].key
+              and (limit := current_limit(run)))
     stopped = f"Stopped early: {found.stopped}; more may be missing." if found.stopped else ""
     return [stopped, driven, window_remark(last), next(limits, ""), parts_remark(first), unfinished_remark(last),
             held_out_remark(found.path[-1]), measured_angle_remark(last), outliers_remark(last),

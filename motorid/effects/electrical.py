@@ -98,7 +98,7 @@ def driver_coast(m: Equations, R_c=P(50.0, "Ω", null=0.0, positive=True, grid=(
     m.voltage -= ca.if_else(ca.fabs(m.command) <= OPEN, R_c * m.i - (1 - shorted) * m.K_e * m.omega, 0)
 
 
-STIFF = 1e3  # times R: what the limiter takes per ampere too much
+LIMITER_GAIN, LIMITER_WIDTH = 20.0, 0.01  # in R: how firmly the current is led to its limit; of R·I_lim: how softly
 
 
 @effect(balance="voltage")
@@ -106,10 +106,17 @@ def driver_current_limit(
     m: Equations,
     I_lim=P(5.0, "A", null=float("inf"), positive=True, grid=(0.8, 0.9, 0.97), doc="largest current of the driver"),
 ):
-    """Driver that takes voltage away above a current. Mohan, Electric Machines and Drives, 2012."""
-    width = I_lim / STIFF
-    z = (ca.fabs(m.i) - I_lim) / width
-    m.voltage -= STIFF * m.R * width * (ca.fmax(z, 0) + ca.log1p(ca.exp(-ca.fabs(z)))) * ca.sign(m.i)
+    """Driver that takes voltage away above a current. Mohan, Electric Machines and Drives, 2012.
+
+    The bridge gives no more than what holds the current at its limit, R·I + K·ω, and leads it there within L/(20 R).
+    """
+    width = LIMITER_WIDTH * m.R * I_lim
+
+    def above(v, sign):
+        z = (sign * (v - m.K_e * m.omega + LIMITER_GAIN * m.R * m.i) - (1 + LIMITER_GAIN) * m.R * I_lim) / width
+        return width * (ca.fmax(z, 0) + ca.log1p(ca.exp(-ca.fabs(z))))
+
+    m.voltage -= above(m.v, 1) - above(m.v, -1)
 
 
 @effect(balance="voltage")
