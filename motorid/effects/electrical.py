@@ -65,7 +65,7 @@ def magnet_heating(m: Equations,
                    alpha_m=P(0.002, "1/K", null=0.0, vary=False, doc="temperature coefficient of ferrite, fixed"),
                    R_thm=P(10.0, "K/W", positive=True, grid=(0.3, 1.0, 3.0), doc="thermal resistance to ambient"),
                    C_thm=P(10.0, "J/K", positive=True, grid=(0.3, 1.0, 3.0), doc="heat capacity")):
-    """Flux that falls as the magnets get warm, K/(1+α·ΔT). Hendershot & Miller, Permanent-Magnet Machines, 2010.
+    """Heating of the magnets, K/(1+α·ΔT). Hendershot & Miller, Permanent-Magnet Machines, 2010.
 
     ``C_th dΔT/dt = R i² − ΔT/R_th``, ΔT = 0 at the start of each run; neodymium has half of ferrite's coefficient.
     """
@@ -77,7 +77,7 @@ def magnet_heating(m: Equations,
 @effect(balance="voltage")
 def supply_sag(m: Equations, R_s=P(0.1, "Ω", null=0.0, lower=0.0, doc="resistance of supply and leads"),
                V_s=P(12.0, "V", positive=True, vary=False, grid=(1.0,), doc="supply without load, fixed")):
-    """Supply that sags behind the bridge, d·(V_s − R_s·d·i), d = v/V_s. Mohan, Electric Machines and Drives, 2012.
+    """Sag of the supply, d·(V_s − R_s·d·i), d = v/V_s. Mohan, Electric Machines and Drives, 2012.
 
     Only R_s/V_s² acts. Unless V_s is given it is the largest voltage of the records: the duty is one there.
     """
@@ -90,7 +90,7 @@ OPEN = 1e-6  # V: a command that opens the bridge
 @effect(balance="voltage")
 def driver_coast(m: Equations, R_c=P(50.0, "Ω", null=0.0, positive=True, grid=(3.0, 30.0),
                                      doc="resistance that ends the current as fast as the diodes do")):
-    """Bridge that opens at command 0: the current dies at once. Mohan, Electric Machines and Drives, 2012.
+    """Coasting of the driver: at command 0 its bridge opens. Mohan, Electric Machines and Drives, 2012.
 
     The diodes put the supply against the current; linear, that is L di/dt = −(R + R_c) i, without the back-EMF.
     """
@@ -106,7 +106,7 @@ def driver_current_limit(
     m: Equations,
     I_lim=P(5.0, "A", null=float("inf"), positive=True, grid=(0.8, 0.9, 0.97), doc="largest current of the driver"),
 ):
-    """Driver that takes voltage away above a current. Mohan, Electric Machines and Drives, 2012.
+    """Current limit of the driver, which takes voltage away. Mohan, Electric Machines and Drives, 2012.
 
     The bridge gives no more than what holds the current at its limit, R·I + K·ω, and leads it there within L/(20 R).
     """
@@ -122,12 +122,12 @@ def driver_current_limit(
 @effect(balance="voltage")
 def measured_temperature(m: Equations, alpha_T=P(0.00393, "1/K", null=0.0, lower=0.0, doc="copper: 0.0039"),
                          T_ref=P(25.0, "°C", vary=False, doc="temperature that R belongs to, fixed")):
-    """Winding resistance at the recorded temperature, R(1+α(T−T_ref)). Kirtley, Electric Power Principles, 2010."""
+    """Recorded temperature of the winding, R(1+α(T−T_ref)). Kirtley, Electric Power Principles, 2010."""
     m.scale("R", 1 + alpha_T * (m.input("temp") - T_ref))
 
 
 @effect(balance="voltage")
 def measured_supply(m: Equations, k_v=P(1.0, "", null=0.0, doc="of the supply's change that acts; 1: all of it"),
                     V_n=P(12.0, "V", positive=True, vary=False, grid=(1.0,), doc="supply that commands mean, fixed")):
-    """Command that means a share of the supply as recorded, v·V/V_n. Mohan, Electric Machines and Drives, 2012."""
+    """Recorded voltage of the supply, of which commands are shares. Mohan, Electric Machines and Drives, 2012."""
     m.scale("v", 1 + k_v * (m.input("v_supply") / V_n - 1))

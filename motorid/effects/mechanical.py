@@ -139,7 +139,7 @@ def spring(m: Equations, k_s=P(1e-3, "N·m/rad", null=0.0, lower=0.0, doc="stiff
 
 @effect(balance="torque")
 def measured_load(m: Equations, k_l=P(1.0, "", null=0.0, doc="of the recorded torque that acts; 1: all of it")):
-    """Load torque as recorded, against positive speed. Isermann, Identification of Dynamic Systems, 2011."""
+    """Recorded load torque, against positive speed. Isermann, Identification of Dynamic Systems, 2011."""
     m.torque -= k_l * m.input("tau_load")
 
 

@@ -61,7 +61,7 @@ def speed_gain(m: Equations, k_w=P(0.01, "", null=0.0, lower=-0.9, upper=9.0, do
 
 @effect(balance="sensor")
 def speed_average(m: Equations, T_a=P(5e-3, "s", null=0.0, positive=True, grid=(2.0, 6.0, 20.0), doc="window of mean")):
-    """Mean speed over a window (counts per interval), Padé of orders 2 and 3. Golub & Van Loan, 2013, sec. 9.3."""
+    """Averaging of the speed over a window (counts), Padé of orders 2 and 3. Golub & Van Loan, 2013, sec. 9.3."""
     # (1 − e⁻ˣ)/x = (120 + 2x²)/(120 + 60x + 12x² + x³) at x = Ts, exact up to x⁵.
     reaching = m.measured("omega")
     z = [m.state("omega_mean", m.start["omega"]), m.state("omega_mean_2"), m.state("omega_mean_3")]
@@ -93,7 +93,7 @@ def current_gain(m: Equations, k_i=P(0.01, "", null=0.0, lower=-0.9, upper=9.0, 
 def supply_side_current(m: Equations, V_dc=P(12.0, "V", positive=True, vary=False, grid=(1.0,), doc="supply, fixed"),
                         s_i=P(1.0, "", null=0.0, lower=0.0, upper=1.0, vary=False, doc="1: reads so, fixed"),
                         u_i=P(0.0, "", vary=False, lower=0.0, upper=1.0, grid=(1.0, 0.0), doc="1: no sign, fixed")):
-    """Current measured before the bridge, d·i at the duty d = abs(v)/V_dc. Mohan, Electric Machines and Drives, 2012.
+    """Current of the supply, not the motor's: d·i, d = abs(v)/V_dc. Mohan, Electric Machines and Drives, 2012.
 
     With u_i = 1 it has no sign, whichever way the motor is driven. Unless V_dc is given it is the largest voltage of
     the records; where it is larger, R, L, b and J come out wrong by that factor.
