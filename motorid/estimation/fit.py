@@ -283,7 +283,8 @@ def in_windows(fit: Fit, solve: Callable[[Problem], Fit] = solve) -> Fit | None:
     if fit.window is not None or problem.initial != "auto":
         return None
     for count in WINDOWS:
-        runs = tuple(p for r in problem.experiments for p in windows(r, longest / count) if r.n > FEWEST * count)
+        enough = [r for r in problem.experiments if r.n > FEWEST * count]
+        runs = tuple(p for r in enough for p in windows(r, longest / count))
         with contextlib.suppress(*FAILURES):
             part = solve(problem.with_(experiments=runs, model=fit.model, balance={})) if runs else None
             if part is not None and follows(part):
