@@ -21,7 +21,7 @@ from motorid.numerics.signals import Array
 from motorid.problem.residuals import Levels, Measured, prior_residual
 from motorid.problem.runs import Run, channels_of, noise_of, prepare_run, smoothing, with_inputs
 from motorid.problem.unknowns import Point, Scaling, Unknowns
-from motorid.records.experiment import Experiment
+from motorid.records.experiment import Experiment, between_pauses
 
 
 @dataclass(frozen=True, eq=False)
@@ -304,6 +304,7 @@ def _without_empty(run: Experiment) -> Experiment:
 
 
 def as_problem(model: Model, runs: Sequence[Experiment] | Experiment, **fields: Any) -> Problem:
-    """Return a `Problem` of a model and one or several runs."""
+    """Return a `Problem` of a model and one or several runs; what follows a pause is a run of its own."""
     experiments = (runs,) if isinstance(runs, Experiment) else tuple(runs)
-    return Problem(model, experiments, **fields)
+    parts = [p for r in experiments for p in (between_pauses(r) if isinstance(r, Experiment) else [r])]
+    return Problem(model, tuple(parts), **fields)

@@ -173,7 +173,7 @@ def with_channels(model: Model, run: Experiment, channels: Sequence[str],
     """Return the run with `channels` filled in from the model, with their noise (default 1 % of the RMS)."""
     blank = run.with_(outputs={**run.outputs, **{c: np.zeros(run.n) for c in channels}},
                       sigma={**run.sigma, **dict.fromkeys(channels, 1.0)})
-    shown = simulate(model, [blank], initial="rest", estimate_initial=False)[0].outputs
+    shown = simulated(Problem(model, (blank,), initial="rest"), estimate_initial=False)[0].outputs
     noise = {c: (sigma or {}).get(c) or ASSUMED_NOISE * float(np.sqrt(np.mean(shown[c] ** 2))) or 1.0 for c in channels}
     filled = {c: shown[c] for c in channels}
     return blank.with_(outputs={**run.outputs, **filled}, sigma={**run.sigma, **noise})

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from motorid.display.numbers import counted
 from motorid.errors import DataError
 from motorid.numerics.signals import Array
-from motorid.records.experiment import INPUTS, MIN_SAMPLES, Experiment
+from motorid.records.experiment import INPUTS, MIN_SAMPLES, Experiment, pauses
 from motorid.records.layout import Layout, Place
 from motorid.records.preprocessing import unwrapped
 
@@ -202,9 +202,10 @@ def _note_gaps(t: Array, said: list[str]) -> None:
     steps = np.diff(t)
     if len(steps) < MIN_SAMPLES - 1:
         return
-    gaps = np.flatnonzero(steps > 5 * np.median(steps))
-    if gaps.size:
-        worst = gaps[np.argmax(steps[gaps])]
-        how_many = "a gap in time," if gaps.size == 1 else f"{gaps.size} gaps in time, the longest"
-        said.append(f"{how_many} {steps[worst]:.4g} s after t = {t[worst]:.6g} s; the input is taken as "
-                    "going on there.")
+    long = pauses(t)
+    gaps = np.setdiff1d(np.flatnonzero(steps > 5 * np.median(steps)), long)
+    for found, what in ((long, "what follows is fitted as a run of its own"), (gaps, "the input is taken as going on")):
+        if found.size:
+            worst = found[np.argmax(steps[found])]
+            how_many = "a gap in time," if found.size == 1 else f"{found.size} gaps in time, the longest"
+            said.append(f"{how_many} {steps[worst]:.4g} s after t = {t[worst]:.6g} s; {what}.")

@@ -11,7 +11,7 @@ from types import MappingProxyType
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from motorid.channels import CHANNELS, MEASURED_INPUTS, NAMES, UNITS
 from motorid.display.cards import Card, Shown
@@ -237,6 +237,32 @@ def windows(experiment: Experiment, seconds: float) -> list[Experiment]:
         raise UsageError(f"a window takes a time in seconds; got {seconds!r}.")
     parts = split(experiment, max(round(experiment.duration / seconds), 1))
     return [p.with_(meta={**experiment.meta, "window": seconds}) for p in parts]
+
+
+def pauses(t: Array) -> NDArray[np.intp]:
+    """Return the indices of the samples before a pause in `t` (N,): more than five usual steps, and more than 0.1 s (or
+    1 % of a short record). With more than ten gaps the usual step is the eleventh longest: a lossy logger."""
+    steps = np.diff(t)
+    usual = max(float(np.median(steps)), float(np.sort(steps)[-11]) if len(steps) > 20 else 0.0)
+    return np.flatnonzero(steps > max(5 * usual, min(0.1, (t[-1] - t[0]) / 100)))
+
+
+def between_pauses(run: Experiment) -> list[Experiment]:
+    """Return the parts of a run between pauses as runs of their own, since nobody saw what the motor did meanwhile.
+
+    A pause is a gap in time, see `pauses`, or begins a part by ``meta["parts"]`` (s). Parts of fewer than 8 samples are
+    left out, where others are left.
+    """
+    if run.meta.get("parts", ()) is None:  # it is such a part
+        return [run]
+    told = np.searchsorted(run.t, np.asarray(run.meta.get("parts", ()), float) - run.dt / 2) - 1
+    cuts = np.union1d(pauses(run.t), told[(told >= 0) & (told < run.n - 1)])
+    parts = [slice(a, b) for a, b in pairwise([0, *(cuts + 1).tolist(), run.n]) if b - a >= MIN_SAMPLES]
+    if not cuts.size or not parts:
+        return [run]
+    live = [s for s in parts if any(np.isfinite(y[s]).any() for y in run.outputs.values())]
+    return [run.select(s).with_(name=f"{run.name}[{k + 1}]", meta={**run.select(s).meta, "parts": None,
+                                "notes": run.meta.get("notes", ()) if k == 0 else ()}) for k, s in enumerate(live)]
 
 
 def _freeze(experiment: Experiment, name: str, value: object) -> None:

@@ -117,9 +117,10 @@ def _find(labels: Sequence[str], column: object) -> str:
 def _named_by_header(places: dict[str, Place], labels: Sequence[str], row: Units) -> None:
     """Add the channels that the header names, where the user has not named them."""
     found: dict[str, list[Place]] = {}
-    for hit in filter(None, (classify(c, row[c]) for c in labels)):
-        place = Place(hit.column, hit.unit or _default(hit.channel), hit.unit is not None, hit.score)
-        found.setdefault(hit.channel, []).append(place)
+    for label in labels:
+        if hit := classify(first_of_its_name(label, labels), row[label]):
+            place = Place(label, hit.unit or _default(hit.channel), hit.unit is not None, hit.score)
+            found.setdefault(hit.channel, []).append(place)
     for channel, hits in found.items():
         best = [p for p in hits if p.score == max(h.score for h in hits)]
         best = [p for p in best if p.unit.factor == 1.0] or best
@@ -132,6 +133,12 @@ def _named_by_header(places: dict[str, Place], labels: Sequence[str], row: Units
             raise DataError(f"{names} look like {_MEANING[channel]} ({channel}) all the same; say which one "
                             f"is meant, e.g. columns={{'{channel}': '{best[0].column}'}}.")
         places[channel] = best[0]
+
+
+def first_of_its_name(label: str, labels: Sequence[str]) -> str:
+    """Return the label without the number that tells it from others of the same name."""
+    name = label.rpartition(" (")[0]
+    return name if label.endswith(")") and label[len(name) + 2:-1].isdigit() and name in labels else label
 
 
 def _last_resorts(places: dict[str, Place], labels: Sequence[str], notes: list[str]) -> None:

@@ -11,7 +11,7 @@ import hashlib
 import os
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -19,9 +19,9 @@ import numpy as np
 from motorid.errors import DataError, UsageError, one_of
 from motorid.records.binary_tables import mat_table, parquet_table
 from motorid.records.cleaning import run_from_columns
-from motorid.records.experiment import Experiment
+from motorid.records.experiment import Experiment, between_pauses
 from motorid.records.files import read_bytes, write_files
-from motorid.records.layout import assign, parse_pairs
+from motorid.records.layout import assign, first_of_its_name, parse_pairs
 from motorid.records.text_tables import TextTable, parse_table
 
 Path_ = str | os.PathLike[str]
@@ -33,11 +33,12 @@ _HEADERS = {("t", "s"): "time_s", ("v", "V"): "voltage_V", ("v", "A"): "command_
             ("v_supply", "V"): "supply_V", ("tau_load", "N·m"): "load_torque_Nm", ("tau_load", "N"): "load_force_N",
             ("temp", "°C"): "temperature_degC"}
 _OWN = re.compile(r"#\s*motorid (columns|hold|sigma): (.*)")  # what write_csv says about its own file
+_PART = re.compile(r"#\s*part begins: (\d+\.?\d*)")  # what a resumed recording says, s
 
 
 def read_runs(paths: Path_ | Iterable[Path_], *, columns: Mapping[str, object] | None = None,
               units: Mapping[str, object] | None = None, hold: str | None = None) -> list[Experiment]:
-    """Read records, one run per file.
+    """Read records, one run per file; where one pauses (a resumed recording, a gap in time), one per part.
 
     Parameters
     ----------
@@ -65,8 +66,9 @@ def read_runs(paths: Path_ | Iterable[Path_], *, columns: Mapping[str, object] |
     files = find_records(paths)
     stems = Counter(f.stem for f in files)
     names = [f.stem if stems[f.stem] == 1 else f"{f.parent.name}/{f.name}" for f in files]
-    return [_READERS.get(f.suffix.lower(), read_csv)(f, columns=columns, units=units, hold=hold, name=name)
-            for f, name in zip(files, names, strict=True)]
+    runs = (_READERS.get(f.suffix.lower(), read_csv)(f, columns=columns, units=units, hold=hold, name=name)
+            for f, name in zip(files, names, strict=True))
+    return [part for run in runs for part in between_pauses(run)]
 
 
 def read_csv(path: Path_, *, columns: Mapping[str, object] | None = None, units: Mapping[str, object] | None = None,
@@ -189,12 +191,21 @@ def _read(path: Path_, to_table: Callable[[bytes], TextTable], columns: Mapping[
         if "columns" in own and not columns:
             columns = parse_pairs(own["columns"], "columns")
             labels = [c for c in labels if c in columns.values()]
+        labels = [c for c in labels if not _is_copy(c, labels, table)]
         layout = assign(labels, columns=columns, units=units, unit_row=table.unit_row)
         return run_from_columns(table.columns, table.texts, layout, name=name or path.stem, notes=table.notes,
                                 hold=hold or own.get("hold", "zoh"), sigma=_sigma(own.get("sigma")),
-                                meta={"source": str(path), "sha256": hashlib.sha256(data).hexdigest()})
+                                meta={"source": str(path), "sha256": hashlib.sha256(data).hexdigest(),
+                                      "parts": tuple(float(m[1]) for m in map(_PART.fullmatch, table.comments) if m)})
     except (DataError, UsageError) as error:
         raise DataError(f"{path}: {error}") from None
+
+
+def _is_copy(label: str, labels: Sequence[str], table: TextTable) -> bool:
+    """Tell a column that repeats the one of the same name: loggers write the time beside each channel."""
+    first = first_of_its_name(label, labels)
+    pair = table.columns.get(first), table.columns.get(label)
+    return first != label and pair[0] is not None and np.array_equal(*pair, equal_nan=True)
 
 
 def _sigma(text: str | None) -> dict[str, float]:

@@ -21,6 +21,8 @@ _COMMENT = ("#", "%", "//")
 _LARGEST = 1e30  # what is larger, or infinite, was not measured
 MISSING = frozenset(["", "nan", "na", "n/a", "null", "none", "-", "--", "---", "?", "missing", "#n/a"])
 _NUMBER = re.compile(r"[-+]?(?:(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?|inf)", re.IGNORECASE)
+_GROUPS = {".": ",", ",": "."}  # decimal mark to what may stand between thousands
+_GROUPED = {mark: rf"[-+]?\d{{1,3}}(?:\{group}\d{{3}})+(?:\{mark}\d*)?" for mark, group in _GROUPS.items()}
 _CONTROL = re.compile(r"[\x00-\x08\x0e-\x1f\x7f]")
 # Delimiter (None: white space) and decimal mark, in the order in which a tie is decided.
 _DIALECTS = (("\t", "."), (";", "."), (",", "."), ("\t", ","), (";", ","), (",", ","), (None, "."), (None, ","))
@@ -244,7 +246,15 @@ def _parse(rows: list[str], dialect: Dialect, labels: list[str],
         raise DataError(f"its rows cannot be read as a table ({str(error).strip()}).") from None
     columns, texts = {}, {}
     for label, column in zip(labels, frame.columns, strict=True):
-        array, bad = numbers(frame[column], dialect.decimal)
+        cells = frame[column]
+        if cells.dtype.kind not in "fiub":
+            cells = cells.astype(str).str.strip(" \"'")
+            grouped = cells.str.fullmatch(_GROUPED[dialect.decimal])
+            cells = cells.where(~grouped, cells.str.replace(_GROUPS[dialect.decimal], "", regex=False))
+            if grouped.any():
+                notes.append(f"'{label}' has '{_GROUPS[dialect.decimal]}' between thousands, as in "
+                             f"'{frame[column][grouped].iloc[0]}'.")
+        array, bad = numbers(cells, dialect.decimal)
         if frame[column].dtype.kind not in "fiub" and bad > 0.5 * np.count_nonzero(frame[column].notna()):
             texts[label] = frame[column].astype(str).tolist()
             continue

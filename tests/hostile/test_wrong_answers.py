@@ -1,0 +1,95 @@
+"""What used to end in a wrong answer without a word."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import motorid as mi
+from motorid.records.experiment import Experiment
+
+TRUE = {"R": 1.4, "L": 2e-3, "K": 0.046, "b": 6e-5, "J": 2e-5}
+
+
+def resting_motor(t: np.ndarray, v: np.ndarray, rng: np.random.Generator) -> dict[str, np.ndarray]:
+    """Current, speed and angle of a motor from rest, with a little noise."""
+    plan = mi.planned(mi.dc_motor(**TRUE), t, v, channels=["i", "omega", "theta"])
+    return {c: y + rng.normal(0, s, y.shape) for (c, y), s in zip(plan.outputs.items(), (5e-3, 0.2, 1e-3), strict=True)}
+
+
+def paused(rng: np.random.Generator, pause: float) -> Experiment:
+    """A motor that is stepped up, switched off for a while unseen, and stepped from rest and another zero again."""
+    t = np.arange(0, 0.8, 2e-3)
+    first, second = np.where(t > 0.05, 6.0, 0.0), np.where(t > 0.3, -4.0, 5.0)
+    a, b = resting_motor(t, first, rng), resting_motor(t, second, rng)
+    return Experiment(np.r_[t, t + t[-1] + pause], {"v": np.r_[first, second]},
+                      {c: np.r_[a[c], b[c] + (7.0 if c == "theta" else 0)] for c in a}, name="run")
+
+
+@pytest.mark.parametrize("pause", [0.3, 5.0])
+def test_what_follows_a_pause_is_a_run_of_its_own(rng, tmp_path, pause):
+    run = paused(rng, pause)
+    path = mi.records.reading.write_csv(run, tmp_path / "run.csv")
+    for runs in (run, mi.read_csv(path), mi.read_runs(path)):
+        fit = mi.fit(mi.dc_motor(), runs)
+        assert [r.name for r in fit.problem.experiments] == ["run[1]", "run[2]"]
+        for name, value in TRUE.items():
+            assert fit.values[name] == pytest.approx(value, rel=0.05), name
+
+
+def test_a_resumed_recording_says_where_its_parts_begin(rng, tmp_path):
+    run = paused(rng, 0.006)  # too short to be seen by itself
+    path = mi.records.reading.write_csv(run, tmp_path / "run.csv")
+    lines = path.read_text(encoding="utf-8").splitlines()
+    second = next(k for k, line in enumerate(lines) if line[:1].isdigit() and float(line.split(",")[0]) > 0.8)
+    begins = lines[second].split(",")[0]
+    lines.insert(second, f"# part begins: {float(begins):.6f}")
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    first, again = mi.read_runs(path)
+    assert (first.n + again.n, again.t[0]) == (run.n, float(begins))
+
+
+def test_a_lossy_logger_is_no_row_of_pauses(rng):
+    t = np.arange(0, 4, 1e-3)
+    keep = np.ones(len(t), bool)
+    for k in range(50, 3900, 150):
+        keep[k:k + 20] = False
+    run = Experiment(t, {"v": np.sign(np.sin(9 * t)) * 6}, {"omega": np.sin(9 * t)}).select(keep)
+    assert len(mi.records.experiment.between_pauses(run)) == 1
+    later = run.t + np.where(run.t > 2, 3.0, 0.0)
+    assert len(mi.records.experiment.between_pauses(run.with_(t=later))) == 2
+
+
+ROWS = [(0.01 * k, 6.0 if k > 3 else 0.0, 0.1 * k, 2.0 * k) for k in range(30)]
+
+
+@pytest.mark.parametrize("twice", ["speed_rad_s", "time_s", "voltage_V", "current_A"])
+def test_two_columns_of_one_name_are_an_error_that_says_how_to_choose(tmp_path, twice):
+    names = ["time_s", "voltage_V", "current_A", "speed_rad_s"]
+    k = names.index(twice)
+    path = tmp_path / "run.csv"
+    path.write_text(",".join([*names, twice]) + "\n" + "".join(
+        ",".join(map(str, [*r, 3 * r[k] + 1])) + "\n" for r in ROWS), encoding="utf-8")
+    channel = "tviw"[k].replace("w", "omega")
+    with pytest.raises(mi.DataError, match="say which one is meant"):
+        mi.read_csv(path)
+    second = mi.read_csv(path, columns={channel: f"{twice} (2)"})
+    assert second.meta["columns"][channel] == f"{twice} (2)"
+    path.write_text(",".join([*names, twice]) + "\n" + "".join(
+        ",".join(map(str, [*r, r[k]])) + "\n" for r in ROWS), encoding="utf-8")
+    assert mi.read_csv(path).n == 30  # the same twice: nothing to choose
+
+
+@pytest.mark.parametrize(("delimiter", "quote", "mark", "group"), [
+    (",", '"', ".", ","), (";", "", ".", ","), ("\t", "", ".", ","), (";", "", ",", ".")])
+def test_separators_between_thousands_are_read_and_said(tmp_path, delimiter, quote, mark, group):
+    lines = [delimiter.join(["time_ms", "voltage_V", "speed_rad_s"])]
+    for k in range(60):
+        t = f"{980 + k:,}".replace(",", group)
+        lines.append(delimiter.join([f"{quote}{t}{quote}", f"6{mark}5", f"{k}{mark}25"]))
+    path = tmp_path / "run.csv"
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    run = mi.read_csv(path)
+    np.testing.assert_allclose(np.diff(run.t), 1e-3)
+    assert run.n == 60
+    assert f"has '{group}' between thousands" in " ".join(run.meta["notes"])
