@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from itertools import pairwise
+from itertools import pairwise, permutations, product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,7 @@ from motorid.records.experiment import Experiment
 
 Check = Callable[[Experiment], str | None]
 _BLOCKS = 40
+BALANCE_BLOCKS = 150
 # Ratio of the angle's rate to the speed, and what was then mistaken for SI.
 _RATIOS = {
     2 * np.pi / 60: "the speed in rpm: units={'omega': 'rpm'}",
@@ -86,7 +87,7 @@ def _clipped(run: Experiment) -> str | None:
             if _at_stop(y, float(top)):
                 share = 100 * float(np.mean(y == top))
                 return (f"the {NAMES[channel]} stays at exactly {top:.4g} {run.units[channel]} in "
-                        f"{share:.0f} % of the samples: clipped at the limit of the sensor or the drive. Use "
+                        f"{share:.2g} % of the samples: clipped at the limit of the sensor or the drive. Use "
                         "a lower voltage, or mark these samples as missing.")
     return None
 
@@ -119,13 +120,13 @@ def current_limit(run: Experiment) -> str | None:
 def _at_stop(y: Array, top: float) -> bool:
     """Tell a channel that has run into a limit from one that rests, or reaches a level by itself."""
     there = y == top
-    if top == 0 or there.sum() < max(10, 0.01 * len(y)) or there.all():
+    if top == 0 or there.sum() < 4 or there.all():
         return False
     below = y[~there]
     reach = np.ptp(y)
     step = quantum(y)
     entries = np.abs(y[np.flatnonzero(there[1:] & ~there[:-1])] - top)
-    if entries.size and float(np.median(entries)) > max(3 * step, 0.005 * reach):
+    if there.sum() >= max(10, 0.01 * len(y)) and entries.size and np.median(entries) > max(3 * step, 0.005 * reach):
         return True
     noise = noise_level(below)
     return step == 0 and noise > 1e-4 * reach and float(np.mean(there[1:][there[:-1]])) > 0.5
@@ -228,6 +229,11 @@ def signs(run: Experiment) -> str | None:
     v = run.inputs["v"]
     against = [name for name, cosine in (("current", _cosine(v, run.outputs.get("i"))),
                                          ("speed", _speed_cosine(run))) if cosine < -0.4]
+    if "omega" in run.outputs:  # a motor that brakes goes against its voltage, too: the balances know
+        order, turned = _as_balances_want(run)
+        against = [name for name, sign in zip(("current", "speed"), turned, strict=True) if sign < 0]
+        if order != (0, 1, 2):
+            return None
     measured = [n for n, here in (("current", "i" in run.outputs), ("speed", _has_speed(run))) if here]
     if not against:
         return None
@@ -326,14 +332,62 @@ def implied_constants(run: Experiment) -> str | None:
 
 
 def swapped_columns(run: Experiment) -> str | None:
-    """A commanded voltage may jump and then hold still; a speed cannot."""
+    """Columns that fit the balances of a motor in another order; a speed that jumps and holds still."""
     omega = run.outputs.get("omega")
     if omega is None:
         return None
+    order, _ = _as_balances_want(run)
+    moved = [c for k, c in enumerate(("v", "i", "omega")) if order[k] != k]
+    if moved:
+        what = " and ".join(NAMES[c] for c in moved)
+        return (f"{what} fit the equations of a motor far better if their columns are exchanged. Say which is which: "
+                f"columns={{{', '.join(f'{c!r}: ...' for c in moved)}}}.")
     if _holds(omega) > 0.8 and _holds(run.inputs["v"]) < 0.3 and _jumps(omega):
         return ("the speed jumps and then stays exactly the same, while the voltage changes smoothly: "
                 "are the two columns swapped? Say which is which: columns={'v': ..., 'omega': ...}.")
     return None
+
+
+def _as_balances_want(run: Experiment) -> tuple[tuple[int, ...], tuple[int, int]]:
+    """Return the order of v, i, omega, and the signs of i and omega, with which they fit the balances of a motor.
+
+    Both balances, integrated over blocks, with coefficients that must be positive (non-negative least squares, Lawson &
+    Hanson 1974): ∫v = R∫i + LΔi + K∫ω ± V·t and Δω = k∫i − b∫ω − c∫sgn ω ± d·t. What is stated stands, unless another
+    reading leaves less than half unexplained. Where no current is measured, the voltage drives in its place.
+    """
+    known = [c for c in ("i", "omega") if c in run.outputs and np.isfinite(run.outputs[c]).sum() > 1]
+    n = min(BALANCE_BLOCKS, run.n // 3)
+    edges = np.linspace(0, run.n - 1, n + 1).astype(int)
+    stated: tuple[tuple[int, ...], tuple[int, int]] = (0, 1, 2), (1, 1)
+    if "omega" not in known or n < 10:
+        return stated
+    y = [run.inputs["v"], *(bridged(run.t, run.outputs[c if c in known else "omega"]) for c in ("i", "omega"))]
+    held = [run.hold == "zoh", False, False]
+    sums = [np.diff(integral(run.t, a, h)[edges]) for a, h in zip(y, held, strict=True)]
+    signs_of = [np.diff(integral(run.t, np.tanh(50 * a / max(np.abs(a).max(), 1e-300)))[edges]) for a in y]
+    steps, T = [np.diff(a[edges]) for a in y], np.diff(run.t[edges])
+
+    def unexplained(order: tuple[int, ...], turned: tuple[int, int]) -> float:
+        (v, i, w), (a, b) = order, turned
+        drive = a * sums[i] if "i" in known else sums[v]
+        voltage = _share_left(sums[v], a * sums[i], a * steps[i], b * sums[w], T, -T) if "i" in known else 1.0
+        speed = _share_left(steps[w], b * drive, -sums[w], -signs_of[w], T, -T)
+        return (voltage + 1e-4) * (speed + 1e-4)
+
+    signs_too = product(permutations(range(3)), product((1, -1), (1, -1)))
+    readings = signs_too if "i" in known else [stated, ((0, 1, 2), (1, -1))]
+    best = min(readings, key=lambda r: unexplained(*r))
+    return best if unexplained(*best) < 0.5 * unexplained(*stated) else stated
+
+
+def _share_left(y: Array, *terms: Array) -> float:
+    """Return the share of y² (N,) that no sum of positive multiples of `terms` explains."""
+    from scipy.optimize import nnls
+
+    A = np.column_stack(terms)
+    size = np.linalg.norm(y)
+    left = nnls(A / np.maximum(np.linalg.norm(A, axis=0), 1e-300), y / max(size, 1e-300))[1]
+    return float(left**2) if size > 0 else 1.0
 
 
 def _cosine(a: Array, b: Array | None) -> float:

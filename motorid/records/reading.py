@@ -204,8 +204,8 @@ def _read(path: Path_, to_table: Callable[[bytes], TextTable], columns: Mapping[
 def _is_copy(label: str, labels: Sequence[str], table: TextTable) -> bool:
     """Tell a column that repeats the one of the same name: loggers write the time beside each channel."""
     first = first_of_its_name(label, labels)
-    pair = table.columns.get(first), table.columns.get(label)
-    return first != label and pair[0] is not None and np.array_equal(*pair, equal_nan=True)
+    a, b = table.columns.get(first), table.columns.get(label)
+    return first != label and a is not None and b is not None and np.array_equal(a, b, equal_nan=True)
 
 
 def _sigma(text: str | None) -> dict[str, float]:

@@ -249,11 +249,12 @@ def _parse(rows: list[str], dialect: Dialect, labels: list[str],
         cells = frame[column]
         if cells.dtype.kind not in "fiub":
             cells = cells.astype(str).str.strip(" \"'")
+            cells_before = cells
             grouped = cells.str.fullmatch(_GROUPED[dialect.decimal])
             cells = cells.where(~grouped, cells.str.replace(_GROUPS[dialect.decimal], "", regex=False))
             if grouped.any():
                 notes.append(f"'{label}' has '{_GROUPS[dialect.decimal]}' between thousands, as in "
-                             f"'{frame[column][grouped].iloc[0]}'.")
+                             f"'{next(iter(cells_before[grouped]))}'.")
         array, bad = numbers(cells, dialect.decimal)
         if frame[column].dtype.kind not in "fiub" and bad > 0.5 * np.count_nonzero(frame[column].notna()):
             texts[label] = frame[column].astype(str).tolist()

@@ -93,3 +93,60 @@ def test_separators_between_thousands_are_read_and_said(tmp_path, delimiter, quo
     np.testing.assert_allclose(np.diff(run.t), 1e-3)
     assert run.n == 60
     assert f"has '{group}' between thousands" in " ".join(run.meta["notes"])
+
+
+VOLTAGES = {"step": lambda t: np.where(t > 0.05, 6.0, 0.0),
+            "reversals": lambda t: np.select([t < 0.05, t < 0.8, t < 1.2], [0.0, 6.0, 0.0], -6.0),
+            "sweep": lambda t: 6 * np.sin(2 * np.pi * (0.5 * t + 2 * t * t))}
+MOTORS = {"lab": TRUE, "big": {"R": 0.3, "L": 1e-3, "K": 0.1, "b": 1e-3, "J": 5e-4}}
+
+
+def record(rng: np.random.Generator, motor: str, voltage: str, seconds: float = 2.0) -> Experiment:
+    t = np.arange(0, seconds, 1e-3)
+    v = VOLTAGES[voltage](t)
+    plan = mi.planned(mi.dc_motor(**MOTORS[motor]), t, v)
+    return plan.with_(outputs={c: y + rng.normal(0, 0.005 * np.ptp(y), y.shape) for c, y in plan.outputs.items()})
+
+
+@pytest.mark.parametrize("motor", MOTORS)
+@pytest.mark.parametrize("voltage", VOLTAGES)
+def test_turned_exchanged_and_clipped_channels_are_remarked_upon(rng, motor, voltage):
+    run = record(rng, motor, voltage)
+    v, i, omega = run.inputs["v"], run.outputs["i"], run.outputs["omega"]
+
+    def said(**changes: np.ndarray) -> str:
+        c = {"v": v, "i": i, "omega": omega} | changes
+        return " ".join(mi.check_runs([run.with_(inputs={"v": c["v"]}, outputs={"i": c["i"], "omega": c["omega"]})]))
+
+    assert "swapped" not in said()
+    assert "exchanged" not in said()
+    assert "sign of the current is probably swapped" in said(i=-i)
+    assert "sign of the speed is probably swapped" in said(omega=-omega)
+    assert "sign of the voltage is probably swapped" in said(v=-v)
+    assert "current and speed fit" in said(i=omega, omega=i)
+    assert "voltage and speed fit" in said(v=omega, omega=v)
+    assert "voltage and current fit" in said(v=i, i=v)
+    top = 0.5 * np.abs(i).max()
+    assert "clipped" in said(i=np.clip(i, -top, top))
+
+
+def test_a_slice_that_only_brakes_is_not_called_swapped(rng):
+    whole = record(rng, "big", "reversals")
+    for channels in ((), ("i",)):
+        brakes = whole.select((whole.t > 0.8) & (whole.t < 0.95) | (whole.t > 1.2) & (whole.t < 1.3)).without(*channels)
+        brakes = brakes.with_(t=np.arange(brakes.n) * 1e-3)
+        assert "swapped" not in " ".join(mi.check_runs([brakes.select(slice(150, None))]))
+        assert "swapped" not in " ".join(mi.check_runs([brakes.select(slice(0, 149))]))
+
+
+def test_a_record_without_noise_has_no_absurd_certainty():
+    t = np.arange(0, 1, 1e-3)
+    v = np.full(len(t), 6.0)
+    run = mi.planned(mi.dc_motor(**TRUE), t, v)
+    for shown in (run, run.without("i"), run.without("omega"), run.with_(
+            outputs={"i": np.full(len(t), 0.2), "omega": np.full(len(t), 120.0)})):
+        fit = mi.fit(mi.dc_motor(), shown)
+        for name, value in TRUE.items():
+            std = fit.std[name]
+            exact = abs(fit.values[name] - value) < 1e-3 * value  # to the error of the integration
+            assert std is None or (exact and std > 1e-9 * value), name
