@@ -85,6 +85,7 @@ def prepare_process() -> None:
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="motorid")  # type: ignore[union-attr]
+    warnings.simplefilter("ignore", RuntimeWarning)  # of arithmetic: what came of it is said
     warnings.formatwarning = lambda message, *_, **__: f"motorid: {message}\n"
     interruption.listen()
 

@@ -39,7 +39,7 @@ class CurrentLimit(Relation):
     weight: float = 10.0
 
     def __post_init__(self) -> None:
-        if not (np.isfinite(self.limit) and self.limit > 0):
+        if not 1e-9 < self.limit < 1e9:
             raise UsageError(f"CurrentLimit takes a positive current in A; got {self.limit!r}.")
         check_weight(self.weight, "CurrentLimit")
 

@@ -78,6 +78,7 @@ class Problem:
         if not self.outputs:
             raise ModelError("none of the channels that the model shows was measured; a fit needs at least "
                              "one of i, omega, theta (torque_driven: omega or theta).")
+        object.__setattr__(self, "experiments", tuple(_shown(r, self.outputs) for r in self.experiments))
         for name in self.priors:
             if name not in self.model.parameters:
                 raise UsageError(f"prior: {one_of(name, self.model.parameters, 'parameter')}")
@@ -295,6 +296,12 @@ class Problem:
     def with_(self, **fields: Any) -> Problem:
         """Return a copy with some fields changed, e.g. ``with_(model=…)``."""
         return replace(self, **{"_runs": None, **fields})
+
+
+def _shown(run: Experiment, outputs: Sequence[str]) -> Experiment:
+    """Return a run with the channels that the model shows: a torque-driven one has no current."""
+    unseen = [c for c in run.channels if c not in outputs]
+    return run.without(*unseen) if unseen and len(unseen) < len(run.channels) else run
 
 
 def _without_empty(run: Experiment) -> Experiment:

@@ -149,7 +149,7 @@ def initial_state(run: Experiment, sigma: Mapping[str, float], initial: str) -> 
     known = rest if initial == "auto" else initial == "rest"
     start, reach = np.zeros(3), {}
     for k, c in enumerate(CHANNELS):
-        if c not in run.outputs:
+        if c not in sigma:  # not measured, or not shown by the model
             continue
         y = run.outputs[c]
         if c == "theta":
@@ -179,7 +179,7 @@ def at_rest(run: Experiment, sigma: Mapping[str, float]) -> tuple[bool, int]:
     lead = int(np.argmin(quiet)) if not quiet.all() else len(v)
     checked = max(lead, 2)
     for c in ("i", "omega"):
-        if c in run.outputs:
+        if c in sigma:
             y = run.outputs[c][:checked]
             y = y[np.isfinite(y)]
             top = np.nanmax(np.abs(run.outputs[c]))

@@ -48,6 +48,8 @@ def running_median(v: Array, samples: int) -> Array:
     """Return the running median of an input over an odd number of samples."""
     if int(samples) != samples or samples < 1 or samples % 2 == 0:
         raise UsageError(f"running_median() takes an odd number of samples, 1 or more; got {samples!r}.")
+    if samples > len(v):
+        raise UsageError(f"a running median over {samples} samples is longer than the record of {len(v)}.")
     from scipy.ndimage import median_filter
 
     return median_filter(v, int(samples), mode="nearest")

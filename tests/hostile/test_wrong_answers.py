@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from command import motorid
 
 import motorid as mi
 from motorid.records.experiment import Experiment
@@ -150,3 +151,29 @@ def test_a_record_without_noise_has_no_absurd_certainty():
             std = fit.std[name]
             exact = abs(fit.values[name] - value) < 1e-3 * value  # to the error of the integration
             assert std is None or (exact and std > 1e-9 * value), name
+
+
+@pytest.mark.parametrize("words", [("fit",), ("fit", "--effects", "coulomb"), ("fit", "--formulation", "penalty"),
+                                   ("identifiability",), ("diagnose", "--max-effects", "1")], ids=" ".join)
+def test_a_torque_drive_that_also_logs_its_current(words, rng, tmp_path):
+    path = mi.records.reading.write_csv(record(rng, "lab", "reversals"), tmp_path / "run.csv")
+    done = motorid(words[0], path, "--drive", "torque", *words[1:])
+    assert done.status == 0, done.err
+    assert "i" not in mi.fit(mi.torque_driven(), mi.read_csv(path)).nrmse
+
+
+@pytest.mark.parametrize(("words", "says"), [
+    (("--set", "R=1e300"), "cannot be meant"), (("--fix", "J=1e308"), "cannot be meant"),
+    (("--set", "J=1e-300"), "cannot be meant"), (("--fix", "R=-1"), "must be positive"),
+    (("--median", "99999999999"), "longer than the record"),
+    (("--current-limit", "1e-300", "--formulation", "penalty"), "positive current")])
+def test_numbers_that_cannot_be_meant_are_said(words, says, rng, tmp_path):
+    path = mi.records.reading.write_csv(record(rng, "lab", "step", 0.5), tmp_path / "run.csv")
+    done = motorid("fit", path, *words)
+    assert (done.status, done.out) == (2, "")
+    assert says in done.err
+
+
+def test_a_motor_without_resistance_is_fitted(rng, tmp_path):
+    path = mi.records.reading.write_csv(record(rng, "lab", "step", 0.5), tmp_path / "run.csv")
+    assert motorid("fit", path, "--fix", "R=0").status in (0, 1)
