@@ -8,7 +8,7 @@ import typer
 
 from motorid.cli import bench, diagnose, fit
 from motorid.cli.console import Command, Group, prepare_process
-from motorid.exporters.json_file import package_version
+from motorid.records.files import package_version
 
 app = typer.Typer(cls=Group, add_completion=False, rich_markup_mode="rich", pretty_exceptions_enable=False,
                   context_settings={"help_option_names": ["-h", "--help"]})

@@ -29,6 +29,7 @@ from motorid.cli.options import (
 from motorid.display.numbers import counted, duration
 from motorid.errors import DataError, UsageError, one_of
 from motorid.estimation.result import Fit, constraint_table, ended, steady_table, value_tables
+from motorid.exporters.c_code import check
 from motorid.exporters.export import FORMS, export
 from motorid.exporters.json_file import constraint_violations, fit_dict, remarks, run_dict, write_json
 from motorid.problem.simulate import Evaluation, error_table, evaluate, run_table
@@ -201,7 +202,9 @@ def export_command(
     """
     if to is not None and to not in FORMS.values():
         raise UsageError(f"--to: {one_of(to, FORMS.values(), 'form')}")
-    show(f"Written: {export(saved_model(fit_json, effects_from), path, to, force=force)}")
+    model = saved_model(fit_json, effects_from)
+    written = export(model, path, to, force=force)
+    show(f"Written: {written}", f"Sub-steps: {check(model).text}" if written.suffix == ".c" else None)
 
 
 @with_options(FitOptions)

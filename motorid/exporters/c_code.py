@@ -3,17 +3,35 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
 
+from motorid.errors import ModelError, SimulationError, printable
 from motorid.estimation.result import Fit
-from motorid.exporters.casadi_file import description, runs_of, system_of, values_of, words, zoh_inputs
+from motorid.exporters.casadi_file import (
+    description,
+    functions_of,
+    records_of,
+    runs_of,
+    simulation,
+    system_of,
+    values_of,
+    words,
+    zoh_inputs,
+)
 from motorid.integrate.rodas3 import step_functions
 from motorid.model.model import Model
+from motorid.numerics.signals import Array
+from motorid.problem.problem import Problem
+from motorid.problem.simulate import planned
+
+ACCURATE = 1e-3  # of the span of an output, that the exported step may differ from the model
+MOST_STEPS = 400_000  # on one record, to find that out
 
 HEADER = """/* {title}
  *
@@ -42,7 +60,11 @@ void {name}_initial(const double s[3], const double* p, double* x);
 void {name}_rhs(const double* x, const double* u, const double* p, double* dx);
 /* What the sensors show. */
 void {name}_outputs(const double* x, const double* u, const double* p, double* y);
-/* x over dt in equal sub-steps, the input running from u0 to u1. An L-stable step: stiffness does no harm. */
+/* x over dt in equal sub-steps, the input running from u0 to u1; with substeps < 1 as many as {NAME}_SUBSTEPS in
+ * {NAME}_DT seconds. The step is L-stable, but quick states (bristles, a small inductance) need short ones:
+ * {checked} */
+#define {NAME}_DT {dt!r}
+#define {NAME}_SUBSTEPS {substeps}
 void {name}_step(double* x, const double* u0, const double* u1, double dt, int substeps, const double* p);
 
 #ifdef __cplusplus
@@ -96,9 +118,12 @@ void {name}_outputs(const double* x, const double* u, const double* p, double* y
 }}
 
 void {name}_step(double* x, const double* u0, const double* u1, double dt, int substeps, const double* p) {{
-  double a[{NAME}_NU], b[{NAME}_NU], next[{NAME}_NX], error[{NAME}_NX], h = dt / substeps;
+  double a[{NAME}_NU], b[{NAME}_NU], next[{NAME}_NX], error[{NAME}_NX], h;
   const double* given[5];
   int s, j;
+  if (substeps < 1) substeps = (int)(dt / {NAME}_DT * {NAME}_SUBSTEPS + 0.999);
+  if (substeps < 1) substeps = 1;
+  h = dt / substeps;
   for (s = 0; s < substeps; s++) {{
     for (j = 0; j < {NAME}_NU; j++) {{
       a[j] = u0[j] + (u1[j] - u0[j]) * s / substeps;
@@ -182,6 +207,55 @@ def c_files(found: Fit | Model, path: Path) -> dict[Path, str]:
     return {folder / file: text for file, text in files.items()}
 
 
+class Checked(NamedTuple):
+    """Sub-steps per `dt` (s) with which the exported step agrees with the model, and how well, in words."""
+
+    dt: float
+    substeps: int
+    text: str
+
+
+@lru_cache(maxsize=1)
+def check(found: Fit | Model) -> Checked:
+    """Walk the exported step over the records of a fit (of a model: over a falling square wave), in equal sub-steps,
+    twice as many until it agrees with the simulation to `ACCURATE` of the span of each output."""
+    functions = {f.name(): f for f in functions_of(found)}
+    p = functions["parameters"]()["p"]
+    if isinstance(found, Fit):
+        records, what = records_of(found)[:3], "the records of the fit"
+    else:
+        t: Array = np.arange(2000) / 1e3
+        v = 12.0 if found.base == "dc_motor" else 1.0
+        what = f"a square wave that falls from ±{v:g} to 0 in 2 s, sampled at 1 ms"
+        try:
+            plan = planned(found, t, v * (1 - t / 2) ** 2 * np.sign(np.sin(16 * t + 0.1)),
+                           channels=system_of(found).outputs)
+            problem = Problem(found.fix(*found.parameters), (plan,), initial="rest")
+            records = records_of(problem.refined(problem.start))
+        except (SimulationError, ModelError):
+            return Checked(1e-3, 1, f"not checked, since the model cannot follow {what}.")
+    dt = float(np.median(np.diff(records[0]["t"])))
+    error = np.inf
+    for m in 2 ** np.arange(11):
+        errors = [_error(functions, r, int(m), p) for r in records]
+        error = max(errors)
+        if error < ACCURATE:
+            break
+    return Checked(dt, int(m), f"with {m} in {dt:.3g} s it differs from the model by at most {error:.2g} of the span, "
+                               f"on {what}.")
+
+
+def _error(functions: Mapping[str, ca.Function], record: Mapping[str, Any], m: int, p: ca.DM) -> float:
+    """Return the largest difference of an output between `m` sub-steps and those of the record, over its span."""
+    n = max(min(len(record["t"]), MOST_STEPS // m), 2)
+    t, u, fine = np.array(record["t"][:n]), np.array(record["u"])[:, :n], np.array(record["substeps"][:n - 1])
+    y, told = (np.array(simulation("walk", functions, t, k, record["held"])(record["s"], u, p)[0])
+               for k in (np.full(n - 1, m), fine))
+    span = np.maximum(np.ptp(told, axis=1), 1e-300)
+    error = float((np.abs(y - told).max(axis=1) / span).max())
+    return error if np.isfinite(error) else np.inf
+
+
 def identifier(stem: str) -> str:
     """Return a C identifier like `stem`."""
     name = re.sub(r"\W", "_", stem, flags=re.ASCII)
@@ -207,9 +281,11 @@ def _fields(found: Fit | Model, name: str) -> dict[str, Any]:
     held = zoh_inputs(system.inputs, found.problem.experiments[0]) if isinstance(found, Fit) else [
         n != "theta_in" for n in system.inputs]
     runs = f"#define {name.upper()}_RUNS {len(starts)}\n" if starts else ""
+    checked = check(found)
     return {
+        "checked": checked.text, "dt": checked.dt, "substeps": checked.substeps,
         "name": name, "NAME": name.upper(), "title": f"{name}: a motor model as C", "generated": _generated(functions),
-        "about": "\n".join(f" * {line}".rstrip() for line in words(description(found))),
+        "about": "\n".join(f" * {_harmless(line)}".rstrip() for line in words(description(found))),
         "sizes": "\n".join(f"#define {name.upper()}_{k} {v}" for k, v in sizes.items()),
         "states": _strings(system.states), "inputs": _strings(system.inputs), "outputs": _strings(system.outputs),
         "parameter_names": _strings(system.parameters), "held": ", ".join(str(int(h)) for h in held),
@@ -235,7 +311,12 @@ def _generated(functions: Sequence[ca.Function]) -> str:
 
 
 def _strings(names: Sequence[str]) -> str:
-    return ", ".join(f'"{n}"' for n in names)
+    return ", ".join('"' + re.sub(r'["\\?\s]', "_", printable(n)) + '"' for n in names)
+
+
+def _harmless(line: str) -> str:
+    """Return text that cannot end a comment or continue a line: names of runs come from files."""
+    return re.sub(r"[*/\\?]{2,}", "_", printable(" ".join(line.split()))).rstrip("\\")
 
 
 def _starts(name: str, starts: Sequence[np.ndarray]) -> str:

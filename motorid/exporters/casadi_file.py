@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from motorid.channels import CHANNELS
 from motorid.errors import UsageError
 from motorid.estimation.result import Fit
-from motorid.exporters.json_file import fit_dict, package_version
+from motorid.exporters.json_file import fit_dict
 from motorid.integrate.rodas3 import step_functions
 from motorid.model.equations import System
 from motorid.model.model import Model
@@ -25,6 +25,7 @@ from motorid.numerics.signals import Array
 from motorid.problem.problem import Problem
 from motorid.problem.runs import Run
 from motorid.records.experiment import Experiment
+from motorid.records.files import package_version
 
 FORMAT = 1
 MOST_RUNS = 20  # of a fit, that travel along as whole simulations
@@ -124,7 +125,7 @@ def functions_of(found: Fit | Model) -> list[ca.Function]:
     step = ca.Function("step", args, [ca.densify(r) for r in light.call(args)], light.name_in(), light.name_out())
     functions = [_named(system.rhs, "rhs"), _named(system.out, "outputs"), _named(system.initial, "initial"), step,
                  ca.Function("parameters", [], [ca.DM(p)], [], ["p"])]
-    return [*functions, *_simulations({f.name(): f for f in functions}, _records(found))]
+    return [*functions, *_simulations({f.name(): f for f in functions}, records_of(found))]
 
 
 def casadi_file(found: Fit | Model, path: Path) -> dict[Path, str]:
@@ -134,7 +135,7 @@ def casadi_file(found: Fit | Model, path: Path) -> dict[Path, str]:
     file = ca.StringSerializer({})
     file.pack(functions)
     file.pack(json.dumps(about))
-    plain = {"functions": [_instructions(f) for f in functions[:4]], "records": _records(found)}
+    plain = {"functions": [_instructions(f) for f in functions[:4]], "records": records_of(found)}
     return {path: f"{file.encode()}{PLAIN}{json.dumps({**plain, **about})}\n"}
 
 
@@ -156,13 +157,15 @@ def read_casadi(data: bytes) -> tuple[dict[str, ca.Function], dict[str, Any]]:
     return functions | {f.name(): f for f in _simulations(functions, about.pop("records"))}, about
 
 
-def _records(found: Fit | Model) -> list[dict[str, Any]]:
-    """Return the records of a fit as plain data: samples, start, inputs (nu, N), sub-steps."""
-    if not isinstance(found, Fit):
+def records_of(found: Fit | Model | Problem) -> list[dict[str, Any]]:
+    """Return the records of a fit or problem as plain data: samples, start, inputs (nu, N), sub-steps."""
+    if isinstance(found, Model):
         return []
+    runs, system = ((runs_of(found), found.problem.system) if isinstance(found, Fit) else
+                    ([(r, r.start) for r in found.runs], found.system))
     return [{"t": run.grid.t.tolist(), "s": start.tolist(), "u": run.grid.u.T.tolist(),
-             "substeps": run.grid.substeps.tolist(), "held": zoh_inputs(found.problem.system.inputs, run.experiment)}
-            for run, start in runs_of(found)[:MOST_RUNS]]
+             "substeps": run.grid.substeps.tolist(), "held": zoh_inputs(system.inputs, run.experiment)}
+            for run, start in runs[:MOST_RUNS]]
 
 
 def _instructions(f: ca.Function) -> dict[str, Any]:
@@ -211,7 +214,7 @@ def _simulations(functions: Mapping[str, ca.Function], records: Sequence[Mapping
         if m.min() < 1 or m.sum() > MOST_SCALARS or (len(t), len(m)) != (u.shape[1], len(t) - 1):
             raise ValueError(f"record {k}")
         found += [ca.Function(f"record_{k}", [], [ca.DM(t).T, ca.DM(r["s"]), ca.DM(u)], [], ["t", "s", "u"]),
-                  _simulation(f"simulate_{k}", functions, t, m, r["held"])]
+                  simulation(f"simulate_{k}", functions, t, m, r["held"])]
     return found
 
 
@@ -235,7 +238,7 @@ def runs_of(fit: Fit) -> list[tuple[Run, Array]]:
     return found
 
 
-def _simulation(name: str, functions: Mapping[str, ca.Function], t: Array, m: NDArray[np.int64],
+def simulation(name: str, functions: Mapping[str, ca.Function], t: Array, m: NDArray[np.int64],
                 held: Sequence[bool]) -> ca.Function:
     """Return ``(s, u, p) -> (y, x)`` on the samples t (N,) and sub-steps m (N-1,): s (3,), u (nu, N), y (ny, N)."""
     initial, outputs, step = (functions[n] for n in ("initial", "outputs", "step"))

@@ -190,8 +190,8 @@ def model_from_json(contents: Mapping[str, Any], effects: Iterable[Effect] = ())
         If an effect is not known.
     """
     try:
-        head, pars = contents["model"], contents["parameters"]
-        base, names = head["base"], list(head["effects"])
+        head, pars = dict(contents["model"]), dict(contents["parameters"])
+        base, names, about = head["base"], [str(n) for n in head["effects"]], dict(head.get("own_effects", {}))
         values = {n: float(p["value"]) for n, p in pars.items()}
         fixed_names = [n for n, p in pars.items() if p["fixed"]]
     except (KeyError, TypeError, ValueError) as error:
@@ -200,7 +200,7 @@ def model_from_json(contents: Mapping[str, Any], effects: Iterable[Effect] = ())
     model = _base(base, head.get("axis", "rotary"))
     own = {e.name: e for e in effects}
     for name in names:
-        model = model + _effect(name, own, head.get("own_effects", {}).get(name))
+        model = model + _effect(name, own, about.get(name))
     missing = set(model.parameters) ^ set(values)
     if missing:
         raise DataError(f"the parameters {', '.join(sorted(missing))} are in only one of the file and the model: an "

@@ -6,8 +6,6 @@ import json
 import re
 import sys
 from collections.abc import Mapping
-from importlib.metadata import PackageNotFoundError
-from importlib.metadata import version as version_of
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +13,7 @@ import numpy as np
 
 from motorid.estimation.shooting.outcome import violations
 from motorid.problem.relations import Relation
-from motorid.records.files import write_files
+from motorid.records.files import package_version, write_files
 
 if TYPE_CHECKING:
     from motorid.estimation.result import Fit
@@ -132,14 +130,6 @@ def plain(value: Any) -> Any:
     if isinstance(value, float | np.floating):
         return float(value) if np.isfinite(value) else None
     return value if value is None or isinstance(value, str) else str(value)
-
-
-def package_version(package: str) -> str:
-    """Return the version of an installed package."""
-    try:
-        return version_of(package)
-    except PackageNotFoundError:
-        return "unknown"
 
 
 def json_text(contents: Mapping[str, Any]) -> str:

@@ -11,6 +11,7 @@ import hashlib
 import os
 import platform
 import shutil
+import stat
 import subprocess
 import sys
 import tempfile
@@ -120,12 +121,27 @@ long long motorid_run(long long n, const long long* nsub, const double* dt, cons
 """
 
 
-def cache_dir() -> Path:
-    """Return the folder of compiled steps: ``$MOTORID_CACHE``, else the user's cache folder."""
-    if os.environ.get("MOTORID_CACHE"):
-        return Path(os.environ["MOTORID_CACHE"])
-    base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return Path(base) / "motorid"
+def cache_dir() -> Path | None:
+    """Return the folder of compiled steps, ``$MOTORID_CACHE``, else one in the user's cache folder, made if need be.
+
+    What is in it is loaded and so can do anything: None (said once) where it belongs to another user, or others may
+    write to it or to the folder it is in (unless that is sticky, like /tmp).
+    """
+    try:
+        base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+        folder = Path(os.environ.get("MOTORID_CACHE") or Path(base) / "motorid").expanduser().resolve()
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        folder.mkdir(mode=0o700, exist_ok=True)
+        own, above = folder.stat(), folder.parent.stat()
+    except (OSError, RuntimeError) as error:  # RuntimeError: no home, or a loop of links
+        return _without(f"cannot compile, for want of a folder ({error})")
+    if not hasattr(os, "getuid"):
+        return folder
+    loose = above.st_mode & 0o002 and not above.st_mode & stat.S_ISVTX
+    if own.st_uid != os.getuid() or own.st_mode & 0o022 or loose:
+        return _without(f"cannot compile into {folder}: others can write there (chmod go-w, or name another one with "
+                        "MOTORID_CACHE)")
+    return folder
 
 
 @lru_cache(maxsize=1)
@@ -176,7 +192,8 @@ def find(mark: str) -> Path | None:
 
     Its file name ends in a digest of its bytes: loading half a file would end the process.
     """
-    for path in cache_dir().glob(f"{mark}-*.so"):
+    folder = cache_dir()
+    for path in folder.glob(f"{mark}-*.so") if folder else ():
         try:
             if path.stem == f"{mark}-{_digest(path.read_bytes())}":
                 return path
@@ -192,12 +209,11 @@ def _digest(data: bytes) -> str:
 
 def build(functions: StepFunctions, mark: str) -> Path | None:
     """Compile into the cache, atomically, and return the library; None (said once) if that does not work."""
-    cc = compiler()
-    if cc is None:
+    cc, cache = compiler(), cache_dir()
+    if cc is None or cache is None:
         return None
     try:
-        cache_dir().mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=cache_dir()) as folder:
+        with tempfile.TemporaryDirectory(dir=cache) as folder:
             (Path(folder) / "step.c").write_text(generate(functions))
             done = subprocess.run([cc[0], *FLAGS, "step.c", "-o", "step.so", "-lm"], capture_output=True,
                                   text=True, timeout=300, cwd=folder)
@@ -205,7 +221,7 @@ def build(functions: StepFunctions, mark: str) -> Path | None:
                 first = (done.stderr.splitlines() or ["no message"])[0]
                 return _without(f"the C compiler failed ({first})")
             made = Path(folder) / "step.so"
-            path = cache_dir() / f"{mark}-{_digest(made.read_bytes())}.so"
+            path = cache / f"{mark}-{_digest(made.read_bytes())}.so"
             os.replace(made, path)
             return path
     except (OSError, subprocess.SubprocessError) as error:

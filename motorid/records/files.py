@@ -9,6 +9,8 @@ import re
 import stat
 import tempfile
 from collections.abc import Iterator, Mapping
+from importlib.metadata import PackageNotFoundError
+from importlib.metadata import version as version_of
 from pathlib import Path
 
 from motorid.errors import DataError, OutputError, UsageError
@@ -20,6 +22,14 @@ _OURS = re.compile(rb'"motorid": ?"|name="generator" content="motorid|[Ww]ritten
                    rb'|"motor":"[^"]*",\s*"status"|"index_columns": \["motor"\]|\At,[\w,]*substeps\n'
                    rb"|\A# motorid columns: |Software\0motorid")
 _WRONG_PLACE = (errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.EACCES, errno.EPERM, errno.EROFS, errno.ENAMETOOLONG)
+
+
+def package_version(package: str) -> str:
+    """Return the version of an installed package."""
+    try:
+        return version_of(package)
+    except PackageNotFoundError:
+        return "unknown"
 
 
 def read_bytes(path: Path) -> bytes:

@@ -16,9 +16,8 @@ from motorid.display.numbers import percent, with_error
 from motorid.display.tables import Flag, Table
 from motorid.errors import UsageError
 from motorid.estimation.result import Fit
-from motorid.exporters.json_file import package_version
 from motorid.records.experiment import Experiment
-from motorid.records.files import write_files
+from motorid.records.files import package_version, write_files
 from motorid.reports import sections
 from motorid.reports.sections import Section
 

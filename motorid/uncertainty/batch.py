@@ -24,7 +24,7 @@ from motorid.model.model import Model
 from motorid.numerics.noise import Outlier, outliers
 from motorid.numerics.parallel import Map, interruption, map_items, one_thread
 from motorid.records.experiment import Experiment
-from motorid.records.files import read_bytes, write_files
+from motorid.records.files import package_version, read_bytes, write_files
 from motorid.records.reading import find_records, read_runs
 from motorid.uncertainty.covariance import covariance
 
@@ -265,16 +265,25 @@ class Checkpoint:
 
 
 def checkpoint_key(model: Model, options: Mapping[str, Any], reading: Mapping[str, Any] | None, records: Any) -> str:
-    """Return a hash of all that a result depends on: model and values, options, contents of the records."""
-    mark = hashlib.sha256()
-    for e in model.effects:
-        code = getattr(e.law, "__code__", None)
-        mark.update(repr((e.name, code.co_code if code else None, code.co_consts if code else None)).encode())
-    mark.update(repr((model.base, model.axis, sorted(model.parameters.items()))).encode())
-    mark.update(repr((sorted(options.items(), key=lambda o: o[0]), sorted((reading or {}).items()))).encode())
+    """Return a hash of all that a result depends on: versions, equations, values, options, contents of the records."""
+    mark = hashlib.sha256(repr([package_version(p) for p in ("motorid", "casadi", "numpy", "scipy")]).encode())
+    mark.update(_equations(model))
+    mark.update(repr((model.base, model.axis, model.effect_names, sorted(model.parameters.items()))).encode())
+    told = sorted(options.items(), key=lambda o: o[0]), sorted((reading or {}).items())
+    text = repr(told)
+    mark.update(pickle.dumps(told) if "..." in text or " at 0x" in text else text.encode())
     for part in _contents(records):
         mark.update(part)
     return mark.hexdigest()
+
+
+def _equations(model: Model) -> bytes:
+    """Return the equations as traced, whatever names, globals or files a law took them from."""
+    try:
+        system = model.system(CHANNELS if model.base == "dc_motor" else ("omega", "theta"))
+        return "".join(f.serialize() for f in (system.rhs, system.out, system.initial)).encode()
+    except Exception as error:  # of the user's law; then no motor can be fitted
+        return repr(error).encode()
 
 
 def _contents(records: Any) -> list[bytes]:

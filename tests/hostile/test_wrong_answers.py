@@ -177,3 +177,25 @@ def test_numbers_that_cannot_be_meant_are_said(words, says, rng, tmp_path):
 def test_a_motor_without_resistance_is_fitted(rng, tmp_path):
     path = mi.records.reading.write_csv(record(rng, "lab", "step", 0.5), tmp_path / "run.csv")
     assert motorid("fit", path, "--fix", "R=0").status in (0, 1)
+
+
+OWN = """import motorid as mi
+SCALE = 1.0
+@mi.effect(balance="torque")
+def drag(m, c=mi.P(1e-4, "N·m", null=0)):
+    m.torque -= SCALE * c * m.omega
+"""
+
+
+@pytest.mark.parametrize("change", [("m.omega", "m.theta"), ("SCALE = 1.0", "SCALE = 3.0")], ids="-".join)
+def test_a_journal_gives_no_answer_of_another_law(change, rng, tmp_path):
+    motors, own, journal = tmp_path / "motors", tmp_path / "own.py", tmp_path / "batch.jsonl"
+    motors.mkdir()
+    mi.records.reading.write_csv(record(rng, "lab", "reversals", 1.0), motors / "a.csv")
+    words = ("fit-many", motors, "--effects-from", own, "--effects", "drag", "--fix", "b", "--journal", journal)
+    marks = []
+    for text in (OWN, OWN, OWN.replace(*change)):
+        own.write_text(text, encoding="utf-8")
+        assert motorid(*words).status == 0
+        marks.append(len(journal.read_text(encoding="utf-8").splitlines()))
+    assert marks == [1, 1, 2]
