@@ -1,8 +1,10 @@
 """Grey-box identification of brushed DC motors: fit, see where the model fails, add what is missing."""
 
+from types import ModuleType as _ModuleType
 from typing import TYPE_CHECKING as _TYPE_CHECKING
 
 from motorid.errors import DataError, FitError, ModelError, MotoridError, SimulationError, UsageError
+from motorid.errors import one_of as _one_of
 
 # isort: split
 from motorid import effects
@@ -53,8 +55,9 @@ def __getattr__(name: str) -> object:
         from motorid import plots
 
         return getattr(plots, name)
-    raise AttributeError(f"module 'motorid' has no attribute {name!r}")
+    raise AttributeError(_one_of(name, __dir__(), "name in motorid"))
 
 
 def __dir__() -> list[str]:
-    return sorted([n for n in globals() if not n.startswith("_")] + list(_FIGURES))
+    rooms = [n for n, value in globals().items() if isinstance(value, _ModuleType) and value not in (effects, datasets)]
+    return sorted([n for n in globals() if not n.startswith("_") and n not in rooms] + list(_FIGURES))

@@ -74,6 +74,11 @@ def printable(text: str) -> str:
     return _CONTROLS.sub(lambda m: m[0].encode("unicode_escape").decode(), text)
 
 
+def name_of(thing: object) -> str:
+    """Return what a message calls an argument that is not what was expected."""
+    return repr(thing) if isinstance(thing, str) else getattr(thing, "__name__", type(thing).__name__)
+
+
 def one_of(word: str, known: Iterable[object], what: str) -> str:
     """Say that `word` is not among the `known` names of `what`, and which one may have been meant."""
     import difflib

@@ -29,6 +29,8 @@ def motorid(context: typer.Context,
 
 for _name, _command in (
     ("demo", diagnose.demo_command),
+    ("check", fit.check_command),
+    ("effects", fit.effects_command),
     ("fit", fit.fit_command),
     ("simulate", fit.simulate_command),
     ("diagnose", diagnose.diagnose_command),

@@ -128,16 +128,30 @@ def show(*parts: Table | str | None) -> None:
             continue
         drawn = RichTable(title=part.title or None, box=box.SIMPLE_HEAD, title_justify="left",
                           title_style="bold")
-        for k, head in enumerate(part.header):
-            words = k in part.left
-            longest = max((len(str(row[k])) for row in part.rows), default=0)
-            least = longest if longest <= MAY_WRAP else max(map(len, head.split()))
-            drawn.add_column(head, justify="left" if words else "right", overflow="fold", min_width=least)
+        for k, (head, least) in enumerate(zip(part.header, _least_widths(part, console.width), strict=True)):
+            drawn.add_column(head, justify="left" if k in part.left else "right", overflow="fold", min_width=least)
         for row in part.rows:
             drawn.add_row(*(Text(printable(str(cell))) for cell in row))
         console.print(drawn)
         if part.note:
             console.print(Text(printable(f"{part.note}\n")))
+
+
+def _least_widths(table: Table, room: int) -> list[int]:
+    """Return the widths below which columns must not shrink: names and numbers stay whole, sentences may wrap.
+
+    Where that is too wide, the columns on the right wrap between words, too.
+    """
+    columns = list(zip(*[[str(c) for c in row] for row in table.rows], strict=True)) or [()] * len(table.header)
+    longest = [max(map(len, cells), default=0) for cells in columns]
+    words = [max((len(w) for cell in (head, *cells) for w in cell.split()), default=0)
+             for head, cells in zip(table.header, columns, strict=True)]
+    least = [word if most > MAY_WRAP else max(most, max(map(len, head.split()), default=0))
+             for head, most, word in zip(table.header, longest, words, strict=True)]
+    for k in reversed(range(1, len(least))):
+        if sum(least) + 3 * len(least) > room:
+            least[k] = words[k]
+    return least
 
 
 def _console() -> Any:
@@ -164,7 +178,8 @@ def wrapped(text: str, first: str = "") -> str:
 def next_command(name: str) -> str:
     """Return what to type next: this command line with another command, without what it writes."""
     words = iter(sys.argv[2:])
-    kept = [w for w in words if not (w in OUTPUTS and next(words, None)) and w.partition("=")[0] not in OUTPUTS]
+    dropped = (*OUTPUTS, "--force")
+    kept = [w for w in words if not (w in OUTPUTS and next(words, None)) and w.partition("=")[0] not in dropped]
     line = shlex.join(["motorid", name, *kept])
     return line if kept and len(line) <= WIDTH else f"motorid {name} RUN... (the same records and options)"
 

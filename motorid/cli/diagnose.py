@@ -59,7 +59,7 @@ def diagnose_command(
     """
     records = options.read(runs)
     held_out = options.read(validate) if validate else []
-    notes = notes_of(records, held_out)
+    notes = notes_of(records)
     before = fit_affordably(records, options.fit)
     own = list(own_effects(options.effects_from).values()) if options.effects_from else []
     done: list[str] = []

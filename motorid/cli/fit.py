@@ -8,6 +8,7 @@ from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
 import typer
 
 from motorid.cli.console import FAILED, INTERRUPTED, next_command, save_report, say_notes, show
@@ -22,11 +23,15 @@ from motorid.cli.options import (
     Validate,
     describe,
     make_folder,
+    named_effect,
     notes_of,
+    own_effects,
     saved_model,
     with_options,
 )
-from motorid.display.numbers import counted, duration
+from motorid.display.numbers import counted, duration, number
+from motorid.display.tables import Table
+from motorid.effects import EVERY
 from motorid.errors import DataError, UsageError, one_of
 from motorid.estimation.result import Fit, constraint_table, ended, steady_table, value_tables
 from motorid.exporters.c_code import check
@@ -41,6 +46,7 @@ from motorid.uncertainty.batch import fit_many, motors_in
 from motorid.uncertainty.identifiability import Identifiability, identifiability
 from motorid.uncertainty.multistart import Multistart, multistart
 
+MOST_SHOWN = 4  # runs of which all columns are listed
 SavedModel = Annotated[Path, typer.Argument(metavar="FIT.json", help="What fit --json or export wrote.")]
 EffectsFrom = Annotated[Path | None, typer.Option(metavar="FILE.py", help="Effects of your own.")]
 
@@ -148,6 +154,55 @@ def _read_or_names(options: FitOptions, files: list[Path]) -> list[Any]:
         return list(options.read([str(f) for f in files]))
     except DataError:
         return list(files)
+
+
+@with_options(ReadingOptions)
+def check_command(runs: Runs, options: ReadingOptions, json: Json = None) -> None:
+    """Show how records are read, column by column, and what looks wrong with them, before any fit.
+
+    Example: motorid check run*.csv
+    """
+    records = options.read(runs)
+    notes = notes_of(records)
+    if json:
+        write_json({"runs": [run_dict(r) | {"columns": r.meta.get("columns"), "units": dict(r.units)} for r in records],
+                    "notes": notes}, json, options.force)
+    if json != "-":
+        found = counted(len(notes), "remark") if notes else "No problem found"
+        show(f"{_amount(records)}. {found}.\n")
+        say_notes(notes)
+        show(*(_channel_table(r) for r in records[:MOST_SHOWN]))
+        show(f"and {counted(len(records) - MOST_SHOWN, 'more run')}\n" if len(records) > MOST_SHOWN else None,
+             f"Next: {next_command('fit')}")
+
+
+def _channel_table(run: Experiment) -> Table:
+    """Return which column became which channel, with unit and range."""
+    columns, units = run.meta.get("columns", {}), run.meta.get("original_units", {})
+    rows = [["t", columns.get("t", "–"), units.get("t", "s"), f"0 … {number(run.duration, 4)} s", "–"]]
+    for c, y in (*run.inputs.items(), *run.outputs.items()):
+        good = y[np.isfinite(y)]
+        limits = f"{number(good.min(), 3)} … {number(good.max(), 3)} {run.units[c]}" if good.size else "–"
+        rows.append([c, columns.get(c, "–"), units.get(c, run.units[c]), limits, str(len(y) - good.size)])
+    return Table(["channel", "column", "unit read", "range (SI)", "missing"], rows, f"{run.name}: {run.n} samples, "
+                 f"{number(1e3 * run.dt, 3)} ms apart", left=(0, 1, 2, 3))
+
+
+def effects_command(
+    name: Annotated[str | None, typer.Argument(metavar="NAME", show_default=False, help="One effect.")] = None,
+    effects_from: EffectsFrom = None,
+) -> None:
+    """List the effects of the library, or show one: its law, its parameters, its source.
+
+    Example: motorid effects stribeck
+    """
+    own = own_effects(effects_from) if effects_from else {}
+    if name is not None:
+        show(str(named_effect(name, own).card()), f"\nAdd it: motorid fit RUN... --effects {name}")
+        return
+    rows = [[e.name, e.balance, e.title, ", ".join(p.name for p in e.parameters)] for e in (own | EVERY).values()]
+    show(Table(["effect", "acts on", "what it is", "parameters"], rows, "Effects", left=(0, 1, 2, 3)),
+         "One of them: motorid effects NAME. Add it: motorid fit RUN... --effects NAME")
 
 
 @with_options(ReadingOptions)

@@ -30,7 +30,7 @@ from motorid.numerics.least_squares import Huber
 from motorid.numerics.parallel import progress
 from motorid.problem.constraints import CurrentLimit, SteadyState
 from motorid.records.checks import check_runs
-from motorid.records.experiment import Experiment
+from motorid.records.experiment import Experiment, repeated
 from motorid.records.layout import parse_pairs
 from motorid.records.reading import read_runs
 
@@ -297,10 +297,7 @@ def describe(model: Model) -> str:
 def notes_of(runs: Sequence[Experiment], held_out: Sequence[Experiment] = ()) -> list[str]:
     """Return what a person should know about the records: how they were read, and what looks wrong."""
     notes = [f"{r.name}: {note}" for r in runs for note in r.meta.get("notes", [])]
-    known = {r.meta.get("sha256") for r in runs} - {None}
-    same = [r.name for r in held_out if r.meta.get("sha256") in known]
-    if same:
-        notes.append(f"{', '.join(same)} is both fitted and held out: its held-out error means nothing.")
+    notes += [twice] if (twice := repeated(runs, held_out)) else []
     return [*dict.fromkeys(notes), *check_runs(runs)]
 
 

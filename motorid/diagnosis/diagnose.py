@@ -31,11 +31,11 @@ from motorid.diagnosis.verdict import (
     window_remark,
 )
 from motorid.errors import MotoridError
-from motorid.estimation.result import Fit
+from motorid.estimation.result import Fit, checked
 from motorid.model.definition import Effect
 from motorid.numerics.parallel import one_thread
 from motorid.records.checks import current_limit
-from motorid.records.experiment import Experiment
+from motorid.records.experiment import Experiment, repeated
 
 
 @one_thread
@@ -70,9 +70,10 @@ def diagnose(fit: Fit, validate: Sequence[Experiment] | Experiment | None = None
     """
     say = progress or (lambda word: None)
     own = tuple(also)
-    found, driven = explored(fit, validate, library(effects, own), map, say, max_effects, budget)
+    found, driven = explored(checked(fit, "diagnose"), validate, library(effects, own), map, say, max_effects, budget)
     say("located what is missing")
-    return _told(found, driven, validate is not None, own)
+    twice = repeated(fit.problem.experiments, [validate] if isinstance(validate, Experiment) else validate or ())
+    return _told(found, " ".join(w for w in (twice, driven) if w), validate is not None, own)
 
 
 def _told(found: Climb, driven: str, validated: bool, own: Sequence[Effect]) -> Diagnosis:

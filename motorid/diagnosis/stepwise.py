@@ -23,7 +23,7 @@ from motorid.diagnosis.results import Adequacy, Candidate, Ladder, Rung
 from motorid.diagnosis.verdict import first_answer
 from motorid.errors import FAILURES, OutOfTime
 from motorid.estimation.fit import TOO_FAR, follows, growth, in_windows, solve
-from motorid.estimation.result import Fit
+from motorid.estimation.result import Fit, checked
 from motorid.model.definition import Effect
 from motorid.numerics.parallel import budget, interruption, one_thread
 from motorid.records.experiment import Experiment
@@ -322,5 +322,5 @@ def improve(fit: Fit, validate: Sequence[Experiment] | Experiment | None = None,
         The models with training and held-out error; ``ladder.best`` is the last fit, to go on from.
     """
     say = progress or (lambda word: None)
-    found, _ = explored(fit, validate, library(effects, also), map, say, max_effects)
+    found, _ = explored(checked(fit, "improve"), validate, library(effects, also), map, say, max_effects)
     return ladder_of(found, validate is not None)

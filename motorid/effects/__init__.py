@@ -78,4 +78,8 @@ def get(name: str) -> Effect:
     return EVERY[name]
 
 
+def __getattr__(name: str) -> Effect:
+    raise AttributeError(one_of(name, EVERY, "effect"))
+
+
 __all__ = ["EVERY", "LIBRARY", "MEASURED", "get", *EVERY]

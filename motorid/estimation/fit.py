@@ -124,6 +124,9 @@ def solve(problem: Problem, solver: Any = None, *, start: str = "auto", callback
           formulation: str = "plain") -> Fit:
     """Solve a `Problem`; `fit` is this with the problem made on the way. See there."""
     began = time.perf_counter()
+    if isinstance(solver, str):
+        raise UsageError("solver takes mi.LevenbergMarquardt() (the default) or mi.MultipleShooting(), not a name; "
+                         f"got '{solver}'.")
     if start not in ("auto", "model"):
         raise UsageError(one_of(start, ("auto", "model"), "start"))
     if not problem.unknown:

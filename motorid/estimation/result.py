@@ -14,7 +14,7 @@ from motorid.channels import channel_name
 from motorid.display.cards import Card, Shown
 from motorid.display.numbers import counted, duration, number, percent, quantity, sentence, with_error
 from motorid.display.tables import Cell, Flag, Table
-from motorid.errors import UsageError
+from motorid.errors import UsageError, name_of
 from motorid.estimation.covariance import Certainty, Quantity, certainty, combinations
 from motorid.model.model import Model
 from motorid.numerics.noise import despiked
@@ -232,6 +232,13 @@ class Fit(Shown):
         sigmas = [run.sigma for run in self.problem.runs]
         return {c: min(s[c] for s in sigmas if c in s) for c in self.nrmse}
 
+    def to_frame(self) -> Any:
+        """Return the parameters as a pandas.DataFrame: value, std, unit, fixed, meaning."""
+        import pandas as pd
+
+        rows = {n: [self.values[n], self.std[n], p.unit, not p.vary, p.doc] for n, p in self.model.parameters.items()}
+        return pd.DataFrame.from_dict(rows, "index", columns=["value", "std", "unit", "fixed", "meaning"])
+
     def card(self) -> Card:
         """Return how it ended, parameters, errors, and what constraints cost."""
         runs = self.problem.experiments
@@ -251,6 +258,19 @@ class Fit(Shown):
         name = " + ".join([self.problem.model.base, *self.problem.model.effect_names])
         end = "" if self.status == "converged" else f", {self.status}"
         return f"<fit of {name}: {FLAGS[self.fits]}{end}, NRMSE {errors}>"
+
+
+def checked(fit: Any, caller: str) -> Fit:
+    """Return `fit` if it is one; `caller` takes nothing else.
+
+    Raises
+    ------
+    UsageError
+        If it is not.
+    """
+    if not isinstance(fit, Fit):
+        raise UsageError(f"{caller} takes a fit, mi.{caller}(mi.fit(mi.dc_motor(), runs)); got {name_of(fit)}.")
+    return fit
 
 
 def ended(fit: Fit) -> str:

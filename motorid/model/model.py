@@ -50,7 +50,8 @@ class Model(Shown):
     def __add__(self, other: Effect) -> Model:
         """Return the model with one more effect."""
         if not isinstance(other, Effect):
-            raise ModelError(f"a model takes effects, got {type(other).__name__}. Use mi.effects.<name> or @mi.effect.")
+            raise ModelError(f"a model takes effects, got {other if isinstance(other, str) else type(other).__name__}: "
+                             "model + mi.effects.coulomb, or one of your own (@mi.effect).")
         if other.name in self.effect_names:
             raise ModelError(f"the model already has '{other.name}'. Take it out first: model.without('{other.name}').")
         for e in self.effects:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from motorid.channels import CHANNELS
-from motorid.errors import ModelError, SimulationError, UsageError, one_of
+from motorid.errors import ModelError, SimulationError, UsageError, name_of, one_of
 from motorid.integrate import engine_of
 from motorid.integrate.engine import Engine, Trajectory
 from motorid.model.definition import Parameter
@@ -312,6 +312,12 @@ def _without_empty(run: Experiment) -> Experiment:
 
 def as_problem(model: Model, runs: Sequence[Experiment] | Experiment, **fields: Any) -> Problem:
     """Return a `Problem` of a model and one or several runs; what follows a pause is a run of its own."""
+    if not isinstance(model, Model):
+        swapped = isinstance(model, Experiment | list | tuple)
+        raise UsageError("the model comes first, then the runs: mi.fit(mi.dc_motor(), runs)." if swapped else
+                         f"expected a model such as mi.dc_motor(), with brackets; got {name_of(model)}.")
+    if isinstance(runs, str | Model) or not isinstance(runs, Iterable | Experiment):
+        raise UsageError(f"expected runs, mi.read_runs('run*.csv'); got {name_of(runs)}.")
     experiments = (runs,) if isinstance(runs, Experiment) else tuple(runs)
     parts = [p for r in experiments for p in (between_pauses(r) if isinstance(r, Experiment) else [r])]
     return Problem(model, tuple(parts), **fields)

@@ -9,6 +9,7 @@ import warnings
 import zlib
 from collections import Counter
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 
@@ -184,6 +185,13 @@ def parquet_table(data: bytes) -> TextTable:
         frame = pd.read_parquet(io.BytesIO(data), engine="pyarrow")
     except Exception as error:  # pyarrow raises whatever its C++ side throws
         raise DataError(f"it cannot be read as Parquet ({_first_line(error)}).") from None
+    return frame_table(frame)
+
+
+def frame_table(frame: Any) -> TextTable:
+    """Return the table of a pandas.DataFrame; a named index counts as a column."""
+    import pandas as pd
+
     frame = frame.reset_index() if frame.index.name or not isinstance(frame.index, pd.RangeIndex) else frame
     labels = unique_labels([str(c) for c in frame.columns])
     columns, texts, notes = {}, {}, []

@@ -13,11 +13,12 @@ import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from motorid.errors import DataError, UsageError, one_of
-from motorid.records.binary_tables import mat_table, parquet_table
+from motorid.records.binary_tables import frame_table, mat_table, parquet_table
 from motorid.records.cleaning import run_from_columns
 from motorid.records.experiment import Experiment, between_pauses
 from motorid.records.files import read_bytes, write_files
@@ -42,7 +43,7 @@ def read_runs(paths: Path_ | Iterable[Path_], *, columns: Mapping[str, object] |
 
     Parameters
     ----------
-    paths : str, path, or iterable of these
+    paths : str, path, pandas.DataFrame, or a list of these
         Files, directories, or patterns such as ``"data/run*.csv"``, each in natural order (run2, run10).
     columns : mapping, optional
         Channel (t, v, i, omega, theta, v_supply, tau_load, temp) to column, by name or by position counted from 1,
@@ -63,6 +64,9 @@ def read_runs(paths: Path_ | Iterable[Path_], *, columns: Mapping[str, object] |
     DataError
         If a file is missing or cannot be used; the message says why and what to do.
     """
+    given = paths if isinstance(paths, list | tuple) else [paths]
+    if any(hasattr(p, "reset_index") for p in given):
+        return [_of_table(frame_table(p), columns, units, hold, f"run{k}", {}) for k, p in enumerate(given, 1)]
     files = find_records(paths)
     stems = Counter(f.stem for f in files)
     names = [f.stem if stems[f.stem] == 1 else f"{f.parent.name}/{f.name}" for f in files]
@@ -185,18 +189,8 @@ def _read(path: Path_, to_table: Callable[[bytes], TextTable], columns: Mapping[
     path = Path(path).expanduser()
     data = read_bytes(path)
     try:
-        table = to_table(data)
-        own: dict[str, str] = {m[1]: m[2] for m in map(_OWN.fullmatch, table.comments) if m}
-        labels = table.labels
-        if "columns" in own and not columns:
-            columns = parse_pairs(own["columns"], "columns")
-            labels = [c for c in labels if c in columns.values()]
-        labels = [c for c in labels if not _is_copy(c, labels, table)]
-        layout = assign(labels, columns=columns, units=units, unit_row=table.unit_row)
-        return run_from_columns(table.columns, table.texts, layout, name=name or path.stem, notes=table.notes,
-                                hold=hold or own.get("hold", "zoh"), sigma=_sigma(own.get("sigma")),
-                                meta={"source": str(path), "sha256": hashlib.sha256(data).hexdigest(),
-                                      "parts": tuple(float(m[1]) for m in map(_PART.fullmatch, table.comments) if m)})
+        meta = {"source": str(path), "sha256": hashlib.sha256(data).hexdigest()}
+        return _of_table(to_table(data), columns, units, hold, name or path.stem, meta)
     except (DataError, UsageError) as error:
         raise DataError(f"{path}: {error}") from None
 
@@ -206,6 +200,21 @@ def _is_copy(label: str, labels: Sequence[str], table: TextTable) -> bool:
     first = first_of_its_name(label, labels)
     a, b = table.columns.get(first), table.columns.get(label)
     return first != label and a is not None and b is not None and np.array_equal(a, b, equal_nan=True)
+
+
+def _of_table(table: TextTable, columns: Mapping[str, object] | None, units: Mapping[str, object] | None,
+              hold: str | None, name: str, meta: Mapping[str, Any]) -> Experiment:
+    own: dict[str, str] = {m[1]: m[2] for m in map(_OWN.fullmatch, table.comments) if m}
+    labels = table.labels
+    if "columns" in own and not columns:
+        columns = parse_pairs(own["columns"], "columns")
+        labels = [c for c in labels if c in columns.values()]
+    labels = [c for c in labels if not _is_copy(c, labels, table)]
+    layout = assign(labels, columns=columns, units=units, unit_row=table.unit_row)
+    parts = tuple(float(m[1]) for m in map(_PART.fullmatch, table.comments) if m)
+    return run_from_columns(table.columns, table.texts, layout, name=name, notes=table.notes,
+                            hold=hold or own.get("hold", "zoh"), sigma=_sigma(own.get("sigma")),
+                            meta={**meta, "parts": parts})
 
 
 def _sigma(text: str | None) -> dict[str, float]:

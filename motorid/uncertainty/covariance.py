@@ -15,7 +15,7 @@ from motorid.display.cards import Card, Printed
 from motorid.display.numbers import interval_text, percent
 from motorid.display.tables import Cell, Flag, Table, value_cell
 from motorid.errors import UsageError, one_of
-from motorid.estimation.result import Fit
+from motorid.estimation.result import Fit, checked
 from motorid.numerics.autoregression import Colour
 from motorid.numerics.parallel import one_thread
 from motorid.numerics.signals import Array
@@ -136,7 +136,7 @@ def covariance(fit: Fit, *, method: str = "coloured") -> Covariance:
     """
     if method not in METHODS:
         raise UsageError(one_of(method, METHODS, "method"))
-    known, unknown = fit.certainty(method), fit.problem.unknown
+    known, unknown = checked(fit, "covariance").certainty(method), fit.problem.unknown
     lost = np.array([s != "determined" for s in known.status], bool)
     matrix = known.matrix.copy()
     matrix[lost], matrix[:, lost] = np.nan, np.nan

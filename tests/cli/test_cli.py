@@ -389,3 +389,29 @@ def test_it_runs_as_a_process_of_its_own(tmp_path):
     assert done.returncode == 0, done.stderr
     assert "winding resistance" in done.stdout
     assert json.loads((tmp_path / "f.json").read_text(encoding="utf-8"))["status"] == "converged"
+
+
+# -- before a fit ------------------------------------------------------------------------------------------
+def test_check_shows_which_column_is_which_channel_and_what_to_type_next(tmp_path):
+    done = motorid("check", FRICTION / "run*.csv")
+    assert done.status == 0
+    for word in ("voltage_V", "current_A", "rad/s", "No problem found", "Next: motorid fit"):
+        assert word in done.out, word
+    assert set(motorid_json(tmp_path, "check", FRICTION / "run1.csv")["runs"][0]["columns"]) == {"t", "v", "i", "omega"}
+
+
+def test_effects_lists_the_library_and_shows_one():
+    assert re.search(r"coulomb +torque +dry \(Coulomb\) friction +tau_c", motorid("effects").out)
+    shown = motorid("effects", "stribeck")
+    assert "breakaway torque" in shown.out
+    assert "Did you mean 'stribeck'" in motorid("effects", "stribek").err
+
+
+def test_names_stay_whole_at_80_columns(monkeypatch):
+    from motorid.cli import console
+
+    monkeypatch.setattr(console, "WIDTH", 80)
+    lines = motorid("effects").out.splitlines()
+    assert max(map(len, lines)) <= 80
+    for name in ("inductance_saturation", "R_thm,", "omega_s"):
+        assert any(name in line for line in lines), name

@@ -79,7 +79,7 @@ def test_an_offset_beside_two_frictions_is_refused_and_said(lab):
     children, listed = search.expand(search.root)
     assert "constant_load" not in {c.added for c in children}
     why = next(c.reason for c in listed if c.effect == "constant_load")
-    assert "not identifiable" in why
+    assert "do not distinguish" in why
     assert "tau_cp and tau_cn" in why
 
 

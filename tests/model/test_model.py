@@ -286,7 +286,7 @@ def test_electrical_effects_on_a_torque_drive():
         (lambda: mi.dc_motor().without("coulomb"), "unknown effect in this model"),
         (lambda: mi.effects.get("coulom"), "Did you mean 'coulomb'"),
         (lambda: mi.effects.coulomb(tau=1.0), r"effect 'coulomb': unknown parameter 'tau'"),
-        (lambda: mi.dc_motor() + "coulomb", r"takes effects, got str.*mi\.effects"),
+        (lambda: mi.dc_motor() + "coulomb", r"takes effects, got coulomb.*mi\.effects"),
         (lambda: mi.torque_driven("rotational"), "unknown axis"),
         (lambda: mi.torque_driven().system(("i",)), r"has no current"),
         (lambda: mi.dc_motor().system(("speed",)), "unknown channel"),
