@@ -9,8 +9,10 @@ from motorid.errors import one_of as _one_of
 # isort: split
 from motorid import effects
 from motorid.acquire.recorder import record
+from motorid.acquire.virtual import virtual_bench
+from motorid.diagnosis.bench_loop import identify_on
 from motorid.diagnosis.diagnose import diagnose
-from motorid.diagnosis.experiment_design import suggest_experiment
+from motorid.diagnosis.experiment_design import design_experiment, suggest_experiment
 from motorid.diagnosis.locate import locate
 from motorid.diagnosis.stepwise import improve
 from motorid.estimation.fit import fit, solve
@@ -44,9 +46,9 @@ from motorid.uncertainty.profile import intervals, profile, profiles
 if _TYPE_CHECKING:
     from motorid.plots import *  # noqa: F403
 
-_FIGURES = ("plot_answer", "plot_current_limit", "plot_fit", "plot_formulations", "plot_ladder", "plot_missing",
-            "plot_parameters", "plot_profile", "plot_ranking", "plot_residuals", "plot_runs", "plot_sensitivities",
-            "plot_singular_values", "plot_waterfall")
+_FIGURES = ("plot_answer", "plot_current_limit", "plot_design", "plot_fit", "plot_formulations", "plot_ladder",
+            "plot_missing", "plot_parameters", "plot_profile", "plot_ranking", "plot_residuals", "plot_runs",
+            "plot_sensitivities", "plot_singular_values", "plot_waterfall")
 
 
 def __getattr__(name: str) -> object:

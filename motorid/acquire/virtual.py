@@ -8,6 +8,7 @@ and what is hidden in it; its equations are those of the plant, which shares no 
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
@@ -157,6 +158,40 @@ class VirtualDevice:
 
     def _done(self) -> bytes:
         return frame("E", "done", self._made, self._why)
+
+
+class VirtualLink:
+    """A wire to a virtual device in this process, as fast as it is read."""
+
+    def __init__(self, device: VirtualDevice, step: int = 100) -> None:
+        self.device, self.step, self._out = device, step, b""
+
+    def write(self, data: bytes) -> None:
+        """Send to the device."""
+        self._out += self.device.receive(data, time.monotonic())
+
+    def read(self, timeout: float) -> bytes:
+        """Return what the device says, after its next samples."""
+        data, self._out = self._out + b"".join(self.device.run(self.step)), b""
+        if not data:
+            time.sleep(min(timeout, 0.002))
+        return data
+
+    def close(self) -> None:
+        """Leave the device as it is: it can be opened again."""
+
+
+def virtual_bench(effect: str = "random", motor: str = "lab", seed: int = 0, rate: float = 1000.0) -> VirtualLink:
+    """Return a bench made of software, in the place of a port: ``record(virtual_bench("coulomb"), "run.csv", …)``.
+
+    Parameters
+    ----------
+    effect, motor, seed
+        What is hidden in which motor; see `hide`.
+    rate : float
+        Samples per second.
+    """
+    return VirtualLink(VirtualDevice(hide(effect, motor, seed), rate))
 
 
 def _channels(m: Any, encoder_bits: int) -> dict[str, Channel]:

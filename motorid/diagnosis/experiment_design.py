@@ -1,26 +1,36 @@
-"""The next experiment: the one whose outcome the rival models predict most differently.
+"""The next experiment: the one whose outcome the rival models predict most differently, or that sharpens parameters.
 
-Candidate records within the voltage and current limits are simulated with every rival; the squared difference of
-their outputs over the noise is what the record would add to the evidence between them (Hunter & Reiner,
-Technometrics 7(3), 1965; Atkinson & Fedorov, Biometrika 62, 1975).
+`suggest_experiment` compares fixed candidates within the limits: the squared difference of the rivals' outputs over the
+noise is what a record would add to the evidence between them (Hunter & Reiner, Technometrics 7(3), 1965).
+`design_experiment` starts there and optimises the voltage; see `motorid.diagnosis.design_criteria`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from io import SEEK_END, StringIO
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from motorid.display.cards import Card, Shown
-from motorid.display.numbers import number
+from motorid.acquire.excitation import program
+from motorid.channels import UNITS, channel_name
+from motorid.diagnosis.design_criteria import NOISES, DesignNlp, Driven, Layout, Rival, Task, all_pairs
+from motorid.diagnosis.results import Diagnosis
+from motorid.display.cards import Card, Printed, Shown
+from motorid.display.numbers import number, quantity
 from motorid.display.tables import Flag, Table
-from motorid.errors import FitError, MotoridError, UsageError
+from motorid.errors import FitError, MotoridError, SimulationError, UsageError, one_of
 from motorid.estimation.result import Fit
+from motorid.estimation.shooting.nlp import Ipopt
+from motorid.numerics.parallel import budget as limited_time
 from motorid.numerics.parallel import one_thread
 from motorid.numerics.signals import Array
 from motorid.problem.simulate import simulate
 from motorid.records.experiment import Experiment
+from motorid.records.files import write_files
 
 SAMPLES = 2000
 
@@ -133,3 +143,413 @@ def _over(predicted: Sequence[Mapping[str, Array]], i_max: float) -> bool:
 def _difference(a: Mapping[str, Array], b: Mapping[str, Array], fit: Fit) -> float:
     sigma = {c: s for run in fit.problem.runs for c, s in run.sigma.items()}
     return float(np.mean([np.mean(((a[c] - b[c]) / sigma[c]) ** 2) for c in a if c in sigma]))
+
+
+# -- designed ----------------------------------------------------------------------------------------------------
+GOALS, SHAPES = ("distinguish", "sharpen"), ("steps", "free", "multisine")
+LEVELS = 30  # a board takes 32 segments
+SHORTEST = 5  # ms of a segment
+FINE = 200  # steps by which a fixed candidate is followed
+MOST_RIVALS = 4
+STARTS = 2
+TRACE = 0.02  # of v_max: a binary signal smaller than this is left out
+MOST_PAIRS = 3  # that one optimisation looks at
+HOPELESS = 0.1  # log(1 + χ²) below which two rivals are as good as one model
+ENOUGH = 7.0  # the same, from which another start is not worth its time
+RIPPLES = (0.0, 0.3)  # share of the voltage for a binary signal on top of a candidate
+DRAWS = 16  # of the parameters, for the check of the limits
+TOLERANCE = 1e-4  # of the integration, relative to the largest state
+WORTH = 4.0  # nats between two rivals from which they count as distinguished
+SOLVER = Ipopt(20, 1e-3, more={
+    "hessian_approximation": "limited-memory", "dual_inf_tol": 1e-2, "constr_viol_tol": 1e-4, "compl_inf_tol": 1e-3,
+    "acceptable_iter": 3, "acceptable_tol": 1e-2, "mu_strategy": "monotone", "mu_init": 1e-3, "bound_push": 1e-3,
+    "bound_frac": 1e-3, "slack_bound_push": 1e-3, "slack_bound_frac": 1e-3})
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Design(Printed):
+    """An experiment designed to distinguish models or to sharpen parameters.
+
+    Attributes
+    ----------
+    goal : {"distinguish", "sharpen"}
+    excite : str
+        What to play: ``mi.record(port, "next.csv", excite=design.excite)``.
+    t, v : ndarray, shape (N,)
+        Time (s) and voltage (V), rounded as the bench plays it.
+    predicted, band : dict of str to dict of str to ndarray
+        Per rival and channel: prediction (N,), SI, and two standard deviations of it, noise included.
+    evidence : dict of (str, str) to (float, float)
+        Per (truth, rival): expected nats against the rival after its refit, by the best fixed candidate and by this.
+    deviations : dict of str to dict of str to (float, float, float)
+        Per rival and free parameter: expected standard deviation, SI: so far, with the best fixed candidate, with this.
+    peaks, limits : dict of str to float
+        Largest size in any rival, uncertain parameters included, and the limit; by ``v, i, omega, theta, dT``.
+    fixed, v_fixed : str, ndarray
+        The best fixed candidate, scaled to the same limits: its name and voltage (V).
+    status : str
+        ``"designed"``, or ``"stopped early"``: the best so far.
+    """
+
+    goal: str
+    excite: str
+    t: Array
+    v: Array
+    predicted: Mapping[str, Mapping[str, Array]]
+    band: Mapping[str, Mapping[str, Array]]
+    evidence: Mapping[tuple[str, str], tuple[float, float]]
+    deviations: Mapping[str, Mapping[str, tuple[float, float, float]]]
+    peaks: Mapping[str, float]
+    limits: Mapping[str, float]
+    fixed: str
+    v_fixed: Array
+    status: str
+
+    @property
+    def text(self) -> str:
+        """What to expect of it."""
+        long = f"This record of {self.t[-1] - self.t[0]:.3g} s"
+        if self.goal == "sharpen":
+            return f"{long} is expected to sharpen the parameters as below."
+        weak = sorted({tuple(sorted(pair)) for pair, (_, nats) in self.evidence.items() if nats < WORTH})
+        names = ", ".join(dict.fromkeys(n for pair in self.evidence for n in pair))
+        if not weak:
+            return f"{long} is expected to distinguish {names}."
+        pairs = "; ".join(" and ".join(pair) for pair in weak)
+        return f"No record of this length within the limits is expected to distinguish {pairs}."
+
+    def card(self) -> Card:
+        """Return what is expected of it, and how to play it."""
+        tables = []
+        if self.evidence:
+            rows = [[a, b, number(fixed, 3), number(mine, 3)] for (a, b), (fixed, mine) in self.evidence.items()]
+            tables.append(Table(["if it is", "evidence against", f"by the {self.fixed}, nats", "by this, nats"], rows,
+                                left=(0, 1)))
+        else:
+            rows = [[name, *(number(x, 3) for x in each)]
+                    for every in self.deviations.values() for name, each in every.items()]
+            tables.append(Table(["parameter", "std (SI) so far", f"with the {self.fixed}", "with this"], rows))
+        unit = {"v": "V", "dT": "K"} | {c: UNITS[c][0] for c in ("i", "omega", "theta")}
+        name = {"v": "voltage", "dT": "temperature rise"}
+        rows = [[name.get(c) or channel_name(c), quantity(p, unit[c], 3), quantity(self.limits.get(c), unit[c], 3)]
+                for c, p in self.peaks.items()]
+        tables.append(Table(["quantity", "largest expected", "limit"], rows))
+        moods = {"designed": "good", "stopped early": "note"}
+        return Card("Designed experiment", (Flag(self.status, moods[self.status]),),
+                    (self.text, f"Play it: {self.excite}"), tables,
+                    (("mi.plot_design(design)", "see it"), ('design.to_csv("plan.csv")', "time and voltage"),
+                     ('mi.record(port, "next.csv", excite=design.excite)', "play it")))
+
+    def to_csv(self, path: str | Path, force: bool = False) -> Path:
+        """Write time, voltage, and what each rival predicts; over another program's file with `force` only."""
+        heads = ["t_s", "v_V", *(f"{c}_{n}" for n, p in self.predicted.items() for c in p)]
+        columns = [self.t, self.v, *(y for p in self.predicted.values() for y in p.values())]
+        text = StringIO("# Written by motorid\n" + ",".join(heads) + "\n")
+        text.seek(0, SEEK_END)
+        np.savetxt(text, np.column_stack(columns), "%.7g", ",")
+        return write_files({Path(path): text.getvalue()}, force)[0]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the contents of ``design --json``."""
+        return {"goal": self.goal, "status": self.status, "text": self.text, "excite": self.excite,
+                "evidence": [{"truth": a, "rival": b, "fixed": f, "designed": d}
+                             for (a, b), (f, d) in self.evidence.items()],
+                "std": {n: {p: {"before": a, "fixed": f, "designed": d} for p, (a, f, d) in every.items()}
+                        for n, every in self.deviations.items()},
+                "peaks": dict(self.peaks), "limits": dict(self.limits), "fixed": self.fixed}
+
+
+@one_thread
+def design_experiment(found: Diagnosis | Fit | Sequence[Fit | Rival], *, goal: str | None = None,
+                      parameters: Sequence[str] | None = None, v_max: float | None = None, i_max: float | None = None,
+                      omega_max: float | None = None, theta_range: tuple[float, float] | None = None,
+                      temp_max: float | None = None, duration: float | None = None, dt: float | None = None,
+                      shape: str = "steps", levels: int = LEVELS, slew: float | None = None,
+                      budget: float | None = None, progress: Callable[[str], None] | None = None) -> Design:
+    """Design the voltage that best distinguishes rival models, or that best sharpens parameters.
+
+    Distinguishing is T-optimal (Atkinson & Fedorov, Biometrika 62, 1975): the largest least χ² between any two
+    rivals, the one refitted to all records, the other, the truth, anywhere within two standard deviations of its
+    values. Sharpening is D-optimal (Fedorov, Theory of Optimal Experiments, 1972; for some of the parameters D_s):
+    log det of the Fisher information, that of the records so far included. Both are solved as an NLP (IPOPT) with the
+    exact derivatives of the discrete step, from fixed candidates as starts; the limits are constraints for every
+    rival, kept away from by the prediction's uncertainty, and checked again with drawn parameters.
+
+    It is a local optimum, as good as the rivals: where all of them are wrong, it promises nothing, nor do the limits.
+
+    Parameters
+    ----------
+    found : Diagnosis, Fit or sequence of Fit
+        What was found, or the rivals themselves, fitted to the same records.
+    goal : {"distinguish", "sharpen"}, optional
+        By default to distinguish where there are rivals.
+    parameters : sequence of str, optional
+        To sharpen; by default all that are free.
+    v_max, i_max, omega_max : float, optional
+        Limits, V, A, rad/s; by default the largest in the records.
+    theta_range : (float, float), optional
+        rad, the start at zero.
+    temp_max : float, optional
+        Rise of the winding's temperature, K; needs a rival with `winding_heating`.
+    duration, dt : float, optional
+        s; by default those of the longest record, and of the samples.
+    shape : {"steps", "free", "multisine"}
+        Steps, ramps between free levels, or ramps along a sum of sines.
+    levels : int
+        Segments of the voltage; a bench takes so many.
+    slew : float, optional
+        Largest slope of ramps, V/s.
+    budget : float, optional
+        s after which the best so far is taken; Ctrl-C does the same.
+    progress : callable, optional
+        Called with a word on what was done.
+
+    Raises
+    ------
+    UsageError
+        For words, names or limits that make no sense.
+    FitError
+        If no record within the limits can be found.
+    """
+    rivals, goal = _rivals(found, goal)
+    say = progress or (lambda word: None)
+    asked = _asked(rivals[0], parameters) if goal == "sharpen" else ()
+    _check_words(shape, levels, slew)
+    seen = rivals[0].seen
+    dt, duration = float(f"{dt or seen['dt']:.9g}"), duration or seen["duration"]
+    limits = _limits(rivals, v_max or seen["v"], i_max, omega_max, theta_range, temp_max)
+    layout = _layout(shape, levels, duration, max(dt, 0.5 * duration / SAMPLES), limits["v"][1])
+    task = _task(rivals, layout, {s: x for s, x in limits.items() if s != "v"}, asked, slew)
+    fixed = _fixed(task)
+    say("compared fixed candidates")
+    with limited_time(budget):
+        best = _optimised(task, say)
+    c = best.best if layout.ramps else _without_traces(best.best)
+    c, peaks = _safe(task.refined(layout.of(c), TOLERANCE), c)
+    return _told(task.refined(layout.of(c), TOLERANCE), c, peaks, fixed, limits,
+                 "stopped early" if best.stopped else "designed")
+
+
+def _optimised(task: Task, say: Callable[[str], None]) -> DesignNlp:
+    """Return the NLP with the best point, from the best starts."""
+    done: list[DesignNlp] = []
+    for name, (_, c) in list(_starts(task).items())[:STARTS * (2 if task.asked else 1)]:
+        nlp = DesignNlp(_hardest(task, c).refined(task.layout.of(c), TOLERANCE), c)
+        one = np.ones(len(c))
+        solver = replace(SOLVER, max_iterations=60) if task.asked else SOLVER  # its criterion costs little
+        solver.solve(nlp, nlp.start(), (np.append(-one, -np.inf), np.append(one, np.inf)))
+        done.append(nlp)
+        say(f"optimised from the {name}: {nlp.best_value:.3g}")
+        if nlp.stopped or (task.pairs and nlp.best_value > ENOUGH):
+            break
+    if not done:
+        raise FitError("no record stays within the limits with all models; allow more voltage, current or angle.")
+    return max(done, key=lambda nlp: nlp.best_value)
+
+
+def _without_traces(c: Array) -> Array:
+    """Return the unknowns of steps without binary signals that are next to nothing."""
+    n = len(c) // 2
+    return np.concatenate([c[:n], np.where(np.abs(c[n:]) < TRACE, 0.0, c[n:])])
+
+
+def _hardest(task: Task, c: Array) -> Task:
+    """Return the task with the pairs alone that are hardest to distinguish, hopeless ones left out."""
+    if not task.pairs:
+        return task
+    levels = task.layout.of(c)
+    worth = [w.value for w in task.criteria(levels, task.respond(levels), False)]
+    order = [k for k in np.argsort(worth) if worth[k] > HOPELESS] or [int(np.argmax(worth))]
+    return replace(task, pairs=tuple(task.pairs[k] for k in order[:MOST_PAIRS]))
+
+
+def _rivals(found: Any, goal: str | None) -> tuple[list[Rival], str]:
+    """Return the rivals, and whether they are to be distinguished."""
+    if goal not in (None, *GOALS):
+        raise UsageError(one_of(str(goal), GOALS, "goal"))
+    fits = list(found.rivals) if isinstance(found, Diagnosis) else [found] if isinstance(found, Fit) else list(found)
+    goal = goal or ("distinguish" if len(fits) > 1 else "sharpen")
+    if goal == "distinguish" and len(fits) < 2:
+        raise UsageError("to distinguish models takes at least two of them: what was found has no group, or give the "
+                         'fits of the rivals. A single fit can be sharpened: goal="sharpen".')
+    if goal == "sharpen" and isinstance(found, Diagnosis):
+        fits = [found.best]
+    rivals = [f if isinstance(f, Rival) else Rival.of(f) for f in fits[:MOST_RIVALS if goal == "distinguish" else 1]]
+    common = set.intersection(*(set(r.model.effect_names) for r in rivals)) if len(rivals) > 1 else set()
+    names = [" + ".join(n for n in r.model.effect_names if n not in common) or "none" for r in rivals]
+    return [replace(r, name=n) for r, n in zip(rivals, names, strict=True)], goal
+
+
+def _asked(rival: Rival, parameters: Sequence[str] | None) -> tuple[str, ...]:
+    free = rival.model.free_names
+    for name in parameters or ():
+        if name not in free:
+            raise UsageError(one_of(name, free, "free parameter"))
+    return tuple(parameters or free)
+
+
+def _check_words(shape: str, levels: int, slew: float | None) -> None:
+    if shape not in SHAPES:
+        raise UsageError(one_of(shape, SHAPES, "shape"))
+    if not 2 <= levels <= 200:
+        raise UsageError(f"levels must lie between 2 and 200; got {levels}.")
+    if slew is not None and (shape == "steps" or not slew > 0):
+        raise UsageError('slew limits ramps, in V/s above zero; steps jump. Use shape="free" with it.')
+
+
+def _limits(rivals: Sequence[Rival], v_max: float, i_max: float | None, omega_max: float | None,
+            theta_range: tuple[float, float] | None, temp_max: float | None) -> dict[str, tuple[float, float]]:
+    """Return the limits by state, and of the voltage."""
+    seen, found = rivals[0].seen, {"v": (-v_max, v_max)}
+    for state, given in (("i", i_max), ("omega", omega_max)):
+        size = given or seen.get(state)
+        if size:
+            found[state] = (-size, size)
+    if theta_range is not None:
+        found["theta"] = theta_range
+    if temp_max is not None:
+        if not any("winding_heating" in r.model.effect_names for r in rivals):
+            raise UsageError("temp_max needs a rival with winding_heating, which knows the winding's heat capacity; "
+                             "limit i_max instead.")
+        found["dT"] = (-temp_max, temp_max)
+    for name, (low, high) in found.items():
+        if not low < 0 < high:
+            raise UsageError(f"the limits of {name} must lie on both sides of zero; got {low:g} … {high:g}.")
+    return found
+
+
+def _whole(ms: int, dt: float) -> int:
+    """Return `ms` or a little more, so that it is a whole number of samples as near as can be."""
+    return min(range(ms, ms + 8), key=lambda n: round(abs(n / dt / 1e3 - round(n / dt / 1e3)), 3))
+
+
+def _layout(shape: str, levels: int, duration: float, dt: float, v_max: float) -> Layout:
+    ms = _whole(max(SHORTEST, round(duration * 1e3 / levels)), dt)
+    segments = max(2, min(levels, round(duration * 1e3 / ms)))
+    quickest = max(1, round(2e3 * dt))
+    bits = np.geomspace(quickest, max(ms / 4, quickest), 4).round().astype(int)
+    layout = Layout((ms,) * segments, dt, tuple(np.resize(bits, segments).tolist()), None, v_max)
+    if shape == "steps":
+        return layout
+    phase = 2 * np.pi * np.arange(segments + 1) / segments
+    tones = np.arange(1, max(2, segments // 4) + 1)
+    mixing = np.hstack([np.sin(np.outer(phase, tones)), np.cos(np.outer(phase, tones))])
+    return replace(layout, bits=(), mixing=mixing if shape == "multisine" else None)
+
+
+def _task(rivals: Sequence[Rival], layout: Layout, limits: Mapping[str, tuple[float, float]], asked: tuple[str, ...],
+          slew: float | None) -> Task:
+    errors = {c: float(np.sqrt(np.mean([r.sigma[c] ** 2 for r in rivals]))) for c in rivals[0].sigma}
+    driven = tuple(Driven.of(r, layout, errors, "theta" in limits) for r in rivals)
+    return Task(driven, limits, errors, asked, () if asked else all_pairs(len(rivals)), slew or np.inf)
+
+
+def _starts(task: Task, ripples: Sequence[float] = RIPPLES) -> dict[str, tuple[float, Array]]:
+    """Return by name of the candidate its worth and the unknowns next to it, within the limits; the best first."""
+    layout, found = task.layout, {}
+    t = np.linspace(0, layout.dt * (layout.edges[-1] - 1), layout.edges[-1])
+    for name, (v, _) in candidates(t, 1.0).items():
+        if layout.ramps:
+            c = v[np.append(layout.edges[:-1], len(t) - 1)]
+            found[name] = c if layout.mixing is None else np.linalg.lstsq(layout.mixing, c, rcond=None)[0]
+            continue
+        c = np.array([part.mean() for part in np.split(v, layout.edges[1:-1].tolist())])
+        for share in ripples:
+            found[f"{name} + PRBS" if share else name] = np.concatenate([(1 - share) * c, np.full(len(c), share)])
+    within = {n: _within(task, c) for n, c in found.items()}
+    return dict(sorted(((n, w) for n, w in within.items() if w is not None), key=lambda w: -w[1][0]))
+
+
+def _within(task: Task, c: Array) -> tuple[float, Array] | None:
+    """Return worth and unknowns, shrunk until the limits hold; None where they never do."""
+    for _ in range(30):
+        try:
+            answers = task.respond(task.layout.of(c))
+        except SimulationError:
+            c = 0.5 * c
+            continue
+        values, _, low, high = task.extremes(answers)
+        ratio = max(float(np.max(values / high, where=values > 0, initial=0.0)),
+                    float(np.max(values / low, where=values < 0, initial=0.0)))
+        if ratio <= 1:
+            worth = [w.value for w in task.criteria(task.layout.of(c), answers, False)]
+            return min((w for w in worth if w > HOPELESS or task.asked), default=0.0), c
+        c = c * min(0.98, 1 / ratio)
+    return None
+
+
+def _fine(task: Task) -> Task:
+    """Return the task with many short steps, which follow any voltage."""
+    old = task.layout
+    ms = _whole(max(1, round(sum(old.ms) / FINE)), old.dt)
+    n = round(sum(old.ms) / ms)
+    layout = replace(old, ms=(ms,) * n, bits=(ms,) * n, mixing=None)
+    driven = (Driven.of(d.rival, layout, task.noise, "theta" in task.limits) for d in task.driven)
+    return replace(task, driven=tuple(driven))
+
+
+def _fixed(task: Task) -> tuple[str, Task, Array]:
+    """Return the best fixed candidate within the same limits, as a task of many steps and its unknowns."""
+    fine = _fine(task)
+    starts = _starts(fine, (0.0,))
+    if not starts:
+        raise FitError("no record stays within the limits with all models; allow more voltage, current or angle.")
+    name = next(iter(starts))
+    return name, fine, starts[name][1]
+
+
+def _safe(task: Task, c: Array) -> tuple[Array, dict[str, float]]:
+    """Return the unknowns, shrunk until drawn parameters keep the limits too, and the largest size of each state."""
+    rng = np.random.default_rng(0)
+    draws = [d.rival.draws(DRAWS, rng) for d in task.driven]
+    for _ in range(30):
+        ratio, peaks = 0.0, dict.fromkeys(task.limits, 0.0)
+        for d, deltas in zip(task.driven, draws, strict=True):
+            for delta in [0 * deltas[0], *deltas]:
+                try:
+                    x = d.respond(task.layout.of(c), delta).x
+                except SimulationError:  # parameters that no motor has
+                    continue
+                for s in (s for s in task.limits if s in d.system.states):
+                    reach, noise = x[:, d.system.states.index(s)], NOISES * task.noise.get(s, 0.0)
+                    low, high = task.limits[s]
+                    ratio = max(ratio, (reach.max() + noise) / high, (reach.min() - noise) / low)
+                    peaks[s] = max(peaks[s], float(np.abs(reach).max()))
+        if ratio <= 1:
+            break
+        c = c * min(0.98, 1 / ratio)
+    return c, {"v": float(np.abs(task.layout.of(c)).max()), **peaks}
+
+
+def _expected(task: Task, levels: Array) -> tuple[dict[tuple[str, str], float], dict[str, dict[str, float]]]:
+    """Return the evidence per (truth, rival), nats, and the deviations per rival and parameter."""
+    answers = task.respond(levels)
+    names = [d.rival.name for d in task.driven]
+    values = () if task.asked else task.criteria(levels, answers, False)
+    evidence = {(names[i], names[j]): 0.5 * float(np.expm1(w.value))
+                for (i, j), w in zip(task.pairs, values, strict=True)}
+    return evidence, {n: d.rival.deviations(d.informs(r))
+                      for n, d, r in zip(names, task.driven, answers, strict=True)}
+
+
+def _told(task: Task, c: Array, peaks: Mapping[str, float], fixed: tuple[str, Task, Array],
+          limits: Mapping[str, tuple[float, float]], status: str) -> Design:
+    """Return the design in the voltage that the bench will play."""
+    layout, levels = task.layout, np.round(task.layout.of(c), 3)
+    excite, n = layout.words(levels), int(layout.edges[-1])
+    predicted, band = {}, {}
+    for d, r in zip(task.driven, task.respond(levels), strict=True):
+        cov, shown = np.linalg.inv(d.rival.known), [c for c in d.system.outputs if c in task.noise]
+        variance = np.einsum("nci,ij,ncj->nc", r.dy, cov, r.dy) + 1
+        predicted[d.rival.name] = {s: r.y[:n, k] * d.errors[k] for k, s in enumerate(shown)}
+        band[d.rival.name] = {s: 2 * np.sqrt(variance[:n, k]) * d.errors[k] for k, s in enumerate(shown)}
+    name, fine, at = fixed
+    evidence, deviations = _expected(task, levels)
+    old_evidence, old_deviations = _expected(fine, fine.layout.of(at))
+    return Design(
+        "sharpen" if task.asked else "distinguish", excite, np.linspace(0, layout.dt * (n - 1), n),
+        program(excite).volts(1 / layout.dt), predicted, band, {p: (old_evidence[p], e) for p, e in evidence.items()},
+        {d.rival.name: {p: (s, old_deviations[d.rival.name][p], deviations[d.rival.name][p])
+                        for p, s in d.rival.deviations(d.rival.known).items()} for d in task.driven},
+        peaks, {s: max(abs(low), abs(high)) for s, (low, high) in limits.items()}, name,
+        fine.layout.voltage(fine.layout.of(at))[:-1], status)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from motorid.channels import UNITS, channel_name
+from motorid.diagnosis.design_criteria import Rival
 from motorid.diagnosis.remainder import Remainder
 from motorid.display.cards import Card, Shown
 from motorid.display.numbers import number, percent, quantity
@@ -276,6 +277,16 @@ class Diagnosis(Shown):
         after += [("found.remainder.as_effect()", "what remains, as an effect to add")] if kind == "structure" else []
         return (*after, ("mi.plot_missing(found)", "see it"), ('mi.report(found, "report.html")', "all on one page"))
 
+    @property
+    def rivals(self) -> tuple[Fit, ...]:
+        """The fits of the first group, which an experiment is to distinguish; without one, the last fit alone."""
+        for rung in self.ladder.rungs:
+            for group in self.groups:
+                fits = tuple(c.fit for c in rung.candidates if c.effect in group and c.fit is not None)
+                if len(fits) > 1:
+                    return fits
+        return (self.after,)
+
     def card(self) -> Card:
         """Return the answer, then what it rests on: place, parameters before and after, the effects tried."""
         first = self.summary()
@@ -323,6 +334,8 @@ class Diagnosis(Shown):
             "groups": [list(g) for g in self.groups],
             "suggestion": self.suggestion,
             "stopped": self.stopped or None,
+            "rivals": [Rival.of(f).to_dict() for f in self.rivals],
+            "best": Rival.of(self.best).to_dict(),
         }
 
 

@@ -61,6 +61,10 @@ class Grid:
         """Return the grid with other sub-steps."""
         return replace(self, substeps=np.ascontiguousarray(substeps, np.int64))
 
+    def part(self, a: int, b: int) -> Grid:
+        """Return samples a to b, both included."""
+        return Grid(self.t[a:b + 1], self.u[a:b + 1], self.u0[a:b], self.u1[a:b], self.substeps[a:b])
+
 
 def address(a: NDArray | None) -> int | None:
     """Return where the contiguous array `a` begins in memory."""

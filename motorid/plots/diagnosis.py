@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
+from motorid.diagnosis.experiment_design import Design
 from motorid.diagnosis.locate import accounted
 from motorid.diagnosis.results import Binned, Candidate, Diagnosis, Ladder, Missing
 from motorid.display.numbers import number
@@ -247,3 +248,32 @@ def _falling(ax: Axes, x: Array, errors: Sequence[float], channel: str, colour: 
     for k, side in ends.items():
         ax.annotate(number(errors[k], 2), (float(x[k]), errors[k]), (-8 if side == "right" else 8, 0), va="center",
                     ha=side, textcoords="offset points", fontsize=8)
+
+
+@style.styled
+def plot_design(design: Design) -> np.ndarray:
+    """Draw a designed voltage, and what each rival predicts with a band of two standard deviations.
+
+    Parameters
+    ----------
+    design : Design
+
+    Returns
+    -------
+    ndarray of Axes, shape (channels + 1,)
+    """
+    if not isinstance(design, Design):
+        raise UsageError(f"plot_design takes mi.design_experiment(...), got {type(design).__name__}.")
+    first = next(iter(design.predicted.values()))
+    axes = style.grid(len(first) + 1, 1, sharex=True)[:, 0]
+    style.line(axes[0], design.t, design.v, zoh=True, color=style.PALETTE["grey"])
+    style.tidy(axes[0], y=style.axis_label("v"), title="Designed experiment")
+    colours = [style.PALETTE[c] for c in ("blue", "orange", "green", "purple")]
+    for ax, channel in zip(axes[1:], first, strict=True):
+        for (name, outputs), colour in zip(design.predicted.items(), colours, strict=False):
+            y, half = outputs[channel], design.band[name][channel]
+            ax.fill_between(design.t, y - half, y + half, color=colour, alpha=0.2, lw=0)
+            style.line(ax, design.t, y, color=colour, label=name if len(design.predicted) > 1 else "predicted")
+        style.tidy(ax, y=style.axis_label(channel), x=style.axis_label("t") if ax is axes[-1] else "")
+    style.above(axes[1])
+    return axes

@@ -51,6 +51,8 @@ FIGURES = {
     "plot_missing": lambda d, check: plots.plot_missing(d),
     "plot_ranking": lambda d, check: plots.plot_ranking(d),
     "plot_ladder": lambda d, check: plots.plot_ladder(d),
+    "plot_design": lambda d, check: plots.plot_design(
+        mi.design_experiment(d.before, duration=0.2, levels=3, budget=0.0)),
     "plot_parameters": lambda d, check: plots.plot_parameters(d, truth={"R": 1.38, "b": 6.5e-5}),
     "plot_sensitivities": lambda d, check: plots.plot_sensitivities(d.after),
     "plot_singular_values": lambda d, check: plots.plot_singular_values(identifiability(d.after)),

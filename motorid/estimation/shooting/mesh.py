@@ -89,7 +89,7 @@ class Mesh:
             for a, b in pairwise(cuts):
                 node = -1 if a == 0 else nodes - 1
                 nodes += b < last
-                found.append(Interval(k, a, b, node, nodes - 1 if b < last else -1, _cut(run.grid, a, b)))
+                found.append(Interval(k, a, b, node, nodes - 1 if b < last else -1, run.grid.part(a, b)))
         return tuple(found)
 
     @cached_property
@@ -268,10 +268,6 @@ def _cuts(last: int, every: int | None) -> Sequence[int]:
     """Samples at which a run is cut, both ends included."""
     step = every or max(FEWEST, -(-last // MOST))
     return np.unique(np.linspace(0, last, max(round(last / step), 1) + 1).round().astype(int)).tolist()
-
-
-def _cut(grid: Grid, a: int, b: int) -> Grid:
-    return Grid(grid.t[a:b + 1], grid.u[a:b + 1], grid.u0[a:b], grid.u1[a:b], grid.substeps[a:b])
 
 
 def _empty(n: int, nx: int, ny: int, nz: int) -> Trajectory:

@@ -7,9 +7,9 @@ that the compiled step of the least-squares engine is used here too.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Any, NamedTuple
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple, Protocol
 
 import casadi as ca
 import numpy as np
@@ -124,13 +124,43 @@ class ShootingNlp:
     def functions(self) -> tuple[ca.Callback, dict[str, ca.Callback]]:
         """Return the NLP and its derivatives in CasADi's naming."""
         x, p, f, g = D(self.n, 1), D(0, 0), D(1, 1), D(self.m, 1)
-        jac, hess = self.jac_pattern, self.hess_pattern
-        nlp = _Function("nlp", ["x", "p"], ["f", "g"], [x, p], [f, g], lambda z, _: self.values(z))
-        grad_f = _Function("nlp_grad_f", ["x", "p"], ["f", "grad:f:x"], [x, p], [f, x], lambda z, _: self.gradient(z))
-        jac_g = _Function("nlp_jac_g", ["x", "p"], ["g", "jac:g:x"], [x, p], [g, jac], lambda z, _: self.jacobian(z))
+        nlp, derivatives = callbacks(self, self.n, self.m, self.jac_pattern)
         hess_lag = _Function("nlp_hess_l", ["x", "p", "lam:f", "lam:g"], ["triu:hess:gamma:x:x"], [x, p, f, g],
-                             [hess], lambda z, _, lam_f, __: [self.hessian(z, float(lam_f[0]))])
-        return nlp, {"grad_f": grad_f, "jac_g": jac_g, "hess_lag": hess_lag}
+                             [self.hess_pattern], lambda z, _, lam_f, __: [self.hessian(z, float(lam_f[0]))])
+        return nlp, {**derivatives, "hess_lag": hess_lag}
+
+
+class Nlp(Protocol):
+    """What `Ipopt` solves: limits of the rows, the factor on f and the multipliers, values and derivatives."""
+
+    lower: Array
+    upper: Array
+    scale: float
+
+    def values(self, z: Array) -> list[Any]:
+        """Return f and g."""
+        ...
+
+    def gradient(self, z: Array) -> list[Any]:
+        """Return f and its gradient."""
+        ...
+
+    def jacobian(self, z: Array) -> list[Any]:
+        """Return g and its Jacobian's entries."""
+        ...
+
+    def functions(self) -> tuple[ca.Callback, dict[str, ca.Callback]]:
+        """Return the NLP and its derivatives in CasADi's naming."""
+        ...
+
+
+def callbacks(nlp: Nlp, n: int, m: int, jac: ca.Sparsity) -> tuple[ca.Callback, dict[str, ca.Callback]]:
+    """Return the NLP and its first derivatives in CasADi's naming: n unknowns, m rows."""
+    x, p, f, g = D(n, 1), D(0, 0), D(1, 1), D(m, 1)
+    values = _Function("nlp", ["x", "p"], ["f", "g"], [x, p], [f, g], lambda z, _: nlp.values(z))
+    grad_f = _Function("nlp_grad_f", ["x", "p"], ["f", "grad:f:x"], [x, p], [f, x], lambda z, _: nlp.gradient(z))
+    jac_g = _Function("nlp_jac_g", ["x", "p"], ["g", "jac:g:x"], [x, p], [g, jac], lambda z, _: nlp.jacobian(z))
+    return values, {"grad_f": grad_f, "jac_g": jac_g}
 
 
 class _Function(ca.Callback):
@@ -207,8 +237,9 @@ class Ipopt:
     max_iterations: int = 300
     tol: float = 1e-9
     verbose: bool = False
+    more: Mapping[str, Any] = field(default_factory=dict)
 
-    def solve(self, nlp: ShootingNlp, z0: Array, bounds: tuple[Array, Array], warm: NlpResult | None = None,
+    def solve(self, nlp: Nlp, z0: Array, bounds: tuple[Array, Array], warm: NlpResult | None = None,
               near: bool = False) -> NlpResult:
         """Solve from `z0`, which may be near a solution, or from an earlier result of the same size."""
         function, derivatives = nlp.functions()
@@ -217,6 +248,7 @@ class Ipopt:
             "compl_inf_tol": 1e-8, "acceptable_iter": 0, "bound_relax_factor": 0.0, "nlp_scaling_method": "none",
             "print_level": 5 if self.verbose else 0, "sb": "yes", "mu_strategy": "adaptive",
         }
+        options |= self.more
         start = {"x0": z0}
         if near:
             options |= {"mu_strategy": "monotone", "mu_init": 1e-6, "bound_push": 1e-8, "bound_frac": 1e-8,

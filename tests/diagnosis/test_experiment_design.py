@@ -1,0 +1,213 @@
+"""Designed experiments: exact gradients, limits that hold on the plant, words that a bench plays, and better fits."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import motorid as mi
+from motorid.acquire.excitation import program
+from motorid.cli.app import app
+from motorid.diagnosis import design_criteria
+from motorid.diagnosis.design_criteria import Driven, Layout, Rival, Task, all_pairs
+from motorid.errors import FitError, UsageError
+
+DT, DURATION, LEVELS = 2e-3, 0.6, 8
+NOISE = {"i": 0.01, "omega": 0.3}
+TRUTH = {"constant_load": {"tau_0": 6e-3}}
+
+
+def measured(plant, motor, effects, t, v, rng):
+    true = plant.simulate(motor, effects, t, v, substep=50e-6)
+    outputs = {c: true[c] + s * rng.standard_normal(len(t)) for c, s in NOISE.items()}
+    return mi.Experiment(t, {"v": v}, outputs), true
+
+
+@pytest.fixture(scope="module")
+def first(plant, lab):
+    """One direction only: friction and load look the same."""
+    t = DT * np.arange(400)
+    v = np.round(5 + 1.5 * np.sin(2 * np.pi * t / 0.4), 4) * np.minimum(t / 0.1, 1)
+    return measured(plant, lab, TRUTH, t, v, np.random.default_rng(4))[0]
+
+
+@pytest.fixture(scope="module")
+def fits(first):
+    return [mi.fit(mi.dc_motor() + e, [first]) for e in (mi.effects.constant_load, mi.effects.coulomb)]
+
+
+@pytest.fixture(scope="module")
+def design(fits):
+    return mi.design_experiment(fits, v_max=8, i_max=3, omega_max=120, duration=DURATION, levels=LEVELS)
+
+
+# -- the criteria ------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def tasks(fits):
+    """Both goals on the same short steps with binary signals."""
+    layout = Layout((60,) * 6, DT, (8,) * 6, None, 8.0)
+    rivals = [Rival.of(f) for f in fits]
+    driven = tuple(Driven.of(r, layout, rivals[0].sigma, False) for r in rivals)
+    both = Task(driven, {"i": (-3, 3)}, NOISE, (), all_pairs(2), np.inf)
+    return both, replace(both, driven=driven[:1], asked=("R", "tau_0"), pairs=())
+
+
+LEVELS_TRIED = np.array([2.0, 4.0, 1.0, -1.0, 3.0, 2.0, 0.5, 0.2, 0.0, 1.0, 0.3, 0.1])
+
+
+@pytest.mark.parametrize("goal", [0, 1])
+def test_gradients_agree_with_differences(tasks, goal, monkeypatch):
+    task = tasks[goal]
+    monkeypatch.setattr(design_criteria, "STEPS", 40)  # at the end of the rivals' refit the gradient is exact
+    monkeypatch.setattr(design_criteria, "SETTLED", 1e-9)
+
+    def worth(levels, slopes=False):
+        return task.criteria(levels, task.respond(levels, slopes), slopes)
+
+    exact = worth(LEVELS_TRIED, True)
+    for j in (0, 3, 7):
+        step = np.where(np.arange(12) == j, 1e-3, 0.0)
+        up, down = worth(LEVELS_TRIED + step), worth(LEVELS_TRIED - step)
+        for e, a, b in zip(exact, up, down, strict=True):
+            assert (a.value - b.value) / 2e-3 == pytest.approx(e.slope[j], rel=0.01, abs=0.01 * np.abs(e.slope).max())
+
+
+def test_a_rival_answers_the_same_with_and_without_slopes(tasks):
+    driven = tasks[0].driven[1]
+    nothing = np.zeros(len(driven.rival.scale))
+    with_slopes, without = (driven.respond(LEVELS_TRIED, nothing, by_level=b) for b in (True, False))
+    np.testing.assert_allclose(with_slopes.y, without.y, rtol=1e-9, atol=1e-9)
+
+
+def test_a_rival_that_can_follow_is_no_evidence(tasks, fits):
+    """A model against itself: whatever the voltage, the refit takes all away."""
+    twin = replace(tasks[0], driven=tasks[0].driven[:1] * 2)
+    assert max(w.value for w in twin.criteria(LEVELS_TRIED, twin.respond(LEVELS_TRIED), False)) < 1e-6
+
+
+# -- the design --------------------------------------------------------------------------------------------
+
+
+def test_what_the_first_record_left_open_is_expected_to_be_distinguished(design):
+    assert "expected to distinguish" in design.text
+    assert "No record" not in design.text
+    assert set(design.evidence) == {("constant_load", "coulomb"), ("coulomb", "constant_load")}
+    assert min(nats for _, nats in design.evidence.values()) > 20
+    assert design.v.min() < 0 < design.v.max()
+
+
+def test_the_bench_plays_just_this_voltage(design):
+    np.testing.assert_allclose(program(design.excite).volts(1 / DT), design.v, atol=1e-9)
+    assert len(program(design.excite).segments) == LEVELS
+    program(design.excite).check(8.0, 32)
+
+
+def test_limits_hold_on_the_plant_noise_included(plant, lab, design):
+    run, true = measured(plant, lab, TRUTH, design.t, design.v, np.random.default_rng(5))
+    for channel, limit in (("i", 3.0), ("omega", 120.0)):
+        assert design.limits[channel] == limit
+        assert np.abs(true[f"true_{channel}"]).max() < limit
+        assert np.abs(run.outputs[channel]).max() < limit
+        assert design.peaks[channel] < limit
+
+
+def test_with_the_designed_record_the_truth_is_plain(plant, lab, first, fits, design):
+    run, _ = measured(plant, lab, TRUTH, design.t, design.v, np.random.default_rng(6))
+    load, friction = (mi.fit(f.problem.model, [first, run]) for f in fits)
+    assert friction.chi2 - load.chi2 > min(n for _, n in design.evidence.values())
+
+
+def test_tighter_limits_are_kept_for_every_rival(fits):
+    tight = mi.design_experiment(fits, v_max=8, i_max=0.8, omega_max=60, theta_range=(-4.0, 6.0), duration=DURATION,
+                                 levels=LEVELS, budget=1.0)
+    assert tight.peaks["i"] < 0.8
+    assert tight.peaks["omega"] < 60
+    assert tight.peaks["theta"] < 6
+    with pytest.raises(FitError, match="limits"):
+        mi.design_experiment(fits, i_max=1e-6, duration=DURATION, levels=LEVELS)
+
+
+def test_by_default_it_stays_within_what_the_records_have_seen(first, fits):
+    plan = mi.design_experiment(fits, duration=DURATION, levels=LEVELS, budget=0.0)
+    for c, y in {**first.inputs, **first.outputs}.items():
+        assert plan.limits[c] == pytest.approx(np.abs(y).max())
+    assert plan.status == "stopped early"
+    assert plan.peaks["i"] < plan.limits["i"]
+
+
+def test_sharpening_lowers_the_deviation_that_was_asked_for(fits):
+    plan = mi.design_experiment(fits[0], parameters=["R"], v_max=8, i_max=3, omega_max=120, duration=DURATION,
+                                levels=LEVELS, budget=2.0)
+    before, fixed, after = plan.deviations["constant_load"]["R"]
+    assert plan.goal == "sharpen"
+    assert after < 0.8 * before
+    assert after < 1.2 * fixed
+
+
+@pytest.mark.parametrize("shape", ["free", "multisine"])
+def test_ramps_keep_to_the_slew_rate_and_are_played(fits, shape):
+    plan = mi.design_experiment(fits, v_max=8, i_max=3, omega_max=120, duration=DURATION, levels=LEVELS, shape=shape,
+                                slew=80.0, budget=1.0)
+    assert np.abs(np.diff(plan.v)).max() <= 80 * DT * 1.01
+    assert plan.excite.startswith("ramp")
+    np.testing.assert_allclose(program(plan.excite).volts(1 / DT), plan.v, atol=1e-9)
+
+
+@pytest.mark.parametrize(("words", "options"), [
+    ("two of them", {"goal": "distinguish"}), ("goal", {"goal": "improve"}), ("tau_c", {"parameters": ["tau_c"]}),
+    ("winding_heating", {"temp_max": 50.0}), ("both sides", {"theta_range": (1.0, 2.0)}), ("shape", {"shape": "sine"}),
+    ("levels", {"levels": 1}), ("steps jump", {"slew": 5.0}),
+])
+def test_what_makes_no_sense_is_said(fits, words, options):
+    with pytest.raises(UsageError, match=words):
+        mi.design_experiment(fits[0], **options)
+
+
+# -- the command line ---------------------------------------------------------------------------------------
+
+
+def test_the_command_designs_from_what_diagnose_wrote(tmp_path, fits):
+    rivals = [Rival.of(f).to_dict() for f in fits]
+    (tmp_path / "found.json").write_text(json.dumps({"rivals": rivals, "best": rivals[0]}))
+    words = ["design", str(tmp_path / "found.json"), "--out", str(tmp_path / "plan.csv"), "--duration", str(DURATION),
+             "--levels", str(LEVELS), "--budget", "1", "--limit-voltage", "8", "--limit-current", "3",
+             "--limit-angle", "-9", "9", "--json", str(tmp_path / "plan.json")]
+    told = CliRunner().invoke(app, words)
+    assert told.exit_code == 0, told.output
+    plan = json.loads((tmp_path / "plan.json").read_text())
+    assert f'--excite "{plan["excite"]}"' in told.output
+    assert plan["goal"] == "distinguish"
+    assert plan["peaks"]["theta"] < 9
+    table = np.genfromtxt(tmp_path / "plan.csv", delimiter=",", names=True, skip_header=1)
+    np.testing.assert_allclose(table["v_V"], program(plan["excite"]).volts(1 / DT), atol=1e-6)
+    (tmp_path / "plan.csv").write_text("1,2,3")
+    again = CliRunner().invoke(app, words)
+    assert again.exit_code == 2
+    assert (tmp_path / "plan.csv").read_text() == "1,2,3"
+
+
+@pytest.mark.parametrize("text", ["", "{}", "[1]", '{"rivals": [{}]}'])
+def test_a_file_without_rivals_is_refused(tmp_path, text):
+    (tmp_path / "found.json").write_text(text)
+    told = CliRunner().invoke(app, ["design", str(tmp_path / "found.json")])
+    assert told.exit_code != 0
+    assert "motorid diagnose" in str(told.exception) + told.output
+
+
+# -- closing the loop ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_the_loop_on_a_bench_ends_with_nothing_open(tmp_path):
+    bench = mi.virtual_bench("coulomb:tau_c=0.008", seed=7, rate=500.0)
+    done = mi.identify_on(bench, tmp_path, v_max=6, i_max=4, duration=1.0, records=3,
+                          first="step:3:0.3,step:4:0.3,step:3.5:0.3,step:2:0.3")
+    assert done.reached
+    assert len(done.steps) == len(done.runs) > 1
+    assert "constant_load" in done.steps[0].open
+    assert done.steps[-1].found.effects == ("coulomb",)
+    assert (tmp_path / "record2.csv").exists()
