@@ -22,7 +22,7 @@ from motorid.diagnosis.refit import GivenUp, Task, lost, refit, refits, widened
 from motorid.diagnosis.results import Candidate
 from motorid.diagnosis.score_test import Score, pairs_of, rank
 from motorid.diagnosis.thresholds import MATERIAL
-from motorid.effects import EVERY
+from motorid.effects import LIBRARY, MEASURED
 from motorid.errors import FAILURES, ModelError
 from motorid.estimation.result import Fit
 from motorid.model.definition import Effect, Parameter
@@ -42,7 +42,8 @@ def library(effects: Iterable[Effect | str] | None, also: Iterable[Effect] = ())
     """Return the effects to try: the whole library, or those named, and the user's own."""
     from motorid.effects import get
 
-    chosen = list(EVERY.values()) if effects is None else [get(e) if isinstance(e, str) else e for e in effects]
+    named = [*LIBRARY, *MEASURED] if effects is None else effects
+    chosen = [get(e) if isinstance(e, str) else e for e in named]
     own = {e.name: e for e in also}  # in the place of one of the library with the same name
     return [e for e in chosen if e.name not in own] + list(own.values())
 

@@ -108,7 +108,8 @@ def restarted(problem: Problem, q) -> Problem:
         for j, c in enumerate(("i", "omega", "theta")):
             if f"{c}_0[{k}]" in physical:  # rounding must not put it outside its limits
                 start[j] = np.clip(physical[f"{c}_0[{k}]"], *run.limits[c])
-        runs.append(replace(run, start=start))
+        apart = {n: physical[p.name] for n, r, p in problem.unknowns.apart if r == k}
+        runs.append(replace(run, start=start, apart={**run.apart, **apart}))
     return replace(problem, model=problem.model.start_at(values), _runs=tuple(runs))
 
 

@@ -324,7 +324,7 @@ class Added:
 
     @cached_property
     def _problem(self) -> Problem:
-        return self.fit.problem.for_model(self.model.fix(*self.model.parameters))
+        return self.fit.problem.for_model(self.model.fix(*self.model.shared_names))
 
     @cached_property
     def _point(self) -> Point:
@@ -345,6 +345,7 @@ class Added:
 
     def _run(self, k: int, at: Point, *slopes: Array) -> Trajectory:
         problem = self._problem
+        at = problem.unknowns.of_run(at, k)
         x0 = problem.unknowns.first_state(at, k)
         return problem.integrator.run(problem.system, problem.runs[k].grid, x0, at.p, *slopes)
 

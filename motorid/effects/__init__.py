@@ -12,9 +12,11 @@ from motorid.effects.electrical import (
     magnetic_saturation,
     measured_supply,
     measured_temperature,
+    supply_per_run,
     supply_sag,
     voltage_offset,
     winding_heating,
+    winding_warm_start,
 )
 from motorid.effects.mechanical import (
     angular_friction,
@@ -40,6 +42,7 @@ from motorid.effects.sensor import (
     current_gain,
     current_lag,
     current_offset,
+    encoder_zero,
     speed_average,
     speed_delay,
     speed_gain,
@@ -62,7 +65,9 @@ LIBRARY: dict[str, Effect] = {
 }
 # For records in which a supply voltage, a load torque or a temperature was measured beside the voltage.
 MEASURED: dict[str, Effect] = {e.name: e for e in (measured_supply, measured_temperature, measured_load)}
-EVERY = LIBRARY | MEASURED
+# Of one parameter per run; a diagnosis tries none by itself.
+PER_RUN: dict[str, Effect] = {e.name: e for e in (encoder_zero, winding_warm_start, supply_per_run)}
+EVERY = LIBRARY | MEASURED | PER_RUN
 
 
 def get(name: str) -> Effect:
@@ -82,4 +87,4 @@ def __getattr__(name: str) -> Effect:
     raise AttributeError(one_of(name, EVERY, "effect"))
 
 
-__all__ = ["EVERY", "LIBRARY", "MEASURED", "get", *EVERY]
+__all__ = ["EVERY", "LIBRARY", "MEASURED", "PER_RUN", "get", *EVERY]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import casadi as ca
 
+from motorid.errors import ModelError
 from motorid.model.definition import P, effect
 from motorid.model.equations import Equations
 
@@ -98,7 +99,7 @@ def driver_coast(m: Equations, R_c=P(50.0, "Ω", null=0.0, positive=True, grid=(
     m.voltage -= ca.if_else(ca.fabs(m.command) <= OPEN, R_c * m.i - (1 - shorted) * m.K_e * m.omega, 0)
 
 
-LIMITER_GAIN, LIMITER_WIDTH = 20.0, 0.01  # in R: how firmly the current is led to its limit; of R·I_lim: how softly
+LIMITER_GAIN, LIMITER_WIDTH = 20.0, 0.002  # in R: how firmly the current is led to its limit; of R·I_lim: how softly
 
 
 @effect(balance="voltage")
@@ -131,3 +132,20 @@ def measured_supply(m: Equations, k_v=P(1.0, "", null=0.0, doc="of the supply's 
                     V_n=P(12.0, "V", positive=True, vary=False, grid=(1.0,), doc="supply that commands mean, fixed")):
     """Recorded voltage of the supply, of which commands are shares. Mohan, Electric Machines and Drives, 2012."""
     m.scale("v", 1 + k_v * (m.input("v_supply") / V_n - 1))
+
+
+@effect(balance="voltage")
+def winding_warm_start(m: Equations, dT_0=P(0.0, "K", null=0.0, per_run=True, doc="rise at the start")):
+    """Winding warm at the start, beside winding_heating. Kirtley, Electric Power Principles, 2010.
+
+    Another rise in every run, against the first one, whose resistance at the start is R.
+    """
+    if "dT" not in m.states:
+        raise ModelError("winding_warm_start says how warm the winding of winding_heating begins: add that too.")
+    m.initial["dT"] = ca.SX(dT_0)
+
+
+@effect(balance="voltage")
+def supply_per_run(m: Equations, g_v=P(0.0, "", null=0.0, lower=-0.9, per_run=True, doc="relative to the first run")):
+    """Supply that is another in every run: the voltage is 1 + g_v of the recorded one. Isermann, 2011."""
+    m.scale("v", 1 + g_v)

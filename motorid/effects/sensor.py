@@ -100,3 +100,12 @@ def supply_side_current(m: Equations, V_dc=P(12.0, "V", positive=True, vary=Fals
     """
     duty = ca.fmin(ca.fabs(m.command) / V_dc, 1) * (1 + u_i * (ca.sign(m.command) - 1))
     m.measure("i", m.measured("i") * (1 - s_i + s_i * duty))
+
+
+@effect(balance="sensor")
+def encoder_zero(m: Equations, z_0=P(0.0, "rad", null=0.0, per_run=True, doc="angle that the encoder calls 0")):
+    """Zero of the encoder, another in every run: cogging keeps its phase. Isermann, Mechatronic Systems, 2005."""
+    m.angle_state()
+    m.initial["theta"] = m.start["theta"] + z_0
+    m.replace("zero", z_0)
+    m.measure("theta", m.measured("theta") - z_0)

@@ -18,7 +18,7 @@ from motorid.estimation.continuation import by_continuation
 from motorid.estimation.least_squares import FINISH, Callback, Estimate, least_squares
 from motorid.estimation.restarts import restore_collapsed
 from motorid.estimation.result import Fit
-from motorid.estimation.start_values import with_start_values
+from motorid.estimation.start_values import from_first_run, with_start_values
 from motorid.integrate.engine import Engine
 from motorid.model.model import Model
 from motorid.numerics.least_squares import LevenbergMarquardt
@@ -133,6 +133,11 @@ def solve(problem: Problem, solver: Any = None, *, start: str = "auto", callback
         raise UsageError("every parameter is held, there is nothing to fit. Free one, model.free('R'), or judge "
                          "the model as it is: mi.evaluate(model, runs).")
     auto, effort = start == "auto", solver or FINISH
+    if problem.unknowns.apart and hasattr(effort, "solve"):
+        raise UsageError("multiple shooting knows no parameters per run: leave the solver out, or the effect.")
+    if auto and problem.unknowns.apart:
+        alone = solve(problem.with_(experiments=problem.experiments[:1]))
+        problem, auto = from_first_run(problem, alone.values), False
     if auto:
         problem = _with_orders(problem)
     if hasattr(effort, "solve"):

@@ -320,7 +320,16 @@ def parameter_cell(fit: Fit, name: str) -> Cell:
 def value_tables(fit: Fit) -> list[Table]:
     """Return the parameters and what follows from them; what is determined goes first."""
     tables = parameter_table(fit), determined_table(fit)
-    return [t for t in (tables[::-1] if None in fit.std.values() else tables) if t is not None]
+    ordered = tables[::-1] if None in fit.std.values() else tables
+    return [t for t in (*ordered, per_run_table(fit)) if t is not None]
+
+
+def per_run_table(fit: Fit) -> Table | None:
+    """Return the parameters that are others in every run."""
+    sd = dict(zip((p.name for p in fit.problem.unknown), np.sqrt(np.diag(fit.covariance)), strict=True))
+    rows = [(name, fit.problem.experiments[k].name, with_error(fit.initial[p.name], float(sd[p.name]), p.unit))
+            for name, k, p in fit.problem.unknowns.apart]
+    return Table(("parameter", "run", "value ± std"), rows, "Parameters per run", left=(0, 1, 2)) if rows else None
 
 
 def determined_table(fit: Fit) -> Table | None:

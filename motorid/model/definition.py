@@ -43,6 +43,8 @@ class Parameter:
         A phase angle: starts are found from its sine and cosine part together.
     order : bool
         A number of periods per turn, found from the spectrum of the misfit over the angle.
+    per_run : bool
+        Another in every run (an encoder's zero): `value` is that of the first run, the others are estimated apart.
     given : bool
         Set by the user; then no first guess replaces it.
     at_least : str
@@ -62,6 +64,7 @@ class Parameter:
     grid: tuple[float, ...] = ()
     periodic: bool = False
     order: bool = False
+    per_run: bool = False
     given: bool = False
     at_least: str = ""
     doc: str = ""
@@ -94,14 +97,14 @@ class Declared:
 
 def P(value: float, unit: str = "", null: float | None = None, *, lower: float = -np.inf, upper: float = np.inf,
       positive: bool = False, vary: bool = True, grid: Iterable[float] = (), periodic: bool = False,
-      order: bool = False, at_least: str = "", doc: str = "") -> Any:
+      order: bool = False, per_run: bool = False, at_least: str = "", doc: str = "") -> Any:
     """Declare a parameter of an effect as a default argument: ``tau_c=P(2e-3, "N·m", null=0)``.
 
     The name comes from the argument; what the others mean is told at `Parameter`.
     """
     return Declared({"value": value, "unit": unit, "null": null, "lower": lower, "upper": upper,
                      "positive": positive, "vary": vary, "grid": tuple(grid), "periodic": periodic,
-                     "order": order, "at_least": at_least, "doc": doc})
+                     "order": order, "per_run": per_run, "at_least": at_least, "doc": doc})
 
 
 BALANCES = ("voltage", "torque", "transmission", "sensor")

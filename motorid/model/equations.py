@@ -43,6 +43,7 @@ class Equations:
         self.placeholders: dict[str, ca.SX] = {}
         self.definitions: dict[str, ca.SX] = {}
         self._replaced: dict[str, str] = {}
+        self.define("zero", 0)  # of the measured angle, where it is given
         self.voltage = ca.SX(0)
         self.torque = ca.SX(0)
         self.sensors: dict[str, ca.SX] = {}
@@ -76,7 +77,7 @@ class Equations:
 
     def _angle(self) -> ca.SX:
         if "theta_in" in self.inputs:
-            return self.inputs["theta_in"]
+            return self.inputs["theta_in"] + self.zero
         return self.angle_state()
 
     def angle_state(self) -> ca.SX:

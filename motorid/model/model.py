@@ -125,6 +125,11 @@ class Model(Shown):
         return tuple(n for n, p in self.parameters.items() if p.vary)
 
     @property
+    def shared_names(self) -> tuple[str, ...]:
+        """Names of the parameters that are the same in every run, as they are or since the user gave them."""
+        return tuple(n for n, p in self.parameters.items() if not p.per_run or p.given)
+
+    @property
     def _base_names(self) -> tuple[str, ...]:
         return tuple(p.name for p in BASES[self.base])
 

@@ -151,6 +151,7 @@ class Problem:
         known = self._latest.get(k)
         if known is not None and np.array_equal(known[0], at.q) and (known[1].dy is not None or not derivatives):
             return known[1]
+        at = self.unknowns.of_run(at, k)
         x0, grid = self.unknowns.first_state(at, k), self.runs[k].grid
         slopes = (self.unknowns.first_slopes(at, k), at.dp) if derivatives else ()
         traj = self.integrator.run(self.system, grid, x0, at.p, *slopes)
@@ -177,12 +178,13 @@ class Problem:
     def fine_enough(self, q: Array) -> bool:
         """Tell whether the present sub-steps keep, within a factor of two, what `refined` asks for at `q`."""
         at = self.unknowns.point(np.asarray(q, float))
-        starts = (self.unknowns.first_state(at, k) for k in range(len(self.runs)))
-        return all(self.integrator.prepare(self.system, run.grid, x0, at.p, self._tolerance(k, 2.0)) is run.grid
-                   for k, (run, x0) in enumerate(zip(self.runs, starts, strict=True)))
+        each = ((run, self.unknowns.of_run(at, k), k) for k, run in enumerate(self.runs))
+        return all(self.integrator.prepare(self.system, run.grid, self.unknowns.first_state(own, k), own.p,
+                                           self._tolerance(k, 2.0)) is run.grid for run, own, k in each)
 
     def _refined_run(self, k: int, at: Point) -> Run:
         # From one step per sample on, so that the grid depends on q alone and not on the way there.
+        at = self.unknowns.of_run(at, k)
         run, x0 = self.runs[k], self.unknowns.first_state(at, k)
         coarse = run.grid.with_substeps(np.ones_like(run.grid.substeps))
         grid = self.integrator.prepare(self.system, coarse, x0, at.p, self._tolerance(k))

@@ -7,7 +7,7 @@ width of sgn that suits them.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Any, NamedTuple
 from weakref import WeakKeyDictionary
@@ -50,6 +50,8 @@ class Run:
         (i, omega, theta) at the first sample: known, measured or the first guess.
     limits : dict of str to (float, float)
         Which of them are unknowns of the fit, and between which values.
+    apart : dict of str to float
+        Values of this run's own of parameters that are others in every run.
     """
 
     experiment: Experiment
@@ -57,6 +59,7 @@ class Run:
     sigma: Mapping[str, float]
     start: Array
     limits: Mapping[str, tuple[float, float]]
+    apart: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def estimated(self) -> tuple[str, ...]:

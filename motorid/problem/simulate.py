@@ -181,7 +181,7 @@ def with_channels(model: Model, run: Experiment, channels: Sequence[str],
 
 def simulated(problem: Problem, estimate_initial: bool = True) -> tuple[Simulation, ...]:
     """Return the simulations of a problem at the model's values."""
-    held = problem.with_(model=problem.model.fix(*problem.model.parameters), priors={}, penalties=())
+    held = problem.with_(model=problem.model.fix(*problem.model.shared_names), priors={}, penalties=())
     q = held.start
     held = held.refined(q)
     if len(q) and estimate_initial:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -45,8 +45,19 @@ class Unknowns:
 
     @cached_property
     def free(self) -> tuple[Parameter, ...]:
-        """Free parameters of the model."""
-        return tuple(p for p in self.parameters.values() if p.vary)
+        """Free parameters of the model that all runs share."""
+        return tuple(p for p in self.parameters.values() if p.vary and not p.per_run)
+
+    @cached_property
+    def apart(self) -> tuple[tuple[str, int, Parameter], ...]:
+        """(name, run, unknown) of each parameter that is another in every run.
+
+        The first run's value stands, since phases or resistances take it up; unless nothing else is free, as where a
+        model is judged on other runs.
+        """
+        own = [p for p in self.parameters.values() if p.vary and p.per_run]
+        return tuple((p.name, k, replace(p, name=f"{p.name}[{k}]", value=self.runs[k].apart.get(p.name, p.value)))
+                     for p in own for k in range(1 if self.free else 0, len(self.runs)))
 
     @cached_property
     def initial(self) -> tuple[tuple[str, int, Parameter], ...]:
@@ -65,7 +76,7 @@ class Unknowns:
     @cached_property
     def all(self) -> tuple[Parameter, ...]:
         """Every unknown, in the order of q."""
-        return (*self.free, *(p for _, _, p in self.initial))
+        return (*self.free, *(p for _, _, p in self.initial), *(p for _, _, p in self.apart))
 
     @cached_property
     def scaling(self) -> Scaling:
@@ -76,7 +87,8 @@ class Unknowns:
             natural = natural_sizes([r.experiment for r in self.runs], values)
             sizes = [s if p.positive else max(s, natural.get(p.unit, 0.0))
                      for p, s in zip(self.free, sizes, strict=True)]
-        return Scaling.of(self.all, [*sizes, *(spread_of(self.runs[k].experiment, c) for c, k, _ in self.initial)])
+        spreads = [spread_of(self.runs[k].experiment, c) for c, k, _ in self.initial]
+        return Scaling.of(self.all, [*sizes, *spreads, *(1.0 for _ in self.apart)])
 
     @cached_property
     def start(self) -> Array:
@@ -127,6 +139,16 @@ class Unknowns:
         dp = np.zeros((len(p), len(q)))
         dp[self._columns, np.arange(n)] = slope[:n]
         return Point(q, physical, slope, p, dp)
+
+    def of_run(self, at: Point, k: int) -> Point:
+        """Return `at` with the parameters that run `k` has for itself."""
+        mine = [(n, j) for j, (n, run, _) in enumerate(self.apart, len(self.free) + len(self.initial)) if run == k]
+        if not mine:
+            return at
+        rows, columns = [self.system.parameters.index(n) for n, _ in mine], [j for _, j in mine]
+        p, dp = at.p.copy(), at.dp.copy()
+        p[rows], dp[rows, columns] = at.physical[columns], at.slope[columns]
+        return at._replace(p=p, dp=dp)
 
     def first_state(self, at: Point, k: int) -> Array:
         """Return x0 (nx,) of run `k`."""

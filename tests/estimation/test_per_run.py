@@ -1,0 +1,60 @@
+"""Parameters that are others in every run: the zero of an encoder, a warm start, another supply."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from lab_records import VALUES, drive
+
+import motorid as mi
+from motorid.errors import ModelError, UsageError
+
+TRUTH = {"A": 8e-3, "N": 12.0, "phi": 0.7}
+ZEROS = (0.0, 0.21, -0.13)
+
+
+def turned(zero, volt, rng):
+    """Cogging seen by an encoder whose zero is `zero` away from the first run's."""
+    model = (mi.dc_motor(**VALUES) + mi.effects.cogging).replace(**{**TRUTH, "phi": TRUTH["phi"] + 12 * zero})
+    t = np.arange(500) * 1e-3
+    bare = mi.Experiment(t, {"v": drive(t, volt)}, {c: np.zeros(500) for c in ("i", "omega", "theta")}, name=f"{volt}")
+    shown = mi.simulate(model, bare, initial="rest")[0].outputs
+    noise = {"i": 0.02, "omega": 0.3, "theta": 1e-3}
+    return bare.with_(outputs={c: shown[c] + s * rng.normal(size=500) for c, s in noise.items()})
+
+
+def test_cogging_keeps_its_phase_where_the_encoder_starts_anew_in_every_run(rng):
+    runs = [turned(z, v, rng) for z, v in zip(ZEROS, (2.0, -2.5, 1.5), strict=True)]
+    model = mi.dc_motor() + mi.effects.cogging
+    one, own = mi.fit(model, runs[:2]), mi.fit(model + mi.effects.encoder_zero, runs[:2])
+    assert one.fits == "poor"
+    assert own.fits == "noise"
+    assert (own.values["N"], own.values["z_0"]) == (12, 0)
+    assert own.values["A"] == pytest.approx(TRUTH["A"], rel=0.02)
+    assert own.initial["z_0[1]"] == pytest.approx(ZEROS[1], abs=5e-3)
+    judged = mi.evaluate(own, runs[2:])  # whose own zero is estimated there
+    assert judged.nrmse["omega"] < 0.4 * mi.evaluate(one, runs[2:]).nrmse["omega"]
+    assert mi.check_derivatives(own.problem, own.q).ok
+    assert "Parameters per run" in str(own.card())
+    with pytest.raises(UsageError, match="parameters per run"):
+        mi.fit(model + mi.effects.encoder_zero, runs[:2], solver=mi.MultipleShooting())
+
+
+def test_a_supply_and_a_warm_winding_of_every_run(rng):
+    t, found = np.arange(300) * 4e-3, []
+    warm = mi.dc_motor(**VALUES) + mi.effects.winding_heating + mi.effects.winding_warm_start
+    for dT, volt in ((0.0, 6.0), (60.0, -5.0)):
+        model = warm.replace(R_th=8.0, C_th=0.8, dT_0=dT)
+        bare = mi.Experiment(t, {"v": drive(t, volt)}, {c: np.zeros(300) for c in ("i", "omega")})
+        shown = mi.simulate(model, bare, initial="rest")[0].outputs
+        found.append(bare.with_(outputs={"i": shown["i"] + 0.005 * rng.normal(size=300),
+                                         "omega": shown["omega"] + 0.1 * rng.normal(size=300)}))
+    fit = mi.fit(mi.dc_motor() + mi.effects.winding_heating + mi.effects.winding_warm_start, found)
+    std = np.sqrt(fit.covariance[-1, -1])
+    assert abs(fit.initial["dT_0[1]"] - 60) < 4 * std < 30
+    assert fit.values["R"] == pytest.approx(VALUES["R"], rel=0.02)
+    with pytest.raises(ModelError, match="winding_heating"):
+        mi.fit(mi.dc_motor() + mi.effects.winding_warm_start, found)
+    lower = [found[0], found[0].with_(inputs={"v": found[0].inputs["v"] / 0.9})]
+    supply = mi.fit(mi.dc_motor() + mi.effects.supply_per_run, lower)
+    assert supply.initial["g_v[1]"] == pytest.approx(-0.1, abs=2e-3)
