@@ -99,7 +99,7 @@ def driver_coast(m: Equations, R_c=P(50.0, "Ω", null=0.0, positive=True, grid=(
     m.voltage -= ca.if_else(ca.fabs(m.command) <= OPEN, R_c * m.i - (1 - shorted) * m.K_e * m.omega, 0)
 
 
-LIMITER_GAIN, LIMITER_WIDTH = 20.0, 0.002  # in R: how firmly the current is led to its limit; of R·I_lim: how softly
+LIMITER_GAIN, LIMITER_WIDTH = 5.0, 0.004  # in R: how firmly the current is led to its limit; of R·I_lim: how softly
 
 
 @effect(balance="voltage")
@@ -109,7 +109,7 @@ def driver_current_limit(
 ):
     """Current limit of the driver, which takes voltage away. Mohan, Electric Machines and Drives, 2012.
 
-    The bridge gives no more than what holds the current at its limit, R·I + K·ω, and leads it there within L/(20 R).
+    The bridge gives no more than what holds the current at its limit, R·I + K·ω, and leads it there within L/(5 R).
     """
     width = LIMITER_WIDTH * m.R * I_lim
 
