@@ -107,5 +107,6 @@ def encoder_zero(m: Equations, z_0=P(0.0, "rad", null=0.0, per_run=True, doc="an
     """Zero of the encoder, another in every run: cogging keeps its phase. Isermann, Mechatronic Systems, 2005."""
     m.angle_state()
     m.initial["theta"] = m.start["theta"] + z_0
-    m.replace("zero", z_0)
+    if "theta_in" in m.inputs:
+        m.replace("zero", z_0)
     m.measure("theta", m.measured("theta") - z_0)

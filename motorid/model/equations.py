@@ -43,7 +43,8 @@ class Equations:
         self.placeholders: dict[str, ca.SX] = {}
         self.definitions: dict[str, ca.SX] = {}
         self._replaced: dict[str, str] = {}
-        self.define("zero", 0)  # of the measured angle, where it is given
+        if angle_input:
+            self.define("zero", 0)  # of the measured angle
         self.voltage = ca.SX(0)
         self.torque = ca.SX(0)
         self.sensors: dict[str, ca.SX] = {}
