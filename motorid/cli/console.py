@@ -17,7 +17,7 @@ from typer.core import TyperCommand, TyperGroup
 
 from motorid.display.tables import Table
 from motorid.errors import DataError, ModelError, MotoridError, UsageError, printable
-from motorid.numerics.parallel import interruption
+from motorid.numerics.parallel import interruption, progress
 from motorid.records.files import check_output
 from motorid.records.reading import find_records
 
@@ -191,7 +191,9 @@ def save_report(result: Any, path: Any, held_out: Sequence[Any] = (), force: boo
     from motorid.reports.report import report
 
     command = " ".join(["motorid", *sys.argv[1:]])
-    show(f"Report: {report(result, path, command=command, validate=held_out, force=force)}")
+    with progress("Writing the report"):
+        written = report(result, path, command=command, validate=held_out, force=force)
+    show(f"Report: {written}")
 
 
 def _say(text: str) -> None:

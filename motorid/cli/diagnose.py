@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -66,7 +66,8 @@ def diagnose_command(
     try:
         with progress("Looking for what is missing") as advance:
             found = diagnose(before, held_out or None, also=own, max_effects=max_effects, budget=budget,
-                             progress=lambda word: advance(_as_it_comes(word, done, quiet=json == "-")))
+                             map=_saying(advance),
+                             progress=lambda word: _as_it_comes(word, done, advance, quiet=json == "-"))
     except (Exception, KeyboardInterrupt) as error:
         if interruption.behind(error):
             _keep_fit(before, done, json, options.force)
@@ -83,12 +84,25 @@ def diagnose_command(
         raise typer.Exit(INTERRUPTED)
 
 
-def _as_it_comes(word: str, done: list[str], quiet: bool) -> int:
-    """Write down what was done; print the first answer at once."""
+def _as_it_comes(word: str, done: list[str], advance: Callable[..., None], quiet: bool) -> None:
+    """Write down what was done, and say it; print the first answer at once."""
     done.append(word)
-    if word.startswith("first answer") and not quiet:
+    first = word.startswith("first answer")
+    if first and not quiet:
         show(f"{word[0].upper()}{word[1:]}\n")
-    return 1
+    advance(1, "" if first else word)
+
+
+def _saying(advance: Callable[..., None]) -> Callable[..., Iterator[Any]]:
+    """Return a `map` that says which effect is being fitted."""
+
+    def mapped(function: Callable[[Any], Any], tasks: Iterable[Any]) -> Iterator[Any]:
+        for task in tasks:
+            effect = getattr(task[0] if isinstance(task, tuple) else task, "effect", None)
+            advance(0, f"fitting {effect.name}" if effect is not None else "")
+            yield function(task)
+
+    return mapped
 
 
 def _keep_fit(before: Fit, done: Sequence[str], json: Json, force: bool) -> None:
@@ -145,7 +159,7 @@ def demo_command(
     show(parameter_table(plain), error_table({"": plain.evaluation}, plain.noise),
          "   Its errors are far above the noise: something is missing.\n", "3. What?")
     with progress("Trying the effects of the library") as advance:
-        found = diagnose(plain, check, progress=lambda _: advance(1))
+        found = diagnose(plain, check, map=_saying(advance), progress=lambda word: advance(1, word))
     show(found.missing.text, ranking_table(found.ranking, 4), found.text, "",
          "4. Added, one line of code: fit.model + mi.effects." + (found.effects or ("…",))[0],
          ladder_table(found.ladder),

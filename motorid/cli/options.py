@@ -67,7 +67,7 @@ class ReadingOptions:
     units: Annotated[str | None, _reading(
         metavar="omega=rpm", help="Units of channels, where the header does not tell.")] = None
     hold: Annotated[str | None, _reading(
-        metavar="zoh|linear", help="The input between samples: held or joined by lines.")] = None
+        metavar="zoh|linear", help="The input between samples: constant (zoh) or linear.")] = None
     median: Annotated[int | None, _reading(
         metavar="N", help="Running median over N samples (odd) of a voltage that was measured with noise.")] = None
     levels: Annotated[bool, _reading(
@@ -174,7 +174,7 @@ class FitOptions(ReadingOptions):
         """Fit the model to `runs`."""
         model = self.model(runs) if model is None else model
         with progress(f"Fitting {describe(model)}") as advance:
-            return fit(model, runs, callback=lambda *_: advance(1), **self.keywords())
+            return fit(model, runs, callback=lambda k, *_: advance(1, f"iteration {k}"), **self.keywords())
 
     def _check_words(self) -> None:
         for word, known, what in ((self.drive, DRIVES, "drive"), (self.formulation, FORMULATIONS, "formulation"),

@@ -45,7 +45,7 @@ class Suggestion(Shown):
     experiment : Experiment
         Time and voltage to apply; its outputs are what the first model predicts.
     discrimination : dict of str to float
-        Per candidate: expected chi² per sample between the rivals that are hardest to tell apart.
+        Per candidate: expected chi² per sample between the rivals that are hardest to distinguish.
     """
 
     name: str

@@ -136,7 +136,7 @@ class Candidate:
     parameters : dict of str to float
         Of the effect, SI: refitted values where there was a refit, else predicted.
     group : tuple of str
-        Effects that these data cannot tell from it.
+        Effects that these records do not distinguish from it.
     accepted : bool
     reason : str
         Why it was taken or not.
@@ -227,7 +227,7 @@ class Diagnosis(Shown):
     adequacy, missing, ranking, ladder
         What it rests on; `ranking` is of the first round, best first.
     groups : tuple of tuple of str
-        Effects that these data cannot tell apart.
+        Effects that these records do not distinguish.
     suggestion : str or None
         The experiment that would separate them.
     before, after : Fit

@@ -49,7 +49,7 @@ def fit(model: Model, runs: Sequence[Experiment] | Experiment, *, solver: Any = 
     Parameters
     ----------
     model : Model
-        E.g. ``mi.dc_motor() + mi.effects.coulomb``. Values set by ``replace`` are the start, held ones stay.
+        E.g. ``mi.dc_motor() + mi.effects.coulomb``. Values set by ``replace`` are the start, fixed ones stay.
     runs : Experiment or sequence of Experiment
     solver : LevenbergMarquardt or MultipleShooting, optional
     start : {"auto", "model"}
@@ -130,7 +130,7 @@ def solve(problem: Problem, solver: Any = None, *, start: str = "auto", callback
     if start not in ("auto", "model"):
         raise UsageError(one_of(start, ("auto", "model"), "start"))
     if not problem.unknown:
-        raise UsageError("every parameter is held, there is nothing to fit. Free one, model.free('R'), or judge "
+        raise UsageError("every parameter is fixed, there is nothing to fit. Free one, model.free('R'), or judge "
                          "the model as it is: mi.evaluate(model, runs).")
     auto, effort = start == "auto", solver or FINISH
     if problem.unknowns.apart and hasattr(effort, "solve"):

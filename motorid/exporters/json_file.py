@@ -84,12 +84,12 @@ def remarks(fit: Fit) -> list[str]:
         said.append("The record moves in m: read K in N/A, b in N·s/m, J as a mass in kg, torques as forces in N.")
     motor = [n for n in vague if n in MOTOR]
     if model.base == "dc_motor" and motor and "i" not in measured:
-        said.append(f"The current was not measured, so {_listed(motor)} cannot be told apart: only "
-                    "combinations such as R·J/K and K + R·b/K are determined. Measure the current, or fix R "
+        said.append(f"The current was not measured, so {_listed(motor)} are not determined one by one, only their "
+                    "combinations. Measure the current, or fix R "
                     "where it is known (--fix R=1.2).")
         vague = [n for n in vague if n not in MOTOR and not _a_torque(model, n)]
     elif model.base == "dc_motor" and motor and "omega" not in measured and "theta" not in measured:
-        said.append(f"Neither speed nor angle was measured, so {_listed(motor)} cannot be told apart. "
+        said.append(f"Neither speed nor angle was measured, so {_listed(motor)} are not determined one by one. "
                     "Measure one of them, or fix K (--fix K=0.05).")
         vague = [n for n in vague if n not in MOTOR and not _a_torque(model, n)]
     if vague:

@@ -33,7 +33,7 @@ class Parameter:
     positive : bool
         Lives on a logarithmic scale (R, L, K, b, J, time constants).
     vary : bool
-        False: held at `value` in a fit.
+        False: fixed at `value` in a fit.
     null : float or None
         Value at which the effect vanishes; None for shape parameters (a Stribeck speed, an angle).
     grid : tuple of float
@@ -148,7 +148,7 @@ class Effect(Shown):
         return sizes[0] if sizes else None
 
     def __call__(self, **values: float) -> Effect:
-        """Return the effect with some parameters given, e.g. ``cogging(N=12)`` (held if it is an order)."""
+        """Return the effect with some parameters given, e.g. ``cogging(N=12)`` (fixed if it is an order)."""
         known = {p.name: p for p in self.parameters}
         for name in values:
             if name not in known:

@@ -18,7 +18,7 @@ from motorid.model.definition import Effect, Parameter
 from motorid.model.equations import Equations, System, build_system
 
 SGN_WIDTH = Parameter("sgn_width", 1e-2, "rad/s", positive=True, vary=False,
-                      doc="speed over which sgn(omega) is smoothed; chosen from the data unless given")
+                      doc="speed over which sgn(ω) is smoothed")
 LINEAR_UNITS = {"N·m": "N", "rad/s": "m/s", "rad": "m", "kg·m²": "kg", "N·m·s/rad": "N·s/m",
                 "N·m·s²/rad²": "N·s²/m²", "N·m/rad": "N/m", "N·m·s²": "kg", "1/(N·m)": "1/N"}
 
@@ -91,7 +91,7 @@ class Model(Shown):
         return self._change({n: {"value": _within(self.parameters[n], v)} for n, v in known.items()})
 
     def fix(self, *names: str, **values: float) -> Model:
-        """Return the model with parameters held: ``fix("L")`` at its value, ``fix(R=1.2)`` at a new one."""
+        """Return the model with parameters fixed: ``fix("L")`` at its value, ``fix(R=1.2)`` at a new one."""
         changes: dict[str, dict[str, Any]] = {n: {"vary": False} for n in names}
         changes |= {n: {"value": float(v), "vary": False, "given": True} for n, v in values.items()}
         return self._change(changes)
@@ -148,13 +148,13 @@ class Model(Shown):
         """Return a copy with some fields changed; equations already made stay where they are the same."""
         new = replace(self, **fields, _systems={})
         if new.effect_names == self.effect_names and new.angle_input == self.angle_input:
-            # The equations depend on values only through "L is zero and held", which is part of the key.
+            # The equations depend on values only through "L is zero and fixed", which is part of the key.
             object.__setattr__(new, "_systems", self._systems)
         return new
 
     @property
     def stored(self) -> tuple[str, ...]:
-        """Base states whose balance has storage; with L held at 0 the current is algebraic."""
+        """Base states whose balance has storage; with L fixed at 0 the current is algebraic."""
         inductance = self.parameters.get("L")
         algebraic = inductance is not None and inductance.value == 0 and not inductance.vary
         return tuple(s for s in STATES[self.base] if not (s == "i" and algebraic))
@@ -211,7 +211,7 @@ class Model(Shown):
     def card(self) -> Card:
         """Return the parameters, whether a fit varies them, and where they come from."""
         owner = {p.name: e.name for e in self.effects for p in e.parameters}
-        rows = [[p.name, quantity(p.value, p.unit), "estimated" if p.vary else "held", owner.get(p.name, "base"), p.doc]
+        rows = [[p.name, quantity(p.value, p.unit), ("fixed", "estimated")[p.vary], owner.get(p.name, "base"), p.doc]
                 for p in self.parameters.values()]
         return Card(f"Model: {self.title}", tables=(Table(["parameter", "value", "in a fit", "of", "meaning"], rows),),
                     after=(("mi.fit(model, runs)", "fit it"), ("model + mi.effects.coulomb", "add an effect")))
@@ -274,14 +274,14 @@ def torque_driven(axis: str = "rotary", **values: float) -> Model:
     axis : {"rotary", "linear"}
         Linear: J is a mass (kg), b in N·s/m, g in N per unit of the command.
     **values : float
-        ``g``, ``b``, ``J``. The gain g is held (only ratios to it can be determined) until ``free("g")``.
+        ``g``, ``b``, ``J``. The gain g is fixed (only ratios to it can be determined) until ``free("g")``.
     """
     if axis not in ("rotary", "linear"):
         raise ModelError(one_of(axis, ("rotary", "linear"), "axis"))
     pars = {p.name: p for p in BASES["torque_driven"]}
     if axis == "linear":
         units = {"g": "N/V", "b": "N·s/m", "J": "kg"}
-        docs = {"g": "force per unit of the command; held", "J": "moving mass", "b": "viscous friction"}
+        docs = {"g": "force per unit of the command; fixed", "J": "moving mass", "b": "viscous friction"}
         pars = {n: replace(p, unit=units[n], doc=docs[n]) for n, p in pars.items()}
     return Model("torque_driven", parameters=pars, axis=axis).replace(**values)
 
@@ -303,7 +303,7 @@ BASES = {
                  Parameter("b", 1e-5, "N·m·s/rad", positive=True, doc="viscous friction"),
                  Parameter("J", 1e-5, "kg·m²", positive=True, doc="moment of inertia")),
     "torque_driven": (
-        Parameter("g", 1.0, "N·m/V", positive=True, vary=False, doc="torque per unit of the command; held"),
+        Parameter("g", 1.0, "N·m/V", positive=True, vary=False, doc="torque per unit of the command; fixed"),
         Parameter("b", 1e-3, "N·m·s/rad", positive=True, doc="viscous friction"),
         Parameter("J", 1e-3, "kg·m²", positive=True, doc="moment of inertia"),
     ),

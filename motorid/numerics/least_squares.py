@@ -97,7 +97,7 @@ MESSAGES = {
     "step": "converged: the step is below the tolerance",
     "gradient": "converged: the gradient is zero within rounding",
     "valley": "stalled: the cost hardly falls any more, by less than 0.03 % in 30 steps; identifiability() shows "
-              "whether parameters cannot be told apart",
+              "whether parameters are determined",
     "stalled": "stalled: no step lowers the cost; the model may be too stiff here. Try another start or engine",
     "limit": "stopped after {} iterations; raise max_iterations or look at identifiability()",
 }

@@ -295,13 +295,13 @@ def progress(text: str, total: float | None = None, *, quiet: bool = False) -> I
     text : str
         What is being done, e.g. ``"Refitting"``.
     total : float, optional
-        Number of tasks; None shows a running bar without an end.
+        Number of tasks; then the time left is shown, too. None: what is at work, and for how long.
     quiet : bool
 
     Yields
     ------
     callable
-        ``advance(n=1)``.
+        ``advance(n=1, at_work="")``.
 
     Examples
     --------
@@ -310,17 +310,20 @@ def progress(text: str, total: float | None = None, *, quiet: bool = False) -> I
     ...         advance()
     """
     if quiet or _showing.get() or not _watched():
-        yield lambda n=1.0: None
+        yield lambda n=1.0, at_work="": None
         return
+    from rich import progress as rich
     from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    columns: list[rich.ProgressColumn] = [rich.SpinnerColumn(), rich.TextColumn("{task.description}")]
+    columns += [rich.BarColumn(), rich.MofNCompleteColumn()] if total else []
+    columns += [rich.TimeElapsedColumn(), *([rich.TimeRemainingColumn()] if total else [])]
     token = _showing.set(True)
     try:
-        with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        with rich.Progress(*columns, console=Console(stderr=True), transient=True) as bar:
             task = bar.add_task(text, total=total)
-            yield lambda n=1.0: bar.advance(task, n)
+            yield lambda n=1.0, at_work="": bar.update(task, advance=n, description=f"{text}: {at_work}" * bool(at_work)
+                                                       or text)
     finally:
         _showing.reset(token)
 

@@ -198,7 +198,7 @@ def frame_table(frame: Any) -> TextTable:
     for label, (_, series) in zip(labels, frame.items(), strict=True):
         if pd.api.types.is_numeric_dtype(series.dtype) and not pd.api.types.is_complex_dtype(series.dtype):
             columns[label], bad = numbers(series)
-            notes += [f"{counted(bad, 'cell')} of '{label}' infinite; taken as missing."] if bad else []
+            notes += [f"{counted(bad, 'cell')} of '{label}' infinite: counted as missing."] if bad else []
         else:
             texts[label] = series.astype(str).tolist()
     return TextTable(columns, texts, labels, notes=notes)

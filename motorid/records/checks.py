@@ -60,7 +60,7 @@ def _excitation(run: Experiment) -> str | None:
     v = run.inputs["v"]
     if np.ptp(v) <= 1e-6 * np.abs(v).max():
         return (f"the voltage is {v[0]:.4g} {run.units['v']} from beginning to end; such a run alone "
-                "cannot tell the parameters apart. Add runs with steps or a sweep of the voltage.")
+                "cannot distinguish the parameters. Add runs with steps or a sweep of the voltage.")
     still = [c for c, y in run.outputs.items() if np.nanmax(y) == np.nanmin(y)]
     if still:
         return (f"the {NAMES[still[0]]} never changes although the voltage does; a dead sensor, a "
@@ -111,7 +111,7 @@ def current_limit(run: Experiment) -> str | None:
             held += b - a
     if held < 0.02 * run.n:
         return None
-    return (f"the current is held at {top:.3g} {run.units['i']} while the voltage stays and the speed changes "
+    return (f"the current stays at {top:.3g} {run.units['i']} while the voltage stays and the speed changes "
             f"({100 * held / run.n:.0f} % of the samples): a current limit of the driver? Then the motor does not get "
             "the voltage that was logged. Use a lower voltage, log the voltage at the motor's terminals, or model it: "
             "mi.effects.driver_current_limit.")
@@ -220,7 +220,7 @@ def _never_reverses(runs: Sequence[Experiment]) -> str | None:
     low, high = min(r.inputs["v"].min() for r in runs), max(r.inputs["v"].max() for r in runs)
     if low > -0.02 * high or high < -0.02 * low:
         return ("the voltage never reverses in any run: effects that depend on the direction (dry friction against a "
-                "constant load, asymmetry, backlash) cannot be told apart. Add a run with both signs.")
+                "constant load, asymmetry, backlash) cannot be distinguished. Add a run with both signs.")
     return None
 
 

@@ -204,7 +204,7 @@ def _note_gaps(t: Array, said: list[str]) -> None:
         return
     long = pauses(t)
     gaps = np.setdiff1d(np.flatnonzero(steps > 5 * np.median(steps)), long)
-    for found, what in ((long, "what follows is fitted as a run of its own"), (gaps, "the input is taken as going on")):
+    for found, what in ((long, "what follows is fitted as a run of its own"), (gaps, "the input is assumed to go on")):
         if found.size:
             worst = found[np.argmax(steps[found])]
             how_many = "a gap in time," if found.size == 1 else f"{found.size} gaps in time, the longest"

@@ -191,7 +191,7 @@ class Experiment(Shown):
             rows.append([f"{NAMES[name]} {name}", f"{limits[0]} … {limits[1]} {self.units[name]}" if limits else "–",
                          Flag(f"{missing} of {len(y)}", "note") if missing else "none"])
         head = (f"{self.n} samples in {duration(self.duration)}, {number(1e3 * self.dt, 3)} ms apart; "
-                f"input {'held' if self.hold == 'zoh' else 'linear'} between samples.")
+                f"input {'constant' if self.hold == 'zoh' else 'linear'} between samples.")
         return Card(f"Run {self.name}", text=(head, *(str(n) for n in self.meta.get("notes", ()))),
                     tables=(Table(["channel", "range", "missing samples"], rows),),
                     after=(("mi.plot_runs(run)", "see it"), ("mi.fit(mi.dc_motor(), [run])", "fit a model")))

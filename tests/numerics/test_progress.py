@@ -64,3 +64,11 @@ def test_pipe_stays_clean_and_rich_is_not_loaded():
             "assert 'rich' not in sys.modules")
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+
+def test_what_is_at_work_is_said_and_no_total_is_made_up(monkeypatch):
+    screen = terminal(monkeypatch)
+    with progress("Looking") as advance:
+        advance(1, "fitting coulomb")
+    assert "Looking: fitting coulomb" in screen.getvalue()
+    assert "?" not in screen.getvalue().replace("\x1b[?25", "")

@@ -196,7 +196,7 @@ def test_a_current_held_by_the_driver_is_told(plant, rng):
             i = float(np.clip(i, -limit, limit))
             omega += 5e-5 * (machine.K * i - machine.b * omega) / machine.J
     noisy = {c: np.array(y) + 0.003 * np.std(y) * rng.normal(size=len(t)) for c, y in held.items()}
-    assert f"the current is held at {limit:.3g} A" in said(Experiment(t, {"v": v}, noisy))
+    assert f"the current stays at {limit:.3g} A" in said(Experiment(t, {"v": v}, noisy))
     free = plant.simulate(machine, {}, t, v)
     assert "held at" not in said(Experiment(t, {"v": v}, {c: free[c] for c in noisy}))
 

@@ -33,7 +33,7 @@ AT_LIMIT = 1e-9  # distance of a solver coordinate from a limit of its parameter
 KEPT = "Start_Kept"
 SAID = {
     KEPT: ("stalled", "stalled: the interior-point solver found nothing better than the least-squares fit that it "
-                      "started from, which is kept; identifiability() shows which parameters cannot be told apart"),
+                      "started from, which is kept; identifiability() shows which parameters are not determined"),
     "Maximum_Iterations_Exceeded": (
         "limit", "stopped at the largest number of iterations; raise max_iterations, or start from a least-squares "
                  "fit: mi.fit(fit.model, …, solver=mi.MultipleShooting(warm='model'))"),
