@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 
 
 def _leave(kind: type[BaseException], error: BaseException, trace: object) -> None:
@@ -63,10 +64,23 @@ class OutOfTime(Exception):
 
 
 # What may go wrong with one of many models without stopping the others.
-FAILURES = (FitError, SimulationError, ModelError, np.linalg.LinAlgError)
+FAILURES = (FitError, SimulationError, ModelError, np.linalg.LinAlgError, ArithmeticError)
 
 
-_CONTROLS = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u202a-\u202e\u2066-\u2069]")
+@contextlib.contextmanager
+def numbers_told() -> Iterator[None]:
+    """Turn what arithmetic raises at numbers beyond all bounds into a `FitError`; also a decorator."""
+    try:
+        yield
+    except (ArithmeticError, ValueError) as error:
+        if type(error) is ValueError and "infs or NaNs" not in str(error):
+            raise
+        raise FitError(f"the numbers of these records, or of this model, are beyond what can be computed ({error}). "
+                       "Look at the units of the columns, and at the values that were set.") from error
+
+
+
+_CONTROLS = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
 
 
 def printable(text: str) -> str:

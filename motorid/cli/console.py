@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import codecs
 import contextlib
+import os
 import shlex
 import sys
 import textwrap
@@ -12,6 +13,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import typer
 from typer.core import TyperCommand, TyperGroup
 
@@ -71,6 +73,9 @@ class Group(TyperGroup):
         except BrokenPipeError:
             sys.stderr.close()  # nobody reads any more, e.g. `motorid fit … | head`
             status = FAILED
+        except (ArithmeticError, np.linalg.LinAlgError, MemoryError) as error:
+            _say(f"the numbers or the size of these records are beyond what can be computed ({error}).")
+            status = FAILED
         except Exception as error:
             if not hasattr(error, "format_message"):
                 raise
@@ -85,6 +90,7 @@ def prepare_process() -> None:
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="motorid")  # type: ignore[union-attr]
+    os.environ["MPLBACKEND"] = "agg"  # figures go to files, whatever backend a shell names
     warnings.simplefilter("ignore", RuntimeWarning)  # of arithmetic: what came of it is said
     warnings.formatwarning = lambda message, *_, **__: f"motorid: {message}\n"
     interruption.listen()

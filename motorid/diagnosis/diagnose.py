@@ -30,7 +30,7 @@ from motorid.diagnosis.verdict import (
     unfinished_remark,
     window_remark,
 )
-from motorid.errors import MotoridError
+from motorid.errors import MotoridError, numbers_told
 from motorid.estimation.result import Fit, checked
 from motorid.model.definition import Effect
 from motorid.numerics.parallel import one_thread
@@ -39,6 +39,7 @@ from motorid.records.experiment import Experiment, repeated
 
 
 @one_thread
+@numbers_told()
 def diagnose(fit: Fit, validate: Sequence[Experiment] | Experiment | None = None, *,
              effects: Iterable[Effect | str] | None = None, also: Iterable[Effect] = (), max_effects: int = 3,
              budget: float | None = None, map: Callable[..., Iterable[Any]] = builtins.map,

@@ -60,7 +60,9 @@ def raced(fit: Fit, model: Model, starts: Sequence[Mapping[str, float]]) -> Race
     for start in (*(starts or ({},)), *_own_starts(fit, model)):
         # As it is where a parameter put back (an inductance that no sample shows) makes the model too stiff.
         for each in (alive,) if alive is model else (alive, model):
-            done = _race(_started(fit, each, start, angular))
+            done = None
+            with contextlib.suppress(*FAILURES):  # a start that the model cannot take is none
+                done = _race(_started(fit, each, start, angular))
             if done is not None:
                 problem, cost = restarted(done.problem, done.solution.q), float(done.solution.history[-1])
                 found.append(Raced(problem, cost, angular))
@@ -134,7 +136,9 @@ def _own_starts(fit: Fit, model: Model) -> list[dict[str, float]]:
     """
     if not lost(fit):
         return []
-    return [first_guess(model, fit.problem.experiments, loaded=True)]
+    with contextlib.suppress(*FAILURES):
+        return [first_guess(model, fit.problem.experiments, loaded=True)]
+    return []
 
 
 def _started(fit: Fit, model: Model, start: Mapping[str, float], angular: bool) -> Problem:
@@ -162,7 +166,8 @@ def _bounded(fit: Fit, model: Model) -> Model:
         for p in (model.parameters[q.name] for q in e.parameters):
             if p.grid and p.null is None and p.vary and not p.given:
                 size = natural.get(p.unit, 1.0)
-                limits[p.name] = (max(p.lower, min(p.grid) * size / ROOM), min(p.upper, max(p.grid) * size * ROOM))
+                low, high = max(p.lower, min(p.grid) * size / ROOM), min(p.upper, max(p.grid) * size * ROOM)
+                limits |= {p.name: (low, high)} if low < high else {}
     inside = {n: float(np.clip(model.parameters[n].value, *limits[n])) for n in limits}
     pars = {n: replace(model.parameters[n], value=inside[n], lower=lo, upper=hi) for n, (lo, hi) in limits.items()}
     return model.with_(parameters={**model.parameters, **pars})

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from motorid.errors import FAILURES, FitError, UsageError, one_of
+from motorid.errors import FAILURES, UsageError, numbers_told, one_of
 from motorid.estimation.angle_orders import effects_of_unknown_order, strongest_order
 from motorid.estimation.continuation import by_continuation
 from motorid.estimation.least_squares import FINISH, Callback, Estimate, least_squares
@@ -39,6 +39,7 @@ MOST_FINER = 4  # times as many steps, where that is not kept
 
 
 @one_thread
+@numbers_told()
 def fit(model: Model, runs: Sequence[Experiment] | Experiment, *, solver: Any = None, start: str = "auto",
         engine: str | Engine = "rosenbrock", formulation: str = "plain",
         priors: Mapping[str, tuple[float, float]] | None = None, penalties: Sequence[Any] = (),
@@ -120,6 +121,7 @@ def fit(model: Model, runs: Sequence[Experiment] | Experiment, *, solver: Any = 
 
 
 @one_thread
+@numbers_told()
 def solve(problem: Problem, solver: Any = None, *, start: str = "auto", callback: Callback = None,
           formulation: str = "plain") -> Fit:
     """Solve a `Problem`; `fit` is this with the problem made on the way. See there."""
@@ -183,7 +185,7 @@ def _with_orders(problem: Problem) -> Problem:
             break
         try:
             fit = _fit(smaller, FINISH)
-        except FitError:
+        except FAILURES:
             break
         found = strongest_order(fit, waiting)
         if found is None:

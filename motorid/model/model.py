@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
@@ -171,7 +172,14 @@ class Model(Shown):
                 raise ModelError(f"the law of the effect '{e.name}' is not here: it was defined in another "
                                  "session. Define it again and build the model anew.")
             m.writer = e.name
-            e.law(m, **{p.name: symbols[p.name] for p in e.parameters})
+            try:
+                e.law(m, **{p.name: symbols[p.name] for p in e.parameters})
+            except ModelError:
+                raise
+            except (Exception, SystemExit) as error:  # whatever the user's own code raises
+                raise ModelError(f"the effect '{e.name}' cannot be written as equations ({type(error).__name__}: "
+                                 f"{error}). Its law is traced with symbols: in place of Python's if, float and numpy "
+                                 "take m.sign, ca.if_else, ca.fabs and the like.") from None
         return m
 
     def system(self, outputs: Iterable[str]) -> System:
@@ -250,7 +258,22 @@ def _shared_system(model: Model, outputs: tuple[str, ...]) -> System:
     """Return the system of the model's structure, shared by all models that differ in values only."""
     slot = _known_of((*_structure(model), outputs, model.stored))
     if not slot:
-        slot.append(build_system(model.write(), tuple(model.parameters), outputs, model.stored))
+        equations, title = model.write(), " + ".join([model.base, *model.effect_names])
+        try:
+            system = build_system(equations, tuple(model.parameters), outputs, model.stored)
+            _ = system.visible  # its slopes
+        except (RuntimeError, IndexError, TypeError) as error:  # CasADi's, and of shapes that are no single number
+            raise ModelError(f"the equations of {title} cannot be built and differentiated: "
+                             f"{str(error).splitlines()[-1]}.") from None
+        f = system.rhs
+        if any(f.instruction_id(k) == ca.OP_CALL for k in range(f.n_instructions())):
+            raise ModelError(f"the equations of {title} call a function that is no arithmetic, so they cannot be "
+                             "differentiated: write it with CasADi's own operations.")
+        if not all(math.isfinite(f.instruction_constant(k)) for k in range(f.n_instructions())
+                   if f.instruction_id(k) == ca.OP_CONST):
+            raise ModelError(f"the equations of {title} hold a number that is not finite: did a law turn a symbol into "
+                             "a float?")
+        slot.append(system)
     return slot[0]
 
 
@@ -287,9 +310,8 @@ def torque_driven(axis: str = "rotary", **values: float) -> Model:
 
 
 def _within(parameter: Parameter, value: float) -> float:
-    """Undo the rounding that a value at its limit suffers on the way through the solver's coordinates."""
-    limit = min(max(value, parameter.lower), parameter.upper)
-    return limit if abs(value - limit) <= 1e-9 * abs(limit) else value
+    """Return a value inside the limits of a parameter."""
+    return min(max(value, parameter.lower), parameter.upper)
 
 
 TITLES = {"dc_motor": "DC motor", "torque_driven": "torque-driven axis"}

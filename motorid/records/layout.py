@@ -66,6 +66,8 @@ def assign(labels: Sequence[str], *, columns: Mapping[str, object] | None = None
         If a channel, column or unit is unknown, two columns claim one channel, or the time, the drive voltage
         or every measured channel is missing.
     """
+    if not labels:
+        raise DataError("it has no columns.")
     row = {label: parse_unit((unit_row or {}).get(label, "")) for label in labels}
     units = units or {}
     places = _named_by_user(labels, columns or {}, units, row)

@@ -165,6 +165,10 @@ def _expand(path: Path) -> list[Path]:
 
 
 def _what_is_there(folder: Path, wanted: str | None = None) -> str:
+    try:
+        os.getcwd()
+    except OSError:
+        return "The working directory does not exist any more."
     if not folder.is_dir():
         return f"Its folder {folder} does not exist, either; the working directory is {Path.cwd()}."
     names = sorted((f.name for f in folder.iterdir() if f.is_dir() or _is_record(f)), key=str.lower)
