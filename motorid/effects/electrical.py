@@ -69,6 +69,7 @@ def magnet_heating(m: Equations,
     """Heating of the magnets, K/(1+α·ΔT). Hendershot & Miller, Permanent-Magnet Machines, 2010.
 
     ``C_th dΔT/dt = R i² − ΔT/R_th``, ΔT = 0 at the start of each run; neodymium has half of ferrite's coefficient.
+    Seen as a no-load speed that rises within minutes of heavy use.
     """
     dT = m.state("dT_magnet")
     m.scale("K", 1 / (1 + alpha_m * dT))
@@ -81,6 +82,7 @@ def supply_sag(m: Equations, R_s=P(0.1, "Ω", null=0.0, lower=0.0, doc="resistan
     """Sag of the supply, d·(V_s − R_s·d·i), d = v/V_s. Mohan, Electric Machines and Drives, 2012.
 
     Only R_s/V_s² acts. Unless V_s is given it is the largest voltage of the records: the duty is one there.
+    Seen as a voltage missing with the duty squared and the current: steps to several duties, under load.
     """
     m.voltage -= R_s * (m.command / V_s) ** 2 * m.i
 
@@ -94,6 +96,7 @@ def driver_coast(m: Equations, R_c=P(50.0, "Ω", null=0.0, positive=True, grid=(
     """Coasting of the driver: at command 0 its bridge opens. Mohan, Electric Machines and Drives, 2012.
 
     The diodes put the supply against the current; linear, that is L di/dt = −(R + R_c) i, without the back-EMF.
+    Seen where the command is 0: no current while the motor turns, and a slow run-down.
     """
     shorted = ca.exp(-3 * R_c / m.R)  # what is left of the back-EMF: 1 at R_c = 0, none behind an open bridge
     m.voltage -= ca.if_else(ca.fabs(m.command) <= OPEN, R_c * m.i - (1 - shorted) * m.K_e * m.omega, 0)
@@ -110,6 +113,7 @@ def driver_current_limit(
     """Current limit of the driver, which takes voltage away. Mohan, Electric Machines and Drives, 2012.
 
     The bridge gives no more than what holds the current at its limit, R·I + K·ω, and leads it there within L/(5 R).
+    Seen as a flat top of the current: hard steps from rest, reversals.
     """
     width = LIMITER_WIDTH * m.R * I_lim
 

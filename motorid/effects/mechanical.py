@@ -106,7 +106,10 @@ def lugre(m: Equations, tau_c=P(2e-3, "N·m", null=0.0, lower=0.0, doc="Coulomb 
 @effect(balance="torque")
 def eddy_brake(m: Equations, c_e=P(1e-5, "N·m·s/rad", null=0.0, lower=0.0, doc="drag per speed when slow"),
                omega_b=P(50.0, "rad/s", positive=True, grid=(0.1, 0.3, 0.8), doc="speed of the largest torque")):
-    """Eddy-current brake, c·ω/(1+(ω/ω_b)²). Wouterse, IEE Proc. B 138(4), 1991."""
+    """Eddy-current brake, c·ω/(1+(ω/ω_b)²). Wouterse, IEE Proc. B 138(4), 1991.
+
+    Seen as a drag that rises and then falls with the speed: a staircase up to full speed.
+    """
     m.torque -= c_e * m.omega / (1 + (m.omega / omega_b) ** 2)
 
 
@@ -115,7 +118,10 @@ def angular_friction(m: Equations, tau_m=P(2e-3, "N·m", null=0.0, lower=0.0, do
                      a_f=P(0.5, "", lower=0.0, upper=1.0, doc="relative amplitude"),
                      N_f=P(1.0, "", vary=False, lower=1.0, doc="periods per turn, fixed"),
                      phi_f=P(0.0, "rad", periodic=True, grid=QUARTERS, doc="phase at theta = 0")):
-    """Friction that varies over a turn (a bent shaft), τ(1+a·sin(Nθ+φ))·sgn ω. Armstrong-Hélouvry, 1991."""
+    """Friction that varies over a turn (a bent shaft), τ(1+a·sin(Nθ+φ))·sgn ω. Armstrong-Hélouvry, 1991.
+
+    Seen as a friction that repeats every turn in both directions: turn slowly, measure the angle.
+    """
     m.torque -= tau_m * (1 + a_f * ca.sin(N_f * m.theta + phi_f)) * m.sign(m.omega)
 
 
@@ -125,6 +131,7 @@ def gear_efficiency(m: Equations, mu_d=P(0.1, "", null=0.0, lower=0.0, upper=1.0
     """Efficiency of the gear, another share of the torque when driven back. Wang & Kim, ICRA, 2015.
 
     Only with J known (fixed) can the two shares be determined; otherwise `load_friction` does the same with another J.
+    Seen in hard braking beside hard acceleration.
     """
     carried, s = m.K_t * m.i if "i" in m.states else m.g * m.v, m.sign(m.omega)
     m.torque -= s * (mu_d * (ca.fabs(carried) + carried * s) + mu_b * (ca.fabs(carried) - carried * s)) / 2
@@ -133,7 +140,10 @@ def gear_efficiency(m: Equations, mu_d=P(0.1, "", null=0.0, lower=0.0, upper=1.0
 @effect(balance="torque")
 def spring(m: Equations, k_s=P(1e-3, "N·m/rad", null=0.0, lower=0.0, doc="stiffness"),
            theta_0=P(0.0, "rad", doc="angle at which it is relaxed")):
-    """Spring to the frame (a return spring, a flexure), k·(θ−θ₀). Meirovitch, Fundamentals of Vibrations, 2001."""
+    """Spring to the frame (a return spring, a flexure), k·(θ−θ₀). Meirovitch, Fundamentals of Vibrations, 2001.
+
+    Seen as an angle that comes back at 0 V: small steps from rest, angle measured.
+    """
     m.torque -= k_s * (m.theta - theta_0)
 
 

@@ -61,7 +61,10 @@ def speed_gain(m: Equations, k_w=P(0.01, "", null=0.0, lower=-0.9, upper=9.0, do
 
 @effect(balance="sensor")
 def speed_average(m: Equations, T_a=P(5e-3, "s", null=0.0, positive=True, grid=(2.0, 6.0, 20.0), doc="window of mean")):
-    """Averaging of the speed over a window (counts), Padé of orders 2 and 3. Golub & Van Loan, 2013, sec. 9.3."""
+    """Averaging of the speed over a window (counts), Padé of orders 2 and 3. Golub & Van Loan, 2013, sec. 9.3.
+
+    Seen as straight flanks that come late after reversals.
+    """
     # (1 − e⁻ˣ)/x = (120 + 2x²)/(120 + 60x + 12x² + x³) at x = Ts, exact up to x⁵.
     reaching = m.measured("omega")
     z = [m.state("omega_mean", m.start["omega"]), m.state("omega_mean_2"), m.state("omega_mean_3")]
@@ -97,6 +100,7 @@ def supply_side_current(m: Equations, V_dc=P(12.0, "V", positive=True, vary=Fals
 
     With u_i = 1 it has no sign, whichever way the motor is driven. Unless V_dc is given it is the largest voltage of
     the records; where it is larger, R, L, b and J come out wrong by that factor.
+    Seen as next to no current at small duties, whatever the load.
     """
     duty = ca.fmin(ca.fabs(m.command) / V_dc, 1) * (1 + u_i * (ca.sign(m.command) - 1))
     m.measure("i", m.measured("i") * (1 - s_i + s_i * duty))
