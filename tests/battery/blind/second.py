@@ -25,7 +25,8 @@ S("lugre_arm", "arm", {"lugre": (.04, .06, .05, .03)}, "posloop:0.15 ramps:0.3",
 S("drag_pump", "pump", {"quadratic_drag": .12}, "stair telegraph", "steps", rho=.6, drop=.03)
 S("eddy_reel", "reel", {"eddy_brake": (.8, .2)}, "stair steps", "telegraph")
 S("eddy_pump_counts", "pump", {"eddy_brake": (.5, .35)}, "stair telegraph", "ramps", cpr=1000, adc=11)
-S("angfriction_winch", "winch", {"angular_friction": (.06, .7, .4)}, "ramps:0.5 steps:0.5", "telegraph:0.6", **A)
+S("angfriction_winch", "winch", {"angular_friction": (.06, .7, .4)}, "ramps:0.5 steps:0.5", "telegraph:0.6",
+  **A, h_=2.5e-5)
 S("angfriction_arm", "arm", {"angular_friction": (.07, .5, 2.0)}, "telegraph:0.6 stopgo:0.6", "ramps:0.5", **A, rho=.5)
 S("viscasym_belt", "belt", {"viscous_asymmetric": .05}, "steps speedloop", "ramps", hum=.02)
 S("loadfric_winch", "winch", {"load_friction": .18}, "mprbs stopgo", "telegraph", rho=.7)
