@@ -325,11 +325,13 @@ def value_tables(fit: Fit) -> list[Table]:
 
 
 def per_run_table(fit: Fit) -> Table | None:
-    """Return the parameters that are others in every run."""
+    """Return the parameters that are others in every run; None without any."""
+    if not any(p.per_run for p in fit.model.parameters.values()):
+        return None
     sd = dict(zip((p.name for p in fit.problem.unknown), np.sqrt(np.diag(fit.covariance)), strict=True))
     rows = [(name, fit.problem.experiments[k].name, with_error(fit.initial[p.name], float(sd[p.name]), p.unit))
             for name, k, p in fit.problem.unknowns.apart]
-    return Table(("parameter", "run", "value ± std"), rows, "Parameters per run", left=(0, 1, 2)) if rows else None
+    return Table(("parameter", "run", "value ± std"), rows, "Parameters per run", left=(0, 1, 2))
 
 
 def determined_table(fit: Fit) -> Table | None:
