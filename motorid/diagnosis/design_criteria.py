@@ -34,7 +34,6 @@ from motorid.model.equations import System
 from motorid.model.model import Model
 from motorid.numerics.parallel import check_time, interruption
 from motorid.numerics.signals import Array
-from motorid.problem.sensitivity import relative_jacobian
 from motorid.problem.unknowns import Scaling
 
 STEPS = 4  # Gauss-Newton steps of the rivals' refit within one evaluation
@@ -76,16 +75,20 @@ class Rival:
     @staticmethod
     def of(fit: Fit, name: str = "") -> Rival:
         """Return the rival that a fit is."""
-        problem, k = fit.problem, len(fit.problem.model.free_names)
+        problem, k = fit.problem, len(fit.problem.unknowns.free)
         runs = problem.experiments
         sigma = {c: max(s, 1e-300) * max(fit.misfit[c], 1.0) for c, s in fit.noise.items() if c in problem.outputs}
-        size = max(1.0, *(fit.misfit[c] for c in sigma))
-        jac = relative_jacobian(problem, fit.q) / size
+        n = problem.n_outputs
+        jac, r = fit.jacobian[:n] * problem.scaling.slope(fit.q), fit.residuals[:n]
+        whole = jac.T @ jac / max(float(r @ r) / fit.dof, float(problem.weights == "noise"))
+        # What is another in every run, initial states above all, is estimated too (Schur's complement).
+        known = whole[:k, :k] - whole[:k, k:] @ np.linalg.pinv(whole[k:, k:], hermitian=True) @ whole[k:, :k]
         seen = {c: max(float(np.nanmax(np.abs({**r.inputs, **r.outputs}[c]))) for r in runs
                        if c in {**r.inputs, **r.outputs}) for c in ("v", *sigma)}
         seen |= {"duration": max(r.duration for r in runs), "dt": float(np.median([r.dt for r in runs]))}
-        return Rival(name or fit.model.title, fit.model.with_(angle_input=False), sigma, problem.scaling.scale[:k],
-                     jac.T @ jac, seen)
+        of_runs = [n for n, p in fit.model.parameters.items() if p.vary and p.per_run]  # as in the first run
+        return Rival(name or fit.model.title, fit.model.with_(angle_input=False).fix(*of_runs), sigma,
+                     problem.scaling.scale[:k], known, seen)
 
     @cached_property
     def scaling(self) -> Scaling:

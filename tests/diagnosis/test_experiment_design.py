@@ -89,6 +89,27 @@ def test_a_rival_that_can_follow_is_no_evidence(tasks, fits):
     assert max(w.value for w in twin.criteria(LEVELS_TRIED, twin.respond(LEVELS_TRIED), False)) < 1e-6
 
 
+def test_what_the_records_know_are_the_deviations_of_the_fit(fits):
+    rival = Rival.of(fits[0])
+    white = np.sqrt(np.diag(fits[0].covariance))
+    names = [p.name for p in fits[0].problem.unknown]
+    told = rival.deviations(rival.known)
+    for name in ("R", "K", "J", "tau_0"):
+        assert told[name] == pytest.approx(white[names.index(name)], rel=0.1)
+
+
+def test_what_is_another_in_every_run_is_no_parameter_to_design_for(first):
+    model = mi.dc_motor() + mi.effect(balance="voltage")(offset)
+    rival = Rival.of(mi.fit(model, [first, first.with_(name="again")]))
+    assert "V_r" not in rival.model.free_names
+    assert rival.information.shape == (5, 5)
+
+
+def offset(m, V_r=mi.P(0.0, "V", null=0.0, per_run=True)):
+    """An offset of the voltage that is another in every run."""
+    m.voltage += V_r
+
+
 # -- the design --------------------------------------------------------------------------------------------
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -130,32 +130,8 @@ class ShootingNlp:
         return nlp, {**derivatives, "hess_lag": hess_lag}
 
 
-class Nlp(Protocol):
-    """What `Ipopt` solves: limits of the rows, the factor on f and the multipliers, values and derivatives."""
-
-    lower: Array
-    upper: Array
-    scale: float
-
-    def values(self, z: Array) -> list[Any]:
-        """Return f and g."""
-        ...
-
-    def gradient(self, z: Array) -> list[Any]:
-        """Return f and its gradient."""
-        ...
-
-    def jacobian(self, z: Array) -> list[Any]:
-        """Return g and its Jacobian's entries."""
-        ...
-
-    def functions(self) -> tuple[ca.Callback, dict[str, ca.Callback]]:
-        """Return the NLP and its derivatives in CasADi's naming."""
-        ...
-
-
-def callbacks(nlp: Nlp, n: int, m: int, jac: ca.Sparsity) -> tuple[ca.Callback, dict[str, ca.Callback]]:
-    """Return the NLP and its first derivatives in CasADi's naming: n unknowns, m rows."""
+def callbacks(nlp: Any, n: int, m: int, jac: ca.Sparsity) -> tuple[ca.Callback, dict[str, ca.Callback]]:
+    """Return an NLP of n unknowns and m rows, as its `values`, `gradient` and `jacobian`, in CasADi's naming."""
     x, p, f, g = D(n, 1), D(0, 0), D(1, 1), D(m, 1)
     values = _Function("nlp", ["x", "p"], ["f", "g"], [x, p], [f, g], lambda z, _: nlp.values(z))
     grad_f = _Function("nlp_grad_f", ["x", "p"], ["f", "grad:f:x"], [x, p], [f, x], lambda z, _: nlp.gradient(z))
@@ -239,9 +215,12 @@ class Ipopt:
     verbose: bool = False
     more: Mapping[str, Any] = field(default_factory=dict)
 
-    def solve(self, nlp: Nlp, z0: Array, bounds: tuple[Array, Array], warm: NlpResult | None = None,
+    def solve(self, nlp: Any, z0: Array, bounds: tuple[Array, Array], warm: NlpResult | None = None,
               near: bool = False) -> NlpResult:
-        """Solve from `z0`, which may be near a solution, or from an earlier result of the same size."""
+        """Solve `nlp`, a `ShootingNlp` or one with its `functions`, `lower`, `upper` and `scale`.
+
+        `z0` may be near a solution, or there may be an earlier result of the same size.
+        """
         function, derivatives = nlp.functions()
         options: dict[str, Any] = {
             "max_iter": self.max_iterations, "tol": self.tol, "constr_viol_tol": 1e-10, "dual_inf_tol": 1e-6,
