@@ -16,6 +16,7 @@ from motorid.channels import CHANNELS
 from motorid.errors import DataError, UsageError
 
 FILL_UP_TO = 60.0  # s; a longer gap is marked by its first and last sample alone
+MOST_FILLED = 200_000  # rows; likewise
 SYNC_EVERY = 0.5  # s between two calls of fsync: what is older than that survives a power cut
 _COLUMNS = {("v", "V"): "voltage_V", ("i", "A"): "current_A", ("omega", "rad/s"): "speed_rad_s",
             ("omega", "m/s"): "speed_m_s", ("theta", "rad"): "angle_rad", ("theta", "m"): "position_m"}
@@ -191,7 +192,7 @@ class RecordFile:
         start = self._last.time if self._last else -1 / self.rate
         held = self._last.values[self._v] if self._last else 0.0
         step = (end.time - start) / (n + 1)
-        which = range(n) if n <= FILL_UP_TO * self.rate else (0, n - 1)
+        which = range(n) if n <= min(FILL_UP_TO * self.rate, MOST_FILLED) else (0, n - 1)
         for k in which:
             known = commanded(first + k)
             held = held if known is None else known

@@ -24,6 +24,7 @@ from motorid.records.datasets import load_plant
 LINES_PER_TURN = 4096  # encoder counts, after quadrature
 NOISE = 0.5  # standard deviation of the converters' noise, in counts
 BLOCK = 256  # samples whose noise is drawn at once
+SIGNED = ("phi", "_0", "k_w", "b_a")  # in names of parameters that may be negative
 OVER_LIMIT = 3  # samples in a row beyond the current limit that switch the motor off
 
 Draw = Callable[[float, float], float]  # a number between two, evenly on a log scale
@@ -282,9 +283,13 @@ def _effect(word: str, motor: Any, draw: Draw) -> tuple[str, dict[str, float]]:
         raise UsageError(one_of(name, ["none", "random", *known], "effect"))
     if numbers:
         try:
-            return name, {k: float(v) for k, v in (n.split("=") for n in numbers)}
+            given = {k: float(v) for k, v in (n.split("=") for n in numbers)}
         except ValueError:
             raise UsageError(f"'{word}': numbers are given as {name}:name=value:name=value.") from None
+        for key, value in given.items():
+            if not math.isfinite(value) or (value < 0 and not any(s in key for s in SIGNED)):
+                raise UsageError(f"'{word}': {key} must be a size, finite and not negative; got {value:g}.")
+        return name, given
     if name not in SIZES:
         raise UsageError(f"no size is drawn for '{name}'; spell its numbers out, as in {name}:name=value. "
                          f"Drawn are: {', '.join(SIZES)}.")

@@ -19,7 +19,7 @@ from motorid.acquire.server import Faults, Pace, Wire, open_transport, serve
 from motorid.acquire.session import Progress
 from motorid.acquire.virtual import VirtualDevice, hide
 from motorid.cli.console import FAILED, INTERRUPTED
-from motorid.errors import printable
+from motorid.errors import UsageError, printable
 
 Port = Annotated[str, typer.Option(help="Serial port of the bench: /dev/ttyACM0, COM3, socket://127.0.0.1:7000.")]
 Out = Annotated[Path, typer.Option(help="The CSV to write.")]
@@ -127,6 +127,9 @@ def bench_command(effect: HiddenEffect = "random", motor: MotorName = "lab", see
 
     Example: motorid bench --effect random --seed 7 --reveal
     """
+    for name, value in (("speed", speed), ("unplug-after", unplug_after), ("plug-after", plug_after)):
+        if value is not None and not 0 <= value < math.inf:
+            raise UsageError(f"--{name} takes a number that is finite and not negative; got {value:g}.")
     seed = secrets.randbelow(1_000_000) if seed is None else seed
     truth, names = hide(effect, motor, seed), tuple(channels.replace(" ", "").split(","))
     VirtualDevice(truth, rate, names)  # complain before anything opens

@@ -269,7 +269,7 @@ def saved_model(path: Path, effects_from: Path | None = None) -> Model:
         found = load(path, own.values())
         return found if isinstance(found, Model) else found.model
     except ModelError as error:
-        if effects_from is not None:
+        if effects_from is not None or "mi.load(path, effects=" not in str(error):
             raise
         raise ModelError(f"{error} On the command line: --effects-from FILE.py") from None
 

@@ -16,7 +16,7 @@ import numpy as np
 from motorid.display.numbers import counted
 from motorid.errors import DataError, MissingDependency
 from motorid.records.experiment import MIN_SAMPLES
-from motorid.records.text_tables import TextTable, numbers, unique_labels
+from motorid.records.text_tables import MOST_COLUMNS, TextTable, numbers, unique_labels
 
 # Numbers of the MAT-file format, version 5.
 _MATRIX, _COMPRESSED, _UINT32 = 14, 15, 6
@@ -24,6 +24,7 @@ _INT32 = (5, 6)  # some writers call it unsigned
 _SIZES = {1: 1, 2: 1, 3: 2, 4: 2, 5: 4, 6: 4, 7: 4, 9: 8, 12: 8, 13: 8, 16: 1, 17: 2, 18: 4}
 _CELL, _STRUCT, _CHAR, _NUMBERS = 1, 2, 4, range(6, 16)
 _DEEPEST = 20
+MOST_UNPACKED = 512_000_000  # bytes
 
 Element = tuple[int, bytes]
 
@@ -69,10 +70,15 @@ def _check_whole(data: bytes) -> None:
     order = {b"IM": "<", b"MI": ">"}.get(data[126:128])
     if order is None:
         return  # version 4 or no MATLAB file at all: SciPy says so without harm
+    left = MOST_UNPACKED
     try:
         for kind, content in _elements(data[128:], order):
             if kind == _COMPRESSED:
-                [(kind, content)] = _elements(zlib.decompress(content), order)
+                unpacked = zlib.decompressobj().decompress(content, left)
+                left -= len(unpacked)
+                if left <= 0:
+                    raise DataError(f"it unpacks to more than {MOST_UNPACKED / 1e6:.0f} MB; save less in one file.")
+                [(kind, content)] = _elements(unpacked, order)
             _need(kind == _MATRIX)
             _check_matrix(content, order, 0)
     except (ValueError, zlib.error, struct.error):
@@ -177,10 +183,17 @@ def parquet_table(data: bytes) -> TextTable:
     import pandas as pd
 
     try:
-        import pyarrow  # noqa: F401
+        import pyarrow.parquet
     except ImportError:
         raise MissingDependency("Parquet files need pyarrow, which is not installed: "
                                 "pip install 'motorid[parquet]', or export CSV.") from None
+    try:
+        about = pyarrow.parquet.read_metadata(io.BytesIO(data))
+    except Exception as error:  # whatever its C++ side throws
+        raise DataError(f"it cannot be read as Parquet ({_first_line(error)}).") from None
+    if 8 * about.num_rows * about.num_columns > MOST_UNPACKED or about.num_columns > MOST_COLUMNS:
+        raise DataError(f"its {about.num_rows} rows of {about.num_columns} columns are more than can be read at once; "
+                        "save fewer.")
     try:
         frame = pd.read_parquet(io.BytesIO(data), engine="pyarrow")
     except Exception as error:  # pyarrow raises whatever its C++ side throws

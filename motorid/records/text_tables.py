@@ -18,6 +18,7 @@ from motorid.errors import DataError
 from motorid.records.headers import parse_unit
 
 _COMMENT = ("#", "%", "//")
+MOST_COLUMNS = 5000
 _LARGEST = 1e30  # what is larger, or infinite, was not measured
 MISSING = frozenset(["", "nan", "na", "n/a", "null", "none", "-", "--", "---", "?", "missing", "#n/a"])
 _NUMBER = re.compile(r"[-+]?(?:(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?|inf)", re.IGNORECASE)
@@ -71,6 +72,10 @@ def parse_table(data: bytes) -> TextTable:
     body = [line for line in lines if not line.lstrip().startswith(_COMMENT)]
     if not body:
         raise DataError("it holds no rows" + (", only comments." if comments else "; the file is empty."))
+    cells = len(re.findall(r"[\t;, ]+", body[len(body) // 2]))
+    if cells > MOST_COLUMNS:
+        raise DataError(f"a row has about {cells} cells; at most {MOST_COLUMNS} columns are read. Is there one row per "
+                        "sample?")
     dialect, width = sniff(body)
     first = next((k for k, line in enumerate(body) if is_data(dialect.cells(line), dialect, width)), None)
     if first is None:
