@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from motorid.channels import CHANNELS
 from motorid.errors import UsageError, one_of
 from motorid.estimation.result import Fit
-from motorid.numerics.autoregression import autocorrelation
+from motorid.numerics.autoregression import autocorrelation, effective_samples
 from motorid.numerics.signals import Array
 from motorid.plots import style
 from motorid.problem.simulate import Simulation
@@ -22,11 +22,11 @@ BINS = 24
 
 @style.styled
 def plot_residuals(fit: Fit, channels: Sequence[str] | None = None) -> np.ndarray:
-    """Draw the residuals of each channel: over time, their histogram and autocorrelation, against
-    the model's ω, i, θ.
+    """Draw the residuals of each channel: over time, their histogram, their correlation with the input and with
+    themselves, against the model's ω, i, θ.
 
-    What only noise leaves over is flat: a histogram under the curve of the normal distribution, an
-    autocorrelation within its band of 95 %, means of zero against every quantity.
+    What only noise leaves over is flat: a histogram under the curve of the normal distribution, correlations within
+    their bands of 95 %, means of zero against every quantity.
 
     Parameters
     ----------
@@ -37,7 +37,7 @@ def plot_residuals(fit: Fit, channels: Sequence[str] | None = None) -> np.ndarra
     Returns
     -------
     ndarray of Axes, shape (channels, k)
-        Time, histogram, autocorrelation, then one per quantity known.
+        Time, histogram, cross-correlation with the input, autocorrelation, then one per quantity known.
     """
     sims = fit.simulations
     present = [c for c in CHANNELS if any(c in s.experiment.outputs and c in s.outputs for s in sims)]
@@ -48,15 +48,16 @@ def plot_residuals(fit: Fit, channels: Sequence[str] | None = None) -> np.ndarra
     against = [c for c in ("omega", "i", "theta") if c in present]
     figure = style.new_figure(style.WIDTH, 3.3 * len(names) + 0.2)
     rows = figure.add_gridspec(2 * len(names), 12)
-    axes = np.empty((len(names), 3 + len(against)), object)
+    axes = np.empty((len(names), 4 + len(against)), object)
     for j, c in enumerate(names):
-        axes[j, 0] = figure.add_subplot(rows[2 * j, :9])
-        axes[j, 1] = figure.add_subplot(rows[2 * j, 9:], sharey=axes[j, 0])
+        axes[j, 0] = figure.add_subplot(rows[2 * j, :7])
+        axes[j, 1] = figure.add_subplot(rows[2 * j, 7:9], sharey=axes[j, 0])
+        axes[j, 2] = figure.add_subplot(rows[2 * j, 9:])
         width = 12 // (1 + len(against))
         for k in range(1 + len(against)):
-            axes[j, 2 + k] = figure.add_subplot(rows[2 * j + 1, k * width : (k + 1) * width])
+            axes[j, 3 + k] = figure.add_subplot(rows[2 * j + 1, k * width : (k + 1) * width])
         _channel(axes[j], fit, c, against)
-    figure.align_ylabels([row[k] for row in axes for k in (0, 2)])
+    figure.align_ylabels([row[k] for row in axes for k in (0, 3)])
     return axes
 
 
@@ -70,15 +71,16 @@ def _channel(axes: np.ndarray, fit: Fit, channel: str, against: Sequence[str]) -
                title=f"Residual of the {style.axis_label(channel, run)}")
     every = np.concatenate([s.residual(channel) for s in sims])
     _histogram(axes[1], style.finite(every, f"the residual of {channel}"), sigma)
-    _autocorrelation(axes[2], [s.residual(channel) for s in sims])
-    for ax, other in zip(axes[3:], against, strict=True):
+    _with_input(axes[2], sims, channel)
+    _autocorrelation(axes[3], [s.residual(channel) for s in sims])
+    for ax, other in zip(axes[4:], against, strict=True):
         # The model's own: the measured one shares its noise with the residual, which then seems to depend.
         with_other = [s for s in sims if other in s.outputs]
         _against(ax, [s.outputs[other] for s in with_other], [s.residual(channel) for s in with_other], sigma)
         style.tidy(ax, x=style.axis_label(other, run), title=f"Against {style.axis_label(other, run).split(' (')[0]}")
-        ax.sharey(axes[3])
-    if len(axes) > 3:
-        axes[3].set_ylabel(f"residual ({unit})")
+        ax.sharey(axes[4])
+    if len(axes) > 4:
+        axes[4].set_ylabel(f"residual ({unit})")
 
 
 def _over_time(ax: Axes, sims: Sequence[Simulation], channel: str, sigma: float) -> None:
@@ -107,8 +109,25 @@ def _histogram(ax: Axes, r: Array, sigma: float) -> None:
     ax.set_xlim(0, 1.25 * max(top, float(bell.max()) if bell.max() < 4 * top else top))
     ax.set_xticks([])
     ax.tick_params(labelleft=False)
-    style.tidy(ax, x="density", title="Histogram")
-    style.above(ax)
+    style.tidy(ax, x="density (line: noise)", title="Histogram")
+
+
+def _with_input(ax: Axes, sims: Sequence[Simulation], channel: str) -> None:
+    """Correlate the residual with the input at lags of either sign; both share the band of coloured residuals."""
+    lags = min(LAGS, min(s.experiment.n for s in sims) // 3)
+    k = np.arange(-lags, lags + 1)
+    total, size, worth = np.zeros(len(k)), np.zeros(2), 0.0
+    for s in sims:
+        r, u = np.nan_to_num(s.residual(channel)), s.experiment.inputs["v"]
+        r, u = r - r.mean(), u - u.mean()
+        total += np.array([r[max(j, 0):len(r) + min(j, 0)] @ u[max(-j, 0):len(u) - max(j, 0)] for j in k])
+        size += r @ r, u @ u
+        worth += effective_samples(r)
+    style.band(ax, 1.96 / np.sqrt(max(worth, 1.0)))
+    ax.vlines(k, 0, total / np.sqrt(np.prod(size) or 1.0), color=style.PALETTE["purple"], lw=0.9)
+    ax.axhline(0, color=style.MUTED, lw=0.6)
+    ax.set_ylim(-0.6, 0.6)
+    style.tidy(ax, x="lag (samples)", title="Input correlation")
 
 
 def _autocorrelation(ax: Axes, residuals: Sequence[Array]) -> None:
@@ -116,13 +135,12 @@ def _autocorrelation(ax: Axes, residuals: Sequence[Array]) -> None:
     every = np.concatenate(list(residuals))
     rho = autocorrelation([r - np.nanmean(every) for r in residuals], lags)
     half = 1.96 / np.sqrt(np.isfinite(every).sum())
-    style.band(ax, half, "white noise, 95 %")
+    style.band(ax, half)
     k = np.arange(1, lags + 1)
     ax.vlines(k, 0, rho[1:], color=style.PALETTE["purple"], lw=1.2)
     ax.axhline(0, color=style.MUTED, lw=0.6)
     ax.set_ylim(min(-0.25, float(rho.min()) * 1.1), max(0.4, min(1.05, float(rho[1:].max(initial=0)) * 1.25)))
     style.tidy(ax, x="lag (samples)", y="correlation", title="Autocorrelation")
-    style.above(ax)
 
 
 def _against(ax: Axes, x: Sequence[Array], r: Sequence[Array], sigma: float) -> None:

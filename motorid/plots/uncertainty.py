@@ -236,13 +236,15 @@ def _sorted_costs(ax: Axes, result: Multistart, ends: Sequence[tuple[StartResult
     for kind, colour in _KINDS.items():
         where = np.flatnonzero([k == kind for _, k in ends])
         if where.size:
-            ax.plot(where + 1, ratio[where], "o", ms=4, color=colour, label=f"{kind} ({where.size})")
+            word = {"good": "agree", "poor": "elsewhere"}.get(kind, kind)
+            ax.plot(where + 1, ratio[where], "o", ms=4, color=colour, label=word)
     ax.set_yscale("log")
     ax.set_ylim(0.9, max(2.2, float(ratio.max(initial=1.0)) * 1.5))
     style.plain_decades(ax)
-    words = f"{len(result.results)} starts, off by up to {result.spread:g} times"
-    words += f", {result.failed} failed" if result.failed else ""
-    style.tidy(ax, x="fits, best first", y="misfit over the best (χ² ratio)", title=words)
+    words = f"{result.good} of {len(result.results)} agree"
+    words += f"; {result.poor} ended elsewhere" if result.poor else ""
+    words += f"; {result.failed} failed" if result.failed else ""
+    style.tidy(ax, x="fits, best first", y="squared error over the best (ratio)", title=words)
     ax.legend(loc="upper left")
 
 
@@ -262,4 +264,5 @@ def _starts_and_ends(ax: Axes, result: Multistart, ends: Sequence[tuple[StartRes
         style.plain_decades(ax)
     ax.set_xticks(range(len(names)), names)
     ax.set_xlim(-0.6, len(names) - 0.4)
-    style.tidy(ax, y="value over the reference", title="Where they began (dots) and ended (circles)")
+    words = f"Starts (dots, up to {result.spread:g} times off) and ends (circles)"
+    style.tidy(ax, y="value over that of the best fit", title=words)
