@@ -39,6 +39,7 @@ from motorid.problem.unknowns import Scaling
 STEPS = 4  # Gauss-Newton steps of the rivals' refit within one evaluation
 REGION = 2.0  # standard deviations within which the truth may lie
 SETTLED = 0.01  # relative fall of χ² at which it ends
+ROUNDING = 1e-10  # of the information, beside which the prior of one unit would be lost
 BESIDE = 1e-4  # of a unit of the solver's coordinates, for differences of slopes
 DEVIATIONS = 3.0  # of the prediction that a limit keeps away
 NOISES = 4.0  # standard deviations of the sensor's noise that it keeps away besides
@@ -98,13 +99,14 @@ class Rival:
     @cached_property
     def known(self) -> Array:
         """Information before the experiment, with a prior of one unit (a factor of e) that keeps it regular."""
-        return self.information + np.eye(len(self.scale))
+        return self.information + np.eye(len(self.scale)) + ROUNDING * np.diag(np.diag(self.information))
 
     def deviations(self, information: Array) -> dict[str, float]:
         """Return one standard deviation per free parameter, SI, of an information matrix."""
         names = self.model.free_names
         slope = self.scaling.slope(self.scaling.scaled([self.model.values[n] for n in names]))
-        return dict(zip(names, (np.sqrt(np.diag(np.linalg.inv(information))) * slope).tolist(), strict=True))
+        variances = np.maximum(np.diag(np.linalg.inv(information)), 0.0)
+        return dict(zip(names, (np.sqrt(variances) * slope).tolist(), strict=True))
 
     def draws(self, n: int, rng: np.random.Generator) -> Array:
         """Return `n` displacements (n, k) of the parameters as uncertain as the records leave them."""
@@ -324,10 +326,11 @@ class Value(NamedTuple):
     slope: Array = np.zeros(0)
 
 
-def separation(truth: Driven, rival: Driven, levels: Array, ra: Response, rb: Response, slopes: bool) -> Value:
+def separation(truth: Driven, rival: Driven, levels: Array, ra: Response, rb: Response, slopes: bool,
+               region: float = REGION) -> Value:
     """Return the χ² that a rival leaves where another model is the truth, once fitted to old and new records.
 
-    The truth is the least favourable one within `REGION` standard deviations of its values. `ra` and `rb` are the
+    The truth is the least favourable one within `region` standard deviations of its values. `ra` and `rb` are the
     answers at the values of the old records, with slopes by parameter.
     """
     k, both = len(truth.rival.scale), (truth, rival)
@@ -337,7 +340,7 @@ def separation(truth: Driven, rival: Driven, levels: Array, ra: Response, rb: Re
     for _ in range(STEPS):
         s = np.concatenate([ra.dy[:, :, -k:], -rb.dy[:, :, k - len(delta):]], axis=2).reshape(-1, len(delta))
         error = (ra.y - rb.y).ravel()
-        step = _worst_case(s.T @ s, s.T @ (s @ delta - error), prior) - delta
+        step = _worst_case(s.T @ s, s.T @ (s @ delta - error), prior, region) - delta
         before, after = chi2, error + s @ step
         if after @ after + (delta + step) @ prior[1] @ (delta + step) > (1 - SETTLED) * chi2:
             break
@@ -360,13 +363,13 @@ def separation(truth: Driven, rival: Driven, levels: Array, ra: Response, rb: Re
     return Value(chi2, 2 * np.tensordot(ra.y - rb.y, ga - gb, 2))
 
 
-def _worst_case(normal: Array, right: Array, prior: Array) -> Array:
-    """Return δ that minimises ½δᵀ(normal + prior₁)δ − rightᵀδ where δᵀ·prior₀·δ is at most `REGION`², by bisection."""
+def _worst_case(normal: Array, right: Array, prior: Array, region: float) -> Array:
+    """Return δ that minimises ½δᵀ(normal + prior₁)δ − rightᵀδ where δᵀ·prior₀·δ is at most `region`², by bisection."""
     low, high = -12.0, 12.0
     for _ in range(20):
         middle = 0.5 * (low + high)
         delta = np.linalg.solve(normal + prior[1] + 10**middle * prior[0], right)
-        low, high = (middle, high) if delta @ prior[0] @ delta > REGION**2 else (low, middle)
+        low, high = (middle, high) if delta @ prior[0] @ delta > region**2 else (low, middle)
     return np.linalg.solve(normal + prior[1] + 10**high * prior[0], right)
 
 
@@ -408,6 +411,8 @@ class Task:
         (truth, rival) to distinguish.
     slew : float
         Largest change of the voltage along a ramp, V/s.
+    nominal : frozenset of (int, int)
+        Pairs whose truth is taken as it was fitted: within its uncertainty nothing would distinguish them.
     """
 
     driven: tuple[Driven, ...]
@@ -416,6 +421,7 @@ class Task:
     asked: tuple[str, ...]
     pairs: tuple[tuple[int, int], ...]
     slew: float
+    nominal: frozenset[tuple[int, int]] = frozenset()
 
     @property
     def layout(self) -> Layout:
@@ -441,7 +447,8 @@ class Task:
                 found.append(Value(value / size, slope / size))
             return found
         for i, j in self.pairs:
-            value, slope = separation(self.driven[i], self.driven[j], levels, answers[i], answers[j], slopes)
+            value, slope = separation(self.driven[i], self.driven[j], levels, answers[i], answers[j], slopes,
+                                      0.0 if (i, j) in self.nominal else REGION)
             found.append(Value(float(np.log1p(value)), slope / (1 + value)))
         return found
 

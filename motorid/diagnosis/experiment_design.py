@@ -270,8 +270,8 @@ def design_experiment(found: Diagnosis | Fit | Sequence[Fit | Rival], *, goal: s
 
     Distinguishing is T-optimal (Atkinson & Fedorov, Biometrika 62, 1975): the largest least χ² between any two
     rivals, the one refitted to all records, the other, the truth, anywhere within two standard deviations of its
-    values. Sharpening is D-optimal (Fedorov, Theory of Optimal Experiments, 1972; for some of the parameters D_s):
-    log det of the Fisher information, that of the records so far included. Both are solved as an NLP (IPOPT) with the
+    values (as fitted, where that would hide the difference). Sharpening is D-optimal (Fedorov, Theory of Optimal
+    Experiments, 1972; for some of the parameters D_s): log det of the Fisher information, that of the records so far included. Both are solved as an NLP (IPOPT) with the
     exact derivatives of the discrete step, from fixed candidates as starts; the limits are constraints for every
     rival, kept away from by the prediction's uncertainty, and checked again with drawn parameters.
 
@@ -320,6 +320,7 @@ def design_experiment(found: Diagnosis | Fit | Sequence[Fit | Rival], *, goal: s
     limits = _limits(rivals, v_max or seen["v"], i_max, omega_max, theta_range, temp_max)
     layout = _layout(shape, levels, duration, max(dt, 0.5 * duration / SAMPLES), limits["v"][1])
     task = _task(rivals, layout, {s: x for s, x in limits.items() if s != "v"}, asked, slew)
+    task = _hopeful(task)
     fixed = _fixed(task)
     say("compared fixed candidates")
     with limited_time(budget):
@@ -345,6 +346,16 @@ def _optimised(task: Task, say: Callable[[str], None]) -> DesignNlp:
     if not done:
         raise FitError("no record stays within the limits with all models; allow more voltage, current or angle.")
     return max(done, key=lambda nlp: nlp.best_value)
+
+
+def _hopeful(task: Task) -> Task:
+    """Return the task with the truth as it was fitted in pairs where within its uncertainty no candidate would do."""
+    every = [task.layout.of(c) for _, c in _starts(task, (0.0,)).values()] if task.pairs else []
+    if not every:
+        return task
+    worth = [[w.value for w in task.criteria(levels, task.respond(levels), False)] for levels in every]
+    best = np.max(worth, axis=0)
+    return replace(task, nominal=frozenset(p for p, b in zip(task.pairs, best, strict=True) if b <= HOPELESS))
 
 
 def _without_traces(c: Array) -> Array:
