@@ -269,7 +269,8 @@ class Diagnosis(Shown):
     def summary(self) -> Card:
         """Return the answer alone: the verdict, the errors before and after, the next step."""
         flags = (Flag(self.verdict, VERDICT_MOODS[self.verdict]), *([Flag(self.where)] if self.where else []))
-        return Card("Diagnosis", flags, (self.answer or self.text,), (ladder_table(self.ladder),), self._next())
+        text = (self.answer or self.text, f"Next experiment: {self.suggestion}" if self.suggestion else "")
+        return Card("Diagnosis", flags, text, (ladder_table(self.ladder),), self._next())
 
     def _next(self) -> tuple[tuple[str, str], ...]:
         kind = self.remainder.kind if self.remainder else "noise"
@@ -290,10 +291,9 @@ class Diagnosis(Shown):
     def card(self) -> Card:
         """Return the answer, then what it rests on: place, parameters before and after, the effects tried."""
         first = self.summary()
-        text = [f"Next experiment: {self.suggestion}"] if self.suggestion else []
         tables = [parameter_table(self.after, self.before)] if self.after is not self.before else []
         tables += [ranking_table(self.ranking, 6)] if self.ranking else []
-        return replace(first, text=(*first.text, *text, *self.details), tables=(*first.tables, *tables))
+        return replace(first, text=(*first.text, *self.details), tables=(*first.tables, *tables))
 
     def __str__(self) -> str:
         return str(self.summary())
