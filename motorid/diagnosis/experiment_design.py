@@ -273,7 +273,8 @@ def design_experiment(found: Diagnosis | Fit | Sequence[Fit | Rival], *, goal: s
     values (as fitted, where that would hide the difference). Sharpening is D-optimal (Fedorov, Theory of Optimal
     Experiments, 1972; for some of the parameters D_s): log det of the Fisher information, that of the records so far
     included. Both are solved as an NLP (IPOPT) with the exact derivatives of the discrete step, from fixed candidates
-    as starts; the limits are constraints for every rival, kept away from by the prediction's uncertainty, and checked again with drawn parameters.
+    as starts; the limits are constraints for every rival, kept away from by the prediction's uncertainty, and checked
+    again with drawn parameters.
 
     It is a local optimum, as good as the rivals: where all of them are wrong, it promises nothing, nor do the limits.
 
