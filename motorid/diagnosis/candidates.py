@@ -18,7 +18,7 @@ from motorid.diagnosis.cross_validation import HeldOut
 from motorid.diagnosis.misspecification import LIMITER
 from motorid.diagnosis.model_comparison import COMMON, Node, beats, evidence, far, node_of, superfluous
 from motorid.diagnosis.predictive_score import Evidence
-from motorid.diagnosis.refit import GivenUp, Task, lost, refit, refits, widened
+from motorid.diagnosis.refit import GivenUp, Task, completed, lost, refit, refits, widened
 from motorid.diagnosis.results import Candidate
 from motorid.diagnosis.score_test import Score, pairs_of, rank
 from motorid.diagnosis.thresholds import MATERIAL
@@ -92,15 +92,16 @@ class Search:
         short = self._shortlist(node)
         tasks = [Task(node.fit, present + s.effect, s.effect, s.starts, s.drop) for s in short]
         tasks += [widened(node.fit, e) for e in wider]
-        fits = refits(tasks, self.map)
-        self.advance(f"refitted {len(fits)}")
-        children, judged = [], {}
-        for e, fit in zip([*(s.effect for s in short), *wider], fits, strict=True):
-            child, candidate = self._judge(node, (e,), fit)
-            judged[e.name] = candidate
-            if child is not None:
-                children.append(child)
-        return children, self.listed(scores, judged)
+        fits = dict(zip((t.effect.name for t in tasks), refits(tasks, self.map), strict=True))
+        self.advance(f"refitted {sum(isinstance(f, Fit) for f in fits.values())} of {len(fits)}")
+        found = {t.effect.name: self._judge(node, (t.effect,), fits[t.effect.name]) for t in tasks}
+        begun = {n: f for n, f in fits.items() if isinstance(f, GivenUp) and f.begun is not None}
+        if begun and all(child is None or child.objection for child, _ in found.values()):  # what led is refused
+            later = dict(zip(begun, completed(list(begun.values()), self.map), strict=True))
+            found |= {t.effect.name: self._judge(node, (t.effect,), later[t.effect.name])
+                      for t in tasks if t.effect.name in later}
+        children = [child for child, _ in found.values() if child is not None]
+        return children, self.listed(scores, {name: candidate for name, (_, candidate) in found.items()})
 
     def _shortlist(self, node: Node) -> list[Score]:
         """Return what is worth a refit: the best, what is common and near the best, and what a score cannot show.

@@ -14,7 +14,7 @@ from motorid.diagnosis.cross_validation import QUICK, ROUGH, restarted
 from motorid.diagnosis.model_comparison import far
 from motorid.diagnosis.record_parts import worth_its_steps
 from motorid.diagnosis.score_test import uses_angle
-from motorid.diagnosis.thresholds import NATS
+from motorid.diagnosis.thresholds import MATERIAL, NATS
 from motorid.errors import FAILURES, OutOfTime
 from motorid.estimation.continuation import by_continuation
 from motorid.estimation.first_guess import first_guess
@@ -41,10 +41,12 @@ WORSE = 1.02  # of the cost along the measured angle: the model's own angle must
 
 @dataclass(frozen=True, eq=False)
 class Raced:
-    """The best of several starts of one model after a few steps, and the cost it has reached."""
+    """The best of several starts of one model after a few steps: the cost it has reached, and the one that an undamped
+    step from there promises."""
 
     problem: Problem
     cost: float
+    reach: float
     angular: bool
 
 
@@ -64,8 +66,8 @@ def raced(fit: Fit, model: Model, starts: Sequence[Mapping[str, float]]) -> Race
             with contextlib.suppress(*FAILURES):  # a start that the model cannot take is none
                 done = _race(_started(fit, each, start, angular))
             if done is not None:
-                problem, cost = restarted(done.problem, done.solution.q), float(done.solution.history[-1])
-                found.append(Raced(problem, cost, angular))
+                reach = _undamped(done.solution.residual, done.solution.jac)
+                found.append(Raced(restarted(done.problem, done.q), float(done.cost), reach, angular))
                 break
     return min(found, key=lambda r: r.cost, default=None)
 
@@ -78,10 +80,14 @@ def promised(fit: Fit, model: Model, starts: Sequence[Mapping[str, float]]) -> f
             problem = _started(fit, _bounded(fit, model), start, angular=False)
             problem = problem.refined(problem.start) if like is None else replace(problem, _runs=like.runs)
             like = problem
-            r, jac = problem.residual_and_jacobian(problem.start)
-            triangle: Array = np.asarray(np.linalg.qr(np.column_stack([jac, r]), mode="r"))
-            lowest = min(lowest, 0.5 * float(np.sum(triangle[jac.shape[1] :, -1] ** 2)))
+            lowest = min(lowest, _undamped(*problem.residual_and_jacobian(problem.start)))
     return lowest
+
+
+def _undamped(r: Array, jac: Array) -> float:
+    """Return the cost that one undamped step promises."""
+    triangle: Array = np.asarray(np.linalg.qr(np.column_stack([jac, r]), mode="r"))
+    return 0.5 * float(np.sum(triangle[jac.shape[1] :, -1] ** 2))
 
 
 def finished(fit: Fit, best: Raced) -> Fit | None:
@@ -221,11 +227,14 @@ def _within(model: Model, values: Mapping[str, float]) -> Model:
     return model.start_at(inside)
 
 
+OUTDONE = 1.5  # times the least cost of a race: 20 nats away from a tie at 100 effective samples
 BEHIND = 10.0  # times the cost of a model that explains all but noise
 HARDLY = 1.01  # times: near enough that a slope tells what more would do
 FAR_LESS = 0.3  # of the promise that was kept
 OUT_OF_TIME = "the time is up"
 INTERRUPTED = "interrupted"
+LESS = "rejected: after the first steps of a refit far behind others"
+NOTHING = "rejected: no gain after the first steps of a refit"
 FAR_BEHIND = "rejected: {} alone already reaches the noise"
 NEARLY = 0.9  # of the best promise: a smaller model with that is the favourite
 
@@ -251,10 +260,12 @@ class Task:
 
 @dataclass(frozen=True)
 class GivenUp:
-    """A refit that was not finished: why, and which share of the squared misfit it had taken away, if it was begun."""
+    """A refit that was not finished: why, which share of the squared misfit it had taken away, if it was begun, and how
+    to finish it, if that may be asked for."""
 
     why: str
     drop: float | None = None
+    begun: tuple[Task, Raced] | None = None
 
 
 def refits(tasks: Sequence[Task], map_: Callable[..., Iterable[Any]]) -> list[Fit | GivenUp | None]:
@@ -297,9 +308,28 @@ def _refit_all(tasks: Sequence[Task], map_: Callable[..., Iterable[Any]],
             found[first] = _finish((tasks[first], races[first]))
         if _quiet(found[first]) is not None:
             found.update(_beaten(tasks, {k: race.cost for k, race in races.items()}, first) | found)
+        found.update(_outdone(tasks, races, found))
     rest = sorted((k for k in races if k not in found), key=lambda k: races[k].cost)
     for k, fit in zip(rest, map_(_finish, [(tasks[k], races[k]) for k in rest]), strict=True):
         found[k] = fit
+
+
+def completed(given_up: Sequence[GivenUp], map_: Callable[..., Iterable[Any]]) -> list[Fit | GivenUp | None]:
+    """Return the refits that were only begun, finished; what cannot be stays given up."""
+    begun = [g.begun for g in given_up if g.begun is not None]
+    done = iter(list(map_(_finish, begun)))
+    return [next(done) if g.begun is not None else g for g in given_up]
+
+
+def _outdone(tasks: Sequence[Task], races: Mapping[int, Raced], found: Mapping[int, Any]) -> dict[int, GivenUp]:
+    """Return the races that an undamped step from their end still leaves far behind, or with nothing gained."""
+    least, given_up = min(race.cost for race in races.values()), {}
+    for k, race in races.items():
+        before = tasks[k].fit.cost
+        if k not in found and race.reach > min(OUTDONE * least, (1 - MATERIAL) ** 2 * before):
+            why = NOTHING if race.reach > (1 - MATERIAL) ** 2 * before else LESS
+            given_up[k] = GivenUp(why, 1 - race.cost / max(before, 1e-300), (tasks[k], race))
+    return given_up
 
 
 def _leader(tasks: Sequence[Task]) -> int | None:
@@ -340,8 +370,7 @@ def _needless(tasks: Sequence[Task], leader: int, best: Fit, map_: Callable[...,
 
 
 def _given_up(task: Task, cost: float, why: str) -> GivenUp:
-    before = 0.5 * float(np.sum(task.fit.residuals**2))
-    return GivenUp(why, 1 - cost / max(before, 1e-300))
+    return GivenUp(why, 1 - cost / max(task.fit.cost, 1e-300))
 
 
 def _beaten(tasks: Sequence[Task], costs: Mapping[int, float], first: int) -> dict[int, GivenUp]:
