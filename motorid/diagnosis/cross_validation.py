@@ -74,11 +74,13 @@ class HeldOut:
                     found.setdefault(c, []).append(e)
             except FAILURES:
                 return {}
-        return {
-            c: Errors(tuple(v for e in both for v in e.values), tuple(b for e in both for b in e.blocks),
-                      both[0].measured, both[0].noise)
-            for c, both in found.items()
-        }
+        return {c: self._joined(*both) for c, both in found.items() if len(both) == 2}
+
+    @staticmethod
+    def _joined(first: Errors, second: Errors) -> Errors:
+        """Return the errors on both halves as one, in the blocks of the runs: comparable with blocks left out."""
+        values = tuple(np.where(np.isfinite(a), a, b) for a, b in zip(first.values, second.values, strict=True))
+        return Errors(values, first.blocks, float(np.hypot(first.measured, second.measured) / np.sqrt(2)), first.noise)
 
 
 def _fold(problem: Problem, odd: int) -> tuple[Problem, tuple[Experiment, ...]]:

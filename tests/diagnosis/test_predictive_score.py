@@ -22,6 +22,7 @@ from motorid.diagnosis.predictive_score import (
 )
 from motorid.diagnosis.thresholds import BLOCKS, MATERIAL, NATS, STANDARD_ERRORS
 from motorid.estimation.fit import solve
+from motorid.records.datasets import data_path
 from motorid.records.experiment import Experiment
 
 
@@ -298,3 +299,16 @@ def test_false_effects_are_refused_and_true_ones_taken(simulated_pairs):
     assert [e for e in true if not e.worth_it] == []
     assert any(e.fall > MATERIAL for e in false)  # the bait: with coloured noise an amount alone says little
     assert min(e.fall for e in true) > 10 * MATERIAL
+
+
+def test_what_was_refitted_without_its_other_half_compares_with_what_slopes_tell():
+    """One model of two may have slopes that lead nowhere: its errors are in the same blocks of the same runs."""
+    runs = mi.read_runs(data_path("hidden_friction") / "run1.csv")
+    plain, rubbing = mi.fit(mi.dc_motor(), runs), mi.fit(mi.dc_motor() + mi.effects.coulomb, runs)
+    refitted = HeldOut.of(plain, None)._refitted(plain)
+    slopes = predictions_left_out(plain)
+    for c, e in slopes.items():
+        assert [len(v) for v in refitted[c].values] == [len(v) for v in e.values]
+        assert refitted[c].nrmse == pytest.approx(e.nrmse, rel=0.2)
+    found = compare(Predictions(refitted, {}), Predictions(predictions_left_out(rubbing), {}))
+    assert found.worth_it
