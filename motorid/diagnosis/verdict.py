@@ -96,6 +96,8 @@ def _valued(fit: Fit, effect: Effect) -> list[str]:
         sd = std.get(p.name)
         known = sd is not None or not fit.problem.model.parameters[p.name].vary
         text = f"{p.name} = {with_error(fit.values[p.name], sd, unit)}" if known else f"{p.name} not determined"
+        if not known and (volts := fit.determined.get(f"{p.name}_voltage")) is not None:
+            text = f"R·{p.name}/K = {with_error(volts.value, volts.std, volts.unit)}"
         if p.name == "k_w" and abs(1 + fit.values[p.name] - RPM) < 0.3:
             text += ", the ratio of rpm to rad/s: the speed is probably in rpm"
         found.append(text)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 
@@ -21,6 +22,7 @@ from motorid.errors import FitError, ModelError, UsageError
 from motorid.estimation.angle_orders import highest_order, likely_orders
 from motorid.estimation.linearisation import Tangent
 from motorid.numerics.autoregression import autocorrelation, effective_samples
+from motorid.records.datasets import data_path
 from motorid.records.experiment import Experiment
 
 FEW = ("coulomb", "brush_drop", "constant_load", "quadratic_drag", "speed_lag")
@@ -417,3 +419,12 @@ def test_text_tables_and_fit_give_the_same_errors_and_deviations(lab):
     assert std > 2 * white["b"]  # the bait
     assert f"b from {with_error(found.before.values['b'], std)} to" in found.text
     assert with_error(found.before.values["b"], std, "N·m·s/rad") in found._repr_html_()
+
+
+def test_without_a_current_a_torque_is_said_as_the_voltage_that_the_records_determine():
+    runs = [r.without("i") for r in mi.read_runs(data_path("hidden_friction") / "run*.csv")]
+    found = mi.diagnose(mi.fit(mi.dc_motor(), runs), effects=["coulomb"])
+    values = found.best.values
+    volts = float(re.search(r"R·tau_c/K = ([\d.]+) ±", found.text).group(1))
+    assert volts == pytest.approx(values["R"] * values["tau_c"] / values["K"], rel=1e-3)
+    assert "tau_c not determined" not in found.text
