@@ -237,7 +237,6 @@ def steady_errors(simulations: Sequence[Simulation], sigma: Sequence[Mapping[str
     return {c: float(np.sqrt(np.mean(np.square(e)))) for c, e in errors.items()}
 
 
-@one_thread
 def cut_alike(fitted: Sequence[Experiment], runs: Sequence[Experiment] | Experiment) -> list[Experiment]:
     """Return `runs` in windows, if the `fitted` ones are."""
     runs = [runs] if isinstance(runs, Experiment) else list(runs)
@@ -245,6 +244,7 @@ def cut_alike(fitted: Sequence[Experiment], runs: Sequence[Experiment] | Experim
     return runs if seconds is None else [part for run in runs for part in windows(run, seconds)]
 
 
+@one_thread
 def evaluate(fit_or_model: Any, runs: Sequence[Experiment] | Experiment, **options: Any) -> Evaluation:
     """Judge a fit (or a model at its values) on `runs` that it may never have seen.
 

@@ -459,9 +459,11 @@ REAL = {
     "fibo": ({}, ("omega",), {"v": "V", "omega": "rad/s"}, [25502] * 3),
     "frc": ({}, ("omega", "theta"), {"v": "V", "omega": "rad/s", "theta": "rad"}, [1287, 4211]),
     "furuta_base": ({}, CHANNELS, {"v": "V", "i": "A", "omega": "rad/s", "theta": "rad"}, [8001, 5001]),
-    "odri_mn4004": ({}, CHANNELS, {"v": "V", "i": "A", "omega": "rad/s", "theta": "rad"}, [3717, 26999]),
+    "odri_mn4004": ({}, CHANNELS,
+                    {"v": "V", "i": "A", "omega": "rad/s", "theta": "rad", "v_supply": "V"}, [3717, 26999]),
     "unmotor": ({"units": {"omega": "deg/s"}}, ("omega",), {"v": "V", "omega": "rad/s"}, [4093, 302]),
-    "xl330": ({}, ("omega", "theta"), {"v": "V", "omega": "rad/s", "theta": "rad"},
+    "xl330": ({}, ("omega", "theta"),
+              {"v": "V", "omega": "rad/s", "theta": "rad", "v_supply": "V", "temp": "°C"},
               [1510, 1124, 1116, 1116, 1499, 1125, 1131, 1123]),
 }
 
