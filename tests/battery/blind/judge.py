@@ -43,7 +43,7 @@ def judge(d: dict[str, Any]) -> dict[str, Any]:
         out["extra"] = 0 if as_a_set else sum(not any(stands_for(n, t) for t in truth) for n in named)
         out["exact"] = out["whole_right"] and not out["extra"]
     else:
-        wrong = [n for n in order if n not in d["acceptable"]]
+        wrong = [n for n in dict.fromkeys([*order, *d["order"]]) if n not in d["acceptable"]]  # rungs, too
         out["wrong"], out["wrong_claimed"] = wrong, [n for n in wrong if n in claimed]
     last = out["ratio"] if out["ratio_remainder"] is None else out["ratio_remainder"]
     out["near"] = last is not None and last <= NEAR
