@@ -91,7 +91,9 @@ class Search:
         scores = self.scores(node)
         short = self._shortlist(node)
         tasks = [Task(node.fit, present + s.effect, s.effect, s.starts, s.drop) for s in short]
-        tasks += [widened(node.fit, e) for e in wider]
+        for e in wider:
+            with contextlib.suppress(ModelError):  # beside what is there it may describe the same twice
+                tasks.append(widened(node.fit, e))
         fits = dict(zip((t.effect.name for t in tasks), refits(tasks, self.map), strict=True))
         self.advance(f"refitted {sum(isinstance(f, Fit) for f in fits.values())} of {len(fits)}")
         found = {t.effect.name: self._judge(node, (t.effect,), fits[t.effect.name]) for t in tasks}
@@ -198,7 +200,7 @@ class Search:
         is left still predicts better than the model `before`: small losses, each by chance, may add up.
         """
         for e in node.fit.problem.model.effects:
-            simpler = [_in_place(node.fit.model, e, r) for r in self._relatives(node, e)]
+            simpler = [m for r in self._relatives(node, e) if (m := _in_place(node.fit.model, e, r)) is not None]
             alone = e.name == node.added and node.parent is not None and len(node.key - node.parent.key) == 1
             smaller = simpler if alone else [*simpler, node.fit.model.without(e.name)]
             for model in sorted(smaller, key=lambda m: len(m.free_names)):
@@ -243,10 +245,16 @@ def _flat_topped(run: Experiment) -> bool:
     return bool(np.mean(size > np.quantile(size, 0.995) - near) > FLAT_TOP)
 
 
-def _in_place(model: Model, old: Effect, new: Effect) -> Model:
-    """Return the model with `new` where `old` was, so that the order in which effects were found stays."""
+def _in_place(model: Model, old: Effect, new: Effect) -> Model | None:
+    """Return the model with `new` where `old` was, so that the order in which effects were found stays.
+
+    None where another effect of the model contains `new`, too.
+    """
     effects = tuple(new if e is old else e for e in model.effects)
-    return (model.without(old.name) + new).with_(effects=effects)
+    try:
+        return (model.without(old.name) + new).with_(effects=effects)
+    except ModelError:
+        return None
 
 
 def _alike(p: Parameter, other: Parameter) -> bool:

@@ -9,6 +9,7 @@ import pytest
 from battery.excite import driven, record
 
 import motorid as mi
+from motorid.diagnosis import candidates
 from motorid.diagnosis import record_parts as parts
 from motorid.diagnosis.admissibility import objections, samples_within, unresolved
 from motorid.diagnosis.candidates import Search, library
@@ -97,6 +98,14 @@ def test_what_made_a_special_effect_special_may_be_taken_over(rubbing):
     assert search.pruned(search.root, plain).fit.model.effect_names == ("coulomb",)
     # Losses that may each be chance add up over a chain of prunings: never to less than the model before had.
     assert search.pruned(search.root, search.root) is search.root
+
+
+def test_a_friction_that_two_effects_contain_takes_the_place_of_neither():
+    """As a model it would describe the same twice; a diagnosis goes on without it."""
+    model = mi.dc_motor() + LIBRARY["coulomb_asymmetric"] + LIBRARY["angular_friction"]
+    assert candidates._in_place(model, model.effects[0], LIBRARY["coulomb"]) is None
+    alone = model.without("angular_friction")
+    assert candidates._in_place(alone, alone.effects[0], LIBRARY["coulomb"]).effect_names == ("coulomb",)
 
 
 # -- limits of physics -------------------------------------------------------------------------------------
