@@ -75,7 +75,8 @@ def over_floor(fit, run, clean) -> dict[str, float]:
     return {c: float(np.std(s.residual(c)) / np.std(run.outputs[c] - clean[c])) for c in ("i", "omega")}
 
 
-FLOORS = {"eddy brake": 1.25, "friction over a turn": 1.9}  # its bend near zero, its rest: not quite in the curve
+# Its bend near zero, its rest: not quite in the curve; the cam's fit ends at 1.03 or at 1.21, as the last digits fall.
+FLOORS = {"eddy brake": 1.25, "friction over a turn": 1.9, "cam": 1.25}
 
 
 @pytest.mark.parametrize("name", CASES)
