@@ -12,17 +12,17 @@ import contextlib
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from functools import cached_property
 
 import numpy as np
 
 from motorid.errors import ModelError, SimulationError
-from motorid.estimation.angle_orders import Line, likely_lines, spectrum
+from motorid.estimation.angle_orders import Line, likely_lines, spectrum, uses_angle
 from motorid.estimation.linearisation import Tangent
 from motorid.estimation.result import Fit
 from motorid.integrate.engine import Trajectory
 from motorid.model.definition import Effect, Parameter
-from motorid.model.model import Model, dc_motor, torque_driven
+from motorid.model.model import Model
 from motorid.numerics.signals import Array
 from motorid.problem.problem import Problem
 from motorid.problem.unknowns import Point
@@ -61,17 +61,6 @@ class Tried:
     values: dict[str, float]
     left: Array
     same_as: tuple[str, ...] = ()
-
-
-@lru_cache(maxsize=256)
-def uses_angle(effect: Effect) -> bool:
-    """Tell whether the effect reads the angle."""
-    for base in (dc_motor(), torque_driven()):
-        try:
-            return "theta" in (base + effect).write().states
-        except ModelError:
-            continue
-    return False
 
 
 def rank(fit: Fit, effects: Sequence[Effect], known: Sequence[Score] = ()) -> list[Score]:

@@ -15,10 +15,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from motorid.errors import ModelError
 from motorid.estimation.linearisation import Response, Tangent, responses
 from motorid.estimation.result import Fit
 from motorid.model.definition import Effect
-from motorid.model.model import Model
+from motorid.model.model import Model, dc_motor, torque_driven
 from motorid.numerics.autoregression import Whitening
 from motorid.numerics.signals import Array
 from motorid.problem.runs import angle_signal
@@ -77,6 +78,17 @@ def _moving(tangent: Tangent) -> Array:
 def likely_orders(tangent: Tangent, effect: Effect, most: int) -> list[float]:
     """Return the orders that explain most of the misfit, best first."""
     return [line.order for line in likely_lines(tangent, effect, most)]
+
+
+@lru_cache(maxsize=256)
+def uses_angle(effect: Effect) -> bool:
+    """Tell whether the effect reads the angle."""
+    for base in (dc_motor(), torque_driven()):
+        try:
+            return "theta" in (base + effect).write().states
+        except ModelError:
+            continue
+    return False
 
 
 def likely_lines(tangent: Tangent, effect: Effect, most: int) -> list[Line]:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from motorid.errors import FAILURES, UsageError, numbers_told, one_of
-from motorid.estimation.angle_orders import effects_of_unknown_order, strongest_order
+from motorid.estimation.angle_orders import effects_of_unknown_order, strongest_order, uses_angle
 from motorid.estimation.continuation import by_continuation
 from motorid.estimation.least_squares import FINISH, Callback, Estimate, least_squares
 from motorid.estimation.restarts import restore_collapsed
@@ -290,8 +290,8 @@ def in_windows(fit: Fit, solve: Callable[[Problem], Fit] = solve) -> Fit | None:
     """
     problem = fit.problem
     longest = max(r.duration for r in problem.experiments)
-    if fit.window is not None or problem.initial != "auto":
-        return None
+    if fit.window is not None or problem.initial != "auto" or not any(uses_angle(e) for e in fit.model.effects):
+        return None  # a torque that does not know the angle cannot drive a small error on
     for count in WINDOWS:
         enough = [r for r in problem.experiments if r.n > FEWEST * count]
         runs = tuple(p for r in enough for p in windows(r, longest / count))
