@@ -7,17 +7,21 @@ import os
 import re
 import sys
 from collections.abc import Iterable, Iterator
+from itertools import pairwise
+from types import TracebackType
 
 
-def _leave(kind: type[BaseException], error: BaseException, trace: object) -> None:
+def _leave(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
     if issubclass(kind, KeyboardInterrupt):
         os.write(2, b"motorid: interrupted.\n")
         os._exit(130)
-    sys.__excepthook__(kind, error, trace)  # type: ignore[arg-type]
+    sys.__excepthook__(kind, error, trace)
 
 
-# As early as can be: what comes after this takes a second to load.
-if sys.argv[:1] == ["-m"] or os.path.basename("".join(sys.argv[:1])).startswith("motorid"):
+# As early as can be: what comes after this takes a second to load. Only for the command itself: a script that imports
+# the package, whatever its name, keeps what Python does.
+_NAME = os.path.basename("".join(sys.argv[:1]))
+if ("-m", "motorid") in pairwise(sys.orig_argv) or _NAME in ("motorid", "motorid.exe"):
     sys.excepthook = _leave
 
 import numpy as np  # noqa: E402

@@ -168,6 +168,14 @@ def test_ctrl_c_is_status_130_in_the_first_second_and_later(after):
     assert "Traceback" not in out + err
 
 
+@pytest.mark.parametrize("name", ["motorid_mine.py", "bench.py"])
+def test_a_script_that_imports_the_package_keeps_its_own_ctrl_c(tmp_path, name):
+    script = tmp_path / name
+    script.write_text("import sys, motorid\nprint(sys.excepthook is sys.__excepthook__)\n")
+    done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, timeout=60)
+    assert done.stdout.strip() == "True", done.stderr
+
+
 def test_an_interrupted_diagnosis_keeps_its_fit(run, tmp_path, monkeypatch):
     from motorid.cli import diagnose
 
