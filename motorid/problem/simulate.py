@@ -26,6 +26,7 @@ from motorid.records.steady_state import find_segments
 ASSUMED_NOISE = 0.01  # of a channel's RMS, where a plan does not say
 
 MOST_RUNS = 12  # shown one by one
+SETTLES = 4  # times that unknown initial states are sought, each with the sub-steps of where the last ended
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,13 +185,17 @@ def simulated(problem: Problem, estimate_initial: bool = True) -> tuple[Simulati
     held = problem.with_(model=problem.model.fix(*problem.model.shared_names), priors={}, penalties=())
     q = held.start
     held = held.refined(q)
-    if len(q) and estimate_initial:
+    for _ in range(SETTLES if len(q) and estimate_initial else 0):  # friction turns elsewhere: other sub-steps there
         try:
-            q = levenberg_marquardt(held.residual, held.residual_and_jacobian, q,
-                                    options=LevenbergMarquardt(max_iterations=20)).q
-        except FitError:  # slopes that cannot be followed (a stick that hangs by a hair): the first samples stand
+            found = levenberg_marquardt(held.residual, held.residual_and_jacobian, q, held.scaling.bounds,
+                                        LevenbergMarquardt(max_iterations=20))
+        except FitError:  # slopes that cannot be followed (a stick that hangs by a hair): the last states stand
             held.residual(q)
-        held = held.refined(q)
+            held = held.refined(q)
+            break
+        q, held = found.q, held.refined(found.q)
+        if found.status == "converged":
+            break
     return at(held, q)
 
 
