@@ -14,9 +14,9 @@ from motorid.cli.options import OUT, Force, Json, own_effects
 from motorid.diagnosis.design_criteria import Rival
 from motorid.diagnosis.experiment_design import LEVELS, design_experiment
 from motorid.errors import DataError
-from motorid.exporters.export import model_from_json
 from motorid.exporters.json_file import write_json
 from motorid.numerics.parallel import interruption, progress
+from motorid.problem.plain_data import model_from_json
 from motorid.records.files import check_output, read_bytes
 
 LIMITS = "Limits"

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from functools import cached_property
+from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
@@ -19,12 +21,15 @@ from motorid.estimation.covariance import Certainty, Quantity, certainty, combin
 from motorid.model.model import Model
 from motorid.numerics.noise import despiked
 from motorid.numerics.signals import Array
+from motorid.problem.plain_data import model_dict, problem_dict
 from motorid.problem.problem import Problem
 from motorid.problem.simulate import Evaluation, Simulation, at, error_table, evaluate, judge, steady_errors
 from motorid.records.experiment import Experiment, units_of
+from motorid.records.files import json_text, write_files
 
 LOST = 1.0  # NRMSE at which zero is as near to what was measured
 COLOURED = 3.0  # times the noise from fast changes: what a correlation of 0.9 between neighbours makes of it
+SAVED = ("q", "status", "message", "history", "seconds", "integration_error", "formulation")  # plain fields
 FLAGS = {"noise": Flag("fits", "good"), "poor": Flag("fits poorly", "bad"), "lost": Flag("does not fit", "bad")}
 
 
@@ -231,6 +236,33 @@ class Fit(Shown):
         """Standard deviation of the sensor's noise per channel, SI; of several runs the smallest."""
         sigmas = [run.sigma for run in self.problem.runs]
         return {c: min(s[c] for s in sigmas if c in s) for c in self.nrmse}
+
+    def save(self, path: str | os.PathLike[str], *, force: bool = False) -> Path:
+        """Write the fit with its records as JSON; `motorid.load` gives it back without fitting again.
+
+        Parameters
+        ----------
+        path : path
+        force : bool
+            Also over a file that motorid did not write.
+
+        Raises
+        ------
+        UsageError
+            If the file must not be written there, or the fit holds code of your own: a `Constraint`, an engine, or
+            multiple shooting with process noise.
+        OutputError
+            If the disk refuses.
+        """
+        if self.formulation == "process noise":
+            raise UsageError("a fit with process noise cannot be saved; its model can, mi.export(fit, 'motor.json').")
+        head = {"model": model_dict(self.model), "parameters": {
+            n: {"value": self.values[n], "std": self.std[n] if p.vary else 0.0, "unit": p.unit, "fixed": not p.vary}
+            for n, p in self.model.parameters.items()}, "verdict": self.verdict}
+        end = {f: getattr(self, f) for f in SAVED} | {"cost": self.cost, "extra": {
+            k: [asdict(m) for m in v] if k in ("multipliers", "active") else v for k, v in self.extra.items()}}
+        text = json_text(head, {"fit": {"problem": problem_dict(self.problem), **end}})
+        return write_files({Path(path).expanduser(): text}, force)[0]
 
     def to_frame(self) -> Any:
         """Return the parameters as a pandas.DataFrame: value, std, unit, fixed, meaning."""

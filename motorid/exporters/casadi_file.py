@@ -22,6 +22,7 @@ from motorid.integrate.rodas3 import step_functions
 from motorid.model.equations import System
 from motorid.model.model import Model
 from motorid.numerics.signals import Array
+from motorid.problem.plain_data import model_dict
 from motorid.problem.problem import Problem
 from motorid.problem.runs import Run
 from motorid.records.experiment import Experiment
@@ -73,8 +74,7 @@ def description(found: Fit | Model) -> dict[str, Any]:
     for name, p in model.parameters.items():
         limits = {"lower": p.lower, "upper": p.upper}
         contents["parameters"][name] |= {k: v for k, v in limits.items() if np.isfinite(v)}
-    contents["model"]["angle_input"] = model.angle_input
-    contents["model"]["own_effects"] = _own(model)
+    contents["model"] = model_dict(model)
     if isinstance(found, Fit):
         contents["covariance"] = {"unknowns": [p.name for p in found.problem.unknown],
                                   "matrix": found.covariance.tolist()}
@@ -87,18 +87,8 @@ def description(found: Fit | Model) -> dict[str, Any]:
 
 
 def _model_dict(model: Model) -> dict[str, Any]:
-    return {"model": {"base": model.base, "axis": model.axis, "effects": list(model.effect_names)},
-            "parameters": {n: {"value": p.value, "std": None, "unit": p.unit, "fixed": not p.vary}
+    return {"parameters": {n: {"value": p.value, "std": None, "unit": p.unit, "fixed": not p.vary}
                            for n, p in model.parameters.items()}}
-
-
-def _own(model: Model) -> dict[str, Any]:
-    """Describe effects that are not in the library: where they were defined and what they take."""
-    from motorid.effects import EVERY
-
-    own = [e for e in model.effects if e.name not in EVERY or EVERY[e.name].law is not e.law]
-    return {e.name: {"balance": e.balance, "parameters": [p.name for p in e.parameters],
-                     "defined_in": getattr(e.law, "__module__", None), "doc": e.doc} for e in own}
 
 
 def fingerprint(run: Experiment) -> dict[str, Any]:

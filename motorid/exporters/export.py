@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import warnings
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,20 +14,23 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from motorid.effects import EVERY
-from motorid.errors import DataError, ModelError, UsageError, one_of
-from motorid.estimation.result import Fit
+from motorid.errors import DataError, MotoridError, UsageError, one_of
+from motorid.estimation.result import SAVED, Fit
+from motorid.estimation.shooting.outcome import Multiplier
 from motorid.exporters.c_code import c_files
 from motorid.exporters.casadi_file import casadi_file, description, model_of, read_casadi
 from motorid.exporters.json_file import json_text
 from motorid.model.definition import Effect
-from motorid.model.model import Model, dc_motor, torque_driven
+from motorid.model.model import Model
+from motorid.numerics.parallel import one_thread
 from motorid.numerics.signals import Array
+from motorid.problem.plain_data import model_from_json, problem_of
 from motorid.records.files import read_bytes, write_files
 
 FORMS = {".casadi": "casadi", ".c": "c", ".json": "json"}
 NO_FMU = ("an FMU is not offered: those that CasADi 3.8.2 writes do not pass FMPy's checker (names of variables, "
           "initial unknowns), and FMPy simulates them with other trajectories. Take to='c' or to='casadi'.")
+SAME = 1e-4  # relative difference of costs that machines and engines make
 NOT_OURS = "it is not a file that mi.export wrote"
 
 
@@ -128,13 +132,16 @@ _CONTENTS: Mapping[str, Callable[[Fit | Model, Path], Mapping[Path, Any]]] = {
     "casadi": casadi_file, "c": c_files, "json": _json_file}
 
 
-def load(path: str | os.PathLike[str], effects: Iterable[Effect] = (), *, trust: bool = False) -> Model | Exported:
-    """Read back what `export` wrote. Nothing in the file is run.
+@one_thread
+def load(path: str | os.PathLike[str], effects: Iterable[Effect] = (), *,
+         trust: bool = False) -> Model | Exported | Fit:
+    """Read back what `Fit.save` or `export` wrote. Nothing in the file is run.
 
     Parameters
     ----------
     path : path
-        JSON gives the `Model` at its values, a ``.casadi`` file an `Exported`.
+        What `Fit.save` wrote gives the `Fit`, at its values, with its records: simulated, not fitted again. Other JSON
+        gives the `Model` at its values, a ``.casadi`` file an `Exported`.
     effects : sequence of Effect, optional
         Effects of your own that the model uses.
     trust : bool
@@ -158,7 +165,7 @@ def load(path: str | os.PathLike[str], effects: Iterable[Effect] = (), *, trust:
             contents = json.loads(data)
         except (ValueError, RecursionError) as error:
             raise DataError(f"{source.name} is not JSON: {error}.") from None
-        return model_from_json(contents, effects)
+        return _fit_of(contents, effects, source.name) if "fit" in contents else model_from_json(contents, effects)
     try:
         return Exported(*(_serialized(source) if trust else read_casadi(data)))
     except (RuntimeError, ValueError, TypeError, AttributeError, LookupError):  # RecursionError is a RuntimeError
@@ -172,62 +179,26 @@ def _serialized(source: Path) -> tuple[dict[str, ca.Function], dict[str, Any]]:
     return {f.name(): f for f in functions}, json.loads(file.unpack())
 
 
-def model_from_json(contents: Mapping[str, Any], effects: Iterable[Effect] = ()) -> Model:
-    """Return the `Model`, at its values, of what ``fit --json`` or `export` wrote.
-
-    Parameters
-    ----------
-    contents : mapping
-        Needs ``model.base``, ``model.effects`` and ``parameters``; more does no harm.
-    effects : sequence of Effect, optional
-        Effects of your own that the model uses; they go before the library's of the same name.
-
-    Raises
-    ------
-    DataError
-        If something is missing in `contents`.
-    ModelError
-        If an effect is not known.
-    """
+def _fit_of(contents: Mapping[str, Any], effects: Iterable[Effect], name: str) -> Fit:
     try:
-        head, pars = dict(contents["model"]), dict(contents["parameters"])
-        base, names, about = head["base"], [str(n) for n in head["effects"]], dict(head.get("own_effects", {}))
-        values = {n: float(p["value"]) for n, p in pars.items()}
-        fixed_names = [n for n, p in pars.items() if p["fixed"]]
-    except (KeyError, TypeError, ValueError) as error:
-        raise DataError(f"this is not a fitted model: {error!s} is missing or wrong; expected model.base, "
-                        "model.effects and parameters with value and fixed.") from None
-    model = _base(base, head.get("axis", "rotary"))
-    own = {e.name: e for e in effects}
-    for name in names:
-        model = model + _effect(name, own, about.get(name))
-    missing = set(model.parameters) ^ set(values)
-    if missing:
-        raise DataError(f"the parameters {', '.join(sorted(missing))} are in only one of the file and the model: an "
-                        "effect has changed since the file was written.")
-    limits = {n: (p.get("lower", -np.inf), p.get("upper", np.inf)) for n, p in pars.items()
-              if "lower" in p or "upper" in p}
-    fixed = {n: values[n] for n in fixed_names}  # first: what is fixed may be zero, what is free may not
-    free = {n: v for n, v in values.items() if n not in fixed}
-    return model.fix(**fixed).replace(**free).bounded(**limits).free(*free)
-
-
-def _base(base: str, axis: str) -> Model:
-    if base == "dc_motor":
-        return dc_motor()
-    if base == "torque_driven":
-        return torque_driven(axis)
-    raise DataError(one_of(str(base), ("dc_motor", "torque_driven"), "base"))
-
-
-def _effect(name: str, own: Mapping[str, Effect], about: Mapping[str, Any] | None) -> Effect:
-    if name in own:
-        return own[name]
-    if about is not None:
-        raise ModelError(f"the effect '{name}' is not in the library: it was defined in {about['defined_in']}, acts on "
-                         f"the {about['balance']} and takes {', '.join(about['parameters'])}. Define it again and "
-                         f"pass it on: mi.load(path, effects=[{name}]).")
-    if name not in EVERY:
-        raise ModelError(f"{one_of(name, EVERY, 'effect')} If it is one of your own, pass it on: "
-                         f"mi.load(path, effects=[{name}]).")
-    return EVERY[name]
+        told = contents["fit"]
+        problem = problem_of(contents["model"], told["problem"], effects)
+        q = np.array(told["q"], float)
+        if q.shape != problem.start.shape:
+            raise ValueError("q")
+        residuals, jac = problem.residual_and_jacobian(q)
+        extra = {k: tuple(Multiplier(**m) for m in v) if k in ("multipliers", "active") else np.array(v, float)
+                 if k == "free" else v for k, v in told["extra"].items()}
+        plain = {f: told[f] for f in SAVED} | {"q": q, "history": tuple(told["history"]), "extra": extra}
+        if plain["integration_error"] is None:
+            plain["integration_error"] = float("nan")
+        cost = float(told["cost"])
+        found = Fit(problem, problem.values(q), residuals, jac / problem.scaling.slope(q), **plain)
+    except MotoridError:
+        raise
+    except (ValueError, TypeError, AttributeError, LookupError, RuntimeError, OverflowError) as error:
+        raise DataError(f"cannot read {name}: its fit is incomplete or wrong ({error}).") from None
+    if not abs(found.cost - cost) <= SAME * abs(found.cost):
+        warnings.warn(f"{name}: its model gives another error than when it was saved, so an effect has changed since. "
+                      "Fit again: mi.fit(fit.model, fit.problem.experiments).", stacklevel=4)
+    return found

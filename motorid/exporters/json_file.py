@@ -3,23 +3,19 @@
 from __future__ import annotations
 
 import json
-import re
 import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from motorid.estimation.shooting.outcome import violations
 from motorid.problem.relations import Relation
-from motorid.records.files import package_version, write_files
+from motorid.records.files import json_text, write_files
 
 if TYPE_CHECKING:
     from motorid.estimation.result import Fit
     from motorid.problem.simulate import Evaluation
 
-_ODD = re.compile("[\x7f-\x9f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
 MOTOR = ("R", "L", "K", "b", "J")
 
 
@@ -113,30 +109,6 @@ def _a_torque(model: Any, name: str) -> bool:
 
 def _listed(names: list[str]) -> str:
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
-
-
-def plain(value: Any) -> Any:
-    """Return `value` in the types that JSON knows; what is not a finite number becomes None."""
-    if isinstance(value, Mapping):
-        return {str(k): plain(v) for k, v in value.items()}
-    if isinstance(value, np.ndarray):
-        return plain(value.tolist())
-    if isinstance(value, list | tuple | set | frozenset):
-        return [plain(v) for v in value]
-    if isinstance(value, bool | np.bool_):
-        return bool(value)
-    if isinstance(value, int | np.integer):
-        return int(value)
-    if isinstance(value, float | np.floating):
-        return float(value) if np.isfinite(value) else None
-    return value if value is None or isinstance(value, str) else str(value)
-
-
-def json_text(contents: Mapping[str, Any]) -> str:
-    """Return JSON that says that motorid wrote it; control characters and lone surrogates are escaped."""
-    signed = {"motorid": package_version("motorid"), **contents}
-    text = json.dumps(plain(signed), indent=1, ensure_ascii=False, allow_nan=False)
-    return _ODD.sub(lambda m: f"\\u{ord(m[0]):04x}", text) + "\n"
 
 
 def write_json(contents: Mapping[str, Any], path: str | Path, force: bool = False) -> None:

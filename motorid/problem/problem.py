@@ -173,7 +173,7 @@ class Problem:
     def refined(self, q: Array) -> Problem:
         """Return the problem with sub-steps that keep the integration error below noise and misfit at `q`."""
         at = self.unknowns.point(np.asarray(q, float))
-        return self._keeping(tuple(self._refined_run(k, at) for k in range(len(self.runs))))
+        return self.with_runs(tuple(self._refined_run(k, at) for k in range(len(self.runs))))
 
     def fine_enough(self, q: Array) -> bool:
         """Tell whether the present sub-steps keep, within a factor of two, what `refined` asks for at `q`."""
@@ -197,9 +197,9 @@ class Problem:
 
     def with_finer_steps(self, factor: int) -> Problem:
         """Return the problem with `factor` times as many sub-steps everywhere."""
-        return self._keeping(tuple(replace(r, grid=r.grid.with_substeps(factor * r.grid.substeps)) for r in self.runs))
+        return self.with_runs(tuple(replace(r, grid=r.grid.with_substeps(factor * r.grid.substeps)) for r in self.runs))
 
-    def _keeping(self, runs: tuple[Run, ...]) -> Problem:
+    def with_runs(self, runs: tuple[Run, ...]) -> Problem:
         """Return a copy with other grids that keeps everything else already made."""
         made = ("outputs", "system", "unknowns", "integrator", "measured", "_levels")
         return self._lending(replace(self, _runs=runs), made)

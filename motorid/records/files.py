@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import json
 import os
 import re
 import stat
@@ -12,6 +13,9 @@ from collections.abc import Iterator, Mapping
 from importlib.metadata import PackageNotFoundError
 from importlib.metadata import version as version_of
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from motorid.errors import DataError, OutputError, UsageError
 
@@ -21,6 +25,7 @@ _LOOK = 65_536  # bytes at either end in which an output says that motorid wrote
 _OURS = re.compile(rb'"motorid": ?"|name="generator" content="motorid|[Ww]ritten by motorid|\Amotor,status,message,'
                    rb'|"motor":"[^"]*",\s*"status"|"index_columns": \["motor"\]|\At,[\w,]*substeps\n'
                    rb"|\A# motorid columns: |Software\0motorid")
+_ODD = re.compile("[\x7f-\x9f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
 _WRONG_PLACE = (errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.EACCES, errno.EPERM, errno.EROFS, errno.ENAMETOOLONG)
 
 
@@ -138,3 +143,32 @@ def _part(target: Path, content: str | bytes) -> Iterator[Path | None]:
     finally:
         with contextlib.suppress(OSError):
             os.unlink(name)
+
+
+def plain(value: Any) -> Any:
+    """Return `value` in the types that JSON knows; what is not a finite number becomes None."""
+    if isinstance(value, Mapping):
+        return {str(k): plain(v) for k, v in value.items()}
+    if isinstance(value, np.ndarray):
+        return plain(value.tolist())
+    if isinstance(value, list | tuple | set | frozenset):
+        return [plain(v) for v in value]
+    if isinstance(value, bool | np.bool_):
+        return bool(value)
+    if isinstance(value, int | np.integer):
+        return int(value)
+    if isinstance(value, float | np.floating):
+        return float(value) if np.isfinite(value) else None
+    return value if value is None or isinstance(value, str) else str(value)
+
+
+def json_text(contents: Mapping[str, Any], bulk: Mapping[str, Any] | None = None) -> str:
+    """Return JSON that says that motorid wrote it, `bulk` on a line of its own.
+
+    Control characters and lone surrogates are escaped.
+    """
+    signed = {"motorid": package_version("motorid"), **contents}
+    text = json.dumps(plain(signed), indent=1, ensure_ascii=False, allow_nan=False)
+    if bulk is not None:
+        text = f"{text[:-2]},\n{json.dumps(plain(bulk), allow_nan=False)[1:-1]}\n}}"
+    return _ODD.sub(lambda m: f"\\u{ord(m[0]):04x}", text) + "\n"

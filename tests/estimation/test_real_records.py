@@ -14,7 +14,7 @@ import pytest
 from command import motorid, motorid_json
 
 import motorid as mi
-from motorid.exporters.export import model_from_json
+from motorid.problem.plain_data import model_from_json
 from motorid.problem.simulate import evaluate
 from motorid.records.experiment import split
 from motorid.records.reading import read_runs

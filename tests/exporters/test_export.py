@@ -12,7 +12,8 @@ import pytest
 
 import motorid as mi
 from motorid.errors import DataError, ModelError, UsageError
-from motorid.exporters.export import Exported, export, load, model_from_json
+from motorid.exporters.export import Exported, export, load
+from motorid.problem.plain_data import model_from_json
 
 COMPILER = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
 ALONE = """
@@ -193,3 +194,84 @@ def test_bad_files_and_words_are_refused(tmp_path):
         model_from_json({"model": {"base": "dc_motor"}})
     with pytest.raises(DataError, match="only one of the file and the model"):
         model_from_json({"model": {"base": "dc_motor", "effects": []}, "parameters": {}})
+
+
+def test_a_saved_fit_comes_back_as_it_was(fit, tmp_path):
+    """Values, errors, deviations and words; with the records, so that everything that takes a fit takes it."""
+    back = load(fit.save(tmp_path / "fit.json"))
+    assert isinstance(back, mi.Fit)
+    assert back.values == fit.values
+    assert back.verdict == fit.verdict
+    assert back.initial == fit.initial
+    assert {n: pytest.approx(s, rel=1e-5) for n, s in fit.std.items()} == back.std
+    np.testing.assert_allclose(back.covariance, fit.covariance, rtol=1e-5, atol=1e-6 * np.abs(fit.covariance).max())
+    for a, b in zip(back.problem.experiments, fit.problem.experiments, strict=True):
+        assert (a.name, a.hold, a.meta.get("sha256")) == (b.name, b.hold, b.meta.get("sha256"))
+        np.testing.assert_array_equal(a.outputs["omega"], b.outputs["omega"])
+    assert mi.identifiability(back).condition_number == pytest.approx(mi.identifiability(fit).condition_number, 1e-4)
+    assert mi.fit(back.model, back.problem.experiments).values == pytest.approx(fit.values, rel=1e-4)
+
+
+def test_a_saved_fit_is_diagnosed_as_the_fit_itself(tmp_path):
+    runs = runs_of("hidden_friction")[:1]
+    fit = mi.fit(mi.dc_motor(), runs)
+    assert mi.diagnose(load(fit.save(tmp_path / "fit.json"))).text == mi.diagnose(fit).text
+
+
+def test_what_was_asked_of_a_fit_comes_back(tmp_path):
+    """Limits, priors, fixed and given values, a robust loss, penalties, constraints with their multipliers, windows."""
+    runs = [r.with_(meta={**r.meta, "note": None}) for r in runs_of("hidden_friction")[:1]]
+    model = (mi.dc_motor() + mi.effects.cogging(N=7)).bounded(b=(1e-7, 1e-2)).fix(L=1e-3).replace(K=0.05)
+    asked = {"priors": {"R": (1.0, 0.5)}, "loss": mi.Huber(2.0), "penalties": [mi.CurrentLimit(50.0)], "window": 1.0}
+    fit = mi.fit(model, runs, **asked)
+    back = load(fit.save(tmp_path / "fit.json"))
+    assert back.problem.model.parameters == fit.problem.model.parameters
+    assert (back.problem.loss, back.window, dict(back.problem.priors)) == (mi.Huber(2.0), 1.0, {"R": [1.0, 0.5]})
+    assert back.problem.model.effects[0].parameters == fit.problem.model.effects[0].parameters
+    assert back.cost == pytest.approx(fit.cost, 1e-9)
+    friction = mi.dc_motor() + mi.effects.coulomb
+    hard = mi.fit(friction, runs, solver=mi.MultipleShooting(), constraints=[mi.SteadyState()])
+    back = load(hard.save(tmp_path / "hard.json"))
+    assert back.std == pytest.approx(hard.std, rel=1e-4)
+    assert back.card().text == hard.card().text
+    assert back.extra["multipliers"] == hard.extra["multipliers"]
+
+
+def test_a_fit_with_an_effect_of_ones_own_asks_for_it(tmp_path):
+    path = mi.fit(mi.dc_motor() + my_drag, runs_of("two_step_noisy")[:1]).save(tmp_path / "own.json")
+    with pytest.raises(ModelError, match=r"effects=\[my_drag\]"):
+        load(path)
+    assert load(path, effects=[my_drag]).model.effect_names == ("my_drag",)
+
+
+def test_code_of_ones_own_cannot_be_saved(tmp_path):
+    fit = mi.fit(mi.dc_motor(), runs_of("two_step_noisy")[:1], penalties=[mi.Constraint(lambda m: m.K, upper=1.0)])
+    with pytest.raises(UsageError, match="Constraint is code of your own"):
+        fit.save(tmp_path / "fit.json")
+    assert not (tmp_path / "fit.json").exists()
+
+
+@pytest.mark.parametrize("wrong", [{"q": [1.0]}, {"q": None}, {"problem": {}}, {"cost": "x"}, {"extra": {"free": "x"}},
+                                   {"problem.runs": []}, {"problem.engine": {"kind": "Popen", "args": "true"}},
+                                   {"problem.runs.0.substeps": [10**9]}, {"problem.runs.0.record.t": [0.0]}],
+                         ids=str)
+def test_a_damaged_fit_is_refused_in_a_sentence(tmp_path, wrong):
+    path = mi.fit(mi.dc_motor(), runs_of("two_step_noisy")[:1]).save(tmp_path / "fit.json")
+    contents = json.loads(path.read_text())
+    place, value = next(iter(wrong.items()))
+    at = contents["fit"]
+    for part in place.split(".")[:-1]:
+        at = at[int(part) if part.isdigit() else part]
+    at[place.split(".")[-1]] = value
+    path.write_text(json.dumps(contents))
+    with pytest.raises((DataError, UsageError)):
+        load(path)
+
+
+def test_a_fit_of_another_law_is_warned_of(tmp_path):
+    path = mi.fit(mi.dc_motor(), runs_of("two_step_noisy")[:1]).save(tmp_path / "fit.json")
+    contents = json.loads(path.read_text())
+    contents["fit"]["cost"] *= 2
+    path.write_text(json.dumps(contents))
+    with pytest.warns(UserWarning, match="an effect has changed since"):
+        load(path)
