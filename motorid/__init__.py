@@ -1,4 +1,15 @@
-"""Grey-box identification of brushed DC motors: fit, see where the model fails, add what is missing."""
+"""Grey-box identification of brushed DC motors: fit, see where the model fails, add what is missing.
+
+Examples everywhere go on from these lines:
+
+>>> import numpy as np
+>>> import motorid as mi
+>>> runs = mi.read_runs(mi.data_path("hidden_friction") / "run*.csv")
+>>> check = mi.read_runs(mi.data_path("hidden_friction") / "check*.csv")
+>>> fit = mi.fit(mi.dc_motor(), runs)
+>>> better = mi.fit(mi.dc_motor() + mi.effects.coulomb, runs)
+>>> found = mi.diagnose(fit, validate=check, effects=["coulomb", "stribeck", "cogging"])
+"""
 
 from types import ModuleType as _ModuleType
 from typing import TYPE_CHECKING as _TYPE_CHECKING

@@ -69,6 +69,13 @@ def record(port: str | Link, out: str | Path, *, baud: int = 115_200, excite: st
         Words, limits, files or calibration are wrong; nothing has moved.
     DeviceError
         The port cannot be opened, nobody answers, or the device refuses.
+
+    Examples
+    --------
+    >>> bench = mi.virtual_bench("coulomb")  # or a port, "/dev/ttyACM0"
+    >>> done = mi.record(bench, "run1.csv", excite="step:6:0.2,coast:0.2", limit_voltage=8)
+    >>> done.complete
+    True
     """
     out = Path(out)
     check_target(out, resume, force)

@@ -191,6 +191,12 @@ def virtual_bench(effect: str = "random", motor: str = "lab", seed: int = 0, rat
         What is hidden in which motor; see `hide`.
     rate : float
         Samples per second.
+
+    Examples
+    --------
+    >>> bench = mi.virtual_bench("coulomb")
+    >>> done = mi.record(bench, "run2.csv", excite="chirp:4:1:20:0.5", limit_voltage=8)
+    >>> runs = mi.read_runs("run2.csv")
     """
     return VirtualLink(VirtualDevice(hide(effect, motor, seed), rate))
 

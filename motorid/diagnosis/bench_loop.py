@@ -105,6 +105,11 @@ def identify_on(bench: str | Link, folder: str | Path = ".", *, goal: str = "dis
         For words or limits that make no sense.
     DeviceError
         If the bench cannot be reached.
+
+    Examples
+    --------
+    >>> bench = mi.virtual_bench("coulomb")
+    >>> campaign = mi.identify_on(bench, "bench", v_max=8, i_max=8)  # doctest: +SKIP
     """
     if goal not in ("distinguish", "sharpen"):
         raise UsageError(one_of(goal, ("distinguish", "sharpen"), "goal"))

@@ -68,6 +68,13 @@ def diagnose(fit: Fit, validate: Sequence[Experiment] | Experiment | None = None
     -------
     Diagnosis
         Printed, it is the verdict in words.
+
+    Examples
+    --------
+    >>> found = mi.diagnose(fit, validate=check, effects=["coulomb", "stribeck", "cogging"])
+    >>> found.verdict, found.effects
+    ('missing', ('coulomb',))
+    >>> better = found.best
     """
     say = progress or (lambda word: None)
     own = tuple(also)

@@ -82,6 +82,11 @@ def suggest_experiment(fits: Sequence[Fit], *, v_max: float | None = None, i_max
         If fewer than two fits are given.
     FitError
         If no candidate can be simulated with all of them.
+
+    Examples
+    --------
+    >>> drag = mi.fit(fit.model + mi.effects.quadratic_drag, runs)
+    >>> next_run = mi.suggest_experiment([better, drag], v_max=12)
     """
     if len(fits) < 2:
         raise UsageError("suggest_experiment() compares models: give at least two fits of the same records.")
@@ -311,6 +316,11 @@ def design_experiment(found: Diagnosis | Fit | Sequence[Fit | Rival], *, goal: s
         For words, names or limits that make no sense.
     FitError
         If no record within the limits can be found.
+
+    Examples
+    --------
+    >>> plan = mi.design_experiment(better, parameters=["b"], v_max=12, i_max=8, duration=0.5, levels=4)
+    >>> words = plan.excite  # for `motorid record --excite`
     """
     rivals, goal = _rivals(found, goal)
     say = progress or (lambda word: None)

@@ -40,6 +40,12 @@ def locate(fit: Fit) -> Missing:
     Missing
         Per run the missing voltage (V) and torque (N·m, N for a linear axis), their dependence on i, omega,
         theta, heat and t with 95 % bands, the share of the misfit by balance and by region.
+
+    Examples
+    --------
+    >>> missing = mi.locate(fit)
+    >>> missing.where
+    'mechanical'
     """
     natural = natural_sizes(fit.problem.experiments, fit.values)
     unit = "N" if fit.problem.model.axis == "linear" else "N·m"

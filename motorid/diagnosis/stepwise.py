@@ -320,6 +320,12 @@ def improve(fit: Fit, validate: Sequence[Experiment] | Experiment | None = None,
     -------
     Ladder
         The models with training and held-out error; ``ladder.best`` is the last fit, to go on from.
+
+    Examples
+    --------
+    >>> ladder = mi.improve(fit, validate=check, effects=["coulomb", "quadratic_drag"])
+    >>> ladder.best.model.effect_names
+    ('coulomb',)
     """
     say = progress or (lambda word: None)
     found, _ = explored(checked(fit, "improve"), validate, library(effects, also), map, say, max_effects)

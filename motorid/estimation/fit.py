@@ -92,6 +92,12 @@ def fit(model: Model, runs: Sequence[Experiment] | Experiment, *, solver: Any = 
     with that, and a short run from either start. Further runs come only where an end is in doubt, a parameter has
     collapsed, the model does not reach the noise in one channel far more than in another, or the sub-steps do not
     suit the end.
+
+    Examples
+    --------
+    >>> fit = mi.fit(mi.dc_motor() + mi.effects.coulomb, runs)
+    >>> fit
+    <fit of dc_motor + coulomb: fits, NRMSE i 1.68 %, omega 0.82 %>
     """
     if formulation not in ("plain", "penalty"):
         raise UsageError(one_of(formulation, ("plain", "penalty"), "formulation") + " For hard constraints use "
@@ -124,7 +130,12 @@ def fit(model: Model, runs: Sequence[Experiment] | Experiment, *, solver: Any = 
 @numbers_told()
 def solve(problem: Problem, solver: Any = None, *, start: str = "auto", callback: Callback = None,
           formulation: str = "plain") -> Fit:
-    """Solve a `Problem`; `fit` is this with the problem made on the way. See there."""
+    """Solve a `Problem`; `fit` is this with the problem made on the way. See there.
+
+    Examples
+    --------
+    >>> fit = mi.solve(mi.Problem(mi.dc_motor(), runs, weights="rms"))
+    """
     began = time.perf_counter()
     if isinstance(solver, str):
         raise UsageError("solver takes mi.LevenbergMarquardt() (the default) or mi.MultipleShooting(), not a name; "

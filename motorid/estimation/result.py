@@ -60,6 +60,14 @@ class Fit(Shown):
         Largest error of the integration, in units of the noise.
     extra : dict
         What a particular solver adds (multipliers, continuity gaps).
+
+    Examples
+    --------
+    >>> fit = mi.fit(mi.dc_motor() + mi.effects.coulomb, runs)
+    >>> fit.fits
+    'noise'
+    >>> print(f"R = {fit.values['R']:.2f} Ω, one standard deviation {fit.std['R']:.1g} Ω")
+    R = 1.38 Ω, one standard deviation 0.0006 Ω
     """
 
     problem: Problem
@@ -315,7 +323,14 @@ def ended(fit: Fit) -> str:
 
 @dataclass(frozen=True, repr=False)
 class Failure(Shown):
-    """A run that failed, kept as a value: where it started, its status and why."""
+    """A run that failed, kept as a value: where it started, its status and why.
+
+    Examples
+    --------
+    >>> many = mi.multistart(fit, starts=2, quiet=True)
+    >>> [end.message for end in many.results if isinstance(end, mi.Failure)]
+    []
+    """
 
     start: Mapping[str, float]
     status: str
@@ -439,6 +454,12 @@ def compare(fits: Sequence[Fit], validate: Sequence[Experiment] | Experiment | N
     ------
     UsageError
         If no fit is given.
+
+    Examples
+    --------
+    >>> table = mi.compare([fit, better], validate=check)
+    >>> table.names
+    ('dc_motor', 'dc_motor + coulomb')
     """
     if not fits:
         raise UsageError("compare() takes a list of fits: mi.compare([fit, better]).")

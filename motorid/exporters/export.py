@@ -94,11 +94,7 @@ def export(found: Fit | Model | Exported, path: str | os.PathLike[str], to: str 
 
     Notes
     -----
-    A ``.casadi`` file is read with CasADi alone::
-
-        file = casadi.FileDeserializer("motor.casadi") functions, about = {f.name(): f for f in file.unpack()},
-        file.unpack() record, p = functions["record_0"](), functions["parameters"]()["p"] y =
-        functions["simulate_0"](s=record["s"], u=record["u"], p=p)["y"]
+    A ``.casadi`` file is read with CasADi alone, see the example.
 
     Raises
     ------
@@ -106,6 +102,15 @@ def export(found: Fit | Model | Exported, path: str | os.PathLike[str], to: str 
         If the form is not known, or a file must not be written there.
     OutputError
         If the disk refuses.
+
+    Examples
+    --------
+    >>> path = mi.export(better, "motor.casadi")
+    >>> import casadi
+    >>> file = casadi.FileDeserializer("motor.casadi")
+    >>> functions = {f.name(): f for f in file.unpack()}
+    >>> record, p = functions["record_0"](), functions["parameters"]()["p"]
+    >>> y = functions["simulate_0"](s=record["s"], u=record["u"], p=p)["y"]  # (channels, samples)
     """
     target = Path(path).expanduser()
     form = to or FORMS.get(target.suffix.lower())
@@ -155,6 +160,13 @@ def load(path: str | os.PathLike[str], effects: Iterable[Effect] = (), *,
         If the file cannot be read, or is none of these.
     ModelError
         If an effect is not known; the message says what is needed.
+
+    Examples
+    --------
+    >>> path = better.save("fit.json")
+    >>> again = mi.load(path)  # a Fit, not fitted again
+    >>> again.values == better.values
+    True
     """
     source = Path(path).expanduser()
     if source.suffix.lower() in (".c", ".h"):

@@ -36,6 +36,10 @@ class Rosenbrock:
     ----------
     compiled : bool or None
         None: compile once a model has used the virtual machine for a moment; True: at once; False: never.
+
+    Examples
+    --------
+    >>> fit = mi.fit(mi.dc_motor(), runs, engine=mi.Rosenbrock(compiled=False))
     """
 
     compiled: bool | None = None

@@ -82,7 +82,12 @@ class _Sundials:
 
 @dataclass(frozen=True)
 class Cvodes(_Sundials):
-    """SUNDIALS CVODES (Hindmarsh et al., ACM TOMS 31(3), 2005): stiff ODEs, variable-order BDF."""
+    """SUNDIALS CVODES (Hindmarsh et al., ACM TOMS 31(3), 2005): stiff ODEs, variable-order BDF.
+
+    Examples
+    --------
+    >>> sharp = mi.simulate(fit.model, runs[0].select(slice(100)), engine=mi.Cvodes(rtol=1e-10))
+    """
 
     name = "cvodes"
 
@@ -94,7 +99,12 @@ class Cvodes(_Sundials):
 
 @dataclass(frozen=True)
 class Idas(_Sundials):
-    """SUNDIALS IDAS: differential-algebraic systems, variable-order BDF."""
+    """SUNDIALS IDAS: differential-algebraic systems, variable-order BDF.
+
+    Examples
+    --------
+    >>> sharp = mi.simulate(fit.model, runs[0].select(slice(100)), engine=mi.Idas())
+    """
 
     name = "idas"
 

@@ -51,6 +51,12 @@ class Parameter:
         Name of a parameter that this one cannot physically fall below (breakaway friction, Coulomb friction);
         checked after a fit, by `diagnose`.
     doc : str
+
+    Examples
+    --------
+    >>> p = mi.dc_motor(R=1.2).parameters["R"]
+    >>> p.value, p.unit, p.vary
+    (1.2, 'Ω', True)
     """
 
     name: str
@@ -101,6 +107,12 @@ def P(value: float, unit: str = "", null: float | None = None, *, lower: float =
     """Declare a parameter of an effect as a default argument: ``tau_c=P(2e-3, "N·m", null=0)``.
 
     The name comes from the argument; what the others mean is told at `Parameter`.
+
+    Examples
+    --------
+    >>> @mi.effect(balance="torque")
+    ... def fan(m, c_2=mi.P(1e-8, "N·m·s²/rad²", null=0, lower=0, doc="drag")):
+    ...     m.torque -= c_2 * m.omega * abs(m.omega)
     """
     return Declared({"value": value, "unit": unit, "null": null, "lower": lower, "upper": upper,
                      "positive": positive, "vary": vary, "grid": tuple(grid), "periodic": periodic,
@@ -126,6 +138,12 @@ class Effect(Shown):
         What it is, with its source.
     includes : tuple of str
         Effects that this one contains as a special case (Stribeck friction contains Coulomb's).
+
+    Examples
+    --------
+    >>> mi.effects.cogging
+    <effect cogging (torque): A, N, phi>
+    >>> model = mi.dc_motor() + mi.effects.cogging(N=12)
     """
 
     name: str
@@ -210,9 +228,10 @@ def effect(*, balance: str, name: str | None = None,
 
     Examples
     --------
-    >>> @effect(balance="torque")
-    ... def coulomb(m, tau_c=P(2e-3, "N·m", null=0)):
+    >>> @mi.effect(balance="torque")
+    ... def dry_friction(m, tau_c=mi.P(2e-3, "N·m", null=0)):
     ...     m.torque -= tau_c * m.sign(m.omega)
+    >>> fit = mi.fit(mi.dc_motor() + dry_friction, runs)
     """
     if balance not in BALANCES:
         raise ModelError(one_of(balance, BALANCES, "balance"))

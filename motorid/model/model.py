@@ -39,6 +39,14 @@ class Model(Shown):
         Linear: the same equations read as mass and force, units shown so.
     angle_input : bool
         Effects take the angle from a given signal instead of the model's own state.
+
+    Examples
+    --------
+    >>> model = (mi.dc_motor() + mi.effects.coulomb).fix(L=1e-3).bounded(R=(0.5, 5))
+    >>> model.free_names
+    ('R', 'K', 'b', 'J', 'tau_c')
+    >>> model.without("coulomb").effect_names
+    ()
     """
 
     base: str
@@ -284,6 +292,11 @@ def dc_motor(**values: float) -> Model:
     ----------
     **values : float
         Known or assumed R (Ω), L (H), K (N·m/A), b (N·m·s/rad), J (kg·m²); none is needed for a fit.
+
+    Examples
+    --------
+    >>> mi.dc_motor(R=1.3)
+    <model dc_motor: R, L, K, b, J>
     """
     model = Model("dc_motor", parameters={p.name: p for p in BASES["dc_motor"]})
     return model.replace(**values)
@@ -298,6 +311,11 @@ def torque_driven(axis: str = "rotary", **values: float) -> Model:
         Linear: J is a mass (kg), b in N·s/m, g in N per unit of the command.
     **values : float
         ``g``, ``b``, ``J``. The gain g is fixed (only ratios to it can be determined) until ``free("g")``.
+
+    Examples
+    --------
+    >>> mi.torque_driven(axis="linear")
+    <model torque_driven: b, J>
     """
     if axis not in ("rotary", "linear"):
         raise ModelError(one_of(axis, ("rotary", "linear"), "axis"))

@@ -46,6 +46,10 @@ class LevenbergMarquardt:
         Largest change of one coordinate per iteration: e² on the logarithmic scale.
     looks : int
         How often a fit restarts where its end is in doubt; see `motorid.estimation.restarts`.
+
+    Examples
+    --------
+    >>> fit = mi.fit(mi.dc_motor(), runs, solver=mi.LevenbergMarquardt(max_iterations=50))
     """
 
     max_iterations: int = 200
@@ -63,7 +67,12 @@ class LevenbergMarquardt:
 
 @dataclass(frozen=True)
 class Huber:
-    """Robust loss: quadratic within `delta` sigma, linear beyond (Huber, Ann. Math. Stat. 35, 1964)."""
+    """Robust loss: quadratic within `delta` sigma, linear beyond (Huber, Ann. Math. Stat. 35, 1964).
+
+    Examples
+    --------
+    >>> fit = mi.fit(mi.dc_motor(), runs, loss=mi.Huber(2.0))
+    """
 
     delta: float = 1.345
 

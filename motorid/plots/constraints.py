@@ -37,6 +37,10 @@ def plot_current_limit(
     -------
     ndarray of Axes, shape (fits, runs)
         At most three runs, each where the current comes near the limit.
+
+    Examples
+    --------
+    >>> axes = mi.plot_current_limit(better, limit=8.0)
     """
     fits: list[Fit] = []
     for r in results:
@@ -111,6 +115,10 @@ def plot_formulations(result: Formulations) -> np.ndarray:
     ndarray of Axes, shape (3,)
         Change of the parameters against the plain fit with two standard deviations; error per channel; distance
         of the penalty solution from the hard one as the penalties grow heavier.
+
+    Examples
+    --------
+    >>> axes = mi.plot_formulations(mi.compare_formulations(better, [mi.SteadyState()], weights=[1.0]))
     """
     if not isinstance(result, Formulations):
         raise UsageError(f"plot_formulations takes mi.compare_formulations(fit), got {type(result).__name__}.")

@@ -39,6 +39,10 @@ def plot_missing(result: Missing | Diagnosis, *, show: int = 3, run: int | None 
     Returns
     -------
     ndarray of Axes, shape (balances, 1 + show)
+
+    Examples
+    --------
+    >>> axes = mi.plot_missing(mi.locate(fit))
     """
     missing = result.missing if isinstance(result, Diagnosis) else result
     if not isinstance(missing, Missing):
@@ -106,6 +110,10 @@ def plot_answer(found: Diagnosis, ax: Axes | None = None) -> Axes:
     ----------
     found : Diagnosis
     ax : Axes, optional
+
+    Examples
+    --------
+    >>> axes = mi.plot_answer(found)
     """
     if not isinstance(found, Diagnosis):
         raise UsageError(f"plot_answer takes a diagnosis, mi.diagnose(fit), got {type(found).__name__}.")
@@ -169,6 +177,10 @@ def plot_ranking(result: Diagnosis | Sequence[Candidate], ax: Axes | None = None
     ax : Axes, optional
     show : int
         Number of effects.
+
+    Examples
+    --------
+    >>> axes = mi.plot_ranking(found)
     """
     every = list(result.ranking if isinstance(result, Diagnosis) else result)
     chosen = every[:show]
@@ -218,6 +230,10 @@ def plot_ladder(result: Ladder | Diagnosis, ax: Axes | None = None) -> Axes:
     ----------
     result : Ladder or Diagnosis
     ax : Axes, optional
+
+    Examples
+    --------
+    >>> axes = mi.plot_ladder(found)
     """
     ladder = result.ladder if isinstance(result, Diagnosis) else result
     if not isinstance(ladder, Ladder) or not ladder.rungs:
@@ -261,6 +277,11 @@ def plot_design(design: Design) -> np.ndarray:
     Returns
     -------
     ndarray of Axes, shape (channels + 1,)
+
+    Examples
+    --------
+    >>> plan = mi.design_experiment(better, parameters=["b"], v_max=12, i_max=8, duration=0.5, levels=4)
+    >>> axes = mi.plot_design(plan)
     """
     if not isinstance(design, Design):
         raise UsageError(f"plot_design takes mi.design_experiment(...), got {type(design).__name__}.")

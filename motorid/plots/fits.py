@@ -33,6 +33,10 @@ def plot_runs(runs: Sequence[Experiment] | Experiment, channels: Sequence[str] |
     Returns
     -------
     ndarray of Axes, shape (channels, runs)
+
+    Examples
+    --------
+    >>> axes = mi.plot_runs(runs)
     """
     every = [runs] if isinstance(runs, Experiment) else list(runs)
     if not every:
@@ -70,6 +74,10 @@ def plot_fit(result: Any, *, before: Any = None) -> np.ndarray:
     -------
     ndarray of Axes, shape (2·channels, runs)
         At most three runs; the band is ±2 standard deviations of the noise.
+
+    Examples
+    --------
+    >>> axes = mi.plot_fit(better, before=fit)
     """
     every = _simulations(result)
     old = _simulations(before)[:COLUMNS] if before is not None else []
@@ -163,6 +171,10 @@ def plot_parameters(*results: Any, truth: Mapping[str, float] | None = None,
     -------
     ndarray of Axes
         One per parameter.
+
+    Examples
+    --------
+    >>> axes = mi.plot_parameters(fit, better)
     """
     fits = _fits(results)
     chosen = list(names or dict.fromkeys(n for f in fits for n, p in f.model.parameters.items() if p.vary))

@@ -38,6 +38,10 @@ def plot_residuals(fit: Fit, channels: Sequence[str] | None = None) -> np.ndarra
     -------
     ndarray of Axes, shape (channels, k)
         Time, histogram, cross-correlation with the input, autocorrelation, then one per quantity known.
+
+    Examples
+    --------
+    >>> axes = mi.plot_residuals(fit)
     """
     sims = fit.simulations
     present = [c for c in CHANNELS if any(c in s.experiment.outputs and c in s.outputs for s in sims)]

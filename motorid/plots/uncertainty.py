@@ -38,6 +38,10 @@ def plot_singular_values(result: Identifiability) -> np.ndarray:
     Returns
     -------
     ndarray of Axes, shape (2,)
+
+    Examples
+    --------
+    >>> axes = mi.plot_singular_values(mi.identifiability(better))
     """
     if not isinstance(result, Identifiability):
         raise UsageError(f"plot_singular_values takes mi.identifiability(fit), got {type(result).__name__}.")
@@ -88,6 +92,10 @@ def plot_profile(result: Profile | Mapping[str, Profile] | Intervals) -> np.ndar
     -------
     ndarray of Axes
         One per parameter.
+
+    Examples
+    --------
+    >>> axes = mi.plot_profile(mi.profile(better, "b", quiet=True))
     """
     profiles = _profiles(result)
     columns = min(len(profiles), 3)
@@ -174,6 +182,10 @@ def plot_sensitivities(fit: Fit, *, run: int = 0, names: Sequence[str] | None = 
     Returns
     -------
     ndarray of Axes, shape (channels,)
+
+    Examples
+    --------
+    >>> axes = mi.plot_sensitivities(better)
     """
     problem = fit.problem
     free = [p.name for p in problem.unknown if p.name in fit.values]
@@ -219,6 +231,10 @@ def plot_waterfall(result: Multistart) -> np.ndarray:
     -------
     ndarray of Axes, shape (2,)
         Misfit over the best, sorted; parameters of starts and ends over the reference.
+
+    Examples
+    --------
+    >>> axes = mi.plot_waterfall(mi.multistart(fit, starts=2, quiet=True))
     """
     if not isinstance(result, Multistart):
         raise UsageError(f"plot_waterfall takes mi.multistart(fit), got {type(result).__name__}.")

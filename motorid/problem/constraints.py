@@ -33,6 +33,10 @@ class CurrentLimit(Relation):
     weight : float
         As a penalty each sample adds ``weight·max(0, |i| − limit)/limit`` to a residual in units of the RMS
         of the measured channels (in a fit weighted by the noise: times the ratio of that RMS to the noise).
+
+    Examples
+    --------
+    >>> fit = mi.fit(mi.dc_motor(), runs, formulation="penalty", constraints=[mi.CurrentLimit(8.0)])
     """
 
     limit: float
@@ -87,6 +91,12 @@ class SteadyState(Relation):
         1 % of its RMS all through the segment.
     at : sequence of (run, begin, end), optional
         Steady parts given by the user, times in s, instead of those found.
+
+    Examples
+    --------
+    >>> hard = mi.fit(better.model, runs, solver=mi.MultipleShooting(), constraints=[mi.SteadyState()])
+    >>> hard.formulation
+    'hard'
     """
 
     tolerance: float = 0.01
@@ -210,6 +220,11 @@ class Constraint(Relation):
     title : str
         What messages call it.
     unit : str
+
+    Examples
+    --------
+    >>> known = mi.Constraint(lambda m: m.K / m.R, lower=0.03, upper=0.05, title="stall torque per volt")
+    >>> fit = mi.fit(mi.dc_motor(), runs, penalties=[known])
     """
 
     expression: Callable[[Any], Any]

@@ -49,6 +49,11 @@ class Problem:
         Local error of the integration relative to the largest state; by default a small part of the noise.
     width : float, optional
         Width of sgn, rad/s, in place of the model's or the one that suits the records (continuation).
+
+    Examples
+    --------
+    >>> problem = mi.Problem(mi.dc_motor(), runs, priors={"R": (1.3, 0.1)})
+    >>> fit = mi.solve(problem)
     """
 
     model: Model

@@ -97,6 +97,11 @@ def check_derivatives(problem: Problem, q: Array | None = None, *, steps: Sequen
         If there is nothing to differentiate, or `q` has the wrong length.
     SimulationError
         If the model cannot be simulated at `q` or beside it.
+
+    Examples
+    --------
+    >>> mi.check_derivatives(better.problem).ok
+    True
     """
     q = np.array(problem.start if q is None else q, float)
     if not len(q) or q.shape != problem.start.shape:

@@ -136,6 +136,12 @@ def simulate(model: Model, runs: Sequence[Experiment] | Experiment, *, engine: s
     ------
     SimulationError
         If the integration fails.
+
+    Examples
+    --------
+    >>> predicted = mi.simulate(better.model, check)
+    >>> predicted[0].outputs["omega"].shape == check[0].t.shape
+    True
     """
     problem = as_problem(model, runs, engine=engine, initial=initial)
     return list(simulated(problem, estimate_initial))
@@ -161,8 +167,10 @@ def planned(model: Model, t: Sequence[float] | Array, v: Sequence[float] | Array
 
     Examples
     --------
-    >>> plan = planned(dc_motor(R=1.4, L=2e-3, K=0.046, b=6e-5, J=2e-5), t, v, channels=["omega"])
-    >>> identifiability(Problem(model, [plan]))
+    >>> t = np.arange(0, 1, 1e-3)
+    >>> plan = mi.planned(better.model, t, np.where(t < 0.5, 6.0, -6.0), channels=["omega"])
+    >>> mi.identifiability(mi.Problem(better.model, [plan])).rank
+    4
     """
     t = np.asarray(t, float)
     blank = Experiment(t, {"v": np.asarray(v, float)}, {c: np.zeros(len(t)) for c in channels}, hold=hold, name=name)
@@ -262,6 +270,11 @@ def evaluate(fit_or_model: Any, runs: Sequence[Experiment] | Experiment, **optio
     runs : Experiment or sequence of Experiment
     **options
         `engine` and `initial` as in `simulate`.
+
+    Examples
+    --------
+    >>> mi.evaluate(better, check)
+    <evaluation of 1 runs: NRMSE i 1.38 %, omega 1.02 %>
     """
     model = fit_or_model if isinstance(fit_or_model, Model) else fit_or_model.model
     if not isinstance(fit_or_model, Model):

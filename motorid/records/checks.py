@@ -45,6 +45,11 @@ def check_runs(runs: Sequence[Experiment]) -> list[str]:
     -------
     list of str
         One sentence or two per finding, naming the runs; empty if there is nothing to say.
+
+    Examples
+    --------
+    >>> for remark in mi.check_runs(runs):
+    ...     print(remark)
     """
     remarks = []
     for check in _CHECKS:

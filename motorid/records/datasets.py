@@ -38,6 +38,11 @@ def data_path(name: str = "") -> Path:
     ------
     DataError
         If there is no such set or file.
+
+    Examples
+    --------
+    >>> mi.data_path("hidden_friction/run1.csv").name
+    'run1.csv'
     """
     root = _root()
     path = root / name

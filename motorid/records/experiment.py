@@ -56,6 +56,13 @@ class Experiment(Shown):
     ------
     DataError
         If anything above does not hold; the message says what was expected and what came.
+
+    Examples
+    --------
+    >>> t = np.arange(0, 1, 1e-3)
+    >>> run = mi.Experiment(t, {"v": np.full(1000, 6.0)}, {"omega": 100 * (1 - np.exp(-t / 0.05))}, name="step")
+    >>> run
+    <Experiment 'step': v → omega; 1000 samples, 0.999 s>
     """
 
     t: Array

@@ -63,6 +63,12 @@ def read_runs(paths: Path_ | Iterable[Path_], *, columns: Mapping[str, object] |
     ------
     DataError
         If a file is missing or cannot be used; the message says why and what to do.
+
+    Examples
+    --------
+    >>> runs = mi.read_runs(mi.data_path("hidden_friction") / "run*.csv")
+    >>> len(runs)
+    2
     """
     given = paths if isinstance(paths, list | tuple) else [paths]
     if any(hasattr(p, "reset_index") for p in given):
@@ -80,13 +86,24 @@ def read_csv(path: Path_, *, columns: Mapping[str, object] | None = None, units:
     """Read one text file of whatever dialect (delimiter, decimal comma, comments, row of units, encoding).
 
     Parameters and errors are those of `read_runs`; `name` is used instead of the name of the file.
+
+    Examples
+    --------
+    >>> run = mi.read_csv(mi.data_path("hidden_friction/run1.csv"))
+    >>> run.channels
+    ('i', 'omega')
     """
     return _read(path, parse_table, columns, units, hold, name)
 
 
 def read_mat(path: Path_, *, columns: Mapping[str, object] | None = None, units: Mapping[str, object] | None = None,
              hold: str | None = None, name: str | None = None) -> Experiment:
-    """Read one MATLAB file (up to version 7); otherwise like `read_csv`."""
+    """Read one MATLAB file (up to version 7); otherwise like `read_csv`.
+
+    Examples
+    --------
+    >>> run = mi.read_mat("bench.mat", columns={"v": "u"}, units={"omega": "rpm"})  # doctest: +SKIP
+    """
     return _read(path, mat_table, columns, units, hold, name)
 
 

@@ -41,6 +41,10 @@ def explore(fit: Fit, *, effects: Iterable[Effect | str] | None = None) -> Explo
     ------
     MissingDependency
         Without ipywidgets.
+
+    Examples
+    --------
+    >>> play = mi.explore(fit, effects=["coulomb", "stribeck"])  # its widgets show in a notebook
     """
     if not isinstance(fit, Fit):
         raise UsageError(f"explore takes a fit, mi.explore(mi.fit(mi.dc_motor(), runs)); got {type(fit).__name__}.")

@@ -56,6 +56,10 @@ def report(result: Any, path: str | Path, *, title: str = "", command: str = "",
         If there is nothing to tell, or the file must not or cannot be written there.
     OutputError
         If the disk refuses.
+
+    Examples
+    --------
+    >>> path = mi.report(found, "motor.html")
     """
     results = list(result) if isinstance(result, list | tuple) else [result]
     if not results:

@@ -137,6 +137,12 @@ def fit_many(model: Model, motors: Mapping[str, Records], *, journal: str | Path
     ------
     UsageError
         If there are no motors.
+
+    Examples
+    --------
+    >>> batch = mi.fit_many(mi.dc_motor(), {"m1": runs[:1], "m2": runs[1:]}, quiet=True)
+    >>> batch.table.loc["m1", "status"]
+    'converged'
     """
     if not motors:
         raise UsageError("fit_many takes a mapping {name: runs}; it is empty. See motors_in(folder).")
@@ -208,6 +214,11 @@ def motors_in(folder: str | Path) -> dict[str, list[Path]]:
     ------
     DataError
         If the folder does not exist or holds no records.
+
+    Examples
+    --------
+    >>> list(mi.motors_in(mi.data_path("hidden_friction")))
+    ['check1', 'run1', 'run2']
     """
     place = Path(folder)
     if not place.is_dir():

@@ -148,6 +148,10 @@ def bootstrap(fit: Fit, *, kind: str = "blocks", n: int = 200, block: int | None
         If there are too few runs to resample them, or the kind is unknown.
     FitError
         If fewer than two refits worked.
+
+    Examples
+    --------
+    >>> spread = mi.bootstrap(better, n=10, quiet=True)
     """
     if kind not in KINDS:
         raise UsageError(one_of(kind, KINDS, "kind of bootstrap"))

@@ -133,6 +133,11 @@ def covariance(fit: Fit, *, method: str = "coloured") -> Covariance:
     ------
     UsageError
         If the method is unknown.
+
+    Examples
+    --------
+    >>> sure = mi.covariance(better)
+    >>> axes = mi.plot_parameters(fit, better)
     """
     if method not in METHODS:
         raise UsageError(one_of(method, METHODS, "method"))

@@ -197,6 +197,11 @@ def identifiability(problem_or_fit: Problem | Fit, *, points: int = 5, seed: int
     ------
     SimulationError
         If the model cannot be simulated there.
+
+    Examples
+    --------
+    >>> mi.identifiability(better).rank
+    6
     """
     problem, q = _problem_at(problem_or_fit)
     names = problem.model.free_names

@@ -62,6 +62,11 @@ def multistart(problem_or_fit: Problem | Fit, *, starts: int = 100, spread: floa
     ------
     UsageError
         If there is nothing to start from, or the spread is below 1.
+
+    Examples
+    --------
+    >>> many = mi.multistart(fit, starts=2, quiet=True)
+    >>> axes = mi.plot_waterfall(many)
     """
     if starts < 1 or not spread >= 1:
         raise UsageError("multistart takes at least one start and a spread of at least 1; "

@@ -145,6 +145,10 @@ def profile(fit: Fit, name: str, *, level: float = 0.95, map: Map | None = None,
     ------
     UsageError
         If the parameter is unknown or fixed.
+
+    Examples
+    --------
+    >>> flat = mi.profile(better, "b", quiet=True)
     """
     return profiles(fit, [name], level=level, map=map, quiet=quiet)[name]
 
@@ -152,7 +156,13 @@ def profile(fit: Fit, name: str, *, level: float = 0.95, map: Map | None = None,
 @one_thread
 def profiles(fit: Fit, names: Sequence[str] | None = None, *, level: float = 0.95, map: Map | None = None,
              quiet: bool = False) -> dict[str, Profile]:
-    """Return the profiles of several parameters, by default of all free ones; see `profile`."""
+    """Return the profiles of several parameters, by default of all free ones; see `profile`.
+
+    Examples
+    --------
+    >>> each = mi.profiles(better, ["R", "b"], quiet=True)
+    >>> axes = mi.plot_profile(each)
+    """
     free = fit.problem.model.free_names
     for n in names or ():
         if n not in free:
@@ -282,6 +292,10 @@ def intervals(fit: Fit, *, level: float = 0.95, kind: str = "blocks", n: int = 2
         Anything with the signature of `map`.
     quiet : bool
         No progress bars.
+
+    Examples
+    --------
+    >>> three = mi.intervals(fit, n=10, quiet=True)
     """
     refits = bootstrap(fit, kind=kind, n=n, seed=seed, map=map, quiet=quiet)
     return Intervals(covariance(fit), refits, profiles(fit, level=level, map=map, quiet=quiet), level)

@@ -157,6 +157,10 @@ def compare_formulations(problem: Problem | Fit, constraints: Sequence[Relation]
     ------
     FitError
         If not even the plain fit can be carried out.
+
+    Examples
+    --------
+    >>> three = mi.compare_formulations(better, [mi.SteadyState()], weights=[1.0])
     """
     given = problem.problem if isinstance(problem, Fit) else problem
     relations = tuple(constraints if constraints is not None else given.constraints) or (SteadyState(),)

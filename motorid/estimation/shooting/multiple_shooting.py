@@ -69,6 +69,10 @@ class MultipleShooting:
         IPOPT's tolerance on the scaled problem.
     verbose : bool
         Show IPOPT's log.
+
+    Examples
+    --------
+    >>> fit = mi.fit(mi.dc_motor(), runs, solver=mi.MultipleShooting(every=100))
     """
 
     every: int | None = None
