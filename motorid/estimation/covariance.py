@@ -102,17 +102,13 @@ def channel_blocks(problem: Problem, residuals: Array, jacobian: Array) -> dict[
     """Return per channel and run the whitened residual (N,), NaN where missing, and its Jacobian (N, k)."""
     start, ny = 0, len(problem.outputs)
     blocks: dict[str, list[tuple[Array, Array]]] = {c: [] for c in problem.outputs}
-    for run in problem.runs:
-        present = np.column_stack([np.isfinite(run.experiment.outputs[c]) if c in run.experiment.outputs
-                                   else np.zeros(len(run.grid.t), bool) for c in problem.outputs])
-        rows, n = np.flatnonzero(present.ravel()), present.size
-        r, jac = np.full(n, np.nan), np.zeros((n, jacobian.shape[1]))
-        r[rows] = residuals[start:start + len(rows)]
-        jac[rows] = jacobian[start:start + len(rows)]
-        start += len(rows)
+    for run, measured, r in zip(problem.runs, problem.measured, problem.unstack(residuals), strict=True):
+        jac = np.zeros((r.size, jacobian.shape[1]))
+        jac[slice(None) if measured.index is None else measured.index] = jacobian[start:start + measured.size]
+        start += measured.size
         for j, c in enumerate(problem.outputs):
             if c in run.sigma:
-                blocks[c].append((r[j::ny], jac[j::ny]))
+                blocks[c].append((r[:, j], jac[j::ny]))
     return blocks
 
 

@@ -55,11 +55,11 @@ def with_start_values(problem: Problem) -> Problem:
 def _guessed(problem: Problem) -> Problem:
     """Return the problem at the best of a few guesses, and of the shapes of its effects."""
     model, runs = problem.model, problem.experiments
-    candidates = [_at(model, first_guess(model, runs))]
+    candidates = [model.start_at(first_guess(model, runs))]
     if any(p.given for p in model.parameters.values()) or _was_fitted(model):
         candidates.append(model)
     if any(e.balance == "torque" for e in model.effects):
-        candidates.append(_at(model, first_guess(model, runs, loaded=True)))
+        candidates.append(model.start_at(first_guess(model, runs, loaded=True)))
     problems = [problem.for_model(with_suited_effects(m, runs)) for m in candidates]
     best = problems[0] if len(problems) == 1 else min(problems, key=lambda p: start_cost(p, refine=False))
     asked = candidates[problems.index(best)]
@@ -67,11 +67,6 @@ def _guessed(problem: Problem) -> Problem:
     for effect in model.effects:
         best = _shaped(best, effect, asked)
     return best
-
-
-def _at(model: Model, values: Mapping[str, float]) -> Model:
-    limits = model.parameters
-    return model.start_at({n: float(np.clip(v, limits[n].lower, limits[n].upper)) for n, v in values.items()})
 
 
 def _was_fitted(model: Model) -> bool:

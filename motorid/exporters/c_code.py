@@ -102,19 +102,19 @@ static void {name}_call(int (*f)(const double**, double**, int*, double*, int), 
 void {name}_initial(const double s[3], const double* p, double* x) {{
   const double* given[2];
   given[0] = s; given[1] = p;
-  {name}_f_initial_call(given, 2, x);
+  {name}_call({name}_f_initial, given, 2, x, 0);
 }}
 
 void {name}_rhs(const double* x, const double* u, const double* p, double* dx) {{
   const double* given[3];
   given[0] = x; given[1] = u; given[2] = p;
-  {name}_f_rhs_call(given, 3, dx);
+  {name}_call({name}_f_rhs, given, 3, dx, 0);
 }}
 
 void {name}_outputs(const double* x, const double* u, const double* p, double* y) {{
   const double* given[3];
   given[0] = x; given[1] = u; given[2] = p;
-  {name}_f_outputs_call(given, 3, y);
+  {name}_call({name}_f_outputs, given, 3, y, 0);
 }}
 
 void {name}_step(double* x, const double* u0, const double* u1, double dt, int substeps, const double* p) {{
@@ -199,8 +199,8 @@ def c_files(found: Fit | Model, path: Path) -> dict[Path, str]:
     name = identifier(path.stem)
     folder = path.parent
     fields = _fields(found, name)
-    files = {f"{name}.c": f"/* {fields['title']}, written by motorid */\n" + fields["generated"] + _wrapper(fields),
-             f"{name}.h": HEADER.format_map(fields), f"{name}_main.c": MAIN.format_map(fields)}
+    source = f"/* {fields['title']}, written by motorid */\n" + fields["generated"] + WRAPPER.format_map(fields)
+    files = {f"{name}.c": source, f"{name}.h": HEADER.format_map(fields), f"{name}_main.c": MAIN.format_map(fields)}
     if isinstance(found, Fit):
         for k, (run, _) in enumerate(runs_of(found)):
             files[f"{name}_run{k}.csv"] = _record(run.grid, found.problem.system.inputs)
@@ -260,16 +260,6 @@ def identifier(stem: str) -> str:
     """Return a C identifier like `stem`."""
     name = re.sub(r"\W", "_", stem, flags=re.ASCII)
     return name if name[:1].isalpha() else f"motor_{name}"
-
-
-def _wrapper(fields: dict[str, Any]) -> str:
-    text = WRAPPER
-    for f in ("initial", "rhs", "outputs"):  # one result each
-        n = {"initial": 2}.get(f, 3)
-        result = {"initial": "x", "rhs": "dx", "outputs": "y"}[f]
-        text = text.replace(f"{{name}}_f_{f}_call(given, {n}, {result});",
-                            f"{{name}}_call({{name}}_f_{f}, given, {n}, {result}, 0);")
-    return text.format_map(fields)
 
 
 def _fields(found: Fit | Model, name: str) -> dict[str, Any]:

@@ -53,7 +53,8 @@ class _Sundials:
             integrators.append(_Integrators(self.name, self.rtol, self.atol, system, nq))
         for first, count in _pieces(grid):
             self._walk(integrators[0], grid, first, count, x, dx, p, dp, scale)
-        return observe(system, grid, x, dx if nq else None, p, dp)
+        y, dy = stepper(system).machine.observe(grid, x, dx if nq else None, p, dp)
+        return Trajectory(y, dy, x, dx if nq else None, None)
 
     def _walk(self, integrators: _Integrators, grid: Grid, first: int, count: int, *rest: Any) -> None:
         x = rest[0]
@@ -202,8 +203,3 @@ def _state_scale(system: System, grid: Grid, x0: Array, p: Array) -> Array:
         size = np.abs(x0)
     return np.where((size > 1e-12) & np.isfinite(size), size, 1.0)
 
-
-def observe(system: System, grid: Grid, x: Array, dx: Array | None, p: Array, dp: Array | None) -> Trajectory:
-    """Return the outputs along a state trajectory."""
-    y, dy = stepper(system).machine.observe(grid, x, dx, p, dp)
-    return Trajectory(y, dy, x, dx, None)

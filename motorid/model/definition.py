@@ -1,4 +1,4 @@
-"""Parameters with units and limits, and the one place where physical values become solver coordinates."""
+"""What a user declares: parameters with units and limits, and effects, whose laws write on the sheet of equations."""
 
 from __future__ import annotations
 

@@ -95,7 +95,7 @@ class Model(Shown):
         return self._change({n: {"value": float(v), "given": True} for n, v in values.items()})
 
     def start_at(self, values: Mapping[str, float]) -> Model:
-        """Return the model with values of a result; unlike after `replace`, a fit may start elsewhere."""
+        """Return the model at values, within their limits; unlike after `replace`, a fit may start elsewhere."""
         known = {n: float(v) for n, v in values.items() if n in self.parameters}
         return self._change({n: {"value": _within(self.parameters[n], v)} for n, v in known.items()})
 

@@ -279,20 +279,6 @@ def _cost(residual: Callable[[Array], Array], q: Array) -> tuple[Array, float]:
     return r, cost if np.isfinite(cost) else np.inf
 
 
-def gauss_newton_covariance(jac: Array, variance: float = 1.0) -> tuple[Array, np.ndarray]:
-    """Return the covariance (JᵀJ)⁻¹·variance, and which coordinates the data determine.
-
-    A coordinate with a noticeable part in a direction that is left out counts as not determined.
-
-    Returns
-    -------
-    covariance : ndarray, shape (n, n)
-    determined : ndarray of bool, shape (n,)
-    """
-    half, blind, _ = seen_directions(jac)
-    return variance * half @ half.T, np.sum(blind**2, axis=0) <= 1e-6
-
-
 def seen_directions(jac: Array) -> tuple[Array, Array, Array]:
     """Return H (n, r) with (JᵀJ)⁻¹ = HHᵀ, the directions left out (m, n), and the columns' lengths (n,).
 

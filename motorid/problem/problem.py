@@ -230,10 +230,6 @@ class Problem:
         """Return whitened residual and Jacobian, before the loss, of run `k`, without missing samples."""
         return self.measured[k].residual(traj)
 
-    def whiten(self, outputs: Sequence[Array]) -> Array:
-        """Return model outputs, (N, ny) per run, minus what was measured, whitened and stacked, before the loss."""
-        return np.concatenate([m.stack((y - m.y) * m.weights) for m, y in zip(self.measured, outputs, strict=True)])
-
     def unstack(self, residual: Array) -> list[Array]:
         """Return a stacked output residual as one (N, ny) per run, NaN where missing."""
         ends = np.cumsum([m.size for m in self.measured])
@@ -292,9 +288,7 @@ class Problem:
 
     def start_at(self, values: Mapping[str, float]) -> Problem:
         """Return the problem with `values` as its start, each inside the limits of its parameter."""
-        limits = self.model.parameters
-        inside = {n: float(np.clip(v, limits[n].lower, limits[n].upper)) for n, v in values.items() if n in limits}
-        return self.for_model(self.model.start_at(inside))
+        return self.for_model(self.model.start_at(values))
 
     def tuned(self, **fields: Any) -> Problem:
         """Return the problem with another `balance`, `width` …; the records stay as prepared."""

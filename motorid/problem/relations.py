@@ -20,6 +20,8 @@ from motorid.errors import UsageError
 from motorid.integrate.engine import Trajectory
 from motorid.numerics.signals import Array
 
+NEAR = 1e-6  # of a row's size: so near it stands at its limit
+
 
 @dataclass(frozen=True, eq=False)
 class Part:
@@ -83,9 +85,9 @@ class Part:
     def _mapped(self) -> ca.Function:
         return self.local.map(len(self.samples))
 
-    def at_limit(self, c: Array, near: float = 1e-6) -> np.ndarray:
+    def at_limit(self, c: Array) -> np.ndarray:
         """Tell which rows (n,) stand at one of their limits."""
-        return (c >= self.upper - near) | (c <= self.lower + near)
+        return (c >= self.upper - NEAR) | (c <= self.lower + NEAR)
 
     def violation(self, c: Array) -> Array:
         """Return how far rows lie outside their limits, (n,), dimensionless, with its sign."""
@@ -126,12 +128,11 @@ class Relation(ABC):
 
     def evaluate(self, problem: Any, q: Array, trajs: Sequence[Trajectory]) -> tuple[Array, Array | None]:
         """Return the residual (n,) as a penalty and its Jacobian (n, nq), None if the trajectories have none."""
-        p, dp = parameters_of(problem, q)
         rs, jacs = [np.zeros(0)], [np.zeros((0, len(q)))]
-        derivatives = all(t.dx is not None for t in trajs)
+        derivatives, at = all(t.dx is not None for t in trajs), problem.unknowns.point(q)
         for part in self.parts(problem):
             t, s = trajs[part.run], part.samples
-            c, jac = part.rows(t.x[s], p, t.dx[s] if derivatives and t.dx is not None else None, dp)
+            c, jac = part.rows(t.x[s], at.p, t.dx[s] if derivatives and t.dx is not None else None, at.dp)
             r, slope = self.penalty(c, part)
             rs.append(r)
             if jac is not None:
@@ -161,17 +162,6 @@ class Weighed(Relation):
 
 
 _made: weakref.WeakKeyDictionary[Any, dict[int, tuple[Any, tuple[Part, ...]]]] = weakref.WeakKeyDictionary()
-
-
-def parameters_of(problem: Any, q: Array) -> tuple[Array, Array]:
-    """Return p (np,) of the system and dp/dq (np, nq)."""
-    values = problem.values(q)
-    names = problem.system.parameters
-    select = np.zeros((len(names), len(problem.unknown)))
-    for j, parameter in enumerate(problem.unknown):
-        if parameter.name in names:
-            select[names.index(parameter.name), j] = 1.0
-    return np.array([values[n] for n in names]), select * problem.scaling.slope(q)
 
 
 def local(system: Any, rows: Callable[..., Any], nd: int) -> ca.Function:

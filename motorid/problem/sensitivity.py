@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from motorid.errors import UsageError
 from motorid.numerics.parallel import one_thread
@@ -120,7 +121,7 @@ def check_derivatives(problem: Problem, q: Array | None = None, *, steps: Sequen
     return DerivativeCheck(tuple(p.name for p in fine.unknown), names, relative, slope, tolerance)
 
 
-def _largest(rows: Array, group: Array, n: int) -> Array:
+def _largest(rows: Array, group: NDArray[np.intp], n: int) -> Array:
     """Return the largest size in each group of rows, shape (columns, n)."""
     return np.column_stack([np.abs(rows[group == g]).max(axis=0, initial=0.0) for g in range(n)])
 
@@ -134,16 +135,9 @@ def _slope(problem: Problem, q: Array, j: int, h: float) -> Array:
     return (8 * (moved(1) - moved(-1)) - (moved(2) - moved(-2))) / (12 * h)
 
 
-def _groups(problem: Problem, n: int) -> tuple[tuple[str, ...], Array]:
+def _groups(problem: Problem, n: int) -> tuple[tuple[str, ...], NDArray[np.intp]]:
     """Return the names of groups of residuals, and the group of each of the `n` rows."""
-    columns = []
-    for run in problem.runs:
-        out = run.experiment.outputs
-        nothing = np.full(len(run.grid.t), np.nan)
-        there = np.isfinite(np.column_stack([out.get(c, nothing) for c in problem.outputs]))
-        columns.append(np.nonzero(there)[1])
-    group = np.concatenate(columns)
-    names = problem.outputs
+    group, names = np.concatenate([np.nonzero(np.isfinite(m.y))[1] for m in problem.measured]), problem.outputs
     if len(group) < n:
         group, names = np.append(group, np.full(n - len(group), len(names))), (*names, "others")
     return names, group

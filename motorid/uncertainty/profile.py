@@ -21,7 +21,7 @@ from motorid.display.tables import Flag, Table
 from motorid.errors import MotoridError, UsageError, one_of
 from motorid.estimation.least_squares import least_squares
 from motorid.estimation.result import Fit
-from motorid.numerics.least_squares import LevenbergMarquardt, gauss_newton_covariance
+from motorid.numerics.least_squares import LevenbergMarquardt, seen_directions
 from motorid.numerics.parallel import Map, Parcel, one_thread, run_tasks
 from motorid.numerics.signals import Array
 from motorid.problem.problem import Problem
@@ -181,7 +181,8 @@ def _plan(fit: Fit, name: str, level: float) -> tuple[float, float, float, float
     found = covariance(fit)
     j = found.names.index(name)
     slope = fit.problem.scaling.slope(fit.q)[j]
-    plain = gauss_newton_covariance(fit.jacobian)[0]
+    half, *_ = seen_directions(fit.jacobian)
+    plain = half @ half.T
     overall = np.median([c.variance for c in found.colours.values()])
     sd = found.std[name]
     factor = float(found.matrix[j, j] / plain[j, j]) if sd else float(overall)

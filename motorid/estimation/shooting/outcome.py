@@ -192,25 +192,24 @@ class Multiplier:
                 "(to first order).")
 
 
-def rows_at(problem: Problem, q: Array, relations: Sequence[Any] | None = None) -> list[tuple[str, Part, Array, Array]]:
+def rows_at(problem: Problem, q: Array, relations: Sequence[Any] | None = None, *,
+            derivatives: bool = True) -> list[tuple[str, Part, Array, Array]]:
     """Return (name, part, rows, d rows/dq) of `relations` on the simulated trajectories at `q`.
 
-    `relations` are the problem's constraints unless given.
+    `relations` are the problem's constraints unless given; without `derivatives` there are no columns.
 
     Raises
     ------
     SimulationError
     """
     at = problem.unknowns.point(q)
-    trajs = [problem.simulate(q, k) for k in range(len(problem.runs))]
+    trajs = [problem.simulate(q, k, derivatives=derivatives) for k in range(len(problem.runs))]
     found = []
     for c in problem.constraints if relations is None else relations:
         for part in c.parts(problem):
-            traj = trajs[part.run]
-            assert traj.dx is not None
-            values, jac = part.rows(traj.x[part.samples], at.p, traj.dx[part.samples], at.dp)
-            assert jac is not None
-            found.append((c.name, part, values, jac))
+            x, dx = trajs[part.run].x, trajs[part.run].dx
+            values, jac = part.rows(x[part.samples], at.p, None if dx is None else dx[part.samples], at.dp)
+            found.append((c.name, part, values, np.empty((len(values), 0)) if jac is None else jac))
     return found
 
 
@@ -322,14 +321,7 @@ def _least_violations(problem: Problem, q: Array) -> tuple[float, Array] | None:
 
 def _violation_rows(problem: Problem, relations: Sequence[Any], q: Array, derivatives: bool) -> tuple[Array, Array]:
     """Return violations of all rows, in their sizes, and their Jacobian."""
-    trajs = [problem.simulate(q, k, derivatives=derivatives) for k in range(len(problem.runs))]
-    at = problem.unknowns.point(q)
-    rs, jacs = [np.zeros(1)], [np.zeros((1, len(q)))]
-    for part in (part for c in relations for part in c.parts(problem)):
-        t, s = trajs[part.run], part.samples
-        c, jac = part.rows(t.x[s], at.p, None if t.dx is None else t.dx[s], at.dp)
-        out = part.violation(c)
-        rs.append(out)
-        if jac is not None:
-            jacs.append(jac * (out != 0)[:, None])
-    return np.concatenate(rs), np.concatenate(jacs)
+    found = rows_at(problem, q, relations, derivatives=derivatives)
+    beyond = [(part.violation(values), jac) for _, part, values, jac in found]
+    return (np.concatenate([np.zeros(1), *(out for out, _ in beyond)]),
+            np.concatenate([np.zeros((1, len(q))), *(jac * (out != 0)[:, None] for out, jac in beyond if jac.size)]))
