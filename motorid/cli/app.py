@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from motorid.cli import bench, design, diagnose, fit
+from motorid.cli import bench, diagnose, fit
 from motorid.cli.console import Command, Group, prepare_process
 from motorid.records.files import package_version
 
@@ -34,7 +34,7 @@ for _name, _command in (
     ("fit", fit.fit_command),
     ("simulate", fit.simulate_command),
     ("diagnose", diagnose.diagnose_command),
-    ("design", design.design_command),
+    ("design", diagnose.design_command),
     ("identifiability", fit.identifiability_command),
     ("robustness", fit.robustness_command),
     ("fit-many", fit.fit_many_command),

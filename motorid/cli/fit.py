@@ -14,6 +14,7 @@ import typer
 from motorid.cli.console import FAILED, INTERRUPTED, next_command, save_report, say_notes, show
 from motorid.cli.options import (
     OUT,
+    EffectsFrom,
     FitOptions,
     Force,
     Json,
@@ -48,7 +49,6 @@ from motorid.uncertainty.multistart import Multistart, multistart
 
 MOST_SHOWN = 4  # runs of which all columns are listed
 SavedModel = Annotated[Path, typer.Argument(metavar="FIT.json", help="What fit --json or export wrote.")]
-EffectsFrom = Annotated[Path | None, typer.Option(metavar="FILE.py", help="Effects of your own.")]
 
 
 @with_options(FitOptions)

@@ -30,8 +30,7 @@ from motorid.diagnosis.thresholds import LARGER
 from motorid.display.numbers import number
 from motorid.estimation.result import Fit
 from motorid.numerics.autoregression import autocorrelation, effective_samples
-from motorid.numerics.noise import despiked, outlier_limit, quantum
-from motorid.numerics.signals import Array
+from motorid.numerics.signals import Array, despiked, outlier_limit, quantum
 from motorid.problem.runs import angle_signal
 from motorid.records.experiment import Experiment
 

@@ -9,8 +9,7 @@ import numpy as np
 from motorid.display.numbers import percent
 from motorid.estimation.result import Fit
 from motorid.model.definition import Effect, Parameter
-from motorid.numerics.noise import noise_level, quantum
-from motorid.numerics.signals import Array, window_slopes
+from motorid.numerics.signals import Array, noise_level, quantum, window_slopes
 from motorid.problem.runs import angle_signal
 
 KNOWN = 0.3  # of a parameter, its standard deviation: determined

@@ -27,7 +27,7 @@ from motorid.errors import FAILURES, ModelError
 from motorid.estimation.result import Fit
 from motorid.model.definition import Effect, Parameter
 from motorid.model.model import Model
-from motorid.numerics.noise import noise_level
+from motorid.numerics.signals import noise_level
 from motorid.records.experiment import Experiment
 
 SHORTLIST = 6

@@ -33,8 +33,7 @@ from motorid.diagnosis.thresholds import (
 )
 from motorid.estimation.result import Fit
 from motorid.numerics.autoregression import effective_samples
-from motorid.numerics.noise import despiked
-from motorid.numerics.signals import Array
+from motorid.numerics.signals import Array, despiked
 from motorid.problem.problem import Problem
 from motorid.problem.simulate import Simulation
 from motorid.records.experiment import Experiment

@@ -16,7 +16,7 @@ from motorid.display.numbers import arrow, number, percent, with_error
 from motorid.effects import EVERY
 from motorid.estimation.result import Fit
 from motorid.model.definition import Effect
-from motorid.numerics.noise import despiked
+from motorid.numerics.signals import despiked
 from motorid.records.experiment import units_of
 
 MOVED = 0.1  # relative change of a motor parameter that is worth a word

@@ -1,4 +1,4 @@
-"""One least-squares run on a problem: every stage of a fit, every start of a race is this one call.
+"""One least-squares run on a problem, and a race of several: every stage of a fit is one of these two calls.
 
 Sub-steps chosen far from the solution hide what rings between samples, so they are chosen again where the run
 goes, and the run is repeated while they do not suit its end. Three efforts serve all purposes.
@@ -6,12 +6,13 @@ goes, and the run is repeated while they do not suit its end. Three efforts serv
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import numpy as np
 
-from motorid.errors import SimulationError
+from motorid.errors import FAILURES, SimulationError
+from motorid.estimation.result import Failure
 from motorid.numerics.least_squares import LevenbergMarquardt, Solution, levenberg_marquardt
 from motorid.numerics.signals import Array
 from motorid.problem.problem import Problem
@@ -98,6 +99,41 @@ def start_cost(problem: Problem, refine: bool = True) -> float:
     except SimulationError:
         return np.inf
     return 0.5 * float(r @ r) if np.isfinite(r).all() else np.inf
+
+
+@dataclass(frozen=True, eq=False)
+class Race:
+    """What came of each start, in their order; one that failed is a value too."""
+
+    ends: tuple[Estimate | Failure, ...]
+
+    @property
+    def best(self) -> Estimate | None:
+        """The end of lowest cost, the first of equals; None if every start failed."""
+        return min((e for e in self.ends if isinstance(e, Estimate)), key=lambda e: e.cost, default=None)
+
+
+def race(problems: Iterable[Problem], effort: LevenbergMarquardt, *,
+         solve: Callable[[Problem, LevenbergMarquardt], Estimate] = least_squares) -> Race:
+    """Minimise the cost of each problem from the values of its model.
+
+    Parameters
+    ----------
+    problems : iterable of Problem
+        Costs are compared: on the same records, with the same weights.
+    effort : LevenbergMarquardt
+        `LOOK` for a few steps, `RACE` for nearly the whole way, `FINISH`.
+    solve : callable
+        How to minimise, e.g. `by_continuation`.
+    """
+    return Race(tuple(_attempt(problem, effort, solve) for problem in problems))
+
+
+def _attempt(problem: Problem, effort: LevenbergMarquardt, solve: Callable[..., Estimate]) -> Estimate | Failure:
+    try:
+        return solve(problem, effort)
+    except FAILURES as error:
+        return Failure(problem.model.values, "failed", str(error))
 
 
 class _Refining:

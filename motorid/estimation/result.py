@@ -19,8 +19,7 @@ from motorid.display.tables import Cell, Flag, Table
 from motorid.errors import UsageError, name_of
 from motorid.estimation.covariance import Certainty, Quantity, certainty, combinations
 from motorid.model.model import Model
-from motorid.numerics.noise import despiked
-from motorid.numerics.signals import Array
+from motorid.numerics.signals import Array, despiked
 from motorid.problem.plain_data import model_dict, problem_dict
 from motorid.problem.problem import Problem
 from motorid.problem.simulate import Evaluation, Simulation, at, error_table, evaluate, judge, steady_errors

@@ -13,8 +13,7 @@ from motorid.effects import LIBRARY
 from motorid.errors import SimulationError
 from motorid.estimation.continuation import by_continuation
 from motorid.estimation.first_guess import first_guess, loads_of
-from motorid.estimation.least_squares import LOOK, RACE, start_cost
-from motorid.estimation.racing import race
+from motorid.estimation.least_squares import LOOK, RACE, race, start_cost
 from motorid.model.definition import Effect, Parameter
 from motorid.model.model import BASES, Model
 from motorid.problem.problem import Problem

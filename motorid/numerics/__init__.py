@@ -1,1 +1,1 @@
-"""Algorithms that know no motor: `least_squares`, `autoregression`, `noise`, `signals`, `parallel`."""
+"""Algorithms that know no motor: `least_squares`, `autoregression`, `signals` with their noise, `parallel`."""

@@ -14,8 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import matmul_toeplitz
 
-from motorid.numerics.noise import outlier_limit
-from motorid.numerics.signals import Array
+from motorid.numerics.signals import Array, outlier_limit
 
 HIGHEST_ORDER = 30  # of a channel's model
 ORDER = 8  # of the filters

@@ -1,11 +1,20 @@
-"""Sampled signals: arrays of floats with time along the first axis, NaN where a sample is missing."""
+"""Sampled signals: gaps, integrals, slopes; steps, outliers, noise. Time is the first axis, NaN a missing sample."""
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
+
+WINDOWS = 200  # over which slopes are taken
+ORDERS = (2, 3, 4, 5, 6)  # of differences
+_SMALLER_HALF = 0.3240277  # mean of |z| over the smaller half, z standard normal: 4·(φ(0) − φ(0.67449))
+_FLOOR = 1e-5  # of the channel's own variation: what a noise-free simulation is given
+_REST = 12  # equal samples in a row that count as standstill
+CLIP = 6.0  # robust standard deviations beyond which a residual counts as an outlier
+_DITHERED = 0.6  # noise that is to be seen through the steps leaves fewer neighbours equal than this
 
 
 def bridged(t: Array, y: Array) -> Array:
@@ -27,11 +36,146 @@ def slope(t: Array, y: Array, half: int) -> Array:
     return (y[b] - y[a]) / (t[b] - t[a])
 
 
-def window_slopes(t: Array, y: Array, windows: int = 200) -> Array:
-    """Return the mean slopes of `y` over about so many windows, one after the other; empty for next to no samples."""
+def window_slopes(t: Array, y: Array) -> Array:
+    """Return the mean slopes of `y` over about 200 windows, one after the other; empty for next to no samples."""
     good = np.isfinite(y)
     y, t = y[good], t[good]
     if len(y) < 4:
         return np.zeros(0)
-    step = max(len(y) // windows, 1)
+    step = max(len(y) // WINDOWS, 1)
     return np.diff(y[::step]) / np.diff(t[::step])
+
+
+def robust_std(r: Array) -> float:
+    """Return the standard deviation about zero of what is normal in `r`, from its median size; NaN left out."""
+    size = np.abs(r[np.isfinite(r)])
+    return 1.4826 * float(np.median(size)) if size.size else 0.0
+
+
+def outlier_limit(r: Array) -> float:
+    """Return the size beyond which a residual counts as an outlier."""
+    return CLIP * robust_std(r)
+
+
+def despiked(r: Array) -> Array:
+    """Return `r` (N,) without NaN, samples that stand alone far from both neighbours replaced by the middle of three.
+
+    A few large samples in a row are no outliers: there the model fails.
+    """
+    r = r[np.isfinite(r)]
+    if len(r) < 3:
+        return r
+    before, after = np.concatenate([r[1:2], r[:-1]]), np.concatenate([r[1:], r[-2:-1]])
+    middle = np.maximum(np.minimum(before, r), np.minimum(np.maximum(before, r), after))
+    return np.where(np.abs(r - middle) > outlier_limit(r), middle, r)
+
+
+def quantum(y: ArrayLike) -> float:
+    """Return the step in which a channel moves (encoder count, converter bit), or 0.0 if it shows none.
+
+    Second differences of a smooth signal that moves in steps are small whole multiples of the step, even if
+    the signal itself passes many steps per sample.
+    """
+    values = np.asarray(y, dtype=float)
+    values = values[np.isfinite(values)]
+    jumps = np.abs(np.diff(values, 2))
+    jumps = jumps[jumps > 1e-9 * np.abs(values).max(initial=0.0)]
+    if len(jumps) < 20:
+        return 0.0
+    for guess in np.unique(np.quantile(jumps, np.arange(0.02, 0.98, 0.04), method="nearest"))[::-1]:
+        step = float(np.median(jumps[np.abs(jumps / guess - 1) < 0.2]))  # rounding in the file blurs it
+        steps = jumps / step
+        if np.mean(np.abs(steps - steps.round()) < 0.1) > 0.95:
+            return step
+    return 0.0
+
+
+def noise_level(y: ArrayLike, t: ArrayLike | None = None) -> float:
+    """Estimate the standard deviation of the measurement noise of one channel.
+
+    High-order differences remove the signal, which is smooth over a few samples, and keep the noise; averaging the
+    smaller half of them ignores outliers and the few samples after a voltage step. On uneven samples the weights are
+    those of divided differences, so missing and jittering samples do no harm. The order starts at two and grows as
+    long as that removes more signal. Parts in which nothing changes at all are left out. The result is never below
+    what rounding alone does (step/√12, where the channel moves in steps), nor below 1e-5 of the channel's variation.
+
+    Parameters
+    ----------
+    y : (N,) array
+        Samples of the channel; NaN where missing.
+    t : (N,) array, optional
+        Their times in s. Without it even spacing is taken.
+
+    Returns
+    -------
+    float
+        Standard deviation in the unit of `y`, always positive; 1.0 for a channel that is zero throughout.
+
+    Notes
+    -----
+    It sees what changes from sample to sample. Noise that is itself smooth is underestimated: by a factor
+    of about four for first-order noise with a correlation of 0.9 between neighbours. A signal that never
+    rests and has only two or three samples per time constant is overestimated.
+
+    References
+    ----------
+    Gasser, Sroka and Jennen-Steinmetz, "Residual variance and residual pattern in nonlinear regression",
+    Biometrika 73(3), 1986; Hall, Kay and Titterington, Biometrika 77(3), 1990.
+    """
+    values = np.asarray(y, dtype=float)
+    times = np.arange(values.size, dtype=float) if t is None else np.asarray(t, dtype=float)
+    keep = np.isfinite(values) & np.isfinite(times)
+    values, times = values[keep], times[keep]
+    step = quantum(values)
+    return float(max(_from_differences(values, times, step), step / np.sqrt(12), _floor(values)))
+
+
+def _floor(values: Array) -> float:
+    if not values.size:
+        return 1.0
+    size = float(np.std(values)) or float(np.abs(values).max())
+    return _FLOOR * size if size > 0 else 1.0
+
+
+def _from_differences(values: Array, times: Array, step: float) -> float:
+    level = np.inf
+    for order in ORDERS:
+        finer = _of_order(values, times, order, step)
+        if finer > 0.85 * level:  # no more signal was removed: what is left is noise
+            return level
+        level = finer
+    return level if np.isfinite(level) else 0.0
+
+
+def _of_order(values: Array, times: Array, order: int, step: float) -> float:
+    """Robust noise level from differences of one order; 0.0 if there are too few."""
+    if len(values) < order + 4:
+        return 0.0
+    t = sliding_window_view(times, order + 1)
+    y = sliding_window_view(values, order + 1)
+    span = t[:, -1] - t[:, 0]
+    whole = span < 2.5 * np.median(span)  # not across a gap
+    t, y, span = t[whole], y[whole], span[whole]
+    u = (t - t[:, :1]) / span[:, None]
+    apart = u[:, :, None] - u[:, None, :] + np.eye(order + 1)
+    weights = 1.0 / np.prod(apart, axis=2)
+    weights /= np.linalg.norm(weights, axis=1, keepdims=True)
+    size = np.abs(np.sum(weights * (y - y[:, :1]), axis=1))
+    live = ~_at_rest(values, order)[whole]
+    if not live.any():
+        return 0.0
+    equal = float(np.mean(y[live, 1:] == y[live, :-1]))
+    return _typical(size if step and equal > _DITHERED else size[live])
+
+
+def _at_rest(values: Array, order: int) -> NDArray[np.bool_]:
+    """Tell which windows of order + 1 samples lie in a standstill, where nothing changes at all."""
+    stretch = np.r_[0, np.cumsum(np.diff(values) != 0)]
+    first, last = stretch[:-order], stretch[order:]
+    return (first == last) & (np.bincount(stretch)[first] >= _REST)
+
+
+def _typical(size: Array) -> float:
+    # The mean of the smaller half is as robust as the median and smoother where values come in steps.
+    half = (len(size) + 1) // 2
+    return float(np.partition(size, half - 1)[:half].mean()) / _SMALLER_HALF

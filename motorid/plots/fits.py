@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from motorid.channels import CHANNELS
 from motorid.display.numbers import percent
 from motorid.errors import UsageError
-from motorid.numerics.noise import noise_level
+from motorid.numerics.signals import noise_level
 from motorid.plots import style
 from motorid.problem.simulate import Simulation
 from motorid.records.experiment import Experiment

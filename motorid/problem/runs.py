@@ -18,8 +18,7 @@ from motorid.channels import CHANNELS, NAMES
 from motorid.errors import ModelError, UsageError, one_of
 from motorid.integrate.engine import Grid
 from motorid.model.definition import Parameter
-from motorid.numerics.noise import noise_level
-from motorid.numerics.signals import Array, bridged, integral, window_slopes
+from motorid.numerics.signals import Array, bridged, integral, noise_level, window_slopes
 from motorid.records.experiment import Experiment
 
 INITIAL = ("auto", "rest", "measured", "estimate")

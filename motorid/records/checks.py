@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from motorid.channels import NAMES
-from motorid.numerics.noise import noise_level, quantum
-from motorid.numerics.signals import Array, bridged, integral
+from motorid.numerics.signals import Array, bridged, integral, noise_level, quantum
 from motorid.records.experiment import Experiment
 
 Check = Callable[[Experiment], str | None]

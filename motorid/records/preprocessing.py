@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from motorid.errors import UsageError
-from motorid.numerics.noise import noise_level, robust_std
-from motorid.numerics.signals import Array
+from motorid.numerics.signals import Array, noise_level, robust_std
 
 CLEAR = np.pi / 2  # rad: a step of the angle this far from what is expected may be a turn or none
 JUMP = 7.0  # times the noise of the voltage: a step

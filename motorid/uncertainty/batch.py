@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.special import stdtrit
 
 from motorid.channels import CHANNELS
 from motorid.display.tables import Table
@@ -21,8 +22,8 @@ from motorid.errors import DataError, FitError, MissingDependency, OutputError, 
 from motorid.estimation.fit import fit
 from motorid.estimation.result import Fit
 from motorid.model.model import Model
-from motorid.numerics.noise import Outlier, outliers
 from motorid.numerics.parallel import Map, interruption, map_items, one_thread
+from motorid.numerics.signals import Array, robust_std
 from motorid.records.experiment import Experiment
 from motorid.records.files import package_version, read_bytes, write_files
 from motorid.records.reading import find_records, read_runs
@@ -30,6 +31,25 @@ from motorid.uncertainty.covariance import covariance
 
 Records = Sequence[Experiment] | Experiment | str | Path | Sequence[str | Path]
 POOR = 3.0  # misfit over noise from which a row is flagged
+FEWEST = 5  # motors among which one can stand out
+LEVEL = 0.01  # chance of any false alarm in the whole batch
+
+
+@dataclass(frozen=True)
+class Outlier:
+    """One parameter of one motor that stands out: value, the batch's median, z, and a sentence."""
+
+    motor: str
+    parameter: str
+    value: float
+    median: float
+    z: float
+    text: str
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain data."""
+        return {"motor": self.motor, "parameter": self.parameter, "value": self.value, "median": self.median,
+                "z": self.z}
 
 
 @dataclass(frozen=True, eq=False)
@@ -236,6 +256,49 @@ def motors_in(folder: str | Path) -> dict[str, list[Path]]:
     if not found:
         raise DataError(f"'{place}' holds no records: expected a folder, or a file, per motor.")
     return found
+
+
+def outliers(rows: Sequence[Mapping[str, Any]], names: Sequence[str], positive: frozenset[str],
+             level: float = LEVEL) -> tuple[Outlier, ...]:
+    """Return the outliers of a batch, the most extreme first.
+
+    Parameters
+    ----------
+    rows : sequence of mapping
+        With ``motor`` and per parameter its value and ``<name>_std``.
+    names : sequence of str
+    positive : set of str
+        Parameters compared on the logarithmic scale.
+    level : float
+        Chance of a false alarm anywhere in a batch of equal scatter.
+    """
+    found = []
+    for n in names:
+        known = [r for r in rows if r.get(f"{n}_std") is not None]
+        if len(known) < FEWEST:
+            continue
+        value = np.array([r[n] for r in known], float)
+        std = np.array([r[f"{n}_std"] for r in known], float)
+        x, sd = (np.log(value), std / value) if n in positive else (value, std)
+        z = scores(x, sd)
+        limit = float(stdtrit(max(len(known) - 2, 1), 1 - level / (2 * len(known) * len(names))))
+        for j in np.flatnonzero(np.abs(z) > limit):
+            middle = float(np.median(value))
+            side = "above" if z[j] > 0 else "below"
+            share = f"{abs(value[j] / middle - 1):.1%} {side}" if middle else side
+            found.append(Outlier(known[j]["motor"], n, float(value[j]), middle, float(z[j]),
+                                 f"{known[j]['motor']}: {n} = {value[j]:.4g} is {share} the batch's median "
+                                 f"{middle:.4g} (z = {z[j]:.1f})."))
+    return tuple(sorted(found, key=lambda o: -abs(o.z)))
+
+
+def scores(x: Array, std: Array) -> Array:
+    """Return robust z of values (n,): distance from the median over scatter and own uncertainty together."""
+    middle = np.median(x)
+    scatter = robust_std(x - middle)
+    own = np.median(std)
+    between = np.sqrt(max(scatter**2 - own**2, 0.0))
+    return (x - middle) / np.maximum(np.hypot(between, std), 1e-12 * max(abs(middle), 1e-300))
 
 
 class Checkpoint:

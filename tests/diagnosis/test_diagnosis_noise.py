@@ -16,7 +16,7 @@ from motorid.diagnosis.model_comparison import node_of
 from motorid.diagnosis.score_test import Score
 from motorid.diagnosis.verdict import _noise_feedback, closed_loop_remark, outliers_remark
 from motorid.effects import LIBRARY
-from motorid.numerics.noise import despiked
+from motorid.numerics.signals import despiked
 from motorid.records.experiment import Experiment
 
 DRIVES = ("stairs", "multisine", "steps")

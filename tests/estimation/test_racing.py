@@ -7,8 +7,7 @@ import pytest
 
 import motorid as mi
 from motorid.errors import FitError
-from motorid.estimation.least_squares import FINISH, LOOK, RACE, least_squares
-from motorid.estimation.racing import race
+from motorid.estimation.least_squares import FINISH, LOOK, RACE, least_squares, race
 from motorid.estimation.result import Failure
 from motorid.problem.problem import Problem
 

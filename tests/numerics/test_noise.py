@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from motorid.numerics.autoregression import autocorrelation
-from motorid.numerics.noise import noise_level, quantum
+from motorid.numerics.signals import noise_level, quantum
 
 N = 2000
 T = np.arange(N) * 1e-3

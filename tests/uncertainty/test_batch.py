@@ -13,12 +13,11 @@ import pytest
 
 import motorid as mi
 from motorid.errors import DataError, UsageError
-from motorid.numerics.noise import outliers
 from motorid.numerics.parallel import Parcel
 from motorid.records.datasets import truth
 from motorid.records.reading import write_csv
 from motorid.uncertainty import batch as batch_module
-from motorid.uncertainty.batch import fit_many, motors_in
+from motorid.uncertainty.batch import fit_many, motors_in, outliers
 
 MOTOR, NOISE = truth("two_step_noisy")["parameters"], {"i": 0.02, "omega": 0.4}
 
