@@ -178,6 +178,18 @@ class VirtualLink:
             time.sleep(min(timeout, 0.002))
         return data
 
+    def simulate(self, t: Any, v: Any) -> dict[str, np.ndarray]:
+        """Return what the motor would really do from rest with the voltage `v` (N,), V, constant between times `t` (s).
+
+        Returns
+        -------
+        dict of str to ndarray, shape (N,)
+            ``i`` (A), ``omega`` (rad/s) and ``theta`` (rad) without any sensor; the device itself stays as it is.
+        """
+        truth = self.device.truth
+        done = load_plant().simulate(truth.motor, truth.effects, t, v)
+        return {c: done[f"true_{c}"] for c in CHANNELS}
+
     def close(self) -> None:
         """Leave the device as it is: it can be opened again."""
 
@@ -197,6 +209,7 @@ def virtual_bench(effect: str = "random", motor: str = "lab", seed: int = 0, rat
     >>> bench = mi.virtual_bench("coulomb")
     >>> done = mi.record(bench, "run2.csv", excite="chirp:4:1:20:0.5", limit_voltage=8)
     >>> runs = mi.read_runs("run2.csv")
+    >>> omega = bench.simulate(runs[0].t, runs[0].inputs["v"])["omega"]  # the truth, without sensors
     """
     return VirtualLink(VirtualDevice(hide(effect, motor, seed), rate))
 

@@ -247,6 +247,8 @@ def plot_ladder(result: Ladder | Diagnosis, ax: Axes | None = None) -> Axes:
             _falling(ax, x, [100 * (r.validation_nrmse or {})[c] for r in rungs], c, style.CYCLE[k], held_out=True)
     ax.set_yscale("log")
     style.plain_decades(ax)
+    for k in sorted({0, len(rungs) - 1}):
+        _error_labels(ax, k, {c: 100 * e for c, e in rungs[k].nrmse.items()}, "right" if k == 0 else "left")
     first = "plain motor" if rungs[0].fit.model.base == "dc_motor" else "plain drive"
     started = " + ".join([first, *rungs[0].fit.model.effect_names])
     ax.set_xticks(x, [started if r.added is None else "+ " + r.added.replace(" + ", "\n+ ") for r in rungs])
@@ -260,10 +262,21 @@ def _falling(ax: Axes, x: Array, errors: Sequence[float], channel: str, colour: 
     name = style.axis_label(channel).split(" (")[0]
     ax.plot(x, errors, "s--" if held_out else "o-", color=colour, mfc="white" if held_out else colour, ms=5.5,
             label=f"{name}, {'held out' if held_out else 'fitted'}")
-    ends = {0: "right", len(x) - 1: "left"} if not held_out else {}
-    for k, side in ends.items():
-        ax.annotate(number(errors[k], 2), (float(x[k]), errors[k]), (-8 if side == "right" else 8, 0), va="center",
-                    ha=side, textcoords="offset points", fontsize=8)
+
+
+def _error_labels(ax: Axes, k: int, errors: Mapping[str, float], side: str) -> None:
+    """Write the fitted errors beside the points of rung `k`, in their colours, apart where points lie close."""
+    low, high = np.log(ax.get_ylim())
+    room = 0.055 * (high - low)  # height of a line of text
+    names = sorted(errors, key=lambda c: errors[c])
+    at = np.log([errors[c] for c in names])
+    for _ in range(len(at)):
+        close = np.maximum(room - np.diff(at), 0.0)
+        at[:-1], at[1:] = at[:-1] - close / 2, at[1:] + close / 2
+    colours = dict(zip(errors, style.CYCLE, strict=False))
+    for c, y in zip(names, np.exp(at), strict=True):
+        ax.annotate(number(errors[c], 2), (k, float(y)), (-8 if side == "right" else 8, 0), va="center", ha=side,
+                    textcoords="offset points", fontsize=8, color=colours[c])
 
 
 @style.styled
@@ -296,5 +309,5 @@ def plot_design(design: Design) -> np.ndarray:
             ax.fill_between(design.t, y - half, y + half, color=colour, alpha=0.2, lw=0)
             style.line(ax, design.t, y, color=colour, label=name if len(design.predicted) > 1 else "predicted")
         style.tidy(ax, y=style.axis_label(channel), x=style.axis_label("t") if ax is axes[-1] else "")
-    style.above(axes[1])
+    axes[0].figure.legend(*axes[1].get_legend_handles_labels(), loc="outside upper right", ncols=4)
     return axes

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.lines import Line2D
+from matplotlib.text import Text
+from PIL import Image
 
 from motorid.channels import CHANNELS
 from motorid.display.numbers import percent
@@ -79,17 +84,90 @@ def plot_fit(result: Any, *, before: Any = None) -> np.ndarray:
     --------
     >>> axes = mi.plot_fit(better, before=fit)
     """
-    every = _simulations(result)
+    return _drawn(_simulations(result), before)[0]
+
+
+class LiveFit:
+    """The figure of `plot_fit` as a PNG that follows its model fast: only what moves is drawn again.
+
+    Parameters
+    ----------
+    result, before
+        As for `plot_fit`.
+    dpi : int
+
+    Attributes
+    ----------
+    axes : ndarray of Axes
+    """
+
+    @style.styled
+    def __init__(self, result: Any, *, before: Any = None, dpi: int = 90) -> None:
+        with style.detached():
+            self.axes, self._moving = _drawn(_simulations(result), before)
+        figure = self.axes[0, 0].figure
+        figure.set_dpi(dpi)
+        self._canvas = FigureCanvasAgg(figure)
+        self._canvas.draw()
+        figure.set_layout_engine("none")
+        self._artists = [a for part in self._moving for a in (part.line, part.title) if a is not None]
+        for artist in self._artists:
+            artist.set_animated(True)
+        self._background: Any = None
+
+    @style.styled
+    def png(self, result: Any) -> bytes:
+        """Return the figure with the curves of another model on the same records."""
+        found, figure = _simulations(result), self._canvas.figure
+        rescaled = sum(part.moved(found[part.run]) for part in self._moving)
+        if rescaled or self._background is None:
+            self._canvas.draw()
+            self._background = self._canvas.copy_from_bbox(figure.bbox)
+        self._canvas.restore_region(self._background)
+        for artist in self._artists:
+            artist.draw(self._canvas.get_renderer())
+        buffer = io.BytesIO()
+        Image.fromarray(np.asarray(self._canvas.buffer_rgba())).convert("RGB").save(buffer, "png", compress_level=1)
+        return buffer.getvalue()
+
+
+class _Moving(NamedTuple):
+    """A curve of a model that moves."""
+
+    line: Line2D
+    run: int
+    channel: str
+    title: Text | None = None  # with the error; None for a residual
+
+    def moved(self, s: Simulation) -> bool:
+        """Put the curve where `s` has it; tell whether its axes had to take another scale."""
+        ax, y = self.line.axes, s.outputs[self.channel] if self.title else s.residual(self.channel)
+        assert isinstance(ax, Axes)
+        if self.title:
+            _error_title(ax, s, self.channel)
+        self.line.set_data(*style.envelope(s.experiment.t, y))
+        low, high = ax.get_ylim()
+        least, most = float(np.nanmin(y)), float(np.nanmax(y))
+        if low <= least and most <= high and (self.title or most - least > 0.1 * (high - low)):
+            return False
+        ax.relim()
+        ax.autoscale_view()
+        return True
+
+
+def _drawn(every: list[Simulation], before: Any) -> tuple[np.ndarray, list[_Moving]]:
+    """Draw, and return which curves are the model's."""
     old = _simulations(before)[:COLUMNS] if before is not None else []
-    shown = every[:COLUMNS]
+    shown, moving = every[:COLUMNS], []
     names = [c for c in CHANNELS if any(c in s.outputs and c in s.experiment.outputs for s in shown)]
     ratios = [1.6, 1.0] * len(names)
     axes = style.grid(2 * len(names), len(shown), row=1.0, sharex="col", sharey="row", height_ratios=ratios)
     for k, s in enumerate(shown):
         for j, c in enumerate(names):
             if c in s.experiment.outputs:
-                _curves(axes[2 * j, k], s, c, old[k] if k < len(old) else None)
-                _residual(axes[2 * j + 1, k], s, c, old[k] if k < len(old) else None)
+                earlier = old[k] if k < len(old) else None
+                moving += [_Moving(_curves(axes[2 * j, k], s, c, earlier), k, c, _error_title(axes[2 * j, k], s, c)),
+                           _Moving(_residual(axes[2 * j + 1, k], s, c, earlier), k, c)]
             else:
                 _absent(axes[2 * j, k], c)
                 axes[2 * j + 1, k].set_axis_off()
@@ -103,26 +181,30 @@ def plot_fit(result: Any, *, before: Any = None) -> np.ndarray:
     handles, labels = axes[0, 0].get_legend_handles_labels()
     rest = axes[1, 0].get_legend_handles_labels()
     axes[0, 0].figure.legend(handles + rest[0], labels + rest[1], loc="outside upper center", ncols=5)
-    return axes
+    return axes, moving
 
 
-def _curves(ax: Axes, s: Simulation, channel: str, old: Simulation | None) -> None:
+def _curves(ax: Axes, s: Simulation, channel: str, old: Simulation | None) -> Line2D:
     y = s.experiment.outputs[channel]
     style.line(ax, s.experiment.t, y, color=style.MEASURED, lw=3.2, alpha=0.5, label="measured")
     if old is not None and channel in old.outputs:
         style.line(ax, s.experiment.t, old.outputs[channel], color=style.PALETTE["yellow"], lw=1.0, label="before")
-    style.line(ax, s.experiment.t, s.outputs[channel], color=style.MODEL, lw=1.2, label="model")
+    return style.line(ax, s.experiment.t, s.outputs[channel], color=style.MODEL, lw=1.2, label="model")
+
+
+def _error_title(ax: Axes, s: Simulation, channel: str) -> Text:
+    y = s.experiment.outputs[channel]
     good = np.isfinite(y)
     error = np.sqrt(np.sum(s.residual(channel)[good] ** 2) / max(float(np.sum(y[good] ** 2)), 1e-300))
-    ax.set_title(f"NRMSE {percent(error)}", loc="right", fontsize=8, color=style.MUTED)
+    return ax.set_title(f"NRMSE {percent(error)}", loc="right", fontsize=8, color=style.MUTED)
 
 
-def _residual(ax: Axes, s: Simulation, channel: str, old: Simulation | None) -> None:
+def _residual(ax: Axes, s: Simulation, channel: str, old: Simulation | None) -> Line2D:
     sigma = s.experiment.sigma.get(channel) or noise_level(s.experiment.outputs[channel], s.experiment.t)
     style.band(ax, 2 * sigma, "noise, ±2σ")
     if old is not None and channel in old.outputs:
         style.line(ax, s.experiment.t, old.residual(channel), color=style.PALETTE["yellow"], lw=0.8)
-    style.line(ax, s.experiment.t, s.residual(channel), color=style.RESIDUAL, lw=0.9, label="residual")
+    return style.line(ax, s.experiment.t, s.residual(channel), color=style.RESIDUAL, lw=0.9, label="residual")
 
 
 def _simulations(result: Any) -> list[Simulation]:

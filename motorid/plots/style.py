@@ -16,6 +16,7 @@ import numpy as np
 from cycler import cycler
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 from motorid.channels import NAMES, SYMBOLS, UNITS, channel_name
 from motorid.errors import DataError
@@ -191,10 +192,10 @@ def envelope(x: Array, y: Array, points: int = POINTS) -> tuple[Array, Array]:
     return x[index], y[index]
 
 
-def line(ax: Axes, x: Array, y: Array, *, zoh: bool = False, **options: Any) -> None:
+def line(ax: Axes, x: Array, y: Array, *, zoh: bool = False, **options: Any) -> Line2D:
     """Draw a curve, decimated without hiding its peaks; with `zoh` as a staircase."""
     a, b = envelope(x, y)
-    ax.plot(a, b, drawstyle="steps-post" if zoh and len(x) <= POINTS else "default", **options)
+    return ax.plot(a, b, drawstyle="steps-post" if zoh and len(x) <= POINTS else "default", **options)[0]
 
 
 def band(ax: Axes, half: float, label: str | None = None) -> None:

@@ -11,7 +11,7 @@ from matplotlib.ticker import MaxNLocator
 from scipy.interpolate import PchipInterpolator
 from scipy.special import stdtrit
 
-from motorid.display.numbers import number
+from motorid.display.numbers import number, quantity
 from motorid.errors import UsageError, one_of
 from motorid.estimation.result import Fit
 from motorid.numerics.signals import Array
@@ -166,10 +166,10 @@ def _profiles(result: Any) -> Sequence[Profile]:
 
 @style.styled
 def plot_sensitivities(fit: Fit, *, run: int = 0, names: Sequence[str] | None = None) -> np.ndarray:
-    """Draw what one per cent of each parameter does to the outputs, beside the noise.
+    """Draw what one per cent of each parameter does to the outputs, one row per parameter, beside the noise.
 
-    Curves of the same shape cannot be distinguished; a curve within the band of the noise tells the fit next to
-    nothing.
+    Rows of the same shape cannot be distinguished; where the curve stays within the grey band of the noise, these
+    samples say next to nothing about the parameter. Every row has its own scale.
 
     Parameters
     ----------
@@ -181,7 +181,7 @@ def plot_sensitivities(fit: Fit, *, run: int = 0, names: Sequence[str] | None = 
 
     Returns
     -------
-    ndarray of Axes, shape (channels,)
+    ndarray of Axes, shape (parameters, channels)
 
     Examples
     --------
@@ -194,27 +194,34 @@ def plot_sensitivities(fit: Fit, *, run: int = 0, names: Sequence[str] | None = 
             raise UsageError(one_of(n, free, "estimated parameter"))
     if not 0 <= run < len(problem.runs):
         raise UsageError(f"the fit has {len(problem.runs)} runs, numbered from 0; got run={run}.")
-    trajectory = problem.simulate(fit.q, run)
+    trajectory, record = problem.simulate(fit.q, run), problem.experiments[run]
     assert trajectory.dy is not None
-    record = problem.experiments[run]
-    channels = [c for c in problem.outputs if c in record.outputs]
-    figure = style.new_figure(style.WIDTH, 1.9 * len(channels) + 0.3)
-    axes = figure.subplots(len(channels), 1, sharex=True, squeeze=False).ravel()
+    channels, shown = [c for c in problem.outputs if c in record.outputs], list(names or free)
+    axes = style.grid(len(shown), len(channels), row=0.8, sharex=True)
     slope = problem.scaling.slope(fit.q)
-    for ax, c in zip(axes, channels, strict=True):
-        style.band(ax, problem.runs[run].sigma[c], "noise, ±σ")
-        for k, name in enumerate(names or free):
-            j = free.index(name)
-            step = 0.01 * (abs(fit.values[name]) or problem.scaling.scale[j])
+    for row, name in zip(axes, shown, strict=True):
+        j = free.index(name)
+        step = 0.01 * (abs(fit.values[name]) or problem.scaling.scale[j])
+        for ax, c in zip(row, channels, strict=True):
             change = trajectory.dy[:, problem.outputs.index(c), j] / slope[j] * step
-            dashes = ("-", "--", ":")[k // len(style.CYCLE) % 3]
-            style.line(ax, record.t, change, color=style.CYCLE[k % len(style.CYCLE)], ls=dashes, label=name)
-        style.tidy(ax, y=f"change of {style.axis_label(c, record).replace(' (', chr(10) + '(')}")
-    style.tidy(axes[0], title=f"What +1 % of each parameter does, {record.name}")
-    style.tidy(axes[-1], x="time (s)")
-    axes[0].legend(loc="upper left", bbox_to_anchor=(1.0, 1.05))
-    figure.align_ylabels(axes)
+            _sensitivity(ax, record.t, change, problem.runs[run].sigma[c], record.units[c])
+        row[0].set_ylabel(name, rotation=0, ha="right", va="center")
+    for top, bottom, c in zip(axes[0], axes[-1], channels, strict=True):
+        style.tidy(top, title=f"{style.axis_label(c, record)}: change for +1 %")
+        style.tidy(bottom, x="time (s)")
+    axes[0, 0].figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper right")
+    axes[0, 0].figure.align_ylabels(axes[:, 0])
     return axes
+
+
+def _sensitivity(ax: Axes, t: Array, change: Array, sigma: float, unit: str) -> None:
+    most = float(np.max(np.abs(change))) or 1.0
+    style.band(ax, sigma, "noise, ±σ")
+    style.line(ax, t, change, color=style.PALETTE["blue"])
+    ax.set_ylim(-1.2 * most, 1.9 * most)  # room for the words
+    ax.set_yticks([0.0], [""])
+    ax.text(0.995, 0.97, f"up to {quantity(most, unit, 2)} = {number(most / sigma, 2)} σ", transform=ax.transAxes,
+            ha="right", va="top", fontsize=8, color=style.INK)
 
 
 @style.styled

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from motorid.diagnosis.score_test import rank
 from motorid.display.cards import Card
 from motorid.display.numbers import counted, duration
 from motorid.effects import LIBRARY, get
@@ -20,11 +21,15 @@ from motorid.problem.problem import Problem
 from motorid.problem.simulate import error_table, evaluate
 from motorid.records.experiment import Experiment
 
+TITLES = {"voltage": "Voltage balance", "torque": "Torque balance", "transmission": "Transmission",
+          "sensor": "Sensors"}
 REACH = 10.0  # a slider goes from a tenth to ten times the value it begins with
 
 
 def explore(fit: Fit, *, effects: Iterable[Effect | str] | None = None) -> Explorer:
     """Play with a fit in a notebook: tick effects, move parameters, see the curves and the error, refit.
+
+    Effects stand by balance, the most promising first, with the share of the misfit that each is predicted to take.
 
     Parameters
     ----------
@@ -78,8 +83,9 @@ class Explorer:
     def __init__(self, start: Fit, effects: Sequence[Effect], runs: Sequence[Experiment]) -> None:
         self.fit, self.runs, self._first = start, tuple(runs), start
         self.model, self.evaluation, self.message = start.model, evaluate(start, runs), ""
-        self._effects = {e.name: e for e in effects}
-        self._quiet = False
+        self._gains = {s.effect.name: s.drop for s in rank(start, effects)}
+        self._effects = {e.name: e for e in sorted(effects, key=lambda e: -self._gains.get(e.name, 1.0))}
+        self._quiet, self._figure = False, None
         self._build()
 
     # -- what can be done --------------------------------------------------------------------------------
@@ -154,20 +160,33 @@ class Explorer:
         refit.on_click(lambda _: self.refit())
         reset.on_click(lambda _: self.reset())
         self.buttons = {"refit": refit, "reset": reset}
-        ticks = w.GridBox(list(self.boxes.values()), layout=w.Layout(grid_template_columns="1fr 1fr"))
-        titles = w.HTML("<b>Effects</b>"), w.HTML("<b>Parameters</b>")
-        parts = [titles[0], ticks, titles[1], self._sliders, w.HBox([refit, reset]), self._status]
+        title = w.HTML("<b>Parameters</b>")
+        parts = [*self._groups(), title, self._sliders, w.HBox([refit, reset]), self._status]
         controls = w.VBox(parts, layout=w.Layout(width="25rem", flex="0 0 auto"))
         shown = w.VBox([self._errors, self._picture], layout=w.Layout(flex="1 1 30rem"))
         self.widget = w.HBox([controls, shown], layout=w.Layout(flex_flow="row wrap", width="100%"))
         self._draw()
         self._show_controls()
 
+    def _groups(self) -> list[Any]:
+        """Return the ticks by balance, under titles."""
+        import ipywidgets as w
+
+        found = []
+        for balance, title in TITLES.items():
+            boxes = [self.boxes[n] for n, e in self._effects.items() if e.balance == balance]
+            grid = w.GridBox(boxes, layout=w.Layout(grid_template_columns="1fr 1fr"))
+            found += [w.HTML(f"<b>{title}</b>"), grid] if boxes else []
+        hint = w.HTML("Effects, with the share of the misfit that each would take away now; hover for the law.")
+        return [hint, *found]
+
     def _box(self, name: str) -> Any:
         import ipywidgets as w
 
-        box = w.Checkbox(value=name in self.model.effect_names, description=name, indent=False,
-                         layout=w.Layout(width="auto"))
+        gain = self._gains.get(name, 0.0)
+        label = f"{name} −{100 * gain:.0f} %" if gain >= 0.005 else name
+        box = w.Checkbox(value=name in self.model.effect_names, description=label, indent=False,
+                         tooltip=self._effects[name].doc, layout=w.Layout(width="auto"))
         box.observe(lambda change: self._quiet or self.tick(name, change["new"]), "value")
         return box
 
@@ -175,9 +194,8 @@ class Explorer:
         import ipywidgets as w
 
         size = abs(p.value) or 1e-3
-        common: dict[str, Any] = {"description": f"{p.name} ({p.unit})" if p.unit else p.name,
-                                  "continuous_update": False, "style": {"description_width": "7.5rem"},
-                                  "layout": w.Layout(width="24rem")}
+        common: dict[str, Any] = {"description": p.name, "style": {"description_width": "4rem"},
+                                  "layout": w.Layout(width="19rem"), "tooltip": p.doc}
         if p.positive:
             power = float(np.log10(p.value))
             slider = w.FloatLogSlider(value=p.value, base=10, min=power - 1, max=power + 1, step=0.002,
@@ -187,17 +205,18 @@ class Explorer:
             step = 1.0 if p.order else (high - low) / 2000
             slider = w.FloatSlider(value=p.value, min=low, max=high, step=step, readout_format=".3g", **common)
         slider.observe(lambda change: self._quiet or self.move(**{p.name: change["new"]}), "value")
-        slider.tooltip = p.doc
         return slider
 
     def _show_controls(self) -> None:
         """Make ticks and sliders agree with the model."""
+        import ipywidgets as w
+
         self._quiet = True
         for name, box in self.boxes.items():
             box.value = name in self.model.effect_names
         wanted = [p for p in self.model.parameters.values() if p.name != "sgn_width"]
         self.sliders = {p.name: self._slider(p) for p in wanted}
-        self._sliders.children = tuple(self.sliders.values())
+        self._sliders.children = tuple(w.HBox([self.sliders[p.name], w.Label(p.unit)]) for p in wanted)
         self._quiet = False
 
     def _show_values(self) -> None:
@@ -210,12 +229,11 @@ class Explorer:
         self._quiet = False
 
     def _draw(self) -> None:
-        from motorid.plots import plot_fit
-        from motorid.plots.style import detached, png_of
+        from motorid.plots.fits import LiveFit
 
-        with detached():
-            axes = plot_fit(self.evaluation, before=self._first)
-        self._picture.value = png_of(axes)
+        if self._figure is None:
+            self._figure = LiveFit(self.evaluation, before=self._first)
+        self._picture.value = self._figure.png(self.evaluation)
         table = error_table({"now": self.evaluation, "at first": self._first.evaluation})
         self._errors.value = Card(self.model.title, tables=(table,)).to_html()
 

@@ -1,5 +1,6 @@
 """Figures: they say what they show, hide no peak, overlap nothing, and leave the user's settings alone."""
 
+import dataclasses
 import itertools
 import re
 import subprocess
@@ -18,6 +19,7 @@ import motorid as mi
 from motorid import plots
 from motorid.errors import UsageError
 from motorid.estimation.shooting.formulations import compare_formulations
+from motorid.plots.fits import LiveFit
 from motorid.plots.residuals import binned_means
 from motorid.plots.style import axis_label, detached, envelope, svg_of
 from motorid.problem.constraints import CurrentLimit
@@ -221,6 +223,34 @@ def test_the_ladder_shows_fitted_and_held_out_errors_in_per_cent(found):
     assert lines["current i, held out"][1] == pytest.approx(100 * last.validation_nrmse["i"])
 
 
+def test_errors_that_lie_close_are_written_apart(found):
+    near = {"i": 0.5, "omega": 0.505}
+    rungs = [dataclasses.replace(r, nrmse=near) for r in found.ladder.rungs]
+    ax = plots.plot_ladder(dataclasses.replace(found.ladder, rungs=tuple(rungs)))
+    FigureCanvasAgg(ax.figure).draw()
+    boxes = [t.get_window_extent() for t in ax.texts]
+    assert len(boxes) == 4
+    assert not any(a.overlaps(b) for a, b in itertools.combinations(boxes, 2))
+
+
+def test_a_live_figure_is_the_figure_of_the_fit(found):
+    """Moved, it shows what a new drawing shows; a curve that leaves its axes gets wider ones."""
+    fit = found.after
+    live = LiveFit(fit)
+    moved = mi.evaluate(fit.model.replace(R=1.01 * fit.values["R"]), fit.problem.experiments)
+    far = mi.evaluate(fit.model.replace(R=20 * fit.values["R"]), fit.problem.experiments)
+    first = live.png(fit)
+    assert live.png(moved) != first
+    axes = plots.plot_fit(far)
+    live.png(far)
+    for drawn, wanted in zip(live.axes.flat, axes.flat, strict=True):
+        np.testing.assert_array_equal(drawn.get_lines()[-1].get_ydata(), wanted.get_lines()[-1].get_ydata())
+        low, high = drawn.get_ylim()
+        y = drawn.get_lines()[-1].get_ydata()
+        assert low <= np.nanmin(y) <= np.nanmax(y) <= high
+        assert drawn.get_title(loc="right") == wanted.get_title(loc="right")
+
+
 def test_parameters_show_two_standard_deviations_and_what_is_not_determined(found):
     axes = plots.plot_parameters(found.before, found.after, names=["K"])
     segments = axes[0].collections[0].get_segments()[0]
@@ -241,7 +271,7 @@ def test_a_true_angle_is_drawn_beside_its_estimate_whatever_the_turn(found):
 def test_sensitivities_are_what_one_per_cent_of_a_parameter_does(found):
     fit = found.after
     axes = plots.plot_sensitivities(fit, names=["K"])
-    t, drawn = axes[1].get_lines()[0].get_data()
+    t, drawn = axes[0, 1].get_lines()[0].get_data()
     run = fit.problem.experiments[0]
     moved = [mi.simulate(fit.model.replace(K=fit.values["K"] * s), run)[0].outputs["omega"] for s in (1.001, 0.999)]
     finite = (moved[0] - moved[1]) / 0.002 * 0.01

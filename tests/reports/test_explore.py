@@ -2,6 +2,7 @@
 
 import builtins
 import sys
+import time
 
 import hand_made
 import pytest
@@ -127,3 +128,25 @@ def test_without_ipywidgets_it_says_what_to_install(fit, monkeypatch):
 def test_something_else_than_a_fit_is_refused():
     with pytest.raises(UsageError, match="explore takes a fit"):
         mi.explore(mi.dc_motor())
+
+
+def test_effects_stand_by_balance_the_most_promising_first_with_their_law(fit):
+    playing = mi.explore(fit, effects=["brush_drop", "quadratic_drag", "coulomb"])
+    shown = [str(getattr(part, "value", "")) for part in playing.widget.children[0].children]
+    assert [t for t in shown if t.startswith("<b>")] == ["<b>Voltage balance</b>", "<b>Torque balance</b>",
+                                                         "<b>Parameters</b>"]
+    assert next(iter(playing.boxes)) == "coulomb"
+    assert playing.boxes["coulomb"].description.startswith("coulomb −")
+    assert "sgn" in playing.boxes["coulomb"].tooltip
+    assert [label.value for _, label in (row.children for row in playing._sliders.children)] == [
+        "Ω", "H", "N·m/A", "N·m·s/rad", "kg·m²"]
+
+
+def test_curves_follow_the_mouse(playing, fit):
+    """While a slider is dragged, within 0.2 s of processor time."""
+    assert playing.sliders["R"].continuous_update
+    playing.move(R=1.01 * fit.values["R"])
+    began = time.process_time()
+    for k in range(3):
+        playing.move(R=(1.02 + 0.001 * k) * fit.values["R"])
+    assert (time.process_time() - began) / 3 < 0.2
