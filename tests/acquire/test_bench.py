@@ -20,6 +20,7 @@ import numpy as np
 import pytest
 from memory_link import MemoryLink
 
+import motorid as mi
 from motorid.acquire import record
 from motorid.acquire.protocol import frame
 from motorid.acquire.server import Faults, Wire
@@ -712,3 +713,12 @@ def test_from_the_bench_to_the_verdict_the_hidden_effect_is_found(tmp_path):
     truth = dict(re.findall(r"(\w+) = ([\d.e-]+)", bench.said[1]))
     for name in ("tau_c", "R", "K", "J"):
         assert told["parameters_after"][name] == pytest.approx(float(truth[name]), rel=0.01)
+
+
+def test_a_virtual_bench_tells_what_its_motor_really_does(tmp_path):
+    bench = mi.virtual_bench("coulomb", seed=3)
+    mi.record(bench, tmp_path / "run.csv", excite="step:6:0.2,step:-3:0.2,coast:0.1", limit_voltage=8)
+    run = mi.read_runs(tmp_path / "run.csv")[0]
+    real = bench.simulate(run.t, run.inputs["v"])
+    for channel, y in run.outputs.items():
+        assert np.sqrt(np.mean((y - real[channel]) ** 2)) < 0.02 * np.abs(y).max()
