@@ -18,13 +18,11 @@ def _leave(kind: type[BaseException], error: BaseException, trace: TracebackType
     sys.__excepthook__(kind, error, trace)
 
 
-# As early as can be: what comes after this takes a second to load. Only for the command itself: a script that imports
-# the package, whatever its name, keeps what Python does.
+# As early as can be: what is imported after this module takes a second to load. Only for the command itself: a script
+# that imports the package, whatever its name, keeps what Python does.
 _NAME = os.path.basename("".join(sys.argv[:1]))
 if ("-m", "motorid") in pairwise(sys.orig_argv) or _NAME in ("motorid", "motorid.exe"):
     sys.excepthook = _leave
-
-import numpy as np  # noqa: E402
 
 
 class MotoridError(Exception):
@@ -67,10 +65,6 @@ class OutOfTime(Exception):
     """A budget of time is spent; whoever set it keeps what there is so far, see `numerics.parallel.budget`."""
 
 
-# What may go wrong with one of many models without stopping the others.
-FAILURES = (FitError, SimulationError, ModelError, np.linalg.LinAlgError, ArithmeticError)
-
-
 @contextlib.contextmanager
 def numbers_told() -> Iterator[None]:
     """Turn what arithmetic raises at numbers beyond all bounds into a `FitError`; also a decorator."""
@@ -81,7 +75,6 @@ def numbers_told() -> Iterator[None]:
             raise
         raise FitError(f"the numbers of these records, or of this model, are beyond what can be computed ({error}). "
                        "Look at the units of the columns, and at the values that were set.") from error
-
 
 
 _CONTROLS = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")

@@ -22,7 +22,6 @@ from motorid.cli.options import (
     Report,
     Runs,
     Validate,
-    describe,
     make_folder,
     named_effect,
     notes_of,
@@ -78,7 +77,7 @@ def _show_fit(found: Fit, records: list[Experiment], notes: list[str], judged: E
     """Print a fit: remarks, parameters, errors, what follows from them, and how it ended."""
     show(found.verdict, f"Held out: NRMSE {judged.words}." if judged else None,
          None if found.fits == "noise" else f"Next: {next_command('diagnose')}",
-         f"\n{describe(found.problem.model)}, {_amount(records)}\n")
+         f"\n{found.problem.model.name}, {_amount(records)}\n")
     say_notes(notes, "About the records")
     show(*value_tables(found))
     say_notes(remarks(found), "What these records do not determine")
@@ -229,7 +228,7 @@ def simulate_command(
                     "nrmse": judged.nrmse, "rmse": judged.rmse, "files": files,
                     "runs": [run_dict(r) | {"nrmse": e} for r, e in pairs]}, json, options.force)
     if json != "-":
-        show(f"{describe(model)}, values of {fit_json}", run_table(judged))
+        show(f"{model.name}, values of {fit_json}", run_table(judged))
         show(*(f"Written: {f}" for f in files))
 
 

@@ -174,7 +174,7 @@ class FitOptions(ReadingOptions):
     def fit(self, runs: Sequence[Experiment], model: Model | None = None) -> Fit:
         """Fit the model to `runs`."""
         model = self.model(runs) if model is None else model
-        with progress(f"Fitting {describe(model)}") as advance:
+        with progress(f"Fitting {model.name}") as advance:
             return fit(model, runs, callback=lambda k, *_: advance(1, f"iteration {k}"), **self.keywords())
 
     def _check_words(self) -> None:
@@ -288,11 +288,6 @@ def make_folder(out: Path) -> None:
     except OSError as error:
         raise UsageError(f"cannot write to {out}: {error.strerror or error}. Choose another folder: --out "
                          "DIR") from None
-
-
-def describe(model: Model) -> str:
-    """Return a model in words: ``dc_motor + coulomb``."""
-    return " + ".join([model.base, *model.effect_names])
 
 
 def notes_of(runs: Sequence[Experiment], held_out: Sequence[Experiment] = ()) -> list[str]:

@@ -23,7 +23,8 @@ from motorid.diagnosis.results import Candidate
 from motorid.diagnosis.score_test import Score, pairs_of, rank
 from motorid.diagnosis.thresholds import MATERIAL
 from motorid.effects import LIBRARY, MEASURED
-from motorid.errors import FAILURES, ModelError
+from motorid.errors import ModelError
+from motorid.estimation.least_squares import FAILURES
 from motorid.estimation.result import Fit
 from motorid.model.definition import Effect, Parameter
 from motorid.model.model import Model

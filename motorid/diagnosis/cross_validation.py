@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from motorid.diagnosis.predictive_score import Channels, Errors, Predictions, errors_of, predictions_left_out
-from motorid.errors import FAILURES
 from motorid.estimation.continuation import by_continuation
+from motorid.estimation.least_squares import FAILURES
 from motorid.estimation.result import Fit
 from motorid.numerics.least_squares import LevenbergMarquardt
 from motorid.problem.problem import Problem

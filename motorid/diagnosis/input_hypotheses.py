@@ -19,9 +19,9 @@ from motorid.diagnosis.predictive_score import Predictions, compare, predictions
 from motorid.diagnosis.refit import RACE
 from motorid.diagnosis.thresholds import MATERIAL
 from motorid.display.numbers import arrow, number
-from motorid.errors import FAILURES
 from motorid.estimation.continuation import by_continuation
 from motorid.estimation.fit import solve
+from motorid.estimation.least_squares import FAILURES
 from motorid.estimation.result import Fit
 from motorid.problem.problem import Problem
 from motorid.problem.simulate import at, judge, misfit_over_noise

@@ -26,7 +26,7 @@ from motorid.diagnosis.predictive_score import (
     stacked_labels,
 )
 from motorid.diagnosis.thresholds import SUPPLANTS, TRIFLE
-from motorid.errors import FAILURES
+from motorid.estimation.least_squares import FAILURES
 from motorid.estimation.result import Fit
 from motorid.model.definition import Effect
 from motorid.records.checks import current_limit

@@ -15,10 +15,10 @@ from motorid.diagnosis.model_comparison import far
 from motorid.diagnosis.record_parts import worth_its_steps
 from motorid.diagnosis.score_test import uses_angle
 from motorid.diagnosis.thresholds import MATERIAL, NATS
-from motorid.errors import FAILURES, OutOfTime
+from motorid.errors import OutOfTime
 from motorid.estimation.continuation import by_continuation
 from motorid.estimation.first_guess import first_guess
-from motorid.estimation.least_squares import Estimate
+from motorid.estimation.least_squares import FAILURES, Estimate
 from motorid.estimation.restarts import collapsed_again, restored
 from motorid.estimation.result import Fit
 from motorid.estimation.start_values import ABOVE, sizes_like

@@ -21,8 +21,9 @@ from motorid.diagnosis.record_parts import affordable
 from motorid.diagnosis.refit import INTERRUPTED, OUT_OF_TIME
 from motorid.diagnosis.results import Adequacy, Candidate, Ladder, Rung
 from motorid.diagnosis.verdict import first_answer
-from motorid.errors import FAILURES, OutOfTime
+from motorid.errors import OutOfTime
 from motorid.estimation.fit import TOO_FAR, follows, growth, in_windows, solve
+from motorid.estimation.least_squares import FAILURES
 from motorid.estimation.result import Fit, checked
 from motorid.model.definition import Effect
 from motorid.numerics.parallel import budget, interruption, one_thread

@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from decimal import ROUND_HALF_EVEN, Decimal
-
-Std = Mapping[str, float | None]  # one standard deviation per name; None: not determined
 
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 _LARGEST = 5  # decades below it are written out, from 1e-3 on (with an error: from 1e-2 on)

@@ -11,6 +11,7 @@ from motorid.model.equations import Equations
 
 QUARTERS = (0.0, math.pi / 2, math.pi, 3 * math.pi / 2)  # of a turn
 
+
 @effect(balance="torque")
 def coulomb(m: Equations, tau_c=P(2e-3, "N·m", null=0.0, lower=0.0, doc="Coulomb friction torque")):
     """Dry (Coulomb) friction, tau_c·sgn(omega). Armstrong-Hélouvry et al., Automatica 30(7), 1994."""
@@ -102,6 +103,7 @@ def lugre(m: Equations, tau_c=P(2e-3, "N·m", null=0.0, lower=0.0, doc="Coulomb 
     rate = (m.omega - ca.fabs(m.omega) * z / level) / theta_s
     m.rate(z, rate)
     m.torque -= tau_c * (z + theta_s / omega_s * rate)
+
 
 @effect(balance="torque")
 def eddy_brake(m: Equations, c_e=P(1e-5, "N·m·s/rad", null=0.0, lower=0.0, doc="drag per speed when slow"),

@@ -12,8 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from motorid.errors import FAILURES
-from motorid.estimation.least_squares import RACE, ROUNDS, Callback, Estimate, least_squares, start_cost
+from motorid.estimation.least_squares import FAILURES, RACE, ROUNDS, Callback, Estimate, least_squares, start_cost
 from motorid.estimation.restarts import restarted_where_doubtful
 from motorid.numerics.least_squares import LevenbergMarquardt
 from motorid.problem.problem import Problem

@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from motorid.errors import FAILURES, UsageError, numbers_told, one_of
+from motorid.errors import UsageError, numbers_told, one_of
 from motorid.estimation.angle_orders import effects_of_unknown_order, strongest_order, uses_angle
 from motorid.estimation.continuation import by_continuation
-from motorid.estimation.least_squares import FINISH, Callback, Estimate, least_squares
+from motorid.estimation.least_squares import FAILURES, FINISH, Callback, Estimate, least_squares
 from motorid.estimation.restarts import restore_collapsed
 from motorid.estimation.result import Fit
 from motorid.estimation.start_values import from_first_run, with_start_values

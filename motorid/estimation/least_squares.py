@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from motorid.errors import FAILURES, SimulationError
+from motorid.errors import FitError, ModelError, SimulationError
 from motorid.estimation.result import Failure
 from motorid.numerics.least_squares import LevenbergMarquardt, Solution, levenberg_marquardt
 from motorid.numerics.signals import Array
@@ -27,6 +27,8 @@ NEAR = 0.05  # and how far they suit without a look
 MOVED = 1e-3  # less than this is no other place
 WILD = 1e7  # times the whole residual: more than any change by a factor of e does to one sample
 
+# What may go wrong with one of many models without stopping the others.
+FAILURES = (FitError, SimulationError, ModelError, np.linalg.LinAlgError, ArithmeticError)
 Callback = Callable[[int, float, Array], object] | None
 
 

@@ -19,8 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from motorid.errors import FAILURES
-from motorid.estimation.least_squares import RACE, Callback, Estimate, least_squares, race, start_cost
+from motorid.estimation.least_squares import FAILURES, RACE, Callback, Estimate, least_squares, race, start_cost
 from motorid.estimation.result import Fit
 from motorid.model.definition import Parameter
 from motorid.model.model import Model

@@ -294,9 +294,8 @@ class Fit(Shown):
 
     def __repr__(self) -> str:
         errors = ", ".join(f"{c} {100 * e:.2f} %" for c, e in self.nrmse.items())
-        name = " + ".join([self.problem.model.base, *self.problem.model.effect_names])
         end = "" if self.status == "converged" else f", {self.status}"
-        return f"<fit of {name}: {FLAGS[self.fits]}{end}, NRMSE {errors}>"
+        return f"<fit of {self.problem.model.name}: {FLAGS[self.fits]}{end}, NRMSE {errors}>"
 
 
 def checked(fit: Any, caller: str) -> Fit:
@@ -465,8 +464,8 @@ def compare(fits: Sequence[Fit], validate: Sequence[Experiment] | Experiment | N
     held = tuple(None if validate is None else dict(evaluate(f, validate).nrmse) for f in fits)
     names = list(dict.fromkeys(n for f in fits for n in f.values if n != "sgn_width"))
     parameters = {n: tuple((f.values[n], f.std[n]) if n in f.values else None for f in fits) for n in names}
-    titles = tuple(" + ".join([f.problem.model.base, *f.problem.model.effect_names]) for f in fits)
-    return Comparison(tuple(fits), titles, tuple(dict(f.nrmse) for f in fits), held, parameters)
+    return Comparison(tuple(fits), tuple(f.problem.model.name for f in fits), tuple(dict(f.nrmse) for f in fits), held,
+                      parameters)
 
 
 def comparison_table(fits: Sequence[tuple[str, Fit]], held_out: Sequence[Mapping[str, float] | None] = ()) -> Table:

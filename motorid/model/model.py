@@ -119,6 +119,11 @@ class Model(Shown):
         return tuple(e.name for e in self.effects)
 
     @property
+    def name(self) -> str:
+        """What outputs call it: ``dc_motor + coulomb``."""
+        return " + ".join([self.base, *self.effect_names])
+
+    @property
     def title(self) -> str:
         """What it is, for people: ``DC motor + coulomb``."""
         return " + ".join([TITLES[self.base], *self.effect_names])
@@ -233,7 +238,7 @@ class Model(Shown):
                     after=(("mi.fit(model, runs)", "fit it"), ("model + mi.effects.coulomb", "add an effect")))
 
     def __repr__(self) -> str:
-        return f"<model {' + '.join([self.base, *self.effect_names])}: {', '.join(self.free_names)}>"
+        return f"<model {self.name}: {', '.join(self.free_names)}>"
 
 
 @lru_cache(maxsize=512)
@@ -266,7 +271,7 @@ def _shared_system(model: Model, outputs: tuple[str, ...]) -> System:
     """Return the system of the model's structure, shared by all models that differ in values only."""
     slot = _known_of((*_structure(model), outputs, model.stored))
     if not slot:
-        equations, title = model.write(), " + ".join([model.base, *model.effect_names])
+        equations, title = model.write(), model.name
         try:
             system = build_system(equations, tuple(model.parameters), outputs, model.stored)
             _ = system.visible  # its slopes
