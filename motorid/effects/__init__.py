@@ -1,72 +1,23 @@
-"""The library of physical effects: `get` gives one by its name; a user's own effect has the same form."""
+"""The library of physical effects: `get` gives one by its name; a user's own effect has the same form.
+
+Every effect that a module here defines is in it: a new one is a function there, and nothing else. Those called
+``measured_…`` are for records in which a supply voltage, a load torque or a temperature was measured too.
+"""
 
 from __future__ import annotations
 
-from motorid.effects.electrical import (
-    brush_drop,
-    driver_coast,
-    driver_current_limit,
-    driver_dead_band,
-    inductance_saturation,
-    magnet_heating,
-    magnetic_saturation,
-    measured_supply,
-    measured_temperature,
-    supply_per_run,
-    supply_sag,
-    voltage_offset,
-    winding_heating,
-    winding_warm_start,
-)
-from motorid.effects.mechanical import (
-    angular_friction,
-    backlash,
-    cogging,
-    compliance,
-    constant_load,
-    coulomb,
-    coulomb_asymmetric,
-    eddy_brake,
-    gear_efficiency,
-    gravity,
-    load_friction,
-    lugre,
-    measured_load,
-    quadratic_drag,
-    spring,
-    stribeck,
-    torque_ripple,
-    viscous_asymmetric,
-)
-from motorid.effects.sensor import (
-    current_gain,
-    current_lag,
-    current_offset,
-    encoder_zero,
-    speed_average,
-    speed_delay,
-    speed_gain,
-    speed_lag,
-    speed_offset,
-    supply_side_current,
-)
+from motorid.effects import electrical, mechanical, sensor
+from motorid.effects.electrical import *  # noqa: F403
+from motorid.effects.mechanical import *  # noqa: F403
+from motorid.effects.sensor import *  # noqa: F403
 from motorid.errors import ModelError, one_of
 from motorid.model.definition import Effect
 
-LIBRARY: dict[str, Effect] = {
-    e.name: e
-    for e in (brush_drop, winding_heating, magnet_heating, inductance_saturation, magnetic_saturation, driver_dead_band,
-              driver_coast, driver_current_limit, supply_sag, voltage_offset,
-              coulomb, coulomb_asymmetric, stribeck, lugre, angular_friction, viscous_asymmetric, quadratic_drag,
-              eddy_brake, load_friction, gear_efficiency, constant_load, gravity, spring, cogging, torque_ripple,
-              compliance, backlash,
-              speed_lag, speed_delay, speed_average, speed_gain, speed_offset, current_lag, current_offset,
-              current_gain, supply_side_current)
-}
-# For records in which a supply voltage, a load torque or a temperature was measured beside the voltage.
-MEASURED: dict[str, Effect] = {e.name: e for e in (measured_supply, measured_temperature, measured_load)}
+_ALL = {e.name: e for part in (electrical, mechanical, sensor) for e in vars(part).values() if isinstance(e, Effect)}
+MEASURED = {n: e for n, e in _ALL.items() if n.startswith("measured_")}
 # Of one parameter per run; a diagnosis tries none by itself.
-PER_RUN: dict[str, Effect] = {e.name: e for e in (encoder_zero, winding_warm_start, supply_per_run)}
+PER_RUN = {n: e for n, e in _ALL.items() if any(p.per_run for p in e.parameters)}
+LIBRARY = {n: e for n, e in _ALL.items() if n not in MEASURED and n not in PER_RUN}
 EVERY = LIBRARY | MEASURED | PER_RUN
 
 
@@ -85,6 +36,10 @@ def get(name: str) -> Effect:
 
 def __getattr__(name: str) -> Effect:
     raise AttributeError(one_of(name, EVERY, "effect"))
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)
 
 
 __all__ = ["EVERY", "LIBRARY", "MEASURED", "PER_RUN", "get", *EVERY]

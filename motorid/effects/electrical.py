@@ -17,36 +17,6 @@ def brush_drop(m: Equations, V_b=P(0.5, "V", null=0.0, lower=0.0, doc="voltage l
 
 
 @effect(balance="voltage")
-def inductance_saturation(
-    m: Equations,
-    i_L=P(5.0, "A", null=float("inf"), positive=True, grid=(0.3, 1.0, 3.0), doc="current that halves L"),
-):
-    """Saturation of the inductance, L/(1+(i/i_L)²). Krause et al., Analysis of Electric Machinery, 2013."""
-    m.scale("L", 1 / (1 + (m.i / i_L) ** 2))
-
-
-@effect(balance="voltage")
-def magnetic_saturation(
-    m: Equations,
-    i_K=P(5.0, "A", null=float("inf"), positive=True, grid=(0.7, 1.5, 3.0), doc="current that halves K"),
-):
-    """Magnetic saturation, K/(1+(i/i_K)²) in torque and back-EMF. Krause et al., Electric Machinery, 2013."""
-    m.scale("K", 1 / (1 + (m.i / i_K) ** 2))
-
-
-@effect(balance="voltage")
-def driver_dead_band(m: Equations, V_d=P(0.2, "V", null=0.0, lower=0.0, doc="half-width of the dead band")):
-    """Dead band of the driver: within ±V_d nothing comes, larger commands lose V_d. Tao & Kokotović, 1996."""
-    m.replace("v", m.command - ca.fmax(-V_d, ca.fmin(V_d, m.command)))
-
-
-@effect(balance="voltage")
-def voltage_offset(m: Equations, V_0=P(0.05, "V", null=0.0, doc="added to the applied voltage")):
-    """Offset of the recorded voltage. Isermann, Identification of Dynamic Systems, 2011."""
-    m.voltage += V_0
-
-
-@effect(balance="voltage")
 def winding_heating(m: Equations,
                     alpha=P(0.00393, "1/K", null=0.0, vary=False, doc="temperature coefficient of copper, fixed"),
                     R_th=P(10.0, "K/W", positive=True, grid=(0.3, 1.0, 3.0), doc="thermal resistance to ambient"),
@@ -77,14 +47,27 @@ def magnet_heating(m: Equations,
 
 
 @effect(balance="voltage")
-def supply_sag(m: Equations, R_s=P(0.1, "Ω", null=0.0, lower=0.0, doc="resistance of supply and leads"),
-               V_s=P(12.0, "V", positive=True, vary=False, grid=(1.0,), doc="supply without load, fixed")):
-    """Sag of the supply, d·(V_s − R_s·d·i), d = v/V_s. Mohan, Electric Machines and Drives, 2012.
+def inductance_saturation(
+    m: Equations,
+    i_L=P(5.0, "A", null=float("inf"), positive=True, grid=(0.3, 1.0, 3.0), doc="current that halves L"),
+):
+    """Saturation of the inductance, L/(1+(i/i_L)²). Krause et al., Analysis of Electric Machinery, 2013."""
+    m.scale("L", 1 / (1 + (m.i / i_L) ** 2))
 
-    Only R_s/V_s² acts. Unless V_s is given it is the largest voltage of the records: the duty is one there.
-    Seen as a voltage missing with the duty squared and the current: steps to several duties, under load.
-    """
-    m.voltage -= R_s * (m.command / V_s) ** 2 * m.i
+
+@effect(balance="voltage")
+def magnetic_saturation(
+    m: Equations,
+    i_K=P(5.0, "A", null=float("inf"), positive=True, grid=(0.7, 1.5, 3.0), doc="current that halves K"),
+):
+    """Magnetic saturation, K/(1+(i/i_K)²) in torque and back-EMF. Krause et al., Electric Machinery, 2013."""
+    m.scale("K", 1 / (1 + (m.i / i_K) ** 2))
+
+
+@effect(balance="voltage")
+def driver_dead_band(m: Equations, V_d=P(0.2, "V", null=0.0, lower=0.0, doc="half-width of the dead band")):
+    """Dead band of the driver: within ±V_d nothing comes, larger commands lose V_d. Tao & Kokotović, 1996."""
+    m.replace("v", m.command - ca.fmax(-V_d, ca.fmin(V_d, m.command)))
 
 
 OPEN = 1e-6  # V: a command that opens the bridge
@@ -125,10 +108,20 @@ def driver_current_limit(
 
 
 @effect(balance="voltage")
-def measured_temperature(m: Equations, alpha_T=P(0.00393, "1/K", null=0.0, lower=0.0, doc="copper: 0.0039"),
-                         T_ref=P(25.0, "°C", vary=False, doc="temperature that R belongs to, fixed")):
-    """Recorded temperature of the winding, R(1+α(T−T_ref)). Kirtley, Electric Power Principles, 2010."""
-    m.scale("R", 1 + alpha_T * (m.input("temp") - T_ref))
+def supply_sag(m: Equations, R_s=P(0.1, "Ω", null=0.0, lower=0.0, doc="resistance of supply and leads"),
+               V_s=P(12.0, "V", positive=True, vary=False, grid=(1.0,), doc="supply without load, fixed")):
+    """Sag of the supply, d·(V_s − R_s·d·i), d = v/V_s. Mohan, Electric Machines and Drives, 2012.
+
+    Only R_s/V_s² acts. Unless V_s is given it is the largest voltage of the records: the duty is one there.
+    Seen as a voltage missing with the duty squared and the current: steps to several duties, under load.
+    """
+    m.voltage -= R_s * (m.command / V_s) ** 2 * m.i
+
+
+@effect(balance="voltage")
+def voltage_offset(m: Equations, V_0=P(0.05, "V", null=0.0, doc="added to the applied voltage")):
+    """Offset of the recorded voltage. Isermann, Identification of Dynamic Systems, 2011."""
+    m.voltage += V_0
 
 
 @effect(balance="voltage")
@@ -136,6 +129,13 @@ def measured_supply(m: Equations, k_v=P(1.0, "", null=0.0, doc="of the supply's 
                     V_n=P(12.0, "V", positive=True, vary=False, grid=(1.0,), doc="supply that commands mean, fixed")):
     """Recorded voltage of the supply, of which commands are shares. Mohan, Electric Machines and Drives, 2012."""
     m.scale("v", 1 + k_v * (m.input("v_supply") / V_n - 1))
+
+
+@effect(balance="voltage")
+def measured_temperature(m: Equations, alpha_T=P(0.00393, "1/K", null=0.0, lower=0.0, doc="copper: 0.0039"),
+                         T_ref=P(25.0, "°C", vary=False, doc="temperature that R belongs to, fixed")):
+    """Recorded temperature of the winding, R(1+α(T−T_ref)). Kirtley, Electric Power Principles, 2010."""
+    m.scale("R", 1 + alpha_T * (m.input("temp") - T_ref))
 
 
 @effect(balance="voltage")

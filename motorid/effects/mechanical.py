@@ -35,10 +35,76 @@ def stribeck(m: Equations, tau_c=P(2e-3, "N·m", null=0.0, lower=0.0, doc="Coulo
     m.torque -= level * m.sign(m.omega)
 
 
+@effect(balance="torque", includes=("coulomb", "coulomb_asymmetric", "stribeck"))
+def lugre(m: Equations, tau_c=P(2e-3, "N·m", null=0.0, lower=0.0, doc="Coulomb friction torque at speed"),
+          s_b=P(1.5, "", lower=1.0, upper=10.0, doc="breakaway over Coulomb torque"),
+          omega_s=P(5.0, "rad/s", positive=True, grid=(0.03, 0.1), doc="Stribeck speed"),
+          theta_s=P(0.01, "rad", positive=True, grid=(0.003, 0.03), doc="presliding angle tau_c/σ0")):
+    """Bristle friction with presliding (LuGre). Canudas de Wit et al., IEEE TAC 40(3), 1995.
+
+    The bristle damping σ1 is σ0 times the time to cross the presliding angle at the Stribeck speed.
+    """
+    level = 1 + (s_b - 1) * ca.exp(-((m.omega / omega_s) ** 2))  # g(ω)/tau_c
+    z = m.state("z_bristle")  # deflection over the presliding angle
+    rate = (m.omega - ca.fabs(m.omega) * z / level) / theta_s
+    m.rate(z, rate)
+    m.torque -= tau_c * (z + theta_s / omega_s * rate)
+
+
+@effect(balance="torque", includes=("coulomb",))
+def angular_friction(m: Equations, tau_m=P(2e-3, "N·m", null=0.0, lower=0.0, doc="friction torque, mean over a turn"),
+                     a_f=P(0.5, "", lower=0.0, upper=1.0, doc="relative amplitude"),
+                     N_f=P(1.0, "", vary=False, lower=1.0, doc="periods per turn, fixed"),
+                     phi_f=P(0.0, "rad", periodic=True, grid=QUARTERS, doc="phase at theta = 0")):
+    """Friction that varies over a turn (a bent shaft), τ(1+a·sin(Nθ+φ))·sgn ω. Armstrong-Hélouvry, 1991.
+
+    Seen as a friction that repeats every turn in both directions: turn slowly, measure the angle.
+    """
+    m.torque -= tau_m * (1 + a_f * ca.sin(N_f * m.theta + phi_f)) * m.sign(m.omega)
+
+
+@effect(balance="torque")
+def viscous_asymmetric(
+    m: Equations,
+    b_a=P(1e-6, "N·m·s/rad", null=0.0, doc="added to b turning forward, taken from it turning backward"),
+):
+    """Viscous friction that differs with the direction, b_a·abs(ω). Janot et al., EMPS benchmark, 2019."""
+    m.torque -= b_a * m.omega * m.sign(m.omega)
+
+
 @effect(balance="torque")
 def quadratic_drag(m: Equations, c_2=P(1e-7, "N·m·s²/rad²", null=0.0, lower=0.0, doc="drag coefficient")):
     """Fan or windage drag, c_2·ω·abs(ω). White, Fluid Mechanics, 2011."""
     m.torque -= c_2 * m.omega * ca.fabs(m.omega)
+
+
+@effect(balance="torque")
+def eddy_brake(m: Equations, c_e=P(1e-5, "N·m·s/rad", null=0.0, lower=0.0, doc="drag per speed when slow"),
+               omega_b=P(50.0, "rad/s", positive=True, grid=(0.1, 0.3, 0.8), doc="speed of the largest torque")):
+    """Eddy-current brake, c·ω/(1+(ω/ω_b)²). Wouterse, IEE Proc. B 138(4), 1991.
+
+    Seen as a drag that rises and then falls with the speed: a staircase up to full speed.
+    """
+    m.torque -= c_e * m.omega / (1 + (m.omega / omega_b) ** 2)
+
+
+@effect(balance="torque")
+def load_friction(m: Equations, mu=P(0.1, "", null=0.0, lower=0.0, upper=1.0, doc="share of the motor torque lost")):
+    """Friction that grows with the torque carried, μ·abs(K·i)·sgn ω. Duclusaud et al., BAM, 2025."""
+    carried = m.K_t * m.i if "i" in m.states else m.g * m.v
+    m.torque -= mu * ca.fabs(carried) * m.sign(m.omega)
+
+
+@effect(balance="torque", includes=("load_friction",))
+def gear_efficiency(m: Equations, mu_d=P(0.1, "", null=0.0, lower=0.0, upper=1.0, doc="share lost when it drives"),
+                    mu_b=P(0.2, "", null=0.0, lower=0.0, doc="share lost when it is driven back")):
+    """Efficiency of the gear, another share of the torque when driven back. Wang & Kim, ICRA, 2015.
+
+    Only with J known (fixed) can the two shares be determined; otherwise `load_friction` does the same with another J.
+    Seen in hard braking beside hard acceleration.
+    """
+    carried, s = m.K_t * m.i if "i" in m.states else m.g * m.v, m.sign(m.omega)
+    m.torque -= s * (mu_d * (ca.fabs(carried) + carried * s) + mu_b * (ca.fabs(carried) - carried * s)) / 2
 
 
 @effect(balance="torque")
@@ -52,6 +118,16 @@ def gravity(m: Equations, mgl=P(1e-3, "N·m", null=0.0, lower=0.0, doc="weight t
             phi_g=P(0.0, "rad", periodic=True, doc="angle of the lever at theta = 0, from hanging")):
     """Gravity on an unbalanced load, m·g·l·sin(θ+φ). Any textbook of mechanics; Duclusaud et al., BAM, 2025."""
     m.torque -= mgl * ca.sin(m.theta + phi_g)
+
+
+@effect(balance="torque")
+def spring(m: Equations, k_s=P(1e-3, "N·m/rad", null=0.0, lower=0.0, doc="stiffness"),
+           theta_0=P(0.0, "rad", doc="angle at which it is relaxed")):
+    """Spring to the frame (a return spring, a flexure), k·(θ−θ₀). Meirovitch, Fundamentals of Vibrations, 2001.
+
+    Seen as an angle that comes back at 0 V: small steps from rest, angle measured.
+    """
+    m.torque -= k_s * (m.theta - theta_0)
 
 
 @effect(balance="torque")
@@ -71,88 +147,6 @@ def torque_ripple(
 ):
     """Torque ripple, K·(1+a·sin(N·θ+φ)), or of a torque drive's gain. Jahns & Soong, IEEE TIE 43(2), 1996."""
     m.scale("K_t" if "i" in m.states else "g", 1 + a_r * ca.sin(N_r * m.theta + phi_r))
-
-
-@effect(balance="torque")
-def load_friction(m: Equations, mu=P(0.1, "", null=0.0, lower=0.0, upper=1.0, doc="share of the motor torque lost")):
-    """Friction that grows with the torque carried, μ·abs(K·i)·sgn ω. Duclusaud et al., BAM, 2025."""
-    carried = m.K_t * m.i if "i" in m.states else m.g * m.v
-    m.torque -= mu * ca.fabs(carried) * m.sign(m.omega)
-
-
-@effect(balance="torque")
-def viscous_asymmetric(
-    m: Equations,
-    b_a=P(1e-6, "N·m·s/rad", null=0.0, doc="added to b turning forward, taken from it turning backward"),
-):
-    """Viscous friction that differs with the direction, b_a·abs(ω). Janot et al., EMPS benchmark, 2019."""
-    m.torque -= b_a * m.omega * m.sign(m.omega)
-
-
-@effect(balance="torque", includes=("coulomb", "coulomb_asymmetric", "stribeck"))
-def lugre(m: Equations, tau_c=P(2e-3, "N·m", null=0.0, lower=0.0, doc="Coulomb friction torque at speed"),
-          s_b=P(1.5, "", lower=1.0, upper=10.0, doc="breakaway over Coulomb torque"),
-          omega_s=P(5.0, "rad/s", positive=True, grid=(0.03, 0.1), doc="Stribeck speed"),
-          theta_s=P(0.01, "rad", positive=True, grid=(0.003, 0.03), doc="presliding angle tau_c/σ0")):
-    """Bristle friction with presliding (LuGre). Canudas de Wit et al., IEEE TAC 40(3), 1995.
-
-    The bristle damping σ1 is σ0 times the time to cross the presliding angle at the Stribeck speed.
-    """
-    level = 1 + (s_b - 1) * ca.exp(-((m.omega / omega_s) ** 2))  # g(ω)/tau_c
-    z = m.state("z_bristle")  # deflection over the presliding angle
-    rate = (m.omega - ca.fabs(m.omega) * z / level) / theta_s
-    m.rate(z, rate)
-    m.torque -= tau_c * (z + theta_s / omega_s * rate)
-
-
-@effect(balance="torque")
-def eddy_brake(m: Equations, c_e=P(1e-5, "N·m·s/rad", null=0.0, lower=0.0, doc="drag per speed when slow"),
-               omega_b=P(50.0, "rad/s", positive=True, grid=(0.1, 0.3, 0.8), doc="speed of the largest torque")):
-    """Eddy-current brake, c·ω/(1+(ω/ω_b)²). Wouterse, IEE Proc. B 138(4), 1991.
-
-    Seen as a drag that rises and then falls with the speed: a staircase up to full speed.
-    """
-    m.torque -= c_e * m.omega / (1 + (m.omega / omega_b) ** 2)
-
-
-@effect(balance="torque", includes=("coulomb",))
-def angular_friction(m: Equations, tau_m=P(2e-3, "N·m", null=0.0, lower=0.0, doc="friction torque, mean over a turn"),
-                     a_f=P(0.5, "", lower=0.0, upper=1.0, doc="relative amplitude"),
-                     N_f=P(1.0, "", vary=False, lower=1.0, doc="periods per turn, fixed"),
-                     phi_f=P(0.0, "rad", periodic=True, grid=QUARTERS, doc="phase at theta = 0")):
-    """Friction that varies over a turn (a bent shaft), τ(1+a·sin(Nθ+φ))·sgn ω. Armstrong-Hélouvry, 1991.
-
-    Seen as a friction that repeats every turn in both directions: turn slowly, measure the angle.
-    """
-    m.torque -= tau_m * (1 + a_f * ca.sin(N_f * m.theta + phi_f)) * m.sign(m.omega)
-
-
-@effect(balance="torque", includes=("load_friction",))
-def gear_efficiency(m: Equations, mu_d=P(0.1, "", null=0.0, lower=0.0, upper=1.0, doc="share lost when it drives"),
-                    mu_b=P(0.2, "", null=0.0, lower=0.0, doc="share lost when it is driven back")):
-    """Efficiency of the gear, another share of the torque when driven back. Wang & Kim, ICRA, 2015.
-
-    Only with J known (fixed) can the two shares be determined; otherwise `load_friction` does the same with another J.
-    Seen in hard braking beside hard acceleration.
-    """
-    carried, s = m.K_t * m.i if "i" in m.states else m.g * m.v, m.sign(m.omega)
-    m.torque -= s * (mu_d * (ca.fabs(carried) + carried * s) + mu_b * (ca.fabs(carried) - carried * s)) / 2
-
-
-@effect(balance="torque")
-def spring(m: Equations, k_s=P(1e-3, "N·m/rad", null=0.0, lower=0.0, doc="stiffness"),
-           theta_0=P(0.0, "rad", doc="angle at which it is relaxed")):
-    """Spring to the frame (a return spring, a flexure), k·(θ−θ₀). Meirovitch, Fundamentals of Vibrations, 2001.
-
-    Seen as an angle that comes back at 0 V: small steps from rest, angle measured.
-    """
-    m.torque -= k_s * (m.theta - theta_0)
-
-
-@effect(balance="torque")
-def measured_load(m: Equations, k_l=P(1.0, "", null=0.0, doc="of the recorded torque that acts; 1: all of it")):
-    """Recorded load torque, against positive speed. Isermann, Identification of Dynamic Systems, 2011."""
-    m.torque -= k_l * m.input("tau_load")
 
 
 CORNER = 0.01  # of half a gap: a stiff shaft is twisted by much less than the gap, and a wide corner is a soft shaft
@@ -202,3 +196,9 @@ def backlash(m: Equations,
         return twist + (soft_up - soft_down) / 2, 1 + (up / soft_up - down / soft_down) / 2
 
     _two_inertias(m, r_gap, omega_c, zeta_c, in_contact, "geared")
+
+
+@effect(balance="torque")
+def measured_load(m: Equations, k_l=P(1.0, "", null=0.0, doc="of the recorded torque that acts; 1: all of it")):
+    """Recorded load torque, against positive speed. Isermann, Identification of Dynamic Systems, 2011."""
+    m.torque -= k_l * m.input("tau_load")

@@ -25,13 +25,6 @@ def speed_lag(
 
 
 @effect(balance="sensor")
-def current_lag(m: Equations,
-                T_i=P(1e-3, "s", null=0.0, positive=True, grid=(0.5, 2.0, 8.0), doc="time constant of current filter")):
-    """First-order lag of the current measurement. Åström & Murray, Feedback Systems, 2008."""
-    _lag(m, "i", T_i)
-
-
-@effect(balance="sensor")
 def speed_delay(m: Equations,
                 T_d=P(5e-3, "s", null=0.0, positive=True, grid=(1.0, 4.0, 16.0), doc="delay of the speed measurement")):
     """Delay of the speed measurement, Padé of orders 2 and 3. Golub & Van Loan, 2013, sec. 9.3."""
@@ -42,21 +35,6 @@ def speed_delay(m: Equations,
     m.rate(z[1], z[2] / T_d)
     m.rate(z[2], (60 * (reaching - z[0]) - 36 * z[1] - 9 * z[2]) / T_d)
     m.measure("omega", z[0] - 0.4 * z[1] + 0.05 * z[2])
-
-
-@effect(balance="sensor")
-def current_offset(m: Equations, i_0=P(0.02, "A", null=0.0, doc="added by the current sensor")):
-    """Offset of the current sensor. Isermann, Identification of Dynamic Systems, 2011."""
-    m.measure("i", m.measured("i") + i_0)
-
-
-@effect(balance="sensor")
-def speed_gain(m: Equations, k_w=P(0.01, "", null=0.0, lower=-0.9, upper=9.0, doc="relative error of the speed scale")):
-    """Wrong scale of the speed sensor. Isermann, Identification of Dynamic Systems, 2011.
-
-    Needs an angle, or fixed motor constants, to be distinguished from K and J.
-    """
-    m.measure("omega", m.measured("omega") * (1 + k_w))
 
 
 @effect(balance="sensor")
@@ -75,12 +53,34 @@ def speed_average(m: Equations, T_a=P(5e-3, "s", null=0.0, positive=True, grid=(
 
 
 @effect(balance="sensor")
+def speed_gain(m: Equations, k_w=P(0.01, "", null=0.0, lower=-0.9, upper=9.0, doc="relative error of the speed scale")):
+    """Wrong scale of the speed sensor. Isermann, Identification of Dynamic Systems, 2011.
+
+    Needs an angle, or fixed motor constants, to be distinguished from K and J.
+    """
+    m.measure("omega", m.measured("omega") * (1 + k_w))
+
+
+@effect(balance="sensor")
 def speed_offset(m: Equations, w_0=P(0.5, "rad/s", null=0.0, doc="added by the speed sensor")):
     """Offset of the speed sensor (a tacho, a gyro). Isermann, Identification of Dynamic Systems, 2011.
 
     While the motor turns, a voltage offset with a load does the same; records at standstill or an angle tell.
     """
     m.measure("omega", m.measured("omega") + w_0)
+
+
+@effect(balance="sensor")
+def current_lag(m: Equations,
+                T_i=P(1e-3, "s", null=0.0, positive=True, grid=(0.5, 2.0, 8.0), doc="time constant of current filter")):
+    """First-order lag of the current measurement. Åström & Murray, Feedback Systems, 2008."""
+    _lag(m, "i", T_i)
+
+
+@effect(balance="sensor")
+def current_offset(m: Equations, i_0=P(0.02, "A", null=0.0, doc="added by the current sensor")):
+    """Offset of the current sensor. Isermann, Identification of Dynamic Systems, 2011."""
+    m.measure("i", m.measured("i") + i_0)
 
 
 @effect(balance="sensor")
