@@ -18,8 +18,7 @@ from motorid.acquire.client import Client, LinkLost
 from motorid.acquire.protocol import Header, Message, Sample, frame
 from motorid.acquire.record_file import Commanded, RecordFile
 from motorid.acquire.timeline import Row, Timeline
-from motorid.display.cards import Card, Shown
-from motorid.display.tables import Flag
+from motorid.display.cards import Card, Flag, Shown
 
 OVER_LIMIT = 3  # samples in a row beyond the current limit that make the computer stop the motor too
 EMPTY = 5  # readings in a row without a valid line, at least, that make a silence

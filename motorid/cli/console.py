@@ -17,7 +17,7 @@ import numpy as np
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from motorid.display.tables import Table
+from motorid.display.cards import Table
 from motorid.errors import DataError, ModelError, MotoridError, UsageError, printable
 from motorid.numerics.parallel import interruption, progress
 from motorid.records.files import check_output

@@ -29,8 +29,8 @@ from motorid.cli.options import (
     saved_model,
     with_options,
 )
+from motorid.display.cards import Table
 from motorid.display.numbers import counted, duration, number
-from motorid.display.tables import Table
 from motorid.effects import EVERY
 from motorid.errors import DataError, UsageError, one_of
 from motorid.estimation.result import Fit, constraint_table, ended, steady_table, value_tables

@@ -12,9 +12,8 @@ from motorid.acquire.recorder import record
 from motorid.diagnosis.diagnose import diagnose
 from motorid.diagnosis.experiment_design import Design, design_experiment
 from motorid.diagnosis.results import Diagnosis
-from motorid.display.cards import Card, Printed
+from motorid.display.cards import Card, Flag, Printed, Table
 from motorid.display.numbers import percent
-from motorid.display.tables import Flag, Table
 from motorid.errors import FitError, UsageError, one_of
 from motorid.estimation.fit import fit
 from motorid.model.model import dc_motor

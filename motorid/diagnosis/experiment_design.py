@@ -19,9 +19,8 @@ from motorid.acquire.excitation import program
 from motorid.channels import UNITS, channel_name
 from motorid.diagnosis.design_criteria import NOISES, DesignNlp, Driven, Layout, Rival, Task, all_pairs
 from motorid.diagnosis.results import Diagnosis
-from motorid.display.cards import Card, Printed, Shown
+from motorid.display.cards import Card, Flag, Printed, Shown, Table
 from motorid.display.numbers import number, quantity
-from motorid.display.tables import Flag, Table
 from motorid.errors import FitError, MotoridError, SimulationError, UsageError, one_of
 from motorid.estimation.result import Fit
 from motorid.estimation.shooting.nlp import Ipopt

@@ -9,9 +9,8 @@ from typing import Any
 from motorid.channels import UNITS, channel_name
 from motorid.diagnosis.design_criteria import Rival
 from motorid.diagnosis.remainder import Remainder
-from motorid.display.cards import Card, Shown
+from motorid.display.cards import Card, Cell, Flag, Shown, Table
 from motorid.display.numbers import number, percent, quantity
-from motorid.display.tables import Cell, Flag, Table
 from motorid.estimation.result import Fit, parameter_table
 from motorid.numerics.signals import Array
 from motorid.problem.simulate import NRMSE

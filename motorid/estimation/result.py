@@ -13,9 +13,8 @@ from typing import Any
 import numpy as np
 
 from motorid.channels import channel_name
-from motorid.display.cards import Card, Shown
+from motorid.display.cards import Card, Cell, Flag, Shown, Table
 from motorid.display.numbers import counted, duration, number, percent, quantity, sentence, with_error
-from motorid.display.tables import Cell, Flag, Table
 from motorid.errors import UsageError, name_of
 from motorid.estimation.covariance import Certainty, Quantity, certainty, combinations
 from motorid.model.model import Model

@@ -11,9 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from motorid.display.cards import Card, Shown
+from motorid.display.cards import Card, Flag, Shown, Table
 from motorid.display.numbers import quantity
-from motorid.display.tables import Flag, Table
 from motorid.errors import ModelError, one_of
 
 

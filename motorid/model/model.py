@@ -11,9 +11,8 @@ from typing import Any
 import casadi as ca
 
 from motorid.channels import CHANNELS
-from motorid.display.cards import Card, Shown
+from motorid.display.cards import Card, Shown, Table
 from motorid.display.numbers import quantity
-from motorid.display.tables import Table
 from motorid.errors import ModelError, one_of
 from motorid.model.definition import Effect, Parameter
 from motorid.model.equations import Equations, System, build_system

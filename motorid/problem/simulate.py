@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 
 from motorid.channels import CHANNELS, UNITS, channel_name
-from motorid.display.cards import Card, Shown
+from motorid.display.cards import Card, Shown, Table
 from motorid.display.numbers import counted, percent, quantity
-from motorid.display.tables import Table
 from motorid.errors import FitError, SimulationError
 from motorid.integrate.engine import Engine
 from motorid.model.model import Model

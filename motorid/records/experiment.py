@@ -14,9 +14,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from motorid.channels import CHANNELS, MEASURED_INPUTS, NAMES, UNITS
-from motorid.display.cards import Card, Shown
+from motorid.display.cards import Card, Flag, Shown, Table
 from motorid.display.numbers import duration, number
-from motorid.display.tables import Flag, Table
 from motorid.errors import DataError, UsageError, one_of, printable
 from motorid.numerics.signals import Array
 from motorid.records import preprocessing

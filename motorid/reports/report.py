@@ -11,9 +11,8 @@ from typing import Any
 
 from motorid.channels import NAMES
 from motorid.diagnosis.results import Diagnosis, Ladder
-from motorid.display.cards import Shown
+from motorid.display.cards import Flag, Shown, Table
 from motorid.display.numbers import percent, with_error
-from motorid.display.tables import Flag, Table
 from motorid.errors import UsageError
 from motorid.estimation.result import Fit
 from motorid.records.experiment import Experiment

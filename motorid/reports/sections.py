@@ -8,9 +8,8 @@ from typing import Any
 
 from motorid.channels import NAMES
 from motorid.diagnosis.results import Diagnosis, Ladder, ladder_table, ranking_table, share_table
-from motorid.display.cards import Shown
+from motorid.display.cards import Shown, Table
 from motorid.display.numbers import counted, duration, number, percent, sentence
-from motorid.display.tables import Table
 from motorid.estimation.result import Fit, ended, parameter_table, value_tables
 from motorid.problem.simulate import error_table, evaluate
 from motorid.records.checks import check_runs

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.special import stdtrit
 
 from motorid.channels import CHANNELS
-from motorid.display.tables import Table
+from motorid.display.cards import Table
 from motorid.errors import DataError, FitError, MissingDependency, OutputError, UsageError, printable
 from motorid.estimation.fit import fit
 from motorid.estimation.result import Fit

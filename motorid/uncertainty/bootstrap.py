@@ -11,9 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from motorid.display.cards import Card, Printed
+from motorid.display.cards import Card, Flag, Printed, Table, value_cell
 from motorid.display.numbers import interval_text, percent
-from motorid.display.tables import Flag, Table, value_cell
 from motorid.errors import FitError, MotoridError, UsageError, one_of
 from motorid.estimation.least_squares import least_squares
 from motorid.estimation.result import Failure, Fit

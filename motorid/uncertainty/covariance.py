@@ -11,9 +11,8 @@ import numpy as np
 from scipy.special import stdtrit
 
 from motorid.channels import channel_name
-from motorid.display.cards import Card, Printed
+from motorid.display.cards import Card, Cell, Flag, Printed, Table, value_cell
 from motorid.display.numbers import interval_text, percent
-from motorid.display.tables import Cell, Flag, Table, value_cell
 from motorid.errors import UsageError, one_of
 from motorid.estimation.result import Fit, checked
 from motorid.numerics.autoregression import Colour

@@ -16,9 +16,8 @@ from typing import Any
 import numpy as np
 
 from motorid.channels import NAMES
-from motorid.display.cards import Card, Printed
+from motorid.display.cards import Card, Flag, Printed, Table
 from motorid.display.numbers import number, percent, quantity
-from motorid.display.tables import Flag, Table
 from motorid.errors import MotoridError, SimulationError, UsageError
 from motorid.estimation.covariance import UNDETERMINED
 from motorid.estimation.result import Fit

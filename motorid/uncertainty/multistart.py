@@ -14,9 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from motorid.display.cards import Card, Printed
+from motorid.display.cards import Card, Flag, Printed, Table
 from motorid.display.numbers import duration, percent, quantity, sentence
-from motorid.display.tables import Flag, Table
 from motorid.errors import MotoridError, SimulationError, UsageError
 from motorid.estimation.fit import minimise, solve
 from motorid.estimation.least_squares import FINISH

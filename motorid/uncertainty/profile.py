@@ -15,9 +15,8 @@ from typing import Any
 import numpy as np
 from scipy.special import stdtrit
 
-from motorid.display.cards import Card, Printed
+from motorid.display.cards import Card, Flag, Printed, Table
 from motorid.display.numbers import interval_text, percent, quantity
-from motorid.display.tables import Flag, Table
 from motorid.errors import MotoridError, UsageError, one_of
 from motorid.estimation.least_squares import least_squares
 from motorid.estimation.result import Fit

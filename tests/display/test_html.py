@@ -16,7 +16,7 @@ import motorid as mi
 from motorid.acquire import Recording
 from motorid.diagnosis.experiment_design import Suggestion
 from motorid.diagnosis.results import Diagnosis, Ladder, Missing
-from motorid.display.tables import COLOURS, Flag, Table
+from motorid.display.cards import COLOURS, Flag, Table
 from motorid.estimation.covariance import Quantity
 from motorid.estimation.result import Comparison, Failure, Fit
 from motorid.estimation.shooting.formulations import Formulations

@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 
 from motorid.channels import channel_name
-from motorid.display.cards import Card, Shown
+from motorid.display.cards import Card, Cell, Flag, Shown, Table, value_cell
 from motorid.display.numbers import duration, number, percent
-from motorid.display.tables import Cell, Flag, Table, value_cell
 from motorid.errors import FitError, MotoridError, SimulationError
 from motorid.estimation.fit import solve
 from motorid.estimation.least_squares import FINISH, least_squares
