@@ -5,6 +5,7 @@ from __future__ import annotations
 import codecs
 import contextlib
 import os
+import re
 import shlex
 import sys
 import textwrap
@@ -29,6 +30,17 @@ _ASCII = {"Ω": "Ohm", "ω": "omega", "τ": "tau", "θ": "theta", "φ": "phi", "
           "μ": "mu", "·": "*", "×": "x", "±": "+-", "²": "^2", "°": "deg", "√": "sqrt", "…": "...", "→": "->",
           "•": "*", "–": "-", "—": "-", "−": "-", "─": "-", "━": "-", "│": "|", "≈": "~", "≤": "<=", "≥": ">=",
           "“": '"', "”": '"', "⁻": "^-", **dict(zip("⁰¹³⁴⁵⁶⁷⁸⁹", "013456789", strict=True))}
+# Messages name what Python takes; on the command line the same is said by options.
+_OPTIONS = ((r"\b(columns|units)=\{(.*?)\}", lambda m: f"--{m[1]} {_pairs(m[2])}"),
+            (r"\bwith (columns|units)\b", lambda m: f"with --{m[1]}"),
+            (r"\b(engine|hold|solver|initial|formulation)='([\w-]+)'", lambda m: f"--{m[1]} {m[2]}"),
+            (r"\bmodel\.without\('(\w+)'\)", lambda m: f"--effects without {m[1]}"),
+            (r"\bmodel\.fix\('?(\w+)'?(=[^)]*)?\)", lambda m: f"--fix {m[1]}{m[2] or ''}"),
+            (r"\bmodel\.free\('?(\w+|…)'?\)", lambda m: f"--free {m[1].replace('…', 'NAME')}"),
+            (r"\bmodel\.fix\(…\)", lambda m: "--fix NAME"),
+            (r"\bmi\.evaluate\(model, runs\)", lambda m: "motorid simulate FIT.json RUN..."),
+            (r"\bmi\.load\(path, effects=\[\w+\]\)", lambda m: "--effects-from FILE.py"),
+            (r" If you know where it comes from, mi\.load.*", lambda m: ""))
 MANY = ("--validate",)  # options that take all names up to the next option
 OUTPUTS = ("--json", "--report")  # options that write a file
 MAY_WRAP = 32  # characters of a cell that is a sentence: shorter ones are names and numbers, and stay whole
@@ -130,7 +142,7 @@ def show(*parts: Table | str | None) -> None:
         if part is None:
             continue
         if isinstance(part, str):
-            console.print(Text(printable(part)))
+            console.print(Text(printable(in_options(part))))
             continue
         drawn = RichTable(title=part.title or None, box=box.SIMPLE_HEAD, title_justify="left",
                           title_style="bold")
@@ -160,6 +172,20 @@ def _least_widths(table: Table, room: int) -> list[int]:
     return least
 
 
+def in_options(text: str) -> str:
+    """Return a message with what Python takes said as the options of the command line."""
+    for pattern, option in _OPTIONS:
+        text = re.sub(pattern, option, text)
+    return text
+
+
+def _pairs(inside: str) -> str:
+    """Return ``v=u_volt,omega=speed`` of ``'v': 'u_volt', 'omega': 'speed'``, quoted where a shell needs it."""
+    pairs = re.findall(r"'(\w+)': ?(?:'([^']*)'|(\d+)|\.\.\.)", inside)
+    words = ",".join(f"{name}={text or number or '...'}" for name, text, number in pairs)
+    return f'"{words}"' if " " in words else words
+
+
 def _console() -> Any:
     from rich.console import Console
 
@@ -177,7 +203,7 @@ def say_notes(notes: Iterable[str], title: str = "Remarks") -> None:
 def wrapped(text: str, first: str = "") -> str:
     """Return a paragraph as wide as the screen, its further lines below the text of the first one."""
     console = _console()
-    return textwrap.fill(text, console.width, initial_indent=first, subsequent_indent=" " * len(first),
+    return textwrap.fill(in_options(text), console.width, initial_indent=first, subsequent_indent=" " * len(first),
                          break_on_hyphens=False, break_long_words=False)
 
 
@@ -203,7 +229,7 @@ def save_report(result: Any, path: Any, held_out: Sequence[Any] = (), force: boo
 
 
 def _say(text: str) -> None:
-    typer.echo(f"motorid: {printable(' '.join(text.split()))}", err=True)
+    typer.echo(f"motorid: {printable(' '.join(in_options(text).split()))}", err=True)
 
 
 def _usage(error: Any) -> str:

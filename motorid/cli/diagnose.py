@@ -120,12 +120,13 @@ def _as_it_comes(word: str, done: list[str], advance: Callable[..., None], quiet
 
 
 def _saying(advance: Callable[..., None]) -> Callable[..., Iterator[Any]]:
-    """Return a `map` that says which effect is being fitted."""
+    """Return a `map` that says which effect is being fitted, and how many of the round are."""
 
     def mapped(function: Callable[[Any], Any], tasks: Iterable[Any]) -> Iterator[Any]:
-        for task in tasks:
+        every = list(tasks)
+        for k, task in enumerate(every, 1):
             effect = getattr(task[0] if isinstance(task, tuple) else task, "effect", None)
-            advance(0, f"fitting {effect.name}" if effect is not None else "")
+            advance(0, f"fitting {effect.name}, {k} of {len(every)} to try now" if effect is not None else "")
             yield function(task)
 
     return mapped

@@ -99,7 +99,7 @@ def _amount(records: list[Experiment]) -> str:
 
 @with_options(FitOptions)
 def fit_many_command(
-    directory: Annotated[Path, typer.Argument(metavar="DIR", help="One folder, or file, per motor.")],
+    directories: Annotated[list[Path], typer.Argument(metavar="DIR...", help="One folder, or file, per motor inside.")],
     options: FitOptions,
     out: Annotated[Path | None, typer.Option(
         metavar="TABLE.csv", rich_help_panel=OUT, help="Write the table: .csv, .parquet or .json.")] = None,
@@ -110,9 +110,12 @@ def fit_many_command(
 ) -> None:
     """Fit one model to the records of many motors; a motor that fails is a row that says why.
 
+    Names of motors begin with their folder where several are given.
+
     Example: motorid fit-many motors/ --effects coulomb --out table.csv
     """
-    motors: dict[str, Any] = dict(motors_in(directory))
+    motors: dict[str, Any] = {f"{place.name}/{name}" if len(directories) > 1 else name: files
+                              for place in directories for name, files in motors_in(place).items()}
     model = options.model(_first_readable(options, motors.values()))
     if options.preprocesses:
         motors = {name: _read_or_names(options, files) for name, files in motors.items()}

@@ -266,13 +266,8 @@ def saved_model(path: Path, effects_from: Path | None = None) -> Model:
         If it has an effect of the user's own, whose file was not named.
     """
     own = own_effects(effects_from) if effects_from else {}
-    try:
-        found = load(path, own.values())
-        return found if isinstance(found, Model) else found.model
-    except ModelError as error:
-        if effects_from is not None or "mi.load(path, effects=" not in str(error):
-            raise
-        raise ModelError(f"{error} On the command line: --effects-from FILE.py") from None
+    found = load(path, own.values())
+    return found if isinstance(found, Model) else found.model
 
 
 def make_folder(out: Path) -> None:

@@ -31,7 +31,7 @@ FORMS = {".casadi": "casadi", ".c": "c", ".json": "json"}
 NO_FMU = ("an FMU is not offered: those that CasADi 3.8.2 writes do not pass FMPy's checker (names of variables, "
           "initial unknowns), and FMPy simulates them with other trajectories. Take to='c' or to='casadi'.")
 SAME = 1e-4  # relative difference of costs that machines and engines make
-NOT_OURS = "it is not a file that mi.export wrote"
+NOT_OURS = "it is no model or fit that motorid wrote"
 
 
 @dataclass(frozen=True, eq=False)

@@ -185,24 +185,26 @@ def _settle_counts(places: dict[str, Place], notes: list[str]) -> None:
 
 
 def _require(places: Mapping[str, Place], labels: Sequence[str]) -> None:
-    for channel in ("t", "v"):
-        if channel not in places:
-            duty = [c for c in labels if is_duty(c)] if channel == "v" else []
-            more = (f" '{duty[0]}' is a duty cycle; with a constant supply of, say, 12 V: columns="
-                    f"{{'v': '{duty[0]}'}}, units={{'v': '12 V'}}.") if duty else ""
-            raise DataError(f"no column looks like {_MEANING[channel]} ({channel}). "
-                            f"{_say_which(labels, channel, labels[0])}{more}")
+    missing = {c: f"{_MEANING[c]} ({c})" for c in ("t", "v") if c not in places}
     if not {"i", "omega", "theta"} & set(places):
-        raise DataError("no column looks like a measured current (i), speed (omega) or angle (theta). "
-                        f"{_say_which(labels, 'omega', labels[-1])}")
+        missing["omega"] = "a measured current (i), speed (omega) or angle (theta)"
+    if not missing:
+        return
+    duty = [c for c in labels if is_duty(c)] if "v" in missing else []
+    more = (f" '{duty[0]}' is a duty cycle; with a constant supply of, say, 12 V: columns="
+            f"{{'v': '{duty[0]}'}}, units={{'v': '12 V'}}.") if duty else ""
+    used = {*duty, *(p.column for p in places.values())}
+    raise DataError(f"no column looks like {', nor like '.join(missing.values())}. "
+                    f"{_say_which(labels, list(missing), [c for c in labels if c not in used])}{more}")
 
 
-def _say_which(labels: Sequence[str], channel: str, example: str) -> str:
+def _say_which(labels: Sequence[str], channels: Sequence[str], free: Sequence[str]) -> str:
     if list(labels) == [str(k + 1) for k in range(len(labels))]:
         return (f"The file has no header, so name its {len(labels)} columns by position, counted from 1: "
                 "columns={'t': 1, 'v': 2, 'omega': 3}.")
     listed = ", ".join(f"'{c}'" for c in labels[:20]) + (" ..." if len(labels) > 20 else "")
-    return f"Columns here: {listed}. Say which one it is, e.g. columns={{'{channel}': '{example}'}}."
+    example = ", ".join(f"'{c}': '{column}'" for c, column in zip(channels, [*free, "...", "...", "..."], strict=False))
+    return f"Columns here: {listed}. Say which is which, e.g. columns={{{example}}}."
 
 
 def _assumed(places: Mapping[str, Place]) -> list[str]:

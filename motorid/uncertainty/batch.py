@@ -7,7 +7,7 @@ import json
 import pickle
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import combinations
 from pathlib import Path
@@ -18,6 +18,7 @@ from scipy.special import stdtrit
 
 from motorid.channels import CHANNELS
 from motorid.display.cards import Table
+from motorid.display.numbers import number, quantity
 from motorid.errors import DataError, FitError, MissingDependency, OutputError, UsageError, printable
 from motorid.estimation.fit import fit
 from motorid.estimation.result import Fit
@@ -68,12 +69,15 @@ class Batch:
         Those compared on the logarithmic scale.
     interrupted : str
         Empty, or how far it came.
+    units : dict of str to str
+        Of the parameters.
     """
 
     rows: tuple[dict[str, Any], ...]
     parameters: tuple[str, ...]
     positive: frozenset[str]
     interrupted: str = ""
+    units: Mapping[str, str] = field(default_factory=dict)
 
     @cached_property
     def table(self) -> Any:
@@ -121,10 +125,15 @@ class Batch:
             v = np.array([r[n] for r in good if r.get(f"{n}_std") is not None], float)
             if v.size:
                 low, middle, high = np.percentile(v, [5, 50, 95])
-                rows.append((n, f"{middle:.4g}", f"{low:.4g} … {high:.4g}", str(v.size)))
-        table = Table(("parameter", "median", "5 % … 95 %", "determined in"), rows,
+                unit = self.units.get(n, "")
+                rows.append((n, quantity(middle, unit), f"{number(low)} … {number(high)}", str(v.size)))
+        table = Table(("parameter", "median", "5 % … 95 % of the motors", "determined in"), rows,
                       f"{len(good)} of {len(self.rows)} motors fitted", left=(0, 2))
-        said = [str(table), *(f"{name}: failed. {why}" for name, why in self.failed.items())]
+        poor = [r["motor"] for r in good if any(f.startswith("misfit") for f in r["flags"])]
+        shown = ", ".join(poor[:5]) + (" …" if len(poor) > 5 else "")
+        first = [f"{len(poor)} of {len(good)} motors fit poorly, errors over {POOR:g} times the noise: {shown}. "
+                 "Next: diagnose the records of one of them."] if poor else []
+        said = [*first, str(table), *(f"{name}: failed. {why}" for name, why in self.failed.items())]
         said += [o.text for o in self.outliers]
         return "\n".join([*said, *([self.interrupted] if self.interrupted else [])])
 
@@ -176,7 +185,8 @@ def fit_many(model: Model, motors: Mapping[str, Records], *, journal: str | Path
     rows = known | {row["motor"]: row for row in found.results}
     said = f"Interrupted after {len(rows)} of {len(motors)} motors." if found.interrupted else ""
     return Batch(tuple(rows[name] for name in motors if name in rows), model.free_names,
-                 frozenset(n for n, p in model.parameters.items() if p.positive), said)
+                 frozenset(n for n, p in model.parameters.items() if p.positive), said,
+                 {n: p.unit for n, p in model.parameters.items()})
 
 
 def _carry_laws(model: Model) -> None:

@@ -326,6 +326,17 @@ def test_fit_many_keeps_a_failed_motor_as_a_row(tmp_path):
     assert len((tmp_path / "table.csv").read_text().splitlines()) == 4
 
 
+def test_fit_many_takes_several_folders_and_says_what_fits_poorly(tmp_path):
+    for folder, source in (("a", STEPS), ("b", data_path("hidden_friction"))):
+        (tmp_path / folder).mkdir()
+        file = min(source.glob("*.csv"))
+        (tmp_path / folder / "m1.csv").write_bytes(file.read_bytes())
+    done = motorid("fit-many", tmp_path / "a", tmp_path / "b")
+    assert "2 of 2 motors fitted" in done.out
+    assert "1 of 2 motors fit poorly, errors over 3 times the noise: b/m1" in done.out
+    assert " Ω" in done.out
+
+
 # -- the whole ---------------------------------------------------------------------------------------------
 @pytest.mark.slow
 def test_demo_tells_the_story_and_leaves_figures_and_report(tmp_path):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 from collections.abc import Callable
@@ -26,8 +27,16 @@ def wrong(done: Done, *says: str) -> None:
     assert done.err.startswith("motorid: ")
     assert len(done.err.splitlines()) == 1
     assert 25 < len(done.err) < 1200
+    assert not re.search(r"\w=\{|(?<!@)\bmi\.|\bmodel\.\w+\(|\b(engine|hold|units|columns)='", done.err), done.err
     for word in says:
         assert word in done.err
+
+
+def test_all_that_is_missing_is_said_at_once_with_the_option_that_names_it(tmp_path):
+    path = tmp_path / "run.csv"
+    path.write_text("a,b c,d\n" + "".join(f"{k},{k},{k}\n" for k in range(30)))
+    wrong(motorid("check", path), "the time (t)", "the drive voltage (v)", "speed (omega)",
+          '--columns "t=a,v=b c,omega=d"')
 
 
 @pytest.mark.parametrize("broken", BROKEN, ids=lambda b: b.name)
