@@ -10,9 +10,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-from scipy.linalg import matmul_toeplitz
+from scipy.fft import next_fast_len
 
 from motorid.numerics.signals import Array, outlier_limit
 
@@ -85,7 +86,10 @@ def colour_of(parts: Sequence[Array], spent: float = 0.0) -> Colour:
 
 def weighed(jac: Array, gamma: Array) -> Array:
     """Return ``Jᵀ Γ J`` (k, k) for J (N, k), zero in rows of missing samples, and autocovariance (N,)."""
-    return jac.T @ np.asarray(matmul_toeplitz((gamma, gamma), jac)).real
+    n = len(jac)
+    size: Any = next_fast_len(2 * n - 1, True)  # SciPy's product with a Toeplitz matrix takes 2n − 1, prime or not
+    spectrum = np.fft.rfft(np.concatenate([gamma, np.zeros(size - 2 * n + 1), gamma[:0:-1]])).real
+    return jac.T @ np.fft.irfft(spectrum[:, None] * np.fft.rfft(jac, size, axis=0), size, axis=0)[:n]
 
 
 @dataclass(frozen=True, eq=False)
