@@ -142,7 +142,8 @@ def show(*parts: Table | str | None) -> None:
         if part is None:
             continue
         if isinstance(part, str):
-            console.print(Text(printable(in_options(part))))
+            lines = printable(in_options(part)).split("\n")
+            console.print(Text("\n".join(_filled(s, console.width) if "   " not in s else s for s in lines)))
             continue
         drawn = RichTable(title=part.title or None, box=box.SIMPLE_HEAD, title_justify="left",
                           title_style="bold")
@@ -202,9 +203,15 @@ def say_notes(notes: Iterable[str], title: str = "Remarks") -> None:
 
 def wrapped(text: str, first: str = "") -> str:
     """Return a paragraph as wide as the screen, its further lines below the text of the first one."""
-    console = _console()
-    return textwrap.fill(in_options(text), console.width, initial_indent=first, subsequent_indent=" " * len(first),
-                         break_on_hyphens=False, break_long_words=False)
+    return _filled(in_options(text), _console().width, first)
+
+
+def _filled(text: str, width: int, first: str = "") -> str:
+    """Return a line of text cut at spaces, but between a number and its unit."""
+    joined = re.sub(r"(?<=[\d⁰¹²³⁴⁵⁶⁷⁸⁹]) (?=[%a-zA-ZΩ°µ])(?!and|or|to|of|the)", "\0", text)
+    lines = textwrap.fill(joined, width, initial_indent=first, subsequent_indent=" " * len(first),
+                          break_on_hyphens=False, break_long_words=False)
+    return lines.replace("\0", " ")
 
 
 def next_command(name: str) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import signal
 from collections.abc import Iterable
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -33,11 +34,11 @@ from motorid.display.cards import Table
 from motorid.display.numbers import counted, duration, number
 from motorid.effects import EVERY
 from motorid.errors import DataError, UsageError, one_of
-from motorid.estimation.result import Fit, constraint_table, ended, steady_table, value_tables
+from motorid.estimation.result import COLOURED, Fit, constraint_table, ended, steady_table, value_tables
 from motorid.exporters.c_code import check
 from motorid.exporters.export import FORMS, export
 from motorid.exporters.json_file import constraint_violations, fit_dict, remarks, run_dict, write_json
-from motorid.problem.simulate import Evaluation, error_table, evaluate, run_table
+from motorid.problem.simulate import NRMSE, Evaluation, error_table, evaluate, run_table
 from motorid.records.experiment import Experiment
 from motorid.records.files import write_files
 from motorid.records.layout import parse_pairs
@@ -75,14 +76,14 @@ def fit_command(
 
 def _show_fit(found: Fit, records: list[Experiment], notes: list[str], judged: Evaluation | None = None) -> None:
     """Print a fit: remarks, parameters, errors, what follows from them, and how it ended."""
-    show(found.verdict, f"Held out: NRMSE {judged.words}." if judged else None,
+    show(found.verdict, _held_out(found, judged) if judged else None, NRMSE,
          None if found.fits == "noise" else f"Next: {next_command('diagnose')}",
          f"\n{found.problem.model.name}, {_amount(records)}\n")
     say_notes(notes, "About the records")
     show(*value_tables(found))
     say_notes(remarks(found), "What these records do not determine")
     several = judged is not None and len(judged.simulations) > 1
-    show(error_table({"": found.evaluation, "held-out": judged}, found.noise),
+    show(replace(error_table({"": found.evaluation, "held-out": judged}, found.noise), note=""),
          run_table(found.evaluation) if len(records) > 1 else None,
          run_table(judged, "Held-out errors run by run") if judged and several else None,
          steady_table(found))
@@ -90,6 +91,13 @@ def _show_fit(found: Fit, records: list[Experiment], notes: list[str], judged: E
     engine = found.problem.engine
     show(f"{ended(found)} Engine "
          f"{engine if isinstance(engine, str) else engine.name}, formulation {found.formulation}.")
+
+
+def _held_out(found: Fit, judged: Evaluation) -> str:
+    """Say how large the held-out errors are beside the noise, since another record may have smaller signals."""
+    times = max((judged.rmse[c] / s for c, s in found.noise.items() if c in judged.rmse), default=0.0)
+    said = "at the level of the noise" if times <= COLOURED else f"up to {number(times, 2)} times the noise"
+    return f"Held out: errors {said} (NRMSE {judged.words})."
 
 
 def _amount(records: list[Experiment]) -> str:

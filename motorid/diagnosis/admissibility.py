@@ -32,7 +32,7 @@ def objections(fit: Fit, added: Effect, before: Fit | None = None) -> str:
         if p.grid and p.vary and not inside and (added.includes or p.unit in LENGTHS):
             return f"{p.name} runs to its limit: nothing of this shape is in the records"
         if p.vary and p.null is not None and not p.positive and fit.values[p.name] <= p.lower == p.null:
-            return f"{p.name} goes to {p.null:g}: the data do not want it, or only with the wrong sign"
+            return f"{p.name} goes to {p.null:g}: the records show none of it, or only with the wrong sign"
         if p.vary and np.isfinite(p.upper) and fit.values[p.name] > 0.98 * p.upper and not _was_narrowed(p, added):
             return f"{p.name} runs to {p.upper:g}, the limit of what is physical"
     why = _too_large(fit, pars) or unresolved(fit, added)

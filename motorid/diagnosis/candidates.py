@@ -273,7 +273,7 @@ def _unseen(score: Score) -> str:
     """Say why an effect was not refitted."""
     if score.same_as:
         return f"these records do not distinguish it from {' and '.join(score.same_as)} together"
-    return "not refitted: too little to gain"
+    return "not refitted: others promised more"
 
 
 def _said(found: Evidence) -> str:

@@ -348,11 +348,16 @@ def ranking_table(candidates: Sequence[Candidate], most: int = 10) -> Table:
     held_out = any(c.held_out_gain is not None for c in candidates[:most])
     header = ["effect", "predicted", "refitted", *(["held out"] if held_out else []), "verdict"]
     rows: list[list[Cell]] = []
+    best = next((c.effect for c in candidates if c.accepted), "")
     for c in candidates[:most]:
         gain = [percent(c.held_out_gain)] if held_out else []
-        verdict = Flag("accepted", "good") if c.accepted else (c.reason or "not refitted")
-        rows.append([c.effect, percent(c.predicted_drop), percent(c.refit_drop), *gain, verdict])
-    note = "Fall of the squared error: predicted from sensitivities, refitted; held out: fall of the NRMSE."
+        helps = c.reason.startswith("lowers the") and c.reason.endswith("%")
+        reason = f"{c.reason}; {best} was taken instead" if helps and best else c.reason
+        verdict = Flag("accepted", "good") if c.accepted else (reason or "not refitted")
+        refit = None if c.refit_drop is None else round(c.refit_drop, 5)
+        rows.append([c.effect, percent(round(c.predicted_drop, 5)), percent(refit), *gain, verdict])
+    note = ("Fall of the squared error, predicted from sensitivities and refitted; held out (runs, or blocks left "
+            "out): fall of the NRMSE.")
     return Table(header, rows, "Effects tried", note, left=(0, len(header) - 1))
 
 

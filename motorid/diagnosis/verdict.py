@@ -65,8 +65,13 @@ def unexplained_text(ranking: Sequence[Candidate], rungs: Sequence[Rung], grades
 
 def approximations_text(grades: Sequence[Grade]) -> str:
     """Say which effects help without being the thing itself, and why."""
-    said = [f"'{g.effect}' helps, but only approximates it: {g.why}." for g in grades if g.grade == "approximates"]
-    return " ".join(said)
+    reasons: dict[str, list[str]] = {}
+    for g in grades:
+        if g.grade == "approximates":
+            reasons.setdefault(g.why, []).append(f"'{g.effect}'")
+    return " ".join(f"{' and '.join(', '.join(names).rsplit(', ', 1))} "
+                    f"{'help, but only approximate' if len(names) > 1 else 'helps, but only approximates'} it: {why}."
+                    for why, names in reasons.items())
 
 
 def missing_text(

@@ -20,7 +20,7 @@ from motorid.numerics.signals import Array
 from motorid.problem.problem import Problem
 
 UNDETERMINED = 1.0  # relative standard deviation above which a value is not shown as determined
-BLIND = 1e-4  # share of a quantity's change along directions that the data do not determine: more, and neither is it
+BLIND = 1e-3  # share of a quantity's change along directions that the data do not determine: more, and neither is it
 Law = Callable[[Mapping[str, float]], float]
 Blocks = Mapping[str, Sequence[tuple[Array, Array]]]
 

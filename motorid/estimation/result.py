@@ -341,10 +341,21 @@ class Failure(Shown):
 
 
 def parameter_table(fit: Fit, before: Fit | None = None) -> Table:
-    """Return the parameters as value ± standard deviation, beside those of another fit where one is given."""
+    """Return the parameters as value ± standard deviation, beside those of another fit where one is given.
+
+    Those that no fit determines share a row; beside another fit what is determined instead follows.
+    """
     fits = [f for f in (before, fit) if f is not None]
-    rows = [[name, *(parameter_cell(f, name) for f in fits), *([p.doc] if before is None else [])]
-            for name, p in fit.model.parameters.items()]
+    pars = [p for p in fit.model.parameters.values() if before is None or p.name != "sgn_width"]
+    open_ = [p for p in pars if p.vary and all(f.std.get(p.name) is None for f in fits)]
+    rows = [[p.name, *(parameter_cell(f, p.name) for f in fits), *([p.doc] if before is None else [])]
+            for p in pars if p not in open_]
+    if open_:
+        meaning = [open_[0].doc if len(open_) == 1 else ""] if before is None else []
+        rows.append([", ".join(p.name for p in open_), *(Flag("not determined", "note") for _ in fits), *meaning])
+    if open_ and before is not None:
+        rows += [[d.text, *(with_error(q.value, q.std, q.unit) if (q := f.determined.get(n)) else "–" for f in fits)]
+                 for n, d in fit.determined.items()]
     heads = ["value ± std", "meaning"] if before is None else ["before", "after"]
     return Table(["parameter", *heads], rows, "Parameters", left=(0, 1, 2))
 

@@ -13,7 +13,7 @@ import pytest
 from command import motorid, motorid_json
 
 from motorid.cli.app import app
-from motorid.cli.console import _spread
+from motorid.cli.console import _spread, wrapped
 from motorid.records.datasets import data_path, truth
 from motorid.records.reading import read_runs, write_csv
 
@@ -126,7 +126,7 @@ def test_without_current_the_fit_says_what_is_determined_and_that_r_and_k_are_no
     for name in ("gain", "time_constant"):  # what voltage and speed alone do tell comes first
         known = found["determined"][name]
         assert known["std"] < 0.01 * known["value"], name
-    assert said.index("speed per voltage") < said.index("winding resistance")
+    assert said.index("speed per voltage") < said.index("R, L, K, b, J not determined")
     assert found["derived"] == {"tau_e": None, "tau_m": None, "damping": None}
 
 
@@ -426,3 +426,18 @@ def test_names_stay_whole_at_80_columns(monkeypatch):
     assert max(map(len, lines)) <= 80
     for name in ("inductance_saturation", "R_thm,", "omega_s"):
         assert any(name in line for line in lines), name
+
+
+def test_held_out_errors_are_said_beside_the_noise():
+    """A record of smaller signals has a larger NRMSE, and is predicted as well."""
+    done = motorid("fit", NOISY / "run1.csv", "--validate", NOISY / "run2.csv")
+    assert "Held out: errors at the level of the noise (NRMSE" in done.out
+    done = motorid("fit", FRICTION / "run1.csv", "--validate", FRICTION / "check1.csv")
+    assert re.search(r"Held out: errors up to \d+ times the noise", done.out)
+
+
+def test_lines_are_cut_between_words_but_not_before_a_unit():
+    text = wrapped("the error of the current is " + "x" * 60 + " about 12.5 % and then more")
+    assert "12.5 %" in text
+    assert max(map(len, text.splitlines())) <= 110
+    assert wrapped(12 * "a long word 1.25 % ").count("1.25 %") == 12
