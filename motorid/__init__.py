@@ -11,10 +11,12 @@ Examples everywhere go on from these lines:
 >>> found = mi.diagnose(fit, validate=check, effects=["coulomb", "stribeck", "cogging"])
 """
 
+from types import FunctionType as _FunctionType
 from types import ModuleType as _ModuleType
 from typing import TYPE_CHECKING as _TYPE_CHECKING
 
 from motorid.errors import DataError, FitError, ModelError, MotoridError, SimulationError, UsageError
+from motorid.errors import arguments_told as _arguments_told
 from motorid.errors import one_of as _one_of
 
 # isort: split
@@ -61,13 +63,20 @@ _FIGURES = ("plot_answer", "plot_current_limit", "plot_design", "plot_fit", "plo
             "plot_missing", "plot_parameters", "plot_profile", "plot_ranking", "plot_residuals", "plot_runs",
             "plot_sensitivities", "plot_singular_values", "plot_waterfall")
 
+for _name, _value in [(n, v) for n, v in globals().items() if not n.startswith("_")]:
+    if isinstance(_value, type) and not issubclass(_value, Exception):
+        _arguments_told(_value)
+    elif isinstance(_value, _FunctionType):
+        globals()[_name] = _arguments_told(_value)
+        globals()[_name].__module__ = __name__  # where a process pool finds it
+
 
 def __getattr__(name: str) -> object:
     """Import matplotlib only when a figure is asked for."""
     if name in _FIGURES:
         from motorid import plots
 
-        return getattr(plots, name)
+        return _arguments_told(getattr(plots, name))
     raise AttributeError(_one_of(name, __dir__(), "name in motorid"))
 
 

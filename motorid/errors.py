@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import contextlib
+import functools
+import inspect
+import numbers
 import os
 import re
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from itertools import pairwise
 from types import TracebackType
+from typing import Any, TypeVar
 
 
 def _leave(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
@@ -77,6 +81,72 @@ def numbers_told() -> Iterator[None]:
                        "Look at the units of the columns, and at the values that were set.") from error
 
 
+_Thing = TypeVar("_Thing", bound=Callable[..., Any])
+_KINDS: dict[str, Any] = {"float": numbers.Real, "int": numbers.Integral, "Path": (str, os.PathLike),
+                          "PathLike": (str, os.PathLike), "Path_": (str, os.PathLike), "Mapping": Mapping,
+                          **dict.fromkeys(("Callable", "Map", "Callback"), Callable), "Records": object,
+                          **dict.fromkeys(("Sequence", "Iterable", "Array", "ArrayLike"), Iterable)}
+
+
+def arguments_told(thing: _Thing) -> _Thing:
+    """Let a function, or what a class is made with and its methods, say which argument is not what its annotation says.
+
+    Only where it fails does it look at the arguments, so nothing that works is refused.
+    """
+    if isinstance(thing, type):
+        for name, member in list(vars(thing).items()):
+            if inspect.isfunction(member) and (name in ("__init__", "__add__") or not name.startswith("_")):
+                setattr(thing, name, arguments_told(member))
+        return thing  # type: ignore[return-value]
+
+    @functools.wraps(thing)
+    def call(*args: Any, **kwargs: Any) -> Any:
+        try:
+            return thing(*args, **kwargs)
+        except (TypeError, AttributeError, ValueError, LookupError) as error:
+            if (wrong := _wrong_argument(thing, args, kwargs)) is None:
+                raise
+            raise UsageError(wrong) from error
+
+    return call  # type: ignore[return-value]
+
+
+def _wrong_argument(function: Callable[..., Any], args: Any, kwargs: Any) -> str | None:
+    signature, title = inspect.signature(function), function.__qualname__.removesuffix(".__init__")
+    try:
+        given = signature.bind(*args, **kwargs).arguments
+    except TypeError as error:
+        return f"{title}: {error}."
+    for name, value in given.items():
+        asked = signature.parameters[name]
+        several = asked.kind in (asked.VAR_POSITIONAL, asked.VAR_KEYWORD)
+        for one in (value.values() if isinstance(value, dict) else value) if several else (value,):
+            if asked.annotation is not asked.empty and not _fits(one, str(asked.annotation)):
+                return (f"{title}: {name} takes {str(asked.annotation).replace(' | ', ' or ')}; got "
+                        f"{name_of(one)}{f' {one}' if isinstance(one, numbers.Number) else ''}.")
+    return None
+
+
+def _fits(value: Any, annotation: str) -> bool:
+    """Tell whether a value is of the kind that an annotation names; of lists and mappings, all that is in them."""
+    for choice in re.split(r" \| (?![^\[]*\])", annotation):
+        name, _, inner = choice.removesuffix("]").partition("[")
+        name = name.rpartition(".")[2]
+        if name in ("Any", "object") or (name == "None" and value is None):
+            return True
+        kind = _KINDS.get(name)
+        if not (isinstance(value, kind) if kind else name in (c.__name__ for c in type(value).__mro__)):
+            continue
+        if isinstance(value, str | Mapping) and kind is Iterable:
+            continue
+        if kind in (Iterable, Mapping) and inner and isinstance(value, list | tuple | np.ndarray | Mapping):
+            parts = value.values() if isinstance(value, Mapping) else value
+            if not all(_fits(part, inner.partition(", ")[2] or inner) for part in parts):
+                continue
+        return True
+    return False
+
+
 _CONTROLS = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
 
 
@@ -95,6 +165,6 @@ def one_of(word: str, known: Iterable[object], what: str) -> str:
     import difflib
 
     names = [str(k) for k in known]
-    near = difflib.get_close_matches(word, names, n=1, cutoff=0.5)
+    near = difflib.get_close_matches(str(word), names, n=1, cutoff=0.5)
     hint = f" Did you mean '{near[0]}'?" if near else ""
     return f"unknown {what} '{word}'.{hint} Known: {', '.join(names)}."

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from motorid.errors import UsageError, one_of
 from motorid.numerics.autoregression import Colour, colour_of, weighed
 from motorid.numerics.least_squares import seen_directions
 from motorid.numerics.signals import Array
@@ -73,6 +74,8 @@ def certainty(problem: Problem, q: Array, residuals: Array, jacobian: Array, fre
 
     `free` (k, m) are the directions that active constraints leave; ``method="white"`` takes samples as independent.
     """
+    if method not in ("coloured", "white"):
+        raise UsageError(one_of(method, ("coloured", "white"), "method"))
     physical = problem.scaling.physical(q)
     limits = [_limit(p.lower, p.upper, v) for p, v in zip(problem.unknown, physical, strict=True)]
     loose = np.array([not s for s in limits], bool)

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from motorid.errors import UsageError, numbers_told, one_of
+from motorid.errors import UsageError, name_of, numbers_told, one_of
 from motorid.estimation.angle_orders import effects_of_unknown_order, strongest_order, uses_angle
 from motorid.estimation.continuation import by_continuation
 from motorid.estimation.least_squares import FAILURES, FINISH, Callback, Estimate, least_squares
@@ -105,8 +105,8 @@ def fit(model: Model, runs: Sequence[Experiment] | Experiment, *, solver: Any = 
     if constraints and formulation == "plain" and not hasattr(solver, "solve"):
         raise UsageError("constraints need a solver that honours them: solver=mi.MultipleShooting(), or "
                          "formulation='penalty' to weigh them.")
-    if isinstance(window, str) and window != "auto":
-        raise UsageError(one_of(window, ("auto",), "window") + " Or give a time in seconds, or None.")
+    if not (window is None or isinstance(window, int | float) or str(window) == "auto"):
+        raise UsageError(one_of(name_of(window), ("auto",), "window") + " Or give a time in seconds, or None.")
     if isinstance(window, int | float):
         runs = [part for run in ([runs] if isinstance(runs, Experiment) else runs) for part in windows(run, window)]
     penalties = tuple(penalties)
@@ -137,9 +137,9 @@ def solve(problem: Problem, solver: Any = None, *, start: str = "auto", callback
     >>> fit = mi.solve(mi.Problem(mi.dc_motor(), runs, weights="rms"))
     """
     began = time.perf_counter()
-    if isinstance(solver, str):
+    if not (solver is None or isinstance(solver, LevenbergMarquardt) or hasattr(solver, "solve")):
         raise UsageError("solver takes mi.LevenbergMarquardt() (the default) or mi.MultipleShooting(), not a name; "
-                         f"got '{solver}'.")
+                         f"got {name_of(solver)}.")
     if start not in ("auto", "model"):
         raise UsageError(one_of(start, ("auto", "model"), "start"))
     if not problem.unknown:

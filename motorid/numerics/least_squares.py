@@ -24,7 +24,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from motorid.errors import FitError, SimulationError
+from motorid.errors import FitError, SimulationError, UsageError
 from motorid.numerics.parallel import check_time
 from motorid.numerics.signals import Array
 
@@ -59,6 +59,11 @@ class LevenbergMarquardt:
     longest_step: float = 2.0
     looks: int = 5
 
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if not 0 <= value < np.inf:
+                raise UsageError(f"LevenbergMarquardt takes numbers of at least zero; {name} is {value!r}.")
+
     def at_most(self, other: LevenbergMarquardt) -> LevenbergMarquardt:
         """Return these options, ending no later than `other`."""
         return replace(self, max_iterations=min(self.max_iterations, other.max_iterations),
@@ -75,6 +80,10 @@ class Huber:
     """
 
     delta: float = 1.345
+
+    def __post_init__(self) -> None:
+        if not 0 < self.delta < np.inf:
+            raise UsageError(f"Huber takes a number of sigmas above zero; got {self.delta!r}.")
 
     def pseudo(self, r: Array) -> tuple[Array, Array]:
         """Return r̃ with r̃² = 2ρ(r), and dr̃/dr, so that least squares of r̃ minimise the robust loss."""

@@ -25,7 +25,7 @@ from functools import lru_cache
 from importlib.util import find_spec
 from typing import Any, NamedTuple
 
-from motorid.errors import OutOfTime
+from motorid.errors import OutOfTime, UsageError
 
 Map = Callable[..., Iterable[Any]]
 WAVE = 4e6  # bytes of records handed to a pool at once; two waves are under way
@@ -68,6 +68,8 @@ _deadline: ContextVar[float] = ContextVar("motorid_deadline", default=float("inf
 @contextmanager
 def budget(seconds: float | None) -> Iterator[None]:
     """Let `check_time` raise `OutOfTime` once so many seconds have passed; never for None."""
+    if seconds is not None and not seconds >= 0:
+        raise UsageError(f"a budget takes seconds, zero or more; got {seconds!r}.")
     token = _deadline.set(_deadline.get() if seconds is None else min(_deadline.get(), time.monotonic() + seconds))
     try:
         yield

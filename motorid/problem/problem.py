@@ -87,6 +87,11 @@ class Problem:
         for name in self.priors:
             if name not in self.model.parameters:
                 raise UsageError(f"prior: {one_of(name, self.model.parameters, 'parameter')}")
+            if not (np.isfinite(self.priors[name]).all() and self.priors[name][1] > 0):
+                raise UsageError(f"the prior of '{name}' takes (mean, std), finite, std above zero; got "
+                                 f"{self.priors[name]}.")
+        if not hasattr(self.loss or Huber, "pseudo"):
+            raise UsageError(f"loss takes mi.Huber() or None; got {name_of(self.loss)}.")
         self.model.check_visible(self.outputs)
         width = self.width or smoothing(self.experiments, self.model.parameters)
         if width is not None:

@@ -20,7 +20,12 @@ from motorid.numerics.parallel import one_thread
 from motorid.numerics.signals import Array
 
 WIDE = 0.8  # of the value: an interval that reaches farther down is made on the logarithmic scale
-METHODS = ("coloured", "white")
+
+
+def check_level(level: float) -> None:
+    """Raise `UsageError` unless `level` is one of confidence."""
+    if not 0 < level < 1:
+        raise UsageError(f"a confidence level lies between 0 and 1; got {level!r}.")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -77,8 +82,7 @@ class Covariance(Printed):
         """
         if name not in self.names:
             raise UsageError(one_of(name, self.names, "parameter"))
-        if not 0 < level < 1:
-            raise UsageError(f"a confidence level lies between 0 and 1; got {level!r}.")
+        check_level(level)
         sd, j = self.std[name], self.names.index(name)
         if sd is None:
             return None
@@ -138,8 +142,6 @@ def covariance(fit: Fit, *, method: str = "coloured") -> Covariance:
     >>> sure = mi.covariance(better)
     >>> axes = mi.plot_parameters(fit, better)
     """
-    if method not in METHODS:
-        raise UsageError(one_of(method, METHODS, "method"))
     known, unknown = checked(fit, "covariance").certainty(method), fit.problem.unknown
     lost = np.array([s != "determined" for s in known.status], bool)
     matrix = known.matrix.copy()

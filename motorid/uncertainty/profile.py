@@ -25,7 +25,7 @@ from motorid.numerics.parallel import Map, Parcel, one_thread, run_tasks
 from motorid.numerics.signals import Array
 from motorid.problem.problem import Problem
 from motorid.uncertainty.bootstrap import Bootstrap, bootstrap
-from motorid.uncertainty.covariance import Covariance, covariance
+from motorid.uncertainty.covariance import Covariance, check_level, covariance
 
 FARTHEST = np.log(1e4)  # on the logarithmic scale; beyond it a parameter counts as not limited
 MOST = 30  # points per side
@@ -69,8 +69,7 @@ class Profile(Printed):
 
     def interval(self, level: float = 0.95) -> tuple[float, float]:
         """Return where the profile crosses the level; an open end is infinite (0 below for positive ones)."""
-        if not 0 < level < 1:
-            raise UsageError(f"a confidence level lies between 0 and 1; got {level!r}.")
+        check_level(level)
         reach = float(stdtrit(self.dof, 0.5 + level / 2))
         start = int(np.argmin(np.abs(self.values - self.value)))
         low = _crossing(self._scale(self.values[start::-1]), self.rise[start::-1], reach)
@@ -168,6 +167,7 @@ def profiles(fit: Fit, names: Sequence[str] | None = None, *, level: float = 0.9
             raise UsageError(one_of(n, free, "free parameter"))
     chosen = tuple(names or free)
     parcel = Parcel.of((fit.problem, dict(fit.values), fit.cost))
+    check_level(level)
     plans = {n: _plan(fit, n, level) for n in chosen}
     tasks = [(parcel, n, side, *plans[n][:3]) for n in chosen for side in (-1.0, 1.0)]
     done = run_tasks(_side, tasks, map, "Profiling", quiet=quiet)

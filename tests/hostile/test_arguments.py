@@ -1,0 +1,73 @@
+"""A wrong argument is named by the function that was called, with what it takes; none is taken for something else."""
+
+from __future__ import annotations
+
+import pickle
+
+import numpy as np
+import pytest
+
+import motorid as mi
+from motorid.records.datasets import data_path
+
+RUN = mi.read_csv(data_path("clean") / "run1.csv")
+FIT = mi.fit(mi.dc_motor(), [RUN])
+ODD = (5, "x", [None], object(), np.arange(3.0), float("nan"), mi.Model)
+
+TAKES = {  # one function of every kind: results, records, files, numbers, words, mappings, callables
+    "locate": mi.locate,
+    "evaluate": lambda x: mi.evaluate(FIT, x),
+    "compare": mi.compare,
+    "profile": lambda x: mi.profile(x, "R", quiet=True),
+    "identifiability": mi.identifiability,
+    "points": lambda x: mi.identifiability(FIT, points=x) if x != 5 else mi.locate(x),
+    "read_csv": mi.read_csv,
+    "columns": lambda x: mi.read_runs(data_path("two_step"), columns=x),
+    "data_path": mi.data_path,
+    "dc_motor": lambda x: mi.dc_motor(R=x) if x != 5 else mi.locate(x),
+    "fix": lambda x: mi.dc_motor().fix(x),
+    "decimate": lambda x: RUN.decimate(x) if x != 5 else mi.locate(x),
+    "effect": lambda x: mi.effect(balance=x)(lambda m, c=mi.P(1.0): None),
+    "fit_many": lambda x: mi.fit_many(mi.dc_motor(), x, quiet=True),
+    "plot_residuals": mi.plot_residuals,
+    "loss": lambda x: mi.fit(mi.dc_motor(), RUN, loss=x),
+    "solver": lambda x: mi.fit(mi.dc_motor(), RUN, solver=x),
+    "window": lambda x: mi.fit(mi.dc_motor(), RUN, window=x) if x != 5 else mi.locate(x),
+    "iterations": lambda x: mi.LevenbergMarquardt(max_iterations=x) if x != 5 else mi.locate(x),
+    "CurrentLimit": lambda x: mi.CurrentLimit(x) if x != 5 else mi.locate(x),
+    "certainty": FIT.certainty,
+}
+
+
+@pytest.mark.parametrize("name", TAKES)
+def test_an_argument_of_another_kind_is_named(name):
+    for odd in ODD:
+        if isinstance(odd, np.ndarray) and name in ("points", "dc_motor", "decimate", "window", "iterations",
+                                                    "CurrentLimit"):
+            odd = (1, 2)
+        with pytest.raises(mi.MotoridError) as told:
+            TAKES[name](odd)
+        assert not any(w in str(told.value) for w in ("object has no attribute", "subscriptable", "ufunc")), told.value
+
+
+@pytest.mark.parametrize("call", [
+    lambda: mi.fit(mi.dc_motor(), RUN, priors={"R": (1.0, -1.0)}),
+    lambda: mi.fit(mi.dc_motor(), RUN, priors={"R": (float("nan"), 1.0)}),
+    lambda: mi.fit(mi.dc_motor(), RUN, priors={"R": 5}),
+    lambda: mi.profile(FIT, "R", level=95, quiet=True),
+    lambda: mi.profile(FIT, "R", level=0.0, quiet=True),
+    lambda: mi.Huber(float("nan")),
+    lambda: mi.diagnose(FIT, budget=float("nan")),
+    lambda: mi.fit(mi.dc_motor(), RUN, nope=1)])
+def test_a_number_that_cannot_be_meant_is_refused(call):
+    with pytest.raises(mi.UsageError):
+        call()
+
+
+def test_an_error_of_the_callers_own_stays_what_it_is():
+    def callback(*_: object) -> None:
+        raise TypeError("mine")
+
+    with pytest.raises(TypeError, match="mine"):
+        mi.fit(mi.dc_motor(), RUN, callback=callback)
+    assert pickle.loads(pickle.dumps(mi.fit)) is mi.fit  # a pool takes it along
