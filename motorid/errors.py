@@ -115,8 +115,8 @@ def _wrong_argument(function: Callable[..., Any], args: Any, kwargs: Any) -> str
     signature, title = inspect.signature(function), function.__qualname__.removesuffix(".__init__")
     try:
         given = signature.bind(*args, **kwargs).arguments
-    except TypeError as error:
-        return f"{title}: {error}."
+    except TypeError:  # Python says it well enough
+        return None
     for name, value in given.items():
         asked = signature.parameters[name]
         several = asked.kind in (asked.VAR_POSITIONAL, asked.VAR_KEYWORD)
@@ -139,7 +139,7 @@ def _fits(value: Any, annotation: str) -> bool:
             continue
         if isinstance(value, str | Mapping) and kind is Iterable:
             continue
-        if kind in (Iterable, Mapping) and inner and isinstance(value, list | tuple | np.ndarray | Mapping):
+        if kind in (Iterable, Mapping) and inner and hasattr(value, "__len__"):
             parts = value.values() if isinstance(value, Mapping) else value
             if not all(_fits(part, inner.partition(", ")[2] or inner) for part in parts):
                 continue

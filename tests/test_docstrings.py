@@ -21,7 +21,8 @@ PUBLIC = [n for n in dir(mi) if not inspect.ismodule(o := getattr(mi, n))
 
 def inner_examples() -> list[doctest.DocTest]:
     """Those of functions that are not public, which know what their module knows."""
-    finder, known = doctest.DocTestFinder(exclude_empty=True), {getattr(mi, n).__module__ + "." + n for n in PUBLIC}
+    finder, known = doctest.DocTestFinder(exclude_empty=True), {
+        inspect.unwrap(getattr(mi, n)).__module__ + "." + n for n in PUBLIC}
     names = [m.name for m in pkgutil.walk_packages(mi.__path__, "motorid.") if not m.name.endswith("__main__")]
     return [t for name in names for t in finder.find(importlib.import_module(name)) if t.examples and
             t.name not in known]

@@ -96,8 +96,9 @@ def record(port: str | Link, out: str | Path, *, baud: int = 115_200, excite: st
         mode = "resume" if plan.tail else "replace" if force else "new"
         file = RecordFile(out, header.channels, header.rate, head if not plan.tail else {}, mode)
         try:
-            setup = Setup(client, header, file, len(todo.segments), _commanded(device, header, todo), limits[1],
-                          _total(todo, duration), duration, max(timeout, 4 / header.rate), progress)
+            setup = Setup(client, header, file, len(todo.segments), _commanded(device, header, todo),
+                          _most(device, header, *limits), _total(todo, duration), duration,
+                          max(timeout, 4 / header.rate), progress)
             return Session(setup, lambda: plan.begin(file, done)).run()
         finally:
             with contextlib.suppress(OSError):  # told already, where it matters
@@ -126,6 +127,12 @@ def _entries(calibration: str | Path | Mapping[str, Any] | None) -> dict[str, An
     if isinstance(calibration, str | Path):
         return read_calibration(calibration)
     return dict(calibration or {})
+
+
+def _most(device: Header, header: Header, v_max: float, i_max: float) -> dict[str, float]:
+    """Return the largest voltage, in the units that a calibration makes of it, and current that may be reported."""
+    raw, v = (next(c for c in h.channels if c.name == "v") for h in (device, header))
+    return {"v": abs(v.scale / raw.scale) * (1.01 * v_max + abs(raw.scale * (raw.offset - v.offset))), "i": i_max}
 
 
 def _limit(asked: float, device: Header) -> tuple[float, int, str]:

@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import contextlib
-import math
 import signal
 import threading
 import time
@@ -20,7 +19,7 @@ from motorid.acquire.record_file import Commanded, RecordFile
 from motorid.acquire.timeline import Row, Timeline
 from motorid.display.cards import Card, Flag, Shown
 
-OVER_LIMIT = 3  # samples in a row beyond the current limit that make the computer stop the motor too
+OVER_LIMIT = 3  # samples in a row beyond a limit that make the computer stop the motor too
 EMPTY = 5  # readings in a row without a valid line, at least, that make a silence
 LAST_WORDS = 1.5  # s to wait for the device to say how many samples it made
 LOOK = 0.25  # s between two reports of progress
@@ -32,6 +31,7 @@ SENTENCES = {
     "duration": "The time asked for is over; the motor was stopped.",
     "interrupted": "Stopped by hand; the motor was stopped.",
     "limit": "The current limit was reached; the motor was switched off. Lower the voltage or raise the limit.",
+    "voltage": "The device reports a voltage beyond the limit; the motor was switched off. Look at its firmware.",
     "emergency": "The emergency stop of the bench was opened; the motor was switched off.",
     "watchdog": "The device heard nothing from this computer for a second and switched the motor off.",
     "unplugged": "The device is gone (unplugged, or its port was closed). Plug it in again and go on with --resume.",
@@ -52,7 +52,7 @@ class Setup:
     file: RecordFile
     segments: int
     commanded: Commanded
-    i_max: float
+    most: Mapping[str, float]  # V and A: beyond it the computer stops the motor, too
     total: float | None  # s, of the program or until stopped
     duration: float | None  # s after which to stop
     timeout: float
@@ -68,7 +68,7 @@ class Session:
         self.made: int | None = None  # samples that the device made, once it has said so
         self.last: Row | None = None
         names = [c.name for c in setup.header.channels]
-        self._current = names.index("i") if "i" in names and math.isfinite(setup.i_max) else None
+        self._limits = [(names.index(n), n, most) for n, most in setup.most.items() if n in names]
         self._over, self._empty = 0, 0
         setup.client.decoder.bad.clear()
         counter, micros = setup.client.go(setup.segments)
@@ -113,14 +113,14 @@ class Session:
             elif rows := self.timeline.accept(item, now):
                 self.setup.file.add(rows, self.setup.commanded)
                 self.last, self._heard = rows[-1], now
-                if self._current is not None:
-                    self._check_current(rows, self._current)
+                self._check_limits(rows)
 
-    def _check_current(self, rows: list[Row], k: int) -> None:
+    def _check_limits(self, rows: list[Row]) -> None:
         for row in rows:
-            self._over = self._over + 1 if abs(row.values[k]) > self.setup.i_max else 0
+            over = [n for k, n, most in self._limits if abs(row.values[k]) > most]
+            self._over = self._over + 1 if over else 0
             if self._over >= OVER_LIMIT:
-                self._end("limit")
+                self._end("limit" if "i" in over else "voltage")
 
     def _message(self, fields: list[str]) -> None:
         if fields[0] == "H":

@@ -25,7 +25,8 @@ from motorid.records.files import check_output
 from motorid.records.reading import find_records
 
 DONE, FAILED, WRONG, INTERRUPTED = 0, 1, 2, 130
-RESULTS, INPUTS = ("json", "report", "path", "remainder_to"), ("runs", "validate", "fit_json", "effects_from")
+RESULTS = ("json", "report", "path", "remainder_to")
+INPUTS = ("runs", "validate", "fit_json", "effects_from", "found_json")
 _ASCII = {"Ω": "Ohm", "ω": "omega", "τ": "tau", "θ": "theta", "φ": "phi", "α": "alpha", "Δ": "Delta", "µ": "u",
           "μ": "mu", "·": "*", "×": "x", "±": "+-", "²": "^2", "°": "deg", "√": "sqrt", "…": "...", "→": "->",
           "•": "*", "–": "-", "—": "-", "−": "-", "─": "-", "━": "-", "│": "|", "≈": "~", "≤": "<=", "≥": ">=",
@@ -116,7 +117,7 @@ def _shown_otherwise(error: UnicodeError) -> tuple[str, int]:
 
 def _check_outputs(given: dict[str, Any], command: str) -> None:
     """Refuse, before the work, an output that must not be written: an input, twice, or another program's file."""
-    wanted = [given[k] for k in (*RESULTS, *(["out"] if command == "fit-many" else [])) if given.get(k)]
+    wanted = [given[k] for k in (*RESULTS, *(["out"] if command in ("fit-many", "design") else [])) if given.get(k)]
     targets = [check_output(path, given.get("force", False)) for path in wanted if path != "-"]
     if len(set(targets)) < len(targets):
         raise UsageError(f"two results cannot be written to one file, {targets[0]}.")

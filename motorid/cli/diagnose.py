@@ -40,7 +40,7 @@ from motorid.problem.plain_data import model_from_json
 from motorid.problem.simulate import error_table
 from motorid.records.datasets import data_path
 from motorid.records.experiment import Experiment
-from motorid.records.files import check_output, read_bytes, write_files
+from motorid.records.files import read_bytes, write_files
 from motorid.records.reading import read_runs
 
 DEMO_SET = "hidden_friction"
@@ -182,8 +182,6 @@ def design_command(found_json: Found, out: Plan = None, goal: Goal = None, param
     Example: motorid design found.json --limit-current 5 --duration 4 --out plan.csv
     """
     rivals = read_rivals(found_json, effects_from, goal)
-    if out is not None:
-        check_output(out, force)
     with progress("Designing") as advance:
         design = design_experiment(
             rivals, goal=goal, parameters=parameters.replace(" ", "").split(",") if parameters else None,

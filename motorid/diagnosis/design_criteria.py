@@ -124,8 +124,12 @@ class Rival:
     @staticmethod
     def from_dict(contents: Mapping[str, Any], model: Model) -> Rival:
         """Return what `to_dict` wrote, its model built already."""
-        return Rival(str(contents["name"]), model, dict(contents["sigma"]), np.asarray(contents["scale"], float),
-                     np.asarray(contents["information"], float), dict(contents["seen"]))
+        sigma, seen = ({str(k): float(v) for k, v in contents[part].items()} for part in ("sigma", "seen"))
+        scale, information = (np.asarray(contents[part], float) for part in ("scale", "information"))
+        sizes = np.array([*sigma.values(), *scale, *(seen[k] for k in ("v", "dt", "duration"))])
+        if not (np.all(sizes > 0) and np.isfinite([*sizes, *information.ravel()]).all()):
+            raise ValueError("sizes of a rival must be finite and above zero")
+        return Rival(str(contents["name"]), model, sigma, scale, information, seen)
 
 
 @dataclass(frozen=True, eq=False)

@@ -89,6 +89,7 @@ def suggest_experiment(fits: Sequence[Fit], *, v_max: float | None = None, i_max
     """
     if len(fits) < 2:
         raise UsageError("suggest_experiment() compares models: give at least two fits of the same records.")
+    _check_sizes(v_max=v_max, i_max=i_max, duration=duration)
     runs = fits[0].problem.experiments
     v_max = v_max or max(float(np.abs(r.inputs["v"]).max()) for r in runs)
     duration = duration or max(r.duration for r in runs)
@@ -321,6 +322,7 @@ def design_experiment(found: Diagnosis | Fit | Sequence[Fit | Rival], *, goal: s
     >>> plan = mi.design_experiment(better, parameters=["b"], v_max=12, i_max=8, duration=0.5, levels=4)
     >>> words = plan.excite  # for `motorid record --excite`
     """
+    _check_sizes(v_max=v_max, i_max=i_max, omega_max=omega_max, temp_max=temp_max, duration=duration, dt=dt)
     rivals, goal = _rivals(found, goal)
     say = progress or (lambda word: None)
     asked = _asked(rivals[0], parameters) if goal == "sharpen" else ()
@@ -339,6 +341,14 @@ def design_experiment(found: Diagnosis | Fit | Sequence[Fit | Rival], *, goal: s
     c, peaks = _safe(task.refined(layout.of(c), TOLERANCE), c)
     return _told(task.refined(layout.of(c), TOLERANCE), c, peaks, fixed, limits,
                  "stopped early" if best.stopped else "designed")
+
+
+def _check_sizes(**given: float | None) -> None:
+    """Refuse limits and lengths that are not above zero: zero means zero, not that none was given."""
+    for name, value in given.items():
+        if value is not None and not 0 < value < np.inf:
+            raise UsageError(f"{name} must be above zero and finite; got {value!r}. Leave it out for that of the "
+                             "records.")
 
 
 def _optimised(task: Task, say: Callable[[str], None]) -> DesignNlp:

@@ -44,7 +44,7 @@ class CurrentLimit(Relation):
 
     def __post_init__(self) -> None:
         if not 1e-9 < self.limit < 1e9:
-            raise UsageError(f"CurrentLimit takes a current between 1e-9 and 1e9 A; got {self.limit!r}.")
+            raise UsageError(f"CurrentLimit takes a positive current, 1e-9 to 1e9 A; got {self.limit!r}.")
         check_weight(self.weight, "CurrentLimit")
 
     @property

@@ -22,6 +22,7 @@ from memory_link import MemoryLink
 
 import motorid as mi
 from motorid.acquire import record
+from motorid.acquire.excitation import program
 from motorid.acquire.protocol import frame
 from motorid.acquire.server import Faults, Wire
 from motorid.acquire.virtual import SIZES, VirtualDevice, hide
@@ -194,6 +195,21 @@ def test_the_computer_stops_a_device_that_does_not_keep_the_limit(out):
     assert done.ended == "limit"
     assert not dev.running
     assert done.received < 60
+
+
+def test_the_computer_stops_a_device_that_applies_more_than_the_voltage_limit(out):
+    dev = device()
+    go = dev._go
+
+    def other_program(segments):
+        answer = go(segments)
+        dev._program = program("rest:0.01,step:9:0.3")
+        return answer
+
+    dev._go = other_program
+    done = record(MemoryLink(dev, step=5), out, excite="rest:0.01,step:3:0.3", limit_voltage=4.0)
+    assert done.ended == "voltage"
+    assert not dev.running
 
 
 def test_a_device_that_does_not_accept_the_limit_is_not_started(out):

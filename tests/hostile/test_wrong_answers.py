@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 from command import motorid
 
 import motorid as mi
+from motorid.diagnosis.design_criteria import Rival
 from motorid.records.experiment import Experiment
 
 TRUE = {"R": 1.4, "L": 2e-3, "K": 0.046, "b": 6e-5, "J": 2e-5}
@@ -199,3 +202,27 @@ def test_a_journal_gives_no_answer_of_another_law(change, rng, tmp_path):
         assert motorid(*words).status == 0
         marks.append(len(journal.read_text(encoding="utf-8").splitlines()))
     assert marks == [1, 1, 2]
+
+
+@pytest.mark.parametrize("given", [{"v_max": 0.0}, {"i_max": 0.0}, {"duration": 0.0}, {"v_max": float("nan")}])
+def test_a_limit_of_zero_is_not_one_left_out(given):
+    fit = mi.fit(mi.dc_motor(), mi.read_csv(mi.data_path("clean") / "run1.csv"))
+    with pytest.raises(mi.UsageError, match="above zero"):
+        mi.design_experiment(fit, levels=4, budget=2, **given)
+
+
+def test_a_plan_goes_neither_over_its_input_nor_on_with_a_spoilt_one(tmp_path):
+    fit = mi.fit(mi.dc_motor(), mi.read_csv(mi.data_path("clean") / "run1.csv"))
+    best = Rival.of(fit).to_dict()
+    found, words = tmp_path / "found.json", ("--goal", "sharpen", "--budget", "1", "--levels", "4")
+    for part, value in (("sigma", {"i": -1.0}), ("seen", {}), ("seen", {"v": 6, "dt": "x", "duration": 1})):
+        found.write_text(json.dumps({"motorid": "1", "best": {**best, part: value}}), encoding="utf-8")
+        done = motorid("design", found, *words)
+        assert done.status == 2
+        assert "holds no rival models" in done.err
+    found.write_text(json.dumps({"motorid": "1", "best": best}), encoding="utf-8")
+    done = motorid("design", found, *words, "--out", found)
+    assert done.status == 2
+    assert "it is read as well" in done.err
+    assert json.loads(found.read_text(encoding="utf-8"))["best"]
+
