@@ -141,7 +141,7 @@ def plot_answer(found: Diagnosis, ax: Axes | None = None) -> Axes:
     noun = "force" if unit == "N" else balance
     name = f"phase of {periods:g} periods per turn (rad)" if periods != 1 else style.axis_label(against)
     style.tidy(ax, x=name, y=style.scaled_title(f"missing {noun}", unit, power), title=f"The missing {noun}")
-    ax.legend(loc="best")
+    ax.legend(loc="upper left", bbox_to_anchor=(0.0, -0.16), borderaxespad=0.0)  # below, where it covers no curve
     return ax
 
 

@@ -87,14 +87,13 @@ def _provenance(story: Story, command: str, held_out: Sequence[Experiment]) -> S
     named = [(r.name, r) for r in story.runs] + [(f"{r.name} (held out)", r) for r in held_out]
     files = [[name, Path(str(run.meta.get("source", "–"))).name, str(run.meta.get("sha256", "–"))[:16]]
              for name, run in named]
-    versions = [["Python", platform.python_version()], *([p, package_version(p)] for p in PACKAGES)]
-    tables = [Table(["software", "version"], versions)]
-    if files:
-        tables.insert(0, Table(["run", "file", "SHA-256 (first 16 digits)"], files))
+    versions = ", ".join([f"Python {platform.python_version()}", *(f"{p} {package_version(p)}" for p in PACKAGES)])
+    tables = [Table(["run", "file", "SHA-256 (first 16 digits)"], files)] if files else []
     return Section(
         "provenance",
         "Where it comes from",
-        ["The files are named by the fingerprint of their contents: the page can be traced to them."] * bool(files),
+        [*["The files are named by the fingerprint of their contents: the page can be traced to them."] * bool(files),
+         f"Made with {versions}."],
         tables=tables,
         code=command,
     )

@@ -123,7 +123,7 @@ def test_headings_are_in_order_and_the_language_is_named(tree):
 
 
 def test_tables_name_their_columns_and_rows(tree):
-    assert len(every(tree, "table")) >= 10
+    assert len(every(tree, "table")) >= 9
     for table in every(tree, "table"):
         rows = every(table, "tr")
         assert all(c.get("scope") == "col" and words(c) for c in rows[0])
