@@ -32,7 +32,7 @@ from motorid.diagnosis.refit import INTERRUPTED as STOPPED_BY_HAND
 from motorid.diagnosis.results import Diagnosis, ladder_table, ranking_table
 from motorid.errors import DataError
 from motorid.estimation.fit import fit
-from motorid.estimation.result import Fit, comparison_table, parameter_table
+from motorid.estimation.result import Fit, parameter_table
 from motorid.exporters.json_file import fit_dict, write_json
 from motorid.model.model import dc_motor
 from motorid.numerics.parallel import interruption, progress
@@ -126,7 +126,7 @@ def _saying(advance: Callable[..., None]) -> Callable[..., Iterator[Any]]:
         every = list(tasks)
         for k, task in enumerate(every, 1):
             effect = getattr(task[0] if isinstance(task, tuple) else task, "effect", None)
-            advance(0, f"fitting {effect.name}, {k} of {len(every)} to try now" if effect is not None else "")
+            advance(0, f"fitting {effect.name}, {k} of {len(every)}" if effect is not None else "")
             yield function(task)
 
     return mapped
@@ -231,14 +231,13 @@ def demo_command(
     show(f"1. Records: {len(runs)} of a motor ({data_path(DEMO_SET)}), and one held out that no fit will see.\n",
          "2. The textbook model, fitted without a first guess:")
     plain = fit(dc_motor(), runs)
-    show(parameter_table(plain), error_table({"": plain.evaluation}, plain.noise),
-         "   Its errors are far above the noise: something is missing.\n", "3. What?")
+    show(plain.verdict, "", parameter_table(plain), error_table({"": plain.evaluation}, plain.noise),
+         "3. What is missing?")
     with progress("Trying the effects of the library") as advance:
         found = diagnose(plain, check, map=_saying(advance), progress=lambda word: advance(1, word))
-    show(found.missing.text, ranking_table(found.ranking, 4), found.text, "",
+    show(found.text, found.missing.text, "", ranking_table(found.ranking, 4),
          "4. Added, one line of code: fit.model + mi.effects." + (found.effects or ("…",))[0],
-         ladder_table(found.ladder),
-         comparison_table([("before", found.before), ("after", found.after)]))
+         ladder_table(found.ladder), parameter_table(found.after, found.before))
     files = _write_demo(found, check, out, force)
     show("Written: " + ", ".join(files), "Now your own: motorid diagnose RUN... --report yours.html")
     if json:

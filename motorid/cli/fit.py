@@ -239,7 +239,7 @@ def simulate_command(
                     "nrmse": judged.nrmse, "rmse": judged.rmse, "files": files,
                     "runs": [run_dict(r) | {"nrmse": e} for r, e in pairs]}, json, options.force)
     if json != "-":
-        show(f"{model.name}, values of {fit_json}", run_table(judged))
+        show(f"{model.name}, values of {fit_json}", run_table(judged), NRMSE)
         show(*(f"Written: {f}" for f in files))
 
 

@@ -344,12 +344,13 @@ def share_table(what: str, shares: Mapping[str, float]) -> Table:
 
 
 def ranking_table(candidates: Sequence[Candidate], most: int = 10) -> Table:
-    """Return the effects tried, best first; the held-out error only where there is one."""
-    held_out = any(c.held_out_gain is not None for c in candidates[:most])
+    """Return the `most` best of the effects tried, and those accepted; the held-out error only where there is one."""
+    shown = [c for k, c in enumerate(candidates) if k < most or c.accepted]
+    held_out = any(c.held_out_gain is not None for c in shown)
     header = ["effect", "predicted", "refitted", *(["held out"] if held_out else []), "verdict"]
     rows: list[list[Cell]] = []
     best = next((c.effect for c in candidates if c.accepted), "")
-    for c in candidates[:most]:
+    for c in shown:
         gain = [percent(c.held_out_gain)] if held_out else []
         helps = c.reason.startswith("lowers the") and c.reason.endswith("%")
         reason = f"{c.reason}; {best} was taken instead" if helps and best else c.reason

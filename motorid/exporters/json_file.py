@@ -81,8 +81,7 @@ def remarks(fit: Fit) -> list[str]:
     motor = [n for n in vague if n in MOTOR]
     if model.base == "dc_motor" and motor and "i" not in measured:
         said.append(f"The current was not measured, so {_listed(motor)} are not determined one by one, only their "
-                    "combinations. Measure the current, or fix R "
-                    "where it is known (--fix R=1.2).")
+                    "combinations. Measure the current, or fix R and K where they are known (--fix R=1.2,K=0.05).")
         vague = [n for n in vague if n not in MOTOR and not _a_torque(model, n)]
     elif model.base == "dc_motor" and motor and "omega" not in measured and "theta" not in measured:
         said.append(f"Neither speed nor angle was measured, so {_listed(motor)} are not determined one by one. "

@@ -168,7 +168,7 @@ class Identifiability(Printed):
         for n, value, unit, size in zip(self.names, self.values, self.units, self.sizes, strict=True):
             sd = std[n]
             share = Flag("not determined", "note") if sd is None else percent(sd / size, 2)
-            rows.append([n, quantity(float(value), unit), quantity(sd, unit, 2), share])
+            rows.append([n, "–" if sd is None else quantity(float(value), unit), quantity(sd, unit, 2), share])
         k = len(self.names)
         partly = Flag(f"{self.rank} of {k} directions determined", "note")
         values = ", ".join(number(s, 3) for s in self.singular_values)

@@ -121,7 +121,9 @@ def test_without_current_the_fit_says_what_is_determined_and_that_r_and_k_are_no
     assert all(found["parameters"][n]["std"] is None for n in ("R", "b", "J"))
     said = " ".join(motorid("fit", speed_only).out.split())
     assert "The current was not measured" in said
-    assert "--fix R=1.2" in said
+    assert "--fix R=1.2,K=0.05" in said
+    fixed = motorid_json(tmp_path, "fit", speed_only, "--fix", "R=1.38,K=0.0462")
+    assert all(found["std"] is not None for found in fixed["parameters"].values()), "the advice must be enough"
     assert "not determined" in said
     for name in ("gain", "time_constant"):  # what voltage and speed alone do tell comes first
         known = found["determined"][name]

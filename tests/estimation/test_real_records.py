@@ -130,7 +130,7 @@ def test_without_current_no_confident_r_comes_out(real, folder, words):
     said = " ".join(done.out.split())
     assert done.status == 0
     assert "The current was not measured" in said
-    assert "fix R where it is known" in said
+    assert "fix R and K where they are known" in said
     for name in ("R", "L", "K", "b", "J"):
         line = next(row for row in done.out.splitlines() if row.split()[:1] == [name])
         assert line.split()[1:3] == ["not", "determined"]  # and no value
