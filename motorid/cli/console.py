@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import codecs
 import contextlib
+import errno
 import os
 import re
 import shlex
@@ -87,14 +88,28 @@ class Group(TyperGroup):
             sys.stderr.close()  # nobody reads any more, e.g. `motorid fit … | head`
             status = FAILED
         except (ArithmeticError, np.linalg.LinAlgError, MemoryError) as error:
-            _say(f"the numbers or the size of these records are beyond what can be computed ({error}).")
+            _say(f"the numbers or the size of these records are beyond what can be computed "
+                 f"({error or type(error).__name__}).")
             status = FAILED
         except Exception as error:
-            if not hasattr(error, "format_message"):
-                raise
-            _say(_usage(error))
-            status = WRONG
+            status = self._unexpected(error)
         sys.exit(status if isinstance(status, int) else DONE)
+
+
+    @staticmethod
+    def _unexpected(error: Exception) -> int:
+        if interruption.behind(error):  # raised inside what was loading, and made another error of
+            interruption.heard()
+            _say("interrupted.")
+            return INTERRUPTED
+        if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EFBIG, errno.EIO):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # what is left of the output has no place
+            _say(f"cannot write the output: {error.strerror}.")
+            return FAILED
+        if not hasattr(error, "format_message"):
+            raise error
+        _say(_usage(error))
+        return WRONG
 
 
 def prepare_process() -> None:

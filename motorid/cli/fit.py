@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 from collections.abc import Iterable
 from concurrent.futures import ProcessPoolExecutor
@@ -133,7 +134,8 @@ def fit_many_command(
     if jobs == 1:
         found = fit_many(model, motors, **given)
     else:
-        with ProcessPoolExecutor(jobs, initializer=signal.signal, initargs=(signal.SIGINT, signal.SIG_IGN)) as pool:
+        most = min(jobs, len(motors), 4 * (os.cpu_count() or 1))  # each process costs memory and a second to begin
+        with ProcessPoolExecutor(most, initializer=signal.signal, initargs=(signal.SIGINT, signal.SIG_IGN)) as pool:
             found = fit_many(model, motors, map=pool.map, **given)
             pool.shutdown(wait=not found.interrupted, cancel_futures=True)
     if json:

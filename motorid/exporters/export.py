@@ -181,8 +181,10 @@ def load(path: str | os.PathLike[str], effects: Iterable[Effect] = (), *,
     try:
         return Exported(*(_serialized(source) if trust else read_casadi(data)))
     except (RuntimeError, ValueError, TypeError, AttributeError, LookupError):  # RecursionError is a RuntimeError
-        raise DataError(f"cannot read {source.name}: {NOT_OURS}, or an older version did. If you know where it comes "
-                        "from, mi.load(path, trust=True) lets CasADi read it, and run what it holds.") from None
+        other = source.suffix.lower() != ".casadi"
+        raise DataError(f"cannot read {source.name}: {NOT_OURS}" + ("." if other else ", or an older version did. If "
+                        "you know where it comes from, mi.load(path, trust=True) lets CasADi read it, and run what it "
+                        "holds.")) from None
 
 
 def _serialized(source: Path) -> tuple[dict[str, ca.Function], dict[str, Any]]:

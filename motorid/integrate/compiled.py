@@ -6,6 +6,7 @@ nothing is compiled again for another run length, number of sub-steps or set of 
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import hashlib
 import os
@@ -141,6 +142,9 @@ def cache_dir() -> Path | None:
     if own.st_uid != os.getuid() or own.st_mode & 0o022 or loose:
         return _without(f"cannot compile into {folder}: others can write there (chmod go-w, or name another one with "
                         "MOTORID_CACHE)")
+    if own.st_mode & 0o077:  # made by an older version, or by hand
+        with contextlib.suppress(OSError):
+            folder.chmod(0o700)
     return folder
 
 

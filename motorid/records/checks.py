@@ -57,7 +57,18 @@ def check_runs(runs: Sequence[Experiment]) -> list[str]:
             others = ", ".join(name for name, _ in hits[1:4])
             others += f" and {len(hits) - 4} more" if len(hits) > 4 else ""
             remarks.append(f"{hits[0][0]}: {hits[0][1]}" + (f" (The same in {others}.)" if others else ""))
-    return remarks + [text for text in (_never_reverses(runs),) if text]
+    return remarks + [text for text in (_the_same_twice(runs), _never_reverses(runs)) if text]
+
+
+def _the_same_twice(runs: Sequence[Experiment]) -> str | None:
+    """The same samples in two runs count as twice as much evidence."""
+    seen: dict[tuple[bytes, ...], str] = {}
+    for run in runs:
+        first = seen.setdefault(tuple(y.tobytes() for y in (run.inputs["v"], *run.outputs.values())), run.name)
+        if first != run.name:
+            return (f"{first} and {run.name} hold the very same samples: a copy adds nothing, and makes standard "
+                    "deviations too small. Leave one out.")
+    return None
 
 
 def _excitation(run: Experiment) -> str | None:

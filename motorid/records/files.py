@@ -22,7 +22,8 @@ from motorid.errors import DataError, OutputError, UsageError
 MOST_BYTES = 256_000_000  # of a file that is read; a table takes about eight times as much memory
 _LOOK = 65_536  # bytes at either end in which an output says that motorid wrote it
 # What the outputs carry: JSON, page, C, table of motors, record of an export, simulated run, figure, CasADi file.
-_OURS = re.compile(rb'"motorid": ?"|name="generator" content="motorid|[Ww]ritten by motorid|\Amotor,status,message,'
+_OURS = re.compile(rb'"motorid": ?"(\d|unknown)|name="generator" content="motorid|[Ww]ritten by motorid|'
+                   rb'\Amotor,status,message,'
                    rb'|"motor":"[^"]*",\s*"status"|"index_columns": \["motor"\]|\At,[\w,]*substeps\n'
                    rb"|\A# motorid columns: |Software\0motorid")
 _ODD = re.compile("[\x7f-\x9f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
@@ -127,7 +128,11 @@ def _part(target: Path, content: str | bytes) -> Iterator[Path | None]:
     """Write `content` beside `target` and clear up afterwards; at once where `target` is a device or a pipe."""
     data = content.encode("utf-8", "backslashreplace") if isinstance(content, str) else content
     if target.exists() and not target.is_file():
-        target.write_bytes(data)
+        number = os.open(target, os.O_WRONLY | getattr(os, "O_NONBLOCK", 0))  # a pipe that nobody reads is an error
+        if hasattr(os, "set_blocking"):
+            os.set_blocking(number, True)
+        with open(number, "wb") as device:
+            device.write(data)
         yield None
         return
     number, name = tempfile.mkstemp(prefix=f".{target.name[:60]}.", suffix=".part", dir=target.parent)

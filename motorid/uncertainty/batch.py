@@ -327,7 +327,12 @@ class Checkpoint:
         for line in text.splitlines():
             try:
                 entry = json.loads(line)
-                self.rows[entry["fingerprint"]] = {"motor": entry["row"]["motor"], **entry["row"]}
+                row = {"motor": entry["row"]["motor"], **entry["row"]}
+                for name, value in row.items():
+                    kind = {"motor": str, "status": str, "message": str, "flags": list}.get(name, int | float | None)
+                    if not isinstance(value, kind):
+                        raise TypeError(name)
+                self.rows[entry["fingerprint"]] = row
             except (ValueError, KeyError, TypeError, RecursionError):
                 continue
         if text.strip() and not self.rows and '{"fingerprint"' not in text:

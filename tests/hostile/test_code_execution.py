@@ -135,6 +135,9 @@ def test_a_cache_that_others_can_write_is_refused(tmp_path, monkeypatch, capfd):
         monkeypatch.setenv("MOTORID_CACHE", str(folder))
         assert (compiled.cache_dir() is not None) is usable
         assert (compiled.find("step-x") is None)
+    mine.chmod(0o755)  # one that was there before
+    monkeypatch.setenv("MOTORID_CACHE", str(mine))
+    assert compiled.cache_dir() == mine
     assert stat.S_IMODE(mine.stat().st_mode) == 0o700
     (tmp_path / "link").symlink_to(shared)
     monkeypatch.setenv("MOTORID_CACHE", str(tmp_path / "link"))

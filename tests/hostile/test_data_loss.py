@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -221,3 +222,36 @@ def test_a_batch_killed_in_the_middle_of_its_journal_ends_in_the_same_table(tmp_
     seconds = rows[0][0].index("seconds")
     assert [[c for k, c in enumerate(r) if k != seconds] for r in rows[0]] == [
         [c for k, c in enumerate(r) if k != seconds] for r in rows[1]]
+
+
+def test_a_file_that_only_speaks_of_motorid_is_not_ours(tmp_path):
+    notes = tmp_path / "notes.json"
+    notes.write_text('{"motorid": "what I think of it"}', encoding="utf-8")
+    assert motorid("fit", RUN, "--json", notes).status == 2
+    assert "think" in notes.read_text(encoding="utf-8")
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes with a name there")
+def test_a_pipe_that_nobody_reads_does_not_hold_the_command_up(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(OutputError):
+        write_files({tmp_path / "pipe": "x"})
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no such device there")
+def test_a_full_disk_behind_the_terminal_is_one_sentence():
+    with open("/dev/full", "w") as full:
+        done = subprocess.run([sys.executable, "-m", "motorid", "effects", "coulomb"], stdout=full,
+                              stderr=subprocess.PIPE, text=True, timeout=60)
+    assert (done.returncode, done.stderr.count("\n")) == (1, 1), done.stderr
+
+
+def test_a_spoilt_row_of_a_journal_is_done_again(tmp_path):
+    (tmp_path / "motors").mkdir()
+    (tmp_path / "motors" / "a.csv").write_bytes(Path(RUN).read_bytes())
+    journal, words = tmp_path / "j.jsonl", ("fit-many", tmp_path / "motors", "--journal", tmp_path / "j.jsonl")
+    assert motorid(*words).status == 0
+    journal.write_text(re.sub(r'"R": [\d.e-]+', '"R": "x"', journal.read_text(encoding="utf-8")), encoding="utf-8")
+    done = motorid(*words)
+    assert done.status == 0, done.err
+    assert len(journal.read_text(encoding="utf-8").splitlines()) == 2

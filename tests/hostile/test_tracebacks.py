@@ -148,3 +148,17 @@ def test_a_refit_that_cannot_be_begun_is_a_value(monkeypatch):
 
     monkeypatch.setattr(refit, "_started", fail)
     assert refit.raced(fit, fit.model + mi.effects.coulomb, ({},)) is None
+
+
+def test_a_name_that_makes_no_name_of_a_function(tmp_path):
+    fit = mi.fit(mi.dc_motor().fix(L=0), mi.read_csv(RUN))
+    for stem in ("my__motor", '"); system("x', "__", "1 2"):
+        mi.export(fit, tmp_path / f"{stem}.c")
+
+
+def test_trust_is_advised_for_casadi_files_alone(tmp_path):
+    for name, advised in (("x.csv", False), ("x.casadi", True)):
+        (tmp_path / name).write_text("1,2\n3,4\n", encoding="utf-8")
+        with pytest.raises(mi.DataError) as told:
+            mi.load(tmp_path / name)
+        assert ("trust=True" in str(told.value)) is advised

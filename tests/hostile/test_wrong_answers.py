@@ -226,3 +226,9 @@ def test_a_plan_goes_neither_over_its_input_nor_on_with_a_spoilt_one(tmp_path):
     assert "it is read as well" in done.err
     assert json.loads(found.read_text(encoding="utf-8"))["best"]
 
+
+
+def test_the_same_record_under_two_names_is_said():
+    run = mi.read_csv(mi.data_path("clean") / "run1.csv")
+    assert any("very same samples" in text for text in mi.check_runs([run, run.with_(name="copy")]))
+    assert not any("very same" in text for text in mi.check_runs([run, run.select(slice(1, None))]))
