@@ -259,7 +259,7 @@ def _error(functions: Mapping[str, ca.Function], record: Mapping[str, Any], m: i
 def identifier(stem: str) -> str:
     """Return a C identifier like `stem`."""
     name = re.sub(r"[\W_]+", "_", stem, flags=re.ASCII).strip("_")  # CasADi takes no two underscores in a row
-    return name if name[:1].isalpha() else f"motor_{name}"
+    return name if name[:1].isalpha() else f"motor_{name}".rstrip("_")
 
 
 def _fields(found: Fit | Model, name: str) -> dict[str, Any]:
