@@ -108,7 +108,7 @@ def _amount(records: list[Experiment]) -> str:
 
 @with_options(FitOptions)
 def fit_many_command(
-    directories: Annotated[list[Path], typer.Argument(metavar="DIR...", help="One folder, or file, per motor inside.")],
+    directories: Annotated[list[Path], typer.Argument(metavar="DIR", help="One folder, or file, per motor inside.")],
     options: FitOptions,
     out: Annotated[Path | None, typer.Option(
         metavar="TABLE.csv", rich_help_panel=OUT, help="Write the table: .csv, .parquet or .json.")] = None,

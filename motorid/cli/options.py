@@ -45,7 +45,7 @@ _model = functools.partial(typer.Option, rich_help_panel=MODEL)
 _solving = functools.partial(typer.Option, rich_help_panel=SOLVE)
 
 Runs = Annotated[list[str], typer.Argument(
-    metavar="RUN...", show_default=False, help="Records: files, directories or patterns.")]
+    metavar="RUN", show_default=False, help="Records: files, directories or patterns.")]
 Json = Annotated[str | None, typer.Option(
     "--json", metavar="PATH", rich_help_panel=OUT, help="Write the result as JSON; - for standard output.")]
 Report = Annotated[Path | None, typer.Option(
@@ -134,7 +134,7 @@ class FitOptions(ReadingOptions):
         metavar="A", help="The current never exceeds this (penalty, hard).")] = None
     engine: Annotated[str, _solving(metavar="rosenbrock|cvodes|idas", help="Integrator.")] = "rosenbrock"
     initial: Annotated[str, _solving(
-        metavar="auto|rest|measured|estimate", help="What is known of the state at the first sample.")] = "auto"
+        metavar="STATE", help="The state at the first sample: auto, rest, measured or estimate.")] = "auto"
     window: Annotated[str, _solving(
         metavar="auto|none|SECONDS", help="Simulate the records in windows, each from an estimated state; auto: where "
         "the model would carry small errors too far over the whole.")] = "auto"

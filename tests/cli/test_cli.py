@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from command import motorid, motorid_json
+from typer.main import get_command
 
 from motorid.cli.app import app
 from motorid.cli.console import _spread, wrapped
@@ -443,3 +444,12 @@ def test_lines_are_cut_between_words_but_not_before_a_unit():
     assert "12.5 %" in text
     assert max(map(len, text.splitlines())) <= 110
     assert wrapped(12 * "a long word 1.25 % ").count("1.25 %") == 12
+
+
+def test_help_cuts_no_name_at_80_columns(monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    for name, command in get_command(app).commands.items():
+        shown = motorid(name, "--help").out
+        for p in command.params:
+            assert not p.metavar or p.metavar in shown, (name, p.metavar)
+            assert all(o in shown for o in p.opts if o.startswith("--")), name
