@@ -120,8 +120,7 @@ def plot_formulations(result: Formulations) -> np.ndarray:
     --------
     >>> axes = mi.plot_formulations(mi.compare_formulations(better, [mi.SteadyState()], weights=[1.0]))
     """
-    if not isinstance(result, Formulations):
-        raise UsageError(f"plot_formulations takes mi.compare_formulations(fit), got {type(result).__name__}.")
+    style.refuse_other(result, Formulations, "plot_formulations takes mi.compare_formulations(fit)")
     axes = style.new_figure(style.WIDTH, 3.0).subplots(1, 3, width_ratios=[1.5, 1.0, 1.0])
     shown = [(f.name, f.fit, style.CYCLE[k]) for k, f in enumerate(result.all) if f.fit is not None]
     _changes(axes[0], shown)

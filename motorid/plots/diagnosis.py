@@ -45,8 +45,7 @@ def plot_missing(result: Missing | Diagnosis, *, show: int = 3, run: int | None 
     >>> axes = mi.plot_missing(mi.locate(fit))
     """
     missing = result.missing if isinstance(result, Diagnosis) else result
-    if not isinstance(missing, Missing):
-        raise UsageError(f"plot_missing takes a diagnosis, mi.diagnose(fit), got {type(result).__name__}.")
+    style.refuse_other(missing, Missing, "plot_missing takes a diagnosis, mi.diagnose(fit)")
     balances = [b for b in ("voltage", "torque") if any(np.any(np.nan_to_num(x)) for x in getattr(missing, b))]
     if missing.where == "mechanical":
         balances.reverse()
@@ -115,8 +114,7 @@ def plot_answer(found: Diagnosis, ax: Axes | None = None) -> Axes:
     --------
     >>> axes = mi.plot_answer(found)
     """
-    if not isinstance(found, Diagnosis):
-        raise UsageError(f"plot_answer takes a diagnosis, mi.diagnose(fit), got {type(found).__name__}.")
+    style.refuse_other(found, Diagnosis, "plot_answer takes a diagnosis, mi.diagnose(fit)")
     m = found.missing
     balance = "voltage" if found.where == "electrical" else "torque"
     against, periods = _quantity(found, balance)
@@ -296,8 +294,7 @@ def plot_design(design: Design) -> np.ndarray:
     >>> plan = mi.design_experiment(better, parameters=["b"], v_max=12, i_max=8, duration=0.5, levels=4)
     >>> axes = mi.plot_design(plan)
     """
-    if not isinstance(design, Design):
-        raise UsageError(f"plot_design takes mi.design_experiment(...), got {type(design).__name__}.")
+    style.refuse_other(design, Design, "plot_design takes mi.design_experiment(...)")
     first = next(iter(design.predicted.values()))
     axes = style.grid(len(first) + 1, 1, sharex=True)[:, 0]
     style.line(axes[0], design.t, design.v, zoh=True, color=style.PALETTE["grey"])

@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from motorid.channels import NAMES, SYMBOLS, UNITS, channel_name
-from motorid.errors import DataError
+from motorid.errors import DataError, UsageError
 from motorid.numerics.signals import Array
 from motorid.records.experiment import Experiment
 
@@ -75,6 +75,17 @@ def detached() -> Iterator[None]:
         yield
     finally:
         _detached.reset(token)
+
+
+def refuse_other(result: object, kind: type, takes: str) -> None:
+    """Refuse a result that is not of the `kind` that a figure draws; `takes` says which figure takes what.
+
+    Raises
+    ------
+    UsageError
+    """
+    if not isinstance(result, kind):
+        raise UsageError(f"{takes}, got {type(result).__name__}.")
 
 
 def new_figure(width: float, height: float) -> Figure:

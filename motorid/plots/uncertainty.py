@@ -43,8 +43,7 @@ def plot_singular_values(result: Identifiability) -> np.ndarray:
     --------
     >>> axes = mi.plot_singular_values(mi.identifiability(better))
     """
-    if not isinstance(result, Identifiability):
-        raise UsageError(f"plot_singular_values takes mi.identifiability(fit), got {type(result).__name__}.")
+    style.refuse_other(result, Identifiability, "plot_singular_values takes mi.identifiability(fit)")
     k = len(result.names)
     axes = style.new_figure(min(style.WIDTH, 4.6 + 0.6 * k), 3.2).subplots(1, 2, width_ratios=[1.0, max(0.8, 0.16 * k)])
     rows = np.arange(1, k + 1)
@@ -243,8 +242,7 @@ def plot_waterfall(result: Multistart) -> np.ndarray:
     --------
     >>> axes = mi.plot_waterfall(mi.multistart(fit, starts=2, quiet=True))
     """
-    if not isinstance(result, Multistart):
-        raise UsageError(f"plot_waterfall takes mi.multistart(fit), got {type(result).__name__}.")
+    style.refuse_other(result, Multistart, "plot_waterfall takes mi.multistart(fit)")
     axes = style.new_figure(style.WIDTH, 3.1).subplots(1, 2, width_ratios=[1.0, 1.2])
     ends = [(e, k) for e, k in zip(result.results, result.kinds, strict=True) if isinstance(e, StartResult)]
     ends = sorted(((e, k) for e, k in ends if np.isfinite(e.cost)), key=lambda p: p[0].cost)

@@ -13,7 +13,7 @@ from motorid.display.numbers import counted, duration
 from motorid.effects import LIBRARY, get
 from motorid.errors import MissingDependency, ModelError, MotoridError, UsageError
 from motorid.estimation.fit import fit
-from motorid.estimation.result import Fit
+from motorid.estimation.result import Fit, checked
 from motorid.estimation.start_values import with_suited_effects
 from motorid.model.definition import Effect, Parameter
 from motorid.model.model import Model
@@ -51,8 +51,7 @@ def explore(fit: Fit, *, effects: Iterable[Effect | str] | None = None) -> Explo
     --------
     >>> play = mi.explore(fit, effects=["coulomb", "stribeck"])  # its widgets show in a notebook
     """
-    if not isinstance(fit, Fit):
-        raise UsageError(f"explore takes a fit, mi.explore(mi.fit(mi.dc_motor(), runs)); got {type(fit).__name__}.")
+    checked(fit, "explore")
     try:
         import ipywidgets  # noqa: F401
     except ImportError:
