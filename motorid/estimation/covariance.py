@@ -5,6 +5,7 @@ are taken as stationary, with the variance they have and the autocovariance of a
 so neither the assumed noise level nor its whiteness matters (sandwich: White, Econometrica 50, 1982; Newey &
 West, Econometrica 55, 1987; here with a parametric Γ, since transients leave few samples to average over).
 Residuals that depend on the motion, of a model that lacks something, are not noise; then it is an indication.
+`Fit.std` is made here; `motorid.uncertainty.covariance` shows all of it.
 """
 
 from __future__ import annotations

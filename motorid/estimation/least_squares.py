@@ -1,7 +1,8 @@
 """One least-squares run on a problem, and a race of several: every stage of a fit is one of these two calls.
 
 Sub-steps chosen far from the solution hide what rings between samples, so they are chosen again where the run
-goes, and the run is repeated while they do not suit its end. Three efforts serve all purposes.
+goes, and the run is repeated while they do not suit its end. Three efforts serve all purposes. The solver
+itself, which knows no problem, is `motorid.numerics.least_squares`.
 """
 
 from __future__ import annotations

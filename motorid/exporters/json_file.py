@@ -6,15 +6,13 @@ import json
 import sys
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from motorid.estimation.result import Fit
 from motorid.estimation.shooting.outcome import violations
 from motorid.problem.relations import Relation
+from motorid.problem.simulate import Evaluation
 from motorid.records.files import json_text, write_files
-
-if TYPE_CHECKING:
-    from motorid.estimation.result import Fit
-    from motorid.problem.simulate import Evaluation
 
 MOTOR = ("R", "L", "K", "b", "J")
 

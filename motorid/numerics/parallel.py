@@ -1,6 +1,7 @@
 """Many independent pieces of work over any `map`: shipped once, kept when done, finished without the pool.
 
-Each piece, and each public call, keeps the linear algebra to one thread, see `one_thread`: its matrices are small.
+What all long work shares is here, too: a budget of time, Ctrl-C in the command line, a progress bar. Each piece, and
+each public call, keeps the linear algebra to one thread, see `one_thread`: its matrices are small.
 
 `map` is anything with the signature of the built-in one: ``executor.map`` of `concurrent.futures`,
 ``client.get_executor(pure=False).map`` of Dask, ``lambda f, xs: joblib.Parallel(2)(joblib.delayed(f)(x) for

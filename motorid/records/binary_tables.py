@@ -201,6 +201,10 @@ def parquet_table(data: bytes) -> TextTable:
     return frame_table(frame)
 
 
+# The ending of a file to what reads its bytes; all others are read as text.
+FORMATS = {".mat": mat_table, ".parquet": parquet_table, ".pq": parquet_table}
+
+
 def frame_table(frame: Any) -> TextTable:
     """Return the table of a pandas.DataFrame; a named index counts as a column."""
     import pandas as pd

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from motorid.errors import DataError, UsageError, one_of
-from motorid.records.binary_tables import frame_table, mat_table, parquet_table
+from motorid.records.binary_tables import FORMATS, frame_table, mat_table
 from motorid.records.cleaning import run_from_columns
 from motorid.records.experiment import Experiment, between_pauses
 from motorid.records.files import read_bytes, write_files
@@ -26,7 +26,7 @@ from motorid.records.layout import assign, first_of_its_name, parse_pairs
 from motorid.records.text_tables import TextTable, parse_table
 
 Path_ = str | os.PathLike[str]
-RECORDS = (".csv", ".txt", ".tsv", ".dat", ".log", ".mat", ".parquet", ".pq")
+RECORDS = (".csv", ".txt", ".tsv", ".dat", ".log", *FORMATS)
 _HEADERS = {("t", "s"): "time_s", ("v", "V"): "voltage_V", ("v", "A"): "command_A",
             ("v", "N·m"): "command_Nm", ("v", "N"): "command_N", ("v", "1"): "command (1)",
             ("i", "A"): "current_A", ("omega", "rad/s"): "speed_rad_s", ("omega", "m/s"): "speed_m_s",
@@ -76,7 +76,7 @@ def read_runs(paths: Path_ | Iterable[Path_], *, columns: Mapping[str, object] |
     files = find_records(paths)
     stems = Counter(f.stem for f in files)
     names = [f.stem if stems[f.stem] == 1 else f"{f.parent.name}/{f.name}" for f in files]
-    runs = (_READERS.get(f.suffix.lower(), read_csv)(f, columns=columns, units=units, hold=hold, name=name)
+    runs = (_read(f, FORMATS.get(f.suffix.lower(), parse_table), columns, units, hold, name)
             for f, name in zip(files, names, strict=True))
     return [part for run in runs for part in between_pauses(run)]
 
@@ -105,15 +105,6 @@ def read_mat(path: Path_, *, columns: Mapping[str, object] | None = None, units:
     >>> run = mi.read_mat("bench.mat", columns={"v": "u"}, units={"omega": "rpm"})  # doctest: +SKIP
     """
     return _read(path, mat_table, columns, units, hold, name)
-
-
-def read_parquet(path: Path_, *, columns: Mapping[str, object] | None = None, units: Mapping[str, object] | None = None,
-                 hold: str | None = None, name: str | None = None) -> Experiment:
-    """Read one Parquet file, which needs ``motorid[parquet]``; otherwise like `read_csv`."""
-    return _read(path, parquet_table, columns, units, hold, name)
-
-
-_READERS = {".mat": read_mat, ".parquet": read_parquet, ".pq": read_parquet}
 
 
 def write_csv(experiment: Experiment, path: Path_, force: bool = False) -> Path:

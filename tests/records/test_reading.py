@@ -14,7 +14,7 @@ from motorid.channels import CHANNELS, UNITS
 from motorid.errors import DataError, MissingDependency, UsageError
 from motorid.records.experiment import MIN_SAMPLES, Experiment
 from motorid.records.layout import parse_pairs
-from motorid.records.reading import find_records, read_csv, read_mat, read_parquet, read_runs, write_csv
+from motorid.records.reading import find_records, read_csv, read_mat, read_runs, write_csv
 
 
 def write(folder: Path, content: str | bytes, name: str = "run.csv") -> Path:
@@ -394,7 +394,7 @@ def test_parquet(tmp_path):
     frame = pd.DataFrame({"voltage_V": np.sin(t), "speed_rpm": t, "state": "on"},
                          index=pd.Index(t, name="time_s"))
     frame.to_parquet(tmp_path / "a.parquet")
-    run = read_parquet(tmp_path / "a.parquet")
+    [run] = read_runs(tmp_path / "a.parquet")
     np.testing.assert_array_equal(run.t, t)
     np.testing.assert_allclose(run.outputs["omega"], t * 2 * np.pi / 60)
     stamps = pd.Timestamp("2024-05-01") + pd.to_timedelta(t, unit="s")
@@ -408,7 +408,7 @@ def test_parquet_without_pyarrow_names_the_extra(tmp_path, monkeypatch):
 
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     with pytest.raises(MissingDependency, match=r"motorid\[parquet\]"):
-        read_parquet(write(tmp_path, b"PAR1", "a.parquet"))
+        read_runs(write(tmp_path, b"PAR1", "a.parquet"))
 
 
 # -- writing ------------------------------------------------------------------------------------------------
