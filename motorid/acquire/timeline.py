@@ -6,7 +6,7 @@ import math
 from collections import Counter
 from typing import NamedTuple
 
-from motorid.acquire.protocol import Channel, Header, Sample
+from motorid.acquire.protocol import Header, Sample
 
 
 class Row(NamedTuple):
@@ -74,10 +74,11 @@ class Timeline:
         if isinstance(mark, str):
             self.bad[mark] += 1
             return []
-        if self._agree(self._last, mark):
-            self._drop_doubtful()
-            return [self._row(mark, sample)]
         held, self._doubtful = self._doubtful, None
+        if self._agree(self._last, mark):
+            if held:
+                self.bad["implausible"] += 1
+            return [self._row(mark, sample)]
         if held:
             later = self._follow(held[0], sample, host)
             if not isinstance(later, str) and self._agree(held[0], later):
@@ -117,11 +118,6 @@ class Timeline:
         by_time = (mark.micros - last.micros) * 1e-6 * self.header.rate
         return step > 0 and abs(by_time - step) <= 5 + 0.2 * step
 
-    def _drop_doubtful(self) -> None:
-        if self._doubtful:
-            self.bad["implausible"] += 1
-            self._doubtful = None
-
     def _row(self, mark: _Mark, sample: Sample) -> Row:
         step, self._last = mark.index - self._last.index, mark
         self.received += 1
@@ -131,7 +127,7 @@ class Timeline:
                 raw = self._unwrappers[k].unwrap(raw, step)
             elif channel.kind != "n" and not 0 < raw < channel.span - 1 and not math.isnan(raw):
                 self.clipped[channel.name] += 1
-            values.append(_si(channel, raw))
+            values.append(channel.scale * (raw - channel.offset))
         return Row(mark.index, mark.micros * 1e-6, tuple(values))
 
 
@@ -152,7 +148,3 @@ class _Unwrapper:
         value = raw + self.span * round((expected - raw) / self.span)
         self.rate, self.value, self.since = (value - self.value) / self.since, value, 0
         return value
-
-
-def _si(channel: Channel, raw: float) -> float:
-    return channel.scale * (raw - channel.offset)

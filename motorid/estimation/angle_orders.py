@@ -138,7 +138,8 @@ def spectrum(tangent: Tangent, effect: Effect) -> Spectrum:
 def _spectrum(tangent: Tangent, relative: bool) -> Spectrum:
     fit, top = tangent.fit, highest_order(tangent)
     # A torque that repeats once per turn is gravity's, and what is to repeat must do so within the travel.
-    lowest = max(1 if relative else 2, int(np.ceil(PERIODS * 2 * np.pi / max(_travel(fit), 1e-9))))
+    travel = max(float(np.ptp(angle_signal(r))) for r in fit.problem.experiments)
+    lowest = max(1 if relative else 2, int(np.ceil(PERIODS * 2 * np.pi / max(travel, 1e-9))))
     if top < lowest or (relative and "i" not in fit.problem.system.states):
         return Spectrum((), False)
     shares, lines = _order_search(tangent).shares(lowest, relative)
@@ -305,7 +306,3 @@ def _lines(orders: Array, sines: Array, cosines: Array, residual: Array) -> list
         a, b = a / sizes[0], b / sizes[1]
     return [Line(float(n), float(share[j]), float(np.hypot(a[j], b[j])), float(np.arctan2(b[j], a[j])))
             for j, n in enumerate(orders) if seen[j]]
-
-
-def _travel(fit) -> float:
-    return max(float(np.ptp(angle_signal(r))) for r in fit.problem.experiments)

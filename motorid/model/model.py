@@ -81,7 +81,7 @@ class Model(Shown):
         """Return the model without the effect called `name`."""
         if name not in self.effect_names:
             raise ModelError(one_of(name, self.effect_names, "effect in this model"))
-        base = {k: v for k, v in self.parameters.items() if k in self._base_names}
+        base = {k: v for k, v in self.parameters.items() if k in {p.name for p in BASES[self.base]}}
         model = self.with_(effects=(), parameters=base)
         for e in self.effects:
             if e.name != name:
@@ -141,10 +141,6 @@ class Model(Shown):
     def shared_names(self) -> tuple[str, ...]:
         """Names of the parameters that are the same in every run, as they are or since the user gave them."""
         return tuple(n for n, p in self.parameters.items() if not p.per_run or p.given)
-
-    @property
-    def _base_names(self) -> tuple[str, ...]:
-        return tuple(p.name for p in BASES[self.base])
 
     def _in_units(self, p: Parameter) -> Parameter:
         return replace(p, unit=LINEAR_UNITS.get(p.unit, p.unit)) if self.axis == "linear" else p

@@ -170,13 +170,13 @@ def scatter(ax: Axes, x: Any, y: Any, most: int = 1500, color: str = style.RESID
     ax.plot(x[keep], y[keep], ".", ms=2, color=color, alpha=0.35, mew=0, rasterized=len(keep) > 400, zorder=1)
 
 
-def binned_means(x: Array, y: Array, bins: int = BINS) -> tuple[Array, Array, Array]:
+def binned_means(x: Array, y: Array) -> tuple[Array, Array, Array]:
     """Return centres, means and 1.96 standard errors of y in equal bins of x with five samples or more."""
-    edges = np.linspace(x.min(), x.max(), bins + 1)
-    which = np.clip(np.searchsorted(edges, x, side="right") - 1, 0, bins - 1)
-    count = np.bincount(which, minlength=bins)
+    edges = np.linspace(x.min(), x.max(), BINS + 1)
+    which = np.clip(np.searchsorted(edges, x, side="right") - 1, 0, BINS - 1)
+    count = np.bincount(which, minlength=BINS)
     safe = np.maximum(count, 1)
-    mean = np.bincount(which, y, bins) / safe
-    spread = np.sqrt(np.maximum(np.bincount(which, y**2, bins) / safe - mean**2, 0))
+    mean = np.bincount(which, y, BINS) / safe
+    spread = np.sqrt(np.maximum(np.bincount(which, y**2, BINS) / safe - mean**2, 0))
     full = count >= 5
     return ((edges[:-1] + edges[1:]) / 2)[full], mean[full], (1.96 * spread / np.sqrt(safe))[full]

@@ -181,15 +181,15 @@ def axis_label(channel: str, run: Experiment | None = None) -> str:
     return f"{name} ({unit})" if unit != "1" else name
 
 
-def envelope(x: Array, y: Array, points: int = POINTS) -> tuple[Array, Array]:
+def envelope(x: Array, y: Array) -> tuple[Array, Array]:
     """Return fewer points whose line looks the same: the lowest and highest sample of each stretch.
 
     Peaks of a single sample stay; a stretch with missing samples keeps a gap.
     """
     x, y = np.asarray(x, float), np.asarray(y, float)
-    if len(x) <= points:
+    if len(x) <= POINTS:
         return x, y
-    width = -(-2 * len(x) // points)
+    width = -(-2 * len(x) // POINTS)
     rows = -(-len(x) // width)
     padded = np.full(rows * width, np.nan)
     padded[: len(y)] = y

@@ -249,7 +249,8 @@ def signs(run: Experiment) -> str | None:
         against = [name for name, sign in zip(("current", "speed"), turned, strict=True) if sign < 0]
         if order != (0, 1, 2):
             return None
-    measured = [n for n, here in (("current", "i" in run.outputs), ("speed", _has_speed(run))) if here]
+    turning = {"omega", "theta"} & set(run.outputs)
+    measured = ["current"] * ("i" in run.outputs) + ["speed"] * bool(turning)
     if not against:
         return None
     if len(against) == 2:
@@ -411,10 +412,6 @@ def _cosine(a: Array, b: Array | None) -> float:
     good = np.isfinite(b)
     scale = np.sqrt(np.sum(a[good] ** 2) * np.sum(b[good] ** 2))
     return float(np.sum(a[good] * b[good]) / scale) if scale > 0 else 0.0
-
-
-def _has_speed(run: Experiment) -> bool:
-    return bool({"omega", "theta"} & set(run.outputs))
 
 
 def _speed_cosine(run: Experiment) -> float:

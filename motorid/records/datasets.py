@@ -47,7 +47,8 @@ def data_path(name: str = "") -> Path:
     root = _root()
     path = root / name
     if not path.exists():
-        raise DataError(one_of(name, datasets() if "/" not in name else _files(), "shipped data"))
+        files = sorted(f for known in _truths().values() for f in known["files"])
+        raise DataError(one_of(name, files if "/" in name else datasets(), "shipped data"))
     return path
 
 
@@ -93,7 +94,3 @@ def load_plant() -> ModuleType:
 
 def _truths() -> dict[str, Any]:
     return json.loads((_root() / "truth.json").read_text(encoding="utf-8"))
-
-
-def _files() -> list[str]:
-    return sorted(file for known in _truths().values() for file in known["files"])

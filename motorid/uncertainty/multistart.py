@@ -184,17 +184,13 @@ class Multistart(Printed):
             return "failed"
         best = self.best or self.reference
         far = any(abs(self._difference(n, end.values[n], best.values[n])) > DISTANCE * sd
-                  for n, sd in self._determined.items())
+                  for n, sd in self.reference.std.items() if sd)
         return "poor" if end.cost > best.cost * (1 + COST_SHARE) or far else "good"
 
     def _difference(self, name: str, a: float, b: float) -> float:
         """Difference of two values; phases are compared on the circle."""
         periodic = self.reference.problem.model.parameters[name].periodic
         return (a - b + np.pi) % (2 * np.pi) - np.pi if periodic else a - b
-
-    @property
-    def _determined(self) -> dict[str, float]:
-        return {n: sd for n, sd in self.reference.std.items() if sd}
 
     @property
     def _good(self) -> list[StartResult]:

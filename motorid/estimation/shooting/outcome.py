@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from motorid.display.numbers import counted
 from motorid.errors import FitError, SimulationError
 from motorid.estimation.result import Fit
 from motorid.estimation.shooting.mesh import Mesh
@@ -248,7 +249,8 @@ def summed(found: Sequence[tuple[str, Part, Array, Array]]) -> tuple[tuple[Multi
             mine = on & np.array([u == unit for u in part.units])
             value, active = sums.get((name, unit), (0.0, 0))
             sums[name, unit] = value + float(np.sum(np.abs(lam / part.size)[mine])), active + int(mine.sum())
-    totals = tuple(Multiplier(name, _rows_at_limit(active), value, unit, active)
+    labels = {n: f"{counted(n, 'row')} at the limit" if n else "not active" for _, n in sums.values()}
+    totals = tuple(Multiplier(name, labels[active], value, unit, active)
                    for (name, unit), (value, active) in sums.items())
     return totals, tuple(sorted(rows, key=lambda m: -m.value))
 
@@ -261,10 +263,6 @@ def free_directions(jac: Array, slope: Array) -> Array:
     _, s, vt = np.linalg.svd(jac / size, full_matrices=True)
     rank = int(np.sum(s > 1e-8))
     return slope[:, None] * vt[rank:].T
-
-
-def _rows_at_limit(active: int) -> str:
-    return "not active" if not active else f"{active} row{'s' if active > 1 else ''} at the limit"
 
 
 def below_steady(problem: Problem) -> str | None:
