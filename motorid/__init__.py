@@ -76,7 +76,7 @@ def __getattr__(name: str) -> object:
     if name in _FIGURES:
         from motorid import plots
 
-        return _arguments_told(getattr(plots, name))
+        return getattr(plots, name)
     raise AttributeError(_one_of(name, __dir__(), "name in motorid"))
 
 

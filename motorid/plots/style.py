@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from motorid.channels import NAMES, SYMBOLS, UNITS, channel_name
-from motorid.errors import DataError, UsageError
+from motorid.errors import DataError, UsageError, arguments_told
 from motorid.numerics.signals import Array
 from motorid.records.experiment import Experiment
 
@@ -53,7 +53,7 @@ _detached: ContextVar[bool] = ContextVar("motorid_detached_figures", default=Fal
 
 
 def styled(draw: Callable[_P, _R]) -> Callable[_P, _R]:
-    """Draw in motorid's style and leave the user's own settings as they were."""
+    """Draw in motorid's style and leave the user's own settings as they were; say which argument is wrong."""
 
     @wraps(draw)
     def inner(*args: _P.args, **kwargs: _P.kwargs) -> _R:
@@ -64,7 +64,7 @@ def styled(draw: Callable[_P, _R]) -> Callable[_P, _R]:
         with mpl.rc_context(dict(STYLE)):
             return draw(*args, **kwargs)
 
-    return inner
+    return arguments_told(inner)
 
 
 @contextmanager
