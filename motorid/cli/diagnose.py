@@ -116,7 +116,7 @@ def _as_it_comes(word: str, done: list[str], advance: Callable[..., None], quiet
     first = word.startswith("first answer")
     if first and not quiet:
         show(f"{word[0].upper()}{word[1:]}\n")
-    advance(1, "" if first else word)
+    advance(0, "" if first else word)
 
 
 def _saying(advance: Callable[..., None]) -> Callable[..., Iterator[Any]]:
@@ -124,10 +124,12 @@ def _saying(advance: Callable[..., None]) -> Callable[..., Iterator[Any]]:
 
     def mapped(function: Callable[[Any], Any], tasks: Iterable[Any]) -> Iterator[Any]:
         every = list(tasks)
-        for k, task in enumerate(every, 1):
+        for k, task in enumerate(every):
             effect = getattr(task[0] if isinstance(task, tuple) else task, "effect", None)
-            advance(0, f"fitting {effect.name}, {k} of {len(every)}" if effect is not None else "")
+            text = f"fitting {effect.name}" if effect is not None else ""
+            advance(0, text, None if k else len(every))
             yield function(task)
+            advance(1, text)
 
     return mapped
 
@@ -234,7 +236,8 @@ def demo_command(
     show(plain.verdict, "", parameter_table(plain), error_table({"": plain.evaluation}, plain.noise),
          "3. What is missing?")
     with progress("Trying the effects of the library") as advance:
-        found = diagnose(plain, check, map=_saying(advance), progress=lambda word: advance(1, word))
+        found = diagnose(plain, check, map=_saying(advance),
+                         progress=lambda word: advance(0, "" if word.startswith("first answer") else word))
     show(found.text, found.missing.text, "", ranking_table(found.ranking, 4),
          "4. Added, one line of code: fit.model + mi.effects." + (found.effects or ("…",))[0],
          ladder_table(found.ladder), parameter_table(found.after, found.before))

@@ -184,7 +184,7 @@ def explored(fit: Fit, validate: Sequence[Experiment] | Experiment | None, effec
     began = time.monotonic()
 
     def climbed(records: Records) -> Climb:
-        left = None if seconds is None else seconds - (time.monotonic() - began)
+        left = None if seconds is None else max(seconds - (time.monotonic() - began), 0.0)
         return climb(Search(records.fit, records.held_out, effects, map_, advance), max_effects, advance, left)
 
     records = Records(affordable(fit), [validate] if isinstance(validate, Experiment) else validate)

@@ -304,7 +304,7 @@ def progress(text: str, total: float | None = None, *, quiet: bool = False) -> I
     Yields
     ------
     callable
-        ``advance(n=1, at_work="")``.
+        ``advance(n=1, at_work="", total=None)``; a `total` begins a round of so many tasks, with a bar of its own.
 
     Examples
     --------
@@ -313,20 +313,25 @@ def progress(text: str, total: float | None = None, *, quiet: bool = False) -> I
     ...         advance()
     """
     if quiet or _showing.get() or not _watched():
-        yield lambda n=1.0, at_work="": None
+        yield lambda n=1.0, at_work="", total=None: None
         return
     from rich import progress as rich
     from rich.console import Console
 
-    columns: list[rich.ProgressColumn] = [rich.SpinnerColumn(), rich.TextColumn("{task.description}")]
-    columns += [rich.BarColumn(), rich.MofNCompleteColumn()] if total else []
-    columns += [rich.TimeElapsedColumn(), *([rich.TimeRemainingColumn()] if total else [])]
+    counted: list[rich.ProgressColumn] = [rich.BarColumn(20), rich.MofNCompleteColumn(), rich.TimeRemainingColumn()]
+    columns = [rich.SpinnerColumn(), rich.TextColumn("{task.description}"), rich.TimeElapsedColumn()]
     token = _showing.set(True)
     try:
-        with rich.Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        with rich.Progress(*columns, *(counted if total else []), console=Console(stderr=True), transient=True) as bar:
             task = bar.add_task(text, total=total)
-            yield lambda n=1.0, at_work="": bar.update(task, advance=n, description=f"{text}: {at_work}" * bool(at_work)
-                                                       or text)
+
+            def advance(n: float = 1.0, at_work: str = "", total: float | None = None) -> None:
+                if total:
+                    bar.columns = (*columns, *counted)
+                    bar.update(task, total=total, completed=0)
+                bar.update(task, advance=n, description=f"{text}: {at_work}" if at_work else text)
+
+            yield advance
     finally:
         _showing.reset(token)
 

@@ -72,3 +72,12 @@ def test_what_is_at_work_is_said_and_no_total_is_made_up(monkeypatch):
         advance(1, "fitting coulomb")
     assert "Looking: fitting coulomb" in screen.getvalue()
     assert "?" not in screen.getvalue().replace("\x1b[?25", "")
+
+
+def test_a_round_whose_total_is_learnt_on_the_way_has_a_true_bar(monkeypatch):
+    screen = terminal(monkeypatch)
+    with progress("Looking") as advance:
+        advance(0, "fitting coulomb", 4)
+        advance(1, "fitting stribeck")
+        advance(2, "fitting gravity")
+    assert "3/4" in screen.getvalue()
