@@ -120,6 +120,7 @@ def prepare_process() -> None:
             stream.reconfigure(errors="motorid")  # type: ignore[union-attr]
     os.environ["MPLBACKEND"] = "agg"  # figures go to files, whatever backend a shell names
     warnings.simplefilter("ignore", RuntimeWarning)  # of arithmetic: what came of it is said
+    warnings.filterwarnings("ignore", message=r"\s*(casadi: a numpy|Glyph |constrained_layout)")  # no user's business
     warnings.formatwarning = lambda message, *_, **__: f"motorid: {message}\n"
     interruption.listen()
 

@@ -134,9 +134,11 @@ class Equations:
 
     def rate(self, state: ca.SX, expression: Any) -> None:
         """Set the time derivative of a state that was added with `state`."""
-        name = state.name()
+        name = state.name() if isinstance(state, ca.SX) else str(state)
         if name not in self.states or name in CHANNELS:
             raise ModelError(f"{self.writer}: rate() takes a state made with m.state(), got '{name}'.")
+        if name in self.rates:
+            raise ModelError(f"{self.writer}: the state '{name}' has a rate already; give it once, as one sum.")
         self.rates[name] = ca.SX(expression)
 
     def measure(self, channel: str, expression: Any) -> None:

@@ -14,6 +14,7 @@ from motorid.records.experiment import Experiment
 
 Check = Callable[[Experiment], str | None]
 _BLOCKS = 40
+EXPLAINED = 1e-3  # product of the shares of the two balances that a reading may leave unexplained
 BALANCE_BLOCKS = 150
 # Ratio of the angle's rate to the speed, and what was then mistaken for SI.
 _RATIOS = {
@@ -369,7 +370,9 @@ def _as_balances_want(run: Experiment) -> tuple[tuple[int, ...], tuple[int, int]
 
     Both balances, integrated over blocks, with coefficients that must be positive (non-negative least squares, Lawson &
     Hanson 1974): ∫v = R∫i + LΔi + K∫ω ± V·t and Δω = k∫i − b∫ω − c∫sgn ω ± d·t. What is stated stands, unless another
-    reading leaves less than half unexplained. Where no current is measured, the voltage drives in its place.
+    reading leaves less than half unexplained. Where no current is measured, the voltage drives in its place. Columns
+    are called exchanged only where the exchange explains the balances: of a record with gaps or a dead sensor anything
+    explains a little more.
     """
     known = [c for c in ("i", "omega") if c in run.outputs and np.isfinite(run.outputs[c]).sum() > 1]
     n = min(BALANCE_BLOCKS, run.n // 3)
@@ -392,8 +395,11 @@ def _as_balances_want(run: Experiment) -> tuple[tuple[int, ...], tuple[int, int]
 
     signs_too = product(permutations(range(3)), product((1, -1), (1, -1)))
     readings = signs_too if "i" in known else [stated, ((0, 1, 2), (1, -1))]
-    best = min(readings, key=lambda r: unexplained(*r))
-    return best if unexplained(*best) < 0.5 * unexplained(*stated) else stated
+    left = {(order, (a, b)): unexplained(order, (a, b)) for order, (a, b) in readings}
+    best = min(left, key=lambda r: left[r])
+    if best[0] != stated[0] and left[best] > EXPLAINED:
+        best = min((r for r in left if r[0] == stated[0]), key=lambda r: left[r])
+    return best if left[best] < 0.5 * left[stated] else stated
 
 
 def _share_left(y: Array, *terms: Array) -> float:

@@ -241,6 +241,8 @@ def windows(experiment: Experiment, seconds: float) -> list[Experiment]:
         return [experiment]
     if not 0 < seconds < np.inf:
         raise UsageError(f"a window takes a time in seconds; got {seconds!r}.")
+    if seconds < 8 * experiment.dt:
+        raise UsageError(f"a window of {seconds:g} s holds fewer than 8 samples, {experiment.dt:.3g} s apart.")
     parts = split(experiment, max(round(experiment.duration / seconds), 1))
     return [p.with_(meta={**experiment.meta, "window": seconds}) for p in parts]
 

@@ -74,7 +74,7 @@ def assign(labels: Sequence[str], *, columns: Mapping[str, object] | None = None
     notes: list[str] = []
     _named_by_header(places, [c for c in labels if c not in {p.column for p in places.values()}], row)
     _last_resorts(places, labels, notes)
-    _apply_units(places, labels, units)
+    _apply_units(places, labels, units, notes)
     _settle_counts(places, notes)
     notes += [f"'{c}' looks like the reference of a controller: what drives the model is the voltage; it is not used."
               for c in labels if is_reference(c) and c not in {p.column for p in places.values()}]
@@ -157,7 +157,8 @@ def _last_resorts(places: dict[str, Place], labels: Sequence[str], notes: list[s
         notes.append(f"took '{duty[0]}' times '{supply[0]}' as the drive voltage.")
 
 
-def _apply_units(places: dict[str, Place], labels: Sequence[str], units: Mapping[str, object]) -> None:
+def _apply_units(places: dict[str, Place], labels: Sequence[str], units: Mapping[str, object],
+                 notes: list[str]) -> None:
     for key, text in units.items():
         channel = key if key in places else next((c for c, p in places.items() if p.column == key), None)
         if channel is None:
@@ -165,7 +166,10 @@ def _apply_units(places: dict[str, Place], labels: Sequence[str], units: Mapping
                    "this column is not used as a channel" if key in labels else
                    one_of(str(key), [*places, *(p.column for p in places.values())], "channel or column"))
             raise DataError(f"units for '{key}': {why}")
-        places[channel] = replace(places[channel], unit=require_unit(text, channel), stated=True)
+        was, unit = places[channel], require_unit(text, channel)
+        if was.stated and not math.isclose(abs(was.unit.factor), abs(unit.factor)):
+            notes.append(f"'{was.column}' says {was.unit.label}, and is read as {unit.label}: units asks for it.")
+        places[channel] = replace(was, unit=unit, stated=True)
     theta, omega = places.get("theta"), places.get("omega")
     if theta and omega and theta.unit.dimension == "length" and not omega.stated:
         places["omega"] = replace(omega, unit=Unit("linear speed", 1.0, "m/s", "m/s"))

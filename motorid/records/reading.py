@@ -150,6 +150,8 @@ def find_records(paths: Path_ | Iterable[Path_]) -> list[Path]:
     for path in paths:
         if not isinstance(path, str | os.PathLike) or isinstance(os.fspath(path), bytes):
             raise UsageError(f"expected the name of a file as text or path; got {path!r}.")
+        if not os.fspath(path):
+            raise UsageError("the name of a record is empty: a variable of the shell that was never set?")
         files |= dict.fromkeys(_expand(Path(path).expanduser()))
     if not files:
         raise DataError("no record is given; name at least one file, directory or pattern.")
@@ -183,7 +185,7 @@ def _what_is_there(folder: Path, wanted: str | None = None) -> str:
     if not names:
         return f"There are no records in {folder.absolute()}."
     if wanted:
-        return one_of(wanted, names[:12], "file")
+        return one_of(wanted, names[:12], "file").removeprefix(f"unknown file '{wanted}'. ")
     return f"There is: {', '.join(names[:12])}{' ...' if len(names) > 12 else ''}."
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 
 import numpy as np
+import pandas as pd
 import pytest
 from command import motorid
 
@@ -232,3 +233,45 @@ def test_the_same_record_under_two_names_is_said():
     run = mi.read_csv(mi.data_path("clean") / "run1.csv")
     assert any("very same samples" in text for text in mi.check_runs([run, run.with_(name="copy")]))
     assert not any("very same" in text for text in mi.check_runs([run, run.select(slice(1, None))]))
+
+
+@pytest.mark.parametrize("spoil", [lambda i: np.where((np.arange(len(i)) // 400) % 3 == 1, np.nan, i),
+                                   lambda i: np.where(np.arange(len(i)) % 13 == 5, -999.0, i)])
+def test_a_spoilt_current_is_not_called_exchanged_with_the_speed(spoil):
+    run = mi.read_csv(mi.data_path("clean") / "run1.csv")
+    run = run.with_(outputs={**run.outputs, "i": spoil(run.outputs["i"])})
+    assert not any("exchanged" in text for text in mi.check_runs([run]))
+
+
+def test_units_that_contradict_the_header_are_said():
+    path = mi.data_path("clean") / "run1.csv"
+    assert any("is read as rpm" in n for n in mi.read_csv(path, units={"omega": "rpm"}).meta["notes"])
+    assert not any("is read as" in n for n in mi.read_csv(path, units={"omega": "-1 rad/s"}).meta["notes"])
+
+
+def test_numbers_kept_as_text_are_numbers(tmp_path):
+    path = mi.data_path("clean") / "run1.csv"
+    pd.read_csv(path).astype(str).to_parquet(tmp_path / "a.parquet")
+    a, b = mi.read_runs(tmp_path / "a.parquet")[0], mi.read_csv(path)
+    assert np.array_equal(a.outputs["i"], b.outputs["i"])
+
+
+def test_an_empty_name_is_not_the_working_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "a.csv").write_bytes((mi.data_path("clean") / "run1.csv").read_bytes())
+    assert motorid("fit", "").status == 2
+
+
+def test_a_window_shorter_than_the_samples_and_a_rate_given_twice_are_refused():
+    with pytest.raises(mi.UsageError, match="fewer than 8 samples"):
+        mi.fit(mi.dc_motor(), mi.read_csv(mi.data_path("clean") / "run1.csv"), window=1e-9)
+
+    @mi.effect(balance="torque")
+    def twice(m, c=mi.P(1.0, null=0)):
+        """Two rates."""
+        z = m.state("z")
+        m.rate(z, c)
+        m.rate(z, m.omega)
+
+    with pytest.raises(mi.ModelError, match="has a rate already"):
+        (mi.dc_motor() + twice).write()
