@@ -43,7 +43,7 @@ class HeldOut:
         if validate is None:
             return HeldOut(None, noise)
         runs = tuple(cut_alike(fit.problem.experiments, validate))
-        problem = fit.problem.with_(experiments=runs, model=fit.model, priors={}, penalties=(), balance={})
+        problem = fit.problem.with_(experiments=runs, model=fit.model, priors={}, penalties=(), noise_factors={})
         return HeldOut(problem, noise)
 
     def predictions(self, fit: Fit) -> Predictions:
@@ -88,7 +88,7 @@ def _fold(problem: Problem, odd: int) -> tuple[Problem, tuple[Experiment, ...]]:
     train, test = zip(*(_parted(r, odd) for r in problem.experiments), strict=True)
     runs = tuple(replace(run, experiment=e) for run, e in zip(problem.runs, train, strict=True))
     other = problem.with_(experiments=train, priors={}, penalties=())
-    return replace(other, _runs=runs).tuned(balance=problem.balance, accuracy=ROUGH), test
+    return replace(other, _runs=runs).tuned(noise_factors=problem.noise_factors, accuracy=ROUGH), test
 
 
 def _parted(run: Experiment, odd: int) -> tuple[Experiment, Experiment]:

@@ -171,10 +171,10 @@ def linearised(fit: Fit, validation: Problem | None, balance: Mapping[str, float
     ------
     SimulationError
     """
-    problem = fit.problem.tuned(balance=fit.problem.balance if balance is None else balance)
+    problem = fit.problem.tuned(noise_factors=fit.problem.noise_factors if balance is None else balance)
     known = [_on(problem, fit, fit.simulations)]
     if validation is not None:
-        other = validation.for_model(fit.model).tuned(balance=problem.balance)
+        other = validation.for_model(fit.model).tuned(noise_factors=problem.noise_factors)
         known.append(_on(other, fit, simulated(other)))
     signals = [[signals_of(fit, p, s, k) for k, s in enumerate(sims)] for p, sims, _, _ in known]
     ranges, orders = ranges_of(signals[0]), orders_of(fit)

@@ -52,7 +52,7 @@ class Reading:
     def problem(self, fit: Fit) -> Problem:
         """Return the problem of the same model on records read so."""
         runs = tuple(self.of(r) for r in fit.problem.experiments)
-        return fit.problem.with_(experiments=runs, model=fit.model, balance={})
+        return fit.problem.with_(experiments=runs, model=fit.model, noise_factors={})
 
     def fitted(self, fit: Fit) -> Fit:
         """Return the fit of the same model to records read so.

@@ -42,7 +42,7 @@ def affordable(fit: Fit) -> Fit:
     if parts is None:
         return fit
     try:
-        return solve(problem.with_(experiments=parts, model=fit.model, balance={}), start="model")
+        return solve(problem.with_(experiments=parts, model=fit.model, noise_factors={}), start="model")
     except MotoridError:
         return fit
 

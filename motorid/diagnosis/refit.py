@@ -188,10 +188,10 @@ def _polished(fit: Fit, problem: Problem) -> Fit | None:
         exact = problem.tuned(accuracy=fit.problem.accuracy)
         problem = exact if worth_its_steps(exact.refined(exact.start)) else problem.tuned(accuracy=ROUGH)
         done = _converged(problem)
-        if problem.balance:
+        if problem.noise_factors:
             factors = misfit_over_noise(done.problem, done.solution.q)
-            if max(abs(np.log(factors[c] / problem.balance.get(c, 1.0))) for c in factors) > 0.1:
-                done = _converged(restarted(done.problem, done.solution.q).tuned(balance=factors))
+            if max(abs(np.log(factors[c] / problem.noise_factors.get(c, 1.0))) for c in factors) > 0.1:
+                done = _converged(restarted(done.problem, done.solution.q).tuned(noise_factors=factors))
     except FAILURES:
         return None
     found, problem = done.solution, done.problem

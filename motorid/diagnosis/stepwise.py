@@ -217,7 +217,7 @@ def _in_windows(found: Climb) -> Fit | None:
     if growth(last) < TOO_FAR or (part := in_windows(last)) is None:
         return None
     try:
-        return solve(part.problem.with_(model=first.model, balance={}))
+        return solve(part.problem.with_(model=first.model, noise_factors={}))
     except FAILURES:
         return None
 

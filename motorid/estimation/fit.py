@@ -222,17 +222,17 @@ def minimise(problem: Problem, effort: LevenbergMarquardt, callback: Callback = 
     found = restore_collapsed(by_continuation(problem, effort, callback, wide=wide), effort, callback)
     effort = replace(effort, looks=0)
     for k in range(REWEIGHTINGS):
-        balance = _rebalanced(found)
-        if balance is None:
+        factors = _reweighted(found)
+        if factors is None:
             break
         begin = found.problem.start_at(found.values) if k else problem
-        again = by_continuation(begin.tuned(balance=balance), effort, callback, wide=wide and k == 0)
+        again = by_continuation(begin.tuned(noise_factors=factors), effort, callback, wide=wide and k == 0)
         again = restore_collapsed(again, effort, callback)
         found = replace(again, history=found.history + again.history)
     return found
 
 
-def _rebalanced(found: Estimate) -> dict[str, float] | None:
+def _reweighted(found: Estimate) -> dict[str, float] | None:
     """Return factors on the noise of each channel where the model fails: their misfit; None where the weights suit.
 
     A model that cannot reach the noise would otherwise spend itself on the channel with the smallest noise
@@ -244,7 +244,7 @@ def _rebalanced(found: Estimate) -> dict[str, float] | None:
     if problem.weights != "noise" or problem.loss is not None or len(problem.outputs) < 2:
         return None
     factors = misfit_over_noise(problem, found.q)
-    relative = [factors[c] / problem.balance.get(c, 1.0) for c in factors]
+    relative = [factors[c] / problem.noise_factors.get(c, 1.0) for c in factors]
     return factors if max(relative) >= IMBALANCE * min(relative) else None
 
 
@@ -307,7 +307,7 @@ def in_windows(fit: Fit, solve: Callable[[Problem], Fit] = solve) -> Fit | None:
         enough = [r for r in problem.experiments if r.n > FEWEST * count]
         runs = tuple(p for r in enough for p in windows(r, longest / count))
         with contextlib.suppress(*FAILURES):
-            part = solve(problem.with_(experiments=runs, model=fit.model, balance={})) if runs else None
+            part = solve(problem.with_(experiments=runs, model=fit.model, noise_factors={})) if runs else None
             if part is not None and follows(part):
                 return part if growth(part) > TOO_FAR else None
     return None

@@ -88,7 +88,7 @@ def _shifted(problem: Problem, shift: float, seed: int) -> Problem:
 
 def _by_other_weights(problem: Problem, effort: LevenbergMarquardt) -> Problem:
     weights = "noise" if problem.weights == "rms" else "rms"
-    found = least_squares(problem.tuned(weights=weights, balance={}), effort.at_most(RACE))
+    found = least_squares(problem.tuned(weights=weights, noise_factors={}), effort.at_most(RACE))
     return problem.start_at(found.values)
 
 

@@ -22,7 +22,7 @@ from motorid.records.experiment import Experiment
 
 MOST_STEPS = 10_000_000  # of a simulation that a file asks for
 KINDS = {kind.__name__: kind for kind in (CurrentLimit, SteadyState, Huber, *ENGINES.values())}
-PLAIN = ("weights", "initial", "balance", "priors", "accuracy", "width")  # fields of a problem that are plain data
+PLAIN = ("weights", "initial", "noise_factors", "priors", "accuracy", "width")  # a problem's fields that are plain data
 OPTIONS = ("loss", "engine", "penalties", "constraints")  # and those that are objects
 KEPT = ("value", "vary", "given", "lower", "upper")  # fields of a parameter that may differ from the library's
 

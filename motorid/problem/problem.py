@@ -43,7 +43,7 @@ class Problem:
     initial : {"auto", "rest", "measured", "estimate"}
         What is known of the state at the first sample.
     engine : str or Engine
-    balance : mapping of str to float
+    noise_factors : mapping of str to float
         Factors on the noise per channel where the misfit, not the noise, decides (reweighting).
     accuracy : float, optional
         Local error of the integration relative to the largest state; by default a small part of the noise.
@@ -65,7 +65,7 @@ class Problem:
     weights: str = "noise"
     initial: str = "auto"
     engine: str | Engine = "rosenbrock"
-    balance: Mapping[str, float] = field(default_factory=dict)
+    noise_factors: Mapping[str, float] = field(default_factory=dict)
     accuracy: float | None = None
     width: float | None = None
     _runs: tuple[Run, ...] | None = field(default=None, repr=False)
@@ -229,7 +229,7 @@ class Problem:
     @cached_property
     def measured(self) -> tuple[Measured, ...]:
         """The records as residuals see them, one per run."""
-        return tuple(Measured.of(run, self.outputs, self.weights, self.balance) for run in self.runs)
+        return tuple(Measured.of(run, self.outputs, self.weights, self.noise_factors) for run in self.runs)
 
     def run_residual(self, k: int, traj: Trajectory) -> tuple[Array, Array | None]:
         """Return whitened residual and Jacobian, before the loss, of run `k`, without missing samples."""
@@ -296,7 +296,7 @@ class Problem:
         return self.for_model(self.model.start_at(values))
 
     def tuned(self, **fields: Any) -> Problem:
-        """Return the problem with another `balance`, `width` …; the records stay as prepared."""
+        """Return the problem with other `noise_factors`, another `width` …; the records stay as prepared."""
         return replace(self, **{"_runs": self.runs, **fields})
 
     def with_(self, **fields: Any) -> Problem:

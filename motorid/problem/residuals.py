@@ -31,13 +31,13 @@ class Measured(NamedTuple):
     name: str
 
     @staticmethod
-    def of(run: Run, outputs: Sequence[str], weights: str, balance: Mapping[str, float]) -> Measured:
-        """Return `run` with `weights` ``"noise"``, times what `balance` tells of each channel, or ``"rms"``."""
+    def of(run: Run, outputs: Sequence[str], weights: str, factors: Mapping[str, float]) -> Measured:
+        """Return `run` with `weights` ``"noise"``, times the factor of each channel, or ``"rms"``."""
         out = run.experiment.outputs
         y = np.column_stack([out.get(c, np.full(run.experiment.n, np.nan)) for c in outputs])
         noise = np.array([run.sigma.get(c, np.inf) for c in outputs])
         if weights == "noise":
-            size = noise * [balance.get(c, 1.0) for c in outputs]
+            size = noise * [factors.get(c, 1.0) for c in outputs]
         else:
             squares = [float(np.nanmean(out[c] ** 2)) if c in out else np.inf for c in outputs]
             size = np.sqrt(np.maximum(squares, 1e-300))

@@ -190,7 +190,7 @@ def test_a_form_answers_as_the_plant_does(lab):
     both = mi.simulate(plain.model, runs), mi.simulate(with_it, runs)
     for s, t, run in zip(*both, plain.problem.runs, strict=True):
         shifts.append(np.column_stack([(t.outputs[c] - s.outputs[c]) / run.sigma[c] for c in ANGLE]).ravel())
-    factors = [plain.problem.balance.get(c, 1.0) for c in ANGLE]
+    factors = [plain.problem.noise_factors.get(c, 1.0) for c in ANGLE]
     change = np.concatenate(shifts) / np.tile(factors, sum(r.n for r in runs))
     form = next(f for f in linear.forms if (f.on, f.carrier) == ("turn", ""))
     columns = np.concatenate([linear.forms[form], linear.own], axis=1)

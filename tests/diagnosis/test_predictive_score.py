@@ -78,7 +78,7 @@ def without(fit, rows):
     (run,) = problem.experiments
     hidden = run.with_(outputs={c: np.where(rows, np.nan, y) for c, y in run.outputs.items()})
     other = replace(problem.with_(experiments=(hidden,)), _runs=(replace(problem.runs[0], experiment=hidden),))
-    return solve(other.tuned(balance=problem.balance).for_model(fit.model), start="model")
+    return solve(other.tuned(noise_factors=problem.noise_factors).for_model(fit.model), start="model")
 
 
 def rms(r) -> float:

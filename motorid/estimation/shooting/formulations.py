@@ -163,7 +163,7 @@ def compare_formulations(problem: Problem | Fit, constraints: Sequence[Relation]
     """
     given = problem.problem if isinstance(problem, Fit) else problem
     relations = tuple(constraints if constraints is not None else given.constraints) or (SteadyState(),)
-    bare = replace(given, constraints=(), balance={})
+    bare = replace(given, constraints=(), noise_factors={})
     plain = solve(bare)
     penalty = _tried(lambda: solve(bare.with_(penalties=(*bare.penalties, *relations), weights="rms"),
                                    formulation="penalty"), plain)

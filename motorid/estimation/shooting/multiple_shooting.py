@@ -138,7 +138,7 @@ class MultipleShooting:
     def _loosely_joined(self, problem: Problem) -> Solved:
         """Solve with short intervals that need not join."""
         every, size = LOOSE
-        mesh = Mesh(problem.tuned(balance=_least_noise(problem)), every)
+        mesh = Mesh(problem.tuned(noise_factors=_least_noise(problem)), every)
         step = float(np.median([run.experiment.dt for run in problem.runs]))
         mesh = replace(mesh, noise=size * mesh.scale / np.sqrt(every * step))
         return self._solve(mesh, mesh.joined(problem.start, nodes_from_data(mesh, problem.start)), rough=True)
