@@ -179,7 +179,7 @@ class Search:
         if not found.worth_it:
             return None, candidate
         candidate = replace(candidate, reason=f"{candidate.reason}, but {objection}") if objection else candidate
-        return replace(child, candidate=candidate), candidate
+        return replace(child, reason=candidate.reason), candidate
 
     @staticmethod
     def listed(scores: Sequence[Score], judged: Mapping[str, Candidate], why: str = "") -> list[Candidate]:

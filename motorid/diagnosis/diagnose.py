@@ -91,7 +91,8 @@ def _told(found: Climb, driven: str, validated: bool, own: Sequence[Effect]) -> 
     names = tuple(g.effect for g in found.grades if g.grade != "approximates")
     ranking = found.rounds[0] if found.rounds else ()
     groups = tuple(g for g in found.groups if g[0] in names)
-    suggestion, form = None, found.form.form if found.form else None
+    forms, suggestion = tuple(f.form for f in found.forms), None
+    form = next(iter(forms), None)
     if form is not None:
         remaining = following(remaining, form.text)
     like = form or next((g.form for g in found.grades if g.form is not None), None)
@@ -114,8 +115,9 @@ def _told(found: Climb, driven: str, validated: bool, own: Sequence[Effect]) -> 
     kind = "structure" if not remaining.adequate else "fluctuation" if far(ladder.best) else "noise"
     details = tuple(t for t in (*details, *_remarks(found, driven)) if t)
     text = " ".join(t for t in (answer, *details, suggestion) if t)
+    remainder = Remainder(kind, ladder.best, forms, found.search.held)
     return Diagnosis(verdict, text, where, names, judged, missing, ranking, ladder, groups, suggestion, fit,
-                     ladder.best, remaining, Remainder(kind, ladder.best, form), found.stopped, answer, details)
+                     ladder.best, remaining, remainder, found.stopped, answer, details)
 
 
 def _remarks(found: Climb, driven: str) -> list[str]:

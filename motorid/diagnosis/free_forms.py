@@ -20,12 +20,16 @@ from motorid.estimation.result import Fit
 from motorid.numerics.signals import Array
 from motorid.problem.problem import Problem
 from motorid.problem.runs import angle_signal
-from motorid.problem.simulate import Simulation, simulated
+from motorid.problem.simulate import Simulation
 
-KNOTS = 9  # cosines over the range of a quantity
+KNOTS = 9  # cosines over the range of a time, twice as many over that of an angle
 HARMONICS = 8  # of a turn
 LINES = 2  # of the spectrum of the misfit over the angle
+PLACES = 12  # over a time or an angle at which something may set in
+SUDDEN = 60.0  # how quickly a curve over the time may step, per range
 SHARP = 1e-3  # of the highest speed: below it a direction is not known
+SOFT = 0.01  # of the largest current or voltage: the width of a jump at zero
+BENDS = (4, 12)  # times the largest speed, current or voltage goes a curve's bend into it
 CHANGES = {"t": "changes with the time", "turn": "changes with the angle within a turn",
            "theta": "changes with the angle", "omega": "changes with the speed", "i": "changes with the current",
            "v": "changes with the voltage", "run": "differs from run to run"}
@@ -56,34 +60,49 @@ class Form:
         return self.on in ("theta", "run")
 
 
-FORMS = (Form("a friction", "torque", "turn", "direction"), Form("a friction", "torque", "theta", "direction"),
-         Form("a friction", "torque", "t", "direction"), Form("a load", "torque", "turn"),
-         Form("a load", "torque", "theta"), Form("a load", "torque", "t"), Form("a drag", "torque", "t", "omega"),
-         Form("a drag", "torque", "turn", "omega"), Form("a torque", "torque", "omega"),
-         Form("a loss of voltage", "voltage", "omega"), Form("a loss of voltage", "voltage", "v"),
-         Form("a loss of voltage", "voltage", "i"), Form("a loss of voltage", "voltage", "t"),
-         Form("a resistance", "voltage", "t", "i"), Form("a motor constant", "both", "t"),
-         Form("a friction", "torque", "run", "direction"), Form("a load", "torque", "run"),
-         Form("a drag", "torque", "run", "omega"), Form("an inertia", "torque", "run", "acceleration"),
-         Form("a loss of voltage", "voltage", "run"), Form("a resistance", "voltage", "run", "i"),
-         Form("a motor constant", "both", "run"),
+_PUSHES = (  # words, balance, carrier, quantities
+    ("a friction", "torque", "direction", ("turn", "theta", "t", "run")),
+    ("a load", "torque", "", ("turn", "theta", "t", "run")),
+    ("a drag", "torque", "omega", ("t", "turn", "run")),
+    ("a torque", "torque", "", ("omega",)),
+    ("an inertia", "torque", "acceleration", ("turn", "t", "run")),
+    ("a loss of voltage", "voltage", "", ("omega", "v", "i", "t", "run")),
+    ("a gain of the voltage", "voltage", "v", ("t", "turn")),
+    ("a resistance", "voltage", "i", ("t", "turn", "run")),
+    ("a motor constant", "both", "", ("t", "turn", "omega", "i", "run")),
+)
+FORMS = (*(Form(words, balance, on, carrier) for words, balance, carrier, quantities in _PUSHES for on in quantities),
          Form("a gain of the speed sensor", "sensor", "turn", "omega", "omega"),
-         Form("an error of the angle sensor", "sensor", "turn", "", "theta"))
+         Form("an error of the angle sensor", "sensor", "turn", "", "theta"),
+         Form("an error of the speed sensor", "sensor", "omega", "", "omega"),
+         Form("an error of the current sensor", "sensor", "i", "", "i"))
 
 
-def ranges_of(signals: Sequence[Mapping[str, Array]]) -> dict[str, tuple[float, float]]:
-    """Return the smallest and the largest value of every quantity known in all runs."""
+@dataclass(frozen=True)
+class Span:
+    """What a form reaches over: the range of every quantity, and the orders of a turn."""
+
+    ranges: Mapping[str, tuple[float, float]]
+    orders: tuple[float, ...]
+
+
+def span_of(fit: Fit, signals: Sequence[Mapping[str, Array]]) -> Span:
+    """Return the smallest and the largest value of every quantity known in all runs, and orders of a turn."""
     names = set.intersection(*(set(s) for s in signals))
-    return {n: (min(float(s[n].min()) for s in signals), max(float(s[n].max()) for s in signals)) for n in names}
+    ranges = {n: (min(float(s[n].min()) for s in signals), max(float(s[n].max()) for s in signals)) for n in names}
+    return Span(ranges, tuple(orders_of(fit)))
 
 
 def shown(form: Form, fit: Fit, ranges: Mapping[str, tuple[float, float]]) -> bool:
     """Tell whether the records can show a form: its quantity is known, its balance is in the model."""
-    if form.channel and not {"omega", "theta"} <= set(fit.problem.outputs):
-        return False  # one measure of the motion needs the other to be told wrong
+    outputs = set(fit.problem.outputs)
+    if form.channel and not (form.channel in outputs and len(outputs) > 1):
+        return False  # one sensor needs another to be told wrong
+    if form.channel and form.carrier and not {"omega", "theta"} <= outputs:
+        return False  # a gain is the motor constant's, unless the motion is measured twice
     if form.on not in ranges or ranges[form.on][0] == ranges[form.on][1]:
         return False
-    if form.balance in ("voltage", "both") and "i" not in fit.problem.outputs:
+    if form.balance in ("voltage", "both") and "i" not in outputs:
         return False  # there a torque says the same
     return form.on != "turn" or fit.problem.model.axis != "linear"
 
@@ -95,40 +114,71 @@ def orders_of(fit: Fit) -> list[float]:
     return sorted({*range(1, HARMONICS + 1), *(round(k * n) for n in known for k in range(1, 5)), *map(round, seen)})
 
 
-def basis_of(
-    form: Form, signal: Mapping[str, Array], ranges: Mapping[str, tuple[float, float]], orders: Sequence[float]
-) -> Array:
-    """Return the form's functions along one run, (N, m)."""
-    low, high = ranges[form.on]
+def functions_of(form: Form, span: Span) -> list[str]:
+    """Return the functions that a form is made of, as source in its quantity z; `m.sign` is the model's smooth sgn."""
+    low, high = span.ranges[form.on]
+    if form.on == "turn":
+        return ["1.0", *(f"ca.{f}({k:.6g} * z)" for k in span.orders for f in ("sin", "cos"))]
+    inside = f"ca.fmin(ca.fmax(z, {low:.9g}), {high:.9g})"  # nothing is known beyond
+    if form.on in ("theta", "t"):
+        scale = f"{np.pi / (high - low):.9g} * ({inside} - {low:.9g})"
+        centres = np.linspace(low, high, PLACES + 2)[1:-1]
+        if form.on == "t":  # something sets in
+            sudden = [f"ca.tanh((z - {c:.9g}) * {SUDDEN / (high - low):.6g})" for c in centres]
+        else:  # a stop, a slack
+            sudden = ["z", *(f"ca.fmax(z - {c:.9g}, 0)" for c in centres)]
+        return ["1.0", *(f"ca.cos({k} * {scale})" for k in range(1, KNOTS if form.on == "t" else 2 * KNOTS)), *sudden]
+    top = max(abs(low), abs(high))
+    s = f"({inside} / {top:.6g})"
+    size = f"ca.fabs{s}"
+    smooth = [s, f"{s}**2", f"{s}**3", *(f"ca.tanh({k} * {s})" for k in BENDS)]
+    if not low < 0 < high:
+        return ["1.0", *smooth]
+    side = "m.sign(z)" if form.on == "omega" else f"ca.tanh(z / {SOFT * top:.6g})"
+    return [side, *smooth, f"{s} * {size}", "1.0", size, f"{size}**3", *(f"ca.tanh({k} * {size})" for k in BENDS)]
+
+
+class _Sheet:
+    """What the source of functions may ask of a model, for arrays."""
+
+    def __init__(self, width: float) -> None:
+        self.width = width
+
+    def sign(self, z: Array) -> Array:
+        return np.tanh(z / self.width)
+
+
+def values_of(functions: Sequence[str], z: Array, width: float) -> Array:
+    """Return functions given by their source at `z` (N,), (N, m); `width` is that of the smooth sgn."""
+    names = {"ca": np, "z": z, "m": _Sheet(width)}
+    return np.column_stack([np.broadcast_to(np.asarray(eval(f, names), float), z.shape) for f in functions])
+
+
+def slopes_over_turn(functions: Sequence[str]) -> list[str]:
+    """Return the slopes of functions over a turn, as source."""
+    slopes = []
+    for f in functions:
+        name, _, rest = f.partition("(")
+        k = rest.split(" *")[0]
+        slopes.append({"ca.sin": f"{k} * ca.cos({rest}", "ca.cos": f"-{k} * ca.sin({rest}"}.get(name, "0.0"))
+    return slopes
+
+
+def basis_of(form: Form, signal: Mapping[str, Array], span: Span) -> Array:
+    """Return the form's functions, times its carrier, along one run, (N, m)."""
     z = signal[form.on]
-    if form.on not in ("turn", "run"):
-        z = np.clip(z, low, high)  # nothing is known beyond
     if form.on == "run":
-        functions = (signal["run"][:, None] == np.arange(int(high) + 1)).astype(float)
-    elif form.on == "turn":
-        waves = [f(k * z) for k in orders for f in (np.sin, np.cos)]
-        functions = np.column_stack([np.ones_like(z), *waves])
-    elif form.on in ("omega", "i", "v"):
-        functions = _through_zero(z, max(abs(low), abs(high)))
+        functions = (z[:, None] == np.arange(int(span.ranges["run"][1]) + 1)).astype(float)
     else:
-        count = KNOTS if form.on == "t" else 2 * KNOTS
-        functions = np.column_stack([np.cos(np.pi * k * (z - low) / (high - low)) for k in range(count)])
-    if form.carrier == "direction" and "direction" in signal:
-        return functions * signal["direction"][:, None]
-    if form.carrier == "direction":
-        top = max(abs(x) for x in ranges["omega"])
-        return functions * np.clip(signal["omega"] / (SHARP * top), -1, 1)[:, None]
+        width = float(signal["width"][0])
+        source = functions_of(form, span)
+        functions = values_of(source, z, width)
+        if form.carrier == "acceleration" and form.on == "turn":  # kinetic energy that changes with the angle
+            return functions * signal["acceleration"][:, None] + (
+                signal["energy"][:, None] * values_of(slopes_over_turn(source), z, width))
     return functions * signal[form.carrier][:, None] if form.carrier else functions
 
 
-def _through_zero(z: Array, top: float) -> Array:
-    """Return odd and even functions of a quantity with a sign, kinks and jumps at zero included."""
-    size, side = np.abs(z) / top, np.clip(z / (SHARP * top), -1, 1)
-    powers = np.column_stack([size**p for p in (0.0, 0.5, 1.0, 2.0, 3.0, 4.0)])
-    return np.column_stack([powers * side[:, None], powers])
-
-
-START = 0.01  # of the natural torque
 BALANCES = ("voltage", "torque")
 STATES = {"torque": "omega", "voltage": "i"}  # whose rate a balance is
 NUDGE = 1e-3  # of a size
@@ -144,6 +194,7 @@ class Linear:
     residual : ndarray, shape (n,)
     slopes : ndarray, shape (n, number of free parameters)
     own : ndarray, shape (n, number of estimated initial states)
+        To half of the range in which each may lie.
     forms : dict of Form to ndarray, shape (n, number of coefficients)
     place, channel : ndarray, shape (n,)
         Of each residual: where in its run it is, from 0 to 1, and which output.
@@ -162,59 +213,58 @@ class Linear:
                       {f: c[rows] for f, c in self.forms.items()}, self.place[rows], self.channel[rows])
 
 
-def linearised(fit: Fit, validation: Problem | None, balance: Mapping[str, float] | None = None) -> list[Linear]:
-    """Return the model of `fit` on its own records and, if given, on held-out ones, the same forms over both.
-
-    `balance` gives other weights of the channels than the fit's own.
+def linearised(fit: Fit, only: Form | None = None, span: Span | None = None) -> Linear:
+    """Return the model of `fit` on its records, with the forms that these can show, or `only` one over a span.
 
     Raises
     ------
     SimulationError
     """
-    problem = fit.problem.tuned(noise_factors=fit.problem.noise_factors if balance is None else balance)
-    known = [_on(problem, fit, fit.simulations)]
-    if validation is not None:
-        other = validation.for_model(fit.model).tuned(noise_factors=problem.noise_factors)
-        known.append(_on(other, fit, simulated(other)))
-    signals = [[signals_of(fit, p, s, k) for k, s in enumerate(sims)] for p, sims, _, _ in known]
-    ranges, orders = ranges_of(signals[0]), orders_of(fit)
-    forms = [f for f in FORMS if shown(f, fit, ranges)]
-    free, p = len(fit.problem.model.free_names), np.array([fit.values[p] for p in problem.system.parameters])
-    found = []
-    for (problem, sims, residual, jac), signal in zip(known, signals, strict=True):
-        n, runs = problem.n_outputs, range(len(sims))
-        answers = responses_of(problem, p, sims)
-        bases = [{f: basis_of(f, s, ranges, orders) for f in forms} for s in signal]
-        parts = [_answers(problem, k, answers[k], bases[k]) for k in runs]
-        columns = {f: np.vstack([part[f] for part in parts]) for f in forms}
-        place, channel = np.concatenate([_labels(problem, k) for k in runs], axis=1)
-        found.append(Linear(residual[:n], jac[:n, :free], jac[:n, free:], columns, place, channel))
-    return found
+    problem = fit.problem
+    residual, jac = _at(problem, fit)
+    signals = signals_along(fit)
+    span = span or span_of(fit, signals)
+    forms = [f for f in FORMS if shown(f, fit, span.ranges)] if only is None else [only]
+    free, n, runs = len(problem.model.free_names), problem.n_outputs, range(len(signals))
+    answers = responses_of(problem, parameter_vector(fit), fit.simulations)
+    bases = [{f: basis_of(f, signal, span) for f in forms} for signal in signals]
+    parts = [_answers(problem, k, answers[k], bases[k]) for k in runs]
+    columns = {f: np.vstack([part[f] for part in parts]) for f in forms}
+    place, channel = np.concatenate([_labels(problem, k) for k in runs], axis=1)
+    own = jac[:n, free:] * [reach if np.isfinite(reach := 0.5 * (p.upper - p.lower)) else 1.0
+                            for p in problem.unknown[free:]]
+    return Linear(residual[:n], jac[:n, :free], own, columns, place, channel)
 
 
-Judged = tuple[Problem, Sequence[Simulation], Array, Array]
-
-
-def _on(problem: Problem, fit: Fit, sims: Sequence[Simulation]) -> Judged:
-    """Return records, the fitted model's simulation of them, residual and slopes (SI)."""
-    first = {f"{c}_0[{k}]": float(y[0]) for k, s in enumerate(sims) for c, y in s.states.items()}
+def _at(problem: Problem, fit: Fit) -> tuple[Array, Array]:
+    """Return residual and slopes (SI) of the fitted model, without loss and priors."""
+    first = {f"{c}_0[{k}]": float(y[0]) for k, s in enumerate(fit.simulations) for c, y in s.states.items()}
     values = {**fit.values, **first}
     q = problem.scaling.scaled([values.get(p.name, p.value) for p in problem.unknown])
-    runs = problem.refined(q).runs
-    problem = replace(problem, loss=None, priors={}, penalties=(), _runs=runs)
+    problem = replace(problem, loss=None, priors={}, penalties=(), _runs=problem.refined(q).runs)
     residual, jac = problem.residual_and_jacobian(q)
-    return problem, sims, residual, jac / problem.scaling.slope(q)
+    return residual, jac / problem.scaling.slope(q)
+
+
+def signals_along(fit: Fit) -> list[dict[str, Array]]:
+    """Return what a form may be a function of, along each run of a fit."""
+    return [signals_of(fit, fit.problem, s, k) for k, s in enumerate(fit.simulations)]
 
 
 def signals_of(fit: Fit, problem: Problem, sim: Simulation, k: int) -> dict[str, Array]:
-    """Return what a form may be a function of, along run `k`, (N,) each; the direction as smooth as the model's own."""
+    """Return what a form may be a function of, along run `k`, (N,) each; the direction as smooth as the model's own.
+
+    ``"width"`` is that of the smooth sgn.
+    """
     run = problem.experiments[k]
-    found = {"t": run.t - run.t[0], "v": run.inputs["v"], "run": np.full(run.n, float(k))}
+    found = {"t": run.t - run.t[0], "v": run.inputs["v"], "run": np.full(run.n, float(k)), "width": np.ones(run.n)}
     found |= {c: np.asarray(sim.states[c]) for c in ("i", "omega") if c in sim.states}
     if "omega" in found:
-        if (width := fit.values.get("sgn_width")) is not None:
-            found["direction"] = np.tanh(found["omega"] / width)
-        found["acceleration"] = np.gradient(found["omega"], run.t)
+        top = max(float(np.abs(s.states["omega"]).max()) for s in fit.simulations)
+        width = fit.values.get("sgn_width") or SHARP * top + 1e-300
+        found["width"], found["direction"] = np.full(run.n, width), np.tanh(found["omega"] / width)
+        found["acceleration"] = fit.values["J"] * np.gradient(found["omega"], run.t)  # of a relative inertia
+        found["energy"] = 0.5 * fit.values["J"] * found["omega"] ** 2
     if "theta" in run.outputs or "omega" in run.outputs:
         found["theta"] = found["turn"] = angle_signal(run)
     return found
@@ -273,13 +323,13 @@ def _labels(problem: Problem, k: int) -> Array:
     return both if index is None else both[:, index]
 
 
-def form_coefficients(fit: Fit, linear: Linear, form: Form) -> Array:
-    """Return the coefficients of a free form's functions that beside `fit` explain its records best."""
+def form_coefficients(fit: Fit, linear: Linear, form: Form, kept: Sequence[int] | None = None) -> Array:
+    """Return the coefficients of a form's functions, of all or those `kept`, that beside `fit` explain most."""
     columns, sizes = form_columns(fit, linear, form)
-    together = np.column_stack([columns, linear.own])
-    found = ridge(together, linear.residual)
     first = linear.slopes.shape[1]
-    return found[first : first + len(sizes)] * sizes
+    chosen = list(range(len(sizes)) if kept is None else kept)
+    together = np.column_stack([columns[:, :first], columns[:, first:][:, chosen], linear.own])
+    return ridge(together, linear.residual)[first : first + len(chosen)] * sizes[chosen]
 
 
 def form_columns(fit: Fit, linear: Linear, form: Form) -> tuple[Array, Array]:
@@ -307,48 +357,59 @@ def ridge(columns: Array, residual: Array) -> Array:
 
 
 def contains(fit: Fit, form: Form, size: str) -> bool:
-    """Tell whether a form in the balance of an effect can be the effect whose size is the parameter `size`.
+    """Tell whether a form in the place of an effect can be the effect whose size is the parameter `size`.
 
-    What the size puts into the balance along the model's trajectory is compared with the form's functions there.
+    What the size puts into the balance, or adds to the output, along the model's trajectory is compared with the
+    form's functions there.
     """
-    if STATES.get(form.balance) not in fit.problem.system.states or size not in fit.problem.system.parameters:
-        return False
-    signals = [signals_of(fit, fit.problem, s, k) for k, s in enumerate(fit.simulations)]
-    ranges, orders = ranges_of(signals), orders_of(fit)
-    if not shown(form, fit, ranges):
+    signals = signals_along(fit)
+    span = span_of(fit, signals)
+    if size not in fit.problem.system.parameters or not shown(form, fit, span.ranges):
         return False
     push = pushes_of(fit, size)
-    whole, own = float(np.sum(push**2)), push[:, fit.problem.system.states.index(STATES[form.balance])]
-    basis = np.concatenate([basis_of(form, s, ranges, orders) for s in signals])
+    place = _place(fit, form)
+    if place is None:
+        return False
+    whole, own = float(np.sum(push**2)), push[:, place]
+    basis = np.concatenate([basis_of(form, s, span) for s in signals])
     left = own - basis @ np.linalg.lstsq(basis, own, rcond=1e-9)[0]
     return float(left @ left) + whole - float(own @ own) < CONTAINED**2 * whole
 
 
+def _place(fit: Fit, form: Form) -> int | None:
+    """Return the column of `pushes_of` in which a form acts, None where it is in none or in two."""
+    states = fit.problem.system.states
+    if form.balance == "sensor":
+        return len(states) + fit.problem.outputs.index(form.channel)
+    state = STATES.get(form.balance)
+    return states.index(state) if state in states else None
+
+
 def pushes_of(fit: Fit, name: str) -> Array:
-    """Return what a small change of a parameter adds to the rate of each state along all runs, (N, nx)."""
+    """Return what a small change of a parameter adds to each state's rate and to each output, (N, nx + ny)."""
     system, values = fit.problem.system, parameter_vector(fit)
     nudged = values.copy()
     nudged[system.parameters.index(name)] += NUDGE * (abs(fit.values[name]) or 1.0)
     found = []
     for run, sim in zip(fit.problem.runs, fit.simulations, strict=True):
         x, u = np.column_stack([sim.states[s] for s in system.states]).T, run.grid.u.T
-        was, now = (np.asarray(system.rhs.map(x.shape[1])(x, u, np.tile(p[:, None], (1, x.shape[1]))))
-                    for p in (values, nudged))
+        was, now = (np.vstack([np.asarray(f.map(x.shape[1])(x, u, np.tile(p[:, None], (1, x.shape[1]))))
+                               for f in (system.rhs, system.out)]) for p in (values, nudged))
         found.append((now - was).T)
     return np.concatenate(found)
 
 
 def force_of(fit: Fit, form: Form) -> float:
-    """Return the torque or voltage of a free form that beside `fit` explains its records best, RMS along all runs."""
-    signals = [signals_of(fit, fit.problem, s, k) for k, s in enumerate(fit.simulations)]
-    ranges, orders = ranges_of(signals), orders_of(fit)
-    basis = np.concatenate([basis_of(form, s, ranges, orders) for s in signals])
-    force = basis @ form_coefficients(fit, linearised(fit, None)[0], form)
+    """Return what a free form that beside `fit` explains its records best amounts to, RMS along all runs."""
+    signals = signals_along(fit)
+    span = span_of(fit, signals)
+    basis = np.concatenate([basis_of(form, s, span) for s in signals])
+    force = basis @ form_coefficients(fit, linearised(fit, form), form)
     return float(np.sqrt(np.mean(force**2)))
 
 
 def effect_force(fit: Fit, form: Form, size: str) -> float:
-    """Return the torque or voltage of the effect of that size in the balance of a form, RMS along all runs."""
-    state = STATES[form.balance]
-    rate = pushes_of(fit, size)[:, fit.problem.system.states.index(state)] / NUDGE
-    return float(np.sqrt(np.mean(rate**2))) * fit.values["J" if state == "omega" else "L"]
+    """Return what the effect of that size does in the place of a form, RMS along all runs."""
+    rate = pushes_of(fit, size)[:, _place(fit, form)] / NUDGE
+    inertia = {"torque": "J", "voltage": "L"}.get(form.balance)
+    return float(np.sqrt(np.mean(rate**2))) * (fit.values[inertia] if inertia else 1.0)

@@ -15,7 +15,7 @@ import numpy as np
 
 from motorid.diagnosis.admissibility import objections
 from motorid.diagnosis.free_forms import Form, Linear, contains, effect_force, force_of, form_columns, linearised, ridge
-from motorid.diagnosis.model_comparison import Node
+from motorid.diagnosis.model_comparison import Node, evidence
 from motorid.diagnosis.predictive_score import (
     Evidence,
     Predictions,
@@ -25,12 +25,15 @@ from motorid.diagnosis.predictive_score import (
     left_out,
     stacked_labels,
 )
-from motorid.diagnosis.thresholds import SUPPLANTS, TRIFLE
+from motorid.diagnosis.thresholds import MOST, SUPPLANTS, TRIFLE
+from motorid.display.numbers import percent
 from motorid.estimation.least_squares import FAILURES
 from motorid.estimation.result import Fit
 from motorid.model.definition import Effect
 from motorid.records.checks import current_limit
 
+INSEPARABLE = 0.02  # of what a function does to the outputs: what all else in the model must not be able to do
+AHEAD = 3  # functions of a curve that may help only together
 LIMITER = "driver_current_limit"
 
 
@@ -50,7 +53,7 @@ def best_form(fit: Fit, rival: Predictions) -> FormGain | None:
 def better_forms(fit: Fit, rival: Predictions) -> list[FormGain]:
     """Return the forms that added to `fit` predict better than `rival`, the best first."""
     try:
-        linear = linearised(fit, None)[0]
+        linear = linearised(fit)
     except FAILURES:
         return []
     gains = []
@@ -62,10 +65,15 @@ def better_forms(fit: Fit, rival: Predictions) -> list[FormGain]:
     return sorted(gains, key=lambda g: -g.evidence.gain)
 
 
-def form_predictions(fit: Fit, linear: Linear, form: Form) -> Predictions | None:
-    """Return what `fit` with a free form predicts of blocks left out, by its slopes; None where they lead nowhere."""
-    problem = fit.problem
+def form_predictions(fit: Fit, linear: Linear, form: Form, kept: Sequence[int] | None = None) -> Predictions | None:
+    """Return what `fit` with a free form, or those functions of it, predicts of blocks left out, by its slopes.
+
+    None where they lead nowhere.
+    """
+    problem, first = fit.problem, linear.slopes.shape[1]
     columns, _ = form_columns(fit, linear, form)
+    if kept is not None:
+        columns = np.column_stack([columns[:, :first], columns[:, first:][:, list(kept)]])
     together = np.column_stack([columns, linear.own])
     try:
         residual = linear.residual - together @ ridge(together, linear.residual)
@@ -74,6 +82,36 @@ def form_predictions(fit: Fit, linear: Linear, form: Form) -> Predictions | None
     except np.linalg.LinAlgError:
         return None
     return Predictions(by_channel(problem, moved, blocks), {}) if np.isfinite(moved).all() else None
+
+
+def chosen_functions(fit: Fit, linear: Linear, form: Form) -> list[int]:
+    """Return the fewest functions of a form that beside `fit` predict blocks left out, the most useful first.
+
+    Orthogonal matching pursuit (Pati, Rezaiifar & Krishnaprasad 1993): each time the function that takes most of what
+    is left, until the next is not worth it. What the model's own parameters do already is none.
+    """
+    columns, _ = form_columns(fit, linear, form)
+    known, answers = np.split(columns, [linear.slopes.shape[1]], axis=1)
+    known = np.linalg.svd(known[:, np.linalg.norm(known, axis=0) > 0], full_matrices=False)[0]
+    left, sizes = answers - known @ (known.T @ answers), np.linalg.norm(answers, axis=0)
+    residual = linear.residual - known @ (known.T @ linear.residual)
+    chosen: list[int] = []
+    ahead: list[int] = []
+    before = form_predictions(fit, linear, form, ())
+    while before is not None and len(ahead) < AHEAD:
+        norms = np.linalg.norm(left, axis=0)
+        free = norms > INSEPARABLE * sizes
+        taken = np.where(free, np.abs(residual @ left) / np.where(free, norms, 1.0), 0.0)
+        best = int(np.argmax(taken))
+        if not taken[best] > 0:
+            break
+        ahead, unit = [*ahead, best], left[:, best] / norms[best]
+        left, residual = left - np.outer(unit, unit @ left), residual - unit * (unit @ residual)
+        left[:, best] = 0.0
+        after = form_predictions(fit, linear, form, [*chosen, *ahead])
+        if after is not None and compare(before, after).worth_it:
+            chosen, before, ahead = [*chosen, *ahead], after, []
+    return chosen
 
 
 @dataclass(frozen=True)
@@ -91,8 +129,8 @@ def grades_of(last: Node, root: Node, groups: Sequence[Sequence[str]], beside: S
     """Return the grade of each effect that `last` has and `root` has not.
 
     A rung that predicts better stays, whatever it is. Its effect is *named* if its law is physical there, no rival
-    predicts as well, and no free form that contains it, or in its place, predicts better by more than the trifle
-    that a free curve follows in any real motor.
+    predicts as well, no free form that contains it, or in its place, predicts better by more than the trifle
+    that a free curve follows in any real motor, and it explains more than it leaves, unless that is noise.
 
     Parameters
     ----------
@@ -112,12 +150,16 @@ def grades_of(last: Node, root: Node, groups: Sequence[Sequence[str]], beside: S
     for e in (e for e in last.fit.model.effects if e.name not in root.key):
         why, form = objections(last.fit, e, root.fit), None
         why = why or ("it may only stand in for the driver's current limit" if limited else "")
-        if not why and structure and (smaller := without(e.name)) is not None:
+        smaller = without(e.name) if structure and not why else None
+        if smaller is not None:
             free = [b for b in beside if _swallows(last.fit, b.form, e)] or better_forms(smaller.fit, last.predictions)
             told = [b for b in free if b.evidence.fall > SUPPLANTS]
             better = next((b for b in told if beside and b.form == beside[0].form), told[0] if told else None)
+            taken = 1 - (1 - max(evidence(smaller, last).fall, 0.0)) ** 2
             if better is not None:
                 form, why = better.form, f"{better.form.text}, which the library lacks, predicts better in its place"
+            elif taken < MOST:
+                why = f"it takes {percent(taken, 2)} of the squared error, and what is left is not noise"
         kind = "approximates" if why else "group" if rivals.get(e.name) else "named"
         found.append(Grade(e.name, kind, why, form))
     return tuple(found)

@@ -11,7 +11,6 @@ from functools import lru_cache
 
 from motorid.diagnosis.cross_validation import HeldOut
 from motorid.diagnosis.predictive_score import Evidence, Predictions, compare
-from motorid.diagnosis.results import Candidate
 from motorid.diagnosis.thresholds import LARGER
 from motorid.estimation.result import Fit
 
@@ -24,15 +23,15 @@ class Node:
     """One model in the search: its fit, and what it predicts of data that it was not fitted to.
 
     `objection` says why its last effect is not the thing itself, whatever it predicts: a wrong sign, a shape at its
-    limit; empty if it may be.
+    limit; empty if it may be. `reason` says what it gained on its parent.
     """
 
     fit: Fit
     added: str | None
     predictions: Predictions
     parent: Node | None = None
-    candidate: Candidate | None = None
     objection: str = ""
+    reason: str = ""
 
     @property
     def key(self) -> frozenset[str]:

@@ -1,48 +1,55 @@
 """What is left beside all effects of a model: noise, fluctuation, or structure that an effect of its own takes up.
 
 Structure comes as a curve over one quantity, in one balance: an effect like any other, to add, fit, look at and export,
-and as source to edit and to name.
+and as source to edit and to name. Slopes propose the curves, the best are fitted with the rest of the model, and what
+then predicts best is the answer.
 """
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
+from motorid.diagnosis.cross_validation import HeldOut
 from motorid.diagnosis.free_forms import (
-    STATES,
     Form,
-    basis_of,
+    Span,
     form_coefficients,
+    functions_of,
     linearised,
-    orders_of,
-    pushes_of,
-    ranges_of,
-    signals_of,
+    signals_along,
+    slopes_over_turn,
+    span_of,
+    values_of,
 )
+from motorid.diagnosis.misspecification import chosen_functions
+from motorid.diagnosis.model_comparison import far
+from motorid.diagnosis.predictive_score import compare
+from motorid.diagnosis.refit import refit
 from motorid.display.numbers import number, percent
 from motorid.errors import UsageError
+from motorid.estimation.least_squares import FAILURES
 from motorid.estimation.result import Fit
 from motorid.model.definition import Effect, P
 from motorid.model.equations import Equations
+from motorid.numerics.parallel import one_thread
 from motorid.numerics.signals import Array
 
 WHERE = {"torque": "mechanical", "voltage": "electrical", "both": "electrical", "sensor": "sensor"}
-ORDERS = 8  # of a turn, the strongest, that the curve keeps
-COSINES = 9  # over the range of a time or an angle
-INSEPARABLE = 0.02  # of a function: what the model's own parameters and the curve's others must not be able to do
-SOFT = 0.01  # of the largest current or voltage: the width of a jump at zero
+TRIED = 4  # curves that are fitted, those that promise most
+ROUNDS = 3  # of choosing functions and fitting: near the optimum slopes show what the misfit hid before
 QUANTITIES = {"turn": "m.theta", "theta": "m.theta", "omega": "m.omega", "i": "m.i", "v": "m.v"}
-UNITS = {"turn": "rad", "theta": "rad", "omega": "rad/s", "i": "A", "v": "V", "t": "s"}
+CARRIERS = {"": "", "direction": "m.sign(m.omega) * ", "omega": "m.omega * ", "i": "m.i * ", "v": "m.v * "}
 
 
 @dataclass(frozen=True)
-class Curve:
+class Law:
     """A law given by its source: functions of one quantity with a coefficient each. Plain data, so it travels."""
 
     source: str
@@ -50,6 +57,137 @@ class Curve:
     def __call__(self, m: Equations, **coefficients: Any) -> None:
         """Write the law on the sheet `m`."""
         exec(self.source, {"ca": ca, "m": m, **coefficients})
+
+
+@dataclass(frozen=True, eq=False)
+class Curve:
+    """A free form beside a model, of as few functions as its records ask for.
+
+    Attributes
+    ----------
+    fit : Fit
+        Of the model without the curve.
+    form : Form
+    coefficients : dict of int to float
+        Of the form's functions, those that are in the curve.
+    fitted : Fit or None
+        Of the model with the curve.
+    name : str
+    """
+
+    fit: Fit
+    form: Form
+    coefficients: Mapping[int, float] = field(default_factory=dict)
+    fitted: Fit | None = None
+    name: str = "remainder"
+
+    @property
+    def effect(self) -> Effect:
+        """The curve as an effect."""
+        parameters = tuple(P(c, self.unit, null=0.0, doc="coefficient of the curve").named(n)
+                           for n, c in self.sizes.items())
+        return Effect(self.name, Law(self.law), parameters, self.balance, f"What is left: {self.form.text}.")
+
+    @property
+    def sizes(self) -> dict[str, float]:
+        """The coefficients by name."""
+        return {f"{self.name}_{k}": c for k, c in enumerate(self.coefficients.values())}
+
+    @property
+    def balance(self) -> str:
+        """The balance of the effect."""
+        return "voltage" if self.form.balance == "both" else self.form.balance
+
+    @property
+    def code(self) -> str:
+        """The curve as Python source of an effect."""
+        pars = [f'    {n}=mi.P({c:.9g}, "{self.unit}", null=0.0),' for n, c in self.sizes.items()]
+        known = [f"    Nearest closed form: {text} (misses {percent(miss, 2)} of the curve)."
+                 for text, miss in self.nearest()[:1]]
+        return "\n".join(["import casadi as ca", "", "import motorid as mi", "", "",
+                          f'@mi.effect(balance="{self.balance}")', f"def {self.name}(", "    m,", *pars, "):",
+                          f'    """What is left of the misfit: {self.form.text}.', *(["", *known, ""] if known else []),
+                          '    """', *("    " + line if line else "" for line in self.law.splitlines()), ""])
+
+    def nearest(self) -> list[tuple[str, float]]:
+        """Return closed forms beside the curve, the nearest first: in words with its size, and the share missed."""
+        z, value = self.points
+        found = [_closed(text, columns, value, self.unit) for text, columns in _closed_forms(self.form.on, z)]
+        return sorted(found, key=lambda f: f[1])
+
+    @cached_property
+    def points(self) -> tuple[Array, Array]:
+        """The quantity at the samples of all runs, and the curve there."""
+        z = np.concatenate([s[self.form.on] for s in self._signals])
+        width = float(self._signals[0]["width"][0])
+        return z, values_of(self._terms, z, width) @ np.array(list(self.coefficients.values()))
+
+    @cached_property
+    def _signals(self) -> list[dict[str, Array]]:
+        return signals_along(self.fit)
+
+    @cached_property
+    def _span(self) -> Span:
+        return span_of(self.fit, self._signals)
+
+    @property
+    def _terms(self) -> list[str]:
+        functions = functions_of(self.form, self._span)
+        return [functions[k] for k in self.coefficients]
+
+    def grown(self) -> Curve | None:
+        """Return the curve with the functions that by their slopes predict more, fitted with the model; None for none.
+
+        Raises
+        ------
+        FitError, SimulationError, ModelError
+        """
+        last = self.fitted or self.fit
+        linear = linearised(last, self.form, self._span)
+        more = chosen_functions(last, linear, self.form)
+        if not more:
+            return None
+        free = form_coefficients(last, linear, self.form, more)
+        added = dict(zip(more, map(float, free), strict=True))
+        curve = replace(self, coefficients={**self.coefficients, **added})
+        without = curve.sizes | dict.fromkeys(list(curve.sizes)[len(self.coefficients):], 0.0)
+        done = refit(last, self.fit.model + curve.effect, (curve.sizes, without))
+        if done is None:
+            return None
+        values = (done.values[n] for n in curve.sizes)
+        return replace(curve, coefficients=dict(zip(curve.coefficients, values, strict=True)), fitted=done)
+
+    @property
+    def unit(self) -> str:
+        """Of the coefficients."""
+        form = self.form
+        if form.carrier == "acceleration":
+            return "1"
+        if form.balance == "sensor":
+            return {"theta": "rad", "omega": "rad/s", "i": "A"}[form.channel] if not form.carrier else "1"
+        torque = "N" if self.fit.model.axis == "linear" else "N·m"
+        over = {"": "", "direction": "", "omega": "·s/rad", "i": "/A", "v": "/V"}[form.carrier]
+        return "1" if (form.balance, form.carrier) == ("voltage", "v") else {
+            "torque": torque, "voltage": "V", "both": f"{torque}/A"}[form.balance] + over
+
+    @property
+    def law(self) -> str:
+        """The law as source."""
+        form, names = self.form, list(self.sizes)
+        lines = ["z = m.state('clock')", "m.rate(z, 1.0)"] if form.on == "t" else [f"z = {QUANTITIES[form.on]}"]
+        lines += ["curve = (", *(f"    + {n} * {t}" for n, t in zip(names, self._terms, strict=True)), ")"]
+        if form.carrier == "acceleration" and form.on == "turn":  # kinetic energy that changes with the angle
+            slopes = slopes_over_turn(self._terms)
+            lines += ["slope = (", *(f"    + {n} * {t}" for n, t in zip(names, slopes, strict=True)), ")",
+                      "m.torque -= 0.5 * m.J / (1 + curve) * slope * m.omega**2"]
+        if form.carrier == "acceleration":
+            return "\n".join([*lines, "m.scale('J', 1 + curve)"])
+        if form.balance == "both":
+            return "\n".join([*lines, "m.torque -= curve * m.i", "m.voltage += curve * m.omega"])
+        carrier = CARRIERS[form.carrier]
+        if form.balance == "sensor":
+            return "\n".join([*lines, f"m.measure('{form.channel}', m.measured('{form.channel}') - {carrier}curve)"])
+        return "\n".join([*lines, f"m.{form.balance} -= {carrier}curve"])
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,13 +200,19 @@ class Remainder:
         ``fluctuation``: larger than the noise of the sensors, and nothing predicts it; ``structure``: predictable.
     fit : Fit
         Of the model that leaves it.
-    form : Form or None
-        The free form that predicts most of it.
+    forms : tuple of Form
+        Free forms that predict something of it, the best first.
     """
 
     kind: str
     fit: Fit
-    form: Form | None = None
+    forms: tuple[Form, ...] = ()
+    _held: HeldOut | None = field(default=None, repr=False)
+
+    @property
+    def form(self) -> Form | None:
+        """The free form that by its slopes predicts most of it."""
+        return self.forms[0] if self.forms else None
 
     @property
     def where(self) -> str | None:
@@ -83,19 +227,14 @@ class Remainder:
     def as_effect(self, name: str = "remainder") -> Effect:
         """Return what is left as an effect: a curve to add to the model, ``fit.model + found.remainder.as_effect()``.
 
+        The first call fits the model with each of the best curves and takes a few seconds.
+
         Raises
         ------
         UsageError
             If nothing is left that a curve could describe.
         """
-        unit = self._unit
-        parameters = tuple(
-            P(float(c), unit, null=0.0, doc="coefficient of the curve").named(n)
-            for n, c in zip(self._names(name), self._coefficients, strict=True)
-        )
-        form = self._needed
-        balance = "voltage" if form.balance == "both" else form.balance
-        return Effect(name, Curve(self._law(self._names(name))), parameters, balance, f"What is left: {form.text}.")
+        return self._named(name).effect
 
     def code(self, name: str = "remainder") -> str:
         """Return the effect as Python source, for ``--effects-from FILE.py`` or a notebook: to edit and to name.
@@ -105,163 +244,59 @@ class Remainder:
         UsageError
             If nothing is left that a curve could describe.
         """
-        form, names = self._needed, self._names(name)
-        balance = "voltage" if form.balance == "both" else form.balance
-        pars = [f'    {n}=mi.P({float(c):.6g}, "{self._unit}", null=0.0),'
-                for n, c in zip(names, self._coefficients, strict=True)]
-        body = ["    " + line if line else "" for line in self._law(names).splitlines()]
-        known = [f"    Nearest closed form: {text} (misses {percent(miss, 2)} of the curve)."
-                 for text, miss in self.nearest()[:1]]
-        return "\n".join(["import casadi as ca", "", "import motorid as mi", "", "", f'@mi.effect(balance="{balance}")',
-                          f"def {name}(", "    m,", *pars, "):",
-                          f'    """What is left of the misfit: {form.text}.', *(["", *known, ""] if known else []),
-                          '    """', *body, ""])
+        return self._named(name).code
 
     def nearest(self) -> list[tuple[str, float]]:
         """Return closed forms beside the curve, the nearest first: in words with its size, and the share missed."""
-        z, value = self.curve
-        found = [_closed(text, columns, value, self._unit) for text, columns in _closed_forms(self._needed.on, z)]
-        return sorted(found, key=lambda f: f[1])
+        return self._chosen.nearest()
 
-    @cached_property
+    @property
+    def fitted(self) -> Fit:
+        """The model with the curve, fitted to the same records."""
+        assert self._chosen.fitted is not None
+        return self._chosen.fitted
+
+    @property
     def curve(self) -> tuple[Array, Array]:
         """The quantity at the samples of all runs, and the missing torque, voltage or error there, SI."""
-        form, basis = self._needed, []
-        bare = replace(form, carrier="")
-        for signal in self._signals:
-            basis.append(basis_of(bare, signal, self._ranges, self._orders))
-        z = np.concatenate([s[form.on] for s in self._signals])
-        return z, np.concatenate(basis) @ self._free
+        return self._chosen.points
 
-    @property
-    def _needed(self) -> Form:
-        if self.form is None:
+    def _named(self, name: str) -> Curve:
+        return replace(self._chosen, name=name)
+
+    @cached_property
+    def _chosen(self) -> Curve:
+        """The curve with which the model, fitted anew, predicts best."""
+        if self.kind != "structure":
             raise UsageError(f"the remainder is {self.kind}: nothing is left that a curve over a quantity predicts.")
-        if self.form.on == "run" or self.form.carrier == "acceleration":
+        if self.form is not None and self.form.on == "run":
             raise UsageError(f"what is left is {self.form.text}: no curve, but another motor in every run. "
                              "Fit the runs apart.")
-        return self.form
-
-    @cached_property
-    def _signals(self) -> list[Mapping[str, Array]]:
-        return [signals_of(self.fit, self.fit.problem, s, k) for k, s in enumerate(self.fit.simulations)]
-
-    @cached_property
-    def _ranges(self) -> dict[str, tuple[float, float]]:
-        return ranges_of(self._signals)
-
-    @cached_property
-    def _orders(self) -> list[float]:
-        return orders_of(self.fit)
-
-    @cached_property
-    def _free(self) -> Array:
-        """Coefficients of the free form."""
-        return form_coefficients(self.fit, linearised(self.fit, None)[0], self._needed)
-
-    @cached_property
-    def _terms(self) -> list[str]:
-        """The functions of the curve, as source in z, without what the model can do by itself."""
-        known = self._own
-        chosen: list[str] = []
-        for term in self._candidates:
-            column = self._columns(self.curve[0], [term])[:, 0] * self._carrier
-            columns = np.column_stack([*known, column])
-            size = np.linalg.norm(columns, axis=0)
-            columns = columns / np.where(size > 0, size, 1.0)
-            left = columns[:, -1] - columns[:, :-1] @ np.linalg.lstsq(columns[:, :-1], columns[:, -1], rcond=1e-9)[0]
-            if not known or np.linalg.norm(left) > INSEPARABLE:
-                chosen.append(term)
-                known = [*known, column]
-        return chosen
-
-    @cached_property
-    def _own(self) -> list[Array]:
-        """What each free parameter of the model puts into the balance of the form, along all runs."""
-        state, problem = STATES.get(self._needed.balance), self.fit.problem
-        if state not in problem.system.states:
-            return []
-        at = problem.system.states.index(state)
-        return [pushes_of(self.fit, n)[:, at] for n in problem.model.free_names if n in problem.system.parameters]
-
-    @cached_property
-    def _carrier(self) -> Array:
-        """What the curve is multiplied by, along all runs."""
-        carrier = self._needed.carrier
-        if not carrier:
-            return np.ones_like(self.curve[0])
-        if carrier == "direction":
-            return np.concatenate([np.sign(s["omega"]) for s in self._signals])
-        return np.concatenate([s[carrier] for s in self._signals])
-
-    @cached_property
-    def _candidates(self) -> list[str]:
-        """The functions that a curve may be made of, as source in z."""
-        form = self._needed
-        low, high = self._ranges[form.on]
-        if form.on == "turn":
-            waves = self._free[1:].reshape(-1, 2)
-            strong = sorted(np.argsort(-np.linalg.norm(waves, axis=1))[:ORDERS])
-            chosen = [self._orders[k] for k in strong]
-            return ["1.0", *(f"ca.{f}({number_of(k)} * z)" for k in chosen for f in ("sin", "cos"))]
-        if form.on in ("theta", "t"):
-            scale = f"{np.pi / (high - low):.9g} * (z - {low:.9g})"
-            return ["1.0", *(f"ca.cos({k} * {scale})" for k in range(1, COSINES))]
-        top = max(abs(low), abs(high))
-        side = "m.sign(z)" if form.on == "omega" else f"ca.tanh(z / {SOFT * top:.6g})"
-        s = f"(z / {top:.6g})"
-        odd = [side, s, f"{s} * ca.fabs{s}", f"{s}**3"]
-        even = ["1.0", f"ca.fabs{s}", f"{s}**2"]
-        return [*odd, *even] if low < 0 < high else ["1.0", s, f"{s}**2", f"{s}**3"]
-
-    @cached_property
-    def _coefficients(self) -> Array:
-        """Coefficients of the terms, fitted to the curve."""
-        z, value = self.curve
-        return np.asarray(np.linalg.lstsq(self._columns(z, self._terms), value, rcond=1e-8)[0], float)
-
-    def _columns(self, z: Array, terms: Sequence[str]) -> Array:
-        names = {"ca": np, "z": z, "m": _Sign(1e-3 * float(np.abs(z).max(initial=0.0)) + 1e-300)}
-        found = [np.broadcast_to(np.asarray(eval(t, names), float), z.shape) for t in terms]
-        return np.column_stack(found)
-
-    def _names(self, name: str) -> list[str]:
-        return [f"{name}_{k}" for k in range(len(self._terms))]
-
-    @property
-    def _unit(self) -> str:
-        form = self._needed
-        torque = "N" if self.fit.model.axis == "linear" else "N·m"
-        over = {"": "", "direction": "", "omega": "·s/rad", "i": "/A"}[form.carrier]
-        base = {"torque": torque, "voltage": "V", "both": f"{torque}/A", "sensor": "rad/s"}[form.balance]
-        return f"{base}{over}"
-
-    def _law(self, names: Sequence[str]) -> str:
-        """Return the law as source."""
-        form = self._needed
-        carrier = {"": "", "direction": "m.sign(m.omega) * ", "omega": "m.omega * ", "i": "m.i * "}[form.carrier]
-        lines = ["z = m.state('clock')", "m.rate(z, 1.0)"] if form.on == "t" else [f"z = {QUANTITIES[form.on]}"]
-        lines += ["curve = (", *(f"    + {n} * {t}" for n, t in zip(names, self._terms, strict=True)), ")"]
-        if form.balance == "both":
-            return "\n".join([*lines, "m.torque -= curve * m.i", "m.voltage += curve * m.omega"])
-        if form.balance == "sensor":
-            return "\n".join([*lines, f"m.measure('{form.channel}', m.measured('{form.channel}') - {carrier}curve)"])
-        return "\n".join([*lines, f"m.{form.balance} -= {carrier}curve"])
+        forms = [f for f in self.forms if f.on != "run"][:TRIED]
+        if (best := _best(self.fit, forms, self._held or HeldOut.of(self.fit, None))) is None:
+            raise UsageError("something predictable is left, but no curve over one quantity lowers the error on data "
+                             "left out.")
+        return best
 
 
-class _Sign:
-    """The sheet's `sign` for arrays."""
-
-    def __init__(self, width: float) -> None:
-        self.width = width
-
-    def sign(self, z: Array) -> Array:
-        return np.tanh(z / self.width)
-
-
-def number_of(order: float) -> str:
-    """Return an order of a turn as source."""
-    return f"{order:.6g}"
+@one_thread
+def _best(fit: Fit, forms: Sequence[Form], held: HeldOut) -> Curve | None:
+    """Return the curve, fitted with the model, that predicts most beyond it; None where none does."""
+    before, found, name = held.predictions(fit), [], "remainder"
+    while name in fit.model.effect_names:  # a curve beside a curve
+        name += "_more"
+    for form in forms:
+        curve, better = Curve(fit, form, name=name), None
+        with contextlib.suppress(*FAILURES):
+            for _ in range(ROUNDS):
+                if (larger := curve.grown()) is None or larger.fitted is None:
+                    break
+                curve, better = larger, compare(before, held.predictions(larger.fitted))
+        if better is not None and better.worth_it and curve.fitted is not None:
+            found.append((better.gain, curve))
+            if not far(curve.fitted):
+                break
+    return max(found, key=lambda f: f[0], default=(0.0, None))[1]
 
 
 def _closed_forms(on: str, z: Array) -> list[tuple[str, Array]]:

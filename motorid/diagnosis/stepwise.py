@@ -38,7 +38,7 @@ HALF_AS_GOOD = 0.5  # of the best child's fall: what a second model must reach t
 class Climb:
     """What the loop went through: the final path, per round the candidates, the groups of what was chosen.
 
-    `form` is the free form that predicts better beside all effects, if any; `grades` are of the effects, in order.
+    `forms` are the free forms that predict better beside all effects, the best first; `grades` are of the effects.
     `stopped` says why it ended before it was done, if it did.
     """
 
@@ -49,7 +49,7 @@ class Climb:
     text: str
     first: Adequacy
     remaining: Adequacy
-    form: FormGain | None = None
+    forms: tuple[FormGain, ...] = ()
     grades: tuple[Grade, ...] = ()
     stopped: str = ""
 
@@ -136,7 +136,7 @@ def _with(found: Climb, best: Node, chosen: Node, ranked: bool, group: tuple[str
 
 
 def _finished(found: Climb) -> Climb:
-    """Return a climb with the free form that predicts better beside all effects, and the grade of each effect."""
+    """Return a climb with the free forms that predict better beside all effects, and the grade of each effect."""
     search, best = found.search, found.path[-1]
     rounds = tuple(tuple(replace(c, group=_without(c.group, best.key)) for c in r) for r in found.rounds)
     groups = tuple((g[0], *rest) for g in found.groups if g and (rest := _without(g[1:], best.key)))
@@ -144,7 +144,7 @@ def _finished(found: Climb) -> Climb:
     forms = better_forms(best.fit, best.predictions) if structure else []
     grades = grades_of(best, search.root, groups, forms, structure,
                        lambda name: None if found.stopped else search.smaller(best, best.fit.model.without(name)))
-    return replace(found, rounds=rounds, groups=groups, form=next(iter(forms), None), grades=grades)
+    return replace(found, rounds=rounds, groups=groups, forms=tuple(forms), grades=grades)
 
 
 def _better(children: Iterable[Node], best: Node) -> tuple[Node, list[Node]] | None:
@@ -254,12 +254,12 @@ def _runners_up(best: Node, ordered: Sequence[Node]) -> list[Node]:
 def _marked(listed: Sequence[Candidate], node: Node, group: tuple[str, ...]) -> tuple[Candidate, ...]:
     """Return the candidates with what was added marked, one effect or two that help only together."""
     names = node.key - node.parent.key if node.parent is not None else frozenset()
-    if len(names) < 2 or node.candidate is None:
+    if len(names) < 2 or not node.reason:
         return tuple(replace(c, accepted=True, group=group) if c.effect == node.added else c for c in listed)
     told = []
     for c in listed:
         if c.effect in names:
-            why = f"together with {' and '.join(sorted(names - {c.effect}))} {node.candidate.reason}"
+            why = f"together with {' and '.join(sorted(names - {c.effect}))} {node.reason}"
             c = replace(c, accepted=True, group=group if c.effect == node.added else (), reason=why)
         told.append(c)
     return tuple(told)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 
 import numpy as np
 
@@ -55,7 +56,7 @@ def unexplained_text(ranking: Sequence[Candidate], rungs: Sequence[Rung], grades
         "Unexplained: something is missing, and no effect of the library explains it.")
     lead = lead if done else f"Unexplained so far: {like or 'something is missing'}; not all effects were tried."
     if grades:
-        return f"{lead} {approximations_text(grades)} {errors_text(rungs[0], rungs[-1])}"
+        return f"{lead} {approximations_text(grades)} {errors_text(rungs)}"
     best = max((c for c in ranking if c.refit_drop is not None), key=lambda c: c.refit_drop or 0.0, default=None)
     if best is None or (best.refit_drop or 0) <= 0.05:
         return lead
@@ -83,7 +84,7 @@ def missing_text(
     parts = [f"Missing: {'; '.join(_described(after, n) for n in names)}."]
     parts += [f"These records do not distinguish {g[0]} from {' or '.join(g[1:])}." for g in groups]
     parts += [approximations_text(grades)] if len(names) < len(grades) else []
-    parts.append(errors_text(rungs[0], rungs[-1]))
+    parts.append(errors_text(rungs))
     left = remaining.text.removeprefix("Something is missing: ")
     parts.append("What remains is noise." if remaining.adequate else f"Not everything is explained: {left}")
     return " ".join(parts)
@@ -116,8 +117,25 @@ def _certain(fit: Fit) -> dict[str, float | None]:
     return {n: None if n in sizes and s is not None and s > abs(fit.values[n]) else s for n, s in std.items()}
 
 
-def errors_text(before: Rung, after: Rung) -> str:
-    """Say how the error changed: on the held-out runs where there are any."""
+def errors_text(rungs: Sequence[Rung]) -> str:
+    """Say how the error changed, on the held-out runs where there are any, and what rose on the way."""
+    risen = [_risen(a, b) for a, b in pairwise(rungs)] if len(rungs) > 2 else []
+    return " ".join([_change(rungs[0], rungs[-1]), *(text for text in risen if text)])
+
+
+def _risen(before: Rung, after: Rung) -> str:
+    """Say which errors one rung raised; empty if none."""
+    here = {c: e for c, e in before.nrmse.items() if after.nrmse[c] > e}
+    was, is_ = before.validation_nrmse or {}, after.validation_nrmse or {}
+    there = {c: e for c, e in was.items() if is_[c] > e}
+    told = [f"{_changes(before, rose, now)} {where}" for rose, now, where in (
+        (here, after.nrmse, "on the fitted runs"), (there, is_, "on the held-out runs")) if rose]
+    decided = "; blocks left out of the fitted runs decided" if was and (
+        np.prod([is_[c] / max(e, 1e-300) for c, e in was.items()]) >= 1) else ""
+    return f"With '{after.added}' {' and '.join(told)}{decided}." if told else ""
+
+
+def _change(before: Rung, after: Rung) -> str:
     was, is_ = before.validation_nrmse, after.validation_nrmse
     if not (was and is_):
         return f"Error: {_changes(before, before.nrmse, after.nrmse)}."
