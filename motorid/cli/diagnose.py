@@ -165,7 +165,7 @@ def _next_step(found: Diagnosis) -> str:
     """Return what to do next: the experiment that decides, what remains, or the model to go on with."""
     if found.suggestion:
         return found.suggestion
-    if found.remainder is not None and found.remainder.kind == "structure":
+    if found.remainder is not None and found.remainder.proposed:
         return f"look at what remains as an effect: {next_command('diagnose')} --remainder-to remainder.py"
     if found.effects:
         return f"{next_command('fit')} --effects {','.join(found.after.model.effect_names)} --json fit.json"

@@ -224,6 +224,11 @@ class Remainder:
         """What it follows, in words."""
         return None if self.form is None else self.form.text
 
+    @property
+    def proposed(self) -> bool:
+        """Tell whether slopes propose a curve; whether it helps, `as_effect` finds out."""
+        return self.kind == "structure" and self.form is not None and self.form.on != "run"
+
     def as_effect(self, name: str = "remainder") -> Effect:
         """Return what is left as an effect: a curve to add to the model, ``fit.model + found.remainder.as_effect()``.
 

@@ -272,9 +272,9 @@ class Diagnosis(Shown):
         return Card("Diagnosis", flags, text, (ladder_table(self.ladder),), self._next())
 
     def _next(self) -> tuple[tuple[str, str], ...]:
-        kind = self.remainder.kind if self.remainder else "noise"
         after = [("found.best", "the better fit")] if self.after is not self.before else []
-        after += [("found.remainder.as_effect()", "what remains, as an effect to add")] if kind == "structure" else []
+        if self.remainder is not None and self.remainder.proposed:
+            after.append(("found.remainder.as_effect()", "what remains, as an effect to add"))
         return (*after, ("mi.plot_missing(found)", "see it"), ('mi.report(found, "report.html")', "all on one page"))
 
     @property

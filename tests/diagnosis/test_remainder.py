@@ -75,10 +75,6 @@ def over_floor(fit, run, clean) -> dict[str, float]:
     return {c: float(np.std(s.residual(c)) / np.std(run.outputs[c] - clean[c])) for c in ("i", "omega")}
 
 
-# Its bend near zero, its rest: not quite in the curve; the cam's fit ends at 1.03 or at 1.21, as the last digits fall.
-FLOORS = {"eddy brake": 1.25, "friction over a turn": 1.9, "cam": 1.25}
-
-
 @pytest.mark.parametrize("name", CASES)
 def test_with_the_remainder_the_held_out_error_falls_to_the_floor(outside, name):
     runs, found, clean = outside(name)
@@ -93,7 +89,7 @@ def test_with_the_remainder_the_held_out_error_falls_to_the_floor(outside, name)
         assert np.corrcoef(began, ended)[0, 1] > 0.5
     before, after = (over_floor(f, runs[2], clean) for f in (found.best, fit))
     assert max(before.values()) > 2
-    assert max(after.values()) < FLOORS.get(name, 1.15)
+    assert max(after.values()) < 1.15
     assert all(after[c] < before[c] for c in after)
 
 
@@ -107,10 +103,9 @@ def test_its_coefficients_are_parameters_with_deviations(outside):
     assert any(fit.std[p.name] for p in effect.parameters)
 
 
-@pytest.mark.xfail(strict=True, reason="the curve's first order is gravity's own: the two run away against each other")
 def test_what_an_effect_of_the_model_does_already_is_no_part_of_the_curve(outside):
     runs, found, _ = outside("cam")
-    assert found.best.model.effect_names == ("gravity",)
+    assert "gravity" in found.best.model.effect_names
     fit = mi.fit(found.best.model + found.remainder.as_effect(), runs[:2])
     assert all(abs(fit.values[p.name]) < 1.0 for e in fit.model.effects for p in e.parameters if p.unit == "N·m")
 
