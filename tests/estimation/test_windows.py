@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 import motorid as mi
 from motorid.cli.app import app
-from motorid.errors import DataError, UsageError
+from motorid.errors import UsageError
 from motorid.estimation.fit import TOO_FAR, follows, growth
 from motorid.records.datasets import data_path
 from motorid.records.experiment import windows
@@ -99,7 +99,7 @@ def test_windows_of_a_length_that_was_asked_for(records):
         mi.fit(PENDULUM, records[1], window="long")
     with pytest.raises(UsageError, match="takes a time in seconds"):
         mi.fit(PENDULUM, records[1], window=-1.0)
-    with pytest.raises(DataError):
+    with pytest.raises(UsageError, match="fewer than 8 samples"):
         mi.fit(PENDULUM, records[1], window=1e-3)
 
 
