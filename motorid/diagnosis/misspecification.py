@@ -15,7 +15,7 @@ import numpy as np
 
 from motorid.diagnosis.admissibility import objections
 from motorid.diagnosis.free_forms import Form, Linear, contains, effect_force, force_of, form_columns, linearised, ridge
-from motorid.diagnosis.model_comparison import Node, evidence
+from motorid.diagnosis.model_comparison import Node, evidence, far
 from motorid.diagnosis.predictive_score import (
     Evidence,
     Predictions,
@@ -128,9 +128,9 @@ def grades_of(last: Node, root: Node, groups: Sequence[Sequence[str]], beside: S
               without: Callable[[str], Node | None]) -> tuple[Grade, ...]:
     """Return the grade of each effect that `last` has and `root` has not.
 
-    A rung that predicts better stays, whatever it is. Its effect is *named* if its law is physical there, no rival
-    predicts as well, no free form that contains it, or in its place, predicts better by more than the trifle
-    that a free curve follows in any real motor, and it explains more than it leaves, unless that is noise.
+    A rung that predicts better stays, whatever it is. Its effect is *named* if its law is physical there and its size
+    determined, no rival predicts as well, no free form that contains it, or in its place, predicts better by more than
+    the trifle that a free curve follows in any real motor, and it explains more than it leaves, unless that is noise.
 
     Parameters
     ----------
@@ -150,9 +150,11 @@ def grades_of(last: Node, root: Node, groups: Sequence[Sequence[str]], beside: S
     for e in (e for e in last.fit.model.effects if e.name not in root.key):
         why, form = objections(last.fit, e, root.fit), None
         why = why or ("it may only stand in for the driver's current limit" if limited else "")
-        smaller = without(e.name) if structure and not why else None
+        why = why or _undetermined(last.fit, e)
+        smaller = without(e.name) if not why and (structure or far(last.fit)) else None
         if smaller is not None:
-            free = [b for b in beside if _swallows(last.fit, b.form, e)] or better_forms(smaller.fit, last.predictions)
+            free = [b for b in beside if _swallows(last.fit, b.form, e)]
+            free = free or (better_forms(smaller.fit, last.predictions) if structure else [])
             told = [b for b in free if b.evidence.fall > SUPPLANTS]
             better = next((b for b in told if beside and b.form == beside[0].form), told[0] if told else None)
             taken = 1 - (1 - max(evidence(smaller, last).fall, 0.0)) ** 2
@@ -163,6 +165,14 @@ def grades_of(last: Node, root: Node, groups: Sequence[Sequence[str]], beside: S
         kind = "approximates" if why else "group" if rivals.get(e.name) else "named"
         found.append(Grade(e.name, kind, why, form))
     return tuple(found)
+
+
+def _undetermined(fit: Fit, effect: Effect) -> str:
+    """Say so where the records determine none of an effect's sizes, by itself or as a voltage."""
+    sizes = [p.name for p in effect.parameters if p.null == 0 and fit.problem.model.parameters[p.name].vary]
+    known = [n for n in sizes if f"{n}_voltage" in fit.determined
+             or ((std := fit.std[n]) is not None and std < abs(fit.values[n]))]
+    return f"{' and '.join(sizes)} {'is' if len(sizes) == 1 else 'are'} not determined" if sizes and not known else ""
 
 
 def _swallows(fit: Fit, form: Form, effect: Effect) -> bool:

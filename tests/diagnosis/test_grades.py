@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from battery.excite import driven, record
 
 import motorid as mi
+from motorid.diagnosis import misspecification
+from motorid.diagnosis.cross_validation import HeldOut
+from motorid.diagnosis.model_comparison import node_of
+from motorid.diagnosis.predictive_score import Predictions
 
 HIDDEN = {"coulomb": {"tau_c": 8e-3}}
 DRIVES = ("stairs", "ramps", "steps")
@@ -78,3 +84,33 @@ def test_what_a_free_form_outdoes_in_its_place_approximates(lab):
     assert found.effects == ()
     accepted = next(c for c in found.ranking if c.effect == "coulomb")
     assert accepted.accepted  # it stays in the ladder
+
+
+@mi.effect(balance="torque")
+def two_frictions(m, tau_a=mi.P(1e-3, "N·m", null=0.0), tau_b=mi.P(1e-3, "N·m", null=0.0)):
+    """Two frictions of one law: only their sum can be seen."""
+    m.torque -= (tau_a + tau_b) * m.sign(m.omega)
+
+
+def test_what_has_no_determined_size_is_not_named(rubbing):
+    found = mi.diagnose(*rubbing, effects=(), also=[two_frictions])
+    rung = found.ladder.rungs[1]
+    assert (rung.added, rung.grade, rung.why) == ("two_frictions", "approximates", "tau_a and tau_b are not determined")
+    assert found.verdict == "unexplained"
+
+
+@pytest.mark.parametrize(("share", "grade"), [(0.3, "approximates"), (0.7, "named")])
+def test_what_explains_less_than_it_leaves_is_not_named(rubbing, monkeypatch, share, grade):
+    """Unless that is noise; here no free form knows better."""
+    plain, check = rubbing
+    held, rubs = HeldOut.of(plain, check), mi.fit(plain.model + mi.effects.coulomb, plain.problem.experiments)
+    root, last = node_of(plain, held), node_of(rubs, held)
+    larger = {c: replace(e, values=tuple(v / np.sqrt(1 - share) for v in e.values))
+              for c, e in last.predictions.held_out.items()}
+    worse = replace(last, predictions=Predictions({}, larger))
+    monkeypatch.setattr(misspecification, "better_forms", lambda fit, rival: [])
+    (told,) = misspecification.grades_of(last, root, (), (), True, lambda name: worse)
+    assert told.grade == grade
+    assert ("30 % of the squared error, and what is left is not noise" in told.why) == (grade == "approximates")
+    (told,) = misspecification.grades_of(last, root, (), (), False, lambda name: worse)
+    assert told.grade == "named"
