@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from battery.blind import first, second
+from battery.blind import first, second, third, third_plant
 from battery.blind.build import build, plain_sim
 from battery.blind.judge import judge, mark, summary
 from battery.blind.plant import MOTORS, TORQUE, Late, motor, run
@@ -29,7 +29,10 @@ def test_the_batteries_cover_what_they_promise():
     assert len(second.B) >= 100
     assert {t for c in of(second.B, "single") for t in c.truth} >= set(LIBRARY)
     assert all(len(of(second.B, k)) >= 20 for k in ("single", "pair", "none", "outside"))
-    for case in (*first.B.values(), *second.B.values()):
+    assert {t for c in of(third.B, "single") for t in c.truth} >= set(LIBRARY)
+    acting = {e for c in third.B.values() for e in c.effects}
+    assert acting == {*third_plant.LAW, *third_plant.SENSORS}
+    for case in (*first.B.values(), *second.B.values(), *third.B.values()):
         named = {*case.acceptable, *(n for w in case.whole for n in w)}
         assert named <= set(EVERY), case.name
         assert case.kind in ("none", "outside") or set(case.truth) <= set(EVERY), case.name
@@ -52,6 +55,27 @@ def test_the_plant_without_effects_is_the_exact_solution(name, hold, kind):
     exact = plain_sim(m, name in TORQUE, t, v, (0, 0, 0), hold)
     for j, c in ((1, "omega"), (2, "theta")):
         assert np.abs(exact[:, j] - y[c]).max() < 1e-5 * np.std(y[c])
+
+
+@pytest.mark.parametrize("name", ["can", "crane", "slide", "table"])
+def test_the_third_plant_without_effects_is_the_exact_solution(name):
+    m = third_plant.motor(name, np.random.default_rng(1))
+    options = {"dt": m["dt"], "T": 0.5 * m["T"]}
+    t, v, y, _ = third_plant.run(m, {}, "steps", np.random.default_rng(2), options)
+    exact = plain_sim(m, m["torque"], t, v, (0, 0, 0), "zoh")
+    for j, c in ((1, "omega"), (2, "theta")):
+        assert np.abs(exact[:, j] - y[c]).max() < 1e-5 * np.std(y[c])
+
+
+def test_the_third_plant_comes_to_rest_as_dry_friction_has_it():
+    m = third_plant.motor("pivot", np.random.default_rng(1))
+    push = np.where(np.arange(2000) < 400, m["V"], 0.0)
+    t, _, y, _ = third_plant.run(m, {"coulomb": 0.1}, "", None, {"dt": m["dt"], "T": 2.0}, given=push)
+    tau, dry = m["J"] / m["b"], 0.1 * m["ts"] / m["b"]
+    rise = (m["V"] / m["b"] - dry) * (1 - np.exp(-np.minimum(t, 0.4) / tau))
+    fall = np.exp(-np.maximum(t - 0.4, 0) / tau)
+    assert np.allclose(y["omega"], np.maximum((rise + dry) * fall - dry, 0), atol=1e-9 * m["ws"])
+    assert y["omega"][-1] == 0
 
 
 def settle(m, effects, v, seconds=1.0):
@@ -129,3 +153,4 @@ def test_a_part_of_the_battery_runs(tmp_path):
 def test_every_motor_is_used():
     used = {c.motor for c in (*first.B.values(), *second.B.values())}
     assert used == set(MOTORS)
+    assert {c.motor for c in third.B.values()} == set(third_plant.MOTORS)

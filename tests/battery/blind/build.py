@@ -11,7 +11,7 @@ from scipy.linalg import expm
 from scipy.optimize import least_squares
 from scipy.signal import lfilter
 
-from battery.blind.plant import LINEAR, TORQUE, measure, motor, run, seed
+from battery.blind.plant import LINEAR, measure, motor, run, seed
 
 CHANNELS = {"i": "i", "w": "omega", "t": "theta"}
 # Effects of the speed sensor that an encoder's counts would have to go through.
@@ -40,10 +40,15 @@ class Case:
     whole: tuple[frozenset[str], ...]
     fixed: tuple[str, ...] = ()
     options: dict[str, Any] = field(default_factory=dict)
+    plant: Any = None  # a module with a `build` of its own
 
 
 class Battery(dict[str, Case]):
-    """Cases by name; one method per kind adds one."""
+    """Cases by name; one method per kind adds one. `plant`: a module that builds them instead of this one."""
+
+    def __init__(self, plant: Any = None):
+        super().__init__()
+        self.plant = plant
 
     def single(self, name, mot, eff, train, check, **more):
         """One effect of the library acts."""
@@ -73,11 +78,13 @@ class Battery(dict[str, Case]):
         acceptable = frozenset(acc).union(*alternatives.values())
         self[name] = Case(name, kind, mot, eff, tuple(train.split()), tuple(check.split()),
                           tuple(CHANNELS[c] for c in ch), truth, acceptable, alternatives,
-                          tuple(frozenset(x) for x in whole), tuple(fixed), options)
+                          tuple(frozenset(x) for x in whole), tuple(fixed), options, self.plant)
 
 
 def build(case: Case, halve: int = 1) -> dict[str, Any]:
     """Return the records of `case`: train, check, noise and floor per channel. `halve` divides the plant's step."""
+    if case.plant:
+        return case.plant.build(case, halve)
     rng = np.random.default_rng(seed(case.name))
     m = motor(case.motor, rng)
     o = dict(case.options)
@@ -177,7 +184,7 @@ def plain_sim(p, torque, t, v, x0, hold):
 def plain_excess(case: Case, built: dict[str, Any]) -> dict[str, float]:
     """Return, per channel, the error of the fitted plain motor over the noise on the training runs (1: it suffices)."""
     m = built["motor"]
-    torque = case.motor in TORQUE
+    torque = m["torque"]
     names = [n for n in (("K", "b") if torque else ("R", "L", "K", "b", "J")) if n not in case.fixed]
     where = {"i": 0, "omega": 1, "theta": 2}
     noise = {}

@@ -27,7 +27,6 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 from battery.blind.build import Case, build
 from battery.blind.judge import summary
-from battery.blind.plant import TORQUE
 
 
 def main() -> None:
@@ -58,7 +57,7 @@ def main() -> None:
 
 def _words() -> argparse.Namespace:
     ap = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    ap.add_argument("battery", choices=("first", "second"))
+    ap.add_argument("battery", choices=("first", "second", "third"))
     ap.add_argument("--out", required=True)
     ap.add_argument("--cases", default="", help="parts of names")
     ap.add_argument("--shuffle", type=int)
@@ -105,7 +104,7 @@ def trial(case: Case) -> dict[str, Any]:
         return dict(mi.evaluate(fit, check).nrmse)
 
     runs, check = records("train"), records("check")
-    model = mi.torque_driven() if case.motor in TORQUE else mi.dc_motor()
+    model = mi.torque_driven() if built["motor"]["torque"] else mi.dc_motor()
     if case.fixed:
         model = model.fix(**{p: built["motor"][p] for p in case.fixed})
     start = _cpu()
@@ -123,7 +122,13 @@ def trial(case: Case) -> dict[str, Any]:
         d |= {"verdict": told["verdict"], "effects": _names(told["effects"]), "told": told, "text": found.text}
         d["remainder"] = getattr(found.remainder, "kind", None)
         if d["remainder"] not in (None, "noise"):
-            d["held_remainder"] = held_out(mi.fit((found.after or fit).model + found.remainder.as_effect(), runs))
+            try:
+                curve = found.remainder.as_effect()
+            except mi.UsageError as e:
+                d["no_curve"] = str(e)
+            else:
+                d["held_remainder"] = held_out(mi.fit((found.after or fit).model + curve, runs))
+        d["cpu_all"] = _cpu() - start
     except Exception as e:  # a result like any other
         d |= {"error": f"{type(e).__name__}: {e}", "trace": traceback.format_exc(), "cpu": d.get("cpu", _cpu() - start)}
     return d
