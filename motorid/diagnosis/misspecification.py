@@ -129,8 +129,9 @@ def grades_of(last: Node, root: Node, groups: Sequence[Sequence[str]], beside: S
     """Return the grade of each effect that `last` has and `root` has not.
 
     A rung that predicts better stays, whatever it is. Its effect is *named* if its law is physical there and its size
-    determined, no rival predicts as well, no free form that contains it, or in its place, predicts better by more than
-    the trifle that a free curve follows in any real motor, and it explains more than it leaves, unless that is noise.
+    more than its deviation, no rival predicts as well, no free form that contains it, or in its place, predicts better
+    by more than the trifle that a free curve follows in any real motor, and it explains more than it leaves, unless
+    that is noise.
 
     Parameters
     ----------
@@ -150,7 +151,7 @@ def grades_of(last: Node, root: Node, groups: Sequence[Sequence[str]], beside: S
     for e in (e for e in last.fit.model.effects if e.name not in root.key):
         why, form = objections(last.fit, e, root.fit), None
         why = why or ("it may only stand in for the driver's current limit" if limited else "")
-        why = why or _undetermined(last.fit, e)
+        why = why or _insignificant(last.fit, e)
         smaller = without(e.name) if not why and (structure or far(last.fit)) else None
         if smaller is not None:
             free = [b for b in beside if _swallows(last.fit, b.form, e)]
@@ -167,12 +168,11 @@ def grades_of(last: Node, root: Node, groups: Sequence[Sequence[str]], beside: S
     return tuple(found)
 
 
-def _undetermined(fit: Fit, effect: Effect) -> str:
-    """Say so where the records determine none of an effect's sizes, by itself or as a voltage."""
+def _insignificant(fit: Fit, effect: Effect) -> str:
+    """Say so where every size of an effect is smaller than its own deviation; one without a deviation may be any."""
     sizes = [p.name for p in effect.parameters if p.null == 0 and fit.problem.model.parameters[p.name].vary]
-    known = [n for n in sizes if f"{n}_voltage" in fit.determined
-             or ((std := fit.std[n]) is not None and std < abs(fit.values[n]))]
-    return f"{' and '.join(sizes)} {'is' if len(sizes) == 1 else 'are'} not determined" if sizes and not known else ""
+    known = [n for n in sizes if (std := fit.std[n]) is None or std < abs(fit.values[n])]
+    return f"{' and '.join(sizes)} could as well be zero, within one standard deviation" if sizes and not known else ""
 
 
 def _swallows(fit: Fit, form: Form, effect: Effect) -> bool:
