@@ -163,7 +163,8 @@ def _contained(model: Model) -> dict[Effect, Effect]:
     """Return the simplest effect that each of the model's effects contains, where it does and has nothing set."""
     found: dict[Effect, Effect] = {}
     for effect in model.effects:
-        simple = next((LIBRARY[n] for n in effect.includes if all(p.null == 0 for p in LIBRARY[n].parameters)), None)
+        inside = (LIBRARY[n] for n in effect.includes if n in LIBRARY)  # a user's effect may contain another of theirs
+        simple = next((e for e in inside if all(p.null == 0 for p in e.parameters)), None)
         taken = {*model.effect_names, *(e.name for e in found.values())}
         if simple and simple.name not in taken and len(_untouched(model, effect)) == len(effect.parameters):
             found[effect] = simple

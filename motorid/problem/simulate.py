@@ -12,7 +12,7 @@ import numpy as np
 from motorid.channels import CHANNELS, UNITS, channel_name
 from motorid.display.cards import Card, Shown, Table
 from motorid.display.numbers import counted, percent, quantity
-from motorid.errors import FitError, SimulationError
+from motorid.errors import FitError, SimulationError, UsageError, name_of
 from motorid.integrate.engine import Engine
 from motorid.model.model import Model
 from motorid.numerics.least_squares import LevenbergMarquardt, levenberg_marquardt
@@ -270,12 +270,19 @@ def evaluate(fit_or_model: Any, runs: Sequence[Experiment] | Experiment, **optio
     **options
         `engine` and `initial` as in `simulate`.
 
+    Raises
+    ------
+    UsageError
+        If the first is neither a fit nor a model.
+
     Examples
     --------
     >>> mi.evaluate(better, check)
     <evaluation of 1 runs: NRMSE i 1.38 %, omega 1.02 %>
     """
-    model = fit_or_model if isinstance(fit_or_model, Model) else fit_or_model.model
+    model = fit_or_model if isinstance(fit_or_model, Model) else getattr(fit_or_model, "model", None)
+    if model is None:
+        raise UsageError(f"evaluate takes a fit or a model first, then the records; got {name_of(fit_or_model)}.")
     if not isinstance(fit_or_model, Model):
         options = {"engine": fit_or_model.problem.engine, "initial": fit_or_model.problem.initial, **options}
         if "sgn_width" in model.parameters:  # it was chosen for the fitted runs; it is part of what is judged

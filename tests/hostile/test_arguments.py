@@ -36,6 +36,7 @@ TAKES = {  # one function of every kind: results, records, files, numbers, words
     "iterations": lambda x: mi.LevenbergMarquardt(max_iterations=x) if x != 5 else mi.locate(x),
     "CurrentLimit": lambda x: mi.CurrentLimit(x) if x != 5 else mi.locate(x),
     "certainty": FIT.certainty,
+    "evaluated": lambda x: mi.evaluate(x, RUN),
 }
 
 
