@@ -12,7 +12,7 @@ import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from itertools import pairwise
 from types import TracebackType
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 
 def _leave(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
@@ -97,7 +97,7 @@ def arguments_told(thing: _Thing) -> _Thing:
         for name, member in list(vars(thing).items()):
             if inspect.isfunction(member) and (name in ("__init__", "__add__") or not name.startswith("_")):
                 setattr(thing, name, arguments_told(member))
-        return thing  # type: ignore[return-value]
+        return cast(_Thing, thing)
 
     @functools.wraps(thing)
     def call(*args: Any, **kwargs: Any) -> Any:
@@ -108,7 +108,7 @@ def arguments_told(thing: _Thing) -> _Thing:
                 raise
             raise UsageError(wrong) from error
 
-    return call  # type: ignore[return-value]
+    return cast(_Thing, call)
 
 
 def _wrong_argument(function: Callable[..., Any], args: Any, kwargs: Any) -> str | None:

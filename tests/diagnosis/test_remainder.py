@@ -13,6 +13,8 @@ from command import motorid_json
 
 import motorid as mi
 from motorid.cli.options import own_effects
+from motorid.diagnosis import remainder
+from motorid.diagnosis.free_forms import Form
 from motorid.diagnosis.remainder import Remainder
 from motorid.exporters.export import load
 from motorid.records.reading import write_csv
@@ -185,3 +187,30 @@ def test_noise_is_no_effect(lab):
             ask()
     with pytest.raises(mi.UsageError, match="the remainder is fluctuation"):
         Remainder("fluctuation", found.best).as_effect()
+
+
+@pytest.mark.parametrize("forced", [False, True])
+def test_a_curve_that_predicts_nothing_is_not_offered(lab, monkeypatch, forced):
+    """Neither are functions chosen for it, nor would they, once fitted, be believed."""
+    if forced:
+        monkeypatch.setattr(remainder, "chosen_functions", lambda *given: [4])
+    rng = np.random.default_rng(2)
+    runs = [record(driven(lab, {}, w, 500, 1e-3, rng), "logger", ("i", "omega"), lab, rng, w) for w in FAST]
+    left = Remainder("structure", mi.fit(mi.dc_motor(), runs), (Form("a torque", "torque", "omega"),))
+    with pytest.raises(mi.UsageError, match="no curve over one quantity lowers the error"):
+        left.as_effect()
+
+
+def test_a_sensor_that_bends_is_a_curve_in_the_measurement(lab):
+    """Its reading falls short by a fifth at the highest speed, a tenth at half of it."""
+    rng = np.random.default_rng(3)
+    runs = [record(driven(lab, {}, w, 600, 1e-3, rng), "logger", ("i", "omega"), lab, rng, w) for w in FAST]
+    top = max(np.abs(r.outputs["omega"]).max() for r in runs)
+    bent = [r.with_(outputs={**r.outputs, "omega": r.outputs["omega"] * (1 - 0.2 * np.abs(r.outputs["omega"]) / top)})
+            for r in runs]
+    found = mi.diagnose(mi.fit(mi.dc_motor(), bent[:2]), bent[2:], effects=("coulomb",))
+    assert found.remainder.where == "sensor"
+    after = mi.fit(found.best.model + found.remainder.as_effect(), bent[:2])
+    was, now = (mi.evaluate(f, bent[2:]).nrmse["omega"] for f in (found.best, after))
+    straight = mi.evaluate(mi.fit(mi.dc_motor(), runs[:2]), runs[2:]).nrmse["omega"]
+    assert now < 1.15 * straight < 0.5 * was
