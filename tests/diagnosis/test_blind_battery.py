@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from battery.blind import first, second, third, third_plant
+from battery.blind import first, fourth, fourth_plant, second, third, third_plant
 from battery.blind.build import build, plain_sim
 from battery.blind.judge import judge, mark, summary
 from battery.blind.plant import MOTORS, TORQUE, Late, motor, run
@@ -32,7 +32,10 @@ def test_the_batteries_cover_what_they_promise():
     assert {t for c in of(third.B, "single") for t in c.truth} >= set(LIBRARY)
     acting = {e for c in third.B.values() for e in c.effects}
     assert acting == {*third_plant.LAW, *third_plant.SENSORS}
-    for case in (*first.B.values(), *second.B.values(), *third.B.values()):
+    assert {t for c in of(fourth.B, "single") for t in c.truth} >= set(LIBRARY)
+    assert {e for c in fourth.B.values() for e in c.effects} == {*fourth_plant.LAW, *fourth_plant.SENSORS}
+    assert all(len(of(fourth.B, k)) >= 20 for k in ("single", "pair", "none", "outside"))
+    for case in (*first.B.values(), *second.B.values(), *third.B.values(), *fourth.B.values()):
         named = {*case.acceptable, *(n for w in case.whole for n in w)}
         assert named <= set(EVERY), case.name
         assert case.kind in ("none", "outside") or set(case.truth) <= set(EVERY), case.name
@@ -57,24 +60,30 @@ def test_the_plant_without_effects_is_the_exact_solution(name, hold, kind):
         assert np.abs(exact[:, j] - y[c]).max() < 1e-5 * np.std(y[c])
 
 
-@pytest.mark.parametrize("name", ["can", "crane", "slide", "table"])
-def test_the_third_plant_without_effects_is_the_exact_solution(name):
-    m = third_plant.motor(name, np.random.default_rng(1))
+@pytest.mark.parametrize(("plant", "name", "within"), [
+    (third_plant, "can", 1e-5), (third_plant, "crane", 1e-5), (third_plant, "slide", 1e-5),
+    (third_plant, "table", 1e-5), (fourth_plant, "coreless16", 1e-4), (fourth_plant, "industrial", 1e-4),
+    (fourth_plant, "gimbal", 1e-4)])
+def test_a_later_plant_without_effects_is_the_exact_solution(plant, name, within):
+    m = plant.motor(name, np.random.default_rng(1))
     options = {"dt": m["dt"], "T": 0.5 * m["T"]}
-    t, v, y, _ = third_plant.run(m, {}, "steps", np.random.default_rng(2), options)
+    kind = "steps" if plant is third_plant else "levels"
+    t, v, y, *_ = plant.run(m, {}, kind, np.random.default_rng(2), options)
     exact = plain_sim(m, m["torque"], t, v, (0, 0, 0), "zoh")
     for j, c in ((1, "omega"), (2, "theta")):
-        assert np.abs(exact[:, j] - y[c]).max() < 1e-5 * np.std(y[c])
+        assert np.abs(exact[:, j] - y[c]).max() < within * np.std(y[c])
 
 
-def test_the_third_plant_comes_to_rest_as_dry_friction_has_it():
-    m = third_plant.motor("pivot", np.random.default_rng(1))
+@pytest.mark.parametrize(("plant", "name", "within"), [(third_plant, "pivot", 1e-9), (fourth_plant, "gimbal", 1e-4)])
+def test_a_later_plant_comes_to_rest_as_dry_friction_has_it(plant, name, within):
+    m = plant.motor(name, np.random.default_rng(1))
     push = np.where(np.arange(2000) < 400, m["V"], 0.0)
-    t, _, y, _ = third_plant.run(m, {"coulomb": 0.1}, "", None, {"dt": m["dt"], "T": 2.0}, given=push)
+    options = {"dt": m["dt"], "T": 2.0}
+    t, _, y, *_ = plant.run(m, {"coulomb": 0.1}, "", np.random.default_rng(2), options, given=push)
     tau, dry = m["J"] / m["b"], 0.1 * m["ts"] / m["b"]
     rise = (m["V"] / m["b"] - dry) * (1 - np.exp(-np.minimum(t, 0.4) / tau))
     fall = np.exp(-np.maximum(t - 0.4, 0) / tau)
-    assert np.allclose(y["omega"], np.maximum((rise + dry) * fall - dry, 0), atol=1e-9 * m["ws"])
+    assert np.allclose(y["omega"], np.maximum((rise + dry) * fall - dry, 0), atol=within * m["ws"])
     assert y["omega"][-1] == 0
 
 
@@ -154,3 +163,4 @@ def test_every_motor_is_used():
     used = {c.motor for c in (*first.B.values(), *second.B.values())}
     assert used == set(MOTORS)
     assert {c.motor for c in third.B.values()} == set(third_plant.MOTORS)
+    assert {c.motor for c in fourth.B.values()} == set(fourth_plant.MOTORS)

@@ -57,7 +57,7 @@ def main() -> None:
 
 def _words() -> argparse.Namespace:
     ap = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    ap.add_argument("battery", choices=("first", "second", "third"))
+    ap.add_argument("battery", choices=("first", "second", "third", "fourth"))
     ap.add_argument("--out", required=True)
     ap.add_argument("--cases", default="", help="parts of names")
     ap.add_argument("--shuffle", type=int)

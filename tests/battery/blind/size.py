@@ -1,4 +1,4 @@
-"""Check the sizes: ``python tests/battery/blind/size.py [first|second|third] [part of a name]``; builds only.
+"""Check the sizes: ``python tests/battery/blind/size.py [first|second|third|fourth] [part of a name]``; builds only.
 
 Prints per case the error of a fitted plain motor over the noise (an effect should stand out, nothing should not), the
 floor, and the change when the plant's step is halved (over the noise), with ``--halve``.
