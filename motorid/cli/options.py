@@ -117,7 +117,7 @@ class FitOptions(ReadingOptions):
 
     effects: Annotated[str | None, _model(metavar="a,b", help="Effects in the model beside the plain motor.")] = None
     fix: Annotated[list[str] | None, _model(
-        metavar="L", help="Fix parameters: L, or L=0 to leave the inductance out.")] = None
+        metavar="R=1.2", help="Fix parameters at values (SI units); L=0 leaves the inductance out.")] = None
     set_: Annotated[list[str] | None, _model("--set", metavar="R=1.2", help="Values to start from (SI units).")] = None
     free: Annotated[list[str] | None, _model(metavar="g", help="Estimate parameters that are fixed by default.")] = None
     drive: Annotated[str, _model(

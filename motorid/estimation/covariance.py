@@ -6,6 +6,13 @@ so neither the assumed noise level nor its whiteness matters (sandwich: White, E
 West, Econometrica 55, 1987; here with a parametric Γ, since transients leave few samples to average over).
 Residuals that depend on the motion, of a model that lacks something, are not noise; then it is an indication.
 `Fit.std` is made here; `motorid.uncertainty.covariance` shows all of it.
+
+A quantity is determined if two things hold. It stays where it is along every direction that has no influence on the
+outputs: what such a direction carries away could be anything. Both are measured in relative changes (natural sizes for
+what may be zero), in which symmetries of the equations are plain numbers such as R, L, 1/J, 1/b; in records without a
+current, shipped and real, what a direction carries away shifts by 0.01 to 1 along it, and what stays by less than
+0.0001. And its 95 % interval does not reach zero; where zero is a value like others, the deviation is less than
+half the natural size.
 """
 
 from __future__ import annotations
@@ -14,15 +21,17 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from motorid.errors import UsageError, one_of
 from motorid.numerics.autoregression import Colour, colour_of, weighed
 from motorid.numerics.least_squares import seen_directions
 from motorid.numerics.signals import Array
 from motorid.problem.problem import Problem
+from motorid.problem.runs import natural_sizes
 
-UNDETERMINED = 1.0  # relative standard deviation above which a value is not shown as determined
-BLIND = 1e-3  # share of a quantity's change along directions that the data do not determine: more, and neither is it
+UNDETERMINED = 0.5  # relative standard deviation: beyond it the 95 % interval of a size reaches zero
+BLIND = 1e-3  # of a relative change: a quantity that shifts so much along a direction without influence is as open
 Law = Callable[[Mapping[str, float]], float]
 Blocks = Mapping[str, Sequence[tuple[Array, Array]]]
 
@@ -41,10 +50,10 @@ class Certainty:
         Effective degrees of freedom of the residuals.
     colours : mapping of str to Colour
         Per channel, of the whitened residuals.
-    blind : ndarray, shape (m, k)
-        Directions that the data do not determine, for unknowns of unit sensitivity.
-    scaling : ndarray, shape (k, k)
-        From a gradient in physical units to one for unknowns of unit sensitivity.
+    blind : ndarray, shape (k, m)
+        Directions without influence on the outputs: orthonormal columns, in solver coordinates.
+    unit : ndarray, shape (k,)
+        Change of each unknown per unit of its solver coordinate: its value where that is logarithmic.
     """
 
     matrix: Array
@@ -52,7 +61,7 @@ class Certainty:
     dof: float
     colours: Mapping[str, Colour]
     blind: Array
-    scaling: Array
+    unit: Array
 
     @property
     def std(self) -> tuple[float | None, ...]:
@@ -63,8 +72,7 @@ class Certainty:
 
     def std_of(self, slope: Array) -> float | None:
         """Return one standard deviation of a quantity with gradient `slope` (k,); None where it is not determined."""
-        scaled = self.scaling @ slope
-        if np.linalg.norm(self.blind @ scaled) > BLIND * np.linalg.norm(scaled):
+        if _shifts(self.blind, self.unit * slope):
             return None
         return float(np.sqrt(max(slope @ self.matrix @ slope, 0.0)))
 
@@ -83,17 +91,26 @@ def certainty(problem: Problem, q: Array, residuals: Array, jacobian: Array, fre
     basis = np.eye(len(loose))[:, loose] if free is None else free
     blocks = channel_blocks(problem, residuals, jacobian)
     colours = _colours(blocks, basis.shape[1], method)
-    half, blind, size = seen_directions(jacobian @ basis)
-    slopes = basis @ half @ half.T @ basis.T
-    matrix = slopes @ _meat(problem, jacobian, blocks, colours) @ slopes
-    sd = np.sqrt(np.maximum(np.diag(matrix), 0.0))
-    lost = np.any(basis[:, np.sum(blind**2, axis=0) > 1e-6] != 0, axis=1)
-    vague = np.array([p.positive for p in problem.unknown], bool) & (sd > UNDETERMINED * np.abs(physical))
-    status = tuple(s or ("not determined" if no else "determined")
-                   for s, no in zip(limits, lost | vague, strict=True))
+    half, blind = seen_directions(jacobian @ basis)
+    unit, through = problem.scaling.slope(q), basis @ half
+    matrix = through @ _meat(problem, jacobian, blocks, colours, through) @ through.T
+    blind = np.linalg.qr((blind @ basis.T / unit).T)[0]
+    open_ = np.array([_shifts(blind, e) for e in np.eye(len(loose))], bool) | _vague(problem, q, matrix)
+    status = tuple(s or ("not determined" if no else "determined") for s, no in zip(limits, open_, strict=True))
     effective = sum(_samples(parts) * colours[c].effective_share for c, parts in blocks.items())
-    return Certainty(matrix, status, max(float(effective) - basis.shape[1], 1.0), colours, blind,
-                     basis.T / size[:, None])
+    return Certainty(matrix, status, max(float(effective) - basis.shape[1], 1.0), colours, blind, unit)
+
+
+def _shifts(blind: Array, slope: Array) -> bool:
+    """Tell whether a quantity of gradient `slope` (k,), in solver coordinates, changes along `blind` (k, m)."""
+    return bool(np.linalg.norm(slope @ blind) > BLIND * np.linalg.norm(slope))
+
+
+def _vague(problem: Problem, q: Array, matrix: Array) -> NDArray[np.bool_]:
+    """Tell of each unknown whether its deviation is half its value, or half the natural size where it may be zero."""
+    sizes, physical = natural_sizes(problem.experiments, problem.values(q)), problem.scaling.physical(q)
+    least = np.array([0.0 if p.positive else sizes.get(p.unit, np.inf) for p in problem.unknown])
+    return np.sqrt(np.maximum(np.diag(matrix), 0.0)) > UNDETERMINED * np.maximum(np.abs(physical), least)
 
 
 def _limit(lower: float, upper: float, value: float) -> str:
@@ -124,15 +141,17 @@ def _colours(blocks: Blocks, unknowns: int, method: str) -> dict[str, Colour]:
     return found
 
 
-def _meat(problem: Problem, jacobian: Array, blocks: Blocks, colours: Mapping[str, Colour]) -> Array:
-    """Covariance of Jᵀr: outputs with their colour, priors as observations of variance 1, penalties fixed."""
-    k = jacobian.shape[1]
-    total = np.zeros((k, k))
+def _meat(problem: Problem, jacobian: Array, blocks: Blocks, colours: Mapping[str, Colour], along: Array) -> Array:
+    """Covariance of (J along)ᵀr: outputs with their colour, priors as observations of variance 1, penalties fixed.
+
+    `along` (k, m) comes first: afterwards, what far weaker directions have would be rounding.
+    """
+    total = np.zeros((along.shape[1],) * 2)
     for c, parts in blocks.items():
         for _, jac in parts:
-            total += weighed(jac, colours[c].autocovariance(len(jac)))
+            total += weighed(jac @ along, colours[c].autocovariance(len(jac)))
     n, unknown = problem.n_outputs, {p.name for p in problem.unknown}
-    prior = jacobian[n:n + len(unknown & set(problem.priors))]
+    prior = jacobian[n:n + len(unknown & set(problem.priors))] @ along
     return total + prior.T @ prior
 
 
@@ -198,7 +217,7 @@ def _laws(problem: Problem, values: Mapping[str, float]) -> dict[str, tuple[str,
             (m := times(p))[0] + np.sqrt(max(m[0] ** 2 - m[1], 0.0)))
         if product > 0:
             laws["time_constant_fast"] = "s", "time constant, fast (electrical)", lambda p: (
-                (m := times(p))[0] - np.sqrt(max(m[0] ** 2 - m[1], 0.0)))
+                (m := times(p))[1] / (m[0] + np.sqrt(max(m[0] ** 2 - m[1], 0.0))))
     else:
         laws["natural_frequency"] = "rad/s", "natural frequency", lambda p: times(p)[1] ** -0.5
     if product > 0:

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from motorid.errors import UsageError, name_of, numbers_told, one_of
+from motorid.errors import ModelError, UsageError, name_of, numbers_told, one_of
 from motorid.estimation.angle_orders import effects_of_unknown_order, strongest_order, uses_angle
 from motorid.estimation.continuation import by_continuation
 from motorid.estimation.least_squares import FAILURES, FINISH, Callback, Estimate, least_squares
@@ -118,6 +118,9 @@ def fit(model: Model, runs: Sequence[Experiment] | Experiment, *, solver: Any = 
     problem = as_problem(model, runs, engine=engine, priors=dict(priors or {}), penalties=penalties, loss=loss,
                          constraints=tuple(constraints), initial=initial,
                          weights=weights or ("rms" if formulation == "penalty" else "noise"))
+    if unset := problem.model.without_value:
+        raise ModelError(f"{' and '.join(unset)} {'is' if len(unset) == 1 else 'are'} to be fixed, but at which value? "
+                         f"Give it, in SI units: model.fix({unset[0]}=…).")
     found = solve(problem, solver, start=start, callback=callback, formulation=formulation)
     if window == "auto" and start == "auto" and not hasattr(solver, "solve"):
         again = partial(solve, solver=solver, callback=callback, formulation=formulation)

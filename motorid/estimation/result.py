@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
@@ -21,7 +21,7 @@ from motorid.model.model import Model
 from motorid.numerics.signals import Array, despiked
 from motorid.problem.plain_data import model_dict, problem_dict
 from motorid.problem.problem import Problem
-from motorid.problem.simulate import Evaluation, Simulation, at, error_table, evaluate, judge, steady_errors
+from motorid.problem.simulate import NRMSE, Evaluation, Simulation, at, error_table, evaluate, judge, steady_errors
 from motorid.records.experiment import Experiment, units_of
 from motorid.records.files import json_text, write_files
 
@@ -284,11 +284,13 @@ class Fit(Shown):
         flags = [FLAGS[self.fits], *([] if self.status == "converged" else [Flag(self.status, "bad")])]
         flags += [Flag(self.formulation)] if self.formulation != "plain" else []
         flags += [Flag(f"{len(vague)} not determined", "note")] if vague else []
-        text = (self.verdict, f"{counted(len(runs), 'run')}, {self.problem.n_outputs} measured values. {ended(self)}")
+        amount = f"{counted(len(runs), 'run')}, {self.problem.n_outputs} measured values."
+        text = (self.verdict, NRMSE, f"{amount} {ended(self)}")
         after = [("mi.plot_fit(fit)", "see it"), ("mi.diagnose(fit)", "what is missing")]
         after = after if self.fits == "noise" else after[::-1]
         after += [("mi.identifiability(fit)", f"why {', '.join(vague)} cannot be determined")] if vague else []
-        tables = (*value_tables(self), error_table({"": self.evaluation}, self.noise), constraint_table(self))
+        errors = replace(error_table({"": self.evaluation}, self.noise), note="")
+        tables = (*value_tables(self), errors, constraint_table(self))
         return Card(f"Fit of {self.model.title}", flags, text, [t for t in tables if t], after)
 
     def __repr__(self) -> str:
@@ -488,4 +490,4 @@ def comparison_table(fits: Sequence[tuple[str, Fit]], held_out: Sequence[Mapping
         rows += [[f"held-out {name}", *(percent((e or {}).get(c)) for e in held_out)] for c, name in channels.items()]
     names = dict.fromkeys(n for _, f in fits for n in f.values if n != "sgn_width")
     rows += [[n, *(parameter_cell(f, n) for _, f in fits)] for n in names]
-    return Table(["quantity", *(title for title, _ in fits)], rows)
+    return Table(["quantity", *(title for title, _ in fits)], rows, note=NRMSE)

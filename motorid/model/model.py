@@ -99,7 +99,7 @@ class Model(Shown):
         return self._change({n: {"value": _within(self.parameters[n], v)} for n, v in known.items()})
 
     def fix(self, *names: str, **values: float) -> Model:
-        """Return the model with parameters fixed: ``fix("L")`` at its value, ``fix(R=1.2)`` at a new one."""
+        """Return the model with parameters fixed: ``fix(R=1.2)`` there, ``fix("R")`` at the value it has."""
         changes: dict[str, dict[str, Any]] = {n: {"vary": False} for n in names}
         changes |= {n: {"value": float(v), "vary": False, "given": True} for n, v in values.items()}
         return self._change(changes)
@@ -136,6 +136,13 @@ class Model(Shown):
     def free_names(self) -> tuple[str, ...]:
         """Names of the parameters that a fit varies."""
         return tuple(n for n, p in self.parameters.items() if p.vary)
+
+    @property
+    def without_value(self) -> tuple[str, ...]:
+        """Names of the motor's parameters that were fixed at the placeholder they have before a fit."""
+        started = {p.name: replace(p, vary=False) for p in BASES[self.base] if p.vary}
+        return tuple(n for n, p in self.parameters.items() if n in started and started[n].value == p.value
+                     and not (p.vary or p.given))
 
     @property
     def shared_names(self) -> tuple[str, ...]:

@@ -288,11 +288,10 @@ def _cost(residual: Callable[[Array], Array], q: Array) -> tuple[Array, float]:
     return r, cost if np.isfinite(cost) else np.inf
 
 
-def seen_directions(jac: Array) -> tuple[Array, Array, Array]:
-    """Return H (n, r) with (JᵀJ)⁻¹ = HHᵀ, the directions left out (m, n), and the columns' lengths (n,).
+def seen_directions(jac: Array) -> tuple[Array, Array]:
+    """Return H (n, r) with (JᵀJ)⁻¹ = HHᵀ, and the directions left out (m, n).
 
-    Columns are scaled to unit length first; directions with singular values below 1e-8 of the largest are left out,
-    and given in these units.
+    Columns are scaled to unit length first; directions with singular values below 1e-8 of the largest are left out.
     """
     norms = np.sqrt(np.einsum("ij,ij->j", jac, jac))
     size = np.where(norms > 0, norms, 1.0)
@@ -300,4 +299,4 @@ def seen_directions(jac: Array) -> tuple[Array, Array, Array]:
     _, s, vt = np.linalg.svd(triangle, full_matrices=True)
     s = np.concatenate([s, np.zeros(vt.shape[0] - len(s))])
     good = s > 1e-8 * max(s.max(initial=0.0), 1e-300)
-    return vt[good].T / s[good] / size[:, None], vt[~good], size
+    return vt[good].T / s[good] / size[:, None], vt[~good] / size

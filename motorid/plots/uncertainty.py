@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -16,11 +17,13 @@ from motorid.errors import UsageError, one_of
 from motorid.estimation.result import Fit
 from motorid.numerics.signals import Array
 from motorid.plots import style
+from motorid.uncertainty.identifiability import LEVEL as SEEN
 from motorid.uncertainty.identifiability import Identifiability
 from motorid.uncertainty.multistart import Multistart, StartResult
 from motorid.uncertainty.profile import Intervals, Profile
 
 LEVEL = 0.95
+TITLE = 52  # characters of a line above half a figure
 _KINDS = {"good": style.PALETTE["blue"], "poor": style.PALETTE["orange"], "failed": style.PALETTE["grey"]}
 
 
@@ -28,8 +31,8 @@ _KINDS = {"good": style.PALETTE["blue"], "poor": style.PALETTE["orange"], "faile
 def plot_singular_values(result: Identifiability) -> np.ndarray:
     """Draw how well each direction of the parameters is seen, and which parameters make it up.
 
-    A direction whose singular value is below one (shaded) changes the outputs by less than the noise even where the
-    parameters change by 100 %. Circles: share of each parameter in a direction, blue and orange for opposite signs.
+    A direction whose singular value is below two (shaded) changes the outputs by less than twice the noise even where
+    the parameters change by 100 %. Circles: share of each parameter in a direction, blue and orange for opposite signs.
 
     Parameters
     ----------
@@ -48,12 +51,12 @@ def plot_singular_values(result: Identifiability) -> np.ndarray:
     axes = style.new_figure(min(style.WIDTH, 4.6 + 0.6 * k), 3.2).subplots(1, 2, width_ratios=[1.0, max(0.8, 0.16 * k)])
     rows = np.arange(1, k + 1)
     values = np.maximum(result.singular_values, 1e-12 * max(float(result.singular_values[0]), 1e-300))
-    colours = [style.PALETTE["blue"] if v > 1 else style.PALETTE["orange"] for v in values]
+    colours = [style.PALETTE["blue"] if v > SEEN else style.PALETTE["orange"] for v in values]
     axes[0].vlines(rows, min(0.1, 0.5 * float(values.min())), values, color=colours, lw=2)
     axes[0].scatter(rows, values, color=colours, s=24, zorder=3)
     axes[0].set_yscale("log")
     axes[0].set_ylim(min(0.1, 0.5 * float(values.min())), 2.5 * float(values[0]))
-    axes[0].axhspan(axes[0].get_ylim()[0], 1, color=style.MUTED, alpha=0.16, lw=0, zorder=0)
+    axes[0].axhspan(axes[0].get_ylim()[0], SEEN, color=style.MUTED, alpha=0.16, lw=0, zorder=0)
     axes[0].set_xticks(rows)
     style.plain_decades(axes[0])
     words = f"rank {result.rank} of {k}, condition number {number(result.condition_number, 3)}"
@@ -263,8 +266,9 @@ def _sorted_costs(ax: Axes, result: Multistart, ends: Sequence[tuple[StartResult
     ax.set_ylim(0.9, max(2.2, float(ratio.max(initial=1.0)) * 1.5))
     style.plain_decades(ax)
     words = f"{result.good} of {len(result.results)} agree"
-    words += f"; {result.poor} ended elsewhere" if result.poor else ""
     words += f"; {result.failed} failed" if result.failed else ""
+    words += f"; {result.poor} elsewhere:" if result.poor else ""
+    words = "\n".join([words, *textwrap.wrap(result.elsewhere, TITLE)])
     style.tidy(ax, x="fits, best first", y="squared error over the best (ratio)", title=words)
     ax.legend(loc="upper left")
 
@@ -277,7 +281,7 @@ def _starts_and_ends(ax: Axes, result: Multistart, ends: Sequence[tuple[StartRes
         shift = np.linspace(-0.3, 0.0, max(len(starts), 1))[: len(starts)]
         ax.plot(j + shift, starts, ".", ms=3, color=style.PALETTE["grey"], alpha=0.7, label="start" if j == 0 else None)
         for kind, colour in _KINDS.items():
-            there = [e.values[name] / middle for e, k in ends if k == kind]
+            there = [1 + result.difference(name, e.values[name], middle) / middle for e, k in ends if k == kind]
             ax.plot(np.full(len(there), j + 0.2), there, "o", ms=4, color=colour, alpha=0.8)
     ax.axhline(1, color=style.MUTED, lw=0.7)
     if all(result.reference.values[n] > 0 for n in names):

@@ -29,7 +29,7 @@ from motorid.problem.sensitivity import relative_jacobian, relative_sensitivitie
 from motorid.problem.simulate import with_channels
 
 STRUCTURAL = 1e-7  # of the largest singular value, columns of equal length: less is no influence
-LEVEL = 1.0 / UNDETERMINED  # singular value below which a factor of e drowns in the noise
+LEVEL = 1.0 / UNDETERMINED  # singular value below which a factor of e is no more than twice the noise
 SHOWN = 0.05  # relative to the largest: smaller parts of a direction do not make it another one
 SPOKEN = 0.005  # smaller parts are not worth a word
 UNMOVED = 1e-6  # standard deviations of the noise that count as nothing
@@ -102,7 +102,7 @@ class Identifiability(Printed):
 
     @property
     def rank(self) -> int:
-        """Number of directions in which a change by 100 % (a factor of e) stands out of the noise."""
+        """Number of directions in which a change by 100 % (a factor of e) is more than twice the noise."""
         return int(np.sum(self.singular_values > LEVEL))
 
     @property

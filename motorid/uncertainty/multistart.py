@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from motorid.display.cards import Card, Flag, Printed, Table
-from motorid.display.numbers import duration, percent, quantity, sentence
+from motorid.display.numbers import duration, number, percent, quantity, sentence
 from motorid.errors import MotoridError, SimulationError, UsageError
 from motorid.estimation.fit import minimise, solve
 from motorid.estimation.least_squares import FINISH
@@ -30,6 +30,7 @@ COST_SHARE = 1e-3  # a good fit's cost is at most this much above the best
 # A good fit's parameters are within this many standard deviations of the best: the integration, accurate to a
 # part of the noise, already moves them by some tenths.
 DISTANCE = 0.5
+PLACES, FARTHEST = 2, 3  # places told of those where other fits ended, and parameters of each
 
 
 @one_thread
@@ -183,11 +184,11 @@ class Multistart(Printed):
         if isinstance(end, Failure) or not np.isfinite(end.cost):
             return "failed"
         best = self.best or self.reference
-        far = any(abs(self._difference(n, end.values[n], best.values[n])) > DISTANCE * sd
+        far = any(abs(self.difference(n, end.values[n], best.values[n])) > DISTANCE * sd
                   for n, sd in self.reference.std.items() if sd)
         return "poor" if end.cost > best.cost * (1 + COST_SHARE) or far else "good"
 
-    def _difference(self, name: str, a: float, b: float) -> float:
+    def difference(self, name: str, a: float, b: float) -> float:
         """Difference of two values; phases are compared on the circle."""
         periodic = self.reference.problem.model.parameters[name].periodic
         return (a - b + np.pi) % (2 * np.pi) - np.pi if periodic else a - b
@@ -231,22 +232,49 @@ class Multistart(Printed):
         """One row per place where fits ended (`pandas.DataFrame`), best first: fits, cost ratio, values."""
         import pandas as pd
 
-        ends = sorted((e for e in self.results if isinstance(e, StartResult) and np.isfinite(e.cost)),
-                      key=lambda e: e.cost)
+        return pd.DataFrame([{"fits": len(p), "cost_ratio": p[0].cost / self._lowest, **dict(p[0].nrmse),
+                              **{n: p[0].values[n] for n in p[0].start}} for p in self._places(("good", "poor"))])
+
+    @property
+    def _lowest(self) -> float:
+        """Lowest cost of all."""
+        return (self.best or self.reference).cost
+
+    def _places(self, kinds: Sequence[str]) -> list[list[StartResult]]:
+        """Return the ends of these kinds by place, the lowest cost first."""
+        ends = [e for e, k in zip(self.results, self.kinds, strict=True) if k in kinds and isinstance(e, StartResult)]
         places: list[list[StartResult]] = []
-        for end in ends:
+        for end in sorted(ends, key=lambda e: e.cost):
             home = next((p for p in places if self._same_place(p[0], end)), None)
             places.append([end]) if home is None else home.append(end)
-        lowest = min([self.reference.cost, *(e.cost for e in ends)])
-        return pd.DataFrame([{"fits": len(p), "cost_ratio": p[0].cost / lowest, **dict(p[0].nrmse),
-                              **{n: p[0].values[n] for n in p[0].start}} for p in places])
+        return places
+
+    @property
+    def elsewhere(self) -> str:
+        """Where the others ended: ``2 at b = 1.3·10⁻³ N·m·s/rad (squared error 3.1 times)``; else empty.
+
+        The places with most fits, and there the parameters that are farthest off.
+        """
+        best, pars = (self.best or self.reference).values, self.reference.model.parameters
+        places = sorted(self._places(("poor",)), key=len, reverse=True)
+        told = []
+        for place in places[:PLACES]:
+            end = place[0].values
+            off = {n: abs(self.difference(n, end[n], best[n])) / max(abs(end[n]), abs(best[n]), 1e-300)
+                   for n in self.reference.problem.model.free_names}
+            most = [n for n in sorted(off, key=lambda n: -off[n])[:FARTHEST] if off[n] > 0.1 * max(off.values())]
+            where = ", ".join(f"{n} = {quantity(end[n], pars[n].unit, 3)}" for n in most)
+            told.append(f"{len(place)} at {where} (squared error "
+                        f"{number(place[0].cost / self._lowest, 3)} times)")
+        more = sum(map(len, places[PLACES:]))
+        return "; ".join([*told, *([f"{more} at other places"] if more else [])])
 
     def _same_place(self, a: StartResult, b: StartResult) -> bool:
         """Tell whether two fits ended in the same place: cost within 1 %, values within 5 %."""
         if abs(a.cost - b.cost) > 10 * COST_SHARE * a.cost:
             return False
         sizes = [max(abs(a.values[n]), abs(b.values[n]), 1e-300) for n in a.start]
-        return all(abs(self._difference(n, a.values[n], b.values[n])) < 0.05 * s
+        return all(abs(self.difference(n, a.values[n], b.values[n])) < 0.05 * s
                    for n, s in zip(a.start, sizes, strict=True))
 
     def statistics(self) -> dict[str, dict[str, float | None]]:
@@ -254,7 +282,7 @@ class Multistart(Printed):
         found = {}
         for n in self.reference.problem.model.free_names:
             middle = self.reference.values[n]
-            v = np.array([middle + self._difference(n, e.values[n], middle) for e in self._good])
+            v = np.array([middle + self.difference(n, e.values[n], middle) for e in self._good])
             found[n] = {"reference": self.reference.values[n], "mean": float(v.mean()) if v.size else None,
                         "std": float(v.std()) if v.size else None}
         return found
@@ -280,9 +308,8 @@ class Multistart(Printed):
         if self.best is not None:
             lower = percent(1 - self.best.cost / self.reference.cost)
             said.append(f"One start found a better place than the fit: its cost is {lower} lower.")
-        if self.poor and len(self.basins) > 1:
-            said.append(f"The fits end in {len(self.basins)} places; the cost of the second is "
-                        f"{self.basins['cost_ratio'].iloc[1]:.4g} times the best.")
+        if self.poor:
+            said.append(f"Elsewhere: {self.elsewhere}.")
         return " ".join([*said, sentence(self.interrupted)]).strip()
 
     def card(self) -> Card:

@@ -11,6 +11,7 @@ from command import motorid, motorid_json
 import motorid as mi
 from motorid import plots
 from motorid.display.numbers import with_error
+from motorid.estimation.covariance import certainty
 from motorid.records.datasets import data_path, truth
 
 FRICTION = data_path("hidden_friction")
@@ -96,3 +97,25 @@ def test_voltage_and_speed_alone_determine_gain_times_and_friction_in_volts(runs
     both = mi.fit(fit.model.without("coulomb"), runs)
     assert set(fit.determined) >= {"time_constant", "damping"} <= set(both.determined)
     assert json.dumps([d.value for d in fit.determined.values()])
+
+
+def test_a_value_whose_interval_reaches_zero_does_not_count_as_determined(runs):
+    """Dry friction tells a little of K without the current, or without the speed: a factor of several each way."""
+    model, hidden = mi.dc_motor() + mi.effects.coulomb, truth("hidden_friction")["parameters"]
+    for left_out in ("i", "omega"):
+        fit = mi.fit(model, [r.without(left_out) for r in runs])
+        assert [fit.std[n] for n in ("K", "b", "J")] == [None] * 3, left_out
+        assert all(d.std < 0.5 * abs(d.value) for d in fit.determined.values())
+    assert fit.values["R"] == pytest.approx(hidden["R"], abs=4 * fit.std["R"])
+    assert "gain" not in fit.determined
+
+
+@pytest.mark.parametrize("apart", [4e-8, 7e-8, 9.65361e-8, 1.2e-7])
+def test_two_columns_that_are_nearly_one_give_no_deviation_of_zero(plain, apart):
+    """What rounding made of them once: a variance below zero, a deviation of 0, and both determined."""
+    jac = plain.jacobian.copy()
+    shape = jac[:, 4] / np.abs(jac[:, 4]).max()
+    jac[:, 3] = 1e-9 * shape * (1 + apart * np.sin(np.arange(len(jac))))
+    known = certainty(plain.problem, plain.q, plain.residuals, jac)
+    assert known.status[3:] == ("not determined",) * 2 + ("determined",) * 2
+    assert np.all(np.diag(known.matrix) > 0)

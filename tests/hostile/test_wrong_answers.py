@@ -196,7 +196,7 @@ def test_a_journal_gives_no_answer_of_another_law(change, rng, tmp_path):
     motors, own, journal = tmp_path / "motors", tmp_path / "own.py", tmp_path / "batch.jsonl"
     motors.mkdir()
     mi.records.reading.write_csv(record(rng, "lab", "reversals", 1.0), motors / "a.csv")
-    words = ("fit-many", motors, "--effects-from", own, "--effects", "drag", "--fix", "b", "--journal", journal)
+    words = ("fit-many", motors, "--effects-from", own, "--effects", "drag", "--fix", "b=1e-5", "--journal", journal)
     marks = []
     for text in (OWN, OWN, OWN.replace(*change)):
         own.write_text(text, encoding="utf-8")

@@ -120,7 +120,8 @@ def test_places_where_fits_end_are_listed_best_first(mixed):
     places = mixed.basins
     assert places["fits"].tolist() == [3, 2]
     assert places["cost_ratio"].tolist() == pytest.approx([1, 8])
-    assert "end in 2 places" in str(mixed)
+    assert "2 elsewhere, 1 failed" in str(mixed)
+    assert "Elsewhere: 2 at " in str(mixed)
 
 
 def test_better_place_than_the_reference_becomes_the_measure(fits):
@@ -232,3 +233,20 @@ def test_nonsense_is_refused(fits):
         multistart(best, starts=0)
     with pytest.raises(UsageError, match="spread of at least 1"):
         multistart(best, spread=0.5)
+
+
+def test_it_says_where_the_other_starts_ended_with_units(fits):
+    fit = fits["two_step_noisy"]
+
+    def ended(cost, **changed):
+        return StartResult(fit.values, {**fit.values, **changed}, fit.cost * cost, fit.nrmse, "converged", "", 3, 0.1)
+
+    ends = (*[ended(1.0)] * 6, ended(9.0, b=1e-3), ended(9.0, b=1e-3), ended(2.0, R=5.0))
+    found = Multistart(fit, ends, 10.0, False, 1.0)
+    assert (found.good, found.poor) == (6, 3)
+    assert found.elsewhere == ("2 at b = 0.001 N·m·s/rad (squared error 9 times); "
+                               "1 at R = 5 Ω (squared error 2 times)")
+    assert f"Elsewhere: {found.elsewhere}." in found.text
+    assert Multistart(fit, (ended(1.0),), 10.0, False, 1.0).elsewhere == ""
+    title = mi.plot_waterfall(found)[0].get_title(loc="left").replace("\n", " ")
+    assert title == f"6 of 9 agree; 3 elsewhere: {found.elsewhere}"
