@@ -20,9 +20,9 @@ from motorid.diagnosis.model_comparison import COMMON, Node, beats, evidence, fa
 from motorid.diagnosis.predictive_score import Evidence
 from motorid.diagnosis.refit import GivenUp, Task, completed, lost, refit, refits, widened
 from motorid.diagnosis.results import Candidate
-from motorid.diagnosis.score_test import Score, pairs_of, rank
+from motorid.diagnosis.score_test import Score, pairs_of, rank, uses_angle, with_phase_per_run, with_warm_start
 from motorid.diagnosis.thresholds import MATERIAL
-from motorid.effects import LIBRARY, MEASURED
+from motorid.effects import LIBRARY, MEASURED, PER_RUN
 from motorid.errors import ModelError
 from motorid.estimation.least_squares import FAILURES
 from motorid.estimation.result import Fit
@@ -43,7 +43,7 @@ def library(effects: Iterable[Effect | str] | None, also: Iterable[Effect] = ())
     """Return the effects to try: the whole library, or those named, and the user's own."""
     from motorid.effects import get
 
-    named = [*LIBRARY, *MEASURED] if effects is None else effects
+    named = [*LIBRARY, *MEASURED, *PER_RUN] if effects is None else effects
     chosen = [get(e) if isinstance(e, str) else e for e in named]
     own = {e.name: e for e in also}  # in the place of one of the library with the same name
     return [e for e in chosen if e.name not in own] + list(own.values())
@@ -95,16 +95,30 @@ class Search:
         for e in wider:
             with contextlib.suppress(ModelError):  # beside what is there it may describe the same twice
                 tasks.append(widened(node.fit, e))
-        fits = dict(zip((t.effect.name for t in tasks), refits(tasks, self.map), strict=True))
+        tasks += self._restarting(node)
+        fits = dict(zip((t.name for t in tasks), refits(tasks, self.map), strict=True))
         self.advance(f"refitted {sum(isinstance(f, Fit) for f in fits.values())} of {len(fits)}")
-        found = {t.effect.name: self._judge(node, (t.effect,), fits[t.effect.name]) for t in tasks}
+        found = {t.name: self._judge(node, t.added, fits[t.name]) for t in tasks}
         begun = {n: f for n, f in fits.items() if isinstance(f, GivenUp) and f.begun is not None}
         if begun and all(child is None or child.objection for child, _ in found.values()):  # what led is refused
             later = dict(zip(begun, completed(list(begun.values()), self.map), strict=True))
-            found |= {t.effect.name: self._judge(node, (t.effect,), later[t.effect.name])
-                      for t in tasks if t.effect.name in later}
+            found |= {t.name: self._judge(node, t.added, later[t.name]) for t in tasks if t.name in later}
         children = [child for child, _ in found.values() if child is not None]
-        return children, self.listed(scores, {name: candidate for name, (_, candidate) in found.items()})
+        tried = sorted((candidate for _, candidate in found.values()), key=lambda c: c.gain or 0.0)
+        return children, self.listed(scores, {c.effect: c for c in tried})
+
+    def _restarting(self, node: Node) -> list[Task]:
+        """Return the effects that explain more with a zero of the encoder, or a warmth, of every run, with that."""
+        own, model, tasks = {e.name: e for e in self.effects if e.name in PER_RUN}, node.fit.model, []
+        if not far(node.fit) or len(set(node.fit.problem.unknowns.firsts)) < 2:
+            return []
+        if (zero := own.get("encoder_zero")) and zero.name not in model.effect_names:
+            found = with_phase_per_run(node.fit, self.scores(node), zero)
+            tasks += [Task(node.fit, model + s.effect + zero, s.effect, s.starts, s.drop) for s in found]
+        if warm := own.get("winding_warm_start"):
+            found = with_warm_start(node.fit, self.scores(node), LIBRARY["winding_heating"])
+            tasks += [Task(node.fit, model + s.effect + warm, s.effect, s.starts, s.drop) for s in found]
+        return tasks
 
     def _shortlist(self, node: Node) -> list[Score]:
         """Return what is worth a refit: the best, what is common and near the best, and what a score cannot show.
@@ -132,6 +146,8 @@ class Search:
                 continue
             if model.axis == "linear" and any(p.periodic for p in e.parameters):
                 continue  # a phase in metres is none
+            if any(p.per_run for p in e.parameters) and not self._restarts(model, e):
+                continue
             if have & set(e.includes):
                 wider.append(e)
                 continue
@@ -142,6 +158,11 @@ class Search:
                 continue
             fresh.append(e)
         return fresh, wider
+
+    def _restarts(self, model: Model, effect: Effect) -> bool:
+        """Tell whether there are several records, and what an effect that begins anew in each acts on."""
+        several = len(set(self.root.fit.problem.unknowns.firsts)) > 1
+        return several and (not uses_angle(effect) or any(uses_angle(e) for e in model.effects))
 
     def expand_by_two(self, node: Node) -> list[Node]:
         """Return the judged models larger by two effects that only together show: each alone was refused."""
@@ -203,7 +224,7 @@ class Search:
         for e in node.fit.problem.model.effects:
             simpler = [m for r in self._relatives(node, e) if (m := _in_place(node.fit.model, e, r)) is not None]
             alone = e.name == node.added and node.parent is not None and len(node.key - node.parent.key) == 1
-            smaller = simpler if alone else [*simpler, node.fit.model.without(e.name)]
+            smaller = simpler if alone else [*simpler, *_without(node.fit.model, e.name)]
             for model in sorted(smaller, key=lambda m: len(m.free_names)):
                 other = self.smaller(node, model)
                 if other is not None and superfluous(node, other) and beats(other, before):
@@ -215,6 +236,10 @@ class Search:
         have = set(node.fit.model.effect_names)
         known = {e.name: e for e in self.effects}
         return [known[n] for n in effect.includes if n in known and n not in have]
+
+    def without(self, node: Node, name: str) -> Node | None:
+        """Return the judged model without an effect; None where that is none."""
+        return next((self.smaller(node, model) for model in _without(node.fit.model, name)), None)
 
     def smaller(self, node: Node, model: Model) -> Node | None:
         """Return the judged model, one that is contained in `node`'s; None where it is no model by itself."""
@@ -244,6 +269,13 @@ def _flat_topped(run: Experiment) -> bool:
     size = np.abs(run.outputs["i"][np.isfinite(run.outputs["i"])])
     near = 4 * noise_level(run.outputs["i"], run.t)
     return bool(np.mean(size > np.quantile(size, 0.995) - near) > FLAT_TOP)
+
+
+def _without(model: Model, name: str) -> list[Model]:
+    """Return the model without an effect, none where another one needs it."""
+    with contextlib.suppress(ModelError):
+        return [model.without(name)]
+    return []
 
 
 def _in_place(model: Model, old: Effect, new: Effect) -> Model | None:

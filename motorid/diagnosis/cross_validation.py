@@ -7,13 +7,20 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from motorid.diagnosis.predictive_score import Channels, Errors, Predictions, errors_of, predictions_left_out
+from motorid.diagnosis.predictive_score import (
+    Channels,
+    Errors,
+    Predictions,
+    errors_of,
+    held_out_errors,
+    predictions_left_out,
+)
 from motorid.estimation.continuation import by_continuation
 from motorid.estimation.least_squares import FAILURES
 from motorid.estimation.result import Fit
 from motorid.numerics.least_squares import LevenbergMarquardt
 from motorid.problem.problem import Problem
-from motorid.problem.simulate import at, cut_alike, simulated
+from motorid.problem.simulate import at, cut_alike
 from motorid.records.experiment import Experiment
 
 QUICK = LevenbergMarquardt(max_iterations=25, ftol=1e-4, xtol=1e-5, looks=0)
@@ -56,7 +63,7 @@ class HeldOut:
         """
         held_out: Channels = {}
         if self.validation is not None:
-            held_out = errors_of(simulated(self.validation.for_model(fit.model)), self.noise)
+            held_out = held_out_errors(self.validation.for_model(fit.model), self.noise)
         blocks = predictions_left_out(fit)
         if blocks is None and not held_out:
             blocks = self._refitted(fit)

@@ -15,7 +15,7 @@ from motorid.diagnosis.thresholds import CONTAINED
 from motorid.effects import LIBRARY
 from motorid.errors import SimulationError
 from motorid.estimation.angle_orders import likely_orders
-from motorid.estimation.linearisation import Response, Tangent, parameter_vector, responses_of
+from motorid.estimation.linearisation import Response, Tangent, parameter_vector, responses
 from motorid.estimation.result import Fit
 from motorid.numerics.signals import Array
 from motorid.problem.problem import Problem
@@ -226,7 +226,7 @@ def linearised(fit: Fit, only: Form | None = None, span: Span | None = None) -> 
     span = span or span_of(fit, signals)
     forms = [f for f in FORMS if shown(f, fit, span.ranges)] if only is None else [only]
     free, n, runs = len(problem.model.free_names), problem.n_outputs, range(len(signals))
-    answers = responses_of(problem, parameter_vector(fit), fit.simulations)
+    answers = responses(fit)
     bases = [{f: basis_of(f, signal, span) for f in forms} for signal in signals]
     parts = [_answers(problem, k, answers[k], bases[k]) for k in runs]
     columns = {f: np.vstack([part[f] for part in parts]) for f in forms}
@@ -239,7 +239,7 @@ def linearised(fit: Fit, only: Form | None = None, span: Span | None = None) -> 
 def _at(problem: Problem, fit: Fit) -> tuple[Array, Array]:
     """Return residual and slopes (SI) of the fitted model, without loss and priors."""
     first = {f"{c}_0[{k}]": float(y[0]) for k, s in enumerate(fit.simulations) for c, y in s.states.items()}
-    values = {**fit.values, **first}
+    values = {**fit.initial, **fit.values, **first}
     q = problem.scaling.scaled([values.get(p.name, p.value) for p in problem.unknown])
     problem = replace(problem, loss=None, priors={}, penalties=(), _runs=problem.refined(q).runs)
     residual, jac = problem.residual_and_jacobian(q)
@@ -387,14 +387,13 @@ def _place(fit: Fit, form: Form) -> int | None:
 
 def pushes_of(fit: Fit, name: str) -> Array:
     """Return what a small change of a parameter adds to each state's rate and to each output, (N, nx + ny)."""
-    system, values = fit.problem.system, parameter_vector(fit)
-    nudged = values.copy()
-    nudged[system.parameters.index(name)] += NUDGE * (abs(fit.values[name]) or 1.0)
-    found = []
-    for run, sim in zip(fit.problem.runs, fit.simulations, strict=True):
+    system, found = fit.problem.system, []
+    nudge = np.array([NUDGE * (abs(fit.values[name]) or 1.0) * (n == name) for n in system.parameters])
+    for k, (run, sim) in enumerate(zip(fit.problem.runs, fit.simulations, strict=True)):
+        values = parameter_vector(fit, k)
         x, u = np.column_stack([sim.states[s] for s in system.states]).T, run.grid.u.T
         was, now = (np.vstack([np.asarray(f.map(x.shape[1])(x, u, np.tile(p[:, None], (1, x.shape[1]))))
-                               for f in (system.rhs, system.out)]) for p in (values, nudged))
+                               for f in (system.rhs, system.out)]) for p in (values, values + nudge))
         found.append((now - was).T)
     return np.concatenate(found)
 

@@ -281,7 +281,7 @@ def smooth(fit: Fit, k: int, walk: Array, begun: Begun) -> Smoothed:
         Where to begin, see `begin`; the same for every walk.
     """
     run, system = fit.problem.runs[k], fit.problem.system
-    p = parameter_vector(fit)
+    p = parameter_vector(fit, k)
     y = fit.problem.measured[k].y
     weights = np.array([1.0 / run.sigma[c] if c in run.sigma else 0.0 for c in fit.problem.outputs])
     x, linear = begun
@@ -316,7 +316,7 @@ def begin(fit: Fit, k: int) -> Begun:
 
 def _linear(fit: Fit, k: int, x: Array, d: Array) -> Linear:
     """Return the model linearised at the states `x` and the inputs `d`."""
-    grid, system, p = fit.problem.runs[k].grid, fit.problem.system, parameter_vector(fit)
+    grid, system, p = fit.problem.runs[k].grid, fit.problem.system, parameter_vector(fit, k)
     return Linear(*linear_steps(system, grid, x, p, d[:-1]), *shown(system, grid, x, p))
 
 

@@ -171,7 +171,9 @@ def grades_of(last: Node, root: Node, groups: Sequence[Sequence[str]], beside: S
 def _insignificant(fit: Fit, effect: Effect) -> str:
     """Say so where every size of an effect is smaller than its own deviation; one without a deviation may be any."""
     sizes = [p.name for p in effect.parameters if p.null == 0 and fit.problem.model.parameters[p.name].vary]
-    known = [n for n in sizes if (std := fit.std[n]) is None or std < abs(fit.values[n])]
+    found = [(fit.values[n], fit.std[n]) for n in sizes]
+    found += [(own["value"], own["std"]) for n in sizes for own in fit.per_run.get(n, {}).values()]
+    known = [value for value, std in found if std is None or std < abs(value)]
     return f"{' and '.join(sizes)} could as well be zero, within one standard deviation" if sizes and not known else ""
 
 

@@ -13,6 +13,8 @@ from motorid.diagnosis.cross_validation import HeldOut
 from motorid.diagnosis.predictive_score import Evidence, Predictions, compare
 from motorid.diagnosis.thresholds import LARGER
 from motorid.estimation.result import Fit
+from motorid.model.model import Model
+from motorid.problem.problem import Problem
 
 COMMON = ("coulomb", "gravity", "brush_drop", "winding_heating", "cogging", "load_friction", "quadratic_drag",
           "constant_load", "speed_lag", "driver_dead_band")  # what is met most, first
@@ -41,7 +43,13 @@ class Node:
     @property
     def size(self) -> int:
         """Number of free parameters."""
-        return len(self.fit.problem.model.free_names)
+        return size_of(self.fit.problem.model, self.fit.problem)
+
+
+def size_of(model: Model, problem: Problem) -> int:
+    """Return the number of free parameters on the records of `problem`, those of every run counted for each."""
+    own = sum(p.vary and p.per_run for p in model.parameters.values())
+    return len(model.free_names) + own * (len(set(problem.unknowns.firsts)) - 1)
 
 
 def node_of(fit: Fit, held: HeldOut, added: str | None = None, parent: Node | None = None) -> Node:

@@ -16,7 +16,7 @@ of its samples.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -35,7 +35,7 @@ from motorid.estimation.result import Fit
 from motorid.numerics.autoregression import effective_samples
 from motorid.numerics.signals import Array, despiked
 from motorid.problem.problem import Problem
-from motorid.problem.simulate import Simulation
+from motorid.problem.simulate import Simulation, at, settled
 from motorid.records.experiment import Experiment
 
 SETTLED = 1e-6  # relative change of the scale at which its iteration stops
@@ -260,7 +260,8 @@ def predictions_left_out(fit: Fit) -> Channels | None:
     from its phase) the linear prediction explodes, and tells nothing.
     """
     problem, n = fit.problem, fit.problem.n_outputs
-    free = [j for j, p in enumerate(problem.unknown) if p.name in fit.values and p.name not in fit.at_bound]
+    at_start = {p.name for *_, p in problem.unknowns.initial}
+    free = [j for j, p in enumerate(problem.unknown) if p.name not in at_start | fit.at_bound]
     columns = (fit.jacobian[:n] * problem.scaling.slope(fit.q))[:, free]
     blocks = blocks_of([run.n for run in problem.experiments])
     residual = fit.residuals[:n]
@@ -292,6 +293,21 @@ def by_channel(problem: Problem, residual: Array, blocks: Sequence[NDArray[np.in
                               float(np.sqrt(np.nanmean(measured**2))),
                               float(np.sqrt(np.mean([problem.runs[k].sigma[c] ** 2 for k in runs]))))
     return found
+
+
+def held_out_errors(problem: Problem, noise: Mapping[str, float]) -> Channels:
+    """Return the errors of a problem's model on its runs, which it was not fitted to.
+
+    What these runs have for themselves (an encoder's zero) counts for each block as the others tell it.
+    """
+    problem, q = settled(problem)
+    errors = errors_of(at(problem, q), noise)
+    if not problem.unknowns.apart:
+        return errors
+    r, jac = problem.residual_and_jacobian(q)
+    blocks = blocks_of([run.n for run in problem.experiments])
+    own = left_out(r, jac[:, len(problem.unknowns.initial) :], stacked_labels(problem, blocks))
+    return {c: replace(errors[c], values=e.values) for c, e in by_channel(problem, own, blocks).items()}
 
 
 def errors_of(simulations: Sequence[Simulation], noise: Mapping[str, float],

@@ -18,7 +18,7 @@ from motorid.estimation.result import Fit
 from motorid.numerics.signals import Array
 from motorid.problem.problem import Problem
 from motorid.problem.runs import angle_signal
-from motorid.records.experiment import Experiment
+from motorid.records.experiment import Experiment, record_of
 
 AFFORDABLE = 60_000  # steps of integration per simulation of all records
 WANTED = 24_000  # of what is longer
@@ -80,7 +80,7 @@ def _parts(run: Experiment, share: float) -> list[Experiment]:
         return [run]
     return [
         run.select(slice(a, a + PART)).with_(
-            name=f"{run.name}[{k + 1}]", meta={**run.meta, "part of": (run.name, run.n)}
+            name=f"{run.name}[{k + 1}]", meta={**run.meta, "part of": (run.name, run.n), "record": record_of(run)}
         )
         for k, a in enumerate(_telling(run, count))
     ]

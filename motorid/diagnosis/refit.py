@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from motorid.diagnosis.cross_validation import QUICK, ROUGH, restarted
-from motorid.diagnosis.model_comparison import far
+from motorid.diagnosis.model_comparison import far, size_of
 from motorid.diagnosis.record_parts import worth_its_steps
 from motorid.diagnosis.score_test import uses_angle
 from motorid.diagnosis.thresholds import MATERIAL, NATS
@@ -151,7 +151,8 @@ def _started(fit: Fit, model: Model, start: Mapping[str, float], angular: bool) 
     """Return the problem of a refit, at its start."""
     names = [n for n in start if n in model.parameters]
     problem = fit.problem.for_model(_within(model, {n: start[n] for n in names})).tuned(accuracy=ROUGH)
-    problem = restarted(problem, problem.scaling.scaled([fit.initial.get(p.name, p.value) for p in problem.unknown]))
+    apart = {**{n: v for n, v in start.items() if n not in model.parameters}, **fit.initial}
+    problem = restarted(problem, problem.scaling.scaled([apart.get(p.name, p.value) for p in problem.unknown]))
     return problem.for_model(replace(problem.model, angle_input=True, _systems={})) if angular else problem
 
 
@@ -253,9 +254,19 @@ class Task:
     promise: float | None = None
 
     @property
+    def added(self) -> tuple[Effect, ...]:
+        """The effects that the fit has not."""
+        return tuple(e for e in self.model.effects if e.name not in self.fit.model.effect_names)
+
+    @property
+    def name(self) -> str:
+        """The names of what is added."""
+        return " + ".join(e.name for e in self.added)
+
+    @property
     def price(self) -> float:
         """What the free parameters must gain, in units of the cost (half of chi²)."""
-        return NATS + 0.5 * len(self.model.free_names) * float(np.log(len(self.fit.residuals)))
+        return NATS + 0.5 * size_of(self.model, self.fit.problem) * float(np.log(len(self.fit.residuals)))
 
 
 @dataclass(frozen=True)
@@ -336,7 +347,7 @@ def _leader(tasks: Sequence[Task]) -> int | None:
     """Return which task promises most, the smallest of those that promise nearly as much; None if none does."""
     promises = {k: task.promise for k, task in enumerate(tasks) if task.promise is not None}
     near = [k for k, promise in promises.items() if promise > NEARLY * max(promises.values())]
-    return min(near, key=lambda k: (len(tasks[k].model.free_names), -promises[k]), default=None)
+    return min(near, key=lambda k: (size_of(tasks[k].model, tasks[k].fit.problem), -promises[k]), default=None)
 
 
 def _quiet(fit: Fit | GivenUp | None) -> Fit | None:

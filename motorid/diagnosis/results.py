@@ -330,6 +330,7 @@ class Diagnosis(Shown):
                           "follows": self.remainder.follows if self.remainder else None, "text": self.remaining.text},
             "parameters_before": dict(self.before.values),
             "parameters_after": dict(self.after.values),
+            "per_run": self.after.per_run,
             "groups": [list(g) for g in self.groups],
             "suggestion": self.suggestion,
             "stopped": self.stopped or None,

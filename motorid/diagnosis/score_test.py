@@ -18,7 +18,7 @@ import numpy as np
 
 from motorid.errors import ModelError, SimulationError
 from motorid.estimation.angle_orders import Line, likely_lines, spectrum, uses_angle
-from motorid.estimation.linearisation import Tangent
+from motorid.estimation.linearisation import Tangent, parameter_vector
 from motorid.estimation.result import Fit
 from motorid.integrate.engine import Trajectory
 from motorid.model.definition import Effect, Parameter
@@ -29,6 +29,7 @@ from motorid.problem.unknowns import Point
 
 ORDERS_TRIED = 8  # a race tells them apart: near friction and far from the optimum the highest line may be another
 MORE = 0.1  # that a pair must promise beyond the better of the two
+PER_RUN = 3  # orders that each run alone may tell
 NOTHING = 6.0  # chi² that an effect takes away by the slopes of a smaller model: too little for a closer look
 
 
@@ -94,6 +95,79 @@ def pairs_of(fit: Fit, scores: Sequence[Score], most: int) -> list[tuple[Score, 
     return [(a, b) for _, a, b in sorted(found, key=lambda pair: -pair[0])[:most]]
 
 
+def with_phase_per_run(fit: Fit, scores: Sequence[Score], zero: Effect) -> list[Score]:
+    """Return the effects over the angle that explain more with a phase in every run, and where each zero then is.
+
+    Parameters
+    ----------
+    fit : Fit
+    scores : sequence of Score
+        Of single effects.
+    zero : Effect
+        The zero of the encoder, of one parameter per run.
+    """
+    tangent, runs = Tangent.of(fit), sorted(set(fit.problem.unknowns.firsts))
+    apart = [f"{zero.parameters[0].name}[{k}]" for k in runs]
+    found = []
+    for s in scores if len(runs) > 1 else ():
+        phase = next((p for p in s.effect.parameters if p.periodic and not p.grid), None)
+        if phase is None or not uses_angle(s.effect):
+            continue
+        tried, added = [], Added.of(tangent, s.effect)
+        order = next((p.name for p in added.pars if p.order and not p.given), "")
+        parts = [Tangent.of(alone(fit, k)) for k in runs] if order else []
+        for n in {line.order for part in parts for line in likely_lines(part, s.effect, PER_RUN)} if order else (1.0,):
+            shape = added.shape({order: n} if order else {})
+            if shape is None or not shape.sizes:
+                continue
+            columns = by_record(fit.problem, shape.columns)
+            drop, a, _ = tangent.explained(np.hstack(columns), [False] * 2 * len(runs))
+            waves = a[::2] + 1j * a[1::2]
+            zeros = np.angle(waves * np.conj(waves[0])) / n
+            wave = {shape.sizes[0].name: float(np.median(np.abs(waves))), phase.name: float(np.angle(waves[0]))}
+            tried.append((drop, {**shape.values, **wave, **dict(zip(apart, zeros.tolist(), strict=True))}))
+        tried = sorted(tried, key=lambda t: -t[0])[:PER_RUN]
+        if tried and tried[0][0] > (1 + MORE) * s.drop:
+            found.append(replace(s, drop=tried[0][0], starts=tuple(values for _, values in tried)))
+    return found
+
+
+def with_warm_start(fit: Fit, scores: Sequence[Score], heated: Effect) -> list[Score]:
+    """Return the score of a heating beside an R that is another in every run, if that explains more."""
+    tangent, n, names = Tangent.of(fit), fit.problem.n_outputs, [p.name for p in fit.problem.unknown]
+    for s in (s for s in scores if s.effect is heated and s.shapes and "R" in names):
+        apart = by_record(fit.problem, fit.jacobian[:n, [names.index("R")]])[1:]
+        signs = [False] * len(apart)
+        both = [tangent.explained(np.hstack([shape.columns, *apart]), [*shape.nonnegative, *signs]).share
+                for shape in s.shapes]
+        if max(both) > (1 + MORE) * s.drop:
+            starts = [{**s.shapes[k].values, **{p.name: p.value for p in s.effect.parameters if not p.vary}}
+                      for k in np.argsort(both)[::-1]]
+            return [replace(s, drop=max(both), starts=tuple(_distinct(starts)))]
+    return []
+
+
+def by_record(problem: Problem, columns: Array) -> list[Array]:
+    """Return stacked columns (n, k) once for each record, zero elsewhere; parts of one record belong together."""
+    records = np.repeat(problem.unknowns.firsts, [m.size for m in problem.measured])
+    return [np.where((records == k)[:, None], columns, 0.0) for k in sorted(set(problem.unknowns.firsts))]
+
+
+def alone(fit: Fit, first: int) -> Fit:
+    """Return a fit, as it is, on the runs of one of its records, the one that begins with run `first`."""
+    problem, mine = fit.problem, [k for k, f in enumerate(fit.problem.unknowns.firsts) if f == first]
+    rows = np.isin(np.repeat(np.arange(len(problem.runs)), [m.size for m in problem.measured]), mine)
+    own = dict(zip(problem.system.parameters, parameter_vector(fit, first).tolist(), strict=True))
+    experiments, prepared = (tuple(what[k] for k in mine) for what in (problem.experiments, problem.runs))
+    part = replace(problem, model=fit.model.start_at(own), experiments=experiments, _runs=prepared, priors={},
+                   penalties=(), width=fit.values.get("sgn_width"))
+    states = [fit.initial[f"{c}_0[{mine[k]}]"] for c, k, _ in part.unknowns.initial]
+    q = part.scaling.scaled([own[n] for n in part.model.free_names] + states)
+    n = problem.n_outputs
+    return replace(fit, problem=part, values={**fit.values, **own}, q=q, residuals=fit.residuals[:n][rows],
+                   jacobian=fit.jacobian[:n][rows])
+
+
 def _nothing(tangent: Tangent, known: Score | None) -> Score | None:
     """Return the score by what an effect added to a smaller model, if that is next to nothing here."""
     if known is None or not known.shapes or any(p.order for p in known.effect.parameters):
@@ -111,11 +185,7 @@ def score(tangent: Tangent, effect: Effect) -> Score:
     ModelError
         If the effect does not go with the model or the measured channels.
     """
-    fit = tangent.fit
-    model = fit.model + effect
-    if uses_angle(effect) and not model.angle_input and not any(uses_angle(e) for e in fit.model.effects):
-        model = replace(model, angle_input=True, _systems={})
-    added = Added.of(fit, model, effect, tangent.sizes)
+    added = Added.of(tangent, effect)
     if any(p.order and not p.given for p in added.pars):
         return _score_orders(tangent, added, effect)
     return _scored(tangent, effect, tuple(s for values in added.grid() if (s := added.shape(values)) is not None))
@@ -258,9 +328,18 @@ class Added:
     natural: Mapping[str, float]
 
     @staticmethod
-    def of(fit: Fit, model: Model, effect: Effect, natural: Mapping[str, float]) -> Added:
-        """Return the fit's model with `effect`."""
-        return Added(fit, model, [model.parameters[p.name] for p in effect.parameters], natural)
+    def of(tangent: Tangent, effect: Effect) -> Added:
+        """Return the fit's model with `effect`; the first one over the angle goes along the measured angle.
+
+        Raises
+        ------
+        ModelError
+            If the effect does not go with the model.
+        """
+        fit, model = tangent.fit, tangent.fit.model + effect
+        if uses_angle(effect) and not model.angle_input and not any(uses_angle(e) for e in fit.model.effects):
+            model = replace(model, angle_input=True, _systems={})
+        return Added(fit, model, [model.parameters[p.name] for p in effect.parameters], tangent.sizes)
 
     def grid(self) -> Iterator[dict[str, float]]:
         """Yield the values of the shape parameters to try."""
@@ -285,6 +364,8 @@ class Added:
             return None if change is None else Shape(values, change[:, None], (), None, weights)
         phase = next((p for p in self.pars if p.periodic and not p.given), None)
         columns = self._slopes(sizes, values)
+        if any(p.per_run for p in sizes):
+            columns, sizes = self._run_by_run(columns, sizes)
         if phase is not None:
             columns = np.hstack([columns, self._slopes(sizes, {**values, phase.name: np.pi / 2})])
         return Shape(values, columns, sizes, phase, weights)
@@ -300,6 +381,12 @@ class Added:
             traj = self._run(k, at, self._problem.unknowns.first_slopes(at, k, to), to)
             parts.append(self._problem.run_residual(k, traj)[1])
         return np.vstack(parts)
+
+    def _run_by_run(self, columns: Array, sizes: Sequence[Parameter]) -> tuple[Array, tuple[Parameter, ...]]:
+        """Return the slopes to sizes that are others in every run, and these; the first run's stand."""
+        parts, own = by_record(self._problem, columns), sorted(set(self._problem.unknowns.firsts))
+        named = tuple(replace(p, name=f"{p.name}[{k}]") for k in own[1:] for p in sizes)
+        return np.hstack([columns[:, :0], *parts[1:]]), named
 
     def _change(self, values: Mapping[str, float]) -> Array | None:
         """Return the change (n,) that the effect makes at finite `values`."""

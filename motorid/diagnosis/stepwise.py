@@ -143,7 +143,7 @@ def _finished(found: Climb) -> Climb:
     structure = not found.remaining.adequate
     forms = better_forms(best.fit, best.predictions) if structure else []
     grades = grades_of(best, search.root, groups, forms, structure,
-                       lambda name: None if found.stopped else search.smaller(best, best.fit.model.without(name)))
+                       lambda name: None if found.stopped else search.without(best, name))
     return replace(found, rounds=rounds, groups=groups, forms=tuple(forms), grades=grades)
 
 

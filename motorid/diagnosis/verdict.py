@@ -15,7 +15,7 @@ from motorid.diagnosis.score_test import Score
 from motorid.diagnosis.thresholds import ELSEWHERE, LARGER, LOST
 from motorid.display.numbers import arrow, number, percent, with_error
 from motorid.effects import EVERY
-from motorid.estimation.result import Fit
+from motorid.estimation.result import Fit, parameter_cell
 from motorid.model.definition import Effect
 from motorid.numerics.signals import despiked
 from motorid.records.experiment import units_of
@@ -102,6 +102,8 @@ def _valued(fit: Fit, effect: Effect) -> list[str]:
         sd = std.get(p.name)
         known = sd is not None or not fit.problem.model.parameters[p.name].vary
         text = f"{p.name} = {with_error(fit.values[p.name], sd, unit)}" if known else f"{p.name} not determined"
+        if p.name in fit.per_run:
+            text = f"{p.name} = {parameter_cell(fit, p.name)}"
         if not known and (volts := fit.determined.get(f"{p.name}_voltage")) is not None:
             text = f"R·{p.name}/K = {with_error(volts.value, volts.std, volts.unit)}"
         if p.name == "k_w" and abs(1 + fit.values[p.name] - RPM) < 0.3:

@@ -15,7 +15,7 @@ from motorid.model.definition import Effect
 
 _ALL = {e.name: e for part in (electrical, mechanical, sensor) for e in vars(part).values() if isinstance(e, Effect)}
 MEASURED = {n: e for n, e in _ALL.items() if n.startswith("measured_")}
-# Of one parameter per run; a diagnosis tries none by itself.
+# Of one parameter per run; a diagnosis tries them where there are several records.
 PER_RUN = {n: e for n, e in _ALL.items() if any(p.per_run for p in e.parameters)}
 LIBRARY = {n: e for n, e in _ALL.items() if n not in MEASURED and n not in PER_RUN}
 EVERY = LIBRARY | MEASURED | PER_RUN

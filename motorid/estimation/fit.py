@@ -18,13 +18,13 @@ from motorid.estimation.continuation import by_continuation
 from motorid.estimation.least_squares import FAILURES, FINISH, Callback, Estimate, least_squares
 from motorid.estimation.restarts import restore_collapsed
 from motorid.estimation.result import Fit
-from motorid.estimation.start_values import from_first_run, with_start_values
+from motorid.estimation.start_values import with_start_values
 from motorid.integrate.engine import Engine
 from motorid.model.model import Model
 from motorid.numerics.least_squares import LevenbergMarquardt
 from motorid.numerics.parallel import one_thread
 from motorid.problem.problem import Problem, as_problem
-from motorid.problem.simulate import integration_error, misfit_over_noise
+from motorid.problem.simulate import integration_error, misfit_over_noise, with_angles_apart
 from motorid.records.experiment import Experiment, windows
 
 NOISE = 1.2  # RMS of the residual over the noise that may be called noise
@@ -151,9 +151,9 @@ def solve(problem: Problem, solver: Any = None, *, start: str = "auto", callback
     auto, effort = start == "auto", solver or FINISH
     if problem.unknowns.apart and hasattr(effort, "solve"):
         raise UsageError("multiple shooting knows no parameters per run: leave the solver out, or the effect.")
-    if auto and problem.unknowns.apart:
+    if auto and any(p.unit == "rad" for *_, p in problem.unknowns.apart):
         alone = solve(problem.with_(experiments=problem.experiments[:1]))
-        problem, auto = from_first_run(problem, alone.values), False
+        problem, auto = with_angles_apart(problem.start_at(alone.values)), False
     if auto:
         problem = _with_orders(problem)
     if hasattr(effort, "solve"):

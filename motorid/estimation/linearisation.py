@@ -20,9 +20,7 @@ from motorid.integrate.rodas3 import rosenbrock_step
 from motorid.model.equations import System
 from motorid.numerics.autoregression import effective_samples
 from motorid.numerics.signals import Array
-from motorid.problem.problem import Problem
 from motorid.problem.runs import natural_sizes
-from motorid.problem.simulate import Simulation
 
 (TRIANGULAR,) = get_lapack_funcs(("tbtrs",), dtype=float)  # banded; SciPy has no other name for it
 
@@ -130,22 +128,19 @@ def shown(system: System, grid, x: Array, p: Array) -> tuple[Array, Array]:
     return np.asarray(y).T, np.asarray(c).reshape(ny, n, nx).transpose(1, 0, 2)
 
 
-def parameter_vector(fit: Fit) -> Array:
-    """Return the system's p of a fit."""
-    return np.array([fit.values[n] for n in fit.problem.system.parameters])
+def parameter_vector(fit: Fit, k: int) -> Array:
+    """Return the system's p of a fit on its run `k`."""
+    unknowns = fit.problem.unknowns
+    own = {n: fit.initial[p.name] for n, run, p in unknowns.apart if run == unknowns.firsts[k]}
+    return np.array([own.get(n, fit.values[n]) for n in fit.problem.system.parameters])
 
 
 @lru_cache(maxsize=2)
 def responses(fit: Fit) -> list[Response]:
     """Return the linear response of every run of `fit`."""
-    return responses_of(fit.problem, parameter_vector(fit), fit.simulations)
-
-
-def responses_of(problem: Problem, p: Array, simulations: Sequence[Simulation]) -> list[Response]:
-    """Return the linear response of every run of `problem`, simulated with the parameters `p`."""
-    found = []
-    for run, sim in zip(problem.runs, simulations, strict=True):
-        x = np.column_stack([sim.states[s] for s in problem.system.states])
+    problem, found = fit.problem, []
+    for k, (run, sim) in enumerate(zip(problem.runs, fit.simulations, strict=True)):
+        x, p = np.column_stack([sim.states[s] for s in problem.system.states]), parameter_vector(fit, k)
         _, a, b = linear_steps(problem.system, run.grid, x, p, np.zeros((len(x) - 1, 2)))
         _, c = shown(problem.system, run.grid, x, p)
         found.append(Response(a, b, c, dict(sim.states)))

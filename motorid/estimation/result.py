@@ -131,6 +131,16 @@ class Fit(Shown):
         return {n: known.get(n, 0.0) for n in self.values}
 
     @cached_property
+    def per_run(self) -> dict[str, dict[str, dict[str, Any]]]:
+        """Value, std and unit of each parameter that is another in every run, by run; the first run's value stands."""
+        known = dict(zip((p.name for p in self.problem.unknown), self._certainty.std, strict=True))
+        found: dict[str, dict[str, dict[str, Any]]] = {}
+        for name, k, p in self.problem.unknowns.apart:
+            own = {"value": self.initial[p.name], "std": known[p.name], "unit": p.unit}
+            found.setdefault(name, {})[self.problem.experiments[k].name] = own
+        return found
+
+    @cached_property
     def determined(self) -> dict[str, Quantity]:
         """Gain, time constants, friction as a voltage …: what the data determine even where parameters stay open."""
         return combinations(self.problem, self.q, self._certainty)
@@ -367,6 +377,9 @@ def parameter_cell(fit: Fit, name: str) -> Cell:
     if name not in fit.values:
         return "–"
     p = fit.model.parameters[name]
+    if name in fit.per_run:
+        values = [own["value"] for own in fit.per_run[name].values()]
+        return f"{number(min(values), 3)} to {number(max(values), 3)} {p.unit}".rstrip() + ", by run"
     if name == "sgn_width" and not p.given:
         return f"{quantity(fit.values[name], p.unit, 2)} (chosen from the data)"
     if p.vary and fit.std[name] is None:
@@ -383,12 +396,8 @@ def value_tables(fit: Fit) -> list[Table]:
 
 def per_run_table(fit: Fit) -> Table | None:
     """Return the parameters that are others in every run; None without any."""
-    if not any(p.per_run for p in fit.model.parameters.values()):
-        return None
-    sd = dict(zip((p.name for p in fit.problem.unknown), np.sqrt(np.diag(fit.covariance)), strict=True))
-    rows = [(name, fit.problem.experiments[k].name, with_error(fit.initial[p.name], float(sd[p.name]), p.unit))
-            for name, k, p in fit.problem.unknowns.apart]
-    return Table(("parameter", "run", "value ± std"), rows, "Parameters per run", left=(0, 1, 2))
+    rows = [(name, run, with_error(**own)) for name, runs in fit.per_run.items() for run, own in runs.items()]
+    return Table(("parameter", "run", "value ± std"), rows, "Parameters per run", left=(0, 1, 2)) if rows else None
 
 
 def determined_table(fit: Fit) -> Table | None:

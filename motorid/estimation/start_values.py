@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Iterator, Sequence
 from itertools import product
 
 import numpy as np
 
 from motorid.effects import LIBRARY
-from motorid.errors import SimulationError
 from motorid.estimation.continuation import by_continuation
 from motorid.estimation.first_guess import first_guess, loads_of
 from motorid.estimation.least_squares import LOOK, RACE, race, start_cost
@@ -24,8 +21,6 @@ ABOVE = 1.3  # times: where a size starts that is at least another
 RESONANCE = "1/s"
 BACK_EMF_SHARES = (0.3, 0.03)
 PHASES = tuple(np.arange(4) * np.pi / 2)
-ALIKE = 1.1  # times the least cost
-TURN = np.arange(-60, 60) * np.pi / 60  # where the zero of an encoder may be
 
 
 def with_start_values(problem: Problem) -> Problem:
@@ -86,31 +81,6 @@ def _untouched(model: Model, effect: Effect) -> list[Parameter]:
     """Parameters of an effect that still have the value they were declared with."""
     here = ((model.parameters[p.name], p) for p in effect.parameters)
     return [now for now, declared in here if now.value == declared.value and not now.given]
-
-
-def from_first_run(problem: Problem, values: Mapping[str, float]) -> Problem:
-    """Return the problem at `values` of its first run alone, an angle that other runs have apart at the best of many.
-
-    One after another: each acts on its own run only.
-    """
-    begin = problem.start_at(values)
-    for name, k, p in begin.unknowns.apart:
-        costs = {}
-        for value in TURN if p.unit == "rad" else ():
-            trial = _with_apart(begin, k, name, float(value))
-            with contextlib.suppress(SimulationError):
-                costs[float(value)] = float(np.sum(
-                    trial.run_residual(k, trial.simulate(trial.start, k, derivatives=False))[0] ** 2))
-        if costs:  # of those a period apart the nearest
-            near = [z for z, cost in costs.items() if cost < ALIKE * min(costs.values())]
-            begin = _with_apart(begin, k, name, min(near, key=abs))
-    return begin
-
-
-def _with_apart(problem: Problem, k: int, name: str, value: float) -> Problem:
-    runs = list(problem.runs)
-    runs[k] = replace(runs[k], apart={**runs[k].apart, name: value})
-    return problem.tuned(_runs=tuple(runs))
 
 
 # -- effects over the angle, and of several shapes -------------------------------------------------------------

@@ -47,7 +47,7 @@ def fit_dict(fit: Fit, held_out: Evaluation | None = None) -> dict[str, Any]:
         "violations": constraint_violations(fit),
         "multipliers": [{"constraint": m.name, "value": m.value, "unit": m.unit, "active": m.active}
                         for m in fit.extra.get("multipliers", ())],
-        "initial": dict(fit.initial), "window": fit.window,
+        "per_run": fit.per_run, "initial": dict(fit.initial), "window": fit.window,
         "runs": [run_dict(r) | {"nrmse": dict(e)}
                  for r, e in zip(problem.experiments, fit.evaluation.by_run, strict=True)],
         "remarks": remarks(fit),

@@ -134,8 +134,8 @@ class Model(Shown):
 
     @property
     def free_names(self) -> tuple[str, ...]:
-        """Names of the parameters that a fit varies."""
-        return tuple(n for n, p in self.parameters.items() if p.vary)
+        """Names of the parameters that a fit varies, those that are others in every run left out."""
+        return tuple(n for n, p in self.parameters.items() if p.vary and not p.per_run)
 
     @property
     def without_value(self) -> tuple[str, ...]:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Any
 
@@ -22,6 +23,8 @@ from motorid.problem.problem import Problem, as_problem
 from motorid.records.experiment import Experiment, units_of, windows
 from motorid.records.steady_state import find_segments
 
+TURN = np.arange(-60, 60) * np.pi / 60  # where the zero of an encoder may be
+ALIKE = 1.1  # times the least cost
 ASSUMED_NOISE = 0.01  # of a channel's RMS, where a plan does not say
 
 MOST_RUNS = 12  # shown one by one
@@ -189,7 +192,13 @@ def with_channels(model: Model, run: Experiment, channels: Sequence[str],
 
 def simulated(problem: Problem, estimate_initial: bool = True) -> tuple[Simulation, ...]:
     """Return the simulations of a problem at the model's values."""
+    return at(*settled(problem, estimate_initial))
+
+
+def settled(problem: Problem, estimate_initial: bool = True) -> tuple[Problem, Array]:
+    """Return a problem with all that runs share fixed at the model's values, and where the rest fits the records."""
     held = problem.with_(model=problem.model.fix(*problem.model.shared_names), priors={}, penalties=())
+    held = with_angles_apart(held) if estimate_initial else held
     q = held.start
     held = held.refined(q)
     for _ in range(SETTLES if len(q) and estimate_initial else 0):  # friction turns elsewhere: other sub-steps there
@@ -203,7 +212,28 @@ def simulated(problem: Problem, estimate_initial: bool = True) -> tuple[Simulati
         q, held = found.q, held.refined(found.q)
         if found.status == "converged":
             break
-    return at(held, q)
+    return held, q
+
+
+def with_angles_apart(problem: Problem) -> Problem:
+    """Return the problem with an angle that is another in every run at the best of many, one run after another."""
+    for name, k, _ in (a for a in problem.unknowns.apart if a[2].unit == "rad"):
+        costs = {}
+        for value in TURN.tolist():
+            trial = _with_apart(problem, k, name, value)
+            with contextlib.suppress(SimulationError):
+                traj = trial.simulate(trial.start, k, derivatives=False)
+                costs[value] = float(np.sum(trial.run_residual(k, traj)[0] ** 2))
+        if costs:  # of those a period apart the nearest
+            near = [z for z, cost in costs.items() if cost < ALIKE * min(costs.values())]
+            problem = _with_apart(problem, k, name, min(near, key=abs))
+    return problem
+
+
+def _with_apart(problem: Problem, k: int, name: str, value: float) -> Problem:
+    runs = list(problem.runs)
+    runs[k] = replace(runs[k], apart={**runs[k].apart, name: value})
+    return problem.tuned(_runs=tuple(runs))
 
 
 def at(problem: Problem, q: Array) -> tuple[Simulation, ...]:

@@ -15,6 +15,7 @@ from motorid.model.definition import Parameter
 from motorid.model.equations import System
 from motorid.numerics.signals import Array
 from motorid.problem.runs import Run, natural_sizes, spread_of
+from motorid.records.experiment import record_of
 
 
 class Point(NamedTuple):
@@ -53,11 +54,17 @@ class Unknowns:
         """(name, run, unknown) of each parameter that is another in every run.
 
         The first run's value stands, since phases or resistances take it up; unless nothing else is free, as where a
-        model is judged on other runs.
+        model is judged on other runs. Parts of one record share theirs.
         """
         own = [p for p in self.parameters.values() if p.vary and p.per_run]
         return tuple((p.name, k, replace(p, name=f"{p.name}[{k}]", value=self.runs[k].apart.get(p.name, p.value)))
-                     for p in own for k in range(1 if self.free else 0, len(self.runs)))
+                     for p in own for k in sorted(set(self.firsts))[1 if self.free else 0:])
+
+    @cached_property
+    def firsts(self) -> tuple[int, ...]:
+        """Per run, the first one of the same record."""
+        records = [record_of(run.experiment) for run in self.runs]
+        return tuple(records.index(r) for r in records)
 
     @cached_property
     def initial(self) -> tuple[tuple[str, int, Parameter], ...]:
@@ -142,7 +149,8 @@ class Unknowns:
 
     def of_run(self, at: Point, k: int) -> Point:
         """Return `at` with the parameters that run `k` has for itself."""
-        mine = [(n, j) for j, (n, run, _) in enumerate(self.apart, len(self.free) + len(self.initial)) if run == k]
+        first = len(self.free) + len(self.initial)
+        mine = [(n, j) for j, (n, run, _) in enumerate(self.apart, first) if run == self.firsts[k]]
         if not mine:
             return at
         rows, columns = [self.system.parameters.index(n) for n, _ in mine], [j for _, j in mine]

@@ -9,6 +9,7 @@ from itertools import pairwise
 from numbers import Real
 from types import MappingProxyType
 from typing import Any, Literal
+from zlib import crc32
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -244,7 +245,13 @@ def windows(experiment: Experiment, seconds: float) -> list[Experiment]:
     if seconds < 8 * experiment.dt:
         raise UsageError(f"a window of {seconds:g} s holds fewer than 8 samples, {experiment.dt:.3g} s apart.")
     parts = split(experiment, max(round(experiment.duration / seconds), 1))
-    return [p.with_(meta={**experiment.meta, "window": seconds}) for p in parts]
+    return [p.with_(meta={**experiment.meta, "record": record_of(experiment), "window": seconds}) for p in parts]
+
+
+def record_of(run: Experiment) -> str:
+    """Return which record a run is a part of, itself if it is whole: what restarts with a record has not there."""
+    samples = b"".join(y.tobytes() for y in (*run.inputs.values(), *run.outputs.values()))
+    return run.meta.get("record") or f"{run.name}/{crc32(samples):08x}"
 
 
 def pauses(t: Array) -> NDArray[np.intp]:
@@ -269,7 +276,8 @@ def between_pauses(run: Experiment) -> list[Experiment]:
     if not cuts.size or not parts:
         return [run]
     live = [s for s in parts if any(np.isfinite(y[s]).any() for y in run.outputs.values())]
-    return [run.select(s).with_(name=f"{run.name}[{k + 1}]", meta={**run.select(s).meta, "parts": None,
+    told = {"parts": None, "record": record_of(run)}
+    return [run.select(s).with_(name=f"{run.name}[{k + 1}]", meta={**run.select(s).meta, **told,
                                 "notes": run.meta.get("notes", ()) if k == 0 else ()}) for k, s in enumerate(live)]
 
 

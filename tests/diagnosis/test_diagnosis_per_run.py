@@ -1,0 +1,78 @@
+"""What begins anew with every run (an encoder's zero, a supply, a warm winding) is found, told once and paid for."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from lab_records import VALUES, drive
+
+import motorid as mi
+from motorid.diagnosis.model_comparison import size_of
+from motorid.diagnosis.predictive_score import predictions_left_out
+from motorid.records.experiment import windows
+
+TRIED = ["cogging", "torque_ripple", "coulomb", "stribeck", "winding_heating", *mi.effects.PER_RUN]
+BASE = mi.dc_motor(**VALUES)
+
+
+def records(models, volts, rng, noise=(0.02, 0.3), dt=1e-3, n=500):
+    t, found = np.arange(n) * dt, []
+    for model, volt in zip(models, volts, strict=True):
+        bare = mi.Experiment(t, {"v": drive(t, volt)}, {"i": np.zeros(n), "omega": np.zeros(n)}, name=f"{volt} V")
+        shown = mi.simulate(model, bare, initial="rest")[0].outputs
+        sizes = zip(("i", "omega"), noise, strict=True)
+        found.append(bare.with_(outputs={c: shown[c] + s * rng.normal(size=n) for c, s in sizes}))
+    return found
+
+
+def cogging(zero):
+    return (BASE + mi.effects.cogging).replace(A=8e-3, N=12.0, phi=0.7 + 12 * zero)
+
+
+def test_cogging_under_an_encoder_zeroed_at_every_start_is_named_with_the_zeros(rng):
+    runs = records(map(cogging, (0.0, 0.21, -0.13, 0.4)), (2.0, -2.5, 1.5, 2.2), rng)
+    found = mi.diagnose(mi.fit(mi.dc_motor(), runs[:3]), runs[3:], effects=TRIED)
+    assert found.effects == ("cogging", "encoder_zero"), found.text
+    assert found.remaining.adequate
+    assert abs(found.after.values["A"] - 8e-3) < 3 * found.after.std["A"]
+    own = found.to_dict()["per_run"]["z_0"]
+    assert list(own) == ["-2.5 V", "1.5 V"]  # the first run's stands
+    for truth, z in zip((0.21, -0.13), own.values(), strict=True):
+        assert abs(z["value"] - truth) < 3 * z["std"] < 0.02
+    assert found.text.count("rad, by run") == 1
+    assert "Parameters per run" in str(found.best.card())
+    assert mi.identifiability(found.best).rank == 7
+
+
+def test_no_zero_is_asked_for_where_the_phase_stays(rng):
+    runs = records(map(cogging, (0.0, 0.0, 0.0)), (2.0, -2.5, 1.5), rng)
+    assert mi.diagnose(mi.fit(mi.dc_motor(), runs[:2]), runs[2:], effects=TRIED).effects == ("cogging",)
+
+
+def test_a_supply_and_a_warm_winding_of_every_run_are_named(rng):
+    shares = (1.0, 0.9, 1.05, 0.95)
+    runs = [r.with_(inputs={"v": r.inputs["v"] / s})
+            for r, s in zip(records([BASE] * 4, (6.0, -5.0, 4.0, 5.0), rng), shares, strict=True)]
+    supply = mi.diagnose(mi.fit(mi.dc_motor(), runs[:3]), runs[3:], effects=TRIED)
+    assert supply.effects == ("supply_per_run",), supply.text
+    assert [own["value"] for own in supply.after.per_run["g_v"].values()] == pytest.approx([-0.1, 0.05], abs=2e-3)
+    heated = (BASE + mi.effects.winding_heating + mi.effects.winding_warm_start).replace(R_th=8.0, C_th=0.8)
+    runs = records([heated.replace(dT_0=dT) for dT in (0, 60, 30, 45)], (6, -5, 5, 6), rng, (5e-3, 0.1), 4e-3)
+    warm = mi.diagnose(mi.fit(mi.dc_motor(), runs[:3]), runs[3:], effects=TRIED)
+    assert warm.effects == ("winding_heating", "winding_warm_start"), warm.text
+    assert [own["value"] for own in warm.after.per_run["dT_0"].values()] == pytest.approx([60, 30], abs=3)
+
+
+def test_each_runs_own_value_is_paid_for_and_parts_of_a_run_share_it(rng):
+    runs = records([BASE] * 3, (6.0, -5.0, 4.0), rng)
+    model = mi.dc_motor() + mi.effects.supply_per_run
+    fit = mi.fit(model, runs)
+    assert size_of(model, fit.problem) == 7  # five of the motor, two of the second and the third run
+    assert predictions_left_out(fit)["i"].nrmse > fit.nrmse["i"]
+    own = mi.fit(model.fix(**{n: fit.values[n] for n in VALUES if n != "b"}), runs)
+    one = mi.fit(own.model.fix(g_v=0.0), runs)  # the same but for values of runs, which cost something where none acts
+    lost = [predictions_left_out(f)["omega"].nrmse / f.nrmse["omega"] for f in (own, one)]
+    assert lost[0] > lost[1]
+    parts = [p for r in runs for p in windows(r, 0.25)]
+    assert list(mi.Problem(model, parts).unknowns.firsts) == [0, 0, 2, 2, 4, 4]
+    assert [p.name for *_, p in mi.Problem(model, parts).unknowns.apart] == ["g_v[2]", "g_v[4]"]
