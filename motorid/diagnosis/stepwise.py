@@ -14,9 +14,10 @@ from typing import Any
 
 from motorid.diagnosis.adequacy import judge_adequacy
 from motorid.diagnosis.candidates import Search, library
+from motorid.diagnosis.cross_validation import HeldOut
 from motorid.diagnosis.input_hypotheses import Reading, better_reading, without_spikes
 from motorid.diagnosis.misspecification import FormGain, Grade, better_forms, grades_of
-from motorid.diagnosis.model_comparison import Node, at_noise, beats, choose, evidence, far, group_of, tied
+from motorid.diagnosis.model_comparison import Node, at_noise, beats, choose, evidence, far, group_of, node_of, tied
 from motorid.diagnosis.record_parts import affordable
 from motorid.diagnosis.refit import INTERRUPTED, OUT_OF_TIME
 from motorid.diagnosis.results import Adequacy, Candidate, Ladder, Rung
@@ -173,6 +174,18 @@ class Records:
         held_out = self.held_out and [reading.of(r) for r in self.held_out]
         return Records(after, held_out, (*self.remarks, reading.remark(self.fit, after)))
 
+    def suits(self, node: Node) -> bool:
+        """Tell whether the model of `node`, fitted to other readings, predicts these records better: an effect that
+        was missing may have asked for another reading."""
+        if len(node.fit.model.effects) == len(self.fit.model.effects):
+            return False
+        try:
+            problem = self.fit.problem.with_(model=node.fit.model, noise_factors={})
+            own = node_of(solve(problem, start="model"), HeldOut.of(self.fit, self.held_out))
+        except FAILURES:
+            return False
+        return evidence(node, own).gain > 0
+
 
 def explored(fit: Fit, validate: Sequence[Experiment] | Experiment | None, effects: Sequence[Effect],
              map_: Callable[..., Iterable[Any]], advance: Callable[[str], None], max_effects: int,
@@ -188,16 +201,22 @@ def explored(fit: Fit, validate: Sequence[Experiment] | Experiment | None, effec
         return climb(Search(records.fit, records.held_out, effects, map_, advance), max_effects, advance, left)
 
     records = Records(affordable(fit), [validate] if isinstance(validate, Experiment) else validate)
-    for better in (without_spikes, better_reading):
-        if reading := better(records.fit):
-            records = records.read(reading)
+    if spikes := without_spikes(records.fit):
+        records = records.read(spikes)
+    as_it_was = records
+    if reading := better_reading(records.fit):
+        records = records.read(reading)
     found = climbed(records)
     if not found.stopped and (windowed := _in_windows(found)) is not None:
         records = replace(records, fit=windowed)
         found = climbed(records)
     last = found.path[-1]
-    if not found.stopped and (reading := _late_reading(found.path)):
+    again = None
+    if not found.stopped and records is not as_it_was and as_it_was.suits(last):
+        again = as_it_was
+    elif not found.stopped and (reading := _late_reading(found.path)):
         again = records.read(reading)
+    if again is not None:
         anew = climbed(again)
         new = anew.path[-1]
         better = evidence(last, new)

@@ -76,6 +76,8 @@ class Unknowns:
                 if c in free:  # an algebraic current follows from the rest
                     unit = run.experiment.units.get(c, UNITS[c][0])
                     low, high = run.limits[c]
+                    if any(p.null == 0 and p.unit == UNITS[c][0] for p in self.parameters.values()):
+                        low, high = min(low, 0.0), max(high, 0.0)  # what was measured there may be the sensor's offset
                     value = float(run.start[CHANNELS.index(c)])
                     found.append((c, k, Parameter(f"{c}_0[{k}]", value, unit, low, high)))
         return tuple(found)
