@@ -146,6 +146,8 @@ class Search:
                 continue
             if model.axis == "linear" and any(p.periodic for p in e.parameters):
                 continue  # a phase in metres is none
+            if contained & set(e.includes) and not have & set(e.includes):
+                continue  # two that contain the same simpler one share its size between them
             if any(p.per_run for p in e.parameters) and not self._restarts(model, e):
                 continue
             if have & set(e.includes):
