@@ -18,7 +18,7 @@ from motorid.diagnosis.cross_validation import HeldOut
 from motorid.diagnosis.misspecification import LIMITER
 from motorid.diagnosis.model_comparison import COMMON, Node, beats, evidence, far, node_of, superfluous
 from motorid.diagnosis.predictive_score import Evidence
-from motorid.diagnosis.refit import GivenUp, Task, completed, lost, refit, refits, widened
+from motorid.diagnosis.refit import GivenUp, Task, completed, hidden_in, lost, refit, refits, widened
 from motorid.diagnosis.results import Candidate
 from motorid.diagnosis.score_test import Score, pairs_of, rank, uses_angle, with_phase_per_run, with_warm_start
 from motorid.diagnosis.thresholds import MATERIAL
@@ -83,6 +83,16 @@ class Search:
             return {}
         added = {p.name for e in node.fit.model.effects for p in e.parameters}
         return {s.effect.name: s.same_as for s in self.scores(node) if s.same_as and added >= set(s.same_as)}
+
+    def hidden(self, node: Node) -> dict[tuple[str, str], tuple[str, ...]]:
+        """Return the parameters that hide a wider effect (two sizes, no shape) than one of `node`, by both names."""
+        found = {}
+        for e in self._takeable(node.fit.model)[1]:
+            inside = [n for n in node.fit.model.effect_names if n in e.includes and n not in self.root.key]
+            if inside and all(p.null == 0 for p in e.parameters):
+                with contextlib.suppress(*FAILURES, ModelError):
+                    found[inside[0], e.name] = hidden_in(node.fit, e)
+        return {names: parameters for names, parameters in found.items() if parameters}
 
     # -- expanding -------------------------------------------------------------------------------------
     def expand(self, node: Node) -> tuple[list[Node], list[Candidate]]:

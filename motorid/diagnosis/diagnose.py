@@ -21,6 +21,7 @@ from motorid.diagnosis.verdict import (
     balance_of,
     closed_loop_remark,
     held_out_remark,
+    hidden_remark,
     inseparable_remark,
     measured_angle_remark,
     missing_text,
@@ -102,7 +103,8 @@ def _told(found: Climb, driven: str, validated: bool, own: Sequence[Effect]) -> 
         verdict, where = "missing", balance_of(names[0], own)
         answer = missing_text(ladder.rungs, remaining, groups, found.grades)
         same = {name: p for node in found.path[1:] for name, p in found.search.inseparable(node).items()}
-        details = [moves(fit, ladder.best), inseparable_remark(same)]
+        hidden = found.search.hidden(found.path[-1])
+        details = [moves(fit, ladder.best), inseparable_remark(same), hidden_remark(hidden)]
         groups = (*groups, *(_sharing(ladder.best, name, parameters) for name, parameters in same.items()))
         suggestion = _suggestion(found)
     elif len(found.path) > 1 or not remaining.adequate:

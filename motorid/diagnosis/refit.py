@@ -36,6 +36,7 @@ POLISH = LevenbergMarquardt(max_iterations=60, ftol=1e-5, xtol=1e-5, looks=0)
 GOING_ON = 4  # times, where the last descent ends at its limit
 LOST = 0.2  # NRMSE of a channel
 ROOM = 10.0  # factor beyond its grid that a shape parameter may run to
+ALONE = 0.1  # of an answer: what is left of it without the others', if these do the same
 WORSE = 1.02  # of the cost along the measured angle: the model's own angle must do as well
 
 
@@ -435,3 +436,23 @@ def widened(fit: Fit, effect: Effect, above: float = ABOVE) -> Task:
     ]
     starts = [{**sizes, **dict(point)} for point in itertools.product(*shapes)][:6]
     return Task(fit, model, effect, starts)
+
+
+def hidden_in(fit: Fit, effect: Effect) -> tuple[str, ...]:
+    """Return the parameters whose other values make up for `effect` in the place of those that it contains.
+
+    Empty if its sizes are determined, or nothing else does the same.
+    """
+    task = widened(fit, effect, 1.0)
+    problem = _started(fit, task.model, task.starts[0], angular=False)
+    jac = problem.residual_and_jacobian(problem.start)[1] / problem.scaling.slope(problem.start)
+    mine = np.array([p.name in task.starts[0] for p in problem.unknown])
+    norms = np.linalg.norm(jac[:, ~mine], axis=0)
+    others, columns = jac[:, ~mine] / np.where(norms > 0, norms, 1.0), jac[:, mine]
+    _, weakest, turned = np.linalg.svd(columns - others @ np.linalg.lstsq(others, columns, rcond=1e-9)[0])
+    answer = columns @ turned[-1]
+    if weakest[-1] * max(task.starts[0].values()) > 1 or not weakest[-1] < ALONE * np.linalg.norm(answer):
+        return ()
+    parts = np.abs(np.linalg.lstsq(others, answer, rcond=1e-9)[0])
+    names = [p.name for p, own in zip(problem.unknown, mine, strict=True) if not own]
+    return tuple(n for n, part in zip(names, parts, strict=True) if part > ALONE * parts.max() and n in fit.values)

@@ -215,6 +215,12 @@ def inseparable_remark(same: Mapping[str, tuple[str, ...]]) -> str:
     )
 
 
+def hidden_remark(hidden: Mapping[tuple[str, str], tuple[str, ...]]) -> str:
+    """Say which wider effects than those found do the same with other values of parameters, and what would tell."""
+    return " ".join(f"'{wider}' with other values of {' and '.join(parameters)} does the same as '{name}': fix one of "
+                    "these where it is known to distinguish them." for (name, wider), parameters in hidden.items())
+
+
 def balance_of(name: str, also: Sequence[Effect] = ()) -> str:
     """Return where an effect acts: electrical, mechanical or sensor."""
     known = {**EVERY, **{e.name: e for e in also}}

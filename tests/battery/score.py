@@ -91,7 +91,10 @@ def _sizes(case: Case, found: Diagnosis) -> dict[str, tuple[float, float | None,
     if truth is None:
         return {}
     names = [p.name for e in truth.effects if e.name in found.effects for p in e.parameters if p.vary]
-    return {n: (fit.values[n], fit.std.get(n), truth.values[n]) for n in names if n in fit.values}
+    true = dict(truth.values)
+    if "R_s" in names:  # only R_s/V_s² acts: at the supply that the fit took
+        true["R_s"] *= (fit.values["V_s"] / true["V_s"]) ** 2
+    return {n: (fit.values[n], fit.std.get(n), true[n]) for n in names if n in fit.values}
 
 
 def _ranking(found: Diagnosis) -> list[Row]:

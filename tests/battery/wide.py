@@ -1,4 +1,4 @@
-"""Each effect of benches (driver, supply, gear, sensors) alone, in three motors under three drives.
+"""Each effect of benches (driver, supply, gear, sensors) alone, in three motors under three drives; and none at all.
 
 ``python tests/battery/run.py --wide --out DIR``. Sizes go with the motor: u is the voltage of the drive.
 """
@@ -56,6 +56,14 @@ def _case(effect: str, motor: str, drive: str) -> Case:
     )
 
 
-WIDE = {
-    c.name: c for c in (_case(e, m, d) for e in SIZES for m in ("lab", "servo", "wheel") for d in DRIVES)
-}
+MOTORS = ("lab", "servo", "wheel")
+NOTHING = 6  # records of each motor and drive without any effect
+
+
+def _nothing(motor: str, drive: str, k: int) -> Case:
+    train, check = DRIVES[drive]
+    return Case(f"none.{motor}.{drive}.{k}", "none", motor, {}, train, check, channels=(ANGLE, ("i", "omega"))[k % 2])
+
+
+WIDE = {c.name: c for c in (_case(e, m, d) for e in SIZES for m in MOTORS for d in DRIVES)}
+WIDE |= {c.name: c for c in (_nothing(m, d, k) for m in MOTORS for d in DRIVES for k in range(NOTHING))}

@@ -1,0 +1,64 @@
+"""What benches add, in a diagnosis: what hides in the motor, readings that an effect asked for, offsets of sensors."""
+
+from __future__ import annotations
+
+import pytest
+from battery.cases import ANGLE, Case
+from battery.wide import SIZES, WIDE
+
+import motorid as mi
+from motorid.diagnosis.candidates import Search, library
+
+
+def test_the_wide_battery_has_every_effect_of_benches_in_three_motors_under_three_drives():
+    singles = [c for c in WIDE.values() if c.kind == "single"]
+    assert len(SIZES) == 12
+    assert len(singles) == 108
+    assert {tuple(c.effects) for c in singles} == {(e,) for e in SIZES}
+    assert sum(c.kind == "none" for c in WIDE.values()) == 54
+
+
+def test_a_gear_that_another_inertia_hides_is_told_with_what_to_fix():
+    case = Case("gear", "single", "lab", {"gear_efficiency": {"mu_d": 0.1, "mu_b": 0.35}}, n=700)
+    runs, check = case.records()
+    tried = ["load_friction", "gear_efficiency", "coulomb"]
+    found = mi.diagnose(mi.fit(mi.dc_motor(), runs), check, effects=tried)
+    assert found.effects == ("load_friction",)
+    assert "'gear_efficiency' with other values of b and J does the same as 'load_friction'" in found.text
+    known = mi.diagnose(mi.fit(mi.dc_motor().fix(J=2.35e-5), runs), check, effects=tried)
+    assert known.effects == ("gear_efficiency",)
+    assert "does the same" not in known.text
+
+
+def test_a_gain_of_the_current_hides_and_identifiability_says_in_what():
+    case = Case("gain", "single", "lab", {"current_gain": {"k_i": 0.08}}, n=700)
+    runs, _ = case.records()
+    text = mi.identifiability(mi.fit(mi.dc_motor() + mi.effects.current_gain, runs)).text
+    assert "R by" in text
+    assert "Fix k_i (or R) where known" in text
+
+
+def test_a_reading_that_only_the_missing_effect_asked_for_is_taken_back():
+    runs, check = WIDE["current_gain.lab.b"].records()
+    fit = mi.fit(WIDE["current_gain.lab.b"].base(), runs)
+    found = mi.diagnose(fit, check, effects=["current_gain", "coulomb"])
+    assert found.effects == ("current_gain",)
+    assert "--hold" not in found.text
+    assert abs(found.after.values["k_i"] - 0.08) < 3 * found.after.std["k_i"]
+
+
+def test_a_motor_at_rest_is_among_the_first_speeds_of_a_sensor_with_an_offset():
+    case = WIDE["speed_offset.lab.b"]
+    fit = mi.fit(mi.dc_motor() + mi.effects.speed_offset, case.records()[0])
+    assert fit.initial["omega_0[0]"] == pytest.approx(0.0, abs=0.3)  # the sensor shows 6 rad/s
+    assert max(fit.misfit.values()) < 1.1
+
+
+def test_two_frictions_that_contain_the_same_one_are_not_both_added():
+    numbers = {"tau_m": 8e-3, "a_f": 0.5, "phi_f": 1.0}
+    runs, _ = Case("turn", "single", "lab", {"angular_friction": numbers}, n=600, channels=ANGLE).records()
+    fit = mi.fit(mi.dc_motor() + mi.effects.angular_friction, runs[:1])
+    search = Search(fit, None, library(["stribeck", "coulomb_asymmetric", "quadratic_drag"]), map, lambda word: None)
+    assert [s.effect.name for s in search.scores(search.root)] == ["quadratic_drag"]
+    wider = Search(mi.fit(mi.dc_motor() + mi.effects.coulomb, runs[:1]), None, library(["stribeck"]), map, str)
+    assert [c.effect for c in wider.expand(wider.root)[1]] == ["stribeck"]  # in the place of the one that it contains
