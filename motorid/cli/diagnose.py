@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from json import loads
 from pathlib import Path
 from typing import Annotated, Any
@@ -90,10 +90,8 @@ def diagnose_command(
     own = list(own_effects(options.effects_from).values()) if options.effects_from else []
     done: list[str] = []
     try:
-        with progress("Looking for what is missing") as advance:
-            found = diagnose(before, held_out or None, also=own, max_effects=max_effects, budget=budget,
-                             map=_saying(advance),
-                             progress=lambda word: _as_it_comes(word, done, advance, quiet=json == "-"))
+        found = diagnose(before, held_out or None, also=own, max_effects=max_effects, budget=budget,
+                         progress=lambda word: _as_it_comes(word, done, quiet=json == "-"))
     except (Exception, KeyboardInterrupt) as error:
         if interruption.behind(error):
             _keep_fit(before, done, json, options.force)
@@ -110,28 +108,11 @@ def diagnose_command(
         raise typer.Exit(INTERRUPTED)
 
 
-def _as_it_comes(word: str, done: list[str], advance: Callable[..., None], quiet: bool) -> None:
-    """Write down what was done, and say it; print the first answer at once."""
+def _as_it_comes(word: str, done: list[str], quiet: bool) -> None:
+    """Write down what was done; print the first answer at once."""
     done.append(word)
-    first = word.startswith("first answer")
-    if first and not quiet:
+    if word.startswith("first answer") and not quiet:
         show(f"{word[0].upper()}{word[1:]}\n")
-    advance(0, "" if first else word)
-
-
-def _saying(advance: Callable[..., None]) -> Callable[..., Iterator[Any]]:
-    """Return a `map` that says which effect is being fitted, and how many of the round are."""
-
-    def mapped(function: Callable[[Any], Any], tasks: Iterable[Any]) -> Iterator[Any]:
-        every = list(tasks)
-        for k, task in enumerate(every):
-            effect = getattr(task[0] if isinstance(task, tuple) else task, "effect", None)
-            text = f"fitting {effect.name}" if effect is not None else ""
-            advance(0, text, None if k else len(every))
-            yield function(task)
-            advance(1, text)
-
-    return mapped
 
 
 def _keep_fit(before: Fit, done: Sequence[str], json: Json, force: bool) -> None:
@@ -235,13 +216,12 @@ def demo_command(
     plain = fit(dc_motor(), runs)
     show(plain.verdict, "", parameter_table(plain), error_table({"": plain.evaluation}, plain.noise),
          "3. What is missing?")
-    with progress("Trying the effects of the library") as advance:
-        found = diagnose(plain, check, map=_saying(advance),
-                         progress=lambda word: advance(0, "" if word.startswith("first answer") else word))
+    found = diagnose(plain, check)
     show(found.text, found.missing.text, "", ranking_table(found.ranking, 4),
          "4. Added, one line of code: fit.model + mi.effects." + (found.effects or ("…",))[0],
          ladder_table(found.ladder), parameter_table(found.after, found.before))
-    files = _write_demo(found, check, out, force)
+    with progress("Writing the figures"):
+        files = _write_demo(found, check, out, force)
     show("Written: " + ", ".join(files), "Now your own: motorid diagnose RUN... --report yours.html")
     if json:
         write_json(found.to_dict() | {"files": files}, json, force)

@@ -174,8 +174,9 @@ class FitOptions(ReadingOptions):
     def fit(self, runs: Sequence[Experiment], model: Model | None = None) -> Fit:
         """Fit the model to `runs`."""
         model = self.model(runs) if model is None else model
-        with progress(f"Fitting {model.name}") as advance:
-            return fit(model, runs, callback=lambda k, *_: advance(1, f"iteration {k}"), **self.keywords())
+        text = f"Fitting {model.name}"
+        with progress(text) as advance:
+            return fit(model, runs, callback=lambda k, *_: advance(1, f"{text}: iteration {k}"), **self.keywords())
 
     def _check_words(self) -> None:
         for word, known, what in ((self.drive, DRIVES, "drive"), (self.formulation, FORMULATIONS, "formulation"),

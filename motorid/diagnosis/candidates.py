@@ -7,7 +7,7 @@ A child must predict data that it was not fitted to better, by more than chance 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -36,7 +36,60 @@ PAIRS = 3  # refitted where no single effect helps
 NEAR = 0.4  # of the best score: what a common effect must reach to be refitted too
 ALWAYS = ("compliance", "speed_lag", "speed_delay", "driver_coast")  # their score at null says little
 FLAT_TOP = 0.04  # of the samples: a current that is as large so often may have a limit
-Advance = Callable[[str], None]
+
+
+class Stages:
+    """What a search is at: words on what was done, and one bar over all rounds that it may take.
+
+    How many refits a round takes shows on the way: each lot of them is taken for half of what is left of the round.
+
+    Parameters
+    ----------
+    rounds : int
+        The most that a climb may take; looking at what remains is one more.
+    say : callable, optional
+        Called with a word on what was done.
+    show : callable, optional
+        What `motorid.numerics.parallel.progress` yields.
+    map_ : callable
+        For the refits.
+    """
+
+    def __init__(self, rounds: int = 0, say: Callable[[str], None] | None = None,
+                 show: Callable[..., None] | None = None, map_: Callable[..., Iterable[Any]] = map) -> None:
+        self.done, self._show, self._map = say or (lambda word: None), show or (lambda *_, **__: None), map_
+        self._rounds, self._total, self._done, self._round = rounds, 0, 0.0, 0
+
+    def climb(self) -> None:
+        """Begin a climb; a second one, with the records read otherwise, makes the whole longer."""
+        self._done, self._total, self._round = float(self._total), self._total + self._rounds + 1, 0
+
+    def round(self, number: int) -> None:
+        """Begin a round; the one after the last looks at what remains."""
+        self._round = number
+        self._done = max(self._done, float(self._end - 1))
+
+    @property
+    def _end(self) -> int:
+        """Rounds done when this one is."""
+        return self._total - self._rounds - 1 + max(self._round, 1)
+
+    def at(self, words: str) -> None:
+        """Show what is at work."""
+        last = self._round > self._rounds or not self._rounds
+        self._show(0, words if last else f"Round {max(self._round, 1)}/{self._rounds}: {words}", self._done,
+                   self._total)
+
+    def map(self, function: Callable[[Any], Any], tasks: Iterable[Any]) -> Iterator[Any]:
+        """Do the same as `map`, saying which effect is being fitted."""
+        every, begun = list(tasks), self._done
+        results = iter(self._map(function, every))
+        for k, task in enumerate(every):
+            name = getattr(task[0] if isinstance(task, tuple) else task, "name", "once more")
+            self._done = begun + (self._end - begun) / 2 * k / len(every)
+            self.at(f"fitting {name}, {k + 1} of {len(every)}")
+            yield next(results)
+        self._done = (begun + self._end) / 2 if every else begun
 
 
 def library(effects: Iterable[Effect | str] | None, also: Iterable[Effect] = ()) -> list[Effect]:
@@ -53,9 +106,10 @@ class Search:
     """One search over models; `expand` and `choose` are its two moves."""
 
     def __init__(self, fit: Fit, validate: Sequence[Experiment] | Experiment | None, effects: Sequence[Effect],
-                 map_: Callable[..., Iterable[Any]], advance: Advance) -> None:
+                 stages: Stages) -> None:
+        stages.at("looking at the misfit")
         self.held = HeldOut.of(fit, validate)
-        self.effects, self.map, self.advance = list(effects), map_, advance
+        self.effects, self.stages, self.map = list(effects), stages, stages.map
         self.root = node_of(fit, self.held)
         self._scores: dict[frozenset[str], list[Score]] = {}
         self._always = (*ALWAYS, LIMITER) if any(map(_flat_topped, fit.problem.experiments)) else ALWAYS
@@ -65,8 +119,9 @@ class Search:
         """Return the scores of all effects that `node` can take, best first; ranked once per model."""
         if node.key not in self._scores:
             fresh, _ = self._takeable(node.fit.model)
+            self.stages.at(f"ranking {len(fresh)} effects")
             self._scores[node.key] = rank(node.fit, fresh, self._scores_before(node))
-            self.advance(f"ranked {len(fresh)} effects")
+            self.stages.done(f"ranked {len(fresh)} effects")
         return self._scores[node.key]
 
     def _scores_before(self, node: Node) -> Sequence[Score]:
@@ -107,7 +162,7 @@ class Search:
                 tasks.append(widened(node.fit, e))
         tasks += self._restarting(node)
         fits = dict(zip((t.name for t in tasks), refits(tasks, self.map), strict=True))
-        self.advance(f"refitted {sum(isinstance(f, Fit) for f in fits.values())} of {len(fits)}")
+        self.stages.done(f"refitted {sum(isinstance(f, Fit) for f in fits.values())} of {len(fits)}")
         found = {t.name: self._judge(node, t.added, fits[t.name]) for t in tasks}
         begun = {n: f for n, f in fits.items() if isinstance(f, GivenUp) and f.begun is not None}
         if begun and all(child is None or child.objection for child, _ in found.values()):  # what led is refused
@@ -187,7 +242,7 @@ class Search:
         for task, fit in zip(tasks, refits(tasks, self.map), strict=True):
             child, _ = self._judge(node, task.model.effects[len(present.effects) :], fit)
             children += [child] if child is not None else []
-        self.advance(f"refitted {len(tasks)} pairs")
+        self.stages.done(f"refitted {len(tasks)} pairs")
         return children
 
     def _judge(self, node: Node, effects: Sequence[Effect], fit: Fit | GivenUp | None) -> tuple[Node | None, Candidate]:
@@ -263,6 +318,7 @@ class Search:
             for p in (p for e in new for p in e.parameters if p.name not in values):
                 if alike := [node.fit.values[o.name] for e in gone for o in e.parameters if _alike(p, o)]:
                     values[p.name] = max(alike)
+            self.stages.at(f"trying {model.title}")
             fit = refit(node.fit, model, (values,))
             if fit is None or any(objections(fit, e) for e in new):  # what takes its place must be sound
                 return None

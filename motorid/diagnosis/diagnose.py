@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 from motorid.diagnosis.adequacy import following
-from motorid.diagnosis.candidates import library
+from motorid.diagnosis.candidates import Stages, library
 from motorid.diagnosis.experiment_design import suggest_experiment
 from motorid.diagnosis.locate import acting_like, locate
 from motorid.diagnosis.misspecification import LIMITER
@@ -35,6 +35,7 @@ from motorid.errors import MotoridError, numbers_told
 from motorid.estimation.result import Fit, checked
 from motorid.model.definition import Effect
 from motorid.numerics.parallel import one_thread
+from motorid.numerics.parallel import progress as shown
 from motorid.records.checks import current_limit
 from motorid.records.experiment import Experiment, repeated
 
@@ -77,12 +78,13 @@ def diagnose(fit: Fit, validate: Sequence[Experiment] | Experiment | None = None
     ('missing', ('coulomb',))
     >>> better = found.best
     """
-    say = progress or (lambda word: None)
     own = tuple(also)
-    found, driven = explored(checked(fit, "diagnose"), validate, library(effects, own), map, say, max_effects, budget)
-    say("located what is missing")
-    twice = repeated(fit.problem.experiments, [validate] if isinstance(validate, Experiment) else validate or ())
-    return _told(found, " ".join(w for w in (twice, driven) if w), validate is not None, own)
+    with shown("Looking for what is missing", max_effects + 1, at_most=True) as show:
+        stages = Stages(max_effects, progress, show, map)
+        found, driven = explored(checked(fit, "diagnose"), validate, library(effects, own), stages, max_effects, budget)
+        stages.done("located what is missing")
+        twice = repeated(fit.problem.experiments, [validate] if isinstance(validate, Experiment) else validate or ())
+        return _told(found, " ".join(w for w in (twice, driven) if w), validate is not None, own)
 
 
 def _told(found: Climb, driven: str, validated: bool, own: Sequence[Effect]) -> Diagnosis:

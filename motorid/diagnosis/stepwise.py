@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from motorid.diagnosis.adequacy import judge_adequacy
-from motorid.diagnosis.candidates import Search, library
+from motorid.diagnosis.candidates import Search, Stages, library
 from motorid.diagnosis.cross_validation import HeldOut
 from motorid.diagnosis.input_hypotheses import Reading, better_reading, without_spikes
 from motorid.diagnosis.misspecification import FormGain, Grade, better_forms, grades_of
@@ -28,6 +28,7 @@ from motorid.estimation.least_squares import FAILURES
 from motorid.estimation.result import Fit, checked
 from motorid.model.definition import Effect
 from motorid.numerics.parallel import budget, interruption, one_thread
+from motorid.numerics.parallel import progress as shown
 from motorid.records.experiment import Experiment
 
 BEAM = 2
@@ -55,16 +56,16 @@ class Climb:
     stopped: str = ""
 
 
-def climb(search: Search, max_effects: int, advance: Callable[[str], None], seconds: float | None = None) -> Climb:
+def climb(search: Search, max_effects: int, seconds: float | None = None) -> Climb:
     """Run the loop until nothing more is worth adding, until the time is up, or until it is interrupted (Ctrl-C).
 
     What was found by then is the answer; `stopped` says so.
     """
     scores = search.scores(search.root)
     first = judge_adequacy(search.root, scores)
-    advance(first_answer(search.root.fit, first, scores))
+    search.stages.done(first_answer(search.root.fit, first, scores))
     found, stopped = Climb(search, (search.root,), (), (), "", first, first), ""
-    steps = _rounds(found, max_effects, advance)
+    steps = _rounds(found, max_effects)
     try:
         with budget(seconds):
             while (further := next(steps, None)) is not None:
@@ -77,14 +78,17 @@ def climb(search: Search, max_effects: int, advance: Callable[[str], None], seco
         found = replace(found, stopped=stopped, text=f"stopped early: {stopped}; more may be missing",
                         rounds=found.rounds or (tuple(search.listed(scores, {}, stopped)),),
                         remaining=judge_adequacy(found.path[-1]))
+    search.stages.round(max_effects + 1)
+    search.stages.at("Looking at what remains")
     return _finished(found)
 
 
-def _rounds(found: Climb, max_effects: int, advance: Callable[[str], None]) -> Iterator[Climb]:
+def _rounds(found: Climb, max_effects: int) -> Iterator[Climb]:
     """Yield how far the loop is, after every step that may be the last."""
     search, best = found.search, found.search.root
     frontier = [best]
-    for _ in range(max_effects):
+    for k in range(max_effects):
+        search.stages.round(k + 1)
         room = max_effects - len(best.key) + len(search.root.key)  # two effects may have come at once
         if room < 1 or (found.remaining.adequate and at_noise(best)):
             break
@@ -109,7 +113,7 @@ def _rounds(found: Climb, max_effects: int, advance: Callable[[str], None]) -> I
         found = _with(found, pruned, chosen_of, new.parent is frontier[0], group)
         found = replace(found, remaining=judge_adequacy(pruned, search.scores(pruned)))
         best, frontier = pruned, [pruned, *_runners_up(pruned, ordered)][:BEAM]
-        advance(f"accepted {chosen_of.added}")
+        search.stages.done(f"accepted {chosen_of.added}")
         yield found
     done = found.remaining.adequate and at_noise(best)
     yield replace(found, text="stopped: what remains is noise" if done
@@ -188,8 +192,7 @@ class Records:
 
 
 def explored(fit: Fit, validate: Sequence[Experiment] | Experiment | None, effects: Sequence[Effect],
-             map_: Callable[..., Iterable[Any]], advance: Callable[[str], None], max_effects: int,
-             seconds: float | None = None) -> tuple[Climb, str]:
+             stages: Stages, max_effects: int, seconds: float | None = None) -> tuple[Climb, str]:
     """Return the climb, and what to say of how the records were read.
 
     A misfit that something missing dominates may hide a better reading of the voltage; then it is climbed again.
@@ -198,7 +201,8 @@ def explored(fit: Fit, validate: Sequence[Experiment] | Experiment | None, effec
 
     def climbed(records: Records) -> Climb:
         left = None if seconds is None else max(seconds - (time.monotonic() - began), 0.0)
-        return climb(Search(records.fit, records.held_out, effects, map_, advance), max_effects, advance, left)
+        stages.climb()
+        return climb(Search(records.fit, records.held_out, effects, stages), max_effects, left)
 
     records = Records(affordable(fit), [validate] if isinstance(validate, Experiment) else validate)
     if spikes := without_spikes(records.fit):
@@ -347,6 +351,7 @@ def improve(fit: Fit, validate: Sequence[Experiment] | Experiment | None = None,
     >>> ladder.best.model.effect_names
     ('coulomb',)
     """
-    say = progress or (lambda word: None)
-    found, _ = explored(checked(fit, "improve"), validate, library(effects, also), map, say, max_effects)
+    with shown("Looking for what is missing", max_effects + 1, at_most=True) as show:
+        stages = Stages(max_effects, progress, show, map)
+        found, _ = explored(checked(fit, "improve"), validate, library(effects, also), stages, max_effects)
     return ladder_of(found, validate is not None)

@@ -283,15 +283,17 @@ def _in_chunks(items: Sequence[Any], map: Map | None) -> list[Sequence[Any]]:
     return [items[k:k + size] for k in range(0, len(items), size)]
 
 
-_showing: ContextVar[bool] = ContextVar("motorid_progress", default=False)
+_outer: ContextVar[Callable[..., None] | None] = ContextVar("motorid_progress", default=None)
 
 
 @contextmanager
-def progress(text: str, total: float | None = None, *, quiet: bool = False) -> Iterator[Callable[..., None]]:
+def progress(text: str, total: float | None = None, *, quiet: bool = False, at_most: bool = False
+             ) -> Iterator[Callable[..., None]]:
     """Show a bar while the block runs; call what it yields once per finished task.
 
-    The bar stands on standard error and vanishes at the end. There is none if `quiet`, if nobody looks (a
-    pipe, a log file, a worker process), or inside another bar, so any function may use it whoever calls it.
+    The bar stands on standard error and vanishes at the end. There is none if `quiet`, or if nobody looks (a pipe, a
+    log file, a worker process). Inside another one it only says what that one is at, so any function may use it
+    whoever calls it. The time left is what it took so far, per task.
 
     Parameters
     ----------
@@ -300,11 +302,14 @@ def progress(text: str, total: float | None = None, *, quiet: bool = False) -> I
     total : float, optional
         Number of tasks; then the time left is shown, too. None: what is at work, and for how long.
     quiet : bool
+    at_most : bool
+        The total may not be reached, and the time left is said so.
 
     Yields
     ------
     callable
-        ``advance(n=1, at_work="", total=None)``; a `total` begins a round of so many tasks, with a bar of its own.
+        ``advance(n=1, at_work="", done=None, total=None)``: `at_work` takes the place of `text`; `done` is how many
+        tasks are, parts of one included.
 
     Examples
     --------
@@ -312,28 +317,34 @@ def progress(text: str, total: float | None = None, *, quiet: bool = False) -> I
     ...     for _ in range(3):
     ...         advance()
     """
-    if quiet or _showing.get() or not _watched():
-        yield lambda n=1.0, at_work="", total=None: None
+    outer = _outer.get()
+    if outer is not None:
+        outer(0, text)
+    if quiet or outer is not None or not _watched():
+        yield lambda n=1.0, at_work="", done=None, total=None: None
         return
     from rich import progress as rich
     from rich.console import Console
+    from rich.table import Column
 
-    counted: list[rich.ProgressColumn] = [rich.BarColumn(20), rich.MofNCompleteColumn(), rich.TimeRemainingColumn()]
-    columns = [rich.SpinnerColumn(), rich.TextColumn("{task.description}"), rich.TimeElapsedColumn()]
-    token = _showing.set(True)
-    try:
-        with rich.Progress(*columns, *(counted if total else []), console=Console(stderr=True), transient=True) as bar:
-            task = bar.add_task(text, total=total)
+    columns: list[rich.ProgressColumn] = [
+        rich.SpinnerColumn(), rich.TextColumn("{task.description}", table_column=Column(overflow="ellipsis")),
+        rich.TimeElapsedColumn(table_column=Column(min_width=7))]
+    if total:
+        count = rich.TextColumn("at most") if at_most else rich.MofNCompleteColumn()
+        columns += [rich.BarColumn(8), count, rich.TimeRemainingColumn(table_column=Column(min_width=7))]
+    with rich.Progress(*columns, console=Console(stderr=True), transient=True, speed_estimate_period=3600.0) as bar:
+        task = bar.add_task(text, total=total)
 
-            def advance(n: float = 1.0, at_work: str = "", total: float | None = None) -> None:
-                if total:
-                    bar.columns = (*columns, *counted)
-                    bar.update(task, total=total, completed=0)
-                bar.update(task, advance=n, description=f"{text}: {at_work}" if at_work else text)
+        def advance(n: float = 1.0, at_work: str = "", done: float | None = None, total: float | None = None) -> None:
+            bar.update(task, description=at_work or text, completed=done, total=total,
+                       advance=n if done is None else None)
 
+        token = _outer.set(advance)
+        try:
             yield advance
-    finally:
-        _showing.reset(token)
+        finally:
+            _outer.reset(token)
 
 
 def _watched() -> bool:

@@ -11,6 +11,7 @@ from motorid.diagnosis.results import Diagnosis, Ladder, ladder_table, ranking_t
 from motorid.display.cards import Shown, Table
 from motorid.display.numbers import counted, duration, number, percent, sentence
 from motorid.estimation.result import Fit, ended, parameter_table, value_tables
+from motorid.numerics.parallel import progress
 from motorid.problem.simulate import error_table, evaluate
 from motorid.records.checks import check_runs
 from motorid.records.experiment import Experiment
@@ -156,7 +157,8 @@ def _figure(name: str, caption: str, alt: str, draw: Callable[..., Any], *args: 
             **options: Any) -> Figure:
     from motorid.plots.style import svg_of
 
-    return Figure(svg_of(draw, *args, name=name, alt=alt, **options), caption, small)
+    with progress(f"Writing the report: figure {name}"):
+        return Figure(svg_of(draw, *args, name=name, alt=alt, **options), caption, small)
 
 
 def error_facts(steps: Ladder) -> list[tuple[str, str]]:

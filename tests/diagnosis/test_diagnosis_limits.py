@@ -12,7 +12,7 @@ import motorid as mi
 from motorid.diagnosis import candidates
 from motorid.diagnosis import record_parts as parts
 from motorid.diagnosis.admissibility import objections, samples_within, unresolved
-from motorid.diagnosis.candidates import Search, library
+from motorid.diagnosis.candidates import Search, Stages, library
 from motorid.diagnosis.model_comparison import node_of
 from motorid.diagnosis.score_test import score
 from motorid.effects import LIBRARY
@@ -42,7 +42,7 @@ def rubbing(lab):
 
 
 def searched(fit, effects=None):
-    return Search(fit, None, library(effects), map, lambda word: None)
+    return Search(fit, None, library(effects), Stages())
 
 
 # -- what samples cannot show ------------------------------------------------------------------------------
@@ -194,3 +194,25 @@ def test_a_long_record_is_looked_at_in_parts_and_that_is_said(lab, monkeypatch):
     assert found.effects == ("coulomb",)
     assert found.after.values["tau_c"] == pytest.approx(8e-3, rel=0.1)
     assert "2 parts of 0.5 s, 33 % of the samples" in found.text
+
+
+# -- what is shown while it works --------------------------------------------------------------------------
+
+
+def test_the_share_done_never_falls_and_a_second_climb_makes_the_whole_longer():
+    seen = []
+    stages = Stages(3, show=lambda n, words, done, total: seen.append((words, done, total)))
+    for climb in range(2):
+        stages.climb()
+        stages.at("ranking 36 effects")
+        for number in (1, 2):
+            stages.round(number)
+            for lot in (4, 1, 3):  # races, then the finish: how many lots a round has is not known before
+                assert list(stages.map(str, range(lot))) == list(map(str, range(lot)))
+        stages.round(4)
+        stages.at("Looking at what remains")
+        assert seen[-1] == ("Looking at what remains", 4 * climb + 3, 4 * climb + 4)
+    done = [share for _, share, _ in seen]
+    assert done == sorted(done)
+    assert all(share < total for _, share, total in seen)
+    assert ("Round 2/3: fitting once more, 2 of 4", 1.125, 4) in seen

@@ -272,7 +272,7 @@ def test_what_was_put_off_is_refitted_where_what_led_is_refused(lab, monkeypatch
     moves = driven(lab, {"coulomb": {"tau_c": 8e-3}}, "stairs", 800, 1e-3, rng)
     run = record(moves, "logger", ("i", "omega"), lab, rng, "run")
     fit = mi.fit(mi.dc_motor(), run)
-    looked = search.Search(fit, None, [mi.effects.coulomb, mi.effects.speed_lag], map, lambda word: None)
+    looked = search.Search(fit, None, [mi.effects.coulomb, mi.effects.speed_lag], search.Stages())
     monkeypatch.setattr(trial, "far", lambda fit: [0])
     _, listed = looked.expand(looked.root)
     assert next(c for c in listed if c.effect == "speed_lag").fit is None

@@ -3,6 +3,7 @@
 import io
 import subprocess
 import sys
+import time
 
 import pytest
 
@@ -30,13 +31,15 @@ def test_bar_counts_up_in_a_terminal(monkeypatch):
     assert "3/3" in screen.getvalue()
 
 
-def test_inner_bar_stays_silent_inside_another(monkeypatch):
+def test_inside_another_bar_one_says_what_that_one_is_at(monkeypatch):
     screen = terminal(monkeypatch)
     with progress("Outer", total=1) as advance:
         with progress("Inner", total=1) as inner:
             inner()
+            time.sleep(0.25)  # drawn ten times a second
         advance()
-    assert "Inner" not in screen.getvalue()
+    assert "Inner" in screen.getvalue()
+    assert "2/1" not in screen.getvalue()
     with progress("Later", total=1) as advance:
         advance()
     assert "Later" in screen.getvalue()
@@ -69,15 +72,15 @@ def test_pipe_stays_clean_and_rich_is_not_loaded():
 def test_what_is_at_work_is_said_and_no_total_is_made_up(monkeypatch):
     screen = terminal(monkeypatch)
     with progress("Looking") as advance:
-        advance(1, "fitting coulomb")
-    assert "Looking: fitting coulomb" in screen.getvalue()
+        advance(1, "Fitting coulomb")
+    assert "Fitting coulomb" in screen.getvalue()
     assert "?" not in screen.getvalue().replace("\x1b[?25", "")
 
 
-def test_a_round_whose_total_is_learnt_on_the_way_has_a_true_bar(monkeypatch):
+def test_parts_of_a_task_count_and_a_total_may_grow_on_the_way(monkeypatch):
     screen = terminal(monkeypatch)
-    with progress("Looking") as advance:
-        advance(0, "fitting coulomb", 4)
-        advance(1, "fitting stribeck")
-        advance(2, "fitting gravity")
-    assert "3/4" in screen.getvalue()
+    with progress("Looking", 4, at_most=True) as advance:
+        advance(0, "Round 1/3: fitting coulomb", 0.5)
+        advance(0, "Round 2/3: fitting stribeck", 1.5, 8)
+    assert "at most" in screen.getvalue()
+    assert "Round 2/3: fitting stribeck" in screen.getvalue()
