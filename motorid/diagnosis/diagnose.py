@@ -6,6 +6,7 @@ import builtins
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
+from motorid.channels import channel_name
 from motorid.diagnosis.adequacy import following
 from motorid.diagnosis.candidates import Stages, library
 from motorid.diagnosis.experiment_design import suggest_experiment
@@ -155,5 +156,9 @@ def _suggestion(found: Climb) -> str | None:
     except MotoridError:
         return None
     if best.discrimination[best.name] < 1e-3:
-        return f"No voltage record within the limits would distinguish {listed}."
+        problem = fits[0].problem
+        shown = ("i", "omega", "theta") if problem.model.base == "dc_motor" else ("omega", "theta")
+        more = [channel_name(c) for c in shown if c not in problem.outputs]
+        told = f"; measure the {' or '.join(more)} too" if more else ""
+        return f"No voltage record of these channels within the limits would distinguish {listed}{told}."
     return f"To distinguish {listed}, record {best.text}."

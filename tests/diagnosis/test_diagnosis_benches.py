@@ -38,6 +38,17 @@ def test_a_gain_of_the_current_hides_and_identifiability_says_in_what():
     assert "Fix k_i (or R) where known" in text
 
 
+def test_a_group_that_no_voltage_distinguishes_is_told_with_what_to_measure():
+    case = Case("offset", "single", "lab", {"speed_offset": {"w_0": 6.0}}, ("forward", "waves"), "forward 0.9",
+                channels=("omega",), n=700)
+    runs, check = case.records()
+    tried = ["speed_offset", "voltage_offset", "constant_load"]
+    found = mi.diagnose(mi.fit(mi.dc_motor(), runs), check, effects=tried)
+    assert sorted(found.groups[0]) == sorted(tried), found.text
+    assert found.suggestion is not None
+    assert found.suggestion.endswith("; measure the current or angle too.")
+
+
 def test_a_reading_that_only_the_missing_effect_asked_for_is_taken_back():
     runs, check = WIDE["current_gain.lab.b"].records()
     fit = mi.fit(WIDE["current_gain.lab.b"].base(), runs)
