@@ -159,11 +159,11 @@ class Explorer:
         refit.on_click(lambda _: self.refit())
         reset.on_click(lambda _: self.reset())
         self.buttons = {"refit": refit, "reset": reset}
-        title = w.HTML("<b>Parameters</b>")
-        parts = [*self._groups(), title, self._sliders, w.HBox([refit, reset]), self._status]
-        controls = w.VBox(parts, layout=w.Layout(width="25rem", flex="0 0 auto"))
-        shown = w.VBox([self._errors, self._picture], layout=w.Layout(flex="1 1 30rem"))
-        self.widget = w.HBox([controls, shown], layout=w.Layout(flex_flow="row wrap", width="100%"))
+        moved = w.VBox([w.HTML("<b>Parameters</b>"), self._sliders, w.HBox([refit, reset]), self._status],
+                       layout=w.Layout(width="25rem", flex="0 0 auto"))
+        shown = w.VBox([self._picture, self._errors], layout=w.Layout(flex="1 1 30rem"))
+        side = w.HBox([moved, shown], layout=w.Layout(flex_flow="row wrap", width="100%"))
+        self.widget = w.VBox([side, *self._groups()], layout=w.Layout(width="100%"))
         self._draw()
         self._show_controls()
 
@@ -174,9 +174,10 @@ class Explorer:
         found = []
         for balance, title in TITLES.items():
             boxes = [self.boxes[n] for n, e in self._effects.items() if e.balance == balance]
-            grid = w.GridBox(boxes, layout=w.Layout(grid_template_columns="1fr 1fr"))
+            grid = w.GridBox(boxes, layout=w.Layout(grid_template_columns="repeat(auto-fill, minmax(13rem, 1fr))"))
             found += [w.HTML(f"<b>{title}</b>"), grid] if boxes else []
-        hint = w.HTML("Effects, with the share of the misfit that each would take away now; hover for the law.")
+        hint = w.HTML("Effects, with the share of the first fit's misfit that each is predicted to take; hover for "
+                      "the law.")
         return [hint, *found]
 
     def _box(self, name: str) -> Any:
@@ -198,13 +199,19 @@ class Explorer:
         if p.positive:
             power = float(np.log10(p.value))
             slider = w.FloatLogSlider(value=p.value, base=10, min=power - 1, max=power + 1, step=0.002,
-                                      readout_format=".3g", **common)
+                                      readout_format=".3g" if 1e-3 <= p.value < 1e4 else ".2e", **common)
         else:
             low, high = max(p.lower, p.value - REACH * size), min(p.upper, p.value + REACH * size)
             step = 1.0 if p.order else (high - low) / 2000
             slider = w.FloatSlider(value=p.value, min=low, max=high, step=step, readout_format=".3g", **common)
-        slider.observe(lambda change: self._quiet or self.move(**{p.name: change["new"]}), "value")
+        slider.observe(lambda change: self._dragged(slider, p.name, change["new"]), "value")
         return slider
+
+    def _dragged(self, slider: Any, name: str, value: float) -> None:
+        """Follow a slider, but not the half step by which a browser rounds what it is given to show."""
+        now = self.model.parameters[name].value
+        if not self._quiet and abs(_position(slider, value) - _position(slider, now)) > 0.5 * slider.step:
+            self.move(**{name: value})
 
     def _show_controls(self) -> None:
         """Make ticks and sliders agree with the model."""

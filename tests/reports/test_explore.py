@@ -132,9 +132,10 @@ def test_something_else_than_a_fit_is_refused():
 
 def test_effects_stand_by_balance_the_most_promising_first_with_their_law(fit):
     playing = mi.explore(fit, effects=["brush_drop", "quadratic_drag", "coulomb"])
-    shown = [str(getattr(part, "value", "")) for part in playing.widget.children[0].children]
-    assert [t for t in shown if t.startswith("<b>")] == ["<b>Voltage balance</b>", "<b>Torque balance</b>",
-                                                         "<b>Parameters</b>"]
+    beside, *below = playing.widget.children  # what is moved and what it does beside one another, the ticks below
+    shown = [str(getattr(part, "value", "")) for part in below]
+    assert [t for t in shown if t.startswith("<b>")] == ["<b>Voltage balance</b>", "<b>Torque balance</b>"]
+    assert "<b>Parameters</b>" in [getattr(part, "value", "") for part in beside.children[0].children]
     assert next(iter(playing.boxes)) == "coulomb"
     assert playing.boxes["coulomb"].description.startswith("coulomb −")
     assert "sgn" in playing.boxes["coulomb"].tooltip
@@ -150,3 +151,16 @@ def test_curves_follow_the_mouse(playing, fit):
     for k in range(3):
         playing.move(R=(1.02 + 0.001 * k) * fit.values["R"])
     assert (time.process_time() - began) / 3 < 0.2
+
+
+def test_a_browser_that_rounds_what_it_shows_moves_nothing(fit):
+    """Seen in one: opening the widget sent every value back, changed in its last digits."""
+    fresh = mi.explore(fit, effects=["coulomb"])
+    before = dict(fresh.model.values)
+    for slider in fresh.sliders.values():
+        slider.value *= 1.0005
+    assert fresh.model.values == before
+    assert fresh.message == ""
+    fresh.sliders["R"].value *= 1.01
+    assert fresh.model.values["R"] == pytest.approx(1.01 * before["R"], rel=1e-3)
+    assert fresh.message == "moved"
