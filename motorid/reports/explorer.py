@@ -174,7 +174,7 @@ class Explorer:
         found = []
         for balance, title in TITLES.items():
             boxes = [self.boxes[n] for n, e in self._effects.items() if e.balance == balance]
-            grid = w.GridBox(boxes, layout=w.Layout(grid_template_columns="repeat(auto-fill, minmax(13rem, 1fr))"))
+            grid = w.GridBox(boxes, layout=w.Layout(grid_template_columns="repeat(auto-fill, minmax(15rem, 1fr))"))
             found += [w.HTML(f"<b>{title}</b>"), grid] if boxes else []
         hint = w.HTML("Effects, with the share of the first fit's misfit that each is predicted to take; hover for "
                       "the law.")
