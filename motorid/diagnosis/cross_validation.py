@@ -63,7 +63,9 @@ class HeldOut:
         """
         held_out: Channels = {}
         if self.validation is not None:
-            held_out = held_out_errors(self.validation.for_model(fit.model), self.noise)
+            # As finely as it was fitted: a tiny noise asks for many sub-steps that change nothing here.
+            there = self.validation.for_model(fit.model).tuned(accuracy=fit.problem.accuracy)
+            held_out = held_out_errors(there, self.noise)
         blocks = predictions_left_out(fit)
         if blocks is None and not held_out:
             blocks = self._refitted(fit)
@@ -76,7 +78,7 @@ class HeldOut:
             try:
                 problem, test = _fold(fit.problem.for_model(fit.model), odd)
                 q = problem.scaling.scaled([fit.initial.get(p.name, p.value) for p in problem.unknown])
-                done = by_continuation(restarted(problem, q), QUICK, wide=False)
+                done = by_continuation(restarted(problem, q), QUICK, wide=False, narrow=False)
                 for c, e in errors_of(at(done.problem, done.solution.q), self.noise, test).items():
                     found.setdefault(c, []).append(e)
             except FAILURES:

@@ -23,6 +23,7 @@ from motorid.estimation.continuation import by_continuation
 from motorid.estimation.fit import solve
 from motorid.estimation.least_squares import FAILURES
 from motorid.estimation.result import Fit
+from motorid.numerics.least_squares import LevenbergMarquardt
 from motorid.problem.problem import Problem
 from motorid.problem.simulate import at, judge, misfit_over_noise
 from motorid.records.experiment import Experiment
@@ -35,6 +36,7 @@ DELAYS = ((-1.0, 1.0, 2.0, 3.0, 5.0, 8.0, 12.0), (-1.0, -0.5, 0.5, 1.0), (-0.25,
 NOISE = (0.9, 1.05)  # times what fast changes tell of the noise: errors that are all noise
 PLAIN = 0.1  # fall of the error with another reading
 OTHER = {"zoh": "linear", "linear": "zoh"}
+AS_IT_IS = LevenbergMarquardt(looks=0)  # beside a fit whose end was looked into
 
 
 @dataclass(frozen=True)
@@ -54,14 +56,14 @@ class Reading:
         runs = tuple(self.of(r) for r in fit.problem.experiments)
         return fit.problem.with_(experiments=runs, model=fit.model, noise_factors={})
 
-    def fitted(self, fit: Fit) -> Fit:
+    def fitted(self, fit: Fit, solver: LevenbergMarquardt | None = None) -> Fit:
         """Return the fit of the same model to records read so.
 
         Raises
         ------
         FitError, SimulationError
         """
-        return solve(self.problem(fit), start="model")
+        return solve(self.problem(fit), solver, start="model")
 
     def remark(self, before: Fit, after: Fit) -> str:
         """Say what was done to the records and what that did to the errors."""
@@ -105,7 +107,7 @@ def better_reading(fit: Fit, late: bool = False) -> Reading | None:
         readings += _best_delay(fit)
     for reading in readings:
         try:
-            after = reading.fitted(fit)
+            after = reading.fitted(fit, AS_IT_IS)
             found = compare(*(Predictions(predictions_left_out(f) or {}, {}) for f in (fit, after)))
         except FAILURES:
             continue
@@ -135,7 +137,7 @@ def _best_delay(fit: Fit) -> list[Reading]:
 def _fall(fit: Fit, reading: Reading) -> float:
     """Return about how much a reading lowers the error: after a few steps from where the fit is."""
     try:
-        done = by_continuation(reading.problem(fit).tuned(accuracy=ROUGH), RACE, wide=False)
+        done = by_continuation(reading.problem(fit).tuned(accuracy=ROUGH), RACE, wide=False, narrow=False)
         after = judge(at(done.problem, done.solution.q)).nrmse
         return 1 - float(np.exp(np.mean([np.log(after[c] / e) for c, e in fit.nrmse.items()])))
     except FAILURES:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from motorid.errors import MotoridError
 from motorid.estimation.fit import solve
 from motorid.estimation.result import Fit
+from motorid.integrate import limited
 from motorid.numerics.signals import Array
 from motorid.problem.problem import Problem
 from motorid.problem.runs import angle_signal
@@ -49,8 +50,16 @@ def affordable(fit: Fit) -> Fit:
 
 def worth_its_steps(problem: Problem) -> bool:
     """Tell whether a problem takes no more sub-steps than its samples are worth."""
-    spent = sum(int(r.grid.substeps.sum()) for r in problem.runs)
-    return spent <= max(SUBSTEPS * _samples(problem.experiments), CHEAP)
+    return sum(int(r.grid.substeps.sum()) for r in problem.runs) <= _most(problem)
+
+
+def _most(problem: Problem) -> int:
+    return max(SUBSTEPS * _samples(problem.experiments), CHEAP)
+
+
+def within_worth(problem: Problem) -> Problem:
+    """Return the problem with an engine that gives up where one record takes more sub-steps than that."""
+    return problem.tuned(engine=limited(problem.integrator, _most(problem)))
 
 
 def fit_affordably(runs: Sequence[Experiment], fit: Callable[[Sequence[Experiment]], Fit]) -> Fit:

@@ -12,11 +12,11 @@ import numpy as np
 
 from motorid.diagnosis.cross_validation import QUICK, ROUGH, restarted
 from motorid.diagnosis.model_comparison import far, size_of
-from motorid.diagnosis.record_parts import worth_its_steps
+from motorid.diagnosis.record_parts import within_worth, worth_its_steps
 from motorid.diagnosis.score_test import uses_angle
 from motorid.diagnosis.thresholds import MATERIAL, NATS
 from motorid.errors import OutOfTime
-from motorid.estimation.continuation import by_continuation
+from motorid.estimation.continuation import by_continuation, sharpened
 from motorid.estimation.first_guess import first_guess
 from motorid.estimation.least_squares import FAILURES, Estimate
 from motorid.estimation.restarts import collapsed_again, restored
@@ -99,7 +99,7 @@ def finished(fit: Fit, best: Raced) -> Fit | None:
     """
     stages = "sgn_width" in best.problem.model.parameters and not fit.model.effects
     try:
-        done = _released(best.problem) if best.angular else by_continuation(best.problem, QUICK, wide=stages)
+        done = _released(best.problem) if best.angular else _quick(best.problem, wide=stages)
     except FAILURES:
         return None
     return _polished(fit, collapsed_again(restarted(done.problem, done.solution.q), fit))
@@ -120,15 +120,25 @@ def _released(measured: Problem) -> Estimate:
     """
     own = measured.for_model(replace(measured.model, angle_input=False, _systems={}))
     if not all("theta" in run.outputs for run in measured.experiments):
-        return by_continuation(own, QUICK, wide=False)
-    along = by_continuation(measured, QUICK, wide=False)
+        return _quick(own)
+    along = _quick(measured)
     values = along.problem.values(along.solution.q)
     own = restarted(along.problem, along.solution.q).for_model(own.model.start_at(values))
     try:
-        free = by_continuation(own, QUICK, wide=False)
+        free = _quick(own)
     except FAILURES:
         return along
     return free if free.solution.history[-1] < WORSE * along.solution.history[-1] else along
+
+
+def _quick(problem: Problem, wide: bool = False) -> Estimate:
+    """Descend nearly to the end.
+
+    Raises
+    ------
+    FitError, SimulationError
+    """
+    return by_continuation(problem, QUICK, wide=wide, narrow=False)
 
 
 def lost(fit: Fit) -> bool:
@@ -160,10 +170,10 @@ def _started(fit: Fit, model: Model, start: Mapping[str, float], angular: bool) 
 def _race(problem: Problem) -> Estimate | None:
     """Go a few steps; None where that fails or needs more sub-steps than the samples are worth."""
     try:
-        done = by_continuation(problem, RACE, wide=False)
+        done = by_continuation(within_worth(problem), RACE, wide=False, narrow=False)
     except FAILURES:
         return None
-    return done if worth_its_steps(done.problem) else None
+    return replace(done, problem=done.problem.tuned(engine=problem.engine)) if worth_its_steps(done.problem) else None
 
 
 def _bounded(fit: Fit, model: Model) -> Model:
@@ -194,6 +204,7 @@ def _polished(fit: Fit, problem: Problem) -> Fit | None:
             factors = misfit_over_noise(done.problem, done.solution.q)
             if max(abs(np.log(factors[c] / problem.noise_factors.get(c, 1.0))) for c in factors) > 0.1:
                 done = _converged(restarted(done.problem, done.solution.q).tuned(noise_factors=factors))
+        done = sharpened(done, POLISH)
     except FAILURES:
         return None
     found, problem = done.solution, done.problem
@@ -210,11 +221,11 @@ def _converged(problem: Problem) -> Estimate:
     ------
     FitError, SimulationError
     """
-    done = by_continuation(problem, POLISH, wide=False)
+    done = by_continuation(problem, POLISH, wide=False, narrow=False)
     for _ in range(GOING_ON):
         if done.solution.status != "limit":
             break
-        again = by_continuation(restarted(done.problem, done.solution.q), POLISH, wide=False)
+        again = by_continuation(restarted(done.problem, done.solution.q), POLISH, wide=False, narrow=False)
         done = replace(again, history=done.history + again.history)
     return done
 

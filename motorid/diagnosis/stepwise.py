@@ -10,11 +10,12 @@ import builtins
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 from motorid.diagnosis.adequacy import judge_adequacy
 from motorid.diagnosis.candidates import Search, Stages, library
-from motorid.diagnosis.cross_validation import HeldOut
+from motorid.diagnosis.cross_validation import QUICK, HeldOut
 from motorid.diagnosis.input_hypotheses import Reading, better_reading, without_spikes
 from motorid.diagnosis.misspecification import FormGain, Grade, better_forms, grades_of
 from motorid.diagnosis.model_comparison import Node, at_noise, beats, choose, evidence, far, group_of, node_of, tied
@@ -237,7 +238,7 @@ def _in_windows(found: Climb) -> Fit | None:
     first, last = found.path[0].fit, found.path[-1].fit
     if follows(last) and not last.model.angle_input:
         return None
-    if growth(last) < TOO_FAR or (part := in_windows(last)) is None:
+    if growth(last) < TOO_FAR or (part := in_windows(last, partial(solve, solver=QUICK, start="model"))) is None:
         return None
     try:
         return solve(part.problem.with_(model=first.model, noise_factors={}))

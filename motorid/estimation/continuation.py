@@ -27,7 +27,7 @@ LOWER = 0.98  # of the cost with a wider sgn, or the narrower one is not worth i
 
 
 def by_continuation(problem: Problem, effort: LevenbergMarquardt, callback: Callback = None, *,
-                    wide: bool = True) -> Estimate:
+                    wide: bool = True, narrow: bool = True) -> Estimate:
     """Minimise the cost from the values of the model, and restart where the first width ends in doubt.
 
     One least-squares run where the model has no sgn, or one whose width was given.
@@ -39,7 +39,9 @@ def by_continuation(problem: Problem, effort: LevenbergMarquardt, callback: Call
         Of the last width; `looks` counts the restarts at the first.
     callback : callable, optional
     wide : bool
-        Begin with a wide sgn; otherwise with the width that the problem has, from where it may still become narrower.
+        Begin with a wide sgn; otherwise with the width that the problem has.
+    narrow : bool
+        End with a narrower sgn where that lowers the cost, see `sharpened`.
 
     Raises
     ------
@@ -63,10 +65,11 @@ def by_continuation(problem: Problem, effort: LevenbergMarquardt, callback: Call
         history += found.history
         if k < last:
             here = found.problem.start_at(found.values)
-    return _sharpened(replace(found, history=history), effort, callback)
+    found = replace(found, history=history)
+    return sharpened(found, effort, callback) if narrow else found
 
 
-def _sharpened(found: Estimate, effort: LevenbergMarquardt, callback: Callback) -> Estimate:
+def sharpened(found: Estimate, effort: LevenbergMarquardt, callback: Callback = None) -> Estimate:
     """Return the estimate with a narrower sgn, as long as that lowers the cost.
 
     Where it does not, the creep of a stuck motor does not matter, and a sgn so narrow only makes the model stiff.

@@ -24,6 +24,7 @@ from motorid.estimation.result import Fit
 from motorid.model.definition import Parameter
 from motorid.model.model import Model
 from motorid.numerics.least_squares import LevenbergMarquardt
+from motorid.numerics.signals import Array
 from motorid.problem.problem import Problem
 from motorid.problem.simulate import poorly_explained
 
@@ -98,8 +99,8 @@ def restore_collapsed(found: Estimate, effort: LevenbergMarquardt, callback: Cal
 
     All are put back together first, then one by one.
     """
-    log = found.problem.scaling.log
-    influence = np.linalg.norm(found.solution.jac, axis=0)
+    log, sd = found.problem.scaling.log, _deviation(found.problem, found.solution.residual)
+    influence = np.linalg.norm(found.solution.jac, axis=0) / sd
     if not (influence[log] < MATTERS).any():
         return found
     values = found.values
@@ -109,9 +110,14 @@ def restore_collapsed(found: Estimate, effort: LevenbergMarquardt, callback: Cal
     each = [{n: v} for n, v in back.items()][:MOST] if len(back) > 1 else []
     for changes in (back, *each) if back else ():
         again = race([found.problem.start_at({**values, **changes})], effort).best
-        if again is not None and again.cost < found.cost - GAIN:
+        if again is not None and again.cost < found.cost - GAIN * sd**2:
             return replace(again, history=found.history + again.history)
     return found
+
+
+def _deviation(problem: Problem, residual: Array) -> float:
+    """Return the standard deviation of the weighted residuals where all is explained: one, if the noise weighs them."""
+    return float(np.sqrt(np.mean(residual**2))) or 1.0 if problem.weights == "rms" else 1.0
 
 
 def restored_values(parameters: Iterable[Parameter], influence: Mapping[str, float]) -> dict[str, float]:
@@ -135,7 +141,8 @@ def restored_values(parameters: Iterable[Parameter], influence: Mapping[str, flo
 def restored(fit: Fit, model: Model) -> Model:
     """Return a larger model than that of `fit`, with the parameters that collapsed in `fit` where they would matter."""
     names = [p.name for p in fit.problem.unknown]
-    slopes = dict(zip(names, np.linalg.norm(fit.jacobian, axis=0), strict=True))
+    sd = _deviation(fit.problem, fit.residuals)
+    slopes = dict(zip(names, np.linalg.norm(fit.jacobian, axis=0) / sd, strict=True))
     known = [p for p in model.parameters.values() if p.name in slopes]
     back = restored_values(known, {p.name: p.value * slopes[p.name] for p in known})
     return model.start_at(back) if back else model
@@ -143,9 +150,9 @@ def restored(fit: Fit, model: Model) -> Model:
 
 def collapsed_again(problem: Problem, fit: Fit) -> Problem:
     """Return the problem with what `restored` put back where `fit` had it, each if that costs nothing."""
-    model = restored(fit, fit.model)
+    model, gain = restored(fit, fit.model), GAIN * _deviation(fit.problem, fit.residuals) ** 2
     for name in (n for n, p in model.parameters.items() if p.value != fit.model.parameters[n].value):
         other = problem.start_at({name: fit.values[name]})
-        if start_cost(other) < start_cost(problem) + GAIN:
+        if start_cost(other) < start_cost(problem) + gain:
             problem = other
     return problem

@@ -18,6 +18,7 @@ from motorid.display.numbers import counted, duration, number, percent, quantity
 from motorid.errors import UsageError, name_of
 from motorid.estimation.covariance import Certainty, Quantity, certainty, combinations
 from motorid.model.model import Model
+from motorid.numerics.parallel import one_thread
 from motorid.numerics.signals import Array, despiked
 from motorid.problem.plain_data import model_dict, problem_dict
 from motorid.problem.problem import Problem
@@ -107,6 +108,7 @@ class Fit(Shown):
         """Accepted steps."""
         return len(self.history) - 1
 
+    @one_thread
     def certainty(self, method: str = "coloured") -> Certainty:
         """Return what the data say of the unknowns; ``"white"`` takes the residuals of samples as independent."""
         return certainty(self.problem, self.q, self.residuals, self.jacobian, self.extra.get("free"), method)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from motorid.errors import UsageError, one_of
 from motorid.integrate.engine import Engine, Grid, Trajectory
 from motorid.integrate.rosenbrock import Rosenbrock
@@ -25,4 +27,9 @@ def engine_of(engine: str | Engine) -> Engine:
     return engine
 
 
-__all__ = ["ENGINES", "Cvodes", "Engine", "Grid", "Idas", "Rosenbrock", "Trajectory", "engine_of"]
+def limited(engine: Engine, steps: int) -> Engine:
+    """Return the engine, one that gives up preparing a record that takes more than so many of its sub-steps."""
+    return replace(engine, most_steps=steps) if isinstance(engine, Rosenbrock) else engine
+
+
+__all__ = ["ENGINES", "Cvodes", "Engine", "Grid", "Idas", "Rosenbrock", "Trajectory", "engine_of", "limited"]

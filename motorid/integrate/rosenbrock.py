@@ -36,6 +36,8 @@ class Rosenbrock:
     ----------
     compiled : bool or None
         None: compile once a model has used the virtual machine for a moment; True: at once; False: never.
+    most_steps : int or None
+        Sub-steps of a record at most: `prepare` fails where accuracy asks for more. None: no limit.
 
     Examples
     --------
@@ -44,6 +46,7 @@ class Rosenbrock:
 
     compiled: bool | None = None
     name: str = "rosenbrock"
+    most_steps: int | None = None
 
     def run(self, system: System, grid: Grid, x0: Array, p: Array, dx0: Array | None = None,
             dp: Array | None = None, local_error: bool = False) -> Trajectory:
@@ -78,6 +81,8 @@ class Rosenbrock:
             finer = np.clip(grid.substeps * np.clip(factor, 1, 16), 1, MOST_SUBSTEPS).astype(np.int64)
             if np.array_equal(finer, grid.substeps):
                 break
+            if self.most_steps is not None and finer.sum() > self.most_steps:
+                raise SimulationError(f"the model is too stiff: it takes more than {self.most_steps} steps.")
             grid = grid.with_substeps(finer)
         return grid
 

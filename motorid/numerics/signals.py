@@ -12,6 +12,8 @@ WINDOWS = 200  # over which slopes are taken
 ORDERS = (2, 3, 4, 5, 6)  # of differences
 _SMALLER_HALF = 0.3240277  # mean of |z| over the smaller half, z standard normal: 4·(φ(0) − φ(0.67449))
 _FLOOR = 1e-5  # of the channel's own variation: what a noise-free simulation is given
+_EVEN = 1e-6  # of the interval: samples are evenly spaced if their times wander by less
+_FEW, _MOSTLY = 512, 0.8  # jumps of a first look at a step, and the share of them that must be its multiples
 _REST = 12  # equal samples in a row that count as standstill
 CLIP = 6.0  # robust standard deviations beyond which a residual counts as an outlier
 _DITHERED = 0.6  # noise that is to be seen through the steps leaves fewer neighbours equal than this
@@ -82,12 +84,21 @@ def quantum(y: ArrayLike) -> float:
     jumps = jumps[jumps > 1e-9 * np.abs(values).max(initial=0.0)]
     if len(jumps) < 20:
         return 0.0
-    for guess in np.unique(np.quantile(jumps, np.arange(0.02, 0.98, 0.04), method="nearest"))[::-1]:
+    guesses = np.unique(np.quantile(jumps, np.arange(0.02, 0.98, 0.04), method="nearest"))[::-1]
+    for guess in guesses[_plausible(jumps, guesses)]:
         step = float(np.median(jumps[np.abs(jumps / guess - 1) < 0.2]))  # rounding in the file blurs it
         steps = jumps / step
         if np.mean(np.abs(steps - steps.round()) < 0.1) > 0.95:
             return step
     return 0.0
+
+
+def _plausible(jumps: Array, guesses: Array) -> NDArray[np.bool_]:
+    """Tell by a few of the jumps which guesses of a step may be right: most of these are then whole multiples."""
+    few = jumps[:: max(len(jumps) // _FEW, 1)] / guesses[:, None]
+    near = np.abs(few - 1) < 0.2
+    few /= np.where(near.any(axis=1), (few * near).sum(axis=1) / np.maximum(near.sum(axis=1), 1), 1.0)[:, None]
+    return (np.mean(np.abs(few - few.round()) < 0.1, axis=1) > _MOSTLY) | ~near.any(axis=1)
 
 
 def noise_level(y: ArrayLike, t: ArrayLike | None = None) -> float:
@@ -151,21 +162,27 @@ def _of_order(values: Array, times: Array, order: int, step: float) -> float:
     """Robust noise level from differences of one order; 0.0 if there are too few."""
     if len(values) < order + 4:
         return 0.0
-    t = sliding_window_view(times, order + 1)
-    y = sliding_window_view(values, order + 1)
-    span = t[:, -1] - t[:, 0]
-    whole = span < 2.5 * np.median(span)  # not across a gap
-    t, y, span = t[whole], y[whole], span[whole]
-    u = (t - t[:, :1]) / span[:, None]
-    apart = u[:, :, None] - u[:, None, :] + np.eye(order + 1)
-    weights = 1.0 / np.prod(apart, axis=2)
-    weights /= np.linalg.norm(weights, axis=1, keepdims=True)
-    size = np.abs(np.sum(weights * (y - y[:, :1]), axis=1))
-    live = ~_at_rest(values, order)[whole]
+    live, same = ~_at_rest(values, order), sliding_window_view(np.diff(values) == 0, order)
+    gaps = np.diff(times)
+    if np.ptp(gaps) < _EVEN * gaps.mean():
+        size = np.abs(np.correlate(values - values[0], _weights(times[None, : order + 1])[0], "valid"))
+    else:
+        t, y = sliding_window_view(times, order + 1), sliding_window_view(values, order + 1)
+        span = t[:, -1] - t[:, 0]
+        whole = span < 2.5 * np.median(span)  # not across a gap
+        live, same = live[whole], same[whole]
+        size = np.abs(np.sum(_weights(t[whole]) * (y - y[:, :1])[whole], axis=1))
     if not live.any():
         return 0.0
-    equal = float(np.mean(y[live, 1:] == y[live, :-1]))
-    return _typical(size if step and equal > _DITHERED else size[live])
+    return _typical(size if step and same[live].mean() > _DITHERED else size[live])
+
+
+def _weights(t: Array) -> Array:
+    """Return the weights of divided differences, of length one, for windows of times (N, order + 1)."""
+    u = (t - t[:, :1]) / (t[:, -1] - t[:, 0])[:, None]
+    apart = u[:, :, None] - u[:, None, :] + np.eye(t.shape[1])
+    weights = 1.0 / np.prod(apart, axis=2)
+    return weights / np.linalg.norm(weights, axis=1, keepdims=True)
 
 
 def _at_rest(values: Array, order: int) -> NDArray[np.bool_]:

@@ -11,7 +11,7 @@ import numpy as np
 
 from motorid.channels import CHANNELS
 from motorid.errors import ModelError, SimulationError, UsageError, name_of, one_of
-from motorid.integrate import engine_of
+from motorid.integrate import engine_of, limited
 from motorid.integrate.engine import Engine, Trajectory
 from motorid.model.definition import Parameter
 from motorid.model.equations import System
@@ -188,9 +188,15 @@ class Problem:
     def fine_enough(self, q: Array) -> bool:
         """Tell whether the present sub-steps keep, within a factor of two, what `refined` asks for at `q`."""
         at = self.unknowns.point(np.asarray(q, float))
-        each = ((run, self.unknowns.of_run(at, k), k) for k, run in enumerate(self.runs))
-        return all(self.integrator.prepare(self.system, run.grid, self.unknowns.first_state(own, k), own.p,
-                                           self._tolerance(k, 2.0)) is run.grid for run, own, k in each)
+        return all(self._suits(k, self.unknowns.of_run(at, k)) for k in range(len(self.runs)))
+
+    def _suits(self, k: int, at: Point) -> bool:
+        grid, x0 = self.runs[k].grid, self.unknowns.first_state(at, k)
+        engine = limited(self.integrator, int(grid.substeps.sum()))  # the first that is finer tells
+        try:
+            return engine.prepare(self.system, grid, x0, at.p, self._tolerance(k, 2.0)) is grid
+        except SimulationError:
+            return False
 
     def _refined_run(self, k: int, at: Point) -> Run:
         # From one step per sample on, so that the grid depends on q alone and not on the way there.

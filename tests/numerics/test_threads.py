@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import multiprocessing
+import re
 import threading
 from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
 
 import pytest
 from threadpoolctl import ThreadpoolController
@@ -85,3 +87,12 @@ def test_every_call_that_computes_is_held_to_one_thread(name, monkeypatch):
     with pytest.raises(TypeError):
         getattr(mi, name)()
     assert seen == [name]
+
+
+THREADS = re.compile(r"\w+_NUM_" r"THREADS|VECLIB_MAXIMUM_" r"THREADS|threadpool_" r"limits")
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def test_no_test_and_no_benchmark_sets_threads_that_users_would_not_have():
+    given = [*(ROOT / "tests").rglob("*.py"), ROOT / "pyproject.toml", *(ROOT / ".ci").glob("*")]
+    assert {str(p): found for p in given if (found := THREADS.findall(p.read_text("utf-8")))} == {}
