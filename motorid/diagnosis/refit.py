@@ -6,6 +6,7 @@ import contextlib
 import itertools
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -37,6 +38,7 @@ GOING_ON = 4  # times, where the last descent ends at its limit
 LOST = 0.2  # NRMSE of a channel
 ROOM = 10.0  # factor beyond its grid that a shape parameter may run to
 ALONE = 0.1  # of an answer: what is left of it without the others', if these do the same
+QUICKLY = partial(by_continuation, effort=QUICK, wide=False, narrow=False)  # nearly to the end
 WORSE = 1.02  # of the cost along the measured angle: the model's own angle must do as well
 
 
@@ -99,7 +101,7 @@ def finished(fit: Fit, best: Raced) -> Fit | None:
     """
     stages = "sgn_width" in best.problem.model.parameters and not fit.model.effects
     try:
-        done = _released(best.problem) if best.angular else _quick(best.problem, wide=stages)
+        done = _released(best.problem) if best.angular else QUICKLY(best.problem, wide=stages)
     except FAILURES:
         return None
     return _polished(fit, collapsed_again(restarted(done.problem, done.solution.q), fit))
@@ -120,25 +122,15 @@ def _released(measured: Problem) -> Estimate:
     """
     own = measured.for_model(replace(measured.model, angle_input=False, _systems={}))
     if not all("theta" in run.outputs for run in measured.experiments):
-        return _quick(own)
-    along = _quick(measured)
+        return QUICKLY(own)
+    along = QUICKLY(measured)
     values = along.problem.values(along.solution.q)
     own = restarted(along.problem, along.solution.q).for_model(own.model.start_at(values))
     try:
-        free = _quick(own)
+        free = QUICKLY(own)
     except FAILURES:
         return along
     return free if free.solution.history[-1] < WORSE * along.solution.history[-1] else along
-
-
-def _quick(problem: Problem, wide: bool = False) -> Estimate:
-    """Descend nearly to the end.
-
-    Raises
-    ------
-    FitError, SimulationError
-    """
-    return by_continuation(problem, QUICK, wide=wide, narrow=False)
 
 
 def lost(fit: Fit) -> bool:

@@ -48,3 +48,9 @@ def test_three_efforts_go_ever_further(problem):
 def test_a_start_is_kept_inside_the_limits(problem):
     tight = problem.for_model(problem.model.bounded(R=(1.0, 3.0)))
     assert tight.start_at({"R": 10.0, "unknown": 1.0}).model.values["R"] == 3.0
+
+
+def test_weights_by_the_rms_do_not_make_a_parameter_that_matters_look_collapsed(problem, monkeypatch):
+    monkeypatch.setattr("motorid.estimation.restarts.race", lambda *_: pytest.fail("put back without need"))
+    fit = mi.fit(mi.dc_motor(), problem.experiments, weights="rms", initial="rest")
+    assert fit.values["K"] == pytest.approx(TRUE["K"], rel=0.02)

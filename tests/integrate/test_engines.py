@@ -14,7 +14,7 @@ from scipy.linalg import expm
 
 import motorid as mi
 from motorid.errors import FitError, ModelError, SimulationError, UsageError
-from motorid.integrate import Cvodes, Grid, Idas, Rosenbrock, engine_of
+from motorid.integrate import Cvodes, Grid, Idas, Rosenbrock, engine_of, limited
 from motorid.model.equations import System
 from motorid.records.datasets import truth as truth_of
 
@@ -206,6 +206,21 @@ def test_order_of_the_rosenbrock_step_is_three(hold):
     orders = np.log2(np.array(errors[:-1]) / np.array(errors[1:]))
     assert (orders > 2.8).all()
     assert (orders < 3.4).all()
+
+
+def test_a_limit_on_the_steps_ends_the_choice_of_steps_before_they_are_taken():
+    system = (mi.dc_motor(**VALUES) + mi.effects.coulomb).system(("i", "omega"))
+    p = np.array([{**VALUES, "tau_c": 5e-3, "sgn_width": 1e-3}[n] for n in system.parameters])
+    t = np.arange(0, 0.4, 1e-3)
+    grid = Grid.of(t, 6 * np.sign(np.sin(30 * t))[:, None], np.array([True]))
+    free = Rosenbrock().prepare(system, grid, np.zeros(2), p, 1e-5)
+    needed = int(free.substeps.sum())
+    assert needed > 1.5 * len(t)
+    assert np.array_equal(limited(Rosenbrock(), needed).prepare(system, grid, np.zeros(2), p, 1e-5).substeps,
+                          free.substeps)
+    with pytest.raises(SimulationError, match="too stiff"):
+        limited(Rosenbrock(), needed // 2).prepare(system, grid, np.zeros(2), p, 1e-5)
+    assert limited(Idas(), 10) == Idas()  # chooses its own
 
 
 def test_substeps_follow_the_tolerance_and_keep_the_error():

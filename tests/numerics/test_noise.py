@@ -139,3 +139,16 @@ def test_autocorrelation_leaves_gaps_out(rng):
     assert rho[0] == 1
     assert rho[1] == pytest.approx(0.5, abs=0.05)
     assert np.abs(rho[2:]).max() < 0.06
+
+
+def test_times_that_wander_a_little_change_nothing(rng):
+    y = speed() + 0.3 * rng.standard_normal(N)
+    assert noise_level(y, T + 1e-8 * rng.standard_normal(N)) == pytest.approx(noise_level(y, T), rel=1e-3)
+    assert noise_level(y, T) == noise_level(y, None)
+
+
+@pytest.mark.parametrize("step", [0.3, 2.0])
+def test_a_step_is_found_in_a_signal_that_passes_many_at_once(step, rng):
+    y = np.round((20 * speed() + 2 * step * rng.standard_normal(N)) / step) * step
+    assert quantum(y) == pytest.approx(step, rel=1e-6)
+    assert quantum(y + 0.3 * step * rng.standard_normal(N)) == 0.0
