@@ -100,13 +100,13 @@ def restore_collapsed(found: Estimate, effort: LevenbergMarquardt, callback: Cal
     All are put back together first, then one by one.
     """
     log, sd = found.problem.scaling.log, _deviation(found.problem, found.solution.residual)
-    influence = np.linalg.norm(found.solution.jac, axis=0) / sd
-    if not (influence[log] < MATTERS).any():
+    influence = np.linalg.norm(found.solution.jac, axis=0)
+    if not (influence[log] < MATTERS * sd).any():
         return found
     values = found.values
     parameters = [replace(p, value=values[p.name]) for p in found.problem.model.parameters.values() if p.vary]
     named = dict(zip((p.name for p in found.problem.unknown), influence, strict=True))
-    back = {n: v for n, v in restored_values(parameters, named).items() if v != values[n]}
+    back = {n: v for n, v in restored_values(parameters, named, sd).items() if v != values[n]}
     each = [{n: v} for n, v in back.items()][:MOST] if len(back) > 1 else []
     for changes in (back, *each) if back else ():
         again = race([found.problem.start_at({**values, **changes})], effort).best
@@ -120,7 +120,8 @@ def _deviation(problem: Problem, residual: Array) -> float:
     return float(np.sqrt(np.mean(residual**2))) or 1.0 if problem.weights == "rms" else 1.0
 
 
-def restored_values(parameters: Iterable[Parameter], influence: Mapping[str, float]) -> dict[str, float]:
+def restored_values(parameters: Iterable[Parameter], influence: Mapping[str, float],
+                    deviation: float = 1.0) -> dict[str, float]:
     """Return the values at which collapsed parameters would matter.
 
     Parameters
@@ -128,11 +129,13 @@ def restored_values(parameters: Iterable[Parameter], influence: Mapping[str, flo
     parameters : iterable of Parameter
         Where the fit has them.
     influence : mapping of str to float
-        Change of the whitened residual with the logarithm of each parameter.
+        Change of the weighted residual with the logarithm of each parameter.
+    deviation : float
+        Standard deviation of that residual.
     """
     back = {}
     for p in parameters:
-        if p.positive and p.vary and 0 < influence.get(p.name, 0.0) < MATTERS:
+        if p.positive and p.vary and 0 < influence.get(p.name, 0.0) < MATTERS * deviation:
             where = 3 * MATTERS / influence[p.name] * p.value
             back[p.name] = float(np.clip(where, p.lower, min(p.upper, FURTHEST * p.value)))
     return back
@@ -141,10 +144,10 @@ def restored_values(parameters: Iterable[Parameter], influence: Mapping[str, flo
 def restored(fit: Fit, model: Model) -> Model:
     """Return a larger model than that of `fit`, with the parameters that collapsed in `fit` where they would matter."""
     names = [p.name for p in fit.problem.unknown]
-    sd = _deviation(fit.problem, fit.residuals)
-    slopes = dict(zip(names, np.linalg.norm(fit.jacobian, axis=0) / sd, strict=True))
+    slopes = dict(zip(names, np.linalg.norm(fit.jacobian, axis=0), strict=True))
     known = [p for p in model.parameters.values() if p.name in slopes]
-    back = restored_values(known, {p.name: p.value * slopes[p.name] for p in known})
+    sd = _deviation(fit.problem, fit.residuals)
+    back = restored_values(known, {p.name: p.value * slopes[p.name] for p in known}, sd)
     return model.start_at(back) if back else model
 
 
