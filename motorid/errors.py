@@ -27,6 +27,8 @@ def _leave(kind: type[BaseException], error: BaseException, trace: TracebackType
 _NAME = os.path.basename("".join(sys.argv[:1]))
 if ("-m", "motorid") in pairwise(sys.orig_argv) or _NAME in ("motorid", "motorid.exe"):
     sys.excepthook = _leave
+    if not re.fullmatch(r"\d{1,10}", os.environ.get("SOURCE_DATE_EPOCH", "0")):
+        del os.environ["SOURCE_DATE_EPOCH"]  # SciPy cannot be imported beside anything else
 
 
 class MotoridError(Exception):

@@ -82,7 +82,7 @@ def _show_fit(found: Fit, records: list[Experiment], notes: list[str], judged: E
          f"\n{found.problem.model.name}, {_amount(records)}\n")
     say_notes(notes, "About the records")
     show(*value_tables(found))
-    say_notes(remarks(found), "What these records do not determine")
+    say_notes(remarks(found), "What to know about these values")
     several = judged is not None and len(judged.simulations) > 1
     show(replace(error_table({"": found.evaluation, "held-out": judged}, found.noise), note=""),
          run_table(found.evaluation) if len(records) > 1 else None,

@@ -386,7 +386,8 @@ def parameter_cell(fit: Fit, name: str) -> Cell:
         return f"{quantity(fit.values[name], p.unit, 2)} (chosen from the data)"
     if p.vary and fit.std[name] is None:
         return Flag("not determined", "note")
-    return with_error(fit.values[name], fit.std[name] if p.vary else 0.0, p.unit)
+    shown = with_error(fit.values[name], fit.std[name] if p.vary else 0.0, p.unit)
+    return Flag(f"{shown}, no value given", "note") if name in fit.model.unset_names else shown
 
 
 def value_tables(fit: Fit) -> list[Table]:
@@ -405,6 +406,8 @@ def per_run_table(fit: Fit) -> Table | None:
 def determined_table(fit: Fit) -> Table | None:
     """Return gain, time constants, damping, torques as voltages, as far as the records determine them."""
     rows = [(d.text, with_error(d.value, d.std, d.unit)) for d in fit.determined.values()]
+    if (top := fit.determined.get("no_load_speed")) and top.unit == "rad/s":  # in what data sheets say: units show
+        rows += [("no-load speed, as data sheets say it", quantity(top.value * 30 / np.pi, "rpm", 3))]
     return Table(("what the records determine", "value ± std"), rows, left=(0, 1)) if rows else None
 
 

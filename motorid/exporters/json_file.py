@@ -8,12 +8,17 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from motorid.display.numbers import number, quantity
 from motorid.estimation.result import Fit
 from motorid.estimation.shooting.outcome import violations
 from motorid.problem.relations import Relation
 from motorid.problem.simulate import Evaluation
 from motorid.records.files import json_text, write_files
 
+QUICKEST = 8900 * 1.7e-8 / 2.0**2  # s, R·J/K² of copper alone (kg/m³, Ω·m) in iron that is saturated (T)
+MOST_FLUX = 10.0  # of a winding over its magnets': motors have 0.02 to 2, and are demagnetised by a few
 MOTOR = ("R", "L", "K", "b", "J")
 
 
@@ -87,11 +92,35 @@ def remarks(fit: Fit) -> list[str]:
         vague = [n for n in vague if n not in MOTOR and not _a_torque(model, n)]
     if vague:
         said.append(f"The records do not determine {_listed(vague)}: another value fits them as well. Fix "
-                    f"{'it' if len(vague) == 1 else 'one of them'} (--fix {vague[0]}), or look at "
+                    f"{'it' if len(vague) == 1 else 'one of them'} (--fix {vague[0]}=…), or look at "
                     "`motorid identifiability`.")
+    for n in model.unset_names:
+        p = model.parameters[n]
+        said.append(f"{n} is fixed at {quantity(p.value, p.unit)}, where a fit would begin: nobody gave it a value. "
+                    f"Give one (--fix {n}=…), or leave it free; the other parameters rest on it.")
+    said += _of_no_motor(fit)
     for n in at_limit:
         said.append(f"{n} ended at {fit.values[n]:.3g}, the limit of what is physical: these records show no "
                     "sign of it.")
+    return said
+
+
+def _of_no_motor(fit: Fit) -> list[str]:
+    """Say what no winding can be, whatever its size, turns or gear: a sign of a wrong unit.
+
+    Copper of density D and resistivity ρ in a field B has J ≥ D·V·r² and K²/R ≤ B²·V·r²/ρ, so R·J/K² is at least
+    D·ρ/B². The flux of the winding, L·v/R, over that of the magnets, K, is the angle turned without load in L/R.
+    """
+    model, std, p = fit.problem.model, fit.std, fit.values
+    if model.base != "dc_motor" or any(std[n] is None for n in ("R", "K")):
+        return []
+    said, most = [], max(float(np.abs(run.inputs["v"]).max()) for run in fit.problem.experiments)
+    if std["J"] is not None and p["R"] * p["J"] / p["K"] ** 2 < QUICKEST:
+        said.append(f"R·J/K² is {quantity(p['R'] * p['J'] / p['K'] ** 2, 's', 2)}: not even bare copper in a field of "
+                    "2 T starts so quickly. Look at the unit of the time.")
+    if std["L"] is not None and (flux := p["L"] * most / (p["R"] * p["K"])) > MOST_FLUX:
+        said.append(f"At {number(most, 3)} V the winding would have {number(flux, 2)} times the flux of the magnets "
+                    "(L·v/R over K): no magnet stands that. Look at the units of time and speed.")
     return said
 
 

@@ -13,8 +13,11 @@ from motorid.numerics.signals import Array, bridged, integral, noise_level, quan
 from motorid.records.experiment import Experiment
 
 Check = Callable[[Experiment], str | None]
+Reading = tuple[tuple[int, ...], tuple[int, int]]  # order of v, i, omega; signs of i and omega
 _BLOCKS = 40
-EXPLAINED = 1e-3  # product of the shares of the two balances that a reading may leave unexplained
+EXPLAINED = 0.1  # share of either balance that a reading with exchanged columns may leave unexplained
+CLEAR = 0.1  # of what the stated columns leave, so much at most
+ROUGH = 0.05  # of the speed: sampled so slowly that its balance cannot be integrated
 BALANCE_BLOCKS = 150
 # Ratio of the angle's rate to the speed, and what was then mistaken for SI.
 _RATIOS = {
@@ -204,7 +207,7 @@ def _slow_sampling(run: Experiment) -> str | None:
     clear = full > 10 * noise_level(i, run.t)
     if clear.any() and float(np.median(first[clear] / full[clear])) > 0.9:
         return (f"after a voltage step the current is there within one sample ({1e3 * run.dt:.3g} ms): the sampling is "
-                "too slow for the inductance, so L will be uncertain. Sample faster, or fix L: it hardly matters here.")
+                "too slow for the inductance, so L will be uncertain. Sample faster, or fix L as data sheets say.")
     return None
 
 
@@ -365,41 +368,51 @@ def swapped_columns(run: Experiment) -> str | None:
     return None
 
 
-def _as_balances_want(run: Experiment) -> tuple[tuple[int, ...], tuple[int, int]]:
+def _as_balances_want(run: Experiment) -> Reading:
     """Return the order of v, i, omega, and the signs of i and omega, with which they fit the balances of a motor.
 
-    Both balances, integrated over blocks, with coefficients that must be positive (non-negative least squares, Lawson &
-    Hanson 1974): ∫v = R∫i + LΔi + K∫ω ± V·t and Δω = k∫i − b∫ω − c∫sgn ω ± d·t. What is stated stands, unless another
-    reading leaves less than half unexplained. Where no current is measured, the voltage drives in its place. Columns
-    are called exchanged only where the exchange explains the balances: of a record with gaps or a dead sensor anything
-    explains a little more.
+    Both balances, integrated, with coefficients that must be positive (non-negative least squares, Lawson & Hanson
+    1974): ∫v = R∫i + LΔi + K∫ω ± V·t over blocks and, from the first sample on since noise hides small steps of the
+    speed, ω = ω₀ + k∫i − b∫ω − c∫sgn ω ± d·t. What is stated stands, unless another reading leaves less than half
+    unexplained. Where no current is measured, the voltage drives in its place. Columns are called exchanged only where
+    the exchange explains both balances, and the sampling resolves them: of a record with gaps or a dead sensor
+    anything explains a little more, of one sampled slowly nearly any reading explains all.
     """
     known = [c for c in ("i", "omega") if c in run.outputs and np.isfinite(run.outputs[c]).sum() > 1]
     n = min(BALANCE_BLOCKS, run.n // 3)
     edges = np.linspace(0, run.n - 1, n + 1).astype(int)
-    stated: tuple[tuple[int, ...], tuple[int, int]] = (0, 1, 2), (1, 1)
+    stated: Reading = (0, 1, 2), (1, 1)
     if "omega" not in known or n < 10:
         return stated
     y = [run.inputs["v"], *(bridged(run.t, run.outputs[c if c in known else "omega"]) for c in ("i", "omega"))]
-    held = [run.hold == "zoh", False, False]
-    sums = [np.diff(integral(run.t, a, h)[edges]) for a, h in zip(y, held, strict=True)]
-    signs_of = [np.diff(integral(run.t, np.tanh(50 * a / max(np.abs(a).max(), 1e-300)))[edges]) for a in y]
-    steps, T = [np.diff(a[edges]) for a in y], np.diff(run.t[edges])
+    sums = [integral(run.t, a, k == 0 and run.hold == "zoh")[edges] for k, a in enumerate(y)]
+    signs_of = [integral(run.t, np.tanh(50 * a / max(np.abs(a).max(), 1e-300)))[edges] for a in y]
+    at, T, one = [a[edges] for a in y], run.t[edges] - run.t[0], np.ones(n + 1)
 
-    def unexplained(order: tuple[int, ...], turned: tuple[int, int]) -> float:
+    def unexplained(order: tuple[int, ...], turned: tuple[int, int]) -> tuple[float, float]:
         (v, i, w), (a, b) = order, turned
+        blocks = (np.diff(y) for y in (sums[v], a * sums[i], a * at[i], b * sums[w], T, -T))
         drive = a * sums[i] if "i" in known else sums[v]
-        voltage = _share_left(sums[v], a * sums[i], a * steps[i], b * sums[w], T, -T) if "i" in known else 1.0
-        speed = _share_left(steps[w], b * drive, -sums[w], -signs_of[w], T, -T)
-        return (voltage + 1e-4) * (speed + 1e-4)
+        voltage = _share_left(*blocks) if "i" in known else 1.0
+        return voltage, _share_left(at[w] - at[w][0], b * drive, -sums[w], -signs_of[w], T, -T, one, -one)
 
     signs_too = product(permutations(range(3)), product((1, -1), (1, -1)))
     readings = signs_too if "i" in known else [stated, ((0, 1, 2), (1, -1))]
-    left = {(order, (a, b)): unexplained(order, (a, b)) for order, (a, b) in readings}
+    shares = {(order, (a, b)): unexplained(order, (a, b)) for order, (a, b) in readings}
+    left = {r: (voltage + 1e-4) * (speed + 1e-4) for r, (voltage, speed) in shares.items()}
     best = min(left, key=lambda r: left[r])
-    if best[0] != stated[0] and left[best] > EXPLAINED:
-        best = min((r for r in left if r[0] == stated[0]), key=lambda r: left[r])
+    if best[0] != stated[0]:
+        coarse = _roughness(y[best[0][2]]) > ROUGH
+        if not coarse and max(shares[best]) <= EXPLAINED and left[best] < CLEAR * left[stated]:
+            return best
+        turned = min((r for r in left if r[0] == stated[0]), key=lambda r: left[r])
+        best = stated if coarse and left[best] < CLEAR * left[turned] else turned
     return best if left[best] < 0.5 * left[stated] else stated
+
+
+def _roughness(y: Array) -> float:
+    """Return one less the correlation of neighbouring samples: of white noise 1, of a well sampled motion nearly 0."""
+    return float(np.mean(np.diff(y) ** 2) / max(2 * np.var(y), 1e-300))
 
 
 def _share_left(y: Array, *terms: Array) -> float:

@@ -41,7 +41,7 @@ def test_names_with_dollars_or_bytes_that_are_no_text_and_no_such_backend(tmp_pa
         done = motorid("fit", path, "--report", page, "--json", out)
         assert done.status == 0, done.err
         assert json.loads(out.read_text(encoding="utf-8"))["parameters"]
-    done = process("fit", RUN, "--report", tmp_path / "other.html", MPLBACKEND="nonsense")
+    done = process("fit", RUN, "--report", tmp_path / "other.html", MPLBACKEND="nonsense", SOURCE_DATE_EPOCH="today")
     assert done.returncode == 0, done.stderr
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from itertools import product
 
 import numpy as np
 import pandas as pd
@@ -11,6 +12,7 @@ from command import motorid
 
 import motorid as mi
 from motorid.diagnosis.design_criteria import Rival
+from motorid.exporters.json_file import fit_dict
 from motorid.records.experiment import Experiment
 
 TRUE = {"R": 1.4, "L": 2e-3, "K": 0.046, "b": 6e-5, "J": 2e-5}
@@ -275,3 +277,52 @@ def test_a_window_shorter_than_the_samples_and_a_rate_given_twice_are_refused():
 
     with pytest.raises(mi.ModelError, match="has a rate already"):
         (mi.dc_motor() + twice).write()
+
+
+def test_a_parameter_fixed_without_a_value_is_said(tmp_path):
+    path, out = mi.data_path("clean") / "run1.csv", tmp_path / "fit.json"
+    for words, said in ((("--fix", "R"), True), (("--fix", "R=1.4"), False), (("--set", "R=1.4", "--fix", "R"), False)):
+        done = motorid("fit", path, *words, "--json", out)
+        assert ("nobody gave it a value" in done.out) is said
+        assert any("nobody gave it a value" in r for r in json.loads(out.read_text())["remarks"]) is said
+    run = mi.read_csv(path)
+    assert "no value given" in str(mi.fit(mi.dc_motor().fix("R"), run).card())
+    assert "no value given" not in str(mi.fit(mi.fit(mi.dc_motor(), run).model.fix("R"), run).card())
+
+
+@pytest.mark.parametrize(("time", "speed", "said"), [
+    (1, 1, ()), (1000, 1, ("flux of the magnets",)), (1e-3, 1, ("bare copper",)),
+    (1, 180 / np.pi, ("flux of the magnets",))])
+def test_a_motor_that_cannot_be_is_remarked_upon(rng, time, speed, said):
+    """Units that are wrong but agree with one another leave no error: only what no winding can be shows them."""
+    for motor in ("lab", "big"):
+        run = record(rng, motor, "reversals")
+        run = run.with_(t=time * run.t, outputs={**run.outputs, "omega": speed * run.outputs["omega"]})
+        remarks = " ".join(fit_dict(mi.fit(mi.dc_motor(), run))["remarks"])
+        assert [w for w in ("flux of the magnets", "bare copper") if w in remarks] == list(said), motor
+
+
+@pytest.mark.parametrize("noise", [0.001, 0.02])
+def test_exchanged_columns_are_found_under_noise_and_no_sign_is_blamed(rng, noise):
+    """Blamed was the sign of the current, since noise hid the small steps of the speed from block to block."""
+    t = np.arange(0, 0.15, 1e-4)
+    for motor, v in product(MOTORS, (np.select([t < 0.01, t < 0.06, t < 0.1], [0, 6.0, 0], -4.0), 6 * np.sin(60 * t))):
+        plan = mi.planned(mi.dc_motor(**MOTORS[motor]), t, v)
+        i, omega = (y + rng.normal(0, noise * np.ptp(y), y.shape) for y in (plan.outputs["i"], plan.outputs["omega"]))
+        for new, what in (((v, omega, i), "current and speed"), ((omega, i, v), "voltage and speed"),
+                          ((i, v, omega), "voltage and current")):
+            said = " ".join(mi.check_runs([plan.with_(inputs={"v": new[0]}, outputs={"i": new[1], "omega": new[2]})]))
+            assert f"{what} fit the equations" in said, (motor, what)
+            assert "probably swapped" not in said
+
+
+def test_slow_sampling_is_not_called_exchanged(rng):
+    """All that a coarse record shows is its steady state: any reading of it explains a little more or less."""
+    t = np.linspace(0, 4.0, 60)
+    for motor, k in product(MOTORS, range(3)):
+        v = 6 * rng.choice([-1.0, -0.5, 0.5, 1.0], 12).repeat(5)
+        plan = mi.planned(mi.dc_motor(**MOTORS[motor]), t, v)
+        run = plan.with_(outputs={c: y + rng.normal(0, 1e-3 * np.ptp(y), y.shape) for c, y in plan.outputs.items()})
+        said = " ".join(mi.check_runs([run]))
+        assert "exchanged" not in said, (motor, k)
+        assert "swapped" not in said, (motor, k)
