@@ -150,9 +150,12 @@ class FitOptions(ReadingOptions):
             model = torque_driven(axis="linear" if linear else "rotary")
         for name in _words([self.effects] if self.effects else []):
             model = model + named_effect(name, own)
-        model = model.replace(**_numbers(self.set_ or [], "--set"))
-        model = _fixed(model, self.fix or [])
-        return model.free(*_words(self.free or []))
+        begin, fixed, free = _numbers(self.set_ or [], "--set"), _words(self.fix or []), _words(self.free or [])
+        values = _numbers([w for w in fixed if "=" in w], "--fix")
+        for option, others in (("--set", begin), ("--free", free)):
+            if both := [n for n in values if n in others]:
+                raise UsageError(f"{both[0]} is in --fix and in {option}: only one of them can be meant.")
+        return model.replace(**begin).fix(*(w for w in fixed if "=" not in w), **values).free(*free)
 
     def keywords(self) -> dict[str, Any]:
         """Return the keyword arguments of `motorid.fit`."""
@@ -301,6 +304,8 @@ def _numbers(texts: Sequence[str], option: str) -> dict[str, float]:
     found: dict[str, float] = {}
     for text in texts:
         for name, value in parse_pairs(text, option).items():
+            if name in found:
+                raise UsageError(f"{option}: '{name}' is given twice, as {found[name]:g} and as {value}.")
             try:
                 found[name] = float(value)
             except ValueError:
@@ -314,9 +319,3 @@ def _seconds(text: str, option: str) -> float:
         return float(text)
     except ValueError:
         raise UsageError(f"{option}: '{text}' is not a time; expected auto, none, or seconds, e.g. 0.5.") from None
-
-
-def _fixed(model: Model, texts: Sequence[str]) -> Model:
-    for word in _words(texts):
-        model = model.fix(**_numbers([word], "--fix")) if "=" in word else model.fix(word)
-    return model

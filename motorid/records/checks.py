@@ -75,6 +75,17 @@ def _the_same_twice(runs: Sequence[Experiment]) -> str | None:
     return None
 
 
+def _one_column_for_two(run: Experiment) -> str | None:
+    """Two channels of the very same numbers are one column, taken twice."""
+    seen: dict[bytes, str] = {}
+    for channel, y in {**run.inputs, **run.outputs}.items():
+        first = seen.setdefault(y.tobytes(), channel)
+        if first != channel and np.nanmin(y) < np.nanmax(y):
+            return (f"{NAMES[first]} and {NAMES[channel]} are the very same numbers: one column twice? Say "
+                    f"which columns hold them: columns={{'{first}': ..., '{channel}': ...}}.")
+    return None
+
+
 def _excitation(run: Experiment) -> str | None:
     v = run.inputs["v"]
     if np.ptp(v) <= 1e-6 * np.abs(v).max():
@@ -469,6 +480,6 @@ def _jumps(values: Array) -> bool:
 
 
 _CHECKS: tuple[Check, ...] = (
-    signs, unsigned, angle_against_speed, magnitudes, implied_constants, swapped_columns,
+    signs, unsigned, angle_against_speed, magnitudes, implied_constants, _one_column_for_two, swapped_columns,
     _excitation, _missing, _clipped, current_limit, _coarse, _spikes, _noisy, _uneven, _slow_sampling, _never_settles,
 )

@@ -147,7 +147,7 @@ def _rows_in_order(t: Array, column: str, said: list[str]) -> NDArray[np.intp]:
                     "rows. Save each run in a file of its own to use all.")
         rows, total = rows[longest], len(longest)
     moving = rows[np.r_[True, t[rows][1:] > np.maximum.accumulate(t[rows])[:-1]]]
-    if 2 * len(moving) < total:
+    if len(moving) < max(total / 2, MIN_SAMPLES):
         raise DataError(f"time stands still or goes back in {total - len(moving)} of {total} rows of "
                         f"'{column}'. Is it the right column? If its clock is too coarse, number the rows "
                         "and say the step, e.g. columns={'t': 'row'}, units={'t': '0.0002 s'}.")

@@ -72,7 +72,7 @@ def assign(labels: Sequence[str], *, columns: Mapping[str, object] | None = None
     units = units or {}
     places = _named_by_user(labels, columns or {}, units, row)
     notes: list[str] = []
-    _named_by_header(places, [c for c in labels if c not in {p.column for p in places.values()}], row)
+    _named_by_header(places, [c for c in labels if c not in {p.column for p in places.values()}], row, notes)
     _last_resorts(places, labels, notes)
     _apply_units(places, labels, units, notes)
     _settle_counts(places, notes)
@@ -116,7 +116,7 @@ def _find(labels: Sequence[str], column: object) -> str:
                     "counted from 1.")
 
 
-def _named_by_header(places: dict[str, Place], labels: Sequence[str], row: Units) -> None:
+def _named_by_header(places: dict[str, Place], labels: Sequence[str], row: Units, notes: list[str]) -> None:
     """Add the channels that the header names, where the user has not named them."""
     found: dict[str, list[Place]] = {}
     for label in labels:
@@ -135,6 +135,8 @@ def _named_by_header(places: dict[str, Place], labels: Sequence[str], row: Units
             raise DataError(f"{names} look like {_MEANING[channel]} ({channel}) all the same; say which one "
                             f"is meant, e.g. columns={{'{channel}': '{best[0].column}'}}.")
         places[channel] = best[0]
+        notes += [f"'{p.column}' looks like {_MEANING[channel]}, too; '{best[0].column}' is used."
+                  for p in hits if p is not best[0] and p.score == best[0].score]
 
 
 def first_of_its_name(label: str, labels: Sequence[str]) -> str:

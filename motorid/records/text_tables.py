@@ -23,7 +23,9 @@ _LARGEST = 1e30  # what is larger, or infinite, was not measured
 MISSING = frozenset(["", "nan", "na", "n/a", "null", "none", "-", "--", "---", "?", "missing", "#n/a"])
 _NUMBER = re.compile(r"[-+]?(?:(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?|inf)", re.IGNORECASE)
 _GROUPS = {".": ",", ",": "."}  # decimal mark to what may stand between thousands
-_GROUPED = {mark: rf"[-+]?\d{{1,3}}(?:\{group}\d{{3}})+(?:\{mark}\d*)?" for mark, group in _GROUPS.items()}
+_SPACES = "'’\u00a0\u2009\u202f"  # may stand there, too
+_GROUPED = {mark: rf"[-+]?[1-9]\d{{0,2}}(?:[{group}{_SPACES}]\d{{3}})+(?:\{mark}\d*)?"
+            for mark, group in _GROUPS.items()}
 _CONTROL = re.compile(r"[\x00-\x08\x0e-\x1f\x7f]")
 # Delimiter (None: white space) and decimal mark, in the order in which a tie is decided.
 _DIALECTS = (("\t", "."), (";", "."), (",", "."), ("\t", ","), (";", ","), (",", ","), (None, "."), (None, ","))
@@ -256,10 +258,11 @@ def _parse(rows: list[str], dialect: Dialect, labels: list[str],
             cells = cells.astype(str).str.strip(" \"'")
             cells_before = cells
             grouped = cells.str.fullmatch(_GROUPED[dialect.decimal])
-            cells = cells.where(~grouped, cells.str.replace(_GROUPS[dialect.decimal], "", regex=False))
+            group = f"[{_GROUPS[dialect.decimal]}{_SPACES}]"
+            cells = cells.where(~grouped, cells.str.replace(group, "", regex=True))
             if grouped.any():
-                notes.append(f"'{label}' has '{_GROUPS[dialect.decimal]}' between thousands, as in "
-                             f"'{next(iter(cells_before[grouped]))}'.")
+                first = next(iter(cells_before[grouped]))
+                notes.append(f"'{label}' has '{re.findall(group, first)[0]}' between thousands, as in '{first}'.")
         array, bad = numbers(cells, dialect.decimal)
         if frame[column].dtype.kind not in "fiub" and bad > 0.5 * np.count_nonzero(frame[column].notna()):
             texts[label] = frame[column].astype(str).tolist()
@@ -283,7 +286,7 @@ def numbers(values: object, decimal: str = ".") -> tuple[NDArray[np.float64], in
         text = text.str.replace(",", ".", regex=False) if decimal == "," else text
         array = np.array(pd.to_numeric(text, errors="coerce"), dtype=float)
         missing |= text.str.lower().isin(MISSING).to_numpy()
-    array[np.abs(array) > _LARGEST] = np.nan
+    array[np.abs(array) >= _LARGEST] = np.nan
     return array, int(np.count_nonzero(np.isnan(array) & ~missing))
 
 

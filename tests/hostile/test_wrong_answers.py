@@ -326,3 +326,67 @@ def test_slow_sampling_is_not_called_exchanged(rng):
         said = " ".join(mi.check_runs([run]))
         assert "exchanged" not in said, (motor, k)
         assert "swapped" not in said, (motor, k)
+
+
+@pytest.mark.parametrize("words", [("--fix", "R=1,R=2"), ("--set", "R=1", "--set", "R=9"),
+                                   ("--fix", "R=1", "--set", "R=9"), ("--fix", "R=1", "--free", "R")], ids=" ".join)
+def test_one_parameter_given_twice_is_refused(words):
+    done = motorid("fit", mi.data_path("clean") / "run1.csv", *words)
+    assert done.status == 2, done.out
+    assert "R" in done.err
+
+
+def written(path, **columns: object) -> mi.Experiment:
+    rows = zip(*columns.values(), strict=True)
+    text = "\n".join([";".join(columns), *(";".join(map(str, row)) for row in rows)])
+    path.write_text(text, encoding="utf-8")
+    return mi.read_csv(path)
+
+
+@pytest.fixture
+def columns() -> dict[str, list[float]]:
+    names = "time_s", "voltage_V", "current_A", "speed_rad_s"
+    return dict(zip(names, map(list, zip(*ROWS, strict=True)), strict=True))
+
+
+@pytest.mark.parametrize("group", ["'", "’", "\u00a0", "\u2009", "\u202f"])
+def test_other_marks_between_thousands_lose_no_row(tmp_path, columns, group):
+    t = [f"{980 + 10 * k:,}".replace(",", group) for k in range(30)]
+    columns.pop("time_s")
+    run = written(tmp_path / "run.csv", time_ms=t, **columns)
+    np.testing.assert_allclose(np.diff(run.t), 0.01)
+    assert run.n == 30
+
+
+def test_decimal_marks_that_change_within_a_column_are_no_thousands(tmp_path, columns):
+    i = [f"{0.1 + 0.001 * k:.3f}" for k in range(30)]
+    columns["current_A"] = [x.replace(".", ",") if k % 3 == 1 else x for k, x in enumerate(i)]
+    run = written(tmp_path / "run.csv", **columns)
+    assert np.nanmax(run.outputs["i"]) < 1
+    assert any("hold no finite number" in n for n in run.meta["notes"])
+
+
+def test_another_column_of_the_same_meaning_is_said(tmp_path, columns):
+    columns["current_mA"] = [1000 * i + 3 for i in columns["current_A"]]
+    run = written(tmp_path / "run.csv", **columns)
+    assert run.meta["columns"]["i"] == "current_A"
+    assert any("'current_mA' looks like the current, too" in n for n in run.meta["notes"])
+
+
+def test_one_column_logged_for_two_channels_is_said(rng):
+    run = record(rng, "lab", "reversals")
+    for channel in ("i", "omega"):
+        copied = run.with_(outputs={**run.outputs, channel: run.inputs["v"]})
+        assert any("very same numbers" in text for text in mi.check_runs([copied]))
+    assert not any("very same numbers" in text for text in mi.check_runs([run]))
+
+
+def test_what_a_logger_writes_for_nothing_is_missing(tmp_path, columns):
+    columns["current_A"] = [1e30 if 5 < k < 9 else i for k, i in enumerate(columns["current_A"])]
+    assert np.nanmax(written(tmp_path / "run.csv", **columns).outputs["i"]) < 1e3
+
+
+def test_rows_out_of_order_are_called_so(rng, tmp_path, columns):
+    order = rng.permutation(30)
+    with pytest.raises(mi.DataError, match="goes back"):
+        written(tmp_path / "run.csv", **{c: [x[k] for k in order] for c, x in columns.items()})
