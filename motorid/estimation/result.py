@@ -386,8 +386,7 @@ def parameter_cell(fit: Fit, name: str) -> Cell:
         return f"{quantity(fit.values[name], p.unit, 2)} (chosen from the data)"
     if p.vary and fit.std[name] is None:
         return Flag("not determined", "note")
-    shown = with_error(fit.values[name], fit.std[name] if p.vary else 0.0, p.unit)
-    return Flag(f"{shown}, no value given", "note") if name in fit.model.unset_names else shown
+    return with_error(fit.values[name], fit.std[name] if p.vary else 0.0, p.unit)
 
 
 def value_tables(fit: Fit) -> list[Table]:

@@ -94,10 +94,6 @@ def remarks(fit: Fit) -> list[str]:
         said.append(f"The records do not determine {_listed(vague)}: another value fits them as well. Fix "
                     f"{'it' if len(vague) == 1 else 'one of them'} (--fix {vague[0]}=…), or look at "
                     "`motorid identifiability`.")
-    for n in model.unset_names:
-        p = model.parameters[n]
-        said.append(f"{n} is fixed at {quantity(p.value, p.unit)}, where a fit would begin: nobody gave it a value. "
-                    f"Give one (--fix {n}=…), or leave it free; the other parameters rest on it.")
     said += _of_no_motor(fit)
     for n in at_limit:
         said.append(f"{n} ended at {fit.values[n]:.3g}, the limit of what is physical: these records show no "

@@ -145,13 +145,6 @@ class Model(Shown):
                      and not (p.vary or p.given))
 
     @property
-    def unset_names(self) -> tuple[str, ...]:
-        """Names of the parameters that are fixed where a fit would begin: nobody gave them a value."""
-        begins = (*BASES[self.base], *(p for e in self.effects for p in e.parameters))
-        return tuple(p.name for p in begins if p.vary and not (q := self.parameters[p.name]).vary and not q.given
-                     and q.value == p.value)
-
-    @property
     def shared_names(self) -> tuple[str, ...]:
         """Names of the parameters that are the same in every run, as they are or since the user gave them."""
         return tuple(n for n, p in self.parameters.items() if not p.per_run or p.given)

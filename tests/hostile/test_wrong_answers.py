@@ -279,17 +279,6 @@ def test_a_window_shorter_than_the_samples_and_a_rate_given_twice_are_refused():
         (mi.dc_motor() + twice).write()
 
 
-def test_a_parameter_fixed_without_a_value_is_said(tmp_path):
-    path, out = mi.data_path("clean") / "run1.csv", tmp_path / "fit.json"
-    for words, said in ((("--fix", "R"), True), (("--fix", "R=1.4"), False), (("--set", "R=1.4", "--fix", "R"), False)):
-        done = motorid("fit", path, *words, "--json", out)
-        assert ("nobody gave it a value" in done.out) is said
-        assert any("nobody gave it a value" in r for r in json.loads(out.read_text())["remarks"]) is said
-    run = mi.read_csv(path)
-    assert "no value given" in str(mi.fit(mi.dc_motor().fix("R"), run).card())
-    assert "no value given" not in str(mi.fit(mi.fit(mi.dc_motor(), run).model.fix("R"), run).card())
-
-
 @pytest.mark.parametrize(("time", "speed", "said"), [
     (1, 1, ()), (1000, 1, ("flux of the magnets",)), (1e-3, 1, ("bare copper",)),
     (1, 180 / np.pi, ("flux of the magnets",))])
