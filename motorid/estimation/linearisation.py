@@ -16,6 +16,7 @@ import numpy as np
 from scipy.linalg import get_lapack_funcs
 
 from motorid.estimation.result import Fit
+from motorid.integrate.engine import Grid
 from motorid.integrate.rodas3 import rosenbrock_step
 from motorid.model.equations import System
 from motorid.numerics.autoregression import effective_samples
@@ -99,13 +100,28 @@ def _mapped(system: System, n: int) -> tuple[ca.Function, ca.Function]:
     return step.map(n), out.map(n)
 
 
-def linear_steps(system: System, grid, x: Array, p: Array, d: Array) -> tuple[Array, Array, Array]:
-    """Return one step from every sample, (x⁺, A, B), vectorised; `d` (N-1, 2), `x` (N, nx)."""
-    n, nx = len(grid.dt), len(system.states)
-    x_next, a, b = _mapped(system, n)[0](x[:-1].T, grid.u0.T, grid.u1.T, grid.dt[None, :],
-                                         np.tile(p[:, None], (1, n)), d.T)
-    return (np.asarray(x_next).T, np.asarray(a).reshape(nx, n, nx).transpose(1, 0, 2),
-            np.asarray(b).reshape(nx, n, 2).transpose(1, 0, 2))
+def linear_steps(system: System, grid: Grid, x: Array, p: Array, d: Array) -> tuple[Array, Array, Array]:
+    """Return what one sample makes of the next, (x⁺, A, B), in the grid's sub-steps; `d` (N-1, 2), `x` (N, nx)."""
+    n, nx, m = len(grid.dt), len(system.states), grid.substeps
+    end, a, b = x[:-1].copy(), np.tile(np.eye(nx), (n, 1, 1)), np.zeros((n, nx, 2))
+    for j in range(int(m.max())):
+        rows = np.flatnonzero(m > j)
+        slope = (grid.u1[rows] - grid.u0[rows]) / m[rows, None]
+        u, h = grid.u0[rows] + j * slope, grid.dt[rows] / m[rows]
+        end[rows], aj, bj = _steps(system, end[rows], u, u + slope, h, p, d[rows])
+        a[rows], b[rows] = aj @ a[rows], aj @ b[rows] + bj
+    return end, a, b
+
+
+def _steps(system: System, x: Array, u0: Array, u1: Array, h: Array, p: Array, d: Array) -> tuple[Array, Array, Array]:
+    """Return one step from every row, (x⁺, A, B)."""
+    n, nx = x.shape
+    size = 1 << (n - 1).bit_length()  # few sizes, so few functions
+    rows = np.minimum(np.arange(size), n - 1)
+    ps = np.tile(p[:, None], (1, size))
+    x_next, a, b = _mapped(system, size)[0](x[rows].T, u0[rows].T, u1[rows].T, h[None, rows], ps, d[rows].T)
+    return (np.asarray(x_next).T[:n], np.asarray(a).reshape(nx, size, nx).transpose(1, 0, 2)[:n],
+            np.asarray(b).reshape(nx, size, 2).transpose(1, 0, 2)[:n])
 
 
 @lru_cache(maxsize=64)
