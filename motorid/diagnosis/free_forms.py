@@ -1,6 +1,8 @@
 """Which free forms there are, and what functions they are made of.
 
-Cosines over the range of a time or an angle, waves of a turn, powers with jumps and kinks at zero for what has a sign.
+Cosines over the range of a time or an angle, waves of a turn, powers with jumps and kinks at zero for what has a sign;
+for what remembers, first-order lags of many lengths: a sum of them comes near any fading memory (Laguerre and
+Kautz models: Wahlberg, IEEE Trans. Automatic Control 36(5), 1991).
 """
 
 from __future__ import annotations
@@ -32,7 +34,11 @@ SOFT = 0.01  # of the largest current or voltage: the width of a jump at zero
 BENDS = (4, 12)  # times the largest speed, current or voltage goes a curve's bend into it
 CHANGES = {"t": "changes with the time", "turn": "changes with the angle within a turn",
            "theta": "changes with the angle", "omega": "changes with the speed", "i": "changes with the current",
-           "v": "changes with the voltage", "run": "differs from run to run"}
+           "v": "changes with the voltage", "run": "differs from run to run",
+           "past i": "depends on the current before", "past omega": "depends on the speed before",
+           "past v": "depends on the voltage before", "path": "depends on the way since a reversal"}
+PAST = ("past i", "past omega", "past v", "path")
+MEMORIES = 8  # lengths of memory
 
 
 @dataclass(frozen=True)
@@ -59,6 +65,11 @@ class Form:
         """Tell whether what is learnt of it on some runs says nothing of others."""
         return self.on in ("theta", "run")
 
+    @property
+    def remembers(self) -> bool:
+        """Tell whether it is a function of what was before."""
+        return self.on in PAST
+
 
 _PUSHES = (  # words, balance, carrier, quantities
     ("a friction", "torque", "direction", ("turn", "theta", "t", "run")),
@@ -75,22 +86,28 @@ FORMS = (*(Form(words, balance, on, carrier) for words, balance, carrier, quanti
          Form("a gain of the speed sensor", "sensor", "turn", "omega", "omega"),
          Form("an error of the angle sensor", "sensor", "turn", "", "theta"),
          Form("an error of the speed sensor", "sensor", "omega", "", "omega"),
-         Form("an error of the current sensor", "sensor", "i", "", "i"))
+         Form("an error of the current sensor", "sensor", "i", "", "i"),
+         *(Form("a loss of voltage", "voltage", f"past {c}") for c in ("v", "i", "omega")),
+         *(Form("a torque", "torque", on) for on in ("past i", "past omega", "path")),
+         *(Form("an error of the current sensor", "sensor", f"past {c}", "", "i") for c in ("i", "v")),
+         *(Form("an error of the speed sensor", "sensor", f"past {c}", "", "omega") for c in ("omega", "i")))
 
 
 @dataclass(frozen=True)
 class Span:
-    """What a form reaches over: the range of every quantity, and the orders of a turn."""
+    """What a form reaches over: the range of every quantity, the orders of a turn, the time between samples (s)."""
 
     ranges: Mapping[str, tuple[float, float]]
     orders: tuple[float, ...]
+    step: float
 
 
 def span_of(fit: Fit, signals: Sequence[Mapping[str, Array]]) -> Span:
     """Return the smallest and the largest value of every quantity known in all runs, and orders of a turn."""
     names = set.intersection(*(set(s) for s in signals))
+    step = float(np.median(np.concatenate([np.diff(s["t"]) for s in signals])))
     ranges = {n: (min(float(s[n].min()) for s in signals), max(float(s[n].max()) for s in signals)) for n in names}
-    return Span(ranges, tuple(orders_of(fit)))
+    return Span(ranges, tuple(orders_of(fit)), step)
 
 
 def shown(form: Form, fit: Fit, ranges: Mapping[str, tuple[float, float]]) -> bool:
@@ -104,6 +121,8 @@ def shown(form: Form, fit: Fit, ranges: Mapping[str, tuple[float, float]]) -> bo
         return False
     if form.balance in ("voltage", "both") and "i" not in outputs:
         return False  # there a torque says the same
+    if form.remembers and fit.window is not None:
+        return False  # what was before a window is not known
     return form.on != "turn" or fit.problem.model.axis != "linear"
 
 
@@ -119,6 +138,8 @@ def functions_of(form: Form, span: Span) -> list[str]:
     low, high = span.ranges[form.on]
     if form.on == "turn":
         return ["1.0", *(f"ca.{f}({k:.6g} * z)" for k in span.orders for f in ("sin", "cos"))]
+    if form.remembers:
+        return [f"past(z, {length:.6g})" for length in memories_of(form, span)]
     inside = f"ca.fmin(ca.fmax(z, {low:.9g}), {high:.9g})"  # nothing is known beyond
     if form.on in ("theta", "t"):
         scale = f"{np.pi / (high - low):.9g} * ({inside} - {low:.9g})"
@@ -138,6 +159,28 @@ def functions_of(form: Form, span: Span) -> list[str]:
     return [side, *smooth, f"{s} * {size}", "1.0", size, f"{size}**3", *(f"ca.tanh({k} * {size})" for k in BENDS)]
 
 
+def memories_of(form: Form, span: Span) -> Array:
+    """Return lengths of memory, from two samples to all of the longest run: s, or rad for the way since a reversal."""
+    longest = span.ranges["t"][1]
+    speed = max(map(abs, span.ranges["omega"])) if form.on == "path" else 1.0
+    shortest = 2 * span.step
+    if form.on == "path":  # a reversal is slow
+        shortest, longest = 0.1 * span.step, min(longest, 100 * span.step)
+    return speed * np.geomspace(shortest, max(longest, 2 * shortest), MEMORIES)
+
+
+def past(z: Array, along: Array, length: float, initial: float) -> Array:
+    """Return `z` (N,) behind a first-order lag over `along` (N,), which grows: a time or a way."""
+    from scipy.signal import lfilter  # slow to import, and not needed before
+
+    even = np.linspace(along[0], along[-1], len(along))
+    kept = np.exp(-(even[1] - even[0]) / length) if even[-1] > even[0] else 1.0
+    driven = np.interp(even, along, z)
+    driven[1:] = 0.5 * (driven[1:] + driven[:-1])
+    lagged, _ = lfilter([1 - kept], [1.0, -kept], driven[1:], zi=[kept * initial])
+    return np.interp(along, even, np.concatenate([[initial], lagged]))
+
+
 class _Sheet:
     """What the source of functions may ask of a model, for arrays."""
 
@@ -148,9 +191,12 @@ class _Sheet:
         return np.tanh(z / self.width)
 
 
-def values_of(functions: Sequence[str], z: Array, width: float) -> Array:
-    """Return functions given by their source at `z` (N,), (N, m); `width` is that of the smooth sgn."""
-    names = {"ca": np, "z": z, "m": _Sheet(width)}
+def values_of(functions: Sequence[str], form: Form, signal: Mapping[str, Array]) -> Array:
+    """Return functions of a form, given by their source, along one run, (N, m)."""
+    z, along = signal[form.on], signal["way" if form.on == "path" else "t"]
+    first = float(z[0]) if form.on in ("past i", "past omega") else 0.0
+    names = {"ca": np, "z": z, "m": _Sheet(float(signal["width"][0])),
+             "past": lambda z, length: past(z, along, length, first)}
     return np.column_stack([np.broadcast_to(np.asarray(eval(f, names), float), z.shape) for f in functions])
 
 
@@ -170,12 +216,11 @@ def basis_of(form: Form, signal: Mapping[str, Array], span: Span) -> Array:
     if form.on == "run":
         functions = (z[:, None] == np.arange(int(span.ranges["run"][1]) + 1)).astype(float)
     else:
-        width = float(signal["width"][0])
         source = functions_of(form, span)
-        functions = values_of(source, z, width)
+        functions = values_of(source, form, signal)
         if form.carrier == "acceleration" and form.on == "turn":  # kinetic energy that changes with the angle
             return functions * signal["acceleration"][:, None] + (
-                signal["energy"][:, None] * values_of(slopes_over_turn(source), z, width))
+                signal["energy"][:, None] * values_of(slopes_over_turn(source), form, signal))
     return functions * signal[form.carrier][:, None] if form.carrier else functions
 
 
@@ -265,9 +310,16 @@ def signals_of(fit: Fit, problem: Problem, sim: Simulation, k: int) -> dict[str,
         found["width"], found["direction"] = np.full(run.n, width), np.tanh(found["omega"] / width)
         found["acceleration"] = fit.values["J"] * np.gradient(found["omega"], run.t)  # of a relative inertia
         found["energy"] = 0.5 * fit.values["J"] * found["omega"] ** 2
+        found["path"], found["way"] = found["direction"], _way(found["omega"], run.t)
+    found |= {f"past {c}": found[c] for c in ("v", "i", "omega") if c in found}
     if "theta" in run.outputs or "omega" in run.outputs:
         found["theta"] = found["turn"] = angle_signal(run)
     return found
+
+
+def _way(omega: Array, t: Array) -> Array:
+    """Return the way gone, (N,), both directions counted."""
+    return np.concatenate([[0.0], np.cumsum(0.5 * np.abs(omega[1:] + omega[:-1]) * np.diff(t))])
 
 
 def _answers(problem: Problem, k: int, answer: Response, bases: Mapping[Form, Array]) -> dict[Form, Array]:
@@ -292,7 +344,8 @@ def _driven(answer: Response, bases: Mapping[Form, Array]) -> Array:
     n, ny, _ = answer.c.shape
     if not bases:
         return np.zeros((n * ny, 0))
-    forces = [np.stack([_share(f, b, answer, on)[:-1] for on in BALANCES], axis=2) for f, b in bases.items()]
+    forces = [np.stack([_over_samples(f, _share(f, b, answer, on)) for on in BALANCES], axis=2)
+              for f, b in bases.items()]
     with np.errstate(over="ignore", invalid="ignore"):
         out = answer.driven(np.einsum("nxf,nmf->mnx", answer.b, np.concatenate(forces, axis=1), optimize=True))
     if not np.all(np.abs(out) < UNBOUNDED):  # or not a number
@@ -305,6 +358,11 @@ def _share(form: Form, basis: Array, answer: Response, balance: str) -> Array:
     if form.balance == "both":
         return basis * (answer.states["i"] if balance == "torque" else -answer.states["omega"])[:, None]
     return basis if form.balance == balance else np.zeros_like(basis)
+
+
+def _over_samples(form: Form, push: Array) -> Array:
+    """Return what a form puts in a balance over each sample, (N-1, m); only the voltage jumps."""
+    return push[:-1] if "v" in (form.on, form.carrier) else 0.5 * (push[:-1] + push[1:])
 
 
 def _read(problem: Problem, form: Form, basis: Array, weights: Array) -> Array:

@@ -8,7 +8,7 @@ parametric law that is outdone by a nonparametric one is not the thing itself (H
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,21 +28,22 @@ from motorid.diagnosis.predictive_score import (
 from motorid.diagnosis.thresholds import MOST, SUPPLANTS, TRIFLE
 from motorid.display.numbers import percent
 from motorid.estimation.least_squares import FAILURES
+from motorid.estimation.linearisation import INSEPARABLE
 from motorid.estimation.result import Fit
 from motorid.model.definition import Effect
 from motorid.records.checks import current_limit
 
-INSEPARABLE = 0.02  # of what a function does to the outputs: what all else in the model must not be able to do
-AHEAD = 3  # functions of a curve that may help only together
+AHEAD = 3  # functions of a curve that may help only together, beyond the best set so far
 LIMITER = "driver_current_limit"
 
 
 @dataclass(frozen=True)
 class FormGain:
-    """A free form, and what it predicts better than the model it is compared with."""
+    """A free form, what a model with it predicts, and what of that is better than the model it is compared with."""
 
     form: Form
     evidence: Evidence
+    predictions: Predictions
 
 
 def best_form(fit: Fit, rival: Predictions) -> FormGain | None:
@@ -61,7 +62,7 @@ def better_forms(fit: Fit, rival: Predictions) -> list[FormGain]:
         predicted = form_predictions(fit, linear, form)
         if predicted is not None:
             found = compare(Predictions(rival.blocks, {}), predicted)
-            gains += [FormGain(form, found)] if found.worth_it else []
+            gains += [FormGain(form, found, predicted)] if found.worth_it else []
     return sorted(gains, key=lambda g: -g.evidence.gain)
 
 
@@ -88,30 +89,45 @@ def chosen_functions(fit: Fit, linear: Linear, form: Form) -> list[int]:
     """Return the fewest functions of a form that beside `fit` predict blocks left out, the most useful first.
 
     Orthogonal matching pursuit (Pati, Rezaiifar & Krishnaprasad 1993): each time the function that takes most of what
-    is left, until the next is not worth it. What the model's own parameters do already is none.
+    is left. Of the sets passed the smallest that predicts within one standard error of the best is taken (Breiman et
+    al., Classification and Regression Trees, 1984, 3.4), if it is worth it. What the model's own parameters do already
+    is no function of its own.
     """
+    before = form_predictions(fit, linear, form, ())
+    if before is None:
+        return []
+    best = tuple[int, ...](), before
+    sets = [best]
+    for chosen in _pursued(fit, linear, form):
+        if (after := form_predictions(fit, linear, form, chosen)) is not None:
+            sets.append((chosen, after))
+            best = (chosen, after) if compare(best[1], after).gain > 0 else best
+        if len(chosen) - len(best[0]) >= AHEAD:
+            break
+    chosen, after = next(s for s in sets if (e := compare(s[1], best[1])).gain <= e.se)
+    return list(chosen) if compare(before, after).worth_it else []
+
+
+def _pursued(fit: Fit, linear: Linear, form: Form) -> Iterator[tuple[int, ...]]:
+    """Yield sets of functions, each with one more: that which takes most of what is left."""
     columns, _ = form_columns(fit, linear, form)
     known, answers = np.split(columns, [linear.slopes.shape[1]], axis=1)
     known = np.linalg.svd(known[:, np.linalg.norm(known, axis=0) > 0], full_matrices=False)[0]
     left, sizes = answers - known @ (known.T @ answers), np.linalg.norm(answers, axis=0)
     residual = linear.residual - known @ (known.T @ linear.residual)
-    chosen: list[int] = []
-    ahead: list[int] = []
-    before = form_predictions(fit, linear, form, ())
-    while before is not None and len(ahead) < AHEAD:
+    chosen: tuple[int, ...] = ()
+    while True:
         norms = np.linalg.norm(left, axis=0)
         free = norms > INSEPARABLE * sizes
         taken = np.where(free, np.abs(residual @ left) / np.where(free, norms, 1.0), 0.0)
         best = int(np.argmax(taken))
         if not taken[best] > 0:
-            break
-        ahead, unit = [*ahead, best], left[:, best] / norms[best]
+            return
+        unit = left[:, best] / norms[best]
         left, residual = left - np.outer(unit, unit @ left), residual - unit * (unit @ residual)
         left[:, best] = 0.0
-        after = form_predictions(fit, linear, form, [*chosen, *ahead])
-        if after is not None and compare(before, after).worth_it:
-            chosen, before, ahead = [*chosen, *ahead], after, []
-    return chosen
+        chosen = (*chosen, best)
+        yield chosen
 
 
 @dataclass(frozen=True)
@@ -130,8 +146,9 @@ def grades_of(last: Node, root: Node, groups: Sequence[Sequence[str]], beside: S
 
     A rung that predicts better stays, whatever it is. Its effect is *named* if its law is physical there and its size
     more than its deviation, no rival predicts as well, no free form that contains it, or in its place, predicts better
-    by more than the trifle that a free curve follows in any real motor, and it explains more than it leaves, unless
-    that is noise.
+    by more than the trifle that a free curve follows in any real motor and by more than a trifle of what the effect
+    itself does, and it explains more than it leaves, unless that is noise. A form beside the effect that predicts
+    surely less than the best one only imitates that.
 
     Parameters
     ----------
@@ -154,11 +171,12 @@ def grades_of(last: Node, root: Node, groups: Sequence[Sequence[str]], beside: S
         why = why or _insignificant(last.fit, e)
         smaller = without(e.name) if not why and (structure or far(last.fit)) else None
         if smaller is not None:
-            free = [b for b in beside if _swallows(last.fit, b.form, e)]
+            free = [b for b in beside if not compare(b.predictions, beside[0].predictions).sure]
+            free = [b for b in free if _swallows(last.fit, b.form, e)]
             free = free or (better_forms(smaller.fit, last.predictions) if structure else [])
-            told = [b for b in free if b.evidence.fall > SUPPLANTS]
-            better = next((b for b in told if beside and b.form == beside[0].form), told[0] if told else None)
             taken = 1 - (1 - max(evidence(smaller, last).fall, 0.0)) ** 2
+            told = [b for b in free if b.evidence.fall > SUPPLANTS and _more(b.evidence.fall, taken) > TRIFLE]
+            better = next((b for b in told if beside and b.form == beside[0].form), told[0] if told else None)
             if better is not None:
                 form, why = better.form, f"{better.form.text}, which the library lacks, predicts better in its place"
             elif taken < MOST:
@@ -166,6 +184,11 @@ def grades_of(last: Node, root: Node, groups: Sequence[Sequence[str]], beside: S
         kind = "approximates" if why else "group" if rivals.get(e.name) else "named"
         found.append(Grade(e.name, kind, why, form))
     return tuple(found)
+
+
+def _more(fall: float, taken: float) -> float:
+    """Return what a form that lets the error fall once more explains, over what the effect does, RMS of the outputs."""
+    return float(np.sqrt((1 - taken) * (1 - (1 - fall) ** 2) / max(taken, 1e-12)))
 
 
 def _insignificant(fit: Fit, effect: Effect) -> str:

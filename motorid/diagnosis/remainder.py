@@ -1,8 +1,8 @@
 """What is left beside all effects of a model: noise, fluctuation, or structure that an effect of its own takes up.
 
-Structure comes as a curve over one quantity, in one balance: an effect like any other, to add, fit, look at and export,
-and as source to edit and to name. Slopes propose the curves, the best are fitted with the rest of the model, and what
-then predicts best is the answer.
+Structure comes as a curve over one quantity, or as lags of one, in one balance: an effect like any other, to add, fit,
+look at and export, and as source to edit and to name. Slopes propose the curves, the best are fitted with the rest of
+the model, and what then predicts best is the answer.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from motorid.diagnosis.free_forms import (
     form_coefficients,
     functions_of,
     linearised,
+    memories_of,
     signals_along,
     slopes_over_turn,
     span_of,
@@ -44,7 +45,11 @@ from motorid.numerics.signals import Array
 WHERE = {"torque": "mechanical", "voltage": "electrical", "both": "electrical", "sensor": "sensor"}
 TRIED = 4  # curves that are fitted, those that promise most
 ROUNDS = 3  # of choosing functions and fitting: near the optimum slopes show what the misfit hid before
-QUANTITIES = {"turn": "m.theta", "theta": "m.theta", "omega": "m.omega", "i": "m.i", "v": "m.v"}
+QUANTITIES = {"turn": "m.theta", "theta": "m.theta", "omega": "m.omega", "i": "m.i", "v": "m.v", "past v": "m.v",
+              "past i": "m.i", "past omega": "m.omega", "path": "m.sign(m.omega)"}
+SI = {"theta": "rad", "omega": "rad/s", "i": "A", "v": "V"}
+OVER = {"": "", "A": "/A", "V": "/V", "rad/s": "·s/rad"}
+FIRST = {"past i": ", m.start['i']", "past omega": ", m.start['omega']"}  # of a memory: as if it had been so before
 CARRIERS = {"": "", "direction": "m.sign(m.omega) * ", "omega": "m.omega * ", "i": "m.i * ", "v": "m.v * "}
 
 
@@ -112,15 +117,21 @@ class Curve:
     def nearest(self) -> list[tuple[str, float]]:
         """Return closed forms beside the curve, the nearest first: in words with its size, and the share missed."""
         z, value = self.points
-        found = [_closed(text, columns, value, self.unit) for text, columns in _closed_forms(self.form.on, z)]
-        return sorted(found, key=lambda f: f[1])
+        forms, unit = _closed_forms(self.form.on, z), self.unit
+        if self.form.remembers:
+            lags = np.concatenate([values_of(functions_of(self.form, self._span), self.form, s) for s in self._signals])
+            over = "rad" if self.form.on == "path" else "s"
+            forms = [(f"one lag of {number(length, 2)} {over}", lags[:, [k]])
+                     for k, length in enumerate(memories_of(self.form, self._span))]
+            unit = self._own_unit
+        return sorted((_closed(text, columns, value, unit) for text, columns in forms), key=lambda f: f[1])
 
     @cached_property
     def points(self) -> tuple[Array, Array]:
         """The quantity at the samples of all runs, and the curve there."""
         z = np.concatenate([s[self.form.on] for s in self._signals])
-        width = float(self._signals[0]["width"][0])
-        return z, values_of(self._terms, z, width) @ np.array(list(self.coefficients.values()))
+        values = np.concatenate([values_of(self._terms, self.form, s) for s in self._signals])
+        return z, values @ np.array(list(self.coefficients.values()))
 
     @cached_property
     def _signals(self) -> list[dict[str, Array]]:
@@ -160,22 +171,31 @@ class Curve:
     @property
     def unit(self) -> str:
         """Of the coefficients."""
-        form = self.form
-        if form.carrier == "acceleration":
-            return "1"
-        if form.balance == "sensor":
-            return {"theta": "rad", "omega": "rad/s", "i": "A"}[form.channel] if not form.carrier else "1"
+        form, own = self.form, self._own_unit
+        by = SI.get(form.on.removeprefix("past ") if form.remembers else form.carrier, "")
+        return "1" if form.carrier == "acceleration" or own == by else own + OVER[by]
+
+    @property
+    def _own_unit(self) -> str:
+        """Of what the curve adds to its balance or its sensor, but for a carrier."""
         torque = "N" if self.fit.model.axis == "linear" else "N·m"
-        over = {"": "", "direction": "", "omega": "·s/rad", "i": "/A", "v": "/V"}[form.carrier]
-        return "1" if (form.balance, form.carrier) == ("voltage", "v") else {
-            "torque": torque, "voltage": "V", "both": f"{torque}/A"}[form.balance] + over
+        return {"torque": torque, "voltage": "V", "both": f"{torque}/A", "sensor": SI.get(self.form.channel, "")}[
+            self.form.balance]
 
     @property
     def law(self) -> str:
         """The law as source."""
         form, names = self.form, list(self.sizes)
         lines = ["z = m.state('clock')", "m.rate(z, 1.0)"] if form.on == "t" else [f"z = {QUANTITIES[form.on]}"]
-        lines += ["curve = (", *(f"    + {n} * {t}" for n, t in zip(names, self._terms, strict=True)), ")"]
+        terms = self._terms
+        if form.remembers:
+            rate = " * ca.fabs(m.omega)" if form.on == "path" else ""
+            lengths = [t.partition(", ")[2].rstrip(")") for t in terms]
+            terms = [f"past_{k}" for k in range(len(terms))]
+            for past, length in zip(terms, lengths, strict=True):
+                lines += [f"{past} = m.state('{self.name}_{past}'{FIRST.get(form.on, '')})",
+                          f"m.rate({past}, (z - {past}){rate} / {length})"]
+        lines += ["curve = (", *(f"    + {n} * {t}" for n, t in zip(names, terms, strict=True)), ")"]
         if form.carrier == "acceleration" and form.on == "turn":  # kinetic energy that changes with the angle
             slopes = slopes_over_turn(self._terms)
             lines += ["slope = (", *(f"    + {n} * {t}" for n, t in zip(names, slopes, strict=True)), ")",

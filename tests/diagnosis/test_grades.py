@@ -11,8 +11,10 @@ from battery.excite import driven, record
 import motorid as mi
 from motorid.diagnosis import misspecification
 from motorid.diagnosis.cross_validation import HeldOut
+from motorid.diagnosis.free_forms import Form
+from motorid.diagnosis.misspecification import FormGain
 from motorid.diagnosis.model_comparison import node_of
-from motorid.diagnosis.predictive_score import Predictions
+from motorid.diagnosis.predictive_score import Evidence, Predictions
 
 HIDDEN = {"coulomb": {"tau_c": 8e-3}}
 DRIVES = ("stairs", "ramps", "steps")
@@ -113,3 +115,19 @@ def test_what_explains_less_than_it_leaves_is_not_named(rubbing, monkeypatch, sh
     assert ("30 % of the squared error, and what is left is not noise" in told.why) == (grade == "approximates")
     (told,) = misspecification.grades_of(last, root, (), (), False, lambda name: worse)
     assert told.grade == "named"
+
+
+@pytest.mark.parametrize(("share", "grade"), [(0.9, "approximates"), (0.998, "named")])
+def test_a_form_that_adds_a_trifle_to_what_an_effect_does_takes_no_name_from_it(rubbing, monkeypatch, share, grade):
+    """However far a fine sensor sees the rest above its noise; the form halves the error in both."""
+    plain, check = rubbing
+    held, rubs = HeldOut.of(plain, check), mi.fit(plain.model + mi.effects.coulomb, plain.problem.experiments)
+    root, last = node_of(plain, held), node_of(rubs, held)
+    larger = {c: replace(e, values=tuple(v / np.sqrt(1 - share) for v in e.values))
+              for c, e in last.predictions.held_out.items()}
+    worse = replace(last, predictions=Predictions({}, larger))
+    gain = FormGain(Form("a torque", "torque", "omega"), Evidence(100.0, 10.0, 0.5), last.predictions)
+    monkeypatch.setattr(misspecification, "better_forms", lambda fit, rival: [gain])
+    (told,) = misspecification.grades_of(last, root, (), (), True, lambda name: worse)
+    assert told.grade == grade
+    assert ("a torque that changes with the speed, which the library lacks" in told.why) == (grade == "approximates")

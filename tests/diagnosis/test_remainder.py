@@ -14,8 +14,8 @@ from command import motorid_json
 import motorid as mi
 from motorid.cli.options import own_effects
 from motorid.diagnosis import remainder
-from motorid.diagnosis.free_forms import Form
-from motorid.diagnosis.remainder import Remainder
+from motorid.diagnosis.free_forms import Form, linearised
+from motorid.diagnosis.remainder import Curve, Remainder
 from motorid.exporters.export import load
 from motorid.records.reading import write_csv
 
@@ -214,3 +214,62 @@ def test_a_sensor_that_bends_is_a_curve_in_the_measurement(lab):
     was, now = (mi.evaluate(f, bent[2:]).nrmse["omega"] for f in (found.best, after))
     straight = mi.evaluate(mi.fit(mi.dc_motor(), runs[:2]), runs[2:]).nrmse["omega"]
     assert now < 1.15 * straight < 0.5 * was
+
+
+def test_slopes_of_every_form_are_those_of_the_model_with_its_curve(lab):
+    """Sticking and voltage steps within samples included."""
+    rng = np.random.default_rng(7)
+    hidden = {"coulomb": {"tau_c": 6e-3}}
+    runs = [record(driven(lab, hidden, w, 300, 1e-3, rng), "logger", ANGLE, lab, rng, w) for w in FAST[:2]]
+    fit = mi.fit(mi.dc_motor() + mi.effects.coulomb, runs)
+    linear = linearised(fit)
+    remembering = [f for f in linear.forms if f.remembers]
+    assert {f.on for f in remembering} == {"past v", "past i", "past omega", "path"}
+    first = {f"{c}_0[{k}]": float(y[0]) for k, s in enumerate(fit.simulations) for c, y in s.states.items()}
+    missed = {}
+    for form, answers in linear.forms.items():
+        if form.on == "run":
+            continue
+        curve = Curve(fit, form, dict.fromkeys(range(answers.shape[1]), 0.0))
+        problem = fit.problem.with_(model=fit.model + curve.effect)
+        values = fit.values | first | dict.fromkeys(curve.sizes, 0.0)
+        q = problem.scaling.scaled([values[p.name] for p in problem.unknown])
+        slopes = problem.refined(q).residual_and_jacobian(q)[1][: problem.n_outputs] / problem.scaling.slope(q)
+        own = slopes[:, [[p.name for p in problem.unknown].index(n) for n in curve.sizes]]
+        own *= np.sign(np.sum(own * answers))
+        missed[form] = float(np.linalg.norm(own - answers) / np.linalg.norm(answers))
+    assert max(miss for f, miss in missed.items() if f.on != "turn") < 0.12  # high orders turn far within a sample
+    assert np.median(list(missed.values())) < 0.03
+
+
+def test_what_remembers_is_found(lab):
+    """A torque that follows the speed late, as of a fluid or of eddy currents; the law and its source have states."""
+
+    @mi.effect(balance="torque")
+    def dragged(m, c=mi.P(2e-4, "N·m·s/rad", null=0.0), t=mi.P(0.05, "s", positive=True)):
+        """A drag that comes late."""
+        z = m.state("dragged")
+        m.rate(z, (m.omega - z) / t)
+        m.torque -= c * z
+
+    rng = np.random.default_rng(3)
+    plain = [record(driven(lab, {}, w, 800, 1e-3, rng), "logger", ("i", "omega"), lab, rng, w) for w in FAST]
+    model = mi.fit(mi.dc_motor(), plain).model + dragged
+    runs = []
+    for run in plain:
+        clean = mi.simulate(model, run)[0].outputs
+        runs.append(run.with_(outputs={c: y + 0.005 * np.std(y) * rng.standard_normal(len(y))
+                                       for c, y in clean.items()}))
+    found = mi.diagnose(mi.fit(mi.dc_motor(), runs[:2]), runs[2:], effects=("coulomb", "quadratic_drag"))
+    assert found.remainder.follows in {f"a torque that depends on the {q} before" for q in ("speed", "current")}
+    fit = mi.fit(found.best.model + found.remainder.as_effect(), runs[:2])
+    before, after = (mi.evaluate(f, runs[2]).nrmse for f in (found.best, fit))
+    floor = {c: 0.005 * np.std(y) / np.sqrt(np.mean(y**2)) for c, y in runs[2].outputs.items()}
+    assert max(after[c] / floor[c] for c in after) < 1.1
+    assert min(before[c] / after[c] for c in after) > 2
+    assert {p.unit for p in found.remainder.as_effect().parameters} <= {"N·m·s/rad", "N·m/A"}
+    assert "m.rate(past_0, (z - past_0) / " in found.remainder.code()
+    text, miss = found.remainder.nearest()[0]
+    assert text.startswith("one lag of ")
+    assert text.endswith(" N·m")
+    assert miss < 0.3
