@@ -26,7 +26,7 @@ from motorid.diagnosis.model_comparison import Node, far
 from motorid.diagnosis.predictive_score import Predictions
 from motorid.diagnosis.results import Adequacy
 from motorid.diagnosis.score_test import Score
-from motorid.diagnosis.thresholds import LARGER
+from motorid.diagnosis.thresholds import LARGER, SEARCHED
 from motorid.display.numbers import number
 from motorid.estimation.result import Fit
 from motorid.numerics.autoregression import autocorrelation, effective_samples
@@ -235,7 +235,7 @@ def _score_tests(fit: Fit, scores: Sequence[Score]) -> list[dict[str, Any]]:
         k = len(s.effect.parameters)
         searched = 1 + 3 * sum(bool(p.grid) for p in s.effect.parameters)
         if any(p.order for p in s.effect.parameters):
-            searched = 200
+            searched = SEARCHED
         p = min(1.0, searched * float(chdtrc(k, -s.effective * np.log1p(-min(s.drop, 1 - 1e-12)))))
         found.append({"channel": None, "on": s.effect.name, "share": s.drop, "p": p})
     return found

@@ -9,7 +9,7 @@ parametric law that is outdone by a nonparametric one is not the thing itself (H
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -62,6 +62,7 @@ def better_forms(fit: Fit, rival: Predictions) -> list[FormGain]:
         predicted = form_predictions(fit, linear, form)
         if predicted is not None:
             found = compare(Predictions(rival.blocks, {}), predicted)
+            found = replace(found, gain=found.gain - np.log(len(linear.forms)))  # the best of many gains by chance
             gains += [FormGain(form, found, predicted)] if found.worth_it else []
     return sorted(gains, key=lambda g: -g.evidence.gain)
 

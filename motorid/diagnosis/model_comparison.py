@@ -6,12 +6,14 @@ On a tie the smaller model wins, then the effect that is met more often.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
+
+import numpy as np
 
 from motorid.diagnosis.cross_validation import HeldOut
 from motorid.diagnosis.predictive_score import Evidence, Predictions, compare
-from motorid.diagnosis.thresholds import LARGER
+from motorid.diagnosis.thresholds import LARGER, SEARCHED
 from motorid.estimation.result import Fit
 from motorid.model.model import Model
 from motorid.problem.problem import Problem
@@ -45,6 +47,12 @@ class Node:
         """Number of free parameters."""
         return size_of(self.fit.problem.model, self.fit.problem)
 
+    @property
+    def search(self) -> float:
+        """Nats that chance gains where each order of an angle effect is the best of many."""
+        orders = sum(any(p.order for p in e.parameters) for e in self.fit.model.effects)
+        return orders * float(np.log(SEARCHED))
+
 
 def size_of(model: Model, problem: Problem) -> int:
     """Return the number of free parameters on the records of `problem`, those of every run counted for each."""
@@ -69,8 +77,9 @@ def _compared(old: Predictions, new: Predictions) -> Evidence:
 
 
 def evidence(old: Node, new: Node) -> Evidence:
-    """Return what `new` predicts better than `old`."""
-    return _compared(old.predictions, new.predictions)
+    """Return what `new` predicts better than `old`, the search for orders paid for."""
+    found = _compared(old.predictions, new.predictions)
+    return replace(found, gain=found.gain - new.search + old.search)
 
 
 def beats(new: Node, old: Node) -> bool:

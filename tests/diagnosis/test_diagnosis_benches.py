@@ -7,7 +7,7 @@ from battery.cases import ANGLE, Case
 from battery.wide import SIZES, WIDE
 
 import motorid as mi
-from motorid.diagnosis.candidates import Search, library
+from motorid.diagnosis.candidates import Search, Stages, library
 
 
 def test_the_wide_battery_has_every_effect_of_benches_in_three_motors_under_three_drives():
@@ -69,7 +69,7 @@ def test_two_frictions_that_contain_the_same_one_are_not_both_added():
     numbers = {"tau_m": 8e-3, "a_f": 0.5, "phi_f": 1.0}
     runs, _ = Case("turn", "single", "lab", {"angular_friction": numbers}, n=600, channels=ANGLE).records()
     fit = mi.fit(mi.dc_motor() + mi.effects.angular_friction, runs[:1])
-    search = Search(fit, None, library(["stribeck", "coulomb_asymmetric", "quadratic_drag"]), map, lambda word: None)
+    search = Search(fit, None, library(["stribeck", "coulomb_asymmetric", "quadratic_drag"]), Stages())
     assert [s.effect.name for s in search.scores(search.root)] == ["quadratic_drag"]
-    wider = Search(mi.fit(mi.dc_motor() + mi.effects.coulomb, runs[:1]), None, library(["stribeck"]), map, str)
+    wider = Search(mi.fit(mi.dc_motor() + mi.effects.coulomb, runs[:1]), None, library(["stribeck"]), Stages())
     assert [c.effect for c in wider.expand(wider.root)[1]] == ["stribeck"]  # in the place of the one that it contains

@@ -10,6 +10,7 @@ from battery.excite import driven, record
 
 import motorid as mi
 from motorid.diagnosis.cross_validation import HeldOut
+from motorid.diagnosis.model_comparison import evidence, node_of
 from motorid.diagnosis.predictive_score import (
     Errors,
     Evidence,
@@ -20,7 +21,7 @@ from motorid.diagnosis.predictive_score import (
     lost_channels,
     predictions_left_out,
 )
-from motorid.diagnosis.thresholds import BLOCKS, MATERIAL, NATS, STANDARD_ERRORS
+from motorid.diagnosis.thresholds import BLOCKS, MATERIAL, NATS, SEARCHED, STANDARD_ERRORS
 from motorid.estimation.fit import solve
 from motorid.records.datasets import data_path
 from motorid.records.experiment import Experiment
@@ -312,3 +313,12 @@ def test_what_was_refitted_without_its_other_half_compares_with_what_slopes_tell
         assert refitted[c].nrmse == pytest.approx(e.nrmse, rel=0.2)
     found = compare(Predictions(refitted, {}), Predictions(predictions_left_out(rubbing), {}))
     assert found.worth_it
+
+
+def test_an_order_that_was_searched_for_is_paid_for():
+    """The best of many orders gains by chance: the logarithm of their number."""
+    fit = mi.fit(mi.dc_motor(), mi.read_runs(data_path("two_step_small")))
+    bare = node_of(fit, HeldOut.of(fit, None))
+    cogs = replace(bare, fit=replace(fit, problem=fit.problem.with_(model=fit.model + mi.effects.cogging)))
+    assert evidence(bare, cogs).gain == pytest.approx(-np.log(SEARCHED))
+    assert evidence(cogs, bare).gain == pytest.approx(np.log(SEARCHED))
