@@ -125,6 +125,7 @@ def fit(model: Model, runs: Sequence[Experiment] | Experiment, *, solver: Any = 
     if window == "auto" and start == "auto" and not hasattr(solver, "solve"):
         again = partial(solve, solver=solver, callback=callback, formulation=formulation)
         found = found if follows(found) else in_windows(found, again) or found
+    _ = found.evaluation, found.std  # kept with the fit: showing it then computes nothing
     return found
 
 

@@ -47,7 +47,7 @@ def fake_fit():
         seconds=0.231, nrmse=nrmse, rmse=rmse, noise={"i": 0.004, "omega": 0.15},
         evaluation=SimpleNamespace(simulations=[SimpleNamespace(experiment=run)], nrmse=nrmse, rmse=rmse),
         fits="noise", verdict="Fits: errors at the level of the noise (NRMSE current 1.68 %, speed 0.815 %).",
-        determined={"gain": Quantity(20.77, 0.005, "rad/s per V", "speed per voltage, steady")},
+        per_run={}, determined={"gain": Quantity(20.77, 0.005, "rad/s per V", "speed per voltage, steady")},
     )  # fmt: skip
 
 

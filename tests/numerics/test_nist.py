@@ -110,7 +110,7 @@ def solved(name, problem, start):
     assert found.status == "converged", found.message
     squares = float(found.residual @ found.residual)
     jac = found.jac / scaling.slope(found.q)
-    half, left_out, _ = seen_directions(jac)
+    half, left_out = seen_directions(jac)
     assert not len(left_out)
     variance = squares / (len(problem.y) - len(start))
     return scaling.physical(found.q), np.sqrt(variance * np.diag(half @ half.T)), squares
