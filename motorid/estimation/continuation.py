@@ -16,14 +16,14 @@ from motorid.estimation.least_squares import FAILURES, RACE, ROUNDS, Callback, E
 from motorid.estimation.restarts import restarted_where_doubtful
 from motorid.numerics.least_squares import LevenbergMarquardt
 from motorid.problem.problem import Problem
-from motorid.problem.runs import SGN_WIDTH_SHARE, top_speed
+from motorid.problem.runs import SGN_WIDTH_SHARE, smoothing, top_speed
 from motorid.problem.simulate import misfit_over_noise
 
 WIDEST = 0.03  # first width of sgn over the highest speed
 STEP = 6.0  # factor from one width to the next, at most
 NOISE = 1.1  # misfit over noise of an angle that has no creep left in it
 WORTH_IT = 1.5  # factor between widths that is worth another run
-LOWER = 0.98  # of the cost with a wider sgn, or the narrower one is not worth it
+LOWER = 0.99  # of the cost with a wider sgn: what creep is left lowers the error by half of what may be named at most
 
 
 def by_continuation(problem: Problem, effort: LevenbergMarquardt, callback: Callback = None, *,
@@ -76,12 +76,24 @@ def sharpened(found: Estimate, effort: LevenbergMarquardt, callback: Callback = 
     """
     while (width := _narrower(found)) is not None:
         problem = found.problem.start_at(found.values).tuned(width=width)
+        if misfit_over_noise(problem, found.q).get("theta", 0.0) < NOISE and not _promises(found, problem):
+            return found
         other = least_squares(problem, effort, callback)
         history = found.history + other.history
         if other.cost > LOWER * found.cost:
             return replace(found, history=history)
         found = replace(other, history=history)
     return found
+
+
+def _promises(found: Estimate, narrower: Problem) -> bool:
+    """Tell whether a narrower sgn lowers the cost, by the slopes with the wider one.
+
+    An angle below its noise says nothing: the noise of fast records is overestimated.
+    """
+    r, jac = narrower.residual(found.q), found.solution.jac
+    left = r - jac @ np.linalg.lstsq(jac, r, rcond=None)[0]
+    return 0.5 * float(left @ left) < LOWER * found.cost
 
 
 def smooths(problem: Problem) -> bool:
@@ -102,9 +114,9 @@ def _at(problem: Problem, width: float | None) -> Problem:
     return problem if width == problem.width else problem.tuned(width=width)
 
 
-def _narrowest(problem: Problem) -> float:
-    """Return the width of sgn that the noise of the records asks for."""
-    return problem.tuned(width=None).model.values["sgn_width"]
+def _narrowest(problem: Problem, noise: float = 1.0) -> float:
+    """Return the width of sgn that the noise of the records asks for, `noise` times what was estimated."""
+    return smoothing(problem.experiments, problem.model.parameters, noise) or problem.model.values["sgn_width"]
 
 
 def _narrow_enough(problem: Problem) -> float:
@@ -113,14 +125,10 @@ def _narrow_enough(problem: Problem) -> float:
 
 
 def _narrower(found: Estimate) -> float | None:
-    """Return a narrower width, where a loaded, stuck motor's creep may show in the angle.
-
-    None where the angle's misfit is noise already, or the width is what that noise asks for.
-    """
+    """Return a narrower width, where a loaded, stuck motor's creep may show in the angle; None where it has no room."""
     problem = found.problem
     if problem.width is None or not smooths(problem) or problem.width > 1.01 * _narrow_enough(problem):
         return None
-    width = max(_narrowest(problem), problem.width / STEP)
-    if width > problem.width / WORTH_IT or misfit_over_noise(problem, found.q).get("theta", 0.0) < NOISE:
-        return None
-    return width
+    misfit = misfit_over_noise(problem, found.q).get("theta")
+    width = max(_narrowest(problem, min(misfit or 1.0, 1.0)), problem.width / STEP)
+    return None if misfit is None or width > problem.width / WORTH_IT else width

@@ -179,7 +179,8 @@ def at_rest(run: Experiment, sigma: Mapping[str, float]) -> tuple[bool, int]:
     v = run.inputs["v"]
     quiet = np.abs(v) <= 1e-3 * max(np.abs(v).max(), 1e-300)
     lead = int(np.argmin(quiet)) if not quiet.all() else len(v)
-    checked = max(lead, 2)
+    # With the voltage on from the first sample, a motor at rest moves at the second: there both tell at the first.
+    checked = max(lead, 1 if {"i", "omega"} <= sigma.keys() else 2)
     for c in ("i", "omega"):
         if c in sigma:
             y = run.outputs[c][:checked]
@@ -327,22 +328,23 @@ def _sizes_of(run: Experiment) -> _Sizes:
 
 
 # -- the width of sgn ------------------------------------------------------------------------------------
-def smoothing(runs: Sequence[Experiment], parameters: Mapping[str, Any]) -> float | None:
-    """Return the width of sgn that suits the data; None where it is given or not used."""
+def smoothing(runs: Sequence[Experiment], parameters: Mapping[str, Any], noise: float = 1.0) -> float | None:
+    """Return the width of sgn that suits the data, `noise` times as noisy as they seem; None if given or unused."""
     p = parameters.get("sgn_width")
     if p is None or p.given:
         return None
-    return _suited_width(tuple(runs))
+    return _suited_width(tuple(runs), noise)
 
 
 @lru_cache(maxsize=64)
-def _suited_width(runs: tuple[Experiment, ...]) -> float | None:
+def _suited_width(runs: tuple[Experiment, ...], noise: float) -> float | None:
     speed = top_speed(runs)
     if speed <= 0:
         return None
     # A smooth sgn lets a loaded, stuck motor creep; over the longest standstill that must stay below the noise of
     # the angle, or the creep looks like an effect of its own.
-    creep = min((CREEP_SHARE * noise_level(r.outputs["theta"], r.t) / still for r in runs if "theta" in r.outputs
+    allowed = CREEP_SHARE * noise
+    creep = min((allowed * noise_level(r.outputs["theta"], r.t) / still for r in runs if "theta" in r.outputs
                  and (still := _longest_standstill(r, speed)) > 0), default=np.inf)
     # Narrower than the finest sub-step's change of speed, it is jumped over, and slopes come out wild.
     jump = max(_speed_gained(r) for r in runs) / FINEST

@@ -67,6 +67,16 @@ def test_what_a_wide_sgn_likes_is_left_where_a_narrow_one_refuses_it(stuck):
     assert by_continuation(bad, FINISH).cost == pytest.approx(by_continuation(good, FINISH).cost, rel=1e-3)
 
 
+def test_an_overestimated_noise_hides_no_creep(stuck):
+    """Below that noise nothing seems left to mend; the slopes say that a narrower sgn lowers the cost all the same."""
+    run = stuck.with_(sigma={"theta": 20e-4})
+    model = mi.torque_driven(g=1.0) + mi.effects.coulomb + mi.effects.constant_load + mi.effects.quadratic_drag
+    begin = as_problem(model.start_at({**TRUE, "c_2": 0.01}), run, initial="rest")
+    done, wider = by_continuation(begin, FINISH), by_continuation(begin, FINISH, narrow=False)
+    assert done.problem.width < 0.5 * wider.problem.width
+    assert done.cost < 0.8 * wider.cost
+
+
 def test_sub_steps_follow_the_solution(stuck):
     """The grid at the end is the one that the end asks for, not the one that the start asked for."""
     done = by_continuation(problem(stuck, 2), FINISH)

@@ -162,6 +162,15 @@ def test_a_record_from_rest_has_no_unknown_beginning(runs):
     assert [p.name for p in as_problem(TRUE, runs).unknown] == list(VALUES)
 
 
+def test_a_motor_at_rest_with_the_voltage_on_from_the_first_sample_begins_at_rest(rng):
+    """Slowly sampled it is in full motion at the second one; where the speed was not measured that says nothing."""
+    t = np.arange(400) * 4e-3
+    run = noisy(simulated(t, np.where(t < 0.8, 6.0, -4.0)), rng)
+    assert run.outputs["i"][1] > 0.5 * np.max(run.outputs["i"])
+    assert [p.name for p in as_problem(TRUE, run).unknown] == list(VALUES)
+    assert len(as_problem(TRUE, run.without("omega")).unknown) > len(VALUES)
+
+
 @pytest.mark.parametrize(
     ("initial", "names"),
     [
