@@ -142,8 +142,7 @@ class Link(Protocol):
     """What a recorder needs of a wire."""
 
     def read(self, timeout: float) -> bytes:
-        """Return what has come, at the latest after `timeout` s (then perhaps nothing); LinkLost at the
-        end."""
+        """Return what has come, at the latest after `timeout` s (then perhaps nothing); LinkLost at the end."""
         ...
 
     def write(self, data: bytes) -> None:

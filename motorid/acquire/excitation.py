@@ -203,18 +203,14 @@ def _milli(value: float) -> int:
     return round(value * 1e3)
 
 
-def _hold(volts: float, seconds: float) -> list[Segment]:
-    return [Segment("R", _milli(seconds), (_milli(volts), _milli(volts)))]
+def _ramp(first: float, last: float, seconds: float) -> list[Segment]:
+    return [Segment("R", _milli(seconds), (_milli(first), _milli(last)))]
 
 
 def _stairs(first: float, last: float, n: float, seconds: float) -> list[Segment]:
     if n != int(n) or not 2 <= n <= 1000:
         raise UsageError(f"stairs need a whole number of levels from 2 on; got {n:g}.")
-    return [s for v in np.linspace(first, last, int(n)) for s in _hold(float(v), seconds)]
-
-
-def _ramp(first: float, last: float, seconds: float) -> list[Segment]:
-    return [Segment("R", _milli(seconds), (_milli(first), _milli(last)))]
+    return [s for v in np.linspace(first, last, int(n)) for s in _ramp(float(v), float(v), seconds)]
 
 
 def _chirp(amplitude: float, low: float, high: float, seconds: float, offset: float = 0.0) -> list[Segment]:
@@ -225,8 +221,8 @@ def _prbs(amplitude: float, bit: float, seconds: float, offset: float = 0.0, see
     return [Segment("P", _milli(seconds), (_milli(offset), _milli(amplitude), round(bit * 1e6), int(seed)))]
 
 
-_WORDS = {"rest": (lambda seconds: _hold(0.0, seconds), 1, 1), "coast": (lambda seconds: _hold(0.0, seconds), 1, 1),
-          "step": (_hold, 2, 2), "stairs": (_stairs, 4, 4), "ramp": (_ramp, 3, 3), "chirp": (_chirp, 4, 5),
-          "prbs": (_prbs, 3, 5)}
+_REST = (lambda seconds: _ramp(0.0, 0.0, seconds), 1, 1)
+_WORDS = {"rest": _REST, "coast": _REST, "step": (lambda volts, seconds: _ramp(volts, volts, seconds), 2, 2),
+          "stairs": (_stairs, 4, 4), "ramp": (_ramp, 3, 3), "chirp": (_chirp, 4, 5), "prbs": (_prbs, 3, 5)}
 _EXAMPLES = {"rest": "rest:0.2", "coast": "coast:1", "step": "step:6:0.5", "stairs": "stairs:1:6:5:0.3",
              "ramp": "ramp:-3:3:2", "chirp": "chirp:4:0.5:50:5", "prbs": "prbs:6:0.05:5"}

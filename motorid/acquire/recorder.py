@@ -80,8 +80,9 @@ def record(port: str | Link, out: str | Path, *, baud: int = 115_200, excite: st
     out = Path(out)
     check_target(out, resume, force)
     _check_numbers(duration, limit_voltage, limit_current, timeout)
-    entries = _entries(calibration)
-    plan = _planned(out, excite, resume)
+    entries = read_calibration(calibration) if isinstance(calibration, str | Path) else dict(calibration or {})
+    tail = read_tail(out) if resume and out.exists() else None  # without an excitation, it goes on with its own
+    plan = RecordingPlan(tail.meta.get("excitation") if tail and excite is None else excite, tail)
     if not (isinstance(plan.excite, str) and "standard" in plan.excite):  # that one asks the device for its limit
         program(plan.excite).check(limit_voltage, 1 << 30, "the limit you gave")
     link = SerialLink(port, baud) if isinstance(port, str) else port
@@ -113,20 +114,6 @@ def _check_numbers(duration: float | None, volts: float, amperes: float, timeout
     for name, value, unit in given:
         if not value > 0:
             raise UsageError(f"{name} must be positive, in {unit}; got {value!r}.")
-
-
-def _planned(out: Path, excite: str | Program | None, resume: bool) -> RecordingPlan:
-    """Say what this recorder adds to `out`; without an excitation, a resumed record goes on with its own."""
-    if not (resume and out.exists()):
-        return RecordingPlan(excite)
-    tail = read_tail(out)
-    return RecordingPlan(excite if excite is not None else tail.meta.get("excitation"), tail)
-
-
-def _entries(calibration: str | Path | Mapping[str, Any] | None) -> dict[str, Any]:
-    if isinstance(calibration, str | Path):
-        return read_calibration(calibration)
-    return dict(calibration or {})
 
 
 def _most(device: Header, header: Header, v_max: float, i_max: float) -> dict[str, float]:
@@ -223,6 +210,8 @@ def read_calibration(path: str | Path) -> dict[str, dict[str, float]]:
         If it cannot be read, or holds an entry that is not known or not a finite number.
     """
     try:
+        if Path(path).exists() and not Path(path).is_file():
+            raise DataError(f"the calibration {path} is no file but a folder, a device or a pipe.")
         tables = tomllib.loads(Path(path).read_text(encoding="utf-8"))
     except OSError as error:
         raise DataError(f"the calibration file {path} cannot be read: {error.strerror}.") from None

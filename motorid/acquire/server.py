@@ -137,8 +137,8 @@ class Pty:
 
     def __init__(self, link: Path | None = None) -> None:
         self.link = link
-        if link and link.exists() and not link.is_symlink():
-            raise UsageError(f"{link} exists and is not a link; choose another name for the port.")
+        if link and link.exists() and not (link.is_symlink() and link.is_char_device()):
+            raise UsageError(f"{link} exists and is no link to a port; choose another name for the port.")
         self.plug()
 
     def plug(self) -> None:
@@ -252,7 +252,11 @@ Transport = Pty | Socket  # the device's end of a wire; `name` is what the recor
 
 def open_transport(link: Path | None = None, port: int | None = None) -> Transport:
     """Open a pseudo-terminal, or a loopback socket where `port` is given or the system has no terminals."""
-    return Pty(link) if port is None and hasattr(os, "openpty") else Socket(port or 0)
+    try:
+        return Pty(link) if port is None and hasattr(os, "openpty") else Socket(port or 0)
+    except OSError as error:
+        raise UsageError(f"cannot serve {port if link is None else link}: {error.strerror or error}. Choose another "
+                         "name or number for the port.") from None
 
 
 @dataclass(frozen=True)

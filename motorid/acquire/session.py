@@ -254,8 +254,7 @@ class Recording(Shown):
     seconds : float
         Length of the run, device time.
     bad : mapping of str to int
-        Lines (and bytes) that were not valid or not usable, by reason. They explain losses, they are not
-        added to them.
+        Lines (and bytes) that were not valid or not usable, by reason. They explain losses, they are not added to them.
     clipped : mapping of str to int
         Samples at the end of a converter's range, by channel.
     """

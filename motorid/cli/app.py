@@ -8,6 +8,7 @@ import typer
 
 from motorid.cli import bench, diagnose, fit
 from motorid.cli.console import Command, Group, prepare_process
+from motorid.numerics.parallel import interruption
 from motorid.records.files import package_version
 
 app = typer.Typer(cls=Group, add_completion=False, rich_markup_mode="rich", pretty_exceptions_enable=False,
@@ -48,4 +49,7 @@ for _name, _command in (
 def main() -> None:
     """Run the command line; leaves by `SystemExit`."""
     prepare_process()
-    app()
+    try:
+        app()
+    finally:
+        interruption.over()

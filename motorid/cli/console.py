@@ -5,6 +5,7 @@ from __future__ import annotations
 import codecs
 import contextlib
 import errno
+import logging
 import os
 import re
 import shlex
@@ -57,16 +58,9 @@ class Command(TyperCommand):
         return super().parse_args(ctx, _spread(args))
 
     def invoke(self, ctx: Any) -> Any:
-        """Look at the outputs before the work; end it where Ctrl-C was pressed."""
-        try:
-            _check_outputs(ctx.params, ctx.info_name)
-            return super().invoke(ctx)
-        except (Exception, KeyboardInterrupt) as error:
-            if not interruption.behind(error):
-                raise
-            interruption.heard()
-            _say("interrupted before it was done; what was written before is kept.")
-            raise typer.Exit(INTERRUPTED) from None
+        """Look at the outputs before the work."""
+        _check_outputs(ctx.params, ctx.info_name)
+        return super().invoke(ctx)
 
 
 class Group(TyperGroup):
@@ -78,6 +72,8 @@ class Group(TyperGroup):
         try:
             status = super().main(args, prog_name or "motorid", complete_var, standalone_mode=False,
                                   windows_expand_args=windows_expand_args, **extra)
+            if interruption.asked and not interruption.told:  # Typer made a status of it, while it read the words
+                _say("interrupted.")
         except MotoridError as error:
             _say(str(error))
             status = WRONG if isinstance(error, DataError | ModelError | UsageError) else FAILED
@@ -95,6 +91,16 @@ class Group(TyperGroup):
             status = self._unexpected(error)
         sys.exit(status if isinstance(status, int) else DONE)
 
+    def invoke(self, ctx: Any) -> Any:
+        """End the work where Ctrl-C was pressed."""
+        try:
+            return super().invoke(ctx)
+        except (Exception, KeyboardInterrupt) as error:
+            if not interruption.behind(error):
+                raise
+            interruption.heard()
+            _say("interrupted before it was done; what was written before is kept.")
+            raise typer.Exit(INTERRUPTED) from None
 
     @staticmethod
     def _unexpected(error: Exception) -> int:
@@ -119,6 +125,7 @@ def prepare_process() -> None:
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="motorid")  # type: ignore[union-attr]
     os.environ["MPLBACKEND"] = "agg"  # figures go to files, whatever backend a shell names
+    logging.getLogger("matplotlib").setLevel(logging.ERROR)  # where it keeps its fonts is no user's business
     warnings.simplefilter("ignore", RuntimeWarning)  # of arithmetic: what came of it is said
     warnings.filterwarnings("ignore", message=r"\s*(casadi: a numpy|Glyph |constrained_layout)")  # no user's business
     warnings.formatwarning = lambda message, *_, **__: f"motorid: {message}\n"
@@ -162,8 +169,7 @@ def show(*parts: Table | str | None) -> None:
             lines = printable(in_options(part)).split("\n")
             console.print(Text("\n".join(_filled(s, console.width) if "   " not in s else s for s in lines)))
             continue
-        drawn = RichTable(title=part.title or None, box=box.SIMPLE_HEAD, title_justify="left",
-                          title_style="bold")
+        drawn = RichTable(title=part.title or None, box=box.SIMPLE_HEAD, title_justify="left", title_style="bold")
         for k, (head, least) in enumerate(zip(part.header, _least_widths(part, console.width), strict=True)):
             drawn.add_column(head, justify="left" if k in part.left else "right", overflow="fold", min_width=least)
         for row in part.rows:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import os
-import signal
-from collections.abc import Iterable
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -39,6 +37,7 @@ from motorid.estimation.result import COLOURED, Fit, constraint_table, ended, st
 from motorid.exporters.c_code import check
 from motorid.exporters.export import FORMS, export
 from motorid.exporters.json_file import constraint_violations, fit_dict, remarks, run_dict, write_json
+from motorid.numerics.parallel import as_worker
 from motorid.problem.simulate import NRMSE, Evaluation, error_table, evaluate, run_table
 from motorid.records.experiment import Experiment
 from motorid.records.files import write_files
@@ -86,8 +85,7 @@ def _show_fit(found: Fit, records: list[Experiment], notes: list[str], judged: E
     several = judged is not None and len(judged.simulations) > 1
     show(replace(error_table({"": found.evaluation, "held-out": judged}, found.noise), note=""),
          run_table(found.evaluation) if len(records) > 1 else None,
-         run_table(judged, "Held-out errors run by run") if judged and several else None,
-         steady_table(found))
+         run_table(judged, "Held-out errors run by run") if judged and several else None, steady_table(found))
     show(constraint_table(found, constraint_violations(found)))
     engine = found.problem.engine
     show(f"{ended(found)} Engine "
@@ -125,9 +123,10 @@ def fit_many_command(
     """
     motors: dict[str, Any] = {f"{place.name}/{name}" if len(directories) > 1 else name: files
                               for place in directories for name, files in motors_in(place).items()}
-    model = options.model(_first_readable(options, motors.values()))
+    known = (records for files in motors.values() if (records := _readable(options, files)))
+    model = options.model(next(known, []))  # the first that can be read tell a rotary from a linear axis
     if options.preprocesses:
-        motors = {name: _read_or_names(options, files) for name, files in motors.items()}
+        motors = {name: _readable(options, files) or files for name, files in motors.items()}
     reading: dict[str, Any] = {k: parse_pairs(v, f"--{k}") for k in ("columns", "units") if (v := getattr(options, k))}
     reading |= {"hold": options.hold} if options.hold else {}
     given = {"journal": journal, "reading": reading, **options.keywords()}
@@ -135,7 +134,7 @@ def fit_many_command(
         found = fit_many(model, motors, **given)
     else:
         most = min(jobs, len(motors), 4 * (os.cpu_count() or 1))  # each process costs memory and a second to begin
-        with ProcessPoolExecutor(most, initializer=signal.signal, initargs=(signal.SIGINT, signal.SIG_IGN)) as pool:
+        with ProcessPoolExecutor(most, initializer=as_worker, initargs=(os.getpid(),)) as pool:
             found = fit_many(model, motors, map=pool.map, **given)
             pool.shutdown(wait=not found.interrupted, cancel_futures=True)
     if json:
@@ -150,22 +149,12 @@ def fit_many_command(
         raise typer.Exit(FAILED)
 
 
-def _first_readable(options: FitOptions, motors: Iterable[list[Path]]) -> list[Experiment]:
-    """Return the records of the first motor that can be read: they tell a rotary from a linear axis."""
-    for files in motors:
-        try:
-            return options.read([str(f) for f in files])
-        except DataError:
-            continue
-    return []
-
-
-def _read_or_names(options: FitOptions, files: list[Path]) -> list[Any]:
-    """Return the records of one motor, or their names where they cannot be read: its row says why."""
+def _readable(options: FitOptions, files: list[Path]) -> list[Any]:
+    """Return the records of one motor, none where they cannot be read: its row says why."""
     try:
         return list(options.read([str(f) for f in files]))
     except DataError:
-        return list(files)
+        return []
 
 
 @with_options(ReadingOptions)

@@ -27,7 +27,7 @@ from motorid.exporters.export import load
 from motorid.model.definition import Effect
 from motorid.model.model import Model, dc_motor, torque_driven
 from motorid.numerics.least_squares import Huber
-from motorid.numerics.parallel import progress
+from motorid.numerics.parallel import interruption, progress
 from motorid.problem.constraints import CurrentLimit, SteadyState
 from motorid.records.checks import check_runs
 from motorid.records.experiment import Experiment, repeated
@@ -239,7 +239,9 @@ def own_effects(path: Path) -> dict[str, Effect]:
     sys.modules[name] = module  # the laws are looked up there when a model goes to another process
     try:
         spec.loader.exec_module(module)
-    except (Exception, SystemExit) as error:  # whatever the user's own code raises
+    except BaseException as error:  # whatever the user's own code raises
+        if interruption.behind(error):
+            raise
         what = f"{type(error).__name__}: {error}"
         raise UsageError(f"--effects-from: {path} cannot be run: {what}.") from None
     effects = [e for e in vars(module).values() if isinstance(e, Effect)]

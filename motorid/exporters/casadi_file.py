@@ -70,7 +70,8 @@ def description(found: Fit | Model) -> dict[str, Any]:
     """Return all that is known of the model as plain data: the contents of ``fit --json``, and what it takes to
     build it again: limits, covariance, fingerprints of the records, versions."""
     model = model_of(found)
-    contents: dict[str, Any] = fit_dict(found) if isinstance(found, Fit) else _model_dict(model)
+    contents: dict[str, Any] = fit_dict(found) if isinstance(found, Fit) else {"parameters": {
+        n: {"value": p.value, "std": None, "unit": p.unit, "fixed": not p.vary} for n, p in model.parameters.items()}}
     for name, p in model.parameters.items():
         limits = {"lower": p.lower, "upper": p.upper}
         contents["parameters"][name] |= {k: v for k, v in limits.items() if np.isfinite(v)}
@@ -84,11 +85,6 @@ def description(found: Fit | Model) -> dict[str, Any]:
                             "python": platform.python_version()}
     contents |= {"export": FORMAT, "order": list(system_of(found).parameters)}
     return contents
-
-
-def _model_dict(model: Model) -> dict[str, Any]:
-    return {"parameters": {n: {"value": p.value, "std": None, "unit": p.unit, "fixed": not p.vary}
-                           for n, p in model.parameters.items()}}
 
 
 def fingerprint(run: Experiment) -> dict[str, Any]:

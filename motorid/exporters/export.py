@@ -129,12 +129,8 @@ def export(found: Fit | Model | Exported, path: str | os.PathLike[str], to: str 
     return write_files(_CONTENTS[form](found, target), force)[0]
 
 
-def _json_file(found: Fit | Model, path: Path) -> dict[Path, str]:
-    return {path: json_text(description(found))}
-
-
 _CONTENTS: Mapping[str, Callable[[Fit | Model, Path], Mapping[Path, Any]]] = {
-    "casadi": casadi_file, "c": c_files, "json": _json_file}
+    "casadi": casadi_file, "c": c_files, "json": lambda found, path: {path: json_text(description(found))}}
 
 
 @one_thread

@@ -6,15 +6,14 @@ gradient points outward are held for the step. λ = 0 is the Gauss-Newton step.
 
 Why it arrives from far away. On the logarithmic scale a positive parameter that runs to zero or to infinity loses its
 influence, and the plateau behind it looks like a minimum. The usual D, the column norms of J (Moré, "The
-Levenberg-Marquardt algorithm", 1978), hardly brakes a parameter of little influence: a first step that is right for
-the others throws it onto the plateau. Here D = ‖r‖ on a logarithmic scale: a change by a factor of e costs λ times
-the present misfit, whatever the parameter, so parameters that the misfit does not ask for stay where they are until
-their turn comes. Damping in proportion to ‖r‖² makes the method converge globally and quadratically even where J is
-singular (Yamashita & Fukushima, Computing Suppl. 15, 2001; Fan & Yuan, Computing 74, 2005), and it fades as the
-misfit does. λ follows the gain ratio (Nielsen, report IMM-REP-1999-05). Of 400 random starts within a factor of ten
-in each of five parameters, 399 and 398 ended in the optimum of the two shipped motors, in 8 and 11 steps (median);
-with the column norms it was 94 and 75 of 100, in 9 and 17. What is left is caught by restarts, see
-`motorid.estimation.restarts`.
+Levenberg-Marquardt algorithm", 1978), hardly brakes a parameter of little influence: a first step that is right for the
+others throws it onto the plateau. Here D = ‖r‖ on a logarithmic scale: a change by a factor of e costs λ times the
+present misfit, whatever the parameter, so parameters that the misfit does not ask for stay where they are until their
+turn comes. Damping in proportion to ‖r‖² makes the method converge globally and quadratically even where J is singular
+(Yamashita & Fukushima, Computing Suppl. 15, 2001; Fan & Yuan, Computing 74, 2005), and it fades as the misfit does. λ
+follows the gain ratio (Nielsen, report IMM-REP-1999-05). Of 400 random starts within a factor of ten in each of five
+parameters, 399 and 398 ended in the optimum of the two shipped motors, in 8 and 11 steps (median); with the column
+norms it was 94 and 75 of 100, in 9 and 17. What is left is caught by restarts, see `motorid.estimation.restarts`.
 """
 
 from __future__ import annotations

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import builtins
 import hashlib
+import os
 import pickle
 import signal
 import sys
@@ -19,7 +20,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import AbstractContextManager, ContextDecorator, contextmanager
+from contextlib import AbstractContextManager, ContextDecorator, contextmanager, suppress
 from contextvars import ContextVar
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -97,27 +98,37 @@ def _blas() -> Any:
 
 
 class Interruption:
-    """Ctrl-C that arrives: C libraries swallow the exception at times, or make another one of it, so it is raised again
-    until someone says `heard`. `asked` tells that it was pressed. Only where `listen` was called, in the command line.
+    """Ctrl-C, or a polite kill, that arrives: C libraries swallow the exception at times, or make another one of it, so
+    it is raised again until someone says `heard`. `asked` tells that it came. Only where `listen` was called, in the
+    command line.
     """
 
     AGAIN = 0.5  # s
 
     def __init__(self) -> None:
-        self.asked = False
+        self.asked = self.told = False
 
     def listen(self) -> None:
-        """Take over Ctrl-C."""
-        for name in ("SIGINT", "SIGALRM"):
-            if hasattr(signal, name):
-                signal.signal(getattr(signal, name), self._raise)
+        """Take over Ctrl-C, and what ends a process politely where that is not ignored (``nohup``)."""
+        for name in ("SIGINT", "SIGALRM", "SIGTERM", "SIGHUP"):
+            number = getattr(signal, name, None)
+            if number and (name == "SIGINT" or signal.getsignal(number) is not signal.SIG_IGN):
+                signal.signal(number, self._raise)
+
+    def over(self) -> None:
+        """Ignore it from now on: all is done, and Python, which hears nothing while it ends, would die of it."""
+        for stream in (sys.stdout, sys.stderr):
+            with suppress(OSError, ValueError):
+                stream.flush()
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
 
     def behind(self, error: BaseException) -> bool:
         """Tell whether Ctrl-C is what an exception comes from."""
         return self.asked or isinstance(error, KeyboardInterrupt)
 
     def heard(self) -> None:
-        """Stop raising it."""
+        """Stop raising it; who hears it tells it."""
+        self.told = True
         if hasattr(signal, "setitimer") and self.asked:
             signal.setitimer(signal.ITIMER_REAL, 0)
 
@@ -129,6 +140,20 @@ class Interruption:
 
 
 interruption = Interruption()
+
+
+def as_worker(parent: int) -> None:
+    """Make this process one of a command's pool: Ctrl-C is the command's, and none goes on without the command."""
+    for name, action in (("SIGINT", signal.SIG_IGN), ("SIGTERM", signal.SIG_DFL), ("SIGHUP", signal.SIG_DFL)):
+        if hasattr(signal, name):
+            signal.signal(getattr(signal, name), action)
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(0.5)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
 
 
 @dataclass(frozen=True)

@@ -150,7 +150,7 @@ def current_limit(run: Experiment) -> str | None:
 def _at_stop(y: Array, top: float) -> bool:
     """Tell a channel that has run into a limit from one that rests, or reaches a level by itself."""
     there = y == top
-    if top == 0 or there.sum() < 4 or there.all():
+    if top == 0 or there.sum() < 3 or there.all():
         return False
     below = y[~there]
     reach = np.ptp(y)
@@ -158,8 +158,11 @@ def _at_stop(y: Array, top: float) -> bool:
     entries = np.abs(y[np.flatnonzero(there[1:] & ~there[:-1])] - top)
     if there.sum() >= max(10, 0.01 * len(y)) and entries.size and np.median(entries) > max(3 * step, 0.005 * reach):
         return True
-    noise = noise_level(below)
-    return step == 0 and noise > 1e-4 * reach and float(np.mean(there[1:][there[:-1]])) > 0.5
+    if step or noise_level(below) <= 1e-4 * reach:
+        return False
+    between = np.sort(y[(y > y.min()) & (y < y.max())])
+    stays = there.sum() > 3 and float(np.mean(there[1:][there[:-1]])) > 0.5
+    return stays or not (np.diff(between) == 0).any()  # noise that is not rounded makes no two samples alike
 
 
 def _coarse(run: Experiment) -> str | None:
@@ -373,7 +376,8 @@ def swapped_columns(run: Experiment) -> str | None:
         what = " and ".join(NAMES[c] for c in moved)
         return (f"{what} fit the equations of a motor far better if their columns are exchanged. Say which is which: "
                 f"columns={{{', '.join(f'{c!r}: ...' for c in moved)}}}.")
-    if _holds(omega) > 0.8 and _holds(run.inputs["v"]) < 0.3 and _jumps(omega):
+    jump, reach = float(np.nanmax(np.abs(np.diff(omega)))), float(np.nanmax(omega) - np.nanmin(omega))
+    if _holds(omega) > 0.8 and _holds(run.inputs["v"]) < 0.3 and jump > 0.3 * reach > 0:
         return ("the speed jumps and then stays exactly the same, while the voltage changes smoothly: "
                 "are the two columns swapped? Say which is which: columns={'v': ..., 'omega': ...}.")
     return None
@@ -383,11 +387,12 @@ def _as_balances_want(run: Experiment) -> Reading:
     """Return the order of v, i, omega, and the signs of i and omega, with which they fit the balances of a motor.
 
     Both balances, integrated, with coefficients that must be positive (non-negative least squares, Lawson & Hanson
-    1974): ∫v = R∫i + LΔi + K∫ω ± V·t over blocks and, from the first sample on since noise hides small steps of the
-    speed, ω = ω₀ + k∫i − b∫ω − c∫sgn ω ± d·t. What is stated stands, unless another reading leaves less than half
-    unexplained. Where no current is measured, the voltage drives in its place. Columns are called exchanged only where
-    the exchange explains both balances, and the sampling resolves them: of a record with gaps or a dead sensor
-    anything explains a little more, of one sampled slowly nearly any reading explains all.
+    1974): ∫v = R∫i + LΔi + K∫ω ± V·t over blocks, less of K∫ω where v is zero and the driver may have let go, and, from
+    the first sample on since noise hides small steps of the speed, ω = ω₀ + k∫i − b∫ω − c∫sgn ω ± d·t. What is stated
+    stands, unless another reading leaves less than half unexplained. Where no current is measured, the voltage drives
+    in its place. Columns are called exchanged only where the exchange explains both balances, and the sampling resolves
+    them: of a record with gaps or a dead sensor anything explains a little more, of one sampled slowly nearly any
+    reading explains all.
     """
     known = [c for c in ("i", "omega") if c in run.outputs and np.isfinite(run.outputs[c]).sum() > 1]
     n = min(BALANCE_BLOCKS, run.n // 3)
@@ -399,10 +404,12 @@ def _as_balances_want(run: Experiment) -> Reading:
     sums = [integral(run.t, a, k == 0 and run.hold == "zoh")[edges] for k, a in enumerate(y)]
     signs_of = [integral(run.t, np.tanh(50 * a / max(np.abs(a).max(), 1e-300)))[edges] for a in y]
     at, T, one = [a[edges] for a in y], run.t[edges] - run.t[0], np.ones(n + 1)
+    driven = [np.add.reduceat(np.abs(a), edges[:-1]) > 0 for a in y]
 
     def unexplained(order: tuple[int, ...], turned: tuple[int, int]) -> tuple[float, float]:
         (v, i, w), (a, b) = order, turned
-        blocks = (np.diff(y) for y in (sums[v], a * sums[i], a * at[i], b * sums[w], T, -T))
+        blocks = [np.diff(y) for y in (sums[v], a * sums[i], a * at[i], b * sums[w], T, -T)]
+        blocks.append(np.where(driven[v], 0.0, -blocks[3]))
         drive = a * sums[i] if "i" in known else sums[v]
         voltage = _share_left(*blocks) if "i" in known else 1.0
         return voltage, _share_left(at[w] - at[w][0], b * drive, -sums[w], -signs_of[w], T, -T, one, -one)
@@ -473,10 +480,6 @@ def _holds(values: Array) -> float:
     """Share of neighbours that are exactly equal, standstill apart."""
     live = np.isfinite(values[1:]) & (values[1:] != 0)
     return float(np.mean(np.diff(values)[live] == 0)) if live.sum() > 20 else 0.0
-
-
-def _jumps(values: Array) -> bool:
-    return float(np.nanmax(np.abs(np.diff(values)))) > 0.3 * float(np.nanmax(values) - np.nanmin(values)) > 0
 
 
 _CHECKS: tuple[Check, ...] = (

@@ -112,7 +112,8 @@ def _dates(cells: Sequence[object], column: str) -> Array:
         try:
             stamps = pd.to_datetime(series, errors="coerce", format="ISO8601", utc=True)
             dated = stamps.notna().mean() > 0.5
-            spans = stamps - stamps.min() if dated else pd.to_timedelta(series, errors="coerce")
+            clock = series.where(series.astype(str).str.contains("[:a-zA-Z]"))  # bare numbers would be nanoseconds
+            spans = stamps - stamps.min() if dated else pd.to_timedelta(clock, errors="coerce")
             seconds = (spans - spans.min()).dt.total_seconds().to_numpy(dtype=float)
         except (ValueError, TypeError, OverflowError, AttributeError):
             seconds = np.full(len(series), np.nan)

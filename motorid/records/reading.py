@@ -27,12 +27,11 @@ from motorid.records.text_tables import TextTable, parse_table
 
 Path_ = str | os.PathLike[str]
 RECORDS = (".csv", ".txt", ".tsv", ".dat", ".log", *FORMATS)
-_HEADERS = {("t", "s"): "time_s", ("v", "V"): "voltage_V", ("v", "A"): "command_A",
-            ("v", "N·m"): "command_Nm", ("v", "N"): "command_N", ("v", "1"): "command (1)",
-            ("i", "A"): "current_A", ("omega", "rad/s"): "speed_rad_s", ("omega", "m/s"): "speed_m_s",
-            ("theta", "rad"): "angle_rad", ("theta", "m"): "position_m",
-            ("v_supply", "V"): "supply_V", ("tau_load", "N·m"): "load_torque_Nm", ("tau_load", "N"): "load_force_N",
-            ("temp", "°C"): "temperature_degC"}
+_HEADERS = {("t", "s"): "time_s", ("v", "V"): "voltage_V", ("v", "A"): "command_A", ("v", "N·m"): "command_Nm",
+            ("v", "N"): "command_N", ("v", "1"): "command (1)", ("i", "A"): "current_A",
+            ("omega", "rad/s"): "speed_rad_s", ("omega", "m/s"): "speed_m_s", ("theta", "rad"): "angle_rad",
+            ("theta", "m"): "position_m", ("v_supply", "V"): "supply_V", ("tau_load", "N·m"): "load_torque_Nm",
+            ("tau_load", "N"): "load_force_N", ("temp", "°C"): "temperature_degC"}
 _OWN = re.compile(r"#\s*motorid (columns|hold|sigma): (.*)")  # what write_csv says about its own file
 _PART = re.compile(r"#\s*part begins: (\d+\.?\d*)")  # what a resumed recording says, s
 

@@ -23,7 +23,7 @@ _LARGEST = 1e30  # what is larger, or infinite, was not measured
 MISSING = frozenset(["", "nan", "na", "n/a", "null", "none", "-", "--", "---", "?", "missing", "#n/a"])
 _NUMBER = re.compile(r"[-+]?(?:(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?|inf)", re.IGNORECASE)
 _GROUPS = {".": ",", ",": "."}  # decimal mark to what may stand between thousands
-_SPACES = "'’\u00a0\u2009\u202f"  # may stand there, too
+_SPACES = " '’\u00a0\u2009\u202f"  # may stand there, too
 _GROUPED = {mark: rf"[-+]?[1-9]\d{{0,2}}(?:[{group}{_SPACES}]\d{{3}})+(?:\{mark}\d*)?"
             for mark, group in _GROUPS.items()}
 _CONTROL = re.compile(r"[\x00-\x08\x0e-\x1f\x7f]")

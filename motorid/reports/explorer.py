@@ -21,8 +21,7 @@ from motorid.problem.problem import Problem
 from motorid.problem.simulate import error_table, evaluate
 from motorid.records.experiment import Experiment
 
-TITLES = {"voltage": "Voltage balance", "torque": "Torque balance", "transmission": "Transmission",
-          "sensor": "Sensors"}
+TITLES = {"voltage": "Voltage balance", "torque": "Torque balance", "transmission": "Transmission", "sensor": "Sensors"}
 REACH = 10.0  # a slider goes from a tenth to ten times the value it begins with
 
 

@@ -13,7 +13,7 @@ from motorid.channels import NAMES
 from motorid.diagnosis.results import Diagnosis, Ladder
 from motorid.display.cards import Flag, Shown, Table
 from motorid.display.numbers import percent, with_error
-from motorid.errors import UsageError
+from motorid.errors import UsageError, printable
 from motorid.estimation.result import Fit
 from motorid.records.experiment import Experiment
 from motorid.records.files import package_version, write_files
@@ -80,7 +80,8 @@ def _page(story: Story) -> str:
     environment = Environment(loader=PackageLoader("motorid.reports", "templates"), autoescape=True,
                               undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     date = datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z")
-    return environment.get_template("report.html").render(story=story, version=package_version("motorid"), date=date)
+    page = environment.get_template("report.html").render(story=story, version=package_version("motorid"), date=date)
+    return printable(page)  # control characters in names of files are not HTML
 
 
 def _provenance(story: Story, command: str, held_out: Sequence[Experiment]) -> Section:

@@ -158,8 +158,7 @@ class Identifiability(Printed):
                 "structural_rank": self.structural_rank, "parameters": list(self.names),
                 "weak_directions": [{"parameters": dict(w.parameters), "text": w.text} for w in self.weak],
                 "combinations": list(self.combinations), "remedies": list(self.remedies), "std": self.std,
-                "noise_std": self.noise_std,
-                "text": self.text}
+                "noise_std": self.noise_std, "text": self.text}
 
     def card(self) -> Card:
         """Return the verdict, and what a fit would know of each parameter."""
@@ -303,7 +302,8 @@ def monomials(names: Sequence[str], weak: Array) -> list[str]:
     if wanted <= 0 or len(involved) > 7:
         return []
     found: list[Array] = []
-    for powers in sorted(product(range(-2, 3), repeat=len(involved)), key=_complexity):
+    tried = sorted(product(range(-2, 3), repeat=len(involved)), key=lambda a: (sum(map(abs, a)), sum(p < 0 for p in a)))
+    for powers in tried:
         a = np.array(powers, float)
         if not a.any() or a[a != 0][0] < 0 or np.count_nonzero(a) > 4:
             continue
@@ -314,10 +314,6 @@ def monomials(names: Sequence[str], weak: Array) -> list[str]:
         if len(found) == wanted:
             break
     return [_product([names[j] for j in involved], a) for a in found]
-
-
-def _complexity(powers: Sequence[int]) -> tuple[int, int]:
-    return sum(abs(p) for p in powers), sum(p < 0 for p in powers)
 
 
 def _product(names: Sequence[str], powers: Array) -> str:

@@ -44,9 +44,8 @@ def multistart(problem_or_fit: Problem | Fit, *, starts: int = 100, spread: floa
         The reference; a problem is solved first.
     starts : int
     spread : float
-        Starts are log-uniform within this factor on either side of the reference, in every free parameter; a
-        parameter that may be negative is moved by the same factors, and its sign is kept; a phase is drawn
-        from the whole circle.
+        Starts are log-uniform within this factor on either side of the reference, in every free parameter; a parameter
+        that may be negative is moved by the same factors, and its sign is kept; a phase is drawn from the whole circle.
     seed : int
         The starts depend on it alone, not on the pool.
     guess : bool
@@ -264,8 +263,7 @@ class Multistart(Printed):
                    for n in self.reference.problem.model.free_names}
             most = [n for n in sorted(off, key=lambda n: -off[n])[:FARTHEST] if off[n] > 0.1 * max(off.values())]
             where = ", ".join(f"{n} = {quantity(end[n], pars[n].unit, 3)}" for n in most)
-            told.append(f"{len(place)} at {where} (squared error "
-                        f"{number(place[0].cost / self._lowest, 3)} times)")
+            told.append(f"{len(place)} at {where} (squared error {number(place[0].cost / self._lowest, 3)} times)")
         more = sum(map(len, places[PLACES:]))
         return "; ".join([*told, *([f"{more} at other places"] if more else [])])
 

@@ -34,6 +34,9 @@ def test_a_pipe_or_a_device_is_no_record(tmp_path):
     refused("fit", tmp_path / "run.csv", says="which may have no end")
     refused("fit", "/dev/urandom", says="which may have no end")
     refused("simulate", "/dev/zero", RUN, says="which may have no end")
+    for endless in ("/dev/zero", tmp_path / "run.csv"):
+        refused("record", "--port", "/dev/null", "--out", tmp_path / "out.csv", "--calibration", endless,
+                says="no file")
 
 
 def test_a_sparse_file_of_gigabytes(tmp_path):

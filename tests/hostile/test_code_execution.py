@@ -152,6 +152,8 @@ def test_escape_sequences_reach_neither_terminal_nor_record(tmp_path):
         done = motorid(*words)
         assert "\x1b" not in done.out + done.err
         assert "\x07" not in done.out + done.err
+    assert motorid("fit", path, "--report", tmp_path / "page.html").status == 0
+    assert not set("\x1b\x07") & set((tmp_path / "page.html").read_text(encoding="utf-8"))
     fields = ["H", "1", "evil\x1b[2J", "100", "32", "32", "12", "5", "8", "v:V:1:0:n", "x:\x1b[2J:1:0:n"]
     body = ",".join(fields).encode()
     [message] = Decoder().feed(b"$%b*%04X\n" % (body, crc_hqx(body, 0xFFFF)))

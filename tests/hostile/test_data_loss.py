@@ -169,6 +169,79 @@ def test_ctrl_c_is_status_130_in_the_first_second_and_later(after):
     assert "Traceback" not in out + err
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="no polite kill there")
+@pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP"])
+def test_a_polite_kill_keeps_what_was_done_as_ctrl_c_does(tmp_path, name):
+    journal, table = tmp_path / "batch.jsonl", tmp_path / "table.csv"
+    process = start("fit-many", motors(tmp_path / "motors", 40), "--journal", journal, "--out", table)
+    begun(process, journal)
+    process.send_signal(getattr(signal, name))
+    _, err = process.communicate(timeout=30)
+    assert (process.returncode, "interrupted" in err) == (130, True), err
+    assert 3 <= len(table.read_text().splitlines()) < 41
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no such signals there")
+def test_ctrl_c_after_the_work_does_not_make_it_a_failure(tmp_path):
+    """While Python ends it hears no signals, and would die of one; a command that is kept running by nohup goes on."""
+    code = ("import os, signal; signal.signal(signal.SIGHUP, signal.SIG_IGN); "
+            "from motorid.numerics.parallel import interruption as it; it.listen(); "
+            "os.kill(os.getpid(), signal.SIGHUP); it.over(); os.kill(os.getpid(), signal.SIGINT)")
+    assert subprocess.run([sys.executable, "-c", code], timeout=60).returncode == 0
+
+
+def motors(folder: Path, count: int) -> Path:
+    folder.mkdir()
+    base, rng = mi.read_csv(RUN), np.random.default_rng(3)
+    for k in range(count):
+        noise = {c: y + rng.normal(0, 0.01 * np.ptp(y), y.shape) for c, y in base.outputs.items()}
+        mi.records.reading.write_csv(base.with_(outputs=noise), folder / f"m{k:02}.csv")
+    return folder
+
+
+def begun(process: subprocess.Popen[str], journal: Path, lines: int = 3) -> None:
+    """Wait until a batch has so many results."""
+    while process.poll() is None and not (journal.exists() and journal.read_bytes().count(b"\n") >= lines):
+        time.sleep(0.002)
+
+
+def without_seconds(table: Path) -> list[list[str]]:
+    rows = [line.split(",") for line in table.read_text().splitlines()]
+    seconds = rows[0].index("seconds")
+    return [[c for k, c in enumerate(r) if k != seconds] for r in rows]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no such kill there")
+def test_no_worker_outlives_a_command_that_was_killed(tmp_path):
+    journal = tmp_path / "batch.jsonl"
+    process = start("fit-many", motors(tmp_path / "motors", 60), "--journal", journal, "--jobs", 2)
+    begun(process, journal, 1)
+    process.kill()
+    process.communicate(timeout=20)  # its pipes close when the last one that has them has gone
+
+
+def test_two_batches_on_one_journal_end_in_the_same_table(tmp_path):
+    folder, tables = motors(tmp_path / "motors", 4), [tmp_path / f"{k}.csv" for k in range(3)]
+    both = [start("fit-many", folder, "--journal", tmp_path / "batch.jsonl", "--out", t) for t in tables[:2]]
+    for process in both:
+        _, err = process.communicate(timeout=60)
+        assert process.returncode == 0, err
+    assert motorid("fit-many", folder, "--journal", tmp_path / "batch.jsonl", "--out", tables[2]).status == 0
+    assert without_seconds(tables[0]) == without_seconds(tables[1]) == without_seconds(tables[2])
+
+
+@pytest.mark.skipif(not hasattr(os, "openpty"), reason="no pseudo-terminals there")
+def test_the_name_of_a_virtual_port_takes_the_place_of_no_file(tmp_path, run):
+    (tmp_path / "link").symlink_to(run)
+    for name, says in ((run, "no link to a port"), (tmp_path / "link", "no link to a port"),
+                       (tmp_path / "none" / "port", "No such file")):
+        done = motorid("bench", "--link", name, "--once")
+        assert done.status == 2
+        assert says in done.err
+    assert run.read_bytes() == RUN.read_bytes()
+    assert (tmp_path / "link").is_symlink()
+
+
 @pytest.mark.parametrize("name", ["motorid_mine.py", "bench.py"])
 def test_a_script_that_imports_the_package_keeps_its_own_ctrl_c(tmp_path, name):
     script = tmp_path / name
@@ -199,16 +272,9 @@ def test_a_recording_without_a_sample_is_no_success(tmp_path):
 
 
 def test_a_batch_killed_in_the_middle_of_its_journal_ends_in_the_same_table(tmp_path):
-    folder, journal = tmp_path / "motors", tmp_path / "batch.jsonl"
-    folder.mkdir()
-    base = mi.read_csv(RUN)
-    rng = np.random.default_rng(3)
-    for k in range(40):
-        noise = {c: y + rng.normal(0, 0.01 * np.ptp(y), y.shape) for c, y in base.outputs.items()}
-        mi.records.reading.write_csv(base.with_(outputs=noise), folder / f"m{k:02}.csv")
+    folder, journal = motors(tmp_path / "motors", 40), tmp_path / "batch.jsonl"
     process = start("fit-many", folder, "--journal", journal)
-    while process.poll() is None and not (journal.exists() and journal.read_bytes().count(b"\n") >= 5):
-        time.sleep(0.002)
+    begun(process, journal, 5)
     process.kill()
     process.communicate()
     done = journal.read_bytes().count(b"\n")
@@ -218,10 +284,7 @@ def test_a_batch_killed_in_the_middle_of_its_journal_ends_in_the_same_table(tmp_
     tables = [tmp_path / "resumed.csv", tmp_path / "whole.csv"]
     assert motorid("fit-many", folder, "--journal", journal, "--out", tables[0]).status == 0
     assert motorid("fit-many", folder, "--out", tables[1]).status == 0
-    rows = [[line.split(",") for line in t.read_text().splitlines()] for t in tables]
-    seconds = rows[0][0].index("seconds")
-    assert [[c for k, c in enumerate(r) if k != seconds] for r in rows[0]] == [
-        [c for k, c in enumerate(r) if k != seconds] for r in rows[1]]
+    assert without_seconds(tables[0]) == without_seconds(tables[1])
 
 
 def test_a_file_that_only_speaks_of_motorid_is_not_ours(tmp_path):

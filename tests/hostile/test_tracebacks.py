@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import socket
 import subprocess
 import sys
 
@@ -162,3 +163,25 @@ def test_trust_is_advised_for_casadi_files_alone(tmp_path):
         with pytest.raises(mi.DataError) as told:
             mi.load(tmp_path / name)
         assert ("trust=True" in str(told.value)) is advised
+
+
+@pytest.mark.parametrize("what", ["SystemExit(0)", "GeneratorExit", "type('Own', (BaseException,), {})"])
+def test_whatever_the_file_of_own_effects_raises_is_said(what, tmp_path):
+    (tmp_path / "own.py").write_text(f"raise {what}\n", encoding="utf-8")
+    done = motorid("fit", RUN, "--effects-from", tmp_path / "own.py", "--effects", "own")
+    assert (done.status, len(done.err.splitlines())) == (2, 1), done
+
+
+@pytest.mark.skipif(not os.path.isdir("/proc/self"), reason="no folder here that nobody may write to")
+def test_a_home_that_cannot_be_written_is_no_news(tmp_path):
+    told = {"HOME": "/proc/none", "XDG_CACHE_HOME": "", "XDG_CONFIG_HOME": "", "MPLCONFIGDIR": "", "MOTORID_CC": "none"}
+    done = process("fit", RUN, "--fix", "L=0", "--report", tmp_path / "page.html", **told)
+    assert (done.returncode, done.stderr) == (0, b"")
+
+
+@pytest.mark.parametrize("end", [("--link", "/dev/null/port"), ("--socket", "{port}")], ids=lambda end: end[0])
+def test_a_virtual_port_that_cannot_be_had_is_said(end):
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        done = motorid("bench", end[0], end[1].format(port=taken.getsockname()[1]), "--once")
+    assert (done.status, len(done.err.splitlines())) == (2, 1), done
+    assert "cannot serve" in done.err

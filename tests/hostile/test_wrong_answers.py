@@ -338,7 +338,7 @@ def columns() -> dict[str, list[float]]:
     return dict(zip(names, map(list, zip(*ROWS, strict=True)), strict=True))
 
 
-@pytest.mark.parametrize("group", ["'", "’", "\u00a0", "\u2009", "\u202f"])
+@pytest.mark.parametrize("group", [" ", "'", "’", "\u00a0", "\u2009", "\u202f"])
 def test_other_marks_between_thousands_lose_no_row(tmp_path, columns, group):
     t = [f"{980 + 10 * k:,}".replace(",", group) for k in range(30)]
     columns.pop("time_s")
@@ -379,3 +379,35 @@ def test_rows_out_of_order_are_called_so(rng, tmp_path, columns):
     order = rng.permutation(30)
     with pytest.raises(mi.DataError, match="goes back"):
         written(tmp_path / "run.csv", **{c: [x[k] for k in order] for c, x in columns.items()})
+
+
+def test_bare_numbers_are_no_clock_times(tmp_path, columns):
+    columns["time_s"] = [f"{980 + 10 * k}~" for k in range(30)]
+    with pytest.raises(mi.DataError, match="neither numbers nor dates"):  # read as nanoseconds by pandas, without the ~
+        written(tmp_path / "run.csv", **columns)
+    columns["time_s"] = [f"0 980 {k:03}" for k in range(30)]
+    with pytest.raises(mi.DataError, match="neither numbers nor dates"):
+        written(tmp_path / "run.csv", **columns)
+    columns["time_s"] = [f"00:00:{k:02}.5" for k in range(30)]
+    assert written(tmp_path / "run.csv", **columns).dt == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("name", ["hidden_coast", "hidden_friction", "hidden_sag"])
+def test_exchanged_columns_are_found_where_the_driver_lets_go(name):
+    """At the command 0 an open bridge leaves the motor its own voltage, whatever is logged."""
+    for run in mi.read_runs(mi.data_path(name) / "*.csv"):
+        v, i, omega = run.inputs["v"], run.outputs["i"], run.outputs["omega"]
+        for new, what in (((v, omega, i), "current and speed"), ((omega, i, v), "voltage and speed"),
+                          ((i, v, omega), "voltage and current"), ((v, i, omega), "")):
+            said = " ".join(mi.check_runs([run.with_(inputs={"v": new[0]}, outputs={"i": new[1], "omega": new[2]})]))
+            assert (f"{what} fit the equations" in said) if what else "exchanged" not in said, (run.name, what)
+
+
+@pytest.mark.parametrize("voltage", ["reversals", "sweep"])
+def test_a_current_that_is_clipped_in_a_few_samples_is_remarked_upon(rng, voltage):
+    """No two samples with noise are alike: three at the top are a limit. Rounded ones may well be."""
+    run = record(rng, "lab", voltage)
+    i = run.outputs["i"]
+    top = np.sort(np.abs(i))[-5]
+    for y, clipped in ((np.clip(i, -top, top), True), (i, False), (np.round(i, 1), False)):
+        assert ("clipped" in " ".join(mi.check_runs([run.with_(outputs={**run.outputs, "i": y})]))) is clipped
