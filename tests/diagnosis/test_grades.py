@@ -100,15 +100,20 @@ def test_a_size_that_could_as_well_be_zero_is_not_named(rubbing, monkeypatch, st
     assert ("tau_c could as well be zero" in told.why) == (grade == "approximates")
 
 
+def explaining(share, rubbing):
+    """The motor without friction, with it, and without it as if it explained that share of the squared error."""
+    plain, check = rubbing
+    held, rubs = HeldOut.of(plain, check), mi.fit(plain.model + mi.effects.coulomb, plain.problem.experiments)
+    last = node_of(rubs, held)
+    larger = {c: replace(e, values=tuple(v / np.sqrt(1 - share) for v in e.values))
+              for c, e in last.predictions.held_out.items()}
+    return node_of(plain, held), last, replace(last, predictions=Predictions({}, larger))
+
+
 @pytest.mark.parametrize(("share", "grade"), [(0.3, "approximates"), (0.7, "named")])
 def test_what_explains_less_than_it_leaves_is_not_named(rubbing, monkeypatch, share, grade):
     """Unless that is noise; here no free form knows better."""
-    plain, check = rubbing
-    held, rubs = HeldOut.of(plain, check), mi.fit(plain.model + mi.effects.coulomb, plain.problem.experiments)
-    root, last = node_of(plain, held), node_of(rubs, held)
-    larger = {c: replace(e, values=tuple(v / np.sqrt(1 - share) for v in e.values))
-              for c, e in last.predictions.held_out.items()}
-    worse = replace(last, predictions=Predictions({}, larger))
+    root, last, worse = explaining(share, rubbing)
     monkeypatch.setattr(misspecification, "better_forms", lambda fit, rival: [])
     (told,) = misspecification.grades_of(last, root, (), (), True, lambda name: worse)
     assert told.grade == grade
@@ -120,12 +125,7 @@ def test_what_explains_less_than_it_leaves_is_not_named(rubbing, monkeypatch, sh
 @pytest.mark.parametrize(("share", "grade"), [(0.9, "approximates"), (0.998, "named")])
 def test_a_form_that_adds_a_trifle_to_what_an_effect_does_takes_no_name_from_it(rubbing, monkeypatch, share, grade):
     """However far a fine sensor sees the rest above its noise; the form halves the error in both."""
-    plain, check = rubbing
-    held, rubs = HeldOut.of(plain, check), mi.fit(plain.model + mi.effects.coulomb, plain.problem.experiments)
-    root, last = node_of(plain, held), node_of(rubs, held)
-    larger = {c: replace(e, values=tuple(v / np.sqrt(1 - share) for v in e.values))
-              for c, e in last.predictions.held_out.items()}
-    worse = replace(last, predictions=Predictions({}, larger))
+    root, last, worse = explaining(share, rubbing)
     gain = FormGain(Form("a torque", "torque", "omega"), Evidence(100.0, 10.0, 0.5), last.predictions)
     monkeypatch.setattr(misspecification, "better_forms", lambda fit, rival: [gain])
     (told,) = misspecification.grades_of(last, root, (), (), True, lambda name: worse)
