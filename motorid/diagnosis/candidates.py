@@ -188,10 +188,10 @@ class Search:
     def _shortlist(self, node: Node) -> list[Score]:
         """Return what is worth a refit: the best, what is common and near the best, and what a score cannot show.
 
-        Far from the records slopes say little, and everything that is common is tried. A line in the spectrum over the
-        angle is no accident, however small beside the rest of the misfit.
+        Far from the records slopes say little, and everything that is common is tried; what has no free parameter has
+        no slope. A line in the spectrum over the angle is no accident, however small beside the rest of the misfit.
         """
-        scores, astray = self.scores(node), lost(node.fit)
+        scores, astray, unmet = self.scores(node), lost(node.fit), bool(far(node.fit))
         near = NEAR * max((s.drop for s in scores), default=0.0)
         return [
             s
@@ -199,6 +199,7 @@ class Search:
             if (s.drop > 0 and (k < SHORTLIST or s.stands_out or (s.effect.name in COMMON and s.drop > near)))
             or (s.effect.name in self._always and s.shapes)
             or (astray and s.effect.name in COMMON)
+            or (unmet and not any(p.vary for p in s.effect.parameters))
         ]
 
     def _takeable(self, model: Model) -> tuple[list[Effect], list[Effect]]:

@@ -62,7 +62,7 @@ def raced(fit: Fit, model: Model, starts: Sequence[Mapping[str, float]]) -> Race
     alive = restored(fit, model)
     angular = any(uses_angle(e) for e in model.effects) and not any(uses_angle(e) for e in fit.model.effects)
     found = []
-    for start in (*(starts or ({},)), *_own_starts(fit, model)):
+    for start in (*(starts or ({},)), *_own_starts(fit, model, starts or ({},))):
         # As it is where a parameter put back (an inductance that no sample shows) makes the model too stiff.
         for each in (alive,) if alive is model else (alive, model):
             done = None
@@ -138,15 +138,16 @@ def lost(fit: Fit) -> bool:
     return max(fit.nrmse.values(), default=0.0) > LOST
 
 
-def _own_starts(fit: Fit, model: Model) -> list[dict[str, float]]:
-    """Return the larger model's own first guess, where the smaller one's fit is no place to begin.
+def _own_starts(fit: Fit, model: Model, starts: Sequence[Mapping[str, float]]) -> list[dict[str, float]]:
+    """Return `starts` with the larger model's own first guess, where the smaller one's fit is no place to begin.
 
     An arm without its weight is fitted by a motor that hardly moves; from there nothing leads back.
     """
     if not lost(fit):
         return []
     with contextlib.suppress(*FAILURES):
-        return [first_guess(model, fit.problem.experiments, loaded=True)]
+        guess = first_guess(model, fit.problem.experiments, loaded=True)
+        return [{**start, **guess} for start in starts]
     return []
 
 

@@ -249,12 +249,12 @@ def _in_windows(found: Climb) -> Fit | None:
 def _late_reading(path: Sequence[Node]) -> Reading | None:
     """Return the reading that the model before any effect of a sensor asks for, since lags imitate one, or the last.
 
-    None where neither leaves more than noise.
+    None where neither leaves more than noise; a model that does not follow the records would ask for anything.
     """
     balances = [[e.balance for e in node.fit.model.effects if e.name not in path[0].key] for node in path]
     plain = max(k for k, kinds in enumerate(balances) if "sensor" not in kinds)
     fits = (path[k].fit for k in dict.fromkeys((plain, len(path) - 1)))
-    asked = (better_reading(fit, late=True) for fit in fits if far(fit))
+    asked = (better_reading(fit, late=True) for fit in fits if far(fit) and follows(fit))
     return next((reading for reading in asked if reading is not None), None)
 
 

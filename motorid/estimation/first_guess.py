@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from motorid.channels import CHANNELS
-from motorid.model.model import Model
+from motorid.model.model import Model, dc_motor
 from motorid.numerics.signals import Array, bridged, integral, slope
 from motorid.records.experiment import Experiment
 
@@ -38,7 +38,7 @@ def first_guess(model: Model, runs: Sequence[Experiment], *, loaded: bool = Fals
         Share of the voltage per speed that is taken for back-EMF where no current tells it from viscous friction.
     """
     held = {n: p.value for n, p in model.parameters.items() if p.given or not p.vary}
-    signals = [_signals(r) for r in runs]
+    signals = [_signals(_read_plainly(r, model)) for r in runs]
     loads = _Loads(model, loads_of(model) if loaded else ())
     if model.base == "torque_driven":
         found = _torque_driven(signals, held, loads)
@@ -70,6 +70,14 @@ class _Loads(NamedTuple):
         motor = {n: v for n, v in found.items() if isinstance(n, str)}
         sizes = {n: v for n, v in found.items() if isinstance(n, Load)}
         return values(self.loads, sizes, per_ratio) | motor
+
+
+def _read_plainly(run: Experiment, model: Model) -> Experiment:
+    """Return the run without a current that is not the motor's, as an effect without a free parameter says."""
+    fixed = [e for e in model.effects if e.balance == "sensor" and not any(p.vary for p in e.parameters)]
+    if "i" in run.outputs and len(run.outputs) > 1 and any("i" in (dc_motor() + e).write().sensors for e in fixed):
+        return run.without("i")
+    return run
 
 
 def _signals(run: Experiment) -> dict[str, Array]:

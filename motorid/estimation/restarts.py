@@ -122,17 +122,7 @@ def _deviation(problem: Problem, residual: Array) -> float:
 
 def restored_values(parameters: Iterable[Parameter], influence: Mapping[str, float],
                     deviation: float = 1.0) -> dict[str, float]:
-    """Return the values at which collapsed parameters would matter.
-
-    Parameters
-    ----------
-    parameters : iterable of Parameter
-        Where the fit has them.
-    influence : mapping of str to float
-        Change of the weighted residual with the logarithm of each parameter.
-    deviation : float
-        Standard deviation of that residual.
-    """
+    """Return the values at which collapsed parameters would matter, whose logarithms change the residual so much."""
     back = {}
     for p in parameters:
         if p.positive and p.vary and 0 < influence.get(p.name, 0.0) < MATTERS * deviation:

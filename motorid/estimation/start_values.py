@@ -122,8 +122,8 @@ def _shapes(problem: Problem, effect: Effect, asked: Model) -> Iterator[dict[str
     sizes = natural_sizes(problem.experiments, problem.model.values)
     axes = []
     for p in _untouched(asked, effect):
-        if p.vary and (p.periodic or p.unit == RESONANCE):
-            values = PHASES if p.periodic else [g * sizes[p.unit] for g in p.grid]
+        if (p.vary and (p.periodic or p.unit == RESONANCE)) or (not p.vary and len(p.grid) > 1):  # or a choice of kinds
+            values = PHASES if p.periodic else [g * sizes.get(p.unit, 1.0) for g in p.grid]
             axes.append([(p.name, float(np.clip(v, p.lower, p.upper))) for v in values])
     return (dict(choice) for choice in product(*axes)) if axes else iter(())
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from lab_records import VALUES, noisy, simulated
 
 import motorid as mi
 from motorid.estimation.first_guess import first_guess
@@ -110,3 +111,16 @@ def test_where_the_integral_leads_astray_the_model_s_own_angle_decides():
     model = mi.dc_motor() + mi.effects.cogging
     found = mi.fit(model, record(model.replace(**truth), "i omega", 3 * np.sin(2 * np.pi * 0.4 * T)))
     assert found.values["A"] == pytest.approx(0.02, rel=0.03)
+
+
+def test_a_current_that_is_not_the_motor_s_is_no_first_guess(rng):
+    """The supply's current without its sign says nothing of R by itself; whether it has one is found."""
+    t = np.arange(1500) * 1e-3
+    v = np.random.default_rng(2).uniform(-10, 10, 60)[np.minimum((t / 0.03).astype(int), 59)]
+    reads = mi.dc_motor() + mi.effects.supply_side_current(V_dc=10.0)
+    run = noisy(simulated(t, v, ("i", "omega"), reads.replace(**VALUES, u_i=1.0)), rng)
+    fit = mi.fit(reads, run)
+    assert fit.values["u_i"] == 1.0
+    assert {n: fit.values[n] for n in VALUES} == pytest.approx(VALUES, rel=0.02)
+    assert fit.fits == "noise"
+    assert mi.diagnose(mi.fit(mi.dc_motor(), run)).effects == ("supply_side_current",)
