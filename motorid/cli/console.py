@@ -13,6 +13,7 @@ import sys
 import textwrap
 import warnings
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -46,8 +47,9 @@ _OPTIONS = ((r"\b(columns|units)=\{(.*?)\}", lambda m: f"--{m[1]} {_pairs(m[2])}
             (r" If you know where it comes from, mi\.load.*", lambda m: ""))
 MANY = ("--validate",)  # options that take all names up to the next option
 OUTPUTS = ("--json", "--report")  # options that write a file
+COMMAND = "Next: motorid"
 MAY_WRAP = 32  # characters of a cell that is a sentence: shorter ones are names and numbers, and stay whole
-WIDTH = 110  # where the output is no terminal
+WIDTH = 80  # where the output is no terminal
 
 
 class Command(TyperCommand):
@@ -166,34 +168,49 @@ def show(*parts: Table | str | None) -> None:
         if part is None:
             continue
         if isinstance(part, str):
-            lines = printable(in_options(part)).split("\n")
-            console.print(Text("\n".join(_filled(s, console.width) if "   " not in s else s for s in lines)))
+            for s in printable(in_options(part)).split("\n"):
+                whole = "   " in s or s.startswith(COMMAND)  # a table, or what is to be copied
+                console.print(Text(s if whole else _filled(s, console.width)), soft_wrap=whole)
             continue
+        part = _upright(part, console.width)
         drawn = RichTable(title=part.title or None, box=box.SIMPLE_HEAD, title_justify="left", title_style="bold")
-        for k, (head, least) in enumerate(zip(part.header, _least_widths(part, console.width), strict=True)):
-            drawn.add_column(head, justify="left" if k in part.left else "right", overflow="fold", min_width=least)
+        for k, (head, width) in enumerate(zip(part.header, _widths(part, console.width), strict=True)):
+            drawn.add_column(head, justify="left" if k in part.left else "right", overflow="fold", width=width)
         for row in part.rows:
             drawn.add_row(*(Text(printable(str(cell))) for cell in row))
         console.print(drawn)
         if part.note:
-            console.print(Text(printable(f"{part.note}\n")))
+            console.print(Text(_filled(printable(part.note), console.width) + "\n"))
 
 
-def _least_widths(table: Table, room: int) -> list[int]:
-    """Return the widths below which columns must not shrink: names and numbers stay whole, sentences may wrap.
+def _needed(table: Table) -> tuple[list[int], list[int], list[int]]:
+    """Return the widths of the columns in full, of names and numbers unbroken, and of single words."""
+    columns = [[str(c) for c in column] for column in zip(table.header, *table.rows, strict=True)]
+    full = [max(map(len, cells)) for cells in columns]
+    words = [max((len(w) for cell in cells for w in cell.split()), default=0) for cells in columns]
+    below = [max(map(len, cells[1:]), default=0) for cells in columns]
+    return full, [word if n > MAY_WRAP else max(word, n) for word, n in zip(words, below, strict=True)], words
 
-    Where that is too wide, the columns on the right wrap between words, too.
-    """
-    columns = list(zip(*[[str(c) for c in row] for row in table.rows], strict=True)) or [()] * len(table.header)
-    longest = [max(map(len, cells), default=0) for cells in columns]
-    words = [max((len(w) for cell in (head, *cells) for w in cell.split()), default=0)
-             for head, cells in zip(table.header, columns, strict=True)]
-    least = [word if most > MAY_WRAP else max(most, max(map(len, head.split()), default=0))
-             for head, most, word in zip(table.header, longest, words, strict=True)]
-    for k in reversed(range(1, len(least))):
-        if sum(least) + 3 * len(least) > room:
-            least[k] = words[k]
-    return least
+
+def _upright(table: Table, room: int) -> Table:
+    """Return a table with rows and columns exchanged where only that keeps its numbers whole."""
+    if sum(_needed(table)[1]) + 3 * len(table.header) < room or len(table.header) <= len(table.rows) + 1:
+        return table
+    head, *rows = zip(table.header, *table.rows, strict=True)
+    return replace(table, header=head, rows=rows, left=(0,))
+
+
+def _widths(table: Table, room: int) -> list[int]:
+    """Return the widths of columns that fit the screen: sentences wrap first, then the columns on the right."""
+    full, widths, words = _needed(table)
+    room -= 3 * len(full) + 1
+    for k in reversed(range(1, len(widths))):
+        widths[k] = words[k] if sum(widths) > room else widths[k]
+    while sum(widths) > room:
+        widths[widths.index(max(widths))] -= 1
+    for k, wanted in enumerate(full):
+        widths[k] += max(0, min(wanted - widths[k], room - sum(widths)))
+    return widths
 
 
 def in_options(text: str) -> str:
@@ -243,7 +260,7 @@ def next_command(name: str) -> str:
     dropped = (*OUTPUTS, "--force")
     kept = [w for w in words if not (w in OUTPUTS and next(words, None)) and w.partition("=")[0] not in dropped]
     line = shlex.join(["motorid", name, *kept])
-    return line if kept and len(line) <= WIDTH else f"motorid {name} RUN... (the same records and options)"
+    return line if kept and len(line) <= 2 * WIDTH else f"motorid {name} RUN... (the same records and options)"
 
 
 def save_report(result: Any, path: Any, held_out: Sequence[Any] = (), force: bool = False) -> None:

@@ -121,7 +121,7 @@ def _keep_fit(before: Fit, done: Sequence[str], json: Json, force: bool) -> None
     if json:
         write_json(fit_dict(before) | {"interrupted": list(done)}, json, force)
     if json != "-":
-        show(f"Interrupted after: {', '.join(done) or 'the fit'}. The model it began with:", parameter_table(before))
+        show(f"Interrupted after: {', '.join(done) or 'the fit'}. The original model:", parameter_table(before))
 
 
 def _write_remainder(found: Diagnosis, path: Path, force: bool) -> None:

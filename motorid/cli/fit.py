@@ -52,9 +52,8 @@ SavedModel = Annotated[Path, typer.Argument(metavar="FIT.json", help="What fit -
 
 
 @with_options(FitOptions)
-def fit_command(
-    runs: Runs, options: FitOptions, validate: Validate = None, json: Json = None, report: Report = None,
-) -> None:
+def fit_command(runs: Runs, options: FitOptions, validate: Validate = None, json: Json = None,
+                report: Report = None) -> None:
     """Fit a motor model to records, and say how far the numbers can be trusted.
 
     Example: motorid fit run*.csv --effects coulomb --validate check*.csv --json fit.json

@@ -45,9 +45,8 @@ NAMES = {"v": "the voltage", "i": "the current", "omega": "the speed", "theta": 
          "acceleration": "the acceleration"}
 
 
-def adequacy(
-    fit: Fit, scores: Sequence[Score] = (), false_alarm: float = FALSE_ALARM, level: float | None = None
-) -> Adequacy:
+def adequacy(fit: Fit, scores: Sequence[Score] = (), false_alarm: float = FALSE_ALARM,
+             level: float | None = None) -> Adequacy:
     """Judge whether the residuals of `fit` are noise.
 
     Parameters
@@ -74,9 +73,7 @@ def adequacy(
     tests += _score_tests(fit, scores)
     material = [t for t in tests if t["share"] > _material(channels, t["channel"])]
     p_value = min([1.0, *(t["p"] * len(tests) for t in material)])
-    far = [
-        c for c, facts in channels.items() if facts["ratio"] > (LARGEST_RATIO if c != "theta" else LARGEST_RATIO / 2)
-    ]
+    far = [c for c, facts in channels.items() if facts["ratio"] > LARGEST_RATIO / (2 if c == "theta" else 1)]
     adequate = p_value > (false_alarm if level is None else level) and not far
     for c, facts in channels.items():
         facts["p_value"] = min([1.0, *(t["p"] for t in tests if t["channel"] == c)])
@@ -103,11 +100,8 @@ def following(judged: Adequacy, what: str) -> Adequacy:
 def unpredicted(judged: Adequacy) -> Adequacy:
     """Return a judgement that knows that no free form predicts errors larger than the noise."""
     larger = " and ".join(channel_name(c) for c, f in judged.channels.items() if f["ratio"] > LARGER)
-    why = (
-        f"Those of {larger} are larger than the fast noise, but no smooth function of time, angle, speed, current or "
-        "voltage predicts them on data left out."
-    )
-    return replace(judged, text=f"{judged.text} {why}")
+    return replace(judged, text=f"{judged.text} Those of {larger} are larger than the fast noise, but no smooth function "
+                                "of time, angle, speed, current or voltage predicts them on data left out.")
 
 
 def _sizes(channels: Mapping[str, Mapping[str, float]]) -> str:
@@ -115,11 +109,8 @@ def _sizes(channels: Mapping[str, Mapping[str, float]]) -> str:
 
 
 def _residuals(fit: Fit, channel: str) -> list[tuple[int, Array]]:
-    return [
-        (k, s.residual(channel))
-        for k, s in enumerate(fit.simulations)
-        if channel in s.experiment.outputs and channel in s.outputs
-    ]
+    return [(k, s.residual(channel)) for k, s in enumerate(fit.simulations)
+            if channel in s.experiment.outputs and channel in s.outputs]
 
 
 def _channel(fit: Fit, channel: str) -> dict[str, float]:
@@ -198,9 +189,7 @@ def _winsorised(r: Array) -> Array:
 def _labels(signals: Sequence[Array], bins: int) -> list[NDArray[np.intp]] | None:
     """Return bin numbers by quantiles of the signal over all runs."""
     edges = np.unique(np.quantile(np.concatenate(list(signals)), np.linspace(0, 1, bins + 1)[1:-1]))
-    if edges.size == 0:
-        return None
-    return [np.searchsorted(edges, s, side="right") for s in signals]
+    return [np.searchsorted(edges, s, side="right") for s in signals] if edges.size else None
 
 
 def _shift_test(labels: Sequence[NDArray[np.intp]], residuals: Sequence[Array]) -> tuple[float, float]:
@@ -228,15 +217,11 @@ def _sums(labels: NDArray[np.intp], r: Array, count: int) -> Array:
 
 def _score_tests(fit: Fit, scores: Sequence[Score]) -> list[dict[str, Any]]:
     """Turn predicted drops into p-values on effective samples, the search over shapes paid for."""
-    if not scores:
-        return []
     found = []
     for s in scores:
-        k = len(s.effect.parameters)
-        searched = 1 + 3 * sum(bool(p.grid) for p in s.effect.parameters)
-        if any(p.order for p in s.effect.parameters):
-            searched = SEARCHED
-        p = min(1.0, searched * float(chdtrc(k, -s.effective * np.log1p(-min(s.drop, 1 - 1e-12)))))
+        pars = s.effect.parameters
+        searched = SEARCHED if any(p.order for p in pars) else 1 + 3 * sum(bool(p.grid) for p in pars)
+        p = min(1.0, searched * float(chdtrc(len(pars), -s.effective * np.log1p(-min(s.drop, 1 - 1e-12)))))
         found.append({"channel": None, "on": s.effect.name, "share": s.drop, "p": p})
     return found
 
@@ -247,17 +232,18 @@ def _text(adequate: bool, channels: Mapping[str, Mapping[str, float]], material:
     if adequate:
         coloured = [channel_name(c) for c, f in channels.items() if f["autocorrelation"] > 0.3 or f["ratio"] > LARGER]
         colour = f" The noise of {' and '.join(coloured)} is coloured." if coloured else ""
-        return (
-            f"The errors ({sizes}) do not depend on the motion (false-alarm rate {100 * false_alarm:g} %).{colour}"
-        )
+        return f"The errors ({sizes}) do not depend on the motion (false-alarm rate {100 * false_alarm:g} %).{colour}"
     if not material:
         return f"Something is missing: the errors ({sizes}) are too large for noise, even coloured noise."
     worst = min(material, key=lambda t: (t["p"], -t["share"]))
     if worst["channel"] is None:
         why = f"'{worst['on']}' would explain {100 * worst['share']:.0f} % of them"
     else:
-        part = f"{100 * worst['share']:.0f} % of the variance of the {channel_name(worst['channel'])} error"
-        why = f"{worst['on']} explains {part}"
+        error = f"{channel_name(worst['channel'])} error"
+        why = f"{worst['on']} explains {100 * worst['share']:.0f} % of the variance of the {error}"
+    if all(f["ratio"] < 1 for f in channels.values()):
+        return (f"Something is missing: the errors are small ({sizes}, which fast motion makes look larger than it "
+                f"is), but they depend on the motion: {why}.")
     return f"Something is missing: the errors ({sizes}) are not noise; {why}."
 
 

@@ -60,9 +60,8 @@ def locate(fit: Fit) -> Missing:
         shares = {"electrical": 0.5, "mechanical": 0.5}
     signals = tuple(_signals(fit, k, s) for k, s in enumerate(both))
     voltage, torque = tuple(s.d[:, 0] for s in both), tuple(s.d[:, 1] for s in both)
-    bins = {
-        name: _against(d, signals) for name, d in (("voltage", voltage), ("torque", torque)) if any(x.any() for x in d)
-    }
+    bins = {name: _against(d, signals)
+            for name, d in (("voltage", voltage), ("torque", torque)) if any(x.any() for x in d)}
     regions = _regions(fit, signals)
     where = None
     if len(shares) > 1 and apart:
@@ -141,9 +140,8 @@ def _against(unknown: Sequence[Array], signals: Sequence[Mapping[str, Array]]) -
 
 def _binned(name: str, z: Array, d: Array, worth: float) -> Binned:
     # Half of the edges by count, half by distance: rest is one value, and rare speeds matter too.
-    inner = np.concatenate(
-        [np.quantile(z, np.linspace(0, 1, BINS // 2 + 1)), np.linspace(z.min(), z.max(), BINS // 2 + 1)]
-    )
+    half = BINS // 2 + 1
+    inner = np.concatenate([np.quantile(z, np.linspace(0, 1, half)), np.linspace(z.min(), z.max(), half)])
     edges = np.unique(inner)
     label = np.clip(np.searchsorted(edges, z, side="right") - 1, 0, len(edges) - 2)
     count = np.bincount(label, minlength=len(edges) - 1)

@@ -68,7 +68,7 @@ def _balance(row: np.ndarray, missing: Missing, balance: str, run: int | None) -
     unit = "V" if balance == "voltage" else missing.torque_unit
     noun = "force" if unit == "N" else balance
     share = missing.shares.get({"voltage": "electrical", "torque": "mechanical"}[balance])
-    part = "" if share is None else f": {100 * share:.0f} % of the misfit"
+    part = "" if share is None else f": {100 * share:.0f} % of the squared error"
     title = style.scaled_title(f"missing {noun}", unit, power)
     style.tidy(row[0], x="time (s)", y=title, title=f"Missing {noun}{part}")
     for ax, b in zip(row[1:], missing.bins.get(balance, ()), strict=False):
@@ -164,7 +164,7 @@ def _profile(x: Array, y: Array) -> tuple[Array, Array, Array, Array]:
 
 @style.styled
 def plot_ranking(result: Diagnosis | Sequence[Candidate], ax: Axes | None = None, *, show: int = 10) -> Axes:
-    """Draw the effects tried, best first: the share of the misfit that each would take away.
+    """Draw the effects tried, best first: by how much each lowers the squared error.
 
     The outline is the prediction from the sensitivities, the bar what a refit gave; a diamond is the fall
     of the held-out error (an arrow: it rises, by more than the axis shows). Accepted effects are blue.
@@ -200,7 +200,7 @@ def plot_ranking(result: Diagnosis | Sequence[Candidate], ax: Axes | None = None
     ax.set_xlim(lowest - 3 if lowest < 0 else 0, 103)
     ax.grid(axis="y", visible=False)
     more = f" (first {len(chosen)} of {len(every)})" if len(every) > len(chosen) else ""
-    style.tidy(ax, x="share of the misfit taken away (%)", title=f"Which effect is missing?{more}")
+    style.tidy(ax, x="fall of the squared error (%)", title=f"Which effect is missing?{more}")
     _ranking_legend(ax, chosen)
     return ax
 

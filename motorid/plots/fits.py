@@ -212,9 +212,8 @@ def _simulations(result: Any) -> list[Simulation]:
     if isinstance(result, Simulation):
         found = [result]
     if not found or not all(isinstance(s, Simulation) for s in found):
-        raise UsageError(
-            f"plot_fit takes a fit, mi.evaluate(fit, runs) or mi.simulate(model, runs); got {type(result).__name__}."
-        )
+        raise UsageError("plot_fit takes a fit, mi.evaluate(fit, runs) or mi.simulate(model, runs); "
+                         f"got {type(result).__name__}.")
     return list(found)
 
 

@@ -19,6 +19,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from motorid.channels import NAMES, SYMBOLS, UNITS, channel_name
+from motorid.display.numbers import number
 from motorid.errors import DataError, UsageError, arguments_told
 from motorid.numerics.signals import Array
 from motorid.records.experiment import Experiment
@@ -236,7 +237,7 @@ def plain_decades(ax: Axes) -> None:
 
     low, high = ax.get_ylim()
     ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if high < 200 * low else (1,)))
-    ax.yaxis.set_major_formatter(FuncFormatter(lambda v, _: f"{v:g}"))
+    ax.yaxis.set_major_formatter(FuncFormatter(lambda v, _: number(v, 1).removeprefix("1·")))
     ax.yaxis.set_minor_formatter(NullFormatter())
     ax.grid(which="minor", visible=False)
     ax.tick_params(which="minor", color=FAINT)

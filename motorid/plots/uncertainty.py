@@ -80,7 +80,7 @@ def _directions(ax: Axes, result: Identifiability) -> None:
 
 @style.styled
 def plot_profile(result: Profile | Mapping[str, Profile] | Intervals) -> np.ndarray:
-    """Draw how the misfit rises as a parameter is fixed away from its value, all others refitted.
+    """Draw how the error rises as a parameter is fixed away from its value, all others refitted.
 
     Where the curve crosses the dashed line the interval of 95 % ends. An even valley is what the covariance
     assumes; a curve that never reaches the line says that the data set no limit there. Of `Intervals` the
@@ -109,7 +109,7 @@ def plot_profile(result: Profile | Mapping[str, Profile] | Intervals) -> np.ndar
     for ax in axes[len(profiles) :]:
         ax.set_axis_off()
     for k in range(0, len(profiles), columns):
-        axes[k].set_ylabel("rise of the misfit (t²)")
+        axes[k].set_ylabel("rise of the error (t²)")
     handles, labels = axes[0].get_legend_handles_labels()
     axes[0].figure.legend(handles, labels, loc="outside upper center", ncols=5)
     return axes[: len(profiles)]
@@ -239,7 +239,7 @@ def plot_waterfall(result: Multistart) -> np.ndarray:
     Returns
     -------
     ndarray of Axes, shape (2,)
-        Misfit over the best, sorted; parameters of starts and ends over the reference.
+        Squared error over the best, sorted; parameters of starts and ends over the reference.
 
     Examples
     --------

@@ -92,7 +92,7 @@ def _provenance(story: Story, command: str, held_out: Sequence[Experiment]) -> S
     tables = [Table(["run", "file", "SHA-256 (first 16 digits)"], files)] if files else []
     return Section(
         "provenance",
-        "Where it comes from",
+        "Provenance",
         [*["The files are named by the fingerprint of their contents: the page can be traced to them."] * bool(files),
          f"Made with {versions}."],
         tables=tables,
@@ -142,10 +142,10 @@ def _of_diagnosis(d: Diagnosis, validate: Sequence[Experiment]) -> Story:
         story.sections.append(Section("details", "Details", (), d.details))
     if len(d.ladder.rungs) > 1:
         story.sections += [sections.parameters(d.before, d.after),
-                           sections.fitted(d.after, "The model with it", key="after", before=d.before, values=False)]
+                           sections.fitted(d.after, "The improved model", key="after", before=d.before, values=False)]
     if validate:
         story.sections.append(sections.held_out(d.after, validate))
-    first = sections.fitted(d.before, "The model it began with", values=d.after is d.before)
+    first = sections.fitted(d.before, "The original model", values=d.after is d.before)
     story.sections += [first, sections.where(d)]
     if d.ranking:
         story.sections.append(sections.which(d))

@@ -59,7 +59,7 @@ def fitted(fit: Fit, title: str, *, key: str = "fit", before: Fit | None = None,
     from motorid.plots import plot_fit
 
     caption = "Measured, model, and residual beside the band of the noise."
-    caption += " The thin curve is the model it began with." if before is not None else ""
+    caption += " The thin curve is the original model." if before is not None else ""
     alt = f"Measured and modelled channels of {fit.model.title}, with residuals. " + f"NRMSE: {fit.evaluation.words}."
     text = [f"{fit.model.title}: {fit.verdict[0].lower()}{fit.verdict[1:]} {ended(fit)}"]
     figure = _figure(key, caption, alt, plot_fit, fit, before=before)
@@ -84,7 +84,7 @@ def held_out(fit: Fit, validate: Sequence[Experiment]) -> Section:
     judged = evaluate(fit, validate)
     alt = "Measured and modelled channels of records that the fit never saw. " + f"NRMSE: {judged.words}."
     figure = _figure("held-out", "Records that the fit never saw.", alt, plot_fit, judged)
-    return Section("held-out", "On records it never saw", (), (), [figure], [error_table({"": judged})])
+    return Section("held-out", "Held-out records", (), (), [figure], [error_table({"": judged})])
 
 
 def answer(d: Diagnosis) -> Section:

@@ -14,7 +14,8 @@ from command import motorid, motorid_json
 from typer.main import get_command
 
 from motorid.cli.app import app
-from motorid.cli.console import _spread, wrapped
+from motorid.cli.console import _spread, show, wrapped
+from motorid.display.cards import Table
 from motorid.records.datasets import data_path, truth
 from motorid.records.reading import read_runs, write_csv
 
@@ -421,14 +422,28 @@ def test_effects_lists_the_library_and_shows_one():
     assert "Did you mean 'stribeck'" in motorid("effects", "stribek").err
 
 
-def test_names_stay_whole_at_80_columns(monkeypatch):
-    from motorid.cli import console
-
-    monkeypatch.setattr(console, "WIDTH", 80)
+def test_names_stay_whole_at_80_columns():
     lines = motorid("effects").out.splitlines()
     assert max(map(len, lines)) <= 80
     for name in ("inductance_saturation", "R_thm,", "omega_s"):
         assert any(name in line for line in lines), name
+
+
+def test_no_table_is_wider_than_80_columns_and_no_number_breaks(capsys):
+    done = motorid("fit", FRICTION / "run*.csv", "--effects", "coulomb", "--validate", FRICTION / "check1.csv")
+    assert max(map(len, done.out.splitlines())) <= 80
+    assert re.search(r"b +\(6\.\d+ ± 0\.\d+\)·10⁻⁵ N·m·s/rad +viscous friction", done.out)
+    errors = [f"{c}, {what}" for what in ("fitted", "held out") for c in ("current", "speed", "angle")]
+    show(Table(["model", *errors], [["DC motor", *6 * ["16.8 %"]], ["+ cogging + gravity", *6 * ["0.261 %"]]]))
+    upright = capsys.readouterr().out
+    assert upright.count("0.261 %") == 6
+    assert re.search(r"angle, held out +16\.8 % +0\.261 %", upright)
+
+
+def test_what_to_type_next_is_one_line(monkeypatch):
+    runs = [f"{FRICTION}/run1.csv", f"{FRICTION}/../hidden_friction/run2.csv"]
+    monkeypatch.setattr(sys, "argv", ["motorid", "fit", *runs])
+    assert f"Next: motorid diagnose {' '.join(runs)}" in motorid("fit", *runs).out.splitlines()
 
 
 def test_held_out_errors_are_said_beside_the_noise():
@@ -442,7 +457,7 @@ def test_held_out_errors_are_said_beside_the_noise():
 def test_lines_are_cut_between_words_but_not_before_a_unit():
     text = wrapped("the error of the current is " + "x" * 60 + " about 12.5 % and then more")
     assert "12.5 %" in text
-    assert max(map(len, text.splitlines())) <= 110
+    assert max(map(len, text.splitlines())) <= 80
     assert wrapped(12 * "a long word 1.25 % ").count("1.25 %") == 12
 
 

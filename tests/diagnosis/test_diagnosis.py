@@ -116,6 +116,16 @@ def test_a_model_that_lacks_friction_is_not_adequate(plain):
     assert "not noise" in judged.text
 
 
+def test_errors_below_the_noise_that_follow_the_motion_are_not_called_too_large(plain):
+    """The noise of fast records is estimated too large; stated too large here."""
+    runs = [r.with_(sigma={"i": 1.0, "omega": 30.0}) for r in plain.problem.experiments]
+    fit = mi.fit(mi.dc_motor(), runs)
+    judged = adequacy(fit, rank(fit, [LIBRARY[n] for n in FEW]))
+    assert not judged.adequate
+    assert max(f["ratio"] for f in judged.channels.values()) < 1
+    assert re.search(r"the errors are small \(.*\), but they depend on the motion: .* explains? \d+ %", judged.text)
+
+
 def test_errors_that_drift_far_beyond_the_noise_are_not_called_noise(plant):
     runs = runs_of(plant.MOTORS["servo"], {"coulomb": {"tau_c": 0.03}}, ("stairs", "ramps"), ("theta",), dt=2e-3)
     judged = adequacy(mi.fit(mi.dc_motor(), runs))

@@ -85,8 +85,8 @@ def test_it_needs_no_network_and_no_script(tree, text):
 def test_it_tells_the_whole_story(tree, found):
     titles = [words(h) for h in every(tree, "h2")]
     assert titles == [
-        "The answer", "How the parameters moved", "The model with it", "On records it never saw",
-        "The model it began with", "Where it fails", "Which effect is missing", "The data", "Where it comes from",
+        "The answer", "How the parameters moved", "The improved model", "Held-out records",
+        "The original model", "Where it fails", "Which effect is missing", "The data", "Provenance",
     ]  # fmt: skip
     body = words(every(tree, "body")[0])
     for told in (found.text, found.missing.text, found.suggestion, "no better than",

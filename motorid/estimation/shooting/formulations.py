@@ -21,6 +21,7 @@ from motorid.numerics.parallel import one_thread
 from motorid.problem.constraints import SteadyState
 from motorid.problem.problem import Problem
 from motorid.problem.relations import Relation, Weighed
+from motorid.problem.simulate import NRMSE
 from motorid.records.experiment import units_of
 
 WEIGHTS = tuple(10.0 ** np.arange(-2, 5))
@@ -92,8 +93,8 @@ class Formulations(Shown):
     @property
     def table(self) -> Table:
         """Everything side by side."""
-        note = " ".join([m.text for m in self.hard.multipliers if m.active]
-                        + [f.result.message for f in self.all if isinstance(f.result, Failure)])
+        note = " ".join([NRMSE, *(m.text for m in self.hard.multipliers if m.active),
+                         *(f.result.message for f in self.all if isinstance(f.result, Failure))])
         return Table(["quantity", *(f.name for f in self.all)], self._rows(), "Formulations", note)
 
     def _rows(self) -> list[Sequence[Cell]]:
