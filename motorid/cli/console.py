@@ -47,7 +47,7 @@ _OPTIONS = ((r"\b(columns|units)=\{(.*?)\}", lambda m: f"--{m[1]} {_pairs(m[2])}
             (r" If you know where it comes from, mi\.load.*", lambda m: ""))
 MANY = ("--validate",)  # options that take all names up to the next option
 OUTPUTS = ("--json", "--report")  # options that write a file
-COMMAND = "Next: motorid"
+COMMAND = ("Next: motorid", "Written: ")  # lines to copy, not wrapped
 MAY_WRAP = 32  # characters of a cell that is a sentence: shorter ones are names and numbers, and stay whole
 WIDTH = 80  # where the output is no terminal
 
@@ -257,8 +257,9 @@ def _filled(text: str, width: int, first: str = "") -> str:
 def next_command(name: str) -> str:
     """Return what to type next: this command line with another command, without what it writes."""
     words = iter(sys.argv[2:])
-    dropped = (*OUTPUTS, "--force")
-    kept = [w for w in words if not (w in OUTPUTS and next(words, None)) and w.partition("=")[0] not in dropped]
+    dropped = OUTPUTS if name == "diagnose" else (*OUTPUTS, "--budget", "--max-effects", "--remainder-to")
+    kept = [w for w in words if not (w in dropped and next(words, None))
+            and w.partition("=")[0] not in (*dropped, "--force")]
     line = shlex.join(["motorid", name, *kept])
     return line if kept and len(line) <= 2 * WIDTH else f"motorid {name} RUN... (the same records and options)"
 

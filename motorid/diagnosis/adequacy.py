@@ -100,8 +100,8 @@ def following(judged: Adequacy, what: str) -> Adequacy:
 def unpredicted(judged: Adequacy) -> Adequacy:
     """Return a judgement that knows that no free form predicts errors larger than the noise."""
     larger = " and ".join(channel_name(c) for c, f in judged.channels.items() if f["ratio"] > LARGER)
-    return replace(judged, text=f"{judged.text} Those of {larger} are larger than the fast noise, but no smooth function "
-                                "of time, angle, speed, current or voltage predicts them on data left out.")
+    return replace(judged, text=f"{judged.text} Those of {larger} are larger than the fast noise, but no smooth "
+                                "function of time, angle, speed, current or voltage predicts them on data left out.")
 
 
 def _sizes(channels: Mapping[str, Mapping[str, float]]) -> str:

@@ -76,7 +76,7 @@ def _against_limit(ax: Axes, s: Simulation, limit: float) -> None:
     for side in (-limit, limit):
         if float(np.max(np.sign(side) * i)) > 0.5 * limit:
             ax.axhline(side, color=style.INK, lw=1.0, ls=(0, (4, 2)), label="limit" if side > 0 else None)
-    ax.fill_between(t, np.clip(i, -limit, limit), i, color=style.PALETTE["orange"], alpha=0.6, lw=0, label="above limit")
+    ax.fill_between(t, np.clip(i, -limit, limit), i, color=style.PALETTE["orange"], alpha=0.6, lw=0, label="above it")
     beyond = float(np.max(np.abs(i)) - limit)
     words = f"{beyond:.2g} A above it" if beyond > 1e-6 * limit else "kept"
     ax.set_title(words, loc="right", fontsize=8, color=style.MUTED)

@@ -14,7 +14,7 @@ from command import motorid, motorid_json
 from typer.main import get_command
 
 from motorid.cli.app import app
-from motorid.cli.console import _spread, show, wrapped
+from motorid.cli.console import _spread, next_command, show, wrapped
 from motorid.display.cards import Table
 from motorid.records.datasets import data_path, truth
 from motorid.records.reading import read_runs, write_csv
@@ -444,6 +444,8 @@ def test_what_to_type_next_is_one_line(monkeypatch):
     runs = [f"{FRICTION}/run1.csv", f"{FRICTION}/../hidden_friction/run2.csv"]
     monkeypatch.setattr(sys, "argv", ["motorid", "fit", *runs])
     assert f"Next: motorid diagnose {' '.join(runs)}" in motorid("fit", *runs).out.splitlines()
+    monkeypatch.setattr(sys, "argv", ["motorid", "diagnose", "run.csv", "--budget", "8", "--max-effects=1", "--hold", "zoh"])
+    assert next_command("fit") == "motorid fit run.csv --hold zoh", "fit takes no budget"
 
 
 def test_held_out_errors_are_said_beside_the_noise():
