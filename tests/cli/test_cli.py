@@ -444,7 +444,8 @@ def test_what_to_type_next_is_one_line(monkeypatch):
     runs = [f"{FRICTION}/run1.csv", f"{FRICTION}/../hidden_friction/run2.csv"]
     monkeypatch.setattr(sys, "argv", ["motorid", "fit", *runs])
     assert f"Next: motorid diagnose {' '.join(runs)}" in motorid("fit", *runs).out.splitlines()
-    monkeypatch.setattr(sys, "argv", ["motorid", "diagnose", "run.csv", "--budget", "8", "--max-effects=1", "--hold", "zoh"])
+    line = "motorid diagnose run.csv --budget 8 --max-effects=1 --hold zoh"
+    monkeypatch.setattr(sys, "argv", line.split())
     assert next_command("fit") == "motorid fit run.csv --hold zoh", "fit takes no budget"
 
 
