@@ -1,4 +1,4 @@
-"""What a voltage would tell about rival models, and its gradient: a designed experiment as an NLP.
+"""What a voltage would tell about rival models, its gradient, and the search for the best.
 
 The unknowns are voltage levels. Each rival is driven by them through the discrete step of the fits, whose exact
 derivatives carry the slopes with respect to levels and parameters over the record. What earlier records tell about the
@@ -7,27 +7,28 @@ parameters enters as a Gaussian prior with their information matrix (Gauss-Newto
 - Distinguishing (T-optimality: Atkinson & Fedorov, Biometrika 62, 1975): the χ² that is left between the predictions of
   two rivals after **both** have moved their parameters as far as old and new records let them. At that minimum the
   gradient needs first derivatives only (Danskin).
-- Sharpening (D_s-optimality: Atkinson, Donev & Tobias, Optimum Experimental Designs, 2007, ch. 10): log det of the
-  information on the asked parameters, the others estimated too. Its gradient takes differences, along few directions
-  of the parameters, of the exact slopes with respect to the levels.
+- Sharpening: the product of the asked parameters' variances, the others estimated too; for one of them D_s-optimality
+  (Atkinson, Donev & Tobias, Optimum Experimental Designs, 2007, ch. 10). Its gradient takes differences, along one
+  direction of the parameters each, of the exact slopes with respect to the levels.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import dataclass, field, replace
+from functools import cached_property, lru_cache
 from itertools import pairwise, permutations
 from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter1d
+from scipy.optimize import linprog
 
-from motorid.acquire.excitation import program
+from motorid.acquire.excitation import lfsr_bits, program
 from motorid.errors import OutOfTime, SimulationError, UsageError
 from motorid.estimation.result import Fit
-from motorid.estimation.shooting.nlp import callbacks
 from motorid.integrate.engine import Grid
 from motorid.integrate.rosenbrock import Rosenbrock
 from motorid.model.equations import System
@@ -41,9 +42,14 @@ REGION = 2.0  # standard deviations within which the truth may lie
 SETTLED = 0.01  # relative fall of χ² at which it ends
 ROUNDING = 1e-10  # of the information, beside which the prior of one unit would be lost
 BESIDE = 1e-4  # of a unit of the solver's coordinates, for differences of slopes
-DEVIATIONS = 3.0  # of the prediction that a limit keeps away
-NOISES = 4.0  # standard deviations of the sensor's noise that it keeps away besides
-LARGEST_MARGIN = 0.5  # of a limit; what is less certain than that is left to the check by draws
+NOISES = 4.0  # standard deviations of the sensor's noise that a limit keeps away
+LARGEST_MARGIN = 0.5  # of a limit
+RADIUS, SMALLEST_RADIUS = 0.3, 2e-3  # of the largest voltage: of the first step of the search, and of its last
+MOST_STEPS = 25
+WORTHWHILE = 2e-3  # nats: a step that promises less ends the search
+OVER = 1e-3  # of a limit, by which a step may pass it; the last check takes it away
+ELSEWHERE = 21  # samples among which what asks for short steps may move while the voltage is optimised
+PERIOD = 32767  # bits of a binary signal, after which it repeats
 ENGINE = Rosenbrock()
 
 
@@ -91,6 +97,11 @@ class Rival:
         return Rival(name or fit.model.title, fit.model.with_(angle_input=False).fix(*of_runs), sigma,
                      problem.scaling.scale[:k], known, seen)
 
+    def smoothed(self, width: float) -> Rival:
+        """Return it with sgn at least so wide (rad/s): a sharp reversal makes criteria rough in the voltage."""
+        own = self.model.values.get("sgn_width", np.inf)
+        return self if own >= width else replace(self, model=self.model.replace(sgn_width=width))
+
     @cached_property
     def scaling(self) -> Scaling:
         """The solver's coordinates of the free parameters."""
@@ -132,11 +143,24 @@ class Rival:
         return Rival(str(contents["name"]), model, sigma, scale, information, seen)
 
 
+@lru_cache(maxsize=64)
+def quiet_seed(n: int, rank: int) -> int:
+    """Return a seed whose `n` bits, as ±1, have a running sum that stays small: the best but `rank`."""
+    bits = np.fromiter(lfsr_bits(1, PERIOD + n + 15), dtype=np.int64)
+    total = np.concatenate([[0], np.cumsum(2 * bits - 1)])
+    reach = np.zeros(PERIOD, int)
+    for k in range(1, n + 1):
+        np.maximum(reach, np.abs(total[k:k + PERIOD] - total[:PERIOD]), out=reach)
+    at = int(np.argsort(reach, kind="stable")[rank])
+    return int(bits[at:at + 15] @ (1 << np.arange(15)))
+
+
 @dataclass(frozen=True, eq=False)
 class Layout:
     """How unknowns become a voltage: segments of whole milliseconds, each a step or a ramp between two levels.
 
-    On a step, a pseudo-random binary signal of its own amplitude may ride: it shows what is quick.
+    On a step, a pseudo-random binary signal of its own amplitude may ride: it shows what is quick. Its seed is the one
+    whose running sum stays smallest, so that the speed hardly moves and the current may be large.
 
     Attributes
     ----------
@@ -145,7 +169,7 @@ class Layout:
     dt : float
         s between samples.
     bits : tuple of int
-        ms per bit on each step; empty for ramps from one level to the next.
+        ms per bit on each step, 0 for a ramp between two levels of its own; empty for ramps from one level to the next.
     mixing : ndarray, shape (levels, unknowns), or None
         Levels, in units of `v_max`, of the unknowns; None: they are the unknowns.
     v_max : float
@@ -178,7 +202,7 @@ class Layout:
         found = np.zeros((int(self.edges[-1]) + 1, 2))
         for j, (a, b) in enumerate(pairwise(self.edges)):
             found[a:b, 0] = np.arange(b - a) * self.dt * 1e3 / self.ms[j]
-            if self.bits:
+            if self.bits and self.bits[j]:
                 found[a:b, 1] = program(self._riding(j, 0.0, 1.0)).volts(1 / self.dt)
         return found
 
@@ -186,11 +210,12 @@ class Layout:
         """Return the voltage at each sample and the end, (N+1,)."""
         n = len(self.ms)
         owner = np.minimum(np.searchsorted(self.edges, np.arange(self.edges[-1] + 1), "right") - 1, n - 1)
-        low, high, ripple = levels[owner], levels[owner + self.ramps], levels[n + owner] if self.bits else 0.0
+        low, high, ripple = np.array([self.at(levels, j) for j in range(n)])[owner].T
         return low + (high - low) * self.inputs[:, 0] + ripple * self.inputs[:, 1]
 
     def _riding(self, j: int, level: float, amplitude: float) -> str:
-        return f"prbs:{amplitude:g}:{self.bits[j] / 1e3:g}:{self.ms[j] / 1e3:g}:{level:g}:{1 + 37 * j}"
+        seed = quiet_seed(-(-self.ms[j] // self.bits[j]), j)
+        return f"prbs:{amplitude:g}:{self.bits[j] / 1e3:g}:{self.ms[j] / 1e3:g}:{level:g}:{seed}"
 
     def of(self, c: Array) -> Array:
         """Return the levels, V, of the unknowns."""
@@ -198,12 +223,15 @@ class Layout:
 
     def places(self, j: int) -> tuple[int, int, int]:
         """Return which levels are the voltage at both ends of segment `j`, and the amplitude on it (-1: none)."""
-        return j, j + self.ramps, len(self.ms) + j if self.bits else -1
+        if self.ramps:
+            return j, j + 1, -1
+        other = len(self.ms) + j
+        return (j, j, other) if self.bits[j] else (j, other, -1)
 
     def at(self, levels: Array, j: int) -> tuple[float, float, float]:
         """Return the voltages at both ends of segment `j`, and the amplitude on it."""
         a, b, ripple = self.places(j)
-        return float(levels[a]), float(levels[b]), float(levels[ripple]) if self.bits else 0.0
+        return float(levels[a]), float(levels[b]), float(levels[ripple]) if ripple >= 0 else 0.0
 
     def words(self, levels: Array) -> str:
         """Return the excitation that `motorid record` plays."""
@@ -314,7 +342,7 @@ class Driven:
         p, _ = self.parameters(np.zeros(len(self.rival.scale)))
         grid = replace(self, substeps=np.ones_like(self.substeps)).grid(levels)
         fine = ENGINE.prepare(self.system, grid, self.system.first_state(np.zeros(3), p), p, tolerance)
-        return replace(self, substeps=np.maximum(fine.substeps, self.substeps))
+        return replace(self, substeps=np.maximum(maximum_filter1d(fine.substeps, ELSEWHERE), self.substeps))
 
     def informs(self, response: Response) -> Array:
         """Return the information (k, k) on the parameters, old and new."""
@@ -378,23 +406,16 @@ def _worst_case(normal: Array, right: Array, prior: Array, region: float) -> Arr
 
 
 def precision(a: Driven, asked: Sequence[int], levels: Array, response: Response, slopes: bool) -> Value:
-    """Return log det of the information on the asked parameters, the others estimated too."""
-    information = a.informs(response)
-    k = len(information)
-    others = [j for j in range(k) if j not in asked]
-    weight = np.linalg.inv(information)
-    value = float(np.linalg.slogdet(information)[1])
-    if others:
-        rest = information[np.ix_(others, others)]
-        value -= float(np.linalg.slogdet(rest)[1])
-        weight[np.ix_(others, others)] -= np.linalg.inv(rest)
+    """Return minus the sum of the logarithms of the asked parameters' variances, the others estimated too."""
+    covariance = np.linalg.inv(a.informs(response))
+    k, variances = len(covariance), np.diag(covariance)[list(asked)]
+    value = -float(np.sum(np.log(variances)))
     if not slopes:
         return Value(value)
-    sizes, directions = np.linalg.eigh(weight)  # of rank len(asked)
     slope = np.zeros(len(levels))
-    for size, way in list(zip(sizes, directions.T, strict=True))[-len(asked):]:
+    for way in (covariance[:, list(asked)] / np.sqrt(variances)).T:
         up, down = (a.respond(levels, s * BESIDE * way, by_level=True).dy for s in (1, -1))
-        slope += 2 * size * np.tensordot(response.dy[:, :, -k:] @ way, (up - down) / (2 * BESIDE), 2)
+        slope += 2 * np.tensordot(response.dy[:, :, -k:] @ way, (up - down) / (2 * BESIDE), 2)
     return Value(value, slope)
 
 
@@ -417,6 +438,8 @@ class Task:
         Largest change of the voltage along a ramp, V/s.
     nominal : frozenset of (int, int)
         Pairs whose truth is taken as it was fitted: within its uncertainty nothing would distinguish them.
+    spread : dict of str to float
+        By state: how many times further than the rivals uncertain parameters may go.
     """
 
     driven: tuple[Driven, ...]
@@ -426,11 +449,17 @@ class Task:
     pairs: tuple[tuple[int, int], ...]
     slew: float
     nominal: frozenset[tuple[int, int]] = frozenset()
+    spread: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def layout(self) -> Layout:
         """How levels become a voltage."""
         return self.driven[0].layout
+
+    def laid(self, layout: Layout) -> Task:
+        """Return the task with another layout, one integration step per sample."""
+        ones = np.ones(int(layout.edges[-1]), int)
+        return replace(self, driven=tuple(replace(d, layout=layout, substeps=ones) for d in self.driven))
 
     def refined(self, levels: Array, tolerance: float) -> Task:
         """Return the task with integration steps that suit `levels`."""
@@ -459,108 +488,116 @@ class Task:
     def extremes(self, answers: Sequence[Response]) -> tuple[Array, Array, Array, Array]:
         """Return the extremes of each limited state in each segment: values, slopes, lower and upper limits, scaled.
 
-        A limit is kept away from by the prediction's own deviation and the sensor's noise.
+        A limit is kept away from by the sensor's noise, and by how far uncertain parameters may go beyond the rivals.
         """
         found = []
         for d, r in zip(self.driven, answers, strict=True):
-            k, cov = len(d.rival.scale), np.linalg.inv(d.rival.known)
+            k = len(d.rival.scale)
             for s in (s for s in self.limits if s in d.system.states):
                 j, (low, high) = d.system.states.index(s), self.limits[s]
                 x, size = r.x[:, j], min(abs(low), abs(high))
                 at = [a + f(x[a:b + 1]) for a, b in pairwise(d.layout.edges) for f in (np.argmax, np.argmin)]
-                slopes = r.dx[at, j]
-                sd = np.sqrt(np.einsum("ij,jk,ik->i", slopes[:, -k:], cov, slopes[:, -k:]))
-                margin = np.minimum(DEVIATIONS * sd + NOISES * self.noise.get(s, 0.0), LARGEST_MARGIN * size)
+                margin, spread = min(NOISES * self.noise.get(s, 0.0), LARGEST_MARGIN * size), self.spread.get(s, 1.0)
                 upper = np.arange(len(at)) % 2 == 0
-                found.append((x[at] / size, slopes[:, :-k] / size, np.where(upper, -np.inf, (low + margin) / size),
-                              np.where(upper, (high - margin) / size, np.inf)))
+                found.append((x[at] / size, r.dx[at, j, :r.dx.shape[2] - k] / size,
+                              np.where(upper, -np.inf, (low + margin) / spread / size),
+                              np.where(upper, (high - margin) / spread / size, np.inf)))
         values, slopes, low, high = (np.concatenate(parts) for parts in zip(*found, strict=True))
         return values, slopes, low, high
 
-
-class DesignNlp:
-    """Maximise the least criterion under the limits: unknowns (c, z), z below every criterion.
-
-    Limits of the states hold at the largest and the smallest value of each segment. `best` is the best point met that
-    keeps them; a budget of time or Ctrl-C ends the search there.
-    """
-
-    scale = 1.0
-
-    def __init__(self, task: Task, c: Array) -> None:
-        self.task = task
-        self._kept: tuple[bytes, bool, Any] = (b"", False, None)
-        self._linear, low, high = _linear_rows(task)
-        self._n = len(c)
-        self.stopped = False
-        self.best, self.best_value = c, -np.inf
-        answers = task.respond(task.layout.of(c))
-        _, _, lower, upper = task.extremes(answers)
-        self._count = len(task.criteria(task.layout.of(c), answers, False))
-        self.lower = np.concatenate([np.zeros(self._count), lower, low])
-        self.upper = np.concatenate([np.full(self._count, np.inf), upper, high])
-
-    def start(self) -> Array:
-        """Return (c, z) at the best point so far."""
-        found = self._at(np.append(self.best, 0.0), False)
-        return np.append(self.best, 0.0 if found is None else found[0].min())
-
-    def _evaluate(self, c: Array, slopes: bool) -> tuple[Array, Array, Array | None]:
-        """Return criteria, rows of limits, and the Jacobian of both by the unknowns."""
-        task, layout = self.task, self.task.layout
-        levels = layout.of(c)
-        answers = task.respond(levels, slopes)
-        worth, (extremes, by_level, _, _) = task.criteria(levels, answers, slopes), task.extremes(answers)
-        values, limited = np.array([w.value for w in worth]), np.concatenate([extremes, self._linear @ c])
-        if not slopes:
-            return values, limited, None
-        by_level = np.vstack([*(w.slope for w in worth), by_level])
-        by_unknown = by_level @ (layout.v_max * (np.eye(layout.levels) if layout.mixing is None else layout.mixing))
-        return values, limited, np.vstack([by_unknown, self._linear])
-
-    def _at(self, z: Array, slopes: bool) -> Any:
-        key, had, found = self._kept
-        if key == z[:-1].tobytes() and (had or not slopes):
-            return found
-        try:
-            check_time()
-            found = None if self.stopped else self._evaluate(z[:-1], slopes)
-        except (SimulationError, np.linalg.LinAlgError):
-            found = None
-        except (OutOfTime, KeyboardInterrupt):
-            interruption.heard()
-            self.stopped, found = True, None
-        self._kept = z[:-1].tobytes(), slopes, found
-        if found is not None:
-            n, rows = self._count, found[1]
-            inside = np.all(rows <= self.upper[n:] + 1e-6) and np.all(rows >= self.lower[n:] - 1e-6)
-            if inside and found[0].min() > self.best_value:
-                self.best, self.best_value = z[:-1].copy(), float(found[0].min())
+    def reach(self, levels: Array, displaced: Sequence[Array]) -> dict[str, tuple[float, float]]:
+        """Return the smallest and largest value of each limited state; `displaced` (n, k): parameters, by rival."""
+        found = dict.fromkeys(self.limits, (0.0, 0.0))
+        for d, deltas in zip(self.driven, displaced, strict=True):
+            for delta in deltas:
+                try:
+                    x = d.respond(levels, delta).x
+                except SimulationError:  # parameters that no motor has
+                    continue
+                for s in (s for s in self.limits if s in d.system.states):
+                    y, (low, high) = x[:, d.system.states.index(s)], found[s]
+                    found[s] = min(low, float(y.min())), max(high, float(y.max()))
         return found
 
-    def values(self, z: Array) -> list[Any]:
-        """Return f and g."""
-        found = self._at(z, False)
-        if found is None:
-            return [np.nan, np.full(len(self.lower), np.nan)]
-        return [-z[-1], np.concatenate([found[0] - z[-1], found[1]])]
 
-    def gradient(self, z: Array) -> list[Any]:
-        """Return f and its gradient."""
-        return [-z[-1], np.append(np.zeros(self._n), -1.0)]
+@dataclass(frozen=True, eq=False)
+class Found:
+    """Where a search ended: the task with its integration steps, the unknowns, the least criterion there."""
 
-    def jacobian(self, z: Array) -> list[Any]:
-        """Return g and its Jacobian, column by column."""
-        found = self._at(z, True)
-        if found is None:
-            return [np.full(len(self.lower), np.nan), np.full(len(self.lower) * (self._n + 1), np.nan)]
-        last = np.append(-np.ones(self._count), np.zeros(len(self.lower) - self._count))
-        return [np.concatenate([found[0] - z[-1], found[1]]), np.column_stack([found[2], last]).ravel(order="F")]
+    task: Task
+    c: Array
+    value: float
+    stopped: bool = False
 
-    def functions(self) -> tuple[ca.Callback, dict[str, ca.Callback]]:
-        """Return the NLP and its derivatives in CasADi's naming."""
-        n, m = self._n + 1, len(self.lower)
-        return callbacks(self, n, m, ca.Sparsity.dense(m, n))
+
+def climb(task: Task, c: Array) -> Found:
+    """Maximise the least criterion under the limits, from unknowns that keep them, by sequential linear programming.
+
+    The information is convex in a linear motor's voltage, so that its maxima lie where limits are active, and a linear
+    program goes there at once (Fletcher & Sainz de la Maza, Mathematical Programming 43, 1989); the trust region
+    shrinks where the step does not keep its promise. Limits of the states hold at the largest and the smallest value
+    of each segment. A budget of time or Ctrl-C ends the search at the best point so far.
+    """
+    linear, low, high = _linear_rows(task)
+    radius, best = RADIUS, Found(task, c, -np.inf)
+    try:
+        worth, limits = _linearised(task, c, True)
+        best = Found(task, c, float(worth[0].min()))
+        for _ in range(MOST_STEPS):
+            check_time()
+            rows = [*limits, (linear @ c, linear, low, high)]
+            step, promise = _linear_step(c, worth, rows, radius)
+            if promise < WORTHWHILE:
+                break
+            try:
+                there, kept = _linearised(task, c + step, False)
+                gain = float(there[0].min()) - best.value
+                good = gain > 0.1 * promise and all(np.all((y <= h + OVER) & (y >= w - OVER)) for y, _, w, h in kept)
+            except (SimulationError, np.linalg.LinAlgError):
+                good = False
+            radius *= 1.5 if good else 0.4
+            if good:
+                c, best = c + step, Found(task, c + step, best.value + gain)
+                worth, limits = _linearised(task, c, True)
+            elif radius < SMALLEST_RADIUS:
+                break
+    except (SimulationError, np.linalg.LinAlgError):
+        return best
+    except (OutOfTime, KeyboardInterrupt):
+        interruption.heard()
+        return replace(best, stopped=True)
+    return best
+
+
+Rows = tuple[Array, Array, Array, Array]  # values, slopes, lower and upper limits
+
+
+def _linearised(task: Task, c: Array, slopes: bool) -> tuple[tuple[Array, Array], list[Rows]]:
+    """Return the criteria and their slopes by the unknowns, and the limited states likewise."""
+    layout = task.layout
+    levels, mix = layout.of(c), layout.v_max * (np.eye(layout.levels) if layout.mixing is None else layout.mixing)
+    answers = task.respond(levels, slopes)
+    worth, (x, dx, low, high) = task.criteria(levels, answers, slopes), task.extremes(answers)
+    values = np.array([w.value for w in worth])
+    if not slopes:
+        return (values, np.zeros((len(values), 0))), [(x, np.zeros((len(x), 0)), low, high)]
+    return (values, np.array([w.slope for w in worth]) @ mix), [(x, dx @ mix, low, high)]
+
+
+def _linear_step(c: Array, worth: tuple[Array, Array], rows: Sequence[Rows], radius: float) -> tuple[Array, float]:
+    """Return the step within `radius` that raises the least linearised criterion most, and by how much."""
+    values, slopes = worth
+    a, b = [np.column_stack([-slopes, np.ones(len(values))])], [values]
+    for y, dy, low, high in rows:
+        for sign, limit in ((1.0, high), (-1.0, -low)):
+            at = np.isfinite(limit)
+            a.append(np.column_stack([sign * dy[at], np.zeros(at.sum())]))
+            b.append(np.maximum(limit[at] - sign * y[at], 0.0))
+    bounds = [(max(-1 - x, -radius), min(1 - x, radius)) for x in c] + [(None, None)]
+    done = linprog(np.append(np.zeros(len(c)), -1.0), np.vstack(a), np.concatenate(b), bounds=bounds, method="highs")
+    if done.x is None:
+        return np.zeros(len(c)), 0.0
+    return done.x[:-1], float(done.x[-1] - values.min())
 
 
 def _linear_rows(task: Task) -> tuple[Array, Array, Array]:
@@ -570,7 +607,8 @@ def _linear_rows(task: Task) -> tuple[Array, Array, Array]:
     rows, high = [np.zeros((0, mix.shape[1]))], [np.zeros(0)]
     if layout.mixing is not None or layout.bits:
         n = len(layout.ms)
-        rows += [mix] if layout.ramps else [mix[:n] + mix[n:], mix[:n] - mix[n:]]
+        on = np.array(layout.bits, bool)
+        rows += [mix] if layout.ramps else [(mix[:n] + mix[n:])[on], (mix[:n] - mix[n:])[on]]
         high += [np.ones(len(r)) for r in rows[1:]]
     if np.isfinite(task.slew):
         rows.append(np.diff(np.vstack([0 * mix[:1], mix, 0 * mix[:1]]), axis=0))

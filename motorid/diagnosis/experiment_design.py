@@ -17,13 +17,12 @@ import numpy as np
 
 from motorid.acquire.excitation import program
 from motorid.channels import UNITS, channel_name
-from motorid.diagnosis.design_criteria import NOISES, DesignNlp, Driven, Layout, Rival, Task, all_pairs
+from motorid.diagnosis.design_criteria import NOISES, Driven, Found, Layout, Rival, Task, all_pairs, climb
 from motorid.diagnosis.results import Diagnosis
 from motorid.display.cards import Card, Flag, Printed, Shown, Table
 from motorid.display.numbers import number, quantity
 from motorid.errors import FitError, MotoridError, SimulationError, UsageError, one_of
 from motorid.estimation.result import Fit
-from motorid.estimation.shooting.nlp import Ipopt
 from motorid.numerics.parallel import budget as limited_time
 from motorid.numerics.parallel import one_thread
 from motorid.numerics.signals import Array
@@ -156,19 +155,17 @@ LEVELS = 30  # a board takes 32 segments
 SHORTEST = 5  # ms of a segment
 FINE = 200  # steps by which a fixed candidate is followed
 MOST_RIVALS = 4
-STARTS = 2
+SHARPENED, DISTINGUISHED = 8, 3  # starts of the search
 TRACE = 0.02  # of v_max: a binary signal smaller than this is left out
 MOST_PAIRS = 3  # that one optimisation looks at
 HOPELESS = 0.1  # log(1 + χ²) below which two rivals are as good as one model
 ENOUGH = 7.0  # the same, from which another start is not worth its time
 RIPPLES = (0.0, 0.3)  # share of the voltage for a binary signal on top of a candidate
 DRAWS = 16  # of the parameters, for the check of the limits
+MOST_SPREAD = 2.0
+SMOOTH = 5e-3  # of the largest speed: width of sgn while the voltage is sought
 TOLERANCE = 1e-4  # of the integration, relative to the largest state
 WORTH = 4.0  # nats between two rivals from which they count as distinguished
-SOLVER = Ipopt(20, 1e-3, more={
-    "hessian_approximation": "limited-memory", "dual_inf_tol": 1e-2, "constr_viol_tol": 1e-4, "compl_inf_tol": 1e-3,
-    "acceptable_iter": 3, "acceptable_tol": 1e-2, "mu_strategy": "monotone", "mu_init": 1e-3, "bound_push": 1e-3,
-    "bound_frac": 1e-3, "slack_bound_push": 1e-3, "slack_bound_frac": 1e-3})
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -275,11 +272,11 @@ def design_experiment(found: Diagnosis | Fit | Sequence[Fit | Rival], *, goal: s
 
     Distinguishing is T-optimal (Atkinson & Fedorov, Biometrika 62, 1975): the largest least χ² between any two
     rivals, the one refitted to all records, the other, the truth, anywhere within two standard deviations of its
-    values (as fitted, where that would hide the difference). Sharpening is D-optimal (Fedorov, Theory of Optimal
-    Experiments, 1972; for some of the parameters D_s): log det of the Fisher information, that of the records so far
-    included. Both are solved as an NLP (IPOPT) with the exact derivatives of the discrete step, from fixed candidates
-    as starts; the limits are constraints for every rival, kept away from by the prediction's uncertainty, and checked
-    again with drawn parameters.
+    values (as fitted, where that would hide the difference). Sharpening is D_s-optimal for one parameter (Fedorov,
+    Theory of Optimal Experiments, 1972); for several, the product of their variances by the Fisher information, that
+    of the records so far included. Both are solved as an NLP, by sequential linear programming with the exact
+    derivatives of the discrete step, from fixed candidates and from waves with current or speed at the limit; the
+    limits are constraints for every rival and for drawn parameters.
 
     It is a local optimum, as good as the rivals: where all of them are wrong, it promises nothing, nor do the limits.
 
@@ -333,11 +330,14 @@ def design_experiment(found: Diagnosis | Fit | Sequence[Fit | Rival], *, goal: s
     layout = _layout(shape, levels, duration, max(dt, 0.5 * duration / SAMPLES), limits["v"][1])
     task = _task(rivals, layout, {s: x for s, x in limits.items() if s != "v"}, asked, slew)
     task = _hopeful(task)
-    fixed = _fixed(task)
+    name, fine, at = _fixed(task)
+    fine = _exact(fine, rivals).refined(fine.layout.of(at), TOLERANCE)
+    fixed = name, fine, _safe(fine, at)[0]
     say("compared fixed candidates")
     with limited_time(budget):
         best = _optimised(task, say)
-    c = best.best if layout.ramps else _without_traces(best.best)
+    task, layout = _exact(replace(best.task, pairs=task.pairs), rivals), best.task.layout
+    c = best.c if layout.ramps else _without_traces(layout, best.c)
     c, peaks = _safe(task.refined(layout.of(c), TOLERANCE), c)
     return _told(task.refined(layout.of(c), TOLERANCE), c, peaks, fixed, limits,
                  "stopped early" if best.stopped else "designed")
@@ -351,26 +351,28 @@ def _check_sizes(**given: float | None) -> None:
                              "records.")
 
 
-def _optimised(task: Task, say: Callable[[str], None]) -> DesignNlp:
-    """Return the NLP with the best point, from the best starts."""
-    done: list[DesignNlp] = []
-    for name, (_, c) in list(_starts(task).items())[:STARTS * (2 if task.asked else 1)]:
-        nlp = DesignNlp(_hardest(task, c).refined(task.layout.of(c), TOLERANCE), c)
-        one = np.ones(len(c))
-        solver = replace(SOLVER, max_iterations=60) if task.asked else SOLVER  # its criterion costs little
-        solver.solve(nlp, nlp.start(), (np.append(-one, -np.inf), np.append(one, np.inf)))
-        done.append(nlp)
-        say(f"optimised from the {name}: {nlp.best_value:.3g}")
-        if nlp.stopped or (task.pairs and nlp.best_value > ENOUGH):
+def _optimised(task: Task, say: Callable[[str], None]) -> Found:
+    """Return the best point that the search reaches from the best starts."""
+    done: list[Found] = []
+    for name, (_, here, c) in list(_starts(task).items())[:SHARPENED if task.asked else DISTINGUISHED]:
+        start = _within(replace(here, spread=_spread(here, c)), c)
+        if start is None:
+            continue
+        found = climb(_hardest(start[1], start[2]), start[2])
+        again = None if found.stopped else _within(found.task, found.c)  # integration steps that suit what was found
+        done.append(climb(again[1], again[2]) if again else found)
+        say(f"optimised from the {name}: {done[-1].value:.3g}")
+        if done[-1].stopped or (task.pairs and done[-1].value > ENOUGH):
             break
     if not done:
         raise FitError("no record stays within the limits with all models; allow more voltage, current or angle.")
-    return max(done, key=lambda nlp: nlp.best_value)
+    return max(done, key=lambda f: f.value)
 
 
 def _hopeful(task: Task) -> Task:
     """Return the task with the truth as it was fitted in pairs where within its uncertainty no candidate would do."""
-    every = [task.layout.of(c) for _, c in _starts(task, (0.0,)).values()] if task.pairs else []
+    kept = [_within(task, c) for c in _followed(task.layout, (0.0,)).values()] if task.pairs else []
+    every = [task.layout.of(k[2]) for k in kept if k is not None]
     if not every:
         return task
     worth = [[w.value for w in task.criteria(levels, task.respond(levels), False)] for levels in every]
@@ -378,10 +380,10 @@ def _hopeful(task: Task) -> Task:
     return replace(task, nominal=frozenset(p for p, b in zip(task.pairs, best, strict=True) if b <= HOPELESS))
 
 
-def _without_traces(c: Array) -> Array:
+def _without_traces(layout: Layout, c: Array) -> Array:
     """Return the unknowns of steps without binary signals that are next to nothing."""
     n = len(c) // 2
-    return np.concatenate([c[:n], np.where(np.abs(c[n:]) < TRACE, 0.0, c[n:])])
+    return np.concatenate([c[:n], np.where((np.array(layout.bits) > 0) & (np.abs(c[n:]) < TRACE), 0.0, c[n:])])
 
 
 def _hardest(task: Task, c: Array) -> Task:
@@ -471,13 +473,31 @@ def _layout(shape: str, levels: int, duration: float, dt: float, v_max: float) -
 def _task(rivals: Sequence[Rival], layout: Layout, limits: Mapping[str, tuple[float, float]], asked: tuple[str, ...],
           slew: float | None) -> Task:
     errors = {c: float(np.sqrt(np.mean([r.sigma[c] ** 2 for r in rivals]))) for c in rivals[0].sigma}
-    driven = tuple(Driven.of(r, layout, errors, "theta" in limits) for r in rivals)
+    width = SMOOTH * limits["omega"][1] if "omega" in limits else 0.0
+    driven = tuple(Driven.of(r.smoothed(width), layout, errors, "theta" in limits) for r in rivals)
     return Task(driven, limits, errors, asked, () if asked else all_pairs(len(rivals)), slew or np.inf)
 
 
-def _starts(task: Task, ripples: Sequence[float] = RIPPLES) -> dict[str, tuple[float, Array]]:
-    """Return by name of the candidate its worth and the unknowns next to it, within the limits; the best first."""
-    layout, found = task.layout, {}
+def _starts(task: Task) -> dict[str, tuple[float, Task, Array]]:
+    """Return starts by name: worth, the task in their layout, unknowns within the limits; the best first."""
+    found = {}
+    for name, (layout, c) in ({} if task.layout.ramps else _waves(task)).items():
+        found[name] = _within(task.laid(layout), c)
+    found |= {n: _within(task, c) for n, c in _followed(task.layout, RIPPLES).items()}
+    kinds: dict[str, str] = {}
+    ranked = _best_first(found)
+    for name in ranked:
+        kinds.setdefault(name.split(" + ")[0], name)
+    return {n: ranked[n] for n in kinds.values()}
+
+
+def _best_first(found: Mapping[str, tuple[float, Task, Array] | None]) -> dict[str, tuple[float, Task, Array]]:
+    return dict(sorted(((n, w) for n, w in found.items() if w is not None), key=lambda w: -w[1][0]))
+
+
+def _followed(layout: Layout, ripples: Sequence[float]) -> dict[str, Array]:
+    """Return the unknowns that follow the fixed candidates, by their names."""
+    found = {}
     t = np.linspace(0, layout.dt * (layout.edges[-1] - 1), layout.edges[-1])
     for name, (v, _) in candidates(t, 1.0).items():
         if layout.ramps:
@@ -487,12 +507,81 @@ def _starts(task: Task, ripples: Sequence[float] = RIPPLES) -> dict[str, tuple[f
         c = np.array([part.mean() for part in np.split(v, layout.edges[1:-1].tolist())])
         for share in ripples:
             found[f"{name} + PRBS" if share else name] = np.concatenate([(1 - share) * c, np.full(len(c), share)])
-    within = {n: _within(task, c) for n, c in found.items()}
-    return dict(sorted(((n, w) for n, w in within.items() if w is not None), key=lambda w: -w[1][0]))
+    return found
 
 
-def _within(task: Task, c: Array) -> tuple[float, Array] | None:
-    """Return worth and unknowns, shrunk until the limits hold; None where they never do."""
+SPEEDS = {"reversals": (1.0, -1.0), "slower reversals": (0.5, -0.5), "fast and slow": (1.0, 0.08),
+          "fast and slow, both ways": (1.0, 0.08, -1.0, -0.08)}
+NEAR = 0.95  # share of a limit at which a wave is drawn
+
+
+def _waves(task: Task) -> dict[str, tuple[Layout, Array]]:
+    """Return waves that stand at the limits: layouts of ramps and steps with binary signals, and their unknowns.
+
+    Between two speeds the current is at its limit (a jump of the voltage, then a ramp with the back-EMF).
+    """
+    old, found = task.layout, {}
+    total, most = sum(old.ms), len(old.ms)
+    quick = max(1, round(2e3 * old.dt))
+    bits = sorted({max(quick, round(b)) for b in np.geomspace(quick, max(total / 60, quick), 6)})
+    for bit in bits:
+        n = min(most, max(1, round(total / (60 * bit))))
+        layout = replace(old, ms=tuple(_split(old, n)), bits=(bit,) * n)
+        found[f"binary signal of {bit} ms"] = layout, np.concatenate([np.zeros(n), np.ones(n)])
+    values = task.driven[0].rival.model.values
+    if not {"R", "K", "J", "b"} <= values.keys() or not {"i", "omega"} <= task.limits.keys():
+        return found
+    for name, speeds in SPEEDS.items():
+        for n in sorted({2, 4, 8, most // 2}):
+            for bit, ripple in ((0, 0.0), *((b, r) for b in bits[::2] for r in (0.15, 0.4))):
+                wave = _between(task, values, [speeds[k % len(speeds)] for k in range(n)], bit, ripple)
+                if wave is not None:
+                    found[f"{name} ({n})" + f" + {ripple:g} at {bit} ms" * bool(bit)] = wave
+    return found
+
+
+def _split(layout: Layout, n: int) -> list[int]:
+    """Return n lengths, ms, of whole samples, that share the record."""
+    unit = _unit(layout)
+    return [unit * int(k) for k in np.diff(np.round(np.linspace(0, sum(layout.ms) // unit, n + 1)))]
+
+
+def _unit(layout: Layout) -> int:
+    """Return the least ms that are whole samples, as near as can be."""
+    return _whole(max(1, int(np.ceil(1e3 * layout.dt - 1e-6))), layout.dt)
+
+
+def _between(task: Task, values: Mapping[str, float], speeds: Sequence[float], bit: int,
+             ripple: float) -> tuple[Layout, Array] | None:
+    """Return the wave that goes from one share of the largest speed to the next and stays there."""
+    R, K, J, b = (values[n] for n in ("R", "K", "J", "b"))
+    V, I = task.layout.v_max, NEAR * task.limits["i"][1]
+    top = NEAR * min(task.limits["omega"][1], V / (K + R * b / K))
+    ms, bits, first, second, w = [], [], [], [], 0.0
+    unit = _unit(task.layout)
+    for share, length in zip(speeds, _split(task.layout, len(speeds)), strict=True):
+        need = 1e3 * J * abs(share * top - w) / (K * I)
+        if need < unit or length < unit:
+            return None
+        go = min(length, unit * round(need / unit))
+        to = w + (share * top - w) * min(1.0, length / need)
+        push = R * I * np.sign(share * top - w)
+        ms, bits = [*ms, go], [*bits, 0]
+        first, second, w = [*first, push + K * w], [*second, push + K * to], to
+        if length - go > max(bit, 1):
+            ms, bits = [*ms, length - go], [*bits, max(bit, 1)]
+            first, second = [*first, (K + R * b / K) * w], [*second, ripple * V]
+        else:
+            ms[-1] = length
+    c = np.clip(np.array([*first, *second]) / V, -1, 1)
+    n, on = len(ms), np.array(bits) > 0
+    c[n:][on] = np.minimum(c[n:][on], 1 - np.abs(c[:n][on]))
+    return replace(task.layout, ms=tuple(ms), bits=tuple(bits)), c
+
+
+def _within(task: Task, c: Array) -> tuple[float, Task, Array] | None:
+    """Return worth, refined task and unknowns, shrunk until the limits hold; None where they never do."""
+    fine = False
     for _ in range(30):
         try:
             answers = task.respond(task.layout.of(c))
@@ -502,54 +591,59 @@ def _within(task: Task, c: Array) -> tuple[float, Array] | None:
         values, _, low, high = task.extremes(answers)
         ratio = max(float(np.max(values / high, where=values > 0, initial=0.0)),
                     float(np.max(values / low, where=values < 0, initial=0.0)))
-        if ratio <= 1:
+        if ratio <= 1 and fine:
             worth = [w.value for w in task.criteria(task.layout.of(c), answers, False)]
-            return min((w for w in worth if w > HOPELESS or task.asked), default=0.0), c
+            return min((w for w in worth if w > HOPELESS or task.asked), default=0.0), task, c
+        if ratio <= 1:
+            task, fine = task.refined(task.layout.of(c), TOLERANCE), True
+            continue
         c = c * min(0.98, 1 / ratio)
     return None
 
 
-def _fine(task: Task) -> Task:
-    """Return the task with many short steps, which follow any voltage."""
-    old = task.layout
-    ms = _whole(max(1, round(sum(old.ms) / FINE)), old.dt)
-    n = round(sum(old.ms) / ms)
-    layout = replace(old, ms=(ms,) * n, bits=(ms,) * n, mixing=None)
-    driven = (Driven.of(d.rival, layout, task.noise, "theta" in task.limits) for d in task.driven)
-    return replace(task, driven=tuple(driven))
+def _exact(task: Task, rivals: Sequence[Rival]) -> Task:
+    """Return the task with the rivals as they were fitted."""
+    return replace(task, driven=tuple(replace(d, rival=r) for d, r in zip(task.driven, rivals, strict=True)))
 
 
 def _fixed(task: Task) -> tuple[str, Task, Array]:
     """Return the best fixed candidate within the same limits, as a task of many steps and its unknowns."""
-    fine = _fine(task)
-    starts = _starts(fine, (0.0,))
+    old = task.layout
+    ms = _whole(max(1, round(sum(old.ms) / FINE)), old.dt)
+    n = round(sum(old.ms) / ms)
+    fine = task.laid(replace(old, ms=(ms,) * n, bits=(ms,) * n, mixing=None))
+    starts = _best_first({n: _within(fine, c) for n, c in _followed(fine.layout, (0.0,)).items()})
     if not starts:
         raise FitError("no record stays within the limits with all models; allow more voltage, current or angle.")
-    name = next(iter(starts))
-    return name, fine, starts[name][1]
+    name, (_, fine, c) = next(iter(starts.items()))
+    return name, fine, c
+
+
+def _drawn(task: Task) -> list[Array]:
+    """Return displacements of the parameters (n, k) by rival, none the first of them."""
+    rng = np.random.default_rng(0)
+    return [np.vstack([np.zeros(len(d.rival.scale)), d.rival.draws(DRAWS, rng)]) for d in task.driven]
+
+
+def _spread(task: Task, c: Array) -> dict[str, float]:
+    """Return by state how many times further than the rivals drawn parameters go."""
+    levels, draws = task.layout.of(c), _drawn(task)
+    here, there = task.reach(levels, [d[:1] for d in draws]), task.reach(levels, draws)
+    return {s: min(max(1.0, *(b / a for a, b in zip(here[s], there[s], strict=True) if a)), MOST_SPREAD) for s in here}
 
 
 def _safe(task: Task, c: Array) -> tuple[Array, dict[str, float]]:
     """Return the unknowns, shrunk until drawn parameters keep the limits too, and the largest size of each state."""
-    rng = np.random.default_rng(0)
-    draws = [d.rival.draws(DRAWS, rng) for d in task.driven]
+    draws, reach = _drawn(task), {}
     for _ in range(30):
-        ratio, peaks = 0.0, dict.fromkeys(task.limits, 0.0)
-        for d, deltas in zip(task.driven, draws, strict=True):
-            for delta in [0 * deltas[0], *deltas]:
-                try:
-                    x = d.respond(task.layout.of(c), delta).x
-                except SimulationError:  # parameters that no motor has
-                    continue
-                for s in (s for s in task.limits if s in d.system.states):
-                    reach, noise = x[:, d.system.states.index(s)], NOISES * task.noise.get(s, 0.0)
-                    low, high = task.limits[s]
-                    ratio = max(ratio, (reach.max() + noise) / high, (reach.min() - noise) / low)
-                    peaks[s] = max(peaks[s], float(np.abs(reach).max()))
+        reach = task.reach(task.layout.of(c), draws)
+        noise = {s: NOISES * task.noise.get(s, 0.0) for s in reach}
+        ratio = max(max((reach[s][0] - noise[s]) / low, (reach[s][1] + noise[s]) / high)
+                    for s, (low, high) in task.limits.items())
         if ratio <= 1:
             break
         c = c * min(0.98, 1 / ratio)
-    return c, {"v": float(np.abs(task.layout.of(c)).max()), **peaks}
+    return c, {"v": float(np.abs(task.layout.of(c)).max()), **{s: max(-a, b) for s, (a, b) in reach.items()}}
 
 
 def _expected(task: Task, levels: Array) -> tuple[dict[tuple[str, str], float], dict[str, dict[str, float]]]:
