@@ -167,9 +167,12 @@ if __name__ == "__main__":
             one = sharpened(MOTORS[which % 4], which, ASKED[which // 4 % len(ASKED)])
             every.append(one)
             print({k: v if isinstance(v, str) else float(f"{v:.3g}") for k, v in one.items()}, flush=True)
-        ratios = [one["fixed"] / one["designed"] for one in every]
-        honest = [one["designed"] / one["designed predicted"] for one in every]
-        print(f"deviation, fixed over designed: median {np.median(ratios):.2f}; achieved over predicted: "
-              f"median {np.median(honest):.2f}")
+        for what, over, under in (("fixed over designed, achieved", "fixed", "designed"),
+                                  ("fixed over designed, predicted", "fixed predicted", "designed predicted"),
+                                  ("achieved over predicted, designed", "designed", "designed predicted"),
+                                  ("achieved over predicted, fixed", "fixed", "fixed predicted")):
+            q = np.quantile([one[over] / one[under] for one in every], [0.25, 0.5, 0.75])
+            print(f"{what}: quartiles {q[0]:.2f} {q[1]:.2f} {q[2]:.2f}")
+        print(f"processor time largest {max(one['seconds'] for one in every):.1f} s")
     else:
         print(__doc__)
