@@ -163,8 +163,8 @@ ENOUGH = 7.0  # the same, from which another start is not worth its time
 RIPPLES = (0.0, 0.3)  # share of the voltage for a binary signal on top of a candidate
 DRAWS = 16  # of the parameters, for the check of the limits
 MOST_SPREAD = 2.0
-SMOOTH = 5e-3  # of the largest speed: width of sgn while the voltage is sought
-TOLERANCE = 1e-4  # of the integration, relative to the largest state
+SMOOTH = 1e-2  # of the largest speed: width of sgn while the voltage is sought
+TOLERANCE = 3e-5  # of the integration, relative to the largest state
 WORTH = 4.0  # nats between two rivals from which they count as distinguished
 
 
@@ -532,7 +532,7 @@ def _waves(task: Task) -> dict[str, tuple[Layout, Array]]:
     if not {"R", "K", "J", "b"} <= values.keys() or not {"i", "omega"} <= task.limits.keys():
         return found
     for name, speeds in SPEEDS.items():
-        for n in sorted({2, 4, 8, most // 2}):
+        for n in sorted({min(k, most // 2) for k in (2, 4, 8, most)}):  # each takes a ramp and a step
             for bit, ripple in ((0, 0.0), *((b, r) for b in bits[::2] for r in (0.15, 0.4))):
                 wave = _between(task, values, [speeds[k % len(speeds)] for k in range(n)], bit, ripple)
                 if wave is not None:

@@ -7,8 +7,8 @@ that the compiled step of the least-squares engine is used here too.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import casadi as ca
@@ -124,19 +124,14 @@ class ShootingNlp:
     def functions(self) -> tuple[ca.Callback, dict[str, ca.Callback]]:
         """Return the NLP and its derivatives in CasADi's naming."""
         x, p, f, g = D(self.n, 1), D(0, 0), D(1, 1), D(self.m, 1)
-        nlp, derivatives = callbacks(self, self.n, self.m, self.jac_pattern)
+        jac_pattern = self.jac_pattern
+        values = _Function("nlp", ["x", "p"], ["f", "g"], [x, p], [f, g], lambda z, _: self.values(z))
+        grad_f = _Function("nlp_grad_f", ["x", "p"], ["f", "grad:f:x"], [x, p], [f, x], lambda z, _: self.gradient(z))
+        jac_g = _Function("nlp_jac_g", ["x", "p"], ["g", "jac:g:x"], [x, p], [g, jac_pattern],
+                          lambda z, _: self.jacobian(z))
         hess_lag = _Function("nlp_hess_l", ["x", "p", "lam:f", "lam:g"], ["triu:hess:gamma:x:x"], [x, p, f, g],
                              [self.hess_pattern], lambda z, _, lam_f, __: [self.hessian(z, float(lam_f[0]))])
-        return nlp, {**derivatives, "hess_lag": hess_lag}
-
-
-def callbacks(nlp: Any, n: int, m: int, jac: ca.Sparsity) -> tuple[ca.Callback, dict[str, ca.Callback]]:
-    """Return an NLP of n unknowns and m rows, as its `values`, `gradient` and `jacobian`, in CasADi's naming."""
-    x, p, f, g = D(n, 1), D(0, 0), D(1, 1), D(m, 1)
-    values = _Function("nlp", ["x", "p"], ["f", "g"], [x, p], [f, g], lambda z, _: nlp.values(z))
-    grad_f = _Function("nlp_grad_f", ["x", "p"], ["f", "grad:f:x"], [x, p], [f, x], lambda z, _: nlp.gradient(z))
-    jac_g = _Function("nlp_jac_g", ["x", "p"], ["g", "jac:g:x"], [x, p], [g, jac], lambda z, _: nlp.jacobian(z))
-    return values, {"grad_f": grad_f, "jac_g": jac_g}
+        return values, {"grad_f": grad_f, "jac_g": jac_g, "hess_lag": hess_lag}
 
 
 class _Function(ca.Callback):
@@ -213,11 +208,10 @@ class Ipopt:
     max_iterations: int = 300
     tol: float = 1e-9
     verbose: bool = False
-    more: Mapping[str, Any] = field(default_factory=dict)
 
-    def solve(self, nlp: Any, z0: Array, bounds: tuple[Array, Array], warm: NlpResult | None = None,
+    def solve(self, nlp: ShootingNlp, z0: Array, bounds: tuple[Array, Array], warm: NlpResult | None = None,
               near: bool = False) -> NlpResult:
-        """Solve `nlp`, a `ShootingNlp` or one with its `functions`, `lower`, `upper` and `scale`.
+        """Solve `nlp`.
 
         `z0` may be near a solution, or there may be an earlier result of the same size.
         """
@@ -227,7 +221,6 @@ class Ipopt:
             "compl_inf_tol": 1e-8, "acceptable_iter": 0, "bound_relax_factor": 0.0, "nlp_scaling_method": "none",
             "print_level": 5 if self.verbose else 0, "sb": "yes", "mu_strategy": "adaptive",
         }
-        options |= self.more
         start = {"x0": z0}
         if near:
             options |= {"mu_strategy": "monotone", "mu_init": 1e-6, "bound_push": 1e-8, "bound_frac": 1e-8,
