@@ -30,18 +30,10 @@ ROUGH = 1e-4  # accuracy of the integration while starts are compared
 
 @dataclass(frozen=True, eq=False)
 class HeldOut:
-    """Where models are judged.
+    """Where models are judged."""
 
-    Attributes
-    ----------
-    validation : Problem or None
-        Held-out runs, of the model to begin with.
-    noise : dict of str to float
-        Of each channel's sensor, SI.
-    """
-
-    validation: Problem | None
-    noise: Mapping[str, float]
+    validation: Problem | None  # held-out runs, of the model to begin with
+    noise: Mapping[str, float]  # of each channel's sensor, SI
 
     @staticmethod
     def of(fit: Fit, validate: Sequence[Experiment] | Experiment | None) -> HeldOut:

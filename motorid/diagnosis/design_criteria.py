@@ -15,8 +15,8 @@ parameters enters as a Gaussian prior with their information matrix (Gauss-Newto
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from functools import cached_property, lru_cache
+from dataclasses import dataclass, replace
+from functools import cache, cached_property
 from itertools import pairwise, permutations
 from typing import Any, NamedTuple
 
@@ -50,34 +50,20 @@ WORTHWHILE = 2e-3  # nats: a step that promises less ends the search
 OVER = 1e-3  # of a limit, by which a step may pass it; the last check takes it away
 ELSEWHERE = 21  # samples among which what asks for short steps may move while the voltage is optimised
 PERIOD = 32767  # bits of a binary signal, after which it repeats
+MOST_SEGMENTS = 200
 ENGINE = Rosenbrock()
 
 
 @dataclass(frozen=True, eq=False)
 class Rival:
-    """A model at its fitted values, and how well the records know them.
+    """A model at its fitted values, and how well the records know them."""
 
-    Attributes
-    ----------
-    name : str
-        The effects by which it differs from the others.
-    model : Model
-    sigma : dict of str to float
-        Error of one sample per measured channel, SI: noise times misfit.
-    scale : ndarray, shape (k,)
-        Sizes of the solver's coordinates of the free parameters: logarithms of positive ones, else in units of this.
-    information : ndarray, shape (k, k)
-        Of the records on these coordinates, initial states estimated too.
-    seen : dict of str to float
-        Largest size of each channel in the records, and their ``duration`` and ``dt``.
-    """
-
-    name: str
+    name: str  # the effects by which it differs from the others
     model: Model
-    sigma: Mapping[str, float]
-    scale: Array
-    information: Array
-    seen: Mapping[str, float]
+    sigma: Mapping[str, float]  # error of one sample per measured channel, SI: noise times misfit
+    scale: Array  # (k,) sizes of the solver's coordinates of the free parameters: of logarithms 1, else in this unit
+    information: Array  # (k, k) of the records on these coordinates, initial states estimated too
+    seen: Mapping[str, float]  # largest size of each channel in the records, and their duration and dt
 
     @staticmethod
     def of(fit: Fit, name: str = "") -> Rival:
@@ -143,16 +129,21 @@ class Rival:
         return Rival(str(contents["name"]), model, sigma, scale, information, seen)
 
 
-@lru_cache(maxsize=64)
-def quiet_seed(n: int, rank: int) -> int:
-    """Return a seed whose `n` bits, as ±1, have a running sum that stays small: the best but `rank`."""
-    bits = np.fromiter(lfsr_bits(1, PERIOD + n + 15), dtype=np.int64)
+@cache
+def quiet_seeds(n: int) -> list[int]:
+    """Return seeds of `n` bits whose running sum, as ±1, stays small; the best first."""
+    bits = _sequence()
     total = np.concatenate([[0], np.cumsum(2 * bits - 1)])
     reach = np.zeros(PERIOD, int)
     for k in range(1, n + 1):
         np.maximum(reach, np.abs(total[k:k + PERIOD] - total[:PERIOD]), out=reach)
-    at = int(np.argsort(reach, kind="stable")[rank])
-    return int(bits[at:at + 15] @ (1 << np.arange(15)))
+    at = np.argsort(reach, kind="stable")[:MOST_SEGMENTS]
+    return (bits[at[:, None] + np.arange(15)] @ (1 << np.arange(15))).tolist()
+
+
+@cache
+def _sequence() -> NDArray[np.int64]:
+    return np.fromiter(lfsr_bits(1, 2 * PERIOD), dtype=np.int64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,25 +151,13 @@ class Layout:
     """How unknowns become a voltage: segments of whole milliseconds, each a step or a ramp between two levels.
 
     On a step, a pseudo-random binary signal of its own amplitude may ride: it shows what is quick. Its seed is the one
-    whose running sum stays smallest, so that the speed hardly moves and the current may be large.
-
-    Attributes
-    ----------
-    ms : tuple of int
-        Lengths of the segments.
-    dt : float
-        s between samples.
-    bits : tuple of int
-        ms per bit on each step, 0 for a ramp between two levels of its own; empty for ramps from one level to the next.
-    mixing : ndarray, shape (levels, unknowns), or None
-        Levels, in units of `v_max`, of the unknowns; None: they are the unknowns.
-    v_max : float
+    whose running sum stays smallest, so that the speed moves little and the current may be large.
     """
 
-    ms: tuple[int, ...]
-    dt: float
-    bits: tuple[int, ...]
-    mixing: Array | None
+    ms: tuple[int, ...]  # lengths of the segments
+    dt: float  # s between samples
+    bits: tuple[int, ...]  # ms per bit on each step, 0: a ramp between two levels; empty: ramps from level to level
+    mixing: Array | None  # (levels, unknowns): levels, in units of v_max, of the unknowns; None: they are the unknowns
     v_max: float
 
     @property
@@ -214,7 +193,7 @@ class Layout:
         return low + (high - low) * self.inputs[:, 0] + ripple * self.inputs[:, 1]
 
     def _riding(self, j: int, level: float, amplitude: float) -> str:
-        seed = quiet_seed(-(-self.ms[j] // self.bits[j]), j)
+        seed = quiet_seeds(min(-(-self.ms[j] // self.bits[j]), PERIOD - 15))[j % MOST_SEGMENTS]
         return f"prbs:{amplitude:g}:{self.bits[j] / 1e3:g}:{self.ms[j] / 1e3:g}:{level:g}:{seed}"
 
     def of(self, c: Array) -> Array:
@@ -351,6 +330,15 @@ class Driven:
         return self.rival.known + s.T @ s
 
 
+class Rows(NamedTuple):
+    """Values, their slopes, lower and upper limits: rows of a linear program."""
+
+    values: Array
+    slopes: Array
+    low: Array
+    high: Array
+
+
 class Value(NamedTuple):
     """A criterion and its gradient by level, empty where it was not asked for."""
 
@@ -421,35 +409,15 @@ def precision(a: Driven, asked: Sequence[int], levels: Array, response: Response
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """What is asked: rivals, limits of their states (low, high), and what is to become as large as can be.
-
-    Attributes
-    ----------
-    driven : tuple of Driven
-    limits : dict of str to (float, float)
-        By state: i, omega, theta, dT; SI.
-    noise : dict of str to float
-        Of the channels' sensors, SI.
-    asked : tuple of str
-        Parameters to sharpen; empty: distinguish the rivals.
-    pairs : tuple of (int, int)
-        (truth, rival) to distinguish.
-    slew : float
-        Largest change of the voltage along a ramp, V/s.
-    nominal : frozenset of (int, int)
-        Pairs whose truth is taken as it was fitted: within its uncertainty nothing would distinguish them.
-    spread : dict of str to float
-        By state: how many times further than the rivals uncertain parameters may go.
-    """
+    """What is asked: rivals, limits of their states, and what is to become as large as can be."""
 
     driven: tuple[Driven, ...]
-    limits: Mapping[str, tuple[float, float]]
-    noise: Mapping[str, float]
-    asked: tuple[str, ...]
-    pairs: tuple[tuple[int, int], ...]
-    slew: float
-    nominal: frozenset[tuple[int, int]] = frozenset()
-    spread: Mapping[str, float] = field(default_factory=dict)
+    limits: Mapping[str, tuple[float, float]]  # by state: i, omega, theta, dT; SI
+    noise: Mapping[str, float]  # of the channels' sensors, SI
+    asked: tuple[str, ...]  # parameters to sharpen; empty: distinguish the rivals
+    pairs: tuple[tuple[int, int], ...]  # (truth, rival) to distinguish
+    slew: float  # largest change of the voltage along a ramp, V/s
+    nominal: frozenset[tuple[int, int]] = frozenset()  # pairs whose truth is as fitted: else nothing distinguishes them
 
     @property
     def layout(self) -> Layout:
@@ -472,38 +440,34 @@ class Task:
     def criteria(self, levels: Array, answers: Sequence[Response], slopes: bool) -> list[Value]:
         """Return what the experiment is worth, in nats: per pair log(1 + χ²), or per rival and asked parameter."""
         found = []
-        if self.asked:
-            for d, r in zip(self.driven, answers, strict=True):
-                places = [d.rival.model.free_names.index(n) for n in self.asked]
-                value, slope = precision(d, places, levels, r, slopes)
-                size = 2 * len(places)
-                found.append(Value(value / size, slope / size))
-            return found
+        for d, r in zip(self.driven if self.asked else (), answers, strict=False):
+            value, slope = precision(d, [d.rival.model.free_names.index(n) for n in self.asked], levels, r, slopes)
+            found.append(Value(value / (2 * len(self.asked)), slope / (2 * len(self.asked))))
         for i, j in self.pairs:
             value, slope = separation(self.driven[i], self.driven[j], levels, answers[i], answers[j], slopes,
                                       0.0 if (i, j) in self.nominal else REGION)
             found.append(Value(float(np.log1p(value)), slope / (1 + value)))
         return found
 
-    def extremes(self, answers: Sequence[Response]) -> tuple[Array, Array, Array, Array]:
-        """Return the extremes of each limited state in each segment: values, slopes, lower and upper limits, scaled.
+    def room(self, state: str) -> tuple[float, float]:
+        """Return a state's limits less the sensor's noise."""
+        low, high = self.limits[state]
+        margin = min(NOISES * self.noise.get(state, 0.0), LARGEST_MARGIN * min(-low, high))
+        return low + margin, high - margin
 
-        A limit is kept away from by the sensor's noise, and by how far uncertain parameters may go beyond the rivals.
-        """
+    def extremes(self, answers: Sequence[Response]) -> Rows:
+        """Return the extremes of each limited state in each segment, over its largest size allowed."""
         found = []
         for d, r in zip(self.driven, answers, strict=True):
             k = len(d.rival.scale)
             for s in (s for s in self.limits if s in d.system.states):
-                j, (low, high) = d.system.states.index(s), self.limits[s]
-                x, size = r.x[:, j], min(abs(low), abs(high))
+                j, (low, high) = d.system.states.index(s), self.room(s)
+                x, size = r.x[:, j], max(-low, high)
                 at = [a + f(x[a:b + 1]) for a, b in pairwise(d.layout.edges) for f in (np.argmax, np.argmin)]
-                margin, spread = min(NOISES * self.noise.get(s, 0.0), LARGEST_MARGIN * size), self.spread.get(s, 1.0)
                 upper = np.arange(len(at)) % 2 == 0
                 found.append((x[at] / size, r.dx[at, j, :r.dx.shape[2] - k] / size,
-                              np.where(upper, -np.inf, (low + margin) / spread / size),
-                              np.where(upper, (high - margin) / spread / size, np.inf)))
-        values, slopes, low, high = (np.concatenate(parts) for parts in zip(*found, strict=True))
-        return values, slopes, low, high
+                              np.where(upper, -np.inf, low / size), np.where(upper, high / size, np.inf)))
+        return Rows(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
 
     def reach(self, levels: Array, displaced: Sequence[Array]) -> dict[str, tuple[float, float]]:
         """Return the smallest and largest value of each limited state; `displaced` (n, k): parameters, by rival."""
@@ -512,8 +476,10 @@ class Task:
             for delta in deltas:
                 try:
                     x = d.respond(levels, delta).x
-                except SimulationError:  # parameters that no motor has
-                    continue
+                except SimulationError:
+                    if delta.any():  # parameters that no motor has
+                        continue
+                    return dict.fromkeys(self.limits, (-np.inf, np.inf))
                 for s in (s for s in self.limits if s in d.system.states):
                     y, (low, high) = x[:, d.system.states.index(s)], found[s]
                     found[s] = min(low, float(y.min())), max(high, float(y.max()))
@@ -538,27 +504,26 @@ def climb(task: Task, c: Array) -> Found:
     shrinks where the step does not keep its promise. Limits of the states hold at the largest and the smallest value
     of each segment. A budget of time or Ctrl-C ends the search at the best point so far.
     """
-    linear, low, high = _linear_rows(task)
-    radius, best = RADIUS, Found(task, c, -np.inf)
+    linear, radius, best = _linear_rows(task), RADIUS, Found(task, c, -np.inf)
     try:
-        worth, limits = _linearised(task, c, True)
-        best = Found(task, c, float(worth[0].min()))
+        values, slopes, states = _linearised(task, c, True)
+        best = Found(task, c, float(values.min()))
         for _ in range(MOST_STEPS):
             check_time()
-            rows = [*limits, (linear @ c, linear, low, high)]
-            step, promise = _linear_step(c, worth, rows, radius)
+            along = linear._replace(values=linear.slopes @ best.c)
+            step, promise = _linear_step(best.c, values, slopes, [states, along], radius)
             if promise < WORTHWHILE:
                 break
             try:
-                there, kept = _linearised(task, c + step, False)
-                gain = float(there[0].min()) - best.value
-                good = gain > 0.1 * promise and all(np.all((y <= h + OVER) & (y >= w - OVER)) for y, _, w, h in kept)
+                there, _, y = _linearised(task, best.c + step, False)
+                kept = bool(np.all((y.values <= y.high + OVER) & (y.values >= y.low - OVER)))
+                good = kept and float(there.min()) - best.value > 0.1 * promise
             except (SimulationError, np.linalg.LinAlgError):
                 good = False
             radius *= 1.5 if good else 0.4
             if good:
-                c, best = c + step, Found(task, c + step, best.value + gain)
-                worth, limits = _linearised(task, c, True)
+                best = Found(task, best.c + step, float(there.min()))
+                values, slopes, states = _linearised(task, best.c, True)
             elif radius < SMALLEST_RADIUS:
                 break
     except (SimulationError, np.linalg.LinAlgError):
@@ -569,24 +534,18 @@ def climb(task: Task, c: Array) -> Found:
     return best
 
 
-Rows = tuple[Array, Array, Array, Array]  # values, slopes, lower and upper limits
-
-
-def _linearised(task: Task, c: Array, slopes: bool) -> tuple[tuple[Array, Array], list[Rows]]:
-    """Return the criteria and their slopes by the unknowns, and the limited states likewise."""
+def _linearised(task: Task, c: Array, slopes: bool) -> tuple[Array, Array, Rows]:
+    """Return the criteria, their slopes by the unknowns (none if not asked for), and the limited states."""
     layout = task.layout
     levels, mix = layout.of(c), layout.v_max * (np.eye(layout.levels) if layout.mixing is None else layout.mixing)
     answers = task.respond(levels, slopes)
-    worth, (x, dx, low, high) = task.criteria(levels, answers, slopes), task.extremes(answers)
-    values = np.array([w.value for w in worth])
-    if not slopes:
-        return (values, np.zeros((len(values), 0))), [(x, np.zeros((len(x), 0)), low, high)]
-    return (values, np.array([w.slope for w in worth]) @ mix), [(x, dx @ mix, low, high)]
+    worth, rows = task.criteria(levels, answers, slopes), task.extremes(answers)
+    values, by = np.array([w.value for w in worth]), np.array([w.slope for w in worth])
+    return (values, by @ mix, rows._replace(slopes=rows.slopes @ mix)) if slopes else (values, by, rows)
 
 
-def _linear_step(c: Array, worth: tuple[Array, Array], rows: Sequence[Rows], radius: float) -> tuple[Array, float]:
+def _linear_step(c: Array, values: Array, slopes: Array, rows: Sequence[Rows], radius: float) -> tuple[Array, float]:
     """Return the step within `radius` that raises the least linearised criterion most, and by how much."""
-    values, slopes = worth
     a, b = [np.column_stack([-slopes, np.ones(len(values))])], [values]
     for y, dy, low, high in rows:
         for sign, limit in ((1.0, high), (-1.0, -low)):
@@ -595,13 +554,11 @@ def _linear_step(c: Array, worth: tuple[Array, Array], rows: Sequence[Rows], rad
             b.append(np.maximum(limit[at] - sign * y[at], 0.0))
     bounds = [(max(-1 - x, -radius), min(1 - x, radius)) for x in c] + [(None, None)]
     done = linprog(np.append(np.zeros(len(c)), -1.0), np.vstack(a), np.concatenate(b), bounds=bounds, method="highs")
-    if done.x is None:
-        return np.zeros(len(c)), 0.0
-    return done.x[:-1], float(done.x[-1] - values.min())
+    return (np.zeros(len(c)), 0.0) if done.x is None else (done.x[:-1], float(done.x[-1] - values.min()))
 
 
-def _linear_rows(task: Task) -> tuple[Array, Array, Array]:
-    """Return the rows, and their limits, of what is linear in the unknowns: mixed levels, and the slew rate."""
+def _linear_rows(task: Task) -> Rows:
+    """Return the rows (their values empty) of what is linear in the unknowns: mixed levels, and the slew rate."""
     layout = task.layout
     mix = np.eye(layout.levels) if layout.mixing is None else layout.mixing
     rows, high = [np.zeros((0, mix.shape[1]))], [np.zeros(0)]
@@ -615,7 +572,7 @@ def _linear_rows(task: Task) -> tuple[Array, Array, Array]:
         seconds = np.array([1e-3, *layout.ms, 1e-3]) / 1e3
         high.append(task.slew * seconds / layout.v_max)
     limit = np.concatenate(high)
-    return np.vstack(rows), -limit, limit
+    return Rows(np.zeros(0), np.vstack(rows), -limit, limit)
 
 
 def all_pairs(n: int) -> tuple[tuple[int, int], ...]:

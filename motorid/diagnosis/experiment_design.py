@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from io import SEEK_END, StringIO
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -17,11 +18,11 @@ import numpy as np
 
 from motorid.acquire.excitation import program
 from motorid.channels import UNITS, channel_name
-from motorid.diagnosis.design_criteria import NOISES, Driven, Found, Layout, Rival, Task, all_pairs, climb
+from motorid.diagnosis.design_criteria import MOST_SEGMENTS, Driven, Found, Layout, Rival, Task, all_pairs, climb
 from motorid.diagnosis.results import Diagnosis
 from motorid.display.cards import Card, Flag, Printed, Shown, Table
 from motorid.display.numbers import number, quantity
-from motorid.errors import FitError, MotoridError, SimulationError, UsageError, one_of
+from motorid.errors import FitError, MotoridError, UsageError, one_of
 from motorid.estimation.result import Fit
 from motorid.numerics.parallel import budget as limited_time
 from motorid.numerics.parallel import one_thread
@@ -35,21 +36,12 @@ SAMPLES = 2000
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Suggestion(Shown):
-    """An experiment that would tell rival models apart.
-
-    Attributes
-    ----------
-    name, text : str
-    experiment : Experiment
-        Time and voltage to apply; its outputs are what the first model predicts.
-    discrimination : dict of str to float
-        Per candidate: expected chi² per sample between the rivals that are hardest to distinguish.
-    """
+    """An experiment that would distinguish rival models."""
 
     name: str
     text: str
-    experiment: Experiment
-    discrimination: Mapping[str, float]
+    experiment: Experiment  # time and voltage to apply; its outputs are what the first model predicts
+    discrimination: Mapping[str, float]  # per candidate: least expected chi² per sample between two rivals
 
     def card(self) -> Card:
         """Return the experiment chosen, and how well each candidate would do."""
@@ -94,14 +86,15 @@ def suggest_experiment(fits: Sequence[Fit], *, v_max: float | None = None, i_max
     duration = duration or max(r.duration for r in runs)
     dt = max(float(np.median([r.dt for r in runs])), duration / SAMPLES)
     t = np.arange(0.0, duration, dt)
-    scores: dict[str, float] = {}
-    kept: dict[str, Experiment] = {}
+    scores, kept = {}, {}
     for name, (v, _) in candidates(t, v_max).items():
-        predicted = _predictions(fits, t, v, name)
-        if predicted is None or (i_max and _over(predicted, i_max)):
+        try:
+            answers = [_prediction(f, t, v, name) for f in fits]
+        except MotoridError:
             continue
-        scores[name] = min(_difference(a, b, fits[0]) for k, a in enumerate(predicted) for b in predicted[k + 1 :])
-        kept[name] = Experiment(t, {"v": v}, predicted[0], name=name)
+        if not i_max or all(float(np.abs(y.get("i", 0.0)).max()) <= i_max for y in answers):
+            scores[name] = min(_difference(a, b, fits[0]) for a, b in combinations(answers, 2))
+            kept[name] = Experiment(t, {"v": v}, answers[0], name=name)
     if not scores:
         raise FitError("no candidate experiment stays within the limits with all models; raise i_max or v_max.")
     best = max(scores, key=lambda n: scores[n])
@@ -128,20 +121,10 @@ def candidates(t: Array, v_max: float) -> dict[str, tuple[Array, str]]:
     }
 
 
-def _predictions(fits: Sequence[Fit], t: Array, v: Array, name: str) -> list[dict[str, Array]] | None:
-    found = []
-    blank = {c: np.zeros_like(t) for c in fits[0].problem.outputs}
-    try:
-        for f in fits:
-            run = Experiment(t, {"v": v}, blank, sigma=dict.fromkeys(blank, 1.0), name=name)
-            found.append(dict(simulate(f.model, run, initial="rest", estimate_initial=False)[0].outputs))
-    except MotoridError:
-        return None
-    return found
-
-
-def _over(predicted: Sequence[Mapping[str, Array]], i_max: float) -> bool:
-    return any("i" in p and float(np.abs(p["i"]).max()) > i_max for p in predicted)
+def _prediction(fit: Fit, t: Array, v: Array, name: str) -> dict[str, Array]:
+    blank = {c: np.zeros_like(t) for c in fit.problem.outputs}
+    run = Experiment(t, {"v": v}, blank, sigma=dict.fromkeys(blank, 1.0), name=name)
+    return dict(simulate(fit.model, run, initial="rest", estimate_initial=False)[0].outputs)
 
 
 def _difference(a: Mapping[str, Array], b: Mapping[str, Array], fit: Fit) -> float:
@@ -162,9 +145,9 @@ HOPELESS = 0.1  # log(1 + χ²) below which two rivals are as good as one model
 ENOUGH = 7.0  # the same, from which another start is not worth its time
 RIPPLES = (0.0, 0.3)  # share of the voltage for a binary signal on top of a candidate
 DRAWS = 16  # of the parameters, for the check of the limits
-MOST_SPREAD = 2.0
 SMOOTH = 1e-2  # of the largest speed: width of sgn while the voltage is sought
 TOLERANCE = 3e-5  # of the integration, relative to the largest state
+NO_RECORD = "no record stays within the limits with all models; allow more voltage, current or angle."
 WORTH = 4.0  # nats between two rivals from which they count as distinguished
 
 
@@ -275,8 +258,8 @@ def design_experiment(found: Diagnosis | Fit | Sequence[Fit | Rival], *, goal: s
     values (as fitted, where that would hide the difference). Sharpening is D_s-optimal for one parameter (Fedorov,
     Theory of Optimal Experiments, 1972); for several, the product of their variances by the Fisher information, that
     of the records so far included. Both are solved as an NLP, by sequential linear programming with the exact
-    derivatives of the discrete step, from fixed candidates and from waves with current or speed at the limit; the
-    limits are constraints for every rival and for drawn parameters.
+    derivatives of the discrete step, from fixed candidates and, to sharpen, from waves with current or speed at the
+    limit; the limits are constraints for every rival, and the voltage shrinks until drawn parameters keep them too.
 
     It is a local optimum, as good as the rivals: where all of them are wrong, it promises nothing, nor do the limits.
 
@@ -329,7 +312,7 @@ def design_experiment(found: Diagnosis | Fit | Sequence[Fit | Rival], *, goal: s
     limits = _limits(rivals, v_max or seen["v"], i_max, omega_max, theta_range, temp_max)
     layout = _layout(shape, levels, duration, max(dt, 0.5 * duration / SAMPLES), limits["v"][1])
     task = _task(rivals, layout, {s: x for s, x in limits.items() if s != "v"}, asked, slew)
-    task = _hopeful(task)
+    task = _ordered(task)
     name, fine, at = _fixed(task)
     fine = _exact(fine, rivals).refined(fine.layout.of(at), TOLERANCE)
     fixed = name, fine, _safe(fine, at)[0]
@@ -355,29 +338,36 @@ def _optimised(task: Task, say: Callable[[str], None]) -> Found:
     """Return the best point that the search reaches from the best starts."""
     done: list[Found] = []
     for name, (_, here, c) in list(_starts(task).items())[:SHARPENED if task.asked else DISTINGUISHED]:
-        start = _within(replace(here, spread=_spread(here, c)), c)
-        if start is None:
-            continue
-        found = climb(_hardest(start[1], start[2]), start[2])
+        found = climb(_hardest(replace(here, pairs=task.pairs), c), c)
         again = None if found.stopped else _within(found.task, found.c)  # integration steps that suit what was found
         done.append(climb(again[1], again[2]) if again else found)
         say(f"optimised from the {name}: {done[-1].value:.3g}")
         if done[-1].stopped or (task.pairs and done[-1].value > ENOUGH):
             break
     if not done:
-        raise FitError("no record stays within the limits with all models; allow more voltage, current or angle.")
+        raise FitError(NO_RECORD)
     return max(done, key=lambda f: f.value)
 
 
-def _hopeful(task: Task) -> Task:
-    """Return the task with the truth as it was fitted in pairs where within its uncertainty no candidate would do."""
-    kept = [_within(task, c) for c in _followed(task.layout, (0.0,)).values()] if task.pairs else []
-    every = [task.layout.of(k[2]) for k in kept if k is not None]
+def _ordered(task: Task) -> Task:
+    """Return the task, the pairs first that are hardest to distinguish by the best fixed candidate, hopeless ones last.
+
+    Where within its uncertainty no candidate would do, the truth is as it was fitted.
+    """
+    kept = [_shrunk(task, c) for c in _followed(task.layout, (0.0,)).values()] if task.pairs else []
+    every = [task.layout.of(k[0]) for k in kept if k is not None]
     if not every:
         return task
-    worth = [[w.value for w in task.criteria(levels, task.respond(levels), False)] for levels in every]
-    best = np.max(worth, axis=0)
-    return replace(task, nominal=frozenset(p for p, b in zip(task.pairs, best, strict=True) if b <= HOPELESS))
+
+    def best(task: Task) -> dict[tuple[int, int], float]:
+        worth = [[w.value for w in task.criteria(levels, task.respond(levels), False)] for levels in every]
+        return dict(zip(task.pairs, np.max(worth, axis=0), strict=True))
+
+    worth = best(task)
+    task = replace(task, nominal=frozenset(p for p, w in worth.items() if w <= HOPELESS))
+    if task.nominal:
+        worth |= best(replace(task, pairs=tuple(task.nominal)))
+    return replace(task, pairs=tuple(sorted(task.pairs, key=lambda p: (worth[p] <= HOPELESS, worth[p]))))
 
 
 def _without_traces(layout: Layout, c: Array) -> Array:
@@ -424,8 +414,8 @@ def _asked(rival: Rival, parameters: Sequence[str] | None) -> tuple[str, ...]:
 def _check_words(shape: str, levels: int, slew: float | None) -> None:
     if shape not in SHAPES:
         raise UsageError(one_of(shape, SHAPES, "shape"))
-    if not 2 <= levels <= 200:
-        raise UsageError(f"levels must lie between 2 and 200; got {levels}.")
+    if not 2 <= levels <= MOST_SEGMENTS:
+        raise UsageError(f"levels must lie between 2 and {MOST_SEGMENTS}; got {levels}.")
     if slew is not None and (shape == "steps" or not slew > 0):
         raise UsageError('slew limits ramps, in V/s above zero; steps jump. Use shape="free" with it.')
 
@@ -473,22 +463,21 @@ def _layout(shape: str, levels: int, duration: float, dt: float, v_max: float) -
 def _task(rivals: Sequence[Rival], layout: Layout, limits: Mapping[str, tuple[float, float]], asked: tuple[str, ...],
           slew: float | None) -> Task:
     errors = {c: float(np.sqrt(np.mean([r.sigma[c] ** 2 for r in rivals]))) for c in rivals[0].sigma}
-    width = SMOOTH * limits["omega"][1] if "omega" in limits else 0.0
+    width = SMOOTH * limits["omega"][1] if asked and "omega" in limits else 0.0  # the rivals may differ at low speed
     driven = tuple(Driven.of(r.smoothed(width), layout, errors, "theta" in limits) for r in rivals)
     return Task(driven, limits, errors, asked, () if asked else all_pairs(len(rivals)), slew or np.inf)
 
 
 def _starts(task: Task) -> dict[str, tuple[float, Task, Array]]:
     """Return starts by name: worth, the task in their layout, unknowns within the limits; the best first."""
-    found = {}
-    for name, (layout, c) in ({} if task.layout.ramps else _waves(task)).items():
-        found[name] = _within(task.laid(layout), c)
-    found |= {n: _within(task, c) for n, c in _followed(task.layout, RIPPLES).items()}
+    task = replace(task, pairs=task.pairs[:MOST_PAIRS])
+    laid = {} if task.layout.ramps or not task.asked else _waves(task)
+    laid |= {n: (task.layout, c) for n, c in _followed(task.layout, RIPPLES).items()}
+    found = _best_first({n: _within(task.laid(layout), c) for n, (layout, c) in laid.items()})
     kinds: dict[str, str] = {}
-    ranked = _best_first(found)
-    for name in ranked:
+    for name in found:
         kinds.setdefault(name.split(" + ")[0], name)
-    return {n: ranked[n] for n in kinds.values()}
+    return {n: found[n] for n in kinds.values()}
 
 
 def _best_first(found: Mapping[str, tuple[float, Task, Array] | None]) -> dict[str, tuple[float, Task, Array]]:
@@ -581,23 +570,27 @@ def _between(task: Task, values: Mapping[str, float], speeds: Sequence[float], b
 
 def _within(task: Task, c: Array) -> tuple[float, Task, Array] | None:
     """Return worth, refined task and unknowns, shrunk until the limits hold; None where they never do."""
-    fine = False
+    kept = _shrunk(task, c)
+    if kept is not None:
+        task = task.refined(task.layout.of(kept[0]), TOLERANCE)
+        kept = _shrunk(task, kept[0])
+    if kept is None:
+        return None
+    levels = task.layout.of(kept[0])
+    worth = [w.value for w in task.criteria(levels, task.respond(levels), False)]
+    return min((w for w in worth if w > HOPELESS or task.asked), default=0.0), task, kept[0]
+
+
+def _shrunk(task: Task, c: Array, displaced: Sequence[Array] = (),
+            ) -> tuple[Array, dict[str, tuple[float, float]]] | None:
+    """Return the unknowns, shrunk until (displaced) rivals keep the limits, and their reach; None: they never do."""
     for _ in range(30):
-        try:
-            answers = task.respond(task.layout.of(c))
-        except SimulationError:
-            c = 0.5 * c
-            continue
-        values, _, low, high = task.extremes(answers)
-        ratio = max(float(np.max(values / high, where=values > 0, initial=0.0)),
-                    float(np.max(values / low, where=values < 0, initial=0.0)))
-        if ratio <= 1 and fine:
-            worth = [w.value for w in task.criteria(task.layout.of(c), answers, False)]
-            return min((w for w in worth if w > HOPELESS or task.asked), default=0.0), task, c
+        reach = task.reach(task.layout.of(c), displaced or [np.zeros((1, len(d.rival.scale))) for d in task.driven])
+        rooms = {s: task.room(s) for s in reach}
+        ratio = max(max(reach[s][0] / low, reach[s][1] / high) for s, (low, high) in rooms.items())
         if ratio <= 1:
-            task, fine = task.refined(task.layout.of(c), TOLERANCE), True
-            continue
-        c = c * min(0.98, 1 / ratio)
+            return c, reach
+        c = c * min(0.98, max(1 / ratio, 0.3))
     return None
 
 
@@ -614,7 +607,7 @@ def _fixed(task: Task) -> tuple[str, Task, Array]:
     fine = task.laid(replace(old, ms=(ms,) * n, bits=(ms,) * n, mixing=None))
     starts = _best_first({n: _within(fine, c) for n, c in _followed(fine.layout, (0.0,)).items()})
     if not starts:
-        raise FitError("no record stays within the limits with all models; allow more voltage, current or angle.")
+        raise FitError(NO_RECORD)
     name, (_, fine, c) = next(iter(starts.items()))
     return name, fine, c
 
@@ -625,24 +618,12 @@ def _drawn(task: Task) -> list[Array]:
     return [np.vstack([np.zeros(len(d.rival.scale)), d.rival.draws(DRAWS, rng)]) for d in task.driven]
 
 
-def _spread(task: Task, c: Array) -> dict[str, float]:
-    """Return by state how many times further than the rivals drawn parameters go."""
-    levels, draws = task.layout.of(c), _drawn(task)
-    here, there = task.reach(levels, [d[:1] for d in draws]), task.reach(levels, draws)
-    return {s: min(max(1.0, *(b / a for a, b in zip(here[s], there[s], strict=True) if a)), MOST_SPREAD) for s in here}
-
-
 def _safe(task: Task, c: Array) -> tuple[Array, dict[str, float]]:
     """Return the unknowns, shrunk until drawn parameters keep the limits too, and the largest size of each state."""
-    draws, reach = _drawn(task), {}
-    for _ in range(30):
-        reach = task.reach(task.layout.of(c), draws)
-        noise = {s: NOISES * task.noise.get(s, 0.0) for s in reach}
-        ratio = max(max((reach[s][0] - noise[s]) / low, (reach[s][1] + noise[s]) / high)
-                    for s, (low, high) in task.limits.items())
-        if ratio <= 1:
-            break
-        c = c * min(0.98, 1 / ratio)
+    kept = _shrunk(task, c, _drawn(task))
+    if kept is None:
+        raise FitError(NO_RECORD)
+    c, reach = kept
     return c, {"v": float(np.abs(task.layout.of(c)).max()), **{s: max(-a, b) for s, (a, b) in reach.items()}}
 
 

@@ -44,24 +44,12 @@ ROUNDS = 50
 
 @dataclass(frozen=True, eq=False)
 class Errors:
-    """Prediction errors of one channel, SI, with the block that each belongs to.
+    """Prediction errors of one channel, SI, with the block that each belongs to."""
 
-    Attributes
-    ----------
-    values : tuple of ndarray
-        One per run, (N,), NaN where nothing was measured.
-    blocks : tuple of ndarray of int
-        Number of the block of each sample, counted over all runs.
-    measured : float
-        RMS of the measured samples.
-    noise : float
-        Standard deviation of the sensor's noise.
-    """
-
-    values: tuple[Array, ...]
-    blocks: tuple[NDArray[np.intp], ...]
-    measured: float
-    noise: float
+    values: tuple[Array, ...]  # one per run, (N,), NaN where nothing was measured
+    blocks: tuple[NDArray[np.intp], ...]  # number of the block of each sample, counted over all runs
+    measured: float  # RMS of the measured samples
+    noise: float  # standard deviation of the sensor's noise
 
     @property
     def misfit(self) -> float:
@@ -81,18 +69,10 @@ Channels = Mapping[str, Errors]
 
 @dataclass(frozen=True, eq=False)
 class Predictions:
-    """What a model predicts of data that it was not fitted to.
+    """What a model predicts of data that it was not fitted to."""
 
-    Attributes
-    ----------
-    blocks : dict of str to Errors
-        Per channel, on blocks of the fitted runs left out in turn.
-    held_out : dict of str to Errors
-        Per channel, on held-out runs; empty without.
-    """
-
-    blocks: Channels
-    held_out: Channels
+    blocks: Channels  # per channel, on blocks of the fitted runs left out in turn
+    held_out: Channels  # per channel, on held-out runs; empty without
 
 
 @dataclass(frozen=True)

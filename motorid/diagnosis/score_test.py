@@ -309,23 +309,12 @@ def weights_of(problem: Problem) -> tuple[Array, ...]:
 
 @dataclass(frozen=True, eq=False)
 class Added:
-    """A fit's model with an effect more, on the fit's records.
-
-    Attributes
-    ----------
-    fit : Fit
-    model : Model
-        With the effect.
-    pars : sequence of Parameter
-        The effect's, as in the model.
-    natural : dict of str to float
-        Natural size per unit.
-    """
+    """A fit's model with an effect more, on the fit's records."""
 
     fit: Fit
-    model: Model
-    pars: Sequence[Parameter]
-    natural: Mapping[str, float]
+    model: Model  # with the effect
+    pars: Sequence[Parameter]  # the effect's, as in the model
+    natural: Mapping[str, float]  # natural size per unit
 
     @staticmethod
     def of(tangent: Tangent, effect: Effect) -> Added:

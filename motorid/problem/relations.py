@@ -25,46 +25,22 @@ NEAR = 1e-6  # of a row's size: so near it stands at its limit
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """Rows of one constraint on one run: ``lower ≤ mean over its samples of local(x, u, p, d) ≤ upper``.
-
-    Attributes
-    ----------
-    run : int
-    local : casadi.Function
-        ``(x, u, p, d) -> (c, dc/dx, dc/dp)``, c of shape (nc,), dimensionless.
-    samples : ndarray of int, shape (m,)
-        In ascending order.
-    group : ndarray of int, shape (m,)
-        Which row block each sample is averaged into.
-    data : ndarray, shape (m, nd)
-    u : ndarray, shape (m, nu)
-    keep : ndarray of bool, shape (ng·nc,)
-        Which rows are used.
-    lower, upper : ndarray, shape (n,)
-        Of the rows kept.
-    size : ndarray, shape (n,)
-        What one unit of a row is, in `unit`.
-    weight : ndarray, shape (n,)
-        Of the rows as a penalty.
-    labels, units : tuple of str
-    gradient : ndarray, shape (nx,), or None
-        dc/dx where the row is this times x and nothing else, which is much faster.
-    """
+    """Rows of one constraint on one run: ``lower ≤ mean over its samples of local(x, u, p, d) ≤ upper``."""
 
     run: int
-    local: ca.Function
-    samples: np.ndarray
-    group: np.ndarray
-    data: Array
-    u: Array
-    keep: np.ndarray
-    lower: Array
+    local: ca.Function  # ``(x, u, p, d) -> (c, dc/dx, dc/dp)``, c of shape (nc,), dimensionless
+    samples: np.ndarray  # (m,) in ascending order
+    group: np.ndarray  # (m,) which row block each sample is averaged into
+    data: Array  # (m, nd)
+    u: Array  # (m, nu)
+    keep: np.ndarray  # (ng·nc,) which rows are used
+    lower: Array  # (n,) of the rows kept
     upper: Array
-    size: Array
-    weight: Array
+    size: Array  # (n,) what one unit of a row is, in `unit`
+    weight: Array  # (n,) of the rows as a penalty
     labels: tuple[str, ...]
     units: tuple[str, ...]
-    gradient: Array | None = None
+    gradient: Array | None = None  # (nx,) dc/dx where the row is this times x and nothing else, which is much faster
 
     def rows(self, x: Array, p: Array, dx: Array | None, dp: Array | None) -> tuple[Array, Array | None]:
         """Return the rows (n,) and d rows/dz (n, nz) at states (m, nx) with dx (m, nx, nz), dp (np, nz)."""

@@ -37,27 +37,14 @@ _sizes: WeakKeyDictionary[Experiment, _Sizes] = WeakKeyDictionary()
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """One record as the solver sees it.
-
-    Attributes
-    ----------
-    experiment : Experiment
-    grid : Grid
-    sigma : dict of str to float
-        Noise per channel, SI.
-    start : ndarray, shape (3,)
-        (i, omega, theta) at the first sample: known, measured or the first guess.
-    limits : dict of str to (float, float)
-        Which of them are unknowns of the fit, and between which values.
-    apart : dict of str to float
-        Values of this run's own of parameters that are others in every run.
-    """
+    """One record as the solver sees it."""
 
     experiment: Experiment
     grid: Grid
-    sigma: Mapping[str, float]
-    start: Array
-    limits: Mapping[str, tuple[float, float]]
+    sigma: Mapping[str, float]  # noise per channel, SI
+    start: Array  # (3,) (i, omega, theta) at the first sample: known, measured or the first guess
+    limits: Mapping[str, tuple[float, float]]  # which of them are unknowns of the fit, and between which values
+    # values of this run's own of parameters that are others in every run
     apart: Mapping[str, float] = field(default_factory=dict)
 
     @property

@@ -62,19 +62,11 @@ class Walk(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """Intervals of all runs and the rows they give.
-
-    Attributes
-    ----------
-    problem : Problem
-    every : int or None
-        Samples per interval; None chooses.
-    noise : ndarray, shape (nx,), or None
-        Process noise per state, unit/√s: gaps at the nodes are weighed by it instead of forbidden.
-    """
+    """Intervals of all runs and the rows they give."""
 
     problem: Problem
-    every: int | None = None
+    every: int | None = None  # samples per interval; None chooses
+    # (nx,) process noise per state, unit/√s: gaps at the nodes are weighed by it instead of forbidden
     noise: Array | None = None
 
     # -- layout ----------------------------------------------------------------------------------------
