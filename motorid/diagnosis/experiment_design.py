@@ -338,7 +338,10 @@ def _optimised(task: Task, say: Callable[[str], None]) -> Found:
     """Return the best point that the search reaches from the best starts."""
     done: list[Found] = []
     for name, (_, here, c) in list(_starts(task).items())[:SHARPENED if task.asked else DISTINGUISHED]:
-        found = climb(_hardest(replace(here, pairs=task.pairs), c), c)
+        start = _within(replace(here, pairs=task.pairs), c)
+        if start is None:
+            continue
+        found = climb(_hardest(start[1], start[2]), start[2])
         again = None if found.stopped else _within(found.task, found.c)  # integration steps that suit what was found
         done.append(climb(again[1], again[2]) if again else found)
         say(f"optimised from the {name}: {done[-1].value:.3g}")
@@ -473,7 +476,7 @@ def _starts(task: Task) -> dict[str, tuple[float, Task, Array]]:
     task = replace(task, pairs=task.pairs[:MOST_PAIRS])
     laid = {} if task.layout.ramps or not task.asked else _waves(task)
     laid |= {n: (task.layout, c) for n, c in _followed(task.layout, RIPPLES).items()}
-    found = _best_first({n: _within(task.laid(layout), c) for n, (layout, c) in laid.items()})
+    found = _best_first({n: _within(task.laid(layout), c, bool(task.asked)) for n, (layout, c) in laid.items()})
     kinds: dict[str, str] = {}
     for name in found:
         kinds.setdefault(name.split(" + ")[0], name)
@@ -568,10 +571,10 @@ def _between(task: Task, values: Mapping[str, float], speeds: Sequence[float], b
     return replace(task.layout, ms=tuple(ms), bits=tuple(bits)), c
 
 
-def _within(task: Task, c: Array) -> tuple[float, Task, Array] | None:
-    """Return worth, refined task and unknowns, shrunk until the limits hold; None where they never do."""
+def _within(task: Task, c: Array, fine: bool = True) -> tuple[float, Task, Array] | None:
+    """Return worth, task (of fine steps) and unknowns, shrunk until the limits hold; None where they never do."""
     kept = _shrunk(task, c)
-    if kept is not None:
+    if kept is not None and fine:
         task = task.refined(task.layout.of(kept[0]), TOLERANCE)
         kept = _shrunk(task, kept[0])
     if kept is None:
