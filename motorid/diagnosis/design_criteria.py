@@ -496,13 +496,13 @@ class Found:
     stopped: bool = False
 
 
-def climb(task: Task, c: Array) -> Found:
+def climb(task: Task, c: Array, enough: float = np.inf) -> Found:
     """Maximise the least criterion under the limits, from unknowns that keep them, by sequential linear programming.
 
     The information is convex in a linear motor's voltage, so that its maxima lie where limits are active, and a linear
     program goes there at once (Fletcher & Sainz de la Maza, Mathematical Programming 43, 1989); the trust region
     shrinks where the step does not keep its promise. Limits of the states hold at the largest and the smallest value
-    of each segment. A budget of time or Ctrl-C ends the search at the best point so far.
+    of each segment. A criterion of `enough`, a budget of time or Ctrl-C ends the search at the best point so far.
     """
     linear, radius, best = _linear_rows(task), RADIUS, Found(task, c, -np.inf)
     try:
@@ -512,7 +512,7 @@ def climb(task: Task, c: Array) -> Found:
             check_time()
             along = linear._replace(values=linear.slopes @ best.c)
             step, promise = _linear_step(best.c, values, slopes, [states, along], radius)
-            if promise < WORTHWHILE:
+            if promise < WORTHWHILE or best.value > enough:
                 break
             try:
                 there, _, y = _linearised(task, best.c + step, False)

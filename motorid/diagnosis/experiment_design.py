@@ -138,7 +138,7 @@ LEVELS = 30  # a board takes 32 segments
 SHORTEST = 5  # ms of a segment
 FINE = 200  # steps by which a fixed candidate is followed
 MOST_RIVALS = 4
-SHARPENED, DISTINGUISHED = 8, 3  # starts of the search
+SHARPENED, DISTINGUISHED = 4, 3  # starts of the search
 TRACE = 0.02  # of v_max: a binary signal smaller than this is left out
 MOST_PAIRS = 3  # that one optimisation looks at
 HOPELESS = 0.1  # log(1 + χ²) below which two rivals are as good as one model
@@ -336,16 +336,16 @@ def _check_sizes(**given: float | None) -> None:
 
 def _optimised(task: Task, say: Callable[[str], None]) -> Found:
     """Return the best point that the search reaches from the best starts."""
-    done: list[Found] = []
+    done, enough = [], np.inf if task.asked else ENOUGH
     for name, (_, here, c) in list(_starts(task).items())[:SHARPENED if task.asked else DISTINGUISHED]:
         start = _within(replace(here, pairs=task.pairs), c)
         if start is None:
             continue
-        found = climb(_hardest(start[1], start[2]), start[2])
+        found = climb(_hardest(start[1], start[2]), start[2], enough)
         again = None if found.stopped else _within(found.task, found.c)  # integration steps that suit what was found
-        done.append(climb(again[1], again[2]) if again else found)
+        done.append(climb(again[1], again[2], enough) if again else found)
         say(f"optimised from the {name}: {done[-1].value:.3g}")
-        if done[-1].stopped or (task.pairs and done[-1].value > ENOUGH):
+        if done[-1].stopped or done[-1].value > enough:
             break
     if not done:
         raise FitError(NO_RECORD)
