@@ -1,7 +1,8 @@
-"""Long records: a diagnosis refits dozens of models, so it looks at parts of what would take too long.
+"""Long records: a diagnosis refits dozens of models, so it looks at less of what would take too long.
 
-Parts are contiguous and chosen so that together they show what the records show: both directions, slow and fast, all
-voltages, early and late. Every part begins where the motor then is, so that an angle drifts no longer than one part
+Samples that their neighbours predict as well as noise allows are left out; of what is still too long, it looks at
+parts. Parts are contiguous and chosen so that together they show what the records show: both directions, slow and fast,
+all voltages, early and late. Every part begins where the motor then is, so that an angle drifts no longer than one part
 lasts. What takes longer than a part to show (heating) is seen between the parts only.
 """
 
@@ -21,6 +22,8 @@ from motorid.problem.problem import Problem
 from motorid.problem.runs import angle_signal
 from motorid.records.experiment import Experiment, record_of
 
+ENOUGH = 4000  # samples: what is left at least of those that their neighbours predict
+SMALL = 0.1  # of the error: a difference that changes no judgement
 AFFORDABLE = 60_000  # steps of integration per simulation of all records
 WANTED = 24_000  # of what is longer
 PART = 1000  # samples
@@ -34,18 +37,48 @@ TIMES = 4  # and parts of the record
 
 
 def affordable(fit: Fit) -> Fit:
-    """Return `fit`, or the fit of the same model to parts of its records if these are too long for many refits."""
-    problem = fit.problem
-    work = sum(int(r.grid.substeps.sum()) for r in problem.runs)
-    if work <= AFFORDABLE or problem.initial != "auto":
+    """Return `fit`, or the fit of the same model to less of its records if these are too long for many refits."""
+    if fit.problem.initial != "auto":
         return fit
-    parts = parts_of(problem.experiments, WANTED / work)
-    if parts is None:
-        return fit
+    if (k := _every(fit)) > 1:
+        fit = _again(fit, [r.decimate(k).with_(meta={**r.meta, "every": k}) for r in fit.problem.experiments])
+    work = sum(int(r.grid.substeps.sum()) for r in fit.problem.runs)
+    return _again(fit, parts_of(fit.problem.experiments, WANTED / work)) if work > AFFORDABLE else fit
+
+
+def thinned_alike(fit: Fit, runs: Sequence[Experiment]) -> list[Experiment]:
+    """Return as many samples of `runs` as of those that were fitted."""
+    return [r.decimate(fit.problem.experiments[0].meta.get("every", 1)) for r in runs]
+
+
+def _again(fit: Fit, runs: Sequence[Experiment] | None) -> Fit:
     try:
-        return solve(problem.with_(experiments=parts, model=fit.model, noise_factors={}), start="model")
+        return fit if runs is None else solve(
+            fit.problem.with_(experiments=runs, model=fit.model, noise_factors={}), start="model")
     except MotoridError:
         return fit
+
+
+def _every(fit: Fit) -> int:
+    """Return k (a power of two) where every k-th sample tells as much as all do, but for noise."""
+    k, runs = 1, list(zip(fit.simulations, fit.problem.runs, strict=True))
+    while _samples(fit.problem.experiments) >= 2 * k * ENOUGH and all(
+            _predicted(s.experiment.t, s.outputs[c], s.residual(c), 2 * k, run.sigma[c])
+            for s, run in runs for c in run.sigma):
+        k *= 2
+    return k
+
+
+def _predicted(t: Array, model: Array, error: Array, k: int, noise: float) -> bool:
+    """Tell whether every k-th sample predicts those between: the model by far, its error as well as noise allows."""
+    def rms_between(y: Array) -> float:
+        at, seen = t[good], y[good]
+        return float(np.sqrt(np.mean((seen - np.interp(at, at[::k], seen[::k])) ** 2)))
+
+    good, w = np.isfinite(error), np.arange(1, k) / k
+    of_noise = noise * np.sqrt(np.sum(1 + w**2 + (1 - w) ** 2) / k)  # linear interpolation of white noise
+    return (rms_between(error) < (1 + SMALL) * of_noise
+            and rms_between(model) < SMALL * np.sqrt(np.mean(error[good] ** 2)))
 
 
 def worth_its_steps(problem: Problem) -> bool:
@@ -133,14 +166,14 @@ def _flags(run: Experiment) -> Array:
 def parts_remark(fit: Fit) -> str:
     """Say which part of the records a fit looked at, if not all."""
     used = fit.problem.experiments
+    k = used[0].meta.get("every", 1)
+    thin = f"One sample of {k} was used: those between differ by noise alone." if k > 1 else ""
     whole = dict(r.meta.get("part of", (r.name, r.n)) for r in used)
     if not any("part of" in r.meta for r in used):
-        return ""
+        return thin
     share = _samples(used) / sum(whole.values())
-    return (
-        f"The records are long: this rests on {len(used)} parts of {_seconds(used):.2g} s, {100 * share:.0f} % of the "
-        "samples; fit the model to all of them."
-    )
+    return (f"The records are long: this rests on {len(used)} parts of {_seconds(used):.2g} s, {100 * share:.0f} % of "
+            f"the samples; fit the model to all of them. {thin}".rstrip())
 
 
 def _samples(runs: Sequence[Experiment]) -> int:

@@ -19,7 +19,7 @@ from motorid.diagnosis.cross_validation import QUICK, HeldOut
 from motorid.diagnosis.input_hypotheses import Reading, better_reading, without_spikes
 from motorid.diagnosis.misspecification import FormGain, Grade, better_forms, grades_of
 from motorid.diagnosis.model_comparison import Node, at_noise, beats, choose, evidence, far, group_of, node_of, tied
-from motorid.diagnosis.record_parts import affordable
+from motorid.diagnosis.record_parts import affordable, thinned_alike
 from motorid.diagnosis.refit import INTERRUPTED, OUT_OF_TIME
 from motorid.diagnosis.results import Adequacy, Candidate, Ladder, Rung
 from motorid.diagnosis.verdict import first_answer
@@ -205,7 +205,8 @@ def explored(fit: Fit, validate: Sequence[Experiment] | Experiment | None, effec
         stages.climb()
         return climb(Search(records.fit, records.held_out, effects, stages), max_effects, left)
 
-    records = Records(affordable(fit), [validate] if isinstance(validate, Experiment) else validate)
+    fit, held_out = affordable(fit), [validate] if isinstance(validate, Experiment) else validate
+    records = Records(fit, held_out and thinned_alike(fit, held_out))
     if spikes := without_spikes(records.fit):
         records = records.read(spikes)
     as_it_was = records

@@ -28,20 +28,11 @@ from motorid.problem.runs import natural_sizes
 
 @dataclass(frozen=True, eq=False)
 class Response:
-    """Linear response of one run.
+    """Linear response of one run."""
 
-    Attributes
-    ----------
-    a : ndarray, shape (N-1, nx, nx)
-    b : ndarray, shape (N-1, nx, 2)
-        To a voltage (V) and a torque (N·m) held over the sample.
-    c : ndarray, shape (N, ny, nx)
-    states : dict of str to ndarray
-    """
-
-    a: Array
-    b: Array
-    c: Array
+    a: Array  # (N-1, nx, nx)
+    b: Array  # (N-1, nx, 2), to a voltage (V) and a torque (N·m) held over the sample
+    c: Array  # (N, ny, nx)
     states: dict[str, Array]
 
     def driven(self, pushes: Array) -> Array:

@@ -30,18 +30,10 @@ class Point(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Unknowns:
-    """Which unknowns there are, and how they enter the system.
-
-    Attributes
-    ----------
-    system : System
-    parameters : mapping of str to Parameter
-        All of the model, fixed ones too.
-    runs : tuple of Run
-    """
+    """Which unknowns there are, and how they enter the system."""
 
     system: System
-    parameters: Mapping[str, Parameter]
+    parameters: Mapping[str, Parameter]  # all of the model, fixed ones too
     runs: tuple[Run, ...]
 
     @cached_property
@@ -186,20 +178,11 @@ class Unknowns:
 
 @dataclass(frozen=True, eq=False)
 class Scaling:
-    """Solver coordinates q of the physical values p: ``p = s·exp(q)`` where `log`, else ``p = s·q``.
+    """Solver coordinates q of the physical values p: ``p = s·exp(q)`` where `log`, else ``p = s·q``; all (n,)."""
 
-    Attributes
-    ----------
-    scale : ndarray, shape (n,)
-        Positive sizes s.
-    log : ndarray of bool, shape (n,)
-    lower, upper : ndarray, shape (n,)
-        Limits of p.
-    """
-
-    scale: NDArray[np.float64]
+    scale: NDArray[np.float64]  # positive sizes s
     log: NDArray[np.bool_]
-    lower: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
+    lower: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))  # limits of p
     upper: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
 
     @staticmethod

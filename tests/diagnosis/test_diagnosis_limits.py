@@ -196,6 +196,28 @@ def test_a_long_record_is_looked_at_in_parts_and_that_is_said(lab, monkeypatch):
     assert "2 parts of 0.5 s, 33 % of the samples" in found.text
 
 
+def test_samples_that_their_neighbours_predict_are_left_out_and_that_is_said(lab, monkeypatch):
+    monkeypatch.setattr(parts, "ENOUGH", 400)
+    run, check = runs_of(lab, {"coulomb": {"tau_c": 8e-3}}, ("ramps 0.3", "waves"), ("theta",), n=3200)
+    whole = mi.fit(mi.dc_motor().fix(R=lab.R, L=lab.L, K=lab.K), [run])
+    thin = parts.affordable(whole)
+    assert thin.problem.experiments[0].n == parts.thinned_alike(thin, [check])[0].n == 800
+    for name in ("b", "J"):
+        assert thin.values[name] == pytest.approx(whole.values[name], rel=0.05), name
+    found = mi.diagnose(whole, check, effects=("coulomb", "brush_drop"))
+    assert found.effects == ("coulomb",)
+    assert found.after.values["tau_c"] == pytest.approx(8e-3, rel=0.03)
+    assert "One sample of 4 was used" in found.text
+
+
+@pytest.mark.parametrize(("voltage", "channels"), [("prbs", ("omega",)), ("stairs 0.4", ("i", "omega"))])
+def test_samples_that_show_what_is_quick_stay(lab, monkeypatch, voltage, channels):
+    """A current that rises within samples, a binary signal; neighbours do not predict them."""
+    monkeypatch.setattr(parts, "ENOUGH", 400)
+    whole = mi.fit(mi.dc_motor(), runs_of(lab, {}, (voltage,), channels, n=3200))
+    assert parts.affordable(whole) is whole
+
+
 # -- what is shown while it works --------------------------------------------------------------------------
 
 
