@@ -210,11 +210,13 @@ def test_samples_that_their_neighbours_predict_are_left_out_and_that_is_said(lab
     assert "One sample of 4 was used" in found.text
 
 
-@pytest.mark.parametrize(("voltage", "channels"), [("prbs", ("omega",)), ("stairs 0.4", ("i", "omega"))])
-def test_samples_that_show_what_is_quick_stay(lab, monkeypatch, voltage, channels):
-    """A current that rises within samples, a binary signal; neighbours do not predict them."""
+@pytest.mark.parametrize(("hidden", "voltage", "channels"), [
+    ({}, "prbs", ("omega",)), ({}, "stairs 0.4", ("i", "omega")),
+    ({"cogging": {"A": 8e-3, "N": 40}}, "ramps 0.3", ("i",))])
+def test_samples_that_show_what_is_quick_stay(lab, monkeypatch, hidden, voltage, channels):
+    """A binary signal, a current that rises within samples, teeth that pass in a few: neighbours predict none."""
     monkeypatch.setattr(parts, "ENOUGH", 400)
-    whole = mi.fit(mi.dc_motor(), runs_of(lab, {}, (voltage,), channels, n=3200))
+    whole = mi.fit(mi.dc_motor(), runs_of(lab, hidden, (voltage,), channels, n=3200))
     assert parts.affordable(whole) is whole
 
 
