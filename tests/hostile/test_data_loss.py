@@ -228,6 +228,8 @@ def test_two_batches_on_one_journal_end_in_the_same_table(tmp_path):
         assert process.returncode == 0, err
     assert motorid("fit-many", folder, "--journal", tmp_path / "batch.jsonl", "--out", tables[2]).status == 0
     assert without_seconds(tables[0]) == without_seconds(tables[1]) == without_seconds(tables[2])
+    lines = (tmp_path / "batch.jsonl").read_text(encoding="utf-8").splitlines()
+    assert {json.loads(line)["row"]["motor"] for line in lines} == {f"m{k:02}" for k in range(4)}
 
 
 @pytest.mark.skipif(not hasattr(os, "openpty"), reason="no pseudo-terminals there")
