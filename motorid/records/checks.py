@@ -108,11 +108,8 @@ def _missing(run: Experiment) -> str | None:
 
 
 def _clipped(run: Experiment) -> str | None:
-    for channel in ("i", "omega"):
-        y = run.outputs.get(channel)
-        if y is None:
-            continue
-        y = y[np.isfinite(y)]
+    for channel in (c for c in ("i", "omega") if c in run.outputs):
+        y = run.outputs[channel][np.isfinite(run.outputs[channel])]
         for top in (y.max(), y.min()):
             if _at_stop(y, float(top)):
                 share = 100 * float(np.mean(y == top))
@@ -267,8 +264,7 @@ def signs(run: Experiment) -> str | None:
         against = [name for name, sign in zip(("current", "speed"), turned, strict=True) if sign < 0]
         if order != (0, 1, 2):
             return None
-    turning = {"omega", "theta"} & set(run.outputs)
-    measured = ["current"] * ("i" in run.outputs) + ["speed"] * bool(turning)
+    measured = ["current"] * ("i" in run.outputs) + ["speed"] * bool({"omega", "theta"} & set(run.outputs))
     if not against:
         return None
     if len(against) == 2:
@@ -377,7 +373,8 @@ def swapped_columns(run: Experiment) -> str | None:
         return (f"{what} fit the equations of a motor far better if their columns are exchanged. Say which is which: "
                 f"columns={{{', '.join(f'{c!r}: ...' for c in moved)}}}.")
     jump, reach = float(np.nanmax(np.abs(np.diff(omega)))), float(np.nanmax(omega) - np.nanmin(omega))
-    if _holds(omega) > 0.8 and _holds(run.inputs["v"]) < 0.3 and jump > 0.3 * reach > 0:
+    if (_holds(omega) > 0.8 and _holds(run.inputs["v"]) < 0.3 and jump > 0.3 * reach > 0
+            and _follows(run.inputs["v"], omega) > 0.1):
         return ("the speed jumps and then stays exactly the same, while the voltage changes smoothly: "
                 "are the two columns swapped? Say which is which: columns={'v': ..., 'omega': ...}.")
     return None
@@ -474,6 +471,19 @@ def _block_travel(run: Experiment) -> tuple[Array, Array]:
 def _edges(run: Experiment, channel: str) -> NDArray[np.intp]:
     known = np.flatnonzero(np.isfinite(run.outputs[channel]))
     return known[np.unique(np.linspace(0, len(known) - 1, min(_BLOCKS, len(known) // 5) + 1).astype(int))]
+
+
+def _follows(y: Array, cause: Array) -> float:
+    """Return the cosine of the jumps of a cause and the bends of y there.
+
+    Near 1 where a speed follows a voltage, near -1 where a controller's voltage follows a speed that is sampled slowly.
+    """
+    at = np.flatnonzero(np.abs(np.diff(cause)) > 0) + 1
+    stays = np.diff(np.r_[0, at, len(cause)])
+    near = np.maximum(np.minimum(stays[:-1], stays[1:]) // 4, 1)
+    before = (y[at - 1] - y[np.maximum(at - 1 - near, 0)]) / near
+    after = (y[np.minimum(at + near, len(y) - 1)] - y[at - 1]) / (near + 1)
+    return _cosine(cause[at] - cause[at - 1], after - before)
 
 
 def _holds(values: Array) -> float:

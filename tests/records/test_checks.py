@@ -138,6 +138,20 @@ def test_swapped_columns_are_told(steps):
     assert "columns swapped" in said(swapped)
 
 
+@pytest.mark.parametrize("gain", [0.0, 0.03])
+def test_a_speed_that_is_measured_now_and_then_is_no_voltage(gain):
+    """By a controller, or beside a smooth voltage: it follows the voltage, and the voltage does not follow it."""
+    t, v, omega, shown, load = np.arange(1500) * 1e-2, np.zeros(1500), np.zeros(1500), np.zeros(1500), 0.0
+    for k in range(1499):
+        shown[k] = shown[k - 1] if k % 25 else omega[k]
+        wanted = 60.0 * (k > 100) - 90.0 * (k > 700)
+        load += 3e-2 * gain * (wanted - shown[k])
+        v[k] = load + gain * (wanted - shown[k]) if gain else 6 * np.sin(k / 40)
+        omega[k + 1] = omega[k] + 1e-2 / 0.1 * (20 * v[k] - omega[k])
+    shown[-1], v[-1] = shown[-2], v[-2]
+    assert "columns swapped" not in said(Experiment(t, {"v": v}, {"omega": shown}))
+
+
 # -- quality ------------------------------------------------------------------------------------------------
 
 
