@@ -291,6 +291,24 @@ def unsigned(run: Experiment) -> str | None:
     return None
 
 
+def unsigned_voltage(run: Experiment) -> str | None:
+    """A positive voltage that is switched on at rest turns the motor one way; a duty cycle without its sign, both."""
+    v, turning = run.inputs["v"], run.outputs.get("theta", run.outputs.get("omega"))
+    if turning is None or v.min() < 0:
+        return None
+    known = bridged(run.t, turning)
+    angle = known if "theta" in run.outputs else integral(run.t, known)
+    switched = np.flatnonzero(np.diff((v > 0.1 * v.max()).astype(int), prepend=0, append=0))
+    on, off = switched[::2], np.minimum(switched[1::2], len(v) - 1)
+    travel, before = angle[off] - angle[on], angle[on] - angle[np.maximum(on - 5, 0)]
+    most = np.abs(travel).max(initial=0.0)
+    travel = travel[(np.abs(before) < 0.02 * most) & (np.abs(travel) > 0.1 * most)]
+    if not travel.size or travel.min() > 0 or travel.max() < 0:
+        return None
+    return ("the voltage is never negative, yet switched on at rest it turns the motor backwards "
+            f"{np.sum(travel < 0)} of {travel.size} times: logged without its sign? Give it that of the direction.")
+
+
 def angle_against_speed(run: Experiment) -> str | None:
     """The angle must advance by the integral of the speed."""
     if not {"omega", "theta"} <= set(run.outputs):
@@ -493,6 +511,6 @@ def _holds(values: Array) -> float:
 
 
 _CHECKS: tuple[Check, ...] = (
-    signs, unsigned, angle_against_speed, magnitudes, implied_constants, _one_column_for_two, swapped_columns,
-    _excitation, _missing, _clipped, current_limit, _coarse, _spikes, _noisy, _uneven, _slow_sampling, _never_settles,
+    signs, unsigned, unsigned_voltage, angle_against_speed, magnitudes, implied_constants, _one_column_for_two,
+    swapped_columns, _excitation, _missing, _clipped, current_limit, _coarse, _spikes, _noisy, _uneven, _slow_sampling, _never_settles,
 )

@@ -8,7 +8,7 @@ from command import motorid_json
 from lab_records import simulated
 
 import motorid as mi
-from motorid.records.checks import unsigned
+from motorid.records.checks import unsigned, unsigned_voltage
 from motorid.records.preprocessing import spikes, unwrapped
 from motorid.records.reading import write_csv
 
@@ -172,3 +172,18 @@ def test_a_current_logged_without_its_sign_is_told():
     assert "without its sign" in (unsigned(rectified) or "")
     forward = run.with_(inputs={"v": np.abs(run.inputs["v"])}, outputs={"i": np.abs(run.outputs["i"])})
     assert unsigned(forward) is None
+
+
+@pytest.mark.parametrize("channel", ["theta", "omega"])
+def test_a_voltage_logged_without_its_sign_is_told(plant, lab, channel):
+    """A bridge's duty cycle is often logged beside its direction."""
+    t = 5e-3 * np.arange(800)
+    v = 6.0 * np.repeat([0, 1, 0, -1, 0, 0.5, 0, -1], 100)
+    turning = plant.simulate(lab, {"coulomb": {"tau_c": 8e-3}}, t, v, substep=1e-3)[channel]
+    run = mi.Experiment(t, {"v": v}, {channel: turning}, name="bench")
+    assert unsigned_voltage(run) is None
+    lost = run.with_(inputs={"v": np.abs(v)})
+    assert "backwards 2 of 4 times" in (unsigned_voltage(lost) or "")
+    assert "backwards 2 of 4 times" in " ".join(mi.check_runs([lost]))
+    swings = lost.with_(outputs={channel: turning[:100].tolist() + np.sin(np.arange(700) / 9).tolist()})
+    assert unsigned_voltage(swings) is None, "never at rest"

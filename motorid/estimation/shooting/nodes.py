@@ -68,26 +68,17 @@ def measured_states(run: Experiment, states: tuple[str, ...]) -> dict[int, Array
 
 @dataclass(frozen=True, eq=False)
 class Gaps:
-    """What is missing at each node: the state there minus the end of the interval before.
+    """What is missing at each of n nodes: the state there minus the end of the interval before.
 
-    Attributes
-    ----------
-    run : ndarray of int, shape (n,)
-    t : ndarray, shape (n,)
-        s.
-    span : ndarray, shape (n,)
-        Length of the interval before, s.
-    states : tuple of str
-    values : ndarray, shape (n, nx)
-        SI. J·gap/span of the speed is the mean torque that was missing in the interval, where the interval is
-        short beside the mechanical time constant.
+    J·gap/span of the speed is the mean torque that was missing in an interval that is short beside the mechanical time
+    constant.
     """
 
-    run: np.ndarray
-    t: Array
-    span: Array
+    run: np.ndarray  # (n,) of int
+    t: Array  # (n,), s
+    span: Array  # (n,), length of the interval before, s
     states: tuple[str, ...]
-    values: Array
+    values: Array  # (n, nx), SI
 
 
 def gaps_of(mesh: Mesh, z: Array) -> Gaps:
