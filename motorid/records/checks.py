@@ -512,5 +512,6 @@ def _holds(values: Array) -> float:
 
 _CHECKS: tuple[Check, ...] = (
     signs, unsigned, unsigned_voltage, angle_against_speed, magnitudes, implied_constants, _one_column_for_two,
-    swapped_columns, _excitation, _missing, _clipped, current_limit, _coarse, _spikes, _noisy, _uneven, _slow_sampling, _never_settles,
+    swapped_columns, _excitation, _missing, _clipped, current_limit, _coarse, _spikes, _noisy, _uneven, _slow_sampling,
+    _never_settles,
 )
