@@ -26,22 +26,12 @@ LOOPBACK = "127.0.0.1"
 
 @dataclass(frozen=True)
 class Pace:
-    """How a virtual bench behaves in time.
+    """How a virtual bench behaves in time."""
 
-    Attributes
-    ----------
-    speed : float
-        Times real time; 0 is as fast as the other end reads.
-    unplug_after, plug_after : float or None
-        Seconds of a run after which the line dies, and after which it comes back (None: never).
-    once : bool
-        Whether to end when the first run is over and the recorder has gone.
-    """
-
-    speed: float = 1.0
-    unplug_after: float | None = None
-    plug_after: float | None = None
-    once: bool = False
+    speed: float = 1.0  # times real time; 0 is as fast as the other end reads
+    unplug_after: float | None = None  # seconds of a run after which the line dies
+    plug_after: float | None = None  # and after which it comes back; None: never
+    once: bool = False  # whether to end when the first run is over and the recorder has gone
 
 
 def serve(make: Callable[[], VirtualDevice], transport: Transport, wire: Wire, pace: Pace,

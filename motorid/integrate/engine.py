@@ -16,25 +16,13 @@ from motorid.numerics.signals import Array
 
 @dataclass(frozen=True, eq=False)
 class Grid:
-    """Sample times and inputs of one record.
+    """Sample times and inputs of one record."""
 
-    Attributes
-    ----------
-    t : ndarray, shape (N,)
-        s.
-    u : ndarray, shape (N, nu)
-        Inputs seen by the sensors at the samples.
-    u0, u1 : ndarray, shape (N-1, nu)
-        Inputs at the beginning and the end of each interval; equal where the input is held.
-    substeps : ndarray of int, shape (N-1,)
-        Rosenbrock steps per interval.
-    """
-
-    t: Array
-    u: Array
-    u0: Array
-    u1: Array
-    substeps: NDArray[np.int64]
+    t: Array  # (N,), s
+    u: Array  # (N, nu), inputs seen by the sensors at the samples
+    u0: Array  # (N-1, nu), inputs at the beginning of each interval
+    u1: Array  # (N-1, nu), and at its end; the same where the input is held
+    substeps: NDArray[np.int64]  # (N-1,), Rosenbrock steps per interval
 
     @staticmethod
     def of(t: Array, u: Array, held: NDArray[np.bool_]) -> Grid:
