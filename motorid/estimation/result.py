@@ -380,7 +380,10 @@ def parameter_cell(fit: Fit, name: str) -> Cell:
         return "–"
     p = fit.model.parameters[name]
     if name in fit.per_run:
-        values = [own["value"] for own in fit.per_run[name].values()]
+        runs = fit.per_run[name]
+        if len(runs) == 1:
+            return "".join(f"{with_error(**own)} in {run}" for run, own in runs.items())
+        values = [own["value"] for own in runs.values()]
         return f"{number(min(values), 3)} to {number(max(values), 3)} {p.unit}".rstrip() + ", by run"
     if name == "sgn_width" and not p.given:
         return f"{quantity(fit.values[name], p.unit, 2)} (chosen from the data)"

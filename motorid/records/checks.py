@@ -413,7 +413,7 @@ def _as_balances_want(run: Experiment) -> Reading:
     n = min(BALANCE_BLOCKS, run.n // 3)
     edges = np.linspace(0, run.n - 1, n + 1).astype(int)
     stated: Reading = (0, 1, 2), (1, 1)
-    if "omega" not in known or n < 10:
+    if "omega" not in known or n < 10 or run.units["v"] != "V":  # a torque or current that is commanded obeys others
         return stated
     y = [run.inputs["v"], *(bridged(run.t, run.outputs[c if c in known else "omega"]) for c in ("i", "omega"))]
     sums = [integral(run.t, a, k == 0 and run.hold == "zoh")[edges] for k, a in enumerate(y)]

@@ -138,6 +138,12 @@ def test_swapped_columns_are_told(steps):
     assert "columns swapped" in said(swapped)
 
 
+def test_a_commanded_torque_need_not_obey_the_balances_of_a_voltage(steps):
+    swapped = steps.with_(inputs={"v": steps.outputs["i"]}, outputs={**steps.outputs, "i": steps.inputs["v"]})
+    assert "columns are exchanged" in said(swapped)
+    assert "columns are exchanged" not in said(swapped.with_(units={**swapped.units, "v": "N·m"}))
+
+
 @pytest.mark.parametrize("gain", [0.0, 0.03])
 def test_a_speed_that_is_measured_now_and_then_is_no_voltage(gain):
     """By a controller, or beside a smooth voltage: it follows the voltage, and the voltage does not follow it."""
