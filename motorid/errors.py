@@ -97,7 +97,7 @@ def arguments_told(thing: _Thing) -> _Thing:
     """
     if isinstance(thing, type):
         for name, member in list(vars(thing).items()):
-            if inspect.isfunction(member) and (name in ("__init__", "__add__") or not name.startswith("_")):
+            if inspect.isfunction(member) and (name in ("__init__", "__add__", "__call__") or not name.startswith("_")):
                 setattr(thing, name, arguments_told(member))
         return cast(_Thing, thing)
 
@@ -111,6 +111,13 @@ def arguments_told(thing: _Thing) -> _Thing:
             raise UsageError(wrong) from error
 
     return cast(_Thing, call)
+
+
+def at_least(least: float, **given: float | None) -> None:
+    """Refuse arguments below the least that makes sense; None is one left out."""
+    for name, number in given.items():
+        if number is not None and not number >= least:
+            raise UsageError(f"{name} must be at least {least:g}; got {number}.")
 
 
 def _wrong_argument(function: Callable[..., Any], args: Any, kwargs: Any) -> str | None:

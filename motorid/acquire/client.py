@@ -246,7 +246,7 @@ def _open(port: str, baud: int) -> Any:
     own = {} if "://" in port else {"baudrate": baud, "exclusive": True}
     try:
         return serial.serial_for_url(port, timeout=0.05, write_timeout=1.0, **own)
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, TypeError) as error:  # TypeError: an address without its port
         raise DeviceError(_why_not(port, baud, error)) from None
 
 
@@ -254,6 +254,8 @@ def _why_not(port: str, baud: int, error: Exception) -> str:
     number = getattr(error, "errno", None)
     if isinstance(error, ValueError):
         return f"{port} cannot be opened at {baud} baud: {error}."
+    if port.startswith("socket://") and not port.rpartition(":")[2].isdigit():
+        return f"{port} names no port; expected e.g. socket://127.0.0.1:7000."
     if "://" in port:
         return f"{port} cannot be opened: {str(error).removeprefix(f'Could not open port {port}: ')}."
     if number == errno.ENOENT or ("could not open port" in str(error).lower() and not number):

@@ -123,6 +123,7 @@ class Group(TyperGroup):
 def prepare_process() -> None:
     """Make a process one that answers to Ctrl-C, prints whatever a terminal can show, and warns in one line."""
     codecs.register_error("motorid", _shown_otherwise)
+    sys.stdout, sys.stderr = (s or open(os.devnull, "w") for s in (sys.stdout, sys.stderr))  # noqa: SIM115 closed by `>&-`
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="motorid")  # type: ignore[union-attr]

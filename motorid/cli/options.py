@@ -9,6 +9,7 @@ from __future__ import annotations
 import functools
 import importlib.util
 import inspect
+import os
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
@@ -221,14 +222,8 @@ def with_options(kind: type) -> Callable[[Callable[..., None]], Callable[..., No
 
 
 def own_effects(path: Path) -> dict[str, Effect]:
-    """Return the effects defined in a Python file, by name.
-
-    Raises
-    ------
-    UsageError
-        If the file cannot be run or defines none.
-    """
-    path = path.expanduser()
+    """Return the effects defined in a Python file, by name; a UsageError if it cannot be run or defines none."""
+    path = Path(os.path.expanduser(path))
     if not path.is_file():
         raise UsageError(f"--effects-from: there is no file {path}.")
     name = f"motorid_own_{path.stem}"
@@ -254,36 +249,21 @@ def own_effects(path: Path) -> dict[str, Effect]:
 
 def named_effect(name: str, own: dict[str, Effect]) -> Effect:
     """Return an effect of the user's file, or of the library."""
-    if name in own:
-        return own[name]
-    if name not in library.EVERY:
+    known = {**library.EVERY, **own}
+    if name not in known:
         raise ModelError(f"--effects: {one_of(name, [*own, *library.EVERY], 'effect')}")
-    return library.get(name)
+    return known[name]
 
 
 def saved_model(path: Path, effects_from: Path | None = None) -> Model:
-    """Return the model that ``fit --json`` or ``export`` wrote, at its values.
-
-    Raises
-    ------
-    DataError
-        If the file is not there, or no such file.
-    ModelError
-        If it has an effect of the user's own, whose file was not named.
-    """
+    """Return the model that ``fit --json`` or ``export`` wrote, at its values; see `load` for what it raises."""
     own = own_effects(effects_from) if effects_from else {}
     found = load(path, own.values())
     return found if isinstance(found, Model) else found.model
 
 
 def make_folder(out: Path) -> None:
-    """Make a folder for results.
-
-    Raises
-    ------
-    UsageError
-        If that cannot be.
-    """
+    """Make a folder for results, or raise a UsageError."""
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:

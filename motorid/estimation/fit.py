@@ -110,6 +110,8 @@ def fit(model: Model, runs: Sequence[Experiment] | Experiment, *, solver: Any = 
     if isinstance(window, int | float):
         runs = [part for run in ([runs] if isinstance(runs, Experiment) else runs) for part in windows(run, window)]
     penalties = tuple(penalties)
+    if odd := [p for p in (*penalties, *constraints) if not hasattr(p, "evaluate")]:
+        raise UsageError(f"penalties and constraints are like mi.CurrentLimit(8), mi.Constraint(…), not {odd[0]!r}.")
     if formulation == "penalty":
         from motorid.problem.constraints import SteadyState
 

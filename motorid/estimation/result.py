@@ -280,7 +280,7 @@ class Fit(Shown):
         end = {f: getattr(self, f) for f in SAVED} | {"cost": self.cost, "extra": {
             k: [asdict(m) for m in v] if k in ("multipliers", "active") else v for k, v in self.extra.items()}}
         text = json_text(head, {"fit": {"problem": problem_dict(self.problem), **end}})
-        return write_files({Path(path).expanduser(): text}, force)[0]
+        return write_files({Path(os.path.expanduser(path)): text}, force)[0]
 
     def to_frame(self) -> Any:
         """Return the parameters as a pandas.DataFrame: value, std, unit, fixed, meaning."""

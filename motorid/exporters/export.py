@@ -112,7 +112,7 @@ def export(found: Fit | Model | Exported, path: str | os.PathLike[str], to: str 
     >>> record, p = functions["record_0"](), functions["parameters"]()["p"]
     >>> y = functions["simulate_0"](s=record["s"], u=record["u"], p=p)["y"]  # (channels, samples)
     """
-    target = Path(path).expanduser()
+    target = Path(os.path.expanduser(path))
     form = to or FORMS.get(target.suffix.lower())
     if "fmu" in (form, target.suffix.lower().lstrip(".")):
         raise UsageError(NO_FMU)
@@ -164,7 +164,7 @@ def load(path: str | os.PathLike[str], effects: Iterable[Effect] = (), *,
     >>> again.values == better.values
     True
     """
-    source = Path(path).expanduser()
+    source = Path(os.path.expanduser(path))
     if source.suffix.lower() in (".c", ".h"):
         raise UsageError(f"{source.name} goes to other programs; load reads .json and .casadi files.")
     data = read_bytes(source)

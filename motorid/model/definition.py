@@ -236,6 +236,8 @@ def effect(*, balance: str, name: str | None = None,
         raise ModelError(one_of(balance, BALANCES, "balance"))
 
     def make(law: Callable[..., None]) -> Effect:
+        if not callable(law):
+            raise ModelError(f"an effect is a function, def my_effect(m, c=mi.P(…)): …; got {law!r}.")
         title = name or law.__name__
         pars = []
         for arg in list(inspect.signature(law).parameters.values())[1:]:

@@ -63,7 +63,8 @@ class Model(Shown):
             raise ModelError(f"the model already has '{other.name}'. Take it out first: model.without('{other.name}').")
         for e in self.effects:
             if e.name in other.includes or other.name in e.includes:
-                raise ModelError(f"'{other.name}' and '{e.name}' describe the same friction twice; one "
+                raise ModelError(f"'{other.name}' and '{e.name}' describe the same "
+                                 f"{'friction' if e.balance == 'torque' else e.balance} twice; one "
                                  f"contains the other. Take the present one out first: model.without('{e.name}').")
         for p in other.parameters:
             if p.name in self.parameters:

@@ -240,8 +240,7 @@ def natural_sizes(runs: Sequence[Experiment], values: Mapping[str, float]) -> di
     speed = max(s.speed for s in seen) or volt / max(values.get("K", 1.0), 1e-9)
     gain = values.get("g")
     resistance = values.get("R", 1.0)
-    amps = [s.ampere for s in seen if s.ampere is not None]
-    ampere = max(amps) if amps else volt / resistance
+    ampere = max(s.ampere or 0.0 for s in seen) or volt / resistance
     torque = gain * volt if gain is not None else values.get("K", 1.0) * ampere
     second = float(np.median([r.dt for r in runs]))
     heats = [(r.duration, resistance * s.mean_square_current(values)) for r, s in zip(runs, seen, strict=True)]

@@ -124,7 +124,7 @@ def current_limit(run: Experiment) -> str | None:
     i, omega, v = run.outputs.get("i"), run.outputs.get("omega"), run.inputs["v"]
     if i is None or omega is None or run.units["v"] != "V" or _clipped(run):
         return None
-    top = float(np.nanmedian(np.abs(i)[np.abs(i) > 0.95 * np.nanquantile(np.abs(i), 0.995)]))
+    top = float(np.nanmedian(np.abs(i)[np.abs(i) >= 0.95 * np.nanquantile(np.abs(i), 0.995)]))
     near = 4 * noise_level(i, run.t)
     if near > 0.1 * top:
         return None

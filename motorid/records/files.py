@@ -71,7 +71,7 @@ def check_output(path: str | Path, force: bool = False) -> Path:
     UsageError
         If its folder is not there, or, without `force`, if there is a file that motorid did not write.
     """
-    target = Path(path).expanduser()
+    target = Path(os.path.expanduser(path))
     try:
         target = target.resolve() if target.is_symlink() else target
         if target.is_dir() or not target.parent.is_dir():

@@ -114,7 +114,7 @@ def write_csv(experiment: Experiment, path: Path_, force: bool = False) -> Path:
     UsageError, OutputError
         If the file must not or cannot be written, see `write_files`.
     """
-    return write_files({Path(path).expanduser(): csv_text(experiment)}, force)[0]
+    return write_files({Path(os.path.expanduser(path)): csv_text(experiment)}, force)[0]
 
 
 def csv_text(run: Experiment) -> str:
@@ -151,7 +151,10 @@ def find_records(paths: Path_ | Iterable[Path_]) -> list[Path]:
             raise UsageError(f"expected the name of a file as text or path; got {path!r}.")
         if not os.fspath(path):
             raise UsageError("the name of a record is empty: a variable of the shell that was never set?")
-        files |= dict.fromkeys(_expand(Path(path).expanduser()))
+        try:
+            files |= dict.fromkeys(_expand(Path(os.path.expanduser(path))))
+        except OSError as error:  # a name that is too long, a folder that may not be looked into
+            raise DataError(f"cannot read {path}: {error.strerror}.") from error
     if not files:
         raise DataError("no record is given; name at least one file, directory or pattern.")
     return list(files)
@@ -199,7 +202,7 @@ def _natural(path: Path) -> list[tuple[int, int, str]]:
 
 def _read(path: Path_, to_table: Callable[[bytes], TextTable], columns: Mapping[str, object] | None,
           units: Mapping[str, object] | None, hold: str | None, name: str | None) -> Experiment:
-    path = Path(path).expanduser()
+    path = Path(os.path.expanduser(path))
     data = read_bytes(path)
     try:
         meta = {"source": str(path), "sha256": hashlib.sha256(data).hexdigest()}

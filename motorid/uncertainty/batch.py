@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import inspect
 import json
 import pickle
 import time
@@ -175,10 +176,11 @@ def fit_many(model: Model, motors: Mapping[str, Records], *, journal: str | Path
     """
     if not motors:
         raise UsageError("fit_many takes a mapping {name: runs}; it is empty. See motors_in(folder).")
+    inspect.signature(fit).bind(model, motors, **options)  # a wrong option is no failure of every motor
     _carry_laws(model)
     done = Checkpoint(Path(journal)) if journal is not None else None
     marks = {n: checkpoint_key(model, options, reading, runs) for n, runs in motors.items()} if done else {}
-    known = {n: done.rows[m] for n, m in marks.items() if m in done.rows} if done else {}
+    known = {n: {**done.rows[m], "motor": n} for n, m in marks.items() if m in done.rows} if done else {}
     todo = [(n, runs) for n, runs in motors.items() if n not in known]
     found = map_items(_fit_one, (model, options, dict(reading or {})), todo, map, "Fitting motors", quiet=quiet,
                       each=None if done is None else lambda row: done.add(marks[row["motor"]], row))

@@ -13,7 +13,7 @@ import numpy as np
 
 from motorid.display.cards import Card, Flag, Printed, Table, value_cell
 from motorid.display.numbers import interval_text, percent
-from motorid.errors import FitError, MotoridError, UsageError, one_of
+from motorid.errors import FitError, MotoridError, UsageError, at_least, one_of
 from motorid.estimation.least_squares import least_squares
 from motorid.estimation.result import Failure, Fit
 from motorid.numerics.autoregression import Colour, colour_of
@@ -93,13 +93,14 @@ class Bootstrap(Printed):
         """Return values with the spread of the refits."""
         flags = [Flag(f"{len(self.samples)} refits")]
         flags += [Flag(f"{len(self.failures)} failed", "bad")] if self.failures else []
-        words = {"blocks": "Blocks of the residuals, put back in random order on the model's curves."}
+        how = ("Blocks of the residuals, put back in random order on the model's curves." if self.kind == "blocks" else
+               f"Resampled: {self.kind}.")
         rows = []
         for n, value, unit in zip(self.names, self.reference, self.units, strict=True):
             limited = Flag(percent(self.limited[n], 2), "note") if self.limited[n] else "none"
             said = value_cell(float(value), self.std[n], unit, self.status[n])
             rows.append([n, said, interval_text(self.interval(n)), limited])
-        return Card("Bootstrap", flags, (words.get(self.kind, f"Resampled: {self.kind}."), self.interrupted),
+        return Card("Bootstrap", flags, (how, self.interrupted),
                     (Table(["parameter", "value ± std", "95 %", "at its limit"], rows, left=(0, 1, 2)),),
                     (("mi.plot_profile(mi.intervals(fit))", "compare"),))
 
@@ -133,7 +134,7 @@ def bootstrap(fit: Fit, *, kind: str = "blocks", n: int = 200, block: int | None
     n : int
         Number of refits.
     block : int, optional
-        Length of a block in samples; default from the residuals' correlation.
+        Length of a block in samples, at most that of the longest run; default from the residuals' correlation.
     seed : int
         The result depends on it alone, not on the pool.
     map : callable, optional
@@ -154,8 +155,8 @@ def bootstrap(fit: Fit, *, kind: str = "blocks", n: int = 200, block: int | None
     """
     if kind not in KINDS:
         raise UsageError(one_of(kind, KINDS, "kind of bootstrap"))
-    if n < 2:
-        raise UsageError(f"a bootstrap takes at least two refits; got {n}.")
+    for least, given in ((2, {"n": n}), (1, {"block": block}), (0, {"seed": seed})):
+        at_least(least, **given)
     if kind == "runs" and len(fit.problem.experiments) < FEWEST_RUNS:
         raise UsageError(f"resampling runs needs at least {FEWEST_RUNS} of them; this fit has "
                          f"{len(fit.problem.experiments)}. Use kind='blocks', or cut runs with "
@@ -191,7 +192,8 @@ def _source(fit: Fit, kind: str, block: int | None) -> _Source:
         scale[c] = np.sqrt(count / max(count - spent, 1.0))
     residuals = tuple({c: scale[c] * (e - np.nanmean(e)) for c, e in r.items()} for r in residuals)
     at_fit = problem.for_model(problem.model.start_at(fit.values))
-    return _Source(at_fit, predicted, residuals, colours, kind, block or _block_length(colours, residuals))
+    block = min(block or _block_length(colours, residuals), max(s.experiment.n for s in fit.simulations))
+    return _Source(at_fit, predicted, residuals, colours, kind, block)
 
 
 def _block_length(colours: Mapping[str, Colour], residuals: Sequence[Mapping[str, Array]]) -> int:

@@ -18,7 +18,7 @@ import numpy as np
 from motorid.channels import NAMES
 from motorid.display.cards import Card, Flag, Printed, Table
 from motorid.display.numbers import number, percent, quantity
-from motorid.errors import MotoridError, SimulationError, UsageError
+from motorid.errors import MotoridError, SimulationError, UsageError, at_least
 from motorid.estimation.covariance import UNDETERMINED
 from motorid.estimation.result import Fit
 from motorid.estimation.start_values import with_start_values
@@ -201,6 +201,7 @@ def identifiability(problem_or_fit: Problem | Fit, *, points: int = 5, seed: int
     >>> mi.identifiability(better).rank
     6
     """
+    at_least(0, points=points, seed=seed)
     problem, q = _problem_at(problem_or_fit)
     names = problem.model.free_names
     if not names:

@@ -16,7 +16,7 @@ import numpy as np
 
 from motorid.display.cards import Card, Flag, Printed, Table
 from motorid.display.numbers import duration, number, percent, quantity, sentence
-from motorid.errors import MotoridError, SimulationError, UsageError
+from motorid.errors import MotoridError, SimulationError, UsageError, at_least
 from motorid.estimation.fit import minimise, solve
 from motorid.estimation.least_squares import FINISH
 from motorid.estimation.result import Failure, Fit
@@ -67,9 +67,8 @@ def multistart(problem_or_fit: Problem | Fit, *, starts: int = 100, spread: floa
     >>> many = mi.multistart(fit, starts=2, quiet=True)
     >>> axes = mi.plot_waterfall(many)
     """
-    if starts < 1 or not spread >= 1:
-        raise UsageError("multistart takes at least one start and a spread of at least 1; "
-                         f"got {starts} and {spread:g}.")
+    at_least(0, seed=seed)
+    at_least(1, starts=starts, spread=spread)
     began = time.perf_counter()
     reference = problem_or_fit if isinstance(problem_or_fit, Fit) else solve(problem_or_fit, solver)
     names = reference.problem.model.free_names

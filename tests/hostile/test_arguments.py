@@ -58,10 +58,33 @@ def test_an_argument_of_another_kind_is_named(name):
     lambda: mi.profile(FIT, "R", level=95, quiet=True),
     lambda: mi.profile(FIT, "R", level=0.0, quiet=True),
     lambda: mi.Huber(float("nan")),
-    lambda: mi.diagnose(FIT, budget=float("nan"))])
+    lambda: mi.diagnose(FIT, budget=float("nan")),
+    lambda: mi.bootstrap(FIT, n=3, block=0, quiet=True),
+    lambda: mi.bootstrap(FIT, n=3, block=-5, quiet=True),  # had no end
+    lambda: mi.bootstrap(FIT, n=3, seed=-1, quiet=True),
+    lambda: mi.multistart(FIT, starts=2, seed=-1, quiet=True),
+    lambda: mi.identifiability(FIT, points=-1),
+    lambda: mi.identifiability(FIT, seed=-1),
+    lambda: mi.fit(mi.dc_motor(), RUN, penalties=[3]),
+    lambda: mi.fit(mi.dc_motor(), RUN, constraints=["x"], formulation="penalty"),
+    lambda: mi.effects.coulomb(tau_c="x")])
 def test_a_number_that_cannot_be_meant_is_refused(call):
     with pytest.raises(mi.UsageError):
         call()
+
+
+def test_a_block_of_the_bootstrap_is_at_most_a_run():
+    assert mi.bootstrap(FIT, n=2, block=10**9, quiet=True).block == RUN.n
+
+
+def test_what_is_no_function_is_no_effect():
+    with pytest.raises(mi.ModelError, match="an effect is a function"):
+        mi.effect(balance="torque")(3)
+
+
+def test_a_wrong_option_is_no_failure_of_every_motor():
+    with pytest.raises(TypeError, match="wibble"):
+        mi.fit_many(mi.dc_motor(), {"a": RUN}, wibble=3, quiet=True)
 
 
 def test_an_error_of_the_callers_own_stays_what_it_is():

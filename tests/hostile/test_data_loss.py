@@ -311,6 +311,19 @@ def test_a_full_disk_behind_the_terminal_is_one_sentence():
     assert (done.returncode, done.stderr.count("\n")) == (1, 1), done.stderr
 
 
+def test_a_motor_that_was_renamed_has_its_new_name(tmp_path):
+    """The journal knows records by what is in them."""
+    folder, out = tmp_path / "motors", tmp_path / "table.csv"
+    folder.mkdir()
+    (folder / "a.csv").write_bytes(Path(RUN).read_bytes())
+    words = ("fit-many", folder, *SMALL, "--journal", tmp_path / "j.jsonl", "--out", out)
+    assert motorid(*words).status == 0
+    (folder / "a.csv").rename(folder / "z.csv")
+    (folder / "y.csv").write_bytes(Path(RUN).read_bytes())
+    assert motorid(*words).status == 0
+    assert [row[0] for row in without_seconds(out)] == ["motor", "y", "z"]
+
+
 def test_a_spoilt_row_of_a_journal_is_done_again(tmp_path):
     (tmp_path / "motors").mkdir()
     (tmp_path / "motors" / "a.csv").write_bytes(Path(RUN).read_bytes())

@@ -109,6 +109,13 @@ def test_numbers_of_no_motor(seconds, size, tmp_path):
     assert len(done.err.splitlines()) == (1 if done.status else 0)
 
 
+def test_a_dead_current_sensor_does_not_end_the_fit():
+    run = mi.read_csv(RUN)
+    dead = run.with_(outputs={**run.outputs, "i": 0 * run.outputs["i"]})
+    assert mi.fit(mi.dc_motor(), dead).std["R"] is None
+    assert any("never changes" in text for text in mi.check_runs([dead]))
+
+
 def test_what_arithmetic_raises_inside_a_fit_is_a_fit_error(monkeypatch):
     """A singular matrix is a failed fit, which one of many may be."""
     from motorid.estimation import fit as module
@@ -163,6 +170,33 @@ def test_trust_is_advised_for_casadi_files_alone(tmp_path):
         with pytest.raises(mi.DataError) as told:
             mi.load(tmp_path / name)
         assert ("trust=True" in str(told.value)) is advised
+
+
+def test_names_that_no_system_takes(tmp_path):
+    """Neither `~x.csv`, which names no user's home, nor one that is too long."""
+    (tmp_path / "~x.csv").write_bytes(RUN.read_bytes())
+    done = process("fit", "~x.csv", "--fix", "L=0", "--json", "~x.json", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "~x.json").exists()
+    for words in (("fit", "x" * 5000), ("fit", RUN, "--json", tmp_path / ("x" * 5000)), ("simulate", "x" * 5000, RUN)):
+        told = motorid(*words)
+        assert (told.status, len(told.err.splitlines())) == (2, 1), told
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no such redirection there")
+def test_a_terminal_that_is_closed(tmp_path):
+    for closed in (">&-", "2>&-", "<&-"):
+        line = f'"{sys.executable}" -m motorid fit "{RUN}" --fix L=0 --json "{tmp_path}/fit.json" {closed}'
+        done = subprocess.run(line, shell=True, capture_output=True, text=True, timeout=60)
+        assert done.returncode == 0, (closed, done.stderr)
+        assert "Traceback" not in done.stderr
+
+
+def test_an_address_without_its_port_is_said():
+    for port in ("socket://127.0.0.1", "socket://"):
+        done = motorid("record", "--port", port, "--out", "never.csv", "--excite", "rest:1", "--limit-voltage", 1)
+        assert done.status in (1, 2)
+        assert "names no port" in done.err
 
 
 @pytest.mark.parametrize("what", ["SystemExit(0)", "GeneratorExit", "type('Own', (BaseException,), {})"])

@@ -229,9 +229,9 @@ def test_problem_is_solved_first(fits):
 
 def test_nonsense_is_refused(fits):
     best = fits["two_step_small"]
-    with pytest.raises(UsageError, match="at least one start"):
+    with pytest.raises(UsageError, match="starts must be at least 1"):
         multistart(best, starts=0)
-    with pytest.raises(UsageError, match="spread of at least 1"):
+    with pytest.raises(UsageError, match="spread must be at least 1"):
         multistart(best, spread=0.5)
 
 
