@@ -47,7 +47,7 @@ _OPTIONS = ((r"\b(columns|units)=\{(.*?)\}", lambda m: f"--{m[1]} {_pairs(m[2])}
             (r" If you know where it comes from, mi\.load.*", lambda m: ""))
 MANY = ("--validate",)  # options that take all names up to the next option
 OUTPUTS = ("--json", "--report")  # options that write a file
-COMMAND = ("Next: motorid", "Written: ")  # lines to copy, not wrapped
+COMMAND = ("Next: motorid", "Then: motorid", "Written: ")  # lines to copy, not wrapped
 MAY_WRAP = 32  # characters of a cell that is a sentence: shorter ones are names and numbers, and stay whole
 WIDTH = 80  # where the output is no terminal
 
@@ -175,43 +175,67 @@ def show(*parts: Table | str | None) -> None:
             continue
         part = _upright(part, console.width)
         drawn = RichTable(title=part.title or None, box=box.SIMPLE_HEAD, title_justify="left", title_style="bold")
-        for k, (head, width) in enumerate(zip(part.header, _widths(part, console.width), strict=True)):
-            drawn.add_column(head, justify="left" if k in part.left else "right", overflow="fold", width=width)
+        widths = _widths(part, console.width)
+        for k, (head, width) in enumerate(zip(part.header, widths, strict=True)):
+            drawn.add_column(_filled(head, width), justify="left" if k in part.left else "right", overflow="fold",
+                             width=width)
         for row in part.rows:
-            drawn.add_row(*(Text(printable(str(cell))) for cell in row))
+            drawn.add_row(*(Text(_filled(printable(str(cell)), w)) for cell, w in zip(row, widths, strict=True)))
         console.print(drawn)
         if part.note:
             console.print(Text(_filled(printable(part.note), console.width) + "\n"))
 
 
-def _needed(table: Table) -> tuple[list[int], list[int], list[int]]:
-    """Return the widths of the columns in full, of names and numbers unbroken, and of single words."""
-    columns = [[str(c) for c in column] for column in zip(table.header, *table.rows, strict=True)]
-    full = [max(map(len, cells)) for cells in columns]
-    words = [max((len(w) for cell in cells for w in cell.split()), default=0) for cells in columns]
-    below = [max(map(len, cells[1:]), default=0) for cells in columns]
-    return full, [word if n > MAY_WRAP else max(word, n) for word, n in zip(words, below, strict=True)], words
+def _columns(table: Table) -> list[list[str]]:
+    return [[str(c) for c in column] for column in zip(table.header, *table.rows, strict=True)]
+
+
+def _least(cells: Sequence[str]) -> int:
+    """Return the length of the longest part that stays whole: a word, a value with its error and unit."""
+    return max((len(part) for cell in cells for part in _glued(cell).split()), default=0)
 
 
 def _upright(table: Table, room: int) -> Table:
-    """Return a table with rows and columns exchanged where only that keeps its numbers whole."""
-    if sum(_needed(table)[1]) + 3 * len(table.header) < room or len(table.header) <= len(table.rows) + 1:
+    """Return a table with rows and columns exchanged where only that keeps its names and numbers whole."""
+    whole = [max(_least(c), *(len(cell) for cell in c[1:] if max(map(len, c)) <= MAY_WRAP), 0) for c in _columns(table)]
+    if sum(whole) + 3 * len(whole) < room or len(whole) <= len(table.rows) + 1:
         return table
     head, *rows = zip(table.header, *table.rows, strict=True)
     return replace(table, header=head, rows=rows, left=(0,))
 
 
 def _widths(table: Table, room: int) -> list[int]:
-    """Return the widths of columns that fit the screen: sentences wrap first, then the columns on the right."""
-    full, widths, words = _needed(table)
-    room -= 3 * len(full) + 1
-    for k in reversed(range(1, len(widths))):
-        widths[k] = words[k] if sum(widths) > room else widths[k]
+    """Return the widths of columns that fit the screen with the least wrapping, of headers evenly shared."""
+    room -= 3 * len(table.header) + 1
+    columns = _columns(table)
+    options = [_options(cells, room) for cells in columns]
+    found = [best for most in (1, 2, 3, 9) if (best := _narrow(options, room, most))]
+    if found:
+        return min(found)[-1]
+    widths = [_least(cells) for cells in columns]  # nothing helps: the widest give way
     while sum(widths) > room:
         widths[widths.index(max(widths))] -= 1
-    for k, wanted in enumerate(full):
-        widths[k] += max(0, min(wanted - widths[k], room - sum(widths)))
     return widths
+
+
+def _options(cells: Sequence[str], room: int) -> dict[int, tuple[int, int]]:
+    """Return the lines of the header and Σ lines² of the cells below for each width of a column."""
+    counts = ((w, [1 if len(c) <= w else 1 + _filled(c, w).count("\n") for c in cells])
+              for w in range(max(_least(cells), 1), min(max(map(len, cells)), room) + 1))
+    return {w: (head, sum(n**2 for n in below)) for w, (head, *below) in counts}
+
+
+def _narrow(options: Sequence[dict[int, tuple[int, int]]], room: int, most: int) -> tuple[int, int, list[int]] | None:
+    """Return cost, sum and widths of the best table whose header has at most so many lines; None without any."""
+    found: dict[int, tuple[int, list[int]]] = {0: (most**2, [])}  # by the sum of the widths
+    for lines in options:
+        step: dict[int, tuple[int, list[int]]] = {}
+        for used, (cost, widths) in found.items():
+            for w, (head, below) in lines.items():
+                if head <= most and used + w <= room and cost + below < step.get(used + w, (np.inf,))[0]:
+                    step[used + w] = cost + below, [*widths, w]
+        found = step
+    return min((cost, used, widths) for used, (cost, widths) in found.items()) if found else None
 
 
 def in_options(text: str) -> str:
@@ -248,11 +272,16 @@ def wrapped(text: str, first: str = "") -> str:
 
 
 def _filled(text: str, width: int, first: str = "") -> str:
-    """Return a line of text cut at spaces, but between a number and its unit."""
-    joined = re.sub(r"(?<=[\d⁰¹²³⁴⁵⁶⁷⁸⁹]) (?=[%a-zA-ZΩ°µ])(?!and|or|to|of|the)", "\0", text)
-    lines = textwrap.fill(joined, width, initial_indent=first, subsequent_indent=" " * len(first),
+    """Return a line of text cut at spaces, but not within a value with its error and unit."""
+    lines = textwrap.fill(_glued(text), width, initial_indent=first, subsequent_indent=" " * len(first),
                           break_on_hyphens=False, break_long_words=False)
     return lines.replace("\0", " ")
+
+
+def _glued(text: str) -> str:
+    """Return a text with what must not be cut joined by NUL: ``1.3 ± 0.1 Ω``, ``12.7 → 1.02 %``."""
+    text = re.sub(r"(?<=\d) ([±→]) (?=\d)", "\0\\1\0", text)
+    return re.sub(r"(?<=[\d⁰¹²³⁴⁵⁶⁷⁸⁹]) (?=[%a-zA-ZΩ°µ])(?!(and|or|to|of|the|times|in)\b)", "\0", text)
 
 
 def next_command(name: str) -> str:

@@ -134,7 +134,7 @@ def _write_remainder(found: Diagnosis, path: Path, force: bool) -> None:
 
 def _show_diagnosis(found: Diagnosis) -> None:
     """Print a diagnosis: the answer, the errors before and after, the next step; then what it rests on."""
-    show(found.answer, "", ladder_table(found.ladder), f"Next: {_next_step(found)}", "")
+    show(found.answer, "", ladder_table(found.ladder), _next_step(found), "")
     say_notes(found.details, "Details")
     if found.after is not found.before:
         show(parameter_table(found.after, found.before))
@@ -144,12 +144,12 @@ def _show_diagnosis(found: Diagnosis) -> None:
 def _next_step(found: Diagnosis) -> str:
     """Return what to do next: the experiment that decides, what remains, or the model to go on with."""
     if found.suggestion:
-        return found.suggestion
+        return f"Next: {found.suggestion[0].lower()}{found.suggestion[1:]}"
     if found.remainder is not None and found.remainder.proposed:
-        return f"look at what remains as an effect: {next_command('diagnose')} --remainder-to remainder.py"
+        return f"Next: {next_command('diagnose')} --remainder-to remainder.py\nIt writes what remains as an effect."
     if found.effects:
-        return f"{next_command('fit')} --effects {','.join(found.after.model.effect_names)} --json fit.json"
-    return f"{next_command('fit')} --json fit.json, then motorid export fit.json motor.casadi"
+        return f"Next: {next_command('fit')} --effects {','.join(found.after.model.effect_names)} --json fit.json"
+    return f"Next: {next_command('fit')} --json fit.json\nThen: motorid export fit.json motor.casadi"
 
 
 def design_command(found_json: Found, out: Plan = None, goal: Goal = None, parameters: Parameters = None,

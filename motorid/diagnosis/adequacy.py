@@ -125,13 +125,9 @@ def _channel(fit: Fit, channel: str) -> dict[str, float]:
     alone = np.concatenate([despiked(p) for _, p in parts])
     ratio = float(np.sqrt(np.mean(alone**2))) / noise if alone.size else 0.0
     return {"noise": noise, "rms": rms, "ratio": ratio,
-            "rounded": float(ratio < AT_ROUNDING and _by_rounding(fit, channel, noise)), "autocorrelation": rho,
+            "rounded": float(ratio < AT_ROUNDING and noise < AT_ROUNDING * _rounding(fit.problem.experiments, channel)),
+            "autocorrelation": rho,
             "input_correlation": linked, "effective_samples": sum(effective_samples(p) for _, p in parts)}
-
-
-def _by_rounding(fit: Fit, channel: str, noise: float) -> bool:
-    """Tell whether the noise of a channel is that of the steps in which it moves."""
-    return noise < AT_ROUNDING * _rounding(fit.problem.experiments, channel)
 
 
 @lru_cache(maxsize=8)

@@ -28,6 +28,7 @@ from motorid.diagnosis.verdict import (
     missing_text,
     moves,
     outliers_remark,
+    rises_text,
     unexplained_text,
     unfinished_remark,
     window_remark,
@@ -107,14 +108,14 @@ def _told(found: Climb, driven: str, validated: bool, own: Sequence[Effect]) -> 
         answer = missing_text(ladder.rungs, remaining, groups, found.grades)
         same = {name: p for node in found.path[1:] for name, p in found.search.inseparable(node).items()}
         hidden = found.search.hidden(found.path[-1])
-        details = [moves(fit, ladder.best), inseparable_remark(same), hidden_remark(hidden)]
+        details = [moves(fit, ladder.best), rises_text(ladder.rungs), inseparable_remark(same), hidden_remark(hidden)]
         groups = (*groups, *(_sharing(ladder.best, name, parameters) for name, parameters in same.items()))
         suggestion = _suggestion(found)
     elif len(found.path) > 1 or not remaining.adequate:
         verdict, where = "unexplained", missing.where
         judged = judged if len(found.path) > 1 else remaining
         answer = unexplained_text(ranking, ladder.rungs, found.grades, like.text if like else "", not found.stopped)
-        details = [judged.text, missing.text]
+        details = [judged.text, missing.text, rises_text(ladder.rungs)]
     else:
         verdict, where, (answer, *details) = "adequate", None, adequate_text(judged, ranking)
     kind = "structure" if not remaining.adequate else "fluctuation" if far(ladder.best) else "noise"

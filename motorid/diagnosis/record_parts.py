@@ -171,14 +171,10 @@ def parts_remark(fit: Fit) -> str:
     whole = dict(r.meta.get("part of", (r.name, r.n)) for r in used)
     if not any("part of" in r.meta for r in used):
         return thin
-    share = _samples(used) / sum(whole.values())
-    return (f"The records are long: this rests on {len(used)} parts of {_seconds(used):.2g} s, {100 * share:.0f} % of "
+    share, seconds = _samples(used) / sum(whole.values()), float(np.median([r.duration for r in used]))
+    return (f"The records are long: this rests on {len(used)} parts of {seconds:.2g} s, {100 * share:.0f} % of "
             f"the samples; fit the model to all of them. {thin}".rstrip())
 
 
 def _samples(runs: Sequence[Experiment]) -> int:
     return sum(r.n for r in runs)
-
-
-def _seconds(runs: Sequence[Experiment]) -> float:
-    return float(np.median([r.duration for r in runs]))

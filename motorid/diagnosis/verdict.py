@@ -12,7 +12,7 @@ from motorid.diagnosis.misspecification import Grade
 from motorid.diagnosis.model_comparison import Node
 from motorid.diagnosis.results import Adequacy, Candidate, Rung
 from motorid.diagnosis.score_test import Score
-from motorid.diagnosis.thresholds import ELSEWHERE, LARGER, LOST
+from motorid.diagnosis.thresholds import ELSEWHERE, LARGER, LOST, MATERIAL
 from motorid.display.numbers import arrow, number, percent, with_error
 from motorid.effects import EVERY
 from motorid.estimation.result import Fit, parameter_cell
@@ -23,13 +23,14 @@ from motorid.records.experiment import units_of
 MOVED = 0.1  # relative change of a motor parameter that is worth a word
 SPIKED = 0.5  # of a channel's squared error: what outliers must make to be worth a word
 RPM = 30 / np.pi
+DECIDED = "blocks left out of the fitted runs decided"
 
 
 def first_answer(fit: Fit, judged: Adequacy, scores: Sequence[Score]) -> str:
     """Return what a look without any refit says: whether the model fits, and what to try first."""
     likely = [f"{s.effect.name} ({percent(s.drop, 2)})" for s in scores[:3] if s.drop > 0]
-    next_ = f"; most promising: {', '.join(likely)} of the squared error" if likely and not judged.adequate else ""
-    return f"first answer: {fit.verdict.rstrip('.')}{next_}"
+    next_ = f" Most promising: {', '.join(likely)} of the squared error." if likely and not judged.adequate else ""
+    return f"first answer: {fit.verdict}{next_}"
 
 
 def window_remark(fit: Fit) -> str:
@@ -105,7 +106,7 @@ def _valued(fit: Fit, effect: Effect) -> list[str]:
         if p.name in fit.per_run:
             text = f"{p.name} = {parameter_cell(fit, p.name)}"
         if not known and (volts := fit.determined.get(f"{p.name}_voltage")) is not None:
-            text = f"R·{p.name}/K = {with_error(volts.value, volts.std, volts.unit)}"
+            text = f"{volts.text.rpartition(', ')[2]} = {with_error(volts.value, volts.std, volts.unit)}"
         if p.name == "k_w" and abs(1 + fit.values[p.name] - RPM) < 0.3:
             text += ", the ratio of rpm to rad/s: the speed is probably in rpm"
         found.append(text)
@@ -120,41 +121,56 @@ def _certain(fit: Fit) -> dict[str, float | None]:
 
 
 def errors_text(rungs: Sequence[Rung]) -> str:
-    """Say how the error changed, on the held-out runs where there are any, and what rose on the way."""
-    risen = [_risen(a, b) for a, b in pairwise(rungs)] if len(rungs) > 2 else []
-    return " ".join([_change(rungs[0], rungs[-1]), *(text for text in risen if text)])
-
-
-def _risen(before: Rung, after: Rung) -> str:
-    """Say which errors one rung raised; empty if none."""
-    here = {c: e for c, e in before.nrmse.items() if after.nrmse[c] > e}
-    was, is_ = before.validation_nrmse or {}, after.validation_nrmse or {}
-    there = {c: e for c, e in was.items() if is_[c] > e}
-    told = [f"{_changes(before, rose, now)} {where}" for rose, now, where in (
-        (here, after.nrmse, "on the fitted runs"), (there, is_, "on the held-out runs")) if rose]
-    decided = "; blocks left out of the fitted runs decided" if was and (
-        np.prod([is_[c] / max(e, 1e-300) for c, e in was.items()]) >= 1) else ""
-    return f"With '{after.added}' {' and '.join(told)}{decided}." if told else ""
-
-
-def _change(before: Rung, after: Rung) -> str:
-    was, is_ = before.validation_nrmse, after.validation_nrmse
-    if not (was and is_):
-        return f"Error: {_changes(before, before.nrmse, after.nrmse)}."
-    text = f"Held-out error: {_changes(before, was, is_)}."
-    if risen := {c: e for c, e in before.nrmse.items() if after.nrmse[c] > e}:
-        text += f" On the fitted runs {_changes(before, risen, after.nrmse)}."
-    if lost := [c for c, e in was.items() if min(e, is_[c]) > LOST]:
-        return f"{text} Both models lose {' and '.join(lost)} there; blocks left out of the fitted runs decided."
-    if np.prod([is_[c] / max(e, 1e-300) for c, e in was.items()]) >= 1:
-        return f"{text} It does not fall overall; blocks left out of the fitted runs decided."
+    """Say how the error changed, on held-out runs where there are any: what fell, then what rose and why."""
+    was, is_, last = rungs[0].validation_nrmse, rungs[-1].validation_nrmse, rungs[-1]
+    held_out = bool(was and is_)
+    was, is_ = (was, is_) if was and is_ else (rungs[0].nrmse, last.nrmse)
+    noise = {c for c in was if last.fit.misfit.get(c, 0.0) < LARGER}
+    said = [_changed(last, c, was[c], is_[c]) + " (mostly noise)" * (c in noise and is_[c] > was[c])
+            for c in sorted(was, key=lambda c: is_[c] > was[c])]
+    text = f"{'Held-out error' if held_out else 'Error'}: {', '.join(said)}."
+    if held_out and (lost := [c for c, e in was.items() if min(e, is_[c]) > LOST]):
+        return f"{text} Both models lose {' and '.join(lost)} there; {DECIDED}."
+    if held_out and _fall(was, is_) <= 0:
+        return f"{text} It does not fall over all channels; {DECIDED}."
+    if any(_matters(was[c], is_[c]) for c in was if c not in noise):
+        text += f" Over all channels it falls by {percent(_fall(was, is_), 2)}."
     return text
 
 
-def _changes(rung: Rung, before: Mapping[str, float], after: Mapping[str, float]) -> str:
-    units = units_of(rung.fit.problem.experiments)
-    return ", ".join(f"{channel_name(c, units.get(c, ''))} {'rises ' * (after[c] > e)}{arrow(e, after[c])}"
-                     for c, e in before.items())
+def rises_text(rungs: Sequence[Rung]) -> str:
+    """Say which errors rose from rung to rung and what decided, beside what `errors_text` says; empty if none."""
+    told, small = [], set()
+    for a, b in pairwise(rungs):
+        there = a.validation_nrmse or {}, b.validation_nrmse or {}
+        kinds = [((a.nrmse, b.nrmse), "fitted"), (there, "held-out")][:1 if len(rungs) == 2 else 2]
+        for (was, is_), where in kinds if there[0] or len(rungs) > 2 else ():
+            risen = [c for c in was if is_[c] > was[c]]
+            large = [_changed(b, c, was[c], is_[c]) for c in risen if _matters(was[c], is_[c])]
+            small |= {_name(b, c) for c in risen if not _matters(was[c], is_[c])}
+            told += [f"With '{b.added}' {', '.join(large)} on the {where} runs."] if large else []
+        if there[0] and len(rungs) > 2 and _fall(*there) <= 0:
+            told.append(f"With '{b.added}' the held-out error does not fall; {DECIDED}.")
+    told += [f"Other rises are below {percent(MATERIAL)} of the error: {', '.join(sorted(small))}."] if small else []
+    return " ".join(told)
+
+
+def _fall(was: Mapping[str, float], is_: Mapping[str, float]) -> float:
+    """Return the relative fall of the error, geometric mean over channels."""
+    return 1 - float(np.exp(np.mean([np.log(max(is_[c], 1e-300) / max(e, 1e-300)) for c, e in was.items()])))
+
+
+def _matters(was: float, is_: float) -> bool:
+    """Tell whether an error rises by an amount that matters."""
+    return is_ > was * (1 + MATERIAL)
+
+
+def _changed(rung: Rung, c: str, was: float, is_: float) -> str:
+    return f"{_name(rung, c)} {'rises ' * (is_ > was)}{arrow(was, is_)}"
+
+
+def _name(rung: Rung, c: str) -> str:
+    return channel_name(c, units_of(rung.fit.problem.experiments).get(c, ""))
 
 
 def moves(before: Fit, after: Fit) -> str:
@@ -209,8 +225,8 @@ def inseparable_remark(same: Mapping[str, tuple[str, ...]]) -> str:
     for name, parameters in same.items():
         by_parameters.setdefault(parameters, []).append(name)
     return " ".join(
-        f"{' or '.join(names)} was not added: these records do not distinguish it from {' and '.join(parameters)} "
-        "together."
+        f"{' or '.join(names)} was not added: these records do not distinguish it from "
+        f"{' and '.join(parameters)}{' together' * (len(parameters) > 1)}."
         for parameters, names in by_parameters.items()
     )
 
@@ -239,10 +255,8 @@ def outliers_remark(fit: Fit) -> str:
         spikes = int(np.count_nonzero(r != kept))
         if spikes and kept @ kept < (1 - SPIKED) * (r @ r):
             share = percent(1 - float(kept @ kept) / float(r @ r), 2)
-            return (
-                f"{spikes} outliers (single samples) make {share} of the squared error of {c}, and least squares "
-                "follows them. A robust loss (--loss huber, loss=mi.Huber()) shows the rest better."
-            )
+            return (f"{spikes} outliers (single samples) make {share} of the squared error of {c}, and least squares "
+                    "follows them. A robust loss (--loss huber, loss=mi.Huber()) shows the rest better.")
     return ""
 
 

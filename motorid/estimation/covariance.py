@@ -222,10 +222,12 @@ def _laws(problem: Problem, values: Mapping[str, float]) -> dict[str, tuple[str,
         laws["natural_frequency"] = "rad/s", "natural frequency", lambda p: times(p)[1] ** -0.5
     if product > 0:
         laws["damping"] = "", "damping ratio", lambda p: times(p)[0] / np.sqrt(times(p)[1])
-    torques = [n for n, p in model.parameters.items() if p.unit in ("N·m", "N")]
-    for n in torques:
-        words = f"{model.parameters[n].doc or n} as a voltage" + (f", R·{n}/K" if motor else "")
-        laws[f"{n}_voltage"] = volt, words, as_voltage(n)
+    force = "N" if model.axis == "linear" else "N·m"
+    for n in (p.name for e in model.effects for p in e.parameters):  # torques, and what makes one of speed or angle
+        p = model.parameters[n]
+        if p.unit.startswith(force):
+            words = f"{p.doc or n} as a voltage, {'R·' * motor}{n}/{'K' if motor else 'g'}"
+            laws[f"{n}_voltage"] = p.unit.replace(force, volt, 1), words, as_voltage(n)
     if model.effect_names in ((), ("coulomb",)):
         most = max(float(np.abs(run.inputs["v"]).max()) for run in runs)
         lost = as_voltage("tau_c") if "tau_c" in values else lambda p: 0.0

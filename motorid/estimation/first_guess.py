@@ -85,17 +85,13 @@ def _signals(run: Experiment) -> dict[str, Array]:
     t = run.t
     found: dict[str, Array] = {"t": t, **run.inputs}
     for c in CHANNELS:
-        if _measured(run, c):
+        if c in run.outputs and np.isfinite(run.outputs[c]).any():
             found[c] = bridged(t, run.outputs[c])
     if "omega" not in found and "theta" in found:
         found["omega"] = slope(t, found["theta"], max(2, min(10, len(t) // 200)))
     if run.hold == "zoh":
         found["held"] = np.ones(1)
     return found
-
-
-def _measured(run: Experiment, channel: str) -> bool:
-    return channel in run.outputs and bool(np.isfinite(run.outputs[channel]).any())
 
 
 def _windowed(t: Array, columns: Sequence[Array], target: Array, windows: int = 20) -> tuple[Array, Array]:

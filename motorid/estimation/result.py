@@ -367,7 +367,7 @@ def parameter_table(fit: Fit, before: Fit | None = None) -> Table:
     if open_:
         meaning = [open_[0].doc if len(open_) == 1 else ""] if before is None else []
         rows.append([", ".join(p.name for p in open_), *(Flag("not determined", "note") for _ in fits), *meaning])
-    if open_ and before is not None:
+    if before is not None and any(p.vary and fit.std.get(p.name) is None for p in pars):
         rows += [[d.text, *(with_error(q.value, q.std, q.unit) if (q := f.determined.get(n)) else "–" for f in fits)]
                  for n, d in fit.determined.items()]
     heads = ["value ± std", "meaning"] if before is None else ["before", "after"]

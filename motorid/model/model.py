@@ -96,7 +96,8 @@ class Model(Shown):
     def start_at(self, values: Mapping[str, float]) -> Model:
         """Return the model at values, within their limits; unlike after `replace`, a fit may start elsewhere."""
         known = {n: float(v) for n, v in values.items() if n in self.parameters}
-        return self._change({n: {"value": _within(self.parameters[n], v)} for n, v in known.items()})
+        return self._change({n: {"value": min(max(v, self.parameters[n].lower), self.parameters[n].upper)}
+                             for n, v in known.items()})
 
     def fix(self, *names: str, **values: float) -> Model:
         """Return the model with parameters fixed: ``fix(R=1.2)`` there, ``fix("R")`` at the value it has."""
@@ -332,11 +333,6 @@ def torque_driven(axis: str = "rotary", **values: float) -> Model:
         docs = {"g": "force per unit of the command; fixed", "J": "moving mass", "b": "viscous friction"}
         pars = {n: replace(p, unit=units[n], doc=docs[n]) for n, p in pars.items()}
     return Model("torque_driven", parameters=pars, axis=axis).replace(**values)
-
-
-def _within(parameter: Parameter, value: float) -> float:
-    """Return a value inside the limits of a parameter."""
-    return min(max(value, parameter.lower), parameter.upper)
 
 
 TITLES = {"dc_motor": "DC motor", "torque_driven": "torque-driven axis"}

@@ -237,7 +237,7 @@ def run_tasks(function: Callable[[Any], Any], tasks: Sequence[Any], map: Map | N
                         raise KeyboardInterrupt from None
                     if way is builtins.map:
                         raise
-                    print(f"motorid: the pool failed ({type(error).__name__}: {_first_line(error)}); doing "
+                    print(f"motorid: the pool failed ({error!r}); doing "
                           f"the remaining {len(tasks) - len(results)} of {len(tasks)} tasks in this process.",
                           file=sys.stderr)
         except KeyboardInterrupt:
@@ -272,10 +272,6 @@ def _waves(tasks: Sequence[Any]) -> Iterator[list[Any]]:
             wave, shipped, size = [], set(), 0
     if wave:
         yield wave
-
-
-def _first_line(error: Exception) -> str:
-    return (str(error).splitlines() or ["no message"])[0]
 
 
 def map_items(function: Callable[[Any, Any], Any], shared: Any, items: Sequence[Any], map: Map | None, text: str, *,

@@ -140,7 +140,8 @@ def _cleaned(svg: str, name: str, alt: str) -> str:
     svg = re.sub(r'\sid="([^"]+)"', lambda m: f' id="{name}-{m[1]}"' if m[1] in used else "", svg)
     svg = re.sub(r"url\(#([^)]+)\)", rf"url(#{name}-\1)", svg)
     svg = re.sub(r'xlink:href="#([^"]+)"', rf'href="#{name}-\1"', svg).replace("xlink:href", "href")
-    svg = re.sub(r"<[^>]+>", _shortened, svg)
+    # coordinates, which stand inside tags, to a tenth of a point
+    svg = re.sub(r"<[^>]+>", lambda tag: re.sub(r"(\d+\.\d)\d{2,}", r"\1", tag[0]), svg)
     for colour, variable in VARIABLES.items():
         svg = svg.replace(colour, f"var(--{variable})")
     svg = svg.replace("font-family: 'DejaVu Sans'", "font-family: var(--font)")
@@ -149,11 +150,6 @@ def _cleaned(svg: str, name: str, alt: str) -> str:
     body = svg[svg.index(">") + 1:]
     view = box[1] if box else "0 0 600 400"
     return f'<svg viewBox="{view}" role="img" aria-label="{escape(alt)}">{body.strip()}'
-
-
-def _shortened(tag: re.Match[str]) -> str:
-    """Round coordinates, which stand inside tags, to a tenth of a point; words outside are left alone."""
-    return re.sub(r"(\d+\.\d)\d{2,}", r"\1", tag[0])
 
 
 def grid(rows: int, columns: int, *, row: float = 1.6, width: float = WIDTH, **options: Any) -> np.ndarray:

@@ -189,8 +189,8 @@ def _noisy(run: Experiment) -> str | None:
     for channel, y in run.outputs.items():
         size, noise = float(np.nanstd(y)), noise_level(y, run.t)
         if noise > 0.5 * size > 0:
-            return (f"the {NAMES[channel]} is mostly noise ({noise:.2g} of {size:.2g} {run.units[channel]}) "
-                    "and will tell the fit little. Drive the motor harder or filter before sampling.")
+            return (f"the {NAMES[channel]} is mostly noise (RMS {min(noise, size):.2g} of {size:.2g} "
+                    f"{run.units[channel]}) and tells a fit little. Drive the motor harder or filter before sampling.")
     return None
 
 

@@ -221,14 +221,11 @@ def _refit(source: _Source, seed: np.random.SeedSequence) -> dict[str, float] | 
 
 def _resampled(source: _Source, k: int, rng: np.random.Generator) -> Experiment:
     run = source.problem.runs[k]
-    e = _noise(source, k, rng) if source.kind == "parametric" else _blocks(source, k, rng)
+    e = ({c: source.colours[c].draw(len(r), rng) for c, r in source.residuals[k].items()}
+         if source.kind == "parametric" else _blocks(source, k, rng))
     outputs = {c: np.where(np.isfinite(y), source.predicted[k][c] + e[c], np.nan) if c in e else y
                for c, y in run.experiment.outputs.items()}
     return run.experiment.with_(outputs=outputs, sigma=dict(run.sigma))
-
-
-def _noise(source: _Source, k: int, rng: np.random.Generator) -> dict[str, Array]:
-    return {c: source.colours[c].draw(len(e), rng) for c, e in source.residuals[k].items()}
 
 
 def _blocks(source: _Source, k: int, rng: np.random.Generator) -> dict[str, Array]:

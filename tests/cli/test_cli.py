@@ -440,6 +440,28 @@ def test_no_table_is_wider_than_80_columns_and_no_number_breaks(capsys):
     assert re.search(r"angle, held out +16\.8 % +0\.261 %", upright)
 
 
+def test_headers_share_their_lines_evenly(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    heads = [f"{c}, {what}" for what in ("fitted", "held out") for c in ("current", "speed")]
+    rows = [["DC motor", *4 * ["27.3 %"]], ["+ magnetic_saturation", *4 * ["0.815 %"]]]
+    show(Table(["model", *heads], 2 * rows))
+    first, second, line, *_ = [row.split() for row in capsys.readouterr().out.splitlines() if row.strip()]
+    assert first == ["current,", "speed,", "current,", "speed,"]
+    assert second == ["model", "fitted", "fitted", "held", "out", "held", "out"]
+    assert set("".join(line)) == {"─"}
+
+
+def test_a_value_keeps_its_error_and_unit_where_a_table_is_narrow(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    rows = [["time constant, slow (mechanical)", "0.112 ± 0.009 s", "1.01 ± 0.14 s"],
+            ["speed per voltage, steady", "193.5 ± 1.2 rad/s per V", "442.25 ± 0.31 rad/s per V"]]
+    show(Table(["parameter", "before", "after"], rows, left=(0, 1, 2)))
+    shown = capsys.readouterr().out
+    assert max(map(len, shown.splitlines())) <= 80
+    assert "0.112 ± 0.009 s" in shown
+    assert "193.5 ± 1.2 rad/s" in shown
+
+
 def test_what_to_type_next_is_one_line(monkeypatch):
     runs = [f"{FRICTION}/run1.csv", f"{FRICTION}/../hidden_friction/run2.csv"]
     monkeypatch.setattr(sys, "argv", ["motorid", "fit", *runs])

@@ -1,0 +1,60 @@
+"""The answer in words: short, what fell first, a reason for what rises; torques as voltages."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import pytest
+from battery.excite import driven, record
+
+import motorid as mi
+from motorid.diagnosis.results import Rung
+from motorid.diagnosis.verdict import errors_text, rises_text
+
+
+def rungs_of(*errors, held_out=None, misfit=1.0):
+    """Rungs with the errors (current, speed) given; `misfit` is of the current, the speed is far from its noise."""
+    fit = SimpleNamespace(misfit={"i": misfit, "omega": 8.0}, problem=SimpleNamespace(experiments=[]))
+    named = [dict(zip(("i", "omega"), e, strict=True)) for e in errors]
+    there = [dict(zip(("i", "omega"), e, strict=True)) for e in held_out] if held_out else [None] * len(errors)
+    names = [None, "coulomb", "cogging"]
+    return [Rung(a, fit, e, v) for a, e, v in zip(names, named, there, strict=False)]
+
+
+def test_a_rise_of_a_noisy_channel_is_said_once_and_with_its_reason():
+    rungs = rungs_of((0.724, 0.030), (0.724, 0.029), (0.726, 0.016),
+                     held_out=((0.756, 0.0335), (0.757, 0.0318), (0.761, 0.0224)))
+    answer = errors_text(rungs)
+    assert answer == "Held-out error: speed 3.35 → 2.24 %, current rises 75.6 → 76.1 % (mostly noise)."
+    assert rises_text(rungs) == "Other rises are below 1 % of the error: current."
+
+
+def test_a_rise_that_matters_is_beside_the_fall_of_all_and_its_rung_is_named():
+    rungs = rungs_of((0.02, 0.5), (0.03, 0.2), (0.03, 0.1), misfit=8.0)
+    assert errors_text(rungs) == ("Error: speed 50 → 10 %, current rises 2 → 3 %. "
+                                  "Over all channels it falls by 45 %.")
+    assert rises_text(rungs) == "With 'coulomb' current rises 2 → 3 % on the fitted runs."
+    assert not rises_text(rungs[:2]), "said in the answer already"
+
+
+def test_where_the_held_out_error_does_not_fall_what_decided_is_said():
+    rungs = rungs_of((0.02, 0.5), (0.02, 0.2), held_out=((0.02, 0.5), (0.05, 0.5)), misfit=8.0)
+    assert "does not fall over all channels; blocks left out of the fitted runs decided" in errors_text(rungs)
+    lost = rungs_of((0.02, 0.5), (0.02, 0.2), held_out=((0.02, 2.5), (0.02, 1.5)), misfit=8.0)
+    assert "Both models lose omega there" in errors_text(lost)
+
+
+@pytest.mark.parametrize(("hidden", "said"), [
+    ({"gravity": {"mgl": 1e-2, "phi_g": 0.3}}, "R·mgl/K = 0.29"),
+    ({"quadratic_drag": {"c_2": 2e-6}}, "R·c_2/K = "),
+])  # fmt: skip
+def test_without_a_current_a_size_is_a_voltage_in_answer_card_and_table(lab, rng, hidden, said):
+    runs = [record(driven(lab, hidden, drive, 800, 1e-3, rng), "logger", ("theta",), lab, rng, drive)
+            for drive in ("stairs", "steps")]
+    found = mi.diagnose(mi.fit(mi.dc_motor(), runs), effects=list(hidden), max_effects=1)
+    assert found.after.std[next(iter(next(iter(hidden.values()))))] is None, "the torque itself is open"
+    assert said in found.answer
+    assert "not determined" not in found.answer
+    assert said in str(found)
+    name = said.partition(" ")[0]
+    assert any(name in row[0] and " V" in row[2] for row in found.card().tables[1].rows)
