@@ -207,22 +207,17 @@ def _upright(table: Table, room: int) -> Table:
 def _widths(table: Table, room: int) -> list[int]:
     """Return the widths of columns that fit the screen with the least wrapping, of headers evenly shared."""
     room -= 3 * len(table.header) + 1
-    columns = _columns(table)
-    options = [_options(cells, room) for cells in columns]
+    options = [_options(cells, room) for cells in _columns(table)]
     found = [best for most in (1, 2, 3, 9) if (best := _narrow(options, room, most))]
-    if found:
-        return min(found)[-1]
-    widths = [_least(cells) for cells in columns]  # nothing helps: the widest give way
-    while sum(widths) > room:
-        widths[widths.index(max(widths))] -= 1
-    return widths
+    return min(found)[-1] if found else [1] * len(options)
 
 
 def _options(cells: Sequence[str], room: int) -> dict[int, tuple[int, int]]:
-    """Return the lines of the header and Σ lines² of the cells below for each width of a column."""
+    """Return the lines of the header and Σ lines² of the cells below for each width; to break a word costs most."""
+    least = _least(cells)
     counts = ((w, [1 if len(c) <= w else 1 + _filled(c, w).count("\n") for c in cells])
-              for w in range(max(_least(cells), 1), min(max(map(len, cells)), room) + 1))
-    return {w: (head, sum(n**2 for n in below)) for w, (head, *below) in counts}
+              for w in range(1, max(1, min(max(map(len, cells)), room)) + 1))
+    return {w: (head, sum(n**2 for n in below) + 1000 * max(least - w, 0) ** 2) for w, (head, *below) in counts}
 
 
 def _narrow(options: Sequence[dict[int, tuple[int, int]]], room: int, most: int) -> tuple[int, int, list[int]] | None:

@@ -103,7 +103,8 @@ def better_reading(fit: Fit, late: bool = False) -> Reading | None:
         return None
     chosen, fall = None, PLAIN
     readings = list(_readings(fit.problem.experiments))
-    if late and _tells_delays(fit):
+    seen = {"i", "omega", "theta"} & set(fit.problem.outputs)
+    if late and "i" in seen and len(seen) > 1:  # current and motion both follow a late voltage, not a late sensor
         readings += _best_delay(fit)
     for reading in readings:
         try:
@@ -115,11 +116,6 @@ def better_reading(fit: Fit, late: bool = False) -> Reading | None:
         if found.fall > fall and found.worth_it and not rises:
             chosen, fall = reading, found.fall
     return chosen
-
-
-def _tells_delays(fit: Fit) -> bool:
-    """Tell whether a late voltage can be told from a late sensor: current and motion both follow it."""
-    return len({"i", "omega", "theta"} & set(fit.problem.outputs)) > 1 and "i" in fit.problem.outputs
 
 
 def _best_delay(fit: Fit) -> list[Reading]:
