@@ -6,7 +6,7 @@ Each is a penalty of the least-squares residual or a true constraint of `Multipl
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any
@@ -145,14 +145,16 @@ class SteadyState(Relation):
         pick = np.unique(np.linspace(s.first, s.last, min(FEWEST, s.n)).round().astype(int))
         data = np.tile([s.v, *[s.means[c] for c in known]], (len(pick), 1))
         one = np.ones(len(names))
-        size = np.array([abs(s.v) if n == "voltage" else _drive(problem.model.values, s) for n in names])
+        own = problem.model.values
+        torque = abs(own["K"] * s.means["i"] if "K" in own else own["g"] * s.v) or 1.0
+        size = np.array([abs(s.v) if n == "voltage" else torque for n in names])
         allowed = (self.tolerance + 3 * sum(_relative_error(run, s, c) for c in known)) * one
         weight = self.weight * np.sqrt(s.n) * share(problem, s.run) * one
-        torque = "N" if problem.model.axis == "linear" else "N·m"
+        unit = "N" if problem.model.axis == "linear" else "N·m"
         labels = tuple(f"{self.name}, {n} balance, run {s.run}, {s.begin:.4g} to {s.end:.4g} s" for n in names)
         return Part(s.run, local(system, _steady_rows(system, known), data.shape[1]), pick,
                     np.zeros(len(pick), int), data, run.grid.u[pick], np.array(wanted), -allowed, allowed, size,
-                    weight, labels, tuple({"voltage": "V", "torque": torque}[n] for n in names))
+                    weight, labels, tuple({"voltage": "V", "torque": unit}[n] for n in names))
 
     @staticmethod
     def _wanted(system: Any, s: SteadySegment) -> tuple[bool, bool]:
@@ -188,11 +190,6 @@ def _steady_rows(system: Any, known: Sequence[str]) -> Callable[..., Any]:
         size = ca.vertcat(d[0], drive)
         return balances / ca.if_else(size == 0, 1.0, size)
     return rows
-
-
-def _drive(values: Mapping[str, float], s: SteadySegment) -> float:
-    """Torque of the motor on this segment, at the present values."""
-    return abs(values["K"] * s.means["i"] if "K" in values else values["g"] * s.v) or 1.0
 
 
 def _relative_error(run: Any, s: SteadySegment, channel: str) -> float:
