@@ -96,11 +96,11 @@ def diagnose_command(
         if interruption.behind(error):
             _keep_fit(before, done, json, options.force)
         raise
-    if json:
-        write_json(found.to_dict() | {"notes": notes}, json, options.force)
     if json != "-":
         say_notes(notes, "About the records")
         _show_diagnosis(found)
+    if json:
+        write_json(found.to_dict() | {"notes": notes}, json, options.force)
     if remainder_to:
         _write_remainder(found, remainder_to, options.force)
     save_report(found, report, held_out, options.force)
@@ -118,10 +118,10 @@ def _as_it_comes(word: str, done: list[str], quiet: bool) -> None:
 def _keep_fit(before: Fit, done: Sequence[str], json: Json, force: bool) -> None:
     """Show and write what an interrupted diagnosis began with, and how far it came."""
     interruption.heard()
-    if json:
-        write_json(fit_dict(before) | {"interrupted": list(done)}, json, force)
     if json != "-":
         show(f"Interrupted after: {', '.join(done) or 'the fit'}. The original model:", parameter_table(before))
+    if json:
+        write_json(fit_dict(before) | {"interrupted": list(done)}, json, force)
 
 
 def _write_remainder(found: Diagnosis, path: Path, force: bool) -> None:
@@ -170,12 +170,12 @@ def design_command(found_json: Found, out: Plan = None, goal: Goal = None, param
             v_max=limit_voltage, i_max=limit_current, omega_max=limit_speed, theta_range=limit_angle,
             temp_max=limit_temperature, duration=duration, shape=shape, levels=levels, slew=slew, budget=budget,
             progress=lambda _: advance(1))
-    if json:
-        write_json(design.to_dict(), json, force)
     if json != "-":
         card = design.card()
         show(card.text[0], *card.tables, "Play it with:")
         typer.echo(f'motorid record --port PORT --out next.csv --excite "{design.excite}"')  # to copy: not wrapped
+    if json:
+        write_json(design.to_dict(), json, force)
     if out is not None:
         path = design.to_csv(out, force)
         show(f"Written: {path}" if json != "-" else None)

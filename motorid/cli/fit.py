@@ -64,10 +64,10 @@ def fit_command(runs: Runs, options: FitOptions, validate: Validate = None, json
     notes = notes_of(records, held_out)
     found = options.fit(records, model)
     judged = evaluate(found, held_out) if held_out else None
-    if json:
-        write_json(fit_dict(found, judged) | {"notes": notes}, json, options.force)
     if json != "-":
         _show_fit(found, records, notes, judged)
+    if json:
+        write_json(fit_dict(found, judged) | {"notes": notes}, json, options.force)
     save_report(found, report, held_out, options.force)
     if found.status == "failed":
         raise typer.Exit(FAILED)
@@ -136,10 +136,10 @@ def fit_many_command(
         with ProcessPoolExecutor(most, initializer=as_worker, initargs=(os.getpid(),)) as pool:
             found = fit_many(model, motors, map=pool.map, **given)
             pool.shutdown(wait=not found.interrupted, cancel_futures=True)
-    if json:
-        write_json(found.to_dict(), json, options.force)
     if json != "-":
         show(str(found))
+    if json:
+        write_json(found.to_dict(), json, options.force)
     if out:
         show(f"Table: {found.save(out, options.force)}")
     if found.interrupted:
@@ -293,8 +293,8 @@ def robustness_command(
 
 
 def _write_and_show(fitted: Fit, found: Identifiability | Multistart, json: Json, report: Report, force: bool) -> None:
-    if json:
-        write_json(found.to_dict(), json, force)
     if json != "-":
         show(str(found))
+    if json:
+        write_json(found.to_dict(), json, force)
     save_report([fitted, found], report, force=force)

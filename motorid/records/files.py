@@ -77,6 +77,8 @@ def check_output(path: str | Path, force: bool = False) -> Path:
         if target.is_dir() or not target.parent.is_dir():
             raise UsageError(f"cannot write {path}: " + ("it is a folder." if target.is_dir() else
                              f"there is no folder {target.parent}."))
+        if (target.is_file() or not target.exists()) and not os.access(target.parent, os.W_OK):
+            raise UsageError(f"cannot write {path}: nobody may write to its folder. Choose another one.")
         if force or not target.is_file():
             return target
         with target.open("rb") as file:

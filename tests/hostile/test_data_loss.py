@@ -112,6 +112,31 @@ def test_a_full_disk_is_a_sentence_status_1_and_the_old_file(saved, tmp_path, mo
         write_files({tmp_path / "x": "text"})
 
 
+@pytest.mark.parametrize(("words", "shown"), [
+    (("fit", "{run}", "--fix", "L=0"), "±"), (("identifiability", "{run}"), "full rank"),
+    (("diagnose", "{run}", "--budget", "0"), "fall of the NRMSE"), (("fit-many", "{folder}"), "of 1 motors fitted")])
+def test_a_result_that_cannot_be_written_is_shown(words, shown, run, tmp_path, monkeypatch):
+    """It may have taken hours."""
+    def full(_: int) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    given = (w.format(run=run, folder=run.parent) for w in words)
+    done = motorid(*given, "--json", tmp_path / "out.json")
+    assert (done.status, "No space left" in done.err) == (1, True)
+    assert shown in done.out
+
+
+def test_a_folder_that_cannot_be_written_to_is_said_before_the_work(run, tmp_path, monkeypatch):
+    monkeypatch.setattr(os, "access", lambda *_: False)
+    monkeypatch.setattr("motorid.cli.fit.evaluate", None)
+    monkeypatch.setattr("motorid.cli.options.fit", None)
+    done = motorid("fit", run, "--json", tmp_path / "out.json")
+    assert (done.status, done.out) == (2, "")
+    assert "cannot write" in done.err
+    assert motorid("export", run, "/dev/null").status == 2  # a device is no folder
+
+
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full here")
 def test_a_device_that_refuses_is_said(run):
     done = motorid("fit", run, *SMALL, "--json", "/dev/full")
@@ -285,6 +310,7 @@ def test_a_batch_killed_in_the_middle_of_its_journal_ends_in_the_same_table(tmp_
         file.truncate(journal.stat().st_size - 20)
     tables = [tmp_path / "resumed.csv", tmp_path / "whole.csv"]
     assert motorid("fit-many", folder, "--journal", journal, "--out", tables[0]).status == 0
+    assert journal.read_bytes().count(b"\n") == done + 40 - (done - 1), "what was done before was done again"
     assert motorid("fit-many", folder, "--out", tables[1]).status == 0
     assert without_seconds(tables[0]) == without_seconds(tables[1])
 
