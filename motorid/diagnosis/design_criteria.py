@@ -185,6 +185,13 @@ class Layout:
                 found[a:b, 1] = program(self._riding(j, 0.0, 1.0)).volts(1 / self.dt)
         return found
 
+    @cached_property
+    def jumps(self) -> NDArray[np.bool_]:
+        """Samples, (N,), that begin with a jump of the voltage."""
+        found = np.diff(self.inputs[:, 1], prepend=0.0)[:-1] != 0
+        found[self.edges[:-1]] |= not self.ramps
+        return found
+
     def voltage(self, levels: Array) -> Array:
         """Return the voltage at each sample and the end, (N+1,)."""
         n = len(self.ms)
@@ -321,7 +328,8 @@ class Driven:
         p, _ = self.parameters(np.zeros(len(self.rival.scale)))
         grid = replace(self, substeps=np.ones_like(self.substeps)).grid(levels)
         fine = ENGINE.prepare(self.system, grid, self.system.first_state(np.zeros(3), p), p, tolerance)
-        return replace(self, substeps=np.maximum(maximum_filter1d(fine.substeps, ELSEWHERE), self.substeps))
+        moving = np.where(self.layout.jumps, 1, fine.substeps)  # while a jump of the voltage stays where it is
+        return replace(self, substeps=np.max([fine.substeps, maximum_filter1d(moving, ELSEWHERE), self.substeps], 0))
 
     def informs(self, response: Response) -> Array:
         """Return the information (k, k) on the parameters, old and new."""

@@ -146,6 +146,7 @@ ENOUGH = 7.0  # the same, from which another start is not worth its time
 RIPPLES = (0.0, 0.3)  # share of the voltage for a binary signal on top of a candidate
 DRAWS = 16  # of the parameters, for the check of the limits
 SMOOTH = 1e-2  # of the largest speed: width of sgn while the voltage is sought
+NEARLY = 0.05  # nats between coarse and fine integration that need no further search
 TOLERANCE = 3e-5  # of the integration, relative to the largest state
 NO_RECORD = "no record stays within the limits with all models; allow more voltage, current or angle."
 WORTH = 4.0  # nats between two rivals from which they count as distinguished
@@ -343,7 +344,10 @@ def _optimised(task: Task, say: Callable[[str], None]) -> Found:
             continue
         found = climb(_hardest(start[1], start[2]), start[2], enough)
         again = None if found.stopped else _within(found.task, found.c)  # integration steps that suit what was found
-        done.append(climb(again[1], again[2], enough) if again else found)
+        if again is not None:
+            near = abs(again[0] - found.value) < NEARLY
+            found = Found(again[1], again[2], again[0]) if near else climb(again[1], again[2], enough)
+        done.append(found)
         say(f"optimised from the {name}: {done[-1].value:.3g}")
         if done[-1].stopped or done[-1].value > enough:
             break

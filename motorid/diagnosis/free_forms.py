@@ -232,25 +232,14 @@ UNBOUNDED = 1e9  # in units of the noise, per unit of a form
 
 @dataclass(frozen=True, eq=False)
 class Linear:
-    """A model on records: its whitened residual, and how that answers to everything that might change.
+    """A model on records: its whitened residual, and how that answers to everything that might change."""
 
-    Attributes
-    ----------
-    residual : ndarray, shape (n,)
-    slopes : ndarray, shape (n, number of free parameters)
-    own : ndarray, shape (n, number of estimated initial states)
-        To half of the range in which each may lie.
-    forms : dict of Form to ndarray, shape (n, number of coefficients)
-    place, channel : ndarray, shape (n,)
-        Of each residual: where in its run it is, from 0 to 1, and which output.
-    """
-
-    residual: Array
-    slopes: Array
-    own: Array
-    forms: Mapping[Form, Array]
-    place: Array
-    channel: Array
+    residual: Array  # (n,)
+    slopes: Array  # (n, number of free parameters)
+    own: Array  # (n, number of estimated initial states), to half of the range in which each may lie
+    forms: Mapping[Form, Array]  # (n, number of coefficients)
+    place: Array  # (n,), of each residual: where in its run it is, from 0 to 1
+    channel: Array  # (n,), and which output
 
     def part(self, rows: NDArray[np.bool_]) -> Linear:
         """Return the rows chosen by a mask."""

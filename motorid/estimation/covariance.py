@@ -38,30 +38,14 @@ Blocks = Mapping[str, Sequence[tuple[Array, Array]]]
 
 @dataclass(frozen=True, eq=False)
 class Certainty:
-    """What residuals and Jacobian say of the unknowns.
+    """What residuals and Jacobian say of the unknowns."""
 
-    Attributes
-    ----------
-    matrix : ndarray, shape (k, k)
-        Covariance in physical units, along the directions that the data determine.
-    status : tuple of str
-        ``"determined"``, ``"not determined"``, ``"at its lower limit"`` or ``"at its upper limit"``.
-    dof : float
-        Effective degrees of freedom of the residuals.
-    colours : mapping of str to Colour
-        Per channel, of the whitened residuals.
-    blind : ndarray, shape (k, m)
-        Directions without influence on the outputs: orthonormal columns, in solver coordinates.
-    unit : ndarray, shape (k,)
-        Change of each unknown per unit of its solver coordinate: its value where that is logarithmic.
-    """
-
-    matrix: Array
-    status: tuple[str, ...]
-    dof: float
-    colours: Mapping[str, Colour]
-    blind: Array
-    unit: Array
+    matrix: Array  # (k, k), covariance in physical units, along the directions that the data determine
+    status: tuple[str, ...]  # "determined", "not determined", "at its lower limit" or "at its upper limit"
+    dof: float  # effective degrees of freedom of the residuals
+    colours: Mapping[str, Colour]  # per channel, of the whitened residuals
+    blind: Array  # (k, m), directions without influence on the outputs: orthonormal, in solver coordinates
+    unit: Array  # (k,), change of each unknown per unit of its solver coordinate: its value where that is logarithmic
 
     @property
     def std(self) -> tuple[float | None, ...]:

@@ -89,6 +89,17 @@ def test_a_rival_that_can_follow_is_no_evidence(tasks, fits):
     assert max(w.value for w in twin.criteria(LEVELS_TRIED, twin.respond(LEVELS_TRIED), False)) < 1e-6
 
 
+def test_jumps_that_stay_where_they_are_take_short_steps_there_alone(tasks):
+    """An inductance that no sample shows would else make every sample of a binary signal dear."""
+    driven = tasks[0].driven[0]
+    stiff = replace(driven, rival=replace(driven.rival, model=driven.rival.model.replace(L=1e-4)))
+    steps = stiff.refined(LEVELS_TRIED, 3e-5).substeps
+    jumps = driven.layout.jumps
+    assert set(np.flatnonzero(jumps)) <= set(range(0, len(steps), 2)), "bits and segments are whole samples"
+    assert 6 < jumps.sum() <= len(steps) / 4
+    assert steps[jumps].mean() > 20 > 6 > steps[~jumps].mean()
+
+
 def test_what_the_records_know_are_the_deviations_of_the_fit(fits):
     rival = Rival.of(fits[0])
     white = np.sqrt(np.diag(fits[0].covariance))
