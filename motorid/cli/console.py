@@ -22,6 +22,7 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from motorid.display.cards import Table
+from motorid.display.numbers import NO_BREAK, glued
 from motorid.errors import DataError, ModelError, MotoridError, UsageError, printable
 from motorid.numerics.parallel import interruption, progress
 from motorid.records.files import check_output
@@ -192,7 +193,7 @@ def _columns(table: Table) -> list[list[str]]:
 
 def _least(cells: Sequence[str]) -> int:
     """Return the length of the longest part that stays whole: a word, a value with its error and unit."""
-    return max((len(part) for cell in cells for part in _glued(cell).split()), default=0)
+    return max((len(part) for cell in cells for part in re.split(r"[ \n]", glued(cell))), default=0)
 
 
 def _upright(table: Table, room: int) -> Table:
@@ -268,25 +269,20 @@ def wrapped(text: str, first: str = "") -> str:
 
 def _filled(text: str, width: int, first: str = "") -> str:
     """Return a line of text cut at spaces, but not within a value with its error and unit."""
-    lines = textwrap.fill(_glued(text), width, initial_indent=first, subsequent_indent=" " * len(first),
+    lines = textwrap.fill(glued(text), width, initial_indent=first, subsequent_indent=" " * len(first),
                           break_on_hyphens=False, break_long_words=False)
-    return lines.replace("\0", " ")
+    return lines.replace(NO_BREAK, " ")
 
 
-def _glued(text: str) -> str:
-    """Return a text with what must not be cut joined by NUL: ``1.3 ± 0.1 Ω``, ``12.7 → 1.02 %``."""
-    text = re.sub(r"(?<=\d) ([±→]) (?=\d)", "\0\\1\0", text)
-    return re.sub(r"(?<=[\d⁰¹²³⁴⁵⁶⁷⁸⁹]) (?=[%a-zA-ZΩ°µ])(?!(and|or|to|of|the|times|in)\b)", "\0", text)
-
-
-def next_command(name: str) -> str:
-    """Return what to type next: this command line with another command, without what it writes."""
+def next_command(name: str, *more: str) -> str:
+    """Return what to type next: this command line with another command and `more`, without what it writes."""
     words = iter(sys.argv[2:])
     dropped = OUTPUTS if name == "diagnose" else (*OUTPUTS, "--budget", "--max-effects", "--remainder-to")
     kept = [w for w in words if not (w in dropped and next(words, None))
             and w.partition("=")[0] not in (*dropped, "--force")]
-    line = shlex.join(["motorid", name, *kept])
-    return line if kept and len(line) <= 2 * WIDTH else f"motorid {name} RUN... (the same records and options)"
+    line = shlex.join(["motorid", name, *kept, *more])
+    short = shlex.join(["motorid", name, "RUN...", *more]).replace("'RUN...'", "RUN...")
+    return line if kept and len(line) <= 2 * WIDTH else f"{short} (the same records and options)"
 
 
 def save_report(result: Any, path: Any, held_out: Sequence[Any] = (), force: bool = False) -> None:

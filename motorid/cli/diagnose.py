@@ -146,10 +146,12 @@ def _next_step(found: Diagnosis) -> str:
     if found.suggestion:
         return f"Next: {found.suggestion[0].lower()}{found.suggestion[1:]}"
     if found.remainder is not None and found.remainder.proposed:
-        return f"Next: {next_command('diagnose')} --remainder-to remainder.py\nIt writes what remains as an effect."
+        name = "remainder.py"
+        return f"Next: {next_command('diagnose', '--remainder-to', name)}\nIt writes what remains as an effect."
     if found.effects:
-        return f"Next: {next_command('fit')} --effects {','.join(found.after.model.effect_names)} --json fit.json"
-    return f"Next: {next_command('fit')} --json fit.json\nThen: motorid export fit.json motor.casadi"
+        names = ",".join(found.after.model.effect_names)
+        return f"Next: {next_command('fit', '--effects', names, '--json', 'fit.json')}"
+    return f"Next: {next_command('fit', '--json', 'fit.json')}\nThen: motorid export fit.json motor.casadi"
 
 
 def design_command(found_json: Found, out: Plan = None, goal: Goal = None, parameters: Parameters = None,

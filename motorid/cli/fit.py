@@ -77,7 +77,7 @@ def _show_fit(found: Fit, records: list[Experiment], notes: list[str], judged: E
     """Print a fit: remarks, parameters, errors, what follows from them, and how it ended."""
     show(found.verdict, _held_out(found, judged) if judged else None, NRMSE,
          None if found.fits == "noise" else f"Next: {next_command('diagnose')}",
-         f"\n{found.problem.model.name}, {_amount(records)}\n")
+         f"\n{found.model.title}, {_amount(records)}. {ended(found)}\n")
     say_notes(notes, "About the records")
     show(*value_tables(found))
     say_notes(remarks(found), "What to know about these values")
@@ -86,9 +86,6 @@ def _show_fit(found: Fit, records: list[Experiment], notes: list[str], judged: E
          run_table(found.evaluation) if len(records) > 1 else None,
          run_table(judged, "Held-out errors run by run") if judged and several else None, steady_table(found))
     show(constraint_table(found, constraint_violations(found)))
-    engine = found.problem.engine
-    show(f"{ended(found)} Engine "
-         f"{engine if isinstance(engine, str) else engine.name}, formulation {found.formulation}.")
 
 
 def _held_out(found: Fit, judged: Evaluation) -> str:

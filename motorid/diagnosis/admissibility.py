@@ -33,7 +33,8 @@ def objections(fit: Fit, added: Effect, before: Fit | None = None) -> str:
             return f"{p.name} runs to its limit: nothing of this shape is in the records"
         if p.vary and p.null is not None and not p.positive and fit.values[p.name] <= p.lower == p.null:
             return f"{p.name} goes to {p.null:g}: the records show none of it, or only with the wrong sign"
-        if p.vary and np.isfinite(p.upper) and fit.values[p.name] > 0.98 * p.upper and not _was_narrowed(p, added):
+        physical = next(q.upper for q in added.parameters if q.name == p.name) == p.upper  # not set for these records
+        if p.vary and np.isfinite(p.upper) and fit.values[p.name] > 0.98 * p.upper and physical:
             return f"{p.name} runs to {p.upper:g}, the limit of what is physical"
     why = _too_large(fit, pars) or unresolved(fit, added)
     return why or (_emptied(fit, added, before) if before else "")
@@ -48,11 +49,6 @@ def _too_large(fit: Fit, pars: Sequence[Parameter]) -> str:
             share = percent(abs(fit.values[p.name]) / top, 2)
             return f"{p.name} = {fit.values[p.name]:.3g} V is {share} of the largest voltage, which is not plausible"
     return ""
-
-
-def _was_narrowed(p: Parameter, added: Effect) -> bool:
-    """Tell whether the limit is one set for these records, and not one of physics."""
-    return next(q.upper for q in added.parameters if q.name == p.name) != p.upper
 
 
 def _emptied(fit: Fit, added: Effect, before: Fit) -> str:
@@ -108,12 +104,9 @@ def _too_quick(fit: Fit, width: float) -> str:
 
 
 def _too_slow(fit: Fit, speed: float) -> str:
-    below = sum(int((_moving(abs(_speed(r))) < 2 * speed).sum()) for r in fit.problem.experiments)
+    speeds = [abs(_speed(r)) for r in fit.problem.experiments]
+    below = sum(int(((s < 2 * speed) & (s > 1e-6 * s.max(initial=0.0))).sum()) for s in speeds)
     return f"only {below} samples in motion are so slow" if below < PASSAGE else ""
-
-
-def _moving(speed: Array) -> Array:
-    return speed[speed > 1e-6 * speed.max(initial=0.0)]
 
 
 def _speed(run) -> Array:

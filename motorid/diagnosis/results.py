@@ -354,7 +354,7 @@ def ranking_table(candidates: Sequence[Candidate], most: int = 10) -> Table:
     for c in shown:
         gain = [percent(c.held_out_gain)] if held_out else []
         helps = c.reason.startswith("lowers the") and c.reason.endswith("%")
-        reason = f"{c.reason}; {best} was taken instead" if helps and best else c.reason
+        reason = f"{c.reason}; {best} was taken instead" if helps and best else c.reason.partition(" (gain ")[0]
         verdict = Flag("accepted", "good") if c.accepted else (reason or "not refitted")
         refit = None if c.refit_drop is None else round(c.refit_drop, 5)
         rows.append([c.effect, percent(round(c.predicted_drop, 5)), percent(refit), *gain, verdict])

@@ -57,7 +57,9 @@ def unexplained_text(ranking: Sequence[Candidate], rungs: Sequence[Rung], grades
         "Unexplained: something is missing, and no effect of the library explains it.")
     lead = lead if done else f"Unexplained so far: {like or 'something is missing'}; not all effects were tried."
     if grades:
-        return f"{lead} {approximations_text(grades)} {errors_text(rungs)}"
+        helps = approximations_text(grades)
+        helps = helps.replace(f"{like}, which the library lacks,", "a curve like this") if like else helps
+        return f"{lead} {helps} {errors_text(rungs)}"
     best = max((c for c in ranking if c.refit_drop is not None), key=lambda c: c.refit_drop or 0.0, default=None)
     if best is None or (best.refit_drop or 0) <= 0.05:
         return lead

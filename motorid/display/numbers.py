@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
+import re
 from decimal import ROUND_HALF_EVEN, Decimal
 
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+NO_BREAK = "\u00a0"
 _LARGEST = 5  # decades below it are written out, from 1e-3 on (with an error: from 1e-2 on)
 
 
@@ -107,6 +109,12 @@ def interval_text(limits: tuple[float, float] | None) -> str:
     width = (high - low) / max(finite) if math.isfinite(high - low) and any(finite) else 1.0
     digits = min(max(2 - math.floor(math.log10(max(width, 1e-12))), 3), 10)
     return f"{number(low, digits)} … {number(high, digits)}"
+
+
+def glued(text: str) -> str:
+    """Return a text in which no line ends within a value, its error and its unit, or between = and a value."""
+    text = re.sub(r"(?<=\d) ([±→]) (?=\d)|(?<=\w) (=) (?=[(\d−])", lambda m: NO_BREAK + (m[1] or m[2]) + NO_BREAK, text)
+    return re.sub(r"(?<=[\d⁰¹²³⁴⁵⁶⁷⁸⁹]) (?=[%a-zA-ZΩ°µ])(?!(and|or|to|of|the|times|in)\b)", NO_BREAK, text)
 
 
 def counted(n: int, noun: str) -> str:

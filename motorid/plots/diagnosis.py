@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -132,7 +133,7 @@ def plot_answer(found: Diagnosis, ax: Axes | None = None) -> Axes:
         had = accounted(found.before, found.after)[balance == "torque"]
         centre, mean, *_ = _profile(every, np.concatenate(had) * 10.0**-power)
         added = " + ".join(n for n in found.after.model.effect_names if n not in found.before.model.effect_names)
-        label = f"{added}, with the shift of the parameters"
+        label = textwrap.fill(f"{added}, with the shift of the parameters", 60)
         ax.plot(centre, mean, "--", color=style.PALETTE["orange"], lw=2.0, label=label)
     ax.axhline(0, color=style.MUTED, lw=0.6)
     unit = "V" if balance == "voltage" else m.torque_unit

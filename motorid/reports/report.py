@@ -12,7 +12,7 @@ from typing import Any
 from motorid.channels import NAMES
 from motorid.diagnosis.results import Diagnosis, Ladder
 from motorid.display.cards import Flag, Shown, Table
-from motorid.display.numbers import percent, with_error
+from motorid.display.numbers import glued, percent, with_error
 from motorid.errors import UsageError, printable
 from motorid.estimation.result import Fit
 from motorid.records.experiment import Experiment
@@ -79,6 +79,7 @@ def _page(story: Story) -> str:
 
     environment = Environment(loader=PackageLoader("motorid.reports", "templates"), autoescape=True,
                               undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    environment.filters["glued"] = glued
     date = datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z")
     page = environment.get_template("report.html").render(story=story, version=package_version("motorid"), date=date)
     return printable(page)  # control characters in names of files are not HTML
@@ -170,7 +171,7 @@ def _of_fit(fit: Fit, validate: Sequence[Experiment]) -> Story:
     story.facts = [(f"Error of the {NAMES[c]}", percent(e)) for c, e in fit.nrmse.items()]
     known = [fit.determined[n] for n in ("gain", "time_constant") if n in fit.determined]
     story.facts += [(q.text.capitalize(), with_error(q.value, q.std, q.unit)) for q in known]
-    story.sections.append(sections.fitted(fit, "The fit"))
+    story.sections.append(sections.fitted(fit, "The fit", told=False))
     if validate:
         story.sections.append(sections.held_out(fit, validate))
     story.sections += [sections.residuals(fit), sections.data(story.runs)]

@@ -54,14 +54,15 @@ def data(runs: Sequence[Experiment]) -> Section:
     return Section("data", "The data", text, remarks, [figure], [table])
 
 
-def fitted(fit: Fit, title: str, *, key: str = "fit", before: Fit | None = None, values: bool = True) -> Section:
-    """A fit: curves, errors, its `values` where no other section has them; beside it the model `before`."""
+def fitted(fit: Fit, title: str, *, key: str = "fit", before: Fit | None = None, values: bool = True,
+           told: bool = True) -> Section:
+    """A fit: its verdict (`told`), curves, errors, its `values`; beside it the model `before`."""
     from motorid.plots import plot_fit
 
     caption = "Measured, model, and residual beside the band of the noise."
     caption += " The thin curve is the original model." if before is not None else ""
     alt = f"Measured and modelled channels of {fit.model.title}, with residuals. " + f"NRMSE: {fit.evaluation.words}."
-    text = [f"{fit.model.title}: {fit.verdict[0].lower()}{fit.verdict[1:]} {ended(fit)}"]
+    text = [f"{fit.model.title}. {fit.verdict} {ended(fit)}"] if told else []
     figure = _figure(key, caption, alt, plot_fit, fit, before=before)
     tables = [*(value_tables(fit) if values else ()), error_table({"": fit.evaluation}, fit.noise)]
     return Section(key, title, text, (), [figure], tables)
@@ -95,7 +96,7 @@ def answer(d: Diagnosis) -> Section:
                "parameters (dashed).") if d.after is not d.before else "What the model lacks: dots, mean with 95 %."
     drawn = [] if d.verdict == "adequate" or d.where == "sensor" else [
         _figure("answer", caption, d.answer or d.text, plot_answer, d, small=True)]
-    next_step = [f"Next: {d.suggestion}"] if d.suggestion else []
+    next_step = [f"Next experiment: {d.suggestion}"] if d.suggestion else []
     return Section("answer", "The answer", next_step, (), drawn, [ladder_table(d.ladder)])
 
 
