@@ -26,7 +26,7 @@ from motorid.cli.options import (
 )
 from motorid.diagnosis.design_criteria import Rival
 from motorid.diagnosis.diagnose import diagnose
-from motorid.diagnosis.experiment_design import LEVELS, design_experiment
+from motorid.diagnosis.experiment_design import DISTINGUISHED, LEVELS, SHARPENED, design_experiment
 from motorid.diagnosis.record_parts import fit_affordably
 from motorid.diagnosis.refit import INTERRUPTED as STOPPED_BY_HAND
 from motorid.diagnosis.results import Diagnosis, ladder_table, ranking_table
@@ -79,7 +79,7 @@ def diagnose_command(
         help="Write what no effect explains as an effect, for --effects-from.")] = None,
     json: Json = None, report: Report = None,
 ) -> None:
-    """Say where the model fails, which physical effect is missing, and whether adding it holds up.
+    """Say where the model fails, which physical effect is missing, and what the error is with it.
 
     Example: motorid diagnose run*.csv --validate check*.csv --report found.html
     """
@@ -166,12 +166,13 @@ def design_command(found_json: Found, out: Plan = None, goal: Goal = None, param
     Example: motorid design found.json --limit-current 5 --duration 4 --out plan.csv
     """
     rivals = read_rivals(found_json, effects_from, goal)
-    with progress("Designing") as advance:
+    starts = SHARPENED if goal == "sharpen" or len(rivals) < 2 else DISTINGUISHED
+    with progress("Designing", 1 + starts, at_most=True) as advance:
         design = design_experiment(
             rivals, goal=goal, parameters=parameters.replace(" ", "").split(",") if parameters else None,
             v_max=limit_voltage, i_max=limit_current, omega_max=limit_speed, theta_range=limit_angle,
             temp_max=limit_temperature, duration=duration, shape=shape, levels=levels, slew=slew, budget=budget,
-            progress=lambda _: advance(1))
+            progress=lambda word: advance(1, f"Designing: {word.partition(':')[0]}"))
     if json != "-":
         card = design.card()
         show(card.text[0], *card.tables, "Play it with:")

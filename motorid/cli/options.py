@@ -137,9 +137,9 @@ class FitOptions(ReadingOptions):
     initial: Annotated[str, _solving(
         metavar="STATE", help="The state at the first sample: auto, rest, measured or estimate.")] = "auto"
     window: Annotated[str, _solving(
-        metavar="auto|none|SECONDS", help="Simulate the records in windows, each from an estimated state; auto: where "
-        "the model would carry small errors too far over the whole.")] = "auto"
-    loss: Annotated[str, _solving(metavar="squares|huber", help="huber forgives outliers.")] = "squares"
+        metavar="auto|none|SECONDS", help="Simulate the records in windows of so many seconds, each from an "
+        "estimated state; auto: where small errors grow along the record.")] = "auto"
+    loss: Annotated[str, _solving(metavar="squares|huber", help="huber: outliers count less.")] = "squares"
 
     def model(self, runs: Sequence[Experiment]) -> Model:
         """Return the model that was asked for."""
@@ -178,7 +178,7 @@ class FitOptions(ReadingOptions):
     def fit(self, runs: Sequence[Experiment], model: Model | None = None) -> Fit:
         """Fit the model to `runs`."""
         model = self.model(runs) if model is None else model
-        text = f"Fitting {model.name}"
+        text = f"Fitting {model.title}"
         with progress(text) as advance:
             return fit(model, runs, callback=lambda k, *_: advance(1, f"{text}: iteration {k}"), **self.keywords())
 
