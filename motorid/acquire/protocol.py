@@ -242,4 +242,5 @@ def _read(body: bytes) -> Sample | Message | None:
         values = tuple([float(r) if r else math.nan for r in raw])
     except ValueError:
         return None
-    return Sample(int(counter), int(time), tuple([r if math.isfinite(r) else math.nan for r in values]))
+    known = tuple([r if math.isfinite(r) else math.nan for r in values])
+    return Sample(int(counter), int(time), known) if any(map(math.isfinite, values)) else None

@@ -98,7 +98,8 @@ def record(port: str | Link, out: str | Path, *, baud: int = 115_200, excite: st
         file = RecordFile(out, header.channels, header.rate, head if not plan.tail else {}, mode)
         try:
             setup = Setup(client, header, file, len(todo.segments), _commanded(device, header, todo),
-                          _most(device, header, *limits), _total(todo, duration), duration,
+                          _most(device, header, *limits),
+                          min((e for e in (todo.duration or None, duration) if e), default=None), duration,
                           max(timeout, 4 / header.rate), progress)
             return Session(setup, lambda: plan.begin(file, done)).run()
         finally:
@@ -126,11 +127,6 @@ def _limit(asked: float, device: Header) -> tuple[float, int, str]:
     if asked < device.v_max:
         return asked, device.segments, "the limit you gave"
     return device.v_max, device.segments, "the device's own limit"
-
-
-def _total(todo: Program, duration: float | None) -> float | None:
-    ends = [e for e in (todo.duration or None, duration) if e is not None]
-    return min(ends, default=None)
 
 
 def _commanded(device: Header, header: Header, todo: Program) -> Commanded:

@@ -33,6 +33,7 @@ SENTENCES = {
     "limit": "The current limit was reached; the motor was switched off. Lower the voltage or raise the limit.",
     "voltage": "The device reports a voltage beyond the limit; the motor was switched off. Look at its firmware.",
     "emergency": "The emergency stop of the bench was opened; the motor was switched off.",
+    "overrun": "The device did not stop at the end of the excitation; the motor was stopped. Look at its firmware.",
     "watchdog": "The device heard nothing from this computer for a second and switched the motor off.",
     "unplugged": "The device is gone (unplugged, or its port was closed). Plug it in again and go on with --resume.",
     "silent": "The device stopped talking. See whether it is powered, then go on with --resume.",
@@ -140,6 +141,8 @@ class Session:
         elapsed = self.last.time if self.last else 0.0
         if self.setup.duration is not None and elapsed >= self.setup.duration - 1.5 / self.setup.header.rate:
             self._end("duration")
+        if self.setup.total is not None and elapsed > self.setup.total + self.setup.timeout:
+            self._end("overrun")
         # Of a computer that was held up itself nothing can be said; hence the empty readings.
         if now - self._heard > self.setup.timeout and self._empty >= EMPTY:
             self._end("silent", f"no valid line for {self.setup.timeout:g} s")
@@ -194,10 +197,9 @@ class _ProgressReports:
             return
         passed = last.time - seconds
         rate = (timeline.received - samples) / passed if passed > 0 else 0.0
-        names = (c.name for c in self.setup.header.channels)
         self.before = (now, timeline.received, last.time)
         self.setup.progress(Progress(last.time, self.setup.total, rate, timeline.received, timeline.lost,
-                                     dict(zip(names, last.values, strict=True))))
+                                     {c.name: y for c, y in zip(self.setup.header.channels, last.values, strict=True)}))
 
 
 @contextlib.contextmanager
@@ -206,7 +208,8 @@ def _stop_by_signal(stop: Callable[[], None]) -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    before = {s: signal.getsignal(s) for s in (signal.SIGINT, signal.SIGTERM)}
+    before = {s: signal.getsignal(s) for n in ("SIGINT", "SIGTERM", "SIGHUP") if (s := getattr(signal, n, None))}
+    before = {s: old for s, old in before.items() if s == signal.SIGINT or old is not signal.SIG_IGN}  # nohup
 
     def handler(number: int, _: object) -> None:
         signal.signal(number, before[signal.Signals(number)])
@@ -243,8 +246,8 @@ class Recording(Shown):
     header : Header
         Of the device, as calibrated.
     ended : str
-        ``done``, ``duration``, ``interrupted``, ``limit``, ``emergency``, ``watchdog``, ``unplugged``,
-        ``silent``, ``restarted`` or ``disk``.
+        ``done``, ``duration``, ``interrupted``, ``limit``, ``emergency``, ``overrun``, ``watchdog``,
+        ``unplugged``, ``silent``, ``restarted`` or ``disk``.
     detail : str
         What the system said, for the last ones.
     received, lost : int
@@ -293,8 +296,8 @@ class Recording(Shown):
         """Return how it ended and what was received."""
         flags = [Flag(self.ended, "good" if self.complete else "bad")]
         flags += [Flag(f"{self.lost} of {self.received + self.lost} samples lost", "note")] if self.lost else []
-        name = self.path.name
-        return Card(f"Recording {name}", flags, str(self).splitlines(), (), ((f'mi.read_runs("{name}")', "read it"),))
+        return Card(f"Recording {self.path.name}", flags, str(self).splitlines(), (),
+                    ((f'mi.read_runs("{self.path.name}")', "read it"),))
 
     def __str__(self) -> str:
         made = self.received + self.lost

@@ -245,9 +245,8 @@ def _never_settles(run: Experiment) -> str | None:
 
 
 def _never_reverses(runs: Sequence[Experiment]) -> str | None:
-    if not runs:
-        return None
-    low, high = min(r.inputs["v"].min() for r in runs), max(r.inputs["v"].max() for r in runs)
+    low = min((r.inputs["v"].min() for r in runs), default=0.0)
+    high = max((r.inputs["v"].max() for r in runs), default=0.0)
     if low > -0.02 * high or high < -0.02 * low:
         return ("the voltage never reverses in any run: effects that depend on the direction (dry friction against a "
                 "constant load, asymmetry, backlash) cannot be distinguished. Add a run with both signs.")

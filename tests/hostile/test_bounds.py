@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import io
 import os
+import re
+import signal
 import struct
 import subprocess
 import sys
+import threading
 import time
 import zlib
 
 import pytest
 from command import motorid
 
-from motorid.acquire.protocol import Channel
+import motorid as mi
+from motorid.acquire.protocol import Channel, frame
 from motorid.acquire.record_file import RecordFile
 from motorid.acquire.timeline import Row
 from motorid.records.datasets import data_path
@@ -79,6 +83,65 @@ def test_a_device_that_jumps_ahead_fills_no_gigabytes(tmp_path):
     file.flush()
     file.close()
     assert (tmp_path / "run.csv").stat().st_size < 1000
+
+
+class Stubborn:
+    """A device that does not stop at the end of its program."""
+
+    pace = 0.0
+
+    def __init__(self, *values: object) -> None:
+        self.values, self.out, self.made, self.going = values, b"", 0, False
+
+    def write(self, data: bytes) -> None:
+        for body in re.findall(rb"\$([^*]*)\*", data):
+            kind, *rest = body.decode().split(",")
+            answer = {"?": ("H", 1, "d", 100, 32, 32, 12, 5, 8, "v:V:1:0:n", "i:A:1:0:n"), "G": ("A", "G", 0, 0),
+                      "X": ("E", "done", self.made, "stop")}.get(kind, ("A", kind, *rest[:2 if kind == "L" else 1]))
+            self.out += frame(*answer)
+            self.going = kind == "G" or (self.going and kind != "X")
+
+    def read(self, timeout: float) -> bytes:
+        for k in range(self.made, self.made + 10 * self.going):
+            self.out += frame("D", k, 10_000 * k, *self.values)
+        self.made += 10 * self.going
+        sent, self.out = self.out, b""
+        time.sleep(self.pace if sent else timeout)
+        return sent
+
+    def close(self) -> None:
+        self.going = False
+
+
+def test_a_device_that_does_not_stop_is_stopped(tmp_path):
+    done = mi.record(Stubborn(0.5, 0.1), tmp_path / "run.csv", excite="rest:1", timeout=0.5)
+    assert (done.ended, done.complete) == ("overrun", False)
+    assert 100 <= done.received < 300
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="no such signal there")
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP"])
+def test_a_terminal_that_is_closed_stops_the_motor_and_keeps_the_data(tmp_path, name, monkeypatch):
+    number = getattr(signal, name)
+    before = signal.signal(number, lambda *_: None)
+    kill = threading.Timer(0.3, os.kill, (os.getpid(), number))
+    kill.start()
+    try:
+        device = Stubborn(0.5, 0.1)
+        device.pace = 0.02
+        done = mi.record(device, tmp_path / "run.csv", excite="rest:100", duration=20.0)
+    finally:
+        kill.cancel()
+        signal.signal(number, before)
+    assert (done.ended, device.going) == ("interrupted", False)
+    assert "# ended: interrupted" in (tmp_path / "run.csv").read_text(encoding="utf-8")
+
+
+def test_a_device_that_knows_no_number_sent_no_sample(tmp_path):
+    """It said: 0 lost, nothing missing."""
+    done = mi.record(Stubborn("nan", "1e400"), tmp_path / "run.csv", excite="rest:1", timeout=0.2)
+    assert (done.received, done.complete) == (0, False)
+    assert done.bad["not understood"] > 0
 
 
 @pytest.mark.parametrize("words", [

@@ -139,9 +139,12 @@ def test_a_cache_that_others_can_write_is_refused(tmp_path, monkeypatch, capfd):
     monkeypatch.setenv("MOTORID_CACHE", str(mine))
     assert compiled.cache_dir() == mine
     assert stat.S_IMODE(mine.stat().st_mode) == 0o700
-    (tmp_path / "link").symlink_to(shared)
-    monkeypatch.setenv("MOTORID_CACHE", str(tmp_path / "link"))
-    assert compiled.cache_dir() is None
+    (shared / "below").mkdir(mode=0o700)
+    for behind in (shared, shared / "below"):  # a link in a good place to a bad one
+        (tmp_path / "link").unlink(missing_ok=True)
+        (tmp_path / "link").symlink_to(behind)
+        monkeypatch.setenv("MOTORID_CACHE", str(tmp_path / "link"))
+        assert compiled.cache_dir() is None, behind
 
 
 def test_escape_sequences_reach_neither_terminal_nor_record(tmp_path):
