@@ -255,7 +255,7 @@ def _why_not(port: str, baud: int, error: Exception) -> str:
     if isinstance(error, ValueError):
         return f"{port} cannot be opened at {baud} baud: {error}."
     if port.startswith("socket://") and not port.rpartition(":")[2].isdigit():
-        return f"{port} names no port; expected e.g. socket://127.0.0.1:7000."
+        return f"{port} cannot be opened: it names no port; expected e.g. socket://127.0.0.1:7000."
     if "://" in port:
         return f"{port} cannot be opened: {str(error).removeprefix(f'Could not open port {port}: ')}."
     if number == errno.ENOENT or ("could not open port" in str(error).lower() and not number):

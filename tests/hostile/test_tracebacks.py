@@ -192,6 +192,13 @@ def test_a_terminal_that_is_closed(tmp_path):
         assert "Traceback" not in done.stderr
 
 
+def test_a_warning_is_a_sentence_without_a_line_of_source():
+    code = ("import sys; from motorid.cli.console import prepare_process; prepare_process(); "
+            "import warnings; warnings.warn('be careful')")
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert done.stderr == "motorid: be careful\n"
+
+
 def test_an_address_without_its_port_is_said():
     for port in ("socket://127.0.0.1", "socket://"):
         done = motorid("record", "--port", port, "--out", "never.csv", "--excite", "rest:1", "--limit-voltage", 1)
