@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +32,7 @@ from motorid.problem.problem import Problem
 from motorid.problem.runs import natural_sizes
 
 UNDETERMINED = 0.5  # relative standard deviation: beyond it the 95 % interval of a size reaches zero
+WIDEST = 10.0  # of a solver coordinate, most of them logarithms: beyond a factor of 20,000 slopes mean nothing
 BLIND = 1e-3  # of a relative change: a quantity that shifts so much along a direction without influence is as open
 Law = Callable[[Mapping[str, float]], float]
 Blocks = Mapping[str, Sequence[tuple[Array, Array]]]
@@ -58,7 +60,14 @@ class Certainty:
         """Return one standard deviation of a quantity with gradient `slope` (k,); None where it is not determined."""
         if _shifts(self.blind, self.unit * slope):
             return None
-        return float(np.sqrt(max(slope @ self.matrix @ slope, 0.0)))
+        return float(np.sqrt(slope @ self._linear @ slope))
+
+    @cached_property
+    def _linear(self) -> Array:
+        """The covariance, (k, k), no direction wider than its linear picture holds: what two parameters do alike along
+        that direction, they do alike at both of its ends."""
+        sizes, ways = np.linalg.eigh(self.matrix / np.outer(self.unit, self.unit))
+        return (self.unit[:, None] * ways * np.clip(sizes, 0, WIDEST**2)) @ (self.unit[:, None] * ways).T
 
 
 def certainty(problem: Problem, q: Array, residuals: Array, jacobian: Array, free: Array | None = None,

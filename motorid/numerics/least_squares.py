@@ -234,7 +234,10 @@ class _Search:
         if enough or small:  # so near that the Jacobian is still that of the solution
             self.q, self.r, self.cost = self.q + step, r, cost
             return end if small else "cost"
-        self._move(self.q + step)
+        try:
+            self._move(self.q + step)
+        except SimulationError:  # slopes may overflow where outputs do not
+            self.lam = 100 * max(self.lam, 1e-3)
         return ""
 
     def _shortened(self, step: Array) -> Array:

@@ -196,7 +196,7 @@ def test_unknown_states_and_foreign_constraints_are_refused():
     runs = runs_of("two_step_noisy")
     with pytest.raises(UsageError, match="state"):
         mi.fit(mi.dc_motor(), runs, solver=MultipleShooting(process_noise={"torque": 1.0}))
-    with pytest.raises(UsageError, match="MultipleShooting takes"):
+    with pytest.raises(UsageError, match="penalties and constraints are like"):
         mi.fit(mi.dc_motor(), runs, solver=MultipleShooting(), constraints=["i < 3"])
 
 

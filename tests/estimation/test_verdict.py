@@ -11,7 +11,7 @@ from command import motorid, motorid_json
 import motorid as mi
 from motorid import plots
 from motorid.display.numbers import with_error
-from motorid.estimation.covariance import certainty
+from motorid.estimation.covariance import Certainty, certainty
 from motorid.records.datasets import data_path, truth
 
 FRICTION = data_path("hidden_friction")
@@ -97,6 +97,18 @@ def test_voltage_and_speed_alone_determine_gain_times_and_friction_in_volts(runs
     both = mi.fit(fit.model.without("coulomb"), runs)
     assert set(fit.determined) >= {"time_constant", "damping"} <= set(both.determined)
     assert json.dumps([d.value for d in fit.determined.values()])
+
+
+def test_what_parameters_do_alike_is_determined_however_wide_each_may_be():
+    """Two that trade off: the longer the way that nothing but a tiny slope along it limits, the more it would claim."""
+    wide, narrow = np.array([1.0, -1.0]) / np.sqrt(2), np.array([1.0, 1.0]) / np.sqrt(2)
+    unit, product = np.array([3.0, 0.2]), np.array([0.2, 3.0])  # of a·b, SI
+    for width in (5.0, 50.0, 5e4):
+        scaled = width**2 * np.outer(wide, wide) + 1e-4 * np.outer(narrow, narrow)
+        known = Certainty(scaled * np.outer(unit, unit), ("not determined",) * 2, 100.0, {}, np.zeros((2, 0)), unit)
+        assert known.std_of(product) == pytest.approx(0.6 * np.sqrt(2) * 0.01, rel=1e-3)
+        tilted = known.std_of(product * [1.002, 0.998])
+        assert tilted == pytest.approx(0.6 * np.sqrt(2) * np.hypot(0.01, 0.002 * min(width, 10)), rel=1e-3)
 
 
 def test_a_value_whose_interval_reaches_zero_does_not_count_as_determined(runs):

@@ -147,3 +147,19 @@ def test_an_end_far_from_a_minimum_is_not_called_converged():
     assert 2 * found.history[-1] > 10 * problem.squares
     assert found.status == "stalled"
     assert "Try another start" in found.message
+
+
+def test_slopes_that_overflow_where_outputs_do_not_shorten_the_step():
+    """As of a model that is unstable there."""
+    def residual(q):
+        return np.array([q[0] - 3.0, 0.1 * (q[0] - 3.0) ** 2])
+
+    def both(q):
+        if 0.5 < q[0] < 2.5:
+            raise SimulationError("the slopes left the finite numbers")
+        return residual(q), np.array([[1.0], [0.2 * (q[0] - 3.0)]])
+
+    steps = levenberg_marquardt(residual, both, np.array([0.0]), options=LevenbergMarquardt(longest_step=2.0))
+    assert 0.4 < steps.q[0] < 0.5, "as near as it can come in steps that are trusted"
+    over = levenberg_marquardt(residual, both, np.array([0.0]), options=LevenbergMarquardt(damping=0, longest_step=9))
+    assert over.q[0] == pytest.approx(3.0, abs=1e-6), "in one step it comes to the other side"

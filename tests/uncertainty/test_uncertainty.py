@@ -251,7 +251,7 @@ def test_bootstrap_says_what_it_cannot_do(fit):
         bootstrap(fit, kind="runs")
     with pytest.raises(UsageError, match="Did you mean 'blocks'"):
         bootstrap(fit, kind="block")
-    with pytest.raises(UsageError, match="at least two"):
+    with pytest.raises(UsageError, match="n must be at least 2; got 1"):
         bootstrap(fit, n=1)
 
 
