@@ -144,7 +144,8 @@ def _shown_otherwise(error: UnicodeError) -> tuple[str, int]:
 
 def _check_outputs(given: dict[str, Any], command: str) -> None:
     """Refuse, before the work, an output that must not be written: an input, twice, or another program's file."""
-    wanted = [given[k] for k in (*RESULTS, *(["out"] if command in ("fit-many", "design") else [])) if given.get(k)]
+    wanted = [given[k] for k in (*RESULTS, *(["out"] if command in ("fit-many", "design") else []))
+              if given.get(k) is not None]
     targets = [check_output(path, given.get("force", False)) for path in wanted if path != "-"]
     if len(set(targets)) < len(targets):
         raise UsageError(f"two results cannot be written to one file, {targets[0]}.")

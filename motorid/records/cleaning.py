@@ -140,7 +140,7 @@ def _rows_in_order(t: Array, column: str, said: list[str]) -> NDArray[np.intp]:
     stretches = _stretches(t[rows])
     longest = max(stretches, key=len)
     again = counted(len(stretches) - 1, "time")
-    if len(stretches) > 1 and len(longest) < MIN_SAMPLES:
+    if len(stretches) > 1 and total < MIN_SAMPLES * len(stretches):  # in disorder, not begun anew
         raise DataError(f"time does not increase: '{column}' goes back {again} in {total} rows. Is it "
                         "the right column? Expected rows in order of time.")
     if len(stretches) > 1:

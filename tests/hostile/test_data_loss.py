@@ -153,6 +153,13 @@ def test_two_runs_of_one_name_are_simulated_into_two_files(saved, tmp_path):
     assert len(list((tmp_path / "out").iterdir())) == 2
 
 
+@pytest.mark.parametrize("option", ["--json", "--report"])
+def test_an_output_without_a_name_is_none_that_was_asked_for(run, option):
+    """A variable of the shell that was never set."""
+    done = motorid("fit", run, option, "")
+    assert (done.status, done.out) == (2, "")
+
+
 def test_two_results_cannot_be_one_file(run, tmp_path):
     done = motorid("fit", run, "--json", tmp_path / "x", "--report", tmp_path / "x")
     assert done.status == 2

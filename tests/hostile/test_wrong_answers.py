@@ -375,8 +375,10 @@ def test_what_a_logger_writes_for_nothing_is_missing(tmp_path, columns):
     assert np.nanmax(written(tmp_path / "run.csv", **columns).outputs["i"]) < 1e3
 
 
-def test_rows_out_of_order_are_called_so(rng, tmp_path, columns):
-    order = rng.permutation(30)
+@pytest.mark.parametrize("n", [30, 2000])  # of many rows a dozen are in order by chance: no stretch to keep
+def test_rows_out_of_order_are_called_so(rng, tmp_path, columns, n):
+    columns = {c: (x * n)[:n] for c, x in columns.items()} | {"time_s": [0.01 * k for k in range(n)]}
+    order = rng.permutation(n)
     with pytest.raises(mi.DataError, match="goes back"):
         written(tmp_path / "run.csv", **{c: [x[k] for k in order] for c, x in columns.items()})
 
