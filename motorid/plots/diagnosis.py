@@ -118,7 +118,8 @@ def plot_answer(found: Diagnosis, ax: Axes | None = None) -> Axes:
     style.refuse_other(found, Diagnosis, "plot_answer takes a diagnosis, mi.diagnose(fit)")
     m = found.missing
     balance = "voltage" if found.where == "electrical" else "torque"
-    against, periods = _quantity(found, balance)
+    had = accounted(found.before, found.after)[balance == "torque"] if found.after is not found.before else None
+    against, periods = _quantity(found, balance, had)
     x = [np.asarray(s[against]) * periods for s in m.signals]
     x = [np.mod(z, 2 * np.pi) if against == "theta" else z for z in x]
     values = getattr(m, balance)
@@ -129,8 +130,7 @@ def plot_answer(found: Diagnosis, ax: Axes | None = None) -> Axes:
     centre, mean, low, high = _profile(every, np.concatenate(values) * 10.0**-power)
     ax.fill_between(centre, low, high, color=_COLOUR[balance], alpha=0.3, lw=0)
     ax.plot(centre, mean, color=_COLOUR[balance], lw=1.6, label="missing, mean ± 95 %")
-    if found.after is not found.before:
-        had = accounted(found.before, found.after)[balance == "torque"]
+    if had is not None:
         centre, mean, *_ = _profile(every, np.concatenate(had) * 10.0**-power)
         added = " + ".join(n for n in found.after.model.effect_names if n not in found.before.model.effect_names)
         label = textwrap.fill(f"{added}, with the shift of the parameters", 60)
@@ -144,13 +144,21 @@ def plot_answer(found: Diagnosis, ax: Axes | None = None) -> Axes:
     return ax
 
 
-def _quantity(found: Diagnosis, balance: str) -> tuple[str, float]:
-    """Return the quantity to draw over: the phase of an effect with periods, else what explains most."""
+def _quantity(found: Diagnosis, balance: str, had: Sequence[Array] | None) -> tuple[str, float]:
+    """Return the quantity to draw over: the phase of an effect with periods, else what the addition `had` follows."""
     values = found.after.values
     orders = [values[p.name] for e in found.after.model.effects if e.name in found.effects for p in e.parameters
               if p.order]
     bins = found.missing.bins.get(balance, ())
-    return ("theta", orders[0]) if orders else (bins[0].against if bins else "t", 1.0)
+    if orders or not bins or had is None:
+        return ("theta", orders[0]) if orders else (bins[0].against if bins else "t", 1.0)
+    y = np.concatenate(had)
+
+    def scatter_about(b: Binned) -> float:
+        x = np.concatenate([np.asarray(s[b.against]) for s in found.missing.signals])
+        return float(np.nanvar(y - np.interp(x, *_profile(x, y)[:2])))
+
+    return min(bins, key=scatter_about).against, 1.0
 
 
 def _profile(x: Array, y: Array) -> tuple[Array, Array, Array, Array]:

@@ -12,7 +12,7 @@ from matplotlib.ticker import MaxNLocator
 from scipy.interpolate import PchipInterpolator
 from scipy.special import stdtrit
 
-from motorid.display.numbers import number, quantity
+from motorid.display.numbers import glued, number, quantity
 from motorid.errors import UsageError, one_of
 from motorid.estimation.result import Fit
 from motorid.numerics.signals import Array
@@ -268,7 +268,7 @@ def _sorted_costs(ax: Axes, result: Multistart, ends: Sequence[tuple[StartResult
     words = f"{result.good} of {len(result.results)} agree"
     words += f"; {result.failed} failed" if result.failed else ""
     words += f"; {result.poor} elsewhere:" if result.poor else ""
-    words = "\n".join([words, *textwrap.wrap(result.elsewhere, TITLE)])
+    words = "\n".join([words, *textwrap.wrap(glued(result.elsewhere), TITLE)])
     style.tidy(ax, x="fits, best first", y="squared error over the best (ratio)", title=words)
     ax.legend(loc="upper left")
 
