@@ -131,7 +131,7 @@ def _parts(run: Experiment, share: float) -> list[Experiment]:
 def _telling(run: Experiment, count: int) -> list[int]:
     """Return where `count` parts begin that show as much as they can of what the record shows, in order of time."""
     begins = np.unique(np.linspace(0, run.n - PART, 4 * (run.n // PART)).astype(int))
-    flags = _flags(run)
+    flags = np.concatenate([np.eye(n)[k] for k, n in _kinds(run)], axis=1)  # (N, levels of all kinds)
     counted = np.concatenate([np.zeros((1, flags.shape[1])), np.cumsum(flags, axis=0)])
     shown = counted[begins + PART] - counted[begins]
     chosen: list[int] = []
@@ -156,11 +156,6 @@ def _level(y: Array) -> NDArray[np.int_]:
     """Return in which of `LEVELS` equal steps between its extremes each sample lies."""
     low, high = np.quantile(y, [0.005, 0.995])
     return np.clip(LEVELS * (y - low) / max(high - low, 1e-300), 0, LEVELS - 1).astype(int)
-
-
-def _flags(run: Experiment) -> Array:
-    """Return which levels each sample shows, (N, levels of all kinds)."""
-    return np.concatenate([np.eye(n)[k] for k, n in _kinds(run)], axis=1)
 
 
 def parts_remark(fit: Fit) -> str:

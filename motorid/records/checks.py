@@ -434,17 +434,13 @@ def _as_balances_want(run: Experiment) -> Reading:
     left = {r: (voltage + 1e-4) * (speed + 1e-4) for r, (voltage, speed) in shares.items()}
     best = min(left, key=lambda r: left[r])
     if best[0] != stated[0]:
-        coarse = _roughness(y[best[0][2]]) > ROUGH
+        speed = y[best[0][2]]  # one less its correlation with the next sample: of white noise 1, of a motion nearly 0
+        coarse = float(np.mean(np.diff(speed) ** 2) / max(2 * np.var(speed), 1e-300)) > ROUGH
         if not coarse and max(shares[best]) <= EXPLAINED and left[best] < CLEAR * left[stated]:
             return best
         turned = min((r for r in left if r[0] == stated[0]), key=lambda r: left[r])
         best = stated if coarse and left[best] < CLEAR * left[turned] else turned
     return best if left[best] < 0.5 * left[stated] else stated
-
-
-def _roughness(y: Array) -> float:
-    """Return one less the correlation of neighbouring samples: of white noise 1, of a well sampled motion nearly 0."""
-    return float(np.mean(np.diff(y) ** 2) / max(2 * np.var(y), 1e-300))
 
 
 def _share_left(y: Array, *terms: Array) -> float:
