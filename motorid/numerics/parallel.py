@@ -120,7 +120,8 @@ class Interruption:
         for stream in (sys.stdout, sys.stderr):
             with suppress(OSError, ValueError):
                 stream.flush()
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        for name in {"SIGINT", "SIGALRM", "SIGTERM", "SIGHUP"} & set(dir(signal)):  # the alarm repeats Ctrl-C
+            signal.signal(getattr(signal, name), signal.SIG_IGN)
 
     def behind(self, error: BaseException) -> bool:
         """Tell whether Ctrl-C is what an exception comes from."""

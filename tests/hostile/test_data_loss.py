@@ -218,7 +218,8 @@ def test_ctrl_c_after_the_work_does_not_make_it_a_failure(tmp_path):
     """While Python ends it hears no signals, and would die of one; a command that is kept running by nohup goes on."""
     code = ("import os, signal; signal.signal(signal.SIGHUP, signal.SIG_IGN); "
             "from motorid.numerics.parallel import interruption as it; it.listen(); "
-            "os.kill(os.getpid(), signal.SIGHUP); it.over(); os.kill(os.getpid(), signal.SIGINT)")
+            "os.kill(os.getpid(), signal.SIGHUP); it.over(); "
+            "[os.kill(os.getpid(), n) for n in (signal.SIGINT, signal.SIGALRM, signal.SIGTERM)]")
     assert subprocess.run([sys.executable, "-c", code], timeout=60).returncode == 0
 
 
