@@ -33,7 +33,7 @@ from motorid.diagnosis.verdict import (
     unfinished_remark,
     window_remark,
 )
-from motorid.errors import MotoridError, numbers_told
+from motorid.errors import MotoridError, at_least, numbers_told
 from motorid.estimation.result import Fit, checked
 from motorid.model.definition import Effect
 from motorid.numerics.parallel import one_thread
@@ -80,6 +80,7 @@ def diagnose(fit: Fit, validate: Sequence[Experiment] | Experiment | None = None
     ('missing', ('coulomb',))
     >>> better = found.best
     """
+    at_least(0, max_effects=max_effects, budget=budget)
     own = tuple(also)
     with shown("Looking for what is missing", max_effects + 1, at_most=True) as show:
         stages = Stages(max_effects, progress, show, map)

@@ -404,6 +404,8 @@ def _rivals(found: Any, goal: str | None) -> tuple[list[Rival], str]:
                          'fits of the rivals. A single fit can be sharpened: goal="sharpen".')
     if goal == "sharpen" and isinstance(found, Diagnosis):
         fits = [found.best]
+    if not fits:
+        raise UsageError("an experiment is designed for models: give a diagnosis or at least one fit.")
     rivals = [f if isinstance(f, Rival) else Rival.of(f) for f in fits[:MOST_RIVALS if goal == "distinguish" else 1]]
     common = set.intersection(*(set(r.model.effect_names) for r in rivals)) if len(rivals) > 1 else set()
     names = [" + ".join(n for n in r.model.effect_names if n not in common) or "none" for r in rivals]

@@ -59,6 +59,10 @@ def test_an_argument_of_another_kind_is_named(name):
     lambda: mi.profile(FIT, "R", level=0.0, quiet=True),
     lambda: mi.Huber(float("nan")),
     lambda: mi.diagnose(FIT, budget=float("nan")),
+    lambda: mi.diagnose(FIT, budget=-1),
+    lambda: mi.diagnose(FIT, max_effects=-1),
+    lambda: mi.design_experiment([]),
+    lambda: mi.design_experiment([], goal="sharpen"),
     lambda: mi.bootstrap(FIT, n=3, block=0, quiet=True),
     lambda: mi.bootstrap(FIT, n=3, block=-5, quiet=True),  # had no end
     lambda: mi.bootstrap(FIT, n=3, seed=-1, quiet=True),
