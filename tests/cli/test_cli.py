@@ -463,7 +463,8 @@ def test_a_value_keeps_its_error_and_unit_where_a_table_is_narrow(capsys, monkey
 
 
 def test_what_to_type_next_is_one_line(monkeypatch):
-    runs = [f"{FRICTION}/run1.csv", f"{FRICTION}/../hidden_friction/run2.csv"]
+    monkeypatch.chdir(FRICTION)
+    runs = ["run1.csv", "../hidden_friction/../hidden_friction/../hidden_friction/run2.csv"]
     monkeypatch.setattr(sys, "argv", ["motorid", "fit", *runs])
     assert f"Next: motorid diagnose {' '.join(runs)}" in motorid("fit", *runs).out.splitlines()
     line = "motorid diagnose run.csv --budget 8 --max-effects=1 --hold zoh"

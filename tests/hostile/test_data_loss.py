@@ -205,7 +205,9 @@ def test_ctrl_c_is_status_130_in_the_first_second_and_later(after):
 @pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP"])
 def test_a_polite_kill_keeps_what_was_done_as_ctrl_c_does(tmp_path, name):
     journal, table = tmp_path / "batch.jsonl", tmp_path / "table.csv"
+    before = signal.signal(getattr(signal, name), signal.SIG_DFL)  # under nohup a hang-up is ignored, and inherited
     process = start("fit-many", motors(tmp_path / "motors", 40), "--journal", journal, "--out", table)
+    signal.signal(getattr(signal, name), before)
     begun(process, journal)
     process.send_signal(getattr(signal, name))
     _, err = process.communicate(timeout=30)

@@ -248,5 +248,5 @@ def test_it_says_where_the_other_starts_ended_with_units(fits):
                                "1 at R = 5 Ω (squared error 2 times)")
     assert f"Elsewhere: {found.elsewhere}." in found.text
     assert Multistart(fit, (ended(1.0),), 10.0, False, 1.0).elsewhere == ""
-    title = mi.plot_waterfall(found)[0].get_title(loc="left").replace("\n", " ")
+    title = mi.plot_waterfall(found)[0].get_title(loc="left").replace("\n", " ").replace("\N{NO-BREAK SPACE}", " ")
     assert title == f"6 of 9 agree; 3 elsewhere: {found.elsewhere}"
