@@ -231,7 +231,7 @@ def test_slopes_of_every_form_are_those_of_the_model_with_its_curve(lab):
         if form.on == "run":
             continue
         curve = Curve(fit, form, dict.fromkeys(range(answers.shape[1]), 0.0))
-        problem = fit.problem.with_(model=fit.model + curve.effect)
+        problem = fit.problem.with_(model=fit.model + curve.effect, engine=mi.Rosenbrock(compiled=False))  # each once
         values = fit.values | first | dict.fromkeys(curve.sizes, 0.0)
         q = problem.scaling.scaled([values[p.name] for p in problem.unknown])
         slopes = problem.refined(q).residual_and_jacobian(q)[1][: problem.n_outputs] / problem.scaling.slope(q)
