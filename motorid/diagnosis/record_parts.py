@@ -48,7 +48,7 @@ def affordable(fit: Fit) -> Fit:
 
 def thinned_alike(fit: Fit, runs: Sequence[Experiment]) -> list[Experiment]:
     """Return as many samples of `runs` as of those that were fitted."""
-    return [r.decimate(fit.problem.experiments[0].meta.get("every", 1)) for r in runs]
+    return [r.decimate(k) for r in runs] if (k := fit.problem.experiments[0].meta.get("every", 1)) > 1 else list(runs)
 
 
 def _again(fit: Fit, runs: Sequence[Experiment] | None) -> Fit:

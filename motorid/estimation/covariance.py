@@ -64,9 +64,8 @@ class Certainty:
 
     @cached_property
     def _linear(self) -> Array:
-        """The covariance, (k, k), no direction wider than its linear picture holds: what two parameters do alike along
-        that direction, they do alike at both of its ends."""
-        sizes, ways = np.linalg.eigh(self.matrix / np.outer(self.unit, self.unit))
+        """The covariance, (k, k), no direction wider than slopes hold: what trades off along it does so at its ends."""
+        sizes, ways = np.linalg.eigh(self.matrix / self.unit / self.unit[:, None])  # one by one: tiny² is 0
         return (self.unit[:, None] * ways * np.clip(sizes, 0, WIDEST**2)) @ (self.unit[:, None] * ways).T
 
 

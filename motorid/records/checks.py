@@ -293,7 +293,7 @@ def unsigned(run: Experiment) -> str | None:
 def unsigned_voltage(run: Experiment) -> str | None:
     """A positive voltage that is switched on at rest turns the motor one way; a duty cycle without its sign, both."""
     v, turning = run.inputs["v"], run.outputs.get("theta", run.outputs.get("omega"))
-    if turning is None or v.min() < 0:
+    if turning is None or v.min() < 0 or not np.isfinite(turning).any():
         return None
     known = bridged(run.t, turning)
     angle = known if "theta" in run.outputs else integral(run.t, known)

@@ -187,3 +187,4 @@ def test_a_voltage_logged_without_its_sign_is_told(plant, lab, channel):
     assert "backwards 2 of 4 times" in " ".join(mi.check_runs([lost]))
     swings = lost.with_(outputs={channel: turning[:100].tolist() + np.sin(np.arange(700) / 9).tolist()})
     assert unsigned_voltage(swings) is None, "never at rest"
+    assert unsigned_voltage(lost.with_(outputs={channel: np.full(t.size, np.nan), "i": v})) is None, "a dead sensor"
