@@ -88,6 +88,14 @@ def screenshot(
     _run(page, folder, width, dark, f"--screenshot={target}", height=height)
 
 
+def printed(page: Path, folder: Path) -> list[tuple[float, float]]:
+    """Return the sizes (width, height) of the pages that the browser prints, mm."""
+    target = folder / "page.pdf"
+    _run(page, folder, 1100, False, f"--print-to-pdf={target}")
+    boxes = re.findall(rb"/MediaBox \[0 0 ([\d.]+) ([\d.]+)\]", target.read_bytes())
+    return [(float(w) * 25.4 / 72, float(h) * 25.4 / 72) for w, h in boxes]
+
+
 def _run(page: Path, folder: Path, width: int, dark: bool, *more: str, height: int = 900):
     scheme = ["--blink-settings=preferredColorScheme=0"] if dark else []
     own = [f"--user-data-dir={folder / 'profile'}", f"--window-size={width},{height}"]

@@ -161,7 +161,8 @@ def _drawn(every: list[Simulation], before: Any) -> tuple[np.ndarray, list[_Movi
     shown, moving = every[:COLUMNS], []
     names = [c for c in CHANNELS if any(c in s.outputs and c in s.experiment.outputs for s in shown)]
     ratios = [1.6, 1.0] * len(names)
-    axes = style.grid(2 * len(names), len(shown), row=1.0, sharex="col", sharey="row", height_ratios=ratios)
+    row = 1.0 if len(names) < 3 else 0.75
+    axes = style.grid(2 * len(names), len(shown), row=row, sharex="col", sharey="row", height_ratios=ratios)
     for k, s in enumerate(shown):
         for j, c in enumerate(names):
             if c in s.experiment.outputs:
@@ -180,7 +181,7 @@ def _drawn(every: list[Simulation], before: Any) -> tuple[np.ndarray, list[_Movi
     axes[0, 0].figure.align_ylabels(axes[:, 0])
     handles, labels = axes[0, 0].get_legend_handles_labels()
     rest = axes[1, 0].get_legend_handles_labels()
-    axes[0, 0].figure.legend(handles + rest[0], labels + rest[1], loc="outside upper center", ncols=5)
+    axes[0, 0].figure.legend(handles + rest[0], labels + rest[1], loc="outside upper left", ncols=5)
     return axes, moving
 
 

@@ -50,16 +50,13 @@ def plot_residuals(fit: Fit, channels: Sequence[str] | None = None) -> np.ndarra
             raise UsageError(one_of(c, present, "channel"))
     names = list(channels or present)
     against = [c for c in ("omega", "i", "theta") if c in present]
-    figure = style.new_figure(style.WIDTH, 3.3 * len(names) + 0.2)
-    rows = figure.add_gridspec(2 * len(names), 12)
+    figure = style.new_figure(style.WIDTH, 3.0 * len(names) + 0.2)
+    rows = figure.add_gridspec(2 * len(names), 1)
     axes = np.empty((len(names), 4 + len(against)), object)
     for j, c in enumerate(names):
-        axes[j, 0] = figure.add_subplot(rows[2 * j, :7])
-        axes[j, 1] = figure.add_subplot(rows[2 * j, 7:9], sharey=axes[j, 0])
-        axes[j, 2] = figure.add_subplot(rows[2 * j, 9:])
-        width = 12 // (1 + len(against))
-        for k in range(1 + len(against)):
-            axes[j, 3 + k] = figure.add_subplot(rows[2 * j + 1, k * width : (k + 1) * width])
+        axes[j, :3] = rows[2 * j].subgridspec(1, 3, width_ratios=(7, 2, 3)).subplots()
+        axes[j, 1].sharey(axes[j, 0])
+        axes[j, 3:] = rows[2 * j + 1].subgridspec(1, 1 + len(against)).subplots(squeeze=False)[0]
         _channel(axes[j], fit, c, against)
     figure.align_ylabels([row[k] for row in axes for k in (0, 3)])
     return axes

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import platform
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -68,10 +68,9 @@ def report(result: Any, path: str | Path, *, title: str = "", command: str = "",
             raise UsageError(f"report takes results of motorid, such as a fit or a diagnosis; got {type(r).__name__}.")
     story = tell(results, title=title, validate=list(validate))
     story.sections.append(_provenance(story, command, list(validate)))
-    target = Path(path)
-    if target.suffix.lower() not in (".html", ".htm"):
-        raise UsageError(f"a report is an HTML page: '{target.name}' must end in .html. A browser prints it to PDF.")
-    return write_files({target: _page(story)}, force)[0]
+    if Path(path).suffix.lower() not in (".html", ".htm"):
+        raise UsageError(f"a report is an HTML page: '{Path(path).name}' must end in .html (a browser prints it).")
+    return write_files({Path(path): _page(story)}, force)[0]
 
 
 def _page(story: Story) -> str:
@@ -131,6 +130,10 @@ def tell(results: Sequence[Shown], *, title: str = "", validate: Sequence[Experi
             again = sections.fitted(r, r.card().title, key=f"result-{k + 1}") if isinstance(r, Fit) else None
             story.sections.append(again or sections.of_card(r, k))
     story.title = title or story.title
+    said = story.lead
+    for s in story.sections:  # a note is said where it is first needed
+        s.tables = [replace(t, note="") if t.note in said else t for t in s.tables]
+        said += "".join(t.note for t in s.tables)
     return story
 
 
@@ -146,7 +149,8 @@ def _of_diagnosis(d: Diagnosis, validate: Sequence[Experiment]) -> Story:
                            sections.fitted(d.after, "The improved model", key="after", before=d.before, values=False)]
     if validate:
         story.sections.append(sections.held_out(d.after, validate))
-    first = sections.fitted(d.before, "The original model", values=d.after is d.before)
+    same = d.after is d.before  # else the improved model's figure shows the original one, too
+    first = sections.fitted(d.before, "The original model", values=same, drawn=same)
     story.sections += [first, sections.where(d)]
     if d.ranking:
         story.sections.append(sections.which(d))

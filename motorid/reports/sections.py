@@ -26,7 +26,7 @@ class Figure:
     small: bool = False
 
 
-@dataclass(frozen=True)
+@dataclass
 class Section:
     """One part of the page."""
 
@@ -55,17 +55,17 @@ def data(runs: Sequence[Experiment]) -> Section:
 
 
 def fitted(fit: Fit, title: str, *, key: str = "fit", before: Fit | None = None, values: bool = True,
-           told: bool = True) -> Section:
-    """A fit: its verdict (`told`), curves, errors, its `values`; beside it the model `before`."""
+           told: bool = True, drawn: bool = True) -> Section:
+    """A fit: its verdict (`told`), curves (`drawn`), errors, its `values`; beside it the model `before`."""
     from motorid.plots import plot_fit
 
     caption = "Measured, model, and residual beside the band of the noise."
     caption += " The thin curve is the original model." if before is not None else ""
     alt = f"Measured and modelled channels of {fit.model.title}, with residuals. " + f"NRMSE: {fit.evaluation.words}."
     text = [f"{fit.model.title}. {fit.verdict} {ended(fit)}"] if told else []
-    figure = _figure(key, caption, alt, plot_fit, fit, before=before)
+    figures = [_figure(key, caption, alt, plot_fit, fit, before=before)] if drawn else []
     tables = [*(value_tables(fit) if values else ()), error_table({"": fit.evaluation}, fit.noise)]
-    return Section(key, title, text, (), [figure], tables)
+    return Section(key, title, text, (), figures, tables)
 
 
 def residuals(fit: Fit) -> Section:
@@ -73,8 +73,7 @@ def residuals(fit: Fit) -> Section:
     from motorid.plots import plot_residuals
 
     caption = "Noise alone would leave means of zero against every quantity and no correlation in time."
-    alt = "Residuals of each channel over time and against speed and current"
-    figure = _figure("residuals", caption, alt, plot_residuals, fit)
+    figure = _figure("residuals", caption, "Residuals over time and against speed and current", plot_residuals, fit)
     return Section("residuals", "Residuals", (), (), [figure])
 
 
@@ -129,8 +128,7 @@ def ladder(steps: Ladder) -> Section:
 
     names = ", ".join(r.added or r.fit.model.title for r in steps.rungs)
     caption = "Error of each model, on the records of the fit and on those it never saw."
-    alt = f"Error of each model in turn: {names}"
-    figure = _figure("ladder", caption, alt, plot_ladder, steps, small=True)
+    figure = _figure("ladder", caption, f"Error of each model in turn: {names}", plot_ladder, steps, small=True)
     return Section("ladder", "The error falls", [sentence(steps.text)], (), [figure], [ladder_table(steps)])
 
 
@@ -138,9 +136,9 @@ def parameters(before: Fit, after: Fit) -> Section:
     """The parameters before and after."""
     from motorid.plots import plot_parameters
 
-    caption = "Bars: two standard deviations."
-    figure = _figure("parameters", caption, "Parameters before and after", plot_parameters, before, after, small=True)
     table = parameter_table(after, before)
+    figure = _figure("parameters", "Bars: two standard deviations.", "Parameters before and after", plot_parameters,
+                     before, after, small=len(table.rows) <= 6)
     return Section("parameters", "How the parameters moved", (), (), [figure], [table])
 
 

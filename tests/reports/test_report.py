@@ -94,7 +94,7 @@ def test_it_tells_the_whole_story(tree, found):
         assert told in body, told
     fingerprint = found.before.problem.experiments[0].meta["sha256"]
     assert fingerprint[:16] in body
-    assert len(every(tree, "figure")) == 8
+    assert len(every(tree, "figure")) == 7
 
 
 def test_numbers_are_those_of_the_result(tree, found):
@@ -233,7 +233,7 @@ def test_chromium_says_nothing_and_asks_the_network_for_nothing(opened):
 def test_chromium_draws_every_figure_and_the_page_does_not_run_out_of_the_window(opened):
     seen, kind = opened
     figures = seen.probe["figures"]
-    assert len(figures) == 8
+    assert len(figures) == 7
     assert all(w > 400 and h > 100 and paths > 10 for w, h, paths in figures)
     assert seen.probe["scroll"] <= seen.probe["view"]
     assert seen.probe["text"] >= 9  # pixels, the smallest words in a figure
@@ -251,6 +251,13 @@ def test_a_picture_of_the_page_is_kept(page, tmp_path):
     target = Path(os.environ.get("MOTORID_PICTURES", tmp_path)) / "report.png"
     browser.screenshot(page, target, tmp_path)
     assert target.stat().st_size > 50_000
+
+
+@pytest.mark.slow
+def test_it_prints_on_few_sheets_of_a4(page, tmp_path):
+    sheets = browser.printed(page, tmp_path)
+    assert len(sheets) in (3, 4, 5)  # nine, where figures and tables leave pages half empty
+    assert all((round(w), round(h)) == (210, 297) for w, h in sheets)
 
 
 @pytest.mark.slow
