@@ -15,6 +15,7 @@ from motorid.cli.options import (
     EffectsFrom,
     FitOptions,
     Force,
+    Jobs,
     Json,
     Report,
     Runs,
@@ -35,7 +36,7 @@ from motorid.estimation.fit import fit
 from motorid.estimation.result import Fit, parameter_table
 from motorid.exporters.json_file import fit_dict, write_json
 from motorid.model.model import dc_motor
-from motorid.numerics.parallel import interruption, progress
+from motorid.numerics.parallel import interruption, processes, progress
 from motorid.problem.plain_data import model_from_json
 from motorid.problem.simulate import error_table
 from motorid.records.datasets import data_path
@@ -77,7 +78,7 @@ def diagnose_command(
     remainder_to: Annotated[Path | None, typer.Option(
         metavar="FILE.py", rich_help_panel=OUT,
         help="Write what no effect explains as an effect, for --effects-from.")] = None,
-    json: Json = None, report: Report = None,
+    jobs: Jobs = 1, json: Json = None, report: Report = None,
 ) -> None:
     """Say where the model fails, which physical effect is missing, and what the error is with it.
 
@@ -90,8 +91,9 @@ def diagnose_command(
     own = list(own_effects(options.effects_from).values()) if options.effects_from else []
     done: list[str] = []
     try:
-        found = diagnose(before, held_out or None, also=own, max_effects=max_effects, budget=budget,
-                         progress=lambda word: _as_it_comes(word, done, quiet=json == "-"))
+        with processes(jobs) as over:
+            found = diagnose(before, held_out or None, also=own, max_effects=max_effects, budget=budget,
+                             map=over or map, progress=lambda word: _as_it_comes(word, done, quiet=json == "-"))
     except (Exception, KeyboardInterrupt) as error:
         if interruption.behind(error):
             _keep_fit(before, done, json, options.force)

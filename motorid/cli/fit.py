@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -17,6 +15,7 @@ from motorid.cli.options import (
     EffectsFrom,
     FitOptions,
     Force,
+    Jobs,
     Json,
     ReadingOptions,
     Report,
@@ -37,7 +36,7 @@ from motorid.estimation.result import COLOURED, Fit, constraint_table, ended, st
 from motorid.exporters.c_code import check
 from motorid.exporters.export import FORMS, export
 from motorid.exporters.json_file import constraint_violations, fit_dict, remarks, run_dict, write_json
-from motorid.numerics.parallel import as_worker
+from motorid.numerics.parallel import processes
 from motorid.problem.simulate import NRMSE, Evaluation, error_table, evaluate, run_table
 from motorid.records.experiment import Experiment
 from motorid.records.files import write_files
@@ -108,7 +107,7 @@ def fit_many_command(
         metavar="TABLE.csv", rich_help_panel=OUT, help="Write the table: .csv, .parquet or .json.")] = None,
     journal: Annotated[Path | None, typer.Option(
         metavar="FILE", rich_help_panel=OUT, help="Results as they come, to go on from.")] = None,
-    jobs: Annotated[int, typer.Option(min=1, metavar="N", rich_help_panel=OUT, help="Processes.")] = 1,
+    jobs: Jobs = 1,
     json: Json = None,
 ) -> None:
     """Fit one model to the records of many motors; a motor that fails is a row that says why.
@@ -126,13 +125,8 @@ def fit_many_command(
     reading: dict[str, Any] = {k: parse_pairs(v, f"--{k}") for k in ("columns", "units") if (v := getattr(options, k))}
     reading |= {"hold": options.hold} if options.hold else {}
     given = {"journal": journal, "reading": reading, **options.keywords()}
-    if jobs == 1:
-        found = fit_many(model, motors, **given)
-    else:
-        most = min(jobs, len(motors), 4 * (os.cpu_count() or 1))  # each process costs memory and a second to begin
-        with ProcessPoolExecutor(most, initializer=as_worker, initargs=(os.getpid(),)) as pool:
-            found = fit_many(model, motors, map=pool.map, **given)
-            pool.shutdown(wait=not found.interrupted, cancel_futures=True)
+    with processes(min(jobs, len(motors))) as over:
+        found = fit_many(model, motors, map=over, **given)
     if json != "-":
         show(str(found))
     if json:

@@ -53,6 +53,8 @@ Report = Annotated[Path | None, typer.Option(
     "--report", metavar="PATH.html", rich_help_panel=OUT, help="Write one page with figures.")]
 Force = Annotated[bool, typer.Option(
     "--force", rich_help_panel=OUT, help="Write over inputs and over files that motorid did not write.")]
+Jobs = Annotated[int, typer.Option(
+    "--jobs", min=1, metavar="N", rich_help_panel=OUT, help="Processes that share the work.")]
 EffectsFrom = Annotated[Path | None, typer.Option(metavar="FILE.py", help="Effects of your own.")]
 Validate = Annotated[list[str] | None, typer.Option(
     "--validate", metavar="RUN...", rich_help_panel=OUT,

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import BrokenExecutor
 from dataclasses import replace
 from typing import Any
 
@@ -28,6 +29,7 @@ from motorid.estimation.least_squares import FAILURES
 from motorid.estimation.result import Fit
 from motorid.model.definition import Effect, Parameter
 from motorid.model.model import Model
+from motorid.numerics.parallel import check_time
 from motorid.numerics.signals import noise_level
 from motorid.records.experiment import Experiment
 
@@ -88,7 +90,12 @@ class Stages:
             name = getattr(task[0] if isinstance(task, tuple) else task, "name", "once more")
             self._done = begun + (self._end - begun) / 2 * k / len(every)
             self.at(f"fitting {name}, {k + 1} of {len(every)}")
-            yield next(results)
+            check_time()
+            try:
+                yield next(results)
+            except BrokenExecutor:  # a process was killed: the rest is done in this one
+                results = map(function, every[k:])
+                yield next(results)
         self._done = (begun + self._end) / 2 if every else begun
 
 

@@ -368,7 +368,10 @@ def separation(truth: Driven, rival: Driven, levels: Array, ra: Response, rb: Re
     for _ in range(STEPS):
         s = np.concatenate([ra.dy[:, :, -k:], -rb.dy[:, :, k - len(delta):]], axis=2).reshape(-1, len(delta))
         error = (ra.y - rb.y).ravel()
-        step = _worst_case(s.T @ s, s.T @ (s @ delta - error), prior, region) - delta
+        with np.errstate(over="ignore", invalid="ignore"):  # slopes that overflow lead nowhere
+            step = _worst_case(s.T @ s, s.T @ (s @ delta - error), prior, region) - delta
+        if not np.isfinite(step).all():
+            break
         before, after = chi2, error + s @ step
         if after @ after + (delta + step) @ prior[1] @ (delta + step) > (1 - SETTLED) * chi2:
             break

@@ -147,7 +147,7 @@ RIPPLES = (0.0, 0.3)  # share of the voltage for a binary signal on top of a can
 DRAWS = 16  # of the parameters, for the check of the limits
 SMOOTH = 1e-2  # of the largest speed: width of sgn while the voltage is sought
 NEARLY = 0.05  # nats between coarse and fine integration that need no further search
-TOLERANCE = 3e-5  # of the integration, relative to the largest state
+ROUGH, TOLERANCE = 3e-4, 3e-5  # of the integration, over the largest state: while the voltage is sought, and after
 NO_RECORD = "no record stays within the limits with all models; allow more voltage, current or angle."
 WORTH = 4.0  # nats between two rivals from which they count as distinguished
 
@@ -581,7 +581,7 @@ def _within(task: Task, c: Array, fine: bool = True) -> tuple[float, Task, Array
     """Return worth, task (of fine steps) and unknowns, shrunk until the limits hold; None where they never do."""
     kept = _shrunk(task, c)
     if kept is not None and fine:
-        task = task.refined(task.layout.of(kept[0]), TOLERANCE)
+        task = task.refined(task.layout.of(kept[0]), ROUGH)
         kept = _shrunk(task, kept[0])
     if kept is None:
         return None

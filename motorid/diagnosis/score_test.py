@@ -263,24 +263,15 @@ NUDGE = 1e-9  # of the natural size: where sizes start, so that fmax(tau_s - tau
 class Shape:
     """What an effect adds at one shape of it, to the whitened outputs of a fit.
 
-    Attributes
-    ----------
-    values : dict of str to float
-        Parameters that are no sizes.
-    columns : ndarray, shape (n, k)
-        Slopes to each of `sizes`, those at a quarter of a period later after them if there is a `phase`; or the one
-        change that the effect as it is makes, where there are no `sizes`.
-    sizes : tuple of Parameter
-    phase : Parameter or None
-    weights : tuple of ndarray
-        Of the channels, per run.
+    The columns (n, k) are slopes to each of `sizes`, those at a quarter of a period later after them if there is a
+    `phase`; or the one change that the effect as it is makes, where there are no `sizes`.
     """
 
-    values: Mapping[str, float]
+    values: Mapping[str, float]  # of parameters that are no sizes
     columns: Array
     sizes: tuple[Parameter, ...]
     phase: Parameter | None
-    weights: tuple[Array, ...]
+    weights: tuple[Array, ...]  # of the channels, per run
 
     @property
     def nonnegative(self) -> list[bool]:

@@ -128,8 +128,9 @@ def errors_text(rungs: Sequence[Rung]) -> str:
     held_out = bool(was and is_)
     was, is_ = (was, is_) if was and is_ else (rungs[0].nrmse, last.nrmse)
     noise = {c for c in was if last.fit.misfit.get(c, 0.0) < LARGER}
-    said = [_changed(last, c, was[c], is_[c]) + " (mostly noise)" * (c in noise and is_[c] > was[c])
-            for c in sorted(was, key=lambda c: is_[c] > was[c])]
+    words = [_changed(last, c, was[c], is_[c]) for c in sorted(was, key=lambda c: is_[c] > was[c])]
+    noisy = tuple(f"{_name(last, c)} rises" for c in noise)
+    said = [w + " (mostly noise)" * w.startswith(noisy) for w in words]
     text = f"{'Held-out error' if held_out else 'Error'}: {', '.join(said)}."
     if held_out and (lost := [c for c, e in was.items() if min(e, is_[c]) > LOST]):
         return f"{text} Both models lose {' and '.join(lost)} there; {DECIDED}."
@@ -168,6 +169,8 @@ def _matters(was: float, is_: float) -> bool:
 
 
 def _changed(rung: Rung, c: str, was: float, is_: float) -> str:
+    if percent(was) == percent(is_):
+        return f"{_name(rung, c)} stays {percent(is_)}"
     return f"{_name(rung, c)} {'rises ' * (is_ > was)}{arrow(was, is_)}"
 
 

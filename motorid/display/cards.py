@@ -57,25 +57,13 @@ Cell = str | Flag
 
 @dataclass(frozen=True)
 class Table:
-    """Rows under headers; the first cell of a row names it.
-
-    Attributes
-    ----------
-    header : sequence of str
-    rows : sequence of sequences of str or Flag
-    title : str
-        Above the text; a page has headings of its own.
-    note : str
-        Below the text, and the caption on a page.
-    left : tuple of int
-        Columns of words, flush left in the text.
-    """
+    """Rows under headers; the first cell of a row names it."""
 
     header: Sequence[str]
     rows: Sequence[Sequence[Cell]]
-    title: str = ""
-    note: str = ""
-    left: tuple[int, ...] = (0,)
+    title: str = ""  # above the text; a page has headings of its own
+    note: str = ""  # below the text, and the caption on a page
+    left: tuple[int, ...] = (0,)  # columns of words, flush left in the text
 
     def __str__(self) -> str:
         lines = [tuple(self.header), *(tuple(str(cell) for cell in row) for row in self.rows)]

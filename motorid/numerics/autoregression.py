@@ -23,23 +23,12 @@ ORDER = 8  # of the filters
 
 @dataclass(frozen=True, eq=False)
 class Colour:
-    """An autoregression ``r_t = Σ a_k r_{t-k} + e_t``.
+    """An autoregression ``r_t = Σ a_k r_{t-k} + e_t``."""
 
-    Attributes
-    ----------
-    a : ndarray, shape (order,)
-    variance : float
-        Of r.
-    innovation : float
-        Variance of e.
-    effective_share : float
-        Effective samples per sample; small where neighbours are alike.
-    """
-
-    a: Array
-    variance: float
-    innovation: float
-    effective_share: float = 1.0
+    a: Array  # (order,)
+    variance: float  # of r
+    innovation: float  # variance of e
+    effective_share: float = 1.0  # effective samples per sample; small where neighbours are alike
 
     def autocovariance(self, n: int) -> Array:
         """Return the autocovariance at lags 0 … n-1."""

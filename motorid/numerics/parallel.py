@@ -20,6 +20,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from contextlib import AbstractContextManager, ContextDecorator, contextmanager, suppress
 from contextvars import ContextVar
 from dataclasses import dataclass, field
@@ -145,6 +146,7 @@ interruption = Interruption()
 
 def as_worker(parent: int) -> None:
     """Make this process one of a command's pool: Ctrl-C is the command's, and none goes on without the command."""
+    one_thread.__enter__()
     for name, action in (("SIGINT", signal.SIG_IGN), ("SIGTERM", signal.SIG_DFL), ("SIGHUP", signal.SIG_DFL)):
         if hasattr(signal, name):
             signal.signal(getattr(signal, name), action)
@@ -155,6 +157,20 @@ def as_worker(parent: int) -> None:
         os._exit(1)
 
     threading.Thread(target=watch, daemon=True).start()
+
+
+@contextmanager
+def processes(jobs: int) -> Iterator[Map | None]:
+    """Yield the `map` of so many processes of this machine, None for one; Ctrl-C leaves what was not begun undone."""
+    if jobs == 1:
+        yield None
+        return
+    most = min(jobs, 4 * (os.cpu_count() or 1))  # each costs memory and a second to begin
+    with ProcessPoolExecutor(most, initializer=as_worker, initargs=(os.getpid(),)) as pool:
+        try:
+            yield pool.map
+        finally:
+            pool.shutdown(wait=not interruption.told, cancel_futures=True)
 
 
 @dataclass(frozen=True)

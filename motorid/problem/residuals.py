@@ -87,16 +87,13 @@ TIGHTEST, LOOSEST = 1e-7, 1e-4  # local integration error over the largest state
 
 
 class Levels(NamedTuple):
-    """What one record tells about the accuracy it needs.
+    """What one record tells about the accuracy it needs."""
 
-    y (N, ny) measured, `missing` of them or None; by channel (ny,): largest size, noise over it, samples.
-    """
-
-    y: Array
-    missing: NDArray[np.bool_] | None
-    top: Array
-    noise: Array
-    count: Array
+    y: Array  # (N, ny), measured
+    missing: NDArray[np.bool_] | None  # (N, ny); None where nothing is
+    top: Array  # (ny,), largest size
+    noise: Array  # (ny,), over that
+    count: Array  # (ny,), samples measured
 
     @staticmethod
     def of(measured: Measured) -> Levels:

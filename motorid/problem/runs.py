@@ -149,8 +149,12 @@ def initial_state(run: Experiment, sigma: Mapping[str, float], initial: str) -> 
         elif not known:
             start[k] = _first(y)
             reach[c] = _reach(y, sigma[c])
-    if "omega" not in run.outputs and "theta" in run.outputs and not known:
-        start[1], reach["omega"] = _first_speed(run.outputs["theta"], run.t, sigma["theta"])
+    if "theta" in run.outputs and not known:
+        speed, far = _first_speed(run.outputs["theta"], run.t, sigma["theta"])
+        if "omega" not in run.outputs:
+            start[1], reach["omega"] = speed, far
+        elif (apart := abs(speed - start[1])) > far:  # the sensors may disagree, by an offset
+            reach["omega"] = max(reach["omega"], apart + far)
     if "i" not in run.outputs and not known:
         reach["i"] = np.inf  # to assume none would be a measurement that was never made
     if initial in ("rest", "measured"):

@@ -283,10 +283,12 @@ def test_a_held_inductance_of_zero_comes_back(tmp_path):
 
 # -- diagnose, identifiability, robustness, fit-many ---------------------------------------------------------
 @pytest.mark.slow
-def test_diagnose_names_the_missing_effect(tmp_path):
+def test_diagnose_names_the_missing_effect_and_processes_share_the_work(tmp_path):
     page = tmp_path / "found.html"
-    found = motorid_json(tmp_path, "diagnose", FRICTION / "run*.csv", "--validate", FRICTION / "check*.csv",
-                         "--max-effects", "1", "--report", page)
+    asked = ("diagnose", FRICTION / "run*.csv", "--validate", FRICTION / "check*.csv", "--max-effects", "1")
+    found = motorid_json(tmp_path, *asked, "--report", page)
+    shared = motorid_json(tmp_path, *asked, "--jobs", "2")
+    assert (shared["answer"], shared["ranking"]) == (found["answer"], found["ranking"])
     assert (found["verdict"], found["where"], found["effects"]) == ("missing", "mechanical", ["coulomb"])
     assert [step["added"] for step in found["ladder"]] == [None, "coulomb"]
     assert found["ladder"][1]["validation_nrmse"]["omega"] < 0.2 * found["ladder"][0]["validation_nrmse"]["omega"]

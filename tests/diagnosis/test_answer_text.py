@@ -29,6 +29,11 @@ def test_a_rise_of_a_noisy_channel_is_said_once_and_with_its_reason():
     assert rises_text(rungs) == "Other rises are below 1 % of the error: current."
 
 
+def test_an_error_that_is_printed_alike_stays():
+    rungs = rungs_of((0.01991, 0.214), (0.01992, 0.0197))
+    assert errors_text(rungs).startswith("Error: speed 21.4 → 1.97 %, current stays 1.99 %.")
+
+
 def test_a_rise_that_matters_is_beside_the_fall_of_all_and_its_rung_is_named():
     rungs = rungs_of((0.02, 0.5), (0.03, 0.2), (0.03, 0.1), misfit=8.0)
     assert errors_text(rungs) == ("Error: speed 50 → 10 %, current rises 2 → 3 %. "

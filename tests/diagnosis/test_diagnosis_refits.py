@@ -1,5 +1,6 @@
 """Refits are judged only when they are finished, where they mean something, and on parts that show what is there."""
 
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import replace
 
 import numpy as np
@@ -17,8 +18,10 @@ from motorid.diagnosis import stepwise
 from motorid.diagnosis.admissibility import objections
 from motorid.diagnosis.verdict import measured_angle_remark
 from motorid.effects import LIBRARY
+from motorid.errors import OutOfTime
 from motorid.estimation.continuation import by_continuation
 from motorid.estimation.restarts import MATTERS, collapsed_again, restored
+from motorid.numerics.parallel import budget
 from motorid.problem.problem import Problem
 from motorid.problem.simulate import simulate
 
@@ -31,6 +34,17 @@ def _run(model, seed=0, n=600, dt=1e-3):
                           sigma={"i": 0.01, "omega": 0.1})
     clean = simulate(model, blank, initial="rest", estimate_initial=False)[0].outputs
     return blank.with_(outputs={c: clean[c] + s * rng.normal(size=n) for c, s in blank.sigma.items()})
+
+
+def test_a_pool_that_breaks_costs_no_refit_and_the_budget_holds_beside_one():
+    def breaking(function, tasks):
+        yield function(tasks[0])
+        raise BrokenProcessPool("a process was killed")
+
+    stages = search.Stages(map_=breaking)
+    assert list(stages.map(abs, [-1, -2, -3])) == [1, 2, 3]
+    with pytest.raises(OutOfTime), budget(0.0):
+        list(stages.map(abs, [-1]))
 
 
 def test_a_refit_goes_on_beyond_its_limit_of_iterations(monkeypatch):

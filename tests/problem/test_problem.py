@@ -12,6 +12,7 @@ from lab_records import NOISE, VALUES, drive, noisy, pair, simulated
 import motorid as mi
 from motorid.errors import DataError, ModelError, UsageError
 from motorid.problem.problem import as_problem
+from motorid.problem.simulate import simulate
 
 TRUE = mi.dc_motor(**VALUES)
 
@@ -297,3 +298,15 @@ def test_a_torque_drive_cannot_explain_a_current(runs):
 def test_a_record_without_any_output_is_no_record(runs):
     with pytest.raises(DataError):
         runs[0].without("i", "omega")
+
+
+def test_an_offset_of_the_speed_sensor_does_not_set_the_first_speed_where_an_angle_denies_it():
+    """A motor that stands still by its encoder, and turns by its tachometer: the fit may begin at rest."""
+    t = 1e-3 * np.arange(400)
+    blank = mi.Experiment(t, {"v": 3 * np.sign(np.sin(20 * t))}, {c: np.zeros(400) for c in ("i", "omega", "theta")},
+                          sigma={"i": 0.01, "omega": 0.5, "theta": 1e-3})
+    clean = simulate(TRUE, blank, initial="rest", estimate_initial=False)[0].outputs
+    fit = mi.fit(mi.dc_motor(), blank.with_(outputs={**clean, "omega": clean["omega"] + 40.0}))
+    assert fit.values["R"] == pytest.approx(VALUES["R"], rel=0.02)
+    assert fit.misfit["theta"] < 0.1
+    assert abs(fit.initial["omega_0[0]"]) < 0.5
