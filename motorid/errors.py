@@ -9,7 +9,7 @@ import numbers
 import os
 import re
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping
 from itertools import pairwise
 from types import TracebackType
 from typing import Any, TypeVar, cast
@@ -84,16 +84,20 @@ def numbers_told() -> Iterator[None]:
 
 
 _Thing = TypeVar("_Thing", bound=Callable[..., Any])
-_KINDS: dict[str, Any] = {"float": numbers.Real, "int": numbers.Integral, "Path": (str, os.PathLike),
+_SCALAR = {"float", "int", "bool", "str", "None"}
+_PLAIN = _SCALAR | {"Sequence", "Iterable", "Mapping", "tuple", "Callable", "Map", "Callback", "Path", "Path_", "os",
+                    "PathLike", "object", "Any"}
+_KINDS: dict[str, Any] = {"Path": (str, os.PathLike),
                           "PathLike": (str, os.PathLike), "Path_": (str, os.PathLike), "Mapping": Mapping,
                           **dict.fromkeys(("Callable", "Map", "Callback"), Callable), "Records": object,
-                          **dict.fromkeys(("Sequence", "Iterable", "Array", "ArrayLike"), Iterable)}
+                          **dict.fromkeys(("Sequence", "Iterable", "tuple", "Array", "ArrayLike"), Iterable)}
 
 
 def arguments_told(thing: _Thing) -> _Thing:
     """Let a function, or what a class is made with and its methods, say which argument is not what its annotation says.
 
-    Only where it fails does it look at the arguments, so nothing that works is refused.
+    Numbers, words, flags and lists of them are looked at in any case: many a wrong one does its harm without an error.
+    All others only where the call fails, so that nothing that works is refused. What a class says itself goes first.
     """
     if isinstance(thing, type):
         for name, member in list(vars(thing).items()):
@@ -101,12 +105,23 @@ def arguments_told(thing: _Thing) -> _Thing:
                 setattr(thing, name, arguments_told(member))
         return cast(_Thing, thing)
 
+    signature = inspect.signature(thing)
+    member = "." in thing.__qualname__
+    plain = {p.name for p in signature.parameters.values()
+             if set(re.findall(r"\w+", str(p.annotation))) <= (_SCALAR if member else _PLAIN)}
+
     @functools.wraps(thing)
     def call(*args: Any, **kwargs: Any) -> Any:
+        early = _wrong_argument(thing, signature, args, kwargs, plain)
+        if early is not None and not member:
+            raise UsageError(early)
         try:
-            return thing(*args, **kwargs)
+            found = thing(*args, **kwargs)
+            if early is not None:
+                raise UsageError(early)
+            return found
         except (TypeError, AttributeError, ValueError, LookupError) as error:
-            if (wrong := _wrong_argument(thing, args, kwargs)) is None:
+            if (wrong := _wrong_argument(thing, signature, args, kwargs)) is None:
                 raise
             raise UsageError(wrong) from error
 
@@ -120,18 +135,29 @@ def at_least(least: float, **given: float | None) -> None:
             raise UsageError(f"{name} must be at least {least:g}; got {number}.")
 
 
-def _wrong_argument(function: Callable[..., Any], args: Any, kwargs: Any) -> str | None:
-    signature, title = inspect.signature(function), function.__qualname__.removesuffix(".__init__")
+def positive(hint: str = "", **given: float | None) -> None:
+    """Refuse arguments that are not positive and finite; None is one left out."""
+    for name, number in given.items():
+        if number is not None and not 0 < number < float("inf"):
+            raise UsageError(f"{name} must be positive and finite; got {number!r}.{hint}")
+
+
+def _wrong_argument(function: Callable[..., Any], signature: inspect.Signature, args: Any, kwargs: Any,
+                    among: Container[str] | None = None) -> str | None:
     try:
         given = signature.bind(*args, **kwargs).arguments
     except TypeError:  # Python says it well enough
         return None
     for name, value in given.items():
         asked = signature.parameters[name]
+        if asked.annotation is asked.empty or (among is not None and name not in among):
+            continue
         several = asked.kind in (asked.VAR_POSITIONAL, asked.VAR_KEYWORD)
         for one in (value.values() if isinstance(value, dict) else value) if several else (value,):
-            if asked.annotation is not asked.empty and not _fits(one, str(asked.annotation)):
-                return (f"{title}: {name} takes {str(asked.annotation).replace(' | ', ' or ')}; got "
+            if not _fits(one, str(asked.annotation)) and not (
+                    isinstance(one, float) and one != one and asked.default != asked.default):
+                return (f"{function.__qualname__.removesuffix('.__init__')}: {name} takes "
+                        f"{str(asked.annotation).replace(' | ', ' or ')}; got "
                         f"{name_of(one)}{f' {one}' if isinstance(one, numbers.Number) else ''}.")
     return None
 
@@ -144,16 +170,33 @@ def _fits(value: Any, annotation: str) -> bool:
         if name in ("Any", "object") or (name == "None" and value is None):
             return True
         kind = _KINDS.get(name)
+        if name in ("float", "int", "bool"):
+            if _is_number(value, name):
+                return True
+            continue
         if not (isinstance(value, kind) if kind else name in (c.__name__ for c in type(value).__mro__)):
             continue
         if isinstance(value, str | Mapping) and kind is Iterable:
             continue
         if kind in (Iterable, Mapping) and inner and hasattr(value, "__len__"):
-            parts = value.values() if isinstance(value, Mapping) else value
-            if not all(_fits(part, inner.partition(", ")[2] or inner) for part in parts):
+            parts = list(value.values() if isinstance(value, Mapping) else value)
+            kinds = re.split(r", (?![^\[]*\])", inner)
+            kinds = kinds if name == "tuple" and "..." not in kinds else [kinds[name == "Mapping"]] * len(parts)
+            if len(parts) != len(kinds) or not all(map(_fits, parts, kinds)):
                 continue
         return True
     return False
+
+
+def _is_number(value: Any, kind: str) -> bool:
+    """Tell whether a value is a number as meant: True is none, NaN is none, 1.5 is no count; of flags, 0 and 1 are."""
+    flag = type(value).__name__ in ("bool", "bool_")
+    if kind == "bool":
+        return flag or (isinstance(value, numbers.Real) and value in (0, 1))
+    array = getattr(value, "ndim", None) == 0 and hasattr(value, "__float__")
+    if flag or not (isinstance(value, numbers.Real) or array):
+        return False
+    return value == value and (kind == "float" or isinstance(value, numbers.Integral))
 
 
 _CONTROLS = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")

@@ -16,7 +16,7 @@ from motorid.acquire.excitation import Program, program
 from motorid.acquire.protocol import VERSION, Channel, Header
 from motorid.acquire.record_file import Commanded, RecordFile, Tail, check_target, read_tail
 from motorid.acquire.session import Progress, Recording, Session, Setup
-from motorid.errors import DataError, UsageError, one_of
+from motorid.errors import DataError, UsageError, one_of, positive
 
 _ENTRIES = ("scale", "offset", "gain", "zero", "sign")  # of a calibration, per channel
 
@@ -79,7 +79,8 @@ def record(port: str | Link, out: str | Path, *, baud: int = 115_200, excite: st
     """
     out = Path(out)
     check_target(out, resume, force)
-    _check_numbers(duration, limit_voltage, limit_current, timeout)
+    limits = {"limit_voltage": limit_voltage, "limit_current": limit_current}
+    positive(duration=duration, timeout=timeout, **{c: x for c, x in limits.items() if x != math.inf})
     entries = read_calibration(calibration) if isinstance(calibration, str | Path) else dict(calibration or {})
     tail = read_tail(out) if resume and out.exists() else None  # without an excitation, it goes on with its own
     plan = RecordingPlan(tail.meta.get("excitation") if tail and excite is None else excite, tail)
@@ -107,14 +108,6 @@ def record(port: str | Link, out: str | Path, *, baud: int = 115_200, excite: st
                 file.close()
     finally:
         link.close()
-
-
-def _check_numbers(duration: float | None, volts: float, amperes: float, timeout: float) -> None:
-    given = (("duration", 1.0 if duration is None else duration, "s"), ("limit_voltage", volts, "V"),
-             ("limit_current", amperes, "A"), ("timeout", timeout, "s"))
-    for name, value, unit in given:
-        if not value > 0:
-            raise UsageError(f"{name} must be positive, in {unit}; got {value!r}.")
 
 
 def _most(device: Header, header: Header, v_max: float, i_max: float) -> dict[str, float]:

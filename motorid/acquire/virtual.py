@@ -18,7 +18,7 @@ import numpy as np
 from motorid.acquire.excitation import Program, Segment
 from motorid.acquire.protocol import SILENCE, Channel, Decoder, Header, Message, frame
 from motorid.channels import CHANNELS
-from motorid.errors import UsageError, one_of
+from motorid.errors import UsageError, at_least, one_of
 from motorid.records.datasets import load_plant
 
 LINES_PER_TURN = 4096  # encoder counts, after quadrature
@@ -211,6 +211,7 @@ def virtual_bench(effect: str = "random", motor: str = "lab", seed: int = 0, rat
     >>> runs = mi.read_runs("run2.csv")
     >>> omega = bench.simulate(runs[0].t, runs[0].inputs["v"])["omega"]  # the truth, without sensors
     """
+    at_least(0, seed=seed)
     return VirtualLink(VirtualDevice(hide(effect, motor, seed), rate))
 
 

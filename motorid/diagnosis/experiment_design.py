@@ -22,7 +22,7 @@ from motorid.diagnosis.design_criteria import MOST_SEGMENTS, Driven, Found, Layo
 from motorid.diagnosis.results import Diagnosis
 from motorid.display.cards import Card, Flag, Printed, Shown, Table
 from motorid.display.numbers import number, quantity
-from motorid.errors import FitError, MotoridError, UsageError, one_of
+from motorid.errors import FitError, MotoridError, UsageError, at_least, one_of, positive
 from motorid.estimation.result import Fit
 from motorid.numerics.parallel import budget as limited_time
 from motorid.numerics.parallel import one_thread
@@ -32,6 +32,8 @@ from motorid.records.experiment import Experiment
 from motorid.records.files import write_files
 
 SAMPLES = 2000
+LONGEST = 1e5  # s
+OMITTED = " Leave it out for that of the records."
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -80,7 +82,7 @@ def suggest_experiment(fits: Sequence[Fit], *, v_max: float | None = None, i_max
     """
     if len(fits) < 2:
         raise UsageError("suggest_experiment() compares models: give at least two fits of the same records.")
-    _check_sizes(v_max=v_max, i_max=i_max, duration=duration)
+    positive(OMITTED, v_max=v_max, i_max=i_max, duration=duration)
     runs = fits[0].problem.experiments
     v_max = v_max or max(float(np.abs(r.inputs["v"]).max()) for r in runs)
     duration = duration or max(r.duration for r in runs)
@@ -303,13 +305,17 @@ def design_experiment(found: Diagnosis | Fit | Sequence[Fit | Rival], *, goal: s
     >>> plan = mi.design_experiment(better, parameters=["b"], v_max=12, i_max=8, duration=0.5, levels=4)
     >>> words = plan.excite  # for `motorid record --excite`
     """
-    _check_sizes(v_max=v_max, i_max=i_max, omega_max=omega_max, temp_max=temp_max, duration=duration, dt=dt)
+    positive(OMITTED, v_max=v_max, i_max=i_max, omega_max=omega_max, temp_max=temp_max, duration=duration, dt=dt)
+    at_least(0, budget=budget)
     rivals, goal = _rivals(found, goal)
     say = progress or (lambda word: None)
     asked = _asked(rivals[0], parameters) if goal == "sharpen" else ()
     _check_words(shape, levels, slew)
     seen = rivals[0].seen
     dt, duration = float(f"{dt or seen['dt']:.9g}"), duration or seen["duration"]
+    if not 10 * dt <= duration <= LONGEST:
+        raise UsageError(f"a design takes ten samples at least and {LONGEST:g} s at most; dt is {dt:g} s, the duration "
+                         f"{duration:g} s.")
     limits = _limits(rivals, v_max or seen["v"], i_max, omega_max, theta_range, temp_max)
     layout = _layout(shape, levels, duration, max(dt, 0.5 * duration / SAMPLES), limits["v"][1])
     task = _task(rivals, layout, {s: x for s, x in limits.items() if s != "v"}, asked, slew)
@@ -325,14 +331,6 @@ def design_experiment(found: Diagnosis | Fit | Sequence[Fit | Rival], *, goal: s
     c, peaks = _safe(task.refined(layout.of(c), TOLERANCE), c)
     return _told(task.refined(layout.of(c), TOLERANCE), c, peaks, fixed, limits,
                  "stopped early" if best.stopped else "designed")
-
-
-def _check_sizes(**given: float | None) -> None:
-    """Refuse limits and lengths that are not above zero: zero means zero, not that none was given."""
-    for name, value in given.items():
-        if value is not None and not 0 < value < np.inf:
-            raise UsageError(f"{name} must be above zero and finite; got {value!r}. Leave it out for that of the "
-                             "records.")
 
 
 def _optimised(task: Task, say: Callable[[str], None]) -> Found:

@@ -23,7 +23,7 @@ from motorid.diagnosis.record_parts import affordable, thinned_alike
 from motorid.diagnosis.refit import INTERRUPTED, OUT_OF_TIME
 from motorid.diagnosis.results import Adequacy, Candidate, Ladder, Rung
 from motorid.diagnosis.verdict import first_answer
-from motorid.errors import OutOfTime
+from motorid.errors import OutOfTime, at_least
 from motorid.estimation.fit import TOO_FAR, follows, growth, in_windows, solve
 from motorid.estimation.least_squares import FAILURES
 from motorid.estimation.result import Fit, checked
@@ -353,6 +353,7 @@ def improve(fit: Fit, validate: Sequence[Experiment] | Experiment | None = None,
     >>> ladder.best.model.effect_names
     ('coulomb',)
     """
+    at_least(0, max_effects=max_effects)
     with shown("Looking for what is missing", max_effects + 1, at_most=True) as show:
         stages = Stages(max_effects, progress, show, map)
         found, _ = explored(checked(fit, "improve"), validate, library(effects, also), stages, max_effects)

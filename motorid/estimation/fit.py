@@ -142,9 +142,7 @@ def solve(problem: Problem, solver: Any = None, *, start: str = "auto", callback
     >>> fit = mi.solve(mi.Problem(mi.dc_motor(), runs, weights="rms"))
     """
     began = time.perf_counter()
-    if not (solver is None or isinstance(solver, LevenbergMarquardt) or hasattr(solver, "solve")):
-        raise UsageError("solver takes mi.LevenbergMarquardt() (the default) or mi.MultipleShooting(), not a name; "
-                         f"got {name_of(solver)}.")
+    check_solver(solver)
     if start not in ("auto", "model"):
         raise UsageError(one_of(start, ("auto", "model"), "start"))
     if not problem.unknown:
@@ -163,6 +161,13 @@ def solve(problem: Problem, solver: Any = None, *, start: str = "auto", callback
     if problem.constraints:
         raise UsageError("LevenbergMarquardt has no true constraints; use solver=mi.MultipleShooting().")
     return _fit(problem, effort, callback, auto=auto, formulation=formulation, began=began)
+
+
+def check_solver(solver: Any) -> None:
+    """Refuse what is no solver."""
+    if not (solver is None or isinstance(solver, LevenbergMarquardt) or hasattr(solver, "solve")):
+        raise UsageError("solver takes mi.LevenbergMarquardt() (the default) or mi.MultipleShooting(), not a name; "
+                         f"got {name_of(solver)}.")
 
 
 def _fit(problem: Problem, effort: LevenbergMarquardt, callback: Callback = None, *, auto: bool = True,

@@ -12,7 +12,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from motorid.errors import SimulationError
+from motorid.errors import SimulationError, at_least
 from motorid.integrate import compiled as cc
 from motorid.integrate.engine import Grid, Trajectory, address
 from motorid.integrate.rodas3 import ERROR_ORDER, StepFunctions, step_functions
@@ -47,6 +47,9 @@ class Rosenbrock:
     compiled: bool | None = None
     name: str = "rosenbrock"
     most_steps: int | None = None
+
+    def __post_init__(self) -> None:
+        at_least(1, most_steps=self.most_steps)
 
     def run(self, system: System, grid: Grid, x0: Array, p: Array, dx0: Array | None = None,
             dp: Array | None = None, local_error: bool = False) -> Trajectory:

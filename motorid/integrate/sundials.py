@@ -18,7 +18,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from motorid.errors import ModelError, SimulationError
+from motorid.errors import ModelError, SimulationError, positive
 from motorid.integrate.engine import Grid, Trajectory
 from motorid.integrate.rosenbrock import Rosenbrock, stepper
 from motorid.model.equations import System
@@ -36,6 +36,9 @@ class _Sundials:
     atol: float = 1e-10
 
     name = "sundials"
+
+    def __post_init__(self) -> None:
+        positive(rtol=self.rtol, atol=self.atol)
 
     def run(self, system: System, grid: Grid, x0: Array, p: Array, dx0: Array | None = None,
             dp: Array | None = None) -> Trajectory:

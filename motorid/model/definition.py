@@ -244,6 +244,10 @@ def effect(*, balance: str, name: str | None = None,
             if not isinstance(arg.default, Declared):
                 raise ModelError(f"effect '{title}': argument '{arg.name}' needs a default P(value, unit, null=…).")
             pars.append(arg.default.named(arg.name))
+        known = ("", *(p.name for p in pars))
+        if odd := next((p for p in pars if p.at_least not in known), None):
+            raise ModelError(f"effect '{title}', at_least of '{odd.name}': "
+                             + one_of(odd.at_least, known[1:], "parameter"))
         return Effect(title, law, tuple(pars), balance, inspect.cleandoc(law.__doc__ or ""), includes)
 
     return make

@@ -23,7 +23,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from motorid.errors import FitError, SimulationError, UsageError
+from motorid.errors import FitError, SimulationError, UsageError, positive
 from motorid.numerics.parallel import check_time
 from motorid.numerics.signals import Array
 
@@ -81,8 +81,7 @@ class Huber:
     delta: float = 1.345
 
     def __post_init__(self) -> None:
-        if not 0 < self.delta < np.inf:
-            raise UsageError(f"Huber takes a number of sigmas above zero; got {self.delta!r}.")
+        positive(" It counts standard deviations.", delta=self.delta)
 
     def pseudo(self, r: Array) -> tuple[Array, Array]:
         """Return r̃ with r̃² = 2ρ(r), and dr̃/dr, so that least squares of r̃ minimise the robust loss."""

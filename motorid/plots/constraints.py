@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
-from motorid.errors import UsageError
+from motorid.errors import UsageError, positive
 from motorid.estimation.result import Fit
 from motorid.estimation.shooting.formulations import Formulations
 from motorid.plots import style
@@ -47,6 +47,7 @@ def plot_current_limit(
         fits += [f.fit for f in r.all if f.fit is not None] if isinstance(r, Formulations) else [r]
     if not fits or not all(isinstance(f, Fit) for f in fits):
         raise UsageError("plot_current_limit takes fits: mi.plot_current_limit(fit, hard, limit=8.0).")
+    positive(limit=limit)
     limit = limit if limit is not None else _limit_of(fits)
     if not all("i" in s.outputs for f in fits for s in f.simulations):
         raise UsageError("these fits have no current: it was not measured, or the model has none.")

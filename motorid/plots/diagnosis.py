@@ -13,7 +13,7 @@ from motorid.diagnosis.experiment_design import Design
 from motorid.diagnosis.locate import accounted
 from motorid.diagnosis.results import Binned, Candidate, Diagnosis, Ladder, Missing
 from motorid.display.numbers import number
-from motorid.errors import UsageError
+from motorid.errors import UsageError, at_least
 from motorid.numerics.signals import Array
 from motorid.plots import style
 from motorid.plots.residuals import scatter
@@ -47,6 +47,8 @@ def plot_missing(result: Missing | Diagnosis, *, show: int = 3, run: int | None 
     """
     missing = result.missing if isinstance(result, Diagnosis) else result
     style.refuse_other(missing, Missing, "plot_missing takes a diagnosis, mi.diagnose(fit)")
+    at_least(1, show=show)
+    style.refuse_index(run, len(missing.t))
     balances = [b for b in ("voltage", "torque") if any(np.any(np.nan_to_num(x)) for x in getattr(missing, b))]
     if missing.where == "mechanical":
         balances.reverse()

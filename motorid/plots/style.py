@@ -89,6 +89,12 @@ def refuse_other(result: object, kind: type, takes: str) -> None:
         raise UsageError(f"{takes}, got {type(result).__name__}.")
 
 
+def refuse_index(run: int | None, runs: int) -> None:
+    """Refuse the number of a run that is not there."""
+    if not 0 <= (run or 0) < runs:
+        raise UsageError(f"the fit has {runs} runs, numbered from 0; got run={run}.")
+
+
 def new_figure(width: float, height: float) -> Figure:
     """Return an empty figure of a size in inches, laid out so that labels do not overlap."""
     if _detached.get():

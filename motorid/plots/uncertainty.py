@@ -194,8 +194,7 @@ def plot_sensitivities(fit: Fit, *, run: int = 0, names: Sequence[str] | None = 
     for n in names or ():
         if n not in free:
             raise UsageError(one_of(n, free, "estimated parameter"))
-    if not 0 <= run < len(problem.runs):
-        raise UsageError(f"the fit has {len(problem.runs)} runs, numbered from 0; got run={run}.")
+    style.refuse_index(run, len(problem.runs))
     trajectory, record = problem.simulate(fit.q, run), problem.experiments[run]
     assert trajectory.dy is not None
     channels, shown = [c for c in problem.outputs if c in record.outputs], list(names or free)

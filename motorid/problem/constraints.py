@@ -14,7 +14,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from motorid.errors import ModelError, UsageError
+from motorid.errors import ModelError, UsageError, positive
 from motorid.numerics.signals import Array
 from motorid.problem.relations import Part, Relation, check_weight, local, share
 from motorid.records.steady_state import SteadySegment, find_segments, segment_between
@@ -236,8 +236,7 @@ class Constraint(Relation):
         if not self.lower <= self.upper or (np.isinf(self.lower) and np.isinf(self.upper)):
             raise UsageError(f"{self.title}: needs lower ≤ upper with at least one of them finite; got "
                              f"[{self.lower:g}, {self.upper:g}].")
-        if not self.size > 0:
-            raise UsageError(f"{self.title}: size must be positive; got {self.size!r}.")
+        positive(size=self.size)
         check_weight(self.weight, self.title)
 
     @property

@@ -90,7 +90,7 @@ class Problem:
             if not (np.isfinite(self.priors[name]).all() and self.priors[name][1] > 0):
                 raise UsageError(f"the prior of '{name}' takes (mean, std), finite, std above zero; got "
                                  f"{self.priors[name]}.")
-        if not hasattr(self.loss or Huber, "pseudo"):
+        if self.loss is not None and not hasattr(self.loss, "pseudo"):
             raise UsageError(f"loss takes mi.Huber() or None; got {name_of(self.loss)}.")
         self.model.check_visible(self.outputs)
         width = self.width or smoothing(self.experiments, self.model.parameters)

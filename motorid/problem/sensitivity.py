@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from motorid.errors import UsageError
+from motorid.errors import UsageError, positive
 from motorid.numerics.parallel import one_thread
 from motorid.numerics.signals import Array
 from motorid.problem.problem import Problem
@@ -104,6 +104,9 @@ def check_derivatives(problem: Problem, q: Array | None = None, *, steps: Sequen
     >>> mi.check_derivatives(better.problem).ok
     True
     """
+    positive(tolerance=tolerance, **{f"steps[{k}]": h for k, h in enumerate(steps)})
+    if not len(steps):
+        raise UsageError("check_derivatives() needs a step at least; got none in steps.")
     q = np.array(problem.start if q is None else q, float)
     if not len(q) or q.shape != problem.start.shape:
         raise UsageError("check_derivatives() needs one value in q per free parameter, and at least one; the "

@@ -13,7 +13,7 @@ import numpy as np
 from motorid.channels import CHANNELS, UNITS, channel_name
 from motorid.display.cards import Card, Shown, Table
 from motorid.display.numbers import counted, percent, quantity
-from motorid.errors import FitError, SimulationError, UsageError, name_of
+from motorid.errors import DataError, FitError, SimulationError, UsageError, name_of, positive
 from motorid.integrate.engine import Engine
 from motorid.model.model import Model
 from motorid.numerics.least_squares import LevenbergMarquardt, levenberg_marquardt
@@ -174,8 +174,12 @@ def planned(model: Model, t: Sequence[float] | Array, v: Sequence[float] | Array
     >>> mi.identifiability(mi.Problem(better.model, [plan])).rank
     4
     """
-    t = np.asarray(t, float)
-    blank = Experiment(t, {"v": np.asarray(v, float)}, {c: np.zeros(len(t)) for c in channels}, hold=hold, name=name)
+    positive(**{f"sigma of {c}": s for c, s in (sigma or {}).items()})
+    try:
+        t, v = np.asarray(t, float), np.asarray(v, float)
+    except (TypeError, ValueError) as error:
+        raise DataError(f"planned: t and v are numbers, one per sample ({error}).") from error
+    blank = Experiment(t, {"v": v}, {c: np.zeros(len(t)) for c in channels}, hold=hold, name=name)
     return with_channels(model, blank, channels, sigma)
 
 

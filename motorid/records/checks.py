@@ -16,7 +16,10 @@ Check = Callable[[Experiment], str | None]
 Reading = tuple[tuple[int, ...], tuple[int, int]]  # order of v, i, omega; signs of i and omega
 _BLOCKS = 40
 EXPLAINED = 0.1  # share of either balance that a reading with exchanged columns may leave unexplained
-CLEAR = 0.1  # of what the stated columns leave, so much at most
+CLEAR = 0.15  # of what the stated columns leave, so much at most
+RESOLVED = 1e-3  # share that noise and the integration from sample to sample leave of any balance
+LOAD = 2.0  # largest torque of a load, as a multiple of the largest current
+STILL = 0.02  # of the largest speed: standstill
 ROUGH = 0.05  # of the speed: sampled so slowly that its balance cannot be integrated
 BALANCE_BLOCKS = 150
 # Ratio of the angle's rate to the speed, and what was then mistaken for SI.
@@ -400,41 +403,25 @@ def swapped_columns(run: Experiment) -> str | None:
 def _as_balances_want(run: Experiment) -> Reading:
     """Return the order of v, i, omega, and the signs of i and omega, with which they fit the balances of a motor.
 
-    Both balances, integrated, with coefficients that must be positive (non-negative least squares, Lawson & Hanson
-    1974): ∫v = R∫i + LΔi + K∫ω ± V·t over blocks, less of K∫ω where v is zero and the driver may have let go, and, from
-    the first sample on since noise hides small steps of the speed, ω = ω₀ + k∫i − b∫ω − c∫sgn ω ± d·t. What is stated
-    stands, unless another reading leaves less than half unexplained. Where no current is measured, the voltage drives
-    in its place. Columns are called exchanged only where the exchange explains both balances, and the sampling resolves
-    them: of a record with gaps or a dead sensor anything explains a little more, of one sampled slowly nearly any
-    reading explains all.
+    What is stated stands, unless another reading leaves less than half unexplained, see `_Balances`. Columns are called
+    exchanged only where the exchange explains both balances, and the sampling resolves them: of a record with gaps or a
+    dead sensor anything explains a little more, of one sampled slowly nearly any reading explains all.
     """
     known = [c for c in ("i", "omega") if c in run.outputs and np.isfinite(run.outputs[c]).sum() > 1]
-    n = min(BALANCE_BLOCKS, run.n // 3)
-    edges = np.linspace(0, run.n - 1, n + 1).astype(int)
     stated: Reading = (0, 1, 2), (1, 1)
-    if "omega" not in known or n < 10 or run.units["v"] != "V":  # a torque or current that is commanded obeys others
+    if "omega" not in known or run.n < 30 or run.units["v"] != "V":  # a commanded torque or current obeys others
         return stated
-    y = [run.inputs["v"], *(bridged(run.t, run.outputs[c if c in known else "omega"]) for c in ("i", "omega"))]
-    sums = [integral(run.t, a, k == 0 and run.hold == "zoh")[edges] for k, a in enumerate(y)]
-    signs_of = [integral(run.t, np.tanh(50 * a / max(np.abs(a).max(), 1e-300)))[edges] for a in y]
-    at, T, one = [a[edges] for a in y], run.t[edges] - run.t[0], np.ones(n + 1)
-    driven = [np.add.reduceat(np.abs(a), edges[:-1]) > 0 for a in y]
-
-    def unexplained(order: tuple[int, ...], turned: tuple[int, int]) -> tuple[float, float]:
-        (v, i, w), (a, b) = order, turned
-        blocks = [np.diff(y) for y in (sums[v], a * sums[i], a * at[i], b * sums[w], T, -T)]
-        blocks.append(np.where(driven[v], 0.0, -blocks[3]))
-        drive = a * sums[i] if "i" in known else sums[v]
-        voltage = _share_left(*blocks) if "i" in known else 1.0
-        return voltage, _share_left(at[w] - at[w][0], b * drive, -sums[w], -signs_of[w], T, -T, one, -one)
-
-    signs_too = product(permutations(range(3)), product((1, -1), (1, -1)))
-    readings = signs_too if "i" in known else [stated, ((0, 1, 2), (1, -1))]
-    shares = {(order, (a, b)): unexplained(order, (a, b)) for order, (a, b) in readings}
-    left = {r: (voltage + 1e-4) * (speed + 1e-4) for r, (voltage, speed) in shares.items()}
+    if "i" in known:
+        balances = _Balances(run, [run.outputs[c] for c in known])
+        shares = {r: balances.unexplained(*r) for r in product(permutations(range(3)), product((1, -1), (1, -1)))}
+    else:  # the voltage drives in its place
+        balances = _Balances(run, [run.inputs["v"], run.outputs["omega"]])
+        shares = {r: (1.0, *balances.unexplained(*r)[1:]) for r in (stated, ((0, 1, 2), (1, -1)))}
+    left = {r: (voltage + RESOLVED) * float(np.sqrt((speed + RESOLVED) * (drive + RESOLVED)))
+            for r, (voltage, speed, drive) in shares.items()}
     best = min(left, key=lambda r: left[r])
     if best[0] != stated[0]:
-        speed = y[best[0][2]]  # one less its correlation with the next sample: of white noise 1, of a motion nearly 0
+        speed = balances.y[best[0][2]]  # one less its correlation with the next sample: of white noise 1, of a motion 0
         coarse = float(np.mean(np.diff(speed) ** 2) / max(2 * np.var(speed), 1e-300)) > ROUGH
         if not coarse and max(shares[best]) <= EXPLAINED and left[best] < CLEAR * left[stated]:
             return best
@@ -443,14 +430,63 @@ def _as_balances_want(run: Experiment) -> Reading:
     return best if left[best] < 0.5 * left[stated] else stated
 
 
-def _share_left(y: Array, *terms: Array) -> float:
-    """Return the share of y² (N,) that no sum of positive multiples of `terms` explains."""
-    from scipy.optimize import nnls
+class _Balances:
+    """Both balances of a motor, integrated over blocks, for any reading of the columns v, i, omega.
 
-    A = np.column_stack(terms)
-    size = np.linalg.norm(y)
-    left = nnls(A / np.maximum(np.linalg.norm(A, axis=0), 1e-300), y / max(size, 1e-300))[1]
-    return float(left**2) if size > 0 else 1.0
+    The voltage: ∫v = R∫i + LΔi + K∫ω ± V·t, less of K∫ω where v is zero and the driver may have let go. The torque,
+    from the first sample on since noise hides small steps of the speed: ω = ω₀ + k∫(i − load) − b∫ω − c∫sgn ω, solved
+    for ω and for ∫i, as either may be the small difference of large terms: the speed of a motor that lifts slowly is.
+    The load is a constant, a weight (sin θ, cos θ with θ = ∫ω), of `LOAD` times the largest current at most, and what
+    friction takes up at standstill. An unlimited weight would explain anything: swung by small angles it is a spring,
+    and a spring does to the current what an inertia does to the speed.
+    """
+
+    def __init__(self, run: Experiment, outputs: Sequence[Array]) -> None:
+        n = min(BALANCE_BLOCKS, run.n // 3)
+        edges = np.linspace(0, run.n - 1, n + 1).astype(int)
+
+        def over(a: Array, hold: bool = False) -> Array:
+            return integral(run.t, a, hold)[edges]
+
+        self.y = [run.inputs["v"], *(bridged(run.t, a) for a in outputs)]
+        self.top = [max(float(np.abs(a).max()), 1e-300) for a in self.y]
+        held = [k == 0 and run.hold == "zoh" for k in range(3)]
+        self.sums = [over(a, h) for a, h in zip(self.y, held, strict=True)]
+        self.signs = [over(np.tanh(50 * a / top)) for a, top in zip(self.y, self.top, strict=True)]
+        angles = [integral(run.t, a, h) for a, h in zip(self.y, held, strict=True)]
+        self.t, self.one = run.t[edges] - run.t[0], np.ones(n + 1)
+        self.loads = [(self.t, over(np.sin(a)), over(np.cos(a))) for a in angles]
+        self.rest = {(w, i): over(np.where(np.abs(self.y[w]) < STILL * self.top[w], self.y[i], 0.0))
+                     for w, i in permutations(range(3), 2)}
+        self.at = [a[edges] for a in self.y]
+        self.driven = [np.add.reduceat(np.abs(a), edges[:-1]) > 0 for a in self.y]
+
+    def unexplained(self, order: tuple[int, ...], turned: tuple[int, int]) -> tuple[float, float, float]:
+        """Return the shares of the voltage, of the speed and of the drive that a reading leaves unexplained."""
+        (v, i, w), (a, b) = order, turned
+        terms = self.sums[v], a * self.sums[i], a * self.at[i], b * self.sums[w], self.t, -self.t
+        blocks = [np.diff(y) for y in terms]
+        blocks.append(np.where(self.driven[v], 0.0, -blocks[3]))
+        drive, rest, most = a * b * self.sums[i], a * b * self.rest[w, i], LOAD * self.top[i]
+        speed, losses = self.at[w] - self.at[w][0], [self.sums[w], self.signs[w]]
+        loads = [sign * most * load for load in self.loads[w] for sign in (1, -1)]
+        caused = [drive, drive - rest, *(drive + load for load in loads), *(-x for x in losses), self.one, -self.one]
+        needed = [speed, *losses, rest, *(load for load in loads)]
+        return (_share_left(blocks[0], *blocks[1:]), _share_left(speed, *caused),
+                _share_left(drive, *needed, most=[np.inf] * 3 + [1.0] * (1 + len(loads))))
+
+
+def _share_left(y: Array, *terms: Array, most: Sequence[float] | None = None) -> float:
+    """Return the share of y² (N,) that no sum of positive multiples of `terms`, each up to `most`, explains."""
+    from scipy.optimize import lsq_linear, nnls
+
+    A, size = np.column_stack(terms), np.linalg.norm(y)
+    norms = np.maximum(np.linalg.norm(A, axis=0), 1e-300)
+    if size == 0:
+        return 1.0
+    if most is None:  # Lawson & Hanson 1974
+        return float(nnls(A / norms, y / size)[1] ** 2)
+    return float(2 * lsq_linear(A / norms, y / size, (0, np.asarray(most) * norms / size), method="bvls").cost)
 
 
 def _cosine(a: Array, b: Array | None) -> float:

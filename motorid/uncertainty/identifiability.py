@@ -201,7 +201,8 @@ def identifiability(problem_or_fit: Problem | Fit, *, points: int = 5, seed: int
     >>> mi.identifiability(better).rank
     6
     """
-    at_least(0, points=points, seed=seed)
+    at_least(1, points=points)
+    at_least(0, seed=seed)
     problem, q = _problem_at(problem_or_fit)
     names = problem.model.free_names
     if not names:

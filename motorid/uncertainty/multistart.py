@@ -17,7 +17,7 @@ import numpy as np
 from motorid.display.cards import Card, Flag, Printed, Table
 from motorid.display.numbers import duration, number, percent, quantity, sentence
 from motorid.errors import MotoridError, SimulationError, UsageError, at_least
-from motorid.estimation.fit import minimise, solve
+from motorid.estimation.fit import check_solver, minimise, solve
 from motorid.estimation.least_squares import FINISH
 from motorid.estimation.result import Failure, Fit
 from motorid.estimation.start_values import with_start_values
@@ -67,6 +67,7 @@ def multistart(problem_or_fit: Problem | Fit, *, starts: int = 100, spread: floa
     >>> many = mi.multistart(fit, starts=2, quiet=True)
     >>> axes = mi.plot_waterfall(many)
     """
+    check_solver(solver)
     at_least(0, seed=seed)
     at_least(1, starts=starts, spread=spread)
     began = time.perf_counter()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import pickle
 
 import numpy as np
@@ -67,7 +68,33 @@ def test_an_argument_of_another_kind_is_named(name):
     lambda: mi.bootstrap(FIT, n=3, block=-5, quiet=True),  # had no end
     lambda: mi.bootstrap(FIT, n=3, seed=-1, quiet=True),
     lambda: mi.multistart(FIT, starts=2, seed=-1, quiet=True),
-    lambda: mi.identifiability(FIT, points=-1),
+    lambda: mi.identifiability(FIT, points=0),
+    lambda: mi.LevenbergMarquardt(ftol=-1.0),
+    lambda: mi.MultipleShooting(max_iterations=0),
+    lambda: mi.MultipleShooting(tol=0.0),
+    lambda: mi.MultipleShooting(process_noise={"i": -1.0}),
+    lambda: mi.Rosenbrock(most_steps=0),
+    lambda: mi.Cvodes(rtol=-1.0),
+    lambda: mi.Idas(atol=float("inf")),
+    lambda: mi.Constraint(lambda m: m.i, upper=1.0, size=float("inf")),
+    lambda: mi.improve(FIT, max_effects=-1),
+    lambda: mi.check_derivatives(FIT.problem, steps=()),
+    lambda: mi.check_derivatives(FIT.problem, tolerance=0.0),
+    lambda: mi.compare_formulations(FIT, weights=[-1.0]),
+    lambda: mi.design_experiment(FIT, duration=1e300),
+    lambda: mi.design_experiment(FIT, duration=1.0, dt=10.0),
+    lambda: mi.design_experiment(FIT, budget=-1.0),
+    lambda: mi.identify_on(mi.virtual_bench(), v_max=-1.0, i_max=1.0),
+    lambda: mi.virtual_bench(seed=-1),
+    lambda: mi.planned(mi.dc_motor(), [0, 1, 2], [1, 1, 1], sigma={"i": 0.0}),
+    lambda: mi.plot_current_limit(FIT, limit=0.0),
+    lambda: mi.plot_missing(mi.locate(FIT), show=0),
+    lambda: mi.plot_missing(mi.locate(FIT), run=1),
+    lambda: mi.plot_missing(mi.locate(FIT), run=-1),
+    lambda: mi.multistart(FIT, starts=2, solver=0, quiet=True),
+    lambda: mi.fit(mi.dc_motor(), RUN, loss=0),
+    lambda: mi.fit(mi.dc_motor(), RUN, window=True),
+    lambda: mi.fit(mi.dc_motor(), RUN, priors={"R": ("x", 1.0)}),
     lambda: mi.identifiability(FIT, seed=-1),
     lambda: mi.fit(mi.dc_motor(), RUN, penalties=[3]),
     lambda: mi.fit(mi.dc_motor(), RUN, constraints=["x"], formulation="penalty"),
@@ -75,6 +102,51 @@ def test_an_argument_of_another_kind_is_named(name):
 def test_a_number_that_cannot_be_meant_is_refused(call):
     with pytest.raises(mi.UsageError):
         call()
+
+
+KINDS = {"float": (True, "x", float("nan"), []), "int": (True, "x", 1.5, float("nan"), []), "bool": ("x", [], 2),
+         "str": (0, True, [])}
+FITTING = {"Mapping": {}, "Callable": print, "tuple": (), "float": 1.0, "str": "x", "Path": "x"}
+
+
+@pytest.mark.parametrize("name", [n for n in dir(mi) if callable(getattr(mi, n)) and not n.endswith("Error")])
+def test_no_number_word_or_flag_is_taken_for_another(name):
+    """Many a wrong one does its harm without an error: a limit of True is one of 1, NaN is below nothing."""
+    function = getattr(mi, name)
+    takes = {p.name: p for p in inspect.signature(function).parameters.values() if p.kind is not p.VAR_POSITIONAL}
+    words = {p: str(q.annotation) for p, q in takes.items()}
+    for asked, kind in words.items():
+        first = kind.removesuffix(" | None")
+        for odd in KINDS.get(first, ()):
+            if odd != odd and takes[asked].default != takes[asked].default:
+                continue  # not known is what its default says
+            others = [p for p in takes.values() if p.default is p.empty and p.kind is not p.VAR_KEYWORD]
+            given = {p.name: next((v for k, v in FITTING.items() if k in words[p.name]), None) for p in others}
+            with pytest.raises(mi.MotoridError) as told:
+                function(**{**given, asked: odd})
+            assert f": {asked} takes" in str(told.value) or isinstance(function, type)  # which may have its own words
+
+
+def test_numbers_of_other_kinds_are_numbers():
+    assert mi.dc_motor(R=np.float32(1.5)).parameters["R"].value == 1.5
+    assert mi.dc_motor(R=np.array(2)).parameters["R"].value == 2
+    assert mi.LevenbergMarquardt(max_iterations=np.int64(3)).max_iterations == 3
+    assert mi.identifiability(FIT, points=np.uint8(1), seed=0).rank
+
+
+def test_what_an_effect_cannot_mean_is_refused():
+    with pytest.raises(mi.ModelError, match="at_least of 'c'"):
+        mi.effect(balance="torque")(_law(mi.P(1.0, at_least="tau")))
+    for given in ({"null": "x"}, {"null": True}, {"lower": float("nan")}, {"grid": "x"}, {"per_run": "x"}):
+        with pytest.raises(mi.UsageError, match="takes"):
+            mi.P(1.0, **given)
+
+
+def _law(c):
+    def law(m, c=c):
+        m.torque -= c * m.omega
+
+    return law
 
 
 def test_a_block_of_the_bootstrap_is_at_most_a_run():

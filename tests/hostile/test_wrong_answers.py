@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import json
-from itertools import product
+from itertools import permutations, product
 
 import numpy as np
 import pandas as pd
 import pytest
+from battery.excite import driven
+from battery.excite import record as logged
 from command import motorid
 
 import motorid as mi
 from motorid.diagnosis.design_criteria import Rival
 from motorid.exporters.json_file import fit_dict
+from motorid.records.datasets import load_plant
 from motorid.records.experiment import Experiment
 
 TRUE = {"R": 1.4, "L": 2e-3, "K": 0.046, "b": 6e-5, "J": 2e-5}
@@ -207,10 +210,10 @@ def test_a_journal_gives_no_answer_of_another_law(change, rng, tmp_path):
     assert marks == [1, 1, 2]
 
 
-@pytest.mark.parametrize("given", [{"v_max": 0.0}, {"i_max": 0.0}, {"duration": 0.0}, {"v_max": float("nan")}])
+@pytest.mark.parametrize("given", [{"v_max": 0.0}, {"i_max": 0.0}, {"duration": 0.0}, {"dt": -1.0}])
 def test_a_limit_of_zero_is_not_one_left_out(given):
     fit = mi.fit(mi.dc_motor(), mi.read_csv(mi.data_path("clean") / "run1.csv"))
-    with pytest.raises(mi.UsageError, match="above zero"):
+    with pytest.raises(mi.UsageError, match="positive and finite"):
         mi.design_experiment(fit, levels=4, budget=2, **given)
 
 
@@ -413,3 +416,35 @@ def test_a_current_that_is_clipped_in_a_few_samples_is_remarked_upon(rng, voltag
     top = np.sort(np.abs(i))[-5]
     for y, clipped in ((np.clip(i, -top, top), True), (i, False), (np.array([float(f"{x:.3g}") for x in i]), False)):
         assert ("clipped" in " ".join(mi.check_runs([run.with_(outputs={**run.outputs, "i": y})]))) is clipped
+
+
+def driven_plant(name, effects, words, per_time_constant, n):
+    motor = load_plant().MOTORS[name]
+    rng = np.random.default_rng([len(name), len(words)])
+    dt = float(f"{motor.R * motor.J / motor.K**2 / per_time_constant:.0e}")
+    return logged(driven(motor, effects, words, n, dt, rng), "logger", ("i", "omega"), motor, rng, "run")
+
+
+@pytest.mark.parametrize(("name", "words", "samples"), [("lab", "ramps 0.3", 20),
+                                                        ("micro", "stairs 0.4", 5)])
+def test_a_weight_that_is_lifted_slowly_is_no_exchange(name, words, samples):
+    """Its current follows its angle as the speed of a motor without load follows the sum of its current."""
+    motor = load_plant().MOTORS[name]
+    weight = {"gravity": {"mgl": 0.2 * motor.K * motor.v_max / motor.R}}
+    said = " ".join(mi.check_runs([driven_plant(name, weight, words, samples, 1200)]))
+    assert "exchanged" not in said
+    assert "swapped" not in said
+
+
+def test_exchanged_columns_of_a_motor_that_sticks_are_found():
+    """At standstill friction takes up what drives: no balance of a moving motor holds, and a sign was blamed."""
+    motor = load_plant().MOTORS["servo"]
+    run = driven_plant("servo", {"coulomb": {"tau_c": 0.05 * motor.K * motor.v_max / motor.R}}, "stairs 0.4", 20, 1000)
+    y = [run.inputs["v"], run.outputs["i"], run.outputs["omega"]]
+    names = ("voltage", "current", "speed")
+    for order in permutations(range(3)):
+        said = " ".join(mi.check_runs([run.with_(inputs={"v": y[order[0]]},
+                                                 outputs={"i": y[order[1]], "omega": y[order[2]]})]))
+        moved = [c for k, c in enumerate(names) if order[k] != k]
+        assert (f"{' and '.join(moved)} fit the equations" in said) if moved else "exchanged" not in said, order
+        assert "probably swapped" not in said, order

@@ -11,7 +11,7 @@ import numpy as np
 from motorid.channels import channel_name
 from motorid.display.cards import Card, Cell, Flag, Shown, Table, value_cell
 from motorid.display.numbers import duration, number, percent
-from motorid.errors import FitError, MotoridError, SimulationError
+from motorid.errors import FitError, MotoridError, SimulationError, positive
 from motorid.estimation.fit import solve
 from motorid.estimation.least_squares import FINISH, least_squares
 from motorid.estimation.result import Failure, Fit
@@ -162,6 +162,7 @@ def compare_formulations(problem: Problem | Fit, constraints: Sequence[Relation]
     --------
     >>> three = mi.compare_formulations(better, [mi.SteadyState()], weights=[1.0])
     """
+    positive(**{f"weights[{k}]": w for k, w in enumerate(weights)})
     given = problem.problem if isinstance(problem, Fit) else problem
     relations = tuple(constraints if constraints is not None else given.constraints) or (SteadyState(),)
     bare = replace(given, constraints=(), noise_factors={})

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from motorid.errors import FitError, SimulationError, UsageError, one_of
+from motorid.errors import FitError, SimulationError, UsageError, at_least, one_of, positive
 from motorid.estimation.fit import minimise
 from motorid.estimation.least_squares import FINISH, least_squares
 from motorid.estimation.result import Fit
@@ -87,8 +87,11 @@ class MultipleShooting:
             raise UsageError(one_of(str(self.warm), ("auto", "data", "model"), "warm start"))
         if isinstance(self.process_noise, str) and self.process_noise != "auto":
             raise UsageError(one_of(self.process_noise, ("auto",), "process noise"))
-        if self.every is not None and (int(self.every) != self.every or self.every < 2):
-            raise UsageError(f"MultipleShooting(every=…) takes a whole number of at least 2; got {self.every!r}.")
+        at_least(2, every=self.every)
+        at_least(1, max_iterations=self.max_iterations)
+        positive(tol=self.tol)
+        noises = self.process_noise if isinstance(self.process_noise, Mapping) else {}
+        positive(**{f"process_noise of {name}": value for name, value in noises.items()})
 
     def solve(self, problem: Problem) -> Fit:
         """Return the fit of `problem` from the values of its model.
