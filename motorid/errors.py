@@ -85,8 +85,7 @@ def numbers_told() -> Iterator[None]:
 
 _Thing = TypeVar("_Thing", bound=Callable[..., Any])
 _SCALAR = {"float", "int", "bool", "str", "None"}
-_PLAIN = _SCALAR | {"Sequence", "Iterable", "Mapping", "tuple", "Callable", "Map", "Callback", "Path", "Path_", "os",
-                    "PathLike", "object", "Any"}
+_PLAIN = _SCALAR | {"Sequence", "Iterable", "Mapping", "tuple", "Callable", "Map", "Callback", "object", "Any"}
 _KINDS: dict[str, Any] = {"Path": (str, os.PathLike),
                           "PathLike": (str, os.PathLike), "Path_": (str, os.PathLike), "Mapping": Mapping,
                           **dict.fromkeys(("Callable", "Map", "Callback"), Callable), "Records": object,
@@ -135,7 +134,7 @@ def at_least(least: float, **given: float | None) -> None:
             raise UsageError(f"{name} must be at least {least:g}; got {number}.")
 
 
-def positive(hint: str = "", **given: float | None) -> None:
+def positive(hint: str = "", /, **given: float | None) -> None:
     """Refuse arguments that are not positive and finite; None is one left out."""
     for name, number in given.items():
         if number is not None and not 0 < number < float("inf"):

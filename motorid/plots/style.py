@@ -79,12 +79,7 @@ def detached() -> Iterator[None]:
 
 
 def refuse_other(result: object, kind: type, takes: str) -> None:
-    """Refuse a result that is not of the `kind` that a figure draws; `takes` says which figure takes what.
-
-    Raises
-    ------
-    UsageError
-    """
+    """Refuse a result that is not of the `kind` that a figure draws; `takes` says which figure takes what."""
     if not isinstance(result, kind):
         raise UsageError(f"{takes}, got {type(result).__name__}.")
 
@@ -259,13 +254,7 @@ def scaled_title(name: str, unit: str, power: int = 0) -> str:
 
 
 def finite(values: Array, what: str) -> Array:
-    """Return the finite ones of `values`.
-
-    Raises
-    ------
-    DataError
-        If there are none.
-    """
+    """Return the finite ones of `values`."""
     good = np.asarray(values, float)
     good = good[np.isfinite(good)]
     if not good.size:

@@ -34,11 +34,6 @@ def mat_table(data: bytes) -> TextTable:
 
     Fields of structures and columns of matrices become columns of their own; of several lengths the most
     frequent is taken.
-
-    Raises
-    ------
-    DataError
-        If it is no such file, or holds no numeric arrays.
     """
     if data.startswith(b"\x89HDF") or b"MATLAB 7.3" in data[:128]:
         raise DataError("it is a MATLAB 7.3 file; save it with save(..., '-v7'), or export CSV.")
@@ -61,11 +56,6 @@ def _check_whole(data: bytes) -> None:
     """Walk through the bytes of a version 5 file and see whether sizes and types agree.
 
     SciPy trusts them: a damaged size can end the process, or take all memory, instead of raising an error.
-
-    Raises
-    ------
-    DataError
-        If they do not.
     """
     order = {b"IM": "<", b"MI": ">"}.get(data[126:128])
     if order is None:
@@ -171,15 +161,7 @@ def _arrays(name: str, value: object, depth: int = 0) -> Iterator[tuple[str, np.
 
 
 def parquet_table(data: bytes) -> TextTable:
-    """Read a table from the bytes of a Parquet file; a named index counts as a column.
-
-    Raises
-    ------
-    MissingDependency
-        If pyarrow is not installed.
-    DataError
-        If it is no Parquet file.
-    """
+    """Read a table from the bytes of a Parquet file; a named index counts as a column."""
     import pandas as pd
 
     try:

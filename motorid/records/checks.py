@@ -411,13 +411,12 @@ def _as_balances_want(run: Experiment) -> Reading:
     stated: Reading = (0, 1, 2), (1, 1)
     if "omega" not in known or run.n < 30 or run.units["v"] != "V":  # a commanded torque or current obeys others
         return stated
-    if "i" in known:
-        balances = _Balances(run, [run.outputs[c] for c in known])
-        shares = {r: balances.unexplained(*r) for r in product(permutations(range(3)), product((1, -1), (1, -1)))}
-    else:  # the voltage drives in its place
-        balances = _Balances(run, [run.inputs["v"], run.outputs["omega"]])
-        shares = {r: (1.0, *balances.unexplained(*r)[1:]) for r in (stated, ((0, 1, 2), (1, -1)))}
-    left = {r: (voltage + RESOLVED) * float(np.sqrt((speed + RESOLVED) * (drive + RESOLVED)))
+    readings: list[Reading] = list(product(permutations(range(3)), product((1, -1), (1, -1))))
+    if "i" not in known:  # the voltage drives in its place, and its own balance says nothing
+        readings = [stated, ((0, 1, 2), (1, -1))]
+    balances = _Balances(run, [run.outputs["i"] if "i" in known else run.inputs["v"], run.outputs["omega"]])
+    shares = {r: balances.unexplained(*r) for r in readings}
+    left = {r: (voltage + RESOLVED if "i" in known else 1.0) * float(np.sqrt((speed + RESOLVED) * (drive + RESOLVED)))
             for r, (voltage, speed, drive) in shares.items()}
     best = min(left, key=lambda r: left[r])
     if best[0] != stated[0]:

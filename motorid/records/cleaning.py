@@ -36,11 +36,6 @@ def run_from_columns(columns: Mapping[str, Array], texts: Texts, layout: Layout,
         Which column is which channel, in which unit.
     name, hold, sigma, meta, notes
         Passed on to the run; `notes` and those made here end up in ``meta["notes"]``.
-
-    Raises
-    ------
-    DataError
-        If no valid run is left.
     """
     said = [*notes, *layout.notes]
     places = dict(layout.places)

@@ -217,11 +217,6 @@ def split(experiment: Experiment, n: int = 2) -> list[Experiment]:
     """Cut a run into `n` contiguous blocks of about equal length, e.g. to hold one out.
 
     Blocks and not random samples: neighbouring samples tell nearly the same. Each block keeps its time.
-
-    Raises
-    ------
-    DataError
-        If a block would have too few samples.
     """
     if int(n) != n or n < 1:
         raise UsageError(f"split() takes a whole number of blocks of at least 1; got {n!r}.")
@@ -232,11 +227,6 @@ def split(experiment: Experiment, n: int = 2) -> list[Experiment]:
 
 def windows(experiment: Experiment, seconds: float) -> list[Experiment]:
     """Cut a run into windows of about `seconds`, to be simulated each from a state of its own; what is cut stays so.
-
-    Raises
-    ------
-    UsageError, DataError
-        If a window would have too few samples.
     """
     if "window" in experiment.meta:
         return [experiment]

@@ -39,13 +39,7 @@ def package_version(package: str) -> str:
 
 
 def read_bytes(path: Path) -> bytes:
-    """Return the contents of a regular file of at most 256 MB.
-
-    Raises
-    ------
-    DataError
-        If it cannot be read, is larger, or is a device or a pipe, which may have no end.
-    """
+    """Return the contents of a regular file of at most 256 MB."""
     try:
         about = path.stat()
         if stat.S_ISDIR(about.st_mode):
@@ -64,13 +58,7 @@ def read_bytes(path: Path) -> bytes:
 
 
 def check_output(path: str | Path, force: bool = False) -> Path:
-    """Return the file to write: `path`, or what it links to.
-
-    Raises
-    ------
-    UsageError
-        If its folder is not there, or, without `force`, if there is a file that motorid did not write.
-    """
+    """Return the file to write: `path`, or what it links to."""
     target = Path(os.path.expanduser(path))
     try:
         target = target.resolve() if target.is_symlink() else target
@@ -103,13 +91,6 @@ def write_files(files: Mapping[Path, str | bytes], force: bool = False) -> list[
         Text is written as UTF-8.
     force : bool
         Also over files that motorid did not write.
-
-    Raises
-    ------
-    UsageError
-        If one of them must not or cannot be written there, see `check_output`; then none is.
-    OutputError
-        If the disk refuses; what was there before is as it was.
     """
     targets = [check_output(path, force) for path in files]
     try:

@@ -69,11 +69,6 @@ def parse_unit(text: str) -> Unit | None:
 
     Encoder counts need the number of counts per turn after a colon. A number before the unit scales it, or
     turns a sign round.
-
-    Raises
-    ------
-    DataError
-        If the number of counts is not a positive number.
     """
     label = text.strip("[](){}<> \t")
     scaled = _SCALED.fullmatch(label)
@@ -95,13 +90,7 @@ def parse_unit(text: str) -> Unit | None:
 
 
 def require_unit(text: object, channel: str) -> Unit:
-    """Read the unit that a user gave for a channel.
-
-    Raises
-    ------
-    DataError
-        If it is not a unit, or not one of this channel.
-    """
+    """Read the unit that a user gave for a channel."""
     unit = parse_unit(str(text))
     allowed = DIMENSIONS[channel]
     if unit is None:

@@ -59,12 +59,6 @@ def assign(labels: Sequence[str], *, columns: Mapping[str, object] | None = None
         Channel or column to unit.
     unit_row : mapping of str to str, optional
         Column to unit, from the row of units below the header.
-
-    Raises
-    ------
-    DataError
-        If a channel, column or unit is unknown, two columns claim one channel, or the time, the drive voltage
-        or every measured channel is missing.
     """
     if not labels:
         raise DataError("it has no columns.")
@@ -226,13 +220,7 @@ def _default(channel: str) -> Unit:
 
 
 def parse_pairs(text: str, what: str) -> dict[str, str]:
-    """Read ``t=time,v=u_volt,omega=speed`` as it is written on a command line.
-
-    Raises
-    ------
-    UsageError
-        If a part is not of the form name=value, or a name comes twice; `what` names the option.
-    """
+    """Read ``t=time,v=u_volt,omega=speed`` as it is written on a command line."""
     pairs: dict[str, str] = {}
     for part in filter(None, (p.strip() for p in text.split(","))):
         name, equals, value = (s.strip() for s in part.partition("="))

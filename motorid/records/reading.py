@@ -107,13 +107,7 @@ def read_mat(path: Path_, *, columns: Mapping[str, object] | None = None, units:
 
 
 def write_csv(experiment: Experiment, path: Path_, force: bool = False) -> Path:
-    """Write a run as `csv_text` has it, so that `read_csv` gives the same run back.
-
-    Raises
-    ------
-    UsageError, OutputError
-        If the file must not or cannot be written, see `write_files`.
-    """
+    """Write a run as `csv_text` has it, so that `read_csv` gives the same run back."""
     return write_files({Path(os.path.expanduser(path)): csv_text(experiment)}, force)[0]
 
 
@@ -134,13 +128,7 @@ def csv_text(run: Experiment) -> str:
 
 
 def find_records(paths: Path_ | Iterable[Path_]) -> list[Path]:
-    """Return the files meant by names, directories and patterns, each once, in natural order.
-
-    Raises
-    ------
-    DataError
-        If a name, directory or pattern leads to no file.
-    """
+    """Return the files meant by names, directories and patterns, each once, in natural order."""
     if isinstance(paths, str | os.PathLike):
         paths = [paths]
     if not isinstance(paths, Iterable):

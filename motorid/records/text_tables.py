@@ -62,11 +62,6 @@ def parse_table(data: bytes) -> TextTable:
 
     Delimiter (comma, semicolon, tab, white space), decimal mark, encoding, comment lines, header and row of
     units are found out. Without a header the columns are called "1", "2", ...
-
-    Raises
-    ------
-    DataError
-        If this is not text, or there are no rows of numbers in it, or the header does not go with the rows.
     """
     text, notes = decode(data)
     lines = [line for line in re.split(r"\r\n|\r|\n", text) if line.strip()]
@@ -90,13 +85,7 @@ def parse_table(data: bytes) -> TextTable:
 
 
 def decode(data: bytes) -> tuple[str, list[str]]:
-    """Turn the bytes of a file into text, with notes on what was mended.
-
-    Raises
-    ------
-    DataError
-        If the file is empty, of a known other kind, or binary.
-    """
+    """Turn the bytes of a file into text, with notes on what was mended."""
     if not data.strip(b"\0 \t\r\n"):
         raise DataError("the file is empty.")
     kind = next((what for magic, what in _MAGIC.items() if data.startswith(magic)), None)
