@@ -448,3 +448,11 @@ def test_exchanged_columns_of_a_motor_that_sticks_are_found():
         moved = [c for k, c in enumerate(names) if order[k] != k]
         assert (f"{' and '.join(moved)} fit the equations" in said) if moved else "exchanged" not in said, order
         assert "probably swapped" not in said, order
+
+
+@pytest.mark.parametrize("option", ["--columns", "--units"])
+def test_a_channel_given_twice_is_refused(option):
+    pairs = {"--columns": "v=voltage_V,v=current_A", "--units": "v=V,v=mV"}[option]
+    done = motorid("check", mi.data_path("clean") / "run1.csv", option, pairs)
+    assert done.status == 2
+    assert "twice" in done.err
