@@ -17,7 +17,7 @@ app = typer.Typer(cls=Group, add_completion=False, rich_markup_mode="rich", pret
 
 @app.callback(invoke_without_command=True)
 def motorid(context: typer.Context,
-            version: Annotated[bool, typer.Option("--version", help="Show the version and leave.")] = False) -> None:
+            version: Annotated[bool, typer.Option("--version", help="Show the version and exit.")] = False) -> None:
     """Identify brushed DC motors: fit a model to records, see where it fails, add the effect that is missing.
 
     Start with: motorid demo

@@ -27,7 +27,7 @@ from motorid.cli.options import (
 )
 from motorid.diagnosis.design_criteria import Rival
 from motorid.diagnosis.diagnose import diagnose
-from motorid.diagnosis.experiment_design import DISTINGUISHED, LEVELS, SHARPENED, design_experiment
+from motorid.diagnosis.experiment_design import LEVELS, design_experiment
 from motorid.diagnosis.record_parts import fit_affordably
 from motorid.diagnosis.refit import INTERRUPTED as STOPPED_BY_HAND
 from motorid.diagnosis.results import Diagnosis, ladder_table, ranking_table
@@ -148,8 +148,8 @@ def _next_step(found: Diagnosis) -> str:
     if found.suggestion:
         return f"Next: {found.suggestion[0].lower()}{found.suggestion[1:]}"
     if found.remainder is not None and found.remainder.proposed:
-        name = "remainder.py"
-        return f"Next: {next_command('diagnose', '--remainder-to', name)}\nIt writes what remains as an effect."
+        command = next_command("diagnose", "--remainder-to", "remainder.py")
+        return f"Next: {command}\nIt writes what remains as an effect."
     if found.effects:
         names = ",".join(found.after.model.effect_names)
         return f"Next: {next_command('fit', '--effects', names, '--json', 'fit.json')}"
@@ -168,13 +168,10 @@ def design_command(found_json: Found, out: Plan = None, goal: Goal = None, param
     Example: motorid design found.json --limit-current 5 --duration 4 --out plan.csv
     """
     rivals = read_rivals(found_json, effects_from, goal)
-    starts = SHARPENED if goal == "sharpen" or len(rivals) < 2 else DISTINGUISHED
-    with progress("Designing", 1 + starts, at_most=True) as advance:
-        design = design_experiment(
-            rivals, goal=goal, parameters=parameters.replace(" ", "").split(",") if parameters else None,
-            v_max=limit_voltage, i_max=limit_current, omega_max=limit_speed, theta_range=limit_angle,
-            temp_max=limit_temperature, duration=duration, shape=shape, levels=levels, slew=slew, budget=budget,
-            progress=lambda word: advance(1, f"Designing: {word.partition(':')[0]}"))
+    design = design_experiment(
+        rivals, goal=goal, parameters=parameters.replace(" ", "").split(",") if parameters else None,
+        v_max=limit_voltage, i_max=limit_current, omega_max=limit_speed, theta_range=limit_angle,
+        temp_max=limit_temperature, duration=duration, shape=shape, levels=levels, slew=slew, budget=budget)
     if json != "-":
         card = design.card()
         show(card.text[0], *card.tables, "Play it with:")

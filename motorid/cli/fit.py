@@ -75,7 +75,7 @@ def fit_command(runs: Runs, options: FitOptions, validate: Validate = None, json
 def _show_fit(found: Fit, records: list[Experiment], notes: list[str], judged: Evaluation | None = None) -> None:
     """Print a fit: remarks, parameters, errors, what follows from them, and how it ended."""
     show(found.verdict, _held_out(found, judged) if judged else None, NRMSE,
-         None if found.fits == "noise" else f"Next: {next_command('diagnose')}",
+         None if "level of the noise" in found.verdict else f"Next: {next_command('diagnose')}",
          f"\n{found.model.title}, {_amount(records)}. {ended(found)}\n")
     say_notes(notes, "About the records")
     show(*value_tables(found))

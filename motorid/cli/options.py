@@ -28,7 +28,7 @@ from motorid.exporters.export import load
 from motorid.model.definition import Effect
 from motorid.model.model import Model, dc_motor, torque_driven
 from motorid.numerics.least_squares import Huber
-from motorid.numerics.parallel import interruption, progress
+from motorid.numerics.parallel import interruption
 from motorid.problem.constraints import CurrentLimit, SteadyState
 from motorid.records.checks import check_runs
 from motorid.records.experiment import Experiment, repeated
@@ -180,9 +180,7 @@ class FitOptions(ReadingOptions):
     def fit(self, runs: Sequence[Experiment], model: Model | None = None) -> Fit:
         """Fit the model to `runs`."""
         model = self.model(runs) if model is None else model
-        text = f"Fitting {model.title}"
-        with progress(text) as advance:
-            return fit(model, runs, callback=lambda k, *_: advance(1, f"{text}: iteration {k}"), **self.keywords())
+        return fit(model, runs, **self.keywords())
 
     def _check_words(self) -> None:
         for word, known, what in ((self.drive, DRIVES, "drive"), (self.formulation, FORMULATIONS, "formulation"),

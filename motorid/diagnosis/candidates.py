@@ -381,7 +381,7 @@ def _unseen(score: Score) -> str:
     """Say why an effect was not refitted."""
     if score.same_as:
         return f"these records do not distinguish it from {' and '.join(score.same_as)} together"
-    return "not refitted: others promised more"
+    return "not refitted: others ranked higher"
 
 
 def _said(found: Evidence) -> str:
@@ -394,7 +394,9 @@ def _said(found: Evidence) -> str:
         return f"no better than chance (gain {found.gain:.1f} ± {found.se:.1f})"
     if not found.worth_it:
         return f"lowers the {where} by less than {100 * MATERIAL:g} %"
-    return f"lowers the {where} by {100 * found.fall:.1f} %"
+    there = found.held_out_fall or 0.0
+    kind, fall = ("held-out", there) if there > MATERIAL else ("prediction", found.fall)
+    return f"lowers the {kind} error by {100 * fall:.1f} %"
 
 
 def _drop(node: Node, fit: Fit) -> float:

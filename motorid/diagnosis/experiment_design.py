@@ -26,6 +26,7 @@ from motorid.errors import FitError, MotoridError, UsageError, at_least, one_of,
 from motorid.estimation.result import Fit
 from motorid.numerics.parallel import budget as limited_time
 from motorid.numerics.parallel import one_thread
+from motorid.numerics.parallel import progress as bar
 from motorid.numerics.signals import Array
 from motorid.problem.simulate import simulate
 from motorid.records.experiment import Experiment
@@ -308,7 +309,6 @@ def design_experiment(found: Diagnosis | Fit | Sequence[Fit | Rival], *, goal: s
     positive(OMITTED, v_max=v_max, i_max=i_max, omega_max=omega_max, temp_max=temp_max, duration=duration, dt=dt)
     at_least(0, budget=budget)
     rivals, goal = _rivals(found, goal)
-    say = progress or (lambda word: None)
     asked = _asked(rivals[0], parameters) if goal == "sharpen" else ()
     _check_words(shape, levels, slew)
     seen = rivals[0].seen
@@ -318,19 +318,24 @@ def design_experiment(found: Diagnosis | Fit | Sequence[Fit | Rival], *, goal: s
                          f"{duration:g} s.")
     limits = _limits(rivals, v_max or seen["v"], i_max, omega_max, theta_range, temp_max)
     layout = _layout(shape, levels, duration, max(dt, 0.5 * duration / SAMPLES), limits["v"][1])
-    task = _task(rivals, layout, {s: x for s, x in limits.items() if s != "v"}, asked, slew)
-    task = _ordered(task)
-    name, fine, at = _fixed(task)
-    fine = _exact(fine, rivals).refined(fine.layout.of(at), TOLERANCE)
-    fixed = name, fine, _safe(fine, at)[0]
-    say("compared fixed candidates")
-    with limited_time(budget):
-        best = _optimised(task, say)
-    task, layout = _exact(replace(best.task, pairs=task.pairs), rivals), best.task.layout
-    c = best.c if layout.ramps else _without_traces(layout, best.c)
-    c, peaks = _safe(task.refined(layout.of(c), TOLERANCE), c)
-    return _told(task.refined(layout.of(c), TOLERANCE), c, peaks, fixed, limits,
-                 "stopped early" if best.stopped else "designed")
+    with bar("Designing", 1 + (SHARPENED if asked else DISTINGUISHED), at_most=True) as advance:
+        def say(word: str) -> None:
+            advance(1, f"Designing: {word.partition(':')[0]}")
+            if progress:
+                progress(word)
+
+        task = _ordered(_task(rivals, layout, {s: x for s, x in limits.items() if s != "v"}, asked, slew))
+        name, fine, at = _fixed(task)
+        fine = _exact(fine, rivals).refined(fine.layout.of(at), TOLERANCE)
+        fixed = name, fine, _safe(fine, at)[0]
+        say("compared fixed candidates")
+        with limited_time(budget):
+            best = _optimised(task, say)
+        task, layout = _exact(replace(best.task, pairs=task.pairs), rivals), best.task.layout
+        c = best.c if layout.ramps else _without_traces(layout, best.c)
+        c, peaks = _safe(task.refined(layout.of(c), TOLERANCE), c)
+        return _told(task.refined(layout.of(c), TOLERANCE), c, peaks, fixed, limits,
+                     "stopped early" if best.stopped else "designed")
 
 
 def _optimised(task: Task, say: Callable[[str], None]) -> Found:

@@ -144,7 +144,9 @@ def _with(found: Climb, best: Node, chosen: Node, ranked: bool, group: tuple[str
 def _finished(found: Climb) -> Climb:
     """Return a climb with the free forms that predict better beside all effects, and the grade of each effect."""
     search, best = found.search, found.path[-1]
-    rounds = tuple(tuple(replace(c, group=_without(c.group, best.key)) for c in r) for r in found.rounds)
+    rounds = tuple(tuple(replace(c, group=_without(c.group, best.key), **(
+        {"reason": "added in a later step"} if c.effect in best.key and not c.accepted else {})) for c in r)
+                   for r in found.rounds)
     groups = tuple((g[0], *rest) for g in found.groups if g and (rest := _without(g[1:], best.key)))
     structure = not found.remaining.adequate
     forms = better_forms(best.fit, best.predictions) if structure else []

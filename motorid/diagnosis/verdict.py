@@ -53,12 +53,12 @@ def unexplained_text(ranking: Sequence[Candidate], rungs: Sequence[Rung], grades
 
     Not `done`: the search was stopped before all effects were tried.
     """
-    lead = f"Unexplained: {like}, which is no effect of the library." if like else (
+    lead = f"Unexplained: {like}, which no effect of the library describes." if like else (
         "Unexplained: something is missing, and no effect of the library explains it.")
     lead = lead if done else f"Unexplained so far: {like or 'something is missing'}; not all effects were tried."
     if grades:
-        helps = approximations_text(grades)
-        helps = helps.replace(f"{like}, which the library lacks,", "a curve like this") if like else helps
+        curve = f"{like}, which the library lacks, predicts better in its place"  # the same in few words
+        helps = approximations_text(grades).replace(curve, "a free curve predicts better")
         return f"{lead} {helps} {errors_text(rungs)}"
     best = max((c for c in ranking if c.refit_drop is not None), key=lambda c: c.refit_drop or 0.0, default=None)
     if best is None or (best.refit_drop or 0) <= 0.05:

@@ -22,7 +22,7 @@ from motorid.estimation.start_values import with_start_values
 from motorid.integrate.engine import Engine
 from motorid.model.model import Model
 from motorid.numerics.least_squares import LevenbergMarquardt
-from motorid.numerics.parallel import one_thread
+from motorid.numerics.parallel import one_thread, progress
 from motorid.problem.problem import Problem, as_problem
 from motorid.problem.simulate import integration_error, misfit_over_noise, with_angles_apart
 from motorid.records.experiment import Experiment, windows
@@ -123,10 +123,12 @@ def fit(model: Model, runs: Sequence[Experiment] | Experiment, *, solver: Any = 
     if unset := problem.model.without_value:
         raise ModelError(f"{' and '.join(unset)} {'is' if len(unset) == 1 else 'are'} to be fixed, but at which value? "
                          f"Give it, in SI units: model.fix({unset[0]}=…).")
-    found = solve(problem, solver, start=start, callback=callback, formulation=formulation)
-    if window == "auto" and start == "auto" and not hasattr(solver, "solve"):
-        again = partial(solve, solver=solver, callback=callback, formulation=formulation)
-        found = found if follows(found) else in_windows(found, again) or found
+    with progress(text := f"Fitting {problem.model.title}", short=True) as advance:
+        again = partial(solve, solver=solver, formulation=formulation, callback=lambda k, *rest: (
+            advance(1, f"{text}: iteration {k}"), callback and callback(k, *rest)))
+        found = again(problem, start=start)
+        if window == "auto" and start == "auto" and not hasattr(solver, "solve"):
+            found = found if follows(found) else in_windows(found, again) or found
     _ = found.evaluation, found.std  # kept with the fit: showing it then computes nothing
     return found
 

@@ -27,6 +27,7 @@ from motorid.records.experiment import Experiment, units_of
 from motorid.records.files import json_text, write_files
 
 LOST = 1.0  # NRMSE at which zero is as near to what was measured
+PLAIN = 1.5  # times the noise: up to here errors are said to be at its level
 COLOURED = 3.0  # times the noise from fast changes: what a correlation of 0.9 between neighbours makes of it
 SAVED = ("q", "status", "message", "history", "seconds", "integration_error", "formulation")  # plain fields
 FLAGS = {"noise": Flag("fits", "good"), "poor": Flag("fits poorly", "bad"), "lost": Flag("does not fit", "bad")}
@@ -162,12 +163,13 @@ class Fit(Shown):
     def verdict(self) -> str:
         """Whether it fits, in a sentence."""
         times = max(self.misfit.values(), default=0.0)
-        said = {"noise": "Fits: errors at the level of the noise",
+        said = {"noise": "Fits: errors at the level of the noise" if times < PLAIN else
+                f"Fits: errors up to {number(times, 2)} times the noise, as correlated noise may be",
                 "poor": f"Fits poorly: errors up to {number(times, 2)} times the noise",
                 "lost": "Does not fit: a model that says zero would be nearer"}[self.fits]
         if self.window:
             said += f", a window of {number(self.window, 2)} s ahead"
-        end = "" if self.status == "converged" else f" Not converged ({self.status}): the values are no optimum."
+        end = "" if self.status == "converged" else f" Not converged ({self.status}): the values are not an optimum."
         return f"{said} (NRMSE {self.evaluation.words}).{end}"
 
     @property
@@ -408,8 +410,8 @@ def per_run_table(fit: Fit) -> Table | None:
 def determined_table(fit: Fit) -> Table | None:
     """Return gain, time constants, damping, torques as voltages, as far as the records determine them."""
     rows = [(d.text, with_error(d.value, d.std, d.unit)) for d in fit.determined.values()]
-    if (top := fit.determined.get("no_load_speed")) and top.unit == "rad/s":  # in what data sheets say: units show
-        rows += [("no-load speed, as data sheets say it", quantity(top.value * 30 / np.pi, "rpm", 3))]
+    if (top := fit.determined.get("no_load_speed")) and top.unit == "rad/s":
+        rows += [("no-load speed in rpm", quantity(top.value * 30 / np.pi, "rpm", 3))]
     return Table(("what the records determine", "value ± std"), rows, left=(0, 1)) if rows else None
 
 

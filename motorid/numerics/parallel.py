@@ -325,7 +325,7 @@ _outer: ContextVar[Callable[..., None] | None] = ContextVar("motorid_progress", 
 
 
 @contextmanager
-def progress(text: str, total: float | None = None, *, quiet: bool = False, at_most: bool = False
+def progress(text: str, total: float | None = None, *, quiet: bool = False, at_most: bool = False, short: bool = False
              ) -> Iterator[Callable[..., None]]:
     """Show a bar while the block runs; call what it yields once per finished task.
 
@@ -342,6 +342,8 @@ def progress(text: str, total: float | None = None, *, quiet: bool = False, at_m
     quiet : bool
     at_most : bool
         The total may not be reached, and the time left is said so.
+    short : bool
+        It is often over in a second: in a notebook, where a bar leaves an empty output, there is none before.
 
     Yields
     ------
@@ -371,18 +373,21 @@ def progress(text: str, total: float | None = None, *, quiet: bool = False, at_m
     if total:
         count = rich.TextColumn("at most") if at_most else rich.MofNCompleteColumn()
         columns += [rich.BarColumn(8), count, rich.TimeRemainingColumn(table_column=Column(min_width=7))]
-    with rich.Progress(*columns, console=Console(stderr=True), transient=True, speed_estimate_period=3600.0) as bar:
-        task = bar.add_task(text, total=total)
+    bar = rich.Progress(*columns, console=Console(stderr=True), transient=True, speed_estimate_period=3600.0)
+    task, begin = bar.add_task(text, total=total), time.monotonic() + (short and in_jupyter())
 
-        def advance(n: float = 1.0, at_work: str = "", done: float | None = None, total: float | None = None) -> None:
-            bar.update(task, description=at_work or text, completed=done, total=total,
-                       advance=n if done is None else None)
+    def advance(n: float = 1.0, at_work: str = "", done: float | None = None, total: float | None = None) -> None:
+        if time.monotonic() >= begin:
+            bar.start()
+        bar.update(task, description=at_work or text, completed=done, total=total, advance=n if done is None else None)
 
-        token = _outer.set(advance)
-        try:
-            yield advance
-        finally:
-            _outer.reset(token)
+    token = _outer.set(advance)
+    try:
+        advance(0)
+        yield advance
+    finally:
+        _outer.reset(token)
+        bar.stop()
 
 
 def _watched() -> bool:

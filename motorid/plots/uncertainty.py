@@ -59,8 +59,8 @@ def plot_singular_values(result: Identifiability) -> np.ndarray:
     axes[0].axhspan(axes[0].get_ylim()[0], SEEN, color=style.MUTED, alpha=0.16, lw=0, zorder=0)
     axes[0].set_xticks(rows)
     style.plain_decades(axes[0])
-    words = f"rank {result.rank} of {k}, condition number {number(result.condition_number, 3)}"
-    style.tidy(axes[0], x="direction", y="singular value", title=words)
+    style.tidy(axes[0], x="direction", y="singular value",
+               title=f"rank {result.rank} of {k}, condition number {number(result.condition_number, 3)}")
     _directions(axes[1], result)
     return axes
 
@@ -261,14 +261,14 @@ def _sorted_costs(ax: Axes, result: Multistart, ends: Sequence[tuple[StartResult
         if where.size:
             word = {"good": "agree", "poor": "elsewhere"}.get(kind, kind)
             ax.plot(where + 1, ratio[where], "o", ms=4, color=colour, label=word)
+    ax.xaxis.get_major_locator().set_params(integer=True)
     ax.set_yscale("log")
     ax.set_ylim(0.9, max(2.2, float(ratio.max(initial=1.0)) * 1.5))
     style.plain_decades(ax)
     words = f"{result.good} of {len(result.results)} agree"
-    words += f"; {result.failed} failed" if result.failed else ""
-    words += f"; {result.poor} elsewhere:" if result.poor else ""
-    words = "\n".join([words, *textwrap.wrap(glued(result.elsewhere), TITLE)])
-    style.tidy(ax, x="fits, best first", y="squared error over the best (ratio)", title=words)
+    words += f"; {result.failed} failed" * bool(result.failed) + f"; {result.poor} elsewhere:" * bool(result.poor)
+    style.tidy(ax, x="fits, best first", y="squared error over the best (ratio)",
+               title="\n".join([words, *textwrap.wrap(glued(result.elsewhere), TITLE)]))
     ax.legend(loc="upper left")
 
 

@@ -220,8 +220,8 @@ def _slow_sampling(run: Experiment) -> str | None:
     first, full = rise[:, :2].max(axis=1), rise.max(axis=1)  # the step itself may lie between two samples
     clear = full > 10 * noise_level(i, run.t)
     if clear.any() and float(np.median(first[clear] / full[clear])) > 0.9:
-        return (f"after a voltage step the current is there within one sample ({1e3 * run.dt:.3g} ms): the sampling is "
-                "too slow for the inductance, so L will be uncertain. Sample faster, or fix L as data sheets say.")
+        return (f"the current follows a voltage step within one sample ({1e3 * run.dt:.3g} ms): the sampling is "
+                "too slow for the inductance, so L will be uncertain. Sample faster, or fix L at its data-sheet value.")
     return None
 
 

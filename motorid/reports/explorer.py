@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from html import escape
 from typing import Any
 
 import numpy as np
@@ -106,8 +107,9 @@ class Explorer:
 
     def refit(self) -> None:
         """Fit the model as it is ticked, from its present values."""
+        p = self._first.problem
         try:
-            found = fit(self.model, self.runs, **self._options)
+            found = fit(self.model, self.runs, engine=p.engine, initial=p.initial, weights=p.weights, loss=p.loss)
         except MotoridError as error:
             self._say(str(error))
             return
@@ -120,11 +122,6 @@ class Explorer:
         self.fit = self._first
         self._try(self._first.model, "back to the first fit")
         self._show_controls()
-
-    @property
-    def _options(self) -> dict[str, Any]:
-        problem = self._first.problem
-        return {"engine": problem.engine, "initial": problem.initial, "weights": problem.weights, "loss": problem.loss}
 
     def _known(self, values: Mapping[str, float]) -> Mapping[str, float]:
         for name in values:
@@ -148,6 +145,7 @@ class Explorer:
     def _build(self) -> None:
         import ipywidgets as w
 
+        self._w: Any = w
         self._picture = w.Image(format="png", layout=w.Layout(max_width="100%"))
         self._errors, self._status = w.HTML(), w.HTML()
         self.boxes = {n: self._box(n) for n in self._effects}
@@ -168,20 +166,17 @@ class Explorer:
 
     def _groups(self) -> list[Any]:
         """Return the ticks by balance, under titles."""
-        import ipywidgets as w
-
-        found = []
+        w, found = self._w, []
         for balance, title in TITLES.items():
             boxes = [self.boxes[n] for n, e in self._effects.items() if e.balance == balance]
             grid = w.GridBox(boxes, layout=w.Layout(grid_template_columns="repeat(auto-fill, minmax(15rem, 1fr))"))
             found += [w.HTML(f"<b>{title}</b>"), grid] if boxes else []
-        hint = w.HTML("Effects, with the share of the first fit's misfit that each is predicted to take; hover for "
-                      "the law.")
+        hint = w.HTML("Effects, with the share of the first fit's squared error that each is predicted to remove; "
+                      "hover for the law.")
         return [hint, *found]
 
     def _box(self, name: str) -> Any:
-        import ipywidgets as w
-
+        w = self._w
         gain = self._gains.get(name, 0.0)
         label = f"{name} −{100 * gain:.0f} %" if gain >= 0.005 else name
         box = w.Checkbox(value=name in self.model.effect_names, description=label, indent=False,
@@ -190,8 +185,7 @@ class Explorer:
         return box
 
     def _slider(self, p: Parameter) -> Any:
-        import ipywidgets as w
-
+        w = self._w
         size = abs(p.value) or 1e-3
         common: dict[str, Any] = {"description": p.name, "style": {"description_width": "4rem"},
                                   "layout": w.Layout(width="19rem"), "tooltip": p.doc}
@@ -214,8 +208,7 @@ class Explorer:
 
     def _show_controls(self) -> None:
         """Make ticks and sliders agree with the model."""
-        import ipywidgets as w
-
+        w = self._w
         self._quiet = True
         for name, box in self.boxes.items():
             box.value = name in self.model.effect_names
@@ -245,8 +238,6 @@ class Explorer:
     def _say(self, message: str) -> None:
         self.message = message
         if hasattr(self, "_status"):
-            from html import escape
-
             self._status.value = f"<span>{escape(message)}</span>"
 
     def _repr_mimebundle_(self, **options: Any) -> Any:

@@ -46,12 +46,11 @@ def data(runs: Sequence[Experiment]) -> Section:
     rows = [[r.name, str(r.n), duration(r.duration), f"{number(1e3 * r.dt, 3)} ms",
              ", ".join(NAMES[c] for c in r.channels)] for r in runs]
     remarks = [*check_runs(runs), *(f"{r.name}: {n}" for r in runs for n in r.meta.get("notes", ()))]
-    text = [f"{counted(len(runs), 'record')} were used." if len(runs) > 1 else "One record was used."]
-    text.append("What the checks found:" if remarks else "The checks found no problem.")
-    names = ", ".join(r.name for r in runs)
-    figure = _figure("data", "Input and measured channels over time.", f"Records {names} over time", plot_runs, runs)
+    checked = "What the checks found:" if remarks else "The checks found no problem."
+    figure = _figure("data", "Input and measured channels over time.",
+                     f"Records {', '.join(r.name for r in runs)} over time", plot_runs, runs)
     table = Table(["record", "samples", "duration", "interval", "measured"], rows)
-    return Section("data", "The data", text, remarks, [figure], [table])
+    return Section("data", "The data", [f"{counted(len(runs), 'record')}. {checked}"], remarks, [figure], [table])
 
 
 def fitted(fit: Fit, title: str, *, key: str = "fit", before: Fit | None = None, values: bool = True,
@@ -82,8 +81,8 @@ def held_out(fit: Fit, validate: Sequence[Experiment]) -> Section:
     from motorid.plots import plot_fit
 
     judged = evaluate(fit, validate)
-    alt = "Measured and modelled channels of records that the fit never saw. " + f"NRMSE: {judged.words}."
-    figure = _figure("held-out", "Records that the fit never saw.", alt, plot_fit, judged)
+    figure = _figure("held-out", "Records that the fit never saw.", f"Measured and modelled. NRMSE: {judged.words}.",
+                     plot_fit, judged)
     return Section("held-out", "Held-out records", (), (), [figure], [error_table({"": judged})])
 
 
@@ -116,7 +115,7 @@ def which(d: Diagnosis) -> Section:
     """The effects that may be missing, ranked."""
     from motorid.plots import plot_ranking
 
-    alt = "Bars of the misfit that each effect would take away; best: " + ", ".join(c.effect for c in d.ranking[:3])
+    alt = "Bars of the squared error that each effect would remove; best: " + ", ".join(c.effect for c in d.ranking[:3])
     caption = "Outline: predicted from sensitivities. Bar: refitted. Diamond: fall of the held-out error."
     figure = _figure("ranking", caption, alt, plot_ranking, d, small=True)
     return Section("which", "Which effect is missing", (), (), [figure], [ranking_table(d.ranking)])

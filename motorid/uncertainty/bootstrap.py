@@ -93,7 +93,7 @@ class Bootstrap(Printed):
         """Return values with the spread of the refits."""
         flags = [Flag(f"{len(self.samples)} refits")]
         flags += [Flag(f"{len(self.failures)} failed", "bad")] if self.failures else []
-        how = ("Blocks of the residuals, put back in random order on the model's curves." if self.kind == "blocks" else
+        how = ("Refitted to the model's curves plus blocks of residuals in random order." if self.kind == "blocks" else
                f"Resampled: {self.kind}.")
         rows = []
         for n, value, unit in zip(self.names, self.reference, self.units, strict=True):
@@ -101,7 +101,7 @@ class Bootstrap(Printed):
             said = value_cell(float(value), self.std[n], unit, self.status[n])
             rows.append([n, said, interval_text(self.interval(n)), limited])
         return Card("Bootstrap", flags, (how, self.interrupted),
-                    (Table(["parameter", "value ± std", "95 %", "at its limit"], rows, left=(0, 1, 2)),),
+                    (Table(["parameter", "value ± bootstrap std", "95 %", "at its limit"], rows, left=(0, 1, 2)),),
                     (("mi.plot_profile(mi.intervals(fit))", "compare"),))
 
 

@@ -109,7 +109,7 @@ class Covariance(Printed):
         header = ["unknown", "value ± std", "95 %", *(f"ρ {n}" for n in self.names)]
         share = ", ".join(f"{channel_name(c)} {percent(v.effective_share, 2)}" for c, v in self.colours.items())
         return Card("Uncertainty", (Flag(f"{self.method} residuals"),),
-                    (f"Effective samples per sample: {share}.",) if share else (),
+                    (f"Effective number of samples, of all: {share}.",) if share else (),
                     (Table(header, rows, left=(0, 1, 2)),), (("mi.bootstrap(fit)", "check it"),))
 
 

@@ -250,7 +250,7 @@ class Multistart(Printed):
 
     @property
     def elsewhere(self) -> str:
-        """Where the others ended: ``2 at b = 1.3·10⁻³ N·m·s/rad (squared error 3.1 times)``; else empty.
+        """Where the others ended: ``2 at b = 1.3·10⁻³ N·m·s/rad (3.1 times the squared error)``; else empty.
 
         The places with most fits, and there the parameters that are farthest off.
         """
@@ -263,7 +263,9 @@ class Multistart(Printed):
                    for n in self.reference.problem.model.free_names}
             most = [n for n in sorted(off, key=lambda n: -off[n])[:FARTHEST] if off[n] > 0.1 * max(off.values())]
             where = ", ".join(f"{n} = {quantity(end[n], pars[n].unit, 3)}" for n in most)
-            told.append(f"{len(place)} at {where} (squared error {number(place[0].cost / self._lowest, 3)} times)")
+            ratio = place[0].cost / self._lowest
+            more = f"{number(ratio, 3)} times the" if ratio > 1.1 else f"{percent(ratio - 1, 1)} more"
+            told.append(f"{len(place)} at {where} ({more} squared error)")
         more = sum(map(len, places[PLACES:]))
         return "; ".join([*told, *([f"{more} at other places"] if more else [])])
 
@@ -300,12 +302,12 @@ class Multistart(Printed):
     @property
     def text(self) -> str:
         """The verdict in words."""
-        said = [f"{self.good} of {len(self.results)} starts within a factor of {self.spread:g} end in the "
-                f"best fit (cost within {percent(COST_SHARE)}, parameters within {DISTANCE:g} standard "
-                f"deviations); {self.poor} elsewhere, {self.failed} failed; {duration(self.seconds)}."]
+        said = [f"{self.good} of {len(self.results)} starts, up to {self.spread:g} times off, reach the best fit "
+                f"(cost within {percent(COST_SHARE)}, parameters within {DISTANCE:g} standard deviations); "
+                f"{self.poor} end elsewhere, {self.failed} failed; {duration(self.seconds)}."]
         if self.best is not None:
             lower = percent(1 - self.best.cost / self.reference.cost)
-            said.append(f"One start found a better place than the fit: its cost is {lower} lower.")
+            said.append(f"One start found a better fit than the one given: its cost is {lower} lower.")
         if self.poor:
             said.append(f"Elsewhere: {self.elsewhere}.")
         return " ".join([*said, sentence(self.interrupted)]).strip()

@@ -120,7 +120,7 @@ def test_places_where_fits_end_are_listed_best_first(mixed):
     places = mixed.basins
     assert places["fits"].tolist() == [3, 2]
     assert places["cost_ratio"].tolist() == pytest.approx([1, 8])
-    assert "2 elsewhere, 1 failed" in str(mixed)
+    assert "2 end elsewhere, 1 failed" in str(mixed)
     assert "Elsewhere: 2 at " in str(mixed)
 
 
@@ -128,7 +128,7 @@ def test_better_place_than_the_reference_becomes_the_measure(fits):
     best = fits["two_step_noisy"]
     found = Multistart(best, (ending(best, best.cost), ending(best, 0.5 * best.cost, R=1.0)), 10.0, False, 1.0)
     assert found.kinds == ("poor", "good")
-    assert "better place" in str(found)
+    assert "better fit" in str(found)
 
 
 def test_dictionary_keeps_the_contract_and_is_json(mixed):
@@ -244,9 +244,10 @@ def test_it_says_where_the_other_starts_ended_with_units(fits):
     ends = (*[ended(1.0)] * 6, ended(9.0, b=1e-3), ended(9.0, b=1e-3), ended(2.0, R=5.0))
     found = Multistart(fit, ends, 10.0, False, 1.0)
     assert (found.good, found.poor) == (6, 3)
-    assert found.elsewhere == ("2 at b = 0.001 N·m·s/rad (squared error 9 times); "
-                               "1 at R = 5 Ω (squared error 2 times)")
+    assert found.elsewhere == ("2 at b = 0.001 N·m·s/rad (9 times the squared error); "
+                               "1 at R = 5 Ω (2 times the squared error)")
     assert f"Elsewhere: {found.elsewhere}." in found.text
     assert Multistart(fit, (ended(1.0),), 10.0, False, 1.0).elsewhere == ""
+    assert Multistart(fit, (ended(1.0, R=5.0),), 10.0, False, 1.0).elsewhere == "1 at R = 5 Ω (0 % more squared error)"
     title = mi.plot_waterfall(found)[0].get_title(loc="left").replace("\n", " ").replace("\N{NO-BREAK SPACE}", " ")
     assert title == f"6 of 9 agree; 3 elsewhere: {found.elsewhere}"
