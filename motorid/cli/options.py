@@ -179,8 +179,7 @@ class FitOptions(ReadingOptions):
 
     def fit(self, runs: Sequence[Experiment], model: Model | None = None) -> Fit:
         """Fit the model to `runs`."""
-        model = self.model(runs) if model is None else model
-        return fit(model, runs, **self.keywords())
+        return fit(self.model(runs) if model is None else model, runs, **self.keywords())
 
     def _check_words(self) -> None:
         for word, known, what in ((self.drive, DRIVES, "drive"), (self.formulation, FORMULATIONS, "formulation"),

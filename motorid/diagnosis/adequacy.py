@@ -79,9 +79,9 @@ def adequacy(fit: Fit, scores: Sequence[Score] = (), false_alarm: float = FALSE_
     adequate = exact or (p_value > (false_alarm if level is None else level) and not far)
     for c, facts in channels.items():
         facts["p_value"] = min([1.0, *(t["p"] for t in tests if t["channel"] == c)])
-    text = ("The errors are below a millionth of what was measured." if exact else
-            _text(adequate, channels, material, false_alarm))
-    return Adequacy(adequate, float(p_value), false_alarm, channels, text)
+    text = "The errors are below a millionth of what was measured." if exact else ""
+    return Adequacy(adequate, float(p_value), false_alarm, channels,
+                    text or _text(adequate, channels, material, false_alarm))
 
 
 def _material(channels: Mapping[str, Mapping[str, float]], channel: str | None) -> float:

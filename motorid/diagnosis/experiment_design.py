@@ -320,9 +320,7 @@ def design_experiment(found: Diagnosis | Fit | Sequence[Fit | Rival], *, goal: s
     layout = _layout(shape, levels, duration, max(dt, 0.5 * duration / SAMPLES), limits["v"][1])
     with bar("Designing", 1 + (SHARPENED if asked else DISTINGUISHED), at_most=True) as advance:
         def say(word: str) -> None:
-            advance(1, f"Designing: {word.partition(':')[0]}")
-            if progress:
-                progress(word)
+            _ = advance(1, f"Designing: {word.partition(':')[0]}"), progress and progress(word)
 
         task = _ordered(_task(rivals, layout, {s: x for s, x in limits.items() if s != "v"}, asked, slew))
         name, fine, at = _fixed(task)

@@ -125,9 +125,8 @@ def ladder(steps: Ladder) -> Section:
     """The error of each model of a ladder."""
     from motorid.plots import plot_ladder
 
-    names = ", ".join(r.added or r.fit.model.title for r in steps.rungs)
     caption = "Error of each model, on the records of the fit and on those it never saw."
-    figure = _figure("ladder", caption, f"Error of each model in turn: {names}", plot_ladder, steps, small=True)
+    figure = _figure("ladder", caption, "Error of each model in turn", plot_ladder, steps, small=True)
     return Section("ladder", "The error falls", [sentence(steps.text)], (), [figure], [ladder_table(steps)])
 
 
