@@ -45,7 +45,8 @@ KNOWS = {
 }
 HOMES = {"matplotlib": "plots", "serial": "acquire", "typer": "cli", "jinja2": "reports.report",
          "rich": "cli numerics.parallel", "threadpoolctl": "numerics.parallel"}
-LATE = ("matplotlib", "serial", "typer", "jinja2", "rich", "pandas", "scipy.stats", "distributed", "threadpoolctl")
+LATE = ("matplotlib", "serial", "typer", "jinja2", "rich", "pandas", "distributed", "threadpoolctl",
+        "scipy.stats", "scipy.special", "scipy.optimize", "scipy.linalg", "scipy.fft", "scipy.sparse", "scipy.ndimage")
 FACES = {".", "effects", "integrate", "acquire", "plots", "cli"}  # their __init__ hands names on
 MOODS = {"held", "revival", "revived", "hardly", "endings", "ending", "beginning", "narrowing", "remedies", "surely",
          "judgement", "astray", "adrift", "favourite"}

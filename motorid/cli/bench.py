@@ -94,20 +94,17 @@ def _live(quiet: bool) -> Iterator[Callable[[Progress], None] | None]:
 
     console = Console(stderr=True)
     if not console.is_terminal:
-        yield _PlainProgress().show
+        due = [0.0]
+
+        def show(p: Progress) -> None:
+            if p.elapsed >= due[0]:
+                typer.echo(_line(p), err=True)
+                due[0] = p.elapsed + 5.0
+
+        yield show
         return
     with Live(console=console, refresh_per_second=4, transient=True) as live:
         yield lambda p: live.update(Text(_line(p)))
-
-
-class _PlainProgress:
-    def __init__(self) -> None:
-        self.next = 0.0
-
-    def show(self, p: Progress) -> None:
-        if p.elapsed >= self.next:
-            typer.echo(_line(p), err=True)
-            self.next = p.elapsed + 5.0
 
 
 def _line(p: Progress) -> str:

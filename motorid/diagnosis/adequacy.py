@@ -17,8 +17,8 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.special import chdtrc, stdtr
 
 from motorid.channels import channel_name
 from motorid.diagnosis.misspecification import best_form
@@ -203,7 +203,7 @@ def _shift_test(labels: Sequence[NDArray[np.intp]], residuals: Sequence[Array]) 
     surrogate = np.log(np.array(shares) + 1e-6)
     # Shares of surrogates are nearly log-normal; a tail beyond their number is read from that, Student's t.
     z = (np.log(actual + 1e-6) - surrogate.mean()) / max(float(surrogate.std(ddof=1)), 0.1)
-    return max(actual - float(np.exp(surrogate.mean())), 0.0), float(stdtr(8, -z))
+    return max(actual - float(np.exp(surrogate.mean())), 0.0), float(scipy.special.stdtr(8, -z))
 
 
 def _sums(labels: NDArray[np.intp], r: Array, count: int) -> Array:
@@ -220,7 +220,8 @@ def _score_tests(fit: Fit, scores: Sequence[Score]) -> list[dict[str, Any]]:
     for s in scores:
         pars = s.effect.parameters
         searched = SEARCHED if any(p.order for p in pars) else 1 + 3 * sum(bool(p.grid) for p in pars)
-        p = min(1.0, searched * float(chdtrc(len(pars), -s.effective * np.log1p(-min(s.drop, 1 - 1e-12)))))
+        chance = scipy.special.chdtrc(len(pars), -s.effective * np.log1p(-min(s.drop, 1 - 1e-12)))
+        p = min(1.0, searched * float(chance))
         found.append({"channel": None, "on": s.effect.name, "share": s.drop, "p": p})
     return found
 

@@ -22,9 +22,8 @@ from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.ndimage import maximum_filter1d
-from scipy.optimize import linprog
 
 from motorid.acquire.excitation import lfsr_bits, program
 from motorid.errors import OutOfTime, SimulationError, UsageError
@@ -329,7 +328,8 @@ class Driven:
         grid = replace(self, substeps=np.ones_like(self.substeps)).grid(levels)
         fine = ENGINE.prepare(self.system, grid, self.system.first_state(np.zeros(3), p), p, tolerance)
         moving = np.where(self.layout.jumps, 1, fine.substeps)  # while a jump of the voltage stays where it is
-        return replace(self, substeps=np.max([fine.substeps, maximum_filter1d(moving, ELSEWHERE), self.substeps], 0))
+        around = scipy.ndimage.maximum_filter1d(moving, ELSEWHERE)
+        return replace(self, substeps=np.max([fine.substeps, around, self.substeps], 0))
 
     def informs(self, response: Response) -> Array:
         """Return the information (k, k) on the parameters, old and new."""
@@ -564,7 +564,8 @@ def _linear_step(c: Array, values: Array, slopes: Array, rows: Sequence[Rows], r
             a.append(np.column_stack([sign * dy[at], np.zeros(at.sum())]))
             b.append(np.maximum(limit[at] - sign * y[at], 0.0))
     bounds = [(max(-1 - x, -radius), min(1 - x, radius)) for x in c] + [(None, None)]
-    done = linprog(np.append(np.zeros(len(c)), -1.0), np.vstack(a), np.concatenate(b), bounds=bounds, method="highs")
+    aim = np.append(np.zeros(len(c)), -1.0)
+    done = scipy.optimize.linprog(aim, np.vstack(a), np.concatenate(b), bounds=bounds, method="highs")
     return (np.zeros(len(c)), 0.0) if done.x is None else (done.x[:-1], float(done.x[-1] - values.min()))
 
 

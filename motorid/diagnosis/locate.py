@@ -7,8 +7,8 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.linalg import LinAlgError, solveh_banded
 
 from motorid.channels import UNITS
 from motorid.diagnosis.free_forms import Form
@@ -363,8 +363,8 @@ def _solve_blocks(diagonal: Array, below: Array, rhs: Array) -> Array:
             band[m + r - c, c : (n - 1) * m : m] = below[:, r, c]
     band[0] += 1e-12
     try:
-        z = solveh_banded(band, (rhs * scale).ravel(), lower=True, check_finite=False)
-    except LinAlgError:
+        z = scipy.linalg.solveh_banded(band, (rhs * scale).ravel(), lower=True, check_finite=False)
+    except np.linalg.LinAlgError:
         band[0] += 1e-6
-        z = solveh_banded(band, (rhs * scale).ravel(), lower=True, check_finite=False)
+        z = scipy.linalg.solveh_banded(band, (rhs * scale).ravel(), lower=True, check_finite=False)
     return z.reshape(n, m) * scale

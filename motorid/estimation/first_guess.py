@@ -10,9 +10,11 @@ the model's effects enter as further columns.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import combinations
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from motorid.channels import CHANNELS
 from motorid.model.model import Model, dc_motor
@@ -103,8 +105,6 @@ def _windowed(t: Array, columns: Sequence[Array], target: Array, windows: int = 
 
 def _solve(rows: list[tuple[Array, Array]], names: Sequence[str | Load], held: Mapping[Any, float]) -> dict[Any, float]:
     """Non-negative least squares with some coefficients known; zeros of the motor become small positive numbers."""
-    from scipy.optimize import lsq_linear, nnls  # slow to import, and not needed before
-
     a, b = np.vstack([r[0] for r in rows]), np.concatenate([r[1] for r in rows])
     known = [n in held for n in names]
     b = b - a[:, known] @ np.array([held[n] for n in names if n in held])
@@ -112,32 +112,36 @@ def _solve(rows: list[tuple[Array, Array]], names: Sequence[str | Load], held: M
     a = a[:, [not k for k in known]]
     if not free:
         return {n: held[n] for n in names}
-    norms = np.linalg.norm(a, axis=0)
-    norms = np.where(norms > 0, norms, 1.0)
+    norms = np.where((norms := np.linalg.norm(a, axis=0)) > 0, norms, 1.0)
     triangle: Array = np.asarray(np.linalg.qr(np.column_stack([a / norms, b]), mode="r"))
-    lowest = np.array([-np.inf if isinstance(n, Load) and n.signed else 0.0 for n in free])
-    if np.all(lowest == 0):
-        z, _ = nnls(triangle[:, :-1], triangle[:, -1])
-    else:
-        z = np.asarray(lsq_linear(triangle[:, :-1], triangle[:, -1], (lowest, np.inf), method="bvls").x)
+    signed = np.array([isinstance(n, Load) and n.signed for n in free])
+    z = _nonnegative(triangle[:, :-1], triangle[:, -1], signed)
     # A coefficient that comes out as zero starts where its term would carry a thousandth of the right-hand side.
     motor = np.array([isinstance(n, str) for n in free])
     z = np.where(motor, np.maximum(z, FLOOR * np.linalg.norm(b)), z) / norms
     return {n: held[n] for n in names if n in held} | dict(zip(free, z.tolist(), strict=True))
 
 
+def _nonnegative(a: Array, b: Array, signed: NDArray[np.bool_]) -> Array:
+    """Return the z (n,) of least ‖a z − b‖ of which only the `signed` may be negative.
+
+    Zeros are tried, the fewest first, until none would rather be positive. To import SciPy's `nnls` takes longer.
+    """
+    bound = np.flatnonzero(~signed)
+    for zero in (list(c) for k in range(len(bound) + 1) for c in combinations(bound, k)):
+        z, rest = np.zeros(len(signed)), np.delete(np.arange(len(signed)), zero)
+        z[rest] = np.linalg.lstsq(a[:, rest], b, rcond=None)[0]
+        if np.all(z[bound] >= 0) and np.all(a[:, zero].T @ (b - a @ z) <= 1e-9 * np.linalg.norm(b)):
+            return z
+    return np.zeros(len(signed))
+
+
 def _full(signals: list[dict], held: Mapping[str, float], loads: _Loads) -> dict[str, float]:
-    electrical, mechanical = [], []
-    for s in signals:
-        t, held_v = s["t"], "held" in s
-        qi, qw = integral(t, s["i"]), integral(t, s["omega"])
-        electrical.append(_windowed(t, [s["i"], qi, qw], integral(t, s["v"], held_v), 200))
-    found = _solve(electrical, ["L", "R", "K"], held)
-    for s in signals:
-        t = s["t"]
-        qi, qw = integral(t, s["i"]), integral(t, s["omega"])
-        known = [s["omega"], qw, *loads.integrals(s, {**found, "b": 0.0, "J": 1.0})]
-        mechanical.append(_windowed(t, known, found["K"] * qi))
+    moved = [(s, integral(s["t"], s["i"]), integral(s["t"], s["omega"])) for s in signals]
+    found = _solve([_windowed(s["t"], [s["i"], qi, qw], integral(s["t"], s["v"], "held" in s), 200)
+                    for s, qi, qw in moved], ["L", "R", "K"], held)
+    mechanical = [_windowed(s["t"], [s["omega"], qw, *loads.integrals(s, {**found, "b": 0.0, "J": 1.0})],
+                            found["K"] * qi) for s, qi, qw in moved]
     return found | loads.split(_solve(mechanical, ["J", "b", *loads.loads], held))
 
 

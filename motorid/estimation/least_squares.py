@@ -8,12 +8,12 @@ itself, which knows no problem, is `motorid.numerics.least_squares`.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
 
 from motorid.errors import FitError, ModelError, SimulationError
-from motorid.estimation.result import Failure
 from motorid.numerics.least_squares import LevenbergMarquardt, Solution, levenberg_marquardt
 from motorid.numerics.signals import Array
 from motorid.problem.problem import Problem
@@ -104,39 +104,24 @@ def start_cost(problem: Problem, refine: bool = True) -> float:
     return 0.5 * float(r @ r) if np.isfinite(r).all() else np.inf
 
 
-@dataclass(frozen=True, eq=False)
-class Race:
-    """What came of each start, in their order; one that failed is a value too."""
-
-    ends: tuple[Estimate | Failure, ...]
-
-    @property
-    def best(self) -> Estimate | None:
-        """The end of lowest cost, the first of equals; None if every start failed."""
-        return min((e for e in self.ends if isinstance(e, Estimate)), key=lambda e: e.cost, default=None)
-
-
 def race(problems: Iterable[Problem], effort: LevenbergMarquardt, *,
-         solve: Callable[[Problem, LevenbergMarquardt], Estimate] = least_squares) -> Race:
-    """Minimise the cost of each problem from the values of its model.
+         solve: Callable[[Problem, LevenbergMarquardt], Estimate] = least_squares) -> Estimate | None:
+    """Minimise the cost of each problem from the values of its model; return the lowest end, None if all failed.
 
     Parameters
     ----------
     problems : iterable of Problem
-        Costs are compared: on the same records, with the same weights.
+        Costs are compared: on the same records, with the same weights. Of equals the first wins.
     effort : LevenbergMarquardt
         `LOOK` for a few steps, `RACE` for nearly the whole way, `FINISH`.
     solve : callable
         How to minimise, e.g. `by_continuation`.
     """
-    return Race(tuple(_attempt(problem, effort, solve) for problem in problems))
-
-
-def _attempt(problem: Problem, effort: LevenbergMarquardt, solve: Callable[..., Estimate]) -> Estimate | Failure:
-    try:
-        return solve(problem, effort)
-    except FAILURES as error:
-        return Failure(problem.model.values, "failed", str(error))
+    ends = []
+    for problem in problems:
+        with suppress(*FAILURES):
+            ends.append(solve(problem, effort))
+    return min(ends, key=lambda e: e.cost, default=None)
 
 
 class _Refining:

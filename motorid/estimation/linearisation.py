@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
-from scipy.linalg import get_lapack_funcs
+import scipy
 
 from motorid.estimation.result import Fit
 from motorid.integrate.engine import Grid
@@ -22,8 +22,6 @@ from motorid.model.equations import System
 from motorid.numerics.autoregression import effective_samples
 from motorid.numerics.signals import Array
 from motorid.problem.runs import natural_sizes
-
-(TRIANGULAR,) = get_lapack_funcs(("tbtrs",), dtype=float)  # banded; SciPy has no other name for it
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,8 +43,8 @@ class Response:
         m, n, nx = pushes.shape
         right = np.zeros((m, n + 1, nx))
         right[:, 1:] = pushes
-        solved = TRIANGULAR(self._band, right.reshape(m, -1).T, uplo="L", diag="U", overwrite_b=True)[0]
-        return np.einsum("nyx,mnx->nym", self.c, solved.T.reshape(m, n + 1, nx), optimize=True)
+        solved = self._solved(right.reshape(m, -1).T).T.reshape(m, n + 1, nx)
+        return np.einsum("nyx,mnx->nym", self.c, solved, optimize=True)
 
     def pulled(self, weights: Array) -> Array:
         """Return by how much a push on each state at the end of each sample, (N-1, nx), moves the weighted outputs.
@@ -56,8 +54,11 @@ class Response:
         weights : ndarray, shape (N, ny)
         """
         right = np.einsum("nyx,ny->nx", self.c, weights)
-        solved = TRIANGULAR(self._band, right.reshape(-1, 1), uplo="L", trans="T", diag="U", overwrite_b=True)[0]
-        return np.asarray(solved).reshape(right.shape)[1:]
+        return self._solved(right.reshape(-1, 1), trans="T").reshape(right.shape)[1:]
+
+    def _solved(self, right: Array, **options: str) -> Array:
+        solve = scipy.linalg.get_lapack_funcs("tbtrs")  # triangular, banded: SciPy has no other name for it
+        return np.asarray(solve(self._band, right, uplo="L", diag="U", overwrite_b=True, **options)[0])
 
     @cached_property
     def _band(self) -> Array:
@@ -202,8 +203,6 @@ class Tangent:
 
     def explained(self, columns: Array, nonnegative: Sequence[bool]) -> Explained:
         """Return what `columns` (n, k) explain of the residual, those coefficients not negative that must not be."""
-        from scipy.optimize import nnls  # slow to import, and not needed before
-
         c = self.off(columns)
         norms = np.linalg.norm(c, axis=0)
         raw = np.linalg.norm(columns, axis=0)
@@ -213,7 +212,7 @@ class Tangent:
         signed = [j for j, positive in enumerate(nonnegative) if not positive]
         a = np.column_stack([c, -c[:, signed]])
         triangle = np.linalg.qr(np.column_stack([a, -self.residual]), mode="r")
-        z, rest = nnls(np.asarray(triangle)[:, :-1], np.asarray(triangle)[:, -1])
+        z, rest = scipy.optimize.nnls(np.asarray(triangle)[:, :-1], np.asarray(triangle)[:, -1])
         coefficients = z[: c.shape[1]].copy()
         coefficients[signed] -= z[c.shape[1] :]
         inside = float(self.residual @ self.residual)

@@ -109,7 +109,7 @@ def restore_collapsed(found: Estimate, effort: LevenbergMarquardt, callback: Cal
     back = {n: v for n, v in restored_values(parameters, named, sd).items() if v != values[n]}
     each = [{n: v} for n, v in back.items()][:MOST] if len(back) > 1 else []
     for changes in (back, *each) if back else ():
-        again = race([found.problem.start_at({**values, **changes})], effort).best
+        again = race([found.problem.start_at({**values, **changes})], effort)
         if again is not None and again.cost < found.cost - GAIN * sd**2:
             return replace(again, history=found.history + again.history)
     return found

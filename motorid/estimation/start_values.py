@@ -36,13 +36,13 @@ def with_start_values(problem: Problem) -> Problem:
     for effect, simple in inner.items():
         simpler = simpler.without(effect.name) + simple
     first = _shared_out(_guessed(problem.for_model(simpler)), simpler)
-    found = race([first], RACE, solve=by_continuation).best
+    found = race([first], RACE, solve=by_continuation)
     if found is None:
         return begin
     values = found.values
     for effect, simple in inner.items():
         values |= sizes_like(effect, max(found.values[p.name] for p in simple.parameters))
-    best = race([begin, begin.start_at(values)], LOOK).best
+    best = race([begin, begin.start_at(values)], LOOK)
     return begin if best is None else begin.start_at(best.values)
 
 
@@ -95,14 +95,14 @@ def _along_measured_angle(problem: Problem, asked: Model) -> Problem:
     led = problem.for_model(problem.model.with_(angle_input=True))
     for effect in problem.model.effects:
         led = _shaped(led, effect, asked)
-    found = race([led], RACE, solve=by_continuation).best
+    found = race([led], RACE, solve=by_continuation)
     if found is None:
         return problem
     other = problem.start_at(found.values)
     if all("theta" in r.outputs for r in problem.experiments):
         return min(other, problem, key=lambda p: start_cost(p, refine=False))
     # An integral drifts: where either leads decides.
-    best = race([other, problem], RACE, solve=by_continuation).best
+    best = race([other, problem], RACE, solve=by_continuation)
     return problem if best is None else problem.start_at(best.values)
 
 
@@ -114,7 +114,7 @@ def _shaped(problem: Problem, effect: Effect, asked: Model) -> Problem:
     shapes = list(_shapes(problem, effect, asked))
     if len(shapes) < 2:
         return problem
-    best = race([problem.start_at(s) for s in shapes], LOOK).best
+    best = race([problem.start_at(s) for s in shapes], LOOK)
     return problem if best is None else problem.start_at(best.values)
 
 
@@ -161,5 +161,5 @@ def _shared_out(problem: Problem, asked: Model) -> Problem:
         return problem
     others = [problem.start_at(first_guess(asked, runs, loaded=True, back_emf=share)) for share in BACK_EMF_SHARES]
     fixed = [p.for_model(p.model.fix("R")) for p in (problem, *others)]
-    best = race(fixed, RACE, solve=by_continuation).best
+    best = race(fixed, RACE, solve=by_continuation)
     return problem if best is None else problem.start_at(best.values)

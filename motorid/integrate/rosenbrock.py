@@ -146,7 +146,7 @@ class Stepper:
         if slopes is None:
             middle = len(traj.x) // 2
             slopes = np.abs(np.asarray(self.functions.out(traj.x[middle], grid.u[middle], p)[1]))
-        tops = np.abs(traj.y.T).max(axis=1)
+        tops = np.abs(np.ascontiguousarray(traj.y.T)).max(axis=1)  # long rows are quicker
         return np.where(slopes > 1e-6, tops[:, None] / np.maximum(slopes, 1e-6), 0.0).max(axis=0)
 
     @cached_property

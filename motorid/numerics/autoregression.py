@@ -10,10 +10,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from scipy.fft import next_fast_len
 
 from motorid.numerics.signals import Array, outlier_limit
 
@@ -61,22 +59,26 @@ def colour_of(parts: Sequence[Array], spent: float = 0.0) -> Colour:
     spent : float
         Degrees of freedom used up by the fit; they enlarge the variance.
     """
-    n = sum(int(np.isfinite(p).sum()) for p in parts)
+    counts = [int(np.isfinite(p).sum()) for p in parts]
+    n = sum(counts)
     most = max(min(HIGHEST_ORDER, int(10 * np.log10(max(n, 1))), n // 4, min(len(p) for p in parts) - 2), 0)
-    gamma = autocovariance(parts, most)
+    each = [autocovariance([p], max(most, len(p) // 2)) for p in parts]
+    gamma = sum((c * g[: most + 1] for c, g in zip(counts, each, strict=True)), np.zeros(most + 1)) / max(n, 1)
     if n < 3:
         return Colour(np.zeros(0), float(gamma[0]), 0.0)
     models = list(_levinson(gamma))
     a, innovation = min(models, key=lambda m: n * np.log(max(m[1], 1e-300)) + 2 * len(m[0]))
     inflation = n / max(n - spent, 1.0)
-    share = sum(effective_samples(p) for p in parts) / n
+    share = sum(_worth(c, g[: len(p) // 2 + 1]) for c, g, p in zip(counts, each, parts, strict=True)) / n
     return Colour(a, float(gamma[0]) * inflation, innovation * inflation, share)
 
 
 def weighed(jac: Array, gamma: Array) -> Array:
     """Return ``Jᵀ Γ J`` (k, k) for J (N, k), zero in rows of missing samples, and autocovariance (N,)."""
     n = len(jac)
-    size: Any = next_fast_len(2 * n - 1, True)  # SciPy's product with a Toeplitz matrix takes 2n − 1, prime or not
+    if not gamma[1:].any():
+        return gamma[0] * (jac.T @ jac)
+    size = min(p << ((2 * n - 2) // p).bit_length() for p in (1, 3, 5, 9, 15, 25, 27))  # 2n − 1 may be prime
     spectrum = np.fft.rfft(np.concatenate([gamma, np.zeros(size - 2 * n + 1), gamma[:0:-1]])).real
     return jac.T @ np.fft.irfft(spectrum[:, None] * np.fft.rfft(jac, size, axis=0), size, axis=0)[:n]
 
@@ -160,13 +162,16 @@ def effective_samples(r: Array) -> float:
     n coloured samples are worth n/(1+2Σρ) independent ones (Bayley & Hammersley, J. R. Stat. Soc. Suppl. 8(2),
     1946), the sum ending at the first negative pair of autocorrelations (Geyer, Stat. Sci. 7(4), 1992).
     """
-    n = int(np.isfinite(r).sum())
-    if n < 8:
+    return _worth(int(np.isfinite(r).sum()), autocovariance([r], len(r) // 2))
+
+
+def _worth(n: int, gamma: Array) -> float:
+    """Return how many independent samples `n` of this autocovariance are worth."""
+    if n < 8 or gamma[0] <= 0:
         return float(n)
-    rho = autocorrelation(r, len(r) // 2)
-    pairs = rho[1 : len(rho) - (len(rho) - 1) % 2].reshape(-1, 2).sum(axis=1)
+    pairs = gamma[1 : len(gamma) - (len(gamma) - 1) % 2].reshape(-1, 2).sum(axis=1)
     stop = int(np.argmax(pairs < 0)) if (pairs < 0).any() else len(pairs)
-    return float(np.clip(n / (1 + 2 * pairs[:stop].sum()), 2.0, n))
+    return float(np.clip(n / (1 + 2 * pairs[:stop].sum() / gamma[0]), 2.0, n))
 
 
 def _levinson(gamma: Array) -> Iterator[tuple[Array, float]]:

@@ -24,7 +24,7 @@ from concurrent.futures import ProcessPoolExecutor
 from contextlib import AbstractContextManager, ContextDecorator, contextmanager, suppress
 from contextvars import ContextVar
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import lru_cache, partial
 from importlib.util import find_spec
 from typing import Any, NamedTuple
 
@@ -173,15 +173,9 @@ def processes(jobs: int) -> Iterator[Map | None]:
             pool.shutdown(wait=not interruption.told, cancel_futures=True)
 
 
-@dataclass(frozen=True)
-class _OnOneThread:
-    """A task's function with one thread for its linear algebra, in whatever process it runs."""
-
-    function: Callable[[Any], Any]
-
-    def __call__(self, task: Any) -> Any:
-        with one_thread:
-            return self.function(task)
+def _on_one_thread(function: Callable[[Any], Any], task: Any) -> Any:
+    with one_thread:  # for its linear algebra, in whatever process it runs
+        return function(task)
 
 
 @dataclass(frozen=True)
@@ -238,7 +232,7 @@ def run_tasks(function: Callable[[Any], Any], tasks: Sequence[Any], map: Map | N
         Called with every result as it comes, for instance to save it.
     """
     results: list[Any] = []
-    function = _OnOneThread(function)
+    function = partial(_on_one_thread, function)
     with progress(text, total=len(tasks), quiet=quiet) as advance:
         try:
             for way in ([map] if map is not None else []) + [builtins.map]:

@@ -84,7 +84,7 @@ def quantum(y: ArrayLike) -> float:
     jumps = jumps[jumps > 1e-9 * np.abs(values).max(initial=0.0)]
     if len(jumps) < 20:
         return 0.0
-    guesses = np.unique(np.quantile(jumps, np.arange(0.02, 0.98, 0.04), method="nearest"))[::-1]
+    guesses = np.unique(np.sort(jumps)[np.rint(np.arange(0.02, 0.98, 0.04) * (len(jumps) - 1)).astype(int)])[::-1]
     for guess in guesses[_plausible(jumps, guesses)]:
         step = float(np.median(jumps[np.abs(jumps / guess - 1) < 0.2]))  # rounding in the file blurs it
         steps = jumps / step
@@ -149,29 +149,30 @@ def _floor(values: Array) -> float:
 
 
 def _from_differences(values: Array, times: Array, step: float) -> float:
-    level = np.inf
+    level, gaps, still = np.inf, np.diff(times), np.diff(values) == 0
+    even = gaps.size > 0 and np.ptp(gaps) < _EVEN * gaps.mean()
     for order in ORDERS:
-        finer = _of_order(values, times, order, step)
+        finer = _of_order(values, None if even else times, still, order, step)
         if finer > 0.85 * level:  # no more signal was removed: what is left is noise
             return level
         level = finer
     return level if np.isfinite(level) else 0.0
 
 
-def _of_order(values: Array, times: Array, order: int, step: float) -> float:
-    """Robust noise level from differences of one order; 0.0 if there are too few."""
+def _of_order(values: Array, times: Array | None, still: NDArray[np.bool_], order: int, step: float) -> float:
+    """Robust noise level from differences of one order; 0.0 if there are too few. No `times`: evenly spaced."""
     if len(values) < order + 4:
         return 0.0
-    live, same = ~_at_rest(values, order), sliding_window_view(np.diff(values) == 0, order)
-    gaps = np.diff(times)
-    if np.ptp(gaps) < _EVEN * gaps.mean():
-        size = np.abs(np.correlate(values - values[0], _weights(times[None, : order + 1])[0], "valid"))
+    if times is None:
+        whole, size = slice(None), np.abs(np.correlate(values - values[0], _EVENLY[order], "valid"))
     else:
         t, y = sliding_window_view(times, order + 1), sliding_window_view(values, order + 1)
         span = t[:, -1] - t[:, 0]
         whole = span < 2.5 * np.median(span)  # not across a gap
-        live, same = live[whole], same[whole]
         size = np.abs(np.sum(_weights(t[whole]) * (y - y[:, :1])[whole], axis=1))
+    if not still.any():
+        return _typical(size)
+    live, same = ~_at_rest(still, order)[whole], sliding_window_view(still, order)[whole]
     if not live.any():
         return 0.0
     return _typical(size if step and same[live].mean() > _DITHERED else size[live])
@@ -185,9 +186,12 @@ def _weights(t: Array) -> Array:
     return weights / np.linalg.norm(weights, axis=1, keepdims=True)
 
 
-def _at_rest(values: Array, order: int) -> NDArray[np.bool_]:
+_EVENLY = {order: _weights(np.arange(order + 1.0)[None])[0] for order in ORDERS}
+
+
+def _at_rest(still: NDArray[np.bool_], order: int) -> NDArray[np.bool_]:
     """Tell which windows of order + 1 samples lie in a standstill, where nothing changes at all."""
-    stretch = np.r_[0, np.cumsum(np.diff(values) != 0)]
+    stretch = np.r_[0, np.cumsum(~still)]
     first, last = stretch[:-order], stretch[order:]
     return (first == last) & (np.bincount(stretch)[first] >= _REST)
 

@@ -306,14 +306,16 @@ class _Sizes(NamedTuple):
 
 def _sizes_of(run: Experiment) -> _Sizes:
     if run not in _sizes:
-        v, (i, omega, theta) = run.inputs.get("v", np.zeros(1)), (run.outputs.get(c) for c in CHANNELS)
-        speeds = omega if omega is not None else window_slopes(run.t, theta) if theta is not None else np.zeros(1)
+        v = run.inputs.get("v", np.zeros(1))
+        i, omega, theta = (None if (y := run.outputs.get(c)) is None else y[np.isfinite(y)] for c in CHANNELS)
+        slopes = np.zeros(1) if theta is None else window_slopes(run.t, run.outputs["theta"])
+        speeds = slopes if omega is None else omega
         _sizes[run] = _Sizes(float(np.abs(v).max()),
-                             float(np.nanpercentile(np.abs(speeds), 99.5)) if speeds.size else 0.0,
-                             None if i is None else float(np.nanpercentile(np.abs(i), 99.5)),
-                             None if theta is None else float(np.nanmax(theta) - np.nanmin(theta)),
-                             float(np.mean(v**2)), None if i is None else float(np.nanmean(i**2)),
-                             {c: float(np.nanstd(y)) for c, y in run.outputs.items()})
+                             float(np.percentile(np.abs(speeds), 99.5)) if speeds.size else 0.0,
+                             None if i is None else float(np.percentile(np.abs(i), 99.5)),
+                             None if theta is None else float(np.ptp(theta)),
+                             float(np.mean(v**2)), None if i is None else float(np.mean(i**2)),
+                             {c: float(np.std(y[np.isfinite(y)])) for c, y in run.outputs.items()})
     return _sizes[run]
 
 

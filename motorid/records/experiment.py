@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from itertools import pairwise
 from numbers import Real
 from types import MappingProxyType
@@ -94,7 +95,7 @@ class Experiment(Shown):
         """Number of samples."""
         return len(self.t)
 
-    @property
+    @cached_property
     def dt(self) -> float:
         """Median time between samples, in s."""
         return float(np.median(np.diff(self.t)))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from itertools import pairwise
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from motorid.errors import UsageError
@@ -49,9 +50,7 @@ def running_median(v: Array, samples: int) -> Array:
         raise UsageError(f"running_median() takes an odd number of samples, 1 or more; got {samples!r}.")
     if samples > len(v):
         raise UsageError(f"a running median over {samples} samples is longer than the record of {len(v)}.")
-    from scipy.ndimage import median_filter
-
-    return median_filter(v, int(samples), mode="nearest")
+    return scipy.ndimage.median_filter(v, int(samples), mode="nearest")
 
 
 def levelled(v: Array) -> Array:

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.special import stdtrit
+import scipy
 
 from motorid.channels import CHANNELS
 from motorid.display.cards import Table
@@ -293,7 +293,7 @@ def outliers(rows: Sequence[Mapping[str, Any]], names: Sequence[str], positive: 
         std = np.array([r[f"{n}_std"] for r in known], float)
         x, sd = (np.log(value), std / value) if n in positive else (value, std)
         z = scores(x, sd)
-        limit = float(stdtrit(max(len(known) - 2, 1), 1 - level / (2 * len(known) * len(names))))
+        limit = float(scipy.special.stdtrit(max(len(known) - 2, 1), 1 - level / (2 * len(known) * len(names))))
         for j in np.flatnonzero(np.abs(z) > limit):
             middle = float(np.median(value))
             side = "above" if z[j] > 0 else "below"

@@ -8,7 +8,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from scipy.special import stdtrit
+import scipy
 
 from motorid.channels import channel_name
 from motorid.display.cards import Card, Cell, Flag, Printed, Table, value_cell
@@ -86,7 +86,7 @@ class Covariance(Printed):
         sd, j = self.std[name], self.names.index(name)
         if sd is None:
             return None
-        reach = float(stdtrit(self.dof, 0.5 + level / 2)) * sd
+        reach = float(scipy.special.stdtrit(self.dof, 0.5 + level / 2)) * sd
         value = float(self.values[j])
         if self.positive[j] and reach > WIDE * value:
             return value * float(np.exp(-reach / value)), value * float(np.exp(reach / value))

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.special import stdtrit
+import scipy
 
 from motorid.display.cards import Card, Flag, Printed, Table
 from motorid.display.numbers import interval_text, percent, quantity
@@ -70,7 +70,7 @@ class Profile(Printed):
     def interval(self, level: float = 0.95) -> tuple[float, float]:
         """Return where the profile crosses the level; an open end is infinite (0 below for positive ones)."""
         check_level(level)
-        reach = float(stdtrit(self.dof, 0.5 + level / 2))
+        reach = float(scipy.special.stdtrit(self.dof, 0.5 + level / 2))
         start = int(np.argmin(np.abs(self.values - self.value)))
         low = _crossing(self._scale(self.values[start::-1]), self.rise[start::-1], reach)
         high = _crossing(self._scale(self.values[start:]), self.rise[start:], reach)
@@ -186,7 +186,7 @@ def _plan(fit: Fit, name: str, level: float) -> tuple[float, float, float, float
     sd = found.std[name]
     factor = float(found.matrix[j, j] / plain[j, j]) if sd else float(overall)
     step = float(np.clip(0.7 * sd / abs(slope), 1e-6, 0.5)) if sd else 0.25
-    height = 1.3 * float(stdtrit(found.dof, 0.5 + level / 2)) ** 2
+    height = 1.3 * float(scipy.special.stdtrit(found.dof, 0.5 + level / 2)) ** 2
     return step, factor, height, found.dof
 
 

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy import sparse
-from scipy.sparse.linalg import splu
+import scipy
 
 from motorid.errors import SimulationError, UsageError, one_of
 from motorid.estimation.shooting.mesh import Mesh
@@ -135,9 +134,9 @@ def reduced(mesh: Mesh, z: Array) -> tuple[Array, Array]:
                            for a, b in zip(starts[:-1], blocks, strict=True)])
     columns = np.concatenate([np.tile(b.columns, len(b.values)) for b in blocks])
     entries = np.concatenate([b.jac.ravel() for b in blocks])
-    whole = sparse.csc_matrix((entries, (rows, columns)), shape=(int(starts[-1]), len(z)))
+    whole = scipy.sparse.csc_matrix((entries, (rows, columns)), shape=(int(starts[-1]), len(z)))
     residual = np.concatenate([b.values for b in blocks])
     jac, nodes = whole[:, :mesh.nq].toarray(), whole[:, mesh.nq:]
     if not nodes.shape[1]:
         return residual, jac
-    return residual, jac - nodes @ splu((nodes.T @ nodes).tocsc()).solve(nodes.T @ jac)
+    return residual, jac - nodes @ scipy.sparse.linalg.splu((nodes.T @ nodes).tocsc()).solve(nodes.T @ jac)
