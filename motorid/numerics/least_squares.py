@@ -256,7 +256,7 @@ def _reduce(jac: Array, r: Array) -> tuple[Array, Array]:
         size = np.sqrt(np.diag(gram))
         triangle = np.linalg.cholesky(gram / size / size[:, None]).T
         if np.diag(triangle).min(initial=1.0) > WELL:
-            return triangle * size, np.asarray(np.linalg.solve(triangle.T, jac.T @ r / size))
+            return np.asarray(triangle * size, float), np.asarray(np.linalg.solve(triangle.T, jac.T @ r / size), float)
     full: Array = np.asarray(np.linalg.qr(np.column_stack([jac, r]), mode="r"))
     n = jac.shape[1]
     if full.shape[0] < n:  # fewer residuals than unknowns
