@@ -37,13 +37,7 @@ def model_dict(model: Model) -> dict[str, Any]:
 
 
 def problem_dict(problem: Problem) -> dict[str, Any]:
-    """Return a problem as plain data: the records, made ready as they are, and what is asked of them.
-
-    Raises
-    ------
-    UsageError
-        If it holds functions of the user's own, which plain data cannot.
-    """
+    """Return a problem as plain data: the records, made ready as they are, and what is asked of them."""
     model = problem.model
     given = {e.name: {p.name: p.value for p in e.parameters if p.given} for e in model.effects}
     return {"parameters": {n: {f: getattr(p, f) for f in KEPT} for n, p in model.parameters.items()},
@@ -117,13 +111,6 @@ def model_from_json(contents: Mapping[str, Any], effects: Iterable[Effect] = ())
         Needs ``model.base``, ``model.effects`` and ``parameters``; more does no harm.
     effects : sequence of Effect, optional
         Effects of your own that the model uses; they go before the library's of the same name.
-
-    Raises
-    ------
-    DataError
-        If something is missing in `contents`.
-    ModelError
-        If an effect is not known.
     """
     try:
         head, pars = dict(contents["model"]), dict(contents["parameters"])

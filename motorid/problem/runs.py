@@ -126,11 +126,6 @@ def initial_state(run: Experiment, sigma: Mapping[str, float], initial: str) -> 
     first sample is as noisy as any), unless it is free of noise. Estimates stay within what the first samples
     allow, so that a model which lacks something cannot hide it in an initial state that never was.
     ``estimate``: everything, without limits.
-
-    Raises
-    ------
-    UsageError
-        If `initial` is none of ``auto``, ``rest``, ``measured``, ``estimate``.
     """
     if initial not in INITIAL:
         raise UsageError(one_of(initial, INITIAL, "initial state"))

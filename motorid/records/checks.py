@@ -381,6 +381,19 @@ def implied_constants(run: Experiment) -> str | None:
     return None
 
 
+def _offset(run: Experiment) -> str | None:
+    """At rest and without a voltage no current flows."""
+    i, omega, v = run.outputs.get("i"), run.outputs.get("omega"), run.inputs["v"]
+    if i is None or omega is None or run.units["v"] != "V":
+        return None
+    rest = (v == 0) & np.isfinite(i) & (np.abs(omega) <= 3 * noise_level(omega, run.t))
+    level, most = float(np.median(i[rest])) if rest.sum() >= 20 else 0.0, float(np.nanmax(np.abs(i)))
+    if abs(level) <= max(0.01 * most, 5 * noise_level(i, run.t) / np.sqrt(max(rest.sum(), 1))):
+        return None
+    return (f"the current reads {level:.2g} {run.units['i']} at rest without a voltage, where none flows: an offset of "
+            "the sensor? Subtract it, or let the fit find it: mi.effects.current_offset.")
+
+
 def swapped_columns(run: Experiment) -> str | None:
     """Columns that fit the balances of a motor in another order; a speed that jumps and holds still."""
     omega = run.outputs.get("omega")
@@ -542,6 +555,6 @@ def _holds(values: Array) -> float:
 
 _CHECKS: tuple[Check, ...] = (
     signs, unsigned, unsigned_voltage, angle_against_speed, magnitudes, implied_constants, _one_column_for_two,
-    swapped_columns, _excitation, _missing, _clipped, current_limit, _coarse, _spikes, _noisy, _uneven, _slow_sampling,
-    _never_settles,
+    swapped_columns, _offset, _excitation, _missing, _clipped, current_limit, _coarse, _spikes, _noisy, _uneven,
+    _slow_sampling, _never_settles,
 )

@@ -456,3 +456,15 @@ def test_a_channel_given_twice_is_refused(option):
     done = motorid("check", mi.data_path("clean") / "run1.csv", option, pairs)
     assert done.status == 2
     assert "twice" in done.err
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.01, 0.2])
+def test_an_offset_of_the_current_is_seen_at_rest(rng, noise):
+    """At rest and without a voltage no current flows; less than the noise allows to see is not told."""
+    t = np.arange(0, 1.0, 1e-3)
+    plan = mi.planned(mi.dc_motor(**TRUE), t, np.select([t < 0.2, t < 0.6], [0.0, 6.0], -4.0))
+    top = np.abs(plan.outputs["i"]).max()
+    i, omega = (y + rng.normal(0, noise * np.ptp(y), t.shape) for y in (plan.outputs["i"], plan.outputs["omega"]))
+    for offset, told in ((0.0, False), (0.002, False), (0.2, True), (-0.2, True)):
+        run = plan.with_(outputs={"i": i + offset * top, "omega": omega})
+        assert ("current_offset" in " ".join(mi.check_runs([run]))) is told, offset
