@@ -6,6 +6,7 @@ import pandas as pd
 import pytest
 
 import motorid as mi
+from motorid.records.experiment import repeated
 
 STEPS = mi.data_path("two_step_small")
 
@@ -65,3 +66,5 @@ def test_records_may_be_data_frames(runs):
 def test_held_out_runs_that_were_fitted_are_remarked(runs, fit):
     found = mi.diagnose(fit, validate=runs[:1], effects=["coulomb"])
     assert f"{runs[0].name} is both fitted and held out" in found.text
+    halves = [runs[0].select(part) for part in (slice(0, runs[0].n // 2), slice(runs[0].n // 2, None))]
+    assert not repeated(halves[:1], halves[1:]), "parts of one file are not the same record"

@@ -147,15 +147,19 @@ def _kept(old: Channels, new: Channels, channels: Channels) -> Channels:
 
 
 def _fall(old: Channels, new: Channels) -> float | None:
-    """Return the relative fall of the error, lone samples left aside, geometric mean over channels."""
+    """Return the relative fall of the error, lone samples left aside, geometric mean over channels and samples.
+
+    Each run counts by its length, not by its size: what a wide swing misses must not hide all others.
+    """
     both = [c for c in old if c in new]
-    return 1 - float(np.exp(np.mean([np.log(_rms(new[c]) / _rms(old[c])) for c in both]))) if both else None
+    return 1 - float(np.exp(np.mean([_log_rms(new[c]) - _log_rms(old[c]) for c in both]))) if both else None
 
 
-def _rms(errors: Errors) -> float:
-    """Return the RMS of errors without lone samples apart; a tenth of the noise is as good as none."""
-    r = np.concatenate([despiked(v) for v in errors.values])
-    return float(np.sqrt(np.mean(r**2) + (0.1 * errors.noise) ** 2)) + 1e-300
+def _log_rms(errors: Errors) -> float:
+    """Return the logarithm of the RMS of errors, mean over runs; a tenth of the noise is as good as none."""
+    runs = [r for v in errors.values if len(r := despiked(v))]
+    logs = [0.5 * np.log(np.mean(r**2) + (0.1 * errors.noise) ** 2 + 1e-300) for r in runs]
+    return float(np.average(logs, weights=[len(r) for r in runs])) if runs else 0.0
 
 
 def _differences(old: Channels, new: Channels, lost: bool) -> Array:

@@ -161,8 +161,8 @@ def _better(children: Iterable[Node], best: Node) -> tuple[Node, list[Node]] | N
     What physics speaks against is taken only where nothing else helps.
     """
     for objected in (False, True):
-        chosen = choose([c for c in children if bool(c.objection) == objected], best)
-        if chosen is not None and beats(chosen[0], best):
+        chosen = choose([c for c in children if bool(c.objection) == objected and beats(c, best)], best)
+        if chosen is not None:
             return chosen
     return None
 

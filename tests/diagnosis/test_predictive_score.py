@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from battery.excite import driven, record
 
 import motorid as mi
+from motorid.diagnosis import stepwise
 from motorid.diagnosis.cross_validation import HeldOut
 from motorid.diagnosis.model_comparison import evidence, node_of
 from motorid.diagnosis.predictive_score import (
@@ -189,6 +191,21 @@ def test_held_out_runs_refuse_what_their_error_or_the_score_says_is_worse(rng):
     assert spoiled.worse_there  # one peak outweighs all other blocks only in the RMS
 
 
+def test_what_a_wide_swing_misses_does_not_hide_the_other_held_out_runs(rng):
+    """Each run counts by its length: a rise of 14 % of a large error, a fall of a third of a small one."""
+    r, slow = rng.normal(size=1000), np.sin(np.arange(1000) / 150)
+
+    def held_out(fitted, swing, calm):
+        theta = Errors((10 * swing * slow, calm * slow[::-1]), tuple(blocks_of([1000, 1000])), 1e3, 0.0)
+        return Predictions(errors(i=fitted), {"theta": theta})
+
+    old = held_out(r, 1.0, 1.0)
+    mixed, worse = compare(old, held_out(0.4 * r, 1.14, 0.67)), compare(old, held_out(0.4 * r, 1.14, 1.0))
+    assert mixed.held_out_fall == pytest.approx(1 - np.sqrt(1.14 * 0.67), abs=0.01)
+    assert mixed.worth_it
+    assert not worse.worth_it
+
+
 def test_ratios_of_errors_far_below_the_noise_do_not_count(rng):
     r = 1e-6 * rng.normal(size=1000)
     old, new = (Predictions(errors(noise=1.0, i=e), {}) for e in (r, r / 100))
@@ -322,3 +339,16 @@ def test_an_order_that_was_searched_for_is_paid_for():
     cogs = replace(bare, fit=replace(fit, problem=fit.problem.with_(model=fit.model + mi.effects.cogging)))
     assert evidence(bare, cogs).gain == pytest.approx(-np.log(SEARCHED))
     assert evidence(cogs, bare).gain == pytest.approx(np.log(SEARCHED))
+
+
+def test_a_child_that_may_not_be_taken_does_not_keep_a_worse_one_out(rng):
+    """What gains most may come from another model of the beam, and predict held-out runs worse than the best."""
+    r, h = rng.normal(size=(2, 1000))
+
+    def node(added, fitted, held_out):
+        return SimpleNamespace(added=added, size=6, search=0.0, objection="", predictions=both(fitted, held_out))
+
+    best, refused, sound = node("coulomb", r, h), node("gravity", 0.2 * r, 1.5 * h), node("cogging", 0.5 * r, 0.9 * h)
+    chosen, _ = stepwise._better([refused, sound], best)
+    assert chosen is sound
+    assert stepwise._better([refused], best) is None
