@@ -68,3 +68,11 @@ def test_held_out_runs_that_were_fitted_are_remarked(runs, fit):
     assert f"{runs[0].name} is both fitted and held out" in found.text
     halves = [runs[0].select(part) for part in (slice(0, runs[0].n // 2), slice(runs[0].n // 2, None))]
     assert not repeated(halves[:1], halves[1:]), "parts of one file are not the same record"
+
+
+def test_results_print_their_tables(runs, fit):
+    for shown, said in ((mi.compare([fit]), "current"), (mi.evaluate(fit, runs[:1]), "current")):
+        assert said in str(shown)
+        assert "─" in str(shown), "a table"
+        assert repr(shown).startswith("<")
+        assert "\n" not in repr(shown)

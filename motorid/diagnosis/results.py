@@ -9,7 +9,7 @@ from typing import Any
 from motorid.channels import UNITS, channel_name
 from motorid.diagnosis.design_criteria import Rival
 from motorid.diagnosis.remainder import Remainder
-from motorid.display.cards import Card, Cell, Flag, Shown, Table
+from motorid.display.cards import Card, Cell, Flag, Printed, Shown, Table
 from motorid.display.numbers import number, percent, quantity
 from motorid.estimation.result import Fit, parameter_table
 from motorid.numerics.signals import Array
@@ -189,7 +189,7 @@ class Rung:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Ladder(Shown):
+class Ladder(Printed):
     """Models of growing detail, training and held-out error of each, and why it stopped."""
 
     rungs: tuple[Rung, ...]

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from motorid.channels import channel_name
-from motorid.display.cards import Card, Cell, Flag, Shown, Table
+from motorid.display.cards import Card, Cell, Flag, Printed, Shown, Table
 from motorid.display.numbers import counted, duration, number, percent, quantity, sentence, with_error
 from motorid.errors import UsageError, name_of
 from motorid.estimation.covariance import Certainty, Quantity, certainty, combinations
@@ -442,7 +442,7 @@ def constraint_table(fit: Fit, violations: Mapping[str, float] = MappingProxyTyp
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Comparison(Shown):
+class Comparison(Printed):
     """Fits side by side: errors on their records, held-out errors, how the parameters moved.
 
     Attributes
