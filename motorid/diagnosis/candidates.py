@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from motorid.diagnosis.admissibility import objections
+from motorid.diagnosis.admissibility import even, objections
 from motorid.diagnosis.cross_validation import HeldOut
 from motorid.diagnosis.misspecification import LIMITER
 from motorid.diagnosis.model_comparison import COMMON, Node, beats, evidence, far, node_of, superfluous
@@ -302,7 +302,8 @@ class Search:
             smaller = simpler if alone else [*simpler, *_without(node.fit.model, e.name)]
             for model in sorted(smaller, key=lambda m: len(m.free_names)):
                 other = self.smaller(node, model)
-                if other is not None and superfluous(node, other) and beats(other, before):
+                no_more = model in simpler and even(node.fit, e)
+                if other is not None and (no_more or superfluous(node, other)) and beats(other, before):
                     return self.pruned(other, before)
         return node
 
@@ -391,7 +392,8 @@ def _said(found: Evidence) -> str:
         rises = f"the held-out error rises by {-100 * found.held_out_fall:.1f} %"
         return rises if found.held_out_fall < 0 else "most of the held-out samples are predicted worse"
     if not found.sure:
-        return f"no better than chance (gain {found.gain:.1f} ± {found.se:.1f})"
+        size = f" (gain {found.gain:.1f} ± {found.se:.1f})" if abs(found.gain) >= 0.05 else ""
+        return f"no better than {'chance' if size else 'without it'}{size}"
     if not found.worth_it:
         return f"lowers the {where} by less than {100 * MATERIAL:g} %"
     there = found.held_out_fall or 0.0

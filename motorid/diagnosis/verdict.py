@@ -78,10 +78,12 @@ def approximations_text(grades: Sequence[Grade]) -> str:
                     for why, names in reasons.items())
 
 
-def missing_text(
-    rungs: Sequence[Rung], remaining: Adequacy, groups: Sequence[Sequence[str]], grades: Sequence[Grade]
-) -> str:
-    """Return the answer when effects were found: what, how large, what the error becomes, what remains."""
+def missing_text(rungs: Sequence[Rung], remaining: Adequacy, groups: Sequence[Sequence[str]],
+                 grades: Sequence[Grade], elsewhere: bool = False) -> str:
+    """Return the answer when effects were found: what, how large, what the error becomes, what remains.
+
+    `elsewhere`: the held-out runs are predicted far worse than the fitted ones.
+    """
     after = rungs[-1].fit
     names = [g.effect for g in grades if g.grade != "approximates"]
     parts = [f"Missing: {'; '.join(_described(after, n) for n in names)}."]
@@ -89,7 +91,8 @@ def missing_text(
     parts += [approximations_text(grades)] if len(names) < len(grades) else []
     parts.append(errors_text(rungs))
     left = remaining.text.removeprefix("Something is missing: ")
-    parts.append("What remains is noise." if remaining.adequate else f"Not everything is explained: {left}")
+    where = " on the fitted runs, not on the held-out ones" * elsewhere
+    parts.append(f"What remains is noise{where}." if remaining.adequate else f"Not everything is explained: {left}")
     return " ".join(parts)
 
 

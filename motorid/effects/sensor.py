@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import casadi as ca
 
 from motorid.model.definition import P, effect
@@ -27,14 +29,14 @@ def speed_lag(
 @effect(balance="sensor")
 def speed_delay(m: Equations,
                 T_d=P(5e-3, "s", null=0.0, positive=True, grid=(1.0, 4.0, 16.0), doc="delay of the speed measurement")):
-    """Delay of the speed measurement, Padé of orders 2 and 3. Golub & Van Loan, 2013, sec. 9.3."""
-    # (60 − 24Ts + 3T²s²)/(60 + 36Ts + 9T²s² + T³s³): with fewer zeros than poles, a jump does not pass at once.
-    reaching = m.measured("omega")
-    z = [m.state("omega_delayed", m.start["omega"]), m.state("omega_delayed_2"), m.state("omega_delayed_3")]
-    m.rate(z[0], z[1] / T_d)
-    m.rate(z[1], z[2] / T_d)
-    m.rate(z[2], (60 * (reaching - z[0]) - 36 * z[1] - 9 * z[2]) / T_d)
-    m.measure("omega", z[0] - 0.4 * z[1] + 0.05 * z[2])
+    """Delay of the speed measurement, Padé of orders 4 and 5. Golub & Van Loan, 2013, sec. 9.3."""
+    # With fewer zeros than poles a jump does not pass at once; x = Ts, (15120 − 6720x + …)/(15120 + 8400x + …).
+    reaching, z = m.measured("omega"), [m.state("omega_delayed", m.start["omega"])]
+    z += [m.state(f"omega_delayed_{k}") for k in range(2, 6)]
+    for slow, fast in pairwise(z):
+        m.rate(slow, fast / T_d)
+    m.rate(z[4], (15120 * (reaching - z[0]) - 8400 * z[1] - 2100 * z[2] - 300 * z[3] - 25 * z[4]) / T_d)
+    m.measure("omega", z[0] - (6720 * z[1] - 1260 * z[2] + 120 * z[3] - 5 * z[4]) / 15120)
 
 
 @effect(balance="sensor")
@@ -58,6 +60,7 @@ def speed_gain(m: Equations, k_w=P(0.01, "", null=0.0, lower=-0.9, upper=9.0, do
 
     Needs an angle, or fixed motor constants, to be distinguished from K and J.
     """
+    m.scale("smoothing", 1 / (1 + k_w))  # a width of the records: a scale of K and J must not sharpen friction
     m.measure("omega", m.measured("omega") * (1 + k_w))
 
 

@@ -43,6 +43,7 @@ class Equations:
         self.placeholders: dict[str, ca.SX] = {}
         self.definitions: dict[str, ca.SX] = {}
         self._replaced: dict[str, str] = {}
+        self.define("smoothing", 1)  # factor on the width of sgn
         if angle_input:
             self.define("zero", 0)  # of the measured angle
         self.voltage = ca.SX(0)
@@ -93,7 +94,7 @@ class Equations:
         """Return a smooth sgn(x); the width (rad/s) is chosen from the data, well below the slowest speed."""
         if self.sgn_width is None:
             self.sgn_width = ca.SX.sym("sgn_width")
-        return ca.tanh(x / self.sgn_width)
+        return ca.tanh(x / (self.sgn_width * self.smoothing))
 
     def measured(self, channel: str) -> ca.SX:
         """Return what the sensor of `channel` shows so far (several sensor effects follow one another)."""
@@ -178,36 +179,19 @@ class Equations:
 
 @dataclass(frozen=True, eq=False)
 class System:
-    """Functions of one model for one choice of outputs; holds no Python code and can be pickled.
+    """Functions of one model for one choice of outputs; holds no Python code and can be pickled."""
 
-    Attributes
-    ----------
-    states, inputs, outputs, parameters : tuple of str
-        Names, in the order of the vectors x, u, y, p.
-    stored : tuple of bool
-        Per state: True for a differential equation, False for an algebraic balance (zero storage).
-    rhs : casadi.Function
-        ``(x, u, p) -> f``: dx/dt of differential states, the balance itself of algebraic ones.
-    out : casadi.Function
-        ``(x, u, p) -> y``: what the sensors show.
-    initial : casadi.Function
-        ``(s, p) -> x0`` with s = (i, omega, theta) at the first sample.
-    balances : casadi.Function
-        ``(x, u, p) -> (voltage, torque)`` left over, V and N·m, at zero rates.
-    forces : casadi.Function
-        ``(x, u, p, d) -> f`` with d = (voltage, torque) added to the balances: `diagnose`'s unknown inputs.
-    """
-
+    # Names, in the order of the vectors x, u, y, p.
     states: tuple[str, ...]
     inputs: tuple[str, ...]
     outputs: tuple[str, ...]
     parameters: tuple[str, ...]
-    stored: tuple[bool, ...]
-    rhs: ca.Function
-    out: ca.Function
-    initial: ca.Function
-    balances: ca.Function
-    forces: ca.Function
+    stored: tuple[bool, ...]  # per state: a differential equation, or an algebraic balance (zero storage)
+    rhs: ca.Function  # (x, u, p) -> f: dx/dt of differential states, the balance itself of algebraic ones
+    out: ca.Function  # (x, u, p) -> y: what the sensors show
+    initial: ca.Function  # (s, p) -> x0 with s = (i, omega, theta) at the first sample
+    balances: ca.Function  # (x, u, p) -> (voltage, torque) left over, V and N·m, at zero rates
+    forces: ca.Function  # (x, u, p, d) -> f with d = (voltage, torque) added to the balances, unknown inputs
 
     @property
     def sizes(self) -> tuple[int, int, int, int]:

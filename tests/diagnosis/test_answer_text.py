@@ -9,7 +9,7 @@ from battery.excite import driven, record
 
 import motorid as mi
 from motorid.diagnosis.results import Rung
-from motorid.diagnosis.verdict import errors_text, rises_text
+from motorid.diagnosis.verdict import errors_text, missing_text, rises_text
 
 
 def rungs_of(*errors, held_out=None, misfit=1.0):
@@ -32,6 +32,14 @@ def test_a_rise_of_a_noisy_channel_is_said_once_and_with_its_reason():
 def test_an_error_that_is_printed_alike_stays():
     rungs = rungs_of((0.01991, 0.214), (0.01992, 0.0197))
     assert errors_text(rungs).startswith("Error: speed 21.4 → 1.97 %, current stays 1.99 %.")
+
+
+@pytest.mark.parametrize(("elsewhere", "said"), [
+    (False, "What remains is noise."), (True, "What remains is noise on the fitted runs, not on the held-out ones.")])
+def test_noise_that_remains_is_where_it_remains(elsewhere, said):
+    rungs = rungs_of((0.02, 0.2), (0.02, 0.02), held_out=((0.02, 0.2), (0.02, 0.19)))
+    noise = SimpleNamespace(adequate=True, text="")
+    assert missing_text(rungs, noise, (), (), elsewhere).endswith(said)
 
 
 def test_a_rise_that_matters_is_beside_the_fall_of_all_and_its_rung_is_named():

@@ -11,7 +11,7 @@ from battery.excite import driven, record
 import motorid as mi
 from motorid.diagnosis import candidates
 from motorid.diagnosis import record_parts as parts
-from motorid.diagnosis.admissibility import objections, samples_within, unresolved
+from motorid.diagnosis.admissibility import even, objections, samples_within, unresolved
 from motorid.diagnosis.candidates import Search, Stages, library
 from motorid.diagnosis.model_comparison import node_of
 from motorid.diagnosis.score_test import score
@@ -87,6 +87,23 @@ def test_an_offset_beside_two_frictions_is_refused_and_said(lab):
 def test_an_offset_beside_one_friction_is_told(rubbing):
     fit = mi.fit(mi.dc_motor() + mi.effects.coulomb, rubbing)
     assert score(Tangent.of(fit), LIBRARY["constant_load"]).same_as == ()
+
+
+def test_a_scale_of_the_speed_cannot_sharpen_a_friction_where_no_angle_tells_it(lab):
+    """It scales K, b and J alone, and not the width of the smooth sgn: else friction as hard as real buys it."""
+    runs = runs_of(lab, {"coulomb": {"tau_c": 8e-3}}, ("stairs", "steps"), channels=("i", "omega"))
+    fit = mi.fit(mi.dc_motor() + mi.effects.coulomb, runs)
+    found = score(Tangent.of(fit), LIBRARY["speed_gain"])
+    assert found.drop == 0
+    assert {"K", "tau_c"} <= set(found.same_as)
+
+
+def test_two_frictions_that_are_alike_are_one(rubbing):
+    asymmetric = mi.effects.coulomb_asymmetric
+    wide = mi.fit(mi.dc_motor() + asymmetric, rubbing)
+    assert even(wide, asymmetric)
+    apart = replace(wide, values={**wide.values, "tau_cp": 1.2 * wide.values["tau_cn"]})
+    assert not even(apart, asymmetric)
 
 
 @pytest.mark.slow
