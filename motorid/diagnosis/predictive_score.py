@@ -77,28 +77,13 @@ class Predictions:
 
 @dataclass(frozen=True)
 class Evidence:
-    """One model against another.
+    """One model against another."""
 
-    Attributes
-    ----------
-    gain : float
-        Difference of the log predictive densities (nats), positive for the new one.
-    se : float
-        Its standard error.
-    fall : float
-        Relative fall of the prediction error, geometric mean over channels: on held-out runs where they say something,
-        else on blocks left out.
-    held_out_fall : float or None
-        The same on held-out runs; None without any, or where both models lose them.
-    worse_there : bool
-        Whether the new model surely predicts the held-out runs worse, by the score or by their error.
-    """
-
-    gain: float
-    se: float
-    fall: float
-    held_out_fall: float | None = None
-    worse_there: bool = False
+    gain: float  # difference of the log predictive densities (nats), positive for the new one
+    se: float  # its standard error
+    fall: float  # of the prediction error, geometric mean over channels: where held-out runs say something, of theirs
+    held_out_fall: float | None = None  # the same on held-out runs; None without any, or where both models lose them
+    worse_there: bool = False  # the new model surely predicts the held-out runs worse, by the score or by their error
 
     @property
     def sure(self) -> bool:

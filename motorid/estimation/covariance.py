@@ -33,6 +33,7 @@ from motorid.problem.runs import natural_sizes
 
 UNDETERMINED = 0.5  # relative standard deviation: beyond it the 95 % interval of a size reaches zero
 WIDEST = 10.0  # of a solver coordinate, most of them logarithms: beyond a factor of 20,000 slopes mean nothing
+ROUNDING = 1e-13  # of the largest influence on the outputs: a smaller one is an error of the arithmetic
 BLIND = 1e-3  # of a relative change: a quantity that shifts so much along a direction without influence is as open
 Law = Callable[[Mapping[str, float]], float]
 Blocks = Mapping[str, Sequence[tuple[Array, Array]]]
@@ -83,8 +84,11 @@ def certainty(problem: Problem, q: Array, residuals: Array, jacobian: Array, fre
     basis = np.eye(len(loose))[:, loose] if free is None else free
     blocks = channel_blocks(problem, residuals, jacobian)
     colours = _colours(blocks, basis.shape[1], method)
+    unit = problem.scaling.slope(q)
+    influence = np.linalg.norm(jacobian * unit, axis=0)
+    jacobian = np.where(influence > ROUNDING * influence.max(initial=0.0), jacobian, 0.0)
     half, blind = seen_directions(jacobian @ basis)
-    unit, through = problem.scaling.slope(q), basis @ half
+    through = basis @ half
     matrix = through @ _meat(problem, jacobian, blocks, colours, through) @ through.T
     blind = np.linalg.qr((blind @ basis.T / unit).T)[0]
     open_ = np.array([_shifts(blind, e) for e in np.eye(len(loose))], bool) | _vague(problem, q, matrix)

@@ -101,6 +101,8 @@ def noise_of(runs: Sequence[Experiment], channels: Sequence[str]) -> dict[str, f
     for c in channels:
         each = [r.sigma.get(c) or _level(r, c) for r in runs if c in r.outputs]
         levels[c] = float(np.sqrt(np.mean(np.square(each))))
+        if not levels[c] > 0:
+            raise FloatingPointError(f"the square of the noise of {c}, {max(each):.3g}, is zero")
     return levels
 
 
