@@ -131,8 +131,15 @@ def test_a_value_whose_interval_reaches_zero_does_not_count_as_determined(runs):
 def test_two_columns_that_are_nearly_one_give_no_deviation_of_zero(plain, apart):
     """What rounding made of them once: a variance below zero, a deviation of 0, and both determined."""
     jac = plain.jacobian.copy()
-    shape = jac[:, 4] / np.abs(jac[:, 4]).max()
-    jac[:, 3] = 1e-9 * shape * (1 + apart * np.sin(np.arange(len(jac))))
+    jac[:, 3] = 1e-3 * jac[:, 4] * (1 + apart * np.sin(np.arange(len(jac))))
     known = certainty(plain.problem, plain.q, plain.residuals, jac)
     assert known.status[3:5] == ("not determined",) * 2
     assert np.all(np.diag(known.matrix) > 0)
+
+
+def test_a_slope_of_rounding_determines_nothing(plain):
+    jac = plain.jacobian.copy()
+    jac[:, 3] = 1e-16 * np.abs(jac[:, 4]).max() * np.random.default_rng(0).normal(size=len(jac))
+    tiny = certainty(plain.problem, plain.q, 1e-15 * plain.residuals, jac)
+    assert tiny.status[3] == "not determined"
+    assert tiny.status[0] == "determined"
