@@ -43,7 +43,7 @@ class Equations:
         self.placeholders: dict[str, ca.SX] = {}
         self.definitions: dict[str, ca.SX] = {}
         self._replaced: dict[str, str] = {}
-        self.define("smoothing", 1)  # factor on the width of sgn
+        self.define("smoothing", 1)  # factor on the width of sgn, which suits the speed as it is measured
         if angle_input:
             self.define("zero", 0)  # of the measured angle
         self.voltage = ca.SX(0)
@@ -163,16 +163,16 @@ class Equations:
         names = list(self.placeholders)
         symbols = [self.placeholders[n] for n in names]
         marks = {s.name() for s in symbols}
-        used: set[str] = set()
+        before, used = set[str](), set[str]()
         for _ in range(len(names) + 1):
-            used = set()
+            before, used = used, set()
             for e in expressions:
                 used |= {s.name() for s in ca.symvar(e)}
             if not used & marks:
                 return expressions
             definitions = ca.vertcat(*[self.definitions[n] for n in names])
             expressions = [ca.substitute(e, ca.vertcat(*symbols), definitions) for e in expressions]
-        circle = ", ".join(sorted(s[1:] for s in used & marks))
+        circle = ", ".join(sorted(s[1:] for s in (before | used) & marks))
         raise ModelError(f"the definitions of {circle} go in a circle: an effect scales or replaces a "
                          "quantity by an expression that needs that same quantity.")
 
@@ -261,6 +261,8 @@ def build_system(m: Equations, parameters: tuple[str, ...], outputs: tuple[str, 
         if not m.voltage.is_zero():
             raise ModelError("a torque-driven model has no voltage balance: leave the electrical effects "
                              "out, or use dc_motor() with a record of the applied voltage.")
+    if "omega" not in outputs:
+        m.definitions["smoothing"] = ca.SX(1)
     shown = [m.measured(c) for c in outputs]
     for name in m.states:
         if name not in ("i", "omega") and name not in m.rates:

@@ -16,6 +16,7 @@ from motorid.diagnosis.candidates import Search, Stages, library
 from motorid.diagnosis.model_comparison import node_of
 from motorid.diagnosis.score_test import score
 from motorid.effects import LIBRARY
+from motorid.errors import ModelError
 from motorid.estimation.angle_orders import likely_lines, spectrum
 from motorid.estimation.linearisation import Tangent
 from motorid.numerics.autoregression import Whitening
@@ -96,6 +97,8 @@ def test_a_scale_of_the_speed_cannot_sharpen_a_friction_where_no_angle_tells_it(
     found = score(Tangent.of(fit), LIBRARY["speed_gain"])
     assert found.drop == 0
     assert {"K", "tau_c"} <= set(found.same_as)
+    with pytest.raises(ModelError, match="cannot be seen"):
+        (mi.dc_motor() + mi.effects.coulomb + mi.effects.speed_gain).check_visible(("i", "theta"))
 
 
 def test_two_frictions_that_are_alike_are_one(rubbing):
