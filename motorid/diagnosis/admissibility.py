@@ -40,17 +40,6 @@ def objections(fit: Fit, added: Effect, before: Fit | None = None) -> str:
     return why or (_emptied(fit, added, before) if before else "")
 
 
-def even(fit: Fit, effect: Effect) -> bool:
-    """Tell whether an effect's two sizes are known and alike, within their deviations: a simpler one says the same."""
-    sizes = [p for p in effect.parameters if p.null == 0]
-    found = [(fit.values[p.name], fit.std[p.name]) for p in sizes]
-    known = [(v, s) for v, s in found if s is not None and s < KNOWN * abs(v)]
-    if len(known) != 2 or len(sizes) != 2 or sizes[0].unit != sizes[1].unit:
-        return False
-    (a, sa), (b, sb) = known
-    return bool(abs(a - b) < np.hypot(sa, sb))
-
-
 def _too_large(fit: Fit, pars: Sequence[Parameter]) -> str:
     """Say so where a voltage lost or added is of the size of what is applied: another parameter has paid for it."""
     top = max(float(np.abs(r.inputs["v"]).max()) for r in fit.problem.experiments)

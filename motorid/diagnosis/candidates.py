@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from motorid.diagnosis.admissibility import even, objections
+from motorid.diagnosis.admissibility import objections
 from motorid.diagnosis.cross_validation import HeldOut
 from motorid.diagnosis.misspecification import LIMITER
 from motorid.diagnosis.model_comparison import COMMON, Node, beats, evidence, far, node_of, superfluous
@@ -302,8 +302,7 @@ class Search:
             smaller = simpler if alone else [*simpler, *_without(node.fit.model, e.name)]
             for model in sorted(smaller, key=lambda m: len(m.free_names)):
                 other = self.smaller(node, model)
-                no_more = model in simpler and even(node.fit, e)
-                if other is not None and (no_more or superfluous(node, other)) and beats(other, before):
+                if other is not None and superfluous(node, other) and beats(other, before):
                     return self.pruned(other, before)
         return node
 

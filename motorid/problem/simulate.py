@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from motorid.channels import CHANNELS, UNITS, channel_name
-from motorid.display.cards import Card, Printed, Table
+from motorid.display.cards import Card, Shown, Table
 from motorid.display.numbers import counted, percent, quantity
 from motorid.errors import DataError, FitError, SimulationError, UsageError, name_of, positive
 from motorid.integrate.engine import Engine
@@ -53,7 +53,7 @@ class Simulation:
 
 
 @dataclass(frozen=True, eq=False)
-class Evaluation(Printed):
+class Evaluation(Shown):
     """How well values explain records: NRMSE and RMSE per channel, over all runs and run by run.
 
     NRMSE is RMSE divided by the RMS of the measured channel over the same samples.
