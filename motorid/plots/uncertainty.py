@@ -261,7 +261,7 @@ def _sorted_costs(ax: Axes, result: Multistart, ends: Sequence[tuple[StartResult
         if where.size:
             word = {"good": "agree", "poor": "elsewhere"}.get(kind, kind)
             ax.plot(where + 1, ratio[where], "o", ms=4, color=colour, label=word)
-    ax.xaxis.get_major_locator().set_params(integer=True)
+    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     ax.set_yscale("log")
     ax.set_ylim(0.9, max(2.2, float(ratio.max(initial=1.0)) * 1.5))
     style.plain_decades(ax)
