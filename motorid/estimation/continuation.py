@@ -50,11 +50,10 @@ def by_continuation(problem: Problem, effort: LevenbergMarquardt, callback: Call
     """
     widths = _widths(problem) if wide and smooths(problem) else (problem.width,)
     history, last = (), len(widths) - 1
-    here, began = problem, np.inf
+    here = problem
     for k, width in enumerate(widths):
-        stage = _at(here, width)
-        if k and start_cost(stage) > began:  # a narrower width may refuse what one likes
-            stage = min(stage, _at(problem, width), key=start_cost)
+        # What one width likes a narrower one may refuse; then the start is better.
+        stage = min((_at(p, width) for p in dict.fromkeys((here, problem))), key=start_cost) if k else _at(here, width)
         rough = effort if k == last else effort.at_most(RACE)
         try:
             found = least_squares(stage, rough, callback, rounds=ROUNDS if k in (0, last) else 1)
@@ -65,7 +64,6 @@ def by_continuation(problem: Problem, effort: LevenbergMarquardt, callback: Call
             continue
         history += found.history
         if k < last:
-            began = found.history[0]
             here = found.problem.start_at(found.values)
     found = replace(found, history=history)
     return sharpened(found, effort, callback) if narrow else found

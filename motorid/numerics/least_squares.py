@@ -1,9 +1,8 @@
 """Levenberg-Marquardt on whitened residuals with exact Jacobians.
 
-The damped step solves ``min ‖J d + r‖² + λ‖D d‖²`` by a QR factorisation of J, its R by Cholesky from JᵀJ where J is
-conditioned so well that no digit of the step suffers, which takes a quarter of the time. A residual that cannot be
-computed counts as a bad step: it is shortened, and the fit goes on. Variables at a bound whose gradient points outward
-are held for the step. λ = 0 is the Gauss-Newton step.
+The damped step solves ``min ‖J d + r‖² + λ‖D d‖²`` by a QR factorisation of J (never JᵀJ). A residual that
+cannot be computed counts as a bad step: it is shortened, and the fit goes on. Variables at a bound whose
+gradient points outward are held for the step. λ = 0 is the Gauss-Newton step.
 
 Why it arrives from far away. On the logarithmic scale a positive parameter that runs to zero or to infinity loses its
 influence, and the plateau behind it looks like a minimum. The usual D, the column norms of J (Moré, "The
@@ -20,7 +19,6 @@ norms it was 94 and 75 of 100, in 9 and 17. What is left is caught by restarts, 
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -121,7 +119,6 @@ MESSAGES = {
 }
 VALLEY = (30, 3e5)  # so many iterations that lower the cost by less than this, times ftol, are enough
 PROMISED = 1e-3  # share of the cost that the undamped step may promise at an end without a step
-WELL = 0.03  # of its length: what is left of each column of J beside those before it, for a Cholesky factorisation
 SLACK = 1.0  # λ above which a small gain does not mean the end: the step was short, not the way
 
 
@@ -210,7 +207,7 @@ class _Search:
         if not free.any() or np.max(np.abs(g[free]) / size[free]) <= 1e-14 * misfit + 1e-300:
             return "gradient"
         weight = np.where(self.log, misfit, np.minimum(size, misfit))[free]
-        triangle, rotated = _reduce(self.jac if free.all() else self.jac[:, free], self.r)
+        triangle, rotated = _reduce(self.jac[:, free], self.r)
         # The undamped step promises ½‖Qᵀr‖²: while that is much, a place without a better one is no minimum.
         end = "step" if 0.5 * float(rotated @ rotated) <= PROMISED * self.cost else "stalled"
         while True:
@@ -251,12 +248,6 @@ class _Search:
 
 def _reduce(jac: Array, r: Array) -> tuple[Array, Array]:
     """Return R and Qᵀr of jac = QR, through the R of [J r], which needs no Q."""
-    with np.errstate(all="ignore"), suppress(np.linalg.LinAlgError):
-        gram = jac.T @ jac
-        size = np.sqrt(np.diag(gram))
-        triangle = np.linalg.cholesky(gram / size / size[:, None]).T
-        if np.diag(triangle).min(initial=1.0) > WELL:
-            return np.asarray(triangle * size, float), np.asarray(np.linalg.solve(triangle.T, jac.T @ r / size), float)
     full: Array = np.asarray(np.linalg.qr(np.column_stack([jac, r]), mode="r"))
     n = jac.shape[1]
     if full.shape[0] < n:  # fewer residuals than unknowns
@@ -279,9 +270,13 @@ def _inside(triangle: Array, rotated: Array, size: Array, lam: float, low: Array
 
 
 def _damped(triangle: Array, rotated: Array, size: Array, lam: float) -> Array:
-    """Solve the small stacked system, in scaled unknowns."""
-    stacked = np.vstack([triangle / size, np.sqrt(lam) * np.eye(len(size))])
-    return -np.linalg.lstsq(stacked, np.append(rotated, np.zeros(len(size))), rcond=None)[0] / size
+    """Solve the damped problem by QR of the small stacked system, in scaled unknowns."""
+    scaled = triangle / size
+    if lam == 0:
+        return -np.linalg.lstsq(scaled, rotated, rcond=None)[0] / size
+    stacked = np.vstack([scaled, np.sqrt(lam) * np.eye(len(size))])
+    q, small = np.linalg.qr(stacked)
+    return -np.linalg.solve(small, q[:len(rotated)].T @ rotated) / size
 
 
 def _cost(residual: Callable[[Array], Array], q: Array) -> tuple[Array, float]:
@@ -299,7 +294,8 @@ def seen_directions(jac: Array) -> tuple[Array, Array]:
 
     Columns are scaled to unit length first; directions with singular values below 1e-8 of the largest are left out.
     """
-    size = np.where((norms := np.sqrt(np.einsum("ij,ij->j", jac, jac))) > 0, norms, 1.0)
+    norms = np.sqrt(np.einsum("ij,ij->j", jac, jac))
+    size = np.where(norms > 0, norms, 1.0)
     triangle = np.linalg.qr(jac / size, mode="r")
     _, s, vt = np.linalg.svd(triangle, full_matrices=True)
     s = np.concatenate([s, np.zeros(vt.shape[0] - len(s))])
