@@ -32,7 +32,7 @@ from motorid.display.cards import Table
 from motorid.display.numbers import counted, duration, number
 from motorid.effects import EVERY
 from motorid.errors import DataError, UsageError, one_of
-from motorid.estimation.result import COLOURED, Fit, constraint_table, ended, steady_table, value_tables
+from motorid.estimation.result import COLOURED, PLAIN, Fit, constraint_table, ended, steady_table, value_tables
 from motorid.exporters.c_code import check
 from motorid.exporters.export import FORMS, export
 from motorid.exporters.json_file import constraint_violations, fit_dict, remarks, run_dict, write_json
@@ -74,8 +74,9 @@ def fit_command(runs: Runs, options: FitOptions, validate: Validate = None, json
 
 def _show_fit(found: Fit, records: list[Experiment], notes: list[str], judged: Evaluation | None = None) -> None:
     """Print a fit: remarks, parameters, errors, what follows from them, and how it ended."""
+    plain = found.fits == "noise" and max(found.misfit.values(), default=0.0) < PLAIN
     show(found.verdict, _held_out(found, judged) if judged else None, NRMSE,
-         None if "level of the noise" in found.verdict else f"Next: {next_command('diagnose')}",
+         None if plain else f"Next: {next_command('diagnose')}",
          f"\n{found.model.title}, {_amount(records)}. {ended(found)}\n")
     say_notes(notes, "About the records")
     show(*value_tables(found))

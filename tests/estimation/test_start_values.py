@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from lab_records import VALUES, noisy, simulated
+from scipy.optimize import lsq_linear
 
 import motorid as mi
-from motorid.estimation.first_guess import first_guess
+from motorid.estimation.first_guess import _nonnegative, first_guess
 
 TRUTH = {"R": 2.0, "L": 1e-3, "K": 0.05, "b": 1e-5, "J": 2e-5}
 T = np.arange(0, 4, 2e-3)
@@ -124,3 +125,11 @@ def test_a_current_that_is_not_the_motor_s_is_no_first_guess(rng):
     assert {n: fit.values[n] for n in VALUES} == pytest.approx(VALUES, rel=0.02)
     assert fit.fits == "noise"
     assert mi.diagnose(mi.fit(mi.dc_motor(), run)).effects == ("supply_side_current",)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_the_guess_solves_least_squares_with_signs_as_scipy_does(seed):
+    rng = np.random.default_rng(seed)
+    a, b, signed = rng.normal(size=(12, 5)), rng.normal(size=12), rng.random(5) < 0.3
+    reference = lsq_linear(a, b, (np.where(signed, -np.inf, 0.0), np.inf), method="bvls").x
+    assert _nonnegative(a, b, signed) == pytest.approx(reference, abs=1e-7)

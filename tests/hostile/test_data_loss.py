@@ -114,7 +114,7 @@ def test_a_full_disk_is_a_sentence_status_1_and_the_old_file(saved, tmp_path, mo
 
 @pytest.mark.parametrize(("words", "shown"), [
     (("fit", "{run}", "--fix", "L=0"), "±"), (("identifiability", "{run}"), "full rank"),
-    (("diagnose", "{run}", "--budget", "0"), "Next: motorid"), (("fit-many", "{folder}"), "of 1 motors fitted")])
+    (("diagnose", "{run}", "--budget", "0"), "below a millionth"), (("fit-many", "{folder}"), "of 1 motors fitted")])
 def test_a_result_that_cannot_be_written_is_shown(words, shown, run, tmp_path, monkeypatch):
     """It may have taken hours."""
     def full(_: int) -> None:
