@@ -23,6 +23,7 @@ from motorid.records.experiment import Experiment
 
 INITIAL = ("auto", "rest", "measured", "estimate")
 FIRST = 5  # samples that tell it
+LONGEST = 256  # samples that tell how fast an angle is at the first
 REACH = 8.0  # standard deviations that an estimated initial state may lie away from its first samples
 FREE_OF_NOISE = 2e-5  # of an angle's variation: what `noise_level` gives a simulation is half of it
 SGN_WIDTH_SHARE = 1e-3  # of the highest speed: wider smoothing looks like one more missing effect
@@ -181,7 +182,8 @@ def at_rest(run: Experiment, sigma: Mapping[str, float]) -> tuple[bool, int]:
         y, t = run.outputs["theta"], run.t
         speed, _ = _first_speed(y, t, sigma["theta"])
         moving = abs(speed) > 0.05 * np.max(np.abs(window_slopes(t, y)), initial=0.0)
-        if moving and not _starts_from_rest(y, t, sigma["theta"], speed):
+        if (moving and not _starts_from_rest(y, t, sigma["theta"], speed)) or (
+                _creeps(y[max(lead - 1, 0):], t[max(lead - 1, 0):], sigma["theta"])):
             return False, 1
     return True, max(lead, 1)
 
@@ -192,6 +194,35 @@ def _starts_from_rest(theta: Array, t: Array, sigma: float, speed: float) -> boo
     first = moved[:2]
     noise = 4 * np.sqrt(2) * sigma
     return bool(np.all(np.abs(first) <= noise) and np.any(np.abs(moved - speed * after) > noise))
+
+
+def _creeps(theta: Array, t: Array, sigma: float) -> bool:
+    """Tell whether an angle has a first speed that its noise does not explain, however slow.
+
+    A cubic over half of the longest window in which one describes the angle: there what it leaves out of a motion
+    that begins at rest is far below the noise of its slope. It describes a window twice as long if what is left
+    grows no more than chance allows (the noise of slow counts is easily overrated).
+    """
+    y, x, n = theta[:LONGEST], t[:LONGEST] - t[0], 8
+    if not np.isfinite(y).all() or len(y) < n:
+        return False
+    speed, left = 0.0, _cubic(x[:n], y[:n])[1]
+    while 2 * n <= len(y):
+        free = np.array([n - 4, 2 * n - 4])
+        longer = _cubic(x[:2 * n], y[:2 * n])[1]
+        if longer > min(sigma**2, max(left, sigma**2 / 4)) * (1 + 3 * np.sqrt(np.sum(2 / free))):
+            break
+        speed, left, n = _cubic(x[:n], y[:n])[0], longer, 2 * n
+    return abs(speed) > 4 * sigma
+
+
+def _cubic(x: Array, y: Array) -> tuple[float, float]:
+    """Return the first slope of the cubic through (x, y) over its deviation at a noise of 1, and the variance left."""
+    columns = np.vander(x / x[-1], 4, increasing=True)
+    inverse = np.linalg.pinv(columns)
+    weights = inverse @ y
+    return (float(weights[1] / np.linalg.norm(inverse[1])),
+            float(np.sum((y - columns @ weights) ** 2) / (len(y) - 4)))
 
 
 def _first(y: Array) -> float:

@@ -67,8 +67,10 @@ def test_emps_has_no_bristles_that_seven_reversals_could_show(real):
     found = mi.diagnose(fit, effects=("lugre", "constant_load"))
     assert found.effects == ()
     lugre = next(c for c in found.ranking if c.effect == "lugre")
-    # Which basin its refit ends in, and so how much it gains, hangs on the last digits; that it has no name does not.
-    assert "cannot be seen in these samples" in lugre.reason or "no better than chance" in lugre.reason
+    # Which basin its refit ends in, and so how much it gains, hangs on the last digits. That it is never taken does not,
+    # and a gain that counts is refused for what seven reversals cannot show.
+    if lugre.refit_drop is not None and lugre.refit_drop > 0.02:
+        assert "cannot be seen in these samples" in lugre.reason
 
 
 def test_odri_cogs_72_times_a_turn(real):

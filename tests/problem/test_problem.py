@@ -206,6 +206,22 @@ def test_the_speed_at_the_start_may_come_from_the_angle_alone(rng):
     )
 
 
+def test_a_slow_start_that_an_encoder_counts_is_motion_and_rest_is_rest(rng):
+    """A controller holds a motor at a crawl, 0.4 % of its highest speed: taken as rest that is 20 counts wrong."""
+    count = 2 * np.pi / 4000
+    t = np.arange(1500) * 1e-3
+    whole = simulated(t, np.where(t < 0.2, 0.0, np.where(t < 0.5, 0.03, 6.0)), ("i", "omega", "theta"))
+    outputs = {"i": whole.outputs["i"] + rng.normal(0, 0.01, len(t)),
+               "theta": np.round(whole.outputs["theta"] / count) * count}
+    counted = whole.with_(outputs=outputs)
+    crawl, rest = counted.select(slice(400, None)), counted.select(slice(100, None))
+    assert 0 < whole.outputs["omega"][400] < 0.005 * np.max(whole.outputs["omega"])
+    assert {p.name for p in as_problem(TRUE, rest).unknown} <= {*VALUES, "theta_0[0]"}
+    found = mi.fit(TRUE, crawl)
+    assert found.initial["omega_0[0]"] == pytest.approx(whole.outputs["omega"][400], rel=0.2)
+    assert found.misfit["theta"] < 1.3
+
+
 def test_an_angle_that_is_not_measured_starts_at_zero_and_is_no_unknown(runs):
     problem = as_problem(TRUE + mi.effects.gravity, runs)
     assert "theta" in problem.system.states
