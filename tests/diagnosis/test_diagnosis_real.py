@@ -67,8 +67,8 @@ def test_emps_has_no_bristles_that_seven_reversals_could_show(real):
     found = mi.diagnose(fit, effects=("lugre", "constant_load"))
     assert found.effects == ()
     lugre = next(c for c in found.ranking if c.effect == "lugre")
-    # Which basin its refit ends in, and so how much it gains, hangs on the last digits. That it is never taken does not,
-    # and a gain beyond chance is refused for what seven reversals cannot show.
+    # Which basin its refit ends in, and so how much it gains, hangs on the last digits. That it is never taken does
+    # not, and a gain beyond chance is refused for what seven reversals cannot show.
     if (lugre.gain or 0.0) > 2 * (lugre.gain_se or 0.0):
         assert "cannot be seen in these samples" in lugre.reason
 
