@@ -48,24 +48,11 @@ NAMES = {"v": "the voltage", "i": "the current", "omega": "the speed", "theta": 
 
 def adequacy(fit: Fit, scores: Sequence[Score] = (), false_alarm: float = FALSE_ALARM,
              level: float | None = None) -> Adequacy:
-    """Judge whether the residuals of `fit` are noise.
+    """Judge whether the residuals of `fit` are noise, by `scores` of effects that might be added (see `rank`) too.
 
-    Parameters
-    ----------
-    fit : Fit
-    scores : sequence of Score, optional
-        Of the effects that might be added, see `rank`.
-    false_alarm : float
-        Probability of calling an adequate model inadequate.
-    level : float, optional
-        The p-value that does so, where another test has a say too; by default `false_alarm`.
+    `false_alarm` is the probability of calling an adequate model inadequate; `level` the p-value that does so, where
+    another test has a say too.
 
-    Returns
-    -------
-    Adequacy
-
-    Notes
-    -----
     The noise is estimated from fast changes, which understates coloured noise by 1/√(1−ρ): 3 times at a correlation
     of 0.9 between neighbours. Residuals beyond ten times the noise (five for an angle) are not noise of any colour.
     """

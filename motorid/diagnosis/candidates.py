@@ -146,6 +146,14 @@ class Search:
         added = {p.name for e in node.fit.model.effects for p in e.parameters}
         return {s.effect.name: s.same_as for s in self.scores(node) if s.same_as and added >= set(s.same_as)}
 
+    def unseen(self, node: Node) -> dict[str, tuple[str, ...]]:
+        """Return the effects that other values of the motor's own parameters imitate in these records.
+
+        Beside the scales of sensors, which do so in any record.
+        """
+        scores = self.scores(node) if node.key in self._scores else ()
+        return {s.effect.name: s.same_as for s in scores if s.same_as and s.effect.balance != "sensor"}
+
     def hidden(self, node: Node) -> dict[tuple[str, str], tuple[str, ...]]:
         """Return the parameters that hide a wider effect (two sizes, no shape) than one of `node`, by both names."""
         found = {}

@@ -31,6 +31,7 @@ from motorid.diagnosis.verdict import (
     rises_text,
     unexplained_text,
     unfinished_remark,
+    unseen_remark,
     window_remark,
 )
 from motorid.errors import MotoridError, at_least, numbers_told
@@ -120,6 +121,8 @@ def _told(found: Climb, driven: str, validated: bool, own: Sequence[Effect]) -> 
     else:
         verdict, where, (answer, *details) = "adequate", None, adequate_text(judged, ranking)
     kind = "structure" if not remaining.adequate else "fluctuation" if far(ladder.best) else "noise"
+    if not names:
+        details.append(unseen_remark(found.search.unseen(found.path[-1])))
     details = tuple(t for t in (*details, *_remarks(found, driven)) if t)
     text = " ".join(t for t in (answer, *details, suggestion) if t)
     remainder = Remainder(kind, ladder.best, forms, found.search.held)

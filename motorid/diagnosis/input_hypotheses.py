@@ -91,13 +91,7 @@ def better_reading(fit: Fit, late: bool = False) -> Reading | None:
     """Return the reading of the voltage that the records ask for; None if it is the one they have.
 
     It must make the error of `fit` plainly smaller, and that of no channel larger; errors that are all noise cannot
-    become so.
-
-    Parameters
-    ----------
-    fit : Fit
-    late : bool
-        All effects that help are in: try what could stand in for one, too.
+    become so. `late`: all effects that help are in, and what could stand in for one is tried too.
     """
     if all(NOISE[0] < ratio < NOISE[1] for ratio in misfit_over_noise(fit.problem, fit.q).values()):
         return None

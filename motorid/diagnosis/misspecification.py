@@ -151,17 +151,8 @@ def grades_of(last: Node, root: Node, groups: Sequence[Sequence[str]], beside: S
     itself does, and it explains more than it leaves, unless that is noise. A form beside the effect that predicts
     surely less than the best one only imitates that.
 
-    Parameters
-    ----------
-    last, root : Node
-    groups : sequence of sequence of str
-        What these data cannot distinguish, the chosen effect first.
-    beside : sequence of FormGain
-        The forms that beside all effects predict better.
-    structure : bool
-        Whether `last` leaves anything but noise.
-    without : callable
-        Gives the model without one of the effects; None where there is none.
+    `groups`: what these data cannot distinguish, the chosen effect first. `beside`: the forms that beside all effects
+    predict better. `structure`: `last` leaves more than noise. `without` gives the model without one of the effects.
     """
     rivals = {g[0]: g[1:] for g in groups}
     limited = structure and LIMITER not in last.key and any(current_limit(run) for run in root.fit.problem.experiments)

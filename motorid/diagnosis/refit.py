@@ -286,14 +286,7 @@ class GivenUp:
 
 def refits(tasks: Sequence[Task], map_: Callable[..., Iterable[Any]]) -> list[Fit | GivenUp | None]:
     """Return the refit of each task, None where none can be simulated; what is not done when the time is up, or when
-    it is interrupted, is given up.
-
-    Parameters
-    ----------
-    tasks : sequence of Task
-        All on the same records.
-    map_ : callable
-        Anything with the signature of `map`.
+    it is interrupted, is given up. All are on the same records.
     """
     found: dict[int, Fit | GivenUp | None] = {}
     try:

@@ -67,13 +67,8 @@ class Tried:
 def rank(fit: Fit, effects: Sequence[Effect], known: Sequence[Score] = ()) -> list[Score]:
     """Score `effects` on `fit`, best first; effects that the model cannot take are left out.
 
-    Parameters
-    ----------
-    fit : Fit
-    effects : sequence of Effect
-    known : sequence of Score, optional
-        Of the same effects on a smaller model's fit to the same records. Where `fit` leaves hardly more than noise,
-        what they added there tells which add nothing here.
+    `known`: scores of the same effects on a smaller model's fit to the same records. Where `fit` leaves hardly more
+    than noise, what they added there tells which add nothing here.
     """
     tangent = Tangent.of(fit)
     before = {s.effect.name: s for s in known}
@@ -98,13 +93,7 @@ def pairs_of(fit: Fit, scores: Sequence[Score], most: int) -> list[tuple[Score, 
 def with_phase_per_run(fit: Fit, scores: Sequence[Score], zero: Effect) -> list[Score]:
     """Return the effects over the angle that explain more with a phase in every run, and where each zero then is.
 
-    Parameters
-    ----------
-    fit : Fit
-    scores : sequence of Score
-        Of single effects.
-    zero : Effect
-        The zero of the encoder, of one parameter per run.
+    `scores` are those of single effects, `zero` is that of the encoder, of one parameter per run.
     """
     tangent, runs = Tangent.of(fit), sorted(set(fit.problem.unknowns.firsts))
     apart = [f"{zero.parameters[0].name}[{k}]" for k in runs]

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from itertools import pairwise
+import itertools
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
@@ -64,7 +64,7 @@ def unexplained_text(ranking: Sequence[Candidate], rungs: Sequence[Rung], grades
     if best is None or (best.refit_drop or 0) <= 0.05:
         return lead
     return (f"{lead} The nearest, '{best.effect}', takes away {percent(best.refit_drop, 2)} of the squared error, but "
-            f"{best.reason}.")
+            f"was not added: {best.reason}.")
 
 
 def approximations_text(grades: Sequence[Grade]) -> str:
@@ -147,7 +147,7 @@ def errors_text(rungs: Sequence[Rung]) -> str:
 def rises_text(rungs: Sequence[Rung]) -> str:
     """Say which errors rose from rung to rung and what decided, beside what `errors_text` says; empty if none."""
     told, small = [], set()
-    for a, b in pairwise(rungs):
+    for a, b in itertools.pairwise(rungs):
         there = a.validation_nrmse or {}, b.validation_nrmse or {}
         kinds = [((a.nrmse, b.nrmse), "fitted"), (there, "held-out")][:1 if len(rungs) == 2 else 2]
         for (was, is_), where in kinds if there[0] or len(rungs) > 2 else ():
@@ -237,6 +237,21 @@ def inseparable_remark(same: Mapping[str, tuple[str, ...]]) -> str:
         f"{' and '.join(parameters)}{' together' * (len(parameters) > 1)}."
         for parameters, names in by_parameters.items()
     )
+
+
+def unseen_remark(same: Mapping[str, tuple[str, ...]]) -> str:
+    """Say which effects these records cannot show, since the motor's own parameters imitate them, and which would."""
+    if not same:
+        return ""
+    parameters = dict.fromkeys(itertools.chain(*same.values()))
+    shown = "it" if len(same) == 1 else "them"
+    return (f"These records cannot show {_listed(same)}: other values of {_listed(parameters)} do the same. Steps of "
+            f"several sizes in both directions, with current and speed measured, are likelier to show {shown}.")
+
+
+def _listed(names: Iterable[str]) -> str:
+    *others, last = names
+    return f"{', '.join(others)} or {last}" if others else last
 
 
 def hidden_remark(hidden: Mapping[tuple[str, str], tuple[str, ...]]) -> str:

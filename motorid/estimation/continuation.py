@@ -30,18 +30,9 @@ def by_continuation(problem: Problem, effort: LevenbergMarquardt, callback: Call
                     wide: bool = True, narrow: bool = True) -> Estimate:
     """Minimise the cost from the values of the model, and restart where the first width ends in doubt.
 
-    One least-squares run where the model has no sgn, or one whose width was given.
-
-    Parameters
-    ----------
-    problem : Problem
-    effort : LevenbergMarquardt
-        Of the last width; `looks` counts the restarts at the first.
-    callback : callable, optional
-    wide : bool
-        Begin with a wide sgn; otherwise with the width that the problem has.
-    narrow : bool
-        End with a narrower sgn where that lowers the cost, see `sharpened`.
+    One least-squares run where the model has no sgn, or one whose width was given. `effort` is that of the last width;
+    its `looks` counts the restarts at the first. `wide`: begin with a wide sgn, not with the width that the problem
+    has. `narrow`: end with a narrower one where that lowers the cost, see `sharpened`.
 
     Raises
     ------

@@ -30,14 +30,8 @@ def first_guess(model: Model, runs: Sequence[Experiment], *, loaded: bool = Fals
                 back_emf: float = BACK_EMF) -> dict[str, float]:
     """Return values of the base parameters, SI, that suit `runs`; given and held ones keep their value.
 
-    Parameters
-    ----------
-    model : Model
-    runs : sequence of Experiment
-    loaded : bool
-        Look for the sizes of the model's torque effects as well, and return them too.
-    back_emf : float
-        Share of the voltage per speed that is taken for back-EMF where no current tells it from viscous friction.
+    `loaded`: the sizes of the model's torque effects as well. `back_emf` is the share of the voltage per speed that is
+    taken for back-EMF where no current distinguishes it from viscous friction.
     """
     held = {n: p.value for n, p in model.parameters.items() if p.given or not p.vary}
     signals = [_signals(_read_plainly(r, model)) for r in runs]

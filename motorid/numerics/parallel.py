@@ -218,18 +218,8 @@ def run_tasks(function: Callable[[Any], Any], tasks: Sequence[Any], map: Map | N
     An interruption (Ctrl-C) keeps what is done. If the pool breaks, for instance because a worker was killed
     and its pool cannot replace it, the rest is done in this process: that costs time, not results.
 
-    Parameters
-    ----------
-    function : callable
-        Of a module's top level; it must return failures instead of raising them.
-    tasks : sequence
-    map : callable or None
-        None: the built-in `map`.
-    text : str
-        What the progress bar says.
-    quiet : bool
-    each : callable, optional
-        Called with every result as it comes, for instance to save it.
+    `function` is one of a module's top level that returns failures instead of raising them. `each` is called with
+    every result as it comes, for instance to save it. No `map` is the built-in one.
     """
     results: list[Any] = []
     function = partial(_on_one_thread, function)

@@ -171,20 +171,11 @@ class HeaderMatch:
 
 
 def classify(label: str, unit: Unit | None = None) -> HeaderMatch | None:
-    """Tell which channel a header names, or None if none.
+    """Tell which channel a header, as it stands in the file, names, or None if none.
 
-    Parameters
-    ----------
-    label : str
-        The header as it stands in the file.
-    unit : Unit, optional
-        The unit from a row of units; without it the header itself is searched for one.
-
-    Returns
-    -------
-    HeaderMatch or None
-        Score 4: the very name of a channel; 3: with words that change nothing ("motor speed"); 2: with
-        unknown words; 1: told by the unit alone; lower: a last resort.
+    `unit` is that of a row of units; without it the header itself is searched for one. Scores: 4 the very name of a
+    channel; 3 with words that change nothing ("motor speed"); 2 with unknown words; 1 told by the unit alone; lower: a
+    last resort.
     """
     for text in (label, _CAMEL.sub(" ", label)):
         name, inner, explicit = unit_in(text)

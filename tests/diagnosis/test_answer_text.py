@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from battery.excite import driven, record
+from lab_records import VALUES, noisy, pair, simulated
 
 import motorid as mi
 from motorid.diagnosis.results import Rung
@@ -71,3 +73,17 @@ def test_without_a_current_a_size_is_a_voltage_in_answer_card_and_table(lab, rng
     assert said in str(found)
     name = said.partition(" ")[0]
     assert any(name in row[0] and " V" in row[2] for row in found.card().tables[1].rows)
+
+
+def test_what_one_step_cannot_show_is_said(rng):
+    """Friction that grows with the load, or in one direction only, is R, K and b to one step; two directions tell."""
+    t = np.arange(600) * 1e-3
+    hidden = mi.dc_motor(**VALUES) + mi.effects.coulomb(tau_c=5e-3)
+    step = noisy(simulated(t, np.where(t < 0.02, 0.0, 6.0), ("omega",), model=hidden), rng)
+    found = mi.diagnose(mi.fit(mi.dc_motor(), step))
+    assert found.effects == ()
+    said = next(d for d in found.details if d.startswith("These records cannot show "))
+    assert "load_friction" in said and "viscous_asymmetric" in said and "speed_gain" not in said
+    both = mi.diagnose(mi.fit(mi.dc_motor(), pair(rng, model=hidden)))
+    assert both.effects == ("coulomb",)
+    assert not any(d.startswith("These records cannot show ") for d in both.details)
