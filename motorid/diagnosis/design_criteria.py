@@ -368,9 +368,12 @@ def separation(truth: Driven, rival: Driven, levels: Array, ra: Response, rb: Re
     for _ in range(STEPS):
         s = np.concatenate([ra.dy[:, :, -k:], -rb.dy[:, :, k - len(delta):]], axis=2).reshape(-1, len(delta))
         error = (ra.y - rb.y).ravel()
-        with np.errstate(over="ignore", invalid="ignore"):  # slopes that overflow lead nowhere
-            step = _worst_case(s.T @ s, s.T @ (s @ delta - error), prior, region) - delta
-        if not np.isfinite(step).all():
+        with np.errstate(over="ignore", invalid="ignore"):
+            try:
+                step = _worst_case(s.T @ s, s.T @ (s @ delta - error), prior, region) - delta
+            except np.linalg.LinAlgError:
+                break
+        if not np.isfinite(step).all():  # slopes that overflow lead nowhere
             break
         before, after = chi2, error + s @ step
         if after @ after + (delta + step) @ prior[1] @ (delta + step) > (1 - SETTLED) * chi2:

@@ -99,6 +99,7 @@ def _told(found: Climb, driven: str, validated: bool, own: Sequence[Effect]) -> 
     ranking = found.rounds[0] if found.rounds else ()
     groups = tuple(g for g in found.groups if g[0] in names)
     forms, suggestion = tuple(f.form for f in found.forms), None
+    unseen = found.search.unseen(found.path[-1])
     form = next(iter(forms), None)
     if form is not None:
         remaining = following(remaining, form.text)
@@ -122,7 +123,7 @@ def _told(found: Climb, driven: str, validated: bool, own: Sequence[Effect]) -> 
         verdict, where, (answer, *details) = "adequate", None, adequate_text(judged, ranking)
     kind = "structure" if not remaining.adequate else "fluctuation" if far(ladder.best) else "noise"
     if not names:
-        details.append(unseen_remark(found.search.unseen(found.path[-1])))
+        details.append(unseen_remark(unseen))
     details = tuple(t for t in (*details, *_remarks(found, driven)) if t)
     text = " ".join(t for t in (answer, *details, suggestion) if t)
     remainder = Remainder(kind, ladder.best, forms, found.search.held)

@@ -446,7 +446,8 @@ def hidden_in(fit: Fit, effect: Effect) -> tuple[str, ...]:
     mine = np.array([p.name in task.starts[0] for p in problem.unknown])
     norms = np.linalg.norm(jac[:, ~mine], axis=0)
     others, columns = jac[:, ~mine] / np.where(norms > 0, norms, 1.0), jac[:, mine]
-    _, weakest, turned = np.linalg.svd(columns - others @ np.linalg.lstsq(others, columns, rcond=1e-9)[0])
+    left = columns - others @ np.linalg.lstsq(others, columns, rcond=1e-9)[0]
+    _, weakest, turned = np.linalg.svd(left, full_matrices=False)
     answer = columns @ turned[-1]
     if weakest[-1] * max(task.starts[0].values()) > 1 or not weakest[-1] < ALONE * np.linalg.norm(answer):
         return ()

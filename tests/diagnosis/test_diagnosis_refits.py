@@ -1,5 +1,6 @@
 """Refits are judged only when they are finished, where they mean something, and on parts that show what is there."""
 
+import tracemalloc
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import replace
 
@@ -71,6 +72,17 @@ def test_what_does_not_matter_collapses_again_and_what_matters_is_kept():
     same = replace(dead, values={**fit.values, "L": fit.values["L"] * 1.0001},
                    problem=fit.problem.for_model(fit.model.start_at({"L": fit.values["L"] * 1.0001})))
     assert collapsed_again(fit.problem.for_model(fit.model), same).model.values["L"] == same.values["L"]
+
+
+def test_memory_grows_with_the_samples_not_with_their_square():
+    model = mi.dc_motor(**TRUE) + mi.effects.coulomb(tau_c=5e-3)
+    fit = mi.fit(model, _run(model, n=3000))
+    tracemalloc.start()
+    try:
+        assert trial.hidden_in(fit, LIBRARY["coulomb_asymmetric"]) == ()
+        assert tracemalloc.get_traced_memory()[1] < 50 * fit.jacobian.nbytes
+    finally:
+        tracemalloc.stop()
 
 
 def test_a_gap_at_its_limit_is_refused():

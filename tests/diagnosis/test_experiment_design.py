@@ -89,6 +89,15 @@ def test_a_rival_that_can_follow_is_no_evidence(tasks, fits):
     assert max(w.value for w in twin.criteria(LEVELS_TRIED, twin.respond(LEVELS_TRIED), False)) < 1e-6
 
 
+def test_slopes_beyond_all_measure_leave_what_the_rivals_answer(tasks):
+    """Two parameters that do the same 1e20 times over: nothing is left of the other information."""
+    task = tasks[0]
+    answers = task.respond(LEVELS_TRIED)
+    wild = [a._replace(dy=np.full_like(a.dy, 1e20)) for a in answers]
+    found = np.array([w.value for w in task.criteria(LEVELS_TRIED, wild, False)])
+    assert (found <= np.sum((answers[0].y - answers[1].y) ** 2)).all()
+
+
 def test_jumps_that_stay_where_they_are_take_short_steps_there_alone(tasks):
     """An inductance that no sample shows would else make every sample of a binary signal dear."""
     driven = tasks[0].driven[0]

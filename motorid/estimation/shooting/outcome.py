@@ -260,7 +260,7 @@ def free_directions(jac: Array, slope: Array) -> Array:
     if not len(jac):
         return np.diag(slope)
     size = np.maximum(np.linalg.norm(jac, axis=1, keepdims=True), 1e-300)
-    _, s, vt = np.linalg.svd(jac / size, full_matrices=True)
+    _, s, vt = np.linalg.svd(np.asarray(np.linalg.qr(jac / size, mode="r")), full_matrices=True)
     rank = int(np.sum(s > 1e-8))
     return slope[:, None] * vt[rank:].T
 
