@@ -10,6 +10,7 @@ import contextlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import BrokenExecutor
 from dataclasses import replace
+from functools import reduce
 from typing import Any
 
 import numpy as np
@@ -356,9 +357,10 @@ def _flat_topped(run: Experiment) -> bool:
 
 
 def _without(model: Model, name: str) -> list[Model]:
-    """Return the model without an effect, none where another one needs it."""
-    with contextlib.suppress(ModelError):
-        return [model.without(name)]
+    """Return the model without an effect, and without the one that needs it; none where several do."""
+    for needing in ((), *((e.name,) for e in model.effects if e.name != name)):
+        with contextlib.suppress(ModelError):
+            return [reduce(Model.without, (*needing, name), model)]
     return []
 
 

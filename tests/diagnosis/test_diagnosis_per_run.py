@@ -7,7 +7,8 @@ import pytest
 from lab_records import VALUES, drive
 
 import motorid as mi
-from motorid.diagnosis.model_comparison import size_of
+from motorid.diagnosis.candidates import Search, Stages, library
+from motorid.diagnosis.model_comparison import node_of, size_of
 from motorid.diagnosis.predictive_score import predictions_left_out
 from motorid.records.experiment import windows
 
@@ -61,6 +62,11 @@ def test_a_supply_and_a_warm_winding_of_every_run_are_named(rng):
     warm = mi.diagnose(mi.fit(mi.dc_motor(), runs[:3]), runs[3:], effects=TRIED)
     assert warm.effects == ("winding_heating", "winding_warm_start"), warm.text
     assert [own["value"] for own in warm.after.per_run["dT_0"].values()] == pytest.approx([60, 30], abs=3)
+    # Whether the heating is real is asked of the model without it, and without what only it makes sense of.
+    search = Search(mi.fit(mi.dc_motor(), runs[:3]), None, library(TRIED), Stages())
+    cold = search.without(node_of(warm.after, search.held), "winding_heating")
+    assert cold is not None
+    assert cold.key == frozenset()
 
 
 def test_each_runs_own_value_is_paid_for_and_parts_of_a_run_share_it(rng):
