@@ -22,6 +22,7 @@ from motorid.diagnosis.model_comparison import Node, at_noise, beats, choose, ev
 from motorid.diagnosis.record_parts import affordable, thinned_alike
 from motorid.diagnosis.refit import INTERRUPTED, OUT_OF_TIME
 from motorid.diagnosis.results import Adequacy, Candidate, Ladder, Rung
+from motorid.diagnosis.thresholds import MATERIAL
 from motorid.diagnosis.verdict import first_answer
 from motorid.errors import OutOfTime, at_least
 from motorid.estimation.fit import TOO_FAR, follows, growth, in_windows, solve
@@ -158,13 +159,12 @@ def _finished(found: Climb) -> Climb:
 def _better(children: Iterable[Node], best: Node) -> tuple[Node, list[Node]] | None:
     """Return the best child, if it beats the best model so far, and all in order.
 
-    What physics speaks against is taken only where nothing else helps.
+    What physics speaks against is taken only where nothing else helps, and where the held-out runs bear it out.
     """
-    for objected in (False, True):
-        chosen = choose([c for c in children if bool(c.objection) == objected and beats(c, best)], best)
-        if chosen is not None:
-            return chosen
-    return None
+    better = [c for c in children if beats(c, best)]
+    falls = ((c, evidence(best, c).held_out_fall) for c in better)
+    sound = [c for c in better if not c.objection]
+    return choose(sound or [c for c, fall in falls if fall is None or fall > MATERIAL], best)
 
 
 @dataclass(frozen=True, eq=False)

@@ -352,3 +352,16 @@ def test_a_child_that_may_not_be_taken_does_not_keep_a_worse_one_out(rng):
     chosen, _ = stepwise._better([refused, sound], best)
     assert chosen is sound
     assert stepwise._better([refused], best) is None
+
+
+@pytest.mark.parametrize(("there", "taken"), [(0.9, True), (1.0, False), (None, True)])
+def test_what_physics_speaks_against_must_help_on_held_out_runs(rng, there, taken):
+    r, h = rng.normal(size=(2, 1000))
+
+    def node(objection, fitted, share):
+        predictions = both(fitted, h if there is None else share * h)
+        predictions = predictions if there is not None else replace(predictions, held_out={})
+        return SimpleNamespace(added="stribeck", size=6, search=0.0, objection=objection, predictions=predictions)
+
+    found = stepwise._better([node("omega_s runs to its limit", 0.5 * r, there)], node("", r, 1.0))
+    assert (found is not None) == taken
