@@ -120,7 +120,7 @@ def _told(found: Climb, driven: str, validated: bool, own: Sequence[Effect]) -> 
         answer = unexplained_text(ranking, ladder.rungs, found.grades, like.text if like else "", not found.stopped)
         details = [judged.text, missing.text, rises_text(ladder.rungs)]
     else:
-        verdict, where, (answer, *details) = "adequate", None, adequate_text(judged, ranking)
+        verdict, where, (answer, *details) = "adequate", None, adequate_text(judged, ranking, bool(far(ladder.best)))
     kind = "structure" if not remaining.adequate else "fluctuation" if far(ladder.best) else "noise"
     if not names:
         details.append(unseen_remark(unseen))

@@ -41,9 +41,12 @@ def window_remark(fit: Fit) -> str:
             "over whole records small errors of this model grow too large. Errors are those of a window ahead.")
 
 
-def adequate_text(judged: Adequacy, ranking: Sequence[Candidate]) -> tuple[str, str]:
-    """Return the answer when nothing is missing, and how many effects were tried."""
+def adequate_text(judged: Adequacy, ranking: Sequence[Candidate], large: bool = False) -> tuple[str, str]:
+    """Return the answer when nothing is missing, and how many effects were tried; `large`: errors beyond the noise."""
     tried = f"{judged.text} None of the {len(ranking)} effects tried is worth adding." if ranking else judged.text
+    if large:
+        return ("Nothing that depends on the motion is missing, but the errors are larger than the noise: they "
+                "fluctuate by themselves, or the noise is slow."), tried
     return "Nothing is missing: the errors do not depend on the motion.", tried
 
 

@@ -11,7 +11,7 @@ from lab_records import VALUES, noisy, pair, simulated
 
 import motorid as mi
 from motorid.diagnosis.results import Rung
-from motorid.diagnosis.verdict import errors_text, missing_text, rises_text
+from motorid.diagnosis.verdict import adequate_text, errors_text, missing_text, rises_text
 
 
 def rungs_of(*errors, held_out=None, misfit=1.0):
@@ -42,6 +42,13 @@ def test_noise_that_remains_is_where_it_remains(elsewhere, said):
     rungs = rungs_of((0.02, 0.2), (0.02, 0.02), held_out=((0.02, 0.2), (0.02, 0.19)))
     noise = SimpleNamespace(adequate=True, text="")
     assert missing_text(rungs, noise, (), (), elsewhere).endswith(said)
+
+
+def test_errors_beyond_the_noise_are_in_the_answer_where_nothing_is_missing():
+    judged = SimpleNamespace(text="The errors (speed 4 times the noise) do not depend on the motion.")
+    small, large = (adequate_text(judged, (), beyond)[0] for beyond in (False, True))
+    assert small == "Nothing is missing: the errors do not depend on the motion."
+    assert "larger than the noise" in large
 
 
 def test_a_rise_that_matters_is_beside_the_fall_of_all_and_its_rung_is_named():
