@@ -155,19 +155,9 @@ class Link(Protocol):
 
 
 class SerialLink:
-    """An exclusively opened port.
+    """An exclusively opened port: ``/dev/ttyACM0``, ``COM3`` or ``socket://127.0.0.1:7000``.
 
-    Parameters
-    ----------
-    port : str
-        ``/dev/ttyACM0``, ``COM3``, or ``socket://127.0.0.1:7000``.
-    baud : int
-        Bits per second; USB devices do not care.
-
-    Raises
-    ------
-    DeviceError
-        If it cannot be opened: it is not there, somebody else has it, or the user may not.
+    Raises `DeviceError` if it cannot be opened: it is not there, somebody else has it, or the user may not.
     """
 
     def __init__(self, port: str, baud: int = 115_200) -> None:
@@ -198,7 +188,7 @@ class SerialLink:
         try:
             self._serial.write(data)
         except OSError as error:  # pyserial's errors are OSErrors
-            raise LinkLost(f"{self.port} does not take what is sent ({error}).") from None
+            raise LinkLost(f"{self.port} cannot be written to ({error}).") from None
 
     def close(self) -> None:
         """Stop the thread and let the port go."""

@@ -186,7 +186,7 @@ def _number(text: str, word: str) -> float:
     except ValueError:
         value = math.nan
     if not abs(value) < 1e6:
-        raise UsageError(f"'{text}' in the excitation '{word}' is not a number that can be meant.")
+        raise UsageError(f"'{text}' in the excitation '{word}' is not a usable number.")
     return value
 
 

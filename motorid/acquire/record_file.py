@@ -94,16 +94,8 @@ def read_tail(out: Path) -> Tail:
 class RecordFile:
     """Appends rows to a record; gaps become rows whose measured cells are empty.
 
-    Every call of `flush` hands whole lines to the operating system, and a thread hands them to the disk every
-    0.5 s; see `Appender` for what happens when it refuses.
-
-    Parameters
-    ----------
-    out : Path
-    channels : of the device, calibrated
-    rate : samples per second
-    meta : written as comment lines ``# key: value`` at the head (of a new record), or where it goes on
-    mode : {"new", "replace", "resume"}
+    Every call of `flush` hands whole lines to the operating system, and a thread hands them to the disk every 0.5 s;
+    see `Appender`. `meta` is written as comment lines ``# key: value`` at the head, or where a record is continued.
     """
 
     def __init__(self, out: Path, channels: tuple[Channel, ...], rate: float, meta: Mapping[str, object],
@@ -204,16 +196,8 @@ class RecordFile:
 class Appender:
     """Appends lines. A thread carries them to the disk, so that a slow one does not hold up the recording.
 
-    Parameters
-    ----------
-    path : Path
-    mode : {"new", "replace", "resume"}
-        A new file must not exist; one to resume is cut back to its last whole line.
-
-    Raises
-    ------
-    UsageError
-        If the file may not be written, has appeared meanwhile, or another recorder has it.
+    With `mode` ``new`` the file must not exist; one to ``resume`` is cut back to its last whole line; else ``replace``.
+    Raises `UsageError` if the file may not be written, has appeared meanwhile, or another recorder has it.
     """
 
     def __init__(self, path: Path, mode: str) -> None:

@@ -208,7 +208,7 @@ def read_calibration(path: str | Path) -> dict[str, dict[str, float]]:
         raise DataError(f"the calibration file {path} is not TOML: {error}.") from None
     for channel, entries in tables.items():
         if not isinstance(entries, dict):
-            raise DataError(f"{path}: expected a table [channel] with entries; '{channel}' stands alone.")
+            raise DataError(f"{path}: expected a table [channel] with entries; '{channel}' is in none.")
         for name, value in entries.items():
             if name not in _ENTRIES:
                 raise DataError(f"{path}, [{channel}]: {one_of(name, _ENTRIES, 'entry')}")
@@ -226,7 +226,7 @@ def calibrate(header: Header, calibration: dict[str, dict[str, float]]) -> Heade
     names = [c.name for c in header.channels]
     for name in calibration:
         if name not in names:
-            raise DataError(f"the calibration speaks of a channel that the device does not send: "
+            raise DataError(f"the calibration names a channel that the device does not send: "
                             f"{one_of(name, names, 'channel')}")
     channels = tuple(_calibrated(c, calibration.get(c.name, {})) for c in header.channels)
     return replace(header, channels=channels)

@@ -35,11 +35,11 @@ SENTENCES = {
     "emergency": "The emergency stop of the bench was opened; the motor was switched off.",
     "overrun": "The device did not stop at the end of the excitation; the motor was stopped. Look at its firmware.",
     "watchdog": "The device heard nothing from this computer for a second and switched the motor off.",
-    "unplugged": "The device is gone (unplugged, or its port was closed). Plug it in again and go on with --resume.",
-    "silent": "The device stopped talking. See whether it is powered, then go on with --resume.",
-    "restarted": "The device restarted in the middle of the run (a reset, or its supply broke down). Go on "
+    "unplugged": "The device is gone (unplugged, or its port was closed). Plug it in again and continue with --resume.",
+    "silent": "The device stopped sending. Check its power, then continue with --resume.",
+    "restarted": "The device restarted in the middle of the run (a reset, or its supply failed). Continue "
                  "with --resume.",
-    "disk": "The disk refused the data; the motor was stopped. Make room, then go on with --resume.",
+    "disk": "The disk refused the data; the motor was stopped. Make room, then continue with --resume.",
 }
 COMPLETE = ("done", "duration", "interrupted")
 

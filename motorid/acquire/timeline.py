@@ -28,19 +28,10 @@ class _Mark(NamedTuple):
 class Timeline:
     """Places samples on the time axis of a run and counts what is lost.
 
-    A gap is the step of the counter. Where the counter may have wrapped more than once the timer decides, and
-    where the timer may have wrapped too, the clock of the computer. A sample whose counter and time
-    contradict each other is believed only when the next one agrees with it, so that a damaged frame that
-    happens to have a valid CRC does not open a gap.
-
-    Parameters
-    ----------
-    header : Header
-        Of the device, channels calibrated.
-    counter, time : int
-        Of the first sample, as the device announced them.
-    host : float
-        Clock of the computer, in s, at that moment.
+    A gap is the step of the counter. Where the counter may have wrapped more than once the timer decides, and where the
+    timer may have wrapped too, the clock of the computer. A sample whose counter and time contradict each other is
+    believed only when the next one agrees with it, so that a damaged frame that happens to have a valid CRC does not
+    open a gap. `counter` and `time` are those of the first sample, `host` the computer's clock (s) then.
     """
 
     def __init__(self, header: Header, counter: int, time: int, host: float = 0.0) -> None:

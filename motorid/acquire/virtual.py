@@ -31,20 +31,10 @@ Draw = Callable[[float, float], float]  # a number between two, evenly on a log 
 
 
 class VirtualDevice:
-    """A device that answers commands and makes samples.
+    """A device that answers commands and makes samples of `channels`, ``v`` first, `rate` times a second.
 
-    Parameters
-    ----------
-    truth : Truth
-        The motor and what is hidden in it. At the start of every run the shaft stands still at angle zero.
-    rate : float
-        Samples per second.
-    channels : tuple of str
-        What it sends, ``v`` first.
-    counter_bits, timer_bits, counter0, time0 : int
-        Widths of the counters, and where they stand when the device is switched on.
-    encoder_bits : int
-        Width of the encoder's counter.
+    At the start of every run the shaft of the motor `truth` stands still at angle zero. The counters have so many bits
+    and stand at `counter0` and `time0` when the device is switched on.
     """
 
     def __init__(self, truth: Truth, rate: float = 1000.0,

@@ -21,38 +21,44 @@ from motorid.acquire.virtual import VirtualDevice, hide
 from motorid.cli.console import FAILED, INTERRUPTED
 from motorid.errors import UsageError, printable
 
-Port = Annotated[str, typer.Option(help="Serial port of the bench: /dev/ttyACM0, COM3, socket://127.0.0.1:7000.")]
-Out = Annotated[Path, typer.Option(help="The CSV to write.")]
-Baud = Annotated[int, typer.Option(min=300, help="Bits per second; a board on USB does not care.")]
+Port = Annotated[str, typer.Option(
+    metavar="PORT", help="Serial port of the bench: /dev/ttyACM0, COM3, socket://127.0.0.1:7000.")]
+Out = Annotated[Path, typer.Option(metavar="RUN.csv", help="The CSV to write.")]
+Baud = Annotated[int, typer.Option(metavar="N", min=300, help="Bits per second; a board on USB ignores it.")]
 Excite = Annotated[str | None, typer.Option(
-    help="Voltage to apply, in words joined by commas: rest:s step:volt:s stairs:from:to:levels:s ramp:from:to:s "
-         "chirp:volt:Hz:Hz:s prbs:volt:bit:s coast:s standard. Without it the motor is held at 0 V.")]
-Duration = Annotated[float | None, typer.Option(help="Stop after so many seconds.")]
-Volts = Annotated[float | None, typer.Option(help="Never more than so many V, of either sign.")]
-Amperes = Annotated[float | None, typer.Option(help="Switch the motor off beyond so many A.")]
-CalibrationFile = Annotated[Path | None, typer.Option(help="TOML with scale, offset, gain … per channel.")]
-Resume = Annotated[bool, typer.Option("--resume", help="Go on with a record that was cut short.")]
+    metavar="PARTS",
+    help="Voltage to apply, in parts joined by commas: rest:s step:volt:s stairs:from:to:levels:s ramp:from:to:s "
+         "chirp:volt:Hz:Hz:s prbs:volt:bit:s coast:s standard. By default 0 V.")]
+Duration = Annotated[float | None, typer.Option(metavar="S", help="Stop after so many seconds.")]
+Volts = Annotated[float | None, typer.Option(metavar="V", help="Largest voltage, of either sign.")]
+Amperes = Annotated[float | None, typer.Option(metavar="A", help="Switch the motor off above this current.")]
+CalibrationFile = Annotated[Path | None, typer.Option(
+    metavar="FILE.toml", help="Scale, offset, gain … per channel.")]
+Resume = Annotated[bool, typer.Option("--resume", help="Continue a record that was cut short.")]
 Force = Annotated[bool, typer.Option("--force", help="Replace a file that exists.")]
-Timeout = Annotated[float, typer.Option(help="Silence in s that ends the recording.")]
+Timeout = Annotated[float, typer.Option(metavar="S", help="End the recording after so many seconds of silence.")]
 Quiet = Annotated[bool, typer.Option("--quiet", help="No live progress.")]
 
 HiddenEffect = Annotated[str, typer.Option(
-    help="What is hidden: none, random, or effects joined by commas, bare or with numbers as in coulomb:tau_c=0.01.")]
-MotorName = Annotated[str, typer.Option(help="Which motor: micro, lab, servo, wheel, big.")]
+    metavar="a,b",
+    help="What is hidden: none, random, or effects joined by commas, with or without values: coulomb:tau_c=0.01.")]
+MotorName = Annotated[str, typer.Option(metavar="NAME", help="Which motor: micro, lab, servo, wheel, big.")]
 Seed = Annotated[int | None, typer.Option(
-    min=0, help="Draws the hidden effect, the motor's constants, the noise and the faults.")]
-Rate = Annotated[float, typer.Option(min=1.0, max=20_000.0, help="Samples per second.")]
-SentChannels = Annotated[str, typer.Option(help="What it sends.")]
-Speed = Annotated[float, typer.Option(min=0.0, help="Times real time; 0 as fast as it is read.")]
-Probability = Annotated[float, typer.Option(min=0.0, max=1.0, help="Probability of this fault, per line.")]
-UnplugAfter = Annotated[float | None, typer.Option(help="Pull the plug after so many s of a run.")]
-PlugAfter = Annotated[float | None, typer.Option(help="Plug it in again after so many s.")]
-LinkName = Annotated[Path | None, typer.Option(help="A name for the port that stays the same.")]
+    metavar="N", min=0, help="Seed of the hidden effect, the motor's constants, the noise and the faults.")]
+Rate = Annotated[float, typer.Option(metavar="HZ", min=1.0, max=20_000.0, help="Samples per second.")]
+SentChannels = Annotated[str, typer.Option(metavar="v,i", help="Channels to send.")]
+Speed = Annotated[float, typer.Option(
+    metavar="FACTOR", min=0.0, help="Times real time; 0: as fast as it is read.")]
+Probability = Annotated[float, typer.Option(
+    metavar="P", min=0.0, max=1.0, help="Probability of this fault, per line.")]
+UnplugAfter = Annotated[float | None, typer.Option(metavar="S", help="Unplug the bench so long into a run.")]
+PlugAfter = Annotated[float | None, typer.Option(metavar="S", help="Plug it in again after so long.")]
+LinkName = Annotated[Path | None, typer.Option(metavar="PATH", help="A name for the port that stays the same.")]
 SocketPort = Annotated[int | None, typer.Option(
-    min=0, max=65_535, help="Serve socket:// on this port of the loopback address (0: any) instead of a "
-                            "pseudo-terminal.")]
+    metavar="PORT", min=0, max=65_535,
+    help="Serve socket:// on this port of the loopback address (0: any) instead of a pseudo-terminal.")]
 Once = Annotated[bool, typer.Option("--once", help="End after the first run.")]
-Reveal = Annotated[bool, typer.Option("--reveal", help="At the end, tell what was hidden.")]
+Reveal = Annotated[bool, typer.Option("--reveal", help="At the end, show what was hidden.")]
 
 
 def record_command(port: Port, out: Out, baud: Baud = 115_200, excite: Excite = None, duration: Duration = None,

@@ -13,7 +13,6 @@ import sys
 import textwrap
 import warnings
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -53,7 +52,21 @@ MAY_WRAP = 32  # characters of a cell that is a sentence: shorter ones are names
 WIDTH = 80  # where the output is no terminal
 
 
-class Command(TyperCommand):
+class _PlainHelp:
+    """Help that names no type of Python: a flag takes no value, an argument has its name."""
+
+    def get_params(self, ctx: Any) -> list[Any]:
+        """See click."""
+        params: list[Any] = super().get_params(ctx)  # type: ignore[misc]
+        for p in params:
+            if p.param_type_name == "argument":
+                p.display_type_rich = lambda ctx: ""
+            elif p.is_flag:
+                p.metavar = ""
+        return params
+
+
+class Command(_PlainHelp, TyperCommand):
     """A command whose ``--validate`` takes several names, as the shell makes them of a pattern."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
@@ -66,7 +79,7 @@ class Command(TyperCommand):
         return super().invoke(ctx)
 
 
-class Group(TyperGroup):
+class Group(_PlainHelp, TyperGroup):
     """Turns errors into one sentence on standard error and the exit status."""
 
     def main(self, args: Sequence[str] | None = None, prog_name: str | None = None, complete_var: str | None = None,
@@ -202,8 +215,7 @@ def _upright(table: Table, room: int) -> Table:
     whole = [max(_least(c), *(len(cell) for cell in c[1:] if max(map(len, c)) <= MAY_WRAP), 0) for c in _columns(table)]
     if sum(whole) + 3 * len(whole) < room or len(whole) <= len(table.rows) + 1:
         return table
-    head, *rows = zip(table.header, *table.rows, strict=True)
-    return replace(table, header=head, rows=rows, left=(0,))
+    return table.turned()
 
 
 def _widths(table: Table, room: int) -> list[int]:

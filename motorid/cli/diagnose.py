@@ -47,7 +47,7 @@ from motorid.records.reading import read_runs
 DEMO_SET = "hidden_friction"
 
 LIMITS = "Limits"
-Found = Annotated[Path, typer.Argument(metavar="FOUND.json", help="What diagnose --json wrote.")]
+Found = Annotated[Path, typer.Argument(metavar="FOUND.json", help="File written by diagnose --json.")]
 Plan = Annotated[Path | None, typer.Option(
     metavar="plan.csv", rich_help_panel=OUT, help="Write time, voltage and predictions.")]
 Goal = Annotated[str | None, typer.Option(
@@ -62,19 +62,19 @@ Kelvin = Annotated[float | None, typer.Option(
     min=0, metavar="K", rich_help_panel=LIMITS, help="Rise of the winding's temperature.")]
 Seconds = Annotated[float | None, typer.Option(min=0, metavar="S", help="By default that of the longest record.")]
 Shape = Annotated[str, typer.Option(metavar="steps|free|multisine", help="Steps, ramps, or ramps along sines.")]
-Levels = Annotated[int, typer.Option(metavar="N", help="Segments of the voltage; a bench takes so many.")]
+Levels = Annotated[int, typer.Option(metavar="N", help="Number of segments of the voltage; a bench has a limit.")]
 Slew = Annotated[float | None, typer.Option(metavar="V/S", rich_help_panel=LIMITS, help="Largest slope of ramps.")]
-Budget = Annotated[float | None, typer.Option(metavar="S", help="Take the best so far after this time.")]
+Budget = Annotated[float | None, typer.Option(metavar="S", help="Stop after this time with the best so far.")]
 
 
 @with_options(FitOptions)
 def diagnose_command(
     runs: Runs, options: FitOptions, validate: Validate = None,
     max_effects: Annotated[int, typer.Option(
-        min=0, metavar="N", rich_help_panel=OUT, help="Add at most so many effects.")] = 3,
+        min=0, metavar="N", rich_help_panel=OUT, help="Largest number of effects to add.")] = 3,
     budget: Annotated[float | None, typer.Option(
         min=0, metavar="SECONDS", rich_help_panel=OUT,
-        help="Give the best answer so far after so long, as Ctrl-C does.")] = None,
+        help="Stop after this time with the best answer so far, as Ctrl-C does.")] = None,
     remainder_to: Annotated[Path | None, typer.Option(
         metavar="FILE.py", rich_help_panel=OUT,
         help="Write what no effect explains as an effect, for --effects-from.")] = None,
@@ -153,6 +153,10 @@ def _next_step(found: Diagnosis) -> str:
     if found.effects:
         names = ",".join(found.after.model.effect_names)
         return f"Next: {next_command('fit', '--effects', names, '--json', 'fit.json')}"
+    if found.verdict == "unexplained":
+        if found.stopped:
+            return "Next: the same command with more time; not all effects were tried."
+        return f"Next: {next_command('diagnose', '--report', 'found.html')}\nIt shows where the model fails."
     return f"Next: {next_command('fit', '--json', 'fit.json')}\nThen: motorid export fit.json motor.casadi"
 
 

@@ -47,7 +47,7 @@ from motorid.uncertainty.identifiability import Identifiability, identifiability
 from motorid.uncertainty.multistart import Multistart, multistart
 
 MOST_SHOWN = 4  # runs of which all columns are listed
-SavedModel = Annotated[Path, typer.Argument(metavar="FIT.json", help="What fit --json or export wrote.")]
+SavedModel = Annotated[Path, typer.Argument(metavar="FIT.json", help="File written by fit --json or export.")]
 
 
 @with_options(FitOptions)
@@ -76,7 +76,8 @@ def _show_fit(found: Fit, records: list[Experiment], notes: list[str], judged: E
     """Print a fit: remarks, parameters, errors, what follows from them, and how it ended."""
     plain = found.fits == "noise" and max(found.misfit.values(), default=0.0) < PLAIN
     show(found.verdict, _held_out(found, judged) if judged else None, NRMSE,
-         None if plain else f"Next: {next_command('diagnose')}",
+         f"Next: {next_command('fit', '--json', 'fit.json')}\nThen: motorid export fit.json motor.casadi" if plain
+         else f"Next: {next_command('diagnose')}",
          f"\n{found.model.title}, {_amount(records)}. {ended(found)}\n")
     say_notes(notes, "About the records")
     show(*value_tables(found))
@@ -238,9 +239,9 @@ def _write_simulations(judged: Evaluation, out: Path, force: bool) -> list[str]:
 
 def export_command(
     fit_json: SavedModel,
-    path: Annotated[Path, typer.Argument(metavar="PATH", help="What to write.")],
+    path: Annotated[Path, typer.Argument(metavar="PATH", help="File to write.")],
     to: Annotated[str | None, typer.Option(
-        metavar="casadi|c|json", show_default=False, help="Form of the model; by default PATH's ending.")] = None,
+        metavar="casadi|c|json", show_default=False, help="Format; by default that of PATH's ending.")] = None,
     effects_from: EffectsFrom = None, force: Force = False,
 ) -> None:
     """Take a fitted model along: as CasADi functions, as C source, as JSON.
@@ -267,10 +268,10 @@ def identifiability_command(runs: Runs, options: FitOptions, json: Json = None, 
 @with_options(FitOptions)
 def robustness_command(
     runs: Runs, options: FitOptions,
-    starts: Annotated[int, typer.Option(min=1, metavar="N", rich_help_panel=OUT, help="How many fits.")] = 100,
+    starts: Annotated[int, typer.Option(min=1, metavar="N", rich_help_panel=OUT, help="Number of fits.")] = 100,
     spread: Annotated[float, typer.Option(
-        min=1.0, rich_help_panel=OUT, help="Every start is off by up to this factor.")] = 10.0,
-    seed: Annotated[int, typer.Option(min=0, rich_help_panel=OUT, help="Of the drawn starts.")] = 0,
+        min=1.0, metavar="FACTOR", rich_help_panel=OUT, help="Every start is off by up to this factor.")] = 10.0,
+    seed: Annotated[int, typer.Option(min=0, metavar="N", rich_help_panel=OUT, help="Seed of the starts.")] = 0,
     json: Json = None, report: Report = None,
 ) -> None:
     """Fit from many poor starts, and say whether all end in the same place.

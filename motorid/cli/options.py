@@ -67,9 +67,9 @@ class ReadingOptions:
 
     columns: Annotated[str | None, _reading(
         metavar="t=…,v=…",
-        help="Which column is which channel, where the header does not tell: t=time,v=u_volt.")] = None
+        help="Which column is which channel, where the header does not say: t=time,v=u_volt.")] = None
     units: Annotated[str | None, _reading(
-        metavar="omega=rpm", help="Units of channels, where the header does not tell.")] = None
+        metavar="omega=rpm", help="Units of channels, where the header does not say.")] = None
     hold: Annotated[str | None, _reading(
         metavar="zoh|linear", help="The input between samples: constant (zoh) or linear.")] = None
     median: Annotated[int | None, _reading(
@@ -132,7 +132,7 @@ class FitOptions(ReadingOptions):
         metavar="lm|multiple-shooting", show_default=False, help="By default lm; multiple-shooting for hard.")] = None
     formulation: Annotated[str, _solving(
         metavar="plain|penalty|hard",
-        help="What is asked beside the data: nothing, weighted penalties, or true constraints.")] = "plain"
+        help="Constraints beside the data: none, weighted penalties, or hard ones.")] = "plain"
     current_limit: Annotated[float | None, _solving(
         metavar="A", help="The current never exceeds this (penalty, hard).")] = None
     engine: Annotated[str, _solving(metavar="rosenbrock|cvodes|idas", help="Integrator.")] = "rosenbrock"
@@ -157,7 +157,7 @@ class FitOptions(ReadingOptions):
         values = _numbers([w for w in fixed if "=" in w], "--fix")
         for option, others in (("--set", begin), ("--free", free)):
             if both := [n for n in values if n in others]:
-                raise UsageError(f"{both[0]} is in --fix and in {option}: only one of them can be meant.")
+                raise UsageError(f"{both[0]} is in --fix and in {option}: give it in one of them.")
         return model.replace(**begin).fix(*(w for w in fixed if "=" not in w), **values).free(*free)
 
     def keywords(self) -> dict[str, Any]:

@@ -27,7 +27,7 @@ from motorid.diagnosis.predictive_score import Predictions
 from motorid.diagnosis.results import Adequacy
 from motorid.diagnosis.score_test import Score
 from motorid.diagnosis.thresholds import LARGER, SEARCHED
-from motorid.display.numbers import number
+from motorid.display.numbers import listed, number
 from motorid.estimation.result import Fit
 from motorid.numerics.autoregression import autocorrelation, effective_samples
 from motorid.numerics.signals import Array, despiked, outlier_limit, quantum
@@ -218,7 +218,7 @@ def _text(adequate: bool, channels: Mapping[str, Mapping[str, float]], material:
     sizes = _sizes(channels)
     if adequate:
         coloured = [channel_name(c) for c, f in channels.items() if f["autocorrelation"] > 0.3 or f["ratio"] > LARGER]
-        colour = f" The noise of {' and '.join(coloured)} is coloured." if coloured else ""
+        colour = f" The noise of {listed(coloured)} is coloured." if coloured else ""
         return f"The errors ({sizes}) do not depend on the motion (false-alarm rate {100 * false_alarm:g} %).{colour}"
     if not material:
         return f"Something is missing: the errors ({sizes}) are too large for noise, even coloured noise."
@@ -229,8 +229,8 @@ def _text(adequate: bool, channels: Mapping[str, Mapping[str, float]], material:
         error = f"{channel_name(worst['channel'])} error"
         why = f"{worst['on']} explains {100 * worst['share']:.0f} % of the variance of the {error}"
     if all(f["ratio"] < 1 for f in channels.values()):
-        return (f"Something is missing: the errors are small ({sizes}, which fast motion makes look larger than it "
-                f"is), but they depend on the motion: {why}.")
+        return (f"Something is missing: the errors are small ({sizes}, exaggerated by fast motion), but they depend on "
+                f"the motion: {why}.")
     return f"Something is missing: the errors ({sizes}) are not noise; {why}."
 
 

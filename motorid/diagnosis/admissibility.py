@@ -62,7 +62,7 @@ def _emptied(fit: Fit, added: Effect, before: Fit) -> str:
     for p, std in zip(before.problem.unknown, before.certainty("white").std, strict=True):
         was, now = (f.values.get(p.name, 0.0) for f in (before, fit))
         if p.positive and std is not None and std < KNOWN * was and now < EMPTIED * was:
-            return f"{p.name} goes to nothing with it, though the data determine it without"
+            return f"{p.name} goes to zero with it, although the data determine it without it"
     return ""
 
 

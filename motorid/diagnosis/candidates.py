@@ -24,6 +24,7 @@ from motorid.diagnosis.refit import GivenUp, Task, completed, hidden_in, lost, r
 from motorid.diagnosis.results import Candidate
 from motorid.diagnosis.score_test import Score, pairs_of, rank, uses_angle, with_phase_per_run, with_warm_start
 from motorid.diagnosis.thresholds import MATERIAL
+from motorid.display.numbers import listed
 from motorid.effects import LIBRARY, MEASURED, PER_RUN
 from motorid.errors import ModelError
 from motorid.estimation.least_squares import FAILURES
@@ -42,20 +43,9 @@ FLAT_TOP = 0.04  # of the samples: a current that is as large so often may have 
 
 
 class Stages:
-    """What a search is at: words on what was done, and one bar over all rounds that it may take.
+    """What a search is at: words on what was done (`say`), and one bar over all rounds that it may take (`show`).
 
     How many refits a round takes shows on the way: each lot of them is taken for half of what is left of the round.
-
-    Parameters
-    ----------
-    rounds : int
-        The most that a climb may take; looking at what remains is one more.
-    say : callable, optional
-        Called with a word on what was done.
-    show : callable, optional
-        What `motorid.numerics.parallel.progress` yields.
-    map_ : callable
-        For the refits.
     """
 
     def __init__(self, rounds: int = 0, say: Callable[[str], None] | None = None,
@@ -390,7 +380,7 @@ def _merged(a: Score, b: Score) -> list[dict[str, float]]:
 def _unseen(score: Score) -> str:
     """Say why an effect was not refitted."""
     if score.same_as:
-        return f"these records do not distinguish it from {' and '.join(score.same_as)} together"
+        return f"these records do not distinguish it from {listed(score.same_as)} together"
     return "not refitted: others ranked higher"
 
 

@@ -267,7 +267,7 @@ class Driven:
         system = rival.model.system({*errors, *(("theta",) if angle else ())})
         if system.inputs != ("v",):
             raise UsageError(f"{rival.name}: a model with measured inputs ({', '.join(system.inputs[1:])}) cannot be "
-                             "used to design an experiment: nobody knows them beforehand.")
+                             "used to design an experiment: they are not known beforehand.")
         system = voltage_as_parameters(system)
         sizes = np.array([errors.get(c, np.inf) for c in system.outputs])
         return Driven(rival, layout, system, sizes, np.ones(int(layout.edges[-1]), int))

@@ -34,6 +34,7 @@ from motorid.diagnosis.verdict import (
     unseen_remark,
     window_remark,
 )
+from motorid.display.numbers import listed
 from motorid.errors import MotoridError, at_least, numbers_told
 from motorid.estimation.result import Fit, checked
 from motorid.model.definition import Effect
@@ -153,7 +154,6 @@ def _suggestion(found: Climb) -> str | None:
     if not found.groups:
         return None
     names = found.groups[0]
-    listed = f"{', '.join(names[:-1])} and {names[-1]}"
     fits = [c.fit for c in found.rounds[0] if c.effect in names and c.fit is not None]
     if len(fits) < 2:
         return None
@@ -166,5 +166,5 @@ def _suggestion(found: Climb) -> str | None:
         shown = ("i", "omega", "theta") if problem.model.base == "dc_motor" else ("omega", "theta")
         more = [channel_name(c) for c in shown if c not in problem.outputs]
         told = f"; measure the {' or '.join(more)} too" if more else ""
-        return f"No voltage record of these channels within the limits would distinguish {listed}{told}."
-    return f"To distinguish {listed}, record {best.text}."
+        return f"No voltage record of these channels within the limits would distinguish {listed(names)}{told}."
+    return f"To distinguish {listed(names)}, record {best.text}."

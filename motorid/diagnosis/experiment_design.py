@@ -286,7 +286,7 @@ def design_experiment(found: Diagnosis | Fit | Sequence[Fit | Rival], *, goal: s
     shape : {"steps", "free", "multisine"}
         Steps, ramps between free levels, or ramps along a sum of sines.
     levels : int
-        Segments of the voltage; a bench takes so many.
+        Number of segments of the voltage; a bench has a limit.
     slew : float, optional
         Largest slope of ramps, V/s.
     budget : float, optional

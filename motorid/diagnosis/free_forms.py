@@ -36,7 +36,7 @@ CHANGES = {"t": "changes with the time", "turn": "changes with the angle within 
            "theta": "changes with the angle", "omega": "changes with the speed", "i": "changes with the current",
            "v": "changes with the voltage", "run": "differs from run to run",
            "past i": "depends on the current before", "past omega": "depends on the speed before",
-           "past v": "depends on the voltage before", "path": "depends on the way since a reversal"}
+           "past v": "depends on the voltage before", "path": "depends on the distance since a reversal"}
 PAST = ("past i", "past omega", "past v", "path")
 MEMORIES = 8  # lengths of memory
 

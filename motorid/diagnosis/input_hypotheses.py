@@ -83,7 +83,7 @@ def without_spikes(fit: Fit) -> Reading | None:
     )
     if not count:
         return None
-    says = f"{count} single samples stand far from both neighbours, as no motor moves, and are left out"
+    says = f"{count} single samples stand far from both neighbours, which no motor can do, and are left out"
     return Reading(says, "--no-spikes", Experiment.without_spikes)
 
 

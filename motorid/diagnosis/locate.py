@@ -269,14 +269,8 @@ class Begun(NamedTuple):
 def smooth(fit: Fit, k: int, walk: Array, begun: Begun) -> Smoothed:
     """Return the smoothed run `k`.
 
-    Parameters
-    ----------
-    fit : Fit
-    k : int
-    walk : ndarray, shape (2,)
-        Step size of the random walk, V/√s and N·m/√s; 0 holds it at zero.
-    begun : Begun
-        Where to begin, see `begin`; the same for every walk.
+    `walk` is the step size of the random walk, V/√s and N·m/√s (0: none); `begun` is where to begin, the same for every
+    walk.
     """
     run, system = fit.problem.runs[k], fit.problem.system
     p = parameter_vector(fit, k)

@@ -26,7 +26,7 @@ from motorid.diagnosis.predictive_score import (
     stacked_labels,
 )
 from motorid.diagnosis.thresholds import MOST, SUPPLANTS, TRIFLE
-from motorid.display.numbers import percent
+from motorid.display.numbers import listed, percent
 from motorid.estimation.least_squares import FAILURES
 from motorid.estimation.linearisation import INSEPARABLE
 from motorid.estimation.result import Fit
@@ -148,11 +148,9 @@ def grades_of(last: Node, root: Node, groups: Sequence[Sequence[str]], beside: S
     A rung that predicts better stays, whatever it is. Its effect is *named* if its law is physical there and its size
     more than its deviation, no rival predicts as well, no free form that contains it, or in its place, predicts better
     by more than the trifle that a free curve follows in any real motor and by more than a trifle of what the effect
-    itself does, and it explains more than it leaves, unless that is noise. A form beside the effect that predicts
-    surely less than the best one only imitates that.
-
-    `groups`: what these data cannot distinguish, the chosen effect first. `beside`: the forms that beside all effects
-    predict better. `structure`: `last` leaves more than noise. `without` gives the model without one of the effects.
+    itself does, and it explains more than it leaves, unless that is noise (no `structure`). A form `beside` the effect
+    that predicts surely less than the best one only imitates that. `without` gives the model without one of the
+    effects, if there is one.
     """
     rivals = {g[0]: g[1:] for g in groups}
     limited = structure and LIMITER not in last.key and any(current_limit(run) for run in root.fit.problem.experiments)
@@ -189,7 +187,7 @@ def _insignificant(fit: Fit, effect: Effect) -> str:
     found = [(fit.values[n], fit.std[n]) for n in sizes]
     found += [(own["value"], own["std"]) for n in sizes for own in fit.per_run.get(n, {}).values()]
     known = [value for value, std in found if std is None or std < abs(value)]
-    return f"{' and '.join(sizes)} could as well be zero, within one standard deviation" if sizes and not known else ""
+    return f"{listed(sizes)} could as well be zero, within one standard deviation" if sizes and not known else ""
 
 
 def _swallows(fit: Fit, form: Form, effect: Effect) -> bool:

@@ -345,8 +345,8 @@ def share_table(what: str, shares: Mapping[str, float]) -> Table:
 
 
 def ranking_table(candidates: Sequence[Candidate], most: int = 10) -> Table:
-    """Return the `most` best of the effects tried, and those accepted; the held-out error only where there is one."""
-    shown = [c for k, c in enumerate(candidates) if k < most or c.accepted]
+    """Return the effects accepted, then the best others up to `most`; the held-out error only where there is one."""
+    shown = sorted((c for k, c in enumerate(candidates) if k < most or c.accepted), key=lambda c: not c.accepted)
     held_out = any(c.held_out_gain is not None for c in shown)
     header = ["effect", "predicted", "refitted", *(["held out"] if held_out else []), "verdict"]
     rows: list[list[Cell]] = []
@@ -377,4 +377,4 @@ def ladder_table(ladder: Ladder) -> Table:
         name += "".join(f" − {gone}" for gone in r.removed)
         held = [percent((r.validation_nrmse or {}).get(c)) for c in channels] if held_out else []
         rows.append([name, *(percent(r.nrmse.get(c)) for c in channels), *held])
-    return Table(header, rows, "NRMSE before and after", NRMSE)
+    return Table(header, rows, "NRMSE before and after" if len(rows) > 1 else "NRMSE", NRMSE)

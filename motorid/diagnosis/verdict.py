@@ -13,7 +13,7 @@ from motorid.diagnosis.model_comparison import Node
 from motorid.diagnosis.results import Adequacy, Candidate, Rung
 from motorid.diagnosis.score_test import Score
 from motorid.diagnosis.thresholds import ELSEWHERE, LARGER, LOST, MATERIAL
-from motorid.display.numbers import arrow, number, percent, with_error
+from motorid.display.numbers import arrow, listed, number, percent, with_error
 from motorid.effects import EVERY
 from motorid.estimation.result import Fit, parameter_cell
 from motorid.model.definition import Effect
@@ -29,7 +29,8 @@ DECIDED = "blocks left out of the fitted runs decided"
 def first_answer(fit: Fit, judged: Adequacy, scores: Sequence[Score]) -> str:
     """Return what a look without any refit says: whether the model fits, and what to try first."""
     likely = [f"{s.effect.name} ({percent(s.drop, 2)})" for s in scores[:3] if s.drop > 0]
-    next_ = f" Most promising: {', '.join(likely)} of the squared error." if likely and not judged.adequate else ""
+    next_ = (f" Most promising, by the share of the squared error that they would remove: {', '.join(likely)}."
+             if likely and not judged.adequate else "")
     return f"first answer: {fit.verdict}{next_}"
 
 
@@ -66,7 +67,7 @@ def unexplained_text(ranking: Sequence[Candidate], rungs: Sequence[Rung], grades
     best = max((c for c in ranking if c.refit_drop is not None), key=lambda c: c.refit_drop or 0.0, default=None)
     if best is None or (best.refit_drop or 0) <= 0.05:
         return lead
-    return (f"{lead} The nearest, '{best.effect}', takes away {percent(best.refit_drop, 2)} of the squared error, but "
+    return (f"{lead} The nearest, '{best.effect}', removes {percent(best.refit_drop, 2)} of the squared error, but "
             f"was not added: {best.reason}.")
 
 
@@ -76,7 +77,7 @@ def approximations_text(grades: Sequence[Grade]) -> str:
     for g in grades:
         if g.grade == "approximates":
             reasons.setdefault(g.why, []).append(f"'{g.effect}'")
-    return " ".join(f"{' and '.join(', '.join(names).rsplit(', ', 1))} "
+    return " ".join(f"{listed(names)} "
                     f"{'help, but only approximate' if len(names) > 1 else 'helps, but only approximates'} it: {why}."
                     for why, names in reasons.items())
 
@@ -139,7 +140,7 @@ def errors_text(rungs: Sequence[Rung]) -> str:
     said = [w + " (mostly noise)" * w.startswith(noisy) for w in words]
     text = f"{'Held-out error' if held_out else 'Error'}: {', '.join(said)}."
     if held_out and (lost := [c for c, e in was.items() if min(e, is_[c]) > LOST]):
-        return f"{text} Both models lose {' and '.join(lost)} there; {DECIDED}."
+        return f"{text} Both models lose {listed(lost)} there; {DECIDED}."
     if held_out and _fall(was, is_) <= 0:
         return f"{text} It does not fall over all channels; {DECIDED}."
     if any(_matters(was[c], is_[c]) for c in was if c not in noise):
@@ -237,7 +238,7 @@ def inseparable_remark(same: Mapping[str, tuple[str, ...]]) -> str:
         by_parameters.setdefault(parameters, []).append(name)
     return " ".join(
         f"{' or '.join(names)} was not added: these records do not distinguish it from "
-        f"{' and '.join(parameters)}{' together' * (len(parameters) > 1)}."
+        f"{listed(parameters)}{' together' * (len(parameters) > 1)}."
         for parameters, names in by_parameters.items()
     )
 
@@ -259,8 +260,8 @@ def _listed(names: Iterable[str]) -> str:
 
 def hidden_remark(hidden: Mapping[tuple[str, str], tuple[str, ...]]) -> str:
     """Say which wider effects than those found do the same with other values of parameters, and what would tell."""
-    return " ".join(f"'{wider}' with other values of {' and '.join(parameters)} does the same as '{name}': fix one of "
-                    "these where it is known to distinguish them." for (name, wider), parameters in hidden.items())
+    return " ".join(f"'{wider}' with other values of {listed(parameters)} does the same as '{name}'. To distinguish "
+                    f"them, fix one of these where it is known." for (name, wider), parameters in hidden.items())
 
 
 def balance_of(name: str, also: Sequence[Effect] = ()) -> str:

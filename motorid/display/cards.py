@@ -7,7 +7,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from html import escape
 
 from motorid.display.numbers import with_error
@@ -23,6 +23,11 @@ _STYLE = """
 .motorid .flag{border-radius:.7em;padding:.05em .6em;font-size:12px;font-weight:600;white-space:nowrap}
 .motorid .muted{opacity:.75}
 .motorid p{margin:.35em 0}
+.motorid .scroll{overflow-x:auto}
+@media screen and (max-width:40rem){.motorid .wordy,.motorid .wordy :is(caption,thead,tbody){display:block}
+.motorid .wordy tr{display:flex;flex-wrap:wrap}
+.motorid .wordy tr>*{flex:1 1 0;min-width:0;border:0}.motorid .wordy tr>:first-child{flex-grow:2}
+.motorid .wordy tr>:last-child{flex:1 0 100%}}
 """
 # Words first, colour second: each pair has a contrast of 5.5 or more, on a light page and on a dark one.
 COLOURS = {
@@ -31,6 +36,9 @@ COLOURS = {
     "bad": ("#8f1220", "#ffe3e4"),
     "plain": ("#3a444f", "#e6eaef"),
 }
+
+
+WIDE, SENTENCE = 5, 32  # columns that a phone has room for; characters of a cell beyond a name or a number
 
 
 @dataclass(frozen=True)
@@ -74,12 +82,30 @@ class Table:
         body.insert(1, "  ".join("─" * w for w in widths))
         return "\n".join([part for part in (self.title, *body, self.note) if part])
 
+    def turned(self) -> Table:
+        """Return the table with rows and columns exchanged."""
+        header, *rows = zip(self.header, *self.rows, strict=True)
+        return replace(self, header=header, rows=rows, left=(0,))
+
+    @property
+    def on_page(self) -> Table:
+        """The table as a page shows it: upright where it would be wider than a phone, and has few rows."""
+        return self.turned() if len(self.header) > max(WIDE, len(self.rows) + 1) else self
+
+    @property
+    def wordy(self) -> bool:
+        """Whether the last column holds sentences: a narrow page shows it below the others."""
+        return len(self.header) > 2 and any(len(str(row[-1])) > SENTENCE for row in self.rows)
+
     def to_html(self) -> str:
         """Return the table with its headers marked as such."""
-        head = "".join(f'<th scope="col">{escape(h)}</th>' for h in self.header)
+        shown = self.on_page
+        head = "".join(f'<th scope="col">{escape(str(h))}</th>' for h in shown.header)
         caption = f"<caption>{escape(self.note)}</caption>" if self.note else ""
-        rows = "\n".join(_row(r) for r in self.rows)
-        return f"<table>{caption}\n<thead><tr>{head}</tr></thead>\n<tbody>\n{rows}\n</tbody></table>"
+        rows = "\n".join(_row(r) for r in shown.rows)
+        table = '<table class="wordy">' if shown.wordy else "<table>"
+        return (f'<div class="scroll">{table}{caption}\n<thead><tr>{head}</tr></thead>\n<tbody>\n{rows}\n'
+                "</tbody></table></div>")
 
 
 def _row(cells: Sequence[Cell]) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Sequence
 from decimal import ROUND_HALF_EVEN, Decimal
 
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
@@ -120,6 +121,11 @@ def glued(text: str) -> str:
 def counted(n: int, noun: str) -> str:
     """Return ``1 run``, ``2 runs``."""
     return f"{n} {noun}" + ("" if n == 1 else "s")
+
+
+def listed(names: Sequence[str]) -> str:
+    """Return ``a, b and c``."""
+    return " and ".join(", ".join(names).rsplit(", ", 1))
 
 
 def sentence(text: str) -> str:

@@ -30,14 +30,9 @@ def by_continuation(problem: Problem, effort: LevenbergMarquardt, callback: Call
                     wide: bool = True, narrow: bool = True) -> Estimate:
     """Minimise the cost from the values of the model, and restart where the first width ends in doubt.
 
-    One least-squares run where the model has no sgn, or one whose width was given. `effort` is that of the last width;
-    its `looks` counts the restarts at the first. `wide`: begin with a wide sgn, not with the width that the problem
-    has. `narrow`: end with a narrower one where that lowers the cost, see `sharpened`.
-
-    Raises
-    ------
-    FitError
-        If the model cannot be simulated at the start.
+    One least-squares run where the model has no sgn, or one whose width was given. `wide` begins with a wide sgn,
+    `narrow` ends with a narrower one where that lowers the cost, see `sharpened`; the `looks` of `effort` count the
+    restarts at the first width. Raises `FitError` if the model cannot be simulated at the start.
     """
     widths = _widths(problem) if wide and smooths(problem) else (problem.width,)
     history, last = (), len(widths) - 1

@@ -28,7 +28,7 @@ FLOOR = 1e-3  # share of its natural size given to a parameter that comes out as
 
 def first_guess(model: Model, runs: Sequence[Experiment], *, loaded: bool = False,
                 back_emf: float = BACK_EMF) -> dict[str, float]:
-    """Return values of the base parameters, SI, that suit `runs`; given and held ones keep their value.
+    """Return values of the base parameters, SI, that suit `runs`; given and fixed ones keep their value.
 
     `loaded`: the sizes of the model's torque effects as well. `back_emf` is the share of the voltage per speed that is
     taken for back-EMF where no current distinguishes it from viscous friction.
@@ -209,16 +209,9 @@ def loads_of(model: Model) -> tuple[Load, ...]:
 
 
 def columns(model: Model, loads: Sequence[Load], signals: Mapping[str, Array], base: Mapping[str, float]) -> Array:
-    """Return the torque against the motion per unit of each load, (N, loads), along `signals`.
+    """Return the torque against the motion per unit of each load, (N, loads), along `signals` (v, omega, theta, i).
 
-    Parameters
-    ----------
-    model : Model
-    loads : sequence of Load
-    signals : mapping
-        v, omega, theta and i (or what stands for it), (N,) each.
-    base : mapping of str to float
-        Values of the base parameters; those of effects are taken at their null, shapes as they are.
+    `base` are the values of the base parameters; those of effects are taken at their null, shapes as they are.
     """
     system = model.system(("omega",))
     zero = np.zeros(len(signals["v"]))

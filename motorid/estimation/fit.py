@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from motorid.display.numbers import listed
 from motorid.errors import ModelError, UsageError, name_of, numbers_told, one_of
 from motorid.estimation.angle_orders import effects_of_unknown_order, strongest_order, uses_angle
 from motorid.estimation.continuation import by_continuation
@@ -121,7 +122,7 @@ def fit(model: Model, runs: Sequence[Experiment] | Experiment, *, solver: Any = 
                          constraints=tuple(constraints), initial=initial,
                          weights=weights or ("rms" if formulation == "penalty" else "noise"))
     if unset := problem.model.without_value:
-        raise ModelError(f"{' and '.join(unset)} {'is' if len(unset) == 1 else 'are'} to be fixed, but at which value? "
+        raise ModelError(f"{listed(unset)} {'is' if len(unset) == 1 else 'are'} to be fixed, but at which value? "
                          f"Give it, in SI units: model.fix({unset[0]}=…).")
     with progress(text := f"Fitting {problem.model.title}", short=True) as advance:
         again = partial(solve, solver=solver, formulation=formulation, callback=lambda k, *rest: (
@@ -221,16 +222,7 @@ def _with_orders(problem: Problem) -> Problem:
 
 def minimise(problem: Problem, effort: LevenbergMarquardt, callback: Callback = None, *,
              wide: bool = True) -> Estimate:
-    """Minimise the cost from the values of the model: continuation, restarts, reweighting.
-
-    Parameters
-    ----------
-    problem : Problem
-    effort : LevenbergMarquardt
-    callback : callable, optional
-    wide : bool
-        Begin with a wide sgn, see `by_continuation`.
-    """
+    """Minimise the cost from the values of the model: continuation, restarts, reweighting; see `by_continuation`."""
     found = restore_collapsed(by_continuation(problem, effort, callback, wide=wide), effort, callback)
     effort = replace(effort, looks=0)
     for k in range(REWEIGHTINGS):
@@ -288,7 +280,7 @@ def _said(found: Estimate, error: float) -> tuple[str, str]:
     problem = found.problem
     if status == "stalled" and problem.weights == "noise" and \
             max(misfit_over_noise(problem, found.q).values(), default=np.inf) <= NOISE:
-        status, message = "converged", "converged: no step lowers a misfit that is noise"
+        status, message = "converged", "converged: the misfit is noise, and no step lowers it"
     if status == "converged" and error > max(1.0, ERROR_SHARE * _misfit(found)):
         return status, (f"{message}; but the integration error is {error:.2g} times the noise: try engine='cvodes' or "
                         "a finer record.")

@@ -59,25 +59,10 @@ class Estimate:
 
 def least_squares(problem: Problem, effort: LevenbergMarquardt, callback: Callback = None, *,
                   q: Array | None = None, refine: bool = True, rounds: int = ROUNDS) -> Estimate:
-    """Minimise the cost of `problem` from the values of its model.
+    """Minimise the cost of `problem` from the values of its model, or from `q`.
 
-    Parameters
-    ----------
-    problem : Problem
-    effort : LevenbergMarquardt
-        `LOOK`, `RACE`, `FINISH`, or options of the user's.
-    callback : callable, optional
-    q : ndarray, optional
-        Another start.
-    refine : bool
-        Choose the sub-steps anew where the solution goes; otherwise they stay as they are.
-    rounds : int
-        How often at most the run is repeated where the sub-steps do not suit its end.
-
-    Raises
-    ------
-    FitError
-        If the model cannot be simulated at the start.
+    `refine` chooses the sub-steps anew where the solution goes; the run is repeated at most `rounds` times where they
+    do not suit its end. Raises `FitError` if the model cannot be simulated at the start.
     """
     q, history = problem.start if q is None else q, ()
     for _ in range(rounds):
@@ -108,14 +93,8 @@ def race(problems: Iterable[Problem], effort: LevenbergMarquardt, *,
          solve: Callable[[Problem, LevenbergMarquardt], Estimate] = least_squares) -> Estimate | None:
     """Minimise the cost of each problem from the values of its model; return the lowest end, None if all failed.
 
-    Parameters
-    ----------
-    problems : iterable of Problem
-        Costs are compared: on the same records, with the same weights. Of equals the first wins.
-    effort : LevenbergMarquardt
-        `LOOK` for a few steps, `RACE` for nearly the whole way, `FINISH`.
-    solve : callable
-        How to minimise, e.g. `by_continuation`.
+    The problems have the same records and weights; of equals the first wins. `effort` is `LOOK` for a few steps, `RACE`
+    for nearly the whole way, or `FINISH`; `solve` minimises, e.g. `by_continuation`.
     """
     ends = []
     for problem in problems:

@@ -166,7 +166,7 @@ class Fit(Shown):
         said = {"noise": "Fits: errors at the level of the noise" if times < PLAIN else
                 f"Fits: errors up to {number(times, 2)} times the noise, as correlated noise may be",
                 "poor": f"Fits poorly: errors up to {number(times, 2)} times the noise",
-                "lost": "Does not fit: a model that says zero would be nearer"}[self.fits]
+                "lost": "Does not fit: predicting zero would be closer"}[self.fits]
         if self.window:
             said += f", a window of {number(self.window, 2)} s ahead"
         end = "" if self.status == "converged" else f" Not converged ({self.status}): the values are not an optimum."
@@ -433,11 +433,11 @@ def constraint_table(fit: Fit, violations: Mapping[str, float] = MappingProxyTyp
         label, _, unit = name.rpartition(", ")
         m = multipliers.get(name)
         beyond = [quantity(violations.get(name), unit, 3)] if violations else []
-        place = "weighed, not enforced" if m is None else Flag(m.label, "note") if m.active else m.label
+        place = "weighted, not enforced" if m is None else Flag(m.label, "note") if m.active else m.label
         cost = "–" if m is None else f"{number(m.value, 3)} per {m.unit or 'unit'}"
         rows.append([label or name, *beyond, place, cost])
     header = ["constraint", *(["largest violation"] if violations else []), "at the solution",
-              "multiplier (fall of the cost if it gave way)"]
+              "multiplier (fall of the cost if relaxed)"]
     return Table(header, rows, "Constraints", left=(0, len(header) - 2)) if rows else None
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from motorid.display.numbers import number, quantity
+from motorid.display.numbers import listed, number, quantity
 from motorid.estimation.result import Fit
 from motorid.estimation.shooting.outcome import violations
 from motorid.problem.relations import Relation
@@ -82,15 +82,15 @@ def remarks(fit: Fit) -> list[str]:
         said.append("The record moves in m: read K in N/A, b in N·s/m, J as a mass in kg, torques as forces in N.")
     motor = [n for n in vague if n in MOTOR]
     if model.base == "dc_motor" and motor and "i" not in measured:
-        said.append(f"The current was not measured, so {_listed(motor)} are not determined one by one, only their "
+        said.append(f"The current was not measured, so {listed(motor)} are not determined one by one, only their "
                     "combinations. Measure the current, or fix R and K where they are known (--fix R=1.2,K=0.05).")
         vague = [n for n in vague if n not in MOTOR and not _a_torque(model, n)]
     elif model.base == "dc_motor" and motor and "omega" not in measured and "theta" not in measured:
-        said.append(f"Neither speed nor angle was measured, so {_listed(motor)} are not determined one by one. "
+        said.append(f"Neither speed nor angle was measured, so {listed(motor)} are not determined one by one. "
                     "Measure one of them, or fix K (--fix K=0.05).")
         vague = [n for n in vague if n not in MOTOR and not _a_torque(model, n)]
     if vague:
-        said.append(f"The records do not determine {_listed(vague)}: another value fits them as well. Fix "
+        said.append(f"The records do not determine {listed(vague)}: another value fits them as well. Fix "
                     f"{'it' if len(vague) == 1 else 'one of them'} (--fix {vague[0]}=…), or look at "
                     "`motorid identifiability`.")
     said += _of_no_motor(fit)
@@ -126,10 +126,6 @@ def _vanished(fit: Fit, name: str) -> bool:
 
 def _a_torque(model: Any, name: str) -> bool:
     return "N" in model.parameters[name].unit
-
-
-def _listed(names: list[str]) -> str:
-    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
 
 
 def write_json(contents: Mapping[str, Any], path: str | Path, force: bool = False) -> None:

@@ -135,7 +135,7 @@ def cache_dir() -> Path | None:
         folder.mkdir(mode=0o700, exist_ok=True)
         own, above = folder.stat(), folder.parent.stat()
     except (OSError, RuntimeError) as error:  # RuntimeError: no home, or a loop of links
-        return _without(f"cannot compile, for want of a folder ({error})")
+        return _without(f"cannot compile: no folder to write to ({error})")
     if not hasattr(os, "getuid"):
         return folder
     loose = above.st_mode & 0o002 and not above.st_mode & stat.S_ISVTX

@@ -78,7 +78,7 @@ class Parameter:
         if not np.isfinite(self.value):
             raise ModelError(f"parameter '{self.name}' needs a finite value, got {self.value}.")
         if self.given and self.value and not 1e-20 < abs(self.value) < 1e20:
-            raise ModelError(f"parameter '{self.name}' = {self.value:g} cannot be meant; give it in SI units.")
+            raise ModelError(f"parameter '{self.name}' = {self.value:g} is not plausible; give it in SI units.")
         if self.positive and (self.value < 0 or (self.vary and self.value == 0)):
             raise ModelError(f"parameter '{self.name}' must be positive, got {self.value:g}. "
                              f"To leave it out of the model, set it to zero and fix it: model.fix({self.name}=0).")

@@ -213,13 +213,11 @@ class Done(NamedTuple):
 
 def run_tasks(function: Callable[[Any], Any], tasks: Sequence[Any], map: Map | None, text: str, *,
               quiet: bool = False, each: Callable[[Any], object] | None = None) -> Done:
-    """Return ``[function(task) for task in tasks]`` by way of `map`, with a progress bar.
+    """Return ``[function(task) for task in tasks]`` by way of `map`, with a progress bar that says `text`.
 
-    An interruption (Ctrl-C) keeps what is done. If the pool breaks, for instance because a worker was killed
-    and its pool cannot replace it, the rest is done in this process: that costs time, not results.
-
-    `function` is one of a module's top level that returns failures instead of raising them. `each` is called with
-    every result as it comes, for instance to save it. No `map` is the built-in one.
+    `function` stands at a module's top level and returns failures instead of raising them; `each` is called with every
+    result as it comes. An interruption (Ctrl-C) keeps what is done. If the pool breaks, for instance because a worker
+    was killed, the rest is done in this process: that costs time, not results.
     """
     results: list[Any] = []
     function = partial(_on_one_thread, function)

@@ -97,7 +97,7 @@ def _binned(ax: Axes, b: Binned, signals: Sequence[Mapping[str, Array]], values:
     ax.axhline(0, color=style.MUTED, lw=0.6)
     label = style.axis_label(b.against)
     label = f"{label.split(' (')[0]} ({b.unit})" if b.unit else label
-    style.tidy(ax, x=label, title=f"{100 * b.explained:.0f} % explained")
+    style.tidy(ax, x=label, title=f"explains {100 * b.explained:.0f} %")
 
 
 @style.styled
@@ -152,6 +152,8 @@ def _quantity(found: Diagnosis, balance: str, had: Sequence[Array] | None) -> tu
     orders = [values[p.name] for e in found.after.model.effects if e.name in found.effects for p in e.parameters
               if p.order]
     bins = found.missing.bins.get(balance, ())
+    # Over time and heat any course is a curve, whatever it depends on: they pass through each value once.
+    bins = [b for b in bins if b.against not in ("t", "heat")] or bins
     if orders or not bins or had is None:
         return ("theta", orders[0]) if orders else (bins[0].against if bins else "t", 1.0)
     y = np.concatenate(had)
@@ -224,7 +226,7 @@ def _ranking_legend(ax: Axes, chosen: Sequence[Candidate]) -> None:
     if any(c.accepted and c.refit_drop is not None for c in chosen):
         handles.append(Patch(color=style.PALETTE["blue"], alpha=0.85, label="refitted, accepted"))
     if any(not c.accepted and c.refit_drop is not None for c in chosen):
-        handles.append(Patch(color=style.PALETTE["grey"], alpha=0.85, label="refitted, not taken"))
+        handles.append(Patch(color=style.PALETTE["grey"], alpha=0.85, label="refitted, not accepted"))
     if any(c.held_out_gain is not None for c in chosen):
         orange = style.PALETTE["orange"]
         handles.append(Line2D([], [], marker="D", ls="", color=orange, label="fall of the held-out error"))

@@ -88,18 +88,7 @@ def plot_fit(result: Any, *, before: Any = None) -> np.ndarray:
 
 
 class LiveFit:
-    """The figure of `plot_fit` as a PNG that follows its model fast: only what moves is drawn again.
-
-    Parameters
-    ----------
-    result, before
-        As for `plot_fit`.
-    dpi : int
-
-    Attributes
-    ----------
-    axes : ndarray of Axes
-    """
+    """The figure of `plot_fit` as a PNG that follows its model fast: only what moves is drawn again."""
 
     @style.styled
     def __init__(self, result: Any, *, before: Any = None, dpi: int = 90) -> None:
@@ -287,12 +276,14 @@ def _one_parameter(ax: Axes, fits: Sequence[Any], name: str, truth: float | None
         value, std, colour = fits[k].values[name], fits[k].std.get(name), style.CYCLE[k % len(style.CYCLE)]
         ax.errorbar(k + 1, value / 10.0**power, yerr=2 * (std or 0.0) / 10.0**power, fmt="o", ms=5,
                     capsize=3 if std else 0, lw=1.4, color=colour, mfc="none" if std is None else colour)
-        if std is None:
-            ax.annotate("not\ndetermined", (k + 1, value / 10.0**power), (0, 6), textcoords="offset points",
-                        ha="center", fontsize=7, color=style.MUTED)
     ax.set_xlim(0.4, len(fits) + 0.6)
     ax.set_xticks(range(1, len(fits) + 1))
     _around(ax, values / 10.0**power)
+    for k in (k for k in known if fits[k].std.get(name) is None):
+        y = fits[k].values[name] / 10.0**power
+        below = y > sum(ax.get_ylim()) / 2  # above it may be the title
+        ax.annotate("not\ndetermined", (k + 1, y), (0, -6 if below else 6), textcoords="offset points", ha="center",
+                    va="top" if below else "bottom", fontsize=7, color=style.MUTED)
     style.tidy(ax, title=style.scaled_title(name, unit, power))
     ax.grid(axis="x", visible=False)
 

@@ -108,16 +108,9 @@ def png_of(axes: Any, dpi: int = 90) -> bytes:
 
 
 def svg_of(draw: Callable[..., Any], *args: Any, name: str, alt: str, **options: Any) -> str:
-    """Draw with one of the plot functions and return an inline ``<svg>`` element.
+    """Draw with `draw`, e.g. `plot_fit`, and return an inline ``<svg>`` element.
 
-    Parameters
-    ----------
-    draw : callable
-        E.g. `plot_fit`; called with `args` and `options`.
-    name : str
-        Prefix of the names inside, unique on the page.
-    alt : str
-        What the figure shows, for those who cannot see it.
+    `name` is the prefix of the names inside, unique on the page; `alt` says what the figure shows.
     """
     with detached():
         drawn = draw(*args, **options)

@@ -59,6 +59,8 @@ def plot_singular_values(result: Identifiability) -> np.ndarray:
     axes[0].axhspan(axes[0].get_ylim()[0], SEEN, color=style.MUTED, alpha=0.16, lw=0, zorder=0)
     axes[0].set_xticks(rows)
     style.plain_decades(axes[0])
+    axes[0].text(0.98, 0.97, "grey: not determined", transform=axes[0].transAxes, ha="right", va="top", fontsize=8,
+                 color=style.MUTED)
     style.tidy(axes[0], x="direction", y="singular value",
                title=f"rank {result.rank} of {k}, condition number {number(result.condition_number, 3)}")
     _directions(axes[1], result)
@@ -75,7 +77,7 @@ def _directions(ax: Axes, result: Identifiability) -> None:
     ax.set_yticks(range(1, k + 1))
     ax.set_ylim(k + 0.6, 0.4)
     ax.set_xlim(-0.6, k - 0.4)
-    style.tidy(ax, y="direction", title="What each direction is made of")
+    style.tidy(ax, y="direction", title="What each direction is made of (area: weight)")
 
 
 @style.styled

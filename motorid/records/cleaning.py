@@ -24,18 +24,9 @@ _LATE = 2  # this many rows in a row may come late before it counts as a new sta
 def run_from_columns(columns: Mapping[str, Array], texts: Texts, layout: Layout, *, name: str, hold: str,
                      sigma: Mapping[str, float] | None = None, meta: Mapping[str, Any] | None = None,
                      notes: Sequence[str] = ()) -> Experiment:
-    """Make a valid run of the columns of a file.
+    """Make a valid run of the columns of a file: numbers with NaN where missing, and `texts`, which may be dates.
 
-    Parameters
-    ----------
-    columns : mapping of str to (N,) array
-        Numbers as in the file, NaN where missing.
-    texts : mapping of str to sequence
-        Columns that are no numbers; a time column of dates is understood.
-    layout : Layout
-        Which column is which channel, in which unit.
-    name, hold, sigma, meta, notes
-        Passed on to the run; `notes` and those made here end up in ``meta["notes"]``.
+    `notes` and those made here end up in ``meta["notes"]``.
     """
     said = [*notes, *layout.notes]
     places = dict(layout.places)

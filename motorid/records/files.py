@@ -66,7 +66,7 @@ def check_output(path: str | Path, force: bool = False) -> Path:
             raise UsageError(f"cannot write {path}: " + ("it is a folder." if target.is_dir() else
                              f"there is no folder {target.parent}."))
         if (target.is_file() or not target.exists()) and not os.access(target.parent, os.W_OK):
-            raise UsageError(f"cannot write {path}: nobody may write to its folder. Choose another one.")
+            raise UsageError(f"cannot write {path}: its folder cannot be written to. Choose another one.")
         if force or not target.is_file():
             return target
         with target.open("rb") as file:
@@ -82,15 +82,9 @@ def check_output(path: str | Path, force: bool = False) -> Path:
 
 
 def write_files(files: Mapping[Path, str | bytes], force: bool = False) -> list[Path]:
-    """Write files whole or not at all: aside, carried to the disk, then renamed; the only way in which outputs are
-    written.
+    """Write `files` (str as UTF-8, or bytes) whole or not at all: aside, carried to the disk, then renamed.
 
-    Parameters
-    ----------
-    files : mapping of Path to str or bytes
-        Text is written as UTF-8.
-    force : bool
-        Also over files that motorid did not write.
+    The only way in which outputs are written; `force`: also over files that motorid did not write.
     """
     targets = [check_output(path, force) for path in files]
     try:

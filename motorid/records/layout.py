@@ -47,18 +47,10 @@ class Layout:
 
 def assign(labels: Sequence[str], *, columns: Mapping[str, object] | None = None,
            units: Mapping[str, object] | None = None, unit_row: Mapping[str, str] | None = None) -> Layout:
-    """Decide which column holds which channel.
+    """Decide which column of `labels` holds which channel; without a header they are the positions "1", "2", ...
 
-    Parameters
-    ----------
-    labels : sequence of str
-        Column names, all different; their positions "1", "2", ... if the file has no header.
-    columns : mapping, optional
-        Channel (t, v, i, omega, theta, v_supply, tau_load, temp) to column name, or to its position counted from 1.
-    units : mapping, optional
-        Channel or column to unit.
-    unit_row : mapping of str to str, optional
-        Column to unit, from the row of units below the header.
+    `columns` gives the name or position of a channel (t, v, i, omega, theta, v_supply, tau_load, temp), `units` the
+    unit of a channel or column, `unit_row` what the row below the header says.
     """
     if not labels:
         raise DataError("it has no columns.")
@@ -126,7 +118,7 @@ def _named_by_header(places: dict[str, Place], labels: Sequence[str], row: Units
             continue  # which of them acts on the motor is not known
         if len(best) > 1:
             names = " and ".join(f"'{p.column}'" for p in best)
-            raise DataError(f"{names} look like {_MEANING[channel]} ({channel}) all the same; say which one "
+            raise DataError(f"{names} look equally like {_MEANING[channel]} ({channel}); say which one "
                             f"is meant, e.g. columns={{'{channel}': '{best[0].column}'}}.")
         places[channel] = best[0]
         notes += [f"'{p.column}' looks like {_MEANING[channel]}, too; '{best[0].column}' is used."
@@ -210,7 +202,7 @@ def _say_which(labels: Sequence[str], channels: Sequence[str], free: Sequence[st
 def _assumed(places: Mapping[str, Place]) -> list[str]:
     guesses = [f"'{p.column}' as {_MEANING[c]}" for c, p in places.items() if p.score <= 1]
     plain = [f"{c} ('{p.column}') in {p.unit.symbol}" for c, p in places.items() if not p.stated]
-    told = [f"took {', '.join(guesses)} by the look of it; override with columns."] if guesses else []
+    told = [f"took {', '.join(guesses)} by their names and values; override with columns."] if guesses else []
     return told + ([f"no unit stated, assuming {', '.join(plain)}; override with units."] if plain else [])
 
 

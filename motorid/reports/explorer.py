@@ -106,7 +106,7 @@ class Explorer:
         self._show_values()
 
     def refit(self) -> None:
-        """Fit the model as it is ticked, from its present values."""
+        """Fit the model with the ticked effects, from its present values."""
         p = self._first.problem
         try:
             found = fit(self.model, self.runs, engine=p.engine, initial=p.initial, weights=p.weights, loss=p.loss)
@@ -151,8 +151,8 @@ class Explorer:
         self.boxes = {n: self._box(n) for n in self._effects}
         self._sliders = w.VBox()
         self.sliders: dict[str, Any] = {}
-        refit = w.Button(description="Refit", button_style="primary", tooltip="Fit the model as it is ticked")
-        reset = w.Button(description="Reset", tooltip="Back to the fit it began with")
+        refit = w.Button(description="Refit", button_style="primary", tooltip="Fit the model with the ticked effects")
+        reset = w.Button(description="Reset", tooltip="Back to the first fit")
         refit.on_click(lambda _: self.refit())
         reset.on_click(lambda _: self.reset())
         self.buttons = {"refit": refit, "reset": reset}

@@ -145,7 +145,7 @@ class Identifiability(Printed):
         elif self.structural_rank == k:
             said.append("The equations would allow all; these records excite too little, or are too noisy.")
         if self.combinations:
-            said.append(f"What they tell, nearly, is {', '.join(self.combinations)}.")
+            said.append(f"They determine approximately {', '.join(self.combinations)}.")
         said += [w.text for w in self.weak]
         said += self.remedies
         return " ".join(said)
@@ -253,13 +253,7 @@ def _structural_rank(problem: Problem, q: Array, points: int, seed: int) -> int:
 def basis_in_words(names: Sequence[str], weak: Array, matrix: Array) -> list[tuple[dict[str, float], float, str]]:
     """Return per weak direction its parts (largest 1), what a step of 10 % does in units of noise, and words.
 
-    Parameters
-    ----------
-    names : sequence of str, length k
-    weak : ndarray, shape (d, k)
-        Orthonormal rows.
-    matrix : ndarray, shape (n, k)
-        Whitened outputs per relative change.
+    `weak` (d, k) has orthonormal rows, `matrix` (n, k) the whitened outputs per relative change.
     """
     found = []
     for row in sparse_basis(weak):

@@ -275,10 +275,10 @@ def test_standard_stays_within_the_limit_and_moves_both_ways():
 
 
 @pytest.mark.parametrize(("words", "said"), [
-    ("stop:1", "unknown excitation 'stop'"), ("step:6", "takes 2 numbers"), ("step:x:1", "not a number"),
-    ("step:inf:1", "not a number"), ("step:6:-1", "1 ms to an hour"), ("prbs:6:0:1", "positive bit time"),
+    ("stop:1", "unknown excitation 'stop'"), ("step:6", "takes 2 numbers"), ("step:x:1", "not a usable number"),
+    ("step:inf:1", "not a usable number"), ("step:6:-1", "1 ms to an hour"), ("prbs:6:0:1", "positive bit time"),
     ("stairs:1:6:1:0.3", "levels"), ("chirp:1:-1:5:1", "negative"), ("standard", "limit-voltage"),
-    ("step:6:1,,", "unknown excitation"), ("rest:1e9", "not a number"), ("step:6:3601", "an hour")])
+    ("step:6:1,,", "unknown excitation"), ("rest:1e9", "not a usable number"), ("step:6:3601", "an hour")])
 def test_words_that_make_no_sense_are_refused_with_the_reason(words, said):
     if words == "step:6:1,,":
         words = "step:6:1,,rest:1"
@@ -316,7 +316,7 @@ def test_calibration_replaces_and_corrects(tmp_path):
 
 
 @pytest.mark.parametrize(("text", "said"), [
-    ("[i\n", "not TOML"), ("offset = 1", "stands alone"), ("[i]\nofset = 1", "Did you mean 'offset'"),
+    ("[i\n", "not TOML"), ("offset = 1", "is in none"), ("[i]\nofset = 1", "Did you mean 'offset'"),
     ("[i]\nscale = 0", "must not be zero"), ("[i]\nscale = true", "must be a number"),
     ("[i]\nsign = 2", "1 or -1"),
     ("[i]\ngain = inf", "must be a number"), ("[omega]\nscale = 1", "does not send")])

@@ -6,6 +6,7 @@ import json
 import re
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,8 +14,10 @@ import pytest
 from command import motorid, motorid_json
 from typer.main import get_command
 
+import motorid as mi
 from motorid.cli.app import app
 from motorid.cli.console import _spread, next_command, show, wrapped
+from motorid.cli.diagnose import _next_step
 from motorid.display.cards import Table
 from motorid.records.datasets import data_path, truth
 from motorid.records.reading import read_runs, write_csv
@@ -490,6 +493,16 @@ def test_lines_are_cut_between_words_but_not_before_a_unit():
     assert wrapped(12 * "a long word 1.25 % ").count("1.25 %") == 12
 
 
+def test_what_no_effect_and_no_curve_explains_is_looked_at_next_not_exported(monkeypatch):
+    """It said to keep the fit and to export it, though the model fails."""
+    monkeypatch.setattr(sys, "argv", ["motorid", "diagnose", "run.csv"])
+    found = mi.diagnose(mi.fit(mi.dc_motor(), read_runs(NOISY / "run1.csv")), max_effects=0)
+    open_ = replace(found, verdict="unexplained", remainder=None)
+    assert _next_step(open_).startswith("Next: motorid diagnose run.csv --report found.html")
+    assert "more time" in _next_step(replace(open_, stopped="the time is up"))
+    assert _next_step(replace(open_, verdict="adequate")).endswith("Then: motorid export fit.json motor.casadi")
+
+
 def test_help_cuts_no_name_at_80_columns(monkeypatch):
     monkeypatch.setenv("COLUMNS", "80")
     for name, command in get_command(app).commands.items():
@@ -497,3 +510,4 @@ def test_help_cuts_no_name_at_80_columns(monkeypatch):
         for p in command.params:
             assert not p.metavar or p.metavar in shown, (name, p.metavar)
             assert all(o in shown for o in p.opts if o.startswith("--")), name
+        assert not re.search(r"<\w", shown), name  # no type of Python

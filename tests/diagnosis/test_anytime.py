@@ -44,7 +44,7 @@ def test_the_first_answer_comes_before_any_refit(plain, monkeypatch):
     first = next(w for w in words if w.startswith("first answer"))
     assert words.index(first) < words.index("refits")
     assert "Fits poorly" in first
-    assert re.search(r"Most promising: \w+ \(\d+ %\)", first)
+    assert re.search(r"Most promising, by the share.*: \w+ \(\d+ %\)", first)
 
 
 def test_a_spent_budget_gives_the_ranking_and_says_what_was_not_done(plain):

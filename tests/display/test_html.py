@@ -278,3 +278,13 @@ def test_showing_a_result_computes_nothing(monkeypatch):
     for r in (found, found.ladder, found.missing, found.adequacy, found.before, fit):
         assert r._repr_html_().count("<table>") >= 1
         assert repr(r)
+
+
+def test_a_page_turns_a_wide_table_with_few_rows_and_puts_sentences_below_on_a_phone():
+    wide = Table(["model", *"abcdef"], [["DC motor", *"123456"], ["+ coulomb", *"654321"]])
+    assert wide.on_page.header == ("model", "DC motor", "+ coulomb")
+    assert list(wide.on_page.rows[0]) == ["a", "1", "6"]
+    assert Table(["model", *"abcd"], wide.rows).on_page.header == ["model", *"abcd"]
+    said = Table(["effect", "fall", "verdict"], [["stribeck", "9 %", "no better than coulomb, which it contains"]])
+    assert '<table class="wordy">' in said.to_html()
+    assert "wordy" not in wide.to_html()

@@ -38,9 +38,9 @@ SAID = {
     "Maximum_Iterations_Exceeded": (
         "limit", "stopped at the largest number of iterations; raise max_iterations, or start from a least-squares "
                  "fit: mi.fit(fit.model, …, solver=mi.MultipleShooting(warm='model'))"),
-    "Infeasible_Problem_Detected": ("failed", "no point nearby keeps all constraints"),
+    "Infeasible_Problem_Detected": ("failed", "no nearby point satisfies all constraints"),
     "Restoration_Failed": (
-        "failed", "the solver could not get back to a point that keeps the constraints; loosen them, or start from "
+        "failed", "the solver could not return to a point that satisfies the constraints; loosen them, or start from "
                   "a least-squares fit with warm='model'"),
     "Invalid_Number_Detected": (
         "failed", "the model could not be simulated on the way; bound the parameters with model.bounded(…), or "
@@ -189,7 +189,7 @@ class Multiplier:
         if not self.active:
             return f"{self.name} is not active: without it the fit would be the same."
         unit = "one unit" if self.unit in ("", "1") else f"1 {self.unit}"
-        return (f"{self.name}: {self.label}; giving way by {unit} would lower the cost by {self.value:.4g} "
+        return (f"{self.name}: {self.label}; relaxing it by {unit} would lower the cost by {self.value:.4g} "
                 "(to first order).")
 
 
