@@ -202,7 +202,7 @@ def _say_which(labels: Sequence[str], channels: Sequence[str], free: Sequence[st
 def _assumed(places: Mapping[str, Place]) -> list[str]:
     guesses = [f"'{p.column}' as {_MEANING[c]}" for c, p in places.items() if p.score <= 1]
     plain = [f"{c} ('{p.column}') in {p.unit.symbol}" for c, p in places.items() if not p.stated]
-    told = [f"took {', '.join(guesses)} by their names and values; override with columns."] if guesses else []
+    told = [f"took {', '.join(guesses)}, a guess from the headers; override with columns."] if guesses else []
     return told + ([f"no unit stated, assuming {', '.join(plain)}; override with units."] if plain else [])
 
 

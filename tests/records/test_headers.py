@@ -121,7 +121,7 @@ def test_what_was_assumed_is_told():
     assert "t ('t') in s" in told
     assert "omega ('w') in rad/s" in told
     assert assign(["t_s", "u_V", "w_rad_s"]).notes == []
-    assert "by the look of it" in "\n".join(assign(["t_s", "CH1 (V)", "w_rad_s"]).notes)
+    assert "a guess from the headers" in "\n".join(assign(["t_s", "CH1 (V)", "w_rad_s"]).notes)
 
 
 def test_columns_by_name_whatever_the_case_and_by_position():
