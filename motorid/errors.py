@@ -9,7 +9,7 @@ import numbers
 import os
 import re
 import sys
-from collections.abc import Callable, Container, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from itertools import pairwise
 from types import TracebackType
 from typing import Any, TypeVar, cast
@@ -86,10 +86,10 @@ def numbers_told() -> Iterator[None]:
 _Thing = TypeVar("_Thing", bound=Callable[..., Any])
 _SCALAR = {"float", "int", "bool", "str", "None"}
 _PLAIN = _SCALAR | {"Sequence", "Iterable", "Mapping", "tuple", "Callable", "Map", "Callback", "object", "Any"}
-_KINDS: dict[str, Any] = {"Path": (str, os.PathLike),
-                          "PathLike": (str, os.PathLike), "Path_": (str, os.PathLike), "Mapping": Mapping,
+_KINDS: dict[str, Any] = {**dict.fromkeys(("Path", "PathLike", "Path_"), (str, os.PathLike)), "Mapping": Mapping,
                           **dict.fromkeys(("Callable", "Map", "Callback"), Callable), "Records": object,
                           **dict.fromkeys(("Sequence", "Iterable", "tuple", "Array", "ArrayLike"), Iterable)}
+_choices = functools.cache(functools.partial(re.split, r" \| (?![^\[]*\])"))  # what an annotation allows
 
 
 def arguments_told(thing: _Thing) -> _Thing:
@@ -106,7 +106,8 @@ def arguments_told(thing: _Thing) -> _Thing:
 
     signature = inspect.signature(thing)
     member = "." in thing.__qualname__
-    plain = {p.name for p in signature.parameters.values()
+    plain = {p.name: "" if p.kind in (p.VAR_POSITIONAL, p.VAR_KEYWORD) else str(p.annotation)
+             for p in signature.parameters.values()
              if set(re.findall(r"\w+", str(p.annotation))) <= (_SCALAR if member else _PLAIN)}
 
     @functools.wraps(thing)
@@ -142,7 +143,11 @@ def positive(hint: str = "", /, **given: float | None) -> None:
 
 
 def _wrong_argument(function: Callable[..., Any], signature: inspect.Signature, args: Any, kwargs: Any,
-                    among: Container[str] | None = None) -> str | None:
+                    among: Mapping[str, str] | None = None) -> str | None:
+    if among is not None:  # most calls: a name per value, as bound but for what a "*" collects, and nothing wrong
+        named = {**dict(zip(signature.parameters, args, strict=False)), **kwargs}
+        if all(kind and (n not in named or _fits(named[n], kind)) for n, kind in among.items()):
+            return None
     try:
         given = signature.bind(*args, **kwargs).arguments
     except TypeError:  # Python says it well enough
@@ -163,19 +168,16 @@ def _wrong_argument(function: Callable[..., Any], signature: inspect.Signature, 
 
 def _fits(value: Any, annotation: str) -> bool:
     """Tell whether a value is of the kind that an annotation names; of lists and mappings, all that is in them."""
-    for choice in re.split(r" \| (?![^\[]*\])", annotation):
+    for choice in _choices(annotation):
         name, _, inner = choice.removesuffix("]").partition("[")
         name = name.rpartition(".")[2]
         if name in ("Any", "object") or (name == "None" and value is None):
             return True
         kind = _KINDS.get(name)
-        if name in ("float", "int", "bool"):
-            if _is_number(value, name):
-                return True
-            continue
-        if not (isinstance(value, kind) if kind else name in (c.__name__ for c in type(value).__mro__)):
-            continue
-        if isinstance(value, str | Mapping) and kind is Iterable:
+        known = (_is_number(value, name) if name in ("float", "int", "bool") else isinstance(value, kind) if kind
+                 else name in (c.__name__ for c in type(value).__mro__))
+        single = isinstance(value, str | Mapping) or (inner and getattr(value, "ndim", 1) == 0)
+        if not known or (kind is Iterable and single):
             continue
         if kind in (Iterable, Mapping) and inner and hasattr(value, "__len__"):
             parts = list(value.values() if isinstance(value, Mapping) else value)
@@ -192,10 +194,8 @@ def _is_number(value: Any, kind: str) -> bool:
     flag = type(value).__name__ in ("bool", "bool_")
     if kind == "bool":
         return flag or (isinstance(value, numbers.Real) and value in (0, 1))
-    array = getattr(value, "ndim", None) == 0 and hasattr(value, "__float__")
-    if flag or not (isinstance(value, numbers.Real) or array):
-        return False
-    return value == value and (kind == "float" or isinstance(value, numbers.Integral))
+    real = isinstance(value, numbers.Real) or (getattr(value, "ndim", None) == 0 and hasattr(value, "__float__"))
+    return not flag and real and value == value and (kind == "float" or isinstance(value, numbers.Integral))
 
 
 _CONTROLS = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")

@@ -72,6 +72,7 @@ def test_an_argument_of_another_kind_is_named(name):
     lambda: mi.LevenbergMarquardt(ftol=-1.0),
     lambda: mi.MultipleShooting(max_iterations=0),
     lambda: mi.MultipleShooting(tol=0.0),
+    lambda: mi.check_derivatives(FIT.problem, steps=np.array(1e-3)),  # one number in an array is no list
     lambda: mi.MultipleShooting(process_noise={"i": -1.0}),
     lambda: mi.Rosenbrock(most_steps=0),
     lambda: mi.Cvodes(rtol=-1.0),
