@@ -31,24 +31,26 @@ GUESS = np.array([2.0, 1e-3, 0.06, 1e-4, 4e-5])
 AIMS = {"compiled": 40, "virtual machine": 5, "cvodes": 4}
 
 
-def simulate(values: np.ndarray, run: mi.Experiment, rtol: float) -> np.ndarray:
-    """(i, omega) at the samples, (N, 2), by SciPy."""
-    r, inductance, k, b, j = values
+def simulate(values: np.ndarray, run: mi.Experiment, rtol: float, width: float = 1.0) -> np.ndarray:
+    """(i, omega) at the samples, (N, 2), by SciPy; a sixth value is dry friction, its sgn smoothed over `width`."""
+    r, inductance, k, b, j = values[:5]
+    dry = values[5] if len(values) > 5 else 0.0
     v, t = run.inputs["v"], run.t
     cuts = np.unique([0, *(np.flatnonzero(np.diff(v)) + 1), len(t) - 1])
     x, out = np.zeros(2), np.zeros((len(t), 2))
     for a, e in pairwise(cuts):
 
         def rates(_, x, volt=v[a]):
-            return (volt - r * x[0] - k * x[1]) / inductance, (k * x[0] - b * x[1]) / j
+            return (volt - r * x[0] - k * x[1]) / inductance, (k * x[0] - b * x[1] - dry * np.tanh(x[1] / width)) / j
 
         done = solve_ivp(rates, (t[a], t[e]), x, method="LSODA", t_eval=t[a:e + 1], rtol=rtol, atol=rtol * 1e-2)
         out[a:e + 1], x = done.y.T, done.y[:, -1]
     return out
 
 
-def scipy_fit(runs: list[mi.Experiment], start: np.ndarray, sigma: np.ndarray, choice: tuple) -> tuple[float, int]:
-    """χ² reached and number of simulations."""
+def scipy_fit(runs: list[mi.Experiment], start: np.ndarray, sigma: np.ndarray, choice: tuple,
+              width: float = 1.0) -> tuple[np.ndarray, float, int]:
+    """Parameters, χ² reached and number of simulations."""
     rtol, step, how = choice
     measured = [np.column_stack([r.outputs["i"], r.outputs["omega"]]) for r in runs]
     count = 0
@@ -57,11 +59,11 @@ def scipy_fit(runs: list[mi.Experiment], start: np.ndarray, sigma: np.ndarray, c
         nonlocal count
         count += 1
         with np.errstate(all="ignore"):
-            return np.concatenate([((simulate(start * np.exp(q), r, rtol) - y) / sigma).ravel()
+            return np.concatenate([((simulate(start * np.exp(q), r, rtol, width) - y) / sigma).ravel()
                                    for r, y in zip(runs, measured, strict=True)])
 
-    done = least_squares(residual, np.zeros(5), diff_step=step, method=how, ftol=1e-9, xtol=1e-9, gtol=1e-12)
-    return 2 * done.cost, count
+    done = least_squares(residual, np.zeros(len(start)), diff_step=step, method=how, ftol=1e-9, xtol=1e-9, gtol=1e-12)
+    return start * np.exp(done.x), 2 * done.cost, count
 
 
 def seconds(work: Callable[[], object]) -> float:
@@ -76,7 +78,7 @@ def rival(runs: list[mi.Experiment], start: np.ndarray, sigma: np.ndarray, chi2:
     took = {}
     for choice in CHOICES:
         began = time.process_time()
-        reached, _ = scipy_fit(runs, start, sigma, choice)
+        _, reached, _ = scipy_fit(runs, start, sigma, choice)
         if reached < chi2 + 0.01:
             took[choice] = time.process_time() - began
     return min(took, key=lambda c: took[c])
@@ -105,7 +107,7 @@ def compare(repeat: int) -> list[str]:
             least[n] = min(least[n], seconds(w))
     lines = [f"{'':<18}{'ms':>8}{'asked':>7}" + "".join(f"{'/ ' + n:>18}" for n in starts) + f"{'chi2':>11}"]
     for n, start in starts.items():
-        reached, count = scipy_fit(runs, start, sigma, choices[n])
+        _, reached, count = scipy_fit(runs, start, sigma, choices[n])
         rtol, step, how = choices[n]
         lines.append(f"{n:<18}{1e3 * least[n]:>8.1f}{'':>61}{reached:>11.3f}   LSODA rtol {rtol:g}, {how}, "
                      f"difference step {step:g}, {count} simulations of both")
