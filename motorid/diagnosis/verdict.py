@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -247,15 +247,10 @@ def unseen_remark(same: Mapping[str, tuple[str, ...]]) -> str:
     """Say which effects these records cannot show, since the motor's own parameters imitate them, and which would."""
     if not same:
         return ""
-    parameters = dict.fromkeys(itertools.chain(*same.values()))
+    parameters = listed(list(dict.fromkeys(itertools.chain(*same.values()))), "or")
     shown = "it" if len(same) == 1 else "them"
-    return (f"These records cannot show {_listed(same)}: other values of {_listed(parameters)} do the same. Steps of "
+    return (f"These records cannot show {listed(list(same), 'or')}: other values of {parameters} do the same. Steps of "
             f"several sizes in both directions, with current and speed measured, are likelier to show {shown}.")
-
-
-def _listed(names: Iterable[str]) -> str:
-    *others, last = names
-    return f"{', '.join(others)} or {last}" if others else last
 
 
 def hidden_remark(hidden: Mapping[tuple[str, str], tuple[str, ...]]) -> str:

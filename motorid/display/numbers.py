@@ -123,9 +123,9 @@ def counted(n: int, noun: str) -> str:
     return f"{n} {noun}" + ("" if n == 1 else "s")
 
 
-def listed(names: Sequence[str]) -> str:
+def listed(names: Sequence[str], last: str = "and") -> str:
     """Return ``a, b and c``."""
-    return " and ".join(", ".join(names).rsplit(", ", 1))
+    return f" {last} ".join(", ".join(names).rsplit(", ", 1))
 
 
 def sentence(text: str) -> str:
