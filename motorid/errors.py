@@ -12,7 +12,7 @@ import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from itertools import pairwise
 from types import TracebackType
-from typing import Any, TypeVar, cast
+from typing import Any, Protocol, TypeVar, cast, runtime_checkable
 
 
 def _leave(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
@@ -83,11 +83,22 @@ def numbers_told() -> Iterator[None]:
                        "Look at the units of the columns, and at the values that were set.") from error
 
 
+LARGEST = 1e12  # of any number asked for in SI units: its square is far from the end of the numbers
+
+
+@runtime_checkable
+class _Wire(Protocol):
+    read: Any
+    write: Any
+    close: Any
+
+
 _Thing = TypeVar("_Thing", bound=Callable[..., Any])
 _SCALAR = {"float", "int", "bool", "str", "None"}
 _PLAIN = _SCALAR | {"Sequence", "Iterable", "Mapping", "tuple", "Callable", "Map", "Callback", "object", "Any"}
 _KINDS: dict[str, Any] = {**dict.fromkeys(("Path", "PathLike", "Path_"), (str, os.PathLike)), "Mapping": Mapping,
                           **dict.fromkeys(("Callable", "Map", "Callback"), Callable), "Records": object,
+                          "Link": _Wire,
                           **dict.fromkeys(("Sequence", "Iterable", "tuple", "Array", "ArrayLike"), Iterable)}
 _choices = functools.cache(functools.partial(re.split, r" \| (?![^\[]*\])"))  # what an annotation allows
 
@@ -136,10 +147,10 @@ def at_least(least: float, **given: float | None) -> None:
 
 
 def positive(hint: str = "", /, **given: float | None) -> None:
-    """Refuse arguments that are not positive and finite; None is one left out."""
+    """Refuse arguments that are not positive, or beyond what anything measures; None is one left out."""
     for name, number in given.items():
-        if number is not None and not 0 < number < float("inf"):
-            raise UsageError(f"{name} must be positive and finite; got {number!r}.{hint}")
+        if number is not None and not 0 < number <= LARGEST:
+            raise UsageError(f"{name} must be positive and finite, at most {LARGEST:g}; got {number!r}.{hint}")
 
 
 def _wrong_argument(function: Callable[..., Any], signature: inspect.Signature, args: Any, kwargs: Any,
@@ -218,4 +229,4 @@ def one_of(word: str, known: Iterable[object], what: str) -> str:
     names = [str(k) for k in known]
     near = difflib.get_close_matches(str(word), names, n=1, cutoff=0.5)
     hint = f" Did you mean '{near[0]}'?" if near else ""
-    return f"unknown {what} '{word}'.{hint} Known: {', '.join(names)}."
+    return f"unknown {what} '{word}'.{hint} Known: {', '.join(names) or 'none'}."

@@ -45,13 +45,7 @@ class Client:
             self._spoken = now
 
     def hello(self) -> Header:
-        """Return the header of the device, having stopped whatever it did.
-
-        Raises
-        ------
-        DeviceError
-            If nobody answers in the protocol, with a guess at why.
-        """
+        """Return the header of the device, having stopped whatever it did; a DeviceError guesses why nobody answers."""
         try:
             header = Header.read(self.ask("?", "H", within=BOOT))
         except TimeoutError:
@@ -62,13 +56,7 @@ class Client:
         return header
 
     def prepare(self, header: Header, v_max: float, i_max: float, program: Program) -> tuple[float, float]:
-        """Send limits and program; return the limits now in force, in V and A.
-
-        Raises
-        ------
-        DeviceError
-            If the device refuses, or does not accept the limits.
-        """
+        """Send limits and program; return the limits now in force, in V and A. DeviceError if the device refuses."""
         v, i = min(v_max, header.v_max), min(i_max, header.i_max)
         _, _, mv, ma = self.ask(f"L,{_milli(v)},{_milli(i)}", "A,L")
         if int(mv) > _milli(v) or int(ma) > _milli(i):
@@ -85,15 +73,8 @@ class Client:
         return int(answer[2]), int(answer[3])
 
     def ask(self, command: str, answer: str, within: float = ANSWER) -> list[str]:
-        """Send a command until its answer comes, and return the answer's fields.
-
-        Raises
-        ------
-        TimeoutError
-            If it does not come (a DeviceError for every command but the first).
-        DeviceError
-            If the device refuses.
-        """
+        """Send a command until its answer comes; return its fields. DeviceError if the device refuses or is silent
+        (TimeoutError at the first command)."""
         end, wanted = time.monotonic() + within, answer.split(",")
         while (now := time.monotonic()) < end:
             self.link.write(frame(command))

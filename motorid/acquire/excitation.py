@@ -137,13 +137,7 @@ class Program:
         return Program(tuple(left), self.words)
 
     def check(self, v_max: float, segments: int, whose: str = "the limit") -> None:
-        """Refuse a program that goes beyond `v_max` volts or has more than `segments` segments.
-
-        Raises
-        ------
-        UsageError
-            Naming the segment that goes too far.
-        """
+        """Refuse a program beyond `v_max` volts, naming the segment, or of more than `segments` segments."""
         for k, segment in enumerate(self.segments):
             if segment.peak > v_max * (1 + 1e-9):
                 raise UsageError(f"segment {k + 1} of the excitation reaches {segment.peak:g} V, but {whose} "

@@ -60,13 +60,8 @@ def crc16(body: bytes) -> int:
 
 
 def frame(*fields: object) -> bytes:
-    """Return one line of the protocol, CRC and newline included.
-
-    Raises
-    ------
-    ValueError
-        If the fields cannot be a frame: too long, or with one of ``$ *`` or a control character in them.
-    """
+    """Return one line of the protocol, CRC and newline included; ValueError where it is too long, or a field holds one
+    of ``$ *`` or a control character."""
     body = ",".join(map(str, fields)).encode("ascii")
     if not 1 <= len(body) <= LONGEST or any(c < 32 or c in b"$*\x7f" for c in body):
         raise ValueError(f"not a frame of the protocol: {body!r}")
@@ -144,13 +139,7 @@ class Header:
 
     @classmethod
     def read(cls, fields: list[str]) -> Header:
-        """Make a header from the fields of its frame.
-
-        Raises
-        ------
-        DeviceError
-            If the device speaks another version, or says something that cannot be.
-        """
+        """Make a header from the fields of its frame; DeviceError for another version, or what cannot be."""
         if len(fields) < 2 or fields[1] != str(VERSION):
             raise DeviceError(f"the device speaks version {''.join(fields[1:2]) or '?'} of the protocol, "
                               f"this motorid version {VERSION}. Update the older one.")

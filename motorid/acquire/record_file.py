@@ -44,13 +44,7 @@ class Tail(NamedTuple):
 
 
 def check_target(out: Path, resume: bool, force: bool) -> None:
-    """Refuse, before anything moves, a file that must not be written.
-
-    Raises
-    ------
-    UsageError
-        If it exists and neither `resume` nor `force` is given, or both are, or its folder does not exist.
-    """
+    """Refuse, before anything moves, a file that exists without `resume` or `force`, or with both, or has no folder."""
     if resume and force:
         raise UsageError("--resume continues a record and --force replaces it; give one of them.")
     if out.exists() and not out.is_file():
@@ -63,13 +57,7 @@ def check_target(out: Path, resume: bool, force: bool) -> None:
 
 
 def read_tail(out: Path) -> Tail:
-    """Read where a record ends; a last line that was cut off does not count.
-
-    Raises
-    ------
-    DataError
-        If the file is not a record made by motorid.
-    """
+    """Read where a record ends; a last line that was cut off does not count. DataError if motorid did not make it."""
     meta: dict[str, str] = {}
     columns, last = "", ""
     with open(out, encoding="utf-8", errors="replace", newline="") as file:

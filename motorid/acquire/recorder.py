@@ -81,7 +81,8 @@ def record(port: str | Link, out: str | Path, *, baud: int = 115_200, excite: st
     check_target(out, resume, force)
     limits = {"limit_voltage": limit_voltage, "limit_current": limit_current}
     positive(duration=duration, timeout=timeout, **{c: x for c, x in limits.items() if x != math.inf})
-    entries = read_calibration(calibration) if isinstance(calibration, str | Path) else dict(calibration or {})
+    entries = (read_calibration(calibration) if isinstance(calibration, str | Path)
+               else _checked(dict(calibration or {}), "the calibration"))
     tail = read_tail(out) if resume and out.exists() else None  # without an excitation, it goes on with its own
     plan = RecordingPlan(tail.meta.get("excitation") if tail and excite is None else excite, tail)
     if not (isinstance(plan.excite, str) and "standard" in plan.excite):  # that one asks the device for its limit
@@ -155,14 +156,9 @@ class RecordingPlan:
     tail: Tail | None = None
 
     def todo(self, whole: Program) -> tuple[Program, int]:
-        """Return what is left of the whole program, and the number of its segments that are done.
+        """Return what is left of the whole program (UsageError if nothing is), and how many of its segments are done.
 
         The segment that was interrupted is repeated from its start, since the motor stood still meanwhile.
-
-        Raises
-        ------
-        UsageError
-            If nothing is left.
         """
         if self.tail is None:
             return whole, 0
@@ -191,21 +187,19 @@ class RecordingPlan:
 
 
 def read_calibration(path: str | Path) -> dict[str, dict[str, float]]:
-    """Read the user's calibration of a bench, a TOML file: per channel scale, offset, gain, zero and sign.
-
-    Raises
-    ------
-    DataError
-        If it cannot be read, or holds an entry that is not known or not a finite number.
-    """
+    """Read the user's calibration of a bench, a TOML file: per channel scale, offset, gain, zero and sign."""
     try:
         if Path(path).exists() and not Path(path).is_file():
             raise DataError(f"the calibration {path} is no file but a folder, a device or a pipe.")
         tables = tomllib.loads(Path(path).read_text(encoding="utf-8"))
     except OSError as error:
         raise DataError(f"the calibration file {path} cannot be read: {error.strerror}.") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (ValueError, RecursionError) as error:
         raise DataError(f"the calibration file {path} is not TOML: {error}.") from None
+    return _checked(tables, path)
+
+
+def _checked(tables: dict[str, Any], path: str | Path) -> dict[str, dict[str, float]]:
     for channel, entries in tables.items():
         if not isinstance(entries, dict):
             raise DataError(f"{path}: expected a table [channel] with entries; '{channel}' is in none.")

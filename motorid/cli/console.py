@@ -101,7 +101,7 @@ class Group(_PlainHelp, TyperGroup):
             status = FAILED
         except (ArithmeticError, np.linalg.LinAlgError, MemoryError) as error:
             _say(f"the numbers or the size of these records are beyond what can be computed "
-                 f"({error or type(error).__name__}).")
+                 f"({str(error) or 'out of memory'}).")
             status = FAILED
         except Exception as error:
             status = self._unexpected(error)

@@ -202,7 +202,7 @@ def read_rivals(path: Path, effects_from: Path | None, goal: str | None) -> list
         contents = loads(text)
         listed = [contents["best"]] if goal == "sharpen" else contents["rivals"]
         return [Rival.from_dict(r, model_from_json(r, own)) for r in listed]
-    except (DataError, ValueError, KeyError, TypeError):
+    except (DataError, ValueError, LookupError, TypeError, AttributeError, RecursionError):
         raise DataError(f"{path} holds no rival models. Write it with: motorid diagnose RUN... --json {path}") from None
 
 

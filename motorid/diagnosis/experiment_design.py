@@ -34,6 +34,7 @@ from motorid.records.files import write_files
 
 SAMPLES = 2000
 LONGEST = 1e5  # s
+MOST_SAMPLES = 1e9
 OMITTED = " Leave it out for that of the records."
 
 
@@ -87,7 +88,9 @@ def suggest_experiment(fits: Sequence[Fit], *, v_max: float | None = None, i_max
     runs = fits[0].problem.experiments
     v_max = v_max or max(float(np.abs(r.inputs["v"]).max()) for r in runs)
     duration = duration or max(r.duration for r in runs)
-    dt = max(float(np.median([r.dt for r in runs])), duration / SAMPLES)
+    dt = float(np.median([r.dt for r in runs]))
+    _check_span(duration, dt)
+    dt = max(dt, duration / SAMPLES)
     t = np.arange(0.0, duration, dt)
     scores, kept = {}, {}
     for name, (v, _) in candidates(t, v_max).items():
@@ -313,9 +316,7 @@ def design_experiment(found: Diagnosis | Fit | Sequence[Fit | Rival], *, goal: s
     _check_words(shape, levels, slew)
     seen = rivals[0].seen
     dt, duration = float(f"{dt or seen['dt']:.9g}"), duration or seen["duration"]
-    if not 10 * dt <= duration <= LONGEST:
-        raise UsageError(f"a design takes ten samples at least and {LONGEST:g} s at most; dt is {dt:g} s, the duration "
-                         f"{duration:g} s.")
+    _check_span(duration, dt)
     limits = _limits(rivals, v_max or seen["v"], i_max, omega_max, theta_range, temp_max)
     layout = _layout(shape, levels, duration, max(dt, 0.5 * duration / SAMPLES), limits["v"][1])
     with bar("Designing", 1 + (SHARPENED if asked else DISTINGUISHED), at_most=True) as advance:
@@ -419,6 +420,12 @@ def _asked(rival: Rival, parameters: Sequence[str] | None) -> tuple[str, ...]:
         if name not in free:
             raise UsageError(one_of(name, free, "free parameter"))
     return tuple(parameters or free)
+
+
+def _check_span(duration: float, dt: float) -> None:
+    if not 10 * dt <= duration <= min(LONGEST, MOST_SAMPLES * dt):
+        raise UsageError(f"an experiment takes {LONGEST:g} s at most, and from ten to {MOST_SAMPLES:g} samples; dt is "
+                         f"{dt:g} s, the duration {duration:g} s.")
 
 
 def _check_words(shape: str, levels: int, slew: float | None) -> None:

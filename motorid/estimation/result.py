@@ -167,6 +167,8 @@ class Fit(Shown):
                 f"Fits: errors up to {number(times, 2)} times the noise, as correlated noise may be",
                 "poor": f"Fits poorly: errors up to {number(times, 2)} times the noise",
                 "lost": "Does not fit: predicting zero would be closer"}[self.fits]
+        if self.fits == "noise" and self.problem.unknown and not any([*self.std.values(), *self.determined]):
+            said = "Nothing is determined: the records do not show what the motor does, and any values fit them"
         if self.window:
             said += f", a window of {number(self.window, 2)} s ahead"
         end = "" if self.status == "converged" else f" Not converged ({self.status}): the values are not an optimum."

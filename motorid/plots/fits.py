@@ -15,7 +15,7 @@ from PIL import Image
 
 from motorid.channels import CHANNELS
 from motorid.display.numbers import percent
-from motorid.errors import UsageError
+from motorid.errors import UsageError, one_of
 from motorid.numerics.signals import noise_level
 from motorid.plots import style
 from motorid.problem.simulate import Simulation
@@ -49,6 +49,9 @@ def plot_runs(runs: Sequence[Experiment] | Experiment, channels: Sequence[str] |
     shown = every[:COLUMNS]
     measured = [c for c in CHANNELS if any(c in r.outputs for r in shown)]
     names = list(channels or ["v", *measured])
+    for name in names:
+        if not any(name in run.inputs or name in CHANNELS for run in every):
+            raise UsageError(one_of(name, ["v", *CHANNELS], "channel"))
     axes = style.grid(len(names), len(shown), row=1.35, sharex="col", sharey="row")
     for k, run in enumerate(shown):
         for j, c in enumerate(names):
@@ -249,6 +252,9 @@ def plot_parameters(*results: Any, truth: Mapping[str, float] | None = None,
     """
     fits = _fits(results)
     chosen = list(names or dict.fromkeys(n for f in fits for n, p in f.model.parameters.items() if p.vary))
+    for name in chosen:
+        if not any(name in f.values for f in fits):
+            raise UsageError(one_of(name, dict.fromkeys(n for f in fits for n in f.values), "parameter"))
     columns = {6: 3, 7: 4, 8: 4}.get(len(chosen), min(len(chosen), 5))
     rows = -(-len(chosen) // columns)
     axes = style.grid(rows, columns, row=1.75, width=style.WIDTH * max(columns, 3) / 5).ravel()

@@ -8,6 +8,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from numbers import Real
 from types import SimpleNamespace
 from typing import Any
 
@@ -107,6 +108,10 @@ class SteadyState(Relation):
         if not (np.isfinite(self.tolerance) and self.tolerance >= 0):
             raise UsageError(f"SteadyState takes a tolerance of at least 0; got {self.tolerance!r}.")
         check_weight(self.weight, "SteadyState")
+        for part in self.at or ():
+            if not (isinstance(part, Sequence) and len(part) == 3 and all(isinstance(x, Real) for x in part)):
+                raise UsageError("SteadyState(at=…) takes (run, begin, end), runs counted from 0 and times in s; "
+                                 f"got {part!r}.")
 
     @property
     def name(self) -> str:
@@ -255,6 +260,9 @@ class Constraint(Relation):
                 return ca.SX(self.expression(SimpleNamespace(**symbols))) / self.size
             except AttributeError as error:
                 raise ModelError(f"{self.title}: {error}; known are {', '.join(symbols)}.") from None
+            except (TypeError, ValueError, ArithmeticError, RuntimeError) as error:
+                raise ModelError(f"{self.title}: its expression is no formula of {', '.join(symbols)} "
+                                 f"({type(error).__name__}: {str(error).partition(chr(10))[0]}).") from None
 
         rows_of = local(system, rows, 0)
         if rows_of.size1_out(0) != 1:

@@ -90,7 +90,7 @@ class Problem:
             if not (np.isfinite(self.priors[name]).all() and self.priors[name][1] > 0):
                 raise UsageError(f"the prior of '{name}' takes (mean, std), finite, std above zero; got "
                                  f"{self.priors[name]}.")
-        if self.loss is not None and not hasattr(self.loss, "pseudo"):
+        if self.loss is not None and (not hasattr(self.loss, "pseudo") or isinstance(self.loss, type)):
             raise UsageError(f"loss takes mi.Huber() or None; got {name_of(self.loss)}.")
         self.model.check_visible(self.outputs)
         width = self.width or smoothing(self.experiments, self.model.parameters)
@@ -148,13 +148,7 @@ class Problem:
         return engine_of(self.engine)
 
     def simulate(self, q: Array, k: int, *, derivatives: bool = True) -> Trajectory:
-        """Return the trajectory of run `k` at `q`, with derivatives with respect to q.
-
-        Raises
-        ------
-        SimulationError
-            If the integration fails there.
-        """
+        """Return the trajectory of run `k` at `q`, with derivatives by q; SimulationError if that fails."""
         return self._simulate(self.unknowns.point(np.asarray(q, float)), k, derivatives)
 
     def _simulate(self, at: Point, k: int, derivatives: bool) -> Trajectory:

@@ -44,10 +44,10 @@ def run_from_columns(columns: Mapping[str, Array], texts: Texts, layout: Layout,
                         "missing; there is nothing measured to fit.")
     _note_gaps(t, said)
     if "theta" in outputs and places["theta"].unit.symbol == "rad":
-        outputs["theta"], turns = unwrapped(outputs["theta"], t, outputs.get("omega"))
-        if turns:
-            said.append(f"the angle '{places['theta'].column}' jumps by a turn {turns} times: taken modulo a turn, "
-                        "it goes on here.")
+        outputs["theta"], turn, jumps = unwrapped(outputs["theta"], t, outputs.get("omega"))
+        if jumps:
+            by = "a turn" if turn == 2 * np.pi else f"{turn:.4g} rad, as a counter does,"
+            said.append(f"the angle '{places['theta'].column}' jumps by {by} {jumps} times; here it goes on.")
     used = {p.column for p in layout.places.values()}
     extra = {c: a[rows] for c, a in columns.items() if c not in used}
     if set(texts) - used:

@@ -58,13 +58,7 @@ def datasets() -> list[str]:
 
 
 def truth(name: str) -> dict[str, Any]:
-    """What is true of a shipped set: motor, parameters in SI, hidden effects, noise, seed.
-
-    Raises
-    ------
-    DataError
-        If there is no such set.
-    """
+    """What is true of a shipped set: motor, parameters in SI, hidden effects, noise, seed."""
     known = _truths()
     if name not in known:
         raise DataError(one_of(name, sorted(known), "shipped set"))

@@ -61,6 +61,8 @@ def check_output(path: str | Path, force: bool = False) -> Path:
     """Return the file to write: `path`, or what it links to."""
     target = Path(os.path.expanduser(path))
     try:
+        if "\0" in str(target):
+            raise ValueError("no name of a file holds a zero byte")
         target = target.resolve() if target.is_symlink() else target
         if target.is_dir() or not target.parent.is_dir():
             raise UsageError(f"cannot write {path}: " + ("it is a folder." if target.is_dir() else

@@ -12,6 +12,7 @@ from motorid.errors import UsageError
 from motorid.numerics.signals import Array, noise_level, robust_std
 
 CLEAR = np.pi / 2  # rad: a step of the angle this far from what is expected may be a turn or none
+BESIDE = 3  # samples on either side of a jump of the angle that show whether the shaft goes on
 JUMP = 7.0  # times the noise of the voltage: a step
 SHORTEST = 6  # samples that have a level
 PEAK = 6  # samples after a jump of the voltage, where the current has a peak
@@ -19,8 +20,8 @@ FEWEST = 20  # finite samples among which one can stand out
 LEAST, MOST = 3, 0.05  # spikes of a channel: fewer may be chance, a larger share is no accident
 
 
-def unwrapped(theta: Array, t: Array, omega: Array | None = None) -> tuple[Array, int]:
-    """Return an angle that was taken modulo a turn as it went on, and how often it had jumped; 0 where it never did.
+def unwrapped(theta: Array, t: Array, omega: Array | None = None) -> tuple[Array, float, int]:
+    """Return an angle that was taken modulo a turn, or a counter's range, as it went on; the jump, and how many.
 
     Parameters
     ----------
@@ -29,19 +30,42 @@ def unwrapped(theta: Array, t: Array, omega: Array | None = None) -> tuple[Array
     """
     seen = np.flatnonzero(np.isfinite(theta))
     turn, y = 2 * np.pi, theta[seen]
-    if len(seen) < FEWEST or not np.pi < np.ptp(y) < 1.01 * turn:
-        return theta, 0
     steps = np.diff(y)
-    expected = np.zeros_like(steps)
-    if omega is not None and np.isfinite(omega[seen]).all():
-        expected = (omega[seen][1:] + omega[seen][:-1]) / 2 * np.diff(t[seen])
-    jumps = np.round((expected - steps) / turn)
-    left = np.abs(steps + jumps * turn - expected)
-    if not jumps.any() or max(np.quantile(left, 0.99), left[jumps != 0].max()) > CLEAR:
-        return theta, 0
+    if len(seen) < FEWEST:
+        return theta, turn, 0
+    modulus = _modulus(steps, float(np.ptp(y)))
+    if abs(modulus - turn) > 0.02 * turn and modulus:
+        jumps, turn = -np.sign(steps) * (np.abs(steps) > np.ptp(y) / 2), modulus
+    elif np.pi < np.ptp(y) < 1.01 * turn:
+        expected = np.zeros_like(steps)
+        if omega is not None and np.isfinite(omega[seen]).all():
+            expected = (omega[seen][1:] + omega[seen][:-1]) / 2 * np.diff(t[seen])
+        jumps = np.round((expected - steps) / turn)
+        left = np.abs(steps + jumps * turn - expected)
+        if not jumps.any() or max(np.quantile(left, 0.99), left[jumps != 0].max()) > CLEAR:
+            return theta, turn, 0
+    else:
+        return theta, turn, 0
     on = theta.copy()
     on[seen[1:]] += turn * np.cumsum(jumps)
-    return on, int(np.count_nonzero(jumps))
+    return on, turn, int(np.count_nonzero(jumps))
+
+
+def _modulus(steps: Array, reach: float) -> float:
+    """Return by how much an angle jumps back, always alike, while the shaft goes on: a counter's range; else 0."""
+    large = np.abs(steps) > reach / 2
+    at = np.flatnonzero(large)
+    usual = float(np.abs(steps[~large]).max(initial=0.0))
+    beside = at[(at >= BESIDE) & (at < len(steps) - BESIDE)]
+    if not len(beside) or usual > reach / 3:
+        return 0.0
+    calm = np.where(large, 0.0, steps)
+    before, after = (np.array([calm[k + a:k + b].mean() for k in beside]) for a, b in ((-BESIDE, 0), (1, BESIDE + 1)))
+    goes_on = (before * steps[beside] < 0) & (after * steps[beside] < 0)
+    sizes = np.abs(steps[beside] - (before + after) / 2)[goes_on]
+    modulus = float(np.median(sizes)) if len(sizes) else 0.0
+    alike = np.abs(sizes - modulus).max(initial=0.0) < 0.02 * modulus
+    return modulus if alike and np.abs(np.abs(steps[at]) - modulus).max() < 1.5 * usual else 0.0
 
 
 def running_median(v: Array, samples: int) -> Array:
@@ -109,7 +133,8 @@ def spikes(t: Array, y: Array, v: Array) -> NDArray[np.intp]:
     for k in range(PEAK + 1):
         steady[np.clip(jumps + k, 0, len(t) - 1)] = False
     calm = steady[seen[1:-1]]
-    # Smooth or not, a channel bends everywhere alike; nine in ten tell how much.
-    usual = float(np.quantile(np.abs(off[calm]), 0.9)) if calm.any() else np.inf
-    large = np.abs(off) > max(12 * noise, 8 * usual)
-    return seen[1:-1][calm & large & (apart < 0.3 * np.abs(off))]
+    alone = calm & (apart < 0.3 * np.abs(off))
+    # Smooth or not, a channel bends everywhere alike; nine in ten tell how much. A spike bends three samples.
+    beside = np.convolve(alone & (np.abs(off) > 12 * noise), np.ones(3), "same") > 0
+    usual = float(np.quantile(np.abs(off[calm & ~beside]), 0.9)) if (calm & ~beside).any() else np.inf
+    return seen[1:-1][alone & (np.abs(off) > max(12 * noise, 8 * usual))]

@@ -177,6 +177,7 @@ def fit_many(model: Model, motors: Mapping[str, Records], *, journal: str | Path
     if not motors:
         raise UsageError("fit_many takes a mapping {name: runs}; it is empty. See motors_in(folder).")
     inspect.signature(fit).bind(model, motors, **options)  # a wrong option is no failure of every motor
+    inspect.signature(read_runs).bind("", **(reading or {}))
     _carry_laws(model)
     done = Checkpoint(Path(journal)) if journal is not None else None
     marks = {n: checkpoint_key(model, options, reading, runs) for n, runs in motors.items()} if done else {}

@@ -16,7 +16,7 @@ import numpy as np
 
 from motorid.display.cards import Card, Flag, Printed, Table
 from motorid.display.numbers import duration, number, percent, quantity, sentence
-from motorid.errors import MotoridError, SimulationError, UsageError, at_least
+from motorid.errors import MotoridError, SimulationError, UsageError, at_least, positive
 from motorid.estimation.fit import check_solver, minimise, solve
 from motorid.estimation.least_squares import FINISH
 from motorid.estimation.result import Failure, Fit
@@ -70,6 +70,7 @@ def multistart(problem_or_fit: Problem | Fit, *, starts: int = 100, spread: floa
     check_solver(solver)
     at_least(0, seed=seed)
     at_least(1, starts=starts, spread=spread)
+    positive(spread=spread)
     began = time.perf_counter()
     reference = problem_or_fit if isinstance(problem_or_fit, Fit) else solve(problem_or_fit, solver)
     names = reference.problem.model.free_names

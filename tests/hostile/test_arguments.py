@@ -99,7 +99,20 @@ def test_an_argument_of_another_kind_is_named(name):
     lambda: mi.identifiability(FIT, seed=-1),
     lambda: mi.fit(mi.dc_motor(), RUN, penalties=[3]),
     lambda: mi.fit(mi.dc_motor(), RUN, constraints=["x"], formulation="penalty"),
-    lambda: mi.effects.coulomb(tau_c="x")])
+    lambda: mi.effects.coulomb(tau_c="x"),
+    lambda: mi.multistart(FIT, starts=2, spread=1e300, quiet=True),
+    lambda: mi.multistart(FIT, starts=2, spread=float("inf"), quiet=True),
+    lambda: mi.suggest_experiment([FIT, FIT], duration=1e300),
+    lambda: mi.suggest_experiment([FIT, FIT], duration=1e6),
+    lambda: mi.suggest_experiment([FIT, FIT], duration=1e-9),
+    lambda: mi.suggest_experiment([FIT, FIT], v_max=1e300),
+    lambda: mi.design_experiment(FIT, duration=0.5, dt=1e-12),
+    lambda: mi.SteadyState(at=["x"]),
+    lambda: mi.SteadyState(at=[(0, 1.0)]),
+    lambda: mi.fit(mi.dc_motor(), RUN, loss=mi.Huber),
+    lambda: mi.plot_parameters(FIT, names=["Q"]),
+    lambda: mi.plot_runs(RUN, ["q"]),
+    lambda: mi.export(FIT, "a\0.json")])
 def test_a_number_that_cannot_be_meant_is_refused(call):
     with pytest.raises(mi.UsageError):
         call()
@@ -162,6 +175,18 @@ def test_what_is_no_function_is_no_effect():
 def test_a_wrong_option_is_no_failure_of_every_motor():
     with pytest.raises(TypeError, match="wibble"):
         mi.fit_many(mi.dc_motor(), {"a": RUN}, wibble=3, quiet=True)
+    with pytest.raises(TypeError, match="wibble"):
+        mi.fit_many(mi.dc_motor(), {"a": "run.csv"}, reading={"wibble": 3}, quiet=True)
+
+
+@pytest.mark.parametrize(("wrong", "says"), [
+    ({"excite": 3}, "excite takes"), ({"progress": 3}, "progress takes"),
+    ({"calibration": {"i": {"scale": "x"}}}, "scale must be a number"), ({"calibration": {"i": 2.0}}, "stands alone")])
+def test_what_is_wrong_of_a_recording_is_not_blamed_on_the_port(wrong, says, tmp_path):
+    with pytest.raises(mi.MotoridError, match=says):
+        mi.record(mi.virtual_bench("coulomb"), tmp_path / "run.csv", **{"excite": "step:1:0.05", **wrong})
+    with pytest.raises(mi.UsageError, match="port takes"):
+        mi.record(3, tmp_path / "other.csv")  # type: ignore[arg-type]
 
 
 def test_an_error_of_the_callers_own_stays_what_it_is():

@@ -228,3 +228,37 @@ def test_a_virtual_port_that_cannot_be_had_is_said(end):
         done = motorid("bench", end[0], end[1].format(port=taken.getsockname()[1]), "--once")
     assert (done.status, len(done.err.splitlines())) == (2, 1), done
     assert "cannot serve" in done.err
+
+
+def test_lists_in_lists_without_end_are_no_diagnosis_and_no_calibration(tmp_path):
+    (tmp_path / "found.json").write_text("[" * 100_000, encoding="utf-8")
+    (tmp_path / "bench.toml").write_text("a = " + "[" * 100_000, encoding="utf-8")
+    done = motorid("design", tmp_path / "found.json")
+    assert done.status == 2
+    assert "holds no rival models" in done.err
+    with pytest.raises(mi.DataError, match="is not TOML"):
+        mi.record(mi.virtual_bench("none"), tmp_path / "run.csv", calibration=tmp_path / "bench.toml")
+
+
+@pytest.mark.filterwarnings("ignore:SteadyState. no steady part")
+def test_a_steady_state_that_no_record_has_asks_for_nothing():
+    t = 1e-3 * np.arange(200)
+    run = mi.planned(mi.dc_motor(), t, 6 * np.sin(40 * t))
+    hard = mi.fit(mi.dc_motor(), run, solver=mi.MultipleShooting(), constraints=[mi.SteadyState()])
+    assert hard.status == "converged"
+
+
+def test_a_constraint_that_is_no_formula_is_said():
+    for odd in (lambda m: "x", lambda m: 1 / 0, lambda m: None):
+        with pytest.raises(ModelError, match="no formula of i"):
+            mi.fit(mi.dc_motor(), mi.read_csv(RUN), penalties=[mi.Constraint(odd, upper=1.0)])
+
+
+def test_no_memory_left_is_said(monkeypatch):
+    def greedy(*_: object, **__: object) -> None:
+        raise MemoryError
+
+    monkeypatch.setattr("motorid.cli.options.read_runs", greedy)
+    done = motorid("fit", RUN)
+    assert done.status == 1
+    assert "out of memory" in done.err

@@ -468,3 +468,47 @@ def test_an_offset_of_the_current_is_seen_at_rest(rng, noise):
     for offset, told in ((0.0, False), (0.002, False), (0.2, True), (-0.2, True)):
         run = plan.with_(outputs={"i": i + offset * top, "omega": omega})
         assert ("current_offset" in " ".join(mi.check_runs([run]))) is told, offset
+
+
+# -- found by a second attack ----------------------------------------------------------------------------------
+
+
+def test_a_few_wild_samples_are_called_spikes_and_nothing_else(rng):
+    """Once taken for the step of a coarse sensor, so for its noise: a fit with an error of 99 % "fitted"."""
+    t = 1e-3 * np.arange(700)
+    v = np.array([0, 6, -4, 10, 3, -8, -2, 5.0])[np.minimum((t / 0.0875).astype(int), 7)]
+    y = resting_motor(t, v, rng)
+    y["omega"][np.arange(20, 700, 27)] = 5000.0
+    run = Experiment(t, {"v": v}, {c: y[c] for c in ("i", "omega")}, name="run")
+    remarks = " ".join(mi.check_runs([run]))
+    assert "spikes" in remarks
+    assert not any(wrong in remarks for wrong in ("counts", "clipped", "noise"))
+    assert mi.fit(mi.dc_motor(), run).fits != "noise"
+
+
+@pytest.mark.parametrize("counts", [1024, 4096, 20000])
+def test_a_counter_that_runs_over_is_no_noisy_angle(counts, rng, tmp_path):
+    t = 1e-3 * np.arange(1500)
+    v = np.repeat([0.0, 9.0, -5.0, 12.0, 12.0], 300)
+    y = resting_motor(t, v, rng)
+    count = np.round(y["theta"] * 2048 / (2 * np.pi) + 1) % counts
+    table = pd.DataFrame({"time_s": t, "voltage_V": v, "current_A": y["i"], "enc": count})
+    table.to_csv(tmp_path / "a.csv", index=False)
+    run = mi.read_csv(tmp_path / "a.csv", columns={"theta": "enc"}, units={"theta": "counts:2048"})
+    assert any("as a counter does" in note for note in run.meta["notes"])
+    assert mi.fit(mi.dc_motor(), run).values["K"] == pytest.approx(TRUE["K"], rel=0.02)
+
+
+def test_a_record_of_nothing_determines_nothing():
+    t = 1e-3 * np.arange(300)
+    still = mi.fit(mi.dc_motor(), Experiment(t, {"v": 0 * t}, {"i": 0 * t, "omega": 0 * t}))
+    assert still.verdict.startswith("Nothing is determined")
+
+
+def test_a_unit_changed_in_a_file_is_seen(tmp_path):
+    run = mi.read_csv(mi.data_path("clean") / "run1.csv")
+    told = fit_dict(mi.fit(mi.dc_motor(), run))
+    told["parameters"]["R"]["unit"] = "kΩ"
+    (tmp_path / "fit.json").write_text(json.dumps(told), encoding="utf-8")
+    with pytest.raises(mi.DataError, match="gives R in kΩ"):
+        mi.load(tmp_path / "fit.json")

@@ -64,7 +64,7 @@ def test_nothing_is_said_about_nothing():
 
 def test_real_records_are_remarked_on_with_reason(real):
     expected = {
-        "emps": [], "fibo": ["17 single samples of the speed"], "frc": ["never reverses"],
+        "emps": [], "fibo": ["4 single samples of the speed"], "frc": ["never reverses"],
         "furuta_base": ["the angle advances 1.26", "at rest without a voltage"],  # -21 ± 7 mA in 1,700 samples
         "odri_mn4004": ["is 1 V from beginning to end", "uneven"], "xl330": ["uneven"],
         "unmotor": ["never reverses"],

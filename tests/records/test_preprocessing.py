@@ -27,7 +27,8 @@ def swinging(t=T):
 @pytest.mark.parametrize("low", [0.0, -np.pi])
 def test_an_angle_taken_modulo_a_turn_goes_on(low):
     theta = swinging()
-    on, jumps = unwrapped(np.mod(theta - low, TURN) + low, T)
+    on, turn, jumps = unwrapped(np.mod(theta - low, TURN) + low, T)
+    assert turn == TURN
     assert jumps >= 6
     assert np.allclose(on - on[0], theta - theta[0], atol=1e-12)
 
@@ -36,7 +37,7 @@ def test_missing_samples_do_not_stop_it():
     theta = swinging()
     wrapped = np.mod(theta, TURN)
     wrapped[100:110] = np.nan
-    on, _ = unwrapped(wrapped, T)
+    on, *_ = unwrapped(wrapped, T)
     seen = np.isfinite(wrapped)
     assert np.array_equal(np.isfinite(on), seen)
     assert np.allclose((on - theta)[seen], (on - theta)[0], atol=1e-12)
@@ -46,15 +47,32 @@ def test_with_the_speed_it_may_turn_by_more_than_half_a_turn_per_sample():
     t = 0.01 * np.arange(300)
     theta, omega = 400 * t**2, 800 * t  # 24 rad per sample at the end
     assert np.diff(theta).max() > 3 * TURN
-    on, _ = unwrapped(np.mod(theta, TURN), t, omega)
+    on, *_ = unwrapped(np.mod(theta, TURN), t, omega)
     assert np.allclose(on, theta, atol=1e-6)
 
 
 @pytest.mark.parametrize("theta", [swinging(), 0.3 * np.sin(7 * T), np.where(T < 0.4, 0.0, 4.0)])
 def test_an_angle_that_is_whole_is_left_alone(theta):
-    on, jumps = unwrapped(theta, T)
+    on, _, jumps = unwrapped(theta, T)
     assert jumps == 0  # one jump of 4 rad is none of 2.3 rad the other way, either
     assert on is theta
+
+
+@pytest.mark.parametrize("turn", [2.0, 9.0, 20.0])
+def test_a_counter_that_runs_over_anywhere_goes_on(turn):
+    theta = swinging()
+    on, found, jumps = unwrapped(np.mod(theta, turn), T)
+    assert found == pytest.approx(turn, rel=2e-3)
+    assert np.allclose(on - on[0], theta - theta[0], atol=0.01 * jumps)
+
+
+@pytest.mark.parametrize("theta", [
+    np.where(T < 0.4, 0.0, 1.0) + 1e-4 * np.sin(50 * T),  # moved within a sample
+    np.floor(1.5 + np.sin(7 * T)),  # two counts
+    np.where(np.arange(800) % 100 == 50, 0.0, 9.0 + np.sin(7 * T)),  # spikes
+    np.cumsum(np.where(np.arange(800) % 97 == 5, 5.0, 0.01))])  # jumps on, not back
+def test_other_jumps_of_an_angle_are_left(theta):
+    assert unwrapped(theta, T)[2] == 0
 
 
 def test_a_file_with_a_wrapped_angle_says_so_and_is_whole(tmp_path):

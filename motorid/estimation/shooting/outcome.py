@@ -140,7 +140,8 @@ def _extra(done: Solved) -> dict[str, Any]:
         extra |= {"gaps": gaps, "process_noise": dict(zip(problem.system.states, mesh.noise.tolist(), strict=True))}
     if problem.constraints:
         totals, rows = summed(_with_multipliers(done))
-        active = [jac[part.at_limit(values)] for _, part, values, jac in rows_at(problem, done.q)]
+        active = [np.zeros((0, len(done.q))),
+                  *(jac[part.at_limit(values)] for _, part, values, jac in rows_at(problem, done.q))]
         extra |= {"multipliers": totals, "active": rows, "violations": violations(problem, done.q),
                   "free": free_directions(np.concatenate(active), problem.scaling.slope(done.q))}
     return extra
