@@ -126,8 +126,8 @@ def model_from_json(contents: Mapping[str, Any], effects: Iterable[Effect] = ())
         raise DataError(f"the parameters {', '.join(sorted(missing))} are in only one of the file and the model: an "
                         "effect has changed since the file was written.")
     for name, p in pars.items():
-        if p.get("unit", unit := model.parameters[name].unit) != unit:
-            raise DataError(f"the file gives {name} in {p['unit']}, the model takes it in {unit or 'no unit'}.")
+        if (p.get("unit") or model.parameters[name].unit) != model.parameters[name].unit:
+            raise DataError(f"the file gives {name} in {p['unit']}, the model in {model.parameters[name].unit or '1'}.")
     limits = {n: (p.get("lower", -np.inf), p.get("upper", np.inf)) for n, p in pars.items()
               if "lower" in p or "upper" in p}
     fixed = {n: values[n] for n in fixed_names}  # first: what is fixed may be zero, what is free may not
