@@ -181,7 +181,8 @@ def test_a_wrong_option_is_no_failure_of_every_motor():
 
 @pytest.mark.parametrize(("wrong", "says"), [
     ({"excite": 3}, "excite takes"), ({"progress": 3}, "progress takes"),
-    ({"calibration": {"i": {"scale": "x"}}}, "scale must be a number"), ({"calibration": {"i": 2.0}}, "expected a table")])
+    ({"calibration": {"i": {"scale": "x"}}}, "scale must be a number"),
+    ({"calibration": {"i": 2.0}}, "expected a table")])
 def test_what_is_wrong_of_a_recording_is_not_blamed_on_the_port(wrong, says, tmp_path):
     with pytest.raises(mi.MotoridError, match=says):
         mi.record(mi.virtual_bench("coulomb"), tmp_path / "run.csv", **{"excite": "step:1:0.05", **wrong})
