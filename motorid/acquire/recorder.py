@@ -39,10 +39,10 @@ def record(port: str | Link, out: str | Path, *, baud: int = 115_200, excite: st
     out : str or Path
         The CSV to write.
     baud : int
-        Bits per second; boards with USB of their own do not care.
+        Bits per second; boards with native USB ignore it.
     excite : str or Program, optional
         What to apply, e.g. ``"rest:0.2,step:6:0.5,coast:1"`` or ``"standard"``; see
-        `motorid.acquire.excitation`. Without it the motor is held at 0 V.
+        `motorid.acquire.excitation`. By default 0 V.
     duration : float, optional
         Stop after so many s.
     limit_voltage, limit_current : float
@@ -50,7 +50,7 @@ def record(port: str | Link, out: str | Path, *, baud: int = 115_200, excite: st
     calibration : path or mapping, optional
         See `read_calibration`.
     resume, force : bool
-        Go on with, or replace, a file that exists. Neither: it is left alone and an error raised.
+        Continue, or replace, a file that exists. Neither: it is left alone and an error raised.
     timeout : float
         Silence of the device, in s, that ends the recording.
     progress : callable, optional

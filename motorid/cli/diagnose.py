@@ -99,8 +99,7 @@ def diagnose_command(
             _keep_fit(before, done, json, options.force)
         raise
     if json != "-":
-        say_notes(notes, "About the records")
-        _show_diagnosis(found)
+        _show_diagnosis(found, notes)
     if json:
         write_json(found.to_dict() | {"notes": notes}, json, options.force)
     if remainder_to:
@@ -134,9 +133,10 @@ def _write_remainder(found: Diagnosis, path: Path, force: bool) -> None:
     show(f"Written: {path}. Fit with it: --effects-from {path} --effects {path.stem}")
 
 
-def _show_diagnosis(found: Diagnosis) -> None:
+def _show_diagnosis(found: Diagnosis, notes: Sequence[str]) -> None:
     """Print a diagnosis: the answer, the errors before and after, the next step; then what it rests on."""
     show(found.answer, "", ladder_table(found.ladder), _next_step(found), "")
+    say_notes(notes, "About the records")
     say_notes(found.details, "Details")
     if found.after is not found.before:
         show(parameter_table(found.after, found.before))
@@ -146,7 +146,8 @@ def _show_diagnosis(found: Diagnosis) -> None:
 def _next_step(found: Diagnosis) -> str:
     """Return what to do next: the experiment that decides, what remains, or the model to go on with."""
     if found.suggestion:
-        return f"Next: {found.suggestion[0].lower()}{found.suggestion[1:]}"
+        made = "\nOr design one: diagnose with --json found.json, then motorid design found.json"
+        return f"Next: {found.suggestion[0].lower()}{found.suggestion[1:]}{made * found.suggestion.startswith('To ')}"
     if found.remainder is not None and found.remainder.proposed:
         command = next_command("diagnose", "--remainder-to", "remainder.py")
         return f"Next: {command}\nIt writes what remains as an effect."

@@ -68,7 +68,7 @@ def identify_on(bench: str | Link, folder: str | Path = ".", *, goal: str = "dis
                 parameters: Sequence[str] | None = None, v_max: float, i_max: float, records: int = 4,
                 duration: float = 2.0, first: str = "standard", progress: Callable[[str], None] | None = None,
                 **options: Any) -> Campaign:
-    """Identify a motor on a bench: record, fit, diagnose, design the next record, until nothing asked is open.
+    """Identify a motor on a bench: record, fit, diagnose, design the next record, until all is determined.
 
     Each designed voltage was checked against every rival before it is played; the device enforces `v_max` and `i_max`
     while it is. **The motor will move: keep clear of the shaft.**
@@ -88,7 +88,7 @@ def identify_on(bench: str | Link, folder: str | Path = ".", *, goal: str = "dis
     v_max, i_max : float
         V, A.
     records : int
-        At most so many.
+        Largest number of records.
     duration : float
         Of a designed record, s.
     first : str

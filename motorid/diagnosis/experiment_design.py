@@ -59,7 +59,7 @@ class Suggestion(Shown):
 @one_thread
 def suggest_experiment(fits: Sequence[Fit], *, v_max: float | None = None, i_max: float | None = None,
                        duration: float | None = None) -> Suggestion:
-    """Choose the experiment that best tells the models of `fits` apart.
+    """Choose the experiment that best distinguishes the models of `fits`.
 
     Parameters
     ----------
@@ -268,12 +268,12 @@ def design_experiment(found: Diagnosis | Fit | Sequence[Fit | Rival], *, goal: s
     derivatives of the discrete step, from fixed candidates and, to sharpen, from waves with current or speed at the
     limit; the limits are constraints for every rival, and the voltage shrinks until drawn parameters keep them too.
 
-    It is a local optimum, as good as the rivals: where all of them are wrong, it promises nothing, nor do the limits.
+    It is a local optimum, as good as the rivals: where all are wrong, neither gain nor limits are guaranteed.
 
     Parameters
     ----------
     found : Diagnosis, Fit or sequence of Fit
-        What was found, or the rivals themselves, fitted to the same records.
+        A diagnosis, or the rivals themselves, fitted to the same records.
     goal : {"distinguish", "sharpen"}, optional
         By default to distinguish where there are rivals.
     parameters : sequence of str, optional

@@ -170,7 +170,7 @@ def grades_of(last: Node, root: Node, groups: Sequence[Sequence[str]], beside: S
             if better is not None:
                 form, why = better.form, f"{better.form.text}, which the library lacks, predicts better in its place"
             elif taken < MOST:
-                why = f"it takes {percent(taken, 2)} of the squared error, and what is left is not noise"
+                why = f"it removes {percent(taken, 2)} of the squared error, and the rest is not noise"
         kind = "approximates" if why else "group" if rivals.get(e.name) else "named"
         found.append(Grade(e.name, kind, why, form))
     return tuple(found)

@@ -351,10 +351,12 @@ def ranking_table(candidates: Sequence[Candidate], most: int = 10) -> Table:
     header = ["effect", "predicted", "refitted", *(["held out"] if held_out else []), "verdict"]
     rows: list[list[Cell]] = []
     best = next((c.effect for c in candidates if c.accepted), "")
+    group = {name for c in shown if c.accepted for name in c.group}
     for c in shown:
         gain = [percent(c.held_out_gain)] if held_out else []
         helps = c.reason.startswith("lowers the") and c.reason.endswith("%")
-        reason = f"{c.reason}; {best} was taken instead" if helps and best else c.reason.partition(" (gain ")[0]
+        instead = f"not distinguished from {best}" if c.effect in group else f"{c.reason}; {best} was taken instead"
+        reason = instead if helps and best else c.reason.partition(" (gain ")[0]
         verdict = Flag("accepted", "good") if c.accepted else (reason or "not refitted")
         refit = None if c.refit_drop is None else round(c.refit_drop, 5)
         rows.append([c.effect, percent(round(c.predicted_drop, 5)), percent(refit), *gain, verdict])

@@ -71,14 +71,14 @@ def unexplained_text(ranking: Sequence[Candidate], rungs: Sequence[Rung], grades
             f"was not added: {best.reason}.")
 
 
-def approximations_text(grades: Sequence[Grade]) -> str:
-    """Say which effects help without being the thing itself, and why."""
+def approximations_text(grades: Sequence[Grade], what: str = "it") -> str:
+    """Say which effects help without being the thing itself, `what`, and why."""
     reasons: dict[str, list[str]] = {}
     for g in grades:
         if g.grade == "approximates":
             reasons.setdefault(g.why, []).append(f"'{g.effect}'")
-    return " ".join(f"{listed(names)} "
-                    f"{'help, but only approximate' if len(names) > 1 else 'helps, but only approximates'} it: {why}."
+    return " ".join(f"{listed(names)} {'help' if len(names) > 1 else 'helps'}, but only "
+                    f"{'approximate' if len(names) > 1 else 'approximates'} {what}: {why}."
                     for why, names in reasons.items())
 
 
@@ -92,7 +92,7 @@ def missing_text(rungs: Sequence[Rung], remaining: Adequacy, groups: Sequence[Se
     names = [g.effect for g in grades if g.grade != "approximates"]
     parts = [f"Missing: {'; '.join(_described(after, n) for n in names)}."]
     parts += [f"These records do not distinguish {g[0]} from {' or '.join(g[1:])}." for g in groups]
-    parts += [approximations_text(grades)] if len(names) < len(grades) else []
+    parts += [approximations_text(grades, "the rest")] if len(names) < len(grades) else []
     parts.append(errors_text(rungs))
     left = remaining.text.removeprefix("Something is missing: ")
     where = " on the fitted runs, not on the held-out ones" * elsewhere
@@ -199,7 +199,8 @@ def moves(before: Fit, after: Fit) -> str:
         f"{with_error(after.values[n], is_[n], after.problem.model.parameters[n].unit)}"
         for n in moved
     ]
-    return f"Without it, other parameters had compensated: {', '.join(said)}."
+    several = len(after.model.effects) > len(before.model.effects) + 1
+    return f"Without {'them' if several else 'it'}, other parameters had compensated: {', '.join(said)}."
 
 
 def measured_angle_remark(fit: Fit) -> str:

@@ -89,8 +89,8 @@ class Table:
 
     @property
     def on_page(self) -> Table:
-        """The table as a page shows it: upright where it would be wider than a phone, and has few rows."""
-        return self.turned() if len(self.header) > max(WIDE, len(self.rows) + 1) else self
+        """The table as a page shows it: turned where it would be wider than a phone, and has few rows."""
+        return self.turned() if len(self.header) > WIDE > len(self.rows) else self
 
     @property
     def wordy(self) -> bool:

@@ -164,7 +164,7 @@ class Fit(Shown):
         """Whether it fits, in a sentence."""
         times = max(self.misfit.values(), default=0.0)
         said = {"noise": "Fits: errors at the level of the noise" if times < PLAIN else
-                f"Fits: errors up to {number(times, 2)} times the noise, as correlated noise may be",
+                f"Fits: errors up to {number(times, 2)} times the noise, which correlated noise can explain",
                 "poor": f"Fits poorly: errors up to {number(times, 2)} times the noise",
                 "lost": "Does not fit: predicting zero would be closer"}[self.fits]
         if self.fits == "noise" and self.problem.unknown and not any([*self.std.values(), *self.determined]):

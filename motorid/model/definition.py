@@ -218,7 +218,7 @@ def effect(*, balance: str, name: str | None = None,
     name : str, optional
         Default: the function's name.
     includes : tuple of str, optional
-        Effects that this one contains as a special case; it refuses to stand beside them.
+        Effects that this one contains as a special case; it cannot be combined with them.
 
     Raises
     ------

@@ -105,7 +105,7 @@ def _limit_of(fits: Sequence[Fit]) -> float:
 
 @style.styled
 def plot_formulations(result: Formulations) -> np.ndarray:
-    """Draw the same fit plain, with penalties and with hard constraints: parameters, errors, and the walk between.
+    """Draw the same fit plain, with penalties and with hard constraints: parameters, errors, and the path between.
 
     Parameters
     ----------

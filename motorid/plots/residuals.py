@@ -25,7 +25,7 @@ def plot_residuals(fit: Fit, channels: Sequence[str] | None = None) -> np.ndarra
     """Draw the residuals of each channel: over time, their histogram, their correlation with the input and with
     themselves, against the model's ω, i, θ.
 
-    What only noise leaves over is flat: a histogram under the curve of the normal distribution, correlations within
+    Noise alone is flat: a histogram under the curve of the normal distribution, correlations within
     their bands of 95 %, means of zero against every quantity.
 
     Parameters

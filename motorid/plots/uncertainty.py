@@ -173,7 +173,7 @@ def plot_sensitivities(fit: Fit, *, run: int = 0, names: Sequence[str] | None = 
     """Draw what one per cent of each parameter does to the outputs, one row per parameter, beside the noise.
 
     Rows of the same shape cannot be distinguished; where the curve stays within the grey band of the noise, these
-    samples say next to nothing about the parameter. Every row has its own scale.
+    samples say almost nothing about the parameter. Every row has its own scale.
 
     Parameters
     ----------
@@ -231,7 +231,7 @@ def _sensitivity(ax: Axes, t: Array, change: Array, sigma: float, unit: str) -> 
 def plot_waterfall(result: Multistart) -> np.ndarray:
     """Draw where fits from random starts ended: their errors in order, and how far the parameters came.
 
-    A flat line of errors and ends at one, from starts all over the place, say that the start does not matter.
+    A flat line of errors and ends at one, from widely scattered starts, say that the start does not matter.
 
     Parameters
     ----------

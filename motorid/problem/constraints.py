@@ -78,7 +78,7 @@ class SteadyState(Relation):
     The measured means of current and speed are put into the voltage and the torque balance; sensor effects
     are undone first, states that were not measured come from the simulation. For the plain motor that is
     ``v = R i + K ω`` and ``K i = b ω``; with effects the relation grows with the model. Steady parts are
-    found in the data, see `segments`. At standstill only the voltage balance is asked for.
+    found in the data, see `segments`. At standstill only the voltage balance is used.
 
     Attributes
     ----------

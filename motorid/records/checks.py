@@ -93,8 +93,8 @@ def _one_column_for_two(run: Experiment) -> str | None:
 def _excitation(run: Experiment) -> str | None:
     v = run.inputs["v"]
     if np.ptp(v) <= 1e-6 * np.abs(v).max():
-        return (f"the voltage is {v[0]:.4g} {run.units['v']} from beginning to end; such a run alone "
-                "cannot distinguish the parameters. Add runs with steps or a sweep of the voltage.")
+        return (f"the voltage is {v[0]:.4g} {run.units['v']} from beginning to end: such a run shows one "
+                "steady speed and at most a start. Add runs with steps or a sweep of the voltage.")
     still = [c for c, y in run.outputs.items() if np.nanmax(y) == np.nanmin(y)]
     if still:
         return (f"the {NAMES[still[0]]} never changes although the voltage does; a dead sensor, a "

@@ -55,7 +55,7 @@ def read_runs(paths: Path_ | Iterable[Path_], *, columns: Mapping[str, object] |
     Returns
     -------
     list of Experiment
-        In SI units. ``run.meta["notes"]`` tells in plain words what was assumed, mended or left out;
+        In SI units. ``run.meta["notes"]`` says what was assumed, mended or left out;
         ``meta["extra"]`` holds the other numeric columns.
 
     Raises
@@ -82,7 +82,7 @@ def read_runs(paths: Path_ | Iterable[Path_], *, columns: Mapping[str, object] |
 
 def read_csv(path: Path_, *, columns: Mapping[str, object] | None = None, units: Mapping[str, object] | None = None,
              hold: str | None = None, name: str | None = None) -> Experiment:
-    """Read one text file of whatever dialect (delimiter, decimal comma, comments, row of units, encoding).
+    """Read one text file of any dialect (delimiter, decimal comma, comments, row of units, encoding).
 
     Parameters and errors are those of `read_runs`; `name` is used instead of the name of the file.
 

@@ -29,7 +29,7 @@ REACH = 10.0  # a slider goes from a tenth to ten times the value it begins with
 def explore(fit: Fit, *, effects: Iterable[Effect | str] | None = None) -> Explorer:
     """Play with a fit in a notebook: tick effects, move parameters, see the curves and the error, refit.
 
-    Effects stand by balance, the most promising first, with the share of the misfit that each is predicted to take.
+    Effects stand by balance, the most promising first, with the share of the misfit that each is predicted to remove.
 
     Parameters
     ----------

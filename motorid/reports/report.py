@@ -28,7 +28,7 @@ def report(result: Any, path: str | Path, *, title: str = "", command: str = "",
     """Write the story of a result as one HTML page: no network, no script, figures inside.
 
     The answer first, with its figure, the errors before and after and the next step; then parameters, fits, held-out
-    records, where the model fails, the effects tried, the data and their checks, and where it all comes from. A fit
+    records, where the model fails, the effects tried, the data and their checks, and the provenance. A fit
     alone gives its part of the story; several results, in a list, follow one another.
 
     Parameters

@@ -153,7 +153,7 @@ def fit_many(model: Model, motors: Mapping[str, Records], *, journal: str | Path
         Per motor its runs, or where they are: a path, a pattern, several of these; read by the worker.
     journal : path, optional
         Results are added to this file as they come; what is there for the same model, options and records is
-        not done again. So an interrupted batch goes on where it was.
+        not done again. So an interrupted batch continues where it was.
     map : callable, optional
         Anything with the signature of `map`; a task is one motor, or a few of many.
     reading : mapping, optional

@@ -49,7 +49,7 @@ def multistart(problem_or_fit: Problem | Fit, *, starts: int = 100, spread: floa
     seed : int
         The starts depend on it alone, not on the pool.
     guess : bool
-        Let the automatic first guess compete with the start, as in `fit`. Default: the start stands alone.
+        Let the automatic first guess compete with the start, as in `fit`. By default it does not.
     solver : optional
         As in `fit`; default `LevenbergMarquardt`.
     map : callable, optional

@@ -56,7 +56,7 @@ def approximates(found):
     for before, rung in pairwise(rungs):
         assert rung.grade == "approximates"
         assert ("which the library lacks, predicts better in its place" in rung.why
-                or "of the squared error, and what is left is not noise" in rung.why)
+                or "of the squared error, and the rest is not noise" in rung.why)
         why = rung.why.replace(f"{found.missing.acts_like}, which the library lacks, predicts better in its place",
                                "a free curve predicts better")
         said = rf"'{rung.added}'[^:]* but only approximates? it: {re.escape(why)}"

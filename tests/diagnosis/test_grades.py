@@ -117,7 +117,7 @@ def test_what_explains_less_than_it_leaves_is_not_named(rubbing, monkeypatch, sh
     monkeypatch.setattr(misspecification, "better_forms", lambda fit, rival: [])
     (told,) = misspecification.grades_of(last, root, (), (), True, lambda name: worse)
     assert told.grade == grade
-    assert ("30 % of the squared error, and what is left is not noise" in told.why) == (grade == "approximates")
+    assert ("30 % of the squared error, and the rest is not noise" in told.why) == (grade == "approximates")
     (told,) = misspecification.grades_of(last, root, (), (), False, lambda name: worse)
     assert told.grade == "named"
 

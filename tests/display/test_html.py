@@ -15,7 +15,7 @@ import pytest
 import motorid as mi
 from motorid.acquire import Recording
 from motorid.diagnosis.experiment_design import Suggestion
-from motorid.diagnosis.results import Diagnosis, Ladder, Missing
+from motorid.diagnosis.results import Candidate, Diagnosis, Ladder, Missing, ranking_table
 from motorid.display.cards import COLOURS, Flag, Table
 from motorid.estimation.covariance import Quantity
 from motorid.estimation.result import Comparison, Failure, Fit
@@ -288,3 +288,12 @@ def test_a_page_turns_a_wide_table_with_few_rows_and_puts_sentences_below_on_a_p
     said = Table(["effect", "fall", "verdict"], [["stribeck", "9 %", "no better than coulomb, which it contains"]])
     assert '<table class="wordy">' in said.to_html()
     assert "wordy" not in wide.to_html()
+
+
+def test_the_effects_tried_begin_with_the_accepted_one_and_name_its_group():
+    helps = "lowers the held-out error by 90 %"
+    tried = [Candidate("spring", 0.9, reason=helps), Candidate("gravity", 0.8, reason=helps),
+             Candidate("coulomb", 0.7, group=("spring",), accepted=True)]
+    rows = ranking_table(tried).rows
+    assert [r[0] for r in rows] == ["coulomb", "spring", "gravity"]
+    assert [str(r[-1]) for r in rows[1:]] == ["not distinguished from coulomb", f"{helps}; coulomb was taken instead"]

@@ -72,7 +72,7 @@ def test_coloured_noise_is_no_poor_fit_and_the_missing_effect_makes_it_good(runs
     assert max(clean.misfit.values()) > 2
     better = mi.fit(mi.dc_motor() + mi.effects.coulomb, runs)
     assert clean.fits == better.fits == "noise"
-    assert clean.verdict.startswith("Fits: errors up to 2.5 times the noise, as correlated noise may be")
+    assert clean.verdict.startswith("Fits: errors up to 2.5 times the noise, which correlated noise can explain")
     assert better.verdict.startswith("Fits: errors at the level of the noise")
 
 

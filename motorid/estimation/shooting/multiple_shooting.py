@@ -57,13 +57,12 @@ class MultipleShooting:
     every : int, optional
         Samples per interval. By default 50, more on long runs so that there are at most 200 intervals.
     warm : {"auto", "data", "model"}
-        States at the nodes at the start: from the measured channels, and nothing else goes before; or from a
-        least-squares fit from the starting values. ``"auto"``: the latter, from poor values after a fit whose
-        intervals join loosely.
+        Initial states at the nodes: ``"data"`` from the measured channels, ``"model"`` from a least-squares fit,
+        ``"auto"`` the latter, from poor values after a fit with loose continuity.
     process_noise : mapping of str to float, or "auto", optional
-        Standard deviation per state and √s (``{"omega": 3.0}``: rad/s per √s); gaps at the nodes are weighed by
-        it instead of forbidden. States not named get next to none. ``"auto"``: of current and speed, as large
-        as their gaps turn out to be. Intervals have 25 samples then.
+        Standard deviation per state and √s (``{"omega": 3.0}``: rad/s per √s); gaps at the nodes are penalised
+        by it instead of forbidden; other states get almost none. ``"auto"``: of current and speed, as large as
+        their gaps are. Intervals then have 25 samples.
     max_iterations : int
     tol : float
         IPOPT's tolerance on the scaled problem.
