@@ -130,7 +130,8 @@ def _write_remainder(found: Diagnosis, path: Path, force: bool) -> None:
     assert found.remainder is not None
     source = found.remainder.code(path.stem if path.stem.isidentifier() else "remainder")
     write_files({path: source}, force)
-    show(f"Written: {path}. Fit with it: --effects-from {path} --effects {path.stem}")
+    effects = ",".join((*found.remainder.model.effect_names, path.stem))
+    show(f"Written: {path}. Fit with it: --effects-from {path} --effects {effects}")
 
 
 def _show_diagnosis(found: Diagnosis, notes: Sequence[str]) -> None:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, reduce
 from typing import Any
 
 import casadi as ca
@@ -34,11 +34,12 @@ from motorid.diagnosis.model_comparison import far
 from motorid.diagnosis.predictive_score import compare
 from motorid.diagnosis.refit import refit
 from motorid.display.numbers import number, percent
-from motorid.errors import UsageError
+from motorid.errors import ModelError, UsageError
 from motorid.estimation.least_squares import FAILURES
 from motorid.estimation.result import Fit
 from motorid.model.definition import Effect, P
 from motorid.model.equations import Equations
+from motorid.model.model import Model
 from motorid.numerics.parallel import one_thread
 from motorid.numerics.signals import Array
 
@@ -228,6 +229,8 @@ class Remainder:
     fit: Fit
     forms: tuple[Form, ...] = ()
     _held: HeldOut | None = field(default=None, repr=False)
+    # effects that only approximate a form which predicts better in their place
+    _replaced: Mapping[str, Form] = field(default_factory=dict, repr=False)
 
     @property
     def form(self) -> Form | None:
@@ -250,7 +253,7 @@ class Remainder:
         return self.kind == "structure" and self.form is not None and self.form.on != "run"
 
     def as_effect(self, name: str = "remainder") -> Effect:
-        """Return what is left as an effect: a curve to add to the model, ``fit.model + found.remainder.as_effect()``.
+        """Return what is left as an effect, a curve: ``found.remainder.model + found.remainder.as_effect()``.
 
         The first call fits the model with each of the best curves and takes a few seconds.
 
@@ -276,8 +279,13 @@ class Remainder:
         return self._chosen.nearest()
 
     @property
+    def model(self) -> Model:
+        """The model to add the curve to, without effects that only approximated it if it does better so."""
+        return self._chosen.fit.model
+
+    @property
     def fitted(self) -> Fit:
-        """The model with the curve, fitted to the same records."""
+        """That model with the curve, fitted to the same records."""
         assert self._chosen.fitted is not None
         return self._chosen.fitted
 
@@ -297,21 +305,32 @@ class Remainder:
         if self.form is not None and self.form.on == "run":
             raise UsageError(f"what is left is {self.form.text}: no curve, but another motor in every run. "
                              "Fit the runs apart.")
-        forms = [f for f in self.forms if f.on != "run"][:TRIED]
-        if (best := _best(self.fit, forms, self._held or HeldOut.of(self.fit, None))) is None:
+        tried = [*self._in_place(), *((self.fit, f) for f in self.forms if f.on != "run")][:TRIED]
+        if (best := _best(self.fit, tried, self._held or HeldOut.of(self.fit, None))) is None:
             raise UsageError("something predictable is left, but no curve over one quantity lowers the error on data "
                              "left out.")
         return best
 
 
+    def _in_place(self) -> list[tuple[Fit, Form]]:
+        """Return the model without what only approximates a form, and each such form: beside it there is no place."""
+        forms = [f for f in dict.fromkeys(self._replaced.values()) if f.on != "run"]
+        with contextlib.suppress(ModelError):
+            model = reduce(Model.without, self._replaced, self.fit.model) if forms else None
+            values = {n: v for n, v in self.fit.values.items() if model is not None and n in model.parameters}
+            if model is not None and (base := refit(self.fit, model, (values,))) is not None:
+                return [(base, f) for f in forms]
+        return []
+
+
 @one_thread
-def _best(fit: Fit, forms: Sequence[Form], held: HeldOut) -> Curve | None:
-    """Return the curve, fitted with the model, that predicts most beyond it; None where none does."""
+def _best(fit: Fit, tried: Sequence[tuple[Fit, Form]], held: HeldOut) -> Curve | None:
+    """Return the curve, fitted with its model, that predicts most beyond `fit`; None where none does."""
     before, found, name = held.predictions(fit), [], "remainder"
     while name in fit.model.effect_names:  # a curve beside a curve
         name += "_more"
-    for form in forms:
-        curve, better = Curve(fit, form, name=name), None
+    for base, form in tried:
+        curve, better = Curve(base, form, name=name), None
         with contextlib.suppress(*FAILURES):
             for _ in range(ROUNDS):
                 if (larger := curve.grown()) is None or larger.fitted is None:

@@ -45,9 +45,11 @@ def beyond(plant):
     """Effects made up here, put into the plant."""
     effects = plant.effects.BEYOND
     effects["eddy"] = lambda m, top, w: {"torque": lambda i, omega, th, t: -2 * top * omega * w / (omega**2 + w**2)}
+    effects["shoes"] = lambda m, c, w: {
+        "torque": lambda i, omega, th, t: -c * np.sign(omega) * np.maximum(np.abs(omega) / w - 1, 0.0) ** 2}
     effects["dip"] = lambda m, s: {"drive": lambda v, w: v * (1 - s * abs(v) / (m.i_max * m.R / 2))}
     yield plant
-    for name in ("eddy", "dip"):
+    for name in ("eddy", "shoes", "dip"):
         effects.pop(name)
 
 
@@ -95,6 +97,19 @@ def test_with_the_remainder_the_held_out_error_falls_to_the_floor(outside, name)
     assert all(after[c] < before[c] for c in after)
 
 
+def test_it_takes_the_place_of_what_only_approximates_it(beyond, lab):
+    """Brake shoes touch above a speed: a drag that cannot be negative would leave the curve beside it no room."""
+    rng = np.random.default_rng(4)
+    clean = [driven(lab, {"shoes": {"c": 0.2, "w": 45.0}}, w, 800, 1e-3, rng) for w in FAST]
+    *runs, check = [record(c, "logger", ("i", "omega"), lab, rng, w) for c, w in zip(clean, FAST, strict=True)]
+    found = mi.diagnose(mi.fit(mi.dc_motor(), runs), check, effects=("quadratic_drag", "coulomb"))
+    assert [(r.added, r.grade) for r in found.ladder.rungs[1:]] == [("quadratic_drag", "approximates")]
+    assert found.remainder.model.effect_names == ()
+    fit = mi.fit(found.remainder.model + found.remainder.as_effect(), runs)
+    without, with_curve = (over_floor(f, check, clean[-1]) for f in (found.after, fit))
+    assert all(with_curve[c] < min(0.3 * without[c], 1.3) for c in without)
+
+
 def test_its_coefficients_are_parameters_with_deviations(outside):
     runs, found, _ = outside("eddy brake")
     effect = found.remainder.as_effect("brake")
@@ -108,7 +123,7 @@ def test_its_coefficients_are_parameters_with_deviations(outside):
 def test_what_an_effect_of_the_model_does_already_is_no_part_of_the_curve(outside):
     runs, found, _ = outside("cam")
     assert "gravity" in found.best.model.effect_names
-    fit = mi.fit(found.best.model + found.remainder.as_effect(), runs[:2])
+    fit = mi.fit(found.remainder.model + found.remainder.as_effect(), runs[:2])
     assert all(abs(fit.values[p.name]) < 1.0 for e in fit.model.effects for p in e.parameters if p.unit == "N·m")
 
 
@@ -133,7 +148,7 @@ def test_the_nearest_closed_form_is_the_hidden_one(outside):
 
 def test_it_travels_to_another_process(outside):
     runs, found, _ = outside("eddy brake")
-    model = found.best.model + found.remainder.as_effect()
+    model = found.remainder.model + found.remainder.as_effect()
     again = pickle.loads(pickle.dumps(model))
     here = mi.simulate(model, runs[2:])[0].outputs
     assert mi.simulate(again, runs[2:])[0].outputs["omega"] == pytest.approx(here["omega"], rel=1e-12)
@@ -168,7 +183,7 @@ def test_its_source_is_fitted_on_the_command_line(outside, tmp_path):
 
 def test_it_is_exported_like_any_other(outside, tmp_path):
     runs, found, _ = outside("fading friction")
-    fit = mi.fit(found.best.model + found.remainder.as_effect(), runs[:2])
+    fit = mi.fit(found.remainder.model + found.remainder.as_effect(), runs[:2])
     file = load(mi.export(fit, tmp_path / "motor.casadi"))
     for k, s in enumerate(fit.simulations):
         wanted = np.column_stack([s.outputs[c] for c in fit.problem.outputs])
@@ -210,7 +225,7 @@ def test_a_sensor_that_bends_is_a_curve_in_the_measurement(lab):
             for r in runs]
     found = mi.diagnose(mi.fit(mi.dc_motor(), bent[:2]), bent[2:], effects=("coulomb",))
     assert found.remainder.where == "sensor"
-    after = mi.fit(found.best.model + found.remainder.as_effect(), bent[:2])
+    after = mi.fit(found.remainder.model + found.remainder.as_effect(), bent[:2])
     was, now = (mi.evaluate(f, bent[2:]).nrmse["omega"] for f in (found.best, after))
     straight = mi.evaluate(mi.fit(mi.dc_motor(), runs[:2]), runs[2:]).nrmse["omega"]
     assert now < 1.15 * straight < 0.5 * was
@@ -262,7 +277,7 @@ def test_what_remembers_is_found(lab):
                                        for c, y in clean.items()}))
     found = mi.diagnose(mi.fit(mi.dc_motor(), runs[:2]), runs[2:], effects=("coulomb", "quadratic_drag"))
     assert found.remainder.follows in {f"a torque that depends on the {q} before" for q in ("speed", "current")}
-    fit = mi.fit(found.best.model + found.remainder.as_effect(), runs[:2])
+    fit = mi.fit(found.remainder.model + found.remainder.as_effect(), runs[:2])
     before, after = (mi.evaluate(f, runs[2]).nrmse for f in (found.best, fit))
     floor = {c: 0.005 * np.std(y) / np.sqrt(np.mean(y**2)) for c, y in runs[2].outputs.items()}
     assert max(after[c] / floor[c] for c in after) < 1.1
