@@ -226,7 +226,8 @@ def columns(model: Model, loads: Sequence[Load], signals: Mapping[str, Array], b
 
     silence = torque({})
     acts = [silence - torque({load.name: 1.0} | ({load.phase: load.angle} if load.phase else {})) for load in loads]
-    return np.column_stack(acts) if acts else np.empty((len(zero), 0))
+    found = np.column_stack(acts) if acts else np.empty((len(zero), 0))
+    return np.where(np.isfinite(found).all(axis=0), found, 0.0)  # a unit of what divides by it may be no motor
 
 
 def values(loads: Sequence[Load], sizes: Mapping[Load, float], per_ratio: float = 1.0) -> dict[str, float]:

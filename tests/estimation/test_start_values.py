@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import casadi as ca
 import numpy as np
 import pytest
 from lab_records import VALUES, noisy, simulated
@@ -82,6 +83,23 @@ def test_arm_is_fitted_from_the_angle_alone():
 
 
 GEARED = {"R": 2.1, "L": 1.6e-3, "K": 0.045, "b": 4e-5, "J": 2e-5}
+
+
+@mi.effect(balance="torque")
+def crank(m, r_J=mi.P(0.3, "1", null=0.0)):
+    """An inertia that changes over a turn; a unit of it, 1 + sin θ, leaves none at one angle."""
+    m.torque -= 0.5 * m.J * r_J * ca.cos(m.theta) / (1 + r_J * ca.sin(m.theta)) * m.omega**2
+    m.scale("J", 1 + r_J * ca.sin(m.theta))
+
+
+def test_a_size_whose_unit_is_no_motor_is_left_where_it_is(rng):
+    t = np.arange(600) * 1e-3
+    v = 6 * np.sign(np.sin(14 * t + 0.1))
+    run = noisy(simulated(t, v, ("i", "omega", "theta"), mi.dc_motor(**VALUES) + crank), rng)
+    runs = [run.with_(outputs={**run.outputs, "theta": np.round(run.outputs["theta"] / (np.pi / 2)) * np.pi / 2})]
+    guess = first_guess(mi.dc_motor() + crank, runs, loaded=True)
+    assert np.isfinite(list(guess.values())).all()
+    assert mi.fit(mi.dc_motor() + crank, run).values["r_J"] == pytest.approx(0.3, rel=0.01)
 
 
 @pytest.mark.parametrize("seed", [0, 1])
