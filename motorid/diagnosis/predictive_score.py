@@ -84,6 +84,7 @@ class Evidence:
     fall: float  # of the prediction error, geometric mean over channels: where held-out runs say something, of theirs
     held_out_fall: float | None = None  # the same on held-out runs; None without any, or where both models lose them
     worse_there: bool = False  # the new model surely predicts the held-out runs worse, by the score or by their error
+    everywhere: float | None = None  # fall over blocks and held-out runs together, each by its samples
 
     @property
     def sure(self) -> bool:
@@ -94,9 +95,11 @@ class Evidence:
     def worth_it(self) -> bool:
         """Tell whether the new model is to be preferred: surely better, by an amount that matters, and not worse there.
 
-        Held-out runs in which the change hardly shows decide nothing; a rise there refuses it.
+        The amount is that over all samples predicted: where held-out runs rise by as much as blocks fall by chance, it
+        is none. A rise there beyond that refuses it.
         """
-        return self.sure and self.fall > MATERIAL and not self.worse_there
+        fall = self.fall if self.everywhere is None else self.everywhere
+        return self.sure and fall > MATERIAL and not self.worse_there
 
 
 def compare(old: Predictions, new: Predictions) -> Evidence:
@@ -106,8 +109,13 @@ def compare(old: Predictions, new: Predictions) -> Evidence:
     blocks = _fall(old.blocks, new.blocks) or 0.0
     held_out = _fall(*(_kept(old.held_out, new.held_out, m) for m in (old.held_out, new.held_out)))
     worse = held_out is not None and (held_out < -MATERIAL or _sure(-there, there_se))
-    fall = blocks if held_out is None else max(blocks, held_out)
-    return Evidence(here + there, float(np.hypot(here_se, there_se)), fall, held_out, worse)
+    gain, se = here + there, float(np.hypot(here_se, there_se))
+    if held_out is None:
+        return Evidence(gain, se, blocks, None, worse)
+    weights = [sum(np.isfinite(r).sum() for e in c.values() for r in e.values) for c in (new.blocks, new.held_out)]
+    logs = np.log1p([-min(f, 1 - 1e-12) for f in (blocks, held_out)])
+    everywhere = 1 - float(np.exp(np.average(logs, weights=weights if any(weights) else None)))
+    return Evidence(gain, se, max(blocks, held_out), held_out, worse, everywhere)
 
 
 def _sure(gain: float, se: float) -> bool:

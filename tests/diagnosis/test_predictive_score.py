@@ -242,6 +242,16 @@ def test_a_rise_on_held_out_runs_refuses(rng):
     assert not spoils.worth_it
 
 
+def test_what_falls_by_chance_on_blocks_and_rises_on_held_out_runs_is_of_no_matter(rng):
+    """An effect that is not there costs held-out runs as much as it gains by chance where it was fitted."""
+    r, h = rng.normal(size=(2, 1000))
+    for there, worth in ((0.985, True), (1.0, False), (1.008, False)):
+        found = compare(both(r, h), both(0.985 * r, there * h))
+        assert found.everywhere == pytest.approx(1 - np.sqrt(0.985 * there), abs=2e-4)
+        assert found.sure
+        assert found.worth_it is worth
+
+
 def test_a_gain_on_held_out_runs_alone_is_one(rng):
     r, h = rng.normal(size=(2, 1000))
     found = compare(both(r, h), both(r, 0.5 * h))
