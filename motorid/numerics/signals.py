@@ -78,9 +78,11 @@ def quantum(y: ArrayLike) -> float:
     Second differences of a smooth signal that moves in steps are small whole multiples of the step, even if
     the signal itself passes many steps per sample.
     """
-    values = np.asarray(y, dtype=float)
-    values = values[np.isfinite(values)]
-    jumps = np.abs(np.diff(values, 2))
+    whole = np.asarray(y, dtype=float)
+    values = whole[np.isfinite(whole)]
+    jumps = np.abs(np.diff(whole, 2))  # of neighbours: across a gap a steady motion is one large step
+    jumps = jumps[np.isfinite(jumps)]
+    jumps = jumps if len(jumps) >= 20 else np.abs(np.diff(values, 2))
     jumps = jumps[jumps > 1e-9 * np.abs(values).max(initial=0.0)]
     rounded = 3e-4 * float(np.quantile(np.abs(values), 0.9)) if len(jumps) else 0.0  # in a file of four digits
     if len(jumps) < 20:
@@ -136,9 +138,8 @@ def noise_level(y: ArrayLike, t: ArrayLike | None = None) -> float:
     """
     values = np.asarray(y, dtype=float)
     times = np.arange(values.size, dtype=float) if t is None else np.asarray(t, dtype=float)
-    keep = np.isfinite(values) & np.isfinite(times)
+    keep, step = np.isfinite(values) & np.isfinite(times), quantum(values)
     values, times = values[keep], times[keep]
-    step = quantum(values)
     return float(max(_from_differences(values, times, step), step / np.sqrt(12), _floor(values)))
 
 

@@ -203,8 +203,9 @@ def _creeps(theta: Array, t: Array, sigma: float) -> bool:
     that begins at rest is far below the noise of its slope. It describes a window twice as long if what is left
     grows no more than chance allows (the noise of slow counts is easily overrated).
     """
-    y, x, n = theta[:LONGEST], t[:LONGEST] - t[0], 8
-    if not np.isfinite(y).all() or len(y) < n:
+    good = np.flatnonzero(np.isfinite(theta))[:LONGEST]
+    y, x, n = theta[good], t[good] - t[0], 8
+    if len(y) < n:
         return False
     speed, left = 0.0, _cubic(x[:n], y[:n])[1]
     while 2 * n <= len(y):

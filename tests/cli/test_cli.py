@@ -293,6 +293,8 @@ def test_diagnose_names_the_missing_effect_and_processes_share_the_work(tmp_path
     shared = motorid_json(tmp_path, *asked, "--jobs", "2")
     judged = [[(c["effect"], c["accepted"], c["reason"]) for c in each["ranking"]] for each in (found, shared)]
     assert (shared["answer"], judged[1]) == (found["answer"], judged[0])
+    drops = [[c["predicted_drop"] for c in each["ranking"]] for each in (found, shared)]
+    assert drops[1] == pytest.approx(drops[0], rel=1e-6, abs=1e-9)  # but for what arithmetic leaves
     assert (found["verdict"], found["where"], found["effects"]) == ("missing", "mechanical", ["coulomb"])
     assert [step["added"] for step in found["ladder"]] == [None, "coulomb"]
     assert found["ladder"][1]["validation_nrmse"]["omega"] < 0.2 * found["ladder"][0]["validation_nrmse"]["omega"]

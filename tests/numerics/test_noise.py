@@ -77,6 +77,16 @@ def test_a_quantised_channel_has_the_noise_of_its_steps(step):
     assert noise_level(y) == pytest.approx(step / np.sqrt(12), rel=0.15)
 
 
+@pytest.mark.parametrize("missing", [0.02, 0.3])
+def test_dropped_samples_of_a_fast_encoder_are_no_steps(rng, missing):
+    """At a steady 79.6 counts per sample a gap is a jump of 80, forty times as large as any change of the speed."""
+    y = np.round(79.6 * np.arange(N) + 300 * np.sin(np.arange(N) / 90))
+    clean = noise_level(y)
+    y[rng.random(N) < missing] = np.nan
+    assert quantum(y) == pytest.approx(1.0)
+    assert noise_level(y) == pytest.approx(clean, rel=0.2)
+
+
 def test_noise_and_steps_together(rng):
     y = np.round(speed() + 0.7 * rng.normal(size=N))
     assert noise_level(y) == pytest.approx(np.hypot(0.7, 1 / np.sqrt(12)), rel=0.2)

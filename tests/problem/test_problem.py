@@ -217,6 +217,7 @@ def test_a_slow_start_that_an_encoder_counts_is_motion_and_rest_is_rest(rng):
     crawl, rest = counted.select(slice(400, None)), counted.select(slice(100, None))
     assert 0 < whole.outputs["omega"][400] < 0.005 * np.max(whole.outputs["omega"])
     assert {p.name for p in as_problem(TRUE, rest).unknown} <= {*VALUES, "theta_0[0]"}
+    assert "omega_0[0]" in {p.name for p in as_problem(TRUE, holed(crawl, "theta", rng)).unknown}
     found = mi.fit(TRUE, crawl)
     assert found.initial["omega_0[0]"] == pytest.approx(whole.outputs["omega"][400], rel=0.2)
     assert found.misfit["theta"] < 1.3
