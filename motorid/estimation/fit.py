@@ -25,17 +25,19 @@ from motorid.model.model import Model
 from motorid.numerics.least_squares import LevenbergMarquardt
 from motorid.numerics.parallel import one_thread, progress
 from motorid.problem.problem import Problem, as_problem
-from motorid.problem.simulate import integration_error, misfit_over_noise, with_angles_apart
+from motorid.problem.simulate import integration_bias, integration_error, misfit_over_noise, with_angles_apart
 from motorid.records.experiment import Experiment, windows
 
 NOISE = 1.2  # RMS of the residual over the noise that may be called noise
 IMBALANCE = 3.0  # between channels, in misfit over noise, above which the misfit decides the weights
 REWEIGHTINGS = 3  # at most
 ERROR_SHARE = 0.2  # integration error accepted beside noise or misfit
+BIAS = 0.2  # deviations by which it may move the estimate
 WINDOWS = (8, 32)  # of the longest record, where it is not followed as a whole
 FEWEST = 50  # samples of a window
 UNFOLLOWED = 0.25  # share of a channel's variance left unexplained
 TOO_FAR = 100.0  # times that an error in the state grows: one of 1 % would be all of the motion
+FINER = 2  # times as many steps, where the descent came to a halt
 MOST_FINER = 4  # times as many steps, where that is not kept
 
 
@@ -253,16 +255,23 @@ def _reweighted(found: Estimate) -> dict[str, float] | None:
 
 
 def _polished(found: Estimate, effort: LevenbergMarquardt, callback: Callback) -> tuple[Estimate, float]:
-    """Return the estimate and its integration error; with finer steps all over where small errors added up."""
-    error = integration_error(found.problem, found.q)
-    allowed = ERROR_SHARE * max(_misfit(found), 1.0)
-    finer = np.ceil((2 * error / allowed) ** (1 / 3)) if np.isfinite(error) else np.inf
-    if error <= allowed or finer > MOST_FINER or found.solution.status != "converged":
+    """Return the estimate and its integration error; with finer steps all over where small errors added up.
+
+    Where no step lowered the cost, a sgn that moves from one step to another may have made slopes of nothing.
+    """
+    problem, misfit = found.problem, max(_misfit(found), 1.0)
+    error, bias = integration_bias(problem, found.q, found.solution.jac)
+    rugged = found.solution.status != "converged" and misfit > NOISE
+    finer = np.ceil(max(2 * error / (ERROR_SHARE * misfit), bias / (BIAS * misfit)) ** (1 / 3))
+    finer = FINER if rugged else finer
+    if not 1 < finer <= MOST_FINER:
         return found, error
-    problem = found.problem.with_finer_steps(int(finer))
+    problem = problem.with_finer_steps(int(finer))
     try:
         again = least_squares(problem, effort, callback, q=found.q, refine=False)
     except FAILURES:
+        return found, error
+    if rugged and again.cost > found.cost:
         return found, error
     return replace(again, history=found.history + again.history), integration_error(problem, again.q)
 

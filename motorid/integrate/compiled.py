@@ -26,7 +26,7 @@ from motorid.integrate.rodas3 import StepFunctions
 
 # -Bsymbolic: a name of ours must never be taken from another library. The last two let divisions by one pivot
 # share its reciprocal; results stay within rounding of the virtual machine's.
-FLAGS = ("-O2", "-fPIC", "-shared", *(() if sys.platform == "darwin" else ("-Wl,-Bsymbolic",)),
+FLAGS = ("-O1", "-fPIC", "-shared", *(() if sys.platform == "darwin" else ("-Wl,-Bsymbolic",)),
          "-ffp-contract=off", "-fno-math-errno", "-freciprocal-math", "-fno-trapping-math")
 _told: set[str] = set()
 
@@ -63,7 +63,20 @@ static void most(int (*work)(casadi_int*, casadi_int*, casadi_int*, casadi_int*)
   if (w > *nw) *nw = w;
 }
 
-/* x over one record; returns -1, or the index of the first sample whose state is not finite. */
+/* Length and inputs of sub-step s of m in interval k. */
+static void part(long long k, long long s, long long m, const double* dt, const double* u0, const double* u1,
+                 double* ua, double* ub, double* h) {
+  int c;
+  *h = dt[k] / m;
+  for (c = 0; c < NU; c++) {
+    double slope = u1[k * NU + c] - u0[k * NU + c];
+    ua[c] = u0[k * NU + c] + slope * s / m;
+    ub[c] = u0[k * NU + c] + slope * (s + 1) / m;
+  }
+}
+
+/* x over one record, E: the largest error estimate in each interval, without S0; returns -1, or the index of the first
+   sample whose state is not finite. */
 long long motorid_run(long long n, const long long* nsub, const double* dt, const double* u0,
                       const double* u1, const double* us, const double* x0, const double* p, long long nq,
                       const double* S0, const double* Pq, double* Y, double* DY, double* X, double* DX,
@@ -79,8 +92,8 @@ long long motorid_run(long long n, const long long* nsub, const double* dt, cons
   double *S = w + nw, *T = S + NX * nq;
   long long nz = 0, *param = malloc((2 * NP * nq + 1) * sizeof(long long)), *unknown = param + NP * nq;
   double* slope = malloc((NP * nq + 1) * sizeof(double));
-  double x[NX], xn[NX], e[NX], A[NX * NX], B[NX * NP], ua[NU], ub[NU], y[NY], C[NY * NX], D[NY * NP];
-  long long k, bad = -1;
+  double x[NX], xn[NX], e[NX], h, A[NX * NX], B[NX * NP], ua[NU], ub[NU], y[NY], C[NY * NX], D[NY * NP];
+  long long k, s, bad = -1;
   memcpy(x, x0, sizeof(x));
   if (nq) memcpy(S, S0, NX * nq * sizeof(double));
   for (k = 0; k < NP * nq; k++) if (Pq[k] != 0) {
@@ -98,15 +111,11 @@ long long motorid_run(long long n, const long long* nsub, const double* dt, cons
     memcpy(Y + k * NY, y, sizeof(y));
     if (nq) propagate(DY + k * NY * nq, NY, C, D, S, nq, nz, param, unknown, slope);
     if (k == n - 1) break;
-    long long s, m = nsub[k]; double h = dt[k] / m;
     if (E) memset(E + k * NX, 0, NX * sizeof(double));
-    for (s = 0; s < m; s++) {
-      for (c = 0; c < NU; c++) {
-        double slope = u1[k * NU + c] - u0[k * NU + c];
-        ua[c] = u0[k * NU + c] + slope * s / m; ub[c] = u0[k * NU + c] + slope * (s + 1) / m;
-      }
+    for (s = 0; s < nsub[k]; s++) {
+      part(k, s, nsub[k], dt, u0, u1, ua, ub, &h);
       arg[0] = x; arg[1] = ua; arg[2] = ub; arg[3] = &h; arg[4] = p;
-      res[0] = xn; res[1] = e; res[2] = A; res[3] = B;
+      res[0] = xn; res[1] = nq ? A : e; res[2] = B;
       if (nq) {
         motorid_full(arg, res, iw, w, 0);
         propagate(T, NX, A, B, S, nq, nz, param, unknown, slope);
@@ -118,6 +127,31 @@ long long motorid_run(long long n, const long long* nsub, const double* dt, cons
   }
   free(arg); free(res); free(iw); free(w); free(param); free(slope);
   return bad;
+}
+
+/* Where intervals `rows` end from X in half the steps. */
+void motorid_halved(long long n, const long long* rows, const long long* nsub, const double* dt, const double* u0,
+                    const double* u1, const double* X, const double* p, double* ends) {
+  casadi_int na = 8, nr = 8, ni = 1, nw = 1;
+  most(motorid_light_work, &na, &nr, &ni, &nw);
+  const double** arg = malloc(na * sizeof(double*));
+  double** res = malloc(nr * sizeof(double*));
+  casadi_int* iw = malloc(ni * sizeof(casadi_int));
+  double* w = malloc((nw + 1) * sizeof(double));
+  double x[NX], h, ua[NU], ub[NU];
+  long long j, s;
+  for (j = 0; j < n; j++, ends += NX) {
+    long long k = rows[j], m = 2 * nsub[k];
+    memcpy(x, X + k * NX, sizeof(x));
+    for (s = 0; s < m; s++) {
+      part(k, s, m, dt, u0, u1, ua, ub, &h);
+      arg[0] = x; arg[1] = ua; arg[2] = ub; arg[3] = &h; arg[4] = p;
+      res[0] = ends; res[1] = 0;
+      motorid_light(arg, res, iw, w, 0);
+      memcpy(x, ends, sizeof(x));
+    }
+  }
+  free(arg); free(res); free(iw); free(w);
 }
 """
 
@@ -232,16 +266,18 @@ def build(functions: StepFunctions, mark: str) -> Path | None:
         return _without(f"cannot compile ({error})")
 
 
-def load(path: Path) -> Any:
-    """Return the driver in the library at `path`; None (said once) if it cannot be loaded."""
+def load(path: Path) -> tuple[Any, Any] | None:
+    """Return the drivers in the library at `path`; None (said once) if it cannot be loaded."""
     try:
-        run = ctypes.CDLL(str(path)).motorid_run
+        library = ctypes.CDLL(str(path))
+        run, halved = library.motorid_run, library.motorid_halved
     except (OSError, AttributeError) as error:
         return _without(f"cannot load {path} ({error}; MOTORID_CACHE names another folder)")
     pointer, integer = ctypes.c_void_p, ctypes.c_longlong
     run.restype = integer
     run.argtypes = [integer, *[pointer] * 7, integer, *[pointer] * 7]
-    return run
+    halved.restype, halved.argtypes = None, [integer, *[pointer] * 8]
+    return run, halved
 
 
 def _without(why: str) -> None:

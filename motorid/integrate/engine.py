@@ -62,7 +62,7 @@ def address(a: NDArray | None) -> int | None:
 class Trajectory(NamedTuple):
     """What an engine returns: y (N, ny); dy (N, ny, nq) or None; x (N, nx); dx (N, nx, nq) or None.
 
-    `error` (N-1, nx) is the largest local error of a step in each interval, where it was asked for.
+    `error` (N-1, nx) is the largest error estimate of a step in each interval, where it was asked for.
     """
 
     y: Array
@@ -92,7 +92,7 @@ class Engine(Protocol):
 
     def prepare(self, system: System, grid: Grid, x0: Array, p: Array,
                 tolerance: float | Callable[[Trajectory], float]) -> Grid:
-        """Return the grid with its sub-steps chosen for a relative local error of `tolerance`.
+        """Return the grid with its sub-steps chosen for an error of `tolerance` per interval, relative to the states.
 
         The tolerance may depend on the trajectory reached so far.
         """

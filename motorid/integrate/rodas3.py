@@ -19,14 +19,14 @@ C = ((), (4.0,), (1.0, -1.0), (1.0, -1.0, -8.0 / 3.0))
 ALPHA = (0.0, 0.0, 1.0, 1.0)
 GAMMA_T = (0.5, 1.5, 0.0, 0.0)
 WEIGHTS = (2.0, 0.0, 1.0, 1.0)
-ERROR_ORDER = 3  # the local error estimate falls with h³
+ORDER = 3  # the error at the end of an interval falls with the third power of its sub-steps
 
 
 class StepFunctions(NamedTuple):
     """The discrete model.
 
     light : ``(x, u0, u1, h, p) -> (x⁺, e)``, the input going from u0 to u1 over h, e the local error.
-    full : ``(x, u0, u1, h, p) -> (x⁺, e, A, B)`` with A = dx⁺/dx and B = dx⁺/dp.
+    full : ``(x, u0, u1, h, p) -> (x⁺, A, B)`` with A = dx⁺/dx and B = dx⁺/dp.
     out : ``(x, u, p) -> (y, C, D)`` with C = dy/dx and D = dy/dp.
     """
 
@@ -45,8 +45,7 @@ def step_functions(system: System) -> StepFunctions:
     light = _dense("motorid_light", args, [x_next, error], names, ["x_next", "error"])
     # In adjoint form: one sweep per state costs less than one per state and parameter.
     slopes = ca.jtimes(x_next, ca.vertcat(x, p), ca.DM.eye(nx), True).T
-    full = _dense("motorid_full", args, [x_next, error, slopes[:, :nx], slopes[:, nx:]], names,
-                  ["x_next", "error", "A", "B"])
+    full = _dense("motorid_full", args, [x_next, slopes[:, :nx], slopes[:, nx:]], names, ["x_next", "A", "B"])
     y = system.out(x, u0, p)
     out = _dense("motorid_out", [x, u0, p], [y, ca.jacobian(y, x), ca.jacobian(y, p)], ["x", "u", "p"], ["y", "C", "D"])
     return StepFunctions(light, full, out)

@@ -15,22 +15,22 @@ from numpy.typing import NDArray
 from motorid.errors import SimulationError, at_least
 from motorid.integrate import compiled as cc
 from motorid.integrate.engine import Grid, Trajectory, address
-from motorid.integrate.rodas3 import ERROR_ORDER, StepFunctions, step_functions
+from motorid.integrate.rodas3 import ORDER, StepFunctions, step_functions
 from motorid.model.equations import System
 from motorid.numerics.signals import Array
 
-# Instructions of the virtual machine (0.15 s) before a step is worth compiling. No clock decides: the two round
+# Instructions of the virtual machine (0.05 s) before a step is worth compiling. No clock decides: the two round
 # differently, and the last digits would depend on what else the machine does.
-PATIENCE = 4e7
+PATIENCE = 1.5e7
 MOST_SUBSTEPS = 256
 MOST_PASSES = 6
-LOST_ERROR = 0.3  # local error, relative to the state so far, at which a step is lost
+LOST_ERROR = 0.3  # error estimate, relative to the state so far, at which a step is lost
 LOST_GROWTH = 1e3  # growth of a state that shows it
 
 
 @dataclass(frozen=True)
 class Rosenbrock:
-    """RODAS3, sub-steps chosen by its error estimate; the exact derivative of the discrete step goes along.
+    """RODAS3, sub-steps chosen by halving them; the exact derivative of the discrete step goes along.
 
     Attributes
     ----------
@@ -53,13 +53,16 @@ class Rosenbrock:
 
     def run(self, system: System, grid: Grid, x0: Array, p: Array, dx0: Array | None = None,
             dp: Array | None = None, local_error: bool = False) -> Trajectory:
-        """See `Engine.run`; on request with the local error of each state."""
+        """See `Engine.run`; on request with the error estimate of each state."""
         return stepper(system).run(grid, x0, p, dx0, dp, local_error, self.compiled)
 
     def prepare(self, system: System, grid: Grid, x0: Array, p: Array,
                 tolerance: float | Callable[[Trajectory], float]) -> Grid:
         """See `Engine.prepare`. Errors are relative to the largest size of each state on the record.
 
+        Where the error estimate of a step is too large, what half the steps change at the end of its interval decides
+        (Hairer, Nørsett & Wanner, Solving Ordinary Differential Equations I, 1993, II.4): a current that settles
+        before the next sample needs no steps of its own.
         Where the run fails, so does every later one on this grid: coarse steps would jump over what happens.
         A step that goes astray spoils all after it, which is then neither refined for nor a measure of size.
         """
@@ -76,11 +79,15 @@ class Rosenbrock:
                 traj = traj._replace(x=traj.x[:astray + 2], y=traj.y[:astray + 2])
                 size, error[:, astray + 1:] = size[:, :astray + 2], 0.0
             sizes = np.maximum(size[:, -1], stepper(system).shown_sizes(grid, traj, p))
-            relative = (error / np.maximum(sizes, 1e-12)[:, None]).max(axis=0)
+            sizes = np.maximum(sizes, 1e-12)[:, None]
+            relative = (error / sizes).max(axis=0)
+            rows = np.flatnonzero(relative > level)
+            if len(rows):
+                relative[rows] = (stepper(system).halved(grid, rows, traj.x, p, self.compiled) / sizes).max(axis=0)
             if not np.max(relative, initial=0.0) > 2 * level:  # or not a number
                 break
             passes -= 1 if astray is None else 1 / 16
-            factor = np.ceil(1.1 * (np.maximum(relative, 1e-300) / level) ** (1 / ERROR_ORDER))
+            factor = np.ceil(1.1 * (np.maximum(relative, 1e-300) / level) ** (1 / ORDER))
             finer = np.clip(grid.substeps * np.clip(factor, 1, 16), 1, MOST_SUBSTEPS).astype(np.int64)
             if np.array_equal(finer, grid.substeps):
                 break
@@ -91,7 +98,7 @@ class Rosenbrock:
 
 
 def _by_state(traj: Trajectory) -> tuple[Array, Array]:
-    """Return the size so far (nx, N) and the local error (nx, N-1); NumPy reduces long rows faster."""
+    """Return the size so far (nx, N) and the error estimate (nx, N-1); NumPy reduces long rows faster."""
     assert traj.error is not None
     size = np.abs(np.ascontiguousarray(traj.x.T))
     return np.maximum.accumulate(size, axis=1, out=size), np.ascontiguousarray(traj.error.T)
@@ -140,6 +147,19 @@ class Stepper:
                                   "parameters make the model unstable or stiff beyond the step.")
         return traj
 
+    def halved(self, grid: Grid, rows: NDArray[np.int64], x: Array, p: Array, compiled: bool | None) -> Array:
+        """Return by how much half the steps change where the intervals `rows` of a trajectory x end, (nx, n)."""
+        x, p = np.ascontiguousarray(x, float), np.ascontiguousarray(p, float)
+        library = self._load(compiled)
+        if library is not None:
+            ends = np.empty((len(rows), self.nx))
+            library[1](len(rows), *map(address, (rows, grid.substeps, grid.dt, grid.u0, grid.u1, x, p, ends)))
+        else:
+            ends = self.machine.halved(grid, rows, x, p)
+            self._spent += self.functions.light.n_instructions() * 2 * int(grid.substeps[rows].sum())
+        with np.errstate(all="ignore"):
+            return np.nan_to_num(np.abs(x[rows + 1] - ends).T, nan=np.inf)
+
     def shown_sizes(self, grid: Grid, traj: Trajectory, p: Array) -> Array:
         """Size (nx,) that the largest output lends the states it shows: a small part need not be exact."""
         slopes = self._constant_slopes
@@ -182,7 +202,7 @@ class Stepper:
         y, x = np.empty((n, self.ny)), np.empty((n, self.nx))
         dy, dx = (np.empty((n, self.ny, nq)), np.empty((n, self.nx, nq))) if nq else (None, None)
         error = np.empty((n - 1, self.nx)) if local_error else None
-        bad = library(n, *grid.addresses, address(x0), address(p), nq, *map(address, (dx0, dp, y, dy, x, dx, error)))
+        bad = library[0](n, *grid.addresses, address(x0), address(p), nq, *map(address, (dx0, dp, y, dy, x, dx, error)))
         return Trajectory(y, dy, x, dx, error), int(bad)
 
 
@@ -233,8 +253,8 @@ class Machine:
         u0, u1, h = ca.SX.sym("u0", self.nu), ca.SX.sym("u1", self.nu), ca.SX.sym("h")
         p, dp = ca.SX.sym("p", self.np), ca.SX.sym("dp", nq, self.np)
         if nq:
-            x_next, e, a, b = self.functions.full(x, u0, u1, h, p)
-            one = ca.Function("one", [x, s, u0, u1, h, p, dp], [x_next, ca.densify(s @ a.T + dp @ b.T), e])
+            x_next, a, b = self.functions.full(x, u0, u1, h, p)
+            one = ca.Function("one", [x, s, u0, u1, h, p, dp], [x_next, ca.densify(s @ a.T + dp @ b.T)])
             return one.mapaccum("walk", CHUNK, 2, {})
         one = ca.Function("one", [x, u0, u1, h, p], list(self.functions.light(x, u0, u1, h, p)))
         return one.mapaccum("walk", CHUNK, 1, {})
@@ -248,7 +268,7 @@ class Machine:
             local_error: bool) -> Trajectory:
         """Return the trajectory; see `Engine.run`."""
         nq = 0 if dp is None or dx0 is None else dp.shape[1]
-        ua, ub, h, ends = _laid_out(grid)
+        ua, ub, h, ends = _laid_out(grid, grid.dt)
         n = len(h)
         x, s, e = np.empty((n + 1, self.nx)), np.empty((n + 1, self.nx, nq)), np.empty((n, self.nx))
         x[0] = x0
@@ -264,12 +284,37 @@ class Machine:
             gone = [x[a], s[a], ua[here], ub[here], h[here]] if nq else [x[a], ua[here], ub[here], h[here]]
             for k, part in enumerate(gone):
                 walk.set_arg(k, _view(part))
-            for k, part in enumerate([x[there], s[there], e[here]] if nq else [x[there], e[here]]):
+            for k, part in enumerate([x[there], s[there]] if nq else [x[there], e[here]]):
                 walk.set_res(k, _view(part))
             trigger()
-        error = np.maximum.reduceat(np.abs(e), ends[:-1]) if local_error else None
         y, dy = self.observe(grid, x[ends], s[ends] if nq else None, p, dp)
+        error = np.maximum.reduceat(np.abs(e), ends[:-1]) if local_error else None
         return Trajectory(y, dy, x[ends], s[ends] if nq else None, error)
+
+    def halved(self, grid: Grid, rows: NDArray[np.int64], x: Array, p: Array) -> Array:
+        """Return where the intervals `rows` end from the states x (N, nx) in half the steps, (n, nx)."""
+        some = Grid(grid.t, grid.u, grid.u0[rows], grid.u1[rows], 2 * grid.substeps[rows])
+        ua, ub, h, ends = _laid_out(some, grid.dt[rows])
+        first = np.zeros((len(h), 1 + self.nx))  # whether an interval begins here, and its state
+        first[ends[:-1]] = np.column_stack([np.ones(len(rows)), x[rows]])
+        end, p = np.zeros((len(h) + 1, self.nx)), _repeated(p)
+        walk, trigger = _buffer(self._restarted)
+        walk.set_arg(5, _view(p))
+        for a in range(0, len(h), CHUNK):
+            here = slice(a, a + CHUNK)
+            for k, part in enumerate([end[a], first[here], ua[here], ub[here], h[here]]):
+                walk.set_arg(k, _view(part))
+            walk.set_res(0, _view(end[a + 1:a + 1 + CHUNK]))
+            trigger()
+        return end[ends[1:]]
+
+    @cached_property
+    def _restarted(self) -> ca.Function:
+        """CHUNK steps in a row, some of them from another state."""
+        x, first = ca.SX.sym("x", self.nx), ca.SX.sym("first", 1 + self.nx)
+        rest = [ca.SX.sym("u0", self.nu), ca.SX.sym("u1", self.nu), ca.SX.sym("h"), ca.SX.sym("p", self.np)]
+        begin = ca.if_else(first[0], first[1:], x)
+        return ca.Function("one", [x, first, *rest], [self.functions.light(begin, *rest)[0]]).mapaccum("walk", CHUNK)
 
     def observe(self, grid: Grid, x: Array, dx: Array | None, p: Array, dp: Array | None) -> tuple[Array, Array | None]:
         """Return what the sensors show along a state trajectory, y (N, ny) and dy/dq (N, ny, nq)."""
@@ -297,7 +342,7 @@ class Machine:
         return y, dy
 
 
-def _laid_out(grid: Grid) -> tuple[Array, Array, Array, NDArray[np.int64]]:
+def _laid_out(grid: Grid, dt: Array) -> tuple[Array, Array, Array, NDArray[np.int64]]:
     """Return the input at both ends and the length of each sub-step, in whole chunks; and samples' places."""
     m = grid.substeps
     ends = np.concatenate([[0], np.cumsum(m)])
@@ -306,7 +351,7 @@ def _laid_out(grid: Grid) -> tuple[Array, Array, Array, NDArray[np.int64]]:
     slope = np.repeat(grid.u1 - grid.u0, m, axis=0) * share[:, None]
     ua = np.repeat(grid.u0, m, axis=0) + slope * part[:, None]
     full = -(-steps // CHUNK) * CHUNK
-    h = np.repeat(grid.dt, m) * share
+    h = np.repeat(dt, m) * share
     return _padded(ua, full), _padded(ua + slope, full), _padded(h, full), ends
 
 

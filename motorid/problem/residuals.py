@@ -81,9 +81,9 @@ def prior_residual(priors: Mapping[str, tuple[float, float]], unknowns: Unknowns
     return (at.physical[columns] - mean) / std, jac
 
 
-NOISE_SHARE = 0.03  # local integration error over the noise
+NOISE_SHARE = 0.01  # error of an interval over the noise
 MISFIT_SHARE = 0.1  # of the misfit, where it is what the noise would be
-TIGHTEST, LOOSEST = 1e-7, 1e-4  # local integration error over the largest state
+TIGHTEST, LOOSEST = 1e-7, 3e-5  # and over the largest state
 
 
 class Levels(NamedTuple):
@@ -106,7 +106,7 @@ class Levels(NamedTuple):
         return Levels(y, missing, top, measured.noise / top, count)
 
     def tolerance(self, slack: float = 1.0) -> float | Callable[[Trajectory], float]:
-        """Return the local error allowed, relative to the largest state; see `Engine.prepare`."""
+        """Return the error of an interval allowed, relative to the largest state; see `Engine.prepare`."""
         if NOISE_SHARE * self.noise.min() >= LOOSEST:
             return slack * LOOSEST
         return lambda traj: slack * self._beside(traj)

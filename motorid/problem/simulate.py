@@ -356,15 +356,33 @@ def poorly_explained(problem: Problem, q: Array) -> bool:
 
 def integration_error(problem: Problem, q: Array) -> float:
     """Return the largest change of an output when every step is halved, in units of the noise."""
-    worst = 0.0
+    return _halved_steps(problem, q)[0]
+
+
+def integration_bias(problem: Problem, q: Array, jac: Array) -> tuple[float, float]:
+    """Return the integration error, and by how many deviations it moves the estimate at most, in any direction.
+
+    Half the steps change the residual by Δr, and so the estimate by −(JᵀJ)⁻¹JᵀΔr, whose length in the metric of the
+    covariance is that of the part of Δr that J can express.
+    """
+    error, change = _halved_steps(problem, q)
+    jac = jac[:len(change)]
+    pull = jac.T @ change
+    return error, float(np.sqrt(np.abs(pull @ np.linalg.pinv(jac.T @ jac, hermitian=True) @ pull)))
+
+
+def _halved_steps(problem: Problem, q: Array) -> tuple[float, Array]:
+    """Return by how much steps half as long change the outputs: at most, over the noise; and the stacked residual."""
+    worst, parts = 0.0, [np.zeros(0)]
+    if not hasattr(problem.integrator, "compiled"):  # chooses its steps itself
+        return worst, parts[0]
+    finer = problem.with_finer_steps(2)
     for k, run in enumerate(problem.runs):
-        if not hasattr(problem.integrator, "compiled"):
-            return 0.0
         try:
-            coarse = problem.simulate(q, k, derivatives=False).y
-            fine = problem.with_finer_steps(2).simulate(q, k, derivatives=False).y
+            change = finer.simulate(q, k, derivatives=False).y - problem.simulate(q, k, derivatives=False).y
         except SimulationError:
-            return float("inf")
+            return float("inf"), parts[0][:0]
         sigma = np.array([run.sigma.get(c, np.inf) for c in problem.outputs])
-        worst = max(worst, float(np.max(np.abs(fine - coarse) / sigma)))
-    return worst
+        worst = max(worst, float(np.max(np.abs(change) / sigma)))
+        parts.append(problem.measured[k].stack(change * problem.measured[k].weights))
+    return worst, np.concatenate(parts)

@@ -15,6 +15,7 @@ from scipy.linalg import expm
 import motorid as mi
 from motorid.errors import FitError, ModelError, SimulationError, UsageError
 from motorid.integrate import Cvodes, Grid, Idas, Rosenbrock, engine_of, limited
+from motorid.integrate.rosenbrock import stepper
 from motorid.model.equations import System
 from motorid.records.datasets import truth as truth_of
 
@@ -241,6 +242,36 @@ def test_substeps_follow_the_tolerance_and_keep_the_error():
         ).all()  # local errors add up over a time constant of some twenty samples
         busy = grid.substeps[9:14].max()
         assert busy > grid.substeps[30:45].max()  # more where the step is than where nothing happens
+
+
+@pytest.mark.parametrize("engine", [Rosenbrock(True), Rosenbrock(False)], ids=["compiled", "machine"])
+def test_a_current_that_settles_between_samples_takes_no_steps_of_its_own(engine, rng):
+    """Its transient is over at the next sample, and so is the error of a step that jumps over it."""
+    motor = {**VALUES, "L": 0.02 * VALUES["R"] * 1e-3}
+    t, v = np.arange(200) * 1e-3, rng.uniform(-6, 6, 200)
+    exact = analytic(t, v[:-1], v[:-1], list(motor.values()), (0.0, 0.0)).real[:, :2]
+    system = mi.dc_motor().system(("i", "omega"))
+    p = np.array([motor[n] for n in system.parameters])
+    grid = engine.prepare(system, Grid.of(t, v[:, None], np.array([True])), np.zeros(2), p, 1e-4)
+    assert grid.substeps.mean() < 10  # 245 where each step has to follow the transient
+    error = np.abs(engine.run(system, grid, np.zeros(2), p).x - exact).max(axis=0)
+    assert (error < 1e-3 * np.abs(exact).max(axis=0)).all()
+
+
+def test_half_the_steps_change_the_same_with_and_without_a_compiler(rng):
+    system = (mi.dc_motor(**VALUES) + mi.effects.coulomb).system(("i", "omega"))
+    p = np.array([{**VALUES, "tau_c": 5e-3, "sgn_width": 1e-1}[n] for n in system.parameters])
+    t = np.arange(0, 0.4, 1e-3)
+    grid = Grid.of(t, rng.uniform(-6, 6, len(t))[:, None], np.array([True]))
+    grid = grid.with_substeps(rng.integers(1, 5, len(t) - 1))
+    x, rows = Rosenbrock().run(system, grid, np.zeros(2), p).x, np.flatnonzero(rng.random(len(t) - 1) < 0.3)
+    found = [stepper(system).halved(grid, rows, x, p, compiled) for compiled in (True, False)]
+    k = rows[0]
+    part = grid.part(k, k + 1).with_substeps(2 * grid.substeps[k:k + 1])
+    half = Rosenbrock().run(system, part, x[k], p).x[1]
+    np.testing.assert_allclose(found[0][:, 0], np.abs(x[k + 1] - half), rtol=1e-6)
+    assert (found[0] > 0).all()
+    np.testing.assert_allclose(*found, atol=1e-12 * np.abs(x).max())
 
 
 def without_inductance(t, v, p):

@@ -251,7 +251,8 @@ def test_less_noise_asks_for_finer_steps(rng, quiet):
     problem = as_problem(TRUE, noisy(simulated(t, drive(t, 6.0)), rng, noise).with_(sigma=noise))
     loud = problem.with_(experiments=(problem.experiments[0].with_(sigma=NOISE),))
     fine, rough = (p.refined(p.start) for p in (problem, loud))
-    assert fine.runs[0].grid.substeps.max() > 2 * rough.runs[0].grid.substeps.max()
+    most = [p.runs[0].grid.substeps.max() for p in (fine, rough)]
+    assert most[0] >= 1.8 * most[1]  # the third root of ten, in whole numbers
     if quiet > 0.01:  # the records were themselves simulated to a few millionths
         assert integration_error(fine, fine.start) < 0.2
 
@@ -261,8 +262,8 @@ def test_a_misfit_far_above_the_noise_spares_steps(rng):
     t = np.arange(500) * 1e-3
     problem = as_problem(TRUE, noisy(simulated(t, drive(t, 6.0)), rng, quiet).with_(sigma=quiet))
     wrong = problem.for_model(TRUE.replace(K=0.06))
-    steps = [p.refined(p.start).runs[0].grid.substeps.sum() for p in (problem, wrong)]
-    assert steps[1] < 0.5 * steps[0]
+    further = [(p.refined(p.start).runs[0].grid.substeps - 1).sum() for p in (problem, wrong)]
+    assert further[1] < 0.2 * further[0]
 
 
 def test_a_problem_for_another_model_keeps_noise_and_beginnings(runs):
