@@ -21,6 +21,7 @@ from motorid.estimation.restarts import restore_collapsed
 from motorid.estimation.result import Fit
 from motorid.estimation.start_values import with_start_values
 from motorid.integrate.engine import Engine
+from motorid.integrate.rodas3 import ORDER
 from motorid.model.model import Model
 from motorid.numerics.least_squares import LevenbergMarquardt
 from motorid.numerics.parallel import one_thread, progress
@@ -262,18 +263,16 @@ def _polished(found: Estimate, effort: LevenbergMarquardt, callback: Callback) -
     problem, misfit = found.problem, max(_misfit(found), 1.0)
     error, bias = integration_bias(problem, found.q, found.solution.jac)
     rugged = found.solution.status != "converged" and misfit > NOISE
-    finer = np.ceil(max(2 * error / (ERROR_SHARE * misfit), bias / (BIAS * misfit)) ** (1 / 3))
-    finer = FINER if rugged else finer
+    share = max(2 * error / (ERROR_SHARE * misfit), bias / (BIAS * misfit))
+    finer = FINER if rugged else np.ceil(share ** (1 / ORDER))
     if not 1 < finer <= MOST_FINER:
         return found, error
     problem = problem.with_finer_steps(int(finer))
-    try:
+    with contextlib.suppress(*FAILURES):
         again = least_squares(problem, effort, callback, q=found.q, refine=False)
-    except FAILURES:
-        return found, error
-    if rugged and again.cost > found.cost:
-        return found, error
-    return replace(again, history=found.history + again.history), integration_error(problem, again.q)
+        if not rugged or again.cost < found.cost:
+            return replace(again, history=found.history + again.history), integration_error(problem, again.q)
+    return found, error
 
 
 def _misfit(found: Estimate) -> float:

@@ -68,10 +68,8 @@ static void part(long long k, long long s, long long m, const double* dt, const 
                  double* ua, double* ub, double* h) {
   int c;
   *h = dt[k] / m;
-  for (c = 0; c < NU; c++) {
-    double slope = u1[k * NU + c] - u0[k * NU + c];
-    ua[c] = u0[k * NU + c] + slope * s / m;
-    ub[c] = u0[k * NU + c] + slope * (s + 1) / m;
+  for (c = 0, u0 += k * NU, u1 += k * NU; c < NU; c++) {
+    ua[c] = u0[c] + (u1[c] - u0[c]) * s / m; ub[c] = u0[c] + (u1[c] - u0[c]) * (s + 1) / m;
   }
 }
 

@@ -157,8 +157,7 @@ class Stepper:
         else:
             ends = self.machine.halved(grid, rows, x, p)
             self._spent += self.functions.light.n_instructions() * 2 * int(grid.substeps[rows].sum())
-        with np.errstate(all="ignore"):
-            return np.nan_to_num(np.abs(x[rows + 1] - ends).T, nan=np.inf)
+        return np.where(np.isfinite(ends), np.abs(x[rows + 1] - ends), np.inf).T
 
     def shown_sizes(self, grid: Grid, traj: Trajectory, p: Array) -> Array:
         """Size (nx,) that the largest output lends the states it shows: a small part need not be exact."""

@@ -373,16 +373,13 @@ def integration_bias(problem: Problem, q: Array, jac: Array) -> tuple[float, flo
 
 def _halved_steps(problem: Problem, q: Array) -> tuple[float, Array]:
     """Return by how much steps half as long change the outputs: at most, over the noise; and the stacked residual."""
-    worst, parts = 0.0, [np.zeros(0)]
     if not hasattr(problem.integrator, "compiled"):  # chooses its steps itself
-        return worst, parts[0]
-    finer = problem.with_finer_steps(2)
-    for k, run in enumerate(problem.runs):
-        try:
-            change = finer.simulate(q, k, derivatives=False).y - problem.simulate(q, k, derivatives=False).y
-        except SimulationError:
-            return float("inf"), parts[0][:0]
-        sigma = np.array([run.sigma.get(c, np.inf) for c in problem.outputs])
-        worst = max(worst, float(np.max(np.abs(change) / sigma)))
-        parts.append(problem.measured[k].stack(change * problem.measured[k].weights))
-    return worst, np.concatenate(parts)
+        return 0.0, np.zeros(0)
+    both, seen = (problem.with_finer_steps(2), problem), problem.measured
+    try:
+        ys = [[p.simulate(q, k, derivatives=False).y for p in both] for k in range(len(seen))]
+    except SimulationError:
+        return float("inf"), np.zeros(0)
+    changes = [fine - coarse for fine, coarse in ys]
+    worst = max(float(np.max(np.abs(c) / m.noise)) for c, m in zip(changes, seen, strict=True))
+    return worst, np.concatenate([m.stack(c * m.weights) for c, m in zip(changes, seen, strict=True)])

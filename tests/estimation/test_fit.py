@@ -296,6 +296,26 @@ def test_a_simulation_that_fails_on_the_way_shortens_the_step(runs):
     assert fit.values == pytest.approx(free.values, rel=1e-4)
 
 
+def test_integration_errors_move_no_estimate_by_more_than_a_share_of_its_deviation(runs, monkeypatch):
+    from motorid.estimation import fit as stages
+    from motorid.problem import residuals as accuracy
+
+    def shift() -> float:
+        """Against the estimate with eight times as many steps, over the deviations."""
+        fit = mi.fit(mi.dc_motor(**VALUES), runs, start="model")
+        finer = fit.problem.with_finer_steps(8)
+        exact = least_squares.least_squares(finer, least_squares.FINISH, q=fit.q, refine=False)
+        return max(abs(fit.values[n] - exact.values[n]) / s for n, s in fit.std.items() if s)
+
+    limit = stages.BIAS
+    monkeypatch.setattr(accuracy, "LOOSEST", 5e-3)
+    monkeypatch.setattr(accuracy, "NOISE_SHARE", 1.0)
+    monkeypatch.setattr(stages, "ERROR_SHARE", np.inf)
+    assert shift() < limit
+    monkeypatch.setattr(stages, "BIAS", np.inf)
+    assert shift() > limit
+
+
 def test_a_start_that_cannot_be_simulated_is_an_error_that_says_what_to_do(runs):
     with pytest.raises(FitError, match=r"cannot be simulated at the start.*model\.replace"):
         mi.fit(mi.dc_motor(**VALUES), runs, start="model", engine=Fragile(limit=1e-5))
