@@ -32,8 +32,7 @@ Excite = Annotated[str | None, typer.Option(
 Duration = Annotated[float | None, typer.Option(metavar="S", help="Stop after so many seconds.")]
 Volts = Annotated[float | None, typer.Option(metavar="V", help="Largest voltage, of either sign.")]
 Amperes = Annotated[float | None, typer.Option(metavar="A", help="Switch the motor off above this current.")]
-CalibrationFile = Annotated[Path | None, typer.Option(
-    metavar="FILE.toml", help="Scale, offset, gain … per channel.")]
+CalibrationFile = Annotated[Path | None, typer.Option(metavar="FILE.toml", help="Scale, offset, gain … per channel.")]
 Resume = Annotated[bool, typer.Option("--resume", help="Continue a record that was cut short.")]
 Force = Annotated[bool, typer.Option("--force", help="Replace a file that exists.")]
 Timeout = Annotated[float, typer.Option(metavar="S", help="End the recording after so many seconds of silence.")]
@@ -47,10 +46,8 @@ Seed = Annotated[int | None, typer.Option(
     metavar="N", min=0, help="Seed of the hidden effect, the motor's constants, the noise and the faults.")]
 Rate = Annotated[float, typer.Option(metavar="HZ", min=1.0, max=20_000.0, help="Samples per second.")]
 SentChannels = Annotated[str, typer.Option(metavar="v,i", help="Channels to send.")]
-Speed = Annotated[float, typer.Option(
-    metavar="FACTOR", min=0.0, help="Times real time; 0: as fast as it is read.")]
-Probability = Annotated[float, typer.Option(
-    metavar="P", min=0.0, max=1.0, help="Probability of this fault, per line.")]
+Speed = Annotated[float, typer.Option(metavar="FACTOR", min=0.0, help="Times real time; 0: as fast as it is read.")]
+Probability = Annotated[float, typer.Option(metavar="P", min=0.0, max=1.0, help="Probability of this fault, per line.")]
 UnplugAfter = Annotated[float | None, typer.Option(metavar="S", help="Unplug the bench so long into a run.")]
 PlugAfter = Annotated[float | None, typer.Option(metavar="S", help="Plug it in again after so long.")]
 LinkName = Annotated[Path | None, typer.Option(metavar="PATH", help="A name for the port that stays the same.")]

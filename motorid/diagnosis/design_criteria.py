@@ -275,8 +275,7 @@ class Driven:
     def grid(self, levels: Array | None) -> Grid:
         """Return samples and inputs: the voltage of `levels`, or (None) what makes a voltage of the parameters."""
         shapes = self.layout.inputs
-        u = np.column_stack([0 * shapes[:, 0], shapes] if levels is None else
-                            [self.layout.voltage(levels), 0 * shapes])
+        u = np.column_stack([0 * shapes[:, 0], shapes] if levels is None else [self.layout.voltage(levels), 0 * shapes])
         t = np.linspace(0, self.layout.dt * (len(u) - 1), len(u))
         return Grid.of(t, u, np.ones(3, bool)).with_substeps(self.substeps)
 

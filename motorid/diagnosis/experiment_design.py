@@ -651,8 +651,7 @@ def _expected(task: Task, levels: Array) -> tuple[dict[tuple[str, str], float], 
     values = () if task.asked else task.criteria(levels, answers, False)
     evidence = {(names[i], names[j]): 0.5 * float(np.expm1(w.value))
                 for (i, j), w in zip(task.pairs, values, strict=True)}
-    return evidence, {n: d.rival.deviations(d.informs(r))
-                      for n, d, r in zip(names, task.driven, answers, strict=True)}
+    return evidence, {n: d.rival.deviations(d.informs(r)) for n, d, r in zip(names, task.driven, answers, strict=True)}
 
 
 def _told(task: Task, c: Array, peaks: Mapping[str, float], fixed: tuple[str, Task, Array],

@@ -17,7 +17,7 @@ from motorid.diagnosis.record_parts import within_worth, worth_its_steps
 from motorid.diagnosis.score_test import uses_angle
 from motorid.diagnosis.thresholds import MATERIAL, NATS
 from motorid.errors import OutOfTime
-from motorid.estimation.continuation import by_continuation, sharpened
+from motorid.estimation.continuation import by_continuation, past_ripples, sharpened
 from motorid.estimation.first_guess import first_guess
 from motorid.estimation.least_squares import FAILURES, Estimate
 from motorid.estimation.restarts import collapsed_again, restored
@@ -99,7 +99,7 @@ def finished(fit: Fit, best: Raced) -> Fit | None:
     Where it went along the measured angle the model's own takes over, unless it drifts too far (periods of the
     angle pass).
     """
-    stages = "sgn_width" in best.problem.model.parameters and not fit.model.effects
+    stages = "sgn_width" in best.problem.model.parameters and "sgn_width" not in fit.model.parameters
     try:
         done = _released(best.problem) if best.angular else QUICKLY(best.problem, wide=stages)
     except FAILURES:
@@ -197,7 +197,7 @@ def _polished(fit: Fit, problem: Problem) -> Fit | None:
             factors = misfit_over_noise(done.problem, done.solution.q)
             if max(abs(np.log(factors[c] / problem.noise_factors.get(c, 1.0))) for c in factors) > 0.1:
                 done = _converged(restarted(done.problem, done.solution.q).tuned(noise_factors=factors))
-        done = sharpened(done, POLISH)
+        done = sharpened(past_ripples(done, POLISH), POLISH)
     except FAILURES:
         return None
     found, problem = done.solution, done.problem

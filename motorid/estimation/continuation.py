@@ -8,13 +8,14 @@ alone, and all at 2.551 mm in stages.
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
 
 from motorid.estimation.least_squares import FAILURES, RACE, ROUNDS, Callback, Estimate, least_squares, start_cost
 from motorid.estimation.restarts import restarted_where_doubtful
-from motorid.numerics.least_squares import LevenbergMarquardt
+from motorid.numerics.least_squares import LevenbergMarquardt, levenberg_marquardt
 from motorid.problem.problem import Problem
 from motorid.problem.runs import SGN_WIDTH_SHARE, smoothing, top_speed
 from motorid.problem.simulate import misfit_over_noise
@@ -52,7 +53,28 @@ def by_continuation(problem: Problem, effort: LevenbergMarquardt, callback: Call
         if k < last:
             here = found.problem.start_at(found.values)
     found = replace(found, history=history)
-    return sharpened(found, effort, callback) if narrow else found
+    return sharpened(past_ripples(found, effort, callback), effort, callback) if narrow else found
+
+
+def past_ripples(found: Estimate, effort: LevenbergMarquardt, callback: Callback = None) -> Estimate:
+    """Return the estimate led on from where it stalled by the slopes of a wider sgn, if that lowers the cost.
+
+    With a narrow sgn the instants at which a motor sticks and breaks away ripple the cost, and its own slopes lead into
+    the nearest ripple; those of a wider one follow the valley. What ends at the noise is left as it is.
+    """
+    problem = found.problem
+    if found.solution.status == "converged" or not smooths(problem) or \
+            max(misfit_over_noise(problem, found.q).values(), default=0.0) < NOISE:
+        return found
+    wider = problem.tuned(width=STEP * found.values["sgn_width"]).refined(found.q)
+    with suppress(*FAILURES):
+        led = levenberg_marquardt(problem.residual, lambda q: (problem.residual(q), wider.jacobian(q)), found.q,
+                                  problem.scaling.bounds, effort.at_most(RACE), callback, problem.scaling.log)
+        if led.history[-1] < LOWER * found.cost:
+            other = least_squares(problem, effort, callback, q=led.q)
+            if other.cost < LOWER * found.cost:
+                return replace(other, history=found.history + led.history + other.history)
+    return found
 
 
 def sharpened(found: Estimate, effort: LevenbergMarquardt, callback: Callback = None) -> Estimate:

@@ -38,7 +38,6 @@ WINDOWS = (8, 32)  # of the longest record, where it is not followed as a whole
 FEWEST = 50  # samples of a window
 UNFOLLOWED = 0.25  # share of a channel's variance left unexplained
 TOO_FAR = 100.0  # times that an error in the state grows: one of 1 % would be all of the motion
-FINER = 2  # times as many steps, where the descent came to a halt
 MOST_FINER = 4  # times as many steps, where that is not kept
 
 
@@ -256,23 +255,18 @@ def _reweighted(found: Estimate) -> dict[str, float] | None:
 
 
 def _polished(found: Estimate, effort: LevenbergMarquardt, callback: Callback) -> tuple[Estimate, float]:
-    """Return the estimate and its integration error; with finer steps all over where small errors added up.
-
-    Where no step lowered the cost, a sgn that moves from one step to another may have made slopes of nothing.
-    """
+    """Return the estimate and its integration error; with finer steps all over where small errors added up."""
     problem, misfit = found.problem, max(_misfit(found), 1.0)
     error, bias = integration_bias(problem, found.q, found.solution.jac)
-    rugged = found.solution.status != "converged" and misfit > NOISE
-    share = max(2 * error / (ERROR_SHARE * misfit), bias / (BIAS * misfit))
-    finer = FINER if rugged else np.ceil(share ** (1 / ORDER))
-    if not 1 < finer <= MOST_FINER:
+    finer = np.ceil(max(2 * error / (ERROR_SHARE * misfit), bias / (BIAS * misfit)) ** (1 / ORDER))
+    if not 1 < finer <= MOST_FINER or found.solution.status != "converged":
         return found, error
     problem = problem.with_finer_steps(int(finer))
-    with contextlib.suppress(*FAILURES):
+    try:
         again = least_squares(problem, effort, callback, q=found.q, refine=False)
-        if not rugged or again.cost < found.cost:
-            return replace(again, history=found.history + again.history), integration_error(problem, again.q)
-    return found, error
+    except FAILURES:
+        return found, error
+    return replace(again, history=found.history + again.history), integration_error(problem, again.q)
 
 
 def _misfit(found: Estimate) -> float:

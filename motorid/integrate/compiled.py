@@ -24,10 +24,10 @@ import casadi as ca
 
 from motorid.integrate.rodas3 import StepFunctions
 
-# -Bsymbolic: a name of ours must never be taken from another library. The last two let divisions by one pivot
-# share its reciprocal; results stay within rounding of the virtual machine's.
+# -Bsymbolic: a name of ours must never be taken from another library. Nothing here changes a rounding: results are
+# those of the virtual machine to the last bit, and so the same whether a step was compiled before, now or never.
 FLAGS = ("-O1", "-fPIC", "-shared", *(() if sys.platform == "darwin" else ("-Wl,-Bsymbolic",)),
-         "-ffp-contract=off", "-fno-math-errno", "-freciprocal-math", "-fno-trapping-math")
+         "-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math")
 _told: set[str] = set()
 
 DRIVER = r"""
@@ -42,34 +42,28 @@ static void propagate(double* out, int rows, const double* A, const double* B, c
   int r, c;
   memset(out, 0, rows * nq * sizeof(double));
   for (r = 0; r < rows; r++) {
-    double* row = out + r * nq;
+    double *row = out + r * nq, direct = 0;
     for (c = 0; c < NX; c++) {
       double a = A[c * rows + r];
       const double* other = S + c * nq;
       if (a != 0) for (j = 0; j < nq; j++) row[j] += a * other[j];
     }
-    for (j = 0; j < nz; j++) row[unknown[j]] += B[param[j] * rows + r] * slope[j];
+    for (j = 0; j < nz; j++) {
+      direct += B[param[j] * rows + r] * slope[j];
+      if (j + 1 < nz && unknown[j + 1] == unknown[j]) continue;
+      row[unknown[j]] += direct; direct = 0;
+    }
   }
-}
-
-/* Work space for the largest of the functions. */
-static void most(int (*work)(casadi_int*, casadi_int*, casadi_int*, casadi_int*), casadi_int* na,
-                 casadi_int* nr, casadi_int* ni, casadi_int* nw) {
-  casadi_int a, r, i, w;
-  work(&a, &r, &i, &w);
-  if (a > *na) *na = a;
-  if (r > *nr) *nr = r;
-  if (i > *ni) *ni = i;
-  if (w > *nw) *nw = w;
 }
 
 /* Length and inputs of sub-step s of m in interval k. */
 static void part(long long k, long long s, long long m, const double* dt, const double* u0, const double* u1,
                  double* ua, double* ub, double* h) {
   int c;
-  *h = dt[k] / m;
+  double share = 1.0 / m, slope;
+  *h = dt[k] * share;
   for (c = 0, u0 += k * NU, u1 += k * NU; c < NU; c++) {
-    ua[c] = u0[c] + (u1[c] - u0[c]) * s / m; ub[c] = u0[c] + (u1[c] - u0[c]) * (s + 1) / m;
+    slope = (u1[c] - u0[c]) * share; ua[c] = u0[c] + slope * s; ub[c] = ua[c] + slope;
   }
 }
 
@@ -79,23 +73,17 @@ long long motorid_run(long long n, const long long* nsub, const double* dt, cons
                       const double* u1, const double* us, const double* x0, const double* p, long long nq,
                       const double* S0, const double* Pq, double* Y, double* DY, double* X, double* DX,
                       double* E) {
-  casadi_int na = 8, nr = 8, ni = 1, nw = 1;
-  most(motorid_light_work, &na, &nr, &ni, &nw);
-  most(motorid_full_work, &na, &nr, &ni, &nw);
-  most(motorid_out_work, &na, &nr, &ni, &nw);
-  const double** arg = malloc(na * sizeof(double*));
-  double** res = malloc(nr * sizeof(double*));
-  casadi_int* iw = malloc(ni * sizeof(casadi_int));
-  double* w = malloc((nw + 2 * NX * nq + 1) * sizeof(double));
-  double *S = w + nw, *T = S + NX * nq;
+  const double* arg[N_ARG];
+  double *res[N_RES], w[N_W], *S = malloc((2 * NX * nq + 1) * sizeof(double)), *T = S + NX * nq, *both = S;
+  casadi_int iw[N_IW];
   long long nz = 0, *param = malloc((2 * NP * nq + 1) * sizeof(long long)), *unknown = param + NP * nq;
   double* slope = malloc((NP * nq + 1) * sizeof(double));
   double x[NX], xn[NX], e[NX], h, A[NX * NX], B[NX * NP], ua[NU], ub[NU], y[NY], C[NY * NX], D[NY * NP];
   long long k, s, bad = -1;
   memcpy(x, x0, sizeof(x));
   if (nq) memcpy(S, S0, NX * nq * sizeof(double));
-  for (k = 0; k < NP * nq; k++) if (Pq[k] != 0) {
-    param[nz] = k / nq; unknown[nz] = k % nq; slope[nz++] = Pq[k];
+  for (k = 0; k < NP * nq; k++) if (Pq[k % NP * nq + k / NP] != 0) {
+    param[nz] = k % NP; unknown[nz] = k / NP; slope[nz++] = Pq[k % NP * nq + k / NP];
   }
   for (k = 0; k < n; k++) {
     int r, c;
@@ -123,20 +111,16 @@ long long motorid_run(long long n, const long long* nsub, const double* dt, cons
       memcpy(x, xn, sizeof(x));
     }
   }
-  free(arg); free(res); free(iw); free(w); free(param); free(slope);
+  free(both); free(param); free(slope);
   return bad;
 }
 
 /* Where intervals `rows` end from X in half the steps. */
 void motorid_halved(long long n, const long long* rows, const long long* nsub, const double* dt, const double* u0,
                     const double* u1, const double* X, const double* p, double* ends) {
-  casadi_int na = 8, nr = 8, ni = 1, nw = 1;
-  most(motorid_light_work, &na, &nr, &ni, &nw);
-  const double** arg = malloc(na * sizeof(double*));
-  double** res = malloc(nr * sizeof(double*));
-  casadi_int* iw = malloc(ni * sizeof(casadi_int));
-  double* w = malloc((nw + 1) * sizeof(double));
-  double x[NX], h, ua[NU], ub[NU];
+  const double* arg[N_ARG];
+  double *res[N_RES], w[N_W], x[NX], h, ua[NU], ub[NU];
+  casadi_int iw[N_IW];
   long long j, s;
   for (j = 0; j < n; j++, ends += NX) {
     long long k = rows[j], m = 2 * nsub[k];
@@ -149,7 +133,6 @@ void motorid_halved(long long n, const long long* rows, const long long* nsub, c
       memcpy(x, ends, sizeof(x));
     }
   }
-  free(arg); free(res); free(iw); free(w);
 }
 """
 
@@ -211,6 +194,7 @@ def generate(functions: StepFunctions) -> str:
         code.add(f)
     f = functions.full
     sizes = {"NX": f.size1_in(0), "NU": f.size1_in(1), "NP": f.size1_in(4), "NY": functions.out.size1_out(0)}
+    sizes |= {f"N_{n.upper()}": max(getattr(f, f"sz_{n}")() for f in functions) for n in ("arg", "res", "iw", "w")}
     return code.dump() + "".join(f"#define {k} {max(v, 1)}\n" for k, v in sizes.items()) + DRIVER
 
 

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import casadi as ca
 
-from motorid.model.equations import System
+from motorid.model.equations import System, reciprocal
 
 GAMMA = 0.5
 A = ((), (0.0,), (2.0, 0.0), (2.0, 0.0, 1.0))
@@ -74,12 +74,13 @@ def rosenbrock_step(system: System, x, u0, u1, h, p):
 
 
 def _lu(w: ca.SX) -> list[list[ca.SX]]:
-    """LU factors without pivoting: W has positive storage or resistance on its diagonal."""
+    """LU factors without pivoting, reciprocals on the diagonal: W has positive storage or resistance there."""
     n = w.shape[0]
     m = [[w[i, j] for j in range(n)] for i in range(n)]
     for k in range(n):
+        m[k][k] = reciprocal(m[k][k])
         for i in range(k + 1, n):
-            m[i][k] = m[i][k] / m[k][k]
+            m[i][k] = m[i][k] * m[k][k]
             for j in range(k + 1, n):
                 m[i][j] = m[i][j] - m[i][k] * m[k][j]
     return m
@@ -94,5 +95,5 @@ def _solve(m: list[list[ca.SX]], rhs: ca.SX) -> ca.SX:
     for i in reversed(range(n)):
         for j in range(i + 1, n):
             z[i] = z[i] - m[i][j] * z[j]
-        z[i] = z[i] / m[i][i]
+        z[i] = z[i] * m[i][i]
     return ca.vertcat(*z)

@@ -19,9 +19,7 @@ from motorid.integrate.rodas3 import ORDER, StepFunctions, step_functions
 from motorid.model.equations import System
 from motorid.numerics.signals import Array
 
-# Instructions of the virtual machine (0.05 s) before a step is worth compiling. No clock decides: the two round
-# differently, and the last digits would depend on what else the machine does.
-PATIENCE = 1.5e7
+PATIENCE = 1.5e7  # instructions of the virtual machine (0.05 s) before a step is worth compiling
 MOST_SUBSTEPS = 256
 MOST_PASSES = 6
 LOST_ERROR = 0.3  # error estimate, relative to the state so far, at which a step is lost
@@ -287,7 +285,7 @@ class Machine:
                 walk.set_res(k, _view(part))
             trigger()
         y, dy = self.observe(grid, x[ends], s[ends] if nq else None, p, dp)
-        error = np.maximum.reduceat(np.abs(e), ends[:-1]) if local_error else None
+        error = np.maximum.reduceat(np.abs(e[:ends[-1]]), ends[:-1]) if local_error else None
         return Trajectory(y, dy, x[ends], s[ends] if nq else None, error)
 
     def halved(self, grid: Grid, rows: NDArray[np.int64], x: Array, p: Array) -> Array:
@@ -334,10 +332,11 @@ class Machine:
         if dx is None or dp is None:
             return results[0][:n], None
         y, c, d = (r[:n] for r in results)
-        dy = (d.reshape(-1, self.np) @ dp).reshape(n, self.ny, -1)
+        dy = np.zeros((n, self.ny, dp.shape[1]))
         with np.errstate(all="ignore"):  # a run that left the finite numbers is reported by its states
             for j in range(self.nx):  # NumPy's product of many small matrices is slower by far
                 dy += c[:, :, j, None] * dx[:, None, j, :]
+            dy += (d.reshape(-1, self.np) @ dp).reshape(dy.shape)
         return y, dy
 
 

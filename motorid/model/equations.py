@@ -16,6 +16,11 @@ from motorid.errors import ModelError, one_of
 from motorid.numerics.signals import Array
 
 
+def reciprocal(x: ca.SX) -> ca.SX:
+    """Return 1/x as a factor that is computed once; CasADi would make a division of every product with 1/x itself."""
+    return 2 / (2 * x)
+
+
 class Equations:
     """Balances, quantities, states and sensors of one model while it is being written.
 
@@ -94,7 +99,7 @@ class Equations:
         """Return a smooth sgn(x); the width (rad/s) is chosen from the data, well below the slowest speed."""
         if self.sgn_width is None:
             self.sgn_width = ca.SX.sym("sgn_width")
-        return ca.tanh(x / (self.sgn_width * self.smoothing))
+        return ca.tanh(x * reciprocal(self.sgn_width * self.smoothing))
 
     def measured(self, channel: str) -> ca.SX:
         """Return what the sensor of `channel` shows so far (several sensor effects follow one another)."""
@@ -269,9 +274,9 @@ def build_system(m: Equations, parameters: tuple[str, ...], outputs: tuple[str, 
             raise ModelError(f"the state '{name}' has no rate: call m.rate({name}, …) in the effect that adds it.")
     d = ca.SX.sym("d", 2)
     rates: dict[str, Any] = dict(m.rates)
-    rates["omega"] = (torque + d[1]) / m.J
+    rates["omega"] = (torque + d[1]) * reciprocal(m.J)
     if electrical:
-        rates["i"] = (voltage + d[0]) / m.L if "i" in stored else voltage + d[0]
+        rates["i"] = (voltage + d[0]) * reciprocal(m.L) if "i" in stored else voltage + d[0]
     names = tuple(m.states)
     initial = {"i": m.start["i"], "omega": m.start["omega"], **m.initial}
     filled = m.fill([*[ca.SX(rates[n]) for n in names], *shown, *[ca.SX(initial[n]) for n in names], voltage, torque])

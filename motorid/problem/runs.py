@@ -222,8 +222,7 @@ def _cubic(x: Array, y: Array) -> tuple[float, float]:
     columns = np.vander(x / x[-1], 4, increasing=True)
     inverse = np.linalg.pinv(columns)
     weights = inverse @ y
-    return (float(weights[1] / np.linalg.norm(inverse[1])),
-            float(np.sum((y - columns @ weights) ** 2) / (len(y) - 4)))
+    return (float(weights[1] / np.linalg.norm(inverse[1])), float(np.sum((y - columns @ weights) ** 2) / (len(y) - 4)))
 
 
 def _first(y: Array) -> float:
