@@ -69,10 +69,9 @@ static void part(long long k, long long s, long long m, const double* dt, const 
 
 /* x over one record, E: the largest error estimate in each interval, without S0; returns -1, or the index of the first
    sample whose state is not finite. */
-long long motorid_run(long long n, const long long* nsub, const double* dt, const double* u0,
-                      const double* u1, const double* us, const double* x0, const double* p, long long nq,
-                      const double* S0, const double* Pq, double* Y, double* DY, double* X, double* DX,
-                      double* E) {
+long long motorid_run(long long n, const long long* nsub, const double* dt, const double* u0, const double* u1,
+                      const double* us, const double* x0, const double* p, long long nq, const double* S0,
+                      const double* Pq, double* Y, double* DY, double* X, double* DX, double* E) {
   const double* arg[N_ARG];
   double *res[N_RES], w[N_W], *S = malloc((2 * NX * nq + 1) * sizeof(double)), *T = S + NX * nq, *both = S;
   casadi_int iw[N_IW];
