@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import motorid as mi
-from motorid.estimation.continuation import by_continuation
-from motorid.estimation.least_squares import FINISH, start_cost
+from motorid.estimation.continuation import by_continuation, past_ripples
+from motorid.estimation.least_squares import FINISH, least_squares, start_cost
 from motorid.problem.problem import Problem, as_problem
 from motorid.records.experiment import Experiment
 
@@ -48,6 +48,15 @@ def test_continuation_leads_every_start_to_one_place_where_the_narrow_sgn_alone_
     staged, alone = ends(stuck, wide=True), ends(stuck, wide=False)
     assert np.ptp(staged) < 1e-3 * staged[0]
     assert max(alone) > 5 * staged[0]
+
+
+def test_the_slopes_of_a_wider_sgn_lead_on_from_where_those_of_a_narrow_one_stall(stuck):
+    ends = [least_squares(problem(stuck, k), FINISH) for k in range(6)]
+    pairs = [(end, past_ripples(end, FINISH)) for end in ends]
+    assert all(led is end for end, led in pairs if end.solution.status == "converged")
+    shares = [led.cost / end.cost for end, led in pairs if end.solution.status != "converged"]
+    assert max(shares) <= 1
+    assert min(shares) < 0.5
 
 
 def test_a_width_that_was_given_is_kept(stuck):
