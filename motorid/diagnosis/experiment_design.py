@@ -153,7 +153,7 @@ RIPPLES = (0.0, 0.3)  # share of the voltage for a binary signal on top of a can
 DRAWS = 16  # of the parameters, for the check of the limits
 SMOOTH = 1e-2  # of the largest speed: width of sgn while the voltage is sought
 NEARLY = 0.05  # nats between coarse and fine integration that need no further search
-ROUGH, TOLERANCE = 3e-4, 3e-5  # of the integration, over the largest state: while the voltage is sought, and after
+ROUGH, TOLERANCE = 3e-4, 1e-5  # of the integration, over the largest state: while the voltage is sought, and after
 NO_RECORD = "no record stays within the limits with all models; allow more voltage, current or angle."
 WORTH = 4.0  # nats between two rivals from which they count as distinguished
 
