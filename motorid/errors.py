@@ -9,6 +9,7 @@ import numbers
 import os
 import re
 import sys
+import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from itertools import pairwise
 from types import TracebackType
@@ -103,6 +104,13 @@ _KINDS: dict[str, Any] = {**dict.fromkeys(("Path", "PathLike", "Path_"), (str, o
 _choices = functools.cache(functools.partial(re.split, r" \| (?![^\[]*\])"))  # what an annotation allows
 
 
+class _Calls(threading.local):
+    within = False  # a public call: what it calls in turn need not be looked at before it fails
+
+
+_calls = _Calls()
+
+
 def arguments_told(thing: _Thing) -> _Thing:
     """Let a function, or what a class is made with and its methods, say which argument is not what its annotation says.
 
@@ -123,9 +131,11 @@ def arguments_told(thing: _Thing) -> _Thing:
 
     @functools.wraps(thing)
     def call(*args: Any, **kwargs: Any) -> Any:
-        early = _wrong_argument(thing, signature, args, kwargs, plain)
+        within = _calls.within
+        early = None if within else _wrong_argument(thing, signature, args, kwargs, plain)
         if early is not None and not member:
             raise UsageError(early)
+        _calls.within = True
         try:
             found = thing(*args, **kwargs)
             if early is not None:
@@ -135,6 +145,8 @@ def arguments_told(thing: _Thing) -> _Thing:
             if (wrong := _wrong_argument(thing, signature, args, kwargs)) is None:
                 raise
             raise UsageError(wrong) from error
+        finally:
+            _calls.within = within
 
     return cast(_Thing, call)
 

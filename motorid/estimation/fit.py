@@ -38,7 +38,7 @@ WINDOWS = (8, 32)  # of the longest record, where it is not followed as a whole
 FEWEST = 50  # samples of a window
 UNFOLLOWED = 0.25  # share of a channel's variance left unexplained
 TOO_FAR = 100.0  # times that an error in the state grows: one of 1 % would be all of the motion
-MOST_FINER = 4  # times as many steps, where that is not kept
+MOST_FINER = 4  # times as many steps at most, where that is not kept
 
 
 @one_thread
@@ -259,9 +259,9 @@ def _polished(found: Estimate, effort: LevenbergMarquardt, callback: Callback) -
     problem, misfit = found.problem, max(_misfit(found), 1.0)
     error, bias = integration_bias(problem, found.q, found.solution.jac)
     finer = np.ceil(max(2 * error / (ERROR_SHARE * misfit), bias / (BIAS * misfit)) ** (1 / ORDER))
-    if not 1 < finer <= MOST_FINER or found.solution.status != "converged":
+    if not finer > 1 or found.solution.status != "converged":
         return found, error
-    problem = problem.with_finer_steps(int(finer))
+    problem = problem.with_finer_steps(int(min(finer, MOST_FINER)))
     try:
         again = least_squares(problem, effort, callback, q=found.q, refine=False)
     except FAILURES:

@@ -26,7 +26,7 @@ from motorid.integrate.rodas3 import StepFunctions
 
 # -Bsymbolic: a name of ours must never be taken from another library. Nothing here changes a rounding: results are
 # those of the virtual machine to the last bit, and so the same whether a step was compiled before, now or never.
-FLAGS = ("-O1", "-fPIC", "-shared", *(() if sys.platform == "darwin" else ("-Wl,-Bsymbolic",)),
+FLAGS = ("-Og", "-fPIC", "-shared", *(() if sys.platform == "darwin" else ("-Wl,-Bsymbolic",)),
          "-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math")
 _told: set[str] = set()
 
