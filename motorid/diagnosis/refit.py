@@ -61,16 +61,19 @@ def raced(fit: Fit, model: Model, starts: Sequence[Mapping[str, float]]) -> Race
     model = _bounded(fit, model)
     alive = restored(fit, model)
     angular = any(uses_angle(e) for e in model.effects) and not any(uses_angle(e) for e in fit.model.effects)
-    found = []
-    for start in (*(starts or ({},)), *_own_starts(fit, model, starts or ({},))):
+    starts, found = starts or ({},), []
+    # A guess of the larger model's own, along the records, is no longer led astray.
+    entries = [(start, angular) for start in starts] + [
+        (start, along) for start in _own_starts(fit, model, starts) for along in sorted({angular, False})]
+    for start, along in entries:
         # As it is where a parameter put back (an inductance that no sample shows) makes the model too stiff.
         for each in (alive,) if alive is model else (alive, model):
             done = None
             with contextlib.suppress(*FAILURES):  # a start that the model cannot take is none
-                done = _race(_started(fit, each, start, angular))
+                done = _race(_started(fit, each, start, along))
             if done is not None:
                 reach = _undamped(done.solution.residual, done.solution.jac)
-                found.append(Raced(restarted(done.problem, done.q), float(done.cost), reach, angular))
+                found.append(Raced(restarted(done.problem, done.q), float(done.cost), reach, along))
                 break
     return min(found, key=lambda r: r.cost, default=None)
 

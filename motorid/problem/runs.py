@@ -25,7 +25,6 @@ INITIAL = ("auto", "rest", "measured", "estimate")
 FIRST = 5  # samples that tell it
 LONGEST = 256  # samples that tell how fast an angle is at the first
 REACH = 8.0  # standard deviations that an estimated initial state may lie away from its first samples
-FREE_OF_NOISE = 2e-5  # of an angle's variation: what `noise_level` gives a simulation is half of it
 SGN_WIDTH_SHARE = 1e-3  # of the highest speed: wider smoothing looks like one more missing effect
 CREEP_SHARE = 0.2  # of the angle's noise that a stuck motor may creep
 NARROWEST = 1e-5  # of the highest speed
@@ -125,8 +124,8 @@ class InitialState(NamedTuple):
 def initial_state(run: Experiment, sigma: Mapping[str, float], initial: str) -> InitialState:
     """Return the state at the first sample, and which parts of it are to be estimated.
 
-    ``auto``: known zeros where nothing moves yet, otherwise estimated; a measured angle is estimated too (its
-    first sample is as noisy as any), unless it is free of noise. Estimates stay within what the first samples
+    ``auto``: known zeros where nothing moves yet, otherwise estimated; a measured angle is estimated too: its
+    first sample is as noisy as any, and half a count of the finest encoder adds up over a long run. Estimates stay within what the first samples
     allow, so that a model which lacks something cannot hide it in an initial state that never was.
     ``estimate``: everything, without limits.
     """
@@ -141,8 +140,7 @@ def initial_state(run: Experiment, sigma: Mapping[str, float], initial: str) -> 
         y = run.outputs[c]
         if c == "theta":
             start[k] = _resting(y[:lead], sigma[c]) if known else _first(y)
-            noisy = sigma[c] > FREE_OF_NOISE * np.nanstd(y)
-            if initial == "estimate" or (initial == "auto" and (noisy or not rest)):
+            if initial in ("estimate", "auto"):
                 reach[c] = _reach(y, sigma[c])
         elif not known:
             start[k] = _first(y)
