@@ -350,7 +350,10 @@ def _without(model: Model, name: str) -> list[Model]:
     """Return the model without an effect, and without the one that needs it; none where several do."""
     for needing in ((), *((e.name,) for e in model.effects if e.name != name)):
         with contextlib.suppress(ModelError):
-            return [reduce(Model.without, (*needing, name), model)]
+            left = reduce(Model.without, (*needing, name), model)
+            zeros = [e.name for e in left.effects if uses_angle(e) and any(p.per_run for p in e.parameters)]
+            alone = not any(uses_angle(e) for e in left.effects if e.name not in zeros)
+            return [reduce(Model.without, zeros, left) if alone else left]  # no effect is left that asks for a zero
     return []
 
 

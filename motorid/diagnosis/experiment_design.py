@@ -105,7 +105,8 @@ def suggest_experiment(fits: Sequence[Fit], *, v_max: float | None = None, i_max
         raise FitError("no candidate experiment stays within the limits with all models; raise i_max or v_max.")
     best = max(scores, key=lambda n: scores[n])
     what = candidates(t, v_max)[best][1]
-    return Suggestion(best, f"{what} (up to {v_max:.3g} V, {duration:.3g} s)", kept[best], scores)
+    unit = runs[0].units["v"]
+    return Suggestion(best, f"{what} (up to {v_max:.3g} {unit}, {duration:.3g} s)", kept[best], scores)
 
 
 def candidates(t: Array, v_max: float) -> dict[str, tuple[Array, str]]:

@@ -29,6 +29,7 @@ HARMONICS = 8  # of a turn
 LINES = 2  # of the spectrum of the misfit over the angle
 PLACES = 12  # over a time or an angle at which something may set in
 SUDDEN = 60.0  # how quickly a curve over the time may step, per range
+STILL = 0.02  # of the highest speed: slower is standstill
 SHARP = 1e-3  # of the highest speed: below it a direction is not known
 SOFT = 0.01  # of the largest current or voltage: the width of a jump at zero
 BENDS = (4, 12)  # times the largest speed, current or voltage goes a curve's bend into it
@@ -119,11 +120,18 @@ def shown(form: Form, fit: Fit, ranges: Mapping[str, tuple[float, float]]) -> bo
         return False  # a gain is the motor constant's, unless the motion is measured twice
     if form.on not in ranges or ranges[form.on][0] == ranges[form.on][1]:
         return False
+    if form.on == "path" and not turns_back(*ranges["omega"]):
+        return False
     if form.balance in ("voltage", "both") and "i" not in outputs:
         return False  # there a torque says the same
     if form.remembers and fit.window is not None:
         return False  # what was before a window is not known
     return form.on != "turn" or fit.problem.model.axis != "linear"
+
+
+def turns_back(lowest: float, highest: float) -> bool:
+    """Tell whether a motor turns both ways, by more than the creep of a smooth sgn or the ripple of a start."""
+    return min(-lowest, highest) > STILL * max(-lowest, highest)
 
 
 def orders_of(fit: Fit) -> list[float]:

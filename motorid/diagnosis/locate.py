@@ -178,11 +178,12 @@ def _masks(s: Mapping[str, Array], top_speed: float, top_current: float) -> dict
     omega = s.get("omega", np.zeros_like(s["t"]))
     n = len(omega)
     still = np.abs(omega) < 0.02 * top_speed
-    crossing = np.flatnonzero(np.diff(np.sign(np.where(still, 0, omega))) != 0)
+    moving = np.where(still, 0, omega)
+    crossing = np.flatnonzero(np.diff(np.sign(moving)) != 0)
     reversal = np.zeros(n, bool)
     window = max(n // 200, 2)
     for c in crossing:
-        if omega[max(c - window, 0)] * omega[min(c + window, n - 1)] < 0:
+        if moving[max(c - window, 0)] * moving[min(c + window, n - 1)] < 0:
             reversal[max(c - window, 0) : c + window] = True
     rate = np.abs(np.gradient(omega, s["t"]))
     fast = rate > 0.2 * max(np.quantile(rate, 0.99), 1e-300)

@@ -28,6 +28,7 @@ from motorid.diagnosis.thresholds import (
     LOST,
     MATERIAL,
     NATS,
+    PLAIN,
     STANDARD_ERRORS,
     UNRELIABLE,
 )
@@ -85,11 +86,16 @@ class Evidence:
     held_out_fall: float | None = None  # the same on held-out runs; None without any, or where both models lose them
     worse_there: bool = False  # the new model surely predicts the held-out runs worse, by the score or by their error
     everywhere: float | None = None  # fall over blocks and held-out runs together, each by its samples
+    plain: bool = False  # the held-out error falls by `PLAIN` and surely, whatever the density makes of single samples
 
     @property
     def sure(self) -> bool:
-        """Tell whether the difference is more than chance: `STANDARD_ERRORS` of it and at least `NATS`."""
-        return _sure(self.gain, self.se)
+        """Tell whether the difference is more than chance: `STANDARD_ERRORS` of it and at least `NATS`.
+
+        Where a motor rests most of the time the density prefers the model that never moves; then a plain fall of the
+        held-out error decides, unless the score surely speaks against it.
+        """
+        return _sure(self.gain, self.se) or (self.plain and not _sure(-self.gain, self.se))
 
     @property
     def worth_it(self) -> bool:
@@ -107,7 +113,8 @@ def compare(old: Predictions, new: Predictions) -> Evidence:
     here, here_se = _summed(_differences(old.blocks, new.blocks, lost=False))
     there, there_se = _summed(_differences(old.held_out, new.held_out, lost=True))
     blocks = _fall(old.blocks, new.blocks) or 0.0
-    held_out = _fall(*(_kept(old.held_out, new.held_out, m) for m in (old.held_out, new.held_out)))
+    unseen = [_kept(old.held_out, new.held_out, m) for m in (old.held_out, new.held_out)]
+    held_out = _fall(*unseen)
     worse = held_out is not None and (held_out < -MATERIAL or _sure(-there, there_se))
     gain, se = here + there, float(np.hypot(here_se, there_se))
     if held_out is None:
@@ -115,7 +122,9 @@ def compare(old: Predictions, new: Predictions) -> Evidence:
     weights = [sum(np.isfinite(r).sum() for e in c.values() for r in e.values) for c in (new.blocks, new.held_out)]
     logs = np.log1p([-min(f, 1 - 1e-12) for f in (blocks, held_out)])
     everywhere = 1 - float(np.exp(np.average(logs, weights=weights if any(weights) else None)))
-    return Evidence(gain, se, max(blocks, held_out), held_out, worse, everywhere)
+    plain = not _sure(gain, se) and held_out > PLAIN and bool(
+        -np.log1p(-held_out) > STANDARD_ERRORS * _fall_error(*unseen))
+    return Evidence(gain, se, max(blocks, held_out), held_out, worse, everywhere, plain)
 
 
 def _sure(gain: float, se: float) -> bool:
@@ -148,9 +157,22 @@ def _fall(old: Channels, new: Channels) -> float | None:
     return 1 - float(np.exp(np.mean([_log_rms(new[c]) - _log_rms(old[c]) for c in both]))) if both else None
 
 
-def _log_rms(errors: Errors) -> float:
-    """Return the logarithm of the RMS of errors, mean over runs; a tenth of the noise is as good as none."""
-    runs = [r for v in errors.values if len(r := despiked(v))]
+def _fall_error(old: Channels, new: Channels) -> float:
+    """Return the standard error of the logarithm of `_fall`, by the jackknife over blocks (Efron & Stein, Annals of
+    Statistics 9(3), 1981)."""
+    both = [c for c in old if c in new]
+    count = 1 + max(int(b.max()) for c in both for b in old[c].blocks)
+    without = np.mean([[_log_rms(new[c], k) - _log_rms(old[c], k) for c in both] for k in range(count)], axis=1)
+    return float(np.sqrt((count - 1) * without.var()))
+
+
+def _log_rms(errors: Errors, left_out: int = -1) -> float:
+    """Return the logarithm of the RMS of errors, mean over runs; a tenth of the noise is as good as none.
+
+    `left_out` is a block that does not count.
+    """
+    each = [despiked(v)[b[np.isfinite(v)] != left_out] for v, b in zip(errors.values, errors.blocks, strict=True)]
+    runs = [r for r in each if len(r)]
     logs = [0.5 * np.log(np.mean(r**2) + (0.1 * errors.noise) ** 2 + 1e-300) for r in runs]
     return float(np.average(logs, weights=[len(r) for r in runs])) if runs else 0.0
 

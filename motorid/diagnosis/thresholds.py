@@ -6,6 +6,7 @@ DEGREES_OF_FREEDOM = 4  # of Student's t: a Gaussian takes offsets for friction 
 STANDARD_ERRORS = 2.0  # that a gain must be: chance lets 1 % of false effects in at 15 effective samples per run
 NATS = 4.0  # that a gain must be at least: 2 to 4 let the same in on 438 pairs of models
 MATERIAL = 0.01  # fall of the prediction error that matters: no false effect of 306 reached 0.1 %
+PLAIN = 0.1  # fall of the held-out error that is plain to see; an arm's weight makes it 0.6 where the score has no say
 SEARCHED = 200  # orders of cogging or ripple, of which the best is taken: the gain of chance grows by their logarithm
 LOST = 1.0  # NRMSE beyond which a channel is lost: zero is nearer to what was measured
 UNRELIABLE = 1.5  # times the error of the fit: a prediction without a block by slopes is within 1.08 where it holds

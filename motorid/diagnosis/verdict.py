@@ -13,7 +13,7 @@ from motorid.diagnosis.model_comparison import Node
 from motorid.diagnosis.results import Adequacy, Candidate, Rung
 from motorid.diagnosis.score_test import Score
 from motorid.diagnosis.thresholds import ELSEWHERE, LARGER, LOST, MATERIAL
-from motorid.display.numbers import arrow, listed, number, percent, with_error
+from motorid.display.numbers import arrow, counted, listed, number, percent, with_error
 from motorid.effects import EVERY
 from motorid.estimation.result import Fit, parameter_cell
 from motorid.model.definition import Effect
@@ -278,8 +278,8 @@ def outliers_remark(fit: Fit) -> str:
         spikes = int(np.count_nonzero(r != kept))
         if spikes and kept @ kept < (1 - SPIKED) * (r @ r):
             share = percent(1 - float(kept @ kept) / float(r @ r), 2)
-            return (f"{spikes} outliers (single samples) make {share} of the squared error of {c}, and least squares "
-                    "follows them. A robust loss (--loss huber, loss=mi.Huber()) shows the rest better.")
+            return (f"{counted(spikes, 'outlier')} (single samples) {'makes' if spikes == 1 else 'make'} {share} of "
+                    f"the squared error of {c}, and least squares follows. A robust loss (--loss huber, loss=mi.Huber()) shows the rest better.")
     return ""
 
 

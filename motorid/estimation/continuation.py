@@ -36,19 +36,22 @@ def by_continuation(problem: Problem, effort: LevenbergMarquardt, callback: Call
     restarts at the first width. Raises `FitError` if the model cannot be simulated at the start.
     """
     widths = _widths(problem) if wide and smooths(problem) else (problem.width,)
-    history, last = (), len(widths) - 1
+    history, last, found = (), len(widths) - 1, None
     here = problem
     for k, width in enumerate(widths):
         # What one width likes a narrower one may refuse; then the start is better.
         stage = min((_at(p, width) for p in dict.fromkeys((here, problem))), key=start_cost) if k else _at(here, width)
         rough = effort if k == last else effort.at_most(RACE)
         try:
-            found = least_squares(stage, rough, callback, rounds=ROUNDS if k in (0, last) else 1)
-            found = found if k else restarted_where_doubtful(found, stage, rough, callback)
+            done = least_squares(stage, rough, callback, rounds=ROUNDS if k in (0, last) else 1)
+            found = done if k else restarted_where_doubtful(done, stage, rough, callback)
         except FAILURES:
-            if k == last:
+            if k < last:
+                continue
+            if found is None:
                 raise
-            continue
+            # Slopes that grow beyond all bounds with a narrow sgn: it stays as wide as can be followed.
+            found = least_squares(found.problem, effort, callback, q=found.q)
         history += found.history
         if k < last:
             here = found.problem.start_at(found.values)
@@ -86,7 +89,10 @@ def sharpened(found: Estimate, effort: LevenbergMarquardt, callback: Callback = 
         problem = found.problem.start_at(found.values).tuned(width=width)
         if misfit_over_noise(problem, found.q).get("theta", 0.0) < NOISE and not _promises(found, problem):
             return found
-        other = least_squares(problem, effort, callback)
+        try:
+            other = least_squares(problem, effort, callback)
+        except FAILURES:  # so narrow that it cannot be followed
+            return found
         history = found.history + other.history
         if other.cost > LOWER * found.cost:
             return replace(found, history=history)

@@ -8,6 +8,7 @@ from itertools import product
 import numpy as np
 
 from motorid.effects import LIBRARY
+from motorid.errors import ModelError
 from motorid.estimation.continuation import by_continuation
 from motorid.estimation.first_guess import first_guess, loads_of
 from motorid.estimation.least_squares import LOOK, RACE, race, start_cost
@@ -33,8 +34,11 @@ def with_start_values(problem: Problem) -> Problem:
     if not inner:
         return _shared_out(begin, problem.model)
     simpler = problem.model
-    for effect, simple in inner.items():
-        simpler = simpler.without(effect.name) + simple
+    try:
+        for effect, simple in inner.items():
+            simpler = simpler.without(effect.name) + simple
+    except ModelError:  # two of them contain the same
+        return _shared_out(begin, problem.model)
     first = _shared_out(_guessed(problem.for_model(simpler)), simpler)
     found = race([first], RACE, solve=by_continuation)
     if found is None:

@@ -328,8 +328,9 @@ def angle_against_speed(run: Experiment) -> str | None:
     ratio = float(np.sum(travel * integral) / np.sum(integral**2))
     if 0.8 < ratio < 1.25:
         return None
-    known = next((text for r, text in _RATIOS.items() if abs(ratio / r - 1) < 0.08), None)
-    guess = f"as if {known}" if known else "a gear between the two sensors, or wrong counts per turn"
+    nearest = min(_RATIOS, key=lambda r: abs(ratio / r - 1))
+    known = abs(ratio / nearest - 1) < 0.08
+    guess = f"as if {_RATIOS[nearest]}" if known else "a gear between the two sensors, or wrong counts per turn"
     return f"the angle advances {ratio:.4g} times as fast as the speed says: {guess}?"
 
 
@@ -346,6 +347,9 @@ def magnitudes(run: Experiment) -> str | None:
         top = float(np.nanmax(np.abs(values)))
         if top > limit:
             was = f" (read as {stated[channel]})" if channel in stated else ""
+            if channel == "v" and stated.get(channel, "")[:1].isdigit():
+                return (f"v reaches {top:.4g} V{was}: that unit is the voltage of a whole duty cycle. Is the column in "
+                        "per cent, or in counts of a timer? Then give the voltage of one: units={'v': '0.12 V'}.")
             return (f"{channel} reaches {top:.4g} {unit}{was}; is it in {likely}? "
                     f"If so: units={{'{channel}': '{likely}'}}.")
     if run.dt > 0.2:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -22,6 +23,7 @@ from motorid.records.headers import (
 )
 
 _CHANNELS = tuple(DIMENSIONS)
+_PERCENT = re.compile(r"%|pct|per_?cent|prozent")
 _MEANING = {c: f"the {name}" for c, name in NAMES.items()} | {"v": "the drive voltage"}
 Units = Mapping[str, Unit | None]
 
@@ -183,8 +185,9 @@ def _require(places: Mapping[str, Place], labels: Sequence[str]) -> None:
     if not missing:
         return
     duty = [c for c in labels if is_duty(c)] if "v" in missing else []
-    more = (f" '{duty[0]}' is a duty cycle; with a constant supply of, say, 12 V: columns="
-            f"{{'v': '{duty[0]}'}}, units={{'v': '12 V'}}.") if duty else ""
+    one = "0.12 V" if duty and _PERCENT.search(duty[0].lower()) else "12 V"
+    more = (f" '{duty[0]}' is a duty cycle; with a constant supply of, say, 12 V ('12 V' for 0 to 1, '0.12 V' for per "
+            f"cent, '0.047 V' for 0 to 255): columns={{'v': '{duty[0]}'}}, units={{'v': '{one}'}}.") if duty else ""
     used = {*duty, *(p.column for p in places.values())}
     raise DataError(f"no column looks like {', nor like '.join(missing.values())}. "
                     f"{_say_which(labels, list(missing), [c for c in labels if c not in used])}{more}")
