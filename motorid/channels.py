@@ -13,14 +13,8 @@ SYMBOLS = {"t": "t", "v": "v", "i": "i", "omega": "ω", "theta": "θ", "v_supply
 # The first unit of each channel is its default. A linear axis is measured in m and m/s; the command of a
 # current- or torque-controlled drive need not be a voltage.
 UNITS: Mapping[str, tuple[str, ...]] = MappingProxyType({
-    "t": ("s",),
-    "v": ("V", "A", "N·m", "N", "1"),
-    "i": ("A",),
-    "omega": ("rad/s", "m/s"),
-    "theta": ("rad", "m"),
-    "v_supply": ("V",),
-    "tau_load": ("N·m", "N"),
-    "temp": ("°C",),
+    "t": ("s",), "v": ("V", "A", "N·m", "N", "1"), "i": ("A",), "omega": ("rad/s", "m/s"), "theta": ("rad", "m"),
+    "v_supply": ("V",), "tau_load": ("N·m", "N"), "temp": ("°C",),
 })
 
 

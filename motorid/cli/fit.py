@@ -109,8 +109,7 @@ def fit_many_command(
         metavar="TABLE.csv", rich_help_panel=OUT, help="Write the table: .csv, .parquet or .json.")] = None,
     journal: Annotated[Path | None, typer.Option(
         metavar="FILE", rich_help_panel=OUT, help="Results as they come, to go on from.")] = None,
-    jobs: Jobs = 1,
-    json: Json = None,
+    jobs: Jobs = 1, json: Json = None,
 ) -> None:
     """Fit one model to the records of many motors; a motor that fails is a row that says why.
 
@@ -201,13 +200,10 @@ def effects_command(
 
 @with_options(ReadingOptions)
 def simulate_command(
-    fit_json: SavedModel,
-    runs: Runs,
-    options: ReadingOptions,
+    fit_json: SavedModel, runs: Runs, options: ReadingOptions,
     out: Annotated[Path | None, typer.Option(metavar="DIR", help="Write the simulated channels as CSV.")] = None,
     engine: Annotated[str, typer.Option(metavar="rosenbrock|cvodes|idas")] = "rosenbrock",
-    effects_from: EffectsFrom = None,
-    json: Json = None,
+    effects_from: EffectsFrom = None, json: Json = None,
 ) -> None:
     """Simulate a fitted model on records, and compare where something was measured.
 

@@ -199,14 +199,10 @@ class Search:
         """
         scores, astray, unmet = self.scores(node), lost(node.fit), bool(far(node.fit))
         near = NEAR * max((s.drop for s in scores), default=0.0)
-        return [
-            s
-            for k, s in enumerate(scores)
-            if (s.drop > 0 and (k < SHORTLIST or s.stands_out or (s.effect.name in COMMON and s.drop > near)))
-            or (s.effect.name in self._always and s.shapes)
-            or (astray and s.effect.name in COMMON)
-            or (unmet and not any(p.vary for p in s.effect.parameters))
-        ]
+        return [s for k, s in enumerate(scores)
+                if (s.drop > 0 and (k < SHORTLIST or s.stands_out or (s.effect.name in COMMON and s.drop > near)))
+                or (s.effect.name in self._always and s.shapes) or (astray and s.effect.name in COMMON)
+                or (unmet and not any(p.vary for p in s.effect.parameters))]
 
     def _takeable(self, model: Model) -> tuple[list[Effect], list[Effect]]:
         """Split the effects into those that can be added and those that would take an earlier one's place."""
@@ -271,7 +267,7 @@ class Search:
                             validation_nrmse={c: e.nrmse for c, e in predictions.held_out.items()} or None,
                             held_out_gain=found.fall if found.held_out_fall is None else found.held_out_fall,
                             gain=found.gain, gain_se=found.se, reason=_said(found))
-        if not found.worth_it:
+        if not (found.worth_it or (found.plain and node is self.root)):
             return None, candidate
         candidate = replace(candidate, reason=f"{candidate.reason}, but {objection}") if objection else candidate
         return replace(child, reason=candidate.reason), candidate
@@ -393,10 +389,10 @@ def _said(found: Evidence) -> str:
     if found.worse_there and found.held_out_fall is not None:
         rises = f"the held-out error rises by {-100 * found.held_out_fall:.1f} %"
         return rises if found.held_out_fall < 0 else "most of the held-out samples are predicted worse"
-    if not found.sure:
+    if not found.sure and not found.plain:
         size = f" (gain {found.gain:.1f} ± {found.se:.1f})" if abs(found.gain) >= 0.05 else ""
         return f"no better than {'chance' if size else 'without it'}{size}"
-    if not found.worth_it:
+    if not (found.worth_it or found.plain):
         return f"lowers the {where} by less than {100 * MATERIAL:g} %"
     there = found.held_out_fall or 0.0
     kind, fall = ("held-out", there) if there > MATERIAL else ("prediction", found.fall)

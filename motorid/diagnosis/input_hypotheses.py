@@ -76,11 +76,8 @@ def without_spikes(fit: Fit) -> Reading | None:
     if fit.problem.loss is not None:
         return None
     runs = fit.problem.experiments
-    count = sum(
-        int(np.isfinite(y).sum() - np.isfinite(quiet.outputs[c]).sum())
-        for run, quiet in zip(runs, [r.without_spikes() for r in runs], strict=True)
-        for c, y in run.outputs.items()
-    )
+    count = sum(int(np.isfinite(y).sum() - np.isfinite(quiet.outputs[c]).sum())
+                for run, quiet in ((r, r.without_spikes()) for r in runs) for c, y in run.outputs.items())
     if not count:
         return None
     says = f"{count} single samples stand far from both neighbours, which no motor can do, and are left out"

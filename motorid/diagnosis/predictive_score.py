@@ -86,16 +86,12 @@ class Evidence:
     held_out_fall: float | None = None  # the same on held-out runs; None without any, or where both models lose them
     worse_there: bool = False  # the new model surely predicts the held-out runs worse, by the score or by their error
     everywhere: float | None = None  # fall over blocks and held-out runs together, each by its samples
-    plain: bool = False  # the held-out error falls by `PLAIN` and surely, whatever the density makes of single samples
+    plain: bool = False  # where the score is not sure: the held-out error falls by `PLAIN`, and that is no chance
 
     @property
     def sure(self) -> bool:
-        """Tell whether the difference is more than chance: `STANDARD_ERRORS` of it and at least `NATS`.
-
-        Where a motor rests most of the time the density prefers the model that never moves; then a plain fall of the
-        held-out error decides, unless the score surely speaks against it.
-        """
-        return _sure(self.gain, self.se) or (self.plain and not _sure(-self.gain, self.se))
+        """Tell whether the difference is more than chance: `STANDARD_ERRORS` of it and at least `NATS`."""
+        return _sure(self.gain, self.se)
 
     @property
     def worth_it(self) -> bool:
@@ -122,8 +118,8 @@ def compare(old: Predictions, new: Predictions) -> Evidence:
     weights = [sum(np.isfinite(r).sum() for e in c.values() for r in e.values) for c in (new.blocks, new.held_out)]
     logs = np.log1p([-min(f, 1 - 1e-12) for f in (blocks, held_out)])
     everywhere = 1 - float(np.exp(np.average(logs, weights=weights if any(weights) else None)))
-    plain = not _sure(gain, se) and held_out > PLAIN and bool(
-        -np.log1p(-held_out) > STANDARD_ERRORS * _fall_error(*unseen))
+    open_ = held_out > PLAIN and not worse and not _sure(abs(gain), se)
+    plain = open_ and bool(-np.log1p(-held_out) > STANDARD_ERRORS * _fall_error(*unseen))
     return Evidence(gain, se, max(blocks, held_out), held_out, worse, everywhere, plain)
 
 
@@ -322,8 +318,6 @@ def errors_of(simulations: Sequence[Simulation], noise: Mapping[str, float],
         for c, y in run.outputs.items():
             if c in sim.outputs and np.isfinite(y).any():
                 parts.setdefault(c, []).append((y - sim.outputs[c], block, y[np.isfinite(y)]))
-    return {
-        c: Errors(tuple(r for r, _, _ in found), tuple(b for _, b, _ in found),
-                  float(np.sqrt(np.mean(np.concatenate([y for _, _, y in found]) ** 2))), noise.get(c, 0.0))
-        for c, found in parts.items()
-    }
+    return {c: Errors(tuple(r for r, _, _ in found), tuple(b for _, b, _ in found),
+                      float(np.sqrt(np.mean(np.concatenate([y for _, _, y in found]) ** 2))), noise.get(c, 0.0))
+            for c, found in parts.items()}

@@ -120,12 +120,9 @@ def _parts(run: Experiment, share: float) -> list[Experiment]:
     count = max(1, round(run.n * share / PART))
     if run.n < 2 * PART * count:
         return [run]
-    return [
-        run.select(slice(a, a + PART)).with_(
-            name=f"{run.name}[{k + 1}]", meta={**run.meta, "part of": (run.name, run.n), "record": record_of(run)}
-        )
-        for k, a in enumerate(_telling(run, count))
-    ]
+    meta = {**run.meta, "part of": (run.name, run.n), "record": record_of(run)}
+    return [run.select(slice(a, a + PART)).with_(name=f"{run.name}[{k + 1}]", meta=meta)
+            for k, a in enumerate(_telling(run, count))]
 
 
 def _telling(run: Experiment, count: int) -> list[int]:

@@ -366,19 +366,13 @@ def _unpromising(tasks: Sequence[Task], leader: int) -> dict[int, GivenUp]:
 def _needless(tasks: Sequence[Task], leader: int, best: Fit, map_: Callable[..., Iterable[Any]]) -> dict[int, GivenUp]:
     """Return the tasks that contain an effect that leaves only noise, and from there promise too little."""
     winner = tasks[leader]
-    wider = {
-        k: widened(best, task.effect, HARDLY)
-        for k, task in enumerate(tasks)
-        if winner.effect.name in task.effect.includes
-    }
+    wider = {k: widened(best, task.effect, HARDLY) for k, task in enumerate(tasks)
+             if winner.effect.name in task.effect.includes}
     gains = dict(zip(wider, map_(_gain, wider.values()), strict=True))
     why = f"no better than {winner.effect.name}, its simpler special case"
-    return {
-        k: GivenUp(why)
-        for k, task in wider.items()
-        if gains[k]
-        < task.price - winner.price + float(np.log(len(task.starts)))  # the search over starts has its price
-    }
+    # The search over starts has its price.
+    prices = {k: task.price - winner.price + float(np.log(len(task.starts))) for k, task in wider.items()}
+    return {k: GivenUp(why) for k, price in prices.items() if gains[k] < price}
 
 
 def _given_up(task: Task, cost: float, why: str) -> GivenUp:

@@ -105,14 +105,10 @@ class Missing(Shown):
     def card(self) -> Card:
         """Return the shares of balances and regions, and what the missing depends on."""
         best = [[balance, b.against, percent(b.explained, 2)] for balance, bins in self.bins.items() for b in bins[:3]]
-        return Card(
-            "Where the model fails",
-            (Flag(self.where, "note"),) if self.where else (),
-            (self.text,),
-            (share_table("balance", self.shares), share_table("region", self.regions),
-             Table(["missing", "depends on", "explained"], best)),
-            (("mi.plot_missing(missing)", "see it"),),
-        )
+        tables = (share_table("balance", self.shares), share_table("region", self.regions),
+                  Table(["missing", "depends on", "explained"], best))
+        return Card("Where the model fails", (Flag(self.where, "note"),) if self.where else (), (self.text,), tables,
+                    (("mi.plot_missing(missing)", "see it"),))
 
 
 @dataclass(frozen=True, eq=False)
@@ -301,15 +297,9 @@ class Diagnosis(Shown):
         """Return the contents of ``diagnose --json``."""
         m = self.missing
         return {
-            "verdict": self.verdict,
-            "answer": self.answer,
-            "text": self.text,
-            "where": self.where,
+            "verdict": self.verdict, "answer": self.answer, "text": self.text, "where": self.where,
             "location": {
-                "shares": dict(m.shares),
-                "regions": dict(m.regions),
-                "text": m.text,
-                "acts_like": m.acts_like or None,
+                "shares": dict(m.shares), "regions": dict(m.regions), "text": m.text, "acts_like": m.acts_like or None,
                 "depends_on": {k: [{"on": b.against, "explained": b.explained} for b in v] for k, v in m.bins.items()},
             },
             "ranking": [
@@ -328,14 +318,10 @@ class Diagnosis(Shown):
             "remaining": {"adequate": self.remaining.adequate, "kind": self.remainder.kind if self.remainder else None,
                           "where": self.remainder.where if self.remainder else None,
                           "follows": self.remainder.follows if self.remainder else None, "text": self.remaining.text},
-            "parameters_before": dict(self.before.values),
-            "parameters_after": dict(self.after.values),
-            "per_run": self.after.per_run,
-            "groups": [list(g) for g in self.groups],
-            "suggestion": self.suggestion,
-            "stopped": self.stopped or None,
-            "rivals": [Rival.of(f).to_dict() for f in self.rivals],
-            "best": Rival.of(self.best).to_dict(),
+            "parameters_before": dict(self.before.values), "parameters_after": dict(self.after.values),
+            "per_run": self.after.per_run, "groups": [list(g) for g in self.groups],
+            "suggestion": self.suggestion, "stopped": self.stopped or None,
+            "rivals": [Rival.of(f).to_dict() for f in self.rivals], "best": Rival.of(self.best).to_dict(),
         }
 
 

@@ -208,11 +208,8 @@ def _score_orders(tangent: Tangent, added: Added, effect: Effect) -> Score:
 
 def _start(line: Line, pars: Sequence[Parameter]) -> dict[str, float]:
     """Return the values of an effect that a line stands for."""
-    return {
-        p.name: line.order if p.order else line.phase if p.periodic else line.amplitude
-        for p in pars
-        if p.order or p.periodic or p.null == 0
-    }
+    return {p.name: line.order if p.order else line.phase if p.periodic else line.amplitude
+            for p in pars if p.order or p.periodic or p.null == 0}
 
 
 def _distinct(starts: list[dict[str, float]], most: int = 3) -> list[dict[str, float]]:

@@ -159,9 +159,16 @@ def _finished(found: Climb) -> Climb:
 def _better(children: Iterable[Node], best: Node) -> tuple[Node, list[Node]] | None:
     """Return the best child, if it beats the best model so far, and all in order.
 
-    What physics speaks against is taken only where nothing else helps, and where the held-out runs bear it out.
+    What physics speaks against is taken only where nothing else helps, and where the held-out runs bear it out. Where
+    the score is sure of nothing, a plain fall of the held-out error begins a ladder: of a motor that mostly rests the
+    density prefers a model that never moves.
     """
+    children = list(children)
     better = [c for c in children if beats(c, best)]
+    if not better and best.parent is None and (
+            plain := [c for c in children if not c.objection and evidence(best, c).plain]):
+        plain.sort(key=lambda c: -(evidence(best, c).held_out_fall or 0.0))
+        return plain[0], plain
     falls = ((c, evidence(best, c).held_out_fall) for c in better)
     sound = [c for c in better if not c.objection]
     return choose(sound or [c for c, fall in falls if fall is None or fall > MATERIAL], best)
@@ -271,11 +278,8 @@ def _runners_up(best: Node, ordered: Sequence[Node]) -> list[Node]:
     if best.parent is None:
         return []
     goal = evidence(best.parent, best).fall
-    return [
-        n
-        for n in ordered
-        if n.key != best.key and not tied(n, best) and evidence(best.parent, n).fall > HALF_AS_GOOD * goal
-    ]
+    return [n for n in ordered
+            if n.key != best.key and not tied(n, best) and evidence(best.parent, n).fall > HALF_AS_GOOD * goal]
 
 
 def _marked(listed: Sequence[Candidate], node: Node, group: tuple[str, ...]) -> tuple[Candidate, ...]:

@@ -194,11 +194,9 @@ def moves(before: Fit, after: Fit) -> str:
     moved = [n for n in known if abs(after.values[n] / max(before.values[n], 1e-300) - 1) > MOVED]
     if not moved:
         return ""
-    said = [
-        f"{n} from {with_error(before.values[n], was[n])} to "
-        f"{with_error(after.values[n], is_[n], after.problem.model.parameters[n].unit)}"
-        for n in moved
-    ]
+    units = {n: p.unit for n, p in after.problem.model.parameters.items()}
+    said = [f"{n} from {with_error(before.values[n], was[n])} to {with_error(after.values[n], is_[n], units[n])}"
+            for n in moved]
     several = len(after.model.effects) > len(before.model.effects) + 1
     return f"Without {'them' if several else 'it'}, other parameters had compensated: {', '.join(said)}."
 
@@ -237,11 +235,9 @@ def inseparable_remark(same: Mapping[str, tuple[str, ...]]) -> str:
     by_parameters: dict[tuple[str, ...], list[str]] = {}
     for name, parameters in same.items():
         by_parameters.setdefault(parameters, []).append(name)
-    return " ".join(
-        f"{' or '.join(names)} was not added: these records do not distinguish it from "
-        f"{listed(parameters)}{' together' * (len(parameters) > 1)}."
-        for parameters, names in by_parameters.items()
-    )
+    return " ".join(f"{' or '.join(names)} was not added: these records do not distinguish it from "
+                    f"{listed(parameters)}{' together' * (len(parameters) > 1)}."
+                    for parameters, names in by_parameters.items())
 
 
 def unseen_remark(same: Mapping[str, tuple[str, ...]]) -> str:
@@ -278,8 +274,9 @@ def outliers_remark(fit: Fit) -> str:
         spikes = int(np.count_nonzero(r != kept))
         if spikes and kept @ kept < (1 - SPIKED) * (r @ r):
             share = percent(1 - float(kept @ kept) / float(r @ r), 2)
-            return (f"{counted(spikes, 'outlier')} (single samples) {'makes' if spikes == 1 else 'make'} {share} of "
-                    f"the squared error of {c}, and least squares follows. A robust loss (--loss huber, loss=mi.Huber()) shows the rest better.")
+            return (f"{counted(spikes, 'outlier')} (single samples) make{'s' * (spikes == 1)} {share} of the "
+                    f"squared error of {c}, and least squares follows. A robust loss (--loss huber, loss=mi.Huber()) "
+                    "shows the rest better.")
     return ""
 
 

@@ -82,7 +82,7 @@ def prior_residual(priors: Mapping[str, tuple[float, float]], unknowns: Unknowns
 
 
 NOISE_SHARE = 0.01  # error of an interval over the noise
-MISFIT_SHARE = 1.0  # of the misfit, which stands for the noise where a model fails: deviations grow with it, too
+MISFIT_SHARE = 0.1  # of the misfit, where it is what the noise would be
 TIGHTEST, LOOSEST = 1e-7, 3e-5  # and over the largest state
 
 

@@ -124,9 +124,9 @@ class InitialState(NamedTuple):
 def initial_state(run: Experiment, sigma: Mapping[str, float], initial: str) -> InitialState:
     """Return the state at the first sample, and which parts of it are to be estimated.
 
-    ``auto``: known zeros where nothing moves yet, otherwise estimated; a measured angle is estimated too: its
-    first sample is as noisy as any, and half a count of the finest encoder adds up over a long run. Estimates stay within what the first samples
-    allow, so that a model which lacks something cannot hide it in an initial state that never was.
+    ``auto``: known zeros where nothing moves yet, otherwise estimated; a measured angle is estimated too: its first
+    sample is as noisy as any, and half a count of the finest encoder shows over a long run. Estimates stay within what
+    the first samples allow, so that a model which lacks something cannot hide it in an initial state that never was.
     ``estimate``: everything, without limits.
     """
     if initial not in INITIAL:

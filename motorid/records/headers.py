@@ -26,14 +26,9 @@ SI = {"time": "s", "voltage": "V", "current": "A", "speed": "rad/s", "linear spe
 
 # What a channel may be measured in. The input of a torque-driven model is a current, torque or force command.
 DIMENSIONS: Mapping[str, tuple[str, ...]] = {
-    "t": ("time",),
-    "v": ("voltage", "current", "torque", "force", "ratio"),
-    "i": ("current",),
-    "omega": ("speed", "linear speed"),
-    "theta": ("angle", "length"),
-    "v_supply": ("voltage",),
-    "tau_load": ("torque", "force"),
-    "temp": ("temperature",),
+    "t": ("time",), "v": ("voltage", "current", "torque", "force", "ratio"), "i": ("current",),
+    "omega": ("speed", "linear speed"), "theta": ("angle", "length"),
+    "v_supply": ("voltage",), "tau_load": ("torque", "force"), "temp": ("temperature",),
 }
 
 _TURN = 2 * math.pi

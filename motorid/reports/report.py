@@ -90,14 +90,8 @@ def _provenance(story: Story, command: str, held_out: Sequence[Experiment]) -> S
              for name, run in named]
     versions = ", ".join([f"Python {platform.python_version()}", *(f"{p} {package_version(p)}" for p in PACKAGES)])
     tables = [Table(["run", "file", "SHA-256 (first 16 digits)"], files)] if files else []
-    return Section(
-        "provenance",
-        "Provenance",
-        [*["The files are named by the fingerprint of their contents: the page can be traced to them."] * bool(files),
-         f"Made with {versions}."],
-        tables=tables,
-        code=command,
-    )
+    traced = ["The files are named by the fingerprint of their contents: the page can be traced to them."] * bool(files)
+    return Section("provenance", "Provenance", [*traced, f"Made with {versions}."], tables=tables, code=command)
 
 
 @dataclass
