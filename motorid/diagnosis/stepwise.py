@@ -165,8 +165,8 @@ def _better(children: Iterable[Node], best: Node) -> tuple[Node, list[Node]] | N
     """
     children = list(children)
     better = [c for c in children if beats(c, best)]
-    if not better and best.parent is None and (
-            plain := [c for c in children if not c.objection and evidence(best, c).plain]):
+    plain = [] if better else [c for c in children if not c.objection and evidence(best, c).plain]
+    if plain and best.parent is None:
         plain.sort(key=lambda c: -(evidence(best, c).held_out_fall or 0.0))
         return plain[0], plain
     falls = ((c, evidence(best, c).held_out_fall) for c in better)

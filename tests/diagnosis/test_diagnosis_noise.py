@@ -122,6 +122,9 @@ def test_outliers_are_left_out_and_what_is_not_is_said(lab, rng):
     assert found.effects == ("coulomb",)
     assert "single samples stand far from both neighbours" in found.text
     assert "--no-spikes" in found.text
+    alone = runs_of(lab, {})[0]
+    alone = alone.with_(outputs={**alone.outputs, "i": alone.outputs["i"] + 400.0 * (np.arange(alone.n) == 500)})
+    assert outliers_remark(mi.fit(mi.dc_motor(), alone)).startswith("1 outlier (single samples) makes")
 
 
 def test_an_angle_that_follows_a_smooth_drive_is_no_closed_loop(lab, plant):

@@ -82,3 +82,12 @@ def test_each_runs_own_value_is_paid_for_and_parts_of_a_run_share_it(rng):
     parts = [p for r in runs for p in windows(r, 0.25)]
     assert list(mi.Problem(model, parts).unknowns.firsts) == [0, 0, 2, 2, 4, 4]
     assert [p.name for *_, p in mi.Problem(model, parts).unknowns.apart] == ["g_v[2]", "g_v[4]"]
+
+
+def test_without_the_cogging_nobody_asks_for_the_zero_of_the_encoder():
+    from motorid.diagnosis.candidates import _without
+
+    both = mi.dc_motor() + mi.effects.cogging + mi.effects.get("encoder_zero")
+    assert [m.effect_names for m in _without(both, "cogging")] == [()]
+    assert [m.effect_names for m in _without(both + mi.effects.gravity, "cogging")] == [("encoder_zero", "gravity")]
+    assert [m.effect_names for m in _without(both, "encoder_zero")] == [("cogging",)]

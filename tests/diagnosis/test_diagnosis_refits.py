@@ -315,3 +315,27 @@ def test_what_takes_too_many_steps_is_polished_roughly(monkeypatch):
     rough = trial._polished(fit, problem)
     assert rough.problem.accuracy == held.ROUGH
     assert rough.values["K"] == pytest.approx(fit.values["K"], rel=1e-3)
+
+
+def test_where_a_fit_is_lost_a_guess_of_its_own_starts_along_either_angle(monkeypatch, rng):
+    """The score's start needs the measured angle; along it a heavy arm without motion can win the race, and not after.
+
+    A guess from the records themselves is where the model's own angle leads on.
+    """
+    t = np.arange(0, 40, 0.04)
+    goal = np.interp(t, np.arange(0, 41, 4), rng.uniform(-1.5, 1.5, 11))
+    run = mi.Experiment(t, {"v": 8 * np.sin(goal) + 0.1 * rng.normal(size=len(t))},
+                        {"theta": goal + 1e-3 * rng.normal(size=len(t))})
+    fit = mi.fit(mi.torque_driven(), run)
+    assert trial.lost(fit)
+    entered, race = [], trial._race
+
+    def seen(problem):
+        entered.append((problem.model.angle_input, problem.model.values["mgl"] > 4))
+        return race(problem)
+
+    monkeypatch.setattr(trial, "_race", seen)
+    best = trial.raced(fit, fit.model + mi.effects.gravity, ({"mgl": 1.0},))
+    assert entered == [(True, False), (False, True), (True, True)]
+    assert best is not None
+    assert best.problem.model.values["mgl"] == pytest.approx(8, rel=0.05)

@@ -375,3 +375,28 @@ def test_what_physics_speaks_against_must_help_on_held_out_runs(rng, there, take
 
     found = stepwise._better([node("omega_s runs to its limit", 0.5 * r, there)], node("", r, 1.0))
     assert (found is not None) == taken
+
+
+def test_a_plain_fall_of_the_held_out_error_is_told_where_the_density_is_not_sure(rng):
+    """A motor mostly rests: a model that never moves is right then, and the density likes that."""
+    noise, r, rests = rng.normal(size=(3, 2000))
+    moves = (np.arange(2000) % 100 > 80) * np.sin(np.arange(2000) / 3) + 0.02 * rests
+    moving = 0.3 * moves + 0.148 * noise  # off by less where it counts, and never quite right
+    still, other = both(r, moves, measured=10.0), both(r, moving, measured=10.0)
+    found = compare(still, other)
+    assert not found.sure
+    assert found.held_out_fall > 0.1
+    assert found.plain
+    assert not found.worth_it
+    assert not compare(other, still).plain
+    once = moves * (np.arange(2000) < 100)  # one swing of twenty: a fall by chance
+    assert not compare(both(r, once, measured=10.0), both(r, 0.8 * once, measured=10.0)).plain
+
+    def node(added, held_out, parent, objection=""):
+        return SimpleNamespace(added=added, size=6, search=0.0, objection=objection, parent=parent,
+                               predictions=both(r, held_out, measured=10.0))
+
+    root = node(None, moves, None)
+    child, refused = node("gravity", moving, root), node("spring", moving, root, "goes to zero")
+    assert stepwise._better([refused, child], root) == (child, [child])  # it begins a ladder
+    assert stepwise._better([child], node("coulomb", moves, root)) is None  # and adds no rung to one

@@ -103,3 +103,26 @@ def test_an_initial_state_cannot_hide_what_the_model_lacks(stuck):
     assert abs(held.initial["theta_0[0]"] - first) < 20e-4
     assert abs(free.initial["theta_0[0]"] - first) > 0.05
     assert free.rmse["theta"] < held.rmse["theta"]
+
+
+def test_where_a_narrow_sgn_cannot_be_followed_it_stays_wide(stuck, monkeypatch):
+    """The slopes of an arm that stands nearly upright grow beyond all bounds under a narrow sgn."""
+    from motorid.estimation import continuation
+
+    def brittle(begun, *args, **options):
+        if begun.width < narrowest:
+            raise mi.FitError("the simulation grows without bound")
+        return least_squares(begun, *args, **options)
+
+    begin = problem(stuck, 0)
+    wide, narrow = continuation._widths(begin)[0], continuation._widths(begin)[-1]
+    narrowest = 0.5 * (wide + narrow)
+    monkeypatch.setattr(continuation, "least_squares", brittle)
+    done = by_continuation(begin, FINISH)
+    assert done.problem.width == wide
+    assert done.solution.status == "converged"
+    narrowest = 2 * wide
+    with pytest.raises(mi.FitError, match="without bound"):
+        by_continuation(begin, FINISH)
+    narrowest = narrow  # the last that can be followed
+    assert by_continuation(begin, FINISH).problem.width == narrow

@@ -151,3 +151,11 @@ def test_the_guess_solves_least_squares_with_signs_as_scipy_does(seed):
     a, b, signed = rng.normal(size=(12, 5)), rng.normal(size=12), rng.random(5) < 0.3
     reference = lsq_linear(a, b, (np.where(signed, -np.inf, 0.0), np.inf), method="bvls").x
     assert _nonnegative(a, b, signed) == pytest.approx(reference, abs=1e-7)
+
+
+def test_frictions_whose_simpler_relatives_exclude_each_other_are_fitted():
+    """Coulomb friction stands in for the asymmetric one at the start, but not beside friction over the angle."""
+    model = mi.dc_motor() + mi.effects.coulomb_asymmetric + mi.effects.angular_friction
+    truth = (mi.dc_motor() + mi.effects.coulomb_asymmetric).replace(**GEARED, tau_cp=0.004, tau_cn=0.006)
+    run = record(truth, "i theta", swinging())
+    assert mi.fit(model, run).values["tau_cn"] == pytest.approx(0.006, rel=0.2)

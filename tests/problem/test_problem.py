@@ -328,3 +328,15 @@ def test_an_offset_of_the_speed_sensor_does_not_set_the_first_speed_where_an_ang
     assert fit.values["R"] == pytest.approx(VALUES["R"], rel=0.02)
     assert fit.misfit["theta"] < 0.1
     assert abs(fit.initial["omega_0[0]"]) < 0.5
+
+
+def test_the_first_angle_of_the_finest_encoder_is_estimated():
+    """An encoder that counts down to whole counts is half a count off; over a hundred turns that shows."""
+    t = np.arange(2000) * 1e-3
+    bare = mi.Experiment(t, {"v": np.where(t < 1.0, 10.0, 4.0)}, {"theta": np.zeros(2000)})
+    model = mi.dc_motor(R=1.0, L=1e-3, K=0.05, b=1e-5, J=1e-5)
+    angle, count = mi.simulate(model, bare, initial="rest")[0].outputs["theta"], 2 * np.pi / 65536
+    fit = mi.fit(mi.dc_motor().fix(R=1.0, L=1e-3), bare.with_(outputs={"theta": count * np.floor(angle / count)}))
+    assert np.ptp(angle) > 1e5 * count
+    assert fit.initial["theta_0[0]"] == pytest.approx(-0.5 * count, rel=0.1)
+    assert fit.misfit["theta"] < 1.1

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from motorid.channels import CHANNELS
+from motorid.errors import DataError
 from motorid.records.checks import check_runs
 from motorid.records.datasets import data_path, datasets
 from motorid.records.experiment import Experiment
@@ -100,6 +101,7 @@ def test_a_swapped_sign_is_told_with_its_channel(good, steps):
     ({"omega": np.pi / 30}, "already in rad/s although rpm is stated"),
     ({"omega": 1 / (2 * np.pi)}, "'omega': 'rev/s'"), ({"theta": 1 / (2 * np.pi)}, "'theta': 'rev'"),
     ({"theta": 1 / 43.7}, "a gear between the two sensors"),
+    ({"theta": 180 / np.pi, "omega": 30 / np.pi}, "'omega': 'rpm', 'theta': 'deg'"),  # six, not two pi
 ])
 def test_angle_and_speed_must_agree(good, scale, remedy):
     assert remedy in said(changed(good, **scale))
@@ -110,6 +112,17 @@ def test_angle_and_speed_must_agree(good, scale, remedy):
 ])
 def test_sizes_no_motor_has_point_to_the_unit(steps, scale, part):
     assert part in said(changed(steps, **scale))
+
+
+def test_a_duty_in_per_cent_read_as_a_share_is_said(tmp_path):
+    """As told by the hint for a header that says so, and once more where it was read as a whole duty all the same."""
+    rows = "".join(f"{0.01 * k:.2f},{50 + k % 50},{k}\n" for k in range(200))
+    (tmp_path / "a.csv").write_text("t,duty_pct,omega\n" + rows)
+    with pytest.raises(DataError, match=r"'0\.12 V' for per cent.*units={'v': '0\.12 V'}"):
+        read_csv(tmp_path / "a.csv")
+    right, wrong = (read_csv(tmp_path / "a.csv", columns={"v": "duty_pct"}, units={"v": u}) for u in ("0.12 V", "12 V"))
+    assert right.inputs["v"].max() < 12
+    assert "Is the column in per cent" in said(wrong)
 
 
 def test_a_speed_of_no_stated_unit_is_suspected_sooner(tmp_path):
