@@ -145,8 +145,7 @@ def torque_ripple(
     N_r=P(12.0, "", order=True, vary=False, lower=1.0, doc="periods per turn, from the misfit, then fixed"),
     phi_r=P(0.0, "rad", periodic=True, doc="phase at theta = 0"),
 ):
-    """Torque ripple, K·i·(1+a·sin(N·θ+φ)) and no ripple in the back-EMF; or in a torque drive's gain. Jahns & Soong,
-    IEEE TIE 43(2), 1996."""
+    """Torque ripple, K·i·(1+a·sin(N·θ+φ)), not in the back-EMF; or of g. Jahns & Soong, IEEE TIE 43(2), 1996."""
     m.scale("K_t" if "i" in m.states else "g", 1 + a_r * ca.sin(N_r * m.theta + phi_r))
 
 
