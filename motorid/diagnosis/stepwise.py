@@ -223,8 +223,10 @@ def explored(fit: Fit, validate: Sequence[Experiment] | Experiment | None, effec
         records = records.read(reading)
     found = climbed(records)
     if not found.stopped and (windowed := _in_windows(found)) is not None:
-        records = replace(records, fit=windowed)
+        whole, records = found, replace(records, fit=windowed)
         found = climbed(records)
+        if found.stopped and len(found.path) == 1:  # what was found before is worth more than nothing
+            found = replace(whole, stopped=found.stopped)
     last = found.path[-1]
     again = None
     if not found.stopped and records is not as_it_was and as_it_was.suits(last):

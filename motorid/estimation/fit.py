@@ -222,8 +222,7 @@ def _with_orders(problem: Problem) -> Problem:
     return problem.for_model(model)
 
 
-def minimise(problem: Problem, effort: LevenbergMarquardt, callback: Callback = None, *,
-             wide: bool = True) -> Estimate:
+def minimise(problem: Problem, effort: LevenbergMarquardt, callback: Callback = None, *, wide: bool = True) -> Estimate:
     """Minimise the cost from the values of the model: continuation, restarts, reweighting; see `by_continuation`."""
     found = restore_collapsed(by_continuation(problem, effort, callback, wide=wide), effort, callback)
     effort = replace(effort, looks=0)

@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 import motorid as mi
 from motorid.cli.app import app
-from motorid.diagnosis import candidates, refit
+from motorid.diagnosis import candidates, refit, stepwise
 from motorid.errors import OutOfTime
 from motorid.numerics.parallel import budget, check_time
 from motorid.records.datasets import data_path
@@ -91,3 +91,21 @@ def test_a_budget_ends_with_its_block_and_an_inner_one_is_no_longer():
     check_time()
     with budget(600), budget(None):
         check_time()
+
+
+def test_a_second_climb_that_is_cut_short_does_not_lose_the_first(plain, monkeypatch):
+    """A pendulum is climbed again in windows; whoever stops that at its start still gets what was found."""
+    climbs, climb = [], stepwise.climb
+
+    def cut(search, max_effects, seconds=None):
+        climbs.append(search)
+        if len(climbs) > 1:
+            seconds = 0.0
+        return climb(search, max_effects, seconds)
+
+    monkeypatch.setattr(stepwise, "climb", cut)
+    monkeypatch.setattr(stepwise, "_in_windows", lambda found: found.path[0].fit)
+    found = mi.diagnose(plain, effects=["coulomb"])
+    assert len(climbs) == 2
+    assert found.effects == ("coulomb",)
+    assert found.stopped == refit.OUT_OF_TIME
