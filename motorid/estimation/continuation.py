@@ -36,7 +36,7 @@ def by_continuation(problem: Problem, effort: LevenbergMarquardt, callback: Call
     restarts at the first width. Raises `FitError` if the model cannot be simulated at the start.
     """
     widths = _widths(problem) if wide and smooths(problem) else (problem.width,)
-    history, last, found = (), len(widths) - 1, None
+    history, last, ends = (), len(widths) - 1, []
     here = problem
     for k, width in enumerate(widths):
         # What one width likes a narrower one may refuse; then the start is better.
@@ -44,18 +44,18 @@ def by_continuation(problem: Problem, effort: LevenbergMarquardt, callback: Call
         rough = effort if k == last else effort.at_most(RACE)
         try:
             done = least_squares(stage, rough, callback, rounds=ROUNDS if k in (0, last) else 1)
-            found = done if k else restarted_where_doubtful(done, stage, rough, callback)
+            ends.append(done if k else restarted_where_doubtful(done, stage, rough, callback))
         except FAILURES:
             if k < last:
                 continue
-            if found is None:
+            if not ends:
                 raise
             # Slopes that grow beyond all bounds with a narrow sgn: it stays as wide as can be followed.
-            found = least_squares(found.problem, effort, callback, q=found.q)
-        history += found.history
+            ends.append(least_squares(ends[-1].problem, effort, callback, q=ends[-1].q))
+        history += ends[-1].history
         if k < last:
-            here = found.problem.start_at(found.values)
-    found = replace(found, history=history)
+            here = ends[-1].problem.start_at(ends[-1].values)
+    found: Estimate = replace(ends[-1], history=history)
     return sharpened(past_ripples(found, effort, callback), effort, callback) if narrow else found
 
 
