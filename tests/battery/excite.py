@@ -100,6 +100,14 @@ def _rms(x) -> float:
     return float(np.sqrt(np.mean(np.square(x))))
 
 
+COUNTS = {"coarse": 240}
+
+
+def count_of(chain: str) -> float:
+    """One count of the encoder, rad."""
+    return 2 * np.pi / COUNTS.get(chain, 4096)
+
+
 def sensed(r: dict, chain: str, motor, rng: np.random.Generator, noise: float = 0.01) -> dict[str, np.ndarray]:
     """Current, speed and angle as written by the logger.
 
@@ -111,7 +119,7 @@ def sensed(r: dict, chain: str, motor, rng: np.random.Generator, noise: float = 
     s = {c: noise * (2 if c == "i" else 1) * _rms(r[c]) for c in ("i", "omega")}
     if chain == "coloured":
         return {c: P.coloured(r[c], s[c], 0.85, rng) for c in s} | {"theta": P.encoder(r["theta"], 4096)}
-    counts = 240 if chain == "coarse" else 4096
+    counts = COUNTS.get(chain, 4096)
     y = {
         "i": P.adc(P.white(r["i"], s["i"], rng), motor.i_max),
         "omega": P.white(r["omega"], s["omega"], rng),

@@ -10,6 +10,7 @@ import numpy as np
 
 import motorid as mi
 from battery.cases import Case
+from battery.excite import count_of
 from motorid.diagnosis.results import Diagnosis
 
 Row = dict[str, Any]
@@ -94,6 +95,11 @@ def _sizes(case: Case, found: Diagnosis) -> dict[str, tuple[float, float | None,
     true = dict(truth.values)
     if "R_s" in names:  # only R_s/V_s² acts: at the supply that the fit took
         true["R_s"] *= (fit.values["V_s"] / true["V_s"]) ** 2
+    half = 0.5 * count_of(case.chain)  # an encoder counts down to whole counts: what it calls 0 is half a count further
+    for e in truth.effects if "theta" in case.channels else ():
+        order = next((true[p.name] for p in e.parameters if p.order or p.name == "N_f"), 1.0)
+        true |= {p.name: true[p.name] + order * half for p in e.parameters if p.periodic}
+        true |= {p.name: true[p.name] - half for p in e.parameters if p.name == "theta_0"}
     return {n: (fit.values[n], fit.std.get(n), true[n]) for n in names if n in fit.values}
 
 
