@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from motorid.display.numbers import percent
+from motorid.display.numbers import number, percent
 from motorid.estimation.result import Fit
 from motorid.model.definition import Effect, Parameter
 from motorid.numerics.signals import Array, noise_level, quantum, window_slopes
@@ -41,9 +41,15 @@ def objections(fit: Fit, added: Effect, before: Fit | None = None) -> str:
 
 
 def _too_large(fit: Fit, pars: Sequence[Parameter]) -> str:
-    """Say so where a voltage lost or added is of the size of what is applied: another parameter has paid for it."""
+    """Say so where a voltage lost or added is of the size of what is applied: another parameter has paid for it; or
+    where cogging is more than the motor ever makes: it would not leave its notch."""
     top = max(float(np.abs(r.inputs["v"]).max()) for r in fit.problem.experiments)
     for p in pars:
+        if p.vary and p.unit in ("N·m", "N") and any(q.order for q in pars):
+            made = max(fit.values["g"] * top if "g" in fit.values else
+                       fit.values["K"] * float(np.abs(s.states["i"]).max()) for s in fit.simulations)
+            if fit.values[p.name] > made:
+                return f"{p.name} is {number(fit.values[p.name] / made, 2)} times the largest torque of the motor"
         most = MOST_OFFSET if p.lower < 0 else MOST_LOST
         if p.vary and p.unit == "V" and p.null == 0 and abs(fit.values[p.name]) > most * top:
             share = percent(abs(fit.values[p.name]) / top, 2)

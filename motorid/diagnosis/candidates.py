@@ -403,9 +403,6 @@ def _drop(node: Node, fit: Fit) -> float:
     """Share of chi² that vanishes, with the weights of the smaller model."""
     problem = node.fit.problem
     noise = {c: s * problem.noise_factors.get(c, 1.0) for run in problem.runs for c, s in run.sigma.items()}
-    old, new = (
-        sum(float(np.nansum((s.residual(c) / noise[c]) ** 2)) for s in f.simulations for c in s.experiment.outputs
-            if c in noise and c in s.outputs)
-        for f in (node.fit, fit)
-    )
+    old, new = (sum(float(np.nansum((s.residual(c) / noise[c]) ** 2)) for s in f.simulations
+                    for c in s.experiment.outputs if c in noise and c in s.outputs) for f in (node.fit, fit))
     return float(1 - new / max(old, 1e-300))

@@ -339,8 +339,8 @@ def _sizes_of(run: Experiment) -> _Sizes:
         _sizes[run] = _Sizes(float(np.abs(v).max()),
                              float(np.percentile(np.abs(speeds), 99.5)) if speeds.size else 0.0,
                              None if i is None else float(np.percentile(np.abs(i), 99.5)),
-                             None if theta is None else float(np.ptp(theta)),
-                             float(np.mean(v**2)), None if i is None else float(np.mean(i**2)),
+                             None if theta is None else float(np.ptp(theta)), float(np.mean(v**2)),
+                             None if i is None else float(np.mean(i**2)),
                              {c: float(np.std(y[np.isfinite(y)])) for c, y in run.outputs.items()})
     return _sizes[run]
 

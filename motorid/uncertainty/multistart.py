@@ -291,9 +291,8 @@ class Multistart(Printed):
     def to_dict(self) -> dict[str, Any]:
         """Return the contents of ``robustness --json``."""
         return {
-            "starts": len(self.results), "spread": self.spread, "guess": self.guess,
-            "good": self.good, "poor": self.poor, "failed": self.failed, "seconds": self.seconds,
-            "parameters": self.statistics(),
+            "starts": len(self.results), "spread": self.spread, "guess": self.guess, "good": self.good,
+            "poor": self.poor, "failed": self.failed, "seconds": self.seconds, "parameters": self.statistics(),
             "nrmse": {c: float(np.mean([e.nrmse[c] for e in self._good])) if self._good else None
                       for c in self.reference.nrmse},
             "thresholds": {"cost_share": COST_SHARE, "standard_deviations": DISTANCE},

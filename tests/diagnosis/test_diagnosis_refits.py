@@ -339,3 +339,15 @@ def test_where_a_fit_is_lost_a_guess_of_its_own_starts_along_either_angle(monkey
     assert entered == [(True, False), (False, True), (True, True)]
     assert best is not None
     assert best.problem.model.values["mgl"] == pytest.approx(8, rel=0.05)
+
+
+def test_a_cogging_that_no_current_of_the_motor_overcomes_is_refused():
+    model = mi.dc_motor(**TRUE) + mi.effects.cogging(A=2e-3, N=7.0, phi=0.3)
+    fit = mi.fit(model.fix("R", "L"), _run(model), start="model")
+    made = fit.values["K"] * max(np.abs(s.states["i"]).max() for s in fit.simulations)
+    assert fit.values["A"] < made
+    assert not objections(fit, LIBRARY["cogging"])
+    absurd = replace(fit, values={**fit.values, "A": 2.5 * made})
+    assert "A is 2.5 times the largest torque of the motor" in objections(absurd, LIBRARY["cogging"])
+    free = mi.fit(mi.torque_driven(g=1e-3) + mi.effects.cogging(A=1e-3, N=7.0), _run(model).without("i"), start="model")
+    assert "times the largest torque" in objections(replace(free, values={**free.values, "A": 1.0}), LIBRARY["cogging"])
