@@ -322,6 +322,7 @@ def test_a_start_that_cannot_be_simulated_is_an_error_that_says_what_to_do(runs)
 
 
 def test_integration_errors_that_add_up_are_mended_by_finer_steps(runs, monkeypatch):
+    from motorid.estimation import fit as fitting
     from motorid.problem import residuals as accuracy
 
     monkeypatch.setattr(accuracy, "LOOSEST", 2e-2)
@@ -331,6 +332,10 @@ def test_integration_errors_that_add_up_are_mended_by_finer_steps(runs, monkeypa
     assert mi.fit(mi.dc_motor(**VALUES), runs, start="model").integration_error < 0.2
     r = [p.residual(p.start) for p in (coarse, coarse.with_finer_steps(4))]
     assert np.abs(r[0] - r[1]).max() > 0.3  # what there was to mend
+    monkeypatch.setattr(fitting, "MOST_FINER", 1)
+    left = mi.fit(mi.dc_motor(**VALUES), runs, start="model").integration_error
+    monkeypatch.setattr(fitting, "MOST_FINER", 2)  # too few for all of it are better than none
+    assert mi.fit(mi.dc_motor(**VALUES), runs, start="model").integration_error < 0.5 * left
 
 
 # -- afterwards ----------------------------------------------------------------------------------------------
