@@ -14,7 +14,8 @@ from command import motorid_json
 import motorid as mi
 from motorid.cli.options import own_effects
 from motorid.diagnosis import remainder
-from motorid.diagnosis.free_forms import Form, linearised
+from motorid.diagnosis.free_forms import Form, linearised, shown, signals_along, span_of
+from motorid.diagnosis.locate import locate
 from motorid.diagnosis.remainder import Curve, Remainder
 from motorid.exporters.export import load
 from motorid.records.reading import write_csv
@@ -288,3 +289,14 @@ def test_what_remembers_is_found(lab):
     assert text.startswith("one lag of ")
     assert text.endswith(" N·m")
     assert miss < 0.3
+
+
+def test_nothing_follows_a_reversal_where_the_motor_never_turns_back(rng):
+    t = np.arange(600) * 1e-3
+    model, path = mi.dc_motor(R=1.2, L=2e-3, K=0.05, b=2e-5, J=3e-5), Form("a torque", "torque", "path")
+    for back in (0.0, -2.0):
+        blank = mi.Experiment(t, {"v": np.where(t < 0.3, 4.0, back)}, {"i": 0 * t, "omega": 0 * t})
+        clean = mi.simulate(model, blank, initial="rest")[0].outputs
+        fit = mi.fit(model, blank.with_(outputs={c: y + 0.05 * rng.normal(size=600) for c, y in clean.items()}))
+        assert shown(path, fit, span_of(fit, signals_along(fit)).ranges) == (back < 0)
+        assert (locate(fit).regions["reversal"] > 0) == (back < 0)
