@@ -424,7 +424,7 @@ def test_check_shows_which_column_is_which_channel_and_what_to_type_next(tmp_pat
     rows = "".join(f"{0.01 * k:.2f},{0.5 * (k % 9)},{k % 50}\n" for k in range(300))
     (tmp_path / "rig.csv").write_text("time_s,command (Nm),speed (rad/s)\n" + rows)
     driven = motorid("check", tmp_path / "rig.csv", "--columns", "v=command (Nm)")
-    assert driven.out.splitlines()[-1].endswith("--drive torque")
+    assert "--drive torque" in driven.out.splitlines()[-1]  # however long the path
 
 
 def test_effects_lists_the_library_and_shows_one():
