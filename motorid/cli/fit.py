@@ -164,7 +164,7 @@ def check_command(runs: Runs, options: ReadingOptions, json: Json = None) -> Non
         show(f"{_amount(records)}. {found}.\n")
         say_notes(notes)
         show(*(_channel_table(r) for r in records[:MOST_SHOWN]))
-        driven = () if records[0].units["v"] in ("V", "") else ("--drive", "torque")
+        driven = ("--drive", "torque") if records[0].units["v"] in ("A", "N·m", "N") else ()
         show(f"and {counted(len(records) - MOST_SHOWN, 'more run')}\n" if len(records) > MOST_SHOWN else None,
              f"Next: {next_command('fit', *driven)}")
 
