@@ -7,7 +7,7 @@ An effect is a function of the motor and its own numbers that returns what it do
     diodes -> V               the bridge opens at command 0; what then stands against the dying current
     limit -> A                the current that the bridge does not let grow any further
     drop(i) -> V              voltage lost in the winding circuit
-    R(dT), L(i), K(i), Kt(th) -> factor on that constant (K in both balances, Kt in the torque alone)
+    R(dT), L(i), K(i), Kt(th), Ke(th) -> factor on that constant (K in both balances, Kt in the torque, Ke in the EMF)
     torque(i, w, th, t) -> N·m on the shaft, continuous in its arguments
     dry(i, w, th, s, t) -> N·m, level of dry friction when sliding (or about to slide) in direction s = ±1
     heat(i, dT) -> K/s        rate of the temperature rise
@@ -154,8 +154,9 @@ def cogging(m: Motor, A: float, N: float, phi: float = 0.0) -> Hooks:
 
 
 @_known
-def torque_ripple(m: Motor, a_r: float, N_r: float, phi_r: float = 0.0) -> Hooks:
-    return {"Kt": lambda th: 1 + a_r * sin(N_r * th + phi_r), "rate": N_r * m.no_load_speed}
+def torque_ripple(m: Motor, a_r: float, N_r: float, phi_r: float = 0.0, e_r: float = 0.0) -> Hooks:
+    return {"Kt": lambda th: 1 + a_r * sin(N_r * th + phi_r), "Ke": lambda th: 1 + e_r * a_r * sin(N_r * th + phi_r),
+            "rate": N_r * m.no_load_speed}
 
 
 @_known

@@ -150,7 +150,7 @@ def _physics(m: Motor, hooks: list[dict], omega0: float, theta0: float) -> tuple
         return [h[kind] for h in hooks if kind in h]
 
     drives, drops, torques, dries, heats = (every(k) for k in ("drive", "drop", "torque", "dry", "heat"))
-    f_R, f_L, f_K, f_Kt, bridges = (every(k) for k in ("R", "L", "K", "Kt", "bridge"))
+    f_R, f_L, f_K, f_Kt, f_Ke, bridges = (every(k) for k in ("R", "L", "K", "Kt", "Ke", "bridge"))
     diodes, limit = every("diodes"), min(every("limit"), default=None)
     parts, fluxes, x0 = [], [], []
     for h in hooks:
@@ -167,7 +167,7 @@ def _physics(m: Motor, hooks: list[dict], omega0: float, theta0: float) -> tuple
 
     def rates(y: list[float], v: float, s: int, t: float) -> list[float]:
         i, w, th, dT = y[0], y[1], y[2], y[3]
-        R, L, K, Kt = R0, L0, K0, 1.0
+        R, L, K, Kt, Ke = R0, L0, K0, 1.0, 1.0
         opened = diodes and v == 0
         for f in drives:
             v = f(v, w)
@@ -185,12 +185,14 @@ def _physics(m: Motor, hooks: list[dict], omega0: float, theta0: float) -> tuple
             K *= f(y[a:z])
         for f in f_Kt:
             Kt *= f(th)
+        for f in f_Ke:
+            Ke *= f(th)
         if opened:
-            v = -diodes[0] if i > 0 else diodes[0] if i < 0 else K * w  # no current, no voltage across the winding
+            v = -diodes[0] if i > 0 else diodes[0] if i < 0 else K * Ke * w  # no current, no voltage across the winding
         torque = K * Kt * i - b * w
         for f in torques:
             torque += f(i, w, th, t)
-        out = [(v - R * i - K * w) / L, 0.0, w, 0.0]
+        out = [(v - R * i - K * Ke * w) / L, 0.0, w, 0.0]
         if limit is not None and abs(i) >= limit and out[0] * i > 0:
             out[0] = 0.0
         for f in heats:

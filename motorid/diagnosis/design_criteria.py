@@ -14,10 +14,10 @@ parameters enters as a Gaussian prior with their information matrix (Gauss-Newto
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
-from itertools import pairwise, permutations
+from itertools import pairwise, permutations, product
 from typing import Any, NamedTuple
 
 import casadi as ca
@@ -27,17 +27,23 @@ from numpy.typing import NDArray
 
 from motorid.acquire.excitation import lfsr_bits, program
 from motorid.errors import OutOfTime, SimulationError, UsageError
+from motorid.estimation.least_squares import RACE, race
 from motorid.estimation.result import Fit
+from motorid.estimation.start_values import ABOVE
 from motorid.integrate.engine import Grid
 from motorid.integrate.rosenbrock import Rosenbrock
+from motorid.model.definition import Parameter
 from motorid.model.equations import System
 from motorid.model.model import Model
 from motorid.numerics.parallel import check_time, interruption
 from motorid.numerics.signals import Array
+from motorid.problem.runs import natural_sizes
 from motorid.problem.unknowns import Scaling
 
 STEPS = 4  # Gauss-Newton steps of the rivals' refit within one evaluation
+ENOUGH = 5.0  # log(1 + χ²) against every rival, from which more is worth nothing
 REGION = 2.0  # standard deviations within which the truth may lie
+AMOUNTS = tuple(np.geomspace(1e-3, 1.0, 10))  # of the natural size: of an effect that the records leave open
 SETTLED = 0.01  # relative fall of χ² at which it ends
 ROUNDING = 1e-10  # of the information, beside which the prior of one unit would be lost
 BESIDE = 1e-4  # of a unit of the solver's coordinates, for differences of slopes
@@ -81,6 +87,34 @@ class Rival:
         of_runs = [n for n, p in fit.model.parameters.items() if p.vary and p.per_run]  # as in the first run
         return Rival(name or fit.model.title, fit.model.with_(angle_input=False).fix(*of_runs), sigma,
                      problem.scaling.scale[:k], known, seen)
+
+    @staticmethod
+    def as_allowed(fit: Fit) -> Rival:
+        """Return the rival that a fit is, an effect that its records leave open as large as they allow.
+
+        As fitted it may be nothing, and no experiment would show it. Of sizes on a grid, the one is taken that, all
+        else fitted anew, raises χ² most, but by `REGION`² at most.
+        """
+        problem, names = fit.problem, [p.name for p in fit.problem.unknowns.free]
+        own = ([p for p in e.parameters if p.name in names] for e in fit.model.effects)
+        unseen = [p for pars in own for p in pars if all(fit.std[other.name] is None for other in pars)]
+        places, found = [names.index(p.name) for p in unseen], []
+        n, unit = problem.n_outputs, max(2 * fit.cost / fit.dof, float(problem.weights == "noise"))
+        for values in _grid(unseen, natural_sizes(problem.experiments, fit.values)):
+            trial = problem.for_model(fit.model.start_at(values).fix(*values))
+            end = race([trial], RACE)
+            if end is not None and end.cost - fit.cost <= 0.5 * unit * REGION**2:
+                found.append((end.cost, values, trial.scaling.physical(end.q)))
+        if not found:
+            return Rival.of(fit)
+        _, values, others = max(found, key=lambda f: f[0])
+        physical = problem.scaling.physical(fit.q)
+        physical[places] = [values[p.name] for p in unseen]
+        physical[np.setdiff1d(np.arange(len(physical)), places)] = others
+        q = problem.scaling.scaled(physical)
+        r, jac = problem.residual_and_jacobian(q)
+        return Rival.of(replace(fit, values=problem.values(q), q=q, residuals=r,
+                                jacobian=jac / problem.scaling.slope(q)))
 
     def smoothed(self, width: float) -> Rival:
         """Return it with sgn at least so wide (rad/s): a sharp reversal makes criteria rough in the voltage."""
@@ -126,6 +160,15 @@ class Rival:
         if not (np.all(sizes > 0) and np.isfinite([*sizes, *information.ravel()]).all()):
             raise ValueError("sizes of a rival must be finite and above zero")
         return Rival(str(contents["name"]), model, sigma, scale, information, seen)
+
+
+def _grid(parameters: Sequence[Parameter], sizes: Mapping[str, float]) -> Iterator[dict[str, float]]:
+    """Yield values of an effect's parameters: amounts from little to much together, at each of its shapes."""
+    axes = [[(p.name, g * sizes.get(p.unit, 1.0)) for g in p.grid] for p in parameters if p.grid]
+    amounts = [p for p in parameters if p.null == 0 and not p.grid]
+    for amount, shape in product(AMOUNTS if amounts else (0.0,), product(*axes)):
+        yield {p.name: p.value for p in parameters} | dict(shape) | {
+            p.name: amount * sizes.get(p.unit, 1.0) * (ABOVE if p.at_least else 1.0) for p in amounts}
 
 
 @cache
@@ -462,6 +505,22 @@ class Task:
             found.append(Value(float(np.log1p(value)), slope / (1 + value)))
         return found
 
+    @cached_property
+    def truths(self) -> list[list[int]]:
+        """Places of the criteria that speak of the same truth."""
+        if self.asked:
+            return [[k] for k in range(len(self.driven))]
+        return [[k for k, (i, _) in enumerate(self.pairs) if i == truth] for truth in dict(self.pairs)]
+
+    def worth(self, values: Array) -> float:
+        """Return the mean over the truths of the least of their criteria, `ENOUGH` for each at most."""
+        return float(np.mean([min(float(values[each].min()), self.enough) for each in self.truths]))
+
+    @property
+    def enough(self) -> float:
+        """Criterion from which more is worth nothing."""
+        return np.inf if self.asked else ENOUGH
+
     def room(self, state: str) -> tuple[float, float]:
         """Return a state's limits less the sensor's noise."""
         low, high = self.limits[state]
@@ -501,7 +560,7 @@ class Task:
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """Where a search ended: the task with its integration steps, the unknowns, the least criterion there."""
+    """Where a search ended: the task with its integration steps, the unknowns, `Task.worth` there."""
 
     task: Task
     c: Array
@@ -509,33 +568,33 @@ class Found:
     stopped: bool = False
 
 
-def climb(task: Task, c: Array, enough: float = np.inf) -> Found:
-    """Maximise the least criterion under the limits, from unknowns that keep them, by sequential linear programming.
+def climb(task: Task, c: Array) -> Found:
+    """Maximise `Task.worth` under the limits, from unknowns that keep them, by sequential linear programming.
 
     The information is convex in a linear motor's voltage, so that its maxima lie where limits are active, and a linear
     program goes there at once (Fletcher & Sainz de la Maza, Mathematical Programming 43, 1989); the trust region
     shrinks where the step does not keep its promise. Limits of the states hold at the largest and the smallest value
-    of each segment. A criterion of `enough`, a budget of time or Ctrl-C ends the search at the best point so far.
+    of each segment. A budget of time or Ctrl-C ends the search at the best point so far.
     """
     linear, radius, best = _linear_rows(task), RADIUS, Found(task, c, -np.inf)
     try:
         values, slopes, states = _linearised(task, c, True)
-        best = Found(task, c, float(values.min()))
+        best = Found(task, c, task.worth(values))
         for _ in range(MOST_STEPS):
             check_time()
             along = linear._replace(values=linear.slopes @ best.c)
-            step, promise = _linear_step(best.c, values, slopes, [states, along], radius)
-            if promise < WORTHWHILE or best.value > enough:
+            step, promise = _linear_step(task, best.c, values, slopes, [states, along], radius)
+            if promise < WORTHWHILE:
                 break
             try:
                 there, _, y = _linearised(task, best.c + step, False)
                 kept = bool(np.all((y.values <= y.high + OVER) & (y.values >= y.low - OVER)))
-                good = kept and float(there.min()) - best.value > 0.1 * promise
+                good = kept and task.worth(there) - best.value > 0.1 * promise
             except (SimulationError, np.linalg.LinAlgError):
                 good = False
             radius *= 1.5 if good else 0.4
             if good:
-                best = Found(task, best.c + step, float(there.min()))
+                best = Found(task, best.c + step, task.worth(there))
                 values, slopes, states = _linearised(task, best.c, True)
             elif radius < SMALLEST_RADIUS:
                 break
@@ -557,18 +616,23 @@ def _linearised(task: Task, c: Array, slopes: bool) -> tuple[Array, Array, Rows]
     return (values, by @ mix, rows._replace(slopes=rows.slopes @ mix)) if slopes else (values, by, rows)
 
 
-def _linear_step(c: Array, values: Array, slopes: Array, rows: Sequence[Rows], radius: float) -> tuple[Array, float]:
-    """Return the step within `radius` that raises the least linearised criterion most, and by how much."""
-    a, b = [np.column_stack([-slopes, np.ones(len(values))])], [values]
+def _linear_step(task: Task, c: Array, values: Array, slopes: Array, rows: Sequence[Rows],
+                 radius: float) -> tuple[Array, float]:
+    """Return the step within `radius` that raises the linearised worth most, and by how much."""
+    n, truths = len(c), len(task.truths)
+    owner = np.zeros((len(values), truths))
+    for k, each in enumerate(task.truths):
+        owner[each, k] = 1.0
+    a, b = [np.hstack([-slopes, owner])], [values]
     for y, dy, low, high in rows:
         for sign, limit in ((1.0, high), (-1.0, -low)):
             at = np.isfinite(limit)
-            a.append(np.column_stack([sign * dy[at], np.zeros(at.sum())]))
+            a.append(np.hstack([sign * dy[at], np.zeros((at.sum(), truths))]))
             b.append(np.maximum(limit[at] - sign * y[at], 0.0))
-    bounds = [(max(-1 - x, -radius), min(1 - x, radius)) for x in c] + [(None, None)]
-    aim = np.append(np.zeros(len(c)), -1.0)
+    bounds = [(max(-1 - x, -radius), min(1 - x, radius)) for x in c] + [(None, task.enough)] * truths
+    aim = np.append(np.zeros(n), np.full(truths, -1 / truths))
     done = scipy.optimize.linprog(aim, np.vstack(a), np.concatenate(b), bounds=bounds, method="highs")
-    return (np.zeros(len(c)), 0.0) if done.x is None else (done.x[:-1], float(done.x[-1] - values.min()))
+    return (np.zeros(n), 0.0) if done.x is None else (done.x[:n], float(-done.fun - task.worth(values)))
 
 
 def _linear_rows(task: Task) -> Rows:

@@ -147,9 +147,8 @@ FINE = 200  # steps by which a fixed candidate is followed
 MOST_RIVALS = 4
 SHARPENED, DISTINGUISHED = 4, 3  # starts of the search
 TRACE = 0.02  # of v_max: a binary signal smaller than this is left out
-MOST_PAIRS = 3  # that one optimisation looks at
+CLOSEST = 1  # rivals of each truth that one optimisation looks at
 HOPELESS = 0.1  # log(1 + χ²) below which two rivals are as good as one model
-ENOUGH = 7.0  # the same, from which another start is not worth its time
 RIPPLES = (0.0, 0.3)  # share of the voltage for a binary signal on top of a candidate
 DRAWS = 16  # of the parameters, for the check of the limits
 SMOOTH = 1e-2  # of the largest speed: width of sgn while the voltage is sought
@@ -324,14 +323,15 @@ def design_experiment(found: Diagnosis | Fit | Sequence[Fit | Rival], *, goal: s
         def say(word: str) -> None:
             _ = advance(1, f"Designing: {word.partition(':')[0]}"), progress and progress(word)
 
-        task = _ordered(_task(rivals, layout, {s: x for s, x in limits.items() if s != "v"}, asked, slew))
+        whole = _task(rivals, layout, {s: x for s, x in limits.items() if s != "v"}, asked, slew)
+        task = _judged(whole)
         name, fine, at = _fixed(task)
-        fine = _exact(fine, rivals).refined(fine.layout.of(at), TOLERANCE)
+        fine = _exact(replace(fine, pairs=whole.pairs), rivals).refined(fine.layout.of(at), TOLERANCE)
         fixed = name, fine, _safe(fine, at)[0]
         say("compared fixed candidates")
         with limited_time(budget):
             best = _optimised(task, say)
-        task, layout = _exact(replace(best.task, pairs=task.pairs), rivals), best.task.layout
+        task, layout = _exact(replace(best.task, pairs=whole.pairs), rivals), best.task.layout
         c = best.c if layout.ramps else _without_traces(layout, best.c)
         c, peaks = _safe(task.refined(layout.of(c), TOLERANCE), c)
         return _told(task.refined(layout.of(c), TOLERANCE), c, peaks, fixed, limits,
@@ -340,27 +340,29 @@ def design_experiment(found: Diagnosis | Fit | Sequence[Fit | Rival], *, goal: s
 
 def _optimised(task: Task, say: Callable[[str], None]) -> Found:
     """Return the best point that the search reaches from the best starts."""
-    done, enough = [], np.inf if task.asked else ENOUGH
+    done: list[Found] = []
     for name, (_, here, c) in list(_starts(task).items())[:SHARPENED if task.asked else DISTINGUISHED]:
-        start = _within(replace(here, pairs=task.pairs), c)
+        start = _within(here, c)
         if start is None:
             continue
-        found = climb(_hardest(start[1], start[2]), start[2], enough)
-        again = None if found.stopped else _within(found.task, found.c)  # integration steps that suit what was found
+        found = climb(_hardest(start[1], start[2]), start[2])
+        again = _within(replace(found.task, pairs=task.pairs), found.c)  # integration steps that suit what was found
         if again is not None:
-            near = abs(again[0] - found.value) < NEARLY
-            found = Found(again[1], again[2], again[0]) if near else climb(again[1], again[2], enough)
+            if not found.stopped and abs(again[0] - found.value) > NEARLY:
+                found = climb(_hardest(again[1], again[2]), again[2])
+                again = _within(replace(found.task, pairs=task.pairs), found.c) or again
+            found = Found(again[1], again[2], again[0], found.stopped)
         done.append(found)
-        say(f"optimised from the {name}: {done[-1].value:.3g}")
-        if done[-1].stopped or done[-1].value > enough:
+        say(f"optimised from the {name}: {found.value:.3g}")
+        if found.stopped or found.value > task.enough - NEARLY:
             break
     if not done:
         raise FitError(NO_RECORD)
     return max(done, key=lambda f: f.value)
 
 
-def _ordered(task: Task) -> Task:
-    """Return the task, the pairs first that are hardest to distinguish by the best fixed candidate, hopeless ones last.
+def _judged(task: Task) -> Task:
+    """Return the task without the pairs that no fixed candidate distinguishes, if there are others.
 
     Where within its uncertainty no candidate would do, the truth is as it was fitted.
     """
@@ -369,15 +371,13 @@ def _ordered(task: Task) -> Task:
     if not every:
         return task
 
-    def best(task: Task) -> dict[tuple[int, int], float]:
+    def hopeless(task: Task) -> frozenset[tuple[int, int]]:
         worth = [[w.value for w in task.criteria(levels, task.respond(levels), False)] for levels in every]
-        return dict(zip(task.pairs, np.max(worth, axis=0), strict=True))
+        return frozenset(p for p, w in zip(task.pairs, np.max(worth, axis=0), strict=True) if w <= HOPELESS)
 
-    worth = best(task)
-    task = replace(task, nominal=frozenset(p for p, w in worth.items() if w <= HOPELESS))
-    if task.nominal:
-        worth |= best(replace(task, pairs=tuple(task.nominal)))
-    return replace(task, pairs=tuple(sorted(task.pairs, key=lambda p: (worth[p] <= HOPELESS, worth[p]))))
+    task = replace(task, nominal=hopeless(task))
+    never = hopeless(replace(task, pairs=tuple(task.nominal))) if task.nominal else ()
+    return replace(task, pairs=tuple(p for p in task.pairs if p not in never) or task.pairs)
 
 
 def _without_traces(layout: Layout, c: Array) -> Array:
@@ -387,13 +387,13 @@ def _without_traces(layout: Layout, c: Array) -> Array:
 
 
 def _hardest(task: Task, c: Array) -> Task:
-    """Return the task with the pairs alone that are hardest to distinguish, hopeless ones left out."""
+    """Return the task with those pairs alone of each truth that are hardest to distinguish."""
     if not task.pairs:
         return task
     levels = task.layout.of(c)
     worth = [w.value for w in task.criteria(levels, task.respond(levels), False)]
-    order = [k for k in np.argsort(worth) if worth[k] > HOPELESS] or [int(np.argmax(worth))]
-    return replace(task, pairs=tuple(task.pairs[k] for k in order[:MOST_PAIRS]))
+    return replace(task, pairs=tuple(task.pairs[k] for each in task.truths
+                                     for k in sorted(each, key=lambda k: worth[k])[:CLOSEST]))
 
 
 def _rivals(found: Any, goal: str | None) -> tuple[list[Rival], str]:
@@ -409,7 +409,8 @@ def _rivals(found: Any, goal: str | None) -> tuple[list[Rival], str]:
         fits = [found.best]
     if not fits:
         raise UsageError("an experiment is designed for models: give a diagnosis or at least one fit.")
-    rivals = [f if isinstance(f, Rival) else Rival.of(f) for f in fits[:MOST_RIVALS if goal == "distinguish" else 1]]
+    as_rival = Rival.as_allowed if goal == "distinguish" else Rival.of
+    rivals = [f if isinstance(f, Rival) else as_rival(f) for f in fits[:MOST_RIVALS if goal == "distinguish" else 1]]
     common = set.intersection(*(set(r.model.effect_names) for r in rivals)) if len(rivals) > 1 else set()
     names = [" + ".join(n for n in r.model.effect_names if n not in common) or "none" for r in rivals]
     return [replace(r, name=n) for r, n in zip(rivals, names, strict=True)], goal
@@ -488,7 +489,6 @@ def _task(rivals: Sequence[Rival], layout: Layout, limits: Mapping[str, tuple[fl
 
 def _starts(task: Task) -> dict[str, tuple[float, Task, Array]]:
     """Return starts by name: worth, the task in their layout, unknowns within the limits; the best first."""
-    task = replace(task, pairs=task.pairs[:MOST_PAIRS])
     laid = {} if task.layout.ramps or not task.asked else _waves(task)
     laid |= {n: (task.layout, c) for n, c in _followed(task.layout, RIPPLES).items()}
     found = _best_first({n: _within(task.laid(layout), c, bool(task.asked)) for n, (layout, c) in laid.items()})
@@ -595,8 +595,8 @@ def _within(task: Task, c: Array, fine: bool = True) -> tuple[float, Task, Array
     if kept is None:
         return None
     levels = task.layout.of(kept[0])
-    worth = [w.value for w in task.criteria(levels, task.respond(levels), False)]
-    return min((w for w in worth if w > HOPELESS or task.asked), default=0.0), task, kept[0]
+    worth = np.array([w.value for w in task.criteria(levels, task.respond(levels), False)])
+    return task.worth(worth), task, kept[0]
 
 
 def _shrunk(task: Task, c: Array, displaced: Sequence[Array] = (),

@@ -17,7 +17,7 @@ from functools import cached_property
 import numpy as np
 
 from motorid.errors import ModelError, SimulationError
-from motorid.estimation.angle_orders import Line, likely_lines, spectrum, uses_angle
+from motorid.estimation.angle_orders import likely_lines, spectrum, uses_angle
 from motorid.estimation.linearisation import Tangent, parameter_vector
 from motorid.estimation.result import Fit
 from motorid.integrate.engine import Trajectory
@@ -198,18 +198,12 @@ def _score_orders(tangent: Tangent, added: Added, effect: Effect) -> Score:
     """Score an effect of the angle at its likely orders, which the misfit without its colour tells."""
     lines = likely_lines(tangent, effect, ORDERS_TRIED)
     order = next(p.name for p in added.pars if p.order)
-    shape = added.shape({order: lines[0].order}) if lines else None
+    shape = added.shape({order: lines[0].order, **lines[0].choice}) if lines else None
     if shape is None:
         return Score(effect, 0.0, ({},))
-    best, starts = _tried(tangent, shape), tuple(_start(line, added.pars) for line in lines)
+    best, starts = _tried(tangent, shape), tuple(line.values(added.pars) for line in lines)
     out = spectrum(tangent, effect).stands_out
     return Score(effect, best.drop, starts, tangent.effective(best.left), best.same_as, out, (shape,))
-
-
-def _start(line: Line, pars: Sequence[Parameter]) -> dict[str, float]:
-    """Return the values of an effect that a line stands for."""
-    return {p.name: line.order if p.order else line.phase if p.periodic else line.amplitude
-            for p in pars if p.order or p.periodic or p.null == 0}
 
 
 def _distinct(starts: list[dict[str, float]], most: int = 3) -> list[dict[str, float]]:

@@ -144,9 +144,16 @@ def torque_ripple(
     a_r=P(0.05, "", null=0.0, lower=0.0, upper=1.0, doc="relative amplitude"),
     N_r=P(12.0, "", order=True, vary=False, lower=1.0, doc="periods per turn, from the misfit, then fixed"),
     phi_r=P(0.0, "rad", periodic=True, doc="phase at theta = 0"),
+    e_r=P(0.0, "", vary=False, lower=0.0, upper=1.0, grid=(0.0, 1.0), doc="1: in the back-EMF too, fixed"),
 ):
-    """Torque ripple, K·i·(1+a·sin(N·θ+φ)), not in the back-EMF; or of g. Jahns & Soong, IEEE TIE 43(2), 1996."""
-    m.scale("K_t" if "i" in m.states else "g", 1 + a_r * ca.sin(N_r * m.theta + phi_r))
+    """Torque ripple, K·i·(1+a·sin(N·θ+φ)), with e_r = 1 in the back-EMF too. Jahns & Soong, IEEE TIE 43(2), 1996.
+
+    What suits is taken, unless given. A model without a current has its torque constant g ripple.
+    """
+    wave = a_r * ca.sin(N_r * m.theta + phi_r)
+    m.scale("K_t" if "i" in m.states else "g", 1 + wave)
+    if "i" in m.states:
+        m.scale("K_e", 1 + e_r * wave)
 
 
 CORNER = 0.01  # of half a gap: a stiff shaft is twisted by much less than the gap, and a wide corner is a soft shaft

@@ -8,8 +8,8 @@ period per sample no alias and no delay of a sensor can pose as it.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from typing import NamedTuple
 
@@ -18,7 +18,7 @@ import numpy as np
 from motorid.errors import ModelError
 from motorid.estimation.linearisation import Response, Tangent, responses
 from motorid.estimation.result import Fit
-from motorid.model.definition import Effect
+from motorid.model.definition import Effect, Parameter
 from motorid.model.model import Model, dc_motor, torque_driven
 from motorid.numerics.autoregression import Whitening
 from motorid.numerics.signals import Array
@@ -37,6 +37,7 @@ ALIKE = 1e-7  # below one, the correlation at which the answers to sine and cosi
 SAMPLED = 8  # orders whose answers are worked out to know about how strong all are
 LOOKED_AT = 12  # of the best then
 STILL = 1e-9  # rad per sample: no motion
+KINDS = ("torque", "motor's torque", "K")  # what an order modulates: K both torque and back-EMF
 SURE = 30.0  # chi² of two degrees of freedom: the highest of 240 orders of noise reaches about 11
 
 
@@ -48,6 +49,12 @@ class Line:
     share: float  # of the squared residual without its colour
     amplitude: float
     phase: float
+    choice: Mapping[str, float] = field(default_factory=dict)  # what it modulates, by the effect's fixed parameter
+
+    def values(self, parameters: Iterable[Parameter]) -> dict[str, float]:
+        """Return the values of an effect's parameters that it stands for."""
+        return {p.name: self.order if p.order else self.phase if p.periodic else self.amplitude
+                for p in parameters if p.order or p.periodic or p.null == 0} | dict(self.choice)
 
 
 @dataclass(frozen=True)
@@ -110,39 +117,34 @@ def strongest_order(fit: Fit, effects: Sequence[Effect]) -> tuple[Effect, dict[s
     if not lines:
         return None
     effect, line = max(lines, key=lambda pair: pair[1].share)
-    return effect, _values(effect, line)
-
-
-def _values(effect: Effect, line: Line) -> dict[str, float]:
-    found = {}
-    for p in effect.parameters:
-        if p.order:
-            found[p.name] = line.order
-        elif p.periodic:
-            found[p.name] = line.phase
-        elif p.null == 0:
-            found[p.name] = line.amplitude
-    return found
+    return effect, line.values(effect.parameters)
 
 
 def spectrum(tangent: Tangent, effect: Effect) -> Spectrum:
     """Return what each order explains of the misfit.
 
     `effect` tells what is modulated: the torque itself (an amplitude in N·m), or the torque made by the current
-    (a relative amplitude).
+    (a relative amplitude), by a fixed parameter of it the back-EMF too.
     """
-    return _spectrum(tangent, any(p.null == 0 and p.unit == "" for p in effect.parameters))
+    if all(p.null != 0 or p.unit for p in effect.parameters):
+        return _spectrum(tangent, "torque")
+    both = next((p.name for p in effect.parameters if not p.vary and p.grid), None)
+    if both is None:
+        return _spectrum(tangent, "motor's torque")
+    ways = [(_spectrum(tangent, kind), {both: value}) for kind, value in (("motor's torque", 0.0), ("K", 1.0))]
+    lines = [replace(line, choice=choice) for found, choice in ways for line in found.lines]
+    return Spectrum(tuple(sorted(lines, key=lambda line: -line.share)), any(found.stands_out for found, _ in ways))
 
 
 @lru_cache(maxsize=4)
-def _spectrum(tangent: Tangent, relative: bool) -> Spectrum:
-    fit, top = tangent.fit, highest_order(tangent)
+def _spectrum(tangent: Tangent, kind: str) -> Spectrum:
+    fit, top, relative = tangent.fit, highest_order(tangent), kind != "torque"
     # A torque that repeats once per turn is gravity's, and what is to repeat must do so within the travel.
     travel = max(float(np.ptp(angle_signal(r))) for r in fit.problem.experiments)
     lowest = max(1 if relative else 2, int(np.ceil(PERIODS * 2 * np.pi / max(travel, 1e-9))))
     if top < lowest or (relative and "i" not in fit.problem.system.states):
         return Spectrum((), False)
-    shares, lines = _order_search(tangent).shares(lowest, relative)
+    shares, lines = _order_search(tangent).shares(lowest, kind)
     if not lines:
         return Spectrum((), False)
     found = sorted(lines, key=lambda line: -line.share)
@@ -171,17 +173,17 @@ class _OrderSearch:
     orders: Array
     slow: Array
 
-    def shares(self, lowest: int, relative: bool) -> tuple[Array, list[Line]]:
+    def shares(self, lowest: int, kind: str) -> tuple[Array, list[Line]]:
         """Return about what each order explains, and exactly the lines of those that explain most.
 
         How much the outputs answer is worked out for a few orders; between them it follows what is put in.
         """
         orders = self.orders[lowest - 1 :]
         few = np.unique(np.geomspace(1, len(orders), SAMPLED).round().astype(int) - 1)
-        lines, sizes = self.exact(orders[few], relative)
+        lines, sizes = self.exact(orders[few], kind)
         if len(few) == len(orders) or not (sizes > 0).any():
             return np.array([line.share for line in lines]), lines
-        pulls, put_in, squares = (m[lowest - 1 :] for m in self.moments[relative])
+        pulls, put_in, squares = (m[lowest - 1 :] for m in self.moments[kind])
         seen = few[sizes > 0]
         with np.errstate(divide="ignore", invalid="ignore"):
             answer = np.interp(np.log(orders), np.log(orders[seen]), np.log(sizes[sizes > 0] / put_in[seen]))
@@ -192,21 +194,21 @@ class _OrderSearch:
             shares /= np.exp(answer) * put_in * float(self.residual @ self.residual)
         shares = np.where(put_in > 0, shares, 0.0)
         best = [k for k in np.argsort(-shares)[:LOOKED_AT] if k not in few]
-        lines += self.exact(orders[best], relative)[0]
+        lines += self.exact(orders[best], kind)[0]
         for line in lines:
             shares[int(line.order) - lowest] = line.share
         return shares[shares > 0], lines
 
-    def exact(self, orders: Array, relative: bool) -> tuple[list[Line], Array]:
+    def exact(self, orders: Array, kind: str) -> tuple[list[Line], Array]:
         """Return the lines at `orders`, and the mean square of the answers to sine and cosine, 0 for none."""
         lines: list[Line] = []
         sizes = np.zeros(len(orders))
         # The residual is model less measurement: what is fitted to it counts against the motor's torque.
-        residual = -self.residual if relative else self.residual
+        residual = self.residual if kind == "torque" else -self.residual
         chunk = int(np.clip(WIDEST / (2 * len(residual)), 10, HIGHEST))
         for first in range(0, len(orders), chunk):
             part = slice(first, first + chunk)
-            columns = self.white([self._columns(k, orders[part], relative) for k in range(len(self.answers))])
+            columns = self.white([self._columns(k, orders[part], kind) for k in range(len(self.answers))])
             columns -= self.basis @ (self.basis.T @ columns)
             sines, cosines = np.split(columns, 2, axis=1)
             sizes[part] = (np.einsum("ij,ij->j", sines, sines) + np.einsum("ij,ij->j", cosines, cosines)) / 2
@@ -214,46 +216,57 @@ class _OrderSearch:
         return [line for line in lines if line.share > 0], sizes
 
     @cached_property
-    def moments(self) -> dict[bool, Moments]:
-        """The moments of all orders, of the torque itself (False) and relative to the motor's (True)."""
+    def moments(self) -> dict[str, Moments]:
+        """The moments of all orders, by what they modulate."""
         n = len(self.orders)
-        found = {kind: Moments(np.zeros(n, complex), np.zeros(n), np.zeros(n, complex)) for kind in (False, True)}
+        found = {kind: Moments(np.zeros(n, complex), np.zeros(n), np.zeros(n, complex)) for kind in KINDS}
         residuals = self.white.transposed(self.residual, [len(a.c) for a in self.answers])
         for k, answer in enumerate(self.answers):
             angle = angle_signal(self.fit.problem.runs[k].experiment)
-            pull = (answer.pulled(self._measured(k, residuals[k])) * answer.b[:, :, 1]).sum(axis=1)
+            pull = answer.pulled(self._measured(k, residuals[k]))
+            pulls = {kind: (pull * self._pushes(k, kind)).sum(axis=1) for kind in found}
             once, step = np.exp(1j * angle), np.diff(angle)
             still = np.abs(step) < STILL
             per_step = 1 / np.where(still, 1.0, 1j * step)
-            carriers = {relative: self._carrier(k, relative) for relative in found}
+            sizes = {kind: self._size(k, kind) for kind in found}
             wave = np.ones_like(once)
             for j, n in enumerate(self.orders):
                 wave = wave * once
                 mean = np.where(still, wave[1:], np.diff(wave) * (per_step / n))  # of exp(jNθ) over each sample
                 mean[np.abs(step) > self.slow[j]] = 0.0
-                for relative, m in found.items():
-                    put = carriers[relative] * mean
-                    m.pulls[j] += pull @ put
+                for kind, m in found.items():
+                    put = sizes[kind] * mean
+                    m.pulls[j] += pulls[kind] @ mean
                     m.sizes[j] += np.vdot(put, put).real
                     m.squares[j] += put @ put
         return found
 
-    def _columns(self, k: int, orders: Array, relative: bool) -> Array:
-        """Whitened outputs of run `k` to unit sine and cosine torques of all `orders`, (N, ny, 2 len(orders))."""
+    def _columns(self, k: int, orders: Array, kind: str) -> Array:
+        """Whitened outputs of run `k` to unit sine and cosine of all `orders`, (N, ny, 2 len(orders))."""
         angle = angle_signal(self.fit.problem.runs[k].experiment)
         slow = self.slow[orders.astype(int) - 1]
         middle, step = (angle[1:] + angle[:-1]) / 2, np.diff(angle)
         # Averaged over the sample, so that orders too fast for the sampling fade instead of posing as slower ones.
         fade = np.sinc(np.outer(orders, step) / (2 * np.pi)) * (np.abs(step) <= slow[:, None])
-        fade = fade * self._carrier(k, relative)
         turning = np.outer(orders, middle)
         drive = np.concatenate([np.sin(turning) * fade, np.cos(turning) * fade])
-        return self._measured(k, self.answers[k].driven(drive[:, :, None] * self.answers[k].b[:, :, 1]))
+        return self._measured(k, self.answers[k].driven(drive[:, :, None] * self._pushes(k, kind)))
 
-    def _carrier(self, k: int, relative: bool) -> Array | float:
-        """What the order modulates: the motor's torque, or nothing but itself."""
+    def _pushes(self, k: int, kind: str) -> Array:
+        """Return what moves the states at the end of each sample, (N-1, nx), if it is not modulated."""
+        return np.einsum("nxd,dn->nx", self.answers[k].b, self._forces(k, kind))
+
+    def _size(self, k: int, kind: str) -> Array:
+        """Return how much is modulated, (N-1,), N·m, a voltage as the torque that it makes at standstill."""
+        voltage, torque = self._forces(k, kind)
+        return np.hypot(torque, voltage * self.fit.values.get("K", 0.0) / self.fit.values.get("R", 1.0))
+
+    def _forces(self, k: int, kind: str) -> Array:
+        """Return the voltage and the torque, (2, N-1), that `kind` modulates."""
         states = self.answers[k].states
-        return self.fit.values["K"] * states["i"][:-1] if relative and "i" in states else 1.0
+        ones, K = np.ones(len(self.answers[k].a)), self.fit.values.get("K", 0.0)
+        torque = ones if kind == "torque" or "i" not in states else K * states["i"][:-1]
+        return np.stack([-K * states["omega"][:-1] if kind == "K" else 0 * ones, torque])
 
     def _measured(self, k: int, outputs: Array) -> Array:
         """Return outputs (N, ny, …) with nothing where nothing was measured."""

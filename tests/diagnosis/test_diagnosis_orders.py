@@ -56,14 +56,29 @@ def test_the_best_orders_are_those_of_a_look_at_all(lab, effect, hidden):
         for k, words in enumerate(("stairs 0.4", "ramps 0.3"))
     ]
     tangent = Tangent.of(mi.fit(mi.dc_motor(), runs))
-    looking, relative = orders._order_search(tangent), effect == "torque_ripple"
+    looking, kind = orders._order_search(tangent), "torque" if effect == "cogging" else "motor's torque"
     every = looking.orders[1:]
     assert len(every) > 2 * (orders.SAMPLED + orders.LOOKED_AT)
-    exact = {line.order: line for line in looking.exact(every, relative)[0]}
-    found = orders.spectrum(tangent, LIBRARY[effect])
+    exact = {line.order: line for line in looking.exact(every, kind)[0]}
+    found = orders._spectrum(tangent, kind)
     best = max(exact.values(), key=lambda line: line.share)
     assert found.lines[0].order == best.order
     for line in found.lines:
         assert line.share == pytest.approx(exact[line.order].share, rel=1e-6)
-    rough, _ = looking.shares(2, relative)
+    rough, _ = looking.shares(2, kind)
     assert np.median(rough) == pytest.approx(np.median([line.share for line in exact.values()]), rel=0.3)
+
+
+@pytest.mark.parametrize("shared", [0.0, 1.0])
+def test_a_ripple_of_the_torque_is_told_from_one_of_the_back_emf_too(lab, shared):
+    rng, hidden = np.random.default_rng(8), {"torque_ripple": {"a_r": 0.08, "N_r": 7, "phi_r": 0.7, "e_r": shared}}
+    runs = [
+        record(driven(lab, hidden, words, 900, 1e-3, rng), "logger", ("i", "omega", "theta"), lab, rng, f"run{k}")
+        for k, words in enumerate(("stairs 0.4", "ramps 0.3", "ternary 0.3"))
+    ]
+    found = mi.diagnose(mi.fit(mi.dc_motor(), runs[:2]), validate=runs[2:])
+    assert found.to_dict()["effects"] == ["torque_ripple"]
+    assert found.after.values["e_r"] == shared
+    assert found.after.fits == "noise"
+    assert mi.fit(mi.dc_motor() + mi.effects.torque_ripple, runs).values["e_r"] == shared
+    assert mi.fit(mi.dc_motor() + mi.effects.torque_ripple, runs).values["N_r"] == 7

@@ -169,6 +169,7 @@ def test_says_what_it_is_with_units_limits_and_source(effect):
             "N",
             "a_r",
             "N_r",
+            "e_r",
             "k_w",
             "s_b",
             "a_f",
