@@ -99,7 +99,7 @@ class Rival:
         own = ([p for p in e.parameters if p.name in names] for e in fit.model.effects)
         unseen = [p for pars in own for p in pars if all(fit.std[other.name] is None for other in pars)]
         places, found = [names.index(p.name) for p in unseen], []
-        n, unit = problem.n_outputs, max(2 * fit.cost / fit.dof, float(problem.weights == "noise"))
+        unit = max(2 * fit.cost / fit.dof, float(problem.weights == "noise"))
         for values in _grid(unseen, natural_sizes(problem.experiments, fit.values)):
             trial = problem.for_model(fit.model.start_at(values).fix(*values))
             end = race([trial], RACE)

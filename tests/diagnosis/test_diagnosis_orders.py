@@ -7,7 +7,6 @@ import pytest
 from battery.excite import driven, record
 
 import motorid as mi
-from motorid.effects import LIBRARY
 from motorid.estimation import angle_orders as orders
 from motorid.estimation.linearisation import Response, Tangent
 from motorid.numerics.autoregression import ORDER, Whitening
