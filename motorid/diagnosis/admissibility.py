@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from motorid.diagnosis.thresholds import MATERIAL
 from motorid.display.numbers import number, percent
 from motorid.estimation.result import Fit
 from motorid.model.definition import Effect, Parameter
@@ -36,8 +37,16 @@ def objections(fit: Fit, added: Effect, before: Fit | None = None) -> str:
         physical = next(q.upper for q in added.parameters if q.name == p.name) == p.upper  # not set for these records
         if p.vary and np.isfinite(p.upper) and fit.values[p.name] > 0.98 * p.upper and physical:
             return f"{p.name} runs to {p.upper:g}, the limit of what is physical"
-    why = _too_large(fit, pars) or unresolved(fit, added)
+    why = _too_large(fit, pars) or _alike(fit, added) or unresolved(fit, added)
     return why or (_emptied(fit, added, before) if before else "")
+
+
+def _alike(fit: Fit, added: Effect) -> str:
+    """Say so where the sizes that tell an effect from a simpler one differ by a trifle: the smooth sgn makes as much."""
+    sizes = [fit.values[p.name] for p in added.parameters if p.null == 0 and p.unit in ("N·m", "N")]
+    if added.includes and len(sizes) > 1 and max(sizes) - min(sizes) < MATERIAL * max(sizes):
+        return f"its sizes differ by less than {percent(MATERIAL, 1)}: no more than {added.includes[0]}"
+    return ""
 
 
 def _too_large(fit: Fit, pars: Sequence[Parameter]) -> str:

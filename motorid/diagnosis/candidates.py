@@ -19,7 +19,7 @@ from motorid.diagnosis.admissibility import objections
 from motorid.diagnosis.cross_validation import HeldOut
 from motorid.diagnosis.misspecification import LIMITER
 from motorid.diagnosis.model_comparison import COMMON, Node, beats, evidence, far, node_of, superfluous
-from motorid.diagnosis.predictive_score import Evidence
+from motorid.diagnosis.predictive_score import Evidence, is_sure
 from motorid.diagnosis.refit import GivenUp, Task, completed, hidden_in, lost, refit, refits, widened
 from motorid.diagnosis.results import Candidate
 from motorid.diagnosis.score_test import Score, pairs_of, rank, uses_angle, with_phase_per_run, with_warm_start
@@ -234,18 +234,28 @@ class Search:
         several = len(set(self.root.fit.problem.unknowns.firsts)) > 1
         return several and (not uses_angle(effect) or any(uses_angle(e) for e in model.effects))
 
-    def expand_by_two(self, node: Node) -> list[Node]:
-        """Return the judged models larger by two effects that only together show: each alone was refused."""
-        present, scores = node.fit.model, self._shortlist(node)
-        tasks = []
-        for a, b in pairs_of(node.fit, scores, PAIRS):
+    def expand_by_two(self, node: Node, refused: Sequence[Candidate]) -> list[Node]:
+        """Return the judged models larger by two effects that only together show: each alone was refused.
+
+        What surely predicts better on the whole, but held-out runs worse, may be right where these lack something else
+        too: the best of `refused` that does so gets a second effect.
+        """
+        present, pairs = node.fit.model, []
+        for a, b in pairs_of(node.fit, self._shortlist(node), PAIRS):
             with contextlib.suppress(ModelError):
-                tasks.append(Task(node.fit, present + a.effect + b.effect, a.effect, _merged(a, b)))
+                pairs.append(Task(node.fit, present + a.effect + b.effect, a.effect, _merged(a, b)))
+        groups = [pairs]
+        for c in sorted(refused, key=lambda c: -(c.gain or 0.0))[:1]:
+            if c.fit is not None and is_sure(c.gain or 0.0, c.gain_se or 0.0):
+                half = replace(node, fit=c.fit, added=c.effect, parent=node)
+                groups.append([Task(c.fit, c.fit.model + s.effect, s.effect, s.starts, s.drop)
+                               for s in self._shortlist(half)])
         children = []
-        for task, fit in zip(tasks, refits(tasks, self.map), strict=True):
-            child, _ = self._judge(node, task.model.effects[len(present.effects) :], fit)
-            children += [child] if child is not None else []
-        self.stages.done(f"refitted {len(tasks)} pairs")
+        for tasks in groups:
+            for task, fit in zip(tasks, refits(tasks, self.map), strict=True):
+                child, _ = self._judge(node, task.model.effects[len(present.effects) :], fit)
+                children += [child] if child is not None else []
+        self.stages.done(f"refitted {sum(map(len, groups))} pairs")
         return children
 
     def _judge(self, node: Node, effects: Sequence[Effect], fit: Fit | GivenUp | None) -> tuple[Node | None, Candidate]:

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from motorid.acquire.excitation import lfsr_bits, program
 from motorid.errors import OutOfTime, SimulationError, UsageError
-from motorid.estimation.least_squares import RACE, race
+from motorid.estimation.least_squares import LOOK, race
 from motorid.estimation.result import Fit
 from motorid.estimation.start_values import ABOVE
 from motorid.integrate.engine import Grid
@@ -43,7 +43,7 @@ from motorid.problem.unknowns import Scaling
 STEPS = 4  # Gauss-Newton steps of the rivals' refit within one evaluation
 ENOUGH = 5.0  # log(1 + χ²) against every rival, from which more is worth nothing
 REGION = 2.0  # standard deviations within which the truth may lie
-AMOUNTS = tuple(np.geomspace(1e-3, 1.0, 10))  # of the natural size: of an effect that the records leave open
+AMOUNTS = tuple(np.geomspace(1e-3, 1.0, 8))  # of the natural size: of an effect that the records leave open
 SETTLED = 0.01  # relative fall of χ² at which it ends
 ROUNDING = 1e-10  # of the information, beside which the prior of one unit would be lost
 BESIDE = 1e-4  # of a unit of the solver's coordinates, for differences of slopes
@@ -100,9 +100,9 @@ class Rival:
         unseen = [p for pars in own for p in pars if all(fit.std[other.name] is None for other in pars)]
         places, found = [names.index(p.name) for p in unseen], []
         unit = max(2 * fit.cost / fit.dof, float(problem.weights == "noise"))
-        for values in _grid(unseen, natural_sizes(problem.experiments, fit.values)):
+        for values in _grid(unseen, natural_sizes(problem.experiments, fit.values)) if unseen else ():
             trial = problem.for_model(fit.model.start_at(values).fix(*values))
-            end = race([trial], RACE)
+            end = race([trial], LOOK)
             if end is not None and end.cost - fit.cost <= 0.5 * unit * REGION**2:
                 found.append((end.cost, values, trial.scaling.physical(end.q)))
         if not found:
@@ -576,7 +576,7 @@ def climb(task: Task, c: Array) -> Found:
     shrinks where the step does not keep its promise. Limits of the states hold at the largest and the smallest value
     of each segment. A budget of time or Ctrl-C ends the search at the best point so far.
     """
-    linear, radius, best = _linear_rows(task), RADIUS, Found(task, c, -np.inf)
+    linear, radius, best = linear_rows(task), RADIUS, Found(task, c, -np.inf)
     try:
         values, slopes, states = _linearised(task, c, True)
         best = Found(task, c, task.worth(values))
@@ -635,7 +635,18 @@ def _linear_step(task: Task, c: Array, values: Array, slopes: Array, rows: Seque
     return (np.zeros(n), 0.0) if done.x is None else (done.x[:n], float(-done.fun - task.worth(values)))
 
 
-def _linear_rows(task: Task) -> Rows:
+def nearest(task: Task, c: Array) -> Array:
+    """Return the unknowns nearest to `c`, by the largest change, that keep the linear limits (a slew rate)."""
+    _, slopes, _, high = linear_rows(task)
+    if (np.abs(slopes @ c) <= high).all():
+        return c
+    one, away = np.ones((len(c), 1)), np.eye(len(c))
+    a = np.block([[s * slopes, np.zeros((len(high), 1))] for s in (1, -1)] + [[s * away, -one] for s in (1, -1)])
+    b = np.concatenate([high, high, c, -c])
+    return scipy.optimize.linprog(np.append(0 * c, 1.0), a, b, bounds=[(-1, 1)] * len(c) + [(0, None)]).x[:-1]
+
+
+def linear_rows(task: Task) -> Rows:
     """Return the rows (their values empty) of what is linear in the unknowns: mixed levels, and the slew rate."""
     layout = task.layout
     mix = np.eye(layout.levels) if layout.mixing is None else layout.mixing
@@ -645,7 +656,7 @@ def _linear_rows(task: Task) -> Rows:
         on = np.array(layout.bits, bool)
         rows += [mix] if layout.ramps else [(mix[:n] + mix[n:])[on], (mix[:n] - mix[n:])[on]]
         high += [np.ones(len(r)) for r in rows[1:]]
-    if np.isfinite(task.slew):
+    if layout.ramps and np.isfinite(task.slew):
         rows.append(np.diff(np.vstack([0 * mix[:1], mix, 0 * mix[:1]]), axis=0))
         seconds = np.array([1e-3, *layout.ms, 1e-3]) / 1e3
         high.append(task.slew * seconds / layout.v_max)

@@ -18,7 +18,17 @@ import numpy as np
 
 from motorid.acquire.excitation import program
 from motorid.channels import UNITS, channel_name
-from motorid.diagnosis.design_criteria import MOST_SEGMENTS, Driven, Found, Layout, Rival, Task, all_pairs, climb
+from motorid.diagnosis.design_criteria import (
+    MOST_SEGMENTS,
+    Driven,
+    Found,
+    Layout,
+    Rival,
+    Task,
+    all_pairs,
+    climb,
+    nearest,
+)
 from motorid.diagnosis.results import Diagnosis
 from motorid.display.cards import Card, Flag, Printed, Shown, Table
 from motorid.display.numbers import number, quantity
@@ -260,9 +270,11 @@ def design_experiment(found: Diagnosis | Fit | Sequence[Fit | Rival], *, goal: s
                       budget: float | None = None, progress: Callable[[str], None] | None = None) -> Design:
     """Design the voltage that best distinguishes rival models, or that best sharpens parameters.
 
-    Distinguishing is T-optimal (Atkinson & Fedorov, Biometrika 62, 1975): the largest least χ² between any two
-    rivals, the one refitted to all records, the other, the truth, anywhere within two standard deviations of its
-    values (as fitted, where that would hide the difference). Sharpening is D_s-optimal for one parameter (Fedorov,
+    Distinguishing is T-optimal (Atkinson & Fedorov, Biometrika 62, 1975): log(1 + χ²) of the rival that comes nearest
+    to the truth, refitted to all records, in the mean over the rivals as truths, up to where more is worth nothing
+    (compound: Ponce de Leon & Atkinson, Biometrika 78, 1991). The truth lies anywhere within two standard deviations
+    of its values, or as fitted where that would hide the difference; an effect that the records leave open is as large
+    as they allow. Sharpening is D_s-optimal for one parameter (Fedorov,
     Theory of Optimal Experiments, 1972); for several, the product of their variances by the Fisher information, that
     of the records so far included. Both are solved as an NLP, by sequential linear programming with the exact
     derivatives of the discrete step, from fixed candidates and, to sharpen, from waves with current or speed at the
@@ -499,7 +511,12 @@ def _starts(task: Task) -> dict[str, tuple[float, Task, Array]]:
 
 
 def _best_first(found: Mapping[str, tuple[float, Task, Array] | None]) -> dict[str, tuple[float, Task, Array]]:
-    return dict(sorted(((n, w) for n, w in found.items() if w is not None), key=lambda w: -w[1][0]))
+    """Return what is there, the best first; of those that tell enough, the gentlest."""
+    def order(entry: tuple[str, tuple[float, Task, Array]]) -> tuple[float, float]:
+        worth, task, c = entry[1]
+        return -worth, float(np.mean(task.layout.voltage(task.layout.of(c)) ** 2))
+
+    return dict(sorted(((n, w) for n, w in found.items() if w is not None), key=order))
 
 
 def _followed(layout: Layout, ripples: Sequence[float]) -> dict[str, Array]:
@@ -602,6 +619,7 @@ def _within(task: Task, c: Array, fine: bool = True) -> tuple[float, Task, Array
 def _shrunk(task: Task, c: Array, displaced: Sequence[Array] = (),
             ) -> tuple[Array, dict[str, tuple[float, float]]] | None:
     """Return the unknowns, shrunk until (displaced) rivals keep the limits, and their reach; None: they never do."""
+    c = nearest(task, c)
     for _ in range(30):
         reach = task.reach(task.layout.of(c), displaced or [np.zeros((1, len(d.rival.scale))) for d in task.driven])
         rooms = {s: task.room(s) for s in reach}

@@ -25,7 +25,7 @@ from motorid.diagnosis.predictive_score import (
     left_out,
     stacked_labels,
 )
-from motorid.diagnosis.thresholds import MOST, SUPPLANTS, TRIFLE
+from motorid.diagnosis.thresholds import MOST, STANDARD_ERRORS, SUPPLANTS, TRIFLE
 from motorid.display.numbers import listed, percent
 from motorid.estimation.least_squares import FAILURES
 from motorid.estimation.linearisation import INSEPARABLE
@@ -146,7 +146,7 @@ def grades_of(last: Node, root: Node, groups: Sequence[Sequence[str]], beside: S
     """Return the grade of each effect that `last` has and `root` has not.
 
     A rung that predicts better stays, whatever it is. Its effect is *named* if its law is physical there and its size
-    more than its deviation, no rival predicts as well, no free form that contains it, or in its place, predicts better
+    more than two of its deviations, no rival predicts as well, no free form that contains it, or in its place, predicts better
     by more than the trifle that a free curve follows in any real motor and by more than a trifle of what the effect
     itself does, and it explains more than it leaves, unless that is noise (no `structure`). A form `beside` the effect
     that predicts surely less than the best one only imitates that. `without` gives the model without one of the
@@ -158,7 +158,7 @@ def grades_of(last: Node, root: Node, groups: Sequence[Sequence[str]], beside: S
     for e in (e for e in last.fit.model.effects if e.name not in root.key):
         why, form = objections(last.fit, e, root.fit), None
         why = why or ("it may only stand in for the driver's current limit" if limited else "")
-        why = why or _insignificant(last.fit, e)
+        why = why or _insignificant(last.fit, e, structure)
         smaller = without(e.name) if not why and (structure or far(last.fit)) else None
         if smaller is not None:
             free = [b for b in beside if not compare(b.predictions, beside[0].predictions).sure]
@@ -181,13 +181,21 @@ def _more(fall: float, taken: float) -> float:
     return float(np.sqrt((1 - taken) * (1 - (1 - fall) ** 2) / max(taken, 1e-12)))
 
 
-def _insignificant(fit: Fit, effect: Effect) -> str:
-    """Say so where every size of an effect is smaller than its own deviation; one without a deviation may be any."""
-    sizes = [p.name for p in effect.parameters if p.null == 0 and fit.problem.model.parameters[p.name].vary]
+def _insignificant(fit: Fit, effect: Effect, structure: bool) -> str:
+    """Say so where every size of an effect is within two deviations of nothing.
+
+    One without a deviation may be any; of a law whose sizes are all open little is known, unless it leaves noise alone.
+    """
+    own = [p for p in effect.parameters if fit.problem.model.parameters[p.name].vary]
+    sizes = [p.name for p in own if p.null == 0]
     found = [(fit.values[n], fit.std[n]) for n in sizes]
     found += [(own["value"], own["std"]) for n in sizes for own in fit.per_run.get(n, {}).values()]
-    known = [value for value, std in found if std is None or std < abs(value)]
-    return f"{listed(sizes)} could as well be zero, within one standard deviation" if sizes and not known else ""
+    if sizes and not any(std is None or STANDARD_ERRORS * std < abs(value) for value, std in found):
+        return f"{listed(sizes)} could as well be zero, within two standard deviations"
+    open_ = [p.name for p in own if not sizes or p.name in sizes]
+    if structure and open_ and not any(p.per_run for p in own) and all(fit.std[n] is None for n in open_):
+        return f"{listed(open_)} {'is' if len(open_) == 1 else 'are'} not determined, and the rest is not noise"
+    return ""
 
 
 def _swallows(fit: Fit, form: Form, effect: Effect) -> bool:

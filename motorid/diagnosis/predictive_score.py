@@ -91,7 +91,7 @@ class Evidence:
     @property
     def sure(self) -> bool:
         """Tell whether the difference is more than chance: `STANDARD_ERRORS` of it and at least `NATS`."""
-        return _sure(self.gain, self.se)
+        return is_sure(self.gain, self.se)
 
     @property
     def worth_it(self) -> bool:
@@ -111,19 +111,19 @@ def compare(old: Predictions, new: Predictions) -> Evidence:
     blocks = _fall(old.blocks, new.blocks) or 0.0
     unseen = [_kept(old.held_out, new.held_out, m) for m in (old.held_out, new.held_out)]
     held_out = _fall(*unseen)
-    worse = held_out is not None and (held_out < -MATERIAL or _sure(-there, there_se))
+    worse = held_out is not None and (held_out < -MATERIAL or is_sure(-there, there_se))
     gain, se = here + there, float(np.hypot(here_se, there_se))
     if held_out is None:
         return Evidence(gain, se, blocks, None, worse)
     weights = [sum(np.isfinite(r).sum() for e in c.values() for r in e.values) for c in (new.blocks, new.held_out)]
     logs = np.log1p([-min(f, 1 - 1e-12) for f in (blocks, held_out)])
     everywhere = 1 - float(np.exp(np.average(logs, weights=weights if any(weights) else None)))
-    open_ = held_out > PLAIN and not worse and not _sure(abs(gain), se)
+    open_ = held_out > PLAIN and not worse and not is_sure(abs(gain), se)
     plain = open_ and bool(-np.log1p(-held_out) > STANDARD_ERRORS * _fall_error(*unseen))
     return Evidence(gain, se, max(blocks, held_out), held_out, worse, everywhere, plain)
 
 
-def _sure(gain: float, se: float) -> bool:
+def is_sure(gain: float, se: float) -> bool:
     """Tell whether a gain is more than chance."""
     return gain > max(STANDARD_ERRORS * se, NATS)
 

@@ -321,7 +321,7 @@ class Diagnosis(Shown):
             "parameters_before": dict(self.before.values), "parameters_after": dict(self.after.values),
             "per_run": self.after.per_run, "groups": [list(g) for g in self.groups],
             "suggestion": self.suggestion, "stopped": self.stopped or None,
-            "rivals": [Rival.of(f).to_dict() for f in self.rivals], "best": Rival.of(self.best).to_dict(),
+            "rivals": [Rival.as_allowed(f).to_dict() for f in self.rivals], "best": Rival.of(self.best).to_dict(),
         }
 
 

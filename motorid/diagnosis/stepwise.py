@@ -18,7 +18,7 @@ from motorid.diagnosis.candidates import Search, Stages, library
 from motorid.diagnosis.cross_validation import QUICK, HeldOut
 from motorid.diagnosis.input_hypotheses import Reading, better_reading, without_spikes
 from motorid.diagnosis.misspecification import FormGain, Grade, better_forms, grades_of
-from motorid.diagnosis.model_comparison import Node, at_noise, beats, choose, evidence, far, group_of, node_of, tied
+from motorid.diagnosis.model_comparison import Node, at_noise, beats, choose, evidence, far, group_of, node_of
 from motorid.diagnosis.record_parts import affordable, thinned_alike
 from motorid.diagnosis.refit import INTERRUPTED, OUT_OF_TIME
 from motorid.diagnosis.results import Adequacy, Candidate, Ladder, Rung
@@ -98,7 +98,7 @@ def _rounds(found: Climb, max_effects: int) -> Iterator[Climb]:
         found = replace(found, rounds=(*found.rounds, tuple(listed)), stopped=stopped)
         chosen = _better(children.values(), best)
         if chosen is None and room > 1 and not stopped and far(best.fit):
-            children = {c.key: c for c in search.expand_by_two(best)}
+            children = {c.key: c for c in search.expand_by_two(best, listed)}
             chosen = _better(children.values(), best)
         if chosen is None:
             yield replace(found, text="stopped: no further effect lowers the error on data left out")
@@ -281,7 +281,7 @@ def _runners_up(best: Node, ordered: Sequence[Node]) -> list[Node]:
         return []
     goal = evidence(best.parent, best).fall
     return [n for n in ordered
-            if n.key != best.key and not tied(n, best) and evidence(best.parent, n).fall > HALF_AS_GOOD * goal]
+            if n.key != best.key and evidence(best.parent, n).fall > HALF_AS_GOOD * goal]
 
 
 def _marked(listed: Sequence[Candidate], node: Node, group: tuple[str, ...]) -> tuple[Candidate, ...]:

@@ -76,6 +76,28 @@ def test_gradients_agree_with_differences(tasks, goal, monkeypatch):
             assert (a.value - b.value) / 2e-3 == pytest.approx(e.slope[j], rel=0.01, abs=0.01 * np.abs(e.slope).max())
 
 
+def test_what_an_experiment_is_worth_is_the_mean_over_the_truths_of_the_nearest_rival(tasks):
+    both, one = tasks
+    three = replace(both, driven=both.driven * 2, pairs=((0, 1), (0, 2), (1, 0), (2, 3)))
+    assert three.worth(np.array([3.0, 1.0, 2.0, 50.0])) == pytest.approx((1 + 2 + design_criteria.ENOUGH) / 3)
+    assert one.worth(np.array([50.0])) == 50, "precision has no end"
+
+
+def test_an_effect_that_the_records_leave_open_is_as_large_as_they_allow(plant, lab, fits):
+    """The fit of a motor without friction says zero: as a truth that could be told from nothing."""
+    t = DT * np.arange(400)
+    v = np.round(5 + 1.5 * np.sin(2 * np.pi * t / 0.4), 4) * np.minimum(t / 0.1, 1)
+    run = measured(plant, lab, {}, t, v, np.random.default_rng(8))[0]
+    fit = mi.fit(mi.dc_motor() + mi.effects.coulomb, [run])
+    assert fit.std["tau_c"] is None
+    assert Rival.of(fit).model.values["tau_c"] == fit.values["tau_c"] < 1e-9
+    tau = Rival.as_allowed(fit).model.values["tau_c"]
+    assert 1e-5 < tau < 0.05, "of a stall torque of 0.4 N·m"
+    with_it = mi.fit((mi.dc_motor() + mi.effects.coulomb).fix(tau_c=tau), [run])
+    assert 0 < 2 * (with_it.cost - fit.cost) / (2 * fit.cost / fit.dof) <= design_criteria.REGION**2 * 1.01
+    assert Rival.as_allowed(fits[0]).model.values == Rival.of(fits[0]).model.values, "what is determined stays"
+
+
 def test_a_rival_answers_the_same_with_and_without_slopes(tasks):
     driven = tasks[0].driven[1]
     nothing = np.zeros(len(driven.rival.scale))
@@ -241,7 +263,8 @@ def test_ramps_keep_to_the_slew_rate_and_are_played(fits, shape):
     plan = mi.design_experiment(fits, v_max=8, i_max=3, omega_max=120, duration=DURATION, levels=LEVELS, shape=shape,
                                 slew=80.0, budget=1.0)
     assert np.abs(np.diff(plan.v)).max() <= 80 * DT * 1.01
-    assert plan.excite.startswith("ramp")
+    assert plan.excite.startswith(("ramp", "rest"))
+    assert "ramp" in plan.excite
     np.testing.assert_allclose(program(plan.excite).volts(1 / DT), plan.v, atol=1e-9)
 
 
