@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from battery.cases import CASES
@@ -152,3 +154,24 @@ def test_what_is_found_later_is_no_rival_any_more():
     assert found.groups == ()
     assert "not distinguish" not in found.text
     assert not any(set(c.group) & set(found.effects) for c in found.ranking)
+
+
+def test_what_held_out_runs_refuse_for_the_lack_of_another_is_found_with_that(plant):
+    """A spring alone makes the held-out runs worse: friction would hold the motor where it springs back."""
+    motor = replace(plant.MOTORS["lab"], R=0.106, L=9e-5, K=0.52, b=0.0135, J=0.24, v_max=36.0)
+    hidden = {"spring": {"k_s": 1.3, "theta_0": 0.7}, "coulomb": {"tau_c": 23.0}}
+    rng, t = np.random.default_rng(1), 1e-3 * np.arange(1720)
+    ends = [0.052, 0.086, 0.226, 0.581, 0.729, 1.126, 1.371, 1.624]
+    hard = np.array([0, -32.4, 36, -32.3, -16.8, -31.1, -26.4, -12.2, -26.5])[np.searchsorted(ends, t, "right")]
+    other = np.repeat([-15.0, 12, 0, 13, 2, 21, 20, 19, -4, -2, 5, -19, -7, 15, 24, -23, 0, 0], 100)[:1720]
+    runs = []
+    for name, v in (("hard", hard), ("other", other)):
+        true = plant.simulate(motor, hidden, t, v, substep=None)
+        noisy = {c: true[f"true_{c}"] + s * rng.normal(size=len(t)) for c, s in
+                 (("i", 1.2), ("omega", 0.3), ("theta", 0.03))}
+        runs.append(Experiment(t, {"v": v}, noisy, name=name))
+    found = diagnosed(runs, ("spring", "coulomb", "stribeck"))
+    assert "held-out error rises" in candidate(diagnosed(runs, ("spring",)), "spring").reason
+    assert found.effects == ("spring", "coulomb")
+    assert found.ladder.rungs[1].added == "spring + coulomb"
+    assert found.after.fits == "noise"

@@ -10,11 +10,13 @@ from battery.excite import driven, record
 
 import motorid as mi
 from motorid.diagnosis import misspecification
+from motorid.diagnosis.admissibility import objections
 from motorid.diagnosis.cross_validation import HeldOut
 from motorid.diagnosis.free_forms import Form
 from motorid.diagnosis.misspecification import FormGain
-from motorid.diagnosis.model_comparison import node_of
+from motorid.diagnosis.model_comparison import node_of, tied
 from motorid.diagnosis.predictive_score import Evidence, Predictions
+from motorid.diagnosis.stepwise import _runners_up
 
 HIDDEN = {"coulomb": {"tau_c": 8e-3}}
 DRIVES = ("stairs", "ramps", "steps")
@@ -88,16 +90,21 @@ def test_what_a_free_form_outdoes_in_its_place_approximates(lab):
     assert accepted.accepted  # it stays in the ladder
 
 
-@pytest.mark.parametrize(("std", "grade"), [(2.0, "approximates"), (0.5, "named"), (None, "named")])
-def test_a_size_that_could_as_well_be_zero_is_not_named(rubbing, monkeypatch, std, grade):
-    """A size without a deviation (no current was measured) may be any."""
+@pytest.mark.parametrize(("std", "structure", "why"), [
+    (2.0, False, "tau_c could as well be zero, within two standard deviations"),
+    (0.6, False, "tau_c could as well be zero, within two standard deviations"), (0.4, False, ""), (None, False, ""),
+    (None, True, "tau_c is not determined, and the rest is not noise"), (0.4, True, ""),
+])
+def test_a_size_that_could_as_well_be_zero_is_not_named(rubbing, monkeypatch, std, structure, why):
+    """A size without a deviation (no current was measured) may be any, if noise alone is left."""
     plain, check = rubbing
     held, rubs = HeldOut.of(plain, check), mi.fit(plain.model + mi.effects.coulomb, plain.problem.experiments)
     certain = rubs.std | {"tau_c": None if std is None else std * rubs.values["tau_c"]}
     monkeypatch.setattr(mi.Fit, "std", property(lambda fit: certain))
-    (told,) = misspecification.grades_of(node_of(rubs, held), node_of(plain, held), (), (), False, lambda name: None)
-    assert told.grade == grade
-    assert ("tau_c could as well be zero" in told.why) == (grade == "approximates")
+    nodes = node_of(rubs, held), node_of(plain, held)
+    (told,) = misspecification.grades_of(*nodes, (), (), structure, lambda name: None)
+    assert told.grade == ("approximates" if why else "named")
+    assert told.why == why
 
 
 def explaining(share, rubbing):
@@ -131,3 +138,23 @@ def test_a_form_that_adds_a_trifle_to_what_an_effect_does_takes_no_name_from_it(
     (told,) = misspecification.grades_of(last, root, (), (), True, lambda name: worse)
     assert told.grade == grade
     assert ("a torque that changes with the speed, which the library lacks" in told.why) == (grade == "approximates")
+
+
+def test_friction_that_differs_by_a_trifle_with_the_direction_is_friction(rubbing):
+    """A smooth sgn makes as much of a difference, which a fine sensor sees."""
+    plain, _ = rubbing
+    both = mi.fit(plain.model + mi.effects.coulomb_asymmetric, plain.problem.experiments)
+    for share, said in ((1e-3, "no more than coulomb"), (0.1, "")):
+        alike = replace(both, values=both.values | {"tau_cp": 8e-3 * (1 + share), "tau_cn": 8e-3})
+        assert said in objections(alike, mi.effects.coulomb_asymmetric)
+        assert bool(said) == ("sizes differ" in objections(alike, mi.effects.coulomb_asymmetric))
+
+
+def test_a_model_that_ties_with_the_best_is_grown_too(rubbing):
+    """Which of them is right may show only with the next effect."""
+    plain, check = rubbing
+    held, root = HeldOut.of(plain, check), node_of(plain, HeldOut.of(plain, check))
+    best, tie, worse = (node_of(mi.fit(plain.model + e, plain.problem.experiments), held, e.name, root)
+                        for e in (mi.effects.coulomb, mi.effects.coulomb_asymmetric, mi.effects.constant_load))
+    assert tied(best, tie)
+    assert _runners_up(best, [best, tie, worse]) == [tie]
