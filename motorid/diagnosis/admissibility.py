@@ -42,7 +42,7 @@ def objections(fit: Fit, added: Effect, before: Fit | None = None) -> str:
 
 
 def _alike(fit: Fit, added: Effect) -> str:
-    """Say so where the sizes that tell an effect from a simpler one differ by a trifle: the smooth sgn makes as much."""
+    """Say so where the sizes that tell an effect from a simpler one differ by a trifle, as a smooth sgn makes too."""
     sizes = [fit.values[p.name] for p in added.parameters if p.null == 0 and p.unit in ("N·m", "N")]
     if added.includes and len(sizes) > 1 and max(sizes) - min(sizes) < MATERIAL * max(sizes):
         return f"its sizes differ by less than {percent(MATERIAL, 1)}: no more than {added.includes[0]}"

@@ -146,10 +146,10 @@ def grades_of(last: Node, root: Node, groups: Sequence[Sequence[str]], beside: S
     """Return the grade of each effect that `last` has and `root` has not.
 
     A rung that predicts better stays, whatever it is. Its effect is *named* if its law is physical there and its size
-    more than two of its deviations, no rival predicts as well, no free form that contains it, or in its place, predicts better
-    by more than the trifle that a free curve follows in any real motor and by more than a trifle of what the effect
-    itself does, and it explains more than it leaves, unless that is noise (no `structure`). A form `beside` the effect
-    that predicts surely less than the best one only imitates that. `without` gives the model without one of the
+    more than two of its deviations, no rival predicts as well, no free form that contains it, or in its place, predicts
+    better by more than the trifle that a free curve follows in any real motor and by more than a trifle of what the
+    effect itself does, and it explains more than it leaves, unless that is noise (no `structure`). A form `beside` the
+    effect that predicts surely less than the best one only imitates that. `without` gives the model without one of the
     effects, if there is one.
     """
     rivals = {g[0]: g[1:] for g in groups}
