@@ -73,14 +73,14 @@ class Form:
 
 
 _PUSHES = (  # words, balance, carrier, quantities
-    ("a friction", "torque", "direction", ("turn", "theta", "t", "run")),
+    ("a friction", "torque", "direction", ("turn", "theta", "t", "i", "run")),
     ("a load", "torque", "", ("turn", "theta", "t", "run")),
-    ("a drag", "torque", "omega", ("t", "turn", "run")),
-    ("a torque", "torque", "", ("omega",)),
+    ("a drag", "torque", "omega", ("t", "turn", "theta", "i", "run")),
+    ("a torque", "torque", "", ("omega", "i")),
     ("an inertia", "torque", "acceleration", ("turn", "t", "run")),
     ("a loss of voltage", "voltage", "", ("omega", "v", "i", "t", "run")),
     ("a gain of the voltage", "voltage", "v", ("t", "turn")),
-    ("a resistance", "voltage", "i", ("t", "turn", "run")),
+    ("a resistance", "voltage", "i", ("t", "turn", "omega", "run")),
     ("a motor constant", "both", "", ("t", "turn", "omega", "i", "run")),
 )
 FORMS = (*(Form(words, balance, on, carrier) for words, balance, carrier, quantities in _PUSHES for on in quantities),
@@ -122,8 +122,8 @@ def shown(form: Form, fit: Fit, ranges: Mapping[str, tuple[float, float]]) -> bo
         return False
     if form.on == "path" and not turns_back(*ranges["omega"]):
         return False
-    if form.balance in ("voltage", "both") and "i" not in outputs:
-        return False  # there a torque says the same
+    if "i" not in outputs and (form.balance in ("voltage", "both") or form.on == "i"):
+        return False  # there a torque over the speed says the same
     if form.remembers and fit.window is not None:
         return False  # what was before a window is not known
     return form.on != "turn" or fit.problem.model.axis != "linear"
