@@ -127,8 +127,7 @@ def plot_formulations(result: Formulations) -> np.ndarray:
     _changes(axes[0], shown)
     _errors(axes[1], shown)
     _walk(axes[2], result)
-    handles, labels = axes[0].get_legend_handles_labels()
-    axes[0].figure.legend(handles, labels, loc="outside upper center", ncols=3)
+    axes[0].figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=3)
     return axes
 
 

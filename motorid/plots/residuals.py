@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from motorid.channels import CHANNELS
-from motorid.errors import UsageError, one_of
+from motorid.errors import DataError, UsageError, one_of
 from motorid.estimation.result import Fit
 from motorid.numerics.autoregression import autocorrelation, effective_samples
 from motorid.numerics.signals import Array
@@ -70,10 +70,13 @@ def _channel(axes: np.ndarray, fit: Fit, channel: str, against: Sequence[str]) -
     _over_time(axes[0], sims, channel, sigma)
     style.tidy(axes[0], x="time, runs one after the other (s)", y=f"residual ({unit})",
                title=f"Residual of the {style.axis_label(channel, run)}")
-    every = np.concatenate([s.residual(channel) for s in sims])
-    _histogram(axes[1], style.finite(every, f"the residual of {channel}"), sigma)
+    residuals = [s.residual(channel) for s in sims]
+    every = np.concatenate(residuals)
+    if not np.isfinite(every).any():
+        raise DataError(f"nothing to draw: the residual of {channel} holds no finite number.")
+    _histogram(axes[1], every[np.isfinite(every)], sigma)
     _with_input(axes[2], sims, channel)
-    _autocorrelation(axes[3], [s.residual(channel) for s in sims])
+    _autocorrelation(axes[3], residuals)
     for ax, other in zip(axes[4:], against, strict=True):
         # The model's own: the measured one shares its noise with the residual, which then seems to depend.
         with_other = [s for s in sims if other in s.outputs]
