@@ -15,7 +15,7 @@ from motorid.acquire.client import Client, Link, SerialLink
 from motorid.acquire.excitation import Program, program
 from motorid.acquire.protocol import VERSION, Channel, Header
 from motorid.acquire.record_file import Commanded, RecordFile, Tail, check_target, read_tail
-from motorid.acquire.session import Progress, Recording, Session, Setup
+from motorid.acquire.session import Progress, Recording, Session
 from motorid.errors import DataError, UsageError, one_of, positive
 
 _ENTRIES = ("scale", "offset", "gain", "zero", "sign")  # of a calibration, per channel
@@ -99,11 +99,12 @@ def record(port: str | Link, out: str | Path, *, baud: int = 115_200, excite: st
         mode = "resume" if plan.tail else "replace" if force else "new"
         file = RecordFile(out, header.channels, header.rate, head if not plan.tail else {}, mode)
         try:
-            setup = Setup(client, header, file, len(todo.segments), _commanded(device, header, todo),
-                          _most(device, header, *limits),
-                          min((e for e in (todo.duration or None, duration) if e), default=None), duration,
-                          max(timeout, 4 / header.rate), progress)
-            return Session(setup, lambda: plan.begin(file, done)).run()
+            session = Session(client, header, file, len(todo.segments), _commanded(device, header, todo),
+                              _most(device, header, *limits),
+                              min((e for e in (todo.duration, duration) if e), default=None), duration,
+                              max(timeout, 4 / header.rate), progress)
+            plan.begin(file, done)
+            return session.run()
         finally:
             with contextlib.suppress(OSError):  # told already, where it matters
                 file.close()
