@@ -16,6 +16,7 @@ from motorid.estimation.result import Fit
 from motorid.exporters.casadi_file import (
     description,
     functions_of,
+    plain_functions,
     records_of,
     runs_of,
     simulation,
@@ -24,7 +25,6 @@ from motorid.exporters.casadi_file import (
     words,
     zoh_inputs,
 )
-from motorid.integrate.rodas3 import step_functions
 from motorid.model.model import Model
 from motorid.numerics.signals import Array
 from motorid.problem.problem import Problem
@@ -235,14 +235,12 @@ def check(found: Fit | Model) -> Checked:
         except (SimulationError, ModelError):
             return Checked(1e-3, 1, f"not checked, since the model cannot follow {what}.")
     dt = float(np.median(np.diff(records[0]["t"])))
-    error = np.inf
-    for m in 2 ** np.arange(11):
-        errors = [_error(functions, r, int(m), p) for r in records]
-        error = max(errors)
+    for m in (2**k for k in range(11)):
+        error = max(_error(functions, r, m, p) for r in records)
         if error < ACCURATE:
             break
-    return Checked(dt, int(m), f"with {m} in {dt:.3g} s it differs from the model by at most {error:.2g} of the span, "
-                               f"on {what}.")
+    return Checked(dt, m, f"with {m} in {dt:.3g} s it differs from the model by at most {error:.2g} of the span, "
+                          f"on {what}.")
 
 
 def _error(functions: Mapping[str, ca.Function], record: Mapping[str, Any], m: int, p: ca.DM) -> float:
@@ -264,8 +262,10 @@ def identifier(stem: str) -> str:
 
 def _fields(found: Fit | Model, name: str) -> dict[str, Any]:
     system = system_of(found)
-    functions = [_as(system.initial, f"{name}_f_initial"), _as(system.rhs, f"{name}_f_rhs"),
-                 _as(system.out, f"{name}_f_outputs"), _as(step_functions(system).light, f"{name}_f_step")]
+    functions = plain_functions(system, f"{name}_f_")
+    code = ca.CodeGenerator("model", {"casadi_int": "int", "casadi_real": "double", "with_header": False})
+    for f in functions:
+        code.add(f)
     sizes = dict(zip(("NX", "NU", "NP", "NY"), system.sizes, strict=True))
     starts = [s for _, s in runs_of(found)] if isinstance(found, Fit) else []
     held = zoh_inputs(system.inputs, found.problem.experiments[0]) if isinstance(found, Fit) else [
@@ -274,7 +274,7 @@ def _fields(found: Fit | Model, name: str) -> dict[str, Any]:
     checked = check(found)
     return {
         "checked": checked.text, "dt": checked.dt, "substeps": checked.substeps,
-        "name": name, "NAME": name.upper(), "title": f"{name}: a motor model as C", "generated": _generated(functions),
+        "name": name, "NAME": name.upper(), "title": f"{name}: a motor model as C", "generated": code.dump(),
         "about": "\n".join(f" * {_harmless(line)}".rstrip() for line in words(description(found))),
         "sizes": "\n".join(f"#define {name.upper()}_{k} {v}" for k, v in sizes.items()),
         "states": _strings(system.states), "inputs": _strings(system.inputs), "outputs": _strings(system.outputs),
@@ -283,21 +283,9 @@ def _fields(found: Fit | Model, name: str) -> dict[str, Any]:
         "starts_declared": f"{runs}extern const double {name}_starts[{len(starts)}][3];"
                            " /* (current, speed, angle) at the start of the records of the fit */\n" if starts else "",
         "starts": _starts(name, starts),
-        "sz_arg": max(max(f.sz_arg() for f in functions), 1), "sz_res": max(max(f.sz_res() for f in functions), 2),
-        "sz_iw": max(max(f.sz_iw() for f in functions), 1), "sz_w": max(max(f.sz_w() for f in functions), 1),
+        **{size: max(least, *(getattr(f, size)() for f in functions))
+           for size, least in (("sz_arg", 1), ("sz_res", 2), ("sz_iw", 1), ("sz_w", 1))},
     }
-
-
-def _as(f: ca.Function, name: str) -> ca.Function:
-    args = f.sx_in()
-    return ca.Function(name, args, f.call(args))
-
-
-def _generated(functions: Sequence[ca.Function]) -> str:
-    code = ca.CodeGenerator("model", {"casadi_int": "int", "casadi_real": "double", "with_header": False})
-    for f in functions:
-        code.add(f)
-    return code.dump()
 
 
 def _strings(names: Sequence[str]) -> str:
