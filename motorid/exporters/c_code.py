@@ -6,6 +6,7 @@ import re
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
+from string import Template
 from typing import Any, NamedTuple
 
 import casadi as ca
@@ -32,163 +33,7 @@ from motorid.problem.simulate import planned
 
 ACCURATE = 1e-3  # of the span of an output, that the exported step may differ from the model
 MOST_STEPS = 400_000  # on one record, to find that out
-
-HEADER = """/* {title}
- *
-{about}
- */
-#ifndef {NAME}_H
-#define {NAME}_H
-
-#ifdef __cplusplus
-extern "C" {{
-#endif
-
-/* States x, inputs u, outputs y, parameters p: SI units, in this order. */
-{sizes}
-
-extern const char* const {name}_state_names[{NAME}_NX];
-extern const char* const {name}_input_names[{NAME}_NU];
-extern const char* const {name}_output_names[{NAME}_NY];
-extern const char* const {name}_parameter_names[{NAME}_NP];
-extern const double {name}_parameters[{NAME}_NP];
-extern const int {name}_held[{NAME}_NU]; /* 1: the input stays constant between samples, 0: straight lines */
-{starts_declared}
-/* x at the start from s = (current, speed, angle) there. */
-void {name}_initial(const double s[3], const double* p, double* x);
-/* dx/dt; of a balance without storage, the balance itself. */
-void {name}_rhs(const double* x, const double* u, const double* p, double* dx);
-/* What the sensors show. */
-void {name}_outputs(const double* x, const double* u, const double* p, double* y);
-/* x over dt in equal sub-steps, the input running from u0 to u1; with substeps < 1 as many as {NAME}_SUBSTEPS in
- * {NAME}_DT seconds. The step is L-stable, but quick states (bristles, a small inductance) need short ones:
- * {checked} */
-#define {NAME}_DT {dt!r}
-#define {NAME}_SUBSTEPS {substeps}
-void {name}_step(double* x, const double* u0, const double* u1, double dt, int substeps, const double* p);
-
-#ifdef __cplusplus
-}}
-#endif
-#endif
-"""
-
-WRAPPER = """
-#include "{name}.h"
-
-const char* const {name}_state_names[{NAME}_NX] = {{{states}}};
-const char* const {name}_input_names[{NAME}_NU] = {{{inputs}}};
-const char* const {name}_output_names[{NAME}_NY] = {{{outputs}}};
-const char* const {name}_parameter_names[{NAME}_NP] = {{{parameter_names}}};
-const double {name}_parameters[{NAME}_NP] = {{
-  {parameters}
-}};
-const int {name}_held[{NAME}_NU] = {{{held}}};
-{starts}
-static void {name}_call(int (*f)(const double**, double**, int*, double*, int), const double** given, int n_given,
-                        double* result, double* other) {{
-  const double* arg[{sz_arg}];
-  double* res[{sz_res}];
-  int iw[{sz_iw}];
-  double w[{sz_w}];
-  int k;
-  for (k = 0; k < {sz_arg}; k++) arg[k] = k < n_given ? given[k] : 0;
-  for (k = 0; k < {sz_res}; k++) res[k] = 0;
-  res[0] = result;
-  res[1] = other;
-  f(arg, res, iw, w, 0);
-}}
-
-void {name}_initial(const double s[3], const double* p, double* x) {{
-  const double* given[2];
-  given[0] = s; given[1] = p;
-  {name}_call({name}_f_initial, given, 2, x, 0);
-}}
-
-void {name}_rhs(const double* x, const double* u, const double* p, double* dx) {{
-  const double* given[3];
-  given[0] = x; given[1] = u; given[2] = p;
-  {name}_call({name}_f_rhs, given, 3, dx, 0);
-}}
-
-void {name}_outputs(const double* x, const double* u, const double* p, double* y) {{
-  const double* given[3];
-  given[0] = x; given[1] = u; given[2] = p;
-  {name}_call({name}_f_outputs, given, 3, y, 0);
-}}
-
-void {name}_step(double* x, const double* u0, const double* u1, double dt, int substeps, const double* p) {{
-  double a[{NAME}_NU], b[{NAME}_NU], next[{NAME}_NX], error[{NAME}_NX], h;
-  const double* given[5];
-  int s, j;
-  if (substeps < 1) substeps = (int)(dt / {NAME}_DT * {NAME}_SUBSTEPS + 0.999);
-  if (substeps < 1) substeps = 1;
-  h = dt / substeps;
-  for (s = 0; s < substeps; s++) {{
-    for (j = 0; j < {NAME}_NU; j++) {{
-      a[j] = u0[j] + (u1[j] - u0[j]) * s / substeps;
-      b[j] = u0[j] + (u1[j] - u0[j]) * (s + 1) / substeps;
-    }}
-    given[0] = x; given[1] = a; given[2] = b; given[3] = &h; given[4] = p;
-    {name}_call({name}_f_step, given, 5, next, error);
-    for (j = 0; j < {NAME}_NX; j++) x[j] = next[j];
-  }}
-}}
-"""
-
-MAIN = r"""/* Example, written by motorid: walk the model over a record.
- *
- *   cc -O2 {name}_main.c {name}.c -lm -o {name}
- *   ./{name} RECORD.csv [RUN] > out.csv
- *
- * RECORD.csv has one heading line, then per sample: time (s), the inputs, and the sub-steps to the next sample.
- * RUN counts the records of the fit from 0; it picks the state at the start (all zero where there is none).
- */
-#include <stdio.h>
-#include <stdlib.h>
-#include "{name}.h"
-
-static int read_row(FILE* file, double* t, double* u, int* substeps) {{
-  int j;
-  if (fscanf(file, "%lf", t) != 1) return 0;
-  for (j = 0; j < {NAME}_NU; j++) if (fscanf(file, " ,%lf", &u[j]) != 1) return 0;
-  return fscanf(file, " ,%d", substeps) == 1 && *substeps > 0;
-}}
-
-int main(int argc, char** argv) {{
-  double s[3] = {{0, 0, 0}}, x[{NAME}_NX], y[{NAME}_NY], u[{NAME}_NU], v[{NAME}_NU], t, later;
-  int run = argc > 2 ? atoi(argv[2]) : 0, m, next, j, c;
-  FILE* file = argc > 1 ? fopen(argv[1], "r") : 0;
-  if (!file) {{ fprintf(stderr, "usage: %s RECORD.csv [RUN]\n", argv[0]); return 2; }}
-  while ((c = fgetc(file)) != '\n' && c != EOF) {{}}
-#ifdef {NAME}_RUNS
-  if (run < 0 || run >= {NAME}_RUNS) {{ fprintf(stderr, "runs are 0 to %d\n", {NAME}_RUNS - 1); return 2; }}
-  for (j = 0; j < 3; j++) s[j] = {name}_starts[run][j];
-#else
-  (void)run;
-#endif
-  if (!read_row(file, &t, u, &m)) {{ fprintf(stderr, "%s has no rows of t, inputs, sub-steps\n", argv[1]); return 2; }}
-  {name}_initial(s, {name}_parameters, x);
-  printf("t");
-  for (j = 0; j < {NAME}_NY; j++) printf(",%s", {name}_output_names[j]);
-  for (;;) {{
-    {name}_outputs(x, u, {name}_parameters, y);
-    printf("\n%.17g", t);
-    for (j = 0; j < {NAME}_NY; j++) printf(",%.17g", y[j]);
-    if (!read_row(file, &later, v, &next)) break;
-    {{
-      double end[{NAME}_NU];
-      for (j = 0; j < {NAME}_NU; j++) end[j] = {name}_held[j] ? u[j] : v[j];
-      {name}_step(x, u, end, later - t, m, {name}_parameters);
-    }}
-    for (j = 0; j < {NAME}_NU; j++) u[j] = v[j];
-    t = later; m = next;
-  }}
-  printf("\n");
-  fclose(file);
-  return 0;
-}}
-"""
+TEMPLATES = Path(__file__).with_name("templates")  # C with $names
 
 
 def c_files(found: Fit | Model, path: Path) -> dict[Path, str]:
@@ -197,14 +42,13 @@ def c_files(found: Fit | Model, path: Path) -> dict[Path, str]:
     NAME is the stem of `path`, made a C identifier. See the header for the functions.
     """
     name = identifier(path.stem)
-    folder = path.parent
     fields = _fields(found, name)
-    source = f"/* {fields['title']}, written by motorid */\n" + fields["generated"] + WRAPPER.format_map(fields)
-    files = {f"{name}.c": source, f"{name}.h": HEADER.format_map(fields), f"{name}_main.c": MAIN.format_map(fields)}
+    files = {path.with_name(f"{name}{ending}"): Template((TEMPLATES / file).read_text("utf-8")).substitute(fields)
+             for ending, file in ((".c", "model.c"), (".h", "model.h"), ("_main.c", "main.c"))}
     if isinstance(found, Fit):
-        for k, (run, _) in enumerate(runs_of(found)):
-            files[f"{name}_run{k}.csv"] = _record(run.grid, found.problem.system.inputs)
-    return {folder / file: text for file, text in files.items()}
+        files |= {path.with_name(f"{name}_run{k}.csv"): _record(run.grid, found.problem.system.inputs)
+                  for k, (run, _) in enumerate(runs_of(found))}
+    return files
 
 
 class Checked(NamedTuple):
