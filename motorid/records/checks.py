@@ -133,13 +133,10 @@ def current_limit(run: Experiment) -> str | None:
     if near > 0.1 * top:
         return None
     flat = np.abs(np.abs(i) - top) < near
-    ends = np.flatnonzero(np.diff(np.r_[0, flat.astype(int), 0]))
-    held = 0
-    for a, b in zip(ends[::2], ends[1::2], strict=True):
-        steady = np.ptp(v[a:b]) < 0.02 * np.ptp(v)
-        if b - a >= 10 and steady and np.isfinite(omega[a:b]).all() and np.ptp(omega[a:b]) > 0.2 * np.nanmax(
-                np.abs(omega)):
-            held += b - a
+    ends = np.flatnonzero(np.diff(flat.astype(int), prepend=0, append=0))
+    clear = 0.2 * np.nanmax(np.abs(omega))  # no range with a missing sample is larger
+    held = sum(b - a for a, b in zip(ends[::2], ends[1::2], strict=True)
+               if b - a >= 10 and np.ptp(v[a:b]) < 0.02 * np.ptp(v) and np.ptp(omega[a:b]) > clear)
     if held < 0.02 * run.n:
         return None
     return (f"the current stays at {top:.3g} {run.units['i']} while the voltage stays and the speed changes "
@@ -259,14 +256,14 @@ def _never_reverses(runs: Sequence[Experiment]) -> str | None:
 
 def signs(run: Experiment) -> str | None:
     """Positive voltage must drive positive current and, on the whole, positive speed."""
-    v = run.inputs["v"]
-    against = [name for name, cosine in (("current", _cosine(v, run.outputs.get("i"))),
-                                         ("speed", _speed_cosine(run))) if cosine < -0.4]
     if "omega" in run.outputs:  # a motor that brakes goes against its voltage, too: the balances know
         order, turned = _as_balances_want(run)
-        against = [name for name, sign in zip(("current", "speed"), turned, strict=True) if sign < 0]
         if order != (0, 1, 2):
             return None
+    else:
+        turned = [-1 if cosine < -0.4 else 1
+                  for cosine in (_cosine(run.inputs["v"], run.outputs.get("i")), _speed_cosine(run))]
+    against = [name for name, sign in zip(("current", "speed"), turned, strict=True) if sign < 0]
     measured = ["current"] * ("i" in run.outputs) + ["speed"] * bool({"omega", "theta"} & set(run.outputs))
     if not against:
         return None
@@ -515,8 +512,7 @@ def _cosine(a: Array, b: Array | None) -> float:
 
 
 def _speed_cosine(run: Experiment) -> float:
-    if "omega" in run.outputs:
-        return _cosine(run.inputs["v"], run.outputs["omega"])
+    """Return the cosine of the integral of the voltage and the travel, where no speed was measured."""
     if "theta" not in run.outputs or len(edges := _edges(run, "theta")) < 6:
         return 0.0
     travel = np.diff(run.outputs["theta"][edges])

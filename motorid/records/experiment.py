@@ -78,7 +78,10 @@ class Experiment(Shown):
     def __post_init__(self) -> None:
         _freeze(self, "name", printable(str(self.name)))
         for optional in ("sigma", "units", "meta"):
-            _freeze(self, optional, _mapping(getattr(self, optional), optional, self.name))
+            given = getattr(self, optional)
+            if not isinstance(given, Mapping | None):
+                raise DataError(f"{self.name}: '{optional}' must be a mapping from names to values; got {given!r}.")
+            _freeze(self, optional, MappingProxyType(dict(given or {})))
         t = _frozen_array(self.t, "t", self.name)
         _check_time(t, self.name)
         _freeze(self, "t", t)
@@ -288,12 +291,6 @@ def _frozen_array(values: ArrayLike, what: str, run: str) -> Array:
         raise DataError(f"{run}: '{what}' must have one dimension; its shape is {array.shape}.")
     array.flags.writeable = False
     return array
-
-
-def _mapping(given: object, what: str, run: str) -> Mapping[str, Any]:
-    if given is not None and not isinstance(given, Mapping):
-        raise DataError(f"{run}: '{what}' must be a mapping from names to values; got {given!r}.")
-    return MappingProxyType(dict(given or {}))
 
 
 def _check_time(t: Array, run: str) -> None:
