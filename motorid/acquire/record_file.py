@@ -30,8 +30,7 @@ def _unknown(index: int) -> None:
 
 def column(channel: Channel) -> str:
     """Name of the channel's column, one that `read_runs` knows."""
-    other = f"{channel.name}_{channel.unit}".replace("/", "_per_")
-    return _COLUMNS.get((channel.name, channel.unit), other)
+    return _COLUMNS.get((channel.name, channel.unit), f"{channel.name}_{channel.unit}".replace("/", "_per_"))
 
 
 class Tail(NamedTuple):

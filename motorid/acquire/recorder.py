@@ -138,15 +138,13 @@ def _commanded(device: Header, header: Header, todo: Program) -> Commanded:
 
 def _head(port: str | Link, header: Header, whole: Program, limits: tuple[float, float],
           entries: Mapping[str, Any]) -> dict[str, object]:
-    head: dict[str, object] = {"motorid record": f"protocol {VERSION}", "device": header.name,
-                               "port": port if isinstance(port, str) else type(port).__name__,
-                               "started": datetime.now().astimezone().isoformat(timespec="milliseconds"),
-                               "rate_Hz": f"{header.rate:g}", "limits": f"{limits[0]:g} V, {limits[1]:g} A",
-                               "excitation": whole.words}
-    for channel in header.channels:
-        head[f"channel {channel.name}"] = (f"{channel.scale:.9g} {channel.unit} per count, zero at "
-                                           f"{channel.offset:.9g}, kind {channel.kind}")
-    return head | ({"calibration": entries} if entries else {})
+    return {"motorid record": f"protocol {VERSION}", "device": header.name,
+            "port": port if isinstance(port, str) else type(port).__name__,
+            "started": datetime.now().astimezone().isoformat(timespec="milliseconds"),
+            "rate_Hz": f"{header.rate:g}", "limits": f"{limits[0]:g} V, {limits[1]:g} A", "excitation": whole.words,
+            **{f"channel {c.name}": f"{c.scale:.9g} {c.unit} per count, zero at {c.offset:.9g}, kind {c.kind}"
+               for c in header.channels},
+            **({"calibration": entries} if entries else {})}
 
 
 @dataclass(frozen=True)
@@ -164,9 +162,8 @@ class RecordingPlan:
         if self.tail is None:
             return whole, 0
         meta = self.tail.meta
-        before = int(meta.get("segments done", 0))
-        ran = self.tail.time - float(meta.get("part begins", 0))
-        left = Program(whole.segments[before:], whole.words).after(ran)
+        left = Program(whole.segments[int(meta.get("segments done", 0)):], whole.words).after(
+            self.tail.time - float(meta.get("part begins", 0)))
         if meta.get("ended") == "done" or (whole.segments and not left.segments):
             raise UsageError("this record is complete; there is nothing to resume. Choose another name for --out.")
         return left, len(whole.segments) - len(left.segments)
@@ -223,8 +220,7 @@ def calibrate(header: Header, calibration: dict[str, dict[str, float]]) -> Heade
         if name not in names:
             raise DataError(f"the calibration names a channel that the device does not send: "
                             f"{one_of(name, names, 'channel')}")
-    channels = tuple(_calibrated(c, calibration.get(c.name, {})) for c in header.channels)
-    return replace(header, channels=channels)
+    return replace(header, channels=tuple(_calibrated(c, calibration.get(c.name, {})) for c in header.channels))
 
 
 def _calibrated(channel: Channel, entries: dict[str, float]) -> Channel:

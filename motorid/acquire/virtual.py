@@ -92,14 +92,12 @@ class VirtualDevice:
         if not self._made % BLOCK:
             self._noise = self._rng.normal(0.0, NOISE, size=(BLOCK, 2)).tolist()
         m, noise = self.truth.motor, self._noise[self._made % BLOCK]
-        raw = [convert(m, mv, seen, noise) for convert in self._raw]
-        line = frame("D", self._counter, self._time, *raw)
+        line = frame("D", self._counter, self._time, *(convert(m, mv, seen, noise) for convert in self._raw))
         self._over = self._over + 1 if abs(seen["i"]) > self._limits[1] else 0
         self._plant.step(mv / 1e3, 1 / self.header.rate)
         self._made += 1
         self._counter = (self._counter + 1) % (1 << self.header.counter_bits)
-        since = round(self._made * 1e6 / self.header.rate)
-        self._time = (self._start[1] + since) % (1 << self.header.timer_bits)
+        self._time = (self._start[1] + round(self._made * 1e6 / self.header.rate)) % (1 << self.header.timer_bits)
         return line
 
     def _answer(self, fields: list[str]) -> bytes:

@@ -128,8 +128,7 @@ def _keep_fit(before: Fit, done: Sequence[str], json: Json, force: bool) -> None
 def _write_remainder(found: Diagnosis, path: Path, force: bool) -> None:
     """Write what is left as an effect to edit; it may have been edited, so never over a file that is there."""
     assert found.remainder is not None
-    source = found.remainder.code(path.stem if path.stem.isidentifier() else "remainder")
-    write_files({path: source}, force)
+    write_files({path: found.remainder.code(path.stem if path.stem.isidentifier() else "remainder")}, force)
     effects = ",".join((*found.remainder.model.effect_names, path.stem))
     show(f"Written: {path}. Fit with it: --effects-from {path} --effects {effects}")
 

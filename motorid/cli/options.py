@@ -236,8 +236,7 @@ def own_effects(path: Path) -> dict[str, Effect]:
     except BaseException as error:  # whatever the user's own code raises
         if interruption.behind(error):
             raise
-        what = f"{type(error).__name__}: {error}"
-        raise UsageError(f"--effects-from: {path} cannot be run: {what}.") from None
+        raise UsageError(f"--effects-from: {path} cannot be run: {type(error).__name__}: {error}.") from None
     effects = [e for e in vars(module).values() if isinstance(e, Effect)]
     found = {e.name: e for e in effects if library.EVERY.get(e.name) is not e}
     if not found:
@@ -256,8 +255,7 @@ def named_effect(name: str, own: dict[str, Effect]) -> Effect:
 
 def saved_model(path: Path, effects_from: Path | None = None) -> Model:
     """Return the model that ``fit --json`` or ``export`` wrote, at its values; see `load` for what it raises."""
-    own = own_effects(effects_from) if effects_from else {}
-    found = load(path, own.values())
+    found = load(path, own_effects(effects_from).values() if effects_from else ())
     return found if isinstance(found, Model) else found.model
 
 

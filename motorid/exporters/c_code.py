@@ -149,7 +149,6 @@ def _starts(name: str, starts: Sequence[np.ndarray]) -> str:
 
 
 def _record(grid: Any, inputs: Sequence[str]) -> str:
-    substeps = np.append(grid.substeps, 1)
     rows = [",".join([repr(t), *map(repr, u), str(m)])
-            for t, u, m in zip(grid.t.tolist(), grid.u.tolist(), substeps.tolist(), strict=True)]
+            for t, u, m in zip(grid.t.tolist(), grid.u.tolist(), np.append(grid.substeps, 1).tolist(), strict=True)]
     return "\n".join([",".join(["t", *inputs, "substeps"]), *rows, ""])

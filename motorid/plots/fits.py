@@ -47,8 +47,7 @@ def plot_runs(runs: Sequence[Experiment] | Experiment, channels: Sequence[str] |
     if not every:
         raise UsageError("plot_runs needs at least one run: mi.plot_runs(mi.read_runs('run*.csv')).")
     shown = every[:COLUMNS]
-    measured = [c for c in CHANNELS if any(c in r.outputs for r in shown)]
-    names = list(channels or ["v", *measured])
+    names = list(channels or ["v", *(c for c in CHANNELS if any(c in r.outputs for r in shown))])
     for name in names:
         if not any(name in run.inputs or name in CHANNELS for run in every):
             raise UsageError(one_of(name, ["v", *CHANNELS], "channel"))

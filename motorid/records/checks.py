@@ -132,8 +132,7 @@ def current_limit(run: Experiment) -> str | None:
     near = 4 * noise_level(i, run.t)
     if near > 0.1 * top:
         return None
-    flat = np.abs(np.abs(i) - top) < near
-    ends = np.flatnonzero(np.diff(flat.astype(int), prepend=0, append=0))
+    ends = np.flatnonzero(np.diff((np.abs(np.abs(i) - top) < near).astype(int), prepend=0, append=0))
     clear = 0.2 * np.nanmax(np.abs(omega))  # no range with a missing sample is larger
     held = sum(b - a for a, b in zip(ends[::2], ends[1::2], strict=True)
                if b - a >= 10 and np.ptp(v[a:b]) < 0.02 * np.ptp(v) and np.ptp(omega[a:b]) > clear)
@@ -516,8 +515,7 @@ def _speed_cosine(run: Experiment) -> float:
     if "theta" not in run.outputs or len(edges := _edges(run, "theta")) < 6:
         return 0.0
     travel = np.diff(run.outputs["theta"][edges])
-    pushed = np.diff(integral(run.t, run.inputs["v"])[edges])
-    return _cosine(pushed, travel)
+    return _cosine(np.diff(integral(run.t, run.inputs["v"])[edges]), travel)
 
 
 def _block_travel(run: Experiment) -> tuple[Array, Array]:
@@ -526,8 +524,7 @@ def _block_travel(run: Experiment) -> tuple[Array, Array]:
     omega = run.outputs["omega"]
     if np.isfinite(omega).sum() < 2:
         return np.empty(0), np.empty(0)
-    filled = bridged(run.t, omega)
-    return np.diff(run.outputs["theta"][edges]), np.diff(integral(run.t, filled)[edges])
+    return np.diff(run.outputs["theta"][edges]), np.diff(integral(run.t, bridged(run.t, omega))[edges])
 
 
 def _edges(run: Experiment, channel: str) -> NDArray[np.intp]:

@@ -180,8 +180,7 @@ class Experiment(Shown):
 
         Not next to jumps of the voltage, where the motor is quick; at least three, at most 5 % of a channel.
         """
-        v = self.inputs["v"]
-        outputs = {c: preprocessing.without_spikes(self.t, y, v) for c, y in self.outputs.items()}
+        outputs = {c: preprocessing.without_spikes(self.t, y, self.inputs["v"]) for c, y in self.outputs.items()}
         return self.with_(outputs=outputs) if any(outputs[c] is not y for c, y in self.outputs.items()) else self
 
     def _with_inputs(self, read: Callable[[Array], Array]) -> Experiment:

@@ -79,8 +79,7 @@ def parse_table(data: bytes) -> TextTable:
         raise DataError(f"it has no rows of at least two numbers; it begins with '{body[0][:60]}'. Expected "
                         "one row per sample, with a comma, semicolon, tab or space between the values.")
     labels, unit_row = _header(body[:first], comments, dialect, width, notes)
-    rows = _rows(body[first:], dialect, len(labels), notes)
-    columns, texts = _parse(rows, dialect, labels, notes)
+    columns, texts = _parse(_rows(body[first:], dialect, len(labels), notes), dialect, labels, notes)
     return TextTable(columns, texts, labels, dict(zip(labels, unit_row, strict=False)), comments, notes)
 
 
