@@ -196,10 +196,9 @@ class Experiment(Shown):
         rows = []
         for name, y in (*self.inputs.items(), *self.outputs.items()):
             good = y[np.isfinite(y)]
-            missing = len(y) - len(good)
-            limits = [number(float(limit), 3) for limit in (good.min(), good.max())] if len(good) else []
-            rows.append([f"{NAMES[name]} {name}", f"{limits[0]} … {limits[1]} {self.units[name]}" if limits else "–",
-                         Flag(f"{missing} of {len(y)}", "note") if missing else "none"])
+            limits = f"{number(good.min(), 3)} … {number(good.max(), 3)} {self.units[name]}" if len(good) else "–"
+            missing = Flag(f"{len(y) - len(good)} of {len(y)}", "note") if len(good) < len(y) else "none"
+            rows.append([f"{NAMES[name]} {name}", limits, missing])
         head = (f"{self.n} samples in {duration(self.duration)}, {number(1e3 * self.dt, 3)} ms apart; "
                 f"input {'constant' if self.hold == 'zoh' else 'linear'} between samples.")
         return Card(f"Run {self.name}", text=(head, *(str(n) for n in self.meta.get("notes", ()))),
@@ -229,8 +228,7 @@ def split(experiment: Experiment, n: int = 2) -> list[Experiment]:
 
 
 def windows(experiment: Experiment, seconds: float) -> list[Experiment]:
-    """Cut a run into windows of about `seconds`, to be simulated each from a state of its own; what is cut stays so.
-    """
+    """Cut a run into windows of about `seconds`, each to be simulated from its own state; what is cut stays so."""
     if "window" in experiment.meta:
         return [experiment]
     if not 0 < seconds < np.inf:
