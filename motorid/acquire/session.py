@@ -166,9 +166,8 @@ class Session:
                 if time.monotonic() > ask:
                     self.client.link.write(frame("X"))
                     ask = time.monotonic() + 0.3
-                items = self.client.receive(0.05)
-                wanted = [i for i in items if self.ended != "disk" or isinstance(i, Message)]
-                self._take(wanted, time.monotonic())
+                came = self.client.receive(0.05)
+                self._take([i for i in came if self.ended != "disk" or isinstance(i, Message)], time.monotonic())
 
     def _close(self) -> Recording:
         self.client.decoder.close()
@@ -291,9 +290,8 @@ class Recording(Shown):
                     ((f'mi.read_runs("{self.path.name}")', "read it"),))
 
     def __str__(self) -> str:
-        made = self.received + self.lost
-        share = f" ({100 * self.lost / made:.3g} %)" if self.lost else ""
-        gaps = f"{self.lost} lost{share}, {'marked as missing' if self.lost else 'nothing missing'}"
+        share = 100 * self.lost / max(self.received + self.lost, 1)
+        gaps = f"{self.lost} lost ({share:.3g} %), marked as missing" if self.lost else "0 lost, nothing missing"
         lines = [self.sentence, f"{self.path}: {self.received} samples, {self.seconds:.6g} s; {gaps}."]
         if not self.tail_known:
             lines.append("Whether the device made more samples after the last one received is not known.")
