@@ -235,7 +235,7 @@ class Truth:
 
 
 def hide(words: str = "random", motor: str = "lab", seed: int = 0) -> Truth:
-    """Choose a motor and what is hidden in it.
+    """Choose a motor and what is hidden in it; UsageError for a name or a number that is not known.
 
     Parameters
     ----------
@@ -245,11 +245,6 @@ def hide(words: str = "random", motor: str = "lab", seed: int = 0) -> Truth:
     motor : str
         One of the plant's motors. Its constants are drawn within 10 % of the nominal ones.
     seed : int
-
-    Raises
-    ------
-    UsageError
-        For a name or a number that is not known.
     """
     plant = load_plant()
     if motor not in plant.MOTORS:

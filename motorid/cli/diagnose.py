@@ -191,13 +191,7 @@ def design_command(found_json: Found, out: Plan = None, goal: Goal = None, param
 
 
 def read_rivals(path: Path, effects_from: Path | None, goal: str | None) -> list[Rival]:
-    """Return the rivals, or the best model alone, that ``diagnose --json`` wrote.
-
-    Raises
-    ------
-    DataError
-        If the file cannot be read, or is no such file.
-    """
+    """Return the rivals, or the best model alone, that ``diagnose --json`` wrote; DataError if that cannot be read."""
     own, text = list(own_effects(effects_from).values()) if effects_from else [], read_bytes(path)
     try:
         contents = loads(text)

@@ -39,13 +39,7 @@ UNARY, BINARY = (frozenset(f"OP_{n}" for n in names.split()) for names in (
 
 
 def model_of(found: Fit | Model) -> Model:
-    """Return the model at its values.
-
-    Raises
-    ------
-    UsageError
-        If `found` is neither a fit nor a model.
-    """
+    """Return the model at its values; UsageError if `found` is neither a fit nor a model."""
     if isinstance(found, Fit):
         return found.model
     if isinstance(found, Model):

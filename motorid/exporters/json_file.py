@@ -117,13 +117,7 @@ def _of_no_motor(fit: Fit) -> list[str]:
 
 
 def write_json(contents: Mapping[str, Any], path: str | Path, force: bool = False) -> None:
-    """Write a dictionary as JSON; ``-`` is standard output.
-
-    Raises
-    ------
-    UsageError, OutputError
-        If the file cannot or must not be written, see `write_files`.
-    """
+    """Write a dictionary as JSON; ``-`` is standard output. For errors see `write_files`."""
     text = json_text(contents)
     if str(path) != "-":
         write_files({Path(path): text}, force)
