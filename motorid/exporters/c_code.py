@@ -14,18 +14,7 @@ import numpy as np
 
 from motorid.errors import ModelError, SimulationError, printable
 from motorid.estimation.result import Fit
-from motorid.exporters.casadi_file import (
-    description,
-    functions_of,
-    plain_functions,
-    records_of,
-    runs_of,
-    simulation,
-    system_of,
-    values_of,
-    words,
-    zoh_inputs,
-)
+from motorid.exporters import casadi_file
 from motorid.model.model import Model
 from motorid.numerics.signals import Array
 from motorid.problem.problem import Problem
@@ -47,7 +36,7 @@ def c_files(found: Fit | Model, path: Path) -> dict[Path, str]:
              for ending, file in ((".c", "model.c"), (".h", "model.h"), ("_main.c", "main.c"))}
     if isinstance(found, Fit):
         files |= {path.with_name(f"{name}_run{k}.csv"): _record(run.grid, found.problem.system.inputs)
-                  for k, (run, _) in enumerate(runs_of(found))}
+                  for k, (run, _) in enumerate(casadi_file.runs_of(found))}
     return files
 
 
@@ -63,19 +52,19 @@ class Checked(NamedTuple):
 def check(found: Fit | Model) -> Checked:
     """Walk the exported step over the records of a fit (of a model: over a falling square wave), in equal sub-steps,
     twice as many until it agrees with the simulation to `ACCURATE` of the span of each output."""
-    functions = {f.name(): f for f in functions_of(found)}
+    functions = {f.name(): f for f in casadi_file.functions_of(found)}
     p = functions["parameters"]()["p"]
     if isinstance(found, Fit):
-        records, what = records_of(found)[:3], "the records of the fit"
+        records, what = casadi_file.records_of(found)[:3], "the records of the fit"
     else:
         t: Array = np.arange(2000) / 1e3
         v = 12.0 if found.base == "dc_motor" else 1.0
         what = f"a square wave that falls from ±{v:g} to 0 in 2 s, sampled at 1 ms"
         try:
             plan = planned(found, t, v * (1 - t / 2) ** 2 * np.sign(np.sin(16 * t + 0.1)),
-                           channels=system_of(found).outputs)
+                           channels=casadi_file.system_of(found).outputs)
             problem = Problem(found.fix(*found.parameters), (plan,), initial="rest")
-            records = records_of(problem.refined(problem.start))
+            records = casadi_file.records_of(problem.refined(problem.start))
         except (SimulationError, ModelError):
             return Checked(1e-3, 1, f"not checked, since the model cannot follow {what}.")
     dt = float(np.median(np.diff(records[0]["t"])))
@@ -91,7 +80,7 @@ def _error(functions: Mapping[str, ca.Function], record: Mapping[str, Any], m: i
     """Return the largest difference of an output between `m` sub-steps and those of the record, over its span."""
     n = max(min(len(record["t"]), MOST_STEPS // m), 2)
     t, u, fine = np.array(record["t"][:n]), np.array(record["u"])[:, :n], np.array(record["substeps"][:n - 1])
-    y, told = (np.array(simulation("walk", functions, t, k, record["held"])(record["s"], u, p)[0])
+    y, told = (np.array(casadi_file.simulation("walk", functions, t, k, record["held"])(record["s"], u, p)[0])
                for k in (np.full(n - 1, m), fine))
     span = np.maximum(np.ptp(told, axis=1), 1e-300)
     error = float((np.abs(y - told).max(axis=1) / span).max())
@@ -105,25 +94,25 @@ def identifier(stem: str) -> str:
 
 
 def _fields(found: Fit | Model, name: str) -> dict[str, Any]:
-    system = system_of(found)
-    functions = plain_functions(system, f"{name}_f_")
+    system, about = casadi_file.system_of(found), casadi_file.words(casadi_file.description(found))
+    functions = casadi_file.plain_functions(system, f"{name}_f_")
     code = ca.CodeGenerator("model", {"casadi_int": "int", "casadi_real": "double", "with_header": False})
     for f in functions:
         code.add(f)
     sizes = dict(zip(("NX", "NU", "NP", "NY"), system.sizes, strict=True))
-    starts = [s for _, s in runs_of(found)] if isinstance(found, Fit) else []
-    held = zoh_inputs(system.inputs, found.problem.experiments[0]) if isinstance(found, Fit) else [
+    starts = [s for _, s in casadi_file.runs_of(found)] if isinstance(found, Fit) else []
+    held = casadi_file.zoh_inputs(system.inputs, found.problem.experiments[0]) if isinstance(found, Fit) else [
         n != "theta_in" for n in system.inputs]
     runs = f"#define {name.upper()}_RUNS {len(starts)}\n" if starts else ""
     checked = check(found)
     return {
         "checked": checked.text, "dt": checked.dt, "substeps": checked.substeps,
         "name": name, "NAME": name.upper(), "title": f"{name}: a motor model as C", "generated": code.dump(),
-        "about": "\n".join(f" * {_harmless(line)}".rstrip() for line in words(description(found))),
+        "about": "\n".join(f" * {_harmless(line)}".rstrip() for line in about),
         "sizes": "\n".join(f"#define {name.upper()}_{k} {v}" for k, v in sizes.items()),
         "states": _strings(system.states), "inputs": _strings(system.inputs), "outputs": _strings(system.outputs),
         "parameter_names": _strings(system.parameters), "held": ", ".join(str(int(h)) for h in held),
-        "parameters": ",\n  ".join(f"{v!r}" for v in values_of(found, system).tolist()),
+        "parameters": ",\n  ".join(f"{v!r}" for v in casadi_file.values_of(found, system).tolist()),
         "starts_declared": f"{runs}extern const double {name}_starts[{len(starts)}][3];"
                            " /* (current, speed, angle) at the start of the records of the fit */\n" if starts else "",
         "starts": _starts(name, starts),
