@@ -23,7 +23,6 @@ from motorid.numerics.parallel import processes
 from motorid.problem.simulate import NRMSE, Evaluation, error_table, evaluate, run_table
 from motorid.records.experiment import Experiment
 from motorid.records.files import write_files
-from motorid.records.layout import parse_pairs
 from motorid.records.reading import csv_text
 from motorid.uncertainty.batch import fit_many, motors_in
 from motorid.uncertainty.identifiability import Identifiability, identifiability
@@ -106,11 +105,8 @@ def fit_many_command(
     model = options.model(next(known, []))  # the first that can be read tell a rotary from a linear axis
     if options.preprocesses:
         motors = {name: _readable(options, files) or files for name, files in motors.items()}
-    reading: dict[str, Any] = {k: parse_pairs(v, f"--{k}") for k in ("columns", "units") if (v := getattr(options, k))}
-    reading |= {"hold": options.hold} if options.hold else {}
-    given = {"journal": journal, "reading": reading, **options.keywords()}
     with processes(min(jobs, len(motors))) as over:
-        found = fit_many(model, motors, map=over, **given)
+        found = fit_many(model, motors, map=over, journal=journal, reading=options.reading, **options.keywords())
     if json != "-":
         show(str(found))
     if json:

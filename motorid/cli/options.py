@@ -85,9 +85,13 @@ class ReadingOptions:
 
     def read(self, paths: Sequence[str]) -> list[Experiment]:
         """Return the runs."""
-        columns = parse_pairs(self.columns, "--columns") if self.columns else None
-        units = parse_pairs(self.units, "--units") if self.units else None
-        return self._preprocessed(read_runs(paths, columns=columns, units=units, hold=self.hold))
+        return self._preprocessed(read_runs(paths, **self.reading))
+
+    @property
+    def reading(self) -> dict[str, Any]:
+        """What was said for `read_runs`, as its keyword arguments."""
+        named = {k: parse_pairs(v, f"--{k}") for k in ("columns", "units") if (v := getattr(self, k))}
+        return named | ({"hold": self.hold} if self.hold else {})
 
     @property
     def preprocesses(self) -> bool:

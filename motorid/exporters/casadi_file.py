@@ -97,8 +97,7 @@ def functions_of(found: Fit | Model) -> list[ca.Function]:
     ``record_k()`` (t, s, u) and ``simulate_k(s, u, p)`` with the very steps of the fit. Columns are samples.
     """
     system = system_of(found)
-    functions = [*plain_functions(system),
-                 ca.Function("parameters", [], [ca.DM(values_of(found, system))], [], ["p"])]
+    functions = [*plain_functions(system), ca.Function("parameters", [], [ca.DM(values_of(found, system))], [], ["p"])]
     return [*functions, *_simulations({f.name(): f for f in functions}, records_of(found))]
 
 

@@ -72,8 +72,7 @@ def _directions(ax: Axes, result: Identifiability) -> None:
             colour = style.PALETTE["blue"] if weight > 0 else style.PALETTE["orange"]
             ax.scatter(column, row, s=180 * abs(float(weight)) ** 1.5, color=colour, alpha=0.85, lw=0)
     k = len(result.names)
-    ax.set(xlim=(-0.6, k - 0.4), ylim=(k + 0.6, 0.4), xticks=range(k), xticklabels=result.names,
-           yticks=range(1, k + 1))
+    ax.set(xlim=(-0.6, k - 0.4), ylim=(k + 0.6, 0.4), xticks=range(k), xticklabels=result.names, yticks=range(1, k + 1))
     style.tidy(ax, y="direction", title="What each direction is made of (area: weight)")
 
 
