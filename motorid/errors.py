@@ -9,8 +9,8 @@ import numbers
 import os
 import re
 import sys
-import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextvars import ContextVar
 from itertools import pairwise
 from types import TracebackType
 from typing import Any, Protocol, TypeVar, cast, runtime_checkable
@@ -104,11 +104,8 @@ _KINDS: dict[str, Any] = {**dict.fromkeys(("Path", "PathLike", "Path_"), (str, o
 _choices = functools.cache(functools.partial(re.split, r" \| (?![^\[]*\])"))  # what an annotation allows
 
 
-class _Calls(threading.local):
-    within = False  # a public call: what it calls in turn need not be looked at before it fails
-
-
-_calls = _Calls()
+# Within a public call: what it calls in turn need not be looked at before it fails.
+_within: ContextVar[bool] = ContextVar("motorid_within_a_call", default=False)
 
 
 def arguments_told(thing: _Thing) -> _Thing:
@@ -131,11 +128,11 @@ def arguments_told(thing: _Thing) -> _Thing:
 
     @functools.wraps(thing)
     def call(*args: Any, **kwargs: Any) -> Any:
-        within = _calls.within
+        within = _within.get()
         early = None if within else _wrong_argument(thing, signature, args, kwargs, plain)
         if early is not None and not member:
             raise UsageError(early)
-        _calls.within = True
+        _within.set(True)
         try:
             found = thing(*args, **kwargs)
             if early is not None:
@@ -146,7 +143,7 @@ def arguments_told(thing: _Thing) -> _Thing:
                 raise
             raise UsageError(wrong) from error
         finally:
-            _calls.within = within
+            _within.set(within)
 
     return cast(_Thing, call)
 

@@ -230,17 +230,14 @@ def _why_not(port: str, baud: int, error: Exception) -> str:
     if "://" in port:
         return f"{port} cannot be opened: {str(error).removeprefix(f'Could not open port {port}: ')}."
     if number == errno.ENOENT or ("could not open port" in str(error).lower() and not number):
-        return f"there is no port {port}. {_known_ports()}"
+        from serial.tools import list_ports
+
+        names = [p.device for p in list_ports.comports()]
+        seen = f"Ports on this computer: {', '.join(names)}." if names else "This computer sees no serial port."
+        return f"there is no port {port}. {seen}"
     if number in (errno.EACCES, errno.EPERM):
         return (f"you may not open {port}. On Linux, become a member of the group that owns it (often "
                 "'dialout') and log in again.")
     if number in (errno.EAGAIN, errno.EBUSY) or "exclusively lock" in str(error):
         return f"{port} is in use, perhaps by another recorder or a serial monitor. Close that first."
     return f"{port} cannot be opened: {error}."
-
-
-def _known_ports() -> str:
-    from serial.tools import list_ports
-
-    names = [p.device for p in list_ports.comports()]
-    return f"Ports on this computer: {', '.join(names)}." if names else "This computer sees no serial port."

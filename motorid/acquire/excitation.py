@@ -23,6 +23,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import accumulate
 
 import numpy as np
 from numpy.typing import NDArray
@@ -105,11 +106,6 @@ class Program:
         """Length in s."""
         return sum(s.ms for s in self.segments) / 1e3
 
-    @property
-    def peak(self) -> float:
-        """Largest voltage of either sign, in V."""
-        return max((s.peak for s in self.segments), default=0.0)
-
     def count(self, rate: float) -> int:
         """Number of samples it lasts."""
         return sum(s.count(rate) for s in self.segments)
@@ -129,12 +125,8 @@ class Program:
 
     def after(self, seconds: float) -> Program:
         """What is left after that time; a segment that was interrupted is repeated from its start."""
-        end, left = 0.0, []
-        for segment in self.segments:
-            end += segment.ms / 1e3
-            if end > seconds:
-                left.append(segment)
-        return Program(tuple(left), self.words)
+        ends = accumulate(s.ms / 1e3 for s in self.segments)
+        return Program(tuple(s for s, end in zip(self.segments, ends, strict=True) if end > seconds), self.words)
 
     def check(self, v_max: float, segments: int, whose: str = "the limit") -> None:
         """Refuse a program beyond `v_max` volts, naming the segment, or of more than `segments` segments."""
@@ -150,10 +142,7 @@ class Program:
 def program(words: str | Program | None, v_max: float = math.inf) -> Program:
     """Read an excitation from words (see the module); `v_max` in V is what ``standard`` is scaled to.
 
-    Raises
-    ------
-    UsageError
-        For a word that is not known, or numbers that make no sense.
+    UsageError for a word that is not known, or numbers that make no sense.
     """
     if isinstance(words, Program) or not words:
         return words or Program()

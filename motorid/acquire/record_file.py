@@ -30,8 +30,7 @@ def _unknown(index: int) -> None:
 
 def column(channel: Channel) -> str:
     """Name of the channel's column, one that `read_runs` knows."""
-    other = f"{channel.name}_{channel.unit}".replace("/", "_per_")
-    return _COLUMNS.get((channel.name, channel.unit), other)
+    return _COLUMNS.get((channel.name, channel.unit), f"{channel.name}_{channel.unit}".replace("/", "_per_"))
 
 
 class Tail(NamedTuple):
@@ -104,16 +103,13 @@ class RecordFile:
         self.note(meta)
         if not tail:
             self._pending.append(self.columns + "\n")
-        self._begin(mode)
-
-    def _begin(self, mode: str) -> None:
         try:
             self.flush()
         except OSError as error:
             self._disk.close(sync=False)
             if mode == "new":
-                self.out.unlink()
-            raise UsageError(f"{self.out} cannot be written: {error.strerror}.") from None
+                out.unlink()
+            raise UsageError(f"{out} cannot be written: {error.strerror}.") from None
 
     @property
     def lines(self) -> int:
@@ -123,9 +119,8 @@ class RecordFile:
     def pause(self, tail: Tail, until: float) -> None:
         """Mark the pause of a resumed record by one row at 0 V; what follows begins at `until` s."""
         if tail.index >= 0:
-            nothing = tuple(0.0 if k == self._v else math.nan for k in range(len(self._order)))
             self._index0, self._time0 = tail.index + 1, tail.time
-            self._pending.append(self._line(0, 1 / self.rate, nothing))
+            self._pending.append(self._line(0, 1 / self.rate, self._nothing_but(0.0)))
         self._index0, self._time0 = max(round(until * self.rate), tail.index + 2), until
 
     def add(self, rows: list[Row], commanded: Commanded = _unknown) -> None:
@@ -159,12 +154,12 @@ class RecordFile:
         self._disk.close()
 
     def _line(self, index: int, time_s: float, values: tuple[float, ...]) -> str:
-        cells = [f"{self._time0 + time_s:.6f}"]
-        for k in self._order:
-            value = values[k]
-            cells.append("" if value != value else f"{value:.9g}")
-        cells.append(str(self._index0 + index))
-        return ",".join(cells) + "\n"
+        measured = ("" if math.isnan(values[k]) else f"{values[k]:.9g}" for k in self._order)
+        return ",".join([f"{self._time0 + time_s:.6f}", *measured, f"{self._index0 + index}\n"])
+
+    def _nothing_but(self, v: float) -> tuple[float, ...]:
+        """Return the values of a sample of which only the voltage is known."""
+        return tuple(v if k == self._v else math.nan for k in range(len(self._order)))
 
     def _fill(self, end: Row, commanded: Commanded) -> None:
         """Mark the samples from the next one due up to `end` (not included) as missing."""
@@ -172,13 +167,10 @@ class RecordFile:
         start = self._last.time if self._last else -1 / self.rate
         held = self._last.values[self._v] if self._last else 0.0
         step = (end.time - start) / (n + 1)
-        which = range(n) if n <= min(FILL_UP_TO * self.rate, MOST_FILLED) else (0, n - 1)
-        for k in which:
+        for k in range(n) if n <= min(FILL_UP_TO * self.rate, MOST_FILLED) else (0, n - 1):
             known = commanded(first + k)
             held = held if known is None else known
-            values = [math.nan] * len(self._order)
-            values[self._v] = held
-            self._pending.append(self._line(first + k, start + (k + 1) * step, tuple(values)))
+            self._pending.append(self._line(first + k, start + (k + 1) * step, self._nothing_but(held)))
 
 
 class Appender:

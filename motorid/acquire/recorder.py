@@ -6,7 +6,7 @@ import contextlib
 import math
 import tomllib
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ from motorid.acquire.client import Client, Link, SerialLink
 from motorid.acquire.excitation import Program, program
 from motorid.acquire.protocol import VERSION, Channel, Header
 from motorid.acquire.record_file import Commanded, RecordFile, Tail, check_target, read_tail
-from motorid.acquire.session import Progress, Recording, Session, Setup
+from motorid.acquire.session import Progress, Recording, Session
 from motorid.errors import DataError, UsageError, one_of, positive
 
 _ENTRIES = ("scale", "offset", "gain", "zero", "sign")  # of a calibration, per channel
@@ -84,26 +84,31 @@ def record(port: str | Link, out: str | Path, *, baud: int = 115_200, excite: st
     entries = (read_calibration(calibration) if isinstance(calibration, str | Path)
                else _checked(dict(calibration or {}), "the calibration"))
     tail = read_tail(out) if resume and out.exists() else None  # without an excitation, it goes on with its own
-    plan = RecordingPlan(tail.meta.get("excitation") if tail and excite is None else excite, tail)
-    if not (isinstance(plan.excite, str) and "standard" in plan.excite):  # that one asks the device for its limit
-        program(plan.excite).check(limit_voltage, 1 << 30, "the limit you gave")
+    if tail and excite is None:
+        excite = tail.meta.get("excitation")
+    if not (isinstance(excite, str) and "standard" in excite):  # that one asks the device for its limit
+        program(excite).check(limit_voltage, 1 << 30, "the limit you gave")
     link = SerialLink(port, baud) if isinstance(port, str) else port
     try:
         client = Client(link)
         device = client.hello()
         header = calibrate(device, entries)
-        todo, done = plan.todo(program(plan.excite, min(limit_voltage, device.v_max)))
-        todo.check(*_limit(limit_voltage, device))
+        whole = program(excite, min(limit_voltage, device.v_max))
+        todo = _left(whole, tail) if tail else whole
+        todo.check(min(limit_voltage, device.v_max), device.segments,
+                   "the limit you gave" if limit_voltage < device.v_max else "the device's own limit")
         limits = client.prepare(device, limit_voltage, limit_current, todo)
-        head = _head(port, header, program(plan.excite, limits[0]), limits, entries) | dict(meta or {})
-        mode = "resume" if plan.tail else "replace" if force else "new"
-        file = RecordFile(out, header.channels, header.rate, head if not plan.tail else {}, mode)
+        head = _head(port, header, program(excite, limits[0]), limits, entries) | dict(meta or {})
+        mode = "resume" if tail else "replace" if force else "new"
+        file = RecordFile(out, header.channels, header.rate, head if not tail else {}, mode)
         try:
-            setup = Setup(client, header, file, len(todo.segments), _commanded(device, header, todo),
-                          _most(device, header, *limits),
-                          min((e for e in (todo.duration or None, duration) if e), default=None), duration,
-                          max(timeout, 4 / header.rate), progress)
-            return Session(setup, lambda: plan.begin(file, done)).run()
+            session = Session(client, header, file, len(todo.segments), _commanded(device, header, todo),
+                              _most(device, header, *limits),
+                              min((e for e in (todo.duration, duration) if e), default=None), duration,
+                              max(timeout, 4 / header.rate), progress)
+            if tail:
+                _begin_part(file, tail, len(whole.segments) - len(todo.segments))
+            return session.run()
         finally:
             with contextlib.suppress(OSError):  # told already, where it matters
                 file.close()
@@ -117,16 +122,9 @@ def _most(device: Header, header: Header, v_max: float, i_max: float) -> dict[st
     return {"v": abs(v.scale / raw.scale) * (1.01 * v_max + abs(raw.scale * (raw.offset - v.offset))), "i": i_max}
 
 
-def _limit(asked: float, device: Header) -> tuple[float, int, str]:
-    if asked < device.v_max:
-        return asked, device.segments, "the limit you gave"
-    return device.v_max, device.segments, "the device's own limit"
-
-
 def _commanded(device: Header, header: Header, todo: Program) -> Commanded:
     """The voltage that the device applies at each sample, in the units of the record."""
-    k = next(k for k, c in enumerate(device.channels) if c.name == "v")
-    told, kept = device.channels[k], header.channels[k]
+    told, kept = (next(c for c in h.channels if c.name == "v") for h in (device, header))
 
     def at(index: int) -> float | None:
         volts = todo.at(index, device.rate)
@@ -137,53 +135,38 @@ def _commanded(device: Header, header: Header, todo: Program) -> Commanded:
 
 def _head(port: str | Link, header: Header, whole: Program, limits: tuple[float, float],
           entries: Mapping[str, Any]) -> dict[str, object]:
-    head: dict[str, object] = {"motorid record": f"protocol {VERSION}", "device": header.name,
-                               "port": port if isinstance(port, str) else type(port).__name__,
-                               "started": datetime.now().astimezone().isoformat(timespec="milliseconds"),
-                               "rate_Hz": f"{header.rate:g}", "limits": f"{limits[0]:g} V, {limits[1]:g} A",
-                               "excitation": whole.words}
-    for channel in header.channels:
-        head[f"channel {channel.name}"] = (f"{channel.scale:.9g} {channel.unit} per count, zero at "
-                                           f"{channel.offset:.9g}, kind {channel.kind}")
-    return head | ({"calibration": entries} if entries else {})
+    return {"motorid record": f"protocol {VERSION}", "device": header.name,
+            "port": port if isinstance(port, str) else type(port).__name__,
+            "started": datetime.now().astimezone().isoformat(timespec="milliseconds"),
+            "rate_Hz": f"{header.rate:g}", "limits": f"{limits[0]:g} V, {limits[1]:g} A", "excitation": whole.words,
+            **{f"channel {c.name}": f"{c.scale:.9g} {c.unit} per count, zero at {c.offset:.9g}, kind {c.kind}"
+               for c in header.channels},
+            **({"calibration": entries} if entries else {})}
 
 
-@dataclass(frozen=True)
-class RecordingPlan:
-    """What this recorder adds to the file: all of it, or (with a tail) what is left."""
+def _left(whole: Program, tail: Tail) -> Program:
+    """Return what a record lacks of the whole program; UsageError if it lacks nothing.
 
-    excite: str | Program | None
-    tail: Tail | None = None
+    The segment that was interrupted is repeated from its start, since the motor stood still meanwhile.
+    """
+    meta = tail.meta
+    left = Program(whole.segments[int(meta.get("segments done", 0)):], whole.words).after(
+        tail.time - float(meta.get("part begins", 0)))
+    if meta.get("ended") == "done" or (whole.segments and not left.segments):
+        raise UsageError("this record is complete; there is nothing to resume. Choose another name for --out.")
+    return left
 
-    def todo(self, whole: Program) -> tuple[Program, int]:
-        """Return what is left of the whole program (UsageError if nothing is), and how many of its segments are done.
 
-        The segment that was interrupted is repeated from its start, since the motor stood still meanwhile.
-        """
-        if self.tail is None:
-            return whole, 0
-        meta = self.tail.meta
-        before = int(meta.get("segments done", 0))
-        ran = self.tail.time - float(meta.get("part begins", 0))
-        left = Program(whole.segments[before:], whole.words).after(ran)
-        if meta.get("ended") == "done" or (whole.segments and not left.segments):
-            raise UsageError("this record is complete; there is nothing to resume. Choose another name for --out.")
-        return left, len(whole.segments) - len(left.segments)
-
-    def begin(self, file: RecordFile, done: int) -> None:
-        """Set the time axis, by the clock of this computer, and mark the pause."""
-        if self.tail is None:
-            return
-        now, tail, step = datetime.now().astimezone(), self.tail, 1 / file.rate
-        at = tail.time + 2 * step
-        if "started" in tail.meta:
-            at = max(at, (now - datetime.fromisoformat(tail.meta["started"])).total_seconds())
-        at = math.ceil(at * file.rate) / file.rate
-        file.pause(tail, at)
-        file.note({"resumed": now.isoformat(timespec="milliseconds"), "part begins": f"{at:.6f}",
-                   "segments done": done,
-                   "pause": f"{at - tail.time:.3f} s, the motor taken to be off; the angle may count from "
-                            "another zero after it"})
+def _begin_part(file: RecordFile, tail: Tail, done: int) -> None:
+    """Set the time axis of a resumed record, by the clock of this computer, and mark the pause."""
+    now, at = datetime.now().astimezone(), tail.time + 2 / file.rate
+    if "started" in tail.meta:
+        at = max(at, (now - datetime.fromisoformat(tail.meta["started"])).total_seconds())
+    at = math.ceil(at * file.rate) / file.rate
+    file.pause(tail, at)
+    file.note({"resumed": now.isoformat(timespec="milliseconds"), "part begins": f"{at:.6f}", "segments done": done,
+               "pause": f"{at - tail.time:.3f} s, the motor taken to be off; the angle may count from another zero "
+                        "after it"})
 
 
 def read_calibration(path: str | Path) -> dict[str, dict[str, float]]:
@@ -222,8 +205,7 @@ def calibrate(header: Header, calibration: dict[str, dict[str, float]]) -> Heade
         if name not in names:
             raise DataError(f"the calibration names a channel that the device does not send: "
                             f"{one_of(name, names, 'channel')}")
-    channels = tuple(_calibrated(c, calibration.get(c.name, {})) for c in header.channels)
-    return replace(header, channels=channels)
+    return replace(header, channels=tuple(_calibrated(c, calibration.get(c.name, {})) for c in header.channels))
 
 
 def _calibrated(channel: Channel, entries: dict[str, float]) -> Channel:

@@ -69,15 +69,12 @@ class _Bench:
             self.began, self.sent, self.ran = now, 0, True
         if self.device.running:
             self._run(now)
-        self._speak(now)
-        if not self.device.running and self.ran and self.pace.once and now - self.device.heard > SILENCE:
-            self.over = True
-
-    def _speak(self, now: float) -> None:
         taken = self.transport.write(self.out) if self.out else 0
         if taken or not self.out:
             self.read_at = now
         self.out = self.out[taken:]
+        if not self.device.running and self.ran and self.pace.once and now - self.device.heard > SILENCE:
+            self.over = True
 
     def _due(self, now: float) -> int:
         """Number of samples to make now.
@@ -89,8 +86,7 @@ class _Bench:
             return 0 if self.out else 100
         if len(self.out) > BUFFER // 2 and not stalled:
             return 0
-        due = int((now - self.began) * rate * self.pace.speed)
-        return min(due - self.sent, int(0.05 * rate) + 1)
+        return min(int((now - self.began) * rate * self.pace.speed) - self.sent, int(0.05 * rate) + 1)
 
     def _run(self, now: float) -> None:
         rate, n = self.device.header.rate, self._due(now)
@@ -287,17 +283,14 @@ class Wire:
         if hit[1] < f.drop:
             return before
         if hit[2] < f.cut:
-            return before + self._cut(line)
+            at = int(self.rng.integers(1, len(line) - 2))
+            return before + (line[:at] if self.rng.random() < 0.5 else line[at:])
         if hit[3] < f.flip:
             return before + self._flip(line)
         late = self._lately[self.rng.integers(len(self._lately))] if hit[4] < f.swap and self._lately else b""
         self._lately.append(line)
         came = line[:-1] if hit[5] < f.glue else line
         return before + came + (came if hit[6] < f.repeat else b"") + late
-
-    def _cut(self, line: bytes) -> bytes:
-        at = int(self.rng.integers(1, len(line) - 2))
-        return line[:at] if self.rng.random() < 0.5 else line[at:]
 
     def _flip(self, line: bytes) -> bytes:
         altered = bytearray(line)

@@ -1,6 +1,6 @@
 """A recording session: take what comes, keep the device awake, notice every way in which it can end.
 
-`Session` leads from a `Setup` to a `Recording`; `Progress` is what the user sees meanwhile.
+`Session` leads to a `Recording`; `Progress` is what the user sees meanwhile.
 """
 
 from __future__ import annotations
@@ -44,9 +44,12 @@ SENTENCES = {
 COMPLETE = ("done", "duration", "interrupted")
 
 
-@dataclass(frozen=True, eq=False)
-class Setup:
-    """Everything that is settled before the motor moves."""
+@dataclass(eq=False)
+class Session:
+    """Starts the device, records until something ends it, stops it, and says what came of it.
+
+    Its fields are settled before the motor moves.
+    """
 
     client: Client
     header: Header  # channels calibrated
@@ -59,24 +62,18 @@ class Setup:
     timeout: float
     progress: Callable[[Progress], None] | None
 
-
-class Session:
-    """Starts the device, records until something ends it, stops it, and says what came of it."""
-
-    def __init__(self, setup: Setup, begin: Callable[[], None]) -> None:
-        self.setup = setup
+    def __post_init__(self) -> None:
         self.ended, self.detail = "", ""
         self.made: int | None = None  # samples that the device made, once it has said so
         self.last: Row | None = None
-        names = [c.name for c in setup.header.channels]
-        self._limits = [(names.index(n), n, most) for n, most in setup.most.items() if n in names]
+        names = [c.name for c in self.header.channels]
+        self._limits = [(names.index(n), n, most) for n, most in self.most.items() if n in names]
         self._over, self._empty = 0, 0
-        setup.client.decoder.bad.clear()
-        counter, micros = setup.client.go(setup.segments)
+        self.client.decoder.bad.clear()
+        counter, micros = self.client.go(self.segments)
         self._heard = time.monotonic()
-        self._reports = _ProgressReports(setup, self._heard)
-        self.timeline = Timeline(setup.header, counter, micros, self._heard)
-        begin()
+        self._reported = self._heard, 0, 0.0  # clock, samples and device time of the last report
+        self.timeline = Timeline(self.header, counter, micros, self._heard)
 
     def run(self) -> Recording:
         """Record to the end."""
@@ -86,33 +83,33 @@ class Session:
                 self._last_words()
         except BaseException:
             with contextlib.suppress(LinkLost):
-                self.setup.client.link.write(frame("X"))
+                self.client.link.write(frame("X"))
             raise
         return self._close()
 
     def _record(self) -> None:
-        items, now = self.setup.client.inbox, self._heard
+        items, now = self.client.inbox, self._heard
         try:
             while True:
                 self._take(items, now)
-                self.setup.file.flush()
+                self.file.flush()
                 self._watch(now)
                 if self.ended:  # only here: what was received is on its way to the disk
                     return
-                self.setup.client.keep_alive()
-                items, now = self.setup.client.receive(0.05), time.monotonic()
+                self.client.keep_alive()
+                items, now = self.client.receive(0.05), time.monotonic()
                 self._empty = 0 if items else self._empty + 1
         except LinkLost as error:
             self._end("unplugged", str(error))
         except OSError as error:
-            self._end("disk", f"{error.strerror}; {self.setup.file.lines} whole lines are in the file")
+            self._end("disk", f"{error.strerror}; {self.file.lines} whole lines are in the file")
 
     def _take(self, items: list[Sample | Message], now: float) -> None:
         for item in items:
             if isinstance(item, Message):
                 self._message(item.fields)
             elif rows := self.timeline.accept(item, now):
-                self.setup.file.add(rows, self.setup.commanded)
+                self.file.add(rows, self.commanded)
                 self.last, self._heard = rows[-1], now
                 self._check_limits(rows)
 
@@ -139,14 +136,25 @@ class Session:
 
     def _watch(self, now: float) -> None:
         elapsed = self.last.time if self.last else 0.0
-        if self.setup.duration is not None and elapsed >= self.setup.duration - 1.5 / self.setup.header.rate:
+        if self.duration is not None and elapsed >= self.duration - 1.5 / self.header.rate:
             self._end("duration")
-        if self.setup.total is not None and elapsed > self.setup.total + self.setup.timeout:
+        if self.total is not None and elapsed > self.total + self.timeout:
             self._end("overrun")
         # Of a computer that was held up itself nothing can be said; hence the empty readings.
-        if now - self._heard > self.setup.timeout and self._empty >= EMPTY:
-            self._end("silent", f"no valid line for {self.setup.timeout:g} s")
-        self._reports.at(self.timeline, self.last, bool(self.ended))
+        if now - self._heard > self.timeout and self._empty >= EMPTY:
+            self._end("silent", f"no valid line for {self.timeout:g} s")
+        self._report()
+
+    def _report(self) -> None:
+        """Call the user's function with a `Progress`, a few times a second and at the end."""
+        now, (looked, samples, seconds) = time.monotonic(), self._reported
+        if self.progress is None or self.last is None or (now - looked < LOOK and not self.ended):
+            return
+        time_s, received = self.last.time, self.timeline.received
+        rate = (received - samples) / (time_s - seconds) if time_s > seconds else 0.0
+        self._reported = now, received, time_s
+        values = {c.name: y for c, y in zip(self.header.channels, self.last.values, strict=True)}
+        self.progress(Progress(time_s, self.total, rate, received, self.timeline.lost, values))
 
     def _last_words(self) -> None:
         """Switch the motor off and learn how many samples there were."""
@@ -156,22 +164,21 @@ class Session:
         with contextlib.suppress(LinkLost):
             while self.made is None and time.monotonic() < end:
                 if time.monotonic() > ask:
-                    self.setup.client.link.write(frame("X"))
+                    self.client.link.write(frame("X"))
                     ask = time.monotonic() + 0.3
-                items = self.setup.client.receive(0.05)
-                wanted = [i for i in items if self.ended != "disk" or isinstance(i, Message)]
-                self._take(wanted, time.monotonic())
+                came = self.client.receive(0.05)
+                self._take([i for i in came if self.ended != "disk" or isinstance(i, Message)], time.monotonic())
 
     def _close(self) -> Recording:
-        self.setup.client.decoder.close()
+        self.client.decoder.close()
         if self.ended == "disk":
             return self._outcome()
         try:
-            self.setup.file.add(self.timeline.finish(self.made), self.setup.commanded)
-            self.setup.file.mark_missing(self.made or 0, self.setup.commanded)
-            self.setup.file.note(self._outcome().meta)
-            self.setup.file.flush()
-            self.setup.file.close()
+            self.file.add(self.timeline.finish(self.made), self.commanded)
+            self.file.mark_missing(self.made or 0, self.commanded)
+            self.file.note(self._outcome().meta)
+            self.file.flush()
+            self.file.close()
         except OSError as error:
             self.ended, self.detail = "disk", error.strerror or str(error)
         return self._outcome()
@@ -179,27 +186,10 @@ class Session:
     def _outcome(self) -> Recording:
         timeline, received = self.timeline, self.timeline.received
         lost = max(timeline.lost, (self.made or 0) - received)
-        seconds = self.last.time + 1 / self.setup.header.rate if self.last else 0.0
-        bad = self.setup.client.decoder.bad + timeline.bad
-        return Recording(self.setup.file.out, self.setup.header, self.ended, self.detail, received, lost,
+        seconds = self.last.time + 1 / self.header.rate if self.last else 0.0
+        bad = self.client.decoder.bad + timeline.bad
+        return Recording(self.file.out, self.header, self.ended, self.detail, received, lost,
                          self.made is not None, seconds, dict(bad), dict(timeline.clipped))
-
-
-class _ProgressReports:
-    """Calls the user's function with a `Progress`, a few times a second."""
-
-    def __init__(self, setup: Setup, now: float) -> None:
-        self.setup, self.before = setup, (now, 0, 0.0)
-
-    def at(self, timeline: Timeline, last: Row | None, final: bool) -> None:
-        now, (looked, samples, seconds) = time.monotonic(), self.before
-        if self.setup.progress is None or last is None or (now - looked < LOOK and not final):
-            return
-        passed = last.time - seconds
-        rate = (timeline.received - samples) / passed if passed > 0 else 0.0
-        self.before = (now, timeline.received, last.time)
-        self.setup.progress(Progress(last.time, self.setup.total, rate, timeline.received, timeline.lost,
-                                     {c.name: y for c, y in zip(self.setup.header.channels, last.values, strict=True)}))
 
 
 @contextlib.contextmanager
@@ -300,9 +290,8 @@ class Recording(Shown):
                     ((f'mi.read_runs("{self.path.name}")', "read it"),))
 
     def __str__(self) -> str:
-        made = self.received + self.lost
-        share = f" ({100 * self.lost / made:.3g} %)" if self.lost else ""
-        gaps = f"{self.lost} lost{share}, {'marked as missing' if self.lost else 'nothing missing'}"
+        share = 100 * self.lost / max(self.received + self.lost, 1)
+        gaps = f"{self.lost} lost ({share:.3g} %), marked as missing" if self.lost else "0 lost, nothing missing"
         lines = [self.sentence, f"{self.path}: {self.received} samples, {self.seconds:.6g} s; {gaps}."]
         if not self.tail_known:
             lines.append("Whether the device made more samples after the last one received is not known.")

@@ -58,7 +58,8 @@ class Timeline:
 
     def accept(self, sample: Sample, host: float = 0.0) -> list[Row]:
         """Return the rows that this sample makes certain: none, itself, or itself and the one held back."""
-        if len(sample.raw) != len(self.header.channels) or not self._within(sample):
+        if (len(sample.raw) != len(self.header.channels) or sample.counter >= self._wrap[0]
+                or sample.time >= self._wrap[1]):
             self.bad["not understood"] += 1
             return []
         mark = self._follow(self._last, sample, host)
@@ -87,9 +88,6 @@ class Timeline:
             self.bad["implausible"] += 1
             return []
         return [self._row(*held)]
-
-    def _within(self, sample: Sample) -> bool:
-        return sample.counter < self._wrap[0] and sample.time < self._wrap[1]
 
     def _follow(self, last: _Mark, sample: Sample, host: float) -> _Mark | str:
         """Where `sample` is, coming after `last`, or why it cannot come after it."""

@@ -58,7 +58,6 @@ class VirtualDevice:
         self._noise: list[list[float]] = []
         self._program, self._length = Program(), 0
         self.heard = 0.0  # clock of the computer when the last valid frame came
-        self._raw = [_CONVERT[c] for c in channels]
 
     def receive(self, data: bytes, now: float = 0.0) -> bytes:
         """Take bytes from the computer at clock `now` (s) and return the answers."""
@@ -88,18 +87,17 @@ class VirtualDevice:
 
     def _sample(self) -> bytes:
         mv = round(1e3 * (self._program.at(self._made, self.header.rate) or 0.0))
-        seen = self._plant.measured()
+        seen = {"v": mv / 1e3, **self._plant.measured()}
         if not self._made % BLOCK:
             self._noise = self._rng.normal(0.0, NOISE, size=(BLOCK, 2)).tolist()
-        m, noise = self.truth.motor, self._noise[self._made % BLOCK]
-        raw = [convert(m, mv, seen, noise) for convert in self._raw]
+        noise: dict[str, float] = dict(zip(("i", "omega"), self._noise[self._made % BLOCK], strict=True))
+        raw = (_count(c, seen[c.name], noise.get(c.name, 0.0)) for c in self.header.channels)
         line = frame("D", self._counter, self._time, *raw)
         self._over = self._over + 1 if abs(seen["i"]) > self._limits[1] else 0
         self._plant.step(mv / 1e3, 1 / self.header.rate)
         self._made += 1
         self._counter = (self._counter + 1) % (1 << self.header.counter_bits)
-        since = round(self._made * 1e6 / self.header.rate)
-        self._time = (self._start[1] + since) % (1 << self.header.timer_bits)
+        self._time = (self._start[1] + round(self._made * 1e6 / self.header.rate)) % (1 << self.header.timer_bits)
         return line
 
     def _answer(self, fields: list[str]) -> bytes:
@@ -206,30 +204,18 @@ def virtual_bench(effect: str = "random", motor: str = "lab", seed: int = 0, rat
 
 
 def _channels(m: Any, encoder_bits: int) -> dict[str, Channel]:
-    current, speed = _steps(m)
+    """Return the channels; a count of a converter has three significant digits, as a header would say it."""
+    current, speed = (float(f"{most / 2048:.3g}")
+                      for most in (1.25 * max(m.i_max, m.v_max / m.R), 1.3 * m.no_load_speed))
     return {"v": Channel("v", "V", 1e-3), "i": Channel("i", "A", current, 2048, "a12"),
             "omega": Channel("omega", "rad/s", speed, 2048, "a12"),
             "theta": Channel("theta", "rad", 2 * math.pi / LINES_PER_TURN, 0, f"w{encoder_bits}")}
 
 
-def _steps(m: Any) -> tuple[float, float]:
-    """Current and speed of one count of the converters, three significant digits as a header would say it."""
-    most = 1.25 * max(m.i_max, m.v_max / m.R), 1.3 * m.no_load_speed
-    return float(f"{most[0] / 2048:.3g}"), float(f"{most[1] / 2048:.3g}")
-
-
-def _converted(value: float, step: float, noise: float) -> int:
-    return min(4095, max(0, round(value / step + 2048 + noise)))
-
-
-# At the start of a run the shaft stands in the middle of an encoder count.
-# One raw value: (motor, commanded mV, what the sensors see, noise of the two converters) -> counts.
-_CONVERT: dict[str, Callable[[Any, int, dict[str, float], list[float]], int]] = {
-    "v": lambda m, mv, seen, noise: mv,
-    "i": lambda m, mv, seen, noise: _converted(seen["i"], _steps(m)[0], noise[0]),
-    "omega": lambda m, mv, seen, noise: _converted(seen["omega"], _steps(m)[1], noise[1]),
-    "theta": lambda m, mv, seen, noise: round(seen["theta"] * LINES_PER_TURN / (2 * math.pi)),
-}
+def _count(channel: Channel, value: float, noise: float) -> int:
+    """Return the raw value that a channel sends; at the start of a run the shaft stands in the middle of a count."""
+    raw = round(value / channel.scale + channel.offset + noise)
+    return raw if channel.wraps or not channel.span else min(max(raw, 0), channel.span - 1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -249,7 +235,7 @@ class Truth:
 
 
 def hide(words: str = "random", motor: str = "lab", seed: int = 0) -> Truth:
-    """Choose a motor and what is hidden in it.
+    """Choose a motor and what is hidden in it; UsageError for a name or a number that is not known.
 
     Parameters
     ----------
@@ -259,11 +245,6 @@ def hide(words: str = "random", motor: str = "lab", seed: int = 0) -> Truth:
     motor : str
         One of the plant's motors. Its constants are drawn within 10 % of the nominal ones.
     seed : int
-
-    Raises
-    ------
-    UsageError
-        For a name or a number that is not known.
     """
     plant = load_plant()
     if motor not in plant.MOTORS:

@@ -28,22 +28,11 @@ def motorid(context: typer.Context,
         typer.echo(context.get_help())
 
 
-for _name, _command in (
-    ("demo", diagnose.demo_command),
-    ("check", fit.check_command),
-    ("effects", fit.effects_command),
-    ("fit", fit.fit_command),
-    ("simulate", fit.simulate_command),
-    ("diagnose", diagnose.diagnose_command),
-    ("design", diagnose.design_command),
-    ("identifiability", fit.identifiability_command),
-    ("robustness", fit.robustness_command),
-    ("fit-many", fit.fit_many_command),
-    ("export", fit.export_command),
-    ("record", bench.record_command),
-    ("bench", bench.bench_command),
-):
-    app.command(_name, cls=Command)(_command)
+for _command in (diagnose.demo_command, fit.check_command, fit.effects_command, fit.fit_command, fit.simulate_command,
+                 diagnose.diagnose_command, diagnose.design_command, fit.identifiability_command,
+                 fit.robustness_command, fit.fit_many_command, fit.export_command,
+                 bench.record_command, bench.bench_command):
+    app.command(_command.__name__.removesuffix("_command").replace("_", "-"), cls=Command)(_command)
 
 
 def main() -> None:

@@ -9,22 +9,8 @@ from typing import Annotated, Any
 
 import typer
 
+from motorid.cli import options as opt
 from motorid.cli.console import INTERRUPTED, next_command, save_report, say_notes, show
-from motorid.cli.options import (
-    OUT,
-    EffectsFrom,
-    FitOptions,
-    Force,
-    Jobs,
-    Json,
-    Report,
-    Runs,
-    Validate,
-    make_folder,
-    notes_of,
-    own_effects,
-    with_options,
-)
 from motorid.diagnosis.design_criteria import Rival
 from motorid.diagnosis.diagnose import diagnose
 from motorid.diagnosis.experiment_design import LEVELS, design_experiment
@@ -49,7 +35,7 @@ DEMO_SET = "hidden_friction"
 LIMITS = "Limits"
 Found = Annotated[Path, typer.Argument(metavar="FOUND.json", help="File written by diagnose --json.")]
 Plan = Annotated[Path | None, typer.Option(
-    metavar="plan.csv", rich_help_panel=OUT, help="Write time, voltage and predictions.")]
+    metavar="plan.csv", rich_help_panel=opt.OUT, help="Write time, voltage and predictions.")]
 Goal = Annotated[str | None, typer.Option(
     metavar="distinguish|sharpen", help="By default to distinguish, where the diagnosis left a group of effects.")]
 Parameters = Annotated[str | None, typer.Option(metavar="R,K", help="What to sharpen; by default all that are free.")]
@@ -67,18 +53,18 @@ Slew = Annotated[float | None, typer.Option(metavar="V/S", rich_help_panel=LIMIT
 Budget = Annotated[float | None, typer.Option(metavar="S", help="Stop after this time with the best so far.")]
 
 
-@with_options(FitOptions)
+@opt.with_options(opt.FitOptions)
 def diagnose_command(
-    runs: Runs, options: FitOptions, validate: Validate = None,
+    runs: opt.Runs, options: opt.FitOptions, validate: opt.Validate = None,
     max_effects: Annotated[int, typer.Option(
-        min=0, metavar="N", rich_help_panel=OUT, help="Largest number of effects to add.")] = 3,
+        min=0, metavar="N", rich_help_panel=opt.OUT, help="Largest number of effects to add.")] = 3,
     budget: Annotated[float | None, typer.Option(
-        min=0, metavar="SECONDS", rich_help_panel=OUT,
+        min=0, metavar="SECONDS", rich_help_panel=opt.OUT,
         help="Stop after this time with the best answer so far, as Ctrl-C does.")] = None,
     remainder_to: Annotated[Path | None, typer.Option(
-        metavar="FILE.py", rich_help_panel=OUT,
+        metavar="FILE.py", rich_help_panel=opt.OUT,
         help="Write what no effect explains as an effect, for --effects-from.")] = None,
-    jobs: Jobs = 1, json: Json = None, report: Report = None,
+    jobs: opt.Jobs = 1, json: opt.Json = None, report: opt.Report = None,
 ) -> None:
     """Say where the model fails, which physical effect is missing, and what the error is with it.
 
@@ -86,9 +72,9 @@ def diagnose_command(
     """
     records = options.read(runs)
     held_out = options.read(validate) if validate else []
-    notes = notes_of(records)
+    notes = opt.notes_of(records)
     before = fit_affordably(records, options.fit)
-    own = list(own_effects(options.effects_from).values()) if options.effects_from else []
+    own = list(opt.own_effects(options.effects_from).values()) if options.effects_from else []
     done: list[str] = []
     try:
         with processes(jobs) as over:
@@ -116,7 +102,7 @@ def _as_it_comes(word: str, done: list[str], quiet: bool) -> None:
         show(f"{word[0].upper()}{word[1:]}\n")
 
 
-def _keep_fit(before: Fit, done: Sequence[str], json: Json, force: bool) -> None:
+def _keep_fit(before: Fit, done: Sequence[str], json: opt.Json, force: bool) -> None:
     """Show and write what an interrupted diagnosis began with, and how far it came."""
     interruption.heard()
     if json != "-":
@@ -128,8 +114,7 @@ def _keep_fit(before: Fit, done: Sequence[str], json: Json, force: bool) -> None
 def _write_remainder(found: Diagnosis, path: Path, force: bool) -> None:
     """Write what is left as an effect to edit; it may have been edited, so never over a file that is there."""
     assert found.remainder is not None
-    source = found.remainder.code(path.stem if path.stem.isidentifier() else "remainder")
-    write_files({path: source}, force)
+    write_files({path: found.remainder.code(path.stem if path.stem.isidentifier() else "remainder")}, force)
     effects = ",".join((*found.remainder.model.effect_names, path.stem))
     show(f"Written: {path}. Fit with it: --effects-from {path} --effects {effects}")
 
@@ -166,7 +151,7 @@ def design_command(found_json: Found, out: Plan = None, goal: Goal = None, param
                    limit_voltage: Volts = None, limit_current: Amperes = None, limit_speed: Speed = None,
                    limit_angle: Angle = None, limit_temperature: Kelvin = None, duration: Seconds = None,
                    shape: Shape = "steps", levels: Levels = LEVELS, slew: Slew = None, budget: Budget = None,
-                   effects_from: EffectsFrom = None, json: Json = None, force: Force = False) -> None:
+                   effects_from: opt.EffectsFrom = None, json: opt.Json = None, force: opt.Force = False) -> None:
     """Design the next experiment: the voltage that best distinguishes what a diagnosis could not, or sharpens it.
 
     Limits are by default the largest values of the records; nothing is played.
@@ -192,14 +177,8 @@ def design_command(found_json: Found, out: Plan = None, goal: Goal = None, param
 
 
 def read_rivals(path: Path, effects_from: Path | None, goal: str | None) -> list[Rival]:
-    """Return the rivals, or the best model alone, that ``diagnose --json`` wrote.
-
-    Raises
-    ------
-    DataError
-        If the file cannot be read, or is no such file.
-    """
-    own, text = list(own_effects(effects_from).values()) if effects_from else [], read_bytes(path)
+    """Return the rivals, or the best model alone, that ``diagnose --json`` wrote; DataError if that cannot be read."""
+    own, text = list(opt.own_effects(effects_from).values()) if effects_from else [], read_bytes(path)
     try:
         contents = loads(text)
         listed = [contents["best"]] if goal == "sharpen" else contents["rivals"]
@@ -210,13 +189,13 @@ def read_rivals(path: Path, effects_from: Path | None, goal: str | None) -> list
 
 def demo_command(
     out: Annotated[Path, typer.Option(metavar="DIR", help="Where figures and report go.")] = Path("motorid-demo"),
-    json: Json = None, force: Force = False,
+    json: opt.Json = None, force: opt.Force = False,
 ) -> None:
     """Show the story on shipped records: fit, see that it fails, add what is missing, see the error fall.
 
     Example: motorid demo --out demo
     """
-    make_folder(out)
+    opt.make_folder(out)
     runs, check = (read_runs(str(data_path(DEMO_SET) / pattern)) for pattern in ("run*.csv", "check*.csv"))
     show(f"1. Records: {len(runs)} of a motor ({data_path(DEMO_SET)}), and one held out that no fit will see.\n",
          "2. The textbook model, fitted without a first guess:")

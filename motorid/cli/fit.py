@@ -9,25 +9,8 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
+from motorid.cli import options as opt
 from motorid.cli.console import FAILED, INTERRUPTED, next_command, save_report, say_notes, show
-from motorid.cli.options import (
-    OUT,
-    EffectsFrom,
-    FitOptions,
-    Force,
-    Jobs,
-    Json,
-    ReadingOptions,
-    Report,
-    Runs,
-    Validate,
-    make_folder,
-    named_effect,
-    notes_of,
-    own_effects,
-    saved_model,
-    with_options,
-)
 from motorid.display.cards import Table
 from motorid.display.numbers import counted, duration, number
 from motorid.effects import EVERY
@@ -40,7 +23,6 @@ from motorid.numerics.parallel import processes
 from motorid.problem.simulate import NRMSE, Evaluation, error_table, evaluate, run_table
 from motorid.records.experiment import Experiment
 from motorid.records.files import write_files
-from motorid.records.layout import parse_pairs
 from motorid.records.reading import csv_text
 from motorid.uncertainty.batch import fit_many, motors_in
 from motorid.uncertainty.identifiability import Identifiability, identifiability
@@ -50,9 +32,9 @@ MOST_SHOWN = 4  # runs of which all columns are listed
 SavedModel = Annotated[Path, typer.Argument(metavar="FIT.json", help="File written by fit --json or export.")]
 
 
-@with_options(FitOptions)
-def fit_command(runs: Runs, options: FitOptions, validate: Validate = None, json: Json = None,
-                report: Report = None) -> None:
+@opt.with_options(opt.FitOptions)
+def fit_command(runs: opt.Runs, options: opt.FitOptions, validate: opt.Validate = None, json: opt.Json = None,
+                report: opt.Report = None) -> None:
     """Fit a motor model to records, and say how far the numbers can be trusted.
 
     Example: motorid fit run*.csv --effects coulomb --validate check*.csv --json fit.json
@@ -60,7 +42,7 @@ def fit_command(runs: Runs, options: FitOptions, validate: Validate = None, json
     records = options.read(runs)
     held_out = options.read(validate) if validate else []
     model = options.model(records)
-    notes = notes_of(records, held_out)
+    notes = opt.notes_of(records, held_out)
     found = options.fit(records, model)
     judged = evaluate(found, held_out) if held_out else None
     if json != "-":
@@ -101,15 +83,15 @@ def _amount(records: list[Experiment]) -> str:
     return f"{counted(len(records), 'run')}, {samples} samples, {duration(seconds)}"
 
 
-@with_options(FitOptions)
+@opt.with_options(opt.FitOptions)
 def fit_many_command(
     directories: Annotated[list[Path], typer.Argument(metavar="DIR", help="One folder, or file, per motor inside.")],
-    options: FitOptions,
+    options: opt.FitOptions,
     out: Annotated[Path | None, typer.Option(
-        metavar="TABLE.csv", rich_help_panel=OUT, help="Write the table: .csv, .parquet or .json.")] = None,
+        metavar="TABLE.csv", rich_help_panel=opt.OUT, help="Write the table: .csv, .parquet or .json.")] = None,
     journal: Annotated[Path | None, typer.Option(
-        metavar="FILE", rich_help_panel=OUT, help="Results as they come, to go on from.")] = None,
-    jobs: Jobs = 1, json: Json = None,
+        metavar="FILE", rich_help_panel=opt.OUT, help="Results as they come, to go on from.")] = None,
+    jobs: opt.Jobs = 1, json: opt.Json = None,
 ) -> None:
     """Fit one model to the records of many motors; a motor that fails is a row that says why.
 
@@ -123,11 +105,8 @@ def fit_many_command(
     model = options.model(next(known, []))  # the first that can be read tell a rotary from a linear axis
     if options.preprocesses:
         motors = {name: _readable(options, files) or files for name, files in motors.items()}
-    reading: dict[str, Any] = {k: parse_pairs(v, f"--{k}") for k in ("columns", "units") if (v := getattr(options, k))}
-    reading |= {"hold": options.hold} if options.hold else {}
-    given = {"journal": journal, "reading": reading, **options.keywords()}
     with processes(min(jobs, len(motors))) as over:
-        found = fit_many(model, motors, map=over, **given)
+        found = fit_many(model, motors, map=over, journal=journal, reading=options.reading, **options.keywords())
     if json != "-":
         show(str(found))
     if json:
@@ -140,7 +119,7 @@ def fit_many_command(
         raise typer.Exit(FAILED)
 
 
-def _readable(options: FitOptions, files: list[Path]) -> list[Any]:
+def _readable(options: opt.FitOptions, files: list[Path]) -> list[Any]:
     """Return the records of one motor, none where they cannot be read: its row says why."""
     try:
         return list(options.read([str(f) for f in files]))
@@ -148,14 +127,14 @@ def _readable(options: FitOptions, files: list[Path]) -> list[Any]:
         return []
 
 
-@with_options(ReadingOptions)
-def check_command(runs: Runs, options: ReadingOptions, json: Json = None) -> None:
+@opt.with_options(opt.ReadingOptions)
+def check_command(runs: opt.Runs, options: opt.ReadingOptions, json: opt.Json = None) -> None:
     """Show how records are read, column by column, and what looks wrong with them, before any fit.
 
     Example: motorid check run*.csv
     """
     records = options.read(runs)
-    notes = notes_of(records)
+    notes = opt.notes_of(records)
     if json:
         write_json({"runs": [run_dict(r) | {"columns": r.meta.get("columns"), "units": dict(r.units)} for r in records],
                     "notes": notes}, json, options.force)
@@ -183,33 +162,33 @@ def _channel_table(run: Experiment) -> Table:
 
 def effects_command(
     name: Annotated[str | None, typer.Argument(metavar="NAME", show_default=False, help="One effect.")] = None,
-    effects_from: EffectsFrom = None,
+    effects_from: opt.EffectsFrom = None,
 ) -> None:
     """List the effects of the library, or show one: its law, its parameters, its source.
 
     Example: motorid effects stribeck
     """
-    own = own_effects(effects_from) if effects_from else {}
+    own = opt.own_effects(effects_from) if effects_from else {}
     if name is not None:
-        show(str(named_effect(name, own).card()), f"\nAdd it: motorid fit RUN... --effects {name}")
+        show(str(opt.named_effect(name, own).card()), f"\nAdd it: motorid fit RUN... --effects {name}")
         return
     rows = [[e.name, e.balance, e.title, ", ".join(p.name for p in e.parameters)] for e in (own | EVERY).values()]
     show(Table(["effect", "acts on", "what it is", "parameters"], rows, "Effects", left=(0, 1, 2, 3)),
          "One of them: motorid effects NAME. Add it: motorid fit RUN... --effects NAME")
 
 
-@with_options(ReadingOptions)
+@opt.with_options(opt.ReadingOptions)
 def simulate_command(
-    fit_json: SavedModel, runs: Runs, options: ReadingOptions,
+    fit_json: SavedModel, runs: opt.Runs, options: opt.ReadingOptions,
     out: Annotated[Path | None, typer.Option(metavar="DIR", help="Write the simulated channels as CSV.")] = None,
     engine: Annotated[str, typer.Option(metavar="rosenbrock|cvodes|idas")] = "rosenbrock",
-    effects_from: EffectsFrom = None, json: Json = None,
+    effects_from: opt.EffectsFrom = None, json: opt.Json = None,
 ) -> None:
     """Simulate a fitted model on records, and compare where something was measured.
 
     Example: motorid simulate fit.json check*.csv --out simulated
     """
-    model = saved_model(fit_json, effects_from)
+    model = opt.saved_model(fit_json, effects_from)
     records = options.read(runs)
     judged = evaluate(model, records, engine=engine)
     files = _write_simulations(judged, out, options.force) if out else []
@@ -224,7 +203,7 @@ def simulate_command(
 
 
 def _write_simulations(judged: Evaluation, out: Path, force: bool) -> list[str]:
-    make_folder(out)
+    opt.make_folder(out)
     files: dict[Path, str] = {}
     for s in judged.simulations:
         name = s.experiment.name.replace("/", "_")
@@ -239,7 +218,7 @@ def export_command(
     path: Annotated[Path, typer.Argument(metavar="PATH", help="File to write.")],
     to: Annotated[str | None, typer.Option(
         metavar="casadi|c|json", show_default=False, help="Format; by default that of PATH's ending.")] = None,
-    effects_from: EffectsFrom = None, force: Force = False,
+    effects_from: opt.EffectsFrom = None, force: opt.Force = False,
 ) -> None:
     """Take a fitted model along: as CasADi functions, as C source, as JSON.
 
@@ -247,13 +226,14 @@ def export_command(
     """
     if to is not None and to not in FORMS.values():
         raise UsageError(f"--to: {one_of(to, FORMS.values(), 'form')}")
-    model = saved_model(fit_json, effects_from)
+    model = opt.saved_model(fit_json, effects_from)
     written = export(model, path, to, force=force)
     show(f"Written: {written}", f"Sub-steps: {check(model).text}" if written.suffix == ".c" else None)
 
 
-@with_options(FitOptions)
-def identifiability_command(runs: Runs, options: FitOptions, json: Json = None, report: Report = None) -> None:
+@opt.with_options(opt.FitOptions)
+def identifiability_command(runs: opt.Runs, options: opt.FitOptions, json: opt.Json = None,
+                            report: opt.Report = None) -> None:
     """Say which parameters, and which combinations of them, the records determine.
 
     Example: motorid identifiability run*.csv --effects coulomb
@@ -262,14 +242,14 @@ def identifiability_command(runs: Runs, options: FitOptions, json: Json = None, 
     _write_and_show(fitted, identifiability(fitted), json, report, options.force)
 
 
-@with_options(FitOptions)
+@opt.with_options(opt.FitOptions)
 def robustness_command(
-    runs: Runs, options: FitOptions,
-    starts: Annotated[int, typer.Option(min=1, metavar="N", rich_help_panel=OUT, help="Number of fits.")] = 100,
+    runs: opt.Runs, options: opt.FitOptions,
+    starts: Annotated[int, typer.Option(min=1, metavar="N", rich_help_panel=opt.OUT, help="Number of fits.")] = 100,
     spread: Annotated[float, typer.Option(
-        min=1.0, metavar="FACTOR", rich_help_panel=OUT, help="Every start is off by up to this factor.")] = 10.0,
-    seed: Annotated[int, typer.Option(min=0, metavar="N", rich_help_panel=OUT, help="Seed of the starts.")] = 0,
-    json: Json = None, report: Report = None,
+        min=1.0, metavar="FACTOR", rich_help_panel=opt.OUT, help="Every start is off by up to this factor.")] = 10.0,
+    seed: Annotated[int, typer.Option(min=0, metavar="N", rich_help_panel=opt.OUT, help="Seed of the starts.")] = 0,
+    json: opt.Json = None, report: opt.Report = None,
 ) -> None:
     """Fit from many poor starts, and say whether all end in the same place.
 
@@ -282,7 +262,8 @@ def robustness_command(
         raise typer.Exit(INTERRUPTED)
 
 
-def _write_and_show(fitted: Fit, found: Identifiability | Multistart, json: Json, report: Report, force: bool) -> None:
+def _write_and_show(fitted: Fit, found: Identifiability | Multistart, json: opt.Json, report: opt.Report,
+                    force: bool) -> None:
     if json != "-":
         show(str(found))
     if json:

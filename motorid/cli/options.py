@@ -85,9 +85,13 @@ class ReadingOptions:
 
     def read(self, paths: Sequence[str]) -> list[Experiment]:
         """Return the runs."""
-        columns = parse_pairs(self.columns, "--columns") if self.columns else None
-        units = parse_pairs(self.units, "--units") if self.units else None
-        return self._preprocessed(read_runs(paths, columns=columns, units=units, hold=self.hold))
+        return self._preprocessed(read_runs(paths, **self.reading))
+
+    @property
+    def reading(self) -> dict[str, Any]:
+        """What was said for `read_runs`, as its keyword arguments."""
+        named = {k: parse_pairs(v, f"--{k}") for k in ("columns", "units") if (v := getattr(self, k))}
+        return named | ({"hold": self.hold} if self.hold else {})
 
     @property
     def preprocesses(self) -> bool:
@@ -236,8 +240,7 @@ def own_effects(path: Path) -> dict[str, Effect]:
     except BaseException as error:  # whatever the user's own code raises
         if interruption.behind(error):
             raise
-        what = f"{type(error).__name__}: {error}"
-        raise UsageError(f"--effects-from: {path} cannot be run: {what}.") from None
+        raise UsageError(f"--effects-from: {path} cannot be run: {type(error).__name__}: {error}.") from None
     effects = [e for e in vars(module).values() if isinstance(e, Effect)]
     found = {e.name: e for e in effects if library.EVERY.get(e.name) is not e}
     if not found:
@@ -256,8 +259,7 @@ def named_effect(name: str, own: dict[str, Effect]) -> Effect:
 
 def saved_model(path: Path, effects_from: Path | None = None) -> Model:
     """Return the model that ``fit --json`` or ``export`` wrote, at its values; see `load` for what it raises."""
-    own = own_effects(effects_from) if effects_from else {}
-    found = load(path, own.values())
+    found = load(path, own_effects(effects_from).values() if effects_from else ())
     return found if isinstance(found, Model) else found.model
 
 

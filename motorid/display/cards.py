@@ -122,28 +122,14 @@ def value_cell(value: float, std: float | None, unit: str = "", why: str = "not 
 
 @dataclass(frozen=True)
 class Card:
-    """What a result shows.
-
-    Attributes
-    ----------
-    title : str
-    flags : sequence of Flag
-        The verdict in a word or two.
-    text : sequence of str
-        Sentences; empty ones are left out.
-    tables : sequence of Table
-    after : sequence of (str, str)
-        What to do next: code, and its use.
-    figure : str
-        Name of the function of `motorid.plots` that draws the result, if one tells more than the tables.
-    """
+    """What a result shows."""
 
     title: str
-    flags: Sequence[Flag] = ()
-    text: Sequence[str] = ()
+    flags: Sequence[Flag] = ()  # the verdict in a word or two
+    text: Sequence[str] = ()  # sentences; empty ones are left out
     tables: Sequence[Table] = ()
-    after: Sequence[tuple[str, str]] = ()
-    figure: str = ""
+    after: Sequence[tuple[str, str]] = ()  # what to do next: code, and its use
+    figure: str = ""  # name of the function of `motorid.plots` that draws the result, if one tells more than the tables
 
     @property
     def line(self) -> str:

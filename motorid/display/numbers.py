@@ -147,9 +147,7 @@ def _power(size: float, smallest: int = -3) -> int:
 
 def _rounded(value: float, place: int, power: int) -> str:
     shifted = Decimal(repr(float(value))).scaleb(-power)
-    text = f"{shifted.quantize(Decimal(1).scaleb(min(place - power, 0)), ROUND_HALF_EVEN):f}"
-    if place - power > 0:  # the error is tens or more: zeros in their place
-        text = f"{shifted.quantize(Decimal(1).scaleb(place - power), ROUND_HALF_EVEN):f}"
+    text = f"{shifted.quantize(Decimal(1).scaleb(place - power), ROUND_HALF_EVEN):f}"  # of tens or more, with zeros
     return text.replace("-", "−") if text.strip("-0.") else text.replace("-", "")
 
 

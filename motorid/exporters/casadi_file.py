@@ -39,13 +39,7 @@ UNARY, BINARY = (frozenset(f"OP_{n}" for n in names.split()) for names in (
 
 
 def model_of(found: Fit | Model) -> Model:
-    """Return the model at its values.
-
-    Raises
-    ------
-    UsageError
-        If `found` is neither a fit nor a model.
-    """
+    """Return the model at its values; UsageError if `found` is neither a fit nor a model."""
     if isinstance(found, Fit):
         return found.model
     if isinstance(found, Model):
@@ -69,22 +63,20 @@ def values_of(found: Fit | Model, system: System) -> Array:
 def description(found: Fit | Model) -> dict[str, Any]:
     """Return all that is known of the model as plain data: the contents of ``fit --json``, and what it takes to
     build it again: limits, covariance, fingerprints of the records, versions."""
-    model = model_of(found)
-    contents: dict[str, Any] = fit_dict(found) if isinstance(found, Fit) else {"parameters": {
-        n: {"value": p.value, "std": None, "unit": p.unit, "fixed": not p.vary} for n, p in model.parameters.items()}}
+    model, version = model_of(found), package_version("motorid")
+    if isinstance(found, Fit):
+        covariance = {"unknowns": [p.name for p in found.problem.unknown], "matrix": found.covariance.tolist()}
+        contents = fit_dict(found) | {"model": model_dict(model), "covariance": covariance,
+                                      "data": [fingerprint(r) for r in found.problem.experiments]}
+    else:
+        contents = {"model": model_dict(model), "data": [], "parameters": {
+            n: {"value": p.value, "std": None, "unit": p.unit, "fixed": not p.vary}
+            for n, p in model.parameters.items()}}
     for name, p in model.parameters.items():
         limits = {"lower": p.lower, "upper": p.upper}
         contents["parameters"][name] |= {k: v for k, v in limits.items() if np.isfinite(v)}
-    contents["model"] = model_dict(model)
-    if isinstance(found, Fit):
-        contents["covariance"] = {"unknowns": [p.name for p in found.problem.unknown],
-                                  "matrix": found.covariance.tolist()}
-    contents["data"] = [fingerprint(r) for r in found.problem.experiments] if isinstance(found, Fit) else []
-    contents["motorid"] = package_version("motorid")
-    contents["versions"] = {"motorid": contents["motorid"], "casadi": ca.__version__, "numpy": np.__version__,
-                            "python": platform.python_version()}
-    contents |= {"export": FORMAT, "order": list(system_of(found).parameters)}
-    return contents
+    return contents | {"motorid": version, "export": FORMAT, "order": list(system_of(found).parameters), "versions": {
+        "motorid": version, "casadi": ca.__version__, "numpy": np.__version__, "python": platform.python_version()}}
 
 
 def fingerprint(run: Experiment) -> dict[str, Any]:
@@ -105,13 +97,19 @@ def functions_of(found: Fit | Model) -> list[ca.Function]:
     ``record_k()`` (t, s, u) and ``simulate_k(s, u, p)`` with the very steps of the fit. Columns are samples.
     """
     system = system_of(found)
-    p = values_of(found, system)
-    light = step_functions(system).light
-    args = light.sx_in()
-    step = ca.Function("step", args, [ca.densify(r) for r in light.call(args)], light.name_in(), light.name_out())
-    functions = [_named(system.rhs, "rhs"), _named(system.out, "outputs"), _named(system.initial, "initial"), step,
-                 ca.Function("parameters", [], [ca.DM(p)], [], ["p"])]
+    functions = [*plain_functions(system), ca.Function("parameters", [], [ca.DM(values_of(found, system))], [], ["p"])]
     return [*functions, *_simulations({f.name(): f for f in functions}, records_of(found))]
+
+
+def plain_functions(system: System, prefix: str = "") -> list[ca.Function]:
+    """Return ``rhs``, ``outputs``, ``initial`` and ``step``, see `functions_of`, with dense results."""
+    found = []
+    for name, f in (("rhs", system.rhs), ("outputs", system.out), ("initial", system.initial),
+                    ("step", step_functions(system).light)):
+        args = f.sx_in()
+        results = [ca.densify(r) for r in f.call(args)]
+        found.append(ca.Function(f"{prefix}{name}", args, results, f.name_in(), f.name_out()))
+    return found
 
 
 def casadi_file(found: Fit | Model, path: Path) -> dict[Path, str]:
@@ -204,24 +202,14 @@ def _simulations(functions: Mapping[str, ca.Function], records: Sequence[Mapping
     return found
 
 
-def _named(f: ca.Function, name: str) -> ca.Function:
-    args = f.sx_in()
-    return ca.Function(name, args, [ca.densify(r) for r in f.call(args)], f.name_in(), f.name_out())
-
-
 def runs_of(fit: Fit) -> list[tuple[Run, Array]]:
     """Return the records with the steps of the fit, and (i, omega, theta) at their start, (3,)."""
     problem: Problem = fit.problem
     if getattr(problem.integrator, "name", "") != "rosenbrock":
         # Another engine chose its own steps: take those that suit ours.
         problem = replace(problem, engine="rosenbrock").refined(fit.q)
-    found = []
-    for k, run in enumerate(problem.runs):
-        start = run.start.copy()
-        for c in CHANNELS:
-            start[CHANNELS.index(c)] = fit.initial.get(f"{c}_0[{k}]", start[CHANNELS.index(c)])
-        found.append((run, start))
-    return found
+    return [(run, np.array([fit.initial.get(f"{c}_0[{k}]", s) for c, s in zip(CHANNELS, run.start, strict=True)]))
+            for k, run in enumerate(problem.runs)]
 
 
 def simulation(name: str, functions: Mapping[str, ca.Function], t: Array, m: NDArray[np.int64],

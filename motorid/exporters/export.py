@@ -175,18 +175,15 @@ def load(path: str | os.PathLike[str], effects: Iterable[Effect] = (), *,
             raise DataError(f"{source.name} is not JSON: {error}.") from None
         return _fit_of(contents, effects, source.name) if "fit" in contents else model_from_json(contents, effects)
     try:
-        return Exported(*(_serialized(source) if trust else read_casadi(data)))
+        if not trust:
+            return Exported(*read_casadi(data))
+        file = ca.FileDeserializer(str(source))
+        return Exported({f.name(): f for f in file.unpack()}, json.loads(file.unpack()))
     except (RuntimeError, ValueError, TypeError, AttributeError, LookupError):  # RecursionError is a RuntimeError
         other = source.suffix.lower() != ".casadi"
         raise DataError(f"cannot read {source.name}: {NOT_OURS}" + ("." if other else ", or an older version did. If "
                         "you know where it comes from, mi.load(path, trust=True) lets CasADi read it, and run what it "
                         "holds.")) from None
-
-
-def _serialized(source: Path) -> tuple[dict[str, ca.Function], dict[str, Any]]:
-    file = ca.FileDeserializer(str(source))
-    functions = file.unpack()
-    return {f.name(): f for f in functions}, json.loads(file.unpack())
 
 
 def _fit_of(contents: Mapping[str, Any], effects: Iterable[Effect], name: str) -> Fit:

@@ -72,21 +72,20 @@ def run_dict(run: Any) -> dict[str, Any]:
 def remarks(fit: Fit) -> list[str]:
     """Say in words what the numbers of a fit cannot: what is not determined, and what would determine it."""
     model, measured, std = fit.problem.model, fit.problem.outputs, fit.std
-    vague = [n for n in model.free_names if std[n] is None]
-    at_limit = [n for n in vague if _vanished(fit, n)]
-    vague = [n for n in vague if n not in at_limit]
+    undetermined = {n: model.parameters[n] for n in model.free_names if std[n] is None}
+    vague = [n for n, p in undetermined.items() if p.lower < fit.values[n] < p.upper]
+    at_limit = [n for n in undetermined if n not in vague]
     said = []
     if model.base == "dc_motor" and any("m" in r.units.values() for r in fit.problem.experiments):
         said.append("The record moves in m: read K in N/A, b in N·s/m, J as a mass in kg, torques as forces in N.")
     motor = [n for n in vague if n in MOTOR]
-    if model.base == "dc_motor" and motor and "i" not in measured:
+    if model.base == "dc_motor" and motor and ("i" not in measured or not {"omega", "theta"} & set(measured)):
         said.append(f"The current was not measured, so {listed(motor)} are not determined one by one, only their "
-                    "combinations. Measure the current, or fix R and K where they are known (--fix R=1.2,K=0.05).")
-        vague = [n for n in vague if n not in MOTOR and not _a_torque(model, n)]
-    elif model.base == "dc_motor" and motor and "omega" not in measured and "theta" not in measured:
-        said.append(f"Neither speed nor angle was measured, so {listed(motor)} are not determined one by one. "
+                    "combinations. Measure the current, or fix R and K where they are known (--fix R=1.2,K=0.05)."
+                    if "i" not in measured else
+                    f"Neither speed nor angle was measured, so {listed(motor)} are not determined one by one. "
                     "Measure one of them, or fix K (--fix K=0.05).")
-        vague = [n for n in vague if n not in MOTOR and not _a_torque(model, n)]
+        vague = [n for n in vague if n not in MOTOR and "N" not in undetermined[n].unit]  # torques go with them
     if vague:
         said.append(f"The records do not determine {listed(vague)}: another value fits them as well. Fix "
                     f"{'it' if len(vague) == 1 else 'one of them'} (--fix {vague[0]}=…), or look at "
@@ -117,23 +116,8 @@ def _of_no_motor(fit: Fit) -> list[str]:
     return said
 
 
-def _vanished(fit: Fit, name: str) -> bool:
-    p = fit.problem.model.parameters[name]
-    return bool(fit.values[name] <= p.lower or fit.values[name] >= p.upper)
-
-
-def _a_torque(model: Any, name: str) -> bool:
-    return "N" in model.parameters[name].unit
-
-
 def write_json(contents: Mapping[str, Any], path: str | Path, force: bool = False) -> None:
-    """Write a dictionary as JSON; ``-`` is standard output.
-
-    Raises
-    ------
-    UsageError, OutputError
-        If the file cannot or must not be written, see `write_files`.
-    """
+    """Write a dictionary as JSON; ``-`` is standard output. For errors see `write_files`."""
     text = json_text(contents)
     if str(path) != "-":
         write_files({Path(path): text}, force)

@@ -58,11 +58,10 @@ def plot_current_limit(
         for ax, s in zip(row, fit.simulations, strict=False):
             _against_limit(ax, s, limit)
         style.tidy(row[0], y=f"{word}\n{style.axis_label('i')}")
-    for ax, s in zip(axes[0], fits[0].simulations, strict=False):
-        style.tidy(ax, title=s.experiment.name)
-    for k, ax in enumerate(axes[-1]):
-        style.tidy(ax, x="time (s)")
-        _zoom(ax, [f.simulations[k] for f in fits], limit)
+    for k, (top, bottom) in enumerate(zip(axes[0], axes[-1], strict=True)):
+        style.tidy(top, title=fits[0].simulations[k].experiment.name)
+        style.tidy(bottom, x="time (s)")
+        _zoom(bottom, [f.simulations[k] for f in fits], limit)
     figure = axes[0, 0].figure
     figure.align_ylabels(axes[:, 0])
     figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper center", ncols=4)
@@ -127,8 +126,7 @@ def plot_formulations(result: Formulations) -> np.ndarray:
     _changes(axes[0], shown)
     _errors(axes[1], shown)
     _walk(axes[2], result)
-    handles, labels = axes[0].get_legend_handles_labels()
-    axes[0].figure.legend(handles, labels, loc="outside upper center", ncols=3)
+    axes[0].figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=3)
     return axes
 
 

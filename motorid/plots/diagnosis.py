@@ -63,8 +63,7 @@ def plot_missing(result: Missing | Diagnosis, *, show: int = 3, run: int | None 
 
 def _balance(row: np.ndarray, missing: Missing, balance: str, run: int | None) -> None:
     values: Sequence[Array] = getattr(missing, balance)
-    size = float(np.nanmax([np.nanmax(np.abs(v), initial=0.0) for v in values]))
-    power = style.decade(size)
+    power = style.decade(float(np.nanmax([np.nanmax(np.abs(v), initial=0.0) for v in values])))
     factor = 10.0**-power
     k = run if run is not None else int(np.argmax([np.nanmean(np.square(v)) for v in values]))
     style.line(row[0], missing.t[k], values[k] * factor, color=_COLOUR[balance], lw=0.9)
@@ -74,9 +73,10 @@ def _balance(row: np.ndarray, missing: Missing, balance: str, run: int | None) -
     part = "" if share is None else f": {100 * share:.0f} % of the squared error"
     title = style.scaled_title(f"missing {noun}", unit, power)
     style.tidy(row[0], x="time (s)", y=title, title=f"Missing {noun}{part}")
-    for ax, b in zip(row[1:], missing.bins.get(balance, ()), strict=False):
+    bins = missing.bins.get(balance, ())
+    for ax, b in zip(row[1:], bins, strict=False):
         _binned(ax, b, missing.signals, values, factor, _COLOUR[balance])
-    for ax in row[1 + len(missing.bins.get(balance, ())) :]:
+    for ax in row[1 + len(bins):]:
         ax.set_axis_off()
 
 
@@ -95,8 +95,8 @@ def _binned(ax: Axes, b: Binned, signals: Sequence[Mapping[str, Array]], values:
         ax.fill_between(x, b.low[part] * factor, b.high[part] * factor, color=colour, alpha=0.3, lw=0)
         ax.plot(x, b.mean[part] * factor, "-" if len(part) > 1 else "o", ms=3, color=colour, lw=1.5)
     ax.axhline(0, color=style.MUTED, lw=0.6)
-    label = style.axis_label(b.against)
-    label = f"{label.split(' (')[0]} ({b.unit})" if b.unit else label
+    name = style.axis_label(b.against)
+    label = f"{name.split(' (')[0]} ({b.unit})" if b.unit else name
     style.tidy(ax, x=label, title=f"explains {100 * b.explained:.0f} %")
 
 
@@ -122,18 +122,17 @@ def plot_answer(found: Diagnosis, ax: Axes | None = None) -> Axes:
     balance = "voltage" if found.where == "electrical" else "torque"
     had = accounted(found.before, found.after)[balance == "torque"] if found.after is not found.before else None
     against, periods = _quantity(found, balance, had)
-    x = [np.asarray(s[against]) * periods for s in m.signals]
-    x = [np.mod(z, 2 * np.pi) if against == "theta" else z for z in x]
-    values = getattr(m, balance)
-    power = style.decade(float(np.nanmax([np.nanmax(np.abs(v), initial=0.0) for v in values])))
+    x = np.concatenate([np.asarray(s[against]) * periods for s in m.signals])
+    x = np.mod(x, 2 * np.pi) if against == "theta" else x
+    values = np.concatenate(getattr(m, balance))
+    power = style.decade(float(np.nanmax(np.abs(values), initial=0.0)))
     ax = style.only(ax, width=5.6, height=3.6)
-    every = np.concatenate(x)
-    scatter(ax, every, np.concatenate(values) * 10.0**-power, most=3000, color=style.MUTED)
-    centre, mean, low, high = _profile(every, np.concatenate(values) * 10.0**-power)
+    scatter(ax, x, values * 10.0**-power, most=3000, color=style.MUTED)
+    centre, mean, low, high = _profile(x, values * 10.0**-power)
     ax.fill_between(centre, low, high, color=_COLOUR[balance], alpha=0.3, lw=0)
     ax.plot(centre, mean, color=_COLOUR[balance], lw=1.6, label="missing, mean ± 95 %")
     if had is not None:
-        centre, mean, *_ = _profile(every, np.concatenate(had) * 10.0**-power)
+        centre, mean, *_ = _profile(x, np.concatenate(had) * 10.0**-power)
         added = " + ".join(n for n in found.after.model.effect_names if n not in found.before.model.effect_names)
         label = textwrap.fill(f"{added}, with the shift of the parameters", 60)
         ax.plot(centre, mean, "--", color=style.PALETTE["orange"], lw=2.0, label=label)
@@ -193,7 +192,7 @@ def plot_ranking(result: Diagnosis | Sequence[Candidate], ax: Axes | None = None
     --------
     >>> axes = mi.plot_ranking(found)
     """
-    every = list(result.ranking if isinstance(result, Diagnosis) else result)
+    every = result.ranking if isinstance(result, Diagnosis) else result
     chosen = every[:show]
     if not chosen or not all(isinstance(c, Candidate) for c in chosen):
         raise UsageError("plot_ranking takes a diagnosis with a ranking: mi.plot_ranking(mi.diagnose(fit)).")
@@ -252,14 +251,16 @@ def plot_ladder(result: Ladder | Diagnosis, ax: Axes | None = None) -> Axes:
     rungs = ladder.rungs
     ax = style.only(ax, width=max(5.6, 1.5 + 1.25 * len(rungs)), height=3.4)
     x = np.arange(len(rungs), dtype=float)
-    for k, c in enumerate(rungs[0].nrmse):
-        _falling(ax, x, [100 * r.nrmse[c] for r in rungs], c, style.CYCLE[k], held_out=False)
+    for c, colour in zip(rungs[0].nrmse, style.CYCLE, strict=False):
+        name = style.axis_label(c).split(" (")[0]
+        ax.plot(x, [100 * r.nrmse[c] for r in rungs], "o-", color=colour, ms=5.5, label=f"{name}, fitted")
         if all(r.validation_nrmse and c in r.validation_nrmse for r in rungs):
-            _falling(ax, x, [100 * (r.validation_nrmse or {})[c] for r in rungs], c, style.CYCLE[k], held_out=True)
+            ax.plot(x, [100 * (r.validation_nrmse or {})[c] for r in rungs], "s--", color=colour, mfc="white", ms=5.5,
+                    label=f"{name}, held out")
     ax.set_yscale("log")
     style.plain_decades(ax)
     for k in sorted({0, len(rungs) - 1}):
-        _error_labels(ax, k, {c: 100 * e for c, e in rungs[k].nrmse.items()}, "right" if k == 0 else "left")
+        _error_labels(ax, k, {c: 100 * e for c, e in rungs[k].nrmse.items()})
     first = "plain motor" if rungs[0].fit.model.base == "dc_motor" else "plain drive"
     started = " + ".join([first, *rungs[0].fit.model.effect_names])
     ax.set_xticks(x, [started if r.added is None else "+ " + r.added.replace(" + ", "\n+ ") for r in rungs])
@@ -269,13 +270,7 @@ def plot_ladder(result: Ladder | Diagnosis, ax: Axes | None = None) -> Axes:
     return ax
 
 
-def _falling(ax: Axes, x: Array, errors: Sequence[float], channel: str, colour: str, *, held_out: bool) -> None:
-    name = style.axis_label(channel).split(" (")[0]
-    ax.plot(x, errors, "s--" if held_out else "o-", color=colour, mfc="white" if held_out else colour, ms=5.5,
-            label=f"{name}, {'held out' if held_out else 'fitted'}")
-
-
-def _error_labels(ax: Axes, k: int, errors: Mapping[str, float], side: str) -> None:
+def _error_labels(ax: Axes, k: int, errors: Mapping[str, float]) -> None:
     """Write the fitted errors beside the points of rung `k`, in their colours, apart where points lie close."""
     low, high = np.log(ax.get_ylim())
     room = 0.055 * (high - low)  # height of a line of text
@@ -285,9 +280,10 @@ def _error_labels(ax: Axes, k: int, errors: Mapping[str, float], side: str) -> N
         close = np.maximum(room - np.diff(at), 0.0)
         at[:-1], at[1:] = at[:-1] - close / 2, at[1:] + close / 2
     colours = dict(zip(errors, style.CYCLE, strict=False))
+    away, side = (8, "left") if k else (-8, "right")
     for c, y in zip(names, np.exp(at), strict=True):
-        ax.annotate(number(errors[c], 2), (k, float(y)), (-8 if side == "right" else 8, 0), va="center", ha=side,
-                    textcoords="offset points", fontsize=8, color=colours[c])
+        ax.annotate(number(errors[c], 2), (k, float(y)), (away, 0), va="center", ha=side, textcoords="offset points",
+                    fontsize=8, color=colours[c])
 
 
 @style.styled
@@ -312,9 +308,8 @@ def plot_design(design: Design) -> np.ndarray:
     axes = style.grid(len(first) + 1, 1, sharex=True)[:, 0]
     style.line(axes[0], design.t, design.v, zoh=True, color=style.PALETTE["grey"])
     style.tidy(axes[0], y=style.axis_label("v"), title="Designed experiment")
-    colours = [style.PALETTE[c] for c in ("blue", "orange", "green", "purple")]
     for ax, channel in zip(axes[1:], first, strict=True):
-        for (name, outputs), colour in zip(design.predicted.items(), colours, strict=False):
+        for (name, outputs), colour in zip(design.predicted.items(), style.CYCLE[:4], strict=False):
             y, half = outputs[channel], design.band[name][channel]
             ax.fill_between(design.t, y - half, y + half, color=colour, alpha=0.2, lw=0)
             style.line(ax, design.t, y, color=colour, label=name if len(design.predicted) > 1 else "predicted")

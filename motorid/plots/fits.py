@@ -47,8 +47,7 @@ def plot_runs(runs: Sequence[Experiment] | Experiment, channels: Sequence[str] |
     if not every:
         raise UsageError("plot_runs needs at least one run: mi.plot_runs(mi.read_runs('run*.csv')).")
     shown = every[:COLUMNS]
-    measured = [c for c in CHANNELS if any(c in r.outputs for r in shown)]
-    names = list(channels or ["v", *measured])
+    names = list(channels or ["v", *(c for c in CHANNELS if any(c in r.outputs for r in shown))])
     for name in names:
         if not any(name in run.inputs or name in CHANNELS for run in every):
             raise UsageError(one_of(name, ["v", *CHANNELS], "channel"))
@@ -63,7 +62,9 @@ def plot_runs(runs: Sequence[Experiment] | Experiment, channels: Sequence[str] |
                            color=style.INK if c == "v" else style.MODEL)
         style.tidy(axes[0, k], title=_run_title(run, k, every))
         style.tidy(axes[-1, k], x="time (s)")
-    _label_rows(axes, names, shown)
+    for ax, c in zip(axes[:, 0], names, strict=True):
+        ax.set_ylabel(style.axis_label(c, next((r for r in shown if c in r.units), None)))
+    axes[0, 0].figure.align_ylabels(axes[:, 0])
     return axes
 
 
@@ -156,24 +157,22 @@ def _drawn(every: list[Simulation], before: Any) -> tuple[np.ndarray, list[_Movi
     row = 1.0 if len(names) < 3 else 0.75
     axes = style.grid(2 * len(names), len(shown), row=row, sharex="col", sharey="row", height_ratios=ratios)
     for k, s in enumerate(shown):
+        earlier = old[k] if k < len(old) else None
         for j, c in enumerate(names):
+            upper, lower = axes[2 * j:2 * j + 2, k]
             if c in s.experiment.outputs:
-                earlier = old[k] if k < len(old) else None
-                moving += [_Moving(_curves(axes[2 * j, k], s, c, earlier), k, c, _error_title(axes[2 * j, k], s, c)),
-                           _Moving(_residual(axes[2 * j + 1, k], s, c, earlier), k, c)]
+                moving += [_Moving(_curves(upper, s, c, earlier), k, c, _error_title(upper, s, c)),
+                           _Moving(_residual(lower, s, c, earlier), k, c)]
+                axes[2 * j, 0].set_ylabel(style.axis_label(c, s.experiment))
+                axes[2 * j + 1, 0].set_ylabel(f"residual\n({s.experiment.units[c]})")
             else:
-                _absent(axes[2 * j, k], c)
-                axes[2 * j + 1, k].set_axis_off()
+                _absent(upper, c)
+                lower.set_axis_off()
         style.tidy(axes[0, k], title=_run_title(s.experiment, k, [e.experiment for e in every]))
         style.tidy(axes[-1, k], x="time (s)")
-    for j, c in enumerate(names):
-        run = next(s.experiment for s in shown if c in s.experiment.outputs)
-        axes[2 * j, 0].set_ylabel(style.axis_label(c, run))
-        axes[2 * j + 1, 0].set_ylabel(f"residual\n({run.units[c]})")
     axes[0, 0].figure.align_ylabels(axes[:, 0])
-    handles, labels = axes[0, 0].get_legend_handles_labels()
-    rest = axes[1, 0].get_legend_handles_labels()
-    axes[0, 0].figure.legend(handles + rest[0], labels + rest[1], loc="outside upper left", ncols=5)
+    entries = (a + b for a, b in zip(*(ax.get_legend_handles_labels() for ax in axes[:2, 0]), strict=True))
+    axes[0, 0].figure.legend(*entries, loc="outside upper left", ncols=5)
     return axes, moving
 
 
@@ -201,9 +200,8 @@ def _residual(ax: Axes, s: Simulation, channel: str, old: Simulation | None) -> 
 
 
 def _simulations(result: Any) -> list[Simulation]:
-    found = result if isinstance(result, list | tuple) else getattr(result, "simulations", None)
-    if isinstance(result, Simulation):
-        found = [result]
+    found = ([result] if isinstance(result, Simulation) else result if isinstance(result, list | tuple) else
+             getattr(result, "simulations", None))
     if not found or not all(isinstance(s, Simulation) for s in found):
         raise UsageError("plot_fit takes a fit, mi.evaluate(fit, runs) or mi.simulate(model, runs); "
                          f"got {type(result).__name__}.")
@@ -213,13 +211,6 @@ def _simulations(result: Any) -> list[Simulation]:
 def _run_title(run: Experiment, k: int, every: Sequence[Experiment]) -> str:
     more = len(every) - COLUMNS
     return f"{run.name}   (and {more} more not shown)" if more > 0 and k == COLUMNS - 1 else run.name
-
-
-def _label_rows(axes: np.ndarray, names: Sequence[str], runs: Sequence[Experiment]) -> None:
-    for j, c in enumerate(names):
-        run = next((r for r in runs if c in r.outputs or c in r.inputs), runs[0])
-        axes[j, 0].set_ylabel(style.axis_label(c, run))
-    axes[0, 0].figure.align_ylabels(axes[:, 0])
 
 
 def _absent(ax: Axes, channel: str) -> None:
@@ -270,9 +261,8 @@ def plot_parameters(*results: Any, truth: Mapping[str, float] | None = None,
 
 def _one_parameter(ax: Axes, fits: Sequence[Any], name: str, truth: float | None) -> None:
     known = [k for k, f in enumerate(fits) if name in f.values]
-    parameter = next((f.model.parameters[name] for f in reversed(fits) if name in f.values), None)
-    unit = parameter.unit if parameter else ""
-    if parameter is not None and parameter.periodic and truth is not None:  # the same angle, some turns further
+    parameter = fits[known[-1]].model.parameters[name]
+    if parameter.periodic and truth is not None:  # the same angle, some turns further
         truth += 2 * np.pi * round((fits[known[-1]].values[name] - truth) / (2 * np.pi))
     values = np.array([fits[k].values[name] for k in known] + ([] if truth is None else [truth]))
     power = style.decade(float(np.max(np.abs(values))))
@@ -282,15 +272,14 @@ def _one_parameter(ax: Axes, fits: Sequence[Any], name: str, truth: float | None
         value, std, colour = fits[k].values[name], fits[k].std.get(name), style.CYCLE[k % len(style.CYCLE)]
         ax.errorbar(k + 1, value / 10.0**power, yerr=2 * (std or 0.0) / 10.0**power, fmt="o", ms=5,
                     capsize=3 if std else 0, lw=1.4, color=colour, mfc="none" if std is None else colour)
-    ax.set_xlim(0.4, len(fits) + 0.6)
-    ax.set_xticks(range(1, len(fits) + 1))
+    ax.set(xlim=(0.4, len(fits) + 0.6), xticks=range(1, len(fits) + 1))
     _around(ax, values / 10.0**power)
     for k in (k for k in known if fits[k].std.get(name) is None):
         y = fits[k].values[name] / 10.0**power
         below = y > sum(ax.get_ylim()) / 2  # above it may be the title
         ax.annotate("not\ndetermined", (k + 1, y), (0, -6 if below else 6), textcoords="offset points", ha="center",
                     va="top" if below else "bottom", fontsize=7, color=style.MUTED)
-    style.tidy(ax, title=style.scaled_title(name, unit, power))
+    style.tidy(ax, title=style.scaled_title(name, parameter.unit, power))
     ax.grid(axis="x", visible=False)
 
 
@@ -307,9 +296,8 @@ def _added(fit: Any, previous: Any) -> str:
     names = fit.model.effect_names
     if previous is None:
         return " + ".join(["plain motor" if fit.model.base == "dc_motor" else "plain drive", *names])
-    new = [n for n in names if n not in previous.model.effect_names]
-    gone = [n for n in previous.model.effect_names if n not in names]
-    changes = [f"+ {n}" for n in new] + [f"− {n}" for n in gone]
+    before = previous.model.effect_names
+    changes = [f"+ {n}" for n in names if n not in before] + [f"− {n}" for n in before if n not in names]
     again = {"penalty": "penalties", "hard": "hard constraints"}.get(fit.formulation, "again")
     return " ".join(changes) or again
 

@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from motorid.channels import CHANNELS
-from motorid.errors import UsageError, one_of
+from motorid.errors import DataError, UsageError, one_of
 from motorid.estimation.result import Fit
 from motorid.numerics.autoregression import autocorrelation, effective_samples
 from motorid.numerics.signals import Array
@@ -70,10 +70,13 @@ def _channel(axes: np.ndarray, fit: Fit, channel: str, against: Sequence[str]) -
     _over_time(axes[0], sims, channel, sigma)
     style.tidy(axes[0], x="time, runs one after the other (s)", y=f"residual ({unit})",
                title=f"Residual of the {style.axis_label(channel, run)}")
-    every = np.concatenate([s.residual(channel) for s in sims])
-    _histogram(axes[1], style.finite(every, f"the residual of {channel}"), sigma)
+    residuals = [s.residual(channel) for s in sims]
+    every = np.concatenate(residuals)
+    if not np.isfinite(every).any():
+        raise DataError(f"nothing to draw: the residual of {channel} holds no finite number.")
+    _histogram(axes[1], every[np.isfinite(every)], sigma)
     _with_input(axes[2], sims, channel)
-    _autocorrelation(axes[3], [s.residual(channel) for s in sims])
+    _autocorrelation(axes[3], residuals)
     for ax, other in zip(axes[4:], against, strict=True):
         # The model's own: the measured one shares its noise with the residual, which then seems to depend.
         with_other = [s for s in sims if other in s.outputs]
@@ -135,10 +138,8 @@ def _autocorrelation(ax: Axes, residuals: Sequence[Array]) -> None:
     lags = min(LAGS, min(len(r) for r in residuals) // 3)
     every = np.concatenate(list(residuals))
     rho = autocorrelation([r - np.nanmean(every) for r in residuals], lags)
-    half = 1.96 / np.sqrt(np.isfinite(every).sum())
-    style.band(ax, half)
-    k = np.arange(1, lags + 1)
-    ax.vlines(k, 0, rho[1:], color=style.PALETTE["purple"], lw=1.2)
+    style.band(ax, 1.96 / np.sqrt(np.isfinite(every).sum()))
+    ax.vlines(np.arange(1, lags + 1), 0, rho[1:], color=style.PALETTE["purple"], lw=1.2)
     ax.axhline(0, color=style.MUTED, lw=0.6)
     ax.set_ylim(min(-0.25, float(rho.min()) * 1.1), max(0.4, min(1.05, float(rho[1:].max(initial=0)) * 1.25)))
     style.tidy(ax, x="lag (samples)", y="correlation", title="Autocorrelation")

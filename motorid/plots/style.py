@@ -20,7 +20,7 @@ from matplotlib.lines import Line2D
 
 from motorid.channels import NAMES, SYMBOLS, UNITS, channel_name
 from motorid.display.numbers import number
-from motorid.errors import DataError, UsageError, arguments_told
+from motorid.errors import UsageError, arguments_told
 from motorid.numerics.signals import Array
 from motorid.records.experiment import Experiment
 
@@ -32,7 +32,7 @@ INK, MUTED, FAINT, PAPER = "#1f2328", "#59636e", "#d1d9e0", "#ffffff"
 PALETTE = {"blue": "#0072b2", "orange": "#d55e00", "green": "#009e73", "purple": "#a4507d", "yellow": "#b98500",
            "grey": "#7a848e"}
 CYCLE = (*(PALETTE[c] for c in ("blue", "orange", "green", "purple", "yellow")), INK, PALETTE["grey"])
-MEASURED, MODEL, RESIDUAL, HELD_OUT = PALETTE["grey"], PALETTE["blue"], PALETTE["orange"], PALETTE["green"]
+MEASURED, MODEL, RESIDUAL = PALETTE["grey"], PALETTE["blue"], PALETTE["orange"]
 # Colours of a figure become variables of the page, so that a dark page has a dark figure.
 VARIABLES = {INK: "ink", MUTED: "muted", FAINT: "line", PAPER: "paper", **{c: n for n, c in PALETTE.items()}}
 WIDTH = 9.2  # inches: the text width of a notebook
@@ -139,10 +139,8 @@ def _cleaned(svg: str, name: str, alt: str) -> str:
     for colour, variable in VARIABLES.items():
         svg = svg.replace(colour, f"var(--{variable})")
     svg = svg.replace("font-family: 'DejaVu Sans'", "font-family: var(--font)")
-    svg = re.sub(r"\n\s*", "\n", svg)
-    box = re.search(r'viewBox="([^"]+)"', svg)
-    body = svg[svg.index(">") + 1:]
-    view = box[1] if box else "0 0 600 400"
+    head, body = re.sub(r"\n\s*", "\n", svg).split(">", 1)
+    view = head.partition('viewBox="')[2].partition('"')[0]
     return f'<svg viewBox="{view}" role="img" aria-label="{escape(alt)}">{body.strip()}'
 
 
@@ -207,12 +205,7 @@ def band(ax: Axes, half: float, label: str | None = None) -> None:
 
 def tidy(ax: Axes, *, x: str = "", y: str = "", title: str = "") -> None:
     """Label axes and leave room for few, round ticks."""
-    if x:
-        ax.set_xlabel(x)
-    if y:
-        ax.set_ylabel(y)
-    if title:
-        ax.set_title(title)
+    ax.set(**{what: text for what, text in (("xlabel", x), ("ylabel", y), ("title", title)) if text})
 
 
 def above(ax: Axes) -> None:
@@ -244,12 +237,3 @@ def scaled_title(name: str, unit: str, power: int = 0) -> str:
     factor = f"10{str(power).translate(str.maketrans('-0123456789', '⁻⁰¹²³⁴⁵⁶⁷⁸⁹'))}" if power else ""
     inside = " ".join(w for w in (factor, unit) if w)
     return f"{name} ({inside})" if inside else name
-
-
-def finite(values: Array, what: str) -> Array:
-    """Return the finite ones of `values`."""
-    good = np.asarray(values, float)
-    good = good[np.isfinite(good)]
-    if not good.size:
-        raise DataError(f"nothing to draw: {what} holds no finite number.")
-    return good

@@ -49,19 +49,18 @@ def plot_singular_values(result: Identifiability) -> np.ndarray:
     style.refuse_other(result, Identifiability, "plot_singular_values takes mi.identifiability(fit)")
     k = len(result.names)
     axes = style.new_figure(min(style.WIDTH, 4.6 + 0.6 * k), 3.2).subplots(1, 2, width_ratios=[1.0, max(0.8, 0.16 * k)])
-    rows = np.arange(1, k + 1)
+    ax, rows = axes[0], np.arange(1, k + 1)
     values = np.maximum(result.singular_values, 1e-12 * max(float(result.singular_values[0]), 1e-300))
+    bottom = min(0.1, 0.5 * float(values.min()))
     colours = [style.PALETTE["blue"] if v > SEEN else style.PALETTE["orange"] for v in values]
-    axes[0].vlines(rows, min(0.1, 0.5 * float(values.min())), values, color=colours, lw=2)
-    axes[0].scatter(rows, values, color=colours, s=24, zorder=3)
-    axes[0].set_yscale("log")
-    axes[0].set_ylim(min(0.1, 0.5 * float(values.min())), 2.5 * float(values[0]))
-    axes[0].axhspan(axes[0].get_ylim()[0], SEEN, color=style.MUTED, alpha=0.16, lw=0, zorder=0)
-    axes[0].set_xticks(rows)
-    style.plain_decades(axes[0])
-    axes[0].text(0.98, 0.97, "grey: not determined", transform=axes[0].transAxes, ha="right", va="top", fontsize=8,
-                 color=style.MUTED)
-    style.tidy(axes[0], x="direction", y="singular value",
+    ax.vlines(rows, bottom, values, color=colours, lw=2)
+    ax.scatter(rows, values, color=colours, s=24, zorder=3)
+    ax.set(yscale="log", ylim=(bottom, 2.5 * float(values[0])), xticks=rows)
+    ax.axhspan(bottom, SEEN, color=style.MUTED, alpha=0.16, lw=0, zorder=0)
+    style.plain_decades(ax)
+    ax.text(0.98, 0.97, "grey: not determined", transform=ax.transAxes, ha="right", va="top", fontsize=8,
+            color=style.MUTED)
+    style.tidy(ax, x="direction", y="singular value",
                title=f"rank {result.rank} of {k}, condition number {number(result.condition_number, 3)}")
     _directions(axes[1], result)
     return axes
@@ -73,10 +72,7 @@ def _directions(ax: Axes, result: Identifiability) -> None:
             colour = style.PALETTE["blue"] if weight > 0 else style.PALETTE["orange"]
             ax.scatter(column, row, s=180 * abs(float(weight)) ** 1.5, color=colour, alpha=0.85, lw=0)
     k = len(result.names)
-    ax.set_xticks(range(k), result.names)
-    ax.set_yticks(range(1, k + 1))
-    ax.set_ylim(k + 0.6, 0.4)
-    ax.set_xlim(-0.6, k - 0.4)
+    ax.set(xlim=(-0.6, k - 0.4), ylim=(k + 0.6, 0.4), xticks=range(k), xticklabels=result.names, yticks=range(1, k + 1))
     style.tidy(ax, y="direction", title="What each direction is made of (area: weight)")
 
 
@@ -112,8 +108,7 @@ def plot_profile(result: Profile | Mapping[str, Profile] | Intervals) -> np.ndar
         ax.set_axis_off()
     for k in range(0, len(profiles), columns):
         axes[k].set_ylabel("rise of the error (t²)")
-    handles, labels = axes[0].get_legend_handles_labels()
-    axes[0].figure.legend(handles, labels, loc="outside upper center", ncols=5)
+    axes[0].figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=5)
     return axes[: len(profiles)]
 
 

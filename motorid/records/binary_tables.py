@@ -171,13 +171,12 @@ def parquet_table(data: bytes) -> TextTable:
                                 "pip install 'motorid[parquet]', or export CSV.") from None
     try:
         about = pyarrow.parquet.read_metadata(io.BytesIO(data))
-    except Exception as error:  # whatever its C++ side throws
-        raise DataError(f"it cannot be read as Parquet ({_first_line(error)}).") from None
-    if 8 * about.num_rows * about.num_columns > MOST_UNPACKED or about.num_columns > MOST_COLUMNS:
-        raise DataError(f"its {about.num_rows} rows of {about.num_columns} columns are more than can be read at once; "
-                        "save fewer.")
-    try:
+        if 8 * about.num_rows * about.num_columns > MOST_UNPACKED or about.num_columns > MOST_COLUMNS:
+            raise DataError(f"its {about.num_rows} rows of {about.num_columns} columns are more than can be read at "
+                            "once; save fewer.")
         frame = pd.read_parquet(io.BytesIO(data), engine="pyarrow")
+    except DataError:
+        raise
     except Exception as error:  # pyarrow raises whatever its C++ side throws
         raise DataError(f"it cannot be read as Parquet ({_first_line(error)}).") from None
     return frame_table(frame)

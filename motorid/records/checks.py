@@ -58,7 +58,8 @@ def check_runs(runs: Sequence[Experiment]) -> list[str]:
     ...     print(remark)
     """
     remarks = []
-    plain = [run.without_spikes() for run in runs]  # a few wild samples say nothing of units, limits or the sensor
+    # A few wild samples say nothing of units, limits or the sensor, nor does a channel without a sample.
+    plain = [run.without(*(c for c, y in run.outputs.items() if np.isnan(y).all())).without_spikes() for run in runs]
     for check in _CHECKS:
         hits = [(run.name, text) for run in (runs if check in (_missing, _spikes) else plain) if (text := check(run))]
         if hits:
@@ -132,14 +133,10 @@ def current_limit(run: Experiment) -> str | None:
     near = 4 * noise_level(i, run.t)
     if near > 0.1 * top:
         return None
-    flat = np.abs(np.abs(i) - top) < near
-    ends = np.flatnonzero(np.diff(np.r_[0, flat.astype(int), 0]))
-    held = 0
-    for a, b in zip(ends[::2], ends[1::2], strict=True):
-        steady = np.ptp(v[a:b]) < 0.02 * np.ptp(v)
-        if b - a >= 10 and steady and np.isfinite(omega[a:b]).all() and np.ptp(omega[a:b]) > 0.2 * np.nanmax(
-                np.abs(omega)):
-            held += b - a
+    ends = np.flatnonzero(np.diff((np.abs(np.abs(i) - top) < near).astype(int), prepend=0, append=0))
+    clear = 0.2 * np.nanmax(np.abs(omega))  # no range with a missing sample is larger
+    held = sum(b - a for a, b in zip(ends[::2], ends[1::2], strict=True)
+               if b - a >= 10 and np.ptp(v[a:b]) < 0.02 * np.ptp(v) and np.ptp(omega[a:b]) > clear)
     if held < 0.02 * run.n:
         return None
     return (f"the current stays at {top:.3g} {run.units['i']} while the voltage stays and the speed changes "
@@ -259,14 +256,14 @@ def _never_reverses(runs: Sequence[Experiment]) -> str | None:
 
 def signs(run: Experiment) -> str | None:
     """Positive voltage must drive positive current and, on the whole, positive speed."""
-    v = run.inputs["v"]
-    against = [name for name, cosine in (("current", _cosine(v, run.outputs.get("i"))),
-                                         ("speed", _speed_cosine(run))) if cosine < -0.4]
     if "omega" in run.outputs:  # a motor that brakes goes against its voltage, too: the balances know
         order, turned = _as_balances_want(run)
-        against = [name for name, sign in zip(("current", "speed"), turned, strict=True) if sign < 0]
         if order != (0, 1, 2):
             return None
+    else:
+        turned = [-1 if cosine < -0.4 else 1
+                  for cosine in (_cosine(run.inputs["v"], run.outputs.get("i")), _speed_cosine(run))]
+    against = [name for name, sign in zip(("current", "speed"), turned, strict=True) if sign < 0]
     measured = ["current"] * ("i" in run.outputs) + ["speed"] * bool({"omega", "theta"} & set(run.outputs))
     if not against:
         return None
@@ -316,16 +313,17 @@ def angle_against_speed(run: Experiment) -> str | None:
     """The angle must advance by the integral of the speed."""
     if not {"omega", "theta"} <= set(run.outputs):
         return None
-    travel, integral = _block_travel(run)
-    if len(travel) < 5 or np.std(travel) < 5 * noise_level(run.outputs["theta"], run.t):
+    theta, omega = run.outputs["theta"], run.outputs["omega"]
+    edges = _block_edges(theta)
+    if len(edges) < 6 or np.isfinite(omega).sum() < 2:
         return None
-    scale = float(np.sqrt(np.sum(travel**2) * np.sum(integral**2)))
-    if scale == 0 or abs(agree := float(np.sum(travel * integral)) / scale) < 0.9:
+    travel, turned = np.diff(theta[edges]), np.diff(integral(run.t, bridged(run.t, omega))[edges])
+    if np.std(travel) < 5 * noise_level(theta, run.t) or abs(agree := _cosine(travel, turned)) < 0.9:
         return None
     if agree < 0:
         return ("the angle falls while the speed is positive: the sign of one of them is swapped. "
                 "Turn it round, e.g. units={'theta': '-1 rad'}.")
-    ratio = float(np.sum(travel * integral) / np.sum(integral**2))
+    ratio = float(np.sum(travel * turned) / np.sum(turned**2))
     if 0.8 < ratio < 1.25:
         return None
     nearest = min(_RATIOS, key=lambda r: abs(ratio / r - 1))
@@ -515,27 +513,16 @@ def _cosine(a: Array, b: Array | None) -> float:
 
 
 def _speed_cosine(run: Experiment) -> float:
-    if "omega" in run.outputs:
-        return _cosine(run.inputs["v"], run.outputs["omega"])
-    if "theta" not in run.outputs or len(edges := _edges(run, "theta")) < 6:
+    """Return the cosine of the integral of the voltage and the travel, where no speed was measured."""
+    theta = run.outputs.get("theta")
+    if theta is None or len(edges := _block_edges(theta)) < 6:
         return 0.0
-    travel = np.diff(run.outputs["theta"][edges])
-    pushed = np.diff(integral(run.t, run.inputs["v"])[edges])
-    return _cosine(pushed, travel)
+    return _cosine(np.diff(integral(run.t, run.inputs["v"])[edges]), np.diff(theta[edges]))
 
 
-def _block_travel(run: Experiment) -> tuple[Array, Array]:
-    """Advance of the angle and integral of the speed over blocks long enough to average noise and delay."""
-    edges = _edges(run, "theta")
-    omega = run.outputs["omega"]
-    if np.isfinite(omega).sum() < 2:
-        return np.empty(0), np.empty(0)
-    filled = bridged(run.t, omega)
-    return np.diff(run.outputs["theta"][edges]), np.diff(integral(run.t, filled)[edges])
-
-
-def _edges(run: Experiment, channel: str) -> NDArray[np.intp]:
-    known = np.flatnonzero(np.isfinite(run.outputs[channel]))
+def _block_edges(theta: Array) -> NDArray[np.intp]:
+    """Return the edges of blocks long enough to average noise and delay, at samples that are not missing."""
+    known = np.flatnonzero(np.isfinite(theta))
     return known[np.unique(np.linspace(0, len(known) - 1, min(_BLOCKS, len(known) // 5) + 1).astype(int))]
 
 

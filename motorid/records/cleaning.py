@@ -52,19 +52,15 @@ def run_from_columns(columns: Mapping[str, Array], texts: Texts, layout: Layout,
     extra = {c: a[rows] for c, a in columns.items() if c not in used}
     if set(texts) - used:
         said.append(f"left out columns of text: {', '.join(sorted(set(texts) - used))}.")
-    facts = {**(meta or {}), **_origin(layout), "notes": said, "extra": extra}
+    facts = {**(meta or {}), "notes": said, "extra": extra,
+             "columns": {c: p.column for c, p in layout.places.items()},
+             "original_units": {c: p.unit.label for c, p in layout.places.items()},
+             "assumed_units": [c for c, p in layout.places.items() if not p.stated]}
     units = {c: places[c].unit.symbol for c in (*inputs, *outputs)}
     try:
         return Experiment(t, inputs, outputs, sigma or {}, cast(Any, hold), units, name, facts)
     except DataError as error:
         raise DataError(str(error).removeprefix(f"{name}: ")) from None
-
-
-def _origin(layout: Layout) -> dict[str, object]:
-    places = layout.places
-    return {"columns": {c: p.column for c, p in places.items()},
-            "original_units": {c: p.unit.label for c, p in places.items()},
-            "assumed_units": [c for c, p in places.items() if not p.stated]}
 
 
 def _channel(columns: Mapping[str, Array], texts: Texts, place: Place, channel: str) -> Array:
@@ -177,12 +173,12 @@ def _filled_forward(v: Array, column: str, said: list[str]) -> Array:
 
 
 def _has_values(channel: str, values: Array, column: str, said: list[str]) -> bool:
-    missing = int(np.count_nonzero(np.isnan(values)))
-    if missing == len(values):
+    missing = np.isnan(values)
+    if missing.all():
         said.append(f"left out '{column}' ({channel}): every sample is missing.")
-    elif missing:
-        said.append(f"'{column}' ({channel}) is missing in {missing} of {len(values)} rows.")
-    return missing < len(values)
+    elif missing.any():
+        said.append(f"'{column}' ({channel}) is missing in {np.count_nonzero(missing)} of {len(values)} rows.")
+    return not missing.all()
 
 
 def _note_gaps(t: Array, said: list[str]) -> None:

@@ -44,8 +44,7 @@ def data_path(name: str = "") -> Path:
     >>> mi.data_path("hidden_friction/run1.csv").name
     'run1.csv'
     """
-    root = _root()
-    path = root / name
+    path = _root() / name
     if not path.exists():
         files = sorted(f for known in _truths().values() for f in known["files"])
         raise DataError(one_of(name, files if "/" in name else datasets(), "shipped data"))

@@ -78,7 +78,10 @@ class Experiment(Shown):
     def __post_init__(self) -> None:
         _freeze(self, "name", printable(str(self.name)))
         for optional in ("sigma", "units", "meta"):
-            _freeze(self, optional, _mapping(getattr(self, optional), optional, self.name))
+            given = getattr(self, optional)
+            if not isinstance(given, Mapping | None):
+                raise DataError(f"{self.name}: '{optional}' must be a mapping from names to values; got {given!r}.")
+            _freeze(self, optional, MappingProxyType(dict(given or {})))
         t = _frozen_array(self.t, "t", self.name)
         _check_time(t, self.name)
         _freeze(self, "t", t)
@@ -177,8 +180,7 @@ class Experiment(Shown):
 
         Not next to jumps of the voltage, where the motor is quick; at least three, at most 5 % of a channel.
         """
-        v = self.inputs["v"]
-        outputs = {c: preprocessing.without_spikes(self.t, y, v) for c, y in self.outputs.items()}
+        outputs = {c: preprocessing.without_spikes(self.t, y, self.inputs["v"]) for c, y in self.outputs.items()}
         return self.with_(outputs=outputs) if any(outputs[c] is not y for c, y in self.outputs.items()) else self
 
     def _with_inputs(self, read: Callable[[Array], Array]) -> Experiment:
@@ -194,10 +196,9 @@ class Experiment(Shown):
         rows = []
         for name, y in (*self.inputs.items(), *self.outputs.items()):
             good = y[np.isfinite(y)]
-            missing = len(y) - len(good)
-            limits = [number(float(limit), 3) for limit in (good.min(), good.max())] if len(good) else []
-            rows.append([f"{NAMES[name]} {name}", f"{limits[0]} … {limits[1]} {self.units[name]}" if limits else "–",
-                         Flag(f"{missing} of {len(y)}", "note") if missing else "none"])
+            limits = f"{number(good.min(), 3)} … {number(good.max(), 3)} {self.units[name]}" if len(good) else "–"
+            missing = Flag(f"{len(y) - len(good)} of {len(y)}", "note") if len(good) < len(y) else "none"
+            rows.append([f"{NAMES[name]} {name}", limits, missing])
         head = (f"{self.n} samples in {duration(self.duration)}, {number(1e3 * self.dt, 3)} ms apart; "
                 f"input {'constant' if self.hold == 'zoh' else 'linear'} between samples.")
         return Card(f"Run {self.name}", text=(head, *(str(n) for n in self.meta.get("notes", ()))),
@@ -227,8 +228,7 @@ def split(experiment: Experiment, n: int = 2) -> list[Experiment]:
 
 
 def windows(experiment: Experiment, seconds: float) -> list[Experiment]:
-    """Cut a run into windows of about `seconds`, to be simulated each from a state of its own; what is cut stays so.
-    """
+    """Cut a run into windows of about `seconds`, each to be simulated from its own state; what is cut stays so."""
     if "window" in experiment.meta:
         return [experiment]
     if not 0 < seconds < np.inf:
@@ -288,12 +288,6 @@ def _frozen_array(values: ArrayLike, what: str, run: str) -> Array:
         raise DataError(f"{run}: '{what}' must have one dimension; its shape is {array.shape}.")
     array.flags.writeable = False
     return array
-
-
-def _mapping(given: object, what: str, run: str) -> Mapping[str, Any]:
-    if given is not None and not isinstance(given, Mapping):
-        raise DataError(f"{run}: '{what}' must be a mapping from names to values; got {given!r}.")
-    return MappingProxyType(dict(given or {}))
 
 
 def _check_time(t: Array, run: str) -> None:

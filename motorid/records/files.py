@@ -10,8 +10,7 @@ import re
 import stat
 import tempfile
 from collections.abc import Iterator, Mapping
-from importlib.metadata import PackageNotFoundError
-from importlib.metadata import version as version_of
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -33,8 +32,8 @@ _WRONG_PLACE = (errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.EACCES, errno.E
 def package_version(package: str) -> str:
     """Return the version of an installed package."""
     try:
-        return version_of(package)
-    except PackageNotFoundError:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
         return "unknown"
 
 

@@ -6,6 +6,7 @@ import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from motorid.errors import DataError, one_of
 
@@ -66,17 +67,13 @@ def parse_unit(text: str) -> Unit | None:
     turns a sign round.
     """
     label = text.strip("[](){}<> \t")
-    scaled = _SCALED.fullmatch(label)
-    if scaled:
-        unit = parse_unit(scaled[2])
-        factor = float(scaled[1])
+    if scaled := _SCALED.fullmatch(label):
+        unit, factor = parse_unit(scaled[2]), float(scaled[1])
         if unit is None or not 1e-50 < abs(factor) < 1e50:
             return None
         return Unit(unit.dimension, factor * unit.factor, unit.symbol, label)
-    word = label.translate(_LETTERS).lower().replace("per", "/").replace("^", "")
-    word = re.sub(r"[\s·*.]", "", word)
-    counts = _COUNTS.fullmatch(word)
-    if counts:
+    word = re.sub(r"[\s·*.^]", "", label.translate(_LETTERS).lower().replace("per", "/"))
+    if counts := _COUNTS.fullmatch(word):
         return _counts(label, counts[1], counts[2])
     if word not in _KNOWN:
         return None
@@ -155,12 +152,10 @@ _CAMEL = re.compile(r"(?<=[a-zäöü][a-zäöü])(?=[A-ZÄÖÜ])")
 _BY_UNIT = {"time": "t", "voltage": "v", "current": "i", "speed": "omega", "linear speed": "omega", "angle": "theta"}
 
 
-@dataclass(frozen=True)
-class HeaderMatch:
-    """A column that may be a channel; a higher `score` means that its name says so more plainly."""
+class HeaderMatch(NamedTuple):
+    """The channel that a column may be; a higher `score` means that its name says so more plainly."""
 
     channel: str
-    column: str
     unit: Unit | None
     score: float
 
@@ -174,22 +169,18 @@ def classify(label: str, unit: Unit | None = None) -> HeaderMatch | None:
     """
     for text in (label, _CAMEL.sub(" ", label)):
         name, inner, explicit = unit_in(text)
-        hit = _by_words(_tokens(name) or _tokens(text), unit or inner, explicit or unit is not None)
-        if hit:
-            channel, found, score = hit
-            return HeaderMatch(channel, label, found, 0.5 if label.strip() == "T" else score)
+        if hit := _by_words(_tokens(name) or _tokens(text), unit or inner, explicit or unit is not None):
+            return hit._replace(score=0.5) if label.strip() == "T" else hit
     return None
 
 
 def unit_in(label: str) -> tuple[str, Unit | None, bool]:
     """Split a header into its name, its unit, and whether that is surely a unit (``u_a`` is no current)."""
-    bracket = _BRACKETS.fullmatch(label)
-    if bracket:
+    if bracket := _BRACKETS.fullmatch(label):
         unit = parse_unit(bracket[2])
         inside = "" if unit or bracket[2].strip() == "t" else bracket[2]  # u(t)
         return f"{bracket[1]} {inside}", unit, unit is not None
-    apart = _IN.fullmatch(label)
-    if apart and (unit := parse_unit(apart[2])):
+    if (apart := _IN.fullmatch(label)) and (unit := parse_unit(apart[2])):
         return apart[1], unit, True
     parts = [p for p in _SEPARATORS.split(label) if p]
     for k in (3, 2, 1):
@@ -222,7 +213,7 @@ def _tokens(name: str) -> list[str]:
     return [w for w in (p.strip("()[]{}<>\"'").lower() for p in _SEPARATORS.split(name)) if w]
 
 
-def _beside(words: set[str], unit: Unit | None, explicit: bool) -> tuple[str, Unit | None, float] | None:
+def _beside(words: set[str], unit: Unit | None, explicit: bool) -> HeaderMatch | None:
     """Tell the supply's voltage, a load torque and a temperature of the motor, which may be measured as well."""
     warm = words & _TEMPERATURE or (explicit and unit is not None and unit.dimension == "temperature")
     channel = ("temp" if warm and not words & _ELECTRONICS else
@@ -230,10 +221,10 @@ def _beside(words: set[str], unit: Unit | None, explicit: bool) -> tuple[str, Un
                "v_supply" if any(w.endswith(_SUPPLY_ENDS) for w in words) and not words & _OTHER else None)
     current = any("current" in w or "strom" in w for w in words)
     fits = channel and (unit is None or unit.dimension in DIMENSIONS[channel]) and not current
-    return (channel, unit, 3.0) if channel and fits else None
+    return HeaderMatch(channel, unit, 3.0) if channel and fits else None
 
 
-def _by_words(words: list[str], unit: Unit | None, explicit: bool) -> tuple[str, Unit | None, float] | None:
+def _by_words(words: list[str], unit: Unit | None, explicit: bool) -> HeaderMatch | None:
     if beside := _beside(set(words), unit, explicit):
         return beside
     if any(w in _OTHER or w.endswith(_OTHER_ENDS) or w.endswith(_SUPPLY_ENDS) for w in words):
@@ -245,10 +236,11 @@ def _by_words(words: list[str], unit: Unit | None, explicit: bool) -> tuple[str,
         if score < 1 or (unit is None and _ONLY_LENGTHS & set(words)):
             return None
         known = unit or (parse_unit("counts") if _WEAK & set(words) and channel == "theta" else None)
-        return channel, known, 2.0 if unit is None and known else score
+        return HeaderMatch(channel, known, 2.0 if unit is None and known else score)
     longest = max(len(w) for w in words if _CHANNEL.get(w.rstrip("0123456789"), channel) == channel)
     if not explicit:  # u_a, theta_m: the letter is an index, not a unit; but speed_V is a tacho
-        return None if score < 1 or (longest > 2 and unit.label in ("V", "A")) else (channel, None, score)
+        lost = score < 1 or (longest > 2 and unit.label in ("V", "A"))
+        return None if lost else HeaderMatch(channel, None, score)
     return _by_unit(words, unit, explicit) if longest < 3 else None
 
 
@@ -284,8 +276,8 @@ def _goes_with(channel: str, unit: Unit, words: list[str]) -> bool:
     return unit.dimension in DIMENSIONS[channel]
 
 
-def _by_unit(words: list[str], unit: Unit | None, explicit: bool) -> tuple[str, Unit | None, float] | None:
+def _by_unit(words: list[str], unit: Unit | None, explicit: bool) -> HeaderMatch | None:
     channel = _BY_UNIT.get(unit.dimension) if unit else None
     if channel is None or not explicit or (channel in ("t", "theta") and any(len(w) > 2 for w in words)):
         return None
-    return channel, unit, 1.0
+    return HeaderMatch(channel, unit, 1.0)

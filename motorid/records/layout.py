@@ -9,20 +9,10 @@ from dataclasses import dataclass, replace
 
 from motorid.channels import MEASURED_INPUTS, NAMES
 from motorid.errors import DataError, UsageError, one_of
-from motorid.records.headers import (
-    DIMENSIONS,
-    SI,
-    Unit,
-    classify,
-    is_duty,
-    is_reference,
-    is_supply,
-    parse_unit,
-    require_unit,
-    unit_in,
-)
+from motorid.records import headers
+from motorid.records.headers import SI, Unit
 
-_CHANNELS = tuple(DIMENSIONS)
+_CHANNELS = tuple(headers.DIMENSIONS)
 _PERCENT = re.compile(r"%|pct|per_?cent|prozent")
 _MEANING = {c: f"the {name}" for c, name in NAMES.items()} | {"v": "the drive voltage"}
 Units = Mapping[str, Unit | None]
@@ -56,7 +46,7 @@ def assign(labels: Sequence[str], *, columns: Mapping[str, object] | None = None
     """
     if not labels:
         raise DataError("it has no columns.")
-    row = {label: parse_unit((unit_row or {}).get(label, "")) for label in labels}
+    row = {label: headers.parse_unit((unit_row or {}).get(label, "")) for label in labels}
     units = units or {}
     places = _named_by_user(labels, columns or {}, units, row)
     notes: list[str] = []
@@ -65,7 +55,7 @@ def assign(labels: Sequence[str], *, columns: Mapping[str, object] | None = None
     _apply_units(places, labels, units, notes)
     _settle_counts(places, notes)
     notes += [f"'{c}' looks like the reference of a controller: what drives the model is the voltage; it is not used."
-              for c in labels if is_reference(c) and c not in {p.column for p in places.values()}]
+              for c in labels if headers.is_reference(c) and c not in {p.column for p in places.values()}]
     _require(places, labels)
     return Layout({c: places[c] for c in _CHANNELS if c in places}, [*notes, *_assumed(places)])
 
@@ -78,11 +68,11 @@ def _named_by_user(labels: Sequence[str], columns: Mapping[str, object], units: 
             raise DataError(f"columns: {one_of(str(channel), _CHANNELS, 'channel')} "
                             "Write channel=column, e.g. v=u_volt.")
         label = _find(labels, column)
-        unit = row[label] or unit_in(label)[1]
-        if unit and unit.dimension not in DIMENSIONS[channel]:
-            named = classify(label, row[label])  # u_a is in no ampere, current_A is
-            if not {channel, label} & set(units) and ((named and named.unit) or unit_in(label)[2]):
-                require_unit(unit.label, channel)
+        unit = row[label] or headers.unit_in(label)[1]
+        if unit and unit.dimension not in headers.DIMENSIONS[channel]:
+            named = headers.classify(label, row[label])  # u_a is in no ampere, current_A is
+            if not {channel, label} & set(units) and ((named and named.unit) or headers.unit_in(label)[2]):
+                headers.require_unit(unit.label, channel)
             unit = None
         places[channel] = Place(label, unit or _default(channel), unit is not None)
     taken = [p.column for p in places.values()]
@@ -108,7 +98,7 @@ def _named_by_header(places: dict[str, Place], labels: Sequence[str], row: Units
     """Add the channels that the header names, where the user has not named them."""
     found: dict[str, list[Place]] = {}
     for label in labels:
-        if hit := classify(first_of_its_name(label, labels), row[label]):
+        if hit := headers.classify(first_of_its_name(label, labels), row[label]):
             place = Place(label, hit.unit or _default(hit.channel), hit.unit is not None, hit.score)
             found.setdefault(hit.channel, []).append(place)
     for channel, hits in found.items():
@@ -137,11 +127,11 @@ def _last_resorts(places: dict[str, Place], labels: Sequence[str], notes: list[s
     if not {"i", "omega", "theta"} & set(places) and "y" in labels:
         places["omega"] = Place("y", _default("omega"), False)
         notes.append("took column 'y' as the speed; if it is not, say which channel it is with columns.")
-    duty, supply = [c for c in labels if is_duty(c)], [c for c in labels if is_supply(c)]
+    duty, supply = [c for c in labels if headers.is_duty(c)], [c for c in labels if headers.is_supply(c)]
     if "v" not in places and len(duty) == len(supply) == 1:
-        unit = unit_in(duty[0])[1]
+        unit = headers.unit_in(duty[0])[1]
         ratio = unit if unit and unit.dimension == "ratio" else Unit("ratio", 1.0, "1", "1")
-        scale = unit_in(supply[0])[1] or _default("v")
+        scale = headers.unit_in(supply[0])[1] or _default("v")
         product = Unit("voltage", ratio.factor * scale.factor, "V", f"{ratio.label}·{scale.label}")
         places["v"] = Place(duty[0], product, True, times=supply[0])
         notes.append(f"took '{duty[0]}' times '{supply[0]}' as the drive voltage.")
@@ -156,7 +146,7 @@ def _apply_units(places: dict[str, Place], labels: Sequence[str], units: Mapping
                    "this column is not used as a channel" if key in labels else
                    one_of(str(key), [*places, *(p.column for p in places.values())], "channel or column"))
             raise DataError(f"units for '{key}': {why}")
-        was, unit = places[channel], require_unit(text, channel)
+        was, unit = places[channel], headers.require_unit(text, channel)
         if was.stated and not math.isclose(abs(was.unit.factor), abs(unit.factor)):
             notes.append(f"'{was.column}' says {was.unit.label}, and is read as {unit.label}: units asks for it.")
         places[channel] = replace(was, unit=unit, stated=True)
@@ -172,7 +162,7 @@ def _settle_counts(places: dict[str, Place], notes: list[str]) -> None:
         if place is None or not math.isnan(place.unit.factor):
             continue
         if {"i", "omega", "theta"} & set(places) == {channel}:
-            require_unit(place.unit.label, channel)
+            headers.require_unit(place.unit.label, channel)
         del places[channel]
         notes.append(f"left out '{place.column}': it is in encoder counts, and how many make one turn is not "
                      f"known; to use it, say units={{'{channel}': 'counts:2048'}}.")
@@ -184,7 +174,7 @@ def _require(places: Mapping[str, Place], labels: Sequence[str]) -> None:
         missing["omega"] = "a measured current (i), speed (omega) or angle (theta)"
     if not missing:
         return
-    duty = [c for c in labels if is_duty(c)] if "v" in missing else []
+    duty = [c for c in labels if headers.is_duty(c)] if "v" in missing else []
     one = "0.12 V" if duty and _PERCENT.search(duty[0].lower()) else "12 V"
     more = (f" '{duty[0]}' is a duty cycle; with a constant supply of, say, 12 V ('12 V' for 0 to 1, '0.12 V' for per "
             f"cent, '0.047 V' for 0 to 255): columns={{'v': '{duty[0]}'}}, units={{'v': '{one}'}}.") if duty else ""
@@ -210,7 +200,7 @@ def _assumed(places: Mapping[str, Place]) -> list[str]:
 
 
 def _default(channel: str) -> Unit:
-    dimension = DIMENSIONS[channel][0]
+    dimension = headers.DIMENSIONS[channel][0]
     return Unit(dimension, 1.0, SI[dimension], SI[dimension])
 
 

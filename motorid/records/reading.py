@@ -123,8 +123,7 @@ def csv_text(run: Experiment) -> str:
     table |= {f"{k} (extra)" if k in taken else k: np.asarray(a) for k, a in extra.items()}
     about = ["# motorid columns: " + ",".join(f"{c}={h}" for c, h in headers.items()), f"# motorid hold: {run.hold}"]
     about += ["# motorid sigma: " + ",".join(f"{c}={s!r}" for c, s in run.sigma.items())] if run.sigma else []
-    rows = pd.DataFrame(table).to_csv(index=False, na_rep="", lineterminator="\n")
-    return "\n".join([*about, rows])
+    return "\n".join([*about, pd.DataFrame(table).to_csv(index=False, na_rep="", lineterminator="\n")])
 
 
 def find_records(paths: Path_ | Iterable[Path_]) -> list[Path]:
@@ -184,8 +183,7 @@ def _is_record(path: Path) -> bool:
 
 
 def _natural(path: Path) -> list[tuple[int, int, str]]:
-    parts = re.split(r"(\d+)", str(path).lower())
-    return [(0, int(p), "") if p.isdecimal() else (1, 0, p) for p in parts if p]
+    return [(0, int(p), "") if p.isdecimal() else (1, 0, p) for p in re.split(r"(\d+)", str(path).lower()) if p]
 
 
 def _read(path: Path_, to_table: Callable[[bytes], TextTable], columns: Mapping[str, object] | None,

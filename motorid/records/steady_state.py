@@ -49,13 +49,9 @@ def find_segments(runs: Sequence[Experiment], sigma: Sequence[Mapping[str, float
     A stretch counts where the two halves of its tail agree in every channel within four standard errors or
     0.1 % of the channel's largest value. Parts without input and without motion say nothing and are left out.
     """
-    found = []
-    for k, run in enumerate(runs):
-        for first, last in _constant_stretches(run.inputs["v"]):
-            segment = _steady_tail(k, run, sigma[k], first, last)
-            if segment is not None:
-                found.append(segment)
-    return tuple(found)
+    tails = (_steady_tail(k, run, sigma[k], first, last)
+             for k, run in enumerate(runs) for first, last in _constant_stretches(run.inputs["v"]))
+    return tuple(segment for segment in tails if segment is not None)
 
 
 def segment_between(k: int, run: Experiment, begin: float, end: float) -> SteadySegment | None:
@@ -69,24 +65,20 @@ def _constant_stretches(v: Array) -> list[tuple[int, int]]:
     band = INPUT_SHARE * max(float(np.abs(v).max()), 1e-300)
     stretches, first = [], 0
     low = high = v[0]
-    for k in range(1, len(v) + 1):
-        if k < len(v):
-            low, high = min(low, v[k]), max(high, v[k])
-        if k == len(v) or high - low > band:
-            if k - first >= LEAST:
-                stretches.append((first, k - 1))
-            if k < len(v):
-                first, low, high = k, v[k], v[k]
-    return stretches
+    for k, value in enumerate(v):
+        low, high = min(low, value), max(high, value)
+        if high - low > band:
+            stretches.append((first, k - 1))
+            first, low, high = k, value, value
+    return [(a, b) for a, b in [*stretches, (first, len(v) - 1)] if b - a + 1 >= LEAST]
 
 
 def _steady_tail(k: int, run: Experiment, sigma: Mapping[str, float], first: int, last: int) -> SteadySegment | None:
     length = last - first + 1
     for share in (0.75, 0.5, 0.25, 0.125):
-        n = int(share * length)
-        if n < LEAST:
+        begin = last - int(share * length) + 1
+        if last - begin + 1 < LEAST:
             return None
-        begin = last - n + 1
         if all(_level(run, c, sigma, begin, last) for c in run.outputs):
             segment = _segment(k, run, begin, last)
             idle = abs(segment.v) <= INPUT_SHARE * float(np.abs(run.inputs["v"]).max()) and not segment.moving
@@ -103,10 +95,8 @@ def _level(run: Experiment, channel: str, sigma: Mapping[str, float], first: int
         half = (run.t[last] - run.t[first]) / 2
         allowed = max(4 * 2 * sigma[channel] / half, DRIFT_SHARE * _top_slope(run))
         return bool(np.isfinite(halves).all() and abs(halves[1] - halves[0]) <= allowed)
-    part = y[first:last + 1]
-    middle = len(part) // 2
-    a, b = part[:middle], part[middle:]
-    a, b = a[np.isfinite(a)], b[np.isfinite(b)]
+    middle = (first + last + 1) // 2
+    a, b = (part[np.isfinite(part)] for part in (y[first:middle], y[middle:last + 1]))
     if min(a.size, b.size) < LEAST // 4:
         return False
     error = sigma[channel] * np.sqrt(1 / a.size + 1 / b.size)

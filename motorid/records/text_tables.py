@@ -79,8 +79,7 @@ def parse_table(data: bytes) -> TextTable:
         raise DataError(f"it has no rows of at least two numbers; it begins with '{body[0][:60]}'. Expected "
                         "one row per sample, with a comma, semicolon, tab or space between the values.")
     labels, unit_row = _header(body[:first], comments, dialect, width, notes)
-    rows = _rows(body[first:], dialect, len(labels), notes)
-    columns, texts = _parse(rows, dialect, labels, notes)
+    columns, texts = _parse(_rows(body[first:], dialect, len(labels), notes), dialect, labels, notes)
     return TextTable(columns, texts, labels, dict(zip(labels, unit_row, strict=False)), comments, notes)
 
 
@@ -88,9 +87,9 @@ def decode(data: bytes) -> tuple[str, list[str]]:
     """Turn the bytes of a file into text, with notes on what was mended."""
     if not data.strip(b"\0 \t\r\n"):
         raise DataError("the file is empty.")
-    kind = next((what for magic, what in _MAGIC.items() if data.startswith(magic)), None)
-    if kind:
-        raise DataError(f"it is {kind}.")
+    for magic, what in _MAGIC.items():
+        if data.startswith(magic):
+            raise DataError(f"it is {what}.")
     try:
         text = data.decode(_encoding(data))
     except UnicodeDecodeError:
@@ -241,20 +240,19 @@ def _parse(rows: list[str], dialect: Dialect, labels: list[str],
     except (pd.errors.ParserWarning, ValueError, OverflowError) as error:  # ParserError is a ValueError
         raise DataError(f"its rows cannot be read as a table ({str(error).strip()}).") from None
     columns, texts = {}, {}
-    for label, column in zip(labels, frame.columns, strict=True):
-        cells = frame[column]
-        if cells.dtype.kind not in "fiub":
-            cells = cells.astype(str).str.strip(" \"'")
-            cells_before = cells
+    group = f"[{_GROUPS[dialect.decimal]}{_SPACES}]"
+    for label, (_, column) in zip(labels, frame.items(), strict=True):
+        cells, words = column, column.dtype.kind not in "fiub"
+        if words:
+            cells = column.astype(str).str.strip(" \"'")
             grouped = cells.str.fullmatch(_GROUPED[dialect.decimal])
-            group = f"[{_GROUPS[dialect.decimal]}{_SPACES}]"
-            cells = cells.where(~grouped, cells.str.replace(group, "", regex=True))
             if grouped.any():
-                first = next(iter(cells_before[grouped]))
+                first = cells[grouped].iloc[0]
                 notes.append(f"'{label}' has '{re.findall(group, first)[0]}' between thousands, as in '{first}'.")
+                cells = cells.where(~grouped, cells.str.replace(group, "", regex=True))
         array, bad = numbers(cells, dialect.decimal)
-        if frame[column].dtype.kind not in "fiub" and bad > 0.5 * np.count_nonzero(frame[column].notna()):
-            texts[label] = frame[column].astype(str).tolist()
+        if words and bad > 0.5 * np.count_nonzero(column.notna()):
+            texts[label] = column.astype(str).tolist()
             continue
         columns[label] = array
         if bad:

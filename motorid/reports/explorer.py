@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from html import escape
 from typing import Any
 
@@ -90,54 +91,51 @@ class Explorer:
     # -- what can be done --------------------------------------------------------------------------------
     def tick(self, name: str, on: bool = True) -> None:
         """Put the effect `name` into the model, at a size that suits the records, or take it out."""
-        try:
+        with self._reasons_said():
+            if name not in self._effects:
+                raise UsageError(f"there is no effect '{name}' here.")
             model = self.model + self._effects[name] if on else self.model.without(name)
-            self._try(with_suited_effects(model, self.runs), f"{'with' if on else 'without'} {name}")
-        except (MotoridError, KeyError) as error:
-            self._say(str(error) if isinstance(error, MotoridError) else f"there is no effect '{name}' here.")
+            self._take(with_suited_effects(model, self.runs), f"{'with' if on else 'without'} {name}")
         self._show_controls()
 
     def move(self, **values: float) -> None:
         """Set parameters, in SI units."""
-        try:
-            self._try(self.model.start_at(self._known(values)), "moved")
-        except MotoridError as error:
-            self._say(str(error))
+        known = self.model.parameters
+        with self._reasons_said():
+            for name in values:
+                if name not in known:
+                    raise UsageError(f"the model has no parameter '{name}'; it has {', '.join(known)}.")
+            self._take(self.model.start_at(values), "moved")
         self._show_values()
 
     def refit(self) -> None:
         """Fit the model with the ticked effects, from its present values."""
         p = self._first.problem
-        try:
-            found = fit(self.model, self.runs, engine=p.engine, initial=p.initial, weights=p.weights, loss=p.loss)
-        except MotoridError as error:
-            self._say(str(error))
-            return
-        self.fit = found
-        self._try(found.model, f"refitted: {found.status} in {duration(found.seconds)}")
+        with self._reasons_said():
+            self.fit = fit(self.model, self.runs, engine=p.engine, initial=p.initial, weights=p.weights, loss=p.loss)
+            self._take(self.fit.model, f"refitted: {self.fit.status} in {duration(self.fit.seconds)}")
         self._show_controls()
 
     def reset(self) -> None:
         """Go back to the fit that it began with."""
         self.fit = self._first
-        self._try(self._first.model, "back to the first fit")
+        with self._reasons_said():
+            self._take(self._first.model, "back to the first fit")
         self._show_controls()
 
-    def _known(self, values: Mapping[str, float]) -> Mapping[str, float]:
-        for name in values:
-            if name not in self.model.parameters:
-                raise UsageError(f"the model has no parameter '{name}'; it has {', '.join(self.model.parameters)}.")
-        return values
-
-    def _try(self, model: Model, done: str) -> None:
-        """Take `model` if it can be simulated; else say why and stay."""
-        problem = self._first.problem
+    @contextmanager
+    def _reasons_said(self) -> Iterator[None]:
+        """Say why something cannot be done, and stay as it was."""
         try:
-            judged = evaluate(model, self.runs, engine=problem.engine, initial=problem.initial)
+            yield
         except MotoridError as error:
             self._say(str(error))
-            return
-        self.model, self.evaluation = model, judged
+
+    def _take(self, model: Model, done: str) -> None:
+        """Take `model` if it can be simulated."""
+        problem = self._first.problem
+        self.evaluation = evaluate(model, self.runs, engine=problem.engine, initial=problem.initial)
+        self.model = model
         self._say(done)
         self._draw()
 
@@ -150,7 +148,6 @@ class Explorer:
         self._errors, self._status = w.HTML(), w.HTML()
         self.boxes = {n: self._box(n) for n in self._effects}
         self._sliders = w.VBox()
-        self.sliders: dict[str, Any] = {}
         refit = w.Button(description="Refit", button_style="primary", tooltip="Fit the model with the ticked effects")
         reset = w.Button(description="Reset", tooltip="Back to the first fit")
         refit.on_click(lambda _: self.refit())
@@ -208,13 +205,12 @@ class Explorer:
 
     def _show_controls(self) -> None:
         """Make ticks and sliders agree with the model."""
-        w = self._w
         self._quiet = True
         for name, box in self.boxes.items():
             box.value = name in self.model.effect_names
         wanted = [p for p in self.model.parameters.values() if p.name != "sgn_width"]
         self.sliders = {p.name: self._slider(p) for p in wanted}
-        self._sliders.children = tuple(w.HBox([self.sliders[p.name], w.Label(p.unit)]) for p in wanted)
+        self._sliders.children = tuple(self._w.HBox([self.sliders[p.name], self._w.Label(p.unit)]) for p in wanted)
         self._quiet = False
 
     def _show_values(self) -> None:
@@ -237,8 +233,7 @@ class Explorer:
 
     def _say(self, message: str) -> None:
         self.message = message
-        if hasattr(self, "_status"):
-            self._status.value = f"<span>{escape(message)}</span>"
+        self._status.value = f"<span>{escape(message)}</span>"
 
     def _repr_mimebundle_(self, **options: Any) -> Any:
         return self.widget._repr_mimebundle_(**options)

@@ -283,3 +283,12 @@ def test_the_same_remark_about_many_runs_is_made_once(steps):
     assert len(remarks) == 1
     assert remarks[0].startswith("run0: ")
     assert "(The same in run1, run2, run3 and 2 more.)" in remarks[0]
+
+
+@pytest.mark.parametrize("dead", ["i", "omega", "theta"])
+def test_a_channel_without_a_single_sample_is_said_to_be_missing(dead):
+    t = np.arange(0, 1, 1e-3)
+    v = 6 * np.sign(np.sin(9 * t))
+    outputs = {"i": 0.1 * v, "omega": 20 * v, "theta": 20 * np.cumsum(v) * 1e-3}
+    said = check_runs([Experiment(t, {"v": v}, outputs | {dead: np.full(len(t), np.nan)})])
+    assert any("100 %" in text and "missing" in text for text in said)
