@@ -69,6 +69,7 @@ class Rival:
     scale: Array  # (k,) sizes of the solver's coordinates of the free parameters: of logarithms 1, else in this unit
     information: Array  # (k, k) of the records on these coordinates, initial states estimated too
     seen: Mapping[str, float]  # largest size of each channel in the records, and their duration and dt
+    fitted: Array  # (k,) from the model's values to the fitted ones, where these are others; see `as_allowed`
 
     @staticmethod
     def of(fit: Fit, name: str = "") -> Rival:
@@ -86,7 +87,7 @@ class Rival:
         seen |= {"duration": max(r.duration for r in runs), "dt": float(np.median([r.dt for r in runs]))}
         of_runs = [n for n, p in fit.model.parameters.items() if p.vary and p.per_run]  # as in the first run
         return Rival(name or fit.model.title, fit.model.with_(angle_input=False).fix(*of_runs), sigma,
-                     problem.scaling.scale[:k], known, seen)
+                     problem.scaling.scale[:k], known, seen, np.zeros(k))
 
     @staticmethod
     def as_allowed(fit: Fit) -> Rival:
@@ -113,8 +114,8 @@ class Rival:
         physical[np.setdiff1d(np.arange(len(physical)), places)] = others
         q = problem.scaling.scaled(physical)
         r, jac = problem.residual_and_jacobian(q)
-        return Rival.of(replace(fit, values=problem.values(q), q=q, residuals=r,
-                                jacobian=jac / problem.scaling.slope(q)))
+        moved = replace(fit, values=problem.values(q), q=q, residuals=r, jacobian=jac / problem.scaling.slope(q))
+        return replace(Rival.of(moved), fitted=(fit.q - q)[:len(names)])
 
     def smoothed(self, width: float) -> Rival:
         """Return it with sgn at least so wide (rad/s): a sharp reversal makes criteria rough in the voltage."""
@@ -139,8 +140,14 @@ class Rival:
         return dict(zip(names, (np.sqrt(variances) * slope).tolist(), strict=True))
 
     def draws(self, n: int, rng: np.random.Generator) -> Array:
-        """Return `n` displacements (n, k) of the parameters as uncertain as the records leave them."""
-        return rng.multivariate_normal(np.zeros(len(self.scale)), np.linalg.inv(self.known), n, method="eigh")
+        """Return `n` displacements (n, k) of the parameters as uncertain as the records leave them, none the first.
+
+        Every other one is from the fitted values.
+        """
+        draws = rng.multivariate_normal(np.zeros(len(self.scale)), np.linalg.inv(self.known), n, method="eigh")
+        draws[:2] = 0.0
+        draws[1::2] += self.fitted
+        return draws
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain data, the model as in ``fit --json``."""
@@ -149,17 +156,17 @@ class Rival:
                 "parameters": {n: {"value": p.value, "unit": p.unit, "fixed": not p.vary}
                                for n, p in m.parameters.items()},
                 "sigma": dict(self.sigma), "scale": self.scale.tolist(), "information": self.information.tolist(),
-                "seen": dict(self.seen)}
+                "seen": dict(self.seen), "fitted": self.fitted.tolist()}
 
     @staticmethod
     def from_dict(contents: Mapping[str, Any], model: Model) -> Rival:
         """Return what `to_dict` wrote, its model built already."""
         sigma, seen = ({str(k): float(v) for k, v in contents[part].items()} for part in ("sigma", "seen"))
-        scale, information = (np.asarray(contents[part], float) for part in ("scale", "information"))
+        scale, information, fitted = (np.asarray(contents[part], float) for part in ("scale", "information", "fitted"))
         sizes = np.array([*sigma.values(), *scale, *(seen[k] for k in ("v", "dt", "duration"))])
-        if not (np.all(sizes > 0) and np.isfinite([*sizes, *information.ravel()]).all()):
+        if not (np.all(sizes > 0) and np.isfinite([*sizes, *information.ravel(), *fitted]).all()):
             raise ValueError("sizes of a rival must be finite and above zero")
-        return Rival(str(contents["name"]), model, sigma, scale, information, seen)
+        return Rival(str(contents["name"]), model, sigma, scale, information, seen, fitted)
 
 
 def _grid(parameters: Sequence[Parameter], sizes: Mapping[str, float]) -> Iterator[dict[str, float]]:

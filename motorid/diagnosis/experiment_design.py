@@ -160,7 +160,7 @@ TRACE = 0.02  # of v_max: a binary signal smaller than this is left out
 CLOSEST = 1  # rivals of each truth that one optimisation looks at
 HOPELESS = 0.1  # log(1 + χ²) below which two rivals are as good as one model
 RIPPLES = (0.0, 0.3)  # share of the voltage for a binary signal on top of a candidate
-DRAWS = 16  # of the parameters, for the check of the limits
+DRAWS = 18  # of the parameters, for the check of the limits
 SMOOTH = 1e-2  # of the largest speed: width of sgn while the voltage is sought
 NEARLY = 0.05  # nats between coarse and fine integration that need no further search
 ROUGH, TOLERANCE = 3e-4, 1e-5  # of the integration, over the largest state: while the voltage is sought, and after
@@ -649,9 +649,9 @@ def _fixed(task: Task) -> tuple[str, Task, Array]:
 
 
 def _drawn(task: Task) -> list[Array]:
-    """Return displacements of the parameters (n, k) by rival, none the first of them."""
+    """Return displacements of the parameters (n, k) by rival."""
     rng = np.random.default_rng(0)
-    return [np.vstack([np.zeros(len(d.rival.scale)), d.rival.draws(DRAWS, rng)]) for d in task.driven]
+    return [d.rival.draws(DRAWS, rng) for d in task.driven]
 
 
 def _safe(task: Task, c: Array) -> tuple[Array, dict[str, float]]:
