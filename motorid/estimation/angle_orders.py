@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from motorid.errors import ModelError
-from motorid.estimation.linearisation import Response, Tangent, responses
+from motorid.estimation.linearisation import Response, Tangent, column_space, responses
 from motorid.estimation.result import Fit
 from motorid.model.definition import Effect
 from motorid.model.model import Model, dc_motor, torque_driven
@@ -285,11 +285,7 @@ def _whitened(tangent: Tangent) -> tuple[Whitening, Array, Array]:
     """Return the filters, the tangent space behind them, and the residual off it."""
     fit = tangent.fit
     white = Whitening.of(fit.problem.unstack(tangent.residual))
-    slopes = zip(*(fit.problem.unstack(column) for column in tangent.basis.T), strict=True)
-    columns = white([np.stack(run, axis=2) for run in slopes])
-    basis, triangle = np.linalg.qr(columns)
-    u, s, _ = np.linalg.svd(triangle)
-    basis = basis @ u[:, s > 1e-7 * max(s.max(initial=0.0), 1e-300)]
+    basis = column_space(white(fit.problem.unstack(tangent.basis)))
     residual = white(fit.problem.unstack(tangent.residual))
     return white, basis, residual - basis @ (basis.T @ residual)
 

@@ -238,11 +238,11 @@ class Problem:
         """Return whitened residual and Jacobian, before the loss, of run `k`, without missing samples."""
         return self.measured[k].residual(traj)
 
-    def unstack(self, residual: Array) -> list[Array]:
-        """Return a stacked output residual as one (N, ny) per run, NaN where missing."""
+    def unstack(self, rows: Array, missing: float = np.nan) -> list[Array]:
+        """Return stacked rows (n, …) of the outputs as (N, ny, …) per run, `missing` where there was no sample."""
         ends = np.cumsum([m.size for m in self.measured])
-        parts = np.split(residual[:ends[-1]], ends[:-1])
-        return [m.unstack(part) for m, part in zip(self.measured, parts, strict=True)]
+        parts = np.split(rows[:ends[-1]], ends[:-1])
+        return [m.unstack(part, missing) for m, part in zip(self.measured, parts, strict=True)]
 
     def residual(self, q: Array) -> Array:
         """Return the whitened residual: outputs run by run, then priors, then penalties.
