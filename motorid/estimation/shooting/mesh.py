@@ -133,12 +133,7 @@ class Mesh:
 
     # -- simulation ------------------------------------------------------------------------------------
     def walk(self, z: Array, derivatives: bool) -> Walk:
-        """Simulate every interval from its node.
-
-        Raises
-        ------
-        SimulationError
-        """
+        """Simulate every interval from its node; SimulationError if that fails."""
         problem, nx, nz = self.problem, self.nx, self.nx + self.nq
         q, states = self.split(z)
         at = problem.unknowns.point(q)
@@ -148,14 +143,11 @@ class Mesh:
         dp = np.hstack([np.zeros((len(at.p), nx)), at.dp])
         inner = np.hstack([np.diag(self.scale), np.zeros((nx, self.nq))])
         for j, v in enumerate(self.intervals):
-            x0 = problem.unknowns.first_state(at, v.run) if v.node < 0 else states[v.node]
-            if derivatives:
-                dx0 = inner
-                if v.node < 0:
-                    dx0 = np.hstack([np.zeros((nx, nx)), problem.unknowns.first_slopes(at, v.run)])
-                traj = problem.integrator.run(problem.system, v.grid, x0, at.p, dx0, dp)
-            else:
-                traj = problem.integrator.run(problem.system, v.grid, x0, at.p)
+            x0, dx0 = (states[v.node], inner) if v.node >= 0 else (problem.unknowns.first_state(at, v.run), None)
+            if dx0 is None and derivatives:
+                dx0 = np.hstack([np.zeros((nx, nx)), problem.unknowns.first_slopes(at, v.run)])
+            slopes = (dx0, dp) if derivatives else ()
+            traj = problem.integrator.run(problem.system, v.grid, x0, at.p, *slopes)
             _fill(runs[v.run], traj, v.first)
             ends[j] = traj.x[-1]
             if dends is not None and traj.dx is not None:

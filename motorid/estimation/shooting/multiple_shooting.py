@@ -19,13 +19,7 @@ from motorid.estimation.least_squares import FINISH, least_squares
 from motorid.estimation.result import Fit
 from motorid.estimation.shooting.mesh import Mesh
 from motorid.estimation.shooting.nlp import Ipopt, NlpResult, ShootingNlp
-from motorid.estimation.shooting.nodes import (
-    first_noise,
-    given_noise,
-    nodes_from_data,
-    nodes_from_simulation,
-    noise_of_gaps,
-)
+from motorid.estimation.shooting.nodes import first_noise, nodes_from_data, nodes_from_simulation, noise_of_gaps
 from motorid.estimation.shooting.outcome import Solved, below_steady, fit_of, violations
 from motorid.numerics.signals import Array
 from motorid.problem.problem import Problem
@@ -179,8 +173,7 @@ class MultipleShooting:
         """Solve with process noise; with ``"auto"`` again until the gaps are as large as was taken."""
         problem = problem.refined(q)
         mesh = Mesh(problem, self.every or NOISY)
-        given = self.process_noise
-        noise = given_noise(given, mesh) if isinstance(given, Mapping) else first_noise(mesh)
+        noise = first_noise(self.process_noise, mesh)
         mesh = replace(mesh, noise=noise)
         done = self._solve(mesh, mesh.joined(q, nodes_from_data(mesh, q)), rough=self.process_noise == "auto")
         for _ in range(NOISE_ROUNDS if self.process_noise == "auto" else 0):
@@ -215,8 +208,7 @@ def _check(problem: Problem) -> None:
             raise UsageError(f"MultipleShooting takes CurrentLimit, SteadyState and Constraint, not "
                              f"{type(c).__name__}.")
         c.parts(problem)
-    contradiction = below_steady(problem)
-    if contradiction:
+    if contradiction := below_steady(problem):
         raise FitError(contradiction)
 
 

@@ -52,7 +52,7 @@ class ShootingNlp:
 
     def __init__(self, mesh: Mesh, z: Array) -> None:
         self.mesh = mesh
-        self._kept: dict[bool, tuple[bytes, _Point | None]] = {}
+        self._kept: dict[bool, tuple[bytes, _Point]] = {}
         at = self._evaluate(z, True)
         self.n, self.m = len(z), len(at.g)
         self.scale = STEEPEST / max(_steepest(at.residual, self.n), 1e-300)
@@ -75,16 +75,13 @@ class ShootingNlp:
         f = 0.5 * sum(float(b.values @ b.values) for b in residual)
         return _Point(f, np.concatenate([np.zeros(0), *(b.values for b in rows)]), residual, rows)
 
-    def at(self, z: Array, derivatives: bool) -> _Point | None:
-        """Return the point z, None where it cannot be simulated."""
+    def at(self, z: Array, derivatives: bool) -> _Point:
+        """Return the point z; SimulationError where it cannot be simulated."""
         key = z.tobytes()
         for stronger in (True, derivatives):
             if stronger in self._kept and self._kept[stronger][0] == key:
                 return self._kept[stronger][1]
-        try:
-            found = self._evaluate(z, derivatives)
-        except SimulationError:
-            found = None
+        found = self._evaluate(z, derivatives)
         self._kept[derivatives] = key, found
         return found
 
@@ -92,13 +89,11 @@ class ShootingNlp:
     def values(self, z: Array) -> list[Any]:
         """Return f and g."""
         point = self.at(z, False)
-        return [np.nan, np.full(self.m, np.nan)] if point is None else [point.f * self.scale, point.g]
+        return [point.f * self.scale, point.g]
 
     def gradient(self, z: Array) -> list[Any]:
         """Return f and its gradient."""
         point = self.at(z, True)
-        if point is None:
-            return [np.nan, np.full(self.n, np.nan)]
         found = np.zeros(self.n)
         for b in point.residual:
             found[b.columns] += b.values @ b.jac
@@ -107,16 +102,12 @@ class ShootingNlp:
     def jacobian(self, z: Array) -> list[Any]:
         """Return g and its sparse Jacobian."""
         point = self.at(z, True)
-        if point is None:
-            return [np.full(self.m, np.nan), np.full(self.jac_pattern.nnz(), np.nan)]
         entries = np.concatenate([np.zeros(0), *(b.jac.ravel() for b in point.rows)])
         return [point.g, entries[self._jac_order]]
 
     def hessian(self, z: Array, lam_f: float) -> Array:
         """Return the entries of the Gauss-Newton Hessian's upper triangle."""
         point = self.at(z, True)
-        if point is None:
-            return np.full(self.hess_pattern.nnz(), np.nan)
         entries = np.concatenate([(b.jac.T @ b.jac).ravel() for b in point.residual])[self._hess_mask]
         summed = np.bincount(self._hess_place, entries, self.hess_pattern.nnz())
         return np.asarray(summed * (self.scale * lam_f), float)
@@ -162,7 +153,10 @@ class _Function(ca.Callback):
         return self._results[i]
 
     def eval(self, arg: Sequence[ca.DM]) -> list[ca.DM]:
-        found = self._call(*(np.asarray(a).ravel() for a in arg))
+        try:
+            found = self._call(*(np.asarray(a).ravel() for a in arg))
+        except SimulationError:  # not a number: IPOPT takes a shorter step
+            found = [np.full(s.nnz(), np.nan) for s in self._results]
         return [ca.DM(s, np.atleast_1d(v)) for s, v in zip(self._results, found, strict=True)]
 
 
