@@ -132,14 +132,9 @@ class _Integrators:
         p, u0, u1, h, scale = ca.vertsplit(theta, ends)
         tau = ca.SX.sym("tau")
         f = self.system.rhs(z * scale, u0 + tau * (u1 - u0), p)
-        parts = {True: ([], []), False: ([], [])}
-        for k, stored in enumerate(self.system.stored):
-            parts[stored][0].append(z[k])
-            parts[stored][1].append(f[k] * h / scale[k] if stored else f[k])
-        dae = {"x": ca.vertcat(*parts[True][0]), "ode": ca.vertcat(*parts[True][1]), "p": theta, "t": tau}
-        if parts[False][0]:
-            dae |= {"z": ca.vertcat(*parts[False][0]), "alg": ca.vertcat(*parts[False][1])}
-        return dae
+        differential, algebraic = (np.flatnonzero(kind).tolist() for kind in (self.stored, ~self.stored))
+        dae = {"x": z[differential], "ode": (f * h / scale)[differential], "p": theta, "t": tau}
+        return dae | {"z": z[algebraic], "alg": f[algebraic]} if algebraic else dae
 
     def _integrator(self, count: int) -> tuple[ca.Function, ca.Function | None]:
         if count not in self.made:

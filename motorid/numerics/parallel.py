@@ -81,12 +81,7 @@ def budget(seconds: float | None) -> Iterator[None]:
 
 
 def check_time() -> None:
-    """Raise `OutOfTime` if the budget around this call is spent; called once an iteration by whatever takes long.
-
-    Raises
-    ------
-    OutOfTime
-    """
+    """Raise `OutOfTime` if the budget around this call is spent; called once an iteration by whatever takes long."""
     if time.monotonic() > _deadline.get():
         raise OutOfTime
 

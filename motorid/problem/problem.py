@@ -245,12 +245,7 @@ class Problem:
         return [m.unstack(part, missing) for m, part in zip(self.measured, parts, strict=True)]
 
     def residual(self, q: Array) -> Array:
-        """Return the whitened residual: outputs run by run, then priors, then penalties.
-
-        Raises
-        ------
-        SimulationError
-        """
+        """Return the whitened residual: outputs run by run, then priors, then penalties; or raise `SimulationError`."""
         return self._evaluate(q, False)[0]
 
     def jacobian(self, q: Array) -> Array:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -98,10 +98,8 @@ class Unknowns:
 
     def values(self, physical: Array) -> dict[str, float]:
         """Return all parameter values of the model, SI, for `physical` values of the unknowns."""
-        found = {n: p.value for n, p in self.parameters.items()}
-        for p, value in zip(self.free, physical.tolist(), strict=False):
-            found[p.name] = value
-        return found
+        fitted = zip((p.name for p in self.free), physical.tolist(), strict=False)
+        return {**{n: p.value for n, p in self.parameters.items()}, **dict(fitted)}
 
     def principal(self, q: Array) -> Array:
         """Return `q` with its phase angles, whole turns of which mean nothing, within ±π."""
@@ -182,8 +180,8 @@ class Scaling:
 
     scale: NDArray[np.float64]  # positive sizes s
     log: NDArray[np.bool_]
-    lower: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))  # limits of p
-    upper: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
+    lower: NDArray[np.float64]  # limits of p
+    upper: NDArray[np.float64]
 
     @staticmethod
     def of(parameters: Iterable[Parameter], sizes: ArrayLike | None = None) -> Scaling:
@@ -193,8 +191,7 @@ class Scaling:
         scale = np.abs(values if sizes is None else np.asarray(sizes, float))
         scale = np.where((scale > 0) & np.isfinite(scale), scale, 1.0)
         log = np.array([p.positive for p in pars], bool)
-        lower, upper = ([getattr(p, side) for p in pars] for side in ("lower", "upper"))
-        return Scaling(scale, log, np.array(lower, float), np.array(upper, float))
+        return Scaling(scale, log, np.array([p.lower for p in pars], float), np.array([p.upper for p in pars], float))
 
     def physical(self, q: ArrayLike) -> NDArray[np.float64]:
         """Return p of q."""

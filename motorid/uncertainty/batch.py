@@ -275,15 +275,8 @@ def outliers(rows: Sequence[Mapping[str, Any]], names: Sequence[str], positive: 
              level: float = LEVEL) -> tuple[Outlier, ...]:
     """Return the outliers of a batch, the most extreme first.
 
-    Parameters
-    ----------
-    rows : sequence of mapping
-        With ``motor`` and per parameter its value and ``<name>_std``.
-    names : sequence of str
-    positive : set of str
-        Parameters compared on the logarithmic scale.
-    level : float
-        Chance of a false alarm anywhere in a batch of equal scatter.
+    `rows` have ``motor`` and per parameter in `names` its value and ``<name>_std``; those in `positive` are compared on
+    the logarithmic scale. `level` is the chance of a false alarm anywhere in a batch of equal scatter.
     """
     found = []
     for n in names:
