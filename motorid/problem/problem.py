@@ -71,13 +71,10 @@ class Problem:
     _runs: tuple[Run, ...] | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
-        runs = self.experiments
-        if isinstance(runs, Experiment):
-            runs = (runs,)
-        object.__setattr__(self, "experiments", tuple(runs))
-        if not self.experiments or not all(isinstance(r, Experiment) for r in self.experiments):
+        runs = (self.experiments,) if isinstance(self.experiments, Experiment) else tuple(self.experiments)
+        if not runs or not all(isinstance(r, Experiment) for r in runs):
             raise UsageError("a problem needs at least one Experiment: runs = mi.read_runs('run*.csv').")
-        object.__setattr__(self, "experiments", tuple(_without_empty(r) for r in self.experiments))
+        object.__setattr__(self, "experiments", tuple(_without_empty(r) for r in runs))
         if self.weights not in ("noise", "rms"):
             raise UsageError(one_of(self.weights, ("noise", "rms"), "weights"))
         if not self.outputs:

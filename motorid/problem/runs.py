@@ -114,15 +114,9 @@ def _level(run: Experiment, channel: str) -> float:
 
 
 # -- the state at the first sample -----------------------------------------------------------------------
-class InitialState(NamedTuple):
-    """`start` (3,): i, omega, theta at the first sample; `limits`: those to estimate, and how far they go."""
-
-    start: Array
-    limits: dict[str, tuple[float, float]]
-
-
-def initial_state(run: Experiment, sigma: Mapping[str, float], initial: str) -> InitialState:
-    """Return the state at the first sample, and which parts of it are to be estimated.
+def initial_state(run: Experiment, sigma: Mapping[str, float],
+                  initial: str) -> tuple[Array, dict[str, tuple[float, float]]]:
+    """Return i, omega, theta (3,) at the first sample, and between which limits some of them are to be estimated.
 
     ``auto``: known zeros where nothing moves yet, otherwise estimated; a measured angle is estimated too: its first
     sample is as noisy as any, and half a count of the finest encoder shows over a long run. Estimates stay within what
@@ -154,11 +148,11 @@ def initial_state(run: Experiment, sigma: Mapping[str, float], initial: str) -> 
     if "i" not in run.outputs and not known:
         reach["i"] = np.inf  # to assume none would be a measurement that was never made
     if initial in ("rest", "measured"):
-        reach = {}
-    free = initial == "estimate"
+        return start, {}
+    if initial == "estimate":
+        return start, dict.fromkeys(reach, (-np.inf, np.inf))
     places = {c: start[CHANNELS.index(c)] for c in reach}
-    return InitialState(start, {c: (-np.inf, np.inf) if free else (x - reach[c], x + reach[c])
-                                for c, x in places.items()})
+    return start, {c: (x - reach[c], x + reach[c]) for c, x in places.items()}
 
 
 def at_rest(run: Experiment, sigma: Mapping[str, float]) -> tuple[bool, int]:
@@ -301,12 +295,10 @@ def suited(parameter: Parameter, sizes: Mapping[str, float]) -> Parameter:
     if parameter.given or parameter.name == "sgn_width":
         return parameter
     size = sizes.get(parameter.unit)
-    if parameter.null is None and parameter.grid:
-        value = parameter.grid[len(parameter.grid) // 2] * (size or 1.0)
-    elif parameter.null == 0 and size is not None and not parameter.positive:
+    if parameter.null == 0 and size is not None and not parameter.positive:
         value = 0.02 * size
-    elif parameter.grid and size is not None:
-        value = parameter.grid[len(parameter.grid) // 2] * size
+    elif parameter.grid and (size is not None or parameter.null is None):
+        value = parameter.grid[len(parameter.grid) // 2] * (size or 1.0)
     else:
         value = parameter.value
     return replace(parameter, value=float(np.clip(value, parameter.lower, parameter.upper)))

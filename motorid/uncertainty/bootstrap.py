@@ -216,7 +216,7 @@ def _refit(source: _Source, seed: np.random.SeedSequence) -> dict[str, float] | 
         done = least_squares(again, SOLVER)
     except (MotoridError, np.linalg.LinAlgError) as error:
         return Failure(problem.model.values, "failed", str(error))
-    return done.problem.values(done.solution.q)
+    return done.values
 
 
 def _resampled(source: _Source, k: int, rng: np.random.Generator) -> Experiment:

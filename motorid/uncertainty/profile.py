@@ -224,8 +224,7 @@ def _refit_with(problem: Problem, values: dict[str, float], name: str,
         done = least_squares(here, SOLVER)
     except (MotoridError, np.linalg.LinAlgError):
         return None
-    r = done.solution.residual
-    return 0.5 * float(r @ r), done.problem.values(done.solution.q)
+    return done.cost, done.values
 
 
 def _joined(fit: Fit, name: str, left: list[Point], right: list[Point], dof: float) -> Profile:

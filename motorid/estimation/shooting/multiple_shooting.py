@@ -18,7 +18,7 @@ from motorid.estimation.fit import minimise
 from motorid.estimation.least_squares import FINISH, least_squares
 from motorid.estimation.result import Fit
 from motorid.estimation.shooting.mesh import Mesh
-from motorid.estimation.shooting.nlp import Ipopt, NlpResult, ShootingNlp
+from motorid.estimation.shooting.nlp import NlpResult, ShootingNlp, ipopt
 from motorid.estimation.shooting.nodes import first_noise, nodes_from_data, nodes_from_simulation, noise_of_gaps
 from motorid.estimation.shooting.outcome import Solved, below_steady, fit_of, violations
 from motorid.numerics.signals import Array
@@ -196,9 +196,9 @@ class MultipleShooting:
             raise FitError(f"the model cannot be simulated at the start: {error} Give other starting values with "
                            "model.replace(…), or leave them out.") from None
         most, tol = (min(ROUGH_ITERATIONS, self.max_iterations), 1e-6) if rough else (self.max_iterations, self.tol)
-        ipopt = Ipopt(most, tol, self.verbose)
-        result = ipopt.solve(nlp, z, (np.concatenate([low, -free]), np.concatenate([high, free])), warm,
-                             near=not rough and self.warm != "data")
+        result = ipopt(nlp, z, (np.concatenate([low, -free]), np.concatenate([high, free])),
+                       {"max_iter": most, "tol": tol, "print_level": 5 if self.verbose else 0}, warm,
+                       near=not rough and self.warm != "data")
         return Solved(mesh, nlp, result, history + result.history)
 
 
@@ -228,7 +228,7 @@ def _least_squares(problem: Problem, stages: bool) -> tuple[Problem, Array]:
         done = minimise(problem, replace(FINISH, ftol=TIGHT), wide=stages)
     except FitError:  # the intervals will have to find it
         return problem, problem.start
-    return done.problem, done.solution.q
+    return done.problem, done.q
 
 
 def _under_heavier_penalties(problem: Problem, q: Array) -> Array:

@@ -7,15 +7,14 @@ that the compiled step of the least-squares engine is used here too.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
 
 from motorid.errors import SimulationError
-from motorid.estimation.shooting.mesh import Block, Mesh
+from motorid.estimation.shooting.mesh import Block, Mesh, places
 from motorid.numerics.signals import Array
 
 D = ca.Sparsity.dense
@@ -170,15 +169,9 @@ def _steepest(blocks: Sequence[Block], n: int) -> float:
 
 def _jacobian_pattern(blocks: Sequence[Block], m: int, n: int) -> tuple[ca.Sparsity, np.ndarray]:
     """Return the sparsity and the order in which the blocks' entries fill it, column by column."""
-    rows, columns, first = [np.zeros(0, int)], [np.zeros(0, int)], 0
-    for b in blocks:
-        h, w = b.jac.shape
-        rows.append(np.repeat(np.arange(first, first + h), w))
-        columns.append(np.tile(b.columns, h))
-        first += h
-    r, c = np.concatenate(rows), np.concatenate(columns)
-    order = np.lexsort((r, c))
-    return _ccs(r[order], c[order], m, n), order
+    rows, columns = places(blocks)
+    order = np.lexsort((rows, columns))
+    return _ccs(rows[order], columns[order], m, n), order
 
 
 def _hessian_pattern(blocks: Sequence[Block], n: int) -> tuple[ca.Sparsity, np.ndarray, np.ndarray]:
@@ -195,41 +188,26 @@ def _ccs(rows: np.ndarray, columns: np.ndarray, m: int, n: int) -> ca.Sparsity:
     return ca.Sparsity(m, n, starts.tolist(), rows.tolist())
 
 
-@dataclass(frozen=True)
-class Ipopt:
-    """Options handed to IPOPT."""
-
-    max_iterations: int = 300
-    tol: float = 1e-9
-    verbose: bool = False
-
-    def solve(self, nlp: ShootingNlp, z0: Array, bounds: tuple[Array, Array], warm: NlpResult | None = None,
-              near: bool = False) -> NlpResult:
-        """Solve `nlp`.
-
-        `z0` may be near a solution, or there may be an earlier result of the same size.
-        """
-        function, derivatives = nlp.functions()
-        options: dict[str, Any] = {
-            "max_iter": self.max_iterations, "tol": self.tol, "constr_viol_tol": 1e-10, "dual_inf_tol": 1e-6,
-            "compl_inf_tol": 1e-8, "acceptable_iter": 0, "bound_relax_factor": 0.0, "nlp_scaling_method": "none",
-            "print_level": 5 if self.verbose else 0, "sb": "yes", "mu_strategy": "adaptive",
-        }
-        start = {"x0": z0}
-        if near:
-            options |= {"mu_strategy": "monotone", "mu_init": 1e-6, "bound_push": 1e-8, "bound_frac": 1e-8,
-                        "slack_bound_push": 1e-8, "slack_bound_frac": 1e-8}
-        if warm is not None:
-            options |= {"mu_strategy": "monotone", "mu_init": 1e-7, "warm_start_init_point": "yes",
-                        "warm_start_bound_push": 1e-9, "warm_start_mult_bound_push": 1e-9,
-                        "warm_start_slack_bound_push": 1e-9}
-            start |= {"lam_g0": warm.lam_g * nlp.scale, "lam_x0": warm.lam_x * nlp.scale}
-        solver = ca.nlpsol("solver", "ipopt", function, {
-            **derivatives, "no_nlp_grad": True, "calc_lam_p": False, "print_time": False, "show_eval_warnings": False,
-            "error_on_fail": False, "ipopt": options})
-        found = solver(**start, lbx=bounds[0], ubx=bounds[1], lbg=nlp.lower, ubg=nlp.upper)
-        stats = solver.stats()
-        costs = tuple(float(f) / nlp.scale for f in stats.get("iterations", {}).get("obj", []))
-        return NlpResult(np.asarray(found["x"]).ravel(), np.asarray(found["lam_g"]).ravel() / nlp.scale,
-                         np.asarray(found["lam_x"]).ravel() / nlp.scale, stats["return_status"],
-                         int(stats["iter_count"]), costs)
+def ipopt(nlp: ShootingNlp, z0: Array, bounds: tuple[Array, Array], options: Mapping[str, Any],
+          warm: NlpResult | None = None, near: bool = False) -> NlpResult:
+    """Solve `nlp` with some of IPOPT's `options`; `z0` may be `near` a solution, `warm` a result of the same size."""
+    function, derivatives = nlp.functions()
+    start = {"x0": z0}
+    told = {"constr_viol_tol": 1e-10, "dual_inf_tol": 1e-6, "compl_inf_tol": 1e-8, "acceptable_iter": 0,
+            "bound_relax_factor": 0.0, "nlp_scaling_method": "none", "sb": "yes", "mu_strategy": "adaptive", **options}
+    if near:
+        told |= {"mu_strategy": "monotone", "mu_init": 1e-6, "bound_push": 1e-8, "bound_frac": 1e-8,
+                 "slack_bound_push": 1e-8, "slack_bound_frac": 1e-8}
+    if warm is not None:
+        told |= {"mu_strategy": "monotone", "mu_init": 1e-7, "warm_start_init_point": "yes",
+                 "warm_start_bound_push": 1e-9, "warm_start_mult_bound_push": 1e-9,
+                 "warm_start_slack_bound_push": 1e-9}
+        start |= {"lam_g0": warm.lam_g * nlp.scale, "lam_x0": warm.lam_x * nlp.scale}
+    solver = ca.nlpsol("solver", "ipopt", function, {
+        **derivatives, "no_nlp_grad": True, "calc_lam_p": False, "print_time": False, "show_eval_warnings": False,
+        "error_on_fail": False, "ipopt": told})
+    found = solver(**start, lbx=bounds[0], ubx=bounds[1], lbg=nlp.lower, ubg=nlp.upper)
+    x, lam_g, lam_x = (np.asarray(found[name]).ravel() for name in ("x", "lam_g", "lam_x"))
+    stats = solver.stats()
+    costs = tuple(float(f) / nlp.scale for f in stats.get("iterations", {}).get("obj", []))
+    return NlpResult(x, lam_g / nlp.scale, lam_x / nlp.scale, stats["return_status"], int(stats["iter_count"]), costs)

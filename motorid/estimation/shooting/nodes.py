@@ -9,7 +9,7 @@ import numpy as np
 import scipy
 
 from motorid.errors import SimulationError, UsageError, one_of
-from motorid.estimation.shooting.mesh import Mesh
+from motorid.estimation.shooting.mesh import Mesh, places
 from motorid.numerics.signals import Array, bridged, slope
 from motorid.records.experiment import Experiment
 
@@ -110,13 +110,9 @@ def reduced(mesh: Mesh, z: Array) -> tuple[Array, Array]:
     the covariance of q with the nodes unknown.
     """
     blocks = mesh.residual(z, mesh.walk(z, True))
-    starts = np.cumsum([0, *(len(b.values) for b in blocks)])
-    rows = np.concatenate([np.repeat(np.arange(a, a + len(b.values)), len(b.columns))
-                           for a, b in zip(starts[:-1], blocks, strict=True)])
-    columns = np.concatenate([np.tile(b.columns, len(b.values)) for b in blocks])
-    entries = np.concatenate([b.jac.ravel() for b in blocks])
-    whole = scipy.sparse.csc_matrix((entries, (rows, columns)), shape=(int(starts[-1]), len(z)))
     residual = np.concatenate([b.values for b in blocks])
+    entries = np.concatenate([b.jac.ravel() for b in blocks])
+    whole = scipy.sparse.csc_matrix((entries, places(blocks)), shape=(len(residual), len(z)))
     jac, nodes = whole[:, :mesh.nq].toarray(), whole[:, mesh.nq:]
     if not nodes.shape[1]:
         return residual, jac
