@@ -43,7 +43,6 @@ class _Sundials:
     def run(self, system: System, grid: Grid, x0: Array, p: Array, dx0: Array | None = None,
             dp: Array | None = None) -> Trajectory:
         """See `Engine.run`."""
-        self._check(system)
         nx, nq = len(system.states), 0 if dp is None else dp.shape[1]
         n = len(grid.t)
         scale = _state_scale(system, grid, x0, p)
@@ -80,9 +79,6 @@ class _Sundials:
         """See `Engine.prepare`; these engines choose their own steps."""
         return grid
 
-    def _check(self, system: System) -> None:
-        return
-
 
 @dataclass(frozen=True)
 class Cvodes(_Sundials):
@@ -94,11 +90,6 @@ class Cvodes(_Sundials):
     """
 
     name = "cvodes"
-
-    def _check(self, system: System) -> None:
-        if not all(system.stored):
-            raise ModelError("cvodes integrates differential equations only, and this model has an algebraic "
-                             "balance (no inductance). Use engine='idas' or engine='rosenbrock'.")
 
 
 @dataclass(frozen=True)
@@ -117,6 +108,9 @@ class _Integrators:
     """Integrators of one system over 2^k steps of length h, made when first needed."""
 
     def __init__(self, plugin: str, rtol: float, atol: float, system: System, nq: int) -> None:
+        if plugin == "cvodes" and not all(system.stored):
+            raise ModelError("cvodes integrates differential equations only, and this model has an algebraic "
+                             "balance (no inductance). Use engine='idas' or engine='rosenbrock'.")
         self.system, self.plugin, self.nq = system, plugin, nq
         # Without second-order correction Newton's matrix is one block for all sensitivities: exact too, faster;
         # CasADi cannot do so with algebraic states.

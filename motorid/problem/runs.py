@@ -272,11 +272,9 @@ def natural_sizes(runs: Sequence[Experiment], values: Mapping[str, float]) -> di
     span = max((s.span for s in seen if s.span is not None), default=1.0)
     sizes = {"V": volt, "A": ampere, "rad/s": speed, "m/s": speed, "N·m": torque, "N": torque, "s": second,
              "Ω": volt / ampere, "1/s": 1 / second, "m": 0.01 * span,
-             "K/W": 30 / max(power, 1e-9), "J/K": max(power * duration, 1e-9) / 30}
-    for unit in ("N·m·s/rad", "N·s/m"):
-        sizes[unit] = torque / speed
-    for unit in ("N·m·s²/rad²", "N·s²/m²"):
-        sizes[unit] = torque / speed**2
+             "K/W": 30 / max(power, 1e-9), "J/K": max(power * duration, 1e-9) / 30,
+             **dict.fromkeys(("N·m·s/rad", "N·s/m"), torque / speed),
+             **dict.fromkeys(("N·m·s²/rad²", "N·s²/m²"), torque / speed**2)}
     return {k: v if np.isfinite(v) and v > 0 else 1.0 for k, v in sizes.items()}
 
 

@@ -24,7 +24,7 @@ from motorid.estimation.shooting.outcome import Solved, below_steady, fit_of, vi
 from motorid.numerics.signals import Array
 from motorid.problem.problem import Problem
 from motorid.problem.relations import Relation, Weighed
-from motorid.problem.simulate import misfit_over_noise
+from motorid.problem.simulate import at, judge, misfit_over_noise
 
 ROUNDS = 4  # of refining the sub-steps
 TIGHT = 1e-13  # share of the cost at which the least-squares fit on the way stops
@@ -281,13 +281,8 @@ def _lowest(found: list[Solved]) -> Solved:
 
 def _poor(problem: Problem, q: Array) -> bool:
     """Tell whether the model explains less than half of some channel at `q`."""
-    for k, run in enumerate(problem.runs):
-        try:
-            y = problem.simulate(q, k, derivatives=False).y
-        except SimulationError:
-            return True
-        for j, c in enumerate(problem.outputs):
-            shown = run.experiment.outputs.get(c)
-            if shown is not None and not np.nanmean((y[:, j] - shown) ** 2) < POOR**2 * np.nanmean(shown**2):
-                return True
-    return False
+    try:
+        errors = judge(at(problem, q)).by_run
+    except SimulationError:
+        return True
+    return not all(e < POOR for run in errors for e in run.values())
