@@ -9,6 +9,7 @@ period per sample no alias and no delay of a sensor can pose as it.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from typing import NamedTuple
@@ -84,10 +85,8 @@ def likely_orders(tangent: Tangent, effect: Effect, most: int) -> list[float]:
 def uses_angle(effect: Effect) -> bool:
     """Tell whether the effect reads the angle."""
     for base in (dc_motor(), torque_driven()):
-        try:
+        with suppress(ModelError):
             return "theta" in (base + effect).write().states
-        except ModelError:
-            continue
     return False
 
 

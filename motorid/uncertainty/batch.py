@@ -8,6 +8,7 @@ import json
 import pickle
 import time
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import combinations
@@ -50,8 +51,7 @@ class Outlier:
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain data."""
-        return {"motor": self.motor, "parameter": self.parameter, "value": self.value, "median": self.median,
-                "z": self.z}
+        return {k: v for k, v in vars(self).items() if k != "text"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,10 +198,8 @@ def _carry_laws(model: Model) -> None:
         return
     for n in (1, 2, 3):
         for outputs in combinations(CHANNELS, n):
-            try:
+            with suppress(Exception):  # a channel that this model does not have
                 model.system(outputs)
-            except Exception:
-                continue  # a channel that this model does not have
 
 
 def _fit_one(task: tuple[Model, Mapping[str, Any], Mapping[str, Any]], motor: tuple[str, Records]) -> dict[str, Any]:
@@ -321,7 +319,7 @@ class Checkpoint:
         self.rows: dict[str, dict[str, Any]] = {}
         text = read_bytes(path).decode("utf-8", "replace") if path.exists() else ""
         for line in text.splitlines():
-            try:
+            with suppress(ValueError, KeyError, TypeError, RecursionError):
                 entry = json.loads(line)
                 row = {"motor": entry["row"]["motor"], **entry["row"]}
                 for name, value in row.items():
@@ -329,8 +327,6 @@ class Checkpoint:
                     if not isinstance(value, kind):
                         raise TypeError(name)
                 self.rows[entry["fingerprint"]] = row
-            except (ValueError, KeyError, TypeError, RecursionError):
-                continue
         if text.strip() and not self.rows and '{"fingerprint"' not in text:
             raise UsageError(f"'{path}' is not a journal of motorid, so nothing is added to it; name another file.")
         self._append("" if text.endswith("\n") or not text else "\n")

@@ -9,6 +9,7 @@ identifiability of nonlinear ODE models", SIAM Review 53, 2011). It works on pla
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import combinations, islice, product
 from typing import Any
@@ -238,13 +239,11 @@ def _structural_rank(problem: Problem, q: Array, points: int, seed: int) -> int:
     for trial in range(points + 1):
         at = q.copy()
         at[:k] += reach * rng.uniform(-1, 1, k) * (trial > 0)
-        try:
+        with suppress(SimulationError):
             jac = relative_jacobian(problem.refined(at), at)
-        except SimulationError:
-            continue
-        norms = np.linalg.norm(jac, axis=0)
-        s = np.linalg.svd(jac / np.where(norms > 0, norms, 1.0), compute_uv=False)
-        best = max(best, int(np.sum(s > STRUCTURAL * max(s[0], 1e-300))))
+            norms = np.linalg.norm(jac, axis=0)
+            s = np.linalg.svd(jac / np.where(norms > 0, norms, 1.0), compute_uv=False)
+            best = max(best, int(np.sum(s > STRUCTURAL * max(s[0], 1e-300))))
         if best == k:
             break
     return best

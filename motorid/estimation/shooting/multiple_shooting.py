@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -162,12 +163,10 @@ class MultipleShooting:
         return done
 
     def _nodes(self, mesh: Mesh, q: Array) -> Array:
-        if self.warm == "data":
-            return nodes_from_data(mesh, q)
-        try:
-            return nodes_from_simulation(mesh, q)
-        except SimulationError:
-            return nodes_from_data(mesh, q)
+        if self.warm != "data":
+            with suppress(SimulationError):
+                return nodes_from_simulation(mesh, q)
+        return nodes_from_data(mesh, q)
 
     def _with_process_noise(self, problem: Problem, q: Array) -> Solved:
         """Solve with process noise; with ``"auto"`` again until the gaps are as large as was taken."""

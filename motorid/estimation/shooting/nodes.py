@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -37,11 +38,9 @@ def nodes_from_data(mesh: Mesh, q: Array) -> Array:
             x = problem.unknowns.first_state(at, v.run)
         if v.next < 0:
             continue
-        try:
-            end = problem.integrator.run(problem.system, v.grid, x, at.p).x[-1]
-        except SimulationError:
-            end = x
-        x = end.copy()
+        with suppress(SimulationError):
+            x = problem.integrator.run(problem.system, v.grid, x, at.p).x[-1]
+        x = x.copy()
         for j, signal in signals[v.run].items():
             x[j] = signal[v.last]
         found[v.next] = x
