@@ -116,8 +116,8 @@ class _Integrators:
         # CasADi cannot do so with algebraic states.
         self.options = {"reltol": rtol, "abstol": atol, "quad_err_con": True, "max_num_steps": 100000,
                         "second_order_correction": not all(system.stored)}
-        self.made: dict[int, tuple[ca.Function, ca.Function | None]] = {}
         self.stored = np.array(system.stored)
+        self.integrator_of = lru_cache(maxsize=None)(self._integrator)
 
     def _dae(self) -> dict[str, Any]:
         nx, nu, np_, _ = self.system.sizes
@@ -131,18 +131,15 @@ class _Integrators:
         return dae | {"z": z[algebraic], "alg": f[algebraic]} if algebraic else dae
 
     def _integrator(self, count: int) -> tuple[ca.Function, ca.Function | None]:
-        if count not in self.made:
-            # Times are in steps; the slope of a linear input is only used with count = 1.
-            f = ca.integrator(f"walk{count}", self.plugin, self._dae(), 0.0, list(np.arange(1.0, count + 1)),
-                              self.options)
-            self.made[count] = (f, f.forward(self.nq) if self.nq else None)
-        return self.made[count]
+        # Times are in steps; the slope of a linear input is only used with count = 1.
+        f = ca.integrator(f"walk{count}", self.plugin, self._dae(), 0.0, list(np.arange(1.0, count + 1)), self.options)
+        return f, f.forward(self.nq) if self.nq else None
 
     def walk(self, grid: Grid, first: int, count: int, x: Array, dx: Array, p: Array, dp: Array | None,
              scale: Array) -> None:
         """Fill x and dx for `count` intervals from sample `first`."""
         length = next(n for n in LENGTHS if n >= count)
-        main, forward = self._integrator(length)
+        main, forward = self.integrator_of(length)
         h = (grid.t[first + count] - grid.t[first]) / count
         theta = np.concatenate([p, grid.u0[first], grid.u1[first], [h], scale])
         d, a = self.stored, ~self.stored

@@ -73,8 +73,7 @@ class Model(Shown):
         added = {p.name: self._in_units(p) for p in other.parameters}
         model = self.with_(effects=(*self.effects, other), parameters={**self.parameters, **added})
         if _smooths(model) and "sgn_width" not in model.parameters:
-            width = replace(SGN_WIDTH, unit="m/s" if self.axis == "linear" else SGN_WIDTH.unit)
-            model = model.with_(parameters={**model.parameters, "sgn_width": width})
+            model = model.with_(parameters={**model.parameters, "sgn_width": self._in_units(SGN_WIDTH)})
         return model
 
     def without(self, name: str) -> Model:
@@ -291,8 +290,7 @@ def dc_motor(**values: float) -> Model:
     >>> mi.dc_motor(R=1.3)
     <model dc_motor: R, L, K, b, J>
     """
-    model = Model("dc_motor", parameters={p.name: p for p in BASES["dc_motor"]})
-    return model.replace(**values)
+    return Model("dc_motor", parameters={p.name: p for p in BASES["dc_motor"]}).replace(**values)
 
 
 def torque_driven(axis: str = "rotary", **values: float) -> Model:

@@ -47,11 +47,6 @@ class Run:
     # values of this run's own of parameters that are others in every run
     apart: Mapping[str, float] = field(default_factory=dict)
 
-    @property
-    def estimated(self) -> tuple[str, ...]:
-        """Initial states that are unknowns of the fit."""
-        return tuple(self.limits)
-
 
 def prepare_run(run: Experiment, channels: Sequence[str], noise: Mapping[str, float], inputs: Sequence[str],
                 initial: str) -> Run:

@@ -64,10 +64,9 @@ class Unknowns:
         found = []
         free = {c for c, stored in zip(self.system.states, self.system.stored, strict=True) if stored}
         for k, run in enumerate(self.runs):
-            for c in run.estimated:
+            for c, (low, high) in run.limits.items():
                 if c in free:  # an algebraic current follows from the rest
                     unit = run.experiment.units.get(c, UNITS[c][0])
-                    low, high = run.limits[c]
                     if any(p.null == 0 and p.unit == UNITS[c][0] for p in self.parameters.values()):
                         low, high = min(low, 0.0), max(high, 0.0)  # what was measured there may be the sensor's offset
                     value = float(run.start[CHANNELS.index(c)])

@@ -180,18 +180,15 @@ class Mesh:
         for v, traj in zip(self.intervals, walk.intervals, strict=True):
             if v.next < 0:
                 continue
-            factor = self.scale / self.gap_size(v) if weighed else np.ones(self.nx)
+            factor = np.ones(self.nx)
+            if weighed and self.noise is not None:
+                factor = self.scale / (self.noise * np.sqrt(v.grid.t[-1] - v.grid.t[0]))
             values = (states[v.next] - traj.x[-1] / self.scale) * factor
             jac = np.zeros((self.nx, 0))
             if traj.dx is not None:
                 jac = np.hstack([-traj.dx[-1] / self.scale[:, None], np.eye(self.nx)]) * factor[:, None]
             blocks.append(_present(Block(values, jac, self.columns(v, after=True))))
         return blocks
-
-    def gap_size(self, v: Interval) -> Array:
-        """Standard deviation (nx,) of the gap after an interval, physical."""
-        assert self.noise is not None
-        return self.noise * np.sqrt(v.grid.t[-1] - v.grid.t[0])
 
     def constraints(self, walk: Walk) -> list[tuple[Block, Part, np.ndarray]]:
         """Return the rows of all constraints with the part they belong to and their places in it."""
