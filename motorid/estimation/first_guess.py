@@ -80,12 +80,12 @@ def _windowed(t: Array, columns: Sequence[Array], target: Array, windows: int = 
 def _solve(rows: list[tuple[Array, Array]], names: Sequence[str | Load], held: Mapping[Any, float]) -> dict[Any, float]:
     """Non-negative least squares with some coefficients known; zeros of the motor become small positive numbers."""
     a, b = np.vstack([r[0] for r in rows]), np.concatenate([r[1] for r in rows])
-    known = [n in held for n in names]
-    b = b - a[:, known] @ np.array([held[n] for n in names if n in held])
+    known = {n: held[n] for n in names if n in held}
     free = [n for n in names if n not in held]
-    a = a[:, [not k for k in known]]
     if not free:
-        return {n: held[n] for n in names}
+        return known
+    b = b - a[:, [n in held for n in names]] @ np.array([*known.values()])
+    a = a[:, [n not in held for n in names]]
     norms = np.where((norms := np.linalg.norm(a, axis=0)) > 0, norms, 1.0)
     triangle: Array = np.asarray(np.linalg.qr(np.column_stack([a / norms, b]), mode="r"))
     signed = np.array([isinstance(n, Load) and n.signed for n in free])
@@ -93,7 +93,7 @@ def _solve(rows: list[tuple[Array, Array]], names: Sequence[str | Load], held: M
     # A coefficient that comes out as zero starts where its term would carry a thousandth of the right-hand side.
     motor = np.array([isinstance(n, str) for n in free])
     z = np.where(motor, np.maximum(z, FLOOR * np.linalg.norm(b)), z) / norms
-    return {n: held[n] for n in names if n in held} | dict(zip(free, z.tolist(), strict=True))
+    return known | dict(zip(free, z.tolist(), strict=True))
 
 
 def _nonnegative(a: Array, b: Array, signed: NDArray[np.bool_]) -> Array:

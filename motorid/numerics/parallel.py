@@ -31,6 +31,8 @@ from typing import Any, NamedTuple
 from motorid.errors import OutOfTime, UsageError
 
 Map = Callable[..., Iterable[Any]]
+# Those of this system; the alarm repeats Ctrl-C.
+SIGNALS = [getattr(signal, n) for n in ("SIGINT", "SIGALRM", "SIGTERM", "SIGHUP") if hasattr(signal, n)]
 WAVE = 4e6  # bytes of records handed to a pool at once; two waves are under way
 MOST_TASKS = 64  # when many small pieces go to a pool together: few enough to ship, many enough to share out
 
@@ -106,9 +108,8 @@ class Interruption:
 
     def listen(self) -> None:
         """Take over Ctrl-C, and what ends a process politely where that is not ignored (``nohup``)."""
-        for name in ("SIGINT", "SIGALRM", "SIGTERM", "SIGHUP"):
-            number = getattr(signal, name, None)
-            if number and (name == "SIGINT" or signal.getsignal(number) is not signal.SIG_IGN):
+        for number in SIGNALS:
+            if number == signal.SIGINT or signal.getsignal(number) is not signal.SIG_IGN:
                 signal.signal(number, self._raise)
 
     def over(self) -> None:
@@ -116,8 +117,8 @@ class Interruption:
         for stream in (sys.stdout, sys.stderr):
             with suppress(OSError, ValueError):
                 stream.flush()
-        for name in {"SIGINT", "SIGALRM", "SIGTERM", "SIGHUP"} & set(dir(signal)):  # the alarm repeats Ctrl-C
-            signal.signal(getattr(signal, name), signal.SIG_IGN)
+        for number in SIGNALS:
+            signal.signal(number, signal.SIG_IGN)
 
     def behind(self, error: BaseException) -> bool:
         """Tell whether Ctrl-C is what an exception comes from."""

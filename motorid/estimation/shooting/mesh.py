@@ -76,8 +76,7 @@ class Mesh:
         nodes = 0
         for k, run in enumerate(self.problem.runs):
             last = len(run.grid.t) - 1
-            cuts = _cuts(last, self.every)
-            for a, b in pairwise(cuts):
+            for a, b in pairwise(_cuts(last, self.every)):
                 node = -1 if a == 0 else nodes - 1
                 nodes += b < last
                 found.append(Interval(k, a, b, node, nodes - 1 if b < last else -1, run.grid.part(a, b)))

@@ -113,24 +113,23 @@ class ShootingNlp:
 
     def functions(self) -> tuple[ca.Callback, dict[str, ca.Callback]]:
         """Return the NLP and its derivatives in CasADi's naming."""
-        x, p, f, g = D(self.n, 1), D(0, 0), D(1, 1), D(self.m, 1)
-        jac_pattern = self.jac_pattern
-        values = _Function("nlp", ["x", "p"], ["f", "g"], [x, p], [f, g], lambda z, _: self.values(z))
-        grad_f = _Function("nlp_grad_f", ["x", "p"], ["f", "grad:f:x"], [x, p], [f, x], lambda z, _: self.gradient(z))
-        jac_g = _Function("nlp_jac_g", ["x", "p"], ["g", "jac:g:x"], [x, p], [g, jac_pattern],
-                          lambda z, _: self.jacobian(z))
-        hess_lag = _Function("nlp_hess_l", ["x", "p", "lam:f", "lam:g"], ["triu:hess:gamma:x:x"], [x, p, f, g],
-                             [self.hess_pattern], lambda z, _, lam_f, __: [self.hessian(z, float(lam_f[0]))])
-        return values, {"grad_f": grad_f, "jac_g": jac_g, "hess_lag": hess_lag}
+        x, f, g = D(self.n, 1), D(1, 1), D(self.m, 1)
+        at = {"x": x, "p": D(0, 0)}
+        return _Function("nlp", at, {"f": f, "g": g}, lambda z, _: self.values(z)), {
+            "grad_f": _Function("nlp_grad_f", at, {"f": f, "grad:f:x": x}, lambda z, _: self.gradient(z)),
+            "jac_g": _Function("nlp_jac_g", at, {"g": g, "jac:g:x": self.jac_pattern}, lambda z, _: self.jacobian(z)),
+            "hess_lag": _Function(
+                "nlp_hess_l", at | {"lam:f": f, "lam:g": g}, {"triu:hess:gamma:x:x": self.hess_pattern},
+                lambda z, _, lam_f, __: [self.hessian(z, float(lam_f[0]))])}
 
 
 class _Function(ca.Callback):
     """A Python function as a CasADi callback; results are dense arrays or the entries of a sparse one."""
 
-    def __init__(self, name: str, names_in: Sequence[str], names_out: Sequence[str], given: Sequence[ca.Sparsity],
-                 results: Sequence[ca.Sparsity], call: Callable[..., list[Any]]) -> None:
+    def __init__(self, name: str, given: Mapping[str, ca.Sparsity], results: Mapping[str, ca.Sparsity],
+                 call: Callable[..., list[Any]]) -> None:
         ca.Callback.__init__(self)
-        self._names, self._given, self._results, self._call = (names_in, names_out), given, results, call
+        self._given, self._results, self._call = list(given.items()), list(results.items()), call
         self.construct(name, {})
 
     def get_n_in(self) -> int:
@@ -140,23 +139,23 @@ class _Function(ca.Callback):
         return len(self._results)
 
     def get_name_in(self, i: int) -> str:
-        return self._names[0][i]
+        return self._given[i][0]
 
     def get_name_out(self, i: int) -> str:
-        return self._names[1][i]
+        return self._results[i][0]
 
     def get_sparsity_in(self, i: int) -> ca.Sparsity:
-        return self._given[i]
+        return self._given[i][1]
 
     def get_sparsity_out(self, i: int) -> ca.Sparsity:
-        return self._results[i]
+        return self._results[i][1]
 
     def eval(self, arg: Sequence[ca.DM]) -> list[ca.DM]:
         try:
             found = self._call(*(np.asarray(a).ravel() for a in arg))
         except SimulationError:  # not a number: IPOPT takes a shorter step
-            found = [np.full(s.nnz(), np.nan) for s in self._results]
-        return [ca.DM(s, np.atleast_1d(v)) for s, v in zip(self._results, found, strict=True)]
+            found = [np.full(s.nnz(), np.nan) for _, s in self._results]
+        return [ca.DM(s, np.atleast_1d(v)) for (_, s), v in zip(self._results, found, strict=True)]
 
 
 def _steepest(blocks: Sequence[Block], n: int) -> float:

@@ -233,8 +233,8 @@ def summed(found: Sequence[tuple[str, Part, Array, Array]]) -> tuple[tuple[Multi
     largest = max((float(np.abs(lam).max(initial=0.0)) for *_, lam in found), default=0.0)
     for name, part, values, lam in found:
         on = part.at_limit(values) & (np.abs(lam) > WEAK * largest)
-        for j in np.flatnonzero(on):
-            rows.append(Multiplier(name, part.labels[j], float(abs(lam[j]) / part.size[j]), part.units[j], 1))
+        rows += [Multiplier(name, part.labels[j], float(abs(lam[j]) / part.size[j]), part.units[j], 1)
+                 for j in np.flatnonzero(on)]
         for unit in dict.fromkeys(part.units):
             mine = on & np.array([u == unit for u in part.units])
             value, active = sums.get((name, unit), (0.0, 0))
