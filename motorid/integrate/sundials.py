@@ -142,26 +142,22 @@ class _Integrators:
         main, forward = self.integrator_of(length)
         h = (grid.t[first + count] - grid.t[first]) / count
         theta = np.concatenate([p, grid.u0[first], grid.u1[first], [h], scale])
-        d, a = self.stored, ~self.stored
+        kinds = {name: which for name, which in (("x", self.stored), ("z", ~self.stored)) if which.any()}
         ks = slice(first + 1, first + count + 1)
-        given = {"x0": x[first, d] / scale[d], "p": theta}
-        if a.any():
-            given["z0"] = x[first, a] / scale[a]
+        given = {f"{name}0": x[first, which] / scale[which] for name, which in kinds.items()} | {"p": theta}
         res = main(**given)
-        x[ks][:, d] = np.asarray(res["xf"]).T[:count] * scale[d]
-        if a.any():
-            x[ks][:, a] = np.asarray(res["zf"]).T[:count] * scale[a]
+        for name, which in kinds.items():
+            x[ks][:, which] = np.asarray(res[f"{name}f"]).T[:count] * scale[which]
         if forward is None or dp is None:
             return
         seeds = np.zeros((theta.size, self.nq))
         seeds[:len(p)] = dp
         given |= {f"out_{k}": res[k] for k in ("xf", "zf")}
-        given |= {"fwd_x0": dx[first][d] / scale[d][:, None], "fwd_p": seeds}
+        given |= {"fwd_x0": dx[first][self.stored] / scale[self.stored][:, None], "fwd_p": seeds}
         sens = forward(**given)
-        for which, key in ((d, "fwd_xf"), (a, "fwd_zf")):
-            if which.any():
-                raw = np.asarray(sens[key]).reshape(which.sum(), self.nq, length)[:, :, :count]
-                dx[ks][:, which, :] = raw.transpose(2, 0, 1) * scale[which][None, :, None]
+        for name, which in kinds.items():
+            raw = np.asarray(sens[f"fwd_{name}f"]).reshape(which.sum(), self.nq, length)[:, :, :count]
+            dx[ks][:, which, :] = raw.transpose(2, 0, 1) * scale[which][None, :, None]
 
 
 @lru_cache(maxsize=64)

@@ -10,7 +10,7 @@ import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -99,20 +99,16 @@ class Batch:
 
     def save(self, path: str | Path, force: bool = False) -> Path:
         """Write the table; the ending says how: ``.csv``, ``.parquet`` or ``.json``; see `write_files`."""
-        target = Path(path)
-        if target.suffix == ".csv":
-            content = self.table.to_csv()
-        elif target.suffix == ".json":
-            content = self.table.reset_index().to_json(orient="records", indent=1, force_ascii=False)
-        elif target.suffix in (".parquet", ".pq"):
-            try:
-                content = self.table.to_parquet()
-            except ImportError as error:
-                raise MissingDependency("writing Parquet needs pyarrow: pip install 'motorid[parquet]', or "
-                                        "save the table as .csv.") from error
-        else:
+        target, table = Path(path), self.table
+        as_json = partial(table.reset_index().to_json, orient="records", indent=1, force_ascii=False)
+        ways = {".csv": table.to_csv, ".json": as_json, ".parquet": table.to_parquet, ".pq": table.to_parquet}
+        if target.suffix not in ways:
             raise UsageError(f"a table is saved as .csv, .parquet or .json; got '{target.name}'.")
-        return write_files({target: content}, force)[0]
+        try:
+            return write_files({target: ways[target.suffix]()}, force)[0]
+        except ImportError as error:
+            raise MissingDependency("writing Parquet needs pyarrow: pip install 'motorid[parquet]', or "
+                                    "save the table as .csv.") from error
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain data: rows, outliers, counts."""

@@ -16,13 +16,12 @@ import numpy as np
 
 from motorid.display.cards import Card, Flag, Printed, Table
 from motorid.display.numbers import duration, number, percent, quantity, sentence
-from motorid.errors import MotoridError, SimulationError, UsageError, at_least, positive
+from motorid.errors import MotoridError, UsageError, at_least, positive
 from motorid.estimation.fit import check_solver, minimise, solve
-from motorid.estimation.least_squares import FINISH, Estimate
+from motorid.estimation.least_squares import FINISH, Estimate, cost_at
 from motorid.estimation.result import Failure, Fit
 from motorid.estimation.start_values import with_start_values
 from motorid.numerics.parallel import Map, map_items, one_thread
-from motorid.numerics.signals import Array
 from motorid.problem.problem import Problem
 from motorid.problem.simulate import at, judge
 
@@ -105,18 +104,10 @@ def _from_start(task: tuple[Problem, dict[str, float], Any, bool], start: dict[s
     except (MotoridError, np.linalg.LinAlgError) as error:
         return Failure(start, "failed", str(error))
     said = end if isinstance(end, Fit) else end.solution
-    cost = _reference_cost(problem, end.problem.scaling.physical(end.q))
+    # With the weights and steps of the reference, so that the results of all starts can be compared.
+    cost = cost_at(problem, problem.scaling.scaled(end.problem.scaling.physical(end.q)))
     return StartResult(start, end.values, cost, judge(at(end.problem, end.q)).nrmse, said.status, said.message,
                        len(end.history) - 1, time.perf_counter() - began)
-
-
-def _reference_cost(problem: Problem, physical: Array) -> float:
-    """Cost with the weights and steps of the reference, so that the results of all starts can be compared."""
-    try:
-        r = problem.residual(problem.scaling.scaled(physical))
-    except SimulationError:
-        return float("inf")
-    return 0.5 * float(r @ r)
 
 
 @dataclass(frozen=True, eq=False)
