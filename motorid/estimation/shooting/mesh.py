@@ -121,20 +121,15 @@ class Mesh:
                     found[j] = max(found[j], float(np.nanmax(np.abs(run.outputs[name]))))
         return np.where(found > 0, found, 1.0)
 
-    def split(self, z: Array) -> tuple[Array, Array]:
-        """Return q and the states at the nodes (n, nx), physical."""
-        return z[:self.nq], z[self.nq:].reshape(self.n_nodes, self.nx) * self.scale
-
     def joined(self, q: Array, states: Array) -> Array:
-        """Return z."""
+        """Return z of q and the states at the nodes (n, nx), physical."""
         return np.concatenate([q, (np.asarray(states).reshape(-1, self.nx) / self.scale).ravel()])
 
     # -- simulation ------------------------------------------------------------------------------------
     def walk(self, z: Array, derivatives: bool) -> Walk:
         """Simulate every interval from its node; SimulationError if that fails."""
         problem, nx = self.problem, self.nx
-        q, states = self.split(z)
-        at = problem.unknowns.point(q)
+        at, states = problem.unknowns.point(z[:self.nq]), z[self.nq:].reshape(self.n_nodes, nx) * self.scale
         dp = np.hstack([np.zeros((len(at.p), nx)), at.dp])
         inner = np.hstack([np.diag(self.scale), np.zeros((nx, self.nq))])
         found = []
@@ -246,8 +241,9 @@ def _cuts(last: int, every: int | None) -> Sequence[int]:
 
 def _joined(intervals: Sequence[Trajectory]) -> Trajectory:
     """Put the intervals of a run together; the sample that two of them share is the later one's."""
-    columns: Any = zip(*(t[:4] for t in intervals), strict=True)
-    y, dy, x, dx = (None if a[0] is None else np.concatenate([*(b[:-1] for b in a[:-1]), a[-1]]) for a in columns)
+    def whole(parts: Any) -> Any:
+        return None if parts[0] is None else np.concatenate([*(a[:-1] for a in parts[:-1]), parts[-1]])
+    y, dy, x, dx = map(whole, zip(*(t[:4] for t in intervals), strict=True))
     return Trajectory(y, dy, x, dx, None)
 
 
