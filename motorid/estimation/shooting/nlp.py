@@ -22,13 +22,12 @@ STEEPEST = 1e4  # largest diagonal entry of the scaled Hessian at the start; IPO
 
 
 class NlpResult(NamedTuple):
-    """Where the NLP solver ended: z, multipliers of the rows (of ½rᵀr) and of z's bounds, status, counts."""
+    """Where the NLP solver ended: z, multipliers of the rows (of ½rᵀr) and of z's bounds, status, costs on the way."""
 
     z: Array
     lam_g: Array
     lam_x: Array
     status: str
-    iterations: int
     history: tuple[float, ...]
 
 
@@ -209,4 +208,4 @@ def ipopt(nlp: ShootingNlp, z0: Array, bounds: tuple[Array, Array], options: Map
     x, lam_g, lam_x = (np.asarray(found[name]).ravel() for name in ("x", "lam_g", "lam_x"))
     stats = solver.stats()
     costs = tuple(float(f) / nlp.scale for f in stats.get("iterations", {}).get("obj", []))
-    return NlpResult(x, lam_g / nlp.scale, lam_x / nlp.scale, stats["return_status"], int(stats["iter_count"]), costs)
+    return NlpResult(x, lam_g / nlp.scale, lam_x / nlp.scale, stats["return_status"], costs)
