@@ -224,7 +224,7 @@ def _with_orders(problem: Problem) -> Problem:
 
 def minimise(problem: Problem, effort: LevenbergMarquardt, callback: Callback = None, *, wide: bool = True) -> Estimate:
     """Minimise the cost from the values of the model: continuation, restarts, reweighting; see `by_continuation`."""
-    found = restore_collapsed(by_continuation(problem, effort, callback, wide=wide), effort, callback)
+    found = restore_collapsed(by_continuation(problem, effort, callback, wide=wide), effort)
     effort = replace(effort, looks=0)
     for k in range(REWEIGHTINGS):
         factors = _reweighted(found)
@@ -232,7 +232,7 @@ def minimise(problem: Problem, effort: LevenbergMarquardt, callback: Callback = 
             break
         begin = found.problem.start_at(found.values) if k else problem
         again = by_continuation(begin.tuned(noise_factors=factors), effort, callback, wide=wide and k == 0)
-        again = restore_collapsed(again, effort, callback)
+        again = restore_collapsed(again, effort)
         found = replace(again, history=found.history + again.history)
     return found
 

@@ -93,7 +93,7 @@ def _by_other_weights(problem: Problem, effort: LevenbergMarquardt) -> Problem:
 
 
 # -- collapsed parameters --------------------------------------------------------------------------------------
-def restore_collapsed(found: Estimate, effort: LevenbergMarquardt, callback: Callback = None) -> Estimate:
+def restore_collapsed(found: Estimate, effort: LevenbergMarquardt) -> Estimate:
     """Return an estimate that collapsed parameters, put back, have led lower, or the same one.
 
     All are put back together first, then one by one.

@@ -20,7 +20,7 @@ import numpy as np
 
 from motorid.errors import ModelError, SimulationError, positive
 from motorid.integrate.engine import Grid, Trajectory
-from motorid.integrate.rosenbrock import Rosenbrock, stepper
+from motorid.integrate.rosenbrock import Rosenbrock, Stepper, stepper
 from motorid.model.equations import System
 from motorid.numerics.signals import Array
 
@@ -50,11 +50,9 @@ class _Sundials:
         x[0] = x0
         if nq:
             dx[0] = dx0
-        integrators = _integrators(self.name, self.rtol, self.atol, stepper(system).key, nq)
-        if not integrators:
-            integrators.append(_Integrators(self.name, self.rtol, self.atol, system, nq))
+        integrators = _integrators(self.name, self.rtol, self.atol, stepper(system), nq)
         for first, count in _pieces(grid):
-            self._walk(integrators[0], grid, first, count, x, dx, p, dp, scale)
+            self._walk(integrators, grid, first, count, x, dx, p, dp, scale)
         y, dy = stepper(system).machine.observe(grid, x, dx if nq else None, p, dp)
         return Trajectory(y, dy, x, dx if nq else None, None)
 
@@ -107,7 +105,8 @@ class Idas(_Sundials):
 class _Integrators:
     """Integrators of one system over 2^k steps of length h, made when first needed."""
 
-    def __init__(self, plugin: str, rtol: float, atol: float, system: System, nq: int) -> None:
+    def __init__(self, plugin: str, rtol: float, atol: float, step: Stepper, nq: int) -> None:
+        system = step.system
         if plugin == "cvodes" and not all(system.stored):
             raise ModelError("cvodes integrates differential equations only, and this model has an algebraic "
                              "balance (no inductance). Use engine='idas' or engine='rosenbrock'.")
@@ -160,9 +159,7 @@ class _Integrators:
             dx[ks][:, which, :] = raw.transpose(2, 0, 1) * scale[which][None, :, None]
 
 
-@lru_cache(maxsize=64)
-def _integrators(plugin: str, rtol: float, atol: float, key: str, nq: int) -> list[_Integrators]:
-    return []
+_integrators = lru_cache(maxsize=64)(_Integrators)
 
 
 def _pieces(grid: Grid) -> Iterator[tuple[int, int]]:
