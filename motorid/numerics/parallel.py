@@ -230,8 +230,9 @@ def map_items(function: Callable[[Any, Any], Any], shared: Any, items: Sequence[
                     for chunk in _in_waves(way, tasks[done:]):
                         results += chunk
                         done += 1
-                        for result in chunk if each is not None else ():
-                            each(result)
+                        if each is not None:
+                            for result in chunk:
+                                each(result)
                         advance()
                     break
                 except Exception as error:

@@ -213,12 +213,11 @@ def identifiability(problem_or_fit: Problem | Fit, *, points: int = 5, seed: int
     _, s, v = np.linalg.svd(np.asarray(np.linalg.qr(matrix, mode="r")), full_matrices=True)
     s = np.concatenate([s, np.zeros(k - len(s))])
     weak = v[s <= LEVEL]
-    shown = [WeakDirection(*words) for words in basis_in_words(names, weak, matrix)]
     return Identifiability(
         names, problem.scaling.physical(q)[:k], problem.scaling.slope(q)[:k],
         tuple(p.unit for p in problem.unknown[:k]), tuple(r.grid.t for r in problem.runs),
-        relative_sensitivities(problem, q), s, v, _structural_rank(problem, q, points, seed), tuple(shown),
-        tuple(monomials(names, weak)) if len(weak) else (),
+        relative_sensitivities(problem, q), s, v, _structural_rank(problem, q, points, seed),
+        basis_in_words(names, weak, matrix), tuple(monomials(names, weak)) if len(weak) else (),
         tuple(suggestions(problem, q, matrix, len(weak))) if len(weak) else (),
         problem_or_fit.std if isinstance(problem_or_fit, Fit) else None)
 
@@ -249,8 +248,8 @@ def _structural_rank(problem: Problem, q: Array, points: int, seed: int) -> int:
     return best
 
 
-def basis_in_words(names: Sequence[str], weak: Array, matrix: Array) -> list[tuple[dict[str, float], float, str]]:
-    """Return per weak direction its parts (largest 1), what a step of 10 % does in units of noise, and words.
+def basis_in_words(names: Sequence[str], weak: Array, matrix: Array) -> tuple[WeakDirection, ...]:
+    """Return the weak directions with as few parts as possible, and what a step of 10 % along each does.
 
     `weak` (d, k) has orthonormal rows, `matrix` (n, k) the whitened outputs per relative change.
     """
@@ -262,8 +261,9 @@ def basis_in_words(names: Sequence[str], weak: Array, matrix: Array) -> list[tup
         moves = ", ".join(f"{n} by {100 * STEP * w:+.2g} %".replace("-", "−") for n, w in parts.items())
         effect = f"moves all outputs by {seen:.1g} standard deviations of their noise"
         effect = "does not move the outputs at all" if seen < UNMOVED else effect
-        found.append((parts, seen, f"Changing {moves}{' together' if len(parts) > 1 else ''} {effect}."))
-    return found
+        text = f"Changing {moves}{' together' if len(parts) > 1 else ''} {effect}."
+        found.append(WeakDirection(parts, seen, text))
+    return tuple(found)
 
 
 def sparse_basis(weak: Array) -> Array:
@@ -327,10 +327,8 @@ def suggestions(problem: Problem, q: Array, matrix: Array, missing: int) -> list
         first = " and ".join(sets[0])
         other = f" (or {' and '.join(sets[1])})" if len(sets) > 1 else ""
         said.append(f"Fix {first}{other} where known, model.fix(…), and the rest is determined.")
-    for channel in ("i", "omega"):
-        if _would_do(problem, q, channel):
-            said.append(f"Measure the {NAMES[channel]} as well: with 1 % of noise all of them are determined.")
-    return said
+    return said + [f"Measure the {NAMES[channel]} as well: with 1 % of noise all of them are determined."
+                   for channel in ("i", "omega") if _would_do(problem, q, channel)]
 
 
 def fixable(names: Sequence[str], matrix: Array, missing: int) -> list[tuple[str, ...]]:
