@@ -22,13 +22,7 @@ EVERY = LIBRARY | MEASURED | PER_RUN
 
 
 def get(name: str) -> Effect:
-    """Return the library's effect called `name`.
-
-    Raises
-    ------
-    ModelError
-        If there is none; the message names the nearest.
-    """
+    """Return the library's effect called `name`; ModelError if there is none, its message names the nearest."""
     if name not in EVERY:
         raise ModelError(one_of(name, EVERY, "effect"))
     return EVERY[name]

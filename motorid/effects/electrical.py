@@ -47,19 +47,15 @@ def magnet_heating(m: Equations,
 
 
 @effect(balance="voltage")
-def inductance_saturation(
-    m: Equations,
-    i_L=P(5.0, "A", null=float("inf"), positive=True, grid=(0.3, 1.0, 3.0), doc="current that halves L"),
-):
+def inductance_saturation(m: Equations, i_L=P(5.0, "A", null=float("inf"), positive=True, grid=(0.3, 1.0, 3.0),
+                                              doc="current that halves L")):
     """Saturation of the inductance, L/(1+(i/i_L)²). Krause et al., Analysis of Electric Machinery, 2013."""
     m.scale("L", 1 / (1 + (m.i / i_L) ** 2))
 
 
 @effect(balance="voltage")
-def magnetic_saturation(
-    m: Equations,
-    i_K=P(5.0, "A", null=float("inf"), positive=True, grid=(0.7, 1.5, 3.0), doc="current that halves K"),
-):
+def magnetic_saturation(m: Equations, i_K=P(5.0, "A", null=float("inf"), positive=True, grid=(0.7, 1.5, 3.0),
+                                            doc="current that halves K")):
     """Magnetic saturation, K/(1+(i/i_K)²) in torque and back-EMF. Krause et al., Electric Machinery, 2013."""
     m.scale("K", 1 / (1 + (m.i / i_K) ** 2))
 
@@ -89,10 +85,8 @@ LIMITER_GAIN, LIMITER_WIDTH = 5.0, 0.004  # in R: how firmly the current is led 
 
 
 @effect(balance="voltage")
-def driver_current_limit(
-    m: Equations,
-    I_lim=P(5.0, "A", null=float("inf"), positive=True, grid=(0.8, 0.9, 0.97), doc="largest current of the driver"),
-):
+def driver_current_limit(m: Equations, I_lim=P(5.0, "A", null=float("inf"), positive=True, grid=(0.8, 0.9, 0.97),
+                                               doc="largest current of the driver")):
     """Current limit of the driver, which takes voltage away. Mohan, Electric Machines and Drives, 2012.
 
     The bridge gives no more than what holds the current at its limit, R·I + K·ω, and leads it there within L/(5 R).

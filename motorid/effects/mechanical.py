@@ -64,10 +64,8 @@ def angular_friction(m: Equations, tau_m=P(2e-3, "N·m", null=0.0, lower=0.0, do
 
 
 @effect(balance="torque")
-def viscous_asymmetric(
-    m: Equations,
-    b_a=P(1e-6, "N·m·s/rad", null=0.0, doc="added to b turning forward, taken from it turning backward"),
-):
+def viscous_asymmetric(m: Equations, b_a=P(1e-6, "N·m·s/rad", null=0.0,
+                                           doc="added to b turning forward, taken from it turning backward")):
     """Viscous friction that differs with the direction, b_a·abs(ω). Janot et al., EMPS benchmark, 2019."""
     m.torque -= b_a * m.omega * m.sign(m.omega)
 

@@ -18,10 +18,8 @@ def _lag(m: Equations, channel: str, time_constant) -> None:
 
 
 @effect(balance="sensor")
-def speed_lag(
-    m: Equations,
-    T_w=P(5e-3, "s", null=0.0, positive=True, grid=(1.0, 4.0, 16.0), doc="time constant of the speed filter"),
-):
+def speed_lag(m: Equations, T_w=P(5e-3, "s", null=0.0, positive=True, grid=(1.0, 4.0, 16.0),
+                                  doc="time constant of the speed filter")):
     """First-order lag of the speed measurement. Åström & Murray, Feedback Systems, 2008."""
     _lag(m, "omega", T_w)
 

@@ -9,6 +9,7 @@ period per sample no alias and no delay of a sensor can pose as it.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from typing import NamedTuple
@@ -16,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from motorid.errors import ModelError
-from motorid.estimation.linearisation import Response, Tangent, responses
+from motorid.estimation.linearisation import Response, Tangent, column_space, responses
 from motorid.estimation.result import Fit
 from motorid.model.definition import Effect, Parameter
 from motorid.model.model import Model, dc_motor, torque_driven
@@ -91,10 +92,8 @@ def likely_orders(tangent: Tangent, effect: Effect, most: int) -> list[float]:
 def uses_angle(effect: Effect) -> bool:
     """Tell whether the effect reads the angle."""
     for base in (dc_motor(), torque_driven()):
-        try:
+        with suppress(ModelError):
             return "theta" in (base + effect).write().states
-        except ModelError:
-            continue
     return False
 
 
@@ -298,11 +297,7 @@ def _whitened(tangent: Tangent) -> tuple[Whitening, Array, Array]:
     """Return the filters, the tangent space behind them, and the residual off it."""
     fit = tangent.fit
     white = Whitening.of(fit.problem.unstack(tangent.residual))
-    slopes = zip(*(fit.problem.unstack(column) for column in tangent.basis.T), strict=True)
-    columns = white([np.stack(run, axis=2) for run in slopes])
-    basis, triangle = np.linalg.qr(columns)
-    u, s, _ = np.linalg.svd(triangle)
-    basis = basis @ u[:, s > 1e-7 * max(s.max(initial=0.0), 1e-300)]
+    basis = column_space(white(fit.problem.unstack(tangent.basis)))
     residual = white(fit.problem.unstack(tangent.residual))
     return white, basis, residual - basis @ (basis.T @ residual)
 

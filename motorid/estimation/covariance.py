@@ -93,7 +93,8 @@ def certainty(problem: Problem, q: Array, residuals: Array, jacobian: Array, fre
     blind = np.linalg.qr((blind @ basis.T / unit).T)[0]
     open_ = np.array([_shifts(blind, e) for e in np.eye(len(loose))], bool) | _vague(problem, q, matrix)
     status = tuple(s or ("not determined" if no else "determined") for s, no in zip(limits, open_, strict=True))
-    effective = sum(_samples(parts) * colours[c].effective_share for c, parts in blocks.items())
+    samples = {c: sum(int(np.isfinite(r).sum()) for r, _ in parts) for c, parts in blocks.items()}
+    effective = sum(n * colours[c].effective_share for c, n in samples.items())
     return Certainty(matrix, status, max(float(effective) - basis.shape[1], 1.0), colours, blind, unit)
 
 
@@ -116,17 +117,9 @@ def _limit(lower: float, upper: float, value: float) -> str:
 
 
 def channel_blocks(problem: Problem, residuals: Array, jacobian: Array) -> dict[str, list[tuple[Array, Array]]]:
-    """Return per channel and run the whitened residual (N,), NaN where missing, and its Jacobian (N, k)."""
-    start, ny = 0, len(problem.outputs)
-    blocks: dict[str, list[tuple[Array, Array]]] = {c: [] for c in problem.outputs}
-    for run, measured, r in zip(problem.runs, problem.measured, problem.unstack(residuals), strict=True):
-        jac = np.zeros((r.size, jacobian.shape[1]))
-        jac[slice(None) if measured.index is None else measured.index] = jacobian[start:start + measured.size]
-        start += measured.size
-        for j, c in enumerate(problem.outputs):
-            if c in run.sigma:
-                blocks[c].append((r[:, j], jac[j::ny]))
-    return blocks
+    """Return per channel and run the whitened residual (N,), NaN where missing, and its Jacobian (N, k), 0 there."""
+    runs = list(zip(problem.runs, problem.unstack(residuals), problem.unstack(jacobian, 0.0), strict=True))
+    return {c: [(r[:, j], jac[:, j]) for run, r, jac in runs if c in run.sigma] for j, c in enumerate(problem.outputs)}
 
 
 def _colours(blocks: Blocks, unknowns: int, method: str) -> dict[str, Colour]:
@@ -149,10 +142,6 @@ def _meat(problem: Problem, jacobian: Array, blocks: Blocks, colours: Mapping[st
     n, unknown = problem.n_outputs, {p.name for p in problem.unknown}
     prior = jacobian[n:n + len(unknown & set(problem.priors))] @ along
     return total + prior.T @ prior
-
-
-def _samples(parts: Sequence[tuple[Array, Array]]) -> int:
-    return int(sum(np.isfinite(r).sum() for r, _ in parts))
 
 
 @dataclass(frozen=True)

@@ -48,26 +48,6 @@ def first_guess(model: Model, runs: Sequence[Experiment], *, loaded: bool = Fals
     return {n: v for n, v in base.items() if v > 0 or n not in BASE}
 
 
-class _Loads(NamedTuple):
-    """The model's torques to be found along with the motor."""
-
-    model: Model
-    loads: tuple[Load, ...]
-
-    def integrals(self, s: Mapping[str, Array], base: Mapping[str, float]) -> list[Array]:
-        """Return the integral over time of each torque along the signals `s`."""
-        if not self.loads:
-            return []
-        along = dict(s) | {"theta": s["theta"] if "theta" in s else integral(s["t"], s["omega"])}
-        return [integral(s["t"], c) for c in columns(self.model, self.loads, along, base).T]
-
-    def split(self, found: dict[str | Load, float], per_ratio: float = 1.0) -> dict[str, float]:
-        """Return the motor's values, and the parameters of the loads."""
-        motor = {n: v for n, v in found.items() if isinstance(n, str)}
-        sizes = {n: v for n, v in found.items() if isinstance(n, Load)}
-        return values(self.loads, sizes, per_ratio) | motor
-
-
 def _read_plainly(run: Experiment, model: Model) -> Experiment:
     """Return the run without a current that is not the motor's, as an effect without a free parameter says."""
     fixed = [e for e in model.effects if e.balance == "sensor" and not any(p.vary for p in e.parameters)]
@@ -100,12 +80,12 @@ def _windowed(t: Array, columns: Sequence[Array], target: Array, windows: int = 
 def _solve(rows: list[tuple[Array, Array]], names: Sequence[str | Load], held: Mapping[Any, float]) -> dict[Any, float]:
     """Non-negative least squares with some coefficients known; zeros of the motor become small positive numbers."""
     a, b = np.vstack([r[0] for r in rows]), np.concatenate([r[1] for r in rows])
-    known = [n in held for n in names]
-    b = b - a[:, known] @ np.array([held[n] for n in names if n in held])
+    known = {n: held[n] for n in names if n in held}
     free = [n for n in names if n not in held]
-    a = a[:, [not k for k in known]]
     if not free:
-        return {n: held[n] for n in names}
+        return known
+    b = b - a[:, [n in held for n in names]] @ np.array([*known.values()])
+    a = a[:, [n not in held for n in names]]
     norms = np.where((norms := np.linalg.norm(a, axis=0)) > 0, norms, 1.0)
     triangle: Array = np.asarray(np.linalg.qr(np.column_stack([a / norms, b]), mode="r"))
     signed = np.array([isinstance(n, Load) and n.signed for n in free])
@@ -113,7 +93,7 @@ def _solve(rows: list[tuple[Array, Array]], names: Sequence[str | Load], held: M
     # A coefficient that comes out as zero starts where its term would carry a thousandth of the right-hand side.
     motor = np.array([isinstance(n, str) for n in free])
     z = np.where(motor, np.maximum(z, FLOOR * np.linalg.norm(b)), z) / norms
-    return {n: held[n] for n in names if n in held} | dict(zip(free, z.tolist(), strict=True))
+    return known | dict(zip(free, z.tolist(), strict=True))
 
 
 def _nonnegative(a: Array, b: Array, signed: NDArray[np.bool_]) -> Array:
@@ -208,37 +188,45 @@ def loads_of(model: Model) -> tuple[Load, ...]:
     return tuple(found)
 
 
-def columns(model: Model, loads: Sequence[Load], signals: Mapping[str, Array], base: Mapping[str, float]) -> Array:
-    """Return the torque against the motion per unit of each load, (N, loads), along `signals` (v, omega, theta, i).
+class _Loads(NamedTuple):
+    """The model's torques to be found along with the motor."""
 
-    `base` are the values of the base parameters; those of effects are taken at their null, shapes as they are.
-    """
-    system = model.system(("omega",))
-    zero = np.zeros(len(signals["v"]))
-    x = np.vstack([signals.get(n, zero) for n in system.states])
-    u = np.vstack([signals["theta" if n == "theta_in" else n] for n in system.inputs])
-    quiet = {n: base.get(n, p.value if p.null is None else p.null) for n, p in model.parameters.items()}
-    quiet["sgn_width"] = WIDE * float(np.max(np.abs(signals["omega"]), initial=0.0)) or 1.0
+    model: Model
+    loads: tuple[Load, ...]
 
-    def torque(changes: Mapping[str, float]) -> Array:
-        p = np.array([(quiet | dict(changes))[n] for n in system.parameters])
-        return np.asarray(system.balances(x, u, p))[1]
+    def integrals(self, s: Mapping[str, Array], base: Mapping[str, float]) -> list[Array]:
+        """Return the integral over time of the torque against the motion per unit of each load, along the signals `s`.
 
-    silence = torque({})
-    acts = [silence - torque({load.name: 1.0} | ({load.phase: load.angle} if load.phase else {})) for load in loads]
-    found = np.column_stack(acts) if acts else np.empty((len(zero), 0))
-    return np.where(np.isfinite(found).all(axis=0), found, 0.0)  # a unit of what divides by it may be no motor
+        `base` are the values of the base parameters; those of effects are taken at their null, shapes as they are.
+        """
+        if not self.loads:
+            return []
+        system, zero = self.model.system(("omega",)), np.zeros(len(s["v"]))
+        along = {**s, "theta": s["theta"] if "theta" in s else integral(s["t"], s["omega"])}
+        x = np.vstack([along.get(n, zero) for n in system.states])
+        u = np.vstack([along["theta" if n == "theta_in" else n] for n in system.inputs])
+        quiet = {n: base.get(n, p.value if p.null is None else p.null) for n, p in self.model.parameters.items()}
+        quiet["sgn_width"] = WIDE * float(np.max(np.abs(s["omega"]), initial=0.0)) or 1.0
 
+        def torque(changes: Mapping[str, float]) -> Array:
+            p = np.array([{**quiet, **changes}[n] for n in system.parameters])
+            return np.asarray(system.balances(x, u, p))[1]
 
-def values(loads: Sequence[Load], sizes: Mapping[Load, float], per_ratio: float = 1.0) -> dict[str, float]:
-    """Return parameter values from the sizes found; `per_ratio` turns the unit of the sizes into torque."""
-    found: dict[str, float] = {}
-    for load in loads:
-        size = sizes[load] * (1.0 if load.ratio else per_ratio)
-        if not load.phase:
-            found[load.name] = size
-        elif load.angle == 0.0:
-            other = sizes[load._replace(angle=np.pi / 2)] * (1.0 if load.ratio else per_ratio)
-            found[load.name] = float(np.hypot(size, other))
-            found[load.phase] = float(np.arctan2(other, size))
-    return {n: v for n, v in found.items() if v != 0.0 or n in {load.phase for load in loads}}
+        silence = torque({})
+        acts = [silence - torque({load.name: 1.0} | ({load.phase: load.angle} if load.phase else {}))
+                for load in self.loads]  # a unit of what divides by it may be no motor
+        return [integral(s["t"], act if np.isfinite(act).all() else zero) for act in acts]
+
+    def split(self, sizes: Mapping[Any, float], per_ratio: float = 1.0) -> dict[str, float]:
+        """Return the motor's values, and the parameters of the loads; `per_ratio` turns their sizes into torques."""
+        found: dict[str, float] = {}
+        for load in self.loads:
+            unit = 1.0 if load.ratio else per_ratio
+            if not load.phase:
+                found[load.name] = sizes[load] * unit
+            elif load.angle == 0.0:
+                size, other = sizes[load] * unit, sizes[load._replace(angle=np.pi / 2)] * unit
+                found |= {load.name: float(np.hypot(size, other)), load.phase: float(np.arctan2(other, size))}
+        phases = {load.phase for load in self.loads}
+        found = {n: v for n, v in found.items() if v != 0.0 or n in phases}
+        return found | {n: v for n, v in sizes.items() if isinstance(n, str)}

@@ -224,7 +224,7 @@ def _with_orders(problem: Problem) -> Problem:
 
 def minimise(problem: Problem, effort: LevenbergMarquardt, callback: Callback = None, *, wide: bool = True) -> Estimate:
     """Minimise the cost from the values of the model: continuation, restarts, reweighting; see `by_continuation`."""
-    found = restore_collapsed(by_continuation(problem, effort, callback, wide=wide), effort, callback)
+    found = restore_collapsed(by_continuation(problem, effort, callback, wide=wide), effort)
     effort = replace(effort, looks=0)
     for k in range(REWEIGHTINGS):
         factors = _reweighted(found)
@@ -232,7 +232,7 @@ def minimise(problem: Problem, effort: LevenbergMarquardt, callback: Callback = 
             break
         begin = found.problem.start_at(found.values) if k else problem
         again = by_continuation(begin.tuned(noise_factors=factors), effort, callback, wide=wide and k == 0)
-        again = restore_collapsed(again, effort, callback)
+        again = restore_collapsed(again, effort)
         found = replace(again, history=found.history + again.history)
     return found
 
@@ -331,19 +331,15 @@ def growth(fit: Fit) -> float:
     ends = set(np.cumsum([len(each) for each in parts])) if fit.window is None else {
         k for k, (a, b) in enumerate(pairwise(runs), 1) if b.t[0] < a.t[-1]}
     problem = problem.refined(problem.start)
-    at = problem.unknowns.point(problem.start)
-    states, slopes = [], []
-    for k, run in enumerate(problem.runs):
-        x0 = problem.unknowns.first_state(at, k)
-        moved = problem.integrator.run(problem.system, run.grid, x0, at.p, np.eye(len(x0)),
-                                       np.zeros((len(at.p), len(x0))))
-        assert moved.dx is not None
-        states.append(moved.x)
-        slopes.append(moved.dx[-1])
-    size = np.sqrt(np.mean(np.concatenate(states) ** 2, axis=0)) + 1e-300
-    worst, through = 1.0, np.eye(len(size))
-    for k, slope in enumerate(slopes, 1):
-        through = (slope * size / size[:, None]) @ through
+    at, one = problem.unknowns.point(problem.start), np.eye(len(problem.system.states))
+    along = one, np.zeros((len(at.p), len(one)))  # derivatives by the first state, at fixed parameters
+    starts = [problem.unknowns.first_state(at, k) for k in range(len(problem.runs))]
+    walks: list[Any] = [problem.integrator.run(problem.system, run.grid, x0, at.p, *along)
+                        for run, x0 in zip(problem.runs, starts, strict=True)]
+    size = np.sqrt(np.mean(np.concatenate([walk.x for walk in walks]) ** 2, axis=0)) + 1e-300
+    worst, through = 1.0, one
+    for k, walk in enumerate(walks, 1):
+        through = (walk.dx[-1] * size / size[:, None]) @ through
         worst = max(worst, float(np.linalg.norm(through, 2)))
-        through = np.eye(len(size)) if k in ends else through
+        through = one if k in ends else through
     return worst

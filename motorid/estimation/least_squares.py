@@ -81,9 +81,14 @@ def least_squares(problem: Problem, effort: LevenbergMarquardt, callback: Callba
 
 
 def start_cost(problem: Problem, refine: bool = True) -> float:
-    """Return the cost at the values of the model, at sub-steps that suit them or as they are; infinite for none."""
+    """Return the cost at the values of the model; see `cost_at`."""
+    return cost_at(problem, problem.start, refine)
+
+
+def cost_at(problem: Problem, q: Array, refine: bool = False) -> float:
+    """Return the cost at `q`, at sub-steps that suit it or as they are; infinite where it cannot be simulated."""
     try:
-        r = (problem.refined(problem.start) if refine else problem).residual(problem.start)
+        r = (problem.refined(q) if refine else problem).residual(q)
     except SimulationError:
         return np.inf
     return 0.5 * float(r @ r) if np.isfinite(r).all() else np.inf

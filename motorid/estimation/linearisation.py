@@ -34,12 +34,7 @@ class Response:
     states: dict[str, Array]
 
     def driven(self, pushes: Array) -> Array:
-        """Return the outputs, (N, ny, m), to m histories of pushes on the states at the end of each sample.
-
-        Parameters
-        ----------
-        pushes : ndarray, shape (m, N-1, nx)
-        """
+        """Return the outputs (N, ny, m) to m histories of `pushes` (m, N-1, nx) on the states at each sample's end."""
         m, n, nx = pushes.shape
         right = np.zeros((m, n + 1, nx))
         right[:, 1:] = pushes
@@ -47,12 +42,7 @@ class Response:
         return np.einsum("nyx,mnx->nym", self.c, solved, optimize=True)
 
     def pulled(self, weights: Array) -> Array:
-        """Return by how much a push on each state at the end of each sample, (N-1, nx), moves the weighted outputs.
-
-        Parameters
-        ----------
-        weights : ndarray, shape (N, ny)
-        """
+        """Return by how much a push on each state at each sample's end (N-1, nx) moves outputs of `weights` (N, ny)."""
         right = np.einsum("nyx,ny->nx", self.c, weights)
         return self._solved(right.reshape(-1, 1), trans="T").reshape(right.shape)[1:]
 
@@ -159,6 +149,13 @@ SHARED = 0.1  # of the largest share in a combination that is worth a name
 INSEPARABLE = 1e-3  # share of an effect's answer that the fitted parameters do not make up together
 
 
+def column_space(columns: Array) -> Array:
+    """Return an orthonormal basis (n, r) of what `columns` (n, k) span, singular directions left out."""
+    q, triangle = np.linalg.qr(columns)
+    u, s, _ = np.linalg.svd(triangle)
+    return q @ u[:, s > 1e-7 * max(s.max(initial=0.0), 1e-300)]
+
+
 class Explained(NamedTuple):
     """Share of chi² explained, the coefficients (k,), and what is left of the residual (n,)."""
 
@@ -182,9 +179,7 @@ class Tangent:
         n = fit.problem.n_outputs
         jac, r = fit.jacobian[:n], fit.residuals[:n]
         norms = np.linalg.norm(jac, axis=0)
-        q, triangle = np.linalg.qr(jac / np.where(norms > 0, norms, 1.0))
-        u, s, _ = np.linalg.svd(triangle)
-        basis = q @ u[:, s > 1e-7 * max(s.max(initial=0.0), 1e-300)]
+        basis = column_space(jac / np.where(norms > 0, norms, 1.0))
         return Tangent(fit, basis, r - basis @ (basis.T @ r), natural_sizes(fit.problem.experiments, fit.values))
 
     @property

@@ -14,6 +14,7 @@ minimum or not. Put back to where it would matter, it comes to its value, or goe
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -54,13 +55,11 @@ def restarted_where_doubtful(found: Estimate, begin: Problem, effort: LevenbergM
         if not doubtful(found, begin):
             break
         careful = replace(effort, damping=restart.damping)
-        try:
+        with suppress(*FAILURES):
             start = _shifted(begin, restart.shift, k) if restart.shift else begin
             start = _by_other_weights(start, careful) if restart.other_weights else start
             again = least_squares(start, careful, callback)
-        except FAILURES:
-            continue
-        found = replace(min(found, again, key=lambda e: e.cost), history=found.history + again.history)
+            found = replace(min(found, again, key=lambda e: e.cost), history=found.history + again.history)
     return found
 
 
@@ -94,7 +93,7 @@ def _by_other_weights(problem: Problem, effort: LevenbergMarquardt) -> Problem:
 
 
 # -- collapsed parameters --------------------------------------------------------------------------------------
-def restore_collapsed(found: Estimate, effort: LevenbergMarquardt, callback: Callback = None) -> Estimate:
+def restore_collapsed(found: Estimate, effort: LevenbergMarquardt) -> Estimate:
     """Return an estimate that collapsed parameters, put back, have led lower, or the same one.
 
     All are put back together first, then one by one.

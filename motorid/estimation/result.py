@@ -182,12 +182,8 @@ class Fit(Shown):
     @cached_property
     def at_bound(self) -> set[str]:
         """Names of the parameters that ended at a limit: their slopes say nothing of what would be beyond."""
-        names = set()
-        for p in self.problem.unknown:
-            value = self.values.get(p.name)
-            if value is not None and (value <= p.lower or value >= p.upper) and np.isfinite(value):
-                names.add(p.name)
-        return names
+        ends = {p.name: (p, self.values[p.name]) for p in self.problem.unknown if p.name in self.values}
+        return {n for n, (p, value) in ends.items() if np.isfinite(value) and not p.lower < value < p.upper}
 
     @property
     def initial(self) -> dict[str, float]:
@@ -233,8 +229,7 @@ class Fit(Shown):
     @property
     def tau_e(self) -> float | None:
         """Electrical time constant L/R, s."""
-        v = self.values
-        return v["L"] / v["R"] if "L" in v else None
+        return self.values["L"] / self.values["R"] if "L" in self.values else None
 
     @property
     def tau_m(self) -> float | None:
@@ -316,13 +311,7 @@ class Fit(Shown):
 
 
 def checked(fit: Any, caller: str) -> Fit:
-    """Return `fit` if it is one; `caller` takes nothing else.
-
-    Raises
-    ------
-    UsageError
-        If it is not.
-    """
+    """Return `fit` if it is one; else `UsageError`: `caller` takes nothing else."""
     if not isinstance(fit, Fit):
         raise UsageError(f"{caller} takes a fit, mi.{caller}(mi.fit(mi.dc_motor(), runs)); got {name_of(fit)}.")
     return fit

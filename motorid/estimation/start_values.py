@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from itertools import product
 
 import numpy as np
@@ -115,21 +115,21 @@ def _shaped(problem: Problem, effect: Effect, asked: Model) -> Problem:
 
     Phases and resonances have side valleys; least squares finds knees, lags and heat capacities by itself.
     """
-    shapes = list(_shapes(problem, effect, asked))
+    shapes = _shapes(problem, effect, asked)
     if len(shapes) < 2:
         return problem
     best = race([problem.start_at(s) for s in shapes], LOOK)
     return problem if best is None else problem.start_at(best.values)
 
 
-def _shapes(problem: Problem, effect: Effect, asked: Model) -> Iterator[dict[str, float]]:
+def _shapes(problem: Problem, effect: Effect, asked: Model) -> list[dict[str, float]]:
     sizes = natural_sizes(problem.experiments, problem.model.values)
     axes = []
     for p in _untouched(asked, effect):
         if (p.vary and (p.periodic or p.unit == RESONANCE)) or (not p.vary and len(p.grid) > 1):  # or a choice of kinds
             values = PHASES if p.periodic else [g * sizes.get(p.unit, 1.0) for g in p.grid]
             axes.append([(p.name, float(np.clip(v, p.lower, p.upper))) for v in values])
-    return (dict(choice) for choice in product(*axes)) if axes else iter(())
+    return [dict(choice) for choice in product(*axes)]
 
 
 # -- simpler models --------------------------------------------------------------------------------------------

@@ -13,13 +13,7 @@ ENGINES = {"rosenbrock": Rosenbrock, "cvodes": Cvodes, "idas": Idas}
 
 
 def engine_of(engine: str | Engine) -> Engine:
-    """Return the engine of that name, or the engine itself.
-
-    Raises
-    ------
-    UsageError
-        If the name is not known.
-    """
+    """Return the engine of that name, or the engine itself; UsageError if the name is not known."""
     if isinstance(engine, str):
         if engine not in ENGINES:
             raise UsageError(one_of(engine, ENGINES, "engine"))

@@ -6,7 +6,6 @@ nothing is compiled again for another run length, number of sub-steps or set of 
 
 from __future__ import annotations
 
-import contextlib
 import ctypes
 import hashlib
 import os
@@ -16,6 +15,7 @@ import stat
 import subprocess
 import sys
 import tempfile
+from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -157,7 +157,7 @@ def cache_dir() -> Path | None:
         return _without(f"cannot compile into {folder}: others can write there (chmod go-w, or name another one with "
                         "MOTORID_CACHE)")
     if own.st_mode & 0o077:  # made by an older version, or by hand
-        with contextlib.suppress(OSError):
+        with suppress(OSError):
             folder.chmod(0o700)
     return folder
 
@@ -169,13 +169,10 @@ def compiler() -> tuple[str, str] | None:
     if wanted == "none" or sys.platform == "win32":
         return None
     for name in (wanted,) if wanted else ("cc", "gcc", "clang"):
-        path = shutil.which(name)
-        if path:
-            try:
+        if path := shutil.which(name):
+            with suppress(OSError, subprocess.SubprocessError):
                 done = subprocess.run([path, "--version"], capture_output=True, text=True, timeout=20, check=True)
-            except (OSError, subprocess.SubprocessError):
-                continue
-            return path, (done.stdout.splitlines() or [""])[0]
+                return path, (done.stdout.splitlines() or [""])[0]
     return None
 
 
@@ -213,12 +210,10 @@ def find(mark: str) -> Path | None:
     """
     folder = cache_dir()
     for path in folder.glob(f"{mark}-*.so") if folder else ():
-        try:
+        with suppress(OSError):
             if path.stem == f"{mark}-{_digest(path.read_bytes())}":
                 return path
             path.unlink(missing_ok=True)
-        except OSError:
-            continue
     return None
 
 

@@ -117,7 +117,7 @@ class Stepper:
     """One system's step, in the virtual machine first and compiled when it pays."""
 
     def __init__(self, system: System, key: str) -> None:
-        self.key = key
+        self.system, self.key = system, key
         self.functions: StepFunctions = step_functions(system)
         self.machine = Machine(self.functions)
         self.nx, _, _, self.ny = system.sizes
@@ -209,26 +209,19 @@ def content_key(system: System) -> str:
     return hashlib.sha256(text.encode("utf-8", "surrogateescape")).hexdigest()
 
 
-_steppers: dict[int, tuple[System, Stepper]] = {}
-
-
 @lru_cache(maxsize=512)
 def _stepper_of_content(key: str) -> list[Stepper]:
     return []
 
 
+@lru_cache(maxsize=1024)
 def stepper(system: System) -> Stepper:
     """Return the stepper of `system`, one per content in this process."""
-    known = _steppers.get(id(system))
-    if known is None or known[0] is not system:
-        key = content_key(system)
-        slot = _stepper_of_content(key)
-        if not slot:
-            slot.append(Stepper(system, key))
-        if len(_steppers) > 1024:
-            _steppers.clear()
-        known = _steppers[id(system)] = (system, slot[0])
-    return known[1]
+    key = content_key(system)
+    slot = _stepper_of_content(key)
+    if not slot:
+        slot.append(Stepper(system, key))
+    return slot[0]
 
 
 CHUNK = 256

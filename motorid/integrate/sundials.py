@@ -20,7 +20,7 @@ import numpy as np
 
 from motorid.errors import ModelError, SimulationError, positive
 from motorid.integrate.engine import Grid, Trajectory
-from motorid.integrate.rosenbrock import Rosenbrock, stepper
+from motorid.integrate.rosenbrock import Rosenbrock, Stepper, stepper
 from motorid.model.equations import System
 from motorid.numerics.signals import Array
 
@@ -43,7 +43,6 @@ class _Sundials:
     def run(self, system: System, grid: Grid, x0: Array, p: Array, dx0: Array | None = None,
             dp: Array | None = None) -> Trajectory:
         """See `Engine.run`."""
-        self._check(system)
         nx, nq = len(system.states), 0 if dp is None else dp.shape[1]
         n = len(grid.t)
         scale = _state_scale(system, grid, x0, p)
@@ -51,11 +50,9 @@ class _Sundials:
         x[0] = x0
         if nq:
             dx[0] = dx0
-        integrators = _integrators(self.name, self.rtol, self.atol, stepper(system).key, nq)
-        if not integrators:
-            integrators.append(_Integrators(self.name, self.rtol, self.atol, system, nq))
+        integrators = _integrators(self.name, self.rtol, self.atol, stepper(system), nq)
         for first, count in _pieces(grid):
-            self._walk(integrators[0], grid, first, count, x, dx, p, dp, scale)
+            self._walk(integrators, grid, first, count, x, dx, p, dp, scale)
         y, dy = stepper(system).machine.observe(grid, x, dx if nq else None, p, dp)
         return Trajectory(y, dy, x, dx if nq else None, None)
 
@@ -80,9 +77,6 @@ class _Sundials:
         """See `Engine.prepare`; these engines choose their own steps."""
         return grid
 
-    def _check(self, system: System) -> None:
-        return
-
 
 @dataclass(frozen=True)
 class Cvodes(_Sundials):
@@ -94,11 +88,6 @@ class Cvodes(_Sundials):
     """
 
     name = "cvodes"
-
-    def _check(self, system: System) -> None:
-        if not all(system.stored):
-            raise ModelError("cvodes integrates differential equations only, and this model has an algebraic "
-                             "balance (no inductance). Use engine='idas' or engine='rosenbrock'.")
 
 
 @dataclass(frozen=True)
@@ -116,14 +105,18 @@ class Idas(_Sundials):
 class _Integrators:
     """Integrators of one system over 2^k steps of length h, made when first needed."""
 
-    def __init__(self, plugin: str, rtol: float, atol: float, system: System, nq: int) -> None:
+    def __init__(self, plugin: str, rtol: float, atol: float, step: Stepper, nq: int) -> None:
+        system = step.system
+        if plugin == "cvodes" and not all(system.stored):
+            raise ModelError("cvodes integrates differential equations only, and this model has an algebraic "
+                             "balance (no inductance). Use engine='idas' or engine='rosenbrock'.")
         self.system, self.plugin, self.nq = system, plugin, nq
         # Without second-order correction Newton's matrix is one block for all sensitivities: exact too, faster;
         # CasADi cannot do so with algebraic states.
         self.options = {"reltol": rtol, "abstol": atol, "quad_err_con": True, "max_num_steps": 100000,
                         "second_order_correction": not all(system.stored)}
-        self.made: dict[int, tuple[ca.Function, ca.Function | None]] = {}
         self.stored = np.array(system.stored)
+        self.integrator_of = lru_cache(maxsize=None)(self._integrator)
 
     def _dae(self) -> dict[str, Any]:
         nx, nu, np_, _ = self.system.sizes
@@ -132,55 +125,41 @@ class _Integrators:
         p, u0, u1, h, scale = ca.vertsplit(theta, ends)
         tau = ca.SX.sym("tau")
         f = self.system.rhs(z * scale, u0 + tau * (u1 - u0), p)
-        parts = {True: ([], []), False: ([], [])}
-        for k, stored in enumerate(self.system.stored):
-            parts[stored][0].append(z[k])
-            parts[stored][1].append(f[k] * h / scale[k] if stored else f[k])
-        dae = {"x": ca.vertcat(*parts[True][0]), "ode": ca.vertcat(*parts[True][1]), "p": theta, "t": tau}
-        if parts[False][0]:
-            dae |= {"z": ca.vertcat(*parts[False][0]), "alg": ca.vertcat(*parts[False][1])}
-        return dae
+        differential, algebraic = (np.flatnonzero(kind).tolist() for kind in (self.stored, ~self.stored))
+        dae = {"x": z[differential], "ode": (f * h / scale)[differential], "p": theta, "t": tau}
+        return dae | {"z": z[algebraic], "alg": f[algebraic]} if algebraic else dae
 
     def _integrator(self, count: int) -> tuple[ca.Function, ca.Function | None]:
-        if count not in self.made:
-            # Times are in steps; the slope of a linear input is only used with count = 1.
-            f = ca.integrator(f"walk{count}", self.plugin, self._dae(), 0.0, list(np.arange(1.0, count + 1)),
-                              self.options)
-            self.made[count] = (f, f.forward(self.nq) if self.nq else None)
-        return self.made[count]
+        # Times are in steps; the slope of a linear input is only used with count = 1.
+        f = ca.integrator(f"walk{count}", self.plugin, self._dae(), 0.0, list(np.arange(1.0, count + 1)), self.options)
+        return f, f.forward(self.nq) if self.nq else None
 
     def walk(self, grid: Grid, first: int, count: int, x: Array, dx: Array, p: Array, dp: Array | None,
              scale: Array) -> None:
         """Fill x and dx for `count` intervals from sample `first`."""
         length = next(n for n in LENGTHS if n >= count)
-        main, forward = self._integrator(length)
+        main, forward = self.integrator_of(length)
         h = (grid.t[first + count] - grid.t[first]) / count
         theta = np.concatenate([p, grid.u0[first], grid.u1[first], [h], scale])
-        d, a = self.stored, ~self.stored
+        kinds = {name: which for name, which in (("x", self.stored), ("z", ~self.stored)) if which.any()}
         ks = slice(first + 1, first + count + 1)
-        given = {"x0": x[first, d] / scale[d], "p": theta}
-        if a.any():
-            given["z0"] = x[first, a] / scale[a]
+        given = {f"{name}0": x[first, which] / scale[which] for name, which in kinds.items()} | {"p": theta}
         res = main(**given)
-        x[ks][:, d] = np.asarray(res["xf"]).T[:count] * scale[d]
-        if a.any():
-            x[ks][:, a] = np.asarray(res["zf"]).T[:count] * scale[a]
+        for name, which in kinds.items():
+            x[ks][:, which] = np.asarray(res[f"{name}f"]).T[:count] * scale[which]
         if forward is None or dp is None:
             return
         seeds = np.zeros((theta.size, self.nq))
         seeds[:len(p)] = dp
         given |= {f"out_{k}": res[k] for k in ("xf", "zf")}
-        given |= {"fwd_x0": dx[first][d] / scale[d][:, None], "fwd_p": seeds}
+        given |= {"fwd_x0": dx[first][self.stored] / scale[self.stored][:, None], "fwd_p": seeds}
         sens = forward(**given)
-        for which, key in ((d, "fwd_xf"), (a, "fwd_zf")):
-            if which.any():
-                raw = np.asarray(sens[key]).reshape(which.sum(), self.nq, length)[:, :, :count]
-                dx[ks][:, which, :] = raw.transpose(2, 0, 1) * scale[which][None, :, None]
+        for name, which in kinds.items():
+            raw = np.asarray(sens[f"fwd_{name}f"]).reshape(which.sum(), self.nq, length)[:, :, :count]
+            dx[ks][:, which, :] = raw.transpose(2, 0, 1) * scale[which][None, :, None]
 
 
-@lru_cache(maxsize=64)
-def _integrators(plugin: str, rtol: float, atol: float, key: str, nq: int) -> list[_Integrators]:
-    return []
+_integrators = lru_cache(maxsize=64)(_Integrators)
 
 
 def _pieces(grid: Grid) -> Iterator[tuple[int, int]]:

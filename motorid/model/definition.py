@@ -6,6 +6,7 @@ import importlib
 import inspect
 import re
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -200,10 +201,8 @@ def _restore_effect(place: tuple[str, str] | None, name: str, parameters: tuple[
                     doc: str, includes: tuple[str, ...]) -> Effect:
     law = None
     if place is not None:
-        try:
+        with suppress(ImportError, AttributeError):
             law = getattr(importlib.import_module(place[0]), place[1]).law
-        except (ImportError, AttributeError):
-            law = None
     return Effect(name, law, parameters, balance, doc, includes)
 
 

@@ -71,7 +71,7 @@ class Equations:
         if name in placeholders:
             return placeholders[name]
         if name == "theta":
-            return self._angle()
+            return self.inputs["theta_in"] + self.zero if "theta_in" in self.inputs else self.angle_state()
         if name.startswith("__"):
             raise AttributeError(name)
         raise self._unknown(name, [*states, "theta", *placeholders, "voltage", "torque"])
@@ -81,11 +81,6 @@ class Equations:
             return ModelError(f"'{self.writer}' needs '{name}', which a torque-driven base lacks: leave "
                               "it out, or use dc_motor() with a record of the applied voltage.")
         return ModelError(f"{self.writer}: {one_of(name, known, 'quantity')}")
-
-    def _angle(self) -> ca.SX:
-        if "theta_in" in self.inputs:
-            return self.inputs["theta_in"] + self.zero
-        return self.angle_state()
 
     def angle_state(self) -> ca.SX:
         """Return the model's own angle, adding ``dθ/dt = ω`` where it is first used."""
@@ -98,7 +93,7 @@ class Equations:
     def sign(self, x: ca.SX) -> ca.SX:
         """Return a smooth sgn(x); the width (rad/s) is chosen from the data, well below the slowest speed."""
         if self.sgn_width is None:
-            self.sgn_width = ca.SX.sym("sgn_width")
+            self.sgn_width = self.symbols.setdefault("sgn_width", ca.SX.sym("sgn_width"))
         return ca.tanh(x * reciprocal(self.sgn_width * self.smoothing))
 
     def measured(self, channel: str) -> ca.SX:
@@ -158,13 +153,7 @@ class Equations:
 
     # -- closing ---------------------------------------------------------------------------------------
     def fill(self, expressions: list[ca.SX]) -> list[ca.SX]:
-        """Return `expressions` with every placeholder replaced by its definition.
-
-        Raises
-        ------
-        ModelError
-            If definitions go in a circle.
-        """
+        """Return `expressions` with placeholders replaced by definitions; ModelError where these go in a circle."""
         names = list(self.placeholders)
         symbols = [self.placeholders[n] for n in names]
         marks = {s.name() for s in symbols}
@@ -284,8 +273,7 @@ def build_system(m: Equations, parameters: tuple[str, ...], outputs: tuple[str, 
     f, y = ca.vertcat(*filled[:n]), ca.vertcat(*filled[n:n + len(shown)])
     x0, balances = ca.vertcat(*filled[n + len(shown):-2]), ca.vertcat(*filled[-2:])
     x, u = ca.vertcat(*m.states.values()), ca.vertcat(*m.inputs.values())
-    p = ca.vertcat(*_symbols(m, parameters))
-    s = ca.vertcat(*m.start.values())
+    p, s = ca.vertcat(*[m.symbols[n] for n in parameters]), ca.vertcat(*m.start.values())
     quiet = ca.substitute(f, d, ca.DM.zeros(2))
     _check_closed(ca.vertcat(quiet, y, balances), ca.vertcat(x, u, p))
     return System(names, tuple(m.inputs), outputs, parameters,
@@ -297,16 +285,8 @@ def build_system(m: Equations, parameters: tuple[str, ...], outputs: tuple[str, 
                   ca.Function("forces", [x, u, p, d], [ca.densify(f)], ["x", "u", "p", "d"], ["f"]))
 
 
-def _symbols(m: Equations, parameters: tuple[str, ...]) -> list[ca.SX]:
-    symbols = dict(m.symbols)
-    if m.sgn_width is not None:
-        symbols["sgn_width"] = m.sgn_width
-    return [symbols.get(n, ca.SX.sym(n)) for n in parameters]
-
-
 def _check_closed(expression: ca.SX, known: ca.SX) -> None:
-    names = {s.name() for s in ca.symvar(known)}
-    stray = sorted({s.name() for s in ca.symvar(expression)} - names)
-    if stray:
+    defined, used = ({s.name() for s in ca.symvar(e)} for e in (known, expression))
+    if stray := sorted(used - defined):
         raise ModelError(f"the model uses {', '.join(stray)}, which nothing defines. Effects may use only "
                          "the sheet m and their own parameters.")

@@ -73,8 +73,7 @@ class Model(Shown):
         added = {p.name: self._in_units(p) for p in other.parameters}
         model = self.with_(effects=(*self.effects, other), parameters={**self.parameters, **added})
         if _smooths(model) and "sgn_width" not in model.parameters:
-            width = replace(SGN_WIDTH, unit="m/s" if self.axis == "linear" else SGN_WIDTH.unit)
-            model = model.with_(parameters={**model.parameters, "sgn_width": width})
+            model = model.with_(parameters={**model.parameters, "sgn_width": self._in_units(SGN_WIDTH)})
         return model
 
     def without(self, name: str) -> Model:
@@ -141,9 +140,8 @@ class Model(Shown):
     @property
     def without_value(self) -> tuple[str, ...]:
         """Names of the motor's parameters that were fixed at the placeholder they have before a fit."""
-        started = {p.name: replace(p, vary=False) for p in BASES[self.base] if p.vary}
-        return tuple(n for n, p in self.parameters.items() if n in started and started[n].value == p.value
-                     and not (p.vary or p.given))
+        started = {p.name: p.value for p in BASES[self.base] if p.vary}
+        return tuple(n for n, p in self.parameters.items() if started.get(n) == p.value and not (p.vary or p.given))
 
     @property
     def shared_names(self) -> tuple[str, ...]:
@@ -217,20 +215,12 @@ class Model(Shown):
         return self._systems[key]
 
     def check_visible(self, outputs: Iterable[str]) -> None:
-        """Refuse an effect of which nothing can be seen in the measured `outputs`.
-
-        Raises
-        ------
-        ModelError
-        """
+        """Refuse, by a `ModelError`, an effect of which nothing can be seen in the measured `outputs`."""
         system = self.system(outputs)
         for e in self.effects:
             if e.parameters and not any(p.name in system.visible for p in e.parameters):
                 raise ModelError(f"'{e.name}' cannot be seen in the measured channels ({', '.join(system.outputs)}). "
                                  f"Leave it out: model.without('{e.name}'), or add a record of its channel.")
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {f: getattr(self, f) for f in self.__dataclass_fields__}
 
     def card(self) -> Card:
         """Return the parameters, whether a fit varies them, and where they come from."""
@@ -257,13 +247,7 @@ def _structure(model: Model) -> tuple[Any, ...]:
 
 
 def _smooths(model: Model) -> bool:
-    """Tell whether an effect uses a smooth sgn.
-
-    Raises
-    ------
-    ModelError
-        If the effects contradict one another.
-    """
+    """Tell whether an effect uses a smooth sgn; ModelError if the effects contradict one another."""
     slot = _known_of(_structure(model))
     if not slot:
         slot.append(model.write().sgn_width is not None)
@@ -306,8 +290,7 @@ def dc_motor(**values: float) -> Model:
     >>> mi.dc_motor(R=1.3)
     <model dc_motor: R, L, K, b, J>
     """
-    model = Model("dc_motor", parameters={p.name: p for p in BASES["dc_motor"]})
-    return model.replace(**values)
+    return Model("dc_motor", parameters={p.name: p for p in BASES["dc_motor"]}).replace(**values)
 
 
 def torque_driven(axis: str = "rotary", **values: float) -> Model:

@@ -50,14 +50,9 @@ class Colour:
 
 
 def colour_of(parts: Sequence[Array], spent: float = 0.0) -> Colour:
-    """Return the autoregression of residuals.
+    """Return the autoregression of residuals, one (N,) per run, NaN where missing.
 
-    Parameters
-    ----------
-    parts : sequence of ndarray
-        One per run, NaN where missing.
-    spent : float
-        Degrees of freedom used up by the fit; they enlarge the variance.
+    The degrees of freedom `spent` by the fit enlarge the variance.
     """
     counts = [int(np.isfinite(p).sum()) for p in parts]
     n = sum(counts)

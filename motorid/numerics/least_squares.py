@@ -93,7 +93,7 @@ class Huber:
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """Where the solver ended: q, residual, jac (in q), status, message, history of costs, evaluations.
+    """Where the solver ended: q, residual, jac (in q), status, message, history of costs.
 
     jac is that of the last step but one where the last one changed next to nothing.
     `status` is ``"converged"``, ``"stalled"`` (no step lowers the cost) or ``"limit"`` (of iterations).
@@ -105,7 +105,6 @@ class Solution:
     status: str
     message: str
     history: tuple[float, ...]
-    evaluations: int
 
 
 MESSAGES = {
@@ -166,7 +165,7 @@ def levenberg_marquardt(residual: Callable[[Array], Array], both: Callable[[Arra
     reason = status or ("valley" if _crawls(history, o.ftol) else "limit")
     ends = {"valley": "stalled", "stalled": "stalled", "limit": "limit"}
     return Solution(search.q, search.r, search.jac, ends.get(reason, "converged"),
-                    MESSAGES[reason].format(o.max_iterations), tuple(history), search.evaluations)
+                    MESSAGES[reason].format(o.max_iterations), tuple(history))
 
 
 def _crawls(history: list[float], ftol: float) -> bool:
@@ -183,7 +182,7 @@ class _Search:
         self.low, self.high = bounds if bounds is not None else (np.full(n, -np.inf), np.full(n, np.inf))
         self.log = np.zeros(n, bool) if log is None else np.asarray(log, bool)
         self.q = np.clip(q0, self.low, self.high)
-        self.lam, self.growth, self.evaluations = options.damping, 2.0, 0
+        self.lam, self.growth = options.damping, 2.0
         self.size = np.zeros(n)
         try:
             self._move(self.q)
@@ -196,7 +195,6 @@ class _Search:
         self.q, self.cost = q, 0.5 * float(self.r @ self.r)
         self.gradient = self.jac.T @ self.r
         self.size = np.maximum(self.size, np.sqrt(np.einsum("ij,ij->j", self.jac, self.jac)))
-        self.evaluations += 1
 
     def step(self) -> str:
         """Take one step that lowers the cost; return why the descent ends here, or an empty string."""
@@ -219,7 +217,6 @@ class _Search:
             small = bool(np.max(np.abs(step) / (np.abs(self.q) + 1.0)) < o.xtol)
             r, cost = _cost(self.residual, self.q + step)
             drop = self.cost - cost
-            self.evaluations += 1
             gain = drop / predicted if predicted > 0 else -1.0
             if drop > 0 and gain > 1e-4:
                 break

@@ -24,13 +24,15 @@ from concurrent.futures import ProcessPoolExecutor
 from contextlib import AbstractContextManager, ContextDecorator, contextmanager, suppress
 from contextvars import ContextVar
 from dataclasses import dataclass, field
-from functools import lru_cache, partial
+from functools import lru_cache
 from importlib.util import find_spec
 from typing import Any, NamedTuple
 
 from motorid.errors import OutOfTime, UsageError
 
 Map = Callable[..., Iterable[Any]]
+# Those of this system; the alarm repeats Ctrl-C.
+SIGNALS = [getattr(signal, n) for n in ("SIGINT", "SIGALRM", "SIGTERM", "SIGHUP") if hasattr(signal, n)]
 WAVE = 4e6  # bytes of records handed to a pool at once; two waves are under way
 MOST_TASKS = 64  # when many small pieces go to a pool together: few enough to ship, many enough to share out
 
@@ -81,12 +83,7 @@ def budget(seconds: float | None) -> Iterator[None]:
 
 
 def check_time() -> None:
-    """Raise `OutOfTime` if the budget around this call is spent; called once an iteration by whatever takes long.
-
-    Raises
-    ------
-    OutOfTime
-    """
+    """Raise `OutOfTime` if the budget around this call is spent; called once an iteration by whatever takes long."""
     if time.monotonic() > _deadline.get():
         raise OutOfTime
 
@@ -111,9 +108,8 @@ class Interruption:
 
     def listen(self) -> None:
         """Take over Ctrl-C, and what ends a process politely where that is not ignored (``nohup``)."""
-        for name in ("SIGINT", "SIGALRM", "SIGTERM", "SIGHUP"):
-            number = getattr(signal, name, None)
-            if number and (name == "SIGINT" or signal.getsignal(number) is not signal.SIG_IGN):
+        for number in SIGNALS:
+            if number == signal.SIGINT or signal.getsignal(number) is not signal.SIG_IGN:
                 signal.signal(number, self._raise)
 
     def over(self) -> None:
@@ -121,8 +117,8 @@ class Interruption:
         for stream in (sys.stdout, sys.stderr):
             with suppress(OSError, ValueError):
                 stream.flush()
-        for name in {"SIGINT", "SIGALRM", "SIGTERM", "SIGHUP"} & set(dir(signal)):  # the alarm repeats Ctrl-C
-            signal.signal(getattr(signal, name), signal.SIG_IGN)
+        for number in SIGNALS:
+            signal.signal(number, signal.SIG_IGN)
 
     def behind(self, error: BaseException) -> bool:
         """Tell whether Ctrl-C is what an exception comes from."""
@@ -173,11 +169,6 @@ def processes(jobs: int) -> Iterator[Map | None]:
             pool.shutdown(wait=not interruption.told, cancel_futures=True)
 
 
-def _on_one_thread(function: Callable[[Any], Any], task: Any) -> Any:
-    with one_thread:  # for its linear algebra, in whatever process it runs
-        return function(task)
-
-
 @dataclass(frozen=True)
 class Parcel:
     """An object pickled once; a process that gets it many times unpacks it once.
@@ -204,6 +195,14 @@ def _opened(parcel: Parcel) -> Any:
     return pickle.loads(parcel.data)
 
 
+class Task(NamedTuple):
+    """What a pool is handed: a function, and what it is applied to."""
+
+    shared: Parcel
+    items: Parcel
+    function: Callable[[Any, Any], Any]
+
+
 class Done(NamedTuple):
     """Results in the order of the tasks, and why there are not all of them (empty if there are)."""
 
@@ -211,24 +210,29 @@ class Done(NamedTuple):
     interrupted: str
 
 
-def run_tasks(function: Callable[[Any], Any], tasks: Sequence[Any], map: Map | None, text: str, *,
+def map_items(function: Callable[[Any, Any], Any], shared: Any, items: Sequence[Any], map: Map | None, text: str, *,
               quiet: bool = False, each: Callable[[Any], object] | None = None) -> Done:
-    """Return ``[function(task) for task in tasks]`` by way of `map`, with a progress bar that says `text`.
+    """Return ``[function(shared, item) for item in items]`` by way of `map`, with a progress bar that says `text`.
 
-    `function` stands at a module's top level and returns failures instead of raising them; `each` is called with every
-    result as it comes. An interruption (Ctrl-C) keeps what is done. If the pool breaks, for instance because a worker
-    was killed, the rest is done in this process: that costs time, not results.
+    `function` stands at a module's top level and returns failures instead of raising them. `shared` travels once per
+    process, small items travel in chunks; `each` is called with every result as it comes. An interruption (Ctrl-C)
+    keeps what is done. If the pool breaks, for instance because a worker was killed, the rest is done in this process:
+    that costs time, not results.
     """
+    parcel = Parcel.of(shared)
+    tasks = [Task(parcel, Parcel.of(chunk), function) for chunk in _in_chunks(items, map)]
     results: list[Any] = []
-    function = partial(_on_one_thread, function)
+    done = 0
     with progress(text, total=len(tasks), quiet=quiet) as advance:
         try:
             for way in ([map] if map is not None else []) + [builtins.map]:
                 try:
-                    for result in _in_waves(way, function, tasks[len(results):]):
-                        results.append(result)
+                    for chunk in _in_waves(way, tasks[done:]):
+                        results += chunk
+                        done += 1
                         if each is not None:
-                            each(result)
+                            for result in chunk:
+                                each(result)
                         advance()
                     break
                 except Exception as error:
@@ -237,70 +241,46 @@ def run_tasks(function: Callable[[Any], Any], tasks: Sequence[Any], map: Map | N
                     if way is builtins.map:
                         raise
                     print(f"motorid: the pool failed ({error!r}); doing "
-                          f"the remaining {len(tasks) - len(results)} of {len(tasks)} tasks in this process.",
-                          file=sys.stderr)
+                          f"the remaining {len(tasks) - done} of {len(tasks)} tasks in this process.", file=sys.stderr)
         except KeyboardInterrupt:
             interruption.heard()
-            return Done(results, f"interrupted after {len(results)} of {len(tasks)}")
+            return Done(results, f"interrupted after {len(results)} of {len(items)}")
     return Done(results, "")
 
 
-def _in_waves(way: Map, function: Callable[[Any], Any], tasks: Sequence[Any]) -> Iterator[Any]:
-    """Yield the results in order, handing over the tasks in waves so that a pool need not hold all records."""
-    under_way: deque[Iterator[Any]] = deque()
-    for wave in _waves(tasks):
-        under_way.append(iter(way(function, wave)))
-        if len(under_way) > 1:
-            yield from under_way.popleft()
-    while under_way:
-        yield from under_way.popleft()
-
-
-def _waves(tasks: Sequence[Any]) -> Iterator[list[Any]]:
-    wave: list[Any] = []
-    shipped: set[str] = set()
-    size = 0
-    for task in tasks:
-        wave.append(task)
-        for part in task if isinstance(task, tuple) else (task,):
-            if isinstance(part, Parcel) and part.key not in shipped:
-                shipped.add(part.key)
-                size += len(part.data)
-        if size > WAVE:
-            yield wave
-            wave, shipped, size = [], set(), 0
-    if wave:
-        yield wave
-
-
-def map_items(function: Callable[[Any, Any], Any], shared: Any, items: Sequence[Any], map: Map | None, text: str, *,
-              quiet: bool = False, each: Callable[[Any], object] | None = None) -> Done:
-    """Return ``[function(shared, item) for item in items]`` by way of `map`: small items travel in chunks.
-
-    `shared` travels once per process. The other parameters are those of `run_tasks`; `each` is called per item.
-    """
-    parcel = Parcel.of(shared)
-    tasks = [(parcel, Parcel.of(chunk), function) for chunk in _in_chunks(items, map)]
-
-    def for_each(results: list[Any]) -> None:
-        for result in results:
-            if each is not None:
-                each(result)
-
-    done = run_tasks(_apply, tasks, map, text, quiet=quiet, each=for_each)
-    results = [result for chunk in done.results for result in chunk]
-    return Done(results, f"interrupted after {len(results)} of {len(items)}" if done.interrupted else "")
-
-
-def _apply(task: tuple[Parcel, Parcel, Callable[[Any, Any], Any]]) -> list[Any]:
-    shared, items, function = task
-    return [function(shared.open(), item) for item in items.open()]
+def _apply(task: Task) -> list[Any]:
+    with one_thread:  # for its linear algebra, in whatever process it runs
+        return [task.function(task.shared.open(), item) for item in task.items.open()]
 
 
 def _in_chunks(items: Sequence[Any], map: Map | None) -> list[Sequence[Any]]:
     """Cut `items` into pieces: single ones for the built-in map, at most `MOST_TASKS` for a pool."""
     size = 1 if map is None or map is builtins.map else max(-(-len(items) // MOST_TASKS), 1)
     return [items[k:k + size] for k in range(0, len(items), size)]
+
+
+def _in_waves(way: Map, tasks: Sequence[Task]) -> Iterator[list[Any]]:
+    """Yield the results in order, handing over the tasks in waves so that a pool need not hold all records."""
+    under_way: deque[Iterator[list[Any]]] = deque()
+    for wave in _waves(tasks):
+        under_way.append(iter(way(_apply, wave)))
+        if len(under_way) > 1:
+            yield from under_way.popleft()
+    while under_way:
+        yield from under_way.popleft()
+
+
+def _waves(tasks: Sequence[Task]) -> Iterator[list[Task]]:
+    wave: list[Task] = []
+    size = 0
+    for task in tasks:
+        size += len(task.items.data) + (0 if wave else len(task.shared.data))
+        wave.append(task)
+        if size > WAVE:
+            yield wave
+            wave, size = [], 0
+    if wave:
+        yield wave
 
 
 _outer: ContextVar[Callable[..., None] | None] = ContextVar("motorid_progress", default=None)

@@ -253,9 +253,8 @@ class Constraint(Relation):
         system = problem.system
 
         def rows(x: ca.SX, u: ca.SX, p: ca.SX, d: ca.SX) -> ca.SX:
-            symbols = {**dict(zip(system.states, ca.vertsplit(x), strict=True)),
-                       **dict(zip(system.inputs, ca.vertsplit(u), strict=True)),
-                       **dict(zip(system.parameters, ca.vertsplit(p), strict=True))}
+            named = (system.states, x), (system.inputs, u), (system.parameters, p)
+            symbols = {n: s for names, v in named for n, s in zip(names, ca.vertsplit(v), strict=True)}
             try:
                 return ca.SX(self.expression(SimpleNamespace(**symbols))) / self.size
             except AttributeError as error:

@@ -14,7 +14,6 @@ from motorid.integrate import ENGINES
 from motorid.model.definition import Effect
 from motorid.model.model import Model, dc_motor, torque_driven
 from motorid.numerics.least_squares import Huber
-from motorid.numerics.signals import Array
 from motorid.problem.constraints import CurrentLimit, SteadyState
 from motorid.problem.problem import Problem
 from motorid.problem.runs import Run, prepare_run
@@ -73,15 +72,11 @@ def _run_of(problem: Problem, record: Experiment, data: Mapping[str, Any]) -> Ru
     run = prepare_run(record, problem.outputs, data["sigma"], problem.system.inputs, "rest")
     limits = {c: (-np.inf if low is None else low, np.inf if high is None else high)
               for c, (low, high) in data["limits"].items()}
-    return replace(run, grid=run.grid.with_substeps(steps), sigma=dict(data["sigma"]), limits=limits,
-                   start=_numbers(data["start"], 3), apart=dict(data["apart"]))
-
-
-def _numbers(values: Any, n: int) -> Array:
-    found = np.array(values, float)
-    if found.shape != (n,):
-        raise ValueError(f"{n} numbers expected, {found.shape} came")
-    return found
+    start = np.array(data["start"], float)
+    if start.shape != (3,):
+        raise ValueError(f"3 numbers expected, {start.shape} came")
+    return replace(run, grid=run.grid.with_substeps(steps), sigma=dict(data["sigma"]), limits=limits, start=start,
+                   apart=dict(data["apart"]))
 
 
 def _options(given: Any) -> Any:

@@ -71,13 +71,10 @@ class Problem:
     _runs: tuple[Run, ...] | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
-        runs = self.experiments
-        if isinstance(runs, Experiment):
-            runs = (runs,)
-        object.__setattr__(self, "experiments", tuple(runs))
-        if not self.experiments or not all(isinstance(r, Experiment) for r in self.experiments):
+        runs = (self.experiments,) if isinstance(self.experiments, Experiment) else tuple(self.experiments)
+        if not runs or not all(isinstance(r, Experiment) for r in runs):
             raise UsageError("a problem needs at least one Experiment: runs = mi.read_runs('run*.csv').")
-        object.__setattr__(self, "experiments", tuple(_without_empty(r) for r in self.experiments))
+        object.__setattr__(self, "experiments", tuple(_without_empty(r) for r in runs))
         if self.weights not in ("noise", "rms"):
             raise UsageError(one_of(self.weights, ("noise", "rms"), "weights"))
         if not self.outputs:
@@ -238,19 +235,14 @@ class Problem:
         """Return whitened residual and Jacobian, before the loss, of run `k`, without missing samples."""
         return self.measured[k].residual(traj)
 
-    def unstack(self, residual: Array) -> list[Array]:
-        """Return a stacked output residual as one (N, ny) per run, NaN where missing."""
+    def unstack(self, rows: Array, missing: float = np.nan) -> list[Array]:
+        """Return stacked rows (n, …) of the outputs as (N, ny, …) per run, `missing` where there was no sample."""
         ends = np.cumsum([m.size for m in self.measured])
-        parts = np.split(residual[:ends[-1]], ends[:-1])
-        return [m.unstack(part) for m, part in zip(self.measured, parts, strict=True)]
+        parts = np.split(rows[:ends[-1]], ends[:-1])
+        return [m.unstack(part, missing) for m, part in zip(self.measured, parts, strict=True)]
 
     def residual(self, q: Array) -> Array:
-        """Return the whitened residual: outputs run by run, then priors, then penalties.
-
-        Raises
-        ------
-        SimulationError
-        """
+        """Return the whitened residual: outputs run by run, then priors, then penalties; or raise `SimulationError`."""
         return self._evaluate(q, False)[0]
 
     def jacobian(self, q: Array) -> Array:

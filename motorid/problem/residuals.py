@@ -64,11 +64,11 @@ class Measured(NamedTuple):
         rows = values.reshape(-1, *values.shape[2:])
         return rows if self.index is None else rows[self.index]
 
-    def unstack(self, rows: Array) -> Array:
-        """Return rows (n,) as (N, ny), NaN where missing."""
-        full = np.full(self.y.size, np.nan)
+    def unstack(self, rows: Array, missing: float = np.nan) -> Array:
+        """Return rows (n, …) as (N, ny, …), with `missing` where there was no sample."""
+        full = np.full((self.y.size, *rows.shape[1:]), missing)
         full[slice(None) if self.index is None else self.index] = rows
-        return full.reshape(self.y.shape)
+        return full.reshape(*self.y.shape, *rows.shape[1:])
 
 
 def prior_residual(priors: Mapping[str, tuple[float, float]], unknowns: Unknowns, at: Point) -> tuple[Array, Array]:

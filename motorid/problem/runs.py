@@ -47,11 +47,6 @@ class Run:
     # values of this run's own of parameters that are others in every run
     apart: Mapping[str, float] = field(default_factory=dict)
 
-    @property
-    def estimated(self) -> tuple[str, ...]:
-        """Initial states that are unknowns of the fit."""
-        return tuple(self.limits)
-
 
 def prepare_run(run: Experiment, channels: Sequence[str], noise: Mapping[str, float], inputs: Sequence[str],
                 initial: str) -> Run:
@@ -114,15 +109,9 @@ def _level(run: Experiment, channel: str) -> float:
 
 
 # -- the state at the first sample -----------------------------------------------------------------------
-class InitialState(NamedTuple):
-    """`start` (3,): i, omega, theta at the first sample; `limits`: those to estimate, and how far they go."""
-
-    start: Array
-    limits: dict[str, tuple[float, float]]
-
-
-def initial_state(run: Experiment, sigma: Mapping[str, float], initial: str) -> InitialState:
-    """Return the state at the first sample, and which parts of it are to be estimated.
+def initial_state(run: Experiment, sigma: Mapping[str, float],
+                  initial: str) -> tuple[Array, dict[str, tuple[float, float]]]:
+    """Return i, omega, theta (3,) at the first sample, and between which limits some of them are to be estimated.
 
     ``auto``: known zeros where nothing moves yet, otherwise estimated; a measured angle is estimated too: its first
     sample is as noisy as any, and half a count of the finest encoder shows over a long run. Estimates stay within what
@@ -154,11 +143,11 @@ def initial_state(run: Experiment, sigma: Mapping[str, float], initial: str) -> 
     if "i" not in run.outputs and not known:
         reach["i"] = np.inf  # to assume none would be a measurement that was never made
     if initial in ("rest", "measured"):
-        reach = {}
-    free = initial == "estimate"
+        return start, {}
+    if initial == "estimate":
+        return start, dict.fromkeys(reach, (-np.inf, np.inf))
     places = {c: start[CHANNELS.index(c)] for c in reach}
-    return InitialState(start, {c: (-np.inf, np.inf) if free else (x - reach[c], x + reach[c])
-                                for c, x in places.items()})
+    return start, {c: (x - reach[c], x + reach[c]) for c, x in places.items()}
 
 
 def at_rest(run: Experiment, sigma: Mapping[str, float]) -> tuple[bool, int]:
@@ -278,11 +267,9 @@ def natural_sizes(runs: Sequence[Experiment], values: Mapping[str, float]) -> di
     span = max((s.span for s in seen if s.span is not None), default=1.0)
     sizes = {"V": volt, "A": ampere, "rad/s": speed, "m/s": speed, "N·m": torque, "N": torque, "s": second,
              "Ω": volt / ampere, "1/s": 1 / second, "m": 0.01 * span,
-             "K/W": 30 / max(power, 1e-9), "J/K": max(power * duration, 1e-9) / 30}
-    for unit in ("N·m·s/rad", "N·s/m"):
-        sizes[unit] = torque / speed
-    for unit in ("N·m·s²/rad²", "N·s²/m²"):
-        sizes[unit] = torque / speed**2
+             "K/W": 30 / max(power, 1e-9), "J/K": max(power * duration, 1e-9) / 30,
+             **dict.fromkeys(("N·m·s/rad", "N·s/m"), torque / speed),
+             **dict.fromkeys(("N·m·s²/rad²", "N·s²/m²"), torque / speed**2)}
     return {k: v if np.isfinite(v) and v > 0 else 1.0 for k, v in sizes.items()}
 
 
@@ -301,12 +288,10 @@ def suited(parameter: Parameter, sizes: Mapping[str, float]) -> Parameter:
     if parameter.given or parameter.name == "sgn_width":
         return parameter
     size = sizes.get(parameter.unit)
-    if parameter.null is None and parameter.grid:
-        value = parameter.grid[len(parameter.grid) // 2] * (size or 1.0)
-    elif parameter.null == 0 and size is not None and not parameter.positive:
+    if parameter.null == 0 and size is not None and not parameter.positive:
         value = 0.02 * size
-    elif parameter.grid and size is not None:
-        value = parameter.grid[len(parameter.grid) // 2] * size
+    elif parameter.grid and (size is not None or parameter.null is None):
+        value = parameter.grid[len(parameter.grid) // 2] * (size or 1.0)
     else:
         value = parameter.value
     return replace(parameter, value=float(np.clip(value, parameter.lower, parameter.upper)))

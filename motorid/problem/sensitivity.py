@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -152,14 +152,8 @@ def relative_jacobian(problem: Problem, q: Array) -> Array:
     A relative change of one is a factor of e for positive parameters, the natural size of the unit for others.
     """
     k = len(problem.model.free_names)
-    parts = []
-    for j, run in enumerate(problem.runs):
-        dy = problem.simulate(q, j).dy
-        assert dy is not None
-        for m, c in enumerate(problem.outputs):
-            if c in run.sigma:
-                parts.append(dy[np.isfinite(run.experiment.outputs[c]), m] / run.sigma[c])
-    jac = np.concatenate(parts)
+    slopes: list[Any] = [problem.simulate(q, j).dy for j in range(len(problem.runs))]
+    jac = np.concatenate([m.stack(dy / m.noise[:, None]) for m, dy in zip(problem.measured, slopes, strict=True)])
     nuisance = jac[:, k:]
     if not nuisance.any():
         return jac[:, :k]

@@ -87,14 +87,10 @@ class Evaluation(Shown):
 
 def error_table(evaluations: Mapping[str, Evaluation | None], noise: Mapping[str, float] = MappingProxyType({})
                 ) -> Table:
-    """Return RMSE and NRMSE per channel of each named evaluation, side by side.
+    """Return RMSE and NRMSE per channel of each named evaluation, side by side; None is left out.
 
-    Parameters
-    ----------
-    evaluations : mapping of str to Evaluation
-        The name goes before the heads of its columns, e.g. ``held-out``; None is left out.
-    noise : mapping of str to float, optional
-        Standard deviation of the sensor's noise per channel, SI, as a column of its own.
+    The name goes before the heads of its columns, e.g. ``held-out``. Where `noise` is given, the standard deviation of
+    the sensor's per channel, SI, it is a column of its own.
     """
     shown = {name: e for name, e in evaluations.items() if e is not None}
     units = units_of(s.experiment for e in shown.values() for s in e.simulations)

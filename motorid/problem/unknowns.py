@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -64,10 +64,9 @@ class Unknowns:
         found = []
         free = {c for c, stored in zip(self.system.states, self.system.stored, strict=True) if stored}
         for k, run in enumerate(self.runs):
-            for c in run.estimated:
+            for c, (low, high) in run.limits.items():
                 if c in free:  # an algebraic current follows from the rest
                     unit = run.experiment.units.get(c, UNITS[c][0])
-                    low, high = run.limits[c]
                     if any(p.null == 0 and p.unit == UNITS[c][0] for p in self.parameters.values()):
                         low, high = min(low, 0.0), max(high, 0.0)  # what was measured there may be the sensor's offset
                     value = float(run.start[CHANNELS.index(c)])
@@ -98,10 +97,8 @@ class Unknowns:
 
     def values(self, physical: Array) -> dict[str, float]:
         """Return all parameter values of the model, SI, for `physical` values of the unknowns."""
-        found = {n: p.value for n, p in self.parameters.items()}
-        for p, value in zip(self.free, physical.tolist(), strict=False):
-            found[p.name] = value
-        return found
+        fitted = zip((p.name for p in self.free), physical.tolist(), strict=False)
+        return {**{n: p.value for n, p in self.parameters.items()}, **dict(fitted)}
 
     def principal(self, q: Array) -> Array:
         """Return `q` with its phase angles, whole turns of which mean nothing, within ±π."""
@@ -182,8 +179,8 @@ class Scaling:
 
     scale: NDArray[np.float64]  # positive sizes s
     log: NDArray[np.bool_]
-    lower: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))  # limits of p
-    upper: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
+    lower: NDArray[np.float64]  # limits of p
+    upper: NDArray[np.float64]
 
     @staticmethod
     def of(parameters: Iterable[Parameter], sizes: ArrayLike | None = None) -> Scaling:
@@ -193,8 +190,7 @@ class Scaling:
         scale = np.abs(values if sizes is None else np.asarray(sizes, float))
         scale = np.where((scale > 0) & np.isfinite(scale), scale, 1.0)
         log = np.array([p.positive for p in pars], bool)
-        lower, upper = ([getattr(p, side) for p in pars] for side in ("lower", "upper"))
-        return Scaling(scale, log, np.array(lower, float), np.array(upper, float))
+        return Scaling(scale, log, np.array([p.lower for p in pars], float), np.array([p.upper for p in pars], float))
 
     def physical(self, q: ArrayLike) -> NDArray[np.float64]:
         """Return p of q."""

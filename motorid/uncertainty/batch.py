@@ -8,8 +8,9 @@ import json
 import pickle
 import time
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -50,8 +51,7 @@ class Outlier:
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain data."""
-        return {"motor": self.motor, "parameter": self.parameter, "value": self.value, "median": self.median,
-                "z": self.z}
+        return {k: v for k, v in vars(self).items() if k != "text"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,20 +99,16 @@ class Batch:
 
     def save(self, path: str | Path, force: bool = False) -> Path:
         """Write the table; the ending says how: ``.csv``, ``.parquet`` or ``.json``; see `write_files`."""
-        target = Path(path)
-        if target.suffix == ".csv":
-            content = self.table.to_csv()
-        elif target.suffix == ".json":
-            content = self.table.reset_index().to_json(orient="records", indent=1, force_ascii=False)
-        elif target.suffix in (".parquet", ".pq"):
-            try:
-                content = self.table.to_parquet()
-            except ImportError as error:
-                raise MissingDependency("writing Parquet needs pyarrow: pip install 'motorid[parquet]', or "
-                                        "save the table as .csv.") from error
-        else:
+        target, table = Path(path), self.table
+        as_json = partial(table.reset_index().to_json, orient="records", indent=1, force_ascii=False)
+        ways = {".csv": table.to_csv, ".json": as_json, ".parquet": table.to_parquet, ".pq": table.to_parquet}
+        if target.suffix not in ways:
             raise UsageError(f"a table is saved as .csv, .parquet or .json; got '{target.name}'.")
-        return write_files({target: content}, force)[0]
+        try:
+            return write_files({target: ways[target.suffix]()}, force)[0]
+        except ImportError as error:
+            raise MissingDependency("writing Parquet needs pyarrow: pip install 'motorid[parquet]', or "
+                                    "save the table as .csv.") from error
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain data: rows, outliers, counts."""
@@ -198,10 +194,8 @@ def _carry_laws(model: Model) -> None:
         return
     for n in (1, 2, 3):
         for outputs in combinations(CHANNELS, n):
-            try:
+            with suppress(Exception):  # a channel that this model does not have
                 model.system(outputs)
-            except Exception:
-                continue  # a channel that this model does not have
 
 
 def _fit_one(task: tuple[Model, Mapping[str, Any], Mapping[str, Any]], motor: tuple[str, Records]) -> dict[str, Any]:
@@ -275,15 +269,8 @@ def outliers(rows: Sequence[Mapping[str, Any]], names: Sequence[str], positive: 
              level: float = LEVEL) -> tuple[Outlier, ...]:
     """Return the outliers of a batch, the most extreme first.
 
-    Parameters
-    ----------
-    rows : sequence of mapping
-        With ``motor`` and per parameter its value and ``<name>_std``.
-    names : sequence of str
-    positive : set of str
-        Parameters compared on the logarithmic scale.
-    level : float
-        Chance of a false alarm anywhere in a batch of equal scatter.
+    `rows` have ``motor`` and per parameter in `names` its value and ``<name>_std``; those in `positive` are compared on
+    the logarithmic scale. `level` is the chance of a false alarm anywhere in a batch of equal scatter.
     """
     found = []
     for n in names:
@@ -328,7 +315,7 @@ class Checkpoint:
         self.rows: dict[str, dict[str, Any]] = {}
         text = read_bytes(path).decode("utf-8", "replace") if path.exists() else ""
         for line in text.splitlines():
-            try:
+            with suppress(ValueError, KeyError, TypeError, RecursionError):
                 entry = json.loads(line)
                 row = {"motor": entry["row"]["motor"], **entry["row"]}
                 for name, value in row.items():
@@ -336,8 +323,6 @@ class Checkpoint:
                     if not isinstance(value, kind):
                         raise TypeError(name)
                 self.rows[entry["fingerprint"]] = row
-            except (ValueError, KeyError, TypeError, RecursionError):
-                continue
         if text.strip() and not self.rows and '{"fingerprint"' not in text:
             raise UsageError(f"'{path}' is not a journal of motorid, so nothing is added to it; name another file.")
         self._append("" if text.endswith("\n") or not text else "\n")

@@ -216,7 +216,7 @@ def _refit(source: _Source, seed: np.random.SeedSequence) -> dict[str, float] | 
         done = least_squares(again, SOLVER)
     except (MotoridError, np.linalg.LinAlgError) as error:
         return Failure(problem.model.values, "failed", str(error))
-    return done.problem.values(done.solution.q)
+    return done.values
 
 
 def _resampled(source: _Source, k: int, rng: np.random.Generator) -> Experiment:
@@ -233,14 +233,11 @@ def _blocks(source: _Source, k: int, rng: np.random.Generator) -> dict[str, Arra
     here = source.residuals[k]
     n = len(next(iter(here.values())))
     donors = [r for r in source.residuals if set(r) == set(here)]
-    pieces: dict[str, list[Array]] = {c: [] for c in here}
-    length = 0
-    while length < n:
+    pieces = []
+    for _ in range(-(-n // source.block)):
         donor = donors[rng.integers(len(donors))]
         size = len(next(iter(donor.values())))
         at = (rng.integers(size) + np.arange(source.block)) % size
-        for c in here:
-            pieces[c].append(donor[c][at])
-        length += source.block
-    joined = {c: np.concatenate(p)[:n] for c, p in pieces.items()}
+        pieces.append({c: e[at] for c, e in donor.items()})
+    joined = {c: np.concatenate([p[c] for p in pieces])[:n] for c in here}
     return {c: np.where(np.isfinite(e), e, 0.0) for c, e in joined.items()}

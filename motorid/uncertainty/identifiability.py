@@ -9,6 +9,7 @@ identifiability of nonlinear ODE models", SIAM Review 53, 2011). It works on pla
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import combinations, islice, product
 from typing import Any
@@ -212,13 +213,12 @@ def identifiability(problem_or_fit: Problem | Fit, *, points: int = 5, seed: int
     _, s, v = np.linalg.svd(np.asarray(np.linalg.qr(matrix, mode="r")), full_matrices=True)
     s = np.concatenate([s, np.zeros(k - len(s))])
     weak = v[s <= LEVEL]
-    shown = [WeakDirection(*words) for words in basis_in_words(names, weak, matrix)]
     return Identifiability(
         names, problem.scaling.physical(q)[:k], problem.scaling.slope(q)[:k],
         tuple(p.unit for p in problem.unknown[:k]), tuple(r.grid.t for r in problem.runs),
-        relative_sensitivities(problem, q), s, v, _structural_rank(problem, q, points, seed), tuple(shown),
-        tuple(monomials(names, weak)) if len(weak) else (),
-        tuple(suggestions(problem, q, matrix, len(weak), LEVEL)) if len(weak) else (),
+        relative_sensitivities(problem, q), s, v, _structural_rank(problem, q, points, seed),
+        basis_in_words(names, weak, matrix), tuple(monomials(names, weak)) if len(weak) else (),
+        tuple(suggestions(problem, q, matrix, len(weak))) if len(weak) else (),
         problem_or_fit.std if isinstance(problem_or_fit, Fit) else None)
 
 
@@ -238,20 +238,18 @@ def _structural_rank(problem: Problem, q: Array, points: int, seed: int) -> int:
     for trial in range(points + 1):
         at = q.copy()
         at[:k] += reach * rng.uniform(-1, 1, k) * (trial > 0)
-        try:
+        with suppress(SimulationError):
             jac = relative_jacobian(problem.refined(at), at)
-        except SimulationError:
-            continue
-        norms = np.linalg.norm(jac, axis=0)
-        s = np.linalg.svd(jac / np.where(norms > 0, norms, 1.0), compute_uv=False)
-        best = max(best, int(np.sum(s > STRUCTURAL * max(s[0], 1e-300))))
+            norms = np.linalg.norm(jac, axis=0)
+            s = np.linalg.svd(jac / np.where(norms > 0, norms, 1.0), compute_uv=False)
+            best = max(best, int(np.sum(s > STRUCTURAL * max(s[0], 1e-300))))
         if best == k:
             break
     return best
 
 
-def basis_in_words(names: Sequence[str], weak: Array, matrix: Array) -> list[tuple[dict[str, float], float, str]]:
-    """Return per weak direction its parts (largest 1), what a step of 10 % does in units of noise, and words.
+def basis_in_words(names: Sequence[str], weak: Array, matrix: Array) -> tuple[WeakDirection, ...]:
+    """Return the weak directions with as few parts as possible, and what a step of 10 % along each does.
 
     `weak` (d, k) has orthonormal rows, `matrix` (n, k) the whitened outputs per relative change.
     """
@@ -263,8 +261,9 @@ def basis_in_words(names: Sequence[str], weak: Array, matrix: Array) -> list[tup
         moves = ", ".join(f"{n} by {100 * STEP * w:+.2g} %".replace("-", "−") for n, w in parts.items())
         effect = f"moves all outputs by {seen:.1g} standard deviations of their noise"
         effect = "does not move the outputs at all" if seen < UNMOVED else effect
-        found.append((parts, seen, f"Changing {moves}{' together' if len(parts) > 1 else ''} {effect}."))
-    return found
+        text = f"Changing {moves}{' together' if len(parts) > 1 else ''} {effect}."
+        found.append(WeakDirection(parts, seen, text))
+    return tuple(found)
 
 
 def sparse_basis(weak: Array) -> Array:
@@ -313,44 +312,38 @@ def monomials(names: Sequence[str], weak: Array) -> list[str]:
 
 
 def _product(names: Sequence[str], powers: Array) -> str:
-    def factor(name: str, power: float) -> str:
-        return f"{name}²" if abs(power) == 2 else name
-
-    above = "·".join(factor(n, p) for n, p in zip(names, powers, strict=True) if p > 0) or "1"
-    below = [factor(n, p) for n, p in zip(names, powers, strict=True) if p < 0]
+    factors = [(f"{n}²" if abs(p) == 2 else n, p) for n, p in zip(names, powers, strict=True)]
+    above, below = "·".join(f for f, p in factors if p > 0) or "1", [f for f, p in factors if p < 0]
     if not below:
         return above
     return f"{above}/{below[0]}" if len(below) == 1 else f"{above}/({'·'.join(below)})"
 
 
-def suggestions(problem: Problem, q: Array, matrix: Array, missing: int, level: float) -> list[str]:
-    """Return sentences on what to fix or to measure so that every singular value exceeds `level`."""
+def suggestions(problem: Problem, q: Array, matrix: Array, missing: int) -> list[str]:
+    """Return sentences on what to fix or to measure so that every singular value exceeds `LEVEL`."""
     names = problem.model.free_names
     said = []
-    sets = fixable(names, matrix, missing, level)
-    if sets:
+    if sets := fixable(names, matrix, missing):
         first = " and ".join(sets[0])
         other = f" (or {' and '.join(sets[1])})" if len(sets) > 1 else ""
         said.append(f"Fix {first}{other} where known, model.fix(…), and the rest is determined.")
-    for channel in ("i", "omega"):
-        if _would_do(problem, q, channel, level):
-            said.append(f"Measure the {NAMES[channel]} as well: with 1 % of noise all of them are determined.")
-    return said
+    return said + [f"Measure the {NAMES[channel]} as well: with 1 % of noise all of them are determined."
+                   for channel in ("i", "omega") if _would_do(problem, q, channel)]
 
 
-def fixable(names: Sequence[str], matrix: Array, missing: int, level: float) -> list[tuple[str, ...]]:
+def fixable(names: Sequence[str], matrix: Array, missing: int) -> list[tuple[str, ...]]:
     """Return the sets of `missing` parameters that, once fixed, leave the others determined; the best set first."""
     found = []
     triangle = np.asarray(np.linalg.qr(matrix, mode="r"))
     for fixed in combinations(range(len(names)), missing):
         s = np.linalg.svd(np.delete(triangle, fixed, axis=1), compute_uv=False)
-        if s.size and s[-1] > level:
+        if s.size and s[-1] > LEVEL:
             ease = sum(EASY.index(names[j]) if names[j] in EASY else len(EASY) for j in fixed)
             found.append((-round(np.log10(s[-1])), ease, tuple(names[j] for j in fixed)))
     return [f[2] for f in sorted(found)]
 
 
-def _would_do(problem: Problem, q: Array, channel: str, level: float) -> bool:
+def _would_do(problem: Problem, q: Array, channel: str) -> bool:
     """Tell whether one more channel, with little noise, would determine everything."""
     if channel in problem.outputs or (channel == "i" and problem.model.base != "dc_motor"):
         return False
@@ -361,4 +354,4 @@ def _would_do(problem: Problem, q: Array, channel: str, level: float) -> bool:
         matrix = relative_jacobian(more.refined(more.start), more.start)
     except MotoridError:
         return False
-    return bool(np.linalg.svd(matrix, compute_uv=False)[-1] > level)
+    return bool(np.linalg.svd(matrix, compute_uv=False)[-1] > LEVEL)

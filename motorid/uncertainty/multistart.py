@@ -16,13 +16,12 @@ import numpy as np
 
 from motorid.display.cards import Card, Flag, Printed, Table
 from motorid.display.numbers import duration, number, percent, quantity, sentence
-from motorid.errors import MotoridError, SimulationError, UsageError, at_least, positive
+from motorid.errors import MotoridError, UsageError, at_least, positive
 from motorid.estimation.fit import check_solver, minimise, solve
-from motorid.estimation.least_squares import FINISH
+from motorid.estimation.least_squares import FINISH, Estimate, cost_at
 from motorid.estimation.result import Failure, Fit
 from motorid.estimation.start_values import with_start_values
 from motorid.numerics.parallel import Map, map_items, one_thread
-from motorid.numerics.signals import Array
 from motorid.problem.problem import Problem
 from motorid.problem.simulate import at, judge
 
@@ -101,27 +100,14 @@ def _from_start(task: tuple[Problem, dict[str, float], Any, bool], start: dict[s
     here = problem.for_model(problem.model.start_at(values | start))
     try:
         here = replace(with_start_values(here), _runs=here.runs) if guess else here
-        if hasattr(solver, "solve"):
-            fit = solver.solve(here)
-            solved, q, status, message, history = fit.problem, fit.q, fit.status, fit.message, fit.history
-        else:
-            done = minimise(here, solver or FINISH)
-            solved, q, history = done.problem, done.solution.q, done.history
-            status, message = done.solution.status, done.solution.message
+        end: Fit | Estimate = solver.solve(here) if hasattr(solver, "solve") else minimise(here, solver or FINISH)
     except (MotoridError, np.linalg.LinAlgError) as error:
         return Failure(start, "failed", str(error))
-    physical = solved.scaling.physical(q)
-    return StartResult(start, solved.values(q), _reference_cost(problem, physical), judge(at(solved, q)).nrmse, status,
-                       message, len(history) - 1, time.perf_counter() - began)
-
-
-def _reference_cost(problem: Problem, physical: Array) -> float:
-    """Cost with the weights and steps of the reference, so that the results of all starts can be compared."""
-    try:
-        r = problem.residual(problem.scaling.scaled(physical))
-    except SimulationError:
-        return float("inf")
-    return 0.5 * float(r @ r)
+    said = end if isinstance(end, Fit) else end.solution
+    # With the weights and steps of the reference, so that the results of all starts can be compared.
+    cost = cost_at(problem, problem.scaling.scaled(end.problem.scaling.physical(end.q)))
+    return StartResult(start, end.values, cost, judge(at(end.problem, end.q)).nrmse, said.status, said.message,
+                       len(end.history) - 1, time.perf_counter() - began)
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,7 +21,7 @@ from motorid.errors import MotoridError, UsageError, one_of
 from motorid.estimation.least_squares import least_squares
 from motorid.estimation.result import Fit
 from motorid.numerics.least_squares import LevenbergMarquardt, seen_directions
-from motorid.numerics.parallel import Map, Parcel, one_thread, run_tasks
+from motorid.numerics.parallel import Map, map_items, one_thread
 from motorid.numerics.signals import Array
 from motorid.problem.problem import Problem
 from motorid.uncertainty.bootstrap import Bootstrap, bootstrap
@@ -166,11 +166,10 @@ def profiles(fit: Fit, names: Sequence[str] | None = None, *, level: float = 0.9
         if n not in free:
             raise UsageError(one_of(n, free, "free parameter"))
     chosen = tuple(names or free)
-    parcel = Parcel.of((fit.problem, dict(fit.values), fit.cost))
     check_level(level)
     plans = {n: _plan(fit, n, level) for n in chosen}
-    tasks = [(parcel, n, side, *plans[n][:3]) for n in chosen for side in (-1.0, 1.0)]
-    done = run_tasks(_side, tasks, map, "Profiling", quiet=quiet)
+    tasks = [(n, side, *plans[n][:3]) for n in chosen for side in (-1.0, 1.0)]
+    done = map_items(_side, (fit.problem, dict(fit.values), fit.cost), tasks, map, "Profiling", quiet=quiet)
     sides = done.results + [[]] * (len(tasks) - len(done.results))
     return {n: _joined(fit, n, sides[2 * k], sides[2 * k + 1], plans[n][3]) for k, n in enumerate(chosen)}
 
@@ -190,10 +189,10 @@ def _plan(fit: Fit, name: str, level: float) -> tuple[float, float, float, float
     return step, factor, height, found.dof
 
 
-def _side(task: tuple[Parcel, str, float, float, float, float]) -> list[Point]:
+def _side(reference: tuple[Problem, dict[str, float], float],
+          task: tuple[str, float, float, float, float]) -> list[Point]:
     """Walk outward from the fit until the cost has risen enough, the limit is reached, or nothing changes."""
-    parcel, name, side, step, factor, height = task
-    problem, values, cost = parcel.open()
+    (problem, values, cost), (name, side, step, factor, height) = reference, task
     j = [p.name for p in problem.unknown].index(name)
     parameter, scale = problem.model.parameters[name], problem.scaling
     q0 = float(scale.scaled([values.get(p.name, p.value) for p in problem.unknown])[j])
@@ -224,8 +223,7 @@ def _refit_with(problem: Problem, values: dict[str, float], name: str,
         done = least_squares(here, SOLVER)
     except (MotoridError, np.linalg.LinAlgError):
         return None
-    r = done.solution.residual
-    return 0.5 * float(r @ r), done.problem.values(done.solution.q)
+    return done.cost, done.values
 
 
 def _joined(fit: Fit, name: str, left: list[Point], right: list[Point], dof: float) -> Profile:

@@ -22,12 +22,13 @@ needs_compiler = pytest.mark.skipif(cc.compiler() is None, reason="no C compiler
 def cache(tmp_path, monkeypatch):
     """An empty cache, and steppers that have loaded nothing yet."""
     monkeypatch.setenv("MOTORID_CACHE", str(tmp_path / "cache"))
-    forget(monkeypatch)
-    return tmp_path / "cache"
+    forget()
+    yield tmp_path / "cache"
+    forget()
 
 
-def forget(monkeypatch):
-    monkeypatch.setattr(rb, "_steppers", {})
+def forget():
+    rb.stepper.cache_clear()
     rb._stepper_of_content.cache_clear()
 
 
@@ -67,16 +68,16 @@ def test_one_library_serves_all_run_lengths_values_and_free_parameters(cache, bu
 
 
 @needs_compiler
-def test_the_next_process_finds_it(cache, builds, monkeypatch):
+def test_the_next_process_finds_it(cache, builds):
     first = simulate().x
-    forget(monkeypatch)
+    forget()
     assert np.array_equal(simulate().x, first)
     assert len(builds) == 1
 
 
 @needs_compiler
 @pytest.mark.parametrize("damage", ["half", "empty", "text", "flipped"])
-def test_a_damaged_library_is_replaced_and_not_loaded(cache, builds, monkeypatch, damage):
+def test_a_damaged_library_is_replaced_and_not_loaded(cache, builds, damage):
     first = simulate().x
     (path,) = cache.glob("*.so")
     data = bytearray(path.read_bytes())
@@ -85,7 +86,7 @@ def test_a_damaged_library_is_replaced_and_not_loaded(cache, builds, monkeypatch
     path.write_bytes(
         {"half": data[: len(data) // 2], "empty": b"", "text": b"no library", "flipped": flipped}[damage]
     )
-    forget(monkeypatch)
+    forget()
     assert np.array_equal(simulate().x, first)
     assert len(builds) == 2
     assert [p.read_bytes() for p in cache.glob("*.so")] == [bytes(data)]
@@ -135,7 +136,7 @@ def test_a_half_written_folder_of_another_process_does_no_harm(cache, builds):
 @needs_compiler
 def test_another_compiler_or_other_flags_make_another_library(cache, builds, monkeypatch):
     simulate()
-    forget(monkeypatch)
+    forget()
     monkeypatch.setattr(cc, "FLAGS", (*cc.FLAGS, "-O1"))
     simulate()
     assert len(builds) == 2
@@ -143,11 +144,10 @@ def test_another_compiler_or_other_flags_make_another_library(cache, builds, mon
 
 
 @needs_compiler
-def test_a_cache_that_cannot_be_written_costs_speed_only(tmp_path, monkeypatch, capsys):
+def test_a_cache_that_cannot_be_written_costs_speed_only(cache, tmp_path, monkeypatch, capsys):
     (tmp_path / "file").write_text("in the way")
     monkeypatch.setenv("MOTORID_CACHE", str(tmp_path / "file" / "cache"))
     monkeypatch.setattr(cc, "_told", set())
-    forget(monkeypatch)
     machine = simulate().x
     simulate()
     assert capsys.readouterr().err.count("cannot compile") == 1

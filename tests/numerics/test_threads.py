@@ -12,12 +12,12 @@ import pytest
 from threadpoolctl import ThreadpoolController
 
 import motorid as mi
-from motorid.numerics.parallel import one_thread, run_tasks
+from motorid.numerics.parallel import map_items, one_thread
 
 MANY = 2
 
 
-def threads_of_blas(_: object = None) -> set[int]:
+def threads_of_blas(*_: object) -> set[int]:
     return {c.num_threads for c in ThreadpoolController().select(user_api="blas").lib_controllers}
 
 
@@ -73,7 +73,7 @@ def test_nested_and_concurrent_calls_leave_it_as_it_was(first_out):
 def test_a_task_runs_on_one_thread_wherever_it_is_done():
     with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
         for way in (None, pool.map):
-            assert run_tasks(threads_of_blas, [0, 1], way, "Counting", quiet=True).results == [{1}, {1}]
+            assert map_items(threads_of_blas, None, [0, 1], way, "Counting", quiet=True).results == [{1}, {1}]
 
 
 @pytest.mark.parametrize("name", ["fit", "solve", "diagnose", "improve", "locate", "suggest_experiment", "simulate",

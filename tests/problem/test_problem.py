@@ -271,7 +271,7 @@ def test_a_problem_for_another_model_keeps_noise_and_beginnings(runs):
     other = problem.for_model(TRUE + mi.effects.coulomb)
     assert other.runs == problem.runs
     assert other.model.effect_names == ("coulomb",)
-    assert problem.with_(initial="estimate").runs[0].estimated == ("i", "omega")
+    assert problem.with_(initial="estimate").runs[0].limits.keys() == {"i", "omega"}
 
 
 def test_a_problem_travels_to_another_process(runs):

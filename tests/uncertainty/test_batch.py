@@ -98,7 +98,7 @@ def test_a_bug_in_one_motors_fit_does_not_end_the_batch(ten, monkeypatch):
 
 
 def _unpacked(content):
-    return type("Held", (), {"content": content, "open": lambda self: content})()
+    return type("Held", (), {"data": b"", "open": lambda self: content})()
 
 
 def test_undetermined_parameters_are_flagged_and_empty(ten):

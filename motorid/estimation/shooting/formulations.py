@@ -109,14 +109,13 @@ class Formulations(Shown):
         rows += [[f"NRMSE {channel_name(c, units.get(c, ''))}", *(percent(f.nrmse[c]) if f else NONE for f in fits)]
                  for c in first.nrmse]
         rows.append(["steady-state residual", *(percent(f.steady_residual) for f in self.all)])
-        for name in dict.fromkeys(n for f in self.all for n in f.violations):
-            rows.append([f"beyond {name}", *(number(f.violations.get(name), 3) for f in self.all)])
+        rows += [[f"beyond {name}", *(number(f.violations.get(name), 3) for f in self.all)]
+                 for name in dict.fromkeys(n for f in self.all for n in f.violations)]
         rows += [[f"multiplier {m.name}, 1/{m.unit or 'unit'}", NONE, NONE, number(m.value, 3)]
                  for m in self.hard.multipliers]
-        rows.append(["iterations", *(str(f.iterations) if f else NONE for f in fits)])
-        rows.append(["time", *(duration(f.seconds) if f else NONE for f in fits)])
-        rows.append(["status", *(f.result.status for f in self.all)])
-        return rows
+        return [*rows, ["iterations", *(str(f.iterations) if f else NONE for f in fits)],
+                ["time", *(duration(f.seconds) if f else NONE for f in fits)],
+                ["status", *(f.result.status for f in self.all)]]
 
     def card(self) -> Card:
         """Return the three side by side."""

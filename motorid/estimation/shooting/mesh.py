@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -49,15 +49,14 @@ class Block(NamedTuple):
 
 
 class Walk(NamedTuple):
-    """All intervals simulated: per run x, y and their local derivatives; per interval its end state.
+    """All intervals simulated, and put together run by run.
 
-    Local columns are (own node, q), in scaled coordinates. `at` is q in the system's terms.
+    Local columns of derivatives are (own node, q), in scaled coordinates. `at` is q in the system's terms.
     """
 
     at: Point
     runs: tuple[Trajectory, ...]
-    ends: Array
-    dends: Array | None
+    intervals: tuple[Trajectory, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,8 +76,7 @@ class Mesh:
         nodes = 0
         for k, run in enumerate(self.problem.runs):
             last = len(run.grid.t) - 1
-            cuts = _cuts(last, self.every)
-            for a, b in pairwise(cuts):
+            for a, b in pairwise(_cuts(last, self.every)):
                 node = -1 if a == 0 else nodes - 1
                 nodes += b < last
                 found.append(Interval(k, a, b, node, nodes - 1 if b < last else -1, run.grid.part(a, b)))
@@ -123,44 +121,26 @@ class Mesh:
                     found[j] = max(found[j], float(np.nanmax(np.abs(run.outputs[name]))))
         return np.where(found > 0, found, 1.0)
 
-    def split(self, z: Array) -> tuple[Array, Array]:
-        """Return q and the states at the nodes (n, nx), physical."""
-        return z[:self.nq], z[self.nq:].reshape(self.n_nodes, self.nx) * self.scale
-
     def joined(self, q: Array, states: Array) -> Array:
-        """Return z."""
+        """Return z of q and the states at the nodes (n, nx), physical."""
         return np.concatenate([q, (np.asarray(states).reshape(-1, self.nx) / self.scale).ravel()])
 
     # -- simulation ------------------------------------------------------------------------------------
     def walk(self, z: Array, derivatives: bool) -> Walk:
-        """Simulate every interval from its node.
-
-        Raises
-        ------
-        SimulationError
-        """
-        problem, nx, nz = self.problem, self.nx, self.nx + self.nq
-        q, states = self.split(z)
-        at = problem.unknowns.point(q)
-        runs = tuple(_empty(len(r.grid.t), nx, len(problem.outputs), nz if derivatives else 0) for r in problem.runs)
-        ends = np.zeros((len(self.intervals), nx))
-        dends = np.zeros((len(self.intervals), nx, nz)) if derivatives else None
+        """Simulate every interval from its node; SimulationError if that fails."""
+        problem, nx = self.problem, self.nx
+        at, states = problem.unknowns.point(z[:self.nq]), z[self.nq:].reshape(self.n_nodes, nx) * self.scale
         dp = np.hstack([np.zeros((len(at.p), nx)), at.dp])
         inner = np.hstack([np.diag(self.scale), np.zeros((nx, self.nq))])
-        for j, v in enumerate(self.intervals):
-            x0 = problem.unknowns.first_state(at, v.run) if v.node < 0 else states[v.node]
-            if derivatives:
-                dx0 = inner
-                if v.node < 0:
-                    dx0 = np.hstack([np.zeros((nx, nx)), problem.unknowns.first_slopes(at, v.run)])
-                traj = problem.integrator.run(problem.system, v.grid, x0, at.p, dx0, dp)
-            else:
-                traj = problem.integrator.run(problem.system, v.grid, x0, at.p)
-            _fill(runs[v.run], traj, v.first)
-            ends[j] = traj.x[-1]
-            if dends is not None and traj.dx is not None:
-                dends[j] = traj.dx[-1]
-        return Walk(at, runs, ends, dends)
+        found = []
+        for v in self.intervals:
+            x0, dx0 = (states[v.node], inner) if v.node >= 0 else (problem.unknowns.first_state(at, v.run), None)
+            if dx0 is None and derivatives:
+                dx0 = np.hstack([np.zeros((nx, nx)), problem.unknowns.first_slopes(at, v.run)])
+            slopes = (dx0, dp) if derivatives else ()
+            found.append(problem.integrator.run(problem.system, v.grid, x0, at.p, *slopes))
+        runs = [[t for v, t in zip(self.intervals, found, strict=True) if v.run == k] for k in range(len(problem.runs))]
+        return Walk(at, tuple(map(_joined, runs)), tuple(found))
 
     # -- rows ------------------------------------------------------------------------------------------
     def residual(self, z: Array, walk: Walk) -> list[Block]:
@@ -191,21 +171,18 @@ class Mesh:
         """Return, per inner node, the node's state minus the end of the interval before it."""
         states = z[self.nq:].reshape(self.n_nodes, self.nx)
         blocks = []
-        for j, v in enumerate(self.intervals):
+        for v, traj in zip(self.intervals, walk.intervals, strict=True):
             if v.next < 0:
                 continue
-            factor = self.scale / self.gap_size(v) if weighed else np.ones(self.nx)
-            values = (states[v.next] - walk.ends[j] / self.scale) * factor
+            factor = np.ones(self.nx)
+            if weighed and self.noise is not None:
+                factor = self.scale / (self.noise * np.sqrt(v.grid.t[-1] - v.grid.t[0]))
+            values = (states[v.next] - traj.x[-1] / self.scale) * factor
             jac = np.zeros((self.nx, 0))
-            if walk.dends is not None:
-                jac = np.hstack([-walk.dends[j] / self.scale[:, None], np.eye(self.nx)]) * factor[:, None]
+            if traj.dx is not None:
+                jac = np.hstack([-traj.dx[-1] / self.scale[:, None], np.eye(self.nx)]) * factor[:, None]
             blocks.append(_present(Block(values, jac, self.columns(v, after=True))))
         return blocks
-
-    def gap_size(self, v: Interval) -> Array:
-        """Standard deviation (nx,) of the gap after an interval, physical."""
-        assert self.noise is not None
-        return self.noise * np.sqrt(v.grid.t[-1] - v.grid.t[0])
 
     def constraints(self, walk: Walk) -> list[tuple[Block, Part, np.ndarray]]:
         """Return the rows of all constraints with the part they belong to and their places in it."""
@@ -262,14 +239,17 @@ def _cuts(last: int, every: int | None) -> Sequence[int]:
     return np.unique(np.linspace(0, last, max(round(last / step), 1) + 1).round().astype(int)).tolist()
 
 
-def _empty(n: int, nx: int, ny: int, nz: int) -> Trajectory:
-    dy, dx = (np.zeros((n, ny, nz)), np.zeros((n, nx, nz))) if nz else (None, None)
-    return Trajectory(np.zeros((n, ny)), dy, np.zeros((n, nx)), dx, None)
+def _joined(intervals: Sequence[Trajectory]) -> Trajectory:
+    """Put the intervals of a run together; the sample that two of them share is the later one's."""
+    def whole(parts: Any) -> Any:
+        return None if parts[0] is None else np.concatenate([*(a[:-1] for a in parts[:-1]), parts[-1]])
+    y, dy, x, dx = map(whole, zip(*(t[:4] for t in intervals), strict=True))
+    return Trajectory(y, dy, x, dx, None)
 
 
-def _fill(whole: Trajectory, traj: Trajectory, first: int) -> None:
-    """Write an interval into the run; the next interval overwrites the shared last sample."""
-    rows = slice(first, first + len(traj.y))
-    whole.y[rows], whole.x[rows] = traj.y, traj.x
-    if whole.dy is not None and whole.dx is not None and traj.dy is not None and traj.dx is not None:
-        whole.dy[rows], whole.dx[rows] = traj.dy, traj.dx
+def places(blocks: Sequence[Block]) -> tuple[np.ndarray, np.ndarray]:
+    """Return row and column of every entry of `blocks`, one below the other, each row by row."""
+    ends = np.cumsum([len(b.values) for b in blocks])
+    rows = [np.repeat(np.arange(e - len(b.values), e), len(b.columns)) for e, b in zip(ends, blocks, strict=True)]
+    columns = [np.tile(b.columns, len(b.values)) for b in blocks]
+    return np.concatenate([np.zeros(0, int), *rows]), np.concatenate([np.zeros(0, int), *columns])

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,19 +19,13 @@ from motorid.estimation.fit import minimise
 from motorid.estimation.least_squares import FINISH, least_squares
 from motorid.estimation.result import Fit
 from motorid.estimation.shooting.mesh import Mesh
-from motorid.estimation.shooting.nlp import Ipopt, NlpResult, ShootingNlp
-from motorid.estimation.shooting.nodes import (
-    first_noise,
-    given_noise,
-    nodes_from_data,
-    nodes_from_simulation,
-    noise_of_gaps,
-)
+from motorid.estimation.shooting.nlp import NlpResult, ShootingNlp, ipopt
+from motorid.estimation.shooting.nodes import first_noise, nodes_from_data, nodes_from_simulation, noise_of_gaps
 from motorid.estimation.shooting.outcome import Solved, below_steady, fit_of, violations
 from motorid.numerics.signals import Array
 from motorid.problem.problem import Problem
 from motorid.problem.relations import Relation, Weighed
-from motorid.problem.simulate import misfit_over_noise
+from motorid.problem.simulate import at, judge, misfit_over_noise
 
 ROUNDS = 4  # of refining the sub-steps
 TIGHT = 1e-13  # share of the cost at which the least-squares fit on the way stops
@@ -168,19 +163,16 @@ class MultipleShooting:
         return done
 
     def _nodes(self, mesh: Mesh, q: Array) -> Array:
-        if self.warm == "data":
-            return nodes_from_data(mesh, q)
-        try:
-            return nodes_from_simulation(mesh, q)
-        except SimulationError:
-            return nodes_from_data(mesh, q)
+        if self.warm != "data":
+            with suppress(SimulationError):
+                return nodes_from_simulation(mesh, q)
+        return nodes_from_data(mesh, q)
 
     def _with_process_noise(self, problem: Problem, q: Array) -> Solved:
         """Solve with process noise; with ``"auto"`` again until the gaps are as large as was taken."""
         problem = problem.refined(q)
         mesh = Mesh(problem, self.every or NOISY)
-        given = self.process_noise
-        noise = given_noise(given, mesh) if isinstance(given, Mapping) else first_noise(mesh)
+        noise = first_noise(self.process_noise, mesh)
         mesh = replace(mesh, noise=noise)
         done = self._solve(mesh, mesh.joined(q, nodes_from_data(mesh, q)), rough=self.process_noise == "auto")
         for _ in range(NOISE_ROUNDS if self.process_noise == "auto" else 0):
@@ -203,9 +195,9 @@ class MultipleShooting:
             raise FitError(f"the model cannot be simulated at the start: {error} Give other starting values with "
                            "model.replace(…), or leave them out.") from None
         most, tol = (min(ROUGH_ITERATIONS, self.max_iterations), 1e-6) if rough else (self.max_iterations, self.tol)
-        ipopt = Ipopt(most, tol, self.verbose)
-        result = ipopt.solve(nlp, z, (np.concatenate([low, -free]), np.concatenate([high, free])), warm,
-                             near=not rough and self.warm != "data")
+        result = ipopt(nlp, z, (np.concatenate([low, -free]), np.concatenate([high, free])),
+                       {"max_iter": most, "tol": tol, "print_level": 5 if self.verbose else 0}, warm,
+                       near=not rough and self.warm != "data")
         return Solved(mesh, nlp, result, history + result.history)
 
 
@@ -215,8 +207,7 @@ def _check(problem: Problem) -> None:
             raise UsageError(f"MultipleShooting takes CurrentLimit, SteadyState and Constraint, not "
                              f"{type(c).__name__}.")
         c.parts(problem)
-    contradiction = below_steady(problem)
-    if contradiction:
+    if contradiction := below_steady(problem):
         raise FitError(contradiction)
 
 
@@ -236,7 +227,7 @@ def _least_squares(problem: Problem, stages: bool) -> tuple[Problem, Array]:
         done = minimise(problem, replace(FINISH, ftol=TIGHT), wide=stages)
     except FitError:  # the intervals will have to find it
         return problem, problem.start
-    return done.problem, done.solution.q
+    return done.problem, done.q
 
 
 def _under_heavier_penalties(problem: Problem, q: Array) -> Array:
@@ -289,13 +280,8 @@ def _lowest(found: list[Solved]) -> Solved:
 
 def _poor(problem: Problem, q: Array) -> bool:
     """Tell whether the model explains less than half of some channel at `q`."""
-    for k, run in enumerate(problem.runs):
-        try:
-            y = problem.simulate(q, k, derivatives=False).y
-        except SimulationError:
-            return True
-        for j, c in enumerate(problem.outputs):
-            shown = run.experiment.outputs.get(c)
-            if shown is not None and not np.nanmean((y[:, j] - shown) ** 2) < POOR**2 * np.nanmean(shown**2):
-                return True
-    return False
+    try:
+        errors = judge(at(problem, q)).by_run
+    except SimulationError:
+        return True
+    return not all(e < POOR for run in errors for e in run.values())

@@ -7,15 +7,14 @@ that the compiled step of the least-squares engine is used here too.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
 
 from motorid.errors import SimulationError
-from motorid.estimation.shooting.mesh import Block, Mesh
+from motorid.estimation.shooting.mesh import Block, Mesh, places
 from motorid.numerics.signals import Array
 
 D = ca.Sparsity.dense
@@ -23,13 +22,12 @@ STEEPEST = 1e4  # largest diagonal entry of the scaled Hessian at the start; IPO
 
 
 class NlpResult(NamedTuple):
-    """Where the NLP solver ended: z, multipliers of the rows (of ½rᵀr) and of z's bounds, status, counts."""
+    """Where the NLP solver ended: z, multipliers of the rows (of ½rᵀr) and of z's bounds, status, costs on the way."""
 
     z: Array
     lam_g: Array
     lam_x: Array
     status: str
-    iterations: int
     history: tuple[float, ...]
 
 
@@ -52,7 +50,7 @@ class ShootingNlp:
 
     def __init__(self, mesh: Mesh, z: Array) -> None:
         self.mesh = mesh
-        self._kept: dict[bool, tuple[bytes, _Point | None]] = {}
+        self._kept: dict[bool, tuple[bytes, _Point]] = {}
         at = self._evaluate(z, True)
         self.n, self.m = len(z), len(at.g)
         self.scale = STEEPEST / max(_steepest(at.residual, self.n), 1e-300)
@@ -75,16 +73,13 @@ class ShootingNlp:
         f = 0.5 * sum(float(b.values @ b.values) for b in residual)
         return _Point(f, np.concatenate([np.zeros(0), *(b.values for b in rows)]), residual, rows)
 
-    def at(self, z: Array, derivatives: bool) -> _Point | None:
-        """Return the point z, None where it cannot be simulated."""
+    def at(self, z: Array, derivatives: bool) -> _Point:
+        """Return the point z; SimulationError where it cannot be simulated."""
         key = z.tobytes()
         for stronger in (True, derivatives):
             if stronger in self._kept and self._kept[stronger][0] == key:
                 return self._kept[stronger][1]
-        try:
-            found = self._evaluate(z, derivatives)
-        except SimulationError:
-            found = None
+        found = self._evaluate(z, derivatives)
         self._kept[derivatives] = key, found
         return found
 
@@ -92,13 +87,11 @@ class ShootingNlp:
     def values(self, z: Array) -> list[Any]:
         """Return f and g."""
         point = self.at(z, False)
-        return [np.nan, np.full(self.m, np.nan)] if point is None else [point.f * self.scale, point.g]
+        return [point.f * self.scale, point.g]
 
     def gradient(self, z: Array) -> list[Any]:
         """Return f and its gradient."""
         point = self.at(z, True)
-        if point is None:
-            return [np.nan, np.full(self.n, np.nan)]
         found = np.zeros(self.n)
         for b in point.residual:
             found[b.columns] += b.values @ b.jac
@@ -107,40 +100,35 @@ class ShootingNlp:
     def jacobian(self, z: Array) -> list[Any]:
         """Return g and its sparse Jacobian."""
         point = self.at(z, True)
-        if point is None:
-            return [np.full(self.m, np.nan), np.full(self.jac_pattern.nnz(), np.nan)]
         entries = np.concatenate([np.zeros(0), *(b.jac.ravel() for b in point.rows)])
         return [point.g, entries[self._jac_order]]
 
     def hessian(self, z: Array, lam_f: float) -> Array:
         """Return the entries of the Gauss-Newton Hessian's upper triangle."""
         point = self.at(z, True)
-        if point is None:
-            return np.full(self.hess_pattern.nnz(), np.nan)
         entries = np.concatenate([(b.jac.T @ b.jac).ravel() for b in point.residual])[self._hess_mask]
         summed = np.bincount(self._hess_place, entries, self.hess_pattern.nnz())
         return np.asarray(summed * (self.scale * lam_f), float)
 
     def functions(self) -> tuple[ca.Callback, dict[str, ca.Callback]]:
         """Return the NLP and its derivatives in CasADi's naming."""
-        x, p, f, g = D(self.n, 1), D(0, 0), D(1, 1), D(self.m, 1)
-        jac_pattern = self.jac_pattern
-        values = _Function("nlp", ["x", "p"], ["f", "g"], [x, p], [f, g], lambda z, _: self.values(z))
-        grad_f = _Function("nlp_grad_f", ["x", "p"], ["f", "grad:f:x"], [x, p], [f, x], lambda z, _: self.gradient(z))
-        jac_g = _Function("nlp_jac_g", ["x", "p"], ["g", "jac:g:x"], [x, p], [g, jac_pattern],
-                          lambda z, _: self.jacobian(z))
-        hess_lag = _Function("nlp_hess_l", ["x", "p", "lam:f", "lam:g"], ["triu:hess:gamma:x:x"], [x, p, f, g],
-                             [self.hess_pattern], lambda z, _, lam_f, __: [self.hessian(z, float(lam_f[0]))])
-        return values, {"grad_f": grad_f, "jac_g": jac_g, "hess_lag": hess_lag}
+        x, f, g = D(self.n, 1), D(1, 1), D(self.m, 1)
+        at = {"x": x, "p": D(0, 0)}
+        return _Function("nlp", at, {"f": f, "g": g}, lambda z, _: self.values(z)), {
+            "grad_f": _Function("nlp_grad_f", at, {"f": f, "grad:f:x": x}, lambda z, _: self.gradient(z)),
+            "jac_g": _Function("nlp_jac_g", at, {"g": g, "jac:g:x": self.jac_pattern}, lambda z, _: self.jacobian(z)),
+            "hess_lag": _Function(
+                "nlp_hess_l", at | {"lam:f": f, "lam:g": g}, {"triu:hess:gamma:x:x": self.hess_pattern},
+                lambda z, _, lam_f, __: [self.hessian(z, float(lam_f[0]))])}
 
 
 class _Function(ca.Callback):
     """A Python function as a CasADi callback; results are dense arrays or the entries of a sparse one."""
 
-    def __init__(self, name: str, names_in: Sequence[str], names_out: Sequence[str], given: Sequence[ca.Sparsity],
-                 results: Sequence[ca.Sparsity], call: Callable[..., list[Any]]) -> None:
+    def __init__(self, name: str, given: Mapping[str, ca.Sparsity], results: Mapping[str, ca.Sparsity],
+                 call: Callable[..., list[Any]]) -> None:
         ca.Callback.__init__(self)
-        self._names, self._given, self._results, self._call = (names_in, names_out), given, results, call
+        self._given, self._results, self._call = list(given.items()), list(results.items()), call
         self.construct(name, {})
 
     def get_n_in(self) -> int:
@@ -150,20 +138,23 @@ class _Function(ca.Callback):
         return len(self._results)
 
     def get_name_in(self, i: int) -> str:
-        return self._names[0][i]
+        return self._given[i][0]
 
     def get_name_out(self, i: int) -> str:
-        return self._names[1][i]
+        return self._results[i][0]
 
     def get_sparsity_in(self, i: int) -> ca.Sparsity:
-        return self._given[i]
+        return self._given[i][1]
 
     def get_sparsity_out(self, i: int) -> ca.Sparsity:
-        return self._results[i]
+        return self._results[i][1]
 
     def eval(self, arg: Sequence[ca.DM]) -> list[ca.DM]:
-        found = self._call(*(np.asarray(a).ravel() for a in arg))
-        return [ca.DM(s, np.atleast_1d(v)) for s, v in zip(self._results, found, strict=True)]
+        try:
+            found = self._call(*(np.asarray(a).ravel() for a in arg))
+        except SimulationError:  # not a number: IPOPT takes a shorter step
+            found = [np.full(s.nnz(), np.nan) for _, s in self._results]
+        return [ca.DM(s, np.atleast_1d(v)) for (_, s), v in zip(self._results, found, strict=True)]
 
 
 def _steepest(blocks: Sequence[Block], n: int) -> float:
@@ -176,15 +167,9 @@ def _steepest(blocks: Sequence[Block], n: int) -> float:
 
 def _jacobian_pattern(blocks: Sequence[Block], m: int, n: int) -> tuple[ca.Sparsity, np.ndarray]:
     """Return the sparsity and the order in which the blocks' entries fill it, column by column."""
-    rows, columns, first = [np.zeros(0, int)], [np.zeros(0, int)], 0
-    for b in blocks:
-        h, w = b.jac.shape
-        rows.append(np.repeat(np.arange(first, first + h), w))
-        columns.append(np.tile(b.columns, h))
-        first += h
-    r, c = np.concatenate(rows), np.concatenate(columns)
-    order = np.lexsort((r, c))
-    return _ccs(r[order], c[order], m, n), order
+    rows, columns = places(blocks)
+    order = np.lexsort((rows, columns))
+    return _ccs(rows[order], columns[order], m, n), order
 
 
 def _hessian_pattern(blocks: Sequence[Block], n: int) -> tuple[ca.Sparsity, np.ndarray, np.ndarray]:
@@ -201,41 +186,26 @@ def _ccs(rows: np.ndarray, columns: np.ndarray, m: int, n: int) -> ca.Sparsity:
     return ca.Sparsity(m, n, starts.tolist(), rows.tolist())
 
 
-@dataclass(frozen=True)
-class Ipopt:
-    """Options handed to IPOPT."""
-
-    max_iterations: int = 300
-    tol: float = 1e-9
-    verbose: bool = False
-
-    def solve(self, nlp: ShootingNlp, z0: Array, bounds: tuple[Array, Array], warm: NlpResult | None = None,
-              near: bool = False) -> NlpResult:
-        """Solve `nlp`.
-
-        `z0` may be near a solution, or there may be an earlier result of the same size.
-        """
-        function, derivatives = nlp.functions()
-        options: dict[str, Any] = {
-            "max_iter": self.max_iterations, "tol": self.tol, "constr_viol_tol": 1e-10, "dual_inf_tol": 1e-6,
-            "compl_inf_tol": 1e-8, "acceptable_iter": 0, "bound_relax_factor": 0.0, "nlp_scaling_method": "none",
-            "print_level": 5 if self.verbose else 0, "sb": "yes", "mu_strategy": "adaptive",
-        }
-        start = {"x0": z0}
-        if near:
-            options |= {"mu_strategy": "monotone", "mu_init": 1e-6, "bound_push": 1e-8, "bound_frac": 1e-8,
-                        "slack_bound_push": 1e-8, "slack_bound_frac": 1e-8}
-        if warm is not None:
-            options |= {"mu_strategy": "monotone", "mu_init": 1e-7, "warm_start_init_point": "yes",
-                        "warm_start_bound_push": 1e-9, "warm_start_mult_bound_push": 1e-9,
-                        "warm_start_slack_bound_push": 1e-9}
-            start |= {"lam_g0": warm.lam_g * nlp.scale, "lam_x0": warm.lam_x * nlp.scale}
-        solver = ca.nlpsol("solver", "ipopt", function, {
-            **derivatives, "no_nlp_grad": True, "calc_lam_p": False, "print_time": False, "show_eval_warnings": False,
-            "error_on_fail": False, "ipopt": options})
-        found = solver(**start, lbx=bounds[0], ubx=bounds[1], lbg=nlp.lower, ubg=nlp.upper)
-        stats = solver.stats()
-        costs = tuple(float(f) / nlp.scale for f in stats.get("iterations", {}).get("obj", []))
-        return NlpResult(np.asarray(found["x"]).ravel(), np.asarray(found["lam_g"]).ravel() / nlp.scale,
-                         np.asarray(found["lam_x"]).ravel() / nlp.scale, stats["return_status"],
-                         int(stats["iter_count"]), costs)
+def ipopt(nlp: ShootingNlp, z0: Array, bounds: tuple[Array, Array], options: Mapping[str, Any],
+          warm: NlpResult | None = None, near: bool = False) -> NlpResult:
+    """Solve `nlp` with some of IPOPT's `options`; `z0` may be `near` a solution, `warm` a result of the same size."""
+    function, derivatives = nlp.functions()
+    start = {"x0": z0}
+    told = {"constr_viol_tol": 1e-10, "dual_inf_tol": 1e-6, "compl_inf_tol": 1e-8, "acceptable_iter": 0,
+            "bound_relax_factor": 0.0, "nlp_scaling_method": "none", "sb": "yes", "mu_strategy": "adaptive", **options}
+    if near:
+        told |= {"mu_strategy": "monotone", "mu_init": 1e-6, "bound_push": 1e-8, "bound_frac": 1e-8,
+                 "slack_bound_push": 1e-8, "slack_bound_frac": 1e-8}
+    if warm is not None:
+        told |= {"mu_strategy": "monotone", "mu_init": 1e-7, "warm_start_init_point": "yes",
+                 "warm_start_bound_push": 1e-9, "warm_start_mult_bound_push": 1e-9,
+                 "warm_start_slack_bound_push": 1e-9}
+        start |= {"lam_g0": warm.lam_g * nlp.scale, "lam_x0": warm.lam_x * nlp.scale}
+    solver = ca.nlpsol("solver", "ipopt", function, {
+        **derivatives, "no_nlp_grad": True, "calc_lam_p": False, "print_time": False, "show_eval_warnings": False,
+        "error_on_fail": False, "ipopt": told})
+    found = solver(**start, lbx=bounds[0], ubx=bounds[1], lbg=nlp.lower, ubg=nlp.upper)
+    x, lam_g, lam_x = (np.asarray(found[name]).ravel() for name in ("x", "lam_g", "lam_x"))
+    stats = solver.stats()
+    costs = tuple(float(f) / nlp.scale for f in stats.get("iterations", {}).get("obj", []))
+    return NlpResult(x, lam_g / nlp.scale, lam_x / nlp.scale, stats["return_status"], costs)

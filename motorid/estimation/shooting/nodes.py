@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,7 +10,7 @@ import numpy as np
 import scipy
 
 from motorid.errors import SimulationError, UsageError, one_of
-from motorid.estimation.shooting.mesh import Mesh
+from motorid.estimation.shooting.mesh import Mesh, places
 from motorid.numerics.signals import Array, bridged, slope
 from motorid.records.experiment import Experiment
 
@@ -20,12 +20,7 @@ DISTURBED = ("i", "omega")  # an unknown voltage, an unknown torque
 
 
 def nodes_from_simulation(mesh: Mesh, q: Array) -> Array:
-    """Return states (n_nodes, nx) on the model's own trajectory at `q`.
-
-    Raises
-    ------
-    SimulationError
-    """
+    """Return states (n_nodes, nx) on the model's own trajectory at `q`; SimulationError if that fails."""
     problem = mesh.problem
     states = [problem.simulate(q, k, derivatives=False).x for k in range(len(problem.runs))]
     return np.array([states[v.run][v.last] for v in mesh.intervals if v.next >= 0]).reshape(-1, mesh.nx)
@@ -43,11 +38,9 @@ def nodes_from_data(mesh: Mesh, q: Array) -> Array:
             x = problem.unknowns.first_state(at, v.run)
         if v.next < 0:
             continue
-        try:
-            end = problem.integrator.run(problem.system, v.grid, x, at.p).x[-1]
-        except SimulationError:
-            end = x
-        x = end.copy()
+        with suppress(SimulationError):
+            x = problem.integrator.run(problem.system, v.grid, x, at.p).x[-1]
+        x = x.copy()
         for j, signal in signals[v.run].items():
             x[j] = signal[v.last]
         found[v.next] = x
@@ -89,27 +82,14 @@ def gaps_of(mesh: Mesh, z: Array) -> Gaps:
                 np.array([v.grid.t[-1] - v.grid.t[0] for v in before]), mesh.problem.system.states, values)
 
 
-def first_noise(mesh: Mesh) -> Array:
-    """Return process noise to begin with, (nx,)."""
-    share = [FIRST if n in DISTURBED else NEXT_TO_NONE for n in mesh.problem.system.states]
-    return mesh.scale * share
-
-
-def given_noise(given: Mapping[str, float], mesh: Mesh) -> Array:
-    """Return the user's process noise, (nx,).
-
-    Raises
-    ------
-    UsageError
-        If a state is not known or a value not positive.
-    """
-    states = mesh.problem.system.states
-    for name, value in given.items():
-        if name not in states:
-            raise UsageError(f"process_noise: {one_of(name, states, 'state')}")
-        if not value > 0:
-            raise UsageError(f"process_noise: '{name}' must be positive, got {value!r}.")
-    return np.array([given.get(n, NEXT_TO_NONE * s) for n, s in zip(states, mesh.scale, strict=True)])
+def first_noise(given: Any, mesh: Mesh) -> Array:
+    """Return process noise to begin with, (nx,): the user's by state, or ``"auto"``; next to none in other states."""
+    sizes = dict(zip(mesh.problem.system.states, mesh.scale, strict=True))
+    if given == "auto":
+        given = {n: FIRST * s for n, s in sizes.items() if n in DISTURBED}
+    if unknown := [n for n in given if n not in sizes]:
+        raise UsageError(f"process_noise: {one_of(unknown[0], sizes, 'state')}")
+    return np.array([given.get(n, NEXT_TO_NONE * s) for n, s in sizes.items()])
 
 
 def noise_of_gaps(done: Any) -> Array:
@@ -129,13 +109,9 @@ def reduced(mesh: Mesh, z: Array) -> tuple[Array, Array]:
     the covariance of q with the nodes unknown.
     """
     blocks = mesh.residual(z, mesh.walk(z, True))
-    starts = np.cumsum([0, *(len(b.values) for b in blocks)])
-    rows = np.concatenate([np.repeat(np.arange(a, a + len(b.values)), len(b.columns))
-                           for a, b in zip(starts[:-1], blocks, strict=True)])
-    columns = np.concatenate([np.tile(b.columns, len(b.values)) for b in blocks])
-    entries = np.concatenate([b.jac.ravel() for b in blocks])
-    whole = scipy.sparse.csc_matrix((entries, (rows, columns)), shape=(int(starts[-1]), len(z)))
     residual = np.concatenate([b.values for b in blocks])
+    entries = np.concatenate([b.jac.ravel() for b in blocks])
+    whole = scipy.sparse.csc_matrix((entries, places(blocks)), shape=(len(residual), len(z)))
     jac, nodes = whole[:, :mesh.nq].toarray(), whole[:, mesh.nq:]
     if not nodes.shape[1]:
         return residual, jac

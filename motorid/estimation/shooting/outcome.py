@@ -75,7 +75,7 @@ class Solved:
     def worse_than(self, z: Array) -> bool:
         """Tell whether a point `z` that the intervals join at is better than the end."""
         start = self.nlp.at(z, False)
-        if start is None or np.abs(start.g).max(initial=0.0) > JOINED:
+        if np.abs(start.g).max(initial=0.0) > JOINED:
             return False
         return self.status != "converged" or (self.cost - start.f) * self.nlp.scale > SAME * max(1, start.f)
 
@@ -112,18 +112,10 @@ class Solved:
 
 
 def fit_of(done: Solved, seconds: float) -> Fit:
-    """Return the `Fit`.
-
-    Raises
-    ------
-    FitError
-        If the constraints cannot be kept; the message names those in conflict.
-    """
+    """Return the `Fit`; FitError if the constraints cannot be kept, its message names those in conflict."""
     problem, q = done.problem, done.q
-    if done.status == "failed" and problem.constraints:
-        found = contradiction(problem, q)
-        if found:
-            raise FitError(found)
+    if done.status == "failed" and problem.constraints and (found := contradiction(problem, q)):
+        raise FitError(found)
     noisy = done.mesh.noise is not None
     residuals, jac = reduced(done.mesh, done.result.z) if noisy else problem.residual_and_jacobian(q)
     name = "process noise" if noisy else "hard" if problem.constraints else "plain"
@@ -198,11 +190,8 @@ def rows_at(problem: Problem, q: Array, relations: Sequence[Any] | None = None, 
             derivatives: bool = True) -> list[tuple[str, Part, Array, Array]]:
     """Return (name, part, rows, d rows/dq) of `relations` on the simulated trajectories at `q`.
 
-    `relations` are the problem's constraints unless given; without `derivatives` there are no columns.
-
-    Raises
-    ------
-    SimulationError
+    `relations` are the problem's constraints unless given; without `derivatives` there are no columns. SimulationError
+    if the model cannot be simulated there.
     """
     at = problem.unknowns.point(q)
     trajs = [problem.simulate(q, k, derivatives=derivatives) for k in range(len(problem.runs))]
@@ -244,8 +233,8 @@ def summed(found: Sequence[tuple[str, Part, Array, Array]]) -> tuple[tuple[Multi
     largest = max((float(np.abs(lam).max(initial=0.0)) for *_, lam in found), default=0.0)
     for name, part, values, lam in found:
         on = part.at_limit(values) & (np.abs(lam) > WEAK * largest)
-        for j in np.flatnonzero(on):
-            rows.append(Multiplier(name, part.labels[j], float(abs(lam[j]) / part.size[j]), part.units[j], 1))
+        rows += [Multiplier(name, part.labels[j], float(abs(lam[j]) / part.size[j]), part.units[j], 1)
+                 for j in np.flatnonzero(on)]
         for unit in dict.fromkeys(part.units):
             mine = on & np.array([u == unit for u in part.units])
             value, active = sums.get((name, unit), (0.0, 0))
