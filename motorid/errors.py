@@ -231,6 +231,12 @@ def name_of(thing: object) -> str:
     return repr(thing) if isinstance(thing, str) else getattr(thing, "__name__", type(thing).__name__)
 
 
+def among(word: object, known: Iterable[object], what: str) -> None:
+    """Raise UsageError unless `word` is among the `known` names of `what`."""
+    if word not in (known := list(known)):
+        raise UsageError(one_of(str(word), known, what))
+
+
 def one_of(word: str, known: Iterable[object], what: str) -> str:
     """Say that `word` is not among the `known` names of `what`, and which one may have been meant."""
     import difflib

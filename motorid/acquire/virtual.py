@@ -18,7 +18,7 @@ import numpy as np
 from motorid.acquire.excitation import Program, Segment
 from motorid.acquire.protocol import SILENCE, Channel, Decoder, Header, Message, frame
 from motorid.channels import CHANNELS
-from motorid.errors import UsageError, at_least, one_of
+from motorid.errors import UsageError, among, at_least, one_of
 from motorid.records.datasets import load_plant
 
 LINES_PER_TURN = 4096  # encoder counts, after quadrature
@@ -43,8 +43,7 @@ class VirtualDevice:
         self.truth, m = truth, truth.motor
         known = _channels(m, encoder_bits)
         for name in channels:
-            if name not in known:
-                raise UsageError(one_of(name, known, "channel"))
+            among(name, known, "channel")
         self.header = Header("virtual motor", rate, tuple(known[c] for c in channels), counter_bits,
                              timer_bits, m.v_max, m.i_max)
         self._rng = np.random.default_rng([truth.seed, 1])
@@ -247,8 +246,7 @@ def hide(words: str = "random", motor: str = "lab", seed: int = 0) -> Truth:
     seed : int
     """
     plant = load_plant()
-    if motor not in plant.MOTORS:
-        raise UsageError(one_of(motor, plant.MOTORS, "motor"))
+    among(motor, plant.MOTORS, "motor")
     rng = np.random.default_rng(seed)
     nominal = plant.MOTORS[motor]
     real = replace(nominal, **{k: getattr(nominal, k) * float(rng.uniform(0.9, 1.1)) for k in "RLKbJ"})

@@ -14,7 +14,7 @@ from motorid.diagnosis.experiment_design import Design, design_experiment
 from motorid.diagnosis.results import Diagnosis
 from motorid.display.cards import Card, Flag, Printed, Table
 from motorid.display.numbers import percent
-from motorid.errors import FitError, UsageError, at_least, one_of, positive
+from motorid.errors import FitError, among, at_least, positive
 from motorid.estimation.fit import fit
 from motorid.model.model import dc_motor
 from motorid.records.experiment import Experiment
@@ -110,8 +110,7 @@ def identify_on(bench: str | Link, folder: str | Path = ".", *, goal: str = "dis
     >>> bench = mi.virtual_bench("coulomb")
     >>> campaign = mi.identify_on(bench, "bench", v_max=8, i_max=8)  # doctest: +SKIP
     """
-    if goal not in ("distinguish", "sharpen"):
-        raise UsageError(one_of(goal, ("distinguish", "sharpen"), "goal"))
+    among(goal, ("distinguish", "sharpen"), "goal")
     at_least(1, records=records)
     positive(until=until, v_max=v_max, i_max=i_max, duration=duration)
     say, folder = progress or (lambda sentence: None), Path(folder)

@@ -32,7 +32,7 @@ from motorid.diagnosis.design_criteria import (
 from motorid.diagnosis.results import Diagnosis
 from motorid.display.cards import Card, Flag, Printed, Shown, Table
 from motorid.display.numbers import number, quantity
-from motorid.errors import FitError, MotoridError, UsageError, at_least, one_of, positive
+from motorid.errors import FitError, MotoridError, UsageError, among, at_least, one_of, positive
 from motorid.estimation.result import Fit
 from motorid.numerics.parallel import budget as limited_time
 from motorid.numerics.parallel import one_thread
@@ -431,8 +431,7 @@ def _rivals(found: Any, goal: str | None) -> tuple[list[Rival], str]:
 def _asked(rival: Rival, parameters: Sequence[str] | None) -> tuple[str, ...]:
     free = rival.model.free_names
     for name in parameters or ():
-        if name not in free:
-            raise UsageError(one_of(name, free, "free parameter"))
+        among(name, free, "free parameter")
     return tuple(parameters or free)
 
 
@@ -443,8 +442,7 @@ def _check_span(duration: float, dt: float) -> None:
 
 
 def _check_words(shape: str, levels: int, slew: float | None) -> None:
-    if shape not in SHAPES:
-        raise UsageError(one_of(shape, SHAPES, "shape"))
+    among(shape, SHAPES, "shape")
     if not 2 <= levels <= MOST_SEGMENTS:
         raise UsageError(f"levels must lie between 2 and {MOST_SEGMENTS}; got {levels}.")
     if slew is not None and (shape == "steps" or not slew > 0):

@@ -24,7 +24,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from motorid.errors import UsageError, one_of
+from motorid.errors import among
 from motorid.numerics.autoregression import Colour, colour_of, weighed
 from motorid.numerics.least_squares import seen_directions
 from motorid.numerics.signals import Array
@@ -76,8 +76,7 @@ def certainty(problem: Problem, q: Array, residuals: Array, jacobian: Array, fre
 
     `free` (k, m) are the directions that active constraints leave; ``method="white"`` takes samples as independent.
     """
-    if method not in ("coloured", "white"):
-        raise UsageError(one_of(method, ("coloured", "white"), "method"))
+    among(method, ("coloured", "white"), "method")
     physical = problem.scaling.physical(q)
     limits = [_limit(p.lower, p.upper, v) for p, v in zip(problem.unknown, physical, strict=True)]
     loose = np.array([not s for s in limits], bool)

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from motorid.display.numbers import listed
-from motorid.errors import ModelError, UsageError, name_of, numbers_told, one_of
+from motorid.errors import ModelError, UsageError, among, name_of, numbers_told, one_of
 from motorid.estimation.angle_orders import effects_of_unknown_order, strongest_order, uses_angle
 from motorid.estimation.continuation import by_continuation
 from motorid.estimation.least_squares import FAILURES, FINISH, Callback, Estimate, least_squares
@@ -148,8 +148,7 @@ def solve(problem: Problem, solver: Any = None, *, start: str = "auto", callback
     """
     began = time.perf_counter()
     check_solver(solver)
-    if start not in ("auto", "model"):
-        raise UsageError(one_of(start, ("auto", "model"), "start"))
+    among(start, ("auto", "model"), "start")
     if not problem.unknown:
         raise UsageError("every parameter is fixed, there is nothing to fit. Free one, model.free('R'), or judge "
                          "the model as it is: mi.evaluate(model, runs).")

@@ -14,7 +14,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from motorid.errors import DataError, MotoridError, UsageError, one_of
+from motorid.errors import DataError, MotoridError, UsageError, among
 from motorid.estimation.result import SAVED, Fit
 from motorid.estimation.shooting.outcome import Multiplier
 from motorid.exporters.c_code import c_files
@@ -119,8 +119,7 @@ def export(found: Fit | Model | Exported, path: str | os.PathLike[str], to: str 
     if form is None:
         raise UsageError(f"what to write is not clear from '{target.name}': end it with {', '.join(FORMS)}, or say "
                          "to='casadi'.")
-    if form not in _CONTENTS:
-        raise UsageError(one_of(form, _CONTENTS, "form"))
+    among(form, _CONTENTS, "form")
     if isinstance(found, Exported):
         found = found.model
     model_of(found)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from motorid.errors import UsageError, one_of
+from motorid.errors import among
 from motorid.integrate.engine import Engine, Grid, Trajectory
 from motorid.integrate.rosenbrock import Rosenbrock
 from motorid.integrate.sundials import Cvodes, Idas
@@ -15,8 +15,7 @@ ENGINES = {"rosenbrock": Rosenbrock, "cvodes": Cvodes, "idas": Idas}
 def engine_of(engine: str | Engine) -> Engine:
     """Return the engine of that name, or the engine itself; UsageError if the name is not known."""
     if isinstance(engine, str):
-        if engine not in ENGINES:
-            raise UsageError(one_of(engine, ENGINES, "engine"))
+        among(engine, ENGINES, "engine")
         return ENGINES[engine]()
     return engine
 

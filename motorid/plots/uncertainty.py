@@ -13,7 +13,7 @@ from scipy.interpolate import PchipInterpolator
 from scipy.special import stdtrit
 
 from motorid.display.numbers import glued, number, quantity
-from motorid.errors import UsageError, one_of
+from motorid.errors import UsageError, among
 from motorid.estimation.result import Fit
 from motorid.numerics.signals import Array
 from motorid.plots import style
@@ -189,8 +189,7 @@ def plot_sensitivities(fit: Fit, *, run: int = 0, names: Sequence[str] | None = 
     problem = fit.problem
     free = [p.name for p in problem.unknown if p.name in fit.values]
     for n in names or ():
-        if n not in free:
-            raise UsageError(one_of(n, free, "estimated parameter"))
+        among(n, free, "estimated parameter")
     style.refuse_index(run, len(problem.runs))
     trajectory, record = problem.simulate(fit.q, run), problem.experiments[run]
     assert trajectory.dy is not None

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from motorid.channels import CHANNELS
-from motorid.errors import ModelError, SimulationError, UsageError, name_of, one_of
+from motorid.errors import ModelError, SimulationError, UsageError, among, name_of, one_of
 from motorid.integrate import engine_of, limited
 from motorid.integrate.engine import Engine, Trajectory
 from motorid.model.definition import Parameter
@@ -75,8 +75,7 @@ class Problem:
         if not runs or not all(isinstance(r, Experiment) for r in runs):
             raise UsageError("a problem needs at least one Experiment: runs = mi.read_runs('run*.csv').")
         object.__setattr__(self, "experiments", tuple(_without_empty(r) for r in runs))
-        if self.weights not in ("noise", "rms"):
-            raise UsageError(one_of(self.weights, ("noise", "rms"), "weights"))
+        among(self.weights, ("noise", "rms"), "weights")
         if not self.outputs:
             raise ModelError("none of the channels that the model shows was measured; a fit needs at least "
                              "one of i, omega, theta (torque_driven: omega or theta).")

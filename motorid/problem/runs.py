@@ -15,7 +15,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from motorid.channels import CHANNELS, NAMES
-from motorid.errors import ModelError, UsageError, one_of
+from motorid.errors import ModelError, among
 from motorid.integrate.engine import Grid
 from motorid.model.definition import Parameter
 from motorid.numerics.signals import Array, bridged, integral, noise_level, window_slopes
@@ -118,8 +118,7 @@ def initial_state(run: Experiment, sigma: Mapping[str, float],
     the first samples allow, so that a model which lacks something cannot hide it in an initial state that never was.
     ``estimate``: everything, without limits.
     """
-    if initial not in INITIAL:
-        raise UsageError(one_of(initial, INITIAL, "initial state"))
+    among(initial, INITIAL, "initial state")
     rest, lead = at_rest(run, sigma)
     known = rest if initial == "auto" else initial == "rest"
     start, reach = np.zeros(3), {}

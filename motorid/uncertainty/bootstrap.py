@@ -13,7 +13,7 @@ import numpy as np
 
 from motorid.display.cards import Card, Flag, Printed, Table, value_cell
 from motorid.display.numbers import interval_text, percent
-from motorid.errors import FitError, MotoridError, UsageError, at_least, one_of
+from motorid.errors import FitError, MotoridError, UsageError, among, at_least
 from motorid.estimation.least_squares import least_squares
 from motorid.estimation.result import Failure, Fit
 from motorid.numerics.autoregression import Colour, colour_of
@@ -75,8 +75,7 @@ class Bootstrap(Printed):
 
     def interval(self, name: str, level: float = 0.95) -> tuple[float, float] | None:
         """Return the percentile interval of a parameter; None where the data do not determine it."""
-        if name not in self.names:
-            raise UsageError(one_of(name, self.names, "parameter"))
+        among(name, self.names, "parameter")
         if self.status[name] == "not determined":
             return None
         tail = 50 * (1 - level)
@@ -153,8 +152,7 @@ def bootstrap(fit: Fit, *, kind: str = "blocks", n: int = 200, block: int | None
     --------
     >>> spread = mi.bootstrap(better, n=10, quiet=True)
     """
-    if kind not in KINDS:
-        raise UsageError(one_of(kind, KINDS, "kind of bootstrap"))
+    among(kind, KINDS, "kind of bootstrap")
     for least, given in ((2, {"n": n}), (1, {"block": block}), (0, {"seed": seed})):
         at_least(least, **given)
     if kind == "runs" and len(fit.problem.experiments) < FEWEST_RUNS:

@@ -13,7 +13,7 @@ import scipy
 from motorid.channels import channel_name
 from motorid.display.cards import Card, Cell, Flag, Printed, Table, value_cell
 from motorid.display.numbers import interval_text, percent
-from motorid.errors import UsageError, one_of
+from motorid.errors import UsageError, among
 from motorid.estimation.result import Fit, checked
 from motorid.numerics.autoregression import Colour
 from motorid.numerics.parallel import one_thread
@@ -80,8 +80,7 @@ class Covariance(Printed):
         Student's t on the effective degrees of freedom; on the logarithmic scale where a positive parameter's
         interval would come near zero.
         """
-        if name not in self.names:
-            raise UsageError(one_of(name, self.names, "parameter"))
+        among(name, self.names, "parameter")
         check_level(level)
         sd, j = self.std[name], self.names.index(name)
         if sd is None:

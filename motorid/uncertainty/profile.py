@@ -17,7 +17,7 @@ import scipy
 
 from motorid.display.cards import Card, Flag, Printed, Table
 from motorid.display.numbers import interval_text, percent, quantity
-from motorid.errors import MotoridError, UsageError, one_of
+from motorid.errors import MotoridError, among
 from motorid.estimation.least_squares import least_squares
 from motorid.estimation.result import Fit
 from motorid.numerics.least_squares import LevenbergMarquardt, seen_directions
@@ -163,8 +163,7 @@ def profiles(fit: Fit, names: Sequence[str] | None = None, *, level: float = 0.9
     """
     free = fit.problem.model.free_names
     for n in names or ():
-        if n not in free:
-            raise UsageError(one_of(n, free, "free parameter"))
+        among(n, free, "free parameter")
     chosen = tuple(names or free)
     check_level(level)
     plans = {n: _plan(fit, n, level) for n in chosen}

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from motorid.errors import FitError, SimulationError, UsageError, at_least, one_of, positive
+from motorid.errors import FitError, SimulationError, UsageError, among, at_least, one_of, positive
 from motorid.estimation.fit import minimise
 from motorid.estimation.least_squares import FINISH, least_squares
 from motorid.estimation.result import Fit
@@ -77,8 +77,7 @@ class MultipleShooting:
     verbose: bool = False
 
     def __post_init__(self) -> None:
-        if self.warm not in ("auto", "data", "model"):
-            raise UsageError(one_of(str(self.warm), ("auto", "data", "model"), "warm start"))
+        among(self.warm, ("auto", "data", "model"), "warm start")
         if isinstance(self.process_noise, str) and self.process_noise != "auto":
             raise UsageError(one_of(self.process_noise, ("auto",), "process noise"))
         at_least(2, every=self.every)
