@@ -19,7 +19,7 @@ from motorid.diagnosis.admissibility import objections
 from motorid.diagnosis.cross_validation import HeldOut
 from motorid.diagnosis.misspecification import LIMITER
 from motorid.diagnosis.model_comparison import COMMON, Node, beats, evidence, far, node_of, superfluous
-from motorid.diagnosis.predictive_score import Evidence, is_sure
+from motorid.diagnosis.predictive_score import Evidence
 from motorid.diagnosis.refit import GivenUp, Task, completed, hidden_in, lost, refit, refits, widened
 from motorid.diagnosis.results import Candidate
 from motorid.diagnosis.score_test import Score, pairs_of, rank, uses_angle, with_phase_per_run, with_warm_start
@@ -234,29 +234,27 @@ class Search:
         several = len(set(self.root.fit.problem.unknowns.firsts)) > 1
         return several and (not uses_angle(effect) or any(uses_angle(e) for e in model.effects))
 
-    def expand_by_two(self, node: Node, refused: Sequence[Candidate]) -> list[Node]:
-        """Return the judged models larger by two effects that only together show: each alone was refused.
-
-        What surely predicts better on the whole, but held-out runs worse, may be right where these lack something else
-        too: the best of `refused` that does so gets a second effect.
-        """
-        present, pairs = node.fit.model, []
+    def expand_by_two(self, node: Node) -> list[Node]:
+        """Return the judged models larger by two effects that only together show: each alone was refused."""
+        present, tasks = node.fit.model, []
         for a, b in pairs_of(node.fit, self._shortlist(node), PAIRS):
             with contextlib.suppress(ModelError):
-                pairs.append(Task(node.fit, present + a.effect + b.effect, a.effect, _merged(a, b)))
-        groups = [pairs]
-        for c in sorted(refused, key=lambda c: -(c.gain or 0.0))[:1]:
-            if c.fit is not None and is_sure(c.gain or 0.0, c.gain_se or 0.0):
-                half = replace(node, fit=c.fit, added=c.effect, parent=node)
-                groups.append([Task(c.fit, c.fit.model + s.effect, s.effect, s.starts, s.drop)
-                               for s in self._shortlist(half)])
-        children = []
-        for tasks in groups:
-            for task, fit in zip(tasks, refits(tasks, self.map), strict=True):
-                child, _ = self._judge(node, task.model.effects[len(present.effects) :], fit)
-                children += [child] if child is not None else []
-        self.stages.done(f"refitted {sum(map(len, groups))} pairs")
-        return children
+                tasks.append(Task(node.fit, present + a.effect + b.effect, a.effect, _merged(a, b)))
+        return self._together(node, tasks)
+
+    def expand_from(self, node: Node, refused: Candidate) -> list[Node]:
+        """Return the judged models with a refused effect and one more, sought from where the first leads."""
+        assert refused.fit is not None
+        half, model = replace(node, fit=refused.fit, added=refused.effect, parent=node), refused.fit.model
+        scores = self._shortlist(half)
+        return self._together(node, [Task(half.fit, model + s.effect, s.effect, s.starts, s.drop) for s in scores])
+
+    def _together(self, node: Node, tasks: Sequence[Task]) -> list[Node]:
+        first = len(node.fit.model.effects)
+        fits = zip(tasks, refits(tasks, self.map), strict=True)
+        judged = [self._judge(node, task.model.effects[first:], fit)[0] for task, fit in fits]
+        self.stages.done(f"refitted {len(tasks)} pairs")
+        return [child for child in judged if child is not None]
 
     def _judge(self, node: Node, effects: Sequence[Effect], fit: Fit | GivenUp | None) -> tuple[Node | None, Candidate]:
         effect = effects[0]

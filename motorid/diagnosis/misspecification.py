@@ -14,7 +14,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from motorid.diagnosis.admissibility import objections
-from motorid.diagnosis.free_forms import Form, Linear, contains, effect_force, force_of, form_columns, linearised, ridge
+from motorid.diagnosis.free_forms import (
+    Form,
+    Linear,
+    contains,
+    effect_force,
+    force_of,
+    form_columns,
+    linearised,
+    pushes_of,
+    ridge,
+)
 from motorid.diagnosis.model_comparison import Node, evidence, far
 from motorid.diagnosis.predictive_score import (
     Evidence,
@@ -31,6 +41,7 @@ from motorid.estimation.least_squares import FAILURES
 from motorid.estimation.linearisation import INSEPARABLE
 from motorid.estimation.result import Fit
 from motorid.model.definition import Effect
+from motorid.problem.runs import SGN_WIDTH_SHARE
 from motorid.records.checks import current_limit
 
 AHEAD = 3  # functions of a curve that may help only together, beyond the best set so far
@@ -158,7 +169,7 @@ def grades_of(last: Node, root: Node, groups: Sequence[Sequence[str]], beside: S
     for e in (e for e in last.fit.model.effects if e.name not in root.key):
         why, form = objections(last.fit, e, root.fit), None
         why = why or ("it may only stand in for the driver's current limit" if limited else "")
-        why = why or _insignificant(last.fit, e, structure)
+        why = why or _insignificant(last.fit, e, structure) or _within_smoothing(last.fit, e)
         smaller = without(e.name) if not why and (structure or far(last.fit)) else None
         if smaller is not None:
             free = [b for b in beside if not compare(b.predictions, beside[0].predictions).sure]
@@ -184,7 +195,8 @@ def _more(fall: float, taken: float) -> float:
 def _insignificant(fit: Fit, effect: Effect, structure: bool) -> str:
     """Say so where every size of an effect is within two deviations of nothing.
 
-    One without a deviation may be any; of a law whose sizes are all open little is known, unless it leaves noise alone.
+    One without a deviation may be any; of a law whose sizes are all open, although the current was measured, little is
+    known, unless it leaves noise alone.
     """
     own = [p for p in effect.parameters if fit.problem.model.parameters[p.name].vary]
     sizes = [p.name for p in own if p.null == 0]
@@ -193,8 +205,21 @@ def _insignificant(fit: Fit, effect: Effect, structure: bool) -> str:
     if sizes and not any(std is None or STANDARD_ERRORS * std < abs(value) for value, std in found):
         return f"{listed(sizes)} could as well be zero, within two standard deviations"
     open_ = [p.name for p in own if not sizes or p.name in sizes]
-    if structure and open_ and not any(p.per_run for p in own) and all(fit.std[n] is None for n in open_):
+    shown = "i" in fit.problem.outputs and not any(p.per_run for p in own)
+    if structure and open_ and shown and all(fit.std[n] is None for n in open_):
         return f"{listed(open_)} {'is' if len(open_) == 1 else 'are'} not determined, and the rest is not noise"
+    return ""
+
+
+def _within_smoothing(fit: Fit, effect: Effect) -> str:
+    """Say so where an effect does less than what a smooth sgn, so wide, gets wrong of the friction beside it."""
+    if effect.balance != "torque" or "sgn_width" not in fit.values:
+        return ""
+    at = fit.problem.system.states.index("omega")
+    forces = {e.name: max((float(np.sqrt(np.mean(pushes_of(fit, p.name)[:, at] ** 2))) for p in e.parameters
+                           if p.null == 0 and p.vary), default=0.0) for e in fit.model.effects if e.balance == "torque"}
+    if forces[effect.name] < SGN_WIDTH_SHARE * max(forces.values()):
+        return f"it does less than {percent(SGN_WIDTH_SHARE, 1)} of what the others do, as a smooth sgn gets wrong"
     return ""
 
 

@@ -13,12 +13,15 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
+import numpy as np
+
 from motorid.diagnosis.adequacy import judge_adequacy
 from motorid.diagnosis.candidates import Search, Stages, library
 from motorid.diagnosis.cross_validation import QUICK, HeldOut
 from motorid.diagnosis.input_hypotheses import Reading, better_reading, without_spikes
 from motorid.diagnosis.misspecification import FormGain, Grade, better_forms, grades_of
 from motorid.diagnosis.model_comparison import Node, at_noise, beats, choose, evidence, far, group_of, node_of
+from motorid.diagnosis.predictive_score import is_sure
 from motorid.diagnosis.record_parts import affordable, thinned_alike
 from motorid.diagnosis.refit import INTERRUPTED, OUT_OF_TIME
 from motorid.diagnosis.results import Adequacy, Candidate, Ladder, Rung
@@ -97,9 +100,12 @@ def _rounds(found: Climb, max_effects: int) -> Iterator[Climb]:
         children, listed, stopped = _grown(search, frontier)
         found = replace(found, rounds=(*found.rounds, tuple(listed)), stopped=stopped)
         chosen = _better(children.values(), best)
-        if chosen is None and room > 1 and not stopped and far(best.fit):
-            children = {c.key: c for c in search.expand_by_two(best, listed)}
-            chosen = _better(children.values(), best)
+        if room > 1 and not stopped and far(best.fit):
+            pairs = [] if chosen else search.expand_by_two(best)
+            if (refused := _outdoing(listed, list(children.values()), best, chosen and chosen[0])) is not None:
+                pairs += search.expand_from(best, refused)
+            children |= {c.key: c for c in pairs}
+            chosen = _better(pairs, best) or chosen
         if chosen is None:
             yield replace(found, text="stopped: no further effect lowers the error on data left out")
             return
@@ -172,6 +178,22 @@ def _better(children: Iterable[Node], best: Node) -> tuple[Node, list[Node]] | N
     falls = ((c, evidence(best, c).held_out_fall) for c in better)
     sound = [c for c in better if not c.objection]
     return choose(sound or [c for c, fall in falls if fall is None or fall > MATERIAL], best)
+
+
+def _outdoing(listed: Sequence[Candidate], children: Sequence[Node], best: Node,
+              chosen: Node | None) -> Candidate | None:
+    """Return what surely predicts more on the whole than the best child, although held-out runs refuse it.
+
+    It may be right where these lack something else as well: a spring whose motor friction holds there, a weight
+    beside a cogging.
+    """
+    known = [c for c in listed if c.fit is not None and c.gain is not None and c.gain_se is not None]
+    first = max(known, key=lambda c: c.gain or 0.0, default=None)
+    if first is None or any(first.effect in child.key for child in children):
+        return None
+    than = evidence(best, chosen) if chosen is not None else None
+    gain, se = (than.gain, than.se) if than else (0.0, 0.0)
+    return first if is_sure((first.gain or 0.0) - gain, float(np.hypot(first.gain_se or 0.0, se))) else None
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,7 +16,8 @@ from motorid.diagnosis.free_forms import Form
 from motorid.diagnosis.misspecification import FormGain
 from motorid.diagnosis.model_comparison import node_of, tied
 from motorid.diagnosis.predictive_score import Evidence, Predictions
-from motorid.diagnosis.stepwise import _runners_up
+from motorid.diagnosis.results import Candidate
+from motorid.diagnosis.stepwise import _outdoing, _runners_up
 
 HIDDEN = {"coulomb": {"tau_c": 8e-3}}
 DRIVES = ("stairs", "ramps", "steps")
@@ -158,3 +159,27 @@ def test_a_model_that_ties_with_the_best_is_grown_too(rubbing):
                         for e in (mi.effects.coulomb, mi.effects.coulomb_asymmetric, mi.effects.constant_load))
     assert tied(best, tie)
     assert _runners_up(best, [best, tie, worse]) == [tie]
+
+
+@pytest.mark.parametrize(("gain", "said"), [(1e4, True), (1.0, False)])
+def test_what_surely_predicts_far_more_than_the_best_child_is_not_forgotten(rubbing, gain, said):
+    """Held-out runs refuse a weight beside cogging, and friction that gains little would be taken."""
+    plain, check = rubbing
+    held, root = HeldOut.of(plain, check), node_of(plain, HeldOut.of(plain, check))
+    chosen = node_of(mi.fit(plain.model + mi.effects.quadratic_drag, plain.problem.experiments), held,
+                     "quadratic_drag", root)
+    refused = Candidate("coulomb", 0.9, gain=gain, gain_se=10.0, fit=plain)
+    listed = [refused, Candidate("lugre", 0.9), Candidate("stribeck", 0.9, gain=-3.0, gain_se=1.0, fit=plain)]
+    assert _outdoing(listed, [chosen], root, chosen) is (refused if said else None)
+    child = node_of(mi.fit(plain.model + mi.effects.coulomb, plain.problem.experiments), held, "coulomb", root)
+    assert _outdoing(listed, [child], root, child) is None
+
+
+@pytest.mark.parametrize(("size", "said"), [(4e-6, True), (4e-4, False)])
+def test_a_load_of_less_than_a_thousandth_of_the_friction_beside_it_is_no_name(rubbing, size, said):
+    """A smooth sgn gets as much wrong, which a fine encoder sees."""
+    plain, _ = rubbing
+    both = mi.fit(plain.model + mi.effects.coulomb + mi.effects.constant_load, plain.problem.experiments)
+    fit = replace(both, values=both.values | {"tau_c": 8e-3, "tau_0": size})
+    assert bool(misspecification._within_smoothing(fit, mi.effects.constant_load)) == said
+    assert not misspecification._within_smoothing(fit, mi.effects.coulomb)

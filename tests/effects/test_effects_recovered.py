@@ -68,9 +68,9 @@ def volts(t: np.ndarray, kind: int) -> np.ndarray:
     return np.where(t < 0.02, 0, steps[np.minimum((t / 0.06).astype(int), 199)] + 2 * np.sin(4.4 * t))
 
 
-def records(effect, rng):
+def records(effect, rng, **other):
     t = np.arange(2400) * 1e-3
-    model = (mi.dc_motor(**VALUES) + effect).replace(**TRUTH[effect.name])
+    model = (mi.dc_motor(**VALUES) + effect).replace(**TRUTH[effect.name] | other)
     channels = tuple(NOISE)
     clean = [simulated(t, volts(t, k), channels, model) for k in (0, 1)]
     if "sgn_width" in model.parameters:  # the width that a fit of these records will choose
@@ -105,3 +105,13 @@ def test_is_found_again_from_its_own_data(name, rng):
         assert fit.values[n] == pytest.approx(value, rel=0.01), n
     plain = mi.fit(mi.dc_motor().fix(**{n: v for n, v in known.items() if n in VALUES}), runs)
     assert plain.chi2 > 1.05 * fit.chi2  # the effect was there to be found
+
+
+@pytest.mark.slow
+def test_a_gap_of_radians_is_found(rng):
+    """At the shaft of a geared motor the play of its gear is as many times as large."""
+    runs = records(LIBRARY["backlash"], rng, gap=2.5)
+    found = mi.diagnose(mi.fit(mi.dc_motor(), runs), effects=["backlash", "compliance"])
+    assert found.effects == ("backlash",)
+    assert found.after.values["gap"] == pytest.approx(2.5, rel=0.02)
+    assert found.after.fits == "noise"
