@@ -23,6 +23,7 @@ from motorid.estimation.least_squares import FAILURES, Estimate
 from motorid.estimation.restarts import collapsed_again, restored
 from motorid.estimation.result import Fit
 from motorid.estimation.start_values import ABOVE, sizes_like
+from motorid.integrate import ahead as engine_ahead
 from motorid.model.definition import Effect
 from motorid.model.model import Model
 from motorid.numerics.least_squares import LevenbergMarquardt
@@ -60,7 +61,7 @@ def raced(fit: Fit, model: Model, starts: Sequence[Mapping[str, float]]) -> Race
     """
     model = _bounded(fit, model)
     alive = restored(fit, model)
-    angular = any(uses_angle(e) for e in model.effects) and not any(uses_angle(e) for e in fit.model.effects)
+    angular = _brings_in_the_angle(fit, model)
     starts, found = starts or ({},), []
     # A guess of the larger model's own, along the records, is no longer led astray.
     entries = [(start, angular) for start in starts] + [
@@ -76,6 +77,11 @@ def raced(fit: Fit, model: Model, starts: Sequence[Mapping[str, float]]) -> Race
                 found.append(Raced(restarted(done.problem, done.q), float(done.cost), reach, along))
                 break
     return min(found, key=lambda r: r.cost, default=None)
+
+
+def _brings_in_the_angle(fit: Fit, model: Model) -> bool:
+    """Tell whether the model is the first with effects of the angle."""
+    return any(uses_angle(e) for e in model.effects) and not any(uses_angle(e) for e in fit.model.effects)
 
 
 def promised(fit: Fit, model: Model, starts: Sequence[Mapping[str, float]]) -> float:
@@ -287,13 +293,14 @@ class GivenUp:
     begun: tuple[Task, Raced] | None = None
 
 
-def refits(tasks: Sequence[Task], map_: Callable[..., Iterable[Any]]) -> list[Fit | GivenUp | None]:
+def refits(tasks: Sequence[Task], map_: Callable[..., Iterable[Any]], *,
+           ahead: bool = False) -> list[Fit | GivenUp | None]:
     """Return the refit of each task, None where none can be simulated; what is not done when the time is up, or when
-    it is interrupted, is given up. All are on the same records.
+    it is interrupted, is given up. All are on the same records. `ahead` compiles beside the work at hand.
     """
     found: dict[int, Fit | GivenUp | None] = {}
     try:
-        _refit_all(tasks, map_, found)
+        _refit_all(tasks, map_, found, ahead)
     except (OutOfTime, KeyboardInterrupt) as error:
         interruption.heard()
         why = GivenUp(OUT_OF_TIME if isinstance(error, OutOfTime) else INTERRUPTED)
@@ -302,7 +309,7 @@ def refits(tasks: Sequence[Task], map_: Callable[..., Iterable[Any]]) -> list[Fi
 
 
 def _refit_all(tasks: Sequence[Task], map_: Callable[..., Iterable[Any]],
-               found: dict[int, Fit | GivenUp | None]) -> None:
+               found: dict[int, Fit | GivenUp | None], ahead: bool) -> None:
     """Put the refit of each task into `found` as it comes: the one that promises most first, then by their races."""
     races: dict[int, Raced] = {}
     leader, alone = _leader(tasks), False
@@ -312,6 +319,8 @@ def _refit_all(tasks: Sequence[Task], map_: Callable[..., Iterable[Any]],
             alone = True
             found.update(_unpromising(tasks, leader) | _needless(tasks, leader, best, map_))
     entered = [k for k in range(len(tasks)) if k not in races and k not in found]
+    for k in entered if ahead else ():
+        _foresee(tasks[k], alone)
     done = map_(_race_tournament, [(tasks[k], alone) for k in entered])
     races |= {k: race for k, race in zip(entered, done, strict=True) if race is not None}
     if races:
@@ -396,6 +405,15 @@ def _race_tournament(entry: tuple[Task, bool]) -> Raced | None:
     """Race a task; its best start alone, where only what comes near a winner matters."""
     task, alone = entry
     return raced(task.fit, task.model, task.starts[:1] if alone else task.starts)
+
+
+def _foresee(task: Task, alone: bool) -> None:
+    """Tell the engine what a race of a task will ask for."""
+    with contextlib.suppress(*FAILURES):
+        starts = task.starts[:1 if alone else None] or ({},)
+        problem = _started(task.fit, _bounded(task.fit, task.model), starts[0], _brings_in_the_angle(task.fit, task.model))
+        steps = sum(run.n for run in problem.experiments) * RACE.max_iterations * len(starts)
+        engine_ahead(problem.integrator, problem.system, steps)
 
 
 def _finish(begun: tuple[Task, Raced]) -> Fit | None:

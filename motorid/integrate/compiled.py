@@ -6,10 +6,12 @@ nothing is compiled again for another run length, number of sub-steps or set of 
 
 from __future__ import annotations
 
+import atexit
 import ctypes
 import hashlib
 import os
 import platform
+import re
 import shutil
 import stat
 import subprocess
@@ -28,6 +30,7 @@ from motorid.integrate.rodas3 import StepFunctions
 # those of the virtual machine to the last bit, and so the same whether a step was compiled before, now or never.
 FLAGS = ("-Og", "-fPIC", "-shared", *(() if sys.platform == "darwin" else ("-Wl,-Bsymbolic",)),
          "-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math")
+GCC_FLAGS = ("--param", "ira-max-conflict-table-size=0")  # a third of the time for a step of 5,000 instructions less
 _told: set[str] = set()
 
 DRIVER = r"""
@@ -176,6 +179,13 @@ def compiler() -> tuple[str, str] | None:
     return None
 
 
+def flags() -> tuple[str, ...]:
+    """Return what the compiler is asked for."""
+    cc = compiler()
+    gcc = cc is not None and re.match(r"(\S*-)?g?cc(-\d+)? \(", cc[1])  # clang and tcc say "version" there
+    return (*FLAGS, *GCC_FLAGS) if gcc else FLAGS
+
+
 def say_once(text: str) -> None:
     """Print one line on standard error, the first time only."""
     if text not in _told:
@@ -199,7 +209,7 @@ def mark_of(key: str) -> str | None:
     cc = compiler()
     if cc is None:
         return None
-    parts = "\0".join([key, *cc, *FLAGS, DRIVER, platform.machine(), ca.__version__])
+    parts = "\0".join([key, *cc, *flags(), DRIVER, platform.machine(), ca.__version__])
     return "step-" + hashlib.sha256(parts.encode()).hexdigest()[:32]
 
 
@@ -221,25 +231,105 @@ def _digest(data: bytes) -> str:
     return hashlib.sha256(data).hexdigest()[:16]
 
 
+class _Compilation:
+    """One run of the compiler, in a folder of its own in the cache."""
+
+    def __init__(self, functions: StepFunctions, mark: str, cc: str, cache: Path) -> None:
+        self.mark, self.cache = mark, cache
+        self.folder = tempfile.TemporaryDirectory(dir=cache, ignore_cleanup_errors=True)
+        self.here = Path(self.folder.name)
+        (self.here / "step.c").write_text(generate(functions))
+        with (self.here / "said").open("wb") as said:
+            self.process = subprocess.Popen([cc, *flags(), "step.c", "-o", "step.so", "-lm"], cwd=self.here,
+                                            stdin=subprocess.DEVNULL, stdout=said, stderr=said)
+
+    def library(self) -> Path:
+        """Wait for the compiler, and return the library, put into the cache atomically.
+
+        Raises
+        ------
+        OSError, subprocess.SubprocessError
+        """
+        try:
+            if self.process.wait(timeout=300):
+                first = (self.here / "said").read_text(errors="replace").splitlines() or ["no message"]
+                raise OSError(f"the C compiler failed ({first[0]})")
+            made = self.here / "step.so"
+            path = self.cache / f"{self.mark}-{_digest(made.read_bytes())}.so"
+            os.replace(made, path)
+            return path
+        finally:
+            self.drop()
+
+    def drop(self) -> None:
+        """End it, and leave nothing behind."""
+        if self.process.poll() is None:
+            self.process.kill()
+            self.process.wait()
+        self.folder.cleanup()
+
+
+class _Ahead:
+    """Steps that will soon be needed, compiled one after the other beside the work at hand."""
+
+    def __init__(self) -> None:
+        self.waiting: dict[str, StepFunctions] = {}
+        self.running: _Compilation | None = None
+        self.process = os.getpid()
+        atexit.register(self.clear)
+
+    def clear(self) -> None:
+        """Let go of everything."""
+        self.waiting.clear()
+        if self.running is not None and self.process == os.getpid():  # a fork has its parent's in its memory
+            self.running.drop()
+        self.running = None
+
+    def tend(self) -> None:
+        """Put into the cache what is done, and go on with the next."""
+        if self.process != os.getpid():
+            self.waiting, self.running, self.process = {}, None, os.getpid()
+        if self.running is not None and self.running.process.poll() is not None:
+            self.take(self.running.mark)
+        while self.running is None and self.waiting:
+            mark = next(iter(self.waiting))
+            functions = self.waiting.pop(mark)
+            if (cc := compiler()) and (cache := cache_dir()) and find(mark) is None:
+                with suppress(OSError):
+                    self.running = _Compilation(functions, mark, cc[0], cache)
+
+    def take(self, mark: str) -> Path | None:
+        """Return a library that is being made, None if it is not; whoever needs it then makes it, and tells why not."""
+        self.waiting.pop(mark, None)
+        if self.running is None or self.running.mark != mark or self.process != os.getpid():
+            return None
+        running, self.running = self.running, None
+        with suppress(OSError, subprocess.SubprocessError):
+            return running.library()
+        return None
+
+
+_ahead = _Ahead()
+tend = _ahead.tend
+
+
+def begin(functions: StepFunctions, mark: str) -> None:
+    """Have a library made beside the work at hand, if it is not in the cache when its turn comes."""
+    _ahead.waiting[mark] = functions
+    tend()
+
+
 def build(functions: StepFunctions, mark: str) -> Path | None:
     """Compile into the cache, atomically, and return the library; None (said once) if that does not work."""
+    if (path := _ahead.take(mark)) is not None:
+        return path
     cc, cache = compiler(), cache_dir()
     if cc is None or cache is None:
         return None
     try:
-        with tempfile.TemporaryDirectory(dir=cache) as folder:
-            (Path(folder) / "step.c").write_text(generate(functions))
-            done = subprocess.run([cc[0], *FLAGS, "step.c", "-o", "step.so", "-lm"], capture_output=True,
-                                  text=True, timeout=300, cwd=folder)
-            if done.returncode:
-                first = (done.stderr.splitlines() or ["no message"])[0]
-                return _without(f"the C compiler failed ({first})")
-            made = Path(folder) / "step.so"
-            path = cache / f"{mark}-{_digest(made.read_bytes())}.so"
-            os.replace(made, path)
-            return path
+        return _Compilation(functions, mark, cc[0], cache).library()
     except (OSError, subprocess.SubprocessError) as error:
-        return _without(f"cannot compile ({error})")
+        return _without(f"cannot compile: {error}")
 
 
 def load(path: Path) -> tuple[Any, Any] | None:

@@ -28,6 +28,7 @@ def cache(tmp_path, monkeypatch):
 
 
 def forget():
+    cc._ahead.clear()
     rb.stepper.cache_clear()
     rb._stepper_of_content.cache_clear()
 
@@ -168,11 +169,68 @@ def test_a_compiler_that_fails_is_told_once_and_not_asked_again(cache, builds, m
         monkeypatch.undo()
         cc.compiler.cache_clear()
     assert capsys.readouterr().err == (
-        "motorid: the C compiler failed (no space); going on with CasADi's virtual "
+        "motorid: cannot compile: the C compiler failed (no space); going on with CasADi's virtual "
         "machine, same results, slower.\n"
     )
     assert len(builds) == 1
     assert np.isfinite(first).all()
+
+
+def system_with(effect):
+    return (mi.dc_motor() + mi.effects.LIBRARY[effect]).system(("i", "omega"))
+
+
+@needs_compiler
+def test_what_will_be_needed_is_compiled_beside_the_work_at_hand(cache, builds):
+    engine, system = Rosenbrock(), system_with("coulomb")
+    engine.ahead(system, 10**6)
+    assert cc._ahead.running is not None
+    cc._ahead.running.process.wait()
+    assert not list(cache.glob("*.so"))
+    cc.tend()
+    assert len(list(cache.glob("*.so"))) == 1
+    assert rb.stepper(system)._load(None) is not None
+    assert not builds and cc._ahead.running is None
+    assert [f for f in cache.iterdir() if f.is_dir()] == []
+
+
+@needs_compiler
+def test_who_needs_it_before_waits_for_it_and_the_next_is_not_begun_twice(cache, builds):
+    engine, systems = Rosenbrock(), [system_with(n) for n in ("coulomb", "constant_load", "stribeck")]
+    for system in systems:
+        engine.ahead(system, 10**6)
+    for system in reversed(systems):  # the last of them first
+        assert rb.stepper(system)._load(True) is not None
+    assert len(list(cache.glob("*.so"))) == 3
+    assert cc._ahead.running is None and not cc._ahead.waiting
+
+
+@needs_compiler
+def test_little_work_is_not_compiled_ahead(cache):
+    Rosenbrock().ahead(system_with("coulomb"), 1000)
+    Rosenbrock(compiled=False).ahead(system_with("coulomb"), 10**6)
+    assert cc._ahead.running is None and not cc._ahead.waiting
+
+
+@needs_compiler
+def test_a_process_that_ends_leaves_nothing_of_what_it_had_begun(tmp_path):
+    code = ("import motorid as mi; from motorid.integrate import Rosenbrock\n"
+            "for e in ('lugre', 'compliance'):\n"
+            "    Rosenbrock().ahead((mi.dc_motor() + mi.effects.LIBRARY[e]).system(('i', 'omega')), 10**6)\n")
+    folder = tmp_path / "cache"
+    done = subprocess.run([sys.executable, "-c", code], env={**os.environ, "MOTORID_CACHE": str(folder)},
+                          capture_output=True, text=True, check=True)
+    assert done.stderr == ""
+    assert list(folder.iterdir()) == []
+
+
+@pytest.mark.parametrize(("line", "own"), [
+    ("gcc (Debian 12.2.0-14) 12.2.0", True), ("cc (Ubuntu 13.2.0) 13.2.0", True),
+    ("x86_64-linux-gnu-gcc-12 (Debian 12.2.0-14) 12.2.0", True), ("Apple clang version 15.0.0 (clang-1500)", False),
+    ("tcc version 0.9.27 (x86_64 Linux)", False), ("icc (ICC) 19.0", False)])
+def test_only_gcc_is_asked_for_what_only_gcc_knows(monkeypatch, line, own):
+    monkeypatch.setattr(cc, "compiler", lambda: ("cc", line))
+    assert (cc.flags() != cc.FLAGS) is own
 
 
 @needs_compiler
