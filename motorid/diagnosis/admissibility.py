@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from motorid.diagnosis.model_comparison import far
 from motorid.diagnosis.thresholds import MATERIAL
 from motorid.display.numbers import number, percent
 from motorid.estimation.result import Fit
@@ -94,7 +95,9 @@ def unresolved(fit: Fit, effect: Effect) -> str:
     for p in (fit.problem.model.parameters[q.name] for q in effect.parameters):
         if not (p.positive and p.vary and p.null is None):
             continue
-        value = fit.values[p.name]
+        value, std = fit.values[p.name], fit.std.get(p.name)
+        if std is not None and std < KNOWN * value and not far(fit):
+            continue  # a fit that leaves noise alone determines it
         if p.unit in ("rad", "m"):
             why = _too_fine(fit, value) or _too_quick(fit, value)
         elif p.unit in ("rad/s", "m/s"):

@@ -118,8 +118,10 @@ def _told(found: Climb, driven: str, validated: bool, own: Sequence[Effect]) -> 
     elif len(found.path) > 1 or not remaining.adequate:
         verdict, where = "unexplained", missing.where
         judged = judged if len(found.path) > 1 else remaining
-        answer = unexplained_text(ranking, ladder.rungs, found.grades, like.text if like else "", not found.stopped)
-        details = [judged.text, missing.text, rises_text(ladder.rungs)]
+        answer = unexplained_text(ranking, ladder.rungs, found.grades, like.text if like else "", remaining,
+                                  done=not found.stopped)
+        details = [] if len(found.path) > 1 else [judged.text]
+        details += [missing.text, rises_text(ladder.rungs)]
     else:
         verdict, where, (answer, *details) = "adequate", None, adequate_text(judged, ranking, bool(far(ladder.best)))
     kind = "structure" if not remaining.adequate else "fluctuation" if far(ladder.best) else "noise"

@@ -446,7 +446,7 @@ def widened(fit: Fit, effect: Effect, above: float = ABOVE) -> Task:
     shapes = [
         [(p.name, g * natural.get(p.unit, 1.0)) for g in p.grid] for p in effect.parameters if p.null is None and p.grid
     ]
-    starts = [{**sizes, **dict(point)} for point in itertools.product(*shapes)][:6]
+    starts = [{**sizes, **dict(point)} for point in itertools.product(*shapes)][:8]
     return Task(fit, model, effect, starts)
 
 

@@ -52,18 +52,19 @@ def adequate_text(judged: Adequacy, ranking: Sequence[Candidate], large: bool = 
 
 
 def unexplained_text(ranking: Sequence[Candidate], rungs: Sequence[Rung], grades: Sequence[Grade], like: str,
-                     done: bool = True) -> str:
+                     remaining: Adequacy, *, done: bool = True) -> str:
     """Return the answer when something is missing that the library does not have, or only something like it.
 
     Not `done`: the search was stopped before all effects were tried.
     """
     lead = f"Unexplained: {like}, which no effect of the library describes." if like else (
+        "Something is missing, and these records do not show what." if grades and remaining.adequate else
         "Unexplained: something is missing, and no effect of the library explains it.")
     lead = lead if done else f"Unexplained so far: {like or 'something is missing'}; not all effects were tried."
     if grades:
         curve = f"{like}, which the library lacks, predicts better in its place"  # the same in few words
         helps = approximations_text(grades).replace(curve, "a free curve predicts better")
-        return f"{lead} {helps} {errors_text(rungs)}"
+        return f"{lead} {helps} {errors_text(rungs)} {_left(remaining)}"
     best = max((c for c in ranking if c.refit_drop is not None), key=lambda c: c.refit_drop or 0.0, default=None)
     if best is None or (best.refit_drop or 0) <= 0.05:
         return lead
@@ -94,10 +95,14 @@ def missing_text(rungs: Sequence[Rung], remaining: Adequacy, groups: Sequence[Se
     parts += [f"These records do not distinguish {g[0]} from {' or '.join(g[1:])}." for g in groups]
     parts += [approximations_text(grades, "the rest")] if len(names) < len(grades) else []
     parts.append(errors_text(rungs))
-    left = remaining.text.removeprefix("Something is missing: ")
-    where = " on the fitted runs, not on the held-out ones" * elsewhere
-    parts.append(f"What remains is noise{where}." if remaining.adequate else f"Not everything is explained: {left}")
+    parts.append(_left(remaining, " on the fitted runs, not on the held-out ones" * elsewhere))
     return " ".join(parts)
+
+
+def _left(remaining: Adequacy, where: str = "") -> str:
+    """Say what is left beside what was found."""
+    left = remaining.text.removeprefix("Something is missing: ")
+    return f"What remains is noise{where}." if remaining.adequate else f"Not everything is explained: {left}"
 
 
 def _described(fit: Fit, name: str) -> str:

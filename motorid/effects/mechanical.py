@@ -54,11 +54,12 @@ def lugre(m: Equations, tau_c=P(2e-3, "N·m", null=0.0, lower=0.0, doc="Coulomb 
 @effect(balance="torque", includes=("coulomb",))
 def angular_friction(m: Equations, tau_m=P(2e-3, "N·m", null=0.0, lower=0.0, doc="friction torque, mean over a turn"),
                      a_f=P(0.5, "", lower=0.0, upper=1.0, doc="relative amplitude"),
-                     N_f=P(1.0, "", vary=False, lower=1.0, doc="periods per turn, fixed"),
+                     N_f=P(1.0, "", vary=False, lower=1.0, grid=(1.0, 2.0), doc="periods per turn, fixed"),
                      phi_f=P(0.0, "rad", periodic=True, grid=QUARTERS, doc="phase at theta = 0")):
     """Friction that varies over a turn (a bent shaft), τ(1+a·sin(Nθ+φ))·sgn ω. Armstrong-Hélouvry, 1991.
 
-    Seen as a friction that repeats every turn in both directions: turn slowly, measure the angle.
+    Seen as a friction that repeats every turn in both directions: turn slowly, measure the angle. Once or twice a turn
+    (a coupling out of line), what suits, unless N_f is given.
     """
     m.torque -= tau_m * (1 + a_f * ca.sin(N_f * m.theta + phi_f)) * m.sign(m.omega)
 

@@ -58,10 +58,39 @@ def test_samples_of_a_passage_are_counted_from_each_turning_point():
 @pytest.mark.parametrize(("theta_s", "seen"), [(1e-5, False), (0.05, True)])
 def test_bristles_finer_than_the_samples_are_refused(rubbing, theta_s, seen):
     fit = mi.fit(mi.dc_motor() + mi.effects.coulomb, rubbing)
-    bristles = replace(fit, values={**fit.values, "tau_c": 8e-3, "s_b": 1.2, "omega_s": 5.0, "theta_s": theta_s})
-    model = mi.dc_motor() + mi.effects.lugre
-    bristles = replace(bristles, problem=fit.problem.for_model(model))
+    own = mi.effects.lugre(tau_c=8e-3, s_b=1.2, omega_s=5.0, theta_s=theta_s)
+    problem = fit.problem.with_(model=fit.model.without("coulomb") + own)
+    bristles = mi.solve(problem, solver=mi.LevenbergMarquardt(max_iterations=0), start="model")
     assert (unresolved(bristles, LIBRARY["lugre"]) == "") is seen
+
+
+@pytest.mark.parametrize(("noise", "seen"), [(0.005, True), (0.3, False)])
+def test_bristles_that_the_current_determines_may_be_finer_than_the_noise_of_the_angle(noise, seen):
+    own = mi.effects.lugre(tau_c=8e-3, s_b=1.2, omega_s=3.0, theta_s=0.02)
+    truth = mi.dc_motor(R=1.2, L=2e-3, K=0.055, b=1.5e-5, J=2.5e-4) + own
+    t, rng = np.arange(2000) * 1e-3, np.random.default_rng(3)
+    v = 3 * np.sin(2 * np.pi * 2 * t) * (1 + 0.3 * np.sin(2 * np.pi * 0.7 * t))
+    shown = mi.simulate(truth, mi.Experiment(t, {"v": v}, {"i": v, "theta": v}), initial="rest")[0].outputs
+    noises = {"i": noise, "theta": 0.02}  # the angle's as large as the bristles are long
+    noisy = {c: y + noises[c] * rng.standard_normal(2000) for c, y in shown.items()}
+    fit = mi.fit(truth, mi.Experiment(t, {"v": v}, noisy))
+    assert (unresolved(fit, LIBRARY["lugre"]) == "") is seen
+
+
+def test_a_friction_that_varies_twice_a_turn_is_one_that_varies_over_a_turn():
+    t, rng = np.arange(3000) * 1e-3, np.random.default_rng(5)
+    v = 4 * np.sin(2 * np.pi * 0.8 * t) + 2 * np.sin(2 * np.pi * 2.3 * t)
+    own = mi.effects.angular_friction(tau_m=0.02, a_f=0.6, N_f=2.0, phi_f=1.0)
+    truth = mi.dc_motor(R=1.2, L=2e-3, K=0.055, b=1.5e-5, J=1e-4) + own
+    shown = mi.simulate(truth, mi.Experiment(t, {"v": v}, {"i": v, "omega": v, "theta": v}), initial="rest")[0].outputs
+    noises = {"i": 0.02, "omega": 0.3, "theta": 0.01}
+    run = mi.Experiment(t, {"v": v}, {c: y + noises[c] * rng.standard_normal(3000) for c, y in shown.items()})
+    beside = mi.fit(mi.dc_motor() + mi.effects.coulomb, run)
+    found = mi.improve(beside, effects=["angular_friction"]).best
+    assert found.model.effect_names == ("angular_friction",)
+    assert found.values["N_f"] == 2
+    assert found.values["a_f"] == pytest.approx(0.6, abs=5 * found.std["a_f"])
+    assert mi.fit(mi.dc_motor() + mi.effects.angular_friction, run).values["N_f"] == 2
 
 
 def test_an_effect_that_replaces_nothing_may_be_as_quick_as_it_likes(rubbing):
