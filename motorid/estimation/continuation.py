@@ -17,7 +17,7 @@ from motorid.estimation.least_squares import FAILURES, RACE, ROUNDS, Callback, E
 from motorid.estimation.restarts import restarted_where_doubtful
 from motorid.numerics.least_squares import LevenbergMarquardt, levenberg_marquardt
 from motorid.problem.problem import Problem
-from motorid.problem.runs import SGN_WIDTH_SHARE, smoothing, top_speed
+from motorid.problem.runs import SGN_WIDTH_SHARE, narrowest_width, smoothing, top_speed
 from motorid.problem.simulate import misfit_over_noise
 
 WIDEST = 0.03  # first width of sgn over the highest speed
@@ -85,11 +85,12 @@ def sharpened(found: Estimate, effort: LevenbergMarquardt, callback: Callback = 
 
     Where it does not, the creep of a stuck motor does not matter, and a sgn so narrow only makes the model stiff.
     """
-    while (width := _narrower(found)) is not None:
+    while (narrower := _narrower(found)) is not None:
+        width, surely = narrower
         problem = found.problem.start_at(found.values).tuned(width=width)
-        if misfit_over_noise(problem, found.q).get("theta", 0.0) < NOISE and not _promises(found, problem):
-            return found
         try:
+            if not surely and not _promises(found, problem):
+                return found
             other = least_squares(problem, effort, callback)
         except FAILURES:  # so narrow that it cannot be followed
             return found
@@ -101,11 +102,8 @@ def sharpened(found: Estimate, effort: LevenbergMarquardt, callback: Callback = 
 
 
 def _promises(found: Estimate, narrower: Problem) -> bool:
-    """Tell whether a narrower sgn lowers the cost, by the slopes with the wider one.
-
-    An angle below its noise says nothing: the noise of fast records is overestimated.
-    """
-    r, jac = narrower.residual(found.q), found.solution.jac
+    """Tell whether a narrower sgn lowers the cost, by the slopes with the wider one."""
+    r, jac = narrower.refined(found.q).residual(found.q), found.solution.jac
     left = r - jac @ np.linalg.lstsq(jac, r, rcond=None)[0]
     return 0.5 * float(left @ left) < LOWER * found.cost
 
@@ -138,11 +136,17 @@ def _narrow_enough(problem: Problem) -> float:
     return max(SGN_WIDTH_SHARE * top_speed(problem.experiments), _narrowest(problem))
 
 
-def _narrower(found: Estimate) -> float | None:
-    """Return a narrower width, where a loaded, stuck motor's creep may show in the angle; None where it has no room."""
+def _narrower(found: Estimate) -> tuple[float, bool] | None:
+    """Return a narrower width to try, and whether the creep of a loaded, stuck motor in the angle surely asks for it.
+
+    None where there is no room: narrower than what a sub-step gains in speed.
+    """
     problem = found.problem
     if problem.width is None or not smooths(problem) or problem.width > 1.01 * _narrow_enough(problem):
         return None
     misfit = misfit_over_noise(problem, found.q).get("theta")
-    width = max(_narrowest(problem, min(misfit or 1.0, 1.0)), problem.width / STEP)
-    return None if misfit is None or width > problem.width / WORTH_IT else width
+    asked = problem.width if misfit is None else _narrowest(problem, min(misfit, 1.0))
+    creeps = asked * WORTH_IT < problem.width
+    width = max(asked if creeps else narrowest_width(problem.experiments), problem.width / STEP)
+    surely = creeps and misfit is not None and misfit > NOISE  # below it, noise that seems larger than it is hides creep
+    return (width, surely) if width * WORTH_IT < problem.width else None

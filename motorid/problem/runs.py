@@ -348,9 +348,12 @@ def _suited_width(runs: tuple[Experiment, ...], noise: float) -> float | None:
     allowed = CREEP_SHARE * noise
     creep = min((allowed * noise_level(r.outputs["theta"], r.t) / still for r in runs if "theta" in r.outputs
                  and (still := _longest_standstill(r, speed)) > 0), default=np.inf)
-    # Narrower than the finest sub-step's change of speed, it is jumped over, and slopes come out wild.
-    jump = max(_speed_gained(r) for r in runs) / FINEST
-    return float(np.clip(creep, max(NARROWEST * speed, jump), SGN_WIDTH_SHARE * speed))
+    return float(np.clip(creep, narrowest_width(runs), SGN_WIDTH_SHARE * speed))
+
+
+def narrowest_width(runs: Sequence[Experiment]) -> float:
+    """Return the least width of sgn: what the finest sub-step changes the speed by, or it jumps over it."""
+    return max(NARROWEST * top_speed(runs), max(_speed_gained(r) for r in runs) / FINEST)
 
 
 def _speed_gained(run: Experiment) -> float:

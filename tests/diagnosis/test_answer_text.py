@@ -10,8 +10,9 @@ from battery.excite import driven, record
 from lab_records import VALUES, noisy, pair, simulated
 
 import motorid as mi
+from motorid.diagnosis.misspecification import Grade
 from motorid.diagnosis.results import Rung
-from motorid.diagnosis.verdict import adequate_text, errors_text, missing_text, rises_text
+from motorid.diagnosis.verdict import adequate_text, errors_text, missing_text, rises_text, unexplained_text
 
 
 def rungs_of(*errors, held_out=None, misfit=1.0):
@@ -42,6 +43,19 @@ def test_noise_that_remains_is_where_it_remains(elsewhere, said):
     rungs = rungs_of((0.02, 0.2), (0.02, 0.02), held_out=((0.02, 0.2), (0.02, 0.19)))
     noise = SimpleNamespace(adequate=True, text="")
     assert missing_text(rungs, noise, (), (), elsewhere).endswith(said)
+
+
+@pytest.mark.parametrize(("adequate", "lead", "left"), [
+    (True, "Something is missing, and these records do not show what.", "What remains is noise."),
+    (False, "Unexplained: something is missing, and no effect of the library explains it.",
+     "Not everything is explained: the errors (speed 3 times the noise) are not noise.")])
+def test_where_nothing_can_be_named_what_is_left_is_that_of_the_last_model(adequate, lead, left):
+    remaining = SimpleNamespace(adequate=adequate, text="Something is missing: the errors (speed 3 times the noise) "
+                                                        "are not noise.")
+    grades = [Grade("lugre", "approximates", "theta_s cannot be seen")]
+    answer = unexplained_text((), rungs_of((0.02, 0.2), (0.02, 0.02)), grades, "", remaining)
+    assert answer.startswith(f"{lead} 'lugre' helps, but only approximates it: theta_s cannot be seen. Error: speed")
+    assert answer.endswith(left)
 
 
 def test_errors_beyond_the_noise_are_in_the_answer_where_nothing_is_missing():

@@ -11,6 +11,7 @@ import motorid as mi
 from motorid.estimation.continuation import by_continuation, past_ripples
 from motorid.estimation.least_squares import FINISH, least_squares, start_cost
 from motorid.problem.problem import Problem, as_problem
+from motorid.problem.runs import SGN_WIDTH_SHARE, top_speed
 from motorid.records.experiment import Experiment
 
 TRUE = {"b": 0.3, "J": 0.1, "tau_c": 0.5, "tau_0": 0.1}
@@ -84,6 +85,22 @@ def test_an_overestimated_noise_hides_no_creep(stuck):
     done, wider = by_continuation(begin, FINISH), by_continuation(begin, FINISH, narrow=False)
     assert done.problem.width < 0.5 * wider.problem.width
     assert done.cost < 0.8 * wider.cost
+
+
+def test_a_motor_that_sticks_on_an_elastic_shaft_sticks_without_an_angle_too():
+    """The load swings on against a motor that creeps; only a narrower sgn lowers the error of current and speed."""
+    own = mi.effects.compliance(r_load=0.49, omega_r=75.0, zeta_r=0.04)
+    truth = mi.dc_motor(R=1.0, L=1e-3, K=0.0635, b=1.9e-4, J=1.9e-4) + mi.effects.coulomb(tau_c=0.12) + own
+    t, rng = np.arange(2000) * 1e-3, np.random.default_rng(1)
+    v = np.repeat(rng.choice([0.0, 3.0, 12.0, -3.0, -12.0], 20), 100)
+    wanted = mi.Experiment(t, {"v": v}, {"i": v, "omega": v})
+    shown = mi.simulate(truth.replace(sgn_width=1e-4), wanted, initial="rest")[0].outputs
+    run = wanted.with_(outputs={"i": shown["i"] + 5e-3 * rng.standard_normal(2000),
+                                "omega": shown["omega"] + 0.1 * rng.standard_normal(2000)})
+    fit = mi.fit(mi.dc_motor() + mi.effects.coulomb + mi.effects.compliance, run)
+    assert fit.values["sgn_width"] < 0.5 * SGN_WIDTH_SHARE * top_speed([run])
+    wide = by_continuation(fit.problem.tuned(width=SGN_WIDTH_SHARE * top_speed([run])), FINISH, narrow=False)
+    assert fit.cost < 0.9 * wide.cost
 
 
 def test_sub_steps_follow_the_solution(stuck):
