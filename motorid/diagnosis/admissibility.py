@@ -17,6 +17,7 @@ from motorid.problem.runs import angle_signal
 KNOWN = 0.3  # of a parameter, its standard deviation: determined
 MOST_LOST = 0.6  # of the largest voltage that a drop or a dead band may be
 MOST_OFFSET = 0.3  # and an offset, which turns the motor by itself
+HOTTEST = 300.0  # K above the surroundings: enamel of the best class ends at 220 °C
 EMPTIED = 1e-2  # of its value before: it has vanished
 LENGTHS = ("rad", "m")  # a gap that runs to its limit is none
 
@@ -35,9 +36,12 @@ def objections(fit: Fit, added: Effect, before: Fit | None = None) -> str:
             return f"{p.name} runs to its limit: nothing of this shape is in the records"
         if p.vary and p.null is not None and not p.positive and fit.values[p.name] <= p.lower == p.null:
             return f"{p.name} goes to {p.null:g}: the records show none of it, or only with the wrong sign"
-        physical = next(q.upper for q in added.parameters if q.name == p.name) == p.upper  # not set for these records
-        if p.vary and np.isfinite(p.upper) and fit.values[p.name] > 0.98 * p.upper and physical:
-            return f"{p.name} runs to {p.upper:g}, the limit of what is physical"
+        declared = next(q for q in added.parameters if q.name == p.name)
+        values = [fit.values[p.name], *(own["value"] for own in fit.per_run.get(p.name, {}).values())]
+        for limit, sign in ((p.upper, 1), (p.lower, -1)):
+            physical = np.isfinite(limit) and limit in (declared.upper, declared.lower)  # not set for these records
+            if p.vary and physical and sign * limit > 0 and max(sign * v for v in values) > 0.98 * sign * limit:
+                return f"{p.name} runs to {limit:g}, the limit of what is physical"
     why = _too_large(fit, pars) or _alike(fit, added) or unresolved(fit, added)
     return why or (_emptied(fit, added, before) if before else "")
 
@@ -51,9 +55,12 @@ def _alike(fit: Fit, added: Effect) -> str:
 
 
 def _too_large(fit: Fit, pars: Sequence[Parameter]) -> str:
-    """Say so where a voltage lost or added is of the size of what is applied: another parameter has paid for it; or
-    where cogging is more than the motor ever makes: it would not leave its notch."""
+    """Say so where a voltage lost or added is of the size of what is applied: another parameter has paid for it; where
+    cogging is more than the motor ever makes: it would not leave its notch; or where a winding is hotter than any."""
     top = max(float(np.abs(r.inputs["v"]).max()) for r in fit.problem.experiments)
+    hottest = max((float(np.abs(s.states["dT"]).max()) for s in fit.simulations if "dT" in s.states), default=0.0)
+    if hottest > HOTTEST and any(p.unit in ("K", "K/W") for p in pars):
+        return f"the winding would be {number(hottest, 2)} K warmer, which none stands"
     for p in pars:
         if p.vary and p.unit in ("N·m", "N") and any(q.order for q in pars):
             made = max(fit.values["g"] * top if "g" in fit.values else

@@ -28,6 +28,7 @@ from motorid.diagnosis.verdict import (
     missing_text,
     moves,
     outliers_remark,
+    own_in_every_run_remark,
     rises_text,
     unexplained_text,
     unfinished_remark,
@@ -141,8 +142,9 @@ def _remarks(found: Climb, driven: str) -> list[str]:
     limits = (f"In {run.name} {limit}" for run in first.problem.experiments if LIMITER not in found.path[-1].key
               and (limit := current_limit(run)))
     stopped = f"Stopped early: {found.stopped}; more may be missing." if found.stopped else ""
+    own = own_in_every_run_remark(last) if found.search.held.validation is not None else ""
     return [stopped, driven, window_remark(last), next(limits, ""), parts_remark(first), unfinished_remark(last),
-            held_out_remark(found.path[-1]), measured_angle_remark(last), outliers_remark(last),
+            held_out_remark(found.path[-1]), own, measured_angle_remark(last), outliers_remark(last),
             closed_loop_remark(first)]
 
 

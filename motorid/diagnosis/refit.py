@@ -411,7 +411,8 @@ def _foresee(task: Task, alone: bool) -> None:
     """Tell the engine what a race of a task will ask for."""
     with contextlib.suppress(*FAILURES):
         starts = task.starts[:1 if alone else None] or ({},)
-        problem = _started(task.fit, _bounded(task.fit, task.model), starts[0], _brings_in_the_angle(task.fit, task.model))
+        model, angular = _bounded(task.fit, task.model), _brings_in_the_angle(task.fit, task.model)
+        problem = _started(task.fit, model, starts[0], angular)
         steps = sum(run.n for run in problem.experiments) * RACE.max_iterations * len(starts)
         engine_ahead(problem.integrator, problem.system, steps)
 

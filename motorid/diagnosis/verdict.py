@@ -64,7 +64,7 @@ def unexplained_text(ranking: Sequence[Candidate], rungs: Sequence[Rung], grades
     if grades:
         curve = f"{like}, which the library lacks, predicts better in its place"  # the same in few words
         helps = approximations_text(grades).replace(curve, "a free curve predicts better")
-        return f"{lead} {helps} {errors_text(rungs)} {_left(remaining)}"
+        return f"{lead} {helps} {errors_text(rungs)} {_left(rungs[-1].fit, remaining)}"
     best = max((c for c in ranking if c.refit_drop is not None), key=lambda c: c.refit_drop or 0.0, default=None)
     if best is None or (best.refit_drop or 0) <= 0.05:
         return lead
@@ -95,14 +95,17 @@ def missing_text(rungs: Sequence[Rung], remaining: Adequacy, groups: Sequence[Se
     parts += [f"These records do not distinguish {g[0]} from {' or '.join(g[1:])}." for g in groups]
     parts += [approximations_text(grades, "the rest")] if len(names) < len(grades) else []
     parts.append(errors_text(rungs))
-    parts.append(_left(remaining, " on the fitted runs, not on the held-out ones" * elsewhere))
+    parts.append(_left(after, remaining, " on the fitted runs, not on the held-out ones" * elsewhere))
     return " ".join(parts)
 
 
-def _left(remaining: Adequacy, where: str = "") -> str:
+def _left(last: Fit, remaining: Adequacy, where: str = "") -> str:
     """Say what is left beside what was found."""
-    left = remaining.text.removeprefix("Something is missing: ")
-    return f"What remains is noise{where}." if remaining.adequate else f"Not everything is explained: {left}"
+    if not remaining.adequate:
+        return f"Not everything is explained: {remaining.text.removeprefix('Something is missing: ')}"
+    large = [f"{channel_name(c)} {number(e, 2)} times" for c, e in last.misfit.items() if e > LARGER]
+    beyond = f", but is larger than the noise ({', '.join(large)})"
+    return f"What remains does not depend on the motion{where}{beyond}." if large else f"What remains is noise{where}."
 
 
 def _described(fit: Fit, name: str) -> str:
@@ -214,6 +217,15 @@ def measured_angle_remark(fit: Fit) -> str:
         "Effects over the angle use the measured angle, on held-out runs too, because the simulated angle drifts too "
         "far. Without a measured angle this model cannot predict."
     )
+
+
+def own_in_every_run_remark(fit: Fit) -> str:
+    """Say so where parameters are others in every run: those of held-out runs are estimated there."""
+    if not fit.per_run:
+        return ""
+    are = "are others" if len(fit.per_run) > 1 else "is another"
+    return (f"{listed(list(fit.per_run))} {are} in every run, and so estimated in the held-out runs too: their error "
+            "is no proof of it.")
 
 
 def unfinished_remark(fit: Fit) -> str:

@@ -133,7 +133,8 @@ def measured_temperature(m: Equations, alpha_T=P(0.00393, "1/K", null=0.0, lower
 
 
 @effect(balance="voltage")
-def winding_warm_start(m: Equations, dT_0=P(0.0, "K", null=0.0, per_run=True, doc="rise at the start")):
+def winding_warm_start(m: Equations, dT_0=P(0.0, "K", null=0.0, lower=-200.0, upper=200.0, per_run=True,
+                                            doc="rise at the start")):
     """Winding warm at the start, beside winding_heating. Kirtley, Electric Power Principles, 2010.
 
     Another rise in every run, against the first one, whose resistance at the start is R.

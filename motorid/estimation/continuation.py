@@ -148,5 +148,6 @@ def _narrower(found: Estimate) -> tuple[float, bool] | None:
     asked = problem.width if misfit is None else _narrowest(problem, min(misfit, 1.0))
     creeps = asked * WORTH_IT < problem.width
     width = max(asked if creeps else narrowest_width(problem.experiments), problem.width / STEP)
-    surely = creeps and misfit is not None and misfit > NOISE  # below it, noise that seems larger than it is hides creep
+    # Below its noise an angle says little: the noise may seem larger than it is.
+    surely = creeps and misfit is not None and misfit > NOISE
     return (width, surely) if width * WORTH_IT < problem.width else None

@@ -201,9 +201,9 @@ class Stepper:
 
     def ahead(self, steps: int) -> None:
         """Have the step compiled beside the work at hand, if so many steps with derivatives are worth it."""
-        if self._library is None and not self._refused and self.functions.full.n_instructions() * steps > PATIENCE:
-            if (mark := cc.mark_of(self.key)) is not None:
-                cc.begin(self.functions, mark)
+        worth_it = self.functions.full.n_instructions() * steps > PATIENCE
+        if worth_it and self._library is None and not self._refused and (mark := cc.mark_of(self.key)) is not None:
+            cc.begin(self.functions, mark)
 
     def _run_compiled(self, library: Any, grid: Grid, x0: Array, p: Array, dx0: Array | None,
                       dp: Array | None, local_error: bool) -> tuple[Trajectory, int]:

@@ -290,7 +290,8 @@ def cut_alike(fitted: Sequence[Experiment], runs: Sequence[Experiment] | Experim
 def evaluate(fit_or_model: Any, runs: Sequence[Experiment] | Experiment, **options: Any) -> Evaluation:
     """Judge a fit (or a model at its values) on `runs` that it may never have seen.
 
-    Unknown initial states of these runs are estimated from them; no parameter is. A fit in windows is judged in
+    Unknown initial states of these runs are estimated from them; no parameter is, but one that is another in every run
+    (a zero of the encoder, a supply): its error here is no proof of it. A fit in windows is judged in
     windows of the same length, by what it predicts a window ahead.
 
     Parameters

@@ -15,9 +15,9 @@ from motorid.diagnosis.results import Rung
 from motorid.diagnosis.verdict import adequate_text, errors_text, missing_text, rises_text, unexplained_text
 
 
-def rungs_of(*errors, held_out=None, misfit=1.0):
-    """Rungs with the errors (current, speed) given; `misfit` is of the current, the speed is far from its noise."""
-    fit = SimpleNamespace(misfit={"i": misfit, "omega": 8.0}, problem=SimpleNamespace(experiments=[]))
+def rungs_of(*errors, held_out=None, misfit=1.0, speed=8.0):
+    """Rungs with the errors (current, speed) given; `misfit` is of the current, `speed` that of the speed."""
+    fit = SimpleNamespace(misfit={"i": misfit, "omega": speed}, problem=SimpleNamespace(experiments=[]))
     named = [dict(zip(("i", "omega"), e, strict=True)) for e in errors]
     there = [dict(zip(("i", "omega"), e, strict=True)) for e in held_out] if held_out else [None] * len(errors)
     names = [None, "coulomb", "cogging"]
@@ -40,9 +40,12 @@ def test_an_error_that_is_printed_alike_stays():
 @pytest.mark.parametrize(("elsewhere", "said"), [
     (False, "What remains is noise."), (True, "What remains is noise on the fitted runs, not on the held-out ones.")])
 def test_noise_that_remains_is_where_it_remains(elsewhere, said):
-    rungs = rungs_of((0.02, 0.2), (0.02, 0.02), held_out=((0.02, 0.2), (0.02, 0.19)))
+    errors = {"held_out": ((0.02, 0.2), (0.02, 0.19))}
     noise = SimpleNamespace(adequate=True, text="")
-    assert missing_text(rungs, noise, (), (), elsewhere).endswith(said)
+    assert missing_text(rungs_of((0.02, 0.2), (0.02, 0.02), **errors, speed=1.0), noise, (), (), elsewhere).endswith(said)
+    larger = missing_text(rungs_of((0.02, 0.2), (0.02, 0.02), **errors, speed=9.4), noise, (), (), elsewhere)
+    assert "remains is noise" not in larger
+    assert larger.endswith(", but is larger than the noise (speed 9.4 times).")
 
 
 @pytest.mark.parametrize(("adequate", "lead", "left"), [
@@ -53,8 +56,8 @@ def test_where_nothing_can_be_named_what_is_left_is_that_of_the_last_model(adequ
     remaining = SimpleNamespace(adequate=adequate, text="Something is missing: the errors (speed 3 times the noise) "
                                                         "are not noise.")
     grades = [Grade("lugre", "approximates", "theta_s cannot be seen")]
-    answer = unexplained_text((), rungs_of((0.02, 0.2), (0.02, 0.02)), grades, "", remaining)
-    assert answer.startswith(f"{lead} 'lugre' helps, but only approximates it: theta_s cannot be seen. Error: speed")
+    answer = unexplained_text((), rungs_of((0.02, 0.2), (0.02, 0.02), speed=1.0), grades, "", remaining)
+    assert answer.startswith(f"{lead} 'lugre' helps, but only approximates it: theta_s cannot be seen. Error: ")
     assert answer.endswith(left)
 
 

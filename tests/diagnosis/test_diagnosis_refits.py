@@ -341,6 +341,33 @@ def test_where_a_fit_is_lost_a_guess_of_its_own_starts_along_either_angle(monkey
     assert best.problem.model.values["mgl"] == pytest.approx(8, rel=0.05)
 
 
+def test_a_winding_hotter_than_any_stands_is_refused():
+    t = np.arange(3000) * 1e-2
+    v = np.where(t % 6 < 4, 12.0, 6.0)
+    model = mi.dc_motor(R=2.0, L=2e-3, K=0.05, b=4e-3, J=1e-4) + mi.effects.winding_heating(R_th=4.0, C_th=1.0)
+    shown = mi.simulate(model, mi.Experiment(t, {"v": v}, {"i": v, "omega": v}), initial="rest")[0].outputs
+    fit = mi.fit(model, mi.Experiment(t, {"v": v}, dict(shown)), start="model")
+    assert not objections(fit, LIBRARY["winding_heating"])
+    hot = mi.fit(model.replace(alpha=3e-4), mi.Experiment(t, {"v": v}, dict(shown)))
+    assert max(s.states["dT"].max() for s in hot.simulations) > 300
+    assert "K warmer, which none stands" in objections(hot, LIBRARY["winding_heating"])
+
+
+def test_a_parameter_of_every_run_keeps_within_what_is_physical():
+    warm = mi.effects.winding_warm_start
+    assert (warm.parameters[0].lower, warm.parameters[0].upper) == (-200, 200)
+    t, rng = np.arange(600) * 5e-3, np.random.default_rng(0)
+    supply = mi.dc_motor(R=1.2, L=2e-3, K=0.05, b=1e-5, J=3e-5)
+    runs = []
+    for k, share in enumerate((1.0, 0.05)):
+        v = 6 * np.sign(np.sin(2 * np.pi * (0.4 + 0.2 * k) * t))
+        shown = mi.simulate(supply, mi.Experiment(t, {"v": share * v}, {"i": v, "omega": v}), initial="rest")[0].outputs
+        noisy_ = {"i": shown["i"] + 0.01 * rng.standard_normal(600), "omega": shown["omega"] + rng.standard_normal(600)}
+        runs.append(mi.Experiment(t, {"v": v}, noisy_, name=f"run{k}"))
+    fit = mi.fit(mi.dc_motor() + mi.effects.supply_per_run, runs)
+    assert "g_v runs to -0.9, the limit of what is physical" in objections(fit, mi.effects.supply_per_run)
+
+
 def test_a_cogging_that_no_current_of_the_motor_overcomes_is_refused():
     model = mi.dc_motor(**TRUE) + mi.effects.cogging(A=2e-3, N=7.0, phi=0.3)
     fit = mi.fit(model.fix("R", "L"), _run(model), start="model")
