@@ -38,6 +38,7 @@ _ASCII = {"Ω": "Ohm", "ω": "omega", "τ": "tau", "θ": "theta", "φ": "phi", "
 _OPTIONS = ((r"\b(columns|units)=\{(.*?)\}", lambda m: f"--{m[1]} {_pairs(m[2])}"),
             (r"\bwith (columns|units)\b", lambda m: f"with --{m[1]}"),
             (r"\b(engine|hold|solver|initial|formulation)='([\w-]+)'", lambda m: f"--{m[1]} {m[2]}"),
+            (r"\bdt=([\d.]+)", lambda m: f"--dt {m[1]}"),
             (r"\bmodel\.without\('(\w+)'\)", lambda m: f"--effects without {m[1]}"),
             (r"\bmodel\.fix\('?(\w+)'?(=[^)]*)?\)", lambda m: f"--fix {m[1]}{m[2] or ''}"),
             (r"\bmodel\.free\('?(\w+|…)'?\)", lambda m: f"--free {m[1].replace('…', 'NAME')}"),

@@ -72,6 +72,8 @@ class ReadingOptions:
         metavar="omega=rpm", help="Units of channels, where the header does not say.")] = None
     hold: Annotated[str | None, _reading(
         metavar="zoh|linear", help="The input between samples: constant (zoh) or linear.")] = None
+    dt: Annotated[float | None, _reading(
+        metavar="S", help="Seconds between samples of records without a column of time.")] = None
     median: Annotated[int | None, _reading(
         metavar="N", help="Running median over N samples (odd) of a voltage that was measured with noise.")] = None
     levels: Annotated[bool, _reading(
@@ -91,7 +93,7 @@ class ReadingOptions:
     def reading(self) -> dict[str, Any]:
         """What was said for `read_runs`, as its keyword arguments."""
         named = {k: parse_pairs(v, f"--{k}") for k in ("columns", "units") if (v := getattr(self, k))}
-        return named | ({"hold": self.hold} if self.hold else {})
+        return named | {k: v for k in ("hold", "dt") if (v := getattr(self, k)) is not None}
 
     @property
     def preprocesses(self) -> bool:

@@ -179,8 +179,9 @@ def _require(places: Mapping[str, Place], labels: Sequence[str]) -> None:
     more = (f" '{duty[0]}' is a duty cycle; with a constant supply of, say, 12 V ('12 V' for 0 to 1, '0.12 V' for per "
             f"cent, '0.047 V' for 0 to 255): columns={{'v': '{duty[0]}'}}, units={{'v': '{one}'}}.") if duty else ""
     used = {*duty, *(p.column for p in places.values())}
+    untimed = " Samples a fixed time apart need no column of time: dt=0.001 says how far, s." * ("t" in missing)
     raise DataError(f"no column looks like {', nor like '.join(missing.values())}. "
-                    f"{_say_which(labels, list(missing), [c for c in labels if c not in used])}{more}")
+                    f"{_say_which(labels, list(missing), [c for c in labels if c not in used])}{more}{untimed}")
 
 
 def _say_which(labels: Sequence[str], channels: Sequence[str], free: Sequence[str]) -> str:

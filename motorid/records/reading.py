@@ -12,12 +12,13 @@ import os
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from motorid.errors import DataError, UsageError, one_of
+from motorid.errors import DataError, UsageError, one_of, positive
 from motorid.records.binary_tables import FORMATS, frame_table, mat_table
 from motorid.records.cleaning import run_from_columns
 from motorid.records.experiment import Experiment, between_pauses
@@ -37,7 +38,8 @@ _PART = re.compile(r"#\s*part begins: (\d+\.?\d*)")  # what a resumed recording 
 
 
 def read_runs(paths: Path_ | Iterable[Path_], *, columns: Mapping[str, object] | None = None,
-              units: Mapping[str, object] | None = None, hold: str | None = None) -> list[Experiment]:
+              units: Mapping[str, object] | None = None, hold: str | None = None,
+              dt: float | None = None) -> list[Experiment]:
     """Read records, one run per file; where one pauses (a resumed recording, a gap in time), one per part.
 
     Parameters
@@ -51,6 +53,8 @@ def read_runs(paths: Path_ | Iterable[Path_], *, columns: Mapping[str, object] |
         Channel or column to unit: ``{"omega": "rpm", "theta": "counts:2048", "i": "-1 A"}``.
     hold : {"zoh", "linear"}, optional
         The input between samples; by default what the file says (see `write_csv`), else "zoh".
+    dt : float, optional
+        Time between samples, s, of records without a column of time.
 
     Returns
     -------
@@ -71,17 +75,17 @@ def read_runs(paths: Path_ | Iterable[Path_], *, columns: Mapping[str, object] |
     """
     given = paths if isinstance(paths, list | tuple) else [paths]
     if any(hasattr(p, "reset_index") for p in given):
-        return [_of_table(frame_table(p), columns, units, hold, f"run{k}", {}) for k, p in enumerate(given, 1)]
+        return [_of_table(frame_table(p), columns, units, hold, dt, f"run{k}", {}) for k, p in enumerate(given, 1)]
     files = find_records(paths)
     stems = Counter(f.stem for f in files)
     names = [f.stem if stems[f.stem] == 1 else f"{f.parent.name}/{f.name}" for f in files]
-    runs = (_read(f, FORMATS.get(f.suffix.lower(), parse_table), columns, units, hold, name)
+    runs = (_read(f, FORMATS.get(f.suffix.lower(), parse_table), columns, units, hold, dt, name)
             for f, name in zip(files, names, strict=True))
     return [part for run in runs for part in between_pauses(run)]
 
 
 def read_csv(path: Path_, *, columns: Mapping[str, object] | None = None, units: Mapping[str, object] | None = None,
-             hold: str | None = None, name: str | None = None) -> Experiment:
+             hold: str | None = None, dt: float | None = None, name: str | None = None) -> Experiment:
     """Read one text file of any dialect (delimiter, decimal comma, comments, row of units, encoding).
 
     Parameters and errors are those of `read_runs`; `name` is used instead of the name of the file.
@@ -92,18 +96,18 @@ def read_csv(path: Path_, *, columns: Mapping[str, object] | None = None, units:
     >>> run.channels
     ('i', 'omega')
     """
-    return _read(path, parse_table, columns, units, hold, name)
+    return _read(path, parse_table, columns, units, hold, dt, name)
 
 
 def read_mat(path: Path_, *, columns: Mapping[str, object] | None = None, units: Mapping[str, object] | None = None,
-             hold: str | None = None, name: str | None = None) -> Experiment:
+             hold: str | None = None, dt: float | None = None, name: str | None = None) -> Experiment:
     """Read one MATLAB file (up to version 7); otherwise like `read_csv`.
 
     Examples
     --------
     >>> run = mi.read_mat("bench.mat", columns={"v": "u"}, units={"omega": "rpm"})  # doctest: +SKIP
     """
-    return _read(path, mat_table, columns, units, hold, name)
+    return _read(path, mat_table, columns, units, hold, dt, name)
 
 
 def write_csv(experiment: Experiment, path: Path_, force: bool = False) -> Path:
@@ -187,12 +191,12 @@ def _natural(path: Path) -> list[tuple[int, int, str]]:
 
 
 def _read(path: Path_, to_table: Callable[[bytes], TextTable], columns: Mapping[str, object] | None,
-          units: Mapping[str, object] | None, hold: str | None, name: str | None) -> Experiment:
+          units: Mapping[str, object] | None, hold: str | None, dt: float | None, name: str | None) -> Experiment:
     path = Path(os.path.expanduser(path))
     data = read_bytes(path)
     try:
         meta = {"source": str(path), "sha256": hashlib.sha256(data).hexdigest()}
-        return _of_table(to_table(data), columns, units, hold, name or path.stem, meta)
+        return _of_table(to_table(data), columns, units, hold, dt, name or path.stem, meta)
     except (DataError, UsageError) as error:
         raise DataError(f"{path}: {error}") from None
 
@@ -205,18 +209,33 @@ def _is_copy(label: str, labels: Sequence[str], table: TextTable) -> bool:
 
 
 def _of_table(table: TextTable, columns: Mapping[str, object] | None, units: Mapping[str, object] | None,
-              hold: str | None, name: str, meta: Mapping[str, Any]) -> Experiment:
+              hold: str | None, dt: float | None, name: str, meta: Mapping[str, Any]) -> Experiment:
     own: dict[str, str] = {m[1]: m[2] for m in map(_OWN.fullmatch, table.comments) if m}
     labels = table.labels
     if "columns" in own and not columns:
         columns = parse_pairs(own["columns"], "columns")
         labels = [c for c in labels if c in columns.values()]
     labels = [c for c in labels if not _is_copy(c, labels, table)]
+    if dt is not None:
+        table, columns, units = _timed(table, columns or {}, units or {}, dt)
+        labels = [*labels, columns["t"]]
     layout = assign(labels, columns=columns, units=units, unit_row=table.unit_row)
     parts = tuple(float(m[1]) for m in map(_PART.fullmatch, table.comments) if m)
     return run_from_columns(table.columns, table.texts, layout, name=name, notes=table.notes,
                             hold=hold or own.get("hold", "zoh"), sigma=_sigma(own.get("sigma")),
                             meta={**meta, "parts": parts})
+
+
+def _timed(table: TextTable, columns: Mapping[str, object], units: Mapping[str, object],
+           dt: float) -> tuple[TextTable, dict[str, Any], dict[str, Any]]:
+    """Return a table with a column of times `dt` apart, named as the time in the columns and units."""
+    positive(" It is the time between samples, s.", dt=dt)
+    if "t" in columns:
+        raise UsageError(f"the time is either a column ('{columns['t']}') or given by dt; leave one of them out.")
+    n = max(map(len, [*table.columns.values(), *table.texts.values()]), default=0)
+    label = "sample times" + "'" * ("sample times" in table.labels)
+    numbers = {**table.columns, label: dt * np.arange(n)}
+    return replace(table, columns=numbers), {**columns, "t": label}, {**units, "t": "s"}
 
 
 def _sigma(text: str | None) -> dict[str, float]:

@@ -36,7 +36,16 @@ def test_all_that_is_missing_is_said_at_once_with_the_option_that_names_it(tmp_p
     path = tmp_path / "run.csv"
     path.write_text("a,b c,d\n" + "".join(f"{k},{k},{k}\n" for k in range(30)))
     wrong(motorid("check", path), "the time (t)", "the drive voltage (v)", "speed (omega)",
-          '--columns "t=a,v=b c,omega=d"')
+          '--columns "t=a,v=b c,omega=d"', "--dt 0.001")
+
+
+def test_samples_a_fixed_time_apart_may_be_told(tmp_path):
+    path = tmp_path / "run.csv"
+    path.write_text("voltage (V),speed (rad/s)\n" + "".join(f"{6 * (k > 5)},{k}\n" for k in range(200)))
+    wrong(motorid("check", path), "--dt 0.001")
+    done = motorid("check", path, "--dt", "0.01")
+    assert done.status == 0, done.err
+    assert "1.99 s" in done.out
 
 
 @pytest.mark.parametrize("broken", BROKEN, ids=lambda b: b.name)

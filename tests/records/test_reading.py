@@ -210,6 +210,20 @@ def test_a_table_without_header_goes_by_position(tmp_path):
     assert list(run.meta["extra"]) == ["3"]
 
 
+@pytest.mark.parametrize("columns", [None, {"v": 1, "omega": "speed (rad/s)"}])
+def test_samples_a_fixed_time_apart_need_no_column_of_time(tmp_path, columns):
+    path = tmp_path / "run.csv"
+    path.write_text("voltage (V),speed (rad/s)\n" + "".join(f"{k % 7},{k}\n" for k in range(30)))
+    with pytest.raises(DataError, match=r"the time \(t\).*dt=0.001"):
+        read_csv(path)
+    run = read_runs(path, columns=columns, dt=0.004)[0]
+    assert run.t == pytest.approx(0.004 * np.arange(30))
+    assert run.channels == ("omega",)
+    for dt, columns, message in ((-1.0, None, "dt must be positive"), (0.1, {"t": 1}, "leave one of them out")):
+        with pytest.raises(DataError, match=message):
+            read_runs(path, columns=columns, dt=dt)
+
+
 def test_encoder_counts_become_an_angle(tmp_path):
     path = write(tmp_path, "t,u,encoder\n" + "".join(f"{k / 100},6,{64 * k}\n" for k in range(30)))
     run = read_csv(path, units={"theta": "counts:2048"})
