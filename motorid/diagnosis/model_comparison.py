@@ -19,7 +19,7 @@ from motorid.model.model import Model
 from motorid.problem.problem import Problem
 
 COMMON = ("coulomb", "gravity", "brush_drop", "winding_heating", "cogging", "load_friction", "quadratic_drag",
-          "constant_load", "speed_lag", "driver_dead_band")  # what is met most, first
+          "constant_load", "speed_lag", "driver_dead_band", "spring")  # what is met most, first
 
 
 @dataclass(frozen=True, eq=False)
