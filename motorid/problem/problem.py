@@ -88,6 +88,10 @@ class Problem:
                                  f"{self.priors[name]}.")
         if self.loss is not None and (not hasattr(self.loss, "pseudo") or isinstance(self.loss, type)):
             raise UsageError(f"loss takes mi.Huber() or None; got {name_of(self.loss)}.")
+        if self.model.base == "torque_driven" and self.model.axis == "rotary" and any(
+                {"m", "m/s"} & set(r.units.values()) for r in self.experiments):
+            raise ModelError("the records are in metres, and the model is one that turns: write "
+                             "mi.torque_driven(axis='linear'), or state the units of the records.")
         self.model.check_visible(self.outputs)
         width = self.width or smoothing(self.experiments, self.model.parameters)
         if width is not None:

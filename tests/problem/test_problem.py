@@ -340,3 +340,12 @@ def test_the_first_angle_of_the_finest_encoder_is_estimated():
     assert np.ptp(angle) > 1e5 * count
     assert fit.initial["theta_0[0]"] == pytest.approx(-0.5 * count, rel=0.1)
     assert fit.misfit["theta"] < 1.1
+
+
+@pytest.mark.parametrize("units", [{"theta": "m"}, {"omega": "m/s"}])
+def test_records_in_metres_are_none_of_a_drive_that_turns(units):
+    t = np.arange(50) * 1e-2
+    run = mi.Experiment(t, {"v": np.ones(50)}, {c: t for c in units}, units=units)
+    with pytest.raises(mi.ModelError, match=r"metres.*torque_driven\(axis='linear'\)"):
+        mi.Problem(mi.torque_driven(), [run])
+    assert mi.Problem(mi.torque_driven(axis="linear"), [run]).outputs == tuple(units)
