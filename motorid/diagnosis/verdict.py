@@ -17,11 +17,13 @@ from motorid.display.numbers import arrow, counted, listed, number, percent, wit
 from motorid.effects import EVERY
 from motorid.estimation.result import Fit, parameter_cell
 from motorid.model.definition import Effect
+from motorid.numerics.autoregression import colour_of
 from motorid.numerics.signals import despiked
 from motorid.records.experiment import units_of
 
 MOVED = 0.1  # relative change of a motor parameter that is worth a word
 SPIKED = 0.5  # of a channel's squared error: what outliers must make to be worth a word
+NOISELESS = 0.1  # of its fast changes: what of a voltage its own past does not tell
 RPM = 30 / np.pi
 DECIDED = "blocks left out of the fitted runs decided"
 
@@ -314,12 +316,15 @@ def closed_loop_remark(fit: Fit) -> str:
 
 
 def _noise_feedback(v, y) -> float:
-    """Correlation of the fast changes of the voltage with those of the measurement just before."""
+    """Correlation of the fast changes of the voltage with those of the measurement just before.
+
+    None where the voltage tells its own next value, as a sweep of sines does: that passes on no noise.
+    """
     if y is None or np.ptp(v) == 0:
         return 0.0
     dv, dy = np.diff(v, 2), np.diff(np.nan_to_num(y), 2)
-    changed = np.abs(dv) > 0
-    if changed.mean() < 0.5:
+    changed, own = np.abs(dv) > 0, colour_of([dv - dv.mean()])
+    if changed.mean() < 0.5 or own.innovation < NOISELESS * own.variance:
         return 0.0
     calm = (np.abs(dv) < 6 * np.median(np.abs(dv)) + 1e-300) & (np.abs(dy) < 6 * np.median(np.abs(dy)) + 1e-300)
     if calm.sum() < 50:
