@@ -114,8 +114,8 @@ def choose(children: Sequence[Node], parent: Node) -> tuple[Node, list[Node]] | 
 def group_of(chosen: Node, siblings: Sequence[Node], includes: Mapping[str, tuple[str, ...]]) -> tuple[str, ...]:
     """Names of the siblings that these data cannot distinguish from `chosen`, what contains it left out."""
     others = (n for n in siblings if n is not chosen and n.parent is chosen.parent and not n.objection)
-    return tuple(n.added for n in others if n.added not in (None, chosen.added)
-                 and chosen.added not in includes.get(n.added, ()) and tied(n, chosen))
+    return tuple(dict.fromkeys(n.added for n in others if n.added not in (None, chosen.added)
+                               and chosen.added not in includes.get(n.added, ()) and tied(n, chosen)))
 
 
 def rarity(name: str | None) -> int:

@@ -66,13 +66,15 @@ def climb(search: Search, max_effects: int, seconds: float | None = None) -> Cli
 
     What was found by then is the answer; `stopped` says so.
     """
+    began = time.monotonic()
     scores = search.scores(search.root)
     first = judge_adequacy(search.root, scores)
     search.stages.done(first_answer(search.root.fit, first, scores))
     found, stopped = Climb(search, (search.root,), (), (), "", first, first), ""
     steps = _rounds(found, max_effects)
+    looked = time.monotonic() - began  # about as long as to look at what remains
     try:
-        with budget(seconds):
+        with budget(seconds and max(seconds - 2 * looked, 0.0)):
             while (further := next(steps, None)) is not None:
                 found = further
     except (OutOfTime, KeyboardInterrupt) as error:
