@@ -331,8 +331,11 @@ def share_table(what: str, shares: Mapping[str, float]) -> Table:
 
 
 def ranking_table(candidates: Sequence[Candidate], most: int = 10) -> Table:
-    """Return the effects accepted, then the best others up to `most`; the held-out error only where there is one."""
-    shown = sorted((c for k, c in enumerate(candidates) if k < most or c.accepted), key=lambda c: not c.accepted)
+    """Return the effects accepted, then the best others up to `most`, that which the refits liked best among them; the
+    held-out error only where there is one."""
+    nearest = max((c for c in candidates if c.refit_drop is not None), key=lambda c: c.refit_drop or 0.0, default=None)
+    shown = sorted((c for k, c in enumerate(candidates) if k < most or c.accepted or c is nearest),
+                   key=lambda c: not c.accepted)
     held_out = any(c.held_out_gain is not None for c in shown)
     header = ["effect", "predicted", "refitted", *(["held out"] if held_out else []), "verdict"]
     rows: list[list[Cell]] = []

@@ -80,9 +80,10 @@ def approximations_text(grades: Sequence[Grade], what: str = "it") -> str:
     for g in grades:
         if g.grade == "approximates":
             reasons.setdefault(g.why, []).append(f"'{g.effect}'")
-    return " ".join(f"{listed(names)} {'help' if len(names) > 1 else 'helps'}, but only "
-                    f"{'approximate' if len(names) > 1 else 'approximates'} {what}: {why}."
-                    for why, names in reasons.items())
+    return " ".join(
+        f"{listed(names)} help, but only approximate {what}: {why.replace('it removes', 'each removes', 1)}."
+        if len(names) > 1 else f"{names[0]} helps, but only approximates {what}: {why}."
+        for why, names in reasons.items())
 
 
 def missing_text(rungs: Sequence[Rung], remaining: Adequacy, groups: Sequence[Sequence[str]],
