@@ -12,7 +12,14 @@ from lab_records import VALUES, noisy, pair, simulated
 import motorid as mi
 from motorid.diagnosis.misspecification import Grade
 from motorid.diagnosis.results import Rung
-from motorid.diagnosis.verdict import adequate_text, errors_text, missing_text, rises_text, unexplained_text
+from motorid.diagnosis.verdict import (
+    adequate_text,
+    errors_text,
+    missing_text,
+    own_in_every_run_remark,
+    rises_text,
+    unexplained_text,
+)
 
 
 def rungs_of(*errors, held_out=None, misfit=1.0, speed=8.0):
@@ -113,3 +120,10 @@ def test_what_one_step_cannot_show_is_said(rng):
     both = mi.diagnose(mi.fit(mi.dc_motor(), pair(rng, model=hidden)))
     assert both.effects == ("coulomb",)
     assert not any(d.startswith("These records cannot show ") for d in both.details)
+
+
+def test_what_is_another_in_every_run_is_said_to_be_estimated_in_the_held_out_runs():
+    one = own_in_every_run_remark(SimpleNamespace(per_run={"g_v": {}}))
+    assert one.startswith("g_v is another in every run, and so estimated in the held-out runs too")
+    assert "z_0 and g_v are others" in own_in_every_run_remark(SimpleNamespace(per_run={"z_0": {}, "g_v": {}}))
+    assert own_in_every_run_remark(SimpleNamespace(per_run={})) == ""
