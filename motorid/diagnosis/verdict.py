@@ -227,8 +227,8 @@ def own_in_every_run_remark(fit: Fit) -> str:
     if not fit.per_run:
         return ""
     are = "are others" if len(fit.per_run) > 1 else "is another"
-    return (f"{listed(list(fit.per_run))} {are} in every run, and so estimated in the held-out runs too, for each block "
-            "by the others: these prove that it stays, not how large it is.")
+    return (f"{listed(list(fit.per_run))} {are} in every run, and so estimated in the held-out runs too, for each "
+            "block by the others: these prove that it stays, not how large it is.")
 
 
 def unfinished_remark(fit: Fit) -> str:

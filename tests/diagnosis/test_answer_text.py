@@ -49,7 +49,8 @@ def test_an_error_that_is_printed_alike_stays():
 def test_noise_that_remains_is_where_it_remains(elsewhere, said):
     errors = {"held_out": ((0.02, 0.2), (0.02, 0.19))}
     noise = SimpleNamespace(adequate=True, text="")
-    assert missing_text(rungs_of((0.02, 0.2), (0.02, 0.02), **errors, speed=1.0), noise, (), (), elsewhere).endswith(said)
+    small = missing_text(rungs_of((0.02, 0.2), (0.02, 0.02), **errors, speed=1.0), noise, (), (), elsewhere)
+    assert small.endswith(said)
     larger = missing_text(rungs_of((0.02, 0.2), (0.02, 0.02), **errors, speed=9.4), noise, (), (), elsewhere)
     assert "remains is noise" not in larger
     assert larger.endswith(", but is larger than the noise (speed 9.4 times).")
