@@ -190,7 +190,8 @@ def test_what_will_be_needed_is_compiled_beside_the_work_at_hand(cache, builds):
     cc.tend()
     assert len(list(cache.glob("*.so"))) == 1
     assert rb.stepper(system)._load(None) is not None
-    assert not builds and cc._ahead.running is None
+    assert not builds
+    assert cc._ahead.running is None
     assert [f for f in cache.iterdir() if f.is_dir()] == []
 
 
@@ -202,14 +203,16 @@ def test_who_needs_it_before_waits_for_it_and_the_next_is_not_begun_twice(cache,
     for system in reversed(systems):  # the last of them first
         assert rb.stepper(system)._load(True) is not None
     assert len(list(cache.glob("*.so"))) == 3
-    assert cc._ahead.running is None and not cc._ahead.waiting
+    assert cc._ahead.running is None
+    assert not cc._ahead.waiting
 
 
 @needs_compiler
 def test_little_work_is_not_compiled_ahead(cache):
     Rosenbrock().ahead(system_with("coulomb"), 1000)
     Rosenbrock(compiled=False).ahead(system_with("coulomb"), 10**6)
-    assert cc._ahead.running is None and not cc._ahead.waiting
+    assert cc._ahead.running is None
+    assert not cc._ahead.waiting
 
 
 @needs_compiler

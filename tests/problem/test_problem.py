@@ -345,7 +345,7 @@ def test_the_first_angle_of_the_finest_encoder_is_estimated():
 @pytest.mark.parametrize("units", [{"theta": "m"}, {"omega": "m/s"}])
 def test_records_in_metres_are_none_of_a_drive_that_turns(units):
     t = np.arange(50) * 1e-2
-    run = mi.Experiment(t, {"v": np.ones(50)}, {c: t for c in units}, units=units)
+    run = mi.Experiment(t, {"v": np.ones(50)}, dict.fromkeys(units, t), units=units)
     with pytest.raises(mi.ModelError, match=r"metres.*torque_driven\(axis='linear'\)"):
         mi.Problem(mi.torque_driven(), [run])
     assert mi.Problem(mi.torque_driven(axis="linear"), [run]).outputs == tuple(units)
