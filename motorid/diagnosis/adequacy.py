@@ -58,7 +58,7 @@ def adequacy(fit: Fit, scores: Sequence[Score] = (), false_alarm: float = FALSE_
     """
     channels = {c: _channel(fit, c) for c in fit.problem.outputs}
     tests = [t for c in channels for t in _dependences(fit, c)]
-    tests += _score_tests(fit, scores)
+    tests += _score_tests(scores)
     material = [t for t in tests if t["share"] > _material(channels, t["channel"])]
     p_value = min([1.0, *(t["p"] * len(tests) for t in material)])
     far = [c for c, facts in channels.items() if facts["ratio"] > LARGEST_RATIO / (2 if c == "theta" else 1)]
@@ -141,10 +141,7 @@ def _largest_cross_correlation(u: Array, r: Array) -> float:
 def motion_of(fit: Fit, k: int) -> dict[str, Array]:
     """Return what the motor was doing in run `k`, (N,) each, from the model's own signals."""
     sim, run = fit.simulations[k], fit.problem.experiments[k]
-    signals = {"v": run.inputs["v"]}
-    for c in ("i", "omega"):
-        if c in sim.states:
-            signals[c] = sim.states[c]
+    signals = {"v": run.inputs["v"], **{c: sim.states[c] for c in ("i", "omega") if c in sim.states}}
     if "theta" in run.outputs or "omega" in run.outputs:
         signals["theta"] = np.mod(angle_signal(run), 2 * np.pi)
     if "omega" in sim.states:
@@ -157,9 +154,8 @@ def _dependences(fit: Fit, channel: str) -> list[dict[str, Any]]:
     parts = _residuals(fit, channel)
     motions = [motion_of(fit, k) for k, _ in parts]
     residuals = [_winsorised(r) for _, r in parts]
-    names = [n for n in motions[0] if all(n in m for m in motions)]
     found = []
-    for name in names:
+    for name in (n for n in motions[0] if all(n in m for m in motions)):
         labels = _labels([m[name] for m in motions], 2 * BINS if name == "theta" else BINS)
         if labels is not None:
             share, p = _shift_test(labels, residuals)
@@ -201,7 +197,7 @@ def _sums(labels: NDArray[np.intp], r: Array, count: int) -> Array:
     return np.fft.irfft(inside * np.conj(np.fft.rfft(r)), n, axis=1)[:, shifts].T
 
 
-def _score_tests(fit: Fit, scores: Sequence[Score]) -> list[dict[str, Any]]:
+def _score_tests(scores: Sequence[Score]) -> list[dict[str, Any]]:
     """Turn predicted drops into p-values on effective samples, the search over shapes paid for."""
     found = []
     for s in scores:

@@ -48,10 +48,7 @@ class HeldOut:
     def predictions(self, fit: Fit) -> Predictions:
         """Return what `fit` predicts of data that it was not fitted to.
 
-        Raises
-        ------
-        SimulationError
-            If it cannot be simulated on the held-out runs.
+        SimulationError if it cannot be simulated on the held-out runs.
         """
         held_out: Channels = {}
         if self.validation is not None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from types import SimpleNamespace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +23,6 @@ from motorid.estimation.result import Fit
 from motorid.numerics.signals import Array
 from motorid.problem.problem import Problem
 from motorid.problem.runs import angle_signal
-from motorid.problem.simulate import Simulation
 
 KNOTS = 9  # cosines over the range of a time, twice as many over that of an angle
 HARMONICS = 8  # of a turn
@@ -189,21 +189,13 @@ def past(z: Array, along: Array, length: float, initial: float) -> Array:
     return np.interp(along, even, np.concatenate([[initial], lagged]))
 
 
-class _Sheet:
-    """What the source of functions may ask of a model, for arrays."""
-
-    def __init__(self, width: float) -> None:
-        self.width = width
-
-    def sign(self, z: Array) -> Array:
-        return np.tanh(z / self.width)
-
 
 def values_of(functions: Sequence[str], form: Form, signal: Mapping[str, Array]) -> Array:
     """Return functions of a form, given by their source, along one run, (N, m)."""
     z, along = signal[form.on], signal["way" if form.on == "path" else "t"]
     first = float(z[0]) if form.on in ("past i", "past omega") else 0.0
-    names = {"ca": np, "z": z, "m": _Sheet(float(signal["width"][0])),
+    width = float(signal["width"][0])
+    names = {"ca": np, "z": z, "m": SimpleNamespace(sign=lambda z: np.tanh(z / width)),
              "past": lambda z, length: past(z, along, length, first)}
     return np.column_stack([np.broadcast_to(np.asarray(eval(f, names), float), z.shape) for f in functions])
 
@@ -258,9 +250,7 @@ class Linear:
 def linearised(fit: Fit, only: Form | None = None, span: Span | None = None) -> Linear:
     """Return the model of `fit` on its records, with the forms that these can show, or `only` one over a span.
 
-    Raises
-    ------
-    SimulationError
+    SimulationError where its answer to small changes grows without bound.
     """
     problem = fit.problem
     residual, jac = _at(problem, fit)
@@ -289,34 +279,31 @@ def _at(problem: Problem, fit: Fit) -> tuple[Array, Array]:
 
 
 def signals_along(fit: Fit) -> list[dict[str, Array]]:
-    """Return what a form may be a function of, along each run of a fit."""
-    return [signals_of(fit, fit.problem, s, k) for k, s in enumerate(fit.simulations)]
-
-
-def signals_of(fit: Fit, problem: Problem, sim: Simulation, k: int) -> dict[str, Array]:
-    """Return what a form may be a function of, along run `k`, (N,) each; the direction as smooth as the model's own.
+    """Return what a form may be a function of, along each run, (N,) each; the direction as smooth as the model's own.
 
     ``"width"`` is that of the smooth sgn.
     """
-    run = problem.experiments[k]
+    return [_signals(fit, k) for k in range(len(fit.simulations))]
+
+
+def _signals(fit: Fit, k: int) -> dict[str, Array]:
+    run, sim = fit.problem.experiments[k], fit.simulations[k]
     found = {"t": run.t - run.t[0], "v": run.inputs["v"], "run": np.full(run.n, float(k)), "width": np.ones(run.n)}
     found |= {c: np.asarray(sim.states[c]) for c in ("i", "omega") if c in sim.states}
     if "omega" in found:
+        omega = found["omega"]
         top = max(float(np.abs(s.states["omega"]).max()) for s in fit.simulations)
         width = fit.values.get("sgn_width") or SHARP * top + 1e-300
-        found["width"], found["direction"] = np.full(run.n, width), np.tanh(found["omega"] / width)
-        found["acceleration"] = fit.values["J"] * np.gradient(found["omega"], run.t)  # of a relative inertia
-        found["energy"] = 0.5 * fit.values["J"] * found["omega"] ** 2
-        found["path"], found["way"] = found["direction"], _way(found["omega"], run.t)
+        found["width"], found["direction"] = np.full(run.n, width), np.tanh(omega / width)
+        found["acceleration"] = fit.values["J"] * np.gradient(omega, run.t)  # of a relative inertia
+        found["energy"] = 0.5 * fit.values["J"] * omega**2
+        gone = np.cumsum(0.5 * np.abs(omega[1:] + omega[:-1]) * np.diff(run.t))  # both directions counted
+        found["path"], found["way"] = found["direction"], np.concatenate([[0.0], gone])
     found |= {f"past {c}": found[c] for c in ("v", "i", "omega") if c in found}
     if "theta" in run.outputs or "omega" in run.outputs:
         found["theta"] = found["turn"] = angle_signal(run)
     return found
 
-
-def _way(omega: Array, t: Array) -> Array:
-    """Return the way gone, (N,), both directions counted."""
-    return np.concatenate([[0.0], np.cumsum(0.5 * np.abs(omega[1:] + omega[:-1]) * np.diff(t))])
 
 
 def _answers(problem: Problem, k: int, answer: Response, bases: Mapping[Form, Array]) -> dict[Form, Array]:
@@ -326,14 +313,11 @@ def _answers(problem: Problem, k: int, answer: Response, bases: Mapping[Form, Ar
     _, weights, index = problem.measured[k][:3]
     answer = replace(answer, c=answer.c * weights[None, :, None])
     inside = {f: b for f, b in bases.items() if f.balance != "sensor"}
-    flat = np.concatenate(
-        [_driven(answer, inside), *(_read(problem, f, b, weights) for f, b in bases.items() if f not in inside)],
-        axis=1,
-    )
+    read = {f: b for f, b in bases.items() if f not in inside}
+    flat = np.concatenate([_driven(answer, inside), *(_read(problem, f, b, weights) for f, b in read.items())], axis=1)
     flat = flat if index is None else flat[index]
-    order = [*inside, *(f for f in bases if f not in inside)]
-    ends = np.cumsum([bases[f].shape[1] for f in order])[:-1]
-    return dict(zip(order, np.split(flat, ends, axis=1), strict=True))
+    ends = np.cumsum([b.shape[1] for b in (*inside.values(), *read.values())])[:-1]
+    return dict(zip((*inside, *read), np.split(flat, ends, axis=1), strict=True))
 
 
 def _driven(answer: Response, bases: Mapping[Form, Array]) -> Array:

@@ -57,12 +57,7 @@ class Reading:
         return fit.problem.with_(experiments=runs, model=fit.model, noise_factors={})
 
     def fitted(self, fit: Fit, solver: LevenbergMarquardt | None = None) -> Fit:
-        """Return the fit of the same model to records read so.
-
-        Raises
-        ------
-        FitError, SimulationError
-        """
+        """Return the fit of the same model to records read so; FitError or SimulationError where there is none."""
         return solve(self.problem(fit), solver, start="model")
 
     def remark(self, before: Fit, after: Fit) -> str:

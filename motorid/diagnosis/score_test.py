@@ -167,13 +167,7 @@ def _nothing(tangent: Tangent, known: Score | None) -> Score | None:
 
 
 def score(tangent: Tangent, effect: Effect) -> Score:
-    """Score one effect.
-
-    Raises
-    ------
-    ModelError
-        If the effect does not go with the model or the measured channels.
-    """
+    """Score one effect; ModelError if it does not go with the model or the measured channels."""
     added = Added.of(tangent, effect)
     if any(p.order and not p.given for p in added.pars):
         return _score_orders(tangent, added, effect)
@@ -217,17 +211,16 @@ def _distinct(starts: list[dict[str, float]], most: int = 3) -> list[dict[str, f
 
 def _tried(tangent: Tangent, shape: Shape) -> Tried:
     """Score one shape, physical signs enforced."""
+    drop, amounts, left = tangent.explained(shape.columns, shape.nonnegative)
     if not shape.sizes:
-        drop, amount, left = tangent.explained(shape.columns, shape.nonnegative)
         # An amount far from one means that the shape itself is wrong: the drop promises more than it can keep.
-        keeps = 0.2 if amount[0] < 0.05 else min(1.0, 3.0 / amount[0])
+        keeps = 0.2 if amounts[0] < 0.05 else min(1.0, 3.0 / amounts[0])
         return Tried(keeps * drop, dict(shape.values), left)
     if shape.phase is not None:
-        drop, a, left = tangent.explained(shape.columns, shape.nonnegative)
-        found = {shape.sizes[0].name: float(np.hypot(*a)), shape.phase.name: float(np.arctan2(a[1], a[0]))}
+        cosine, sine = amounts
+        found = {shape.sizes[0].name: float(np.hypot(cosine, sine)), shape.phase.name: float(np.arctan2(sine, cosine))}
     else:
-        drop, a, left = tangent.explained(shape.columns, shape.nonnegative)
-        found = {p.name: float(v) for p, v in zip(shape.sizes, a, strict=True)}
+        found = {p.name: float(v) for p, v in zip(shape.sizes, amounts, strict=True)}
     held = {p.name: p.value for p in shape.sizes if not p.vary}
     if held:  # e.g. copper's temperature coefficient: only near its physical value does the shape make sense
         ratio = min((v / h for (n, h) in held.items() if (v := found[n]) > 0 and h), default=0.0)
@@ -291,10 +284,7 @@ class Added:
     def of(tangent: Tangent, effect: Effect) -> Added:
         """Return the fit's model with `effect`; the first one over the angle goes along the measured angle.
 
-        Raises
-        ------
-        ModelError
-            If the effect does not go with the model.
+        ModelError if the effect does not go with the model.
         """
         fit, model = tangent.fit, tangent.fit.model + effect
         if uses_angle(effect) and not model.angle_input and not any(uses_angle(e) for e in fit.model.effects):
@@ -303,18 +293,14 @@ class Added:
 
     def grid(self) -> Iterator[dict[str, float]]:
         """Yield the values of the shape parameters to try."""
-        axes = [
-            [(p.name, g * self.natural.get(p.unit, 1.0)) for g in p.grid] for p in self.pars if p.grid and not p.given
-        ]
-        yield from (dict(point) for point in itertools.product(*axes))
+        tried = [p for p in self.pars if p.grid and not p.given]
+        axes = [[(p.name, g * self.natural.get(p.unit, 1.0)) for g in p.grid] for p in tried]
+        yield from map(dict, itertools.product(*axes))
 
     def shape(self, values: Mapping[str, float]) -> Shape | None:
         """Return what the effect adds at `values`; None where that cannot be simulated, or is nothing.
 
-        Raises
-        ------
-        SimulationError
-            Where it vanishes.
+        SimulationError where it vanishes.
         """
         sizes = tuple(p for p in self.pars if p.null is not None and not p.positive)
         finite = any(p.null is not None and p.positive for p in self.pars)
@@ -391,6 +377,5 @@ def plain_residual(fit: Fit) -> Array:
     problem = fit.problem
     if problem.loss is None:
         return fit.residuals[: problem.n_outputs]
-    return np.concatenate(
-        [problem.run_residual(k, problem.simulate(fit.q, k, derivatives=False))[0] for k in range(len(problem.runs))]
-    )
+    sims = (problem.simulate(fit.q, k, derivatives=False) for k in range(len(problem.runs)))
+    return np.concatenate([problem.run_residual(k, s)[0] for k, s in enumerate(sims)])

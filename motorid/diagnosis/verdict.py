@@ -88,9 +88,8 @@ def missing_text(rungs: Sequence[Rung], remaining: Adequacy, groups: Sequence[Se
 
     `elsewhere`: the held-out runs are predicted far worse than the fitted ones.
     """
-    after = rungs[-1].fit
     names = [g.effect for g in grades if g.grade != "approximates"]
-    parts = [f"Missing: {'; '.join(_described(after, n) for n in names)}."]
+    parts = [f"Missing: {'; '.join(_described(rungs[-1].fit, n) for n in names)}."]
     parts += [f"These records do not distinguish {g[0]} from {' or '.join(g[1:])}." for g in groups]
     parts += [approximations_text(grades, "the rest")] if len(names) < len(grades) else []
     parts.append(errors_text(rungs))
@@ -203,12 +202,8 @@ def moves(before: Fit, after: Fit) -> str:
 
 def measured_angle_remark(fit: Fit) -> str:
     """Say so where effects take the angle from the record, since the model's own drifts too far for them."""
-    if not fit.model.angle_input:
-        return ""
-    return (
-        "Effects over the angle use the measured angle, on held-out runs too, because the simulated angle drifts too "
-        "far. Without a measured angle this model cannot predict."
-    )
+    return ("Effects over the angle use the measured angle, on held-out runs too, because the simulated angle drifts "
+            "too far. Without a measured angle this model cannot predict.") if fit.model.angle_input else ""
 
 
 def unfinished_remark(fit: Fit) -> str:
@@ -289,10 +284,9 @@ def closed_loop_remark(fit: Fit) -> str:
         feedback = min(_noise_feedback(run.inputs["v"], y) for y in both)
         extra = run.meta.get("extra", {})
         if feedback > 0.5 or any("ref" in str(n).lower() or "goal" in str(n).lower() for n in extra):
-            return (
-                "The records seem to come from a closed loop: the controller compensates what the model lacks, so "
-                "part of it hides in the voltage, and an open-loop simulation drifts. Open-loop records show it better."
-            )
+            return ("The records seem to come from a closed loop: the controller compensates what the model lacks, so "
+                    "part of it hides in the voltage, and an open-loop simulation drifts. Open-loop records show it "
+                    "better.")
     return ""
 
 
@@ -301,13 +295,8 @@ def _noise_feedback(v, y) -> float:
     if y is None or np.ptp(v) == 0:
         return 0.0
     dv, dy = np.diff(v, 2), np.diff(np.nan_to_num(y), 2)
-    changed = np.abs(dv) > 0
-    if changed.mean() < 0.5:
-        return 0.0
-    calm = (np.abs(dv) < 6 * np.median(np.abs(dv)) + 1e-300) & (np.abs(dy) < 6 * np.median(np.abs(dy)) + 1e-300)
-    if calm.sum() < 50:
-        return 0.0
-    if min(np.ptp(dv[calm]), np.ptp(dy[calm])) == 0:
+    calm = np.all([np.abs(d) < 6 * np.median(np.abs(d)) + 1e-300 for d in (dv, dy)], axis=0)
+    if np.mean(dv != 0) < 0.5 or calm.sum() < 50 or min(np.ptp(dv[calm]), np.ptp(dy[calm])) == 0:
         return 0.0
     both = [np.corrcoef(dv[1:][calm[1:]], dy[:-1][calm[1:]])[0, 1], np.corrcoef(dv[calm], dy[calm])[0, 1]]
     return float(np.nanmax(np.abs(both)))
