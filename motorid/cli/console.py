@@ -329,13 +329,9 @@ def _spread(args: Sequence[str]) -> list[str]:
     for k, word in enumerate(args):
         if word == "--":
             return [*spread, *args[k:]]
-        if word in MANY:
-            option, first = word, True
-            spread.append(word)
-        elif option and not (word.startswith("-") and len(word) > 1):
-            spread += [word] if first else [option, word]
-            first = False
-        else:
-            option = None
-            spread.append(word)
+        if word.startswith("-") and len(word) > 1:
+            option = word if word in MANY else None
+        elif option and spread[-1] != option:
+            spread.append(option)
+        spread.append(word)
     return spread

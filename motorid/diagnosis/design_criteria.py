@@ -342,12 +342,7 @@ class Driven:
         return np.array([values.get(n, 0.0) for n in self.system.parameters]), scaling.slope(q)
 
     def respond(self, levels: Array, delta: Array, by_level: bool = False, by_parameter: bool = False) -> Response:
-        """Simulate from rest at angle zero.
-
-        Raises
-        ------
-        SimulationError
-        """
+        """Simulate from rest at angle zero; SimulationError where that does not reach the end."""
         (p, slope), m = self.parameters(delta), len(levels) if by_level else 0
         place = [self.system.parameters.index(n) for n in self.rival.model.free_names]
         k = len(place) if by_parameter else 0

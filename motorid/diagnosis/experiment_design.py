@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from io import SEEK_END, StringIO
+from io import StringIO
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -32,7 +32,7 @@ from motorid.diagnosis.design_criteria import (
 from motorid.diagnosis.results import Diagnosis
 from motorid.display.cards import Card, Flag, Printed, Shown, Table
 from motorid.display.numbers import number, quantity
-from motorid.errors import FitError, MotoridError, UsageError, among, at_least, one_of, positive
+from motorid.errors import FitError, MotoridError, UsageError, among, at_least, chosen, one_of, positive
 from motorid.estimation.result import Fit
 from motorid.numerics.parallel import budget as limited_time
 from motorid.numerics.parallel import one_thread
@@ -246,9 +246,8 @@ class Design(Printed):
         """Write time, voltage, and what each rival predicts; over another program's file with `force` only."""
         heads = ["t_s", "v_V", *(f"{c}_{n}" for n, p in self.predicted.items() for c in p)]
         columns = [self.t, self.v, *(y for p in self.predicted.values() for y in p.values())]
-        text = StringIO("# Written by motorid\n" + ",".join(heads) + "\n")
-        text.seek(0, SEEK_END)
-        np.savetxt(text, np.column_stack(columns), "%.7g", ",")
+        text, lead = StringIO(), "# Written by motorid\n"
+        np.savetxt(text, np.column_stack(columns), "%.7g", ",", header=",".join(heads), comments=lead)
         return write_files({Path(path): text.getvalue()}, force)[0]
 
     def to_dict(self) -> dict[str, Any]:
@@ -324,7 +323,7 @@ def design_experiment(found: Diagnosis | Fit | Sequence[Fit | Rival], *, goal: s
     positive(OMITTED, v_max=v_max, i_max=i_max, omega_max=omega_max, temp_max=temp_max, duration=duration, dt=dt)
     at_least(0, budget=budget)
     rivals, goal = _rivals(found, goal)
-    asked = _asked(rivals[0], parameters) if goal == "sharpen" else ()
+    asked = tuple(chosen(parameters, rivals[0].model.free_names, "free parameter")) if goal == "sharpen" else ()
     _check_words(shape, levels, slew)
     seen = rivals[0].seen
     dt, duration = float(f"{dt or seen['dt']:.9g}"), duration or seen["duration"]
@@ -427,12 +426,6 @@ def _rivals(found: Any, goal: str | None) -> tuple[list[Rival], str]:
     names = [" + ".join(n for n in r.model.effect_names if n not in common) or "none" for r in rivals]
     return [replace(r, name=n) for r, n in zip(rivals, names, strict=True)], goal
 
-
-def _asked(rival: Rival, parameters: Sequence[str] | None) -> tuple[str, ...]:
-    free = rival.model.free_names
-    for name in parameters or ():
-        among(name, free, "free parameter")
-    return tuple(parameters or free)
 
 
 def _check_span(duration: float, dt: float) -> None:
@@ -646,15 +639,10 @@ def _fixed(task: Task) -> tuple[str, Task, Array]:
     return name, fine, c
 
 
-def _drawn(task: Task) -> list[Array]:
-    """Return displacements of the parameters (n, k) by rival."""
-    rng = np.random.default_rng(0)
-    return [d.rival.draws(DRAWS, rng) for d in task.driven]
-
-
 def _safe(task: Task, c: Array) -> tuple[Array, dict[str, float]]:
     """Return the unknowns, shrunk until drawn parameters keep the limits too, and the largest size of each state."""
-    kept = _shrunk(task, c, _drawn(task))
+    rng = np.random.default_rng(0)
+    kept = _shrunk(task, c, [d.rival.draws(DRAWS, rng) for d in task.driven])
     if kept is None:
         raise FitError(NO_RECORD)
     c, reach = kept

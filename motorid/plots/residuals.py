@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from motorid.channels import CHANNELS
-from motorid.errors import DataError, among
+from motorid.errors import DataError, chosen
 from motorid.estimation.result import Fit
 from motorid.numerics.autoregression import autocorrelation, effective_samples
 from motorid.numerics.signals import Array
@@ -45,9 +45,7 @@ def plot_residuals(fit: Fit, channels: Sequence[str] | None = None) -> np.ndarra
     """
     sims = fit.simulations
     present = [c for c in CHANNELS if any(c in s.experiment.outputs and c in s.outputs for s in sims)]
-    for c in channels or ():
-        among(c, present, "channel")
-    names = list(channels or present)
+    names = chosen(channels, present, "channel")
     against = [c for c in ("omega", "i", "theta") if c in present]
     figure = style.new_figure(style.WIDTH, 3.0 * len(names) + 0.2)
     rows = figure.add_gridspec(2 * len(names), 1)

@@ -17,7 +17,7 @@ import scipy
 
 from motorid.display.cards import Card, Flag, Printed, Table
 from motorid.display.numbers import interval_text, percent, quantity
-from motorid.errors import MotoridError, among
+from motorid.errors import MotoridError, chosen
 from motorid.estimation.least_squares import least_squares
 from motorid.estimation.result import Fit
 from motorid.numerics.least_squares import LevenbergMarquardt, seen_directions
@@ -161,16 +161,13 @@ def profiles(fit: Fit, names: Sequence[str] | None = None, *, level: float = 0.9
     >>> each = mi.profiles(better, ["R", "b"], quiet=True)
     >>> axes = mi.plot_profile(each)
     """
-    free = fit.problem.model.free_names
-    for n in names or ():
-        among(n, free, "free parameter")
-    chosen = tuple(names or free)
+    names = chosen(names, fit.problem.model.free_names, "free parameter")
     check_level(level)
-    plans = {n: _plan(fit, n, level) for n in chosen}
-    tasks = [(n, side, *plans[n][:3]) for n in chosen for side in (-1.0, 1.0)]
+    plans = {n: _plan(fit, n, level) for n in names}
+    tasks = [(n, side, *plans[n][:3]) for n in names for side in (-1.0, 1.0)]
     done = map_items(_side, (fit.problem, dict(fit.values), fit.cost), tasks, map, "Profiling", quiet=quiet)
     sides = done.results + [[]] * (len(tasks) - len(done.results))
-    return {n: _joined(fit, n, sides[2 * k], sides[2 * k + 1], plans[n][3]) for k, n in enumerate(chosen)}
+    return {n: _joined(fit, n, sides[2 * k], sides[2 * k + 1], plans[n][3]) for k, n in enumerate(names)}
 
 
 def _plan(fit: Fit, name: str, level: float) -> tuple[float, float, float, float]:
