@@ -213,9 +213,7 @@ def _least(cells: Sequence[str]) -> int:
 def _upright(table: Table, room: int) -> Table:
     """Return a table with rows and columns exchanged where only that keeps its names and numbers whole."""
     whole = [max(_least(c), *(len(cell) for cell in c[1:] if max(map(len, c)) <= MAY_WRAP), 0) for c in _columns(table)]
-    if sum(whole) + 3 * len(whole) < room or len(whole) <= len(table.rows) + 1:
-        return table
-    return table.turned()
+    return table if sum(whole) + 3 * len(whole) < room or len(whole) <= len(table.rows) + 1 else table.turned()
 
 
 def _widths(table: Table, room: int) -> list[int]:

@@ -93,10 +93,6 @@ class ReadingOptions:
         named = {k: parse_pairs(v, f"--{k}") for k in ("columns", "units") if (v := getattr(self, k))}
         return named | ({"hold": self.hold} if self.hold else {})
 
-    @property
-    def preprocesses(self) -> bool:
-        """Whether the runs differ from what their files say."""
-        return bool(self.ignore or self.median or self.levels or self.delay or self.no_spikes)
 
     def _preprocessed(self, runs: Sequence[Experiment]) -> list[Experiment]:
         """Return `runs` without the ignored channels, filtered, delayed and without spikes as asked."""

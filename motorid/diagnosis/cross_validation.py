@@ -7,14 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from motorid.diagnosis.predictive_score import (
-    Channels,
-    Errors,
-    Predictions,
-    errors_of,
-    held_out_errors,
-    predictions_left_out,
-)
+from motorid.diagnosis.predictive_score import Errors, Predictions, errors_of, held_out_errors, predictions_left_out
 from motorid.estimation.continuation import by_continuation
 from motorid.estimation.least_squares import FAILURES
 from motorid.estimation.result import Fit
@@ -50,7 +43,7 @@ class HeldOut:
 
         SimulationError if it cannot be simulated on the held-out runs.
         """
-        held_out: Channels = {}
+        held_out: Mapping[str, Errors] = {}
         if self.validation is not None:
             # As finely as it was fitted: a tiny noise asks for many sub-steps that change nothing here.
             there = self.validation.for_model(fit.model).tuned(accuracy=fit.problem.accuracy)
@@ -60,7 +53,7 @@ class HeldOut:
             blocks = self._refitted(fit)
         return Predictions(blocks or {}, held_out)
 
-    def _refitted(self, fit: Fit) -> Channels:
+    def _refitted(self, fit: Fit) -> Mapping[str, Errors]:
         """Return the errors on every other part of each run, the model refitted to the rest, both ways round."""
         found: dict[str, list[Errors]] = {}
         for odd in (0, 1):

@@ -17,7 +17,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
-from itertools import pairwise, permutations, product
+from itertools import pairwise, product
 from typing import Any, NamedTuple
 
 import casadi as ca
@@ -664,8 +664,3 @@ def linear_rows(task: Task) -> Rows:
         high.append(task.slew * seconds / layout.v_max)
     limit = np.concatenate(high)
     return Rows(np.zeros(0), np.vstack(rows), -limit, limit)
-
-
-def all_pairs(n: int) -> tuple[tuple[int, int], ...]:
-    """Return (truth, rival) for each two of n models."""
-    return tuple(permutations(range(n), 2))

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from io import StringIO
-from itertools import combinations
+from itertools import combinations, permutations
 from pathlib import Path
 from typing import Any
 
@@ -18,17 +18,7 @@ import numpy as np
 
 from motorid.acquire.excitation import program
 from motorid.channels import UNITS, channel_name
-from motorid.diagnosis.design_criteria import (
-    MOST_SEGMENTS,
-    Driven,
-    Found,
-    Layout,
-    Rival,
-    Task,
-    all_pairs,
-    climb,
-    nearest,
-)
+from motorid.diagnosis.design_criteria import MOST_SEGMENTS, Driven, Found, Layout, Rival, Task, climb, nearest
 from motorid.diagnosis.results import Diagnosis
 from motorid.display.cards import Card, Flag, Printed, Shown, Table
 from motorid.display.numbers import number, quantity
@@ -102,6 +92,11 @@ def suggest_experiment(fits: Sequence[Fit], *, v_max: float | None = None, i_max
     _check_span(duration, dt)
     dt = max(dt, duration / SAMPLES)
     t = np.arange(0.0, duration, dt)
+    sigma = {c: s for run in fits[0].problem.runs for c, s in run.sigma.items()}
+
+    def difference(a: Mapping[str, Array], b: Mapping[str, Array]) -> float:
+        return float(np.mean([np.mean(((a[c] - b[c]) / sigma[c]) ** 2) for c in a if c in sigma]))
+
     scores, kept = {}, {}
     for name, (v, _) in candidates(t, v_max).items():
         try:
@@ -109,7 +104,7 @@ def suggest_experiment(fits: Sequence[Fit], *, v_max: float | None = None, i_max
         except MotoridError:
             continue
         if not i_max or all(float(np.abs(y.get("i", 0.0)).max()) <= i_max for y in answers):
-            scores[name] = min(_difference(a, b, fits[0]) for a, b in combinations(answers, 2))
+            scores[name] = min(difference(a, b) for a, b in combinations(answers, 2))
             kept[name] = Experiment(t, {"v": v}, answers[0], name=name)
     if not scores:
         raise FitError("no candidate experiment stays within the limits with all models; raise i_max or v_max.")
@@ -143,10 +138,6 @@ def _prediction(fit: Fit, t: Array, v: Array, name: str) -> dict[str, Array]:
     run = Experiment(t, {"v": v}, blank, sigma=dict.fromkeys(blank, 1.0), name=name)
     return dict(simulate(fit.model, run, initial="rest", estimate_initial=False)[0].outputs)
 
-
-def _difference(a: Mapping[str, Array], b: Mapping[str, Array], fit: Fit) -> float:
-    sigma = {c: s for run in fit.problem.runs for c, s in run.sigma.items()}
-    return float(np.mean([np.mean(((a[c] - b[c]) / sigma[c]) ** 2) for c in a if c in sigma]))
 
 
 # -- designed ----------------------------------------------------------------------------------------------------
@@ -231,13 +222,11 @@ class Design(Printed):
             rows = [[name, *(number(x, 3) for x in each)]
                     for every in self.deviations.values() for name, each in every.items()]
             tables.append(Table(["parameter", "std (SI) so far", f"with the {self.fixed}", "with this"], rows))
-        unit = {"v": "V", "dT": "K"} | {c: UNITS[c][0] for c in ("i", "omega", "theta")}
-        name = {"v": "voltage", "dT": "temperature rise"}
-        rows = [[name.get(c) or channel_name(c), quantity(p, unit[c], 3), quantity(self.limits.get(c), unit[c], 3)]
-                for c, p in self.peaks.items()]
+        unit = {"dT": "K"} | {c: units[0] for c, units in UNITS.items()}
+        rows = [["temperature rise" if c == "dT" else channel_name(c), quantity(p, unit[c], 3),
+                 quantity(self.limits.get(c), unit[c], 3)] for c, p in self.peaks.items()]
         tables.append(Table(["quantity", "largest expected", "limit"], rows))
-        moods = {"designed": "good", "stopped early": "note"}
-        return Card("Designed experiment", (Flag(self.status, moods[self.status]),),
+        return Card("Designed experiment", (Flag(self.status, "good" if self.status == "designed" else "note"),),
                     (self.text, f"Play it: {self.excite}"), tables,
                     (("mi.plot_design(design)", "see it"), ('design.to_csv("plan.csv")', "time and voltage"),
                      ('mi.record(port, "next.csv", excite=design.excite)', "play it")))
@@ -487,7 +476,8 @@ def _task(rivals: Sequence[Rival], layout: Layout, limits: Mapping[str, tuple[fl
     errors = {c: float(np.sqrt(np.mean([r.sigma[c] ** 2 for r in rivals]))) for c in rivals[0].sigma}
     width = SMOOTH * limits["omega"][1] if asked and "omega" in limits else 0.0  # the rivals may differ at low speed
     driven = tuple(Driven.of(r.smoothed(width), layout, errors, "theta" in limits) for r in rivals)
-    return Task(driven, limits, errors, asked, () if asked else all_pairs(len(rivals)), slew or np.inf)
+    pairs = () if asked else tuple(permutations(range(len(rivals)), 2))
+    return Task(driven, limits, errors, asked, pairs, slew or np.inf)
 
 
 def _starts(task: Task) -> dict[str, tuple[float, Task, Array]]:

@@ -104,11 +104,17 @@ class Span:
 
 
 def span_of(fit: Fit, signals: Sequence[Mapping[str, Array]]) -> Span:
-    """Return the smallest and the largest value of every quantity known in all runs, and orders of a turn."""
+    """Return the smallest and the largest value of every quantity known in all runs, and orders of a turn.
+
+    These are the lowest, the harmonics of those in the model, and what stands out of the misfit.
+    """
     names = set.intersection(*(set(s) for s in signals))
     step = float(np.median(np.concatenate([np.diff(s["t"]) for s in signals])))
     ranges = {n: (min(float(s[n].min()) for s in signals), max(float(s[n].max()) for s in signals)) for n in names}
-    return Span(ranges, tuple(orders_of(fit)), step)
+    known = [fit.values[p.name] for e in fit.model.effects for p in e.parameters if p.order]
+    seen = likely_orders(Tangent.of(fit), LIBRARY["cogging"], LINES) if "theta" in fit.problem.outputs else []
+    orders = {*range(1, HARMONICS + 1), *(round(k * n) for n in known for k in range(1, 5)), *map(round, seen)}
+    return Span(ranges, tuple(sorted(orders)), step)
 
 
 def shown(form: Form, fit: Fit, ranges: Mapping[str, tuple[float, float]]) -> bool:
@@ -120,25 +126,16 @@ def shown(form: Form, fit: Fit, ranges: Mapping[str, tuple[float, float]]) -> bo
         return False  # a gain is the motor constant's, unless the motion is measured twice
     if form.on not in ranges or ranges[form.on][0] == ranges[form.on][1]:
         return False
-    if form.on == "path" and not turns_back(*ranges["omega"]):
-        return False
+    if form.on == "path":  # both ways, by more than the creep of a smooth sgn or the ripple of a start
+        low, high = ranges["omega"]
+        if min(-low, high) <= STILL * max(-low, high):
+            return False
     if "i" not in outputs and (form.balance in ("voltage", "both") or form.on == "i"):
         return False  # there a torque over the speed says the same
     if form.remembers and fit.window is not None:
         return False  # what was before a window is not known
     return form.on != "turn" or fit.problem.model.axis != "linear"
 
-
-def turns_back(lowest: float, highest: float) -> bool:
-    """Tell whether a motor turns both ways, by more than the creep of a smooth sgn or the ripple of a start."""
-    return min(-lowest, highest) > STILL * max(-lowest, highest)
-
-
-def orders_of(fit: Fit) -> list[float]:
-    """Return orders of a turn: the lowest, the harmonics of those in the model, and what stands out of the misfit."""
-    known = [fit.values[p.name] for e in fit.model.effects for p in e.parameters if p.order]
-    seen = likely_orders(Tangent.of(fit), LIBRARY["cogging"], LINES) if "theta" in fit.problem.outputs else []
-    return sorted({*range(1, HARMONICS + 1), *(round(k * n) for n in known for k in range(1, 5)), *map(round, seen)})
 
 
 def functions_of(form: Form, span: Span) -> list[str]:
@@ -325,8 +322,7 @@ def _driven(answer: Response, bases: Mapping[Form, Array]) -> Array:
     n, ny, _ = answer.c.shape
     if not bases:
         return np.zeros((n * ny, 0))
-    forces = [np.stack([_over_samples(f, _share(f, b, answer, on)) for on in BALANCES], axis=2)
-              for f, b in bases.items()]
+    forces = [np.stack([_share(f, b, answer, on) for on in BALANCES], axis=2) for f, b in bases.items()]
     with np.errstate(over="ignore", invalid="ignore"):
         out = answer.driven(np.einsum("nxf,nmf->mnx", answer.b, np.concatenate(forces, axis=1), optimize=True))
     if not np.all(np.abs(out) < UNBOUNDED):  # or not a number
@@ -335,15 +331,12 @@ def _driven(answer: Response, bases: Mapping[Form, Array]) -> Array:
 
 
 def _share(form: Form, basis: Array, answer: Response, balance: str) -> Array:
-    """Return what a form puts in a balance, (N, m)."""
-    if form.balance == "both":
-        return basis * (answer.states["i"] if balance == "torque" else -answer.states["omega"])[:, None]
-    return basis if form.balance == balance else np.zeros_like(basis)
-
-
-def _over_samples(form: Form, push: Array) -> Array:
     """Return what a form puts in a balance over each sample, (N-1, m); only the voltage jumps."""
-    return push[:-1] if "v" in (form.on, form.carrier) else 0.5 * (push[:-1] + push[1:])
+    if form.balance == "both":
+        basis = basis * (answer.states["i"] if balance == "torque" else -answer.states["omega"])[:, None]
+    elif form.balance != balance:
+        return np.zeros_like(basis[1:])
+    return basis[:-1] if "v" in (form.on, form.carrier) else 0.5 * (basis[:-1] + basis[1:])
 
 
 def _read(problem: Problem, form: Form, basis: Array, weights: Array) -> Array:
@@ -357,8 +350,7 @@ def _read(problem: Problem, form: Form, basis: Array, weights: Array) -> Array:
 def _labels(problem: Problem, k: int) -> Array:
     """Return place in the run and channel of every residual of run `k`, (2, n)."""
     y, _, index = problem.measured[k][:3]
-    place = np.repeat(np.arange(len(y)) / len(y), y.shape[1])
-    both = np.stack([place, np.tile(np.arange(y.shape[1]), len(y))])
+    both = np.stack([np.repeat(np.arange(len(y)) / len(y), y.shape[1]), np.tile(np.arange(y.shape[1]), len(y))])
     return both if index is None else both[:, index]
 
 

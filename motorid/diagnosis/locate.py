@@ -86,7 +86,7 @@ def _region(regions: Mapping[str, float]) -> str:
     return f"{100 * regions[first]:.0f} % of the squared error lies in {place}."
 
 
-def _walk(fit: Fit, size: Array, begun: Sequence[Begun]) -> tuple[float, list[Smoothed]]:
+def _walk(fit: Fit, size: Array, begun: Sequence[Linear]) -> tuple[float, list[Smoothed]]:
     """Return the smallest random walk that explains the measurements, and the smoothed runs."""
     found: list[Smoothed] = []
     for walk in WALKS:
@@ -96,7 +96,7 @@ def _walk(fit: Fit, size: Array, begun: Sequence[Begun]) -> tuple[float, list[Sm
     return WALKS[-1], found
 
 
-def _shares(fit: Fit, walk: Array, both: Sequence[Smoothed], begun: Sequence[Begun]) -> dict[str, float]:
+def _shares(fit: Fit, walk: Array, both: Sequence[Smoothed], begun: Sequence[Linear]) -> dict[str, float]:
     """Share of the misfit by balance: what one unknown input alone leaves, the other has to explain."""
     alone = [[smooth(fit, k, walk * keep, at).chi2 for k, at in enumerate(begun)] for keep in ([1, 0], [0, 1])]
     left = [float(np.mean(chi2)) for chi2 in alone]
@@ -121,9 +121,7 @@ def _against(unknown: Sequence[Array], signals: Sequence[Mapping[str, Array]]) -
     d = np.concatenate(list(unknown))
     worth = sum(effective_samples(x - x.mean()) for x in unknown) / len(d)
     found = []
-    for name in ("omega", "i", "theta", "heat", "t"):
-        if not all(name in s for s in signals):
-            continue
+    for name in (n for n in ("omega", "i", "theta", "heat", "t") if all(n in s for s in signals)):
         z = np.concatenate([s[name] for s in signals])
         z = np.mod(z, 2 * np.pi) if name == "theta" else z
         if np.ptp(z) > 0:
@@ -203,10 +201,9 @@ def accounted(before: Fit, after: Fit) -> tuple[tuple[Array, ...], tuple[Array, 
     That is its effects and the shift of the parameters: what the balances of `before` lack along the motion of `after`.
     """
     every = []
+    scale = {"i": before.values.get("L", 0.0), "omega": before.values["J"]}
     for k, run in enumerate(after.problem.runs):
-        states = after.simulations[k].states
-        new, old = (_rates(f, k, states) for f in (after, before))
-        scale = {"i": before.values.get("L", 0.0), "omega": before.values["J"]}
+        new, old = (_rates(f, k, after.simulations[k].states) for f in (after, before))
         every.append([f * (new[n] - old[n]) if n in old else np.zeros(run.experiment.n) for n, f in scale.items()])
     voltages, torques = zip(*every, strict=True)
     return voltages, torques
@@ -233,8 +230,10 @@ class Smoothed(NamedTuple):
 
 
 class Linear(NamedTuple):
-    """One step from every sample, x⁺ (N-1, nx) with its slopes A and B, and the outputs (N, ny) with theirs."""
+    """A model linearised at states x (N, nx): one step from every sample, x⁺ (N-1, nx) with its slopes A and B, and the
+    outputs (N, ny) with theirs."""
 
+    x: Array
     x_next: Array
     a: Array
     b: Array
@@ -242,24 +241,17 @@ class Linear(NamedTuple):
     c: Array
 
 
-class Begun(NamedTuple):
-    """States (N, nx) to begin at, and the model linearised there."""
-
-    x: Array
-    linear: Linear
-
-
-def smooth(fit: Fit, k: int, walk: Array, begun: Begun) -> Smoothed:
+def smooth(fit: Fit, k: int, walk: Array, linear: Linear) -> Smoothed:
     """Return the smoothed run `k`.
 
-    `walk` is the step size of the random walk, V/√s and N·m/√s (0: none); `begun` is where to begin, the same for every
-    walk.
+    `walk` is the step size of the random walk, V/√s and N·m/√s (0: none); `linear` is where to begin, the same for
+    every walk.
     """
     run, system = fit.problem.runs[k], fit.problem.system
     p = parameter_vector(fit, k)
     y = fit.problem.measured[k].y
     weights = np.array([1.0 / run.sigma[c] if c in run.sigma else 0.0 for c in fit.problem.outputs])
-    x, linear = begun
+    x = linear.x
     n, nx = x.shape
     d = np.zeros((n, 2))
     size = np.maximum(np.abs(x).max(axis=0), 1e-9)
@@ -279,20 +271,18 @@ def smooth(fit: Fit, k: int, walk: Array, begun: Begun) -> Smoothed:
     return Smoothed(d, x, float(np.nanmean(e[:, weights > 0] ** 2)))
 
 
-def begin(fit: Fit, k: int) -> Begun:
-    """Return where to begin, (N, nx), what was measured where it was, and the model linearised about that."""
-    run, sim = fit.problem.runs[k], fit.simulations[k]
-    x = np.column_stack([sim.states[s] for s in fit.problem.system.states])
-    for j, s in enumerate(fit.problem.system.states):
-        if s in run.experiment.outputs:
-            x[:, j] = bridged(run.experiment.t, run.experiment.outputs[s])
-    return Begun(x, _linear(fit, k, x, np.zeros((len(x), 2))))
+def begin(fit: Fit, k: int) -> Linear:
+    """Return the model linearised where to begin: at what was measured, and simulated where it was not."""
+    run, simulated = fit.problem.experiments[k], fit.simulations[k].states
+    x = np.column_stack([bridged(run.t, run.outputs[s]) if s in run.outputs else simulated[s]
+                         for s in fit.problem.system.states])
+    return _linear(fit, k, x, np.zeros((len(x), 2)))
 
 
 def _linear(fit: Fit, k: int, x: Array, d: Array) -> Linear:
     """Return the model linearised at the states `x` and the inputs `d`."""
     grid, system, p = fit.problem.runs[k].grid, fit.problem.system, parameter_vector(fit, k)
-    return Linear(*linear_steps(system, grid, x, p, d[:-1]), *shown(system, grid, x, p))
+    return Linear(x, *linear_steps(system, grid, x, p, d[:-1]), *shown(system, grid, x, p))
 
 
 def _banded_step(n, nx, misfit, c, defect, a, b, model, d, hold, dt, free) -> Array:

@@ -13,6 +13,7 @@ import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
@@ -54,8 +55,7 @@ class Score:
     shapes: tuple[Shape, ...] = ()
 
 
-@dataclass(frozen=True, eq=False)
-class Tried:
+class Tried(NamedTuple):
     """One shape scored: share of chi² explained, values, what is left of the residual, what does the same."""
 
     drop: float
@@ -109,8 +109,7 @@ def with_phase_per_run(fit: Fit, scores: Sequence[Score], zero: Effect) -> list[
             shape = added.shape({order: n} if order else {})
             if shape is None or not shape.sizes:
                 continue
-            columns = by_record(fit.problem, shape.columns)
-            drop, a, _ = tangent.explained(np.hstack(columns), [False] * 2 * len(runs))
+            drop, a, _ = tangent.explained(np.hstack(by_record(fit.problem, shape.columns)), [False] * 2 * len(runs))
             waves = a[::2] + 1j * a[1::2]
             zeros = np.angle(waves * np.conj(waves[0])) / n
             wave = {shape.sizes[0].name: float(np.median(np.abs(waves))), phase.name: float(np.angle(waves[0]))}
@@ -161,8 +160,7 @@ def _nothing(tangent: Tangent, known: Score | None) -> Score | None:
     """Return the score by what an effect added to a smaller model, if that is next to nothing here."""
     if known is None or not known.shapes or any(p.order for p in known.effect.parameters):
         return None
-    shapes = tuple(s.weighed_like(tangent.fit) for s in known.shapes)
-    found = _scored(tangent, known.effect, shapes)
+    found = _scored(tangent, known.effect, tuple(s.weighed_like(tangent.fit) for s in known.shapes))
     return found if found.drop * tangent.chi2 < NOTHING else None
 
 
@@ -310,8 +308,10 @@ class Added:
             return None if change is None else Shape(values, change[:, None], (), None, weights)
         phase = next((p for p in self.pars if p.periodic and not p.given), None)
         columns = self._slopes(sizes, values)
-        if any(p.per_run for p in sizes):
-            columns, sizes = self._run_by_run(columns, sizes)
+        if any(p.per_run for p in sizes):  # in every run another, the first run's stand
+            columns = np.hstack([columns[:, :0], *by_record(self._problem, columns)[1:]])
+            others = sorted(set(self._problem.unknowns.firsts))[1:]
+            sizes = tuple(replace(p, name=f"{p.name}[{k}]") for k in others for p in sizes)
         if phase is not None:
             columns = np.hstack([columns, self._slopes(sizes, {**values, phase.name: np.pi / 2})])
         return Shape(values, columns, sizes, phase, weights)
@@ -328,11 +328,6 @@ class Added:
             parts.append(self._problem.run_residual(k, traj)[1])
         return np.vstack(parts)
 
-    def _run_by_run(self, columns: Array, sizes: Sequence[Parameter]) -> tuple[Array, tuple[Parameter, ...]]:
-        """Return the slopes to sizes that are others in every run, and these; the first run's stand."""
-        parts, own = by_record(self._problem, columns), sorted(set(self._problem.unknowns.firsts))
-        named = tuple(replace(p, name=f"{p.name}[{k}]") for k in own[1:] for p in sizes)
-        return np.hstack([columns[:, :0], *parts[1:]]), named
 
     def _change(self, values: Mapping[str, float]) -> Array | None:
         """Return the change (n,) that the effect makes at finite `values`."""

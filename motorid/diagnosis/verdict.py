@@ -124,8 +124,7 @@ def _valued(fit: Fit, effect: Effect) -> list[str]:
 def _certain(fit: Fit) -> dict[str, float | None]:
     """Return one standard deviation per parameter; None for a size that is not known even to itself."""
     sizes = {n for n, p in fit.model.parameters.items() if p.positive or p.null == 0}
-    std = fit.std
-    return {n: None if n in sizes and s is not None and s > abs(fit.values[n]) else s for n, s in std.items()}
+    return {n: None if n in sizes and s is not None and s > abs(fit.values[n]) else s for n, s in fit.std.items()}
 
 
 def errors_text(rungs: Sequence[Rung]) -> str:
@@ -219,10 +218,8 @@ def held_out_remark(node: Node) -> str:
     worse = {c: e.nrmse / max(fitted[c].nrmse, 1e-300) for c, e in node.predictions.held_out.items() if c in fitted}
     said = [f"{c} {number(r, 2)} times" for c, r in worse.items()
             if r > ELSEWHERE and node.predictions.held_out[c].misfit > LARGER]
-    if not said:
-        return ""
     return (f"The error is larger on the held-out runs than on the fitted ones ({', '.join(said)}): the fitted records "
-            "do not determine the model there, or another effect acts there.")
+            "do not determine the model there, or another effect acts there.") if said else ""
 
 
 def inseparable_remark(same: Mapping[str, tuple[str, ...]]) -> str:

@@ -214,10 +214,9 @@ def _ranking_legend(ax: Axes, chosen: Sequence[Candidate]) -> None:
     from matplotlib.patches import Patch
 
     handles: list[Any] = [Patch(fill=False, edgecolor=style.INK, label="predicted")]
-    if any(c.accepted and c.refit_drop is not None for c in chosen):
-        handles.append(Patch(color=style.PALETTE["blue"], alpha=0.85, label="refitted, accepted"))
-    if any(not c.accepted and c.refit_drop is not None for c in chosen):
-        handles.append(Patch(color=style.PALETTE["grey"], alpha=0.85, label="refitted, not accepted"))
+    for accepted, colour, label in ((True, "blue", "refitted, accepted"), (False, "grey", "refitted, not accepted")):
+        if any(c.accepted == accepted and c.refit_drop is not None for c in chosen):
+            handles.append(Patch(color=style.PALETTE[colour], alpha=0.85, label=label))
     if any(c.held_out_gain is not None for c in chosen):
         orange = style.PALETTE["orange"]
         handles.append(Line2D([], [], marker="D", ls="", color=orange, label="fall of the held-out error"))

@@ -15,7 +15,7 @@ from PIL import Image
 
 from motorid.channels import CHANNELS
 from motorid.display.numbers import percent
-from motorid.errors import UsageError, one_of
+from motorid.errors import UsageError, among, one_of
 from motorid.numerics.signals import noise_level
 from motorid.plots import style
 from motorid.problem.simulate import Simulation
@@ -244,8 +244,7 @@ def plot_parameters(*results: Any, truth: Mapping[str, float] | None = None,
     fits = _fits(results)
     chosen = list(names or dict.fromkeys(n for f in fits for n, p in f.model.parameters.items() if p.vary))
     for name in chosen:
-        if not any(name in f.values for f in fits):
-            raise UsageError(one_of(name, dict.fromkeys(n for f in fits for n in f.values), "parameter"))
+        among(name, dict.fromkeys(n for f in fits for n in f.values), "parameter")
     columns = {6: 3, 7: 4, 8: 4}.get(len(chosen), min(len(chosen), 5))
     rows = -(-len(chosen) // columns)
     axes = style.grid(rows, columns, row=1.75, width=style.WIDTH * max(columns, 3) / 5).ravel()
@@ -298,8 +297,7 @@ def _added(fit: Any, previous: Any) -> str:
         return " + ".join(["plain motor" if fit.model.base == "dc_motor" else "plain drive", *names])
     before = previous.model.effect_names
     changes = [f"+ {n}" for n in names if n not in before] + [f"− {n}" for n in before if n not in names]
-    again = {"penalty": "penalties", "hard": "hard constraints"}.get(fit.formulation, "again")
-    return " ".join(changes) or again
+    return " ".join(changes) or {"penalty": "penalties", "hard": "hard constraints"}.get(fit.formulation, "again")
 
 
 def _fits(results: Sequence[Any]) -> list[Any]:

@@ -97,7 +97,8 @@ def _over_time(ax: Axes, sims: Sequence[Simulation], channel: str, sigma: float)
         shift += float(t[-1])
         if k + 1 < len(sims):
             ax.axvline(shift, color=style.MUTED, lw=0.7)
-    style.above(ax)
+    legend = ax.legend(loc="lower right", bbox_to_anchor=(1.02, 0.97), borderpad=0.1, ncols=4, handlelength=1.6)
+    legend.set_in_layout(False)  # at the right above the axes, where it covers no data: the title's line has room
 
 
 def _histogram(ax: Axes, r: Array, sigma: float) -> None:

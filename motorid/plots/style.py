@@ -208,11 +208,6 @@ def tidy(ax: Axes, *, x: str = "", y: str = "", title: str = "") -> None:
     ax.set(**{what: text for what, text in (("xlabel", x), ("ylabel", y), ("title", title)) if text})
 
 
-def above(ax: Axes) -> None:
-    """Put the legend at the right above the axes, where it covers no data."""
-    legend = ax.legend(loc="lower right", bbox_to_anchor=(1.02, 0.97), borderpad=0.1, ncols=4, handlelength=1.6)
-    legend.set_in_layout(False)  # the title's line has room for it
-
 
 def plain_decades(ax: Axes) -> None:
     """Write the ticks of a logarithmic axis as plain numbers, with some in between where there is room."""

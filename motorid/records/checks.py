@@ -106,10 +106,8 @@ def _excitation(run: Experiment) -> str | None:
 def _missing(run: Experiment) -> str | None:
     share = {c: float(np.mean(np.isnan(y))) for c, y in run.outputs.items()}
     worst = max(share, key=lambda c: share[c])
-    if share[worst] > 0.2:
-        return (f"{100 * share[worst]:.0f} % of the {NAMES[worst]} samples are missing; the fit uses "
-                "the others. Look whether the logger drops them at certain moments.")
-    return None
+    return (f"{100 * share[worst]:.0f} % of the {NAMES[worst]} samples are missing; the fit uses the others. Look "
+            "whether the logger drops them at certain moments.") if share[worst] > 0.2 else None
 
 
 def _clipped(run: Experiment) -> str | None:
@@ -353,9 +351,7 @@ def magnitudes(run: Experiment) -> str | None:
     if run.dt > 0.2:
         return (f"there are {run.dt:.3g} s between samples, too long for a motor; is the time in ms? "
                 "If so: units={'t': 'ms'}.")
-    if run.dt < 1e-6:
-        return f"there are only {run.dt:.3g} s between samples; is the unit of the time right?"
-    return None
+    return f"there are only {run.dt:.3g} s between samples; is the unit of the time right?" if run.dt < 1e-6 else None
 
 
 def implied_constants(run: Experiment) -> str | None:
@@ -460,15 +456,14 @@ class _Balances:
         n = min(BALANCE_BLOCKS, run.n // 3)
         edges = np.linspace(0, run.n - 1, n + 1).astype(int)
 
-        def over(a: Array, hold: bool = False) -> Array:
-            return integral(run.t, a, hold)[edges]
+        def over(a: Array) -> Array:
+            return integral(run.t, a)[edges]
 
         self.y = [run.inputs["v"], *(bridged(run.t, a) for a in outputs)]
         self.top = [max(float(np.abs(a).max()), 1e-300) for a in self.y]
-        held = [k == 0 and run.hold == "zoh" for k in range(3)]
-        self.sums = [over(a, h) for a, h in zip(self.y, held, strict=True)]
+        angles = [integral(run.t, a, k == 0 and run.hold == "zoh") for k, a in enumerate(self.y)]
+        self.sums = [a[edges] for a in angles]
         self.signs = [over(np.tanh(50 * a / top)) for a, top in zip(self.y, self.top, strict=True)]
-        angles = [integral(run.t, a, h) for a, h in zip(self.y, held, strict=True)]
         self.t, self.one = run.t[edges] - run.t[0], np.ones(n + 1)
         self.loads = [(self.t, over(np.sin(a)), over(np.cos(a))) for a in angles]
         self.rest = {(w, i): over(np.where(np.abs(self.y[w]) < STILL * self.top[w], self.y[i], 0.0))

@@ -210,12 +210,9 @@ def _fit_one(task: tuple[Model, Mapping[str, Any], Mapping[str, Any]], motor: tu
 
 
 def _runs(records: Records, reading: Mapping[str, Any]) -> list[Experiment]:
-    if isinstance(records, Experiment):
-        return [records]
-    if isinstance(records, str | Path):
-        return read_runs(records, **reading)
-    paths = [r for r in records if not isinstance(r, Experiment)]
-    return [r for r in records if isinstance(r, Experiment)] + (read_runs(paths, **reading) if paths else [])
+    every = [records] if isinstance(records, Experiment | str | Path) else records
+    paths = [r for r in every if not isinstance(r, Experiment)]
+    return [r for r in every if isinstance(r, Experiment)] + (read_runs(paths, **reading) if paths else [])
 
 
 def _row(found: Fit) -> dict[str, Any]:
@@ -302,13 +299,7 @@ def scores(x: Array, std: Array) -> Array:
 
 
 class Checkpoint:
-    """A file of JSON lines, one result each; a line cut off by a crash is ignored.
-
-    Attributes
-    ----------
-    rows : dict of str to dict
-        Results by fingerprint.
-    """
+    """A file of JSON lines, one result each; a line cut off by a crash is ignored. `rows`: results by fingerprint."""
 
     def __init__(self, path: Path) -> None:
         self.path = path

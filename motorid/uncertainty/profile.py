@@ -118,10 +118,8 @@ def _crossing(x: Array, rise: Array, reach: float) -> float | None:
     above = np.flatnonzero(root > reach)
     if not above.size:
         return None
-    j = int(above[0])
-    if j == 0:
-        return float(x[0])
-    return float(np.interp(reach, root[j - 1:j + 1], x[j - 1:j + 1]))
+    near = slice(max(above[0] - 1, 0), above[0] + 1)
+    return float(np.interp(reach, root[near], x[near]))
 
 
 @one_thread
@@ -199,10 +197,11 @@ def _side(reference: tuple[Problem, dict[str, float], float],
     while len(points) < MOST and abs(at - q0) < farthest:
         at = float(np.clip(at + side * step, low, high))
         p = float(scale.scale[j] * np.exp(at) if scale.log[j] else scale.scale[j] * at)
-        found = _refit_with(problem, values, name, p)
-        if found is None:
+        try:
+            found = least_squares(problem.for_model(problem.model.start_at(values).fix(**{name: p})), SOLVER)
+        except (MotoridError, np.linalg.LinAlgError):
             break
-        rise, values = 2 * (found[0] - cost) / factor, found[1]
+        rise, values = 2 * (found.cost - cost) / factor, found.values
         points.append((p, rise, values))
         if rise > height or at in (low, high):
             break
@@ -212,19 +211,9 @@ def _side(reference: tuple[Problem, dict[str, float], float],
     return points
 
 
-def _refit_with(problem: Problem, values: dict[str, float], name: str,
-                p: float) -> tuple[float, dict[str, float]] | None:
-    here = problem.for_model(problem.model.start_at(values).fix(**{name: p}))
-    try:
-        done = least_squares(here, SOLVER)
-    except (MotoridError, np.linalg.LinAlgError):
-        return None
-    return done.cost, done.values
-
 
 def _joined(fit: Fit, name: str, left: list[Point], right: list[Point], dof: float) -> Profile:
-    middle = (fit.values[name], 0.0, dict(fit.values))
-    points = [*reversed(left), middle, *right]
+    points = [*reversed(left), (fit.values[name], 0.0, dict(fit.values)), *right]
     p = fit.problem.model.parameters[name]
     others = {n: np.array([v[n] for _, _, v in points]) for n in fit.problem.model.free_names if n != name}
     return Profile(name, p.unit, fit.values[name], np.array([v for v, _, _ in points]),
