@@ -269,8 +269,7 @@ def _console() -> Any:
 
 def say_notes(notes: Iterable[str], title: str = "Remarks") -> None:
     """Print remarks as a list, if there are any."""
-    lines = [wrapped(note, "  • ") for note in notes]
-    if lines:
+    if lines := [wrapped(note, "  • ") for note in notes]:
         show("\n".join([title, *lines, ""]))
 
 

@@ -247,8 +247,7 @@ def own_effects(path: Path) -> dict[str, Effect]:
 
 def named_effect(name: str, own: dict[str, Effect]) -> Effect:
     """Return an effect of the user's file, or of the library."""
-    known = {**library.EVERY, **own}
-    if name not in known:
+    if name not in (known := {**library.EVERY, **own}):
         raise ModelError(f"--effects: {one_of(name, [*own, *library.EVERY], 'effect')}")
     return known[name]
 

@@ -46,29 +46,26 @@ NAMES = {"v": "the voltage", "i": "the current", "omega": "the speed", "theta": 
          "acceleration": "the acceleration"}
 
 
-def adequacy(fit: Fit, scores: Sequence[Score] = (), false_alarm: float = FALSE_ALARM,
-             level: float | None = None) -> Adequacy:
+def adequacy(fit: Fit, scores: Sequence[Score] = (), level: float = FALSE_ALARM) -> Adequacy:
     """Judge whether the residuals of `fit` are noise, by `scores` of effects that might be added (see `rank`) too.
 
-    `false_alarm` is the probability of calling an adequate model inadequate; `level` the p-value that does so, where
-    another test has a say too.
+    `FALSE_ALARM` is the probability of calling an adequate model inadequate; `level` the p-value that does so, another
+    one where another test has a say too.
 
     The noise is estimated from fast changes, which understates coloured noise by 1/√(1−ρ): 3 times at a correlation
     of 0.9 between neighbours. Residuals beyond ten times the noise (five for an angle) are not noise of any colour.
     """
     channels = {c: _channel(fit, c) for c in fit.problem.outputs}
-    tests = [t for c in channels for t in _dependences(fit, c)]
-    tests += _score_tests(scores)
+    tests = [*(t for c in channels for t in _dependences(fit, c)), *_score_tests(scores)]
     material = [t for t in tests if t["share"] > _material(channels, t["channel"])]
     p_value = min([1.0, *(t["p"] * len(tests) for t in material)])
     far = [c for c, facts in channels.items() if facts["ratio"] > LARGEST_RATIO / (2 if c == "theta" else 1)]
     exact = max(fit.nrmse.values(), default=1.0) < EXACT
-    adequate = exact or (p_value > (false_alarm if level is None else level) and not far)
+    adequate = exact or (p_value > level and not far)
     for c, facts in channels.items():
         facts["p_value"] = min([1.0, *(t["p"] for t in tests if t["channel"] == c)])
     text = "The errors are below a millionth of what was measured." if exact else ""
-    return Adequacy(adequate, float(p_value), false_alarm, channels,
-                    text or _text(adequate, channels, material, false_alarm))
+    return Adequacy(adequate, float(p_value), FALSE_ALARM, channels, text or _text(adequate, channels, material))
 
 
 def _material(channels: Mapping[str, Mapping[str, float]], channel: str | None) -> float:
@@ -156,8 +153,7 @@ def _dependences(fit: Fit, channel: str) -> list[dict[str, Any]]:
     residuals = [_winsorised(r) for _, r in parts]
     found = []
     for name in (n for n in motions[0] if all(n in m for m in motions)):
-        labels = _labels([m[name] for m in motions], 2 * BINS if name == "theta" else BINS)
-        if labels is not None:
+        if (labels := _labels([m[name] for m in motions], 2 * BINS if name == "theta" else BINS)) is not None:
             share, p = _shift_test(labels, residuals)
             found.append({"channel": channel, "on": NAMES[name], "share": share, "p": p})
     return found
@@ -209,13 +205,12 @@ def _score_tests(scores: Sequence[Score]) -> list[dict[str, Any]]:
     return found
 
 
-def _text(adequate: bool, channels: Mapping[str, Mapping[str, float]], material: Sequence[Mapping[str, Any]],
-          false_alarm: float) -> str:
+def _text(adequate: bool, channels: Mapping[str, Mapping[str, float]], material: Sequence[Mapping[str, Any]]) -> str:
     sizes = _sizes(channels)
     if adequate:
         coloured = [channel_name(c) for c, f in channels.items() if f["autocorrelation"] > 0.3 or f["ratio"] > LARGER]
         colour = f" The noise of {listed(coloured)} is coloured." if coloured else ""
-        return f"The errors ({sizes}) do not depend on the motion (false-alarm rate {100 * false_alarm:g} %).{colour}"
+        return f"The errors ({sizes}) do not depend on the motion (false-alarm rate {100 * FALSE_ALARM:g} %).{colour}"
     if not material:
         return f"Something is missing: the errors ({sizes}) are too large for noise, even coloured noise."
     worst = min(material, key=lambda t: (t["p"], -t["share"]))

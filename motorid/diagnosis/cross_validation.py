@@ -93,7 +93,6 @@ def _parted(run: Experiment, odd: int) -> tuple[Experiment, Experiment]:
 
 def restarted(problem: Problem, q) -> Problem:
     """Return the problem with the values at `q` as its start, initial states too."""
-    values = problem.values(q)
     physical = dict(zip([p.name for p in problem.unknown], problem.scaling.physical(q), strict=True))
     runs = []
     for k, run in enumerate(problem.runs):
@@ -103,6 +102,6 @@ def restarted(problem: Problem, q) -> Problem:
                 start[j] = np.clip(physical[f"{c}_0[{k}]"], *run.limits[c])
         apart = {n: physical[p.name] for n, r, p in problem.unknowns.apart if r == k}
         runs.append(replace(run, start=start, apart={**run.apart, **apart}))
-    return replace(problem, model=problem.model.start_at(values), _runs=tuple(runs))
+    return replace(problem, model=problem.model.start_at(problem.values(q)), _runs=tuple(runs))
 
 

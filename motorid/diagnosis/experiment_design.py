@@ -22,7 +22,7 @@ from motorid.diagnosis.design_criteria import MOST_SEGMENTS, Driven, Found, Layo
 from motorid.diagnosis.results import Diagnosis
 from motorid.display.cards import Card, Flag, Printed, Shown, Table
 from motorid.display.numbers import number, quantity
-from motorid.errors import FitError, MotoridError, UsageError, among, at_least, chosen, one_of, positive
+from motorid.errors import FitError, MotoridError, UsageError, among, at_least, chosen, positive
 from motorid.estimation.result import Fit
 from motorid.numerics.parallel import budget as limited_time
 from motorid.numerics.parallel import one_thread
@@ -342,8 +342,7 @@ def _optimised(task: Task, say: Callable[[str], None]) -> Found:
     """Return the best point that the search reaches from the best starts."""
     done: list[Found] = []
     for name, (_, here, c) in list(_starts(task).items())[:SHARPENED if task.asked else DISTINGUISHED]:
-        start = _within(here, c)
-        if start is None:
+        if (start := _within(here, c)) is None:
             continue
         found = climb(_hardest(start[1], start[2]), start[2])
         again = _within(replace(found.task, pairs=task.pairs), found.c)  # integration steps that suit what was found
@@ -398,10 +397,9 @@ def _hardest(task: Task, c: Array) -> Task:
 
 def _rivals(found: Any, goal: str | None) -> tuple[list[Rival], str]:
     """Return the rivals, and whether they are to be distinguished."""
-    if goal not in (None, *GOALS):
-        raise UsageError(one_of(str(goal), GOALS, "goal"))
     fits = list(found.rivals) if isinstance(found, Diagnosis) else [found] if isinstance(found, Fit) else list(found)
     goal = goal or ("distinguish" if len(fits) > 1 else "sharpen")
+    among(goal, GOALS, "goal")
     if goal == "distinguish" and len(fits) < 2:
         raise UsageError("to distinguish models takes at least two of them: what was found has no group, or give the "
                          'fits of the rivals. A single fit can be sharpened: goal="sharpen".')
@@ -436,8 +434,7 @@ def _limits(rivals: Sequence[Rival], v_max: float, i_max: float | None, omega_ma
     """Return the limits by state, and of the voltage."""
     seen, found = rivals[0].seen, {"v": (-v_max, v_max)}
     for state, given in (("i", i_max), ("omega", omega_max)):
-        size = given or seen.get(state)
-        if size:
+        if size := given or seen.get(state):
             found[state] = (-size, size)
     if theta_range is not None:
         found["theta"] = theta_range

@@ -398,8 +398,7 @@ def contains(fit: Fit, form: Form, size: str) -> bool:
     if size not in fit.problem.system.parameters or not shown(form, fit, span.ranges):
         return False
     push = pushes_of(fit, size)
-    place = _place(fit, form)
-    if place is None:
+    if (place := _place(fit, form)) is None:
         return False
     whole, own = float(np.sum(push**2)), push[:, place]
     basis = np.concatenate([basis_of(form, s, span) for s in signals])

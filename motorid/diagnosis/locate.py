@@ -296,8 +296,7 @@ def _banded_step(n, nx, misfit, c, defect, a, b, model, d, hold, dt, free) -> Ar
     rhs[:, :nx] += np.einsum("nyi,ny->ni", cc, e)
     # defect_k = Φ(x_k, d_k) - x_{k+1}:  A δx_k + B δd_k - δx_{k+1} + defect = 0, weighed by 1/model
     g = np.concatenate([a, b * free], axis=2) / model[None, :, None]
-    back = np.zeros((nx, m))
-    back[:, :nx] = -np.diag(1.0 / model)
+    back = -np.eye(nx, m) / model[:, None]
     w = defect / model
     diagonal[:-1] += np.einsum("nki,nkj->nij", g, g)
     diagonal[1:] += back.T @ back

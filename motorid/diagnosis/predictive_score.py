@@ -265,8 +265,7 @@ def by_channel(problem: Problem, residual: Array, blocks: Sequence[NDArray[np.in
     parts, weights = problem.unstack(residual), [m.weights for m in problem.measured]
     found = {}
     for j, c in enumerate(problem.outputs):
-        runs = [k for k, run in enumerate(problem.runs) if c in run.sigma]
-        if runs:
+        if runs := [k for k, run in enumerate(problem.runs) if c in run.sigma]:
             measured = np.concatenate([problem.experiments[k].outputs[c] for k in runs])
             found[c] = Errors(tuple(parts[k][:, j] / weights[k][j] for k in runs), tuple(blocks[k] for k in runs),
                               float(np.sqrt(np.nanmean(measured**2))),

@@ -16,6 +16,7 @@ from motorid.display.numbers import number
 from motorid.errors import UsageError, at_least
 from motorid.numerics.signals import Array
 from motorid.plots import style
+from motorid.plots.fits import what_changed
 from motorid.plots.residuals import scatter
 
 FINE = 60  # bins of a mean that is drawn as a curve
@@ -83,12 +84,10 @@ def _balance(row: np.ndarray, missing: Missing, balance: str, run: int | None) -
 
 def _binned(ax: Axes, b: Binned, signals: Sequence[Mapping[str, Array]], values: Sequence[Array], factor: float,
             colour: str) -> None:
-    pairs = [(np.asarray(s[b.against]), v) for s, v in zip(signals, values, strict=True) if b.against in s]
-    if pairs:
-        x, y = np.concatenate([p[0] for p in pairs]), np.concatenate([p[1] for p in pairs]) * factor
-        ok = np.isfinite(x) & np.isfinite(y) & (x >= b.centre.min()) & (x <= b.centre.max())
-        if ok.any():
-            scatter(ax, x[ok], y[ok], most=800, color=style.MUTED)
+    x, y = np.concatenate([np.asarray(s[b.against]) for s in signals]), np.concatenate(list(values)) * factor
+    ok = np.isfinite(x) & np.isfinite(y) & (x >= b.centre.min()) & (x <= b.centre.max())
+    if ok.any():
+        scatter(ax, x[ok], y[ok], most=800, color=style.MUTED)
     gaps = np.diff(b.centre)
     cuts = np.flatnonzero(gaps > max(4 * float(np.median(gaps)), 0.15 * float(np.ptp(b.centre)))) + 1
     for part in np.split(np.arange(len(b.centre)), cuts):  # no curve where there are no samples
@@ -252,8 +251,7 @@ def plot_ladder(result: Ladder | Diagnosis, ax: Axes | None = None) -> Axes:
     style.plain_decades(ax)
     for k in sorted({0, len(rungs) - 1}):
         _error_labels(ax, k, {c: 100 * e for c, e in rungs[k].nrmse.items()})
-    first = "plain motor" if rungs[0].fit.model.base == "dc_motor" else "plain drive"
-    started = " + ".join([first, *rungs[0].fit.model.effect_names])
+    started = what_changed(rungs[0].fit, None)
     ax.set_xticks(x, [started if r.added is None else "+ " + r.added.replace(" + ", "\n+ ") for r in rungs])
     ax.set_xlim(-0.45, len(rungs) - 0.55)
     style.tidy(ax, y="NRMSE (%)", title="Error as effects are added")

@@ -54,8 +54,7 @@ def plot_runs(runs: Sequence[Experiment] | Experiment, channels: Sequence[str] |
     axes = style.grid(len(names), len(shown), row=1.35, sharex="col", sharey="row")
     for k, run in enumerate(shown):
         for j, c in enumerate(names):
-            y = run.inputs.get(c, run.outputs.get(c))
-            if y is None:
+            if (y := run.inputs.get(c, run.outputs.get(c))) is None:
                 _absent(axes[j, k], c)
             else:
                 style.line(axes[j, k], run.t, y, zoh=c == "v" and run.hold == "zoh", lw=1.0,
@@ -112,8 +111,7 @@ class LiveFit:
     def png(self, result: Any) -> bytes:
         """Return the figure with the curves of another model on the same records."""
         found, figure = _simulations(result), self._canvas.figure
-        rescaled = sum(part.moved(found[part.run]) for part in self._moving)
-        if rescaled or self._background is None:
+        if sum(part.moved(found[part.run]) for part in self._moving) or self._background is None:
             self._canvas.draw()
             self._background = self._canvas.copy_from_bbox(figure.bbox)
         self._canvas.restore_region(self._background)
@@ -252,7 +250,7 @@ def plot_parameters(*results: Any, truth: Mapping[str, float] | None = None,
         _one_parameter(ax, fits, name, (truth or {}).get(name))
     for ax in axes[len(chosen):]:
         ax.set_axis_off()
-    notes = [f"{k + 1}: {_added(f, fits[k - 1] if k else None)}" for k, f in enumerate(fits)]
+    notes = [f"{k + 1}: {what_changed(f, fits[k - 1] if k else None)}" for k, f in enumerate(fits)]
     notes += ["dashed: true value"] * bool(truth) + ["bars: ±2σ"]
     axes[0].figure.supxlabel("   ·   ".join(notes), fontsize=8, color=style.MUTED)
     return axes[: len(chosen)]
@@ -291,7 +289,8 @@ def _around(ax: Axes, values: np.ndarray) -> None:
         ax.set_ylim(middle - least / 2, middle + least / 2)
 
 
-def _added(fit: Any, previous: Any) -> str:
+def what_changed(fit: Any, previous: Any) -> str:
+    """Return which effects a fit has that the previous one had not, and the other way round; of the first, its own."""
     names = fit.model.effect_names
     if previous is None:
         return " + ".join(["plain motor" if fit.model.base == "dc_motor" else "plain drive", *names])

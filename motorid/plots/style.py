@@ -115,8 +115,7 @@ def svg_of(draw: Callable[..., Any], *args: Any, name: str, alt: str, **options:
     with detached():
         drawn = draw(*args, **options)
     figure = np.atleast_1d(np.asarray(drawn, object)).ravel()[0].figure
-    engine = figure.get_layout_engine()
-    if engine is not None:  # once, and not again while saving
+    if (engine := figure.get_layout_engine()) is not None:  # once, and not again while saving
         engine.execute(figure)
         figure.set_layout_engine("none")
     buffer = io.StringIO()

@@ -96,8 +96,7 @@ def _excitation(run: Experiment) -> str | None:
     if np.ptp(v) <= 1e-6 * np.abs(v).max():
         return (f"the voltage is {v[0]:.4g} {run.units['v']} from beginning to end: such a run shows one "
                 "steady speed and at most a start. Add runs with steps or a sweep of the voltage.")
-    still = [c for c, y in run.outputs.items() if np.nanmax(y) == np.nanmin(y)]
-    if still:
+    if still := [c for c, y in run.outputs.items() if np.nanmax(y) == np.nanmin(y)]:
         return (f"the {NAMES[still[0]]} never changes although the voltage does; a dead sensor, a "
                 "locked rotor, or too little voltage to move?")
     return None
@@ -195,8 +194,7 @@ def _noisy(run: Experiment) -> str | None:
 
 def _uneven(run: Experiment) -> str | None:
     steps = np.diff(run.t)
-    share = float(np.mean(np.abs(steps - run.dt) > 0.25 * run.dt))
-    if share > 0.05:
+    if np.mean(np.abs(steps - run.dt) > 0.25 * run.dt) > 0.05:
         low, high = np.quantile(steps, (0.02, 0.98))
         return (f"sampling is uneven, {1e3 * low:.3g} to {1e3 * high:.3g} ms apart. Each sample is used "
                 "at its own time; make sure that the stamps say when it was taken, not when it arrived.")
@@ -333,15 +331,13 @@ def angle_against_speed(run: Experiment) -> str | None:
 def magnitudes(run: Experiment) -> str | None:
     """Sizes no laboratory motor has point to a wrong unit."""
     stated = run.meta.get("original_units", {})
-    assumed = "omega" in run.meta.get("assumed_units", ())
     limits = {"v": (1000.0, "V", "mV"), "i": (1000.0, "A", "mA"),
-              "omega": (800.0 if assumed else 3000.0, "rad/s", "rpm")}
+              "omega": (800.0 if "omega" in run.meta.get("assumed_units", ()) else 3000.0, "rad/s", "rpm")}
     for channel, (limit, unit, likely) in limits.items():
         values = run.inputs.get(channel, run.outputs.get(channel))
         if values is None or run.units[channel] != unit:
             continue
-        top = float(np.nanmax(np.abs(values)))
-        if top > limit:
+        if (top := float(np.nanmax(np.abs(values)))) > limit:
             was = f" (read as {stated[channel]})" if channel in stated else ""
             if channel == "v" and stated.get(channel, "")[:1].isdigit():
                 return (f"v reaches {top:.4g} V{was}: that unit is the voltage of a whole duty cycle. Is the column in "
@@ -395,12 +391,10 @@ def _offset(run: Experiment) -> str | None:
 
 def swapped_columns(run: Experiment) -> str | None:
     """Columns that fit the balances of a motor in another order; a speed that jumps and holds still."""
-    omega = run.outputs.get("omega")
-    if omega is None:
+    if (omega := run.outputs.get("omega")) is None:
         return None
     order, _ = _as_balances_want(run)
-    moved = [c for k, c in enumerate(("v", "i", "omega")) if order[k] != k]
-    if moved:
+    if moved := [c for k, c in enumerate(("v", "i", "omega")) if order[k] != k]:
         what = " and ".join(NAMES[c] for c in moved)
         return (f"{what} fit the equations of a motor far better if their columns are exchanged. Say which is which: "
                 f"columns={{{', '.join(f'{c!r}: ...' for c in moved)}}}.")

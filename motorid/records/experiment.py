@@ -318,8 +318,7 @@ def _check_values(run: Experiment) -> None:
     if "v" not in run.inputs:
         raise DataError(f"{run.name}: the input 'v' (drive voltage or command) is missing; a simulation needs it.")
     for name, array in run.inputs.items():
-        bad = int(np.count_nonzero(~np.isfinite(array)))
-        if bad:
+        if bad := int(np.count_nonzero(~np.isfinite(array))):
             raise DataError(f"{run.name}: the input '{name}' is missing or infinite in {bad} of {run.n} "
                             "samples; a simulation needs it everywhere. Fill it or cut these samples out.")
     for name, array in run.outputs.items():

@@ -224,8 +224,7 @@ def _row(found: Fit) -> dict[str, Any]:
         values |= {n: found.values[n], f"{n}_std": certain.std[n]}
     flags = [] if found.status == "converged" else [found.status]
     flags += [f"{n} {certain.status[n]}" for n in found.problem.model.free_names if certain.status[n] != "determined"]
-    misfit = float(np.sqrt(found.chi2 / found.dof))
-    if misfit > POOR:
+    if (misfit := float(np.sqrt(found.chi2 / found.dof))) > POOR:
         flags.append(f"misfit {misfit:.2g} times the noise")
     return {"status": found.status, "message": found.message, "flags": flags, **values,
             **{f"nrmse_{c}": e for c, e in found.nrmse.items()}, "chi2": found.chi2, "dof": found.dof}

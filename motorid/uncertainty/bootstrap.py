@@ -69,9 +69,8 @@ class Bootstrap(Printed):
     @property
     def std(self) -> dict[str, float | None]:
         """Standard deviation of the refits per parameter; None where the data do not determine it."""
-        spread = np.std(self.samples, axis=0, ddof=1)
         return {n: float(s) if self.status[n] == "determined" else None
-                for n, s in zip(self.names, spread, strict=True)}
+                for n, s in zip(self.names, np.std(self.samples, axis=0, ddof=1), strict=True)}
 
     def interval(self, name: str, level: float = 0.95) -> tuple[float, float] | None:
         """Return the percentile interval of a parameter; None where the data do not determine it."""
