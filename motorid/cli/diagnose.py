@@ -101,7 +101,6 @@ def diagnose_command(
         raise typer.Exit(INTERRUPTED)
 
 
-
 def _keep_fit(before: Fit, done: Sequence[str], json: opt.Json, force: bool) -> None:
     """Show and write what an interrupted diagnosis began with, and how far it came."""
     interruption.heard()

@@ -93,7 +93,6 @@ class ReadingOptions:
         named = {k: parse_pairs(v, f"--{k}") for k in ("columns", "units") if (v := getattr(self, k))}
         return named | ({"hold": self.hold} if self.hold else {})
 
-
     def _preprocessed(self, runs: Sequence[Experiment]) -> list[Experiment]:
         """Return `runs` without the ignored channels, filtered, delayed and without spikes as asked."""
         out = _words([self.ignore] if self.ignore else [])

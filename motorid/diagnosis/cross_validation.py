@@ -103,5 +103,3 @@ def restarted(problem: Problem, q) -> Problem:
         apart = {n: physical[p.name] for n, r, p in problem.unknowns.apart if r == k}
         runs.append(replace(run, start=start, apart={**run.apart, **apart}))
     return replace(problem, model=problem.model.start_at(problem.values(q)), _runs=tuple(runs))
-
-

@@ -139,7 +139,6 @@ def _prediction(fit: Fit, t: Array, v: Array, name: str) -> dict[str, Array]:
     return dict(simulate(fit.model, run, initial="rest", estimate_initial=False)[0].outputs)
 
 
-
 # -- designed ----------------------------------------------------------------------------------------------------
 GOALS, SHAPES = ("distinguish", "sharpen"), ("steps", "free", "multisine")
 LEVELS = 30  # a board takes 32 segments
@@ -412,7 +411,6 @@ def _rivals(found: Any, goal: str | None) -> tuple[list[Rival], str]:
     common = set.intersection(*(set(r.model.effect_names) for r in rivals)) if len(rivals) > 1 else set()
     names = [" + ".join(n for n in r.model.effect_names if n not in common) or "none" for r in rivals]
     return [replace(r, name=n) for r, n in zip(rivals, names, strict=True)], goal
-
 
 
 def _check_span(duration: float, dt: float) -> None:

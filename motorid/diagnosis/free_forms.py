@@ -137,7 +137,6 @@ def shown(form: Form, fit: Fit, ranges: Mapping[str, tuple[float, float]]) -> bo
     return form.on != "turn" or fit.problem.model.axis != "linear"
 
 
-
 def functions_of(form: Form, span: Span) -> list[str]:
     """Return the functions that a form is made of, as source in its quantity z; `m.sign` is the model's smooth sgn."""
     low, high = span.ranges[form.on]
@@ -184,7 +183,6 @@ def past(z: Array, along: Array, length: float, initial: float) -> Array:
     driven[1:] = 0.5 * (driven[1:] + driven[:-1])
     lagged, _ = lfilter([1 - kept], [1.0, -kept], driven[1:], zi=[kept * initial])
     return np.interp(along, even, np.concatenate([[initial], lagged]))
-
 
 
 def values_of(functions: Sequence[str], form: Form, signal: Mapping[str, Array]) -> Array:
@@ -300,7 +298,6 @@ def _signals(fit: Fit, k: int) -> dict[str, Array]:
     if "theta" in run.outputs or "omega" in run.outputs:
         found["theta"] = found["turn"] = angle_signal(run)
     return found
-
 
 
 def _answers(problem: Problem, k: int, answer: Response, bases: Mapping[Form, Array]) -> dict[Form, Array]:

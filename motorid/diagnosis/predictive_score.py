@@ -139,7 +139,6 @@ def lost_channels(old: Channels, new: Channels) -> tuple[str, ...]:
     return tuple(c for c in old if c in new and min(old[c].nrmse, new[c].nrmse) > LOST)
 
 
-
 def _fall(old: Channels, new: Channels) -> float | None:
     """Return the relative fall of the error, lone samples left aside, geometric mean over channels and samples.
 
@@ -187,7 +186,6 @@ def _differences(old: Channels, new: Channels) -> Array:
         total += share * (each[1] - each[0])
         seen |= np.bincount(labels, minlength=count) > 0
     return total[seen]
-
 
 
 def _log_densities(r: Array, labels: NDArray[np.intp], count: int, floor: float) -> Array:

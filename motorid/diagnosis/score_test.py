@@ -328,7 +328,6 @@ class Added:
             parts.append(self._problem.run_residual(k, traj)[1])
         return np.vstack(parts)
 
-
     def _change(self, values: Mapping[str, float]) -> Array | None:
         """Return the change (n,) that the effect makes at finite `values`."""
         at = self._at(values)

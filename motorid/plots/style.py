@@ -207,7 +207,6 @@ def tidy(ax: Axes, *, x: str = "", y: str = "", title: str = "") -> None:
     ax.set(**{what: text for what, text in (("xlabel", x), ("ylabel", y), ("title", title)) if text})
 
 
-
 def plain_decades(ax: Axes) -> None:
     """Write the ticks of a logarithmic axis as plain numbers, with some in between where there is room."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter

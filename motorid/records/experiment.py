@@ -273,7 +273,6 @@ def between_pauses(run: Experiment) -> list[Experiment]:
                                 "notes": run.meta.get("notes", ()) if k == 0 else ()}) for k, s in enumerate(live)]
 
 
-
 def _frozen_array(values: ArrayLike, what: str, run: str) -> Array:
     try:
         raw = np.ma.filled(values, np.nan) if np.ma.isMaskedArray(values) else np.asarray(values)

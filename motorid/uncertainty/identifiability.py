@@ -225,7 +225,6 @@ def identifiability(problem_or_fit: Problem | Fit, *, points: int = 5, seed: int
         problem_or_fit.std if isinstance(problem_or_fit, Fit) else None)
 
 
-
 def _structural_rank(problem: Problem, q: Array, points: int, seed: int) -> int:
     """Return the largest rank at `q` and at random points within a factor of three, noise not counting."""
     rng, k, best = np.random.default_rng(seed), len(problem.model.free_names), 0

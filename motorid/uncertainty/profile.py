@@ -211,7 +211,6 @@ def _side(reference: tuple[Problem, dict[str, float], float],
     return points
 
 
-
 def _joined(fit: Fit, name: str, left: list[Point], right: list[Point], dof: float) -> Profile:
     points = [*reversed(left), (fit.values[name], 0.0, dict(fit.values)), *right]
     p = fit.problem.model.parameters[name]
