@@ -273,7 +273,7 @@ def smooth(fit: Fit, k: int, walk: Array, linear: Linear) -> Smoothed:
 
 def begin(fit: Fit, k: int) -> Linear:
     """Return the model linearised where to begin: at what was measured, and simulated where it was not."""
-    run, simulated = fit.problem.experiments[k], fit.simulations[k].states
+    run, simulated = fit.problem.runs[k].experiment, fit.simulations[k].states
     x = np.column_stack([bridged(run.t, run.outputs[s]) if s in run.outputs else simulated[s]
                          for s in fit.problem.system.states])
     return _linear(fit, k, x, np.zeros((len(x), 2)))
