@@ -88,8 +88,9 @@ def missing_text(rungs: Sequence[Rung], remaining: Adequacy, groups: Sequence[Se
 
     `elsewhere`: the held-out runs are predicted far worse than the fitted ones.
     """
+    after = rungs[-1].fit
     names = [g.effect for g in grades if g.grade != "approximates"]
-    parts = [f"Missing: {'; '.join(_described(rungs[-1].fit, n) for n in names)}."]
+    parts = [f"Missing: {'; '.join(_described(after, n) for n in names)}."]
     parts += [f"These records do not distinguish {g[0]} from {' or '.join(g[1:])}." for g in groups]
     parts += [approximations_text(grades, "the rest")] if len(names) < len(grades) else []
     parts.append(errors_text(rungs))
