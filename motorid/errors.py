@@ -237,6 +237,13 @@ def among(word: object, known: Iterable[object], what: str) -> None:
         raise UsageError(one_of(str(word), known, what))
 
 
+def chosen(names: Iterable[str] | None, known: Iterable[str], what: str) -> list[str]:
+    """Return `names`, by default all that are `known`; UsageError for one that is none of these."""
+    for name in names or ():
+        among(name, known, what)
+    return list(names or known)
+
+
 def one_of(word: str, known: Iterable[object], what: str) -> str:
     """Say that `word` is not among the `known` names of `what`, and which one may have been meant."""
     import difflib

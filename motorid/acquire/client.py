@@ -184,8 +184,7 @@ class SerialLink:
     def _pump(self) -> None:
         try:
             while not self._closing:
-                data = _read_once(self._serial)
-                if data:
+                if data := _read_once(self._serial):
                     self._queue.put(data)
                     time.sleep(BATCH)
         except (OSError, TypeError, ValueError) as error:  # the last two: closed under our feet

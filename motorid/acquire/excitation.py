@@ -89,9 +89,7 @@ def lfsr_bits(seed: int, n: int) -> Iterator[int]:
         state = (state >> 1) | (bit << 14)
 
 
-@lru_cache(maxsize=4)
-def _volts(segment: Segment, rate: float) -> NDArray[np.float64]:
-    return segment.volts(rate)
+_volts = lru_cache(maxsize=4)(Segment.volts)
 
 
 @dataclass(frozen=True)

@@ -212,8 +212,7 @@ class Decoder:
         self._rest = b""
 
     def _discard(self, junk: bytes) -> None:
-        stray = len(junk) - junk.count(b"\n") - junk.count(b"\r")
-        if stray:
+        if stray := len(junk) - junk.count(b"\n") - junk.count(b"\r"):
             self.bad["stray bytes"] += stray
             self.bad["cut"] += junk.count(b"$")
 

@@ -241,8 +241,7 @@ class Appender:
         with open(path, "rb") as file:
             file.seek(max(0, self._size - 4096))
             end = file.read()
-        cut = len(end) - (end.rfind(b"\n") + 1)
-        if cut:
+        if cut := len(end) - (end.rfind(b"\n") + 1):
             self._size -= cut
             os.ftruncate(self._fd, self._size)
 

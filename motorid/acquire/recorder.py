@@ -102,8 +102,9 @@ def record(port: str | Link, out: str | Path, *, baud: int = 115_200, excite: st
         mode = "resume" if tail else "replace" if force else "new"
         file = RecordFile(out, header.channels, header.rate, head if not tail else {}, mode)
         try:
-            session = Session(client, header, file, len(todo.segments), _commanded(device, header, todo),
-                              _most(device, header, *limits),
+            told, kept = (next(c for c in h.channels if c.name == "v") for h in (device, header))
+            session = Session(client, header, file, len(todo.segments), _commanded(told, kept, device.rate, todo),
+                              _most(told, kept, *limits),
                               min((e for e in (todo.duration, duration) if e), default=None), duration,
                               max(timeout, 4 / header.rate), progress)
             if tail:
@@ -116,18 +117,16 @@ def record(port: str | Link, out: str | Path, *, baud: int = 115_200, excite: st
         link.close()
 
 
-def _most(device: Header, header: Header, v_max: float, i_max: float) -> dict[str, float]:
+def _most(told: Channel, kept: Channel, v_max: float, i_max: float) -> dict[str, float]:
     """Return the largest voltage, in the units that a calibration makes of it, and current that may be reported."""
-    raw, v = (next(c for c in h.channels if c.name == "v") for h in (device, header))
-    return {"v": abs(v.scale / raw.scale) * (1.01 * v_max + abs(raw.scale * (raw.offset - v.offset))), "i": i_max}
+    beside = abs(told.scale * (told.offset - kept.offset))
+    return {"v": abs(kept.scale / told.scale) * (1.01 * v_max + beside), "i": i_max}
 
 
-def _commanded(device: Header, header: Header, todo: Program) -> Commanded:
+def _commanded(told: Channel, kept: Channel, rate: float, todo: Program) -> Commanded:
     """The voltage that the device applies at each sample, in the units of the record."""
-    told, kept = (next(c for c in h.channels if c.name == "v") for h in (device, header))
-
     def at(index: int) -> float | None:
-        volts = todo.at(index, device.rate)
+        volts = todo.at(index, rate)
         return None if volts is None else kept.scale * (volts / told.scale + told.offset - kept.offset)
 
     return at

@@ -130,10 +130,9 @@ class _Unwrapper:
         self.since += step
         if math.isnan(raw):
             return raw
-        if math.isnan(self.value):  # the first one: the turn that is nearest to zero
-            self.value, self.since = raw + self.span * round(-raw / self.span), 0
-            return self.value
-        expected = self.value + self.rate * self.since
+        first = math.isnan(self.value)  # then it is the turn that is nearest to zero
+        expected = 0.0 if first else self.value + self.rate * self.since
         value = raw + self.span * round((expected - raw) / self.span)
-        self.rate, self.value, self.since = (value - self.value) / self.since, value, 0
+        self.rate = 0.0 if first else (value - self.value) / self.since
+        self.value, self.since = value, 0
         return value

@@ -103,8 +103,7 @@ class VirtualDevice:
         handlers: dict[str, Callable[..., bytes]] = {
             "?": lambda: frame(*self.header.fields), "L": self._set_limits, "S": self._add_segment, "G": self._go,
             "X": lambda: self._stop("stop"), "K": lambda: b"" if self.running else self._done()}
-        handler = handlers.get(fields[0])
-        if handler is None:
+        if (handler := handlers.get(fields[0])) is None:
             return frame("E", "refused", "unknown command")
         try:
             return handler(*fields[1:])

@@ -214,9 +214,7 @@ def _least(cells: Sequence[str]) -> int:
 def _upright(table: Table, room: int) -> Table:
     """Return a table with rows and columns exchanged where only that keeps its names and numbers whole."""
     whole = [max(_least(c), *(len(cell) for cell in c[1:] if max(map(len, c)) <= MAY_WRAP), 0) for c in _columns(table)]
-    if sum(whole) + 3 * len(whole) < room or len(whole) <= len(table.rows) + 1:
-        return table
-    return table.turned()
+    return table if sum(whole) + 3 * len(whole) < room or len(whole) <= len(table.rows) + 1 else table.turned()
 
 
 def _widths(table: Table, room: int) -> list[int]:
@@ -272,8 +270,7 @@ def _console() -> Any:
 
 def say_notes(notes: Iterable[str], title: str = "Remarks") -> None:
     """Print remarks as a list, if there are any."""
-    lines = [wrapped(note, "  • ") for note in notes]
-    if lines:
+    if lines := [wrapped(note, "  • ") for note in notes]:
         show("\n".join([title, *lines, ""]))
 
 
@@ -330,13 +327,9 @@ def _spread(args: Sequence[str]) -> list[str]:
     for k, word in enumerate(args):
         if word == "--":
             return [*spread, *args[k:]]
-        if word in MANY:
-            option, first = word, True
-            spread.append(word)
-        elif option and not (word.startswith("-") and len(word) > 1):
-            spread += [word] if first else [option, word]
-            first = False
-        else:
-            option = None
-            spread.append(word)
+        if word.startswith("-") and len(word) > 1:
+            option = word if word in MANY else None
+        elif option and spread[-1] != option:
+            spread.append(option)
+        spread.append(word)
     return spread

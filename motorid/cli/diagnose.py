@@ -76,10 +76,16 @@ def diagnose_command(
     before = fit_affordably(records, options.fit)
     own = list(opt.own_effects(options.effects_from).values()) if options.effects_from else []
     done: list[str] = []
+
+    def as_it_comes(word: str) -> None:
+        done.append(word)
+        if word.startswith("first answer") and json != "-":
+            show(f"{word[0].upper()}{word[1:]}\n")
+
     try:
         with processes(jobs) as over:
             found = diagnose(before, held_out or None, also=own, max_effects=max_effects, budget=budget,
-                             map=over or map, progress=lambda word: _as_it_comes(word, done, quiet=json == "-"))
+                             map=over or map, progress=as_it_comes)
     except (Exception, KeyboardInterrupt) as error:
         if interruption.behind(error):
             _keep_fit(before, done, json, options.force)
@@ -93,13 +99,6 @@ def diagnose_command(
     save_report(found, report, held_out, options.force)
     if found.stopped == STOPPED_BY_HAND:
         raise typer.Exit(INTERRUPTED)
-
-
-def _as_it_comes(word: str, done: list[str], quiet: bool) -> None:
-    """Write down what was done; print the first answer at once."""
-    done.append(word)
-    if word.startswith("first answer") and not quiet:
-        show(f"{word[0].upper()}{word[1:]}\n")
 
 
 def _keep_fit(before: Fit, done: Sequence[str], json: opt.Json, force: bool) -> None:

@@ -103,7 +103,7 @@ def fit_many_command(
                               for place in directories for name, files in motors_in(place).items()}
     known = (records for files in motors.values() if (records := _readable(options, files)))
     model = options.model(next(known, []))  # the first that can be read tell a rotary from a linear axis
-    if options.preprocesses:
+    if options.ignore or options.median or options.levels or options.delay or options.no_spikes:
         motors = {name: _readable(options, files) or files for name, files in motors.items()}
     with processes(min(jobs, len(motors))) as over:
         found = fit_many(model, motors, map=over, journal=journal, reading=options.reading, **options.keywords())

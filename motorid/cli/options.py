@@ -95,11 +95,6 @@ class ReadingOptions:
         named = {k: parse_pairs(v, f"--{k}") for k in ("columns", "units") if (v := getattr(self, k))}
         return named | {k: v for k in ("hold", "dt") if (v := getattr(self, k)) is not None}
 
-    @property
-    def preprocesses(self) -> bool:
-        """Whether the runs differ from what their files say."""
-        return bool(self.ignore or self.median or self.levels or self.delay or self.no_spikes)
-
     def _preprocessed(self, runs: Sequence[Experiment]) -> list[Experiment]:
         """Return `runs` without the ignored channels, filtered, delayed and without spikes as asked."""
         out = _words([self.ignore] if self.ignore else [])
@@ -253,8 +248,7 @@ def own_effects(path: Path) -> dict[str, Effect]:
 
 def named_effect(name: str, own: dict[str, Effect]) -> Effect:
     """Return an effect of the user's file, or of the library."""
-    known = {**library.EVERY, **own}
-    if name not in known:
+    if name not in (known := {**library.EVERY, **own}):
         raise ModelError(f"--effects: {one_of(name, [*own, *library.EVERY], 'effect')}")
     return known[name]
 

@@ -46,29 +46,26 @@ NAMES = {"v": "the voltage", "i": "the current", "omega": "the speed", "theta": 
          "acceleration": "the acceleration"}
 
 
-def adequacy(fit: Fit, scores: Sequence[Score] = (), false_alarm: float = FALSE_ALARM,
-             level: float | None = None) -> Adequacy:
+def adequacy(fit: Fit, scores: Sequence[Score] = (), level: float = FALSE_ALARM) -> Adequacy:
     """Judge whether the residuals of `fit` are noise, by `scores` of effects that might be added (see `rank`) too.
 
-    `false_alarm` is the probability of calling an adequate model inadequate; `level` the p-value that does so, where
-    another test has a say too.
+    `FALSE_ALARM` is the probability of calling an adequate model inadequate; `level` the p-value that does so, another
+    one where another test has a say too.
 
     The noise is estimated from fast changes, which understates coloured noise by 1/√(1−ρ): 3 times at a correlation
     of 0.9 between neighbours. Residuals beyond ten times the noise (five for an angle) are not noise of any colour.
     """
     channels = {c: _channel(fit, c) for c in fit.problem.outputs}
-    tests = [t for c in channels for t in _dependences(fit, c)]
-    tests += _score_tests(fit, scores)
+    tests = [*(t for c in channels for t in _dependences(fit, c)), *_score_tests(scores)]
     material = [t for t in tests if t["share"] > _material(channels, t["channel"])]
     p_value = min([1.0, *(t["p"] * len(tests) for t in material)])
     far = [c for c, facts in channels.items() if facts["ratio"] > LARGEST_RATIO / (2 if c == "theta" else 1)]
     exact = max(fit.nrmse.values(), default=1.0) < EXACT
-    adequate = exact or (p_value > (false_alarm if level is None else level) and not far)
+    adequate = exact or (p_value > level and not far)
     for c, facts in channels.items():
         facts["p_value"] = min([1.0, *(t["p"] for t in tests if t["channel"] == c)])
     text = "The errors are below a millionth of what was measured." if exact else ""
-    return Adequacy(adequate, float(p_value), false_alarm, channels,
-                    text or _text(adequate, channels, material, false_alarm))
+    return Adequacy(adequate, float(p_value), FALSE_ALARM, channels, text or _text(adequate, channels, material))
 
 
 def _material(channels: Mapping[str, Mapping[str, float]], channel: str | None) -> float:
@@ -141,10 +138,7 @@ def _largest_cross_correlation(u: Array, r: Array) -> float:
 def motion_of(fit: Fit, k: int) -> dict[str, Array]:
     """Return what the motor was doing in run `k`, (N,) each, from the model's own signals."""
     sim, run = fit.simulations[k], fit.problem.experiments[k]
-    signals = {"v": run.inputs["v"]}
-    for c in ("i", "omega"):
-        if c in sim.states:
-            signals[c] = sim.states[c]
+    signals = {"v": run.inputs["v"], **{c: sim.states[c] for c in ("i", "omega") if c in sim.states}}
     if "theta" in run.outputs or "omega" in run.outputs:
         signals["theta"] = np.mod(angle_signal(run), 2 * np.pi)
     if "omega" in sim.states:
@@ -157,11 +151,9 @@ def _dependences(fit: Fit, channel: str) -> list[dict[str, Any]]:
     parts = _residuals(fit, channel)
     motions = [motion_of(fit, k) for k, _ in parts]
     residuals = [_winsorised(r) for _, r in parts]
-    names = [n for n in motions[0] if all(n in m for m in motions)]
     found = []
-    for name in names:
-        labels = _labels([m[name] for m in motions], 2 * BINS if name == "theta" else BINS)
-        if labels is not None:
+    for name in (n for n in motions[0] if all(n in m for m in motions)):
+        if (labels := _labels([m[name] for m in motions], 2 * BINS if name == "theta" else BINS)) is not None:
             share, p = _shift_test(labels, residuals)
             found.append({"channel": channel, "on": NAMES[name], "share": share, "p": p})
     return found
@@ -201,7 +193,7 @@ def _sums(labels: NDArray[np.intp], r: Array, count: int) -> Array:
     return np.fft.irfft(inside * np.conj(np.fft.rfft(r)), n, axis=1)[:, shifts].T
 
 
-def _score_tests(fit: Fit, scores: Sequence[Score]) -> list[dict[str, Any]]:
+def _score_tests(scores: Sequence[Score]) -> list[dict[str, Any]]:
     """Turn predicted drops into p-values on effective samples, the search over shapes paid for."""
     found = []
     for s in scores:
@@ -213,13 +205,12 @@ def _score_tests(fit: Fit, scores: Sequence[Score]) -> list[dict[str, Any]]:
     return found
 
 
-def _text(adequate: bool, channels: Mapping[str, Mapping[str, float]], material: Sequence[Mapping[str, Any]],
-          false_alarm: float) -> str:
+def _text(adequate: bool, channels: Mapping[str, Mapping[str, float]], material: Sequence[Mapping[str, Any]]) -> str:
     sizes = _sizes(channels)
     if adequate:
         coloured = [channel_name(c) for c, f in channels.items() if f["autocorrelation"] > 0.3 or f["ratio"] > LARGER]
         colour = f" The noise of {listed(coloured)} is coloured." if coloured else ""
-        return f"The errors ({sizes}) do not depend on the motion (false-alarm rate {100 * false_alarm:g} %).{colour}"
+        return f"The errors ({sizes}) do not depend on the motion (false-alarm rate {100 * FALSE_ALARM:g} %).{colour}"
     if not material:
         return f"Something is missing: the errors ({sizes}) are too large for noise, even coloured noise."
     worst = min(material, key=lambda t: (t["p"], -t["share"]))

@@ -7,14 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from motorid.diagnosis.predictive_score import (
-    Channels,
-    Errors,
-    Predictions,
-    errors_of,
-    held_out_errors,
-    predictions_left_out,
-)
+from motorid.diagnosis.predictive_score import Errors, Predictions, errors_of, held_out_errors, predictions_left_out
 from motorid.estimation.continuation import by_continuation
 from motorid.estimation.least_squares import FAILURES
 from motorid.estimation.result import Fit
@@ -48,12 +41,9 @@ class HeldOut:
     def predictions(self, fit: Fit) -> Predictions:
         """Return what `fit` predicts of data that it was not fitted to.
 
-        Raises
-        ------
-        SimulationError
-            If it cannot be simulated on the held-out runs.
+        SimulationError if it cannot be simulated on the held-out runs.
         """
-        held_out: Channels = {}
+        held_out: Mapping[str, Errors] = {}
         if self.validation is not None:
             # As finely as it was fitted: a tiny noise asks for many sub-steps that change nothing here.
             there = self.validation.for_model(fit.model).tuned(accuracy=fit.problem.accuracy)
@@ -63,7 +53,7 @@ class HeldOut:
             blocks = self._refitted(fit)
         return Predictions(blocks or {}, held_out)
 
-    def _refitted(self, fit: Fit) -> Channels:
+    def _refitted(self, fit: Fit) -> Mapping[str, Errors]:
         """Return the errors on every other part of each run, the model refitted to the rest, both ways round."""
         found: dict[str, list[Errors]] = {}
         for odd in (0, 1):
@@ -103,7 +93,6 @@ def _parted(run: Experiment, odd: int) -> tuple[Experiment, Experiment]:
 
 def restarted(problem: Problem, q) -> Problem:
     """Return the problem with the values at `q` as its start, initial states too."""
-    values = problem.values(q)
     physical = dict(zip([p.name for p in problem.unknown], problem.scaling.physical(q), strict=True))
     runs = []
     for k, run in enumerate(problem.runs):
@@ -113,6 +102,4 @@ def restarted(problem: Problem, q) -> Problem:
                 start[j] = np.clip(physical[f"{c}_0[{k}]"], *run.limits[c])
         apart = {n: physical[p.name] for n, r, p in problem.unknowns.apart if r == k}
         runs.append(replace(run, start=start, apart={**run.apart, **apart}))
-    return replace(problem, model=problem.model.start_at(values), _runs=tuple(runs))
-
-
+    return replace(problem, model=problem.model.start_at(problem.values(q)), _runs=tuple(runs))

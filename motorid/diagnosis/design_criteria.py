@@ -17,7 +17,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
-from itertools import pairwise, permutations, product
+from itertools import pairwise, product
 from typing import Any, NamedTuple
 
 import casadi as ca
@@ -342,12 +342,7 @@ class Driven:
         return np.array([values.get(n, 0.0) for n in self.system.parameters]), scaling.slope(q)
 
     def respond(self, levels: Array, delta: Array, by_level: bool = False, by_parameter: bool = False) -> Response:
-        """Simulate from rest at angle zero.
-
-        Raises
-        ------
-        SimulationError
-        """
+        """Simulate from rest at angle zero; SimulationError where that does not reach the end."""
         (p, slope), m = self.parameters(delta), len(levels) if by_level else 0
         place = [self.system.parameters.index(n) for n in self.rival.model.free_names]
         k = len(place) if by_parameter else 0
@@ -669,8 +664,3 @@ def linear_rows(task: Task) -> Rows:
         high.append(task.slew * seconds / layout.v_max)
     limit = np.concatenate(high)
     return Rows(np.zeros(0), np.vstack(rows), -limit, limit)
-
-
-def all_pairs(n: int) -> tuple[tuple[int, int], ...]:
-    """Return (truth, rival) for each two of n models."""
-    return tuple(permutations(range(n), 2))

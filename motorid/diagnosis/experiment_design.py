@@ -9,8 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from io import SEEK_END, StringIO
-from itertools import combinations
+from io import StringIO
+from itertools import combinations, permutations
 from pathlib import Path
 from typing import Any
 
@@ -18,21 +18,11 @@ import numpy as np
 
 from motorid.acquire.excitation import program
 from motorid.channels import UNITS, channel_name
-from motorid.diagnosis.design_criteria import (
-    MOST_SEGMENTS,
-    Driven,
-    Found,
-    Layout,
-    Rival,
-    Task,
-    all_pairs,
-    climb,
-    nearest,
-)
+from motorid.diagnosis.design_criteria import MOST_SEGMENTS, Driven, Found, Layout, Rival, Task, climb, nearest
 from motorid.diagnosis.results import Diagnosis
 from motorid.display.cards import Card, Flag, Printed, Shown, Table
 from motorid.display.numbers import number, quantity
-from motorid.errors import FitError, MotoridError, UsageError, among, at_least, one_of, positive
+from motorid.errors import FitError, MotoridError, UsageError, among, at_least, chosen, positive
 from motorid.estimation.result import Fit
 from motorid.numerics.parallel import budget as limited_time
 from motorid.numerics.parallel import one_thread
@@ -102,6 +92,11 @@ def suggest_experiment(fits: Sequence[Fit], *, v_max: float | None = None, i_max
     _check_span(duration, dt)
     dt = max(dt, duration / SAMPLES)
     t = np.arange(0.0, duration, dt)
+    sigma = {c: s for run in fits[0].problem.runs for c, s in run.sigma.items()}
+
+    def difference(a: Mapping[str, Array], b: Mapping[str, Array]) -> float:
+        return float(np.mean([np.mean(((a[c] - b[c]) / sigma[c]) ** 2) for c in a if c in sigma]))
+
     scores, kept = {}, {}
     for name, (v, _) in candidates(t, v_max).items():
         try:
@@ -109,7 +104,7 @@ def suggest_experiment(fits: Sequence[Fit], *, v_max: float | None = None, i_max
         except MotoridError:
             continue
         if not i_max or all(float(np.abs(y.get("i", 0.0)).max()) <= i_max for y in answers):
-            scores[name] = min(_difference(a, b, fits[0]) for a, b in combinations(answers, 2))
+            scores[name] = min(difference(a, b) for a, b in combinations(answers, 2))
             kept[name] = Experiment(t, {"v": v}, answers[0], name=name)
     if not scores:
         raise FitError("no candidate experiment stays within the limits with all models; raise i_max or v_max.")
@@ -142,11 +137,6 @@ def _prediction(fit: Fit, t: Array, v: Array, name: str) -> dict[str, Array]:
     blank = {c: np.zeros_like(t) for c in fit.problem.outputs}
     run = Experiment(t, {"v": v}, blank, sigma=dict.fromkeys(blank, 1.0), name=name)
     return dict(simulate(fit.model, run, initial="rest", estimate_initial=False)[0].outputs)
-
-
-def _difference(a: Mapping[str, Array], b: Mapping[str, Array], fit: Fit) -> float:
-    sigma = {c: s for run in fit.problem.runs for c, s in run.sigma.items()}
-    return float(np.mean([np.mean(((a[c] - b[c]) / sigma[c]) ** 2) for c in a if c in sigma]))
 
 
 # -- designed ----------------------------------------------------------------------------------------------------
@@ -231,13 +221,11 @@ class Design(Printed):
             rows = [[name, *(number(x, 3) for x in each)]
                     for every in self.deviations.values() for name, each in every.items()]
             tables.append(Table(["parameter", "std (SI) so far", f"with the {self.fixed}", "with this"], rows))
-        unit = {"v": "V", "dT": "K"} | {c: UNITS[c][0] for c in ("i", "omega", "theta")}
-        name = {"v": "voltage", "dT": "temperature rise"}
-        rows = [[name.get(c) or channel_name(c), quantity(p, unit[c], 3), quantity(self.limits.get(c), unit[c], 3)]
-                for c, p in self.peaks.items()]
+        unit = {"dT": "K"} | {c: units[0] for c, units in UNITS.items()}
+        rows = [["temperature rise" if c == "dT" else channel_name(c), quantity(p, unit[c], 3),
+                 quantity(self.limits.get(c), unit[c], 3)] for c, p in self.peaks.items()]
         tables.append(Table(["quantity", "largest expected", "limit"], rows))
-        moods = {"designed": "good", "stopped early": "note"}
-        return Card("Designed experiment", (Flag(self.status, moods[self.status]),),
+        return Card("Designed experiment", (Flag(self.status, "good" if self.status == "designed" else "note"),),
                     (self.text, f"Play it: {self.excite}"), tables,
                     (("mi.plot_design(design)", "see it"), ('design.to_csv("plan.csv")', "time and voltage"),
                      ('mi.record(port, "next.csv", excite=design.excite)', "play it")))
@@ -246,9 +234,8 @@ class Design(Printed):
         """Write time, voltage, and what each rival predicts; over another program's file with `force` only."""
         heads = ["t_s", "v_V", *(f"{c}_{n}" for n, p in self.predicted.items() for c in p)]
         columns = [self.t, self.v, *(y for p in self.predicted.values() for y in p.values())]
-        text = StringIO("# Written by motorid\n" + ",".join(heads) + "\n")
-        text.seek(0, SEEK_END)
-        np.savetxt(text, np.column_stack(columns), "%.7g", ",")
+        text, lead = StringIO(), "# Written by motorid\n"
+        np.savetxt(text, np.column_stack(columns), "%.7g", ",", header=",".join(heads), comments=lead)
         return write_files({Path(path): text.getvalue()}, force)[0]
 
     def to_dict(self) -> dict[str, Any]:
@@ -324,7 +311,7 @@ def design_experiment(found: Diagnosis | Fit | Sequence[Fit | Rival], *, goal: s
     positive(OMITTED, v_max=v_max, i_max=i_max, omega_max=omega_max, temp_max=temp_max, duration=duration, dt=dt)
     at_least(0, budget=budget)
     rivals, goal = _rivals(found, goal)
-    asked = _asked(rivals[0], parameters) if goal == "sharpen" else ()
+    asked = tuple(chosen(parameters, rivals[0].model.free_names, "free parameter")) if goal == "sharpen" else ()
     _check_words(shape, levels, slew)
     seen = rivals[0].seen
     dt, duration = float(f"{dt or seen['dt']:.9g}"), duration or seen["duration"]
@@ -354,8 +341,7 @@ def _optimised(task: Task, say: Callable[[str], None]) -> Found:
     """Return the best point that the search reaches from the best starts."""
     done: list[Found] = []
     for name, (_, here, c) in list(_starts(task).items())[:SHARPENED if task.asked else DISTINGUISHED]:
-        start = _within(here, c)
-        if start is None:
+        if (start := _within(here, c)) is None:
             continue
         found = climb(_hardest(start[1], start[2]), start[2])
         again = _within(replace(found.task, pairs=task.pairs), found.c)  # integration steps that suit what was found
@@ -410,10 +396,9 @@ def _hardest(task: Task, c: Array) -> Task:
 
 def _rivals(found: Any, goal: str | None) -> tuple[list[Rival], str]:
     """Return the rivals, and whether they are to be distinguished."""
-    if goal not in (None, *GOALS):
-        raise UsageError(one_of(str(goal), GOALS, "goal"))
     fits = list(found.rivals) if isinstance(found, Diagnosis) else [found] if isinstance(found, Fit) else list(found)
     goal = goal or ("distinguish" if len(fits) > 1 else "sharpen")
+    among(goal, GOALS, "goal")
     if goal == "distinguish" and len(fits) < 2:
         raise UsageError("to distinguish models takes at least two of them: what was found has no group, or give the "
                          'fits of the rivals. A single fit can be sharpened: goal="sharpen".')
@@ -426,13 +411,6 @@ def _rivals(found: Any, goal: str | None) -> tuple[list[Rival], str]:
     common = set.intersection(*(set(r.model.effect_names) for r in rivals)) if len(rivals) > 1 else set()
     names = [" + ".join(n for n in r.model.effect_names if n not in common) or "none" for r in rivals]
     return [replace(r, name=n) for r, n in zip(rivals, names, strict=True)], goal
-
-
-def _asked(rival: Rival, parameters: Sequence[str] | None) -> tuple[str, ...]:
-    free = rival.model.free_names
-    for name in parameters or ():
-        among(name, free, "free parameter")
-    return tuple(parameters or free)
 
 
 def _check_span(duration: float, dt: float) -> None:
@@ -454,8 +432,7 @@ def _limits(rivals: Sequence[Rival], v_max: float, i_max: float | None, omega_ma
     """Return the limits by state, and of the voltage."""
     seen, found = rivals[0].seen, {"v": (-v_max, v_max)}
     for state, given in (("i", i_max), ("omega", omega_max)):
-        size = given or seen.get(state)
-        if size:
+        if size := given or seen.get(state):
             found[state] = (-size, size)
     if theta_range is not None:
         found["theta"] = theta_range
@@ -494,7 +471,8 @@ def _task(rivals: Sequence[Rival], layout: Layout, limits: Mapping[str, tuple[fl
     errors = {c: float(np.sqrt(np.mean([r.sigma[c] ** 2 for r in rivals]))) for c in rivals[0].sigma}
     width = SMOOTH * limits["omega"][1] if asked and "omega" in limits else 0.0  # the rivals may differ at low speed
     driven = tuple(Driven.of(r.smoothed(width), layout, errors, "theta" in limits) for r in rivals)
-    return Task(driven, limits, errors, asked, () if asked else all_pairs(len(rivals)), slew or np.inf)
+    pairs = () if asked else tuple(permutations(range(len(rivals)), 2))
+    return Task(driven, limits, errors, asked, pairs, slew or np.inf)
 
 
 def _starts(task: Task) -> dict[str, tuple[float, Task, Array]]:
@@ -646,15 +624,10 @@ def _fixed(task: Task) -> tuple[str, Task, Array]:
     return name, fine, c
 
 
-def _drawn(task: Task) -> list[Array]:
-    """Return displacements of the parameters (n, k) by rival."""
-    rng = np.random.default_rng(0)
-    return [d.rival.draws(DRAWS, rng) for d in task.driven]
-
-
 def _safe(task: Task, c: Array) -> tuple[Array, dict[str, float]]:
     """Return the unknowns, shrunk until drawn parameters keep the limits too, and the largest size of each state."""
-    kept = _shrunk(task, c, _drawn(task))
+    rng = np.random.default_rng(0)
+    kept = _shrunk(task, c, [d.rival.draws(DRAWS, rng) for d in task.driven])
     if kept is None:
         raise FitError(NO_RECORD)
     c, reach = kept

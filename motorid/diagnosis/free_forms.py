@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from types import SimpleNamespace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +23,6 @@ from motorid.estimation.result import Fit
 from motorid.numerics.signals import Array
 from motorid.problem.problem import Problem
 from motorid.problem.runs import angle_signal
-from motorid.problem.simulate import Simulation
 
 KNOTS = 9  # cosines over the range of a time, twice as many over that of an angle
 HARMONICS = 8  # of a turn
@@ -104,11 +104,17 @@ class Span:
 
 
 def span_of(fit: Fit, signals: Sequence[Mapping[str, Array]]) -> Span:
-    """Return the smallest and the largest value of every quantity known in all runs, and orders of a turn."""
+    """Return the smallest and the largest value of every quantity known in all runs, and orders of a turn.
+
+    These are the lowest, the harmonics of those in the model, and what stands out of the misfit.
+    """
     names = set.intersection(*(set(s) for s in signals))
     step = float(np.median(np.concatenate([np.diff(s["t"]) for s in signals])))
     ranges = {n: (min(float(s[n].min()) for s in signals), max(float(s[n].max()) for s in signals)) for n in names}
-    return Span(ranges, tuple(orders_of(fit)), step)
+    known = [fit.values[p.name] for e in fit.model.effects for p in e.parameters if p.order]
+    seen = likely_orders(Tangent.of(fit), LIBRARY["cogging"], LINES) if "theta" in fit.problem.outputs else []
+    orders = {*range(1, HARMONICS + 1), *(round(k * n) for n in known for k in range(1, 5)), *map(round, seen)}
+    return Span(ranges, tuple(sorted(orders)), step)
 
 
 def shown(form: Form, fit: Fit, ranges: Mapping[str, tuple[float, float]]) -> bool:
@@ -120,25 +126,15 @@ def shown(form: Form, fit: Fit, ranges: Mapping[str, tuple[float, float]]) -> bo
         return False  # a gain is the motor constant's, unless the motion is measured twice
     if form.on not in ranges or ranges[form.on][0] == ranges[form.on][1]:
         return False
-    if form.on == "path" and not turns_back(*ranges["omega"]):
-        return False
+    if form.on == "path":  # both ways, by more than the creep of a smooth sgn or the ripple of a start
+        low, high = ranges["omega"]
+        if min(-low, high) <= STILL * max(-low, high):
+            return False
     if "i" not in outputs and (form.balance in ("voltage", "both") or form.on == "i"):
         return False  # there a torque over the speed says the same
     if form.remembers and fit.window is not None:
         return False  # what was before a window is not known
     return form.on != "turn" or fit.problem.model.axis != "linear"
-
-
-def turns_back(lowest: float, highest: float) -> bool:
-    """Tell whether a motor turns both ways, by more than the creep of a smooth sgn or the ripple of a start."""
-    return min(-lowest, highest) > STILL * max(-lowest, highest)
-
-
-def orders_of(fit: Fit) -> list[float]:
-    """Return orders of a turn: the lowest, the harmonics of those in the model, and what stands out of the misfit."""
-    known = [fit.values[p.name] for e in fit.model.effects for p in e.parameters if p.order]
-    seen = likely_orders(Tangent.of(fit), LIBRARY["cogging"], LINES) if "theta" in fit.problem.outputs else []
-    return sorted({*range(1, HARMONICS + 1), *(round(k * n) for n in known for k in range(1, 5)), *map(round, seen)})
 
 
 def functions_of(form: Form, span: Span) -> list[str]:
@@ -189,21 +185,12 @@ def past(z: Array, along: Array, length: float, initial: float) -> Array:
     return np.interp(along, even, np.concatenate([[initial], lagged]))
 
 
-class _Sheet:
-    """What the source of functions may ask of a model, for arrays."""
-
-    def __init__(self, width: float) -> None:
-        self.width = width
-
-    def sign(self, z: Array) -> Array:
-        return np.tanh(z / self.width)
-
-
 def values_of(functions: Sequence[str], form: Form, signal: Mapping[str, Array]) -> Array:
     """Return functions of a form, given by their source, along one run, (N, m)."""
     z, along = signal[form.on], signal["way" if form.on == "path" else "t"]
     first = float(z[0]) if form.on in ("past i", "past omega") else 0.0
-    names = {"ca": np, "z": z, "m": _Sheet(float(signal["width"][0])),
+    width = float(signal["width"][0])
+    names = {"ca": np, "z": z, "m": SimpleNamespace(sign=lambda z: np.tanh(z / width)),
              "past": lambda z, length: past(z, along, length, first)}
     return np.column_stack([np.broadcast_to(np.asarray(eval(f, names), float), z.shape) for f in functions])
 
@@ -258,9 +245,7 @@ class Linear:
 def linearised(fit: Fit, only: Form | None = None, span: Span | None = None) -> Linear:
     """Return the model of `fit` on its records, with the forms that these can show, or `only` one over a span.
 
-    Raises
-    ------
-    SimulationError
+    SimulationError where its answer to small changes grows without bound.
     """
     problem = fit.problem
     residual, jac = _at(problem, fit)
@@ -289,34 +274,30 @@ def _at(problem: Problem, fit: Fit) -> tuple[Array, Array]:
 
 
 def signals_along(fit: Fit) -> list[dict[str, Array]]:
-    """Return what a form may be a function of, along each run of a fit."""
-    return [signals_of(fit, fit.problem, s, k) for k, s in enumerate(fit.simulations)]
-
-
-def signals_of(fit: Fit, problem: Problem, sim: Simulation, k: int) -> dict[str, Array]:
-    """Return what a form may be a function of, along run `k`, (N,) each; the direction as smooth as the model's own.
+    """Return what a form may be a function of, along each run, (N,) each; the direction as smooth as the model's own.
 
     ``"width"`` is that of the smooth sgn.
     """
-    run = problem.experiments[k]
+    return [_signals(fit, k) for k in range(len(fit.simulations))]
+
+
+def _signals(fit: Fit, k: int) -> dict[str, Array]:
+    run, sim = fit.problem.experiments[k], fit.simulations[k]
     found = {"t": run.t - run.t[0], "v": run.inputs["v"], "run": np.full(run.n, float(k)), "width": np.ones(run.n)}
     found |= {c: np.asarray(sim.states[c]) for c in ("i", "omega") if c in sim.states}
     if "omega" in found:
+        omega = found["omega"]
         top = max(float(np.abs(s.states["omega"]).max()) for s in fit.simulations)
         width = fit.values.get("sgn_width") or SHARP * top + 1e-300
-        found["width"], found["direction"] = np.full(run.n, width), np.tanh(found["omega"] / width)
-        found["acceleration"] = fit.values["J"] * np.gradient(found["omega"], run.t)  # of a relative inertia
-        found["energy"] = 0.5 * fit.values["J"] * found["omega"] ** 2
-        found["path"], found["way"] = found["direction"], _way(found["omega"], run.t)
+        found["width"], found["direction"] = np.full(run.n, width), np.tanh(omega / width)
+        found["acceleration"] = fit.values["J"] * np.gradient(omega, run.t)  # of a relative inertia
+        found["energy"] = 0.5 * fit.values["J"] * omega**2
+        gone = np.cumsum(0.5 * np.abs(omega[1:] + omega[:-1]) * np.diff(run.t))  # both directions counted
+        found["path"], found["way"] = found["direction"], np.concatenate([[0.0], gone])
     found |= {f"past {c}": found[c] for c in ("v", "i", "omega") if c in found}
     if "theta" in run.outputs or "omega" in run.outputs:
         found["theta"] = found["turn"] = angle_signal(run)
     return found
-
-
-def _way(omega: Array, t: Array) -> Array:
-    """Return the way gone, (N,), both directions counted."""
-    return np.concatenate([[0.0], np.cumsum(0.5 * np.abs(omega[1:] + omega[:-1]) * np.diff(t))])
 
 
 def _answers(problem: Problem, k: int, answer: Response, bases: Mapping[Form, Array]) -> dict[Form, Array]:
@@ -326,14 +307,11 @@ def _answers(problem: Problem, k: int, answer: Response, bases: Mapping[Form, Ar
     _, weights, index = problem.measured[k][:3]
     answer = replace(answer, c=answer.c * weights[None, :, None])
     inside = {f: b for f, b in bases.items() if f.balance != "sensor"}
-    flat = np.concatenate(
-        [_driven(answer, inside), *(_read(problem, f, b, weights) for f, b in bases.items() if f not in inside)],
-        axis=1,
-    )
+    read = {f: b for f, b in bases.items() if f not in inside}
+    flat = np.concatenate([_driven(answer, inside), *(_read(problem, f, b, weights) for f, b in read.items())], axis=1)
     flat = flat if index is None else flat[index]
-    order = [*inside, *(f for f in bases if f not in inside)]
-    ends = np.cumsum([bases[f].shape[1] for f in order])[:-1]
-    return dict(zip(order, np.split(flat, ends, axis=1), strict=True))
+    ends = np.cumsum([b.shape[1] for b in (*inside.values(), *read.values())])[:-1]
+    return dict(zip((*inside, *read), np.split(flat, ends, axis=1), strict=True))
 
 
 def _driven(answer: Response, bases: Mapping[Form, Array]) -> Array:
@@ -341,8 +319,7 @@ def _driven(answer: Response, bases: Mapping[Form, Array]) -> Array:
     n, ny, _ = answer.c.shape
     if not bases:
         return np.zeros((n * ny, 0))
-    forces = [np.stack([_over_samples(f, _share(f, b, answer, on)) for on in BALANCES], axis=2)
-              for f, b in bases.items()]
+    forces = [np.stack([_share(f, b, answer, on) for on in BALANCES], axis=2) for f, b in bases.items()]
     with np.errstate(over="ignore", invalid="ignore"):
         out = answer.driven(np.einsum("nxf,nmf->mnx", answer.b, np.concatenate(forces, axis=1), optimize=True))
     if not np.all(np.abs(out) < UNBOUNDED):  # or not a number
@@ -351,15 +328,12 @@ def _driven(answer: Response, bases: Mapping[Form, Array]) -> Array:
 
 
 def _share(form: Form, basis: Array, answer: Response, balance: str) -> Array:
-    """Return what a form puts in a balance, (N, m)."""
-    if form.balance == "both":
-        return basis * (answer.states["i"] if balance == "torque" else -answer.states["omega"])[:, None]
-    return basis if form.balance == balance else np.zeros_like(basis)
-
-
-def _over_samples(form: Form, push: Array) -> Array:
     """Return what a form puts in a balance over each sample, (N-1, m); only the voltage jumps."""
-    return push[:-1] if "v" in (form.on, form.carrier) else 0.5 * (push[:-1] + push[1:])
+    if form.balance == "both":
+        basis = basis * (answer.states["i"] if balance == "torque" else -answer.states["omega"])[:, None]
+    elif form.balance != balance:
+        return np.zeros_like(basis[1:])
+    return basis[:-1] if "v" in (form.on, form.carrier) else 0.5 * (basis[:-1] + basis[1:])
 
 
 def _read(problem: Problem, form: Form, basis: Array, weights: Array) -> Array:
@@ -373,8 +347,7 @@ def _read(problem: Problem, form: Form, basis: Array, weights: Array) -> Array:
 def _labels(problem: Problem, k: int) -> Array:
     """Return place in the run and channel of every residual of run `k`, (2, n)."""
     y, _, index = problem.measured[k][:3]
-    place = np.repeat(np.arange(len(y)) / len(y), y.shape[1])
-    both = np.stack([place, np.tile(np.arange(y.shape[1]), len(y))])
+    both = np.stack([np.repeat(np.arange(len(y)) / len(y), y.shape[1]), np.tile(np.arange(y.shape[1]), len(y))])
     return both if index is None else both[:, index]
 
 
@@ -422,8 +395,7 @@ def contains(fit: Fit, form: Form, size: str) -> bool:
     if size not in fit.problem.system.parameters or not shown(form, fit, span.ranges):
         return False
     push = pushes_of(fit, size)
-    place = _place(fit, form)
-    if place is None:
+    if (place := _place(fit, form)) is None:
         return False
     whole, own = float(np.sum(push**2)), push[:, place]
     basis = np.concatenate([basis_of(form, s, span) for s in signals])

@@ -41,15 +41,11 @@ AS_IT_IS = LevenbergMarquardt(looks=0)  # beside a fit whose end was looked into
 
 @dataclass(frozen=True)
 class Reading:
-    """Another reading of the records: what it says, the option for it, and what it makes of a run.
-
-    `late`: it can stand in for an effect, and is tried only where effects leave more than noise.
-    """
+    """Another reading of the records: what it says, the option for it, and what it makes of a run."""
 
     says: str
     option: str
     of: Callable[[Experiment], Experiment]
-    late: bool = False
 
     def problem(self, fit: Fit) -> Problem:
         """Return the problem of the same model on records read so."""
@@ -57,12 +53,7 @@ class Reading:
         return fit.problem.with_(experiments=runs, model=fit.model, noise_factors={})
 
     def fitted(self, fit: Fit, solver: LevenbergMarquardt | None = None) -> Fit:
-        """Return the fit of the same model to records read so.
-
-        Raises
-        ------
-        FitError, SimulationError
-        """
+        """Return the fit of the same model to records read so; FitError or SimulationError where there is none."""
         return solve(self.problem(fit), solver, start="model")
 
     def remark(self, before: Fit, after: Fit) -> str:
@@ -134,7 +125,7 @@ def _fall(fit: Fit, reading: Reading) -> float:
 def _delay(fit: Fit, samples: float) -> Reading:
     seconds = samples * float(np.median(np.concatenate([np.diff(r.t) for r in fit.problem.experiments])))
     how = f"acts {number(abs(seconds) * 1e3, 3)} ms {'later' if seconds > 0 else 'earlier'} than it was logged"
-    return Reading(f"The voltage {how}", f"--delay {seconds:.3g}", lambda r: r.delayed(seconds), late=True)
+    return Reading(f"The voltage {how}", f"--delay {seconds:.3g}", lambda r: r.delayed(seconds))
 
 
 def _readings(runs: Sequence[Experiment]) -> Iterator[Reading]:

@@ -49,27 +49,24 @@ def locate(fit: Fit) -> Missing:
     """
     natural = natural_sizes(fit.problem.experiments, fit.values)
     unit = "N" if fit.problem.model.axis == "linear" else "N·m"
-    size = np.array([natural["V"] if "i" in fit.problem.system.states else 0.0, natural[unit]])
-    apart = "i" in fit.problem.outputs and len(fit.problem.outputs) > 1
-    if not apart and "i" in fit.problem.system.states:
-        size[0] = 0.0  # one of them stands for both
+    electrical = "i" in fit.problem.system.states
+    apart = "i" in fit.problem.outputs and len(fit.problem.outputs) > 1  # else the torque stands for both
+    size = np.array([natural["V"] if electrical and apart else 0.0, natural[unit]])
     begun = [begin(fit, k) for k in range(len(fit.problem.runs))]
     walk, both = _walk(fit, size, begun)
-    shares = _shares(fit, walk * size, both, begun) if apart else {"mechanical": 1.0}
-    if "i" in fit.problem.system.states and not apart:
-        shares = {"electrical": 0.5, "mechanical": 0.5}
+    if apart:
+        shares = _shares(fit, walk * size, both, begun)
+        where = max(shares, key=lambda s: shares[s])
+    else:
+        shares = {"electrical": 0.5, "mechanical": 0.5} if electrical else {"mechanical": 1.0}
+        where = None if electrical else "mechanical"
     signals = tuple(_signals(fit, k, s) for k, s in enumerate(both))
     voltage, torque = tuple(s.d[:, 0] for s in both), tuple(s.d[:, 1] for s in both)
     bins = {name: _against(d, signals)
             for name, d in (("voltage", voltage), ("torque", torque)) if any(x.any() for x in d)}
     regions = _regions(fit, signals)
-    where = None
-    if len(shares) > 1 and apart:
-        where = max(shares, key=lambda s: shares[s])
-    elif len(shares) == 1:
-        where = "mechanical"
     return Missing(where, tuple(r.experiment.t for r in fit.problem.runs), voltage, torque, signals, shares, regions,
-                   bins, _text(where, shares, regions, bins, apart), unit)
+                   bins, _text(where, shares, regions, bins), unit)
 
 
 def acting_like(missing: Missing, form: Form) -> Missing:
@@ -79,17 +76,17 @@ def acting_like(missing: Missing, form: Form) -> Missing:
     fails = {"both": "Both balances fail.", "sensor": "The measurement fails."}
     lead = fails.get(form.balance, f"The {form.balance} balance fails.")
     lead = lead if apart else missing.text.split(".")[0] + "."
-    first = max(missing.regions, key=lambda r: missing.regions[r])
-    text = f"{lead} What is missing acts like {form.text}. {_region(first, missing.regions)}"
+    text = f"{lead} What is missing acts like {form.text}. {_region(missing.regions)}"
     return replace(missing, where=where if apart else None, acts_like=form.text, text=text)
 
 
-def _region(first: str, regions: Mapping[str, float]) -> str:
+def _region(regions: Mapping[str, float]) -> str:
+    first = max(regions, key=lambda r: regions[r])
     place = "steady motion" if first == "steady" else first
     return f"{100 * regions[first]:.0f} % of the squared error lies in {place}."
 
 
-def _walk(fit: Fit, size: Array, begun: Sequence[Begun]) -> tuple[float, list[Smoothed]]:
+def _walk(fit: Fit, size: Array, begun: Sequence[Linear]) -> tuple[float, list[Smoothed]]:
     """Return the smallest random walk that explains the measurements, and the smoothed runs."""
     found: list[Smoothed] = []
     for walk in WALKS:
@@ -99,7 +96,7 @@ def _walk(fit: Fit, size: Array, begun: Sequence[Begun]) -> tuple[float, list[Sm
     return WALKS[-1], found
 
 
-def _shares(fit: Fit, walk: Array, both: Sequence[Smoothed], begun: Sequence[Begun]) -> dict[str, float]:
+def _shares(fit: Fit, walk: Array, both: Sequence[Smoothed], begun: Sequence[Linear]) -> dict[str, float]:
     """Share of the misfit by balance: what one unknown input alone leaves, the other has to explain."""
     alone = [[smooth(fit, k, walk * keep, at).chi2 for k, at in enumerate(begun)] for keep in ([1, 0], [0, 1])]
     left = [float(np.mean(chi2)) for chi2 in alone]
@@ -110,16 +107,12 @@ def _shares(fit: Fit, walk: Array, both: Sequence[Smoothed], begun: Sequence[Beg
 
 
 def _signals(fit: Fit, k: int, s: Smoothed) -> Mapping[str, Array]:
-    run = fit.problem.experiments[k]
-    found: dict[str, Array] = {"t": run.t}
-    for c in ("i", "omega"):
-        if c in fit.problem.system.states:
-            found[c] = s.x[:, fit.problem.system.states.index(c)]
+    run, states = fit.problem.experiments[k], fit.problem.system.states
+    found = {"t": run.t, **{c: s.x[:, states.index(c)] for c in ("i", "omega") if c in states}}
     if "theta" in run.outputs or "omega" in run.outputs:
         found["theta"] = angle_signal(run)
     if "i" in found:
-        power = fit.values["R"] * found["i"] ** 2
-        found["heat"] = integral(run.t, power)
+        found["heat"] = integral(run.t, fit.values["R"] * found["i"] ** 2)
     return found
 
 
@@ -128,29 +121,25 @@ def _against(unknown: Sequence[Array], signals: Sequence[Mapping[str, Array]]) -
     d = np.concatenate(list(unknown))
     worth = sum(effective_samples(x - x.mean()) for x in unknown) / len(d)
     found = []
-    for name in ("omega", "i", "theta", "heat", "t"):
-        if not all(name in s for s in signals):
-            continue
+    for name in (n for n in ("omega", "i", "theta", "heat", "t") if all(n in s for s in signals)):
         z = np.concatenate([s[name] for s in signals])
         z = np.mod(z, 2 * np.pi) if name == "theta" else z
         if np.ptp(z) > 0:
-            found.append(_binned(name, z, d, worth))
+            found.append(binned(name, z, d, worth))
     return tuple(sorted(found, key=lambda b: -b.explained))
 
 
-def _binned(name: str, z: Array, d: Array, worth: float) -> Binned:
+def binned(name: str, z: Array, d: Array, worth: float = 1.0, bins: int = BINS) -> Binned:
+    """Bin `d` (N,) over the quantity `name`, `z` (N,); each sample counts as `worth` independent ones."""
     # Half of the edges by count, half by distance: rest is one value, and rare speeds matter too.
-    half = BINS // 2 + 1
-    inner = np.concatenate([np.quantile(z, np.linspace(0, 1, half)), np.linspace(z.min(), z.max(), half)])
-    edges = np.unique(inner)
-    label = np.clip(np.searchsorted(edges, z, side="right") - 1, 0, len(edges) - 2)
+    half = bins // 2 + 1
+    edges = np.union1d(np.quantile(z, np.linspace(0, 1, half)), np.linspace(z.min(), z.max(), half))
+    label = np.searchsorted(edges[1:-1], z, side="right")
     count = np.bincount(label, minlength=len(edges) - 1)
     keep = count >= 3
     n = np.maximum(count, 1)
-    mean = np.bincount(label, d, len(edges) - 1) / n
-    spread = np.sqrt(np.maximum(np.bincount(label, d**2, len(edges) - 1) / n - mean**2, 0.0))
-    half = 1.96 * spread / np.sqrt(np.maximum(n * worth, 1.0))
-    centre = np.bincount(label, z, len(edges) - 1) / n
+    centre, mean, square = (np.bincount(label, w, len(edges) - 1) / n for w in (z, d, d**2))
+    half = 1.96 * np.sqrt(np.maximum(square - mean**2, 0.0)) / np.sqrt(np.maximum(n * worth, 1.0))
     total = float(np.sum((d - d.mean()) ** 2))
     between = float(np.sum(count * (mean - d.mean()) ** 2))
     inside = (total - between) / max(len(d) - keep.sum(), 1)
@@ -167,14 +156,15 @@ def _regions(fit: Fit, signals: Sequence[Mapping[str, Array]]) -> dict[str, floa
     for k, s in enumerate(signals):
         sigma, sim = fit.problem.runs[k].sigma, fit.simulations[k]
         r2 = np.sum([np.nan_to_num(sim.residual(c) / sigma[c]) ** 2 for c in sigma], axis=0)
-        for name, mask in _masks(s, top_speed, top_current).items():
-            sums[name] += float(np.sum(r2[mask]))
+        region = _region_of_samples(s, top_speed, top_current)
+        for name in REGIONS:
+            sums[name] += float(np.sum(r2[region == name]))
     total = sum(sums.values()) or 1.0
     return {name: v / total for name, v in sums.items()}
 
 
-def _masks(s: Mapping[str, Array], top_speed: float, top_current: float) -> dict[str, NDArray[np.bool_]]:
-    """Return one mask per region; every sample is in just one."""
+def _region_of_samples(s: Mapping[str, Array], top_speed: float, top_current: float) -> NDArray[np.str_]:
+    """Return the region of each sample, (N,)."""
     omega = s.get("omega", np.zeros_like(s["t"]))
     n = len(omega)
     still = np.abs(omega) < 0.02 * top_speed
@@ -188,24 +178,15 @@ def _masks(s: Mapping[str, Array], top_speed: float, top_current: float) -> dict
     rate = np.abs(np.gradient(omega, s["t"]))
     fast = rate > 0.2 * max(np.quantile(rate, 0.99), 1e-300)
     strong = np.abs(s["i"]) > 0.6 * top_current if "i" in s else np.zeros(n, bool)
-    masks, taken = {}, np.zeros(n, bool)
-    for name, mask in (("reversal", reversal), ("standstill", still), ("high current", strong), ("acceleration", fast),
-                       ("steady", np.ones(n, bool))):
-        masks[name] = mask & ~taken
-        taken |= mask
-    return masks
+    masks = {"reversal": reversal, "standstill": still, "high current": strong, "acceleration": fast}
+    return np.select(list(masks.values()), [np.array(name) for name in masks], np.array("steady"))
 
 
 def _text(where: str | None, shares: Mapping[str, float], regions: Mapping[str, float],
-          bins: Mapping[str, Sequence[Binned]], apart: bool) -> str:
-    first = max(regions, key=lambda r: regions[r])
-    region = _region(first, regions)
-    if not apart and len(shares) > 1:
-        lead = "Without current and speed both measured, a missing voltage and a missing torque look the same."
-        name = "torque"
-    else:
-        name = "voltage" if where == "electrical" else "torque"
-        lead = f"The {name} balance fails ({100 * shares.get(where or '', 0):.0f} % of the squared error)."
+          bins: Mapping[str, Sequence[Binned]]) -> str:
+    region, name = _region(regions), "voltage" if where == "electrical" else "torque"
+    lead = (f"The {name} balance fails ({100 * shares[where]:.0f} % of the squared error)." if where else
+            "Without current and speed both measured, a missing voltage and a missing torque look the same.")
     best = bins.get(name, ())
     if best and best[0].explained > 0.2:
         what = WORDS[best[0].against]
@@ -219,15 +200,13 @@ def accounted(before: Fit, after: Fit) -> tuple[tuple[Array, ...], tuple[Array, 
 
     That is its effects and the shift of the parameters: what the balances of `before` lack along the motion of `after`.
     """
-    voltages, torques = [], []
+    every = []
+    scale = {"i": before.values.get("L", 0.0), "omega": before.values["J"]}
     for k, run in enumerate(after.problem.runs):
-        states = after.simulations[k].states
-        new, old = (_rates(f, k, states) for f in (after, before))
-        scale = {"i": before.values.get("L", 0.0), "omega": before.values["J"]}
-        missing = {n: scale[n] * (new[n] - old[n]) if n in old else np.zeros(run.experiment.n) for n in scale}
-        voltages.append(missing["i"])
-        torques.append(missing["omega"])
-    return tuple(voltages), tuple(torques)
+        new, old = (_rates(f, k, after.simulations[k].states) for f in (after, before))
+        every.append([f * (new[n] - old[n]) if n in old else np.zeros(run.experiment.n) for n, f in scale.items()])
+    voltages, torques = zip(*every, strict=True)
+    return voltages, torques
 
 
 def _rates(fit: Fit, k: int, states: Mapping[str, Array]) -> dict[str, Array]:
@@ -251,8 +230,10 @@ class Smoothed(NamedTuple):
 
 
 class Linear(NamedTuple):
-    """One step from every sample, x⁺ (N-1, nx) with its slopes A and B, and the outputs (N, ny) with theirs."""
+    """A model linearised at states x (N, nx): one step from every sample, x⁺ (N-1, nx) with its slopes A and B, and the
+    outputs (N, ny) with theirs."""
 
+    x: Array
     x_next: Array
     a: Array
     b: Array
@@ -260,24 +241,17 @@ class Linear(NamedTuple):
     c: Array
 
 
-class Begun(NamedTuple):
-    """States (N, nx) to begin at, and the model linearised there."""
-
-    x: Array
-    linear: Linear
-
-
-def smooth(fit: Fit, k: int, walk: Array, begun: Begun) -> Smoothed:
+def smooth(fit: Fit, k: int, walk: Array, linear: Linear) -> Smoothed:
     """Return the smoothed run `k`.
 
-    `walk` is the step size of the random walk, V/√s and N·m/√s (0: none); `begun` is where to begin, the same for every
-    walk.
+    `walk` is the step size of the random walk, V/√s and N·m/√s (0: none); `linear` is where to begin, the same for
+    every walk.
     """
     run, system = fit.problem.runs[k], fit.problem.system
     p = parameter_vector(fit, k)
     y = fit.problem.measured[k].y
     weights = np.array([1.0 / run.sigma[c] if c in run.sigma else 0.0 for c in fit.problem.outputs])
-    x, linear = begun
+    x = linear.x
     n, nx = x.shape
     d = np.zeros((n, 2))
     size = np.maximum(np.abs(x).max(axis=0), 1e-9)
@@ -297,20 +271,18 @@ def smooth(fit: Fit, k: int, walk: Array, begun: Begun) -> Smoothed:
     return Smoothed(d, x, float(np.nanmean(e[:, weights > 0] ** 2)))
 
 
-def begin(fit: Fit, k: int) -> Begun:
-    """Return where to begin, (N, nx), what was measured where it was, and the model linearised about that."""
-    run, sim = fit.problem.runs[k], fit.simulations[k]
-    x = np.column_stack([sim.states[s] for s in fit.problem.system.states])
-    for j, s in enumerate(fit.problem.system.states):
-        if s in run.experiment.outputs:
-            x[:, j] = bridged(run.experiment.t, run.experiment.outputs[s])
-    return Begun(x, _linear(fit, k, x, np.zeros((len(x), 2))))
+def begin(fit: Fit, k: int) -> Linear:
+    """Return the model linearised where to begin: at what was measured, and simulated where it was not."""
+    run, simulated = fit.problem.runs[k].experiment, fit.simulations[k].states
+    x = np.column_stack([bridged(run.t, run.outputs[s]) if s in run.outputs else simulated[s]
+                         for s in fit.problem.system.states])
+    return _linear(fit, k, x, np.zeros((len(x), 2)))
 
 
 def _linear(fit: Fit, k: int, x: Array, d: Array) -> Linear:
     """Return the model linearised at the states `x` and the inputs `d`."""
     grid, system, p = fit.problem.runs[k].grid, fit.problem.system, parameter_vector(fit, k)
-    return Linear(*linear_steps(system, grid, x, p, d[:-1]), *shown(system, grid, x, p))
+    return Linear(x, *linear_steps(system, grid, x, p, d[:-1]), *shown(system, grid, x, p))
 
 
 def _banded_step(n, nx, misfit, c, defect, a, b, model, d, hold, dt, free) -> Array:
@@ -324,8 +296,7 @@ def _banded_step(n, nx, misfit, c, defect, a, b, model, d, hold, dt, free) -> Ar
     rhs[:, :nx] += np.einsum("nyi,ny->ni", cc, e)
     # defect_k = Φ(x_k, d_k) - x_{k+1}:  A δx_k + B δd_k - δx_{k+1} + defect = 0, weighed by 1/model
     g = np.concatenate([a, b * free], axis=2) / model[None, :, None]
-    back = np.zeros((nx, m))
-    back[:, :nx] = -np.diag(1.0 / model)
+    back = -np.eye(nx, m) / model[:, None]
     w = defect / model
     diagonal[:-1] += np.einsum("nki,nkj->nij", g, g)
     diagonal[1:] += back.T @ back

@@ -61,19 +61,11 @@ def size_of(model: Model, problem: Problem) -> int:
 
 
 def node_of(fit: Fit, held: HeldOut, added: str | None = None, parent: Node | None = None) -> Node:
-    """Judge a fit.
-
-    Raises
-    ------
-    SimulationError
-        If it cannot be simulated on the held-out runs.
-    """
+    """Judge a fit; SimulationError if it cannot be simulated on the held-out runs."""
     return Node(fit, added, held.predictions(fit), parent)
 
 
-@lru_cache(maxsize=4096)
-def _compared(old: Predictions, new: Predictions) -> Evidence:
-    return compare(old, new)
+_compared = lru_cache(maxsize=4096)(compare)
 
 
 def evidence(old: Node, new: Node) -> Evidence:

@@ -15,9 +15,8 @@ of its samples.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -106,10 +105,11 @@ class Evidence:
 
 def compare(old: Predictions, new: Predictions) -> Evidence:
     """Return what `new` predicts better than `old` on the same data."""
-    here, here_se = _summed(_differences(old.blocks, new.blocks, lost=False))
-    there, there_se = _summed(_differences(old.held_out, new.held_out, lost=True))
+    gone = lost_channels(old.held_out, new.held_out)
+    unseen = [{c: e for c, e in model.held_out.items() if c not in gone} for model in (old, new)]
+    here, here_se = _summed(_differences(old.blocks, new.blocks))
+    there, there_se = _summed(_differences(*unseen))
     blocks = _fall(old.blocks, new.blocks) or 0.0
-    unseen = [_kept(old.held_out, new.held_out, m) for m in (old.held_out, new.held_out)]
     held_out = _fall(*unseen)
     worse = held_out is not None and (held_out < -MATERIAL or is_sure(-there, there_se))
     gain, se = here + there, float(np.hypot(here_se, there_se))
@@ -137,11 +137,6 @@ def _summed(differences: Array) -> tuple[float, float]:
 def lost_channels(old: Channels, new: Channels) -> tuple[str, ...]:
     """Return the channels that both models lose: zero is nearer to what was measured than either."""
     return tuple(c for c in old if c in new and min(old[c].nrmse, new[c].nrmse) > LOST)
-
-
-def _kept(old: Channels, new: Channels, channels: Channels) -> Channels:
-    gone = lost_channels(old, new)
-    return {c: e for c, e in channels.items() if c not in gone}
 
 
 def _fall(old: Channels, new: Channels) -> float | None:
@@ -173,16 +168,16 @@ def _log_rms(errors: Errors, left_out: int = -1) -> float:
     return float(np.average(logs, weights=[len(r) for r in runs])) if runs else 0.0
 
 
-def _differences(old: Channels, new: Channels, lost: bool) -> Array:
+def _differences(old: Channels, new: Channels) -> Array:
     """Return the difference of log densities per block, summed over channels."""
-    gone = lost_channels(old, new) if lost else ()
-    both = [c for c in old if c in new and c not in gone]
+    both = [c for c in old if c in new]
     if not both:
         return np.zeros(0)
     count = 1 + max(int(b.max()) for c in both for b in old[c].blocks)
     total, seen = np.zeros(count), np.zeros(count, bool)
     for c in both:
-        share = _effective_share(min((old[c], new[c]), key=lambda e: e.nrmse))
+        better = min((old[c], new[c]), key=lambda e: e.nrmse).values
+        share = sum(effective_samples(r) for r in better) / max(int(np.isfinite(np.concatenate(better)).sum()), 1)
         labels = np.concatenate(old[c].blocks)
         was, now = np.concatenate(old[c].values), np.concatenate(new[c].values)
         known = np.isfinite(was) & np.isfinite(now)
@@ -191,11 +186,6 @@ def _differences(old: Channels, new: Channels, lost: bool) -> Array:
         total += share * (each[1] - each[0])
         seen |= np.bincount(labels, minlength=count) > 0
     return total[seen]
-
-
-def _effective_share(errors: Errors) -> float:
-    n = sum(int(np.isfinite(r).sum()) for r in errors.values)
-    return sum(effective_samples(r) for r in errors.values) / max(n, 1)
 
 
 def _log_densities(r: Array, labels: NDArray[np.intp], count: int, floor: float) -> Array:
@@ -223,26 +213,18 @@ def left_out(residual: Array, columns: Array, labels: NDArray[np.intp]) -> Array
     """Return what `residual` (n,) would be in each block, left out of the fit of `columns` (n, k)."""
     scale2 = float(residual @ residual) / max(len(residual), 1)
     normal = columns.T @ columns + scale2 * np.eye(columns.shape[1])
-    found = residual.copy()
-    for rows in _rows(labels):
+    found, order = residual.copy(), np.argsort(labels, kind="stable")
+    for rows in np.split(order, np.flatnonzero(np.diff(labels[order])) + 1):
         j, r = columns[rows], residual[rows]
         found[rows] = r + j @ np.linalg.solve(normal - j.T @ j, j.T @ r)
     return found
 
 
-def _rows(labels: NDArray[np.intp]) -> Iterator[NDArray[np.intp]]:
-    """Yield the rows of each block."""
-    order = np.argsort(labels, kind="stable")
-    ends = np.flatnonzero(np.diff(labels[order])) + 1
-    for a, b in pairwise([0, *ends.tolist(), len(order)]):
-        yield order[a:b]
-
-
-def blocks_of(lengths: Sequence[int], count: int = BLOCKS) -> list[NDArray[np.intp]]:
-    """Return the block of each sample of runs of these lengths, `count` blocks a run."""
+def blocks_of(lengths: Sequence[int]) -> list[NDArray[np.intp]]:
+    """Return the block of each sample of runs of these lengths, `BLOCKS` a run."""
     found, first = [], 0
     for n in lengths:
-        parts = max(min(count, n // 2), 1)
+        parts = max(min(BLOCKS, n // 2), 1)
         found.append(first + np.minimum(np.arange(n) * parts // n, parts - 1))
         first += parts
     return found
@@ -281,8 +263,7 @@ def by_channel(problem: Problem, residual: Array, blocks: Sequence[NDArray[np.in
     parts, weights = problem.unstack(residual), [m.weights for m in problem.measured]
     found = {}
     for j, c in enumerate(problem.outputs):
-        runs = [k for k, run in enumerate(problem.runs) if c in run.sigma]
-        if runs:
+        if runs := [k for k, run in enumerate(problem.runs) if c in run.sigma]:
             measured = np.concatenate([problem.experiments[k].outputs[c] for k in runs])
             found[c] = Errors(tuple(parts[k][:, j] / weights[k][j] for k in runs), tuple(blocks[k] for k in runs),
                               float(np.sqrt(np.nanmean(measured**2))),

@@ -13,6 +13,7 @@ import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
@@ -54,8 +55,7 @@ class Score:
     shapes: tuple[Shape, ...] = ()
 
 
-@dataclass(frozen=True, eq=False)
-class Tried:
+class Tried(NamedTuple):
     """One shape scored: share of chi² explained, values, what is left of the residual, what does the same."""
 
     drop: float
@@ -109,8 +109,7 @@ def with_phase_per_run(fit: Fit, scores: Sequence[Score], zero: Effect) -> list[
             shape = added.shape({order: n} if order else {})
             if shape is None or not shape.sizes:
                 continue
-            columns = by_record(fit.problem, shape.columns)
-            drop, a, _ = tangent.explained(np.hstack(columns), [False] * 2 * len(runs))
+            drop, a, _ = tangent.explained(np.hstack(by_record(fit.problem, shape.columns)), [False] * 2 * len(runs))
             waves = a[::2] + 1j * a[1::2]
             zeros = np.angle(waves * np.conj(waves[0])) / n
             wave = {shape.sizes[0].name: float(np.median(np.abs(waves))), phase.name: float(np.angle(waves[0]))}
@@ -161,19 +160,12 @@ def _nothing(tangent: Tangent, known: Score | None) -> Score | None:
     """Return the score by what an effect added to a smaller model, if that is next to nothing here."""
     if known is None or not known.shapes or any(p.order for p in known.effect.parameters):
         return None
-    shapes = tuple(s.weighed_like(tangent.fit) for s in known.shapes)
-    found = _scored(tangent, known.effect, shapes)
+    found = _scored(tangent, known.effect, tuple(s.weighed_like(tangent.fit) for s in known.shapes))
     return found if found.drop * tangent.chi2 < NOTHING else None
 
 
 def score(tangent: Tangent, effect: Effect) -> Score:
-    """Score one effect.
-
-    Raises
-    ------
-    ModelError
-        If the effect does not go with the model or the measured channels.
-    """
+    """Score one effect; ModelError if it does not go with the model or the measured channels."""
     added = Added.of(tangent, effect)
     if any(p.order and not p.given for p in added.pars):
         return _score_orders(tangent, added, effect)
@@ -217,17 +209,16 @@ def _distinct(starts: list[dict[str, float]], most: int = 3) -> list[dict[str, f
 
 def _tried(tangent: Tangent, shape: Shape) -> Tried:
     """Score one shape, physical signs enforced."""
+    drop, amounts, left = tangent.explained(shape.columns, shape.nonnegative)
     if not shape.sizes:
-        drop, amount, left = tangent.explained(shape.columns, shape.nonnegative)
         # An amount far from one means that the shape itself is wrong: the drop promises more than it can keep.
-        keeps = 0.2 if amount[0] < 0.05 else min(1.0, 3.0 / amount[0])
+        keeps = 0.2 if amounts[0] < 0.05 else min(1.0, 3.0 / amounts[0])
         return Tried(keeps * drop, dict(shape.values), left)
     if shape.phase is not None:
-        drop, a, left = tangent.explained(shape.columns, shape.nonnegative)
-        found = {shape.sizes[0].name: float(np.hypot(*a)), shape.phase.name: float(np.arctan2(a[1], a[0]))}
+        cosine, sine = amounts
+        found = {shape.sizes[0].name: float(np.hypot(cosine, sine)), shape.phase.name: float(np.arctan2(sine, cosine))}
     else:
-        drop, a, left = tangent.explained(shape.columns, shape.nonnegative)
-        found = {p.name: float(v) for p, v in zip(shape.sizes, a, strict=True)}
+        found = {p.name: float(v) for p, v in zip(shape.sizes, amounts, strict=True)}
     held = {p.name: p.value for p in shape.sizes if not p.vary}
     if held:  # e.g. copper's temperature coefficient: only near its physical value does the shape make sense
         ratio = min((v / h for (n, h) in held.items() if (v := found[n]) > 0 and h), default=0.0)
@@ -291,10 +282,7 @@ class Added:
     def of(tangent: Tangent, effect: Effect) -> Added:
         """Return the fit's model with `effect`; the first one over the angle goes along the measured angle.
 
-        Raises
-        ------
-        ModelError
-            If the effect does not go with the model.
+        ModelError if the effect does not go with the model.
         """
         fit, model = tangent.fit, tangent.fit.model + effect
         if uses_angle(effect) and not model.angle_input and not any(uses_angle(e) for e in fit.model.effects):
@@ -303,18 +291,14 @@ class Added:
 
     def grid(self) -> Iterator[dict[str, float]]:
         """Yield the values of the shape parameters to try."""
-        axes = [
-            [(p.name, g * self.natural.get(p.unit, 1.0)) for g in p.grid] for p in self.pars if p.grid and not p.given
-        ]
-        yield from (dict(point) for point in itertools.product(*axes))
+        tried = [p for p in self.pars if p.grid and not p.given]
+        axes = [[(p.name, g * self.natural.get(p.unit, 1.0)) for g in p.grid] for p in tried]
+        yield from map(dict, itertools.product(*axes))
 
     def shape(self, values: Mapping[str, float]) -> Shape | None:
         """Return what the effect adds at `values`; None where that cannot be simulated, or is nothing.
 
-        Raises
-        ------
-        SimulationError
-            Where it vanishes.
+        SimulationError where it vanishes.
         """
         sizes = tuple(p for p in self.pars if p.null is not None and not p.positive)
         finite = any(p.null is not None and p.positive for p in self.pars)
@@ -324,8 +308,10 @@ class Added:
             return None if change is None else Shape(values, change[:, None], (), None, weights)
         phase = next((p for p in self.pars if p.periodic and not p.given), None)
         columns = self._slopes(sizes, values)
-        if any(p.per_run for p in sizes):
-            columns, sizes = self._run_by_run(columns, sizes)
+        if any(p.per_run for p in sizes):  # in every run another, the first run's stand
+            columns = np.hstack([columns[:, :0], *by_record(self._problem, columns)[1:]])
+            others = sorted(set(self._problem.unknowns.firsts))[1:]
+            sizes = tuple(replace(p, name=f"{p.name}[{k}]") for k in others for p in sizes)
         if phase is not None:
             columns = np.hstack([columns, self._slopes(sizes, {**values, phase.name: np.pi / 2})])
         return Shape(values, columns, sizes, phase, weights)
@@ -341,12 +327,6 @@ class Added:
             traj = self._run(k, at, self._problem.unknowns.first_slopes(at, k, to), to)
             parts.append(self._problem.run_residual(k, traj)[1])
         return np.vstack(parts)
-
-    def _run_by_run(self, columns: Array, sizes: Sequence[Parameter]) -> tuple[Array, tuple[Parameter, ...]]:
-        """Return the slopes to sizes that are others in every run, and these; the first run's stand."""
-        parts, own = by_record(self._problem, columns), sorted(set(self._problem.unknowns.firsts))
-        named = tuple(replace(p, name=f"{p.name}[{k}]") for k in own[1:] for p in sizes)
-        return np.hstack([columns[:, :0], *parts[1:]]), named
 
     def _change(self, values: Mapping[str, float]) -> Array | None:
         """Return the change (n,) that the effect makes at finite `values`."""
@@ -391,6 +371,5 @@ def plain_residual(fit: Fit) -> Array:
     problem = fit.problem
     if problem.loss is None:
         return fit.residuals[: problem.n_outputs]
-    return np.concatenate(
-        [problem.run_residual(k, problem.simulate(fit.q, k, derivatives=False))[0] for k in range(len(problem.runs))]
-    )
+    sims = (problem.simulate(fit.q, k, derivatives=False) for k in range(len(problem.runs)))
+    return np.concatenate([problem.run_residual(k, s)[0] for k, s in enumerate(sims)])

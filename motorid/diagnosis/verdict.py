@@ -136,8 +136,7 @@ def _valued(fit: Fit, effect: Effect) -> list[str]:
 def _certain(fit: Fit) -> dict[str, float | None]:
     """Return one standard deviation per parameter; None for a size that is not known even to itself."""
     sizes = {n for n, p in fit.model.parameters.items() if p.positive or p.null == 0}
-    std = fit.std
-    return {n: None if n in sizes and s is not None and s > abs(fit.values[n]) else s for n, s in std.items()}
+    return {n: None if n in sizes and s is not None and s > abs(fit.values[n]) else s for n, s in fit.std.items()}
 
 
 def errors_text(rungs: Sequence[Rung]) -> str:
@@ -214,12 +213,8 @@ def moves(before: Fit, after: Fit) -> str:
 
 def measured_angle_remark(fit: Fit) -> str:
     """Say so where effects take the angle from the record, since the model's own drifts too far for them."""
-    if not fit.model.angle_input:
-        return ""
-    return (
-        "Effects over the angle use the measured angle, on held-out runs too, because the simulated angle drifts too "
-        "far. Without a measured angle this model cannot predict."
-    )
+    return ("Effects over the angle use the measured angle, on held-out runs too, because the simulated angle drifts "
+            "too far. Without a measured angle this model cannot predict.") if fit.model.angle_input else ""
 
 
 def own_in_every_run_remark(fit: Fit) -> str:
@@ -244,10 +239,8 @@ def held_out_remark(node: Node) -> str:
     worse = {c: e.nrmse / max(fitted[c].nrmse, 1e-300) for c, e in node.predictions.held_out.items() if c in fitted}
     said = [f"{c} {number(r, 2)} times" for c, r in worse.items()
             if r > ELSEWHERE and node.predictions.held_out[c].misfit > LARGER]
-    if not said:
-        return ""
     return (f"The error is larger on the held-out runs than on the fitted ones ({', '.join(said)}): the fitted records "
-            "do not determine the model there, or another effect acts there.")
+            "do not determine the model there, or another effect acts there.") if said else ""
 
 
 def inseparable_remark(same: Mapping[str, tuple[str, ...]]) -> str:
@@ -309,10 +302,9 @@ def closed_loop_remark(fit: Fit) -> str:
         feedback = min(_noise_feedback(run.inputs["v"], y) for y in both)
         extra = run.meta.get("extra", {})
         if feedback > 0.5 or any("ref" in str(n).lower() or "goal" in str(n).lower() for n in extra):
-            return (
-                "The records seem to come from a closed loop: the controller compensates what the model lacks, so "
-                "part of it hides in the voltage, and an open-loop simulation drifts. Open-loop records show it better."
-            )
+            return ("The records seem to come from a closed loop: the controller compensates what the model lacks, so "
+                    "part of it hides in the voltage, and an open-loop simulation drifts. Open-loop records show it "
+                    "better.")
     return ""
 
 
@@ -324,13 +316,10 @@ def _noise_feedback(v, y) -> float:
     if y is None or np.ptp(v) == 0:
         return 0.0
     dv, dy = np.diff(v, 2), np.diff(np.nan_to_num(y), 2)
-    changed, own = np.abs(dv) > 0, colour_of([dv - dv.mean()])
-    if changed.mean() < 0.5 or own.innovation < NOISELESS * own.variance:
-        return 0.0
-    calm = (np.abs(dv) < 6 * np.median(np.abs(dv)) + 1e-300) & (np.abs(dy) < 6 * np.median(np.abs(dy)) + 1e-300)
-    if calm.sum() < 50:
-        return 0.0
-    if min(np.ptp(dv[calm]), np.ptp(dy[calm])) == 0:
+    own = colour_of([dv - dv.mean()])
+    calm = np.all([np.abs(d) < 6 * np.median(np.abs(d)) + 1e-300 for d in (dv, dy)], axis=0)
+    smooth = np.mean(dv != 0) < 0.5 or own.innovation < NOISELESS * own.variance
+    if smooth or calm.sum() < 50 or min(np.ptp(dv[calm]), np.ptp(dy[calm])) == 0:
         return 0.0
     both = [np.corrcoef(dv[1:][calm[1:]], dy[:-1][calm[1:]])[0, 1], np.corrcoef(dv[calm], dy[calm])[0, 1]]
     return float(np.nanmax(np.abs(both)))

@@ -10,14 +10,16 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from motorid.diagnosis.experiment_design import Design
-from motorid.diagnosis.locate import accounted
+from motorid.diagnosis.locate import accounted, binned
 from motorid.diagnosis.results import Binned, Candidate, Diagnosis, Ladder, Missing
 from motorid.display.numbers import number
 from motorid.errors import UsageError, at_least
 from motorid.numerics.signals import Array
 from motorid.plots import style
+from motorid.plots.fits import what_changed
 from motorid.plots.residuals import scatter
 
+FINE = 60  # bins of a mean that is drawn as a curve
 LOWEST_GAIN = -0.12  # drawn; what lies below is shown by an arrow
 _COLOUR = {"voltage": style.PALETTE["purple"], "torque": style.PALETTE["blue"]}
 
@@ -82,12 +84,10 @@ def _balance(row: np.ndarray, missing: Missing, balance: str, run: int | None) -
 
 def _binned(ax: Axes, b: Binned, signals: Sequence[Mapping[str, Array]], values: Sequence[Array], factor: float,
             colour: str) -> None:
-    pairs = [(np.asarray(s[b.against]), v) for s, v in zip(signals, values, strict=True) if b.against in s]
-    if pairs:
-        x, y = np.concatenate([p[0] for p in pairs]), np.concatenate([p[1] for p in pairs]) * factor
-        ok = np.isfinite(x) & np.isfinite(y) & (x >= b.centre.min()) & (x <= b.centre.max())
-        if ok.any():
-            scatter(ax, x[ok], y[ok], most=800, color=style.MUTED)
+    x, y = np.concatenate([np.asarray(s[b.against]) for s in signals]), np.concatenate(list(values)) * factor
+    ok = np.isfinite(x) & np.isfinite(y) & (x >= b.centre.min()) & (x <= b.centre.max())
+    if ok.any():
+        scatter(ax, x[ok], y[ok], most=800, color=style.MUTED)
     gaps = np.diff(b.centre)
     cuts = np.flatnonzero(gaps > max(4 * float(np.median(gaps)), 0.15 * float(np.ptp(b.centre)))) + 1
     for part in np.split(np.arange(len(b.centre)), cuts):  # no curve where there are no samples
@@ -128,14 +128,14 @@ def plot_answer(found: Diagnosis, ax: Axes | None = None) -> Axes:
     power = style.decade(float(np.nanmax(np.abs(values), initial=0.0)))
     ax = style.only(ax, width=5.6, height=3.6)
     scatter(ax, x, values * 10.0**-power, most=3000, color=style.MUTED)
-    centre, mean, low, high = _profile(x, values * 10.0**-power)
-    ax.fill_between(centre, low, high, color=_COLOUR[balance], alpha=0.3, lw=0)
-    ax.plot(centre, mean, color=_COLOUR[balance], lw=1.6, label="missing, mean ± 95 %")
+    b = binned(against, x, values * 10.0**-power, bins=FINE)
+    ax.fill_between(b.centre, b.low, b.high, color=_COLOUR[balance], alpha=0.3, lw=0)
+    ax.plot(b.centre, b.mean, color=_COLOUR[balance], lw=1.6, label="missing, mean ± 95 %")
     if had is not None:
-        centre, mean, *_ = _profile(x, np.concatenate(had) * 10.0**-power)
+        b = binned(against, x, np.concatenate(had) * 10.0**-power, bins=FINE)
         added = " + ".join(n for n in found.after.model.effect_names if n not in found.before.model.effect_names)
         label = textwrap.fill(f"{added}, with the shift of the parameters", 60)
-        ax.plot(centre, mean, "--", color=style.PALETTE["orange"], lw=2.0, label=label)
+        ax.plot(b.centre, b.mean, "--", color=style.PALETTE["orange"], lw=2.0, label=label)
     ax.axhline(0, color=style.MUTED, lw=0.6)
     unit = "V" if balance == "voltage" else m.torque_unit
     noun = "force" if unit == "N" else balance
@@ -159,19 +159,10 @@ def _quantity(found: Diagnosis, balance: str, had: Sequence[Array] | None) -> tu
 
     def scatter_about(b: Binned) -> float:
         x = np.concatenate([np.asarray(s[b.against]) for s in found.missing.signals])
-        return float(np.nanvar(y - np.interp(x, *_profile(x, y)[:2])))
+        fine = binned(b.against, x, y, bins=FINE)
+        return float(np.nanvar(y - np.interp(x, fine.centre, fine.mean)))
 
     return min(bins, key=scatter_about).against, 1.0
-
-
-def _profile(x: Array, y: Array) -> tuple[Array, Array, Array, Array]:
-    """Return centres, means and their intervals of 95 % in bins, half of the edges by count, half by distance."""
-    edges = np.union1d(np.quantile(x, np.linspace(0, 1, 31)), np.linspace(x.min(), x.max(), 31))
-    label = np.searchsorted(edges[1:-1], x, side="right")
-    parts = [k for k in (np.flatnonzero(label == j) for j in range(len(edges) - 1)) if len(k) > 2]
-    centre, mean = (np.array([float(np.nanmean(z[k])) for k in parts]) for z in (x, y))
-    half = np.array([1.96 * float(np.nanstd(y[k])) / np.sqrt(len(k)) for k in parts])
-    return centre, mean, mean - half, mean + half
 
 
 @style.styled
@@ -222,10 +213,9 @@ def _ranking_legend(ax: Axes, chosen: Sequence[Candidate]) -> None:
     from matplotlib.patches import Patch
 
     handles: list[Any] = [Patch(fill=False, edgecolor=style.INK, label="predicted")]
-    if any(c.accepted and c.refit_drop is not None for c in chosen):
-        handles.append(Patch(color=style.PALETTE["blue"], alpha=0.85, label="refitted, accepted"))
-    if any(not c.accepted and c.refit_drop is not None for c in chosen):
-        handles.append(Patch(color=style.PALETTE["grey"], alpha=0.85, label="refitted, not accepted"))
+    for accepted, colour, label in ((True, "blue", "refitted, accepted"), (False, "grey", "refitted, not accepted")):
+        if any(c.accepted == accepted and c.refit_drop is not None for c in chosen):
+            handles.append(Patch(color=style.PALETTE[colour], alpha=0.85, label=label))
     if any(c.held_out_gain is not None for c in chosen):
         orange = style.PALETTE["orange"]
         handles.append(Line2D([], [], marker="D", ls="", color=orange, label="fall of the held-out error"))
@@ -261,8 +251,7 @@ def plot_ladder(result: Ladder | Diagnosis, ax: Axes | None = None) -> Axes:
     style.plain_decades(ax)
     for k in sorted({0, len(rungs) - 1}):
         _error_labels(ax, k, {c: 100 * e for c, e in rungs[k].nrmse.items()})
-    first = "plain motor" if rungs[0].fit.model.base == "dc_motor" else "plain drive"
-    started = " + ".join([first, *rungs[0].fit.model.effect_names])
+    started = what_changed(rungs[0].fit, None)
     ax.set_xticks(x, [started if r.added is None else "+ " + r.added.replace(" + ", "\n+ ") for r in rungs])
     ax.set_xlim(-0.45, len(rungs) - 0.55)
     style.tidy(ax, y="NRMSE (%)", title="Error as effects are added")

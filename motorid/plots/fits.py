@@ -15,7 +15,7 @@ from PIL import Image
 
 from motorid.channels import CHANNELS
 from motorid.display.numbers import percent
-from motorid.errors import UsageError, one_of
+from motorid.errors import UsageError, among, one_of
 from motorid.numerics.signals import noise_level
 from motorid.plots import style
 from motorid.problem.simulate import Simulation
@@ -54,8 +54,7 @@ def plot_runs(runs: Sequence[Experiment] | Experiment, channels: Sequence[str] |
     axes = style.grid(len(names), len(shown), row=1.35, sharex="col", sharey="row")
     for k, run in enumerate(shown):
         for j, c in enumerate(names):
-            y = run.inputs.get(c, run.outputs.get(c))
-            if y is None:
+            if (y := run.inputs.get(c, run.outputs.get(c))) is None:
                 _absent(axes[j, k], c)
             else:
                 style.line(axes[j, k], run.t, y, zoh=c == "v" and run.hold == "zoh", lw=1.0,
@@ -244,8 +243,7 @@ def plot_parameters(*results: Any, truth: Mapping[str, float] | None = None,
     fits = _fits(results)
     chosen = list(names or dict.fromkeys(n for f in fits for n, p in f.model.parameters.items() if p.vary))
     for name in chosen:
-        if not any(name in f.values for f in fits):
-            raise UsageError(one_of(name, dict.fromkeys(n for f in fits for n in f.values), "parameter"))
+        among(name, dict.fromkeys(n for f in fits for n in f.values), "parameter")
     columns = {6: 3, 7: 4, 8: 4}.get(len(chosen), min(len(chosen), 5))
     rows = -(-len(chosen) // columns)
     axes = style.grid(rows, columns, row=1.75, width=style.WIDTH * max(columns, 3) / 5).ravel()
@@ -253,7 +251,7 @@ def plot_parameters(*results: Any, truth: Mapping[str, float] | None = None,
         _one_parameter(ax, fits, name, (truth or {}).get(name))
     for ax in axes[len(chosen):]:
         ax.set_axis_off()
-    notes = [f"{k + 1}: {_added(f, fits[k - 1] if k else None)}" for k, f in enumerate(fits)]
+    notes = [f"{k + 1}: {what_changed(f, fits[k - 1] if k else None)}" for k, f in enumerate(fits)]
     notes += ["dashed: true value"] * bool(truth) + ["bars: ±2σ"]
     axes[0].figure.supxlabel("   ·   ".join(notes), fontsize=8, color=style.MUTED)
     return axes[: len(chosen)]
@@ -292,14 +290,14 @@ def _around(ax: Axes, values: np.ndarray) -> None:
         ax.set_ylim(middle - least / 2, middle + least / 2)
 
 
-def _added(fit: Any, previous: Any) -> str:
+def what_changed(fit: Any, previous: Any) -> str:
+    """Return which effects a fit has that the previous one had not, and the other way round; of the first, its own."""
     names = fit.model.effect_names
     if previous is None:
         return " + ".join(["plain motor" if fit.model.base == "dc_motor" else "plain drive", *names])
     before = previous.model.effect_names
     changes = [f"+ {n}" for n in names if n not in before] + [f"− {n}" for n in before if n not in names]
-    again = {"penalty": "penalties", "hard": "hard constraints"}.get(fit.formulation, "again")
-    return " ".join(changes) or again
+    return " ".join(changes) or {"penalty": "penalties", "hard": "hard constraints"}.get(fit.formulation, "again")
 
 
 def _fits(results: Sequence[Any]) -> list[Any]:

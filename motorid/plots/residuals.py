@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from motorid.channels import CHANNELS
-from motorid.errors import DataError, among
+from motorid.errors import DataError, chosen
 from motorid.estimation.result import Fit
 from motorid.numerics.autoregression import autocorrelation, effective_samples
 from motorid.numerics.signals import Array
@@ -45,9 +45,7 @@ def plot_residuals(fit: Fit, channels: Sequence[str] | None = None) -> np.ndarra
     """
     sims = fit.simulations
     present = [c for c in CHANNELS if any(c in s.experiment.outputs and c in s.outputs for s in sims)]
-    for c in channels or ():
-        among(c, present, "channel")
-    names = list(channels or present)
+    names = chosen(channels, present, "channel")
     against = [c for c in ("omega", "i", "theta") if c in present]
     figure = style.new_figure(style.WIDTH, 3.0 * len(names) + 0.2)
     rows = figure.add_gridspec(2 * len(names), 1)
@@ -99,7 +97,8 @@ def _over_time(ax: Axes, sims: Sequence[Simulation], channel: str, sigma: float)
         shift += float(t[-1])
         if k + 1 < len(sims):
             ax.axvline(shift, color=style.MUTED, lw=0.7)
-    style.above(ax)
+    legend = ax.legend(loc="lower right", bbox_to_anchor=(1.02, 0.97), borderpad=0.1, ncols=4, handlelength=1.6)
+    legend.set_in_layout(False)  # at the right above the axes, where it covers no data: the title's line has room
 
 
 def _histogram(ax: Axes, r: Array, sigma: float) -> None:

@@ -115,8 +115,7 @@ def svg_of(draw: Callable[..., Any], *args: Any, name: str, alt: str, **options:
     with detached():
         drawn = draw(*args, **options)
     figure = np.atleast_1d(np.asarray(drawn, object)).ravel()[0].figure
-    engine = figure.get_layout_engine()
-    if engine is not None:  # once, and not again while saving
+    if (engine := figure.get_layout_engine()) is not None:  # once, and not again while saving
         engine.execute(figure)
         figure.set_layout_engine("none")
     buffer = io.StringIO()
@@ -206,12 +205,6 @@ def band(ax: Axes, half: float, label: str | None = None) -> None:
 def tidy(ax: Axes, *, x: str = "", y: str = "", title: str = "") -> None:
     """Label axes and leave room for few, round ticks."""
     ax.set(**{what: text for what, text in (("xlabel", x), ("ylabel", y), ("title", title)) if text})
-
-
-def above(ax: Axes) -> None:
-    """Put the legend at the right above the axes, where it covers no data."""
-    legend = ax.legend(loc="lower right", bbox_to_anchor=(1.02, 0.97), borderpad=0.1, ncols=4, handlelength=1.6)
-    legend.set_in_layout(False)  # the title's line has room for it
 
 
 def plain_decades(ax: Axes) -> None:

@@ -13,7 +13,7 @@ from scipy.interpolate import PchipInterpolator
 from scipy.special import stdtrit
 
 from motorid.display.numbers import glued, number, quantity
-from motorid.errors import UsageError, among
+from motorid.errors import UsageError, chosen
 from motorid.estimation.result import Fit
 from motorid.numerics.signals import Array
 from motorid.plots import style
@@ -188,12 +188,11 @@ def plot_sensitivities(fit: Fit, *, run: int = 0, names: Sequence[str] | None = 
     """
     problem = fit.problem
     free = [p.name for p in problem.unknown if p.name in fit.values]
-    for n in names or ():
-        among(n, free, "estimated parameter")
+    shown = chosen(names, free, "estimated parameter")
     style.refuse_index(run, len(problem.runs))
     trajectory, record = problem.simulate(fit.q, run), problem.experiments[run]
     assert trajectory.dy is not None
-    channels, shown = [c for c in problem.outputs if c in record.outputs], list(names or free)
+    channels = [c for c in problem.outputs if c in record.outputs]
     axes = style.grid(len(shown), len(channels), row=0.8, sharex=True)
     slope = problem.scaling.slope(fit.q)
     for row, name in zip(axes, shown, strict=True):

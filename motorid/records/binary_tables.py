@@ -57,8 +57,7 @@ def _check_whole(data: bytes) -> None:
 
     SciPy trusts them: a damaged size can end the process, or take all memory, instead of raising an error.
     """
-    order = {b"IM": "<", b"MI": ">"}.get(data[126:128])
-    if order is None:
+    if (order := {b"IM": "<", b"MI": ">"}.get(data[126:128])) is None:
         return  # version 4 or no MATLAB file at all: SciPy says so without harm
     left = MOST_UNPACKED
     try:

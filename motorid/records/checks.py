@@ -96,8 +96,7 @@ def _excitation(run: Experiment) -> str | None:
     if np.ptp(v) <= 1e-6 * np.abs(v).max():
         return (f"the voltage is {v[0]:.4g} {run.units['v']} from beginning to end: such a run shows one "
                 "steady speed and at most a start. Add runs with steps or a sweep of the voltage.")
-    still = [c for c, y in run.outputs.items() if np.nanmax(y) == np.nanmin(y)]
-    if still:
+    if still := [c for c, y in run.outputs.items() if np.nanmax(y) == np.nanmin(y)]:
         return (f"the {NAMES[still[0]]} never changes although the voltage does; a dead sensor, a "
                 "locked rotor, or too little voltage to move?")
     return None
@@ -106,10 +105,8 @@ def _excitation(run: Experiment) -> str | None:
 def _missing(run: Experiment) -> str | None:
     share = {c: float(np.mean(np.isnan(y))) for c, y in run.outputs.items()}
     worst = max(share, key=lambda c: share[c])
-    if share[worst] > 0.2:
-        return (f"{100 * share[worst]:.0f} % of the {NAMES[worst]} samples are missing; the fit uses "
-                "the others. Look whether the logger drops them at certain moments.")
-    return None
+    return (f"{100 * share[worst]:.0f} % of the {NAMES[worst]} samples are missing; the fit uses the others. Look "
+            "whether the logger drops them at certain moments.") if share[worst] > 0.2 else None
 
 
 def _clipped(run: Experiment) -> str | None:
@@ -197,8 +194,7 @@ def _noisy(run: Experiment) -> str | None:
 
 def _uneven(run: Experiment) -> str | None:
     steps = np.diff(run.t)
-    share = float(np.mean(np.abs(steps - run.dt) > 0.25 * run.dt))
-    if share > 0.05:
+    if np.mean(np.abs(steps - run.dt) > 0.25 * run.dt) > 0.05:
         low, high = np.quantile(steps, (0.02, 0.98))
         return (f"sampling is uneven, {1e3 * low:.3g} to {1e3 * high:.3g} ms apart. Each sample is used "
                 "at its own time; make sure that the stamps say when it was taken, not when it arrived.")
@@ -335,15 +331,13 @@ def angle_against_speed(run: Experiment) -> str | None:
 def magnitudes(run: Experiment) -> str | None:
     """Sizes no laboratory motor has point to a wrong unit."""
     stated = run.meta.get("original_units", {})
-    assumed = "omega" in run.meta.get("assumed_units", ())
     limits = {"v": (1000.0, "V", "mV"), "i": (1000.0, "A", "mA"),
-              "omega": (800.0 if assumed else 3000.0, "rad/s", "rpm")}
+              "omega": (800.0 if "omega" in run.meta.get("assumed_units", ()) else 3000.0, "rad/s", "rpm")}
     for channel, (limit, unit, likely) in limits.items():
         values = run.inputs.get(channel, run.outputs.get(channel))
         if values is None or run.units[channel] != unit:
             continue
-        top = float(np.nanmax(np.abs(values)))
-        if top > limit:
+        if (top := float(np.nanmax(np.abs(values)))) > limit:
             was = f" (read as {stated[channel]})" if channel in stated else ""
             if channel == "v" and stated.get(channel, "")[:1].isdigit():
                 return (f"v reaches {top:.4g} V{was}: that unit is the voltage of a whole duty cycle. Is the column in "
@@ -353,9 +347,7 @@ def magnitudes(run: Experiment) -> str | None:
     if run.dt > 0.2:
         return (f"there are {run.dt:.3g} s between samples, too long for a motor; is the time in ms? "
                 "If so: units={'t': 'ms'}.")
-    if run.dt < 1e-6:
-        return f"there are only {run.dt:.3g} s between samples; is the unit of the time right?"
-    return None
+    return f"there are only {run.dt:.3g} s between samples; is the unit of the time right?" if run.dt < 1e-6 else None
 
 
 def implied_constants(run: Experiment) -> str | None:
@@ -399,12 +391,10 @@ def _offset(run: Experiment) -> str | None:
 
 def swapped_columns(run: Experiment) -> str | None:
     """Columns that fit the balances of a motor in another order; a speed that jumps and holds still."""
-    omega = run.outputs.get("omega")
-    if omega is None:
+    if (omega := run.outputs.get("omega")) is None:
         return None
     order, _ = _as_balances_want(run)
-    moved = [c for k, c in enumerate(("v", "i", "omega")) if order[k] != k]
-    if moved:
+    if moved := [c for k, c in enumerate(("v", "i", "omega")) if order[k] != k]:
         what = " and ".join(NAMES[c] for c in moved)
         return (f"{what} fit the equations of a motor far better if their columns are exchanged. Say which is which: "
                 f"columns={{{', '.join(f'{c!r}: ...' for c in moved)}}}.")
@@ -460,15 +450,14 @@ class _Balances:
         n = min(BALANCE_BLOCKS, run.n // 3)
         edges = np.linspace(0, run.n - 1, n + 1).astype(int)
 
-        def over(a: Array, hold: bool = False) -> Array:
-            return integral(run.t, a, hold)[edges]
+        def over(a: Array) -> Array:
+            return integral(run.t, a)[edges]
 
         self.y = [run.inputs["v"], *(bridged(run.t, a) for a in outputs)]
         self.top = [max(float(np.abs(a).max()), 1e-300) for a in self.y]
-        held = [k == 0 and run.hold == "zoh" for k in range(3)]
-        self.sums = [over(a, h) for a, h in zip(self.y, held, strict=True)]
+        angles = [integral(run.t, a, k == 0 and run.hold == "zoh") for k, a in enumerate(self.y)]
+        self.sums = [a[edges] for a in angles]
         self.signs = [over(np.tanh(50 * a / top)) for a, top in zip(self.y, self.top, strict=True)]
-        angles = [integral(run.t, a, h) for a, h in zip(self.y, held, strict=True)]
         self.t, self.one = run.t[edges] - run.t[0], np.ones(n + 1)
         self.loads = [(self.t, over(np.sin(a)), over(np.cos(a))) for a in angles]
         self.rest = {(w, i): over(np.where(np.abs(self.y[w]) < STILL * self.top[w], self.y[i], 0.0))

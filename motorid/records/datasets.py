@@ -58,8 +58,7 @@ def datasets() -> list[str]:
 
 def truth(name: str) -> dict[str, Any]:
     """What is true of a shipped set: motor, parameters in SI, hidden effects, noise, seed."""
-    known = _truths()
-    if name not in known:
+    if name not in (known := _truths()):
         raise DataError(one_of(name, sorted(known), "shipped set"))
     return known[name]
 

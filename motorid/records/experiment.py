@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import pairwise
 from numbers import Real
 from types import MappingProxyType
@@ -76,20 +76,21 @@ class Experiment(Shown):
     meta: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        _freeze(self, "name", printable(str(self.name)))
+        freeze = partial(object.__setattr__, self)
+        freeze("name", printable(str(self.name)))
         for optional in ("sigma", "units", "meta"):
             given = getattr(self, optional)
             if not isinstance(given, Mapping | None):
                 raise DataError(f"{self.name}: '{optional}' must be a mapping from names to values; got {given!r}.")
-            _freeze(self, optional, MappingProxyType(dict(given or {})))
+            freeze(optional, MappingProxyType(dict(given or {})))
         t = _frozen_array(self.t, "t", self.name)
         _check_time(t, self.name)
-        _freeze(self, "t", t)
-        _freeze(self, "inputs", _channels(self.inputs, INPUTS, "input", t, self.name))
-        _freeze(self, "outputs", _channels(self.outputs, CHANNELS, "output", t, self.name))
+        freeze("t", t)
+        freeze("inputs", _channels(self.inputs, INPUTS, "input", t, self.name))
+        freeze("outputs", _channels(self.outputs, CHANNELS, "output", t, self.name))
         _check_values(self)
-        _freeze(self, "sigma", _sigmas(self))
-        _freeze(self, "units", _units(self))
+        freeze("sigma", _sigmas(self))
+        freeze("units", _units(self))
         if self.hold not in ("zoh", "linear"):
             raise DataError(f"{self.name}: {one_of(str(self.hold), ('zoh', 'linear'), 'hold')}")
 
@@ -272,10 +273,6 @@ def between_pauses(run: Experiment) -> list[Experiment]:
                                 "notes": run.meta.get("notes", ()) if k == 0 else ()}) for k, s in enumerate(live)]
 
 
-def _freeze(experiment: Experiment, name: str, value: object) -> None:
-    object.__setattr__(experiment, name, value)
-
-
 def _frozen_array(values: ArrayLike, what: str, run: str) -> Array:
     try:
         raw = np.ma.filled(values, np.nan) if np.ma.isMaskedArray(values) else np.asarray(values)
@@ -320,8 +317,7 @@ def _check_values(run: Experiment) -> None:
     if "v" not in run.inputs:
         raise DataError(f"{run.name}: the input 'v' (drive voltage or command) is missing; a simulation needs it.")
     for name, array in run.inputs.items():
-        bad = int(np.count_nonzero(~np.isfinite(array)))
-        if bad:
+        if bad := int(np.count_nonzero(~np.isfinite(array))):
             raise DataError(f"{run.name}: the input '{name}' is missing or infinite in {bad} of {run.n} "
                             "samples; a simulation needs it everywhere. Fill it or cut these samples out.")
     for name, array in run.outputs.items():

@@ -195,8 +195,7 @@ def unit_in(label: str) -> tuple[str, Unit | None, bool]:
 def is_supply(label: str) -> bool:
     """Tell whether a header names a supply or bus voltage."""
     words = _tokens(unit_in(label)[0]) + _tokens(label)
-    current = any("current" in w or "strom" in w for w in words)
-    return any(w.endswith(_SUPPLY_ENDS) for w in words) and not current
+    return any(w.endswith(_SUPPLY_ENDS) for w in words) and not any("current" in w or "strom" in w for w in words)
 
 
 def is_reference(label: str) -> bool:

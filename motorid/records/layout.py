@@ -76,8 +76,7 @@ def _named_by_user(labels: Sequence[str], columns: Mapping[str, object], units: 
             unit = None
         places[channel] = Place(label, unit or _default(channel), unit is not None)
     taken = [p.column for p in places.values()]
-    twice = [label for label in taken if taken.count(label) > 1]
-    if twice:
+    if twice := [label for label in taken if taken.count(label) > 1]:
         raise DataError(f"columns: '{twice[0]}' is given for {len(twice)} channels; each needs its own.")
     return places
 

@@ -1,8 +1,4 @@
-"""Read and write records: text tables, MATLAB, Parquet; `read_runs` is the entry.
-
-Bytes become a table (`text_tables`, `binary_tables`), its columns channels in SI units (`layout`, from `headers`), and
-these a valid run (`cleaning`).
-"""
+"""Read and write records: text tables, MATLAB, Parquet; `read_runs` is the entry."""
 
 from __future__ import annotations
 
@@ -160,8 +156,7 @@ def _expand(path: Path) -> list[Path]:
     if path.exists():
         return [path]
     if glob.has_magic(str(path)):
-        found = [f for f in map(Path, glob.glob(str(path), recursive=True)) if f.is_file()]
-        if found:
+        if found := [f for f in map(Path, glob.glob(str(path), recursive=True)) if f.is_file()]:
             return sorted(found, key=_natural)
         raise DataError(f"nothing matches the pattern {path}. {_what_is_there(path.parent)}")
     raise DataError(f"there is no file {path}. {_what_is_there(path.parent, path.name)}")

@@ -123,8 +123,7 @@ def _slope(run: Experiment, first: int, last: int) -> float:
 
 
 def _top_slope(run: Experiment) -> float:
-    y = run.outputs.get("theta")
-    if y is None:
+    if (y := run.outputs.get("theta")) is None:
         return 0.0
     good = np.flatnonzero(np.isfinite(y))[::max(run.n // 200, 1)]
     return float(np.max(np.abs(np.diff(y[good]) / np.diff(run.t[good])), initial=0.0))

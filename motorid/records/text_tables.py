@@ -171,8 +171,7 @@ def _header(above: list[str], comments: list[str], dialect: Dialect, width: int,
     rows = [_names(line, dialect, width) for line in above]
     if not rows:
         named = [_names(c.lstrip("#%/ "), dialect, width) for c in comments]
-        fitting = [row for row in named if len(row) == width and not any(map(dialect.is_number, row))]
-        if fitting:
+        if fitting := [row for row in named if len(row) == width and not any(map(dialect.is_number, row))]:
             return unique_labels(fitting[-1]), []
         return [str(k + 1) for k in range(width)], []
     units = rows[-1] if len(rows) > 1 and _is_unit_row(rows[-1]) and len(rows[-2]) >= width else []
@@ -182,8 +181,7 @@ def _header(above: list[str], comments: list[str], dialect: Dialect, width: int,
                 if dialect.delimiter == "," else "")
         raise DataError(f"the header has {len(names)} names but the rows have {width} values: "
                         f"'{above[-1][:80]}'.{hint}")
-    ignored = len(rows) - (2 if units else 1)
-    if ignored:
+    if ignored := len(rows) - (2 if units else 1):
         notes.append(f"ignored {counted(ignored, 'line')} above the header, from '{above[0][:60]}' on.")
     return unique_labels(names), units
 

@@ -144,8 +144,7 @@ def _of_diagnosis(d: Diagnosis, validate: Sequence[Experiment]) -> Story:
     if validate:
         story.sections.append(sections.held_out(d.after, validate))
     same = d.after is d.before  # else the improved model's figure shows the original one, too
-    first = sections.fitted(d.before, "The original model", values=same, drawn=same)
-    story.sections += [first, sections.where(d)]
+    story.sections += [sections.fitted(d.before, "The original model", values=same, drawn=same), sections.where(d)]
     if d.ranking:
         story.sections.append(sections.which(d))
     if len(d.ladder.rungs) > 2:

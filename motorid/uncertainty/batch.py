@@ -210,12 +210,9 @@ def _fit_one(task: tuple[Model, Mapping[str, Any], Mapping[str, Any]], motor: tu
 
 
 def _runs(records: Records, reading: Mapping[str, Any]) -> list[Experiment]:
-    if isinstance(records, Experiment):
-        return [records]
-    if isinstance(records, str | Path):
-        return read_runs(records, **reading)
-    paths = [r for r in records if not isinstance(r, Experiment)]
-    return [r for r in records if isinstance(r, Experiment)] + (read_runs(paths, **reading) if paths else [])
+    every = [records] if isinstance(records, Experiment | str | Path) else records
+    paths = [r for r in every if not isinstance(r, Experiment)]
+    return [r for r in every if isinstance(r, Experiment)] + (read_runs(paths, **reading) if paths else [])
 
 
 def _row(found: Fit) -> dict[str, Any]:
@@ -227,8 +224,7 @@ def _row(found: Fit) -> dict[str, Any]:
         values |= {n: found.values[n], f"{n}_std": certain.std[n]}
     flags = [] if found.status == "converged" else [found.status]
     flags += [f"{n} {certain.status[n]}" for n in found.problem.model.free_names if certain.status[n] != "determined"]
-    misfit = float(np.sqrt(found.chi2 / found.dof))
-    if misfit > POOR:
+    if (misfit := float(np.sqrt(found.chi2 / found.dof))) > POOR:
         flags.append(f"misfit {misfit:.2g} times the noise")
     return {"status": found.status, "message": found.message, "flags": flags, **values,
             **{f"nrmse_{c}": e for c, e in found.nrmse.items()}, "chi2": found.chi2, "dof": found.dof}
@@ -302,13 +298,7 @@ def scores(x: Array, std: Array) -> Array:
 
 
 class Checkpoint:
-    """A file of JSON lines, one result each; a line cut off by a crash is ignored.
-
-    Attributes
-    ----------
-    rows : dict of str to dict
-        Results by fingerprint.
-    """
+    """A file of JSON lines, one result each; a line cut off by a crash is ignored. `rows`: results by fingerprint."""
 
     def __init__(self, path: Path) -> None:
         self.path = path

@@ -69,9 +69,8 @@ class Bootstrap(Printed):
     @property
     def std(self) -> dict[str, float | None]:
         """Standard deviation of the refits per parameter; None where the data do not determine it."""
-        spread = np.std(self.samples, axis=0, ddof=1)
         return {n: float(s) if self.status[n] == "determined" else None
-                for n, s in zip(self.names, spread, strict=True)}
+                for n, s in zip(self.names, np.std(self.samples, axis=0, ddof=1), strict=True)}
 
     def interval(self, name: str, level: float = 0.95) -> tuple[float, float] | None:
         """Return the percentile interval of a parameter; None where the data do not determine it."""
@@ -161,8 +160,7 @@ def bootstrap(fit: Fit, *, kind: str = "blocks", n: int = 200, block: int | None
                          "motorid.records.experiment.split.")
     source = _source(fit, kind, block)
     seeds = np.random.SeedSequence(seed).spawn(n)
-    done = map_items(_refit, source, seeds, map, "Refitting resampled records", quiet=quiet)
-    found = done.results
+    found, interrupted = map_items(_refit, source, seeds, map, "Refitting resampled records", quiet=quiet)
     names = fit.problem.model.free_names
     rows = [[r[k] for k in names] for r in found if not isinstance(r, Failure)]
     failures = tuple(r for r in found if isinstance(r, Failure))
@@ -172,14 +170,13 @@ def bootstrap(fit: Fit, *, kind: str = "blocks", n: int = 200, block: int | None
     samples, pars = np.array(rows), fit.problem.model.parameters
     limited = {k: float(np.mean((samples[:, j] <= pars[k].lower) | (samples[:, j] >= pars[k].upper)))
                for j, k in enumerate(names)}
-    said = f"Interrupted after {len(found)} of {n}." if done.interrupted else ""
+    said = f"Interrupted after {len(found)} of {n}." if interrupted else ""
     return Bootstrap(kind, names, np.array([fit.values[k] for k in names]), samples, failures, limited,
                      tuple(pars[k].unit for k in names), covariance(fit).status, source.block, said)
 
 
 def _source(fit: Fit, kind: str, block: int | None) -> _Source:
     problem = fit.problem
-    predicted = tuple(dict(s.outputs) for s in fit.simulations)
     residuals = tuple({c: s.residual(c) for c in s.experiment.outputs if c in s.outputs} for s in fit.simulations)
     spent = len(problem.unknown) / len(problem.outputs)
     colours, scale = {}, {}
@@ -191,7 +188,7 @@ def _source(fit: Fit, kind: str, block: int | None) -> _Source:
     residuals = tuple({c: scale[c] * (e - np.nanmean(e)) for c, e in r.items()} for r in residuals)
     at_fit = problem.for_model(problem.model.start_at(fit.values))
     block = min(block or _block_length(colours, residuals), max(s.experiment.n for s in fit.simulations))
-    return _Source(at_fit, predicted, residuals, colours, kind, block)
+    return _Source(at_fit, tuple(dict(s.outputs) for s in fit.simulations), residuals, colours, kind, block)
 
 
 def _block_length(colours: Mapping[str, Colour], residuals: Sequence[Mapping[str, Array]]) -> int:
@@ -209,8 +206,7 @@ def _refit(source: _Source, seed: np.random.SeedSequence) -> dict[str, float] | 
             again = replace(problem, experiments=tuple(problem.experiments[k] for k in drawn),
                             _runs=tuple(problem.runs[k] for k in drawn))
         else:
-            runs = tuple(_resampled(source, k, rng) for k in range(len(problem.runs)))
-            again = problem.with_(experiments=runs)
+            again = problem.with_(experiments=tuple(_resampled(source, k, rng) for k in range(len(problem.runs))))
         done = least_squares(again, SOLVER)
     except (MotoridError, np.linalg.LinAlgError) as error:
         return Failure(problem.model.values, "failed", str(error))

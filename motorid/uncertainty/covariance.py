@@ -64,9 +64,8 @@ class Covariance(Printed):
     @cached_property
     def std(self) -> dict[str, float | None]:
         """One standard deviation per unknown, in its unit; None where it is not determined or at a limit."""
-        variances = np.diag(self.matrix)
         return {n: float(np.sqrt(v)) if self.status[n] == "determined" else None
-                for n, v in zip(self.names, variances, strict=True)}
+                for n, v in zip(self.names, np.diag(self.matrix), strict=True)}
 
     @cached_property
     def correlation(self) -> Array:

@@ -147,9 +147,7 @@ class Identifiability(Printed):
             said.append("The equations would allow all; these records excite too little, or are too noisy.")
         if self.combinations:
             said.append(f"They determine approximately {', '.join(self.combinations)}.")
-        said += [w.text for w in self.weak]
-        said += self.remedies
-        return " ".join(said)
+        return " ".join([*said, *(w.text for w in self.weak), *self.remedies])
 
     def to_dict(self) -> dict[str, Any]:
         """Return the contents of ``identifiability --json``."""
@@ -204,7 +202,12 @@ def identifiability(problem_or_fit: Problem | Fit, *, points: int = 5, seed: int
     """
     at_least(1, points=points)
     at_least(0, seed=seed)
-    problem, q = _problem_at(problem_or_fit)
+    if isinstance(problem_or_fit, Fit):
+        problem, q = problem_or_fit.problem, problem_or_fit.q
+    else:
+        given = any(p.given for p in problem_or_fit.model.parameters.values())
+        begun = problem_or_fit if given else with_start_values(problem_or_fit)
+        problem, q = begun.refined(begun.start), begun.start
     names = problem.model.free_names
     if not names:
         raise UsageError("the model has no free parameter; free some with model.free(…).")
@@ -220,15 +223,6 @@ def identifiability(problem_or_fit: Problem | Fit, *, points: int = 5, seed: int
         basis_in_words(names, weak, matrix), tuple(monomials(names, weak)) if len(weak) else (),
         tuple(suggestions(problem, q, matrix, len(weak))) if len(weak) else (),
         problem_or_fit.std if isinstance(problem_or_fit, Fit) else None)
-
-
-def _problem_at(problem_or_fit: Problem | Fit) -> tuple[Problem, Array]:
-    if isinstance(problem_or_fit, Fit):
-        return problem_or_fit.problem, problem_or_fit.q
-    problem = problem_or_fit
-    if not any(p.given for p in problem.model.parameters.values()):
-        problem = with_start_values(problem)
-    return problem.refined(problem.start), problem.start
 
 
 def _structural_rank(problem: Problem, q: Array, points: int, seed: int) -> int:
@@ -261,8 +255,7 @@ def basis_in_words(names: Sequence[str], weak: Array, matrix: Array) -> tuple[We
         moves = ", ".join(f"{n} by {100 * STEP * w:+.2g} %".replace("-", "−") for n, w in parts.items())
         effect = f"moves all outputs by {seen:.1g} standard deviations of their noise"
         effect = "does not move the outputs at all" if seen < UNMOVED else effect
-        text = f"Changing {moves}{' together' if len(parts) > 1 else ''} {effect}."
-        found.append(WeakDirection(parts, seen, text))
+        found.append(WeakDirection(parts, seen, f"Changing {moves}{' together' * (len(parts) > 1)} {effect}."))
     return tuple(found)
 
 

@@ -83,8 +83,7 @@ def multistart(problem_or_fit: Problem | Fit, *, starts: int = 100, spread: floa
 
 
 def _draw(reference: Fit, names: Sequence[str], starts: int, spread: float, seed: int) -> list[dict[str, float]]:
-    rng = np.random.default_rng(np.random.SeedSequence(seed))
-    factors = spread ** rng.uniform(-1, 1, (starts, len(names)))
+    factors = spread ** np.random.default_rng(seed).uniform(-1, 1, (starts, len(names)))
     pars = reference.problem.model.parameters
     scale = reference.problem.scaling.scale
     sizes = np.array([reference.values[n] or 1e-3 * s for n, s in zip(names, scale, strict=False)])
@@ -153,8 +152,7 @@ class Multistart(Printed):
     @cached_property
     def best(self) -> StartResult | None:
         """The result with the lowest cost, if it is lower than the reference's by more than the tolerance."""
-        ends = [e for e in self.results if isinstance(e, StartResult)]
-        best = min(ends, key=lambda e: e.cost, default=None)
+        best = min((e for e in self.results if isinstance(e, StartResult)), key=lambda e: e.cost, default=None)
         return best if best is not None and best.cost < self.reference.cost * (1 - COST_SHARE) else None
 
     @cached_property
@@ -179,9 +177,8 @@ class Multistart(Printed):
         periodic = self.reference.problem.model.parameters[name].periodic
         return (a - b + np.pi) % (2 * np.pi) - np.pi if periodic else a - b
 
-    @property
-    def _good(self) -> list[StartResult]:
-        return [e for e, k in zip(self.results, self.kinds, strict=True) if k == "good" and isinstance(e, StartResult)]
+    def _ends(self, *kinds: str) -> list[StartResult]:
+        return [e for e, k in zip(self.results, self.kinds, strict=True) if k in kinds and isinstance(e, StartResult)]
 
     @property
     def good(self) -> int:
@@ -219,18 +216,17 @@ class Multistart(Printed):
         import pandas as pd
 
         return pd.DataFrame([{"fits": len(p), "cost_ratio": p[0].cost / self._lowest, **dict(p[0].nrmse),
-                              **{n: p[0].values[n] for n in p[0].start}} for p in self._places(("good", "poor"))])
+                              **{n: p[0].values[n] for n in p[0].start}} for p in self._places("good", "poor")])
 
     @property
     def _lowest(self) -> float:
         """Lowest cost of all."""
         return (self.best or self.reference).cost
 
-    def _places(self, kinds: Sequence[str]) -> list[list[StartResult]]:
+    def _places(self, *kinds: str) -> list[list[StartResult]]:
         """Return the ends of these kinds by place, the lowest cost first."""
-        ends = [e for e, k in zip(self.results, self.kinds, strict=True) if k in kinds and isinstance(e, StartResult)]
         places: list[list[StartResult]] = []
-        for end in sorted(ends, key=lambda e: e.cost):
+        for end in sorted(self._ends(*kinds), key=lambda e: e.cost):
             home = next((p for p in places if self._same_place(p[0], end)), None)
             places.append([end]) if home is None else home.append(end)
         return places
@@ -242,7 +238,7 @@ class Multistart(Printed):
         The places with most fits, and there the parameters that are farthest off.
         """
         best, pars = (self.best or self.reference).values, self.reference.model.parameters
-        places = sorted(self._places(("poor",)), key=len, reverse=True)
+        places = sorted(self._places("poor"), key=len, reverse=True)
         told = []
         for place in places[:PLACES]:
             end = place[0].values
@@ -266,21 +262,21 @@ class Multistart(Printed):
 
     def statistics(self) -> dict[str, dict[str, float | None]]:
         """Return per free parameter the reference and mean and standard deviation over the good fits."""
-        found = {}
+        found, good = {}, self._ends("good")
         for n in self.reference.problem.model.free_names:
             middle = self.reference.values[n]
-            v = np.array([middle + self.difference(n, e.values[n], middle) for e in self._good])
-            found[n] = {"reference": self.reference.values[n], "mean": float(v.mean()) if v.size else None,
-                        "std": float(v.std()) if v.size else None}
+            v = np.array([middle + self.difference(n, e.values[n], middle) for e in good])
+            mean, std = (float(v.mean()), float(v.std())) if good else (None, None)
+            found[n] = {"reference": middle, "mean": mean, "std": std}
         return found
 
     def to_dict(self) -> dict[str, Any]:
         """Return the contents of ``robustness --json``."""
+        good = self._ends("good")
         return {
             "starts": len(self.results), "spread": self.spread, "guess": self.guess, "good": self.good,
             "poor": self.poor, "failed": self.failed, "seconds": self.seconds, "parameters": self.statistics(),
-            "nrmse": {c: float(np.mean([e.nrmse[c] for e in self._good])) if self._good else None
-                      for c in self.reference.nrmse},
+            "nrmse": {c: float(np.mean([e.nrmse[c] for e in good])) if good else None for c in self.reference.nrmse},
             "thresholds": {"cost_share": COST_SHARE, "standard_deviations": DISTANCE},
             "interrupted": self.interrupted or None,
         }

@@ -17,7 +17,7 @@ import scipy
 
 from motorid.display.cards import Card, Flag, Printed, Table
 from motorid.display.numbers import interval_text, percent, quantity
-from motorid.errors import MotoridError, among
+from motorid.errors import MotoridError, chosen
 from motorid.estimation.least_squares import least_squares
 from motorid.estimation.result import Fit
 from motorid.numerics.least_squares import LevenbergMarquardt, seen_directions
@@ -118,10 +118,8 @@ def _crossing(x: Array, rise: Array, reach: float) -> float | None:
     above = np.flatnonzero(root > reach)
     if not above.size:
         return None
-    j = int(above[0])
-    if j == 0:
-        return float(x[0])
-    return float(np.interp(reach, root[j - 1:j + 1], x[j - 1:j + 1]))
+    near = slice(max(above[0] - 1, 0), above[0] + 1)
+    return float(np.interp(reach, root[near], x[near]))
 
 
 @one_thread
@@ -161,16 +159,13 @@ def profiles(fit: Fit, names: Sequence[str] | None = None, *, level: float = 0.9
     >>> each = mi.profiles(better, ["R", "b"], quiet=True)
     >>> axes = mi.plot_profile(each)
     """
-    free = fit.problem.model.free_names
-    for n in names or ():
-        among(n, free, "free parameter")
-    chosen = tuple(names or free)
+    names = chosen(names, fit.problem.model.free_names, "free parameter")
     check_level(level)
-    plans = {n: _plan(fit, n, level) for n in chosen}
-    tasks = [(n, side, *plans[n][:3]) for n in chosen for side in (-1.0, 1.0)]
+    plans = {n: _plan(fit, n, level) for n in names}
+    tasks = [(n, side, *plans[n][:3]) for n in names for side in (-1.0, 1.0)]
     done = map_items(_side, (fit.problem, dict(fit.values), fit.cost), tasks, map, "Profiling", quiet=quiet)
     sides = done.results + [[]] * (len(tasks) - len(done.results))
-    return {n: _joined(fit, n, sides[2 * k], sides[2 * k + 1], plans[n][3]) for k, n in enumerate(chosen)}
+    return {n: _joined(fit, n, sides[2 * k], sides[2 * k + 1], plans[n][3]) for k, n in enumerate(names)}
 
 
 def _plan(fit: Fit, name: str, level: float) -> tuple[float, float, float, float]:
@@ -202,10 +197,12 @@ def _side(reference: tuple[Problem, dict[str, float], float],
     while len(points) < MOST and abs(at - q0) < farthest:
         at = float(np.clip(at + side * step, low, high))
         p = float(scale.scale[j] * np.exp(at) if scale.log[j] else scale.scale[j] * at)
-        found = _refit_with(problem, values, name, p)
-        if found is None:
+        here = problem.for_model(problem.model.start_at(values).fix(**{name: p}))
+        try:
+            found = least_squares(here, SOLVER)
+        except (MotoridError, np.linalg.LinAlgError):
             break
-        rise, values = 2 * (found[0] - cost) / factor, found[1]
+        rise, values = 2 * (found.cost - cost) / factor, found.values
         points.append((p, rise, values))
         if rise > height or at in (low, high):
             break
@@ -215,19 +212,8 @@ def _side(reference: tuple[Problem, dict[str, float], float],
     return points
 
 
-def _refit_with(problem: Problem, values: dict[str, float], name: str,
-                p: float) -> tuple[float, dict[str, float]] | None:
-    here = problem.for_model(problem.model.start_at(values).fix(**{name: p}))
-    try:
-        done = least_squares(here, SOLVER)
-    except (MotoridError, np.linalg.LinAlgError):
-        return None
-    return done.cost, done.values
-
-
 def _joined(fit: Fit, name: str, left: list[Point], right: list[Point], dof: float) -> Profile:
-    middle = (fit.values[name], 0.0, dict(fit.values))
-    points = [*reversed(left), middle, *right]
+    points = [*reversed(left), (fit.values[name], 0.0, dict(fit.values)), *right]
     p = fit.problem.model.parameters[name]
     others = {n: np.array([v[n] for _, _, v in points]) for n in fit.problem.model.free_names if n != name}
     return Profile(name, p.unit, fit.values[name], np.array([v for v, _, _ in points]),

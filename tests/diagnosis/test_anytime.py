@@ -39,7 +39,7 @@ def interrupted_at(monkeypatch, count: int) -> None:
 
 def test_the_first_answer_comes_before_any_refit(plain, monkeypatch):
     words = []
-    monkeypatch.setattr(candidates, "refits", lambda tasks, map_: words.append("refits") or refit.refits(tasks, map_))
+    monkeypatch.setattr(candidates, "refits", lambda *told, **more: words.append("refits") or refit.refits(*told, **more))
     mi.diagnose(plain, max_effects=1, progress=words.append)
     first = next(w for w in words if w.startswith("first answer"))
     assert words.index(first) < words.index("refits")

@@ -11,7 +11,7 @@ import motorid as mi
 from motorid.acquire.excitation import program
 from motorid.cli.app import app
 from motorid.diagnosis import design_criteria, experiment_design
-from motorid.diagnosis.design_criteria import Driven, Layout, Rival, Task, all_pairs, quiet_seeds
+from motorid.diagnosis.design_criteria import Driven, Layout, Rival, Task, quiet_seeds
 from motorid.errors import FitError, UsageError
 
 DT, DURATION, LEVELS = 2e-3, 0.6, 8
@@ -52,7 +52,7 @@ def tasks(fits):
     layout = Layout((60,) * 6, DT, (8,) * 6, None, 8.0)
     rivals = [Rival.of(f) for f in fits]
     driven = tuple(Driven.of(r, layout, rivals[0].sigma, False) for r in rivals)
-    both = Task(driven, {"i": (-3, 3)}, NOISE, (), all_pairs(2), np.inf)
+    both = Task(driven, {"i": (-3, 3)}, NOISE, (), ((0, 1), (1, 0)), np.inf)
     return both, replace(both, driven=driven[:1], asked=("R", "tau_0"), pairs=())
 
 
