@@ -39,7 +39,12 @@ def interrupted_at(monkeypatch, count: int) -> None:
 
 def test_the_first_answer_comes_before_any_refit(plain, monkeypatch):
     words = []
-    monkeypatch.setattr(candidates, "refits", lambda *told, **more: words.append("refits") or refit.refits(*told, **more))
+
+    def told(*tasks, **more):
+        words.append("refits")
+        return refit.refits(*tasks, **more)
+
+    monkeypatch.setattr(candidates, "refits", told)
     mi.diagnose(plain, max_effects=1, progress=words.append)
     first = next(w for w in words if w.startswith("first answer"))
     assert words.index(first) < words.index("refits")
