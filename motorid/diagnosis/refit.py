@@ -14,7 +14,7 @@ import numpy as np
 from motorid.diagnosis.cross_validation import QUICK, ROUGH, restarted
 from motorid.diagnosis.model_comparison import far, size_of
 from motorid.diagnosis.record_parts import within_worth, worth_its_steps
-from motorid.diagnosis.score_test import uses_angle
+from motorid.diagnosis.score_test import believable_start, uses_angle
 from motorid.diagnosis.thresholds import MATERIAL, NATS
 from motorid.errors import OutOfTime
 from motorid.estimation.continuation import by_continuation, past_ripples, sharpened
@@ -164,7 +164,7 @@ def _started(fit: Fit, model: Model, start: Mapping[str, float], angular: bool) 
     """Return the problem of a refit, at its start."""
     names = [n for n in start if n in model.parameters]
     problem = fit.problem.for_model(_within(model, {n: start[n] for n in names})).tuned(accuracy=ROUGH)
-    apart = {**{n: v for n, v in start.items() if n not in model.parameters}, **fit.initial}
+    apart = {**{n: v for n, v in start.items() if n not in model.parameters}, **believable_start(fit)}
     problem = restarted(problem, problem.scaling.scaled([apart.get(p.name, p.value) for p in problem.unknown]))
     return problem.for_model(replace(problem.model, angle_input=True, _systems={})) if angular else problem
 

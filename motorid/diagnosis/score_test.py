@@ -264,6 +264,19 @@ class Shape:
         return replace(self, columns=self.columns * np.concatenate(rows)[:, None], weights=new)
 
 
+def believable_start(fit: Fit) -> dict[str, float]:
+    """Return the estimated initial states of a fit, no current larger than twice the voltage drives through R.
+
+    With next to no inductance a current of megamperes is but a kick at the start, and would melt a winding that heats.
+    """
+    found = dict(fit.initial)
+    for k, run in enumerate(fit.problem.experiments) if "R" in fit.values else ():
+        if (name := f"i_0[{k}]") in found and "i" not in run.outputs:
+            most = 2 * float(np.abs(run.inputs["v"]).max()) / fit.values["R"]
+            found[name] = float(np.clip(found[name], -most, most))
+    return found
+
+
 def weights_of(problem: Problem) -> tuple[Array, ...]:
     """Return the weights of the channels, per run."""
     return tuple(m.weights for m in problem.measured)
@@ -345,7 +358,7 @@ class Added:
     @cached_property
     def _point(self) -> Point:
         """The fit's values and initial states."""
-        problem, initial = self._problem, self.fit.initial
+        problem, initial = self._problem, believable_start(self.fit)
         return problem.unknowns.point(problem.scaling.scaled([initial.get(p.name, p.value) for p in problem.unknown]))
 
     @cached_property
