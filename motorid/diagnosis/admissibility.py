@@ -37,7 +37,8 @@ def objections(fit: Fit, added: Effect, before: Fit | None = None) -> str:
         if p.vary and p.null is not None and not p.positive and fit.values[p.name] <= p.lower == p.null:
             return f"{p.name} goes to {p.null:g}: the records show none of it, or only with the wrong sign"
         declared = next(q for q in added.parameters if q.name == p.name)
-        values = [fit.values[p.name], *(own["value"] for own in fit.per_run.get(p.name, {}).values())]
+        others = fit.per_run.get(p.name, {}).values() if p.per_run else ()
+        values = [fit.values[p.name], *(own["value"] for own in others)]
         for limit, sign in ((p.upper, 1), (p.lower, -1)):
             physical = np.isfinite(limit) and limit in (declared.upper, declared.lower)  # not set for these records
             if p.vary and physical and sign * limit > 0 and max(sign * v for v in values) > 0.98 * sign * limit:
@@ -58,9 +59,10 @@ def _too_large(fit: Fit, pars: Sequence[Parameter]) -> str:
     """Say so where a voltage lost or added is of the size of what is applied: another parameter has paid for it; where
     cogging is more than the motor ever makes: it would not leave its notch; or where a winding is hotter than any."""
     top = max(float(np.abs(r.inputs["v"]).max()) for r in fit.problem.experiments)
-    hottest = max((float(np.abs(s.states["dT"]).max()) for s in fit.simulations if "dT" in s.states), default=0.0)
-    if hottest > HOTTEST and any(p.unit in ("K", "K/W") for p in pars):
-        return f"the winding would be {number(hottest, 2)} K warmer, which none stands"
+    if any(p.unit in ("K", "K/W") for p in pars):
+        hottest = max((float(np.abs(s.states["dT"]).max()) for s in fit.simulations if "dT" in s.states), default=0.0)
+        if hottest > HOTTEST:
+            return f"the winding would be {number(hottest, 2)} K warmer, which none stands"
     for p in pars:
         if p.vary and p.unit in ("N·m", "N") and any(q.order for q in pars):
             made = max(fit.values["g"] * top if "g" in fit.values else
