@@ -243,7 +243,7 @@ class _Compilation:
             self.process = subprocess.Popen([cc, *flags(), "step.c", "-o", "step.so", "-lm"], cwd=self.here,
                                             stdin=subprocess.DEVNULL, stdout=said, stderr=said)
 
-    def library(self) -> Path:
+    def finished(self) -> Path:
         """Wait for the compiler, and return the library, put into the cache atomically.
 
         Raises
@@ -287,7 +287,7 @@ class _Ahead:
 
     def tend(self) -> None:
         """Put into the cache what is done, and go on with the next."""
-        if self.process != os.getpid():
+        if self.process != os.getpid():  # a fork has begun nothing
             self.waiting, self.running, self.process = {}, None, os.getpid()
         if self.running is not None and self.running.process.poll() is not None:
             self.take(self.running.mark)
@@ -305,7 +305,7 @@ class _Ahead:
             return None
         running, self.running = self.running, None
         with suppress(OSError, subprocess.SubprocessError):
-            return running.library()
+            return running.finished()
         return None
 
 
@@ -327,7 +327,7 @@ def build(functions: StepFunctions, mark: str) -> Path | None:
     if cc is None or cache is None:
         return None
     try:
-        return _Compilation(functions, mark, cc[0], cache).library()
+        return _Compilation(functions, mark, cc[0], cache).finished()
     except (OSError, subprocess.SubprocessError) as error:
         return _without(f"cannot compile: {error}")
 
