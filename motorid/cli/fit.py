@@ -12,7 +12,7 @@ import typer
 from motorid.cli import options as opt
 from motorid.cli.console import FAILED, INTERRUPTED, next_command, save_report, say_notes, show
 from motorid.display.cards import Table
-from motorid.display.numbers import counted, duration, number
+from motorid.display.numbers import counted, duration, number, quantity
 from motorid.effects import EVERY
 from motorid.errors import DataError, UsageError, one_of
 from motorid.estimation.result import COLOURED, PLAIN, Fit, constraint_table, ended, steady_table, value_tables
@@ -154,7 +154,7 @@ def _channel_table(run: Experiment) -> Table:
     rows = [["t", columns.get("t", "–"), units.get("t", "s"), f"0 … {number(run.duration, 4)} s", "–"]]
     for c, y in (*run.inputs.items(), *run.outputs.items()):
         good = y[np.isfinite(y)]
-        limits = f"{number(good.min(), 3)} … {number(good.max(), 3)} {run.units[c]}" if good.size else "–"
+        limits = f"{number(good.min(), 3)} … {quantity(good.max(), run.units[c], 3)}" if good.size else "–"
         rows.append([c, columns.get(c, "–"), units.get(c, run.units[c]), limits, str(len(y) - good.size)])
     return Table(["channel", "column", "unit read", "range (SI)", "missing"], rows, f"{run.name}: {run.n} samples, "
                  f"{number(1e3 * run.dt, 3)} ms apart", left=(0, 1, 2, 3))

@@ -111,7 +111,7 @@ def suggest_experiment(fits: Sequence[Fit], *, v_max: float | None = None, i_max
     best = max(scores, key=lambda n: scores[n])
     what = candidates(t, v_max)[best][1]
     unit = runs[0].units["v"]
-    return Suggestion(best, f"{what} (up to {v_max:.3g} {unit}, {duration:.3g} s)", kept[best], scores)
+    return Suggestion(best, f"{what} (up to {quantity(v_max, unit, 3)}, {duration:.3g} s)", kept[best], scores)
 
 
 def candidates(t: Array, v_max: float) -> dict[str, tuple[Array, str]]:

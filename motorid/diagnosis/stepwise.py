@@ -122,7 +122,7 @@ def _rounds(found: Climb, max_effects: int) -> Iterator[Climb]:
         group = group_of(chosen_of, ordered, {e.name: e.includes for e in search.effects})
         found = _with(found, pruned, chosen_of, new.parent is frontier[0], group)
         found = replace(found, remaining=judge_adequacy(pruned, search.scores(pruned)))
-        best, frontier = pruned, [pruned, *_runners_up(pruned, ordered)][:BEAM]
+        best, frontier = pruned, [pruned, *_runners_up(pruned, ordered, search.effects)]
         search.stages.done(f"accepted {chosen_of.added}")
         yield found
     done = found.remaining.adequate and at_noise(best)
@@ -299,13 +299,16 @@ def _without(group: Sequence[str], found: frozenset[str]) -> tuple[str, ...]:
     return tuple(n for n in group if n not in found)
 
 
-def _runners_up(best: Node, ordered: Sequence[Node]) -> list[Node]:
-    """Children that came near enough to be grown too, those of another kind than the best."""
+def _runners_up(best: Node, ordered: Sequence[Node], effects: Sequence[Effect]) -> list[Node]:
+    """Return the next best child if it came near enough to be grown too, as one of another kind than the best.
+
+    What contains the best's effect and predicts no better is none: every later round tries it in that one's place.
+    """
     if best.parent is None:
         return []
-    goal = evidence(best.parent, best).fall
-    return [n for n in ordered
-            if n.key != best.key and evidence(best.parent, n).fall > HALF_AS_GOOD * goal]
+    goal, wider = evidence(best.parent, best).fall, {e.name for e in effects if best.added in e.includes}
+    near = (n for n in ordered if n.key != best.key and evidence(best.parent, n).fall > HALF_AS_GOOD * goal)
+    return [n for n in [*near][:BEAM - 1] if n.added not in wider or beats(n, best)]
 
 
 def _marked(listed: Sequence[Candidate], node: Node, group: tuple[str, ...]) -> tuple[Candidate, ...]:

@@ -72,9 +72,9 @@ def number(value: float | None, digits: int = 4) -> str:
 
 
 def quantity(value: float | None, unit: str = "", digits: int = 4) -> str:
-    """Return a number with its unit; what is not known has none."""
-    if value is None or math.isnan(value):
-        return number(value)
+    """Return a number with its unit; what is not known, and a ratio ("1"), has none."""
+    if value is None or math.isnan(value) or unit == "1":
+        return number(value, digits)
     return f"{number(value, digits)} {unit}".rstrip()
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from motorid.channels import NAMES
+from motorid.display.numbers import quantity
 from motorid.numerics.signals import Array, bridged, integral, noise_level, quantum
 from motorid.records.experiment import Experiment
 
@@ -94,7 +95,7 @@ def _one_column_for_two(run: Experiment) -> str | None:
 def _excitation(run: Experiment) -> str | None:
     v = run.inputs["v"]
     if np.ptp(v) <= 1e-6 * np.abs(v).max():
-        return (f"the voltage is {v[0]:.4g} {run.units['v']} from beginning to end: such a run shows one "
+        return (f"the voltage is {quantity(v[0], run.units['v'])} from beginning to end: such a run shows one "
                 "steady speed and at most a start. Add runs with steps or a sweep of the voltage.")
     if still := [c for c, y in run.outputs.items() if np.nanmax(y) == np.nanmin(y)]:
         return (f"the {NAMES[still[0]]} never changes although the voltage does; a dead sensor, a "

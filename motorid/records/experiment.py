@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from motorid.channels import CHANNELS, MEASURED_INPUTS, NAMES, UNITS
 from motorid.display.cards import Card, Flag, Shown, Table
-from motorid.display.numbers import duration, number
+from motorid.display.numbers import duration, number, quantity
 from motorid.errors import DataError, UsageError, one_of, printable
 from motorid.numerics.signals import Array
 from motorid.records import preprocessing
@@ -197,7 +197,7 @@ class Experiment(Shown):
         rows = []
         for name, y in (*self.inputs.items(), *self.outputs.items()):
             good = y[np.isfinite(y)]
-            limits = f"{number(good.min(), 3)} … {number(good.max(), 3)} {self.units[name]}" if len(good) else "–"
+            limits = f"{number(good.min(), 3)} … {quantity(good.max(), self.units[name], 3)}" if len(good) else "–"
             missing = Flag(f"{len(y) - len(good)} of {len(y)}", "note") if len(good) < len(y) else "none"
             rows.append([f"{NAMES[name]} {name}", limits, missing])
         head = (f"{self.n} samples in {duration(self.duration)}, {number(1e3 * self.dt, 3)} ms apart; "

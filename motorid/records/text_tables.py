@@ -174,8 +174,9 @@ def _header(above: list[str], comments: list[str], dialect: Dialect, width: int,
         if fitting := [row for row in named if len(row) == width and not any(map(dialect.is_number, row))]:
             return unique_labels(fitting[-1]), []
         return [str(k + 1) for k in range(width)], []
-    units = rows[-1] if len(rows) > 1 and _is_unit_row(rows[-1]) and len(rows[-2]) >= width else []
-    names = rows[-2] if units else rows[-1]
+    # Names, units; or long names, units, short names.
+    at = next((k for k in (-1, -2) if len(rows) > -k and _is_unit_row(rows[k]) and len(rows[k - 1]) >= width), None)
+    units, names = ([], rows[-1]) if at is None else (rows[at], rows[-2] if at == -1 else rows[-1])
     if len(names) < width:
         hint = (" If the comma is the decimal mark, too, export with a semicolon between the cells."
                 if dialect.delimiter == "," else "")

@@ -11,6 +11,7 @@ from battery.excite import driven, record
 import motorid as mi
 from motorid.diagnosis import misspecification
 from motorid.diagnosis.admissibility import objections
+from motorid.diagnosis.candidates import library
 from motorid.diagnosis.cross_validation import HeldOut
 from motorid.diagnosis.free_forms import Form
 from motorid.diagnosis.misspecification import FormGain
@@ -151,14 +152,15 @@ def test_friction_that_differs_by_a_trifle_with_the_direction_is_friction(rubbin
         assert bool(said) == ("sizes differ" in objections(alike, mi.effects.coulomb_asymmetric))
 
 
-def test_a_model_that_ties_with_the_best_is_grown_too(rubbing):
-    """Which of them is right may show only with the next effect."""
+def test_a_model_that_ties_with_the_best_is_grown_too_unless_it_contains_it(rubbing):
+    """Which of them is right may show only with the next effect; what contains it is tried in its place anyway."""
     plain, check = rubbing
     held, root = HeldOut.of(plain, check), node_of(plain, HeldOut.of(plain, check))
-    best, tie, worse = (node_of(mi.fit(plain.model + e, plain.problem.experiments), held, e.name, root)
-                        for e in (mi.effects.coulomb, mi.effects.coulomb_asymmetric, mi.effects.constant_load))
-    assert tied(best, tie)
-    assert _runners_up(best, [best, tie, worse]) == [tie]
+    best, wider, worse = (node_of(mi.fit(plain.model + e, plain.problem.experiments), held, e.name, root)
+                          for e in (mi.effects.coulomb, mi.effects.coulomb_asymmetric, mi.effects.constant_load))
+    assert tied(best, wider)
+    assert _runners_up(best, [best, wider, worse], [mi.effects.constant_load]) == [wider]
+    assert _runners_up(best, [best, wider, worse], library(None)) == []
 
 
 @pytest.mark.parametrize(("gain", "said"), [(1e4, True), (1.0, False)])
