@@ -52,4 +52,5 @@ def test_words_for_shares_units_and_times():
     assert percent(None) == "–"
     assert quantity(None, "Ω") == "–"
     assert quantity(5e-3, "N·m") == "0.005 N·m"
+    assert quantity(0.4, "1") == "0.4"  # a duty
     assert [duration(s) for s in (0.0352, 1.234, 59.99, 200)] == ["35 ms", "1.23 s", "1 min", "3 min 20 s"]

@@ -141,6 +141,7 @@ DIALECTS = {
     "Latin-1": ("Zeit_s;Spannung_V;Strom_A;Geschwindigkeit_rad_s;Kühlung_°C\n"
                 + rows(pattern="{t:.3f};{v};{i:.3f};{w:.3f};20\n")).encode("latin-1"),
     "row of units": "time;voltage;current;speed\ns;V;A;rad/s\n" + SEMICOLON,
+    "long names, units, short names": "Time;Drive;Current;Motor speed\ns;V;A;rad/s\nt;u;i;w\n" + SEMICOLON,
     "row of units in brackets": "Time,Voltage,Current,Speed\n(s),(V),(A),(rad/s)\n" + rows(),
     "lines above the header": "Scope 7\nSampling rate, 100\nOperator: me\n\n" + GOOD,
     "quoted header": '"time_s","voltage_V","current_A","speed_rad_s"\n' + rows(),
