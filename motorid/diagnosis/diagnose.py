@@ -130,8 +130,8 @@ def _told(found: Climb, driven: str, validated: bool, own: Sequence[Effect]) -> 
         details.append(unseen_remark(unseen))
     details = tuple(t for t in (*details, *_remarks(found, driven)) if t)
     text = " ".join(t for t in (answer, *details, suggestion) if t)
-    replaced = {g.effect: g.form for g in found.grades if g.form is not None}
-    remainder = Remainder(kind, ladder.best, forms, found.search.held, replaced)
+    approximating = {g.effect: g.form for g in found.grades if g.grade == "approximates"}
+    remainder = Remainder(kind, ladder.best, forms, found.search.held, approximating)
     return Diagnosis(verdict, text, where, names, judged, missing, ranking, ladder, groups, suggestion, fit,
                      ladder.best, remaining, remainder, found.stopped, answer, details)
 

@@ -37,9 +37,11 @@ CHANGES = {"t": "changes with the time", "turn": "changes with the angle within 
            "theta": "changes with the angle", "omega": "changes with the speed", "i": "changes with the current",
            "v": "changes with the voltage", "run": "differs from run to run",
            "past i": "depends on the current before", "past omega": "depends on the speed before",
-           "past v": "depends on the voltage before", "path": "depends on the distance since a reversal"}
-PAST = ("past i", "past omega", "past v", "path")
+           "past v": "depends on the voltage before", "path": "depends on the distance since a reversal",
+           "past speed": "depends on how fast it ran before"}
+PAST = ("past i", "past omega", "past v", "past speed", "path")
 MEMORIES = 8  # lengths of memory
+LASTING = 10.0  # times the longest run: a memory that forgets nothing in it
 
 
 @dataclass(frozen=True)
@@ -73,9 +75,9 @@ class Form:
 
 
 _PUSHES = (  # words, balance, carrier, quantities
-    ("a friction", "torque", "direction", ("turn", "theta", "t", "i", "run")),
+    ("a friction", "torque", "direction", ("turn", "theta", "t", "i", "run", "past speed")),
     ("a load", "torque", "", ("turn", "theta", "t", "run")),
-    ("a drag", "torque", "omega", ("t", "turn", "theta", "i", "run")),
+    ("a drag", "torque", "omega", ("t", "turn", "theta", "i", "run", "past speed")),
     ("a torque", "torque", "", ("omega", "i")),
     ("an inertia", "torque", "acceleration", ("turn", "t", "run")),
     ("a loss of voltage", "voltage", "", ("omega", "v", "i", "t", "run")),
@@ -143,7 +145,7 @@ def functions_of(form: Form, span: Span) -> list[str]:
     if form.on == "turn":
         return ["1.0", *(f"ca.{f}({k:.6g} * z)" for k in span.orders for f in ("sin", "cos"))]
     if form.remembers:
-        return [f"past(z, {length:.6g})" for length in memories_of(form, span)]
+        return [*(f"past(z, {length:.6g})" for length in memories_of(form, span)), *(["1.0"] if form.carrier else [])]
     inside = f"ca.fmin(ca.fmax(z, {low:.9g}), {high:.9g})"  # nothing is known beyond
     if form.on in ("theta", "t"):
         scale = f"{np.pi / (high - low):.9g} * ({inside} - {low:.9g})"
@@ -170,6 +172,8 @@ def memories_of(form: Form, span: Span) -> Array:
     shortest = 2 * span.step
     if form.on == "path":  # a reversal is slow
         shortest, longest = 0.1 * span.step, min(longest, 100 * span.step)
+    elif form.carrier:  # what runs in, or warms, sums up all that was
+        longest *= LASTING
     return speed * np.geomspace(shortest, max(longest, 2 * shortest), MEMORIES)
 
 
@@ -295,6 +299,8 @@ def _signals(fit: Fit, k: int) -> dict[str, Array]:
         gone = np.cumsum(0.5 * np.abs(omega[1:] + omega[:-1]) * np.diff(run.t))  # both directions counted
         found["path"], found["way"] = found["direction"], np.concatenate([[0.0], gone])
     found |= {f"past {c}": found[c] for c in ("v", "i", "omega") if c in found}
+    if "omega" in found:
+        found["past speed"] = np.abs(found["omega"])
     if "theta" in run.outputs or "omega" in run.outputs:
         found["theta"] = found["turn"] = angle_signal(run)
     return found

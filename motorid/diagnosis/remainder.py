@@ -8,9 +8,10 @@ the model, and what then predicts best is the answer.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, reduce
+from itertools import zip_longest
 from typing import Any
 
 import casadi as ca
@@ -29,7 +30,7 @@ from motorid.diagnosis.free_forms import (
     span_of,
     values_of,
 )
-from motorid.diagnosis.misspecification import chosen_functions
+from motorid.diagnosis.misspecification import better_forms, chosen_functions
 from motorid.diagnosis.model_comparison import far
 from motorid.diagnosis.predictive_score import compare
 from motorid.diagnosis.refit import refit
@@ -47,8 +48,8 @@ WHERE = {"torque": "mechanical", "voltage": "electrical", "both": "electrical", 
 TRIED = 4  # curves that are fitted, those that promise most
 ROUNDS = 3  # of choosing functions and fitting: near the optimum slopes show what the misfit hid before
 QUANTITIES = {"turn": "m.theta", "theta": "m.theta", "omega": "m.omega", "i": "m.i", "v": "m.v", "past v": "m.v",
-              "past i": "m.i", "past omega": "m.omega", "path": "m.sign(m.omega)"}
-SI = {"theta": "rad", "omega": "rad/s", "i": "A", "v": "V"}
+              "past i": "m.i", "past omega": "m.omega", "past speed": "ca.fabs(m.omega)", "path": "m.sign(m.omega)"}
+SI = {"theta": "rad", "omega": "rad/s", "speed": "rad/s", "i": "A", "v": "V"}
 OVER = {"": "", "A": "/A", "V": "/V", "rad/s": "·s/rad"}
 FIRST = {"past i": ", m.start['i']", "past omega": ", m.start['omega']"}  # of a memory: as if it had been so before
 CARRIERS = {"": "", "direction": "m.sign(m.omega) * ", "omega": "m.omega * ", "i": "m.i * ", "v": "m.v * "}
@@ -173,8 +174,8 @@ class Curve:
     def unit(self) -> str:
         """Of the coefficients."""
         form, own = self.form, self._own_unit
-        by = SI.get(form.on.removeprefix("past ") if form.remembers else form.carrier, "")
-        return "1" if form.carrier == "acceleration" or own == by else own + OVER[by]
+        by = [SI.get(n, "") for n in (form.on.removeprefix("past ") if form.remembers else "", form.carrier)]
+        return "1" if form.carrier == "acceleration" or own in by else own + "".join(OVER[unit] for unit in by)
 
     @property
     def _own_unit(self) -> str:
@@ -191,9 +192,8 @@ class Curve:
         terms = self._terms
         if form.remembers:
             rate = " * ca.fabs(m.omega)" if form.on == "path" else ""
-            lengths = [t.partition(", ")[2].rstrip(")") for t in terms]
-            terms = [f"past_{k}" for k in range(len(terms))]
-            for past, length in zip(terms, lengths, strict=True):
+            for k, length in ((k, t[len("past(z, "):-1]) for k, t in enumerate(terms) if t != "1.0"):
+                terms[k] = past = f"past_{k}"
                 lines += [f"{past} = m.state('{self.name}_{past}'{FIRST.get(form.on, '')})",
                           f"m.rate({past}, (z - {past}){rate} / {length})"]
         lines += ["curve = (", *(f"    + {n} * {t}" for n, t in zip(names, terms, strict=True)), ")"]
@@ -229,8 +229,8 @@ class Remainder:
     fit: Fit
     forms: tuple[Form, ...] = ()
     _held: HeldOut | None = field(default=None, repr=False)
-    # effects that only approximate a form which predicts better in their place
-    _replaced: Mapping[str, Form] = field(default_factory=dict, repr=False)
+    # effects that only approximate the rest, with the form that predicts better in their place, if one does
+    _approximating: Mapping[str, Form | None] = field(default_factory=dict, repr=False)
 
     @property
     def form(self) -> Form | None:
@@ -305,22 +305,39 @@ class Remainder:
         if self.form is not None and self.form.on == "run":
             raise UsageError(f"what is left is {self.form.text}: no curve, but another motor in every run. "
                              "Fit the runs apart.")
-        tried = [*self._in_place(), *((self.fit, f) for f in self.forms if f.on != "run")][:TRIED]
-        if (best := _best(self.fit, tried, self._held or HeldOut.of(self.fit, None))) is None:
+        beside = [(self.fit, f) for f in self.forms]
+        tried = [t for pair in zip_longest(self._alone(), beside) for t in pair if t is not None]
+        tried = [t for t in (*self._in_place(), *tried) if t[1].on != "run"][:TRIED]
+        if (best := _best(self.fit, tried, self._judge)) is None:
             raise UsageError("something predictable is left, but no curve over one quantity lowers the error on data "
                              "left out.")
         return best
 
 
+    @property
+    def _judge(self) -> HeldOut:
+        return self._held or HeldOut.of(self.fit, None)
+
     def _in_place(self) -> list[tuple[Fit, Form]]:
         """Return the model without what only approximates a form, and each such form: beside it there is no place."""
-        forms = [f for f in dict.fromkeys(self._replaced.values()) if f.on != "run"]
+        replaced = {name: form for name, form in self._approximating.items() if form is not None}
+        base = self._without(replaced)
+        return [] if base is None else [(base, form) for form in dict.fromkeys(replaced.values())]
+
+    def _alone(self) -> list[tuple[Fit, Form]]:
+        """Return the model without all that only approximates, and the forms that predict best beside that."""
+        base = self._without(self._approximating)
+        if base is None or not far(self.fit):
+            return []
+        return [(base, gain.form) for gain in better_forms(base, self._judge.predictions(base))]
+
+    def _without(self, names: Iterable[str]) -> Fit | None:
+        """Return the fit without these effects; None where there are none, or no fit is."""
         with contextlib.suppress(ModelError):
-            model = reduce(Model.without, self._replaced, self.fit.model) if forms else None
-            values = {n: v for n, v in self.fit.values.items() if model is not None and n in model.parameters}
-            if model is not None and (base := refit(self.fit, model, (values,))) is not None:
-                return [(base, f) for f in forms]
-        return []
+            model = reduce(Model.without, names, self.fit.model)
+            values = {n: v for n, v in self.fit.values.items() if n in model.parameters}
+            return None if model is self.fit.model else refit(self.fit, model, (values,))
+        return None
 
 
 @one_thread
@@ -335,7 +352,10 @@ def _best(fit: Fit, tried: Sequence[tuple[Fit, Form]], held: HeldOut) -> Curve |
             for _ in range(ROUNDS):
                 if (larger := curve.grown()) is None or larger.fitted is None:
                     break
-                curve, better = larger, compare(before, held.predictions(larger.fitted))
+                found_better = compare(before, held.predictions(larger.fitted))
+                if better is not None and found_better.gain < better.gain:  # slopes led astray
+                    break
+                curve, better = larger, found_better
         if better is not None and better.worth_it and curve.fitted is not None:
             found.append((better.gain, curve))
             if not far(curve.fitted):

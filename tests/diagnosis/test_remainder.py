@@ -240,7 +240,7 @@ def test_slopes_of_every_form_are_those_of_the_model_with_its_curve(lab):
     fit = mi.fit(mi.dc_motor() + mi.effects.coulomb, runs)
     linear = linearised(fit)
     remembering = [f for f in linear.forms if f.remembers]
-    assert {f.on for f in remembering} == {"past v", "past i", "past omega", "path"}
+    assert {f.on for f in remembering} == {"past v", "past i", "past omega", "past speed", "path"}
     first = {f"{c}_0[{k}]": float(y[0]) for k, s in enumerate(fit.simulations) for c, y in s.states.items()}
     missed = {}
     for form, answers in linear.forms.items():
