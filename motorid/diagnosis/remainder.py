@@ -123,7 +123,8 @@ class Curve:
         if self.form.remembers:
             lags = np.concatenate([values_of(functions_of(self.form, self._span), self.form, s) for s in self._signals])
             over = "rad" if self.form.on == "path" else "s"
-            forms = [(f"one lag of {number(length, 2)} {over}", lags[:, [k]])
+            base, also = ("a constant and ", [-1]) if self.form.carrier else ("", [])
+            forms = [(f"{base}one lag of {number(length, 2)} {over}", lags[:, [k, *also]])
                      for k, length in enumerate(memories_of(self.form, self._span))]
             unit = self._own_unit
         return sorted((_closed(text, columns, value, unit) for text, columns in forms), key=lambda f: f[1])
