@@ -6,7 +6,7 @@ import contextlib
 import itertools
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import partial, reduce
 from typing import Any
 
 import numpy as np
@@ -434,19 +434,17 @@ def _sizes(fit: Fit, effect: Effect) -> list[float]:
 def widened(fit: Fit, effect: Effect, above: float = ABOVE) -> Task:
     """Return the refit with `effect` in the place of those that it includes, from where they were.
 
-    Sizes that are at least another start at `above` times that.
+    Sizes that are at least another start at `above` times that; a shape is that of the same unit, if there was one.
     """
-    model, level = fit.model, 0.0
-    for e in model.effects:
-        if e.name in effect.includes:
-            level = max([level, *_sizes(fit, e)])
-            model = model.without(e.name)
-    model = model + effect
+    inside = [e for e in fit.model.effects if e.name in effect.includes]
+    level = max((size for e in inside for size in _sizes(fit, e)), default=0.0)
+    model = reduce(Model.without, (e.name for e in inside), fit.model) + effect
     natural = natural_sizes(fit.problem.experiments, fit.values)
     sizes = sizes_like(effect, level, above)
-    shapes = [
-        [(p.name, g * natural.get(p.unit, 1.0)) for g in p.grid] for p in effect.parameters if p.null is None and p.grid
-    ]
+    shaped = {p.unit: fit.values[p.name] for e in inside for p in e.parameters if p.null is None and p.vary}
+    shapes = [[(p.name, shaped[p.unit])] if p.unit in shaped else
+              [(p.name, g * natural.get(p.unit, 1.0)) for g in p.grid]
+              for p in effect.parameters if p.null is None and p.grid]
     starts = [{**sizes, **dict(point)} for point in itertools.product(*shapes)][:8]
     return Task(fit, model, effect, starts)
 

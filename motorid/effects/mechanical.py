@@ -188,7 +188,7 @@ def compliance(m: Equations,
 @effect(balance="transmission", includes=("compliance",))
 def backlash(m: Equations,
              r_gap=P(0.3, "", null=0.0, lower=0.0, upper=0.98, grid=(0.3, 0.7), doc="load's share of the inertia"),
-             gap=P(0.02, "rad", positive=True, grid=(0.01, 0.03, 0.1, 1.0), doc="total free play"),
+             gap=P(0.02, "rad", positive=True, grid=(0.001, 0.01, 0.03, 0.1, 1.0), doc="total free play"),
              omega_c=P(500.0, "1/s", positive=True, grid=(0.1, 0.4), doc="resonance while in contact"),
              zeta_c=P(0.2, "", positive=True, upper=2.0, grid=(0.1, 0.5), doc="damping ratio while in contact")):
     """Backlash between two inertias, elastic in contact. Nordin & Gutman, Automatica 38(10), 2002."""

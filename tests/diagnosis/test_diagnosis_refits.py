@@ -98,6 +98,26 @@ def test_a_gap_at_its_limit_is_refused():
     assert "gap" not in objections(inside, LIBRARY["backlash"])
 
 
+def test_a_small_play_in_an_elastic_shaft_is_sought_from_that_shaft():
+    """A twentieth of a degree, on a motor that turns slowly; an elastic shaft alone explains four fifths of it."""
+    motor = {"R": 2.07, "L": 8.7e-4, "K": 0.875, "b": 5.7e-3, "J": 0.0167}
+    play = {"r_gap": 0.6, "gap": 1e-3, "omega_c": 500.0, "zeta_c": 0.2}
+    model = mi.dc_motor(**motor) + mi.effects.backlash(**play)
+    t, rng = 5e-4 * np.arange(3000), np.random.default_rng(1)
+    waves = [sum(rng.normal() * np.sin(w * t + rng.uniform(0, 6)) for w in (9, 23, 57, 131)) for _ in range(2)]
+    runs = []
+    for v in waves:
+        clean = simulate(model, mi.Experiment(t, {"v": v}, {"i": 0 * t, "omega": 0 * t}), initial="rest")[0].outputs
+        runs.append(mi.Experiment(t, {"v": v}, {c: y + 0.003 * np.std(y) * rng.normal(size=len(t))
+                                                for c, y in clean.items()}))
+    shaft = mi.fit(mi.dc_motor() + mi.effects.compliance, runs[0])
+    task = trial.widened(shaft, LIBRARY["backlash"])
+    assert {start["omega_c"] for start in task.starts} == {shaft.values["omega_r"]}
+    found = mi.diagnose(mi.fit(mi.dc_motor(), runs[0]), runs[1:], effects=("compliance", "backlash"))
+    assert found.effects == ("backlash",)
+    assert found.best.values["gap"] == pytest.approx(1e-3, rel=0.05)
+
+
 def test_a_sensor_that_empties_a_known_parameter_is_refused():
     run = _run(mi.dc_motor(**TRUE))
     before = mi.fit(mi.dc_motor(), run)
