@@ -25,17 +25,19 @@ from motorid.problem.problem import Problem
 from motorid.problem.runs import angle_signal
 
 KNOTS = 9  # cosines over the range of a time, twice as many over that of an angle
-HARMONICS = 8  # of a turn
+HARMONICS = 12  # of a turn
 LINES = 2  # of the spectrum of the misfit over the angle
 PLACES = 12  # over a time or an angle at which something may set in
-SUDDEN = 60.0  # how quickly a curve over the time may step, per range
+SUDDEN = 60.0  # how quickly a curve over the time or the angle may step, per range
+FADES = (1, 3, 10, 30)  # lengths in a range of what fades over a time or a distance
 STILL = 0.02  # of the highest speed: slower is standstill
 SHARP = 1e-3  # of the highest speed: below it a direction is not known
 SOFT = 0.01  # of the largest current or voltage: the width of a jump at zero
 BENDS = (4, 12)  # times the largest speed, current or voltage goes a curve's bend into it
-CHANGES = {"t": "changes with the time", "turn": "changes with the angle within a turn",
-           "theta": "changes with the angle", "omega": "changes with the speed", "i": "changes with the current",
-           "v": "changes with the voltage", "run": "differs from run to run",
+CHANGES = {"t": "changes with the time", "distance": "changes with the distance run",
+           "turn": "changes with the angle within a turn", "theta": "changes with the angle",
+           "omega": "changes with the speed", "i": "changes with the current", "v": "changes with the voltage",
+           "run": "differs from run to run",
            "past i": "depends on the current before", "past omega": "depends on the speed before",
            "past v": "depends on the voltage before", "path": "depends on the distance since a reversal",
            "past speed": "depends on how fast it ran before"}
@@ -75,9 +77,9 @@ class Form:
 
 
 _PUSHES = (  # words, balance, carrier, quantities
-    ("a friction", "torque", "direction", ("turn", "theta", "t", "i", "run", "past speed")),
+    ("a friction", "torque", "direction", ("turn", "theta", "t", "distance", "i", "run", "past speed")),
     ("a load", "torque", "", ("turn", "theta", "t", "run")),
-    ("a drag", "torque", "omega", ("t", "turn", "theta", "i", "run", "past speed")),
+    ("a drag", "torque", "omega", ("t", "distance", "turn", "theta", "i", "run", "past speed")),
     ("a torque", "torque", "", ("omega", "i")),
     ("an inertia", "torque", "acceleration", ("turn", "t", "run")),
     ("a loss of voltage", "voltage", "", ("omega", "v", "i", "t", "run")),
@@ -134,7 +136,7 @@ def shown(form: Form, fit: Fit, ranges: Mapping[str, tuple[float, float]]) -> bo
             return False
     if "i" not in outputs and (form.balance in ("voltage", "both") or form.on == "i"):
         return False  # there a torque over the speed says the same
-    if form.remembers and fit.window is not None:
+    if (form.remembers or form.on == "distance") and fit.window is not None:
         return False  # what was before a window is not known
     return form.on != "turn" or fit.problem.model.axis != "linear"
 
@@ -147,14 +149,16 @@ def functions_of(form: Form, span: Span) -> list[str]:
     if form.remembers:
         return [*(f"past(z, {length:.6g})" for length in memories_of(form, span)), *(["1.0"] if form.carrier else [])]
     inside = f"ca.fmin(ca.fmax(z, {low:.9g}), {high:.9g})"  # nothing is known beyond
-    if form.on in ("theta", "t"):
+    if form.on in ("theta", "t", "distance"):
         scale = f"{np.pi / (high - low):.9g} * ({inside} - {low:.9g})"
         centres = np.linspace(low, high, PLACES + 2)[1:-1]
-        if form.on == "t":  # something sets in
-            sudden = [f"ca.tanh((z - {c:.9g}) * {SUDDEN / (high - low):.6g})" for c in centres]
-        else:  # a stop, a slack
-            sudden = ["z", *(f"ca.fmax(z - {c:.9g}, 0)" for c in centres)]
-        return ["1.0", *(f"ca.cos({k} * {scale})" for k in range(1, KNOTS if form.on == "t" else 2 * KNOTS)), *sudden]
+        sudden = [f"ca.tanh((z - {c:.9g}) * {SUDDEN / (high - low):.6g})" for c in centres]  # something sets in
+        if form.on == "theta":  # a stop, a slack
+            sudden += ["z", *(f"ca.fmax(z - {c:.9g}, 0)" for c in centres)]
+        else:  # what warms up, or runs in
+            sudden += [f"ca.exp(-z / {(high - low) / k:.9g})" for k in FADES]
+        most = 2 * KNOTS if form.on == "theta" else KNOTS
+        return ["1.0", *(f"ca.cos({k} * {scale})" for k in range(1, most)), *sudden]
     top = max(abs(low), abs(high))
     s = f"({inside} / {top:.6g})"
     size = f"ca.fabs{s}"
@@ -191,7 +195,7 @@ def past(z: Array, along: Array, length: float, initial: float) -> Array:
 
 def values_of(functions: Sequence[str], form: Form, signal: Mapping[str, Array]) -> Array:
     """Return functions of a form, given by their source, along one run, (N, m)."""
-    z, along = signal[form.on], signal["way" if form.on == "path" else "t"]
+    z, along = signal[form.on], signal["distance" if form.on == "path" else "t"]
     first = float(z[0]) if form.on in ("past i", "past omega") else 0.0
     width = float(signal["width"][0])
     names = {"ca": np, "z": z, "m": SimpleNamespace(sign=lambda z: np.tanh(z / width)),
@@ -297,10 +301,9 @@ def _signals(fit: Fit, k: int) -> dict[str, Array]:
         found["acceleration"] = fit.values["J"] * np.gradient(omega, run.t)  # of a relative inertia
         found["energy"] = 0.5 * fit.values["J"] * omega**2
         gone = np.cumsum(0.5 * np.abs(omega[1:] + omega[:-1]) * np.diff(run.t))  # both directions counted
-        found["path"], found["way"] = found["direction"], np.concatenate([[0.0], gone])
+        found["path"], found["distance"] = found["direction"], np.concatenate([[0.0], gone])
+        found["past speed"] = np.abs(omega)
     found |= {f"past {c}": found[c] for c in ("v", "i", "omega") if c in found}
-    if "omega" in found:
-        found["past speed"] = np.abs(found["omega"])
     if "theta" in run.outputs or "omega" in run.outputs:
         found["theta"] = found["turn"] = angle_signal(run)
     return found

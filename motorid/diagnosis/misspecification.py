@@ -8,7 +8,7 @@ parametric law that is outdone by a nonparametric one is not the thing itself (H
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -35,7 +35,7 @@ from motorid.diagnosis.predictive_score import (
     left_out,
     stacked_labels,
 )
-from motorid.diagnosis.thresholds import MOST, STANDARD_ERRORS, SUPPLANTS, TRIFLE
+from motorid.diagnosis.thresholds import MOST, STANDARD_ERRORS, SUPPLANTS, TRIFLE, UNCONTESTED
 from motorid.display.numbers import listed, percent
 from motorid.estimation.least_squares import FAILURES
 from motorid.estimation.linearisation import INSEPARABLE
@@ -44,7 +44,6 @@ from motorid.model.definition import Effect
 from motorid.problem.runs import SGN_WIDTH_SHARE
 from motorid.records.checks import current_limit
 
-AHEAD = 3  # functions of a curve that may help only together, beyond the best set so far
 LIMITER = "driver_current_limit"
 
 
@@ -97,31 +96,29 @@ def form_predictions(fit: Fit, linear: Linear, form: Form, kept: Sequence[int] |
     return Predictions(by_channel(problem, moved, blocks), {}) if np.isfinite(moved).all() else None
 
 
-def chosen_functions(fit: Fit, linear: Linear, form: Form) -> list[int]:
+def chosen_functions(fit: Fit, linear: Linear, form: Form, chosen_before: Iterable[int] = ()) -> list[int]:
     """Return the fewest functions of a form that beside `fit` predict blocks left out, the most useful first.
 
     Orthogonal matching pursuit (Pati, Rezaiifar & Krishnaprasad 1993): each time the function that takes most of what
     is left. Of the sets passed the smallest that predicts within one standard error of the best is taken (Breiman et
     al., Classification and Regression Trees, 1984, 3.4), if it is worth it. What the model's own parameters do already
-    is no function of its own.
+    is no function of its own. All sets are passed: the waves of a narrow dip help only together.
     """
     before = form_predictions(fit, linear, form, ())
     if before is None:
         return []
     best = tuple[int, ...](), before
     sets = [best]
-    for chosen in _pursued(fit, linear, form):
+    for chosen in _pursued(fit, linear, form, list(chosen_before)):
         if (after := form_predictions(fit, linear, form, chosen)) is not None:
             sets.append((chosen, after))
             best = (chosen, after) if compare(best[1], after).gain > 0 else best
-        if len(chosen) - len(best[0]) >= AHEAD:
-            break
     chosen, after = next(s for s in sets if (e := compare(s[1], best[1])).gain <= e.se)
     return list(chosen) if compare(before, after).worth_it else []
 
 
-def _pursued(fit: Fit, linear: Linear, form: Form) -> Iterator[tuple[int, ...]]:
-    """Yield sets of functions, each with one more: that which takes most of what is left."""
+def _pursued(fit: Fit, linear: Linear, form: Form, had: Sequence[int]) -> Iterator[tuple[int, ...]]:
+    """Yield sets of functions, each with one more: that which takes most of what is left, beside those it `had`."""
     columns, _ = form_columns(fit, linear, form)
     known, answers = np.split(columns, [linear.slopes.shape[1]], axis=1)
     known = np.linalg.svd(known[:, np.linalg.norm(known, axis=0) > 0], full_matrices=False)[0]
@@ -131,6 +128,7 @@ def _pursued(fit: Fit, linear: Linear, form: Form) -> Iterator[tuple[int, ...]]:
     while True:
         norms = np.linalg.norm(left, axis=0)
         free = norms > INSEPARABLE * sizes
+        free[had] = False
         taken = np.where(free, np.abs(residual @ left) / np.where(free, norms, 1.0), 0.0)
         best = int(np.argmax(taken))
         if not taken[best] > 0:
@@ -180,7 +178,7 @@ def grades_of(last: Node, root: Node, groups: Sequence[Sequence[str]], beside: S
             better = next((b for b in told if beside and b.form == beside[0].form), told[0] if told else None)
             if better is not None:
                 form, why = better.form, f"{better.form.text}, which the library lacks, predicts better in its place"
-            elif taken < MOST:
+            elif taken < (UNCONTESTED if e.balance == "transmission" else MOST):
                 why = f"it removes {percent(taken, 2)} of the squared error, and the rest is not noise"
         kind = "approximates" if why else "group" if rivals.get(e.name) else "named"
         found.append(Grade(e.name, kind, why, form))

@@ -47,8 +47,10 @@ from motorid.numerics.signals import Array
 WHERE = {"torque": "mechanical", "voltage": "electrical", "both": "electrical", "sensor": "sensor"}
 TRIED = 4  # curves that are fitted, those that promise most
 ROUNDS = 3  # of choosing functions and fitting: near the optimum slopes show what the misfit hid before
-QUANTITIES = {"turn": "m.theta", "theta": "m.theta", "omega": "m.omega", "i": "m.i", "v": "m.v", "past v": "m.v",
-              "past i": "m.i", "past omega": "m.omega", "past speed": "ca.fabs(m.omega)", "path": "m.sign(m.omega)"}
+QUANTITIES = {"t": "m.state('clock')", "distance": "m.state('distance')", "turn": "m.theta", "theta": "m.theta",
+              "omega": "m.omega", "i": "m.i", "v": "m.v", "past v": "m.v", "past i": "m.i", "past omega": "m.omega",
+              "past speed": "ca.fabs(m.omega)", "path": "m.sign(m.omega)"}
+RATES = {"t": "1.0", "distance": "ca.fabs(m.omega)"}
 SI = {"theta": "rad", "omega": "rad/s", "speed": "rad/s", "i": "A", "v": "V"}
 OVER = {"": "", "A": "/A", "V": "/V", "rad/s": "·s/rad"}
 FIRST = {"past i": ", m.start['i']", "past omega": ", m.start['omega']"}  # of a memory: as if it had been so before
@@ -158,7 +160,7 @@ class Curve:
         """
         last = self.fitted or self.fit
         linear = linearised(last, self.form, self._span)
-        more = chosen_functions(last, linear, self.form)
+        more = chosen_functions(last, linear, self.form, self.coefficients)
         if not more:
             return None
         free = form_coefficients(last, linear, self.form, more)
@@ -189,7 +191,9 @@ class Curve:
     def law(self) -> str:
         """The law as source."""
         form, names = self.form, list(self.sizes)
-        lines = ["z = m.state('clock')", "m.rate(z, 1.0)"] if form.on == "t" else [f"z = {QUANTITIES[form.on]}"]
+        lines = [f"z = {QUANTITIES[form.on]}"]
+        if form.on in RATES:
+            lines += [f"m.rate(z, {RATES[form.on]})"]
         terms = self._terms
         if form.remembers:
             rate = " * ca.fabs(m.omega)" if form.on == "path" else ""
