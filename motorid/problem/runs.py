@@ -135,8 +135,8 @@ def initial_state(run: Experiment, sigma: Mapping[str, float],
             reach[c] = _reach(y, sigma[c])
     if "theta" in run.outputs and not known:
         speed, far = _first_speed(run.outputs["theta"], run.t, sigma["theta"])
-        if "omega" not in run.outputs:
-            start[1], reach["omega"] = speed, far
+        if "omega" not in run.outputs:  # an angle of few counts tells late that a motor begins at rest
+            start[1], reach["omega"] = speed, max(far, abs(speed)) if _may_rest(run, sigma, _lead(run)) else far
         elif (apart := abs(speed - start[1])) > far:  # the sensors may disagree, by an offset
             reach["omega"] = max(reach["omega"], apart + far)
     if "i" not in run.outputs and not known:
@@ -151,9 +151,28 @@ def initial_state(run: Experiment, sigma: Mapping[str, float],
 
 def at_rest(run: Experiment, sigma: Mapping[str, float]) -> tuple[bool, int]:
     """Tell whether the run begins at rest, and how many samples that lasts."""
+    lead = _lead(run)
+    if not _may_rest(run, sigma, lead):
+        return False, 1
+    if "omega" not in run.outputs and "theta" in run.outputs:
+        y, t = run.outputs["theta"], run.t
+        speed, _ = _first_speed(y, t, sigma["theta"])
+        moving = abs(speed) > 0.05 * np.max(np.abs(window_slopes(t, y)), initial=0.0)
+        if (moving and not _starts_from_rest(y, t, sigma["theta"], speed)) or (
+                _creeps(y[max(lead - 1, 0):], t[max(lead - 1, 0):], sigma["theta"])):
+            return False, 1
+    return True, max(lead, 1)
+
+
+def _lead(run: Experiment) -> int:
+    """Return the number of samples before the first voltage."""
     v = run.inputs["v"]
     quiet = np.abs(v) <= 1e-3 * max(np.abs(v).max(), 1e-300)
-    lead = int(np.argmin(quiet)) if not quiet.all() else len(v)
+    return int(np.argmin(quiet)) if not quiet.all() else len(v)
+
+
+def _may_rest(run: Experiment, sigma: Mapping[str, float], lead: int) -> bool:
+    """Tell whether neither current nor speed speak against rest at the first samples."""
     # With the voltage on from the first sample, a motor at rest moves at the second: there both tell at the first.
     checked = max(lead, 1 if {"i", "omega"} <= sigma.keys() else 2)
     for c in ("i", "omega"):
@@ -163,15 +182,8 @@ def at_rest(run: Experiment, sigma: Mapping[str, float]) -> tuple[bool, int]:
             top = np.nanmax(np.abs(run.outputs[c]))
             # A wild first sample or an offset of the sensor is not motion; a median above the noise is.
             if y.size and abs(np.median(y)) > max(5 * sigma[c], 0.02 * top):
-                return False, 1
-    if "omega" not in run.outputs and "theta" in run.outputs:
-        y, t = run.outputs["theta"], run.t
-        speed, _ = _first_speed(y, t, sigma["theta"])
-        moving = abs(speed) > 0.05 * np.max(np.abs(window_slopes(t, y)), initial=0.0)
-        if (moving and not _starts_from_rest(y, t, sigma["theta"], speed)) or (
-                _creeps(y[max(lead - 1, 0):], t[max(lead - 1, 0):], sigma["theta"])):
-            return False, 1
-    return True, max(lead, 1)
+                return False
+    return True
 
 
 def _starts_from_rest(theta: Array, t: Array, sigma: float, speed: float) -> bool:

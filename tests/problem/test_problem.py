@@ -12,6 +12,7 @@ from lab_records import NOISE, VALUES, drive, noisy, pair, simulated
 import motorid as mi
 from motorid.errors import DataError, ModelError, UsageError
 from motorid.problem.problem import as_problem
+from motorid.problem.runs import initial_state
 from motorid.problem.simulate import simulate
 
 TRUE = mi.dc_motor(**VALUES)
@@ -204,6 +205,21 @@ def test_the_speed_at_the_start_may_come_from_the_angle_alone(rng):
     assert found["omega_0[0]"] == pytest.approx(
         simulated(np.arange(800) * 1e-3, drive(np.arange(800) * 1e-3, 6.0)).outputs["omega"][300], rel=0.1
     )
+
+
+def test_a_record_that_begins_at_rest_may_do_so_however_few_counts_tell_its_first_speed(rng):
+    """A quick start under 256 counts a turn: the speed that the first counts suggest is no limit."""
+    t = 2e-3 * np.arange(3000)
+    v = np.where(t < 0.004, 0.0, -3 * np.cos(3 * t))
+    motor = mi.dc_motor(R=1.71, L=8.6e-4, K=0.915, b=4.2e-3, J=0.0164)
+    clean = mi.simulate(motor, mi.Experiment(t, {"v": v}, {"i": 0 * t, "theta": 0 * t}), initial="rest")[0].outputs
+    step = 2 * np.pi / 256
+    run = mi.Experiment(t, {"v": v}, {"i": clean["i"] + 6e-3 * rng.normal(size=3000),
+                                      "theta": step * np.round(clean["theta"] / step)})
+    _, limits = initial_state(run, {"i": 6e-3, "theta": step / np.sqrt(12)}, "auto")
+    low, high = limits["omega"]
+    assert low <= 0 <= high
+    assert mi.evaluate(motor, run).rmse["i"] < 6.5e-3
 
 
 def test_a_slow_start_that_an_encoder_counts_is_motion_and_rest_is_rest(rng):
