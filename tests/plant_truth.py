@@ -33,6 +33,7 @@ NUMBERS = {  # one plausible size of every effect
     "speed_gain": {"k_w": 0.05},
     "driver_coast": {"V_c": 12.0},
     "driver_current_limit": {"I_lim": 1.0},
+    "driver_lag": {"T_v": 0.02},
     "supply_sag": {"R_s": 0.5, "V_s": 3.0},
     "magnet_heating": {"R_thm": 5.0, "C_thm": 4.0},
     "eddy_brake": {"c_e": 4e-4, "omega_b": 20.0},

@@ -3,6 +3,7 @@
 An effect is a function of the motor and its own numbers that returns what it does:
 
     drive(v, w) -> v          the bridge: from the commanded voltage to the one at the terminals
+    lag -> s                  time constant with which the driver's voltage follows the command
     bridge(v, i) -> v         the supply behind it: from the voltage of the bridge to the one at the terminals
     diodes -> V               the bridge opens at command 0; what then stands against the dying current
     limit -> A                the current that the bridge does not let grow any further
@@ -98,6 +99,11 @@ def driver_coast(m: Motor, V_c: float) -> Hooks:
 @_known
 def driver_current_limit(m: Motor, I_lim: float) -> Hooks:
     return {"limit": I_lim}
+
+
+@_known
+def driver_lag(m: Motor, T_v: float) -> Hooks:
+    return {"lag": T_v}
 
 
 @_known

@@ -8,7 +8,7 @@ breakaway level) or slides on. A stuck shaft stays at exactly zero speed until t
 from __future__ import annotations
 
 from collections.abc import Callable
-from math import ceil, copysign, inf
+from math import ceil, copysign, exp, inf
 
 import numpy as np
 
@@ -56,6 +56,8 @@ class Plant:
         self._sensors = Chain(hooks, omega0)
         self._v, self._coasts = 0.0, any("diodes" in h for h in hooks)
         self._limit = min((h["limit"] for h in hooks if "limit" in h), default=inf)
+        self._lag = sum(h["lag"] for h in hooks if "lag" in h)
+        self._driven = motor.K * omega0  # what the driver makes of the command: at first what holds the motor
 
     i = property(lambda self: self._y[0])
     omega = property(lambda self: self._y[1])
@@ -72,7 +74,7 @@ class Plant:
         self._v = v + n * slope
         for k in range(n):
             i = self._y[0]
-            self._advance(v + k * slope, v + (k + 1) * slope, h)
+            self._advance(*self._behind(v + k * slope, v + (k + 1) * slope, h), h)
             if self._coasts and v == 0 == slope and i * self._y[0] <= 0:
                 self._y[0] = 0.0  # the diodes let no current turn round
             if abs(i) <= self._limit < abs(self._y[0]):
@@ -80,6 +82,14 @@ class Plant:
             self.t = t0 + (k + 1) * h
             self._sensors.sample(self.t, h, self._y[0], self._y[1])
         return self.measured()
+
+    def _behind(self, v0: float, v1: float, h: float) -> tuple[float, float]:
+        """Voltage of the driver at both ends of a step of h seconds, exact for a command that goes straight."""
+        if not self._lag:
+            return v0, v1
+        before, late = self._driven, (v1 - v0) / h * self._lag  # a ramp is followed that much behind
+        self._driven = v1 - late + (before - v0 + late) * exp(-h / self._lag)
+        return before, self._driven
 
     def measured(self, v: float | None = None) -> dict[str, float]:
         """Current, speed and angle as the sensors give them (no noise; see `sensors.py` for that).

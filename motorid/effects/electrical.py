@@ -102,6 +102,20 @@ def driver_current_limit(m: Equations, I_lim=P(5.0, "A", null=float("inf"), posi
 
 
 @effect(balance="voltage")
+def driver_lag(m: Equations, T_v=P(5e-3, "s", null=0.0, positive=True, grid=(1.0, 4.0, 16.0),
+                                   doc="time constant of the driver's output")):
+    """First-order lag of the driver: an output filter, a slow amplifier. Åström & Murray, Feedback Systems, 2008.
+
+    Seen as current and speed that are both late: quick steps, both measured. T_v and L/R may change places in a fit:
+    fix L where it is known.
+    """
+    first = m.base("R") * m.start["i"] + m.base("K") * m.start["omega"]  # what holds the motor as it was
+    z = m.state("v_lagged", first)
+    m.rate(z, (m.v - z) / T_v)
+    m.voltage -= m.v - z
+
+
+@effect(balance="voltage")
 def supply_sag(m: Equations, R_s=P(0.1, "Ω", null=0.0, lower=0.0, doc="resistance of supply and leads"),
                V_s=P(12.0, "V", positive=True, vary=False, grid=(1.0,), doc="supply without load, fixed")):
     """Sag of the supply, d·(V_s − R_s·d·i), d = v/V_s. Mohan, Electric Machines and Drives, 2012.

@@ -82,6 +82,12 @@ class Equations:
                               "it out, or use dc_motor() with a record of the applied voltage.")
         return ModelError(f"{self.writer}: {one_of(name, known, 'quantity')}")
 
+    def base(self, name: str) -> ca.SX:
+        """Return a parameter of the motor alone, whatever effects make of it: for initial states."""
+        if name not in self.symbols:
+            raise self._unknown(name, self.symbols)
+        return self.symbols[name]
+
     def angle_state(self) -> ca.SX:
         """Return the model's own angle, adding ``dθ/dt = ω`` where it is first used."""
         if "theta" not in self.states:

@@ -23,6 +23,7 @@ COASTING = {
 SIZES: dict[str, Callable[[P.Motor, float], dict[str, float]]] = {
     "driver_coast": lambda m, u: {"V_c": m.v_max + 1.4},
     "driver_current_limit": lambda m, u: {"I_lim": 0.2 * m.i_max},
+    "driver_lag": lambda m, u: {"T_v": max(0.2 * time_constant(m), 2 * DT[m.name])},
     "supply_sag": lambda m, u: {"R_s": 0.3 * m.R, "V_s": 1.05 * u},
     "magnet_heating": lambda m, u: {"R_thm": 240 * m.R / u**2, "C_thm": u**2 / m.R * DT[m.name] / 0.6},
     "eddy_brake": lambda m, u: {"c_e": 0.96 * m.K**2 / m.R, "omega_b": 0.25 * u / m.K},
@@ -37,7 +38,7 @@ SIZES: dict[str, Callable[[P.Motor, float], dict[str, float]]] = {
     "current_gain": lambda m, u: {"k_i": 0.08},
     "supply_side_current": lambda m, u: {"V_dc": 1.0 * u},
 }
-KNOWN = {"gear_efficiency": ("J",), "current_gain": ("R",)}
+KNOWN = {"driver_lag": ("L",), "gear_efficiency": ("J",), "current_gain": ("R",)}
 SEES_ANGLE = ("spring", "angular_friction", "speed_offset")
 
 

@@ -39,6 +39,7 @@ TRUTH = {
     "speed_gain": {"k_w": 0.04},
     "driver_coast": {"R_c": 9.0},
     "driver_current_limit": {"I_lim": 2.5},
+    "driver_lag": {"T_v": 6e-3},
     "supply_sag": {"R_s": 0.4, "V_s": 8.0},
     "magnet_heating": {"R_thm": 20.0, "C_thm": 0.3},
     "eddy_brake": {"c_e": 3e-4, "omega_b": 30.0},
@@ -51,6 +52,7 @@ TRUTH = {
     "supply_side_current": {"V_dc": 9.0},
 }
 KNOWN = {  # what the records leave open
+    "driver_lag": {"L": VALUES["L"]},
     "supply_sag": {"V_s": 8.0},
     "supply_side_current": {"V_dc": 9.0},
     "current_gain": {"R": VALUES["R"]},
