@@ -20,7 +20,7 @@ import typer
 
 from motorid import effects as library
 from motorid.channels import CHANNELS
-from motorid.errors import ModelError, UsageError, one_of
+from motorid.errors import ModelError, UsageError, among
 from motorid.estimation.fit import fit
 from motorid.estimation.result import Fit
 from motorid.estimation.shooting.multiple_shooting import MultipleShooting
@@ -100,8 +100,7 @@ class ReadingOptions:
         out = _words([self.ignore] if self.ignore else [])
         known = [c for c in CHANNELS if any(c in r.outputs for r in runs)]
         for channel in out:
-            if channel not in known:
-                raise UsageError(f"--ignore: {one_of(channel, known, 'measured channel')}")
+            among(channel, known, "measured channel", where="--ignore: ")
         for r in runs:
             if set(r.outputs) <= set(out):
                 raise UsageError(f"--ignore {self.ignore} leaves nothing measured in {r.name}; keep one of "
@@ -185,8 +184,7 @@ class FitOptions(ReadingOptions):
     def _check_words(self) -> None:
         for word, known, what in ((self.drive, DRIVES, "drive"), (self.formulation, FORMULATIONS, "formulation"),
                                   (self.solver or "lm", SOLVERS, "solver"), (self.loss, LOSSES, "loss")):
-            if word not in known:
-                raise UsageError(f"--{what}: {one_of(word, known, what)}")
+            among(word, known, what, where=f"--{what}: ")
         if self.formulation == "hard" and self.solver == "lm":
             raise UsageError("--formulation hard needs --solver multiple-shooting: least squares has no true "
                              "constraints. Leave --solver out, or take --formulation penalty.")
@@ -248,9 +246,8 @@ def own_effects(path: Path) -> dict[str, Effect]:
 
 def named_effect(name: str, own: dict[str, Effect]) -> Effect:
     """Return an effect of the user's file, or of the library."""
-    if name not in (known := {**library.EVERY, **own}):
-        raise ModelError(f"--effects: {one_of(name, [*own, *library.EVERY], 'effect')}")
-    return known[name]
+    among(name, [*own, *library.EVERY], "effect", ModelError, "--effects: ")
+    return {**library.EVERY, **own}[name]
 
 
 def saved_model(path: Path, effects_from: Path | None = None) -> Model:

@@ -14,7 +14,7 @@ import numpy as np
 
 from motorid.display.cards import Card, Flag, Shown, Table
 from motorid.display.numbers import quantity
-from motorid.errors import ModelError, one_of
+from motorid.errors import ModelError, among, one_of
 
 
 @dataclass(frozen=True)
@@ -169,8 +169,7 @@ class Effect(Shown):
         """Return the effect with some parameters given, e.g. ``cogging(N=12)`` (fixed if it is an order)."""
         known = {p.name: p for p in self.parameters}
         for name in values:
-            if name not in known:
-                raise ModelError(f"effect '{self.name}': {one_of(name, known, 'parameter')}")
+            among(name, known, "parameter", ModelError, f"effect '{self.name}': ")
         pars = tuple(replace(p, value=float(values[p.name]), given=True, vary=p.vary and not p.order)
                      if p.name in values else p for p in self.parameters)
         return replace(self, parameters=pars)
@@ -231,8 +230,7 @@ def effect(*, balance: str, name: str | None = None,
     ...     m.torque -= tau_c * m.sign(m.omega)
     >>> fit = mi.fit(mi.dc_motor() + dry_friction, runs)
     """
-    if balance not in BALANCES:
-        raise ModelError(one_of(balance, BALANCES, "balance"))
+    among(balance, BALANCES, "balance", ModelError)
 
     def make(law: Callable[..., None]) -> Effect:
         if not callable(law):

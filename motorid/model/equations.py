@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from motorid.channels import CHANNELS, MEASURED_INPUTS
-from motorid.errors import ModelError, one_of
+from motorid.errors import ModelError, among, one_of
 from motorid.numerics.signals import Array
 
 
@@ -98,16 +98,14 @@ class Equations:
 
     def measured(self, channel: str) -> ca.SX:
         """Return what the sensor of `channel` shows so far (several sensor effects follow one another)."""
-        if channel not in CHANNELS:
-            raise ModelError(f"{self.writer}: {one_of(channel, CHANNELS, 'channel')}")
+        among(channel, CHANNELS, "channel", ModelError, f"{self.writer}: ")
         if channel in self.sensors:
             return self.sensors[channel]
         return self.angle_state() if channel == "theta" else self.__getattr__(channel)
 
     def input(self, name: str) -> ca.SX:
         """Return what was measured beside the voltage, e.g. ``"tau_load"``; the model's records must have it."""
-        if name not in MEASURED_INPUTS:
-            raise ModelError(f"{self.writer}: {one_of(name, MEASURED_INPUTS, 'input')}")
+        among(name, MEASURED_INPUTS, "input", ModelError, f"{self.writer}: ")
         return self.inputs.setdefault(name, ca.SX.sym(name))
 
     # -- writing ---------------------------------------------------------------------------------------

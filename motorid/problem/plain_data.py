@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from motorid.effects import EVERY
-from motorid.errors import DataError, ModelError, UsageError, one_of
+from motorid.errors import DataError, ModelError, UsageError, among, one_of
 from motorid.integrate import ENGINES
 from motorid.model.definition import Effect
 from motorid.model.model import Model, dc_motor, torque_driven
@@ -134,8 +134,7 @@ def _assembled(head: Mapping[str, Any], effects: Iterable[Effect],
                given: Mapping[str, Mapping[str, float]] | None = None) -> Model:
     """Return base and effects; `given` are parameters that the user set in an effect."""
     base, axis = str(head["base"]), head.get("axis", "rotary")
-    if base not in ("dc_motor", "torque_driven"):
-        raise DataError(one_of(base, ("dc_motor", "torque_driven"), "base"))
+    among(base, ("dc_motor", "torque_driven"), "base", DataError)
     model = dc_motor() if base == "dc_motor" else torque_driven(axis)
     own = {e.name: e for e in effects}
     for name in map(str, head["effects"]):
