@@ -54,7 +54,9 @@ class ShootingNlp:
         at = self._evaluate(z, True)
         self.n, self.m = len(z), len(at.g)
         self.scale = STEEPEST / max(_steepest(at.residual, self.n), 1e-300)
-        self.jac_pattern, self._jac_order = _jacobian_pattern(at.rows, self.m, self.n)
+        rows, columns = places(at.rows)
+        self._jac_order = np.lexsort((rows, columns))  # the blocks' entries fill it column by column
+        self.jac_pattern = _ccs(rows[self._jac_order], columns[self._jac_order], self.m, self.n)
         self.hess_pattern, self._hess_mask, self._hess_place = _hessian_pattern(at.residual, self.n)
         self.lower, self.upper = self._limits(z)
 
@@ -163,13 +165,6 @@ def _steepest(blocks: Sequence[Block], n: int) -> float:
     for b in blocks:
         found[b.columns] += np.einsum("ij,ij->j", b.jac, b.jac)
     return float(found.max(initial=0.0))
-
-
-def _jacobian_pattern(blocks: Sequence[Block], m: int, n: int) -> tuple[ca.Sparsity, np.ndarray]:
-    """Return the sparsity and the order in which the blocks' entries fill it, column by column."""
-    rows, columns = places(blocks)
-    order = np.lexsort((rows, columns))
-    return _ccs(rows[order], columns[order], m, n), order
 
 
 def _hessian_pattern(blocks: Sequence[Block], n: int) -> tuple[ca.Sparsity, np.ndarray, np.ndarray]:
