@@ -9,7 +9,6 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
 from motorid.channels import CHANNELS, MEASURED_INPUTS
 from motorid.errors import ModelError, among, one_of
@@ -196,7 +195,8 @@ class System:
         nx, nu, np_, _ = self.sizes
         x, u, p, s = ca.SX.sym("x", nx), ca.SX.sym("u", nu), ca.SX.sym("p", np_), ca.SX.sym("s", 3)
         f, y, x0 = self.rhs(x, u, p), self.out(x, u, p), self.initial(s, p)
-        f_x, f_p, y_x, y_p, x0_p = (_pattern(a, b) for a, b in ((f, x), (f, p), (y, x), (y, p), (x0, p)))
+        f_x, f_p, y_x, y_p, x0_p = (np.asarray(ca.DM(ca.jacobian_sparsity(a, b), 1).full(), bool)
+                                    for a, b in ((f, x), (f, p), (y, x), (y, p), (x0, p)))
         seen = y_x.any(axis=0)  # states that act on an output, directly or through other states
         for _ in range(nx):
             seen = seen | f_x[seen].any(axis=0)
@@ -234,10 +234,6 @@ class System:
 
     def __getstate__(self) -> dict[str, Any]:
         return {f: getattr(self, f) for f in self.__dataclass_fields__}
-
-
-def _pattern(f: ca.SX, z: ca.SX) -> NDArray[np.bool_]:
-    return np.asarray(ca.DM(ca.jacobian_sparsity(f, z), 1).full(), bool)
 
 
 def build_system(m: Equations, parameters: tuple[str, ...], outputs: tuple[str, ...],

@@ -19,9 +19,8 @@ NEAR = 0.5  # of the limit: what is worth a closer look
 
 
 @style.styled
-def plot_current_limit(
-    *results: Fit | Formulations, limit: float | None = None, labels: Sequence[str] | None = None
-) -> np.ndarray:
+def plot_current_limit(*results: Fit | Formulations, limit: float | None = None,
+                       labels: Sequence[str] | None = None) -> np.ndarray:
     """Draw the current of one or several fits against the limit, what lies above it shaded.
 
     Parameters
