@@ -175,8 +175,7 @@ class Stepper:
     @cached_property
     def _constant_slopes(self) -> Array | None:
         """|dy/dx|, if it is the same everywhere."""
-        sizes = (self.functions.out.size1_in(k) for k in range(3))
-        slopes = self.functions.out(*(ca.SX.sym(n, k) for n, k in zip("xup", sizes, strict=True)))[1]
+        slopes = self.functions.out(*self.functions.out.sx_in())[1]
         return None if ca.symvar(slopes) else np.abs(np.asarray(ca.DM(ca.evalf(slopes))))
 
     def _load(self, compiled: bool | None) -> Any:
@@ -251,9 +250,8 @@ class Machine:
 
     def _walk(self, nq: int) -> ca.Function:
         """Return CHUNK steps in a row; sensitivities go transposed, so that time comes first in memory."""
-        x, s = ca.SX.sym("x", self.nx), ca.SX.sym("S", nq, self.nx)
-        u0, u1, h = ca.SX.sym("u0", self.nu), ca.SX.sym("u1", self.nu), ca.SX.sym("h")
-        p, dp = ca.SX.sym("p", self.np), ca.SX.sym("dp", nq, self.np)
+        x, u0, u1, h, p = self.functions.full.sx_in()
+        s, dp = ca.SX.sym("S", nq, self.nx), ca.SX.sym("dp", nq, self.np)
         if nq:
             x_next, a, b = self.functions.full(x, u0, u1, h, p)
             one = ca.Function("one", [x, s, u0, u1, h, p, dp], [x_next, ca.densify(s @ a.T + dp @ b.T)])
@@ -262,9 +260,9 @@ class Machine:
         return one.mapaccum("walk", CHUNK, 1, {})
 
     def _observation(self, derivatives: bool) -> ca.Function:
-        x, u, p = ca.SX.sym("x", self.nx), ca.SX.sym("u", self.nu), ca.SX.sym("p", self.np)
-        y, c, d = self.functions.out(x, u, p)
-        return ca.Function("seen", [x, u, p], [y, c.T, d.T] if derivatives else [y]).map(CHUNK)
+        given = self.functions.out.sx_in()
+        y, c, d = self.functions.out(*given)
+        return ca.Function("seen", given, [y, c.T, d.T] if derivatives else [y]).map(CHUNK)
 
     def run(self, grid: Grid, x0: Array, p: Array, dx0: Array | None, dp: Array | None,
             local_error: bool) -> Trajectory:
@@ -297,8 +295,7 @@ class Machine:
     @cached_property
     def _restarted(self) -> ca.Function:
         """CHUNK steps in a row, some of them from another state."""
-        x, first = ca.SX.sym("x", self.nx), ca.SX.sym("first", 1 + self.nx)
-        rest = [ca.SX.sym("u0", self.nu), ca.SX.sym("u1", self.nu), ca.SX.sym("h"), ca.SX.sym("p", self.np)]
+        (x, *rest), first = self.functions.light.sx_in(), ca.SX.sym("first", 1 + self.nx)
         begin = ca.if_else(first[0], first[1:], x)
         return ca.Function("one", [x, first, *rest], [self.functions.light(begin, *rest)[0]]).mapaccum("walk", CHUNK)
 
@@ -330,8 +327,7 @@ def _laid_out(grid: Grid, dt: Array) -> tuple[Array, Array, Array, NDArray[np.in
     slope = np.repeat(grid.u1 - grid.u0, m, axis=0) * share[:, None]
     ua = np.repeat(grid.u0, m, axis=0) + slope * part[:, None]
     full = -(-steps // CHUNK) * CHUNK
-    h = np.repeat(dt, m) * share
-    return _padded(ua, full), _padded(ua + slope, full), _padded(h, full), ends
+    return _padded(ua, full), _padded(ua + slope, full), _padded(np.repeat(dt, m) * share, full), ends
 
 
 def _padded(a: Array, n: int) -> Array:
