@@ -78,8 +78,7 @@ class Client:
         end, wanted = time.monotonic() + within, answer.split(",")
         while (now := time.monotonic()) < end:
             self.link.write(frame(command))
-            again = now + AGAIN
-            while (left := again - time.monotonic()) > 0:
+            while (left := now + AGAIN - time.monotonic()) > 0:
                 got = self.receive(left)
                 for k, item in enumerate(got):
                     if isinstance(item, Sample):

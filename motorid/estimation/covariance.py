@@ -77,8 +77,7 @@ def certainty(problem: Problem, q: Array, residuals: Array, jacobian: Array, fre
     `free` (k, m) are the directions that active constraints leave; ``method="white"`` takes samples as independent.
     """
     among(method, ("coloured", "white"), "method")
-    physical = problem.scaling.physical(q)
-    limits = [_limit(p.lower, p.upper, v) for p, v in zip(problem.unknown, physical, strict=True)]
+    limits = [_limit(p.lower, p.upper, v) for p, v in zip(problem.unknown, problem.scaling.physical(q), strict=True)]
     loose = np.array([not s for s in limits], bool)
     basis = np.eye(len(loose))[:, loose] if free is None else free
     blocks = channel_blocks(problem, residuals, jacobian)

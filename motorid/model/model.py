@@ -99,9 +99,8 @@ class Model(Shown):
 
     def fix(self, *names: str, **values: float) -> Model:
         """Return the model with parameters fixed: ``fix(R=1.2)`` there, ``fix("R")`` at the value it has."""
-        changes: dict[str, dict[str, Any]] = {n: {"vary": False} for n in names}
-        changes |= {n: {"value": float(v), "vary": False, "given": True} for n, v in values.items()}
-        return self._change(changes)
+        return self._change({n: {"vary": False} for n in names}
+                            | {n: {"value": float(v), "vary": False, "given": True} for n, v in values.items()})
 
     def free(self, *names: str) -> Model:
         """Return the model with the parameters `names` estimated again."""

@@ -51,8 +51,7 @@ def plot_current_limit(*results: Fit | Formulations, limit: float | None = None,
     if not all("i" in s.outputs for f in fits for s in f.simulations):
         raise UsageError("these fits have no current: it was not measured, or the model has none.")
     words = list(labels or [f.formulation for f in fits])
-    runs = min(len(fits[0].simulations), 3)
-    axes = style.grid(len(fits), runs, row=1.5, sharex="col", sharey="row")
+    axes = style.grid(len(fits), min(len(fits[0].simulations), 3), row=1.5, sharex="col", sharey="row")
     for row, fit, word in zip(axes, fits, words, strict=False):
         for ax, s in zip(row, fit.simulations, strict=False):
             _against_limit(ax, s, limit)

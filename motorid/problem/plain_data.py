@@ -52,8 +52,7 @@ def problem_of(about: Mapping[str, Any], data: Mapping[str, Any], effects: Itera
     model = model.with_(angle_input=bool(about["angle_input"]),
                         parameters={n: replace(p, **told[n]) for n, p in model.parameters.items()})
     runs = [Experiment(**r["record"]) for r in data["runs"]]
-    more = {f: data[f] for f in PLAIN} | {f: _built(data[f]) for f in OPTIONS}
-    problem = Problem(model, tuple(runs), **more)
+    problem = Problem(model, tuple(runs), **{f: data[f] for f in PLAIN}, **{f: _built(data[f]) for f in OPTIONS})
     ready = [_run_of(problem, run, r) for run, r in zip(problem.experiments, data["runs"], strict=True)]
     return problem.with_runs(tuple(ready))
 

@@ -266,8 +266,7 @@ class Problem:
         parts += [penalty.evaluate(self, q, trajs) for penalty in self.penalties]
         if len(parts) == 1:
             return parts[0]
-        r = np.concatenate([p[0] for p in parts])
-        return r, np.concatenate([p[1] for p in parts]) if derivatives else None
+        return np.concatenate([p[0] for p in parts]), np.concatenate([p[1] for p in parts]) if derivatives else None
 
     def with_loss(self, r: Array, jac: Array | None) -> tuple[Array, Array | None]:
         """Return residual and Jacobian with the robust loss, if there is one."""

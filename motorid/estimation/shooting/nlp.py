@@ -177,8 +177,7 @@ def _hessian_pattern(blocks: Sequence[Block], n: int) -> tuple[ca.Sparsity, np.n
 
 
 def _ccs(rows: np.ndarray, columns: np.ndarray, m: int, n: int) -> ca.Sparsity:
-    starts = np.searchsorted(columns, np.arange(n + 1))
-    return ca.Sparsity(m, n, starts.tolist(), rows.tolist())
+    return ca.Sparsity(m, n, np.searchsorted(columns, np.arange(n + 1)).tolist(), rows.tolist())
 
 
 def ipopt(nlp: ShootingNlp, z0: Array, bounds: tuple[Array, Array], options: Mapping[str, Any],
