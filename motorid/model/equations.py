@@ -214,12 +214,8 @@ class System:
         """Return dx0/ds (nx, 3) and dx0/dp (nx, np)."""
         if self._affine is not None:
             return self._affine[1], self._affine[2]
-        by_s, by_p = self._initial_jacobian(s, p, np.zeros(len(self.states)))
+        by_s, by_p = self.initial.jacobian()(s, p, np.zeros(len(self.states)))
         return np.asarray(by_s), np.asarray(by_p)
-
-    @cached_property
-    def _initial_jacobian(self) -> ca.Function:
-        return self.initial.jacobian()
 
     @cached_property
     def _affine(self) -> tuple[Array, Array, Array] | None:
