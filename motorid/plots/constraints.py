@@ -104,10 +104,6 @@ def _limit_of(fits: Sequence[Fit]) -> float:
 def plot_formulations(result: Formulations) -> np.ndarray:
     """Draw the same fit plain, with penalties and with hard constraints: parameters, errors, and the path between.
 
-    Parameters
-    ----------
-    result : Formulations
-
     Returns
     -------
     ndarray of Axes, shape (3,)

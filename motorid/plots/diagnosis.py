@@ -108,11 +108,6 @@ def plot_answer(found: Diagnosis, ax: Axes | None = None) -> Axes:
     last model has instead: the accepted effects and the shift of the parameters. An effect with so many periods per
     turn is drawn over one of them.
 
-    Parameters
-    ----------
-    found : Diagnosis
-    ax : Axes, optional
-
     Examples
     --------
     >>> axes = mi.plot_answer(found)
@@ -226,11 +221,6 @@ def _ranking_legend(ax: Axes, chosen: Sequence[Candidate]) -> None:
 def plot_ladder(result: Ladder | Diagnosis, ax: Axes | None = None) -> Axes:
     """Draw how the error falls as effects are added: on the records of the fit, and on those it never saw.
 
-    Parameters
-    ----------
-    result : Ladder or Diagnosis
-    ax : Axes, optional
-
     Examples
     --------
     >>> axes = mi.plot_ladder(found)
@@ -278,10 +268,6 @@ def _error_labels(ax: Axes, k: int, errors: Mapping[str, float]) -> None:
 @style.styled
 def plot_design(design: Design) -> np.ndarray:
     """Draw a designed voltage, and what each rival predicts with a band of two standard deviations.
-
-    Parameters
-    ----------
-    design : Design
 
     Returns
     -------

@@ -88,10 +88,6 @@ def check_derivatives(problem: Problem, q: Array | None = None, *, steps: Sequen
     tolerance : float
         CVODES and IDAS reach it at their default accuracy, `Rosenbrock` 1e-7.
 
-    Returns
-    -------
-    DerivativeCheck
-
     Raises
     ------
     UsageError
