@@ -39,25 +39,21 @@ DRIVES = ("voltage", "torque")
 SOLVERS = ("lm", "multiple-shooting")
 FORMULATIONS = ("plain", "penalty", "hard")
 LOSSES = ("squares", "huber")
-MODEL, SOLVE, READ, OUT = "Model", "Estimation", "Reading", "Results"
 
-_reading = functools.partial(typer.Option, rich_help_panel=READ)
-_model = functools.partial(typer.Option, rich_help_panel=MODEL)
-_solving = functools.partial(typer.Option, rich_help_panel=SOLVE)
+_reading = functools.partial(typer.Option, rich_help_panel="Reading")
+_model = functools.partial(typer.Option, rich_help_panel="Model")
+_solving = functools.partial(typer.Option, rich_help_panel="Estimation")
+result = functools.partial(typer.Option, rich_help_panel="Results")
 
 Runs = Annotated[list[str], typer.Argument(
     metavar="RUN", show_default=False, help="Records: files, directories or patterns.")]
-Json = Annotated[str | None, typer.Option(
-    "--json", metavar="PATH", rich_help_panel=OUT, help="Write the result as JSON; - for standard output.")]
-Report = Annotated[Path | None, typer.Option(
-    "--report", metavar="PATH.html", rich_help_panel=OUT, help="Write one page with figures.")]
-Force = Annotated[bool, typer.Option(
-    "--force", rich_help_panel=OUT, help="Write over inputs and over files that motorid did not write.")]
-Jobs = Annotated[int, typer.Option(
-    "--jobs", min=1, metavar="N", rich_help_panel=OUT, help="Processes that share the work.")]
+Json = Annotated[str | None, result("--json", metavar="PATH", help="Write the result as JSON; - for standard output.")]
+Report = Annotated[Path | None, result("--report", metavar="PATH.html", help="Write one page with figures.")]
+Force = Annotated[bool, result("--force", help="Write over inputs and over files that motorid did not write.")]
+Jobs = Annotated[int, result("--jobs", min=1, metavar="N", help="Processes that share the work.")]
 EffectsFrom = Annotated[Path | None, typer.Option(metavar="FILE.py", help="Effects of your own.")]
-Validate = Annotated[list[str] | None, typer.Option(
-    "--validate", metavar="RUN...", rich_help_panel=OUT,
+Validate = Annotated[list[str] | None, result(
+    "--validate", metavar="RUN...",
     help="Held-out records, never fitted; put it after the records, since it takes all names that follow.")]
 
 
