@@ -35,11 +35,6 @@ from motorid.records.experiment import Experiment, repeated
 from motorid.records.layout import parse_pairs
 from motorid.records.reading import read_runs
 
-DRIVES = ("voltage", "torque")
-SOLVERS = ("lm", "multiple-shooting")
-FORMULATIONS = ("plain", "penalty", "hard")
-LOSSES = ("squares", "huber")
-
 _reading = functools.partial(typer.Option, rich_help_panel="Reading")
 _model = functools.partial(typer.Option, rich_help_panel="Model")
 _solving = functools.partial(typer.Option, rich_help_panel="Estimation")
@@ -178,8 +173,10 @@ class FitOptions(ReadingOptions):
         return fit(self.model(runs) if model is None else model, runs, **self.keywords())
 
     def _check_words(self) -> None:
-        for word, known, what in ((self.drive, DRIVES, "drive"), (self.formulation, FORMULATIONS, "formulation"),
-                                  (self.solver or "lm", SOLVERS, "solver"), (self.loss, LOSSES, "loss")):
+        for word, known, what in ((self.drive, ("voltage", "torque"), "drive"),
+                                  (self.formulation, ("plain", "penalty", "hard"), "formulation"),
+                                  (self.solver or "lm", ("lm", "multiple-shooting"), "solver"),
+                                  (self.loss, ("squares", "huber"), "loss")):
             among(word, known, what, where=f"--{what}: ")
         if self.formulation == "hard" and self.solver == "lm":
             raise UsageError("--formulation hard needs --solver multiple-shooting: least squares has no true "

@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
 
 from motorid.diagnosis.experiment_design import Design
 from motorid.diagnosis.locate import accounted, binned
@@ -204,9 +206,6 @@ def plot_ranking(result: Diagnosis | Sequence[Candidate], ax: Axes | None = None
 
 
 def _ranking_legend(ax: Axes, chosen: Sequence[Candidate]) -> None:
-    from matplotlib.lines import Line2D
-    from matplotlib.patches import Patch
-
     handles: list[Any] = [Patch(fill=False, edgecolor=style.INK, label="predicted")]
     for accepted, colour, label in ((True, "blue", "refitted, accepted"), (False, "grey", "refitted, not accepted")):
         if any(c.accepted == accepted and c.refit_drop is not None for c in chosen):
