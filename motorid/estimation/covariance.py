@@ -53,9 +53,8 @@ class Certainty:
     @property
     def std(self) -> tuple[float | None, ...]:
         """One standard deviation per unknown; None where it is not determined or at a limit."""
-        variances = np.maximum(np.diag(self.matrix), 0.0)
-        return tuple(float(np.sqrt(v)) if s == "determined" else None
-                     for s, v in zip(self.status, variances, strict=True))
+        sizes = np.sqrt(np.maximum(np.diag(self.matrix), 0.0))
+        return tuple(float(v) if s == "determined" else None for s, v in zip(self.status, sizes, strict=True))
 
     def std_of(self, slope: Array) -> float | None:
         """Return one standard deviation of a quantity with gradient `slope` (k,); None where it is not determined."""

@@ -166,8 +166,7 @@ def _pieces(grid: Grid) -> Iterator[tuple[int, int]]:
     dt = grid.dt
     flat = (grid.u0 == grid.u1).all(axis=1)
     same = np.zeros(len(dt), bool)  # interval k continues interval k-1
-    same[1:] = (flat[1:] & flat[:-1] & (grid.u0[1:] == grid.u0[:-1]).all(axis=1)
-                & (np.abs(np.diff(dt)) < 1e-6 * dt[1:]))
+    same[1:] = flat[1:] & flat[:-1] & (grid.u0[1:] == grid.u0[:-1]).all(axis=1) & (np.abs(np.diff(dt)) < 1e-6 * dt[1:])
     for a, b in pairwise([*np.flatnonzero(~same).tolist(), len(dt)]):
         while a < b:
             count = min(b - a, LENGTHS[-1])

@@ -14,7 +14,7 @@ import numpy as np
 
 from motorid.display.cards import Card, Flag, Shown, Table
 from motorid.display.numbers import quantity
-from motorid.errors import ModelError, among, one_of
+from motorid.errors import ModelError, among
 
 
 @dataclass(frozen=True)
@@ -241,10 +241,9 @@ def effect(*, balance: str, name: str | None = None,
             if not isinstance(arg.default, Declared):
                 raise ModelError(f"effect '{title}': argument '{arg.name}' needs a default P(value, unit, null=…).")
             pars.append(arg.default.named(arg.name))
-        known = ("", *(p.name for p in pars))
-        if odd := next((p for p in pars if p.at_least not in known), None):
-            raise ModelError(f"effect '{title}', at_least of '{odd.name}': "
-                             + one_of(odd.at_least, known[1:], "parameter"))
+        names = [p.name for p in pars]
+        for p in (p for p in pars if p.at_least):
+            among(p.at_least, names, "parameter", ModelError, f"effect '{title}', at_least of '{p.name}': ")
         return Effect(title, law, tuple(pars), balance, inspect.cleandoc(law.__doc__ or ""), includes)
 
     return make

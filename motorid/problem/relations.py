@@ -140,8 +140,7 @@ def local(system: Any, rows: Callable[..., Any], nd: int) -> ca.Function:
     """Return ``(x, u, p, d) -> (c, dc/dx, dc/dp)`` of the expression `rows`."""
     (x, u, p), d = system.rhs.sx_in(), ca.SX.sym("d", nd)
     c = ca.SX(rows(x, u, p, d))
-    return ca.Function("rows", [x, u, p, d],
-                       [ca.densify(c), ca.densify(ca.jacobian(c, x)), ca.densify(ca.jacobian(c, p))])
+    return ca.Function("rows", [x, u, p, d], [ca.densify(a) for a in (c, ca.jacobian(c, x), ca.jacobian(c, p))])
 
 
 def share(problem: Any, k: int) -> float:
