@@ -10,12 +10,16 @@ MEASURED_INPUTS = ("v_supply", "tau_load", "temp")  # what may be recorded besid
 NAMES = {"t": "time", "v": "voltage", "i": "current", "omega": "speed", "theta": "angle",
          "v_supply": "supply voltage", "tau_load": "load torque", "temp": "temperature"}
 SYMBOLS = {"t": "t", "v": "v", "i": "i", "omega": "ω", "theta": "θ", "v_supply": "V", "tau_load": "τ", "temp": "T"}
-# The first unit of each channel is its default. A linear axis is measured in m and m/s; the command of a
+SI = {"time": "s", "voltage": "V", "current": "A", "speed": "rad/s", "linear speed": "m/s", "angle": "rad",
+      "length": "m", "torque": "N·m", "force": "N", "ratio": "1", "temperature": "°C"}
+# What a channel may be measured in, the default first. A linear axis is measured in m and m/s; the command of a
 # current- or torque-controlled drive need not be a voltage.
-UNITS: Mapping[str, tuple[str, ...]] = MappingProxyType({
-    "t": ("s",), "v": ("V", "A", "N·m", "N", "1"), "i": ("A",), "omega": ("rad/s", "m/s"), "theta": ("rad", "m"),
-    "v_supply": ("V",), "tau_load": ("N·m", "N"), "temp": ("°C",),
+DIMENSIONS: Mapping[str, tuple[str, ...]] = MappingProxyType({
+    "t": ("time",), "v": ("voltage", "current", "torque", "force", "ratio"), "i": ("current",),
+    "omega": ("speed", "linear speed"), "theta": ("angle", "length"),
+    "v_supply": ("voltage",), "tau_load": ("torque", "force"), "temp": ("temperature",),
 })
+UNITS = MappingProxyType({c: tuple(SI[d] for d in dimensions) for c, dimensions in DIMENSIONS.items()})
 
 
 def channel_name(channel: str, unit: str = "") -> str:

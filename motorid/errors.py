@@ -231,10 +231,11 @@ def name_of(thing: object) -> str:
     return repr(thing) if isinstance(thing, str) else getattr(thing, "__name__", type(thing).__name__)
 
 
-def among(word: object, known: Iterable[object], what: str) -> None:
-    """Raise UsageError unless `word` is among the `known` names of `what`."""
+def among(word: object, known: Iterable[object], what: str, error: type[MotoridError] = UsageError,
+          where: str = "") -> None:
+    """Raise `error` unless `word` is among the `known` names of `what`; `where` begins its message."""
     if word not in (known := list(known)):
-        raise UsageError(one_of(str(word), known, what))
+        raise error(where + one_of(str(word), known, what))
 
 
 def chosen(names: Iterable[str] | None, known: Iterable[str], what: str) -> list[str]:

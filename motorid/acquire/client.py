@@ -78,8 +78,7 @@ class Client:
         end, wanted = time.monotonic() + within, answer.split(",")
         while (now := time.monotonic()) < end:
             self.link.write(frame(command))
-            again = now + AGAIN
-            while (left := again - time.monotonic()) > 0:
+            while (left := now + AGAIN - time.monotonic()) > 0:
                 got = self.receive(left)
                 for k, item in enumerate(got):
                     if isinstance(item, Sample):
@@ -104,11 +103,9 @@ class Client:
 
 def _complete(fields: list[str]) -> bool:
     """Whether an answer carries the whole numbers it has to."""
-    numbers = {"L": 2, "S": 1, "G": 2, "done": 1}.get(fields[1] if len(fields) > 1 else "", 0)
-    if fields[0] == "H":
-        return True
+    numbers = {"L": 2, "S": 1, "G": 2, "done": 1}.get("".join(fields[1:2]), 0)
     found = fields[2:2 + numbers]
-    return len(found) == numbers and all(f.isdigit() for f in found)
+    return fields[0] == "H" or (len(found) == numbers and all(f.isdigit() for f in found))
 
 
 def _milli(value: float) -> int:
@@ -196,8 +193,7 @@ def _read_once(serial: Any) -> bytes:
     if os.name != "posix":
         return serial.read(max(1, min(serial.in_waiting, 65536)))
     # pyserial's own read() gathers in a loop and drops what it has gathered when the port dies.
-    ready, _, _ = select.select([serial.fileno()], [], [], 0.05)
-    if not ready:
+    if not select.select([serial.fileno()], [], [], 0.05)[0]:
         return b""
     try:
         data = os.read(serial.fileno(), 65536)

@@ -16,7 +16,7 @@ from motorid.acquire.excitation import Program, program
 from motorid.acquire.protocol import VERSION, Channel, Header
 from motorid.acquire.record_file import Commanded, RecordFile, Tail, check_target, read_tail
 from motorid.acquire.session import Progress, Recording, Session
-from motorid.errors import DataError, UsageError, one_of, positive
+from motorid.errors import DataError, UsageError, among, positive
 
 _ENTRIES = ("scale", "offset", "gain", "zero", "sign")  # of a calibration, per channel
 
@@ -186,8 +186,7 @@ def _checked(tables: dict[str, Any], path: str | Path) -> dict[str, dict[str, fl
         if not isinstance(entries, dict):
             raise DataError(f"{path}: expected a table [channel] with entries; '{channel}' is in none.")
         for name, value in entries.items():
-            if name not in _ENTRIES:
-                raise DataError(f"{path}, [{channel}]: {one_of(name, _ENTRIES, 'entry')}")
+            among(name, _ENTRIES, "entry", DataError, f"{path}, [{channel}]: ")
             if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
                 raise DataError(f"{path}, [{channel}]: {name} must be a number; got {value!r}.")
             if name == "sign" and value not in (1, -1):
@@ -201,9 +200,7 @@ def calibrate(header: Header, calibration: dict[str, dict[str, float]]) -> Heade
     """Return the header with the channels' scales and offsets as the calibration wants them."""
     names = [c.name for c in header.channels]
     for name in calibration:
-        if name not in names:
-            raise DataError(f"the calibration names a channel that the device does not send: "
-                            f"{one_of(name, names, 'channel')}")
+        among(name, names, "channel", DataError, "the calibration names a channel that the device does not send: ")
     return replace(header, channels=tuple(_calibrated(c, calibration.get(c.name, {})) for c in header.channels))
 
 

@@ -288,21 +288,13 @@ def _stall(m: Any) -> float:
     return m.K * m.v_max / m.R  # N·m at v_max with the shaft held
 
 
-def _stribeck(m: Any, draw: Draw) -> dict[str, float]:
-    tau_c = _stall(m) * draw(0.02, 0.04)
-    return {"tau_c": tau_c, "tau_s": tau_c * draw(1.6, 2.2), "omega_s": m.no_load_speed * draw(0.02, 0.05)}
-
-
-def _asymmetric(m: Any, draw: Draw) -> dict[str, float]:
-    tau = _stall(m) * draw(0.02, 0.05)
-    return {"tau_cp": tau, "tau_cn": tau * draw(1.6, 2.5)}
-
-
 # Sizes by effect, from the motor's own scales. An effect that is not here needs its numbers spelt out.
 SIZES: Mapping[str, Callable[[Any, Draw], dict[str, float]]] = {
     "coulomb": lambda m, draw: {"tau_c": _stall(m) * draw(0.02, 0.06)},
-    "coulomb_asymmetric": _asymmetric,
-    "stribeck": _stribeck,
+    "coulomb_asymmetric": lambda m, draw: {"tau_cp": (tau := _stall(m) * draw(0.02, 0.05)),
+                                           "tau_cn": tau * draw(1.6, 2.5)},
+    "stribeck": lambda m, draw: {"tau_c": (tau_c := _stall(m) * draw(0.02, 0.04)), "tau_s": tau_c * draw(1.6, 2.2),
+                                 "omega_s": m.no_load_speed * draw(0.02, 0.05)},
     "quadratic_drag": lambda m, draw: {"c_2": _stall(m) * draw(0.05, 0.15) / (0.6 * m.no_load_speed) ** 2},
     "constant_load": lambda m, draw: {"tau_0": _stall(m) * draw(0.03, 0.08)},
     "gravity": lambda m, draw: {"mgl": _stall(m) * draw(0.04, 0.1)},

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from json import loads
 from pathlib import Path
@@ -32,38 +33,32 @@ from motorid.records.reading import read_runs
 
 DEMO_SET = "hidden_friction"
 
-LIMITS = "Limits"
+_limit = functools.partial(typer.Option, rich_help_panel="Limits")
 Found = Annotated[Path, typer.Argument(metavar="FOUND.json", help="File written by diagnose --json.")]
-Plan = Annotated[Path | None, typer.Option(
-    metavar="plan.csv", rich_help_panel=opt.OUT, help="Write time, voltage and predictions.")]
+Plan = Annotated[Path | None, opt.result(metavar="plan.csv", help="Write time, voltage and predictions.")]
 Goal = Annotated[str | None, typer.Option(
     metavar="distinguish|sharpen", help="By default to distinguish, where the diagnosis left a group of effects.")]
 Parameters = Annotated[str | None, typer.Option(metavar="R,K", help="What to sharpen; by default all that are free.")]
-Volts = Annotated[float | None, typer.Option(min=0, metavar="V", rich_help_panel=LIMITS)]
-Amperes = Annotated[float | None, typer.Option(min=0, metavar="A", rich_help_panel=LIMITS)]
-Speed = Annotated[float | None, typer.Option(min=0, metavar="RAD/S", rich_help_panel=LIMITS)]
-Angle = Annotated[tuple[float, float] | None, typer.Option(
-    metavar="RAD RAD", rich_help_panel=LIMITS, help="From, to; the start is at 0.")]
-Kelvin = Annotated[float | None, typer.Option(
-    min=0, metavar="K", rich_help_panel=LIMITS, help="Rise of the winding's temperature.")]
+Volts = Annotated[float | None, _limit(min=0, metavar="V")]
+Amperes = Annotated[float | None, _limit(min=0, metavar="A")]
+Speed = Annotated[float | None, _limit(min=0, metavar="RAD/S")]
+Angle = Annotated[tuple[float, float] | None, _limit(metavar="RAD RAD", help="From, to; the start is at 0.")]
+Kelvin = Annotated[float | None, _limit(min=0, metavar="K", help="Rise of the winding's temperature.")]
 Seconds = Annotated[float | None, typer.Option(min=0, metavar="S", help="By default that of the longest record.")]
 Shape = Annotated[str, typer.Option(metavar="steps|free|multisine", help="Steps, ramps, or ramps along sines.")]
 Levels = Annotated[int, typer.Option(metavar="N", help="Number of segments of the voltage; a bench has a limit.")]
-Slew = Annotated[float | None, typer.Option(metavar="V/S", rich_help_panel=LIMITS, help="Largest slope of ramps.")]
+Slew = Annotated[float | None, _limit(metavar="V/S", help="Largest slope of ramps.")]
 Budget = Annotated[float | None, typer.Option(metavar="S", help="Stop after this time with the best so far.")]
 
 
 @opt.with_options(opt.FitOptions)
 def diagnose_command(
     runs: opt.Runs, options: opt.FitOptions, validate: opt.Validate = None,
-    max_effects: Annotated[int, typer.Option(
-        min=0, metavar="N", rich_help_panel=opt.OUT, help="Largest number of effects to add.")] = 3,
-    budget: Annotated[float | None, typer.Option(
-        min=0, metavar="SECONDS", rich_help_panel=opt.OUT,
-        help="Stop after this time with the best answer so far, as Ctrl-C does.")] = None,
-    remainder_to: Annotated[Path | None, typer.Option(
-        metavar="FILE.py", rich_help_panel=opt.OUT,
-        help="Write what no effect explains as an effect, for --effects-from.")] = None,
+    max_effects: Annotated[int, opt.result(min=0, metavar="N", help="Largest number of effects to add.")] = 3,
+    budget: Annotated[float | None, opt.result(
+        min=0, metavar="SECONDS", help="Stop after this time with the best answer so far, as Ctrl-C does.")] = None,
+    remainder_to: Annotated[Path | None, opt.result(
+        metavar="FILE.py", help="Write what no effect explains as an effect, for --effects-from.")] = None,
     jobs: opt.Jobs = 1, json: opt.Json = None, report: opt.Report = None,
 ) -> None:
     """Say where the model fails, which physical effect is missing, and what the error is with it.

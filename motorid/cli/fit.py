@@ -87,10 +87,9 @@ def _amount(records: list[Experiment]) -> str:
 def fit_many_command(
     directories: Annotated[list[Path], typer.Argument(metavar="DIR", help="One folder, or file, per motor inside.")],
     options: opt.FitOptions,
-    out: Annotated[Path | None, typer.Option(
-        metavar="TABLE.csv", rich_help_panel=opt.OUT, help="Write the table: .csv, .parquet or .json.")] = None,
-    journal: Annotated[Path | None, typer.Option(
-        metavar="FILE", rich_help_panel=opt.OUT, help="Results as they come, to go on from.")] = None,
+    out: Annotated[Path | None, opt.result(
+        metavar="TABLE.csv", help="Write the table: .csv, .parquet or .json.")] = None,
+    journal: Annotated[Path | None, opt.result(metavar="FILE", help="Results as they come, to go on from.")] = None,
     jobs: opt.Jobs = 1, json: opt.Json = None,
 ) -> None:
     """Fit one model to the records of many motors; a motor that fails is a row that says why.
@@ -245,10 +244,10 @@ def identifiability_command(runs: opt.Runs, options: opt.FitOptions, json: opt.J
 @opt.with_options(opt.FitOptions)
 def robustness_command(
     runs: opt.Runs, options: opt.FitOptions,
-    starts: Annotated[int, typer.Option(min=1, metavar="N", rich_help_panel=opt.OUT, help="Number of fits.")] = 100,
-    spread: Annotated[float, typer.Option(
-        min=1.0, metavar="FACTOR", rich_help_panel=opt.OUT, help="Every start is off by up to this factor.")] = 10.0,
-    seed: Annotated[int, typer.Option(min=0, metavar="N", rich_help_panel=opt.OUT, help="Seed of the starts.")] = 0,
+    starts: Annotated[int, opt.result(min=1, metavar="N", help="Number of fits.")] = 100,
+    spread: Annotated[float, opt.result(
+        min=1.0, metavar="FACTOR", help="Every start is off by up to this factor.")] = 10.0,
+    seed: Annotated[int, opt.result(min=0, metavar="N", help="Seed of the starts.")] = 0,
     json: opt.Json = None, report: opt.Report = None,
 ) -> None:
     """Fit from many poor starts, and say whether all end in the same place.

@@ -20,7 +20,7 @@ import typer
 
 from motorid import effects as library
 from motorid.channels import CHANNELS
-from motorid.errors import ModelError, UsageError, one_of
+from motorid.errors import ModelError, UsageError, among
 from motorid.estimation.fit import fit
 from motorid.estimation.result import Fit
 from motorid.estimation.shooting.multiple_shooting import MultipleShooting
@@ -35,29 +35,20 @@ from motorid.records.experiment import Experiment, repeated
 from motorid.records.layout import parse_pairs
 from motorid.records.reading import read_runs
 
-DRIVES = ("voltage", "torque")
-SOLVERS = ("lm", "multiple-shooting")
-FORMULATIONS = ("plain", "penalty", "hard")
-LOSSES = ("squares", "huber")
-MODEL, SOLVE, READ, OUT = "Model", "Estimation", "Reading", "Results"
-
-_reading = functools.partial(typer.Option, rich_help_panel=READ)
-_model = functools.partial(typer.Option, rich_help_panel=MODEL)
-_solving = functools.partial(typer.Option, rich_help_panel=SOLVE)
+_reading = functools.partial(typer.Option, rich_help_panel="Reading")
+_model = functools.partial(typer.Option, rich_help_panel="Model")
+_solving = functools.partial(typer.Option, rich_help_panel="Estimation")
+result = functools.partial(typer.Option, rich_help_panel="Results")
 
 Runs = Annotated[list[str], typer.Argument(
     metavar="RUN", show_default=False, help="Records: files, directories or patterns.")]
-Json = Annotated[str | None, typer.Option(
-    "--json", metavar="PATH", rich_help_panel=OUT, help="Write the result as JSON; - for standard output.")]
-Report = Annotated[Path | None, typer.Option(
-    "--report", metavar="PATH.html", rich_help_panel=OUT, help="Write one page with figures.")]
-Force = Annotated[bool, typer.Option(
-    "--force", rich_help_panel=OUT, help="Write over inputs and over files that motorid did not write.")]
-Jobs = Annotated[int, typer.Option(
-    "--jobs", min=1, metavar="N", rich_help_panel=OUT, help="Processes that share the work.")]
+Json = Annotated[str | None, result("--json", metavar="PATH", help="Write the result as JSON; - for standard output.")]
+Report = Annotated[Path | None, result("--report", metavar="PATH.html", help="Write one page with figures.")]
+Force = Annotated[bool, result("--force", help="Write over inputs and over files that motorid did not write.")]
+Jobs = Annotated[int, result("--jobs", min=1, metavar="N", help="Processes that share the work.")]
 EffectsFrom = Annotated[Path | None, typer.Option(metavar="FILE.py", help="Effects of your own.")]
-Validate = Annotated[list[str] | None, typer.Option(
-    "--validate", metavar="RUN...", rich_help_panel=OUT,
+Validate = Annotated[list[str] | None, result(
+    "--validate", metavar="RUN...",
     help="Held-out records, never fitted; put it after the records, since it takes all names that follow.")]
 
 
@@ -100,8 +91,7 @@ class ReadingOptions:
         out = _words([self.ignore] if self.ignore else [])
         known = [c for c in CHANNELS if any(c in r.outputs for r in runs)]
         for channel in out:
-            if channel not in known:
-                raise UsageError(f"--ignore: {one_of(channel, known, 'measured channel')}")
+            among(channel, known, "measured channel", where="--ignore: ")
         for r in runs:
             if set(r.outputs) <= set(out):
                 raise UsageError(f"--ignore {self.ignore} leaves nothing measured in {r.name}; keep one of "
@@ -183,10 +173,11 @@ class FitOptions(ReadingOptions):
         return fit(self.model(runs) if model is None else model, runs, **self.keywords())
 
     def _check_words(self) -> None:
-        for word, known, what in ((self.drive, DRIVES, "drive"), (self.formulation, FORMULATIONS, "formulation"),
-                                  (self.solver or "lm", SOLVERS, "solver"), (self.loss, LOSSES, "loss")):
-            if word not in known:
-                raise UsageError(f"--{what}: {one_of(word, known, what)}")
+        for word, known, what in ((self.drive, ("voltage", "torque"), "drive"),
+                                  (self.formulation, ("plain", "penalty", "hard"), "formulation"),
+                                  (self.solver or "lm", ("lm", "multiple-shooting"), "solver"),
+                                  (self.loss, ("squares", "huber"), "loss")):
+            among(word, known, what, where=f"--{what}: ")
         if self.formulation == "hard" and self.solver == "lm":
             raise UsageError("--formulation hard needs --solver multiple-shooting: least squares has no true "
                              "constraints. Leave --solver out, or take --formulation penalty.")
@@ -248,9 +239,8 @@ def own_effects(path: Path) -> dict[str, Effect]:
 
 def named_effect(name: str, own: dict[str, Effect]) -> Effect:
     """Return an effect of the user's file, or of the library."""
-    if name not in (known := {**library.EVERY, **own}):
-        raise ModelError(f"--effects: {one_of(name, [*own, *library.EVERY], 'effect')}")
-    return known[name]
+    among(name, [*own, *library.EVERY], "effect", ModelError, "--effects: ")
+    return {**library.EVERY, **own}[name]
 
 
 def saved_model(path: Path, effects_from: Path | None = None) -> Model:

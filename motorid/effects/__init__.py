@@ -10,7 +10,7 @@ from motorid.effects import electrical, mechanical, sensor
 from motorid.effects.electrical import *  # noqa: F403
 from motorid.effects.mechanical import *  # noqa: F403
 from motorid.effects.sensor import *  # noqa: F403
-from motorid.errors import ModelError, one_of
+from motorid.errors import ModelError, among, one_of
 from motorid.model.definition import Effect
 
 _ALL = {e.name: e for part in (electrical, mechanical, sensor) for e in vars(part).values() if isinstance(e, Effect)}
@@ -23,8 +23,7 @@ EVERY = LIBRARY | MEASURED | PER_RUN
 
 def get(name: str) -> Effect:
     """Return the library's effect called `name`; ModelError if there is none, its message names the nearest."""
-    if name not in EVERY:
-        raise ModelError(one_of(name, EVERY, "effect"))
+    among(name, EVERY, "effect", ModelError)
     return EVERY[name]
 
 

@@ -169,11 +169,10 @@ def _two_inertias(m: Equations, share, resonance, zeta, twist_of, name: str) -> 
     elastic, contact = twist_of(twist)
     # Shaft torque over J·r:
     per_share = (1 - share) * (resonance**2 * elastic + 2 * zeta * resonance * contact * slip)
-    motor_side = m.symbols["J"]
     m.rate(twist, slip)
     m.rate(omega_load, per_share)
     m.scale("J", 1 - share)
-    m.torque -= motor_side * share * per_share
+    m.torque -= m.symbols["J"] * share * per_share
 
 
 @effect(balance="transmission")

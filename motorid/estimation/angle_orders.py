@@ -147,8 +147,7 @@ def _spectrum(tangent: Tangent, kind: str) -> Spectrum:
     if not lines:
         return Spectrum((), False)
     found = sorted(lines, key=lambda line: -line.share)
-    n = tangent.residual.size
-    sure = found[0].share * n > SURE and found[0].share > STANDS_OUT * float(np.median(shares))
+    sure = found[0].share * tangent.residual.size > SURE and found[0].share > STANDS_OUT * float(np.median(shares))
     return Spectrum(tuple(found), bool(sure))
 
 

@@ -53,9 +53,8 @@ class Certainty:
     @property
     def std(self) -> tuple[float | None, ...]:
         """One standard deviation per unknown; None where it is not determined or at a limit."""
-        variances = np.maximum(np.diag(self.matrix), 0.0)
-        return tuple(float(np.sqrt(v)) if s == "determined" else None
-                     for s, v in zip(self.status, variances, strict=True))
+        sizes = np.sqrt(np.maximum(np.diag(self.matrix), 0.0))
+        return tuple(float(v) if s == "determined" else None for s, v in zip(self.status, sizes, strict=True))
 
     def std_of(self, slope: Array) -> float | None:
         """Return one standard deviation of a quantity with gradient `slope` (k,); None where it is not determined."""
@@ -77,8 +76,7 @@ def certainty(problem: Problem, q: Array, residuals: Array, jacobian: Array, fre
     `free` (k, m) are the directions that active constraints leave; ``method="white"`` takes samples as independent.
     """
     among(method, ("coloured", "white"), "method")
-    physical = problem.scaling.physical(q)
-    limits = [_limit(p.lower, p.upper, v) for p, v in zip(problem.unknown, physical, strict=True)]
+    limits = [_limit(p.lower, p.upper, v) for p, v in zip(problem.unknown, problem.scaling.physical(q), strict=True)]
     loose = np.array([not s for s in limits], bool)
     basis = np.eye(len(loose))[:, loose] if free is None else free
     blocks = channel_blocks(problem, residuals, jacobian)

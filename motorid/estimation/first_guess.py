@@ -72,8 +72,7 @@ def _signals(run: Experiment) -> dict[str, Array]:
 
 def _windowed(t: Array, columns: Sequence[Array], target: Array, windows: int = 20) -> tuple[Array, Array]:
     """Take differences over a window, so that slow drift of the integrals does not outweigh the transients."""
-    n = len(t)
-    w = max(n // windows, 1)
+    w = max(len(t) // windows, 1)
     return np.column_stack([c[w:] - c[:-w] for c in columns]), target[w:] - target[:-w]
 
 

@@ -76,10 +76,6 @@ def fit(model: Model, runs: Sequence[Experiment] | Experiment, *, solver: Any = 
     callback : callable, optional
         ``callback(iteration, cost, q)``.
 
-    Returns
-    -------
-    Fit
-
     Raises
     ------
     UsageError, ModelError, DataError

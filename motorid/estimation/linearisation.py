@@ -110,8 +110,7 @@ def _steps(system: System, x: Array, u0: Array, u1: Array, h: Array, p: Array, d
 def _plain_outputs(system: System) -> bool:
     """Tell whether the outputs are a constant mixture of the states: no need to ask at every sample."""
     _, out = _disturbed(system)
-    sizes = (out.size1_in(k) for k in range(3))
-    x, u, p = (ca.SX.sym(name, n) for name, n in zip("xup", sizes, strict=True))
+    x, u, p = out.sx_in()
     y, c = out(x, u, p)
     return not (ca.depends_on(c, ca.vertcat(x, u)) or ca.depends_on(y, u))
 
@@ -200,8 +199,7 @@ class Tangent:
         """Return what `columns` (n, k) explain of the residual, those coefficients not negative that must not be."""
         c = self.off(columns)
         norms = np.linalg.norm(c, axis=0)
-        raw = np.linalg.norm(columns, axis=0)
-        usable = norms > 1e-6 * np.maximum(raw, 1e-300)
+        usable = norms > 1e-6 * np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
         scale = np.where(usable, norms, 1.0)
         c = np.where(usable, c / scale, 0.0)
         signed = [j for j, positive in enumerate(nonnegative) if not positive]

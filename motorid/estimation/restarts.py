@@ -132,8 +132,7 @@ def restored_values(parameters: Iterable[Parameter], influence: Mapping[str, flo
 
 def restored(fit: Fit, model: Model) -> Model:
     """Return a larger model than that of `fit`, with the parameters that collapsed in `fit` where they would matter."""
-    names = [p.name for p in fit.problem.unknown]
-    slopes = dict(zip(names, np.linalg.norm(fit.jacobian, axis=0), strict=True))
+    slopes = dict(zip((p.name for p in fit.problem.unknown), np.linalg.norm(fit.jacobian, axis=0), strict=True))
     known = [p for p in model.parameters.values() if p.name in slopes]
     sd = _deviation(fit.problem, fit.residuals)
     back = restored_values(known, {p.name: p.value * slopes[p.name] for p in known}, sd)

@@ -39,8 +39,7 @@ def with_start_values(problem: Problem) -> Problem:
             simpler = simpler.without(effect.name) + simple
     except ModelError:  # two of them contain the same
         return _shared_out(begin, problem.model)
-    first = _shared_out(_guessed(problem.for_model(simpler)), simpler)
-    found = race([first], RACE, solve=by_continuation)
+    found = race([_shared_out(_guessed(problem.for_model(simpler)), simpler)], RACE, solve=by_continuation)
     if found is None:
         return begin
     values = found.values
@@ -164,6 +163,5 @@ def _shared_out(problem: Problem, asked: Model) -> Problem:
     if not open_ or asked.parameters["K"].given or not any(load.ratio for load in loads_of(asked)):
         return problem
     others = [problem.start_at(first_guess(asked, runs, loaded=True, back_emf=share)) for share in BACK_EMF_SHARES]
-    fixed = [p.for_model(p.model.fix("R")) for p in (problem, *others)]
-    best = race(fixed, RACE, solve=by_continuation)
+    best = race([p.for_model(p.model.fix("R")) for p in (problem, *others)], RACE, solve=by_continuation)
     return problem if best is None else problem.start_at(best.values)

@@ -28,9 +28,8 @@ class Grid:
     def of(t: Array, u: Array, held: NDArray[np.bool_]) -> Grid:
         """Lay out inputs `u` (N, nu); `held` (nu,) tells which stay constant between samples."""
         u = np.ascontiguousarray(u, float)
-        after = np.where(held, u[:-1], u[1:])
         return Grid(np.ascontiguousarray(t, float), u, np.ascontiguousarray(u[:-1]),
-                    np.ascontiguousarray(after), np.ones(len(t) - 1, np.int64))
+                    np.ascontiguousarray(np.where(held, u[:-1], u[1:])), np.ones(len(t) - 1, np.int64))
 
     @cached_property
     def dt(self) -> Array:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Any
@@ -175,8 +175,7 @@ class Stepper:
     @cached_property
     def _constant_slopes(self) -> Array | None:
         """|dy/dx|, if it is the same everywhere."""
-        sizes = (self.functions.out.size1_in(k) for k in range(3))
-        slopes = self.functions.out(*(ca.SX.sym(n, k) for n, k in zip("xup", sizes, strict=True)))[1]
+        slopes = self.functions.out(*self.functions.out.sx_in())[1]
         return None if ca.symvar(slopes) else np.abs(np.asarray(ca.DM(ca.evalf(slopes))))
 
     def _load(self, compiled: bool | None) -> Any:
@@ -251,9 +250,8 @@ class Machine:
 
     def _walk(self, nq: int) -> ca.Function:
         """Return CHUNK steps in a row; sensitivities go transposed, so that time comes first in memory."""
-        x, s = ca.SX.sym("x", self.nx), ca.SX.sym("S", nq, self.nx)
-        u0, u1, h = ca.SX.sym("u0", self.nu), ca.SX.sym("u1", self.nu), ca.SX.sym("h")
-        p, dp = ca.SX.sym("p", self.np), ca.SX.sym("dp", nq, self.np)
+        x, u0, u1, h, p = self.functions.full.sx_in()
+        s, dp = ca.SX.sym("S", nq, self.nx), ca.SX.sym("dp", nq, self.np)
         if nq:
             x_next, a, b = self.functions.full(x, u0, u1, h, p)
             one = ca.Function("one", [x, s, u0, u1, h, p, dp], [x_next, ca.densify(s @ a.T + dp @ b.T)])
@@ -262,9 +260,9 @@ class Machine:
         return one.mapaccum("walk", CHUNK, 1, {})
 
     def _observation(self, derivatives: bool) -> ca.Function:
-        x, u, p = ca.SX.sym("x", self.nx), ca.SX.sym("u", self.nu), ca.SX.sym("p", self.np)
-        y, c, d = self.functions.out(x, u, p)
-        return ca.Function("seen", [x, u, p], [y, c.T, d.T] if derivatives else [y]).map(CHUNK)
+        given = self.functions.out.sx_in()
+        y, c, d = self.functions.out(*given)
+        return ca.Function("seen", given, [y, c.T, d.T] if derivatives else [y]).map(CHUNK)
 
     def run(self, grid: Grid, x0: Array, p: Array, dx0: Array | None, dp: Array | None,
             local_error: bool) -> Trajectory:
@@ -278,17 +276,8 @@ class Machine:
         if dp is not None:
             s[0] = dx0
             steady.append(_repeated(dp))  # column-major (nq, np) is dp itself
-        walk, trigger = _buffer(self.walk_of(nq))
-        for k, a in enumerate(steady):
-            walk.set_arg(k + (5 if nq else 4), _view(a))
-        for a in range(0, n, CHUNK):
-            here, there = slice(a, a + CHUNK), slice(a + 1, a + 1 + CHUNK)
-            gone = [x[a], s[a], ua[here], ub[here], h[here]] if nq else [x[a], ua[here], ub[here], h[here]]
-            for k, part in enumerate(gone):
-                walk.set_arg(k, _view(part))
-            for k, part in enumerate([x[there], s[there]] if nq else [x[there], e[here]]):
-                walk.set_res(k, _view(part))
-            trigger()
+        moving, results = ([x, s, ua, ub, h], [x[1:], s[1:]]) if nq else ([x, ua, ub, h], [x[1:], e])
+        _in_chunks(self.walk_of(nq), n, moving, steady, results)
         y, dy = self.observe(grid, x[ends], s[ends] if nq else None, p, dp)
         error = np.maximum.reduceat(np.abs(e[:ends[-1]]), ends[:-1]) if local_error else None
         return Trajectory(y, dy, x[ends], s[ends] if nq else None, error)
@@ -300,21 +289,13 @@ class Machine:
         first = np.zeros((len(h), 1 + self.nx))  # whether an interval begins here, and its state
         first[ends[:-1]] = np.column_stack([np.ones(len(rows)), x[rows]])
         end, p = np.zeros((len(h) + 1, self.nx)), _repeated(p)
-        walk, trigger = _buffer(self._restarted)
-        walk.set_arg(5, _view(p))
-        for a in range(0, len(h), CHUNK):
-            here = slice(a, a + CHUNK)
-            for k, part in enumerate([end[a], first[here], ua[here], ub[here], h[here]]):
-                walk.set_arg(k, _view(part))
-            walk.set_res(0, _view(end[a + 1:a + 1 + CHUNK]))
-            trigger()
+        _in_chunks(self._restarted, len(h), [end, first, ua, ub, h], [p], [end[1:]])
         return end[ends[1:]]
 
     @cached_property
     def _restarted(self) -> ca.Function:
         """CHUNK steps in a row, some of them from another state."""
-        x, first = ca.SX.sym("x", self.nx), ca.SX.sym("first", 1 + self.nx)
-        rest = [ca.SX.sym("u0", self.nu), ca.SX.sym("u1", self.nu), ca.SX.sym("h"), ca.SX.sym("p", self.np)]
+        (x, *rest), first = self.functions.light.sx_in(), ca.SX.sym("first", 1 + self.nx)
         begin = ca.if_else(first[0], first[1:], x)
         return ca.Function("one", [x, first, *rest], [self.functions.light(begin, *rest)[0]]).mapaccum("walk", CHUNK)
 
@@ -322,18 +303,10 @@ class Machine:
         """Return what the sensors show along a state trajectory, y (N, ny) and dy/dq (N, ny, nq)."""
         n = len(x)
         full = -(-n // CHUNK) * CHUNK
-        x_all, u_all, p_all = _padded(x, full), _padded(grid.u, full), _repeated(p)
         shapes = [(self.ny,), (self.ny, self.nx), (self.ny, self.np)][:1 if dx is None else 3]
         results = [np.empty((full, *shape)) for shape in shapes]
-        seen, trigger = _buffer(self.observation_of(dx is not None))
-        seen.set_arg(2, _view(p_all))
-        for a in range(0, full, CHUNK):
-            here = slice(a, a + CHUNK)
-            seen.set_arg(0, _view(x_all[here]))
-            seen.set_arg(1, _view(u_all[here]))
-            for k, r in enumerate(results):
-                seen.set_res(k, _view(r[here]))
-            trigger()
+        moving = [_padded(x, full), _padded(grid.u, full)]
+        _in_chunks(self.observation_of(dx is not None), full, moving, [_repeated(p)], results)
         if dx is None or dp is None:
             return results[0][:n], None
         y, c, d = (r[:n] for r in results)
@@ -354,8 +327,7 @@ def _laid_out(grid: Grid, dt: Array) -> tuple[Array, Array, Array, NDArray[np.in
     slope = np.repeat(grid.u1 - grid.u0, m, axis=0) * share[:, None]
     ua = np.repeat(grid.u0, m, axis=0) + slope * part[:, None]
     full = -(-steps // CHUNK) * CHUNK
-    h = np.repeat(dt, m) * share
-    return _padded(ua, full), _padded(ua + slope, full), _padded(h, full), ends
+    return _padded(ua, full), _padded(ua + slope, full), _padded(np.repeat(dt, m) * share, full), ends
 
 
 def _padded(a: Array, n: int) -> Array:
@@ -363,8 +335,18 @@ def _padded(a: Array, n: int) -> Array:
     return np.ascontiguousarray(np.concatenate([a, np.repeat(a[-1:], n - len(a), axis=0)]))
 
 
-def _buffer(f: ca.Function) -> Any:
-    return f.buffer()
+def _in_chunks(f: Any, n: int, moving: Sequence[Array], steady: Sequence[Array], results: Sequence[Array]) -> None:
+    """Fill `results` by calls of `f` over `CHUNK` rows each; of a chunk of `moving` a call reads what it takes."""
+    call, trigger = f.buffer()
+    for k, a in enumerate(steady, len(moving)):
+        call.set_arg(k, _view(a))
+    for first in range(0, n, CHUNK):
+        rows = slice(first, first + CHUNK)
+        for k, a in enumerate(moving):
+            call.set_arg(k, _view(a[rows]))
+        for k, a in enumerate(results):
+            call.set_res(k, _view(a[rows]))
+        trigger()
 
 
 def _view(a: Array) -> Any:

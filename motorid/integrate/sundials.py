@@ -121,8 +121,7 @@ class _Integrators:
     def _dae(self) -> dict[str, Any]:
         nx, nu, np_, _ = self.system.sizes
         z, theta = ca.SX.sym("z", nx), ca.SX.sym("theta", np_ + 2 * nu + 1 + nx)
-        ends = np.cumsum([0, np_, nu, nu, 1, nx]).tolist()
-        p, u0, u1, h, scale = ca.vertsplit(theta, ends)
+        p, u0, u1, h, scale = ca.vertsplit(theta, np.cumsum([0, np_, nu, nu, 1, nx]).tolist())
         tau = ca.SX.sym("tau")
         f = self.system.rhs(z * scale, u0 + tau * (u1 - u0), p)
         differential, algebraic = (np.flatnonzero(kind).tolist() for kind in (self.stored, ~self.stored))
@@ -167,10 +166,8 @@ def _pieces(grid: Grid) -> Iterator[tuple[int, int]]:
     dt = grid.dt
     flat = (grid.u0 == grid.u1).all(axis=1)
     same = np.zeros(len(dt), bool)  # interval k continues interval k-1
-    same[1:] = (flat[1:] & flat[:-1] & (grid.u0[1:] == grid.u0[:-1]).all(axis=1)
-                & (np.abs(np.diff(dt)) < 1e-6 * dt[1:]))
-    starts = np.append(np.flatnonzero(~same), len(dt))
-    for a, b in pairwise(starts.tolist()):
+    same[1:] = flat[1:] & flat[:-1] & (grid.u0[1:] == grid.u0[:-1]).all(axis=1) & (np.abs(np.diff(dt)) < 1e-6 * dt[1:])
+    for a, b in pairwise([*np.flatnonzero(~same).tolist(), len(dt)]):
         while a < b:
             count = min(b - a, LENGTHS[-1])
             yield a, count

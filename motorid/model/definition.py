@@ -14,7 +14,7 @@ import numpy as np
 
 from motorid.display.cards import Card, Flag, Shown, Table
 from motorid.display.numbers import quantity
-from motorid.errors import ModelError, one_of
+from motorid.errors import ModelError, among
 
 
 @dataclass(frozen=True)
@@ -169,8 +169,7 @@ class Effect(Shown):
         """Return the effect with some parameters given, e.g. ``cogging(N=12)`` (fixed if it is an order)."""
         known = {p.name: p for p in self.parameters}
         for name in values:
-            if name not in known:
-                raise ModelError(f"effect '{self.name}': {one_of(name, known, 'parameter')}")
+            among(name, known, "parameter", ModelError, f"effect '{self.name}': ")
         pars = tuple(replace(p, value=float(values[p.name]), given=True, vary=p.vary and not p.order)
                      if p.name in values else p for p in self.parameters)
         return replace(self, parameters=pars)
@@ -231,8 +230,7 @@ def effect(*, balance: str, name: str | None = None,
     ...     m.torque -= tau_c * m.sign(m.omega)
     >>> fit = mi.fit(mi.dc_motor() + dry_friction, runs)
     """
-    if balance not in BALANCES:
-        raise ModelError(one_of(balance, BALANCES, "balance"))
+    among(balance, BALANCES, "balance", ModelError)
 
     def make(law: Callable[..., None]) -> Effect:
         if not callable(law):
@@ -243,10 +241,9 @@ def effect(*, balance: str, name: str | None = None,
             if not isinstance(arg.default, Declared):
                 raise ModelError(f"effect '{title}': argument '{arg.name}' needs a default P(value, unit, null=…).")
             pars.append(arg.default.named(arg.name))
-        known = ("", *(p.name for p in pars))
-        if odd := next((p for p in pars if p.at_least not in known), None):
-            raise ModelError(f"effect '{title}', at_least of '{odd.name}': "
-                             + one_of(odd.at_least, known[1:], "parameter"))
+        names = [p.name for p in pars]
+        for p in (p for p in pars if p.at_least):
+            among(p.at_least, names, "parameter", ModelError, f"effect '{title}', at_least of '{p.name}': ")
         return Effect(title, law, tuple(pars), balance, inspect.cleandoc(law.__doc__ or ""), includes)
 
     return make

@@ -9,10 +9,9 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
 from motorid.channels import CHANNELS, MEASURED_INPUTS
-from motorid.errors import ModelError, one_of
+from motorid.errors import ModelError, among, one_of
 from motorid.numerics.signals import Array
 
 
@@ -104,16 +103,14 @@ class Equations:
 
     def measured(self, channel: str) -> ca.SX:
         """Return what the sensor of `channel` shows so far (several sensor effects follow one another)."""
-        if channel not in CHANNELS:
-            raise ModelError(f"{self.writer}: {one_of(channel, CHANNELS, 'channel')}")
+        among(channel, CHANNELS, "channel", ModelError, f"{self.writer}: ")
         if channel in self.sensors:
             return self.sensors[channel]
         return self.angle_state() if channel == "theta" else self.__getattr__(channel)
 
     def input(self, name: str) -> ca.SX:
         """Return what was measured beside the voltage, e.g. ``"tau_load"``; the model's records must have it."""
-        if name not in MEASURED_INPUTS:
-            raise ModelError(f"{self.writer}: {one_of(name, MEASURED_INPUTS, 'input')}")
+        among(name, MEASURED_INPUTS, "input", ModelError, f"{self.writer}: ")
         return self.inputs.setdefault(name, ca.SX.sym(name))
 
     # -- writing ---------------------------------------------------------------------------------------
@@ -204,7 +201,8 @@ class System:
         nx, nu, np_, _ = self.sizes
         x, u, p, s = ca.SX.sym("x", nx), ca.SX.sym("u", nu), ca.SX.sym("p", np_), ca.SX.sym("s", 3)
         f, y, x0 = self.rhs(x, u, p), self.out(x, u, p), self.initial(s, p)
-        f_x, f_p, y_x, y_p, x0_p = (_pattern(a, b) for a, b in ((f, x), (f, p), (y, x), (y, p), (x0, p)))
+        f_x, f_p, y_x, y_p, x0_p = (np.asarray(ca.DM(ca.jacobian_sparsity(a, b), 1).full(), bool)
+                                    for a, b in ((f, x), (f, p), (y, x), (y, p), (x0, p)))
         seen = y_x.any(axis=0)  # states that act on an output, directly or through other states
         for _ in range(nx):
             seen = seen | f_x[seen].any(axis=0)
@@ -222,12 +220,8 @@ class System:
         """Return dx0/ds (nx, 3) and dx0/dp (nx, np)."""
         if self._affine is not None:
             return self._affine[1], self._affine[2]
-        by_s, by_p = self._initial_jacobian(s, p, np.zeros(len(self.states)))
+        by_s, by_p = self.initial.jacobian()(s, p, np.zeros(len(self.states)))
         return np.asarray(by_s), np.asarray(by_p)
-
-    @cached_property
-    def _initial_jacobian(self) -> ca.Function:
-        return self.initial.jacobian()
 
     @cached_property
     def _affine(self) -> tuple[Array, Array, Array] | None:
@@ -242,10 +236,6 @@ class System:
 
     def __getstate__(self) -> dict[str, Any]:
         return {f: getattr(self, f) for f in self.__dataclass_fields__}
-
-
-def _pattern(f: ca.SX, z: ca.SX) -> NDArray[np.bool_]:
-    return np.asarray(ca.DM(ca.jacobian_sparsity(f, z), 1).full(), bool)
 
 
 def build_system(m: Equations, parameters: tuple[str, ...], outputs: tuple[str, ...],

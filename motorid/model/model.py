@@ -13,7 +13,7 @@ import casadi as ca
 from motorid.channels import CHANNELS
 from motorid.display.cards import Card, Shown, Table
 from motorid.display.numbers import quantity
-from motorid.errors import ModelError, one_of
+from motorid.errors import ModelError, among, one_of
 from motorid.model.definition import Effect, Parameter
 from motorid.model.equations import Equations, System, build_system
 
@@ -78,8 +78,7 @@ class Model(Shown):
 
     def without(self, name: str) -> Model:
         """Return the model without the effect called `name`."""
-        if name not in self.effect_names:
-            raise ModelError(one_of(name, self.effect_names, "effect in this model"))
+        among(name, self.effect_names, "effect in this model", ModelError)
         base = {k: v for k, v in self.parameters.items() if k in {p.name for p in BASES[self.base]}}
         model = self.with_(effects=(), parameters=base)
         for e in self.effects:
@@ -100,9 +99,8 @@ class Model(Shown):
 
     def fix(self, *names: str, **values: float) -> Model:
         """Return the model with parameters fixed: ``fix(R=1.2)`` there, ``fix("R")`` at the value it has."""
-        changes: dict[str, dict[str, Any]] = {n: {"vary": False} for n in names}
-        changes |= {n: {"value": float(v), "vary": False, "given": True} for n, v in values.items()}
-        return self._change(changes)
+        return self._change({n: {"vary": False} for n in names}
+                            | {n: {"value": float(v), "vary": False, "given": True} for n, v in values.items()})
 
     def free(self, *names: str) -> Model:
         """Return the model with the parameters `names` estimated again."""
@@ -154,8 +152,7 @@ class Model(Shown):
     def _change(self, changes: Mapping[str, Mapping[str, Any]]) -> Model:
         pars = dict(self.parameters)
         for name, fields in changes.items():
-            if name not in pars:
-                raise ModelError(one_of(name, pars, "parameter"))
+            among(name, pars, "parameter", ModelError)
             pars[name] = replace(pars[name], **fields)
         return self.with_(parameters=pars)
 
@@ -308,8 +305,7 @@ def torque_driven(axis: str = "rotary", **values: float) -> Model:
     >>> mi.torque_driven(axis="linear")
     <model torque_driven: b, J>
     """
-    if axis not in ("rotary", "linear"):
-        raise ModelError(one_of(axis, ("rotary", "linear"), "axis"))
+    among(axis, ("rotary", "linear"), "axis", ModelError)
     pars = {p.name: p for p in BASES["torque_driven"]}
     if axis == "linear":
         units = {"g": "N/V", "b": "N·s/m", "J": "kg"}

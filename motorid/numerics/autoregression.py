@@ -61,8 +61,7 @@ def colour_of(parts: Sequence[Array], spent: float = 0.0) -> Colour:
     gamma = sum((c * g[: most + 1] for c, g in zip(counts, each, strict=True)), np.zeros(most + 1)) / max(n, 1)
     if n < 3:
         return Colour(np.zeros(0), float(gamma[0]), 0.0)
-    models = list(_levinson(gamma))
-    a, innovation = min(models, key=lambda m: n * np.log(max(m[1], 1e-300)) + 2 * len(m[0]))
+    a, innovation = min(_levinson(gamma), key=lambda m: n * np.log(max(m[1], 1e-300)) + 2 * len(m[0]))
     inflation = n / max(n - spent, 1.0)
     share = sum(_worth(c, g[: len(p) // 2 + 1]) for c, g, p in zip(counts, each, parts, strict=True)) / n
     return Colour(a, float(gamma[0]) * inflation, innovation * inflation, share)

@@ -271,8 +271,7 @@ def _damped(triangle: Array, rotated: Array, size: Array, lam: float) -> Array:
     scaled = triangle / size
     if lam == 0:
         return -np.linalg.lstsq(scaled, rotated, rcond=None)[0] / size
-    stacked = np.vstack([scaled, np.sqrt(lam) * np.eye(len(size))])
-    q, small = np.linalg.qr(stacked)
+    q, small = np.linalg.qr(np.vstack([scaled, np.sqrt(lam) * np.eye(len(size))]))
     return -np.linalg.solve(small, q[:len(rotated)].T @ rotated) / size
 
 
@@ -293,8 +292,7 @@ def seen_directions(jac: Array) -> tuple[Array, Array]:
     """
     norms = np.sqrt(np.einsum("ij,ij->j", jac, jac))
     size = np.where(norms > 0, norms, 1.0)
-    triangle = np.linalg.qr(jac / size, mode="r")
-    _, s, vt = np.linalg.svd(triangle, full_matrices=True)
+    _, s, vt = np.linalg.svd(np.linalg.qr(jac / size, mode="r"), full_matrices=True)
     s = np.concatenate([s, np.zeros(vt.shape[0] - len(s))])
     good = s > 1e-8 * max(s.max(initial=0.0), 1e-300)
     return vt[good].T / s[good] / size[:, None], vt[~good] / size

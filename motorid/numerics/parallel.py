@@ -185,14 +185,10 @@ class Parcel:
         data = pickle.dumps(content, protocol=pickle.HIGHEST_PROTOCOL)
         return Parcel(hashlib.sha256(data).hexdigest(), data)
 
+    @lru_cache(maxsize=8)  # noqa: B019 parcels are equal by content, and few are kept
     def open(self) -> Any:
         """Return the content; one object per process, so it must not be changed."""
-        return _opened(self)
-
-
-@lru_cache(maxsize=8)
-def _opened(parcel: Parcel) -> Any:
-    return pickle.loads(parcel.data)
+        return pickle.loads(self.data)
 
 
 class Task(NamedTuple):
@@ -220,7 +216,8 @@ def map_items(function: Callable[[Any, Any], Any], shared: Any, items: Sequence[
     that costs time, not results.
     """
     parcel = Parcel.of(shared)
-    tasks = [Task(parcel, Parcel.of(chunk), function) for chunk in _in_chunks(items, map)]
+    size = 1 if map is None or map is builtins.map else max(-(-len(items) // MOST_TASKS), 1)
+    tasks = [Task(parcel, Parcel.of(items[k:k + size]), function) for k in range(0, len(items), size)]
     results: list[Any] = []
     done = 0
     with progress(text, total=len(tasks), quiet=quiet) as advance:
@@ -251,12 +248,6 @@ def map_items(function: Callable[[Any, Any], Any], shared: Any, items: Sequence[
 def _apply(task: Task) -> list[Any]:
     with one_thread:  # for its linear algebra, in whatever process it runs
         return [task.function(task.shared.open(), item) for item in task.items.open()]
-
-
-def _in_chunks(items: Sequence[Any], map: Map | None) -> list[Sequence[Any]]:
-    """Cut `items` into pieces: single ones for the built-in map, at most `MOST_TASKS` for a pool."""
-    size = 1 if map is None or map is builtins.map else max(-(-len(items) // MOST_TASKS), 1)
-    return [items[k:k + size] for k in range(0, len(items), size)]
 
 
 def _in_waves(way: Map, tasks: Sequence[Task]) -> Iterator[list[Any]]:

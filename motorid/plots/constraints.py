@@ -19,9 +19,8 @@ NEAR = 0.5  # of the limit: what is worth a closer look
 
 
 @style.styled
-def plot_current_limit(
-    *results: Fit | Formulations, limit: float | None = None, labels: Sequence[str] | None = None
-) -> np.ndarray:
+def plot_current_limit(*results: Fit | Formulations, limit: float | None = None,
+                       labels: Sequence[str] | None = None) -> np.ndarray:
     """Draw the current of one or several fits against the limit, what lies above it shaded.
 
     Parameters
@@ -52,8 +51,7 @@ def plot_current_limit(
     if not all("i" in s.outputs for f in fits for s in f.simulations):
         raise UsageError("these fits have no current: it was not measured, or the model has none.")
     words = list(labels or [f.formulation for f in fits])
-    runs = min(len(fits[0].simulations), 3)
-    axes = style.grid(len(fits), runs, row=1.5, sharex="col", sharey="row")
+    axes = style.grid(len(fits), min(len(fits[0].simulations), 3), row=1.5, sharex="col", sharey="row")
     for row, fit, word in zip(axes, fits, words, strict=False):
         for ax, s in zip(row, fit.simulations, strict=False):
             _against_limit(ax, s, limit)
@@ -105,10 +103,6 @@ def _limit_of(fits: Sequence[Fit]) -> float:
 @style.styled
 def plot_formulations(result: Formulations) -> np.ndarray:
     """Draw the same fit plain, with penalties and with hard constraints: parameters, errors, and the path between.
-
-    Parameters
-    ----------
-    result : Formulations
 
     Returns
     -------

@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
 
 from motorid.diagnosis.experiment_design import Design
 from motorid.diagnosis.locate import accounted, binned
@@ -108,11 +110,6 @@ def plot_answer(found: Diagnosis, ax: Axes | None = None) -> Axes:
     last model has instead: the accepted effects and the shift of the parameters. An effect with so many periods per
     turn is drawn over one of them.
 
-    Parameters
-    ----------
-    found : Diagnosis
-    ax : Axes, optional
-
     Examples
     --------
     >>> axes = mi.plot_answer(found)
@@ -209,9 +206,6 @@ def plot_ranking(result: Diagnosis | Sequence[Candidate], ax: Axes | None = None
 
 
 def _ranking_legend(ax: Axes, chosen: Sequence[Candidate]) -> None:
-    from matplotlib.lines import Line2D
-    from matplotlib.patches import Patch
-
     handles: list[Any] = [Patch(fill=False, edgecolor=style.INK, label="predicted")]
     for accepted, colour, label in ((True, "blue", "refitted, accepted"), (False, "grey", "refitted, not accepted")):
         if any(c.accepted == accepted and c.refit_drop is not None for c in chosen):
@@ -225,11 +219,6 @@ def _ranking_legend(ax: Axes, chosen: Sequence[Candidate]) -> None:
 @style.styled
 def plot_ladder(result: Ladder | Diagnosis, ax: Axes | None = None) -> Axes:
     """Draw how the error falls as effects are added: on the records of the fit, and on those it never saw.
-
-    Parameters
-    ----------
-    result : Ladder or Diagnosis
-    ax : Axes, optional
 
     Examples
     --------
@@ -278,10 +267,6 @@ def _error_labels(ax: Axes, k: int, errors: Mapping[str, float]) -> None:
 @style.styled
 def plot_design(design: Design) -> np.ndarray:
     """Draw a designed voltage, and what each rival predicts with a band of two standard deviations.
-
-    Parameters
-    ----------
-    design : Design
 
     Returns
     -------

@@ -245,8 +245,7 @@ def plot_parameters(*results: Any, truth: Mapping[str, float] | None = None,
     for name in chosen:
         among(name, dict.fromkeys(n for f in fits for n in f.values), "parameter")
     columns = {6: 3, 7: 4, 8: 4}.get(len(chosen), min(len(chosen), 5))
-    rows = -(-len(chosen) // columns)
-    axes = style.grid(rows, columns, row=1.75, width=style.WIDTH * max(columns, 3) / 5).ravel()
+    axes = style.grid(-(-len(chosen) // columns), columns, row=1.75, width=style.WIDTH * max(columns, 3) / 5).ravel()
     for ax, name in zip(axes, chosen, strict=False):
         _one_parameter(ax, fits, name, (truth or {}).get(name))
     for ax in axes[len(chosen):]:

@@ -43,8 +43,7 @@ def plot_residuals(fit: Fit, channels: Sequence[str] | None = None) -> np.ndarra
     --------
     >>> axes = mi.plot_residuals(fit)
     """
-    sims = fit.simulations
-    present = [c for c in CHANNELS if any(c in s.experiment.outputs and c in s.outputs for s in sims)]
+    present = [c for c in CHANNELS if any(c in s.experiment.outputs and c in s.outputs for s in fit.simulations)]
     names = chosen(channels, present, "channel")
     against = [c for c in ("omega", "i", "theta") if c in present]
     figure = style.new_figure(style.WIDTH, 3.0 * len(names) + 0.2)

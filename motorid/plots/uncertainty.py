@@ -34,10 +34,6 @@ def plot_singular_values(result: Identifiability) -> np.ndarray:
     A direction whose singular value is below two (shaded) changes the outputs by less than twice the noise even where
     the parameters change by 100 %. Circles: share of each parameter in a direction, blue and orange for opposite signs.
 
-    Parameters
-    ----------
-    result : Identifiability
-
     Returns
     -------
     ndarray of Axes, shape (2,)
@@ -83,10 +79,6 @@ def plot_profile(result: Profile | Mapping[str, Profile] | Intervals) -> np.ndar
     Where the curve crosses the dashed line the interval of 95 % ends. An even valley is what the covariance
     assumes; a curve that never reaches the line says that the data set no limit there. Of `Intervals` the
     covariance's and the bootstrap's are drawn below the curve.
-
-    Parameters
-    ----------
-    result : Profile, mapping of str to Profile, or Intervals
 
     Returns
     -------
@@ -225,10 +217,6 @@ def plot_waterfall(result: Multistart) -> np.ndarray:
     """Draw where fits from random starts ended: their errors in order, and how far the parameters came.
 
     A flat line of errors and ends at one, from widely scattered starts, say that the start does not matter.
-
-    Parameters
-    ----------
-    result : Multistart
 
     Returns
     -------

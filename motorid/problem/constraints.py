@@ -143,7 +143,9 @@ class SteadyState(Relation):
     def _part(self, problem: Any, s: SteadySegment) -> Part | None:
         system, run = problem.system, problem.runs[s.run]
         known = tuple(c for c in ("i", "omega") if c in s.means)
-        wanted = self._wanted(system, s)
+        # The voltage and the torque balance need what was measured; at standstill friction is anything.
+        electrical, current = "i" in system.states, "i" in s.means
+        wanted = (electrical and current and s.v != 0, s.moving and "omega" in s.means and (current or not electrical))
         names = [n for n, w in zip(("voltage", "torque"), wanted, strict=True) if w]
         if not names:
             return None
@@ -160,13 +162,6 @@ class SteadyState(Relation):
         return Part(s.run, local(system, _steady_rows(system, known), data.shape[1]), pick,
                     np.zeros(len(pick), int), data, run.grid.u[pick], np.array(wanted), -allowed, allowed, size,
                     weight, labels, tuple({"voltage": "V", "torque": unit}[n] for n in names))
-
-    @staticmethod
-    def _wanted(system: Any, s: SteadySegment) -> tuple[bool, bool]:
-        """Tell which of the voltage and the torque balance this segment can be held to."""
-        electrical = "i" in system.states
-        current = "i" in s.means
-        return electrical and current and s.v != 0, s.moving and "omega" in s.means and (current or not electrical)
 
     def penalty(self, c: Array, part: Part) -> tuple[Array, Array]:
         """Return residual and slope as a penalty, the source paper's: zero only where the balance is."""

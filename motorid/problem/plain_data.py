@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from motorid.effects import EVERY
-from motorid.errors import DataError, ModelError, UsageError, one_of
+from motorid.errors import DataError, ModelError, UsageError, among, one_of
 from motorid.integrate import ENGINES
 from motorid.model.definition import Effect
 from motorid.model.model import Model, dc_motor, torque_driven
@@ -52,8 +52,7 @@ def problem_of(about: Mapping[str, Any], data: Mapping[str, Any], effects: Itera
     model = model.with_(angle_input=bool(about["angle_input"]),
                         parameters={n: replace(p, **told[n]) for n, p in model.parameters.items()})
     runs = [Experiment(**r["record"]) for r in data["runs"]]
-    more = {f: data[f] for f in PLAIN} | {f: _built(data[f]) for f in OPTIONS}
-    problem = Problem(model, tuple(runs), **more)
+    problem = Problem(model, tuple(runs), **{f: data[f] for f in PLAIN}, **{f: _built(data[f]) for f in OPTIONS})
     ready = [_run_of(problem, run, r) for run, r in zip(problem.experiments, data["runs"], strict=True)]
     return problem.with_runs(tuple(ready))
 
@@ -134,8 +133,7 @@ def _assembled(head: Mapping[str, Any], effects: Iterable[Effect],
                given: Mapping[str, Mapping[str, float]] | None = None) -> Model:
     """Return base and effects; `given` are parameters that the user set in an effect."""
     base, axis = str(head["base"]), head.get("axis", "rotary")
-    if base not in ("dc_motor", "torque_driven"):
-        raise DataError(one_of(base, ("dc_motor", "torque_driven"), "base"))
+    among(base, ("dc_motor", "torque_driven"), "base", DataError)
     model = dc_motor() if base == "dc_motor" else torque_driven(axis)
     own = {e.name: e for e in effects}
     for name in map(str, head["effects"]):

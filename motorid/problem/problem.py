@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from motorid.channels import CHANNELS
-from motorid.errors import ModelError, SimulationError, UsageError, among, name_of, one_of
+from motorid.errors import ModelError, SimulationError, UsageError, among, name_of
 from motorid.integrate import engine_of, limited
 from motorid.integrate.engine import Engine, Trajectory
 from motorid.model.definition import Parameter
@@ -81,8 +81,7 @@ class Problem:
                              "one of i, omega, theta (torque_driven: omega or theta).")
         object.__setattr__(self, "experiments", tuple(_shown(r, self.outputs) for r in self.experiments))
         for name in self.priors:
-            if name not in self.model.parameters:
-                raise UsageError(f"prior: {one_of(name, self.model.parameters, 'parameter')}")
+            among(name, self.model.parameters, "parameter", where="prior: ")
             if not (np.isfinite(self.priors[name]).all() and self.priors[name][1] > 0):
                 raise UsageError(f"the prior of '{name}' takes (mean, std), finite, std above zero; got "
                                  f"{self.priors[name]}.")
@@ -267,8 +266,7 @@ class Problem:
         parts += [penalty.evaluate(self, q, trajs) for penalty in self.penalties]
         if len(parts) == 1:
             return parts[0]
-        r = np.concatenate([p[0] for p in parts])
-        return r, np.concatenate([p[1] for p in parts]) if derivatives else None
+        return np.concatenate([p[0] for p in parts]), np.concatenate([p[1] for p in parts]) if derivatives else None
 
     def with_loss(self, r: Array, jac: Array | None) -> tuple[Array, Array | None]:
         """Return residual and Jacobian with the robust loss, if there is one."""

@@ -47,14 +47,11 @@ class Part:
         if self.gradient is not None:
             return x @ self.gradient, None if dx is None else np.einsum("mxz,x->mz", dx, self.gradient)
         m, nc = len(self.samples), self.local.size1_out(0)
-        wide = np.tile(np.asarray(p, float)[:, None], (1, m))
-        found = self._mapped(x.T, self.u.T, wide, self.data.T)
-        c = np.asarray(found[0]).T
-        mean = self._mean(c).ravel()[self.keep]
+        found = self._mapped(x.T, self.u.T, np.tile(np.asarray(p, float)[:, None], (1, m)), self.data.T)
+        mean = self._mean(np.asarray(found[0]).T).ravel()[self.keep]
         if dx is None or dp is None:
             return mean, None
-        cx = np.asarray(found[1]).reshape(nc, m, -1).transpose(1, 0, 2)
-        cp = np.asarray(found[2]).reshape(nc, m, -1).transpose(1, 0, 2)
+        cx, cp = (np.asarray(a).reshape(nc, m, -1).transpose(1, 0, 2) for a in found[1:])
         return mean, self._mean(cx @ dx + cp @ dp).reshape(-1, dx.shape[2])[self.keep]
 
     @cached_property
@@ -70,8 +67,7 @@ class Part:
         return np.where(c > self.upper, c - self.upper, np.where(c < self.lower, c - self.lower, 0.0))
 
     def _mean(self, values: Array) -> Array:
-        groups = int(self.group[-1]) + 1
-        if groups == len(self.group):
+        if int(self.group[-1]) + 1 == len(self.group):
             return values
         starts = np.flatnonzero(np.diff(self.group, prepend=-1))
         counts = np.diff(starts, append=len(self.group))
@@ -142,11 +138,9 @@ _made: weakref.WeakKeyDictionary[Any, dict[int, tuple[Any, tuple[Part, ...]]]] =
 
 def local(system: Any, rows: Callable[..., Any], nd: int) -> ca.Function:
     """Return ``(x, u, p, d) -> (c, dc/dx, dc/dp)`` of the expression `rows`."""
-    nx, nu, np_, _ = system.sizes
-    x, u, p, d = ca.SX.sym("x", nx), ca.SX.sym("u", nu), ca.SX.sym("p", np_), ca.SX.sym("d", nd)
+    (x, u, p), d = system.rhs.sx_in(), ca.SX.sym("d", nd)
     c = ca.SX(rows(x, u, p, d))
-    return ca.Function("rows", [x, u, p, d],
-                       [ca.densify(c), ca.densify(ca.jacobian(c, x)), ca.densify(ca.jacobian(c, p))])
+    return ca.Function("rows", [x, u, p, d], [ca.densify(a) for a in (c, ca.jacobian(c, x), ca.jacobian(c, p))])
 
 
 def share(problem: Any, k: int) -> float:

@@ -88,10 +88,6 @@ def check_derivatives(problem: Problem, q: Array | None = None, *, steps: Sequen
     tolerance : float
         CVODES and IDAS reach it at their default accuracy, `Rosenbrock` 1e-7.
 
-    Returns
-    -------
-    DerivativeCheck
-
     Raises
     ------
     UsageError
@@ -116,8 +112,7 @@ def check_derivatives(problem: Problem, q: Array | None = None, *, steps: Sequen
     names, group = _groups(fine, len(jac))
     slope = _largest(jac, group, len(names))
     numeric = (np.column_stack([_slope(fine, q, j, h) for j in range(len(q))]) for h in steps)
-    each = [_largest(jac - n, group, len(names)) for n in numeric]
-    difference = np.min(each, axis=0)
+    difference = np.min([_largest(jac - n, group, len(names)) for n in numeric], axis=0)
     most = slope.max(axis=1, keepdims=True)
     size = np.where(slope > 0, np.maximum(slope, SMALL * most), most)
     relative = np.divide(difference, size, out=np.where(difference > 0, np.inf, 0.0), where=size > 0)

@@ -141,8 +141,7 @@ def simulate(model: Model, runs: Sequence[Experiment] | Experiment, *, engine: s
     >>> predicted[0].outputs["omega"].shape == check[0].t.shape
     True
     """
-    problem = as_problem(model, runs, engine=engine, initial=initial)
-    return list(simulated(problem, estimate_initial))
+    return list(simulated(as_problem(model, runs, engine=engine, initial=initial), estimate_initial))
 
 
 @one_thread
@@ -186,8 +185,7 @@ def with_channels(model: Model, run: Experiment, channels: Sequence[str],
                       sigma={**run.sigma, **dict.fromkeys(channels, 1.0)})
     shown = simulated(Problem(model, (blank,), initial="rest"), estimate_initial=False)[0].outputs
     noise = {c: (sigma or {}).get(c) or ASSUMED_NOISE * float(np.sqrt(np.mean(shown[c] ** 2))) or 1.0 for c in channels}
-    filled = {c: shown[c] for c in channels}
-    return blank.with_(outputs={**run.outputs, **filled}, sigma={**run.sigma, **noise})
+    return blank.with_(outputs={**run.outputs, **{c: shown[c] for c in channels}}, sigma={**run.sigma, **noise})
 
 
 def simulated(problem: Problem, estimate_initial: bool = True) -> tuple[Simulation, ...]:
@@ -269,9 +267,8 @@ def judge(simulations: Sequence[Simulation]) -> Evaluation:
 
 def steady_errors(simulations: Sequence[Simulation], sigma: Sequence[Mapping[str, float]]) -> dict[str, float]:
     """Return the RMS difference of measured and simulated means over the steady parts, SI; empty without any."""
-    segments = find_segments([s.experiment for s in simulations], sigma)
     errors: dict[str, list[float]] = {}
-    for part in segments:
+    for part in find_segments([s.experiment for s in simulations], sigma):
         s = simulations[part.run]
         for c in part.means:
             if c in s.experiment.outputs and c in s.outputs:

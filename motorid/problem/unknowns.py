@@ -112,8 +112,7 @@ class Unknowns:
     @cached_property
     def _columns(self) -> NDArray[np.int64]:
         """Index into the system's p of each free parameter."""
-        place = {n: j for j, n in enumerate(self.system.parameters)}
-        return np.array([place[p.name] for p in self.free], int)
+        return np.array([self.system.parameters.index(p.name) for p in self.free], int)
 
     @cached_property
     def _fixed(self) -> Array:
@@ -186,8 +185,7 @@ class Scaling:
     def of(parameters: Iterable[Parameter], sizes: ArrayLike | None = None) -> Scaling:
         """Return the scaling of `parameters`; `sizes` (n,) replaces the size read from their values."""
         pars = list(parameters)
-        values = np.array([p.value for p in pars], float)
-        scale = np.abs(values if sizes is None else np.asarray(sizes, float))
+        scale = np.abs(np.array([p.value for p in pars] if sizes is None else sizes, float))
         scale = np.where((scale > 0) & np.isfinite(scale), scale, 1.0)
         log = np.array([p.positive for p in pars], bool)
         return Scaling(scale, log, np.array([p.lower for p in pars], float), np.array([p.upper for p in pars], float))
@@ -200,8 +198,7 @@ class Scaling:
     def scaled(self, p: ArrayLike) -> NDArray[np.float64]:
         """Return q of p."""
         ratio = np.asarray(p, float) / self.scale
-        tiny = np.finfo(float).tiny
-        return np.where(self.log, np.log(np.maximum(ratio, tiny)), ratio)
+        return np.where(self.log, np.log(np.maximum(ratio, np.finfo(float).tiny)), ratio)
 
     def slope(self, q: ArrayLike) -> NDArray[np.float64]:
         """Return dp/dq at q, shape (n,)."""

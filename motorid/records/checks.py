@@ -148,13 +148,12 @@ def _at_stop(y: Array, top: float) -> bool:
     there = y == top
     if top == 0 or there.sum() < 3 or there.all():
         return False
-    below = y[~there]
     reach = np.ptp(y)
     step = quantum(y)
     entries = np.abs(y[np.flatnonzero(there[1:] & ~there[:-1])] - top)
     if there.sum() >= max(10, 0.01 * len(y)) and entries.size and np.median(entries) > max(3 * step, 0.005 * reach):
         return True
-    if step or noise_level(below) <= 1e-4 * reach:
+    if step or noise_level(y[~there]) <= 1e-4 * reach:
         return False
     between = np.sort(y[(y > y.min()) & (y < y.max())])
     stays = there.sum() > 3 and float(np.mean(there[1:][there[:-1]])) > 0.5

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from motorid.channels import CHANNELS, MEASURED_INPUTS, NAMES, UNITS
 from motorid.display.cards import Card, Flag, Shown, Table
 from motorid.display.numbers import duration, number, quantity
-from motorid.errors import DataError, UsageError, one_of, printable
+from motorid.errors import DataError, UsageError, among, printable
 from motorid.numerics.signals import Array
 from motorid.records import preprocessing
 
@@ -91,8 +91,7 @@ class Experiment(Shown):
         _check_values(self)
         freeze("sigma", _sigmas(self))
         freeze("units", _units(self))
-        if self.hold not in ("zoh", "linear"):
-            raise DataError(f"{self.name}: {one_of(str(self.hold), ('zoh', 'linear'), 'hold')}")
+        among(self.hold, ("zoh", "linear"), "hold", DataError, f"{self.name}: ")
 
     @property
     def n(self) -> int:
@@ -118,8 +117,7 @@ class Experiment(Shown):
         """Return a copy with some fields replaced, validated again."""
         known = [f.name for f in dataclasses.fields(self)]
         for key in changes:
-            if key not in known:
-                raise UsageError(f"with_(): {one_of(key, known, 'field')}")
+            among(key, known, "field", where="with_(): ")
         return dataclasses.replace(self, **changes)
 
     def select(self, keep: slice | ArrayLike) -> Experiment:
@@ -141,8 +139,7 @@ class Experiment(Shown):
     def without(self, *channels: str) -> Experiment:
         """Return a copy that lacks these output channels (as a model sees it that may not use them)."""
         for channel in channels:
-            if channel not in self.outputs:
-                raise UsageError(f"{self.name}: {one_of(channel, self.channels, 'output channel')}")
+            among(channel, self.channels, "output channel", where=f"{self.name}: ")
         return self.with_(outputs={k: a for k, a in self.outputs.items() if k not in channels})
 
     def decimate(self, k: int) -> Experiment:
@@ -305,8 +302,7 @@ def _channels(given: object, known: tuple[str, ...], kind: str, t: Array, run: s
         raise DataError(f"{run}: {kind}s must be a mapping with at least one of {', '.join(known)}.")
     arrays = {}
     for name, values in given.items():
-        if name not in known:
-            raise DataError(f"{run}: {one_of(str(name), known, f'{kind} channel')}")
+        among(name, known, f"{kind} channel", DataError, f"{run}: ")
         arrays[name] = _frozen_array(values, str(name), run)
         if len(arrays[name]) != len(t):
             raise DataError(f"{run}: '{name}' has {len(arrays[name])} samples but time has {len(t)}.")
@@ -330,8 +326,7 @@ def _check_values(run: Experiment) -> None:
 
 def _sigmas(run: Experiment) -> Mapping[str, float]:
     for name, value in run.sigma.items():
-        if name not in CHANNELS:
-            raise DataError(f"{run.name}: {one_of(str(name), CHANNELS, 'channel in sigma')}")
+        among(name, CHANNELS, "channel in sigma", DataError, f"{run.name}: ")
         if not (isinstance(value, Real) and np.isfinite(value) and value > 0):
             raise DataError(f"{run.name}: sigma of '{name}' must be a positive number; got {value!r}.")
     return MappingProxyType({k: float(s) for k, s in run.sigma.items() if k in run.outputs})
@@ -339,8 +334,7 @@ def _sigmas(run: Experiment) -> Mapping[str, float]:
 
 def _units(run: Experiment) -> Mapping[str, str]:
     for name, unit in run.units.items():
-        if name not in UNITS:
-            raise DataError(f"{run.name}: {one_of(str(name), UNITS, 'channel in units')}")
+        among(name, UNITS, "channel in units", DataError, f"{run.name}: ")
         if unit not in UNITS[name]:
             raise DataError(f"{run.name}: '{name}' is kept in {' or '.join(UNITS[name])}, not in {unit!r}; "
                             "convert it first (read_csv does).")

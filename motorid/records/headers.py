@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
+from motorid.channels import DIMENSIONS, SI
 from motorid.errors import DataError, one_of
 
 
@@ -21,16 +21,6 @@ class Unit:
     label: str
     offset: float = 0.0  # added after the factor: kelvins
 
-
-SI = {"time": "s", "voltage": "V", "current": "A", "speed": "rad/s", "linear speed": "m/s", "angle": "rad",
-      "length": "m", "torque": "N·m", "force": "N", "ratio": "1", "temperature": "°C"}
-
-# What a channel may be measured in. The input of a torque-driven model is a current, torque or force command.
-DIMENSIONS: Mapping[str, tuple[str, ...]] = {
-    "t": ("time",), "v": ("voltage", "current", "torque", "force", "ratio"), "i": ("current",),
-    "omega": ("speed", "linear speed"), "theta": ("angle", "length"),
-    "v_supply": ("voltage",), "tau_load": ("torque", "force"), "temp": ("temperature",),
-}
 
 _TURN = 2 * math.pi
 _DEGREE = math.pi / 180

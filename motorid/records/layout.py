@@ -7,12 +7,11 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from motorid.channels import MEASURED_INPUTS, NAMES
+from motorid.channels import DIMENSIONS, MEASURED_INPUTS, NAMES, SI
 from motorid.errors import DataError, UsageError, one_of
 from motorid.records import headers
-from motorid.records.headers import SI, Unit
+from motorid.records.headers import Unit
 
-_CHANNELS = tuple(headers.DIMENSIONS)
 _PERCENT = re.compile(r"%|pct|per_?cent|prozent")
 _MEANING = {c: f"the {name}" for c, name in NAMES.items()} | {"v": "the drive voltage"}
 Units = Mapping[str, Unit | None]
@@ -57,19 +56,19 @@ def assign(labels: Sequence[str], *, columns: Mapping[str, object] | None = None
     notes += [f"'{c}' looks like the reference of a controller: what drives the model is the voltage; it is not used."
               for c in labels if headers.is_reference(c) and c not in {p.column for p in places.values()}]
     _require(places, labels)
-    return Layout({c: places[c] for c in _CHANNELS if c in places}, [*notes, *_assumed(places)])
+    return Layout({c: places[c] for c in DIMENSIONS if c in places}, [*notes, *_assumed(places)])
 
 
 def _named_by_user(labels: Sequence[str], columns: Mapping[str, object], units: Mapping[str, object],
                    row: Units) -> dict[str, Place]:
     places = {}
     for channel, column in columns.items():
-        if channel not in _CHANNELS:
-            raise DataError(f"columns: {one_of(str(channel), _CHANNELS, 'channel')} "
+        if channel not in DIMENSIONS:
+            raise DataError(f"columns: {one_of(str(channel), DIMENSIONS, 'channel')} "
                             "Write channel=column, e.g. v=u_volt.")
         label = _find(labels, column)
         unit = row[label] or headers.unit_in(label)[1]
-        if unit and unit.dimension not in headers.DIMENSIONS[channel]:
+        if unit and unit.dimension not in DIMENSIONS[channel]:
             named = headers.classify(label, row[label])  # u_a is in no ampere, current_A is
             if not {channel, label} & set(units) and ((named and named.unit) or headers.unit_in(label)[2]):
                 headers.require_unit(unit.label, channel)
@@ -141,7 +140,7 @@ def _apply_units(places: dict[str, Place], labels: Sequence[str], units: Mapping
     for key, text in units.items():
         channel = key if key in places else next((c for c, p in places.items() if p.column == key), None)
         if channel is None:
-            why = ("no column was recognised as this channel; name it with columns" if key in _CHANNELS else
+            why = ("no column was recognised as this channel; name it with columns" if key in DIMENSIONS else
                    "this column is not used as a channel" if key in labels else
                    one_of(str(key), [*places, *(p.column for p in places.values())], "channel or column"))
             raise DataError(f"units for '{key}': {why}")
@@ -200,7 +199,7 @@ def _assumed(places: Mapping[str, Place]) -> list[str]:
 
 
 def _default(channel: str) -> Unit:
-    dimension = headers.DIMENSIONS[channel][0]
+    dimension = DIMENSIONS[channel][0]
     return Unit(dimension, 1.0, SI[dimension], SI[dimension])
 
 

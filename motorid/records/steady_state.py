@@ -74,9 +74,8 @@ def _constant_stretches(v: Array) -> list[tuple[int, int]]:
 
 
 def _steady_tail(k: int, run: Experiment, sigma: Mapping[str, float], first: int, last: int) -> SteadySegment | None:
-    length = last - first + 1
     for share in (0.75, 0.5, 0.25, 0.125):
-        begin = last - int(share * length) + 1
+        begin = last - int(share * (last - first + 1)) + 1
         if last - begin + 1 < LEAST:
             return None
         if all(_level(run, c, sigma, begin, last) for c in run.outputs):

@@ -292,8 +292,7 @@ def scores(x: Array, std: Array) -> Array:
     """Return robust z of values (n,): distance from the median over scatter and own uncertainty together."""
     middle = np.median(x)
     scatter = robust_std(x - middle)
-    own = np.median(std)
-    between = np.sqrt(max(scatter**2 - own**2, 0.0))
+    between = np.sqrt(max(scatter**2 - np.median(std) ** 2, 0.0))
     return (x - middle) / np.maximum(np.hypot(between, std), 1e-12 * max(abs(middle), 1e-300))
 
 

@@ -314,9 +314,8 @@ def _product(names: Sequence[str], powers: Array) -> str:
 
 def suggestions(problem: Problem, q: Array, matrix: Array, missing: int) -> list[str]:
     """Return sentences on what to fix or to measure so that every singular value exceeds `LEVEL`."""
-    names = problem.model.free_names
     said = []
-    if sets := fixable(names, matrix, missing):
+    if sets := fixable(problem.model.free_names, matrix, missing):
         first = " and ".join(sets[0])
         other = f" (or {' and '.join(sets[1])})" if len(sets) > 1 else ""
         said.append(f"Fix {first}{other} where known, model.fix(…), and the rest is determined.")

@@ -273,13 +273,11 @@ class Multistart(Printed):
     def to_dict(self) -> dict[str, Any]:
         """Return the contents of ``robustness --json``."""
         good = self._ends("good")
-        return {
-            "starts": len(self.results), "spread": self.spread, "guess": self.guess, "good": self.good,
-            "poor": self.poor, "failed": self.failed, "seconds": self.seconds, "parameters": self.statistics(),
-            "nrmse": {c: float(np.mean([e.nrmse[c] for e in good])) if good else None for c in self.reference.nrmse},
-            "thresholds": {"cost_share": COST_SHARE, "standard_deviations": DISTANCE},
-            "interrupted": self.interrupted or None,
-        }
+        nrmse = {c: float(np.mean([e.nrmse[c] for e in good])) if good else None for c in self.reference.nrmse}
+        return {"starts": len(self.results), "spread": self.spread, "guess": self.guess, "good": self.good,
+                "poor": self.poor, "failed": self.failed, "seconds": self.seconds, "parameters": self.statistics(),
+                "nrmse": nrmse, "thresholds": {"cost_share": COST_SHARE, "standard_deviations": DISTANCE},
+                "interrupted": self.interrupted or None}
 
     @property
     def text(self) -> str:

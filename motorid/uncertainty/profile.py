@@ -222,15 +222,7 @@ def _joined(fit: Fit, name: str, left: list[Point], right: list[Point], dof: flo
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Intervals(Printed):
-    """Three answers to one question. Where they agree, any will do; where not, believe the profile.
-
-    Attributes
-    ----------
-    covariance : Covariance
-    bootstrap : Bootstrap
-    profiles : mapping of str to Profile
-    level : float
-    """
+    """Three answers to one question. Where they agree, any will do; where not, believe the profile."""
 
     covariance: Covariance
     bootstrap: Bootstrap

@@ -18,7 +18,7 @@ import numpy as np
 from motorid.integrate.engine import Grid, Trajectory
 from motorid.numerics.signals import Array
 from motorid.problem.problem import Problem
-from motorid.problem.relations import Part, Relation
+from motorid.problem.relations import Part
 from motorid.problem.residuals import prior_residual
 from motorid.problem.unknowns import Point
 
@@ -76,7 +76,9 @@ class Mesh:
         nodes = 0
         for k, run in enumerate(self.problem.runs):
             last = len(run.grid.t) - 1
-            for a, b in pairwise(_cuts(last, self.every)):
+            step = self.every or max(FEWEST, -(-last // MOST))
+            cuts = np.unique(np.linspace(0, last, max(round(last / step), 1) + 1).round().astype(int)).tolist()
+            for a, b in pairwise(cuts):
                 node = -1 if a == 0 else nodes - 1
                 nodes += b < last
                 found.append(Interval(k, a, b, node, nodes - 1 if b < last else -1, run.grid.part(a, b)))
@@ -157,15 +159,11 @@ class Mesh:
         if problem.priors:
             r, jac = prior_residual(problem.priors, problem.unknowns, walk.at)
             blocks.append(Block(r, jac, np.arange(self.nq)))
-        for penalty in problem.penalties:
-            for part in penalty.parts(problem):
-                blocks += self._penalty(penalty, part, walk)
+        for penalty, part in ((c, part) for c in problem.penalties for part in c.parts(problem)):
+            found = self._part(part, walk)
+            r, slope = penalty.penalty(np.concatenate([b.values for b, _ in found]), part)
+            blocks += [Block(r[rows], slope[rows, None] * b.jac, b.columns) for b, rows in found]
         return blocks
-
-    def _penalty(self, penalty: Relation, part: Part, walk: Walk) -> list[Block]:
-        blocks = self._part(part, walk)
-        r, slope = penalty.penalty(np.concatenate([b.values for b, _ in blocks]), part)
-        return [Block(r[rows], slope[rows, None] * b.jac, b.columns) for b, rows in blocks]
 
     def gaps(self, z: Array, walk: Walk, weighed: bool) -> list[Block]:
         """Return, per inner node, the node's state minus the end of the interval before it."""
@@ -231,12 +229,6 @@ def _present(b: Block) -> Block:
     """Drop absent columns."""
     there = b.columns >= 0
     return Block(b.values, b.jac[:, there] if b.jac.shape[1] else b.jac, b.columns[there])
-
-
-def _cuts(last: int, every: int | None) -> Sequence[int]:
-    """Samples at which a run is cut, both ends included."""
-    step = every or max(FEWEST, -(-last // MOST))
-    return np.unique(np.linspace(0, last, max(round(last / step), 1) + 1).round().astype(int)).tolist()
 
 
 def _joined(intervals: Sequence[Trajectory]) -> Trajectory:

@@ -102,8 +102,7 @@ class MultipleShooting:
         """
         began = time.perf_counter()
         _check(problem)
-        plain = replace(problem, constraints=())
-        near, q = self._unconstrained(plain)
+        near, q = self._unconstrained(replace(problem, constraints=()))
         bound = replace(near, constraints=problem.constraints)
         if self.process_noise is not None:
             return fit_of(self._with_process_noise(bound, q), time.perf_counter() - began)
@@ -241,8 +240,7 @@ def _under_heavier_penalties(problem: Problem, q: Array) -> Array:
         return q
     names = [p.name for p in problem.unknown]
     starts = [q, q + VALLEY * np.array([n == "L" for n in names])] if "L" in names else [q]
-    found = [_under_penalties(problem, start) for start in starts]
-    return min(found, key=lambda f: f[0])[1]
+    return min((_under_penalties(problem, start) for start in starts), key=lambda f: f[0])[1]
 
 
 def _under_penalties(problem: Problem, q: Array) -> tuple[float, Array]:

@@ -54,7 +54,9 @@ class ShootingNlp:
         at = self._evaluate(z, True)
         self.n, self.m = len(z), len(at.g)
         self.scale = STEEPEST / max(_steepest(at.residual, self.n), 1e-300)
-        self.jac_pattern, self._jac_order = _jacobian_pattern(at.rows, self.m, self.n)
+        rows, columns = places(at.rows)
+        self._jac_order = np.lexsort((rows, columns))  # the blocks' entries fill it column by column
+        self.jac_pattern = _ccs(rows[self._jac_order], columns[self._jac_order], self.m, self.n)
         self.hess_pattern, self._hess_mask, self._hess_place = _hessian_pattern(at.residual, self.n)
         self.lower, self.upper = self._limits(z)
 
@@ -165,13 +167,6 @@ def _steepest(blocks: Sequence[Block], n: int) -> float:
     return float(found.max(initial=0.0))
 
 
-def _jacobian_pattern(blocks: Sequence[Block], m: int, n: int) -> tuple[ca.Sparsity, np.ndarray]:
-    """Return the sparsity and the order in which the blocks' entries fill it, column by column."""
-    rows, columns = places(blocks)
-    order = np.lexsort((rows, columns))
-    return _ccs(rows[order], columns[order], m, n), order
-
-
 def _hessian_pattern(blocks: Sequence[Block], n: int) -> tuple[ca.Sparsity, np.ndarray, np.ndarray]:
     """Return the sparsity of the upper triangle, which entries of the blocks lie in it, and where they go."""
     rows = np.concatenate([np.repeat(b.columns, len(b.columns)) for b in blocks])
@@ -182,8 +177,7 @@ def _hessian_pattern(blocks: Sequence[Block], n: int) -> tuple[ca.Sparsity, np.n
 
 
 def _ccs(rows: np.ndarray, columns: np.ndarray, m: int, n: int) -> ca.Sparsity:
-    starts = np.searchsorted(columns, np.arange(n + 1))
-    return ca.Sparsity(m, n, starts.tolist(), rows.tolist())
+    return ca.Sparsity(m, n, np.searchsorted(columns, np.arange(n + 1)).tolist(), rows.tolist())
 
 
 def ipopt(nlp: ShootingNlp, z0: Array, bounds: tuple[Array, Array], options: Mapping[str, Any],
