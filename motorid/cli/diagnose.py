@@ -86,7 +86,7 @@ def diagnose_command(
             _keep_fit(before, done, json, options.force)
         raise
     if json != "-":
-        _show_diagnosis(found, notes)
+        _show_diagnosis(found, notes, report)
     if json:
         write_json(found.to_dict() | {"notes": notes}, json, options.force)
     if remainder_to:
@@ -113,9 +113,9 @@ def _write_remainder(found: Diagnosis, path: Path, force: bool) -> None:
     show(f"Written: {path}. Fit with it: --effects-from {path} --effects {effects}")
 
 
-def _show_diagnosis(found: Diagnosis, notes: Sequence[str]) -> None:
+def _show_diagnosis(found: Diagnosis, notes: Sequence[str], report: Path | None) -> None:
     """Print a diagnosis: the answer, the errors before and after, the next step; then what it rests on."""
-    show(found.answer, "", ladder_table(found.ladder), _next_step(found), "")
+    show(found.answer, "", ladder_table(found.ladder), _next_step(found, report), "")
     say_notes(notes, "About the records")
     say_notes(found.details, "Details")
     if found.after is not found.before:
@@ -123,8 +123,10 @@ def _show_diagnosis(found: Diagnosis, notes: Sequence[str]) -> None:
     show(ranking_table(found.ranking, 8) if found.ranking else None)
 
 
-def _next_step(found: Diagnosis) -> str:
-    """Return what to do next: the experiment that decides, what remains, or the model to go on with."""
+def _next_step(found: Diagnosis, report: Path | None = None) -> str:
+    """Return what to do next: more time, the experiment that decides, what remains, or the model to go on with."""
+    if found.stopped:
+        return "Next: the same command with more time; not all effects were tried."
     if found.suggestion:
         made = "\nOr design one: diagnose with --json found.json, then motorid design found.json"
         return f"Next: {found.suggestion[0].lower()}{found.suggestion[1:]}{made * found.suggestion.startswith('To ')}"
@@ -135,9 +137,8 @@ def _next_step(found: Diagnosis) -> str:
         names = ",".join(found.after.model.effect_names)
         return f"Next: {next_command('fit', '--effects', names, '--json', 'fit.json')}"
     if found.verdict == "unexplained":
-        if found.stopped:
-            return "Next: the same command with more time; not all effects were tried."
-        return f"Next: {next_command('diagnose', '--report', 'found.html')}\nIt shows where the model fails."
+        command = f"look at {report}." if report else next_command("diagnose", "--report", "found.html")
+        return f"Next: {command}\nIt shows where the model fails."
     return f"Next: {next_command('fit', '--json', 'fit.json')}\nThen: motorid export fit.json motor.casadi"
 
 

@@ -83,19 +83,23 @@ class ReadingOptions:
     @property
     def reading(self) -> dict[str, Any]:
         """What was said for `read_runs`, as its keyword arguments."""
-        named = {k: parse_pairs(v, f"--{k}") for k in ("columns", "units") if (v := getattr(self, k))}
+        named: dict[str, Any] = {
+            k: parse_pairs(v, f"--{k}") for k in ("columns", "units") if (v := getattr(self, k))}
+        if self.ignore:  # which of several columns it is does not matter then
+            named["columns"] = {**dict.fromkeys(self._ignored), **named.get("columns", {})}
         return named | {k: v for k in ("hold", "dt") if (v := getattr(self, k)) is not None}
+
+    @property
+    def _ignored(self) -> tuple[str, ...]:
+        """The channels to leave out."""
+        out = _words([self.ignore] if self.ignore else [])
+        for channel in out:
+            among(channel, CHANNELS, "measured channel", where="--ignore: ")
+        return tuple(out)
 
     def _preprocessed(self, runs: Sequence[Experiment]) -> list[Experiment]:
         """Return `runs` without the ignored channels, filtered, delayed and without spikes as asked."""
-        out = _words([self.ignore] if self.ignore else [])
-        known = [c for c in CHANNELS if any(c in r.outputs for r in runs)]
-        for channel in out:
-            among(channel, known, "measured channel", where="--ignore: ")
-        for r in runs:
-            if set(r.outputs) <= set(out):
-                raise UsageError(f"--ignore {self.ignore} leaves nothing measured in {r.name}; keep one of "
-                                 f"{', '.join(r.channels)}.")
+        out = self._ignored
         if self.median is not None and (self.median < 1 or self.median % 2 == 0):
             raise UsageError(f"--median takes an odd number of samples, 1 or more; got {self.median}.")
         kept = [r.without(*(c for c in out if c in r.outputs)) for r in runs]

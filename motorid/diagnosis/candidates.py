@@ -32,13 +32,15 @@ from motorid.estimation.result import Fit
 from motorid.model.definition import Effect, Parameter
 from motorid.model.model import Model
 from motorid.numerics.parallel import check_time
-from motorid.numerics.signals import noise_level
+from motorid.numerics.signals import Array, noise_level
 from motorid.records.experiment import Experiment
 
 SHORTLIST = 6
 PAIRS = 3  # refitted where no single effect helps
 NEAR = 0.4  # of the best score: what a common effect must reach to be refitted too
 ALWAYS = ("compliance", "speed_lag", "speed_delay", "driver_coast")  # their score at null says little
+ON = 0.05  # of the largest voltage: a level by itself
+PER_RUN_VOLTAGE = ("supply_per_run", "winding_warm_start")
 FLAT_TOP = 0.04  # of the samples: a current that is as large so often may have a limit
 
 
@@ -112,7 +114,8 @@ class Search:
                  stages: Stages) -> None:
         stages.at("looking at the misfit")
         self.held = HeldOut.of(fit, validate)
-        self.effects, self.stages, self.map = list(effects), stages, stages.map
+        self.effects = [e for e in effects if e.name not in PER_RUN_VOLTAGE or not _own_levels(fit.problem.experiments)]
+        self.stages, self.map = stages, stages.map
         self.root = node_of(fit, self.held)
         self._scores: dict[frozenset[str], list[Score]] = {}
         self._always = (*ALWAYS, LIMITER) if any(map(_flat_topped, fit.problem.experiments)) else ALWAYS
@@ -344,6 +347,21 @@ class Search:
             except FAILURES:
                 return None
         return self.nodes[key]
+
+
+def _own_levels(runs: Sequence[Experiment]) -> bool:
+    """Tell whether every run has a voltage of its own: what is another in each of them is any law of the voltage."""
+    levels = [_level(run.inputs["v"]) for run in runs]
+    return None not in levels and len(set(levels)) > 1
+
+
+def _level(v: Array) -> float | None:
+    """Return the size of a voltage that is on or off, to two digits; None for one of several sizes."""
+    on = np.abs(v[np.abs(v) > ON * np.max(np.abs(v), initial=0.0)])
+    if not on.size:
+        return 0.0
+    low, middle, high = np.quantile(on, [ON, 0.5, 1 - ON])
+    return float(f"{middle:.1e}") if high - low < ON * middle else None
 
 
 def _flat_topped(run: Experiment) -> bool:

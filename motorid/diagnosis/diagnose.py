@@ -110,7 +110,8 @@ def _told(found: Climb, driven: str, validated: bool, own: Sequence[Effect]) -> 
         missing = acting_like(missing, like)
     if names:
         verdict, where = "missing", balance_of(names[0], own)
-        answer = missing_text(ladder.rungs, remaining, groups, found.grades, bool(held_out_remark(found.path[-1])))
+        answer = missing_text(ladder.rungs, remaining, groups, found.grades, bool(held_out_remark(found.path[-1])),
+                              found.stopped)
         same = {name: p for node in found.path[1:] for name, p in found.search.inseparable(node).items()}
         hidden = found.search.hidden(found.path[-1])
         details = [moves(fit, ladder.best), rises_text(ladder.rungs), inseparable_remark(same), hidden_remark(hidden)]

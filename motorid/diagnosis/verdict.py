@@ -87,14 +87,15 @@ def approximations_text(grades: Sequence[Grade], what: str = "it") -> str:
 
 
 def missing_text(rungs: Sequence[Rung], remaining: Adequacy, groups: Sequence[Sequence[str]],
-                 grades: Sequence[Grade], elsewhere: bool = False) -> str:
+                 grades: Sequence[Grade], elsewhere: bool = False, stopped: str = "") -> str:
     """Return the answer when effects were found: what, how large, what the error becomes, what remains.
 
-    `elsewhere`: the held-out runs are predicted far worse than the fitted ones.
+    `elsewhere`: the held-out runs are predicted far worse than the fitted ones. `stopped`: why before all were tried.
     """
     after = rungs[-1].fit
     names = [g.effect for g in grades if g.grade != "approximates"]
-    parts = [f"Missing: {'; '.join(_described(after, n) for n in names)}."]
+    lead = f"Missing so far ({stopped})" if stopped else "Missing"
+    parts = [f"{lead}: {'; '.join(_described(after, n) for n in names)}."]
     parts += [f"These records do not distinguish {g[0]} from {' or '.join(g[1:])}." for g in groups]
     parts += [approximations_text(grades, "the rest")] if len(names) < len(grades) else []
     parts.append(errors_text(rungs))

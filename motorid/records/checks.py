@@ -345,8 +345,9 @@ def magnitudes(run: Experiment) -> str | None:
             return (f"{channel} reaches {top:.4g} {unit}{was}; is it in {likely}? "
                     f"If so: units={{'{channel}': '{likely}'}}.")
     if run.dt > 0.2:
-        return (f"there are {run.dt:.3g} s between samples, too long for a motor; is the time in ms? "
-                "If so: units={'t': 'ms'}.")
+        likely = "ms" if run.dt < 200 else "us"
+        return (f"there are {run.dt:.3g} s between samples, too long for a motor; is the time in {likely}? "
+                f"If so: units={{'t': '{likely}'}}.")
     return f"there are only {run.dt:.3g} s between samples; is the unit of the time right?" if run.dt < 1e-6 else None
 
 

@@ -40,8 +40,8 @@ def assign(labels: Sequence[str], *, columns: Mapping[str, object] | None = None
            units: Mapping[str, object] | None = None, unit_row: Mapping[str, str] | None = None) -> Layout:
     """Decide which column of `labels` holds which channel; without a header they are the positions "1", "2", ...
 
-    `columns` gives the name or position of a channel (t, v, i, omega, theta, v_supply, tau_load, temp), `units` the
-    unit of a channel or column, `unit_row` what the row below the header says.
+    `columns` gives the name or position of a channel (t, v, i, omega, theta, v_supply, tau_load, temp), None for one to
+    be left out, `units` the unit of a channel or column, `unit_row` what the row below the header says.
     """
     if not labels:
         raise DataError("it has no columns.")
@@ -49,7 +49,8 @@ def assign(labels: Sequence[str], *, columns: Mapping[str, object] | None = None
     units = units or {}
     places = _named_by_user(labels, columns or {}, units, row)
     notes: list[str] = []
-    _named_by_header(places, [c for c in labels if c not in {p.column for p in places.values()}], row, notes)
+    free = [c for c in labels if c not in {p.column for p in places.values()}]
+    _named_by_header(places, free, row, notes, [c for c, column in (columns or {}).items() if column is None])
     _last_resorts(places, labels, notes)
     _apply_units(places, labels, units, notes)
     _settle_counts(places, notes)
@@ -66,6 +67,8 @@ def _named_by_user(labels: Sequence[str], columns: Mapping[str, object], units: 
         if channel not in DIMENSIONS:
             raise DataError(f"columns: {one_of(str(channel), DIMENSIONS, 'channel')} "
                             "Write channel=column, e.g. v=u_volt.")
+        if column is None:
+            continue
         label = _find(labels, column)
         unit = row[label] or headers.unit_in(label)[1]
         if unit and unit.dimension not in DIMENSIONS[channel]:
@@ -92,8 +95,9 @@ def _find(labels: Sequence[str], column: object) -> str:
                     "counted from 1.")
 
 
-def _named_by_header(places: dict[str, Place], labels: Sequence[str], row: Units, notes: list[str]) -> None:
-    """Add the channels that the header names, where the user has not named them."""
+def _named_by_header(places: dict[str, Place], labels: Sequence[str], row: Units, notes: list[str],
+                     without: Sequence[str]) -> None:
+    """Add the channels that the header names, where the user has not named them, or wants to do `without`."""
     found: dict[str, list[Place]] = {}
     for label in labels:
         if hit := headers.classify(first_of_its_name(label, labels), row[label]):
@@ -102,7 +106,8 @@ def _named_by_header(places: dict[str, Place], labels: Sequence[str], row: Units
     for channel, hits in found.items():
         best = [p for p in hits if p.score == max(h.score for h in hits)]
         best = [p for p in best if p.unit.factor == 1.0] or best
-        if channel in places or (len(best) > 1 and best[0].score <= 1 and channel not in ("t", "v")):
+        weak = len(best) > 1 and best[0].score <= 1 and channel not in ("t", "v")
+        if channel in places or channel in without or weak:
             continue
         if len(best) > 1 and channel in MEASURED_INPUTS:
             continue  # which of them acts on the motor is not known

@@ -44,7 +44,7 @@ def read_runs(paths: Path_ | Iterable[Path_], *, columns: Mapping[str, object] |
         Files, directories, or patterns such as ``"data/run*.csv"``, each in natural order (run2, run10).
     columns : mapping, optional
         Channel (t, v, i, omega, theta, v_supply, tau_load, temp) to column, by name or by position counted from 1,
-        where the header does not tell: ``{"v": "u_volt"}``.
+        where the header does not tell: ``{"v": "u_volt"}``; to None where it is to be left out.
     units : mapping, optional
         Channel or column to unit: ``{"omega": "rpm", "theta": "counts:2048", "i": "-1 A"}``.
     hold : {"zoh", "linear"}, optional
@@ -207,8 +207,8 @@ def _of_table(table: TextTable, columns: Mapping[str, object] | None, units: Map
               hold: str | None, dt: float | None, name: str, meta: Mapping[str, Any]) -> Experiment:
     own: dict[str, str] = {m[1]: m[2] for m in map(_OWN.fullmatch, table.comments) if m}
     labels = table.labels
-    if "columns" in own and not columns:
-        columns = parse_pairs(own["columns"], "columns")
+    if "columns" in own and all(column is None for column in (columns or {}).values()):
+        columns = {**parse_pairs(own["columns"], "columns"), **(columns or {})}
         labels = [c for c in labels if c in columns.values()]
     labels = [c for c in labels if not _is_copy(c, labels, table)]
     if dt is not None:

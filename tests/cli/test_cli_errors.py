@@ -91,7 +91,7 @@ def test_broken_records(broken: Broken, tmp_path):
     (["fit", RUN, "--loss", "heavy"], "unknown loss 'heavy'"),
     (["fit", RUN, "--hold", "spline"], "hold"),
     (["fit", RUN, "--median", "4"], "odd number"),
-    (["fit", RUN, "--ignore", "theta"], "unknown measured channel 'theta'"),
+    (["fit", RUN, "--ignore", "thata"], "unknown measured channel 'thata'"),
     (["fit", RUN, "--ignore", "i,omega"], "measured"),
     (["fit", RUN, "--columns", "t:time"], "name=value"),
     (["fit", RUN, "--units", "omega=furlong"], "unknown unit 'furlong'"),

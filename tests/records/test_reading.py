@@ -170,6 +170,15 @@ def test_every_dialect_gives_the_same_run(name, tmp_path):
         np.testing.assert_array_equal(run.outputs[channel], expected.outputs[channel])
 
 
+def test_a_channel_that_is_left_out_need_not_be_told_from_others(tmp_path):
+    path = write(tmp_path, "t,v,speed,current_2,current_3\n" + rows(pattern="{t:.3f},{v},{w:.3f},{i:.3f},{i:.3f}\n"))
+    with pytest.raises(DataError, match="look equally like the current"):
+        read_csv(path)
+    assert read_csv(path, columns={"i": None}).channels == ("omega",)
+    own = write_csv(read_csv(write(tmp_path, GOOD, "plain.csv")), tmp_path / "own.csv")
+    assert read_csv(own, columns={"i": None}).channels == ("omega",)
+
+
 def test_units_in_the_header_are_converted(tmp_path):
     run = read_csv(write(tmp_path, "t_ms,voltage_mV,current_mA,speed_rpm,angle_deg\n" + rows(
         pattern="{t:.3f},{v},{i:.3f},{w:.3f},{w:.3f}\n")))
