@@ -505,6 +505,7 @@ def test_what_no_effect_and_no_curve_explains_is_looked_at_next_not_exported(mon
     found = mi.diagnose(mi.fit(mi.dc_motor(), read_runs(NOISY / "run1.csv")), max_effects=0)
     open_ = replace(found, verdict="unexplained", remainder=None)
     assert _next_step(open_).startswith("Next: motorid diagnose run.csv --report found.html")
+    assert _next_step(open_, Path("found.html")).startswith("Next: look at found.html.")
     assert "more time" in _next_step(replace(open_, stopped="the time is up"))
     assert _next_step(replace(open_, verdict="adequate")).endswith("Then: motorid export fit.json motor.casadi")
 

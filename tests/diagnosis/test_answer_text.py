@@ -51,6 +51,8 @@ def test_noise_that_remains_is_where_it_remains(elsewhere, said):
     noise = SimpleNamespace(adequate=True, text="")
     small = missing_text(rungs_of((0.02, 0.2), (0.02, 0.02), **errors, speed=1.0), noise, (), (), elsewhere)
     assert small.endswith(said)
+    stopped = missing_text(rungs_of((0.02, 0.2), (0.02, 0.02), **errors), noise, (), (), stopped="the time is up")
+    assert stopped.startswith("Missing so far (the time is up): ")
     larger = missing_text(rungs_of((0.02, 0.2), (0.02, 0.02), **errors, speed=9.4), noise, (), (), elsewhere)
     assert "remains is noise" not in larger
     assert larger.endswith(", but is larger than the noise (speed 9.4 times).")

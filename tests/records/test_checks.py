@@ -292,3 +292,10 @@ def test_a_channel_without_a_single_sample_is_said_to_be_missing(dead):
     outputs = {"i": 0.1 * v, "omega": 20 * v, "theta": 20 * np.cumsum(v) * 1e-3}
     said = check_runs([Experiment(t, {"v": v}, outputs | {dead: np.full(len(t), np.nan)})])
     assert any("100 %" in text and "missing" in text for text in said)
+
+
+@pytest.mark.parametrize(("each", "unit"), [(1.0, "ms"), (500.0, "us")])
+def test_a_time_that_was_not_in_seconds_is_asked_for(each, unit, rng):
+    t = each * np.arange(200)
+    run = Experiment(t, {"v": np.sign(np.sin(0.1 * np.arange(200) + 0.1))}, {"omega": rng.normal(size=200)})
+    assert f"units={{'t': '{unit}'}}" in said(run)
