@@ -198,7 +198,8 @@ def _with_orders(problem: Problem) -> Problem:
     """
     model = present = problem.model
     waiting = effects_of_unknown_order(model)
-    for effect in waiting:
+    zeros = [e for e in model.effects if e.name == "encoder_zero" and "theta" not in problem.outputs]
+    for effect in (*waiting, *(zeros if waiting else ())):  # a zero is seen by what it shifts alone
         present = present.without(effect.name)
     while waiting:
         smaller = problem.for_model(present).tuned(constraints=())  # an order shows without them

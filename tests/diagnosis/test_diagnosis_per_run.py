@@ -105,3 +105,14 @@ def test_what_is_another_in_every_run_is_not_asked_of_runs_of_one_voltage_each()
     half = [r.with_(inputs={"v": np.where(t < 0.5, r.inputs["v"], 0.5 * r.inputs["v"])}) for r in runs]
     names = {e.name for e in Search(mi.fit(mi.dc_motor(), half), None, library(None), Stages()).effects}
     assert {"supply_per_run", "winding_warm_start"} <= names
+
+
+def test_what_was_named_without_an_angle_can_be_fitted_by_name():
+    """The order of a cogging is sought without it, and then nothing is left that a zero of the encoder shifts."""
+    t = 1e-3 * np.arange(1200)
+    motor = mi.dc_motor(R=1.4, L=2e-3, K=0.05, b=6e-5, J=2.4e-5) + mi.effects.cogging(A=4e-3, N=6, phi=0.4)
+    runs = [mi.planned(motor, t, np.where(t < 0.6, v, -v)) for v in (1.5, 2.2)]
+    runs = [r.with_(outputs={c: y for c, y in r.outputs.items() if c != "theta"}) for r in runs]
+    found = mi.fit(mi.dc_motor() + mi.effects.cogging + mi.effects.encoder_zero, runs)
+    assert found.values["N"] == 6
+    assert max(found.nrmse.values()) < 0.01
