@@ -12,6 +12,7 @@ WINDOWS = 200  # over which slopes are taken
 ORDERS = (2, 3, 4, 5, 6)  # of differences
 _SMALLER_HALF = 0.3240277  # mean of |z| over the smaller half, z standard normal: 4·(φ(0) − φ(0.67449))
 _FLOOR = 1e-5  # of the channel's own variation: what a noise-free simulation is given
+FEWEST_FRESH = 20  # measurements of a sensor that is read more often than it measures
 _EVEN = 1e-6  # of the interval: samples are evenly spaced if their times wander by less
 _FEW, _MOSTLY = 512, 0.8  # jumps of a first look at a step, and the share of them that must be its multiples
 _REST = 12  # equal samples in a row that count as standstill
@@ -110,7 +111,8 @@ def noise_level(y: ArrayLike, t: ArrayLike | None = None) -> float:
     High-order differences remove the signal, which is smooth over a few samples, and keep the noise; averaging the
     smaller half of them ignores outliers and the few samples after a voltage step. On uneven samples the weights are
     those of divided differences, so missing and jittering samples do no harm. The order starts at two and grows as
-    long as that removes more signal. Parts in which nothing changes at all are left out. The result is never below
+    long as that removes more signal. Parts in which nothing changes at all are left out, and so is what a sensor that
+    measures every few samples repeats meanwhile. The result is never below
     what rounding alone does (step/√12, where the channel moves in steps), nor below 1e-5 of the channel's variation.
 
     Parameters
@@ -140,6 +142,9 @@ def noise_level(y: ArrayLike, t: ArrayLike | None = None) -> float:
     times = np.arange(values.size, dtype=float) if t is None else np.asarray(t, dtype=float)
     keep, step = np.isfinite(values) & np.isfinite(times), quantum(values)
     values, times = values[keep], times[keep]
+    fresh = np.concatenate([[True], np.diff(values) != 0]) if values.size else keep
+    if step == 0 and FEWEST_FRESH <= np.count_nonzero(fresh) < 0.5 * fresh.size:
+        values, times = values[fresh], times[fresh]
     return float(max(_from_differences(values, times, step), step / np.sqrt(12), _floor(values)))
 
 

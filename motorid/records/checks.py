@@ -114,7 +114,9 @@ def _clipped(run: Experiment) -> str | None:
     for channel in (c for c in ("i", "omega") if c in run.outputs):
         y = run.outputs[channel][np.isfinite(run.outputs[channel])]
         for top in (y.max(), y.min()):
-            if _at_stop(y, float(top)):
+            others = np.diff(y[(y > y.min()) & (y < y.max())])
+            repeats = np.count_nonzero(others == 0) > 0.5 * len(others)  # a sensor read more often than it measures
+            if _at_stop(y, float(top)) and not repeats:
                 share = 100 * float(np.mean(y == top))
                 return (f"the {NAMES[channel]} stays at exactly {top:.4g} {run.units[channel]} in "
                         f"{share:.2g} % of the samples: clipped at the limit of the sensor or the drive. Use "

@@ -162,3 +162,10 @@ def test_a_step_is_found_in_a_signal_that_passes_many_at_once(step, rng):
     y = np.round((20 * speed() + 2 * step * rng.standard_normal(N)) / step) * step
     assert quantum(y) == pytest.approx(step, rel=1e-6)
     assert quantum(y + 0.3 * step * rng.standard_normal(N)) == 0.0
+
+
+def test_a_sensor_that_is_read_more_often_than_it_measures_has_the_noise_of_its_measurements(rng):
+    t = 1e-3 * np.arange(4000)
+    measured = 20 * np.sin(3 * t) + 0.1 * rng.normal(size=4000)
+    held = measured[np.arange(4000) // 8 * 8]
+    assert noise_level(held, t) == pytest.approx(0.1, rel=0.3)

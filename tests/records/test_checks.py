@@ -299,3 +299,11 @@ def test_a_time_that_was_not_in_seconds_is_asked_for(each, unit, rng):
     t = each * np.arange(200)
     run = Experiment(t, {"v": np.sign(np.sin(0.1 * np.arange(200) + 0.1))}, {"omega": rng.normal(size=200)})
     assert f"units={{'t': '{unit}'}}" in said(run)
+
+
+def test_a_sensor_that_is_read_more_often_than_it_measures_is_not_clipped(rng):
+    t = 1e-3 * np.arange(2000)
+    v = 5 * np.sin(6 * t)
+    speed = (90 * np.sin(6 * t - 0.4) + rng.normal(size=2000))[np.arange(2000) // 40 * 40]
+    assert "clipped" not in said(Experiment(t, {"v": v}, {"omega": speed}))
+    assert "clipped" in said(Experiment(t, {"v": v}, {"omega": np.clip(90 * np.sin(6 * t - 0.4), -60, 60)}))
