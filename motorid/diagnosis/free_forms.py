@@ -230,7 +230,7 @@ def basis_of(form: Form, signal: Mapping[str, Array], span: Span) -> Array:
 BALANCES = ("voltage", "torque")
 STATES = {"torque": "omega", "voltage": "i"}  # whose rate a balance is
 NUDGE = 1e-3  # of a size
-UNBOUNDED = 1e9  # in units of the noise, per unit of a form
+UNBOUNDED = 1e9  # in units of the noise, per unit of what a form puts in
 
 
 @dataclass(frozen=True, eq=False)
@@ -331,7 +331,8 @@ def _driven(answer: Response, bases: Mapping[Form, Array]) -> Array:
     forces = [np.stack([_share(f, b, answer, on) for on in BALANCES], axis=2) for f, b in bases.items()]
     with np.errstate(over="ignore", invalid="ignore"):
         out = answer.driven(np.einsum("nxf,nmf->mnx", answer.b, np.concatenate(forces, axis=1), optimize=True))
-    if not np.all(np.abs(out) < UNBOUNDED):  # or not a number
+    unit = max(1.0, *(float(np.abs(b).max(initial=0.0)) for b in bases.values()))
+    if not np.all(np.abs(out) < UNBOUNDED * unit):  # or not a number
         raise SimulationError("the model's answer to small changes grows without bound along these records.")
     return out.reshape(n * ny, -1)
 

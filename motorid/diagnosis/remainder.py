@@ -31,7 +31,7 @@ from motorid.diagnosis.free_forms import (
     values_of,
 )
 from motorid.diagnosis.misspecification import better_forms, chosen_functions
-from motorid.diagnosis.model_comparison import far
+from motorid.diagnosis.model_comparison import Node, at_noise, far
 from motorid.diagnosis.predictive_score import compare
 from motorid.diagnosis.refit import refit
 from motorid.display.numbers import number, percent
@@ -311,7 +311,7 @@ class Remainder:
             raise UsageError(f"what is left is {self.form.text}: no curve, but another motor in every run. "
                              "Fit the runs apart.")
         beside = [(self.fit, f) for f in self.forms]
-        tried = [t for pair in zip_longest(self._alone(), beside) for t in pair if t is not None]
+        tried = [t for pair in zip_longest(beside, self._alone()) for t in pair if t is not None]
         tried = [t for t in (*self._in_place(), *tried) if t[1].on != "run"][:TRIED]
         if (best := _best(self.fit, tried, self._judge)) is None:
             raise UsageError("something predictable is left, but no curve over one quantity lowers the error on data "
@@ -352,18 +352,19 @@ def _best(fit: Fit, tried: Sequence[tuple[Fit, Form]], held: HeldOut) -> Curve |
     while name in fit.model.effect_names:  # a curve beside a curve
         name += "_more"
     for base, form in tried:
-        curve, better = Curve(base, form, name=name), None
+        curve, better, after = Curve(base, form, name=name), None, before
         with contextlib.suppress(*FAILURES):
             for _ in range(ROUNDS):
                 if (larger := curve.grown()) is None or larger.fitted is None:
                     break
-                found_better = compare(before, held.predictions(larger.fitted))
-                if better is not None and found_better.gain < better.gain:  # slopes led astray
+                predicted = held.predictions(larger.fitted)
+                gained = compare(before, predicted)
+                if better is not None and gained.gain < better.gain:  # slopes led astray
                     break
-                curve, better = larger, found_better
+                curve, better, after = larger, gained, predicted
         if better is not None and better.worth_it and curve.fitted is not None:
             found.append((better.gain, curve))
-            if not far(curve.fitted):
+            if at_noise(Node(curve.fitted, None, after)):
                 break
     return max(found, key=lambda f: f[0], default=(0.0, None))[1]
 

@@ -146,6 +146,7 @@ SINGLES = [
     single("speed_gain", "servo", {"k_w": 0.04}, train=("stairs", "multisine"), channels=ANGLE),
     single("driver_coast", "lab", {"V_c": 12.0}, train=("pulses", "pulses 0.7"), check="pulses 0.5"),
     single("driver_current_limit", "lab", {"I_lim": 3.0}, train=("stairs", "prbs 0.8")),
+    single("driver_lag", "servo", {"T_v": 8e-3}, train=("stairs", "prbs 0.8")),
     single("supply_sag", "wheel", {"R_s": 0.15, "V_s": 13.0}, train=("stairs", "ramps")),
     single(
         "magnet_heating",
