@@ -318,7 +318,6 @@ class Remainder:
                              "left out.")
         return best
 
-
     @property
     def _judge(self) -> HeldOut:
         return self._held or HeldOut.of(self.fit, None)
