@@ -40,7 +40,6 @@ PAIRS = 3  # refitted where no single effect helps
 NEAR = 0.4  # of the best score: what a common effect must reach to be refitted too
 ALWAYS = ("compliance", "speed_lag", "speed_delay", "driver_coast")  # their score at null says little
 ON = 0.05  # of the largest voltage: a level by itself
-PER_RUN_VOLTAGE = ("supply_per_run", "winding_warm_start")
 FLAT_TOP = 0.04  # of the samples: a current that is as large so often may have a limit
 
 
@@ -114,7 +113,8 @@ class Search:
                  stages: Stages) -> None:
         stages.at("looking at the misfit")
         self.held = HeldOut.of(fit, validate)
-        self.effects = [e for e in effects if e.name not in PER_RUN_VOLTAGE or not _own_levels(fit.problem.experiments)]
+        law = _own_levels(fit.problem.experiments)
+        self.effects = [e for e in effects if not (law and e.name in PER_RUN and e.balance == "voltage")]
         self.stages, self.map = stages, stages.map
         self.root = node_of(fit, self.held)
         self._scores: dict[frozenset[str], list[Score]] = {}
@@ -358,10 +358,8 @@ def _own_levels(runs: Sequence[Experiment]) -> bool:
 def _level(v: Array) -> float | None:
     """Return the size of a voltage that is on or off, to two digits; None for one of several sizes."""
     on = np.abs(v[np.abs(v) > ON * np.max(np.abs(v), initial=0.0)])
-    if not on.size:
-        return 0.0
-    low, middle, high = np.quantile(on, [ON, 0.5, 1 - ON])
-    return float(f"{middle:.1e}") if high - low < ON * middle else None
+    low, middle, high = np.quantile(on if on.size else [0.0], [ON, 0.5, 1 - ON])
+    return float(f"{middle:.1e}") if high - low <= ON * middle else None
 
 
 def _flat_topped(run: Experiment) -> bool:

@@ -8,10 +8,10 @@ the model, and what then predicts best is the answer.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property, reduce
-from itertools import zip_longest
+from itertools import islice, zip_longest
 from typing import Any
 
 import casadi as ca
@@ -310,30 +310,28 @@ class Remainder:
         if self.form is not None and self.form.on == "run":
             raise UsageError(f"what is left is {self.form.text}: no curve, but another motor in every run. "
                              "Fit the runs apart.")
-        beside = [(self.fit, f) for f in self.forms]
-        tried = [t for pair in zip_longest(beside, self._alone()) for t in pair if t is not None]
-        tried = [t for t in (*self._in_place(), *tried) if t[1].on != "run"][:TRIED]
-        if (best := _best(self.fit, tried, self._judge)) is None:
+        held = self._held or HeldOut.of(self.fit, None)
+        tried = islice((t for t in self._tried(held) if t[1].on != "run"), TRIED)
+        if (best := _best(self.fit, tried, held)) is None:
             raise UsageError("something predictable is left, but no curve over one quantity lowers the error on data "
                              "left out.")
         return best
 
-    @property
-    def _judge(self) -> HeldOut:
-        return self._held or HeldOut.of(self.fit, None)
+    def _tried(self, held: HeldOut) -> Iterator[tuple[Fit, Form]]:
+        """Yield models and a form to fit with each, the likeliest first; what takes a fit to find only when asked for.
 
-    def _in_place(self) -> list[tuple[Fit, Form]]:
-        """Return the model without what only approximates a form, and each such form: beside it there is no place."""
+        Beside what only approximates a form there is no place for it; then the whole model, or without all that does.
+        """
         replaced = {name: form for name, form in self._approximating.items() if form is not None}
-        base = self._without(replaced)
-        return [] if base is None else [(base, form) for form in dict.fromkeys(replaced.values())]
-
-    def _alone(self) -> list[tuple[Fit, Form]]:
-        """Return the model without all that only approximates, and the forms that predict best beside that."""
-        base = self._without(self._approximating)
-        if base is None or not far(self.fit):
-            return []
-        return [(base, gain.form) for gain in better_forms(base, self._judge.predictions(base))]
+        if (base := self._without(replaced)) is not None:
+            yield from ((base, form) for form in dict.fromkeys(replaced.values()))
+        alone, beside = list[tuple[Fit, Form]](), [(self.fit, form) for form in self.forms]
+        yield from beside[:1]
+        with contextlib.suppress(*FAILURES):
+            if far(self.fit) and (base := self._without(self._approximating)) is not None:
+                alone = [(base, gain.form) for gain in better_forms(base, held.predictions(base))]
+        for pair in zip_longest(alone, beside[1:]):
+            yield from filter(None, pair)
 
     def _without(self, names: Iterable[str]) -> Fit | None:
         """Return the fit without these effects; None where there are none, or no fit is."""
@@ -345,7 +343,7 @@ class Remainder:
 
 
 @one_thread
-def _best(fit: Fit, tried: Sequence[tuple[Fit, Form]], held: HeldOut) -> Curve | None:
+def _best(fit: Fit, tried: Iterable[tuple[Fit, Form]], held: HeldOut) -> Curve | None:
     """Return the curve, fitted with its model, that predicts most beyond `fit`; None where none does."""
     before, found, name = held.predictions(fit), [], "remainder"
     while name in fit.model.effect_names:  # a curve beside a curve

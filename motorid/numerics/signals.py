@@ -142,7 +142,7 @@ def noise_level(y: ArrayLike, t: ArrayLike | None = None) -> float:
     times = np.arange(values.size, dtype=float) if t is None else np.asarray(t, dtype=float)
     keep, step = np.isfinite(values) & np.isfinite(times), quantum(values)
     values, times = values[keep], times[keep]
-    fresh = np.concatenate([[True], np.diff(values) != 0]) if values.size else keep
+    fresh = np.diff(values, prepend=np.nan) != 0
     if step == 0 and FEWEST_FRESH <= np.count_nonzero(fresh) < 0.5 * fresh.size:
         values, times = values[fresh], times[fresh]
     return float(max(_from_differences(values, times, step), step / np.sqrt(12), _floor(values)))
