@@ -184,7 +184,7 @@ def _bounded(fit: Fit, model: Model) -> Model:
     limits = {}
     for e in model.effects:
         for p in (model.parameters[q.name] for q in e.parameters):
-            if p.grid and p.null is None and p.vary and not p.given:
+            if p.grid and p.null is None and p.vary and not (p.given or p.periodic):
                 size = natural.get(p.unit, 1.0)
                 low, high = max(p.lower, min(p.grid) * size / ROOM), min(p.upper, max(p.grid) * size * ROOM)
                 limits |= {p.name: (low, high)} if low < high else {}

@@ -48,6 +48,17 @@ def test_a_pool_that_breaks_costs_no_refit_and_the_budget_holds_beside_one():
         list(stages.map(abs, [-1]))
 
 
+def test_a_phase_may_turn_either_way_in_a_refit(lab):
+    """Its places to start from are quarters of a turn, which are no limits."""
+    hidden = {"angular_friction": {"tau_m": 6e-3, "a_f": 0.6, "N_f": 1, "phi_f": -1.3}}
+    rng, angle = np.random.default_rng(3), ("i", "omega", "theta")
+    runs = [record(driven(lab, hidden, w, 600, 2e-3, rng), "logger", angle, lab, rng, w) for w in ("stairs", "ramps")]
+    fit = mi.fit(mi.dc_motor(), runs)
+    found = trial.refit(fit, fit.model + mi.effects.angular_friction, [{"tau_m": 5e-3, "phi_f": -0.3}])
+    assert found.values["phi_f"] == pytest.approx(-1.3, abs=0.1)
+    assert found.values["a_f"] == pytest.approx(0.6, abs=0.05)
+
+
 def test_a_refit_goes_on_beyond_its_limit_of_iterations(monkeypatch):
     run = _run(mi.dc_motor(**TRUE))
     monkeypatch.setattr(trial, "POLISH", replace(trial.POLISH, max_iterations=2))
