@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, reduce
 
 import numpy as np
 
@@ -90,11 +90,15 @@ def tied(a: Node, b: Node) -> bool:
 
 
 def choose(children: Sequence[Node], parent: Node) -> tuple[Node, list[Node]] | None:
-    """Return the best child, the smaller on a tie, and the children in order; None without any."""
+    """Return the best child, the smaller on a tie, and the children in order; None without any.
+
+    Gains on the parent, each in effective samples of its own residual, order the children; which of two is better only
+    a comparison of the two tells.
+    """
     if not children:
         return None
     ordered = sorted(children, key=lambda n: -evidence(parent, n).gain)
-    chosen = ordered[0]
+    chosen = reduce(lambda best, n: n if beats(n, best) else best, ordered)
     while True:  # ties are not transitive: what is tied with the smaller model may be smaller still
         near = [n for n in ordered if n is chosen or not beats(chosen, n)]
         smaller = min(near, key=lambda n: (n.size, rarity(n.added), -evidence(parent, n).gain))
