@@ -32,6 +32,7 @@ NUMBERS = {  # one plausible size of every effect
     "current_offset": {"i_0": 0.03},
     "speed_gain": {"k_w": 0.05},
     "driver_coast": {"V_c": 12.0},
+    "pwm_coast": {"s_c": 0.8, "V_s": 3.0},
     "driver_current_limit": {"I_lim": 1.0},
     "driver_lag": {"T_v": 0.02},
     "supply_sag": {"R_s": 0.5, "V_s": 3.0},

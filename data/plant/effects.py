@@ -97,6 +97,11 @@ def driver_coast(m: Motor, V_c: float) -> Hooks:
 
 
 @_known
+def pwm_coast(m: Motor, s_c: float, V_s: float) -> Hooks:
+    return {"drive": lambda v, w: v + s_c * max(1 - abs(v) / V_s, 0.0) * m.K * w}
+
+
+@_known
 def driver_current_limit(m: Motor, I_lim: float) -> Hooks:
     return {"limit": I_lim}
 

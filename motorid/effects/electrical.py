@@ -81,6 +81,18 @@ def driver_coast(m: Equations, R_c=P(50.0, "Ω", null=0.0, positive=True, grid=(
     m.voltage -= ca.if_else(ca.fabs(m.command) <= OPEN, R_c * m.i - (1 - shorted) * m.K_e * m.omega, 0)
 
 
+@effect(balance="voltage")
+def pwm_coast(m: Equations, s_c=P(0.5, "", null=0.0, lower=0.0, upper=1.0, doc="share of the pauses without a current"),
+              V_s=P(12.0, "V", positive=True, vary=False, grid=(1.0,), doc="supply, the voltage of full duty, fixed")):
+    """PWM whose bridge opens in its pauses: no back-EMF acts there, K·ω·(1−s·(1−d)), d = abs(v)/V_s. Mohan, 2012.
+
+    Drivers switched by their enable pin, "fast decay": s is near 1 where a pause is long against L/R. Unless V_s is
+    given it is the largest voltage of the records. Seen as a motor that hardly brakes, and runs too fast at small duty:
+    several duties, with steps down.
+    """
+    m.voltage += s_c * ca.fmax(1 - ca.fabs(m.command) / V_s, 0) * m.K_e * m.omega
+
+
 LIMITER_GAIN, LIMITER_WIDTH = 5.0, 0.004  # in R: how firmly the current is led to its limit; of R·I_lim: how softly
 
 

@@ -171,6 +171,7 @@ def test_says_what_it_is_with_units_limits_and_source(effect):
             "N_r",
             "e_r",
             "k_w",
+            "s_c",
             "s_b",
             "a_f",
             "N_f",

@@ -38,6 +38,7 @@ TRUTH = {
     "current_offset": {"i_0": 0.05},
     "speed_gain": {"k_w": 0.04},
     "driver_coast": {"R_c": 9.0},
+    "pwm_coast": {"s_c": 0.6, "V_s": 8.0},
     "driver_current_limit": {"I_lim": 2.5},
     "driver_lag": {"T_v": 6e-3},
     "supply_sag": {"R_s": 0.4, "V_s": 8.0},
@@ -54,6 +55,7 @@ TRUTH = {
 KNOWN = {  # what the records leave open
     "driver_lag": {"L": VALUES["L"]},
     "supply_sag": {"V_s": 8.0},
+    "pwm_coast": {"V_s": 8.0},
     "supply_side_current": {"V_dc": 9.0},
     "current_gain": {"R": VALUES["R"]},
     "gear_efficiency": {"J": VALUES["J"]},
