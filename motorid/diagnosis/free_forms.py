@@ -34,6 +34,7 @@ STILL = 0.02  # of the highest speed: slower is standstill
 SHARP = 1e-3  # of the highest speed: below it a direction is not known
 SOFT = 0.01  # of the largest current or voltage: the width of a jump at zero
 BENDS = (4, 12)  # times the largest speed, current or voltage goes a curve's bend into it
+KNEES = 9  # of a speed, current or voltage of either sign, beyond which something sets in
 CHANGES = {"t": "changes with the time", "distance": "changes with the distance run",
            "turn": "changes with the angle within a turn", "theta": "changes with the angle",
            "omega": "changes with the speed", "i": "changes with the current", "v": "changes with the voltage",
@@ -163,6 +164,8 @@ def functions_of(form: Form, span: Span) -> list[str]:
     s = f"({inside} / {top:.6g})"
     size = f"ca.fabs{s}"
     smooth = [s, f"{s}**2", f"{s}**3", *(f"ca.tanh({k} * {s})" for k in BENDS)]
+    sides = [sign for sign, reach in (("", high), ("-", -low)) if reach > 0]
+    smooth += [f"ca.fmax({sign}{s} - {c:.6g}, 0)" for sign in sides for c in np.linspace(0, 1, KNEES + 2)[1:-1]]
     if not low < 0 < high:
         return ["1.0", *smooth]
     side = "m.sign(z)" if form.on == "omega" else f"ca.tanh(z / {SOFT * top:.6g})"

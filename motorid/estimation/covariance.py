@@ -47,8 +47,8 @@ class Certainty:
     status: tuple[str, ...]  # "determined", "not determined", "at its lower limit" or "at its upper limit"
     dof: float  # effective degrees of freedom of the residuals
     colours: Mapping[str, Colour]  # per channel, of the whitened residuals
-    blind: Array  # (k, m), directions without influence on the outputs: orthonormal, in solver coordinates
-    unit: Array  # (k,), change of each unknown per unit of its solver coordinate: its value where that is logarithmic
+    blind: Array  # (k, m), directions without influence on the outputs: orthonormal, in relative changes
+    unit: Array  # (k,), what a relative change is one of: the value, or the natural size where that is larger
 
     @property
     def std(self) -> tuple[float | None, ...]:
@@ -81,7 +81,7 @@ def certainty(problem: Problem, q: Array, residuals: Array, jacobian: Array, fre
     basis = np.eye(len(loose))[:, loose] if free is None else free
     blocks = channel_blocks(problem, residuals, jacobian)
     colours = _colours(blocks, basis.shape[1], method)
-    unit = problem.scaling.slope(q)
+    unit = np.maximum(problem.scaling.slope(q), np.abs(problem.scaling.physical(q)))
     influence = np.linalg.norm(jacobian * unit, axis=0)
     jacobian = np.where(influence > ROUNDING * influence.max(initial=0.0), jacobian, 0.0)
     half, blind = seen_directions(jacobian @ basis)
@@ -96,7 +96,7 @@ def certainty(problem: Problem, q: Array, residuals: Array, jacobian: Array, fre
 
 
 def _shifts(blind: Array, slope: Array) -> bool:
-    """Tell whether a quantity of gradient `slope` (k,), in solver coordinates, changes along `blind` (k, m)."""
+    """Tell whether a quantity of gradient `slope` (k,), to relative changes, changes along `blind` (k, m)."""
     return bool(np.linalg.norm(slope @ blind) > BLIND * np.linalg.norm(slope))
 
 

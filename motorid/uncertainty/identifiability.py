@@ -232,7 +232,7 @@ def _structural_rank(problem: Problem, q: Array, points: int, seed: int) -> int:
     for trial in range(points + 1):
         at = q.copy()
         at[:k] += reach * rng.uniform(-1, 1, k) * (trial > 0)
-        with suppress(SimulationError):
+        with suppress(SimulationError, np.linalg.LinAlgError), np.errstate(over="ignore", invalid="ignore"):
             jac = relative_jacobian(problem.refined(at), at)
             norms = np.linalg.norm(jac, axis=0)
             s = np.linalg.svd(jac / np.where(norms > 0, norms, 1.0), compute_uv=False)
