@@ -91,11 +91,16 @@ def channels_of(runs: Sequence[Experiment]) -> tuple[str, ...]:
 
 
 def noise_of(runs: Sequence[Experiment], channels: Sequence[str]) -> dict[str, float]:
-    """Noise per channel, estimated once for all runs (quadratic mean) where no run states it."""
+    """Noise per channel, estimated once for all runs (quadratic mean over samples) where no run states it.
+
+    A channel that never moves in a run tells nothing there.
+    """
     levels = {}
     for c in channels:
         each = [r.sigma.get(c) or _level(r, c) for r in runs if c in r.outputs]
-        levels[c] = float(np.sqrt(np.mean(np.square(each))))
+        known = [(r, y[np.isfinite(y)]) for r in runs if (y := r.outputs.get(c)) is not None]
+        counts = [y.size if c in r.sigma or (y.size and np.ptp(y)) else 0 for r, y in known]
+        levels[c] = float(np.sqrt(np.average(np.square(each), weights=counts if any(counts) else None)))
         if not levels[c] > 0:
             raise FloatingPointError(f"the square of the noise of {c}, {max(each):.3g}, is zero")
     return levels

@@ -17,6 +17,7 @@ Check = Callable[[Experiment], str | None]
 Reading = tuple[tuple[int, ...], tuple[int, int]]  # order of v, i, omega; signs of i and omega
 _BLOCKS = 40
 EXPLAINED = 0.1  # share of either balance that a reading with exchanged columns may leave unexplained
+ALONG = 0.5  # cosine of voltage and speed beyond which neither is turned, whatever a driver that saturates does
 CLEAR = 0.15  # of what the stated columns leave, so much at most
 RESOLVED = 1e-3  # share that noise and the integration from sample to sample leave of any balance
 LOAD = 2.0  # largest torque of a load, as a multiple of the largest current
@@ -422,6 +423,8 @@ def _as_balances_want(run: Experiment) -> Reading:
         return stated
     readings: list[Reading] = list(product(permutations(range(3)), product((1, -1), (1, -1))))
     if "i" not in known:  # the voltage drives in its place, and its own balance says nothing
+        if _cosine(run.inputs["v"], run.outputs["omega"]) > ALONG:
+            return stated
         readings = [stated, ((0, 1, 2), (1, -1))]
     balances = _Balances(run, [run.outputs["i"] if "i" in known else run.inputs["v"], run.outputs["omega"]])
     shares = {r: balances.unexplained(*r) for r in readings}

@@ -360,5 +360,6 @@ def repeated(runs: Sequence[Experiment], held_out: Sequence[Experiment]) -> str:
         return run.n, *(y[np.isfinite(y)].sum() for y in run.outputs.values())
 
     fitted = {mark(run) for run in runs}
-    same = [run.name for run in held_out if mark(run) in fitted]
+    moving = [run for run in held_out if any(np.ptp(y[np.isfinite(y)]) > 0 for y in run.outputs.values())]  # not a rest
+    same = [run.name for run in moving if mark(run) in fitted]
     return f"{', '.join(same)} is both fitted and held out: its held-out error means nothing." if same else ""

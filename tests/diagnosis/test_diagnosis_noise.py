@@ -16,6 +16,7 @@ from motorid.diagnosis.model_comparison import node_of
 from motorid.diagnosis.score_test import Score
 from motorid.diagnosis.verdict import _noise_feedback, closed_loop_remark, outliers_remark
 from motorid.effects import LIBRARY
+from motorid.numerics.parallel import one_thread
 from motorid.numerics.signals import despiked
 from motorid.records.experiment import Experiment
 
@@ -66,6 +67,7 @@ def test_a_tachometer_that_ripples_is_found_in_the_measurement(lab):
     assert "The measurement fails" in found.text
 
 
+@one_thread
 def test_no_form_predicts_coloured_noise(lab):
     for seed in range(5):
         runs = runs_of(lab, {}, seed=seed, rho=0.93, size=0.02)

@@ -125,6 +125,14 @@ def test_a_speed_in_rpm_is_recognised(plant):
     assert "rpm" in found.text
 
 
+def test_of_two_sensors_the_one_that_predicts_better_beside_the_other_comes_first(plant):
+    """Its errors are smoother, of fewer effective samples: the gain on the plain motor alone would take the lag."""
+    hidden = {"coulomb": {"tau_c": 8e-3}, "speed_average": {"T_a": 0.012}}
+    runs = runs_of(plant.MOTORS["lab"], hidden, ("steps", "chirp", "prbs"))
+    found = diagnosed(runs, ("speed_delay", "speed_average", "speed_lag", "coulomb"))
+    assert [r.added for r in found.ladder.rungs] == [None, "speed_average", "coulomb"]
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("chain", ["logger", "coloured", "coarse", "spikes"])
 def test_noise_alone_gets_no_effect(plant, chain):

@@ -20,6 +20,7 @@ from motorid.diagnosis.free_forms import Form, linearised, shown, signals_along,
 from motorid.diagnosis.locate import locate
 from motorid.diagnosis.remainder import Curve, Remainder
 from motorid.exporters.export import load
+from motorid.numerics.parallel import one_thread
 from motorid.records.reading import write_csv
 
 ANGLE = ("i", "omega", "theta")
@@ -234,6 +235,7 @@ def test_a_sensor_that_bends_is_a_curve_in_the_measurement(lab):
     assert now < 1.15 * straight < 0.5 * was
 
 
+@one_thread
 def test_slopes_of_every_form_are_those_of_the_model_with_its_curve(lab):
     """Sticking and voltage steps within samples included."""
     rng = np.random.default_rng(7)

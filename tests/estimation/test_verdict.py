@@ -83,6 +83,26 @@ def test_a_channel_that_is_not_followed_at_all_is_lost(runs):
     assert fit.verdict.startswith("Does not fit")
 
 
+def test_what_is_determined_does_not_depend_on_where_a_fit_without_current_ends(runs):
+    """Currents ten thousand times as large beside an R as much smaller are the same motor; first currents are some."""
+    fit = mi.fit(mi.dc_motor(), [r.without("i") for r in runs], window=0.4)
+    problem, unknown = fit.problem, [p.name for p in fit.problem.unknown]
+    assert any(n.startswith("i_0[") for n in unknown)
+    power = np.array([{"R": -1, "L": -1, "K": 0, "o": 0}.get(n[0], 1) for n in unknown])
+    q = problem.scaling.scaled(problem.scaling.physical(fit.q) * 1e4**power)
+    r, jac = problem.residual_and_jacobian(q)
+    assert r == pytest.approx(fit.residuals, rel=1e-3, abs=1e-3)
+    found = certainty(problem, q, r, jac / problem.scaling.slope(q))
+    assert {n for n, std in zip(unknown, found.std, strict=True) if std is None} >= {"R", "L", "J", "b"}
+    assert found.std[unknown.index("K")] == pytest.approx(fit.std["K"], rel=0.05) if fit.std["K"] else True
+
+
+def test_a_motor_on_a_linear_axis_has_a_speed_in_metres(runs):
+    cart = [r.without("i").with_(outputs={"omega": 0.03 * r.outputs["omega"]}, units={"omega": "m/s"}) for r in runs]
+    known = mi.fit(mi.dc_motor(), cart).determined
+    assert known["gain"].unit == "m/s per V"
+
+
 def test_voltage_and_speed_alone_determine_gain_times_and_friction_in_volts(runs):
     """They are the plant's, within what they claim, though no single parameter is determined."""
     fit = mi.fit(mi.dc_motor() + mi.effects.coulomb, [r.without("i") for r in runs])

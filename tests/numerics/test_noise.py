@@ -5,8 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+import motorid as mi
 from motorid.numerics.autoregression import autocorrelation
 from motorid.numerics.signals import noise_level, quantum
+from motorid.problem.runs import noise_of
+from motorid.records.experiment import repeated
 
 N = 2000
 T = np.arange(N) * 1e-3
@@ -169,3 +172,15 @@ def test_a_sensor_that_is_read_more_often_than_it_measures_has_the_noise_of_its_
     measured = 20 * np.sin(3 * t) + 0.1 * rng.normal(size=4000)
     held = measured[np.arange(4000) // 8 * 8]
     assert noise_level(held, t) == pytest.approx(0.1, rel=0.3)
+
+
+def test_a_short_rest_tells_nothing_of_the_noise(rng):
+    """A logger that writes zeros before it begins has no noise of one unit."""
+    t, zero = np.arange(3000) * 1e-3, np.zeros(10)
+    moving = np.sin(3 * t) + 0.01 * rng.standard_normal(t.size)
+    long = mi.Experiment(t, {"v": np.sign(np.sin(9 * t))}, {"omega": moving})
+    rest = mi.Experiment(t[:10], {"v": zero}, {"omega": zero})
+    alone, both = (noise_of(runs, ("omega",))["omega"] for runs in ([long], [rest, long]))
+    assert both == alone == pytest.approx(0.01, rel=0.1)
+    assert noise_of([rest], ("omega",))["omega"] > 0
+    assert not repeated([rest, long], [rest]), "a rest is no record"

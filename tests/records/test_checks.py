@@ -306,3 +306,11 @@ def test_a_sensor_that_is_read_more_often_than_it_measures_is_not_clipped(rng):
     v = 5 * np.sin(6 * t)
     speed = (90 * np.sin(6 * t - 0.4) + rng.normal(size=2000))[np.arange(2000) // 40 * 40]
     assert "clipped" not in said(Experiment(t, {"v": v}, {"omega": speed}))
+
+
+def test_a_driver_at_its_end_does_not_turn_the_speed_round(plant, lab):
+    """The command goes on beyond what there is; the speed stays, and still is along the voltage."""
+    t = np.arange(0, 4, 2e-3)
+    command = 1.5 * lab.v_max * t / t[-1]
+    shown = plant.simulate(lab, {}, t, np.minimum(command, 0.5 * lab.v_max))
+    assert "swapped" not in said(Experiment(t, {"v": command}, {"omega": shown["omega"]}))

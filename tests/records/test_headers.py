@@ -85,6 +85,12 @@ def test_what_is_no_unit_is_none(text):
     assert parse_unit(text) is None
 
 
+def test_a_number_may_touch_the_unit_that_a_user_gives():
+    assert require_unit("0.047V", "v").factor == 0.047
+    assert require_unit("-1rad/s", "omega").factor == -1
+    assert parse_unit("12V") is None, "in a header that is a name"
+
+
 @pytest.mark.parametrize(("text", "channel", "says"), [
     ("rmp", "omega", "Did you mean 'rpm'"), ("V", "omega", "that is a voltage"),
     ("rpm", "theta", "that is a speed"),
