@@ -157,7 +157,8 @@ class Effect(Shown):
     def title(self) -> str:
         """What people call it: the first words of its `doc`, else its name."""
         words = re.split(r"[,.:;] ?|\n", re.sub(r" \([^)\s]* [^)]*\)", "", self.doc), maxsplit=1)[0].strip()
-        return words[:1].lower() + words[1:] if 0 < len(words) <= 60 else self.name.replace("_", " ")
+        first = words[:1] if words[:2].isupper() else words[:1].lower()  # PWM
+        return first + words[1:] if 0 < len(words) <= 60 else self.name.replace("_", " ")
 
     @property
     def size(self) -> Parameter | None:
