@@ -14,12 +14,6 @@ os.environ.setdefault("MPLBACKEND", "Agg")  # figures without a display, for pro
 from motorid.records.datasets import load_plant
 
 
-@pytest.hookimpl(optionalhook=True)
-def pytest_xdist_auto_num_workers() -> int:
-    """One worker more than there are cores: some tests wait, for a bench or for another process."""
-    return (os.cpu_count() or 1) + 1
-
-
 @pytest.fixture
 def rng() -> np.random.Generator:
     """A generator with a fixed seed, new for every test."""

@@ -15,8 +15,7 @@ from battery.score import figures, run_case
 from motorid.effects import LIBRARY
 
 HERE = Path(__file__).parents[1]
-PART = ("magnetic_saturation", "coulomb_coloured", "driver_dead_band+magnetic_saturation", "none_outliers",
-        "grease_warm_up")
+PART = ("magnetic_saturation", "coulomb_coloured", "driver_dead_band+magnetic_saturation", "none_outliers")
 
 
 def test_the_battery_covers_what_it_promises():
