@@ -242,6 +242,7 @@ def _within(model: Model, values: Mapping[str, float]) -> Model:
     return model.start_at(inside)
 
 
+BEAM = 2  # models that the next round grows: that many are finished
 OUTDONE = 1.5  # times the least cost of a race: 20 nats away from a tie at 100 effective samples
 BEHIND = 10.0  # times the cost of a model that explains all but noise
 HARDLY = 1.01  # times: near enough that a slope tells what more would do
@@ -344,12 +345,12 @@ def completed(given_up: Sequence[GivenUp], map_: Callable[..., Iterable[Any]]) -
 
 def _outdone(tasks: Sequence[Task], races: Mapping[int, Raced], found: Mapping[int, Any]) -> dict[int, GivenUp]:
     """Return the races that an undamped step from their end still leaves far behind, or with nothing gained."""
-    least, given_up = min(race.cost for race in races.values()), {}
+    costs, given_up = sorted(race.cost for race in races.values()), {}
     for k, race in races.items():
         before = tasks[k].fit.cost
-        if k not in found and race.reach > min(OUTDONE * least, (1 - MATERIAL) ** 2 * before):
-            why = NOTHING if race.reach > (1 - MATERIAL) ** 2 * before else LESS
-            given_up[k] = GivenUp(why, 1 - race.cost / max(before, 1e-300), (tasks[k], race))
+        nothing = race.reach > (1 - MATERIAL) ** 2 * before
+        if k not in found and (nothing or (race.reach > OUTDONE * costs[0] and race.cost not in costs[:BEAM])):
+            given_up[k] = GivenUp(NOTHING if nothing else LESS, 1 - race.cost / max(before, 1e-300), (tasks[k], race))
     return given_up
 
 

@@ -23,7 +23,7 @@ from motorid.diagnosis.misspecification import FormGain, Grade, better_forms, gr
 from motorid.diagnosis.model_comparison import Node, at_noise, beats, choose, evidence, far, group_of, node_of
 from motorid.diagnosis.predictive_score import is_sure
 from motorid.diagnosis.record_parts import affordable, thinned_alike
-from motorid.diagnosis.refit import INTERRUPTED, OUT_OF_TIME
+from motorid.diagnosis.refit import BEAM, INTERRUPTED, OUT_OF_TIME
 from motorid.diagnosis.results import Adequacy, Candidate, Ladder, Rung
 from motorid.diagnosis.thresholds import MATERIAL
 from motorid.diagnosis.verdict import first_answer
@@ -36,7 +36,6 @@ from motorid.numerics.parallel import budget, interruption, one_thread
 from motorid.numerics.parallel import progress as shown
 from motorid.records.experiment import Experiment
 
-BEAM = 2
 ORDER = ("named", "group", "approximates")  # grades, the surest first
 HALF_AS_GOOD = 0.5  # of the best child's fall: what a second model must reach to be carried along
 
