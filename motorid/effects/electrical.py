@@ -82,7 +82,7 @@ def driver_coast(m: Equations, R_c=P(50.0, "Ω", null=0.0, positive=True, grid=(
 
 
 @effect(balance="voltage")
-def pwm_coast(m: Equations, s_c=P(0.5, "", null=0.0, lower=0.0, upper=1.0, doc="share of the pauses without a current"),
+def pwm_coast(m: Equations, s_c=P(0.5, "", null=0.0, lower=0.0, upper=1.1, doc="share of the pauses without current"),
               V_s=P(12.0, "V", positive=True, vary=False, grid=(1.0,), doc="supply, the voltage of full duty, fixed")):
     """PWM whose bridge opens in its pauses: no back-EMF acts there, K·ω·(1−s·(1−d)), d = abs(v)/V_s. Mohan, 2012.
 
