@@ -215,7 +215,7 @@ def _text(adequate: bool, channels: Mapping[str, Mapping[str, float]], material:
         return f"Something is missing: the errors ({sizes}) are too large for noise, even coloured noise."
     worst = min(material, key=lambda t: (t["p"], -t["share"]))
     if worst["channel"] is None:
-        why = f"'{worst['on']}' would explain {100 * worst['share']:.0f} % of them"
+        why = f"'{worst['on']}' is predicted to explain {100 * worst['share']:.0f} % of them"
     else:
         error = f"{channel_name(worst['channel'])} error"
         why = f"{worst['on']} explains {100 * worst['share']:.0f} % of the variance of the {error}"

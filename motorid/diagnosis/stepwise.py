@@ -152,15 +152,22 @@ def _with(found: Climb, best: Node, chosen: Node, ranked: bool, group: tuple[str
 def _finished(found: Climb) -> Climb:
     """Return a climb with the free forms that predict better beside all effects, and the grade of each effect."""
     search, best = found.search, found.path[-1]
-    rounds = tuple(tuple(replace(c, group=_without(c.group, best.key), **(
-        {"reason": "added in a later step"} if c.effect in best.key and not c.accepted else {})) for c in r)
-                   for r in found.rounds)
+    met = frozenset[str]().union(*(node.key for node in found.path))
+    rounds = tuple(tuple(_as_it_ended(c, best.key, met) for c in r) for r in found.rounds)
     groups = tuple((g[0], *rest) for g in found.groups if g and (rest := _without(g[1:], best.key)))
     structure = not found.remaining.adequate
     forms = better_forms(best.fit, best.predictions) if structure else []
     grades = grades_of(best, search.root, groups, forms, structure,
                        lambda name: None if found.stopped else search.without(best, name))
     return replace(found, rounds=rounds, groups=groups, forms=tuple(forms), grades=grades)
+
+
+def _as_it_ended(tried: Candidate, last: frozenset[str], met: frozenset[str]) -> Candidate:
+    """Return a candidate as the `last` model has it; what no model on the way there `met` was not taken after all."""
+    tried = replace(tried, group=_without(tried.group, last))
+    if tried.accepted and not met.issuperset(tried.effect.split(" + ")):
+        return replace(tried, accepted=False, reason="taken at first, but a model without it predicts better")
+    return tried if tried.accepted or tried.effect not in last else replace(tried, reason="added in a later step")
 
 
 def _better(children: Iterable[Node], best: Node) -> tuple[Node, list[Node]] | None:

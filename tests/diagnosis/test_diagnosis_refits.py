@@ -17,6 +17,7 @@ from motorid.diagnosis import refit as trial
 from motorid.diagnosis import score_test as ranking
 from motorid.diagnosis import stepwise
 from motorid.diagnosis.admissibility import objections
+from motorid.diagnosis.results import Candidate
 from motorid.diagnosis.verdict import measured_angle_remark
 from motorid.effects import LIBRARY
 from motorid.errors import OutOfTime
@@ -409,3 +410,17 @@ def test_a_cogging_that_no_current_of_the_motor_overcomes_is_refused():
     assert "A is 2.5 times the largest torque of the motor" in objections(absurd, LIBRARY["cogging"])
     free = mi.fit(mi.torque_driven(g=1e-3) + mi.effects.cogging(A=1e-3, N=7.0), _run(model).without("i"), start="model")
     assert "times the largest torque" in objections(replace(free, values={**free.values, "A": 1.0}), LIBRARY["cogging"])
+
+
+def test_what_the_ladder_left_again_is_not_called_accepted():
+    first = Candidate("supply_sag", 0.9, accepted=True, reason="lowers the held-out error")
+    last = frozenset({"pwm_coast", "coulomb"})
+    left = stepwise._as_it_ended(first, last, last)
+    assert not left.accepted
+    assert "a model without it predicts better" in left.reason
+    pair = replace(first, effect="pwm_coast + coulomb")
+    assert stepwise._as_it_ended(pair, last, last) == pair
+    replaced = stepwise._as_it_ended(first, last, last | {"supply_sag"})
+    assert replaced.accepted, "its rung is there, whatever came in its place"
+    later = stepwise._as_it_ended(replace(first, effect="coulomb", accepted=False), last, last)
+    assert later.reason == "added in a later step"
