@@ -419,7 +419,7 @@ def test_what_the_ladder_left_again_is_not_called_accepted():
     assert not left.accepted
     assert "a model without it predicts better" in left.reason
     pair = replace(first, effect="pwm_coast + coulomb")
-    assert stepwise._as_it_ended(pair, last, last) == pair
+    assert stepwise._as_it_ended(pair, last, last).accepted
     replaced = stepwise._as_it_ended(first, last, last | {"supply_sag"})
     assert replaced.accepted, "its rung is there, whatever came in its place"
     later = stepwise._as_it_ended(replace(first, effect="coulomb", accepted=False), last, last)
