@@ -264,8 +264,12 @@ def _pairs(inside: str) -> str:
 def _console() -> Any:
     from rich.console import Console
 
-    console = Console(highlight=False, soft_wrap=False)
-    return console if console.is_terminal else Console(highlight=False, width=WIDTH)
+    class Printer(Console):
+        def on_broken_pipe(self) -> None:  # nobody reads on, `motorid fit … | head`: files are written all the same
+            os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+
+    console = Printer(highlight=False, soft_wrap=False)
+    return console if console.is_terminal else Printer(highlight=False, width=WIDTH)
 
 
 def say_notes(notes: Iterable[str], title: str = "Remarks") -> None:

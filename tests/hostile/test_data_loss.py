@@ -369,3 +369,14 @@ def test_a_spoilt_row_of_a_journal_is_done_again(tmp_path):
     done = motorid(*words)
     assert done.status == 0, done.err
     assert len(journal.read_text(encoding="utf-8").splitlines()) == 2
+
+
+def test_a_result_is_written_though_nobody_reads_what_is_printed(tmp_path):
+    out = tmp_path / "fit.json"
+    command = [sys.executable, "-m", "motorid", "fit", str(RUN), "--json", str(out)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        process.stdout.close()  # as `| head` does
+        said = process.stderr.read()
+    assert process.returncode == 0, said
+    assert "Traceback" not in said
+    assert json.loads(out.read_text(encoding="utf-8"))["parameters"]
