@@ -93,9 +93,8 @@ def _dates(cells: Sequence[object], column: str) -> Array:
         warnings.simplefilter("ignore")
         try:
             stamps = pd.to_datetime(series, errors="coerce", format="ISO8601", utc=True)
-            dated = stamps.notna().mean() > 0.5
             clock = series.where(series.astype(str).str.contains("[:a-zA-Z]"))  # bare numbers would be nanoseconds
-            spans = stamps - stamps.min() if dated else pd.to_timedelta(clock, errors="coerce")
+            spans = stamps if stamps.notna().mean() > 0.5 else pd.to_timedelta(clock, errors="coerce")
             seconds = (spans - spans.min()).dt.total_seconds().to_numpy(dtype=float)
         except (ValueError, TypeError, OverflowError, AttributeError):
             seconds = np.full(len(series), np.nan)

@@ -21,8 +21,7 @@ def _root() -> Path:
     for place in places:
         if (place / "truth.json").is_file():
             return place
-    looked = " and ".join(str(place) for place in places)
-    raise DataError(f"the shipped records were not found; looked for truth.json in {looked}. "
+    raise DataError(f"the shipped records were not found; looked for truth.json in {' and '.join(map(str, places))}. "
                     "Install motorid from a wheel, or work in a checkout that has its data folder.")
 
 

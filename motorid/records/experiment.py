@@ -153,7 +153,10 @@ class Experiment(Shown):
         coarse = self.select(slice(None, None, int(k)))
         if self.hold == "linear" or k == 1:
             return coarse
-        return coarse.with_(inputs={c: _zoh_mean(self.t, a, int(k)) for c, a in self.inputs.items()})
+        starts, width = np.arange(0, self.n, int(k)), np.diff(self.t)
+        width = np.append(width, width[-1])  # the last sample is held for as long as the one before
+        means = {c: np.add.reduceat(a * width, starts) / np.add.reduceat(width, starts) for c, a in self.inputs.items()}
+        return coarse.with_(inputs=means)
 
     def running_median(self, samples: int) -> Experiment:
         """Return the run with its voltage, noisy as it was measured, replaced by the median over `samples` (odd)."""
@@ -221,8 +224,8 @@ def split(experiment: Experiment, n: int = 2) -> list[Experiment]:
     if int(n) != n or n < 1:
         raise UsageError(f"split() takes a whole number of blocks of at least 1; got {n!r}.")
     edges = np.linspace(0, experiment.n, int(n) + 1).round().astype(int)
-    blocks = (experiment.select(slice(a, b)) for a, b in pairwise(edges))
-    return [b.with_(name=f"{experiment.name}[{j + 1}/{n}]") for j, b in enumerate(blocks)]
+    return [experiment.select(slice(a, b)).with_(name=f"{experiment.name}[{j}/{n}]")
+            for j, (a, b) in enumerate(pairwise(edges), 1)]
 
 
 def windows(experiment: Experiment, seconds: float) -> list[Experiment]:
@@ -345,13 +348,6 @@ def _units(run: Experiment) -> Mapping[str, str]:
         raise DataError(f"{run.name}: omega in {given['omega']} does not go with theta in {given['theta']}.")
     return MappingProxyType({c: UNITS[c][-1 if True in linear and c in ("omega", "theta") else 0]
                              for c in present} | given)
-
-
-def _zoh_mean(t: Array, values: Array, k: int) -> Array:
-    starts = np.arange(0, len(t), k)
-    width = np.diff(t, append=t[-1])
-    width[-1] = width[-2]  # the last sample is held for as long as the one before
-    return np.add.reduceat(values * width, starts) / np.add.reduceat(width, starts)
 
 
 def repeated(runs: Sequence[Experiment], held_out: Sequence[Experiment]) -> str:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from motorid.numerics.signals import Array
+from motorid.numerics.signals import Array, window_slopes
 from motorid.records.experiment import Experiment
 
 LEAST = 16  # samples
@@ -122,7 +122,5 @@ def _slope(run: Experiment, first: int, last: int) -> float:
 
 
 def _top_slope(run: Experiment) -> float:
-    if (y := run.outputs.get("theta")) is None:
-        return 0.0
-    good = np.flatnonzero(np.isfinite(y))[::max(run.n // 200, 1)]
-    return float(np.max(np.abs(np.diff(y[good]) / np.diff(run.t[good])), initial=0.0))
+    y = run.outputs.get("theta")
+    return 0.0 if y is None else float(np.abs(window_slopes(run.t, y)).max(initial=0.0))
