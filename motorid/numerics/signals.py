@@ -188,8 +188,7 @@ def _of_order(values: Array, times: Array | None, still: NDArray[np.bool_], orde
 def _weights(t: Array) -> Array:
     """Return the weights of divided differences, of length one, for windows of times (N, order + 1)."""
     u = (t - t[:, :1]) / (t[:, -1] - t[:, 0])[:, None]
-    apart = u[:, :, None] - u[:, None, :] + np.eye(t.shape[1])
-    weights = 1.0 / np.prod(apart, axis=2)
+    weights = 1.0 / np.prod(u[:, :, None] - u[:, None, :] + np.eye(t.shape[1]), axis=2)
     return weights / np.linalg.norm(weights, axis=1, keepdims=True)
 
 
