@@ -125,8 +125,7 @@ class MultipleShooting:
 
     def _from_poor_values(self, problem: Problem) -> Array:
         """Return values that a fit finds whose intervals join loosely, then tightly, from poor ones."""
-        found = [self._roughly(problem, q) for q in _with_resets(problem, self._loosely_joined(problem).q)]
-        best = _lowest(found)
+        best = _lowest([self._roughly(problem, q) for q in _with_resets(problem, self._loosely_joined(problem).q)])
         # Once the others are right, a parameter that ran off to where nothing depends on it finds its way back.
         return _lowest([best, *(self._roughly(problem, q) for q in _with_resets(problem, best.q)[1:])]).q
 
@@ -175,9 +174,8 @@ class MultipleShooting:
         done = self._solve(mesh, mesh.joined(q, nodes_from_data(mesh, q)), rough=self.process_noise == "auto")
         for _ in range(NOISE_ROUNDS if self.process_noise == "auto" else 0):
             before, noise = noise, noise_of_gaps(done)
-            near = bool(np.all(np.abs(np.log(noise / before)) < NOISE_KNOWN))
             done = self._solve(replace(done.mesh, noise=noise), done.result.z, history=done.history)
-            if near:
+            if (np.abs(np.log(noise / before)) < NOISE_KNOWN).all():
                 break
         return done
 
@@ -247,8 +245,7 @@ def _under_penalties(problem: Problem, q: Array) -> tuple[float, Array]:
     """Return the cost and the solution under the heaviest penalties, each reached from the one before."""
     cost = np.inf
     for factor in HEAVIER:
-        weighed = tuple(Weighed(c, factor) for c in problem.constraints)
-        step = replace(problem, penalties=(*problem.penalties, *weighed))
+        step = replace(problem, penalties=(*problem.penalties, *(Weighed(c, factor) for c in problem.constraints)))
         try:
             found = least_squares(step, replace(FINISH, max_iterations=60), q=q, refine=False)
         except (FitError, SimulationError):
