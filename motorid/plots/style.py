@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from motorid.channels import NAMES, SYMBOLS, UNITS, channel_name
-from motorid.display.numbers import number
+from motorid.display.numbers import number, raised
 from motorid.errors import UsageError, arguments_told
 from motorid.numerics.signals import Array
 from motorid.records.experiment import Experiment
@@ -145,8 +145,7 @@ def _cleaned(svg: str, name: str, alt: str) -> str:
 
 def grid(rows: int, columns: int, *, row: float = 1.6, width: float = WIDTH, **options: Any) -> np.ndarray:
     """Return axes (rows, columns) on a new figure; `row` is the height of a row in inches."""
-    ratios = options.get("height_ratios")
-    total = row * (sum(ratios) if ratios is not None else rows)
+    total = row * sum(options.get("height_ratios", [1.0] * rows))
     return new_figure(width, total + 0.35).subplots(rows, columns, squeeze=False, **options)
 
 
@@ -227,6 +226,5 @@ def decade(size: float) -> int:
 
 def scaled_title(name: str, unit: str, power: int = 0) -> str:
     """Return ``L (10⁻³ H)``."""
-    factor = f"10{str(power).translate(str.maketrans('-0123456789', '⁻⁰¹²³⁴⁵⁶⁷⁸⁹'))}" if power else ""
-    inside = " ".join(w for w in (factor, unit) if w)
+    inside = " ".join(w for w in (f"10{raised(power)}" if power else "", unit) if w)
     return f"{name} ({inside})" if inside else name

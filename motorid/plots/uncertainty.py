@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -89,13 +88,15 @@ def plot_profile(result: Profile | Mapping[str, Profile] | Intervals) -> np.ndar
     --------
     >>> axes = mi.plot_profile(mi.profile(better, "b", quiet=True))
     """
-    profiles = _profiles(result)
+    found = result.profiles if isinstance(result, Intervals) else result
+    profiles = list(found.values()) if isinstance(found, Mapping) else [found]
+    if not profiles or not all(isinstance(p, Profile) for p in profiles):
+        raise UsageError(f"plot_profile takes mi.profile(fit, 'R') or mi.intervals(fit), got {type(result).__name__}.")
     columns = min(len(profiles), 3)
     rows = -(-len(profiles) // columns)
     axes = style.grid(rows, columns, row=2.2, width=style.WIDTH if columns == 3 else 4.2 * columns).ravel()
-    both = result if isinstance(result, Intervals) else None
     for ax, p in zip(axes, profiles, strict=False):
-        _one_profile(ax, p, both)
+        _one_profile(ax, p, result if isinstance(result, Intervals) else None)
     for ax in axes[len(profiles) :]:
         ax.set_axis_off()
     for k in range(0, len(profiles), columns):
@@ -145,14 +146,6 @@ def _smooth(x: Array, rise: Array, at: float) -> tuple[Array, Array]:
         return x, rise
     fine = np.linspace(x[0], x[-1], 200)
     return fine, PchipInterpolator(x, root)(fine) ** 2
-
-
-def _profiles(result: Any) -> Sequence[Profile]:
-    found = result.profiles if isinstance(result, Intervals) else result
-    chosen = list(found.values()) if isinstance(found, Mapping) else [found]
-    if not chosen or not all(isinstance(p, Profile) for p in chosen):
-        raise UsageError(f"plot_profile takes mi.profile(fit, 'R') or mi.intervals(fit), got {type(result).__name__}.")
-    return chosen
 
 
 @style.styled
