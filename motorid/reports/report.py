@@ -85,9 +85,8 @@ def _page(story: Story) -> str:
 
 
 def _provenance(story: Story, command: str, held_out: Sequence[Experiment]) -> Section:
-    named = [(r.name, r) for r in story.runs] + [(f"{r.name} (held out)", r) for r in held_out]
-    files = [[name, Path(str(run.meta.get("source", "–"))).name, str(run.meta.get("sha256", "–"))[:16]]
-             for name, run in named]
+    files = [[run.name + more, Path(str(run.meta.get("source", "–"))).name, str(run.meta.get("sha256", "–"))[:16]]
+             for more, runs in (("", story.runs), (" (held out)", held_out)) for run in runs]
     versions = ", ".join([f"Python {platform.python_version()}", *(f"{p} {package_version(p)}" for p in PACKAGES)])
     tables = [Table(["run", "file", "SHA-256 (first 16 digits)"], files)] if files else []
     traced = ["The files are named by the fingerprint of their contents: the page can be traced to them."] * bool(files)
