@@ -65,8 +65,7 @@ def number(value: float | None, digits: int = 4) -> str:
         return "0"
     value = float(f"{value:.{digits - 1}e}")
     power = _power(abs(value))
-    place = math.floor(math.log10(abs(value))) - digits + 1
-    text = _rounded(value, place, power)
+    text = _rounded(value, math.floor(math.log10(abs(value))) - digits + 1, power)
     text = text.rstrip("0").rstrip(".") if "." in text else text
     return f"{text}·10{raised(power)}" if power else text
 

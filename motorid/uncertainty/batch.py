@@ -275,8 +275,7 @@ def outliers(rows: Sequence[Mapping[str, Any]], names: Sequence[str], positive: 
             continue
         value = np.array([r[n] for r in known], float)
         std = np.array([r[f"{n}_std"] for r in known], float)
-        x, sd = (np.log(value), std / value) if n in positive else (value, std)
-        z = scores(x, sd)
+        z = scores(np.log(value), std / value) if n in positive else scores(value, std)
         limit = float(scipy.special.stdtrit(max(len(known) - 2, 1), 1 - level / (2 * len(known) * len(names))))
         for j in np.flatnonzero(np.abs(z) > limit):
             middle = float(np.median(value))
@@ -291,8 +290,7 @@ def outliers(rows: Sequence[Mapping[str, Any]], names: Sequence[str], positive: 
 def scores(x: Array, std: Array) -> Array:
     """Return robust z of values (n,): distance from the median over scatter and own uncertainty together."""
     middle = np.median(x)
-    scatter = robust_std(x - middle)
-    between = np.sqrt(max(scatter**2 - np.median(std) ** 2, 0.0))
+    between = np.sqrt(max(robust_std(x - middle) ** 2 - np.median(std) ** 2, 0.0))
     return (x - middle) / np.maximum(np.hypot(between, std), 1e-12 * max(abs(middle), 1e-300))
 
 

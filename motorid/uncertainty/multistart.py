@@ -87,9 +87,8 @@ def _draw(reference: Fit, names: Sequence[str], starts: int, spread: float, seed
     pars = reference.problem.model.parameters
     scale = reference.problem.scaling.scale
     sizes = np.array([reference.values[n] or 1e-3 * s for n, s in zip(names, scale, strict=False)])
-    turning = np.array([pars[n].periodic for n in names], bool)
     phases = sizes + np.pi * np.log(factors) / max(np.log(spread), 1e-300)  # anywhere on the circle
-    drawn = np.where(turning & (spread > 1), phases, factors * sizes)
+    drawn = np.where([pars[n].periodic and spread > 1 for n in names], phases, factors * sizes)
     drawn = np.clip(drawn, [pars[n].lower for n in names], [pars[n].upper for n in names])
     return [dict(zip(names, row, strict=True)) for row in drawn.tolist()]
 
