@@ -223,8 +223,7 @@ def simulation(name: str, functions: Mapping[str, ca.Function], t: Array, m: NDA
     share = 1.0 / m[interval]
     s, u, p = ca.MX.sym("s", 3), ca.MX.sym("u", nu, len(t)), ca.MX.sym("p", np_)
     before = u[:, interval.tolist()]
-    after = ca.vertcat(*[u[j, (interval if hold else interval + 1).tolist()] for j, hold in enumerate(held)])
-    slope = after - before
+    slope = ca.vertcat(*[u[j, (interval if hold else interval + 1).tolist()] for j, hold in enumerate(held)]) - before
     u0 = before + slope * ca.repmat(ca.DM(part * share).T, nu, 1)
     u1 = u0 + slope * ca.repmat(ca.DM(share).T, nu, 1)
     h = ca.DM(np.diff(t)[interval] * share).T
