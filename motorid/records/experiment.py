@@ -267,10 +267,10 @@ def between_pauses(run: Experiment) -> list[Experiment]:
     parts = [slice(a, b) for a, b in pairwise([0, *(cuts + 1).tolist(), run.n]) if b - a >= MIN_SAMPLES]
     if not cuts.size or not parts:
         return [run]
-    live = [s for s in parts if any(np.isfinite(y[s]).any() for y in run.outputs.values())]
+    live = [run.select(s) for s in parts if any(np.isfinite(y[s]).any() for y in run.outputs.values())]
     told = {"parts": None, "record": record_of(run)}
-    return [run.select(s).with_(name=f"{run.name}[{k + 1}]", meta={**run.select(s).meta, **told,
-                                "notes": run.meta.get("notes", ()) if k == 0 else ()}) for k, s in enumerate(live)]
+    return [part.with_(name=f"{run.name}[{k}]", meta={**part.meta, **told,
+                       "notes": run.meta.get("notes", ()) if k == 1 else ()}) for k, part in enumerate(live, 1)]
 
 
 def _frozen_array(values: ArrayLike, what: str, run: str) -> Array:

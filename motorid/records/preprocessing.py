@@ -126,10 +126,7 @@ def spikes(t: Array, y: Array, v: Array) -> NDArray[np.intp]:
     before, here, after = y[seen[:-2]], y[seen[1:-1]], y[seen[2:]]
     off, apart = here - (before + after) / 2, np.abs(after - before)
     jumps = np.flatnonzero(np.abs(np.diff(v)) > 0.02 * np.ptp(v))
-    steady = np.ones(len(t), bool)
-    for k in range(PEAK + 1):
-        steady[np.clip(jumps + k, 0, len(t) - 1)] = False
-    calm = steady[seen[1:-1]]
+    calm = ~np.isin(seen[1:-1], jumps[:, None] + np.arange(PEAK + 1))
     alone = calm & (apart < 0.3 * np.abs(off))
     # Smooth or not, a channel bends everywhere alike; nine in ten tell how much. A spike bends three samples.
     beside = np.convolve(alone & (np.abs(off) > 12 * noise), np.ones(3), "same") > 0

@@ -49,9 +49,8 @@ def find_segments(runs: Sequence[Experiment], sigma: Sequence[Mapping[str, float
     A stretch counts where the two halves of its tail agree in every channel within four standard errors or
     0.1 % of the channel's largest value. Parts without input and without motion say nothing and are left out.
     """
-    tails = (_steady_tail(k, run, sigma[k], first, last)
-             for k, run in enumerate(runs) for first, last in _constant_stretches(run.inputs["v"]))
-    return tuple(segment for segment in tails if segment is not None)
+    return tuple(tail for k, run in enumerate(runs) for first, last in _constant_stretches(run.inputs["v"])
+                 if (tail := _steady_tail(k, run, sigma[k], first, last)))
 
 
 def segment_between(k: int, run: Experiment, begin: float, end: float) -> SteadySegment | None:
