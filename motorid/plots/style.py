@@ -177,10 +177,8 @@ def envelope(x: Array, y: Array) -> tuple[Array, Array]:
     if len(x) <= POINTS:
         return x, y
     width = -(-2 * len(x) // POINTS)
-    rows = -(-len(x) // width)
-    padded = np.full(rows * width, np.nan)
-    padded[: len(y)] = y
-    blocks, start = padded.reshape(rows, width), np.arange(rows) * width
+    blocks = np.pad(y, (0, -len(y) % width), constant_values=np.nan).reshape(-1, width)
+    start = width * np.arange(len(blocks))
     missing = ~np.isfinite(blocks)
     lowest = start + np.argmin(np.where(missing, np.inf, blocks), axis=1)
     highest = start + np.argmax(np.where(missing, -np.inf, blocks), axis=1)
