@@ -73,8 +73,7 @@ def description(found: Fit | Model) -> dict[str, Any]:
             n: {"value": p.value, "std": None, "unit": p.unit, "fixed": not p.vary}
             for n, p in model.parameters.items()}}
     for name, p in model.parameters.items():
-        limits = {"lower": p.lower, "upper": p.upper}
-        contents["parameters"][name] |= {k: v for k, v in limits.items() if np.isfinite(v)}
+        contents["parameters"][name] |= {k: v for k in ("lower", "upper") if np.isfinite(v := getattr(p, k))}
     return contents | {"motorid": version, "export": FORMAT, "order": list(system_of(found).parameters), "versions": {
         "motorid": version, "casadi": ca.__version__, "numpy": np.__version__, "python": platform.python_version()}}
 
@@ -82,10 +81,8 @@ def description(found: Fit | Model) -> dict[str, Any]:
 def fingerprint(run: Experiment) -> dict[str, Any]:
     """Return what identifies a record: name, samples, channels, SHA-256 of its numbers."""
     mark = hashlib.sha256(run.t.tobytes())
-    for channels in (run.inputs, run.outputs):
-        for name in sorted(channels):
-            mark.update(name.encode())
-            mark.update(np.ascontiguousarray(channels[name]).tobytes())
+    for name, a in (*sorted(run.inputs.items()), *sorted(run.outputs.items())):
+        mark.update(name.encode() + a.tobytes())
     return {"name": run.name, "samples": run.n, "channels": list(run.channels), "sha256": mark.hexdigest()}
 
 

@@ -216,8 +216,7 @@ def violations(problem: Problem, q: Array, relations: Sequence[Any] | None = Non
         several = len(set(part.units)) > 1
         for unit in dict.fromkeys(part.units):
             key = f"{name}, {unit}" if several or unit else name
-            mine = np.array([u == unit for u in part.units])
-            found[key] = max(found.get(key, 0.0), float(beyond[mine].max(initial=0.0)))
+            found[key] = max(found.get(key, 0.0), float(beyond[np.array(part.units) == unit].max(initial=0.0)))
     return found
 
 
@@ -237,7 +236,7 @@ def summed(found: Sequence[tuple[str, Part, Array, Array]]) -> tuple[tuple[Multi
         rows += [Multiplier(name, part.labels[j], float(abs(lam[j]) / part.size[j]), part.units[j], 1)
                  for j in np.flatnonzero(on)]
         for unit in dict.fromkeys(part.units):
-            mine = on & np.array([u == unit for u in part.units])
+            mine = on & (np.array(part.units) == unit)
             value, active = sums.get((name, unit), (0.0, 0))
             sums[name, unit] = value + float(np.sum(np.abs(lam / part.size)[mine])), active + int(mine.sum())
     labels = {n: f"{counted(n, 'row')} at the limit" if n else "not active" for _, n in sums.values()}
