@@ -116,8 +116,7 @@ def tell(results: Sequence[Shown], *, title: str = "", validate: Sequence[Experi
         story = _of_fit(main, validate)
     else:
         card = main.card()
-        story = Story(card.title, " ".join(card.text[:1]), card.flags)
-        story.sections.append(sections.of_card(main, 0))
+        story = Story(card.title, " ".join(card.text[:1]), card.flags, sections=[sections.of_card(main, 0)])
     for k, r in enumerate(results):
         if r is not main:
             again = sections.fitted(r, r.card().title, key=f"result-{k + 1}") if isinstance(r, Fit) else None
@@ -132,9 +131,8 @@ def tell(results: Sequence[Shown], *, title: str = "", validate: Sequence[Experi
 
 def _of_diagnosis(d: Diagnosis, validate: Sequence[Experiment]) -> Story:
     runs = d.before.problem.experiments
-    story = Story("What is missing in the motor's model?", d.answer or d.text, runs=runs)
-    story.facts = sections.error_facts(d.ladder)
-    story.sections.append(sections.answer(d))
+    story = Story("What is missing in the motor's model?", d.answer or d.text, (), sections.error_facts(d.ladder),
+                  [sections.answer(d)], runs)
     if d.details:
         story.sections.append(Section("details", "Details", (), d.details))
     if len(d.ladder.rungs) > 1:
@@ -154,11 +152,10 @@ def _of_diagnosis(d: Diagnosis, validate: Sequence[Experiment]) -> Story:
 
 def _of_ladder(ladder: Ladder) -> Story:
     first, best = ladder.rungs[0].fit, ladder.best
-    story = Story("Models of growing detail", ladder.text, runs=first.problem.experiments)
-    story.facts = sections.error_facts(ladder)
-    story.sections += [sections.data(story.runs), sections.ladder(ladder), sections.parameters(first, best)]
-    story.sections.append(sections.fitted(best, "The last model", before=first if best is not first else None))
-    return story
+    told = [sections.data(first.problem.experiments), sections.ladder(ladder), sections.parameters(first, best),
+            sections.fitted(best, "The last model", before=first if best is not first else None)]
+    return Story("Models of growing detail", ladder.text, (), sections.error_facts(ladder), told,
+                 first.problem.experiments)
 
 
 def _of_fit(fit: Fit, validate: Sequence[Experiment]) -> Story:
