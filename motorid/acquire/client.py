@@ -34,8 +34,7 @@ class Client:
 
     def receive(self, timeout: float) -> list[Sample | Message]:
         """Return what comes within `timeout` s, sooner if something does."""
-        data = self.link.read(timeout)
-        return self.decoder.feed(data) if data else []
+        return self.decoder.feed(self.link.read(timeout))
 
     def keep_alive(self) -> None:
         """Tell the device, every 0.2 s, that somebody is listening."""

@@ -250,12 +250,9 @@ def motors_in(folder: str | Path) -> dict[str, list[Path]]:
     for entry in sorted(place.iterdir()):
         if entry.name.startswith("."):
             continue
-        try:
-            files = find_records(entry)
-        except DataError:
-            continue
         name = entry.name if entry.is_dir() or entry.stem in found else entry.stem
-        found[printable(name)] = [Path(f) for f in files]
+        with suppress(DataError):
+            found[printable(name)] = find_records(entry)
     if not found:
         raise DataError(f"'{place}' holds no records: expected a folder, or a file, per motor.")
     return found
@@ -305,11 +302,9 @@ class Checkpoint:
             with suppress(ValueError, KeyError, TypeError, RecursionError):
                 entry = json.loads(line)
                 row = {"motor": entry["row"]["motor"], **entry["row"]}
-                for name, value in row.items():
-                    kind = {"motor": str, "status": str, "message": str, "flags": list}.get(name, int | float | None)
-                    if not isinstance(value, kind):
-                        raise TypeError(name)
-                self.rows[entry["fingerprint"]] = row
+                kinds = {"motor": str, "status": str, "message": str, "flags": list}
+                if all(isinstance(value, kinds.get(name, int | float | None)) for name, value in row.items()):
+                    self.rows[entry["fingerprint"]] = row
         if text.strip() and not self.rows and '{"fingerprint"' not in text:
             raise UsageError(f"'{path}' is not a journal of motorid, so nothing is added to it; name another file.")
         self._append("" if text.endswith("\n") or not text else "\n")
