@@ -176,7 +176,7 @@ def _levinson(gamma: Array) -> Iterator[tuple[Array, float]]:
     for k in range(1, len(gamma)):
         if variance <= 1e-12 * gamma[0]:
             return
-        reflection = (gamma[k] - a @ gamma[k - 1 : 0 : -1]) / variance if k > 1 else gamma[1] / variance
+        reflection = (gamma[k] - a @ gamma[k - 1 : 0 : -1]) / variance
         a = np.concatenate([a - reflection * a[::-1], [reflection]])
         variance *= 1 - reflection**2
         yield a, variance

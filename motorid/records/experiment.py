@@ -115,9 +115,8 @@ class Experiment(Shown):
 
     def with_(self, **changes: Any) -> Experiment:
         """Return a copy with some fields replaced, validated again."""
-        known = [f.name for f in dataclasses.fields(self)]
         for key in changes:
-            among(key, known, "field", where="with_(): ")
+            among(key, (f.name for f in dataclasses.fields(self)), "field", where="with_(): ")
         return dataclasses.replace(self, **changes)
 
     def select(self, keep: slice | ArrayLike) -> Experiment:

@@ -256,10 +256,9 @@ def below_steady(problem: Problem) -> str | None:
 
     Values that keep such a limit exist, but they describe another motor.
     """
-    limits = [c for c in problem.constraints if isinstance(c, CurrentLimit)]
-    if not limits:
+    limits = (c for c in problem.constraints if isinstance(c, CurrentLimit))
+    if (lowest := min(limits, key=lambda c: c.limit, default=None)) is None:
         return None
-    lowest = min(limits, key=lambda c: c.limit)
     steady = [c for c in problem.constraints if isinstance(c, SteadyState)]
     segments = (steady[0] if steady else SteadyState()).segments(problem)
     for s in sorted(segments, key=lambda s: -abs(s.means.get("i", 0.0))):
