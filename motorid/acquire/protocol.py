@@ -186,13 +186,11 @@ class Decoder:
         found: list[Sample | Message] = []
         end = 0
         for match in _FRAME.finditer(buffer):
-            if match.start() > end:
-                self._discard(buffer[end:match.start()])
+            self._discard(buffer[end:match.start()])
             end = match.end()
-            body = match[1]
-            if crc_hqx(body, 0xFFFF) != int(match[2], 16):
+            if crc16(match[1]) != int(match[2], 16):
                 self.bad["wrong CRC"] += 1
-            elif (read := _read(body)) is None:
+            elif (read := _read(match[1])) is None:
                 self.bad["not understood"] += 1
             else:
                 found.append(read)
