@@ -116,9 +116,8 @@ def _one_profile(ax: Axes, p: Profile, both: Intervals | None) -> None:
     ends = np.clip(p.interval(level), float(p.values.min()), float(p.values.max()))
     ax.axvspan(ends[0] * scale, ends[1] * scale, color=style.PALETTE["blue"], alpha=0.1, lw=0)
     if both is not None:
-        known, drawn = both.covariance.interval(p.name, level), both.bootstrap.interval(p.name, level)
-        for y, limits, name, colour in ((-0.8, known, "covariance", "purple"), (-1.7, drawn, "bootstrap", "green")):
-            if limits is not None:
+        for y, name, colour in ((-0.8, "covariance", "purple"), (-1.7, "bootstrap", "green")):
+            if (limits := getattr(both, name).interval(p.name, level)) is not None:
                 ax.plot(np.array(limits) * scale, [y, y], "|-", color=style.PALETTE[colour], lw=2, ms=6, label=name)
     ax.set_ylim(-2.4 if both is not None else -0.4, max(1.5 * height, 2.0))
     ax.set_yticks([y for y in ax.get_yticks() if 0 <= y <= ax.get_ylim()[1]])

@@ -255,9 +255,8 @@ class Multistart(Printed):
         """Tell whether two fits ended in the same place: cost within 1 %, values within 5 %."""
         if abs(a.cost - b.cost) > 10 * COST_SHARE * a.cost:
             return False
-        sizes = [max(abs(a.values[n]), abs(b.values[n]), 1e-300) for n in a.start]
-        return all(abs(self.difference(n, a.values[n], b.values[n])) < 0.05 * s
-                   for n, s in zip(a.start, sizes, strict=True))
+        pairs = ((n, a.values[n], b.values[n]) for n in a.start)
+        return all(abs(self.difference(n, x, y)) < 0.05 * max(abs(x), abs(y), 1e-300) for n, x, y in pairs)
 
     def statistics(self) -> dict[str, dict[str, float | None]]:
         """Return per free parameter the reference and mean and standard deviation over the good fits."""
