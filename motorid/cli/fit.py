@@ -14,7 +14,7 @@ from motorid.cli.console import FAILED, INTERRUPTED, next_command, save_report, 
 from motorid.display.cards import Table
 from motorid.display.numbers import counted, duration, number, quantity
 from motorid.effects import EVERY
-from motorid.errors import DataError, UsageError, one_of
+from motorid.errors import DataError, among
 from motorid.estimation.result import COLOURED, PLAIN, Fit, constraint_table, ended, steady_table, value_tables
 from motorid.exporters.c_code import check
 from motorid.exporters.export import FORMS, export
@@ -220,8 +220,8 @@ def export_command(
 
     Example: motorid export fit.json --to c motor.c
     """
-    if to is not None and to not in FORMS.values():
-        raise UsageError(f"--to: {one_of(to, FORMS.values(), 'form')}")
+    if to is not None:
+        among(to, FORMS.values(), "form", where="--to: ")
     model = opt.saved_model(fit_json, effects_from)
     written = export(model, path, to, force=force)
     show(f"Written: {written}", f"Sub-steps: {check(model).text}" if written.suffix == ".c" else None)

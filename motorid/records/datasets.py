@@ -9,7 +9,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from motorid.errors import DataError, one_of
+from motorid.errors import DataError, among, one_of
 
 _PLANT = "motorid_plant"
 
@@ -57,8 +57,8 @@ def datasets() -> list[str]:
 
 def truth(name: str) -> dict[str, Any]:
     """What is true of a shipped set: motor, parameters in SI, hidden effects, noise, seed."""
-    if name not in (known := _truths()):
-        raise DataError(one_of(name, sorted(known), "shipped set"))
+    known = _truths()
+    among(name, sorted(known), "shipped set", DataError)
     return known[name]
 
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from motorid.errors import FitError, SimulationError, UsageError, among, at_least, one_of, positive
+from motorid.errors import FitError, SimulationError, UsageError, among, at_least, positive
 from motorid.estimation.fit import minimise
 from motorid.estimation.least_squares import FINISH, least_squares
 from motorid.estimation.result import Fit
@@ -78,8 +78,8 @@ class MultipleShooting:
 
     def __post_init__(self) -> None:
         among(self.warm, ("auto", "data", "model"), "warm start")
-        if isinstance(self.process_noise, str) and self.process_noise != "auto":
-            raise UsageError(one_of(self.process_noise, ("auto",), "process noise"))
+        if isinstance(self.process_noise, str):
+            among(self.process_noise, ("auto",), "process noise")
         at_least(2, every=self.every)
         at_least(1, max_iterations=self.max_iterations)
         positive(tol=self.tol)
