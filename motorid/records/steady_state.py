@@ -105,9 +105,8 @@ def _segment(k: int, run: Experiment, first: int, last: int) -> SteadySegment:
     part = slice(first, last + 1)
     means = {c: float(np.nanmean(run.outputs[c][part])) for c in ("i", "omega")
              if c in run.outputs and np.isfinite(run.outputs[c][part]).any()}
-    if "omega" not in run.outputs and "theta" in run.outputs:
-        slope = _slope(run, first, last)
-        means |= {"omega": slope} if np.isfinite(slope) else {}
+    if "omega" not in run.outputs and "theta" in run.outputs and np.isfinite(slope := _slope(run, first, last)):
+        means["omega"] = slope
     top = float(np.nanmax(np.abs(run.outputs["omega"]))) if "omega" in run.outputs else _top_slope(run)
     moving = abs(means["omega"]) > MOVING_SHARE * top if "omega" in means else True
     return SteadySegment(k, first, last, float(run.t[first]), float(run.t[last]),

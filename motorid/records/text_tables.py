@@ -126,10 +126,9 @@ class Dialect:
         if '"' not in line:
             return [c.strip() for c in line.split(self.delimiter)]
         try:
-            row = next(csv.reader([line], delimiter=self.delimiter, skipinitialspace=True), [])
+            return [c.strip() for c in next(csv.reader([line], delimiter=self.delimiter, skipinitialspace=True), [])]
         except csv.Error:
             return [line]
-        return [c.strip() for c in row]
 
     def is_number(self, cell: str) -> bool:
         """Tell whether a cell is one number in this dialect."""

@@ -159,13 +159,10 @@ def _of_ladder(ladder: Ladder) -> Story:
 
 
 def _of_fit(fit: Fit, validate: Sequence[Experiment]) -> Story:
-    card = fit.card()
-    story = Story(card.title, " ".join(t for t in card.text if t), card.flags[1:], runs=fit.problem.experiments)
-    story.facts = [(f"Error of the {NAMES[c]}", percent(e)) for c, e in fit.nrmse.items()]
+    card, runs = fit.card(), fit.problem.experiments
+    facts = [(f"Error of the {NAMES[c]}", percent(e)) for c, e in fit.nrmse.items()]
     known = [fit.determined[n] for n in ("gain", "time_constant") if n in fit.determined]
-    story.facts += [(q.text.capitalize(), with_error(q.value, q.std, q.unit)) for q in known]
-    story.sections.append(sections.fitted(fit, "The fit", told=False))
-    if validate:
-        story.sections.append(sections.held_out(fit, validate))
-    story.sections += [sections.residuals(fit), sections.data(story.runs)]
-    return story
+    facts += [(q.text.capitalize(), with_error(q.value, q.std, q.unit)) for q in known]
+    told = [sections.fitted(fit, "The fit", told=False), *([sections.held_out(fit, validate)] if validate else []),
+            sections.residuals(fit), sections.data(runs)]
+    return Story(card.title, " ".join(t for t in card.text if t), card.flags[1:], facts, told, runs)
