@@ -167,8 +167,7 @@ class MultipleShooting:
 
     def _with_process_noise(self, problem: Problem, q: Array) -> Solved:
         """Solve with process noise; with ``"auto"`` again until the gaps are as large as was taken."""
-        problem = problem.refined(q)
-        mesh = Mesh(problem, self.every or NOISY)
+        mesh = Mesh(problem.refined(q), self.every or NOISY)
         noise = first_noise(self.process_noise, mesh)
         mesh = replace(mesh, noise=noise)
         done = self._solve(mesh, mesh.joined(q, nodes_from_data(mesh, q)), rough=self.process_noise == "auto")
