@@ -34,8 +34,7 @@ class Client:
 
     def receive(self, timeout: float) -> list[Sample | Message]:
         """Return what comes within `timeout` s, sooner if something does."""
-        data = self.link.read(timeout)
-        return self.decoder.feed(data) if data else []
+        return self.decoder.feed(self.link.read(timeout))
 
     def keep_alive(self) -> None:
         """Tell the device, every 0.2 s, that somebody is listening."""
@@ -109,7 +108,7 @@ def _complete(fields: list[str]) -> bool:
 
 
 def _milli(value: float) -> int:
-    return min(2_000_000_000, math.floor(value * 1e3 + 1e-6)) if math.isfinite(value) else 2_000_000_000
+    return math.floor(min(value, 2e6) * 1e3 + 1e-6)
 
 
 class LinkLost(DeviceError):

@@ -28,7 +28,7 @@ from itertools import accumulate
 import numpy as np
 from numpy.typing import NDArray
 
-from motorid.errors import UsageError, one_of
+from motorid.errors import UsageError, among
 
 LONGEST = 3600.0  # s of one segment
 _SHAPES = {"R": 2, "C": 4, "P": 4}  # numbers after the duration
@@ -150,8 +150,7 @@ def program(words: str | Program | None, v_max: float = math.inf) -> Program:
             segments += program(_standard(v_max)).segments
             continue
         name, *numbers = word.split(":")
-        if name not in _WORDS:
-            raise UsageError(one_of(name, [*_WORDS, "standard"], "excitation"))
+        among(name, [*_WORDS, "standard"], "excitation")
         make, least, most = _WORDS[name]
         values = [_number(n, word) for n in numbers]
         if not least <= len(values) <= most:

@@ -144,15 +144,12 @@ class Header:
             raise DeviceError(f"the device speaks version {''.join(fields[1:2]) or '?'} of the protocol, "
                               f"this motorid version {VERSION}. Update the older one.")
         try:
-            name, rate, counter, timer = fields[2], float(fields[3]), int(fields[4]), int(fields[5])
-            v_max, i_max, segments = float(fields[6]), float(fields[7]), int(fields[8])
-            channels = []
-            for word in fields[9:]:
-                channel, unit, scale, offset, kind = word.split(":")
-                channels.append(Channel(channel, unit, float(scale), float(offset), kind))
+            channels = tuple(Channel(name, unit, float(scale), float(offset), kind)
+                             for name, unit, scale, offset, kind in (word.split(":") for word in fields[9:]))
+            return cls(fields[2], float(fields[3]), channels, int(fields[4]), int(fields[5]), float(fields[6]),
+                       float(fields[7]), int(fields[8]))
         except (IndexError, ValueError) as error:
             raise DeviceError(f"the device's header cannot be read ({error}): {','.join(fields)}") from None
-        return cls(name, rate, tuple(channels), counter, timer, v_max, i_max, segments)
 
 
 class Sample(NamedTuple):
@@ -189,13 +186,11 @@ class Decoder:
         found: list[Sample | Message] = []
         end = 0
         for match in _FRAME.finditer(buffer):
-            if match.start() > end:
-                self._discard(buffer[end:match.start()])
+            self._discard(buffer[end:match.start()])
             end = match.end()
-            body = match[1]
-            if crc_hqx(body, 0xFFFF) != int(match[2], 16):
+            if crc16(match[1]) != int(match[2], 16):
                 self.bad["wrong CRC"] += 1
-            elif (read := _read(body)) is None:
+            elif (read := _read(match[1])) is None:
                 self.bad["not understood"] += 1
             else:
                 found.append(read)

@@ -24,10 +24,6 @@ _COLUMNS = {("v", "V"): "voltage_V", ("i", "A"): "current_A", ("omega", "rad/s")
 Commanded = Callable[[int], float | None]  # voltage (V) commanded at a sample, None where nobody knows
 
 
-def _unknown(index: int) -> None:
-    return None
-
-
 def column(channel: Channel) -> str:
     """Name of the channel's column, one that `read_runs` knows."""
     return _COLUMNS.get((channel.name, channel.unit), f"{channel.name}_{channel.unit}".replace("/", "_per_"))
@@ -123,7 +119,7 @@ class RecordFile:
             self._pending.append(self._line(0, 1 / self.rate, self._nothing_but(0.0)))
         self._index0, self._time0 = max(round(until * self.rate), tail.index + 2), until
 
-    def add(self, rows: list[Row], commanded: Commanded = _unknown) -> None:
+    def add(self, rows: list[Row], commanded: Commanded = lambda _: None) -> None:
         """Append rows; `commanded` tells the voltage (V) of samples that were lost, where it is known."""
         for row in rows:
             if row.index > self._next:
@@ -131,7 +127,7 @@ class RecordFile:
             self._pending.append(self._line(row.index, row.time, row.values))
             self._next, self._last = row.index + 1, row
 
-    def mark_missing(self, until: int, commanded: Commanded = _unknown) -> None:
+    def mark_missing(self, until: int, commanded: Commanded = lambda _: None) -> None:
         """Mark as missing what was made up to sample `until` (not included) and never came."""
         if until > self._next:
             last = self._last.time if self._last else -1 / self.rate

@@ -8,13 +8,14 @@ import tomllib
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from datetime import datetime
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from motorid.acquire.client import Client, Link, SerialLink
 from motorid.acquire.excitation import Program, program
 from motorid.acquire.protocol import VERSION, Channel, Header
-from motorid.acquire.record_file import Commanded, RecordFile, Tail, check_target, read_tail
+from motorid.acquire.record_file import RecordFile, Tail, check_target, read_tail
 from motorid.acquire.session import Progress, Recording, Session
 from motorid.errors import DataError, UsageError, among, positive
 
@@ -103,8 +104,8 @@ def record(port: str | Link, out: str | Path, *, baud: int = 115_200, excite: st
         file = RecordFile(out, header.channels, header.rate, head if not tail else {}, mode)
         try:
             told, kept = (next(c for c in h.channels if c.name == "v") for h in (device, header))
-            session = Session(client, header, file, len(todo.segments), _commanded(told, kept, device.rate, todo),
-                              _most(told, kept, *limits),
+            commanded = partial(_commanded, told, kept, device.rate, todo)
+            session = Session(client, header, file, len(todo.segments), commanded, _most(told, kept, *limits),
                               min((e for e in (todo.duration, duration) if e), default=None), duration,
                               max(timeout, 4 / header.rate), progress)
             if tail:
@@ -123,13 +124,10 @@ def _most(told: Channel, kept: Channel, v_max: float, i_max: float) -> dict[str,
     return {"v": abs(kept.scale / told.scale) * (1.01 * v_max + beside), "i": i_max}
 
 
-def _commanded(told: Channel, kept: Channel, rate: float, todo: Program) -> Commanded:
-    """The voltage that the device applies at each sample, in the units of the record."""
-    def at(index: int) -> float | None:
-        volts = todo.at(index, rate)
-        return None if volts is None else kept.scale * (volts / told.scale + told.offset - kept.offset)
-
-    return at
+def _commanded(told: Channel, kept: Channel, rate: float, todo: Program, index: int) -> float | None:
+    """The voltage that the device applies at a sample, in the units of the record."""
+    volts = todo.at(index, rate)
+    return None if volts is None else kept.scale * (volts / told.scale + told.offset - kept.offset)
 
 
 def _head(port: str | Link, header: Header, whole: Program, limits: tuple[float, float],

@@ -92,9 +92,8 @@ class _Bench:
         rate, n = self.device.header.rate, self._due(now)
         if self.unplug_at is not None:
             n = min(n, int(self.unplug_at * rate) - self.sent)
-        frames = self.device.run(n)
+        data = self.wire.carry(self.device.run(n))
         self.sent += n
-        data = self.wire.carry(frames)
         if len(self.out) + len(data) <= BUFFER or not self.pace.speed:
             self.out += data
         if self.unplug_at is not None and self.sent >= int(self.unplug_at * rate):
@@ -192,7 +191,12 @@ class Socket:
         ready, _, _ = select.select([self._server, *peer], peer if writing else [], [], timeout)
         if self._server in ready:
             with contextlib.suppress(OSError):
-                self._answer(self._server.accept()[0])
+                knocking, _ = self._server.accept()
+                if self._peer is None:
+                    knocking.setblocking(False)
+                    self._peer = knocking
+                else:
+                    knocking.close()
 
     def read(self) -> bytes:
         """Return what the computer sent."""
@@ -219,13 +223,6 @@ class Socket:
         except OSError:
             self._hang_up()
             return len(data)
-
-    def _answer(self, peer: socket.socket) -> None:
-        if self._peer is None:
-            peer.setblocking(False)
-            self._peer = peer
-        else:
-            peer.close()
 
     def _hang_up(self) -> None:
         if self._peer:

@@ -120,7 +120,7 @@ class Group(_PlainHelp, TyperGroup):
             raise typer.Exit(INTERRUPTED) from None
 
     @staticmethod
-    def _unexpected(error: Exception) -> int:
+    def _unexpected(error: Any) -> int:
         if interruption.behind(error):  # raised inside what was loading, and made another error of
             interruption.heard()
             _say("interrupted.")
@@ -131,7 +131,9 @@ class Group(_PlainHelp, TyperGroup):
             return FAILED
         if not hasattr(error, "format_message"):
             raise error
-        _say(_usage(error))
+        text, context = error.format_message().strip(), getattr(error, "ctx", None)
+        _say(text + ("" if text.endswith((".", "?", "!")) else ".")
+             + f" Help: {context.command_path if context else 'motorid'} --help")
         return WRONG
 
 
@@ -315,13 +317,6 @@ def save_report(result: Any, path: Any, held_out: Sequence[Any] = (), force: boo
 
 def _say(text: str) -> None:
     typer.echo(f"motorid: {printable(' '.join(in_options(text).split()))}", err=True)
-
-
-def _usage(error: Any) -> str:
-    text = error.format_message().strip()
-    text = text if text.endswith((".", "?", "!")) else f"{text}."
-    context = getattr(error, "ctx", None)
-    return f"{text} Help: {context.command_path if context else 'motorid'} --help"
 
 
 def _spread(args: Sequence[str]) -> list[str]:

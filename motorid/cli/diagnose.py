@@ -6,7 +6,7 @@ import functools
 from collections.abc import Sequence
 from json import loads
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -214,8 +214,8 @@ def _write_demo(found: Diagnosis, check: Sequence[Experiment], out: Path, force:
     from motorid.plots.style import png_of
     from motorid.reports.report import report
 
-    drawn: dict[str, Any] = {"fit.png": plot_fit(found.after, before=found.before).flat[0],
-                             "missing.png": plot_missing(found).flat[0], "ladder.png": plot_ladder(found)}
+    drawn = {"fit.png": plot_fit(found.after, before=found.before), "missing.png": plot_missing(found),
+             "ladder.png": plot_ladder(found)}
     figures = write_files({out / name: png_of(axes, 120) for name, axes in drawn.items()}, force)
     page = report(found, out / "report.html", command=f"motorid demo --out {out}", validate=check, force=force)
     return [str(page), *map(str, figures)]

@@ -14,7 +14,7 @@ from motorid.cli.console import FAILED, INTERRUPTED, next_command, save_report, 
 from motorid.display.cards import Table
 from motorid.display.numbers import counted, duration, number, quantity
 from motorid.effects import EVERY
-from motorid.errors import DataError, UsageError, one_of
+from motorid.errors import DataError, among
 from motorid.estimation.result import COLOURED, PLAIN, Fit, constraint_table, ended, steady_table, value_tables
 from motorid.exporters.c_code import check
 from motorid.exporters.export import FORMS, export
@@ -41,9 +41,8 @@ def fit_command(runs: opt.Runs, options: opt.FitOptions, validate: opt.Validate 
     """
     records = options.read(runs)
     held_out = options.read(validate) if validate else []
-    model = options.model(records)
     notes = opt.notes_of(records, held_out)
-    found = options.fit(records, model)
+    found = options.fit(records)
     judged = evaluate(found, held_out) if held_out else None
     if json != "-":
         _show_fit(found, records, notes, judged)
@@ -64,11 +63,10 @@ def _show_fit(found: Fit, records: list[Experiment], notes: list[str], judged: E
     say_notes(notes, "About the records")
     show(*value_tables(found))
     say_notes(remarks(found), "What to know about these values")
-    several = judged is not None and len(judged.simulations) > 1
     show(replace(error_table({"": found.evaluation, "held-out": judged}, found.noise), note=""),
          run_table(found.evaluation) if len(records) > 1 else None,
-         run_table(judged, "Held-out errors run by run") if judged and several else None, steady_table(found))
-    show(constraint_table(found, constraint_violations(found)))
+         run_table(judged, "Held-out errors run by run") if judged and len(judged.simulations) > 1 else None,
+         steady_table(found), constraint_table(found, constraint_violations(found)))
 
 
 def _held_out(found: Fit, judged: Evaluation) -> str:
@@ -138,8 +136,7 @@ def check_command(runs: opt.Runs, options: opt.ReadingOptions, json: opt.Json = 
         write_json({"runs": [run_dict(r) | {"columns": r.meta.get("columns"), "units": dict(r.units)} for r in records],
                     "notes": notes}, json, options.force)
     if json != "-":
-        found = counted(len(notes), "remark") if notes else "No problem found"
-        show(f"{_amount(records)}. {found}.\n")
+        show(f"{_amount(records)}. {counted(len(notes), 'remark') if notes else 'No problem found'}.\n")
         say_notes(notes)
         show(*(_channel_table(r) for r in records[:MOST_SHOWN]))
         driven = ("--drive", "torque") if records[0].units["v"] in ("A", "N·m", "N") else ()
@@ -223,8 +220,8 @@ def export_command(
 
     Example: motorid export fit.json --to c motor.c
     """
-    if to is not None and to not in FORMS.values():
-        raise UsageError(f"--to: {one_of(to, FORMS.values(), 'form')}")
+    if to is not None:
+        among(to, FORMS.values(), "form", where="--to: ")
     model = opt.saved_model(fit_json, effects_from)
     written = export(model, path, to, force=force)
     show(f"Written: {written}", f"Sub-steps: {check(model).text}" if written.suffix == ".c" else None)

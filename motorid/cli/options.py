@@ -92,7 +92,7 @@ class ReadingOptions:
     @property
     def _ignored(self) -> tuple[str, ...]:
         """The channels to leave out."""
-        out = _words([self.ignore] if self.ignore else [])
+        out = _words(self.ignore)
         for channel in out:
             among(channel, CHANNELS, "measured channel", where="--ignore: ")
         return tuple(out)
@@ -146,9 +146,9 @@ class FitOptions(ReadingOptions):
         if self.drive == "torque":
             linear = any(r.units.get("theta") == "m" or r.units.get("omega") == "m/s" for r in runs)
             model = torque_driven(axis="linear" if linear else "rotary")
-        for name in _words([self.effects] if self.effects else []):
+        for name in _words(self.effects):
             model = model + named_effect(name, own)
-        begin, fixed, free = _numbers(self.set_ or [], "--set"), _words(self.fix or []), _words(self.free or [])
+        begin, fixed, free = _numbers(self.set_ or [], "--set"), _words(*(self.fix or ())), _words(*(self.free or ()))
         values = _numbers([w for w in fixed if "=" in w], "--fix")
         for option, others in (("--set", begin), ("--free", free)):
             if both := [n for n in values if n in others]:
@@ -172,9 +172,9 @@ class FitOptions(ReadingOptions):
             found["window"] = None if self.window == "none" else _seconds(self.window, "--window")
         return found
 
-    def fit(self, runs: Sequence[Experiment], model: Model | None = None) -> Fit:
+    def fit(self, runs: Sequence[Experiment]) -> Fit:
         """Fit the model to `runs`."""
-        return fit(self.model(runs) if model is None else model, runs, **self.keywords())
+        return fit(self.model(runs), runs, **self.keywords())
 
     def _check_words(self) -> None:
         for word, known, what in ((self.drive, ("voltage", "torque"), "drive"),
@@ -269,8 +269,8 @@ def notes_of(runs: Sequence[Experiment], held_out: Sequence[Experiment] = ()) ->
     return [*dict.fromkeys(notes), *check_runs(runs)]
 
 
-def _words(texts: Sequence[str]) -> list[str]:
-    return [w for text in texts for w in (part.strip() for part in text.split(",")) if w]
+def _words(*texts: str | None) -> list[str]:
+    return [word for text in texts if text for part in text.split(",") if (word := part.strip())]
 
 
 def _numbers(texts: Sequence[str], option: str) -> dict[str, float]:

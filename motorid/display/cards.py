@@ -36,8 +36,6 @@ COLOURS = {
     "bad": ("#8f1220", "#ffe3e4"),
     "plain": ("#3a444f", "#e6eaef"),
 }
-
-
 WIDE, SENTENCE = 5, 32  # columns that a phone has room for; characters of a cell beyond a name or a number
 
 

@@ -51,7 +51,7 @@ def with_error(value: float, std: float | None, unit: str = "", why: str = "not 
     power = _power(max(abs(value), std), -2)
     exact, error = _rounded(value, place, power), _rounded(std, place, power)
     if power:
-        return f"({exact} ± {error})·10{_raised(power)}{tail}"
+        return f"({exact} ± {error})·10{raised(power)}{tail}"
     return f"{exact} ± {error}{tail}"
 
 
@@ -65,10 +65,9 @@ def number(value: float | None, digits: int = 4) -> str:
         return "0"
     value = float(f"{value:.{digits - 1}e}")
     power = _power(abs(value))
-    place = math.floor(math.log10(abs(value))) - digits + 1
-    text = _rounded(value, place, power)
+    text = _rounded(value, math.floor(math.log10(abs(value))) - digits + 1, power)
     text = text.rstrip("0").rstrip(".") if "." in text else text
-    return f"{text}·10{_raised(power)}" if power else text
+    return f"{text}·10{raised(power)}" if power else text
 
 
 def quantity(value: float | None, unit: str = "", digits: int = 4) -> str:
@@ -151,5 +150,6 @@ def _rounded(value: float, place: int, power: int) -> str:
     return text.replace("-", "−") if text.strip("-0.") else text.replace("-", "")
 
 
-def _raised(power: int) -> str:
+def raised(power: int) -> str:
+    """Return an exponent as it stands above the line."""
     return str(power).translate(_RAISED)

@@ -73,8 +73,7 @@ def description(found: Fit | Model) -> dict[str, Any]:
             n: {"value": p.value, "std": None, "unit": p.unit, "fixed": not p.vary}
             for n, p in model.parameters.items()}}
     for name, p in model.parameters.items():
-        limits = {"lower": p.lower, "upper": p.upper}
-        contents["parameters"][name] |= {k: v for k, v in limits.items() if np.isfinite(v)}
+        contents["parameters"][name] |= {k: v for k in ("lower", "upper") if np.isfinite(v := getattr(p, k))}
     return contents | {"motorid": version, "export": FORMAT, "order": list(system_of(found).parameters), "versions": {
         "motorid": version, "casadi": ca.__version__, "numpy": np.__version__, "python": platform.python_version()}}
 
@@ -82,10 +81,8 @@ def description(found: Fit | Model) -> dict[str, Any]:
 def fingerprint(run: Experiment) -> dict[str, Any]:
     """Return what identifies a record: name, samples, channels, SHA-256 of its numbers."""
     mark = hashlib.sha256(run.t.tobytes())
-    for channels in (run.inputs, run.outputs):
-        for name in sorted(channels):
-            mark.update(name.encode())
-            mark.update(np.ascontiguousarray(channels[name]).tobytes())
+    for name, a in (*sorted(run.inputs.items()), *sorted(run.outputs.items())):
+        mark.update(name.encode() + a.tobytes())
     return {"name": run.name, "samples": run.n, "channels": list(run.channels), "sha256": mark.hexdigest()}
 
 
@@ -223,8 +220,7 @@ def simulation(name: str, functions: Mapping[str, ca.Function], t: Array, m: NDA
     share = 1.0 / m[interval]
     s, u, p = ca.MX.sym("s", 3), ca.MX.sym("u", nu, len(t)), ca.MX.sym("p", np_)
     before = u[:, interval.tolist()]
-    after = ca.vertcat(*[u[j, (interval if hold else interval + 1).tolist()] for j, hold in enumerate(held)])
-    slope = after - before
+    slope = ca.vertcat(*[u[j, (interval if hold else interval + 1).tolist()] for j, hold in enumerate(held)]) - before
     u0 = before + slope * ca.repmat(ca.DM(part * share).T, nu, 1)
     u1 = u0 + slope * ca.repmat(ca.DM(share).T, nu, 1)
     h = ca.DM(np.diff(t)[interval] * share).T

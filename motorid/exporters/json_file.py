@@ -74,7 +74,8 @@ def remarks(fit: Fit) -> list[str]:
     model, measured, std = fit.problem.model, fit.problem.outputs, fit.std
     undetermined = {n: model.parameters[n] for n in model.free_names if std[n] is None}
     vague = [n for n, p in undetermined.items() if p.lower < fit.values[n] < p.upper]
-    at_limit = [n for n in undetermined if n not in vague]
+    at_limit = [f"{n} ended at {fit.values[n]:.3g}, the limit of what is physical: these records show no sign of it."
+                for n in undetermined if n not in vague]
     said = []
     if model.base == "dc_motor" and any("m" in r.units.values() for r in fit.problem.experiments):
         said.append("The record moves in m: read K in N/A, b in N·s/m, J as a mass in kg, torques as forces in N.")
@@ -90,11 +91,7 @@ def remarks(fit: Fit) -> list[str]:
         said.append(f"The records do not determine {listed(vague)}: another value fits them as well. Fix "
                     f"{'it' if len(vague) == 1 else 'one of them'} (--fix {vague[0]}=…), or look at "
                     "`motorid identifiability`.")
-    said += _of_no_motor(fit)
-    for n in at_limit:
-        said.append(f"{n} ended at {fit.values[n]:.3g}, the limit of what is physical: these records show no "
-                    "sign of it.")
-    return said
+    return [*said, *_of_no_motor(fit), *at_limit]
 
 
 def _of_no_motor(fit: Fit) -> list[str]:

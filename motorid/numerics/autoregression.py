@@ -99,8 +99,7 @@ class Whitening:
         """Return (N, ny, …) per run, filtered over time and stacked as rows; the first samples are left out."""
         parts = []
         for y in stacks:
-            filled = np.nan_to_num(y)
-            done = [_filtered(a, filled[:, j]) for j, a in enumerate(self.filters)]
+            done = [_filtered(a, np.nan_to_num(y[:, j])) for j, a in enumerate(self.filters)]
             parts.append(np.stack(done, axis=1).reshape(-1, *y.shape[2:]))
         return np.concatenate(parts)
 
@@ -112,9 +111,8 @@ class Whitening:
             part = rows[first : first + shape[0] * shape[1]].reshape(shape)
             first += part.size
             out = np.zeros((n, shape[1]))
-            for j, a in enumerate(self.filters):
-                for k, c in enumerate(a):
-                    out[ORDER - k : ORDER - k + shape[0], j] += c * part[:, j]
+            for j, a in enumerate(self.filters if part.size else ()):
+                out[:, j] = np.convolve(part[:, j], a[::-1])
             found.append(out)
         return found
 
@@ -178,7 +176,7 @@ def _levinson(gamma: Array) -> Iterator[tuple[Array, float]]:
     for k in range(1, len(gamma)):
         if variance <= 1e-12 * gamma[0]:
             return
-        reflection = (gamma[k] - a @ gamma[k - 1 : 0 : -1]) / variance if k > 1 else gamma[1] / variance
+        reflection = (gamma[k] - a @ gamma[k - 1 : 0 : -1]) / variance
         a = np.concatenate([a - reflection * a[::-1], [reflection]])
         variance *= 1 - reflection**2
         yield a, variance

@@ -18,7 +18,6 @@ import signal
 import sys
 import threading
 import time
-from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import AbstractContextManager, ContextDecorator, contextmanager, suppress
@@ -256,13 +255,11 @@ def _apply(task: Task) -> list[Any]:
 
 def _in_waves(way: Map, tasks: Sequence[Task]) -> Iterator[list[Any]]:
     """Yield the results in order, handing over the tasks in waves so that a pool need not hold all records."""
-    under_way: deque[Iterator[list[Any]]] = deque()
+    under_way: Iterable[list[Any]] = ()
     for wave in _waves(tasks):
-        under_way.append(iter(way(_apply, wave)))
-        if len(under_way) > 1:
-            yield from under_way.popleft()
-    while under_way:
-        yield from under_way.popleft()
+        before, under_way = under_way, way(_apply, wave)
+        yield from before
+    yield from under_way
 
 
 def _waves(tasks: Sequence[Task]) -> Iterator[list[Task]]:

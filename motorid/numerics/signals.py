@@ -85,9 +85,9 @@ def quantum(y: ArrayLike) -> float:
     jumps = jumps[np.isfinite(jumps)]
     jumps = jumps if len(jumps) >= 20 else np.abs(np.diff(values, 2))
     jumps = jumps[jumps > 1e-9 * np.abs(values).max(initial=0.0)]
-    rounded = 3e-4 * float(np.quantile(np.abs(values), 0.9)) if len(jumps) else 0.0  # in a file of four digits
     if len(jumps) < 20:
         return 0.0
+    rounded = 3e-4 * float(np.quantile(np.abs(values), 0.9))  # in a file of four digits
     guesses = np.unique(np.sort(jumps)[np.rint(np.arange(0.02, 0.98, 0.04) * (len(jumps) - 1)).astype(int)])[::-1]
     for guess in guesses[_plausible(jumps, guesses)]:
         step = float(np.median(jumps[np.abs(jumps / guess - 1) < 0.2]))  # rounding in the file blurs it
@@ -149,9 +149,7 @@ def noise_level(y: ArrayLike, t: ArrayLike | None = None) -> float:
 
 
 def _floor(values: Array) -> float:
-    if not values.size:
-        return 1.0
-    size = float(np.std(values)) or float(np.abs(values).max())
+    size = float(np.std(values) or np.abs(values).max()) if values.size else 0.0
     return _FLOOR * size if size > 0 else 1.0
 
 
@@ -188,8 +186,7 @@ def _of_order(values: Array, times: Array | None, still: NDArray[np.bool_], orde
 def _weights(t: Array) -> Array:
     """Return the weights of divided differences, of length one, for windows of times (N, order + 1)."""
     u = (t - t[:, :1]) / (t[:, -1] - t[:, 0])[:, None]
-    apart = u[:, :, None] - u[:, None, :] + np.eye(t.shape[1])
-    weights = 1.0 / np.prod(apart, axis=2)
+    weights = 1.0 / np.prod(u[:, :, None] - u[:, None, :] + np.eye(t.shape[1]), axis=2)
     return weights / np.linalg.norm(weights, axis=1, keepdims=True)
 
 

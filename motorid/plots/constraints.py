@@ -41,18 +41,18 @@ def plot_current_limit(*results: Fit | Formulations, limit: float | None = None,
     --------
     >>> axes = mi.plot_current_limit(better, limit=8.0)
     """
-    fits: list[Fit] = []
-    for r in results:
-        fits += [f.fit for f in r.all if f.fit is not None] if isinstance(r, Formulations) else [r]
+    fits = [f for r in results for f in ([c.fit for c in r.all if c.fit] if isinstance(r, Formulations) else [r])]
     if not fits or not all(isinstance(f, Fit) for f in fits):
         raise UsageError("plot_current_limit takes fits: mi.plot_current_limit(fit, hard, limit=8.0).")
     positive(limit=limit)
-    limit = limit if limit is not None else _limit_of(fits)
+    relations = (c for f in fits for c in (*f.problem.constraints, *f.problem.penalties))
+    limit = limit or next((c.limit for c in relations if isinstance(c, CurrentLimit)), None)
+    if limit is None:
+        raise UsageError("no CurrentLimit in these fits; say which one to draw: mi.plot_current_limit(fit, limit=8.0).")
     if not all("i" in s.outputs for f in fits for s in f.simulations):
         raise UsageError("these fits have no current: it was not measured, or the model has none.")
-    words = list(labels or [f.formulation for f in fits])
     axes = style.grid(len(fits), min(len(fits[0].simulations), 3), row=1.5, sharex="col", sharey="row")
-    for row, fit, word in zip(axes, fits, words, strict=False):
+    for row, fit, word in zip(axes, fits, labels or [f.formulation for f in fits], strict=False):
         for ax, s in zip(row, fit.simulations, strict=False):
             _against_limit(ax, s, limit)
         style.tidy(row[0], y=f"{word}\n{style.axis_label('i')}")
@@ -90,14 +90,6 @@ def _zoom(ax: Axes, simulations: Sequence[Simulation], limit: float) -> None:
     room = max(last - first, 10 * float(np.median(np.diff(t))))
     if last - first + 2 * room < 0.5 * (t[-1] - t[0]):
         ax.set_xlim(max(first - room, t[0]), min(last + 2 * room, t[-1]))
-
-
-def _limit_of(fits: Sequence[Fit]) -> float:
-    for f in fits:
-        for c in (*f.problem.constraints, *f.problem.penalties):
-            if isinstance(c, CurrentLimit):
-                return c.limit
-    raise UsageError("no CurrentLimit in these fits; say which one to draw: mi.plot_current_limit(fit, limit=8.0).")
 
 
 @style.styled

@@ -152,9 +152,8 @@ def _drawn(every: list[Simulation], before: Any) -> tuple[np.ndarray, list[_Movi
     old = _simulations(before)[:COLUMNS] if before is not None else []
     shown, moving = every[:COLUMNS], []
     names = [c for c in CHANNELS if any(c in s.outputs and c in s.experiment.outputs for s in shown)]
-    ratios = [1.6, 1.0] * len(names)
-    row = 1.0 if len(names) < 3 else 0.75
-    axes = style.grid(2 * len(names), len(shown), row=row, sharex="col", sharey="row", height_ratios=ratios)
+    axes = style.grid(2 * len(names), len(shown), row=1.0 if len(names) < 3 else 0.75, sharex="col", sharey="row",
+                      height_ratios=[1.6, 1.0] * len(names))
     for k, s in enumerate(shown):
         earlier = old[k] if k < len(old) else None
         for j, c in enumerate(names):

@@ -102,9 +102,8 @@ def _over_time(ax: Axes, sims: Sequence[Simulation], channel: str, sigma: float)
 
 def _histogram(ax: Axes, r: Array, sigma: float) -> None:
     edges = np.linspace(r.min(), r.max(), 41) if np.ptp(r) > 0 else np.linspace(-1, 1, 41)
-    ax.hist(r, edges.tolist(), density=True, orientation="horizontal", color=style.RESIDUAL, alpha=0.55)
-    y = np.linspace(-4 * sigma, 4 * sigma, 121)
-    top = float(np.max(np.histogram(r, edges, density=True)[0]))
+    bars = ax.hist(r, edges.tolist(), density=True, orientation="horizontal", color=style.RESIDUAL, alpha=0.55)
+    top, y = float(np.max(bars[0])), np.linspace(-4 * sigma, 4 * sigma, 121)
     bell = np.exp(-0.5 * (y / sigma) ** 2) / (sigma * np.sqrt(2 * np.pi))
     ax.plot(bell, y, color=style.INK, lw=1.0, label="noise")
     ax.set_xlim(0, 1.25 * max(top, float(bell.max()) if bell.max() < 4 * top else top))
@@ -159,9 +158,8 @@ def _against(ax: Axes, x: Sequence[Array], r: Sequence[Array], sigma: float) -> 
 
 def scatter(ax: Axes, x: Any, y: Any, most: int = 1500, color: str = style.RESIDUAL) -> None:
     """Draw points, every so many of them where there are too many, the extreme ones always."""
-    keep = np.arange(len(x))[:: max(1, len(x) // most)]
-    extreme = np.argsort(y)[[*range(min(5, len(y))), *range(-min(5, len(y)), 0)]]
-    keep = np.union1d(keep, extreme)
+    order = np.argsort(y)
+    keep = np.unique(np.concatenate([np.arange(0, len(x), max(1, len(x) // most)), order[:5], order[-5:]]))
     ax.plot(x[keep], y[keep], ".", ms=2, color=color, alpha=0.35, mew=0, rasterized=len(keep) > 400, zorder=1)
 
 

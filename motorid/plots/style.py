@@ -17,9 +17,10 @@ from cycler import cycler
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from motorid.channels import NAMES, SYMBOLS, UNITS, channel_name
-from motorid.display.numbers import number
+from motorid.display.numbers import number, raised
 from motorid.errors import UsageError, arguments_told
 from motorid.numerics.signals import Array
 from motorid.records.experiment import Experiment
@@ -102,7 +103,7 @@ def new_figure(width: float, height: float) -> Figure:
 def png_of(axes: Any, dpi: int = 90) -> bytes:
     """Return the figure of some axes as a PNG."""
     buffer = io.BytesIO()
-    figure = np.atleast_1d(np.asarray(axes, object)).ravel()[0].figure
+    figure = np.ravel(np.asarray(axes, object))[0].figure
     figure.savefig(buffer, format="png", dpi=dpi, metadata={"Software": "motorid"})
     return buffer.getvalue()
 
@@ -114,7 +115,7 @@ def svg_of(draw: Callable[..., Any], *args: Any, name: str, alt: str, **options:
     """
     with detached():
         drawn = draw(*args, **options)
-    figure = np.atleast_1d(np.asarray(drawn, object)).ravel()[0].figure
+    figure = np.ravel(np.asarray(drawn, object))[0].figure
     if (engine := figure.get_layout_engine()) is not None:  # once, and not again while saving
         engine.execute(figure)
         figure.set_layout_engine("none")
@@ -145,8 +146,7 @@ def _cleaned(svg: str, name: str, alt: str) -> str:
 
 def grid(rows: int, columns: int, *, row: float = 1.6, width: float = WIDTH, **options: Any) -> np.ndarray:
     """Return axes (rows, columns) on a new figure; `row` is the height of a row in inches."""
-    ratios = options.get("height_ratios")
-    total = row * (sum(ratios) if ratios is not None else rows)
+    total = row * sum(options.get("height_ratios", [1.0] * rows))
     return new_figure(width, total + 0.35).subplots(rows, columns, squeeze=False, **options)
 
 
@@ -163,9 +163,8 @@ def axis_label(channel: str, run: Experiment | None = None) -> str:
         return channel
     unit = UNITS[channel][0] if run is None else run.units.get(channel, UNITS[channel][0])
     symbol = {"m": "x", "m/s": "v"}.get(unit, SYMBOLS[channel])
-    name = "time" if channel == "t" else f"{channel_name(channel, unit)} {symbol}"
-    if channel == "v" and unit != "V":
-        name = "command u"
+    name = ("time" if channel == "t" else "command u" if channel == "v" and unit != "V" else
+            f"{channel_name(channel, unit)} {symbol}")
     return f"{name} ({unit})" if unit != "1" else name
 
 
@@ -178,10 +177,8 @@ def envelope(x: Array, y: Array) -> tuple[Array, Array]:
     if len(x) <= POINTS:
         return x, y
     width = -(-2 * len(x) // POINTS)
-    rows = -(-len(x) // width)
-    padded = np.full(rows * width, np.nan)
-    padded[: len(y)] = y
-    blocks, start = padded.reshape(rows, width), np.arange(rows) * width
+    blocks = np.pad(y, (0, -len(y) % width), constant_values=np.nan).reshape(-1, width)
+    start = width * np.arange(len(blocks))
     missing = ~np.isfinite(blocks)
     lowest = start + np.argmin(np.where(missing, np.inf, blocks), axis=1)
     highest = start + np.argmax(np.where(missing, -np.inf, blocks), axis=1)
@@ -209,8 +206,6 @@ def tidy(ax: Axes, *, x: str = "", y: str = "", title: str = "") -> None:
 
 def plain_decades(ax: Axes) -> None:
     """Write the ticks of a logarithmic axis as plain numbers, with some in between where there is room."""
-    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
-
     low, high = ax.get_ylim()
     ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if high < 200 * low else (1,)))
     ax.yaxis.set_major_formatter(FuncFormatter(lambda v, _: number(v, 1).removeprefix("1·")))
@@ -227,6 +222,5 @@ def decade(size: float) -> int:
 
 def scaled_title(name: str, unit: str, power: int = 0) -> str:
     """Return ``L (10⁻³ H)``."""
-    factor = f"10{str(power).translate(str.maketrans('-0123456789', '⁻⁰¹²³⁴⁵⁶⁷⁸⁹'))}" if power else ""
-    inside = " ".join(w for w in (factor, unit) if w)
+    inside = " ".join(w for w in (f"10{raised(power)}" if power else "", unit) if w)
     return f"{name} ({inside})" if inside else name

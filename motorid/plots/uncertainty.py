@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -89,13 +88,15 @@ def plot_profile(result: Profile | Mapping[str, Profile] | Intervals) -> np.ndar
     --------
     >>> axes = mi.plot_profile(mi.profile(better, "b", quiet=True))
     """
-    profiles = _profiles(result)
+    found = result.profiles if isinstance(result, Intervals) else result
+    profiles = list(found.values()) if isinstance(found, Mapping) else [found]
+    if not profiles or not all(isinstance(p, Profile) for p in profiles):
+        raise UsageError(f"plot_profile takes mi.profile(fit, 'R') or mi.intervals(fit), got {type(result).__name__}.")
     columns = min(len(profiles), 3)
     rows = -(-len(profiles) // columns)
     axes = style.grid(rows, columns, row=2.2, width=style.WIDTH if columns == 3 else 4.2 * columns).ravel()
-    both = result if isinstance(result, Intervals) else None
     for ax, p in zip(axes, profiles, strict=False):
-        _one_profile(ax, p, both)
+        _one_profile(ax, p, result if isinstance(result, Intervals) else None)
     for ax in axes[len(profiles) :]:
         ax.set_axis_off()
     for k in range(0, len(profiles), columns):
@@ -115,9 +116,8 @@ def _one_profile(ax: Axes, p: Profile, both: Intervals | None) -> None:
     ends = np.clip(p.interval(level), float(p.values.min()), float(p.values.max()))
     ax.axvspan(ends[0] * scale, ends[1] * scale, color=style.PALETTE["blue"], alpha=0.1, lw=0)
     if both is not None:
-        known, drawn = both.covariance.interval(p.name, level), both.bootstrap.interval(p.name, level)
-        for y, limits, name, colour in ((-0.8, known, "covariance", "purple"), (-1.7, drawn, "bootstrap", "green")):
-            if limits is not None:
+        for y, name, colour in ((-0.8, "covariance", "purple"), (-1.7, "bootstrap", "green")):
+            if (limits := getattr(both, name).interval(p.name, level)) is not None:
                 ax.plot(np.array(limits) * scale, [y, y], "|-", color=style.PALETTE[colour], lw=2, ms=6, label=name)
     ax.set_ylim(-2.4 if both is not None else -0.4, max(1.5 * height, 2.0))
     ax.set_yticks([y for y in ax.get_yticks() if 0 <= y <= ax.get_ylim()[1]])
@@ -145,14 +145,6 @@ def _smooth(x: Array, rise: Array, at: float) -> tuple[Array, Array]:
         return x, rise
     fine = np.linspace(x[0], x[-1], 200)
     return fine, PchipInterpolator(x, root)(fine) ** 2
-
-
-def _profiles(result: Any) -> Sequence[Profile]:
-    found = result.profiles if isinstance(result, Intervals) else result
-    chosen = list(found.values()) if isinstance(found, Mapping) else [found]
-    if not chosen or not all(isinstance(p, Profile) for p in chosen):
-        raise UsageError(f"plot_profile takes mi.profile(fit, 'R') or mi.intervals(fit), got {type(result).__name__}.")
-    return chosen
 
 
 @style.styled

@@ -455,18 +455,14 @@ class _Balances:
     def __init__(self, run: Experiment, outputs: Sequence[Array]) -> None:
         n = min(BALANCE_BLOCKS, run.n // 3)
         edges = np.linspace(0, run.n - 1, n + 1).astype(int)
-
-        def over(a: Array) -> Array:
-            return integral(run.t, a)[edges]
-
         self.y = [run.inputs["v"], *(bridged(run.t, a) for a in outputs)]
         self.top = [max(float(np.abs(a).max()), 1e-300) for a in self.y]
         angles = [integral(run.t, a, k == 0 and run.hold == "zoh") for k, a in enumerate(self.y)]
         self.sums = [a[edges] for a in angles]
-        self.signs = [over(np.tanh(50 * a / top)) for a, top in zip(self.y, self.top, strict=True)]
+        self.signs = [integral(run.t, np.tanh(50 * a / top))[edges] for a, top in zip(self.y, self.top, strict=True)]
         self.t, self.one = run.t[edges] - run.t[0], np.ones(n + 1)
-        self.loads = [(self.t, over(np.sin(a)), over(np.cos(a))) for a in angles]
-        self.rest = {(w, i): over(np.where(np.abs(self.y[w]) < STILL * self.top[w], self.y[i], 0.0))
+        self.loads = [(self.t, *(integral(run.t, f(a))[edges] for f in (np.sin, np.cos))) for a in angles]
+        self.rest = {(w, i): integral(run.t, np.where(np.abs(self.y[w]) < STILL * self.top[w], self.y[i], 0.0))[edges]
                      for w, i in permutations(range(3), 2)}
         self.at = [a[edges] for a in self.y]
         self.driven = [np.add.reduceat(np.abs(a), edges[:-1]) > 0 for a in self.y]
@@ -481,9 +477,8 @@ class _Balances:
         speed, losses = self.at[w] - self.at[w][0], [self.sums[w], self.signs[w]]
         loads = [sign * most * load for load in self.loads[w] for sign in (1, -1)]
         caused = [drive, drive - rest, *(drive + load for load in loads), *(-x for x in losses), self.one, -self.one]
-        needed = [speed, *losses, rest, *(load for load in loads)]
-        return (_share_left(blocks[0], *blocks[1:]), _share_left(speed, *caused),
-                _share_left(drive, *needed, most=[np.inf] * 3 + [1.0] * (1 + len(loads))))
+        return (_share_left(*blocks), _share_left(speed, *caused),
+                _share_left(drive, speed, *losses, rest, *loads, most=[np.inf] * 3 + [1.0] * (1 + len(loads))))
 
 
 def _share_left(y: Array, *terms: Array, most: Sequence[float] | None = None) -> float:

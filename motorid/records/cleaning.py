@@ -22,8 +22,7 @@ _LATE = 2  # this many rows in a row may come late before it counts as a new sta
 
 
 def run_from_columns(columns: Mapping[str, Array], texts: Texts, layout: Layout, *, name: str, hold: str,
-                     sigma: Mapping[str, float] | None = None, meta: Mapping[str, Any] | None = None,
-                     notes: Sequence[str] = ()) -> Experiment:
+                     sigma: Mapping[str, float], meta: Mapping[str, Any], notes: Sequence[str]) -> Experiment:
     """Make a valid run of the columns of a file: numbers with NaN where missing, and `texts`, which may be dates.
 
     `notes` and those made here end up in ``meta["notes"]``.
@@ -52,13 +51,13 @@ def run_from_columns(columns: Mapping[str, Array], texts: Texts, layout: Layout,
     extra = {c: a[rows] for c, a in columns.items() if c not in used}
     if set(texts) - used:
         said.append(f"left out columns of text: {', '.join(sorted(set(texts) - used))}.")
-    facts = {**(meta or {}), "notes": said, "extra": extra,
+    facts = {**meta, "notes": said, "extra": extra,
              "columns": {c: p.column for c, p in layout.places.items()},
              "original_units": {c: p.unit.label for c, p in layout.places.items()},
              "assumed_units": [c for c, p in layout.places.items() if not p.stated]}
     units = {c: places[c].unit.symbol for c in (*inputs, *outputs)}
     try:
-        return Experiment(t, inputs, outputs, sigma or {}, cast(Any, hold), units, name, facts)
+        return Experiment(t, inputs, outputs, sigma, cast(Any, hold), units, name, facts)
     except DataError as error:
         raise DataError(str(error).removeprefix(f"{name}: ")) from None
 
@@ -93,9 +92,8 @@ def _dates(cells: Sequence[object], column: str) -> Array:
         warnings.simplefilter("ignore")
         try:
             stamps = pd.to_datetime(series, errors="coerce", format="ISO8601", utc=True)
-            dated = stamps.notna().mean() > 0.5
             clock = series.where(series.astype(str).str.contains("[:a-zA-Z]"))  # bare numbers would be nanoseconds
-            spans = stamps - stamps.min() if dated else pd.to_timedelta(clock, errors="coerce")
+            spans = stamps if stamps.notna().mean() > 0.5 else pd.to_timedelta(clock, errors="coerce")
             seconds = (spans - spans.min()).dt.total_seconds().to_numpy(dtype=float)
         except (ValueError, TypeError, OverflowError, AttributeError):
             seconds = np.full(len(series), np.nan)

@@ -9,7 +9,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from motorid.errors import DataError, one_of
+from motorid.errors import DataError, among, one_of
 
 _PLANT = "motorid_plant"
 
@@ -21,8 +21,7 @@ def _root() -> Path:
     for place in places:
         if (place / "truth.json").is_file():
             return place
-    looked = " and ".join(str(place) for place in places)
-    raise DataError(f"the shipped records were not found; looked for truth.json in {looked}. "
+    raise DataError(f"the shipped records were not found; looked for truth.json in {' and '.join(map(str, places))}. "
                     "Install motorid from a wheel, or work in a checkout that has its data folder.")
 
 
@@ -58,8 +57,8 @@ def datasets() -> list[str]:
 
 def truth(name: str) -> dict[str, Any]:
     """What is true of a shipped set: motor, parameters in SI, hidden effects, noise, seed."""
-    if name not in (known := _truths()):
-        raise DataError(one_of(name, sorted(known), "shipped set"))
+    known = _truths()
+    among(name, sorted(known), "shipped set", DataError)
     return known[name]
 
 

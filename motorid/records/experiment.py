@@ -115,9 +115,8 @@ class Experiment(Shown):
 
     def with_(self, **changes: Any) -> Experiment:
         """Return a copy with some fields replaced, validated again."""
-        known = [f.name for f in dataclasses.fields(self)]
         for key in changes:
-            among(key, known, "field", where="with_(): ")
+            among(key, (f.name for f in dataclasses.fields(self)), "field", where="with_(): ")
         return dataclasses.replace(self, **changes)
 
     def select(self, keep: slice | ArrayLike) -> Experiment:
@@ -153,7 +152,10 @@ class Experiment(Shown):
         coarse = self.select(slice(None, None, int(k)))
         if self.hold == "linear" or k == 1:
             return coarse
-        return coarse.with_(inputs={c: _zoh_mean(self.t, a, int(k)) for c, a in self.inputs.items()})
+        starts, width = np.arange(0, self.n, int(k)), np.diff(self.t)
+        width = np.append(width, width[-1])  # the last sample is held for as long as the one before
+        means = {c: np.add.reduceat(a * width, starts) / np.add.reduceat(width, starts) for c, a in self.inputs.items()}
+        return coarse.with_(inputs=means)
 
     def running_median(self, samples: int) -> Experiment:
         """Return the run with its voltage, noisy as it was measured, replaced by the median over `samples` (odd)."""
@@ -221,8 +223,8 @@ def split(experiment: Experiment, n: int = 2) -> list[Experiment]:
     if int(n) != n or n < 1:
         raise UsageError(f"split() takes a whole number of blocks of at least 1; got {n!r}.")
     edges = np.linspace(0, experiment.n, int(n) + 1).round().astype(int)
-    blocks = (experiment.select(slice(a, b)) for a, b in pairwise(edges))
-    return [b.with_(name=f"{experiment.name}[{j + 1}/{n}]") for j, b in enumerate(blocks)]
+    return [experiment.select(slice(a, b)).with_(name=f"{experiment.name}[{j}/{n}]")
+            for j, (a, b) in enumerate(pairwise(edges), 1)]
 
 
 def windows(experiment: Experiment, seconds: float) -> list[Experiment]:
@@ -264,10 +266,10 @@ def between_pauses(run: Experiment) -> list[Experiment]:
     parts = [slice(a, b) for a, b in pairwise([0, *(cuts + 1).tolist(), run.n]) if b - a >= MIN_SAMPLES]
     if not cuts.size or not parts:
         return [run]
-    live = [s for s in parts if any(np.isfinite(y[s]).any() for y in run.outputs.values())]
+    live = [run.select(s) for s in parts if any(np.isfinite(y[s]).any() for y in run.outputs.values())]
     told = {"parts": None, "record": record_of(run)}
-    return [run.select(s).with_(name=f"{run.name}[{k + 1}]", meta={**run.select(s).meta, **told,
-                                "notes": run.meta.get("notes", ()) if k == 0 else ()}) for k, s in enumerate(live)]
+    return [part.with_(name=f"{run.name}[{k}]", meta={**part.meta, **told,
+                       "notes": run.meta.get("notes", ()) if k == 1 else ()}) for k, part in enumerate(live, 1)]
 
 
 def _frozen_array(values: ArrayLike, what: str, run: str) -> Array:
@@ -345,13 +347,6 @@ def _units(run: Experiment) -> Mapping[str, str]:
         raise DataError(f"{run.name}: omega in {given['omega']} does not go with theta in {given['theta']}.")
     return MappingProxyType({c: UNITS[c][-1 if True in linear and c in ("omega", "theta") else 0]
                              for c in present} | given)
-
-
-def _zoh_mean(t: Array, values: Array, k: int) -> Array:
-    starts = np.arange(0, len(t), k)
-    width = np.diff(t, append=t[-1])
-    width[-1] = width[-2]  # the last sample is held for as long as the one before
-    return np.add.reduceat(values * width, starts) / np.add.reduceat(width, starts)
 
 
 def repeated(runs: Sequence[Experiment], held_out: Sequence[Experiment]) -> str:

@@ -132,17 +132,13 @@ def plain(value: Any) -> Any:
     """Return `value` in the types that JSON knows; what is not a finite number becomes None."""
     if isinstance(value, Mapping):
         return {str(k): plain(v) for k, v in value.items()}
-    if isinstance(value, np.ndarray):
-        return plain(value.tolist())
     if isinstance(value, list | tuple | set | frozenset):
         return [plain(v) for v in value]
-    if isinstance(value, bool | np.bool_):
-        return bool(value)
-    if isinstance(value, int | np.integer):
-        return int(value)
     if isinstance(value, float | np.floating):
         return float(value) if np.isfinite(value) else None
-    return value if value is None or isinstance(value, str) else str(value)
+    if isinstance(value, np.ndarray | np.generic):
+        return plain(value.tolist())
+    return value if value is None or isinstance(value, str | int) else str(value)
 
 
 def json_text(contents: Mapping[str, Any], bulk: Mapping[str, Any] | None = None) -> str:
@@ -150,8 +146,8 @@ def json_text(contents: Mapping[str, Any], bulk: Mapping[str, Any] | None = None
 
     Control characters and lone surrogates are escaped.
     """
-    signed = {"motorid": package_version("motorid"), **contents}
-    text = json.dumps(plain(signed), indent=1, ensure_ascii=False, allow_nan=False)
+    signed = plain({"motorid": package_version("motorid"), **contents})
+    text = json.dumps(signed, indent=1, ensure_ascii=False, allow_nan=False)
     if bulk is not None:
         text = f"{text[:-2]},\n{json.dumps(plain(bulk), allow_nan=False)[1:-1]}\n}}"
     return _ODD.sub(lambda m: f"\\u{ord(m[0]):04x}", text) + "\n"

@@ -238,8 +238,7 @@ def _channel_of(words: list[str]) -> tuple[str | None, float]:
     whole = "".join(words)
     if whole in _CHANNEL:
         return _CHANNEL[whole], 4.0
-    stems = [w.rstrip("0123456789") for w in words]
-    hits = [s for s in stems if s in _CHANNEL]
+    hits = [stem for w in words if (stem := w.rstrip("0123456789")) in _CHANNEL]
     hits = [s for s in hits if len(s) > 2] or hits
     channels = {_CHANNEL[s] for s in hits if s not in _WEAK} or {_CHANNEL[s] for s in hits}
     if channels == {"theta", "omega"} or (channels == {"theta"} and _DERIVATIVE & set(words)):

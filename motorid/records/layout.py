@@ -106,11 +106,10 @@ def _named_by_header(places: dict[str, Place], labels: Sequence[str], row: Units
     for channel, hits in found.items():
         best = [p for p in hits if p.score == max(h.score for h in hits)]
         best = [p for p in best if p.unit.factor == 1.0] or best
-        weak = len(best) > 1 and best[0].score <= 1 and channel not in ("t", "v")
-        if channel in places or channel in without or weak:
+        # Of several measured inputs nobody knows which one acts on the motor.
+        spare = channel in MEASURED_INPUTS or (best[0].score <= 1 and channel not in ("t", "v"))
+        if channel in places or channel in without or (len(best) > 1 and spare):
             continue
-        if len(best) > 1 and channel in MEASURED_INPUTS:
-            continue  # which of them acts on the motor is not known
         if len(best) > 1:
             names = " and ".join(f"'{p.column}'" for p in best)
             raise DataError(f"{names} look equally like {_MEANING[channel]} ({channel}); say which one "

@@ -9,7 +9,7 @@ import scipy
 from numpy.typing import NDArray
 
 from motorid.errors import UsageError
-from motorid.numerics.signals import Array, noise_level, robust_std
+from motorid.numerics.signals import Array, integral, noise_level, robust_std
 
 CLEAR = np.pi / 2  # rad: a step of the angle this far from what is expected may be a turn or none
 BESIDE = 3  # samples on either side of a jump of the angle that show whether the shaft goes on
@@ -92,19 +92,16 @@ def levelled(v: Array) -> Array:
 
 
 def delayed(t: Array, v: Array, hold: str, seconds: float) -> Array:
-    """Return an input that acts `seconds` later; `hold` says how it goes on between samples."""
+    """Return an input that acts `seconds` later; `hold` says how it goes on between samples.
+
+    A held one is averaged over each step; before the record it is as at its beginning.
+    """
     at = t - seconds
-    return np.interp(at, t, v) if hold == "linear" else _zoh_means(t, v, at)
-
-
-def _zoh_means(t: Array, v: Array, at: Array) -> Array:
-    """Return the means of a held input between the times `at`; before the record it is as at its beginning."""
-    before, after = min(at[0] - t[0], 0.0), max(at[-1] - t[-1], 0.0)
-    ends = np.concatenate([[t[0] + before], t, [t[-1] + after]])
-    held = np.concatenate([v[:1], v])
-    integral = np.concatenate([[0.0], np.cumsum(held * np.diff(ends))])
-    means = np.diff(np.interp(at, ends, integral)) / np.diff(at)
-    return np.append(means, v[np.searchsorted(t, at[-1], side="right") - 1])
+    if hold == "linear":
+        return np.interp(at, t, v)
+    ends = np.concatenate([[min(at[0], t[0])], t, [max(at[-1], t[-1])]])
+    sums = integral(ends, np.pad(v, 1, "edge"), hold=True)
+    return np.append(np.diff(np.interp(at, ends, sums)) / np.diff(at), v[np.searchsorted(t, at[-1], side="right") - 1])
 
 
 def without_spikes(t: Array, y: Array, v: Array) -> Array:
@@ -129,10 +126,7 @@ def spikes(t: Array, y: Array, v: Array) -> NDArray[np.intp]:
     before, here, after = y[seen[:-2]], y[seen[1:-1]], y[seen[2:]]
     off, apart = here - (before + after) / 2, np.abs(after - before)
     jumps = np.flatnonzero(np.abs(np.diff(v)) > 0.02 * np.ptp(v))
-    steady = np.ones(len(t), bool)
-    for k in range(PEAK + 1):
-        steady[np.clip(jumps + k, 0, len(t) - 1)] = False
-    calm = steady[seen[1:-1]]
+    calm = ~np.isin(seen[1:-1], jumps[:, None] + np.arange(PEAK + 1))
     alone = calm & (apart < 0.3 * np.abs(off))
     # Smooth or not, a channel bends everywhere alike; nine in ten tell how much. A spike bends three samples.
     beside = np.convolve(alone & (np.abs(off) > 12 * noise), np.ones(3), "same") > 0

@@ -117,10 +117,9 @@ def csv_text(run: Experiment) -> str:
 
     channels = {"t": run.t, **run.inputs, **run.outputs}
     headers = {c: _HEADERS[c, {"t": "s", **run.units}[c]] for c in channels}
-    extra = {str(k): a for k, a in run.meta.get("extra", {}).items() if np.shape(a) == run.t.shape}
-    taken = set(headers.values())
     table = {headers[c]: a for c, a in channels.items()}
-    table |= {f"{k} (extra)" if k in taken else k: np.asarray(a) for k, a in extra.items()}
+    table |= {f"{k} (extra)" if k in table else str(k): np.asarray(a)
+              for k, a in run.meta.get("extra", {}).items() if np.shape(a) == run.t.shape}
     about = ["# motorid columns: " + ",".join(f"{c}={h}" for c, h in headers.items()), f"# motorid hold: {run.hold}"]
     about += ["# motorid sigma: " + ",".join(f"{c}={s!r}" for c, s in run.sigma.items())] if run.sigma else []
     return "\n".join([*about, pd.DataFrame(table).to_csv(index=False, na_rep="", lineterminator="\n")])

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from motorid.numerics.signals import Array
+from motorid.numerics.signals import Array, window_slopes
 from motorid.records.experiment import Experiment
 
 LEAST = 16  # samples
@@ -49,9 +49,8 @@ def find_segments(runs: Sequence[Experiment], sigma: Sequence[Mapping[str, float
     A stretch counts where the two halves of its tail agree in every channel within four standard errors or
     0.1 % of the channel's largest value. Parts without input and without motion say nothing and are left out.
     """
-    tails = (_steady_tail(k, run, sigma[k], first, last)
-             for k, run in enumerate(runs) for first, last in _constant_stretches(run.inputs["v"]))
-    return tuple(segment for segment in tails if segment is not None)
+    return tuple(tail for k, run in enumerate(runs) for first, last in _constant_stretches(run.inputs["v"])
+                 if (tail := _steady_tail(k, run, sigma[k], first, last)))
 
 
 def segment_between(k: int, run: Experiment, begin: float, end: float) -> SteadySegment | None:
@@ -106,9 +105,8 @@ def _segment(k: int, run: Experiment, first: int, last: int) -> SteadySegment:
     part = slice(first, last + 1)
     means = {c: float(np.nanmean(run.outputs[c][part])) for c in ("i", "omega")
              if c in run.outputs and np.isfinite(run.outputs[c][part]).any()}
-    if "omega" not in run.outputs and "theta" in run.outputs:
-        slope = _slope(run, first, last)
-        means |= {"omega": slope} if np.isfinite(slope) else {}
+    if "omega" not in run.outputs and "theta" in run.outputs and np.isfinite(slope := _slope(run, first, last)):
+        means["omega"] = slope
     top = float(np.nanmax(np.abs(run.outputs["omega"]))) if "omega" in run.outputs else _top_slope(run)
     moving = abs(means["omega"]) > MOVING_SHARE * top if "omega" in means else True
     return SteadySegment(k, first, last, float(run.t[first]), float(run.t[last]),
@@ -122,7 +120,5 @@ def _slope(run: Experiment, first: int, last: int) -> float:
 
 
 def _top_slope(run: Experiment) -> float:
-    if (y := run.outputs.get("theta")) is None:
-        return 0.0
-    good = np.flatnonzero(np.isfinite(y))[::max(run.n // 200, 1)]
-    return float(np.max(np.abs(np.diff(y[good]) / np.diff(run.t[good])), initial=0.0))
+    y = run.outputs.get("theta")
+    return 0.0 if y is None else float(np.abs(window_slopes(run.t, y)).max(initial=0.0))

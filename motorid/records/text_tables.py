@@ -126,10 +126,9 @@ class Dialect:
         if '"' not in line:
             return [c.strip() for c in line.split(self.delimiter)]
         try:
-            row = next(csv.reader([line], delimiter=self.delimiter, skipinitialspace=True), [])
+            return [c.strip() for c in next(csv.reader([line], delimiter=self.delimiter, skipinitialspace=True), [])]
         except csv.Error:
             return [line]
-        return [c.strip() for c in row]
 
     def is_number(self, cell: str) -> bool:
         """Tell whether a cell is one number in this dialect."""
@@ -229,11 +228,10 @@ def _parse(rows: list[str], dialect: Dialect, labels: list[str],
            notes: list[str]) -> tuple[dict[str, NDArray[np.float64]], dict[str, Sequence[object]]]:
     import pandas as pd
 
-    text = io.StringIO("\n".join(rows))
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", pd.errors.ParserWarning)  # it would lose cells
-            frame = pd.read_csv(text, sep=dialect.delimiter or r"\s+", decimal=dialect.decimal,
+            frame = pd.read_csv(io.StringIO("\n".join(rows)), sep=dialect.delimiter or r"\s+", decimal=dialect.decimal,
                                 header=None, names=range(len(labels)), index_col=False, skipinitialspace=True,
                                 low_memory=False, na_values=sorted(MISSING - {""}))
     except (pd.errors.ParserWarning, ValueError, OverflowError) as error:  # ParserError is a ValueError
@@ -279,9 +277,6 @@ def numbers(values: object, decimal: str = ".") -> tuple[NDArray[np.float64], in
 def unique_labels(labels: Sequence[str]) -> list[str]:
     """Give every column a name of its own: empty ones by position, repeated ones with a number."""
     named = [label.strip().strip("\"'") or f"column {k + 1}" for k, label in enumerate(labels)]
-    seen: Counter[str] = Counter()
-    result = []
-    for label in named:
-        seen[label] += 1
-        result.append(label if seen[label] == 1 else f"{label} ({seen[label]})")
+    before = [named[:k].count(label) for k, label in enumerate(named)]
+    result = [f"{label} ({n + 1})" if n else label for label, n in zip(named, before, strict=True)]
     return result if len(set(result)) == len(result) else [f"{c} [{k + 1}]" for k, c in enumerate(named)]

@@ -21,7 +21,6 @@ from motorid.model.definition import Effect, Parameter
 from motorid.model.model import Model
 from motorid.problem.problem import Problem
 from motorid.problem.simulate import error_table, evaluate
-from motorid.records.experiment import Experiment
 
 TITLES = {"voltage": "Voltage balance", "torque": "Torque balance", "transmission": "Transmission", "sensor": "Sensors"}
 REACH = 10.0  # a slider goes from a tenth to ten times the value it begins with
@@ -59,8 +58,7 @@ def explore(fit: Fit, *, effects: Iterable[Effect | str] | None = None) -> Explo
         raise MissingDependency("mi.explore needs ipywidgets: pip install 'motorid[notebooks]'.") from None
     chosen = LIBRARY.values() if effects is None else [get(e) if isinstance(e, str) else e for e in effects]
     own = [e for e in fit.model.effects if e.name not in {c.name for c in chosen}]
-    runs = fit.problem.experiments
-    return Explorer(fit, [e for e in (*own, *chosen) if effects is not None or _can_be_seen(fit, e)], runs)
+    return Explorer(fit, [e for e in (*own, *chosen) if effects is not None or _can_be_seen(fit, e)])
 
 
 class Explorer:
@@ -80,9 +78,9 @@ class Explorer:
         The controls and the figure.
     """
 
-    def __init__(self, start: Fit, effects: Sequence[Effect], runs: Sequence[Experiment]) -> None:
-        self.fit, self.runs, self._first = start, tuple(runs), start
-        self.model, self.evaluation, self.message = start.model, evaluate(start, runs), ""
+    def __init__(self, start: Fit, effects: Sequence[Effect]) -> None:
+        self.fit, self.runs, self._first = start, start.problem.experiments, start
+        self.model, self.evaluation, self.message = start.model, evaluate(start, self.runs), ""
         self._gains = {s.effect.name: s.drop for s in rank(start, effects)}
         self._effects = {e.name: e for e in sorted(effects, key=lambda e: -self._gains.get(e.name, 1.0))}
         self._quiet, self._figure = False, None
@@ -168,9 +166,8 @@ class Explorer:
             boxes = [self.boxes[n] for n, e in self._effects.items() if e.balance == balance]
             grid = w.GridBox(boxes, layout=w.Layout(grid_template_columns="repeat(auto-fill, minmax(15rem, 1fr))"))
             found += [w.HTML(f"<b>{title}</b>"), grid] if boxes else []
-        hint = w.HTML("Effects, with the share of the first fit's squared error that each is predicted to remove; "
-                      "hover for the law.")
-        return [hint, *found]
+        return [w.HTML("Effects, with the share of the first fit's squared error that each is predicted to remove; "
+                       "hover for the law."), *found]
 
     def _box(self, name: str) -> Any:
         w = self._w

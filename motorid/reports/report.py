@@ -85,9 +85,8 @@ def _page(story: Story) -> str:
 
 
 def _provenance(story: Story, command: str, held_out: Sequence[Experiment]) -> Section:
-    named = [(r.name, r) for r in story.runs] + [(f"{r.name} (held out)", r) for r in held_out]
-    files = [[name, Path(str(run.meta.get("source", "–"))).name, str(run.meta.get("sha256", "–"))[:16]]
-             for name, run in named]
+    files = [[run.name + more, Path(str(run.meta.get("source", "–"))).name, str(run.meta.get("sha256", "–"))[:16]]
+             for more, runs in (("", story.runs), (" (held out)", held_out)) for run in runs]
     versions = ", ".join([f"Python {platform.python_version()}", *(f"{p} {package_version(p)}" for p in PACKAGES)])
     tables = [Table(["run", "file", "SHA-256 (first 16 digits)"], files)] if files else []
     traced = ["The files are named by the fingerprint of their contents: the page can be traced to them."] * bool(files)
@@ -117,8 +116,7 @@ def tell(results: Sequence[Shown], *, title: str = "", validate: Sequence[Experi
         story = _of_fit(main, validate)
     else:
         card = main.card()
-        story = Story(card.title, " ".join(card.text[:1]), card.flags)
-        story.sections.append(sections.of_card(main, 0))
+        story = Story(card.title, " ".join(card.text[:1]), card.flags, sections=[sections.of_card(main, 0)])
     for k, r in enumerate(results):
         if r is not main:
             again = sections.fitted(r, r.card().title, key=f"result-{k + 1}") if isinstance(r, Fit) else None
@@ -133,9 +131,8 @@ def tell(results: Sequence[Shown], *, title: str = "", validate: Sequence[Experi
 
 def _of_diagnosis(d: Diagnosis, validate: Sequence[Experiment]) -> Story:
     runs = d.before.problem.experiments
-    story = Story("What is missing in the motor's model?", d.answer or d.text, runs=runs)
-    story.facts = sections.error_facts(d.ladder)
-    story.sections.append(sections.answer(d))
+    story = Story("What is missing in the motor's model?", d.answer or d.text, (), sections.error_facts(d.ladder),
+                  [sections.answer(d)], runs)
     if d.details:
         story.sections.append(Section("details", "Details", (), d.details))
     if len(d.ladder.rungs) > 1:
@@ -155,21 +152,17 @@ def _of_diagnosis(d: Diagnosis, validate: Sequence[Experiment]) -> Story:
 
 def _of_ladder(ladder: Ladder) -> Story:
     first, best = ladder.rungs[0].fit, ladder.best
-    story = Story("Models of growing detail", ladder.text, runs=first.problem.experiments)
-    story.facts = sections.error_facts(ladder)
-    story.sections += [sections.data(story.runs), sections.ladder(ladder), sections.parameters(first, best)]
-    story.sections.append(sections.fitted(best, "The last model", before=first if best is not first else None))
-    return story
+    told = [sections.data(first.problem.experiments), sections.ladder(ladder), sections.parameters(first, best),
+            sections.fitted(best, "The last model", before=first if best is not first else None)]
+    return Story("Models of growing detail", ladder.text, (), sections.error_facts(ladder), told,
+                 first.problem.experiments)
 
 
 def _of_fit(fit: Fit, validate: Sequence[Experiment]) -> Story:
-    card = fit.card()
-    story = Story(card.title, " ".join(t for t in card.text if t), card.flags[1:], runs=fit.problem.experiments)
-    story.facts = [(f"Error of the {NAMES[c]}", percent(e)) for c, e in fit.nrmse.items()]
+    card, runs = fit.card(), fit.problem.experiments
+    facts = [(f"Error of the {NAMES[c]}", percent(e)) for c, e in fit.nrmse.items()]
     known = [fit.determined[n] for n in ("gain", "time_constant") if n in fit.determined]
-    story.facts += [(q.text.capitalize(), with_error(q.value, q.std, q.unit)) for q in known]
-    story.sections.append(sections.fitted(fit, "The fit", told=False))
-    if validate:
-        story.sections.append(sections.held_out(fit, validate))
-    story.sections += [sections.residuals(fit), sections.data(story.runs)]
-    return story
+    facts += [(q.text.capitalize(), with_error(q.value, q.std, q.unit)) for q in known]
+    told = [sections.fitted(fit, "The fit", told=False), *([sections.held_out(fit, validate)] if validate else []),
+            sections.residuals(fit), sections.data(runs)]
+    return Story(card.title, " ".join(t for t in card.text if t), card.flags[1:], facts, told, runs)

@@ -250,12 +250,9 @@ def motors_in(folder: str | Path) -> dict[str, list[Path]]:
     for entry in sorted(place.iterdir()):
         if entry.name.startswith("."):
             continue
-        try:
-            files = find_records(entry)
-        except DataError:
-            continue
         name = entry.name if entry.is_dir() or entry.stem in found else entry.stem
-        found[printable(name)] = [Path(f) for f in files]
+        with suppress(DataError):
+            found[printable(name)] = find_records(entry)
     if not found:
         raise DataError(f"'{place}' holds no records: expected a folder, or a file, per motor.")
     return found
@@ -275,8 +272,7 @@ def outliers(rows: Sequence[Mapping[str, Any]], names: Sequence[str], positive: 
             continue
         value = np.array([r[n] for r in known], float)
         std = np.array([r[f"{n}_std"] for r in known], float)
-        x, sd = (np.log(value), std / value) if n in positive else (value, std)
-        z = scores(x, sd)
+        z = scores(np.log(value), std / value) if n in positive else scores(value, std)
         limit = float(scipy.special.stdtrit(max(len(known) - 2, 1), 1 - level / (2 * len(known) * len(names))))
         for j in np.flatnonzero(np.abs(z) > limit):
             middle = float(np.median(value))
@@ -291,8 +287,7 @@ def outliers(rows: Sequence[Mapping[str, Any]], names: Sequence[str], positive: 
 def scores(x: Array, std: Array) -> Array:
     """Return robust z of values (n,): distance from the median over scatter and own uncertainty together."""
     middle = np.median(x)
-    scatter = robust_std(x - middle)
-    between = np.sqrt(max(scatter**2 - np.median(std) ** 2, 0.0))
+    between = np.sqrt(max(robust_std(x - middle) ** 2 - np.median(std) ** 2, 0.0))
     return (x - middle) / np.maximum(np.hypot(between, std), 1e-12 * max(abs(middle), 1e-300))
 
 
@@ -307,11 +302,9 @@ class Checkpoint:
             with suppress(ValueError, KeyError, TypeError, RecursionError):
                 entry = json.loads(line)
                 row = {"motor": entry["row"]["motor"], **entry["row"]}
-                for name, value in row.items():
-                    kind = {"motor": str, "status": str, "message": str, "flags": list}.get(name, int | float | None)
-                    if not isinstance(value, kind):
-                        raise TypeError(name)
-                self.rows[entry["fingerprint"]] = row
+                kinds = {"motor": str, "status": str, "message": str, "flags": list}
+                if all(isinstance(value, kinds.get(name, int | float | None)) for name, value in row.items()):
+                    self.rows[entry["fingerprint"]] = row
         if text.strip() and not self.rows and '{"fingerprint"' not in text:
             raise UsageError(f"'{path}' is not a journal of motorid, so nothing is added to it; name another file.")
         self._append("" if text.endswith("\n") or not text else "\n")

@@ -293,9 +293,7 @@ def monomials(names: Sequence[str], weak: Array) -> list[str]:
     tried = sorted(product(range(-2, 3), repeat=len(involved)), key=lambda a: (sum(map(abs, a)), sum(p < 0 for p in a)))
     for powers in tried:
         a = np.array(powers, float)
-        if not a.any() or a[a != 0][0] < 0 or np.count_nonzero(a) > 4:
-            continue
-        if np.linalg.norm(weak[:, involved] @ a) > ALIKE:
+        if not a.any() or a[a != 0][0] < 0 or np.count_nonzero(a) > 4 or np.linalg.norm(weak[:, involved] @ a) > ALIKE:
             continue
         if np.linalg.matrix_rank(np.array([*found, a])) > len(found):
             found.append(a)

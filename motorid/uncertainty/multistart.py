@@ -87,9 +87,8 @@ def _draw(reference: Fit, names: Sequence[str], starts: int, spread: float, seed
     pars = reference.problem.model.parameters
     scale = reference.problem.scaling.scale
     sizes = np.array([reference.values[n] or 1e-3 * s for n, s in zip(names, scale, strict=False)])
-    turning = np.array([pars[n].periodic for n in names], bool)
     phases = sizes + np.pi * np.log(factors) / max(np.log(spread), 1e-300)  # anywhere on the circle
-    drawn = np.where(turning & (spread > 1), phases, factors * sizes)
+    drawn = np.where([pars[n].periodic and spread > 1 for n in names], phases, factors * sizes)
     drawn = np.clip(drawn, [pars[n].lower for n in names], [pars[n].upper for n in names])
     return [dict(zip(names, row, strict=True)) for row in drawn.tolist()]
 
@@ -256,9 +255,8 @@ class Multistart(Printed):
         """Tell whether two fits ended in the same place: cost within 1 %, values within 5 %."""
         if abs(a.cost - b.cost) > 10 * COST_SHARE * a.cost:
             return False
-        sizes = [max(abs(a.values[n]), abs(b.values[n]), 1e-300) for n in a.start]
-        return all(abs(self.difference(n, a.values[n], b.values[n])) < 0.05 * s
-                   for n, s in zip(a.start, sizes, strict=True))
+        pairs = ((n, a.values[n], b.values[n]) for n in a.start)
+        return all(abs(self.difference(n, x, y)) < 0.05 * max(abs(x), abs(y), 1e-300) for n, x, y in pairs)
 
     def statistics(self) -> dict[str, dict[str, float | None]]:
         """Return per free parameter the reference and mean and standard deviation over the good fits."""

@@ -72,16 +72,10 @@ class Profile(Printed):
         check_level(level)
         reach = float(scipy.special.stdtrit(self.dof, 0.5 + level / 2))
         start = int(np.argmin(np.abs(self.values - self.value)))
-        low = _crossing(self._scale(self.values[start::-1]), self.rise[start::-1], reach)
-        high = _crossing(self._scale(self.values[start:]), self.rise[start:], reach)
-        return ((0.0 if self.positive else -np.inf) if low is None else self._back(low),
-                np.inf if high is None else self._back(high))
-
-    def _scale(self, p: Array) -> Array:
-        return np.log(p) if self.positive else p
-
-    def _back(self, x: float) -> float:
-        return float(np.exp(x)) if self.positive else float(x)
+        x = np.log(self.values) if self.positive else self.values
+        low = _crossing(x[start::-1], self.rise[start::-1], reach, -np.inf)
+        high = _crossing(x[start:], self.rise[start:], reach, np.inf)
+        return (float(np.exp(low)), float(np.exp(high))) if self.positive else (low, high)
 
     def to_dict(self, level: float = 0.95) -> dict[str, Any]:
         """Return plain data; an open end is null."""
@@ -112,12 +106,12 @@ class Profile(Printed):
         return Card(f"Profile of {self.name}", flags, (self.text,), (), after, "plot_profile")
 
 
-def _crossing(x: Array, rise: Array, reach: float) -> float | None:
-    """Where sqrt(rise), interpolated, first exceeds `reach` going outward; None if it never does."""
+def _crossing(x: Array, rise: Array, reach: float, never: float) -> float:
+    """Where sqrt(rise), interpolated, first exceeds `reach` going outward; `never` if it does not."""
     root = np.sqrt(np.maximum(rise, 0.0))
     above = np.flatnonzero(root > reach)
     if not above.size:
-        return None
+        return never
     near = slice(max(above[0] - 1, 0), above[0] + 1)
     return float(np.interp(reach, root[near], x[near]))
 
@@ -174,11 +168,9 @@ def _plan(fit: Fit, name: str, level: float) -> tuple[float, float, float, float
     j = found.names.index(name)
     slope = fit.problem.scaling.slope(fit.q)[j]
     half, *_ = seen_directions(fit.jacobian)
-    plain = half @ half.T
-    overall = np.median([c.variance for c in found.colours.values()])
-    sd = found.std[name]
-    factor = float(found.matrix[j, j] / plain[j, j]) if sd else float(overall)
-    step = float(np.clip(0.7 * sd / abs(slope), 1e-6, 0.5)) if sd else 0.25
+    step, factor = 0.25, float(np.median([c.variance for c in found.colours.values()]))
+    if sd := found.std[name]:
+        step, factor = float(np.clip(0.7 * sd / abs(slope), 1e-6, 0.5)), float(sd**2 / (half[j] @ half[j]))
     height = 1.3 * float(scipy.special.stdtrit(found.dof, 0.5 + level / 2)) ** 2
     return step, factor, height, found.dof
 

@@ -194,13 +194,12 @@ def _path(problem: Problem, relations: Sequence[Relation], weights: Sequence[flo
           hard: Fit) -> tuple[PathPoint, ...]:
     """Follow the penalty solution back from the hard one as the penalties grow lighter: the same valley."""
     found, q = [], hard.q
-    effort = replace(FINISH, ftol=1e-12)
     free = [n for n in problem.model.free_names if hard.std[n] is not None and hard.values[n] != 0]
     for weight in sorted(weights, reverse=True):
         step = replace(problem, _runs=hard.problem.runs,
                        penalties=(*problem.penalties, *(Weighed(c, float(weight)) for c in relations)))
         try:
-            q = least_squares(step, effort, q=q, refine=False).q
+            q = least_squares(step, replace(FINISH, ftol=1e-12), q=q, refine=False).q
         except (FitError, SimulationError):
             break
         values = step.values(q)

@@ -116,12 +116,9 @@ class Mesh:
     @cached_property
     def scale(self) -> Array:
         """Size of each state: the largest seen in the data or, where not measured, in the simulated intervals."""
-        found = np.zeros(self.nx)
-        for j, name in enumerate(self.problem.system.states):
-            for run in self.problem.experiments:
-                if name in run.outputs:
-                    found[j] = max(found[j], float(np.nanmax(np.abs(run.outputs[name]))))
-        return np.where(found > 0, found, 1.0)
+        runs = self.problem.experiments
+        return np.array([max([0.0, *(np.nanmax(np.abs(r.outputs[name])) for r in runs if name in r.outputs)]) or 1.0
+                         for name in self.problem.system.states])
 
     def joined(self, q: Array, states: Array) -> Array:
         """Return z of q and the states at the nodes (n, nx), physical."""

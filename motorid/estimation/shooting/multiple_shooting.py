@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from motorid.errors import FitError, SimulationError, UsageError, among, at_least, one_of, positive
+from motorid.errors import FitError, SimulationError, UsageError, among, at_least, positive
 from motorid.estimation.fit import minimise
 from motorid.estimation.least_squares import FINISH, least_squares
 from motorid.estimation.result import Fit
@@ -78,8 +78,8 @@ class MultipleShooting:
 
     def __post_init__(self) -> None:
         among(self.warm, ("auto", "data", "model"), "warm start")
-        if isinstance(self.process_noise, str) and self.process_noise != "auto":
-            raise UsageError(one_of(self.process_noise, ("auto",), "process noise"))
+        if isinstance(self.process_noise, str):
+            among(self.process_noise, ("auto",), "process noise")
         at_least(2, every=self.every)
         at_least(1, max_iterations=self.max_iterations)
         positive(tol=self.tol)
@@ -125,8 +125,7 @@ class MultipleShooting:
 
     def _from_poor_values(self, problem: Problem) -> Array:
         """Return values that a fit finds whose intervals join loosely, then tightly, from poor ones."""
-        found = [self._roughly(problem, q) for q in _with_resets(problem, self._loosely_joined(problem).q)]
-        best = _lowest(found)
+        best = _lowest([self._roughly(problem, q) for q in _with_resets(problem, self._loosely_joined(problem).q)])
         # Once the others are right, a parameter that ran off to where nothing depends on it finds its way back.
         return _lowest([best, *(self._roughly(problem, q) for q in _with_resets(problem, best.q)[1:])]).q
 
@@ -168,16 +167,14 @@ class MultipleShooting:
 
     def _with_process_noise(self, problem: Problem, q: Array) -> Solved:
         """Solve with process noise; with ``"auto"`` again until the gaps are as large as was taken."""
-        problem = problem.refined(q)
-        mesh = Mesh(problem, self.every or NOISY)
+        mesh = Mesh(problem.refined(q), self.every or NOISY)
         noise = first_noise(self.process_noise, mesh)
         mesh = replace(mesh, noise=noise)
         done = self._solve(mesh, mesh.joined(q, nodes_from_data(mesh, q)), rough=self.process_noise == "auto")
         for _ in range(NOISE_ROUNDS if self.process_noise == "auto" else 0):
             before, noise = noise, noise_of_gaps(done)
-            near = bool(np.all(np.abs(np.log(noise / before)) < NOISE_KNOWN))
             done = self._solve(replace(done.mesh, noise=noise), done.result.z, history=done.history)
-            if near:
+            if (np.abs(np.log(noise / before)) < NOISE_KNOWN).all():
                 break
         return done
 
@@ -247,8 +244,7 @@ def _under_penalties(problem: Problem, q: Array) -> tuple[float, Array]:
     """Return the cost and the solution under the heaviest penalties, each reached from the one before."""
     cost = np.inf
     for factor in HEAVIER:
-        weighed = tuple(Weighed(c, factor) for c in problem.constraints)
-        step = replace(problem, penalties=(*problem.penalties, *weighed))
+        step = replace(problem, penalties=(*problem.penalties, *(Weighed(c, factor) for c in problem.constraints)))
         try:
             found = least_squares(step, replace(FINISH, max_iterations=60), q=q, refine=False)
         except (FitError, SimulationError):

@@ -53,18 +53,18 @@ class ShootingNlp:
         self._kept: dict[bool, tuple[bytes, _Point]] = {}
         at = self._evaluate(z, True)
         self.n, self.m = len(z), len(at.g)
-        self.scale = STEEPEST / max(_steepest(at.residual, self.n), 1e-300)
+        diagonal = np.zeros(self.n)  # of JᵀJ
+        for b in at.residual:
+            diagonal[b.columns] += np.einsum("ij,ij->j", b.jac, b.jac)
+        self.scale = STEEPEST / max(float(diagonal.max(initial=0.0)), 1e-300)
         rows, columns = places(at.rows)
         self._jac_order = np.lexsort((rows, columns))  # the blocks' entries fill it column by column
         self.jac_pattern = _ccs(rows[self._jac_order], columns[self._jac_order], self.m, self.n)
         self.hess_pattern, self._hess_mask, self._hess_place = _hessian_pattern(at.residual, self.n)
-        self.lower, self.upper = self._limits(z)
-
-    def _limits(self, z: Array) -> tuple[Array, Array]:
-        zero = np.zeros(0 if self.mesh.noise is not None else self.mesh.n_nodes * self.mesh.nx)
-        found = self.mesh.constraints(self.mesh.walk(z, False))
-        return (np.concatenate([zero, *(part.lower[rows] for _, part, rows in found)]),
-                np.concatenate([zero, *(part.upper[rows] for _, part, rows in found)]))
+        zero = np.zeros(0 if mesh.noise is not None else mesh.n_nodes * mesh.nx)
+        found = mesh.constraints(mesh.walk(z, False))
+        self.lower = np.concatenate([zero, *(part.lower[own] for _, part, own in found)])
+        self.upper = np.concatenate([zero, *(part.upper[own] for _, part, own in found)])
 
     # -- one point -------------------------------------------------------------------------------------
     def _evaluate(self, z: Array, derivatives: bool) -> _Point:
@@ -102,15 +102,12 @@ class ShootingNlp:
     def jacobian(self, z: Array) -> list[Any]:
         """Return g and its sparse Jacobian."""
         point = self.at(z, True)
-        entries = np.concatenate([np.zeros(0), *(b.jac.ravel() for b in point.rows)])
-        return [point.g, entries[self._jac_order]]
+        return [point.g, np.concatenate([np.zeros(0), *(b.jac.ravel() for b in point.rows)])[self._jac_order]]
 
-    def hessian(self, z: Array, lam_f: float) -> Array:
+    def hessian(self, z: Array, lam_f: float) -> list[Any]:
         """Return the entries of the Gauss-Newton Hessian's upper triangle."""
-        point = self.at(z, True)
-        entries = np.concatenate([(b.jac.T @ b.jac).ravel() for b in point.residual])[self._hess_mask]
-        summed = np.bincount(self._hess_place, entries, self.hess_pattern.nnz())
-        return np.asarray(summed * (self.scale * lam_f), float)
+        entries = np.concatenate([(b.jac.T @ b.jac).ravel() for b in self.at(z, True).residual])[self._hess_mask]
+        return [np.bincount(self._hess_place, entries, self.hess_pattern.nnz()) * (self.scale * lam_f)]
 
     def functions(self) -> tuple[ca.Callback, dict[str, ca.Callback]]:
         """Return the NLP and its derivatives in CasADi's naming."""
@@ -121,7 +118,7 @@ class ShootingNlp:
             "jac_g": _Function("nlp_jac_g", at, {"g": g, "jac:g:x": self.jac_pattern}, lambda z, _: self.jacobian(z)),
             "hess_lag": _Function(
                 "nlp_hess_l", at | {"lam:f": f, "lam:g": g}, {"triu:hess:gamma:x:x": self.hess_pattern},
-                lambda z, _, lam_f, __: [self.hessian(z, float(lam_f[0]))])}
+                lambda z, _, lam_f, __: self.hessian(z, float(lam_f[0])))}
 
 
 class _Function(ca.Callback):
@@ -157,14 +154,6 @@ class _Function(ca.Callback):
         except SimulationError:  # not a number: IPOPT takes a shorter step
             found = [np.full(s.nnz(), np.nan) for _, s in self._results]
         return [ca.DM(s, np.atleast_1d(v)) for (_, s), v in zip(self._results, found, strict=True)]
-
-
-def _steepest(blocks: Sequence[Block], n: int) -> float:
-    """Return the largest diagonal entry of JᵀJ."""
-    found = np.zeros(n)
-    for b in blocks:
-        found[b.columns] += np.einsum("ij,ij->j", b.jac, b.jac)
-    return float(found.max(initial=0.0))
 
 
 def _hessian_pattern(blocks: Sequence[Block], n: int) -> tuple[ca.Sparsity, np.ndarray, np.ndarray]:

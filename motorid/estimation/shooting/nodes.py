@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import scipy
 
-from motorid.errors import SimulationError, UsageError, one_of
+from motorid.errors import SimulationError, among
 from motorid.estimation.shooting.mesh import Mesh, places
 from motorid.numerics.signals import Array, bridged, slope
 from motorid.records.experiment import Experiment
@@ -87,8 +87,8 @@ def first_noise(given: Any, mesh: Mesh) -> Array:
     sizes = dict(zip(mesh.problem.system.states, mesh.scale, strict=True))
     if given == "auto":
         given = {n: FIRST * s for n, s in sizes.items() if n in DISTURBED}
-    if unknown := [n for n in given if n not in sizes]:
-        raise UsageError(f"process_noise: {one_of(unknown[0], sizes, 'state')}")
+    for name in given:
+        among(name, sizes, "state", where="process_noise: ")
     return np.array([given.get(n, NEXT_TO_NONE * s) for n, s in sizes.items()])
 
 

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+import scipy
 
 from motorid.display.numbers import counted
 from motorid.errors import FitError, SimulationError
@@ -132,7 +133,7 @@ def _extra(done: Solved) -> dict[str, Any]:
         extra |= {"gaps": gaps, "process_noise": dict(zip(problem.system.states, mesh.noise.tolist(), strict=True))}
     if problem.constraints:
         totals, rows = summed(_with_multipliers(done))
-        active = [np.zeros((0, len(done.q))),
+        active = [np.zeros((1, len(done.q))),
                   *(jac[part.at_limit(values)] for _, part, values, jac in rows_at(problem, done.q))]
         extra |= {"multipliers": totals, "active": rows, "violations": violations(problem, done.q),
                   "free": free_directions(np.concatenate(active), problem.scaling.slope(done.q))}
@@ -215,8 +216,7 @@ def violations(problem: Problem, q: Array, relations: Sequence[Any] | None = Non
         several = len(set(part.units)) > 1
         for unit in dict.fromkeys(part.units):
             key = f"{name}, {unit}" if several or unit else name
-            mine = np.array([u == unit for u in part.units])
-            found[key] = max(found.get(key, 0.0), float(beyond[mine].max(initial=0.0)))
+            found[key] = max(found.get(key, 0.0), float(beyond[np.array(part.units) == unit].max(initial=0.0)))
     return found
 
 
@@ -236,7 +236,7 @@ def summed(found: Sequence[tuple[str, Part, Array, Array]]) -> tuple[tuple[Multi
         rows += [Multiplier(name, part.labels[j], float(abs(lam[j]) / part.size[j]), part.units[j], 1)
                  for j in np.flatnonzero(on)]
         for unit in dict.fromkeys(part.units):
-            mine = on & np.array([u == unit for u in part.units])
+            mine = on & (np.array(part.units) == unit)
             value, active = sums.get((name, unit), (0.0, 0))
             sums[name, unit] = value + float(np.sum(np.abs(lam / part.size)[mine])), active + int(mine.sum())
     labels = {n: f"{counted(n, 'row')} at the limit" if n else "not active" for _, n in sums.values()}
@@ -247,12 +247,8 @@ def summed(found: Sequence[tuple[str, Part, Array, Array]]) -> tuple[tuple[Multi
 
 def free_directions(jac: Array, slope: Array) -> Array:
     """Return a basis (nq, n) of the physical unknowns' changes that keep active rows (m, nq in q) as they are."""
-    if not len(jac):
-        return np.diag(slope)
     size = np.maximum(np.linalg.norm(jac, axis=1, keepdims=True), 1e-300)
-    _, s, vt = np.linalg.svd(np.asarray(np.linalg.qr(jac / size, mode="r")), full_matrices=True)
-    rank = int(np.sum(s > 1e-8))
-    return slope[:, None] * vt[rank:].T
+    return slope[:, None] * scipy.linalg.null_space(np.linalg.qr(jac / size, mode="r"), rcond=1e-8)
 
 
 def below_steady(problem: Problem) -> str | None:
@@ -260,10 +256,9 @@ def below_steady(problem: Problem) -> str | None:
 
     Values that keep such a limit exist, but they describe another motor.
     """
-    limits = [c for c in problem.constraints if isinstance(c, CurrentLimit)]
-    if not limits:
+    limits = (c for c in problem.constraints if isinstance(c, CurrentLimit))
+    if (lowest := min(limits, key=lambda c: c.limit, default=None)) is None:
         return None
-    lowest = min(limits, key=lambda c: c.limit)
     steady = [c for c in problem.constraints if isinstance(c, SteadyState)]
     segments = (steady[0] if steady else SteadyState()).segments(problem)
     for s in sorted(segments, key=lambda s: -abs(s.means.get("i", 0.0))):
@@ -297,11 +292,10 @@ def contradiction(problem: Problem, q: Array) -> str | None:
 
 def _least_violations(problem: Problem, q: Array) -> tuple[float, Array] | None:
     """Return the largest violation and the point at the least sum of squares that is reached from `q`."""
-    options = LevenbergMarquardt(max_iterations=60, damping=1e-2)
     try:
         found = levenberg_marquardt(lambda z: _violation_rows(problem, problem.constraints, z, False)[0],
                                     lambda z: _violation_rows(problem, problem.constraints, z, True),
-                                    q, problem.scaling.bounds, options)
+                                    q, problem.scaling.bounds, LevenbergMarquardt(max_iterations=60, damping=1e-2))
     except (FitError, SimulationError):
         return None
     return float(np.abs(found.residual).max(initial=0.0)), found.q
