@@ -3,6 +3,7 @@
 import tracemalloc
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -424,3 +425,13 @@ def test_what_the_ladder_left_again_is_not_called_accepted():
     assert replaced.accepted, "its rung is there, whatever came in its place"
     later = stepwise._as_it_ended(replace(first, effect="coulomb", accepted=False), last, last)
     assert later.reason == "added in a later step"
+
+
+def test_the_second_best_race_is_finished_however_far_it_is_behind():
+    """The next round grows two models; what gains nothing, and all others far behind, stay given up."""
+    fit, costs = SimpleNamespace(cost=100.0), (1.0, 2.5, 3.0, 99.9)
+    tasks = [SimpleNamespace(fit=fit) for _ in costs]
+    races = {k: SimpleNamespace(cost=c, reach=c) for k, c in enumerate(costs)}
+    given_up = trial._outdone(tasks, races, {0: None})
+    assert {k: g.why for k, g in given_up.items()} == {2: trial.LESS, 3: trial.NOTHING}
+    assert set(trial._outdone(tasks[:1] + tasks[3:], {0: races[0], 1: races[3]}, {})) == {1}

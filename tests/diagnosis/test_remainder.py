@@ -16,7 +16,16 @@ from command import motorid_json
 import motorid as mi
 from motorid.cli.options import own_effects
 from motorid.diagnosis import remainder
-from motorid.diagnosis.free_forms import Form, linearised, shown, signals_along, span_of
+from motorid.diagnosis.free_forms import (
+    Form,
+    Span,
+    functions_of,
+    linearised,
+    shown,
+    signals_along,
+    span_of,
+    values_of,
+)
 from motorid.diagnosis.locate import locate
 from motorid.diagnosis.remainder import Curve, Remainder
 from motorid.exporters.export import load
@@ -335,3 +344,15 @@ def test_nothing_follows_a_reversal_where_the_motor_never_turns_back(rng):
         fit = mi.fit(model, blank.with_(outputs={c: y + 0.05 * rng.normal(size=600) for c, y in clean.items()}))
         assert shown(path, fit, span_of(fit, signals_along(fit)).ranges) == (back < 0)
         assert (locate(fit).regions["reversal"] > 0) == (back < 0)
+
+
+@pytest.mark.parametrize("sides", [(1, -1), (1,), (-1,)])
+def test_a_curve_over_the_speed_may_set_in_beyond_one(sides):
+    """A centrifugal brake: nothing below a speed, then as its square."""
+    omega = np.linspace(-90, 100, 801)
+    span = Span({"omega": (-90.0, 100.0)}, (), 1e-3)
+    brake = sum(s * np.maximum((s * omega)**2 - 57.0**2, 0) * (s * omega > 0) for s in sides)
+    form = Form("a torque", "torque", "omega")
+    basis = values_of(functions_of(form, span), form, {"omega": omega, "t": omega, "width": np.full(omega.size, 0.1)})
+    left = brake - basis @ np.linalg.lstsq(basis, brake, rcond=1e-9)[0]
+    assert np.std(left) < 0.03 * np.std(brake)  # 0.05 without knees
