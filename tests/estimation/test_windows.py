@@ -82,7 +82,8 @@ def test_a_motor_that_is_only_poorly_described_is_simulated_as_a_whole(lab):
 
 def test_a_diagnosis_finds_what_holds_a_pendulum_up_and_what_rubs_in_it():
     fit = mi.fit(mi.torque_driven(), upright(1, 8, tau_c=0.03))
-    found = mi.diagnose(fit, upright(6, 5, tau_c=0.03))
+    rivals = ("gravity", "spring", "cogging", "constant_load", "coulomb", "stribeck", "quadratic_drag", "speed_lag")
+    found = mi.diagnose(fit, upright(6, 5, tau_c=0.03), effects=rivals)
     assert found.effects == ("gravity", "coulomb")
     assert found.best.window == pytest.approx(1, rel=0.01)
     assert "in windows of 1 s" in found.text

@@ -192,7 +192,7 @@ def test_ctrl_c_is_status_130_in_the_first_second_and_later(after):
     process.send_signal(signal.SIGINT)
     for _ in range(6):  # while Python itself is starting it may lose one: then it is pressed again, as anybody would,
         try:  # but not while the command is about to end: Python itself may die of it there
-            out, err = process.communicate(timeout=15)
+            out, err = process.communicate(timeout=5)
             break
         except subprocess.TimeoutExpired:
             process.send_signal(signal.SIGINT)
