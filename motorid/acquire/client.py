@@ -108,7 +108,7 @@ def _complete(fields: list[str]) -> bool:
 
 
 def _milli(value: float) -> int:
-    return math.floor(min(value, 2e6) * 1e3 + 1e-6)
+    return min(2_000_000_000, math.floor(value * 1e3 + 1e-6)) if math.isfinite(value) else 2_000_000_000
 
 
 class LinkLost(DeviceError):

@@ -277,6 +277,9 @@ def numbers(values: object, decimal: str = ".") -> tuple[NDArray[np.float64], in
 def unique_labels(labels: Sequence[str]) -> list[str]:
     """Give every column a name of its own: empty ones by position, repeated ones with a number."""
     named = [label.strip().strip("\"'") or f"column {k + 1}" for k, label in enumerate(labels)]
-    before = [named[:k].count(label) for k, label in enumerate(named)]
-    result = [f"{label} ({n + 1})" if n else label for label, n in zip(named, before, strict=True)]
+    seen: Counter[str] = Counter()
+    result = []
+    for label in named:
+        seen[label] += 1
+        result.append(label if seen[label] == 1 else f"{label} ({seen[label]})")
     return result if len(set(result)) == len(result) else [f"{c} [{k + 1}]" for k, c in enumerate(named)]

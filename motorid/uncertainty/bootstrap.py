@@ -233,4 +233,5 @@ def _blocks(source: _Source, k: int, rng: np.random.Generator) -> dict[str, Arra
         size = len(next(iter(donor.values())))
         at = (rng.integers(size) + np.arange(source.block)) % size
         pieces.append({c: e[at] for c, e in donor.items()})
-    return {c: np.nan_to_num(np.concatenate([p[c] for p in pieces])[:n]) for c in here}
+    joined = {c: np.concatenate([p[c] for p in pieces])[:n] for c in here}
+    return {c: np.where(np.isfinite(e), e, 0.0) for c, e in joined.items()}

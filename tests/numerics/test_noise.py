@@ -184,3 +184,5 @@ def test_a_short_rest_tells_nothing_of_the_noise(rng):
     assert both == alone == pytest.approx(0.01, rel=0.1)
     assert noise_of([rest], ("omega",))["omega"] > 0
     assert not repeated([rest, long], [rest]), "a rest is no record"
+    dead = long.with_(outputs={"i": np.full(long.n, np.nan), **long.outputs})
+    assert repeated([dead], [dead]), "whatever other channel is empty"
