@@ -26,6 +26,8 @@ NUMBERS = {  # one plausible size of every effect
     "lugre": {"sigma_0": 0.5, "sigma_1": 1e-3, "tau_c": 4e-3, "tau_s": 6e-3, "omega_s": 4.0},
     "compliance": {"k_s": 2.0, "c_s": 1e-3, "J_l": 2e-5},
     "backlash": {"gap": 0.03, "k_s": 5.0, "c_s": 2e-3, "J_l": 2e-5},
+    "slip_clutch": {"tau_slip": 3e-3, "omega_slip": 0.5, "b_slip": 1e-6, "J_l": 2e-5},
+    "freewheel": {"c_g": 0.05, "b_free": 2e-6, "J_l": 2e-5, "side": 1.0},
     "speed_lag": {"T_w": 5e-3},
     "current_lag": {"T_i": 2e-3},
     "speed_delay": {"T_d": 8e-3},
@@ -82,6 +84,12 @@ def in_library_words(name, numbers, motor):
         shaft = (J_l / J, resonance, c_s * resonance / (2 * k_s))
         words = ("r_load", "omega_r", "zeta_r") if name == "compliance" else ("r_gap", "omega_c", "zeta_c")
         n |= dict(zip(words, shaft, strict=True))
+    if name in ("slip_clutch", "freewheel"):
+        J_l = n.pop("J_l")
+        J = motor.J + J_l
+        n["r_slip" if name == "slip_clutch" else "r_free"] = J_l / J
+    if name == "freewheel":
+        n["g_free"] = n.pop("c_g") * (1 / motor.J + 1 / J_l)
     if name == "driver_coast":  # so soon that it does not matter how
         n = {"R_c": 100 * motor.R}
     if name == "lugre":

@@ -247,6 +247,28 @@ def backlash(m: Motor, gap: float, k_s: float, c_s: float, J_l: float) -> Hooks:
     return {"part": part, "x0": lambda w, th: (w, th), "rate": 20 * sqrt(k_s / m.J + k_s / J_l)}
 
 
+@_known
+def slip_clutch(m: Motor, tau_slip: float, omega_slip: float, b_slip: float, J_l: float) -> Hooks:
+    """A load of inertia J_l and friction b_slip, driven by at most tau_slip; just before it creeps by omega_slip."""
+
+    def part(i: float, w: float, th: float, x: list[float]) -> tuple[float, tuple[float, ...]]:
+        carried = tau_slip * max(-1.0, min(1.0, (w - x[0]) / omega_slip))
+        return -carried, ((carried - b_slip * x[0]) / J_l,)
+
+    return {"part": part, "x0": lambda w, th: (w,), "rate": tau_slip / omega_slip * (1 / m.J + 1 / J_l)}
+
+
+@_known
+def freewheel(m: Motor, c_g: float, b_free: float, J_l: float, side: float = 1.0) -> Hooks:
+    """A load that is driven in one direction, by a grip c_g, and free to overrun."""
+
+    def part(i: float, w: float, th: float, x: list[float]) -> tuple[float, tuple[float, ...]]:
+        carried = side * c_g * max(0.0, side * (w - x[0]))
+        return -carried, ((carried - b_free * x[0]) / J_l,)
+
+    return {"part": part, "x0": lambda w, th: (w,), "rate": c_g * (1 / m.J + 1 / J_l)}
+
+
 # ---------------------------------------------------------------- sensor
 
 

@@ -118,6 +118,7 @@ class Search:
         self.stages, self.map = stages, stages.map
         self.root = node_of(fit, self.held)
         self._scores: dict[frozenset[str], list[Score]] = {}
+        self._settled: set[frozenset[str]] = set()  # models that a larger one was taken back to
         self._always = (*ALWAYS, LIMITER) if any(map(_flat_topped, fit.problem.experiments)) else ALWAYS
         self.nodes: dict[frozenset[str], Node] = {self.root.key: self.root}
 
@@ -316,6 +317,23 @@ class Search:
                 if other is not None and superfluous(node, other) and beats(other, before):
                     return self.pruned(other, before)
         return node
+
+    def settled(self, larger: Node) -> Node | None:
+        """Return the model that `larger` was grown from, fitted anew from there, if that predicts better.
+
+        It had not come to its optimum, and what was added may have done no more than to lead it out of a valley.
+        """
+        node = larger.parent
+        if node is None or node.parent is None or node.key in self._settled:
+            return None
+        self._settled.add(node.key)
+        fit = refit(larger.fit, node.fit.model, ({n: larger.fit.values[n] for n in node.fit.values},))
+        lower = node_of(fit, self.held, node.added, node.parent) if fit is not None else None
+        if lower is None or not beats(lower, node):
+            return None
+        self.nodes[node.key] = lower
+        self._scores.pop(node.key, None)
+        return lower
 
     def _relatives(self, node: Node, effect: Effect) -> list[Effect]:
         """Return the simpler effects, not in the model yet, that `effect` contains."""

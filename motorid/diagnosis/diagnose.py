@@ -84,16 +84,16 @@ def diagnose(fit: Fit, validate: Sequence[Experiment] | Experiment | None = None
     >>> better = found.best
     """
     at_least(0, max_effects=max_effects, budget=budget)
-    own = tuple(also)
+    tried = library(effects, also)
     with shown("Looking for what is missing", max_effects + 1, at_most=True) as show:
         stages = Stages(max_effects, progress, show, map)
-        found, driven = explored(checked(fit, "diagnose"), validate, library(effects, own), stages, max_effects, budget)
+        found, driven = explored(checked(fit, "diagnose"), validate, tried, stages, max_effects, budget)
         stages.done("located what is missing")
         twice = repeated(fit.problem.experiments, [validate] if isinstance(validate, Experiment) else validate or ())
-        return _told(found, " ".join(w for w in (twice, driven) if w), validate is not None, own)
+        return _told(found, " ".join(w for w in (twice, driven) if w), validate is not None)
 
 
-def _told(found: Climb, driven: str, validated: bool, own: Sequence[Effect]) -> Diagnosis:
+def _told(found: Climb, driven: str, validated: bool) -> Diagnosis:
     """Return what a climb found, in words and as a result."""
     fit, ladder, remaining = found.search.root.fit, ladder_of(found, validated), found.remaining
     missing, judged = locate(fit), found.first
@@ -109,7 +109,7 @@ def _told(found: Climb, driven: str, validated: bool, own: Sequence[Effect]) -> 
     if like is not None and not names:
         missing = acting_like(missing, like)
     if names:
-        verdict, where = "missing", balance_of(names[0], own)
+        verdict, where = "missing", balance_of(ladder.best, names[0])
         answer = missing_text(ladder.rungs, remaining, groups, found.grades, bool(held_out_remark(found.path[-1])),
                               found.stopped)
         same = {name: p for node in found.path[1:] for name, p in found.search.inseparable(node).items()}

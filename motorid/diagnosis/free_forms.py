@@ -41,8 +41,8 @@ CHANGES = {"t": "changes with the time", "distance": "changes with the distance 
            "run": "differs from run to run",
            "past i": "depends on the current before", "past omega": "depends on the speed before",
            "past v": "depends on the voltage before", "path": "depends on the distance since a reversal",
-           "past speed": "depends on how fast it ran before"}
-PAST = ("past i", "past omega", "past v", "past speed", "path")
+           "past speed": "depends on how fast it ran before", "past power": "depends on how fast it ran before"}
+PAST = ("past i", "past omega", "past v", "past speed", "past power", "path")
 MEMORIES = 8  # lengths of memory
 LASTING = 10.0  # times the longest run: a memory that forgets nothing in it
 
@@ -76,11 +76,17 @@ class Form:
         """Tell whether it is a function of what was before."""
         return self.on in PAST
 
+    @property
+    def bends(self) -> bool:
+        """Tell whether the square of what was before counts, too: the drag of a fluid that follows late."""
+        return self.balance == "torque" and self.on == "past omega"
+
 
 _PUSHES = (  # words, balance, carrier, quantities
-    ("a friction", "torque", "direction", ("turn", "theta", "t", "distance", "i", "run", "past speed")),
+    ("a friction", "torque", "direction", ("turn", "theta", "t", "distance", "i", "v", "run", "past speed",
+                                         "past power")),
     ("a load", "torque", "", ("turn", "theta", "t", "run")),
-    ("a drag", "torque", "omega", ("t", "distance", "turn", "theta", "i", "run", "past speed")),
+    ("a drag", "torque", "omega", ("t", "distance", "turn", "theta", "i", "run", "past speed", "past power")),
     ("a torque", "torque", "", ("omega", "i")),
     ("an inertia", "torque", "acceleration", ("turn", "t", "run")),
     ("a loss of voltage", "voltage", "", ("omega", "v", "i", "t", "run")),
@@ -148,7 +154,9 @@ def functions_of(form: Form, span: Span) -> list[str]:
     if form.on == "turn":
         return ["1.0", *(f"ca.{f}({k:.6g} * z)" for k in span.orders for f in ("sin", "cos"))]
     if form.remembers:
-        return [*(f"past(z, {length:.6g})" for length in memories_of(form, span)), *(["1.0"] if form.carrier else [])]
+        lags = [f"past(z, {length:.6g})" for length in memories_of(form, span)]
+        bent = [f"{lag} * ca.fabs({lag}) / {max(abs(low), abs(high)):.6g}" for lag in lags if form.bends]
+        return [*lags, *bent, *(["1.0"] if form.carrier else [])]
     inside = f"ca.fmin(ca.fmax(z, {low:.9g}), {high:.9g})"  # nothing is known beyond
     if form.on in ("theta", "t", "distance"):
         scale = f"{np.pi / (high - low):.9g} * ({inside} - {low:.9g})"
@@ -305,7 +313,7 @@ def _signals(fit: Fit, k: int) -> dict[str, Array]:
         found["energy"] = 0.5 * fit.values["J"] * omega**2
         gone = np.cumsum(0.5 * np.abs(omega[1:] + omega[:-1]) * np.diff(run.t))  # both directions counted
         found["path"], found["distance"] = found["direction"], np.concatenate([[0.0], gone])
-        found["past speed"] = np.abs(omega)
+        found["past speed"], found["past power"] = np.abs(omega), omega**2
     found |= {f"past {c}": found[c] for c in ("v", "i", "omega") if c in found}
     if "theta" in run.outputs or "omega" in run.outputs:
         found["theta"] = found["turn"] = angle_signal(run)

@@ -8,6 +8,7 @@ the model, and what then predicts best is the answer.
 from __future__ import annotations
 
 import contextlib
+import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property, reduce
@@ -46,13 +47,14 @@ from motorid.numerics.signals import Array
 
 WHERE = {"torque": "mechanical", "voltage": "electrical", "both": "electrical", "sensor": "sensor"}
 TRIED = 4  # curves that are fitted, those that promise most
+FINE = 36  # harmonics of a turn in a curve that is fitted
 ROUNDS = 3  # of choosing functions and fitting: near the optimum slopes show what the misfit hid before
 QUANTITIES = {"t": "m.state('clock')", "distance": "m.state('distance')", "turn": "m.theta", "theta": "m.theta",
               "omega": "m.omega", "i": "m.i", "v": "m.v", "past v": "m.v", "past i": "m.i", "past omega": "m.omega",
-              "past speed": "ca.fabs(m.omega)", "path": "m.sign(m.omega)"}
+              "past speed": "ca.fabs(m.omega)", "past power": "m.omega**2", "path": "m.sign(m.omega)"}
 RATES = {"t": "1.0", "distance": "ca.fabs(m.omega)"}
-SI = {"theta": "rad", "omega": "rad/s", "speed": "rad/s", "i": "A", "v": "V"}
-OVER = {"": "", "A": "/A", "V": "/V", "rad/s": "·s/rad"}
+SI = {"theta": "rad", "omega": "rad/s", "speed": "rad/s", "i": "A", "v": "V", "power": "rad²/s²"}
+OVER = {"": "", "A": "/A", "V": "/V", "rad/s": "·s/rad", "rad²/s²": "·s²/rad²"}
 FIRST = {"past i": ", m.start['i']", "past omega": ", m.start['omega']"}  # of a memory: as if it had been so before
 CARRIERS = {"": "", "direction": "m.sign(m.omega) * ", "omega": "m.omega * ", "i": "m.i * ", "v": "m.v * "}
 
@@ -144,7 +146,8 @@ class Curve:
 
     @cached_property
     def _span(self) -> Span:
-        return span_of(self.fit, self._signals)
+        span = span_of(self.fit, self._signals)
+        return replace(span, orders=tuple(sorted({*span.orders, *range(1, FINE + 1)})))
 
     @property
     def _terms(self) -> list[str]:
@@ -197,10 +200,11 @@ class Curve:
         terms = self._terms
         if form.remembers:
             rate = " * ca.fabs(m.omega)" if form.on == "path" else ""
-            for k, length in ((k, t[len("past(z, "):-1]) for k, t in enumerate(terms) if t != "1.0"):
-                terms[k] = past = f"past_{k}"
+            for k, lag in enumerate(dict.fromkeys(re.findall(r"past\(z, .*?\)", " ".join(terms)))):
+                past, length = f"past_{k}", lag[len("past(z, "):-1]
                 lines += [f"{past} = m.state('{self.name}_{past}'{FIRST.get(form.on, '')})",
                           f"m.rate({past}, (z - {past}){rate} / {length})"]
+                terms = [t.replace(lag, past) for t in terms]
         lines += ["curve = (", *(f"    + {n} * {t}" for n, t in zip(names, terms, strict=True)), ")"]
         if form.carrier == "acceleration" and form.on == "turn":  # kinetic energy that changes with the angle
             slopes = slopes_over_turn(self._terms)

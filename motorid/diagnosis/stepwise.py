@@ -91,8 +91,8 @@ def climb(search: Search, max_effects: int, seconds: float | None = None) -> Cli
 
 def _rounds(found: Climb, max_effects: int) -> Iterator[Climb]:
     """Yield how far the loop is, after every step that may be the last."""
-    search, best = found.search, found.search.root
-    frontier = [best]
+    search, best = found.search, found.path[-1]
+    frontier, before = [best], found
     for k in range(max_effects):
         search.stages.round(k + 1)
         room = max_effects - len(best.key) + len(search.root.key)  # two effects may have come at once
@@ -111,6 +111,9 @@ def _rounds(found: Climb, max_effects: int) -> Iterator[Climb]:
             yield replace(found, text="stopped: no further effect lowers the error on data left out")
             return
         new, ordered = chosen
+        if not stopped and (lower := search.settled(new)) is not None:
+            yield from _rounds(replace(before, path=tuple(_path(lower))), max_effects)
+            return
         search.nodes |= children
         yield _with(found, new, new, new.parent is frontier[0], ())
         if stopped:
@@ -123,6 +126,7 @@ def _rounds(found: Climb, max_effects: int) -> Iterator[Climb]:
         found = replace(found, remaining=judge_adequacy(pruned, search.scores(pruned)))
         best, frontier = pruned, [pruned, *_runners_up(pruned, ordered, search.effects)]
         search.stages.done(f"accepted {chosen_of.added}")
+        before = found
         yield found
     done = found.remaining.adequate and at_noise(best)
     yield replace(found, text="stopped: what remains is noise" if done

@@ -14,7 +14,6 @@ from motorid.diagnosis.results import Adequacy, Candidate, Rung
 from motorid.diagnosis.score_test import Score
 from motorid.diagnosis.thresholds import ELSEWHERE, LARGER, LOST, MATERIAL
 from motorid.display.numbers import arrow, counted, listed, number, percent, with_error
-from motorid.effects import EVERY
 from motorid.estimation.result import Fit, parameter_cell
 from motorid.model.definition import Effect
 from motorid.numerics.autoregression import colour_of
@@ -270,11 +269,10 @@ def hidden_remark(hidden: Mapping[tuple[str, str], tuple[str, ...]]) -> str:
                     f"them, fix one of these where it is known." for (name, wider), parameters in hidden.items())
 
 
-def balance_of(name: str, also: Sequence[Effect] = ()) -> str:
-    """Return where an effect acts: electrical, mechanical or sensor."""
-    known = {**EVERY, **{e.name: e for e in also}}
+def balance_of(fit: Fit, name: str) -> str:
+    """Return where an effect of a model acts: electrical, mechanical or sensor."""
     return {"voltage": "electrical", "torque": "mechanical", "transmission": "mechanical",
-            "sensor": "sensor"}[known[name].balance]
+            "sensor": "sensor"}[next(e.balance for e in fit.model.effects if e.name == name)]
 
 
 def outliers_remark(fit: Fit) -> str:

@@ -203,6 +203,46 @@ def backlash(m: Equations,
     _two_inertias(m, r_gap, omega_c, zeta_c, in_contact, "geared")
 
 
+LEAST = 1e-6  # share of the inertia, so that a load of none is not driven infinitely fast
+
+
+def _driven_load(m: Equations, share, drag, torque, name: str) -> None:
+    """Split J into the motor and a load with a viscous friction of its own; `torque` is that of their difference."""
+    omega_load, inertia = m.state(f"omega_{name}", m.start["omega"]), m.symbols["J"] * (share + LEAST)
+    carried = torque(m.omega - omega_load)
+    m.rate(omega_load, (carried - drag * omega_load) / inertia)
+    m.scale("J", 1 - share)
+    m.torque -= m.symbols["J"] * share * carried / inertia
+
+
+@effect(balance="transmission")
+def slip_clutch(m: Equations,
+                r_slip=P(0.3, "", null=0.0, lower=0.0, upper=0.98, grid=(0.3, 0.7), doc="load's share of the inertia"),
+                tau_slip=P(0.01, "N·m", positive=True, grid=(0.1, 0.3, 0.6), doc="largest torque that it carries"),
+                omega_slip=P(1.0, "rad/s", positive=True, grid=(0.01,), doc="slip at which it carries 3/4 of that"),
+                b_slip=P(1e-6, "N·m·s/rad", lower=0.0, grid=(0.003, 0.1), doc="viscous friction of the load")):
+    """Load driven by friction that may slip, τ·tanh(Δω/ω_s): a clutch, a belt, a wheel. Awrejcewicz & Olejnik, 2005.
+
+    Seen as a motor that runs up too fast with hard steps and not with soft ones: ramps and steps of several sizes.
+    """
+    _driven_load(m, r_slip, b_slip, lambda slip: tau_slip * ca.tanh(slip / omega_slip), "slip")
+
+
+@effect(balance="transmission")
+def freewheel(m: Equations,
+              r_free=P(0.3, "", null=0.0, lower=0.0, upper=0.98, grid=(0.3, 0.7), doc="load's share of the inertia"),
+              g_free=P(200.0, "1/s", positive=True, grid=(0.3,), doc="how fast it grips"),
+              b_free=P(1e-6, "N·m·s/rad", lower=0.0, grid=(0.003, 0.1), doc="viscous friction of the load"),
+              side=P(1.0, "", vary=False, lower=-1.0, upper=1.0, grid=(1.0, -1.0), doc="direction it drives, fixed")):
+    """Load behind a freewheel (one-way clutch), driven in one direction and free to overrun. Zhu & Parker, JSV, 2005.
+
+    Seen as a motor that stops sooner than its inertia while running up allows. The direction that suits is taken,
+    unless given. While it grips its torque is J·r·(1−r)·g·Δω.
+    """
+    grip = m.symbols["J"] * r_free * (1 - r_free) * g_free
+    _driven_load(m, r_free, b_free, lambda slip: side * grip * ca.fmax(side * slip, 0), "free")
+
+
 @effect(balance="torque")
 def measured_load(m: Equations, k_l=P(1.0, "", null=0.0, doc="of the recorded torque that acts; 1: all of it")):
     """Recorded load torque, against positive speed. Isermann, Identification of Dynamic Systems, 2011."""

@@ -16,7 +16,7 @@ from motorid.model.model import dc_motor
 INEXACT = {"coulomb": 5e-4, "coulomb_asymmetric": 5e-4, "stribeck": 5e-4, "load_friction": 2e-4,
            "viscous_asymmetric": 1e-5, "current_lag": 2e-5, "speed_delay": 0.01, "backlash": 0.04,
            "angular_friction": 5e-4, "gear_efficiency": 2e-4, "driver_coast": 2e-3, "driver_current_limit": 1e-2,
-           "speed_average": 2e-3}
+           "speed_average": 2e-3, "slip_clutch": 1e-2}
 
 
 def by_library(model, t, v):
@@ -50,6 +50,6 @@ def test_the_library_and_the_plant_know_the_same_effects_by_the_same_words(plant
     assert set(plant.LIBRARY) == set(LIBRARY)
     assert set(NUMBERS) == set(plant.LIBRARY) | set(plant.BEYOND)
     assert len(plant.BEYOND) >= 3
-    shaped_otherwise = {"lugre", "compliance", "backlash", "driver_coast"}  # a stiffness there, a frequency here
+    shaped_otherwise = {"lugre", "compliance", "backlash", "slip_clutch", "freewheel", "driver_coast"}  # a stiffness there, a frequency here
     for name in set(LIBRARY) - shaped_otherwise:
         assert set(NUMBERS[name]) <= {p.name for p in LIBRARY[name].parameters}, name

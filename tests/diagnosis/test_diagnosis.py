@@ -359,7 +359,7 @@ def test_the_users_own_effect_wins_where_it_is_the_truth(lab):
     runs = runs_of(lab, {"root_drag": {"c_r": 1.5e-3}}, ("stairs", "ramps", "steps"))
     fit = mi.fit(mi.dc_motor(), runs[:2])
     found = mi.diagnose(fit, runs[2:], effects=("coulomb", "quadratic_drag", "constant_load"), also=[seal_drag])
-    assert found.effects == ("seal_drag",)
+    assert found.effects == mi.diagnose(fit, runs[2:], effects=("coulomb", seal_drag)).effects == ("seal_drag",)
     assert found.after.values["c_r"] == pytest.approx(1.5e-3, rel=0.05)
     assert found.where == "mechanical"
 

@@ -253,7 +253,7 @@ def test_slopes_of_every_form_are_those_of_the_model_with_its_curve(lab):
     fit = mi.fit(mi.dc_motor() + mi.effects.coulomb, runs)
     linear = linearised(fit)
     remembering = [f for f in linear.forms if f.remembers]
-    assert {f.on for f in remembering} == {"past v", "past i", "past omega", "past speed", "path"}
+    assert {f.on for f in remembering} == {"past v", "past i", "past omega", "past speed", "past power", "path"}
     first = {f"{c}_0[{k}]": float(y[0]) for k, s in enumerate(fit.simulations) for c, y in s.states.items()}
     missed = {}
     for form, answers in linear.forms.items():
@@ -277,6 +277,14 @@ def dragged(m, c=mi.P(2e-4, "N·m·s/rad", null=0.0), t=mi.P(0.05, "s", positive
     z = m.state("dragged")
     m.rate(z, (m.omega - z) / t)
     m.torque -= c * z
+
+
+@mi.effect(balance="torque")
+def ducted(m, c_2=mi.P(1.2e-5, "N·m·s²/rad²", null=0.0), t=mi.P(0.1, "s", positive=True)):
+    """A fan whose air follows late: drag as the square of the air's speed."""
+    z = m.state("air")
+    m.rate(z, (m.omega - z) / t)
+    m.torque -= c_2 * z * ca.fabs(z)
 
 
 @mi.effect(balance="torque")
@@ -308,8 +316,8 @@ NARROW = {"a resistance that changes with the angle within a turn"}
 
 
 @pytest.mark.parametrize(("law", "channels", "follows", "closed"), [
-    (dragged, ANGLE[:2], LATE, 1.1), (warmed, ANGLE[:2], WARM, 1.2), (run_in, ANGLE, FADES, 1.1),
-    (dirty_segment, ANGLE, NARROW, 1.25)], ids=["late", "warmed", "run-in", "segment"])
+    (dragged, ANGLE[:2], LATE, 1.1), (ducted, ANGLE[:2], LATE, 1.35), (warmed, ANGLE[:2], WARM, 1.2),
+    (run_in, ANGLE, FADES, 1.1), (dirty_segment, ANGLE, NARROW, 1.25)], ids=["late", "ducted", "warmed", "run-in", "segment"])
 def test_what_remembers_fades_or_is_narrow_is_found(law, channels, follows, closed, lab):
     """As of a fluid or of eddy currents; of grease; of new brushes; of the waves of a narrow dip none helps alone."""
     rng = np.random.default_rng(3)
@@ -332,7 +340,7 @@ def test_what_remembers_fades_or_is_narrow_is_found(law, channels, follows, clos
         assert {p.unit for p in found.remainder.as_effect().parameters} <= {"N·m·s/rad", "N·m/A"}
         assert re.search(r"m.rate\((past_\d), \(z - \1\) / ", found.remainder.code())
         assert re.match("(a constant and )?one lag of .* N·m$", text)
-        assert miss < 0.3
+        assert miss < 0.35
 
 
 def test_nothing_follows_a_reversal_where_the_motor_never_turns_back(rng):

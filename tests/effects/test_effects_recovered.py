@@ -39,6 +39,8 @@ TRUTH = {
     "speed_gain": {"k_w": 0.04},
     "driver_coast": {"R_c": 9.0},
     "pwm_coast": {"s_c": 0.6, "V_s": 8.0},
+    "slip_clutch": {"r_slip": 0.5, "tau_slip": 0.03, "omega_slip": 2.0, "b_slip": 2e-5},
+    "freewheel": {"r_free": 0.5, "g_free": 500.0, "b_free": 2e-5, "side": 1.0},
     "driver_current_limit": {"I_lim": 2.5},
     "driver_lag": {"T_v": 6e-3},
     "supply_sag": {"R_s": 0.4, "V_s": 8.0},
