@@ -78,8 +78,8 @@ class Form:
 
     @property
     def bends(self) -> bool:
-        """Tell whether the square of what was before counts, too: the drag of a fluid that follows late."""
-        return self.balance == "torque" and self.on == "past omega"
+        """Tell whether the square of what was before counts, too: a fluid that follows late, or that friction warms."""
+        return self.balance == "torque" and self.carrier != "direction" and self.on in ("past omega", "past power")
 
 
 _PUSHES = (  # words, balance, carrier, quantities

@@ -172,7 +172,7 @@ def grades_of(last: Node, root: Node, groups: Sequence[Sequence[str]], beside: S
         if smaller is not None:
             free = [b for b in beside if not compare(b.predictions, beside[0].predictions).sure]
             free = [b for b in free if _swallows(last.fit, b.form, e)]
-            free = free or (better_forms(smaller.fit, last.predictions) if structure else [])
+            free = free or better_forms(smaller.fit, last.predictions)
             taken = 1 - (1 - max(evidence(smaller, last).fall, 0.0)) ** 2
             told = [b for b in free if b.evidence.fall > SUPPLANTS and _more(b.evidence.fall, taken) > TRIFLE]
             better = next((b for b in told if beside and b.form == beside[0].form), told[0] if told else None)

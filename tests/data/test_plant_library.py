@@ -50,6 +50,7 @@ def test_the_library_and_the_plant_know_the_same_effects_by_the_same_words(plant
     assert set(plant.LIBRARY) == set(LIBRARY)
     assert set(NUMBERS) == set(plant.LIBRARY) | set(plant.BEYOND)
     assert len(plant.BEYOND) >= 3
-    shaped_otherwise = {"lugre", "compliance", "backlash", "slip_clutch", "freewheel", "driver_coast"}  # a stiffness there, a frequency here
+    # a stiffness there, a frequency here
+    shaped_otherwise = {"lugre", "compliance", "backlash", "slip_clutch", "freewheel", "driver_coast"}
     for name in set(LIBRARY) - shaped_otherwise:
         assert set(NUMBERS[name]) <= {p.name for p in LIBRARY[name].parameters}, name

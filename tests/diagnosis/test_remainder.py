@@ -317,7 +317,8 @@ NARROW = {"a resistance that changes with the angle within a turn"}
 
 @pytest.mark.parametrize(("law", "channels", "follows", "closed"), [
     (dragged, ANGLE[:2], LATE, 1.1), (ducted, ANGLE[:2], LATE, 1.35), (warmed, ANGLE[:2], WARM, 1.2),
-    (run_in, ANGLE, FADES, 1.1), (dirty_segment, ANGLE, NARROW, 1.25)], ids=["late", "ducted", "warmed", "run-in", "segment"])
+    (run_in, ANGLE, FADES, 1.1), (dirty_segment, ANGLE, NARROW, 1.25)],
+    ids=["late", "ducted", "warmed", "run-in", "segment"])
 def test_what_remembers_fades_or_is_narrow_is_found(law, channels, follows, closed, lab):
     """As of a fluid or of eddy currents; of grease; of new brushes; of the waves of a narrow dip none helps alone."""
     rng = np.random.default_rng(3)
