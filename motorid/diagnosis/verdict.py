@@ -107,8 +107,9 @@ def _left(last: Fit, remaining: Adequacy, where: str = "") -> str:
     if not remaining.adequate:
         return f"Not everything is explained: {remaining.text.removeprefix('Something is missing: ')}"
     large = [f"{channel_name(c)} {number(e, 2)} times" for c, e in last.misfit.items() if e > LARGER]
-    beyond = f", but is larger than the noise ({', '.join(large)})"
-    return f"What remains does not depend on the motion{where}{beyond}." if large else f"What remains is noise{where}."
+    if large:
+        return f"What remains is larger than the noise ({', '.join(large)}), but nothing tried predicts it."
+    return f"What remains is noise{where}."
 
 
 def _described(fit: Fit, name: str) -> str:

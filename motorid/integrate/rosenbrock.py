@@ -170,7 +170,8 @@ class Stepper:
             middle = len(traj.x) // 2
             slopes = np.abs(np.asarray(self.functions.out(traj.x[middle], grid.u[middle], p)[1]))
         tops = np.abs(np.ascontiguousarray(traj.y.T)).max(axis=1)  # long rows are quicker
-        return np.where(slopes > 1e-6, tops[:, None] / np.maximum(slopes, 1e-6), 0.0).max(axis=0)
+        with np.errstate(over="ignore"):  # a model that runs away
+            return np.where(slopes > 1e-6, tops[:, None] / np.maximum(slopes, 1e-6), 0.0).max(axis=0)
 
     @cached_property
     def _constant_slopes(self) -> Array | None:

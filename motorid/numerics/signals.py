@@ -97,6 +97,22 @@ def quantum(y: ArrayLike) -> float:
     return 0.0
 
 
+def held_samples(y: Array) -> NDArray[np.bool_]:
+    """Tell which samples of `y` (N,) only repeat the one before: the sensor is read more often than it measures.
+
+    None of a channel that changes irregularly, moves in steps, or rests: that is as it was measured.
+    """
+    changes = np.flatnonzero(np.diff(y, prepend=np.nan) != 0)
+    lengths = np.diff(changes, append=len(y))
+    every = float(np.median(lengths)) if len(lengths) else 0.0
+    even = np.abs(lengths - every) <= every / 4
+    if len(lengths) < FEWEST_FRESH or every < 2 or np.mean(even) < _MOSTLY or quantum(y) > 0:
+        return np.zeros(len(y), bool)
+    again = np.isfinite(y) & np.repeat(lengths < 2 * every, lengths)
+    again[changes] = False
+    return again
+
+
 def _plausible(jumps: Array, guesses: Array) -> NDArray[np.bool_]:
     """Tell by a few of the jumps which guesses of a step may be right: most of these are then whole multiples."""
     few = jumps[:: max(len(jumps) // _FEW, 1)] / guesses[:, None]

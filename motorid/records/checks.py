@@ -105,7 +105,9 @@ def _excitation(run: Experiment) -> str | None:
 
 
 def _missing(run: Experiment) -> str | None:
-    share = {c: float(np.mean(np.isnan(y))) for c, y in run.outputs.items()}
+    there = {c: np.flatnonzero(np.isfinite(y)) for c, y in run.outputs.items()}
+    slower = {c: float(np.median(np.diff(rows))) if len(rows) > 1 else 1.0 for c, rows in there.items()}  # lacks none
+    share = {c: 1 - len(rows) * slower[c] / run.n for c, rows in there.items()}
     worst = max(share, key=lambda c: share[c])
     return (f"{100 * share[worst]:.0f} % of the {NAMES[worst]} samples are missing; the fit uses the others. Look "
             "whether the logger drops them at certain moments.") if share[worst] > 0.2 else None

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 from broken_inputs import BROKEN, GOOD, HEADER, Broken, rows
 from hypothesis import HealthCheck, example, given, settings
@@ -304,6 +305,29 @@ def test_time_is_put_in_order_and_every_loss_is_told(t, dropped, note, tmp_path)
     np.testing.assert_array_equal(run.t, [t[k] for k in kept])
     np.testing.assert_array_equal(run.outputs["omega"], kept)
     assert note in notes(run)
+
+
+@pytest.mark.parametrize("every", [2, 5, 12])
+def test_a_sensor_read_more_often_than_it_measures_counts_once(every, tmp_path, rng):
+    """What it repeats meanwhile would be taken for a delay; a rest, steps of a converter, lone equals stay."""
+    n = 1200
+    live = rng.normal(size=n)
+    rests = np.where(np.arange(n) < 400, 0.0, live)
+    table = pd.DataFrame({"t": np.arange(n) * 1e-3, "v": 1.0, "speed_rad_s": live[np.arange(n) // every * every],
+                          "current_A": rests})
+    run = read_runs(_written(table, tmp_path))[0]
+    assert np.array_equal(np.flatnonzero(np.isfinite(run.outputs["omega"])), np.arange(0, n, every))
+    assert np.array_equal(run.outputs["i"], rests)
+    assert f"of 1200 samples {n - n // every} repeat the one before" in " ".join(run.meta["notes"])
+    rounded = np.round(np.cumsum(np.full(n, 0.2 / every)) + 0.3 * live, 1)  # counts
+    table["speed_rad_s"] = rounded
+    assert np.array_equal(read_runs(_written(table, tmp_path))[0].outputs["omega"], rounded)
+
+
+def _written(table, folder):
+    path = folder / "run.csv"
+    table.to_csv(path, index=False)
+    return path
 
 
 def test_rows_of_the_wrong_length_are_told(tmp_path):
