@@ -37,6 +37,7 @@ NUMBERS = {  # one plausible size of every effect
     "pwm_coast": {"s_c": 0.8, "V_s": 3.0},
     "driver_current_limit": {"I_lim": 1.0},
     "driver_lag": {"T_v": 0.02},
+    "driver_slew": {"T_r": 0.03, "V_s": 3.0},
     "supply_sag": {"R_s": 0.5, "V_s": 3.0},
     "magnet_heating": {"R_thm": 5.0, "C_thm": 4.0},
     "eddy_brake": {"c_e": 4e-4, "omega_b": 20.0},
@@ -84,6 +85,8 @@ def in_library_words(name, numbers, motor):
         shaft = (J_l / J, resonance, c_s * resonance / (2 * k_s))
         words = ("r_load", "omega_r", "zeta_r") if name == "compliance" else ("r_gap", "omega_c", "zeta_c")
         n |= dict(zip(words, shaft, strict=True))
+    if name == "driver_slew":  # so near that it does not matter
+        n["V_w"] = 2e-3
     if name in ("slip_clutch", "freewheel"):
         J_l = n.pop("J_l")
         J = motor.J + J_l

@@ -4,6 +4,7 @@ An effect is a function of the motor and its own numbers that returns what it do
 
     drive(v, w) -> v          the bridge: from the commanded voltage to the one at the terminals
     lag -> s                  time constant with which the driver's voltage follows the command
+    slew -> V/s               how fast it changes at most
     bridge(v, i) -> v         the supply behind it: from the voltage of the bridge to the one at the terminals
     diodes -> V               the bridge opens at command 0; what then stands against the dying current
     limit -> A                the current that the bridge does not let grow any further
@@ -109,6 +110,11 @@ def driver_current_limit(m: Motor, I_lim: float) -> Hooks:
 @_known
 def driver_lag(m: Motor, T_v: float) -> Hooks:
     return {"lag": T_v}
+
+
+@_known
+def driver_slew(m: Motor, T_r: float, V_s: float) -> Hooks:
+    return {"slew": V_s / T_r}
 
 
 @_known

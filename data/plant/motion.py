@@ -57,6 +57,7 @@ class Plant:
         self._v, self._coasts = 0.0, any("diodes" in h for h in hooks)
         self._limit = min((h["limit"] for h in hooks if "limit" in h), default=inf)
         self._lag = sum(h["lag"] for h in hooks if "lag" in h)
+        self._slew = min((h["slew"] for h in hooks if "slew" in h), default=inf)
         self._driven = motor.K * omega0  # what the driver makes of the command: at first what holds the motor
 
     i = property(lambda self: self._y[0])
@@ -74,7 +75,7 @@ class Plant:
         self._v = v + n * slope
         for k in range(n):
             i, a, b = self._y[0], v + k * slope, v + (k + 1) * slope
-            self._advance(*(self._behind(a, b, h) if self._lag else (a, b)), h)
+            self._advance(*(self._behind(a, b, h) if self._lag or self._slew < inf else (a, b)), h)
             if self._coasts and v == 0 == slope and i * self._y[0] <= 0:
                 self._y[0] = 0.0  # the diodes let no current turn round
             if abs(i) <= self._limit < abs(self._y[0]):
@@ -85,8 +86,11 @@ class Plant:
 
     def _behind(self, v0: float, v1: float, h: float) -> tuple[float, float]:
         """Voltage of the driver at both ends of a step of h seconds, exact for a command that goes straight."""
-        before, late = self._driven, (v1 - v0) / h * self._lag  # a ramp is followed that much behind
-        self._driven = v1 - late + (before - v0 + late) * exp(-h / self._lag)
+        before, after, most = self._driven, v1, self._slew * h
+        if self._lag:
+            late = (v1 - v0) / h * self._lag  # a ramp is followed that much behind
+            after = v1 - late + (before - v0 + late) * exp(-h / self._lag)
+        self._driven = before + max(-most, min(most, after - before))
         return before, self._driven
 
     def measured(self, v: float | None = None) -> dict[str, float]:

@@ -127,6 +127,25 @@ def driver_lag(m: Equations, T_v=P(5e-3, "s", null=0.0, positive=True, grid=(1.0
     m.voltage -= m.v - z
 
 
+NO_RAMP = 6e-8  # s: a ramp quicker than that is a lag of it, which a step of any length follows
+
+
+@effect(balance="voltage", includes=("driver_lag",))
+def driver_slew(m: Equations, T_r=P(0.1, "s", null=0.0, positive=True, grid=(4.0, 16.0, 64.0, 256.0),
+                                    doc="time of a change by V_s"),
+                V_s=P(12.0, "V", positive=True, vary=False, grid=(1.0,), doc="supply, the voltage of full duty, fixed"),
+                V_w=P(0.1, "V", positive=True, grid=(0.01, 0.1), doc="how far behind it is at 3/4 of its fastest")):
+    """Slew-rate limit of the driver (ramp, soft start), V_s/T_r·tanh(Δv/V_w). Franco, Operational Amplifiers, 2015.
+
+    Seen as steps that come as ramps, the larger the later; small ones as through a lag of T_r·V_w/V_s. Unless V_s is
+    given it is the largest voltage of the records.
+    """
+    first = m.base("R") * m.start["i"] + m.base("K") * m.start["omega"]
+    z = m.state("v_ramped", first)
+    m.rate(z, V_s / T_r * ca.tanh((m.v - z) / (V_w + V_s * NO_RAMP / T_r)))
+    m.voltage -= m.v - z
+
+
 @effect(balance="voltage")
 def supply_sag(m: Equations, R_s=P(0.1, "Ω", null=0.0, lower=0.0, doc="resistance of supply and leads"),
                V_s=P(12.0, "V", positive=True, vary=False, grid=(1.0,), doc="supply without load, fixed")):

@@ -25,6 +25,7 @@ SIZES: dict[str, Callable[[P.Motor, float], dict[str, float]]] = {
     "pwm_coast": lambda m, u: {"s_c": 0.7, "V_s": 1.05 * u},
     "driver_current_limit": lambda m, u: {"I_lim": 0.2 * m.i_max},
     "driver_lag": lambda m, u: {"T_v": max(0.2 * time_constant(m), 2 * DT[m.name])},
+    "driver_slew": lambda m, u: {"T_r": max(1.5 * time_constant(m), 10 * DT[m.name]), "V_s": 1.0 * u},
     "supply_sag": lambda m, u: {"R_s": 0.3 * m.R, "V_s": 1.05 * u},
     "magnet_heating": lambda m, u: {"R_thm": 240 * m.R / u**2, "C_thm": u**2 / m.R * DT[m.name] / 0.6},
     "eddy_brake": lambda m, u: {"c_e": 0.96 * m.K**2 / m.R, "omega_b": 0.25 * u / m.K},

@@ -43,6 +43,7 @@ TRUTH = {
     "freewheel": {"r_free": 0.5, "g_free": 500.0, "b_free": 2e-5, "side": 1.0},
     "driver_current_limit": {"I_lim": 2.5},
     "driver_lag": {"T_v": 6e-3},
+    "driver_slew": {"T_r": 0.04, "V_s": 8.0, "V_w": 0.3},
     "supply_sag": {"R_s": 0.4, "V_s": 8.0},
     "magnet_heating": {"R_thm": 20.0, "C_thm": 0.3},
     "eddy_brake": {"c_e": 3e-4, "omega_b": 30.0},
@@ -57,6 +58,7 @@ TRUTH = {
 KNOWN = {  # what the records leave open
     "driver_lag": {"L": VALUES["L"]},
     "supply_sag": {"V_s": 8.0},
+    "driver_slew": {"V_s": 8.0},
     "pwm_coast": {"V_s": 8.0},
     "supply_side_current": {"V_dc": 9.0},
     "current_gain": {"R": VALUES["R"]},
