@@ -55,10 +55,10 @@ def plot_current_limit(*results: Fit | Formulations, limit: float | None = None,
     for row, fit, word in zip(axes, fits, labels or [f.formulation for f in fits], strict=False):
         for ax, s in zip(row, fit.simulations, strict=False):
             _against_limit(ax, s, limit)
-        style.tidy(row[0], y=f"{word}\n{style.axis_label('i')}")
+        row[0].set(ylabel=f"{word}\n{style.axis_label('i')}")
     for k, (top, bottom) in enumerate(zip(axes[0], axes[-1], strict=True)):
-        style.tidy(top, title=fits[0].simulations[k].experiment.name)
-        style.tidy(bottom, x="time (s)")
+        top.set(title=fits[0].simulations[k].experiment.name)
+        bottom.set(xlabel="time (s)")
         _zoom(bottom, [f.simulations[k] for f in fits], limit)
     figure = axes[0, 0].figure
     figure.align_ylabels(axes[:, 0])
@@ -125,8 +125,8 @@ def _changes(ax: Axes, shown: Sequence[tuple[str, Any, str]]) -> None:
         spread = [200 * (fit.std[n] or 0.0) / abs(plain.values[n]) for n in names]
         ax.errorbar(place, change, yerr=spread, fmt="o", ms=4.5, capsize=2.5, lw=1.2, color=colour, label=word)
     ax.axhline(0, color=style.MUTED, lw=0.7)
-    ax.set_xticks(range(len(names)), names)
-    style.tidy(ax, y="change against the plain fit (%)", title="Parameters, ±2σ")
+    ax.set(xticks=range(len(names)), xticklabels=names, ylabel="change against the plain fit (%)",
+           title="Parameters, ±2σ")
 
 
 def _errors(ax: Axes, shown: Sequence[tuple[str, Any, str]]) -> None:
@@ -136,11 +136,11 @@ def _errors(ax: Axes, shown: Sequence[tuple[str, Any, str]]) -> None:
         ax.bar(place, [100 * fit.nrmse[c] for c in channels], width=0.24, color=colour)
     ax.set_xticks(range(len(channels)), [style.axis_label(c).split(" (")[0] for c in channels])
     ax.grid(axis="x", visible=False)
-    style.tidy(ax, y="NRMSE (%)", title="Error")
+    ax.set(ylabel="NRMSE (%)", title="Error")
 
 
 def _walk(ax: Axes, result: Formulations) -> None:
-    style.tidy(ax, x="weight of the penalties", y="distance from the hard fit (%)", title="Heavier penalties")
+    ax.set(xlabel="weight of the penalties", ylabel="distance from the hard fit (%)", title="Heavier penalties")
     points = [(p.weight, 100 * p.distance) for p in result.path if p.distance > 0]
     if not points:
         ax.text(0.5, 0.5, "no path", transform=ax.transAxes, ha="center", color=style.MUTED)

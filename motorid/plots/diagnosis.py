@@ -76,7 +76,7 @@ def _balance(row: np.ndarray, missing: Missing, balance: str, run: int | None) -
     share = missing.shares.get({"voltage": "electrical", "torque": "mechanical"}[balance])
     part = "" if share is None else f": {100 * share:.0f} % of the squared error"
     title = style.scaled_title(f"missing {noun}", unit, power)
-    style.tidy(row[0], x="time (s)", y=title, title=f"Missing {noun}{part}")
+    row[0].set(xlabel="time (s)", ylabel=title, title=f"Missing {noun}{part}")
     bins = missing.bins.get(balance, ())
     for ax, b in zip(row[1:], bins, strict=False):
         _binned(ax, b, missing.signals, values, factor, _COLOUR[balance])
@@ -99,7 +99,7 @@ def _binned(ax: Axes, b: Binned, signals: Sequence[Mapping[str, Array]], values:
     ax.axhline(0, color=style.MUTED, lw=0.6)
     name = style.axis_label(b.against)
     label = f"{name.split(' (')[0]} ({b.unit})" if b.unit else name
-    style.tidy(ax, x=label, title=f"explains {100 * b.explained:.0f} %")
+    ax.set(xlabel=label, title=f"explains {100 * b.explained:.0f} %")
 
 
 @style.styled
@@ -137,7 +137,7 @@ def plot_answer(found: Diagnosis, ax: Axes | None = None) -> Axes:
     unit = "V" if balance == "voltage" else m.torque_unit
     noun = "force" if unit == "N" else balance
     name = f"phase of {periods:g} periods per turn (rad)" if periods != 1 else style.axis_label(against)
-    style.tidy(ax, x=name, y=style.scaled_title(f"missing {noun}", unit, power), title=f"The missing {noun}")
+    ax.set(xlabel=name, ylabel=style.scaled_title(f"missing {noun}", unit, power), title=f"The missing {noun}")
     ax.legend(loc="upper left", bbox_to_anchor=(0.0, -0.16), borderaxespad=0.0)  # below, where it covers no curve
     return ax
 
@@ -194,13 +194,12 @@ def plot_ranking(result: Diagnosis | Sequence[Candidate], ax: Axes | None = None
             clipped = c.held_out_gain < LOWEST_GAIN
             ax.plot(100 * max(c.held_out_gain, LOWEST_GAIN), k, "<" if clipped else "D", ms=6, mew=0.7,
                     color=style.PALETTE["orange"], mec="white", zorder=3)
-    ax.set_yticks(range(len(chosen)), [c.effect for c in chosen])
-    ax.set_ylim(len(chosen) - 0.4, -0.6)
     lowest = min([0.0, *(100 * max(c.held_out_gain or 0.0, LOWEST_GAIN) for c in chosen)])
-    ax.set_xlim(lowest - 3 if lowest < 0 else 0, 103)
-    ax.grid(axis="y", visible=False)
     more = f" (first {len(chosen)} of {len(every)})" if len(every) > len(chosen) else ""
-    style.tidy(ax, x="fall of the squared error (%)", title=f"Which effect is missing?{more}")
+    ax.set(yticks=range(len(chosen)), yticklabels=[c.effect for c in chosen], ylim=(len(chosen) - 0.4, -0.6),
+           xlim=(lowest - 3 if lowest < 0 else 0, 103), xlabel="fall of the squared error (%)",
+           title=f"Which effect is missing?{more}")
+    ax.grid(axis="y", visible=False)
     _ranking_legend(ax, chosen)
     return ax
 
@@ -242,8 +241,7 @@ def plot_ladder(result: Ladder | Diagnosis, ax: Axes | None = None) -> Axes:
         _error_labels(ax, k, {c: 100 * e for c, e in rungs[k].nrmse.items()})
     started = what_changed(rungs[0].fit, None)
     ax.set_xticks(x, [started if r.added is None else "+ " + r.added.replace(" + ", "\n+ ") for r in rungs])
-    ax.set_xlim(-0.45, len(rungs) - 0.55)
-    style.tidy(ax, y="NRMSE (%)", title="Error as effects are added")
+    ax.set(xlim=(-0.45, len(rungs) - 0.55), ylabel="NRMSE (%)", title="Error as effects are added")
     ax.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
     return ax
 
@@ -281,12 +279,12 @@ def plot_design(design: Design) -> np.ndarray:
     first = next(iter(design.predicted.values()))
     axes = style.grid(len(first) + 1, 1, sharex=True)[:, 0]
     style.line(axes[0], design.t, design.v, zoh=True, color=style.PALETTE["grey"])
-    style.tidy(axes[0], y=style.axis_label("v"), title="Designed experiment")
+    axes[0].set(ylabel=style.axis_label("v"), title="Designed experiment")
     for ax, channel in zip(axes[1:], first, strict=True):
         for (name, outputs), colour in zip(design.predicted.items(), style.CYCLE[:4], strict=False):
             y, half = outputs[channel], design.band[name][channel]
             ax.fill_between(design.t, y - half, y + half, color=colour, alpha=0.2, lw=0)
             style.line(ax, design.t, y, color=colour, label=name if len(design.predicted) > 1 else "predicted")
-        style.tidy(ax, y=style.axis_label(channel), x=style.axis_label("t") if ax is axes[-1] else "")
+        ax.set(ylabel=style.axis_label(channel), xlabel=style.axis_label("t") if ax is axes[-1] else "")
     axes[0].figure.legend(*axes[1].get_legend_handles_labels(), loc="outside upper right", ncols=4)
     return axes

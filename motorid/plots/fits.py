@@ -59,8 +59,8 @@ def plot_runs(runs: Sequence[Experiment] | Experiment, channels: Sequence[str] |
             else:
                 style.line(axes[j, k], run.t, y, zoh=c == "v" and run.hold == "zoh", lw=1.0,
                            color=style.INK if c == "v" else style.MODEL)
-        style.tidy(axes[0, k], title=_run_title(run, k, every))
-        style.tidy(axes[-1, k], x="time (s)")
+        axes[0, k].set(title=_run_title(run, k, every))
+        axes[-1, k].set(xlabel="time (s)")
     for ax, c in zip(axes[:, 0], names, strict=True):
         ax.set_ylabel(style.axis_label(c, next((r for r in shown if c in r.units), None)))
     axes[0, 0].figure.align_ylabels(axes[:, 0])
@@ -166,8 +166,8 @@ def _drawn(every: list[Simulation], before: Any) -> tuple[np.ndarray, list[_Movi
             else:
                 _absent(upper, c)
                 lower.set_axis_off()
-        style.tidy(axes[0, k], title=_run_title(s.experiment, k, [e.experiment for e in every]))
-        style.tidy(axes[-1, k], x="time (s)")
+        axes[0, k].set(title=_run_title(s.experiment, k, [e.experiment for e in every]))
+        axes[-1, k].set(xlabel="time (s)")
     axes[0, 0].figure.align_ylabels(axes[:, 0])
     entries = (a + b for a, b in zip(*(ax.get_legend_handles_labels() for ax in axes[:2, 0]), strict=True))
     axes[0, 0].figure.legend(*entries, loc="outside upper left", ncols=5)
@@ -244,15 +244,13 @@ def plot_parameters(*results: Any, truth: Mapping[str, float] | None = None,
     for name in chosen:
         among(name, dict.fromkeys(n for f in fits for n in f.values), "parameter")
     columns = {6: 3, 7: 4, 8: 4}.get(len(chosen), min(len(chosen), 5))
-    axes = style.grid(-(-len(chosen) // columns), columns, row=1.75, width=style.WIDTH * max(columns, 3) / 5).ravel()
-    for ax, name in zip(axes, chosen, strict=False):
+    axes = style.panels(len(chosen), columns, row=1.75, width=style.WIDTH * max(columns, 3) / 5)
+    for ax, name in zip(axes, chosen, strict=True):
         _one_parameter(ax, fits, name, (truth or {}).get(name))
-    for ax in axes[len(chosen):]:
-        ax.set_axis_off()
     notes = [f"{k + 1}: {what_changed(f, fits[k - 1] if k else None)}" for k, f in enumerate(fits)]
     notes += ["dashed: true value"] * bool(truth) + ["bars: ±2σ"]
     axes[0].figure.supxlabel("   ·   ".join(notes), fontsize=8, color=style.MUTED)
-    return axes[: len(chosen)]
+    return axes
 
 
 def _one_parameter(ax: Axes, fits: Sequence[Any], name: str, truth: float | None) -> None:
@@ -275,7 +273,7 @@ def _one_parameter(ax: Axes, fits: Sequence[Any], name: str, truth: float | None
         below = y > sum(ax.get_ylim()) / 2  # above it may be the title
         ax.annotate("not\ndetermined", (k + 1, y), (0, -6 if below else 6), textcoords="offset points", ha="center",
                     va="top" if below else "bottom", fontsize=7, color=style.MUTED)
-    style.tidy(ax, title=style.scaled_title(name, parameter.unit, power))
+    ax.set(title=style.scaled_title(name, parameter.unit, power))
     ax.grid(axis="x", visible=False)
 
 

@@ -64,8 +64,8 @@ def _channel(axes: np.ndarray, fit: Fit, channel: str, against: Sequence[str]) -
     unit = run.units[channel]
     sigma = float(np.mean([r.sigma[channel] for r in fit.problem.runs if channel in r.sigma]))
     _over_time(axes[0], sims, channel, sigma)
-    style.tidy(axes[0], x="time, runs one after the other (s)", y=f"residual ({unit})",
-               title=f"Residual of the {style.axis_label(channel, run)}")
+    axes[0].set(xlabel="time, runs one after the other (s)", ylabel=f"residual ({unit})",
+                title=f"Residual of the {style.axis_label(channel, run)}")
     residuals = [s.residual(channel) for s in sims]
     every = np.concatenate(residuals)
     if not np.isfinite(every).any():
@@ -77,7 +77,7 @@ def _channel(axes: np.ndarray, fit: Fit, channel: str, against: Sequence[str]) -
         # The model's own: the measured one shares its noise with the residual, which then seems to depend.
         with_other = [s for s in sims if other in s.outputs]
         _against(ax, [s.outputs[other] for s in with_other], [s.residual(channel) for s in with_other], sigma)
-        style.tidy(ax, x=style.axis_label(other, run), title=f"Against {style.axis_label(other, run).split(' (')[0]}")
+        ax.set(xlabel=style.axis_label(other, run), title=f"Against {style.axis_label(other, run).split(' (')[0]}")
         ax.sharey(axes[4])
     if len(axes) > 4:
         axes[4].set_ylabel(f"residual ({unit})")
@@ -106,10 +106,9 @@ def _histogram(ax: Axes, r: Array, sigma: float) -> None:
     top, y = float(np.max(bars[0])), np.linspace(-4 * sigma, 4 * sigma, 121)
     bell = np.exp(-0.5 * (y / sigma) ** 2) / (sigma * np.sqrt(2 * np.pi))
     ax.plot(bell, y, color=style.INK, lw=1.0, label="noise")
-    ax.set_xlim(0, 1.25 * max(top, float(bell.max()) if bell.max() < 4 * top else top))
-    ax.set_xticks([])
+    ax.set(xlim=(0, 1.25 * max(top, float(bell.max()) if bell.max() < 4 * top else top)), xticks=[],
+           xlabel="density (line: noise)", title="Histogram")
     ax.tick_params(labelleft=False)
-    style.tidy(ax, x="density (line: noise)", title="Histogram")
 
 
 def _with_input(ax: Axes, sims: Sequence[Simulation], channel: str) -> None:
@@ -126,8 +125,7 @@ def _with_input(ax: Axes, sims: Sequence[Simulation], channel: str) -> None:
     style.band(ax, 1.96 / np.sqrt(max(worth, 1.0)))
     ax.vlines(k, 0, total / np.sqrt(np.prod(size) or 1.0), color=style.PALETTE["purple"], lw=0.9)
     ax.axhline(0, color=style.MUTED, lw=0.6)
-    ax.set_ylim(-0.6, 0.6)
-    style.tidy(ax, x="lag (samples)", title="Input correlation")
+    ax.set(ylim=(-0.6, 0.6), xlabel="lag (samples)", title="Input correlation")
 
 
 def _autocorrelation(ax: Axes, residuals: Sequence[Array]) -> None:
@@ -138,7 +136,7 @@ def _autocorrelation(ax: Axes, residuals: Sequence[Array]) -> None:
     ax.vlines(np.arange(1, lags + 1), 0, rho[1:], color=style.PALETTE["purple"], lw=1.2)
     ax.axhline(0, color=style.MUTED, lw=0.6)
     ax.set_ylim(min(-0.25, float(rho.min()) * 1.1), max(0.4, min(1.05, float(rho[1:].max(initial=0)) * 1.25)))
-    style.tidy(ax, x="lag (samples)", y="correlation", title="Autocorrelation")
+    ax.set(xlabel="lag (samples)", ylabel="correlation", title="Autocorrelation")
 
 
 def _against(ax: Axes, x: Sequence[Array], r: Sequence[Array], sigma: float) -> None:
@@ -165,11 +163,8 @@ def scatter(ax: Axes, x: Any, y: Any, most: int = 1500, color: str = style.RESID
 
 def binned_means(x: Array, y: Array) -> tuple[Array, Array, Array]:
     """Return centres, means and 1.96 standard errors of y in equal bins of x with five samples or more."""
-    edges = np.linspace(x.min(), x.max(), BINS + 1)
-    which = np.clip(np.searchsorted(edges, x, side="right") - 1, 0, BINS - 1)
-    count = np.bincount(which, minlength=BINS)
-    safe = np.maximum(count, 1)
-    mean = np.bincount(which, y, BINS) / safe
-    spread = np.sqrt(np.maximum(np.bincount(which, y**2, BINS) / safe - mean**2, 0))
-    full = count >= 5
-    return ((edges[:-1] + edges[1:]) / 2)[full], mean[full], (1.96 * spread / np.sqrt(safe))[full]
+    count, edges = np.histogram(x, BINS)
+    n, full = np.maximum(count, 1), count >= 5
+    mean, square = (np.histogram(x, edges, weights=w)[0] / n for w in (y, y**2))
+    half = 1.96 * np.sqrt(np.maximum(square - mean**2, 0) / n)
+    return ((edges[:-1] + edges[1:]) / 2)[full], mean[full], half[full]

@@ -150,6 +150,14 @@ def grid(rows: int, columns: int, *, row: float = 1.6, width: float = WIDTH, **o
     return new_figure(width, total + 0.35).subplots(rows, columns, squeeze=False, **options)
 
 
+def panels(n: int, columns: int, **options: Any) -> np.ndarray:
+    """Return `n` axes in rows of so many columns on a new figure, see `grid`; what is left of the last row is blank."""
+    axes = grid(-(-n // columns), columns, **options).ravel()
+    for ax in axes[n:]:
+        ax.set_axis_off()
+    return axes[:n]
+
+
 def only(ax: Axes | None, *, width: float = 5.6, height: float = 3.2) -> Axes:
     """Return `ax`, or the axes of a new figure."""
     return ax if ax is not None else new_figure(width, height).subplots()
@@ -197,11 +205,6 @@ def line(ax: Axes, x: Array, y: Array, *, zoh: bool = False, **options: Any) -> 
 def band(ax: Axes, half: float, label: str | None = None) -> None:
     """Shade ±half around zero."""
     ax.axhspan(-half, half, color=MUTED, alpha=0.16, lw=0, label=label, zorder=0)
-
-
-def tidy(ax: Axes, *, x: str = "", y: str = "", title: str = "") -> None:
-    """Label axes and leave room for few, round ticks."""
-    ax.set(**{what: text for what, text in (("xlabel", x), ("ylabel", y), ("title", title)) if text})
 
 
 def plain_decades(ax: Axes) -> None:

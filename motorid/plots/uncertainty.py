@@ -50,13 +50,13 @@ def plot_singular_values(result: Identifiability) -> np.ndarray:
     colours = [style.PALETTE["blue"] if v > SEEN else style.PALETTE["orange"] for v in values]
     ax.vlines(rows, bottom, values, color=colours, lw=2)
     ax.scatter(rows, values, color=colours, s=24, zorder=3)
-    ax.set(yscale="log", ylim=(bottom, 2.5 * float(values[0])), xticks=rows)
+    ax.set(yscale="log", ylim=(bottom, 2.5 * float(values[0])), xticks=rows, xlabel="direction",
+           ylabel="singular value",
+           title=f"rank {result.rank} of {k}, condition number {number(result.condition_number, 3)}")
     ax.axhspan(bottom, SEEN, color=style.MUTED, alpha=0.16, lw=0, zorder=0)
     style.plain_decades(ax)
     ax.text(0.98, 0.97, "grey: not determined", transform=ax.transAxes, ha="right", va="top", fontsize=8,
             color=style.MUTED)
-    style.tidy(ax, x="direction", y="singular value",
-               title=f"rank {result.rank} of {k}, condition number {number(result.condition_number, 3)}")
     _directions(axes[1], result)
     return axes
 
@@ -67,8 +67,8 @@ def _directions(ax: Axes, result: Identifiability) -> None:
             colour = style.PALETTE["blue"] if weight > 0 else style.PALETTE["orange"]
             ax.scatter(column, row, s=180 * abs(float(weight)) ** 1.5, color=colour, alpha=0.85, lw=0)
     k = len(result.names)
-    ax.set(xlim=(-0.6, k - 0.4), ylim=(k + 0.6, 0.4), xticks=range(k), xticklabels=result.names, yticks=range(1, k + 1))
-    style.tidy(ax, y="direction", title="What each direction is made of (area: weight)")
+    ax.set(xlim=(-0.6, k - 0.4), ylim=(k + 0.6, 0.4), xticks=range(k), xticklabels=result.names, yticks=range(1, k + 1),
+           ylabel="direction", title="What each direction is made of (area: weight)")
 
 
 @style.styled
@@ -93,16 +93,13 @@ def plot_profile(result: Profile | Mapping[str, Profile] | Intervals) -> np.ndar
     if not profiles or not all(isinstance(p, Profile) for p in profiles):
         raise UsageError(f"plot_profile takes mi.profile(fit, 'R') or mi.intervals(fit), got {type(result).__name__}.")
     columns = min(len(profiles), 3)
-    rows = -(-len(profiles) // columns)
-    axes = style.grid(rows, columns, row=2.2, width=style.WIDTH if columns == 3 else 4.2 * columns).ravel()
-    for ax, p in zip(axes, profiles, strict=False):
+    axes = style.panels(len(profiles), columns, row=2.2, width=style.WIDTH if columns == 3 else 4.2 * columns)
+    for ax, p in zip(axes, profiles, strict=True):
         _one_profile(ax, p, result if isinstance(result, Intervals) else None)
-    for ax in axes[len(profiles) :]:
-        ax.set_axis_off()
-    for k in range(0, len(profiles), columns):
-        axes[k].set_ylabel("rise of the error (t²)")
+    for ax in axes[::columns]:
+        ax.set_ylabel("rise of the error (t²)")
     axes[0].figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=5)
-    return axes[: len(profiles)]
+    return axes
 
 
 def _one_profile(ax: Axes, p: Profile, both: Intervals | None) -> None:
@@ -122,7 +119,7 @@ def _one_profile(ax: Axes, p: Profile, both: Intervals | None) -> None:
     ax.set_ylim(-2.4 if both is not None else -0.4, max(1.5 * height, 2.0))
     ax.set_yticks([y for y in ax.get_yticks() if 0 <= y <= ax.get_ylim()[1]])
     _reach(ax, p, height, scale)
-    style.tidy(ax, x=style.scaled_title(p.name, p.unit, style.decade(abs(p.value))))
+    ax.set(xlabel=style.scaled_title(p.name, p.unit, style.decade(abs(p.value))))
 
 
 def _reach(ax: Axes, p: Profile, height: float, scale: float) -> None:
@@ -187,8 +184,8 @@ def plot_sensitivities(fit: Fit, *, run: int = 0, names: Sequence[str] | None = 
             _sensitivity(ax, record.t, change, problem.runs[run].sigma[c], record.units[c])
         row[0].set_ylabel(name, rotation=0, ha="right", va="center")
     for top, bottom, c in zip(axes[0], axes[-1], channels, strict=True):
-        style.tidy(top, title=f"{style.axis_label(c, record)}: change for +1 %")
-        style.tidy(bottom, x="time (s)")
+        top.set(title=f"{style.axis_label(c, record)}: change for +1 %")
+        bottom.set(xlabel="time (s)")
     axes[0, 0].figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper right")
     axes[0, 0].figure.align_ylabels(axes[:, 0])
     return axes
@@ -237,13 +234,12 @@ def _sorted_costs(ax: Axes, result: Multistart, ends: Sequence[tuple[StartResult
             word = {"good": "agree", "poor": "elsewhere"}.get(kind, kind)
             ax.plot(where + 1, ratio[where], "o", ms=4, color=colour, label=word)
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
-    ax.set_yscale("log")
-    ax.set_ylim(0.9, max(2.2, float(ratio.max(initial=1.0)) * 1.5))
-    style.plain_decades(ax)
     words = f"{result.good} of {len(result.results)} agree"
     words += f"; {result.failed} failed" * bool(result.failed) + f"; {result.poor} elsewhere:" * bool(result.poor)
-    style.tidy(ax, x="fits, best first", y="squared error over the best (ratio)",
-               title="\n".join([words, *textwrap.wrap(glued(result.elsewhere), TITLE)]))
+    ax.set(yscale="log", ylim=(0.9, max(2.2, float(ratio.max(initial=1.0)) * 1.5)), xlabel="fits, best first",
+           ylabel="squared error over the best (ratio)",
+           title="\n".join([words, *textwrap.wrap(glued(result.elsewhere), TITLE)]))
+    style.plain_decades(ax)
     ax.legend(loc="upper left")
 
 
@@ -261,7 +257,6 @@ def _starts_and_ends(ax: Axes, result: Multistart, ends: Sequence[tuple[StartRes
     if all(result.reference.values[n] > 0 for n in names):
         ax.set_yscale("log")
         style.plain_decades(ax)
-    ax.set_xticks(range(len(names)), names)
-    ax.set_xlim(-0.6, len(names) - 0.4)
-    words = f"Starts (dots, up to {result.spread:g} times off) and ends (circles)"
-    style.tidy(ax, y="value over that of the best fit", title=words)
+    ax.set(xticks=range(len(names)), xticklabels=names, xlim=(-0.6, len(names) - 0.4),
+           ylabel="value over that of the best fit",
+           title=f"Starts (dots, up to {result.spread:g} times off) and ends (circles)")
