@@ -36,16 +36,16 @@ _ASCII = {"Ω": "Ohm", "ω": "omega", "τ": "tau", "θ": "theta", "φ": "phi", "
           "“": '"', "”": '"', "⁻": "^-", **dict(zip("⁰¹³⁴⁵⁶⁷⁸⁹", "013456789", strict=True))}
 # Messages name what Python takes; on the command line the same is said by options.
 _OPTIONS = ((r"\b(columns|units)=\{(.*?)\}", lambda m: f"--{m[1]} {_pairs(m[2])}"),
-            (r"\bwith (columns|units)\b", lambda m: f"with --{m[1]}"),
-            (r"\b(engine|hold|solver|initial|formulation)='([\w-]+)'", lambda m: f"--{m[1]} {m[2]}"),
-            (r"\bdt=([\d.]+)", lambda m: f"--dt {m[1]}"),
-            (r"\bmodel\.without\('(\w+)'\)", lambda m: f"--effects without {m[1]}"),
-            (r"\bmodel\.fix\('?(\w+)'?(=[^)]*)?\)", lambda m: f"--fix {m[1]}{m[2] or ''}"),
-            (r"\bmodel\.free\('?(\w+|…)'?\)", lambda m: f"--free {m[1].replace('…', 'NAME')}"),
-            (r"\bmodel\.fix\(…\)", lambda m: "--fix NAME"),
-            (r"\bmi\.evaluate\(model, runs\)", lambda m: "motorid simulate FIT.json RUN..."),
-            (r"\bmi\.load\(path, effects=\[\w+\]\)", lambda m: "--effects-from FILE.py"),
-            (r" If you know where it comes from, mi\.load.*", lambda m: ""))
+            (r"\bwith (columns|units)\b", r"with --\1"),
+            (r"\b(engine|hold|solver|initial|formulation)='([\w-]+)'", r"--\1 \2"),
+            (r"\bdt=([\d.]+)", r"--dt \1"),
+            (r"\bmodel\.without\('(\w+)'\)", r"--effects without \1"),
+            (r"\bmodel\.(fix|free)\(…\)", r"--\1 NAME"),
+            (r"\bmodel\.fix\('?(\w+)'?(=[^)]*)?\)", r"--fix \1\2"),
+            (r"\bmodel\.free\('?(\w+)'?\)", r"--free \1"),
+            (r"\bmi\.evaluate\(model, runs\)", "motorid simulate FIT.json RUN..."),
+            (r"\bmi\.load\(path, effects=\[\w+\]\)", "--effects-from FILE.py"),
+            (r" If you know where it comes from, mi\.load.*", ""))
 MANY = ("--validate",)  # options that take all names up to the next option
 OUTPUTS = ("--json", "--report")  # options that write a file
 COMMAND = ("Next: motorid", "Then: motorid", "Written: ")  # lines to copy, not wrapped

@@ -24,7 +24,7 @@ from motorid.problem.simulate import NRMSE, Evaluation, error_table, evaluate, r
 from motorid.records.experiment import Experiment
 from motorid.records.files import write_files
 from motorid.records.reading import csv_text
-from motorid.uncertainty.batch import fit_many, motors_in
+from motorid.uncertainty.batch import Batch, fit_many, motors_in
 from motorid.uncertainty.identifiability import Identifiability, identifiability
 from motorid.uncertainty.multistart import Multistart, multistart
 
@@ -104,10 +104,7 @@ def fit_many_command(
         motors = {name: _readable(options, files) or files for name, files in motors.items()}
     with processes(min(jobs, len(motors))) as over:
         found = fit_many(model, motors, map=over, journal=journal, reading=options.reading, **options.keywords())
-    if json != "-":
-        show(str(found))
-    if json:
-        write_json(found.to_dict(), json, options.force)
+    _give(found, json, options.force)
     if out:
         show(f"Table: {found.save(out, options.force)}")
     if found.interrupted:
@@ -235,7 +232,9 @@ def identifiability_command(runs: opt.Runs, options: opt.FitOptions, json: opt.J
     Example: motorid identifiability run*.csv --effects coulomb
     """
     fitted = options.fit(options.read(runs))
-    _write_and_show(fitted, identifiability(fitted), json, report, options.force)
+    found = identifiability(fitted)
+    _give(found, json, options.force)
+    save_report([fitted, found], report, force=options.force)
 
 
 @opt.with_options(opt.FitOptions)
@@ -253,15 +252,15 @@ def robustness_command(
     """
     fitted = options.fit(options.read(runs))
     found = multistart(fitted, starts=starts, spread=spread, seed=seed)
-    _write_and_show(fitted, found, json, report, options.force)
+    _give(found, json, options.force)
+    save_report([fitted, found], report, force=options.force)
     if found.interrupted:
         raise typer.Exit(INTERRUPTED)
 
 
-def _write_and_show(fitted: Fit, found: Identifiability | Multistart, json: opt.Json, report: opt.Report,
-                    force: bool) -> None:
+def _give(found: Batch | Identifiability | Multistart, json: opt.Json, force: bool) -> None:
+    """Show a result and write it as JSON, as asked."""
     if json != "-":
         show(str(found))
     if json:
         write_json(found.to_dict(), json, force)
-    save_report([fitted, found], report, force=force)

@@ -169,7 +169,8 @@ class FitOptions(ReadingOptions):
             found["solver"] = MultipleShooting()
         found["formulation"] = "plain" if hard else self.formulation
         if self.window != "auto":
-            found["window"] = None if self.window == "none" else _seconds(self.window, "--window")
+            expected = "a time; expected auto, none, or seconds, e.g. 0.5"
+            found["window"] = None if self.window == "none" else _number(self.window, "--window", expected)
         return found
 
     def fit(self, runs: Sequence[Experiment]) -> Fit:
@@ -207,10 +208,10 @@ def with_options(kind: type) -> Callable[[Callable[..., None]], Callable[..., No
             taken = {f.name: given.pop(f.name) for f in fields(kind)}
             command(**given, options=kind(**taken))
 
-        required = [p for p in mine if p.default is inspect.Parameter.empty]
-        rest = [p for p in mine if p.default is not inspect.Parameter.empty]
-        run.__signature__ = inspect.Signature([*required, *parts, *rest])  # type: ignore[attr-defined]
-        run.__annotations__ = {p.name: p.annotation for p in [*required, *parts, *rest]}
+        required = [p for p in mine if p.default is p.empty]
+        every = [*required, *parts, *(p for p in mine if p not in required)]
+        run.__signature__ = inspect.Signature(every)  # type: ignore[attr-defined]
+        run.__annotations__ = {p.name: p.annotation for p in every}
         return run
 
     return wrap
@@ -279,16 +280,12 @@ def _numbers(texts: Sequence[str], option: str) -> dict[str, float]:
         for name, value in parse_pairs(text, option).items():
             if name in found:
                 raise UsageError(f"{option}: '{name}' is given twice, as {found[name]:g} and as {value}.")
-            try:
-                found[name] = float(value)
-            except ValueError:
-                raise UsageError(f"{option}: '{value}' is not a number; expected e.g. {name}=1.2, in SI "
-                                 "units.") from None
+            found[name] = _number(value, option, f"a number; expected e.g. {name}=1.2, in SI units")
     return found
 
 
-def _seconds(text: str, option: str) -> float:
+def _number(text: str, option: str, expected: str) -> float:
     try:
         return float(text)
     except ValueError:
-        raise UsageError(f"{option}: '{text}' is not a time; expected auto, none, or seconds, e.g. 0.5.") from None
+        raise UsageError(f"{option}: '{text}' is not {expected}.") from None
