@@ -39,7 +39,6 @@ class Timeline:
         self.bad: Counter[str] = Counter()
         self.clipped: Counter[str] = Counter()
         self.received = 0
-        self.first = time
         self._wrap = 1 << header.counter_bits, 1 << header.timer_bits
         period = round(1e6 / header.rate)
         self._last = _Mark((counter - 1) % self._wrap[0], (time - period) % self._wrap[1], -1, -period, host)

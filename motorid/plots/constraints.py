@@ -134,9 +134,9 @@ def _errors(ax: Axes, shown: Sequence[tuple[str, Any, str]]) -> None:
     for k, (_, fit, colour) in enumerate(shown):
         place = np.arange(len(channels)) + 0.26 * (k - 1)
         ax.bar(place, [100 * fit.nrmse[c] for c in channels], width=0.24, color=colour)
-    ax.set_xticks(range(len(channels)), [style.axis_label(c).split(" (")[0] for c in channels])
+    ax.set(xticks=range(len(channels)), xticklabels=[style.axis_label(c).split(" (")[0] for c in channels],
+           ylabel="NRMSE (%)", title="Error")
     ax.grid(axis="x", visible=False)
-    ax.set(ylabel="NRMSE (%)", title="Error")
 
 
 def _walk(ax: Axes, result: Formulations) -> None:

@@ -18,7 +18,7 @@ from motorid.display.numbers import percent
 from motorid.errors import UsageError, among, one_of
 from motorid.numerics.signals import noise_level
 from motorid.plots import style
-from motorid.problem.simulate import Simulation
+from motorid.problem.simulate import Simulation, judge
 from motorid.records.experiment import Experiment
 
 COLUMNS = 3  # runs side by side at most: more would be unreadable
@@ -183,10 +183,7 @@ def _curves(ax: Axes, s: Simulation, channel: str, old: Simulation | None) -> Li
 
 
 def _error_title(ax: Axes, s: Simulation, channel: str) -> Text:
-    y = s.experiment.outputs[channel]
-    good = np.isfinite(y)
-    error = np.sqrt(np.sum(s.residual(channel)[good] ** 2) / max(float(np.sum(y[good] ** 2)), 1e-300))
-    return ax.set_title(f"NRMSE {percent(error)}", loc="right", fontsize=8, color=style.MUTED)
+    return ax.set_title(f"NRMSE {percent(judge([s]).nrmse[channel])}", loc="right", fontsize=8, color=style.MUTED)
 
 
 def _residual(ax: Axes, s: Simulation, channel: str, old: Simulation | None) -> Line2D:

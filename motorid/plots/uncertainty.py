@@ -127,8 +127,7 @@ def _reach(ax: Axes, p: Profile, height: float, scale: float) -> None:
     inside = p.values[p.rise <= 1.6 * height] * scale
     low, high = float(inside.min()), float(inside.max())
     if low > 0 and high > 20 * low:
-        ax.set_xscale("log")
-        ax.set_xlim(low / 1.5, high * 1.5)
+        ax.set(xscale="log", xlim=(low / 1.5, high * 1.5))
         return
     room = 0.08 * (high - low) or 0.1 * abs(high)
     ax.set_xlim(low - room, high + room)
@@ -195,8 +194,7 @@ def _sensitivity(ax: Axes, t: Array, change: Array, sigma: float, unit: str) -> 
     most = float(np.max(np.abs(change))) or 1.0
     style.band(ax, sigma, "noise, ±σ")
     style.line(ax, t, change, color=style.PALETTE["blue"])
-    ax.set_ylim(-1.2 * most, 1.9 * most)  # room for the words
-    ax.set_yticks([0.0], [""])
+    ax.set(ylim=(-1.2 * most, 1.9 * most), yticks=[0.0], yticklabels=[""])  # room for the words
     ax.text(0.995, 0.97, f"up to {quantity(most, unit, 2)} = {number(most / sigma, 2)} σ", transform=ax.transAxes,
             ha="right", va="top", fontsize=8, color=style.INK)
 

@@ -328,7 +328,7 @@ def checkpoint_key(model: Model, options: Mapping[str, Any], reading: Mapping[st
     mark = hashlib.sha256(repr([package_version(p) for p in ("motorid", "casadi", "numpy", "scipy")]).encode())
     mark.update(_equations(model))
     mark.update(repr((model.base, model.axis, model.effect_names, sorted(model.parameters.items()))).encode())
-    told = sorted(options.items(), key=lambda o: o[0]), sorted((reading or {}).items())
+    told = sorted(options.items()), sorted((reading or {}).items())
     text = repr(told)
     mark.update(pickle.dumps(told) if "..." in text or " at 0x" in text else text.encode())
     for part in _contents(records):
@@ -348,8 +348,8 @@ def _equations(model: Model) -> bytes:
 def _contents(records: Any) -> list[bytes]:
     if isinstance(records, Experiment):
         return [pickle.dumps((records.hold, dict(records.sigma), dict(records.units))),
-                *(np.ascontiguousarray(a).tobytes() for a in (records.t, *records.inputs.values())),
-                *(c.encode() + np.ascontiguousarray(a).tobytes() for c, a in records.outputs.items())]
+                *(a.tobytes() for a in (records.t, *records.inputs.values())),
+                *(c.encode() + a.tobytes() for c, a in records.outputs.items())]
     if isinstance(records, str | Path):
         try:
             return [Path(f).read_bytes() for f in find_records(records)]

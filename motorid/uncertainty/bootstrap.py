@@ -155,9 +155,8 @@ def bootstrap(fit: Fit, *, kind: str = "blocks", n: int = 200, block: int | None
     for least, given in ((2, {"n": n}), (1, {"block": block}), (0, {"seed": seed})):
         at_least(least, **given)
     if kind == "runs" and len(fit.problem.experiments) < FEWEST_RUNS:
-        raise UsageError(f"resampling runs needs at least {FEWEST_RUNS} of them; this fit has "
-                         f"{len(fit.problem.experiments)}. Use kind='blocks', or cut runs with "
-                         "motorid.records.experiment.split.")
+        raise UsageError(f"resampling runs needs at least {FEWEST_RUNS} of them; this fit has {len(fit.problem.runs)}. "
+                         "Use kind='blocks', or cut runs with motorid.records.experiment.split.")
     source = _source(fit, kind, block)
     seeds = np.random.SeedSequence(seed).spawn(n)
     found, interrupted = map_items(_refit, source, seeds, map, "Refitting resampled records", quiet=quiet)
