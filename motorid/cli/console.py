@@ -83,27 +83,22 @@ class Command(_PlainHelp, TyperCommand):
 class Group(_PlainHelp, TyperGroup):
     """Turns errors into one sentence on standard error and the exit status."""
 
-    def main(self, args: Sequence[str] | None = None, prog_name: str | None = None, complete_var: str | None = None,
-             standalone_mode: bool = True, windows_expand_args: bool = True, **extra: Any) -> Any:
+    def main(self, args: Sequence[str] | None = None, prog_name: str | None = None, **extra: Any) -> Any:
         """See click; leaves by `SystemExit`."""
         try:
-            status = super().main(args, prog_name or "motorid", complete_var, standalone_mode=False,
-                                  windows_expand_args=windows_expand_args, **extra)
+            status = super().main(args, prog_name or "motorid", **{**extra, "standalone_mode": False})
             if interruption.asked and not interruption.told:  # Typer made a status of it, while it read the words
                 _say("interrupted.")
         except MotoridError as error:
-            _say(str(error))
-            status = WRONG if isinstance(error, DataError | ModelError | UsageError) else FAILED
+            status = _say(str(error), WRONG if isinstance(error, DataError | ModelError | UsageError) else FAILED)
         except typer.Abort:
-            _say("stopped.")
-            status = INTERRUPTED
+            status = _say("stopped.")
         except BrokenPipeError:
             sys.stderr.close()  # nobody reads any more, e.g. `motorid fit … | head`
             status = FAILED
         except (ArithmeticError, np.linalg.LinAlgError, MemoryError) as error:
-            _say(f"the numbers or the size of these records are beyond what can be computed "
-                 f"({str(error) or 'out of memory'}).")
-            status = FAILED
+            status = _say("the numbers or the size of these records are beyond what can be computed "
+                          f"({str(error) or 'out of memory'}).", FAILED)
         except Exception as error:
             status = self._unexpected(error)
         sys.exit(status if isinstance(status, int) else DONE)
@@ -116,25 +111,21 @@ class Group(_PlainHelp, TyperGroup):
             if not interruption.behind(error):
                 raise
             interruption.heard()
-            _say("interrupted before it was done; what was written before is kept.")
-            raise typer.Exit(INTERRUPTED) from None
+            raise typer.Exit(_say("interrupted before it was done; what was written before is kept.")) from None
 
     @staticmethod
     def _unexpected(error: Any) -> int:
         if interruption.behind(error):  # raised inside what was loading, and made another error of
             interruption.heard()
-            _say("interrupted.")
-            return INTERRUPTED
+            return _say("interrupted.")
         if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EFBIG, errno.EIO):
             os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # what is left of the output has no place
-            _say(f"cannot write the output: {error.strerror}.")
-            return FAILED
+            return _say(f"cannot write the output: {error.strerror}.", FAILED)
         if not hasattr(error, "format_message"):
             raise error
         text, context = error.format_message().strip(), getattr(error, "ctx", None)
-        _say(text + ("" if text.endswith((".", "?", "!")) else ".")
-             + f" Help: {context.command_path if context else 'motorid'} --help")
-        return WRONG
+        help_ = f" Help: {context.command_path if context else 'motorid'} --help"
+        return _say(text + ("" if text.endswith((".", "?", "!")) else ".") + help_, WRONG)
 
 
 def prepare_process() -> None:
@@ -315,8 +306,10 @@ def save_report(result: Any, path: Any, held_out: Sequence[Any] = (), force: boo
     show(f"Report: {written}")
 
 
-def _say(text: str) -> None:
+def _say(text: str, status: int = INTERRUPTED) -> int:
+    """Say on standard error why a command ends, and return the exit status."""
     typer.echo(f"motorid: {printable(' '.join(in_options(text).split()))}", err=True)
+    return status
 
 
 def _spread(args: Sequence[str]) -> list[str]:
