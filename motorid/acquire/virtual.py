@@ -74,14 +74,11 @@ class VirtualDevice:
     def run(self, n: int) -> list[bytes]:
         """Make up to n samples and return their frames; the last one is followed by ``E,done``."""
         frames: list[bytes] = []
-        for _ in range(n if self.running else 0):
-            if self._made >= self._length and self._segments:
-                frames.append(self._stop("end"))
-                break
-            frames.append(self._sample())
+        while self.running and len(frames) < n:
+            over = self._made >= self._length and self._segments
+            frames.append(self._stop("end") if over else self._sample())
             if self._over >= OVER_LIMIT:
                 frames.append(self._stop("limit"))
-                break
         return frames
 
     def _sample(self) -> bytes:

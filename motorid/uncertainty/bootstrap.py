@@ -223,14 +223,12 @@ def _resampled(source: _Source, k: int, rng: np.random.Generator) -> Experiment:
 
 def _blocks(source: _Source, k: int, rng: np.random.Generator) -> dict[str, Array]:
     """Blocks of residuals from any run with the same channels, the same stretch for all channels."""
-    here = source.residuals[k]
-    n = len(next(iter(here.values())))
-    donors = [r for r in source.residuals if set(r) == set(here)]
+    here, n = source.residuals[k], source.problem.runs[k].experiment.n
+    donors = [np.array([r[c] for c in here]) for r in source.residuals if set(r) == set(here)]
     pieces = []
     for _ in range(-(-n // source.block)):
         donor = donors[rng.integers(len(donors))]
-        size = len(next(iter(donor.values())))
-        at = (rng.integers(size) + np.arange(source.block)) % size
-        pieces.append({c: e[at] for c, e in donor.items()})
-    joined = {c: np.concatenate([p[c] for p in pieces])[:n] for c in here}
-    return {c: np.where(np.isfinite(e), e, 0.0) for c, e in joined.items()}
+        size = donor.shape[1]
+        pieces.append(donor[:, (rng.integers(size) + np.arange(source.block)) % size])
+    joined = np.concatenate(pieces, axis=1)[:, :n]
+    return dict(zip(here, np.where(np.isfinite(joined), joined, 0.0), strict=True))

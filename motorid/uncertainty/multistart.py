@@ -166,7 +166,7 @@ class Multistart(Printed):
     def _kind(self, end: StartResult | Failure) -> str:
         if isinstance(end, Failure) or not np.isfinite(end.cost):
             return "failed"
-        best = self.best or self.reference
+        best = self._lowest
         far = any(abs(self.difference(n, end.values[n], best.values[n])) > DISTANCE * sd
                   for n, sd in self.reference.std.items() if sd)
         return "poor" if end.cost > best.cost * (1 + COST_SHARE) or far else "good"
@@ -214,13 +214,13 @@ class Multistart(Printed):
         """One row per place where fits ended (`pandas.DataFrame`), best first: fits, cost ratio, values."""
         import pandas as pd
 
-        return pd.DataFrame([{"fits": len(p), "cost_ratio": p[0].cost / self._lowest, **dict(p[0].nrmse),
+        return pd.DataFrame([{"fits": len(p), "cost_ratio": p[0].cost / self._lowest.cost, **dict(p[0].nrmse),
                               **{n: p[0].values[n] for n in p[0].start}} for p in self._places("good", "poor")])
 
     @property
-    def _lowest(self) -> float:
-        """Lowest cost of all."""
-        return (self.best or self.reference).cost
+    def _lowest(self) -> StartResult | Fit:
+        """What has the lowest cost of all."""
+        return self.best or self.reference
 
     def _places(self, *kinds: str) -> list[list[StartResult]]:
         """Return the ends of these kinds by place, the lowest cost first."""
@@ -236,7 +236,7 @@ class Multistart(Printed):
 
         The places with most fits, and there the parameters that are farthest off.
         """
-        best, pars = (self.best or self.reference).values, self.reference.model.parameters
+        best, pars = self._lowest.values, self.reference.model.parameters
         places = sorted(self._places("poor"), key=len, reverse=True)
         told = []
         for place in places[:PLACES]:
@@ -245,7 +245,7 @@ class Multistart(Printed):
                    for n in self.reference.problem.model.free_names}
             most = [n for n in sorted(off, key=lambda n: -off[n])[:FARTHEST] if off[n] > 0.1 * max(off.values())]
             where = ", ".join(f"{n} = {quantity(end[n], pars[n].unit, 3)}" for n in most)
-            ratio = place[0].cost / self._lowest
+            ratio = place[0].cost / self._lowest.cost
             more = f"{number(ratio, 3)} times the" if ratio > 1.1 else f"{percent(ratio - 1, 1)} more"
             told.append(f"{len(place)} at {where} ({more} squared error)")
         more = sum(map(len, places[PLACES:]))
