@@ -62,7 +62,7 @@ class Client:
             raise DeviceError(f"the device was told to stay within {v:g} V and {i:g} A and answers with "
                               f"{int(mv) / 1e3:g} V and {int(ma) / 1e3:g} A. Nothing was applied to the motor.")
         for k, segment in enumerate(program.segments):
-            self.ask(",".join(map(str, ("S", k, *segment.fields))), f"A,S,{k}")
+            self.ask(",".join(map(str, ("S", k, segment.shape, segment.ms, *segment.args))), f"A,S,{k}")
         return int(mv) / 1e3, int(ma) / 1e3
 
     def go(self, segments: int) -> tuple[int, int]:

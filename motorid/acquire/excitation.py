@@ -52,11 +52,6 @@ class Segment:
             raise UsageError("a PRBS needs a positive bit time and a seed from 1 to 32767.")
 
     @property
-    def fields(self) -> tuple[object, ...]:
-        """The segment as fields of its frame."""
-        return (self.shape, self.ms, *self.args)
-
-    @property
     def peak(self) -> float:
         """Largest voltage of either sign, in V."""
         a, b = self.args[:2]

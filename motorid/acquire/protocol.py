@@ -100,11 +100,6 @@ class Channel:
         """Whether the raw value is a counter that wraps around."""
         return self.kind[0] == "w"
 
-    @property
-    def word(self) -> str:
-        """The channel as it stands in a header."""
-        return f"{self.name}:{self.unit}:{self.scale:.9g}:{self.offset:.9g}:{self.kind}"
-
 
 @dataclass(frozen=True)
 class Header:
@@ -135,7 +130,8 @@ class Header:
     def fields(self) -> tuple[object, ...]:
         """The header as the fields of its frame."""
         return ("H", VERSION, self.name, f"{self.rate:.9g}", self.counter_bits, self.timer_bits,
-                f"{self.v_max:.6g}", f"{self.i_max:.6g}", self.segments, *(c.word for c in self.channels))
+                f"{self.v_max:.6g}", f"{self.i_max:.6g}", self.segments,
+                *(f"{c.name}:{c.unit}:{c.scale:.9g}:{c.offset:.9g}:{c.kind}" for c in self.channels))
 
     @classmethod
     def read(cls, fields: list[str]) -> Header:

@@ -77,8 +77,15 @@ class ReadingOptions:
     force: Force = False
 
     def read(self, paths: Sequence[str]) -> list[Experiment]:
-        """Return the runs."""
-        return self._preprocessed(read_runs(paths, **self.reading))
+        """Return the runs without the ignored channels, filtered, delayed and without spikes as asked."""
+        runs, out = read_runs(paths, **self.reading), self._ignored
+        if self.median is not None and (self.median < 1 or self.median % 2 == 0):
+            raise UsageError(f"--median takes an odd number of samples, 1 or more; got {self.median}.")
+        kept = [r.without(*(c for c in out if c in r.outputs)) for r in runs]
+        kept = [r.running_median(self.median) for r in kept] if self.median else kept
+        kept = [r.levelled() for r in kept] if self.levels else kept
+        kept = [r.delayed(self.delay) for r in kept] if self.delay else kept
+        return [r.without_spikes() for r in kept] if self.no_spikes else kept
 
     @property
     def reading(self) -> dict[str, Any]:
@@ -90,23 +97,12 @@ class ReadingOptions:
         return named | {k: v for k in ("hold", "dt") if (v := getattr(self, k)) is not None}
 
     @property
-    def _ignored(self) -> tuple[str, ...]:
+    def _ignored(self) -> list[str]:
         """The channels to leave out."""
         out = _words(self.ignore)
         for channel in out:
             among(channel, CHANNELS, "measured channel", where="--ignore: ")
-        return tuple(out)
-
-    def _preprocessed(self, runs: Sequence[Experiment]) -> list[Experiment]:
-        """Return `runs` without the ignored channels, filtered, delayed and without spikes as asked."""
-        out = self._ignored
-        if self.median is not None and (self.median < 1 or self.median % 2 == 0):
-            raise UsageError(f"--median takes an odd number of samples, 1 or more; got {self.median}.")
-        kept = [r.without(*(c for c in out if c in r.outputs)) for r in runs]
-        kept = [r.running_median(self.median) for r in kept] if self.median else kept
-        kept = [r.levelled() for r in kept] if self.levels else kept
-        kept = [r.delayed(self.delay) for r in kept] if self.delay else kept
-        return [r.without_spikes() for r in kept] if self.no_spikes else kept
+        return out
 
 
 @dataclass(frozen=True)
