@@ -97,7 +97,7 @@ def quantum(y: ArrayLike) -> float:
     return 0.0
 
 
-def held_samples(y: Array) -> NDArray[np.bool_]:
+def repeats(y: Array) -> NDArray[np.bool_]:
     """Tell which samples of `y` (N,) only repeat the one before: the sensor is read more often than it measures.
 
     None of a channel that changes irregularly, moves in steps, or rests: that is as it was measured.

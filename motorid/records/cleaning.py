@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from motorid.display.numbers import counted
 from motorid.errors import DataError
-from motorid.numerics.signals import Array, held_samples
+from motorid.numerics.signals import Array, repeats
 from motorid.records.experiment import INPUTS, MIN_SAMPLES, Experiment, pauses
 from motorid.records.layout import Layout, Place
 from motorid.records.preprocessing import unwrapped
@@ -48,7 +48,7 @@ def run_from_columns(columns: Mapping[str, Array], texts: Texts, layout: Layout,
             by = "a turn" if turn == 2 * np.pi else f"{turn:.4g} rad, as a counter does,"
             said.append(f"the angle '{places['theta'].column}' jumps by {by} {jumps} times; here it goes on.")
     for c, y in outputs.items():
-        if (again := held_samples(y)).any():
+        if (again := repeats(y)).any():
             outputs[c] = np.where(again, np.nan, y)
             said.append(f"'{places[c].column}' ({c}) was read more often than it was measured: of {len(y)} samples "
                         f"{np.count_nonzero(again)} repeat the one before and do not count.")
