@@ -83,8 +83,7 @@ class Form:
 
 
 _PUSHES = (  # words, balance, carrier, quantities
-    ("a friction", "torque", "direction", ("turn", "theta", "t", "distance", "i", "v", "run", "past speed",
-                                         "past power")),
+    ("a friction", "torque", "direction", ("turn", "theta", "t", "distance", "i", "run", "past speed", "past power")),
     ("a load", "torque", "", ("turn", "theta", "t", "run")),
     ("a drag", "torque", "omega", ("t", "distance", "turn", "theta", "i", "run", "past speed", "past power")),
     ("a torque", "torque", "", ("omega", "i")),

@@ -62,7 +62,10 @@ def best_form(fit: Fit, rival: Predictions) -> FormGain | None:
 
 
 def better_forms(fit: Fit, rival: Predictions) -> list[FormGain]:
-    """Return the forms that added to `fit` predict better than `rival`, the best first."""
+    """Return the forms that added to `fit` predict better than `rival`, the best first.
+
+    What remembers comes after a function of the present that is not surely worse.
+    """
     try:
         linear = linearised(fit)
     except FAILURES:
@@ -74,7 +77,11 @@ def better_forms(fit: Fit, rival: Predictions) -> list[FormGain]:
             found = compare(Predictions(rival.blocks, {}), predicted)
             found = replace(found, gain=found.gain - np.log(len(linear.forms)))  # the best of many gains by chance
             gains += [FormGain(form, found, predicted)] if found.worth_it else []
-    return sorted(gains, key=lambda g: -g.evidence.gain)
+    gains.sort(key=lambda g: -g.evidence.gain)
+    if gains and gains[0].form.remembers:
+        best = gains[0].predictions
+        gains.sort(key=lambda g: g.form.remembers or compare(g.predictions, best).sure)
+    return gains
 
 
 def form_predictions(fit: Fit, linear: Linear, form: Form, kept: Sequence[int] | None = None) -> Predictions | None:

@@ -55,7 +55,7 @@ def test_noise_that_remains_is_where_it_remains(elsewhere, said):
     assert stopped.startswith("Missing so far (the time is up): ")
     larger = missing_text(rungs_of((0.02, 0.2), (0.02, 0.02), **errors, speed=9.4), noise, (), (), elsewhere)
     assert "remains is noise" not in larger
-    assert larger.endswith(", but is larger than the noise (speed 9.4 times).")
+    assert larger.endswith("What remains is larger than the noise (speed 9.4 times), but nothing tried predicts it.")
 
 
 @pytest.mark.parametrize(("adequate", "lead", "left"), [
