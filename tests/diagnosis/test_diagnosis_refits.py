@@ -50,6 +50,43 @@ def test_a_pool_that_breaks_costs_no_refit_and_the_budget_holds_beside_one():
         list(stages.map(abs, [-1]))
 
 
+def test_a_model_left_in_a_valley_is_settled_before_a_larger_one_counts():
+    """What was added may have done no more than to lead it out."""
+    truth = mi.dc_motor(**TRUE) + mi.effects.coulomb(tau_c=8e-3)
+    fit = mi.fit(mi.dc_motor(), [_run(truth, k) for k in range(2)])
+    looked = search.Search(fit, None, [mi.effects.coulomb, mi.effects.speed_lag], search.Stages())
+    begun = mi.Problem(fit.model + mi.effects.coulomb, fit.problem.experiments)
+    one_step = mi.LevenbergMarquardt(max_iterations=1)
+    halted = mi.solve(begun.start_at({"R": 3.0, "tau_c": 1e-4}), solver=one_step, start="model")
+    valley = search.node_of(halted, looked.held, "coulomb", looked.root)
+    larger = search.node_of(mi.solve(begun.with_(model=begun.model + mi.effects.speed_lag)), looked.held, "speed_lag",
+                            valley)
+    assert looked.settled(valley) is None, "the model to begin with is as it was given"
+    lower = looked.settled(larger)
+    assert lower.key == valley.key
+    assert lower.parent is looked.root
+    assert lower.fit.values["tau_c"] == pytest.approx(8e-3, rel=0.02)
+    assert looked.settled(larger) is None, "once is enough"
+    assert looked.settled(replace(larger, parent=lower)) is None
+
+
+def test_a_climb_goes_on_from_the_settled_model(monkeypatch):
+    truth = mi.dc_motor(**TRUE) + mi.effects.coulomb(tau_c=8e-3) + mi.effects.speed_lag(T_w=6e-3)
+    fit, lower = mi.fit(mi.dc_motor(), [_run(truth, k) for k in range(2)]), []
+
+    def once(self, larger):
+        if larger.parent is not self.root and not lower:
+            lower.append(replace(larger.parent, reason="settled"))
+            return lower[0]
+        return None
+
+    monkeypatch.setattr(search.Search, "settled", once)
+    found, _ = stepwise.explored(fit, None, [mi.effects.coulomb, mi.effects.speed_lag], search.Stages(), 3)
+    assert found.path[1] is lower[0]
+    assert found.path[-1].key == {"coulomb", "speed_lag"}
+    assert len(found.rounds) == 2, "the round that led back is not told"
+
+
 def test_a_phase_may_turn_either_way_in_a_refit(lab):
     """Its places to start from are quarters of a turn, which are no limits."""
     hidden = {"angular_friction": {"tau_m": 6e-3, "a_f": 0.6, "N_f": 1, "phi_f": -1.3}}
