@@ -109,8 +109,8 @@ _WORDS = {
     "t": "t time timestamp timestamps zeit temps tiempo tempo clock sec seconds millis micros elapsed",
     "v": "v u volt volts voltage spannung tension voltaje uq vq ua va um vm vin uin vmot umot vmotor umotor "
          "ankerspannung motorspannung klemmenspannung",
-    "i": "i current strom courant corriente iq ia im imot imotor amp amps ampere amperes ankerstrom motorstrom",
-    "omega": "omega w speed velocity vel rpm drehzahl geschwindigkeit winkelgeschwindigkeit vitesse "
+    "i": "i current curr strom courant corriente iq ia im imot imotor amp amps ampere amperes ankerstrom motorstrom",
+    "omega": "omega w speed spd velocity velo vel rpm drehzahl geschwindigkeit winkelgeschwindigkeit vitesse "
              "velocidad thetadot phidot qdot posdot dtheta dphi dq qd ω",
     "theta": "theta angle position pos phi q winkel lage drehwinkel posicion encoder enc x weg stroke "
              "travel displacement hub θ φ",

@@ -17,11 +17,11 @@ KNOWN = {
          "motorVoltage|motor_voltage_v|voltage_cmd|command|command_N|input|Vin|CH1 (V)|"
          "Ankerspannung [V]|drive voltage|volts|Tension (V)|u(t)",
     "i": "i|I_A|current_mA|current|Iq|i_q|Strom|Strom [A]|motor current (A)|i_a|ia|Courant (A)|"
-         "CH2 [A]|current_A|amps|I in mA|phase_current_A",
+         "CH2 [A]|current_A|curr_mA|amps|I in mA|phase_current_A",
     "omega": "omega|w|speed|speed_rpm|speed_rad_s|Velocity|velocity_rad_per_s|rpm|n_rpm|N [rpm]|"
              "Drehzahl|Drehzahl [1/min]|Drehzahl in U/min|vel_deg_s|omega_rev_s|speed (krpm)|"
              "theta_dot|thetadot|dtheta_dt|angular velocity [rad/s]|v_m_s|v [m/s]|speed_m_s|"
-             "Vitesse (tr/min)|speedRPM|speed_dps|encoder_speed|angle_rate|ω [rad/s]|qd",
+             "Vitesse (tr/min)|speedRPM|velo|motor_spd|speed_dps|encoder_speed|angle_rate|ω [rad/s]|qd",
     "theta": "theta|angle_deg|position_rad|position_m|pos|Position|Winkel|Winkel [°]|encoder|"
              "encoder_counts|position_counts|theta_m|x_m|x [mm]|phi|q|angle|angular position|"
              "positionDeg|Weg in mm|rotor_angle_rad",
