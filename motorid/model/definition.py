@@ -179,7 +179,8 @@ class Effect(Shown):
         """Return what the effect acts on, where it comes from, and its parameters."""
         rows = [[p.name, quantity(p.value, p.unit), "–" if p.null is None else quantity(p.null, p.unit), p.doc]
                 for p in self.parameters]
-        return Card(f"Effect: {self.name}", (Flag(self.balance),), (self.doc,),
+        text = tuple(" ".join(paragraph.split()) for paragraph in self.doc.split("\n\n"))
+        return Card(f"Effect: {self.name}", (Flag(self.balance),), text,
                     (Table(["parameter", "start", "vanishes at", "meaning"], rows),), (("model + effect", "use it"),))
 
     def __repr__(self) -> str:
