@@ -7,6 +7,7 @@ A child must predict data that it was not fitted to better, by more than chance 
 from __future__ import annotations
 
 import contextlib
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import BrokenExecutor
 from dataclasses import replace
@@ -39,6 +40,7 @@ SHORTLIST = 6
 PAIRS = 3  # refitted where no single effect helps
 NEAR = 0.4  # of the best score: what a common effect must reach to be refitted too
 ALWAYS = ("compliance", "speed_lag", "speed_delay", "driver_coast")  # their score at null says little
+OFTEN = 3  # that a larger model may be taken back to the smaller one that it led out of a valley
 ON = 0.05  # of the largest voltage: a level by itself
 FLAT_TOP = 0.04  # of the samples: a current that is as large so often may have a limit
 
@@ -118,7 +120,7 @@ class Search:
         self.stages, self.map = stages, stages.map
         self.root = node_of(fit, self.held)
         self._scores: dict[frozenset[str], list[Score]] = {}
-        self._settled: set[frozenset[str]] = set()  # models that a larger one was taken back to
+        self._settled: Counter[frozenset[str]] = Counter()  # how often a larger model was taken back to one
         self._always = (*ALWAYS, LIMITER) if any(map(_flat_topped, fit.problem.experiments)) else ALWAYS
         self.nodes: dict[frozenset[str], Node] = {self.root.key: self.root}
 
@@ -324,9 +326,9 @@ class Search:
         It had not come to its optimum, and what was added may have done no more than to lead it out of a valley.
         """
         node = larger.parent
-        if node is None or node.parent is None or node.key in self._settled:
+        if node is None or node.parent is None or self._settled[node.key] == OFTEN:
             return None
-        self._settled.add(node.key)
+        self._settled[node.key] += 1
         fit = refit(larger.fit, node.fit.model, ({n: larger.fit.values[n] for n in node.fit.values},))
         lower = node_of(fit, self.held, node.added, node.parent) if fit is not None else None
         if lower is None or not beats(lower, node):
