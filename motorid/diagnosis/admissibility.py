@@ -32,7 +32,7 @@ def objections(fit: Fit, added: Effect, before: Fit | None = None) -> str:
         if p.at_least and fit.values[p.name] < 0.98 * fit.values[p.at_least]:
             return f"{p.name} < {p.at_least}, which is not physical"
         inside = 1.02 * p.lower < fit.values[p.name] < 0.98 * p.upper
-        shaped = (added.includes and added.balance == "torque") or p.unit in LENGTHS  # a driver's ramp may be any
+        shaped = (added.includes and added.balance != "voltage") or p.unit in LENGTHS  # a driver's ramp may be any
         if p.grid and p.vary and not inside and shaped:
             return f"{p.name} runs to its limit: nothing of this shape is in the records"
         if p.vary and p.null is not None and not p.positive and fit.values[p.name] <= p.lower == p.null:

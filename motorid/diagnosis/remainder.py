@@ -12,7 +12,7 @@ import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property, reduce
-from itertools import islice, zip_longest
+from itertools import islice, product, zip_longest
 from typing import Any
 
 import casadi as ca
@@ -128,8 +128,10 @@ class Curve:
             lags = np.concatenate([values_of(functions_of(self.form, self._span), self.form, s) for s in self._signals])
             over = "rad" if self.form.on == "path" else "s"
             base, also = ("a constant and ", [-1]) if self.form.carrier else ("", [])
-            forms = [(f"{base}one lag of {number(length, 2)} {over}", lags[:, [k, *also]])
-                     for k, length in enumerate(memories_of(self.form, self._span))]
+            powers = ("", "the square of ") if self.form.bends else ("",)
+            each = product(powers, memories_of(self.form, self._span))  # in the order of the functions
+            forms = [(f"{base}{power}one lag of {number(length, 2)} {over}", lags[:, [k, *also]])
+                     for k, (power, length) in enumerate(each)]
             unit = self._own_unit
         return sorted((_closed(text, columns, value, unit) for text, columns in forms), key=lambda f: f[1])
 

@@ -111,11 +111,11 @@ def _rounds(found: Climb, max_effects: int) -> Iterator[Climb]:
             yield replace(found, text="stopped: no further effect lowers the error on data left out")
             return
         new, ordered = chosen
+        yield _with(found, new, new, new.parent is frontier[0], ())
         if not stopped and (lower := search.settled(new)) is not None:
             yield from _rounds(replace(before, path=tuple(_path(lower))), max_effects)
             return
         search.nodes |= children
-        yield _with(found, new, new, new.parent is frontier[0], ())
         if stopped:
             return
         pruned = search.pruned(new, best)

@@ -88,6 +88,18 @@ def test_a_climb_goes_on_from_the_settled_model(monkeypatch):
     assert len(found.rounds) == 2, "the round that led back is not told"
 
 
+def test_what_was_accepted_stays_where_the_time_ends_before_it_is_settled(monkeypatch):
+    fit = mi.fit(mi.dc_motor(), [_run(mi.dc_motor(**TRUE) + mi.effects.coulomb(tau_c=8e-3), k) for k in range(2)])
+
+    def out_of_time(self, larger):
+        raise OutOfTime
+
+    monkeypatch.setattr(search.Search, "settled", out_of_time)
+    found, _ = stepwise.explored(fit, None, [mi.effects.coulomb], search.Stages(), 3)
+    assert found.path[-1].key == {"coulomb"}
+    assert found.stopped == trial.OUT_OF_TIME
+
+
 def test_a_phase_may_turn_either_way_in_a_refit(lab):
     """Its places to start from are quarters of a turn, which are no limits."""
     hidden = {"angular_friction": {"tau_m": 6e-3, "a_f": 0.6, "N_f": 1, "phi_f": -1.3}}
@@ -147,6 +159,8 @@ def test_a_gap_at_its_limit_is_refused():
     assert "gap runs to its limit" in objections(at_limit, LIBRARY["backlash"])
     inside = replace(at_limit, values={**values, "gap": 3 * low})
     assert "gap" not in objections(inside, LIBRARY["backlash"])
+    shaft = replace(inside, values={**inside.values, "omega_c": problem.parameters["omega_c"].upper})
+    assert "omega_c runs to its limit" in objections(shaft, LIBRARY["backlash"])
 
 
 def test_a_small_play_in_an_elastic_shaft_is_sought_from_that_shaft():
