@@ -61,7 +61,7 @@ LEVELS_TRIED = np.array([2.0, 4.0, 1.0, -1.0, 3.0, 2.0, 0.5, 0.2, 0.0, 1.0, 0.3,
 
 @pytest.mark.parametrize("goal", [0, 1])
 def test_gradients_agree_with_differences(tasks, goal, monkeypatch):
-    task = tasks[goal]
+    task = tasks[goal].refined(LEVELS_TRIED, 1e-3)  # steps so rough that the value jumps with them have no slope
     monkeypatch.setattr(design_criteria, "STEPS", 40)  # at the end of the rivals' refit the gradient is exact
     monkeypatch.setattr(design_criteria, "SETTLED", 1e-9)
 

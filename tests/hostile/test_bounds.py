@@ -30,7 +30,7 @@ def refused(*words: object, says: str) -> None:
     done = motorid(*words)
     assert (done.status, done.out, len(done.err.splitlines())) == (2, "", 1), done
     assert says in done.err
-    assert time.process_time() - began < 5
+    assert time.process_time() - began < 30, "refused only after it was read"
 
 
 def test_a_pipe_or_a_device_is_no_record(tmp_path):

@@ -127,7 +127,7 @@ def trial(case: Case) -> dict[str, Any]:
             except mi.UsageError as e:
                 d["no_curve"] = str(e)
             else:
-                d["held_remainder"] = held_out(mi.fit((found.after or fit).model + curve, runs))
+                d["held_remainder"] = held_out(mi.fit(found.remainder.model + curve, runs))
         d["cpu_all"] = _cpu() - start
     except Exception as e:  # a result like any other
         d |= {"error": f"{type(e).__name__}: {e}", "trace": traceback.format_exc(), "cpu": d.get("cpu", _cpu() - start)}
