@@ -22,12 +22,12 @@ from numpy.typing import NDArray
 
 from motorid.channels import channel_name
 from motorid.diagnosis.misspecification import best_form
-from motorid.diagnosis.model_comparison import Node, far
+from motorid.diagnosis.model_comparison import Node, far, finer
 from motorid.diagnosis.predictive_score import Predictions
 from motorid.diagnosis.results import Adequacy
 from motorid.diagnosis.score_test import Score
 from motorid.diagnosis.thresholds import LARGER, SEARCHED
-from motorid.display.numbers import listed, number
+from motorid.display.numbers import listed, number, percent
 from motorid.estimation.result import Fit
 from motorid.numerics.autoregression import autocorrelation, effective_samples
 from motorid.numerics.signals import Array, despiked, outlier_limit, quantum
@@ -56,16 +56,27 @@ def adequacy(fit: Fit, scores: Sequence[Score] = (), level: float = FALSE_ALARM)
     of 0.9 between neighbours. Residuals beyond ten times the noise (five for an angle) are not noise of any colour.
     """
     channels = {c: _channel(fit, c) for c in fit.problem.outputs}
-    tests = [*(t for c in channels for t in _dependences(fit, c)), *_score_tests(scores)]
+    beyond = {c for c, facts in channels.items() if facts["ratio"] > LARGER and finer(fit, c)}  # scores see little else
+    tests = [*(t for c in channels if c not in beyond for t in _dependences(fit, c)),
+             *(_score_tests(scores) if not beyond else ())]
     material = [t for t in tests if t["share"] > _material(channels, t["channel"])]
     p_value = min([1.0, *(t["p"] * len(tests) for t in material)])
-    far = [c for c, facts in channels.items() if facts["ratio"] > LARGEST_RATIO / (2 if c == "theta" else 1)]
+    far = [c for c, facts in channels.items()
+           if facts["ratio"] > LARGEST_RATIO / (2 if c == "theta" else 1) and c not in beyond]
     exact = max(fit.nrmse.values(), default=1.0) < EXACT
     adequate = exact or (p_value > level and not far)
     for c, facts in channels.items():
         facts["p_value"] = min([1.0, *(t["p"] for t in tests if t["channel"] == c)])
-    text = "The errors are below a millionth of what was measured." if exact else ""
-    return Adequacy(adequate, float(p_value), FALSE_ALARM, channels, text or _text(adequate, channels, material))
+    text = "The errors are below a millionth of what was measured." if exact else _text(adequate, channels, material)
+    return Adequacy(adequate, float(p_value), FALSE_ALARM, channels, f"{text} {fine_angle_remark(fit)}".rstrip())
+
+
+def fine_angle_remark(fit: Fit) -> str:
+    """Say so where the angle is followed less closely than its encoder shows, but as closely as can be asked."""
+    if not any(fit.misfit[c] > LARGER and finer(fit, c) for c in fit.problem.outputs):
+        return ""
+    share, times = percent(fit.nrmse["theta"], 2), number(fit.misfit["theta"], 2)
+    return f"The angle's error, {share}, is {times} times what its encoder shows, but no model is asked for less."
 
 
 def _material(channels: Mapping[str, Mapping[str, float]], channel: str | None) -> float:

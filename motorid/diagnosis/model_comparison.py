@@ -13,7 +13,7 @@ import numpy as np
 
 from motorid.diagnosis.cross_validation import HeldOut
 from motorid.diagnosis.predictive_score import Evidence, Predictions, compare
-from motorid.diagnosis.thresholds import LARGER, SEARCHED
+from motorid.diagnosis.thresholds import FINER, FINER_RATE, LARGER, SEARCHED
 from motorid.estimation.result import Fit
 from motorid.model.model import Model
 from motorid.problem.problem import Problem
@@ -120,10 +120,24 @@ def rarity(name: str | None) -> int:
 
 
 def far(fit: Fit) -> list[int]:
-    """Return which channels' errors are plainly larger than their noise."""
-    return [j for j, c in enumerate(fit.problem.outputs) if fit.misfit[c] > LARGER]
+    """Return which channels' errors are plainly larger than their noise, or what can be asked of a model."""
+    return [j for j, c in enumerate(fit.problem.outputs) if fit.misfit[c] > LARGER and not finer(fit, c)]
+
+
+def finer(fit: Fit, channel: str) -> bool:
+    """Tell whether a channel is an angle that is followed as closely as can be asked: an encoder is finer than a model.
+
+    It sums up for the whole run what a lost sample or a hum does for an instant.
+    """
+    if channel != "theta" or not fit.nrmse[channel] < FINER:
+        return False
+    rates = [(np.diff(y) / np.diff(s.experiment.t)) for s in fit.simulations if channel in s.experiment.outputs
+             for y in (s.residual(channel), s.experiment.outputs[channel])]
+    error, speed = (float(np.nanmean(np.concatenate(r) ** 2)) for r in (rates[::2], rates[1::2]))
+    return error < FINER_RATE**2 * speed
 
 
 def at_noise(node: Node) -> bool:
     """Tell whether a model leaves hardly more than noise, on the held-out runs too."""
-    return not far(node.fit) and all(e.misfit < LARGER for e in node.predictions.held_out.values())
+    return not far(node.fit) and all(e.misfit < LARGER or (finer(node.fit, c) and e.nrmse < FINER)
+                                     for c, e in node.predictions.held_out.items())

@@ -13,6 +13,8 @@ UNRELIABLE = 1.5  # times the error of the fit: a prediction without a block by 
 
 # -- noise ------------------------------------------------------------------------------------------------------
 LARGER = 1.5  # of residual to noise: beyond it the noise must be coloured, or something is missing
+FINER = 1e-3  # share of an angle, RMS, below which its error is asked no more, and
+FINER_RATE = 5e-3  # share of the speed, RMS, for the rate of that error: encoders saw true models fail by 2e-4 and 3e-3
 
 # -- what an effect may be called -----------------------------------------------------------------------------------
 CONTAINED = 0.1  # of what an effect puts into its balance, RMS: what a free form may miss and still contain it

@@ -8,8 +8,9 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from motorid.channels import channel_name
+from motorid.diagnosis.adequacy import fine_angle_remark
 from motorid.diagnosis.misspecification import Grade
-from motorid.diagnosis.model_comparison import Node
+from motorid.diagnosis.model_comparison import Node, far
 from motorid.diagnosis.results import Adequacy, Candidate, Rung
 from motorid.diagnosis.score_test import Score
 from motorid.diagnosis.thresholds import ELSEWHERE, LARGER, LOST, MATERIAL
@@ -106,10 +107,11 @@ def _left(last: Fit, remaining: Adequacy, where: str = "") -> str:
     """Say what is left beside what was found."""
     if not remaining.adequate:
         return f"Not everything is explained: {remaining.text.removeprefix('Something is missing: ')}"
-    large = [f"{channel_name(c)} {number(e, 2)} times" for c, e in last.misfit.items() if e > LARGER]
+    channels = [last.problem.outputs[j] for j in far(last)]
+    large = [f"{channel_name(c)} {number(last.misfit[c], 2)} times" for c in channels]
     if large:
         return f"What remains is larger than the noise ({', '.join(large)}), but nothing tried predicts it."
-    return f"What remains is noise{where}."
+    return f"What remains is noise{where}. {fine_angle_remark(last)}".rstrip()
 
 
 def _described(fit: Fit, name: str) -> str:
