@@ -41,8 +41,9 @@ CHANGES = {"t": "changes with the time", "distance": "changes with the distance 
            "run": "differs from run to run",
            "past i": "depends on the current before", "past omega": "depends on the speed before",
            "past v": "depends on the voltage before", "path": "depends on the distance since a reversal",
-           "past speed": "depends on how fast it ran before", "past power": "depends on how fast it ran before"}
-PAST = ("past i", "past omega", "past v", "past speed", "past power", "path")
+           "past speed": "depends on how fast it ran before", "past power": "depends on how fast it ran before",
+           "past load": "depends on the power drawn before", "most i": "depends on the largest current so far"}
+PAST = ("past i", "past omega", "past v", "past speed", "past power", "past load", "path")
 MEMORIES = 8  # lengths of memory
 LASTING = 10.0  # times the longest run: a memory that forgets nothing in it
 
@@ -87,14 +88,16 @@ _PUSHES = (  # words, balance, carrier, quantities
     ("a load", "torque", "", ("turn", "theta", "t", "run")),
     ("a drag", "torque", "omega", ("t", "distance", "turn", "theta", "i", "run", "past speed", "past power")),
     ("a torque", "torque", "", ("omega", "i")),
-    ("an inertia", "torque", "acceleration", ("turn", "t", "run")),
+    ("an inertia", "torque", "acceleration", ("turn", "t", "run", "omega")),
     ("a loss of voltage", "voltage", "", ("omega", "v", "i", "t", "run")),
-    ("a gain of the voltage", "voltage", "v", ("t", "turn")),
+    ("a gain of the voltage", "voltage", "v", ("t", "turn", "past load")),
     ("a resistance", "voltage", "i", ("t", "turn", "omega", "run")),
-    ("a motor constant", "both", "", ("t", "turn", "omega", "i", "run")),
+    ("a motor constant", "both", "", ("t", "turn", "omega", "i", "run", "past i", "past v", "most i")),
 )
 FORMS = (*(Form(words, balance, on, carrier) for words, balance, carrier, quantities in _PUSHES for on in quantities),
-         Form("a gain of the speed sensor", "sensor", "turn", "omega", "omega"),
+         *(Form("a gain of the speed sensor", "sensor", on, "omega", "omega") for on in ("turn", "t")),
+         Form("a gain of the current sensor", "sensor", "t", "i", "i"),
+         Form("an error of the angle sensor", "sensor", "path", "", "theta"),
          Form("an error of the angle sensor", "sensor", "turn", "", "theta"),
          Form("an error of the speed sensor", "sensor", "omega", "", "omega"),
          Form("an error of the current sensor", "sensor", "i", "", "i"),
@@ -132,7 +135,7 @@ def shown(form: Form, fit: Fit, ranges: Mapping[str, tuple[float, float]]) -> bo
     outputs = set(fit.problem.outputs)
     if form.channel and not (form.channel in outputs and len(outputs) > 1):
         return False  # one sensor needs another to be told wrong
-    if form.channel and form.carrier and not {"omega", "theta"} <= outputs:
+    if form.channel == "omega" and form.carrier and "theta" not in outputs:
         return False  # a gain is the motor constant's, unless the motion is measured twice
     if form.on not in ranges or ranges[form.on][0] == ranges[form.on][1]:
         return False
@@ -153,9 +156,9 @@ def functions_of(form: Form, span: Span) -> list[str]:
     if form.on == "turn":
         return ["1.0", *(f"ca.{f}({k:.6g} * z)" for k in span.orders for f in ("sin", "cos"))]
     if form.remembers:
-        lags = [f"past(z, {length:.6g})" for length in memories_of(form, span)]
-        bent = [f"{lag} * ca.fabs({lag}) / {max(abs(low), abs(high)):.6g}" for lag in lags if form.bends]
-        return [*lags, *bent, *(["1.0"] if form.carrier else [])]
+        lags, top = [f"past(z, {length:.6g})" for length in memories_of(form, span)], f"{max(abs(low), abs(high)):.6g}"
+        bent = [f"{lag} * ca.fabs({lag}) / {top}" for lag in lags if form.bends]
+        return [f"{lag} / {top}" for lag in (*lags, *bent)] + ["1.0"] if form.carrier else lags + bent
     inside = f"ca.fmin(ca.fmax(z, {low:.9g}), {high:.9g})"  # nothing is known beyond
     if form.on in ("theta", "t", "distance"):
         scale = f"{np.pi / (high - low):.9g} * ({inside} - {low:.9g})"
@@ -313,6 +316,8 @@ def _signals(fit: Fit, k: int) -> dict[str, Array]:
         gone = np.cumsum(0.5 * np.abs(omega[1:] + omega[:-1]) * np.diff(run.t))  # both directions counted
         found["path"], found["distance"] = found["direction"], np.concatenate([[0.0], gone])
         found["past speed"], found["past power"] = np.abs(omega), omega**2
+    if "i" in found:
+        found["past load"], found["most i"] = found["v"] * found["i"], np.maximum.accumulate(np.abs(found["i"]))
     found |= {f"past {c}": found[c] for c in ("v", "i", "omega") if c in found}
     if "theta" in run.outputs or "omega" in run.outputs:
         found["theta"] = found["turn"] = angle_signal(run)

@@ -51,10 +51,11 @@ FINE = 36  # harmonics of a turn in a curve that is fitted
 ROUNDS = 3  # of choosing functions and fitting: near the optimum slopes show what the misfit hid before
 QUANTITIES = {"t": "m.state('clock')", "distance": "m.state('distance')", "turn": "m.theta", "theta": "m.theta",
               "omega": "m.omega", "i": "m.i", "v": "m.v", "past v": "m.v", "past i": "m.i", "past omega": "m.omega",
-              "past speed": "ca.fabs(m.omega)", "past power": "m.omega**2", "path": "m.sign(m.omega)"}
-RATES = {"t": "1.0", "distance": "ca.fabs(m.omega)"}
-SI = {"theta": "rad", "omega": "rad/s", "speed": "rad/s", "i": "A", "v": "V", "power": "rad²/s²"}
-OVER = {"": "", "A": "/A", "V": "/V", "rad/s": "·s/rad", "rad²/s²": "·s²/rad²"}
+              "past speed": "ca.fabs(m.omega)", "past power": "m.omega**2", "path": "m.sign(m.omega)",
+              "past load": "m.v * m.i", "most i": "m.state('most_i', ca.fabs(m.start['i']))"}
+RATES = {"t": "1.0", "distance": "ca.fabs(m.omega)", "most i": "ca.fmax(ca.fabs(m.i) - z, 0) / {step:.6g}"}
+SI = {"theta": "rad", "omega": "rad/s", "i": "A", "v": "V"}
+OVER = {"": "", "A": "/A", "V": "/V", "rad/s": "·s/rad"}
 FIRST = {"past i": ", m.start['i']", "past omega": ", m.start['omega']"}  # of a memory: as if it had been so before
 CARRIERS = {"": "", "direction": "m.sign(m.omega) * ", "omega": "m.omega * ", "i": "m.i * ", "v": "m.v * "}
 
@@ -182,7 +183,8 @@ class Curve:
     def unit(self) -> str:
         """Of the coefficients."""
         form, own = self.form, self._own_unit
-        by = [SI.get(n, "") for n in (form.on.removeprefix("past ") if form.remembers else "", form.carrier)]
+        before = form.on.removeprefix("past ") if form.remembers and not form.carrier else ""
+        by = [SI.get(n, "") for n in (before, form.carrier)]
         return "1" if form.carrier == "acceleration" or own in by else own + "".join(OVER[unit] for unit in by)
 
     @property
@@ -198,7 +200,7 @@ class Curve:
         form, names = self.form, list(self.sizes)
         lines = [f"z = {QUANTITIES[form.on]}"]
         if form.on in RATES:
-            lines += [f"m.rate(z, {RATES[form.on]})"]
+            lines += [f"m.rate(z, {RATES[form.on].format(step=self._span.step)})"]
         terms = self._terms
         if form.remembers:
             rate = " * ca.fabs(m.omega)" if form.on == "path" else ""

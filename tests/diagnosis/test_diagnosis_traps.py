@@ -183,3 +183,38 @@ def test_what_held_out_runs_refuse_for_the_lack_of_another_is_found_with_that(pl
     assert found.effects == ("spring", "coulomb")
     assert found.ladder.rungs[1].added == "spring + coulomb"
     assert found.after.fits == "noise"
+
+
+def fine_encoder(motor, effects, seed=5) -> list[Experiment]:
+    """An encoder that sees a millionth of a turn; the driver's voltage wanders by a thousandth, which none records."""
+    runs, rng, t = [], np.random.default_rng(seed), 2e-3 * np.arange(1500)
+    model = mi.dc_motor(R=motor.R, L=motor.L, K=motor.K, b=motor.b, J=motor.J)
+    for name, sizes in effects.items():
+        model += LIBRARY[name](**sizes)
+    for k in range(3):
+        v = np.repeat(rng.uniform(-8, 8, 30), 50)
+        wander = sum(rng.normal() * np.sin(w * t + rng.uniform(0, 6)) for w in rng.uniform(3, 40, 6))
+        blank = Experiment(t, {"v": v * (1 + 1e-3 * wander / np.std(wander))}, {c: 0 * t for c in ANGLE})
+        clean = mi.simulate(model, blank, initial="rest")[0].outputs
+        size = {"i": 5e-3 * np.std(clean["i"]), "omega": 5e-3 * np.std(clean["omega"]), "theta": 5e-6}
+        outputs = {c: y + size[c] * rng.standard_normal(len(t)) for c, y in clean.items()}
+        runs.append(Experiment(t, {"v": v}, outputs, name=f"run{k + 1}"))
+    return runs
+
+
+def test_an_encoder_finer_than_any_model_invites_no_effect(lab):
+    """What moves the current and the speed by a fifth of their noise is 50 times that of the angle."""
+    found = diagnosed(fine_encoder(lab, {"coulomb": {"tau_c": 8e-3}}))
+    assert [r.added for r in found.ladder.rungs] == [None, "coulomb"]
+    assert found.after.misfit["theta"] > 30
+    assert found.remaining.adequate
+    assert "no model is asked for less" in found.text
+
+
+def test_what_an_angle_shows_within_a_turn_is_still_asked_of_it(lab):
+    """Cogging, of which a turn's mean knows nothing."""
+    runs = [run.with_(outputs={"theta": run.outputs["theta"]})
+            for run in fine_encoder(lab, {"cogging": {"A": 4e-3, "N": 12, "phi": 0.5}})]
+    fit = mi.fit(mi.dc_motor().fix(R=lab.R, L=lab.L), runs[:2])
+    found = mi.diagnose(fit, runs[2:], effects=("cogging", "coulomb", "quadratic_drag"))
+    assert found.effects == ("cogging",)

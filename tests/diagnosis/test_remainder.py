@@ -17,6 +17,7 @@ import motorid as mi
 from motorid.cli.options import own_effects
 from motorid.diagnosis import remainder
 from motorid.diagnosis.free_forms import (
+    PAST,
     Form,
     Span,
     functions_of,
@@ -253,7 +254,7 @@ def test_slopes_of_every_form_are_those_of_the_model_with_its_curve(lab):
     fit = mi.fit(mi.dc_motor() + mi.effects.coulomb, runs)
     linear = linearised(fit)
     remembering = [f for f in linear.forms if f.remembers]
-    assert {f.on for f in remembering} == {"past v", "past i", "past omega", "past speed", "past power", "path"}
+    assert {f.on for f in remembering} == set(PAST)
     first = {f"{c}_0[{k}]": float(y[0]) for k, s in enumerate(fit.simulations) for c, y in s.states.items()}
     missed = {}
     for form, answers in linear.forms.items():
@@ -267,7 +268,8 @@ def test_slopes_of_every_form_are_those_of_the_model_with_its_curve(lab):
         own = slopes[:, [[p.name for p in problem.unknown].index(n) for n in curve.sizes]]
         own *= np.sign(np.sum(own * answers))
         missed[form] = float(np.linalg.norm(own - answers) / np.linalg.norm(answers))
-    assert max(miss for f, miss in missed.items() if f.on != "turn") < 0.12  # high orders turn far within a sample
+    within = {f for f in missed if f.on == "turn" or (f.on, f.channel) == ("path", "theta")}  # what changes within a sample
+    assert max(miss for f, miss in missed.items() if f not in within) < 0.12
     assert np.median(list(missed.values())) < 0.03
 
 
