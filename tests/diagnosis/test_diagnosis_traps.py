@@ -194,7 +194,7 @@ def fine_encoder(motor, effects, seed=5) -> list[Experiment]:
     for k in range(3):
         v = np.repeat(rng.uniform(-8, 8, 30), 50)
         wander = sum(rng.normal() * np.sin(w * t + rng.uniform(0, 6)) for w in rng.uniform(3, 40, 6))
-        blank = Experiment(t, {"v": v * (1 + 1e-3 * wander / np.std(wander))}, {c: 0 * t for c in ANGLE})
+        blank = Experiment(t, {"v": v * (1 + 1e-3 * wander / np.std(wander))}, dict.fromkeys(ANGLE, 0 * t))
         clean = mi.simulate(model, blank, initial="rest")[0].outputs
         size = {"i": 5e-3 * np.std(clean["i"]), "omega": 5e-3 * np.std(clean["omega"]), "theta": 5e-6}
         outputs = {c: y + size[c] * rng.standard_normal(len(t)) for c, y in clean.items()}

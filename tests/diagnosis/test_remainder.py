@@ -268,7 +268,7 @@ def test_slopes_of_every_form_are_those_of_the_model_with_its_curve(lab):
         own = slopes[:, [[p.name for p in problem.unknown].index(n) for n in curve.sizes]]
         own *= np.sign(np.sum(own * answers))
         missed[form] = float(np.linalg.norm(own - answers) / np.linalg.norm(answers))
-    within = {f for f in missed if f.on == "turn" or (f.on, f.channel) == ("path", "theta")}  # what changes within a sample
+    within = {f for f in missed if f.on == "turn" or (f.on, f.channel) == ("path", "theta")}  # quicker than samples
     assert max(miss for f, miss in missed.items() if f not in within) < 0.12
     assert np.median(list(missed.values())) < 0.03
 
@@ -323,19 +323,11 @@ NARROW = {"a resistance that changes with the angle within a turn"}
     ids=["late", "ducted", "warmed", "run-in", "segment"])
 def test_what_remembers_fades_or_is_narrow_is_found(law, channels, follows, closed, lab):
     """As of a fluid or of eddy currents; of grease; of new brushes; of the waves of a narrow dip none helps alone."""
-    rng = np.random.default_rng(3)
-    plain = [record(driven(lab, {}, w, 800, 1e-3, rng), "logger", channels, lab, rng, w) for w in FAST]
-    model = mi.fit(mi.dc_motor(), plain).model + law
-    runs = []
-    for run in plain:
-        clean = mi.simulate(model, run)[0].outputs
-        runs.append(run.with_(outputs={c: y + 0.005 * np.std(y) * rng.standard_normal(len(y))
-                                       for c, y in clean.items()}))
+    runs, floor = _with_law(law, channels, lab)
     found = mi.diagnose(mi.fit(mi.dc_motor(), runs[:2]), runs[2:], effects=("coulomb", "quadratic_drag"))
     assert found.remainder.follows in follows
     fit = mi.fit(found.remainder.model + found.remainder.as_effect(), runs[:2])
     before, after = (mi.evaluate(f, runs[2]).nrmse for f in (found.best, fit))
-    floor = {c: 0.005 * np.std(y) / np.sqrt(np.mean(y**2)) for c, y in runs[2].outputs.items()}
     assert max(after[c] / floor[c] for c in after) < closed
     assert min(before[c] / after[c] for c in after) > 1.8
     text, miss = found.remainder.nearest()[0]
@@ -345,6 +337,63 @@ def test_what_remembers_fades_or_is_narrow_is_found(law, channels, follows, clos
         assert re.match("(a constant and )?(the square of )?one lag of .* N·m$", text)
         assert ("square" in text) == (law is ducted)
         assert miss < 0.3
+
+
+@mi.effect(balance="sensor")
+def tacho_drifts(m, k=mi.P(0.1, "", null=0.0)):
+    z = m.state("clock")
+    m.rate(z, 1.0)
+    m.measure("omega", m.measured("omega") * (1 - k * (1 - ca.exp(-z / 0.3))))
+
+
+@mi.effect(balance="sensor")
+def loose_encoder(m, g=mi.P(0.05, "rad", null=0.0)):
+    """Play in its coupling, taken up over a fiftieth of a radian."""
+    z = m.state("side")
+    m.rate(z, (m.sign(m.omega) - z) * ca.fabs(m.omega) / 0.02)
+    m.measure("theta", m.measured("theta") - g * z)
+
+
+@mi.effect(balance="torque")
+def governor(m, c=mi.P(0.5, "", null=0.0)):
+    """Weights that fly outwards."""
+    m.scale("J", 1 + c * (m.omega / 150) ** 2)
+
+
+@mi.effect(balance="voltage")
+def pumped(m, k=mi.P(0.04, "1/W", null=0.0)):
+    """A supply with a capacitor, which the power drawn empties and braking fills."""
+    z = m.state("bus")
+    m.rate(z, (m.v * m.i - z) / 0.08)
+    m.voltage -= m.v * k * z
+
+
+@pytest.mark.parametrize(("law", "channels", "follows"), [
+    (tacho_drifts, ANGLE, "a gain of the speed sensor that changes with the time"),
+    (loose_encoder, ANGLE, "an error of the angle sensor that depends on the distance since a reversal"),
+    (governor, ANGLE[:2], "an inertia that changes with the speed"),
+    (pumped, ANGLE[:2], "a gain of the voltage that depends on the power drawn before")])
+def test_what_changes_in_sensors_inertia_and_supply_is_found(law, channels, follows, lab):
+    runs, floor = _with_law(law, channels, lab)
+    found = mi.diagnose(mi.fit(mi.dc_motor(), runs[:2]), runs[2:], effects=("coulomb", "quadratic_drag"))
+    assert found.remainder.follows == follows
+    fit = mi.fit(found.remainder.model + found.remainder.as_effect(), runs[:2])
+    before, after = (mi.evaluate(f, runs[2]).nrmse for f in (found.best, fit))
+    assert max(after[c] / floor[c] for c in after) < 1.1
+    assert max(before[c] / after[c] for c in after) > 2.5
+
+
+def _with_law(law, channels, lab):
+    """Return three runs of the lab motor with a law beside it, the last to hold out, and the error of its noise."""
+    rng = np.random.default_rng(3)
+    plain = [record(driven(lab, {}, w, 800, 1e-3, rng), "logger", channels, lab, rng, w) for w in FAST]
+    model = mi.fit(mi.dc_motor(), plain).model + law
+    runs = []
+    for run in plain:
+        clean = mi.simulate(model, run)[0].outputs
+        runs.append(run.with_(outputs={c: y + 0.005 * np.std(y) * rng.standard_normal(len(y))
+                                       for c, y in clean.items()}))
+    return runs, {c: 0.005 * np.std(y) / np.sqrt(np.mean(y**2)) for c, y in runs[2].outputs.items()}
 
 
 def test_nothing_follows_a_reversal_where_the_motor_never_turns_back(rng):
