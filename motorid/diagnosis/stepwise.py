@@ -266,7 +266,8 @@ def explored(fit: Fit, validate: Sequence[Experiment] | Experiment | None, effec
     if not found.stopped and records is not as_it_was and as_it_was.suits(last):
         again = as_it_was
     elif not found.stopped and (reading := _late_reading(found.path)):
-        again = records.read(reading)
+        late = records.read(reading)
+        again = late if len(found.path) == 1 or late.suits(last) else None
     if again is not None:
         anew = climbed(again)
         new = anew.path[-1]

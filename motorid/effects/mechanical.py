@@ -155,7 +155,8 @@ def torque_ripple(
         m.scale("K_e", 1 + e_r * wave)
 
 
-CORNER = 0.01  # of half a gap: a stiff shaft is twisted by much less than the gap, and a wide corner is a soft shaft
+CORNER = 0.01  # of half a gap: a stiff shaft is twisted by much less than the gap, and a wide corner is a soft shaft,
+WIDE = 0.1  # rad: which a corner wider than a thousandth of a radian is, however large the gap
 
 
 def _two_inertias(m: Equations, share, resonance, zeta, twist_of, name: str) -> None:
@@ -192,7 +193,7 @@ def backlash(m: Equations,
              zeta_c=P(0.2, "", positive=True, upper=2.0, grid=(0.1, 0.5), doc="damping ratio while in contact")):
     """Backlash between two inertias, elastic in contact. Nordin & Gutman, Automatica 38(10), 2002."""
     half = gap / 2
-    width = CORNER * half
+    width = CORNER * half / (1 + half / WIDE)
 
     def in_contact(twist):
         # Smooth dead zone (softplus of square-root type) and its slope.
