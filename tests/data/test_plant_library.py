@@ -54,3 +54,25 @@ def test_the_library_and_the_plant_know_the_same_effects_by_the_same_words(plant
     shaped_otherwise = {"lugre", "compliance", "backlash", "slip_clutch", "freewheel", "driver_coast"}
     for name in set(LIBRARY) - shaped_otherwise:
         assert set(NUMBERS[name]) <= {p.name for p in LIBRARY[name].parameters}, name
+
+
+def test_corners_of_a_wide_gap_are_as_sharp_as_an_elastic_shaft_asks(plant):
+    """A third of a turn of play, against the same law with hard corners."""
+    m, gap, r, w_c, zeta = plant.MOTORS["lab"], 2.0, 0.45, 750.0, 0.3
+    t, v = plant.staircase([3, -2, 2], 0.06)
+
+    def rhs(_, x, u):
+        i, w, _, twist, load = x
+        elastic = np.sign(twist) * max(abs(twist) - gap / 2, 0.0)
+        push = (1 - r) * (w_c**2 * elastic + 2 * zeta * w_c * (w - load)) if elastic else 0.0
+        dw = (m.K * i - m.b * w - m.J * r * push) / (m.J * (1 - r))
+        return (u - m.R * i - m.K * w) / m.L, dw, w, w - load, push
+
+    x, hard = np.zeros(5), []
+    for u, dt in zip(v, np.diff(t, append=2 * t[-1] - t[-2]), strict=True):
+        hard.append(x[:2])
+        x = solve_ivp(rhs, (0, dt), x, args=(u,), method="LSODA", rtol=1e-7, atol=1e-10, max_step=2e-5).y[:, -1]
+    model = dc_motor(R=m.R, L=m.L, K=m.K, b=m.b, J=m.J) + LIBRARY["backlash"]
+    smooth = by_library(model.replace(gap=gap, r_gap=r, omega_c=w_c, zeta_c=zeta), t, v)
+    for a, b in zip(smooth, np.array(hard).T, strict=True):
+        assert np.sqrt(np.mean((a - b) ** 2) / np.mean(b**2)) < 0.01
