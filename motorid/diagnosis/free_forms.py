@@ -42,8 +42,9 @@ CHANGES = {"t": "changes with the time", "distance": "changes with the distance 
            "past i": "depends on the current before", "past omega": "depends on the speed before",
            "past v": "depends on the voltage before", "path": "depends on the distance since a reversal",
            "past speed": "depends on how fast it ran before", "past power": "depends on how fast it ran before",
-           "past load": "depends on the power drawn before", "most i": "depends on the largest current so far"}
-PAST = ("past i", "past omega", "past v", "past speed", "past power", "past load", "path")
+           "past load": "depends on the power drawn before", "past size": "depends on the voltage before",
+           "most i": "depends on the largest current so far"}
+PAST = ("past i", "past omega", "past v", "past speed", "past power", "past load", "past size", "path")
 MEMORIES = 8  # lengths of memory
 LASTING = 10.0  # times the longest run: a memory that forgets nothing in it
 
@@ -92,7 +93,7 @@ _PUSHES = (  # words, balance, carrier, quantities
     ("a loss of voltage", "voltage", "", ("omega", "v", "i", "t", "run")),
     ("a gain of the voltage", "voltage", "v", ("t", "turn", "past load")),
     ("a resistance", "voltage", "i", ("t", "turn", "omega", "run")),
-    ("a motor constant", "both", "", ("t", "turn", "omega", "i", "run", "past i", "past v", "most i")),
+    ("a motor constant", "both", "", ("t", "turn", "omega", "i", "run", "past i", "past size", "most i")),
 )
 FORMS = (*(Form(words, balance, on, carrier) for words, balance, carrier, quantities in _PUSHES for on in quantities),
          *(Form("a gain of the speed sensor", "sensor", on, "omega", "omega") for on in ("turn", "t")),
@@ -318,6 +319,7 @@ def _signals(fit: Fit, k: int) -> dict[str, Array]:
         found["past speed"], found["past power"] = np.abs(omega), omega**2
     if "i" in found:
         found["past load"], found["most i"] = found["v"] * found["i"], np.maximum.accumulate(np.abs(found["i"]))
+        found["past size"] = np.abs(found["v"])
     found |= {f"past {c}": found[c] for c in ("v", "i", "omega") if c in found}
     if "theta" in run.outputs or "omega" in run.outputs:
         found["theta"] = found["turn"] = angle_signal(run)

@@ -52,9 +52,10 @@ ROUNDS = 3  # of choosing functions and fitting: near the optimum slopes show wh
 QUANTITIES = {"t": "m.state('clock')", "distance": "m.state('distance')", "turn": "m.theta", "theta": "m.theta",
               "omega": "m.omega", "i": "m.i", "v": "m.v", "past v": "m.v", "past i": "m.i", "past omega": "m.omega",
               "past speed": "ca.fabs(m.omega)", "past power": "m.omega**2", "path": "m.sign(m.omega)",
-              "past load": "m.v * m.i", "most i": "m.state('most_i', ca.fabs(m.start['i']))"}
+              "past load": "m.v * m.i", "past size": "ca.fabs(m.v)",
+              "most i": "m.state('most_i', ca.fabs(m.start['i']))"}
 RATES = {"t": "1.0", "distance": "ca.fabs(m.omega)", "most i": "ca.fmax(ca.fabs(m.i) - z, 0) / {step:.6g}"}
-SI = {"theta": "rad", "omega": "rad/s", "i": "A", "v": "V"}
+SI = {"theta": "rad", "omega": "rad/s", "i": "A", "v": "V", "size": "V"}
 OVER = {"": "", "A": "/A", "V": "/V", "rad/s": "·s/rad"}
 FIRST = {"past i": ", m.start['i']", "past omega": ", m.start['omega']"}  # of a memory: as if it had been so before
 CARRIERS = {"": "", "direction": "m.sign(m.omega) * ", "omega": "m.omega * ", "i": "m.i * ", "v": "m.v * "}

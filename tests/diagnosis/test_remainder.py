@@ -368,11 +368,22 @@ def pumped(m, k=mi.P(0.04, "1/W", null=0.0)):
     m.voltage -= m.v * k * z
 
 
+@mi.effect(balance="voltage")
+def wound_field(m, k=mi.P(0.3, "", null=0.0)):
+    """Part of the field by a winding across the terminals, rectified, that follows late."""
+    z = m.state("field")
+    m.rate(z, (ca.fabs(m.v) / 6 - z) / 0.1)
+    lost = k * (1 - z) * m.symbols["K"]
+    m.torque -= lost * m.i
+    m.voltage += lost * m.omega
+
+
 @pytest.mark.parametrize(("law", "channels", "follows"), [
     (tacho_drifts, ANGLE, "a gain of the speed sensor that changes with the time"),
     (loose_encoder, ANGLE, "an error of the angle sensor that depends on the distance since a reversal"),
     (governor, ANGLE[:2], "an inertia that changes with the speed"),
-    (pumped, ANGLE[:2], "a gain of the voltage that depends on the power drawn before")])
+    (pumped, ANGLE[:2], "a gain of the voltage that depends on the power drawn before"),
+    (wound_field, ANGLE[:2], "a motor constant that depends on the voltage before")])
 def test_what_changes_in_sensors_inertia_and_supply_is_found(law, channels, follows, lab):
     runs, floor = _with_law(law, channels, lab)
     found = mi.diagnose(mi.fit(mi.dc_motor(), runs[:2]), runs[2:], effects=("coulomb", "quadratic_drag"))
