@@ -47,8 +47,6 @@ class Client:
         """Return the header of the device, having stopped whatever it did; a DeviceError guesses why nobody answers."""
         try:
             header = Header.read(self.ask("?", "H", within=BOOT))
-        except TimeoutError:
-            raise DeviceError(self._nobody()) from None
         except LinkLost as error:
             raise DeviceError(f"{error} Nobody had answered yet: is it in use by another recorder?") from None
         self.ask("X", "E,done")
@@ -72,8 +70,7 @@ class Client:
         return int(answer[2]), int(answer[3])
 
     def ask(self, command: str, answer: str, within: float = ANSWER) -> list[str]:
-        """Send a command until its answer comes; return its fields. DeviceError if the device refuses or is silent
-        (TimeoutError at the first command)."""
+        """Send a command until its answer comes; return its fields. DeviceError if the device refuses or is silent."""
         end, wanted = time.monotonic() + within, answer.split(",")
         while (now := time.monotonic()) < end:
             self.link.write(frame(command))
@@ -87,9 +84,8 @@ class Client:
                         return item.fields
                     elif item.fields[:2] == ["E", "refused"]:
                         raise DeviceError(f"the device refuses '{command}': {','.join(item.fields[2:])}.")
-        if command == "?":
-            raise TimeoutError
-        raise DeviceError(f"the device did not answer '{command}' within {within:g} s.")
+        silent = f"the device did not answer '{command}' within {within:g} s."
+        raise DeviceError(self._nobody() if command == "?" else silent)
 
     def _nobody(self) -> str:
         seen, bad = self.decoder.seen, sum(self.decoder.bad.values())

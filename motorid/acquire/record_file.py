@@ -90,7 +90,7 @@ class RecordFile:
         self.columns = ",".join(["time_s", *(column(channels[k]) for k in self._order), "sample"])
         self._pending: list[str] = []
         self._next, self._index0, self._time0 = 0, 0, 0.0
-        self._last: Row | None = None
+        self._last = Row(-1, -1 / rate, (0.0,) * len(channels))  # at rest, before the first one
         tail = read_tail(out) if mode == "resume" and out.stat().st_size else None
         if tail and tail.columns != self.columns:
             raise DataError(f"{out} has the columns {tail.columns}, but the device now sends {self.columns}. "
@@ -130,8 +130,7 @@ class RecordFile:
     def mark_missing(self, until: int, commanded: Commanded = lambda _: None) -> None:
         """Mark as missing what was made up to sample `until` (not included) and never came."""
         if until > self._next:
-            last = self._last.time if self._last else -1 / self.rate
-            end = Row(until, last + (until - self._next + 1) / self.rate, (math.nan,) * len(self._order))
+            end = Row(until, self._last.time + (until - self._next + 1) / self.rate, (math.nan,) * len(self._order))
             self._fill(end, commanded)
             self._next = until
 
@@ -160,8 +159,7 @@ class RecordFile:
     def _fill(self, end: Row, commanded: Commanded) -> None:
         """Mark the samples from the next one due up to `end` (not included) as missing."""
         first, n = self._next, end.index - self._next
-        start = self._last.time if self._last else -1 / self.rate
-        held = self._last.values[self._v] if self._last else 0.0
+        start, held = self._last.time, self._last.values[self._v]
         step = (end.time - start) / (n + 1)
         for k in range(n) if n <= min(FILL_UP_TO * self.rate, MOST_FILLED) else (0, n - 1):
             known = commanded(first + k)
@@ -220,12 +218,11 @@ class Appender:
             os.close(self._fd)
 
     def _keep_syncing(self) -> None:
-        while not self._over.wait(SYNC_EVERY):
-            try:
+        try:
+            while not self._over.wait(SYNC_EVERY):
                 self._sync()
-            except OSError as error:
-                self._trouble = error
-                return
+        except OSError as error:
+            self._trouble = error
 
     def _sync(self) -> None:
         size = self._size

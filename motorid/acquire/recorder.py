@@ -146,10 +146,9 @@ def _left(whole: Program, tail: Tail) -> Program:
 
     The segment that was interrupted is repeated from its start, since the motor stood still meanwhile.
     """
-    meta = tail.meta
-    left = Program(whole.segments[int(meta.get("segments done", 0)):], whole.words).after(
-        tail.time - float(meta.get("part begins", 0)))
-    if meta.get("ended") == "done" or (whole.segments and not left.segments):
+    left = Program(whole.segments[int(tail.meta.get("segments done", 0)):], whole.words).after(
+        tail.time - float(tail.meta.get("part begins", 0)))
+    if tail.meta.get("ended") == "done" or (whole.segments and not left.segments):
         raise UsageError("this record is complete; there is nothing to resume. Choose another name for --out.")
     return left
 

@@ -121,14 +121,12 @@ class Session:
                 self._end("limit" if "i" in over else "voltage")
 
     def _message(self, fields: list[str]) -> None:
-        if fields[0] == "H":
+        made = int(fields[2]) if fields[:2] == ["E", "done"] and "".join(fields[2:3]).isdigit() else None
+        if fields[0] == "H" or (made is not None and made < self.timeline.next_index):
             self._end("restarted")
-        elif fields[:2] == ["E", "done"] and len(fields) > 2 and fields[2].isdigit():
-            if int(fields[2]) < self.timeline.next_index:
-                self._end("restarted")
-            else:
-                self.made = int(fields[2])
-                self._end(REASONS.get("".join(fields[3:4]), "done"))
+        elif made is not None:
+            self.made = made
+            self._end(REASONS.get("".join(fields[3:4]), "done"))
 
     def _end(self, why: str, detail: str = "") -> None:
         if not self.ended:
@@ -171,16 +169,15 @@ class Session:
 
     def _close(self) -> Recording:
         self.client.decoder.close()
-        if self.ended == "disk":
-            return self._outcome()
-        try:
-            self.file.add(self.timeline.finish(self.made), self.commanded)
-            self.file.mark_missing(self.made or 0, self.commanded)
-            self.file.note(self._outcome().meta)
-            self.file.flush()
-            self.file.close()
-        except OSError as error:
-            self.ended, self.detail = "disk", error.strerror or str(error)
+        if self.ended != "disk":
+            try:
+                self.file.add(self.timeline.finish(self.made), self.commanded)
+                self.file.mark_missing(self.made or 0, self.commanded)
+                self.file.note(self._outcome().meta)
+                self.file.flush()
+                self.file.close()
+            except OSError as error:
+                self.ended, self.detail = "disk", error.strerror or str(error)
         return self._outcome()
 
     def _outcome(self) -> Recording:

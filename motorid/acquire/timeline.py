@@ -81,12 +81,10 @@ class Timeline:
     def finish(self, made: int | None = None) -> list[Row]:
         """End the run of `made` samples (None: nobody knows) and return the last row if it was held back."""
         held, self._doubtful = self._doubtful, None
-        if held is None:
-            return []
-        if made is not None and held[0].index >= made:
+        if held and made is not None and held[0].index >= made:
             self.bad["implausible"] += 1
             return []
-        return [self._row(*held)]
+        return [self._row(*held)] if held else []
 
     def _follow(self, last: _Mark, sample: Sample, host: float) -> _Mark | str:
         """Where `sample` is, coming after `last`, or why it cannot come after it."""

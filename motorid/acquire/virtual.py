@@ -60,12 +60,9 @@ class VirtualDevice:
 
     def receive(self, data: bytes, now: float = 0.0) -> bytes:
         """Take bytes from the computer at clock `now` (s) and return the answers."""
-        answers = b""
-        for item in self._decoder.feed(data):
-            if isinstance(item, Message):
-                self.heard = now
-                answers += self._answer(item.fields)
-        return answers
+        messages = [item for item in self._decoder.feed(data) if isinstance(item, Message)]
+        self.heard = now if messages else self.heard
+        return b"".join([self._answer(m.fields) for m in messages])
 
     def watch(self, now: float) -> bytes:
         """Switch the motor off if nobody has been heard for a second; return what there is to say."""

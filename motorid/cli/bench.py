@@ -69,8 +69,9 @@ def record_command(port: Port, out: Out, baud: Baud = 115_200, excite: Excite = 
     """
     with _live(quiet) as progress:
         try:
+            volts, amperes = (math.inf if limit is None else limit for limit in (limit_voltage, limit_current))
             outcome = record(port, out, baud=baud, excite=excite, duration=duration,
-                             limit_voltage=_limit(limit_voltage), limit_current=_limit(limit_current),
+                             limit_voltage=volts, limit_current=amperes,
                              calibration=calibration, resume=resume, force=force, timeout=timeout, progress=progress)
         except KeyboardInterrupt:
             typer.echo("Stopped before anything was recorded.", err=True)
@@ -79,10 +80,6 @@ def record_command(port: Port, out: Out, baud: Baud = 115_200, excite: Excite = 
     if outcome.ended == "interrupted" or not outcome.complete:
         raise typer.Exit(INTERRUPTED if outcome.ended == "interrupted" else FAILED)
     typer.echo(printable(f"Now: motorid diagnose {outcome.path}"))
-
-
-def _limit(value: float | None) -> float:
-    return math.inf if value is None else value
 
 
 @contextmanager

@@ -134,8 +134,7 @@ def _check_children(parts: list[Element], order: str, count: int, named: bool, d
 def _load(data: bytes) -> dict[str, object]:
     from scipy.io import loadmat
 
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"):
         try:
             found = loadmat(io.BytesIO(data), simplify_cells=True)
         except Exception as error:  # a damaged file makes loadmat fail in every way there is

@@ -33,8 +33,7 @@ _RATIOS = {
     2 * np.pi: "the speed in turns per second: units={'omega': 'rev/s'}",
     1 / (2 * np.pi): "the angle in turns: units={'theta': 'rev'}",
     6.0: "the speed in rpm and the angle in degrees: units={'omega': 'rpm', 'theta': 'deg'}",
-    1000.0: "one of them in thousandths",
-    1e-3: "one of them in thousandths",
+    **dict.fromkeys((1000.0, 1e-3), "one of them in thousandths"),
 }
 
 

@@ -93,8 +93,7 @@ def _dates(cells: Sequence[object], column: str) -> Array:
     import pandas as pd
 
     series = pd.Series(cells, dtype=object)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"):
         try:
             stamps = pd.to_datetime(series, errors="coerce", format="ISO8601", utc=True)
             clock = series.where(series.astype(str).str.contains("[:a-zA-Z]"))  # bare numbers would be nanoseconds

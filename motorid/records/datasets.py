@@ -18,9 +18,8 @@ def _root() -> Path:
     """The data folder of a checkout (beside the package) or of an installed wheel (inside it)."""
     package = Path(__file__).resolve().parents[1]
     places = (package.parent / "data", package / "data")
-    for place in places:
-        if (place / "truth.json").is_file():
-            return place
+    if found := next((place for place in places if (place / "truth.json").is_file()), None):
+        return found
     raise DataError(f"the shipped records were not found; looked for truth.json in {' and '.join(map(str, places))}. "
                     "Install motorid from a wheel, or work in a checkout that has its data folder.")
 

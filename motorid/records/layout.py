@@ -159,13 +159,10 @@ def _apply_units(places: dict[str, Place], labels: Sequence[str], units: Mapping
 
 def _settle_counts(places: dict[str, Place], notes: list[str]) -> None:
     """Leave out an angle in counts of unknown size, unless it is all there is."""
-    for channel in ("theta", "omega"):
-        place = places.get(channel)
-        if place is None or not math.isnan(place.unit.factor):
-            continue
+    for channel in [c for c in ("theta", "omega") if c in places and math.isnan(places[c].unit.factor)]:
         if {"i", "omega", "theta"} & set(places) == {channel}:
-            headers.require_unit(place.unit.label, channel)
-        del places[channel]
+            headers.require_unit(places[channel].unit.label, channel)
+        place = places.pop(channel)
         notes.append(f"left out '{place.column}': it is in encoder counts, and how many make one turn is not "
                      f"known; to use it, say units={{'{channel}': 'counts:2048'}}.")
 

@@ -6,9 +6,10 @@ import csv
 import io
 import re
 import warnings
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import count
 
 import numpy as np
 from numpy.typing import NDArray
@@ -229,8 +230,7 @@ def _parse(rows: list[str], dialect: Dialect, labels: list[str],
     import pandas as pd
 
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("error", pd.errors.ParserWarning)  # it would lose cells
+        with warnings.catch_warnings(action="error", category=pd.errors.ParserWarning):  # it would lose cells
             frame = pd.read_csv(io.StringIO("\n".join(rows)), sep=dialect.delimiter or r"\s+", decimal=dialect.decimal,
                                 header=None, names=range(len(labels)), index_col=False, skipinitialspace=True,
                                 low_memory=False, na_values=sorted(MISSING - {""}))
@@ -277,9 +277,6 @@ def numbers(values: object, decimal: str = ".") -> tuple[NDArray[np.float64], in
 def unique_labels(labels: Sequence[str]) -> list[str]:
     """Give every column a name of its own: empty ones by position, repeated ones with a number."""
     named = [label.strip().strip("\"'") or f"column {k + 1}" for k, label in enumerate(labels)]
-    seen: Counter[str] = Counter()
-    result = []
-    for label in named:
-        seen[label] += 1
-        result.append(label if seen[label] == 1 else f"{label} ({seen[label]})")
+    seen: defaultdict[str, count[int]] = defaultdict(lambda: count(1))
+    result = [label if (n := next(seen[label])) == 1 else f"{label} ({n})" for label in named]
     return result if len(set(result)) == len(result) else [f"{c} [{k + 1}]" for k, c in enumerate(named)]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from html import escape
 from typing import Any
@@ -89,45 +89,42 @@ class Explorer:
     # -- what can be done --------------------------------------------------------------------------------
     def tick(self, name: str, on: bool = True) -> None:
         """Put the effect `name` into the model, at a size that suits the records, or take it out."""
-        with self._reasons_said():
+        with self._reasons_said(self._show_controls):
             if name not in self._effects:
                 raise UsageError(f"there is no effect '{name}' here.")
             model = self.model + self._effects[name] if on else self.model.without(name)
             self._take(with_suited_effects(model, self.runs), f"{'with' if on else 'without'} {name}")
-        self._show_controls()
 
     def move(self, **values: float) -> None:
         """Set parameters, in SI units."""
         known = self.model.parameters
-        with self._reasons_said():
+        with self._reasons_said(self._show_values):
             for name in values:
                 if name not in known:
                     raise UsageError(f"the model has no parameter '{name}'; it has {', '.join(known)}.")
             self._take(self.model.start_at(values), "moved")
-        self._show_values()
 
     def refit(self) -> None:
         """Fit the model with the ticked effects, from its present values."""
         p = self._first.problem
-        with self._reasons_said():
+        with self._reasons_said(self._show_controls):
             self.fit = fit(self.model, self.runs, engine=p.engine, initial=p.initial, weights=p.weights, loss=p.loss)
             self._take(self.fit.model, f"refitted: {self.fit.status} in {duration(self.fit.seconds)}")
-        self._show_controls()
 
     def reset(self) -> None:
         """Go back to the fit that it began with."""
         self.fit = self._first
-        with self._reasons_said():
+        with self._reasons_said(self._show_controls):
             self._take(self._first.model, "back to the first fit")
-        self._show_controls()
 
     @contextmanager
-    def _reasons_said(self) -> Iterator[None]:
-        """Say why something cannot be done, and stay as it was."""
+    def _reasons_said(self, show: Callable[[], None]) -> Iterator[None]:
+        """Say why something cannot be done, and stay as it was; either way, `show` what is so now."""
         try:
             yield
         except MotoridError as error:
             self._say(str(error))
+        show()
 
     def _take(self, model: Model, done: str) -> None:
         """Take `model` if it can be simulated."""
@@ -170,11 +167,10 @@ class Explorer:
                        "hover for the law."), *found]
 
     def _box(self, name: str) -> Any:
-        w = self._w
         gain = self._gains.get(name, 0.0)
         label = f"{name} −{100 * gain:.0f} %" if gain >= 0.005 else name
-        box = w.Checkbox(value=name in self.model.effect_names, description=label, indent=False,
-                         tooltip=self._effects[name].doc, layout=w.Layout(width="auto"))
+        box = self._w.Checkbox(value=name in self.model.effect_names, description=label, indent=False,
+                               tooltip=self._effects[name].doc, layout=self._w.Layout(width="auto"))
         box.observe(lambda change: self._quiet or self.tick(name, change["new"]), "value")
         return box
 

@@ -201,18 +201,15 @@ def _carry_laws(model: Model) -> None:
 def _fit_one(task: tuple[Model, Mapping[str, Any], Mapping[str, Any]], motor: tuple[str, Records]) -> dict[str, Any]:
     (model, options, reading), (name, records), began = task, motor, time.perf_counter()
     try:
-        row = _row(fit(model, _runs(records, reading), **options))
+        every = [records] if isinstance(records, Experiment | str | Path) else records
+        paths = [r for r in every if not isinstance(r, Experiment)]
+        runs = [r for r in every if isinstance(r, Experiment)] + (read_runs(paths, **reading) if paths else [])
+        row = _row(fit(model, runs, **options))
     except Exception as error:  # one motor's trouble, whatever it is, must not end the batch
         if interruption.asked:
             raise KeyboardInterrupt from None
         row = {"status": "failed", "message": f"{type(error).__name__}: {error}", "flags": ["failed"]}
     return {"motor": name, **row, "seconds": time.perf_counter() - began}
-
-
-def _runs(records: Records, reading: Mapping[str, Any]) -> list[Experiment]:
-    every = [records] if isinstance(records, Experiment | str | Path) else records
-    paths = [r for r in every if not isinstance(r, Experiment)]
-    return [r for r in every if isinstance(r, Experiment)] + (read_runs(paths, **reading) if paths else [])
 
 
 def _row(found: Fit) -> dict[str, Any]:

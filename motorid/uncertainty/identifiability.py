@@ -161,10 +161,8 @@ class Identifiability(Printed):
 
     def card(self) -> Card:
         """Return the verdict, and what a fit would know of each parameter."""
-        std = self.std
         rows = []
-        for n, value, unit, size in zip(self.names, self.values, self.units, self.sizes, strict=True):
-            sd = std[n]
+        for (n, sd), value, unit, size in zip(self.std.items(), self.values, self.units, self.sizes, strict=True):
             share = Flag("not determined", "note") if sd is None else percent(sd / size, 2)
             rows.append([n, "–" if sd is None else quantity(float(value), unit), quantity(sd, unit, 2), share])
         k = len(self.names)
