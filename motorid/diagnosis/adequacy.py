@@ -247,7 +247,7 @@ def judge_adequacy(node: Node, scores: Sequence[Score] = ()) -> Adequacy:
     judged = adequacy(node.fit, scores)
     if not far(node.fit) or not (doubtful := adequacy(node.fit, scores, level=CLEAR)).adequate:
         return judged
-    larger = {node.fit.problem.outputs[j] for j in far(node.fit)}  # a form that helps the others explains nothing here
+    larger = far(node.fit)  # a form that helps the others explains nothing here
     errors = {c: e for c, e in node.predictions.blocks.items() if c in larger}
     found = best_form(node.fit, Predictions(errors, {})) if errors else None
     return following(judged, found.form.text) if found else unpredicted(doubtful)

@@ -119,16 +119,13 @@ def rarity(name: str | None) -> int:
     return COMMON.index(name) if name in COMMON else len(COMMON)
 
 
-def far(fit: Fit) -> list[int]:
-    """Return which channels' errors are plainly larger than their noise, or what can be asked of a model."""
-    return [j for j, c in enumerate(fit.problem.outputs) if fit.misfit[c] > LARGER and not finer(fit, c)]
+def far(fit: Fit) -> list[str]:
+    """Return the channels whose errors are plainly larger than their noise, and than what can be asked of a model."""
+    return [c for c in fit.problem.outputs if fit.misfit[c] > LARGER and not finer(fit, c)]
 
 
 def finer(fit: Fit, channel: str) -> bool:
-    """Tell whether a channel is an angle that is followed as closely as can be asked: an encoder is finer than a model.
-
-    It sums up for the whole run what a lost sample or a hum does for an instant.
-    """
+    """Tell whether a channel is an angle followed as closely as can be asked: it sums up every trifle of a run."""
     if channel != "theta" or not fit.nrmse[channel] < FINER:
         return False
     rates = [(np.diff(y) / np.diff(s.experiment.t)) for s in fit.simulations if channel in s.experiment.outputs

@@ -130,7 +130,7 @@ class Curve:
             lags = np.concatenate([values_of(functions_of(self.form, self._span), self.form, s) for s in self._signals])
             over = "rad" if self.form.on == "path" else "s"
             base, also = ("a constant and ", [-1]) if self.form.carrier else ("", [])
-            powers = ("", "the square of ") if self.form.bends else ("",)
+            powers = ("", "the square of ")[: 1 + self.form.bends]
             each = product(powers, memories_of(self.form, self._span))  # in the order of the functions
             forms = [(f"{base}{power}one lag of {number(length, 2)} {over}", lags[:, [k, *also]])
                      for k, (power, length) in enumerate(each)]

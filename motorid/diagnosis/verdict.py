@@ -107,8 +107,7 @@ def _left(last: Fit, remaining: Adequacy, where: str = "") -> str:
     """Say what is left beside what was found."""
     if not remaining.adequate:
         return f"Not everything is explained: {remaining.text.removeprefix('Something is missing: ')}"
-    channels = [last.problem.outputs[j] for j in far(last)]
-    large = [f"{channel_name(c)} {number(last.misfit[c], 2)} times" for c in channels]
+    large = [f"{channel_name(c)} {number(last.misfit[c], 2)} times" for c in far(last)]
     if large:
         return f"What remains is larger than the noise ({', '.join(large)}), but nothing tried predicts it."
     return f"What remains is noise{where}. {fine_angle_remark(last)}".rstrip()
