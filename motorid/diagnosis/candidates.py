@@ -329,7 +329,7 @@ class Search:
         if node is None or node.parent is None or self._settled[node.key] == OFTEN:
             return None
         self._settled[node.key] += 1
-        fit = refit(larger.fit, node.fit.model, ({n: larger.fit.values[n] for n in node.fit.values},))
+        fit = refit(larger.fit, node.fit.model, ({n: larger.fit.values.get(n, v) for n, v in node.fit.values.items()},))
         lower = node_of(fit, self.held, node.added, node.parent) if fit is not None else None
         if lower is None or not beats(lower, node):
             return None

@@ -71,6 +71,16 @@ def test_a_model_left_in_a_valley_is_settled_before_a_larger_one_counts():
     assert looked.settled(larger) is None, "often enough"
 
 
+def test_a_model_is_settled_from_one_that_took_another_effect_in_its_place():
+    truth = mi.dc_motor(**TRUE) + mi.effects.coulomb(tau_c=8e-3)
+    fit = mi.fit(mi.dc_motor(), [_run(truth, k) for k in range(2)])
+    looked = search.Search(fit, None, [mi.effects.coulomb, mi.effects.brush_drop], search.Stages())
+    models = (fit.model + e for e in (mi.effects.coulomb, mi.effects.brush_drop))
+    both = [mi.solve(mi.Problem(m, fit.problem.experiments)) for m in models]
+    node = search.node_of(both[0], looked.held, "coulomb", looked.root)
+    assert looked.settled(search.node_of(both[1], looked.held, "brush_drop", node)) is None
+
+
 def test_a_climb_goes_on_from_the_settled_model(monkeypatch):
     truth = mi.dc_motor(**TRUE) + mi.effects.coulomb(tau_c=8e-3) + mi.effects.speed_lag(T_w=6e-3)
     fit, lower = mi.fit(mi.dc_motor(), [_run(truth, k) for k in range(2)]), []
