@@ -24,7 +24,8 @@ from motorid.diagnosis.verdict import (
 
 def rungs_of(*errors, held_out=None, misfit=1.0, speed=8.0):
     """Rungs with the errors (current, speed) given; `misfit` is of the current, `speed` that of the speed."""
-    fit = SimpleNamespace(misfit={"i": misfit, "omega": speed}, problem=SimpleNamespace(experiments=[]))
+    problem = SimpleNamespace(experiments=[], outputs=["i", "omega"])
+    fit = SimpleNamespace(misfit={"i": misfit, "omega": speed}, problem=problem)
     named = [dict(zip(("i", "omega"), e, strict=True)) for e in errors]
     there = [dict(zip(("i", "omega"), e, strict=True)) for e in held_out] if held_out else [None] * len(errors)
     names = [None, "coulomb", "cogging"]
