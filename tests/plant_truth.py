@@ -29,6 +29,7 @@ NUMBERS = {  # one plausible size of every effect
     "slip_clutch": {"tau_slip": 3e-3, "omega_slip": 0.5, "b_slip": 1e-6, "J_l": 2e-5},
     "freewheel": {"c_g": 0.05, "b_free": 2e-6, "J_l": 2e-5, "side": 1.0},
     "speed_lag": {"T_w": 5e-3},
+    "speed_filter": {"T_f": 5e-3, "zeta_f": 0.4},
     "current_lag": {"T_i": 2e-3},
     "speed_delay": {"T_d": 8e-3},
     "current_offset": {"i_0": 0.03},

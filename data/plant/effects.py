@@ -284,6 +284,11 @@ def speed_lag(m: Motor, T_w: float) -> Hooks:
 
 
 @_known
+def speed_filter(m: Motor, T_f: float, zeta_f: float) -> Hooks:
+    return {"sensor": ("speed_filter", (T_f, zeta_f)), "rate": max(1.0, zeta_f) / T_f}
+
+
+@_known
 def current_lag(m: Motor, T_i: float) -> Hooks:
     return {"sensor": ("current_lag", T_i), "rate": 1 / T_i}
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cmath
 from bisect import bisect_right
 from math import exp
 
@@ -76,6 +77,7 @@ class Chain:
     def __init__(self, hooks: list[dict], omega0: float) -> None:
         has = dict(h["sensor"] for h in hooks if "sensor" in h)
         self.lag_i, self.lag_w = has.get("current_lag"), has.get("speed_lag")
+        self.filter, self._rate = has.get("speed_filter"), 0.0
         self.delay, self.gain = has.get("speed_delay", 0.0), has.get("speed_gain", 1.0)
         self.offset, self.window = has.get("current_offset", 0.0), has.get("speed_average", 0.0)
         self.speed_offset, self.current_gain = has.get("speed_offset", 0.0), has.get("current_gain", 1.0)
@@ -88,7 +90,10 @@ class Chain:
     def sample(self, t: float, h: float, i: float, w: float) -> None:
         """Follow the true current and speed, taken as straight lines over the last step of h seconds."""
         self.i = _lag(self.i, self._last[0], i, h, self.lag_i)
-        self.w = _lag(self.w, self._last[1], w, h, self.lag_w)
+        if self.filter:
+            self.w, self._rate = _filtered(self.w, self._rate, self._last[1], w, h, *self.filter)
+        else:
+            self.w = _lag(self.w, self._last[1], w, h, self.lag_w)
         if self.window:  # what is kept and looked up is the angle
             self._turned += 0.5 * h * (self._last[1] + w)
         self._last = (i, w)
@@ -122,3 +127,14 @@ def _lag(z: float, u0: float, u1: float, h: float, tau: float | None) -> float:
         return u1
     slope = (u1 - u0) / h
     return (u1 - slope * tau) + (z - u0 + slope * tau) * exp(-h / tau)
+
+
+def _filtered(z: float, rate: float, u0: float, u1: float, h: float, T: float, zeta: float) -> tuple[float, float]:
+    """Second-order filter over h, T²z″ + 2ζTz′ + z = u, exact for an input that goes from u0 to u1 in a straight line."""
+    slope = (u1 - u0) / h
+    a, b = z - (u0 - 2 * zeta * T * slope), rate - slope  # off the straight line that is left at last
+    root = cmath.sqrt(zeta * zeta - 1) or 1e-6
+    fast, slow = (-zeta - root) / T, (-zeta + root) / T
+    p = (b - slow * a) / (fast - slow)
+    one, two = p * cmath.exp(fast * h), (a - p) * cmath.exp(slow * h)
+    return (one + two).real + u1 - 2 * zeta * T * slope, (fast * one + slow * two).real + slope

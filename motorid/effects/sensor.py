@@ -24,6 +24,17 @@ def speed_lag(m: Equations, T_w=P(5e-3, "s", null=0.0, positive=True, grid=(1.0,
     _lag(m, "omega", T_w)
 
 
+@effect(balance="sensor", includes=("speed_lag",))
+def speed_filter(m: Equations, T_f=P(5e-3, "s", null=0.0, positive=True, grid=(1.0, 4.0, 16.0),
+                                     doc="1/natural frequency"),
+                 zeta_f=P(0.7, "", positive=True, upper=5.0, grid=(0.1, 0.7), doc="damping ratio")):
+    """Second-order filter of the speed: Butterworth, tracking loop, tacho's coupling. Åström & Murray, 2008, ch. 6."""
+    reaching, z, rate = m.measured("omega"), m.state("omega_filtered", m.start["omega"]), m.state("omega_filtered_rate")
+    m.rate(z, rate / T_f)
+    m.rate(rate, (reaching - z - 2 * zeta_f * rate) / T_f)
+    m.measure("omega", z)
+
+
 @effect(balance="sensor")
 def speed_delay(m: Equations,
                 T_d=P(5e-3, "s", null=0.0, positive=True, grid=(1.0, 4.0, 16.0), doc="delay of the speed measurement")):

@@ -143,6 +143,7 @@ SINGLES = [
            train=("stairs", "steps 0.8"), check="prbs 0.8"),
     single("freewheel", "lab", {"c_g": 0.2, "b_free": 2e-5, "J_l": 3e-5}, train=("stairs", "prbs 0.8")),
     single("speed_lag", "wheel", {"T_w": 0.012}, train=("prbs", "stairs")),
+    single("speed_filter", "lab", {"T_f": 4e-3, "zeta_f": 0.3}, train=("prbs", "stairs")),
     single("current_lag", "lab", {"T_i": 3e-3}, train=("prbs", "stairs")),
     single("speed_delay", "lab", {"T_d": 6e-3}, train=("prbs", "chirp")),
     single("current_offset", "micro", {"i_0": 0.02}, train=("stairs", "multisine")),

@@ -38,6 +38,7 @@ SIZES: dict[str, Callable[[P.Motor, float], dict[str, float]]] = {
                                  "J_l": m.J},
     "freewheel": lambda m, u: {"c_g": m.J / DT[m.name], "b_free": 0.5 * m.K**2 / m.R, "J_l": m.J},
     "gear_efficiency": lambda m, u: {"mu_d": 0.1, "mu_b": 0.35},
+    "speed_filter": lambda m, u: {"T_f": max(0.2 * time_constant(m), 3 * DT[m.name]), "zeta_f": 0.5},
     "speed_average": lambda m, u: {"T_a": max(0.5 * time_constant(m), 4 * DT[m.name])},
     "speed_offset": lambda m, u: {"w_0": 0.05 * u / m.K},
     "current_gain": lambda m, u: {"k_i": 0.08},

@@ -33,6 +33,7 @@ TRUTH = {
     "compliance": {"r_load": 0.4, "omega_r": 250.0, "zeta_r": 0.05},
     "backlash": {"r_gap": 0.5, "gap": 0.05, "omega_c": 400.0, "zeta_c": 0.3},
     "speed_lag": {"T_w": 4e-3},
+    "speed_filter": {"T_f": 5e-3, "zeta_f": 0.4},
     "current_lag": {"T_i": 8e-4},
     "speed_delay": {"T_d": 5e-3},
     "current_offset": {"i_0": 0.05},
