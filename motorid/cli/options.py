@@ -30,7 +30,7 @@ from motorid.model.model import Model, dc_motor, torque_driven
 from motorid.numerics.least_squares import Huber
 from motorid.numerics.parallel import interruption
 from motorid.problem.constraints import CurrentLimit, SteadyState
-from motorid.records.checks import check_runs
+from motorid.records.checks import check_runs, reading_notes
 from motorid.records.experiment import Experiment, repeated
 from motorid.records.layout import parse_pairs
 from motorid.records.reading import read_runs
@@ -261,9 +261,8 @@ def make_folder(out: Path) -> None:
 
 def notes_of(runs: Sequence[Experiment], held_out: Sequence[Experiment] = ()) -> list[str]:
     """Return what a person should know about the records: how they were read, and what looks wrong."""
-    notes = [f"{r.name}: {note}" for r in runs for note in r.meta.get("notes", [])]
-    notes += [twice] if (twice := repeated(runs, held_out)) else []
-    return [*dict.fromkeys(notes), *check_runs(runs)]
+    twice = repeated(runs, held_out)
+    return [*reading_notes(runs), *([twice] if twice else []), *check_runs(runs)]
 
 
 def _words(*texts: str | None) -> list[str]:

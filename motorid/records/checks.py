@@ -64,10 +64,22 @@ def check_runs(runs: Sequence[Experiment]) -> list[str]:
     for check in _CHECKS:
         hits = [(run.name, text) for run in (runs if check in (_missing, _spikes) else plain) if (text := check(run))]
         if hits:
-            others = ", ".join(name for name, _ in hits[1:4])
-            others += f" and {len(hits) - 4} more" if len(hits) > 4 else ""
-            remarks.append(f"{hits[0][0]}: {hits[0][1]}" + (f" (The same in {others}.)" if others else ""))
+            remarks.append(_told_once(hits[0][1], [name for name, _ in hits]))
     return remarks + [text for text in (_the_same_twice(runs), _never_reverses(runs)) if text]
+
+
+def reading_notes(runs: Sequence[Experiment]) -> list[str]:
+    """Return what was noted while reading, each note once, naming the runs."""
+    names: dict[str, list[str]] = {}
+    for run in runs:
+        for note in run.meta.get("notes", ()):
+            names.setdefault(note, []).append(run.name)
+    return [_told_once(note, of) for note, of in names.items()]
+
+
+def _told_once(text: str, names: Sequence[str]) -> str:
+    others = ", ".join(names[1:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else "")
+    return f"{names[0]}: {text}" + (f" (The same in {others}.)" if others else "")
 
 
 def _the_same_twice(runs: Sequence[Experiment]) -> str | None:

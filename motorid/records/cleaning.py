@@ -31,9 +31,10 @@ def run_from_columns(columns: Mapping[str, Array], texts: Texts, layout: Layout,
     places = dict(layout.places)
     t = _time(columns, texts, places.pop("t"), said)
     values = {c: _channel(columns, texts, place, c) for c, place in places.items()}
-    rows = _rows_in_order(t, layout.places["t"].column, said)
-    rows = rows[_first_input(values["v"][rows], places["v"].column, said):]
-    t, values = t[rows], {c: a[rows] for c, a in values.items()}
+    rows, t, begun = _rows_in_order(t, layout.places["t"].column, said)
+    first = _first_input(values["v"][rows], places["v"].column, said)
+    rows, t = rows[first:], t[first:]
+    values = {c: a[rows] for c, a in values.items()}
     inputs = {c: _filled_forward(values.pop(c), places[c].column, said) for c in INPUTS if c in values
               if c == "v" or _has_values(c, values[c], places[c].column, [])}
     values = {c: a for c, a in values.items() if c not in INPUTS}
@@ -41,12 +42,15 @@ def run_from_columns(columns: Mapping[str, Array], texts: Texts, layout: Layout,
     if not outputs:
         raise DataError(f"every sample of {', '.join(repr(places[c].column) for c in values)} is "
                         "missing; there is nothing measured to fit.")
-    _note_gaps(t, said)
-    if "theta" in outputs and places["theta"].unit.symbol == "rad":
-        outputs["theta"], turn, jumps = unwrapped(outputs["theta"], t, outputs.get("omega"))
-        if jumps:
-            by = "a turn" if turn == 2 * np.pi else f"{turn:.4g} rad, as a counter does,"
-            said.append(f"the angle '{places['theta'].column}' jumps by {by} {jumps} times; here it goes on.")
+    parts = np.split(np.arange(len(t)), np.searchsorted(t, begun))
+    for part in parts:
+        _note_gaps(t[part], said)
+        if "theta" in outputs and places["theta"].unit.symbol == "rad":
+            measured = {c: y[part] for c, y in outputs.items()}
+            outputs["theta"][part], turn, jumps = unwrapped(measured["theta"], t[part], measured.get("omega"))
+            if jumps:
+                by = "a turn" if turn == 2 * np.pi else f"{turn:.4g} rad, as a counter does,"
+                said.append(f"the angle '{places['theta'].column}' jumps by {by} {jumps} times; here it goes on.")
     for c, y in outputs.items():
         if (again := repeats(y)).any():
             outputs[c] = np.where(again, np.nan, y)
@@ -56,6 +60,8 @@ def run_from_columns(columns: Mapping[str, Array], texts: Texts, layout: Layout,
     extra = {c: a[rows] for c, a in columns.items() if c not in used}
     if set(texts) - used:
         said.append(f"left out columns of text: {', '.join(sorted(set(texts) - used))}.")
+    if begun:
+        meta = {**meta, "parts": sorted({*meta.get("parts", ()), *begun})}
     facts = {**meta, "notes": said, "extra": extra,
              "columns": {c: p.column for c, p in layout.places.items()},
              "original_units": {c: p.unit.label for c, p in layout.places.items()},
@@ -107,8 +113,11 @@ def _dates(cells: Sequence[object], column: str) -> Array:
     return seconds
 
 
-def _rows_in_order(t: Array, column: str, said: list[str]) -> NDArray[np.intp]:
-    """Return the rows with a time that moves on: the longest stretch without a restart, without repeats."""
+def _rows_in_order(t: Array, column: str, said: list[str]) -> tuple[NDArray[np.intp], Array, list[float]]:
+    """Return the rows with a time that moves on, without repeats, their times, and when it started again.
+
+    What is long enough goes on a step after what was before.
+    """
     rows = np.flatnonzero(np.isfinite(t))
     if len(rows) < len(t):
         said.append(f"left out {counted(len(t) - len(rows), 'row')} of {len(t)}: no time is given.")
@@ -127,19 +136,27 @@ def _rows_in_order(t: Array, column: str, said: list[str]) -> NDArray[np.intp]:
     if len(stretches) > 1 and total < MIN_SAMPLES * len(stretches):  # in disorder, not begun anew
         raise DataError(f"time does not increase: '{column}' goes back {again} in {total} rows. Is it "
                         "the right column? Expected rows in order of time.")
-    if len(stretches) > 1:
-        said.append(f"time starts again {again}; kept the longest stretch, {len(longest)} of {total} "
-                    "rows. Save each run in a file of its own to use all.")
-        rows, total = rows[longest], len(longest)
-    moving = rows[np.r_[True, t[rows][1:] > np.maximum.accumulate(t[rows])[:-1]]]
-    if len(moving) < max(total / 2, MIN_SAMPLES):
-        raise DataError(f"time stands still or goes back in {total - len(moving)} of {total} rows of "
+    stretches = [s for s in stretches if len(s) >= MIN_SAMPLES] or [longest]
+    if again != "0 times":
+        used = sum(map(len, stretches))
+        what = f"kept the longest stretch, {used}" if len(stretches) == 1 else f"a run each time, {used}"
+        said.append(f"time starts again {again}; {what} of {total} rows.")
+        total = used
+    stretches = [rows[s] for s in stretches]
+    moving = [s[np.r_[True, t[s][1:] > np.maximum.accumulate(t[s])[:-1]]] for s in stretches]
+    kept = sum(map(len, moving))
+    if kept < max(total / 2, MIN_SAMPLES):
+        raise DataError(f"time stands still or goes back in {total - kept} of {total} rows of "
                         f"'{column}'. Is it the right column? If its clock is too coarse, number the rows "
                         "and say the step, e.g. columns={'t': 'row'}, units={'t': '0.0002 s'}.")
-    if len(moving) < total:
-        said.append(f"left out {counted(total - len(moving), 'row')} of {total}: the time stamp repeats "
+    if kept < total:
+        said.append(f"left out {counted(total - kept, 'row')} of {total}: the time stamp repeats "
                     "an earlier one, goes back, or jumps ahead.")
-    return moving
+    times, begun = [t[moving[0]]], []
+    for rows in moving[1:]:
+        begun.append(float(times[-1][-1] + np.median(np.diff(t[rows]))))
+        times.append(t[rows] - t[rows[0]] + begun[-1])
+    return np.concatenate(moving), np.concatenate(times), begun
 
 
 def _stretches(t: Array) -> list[NDArray[np.intp]]:

@@ -112,8 +112,9 @@ def _named_by_header(places: dict[str, Place], labels: Sequence[str], row: Units
             continue
         if len(best) > 1:
             names = " and ".join(f"'{p.column}'" for p in best)
+            speed = " If 'v' is the speed: columns={'v': 'u', 'omega': 'v'}." * (names.lower() == "'u' and 'v'")
             raise DataError(f"{names} look equally like {_MEANING[channel]} ({channel}); say which one "
-                            f"is meant, e.g. columns={{'{channel}': '{best[0].column}'}}.")
+                            f"is meant, e.g. columns={{'{channel}': '{best[0].column}'}}.{speed}")
         places[channel] = best[0]
         notes += [f"'{p.column}' looks like {_MEANING[channel]}, too; '{best[0].column}' is used."
                   for p in hits if p is not best[0] and p.score == best[0].score]
@@ -179,8 +180,9 @@ def _require(places: Mapping[str, Place], labels: Sequence[str]) -> None:
             f"cent, '0.047 V' for 0 to 255): columns={{'v': '{duty[0]}'}}, units={{'v': '{one}'}}.") if duty else ""
     used = {*duty, *(p.column for p in places.values())}
     untimed = " Samples a fixed time apart need no column of time: dt=0.001 says how far, s." * ("t" in missing)
+    asked = [c for c in missing if c != "v" or not duty]
     raise DataError(f"no column looks like {', nor like '.join(missing.values())}. "
-                    f"{_say_which(labels, list(missing), [c for c in labels if c not in used])}{more}{untimed}")
+                    f"{_say_which(labels, asked, [c for c in labels if c not in used])}{more}{untimed}")
 
 
 def _say_which(labels: Sequence[str], channels: Sequence[str], free: Sequence[str]) -> str:
@@ -189,7 +191,7 @@ def _say_which(labels: Sequence[str], channels: Sequence[str], free: Sequence[st
                 "columns={'t': 1, 'v': 2, 'omega': 3}.")
     listed = ", ".join(f"'{c}'" for c in labels[:20]) + (" ..." if len(labels) > 20 else "")
     example = ", ".join(f"'{c}': '{column}'" for c, column in zip(channels, [*free, "...", "...", "..."], strict=False))
-    return f"Columns here: {listed}. Say which is which, e.g. columns={{{example}}}."
+    return f"Columns here: {listed}." + (f" Say which is which, e.g. columns={{{example}}}." if channels else "")
 
 
 def _assumed(places: Mapping[str, Place]) -> list[str]:

@@ -84,9 +84,8 @@ def levelled(v: Array) -> Array:
     ends = np.concatenate([[0], np.flatnonzero(np.abs(changes) > JUMP * noise) + 1, [len(v)]])
     level = v.copy()
     for a, b in pairwise(ends.tolist()):
-        part = v[a:b]
-        halves = np.mean(part[: len(part) // 2]), np.mean(part[len(part) // 2 :])
-        if len(part) >= SHORTEST and np.std(part) < 1.5 * noise and abs(np.subtract(*halves)) < noise:
+        part, half = v[a:b], (b - a) // 2
+        if b - a >= SHORTEST and np.std(part) < 1.5 * noise and abs(part[:half].mean() - part[half:].mean()) < noise:
             level[a:b] = part.mean()
     return level
 

@@ -13,7 +13,7 @@ from motorid.display.numbers import counted, duration, number, percent, sentence
 from motorid.estimation.result import Fit, ended, parameter_table, value_tables
 from motorid.numerics.parallel import progress
 from motorid.problem.simulate import error_table, evaluate
-from motorid.records.checks import check_runs
+from motorid.records.checks import check_runs, reading_notes
 from motorid.records.experiment import Experiment
 
 
@@ -43,7 +43,7 @@ def data(runs: Sequence[Experiment]) -> Section:
     """The records and what the checks say of them."""
     rows = [[r.name, str(r.n), duration(r.duration), f"{number(1e3 * r.dt, 3)} ms",
              ", ".join(NAMES[c] for c in r.channels)] for r in runs]
-    remarks = [*check_runs(runs), *(f"{r.name}: {n}" for r in runs for n in r.meta.get("notes", ()))]
+    remarks = [*check_runs(runs), *reading_notes(runs)]
     checked = "What the checks found:" if remarks else "The checks found no problem."
     figure = _figure("data", "Input and measured channels over time.",
                      f"Records {', '.join(r.name for r in runs)} over time", "plot_runs", runs)

@@ -7,7 +7,7 @@ import pytest
 
 from motorid.channels import CHANNELS
 from motorid.errors import DataError
-from motorid.records.checks import check_runs
+from motorid.records.checks import check_runs, reading_notes
 from motorid.records.datasets import data_path, datasets
 from motorid.records.experiment import Experiment
 from motorid.records.reading import read_csv, read_runs
@@ -31,6 +31,12 @@ def said(*runs: Experiment) -> str:
 def changed(run: Experiment, **scale: float) -> Experiment:
     return run.with_(inputs={"v": run.inputs["v"] * scale.get("v", 1.0)},
                      outputs={c: y * scale.get(c, 1.0) for c, y in run.outputs.items()})
+
+
+def test_what_was_noted_of_several_files_is_said_once(good):
+    runs = [good.with_(name=f"run{k}", meta={"notes": ["no unit stated", *(["late"] if k == 3 else [])]})
+            for k in range(1, 7)]
+    assert reading_notes(runs) == ["run1: no unit stated (The same in run2, run3, run4 and 2 more.)", "run3: late"]
 
 
 # -- silence ------------------------------------------------------------------------------------------------

@@ -130,6 +130,12 @@ def test_a_noisy_voltage_is_its_mean_between_steps_and_nowhere_else():
     assert np.std(level[400:] - v[400:]) == pytest.approx(0.1, rel=0.2)
 
 
+def test_a_lone_sample_of_a_noisy_voltage_stays_without_a_warning(rng):
+    v = np.repeat([0.0, 5.0], 100) + rng.normal(0, 0.1, 200)
+    v[50] = 9.0
+    assert held(v).levelled().inputs["v"][50] == 9.0
+
+
 def test_a_commanded_voltage_stays_as_it_is():
     v = np.repeat([0.0, 5.0, -3.0], 100)
     assert np.array_equal(held(v).levelled().inputs["v"], v)

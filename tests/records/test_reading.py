@@ -180,6 +180,16 @@ def test_a_channel_that_is_left_out_need_not_be_told_from_others(tmp_path):
     assert read_csv(own, columns={"i": None}).channels == ("omega",)
 
 
+def test_a_duty_and_the_names_of_control_lectures_are_met_with_the_right_line(tmp_path):
+    """Not with an example that names another column as the voltage."""
+    body = rows(pattern="{t:.3f},{v},{w:.3f}\n")
+    with pytest.raises(DataError, match=r"look equally .* If 'v' is the speed: columns={'v': 'u', 'omega': 'v'}"):
+        read_csv(write(tmp_path, "t,u,v\n" + body))
+    with pytest.raises(DataError, match=r"a duty cycle; .*'v': 'duty'") as told:
+        read_csv(write(tmp_path, "t,duty,speed\n" + body))
+    assert "Say which is which" not in str(told.value)
+
+
 def test_units_in_the_header_are_converted(tmp_path):
     run = read_csv(write(tmp_path, "t_ms,voltage_mV,current_mA,speed_rpm,angle_deg\n" + rows(
         pattern="{t:.3f},{v},{i:.3f},{w:.3f},{w:.3f}\n")))
@@ -294,8 +304,8 @@ def test_missing_outputs_stay_missing_and_missing_inputs_are_held(tmp_path):
     ([0, 1, 2, 3, 1.5, 1.6, 4, 5, 6, 7, 8, 9], {4, 5}, "2 rows of 12"),
     ([0, 1, 2, 900, 3, 4, 5, 6, 7, 8], {3}, "jumps ahead"),
     ([*range(5), *range(12)], {*range(5)}, "starts again 1 time; kept the longest stretch, 12 of 17"),
-    ([*range(12), *range(9)], {*range(12, 21)}, "12 of 21"),
-    ([*range(9), 3, *range(9, 12), *range(9)], {9, *range(13, 22)}, "starts again 1 time"),
+    ([*range(12), *range(5)], {*range(12, 17)}, "12 of 17"),
+    ([*range(9), 3, *range(9, 12), *range(5)], {9, *range(13, 18)}, "starts again 1 time"),
     ([0, 1, "", 3, 4, 5, 6, 7, 8, 9], {2}, "1 row of 10: no time"),
     ([*range(8), 20, 21], set(), "a gap in time, 13 s after t = 7 s"),
 ])
@@ -305,6 +315,20 @@ def test_time_is_put_in_order_and_every_loss_is_told(t, dropped, note, tmp_path)
     np.testing.assert_array_equal(run.t, [t[k] for k in kept])
     np.testing.assert_array_equal(run.outputs["omega"], kept)
     assert note in notes(run)
+
+
+def test_a_time_that_starts_again_begins_another_run(tmp_path):
+    """A logger that appends, and counts turns modulo one anew; too few rows are no run."""
+    counts = [*range(60), *range(100, 150), *range(30, 33), *range(9)]
+    t = [0.01 * k for n in (60, 50, 3, 9) for k in range(n)]
+    turns = "t_s,u_V,theta_rad\n" + "".join(f"{a},1,{0.3 * b % 6.283185307}\n" for a, b in zip(t, counts, strict=True))
+    runs = read_runs(write(tmp_path, turns))
+    assert [r.n for r in runs] == [60, 50, 9]
+    for run in runs:
+        np.testing.assert_allclose(np.diff(run.t), 0.01)
+        np.testing.assert_allclose(np.diff(run.outputs["theta"]), 0.3, atol=1e-6)
+    assert "time starts again 3 times; a run each time, 119 of 122 rows" in notes(runs[0])
+    assert "gap" not in notes(runs[0])
 
 
 @pytest.mark.parametrize("every", [2, 5, 12])
