@@ -35,6 +35,7 @@ SHARP = 1e-3  # of the highest speed: below it a direction is not known
 SOFT = 0.01  # of the largest current or voltage: the width of a jump at zero
 BENDS = (4, 12)  # times the largest speed, current or voltage goes a curve's bend into it
 KNEES = 9  # of a speed, current or voltage of either sign, beyond which something sets in
+FINER = 4  # times as many places and knees in a curve that is fitted: what is narrow stands between the few
 CHANGES = {"t": "changes with the time", "distance": "changes with the distance run",
            "turn": "changes with the angle within a turn", "theta": "changes with the angle",
            "omega": "changes with the speed", "i": "changes with the current", "v": "changes with the voltage",
@@ -101,7 +102,7 @@ FORMS = (*(Form(words, balance, on, carrier) for words, balance, carrier, quanti
          Form("an error of the angle sensor", "sensor", "path", "", "theta"),
          Form("an error of the angle sensor", "sensor", "turn", "", "theta"),
          Form("an error of the speed sensor", "sensor", "omega", "", "omega"),
-         Form("an error of the current sensor", "sensor", "i", "", "i"),
+         *(Form("an error of the current sensor", "sensor", on, "", "i") for on in ("i", "v", "omega")),
          *(Form("a loss of voltage", "voltage", f"past {c}") for c in ("v", "i", "omega")),
          *(Form("a torque", "torque", on) for on in ("past i", "past omega", "path")),
          *(Form("an error of the current sensor", "sensor", f"past {c}", "", "i") for c in ("i", "v")),
@@ -110,11 +111,13 @@ FORMS = (*(Form(words, balance, on, carrier) for words, balance, carrier, quanti
 
 @dataclass(frozen=True)
 class Span:
-    """What a form reaches over: the range of every quantity, the orders of a turn, the time between samples (s)."""
+    """What a form reaches over: the range of every quantity, the orders of a turn, the time between samples (s); how
+    many places and knees it has, for each of the few by which forms are compared."""
 
     ranges: Mapping[str, tuple[float, float]]
     orders: tuple[float, ...]
     step: float
+    finer: int = 1
 
 
 def span_of(fit: Fit, signals: Sequence[Mapping[str, Array]]) -> Span:
@@ -148,7 +151,7 @@ def shown(form: Form, fit: Fit, ranges: Mapping[str, tuple[float, float]]) -> bo
         return False  # there a torque over the speed says the same
     if (form.remembers or form.on == "distance") and fit.window is not None:
         return False  # what was before a window is not known
-    return form.on != "turn" or fit.problem.model.axis != "linear"
+    return form.on != "turn" or not fit.problem.linear
 
 
 def functions_of(form: Form, span: Span) -> list[str]:
@@ -163,8 +166,9 @@ def functions_of(form: Form, span: Span) -> list[str]:
     inside = f"ca.fmin(ca.fmax(z, {low:.9g}), {high:.9g})"  # nothing is known beyond
     if form.on in ("theta", "t", "distance"):
         scale = f"{np.pi / (high - low):.9g} * ({inside} - {low:.9g})"
-        centres = np.linspace(low, high, PLACES + 2)[1:-1]
-        sudden = [f"ca.tanh((z - {c:.9g}) * {SUDDEN / (high - low):.6g})" for c in centres]  # something sets in
+        centres = np.linspace(low, high, PLACES * span.finer + 2)[1:-1]
+        steep = f"{SUDDEN * span.finer / (high - low):.6g}"
+        sudden = [f"ca.tanh((z - {c:.9g}) * {steep})" for c in centres]  # something sets in
         if form.on == "theta":  # a stop, a slack
             sudden += ["z", *(f"ca.fmax(z - {c:.9g}, 0)" for c in centres)]
         else:  # what warms up, or runs in
@@ -176,7 +180,8 @@ def functions_of(form: Form, span: Span) -> list[str]:
     size = f"ca.fabs{s}"
     smooth = [s, f"{s}**2", f"{s}**3", *(f"ca.tanh({k} * {s})" for k in BENDS)]
     sides = [sign for sign, reach in (("", high), ("-", -low)) if reach > 0]
-    smooth += [f"ca.fmax({sign}{s} - {c:.6g}, 0)" for sign in sides for c in np.linspace(0, 1, KNEES + 2)[1:-1]]
+    knees = np.linspace(0, 1, KNEES * span.finer + 2)[1:-1]
+    smooth += [f"ca.fmax({sign}{s} - {c:.6g}, 0)" for sign in sides for c in knees]
     if not low < 0 < high:
         return ["1.0", *smooth]
     side = "m.sign(z)" if form.on == "omega" else f"ca.tanh(z / {SOFT * top:.6g})"
@@ -192,7 +197,7 @@ def memories_of(form: Form, span: Span) -> Array:
         shortest, longest = 0.1 * span.step, min(longest, 100 * span.step)
     elif form.carrier:  # what runs in, or warms, sums up all that was
         longest *= LASTING
-    return speed * np.geomspace(shortest, max(longest, 2 * shortest), MEMORIES)
+    return speed * np.geomspace(shortest, max(longest, 2 * shortest), MEMORIES * span.finer)
 
 
 def past(z: Array, along: Array, length: float, initial: float) -> Array:

@@ -20,6 +20,7 @@ import numpy as np
 
 from motorid.diagnosis.cross_validation import HeldOut
 from motorid.diagnosis.free_forms import (
+    FINER,
     Form,
     Span,
     form_coefficients,
@@ -127,11 +128,11 @@ class Curve:
         z, value = self.points
         forms, unit = _closed_forms(self.form.on, z), self.unit
         if self.form.remembers:
-            lags = np.concatenate([values_of(functions_of(self.form, self._span), self.form, s) for s in self._signals])
+            lags = np.concatenate([values_of(functions_of(self.form, self.span), self.form, s) for s in self._signals])
             over = "rad" if self.form.on == "path" else "s"
             base, also = ("a constant and ", [-1]) if self.form.carrier else ("", [])
             powers = ("", "the square of ")[: 1 + self.form.bends]
-            each = product(powers, memories_of(self.form, self._span))  # in the order of the functions
+            each = product(powers, memories_of(self.form, self.span))  # in the order of the functions
             forms = [(f"{base}{power}one lag of {number(length, 2)} {over}", lags[:, [k, *also]])
                      for k, (power, length) in enumerate(each)]
             unit = self._own_unit
@@ -149,13 +150,14 @@ class Curve:
         return signals_along(self.fit)
 
     @cached_property
-    def _span(self) -> Span:
+    def span(self) -> Span:
+        """What the form reaches over, and as many waves, places and knees as a curve that is fitted may have."""
         span = span_of(self.fit, self._signals)
-        return replace(span, orders=tuple(sorted({*span.orders, *range(1, FINE + 1)})))
+        return replace(span, orders=tuple(sorted({*span.orders, *range(1, FINE + 1)})), finer=FINER)
 
     @property
     def _terms(self) -> list[str]:
-        functions = functions_of(self.form, self._span)
+        functions = functions_of(self.form, self.span)
         return [functions[k] for k in self.coefficients]
 
     def grown(self) -> Curve | None:
@@ -166,7 +168,7 @@ class Curve:
         FitError, SimulationError, ModelError
         """
         last = self.fitted or self.fit
-        linear = linearised(last, self.form, self._span)
+        linear = linearised(last, self.form, self.span)
         more = chosen_functions(last, linear, self.form, self.coefficients)
         if not more:
             return None
@@ -201,7 +203,7 @@ class Curve:
         form, names = self.form, list(self.sizes)
         lines = [f"z = {QUANTITIES[form.on]}"]
         if form.on in RATES:
-            lines += [f"m.rate(z, {RATES[form.on].format(step=self._span.step)})"]
+            lines += [f"m.rate(z, {RATES[form.on].format(step=self.span.step)})"]
         terms = self._terms
         if form.remembers:
             rate = " * ca.fabs(m.omega)" if form.on == "path" else ""
