@@ -223,7 +223,7 @@ class Search:
         for e in self.effects:
             if e.name in have or e.name in contained:
                 continue
-            if model.axis == "linear" and any(p.periodic for p in e.parameters):
+            if self.root.fit.problem.linear and any(p.periodic for p in e.parameters):
                 continue  # a phase in metres is none
             if contained & set(e.includes) and not have & set(e.includes):
                 continue  # two that contain the same simpler one share its size between them

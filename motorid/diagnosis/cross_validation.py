@@ -60,7 +60,7 @@ class HeldOut:
             try:
                 problem, test = _fold(fit.problem.for_model(fit.model), odd)
                 q = problem.scaling.scaled([fit.initial.get(p.name, p.value) for p in problem.unknown])
-                done = by_continuation(restarted(problem, q), QUICK, wide=False, narrow=False)
+                done = by_continuation(problem.begun_at(q), QUICK, wide=False, narrow=False)
                 for c, e in errors_of(at(done.problem, done.solution.q), self.noise, test).items():
                     found.setdefault(c, []).append(e)
             except FAILURES:
@@ -89,17 +89,3 @@ def _parted(run: Experiment, odd: int) -> tuple[Experiment, Experiment]:
     judged = {c: np.where(part, y, np.nan) for c, y in run.outputs.items()}
     keep = {c: y for c, y in hidden.items() if np.isfinite(y).any()}
     return run.with_(outputs=keep or run.outputs), run.with_(outputs=judged)
-
-
-def restarted(problem: Problem, q) -> Problem:
-    """Return the problem with the values at `q` as its start, initial states too."""
-    physical = dict(zip([p.name for p in problem.unknown], problem.scaling.physical(q), strict=True))
-    runs = []
-    for k, run in enumerate(problem.runs):
-        start = run.start.copy()
-        for j, c in enumerate(("i", "omega", "theta")):
-            if f"{c}_0[{k}]" in physical:  # rounding must not put it outside its limits
-                start[j] = np.clip(physical[f"{c}_0[{k}]"], *run.limits[c])
-        apart = {n: physical[p.name] for n, r, p in problem.unknowns.apart if r == k}
-        runs.append(replace(run, start=start, apart={**run.apart, **apart}))
-    return replace(problem, model=problem.model.start_at(problem.values(q)), _runs=tuple(runs))

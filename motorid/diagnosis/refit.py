@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from motorid.diagnosis.cross_validation import QUICK, ROUGH, restarted
+from motorid.diagnosis.cross_validation import QUICK, ROUGH
 from motorid.diagnosis.model_comparison import far, size_of
 from motorid.diagnosis.record_parts import within_worth, worth_its_steps
 from motorid.diagnosis.score_test import believable_start, uses_angle
@@ -30,7 +30,7 @@ from motorid.numerics.least_squares import LevenbergMarquardt
 from motorid.numerics.parallel import interruption
 from motorid.numerics.signals import Array
 from motorid.problem.problem import Problem
-from motorid.problem.runs import natural_sizes
+from motorid.problem.runs import natural_sizes, with_inputs
 from motorid.problem.simulate import misfit_over_noise
 
 RACE = LevenbergMarquardt(max_iterations=6, ftol=1e-3, xtol=1e-4, looks=0)
@@ -41,6 +41,8 @@ ROOM = 10.0  # factor beyond its grid that a shape parameter may run to
 ALONE = 0.1  # of an answer: what is left of it without the others', if these do the same
 QUICKLY = partial(by_continuation, effort=QUICK, wide=False, narrow=False)  # nearly to the end
 WORSE = 1.02  # of the cost along the measured angle: the model's own angle must do as well
+SHAKEN = 1e-3  # of the travel: a small change of the measured angle
+SHAKES = 20  # places at which it is drawn
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +76,7 @@ def raced(fit: Fit, model: Model, starts: Sequence[Mapping[str, float]]) -> Race
                 done = _race(_started(fit, each, start, along))
             if done is not None:
                 reach = _undamped(done.solution.residual, done.solution.jac)
-                found.append(Raced(restarted(done.problem, done.q), float(done.cost), reach, along))
+                found.append(Raced(done.onward, float(done.cost), reach, along))
                 break
     return min(found, key=lambda r: r.cost, default=None)
 
@@ -113,7 +115,7 @@ def finished(fit: Fit, best: Raced) -> Fit | None:
         done = _released(best.problem) if best.angular else QUICKLY(best.problem, wide=stages)
     except FAILURES:
         return None
-    return _polished(fit, collapsed_again(restarted(done.problem, done.solution.q), fit))
+    return _polished(fit, collapsed_again(done.onward, fit))
 
 
 def refit(fit: Fit, model: Model, starts: Sequence[Mapping[str, float]]) -> Fit | None:
@@ -123,7 +125,7 @@ def refit(fit: Fit, model: Model, starts: Sequence[Mapping[str, float]]) -> Fit 
 
 
 def _released(measured: Problem) -> Estimate:
-    """Let the model's own angle take the place of the measured one, if it is good enough.
+    """Let the model's own angle take the place of the measured one, if it is good enough, or where that is copied.
 
     Raises
     ------
@@ -134,12 +136,33 @@ def _released(measured: Problem) -> Estimate:
         return QUICKLY(own)
     along = QUICKLY(measured)
     values = along.problem.values(along.solution.q)
-    own = restarted(along.problem, along.solution.q).for_model(own.model.start_at(values))
+    own = along.onward.for_model(own.model.start_at(values))
+    if copies_the_angle(along.problem, along.q):
+        first = {n: measured.model.parameters[n].value for n in measured.model.free_names}
+        return QUICKLY(measured.for_model(own.model.start_at(first)))
     try:
         free = QUICKLY(own)
     except FAILURES:
         return along
     return free if free.solution.history[-1] < WORSE * along.solution.history[-1] else along
+
+
+def copies_the_angle(problem: Problem, q: Array) -> bool:
+    """Tell whether the simulated angle follows changes of the measured one that goes in: then it predicts nothing.
+
+    The measured angle is shaken a little, and the simulated one nearer to the same shaking than to none.
+    """
+    rng, runs, shakes = np.random.default_rng(0), [], []
+    for run in problem.runs:
+        theta = run.experiment.outputs["theta"]
+        knots = np.linspace(run.experiment.t[0], run.experiment.t[-1], SHAKES)
+        shakes.append(SHAKEN * np.nanstd(theta) * np.interp(run.experiment.t, knots, rng.standard_normal(SHAKES)))
+        shaken = run.experiment.with_(outputs={**run.experiment.outputs, "theta": theta + shakes[-1]})
+        runs.append(with_inputs(replace(run, experiment=shaken), problem.system.inputs))
+    there, column = problem.with_runs(tuple(runs)), problem.outputs.index("theta")
+    moved = [(p.simulate(q, k, derivatives=False).y[:, column]) for p in (problem, there) for k in range(len(runs))]
+    answer, shake = np.concatenate(moved[len(runs):]) - np.concatenate(moved[:len(runs)]), np.concatenate(shakes)
+    return bool(np.linalg.norm(answer - shake) < 0.5 * np.linalg.norm(shake))
 
 
 def lost(fit: Fit) -> bool:
@@ -165,7 +188,7 @@ def _started(fit: Fit, model: Model, start: Mapping[str, float], angular: bool) 
     names = [n for n in start if n in model.parameters]
     problem = fit.problem.for_model(_within(model, {n: start[n] for n in names})).tuned(accuracy=ROUGH)
     apart = {**{n: v for n, v in start.items() if n not in model.parameters}, **believable_start(fit)}
-    problem = restarted(problem, problem.scaling.scaled([apart.get(p.name, p.value) for p in problem.unknown]))
+    problem = problem.begun_at(problem.scaling.scaled([apart.get(p.name, p.value) for p in problem.unknown]))
     return problem.for_model(replace(problem.model, angle_input=True, _systems={})) if angular else problem
 
 
@@ -205,7 +228,7 @@ def _polished(fit: Fit, problem: Problem) -> Fit | None:
         if problem.noise_factors:
             factors = misfit_over_noise(done.problem, done.solution.q)
             if max(abs(np.log(factors[c] / problem.noise_factors.get(c, 1.0))) for c in factors) > 0.1:
-                done = _converged(restarted(done.problem, done.solution.q).tuned(noise_factors=factors))
+                done = _converged(done.onward.tuned(noise_factors=factors))
         done = sharpened(past_ripples(done, POLISH), POLISH)
     except FAILURES:
         return None
@@ -227,7 +250,7 @@ def _converged(problem: Problem) -> Estimate:
     for _ in range(GOING_ON):
         if done.solution.status != "limit":
             break
-        again = by_continuation(restarted(done.problem, done.solution.q), POLISH, wide=False, narrow=False)
+        again = by_continuation(done.onward, POLISH, wide=False, narrow=False)
         done = replace(again, history=done.history + again.history)
     return done
 

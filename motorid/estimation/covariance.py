@@ -176,8 +176,7 @@ def _laws(problem: Problem, values: Mapping[str, float]) -> dict[str, tuple[str,
     it; with dry friction alone the no-load speed.
     """
     model, runs, motor = problem.model, problem.experiments, problem.model.base == "dc_motor"
-    volt, units = runs[0].units["v"], {u for run in runs for u in run.units.values()}
-    linear = model.axis == "linear" or bool(units & {"m", "m/s"})
+    volt, linear = runs[0].units["v"], problem.linear
     speed = "m/s" if linear else "rad/s"
 
     def gain(p: Mapping[str, float]) -> float:

@@ -16,7 +16,7 @@ from motorid.display.numbers import listed
 from motorid.errors import ModelError, UsageError, among, name_of, numbers_told, one_of
 from motorid.estimation.angle_orders import effects_of_unknown_order, strongest_order, uses_angle
 from motorid.estimation.continuation import by_continuation
-from motorid.estimation.least_squares import FAILURES, FINISH, Callback, Estimate, least_squares
+from motorid.estimation.least_squares import FAILURES, FINISH, Callback, Estimate, least_squares, race
 from motorid.estimation.restarts import restore_collapsed
 from motorid.estimation.result import Fit
 from motorid.estimation.start_values import with_start_values
@@ -26,6 +26,7 @@ from motorid.model.model import Model
 from motorid.numerics.least_squares import LevenbergMarquardt
 from motorid.numerics.parallel import one_thread, progress
 from motorid.problem.problem import Problem, as_problem
+from motorid.problem.runs import natural_sizes, suited
 from motorid.problem.simulate import integration_bias, integration_error, misfit_over_noise, with_angles_apart
 from motorid.records.experiment import Experiment, windows
 
@@ -38,6 +39,7 @@ WINDOWS = (8, 32)  # of the longest record, where it is not followed as a whole
 FEWEST = 50  # samples of a window
 UNFOLLOWED = 0.25  # share of a channel's variance left unexplained
 TOO_FAR = 100.0  # times that an error in the state grows: one of 1 % would be all of the motion
+NEXT_TO_NOTHING = 0.01  # times the natural size of an effect
 MOST_FINER = 4  # times as many steps at most, where that is not kept
 
 
@@ -176,10 +178,13 @@ def _fit(problem: Problem, effort: LevenbergMarquardt, callback: Callback = None
 
     The covariance follows from the Jacobian there.
     """
+    asked = problem
     if auto:
         problem = with_start_values(problem)  # first guess, race of starts
         effort = replace(effort, looks=min(effort.looks, 1))  # a misfit from there is the model's, not the start's
     found = minimise(problem, effort, callback, wide=auto)  # continuation, restarts, reweighting
+    if auto:
+        found = no_worse_than_smaller(found, asked, effort, callback)
     found, error = _polished(found, effort, callback)  # finer sub-steps
     problem, q = found.problem, found.problem.unknowns.principal(found.q)
     status, message = _said(found, error)
@@ -230,6 +235,32 @@ def minimise(problem: Problem, effort: LevenbergMarquardt, callback: Callback = 
         again = by_continuation(begin.tuned(noise_factors=factors), effort, callback, wide=wide and k == 0)
         again = restore_collapsed(again, effort)
         found = replace(again, history=found.history + again.history)
+    return found
+
+
+def no_worse_than_smaller(found: Estimate, asked: Problem, effort: LevenbergMarquardt, callback: Callback) -> Estimate:
+    """Return an estimate that, where it leaves more than noise, costs no more than without one of its effects.
+
+    A model contains the smaller one: if that does better, begun as `asked`, this one is in a side valley, and begins
+    again from there.
+    """
+    problem, sizes = found.problem, natural_sizes(found.problem.experiments, found.values)
+    if not max(misfit_over_noise(problem, found.q).values(), default=0.0) > IMBALANCE:
+        return found
+    for effect in problem.model.effects:
+        with contextlib.suppress(*FAILURES):
+            smaller = asked.for_model(asked.model.without(effect.name)).tuned(noise_factors=problem.noise_factors)
+            end = minimise(with_start_values(smaller), effort)
+            if end.cost > found.cost:
+                continue
+            fresh = {p.name: suited(p, sizes).value for p in effect.parameters if p.vary and not p.given}
+            vanishing = [p.name for p in effect.parameters if p.null == 0]
+            weak = {n: NEXT_TO_NOTHING * value for n, value in fresh.items() if n in vanishing}
+            there = end.onward.tuned(width=problem.width)
+            starts = [there.for_model(problem.model.start_at(end.values | fresh | size)) for size in ({}, weak)]
+            again = race(starts, effort, solve=by_continuation)
+            if again is not None and again.cost < found.cost:
+                found = replace(again, history=found.history + again.history)
     return found
 
 

@@ -47,6 +47,11 @@ class Estimate:
         return self.solution.q
 
     @property
+    def onward(self) -> Problem:
+        """The problem begun at the end."""
+        return self.problem.begun_at(self.q)
+
+    @property
     def cost(self) -> float:
         """½ rᵀr at the end."""
         return self.solution.history[-1]

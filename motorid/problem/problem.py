@@ -21,7 +21,7 @@ from motorid.numerics.signals import Array
 from motorid.problem.residuals import Levels, Measured, prior_residual
 from motorid.problem.runs import Run, channels_of, noise_of, prepare_run, smoothing, with_inputs
 from motorid.problem.unknowns import Point, Scaling, Unknowns
-from motorid.records.experiment import Experiment, between_pauses
+from motorid.records.experiment import Experiment, between_pauses, units_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -276,6 +276,11 @@ class Problem:
         return pseudo, None if jac is None else jac * slope[:, None]
 
     @property
+    def linear(self) -> bool:
+        """Tell whether the angle is a position in metres: nothing comes back with a turn."""
+        return self.model.axis == "linear" or not {"m", "m/s"}.isdisjoint(units_of(self.experiments).values())
+
+    @property
     def n_outputs(self) -> int:
         """Number of output residuals (finite measured samples)."""
         return sum(m.size for m in self.measured)
@@ -290,6 +295,19 @@ class Problem:
     def start_at(self, values: Mapping[str, float]) -> Problem:
         """Return the problem with `values` as its start, each inside the limits of its parameter."""
         return self.for_model(self.model.start_at(values))
+
+    def begun_at(self, q: Array) -> Problem:
+        """Return the problem with the values at `q` as its start, those of each run and initial states too."""
+        physical = dict(zip([p.name for p in self.unknown], self.scaling.physical(q), strict=True))
+        runs = []
+        for k, run in enumerate(self.runs):
+            start = run.start.copy()
+            for j, c in enumerate(("i", "omega", "theta")):
+                if f"{c}_0[{k}]" in physical:  # rounding must not put it outside its limits
+                    start[j] = np.clip(physical[f"{c}_0[{k}]"], *run.limits[c])
+            apart = {n: physical[p.name] for n, r, p in self.unknowns.apart if r == k}
+            runs.append(replace(run, start=start, apart={**run.apart, **apart}))
+        return replace(self, model=self.model.start_at(self.values(q)), _runs=tuple(runs))
 
     def tuned(self, **fields: Any) -> Problem:
         """Return the problem with other `noise_factors`, another `width` …; the records stay as prepared."""

@@ -39,6 +39,20 @@ def _run(model, seed=0, n=600, dt=1e-3):
     return blank.with_(outputs={c: clean[c] + s * rng.normal(size=n) for c, s in blank.sigma.items()})
 
 
+def test_a_model_that_copies_the_measured_angle_predicts_none():
+    """Next to no inertia: the current balances the weight, and its voltage is the measured angle's rate."""
+    copying = {"R": 1e-6, "L": 1.0, "K": 1.0, "b": 1e-3, "J": 1e-6}
+    t = np.arange(600) * 2e-3
+    theta = 0.1 * np.sin(7 * t) + 0.05 * np.sin(17 * t)
+    run = mi.Experiment(t, {"v": 0.3 * np.cos(7 * t)}, {"theta": theta})
+    for model, copies in ((mi.dc_motor(**copying) + mi.effects.gravity(mgl=1.0, phi_g=np.pi), True),
+                          (mi.dc_motor(**TRUE) + mi.effects.gravity(mgl=0.01, phi_g=0.0), False),
+                          (mi.dc_motor(**TRUE) + mi.effects.cogging(A=5e-3, N=12, phi=0.0), False)):
+        problem = mi.Problem(model.with_(angle_input=True), [run])
+        problem = problem.refined(problem.start)
+        assert trial.copies_the_angle(problem, problem.start) == copies
+
+
 def test_a_pool_that_breaks_costs_no_refit_and_the_budget_holds_beside_one():
     def breaking(function, tasks):
         yield function(tasks[0])

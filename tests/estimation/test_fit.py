@@ -12,6 +12,7 @@ import motorid as mi
 from motorid.effects import LIBRARY
 from motorid.errors import FitError, SimulationError, UsageError
 from motorid.estimation import least_squares
+from motorid.estimation.fit import no_worse_than_smaller
 from motorid.integrate import Rosenbrock
 from motorid.records.datasets import truth
 
@@ -389,6 +390,20 @@ def test_a_fit_takes_no_more_least_squares_runs_than_its_docstring_says(effects,
     assert {n: fit.values[n] for n in hidden} == pytest.approx(hidden, rel=0.1)
     assert len(ends) == most
     assert len(fit.history) <= sum(len(end.history) for end in ends)
+
+
+def test_a_model_that_misses_the_noise_fits_no_worse_than_without_one_of_its_effects(rng):
+    """From a side valley it begins again where the smaller model ends."""
+    hidden = mi.dc_motor(**VALUES) + mi.effects.quadratic_drag(c_2=3e-6) + mi.effects.voltage_offset(V_0=0.4)
+    t = np.arange(500) * 1e-3
+    records = [noisy(simulated(t, drive(t, volt), model=hidden), rng) for volt in (6.0, -4.0)]
+    model = mi.dc_motor() + mi.effects.coulomb + mi.effects.speed_lag
+    asked = mi.Problem(model, records)
+    begin = asked.start_at({"R": 300.0, "J": 1.0})
+    astray = least_squares.least_squares(begin, mi.LevenbergMarquardt(max_iterations=1))
+    mended = no_worse_than_smaller(astray, asked, least_squares.FINISH, None)
+    smaller = [mi.fit(model.without(e.name), records).cost for e in model.effects]
+    assert mended.cost < 1.001 * min(smaller) < 0.1 * astray.cost
 
 
 def test_a_fit_can_go_on_from_a_fit(runs):
