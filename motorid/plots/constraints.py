@@ -60,9 +60,8 @@ def plot_current_limit(*results: Fit | Formulations, limit: float | None = None,
         top.set(title=fits[0].simulations[k].experiment.name)
         bottom.set(xlabel="time (s)")
         _zoom(bottom, [f.simulations[k] for f in fits], limit)
-    figure = axes[0, 0].figure
-    figure.align_ylabels(axes[:, 0])
-    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper center", ncols=4)
+    axes[0, 0].figure.align_ylabels(axes[:, 0])
+    axes[0, 0].figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper center", ncols=4)
     return axes
 
 

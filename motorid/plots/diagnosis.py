@@ -144,9 +144,8 @@ def plot_answer(found: Diagnosis, ax: Axes | None = None) -> Axes:
 
 def _quantity(found: Diagnosis, balance: str, had: Sequence[Array] | None) -> tuple[str, float]:
     """Return the quantity to draw over: the phase of an effect with periods, else what the addition `had` follows."""
-    values = found.after.values
-    orders = [values[p.name] for e in found.after.model.effects if e.name in found.effects for p in e.parameters
-              if p.order]
+    orders = [found.after.values[p.name] for e in found.after.model.effects if e.name in found.effects
+              for p in e.parameters if p.order]
     bins = found.missing.bins.get(balance, ())
     # Over time and heat any course is a curve, whatever it depends on: they pass through each value once.
     bins = [b for b in bins if b.against not in ("t", "heat")] or bins
@@ -191,9 +190,8 @@ def plot_ranking(result: Diagnosis | Sequence[Candidate], ax: Axes | None = None
             ax.barh(k, 100 * c.refit_drop, height=0.62, color=colour, alpha=0.85)
         ax.barh(k, 100 * c.predicted_drop, height=0.62, fill=False, edgecolor=style.INK, lw=0.9)
         if c.held_out_gain is not None:
-            clipped = c.held_out_gain < LOWEST_GAIN
-            ax.plot(100 * max(c.held_out_gain, LOWEST_GAIN), k, "<" if clipped else "D", ms=6, mew=0.7,
-                    color=style.PALETTE["orange"], mec="white", zorder=3)
+            ax.plot(100 * max(c.held_out_gain, LOWEST_GAIN), k, "<" if c.held_out_gain < LOWEST_GAIN else "D", ms=6,
+                    mew=0.7, color=style.PALETTE["orange"], mec="white", zorder=3)
     lowest = min([0.0, *(100 * max(c.held_out_gain or 0.0, LOWEST_GAIN) for c in chosen)])
     more = f" (first {len(chosen)} of {len(every)})" if len(every) > len(chosen) else ""
     ax.set(yticks=range(len(chosen)), yticklabels=[c.effect for c in chosen], ylim=(len(chosen) - 0.4, -0.6),

@@ -124,8 +124,6 @@ class LiveFit:
 
 
 class _Moving(NamedTuple):
-    """A curve of a model that moves."""
-
     line: Line2D
     run: int
     channel: str

@@ -114,8 +114,7 @@ def svg_of(draw: Callable[..., Any], *args: Any, name: str, alt: str, **options:
     `name` is the prefix of the names inside, unique on the page; `alt` says what the figure shows.
     """
     with detached():
-        drawn = draw(*args, **options)
-    figure = np.ravel(np.asarray(drawn, object))[0].figure
+        figure = np.ravel(np.asarray(draw(*args, **options), object))[0].figure
     if (engine := figure.get_layout_engine()) is not None:  # once, and not again while saving
         engine.execute(figure)
         figure.set_layout_engine("none")
