@@ -30,12 +30,8 @@ _STYLE = """
 .motorid .wordy tr>:last-child{flex:1 0 100%}}
 """
 # Words first, colour second: each pair has a contrast of 5.5 or more, on a light page and on a dark one.
-COLOURS = {
-    "good": ("#0b5a26", "#d7f5df"),
-    "note": ("#6b4100", "#fdf0c8"),
-    "bad": ("#8f1220", "#ffe3e4"),
-    "plain": ("#3a444f", "#e6eaef"),
-}
+COLOURS = {"good": ("#0b5a26", "#d7f5df"), "note": ("#6b4100", "#fdf0c8"), "bad": ("#8f1220", "#ffe3e4"),
+           "plain": ("#3a444f", "#e6eaef")}
 WIDE, SENTENCE = 5, 32  # columns that a phone has room for; characters of a cell beyond a name or a number
 
 
@@ -107,9 +103,8 @@ class Table:
 
 
 def _row(cells: Sequence[Cell]) -> str:
-    texts = [c.to_html() if isinstance(c, Flag) else escape(c) for c in cells]
-    rest = "".join(f"<td>{t}</td>" for t in texts[1:])
-    return f'<tr><th scope="row">{texts[0]}</th>{rest}</tr>'
+    name, *rest = (c.to_html() if isinstance(c, Flag) else escape(c) for c in cells)
+    return f'<tr><th scope="row">{name}</th>' + "".join(f"<td>{t}</td>" for t in rest) + "</tr>"
 
 
 def value_cell(value: float, std: float | None, unit: str = "", why: str = "not determined") -> Cell:

@@ -50,9 +50,7 @@ def with_error(value: float, std: float | None, unit: str = "", why: str = "not 
         place = max(min(place, _place(abs(value))), place - 2)
     power = _power(max(abs(value), std), -2)
     exact, error = _rounded(value, place, power), _rounded(std, place, power)
-    if power:
-        return f"({exact} ± {error})·10{raised(power)}{tail}"
-    return f"{exact} ± {error}{tail}"
+    return f"({exact} ± {error})·10{raised(power)}{tail}" if power else f"{exact} ± {error}{tail}"
 
 
 def number(value: float | None, digits: int = 4) -> str:
