@@ -177,7 +177,6 @@ class _Ahead:
         atexit.register(self.clear)
 
     def clear(self) -> None:
-        """Let go of everything."""
         self.waiting.clear()
         if self.running is not None and self.process == os.getpid():  # a fork has its parent's in its memory
             self.running.drop()

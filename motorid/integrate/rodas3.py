@@ -68,8 +68,7 @@ def rosenbrock_step(system: System, x, u0, u1, h, p):
         u = u0 + ALPHA[s] * (u1 - u0)
         rhs = h * (system.rhs(at, u, p) if s > 1 else f) + h * GAMMA_T[s] * drift
         before = sum((c * k for c, k in zip(C[s], stages, strict=True)), ca.SX.zeros(x.numel()))
-        rhs += ca.mtimes(mass, before)
-        stages.append(_solve(factors, rhs))
+        stages.append(_solve(factors, rhs + ca.mtimes(mass, before)))
     return x + sum(w * k for w, k in zip(WEIGHTS, stages, strict=True) if w), stages[3]
 
 

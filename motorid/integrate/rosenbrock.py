@@ -20,6 +20,7 @@ from motorid.model.equations import System
 from motorid.numerics.signals import Array
 
 PATIENCE = 1.5e7  # instructions of the virtual machine (0.05 s) before a step is worth compiling
+CHUNK = 256  # steps in one call of the virtual machine
 MOST_SUBSTEPS = 256
 MOST_PASSES = 6
 LOST_ERROR = 0.3  # error estimate, relative to the state so far, at which a step is lost
@@ -81,8 +82,7 @@ class Rosenbrock:
             if astray is not None:
                 traj = traj._replace(x=traj.x[:astray + 2], y=traj.y[:astray + 2])
                 size, error[:, astray + 1:] = size[:, :astray + 2], 0.0
-            sizes = np.maximum(size[:, -1], stepper(system).shown_sizes(grid, traj, p))
-            sizes = np.maximum(sizes, 1e-12)[:, None]
+            sizes = np.maximum(np.maximum(size[:, -1], stepper(system).shown_sizes(grid, traj, p)), 1e-12)[:, None]
             relative = (error / sizes).max(axis=0)
             rows = np.flatnonzero(relative > level)
             if len(rows):
@@ -236,9 +236,6 @@ def stepper(system: System) -> Stepper:
     return slot[0]
 
 
-CHUNK = 256
-
-
 class Machine:
     """Walks and observations of one system, over `CHUNK` steps at a time, made when first needed."""
 
@@ -251,14 +248,13 @@ class Machine:
 
     def _walk(self, nq: int) -> ca.Function:
         """Return CHUNK steps in a row; sensitivities go transposed, so that time comes first in memory."""
+        if not nq:
+            return self.functions.light.mapaccum("walk", CHUNK)
         x, u0, u1, h, p = self.functions.full.sx_in()
         s, dp = ca.SX.sym("S", nq, self.nx), ca.SX.sym("dp", nq, self.np)
-        if nq:
-            x_next, a, b = self.functions.full(x, u0, u1, h, p)
-            one = ca.Function("one", [x, s, u0, u1, h, p, dp], [x_next, ca.densify(s @ a.T + dp @ b.T)])
-            return one.mapaccum("walk", CHUNK, 2, {})
-        one = ca.Function("one", [x, u0, u1, h, p], list(self.functions.light(x, u0, u1, h, p)))
-        return one.mapaccum("walk", CHUNK, 1, {})
+        x_next, a, b = self.functions.full(x, u0, u1, h, p)
+        one = ca.Function("one", [x, s, u0, u1, h, p, dp], [x_next, ca.densify(s @ a.T + dp @ b.T)])
+        return one.mapaccum("walk", CHUNK, 2, {})
 
     def _observation(self, derivatives: bool) -> ca.Function:
         given = self.functions.out.sx_in()
@@ -350,10 +346,9 @@ def _in_chunks(f: Any, n: int, moving: Sequence[Array], steady: Sequence[Array],
         trigger()
 
 
-def _view(a: Array) -> Any:
+def _view(a: Any) -> memoryview:
     """Return the memory of the contiguous array `a`, for CasADi."""
-    flat: Any = a.reshape(-1)
-    return memoryview(flat)
+    return memoryview(a.reshape(-1))
 
 
 def _repeated(a: Array) -> Array:
