@@ -103,6 +103,7 @@ def _fields(found: Fit | Model, name: str) -> dict[str, Any]:
     starts = [s for _, s in casadi_file.runs_of(found)] if isinstance(found, Fit) else []
     held = casadi_file.zoh_inputs(system.inputs, found.problem.experiments[0]) if isinstance(found, Fit) else [
         n != "theta_in" for n in system.inputs]
+    rows = ",\n".join("  {" + ", ".join(map(repr, s.tolist())) + "}" for s in starts)
     runs = f"#define {name.upper()}_RUNS {len(starts)}\n" if starts else ""
     checked = check(found)
     return {
@@ -115,7 +116,7 @@ def _fields(found: Fit | Model, name: str) -> dict[str, Any]:
         "parameters": ",\n  ".join(f"{v!r}" for v in casadi_file.values_of(found, system).tolist()),
         "starts_declared": f"{runs}extern const double {name}_starts[{len(starts)}][3];"
                            " /* (current, speed, angle) at the start of the records of the fit */\n" if starts else "",
-        "starts": _starts(name, starts),
+        "starts": f"const double {name}_starts[{len(starts)}][3] = {{\n{rows}\n}};\n" if starts else "",
         **{size: max(least, *(getattr(f, size)() for f in functions))
            for size, least in (("sz_arg", 1), ("sz_res", 2), ("sz_iw", 1), ("sz_w", 1))},
     }
@@ -128,13 +129,6 @@ def _strings(names: Sequence[str]) -> str:
 def _harmless(line: str) -> str:
     """Return text that cannot end a comment or continue a line: names of runs come from files."""
     return re.sub(r"[*/\\?]{2,}", "_", printable(" ".join(line.split()))).rstrip("\\")
-
-
-def _starts(name: str, starts: Sequence[np.ndarray]) -> str:
-    if not starts:
-        return ""
-    rows = ",\n".join("  {" + ", ".join(repr(v) for v in s.tolist()) + "}" for s in starts)
-    return f"const double {name}_starts[{len(starts)}][3] = {{\n{rows}\n}};\n"
 
 
 def _record(grid: Any, inputs: Sequence[str]) -> str:

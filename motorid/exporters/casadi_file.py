@@ -40,11 +40,9 @@ UNARY, BINARY = (frozenset(f"OP_{n}" for n in names.split()) for names in (
 
 def model_of(found: Fit | Model) -> Model:
     """Return the model at its values; UsageError if `found` is neither a fit nor a model."""
-    if isinstance(found, Fit):
-        return found.model
-    if isinstance(found, Model):
-        return found
-    raise UsageError(f"a fit or a model can be exported, not {type(found).__name__}: mi.export(fit, path).")
+    if not isinstance(found, Fit | Model):
+        raise UsageError(f"a fit or a model can be exported, not {type(found).__name__}: mi.export(fit, path).")
+    return found.model if isinstance(found, Fit) else found
 
 
 def system_of(found: Fit | Model) -> System:
@@ -100,9 +98,9 @@ def functions_of(found: Fit | Model) -> list[ca.Function]:
 
 def plain_functions(system: System, prefix: str = "") -> list[ca.Function]:
     """Return ``rhs``, ``outputs``, ``initial`` and ``step``, see `functions_of`, with dense results."""
+    sparse = {"rhs": system.rhs, "outputs": system.out, "initial": system.initial, "step": step_functions(system).light}
     found = []
-    for name, f in (("rhs", system.rhs), ("outputs", system.out), ("initial", system.initial),
-                    ("step", step_functions(system).light)):
+    for name, f in sparse.items():
         args = f.sx_in()
         results = [ca.densify(r) for r in f.call(args)]
         found.append(ca.Function(f"{prefix}{name}", args, results, f.name_in(), f.name_out()))

@@ -28,6 +28,8 @@ from motorid.problem.plain_data import model_from_json, problem_of
 from motorid.records.files import read_bytes, write_files
 
 FORMS = {".casadi": "casadi", ".c": "c", ".json": "json"}
+_CONTENTS: Mapping[str, Callable[[Fit | Model, Path], Mapping[Path, Any]]] = {
+    "casadi": casadi_file, "c": c_files, "json": lambda found, path: {path: json_text(description(found))}}
 NO_FMU = ("an FMU is not offered: those that CasADi 3.8.2 writes do not pass FMPy's checker (names of variables, "
           "initial unknowns), and FMPy simulates them with other trajectories. Take to='c' or to='casadi'.")
 SAME = 1e-4  # relative difference of costs that machines and engines make
@@ -126,10 +128,6 @@ def export(found: Fit | Model | Exported, path: str | os.PathLike[str], to: str 
     with contextlib.suppress(OSError):  # said when it is written
         target.parent.mkdir(parents=True, exist_ok=True)
     return write_files(_CONTENTS[form](found, target), force)[0]
-
-
-_CONTENTS: Mapping[str, Callable[[Fit | Model, Path], Mapping[Path, Any]]] = {
-    "casadi": casadi_file, "c": c_files, "json": lambda found, path: {path: json_text(description(found))}}
 
 
 @one_thread
