@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import secrets
 import signal
-import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -26,9 +25,8 @@ Port = Annotated[str, typer.Option(
 Out = Annotated[Path, typer.Option(metavar="RUN.csv", help="The CSV to write.")]
 Baud = Annotated[int, typer.Option(metavar="N", min=300, help="Bits per second; a board on USB ignores it.")]
 Excite = Annotated[str | None, typer.Option(
-    metavar="PARTS",
-    help="Voltage to apply, in parts joined by commas: rest:s step:volt:s stairs:from:to:levels:s ramp:from:to:s "
-         "chirp:volt:Hz:Hz:s prbs:volt:bit:s coast:s standard. By default 0 V.")]
+    metavar="PARTS", help="Voltage to apply, in parts joined by commas: rest:s step:volt:s stairs:from:to:levels:s "
+    "ramp:from:to:s chirp:volt:Hz:Hz:s prbs:volt:bit:s coast:s standard. By default 0 V.")]
 Duration = Annotated[float | None, typer.Option(metavar="S", help="Stop after so many seconds.")]
 Volts = Annotated[float | None, typer.Option(metavar="V", help="Largest voltage, of either sign.")]
 Amperes = Annotated[float | None, typer.Option(metavar="A", help="Switch the motor off above this current.")]
@@ -132,10 +130,8 @@ def bench_command(effect: HiddenEffect = "random", motor: MotorName = "lab", see
     VirtualDevice(truth, rate, names)  # complain before anything opens
     wire = Wire(Faults(drop, garbage, cut, flip), np.random.default_rng([seed, 2]))
     end = open_transport(link, socket)
-    typer.echo(f"port: {end.name}")
-    typer.echo(f"A virtual motor '{motor}' at {rate:g} samples per second; now, in another terminal:\n"
-               f"  motorid record --port {end.name} --out run.csv --excite standard\nCtrl-C ends it.")
-    sys.stdout.flush()
+    typer.echo(f"port: {end.name}\nA virtual motor '{motor}' at {rate:g} samples per second; now, in another "
+               f"terminal:\n  motorid record --port {end.name} --out run.csv --excite standard\nCtrl-C ends it.")
     stopped: list[int] = []
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda n, _: stopped.append(n))

@@ -174,9 +174,7 @@ def show(*parts: Table | str | None) -> None:
     from rich.text import Text
 
     console = _console()
-    for part in parts:
-        if part is None:
-            continue
+    for part in (p for p in parts if p is not None):
         if isinstance(part, str):
             for s in printable(in_options(part)).split("\n"):
                 whole = "   " in s or s.startswith(COMMAND)  # a table, or what is to be copied
@@ -300,9 +298,8 @@ def save_report(result: Any, path: Any, held_out: Sequence[Any] = (), force: boo
         return
     from motorid.reports.report import report
 
-    command = " ".join(["motorid", *sys.argv[1:]])
     with progress("Writing the report"):
-        written = report(result, path, command=command, validate=held_out, force=force)
+        written = report(result, path, command=" ".join(["motorid", *sys.argv[1:]]), validate=held_out, force=force)
     show(f"Report: {written}")
 
 

@@ -34,6 +34,11 @@ from motorid.records.reading import read_runs
 DEMO_SET = "hidden_friction"
 
 _limit = functools.partial(typer.Option, rich_help_panel="Limits")
+MaxEffects = Annotated[int, opt.result(min=0, metavar="N", help="Largest number of effects to add.")]
+TimeLimit = Annotated[float | None, opt.result(
+    min=0, metavar="SECONDS", help="Stop after this time with the best answer so far, as Ctrl-C does.")]
+RemainderFile = Annotated[Path | None, opt.result(
+    metavar="FILE.py", help="Write what no effect explains as an effect, for --effects-from.")]
 Found = Annotated[Path, typer.Argument(metavar="FOUND.json", help="File written by diagnose --json.")]
 Plan = Annotated[Path | None, opt.result(metavar="plan.csv", help="Write time, voltage and predictions.")]
 Goal = Annotated[str | None, typer.Option(
@@ -50,17 +55,13 @@ Levels = Annotated[int, typer.Option(metavar="N", help="Number of segments of th
 Slew = Annotated[float | None, _limit(metavar="V/S", help="Largest slope of ramps.")]
 Budget = Annotated[float | None, typer.Option(metavar="S", help="Stop after this time with the best so far.")]
 
+DemoFolder = Annotated[Path, typer.Option(metavar="DIR", help="Where figures and report go.")]
+
 
 @opt.with_options(opt.FitOptions)
-def diagnose_command(
-    runs: opt.Runs, options: opt.FitOptions, validate: opt.Validate = None,
-    max_effects: Annotated[int, opt.result(min=0, metavar="N", help="Largest number of effects to add.")] = 3,
-    budget: Annotated[float | None, opt.result(
-        min=0, metavar="SECONDS", help="Stop after this time with the best answer so far, as Ctrl-C does.")] = None,
-    remainder_to: Annotated[Path | None, opt.result(
-        metavar="FILE.py", help="Write what no effect explains as an effect, for --effects-from.")] = None,
-    jobs: opt.Jobs = 1, json: opt.Json = None, report: opt.Report = None,
-) -> None:
+def diagnose_command(runs: opt.Runs, options: opt.FitOptions, validate: opt.Validate = None,
+                     max_effects: MaxEffects = 3, budget: TimeLimit = None, remainder_to: RemainderFile = None,
+                     jobs: opt.Jobs = 1, json: opt.Json = None, report: opt.Report = None) -> None:
     """Say where the model fails, which physical effect is missing, and what the error is with it.
 
     Example: motorid diagnose run*.csv --validate check*.csv --report found.html
@@ -182,10 +183,7 @@ def read_rivals(path: Path, effects_from: Path | None, goal: str | None) -> list
         raise DataError(f"{path} holds no rival models. Write it with: motorid diagnose RUN... --json {path}") from None
 
 
-def demo_command(
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Where figures and report go.")] = Path("motorid-demo"),
-    json: opt.Json = None, force: opt.Force = False,
-) -> None:
+def demo_command(out: DemoFolder = Path("motorid-demo"), json: opt.Json = None, force: opt.Force = False) -> None:
     """Show the story on shipped records: fit, see that it fails, add what is missing, see the error fall.
 
     Example: motorid demo --out demo
@@ -209,7 +207,6 @@ def demo_command(
 
 
 def _write_demo(found: Diagnosis, check: Sequence[Experiment], out: Path, force: bool) -> list[str]:
-    """Save the report and three figures; return their paths."""
     from motorid.plots import plot_fit, plot_ladder, plot_missing
     from motorid.plots.style import png_of
     from motorid.reports.report import report

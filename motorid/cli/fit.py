@@ -30,6 +30,18 @@ from motorid.uncertainty.multistart import Multistart, multistart
 
 MOST_SHOWN = 4  # runs of which all columns are listed
 SavedModel = Annotated[Path, typer.Argument(metavar="FIT.json", help="File written by fit --json or export.")]
+Motors = Annotated[list[Path], typer.Argument(metavar="DIR", help="One folder, or file, per motor inside.")]
+MotorTable = Annotated[Path | None, opt.result(metavar="TABLE.csv", help="Write the table: .csv, .parquet or .json.")]
+Journal = Annotated[Path | None, opt.result(metavar="FILE", help="Results as they come, to go on from.")]
+EffectName = Annotated[str | None, typer.Argument(metavar="NAME", show_default=False, help="One effect.")]
+ChannelFolder = Annotated[Path | None, typer.Option(metavar="DIR", help="Write the simulated channels as CSV.")]
+Engine = Annotated[str, typer.Option(metavar="rosenbrock|cvodes|idas")]
+Target = Annotated[Path, typer.Argument(metavar="PATH", help="File to write.")]
+Form = Annotated[str | None, typer.Option(
+    metavar="casadi|c|json", show_default=False, help="Format; by default that of PATH's ending.")]
+Starts = Annotated[int, opt.result(min=1, metavar="N", help="Number of fits.")]
+Spread = Annotated[float, opt.result(min=1.0, metavar="FACTOR", help="Every start is off by up to this factor.")]
+Seed = Annotated[int, opt.result(min=0, metavar="N", help="Seed of the starts.")]
 
 
 @opt.with_options(opt.FitOptions)
@@ -54,7 +66,6 @@ def fit_command(runs: opt.Runs, options: opt.FitOptions, validate: opt.Validate 
 
 
 def _show_fit(found: Fit, records: list[Experiment], notes: list[str], judged: Evaluation | None = None) -> None:
-    """Print a fit: remarks, parameters, errors, what follows from them, and how it ended."""
     plain = found.fits == "noise" and max(found.misfit.values(), default=0.0) < PLAIN
     show(found.verdict, _held_out(found, judged) if judged else None, NRMSE,
          f"Next: {next_command('fit', '--json', 'fit.json')}\nThen: motorid export fit.json motor.casadi" if plain
@@ -82,14 +93,8 @@ def _amount(records: list[Experiment]) -> str:
 
 
 @opt.with_options(opt.FitOptions)
-def fit_many_command(
-    directories: Annotated[list[Path], typer.Argument(metavar="DIR", help="One folder, or file, per motor inside.")],
-    options: opt.FitOptions,
-    out: Annotated[Path | None, opt.result(
-        metavar="TABLE.csv", help="Write the table: .csv, .parquet or .json.")] = None,
-    journal: Annotated[Path | None, opt.result(metavar="FILE", help="Results as they come, to go on from.")] = None,
-    jobs: opt.Jobs = 1, json: opt.Json = None,
-) -> None:
+def fit_many_command(directories: Motors, options: opt.FitOptions, out: MotorTable = None, journal: Journal = None,
+                     jobs: opt.Jobs = 1, json: opt.Json = None) -> None:
     """Fit one model to the records of many motors; a motor that fails is a row that says why.
 
     Names of motors begin with their folder where several are given.
@@ -153,10 +158,7 @@ def _channel_table(run: Experiment) -> Table:
                  f"{number(1e3 * run.dt, 3)} ms apart", left=(0, 1, 2, 3))
 
 
-def effects_command(
-    name: Annotated[str | None, typer.Argument(metavar="NAME", show_default=False, help="One effect.")] = None,
-    effects_from: opt.EffectsFrom = None,
-) -> None:
+def effects_command(name: EffectName = None, effects_from: opt.EffectsFrom = None) -> None:
     """List the effects of the library, or show one: its law, its parameters, its source.
 
     Example: motorid effects stribeck
@@ -171,12 +173,9 @@ def effects_command(
 
 
 @opt.with_options(opt.ReadingOptions)
-def simulate_command(
-    fit_json: SavedModel, runs: opt.Runs, options: opt.ReadingOptions,
-    out: Annotated[Path | None, typer.Option(metavar="DIR", help="Write the simulated channels as CSV.")] = None,
-    engine: Annotated[str, typer.Option(metavar="rosenbrock|cvodes|idas")] = "rosenbrock",
-    effects_from: opt.EffectsFrom = None, json: opt.Json = None,
-) -> None:
+def simulate_command(fit_json: SavedModel, runs: opt.Runs, options: opt.ReadingOptions, out: ChannelFolder = None,
+                     engine: Engine = "rosenbrock", effects_from: opt.EffectsFrom = None,
+                     json: opt.Json = None) -> None:
     """Simulate a fitted model on records, and compare where something was measured.
 
     Example: motorid simulate fit.json check*.csv --out simulated
@@ -206,13 +205,8 @@ def _write_simulations(judged: Evaluation, out: Path, force: bool) -> list[str]:
     return [str(f) for f in write_files(files, force)]
 
 
-def export_command(
-    fit_json: SavedModel,
-    path: Annotated[Path, typer.Argument(metavar="PATH", help="File to write.")],
-    to: Annotated[str | None, typer.Option(
-        metavar="casadi|c|json", show_default=False, help="Format; by default that of PATH's ending.")] = None,
-    effects_from: opt.EffectsFrom = None, force: opt.Force = False,
-) -> None:
+def export_command(fit_json: SavedModel, path: Target, to: Form = None, effects_from: opt.EffectsFrom = None,
+                   force: opt.Force = False) -> None:
     """Take a fitted model along: as CasADi functions, as C source, as JSON.
 
     Example: motorid export fit.json --to c motor.c
@@ -238,14 +232,8 @@ def identifiability_command(runs: opt.Runs, options: opt.FitOptions, json: opt.J
 
 
 @opt.with_options(opt.FitOptions)
-def robustness_command(
-    runs: opt.Runs, options: opt.FitOptions,
-    starts: Annotated[int, opt.result(min=1, metavar="N", help="Number of fits.")] = 100,
-    spread: Annotated[float, opt.result(
-        min=1.0, metavar="FACTOR", help="Every start is off by up to this factor.")] = 10.0,
-    seed: Annotated[int, opt.result(min=0, metavar="N", help="Seed of the starts.")] = 0,
-    json: opt.Json = None, report: opt.Report = None,
-) -> None:
+def robustness_command(runs: opt.Runs, options: opt.FitOptions, starts: Starts = 100, spread: Spread = 10.0,
+                       seed: Seed = 0, json: opt.Json = None, report: opt.Report = None) -> None:
     """Fit from many poor starts, and say whether all end in the same place.
 
     Example: motorid robustness run*.csv --starts 50 --spread 10
@@ -259,7 +247,6 @@ def robustness_command(
 
 
 def _give(found: Batch | Identifiability | Multistart, json: opt.Json, force: bool) -> None:
-    """Show a result and write it as JSON, as asked."""
     if json != "-":
         show(str(found))
     if json:

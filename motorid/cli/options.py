@@ -90,15 +90,13 @@ class ReadingOptions:
     @property
     def reading(self) -> dict[str, Any]:
         """What was said for `read_runs`, as its keyword arguments."""
-        named: dict[str, Any] = {
-            k: parse_pairs(v, f"--{k}") for k in ("columns", "units") if (v := getattr(self, k))}
+        named: dict[str, Any] = {k: parse_pairs(v, f"--{k}") for k in ("columns", "units") if (v := getattr(self, k))}
         if self.ignore:  # which of several columns it is does not matter then
             named["columns"] = {**dict.fromkeys(self._ignored), **named.get("columns", {})}
         return named | {k: v for k in ("hold", "dt") if (v := getattr(self, k)) is not None}
 
     @property
     def _ignored(self) -> list[str]:
-        """The channels to leave out."""
         out = _words(self.ignore)
         for channel in out:
             among(channel, CHANNELS, "measured channel", where="--ignore: ")
@@ -230,8 +228,7 @@ def own_effects(path: Path) -> dict[str, Effect]:
         if interruption.behind(error):
             raise
         raise UsageError(f"--effects-from: {path} cannot be run: {type(error).__name__}: {error}.") from None
-    effects = [e for e in vars(module).values() if isinstance(e, Effect)]
-    found = {e.name: e for e in effects if library.EVERY.get(e.name) is not e}
+    found = {e.name: e for e in vars(module).values() if isinstance(e, Effect) and library.EVERY.get(e.name) is not e}
     if not found:
         raise UsageError(f"--effects-from: {path} defines no effect of its own. Write a function and "
                          "decorate it with @mi.effect(balance=\"torque\").")
@@ -261,8 +258,7 @@ def make_folder(out: Path) -> None:
 
 def notes_of(runs: Sequence[Experiment], held_out: Sequence[Experiment] = ()) -> list[str]:
     """Return what a person should know about the records: how they were read, and what looks wrong."""
-    twice = repeated(runs, held_out)
-    return [*reading_notes(runs), *([twice] if twice else []), *check_runs(runs)]
+    return [note for note in (*reading_notes(runs), repeated(runs, held_out), *check_runs(runs)) if note]
 
 
 def _words(*texts: str | None) -> list[str]:
