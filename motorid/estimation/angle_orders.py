@@ -277,7 +277,10 @@ class _OrderSearch:
 @lru_cache(maxsize=2)
 def _order_search(tangent: Tangent) -> _OrderSearch:
     """Return what is there to be looked into; outputs count in units of their noise."""
-    white, basis, residual = _whitened(tangent)
+    unstack = tangent.fit.problem.unstack
+    white = Whitening.of(unstack(tangent.residual))
+    basis, residual = column_space(white(unstack(tangent.basis))), white(unstack(tangent.residual))
+    residual = residual - basis @ (basis.T @ residual)
     answers = [replace(answer, c=answer.c * run.weights[None, :, None])
                for answer, run in zip(responses(tangent.fit), tangent.fit.problem.measured, strict=True)]
     orders = np.arange(1.0, highest_order(tangent) + 1)
@@ -290,15 +293,6 @@ def _slow_enough(moving: Array, orders: Array) -> Array:
     sure, some = (np.searchsorted(counted, part / orders, side="right") for part in (QUARTER, np.pi))
     slow = np.where(some > SLOW_PART * moving.size, np.pi / orders, 0.0)
     return np.where(sure > max(SAMPLES, SURE_PART * moving.size), QUARTER / orders, slow)
-
-
-def _whitened(tangent: Tangent) -> tuple[Whitening, Array, Array]:
-    """Return the filters, the tangent space behind them, and the residual off it."""
-    fit = tangent.fit
-    white = Whitening.of(fit.problem.unstack(tangent.residual))
-    basis = column_space(white(fit.problem.unstack(tangent.basis)))
-    residual = white(fit.problem.unstack(tangent.residual))
-    return white, basis, residual - basis @ (basis.T @ residual)
 
 
 def _lines(orders: Array, sines: Array, cosines: Array, residual: Array) -> list[Line]:

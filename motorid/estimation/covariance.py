@@ -120,11 +120,8 @@ def channel_blocks(problem: Problem, residuals: Array, jacobian: Array) -> dict[
 
 
 def _colours(blocks: Blocks, unknowns: int, method: str) -> dict[str, Colour]:
-    found = {}
-    for c, parts in blocks.items():
-        colour = colour_of([r for r, _ in parts], unknowns / len(blocks))
-        found[c] = colour if method == "coloured" else Colour(np.zeros(0), colour.variance, colour.variance)
-    return found
+    found = {c: colour_of([r for r, _ in parts], unknowns / len(blocks)) for c, parts in blocks.items()}
+    return found if method == "coloured" else {c: Colour(np.zeros(0), k.variance, k.variance) for c, k in found.items()}
 
 
 def _meat(problem: Problem, jacobian: Array, blocks: Blocks, colours: Mapping[str, Colour], along: Array) -> Array:

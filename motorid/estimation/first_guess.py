@@ -59,10 +59,8 @@ def _read_plainly(run: Experiment, model: Model) -> Experiment:
 def _signals(run: Experiment) -> dict[str, Array]:
     """Return t, v and what was measured of i, omega, theta on all samples, gaps bridged; omega from the angle."""
     t = run.t
-    found: dict[str, Array] = {"t": t, **run.inputs}
-    for c in CHANNELS:
-        if c in run.outputs and np.isfinite(run.outputs[c]).any():
-            found[c] = bridged(t, run.outputs[c])
+    measured = (c for c in CHANNELS if c in run.outputs and np.isfinite(run.outputs[c]).any())
+    found: dict[str, Array] = {"t": t, **run.inputs, **{c: bridged(t, run.outputs[c]) for c in measured}}
     if "omega" not in found and "theta" in found:
         found["omega"] = slope(t, found["theta"], max(2, min(10, len(t) // 200)))
     if run.hold == "zoh":

@@ -159,16 +159,13 @@ class Unknowns:
             return jp @ along
         rows, columns = self._places[k]
         dx0 = jp @ at.dp
-        if rows:
-            dx0[:, columns] += js[:, rows] * at.slope[columns]
+        dx0[:, columns] += js[:, rows] * at.slope[columns]
         return dx0
 
     def _sensed(self, at: Point, k: int) -> Array:
         rows, columns = self._places[k]
-        start = self.runs[k].start
-        if rows:
-            start = start.copy()
-            start[rows] = at.physical[columns]
+        start = self.runs[k].start.copy()
+        start[rows] = at.physical[columns]
         return start
 
 
