@@ -116,15 +116,14 @@ def _channel(fit: Fit, channel: str) -> dict[str, float]:
     noise = float(np.sqrt(np.mean([fit.problem.runs[k].sigma[channel] ** 2 for k, _ in parts])))
     r = np.concatenate([p for _, p in parts])
     r = r[np.isfinite(r)]
-    rho = float(np.mean([autocorrelation(p, 1)[-1] for _, p in parts]))
-    v = [fit.problem.experiments[k].inputs["v"] for k, _ in parts]
-    linked = max((_largest_cross_correlation(u, p) for u, (_, p) in zip(v, parts, strict=True)), default=0.0)
+    runs = fit.problem.experiments
+    linked = max((_largest_cross_correlation(runs[k].inputs["v"], p) for k, p in parts), default=0.0)
     rms = float(np.sqrt(np.mean(r**2))) if r.size else 0.0
     alone = np.concatenate([despiked(p) for _, p in parts])
     ratio = float(np.sqrt(np.mean(alone**2))) / noise if alone.size else 0.0
     return {"noise": noise, "rms": rms, "ratio": ratio,
-            "rounded": float(ratio < AT_ROUNDING and noise < AT_ROUNDING * _rounding(fit.problem.experiments, channel)),
-            "autocorrelation": rho,
+            "rounded": float(ratio < AT_ROUNDING and noise < AT_ROUNDING * _rounding(runs, channel)),
+            "autocorrelation": float(np.mean([autocorrelation(p, 1)[-1] for _, p in parts])),
             "input_correlation": linked, "effective_samples": sum(effective_samples(p) for _, p in parts)}
 
 
@@ -211,8 +210,7 @@ def _score_tests(scores: Sequence[Score]) -> list[dict[str, Any]]:
         pars = s.effect.parameters
         searched = SEARCHED if any(p.order for p in pars) else 1 + 3 * sum(bool(p.grid) for p in pars)
         chance = scipy.special.chdtrc(len(pars), -s.effective * np.log1p(-min(s.drop, 1 - 1e-12)))
-        p = min(1.0, searched * float(chance))
-        found.append({"channel": None, "on": s.effect.name, "share": s.drop, "p": p})
+        found.append({"channel": None, "on": s.effect.name, "share": s.drop, "p": min(1.0, searched * float(chance))})
     return found
 
 

@@ -212,21 +212,20 @@ class Design(Printed):
 
     def card(self) -> Card:
         """Return what is expected of it, and how to play it."""
-        tables = []
         if self.evidence:
             rows = [[a, b, number(fixed, 3), number(mine, 3)] for (a, b), (fixed, mine) in self.evidence.items()]
-            tables.append(Table(["if it is", "evidence against", f"by the {self.fixed}, nats", "by this, nats"], rows,
-                                left=(0, 1)))
+            heads = ["if it is", "evidence against", f"by the {self.fixed}, nats", "by this, nats"]
+            expected = Table(heads, rows, left=(0, 1))
         else:
             rows = [[name, *(number(x, 3) for x in each)]
                     for every in self.deviations.values() for name, each in every.items()]
-            tables.append(Table(["parameter", "std (SI) so far", f"with the {self.fixed}", "with this"], rows))
+            expected = Table(["parameter", "std (SI) so far", f"with the {self.fixed}", "with this"], rows)
         unit = {"dT": "K"} | {c: units[0] for c, units in UNITS.items()}
         rows = [["temperature rise" if c == "dT" else channel_name(c), quantity(p, unit[c], 3),
                  quantity(self.limits.get(c), unit[c], 3)] for c, p in self.peaks.items()]
-        tables.append(Table(["quantity", "largest expected", "limit"], rows))
         return Card("Designed experiment", (Flag(self.status, "good" if self.status == "designed" else "note"),),
-                    (self.text, f"Play it: {self.excite}"), tables,
+                    (self.text, f"Play it: {self.excite}"),
+                    (expected, Table(["quantity", "largest expected", "limit"], rows)),
                     (("mi.plot_design(design)", "see it"), ('design.to_csv("plan.csv")', "time and voltage"),
                      ('mi.record(port, "next.csv", excite=design.excite)', "play it")))
 

@@ -98,12 +98,10 @@ def _walk(fit: Fit, size: Array, begun: Sequence[Linear]) -> tuple[float, list[S
 
 def _shares(fit: Fit, walk: Array, both: Sequence[Smoothed], begun: Sequence[Linear]) -> dict[str, float]:
     """Share of the misfit by balance: what one unknown input alone leaves, the other has to explain."""
-    alone = [[smooth(fit, k, walk * keep, at).chi2 for k, at in enumerate(begun)] for keep in ([1, 0], [0, 1])]
-    left = [float(np.mean(chi2)) for chi2 in alone]
-    rest = float(np.mean([s.chi2 for s in both]))
-    missed = [max(c - max(rest, 1.0), 0.0) + 1e-3 for c in left]
-    total = sum(missed)
-    return {"electrical": missed[1] / total, "mechanical": missed[0] / total}
+    alone = [np.mean([smooth(fit, k, walk * keep, at).chi2 for k, at in enumerate(begun)]) for keep in ([1, 0], [0, 1])]
+    rest = max(float(np.mean([s.chi2 for s in both])), 1.0)
+    missed = [max(float(chi2) - rest, 0.0) + 1e-3 for chi2 in alone]
+    return {"electrical": missed[1] / sum(missed), "mechanical": missed[0] / sum(missed)}
 
 
 def _signals(fit: Fit, k: int, s: Smoothed) -> Mapping[str, Array]:

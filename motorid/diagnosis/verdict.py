@@ -98,8 +98,7 @@ def missing_text(rungs: Sequence[Rung], remaining: Adequacy, groups: Sequence[Se
     parts = [f"{lead}: {'; '.join(_described(after, n) for n in names)}."]
     parts += [f"These records do not distinguish {g[0]} from {' or '.join(g[1:])}." for g in groups]
     parts += [approximations_text(grades, "the rest")] if len(names) < len(grades) else []
-    parts.append(errors_text(rungs))
-    parts.append(_left(after, remaining, " on the fitted runs, not on the held-out ones" * elsewhere))
+    parts += [errors_text(rungs), _left(after, remaining, " on the fitted runs, not on the held-out ones" * elsewhere)]
     return " ".join(parts)
 
 
