@@ -283,14 +283,11 @@ class Wire:
             at = int(self.rng.integers(1, len(line) - 2))
             return before + (line[:at] if self.rng.random() < 0.5 else line[at:])
         if hit[3] < f.flip:
-            return before + self._flip(line)
+            altered = bytearray(line)
+            for at in self.rng.choice(len(line) - 1, size=int(self.rng.integers(1, 4)), replace=False):
+                altered[at] ^= int(self.rng.integers(1, 256))
+            return before + bytes(altered)
         late = self._lately[self.rng.integers(len(self._lately))] if hit[4] < f.swap and self._lately else b""
         self._lately.append(line)
         came = line[:-1] if hit[5] < f.glue else line
         return before + came + (came if hit[6] < f.repeat else b"") + late
-
-    def _flip(self, line: bytes) -> bytes:
-        altered = bytearray(line)
-        for at in self.rng.choice(len(line) - 1, size=int(self.rng.integers(1, 4)), replace=False):
-            altered[at] ^= int(self.rng.integers(1, 256))
-        return bytes(altered)
