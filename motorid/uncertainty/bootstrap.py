@@ -93,11 +93,9 @@ class Bootstrap(Printed):
         flags += [Flag(f"{len(self.failures)} failed", "bad")] if self.failures else []
         how = ("Refitted to the model's curves plus blocks of residuals in random order." if self.kind == "blocks" else
                f"Resampled: {self.kind}.")
-        rows = []
-        for n, value, unit in zip(self.names, self.reference, self.units, strict=True):
-            limited = Flag(percent(self.limited[n], 2), "note") if self.limited[n] else "none"
-            said = value_cell(float(value), self.std[n], unit, self.status[n])
-            rows.append([n, said, interval_text(self.interval(n)), limited])
+        rows = [[n, value_cell(float(value), self.std[n], unit, self.status[n]), interval_text(self.interval(n)),
+                 Flag(percent(self.limited[n], 2), "note") if self.limited[n] else "none"]
+                for n, value, unit in zip(self.names, self.reference, self.units, strict=True)]
         return Card("Bootstrap", flags, (how, self.interrupted),
                     (Table(["parameter", "value ± bootstrap std", "95 %", "at its limit"], rows, left=(0, 1, 2)),),
                     (("mi.plot_profile(mi.intervals(fit))", "compare"),))
@@ -206,10 +204,9 @@ def _refit(source: _Source, seed: np.random.SeedSequence) -> dict[str, float] | 
                             _runs=tuple(problem.runs[k] for k in drawn))
         else:
             again = problem.with_(experiments=tuple(_resampled(source, k, rng) for k in range(len(problem.runs))))
-        done = least_squares(again, SOLVER)
+        return least_squares(again, SOLVER).values
     except (MotoridError, np.linalg.LinAlgError) as error:
         return Failure(problem.model.values, "failed", str(error))
-    return done.values
 
 
 def _resampled(source: _Source, k: int, rng: np.random.Generator) -> Experiment:

@@ -101,9 +101,8 @@ class Covariance(Printed):
     def card(self) -> Card:
         """Return values, intervals and correlations."""
         rows = [[n, value_cell(float(value), self.std[n], unit, self.status[n]), interval_text(self.interval(n)),
-                 *(_correlation_cell(x) for x in correlations)]
-                for n, value, unit, correlations in zip(
-                    self.names, self.values, self.units, self.correlation, strict=True)]
+                 *(_correlation_cell(x) for x in line)]
+                for n, value, unit, line in zip(self.names, self.values, self.units, self.correlation, strict=True)]
         header = ["unknown", "value ± std", "95 %", *(f"ρ {n}" for n in self.names)]
         share = ", ".join(f"{channel_name(c)} {percent(v.effective_share, 2)}" for c, v in self.colours.items())
         return Card("Uncertainty", (Flag(f"{self.method} residuals"),),

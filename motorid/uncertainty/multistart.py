@@ -219,7 +219,6 @@ class Multistart(Printed):
 
     @property
     def _lowest(self) -> StartResult | Fit:
-        """What has the lowest cost of all."""
         return self.best or self.reference
 
     def _places(self, *kinds: str) -> list[list[StartResult]]:

@@ -171,8 +171,7 @@ def _plan(fit: Fit, name: str, level: float) -> tuple[float, float, float, float
     step, factor = 0.25, float(np.median([c.variance for c in found.colours.values()]))
     if sd := found.std[name]:
         step, factor = float(np.clip(0.7 * sd / abs(slope), 1e-6, 0.5)), float(sd**2 / (half[j] @ half[j]))
-    height = 1.3 * float(scipy.special.stdtrit(found.dof, 0.5 + level / 2)) ** 2
-    return step, factor, height, found.dof
+    return step, factor, 1.3 * float(scipy.special.stdtrit(found.dof, 0.5 + level / 2)) ** 2, found.dof
 
 
 def _side(reference: tuple[Problem, dict[str, float], float],
