@@ -57,14 +57,13 @@ def _read_plainly(run: Experiment, model: Model) -> Experiment:
 
 
 def _signals(run: Experiment) -> dict[str, Array]:
-    """Return t, v and what was measured of i, omega, theta on all samples, gaps bridged; omega from the angle."""
+    """Return t, v, its integral `flux`, and on all samples what was measured of i, omega (or its slope) and theta."""
     t = run.t
     measured = (c for c in CHANNELS if c in run.outputs and np.isfinite(run.outputs[c]).any())
     found: dict[str, Array] = {"t": t, **run.inputs, **{c: bridged(t, run.outputs[c]) for c in measured}}
     if "omega" not in found and "theta" in found:
         found["omega"] = slope(t, found["theta"], max(2, min(10, len(t) // 200)))
-    if run.hold == "zoh":
-        found["held"] = np.ones(1)
+    found["flux"] = integral(t, run.inputs["v"], run.hold == "zoh")
     return found
 
 
@@ -109,8 +108,8 @@ def _nonnegative(a: Array, b: Array, signed: NDArray[np.bool_]) -> Array:
 
 def _full(signals: list[dict], held: Mapping[str, float], loads: _Loads) -> dict[str, float]:
     moved = [(s, integral(s["t"], s["i"]), integral(s["t"], s["omega"])) for s in signals]
-    found = _solve([_windowed(s["t"], [s["i"], qi, qw], integral(s["t"], s["v"], "held" in s), 200)
-                    for s, qi, qw in moved], ["L", "R", "K"], held)
+    electrical = [_windowed(s["t"], [s["i"], qi, qw], s["flux"], 200) for s, qi, qw in moved]
+    found = _solve(electrical, ["L", "R", "K"], held)
     mechanical = [_windowed(s["t"], [s["omega"], qw, *loads.integrals(s, {**found, "b": 0.0, "J": 1.0})],
                             found["K"] * qi) for s, qi, qw in moved]
     return found | loads.split(_solve(mechanical, ["J", "b", *loads.loads], held))
@@ -119,8 +118,7 @@ def _full(signals: list[dict], held: Mapping[str, float], loads: _Loads) -> dict
 def _torque_driven(signals: list[dict], held: Mapping[str, float], loads: _Loads) -> dict[str, float]:
     g = held.get("g", 1.0)
     rows = [_windowed(s["t"], [s["omega"], integral(s["t"], s["omega"]),
-                               *loads.integrals(s, {"g": g, "b": 0.0, "J": 1.0})],
-                      g * integral(s["t"], s["v"], "held" in s)) for s in signals]
+                               *loads.integrals(s, {"g": g, "b": 0.0, "J": 1.0})], g * s["flux"]) for s in signals]
     return {"g": g} | loads.split(_solve(rows, ["J", "b", *loads.loads], held))
 
 
@@ -129,7 +127,7 @@ def _without_current(signals: list[dict], held: Mapping[str, float], loads: _Loa
     """``∫v = (RJ/K) Δω + (K + Rb/K) ∫ω + (R/K) ∫load``: two numbers and the loads; the rest is assumed."""
     unit = {"R": 1.0, "L": 1.0, "K": 1.0, "b": 0.0, "J": 1.0}
     rows = [_windowed(s["t"], [s["omega"], integral(s["t"], s["omega"]), *loads.integrals({**s, "i": s["v"]}, unit)],
-                      integral(s["t"], s["v"], "held" in s)) for s in signals]
+                      s["flux"]) for s in signals]
     two = _solve(rows, ["slope", "gain", *loads.loads], {})
     r = held.get("R", 1.0)
     k = held.get("K", back_emf * two["gain"])
@@ -142,8 +140,8 @@ def _without_speed(signals: list[dict], held: Mapping[str, float]) -> dict[str, 
     """``∫v = L i + (R + Lb/J)∫i + (K² + Rb)/J ∬i − (b/J) ∬v``: K alone is assumed."""
     rows = []
     for s in signals:
-        t = s["t"]
-        qv, qi = integral(t, s["v"], "held" in s), integral(t, s["i"])
+        t, qv = s["t"], s["flux"]
+        qi = integral(t, s["i"])
         rows.append(_windowed(t, [s["i"], qi, integral(t, qi), -integral(t, qv)], qv))
     z = _solve(rows, ["L", "R", "stiff", "rate"], {})
     k = held.get("K", 0.05)

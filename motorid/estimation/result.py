@@ -290,12 +290,11 @@ class Fit(Shown):
 
     def card(self) -> Card:
         """Return how it ended, parameters, errors, and what constraints cost."""
-        runs = self.problem.experiments
         vague = [n for n, s in self.std.items() if s is None]
         flags = [FLAGS[self.fits], *([] if self.status == "converged" else [Flag(self.status, "bad")])]
         flags += [Flag(self.formulation)] if self.formulation != "plain" else []
         flags += [Flag(f"{len(vague)} not determined", "note")] if vague else []
-        amount = f"{counted(len(runs), 'run')}, {self.problem.n_outputs} measured values."
+        amount = f"{counted(len(self.problem.experiments), 'run')}, {self.problem.n_outputs} measured values."
         text = (self.verdict, NRMSE, f"{amount} {ended(self)}")
         after = [("mi.plot_fit(fit)", "see it"), ("mi.diagnose(fit)", "what is missing")]
         after = after if self.fits == "noise" else after[::-1]

@@ -26,7 +26,6 @@ from motorid.records.steady_state import find_segments
 TURN = np.arange(-60, 60) * np.pi / 60  # where the zero of an encoder may be
 ALIKE = 1.1  # times the least cost
 ASSUMED_NOISE = 0.01  # of a channel's RMS, where a plan does not say
-
 MOST_RUNS = 12  # shown one by one
 SETTLES = 4  # times that unknown initial states are sought, each with the sub-steps of where the last ended
 
@@ -236,13 +235,10 @@ def _with_apart(problem: Problem, k: int, name: str, value: float) -> Problem:
 
 def at(problem: Problem, q: Array) -> tuple[Simulation, ...]:
     """Return the simulations of a problem at solver coordinates `q`."""
-    found = []
-    for k, run in enumerate(problem.runs):
-        traj = problem.simulate(q, k, derivatives=False)
-        outputs = {c: traj.y[:, j] for j, c in enumerate(problem.outputs)}
-        states = {s: traj.x[:, j] for j, s in enumerate(problem.system.states)}
-        found.append(Simulation(run.experiment, outputs, states))
-    return tuple(found)
+    trajs = (problem.simulate(q, k, derivatives=False) for k in range(len(problem.runs)))
+    return tuple(Simulation(run.experiment, dict(zip(problem.outputs, traj.y.T, strict=True)),
+                            dict(zip(problem.system.states, traj.x.T, strict=True)))
+                 for run, traj in zip(problem.runs, trajs, strict=True))
 
 
 def judge(simulations: Sequence[Simulation]) -> Evaluation:

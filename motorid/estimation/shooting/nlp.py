@@ -181,8 +181,7 @@ def ipopt(nlp: ShootingNlp, z0: Array, bounds: tuple[Array, Array], options: Map
                  "slack_bound_push": 1e-8, "slack_bound_frac": 1e-8}
     if warm is not None:
         told |= {"mu_strategy": "monotone", "mu_init": 1e-7, "warm_start_init_point": "yes",
-                 "warm_start_bound_push": 1e-9, "warm_start_mult_bound_push": 1e-9,
-                 "warm_start_slack_bound_push": 1e-9}
+                 "warm_start_bound_push": 1e-9, "warm_start_mult_bound_push": 1e-9, "warm_start_slack_bound_push": 1e-9}
         start |= {"lam_g0": warm.lam_g * nlp.scale, "lam_x0": warm.lam_x * nlp.scale}
     solver = ca.nlpsol("solver", "ipopt", function, {
         **derivatives, "no_nlp_grad": True, "calc_lam_p": False, "print_time": False, "show_eval_warnings": False,
