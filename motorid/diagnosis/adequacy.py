@@ -118,10 +118,9 @@ def _channel(fit: Fit, channel: str) -> dict[str, float]:
     r = r[np.isfinite(r)]
     runs = fit.problem.experiments
     linked = max((_largest_cross_correlation(runs[k].inputs["v"], p) for k, p in parts), default=0.0)
-    rms = float(np.sqrt(np.mean(r**2))) if r.size else 0.0
     alone = np.concatenate([despiked(p) for _, p in parts])
     ratio = float(np.sqrt(np.mean(alone**2))) / noise if alone.size else 0.0
-    return {"noise": noise, "rms": rms, "ratio": ratio,
+    return {"noise": noise, "rms": float(np.sqrt(np.mean(r**2))) if r.size else 0.0, "ratio": ratio,
             "rounded": float(ratio < AT_ROUNDING and noise < AT_ROUNDING * _rounding(runs, channel)),
             "autocorrelation": float(np.mean([autocorrelation(p, 1)[-1] for _, p in parts])),
             "input_correlation": linked, "effective_samples": sum(effective_samples(p) for _, p in parts)}

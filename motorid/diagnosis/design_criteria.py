@@ -562,7 +562,7 @@ class Task:
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """Where a search ended: the task with its integration steps, the unknowns, `Task.worth` there."""
+    """Where a search stands: the task with its integration steps, the unknowns, `Task.worth` there."""
 
     task: Task
     c: Array
@@ -654,8 +654,7 @@ def linear_rows(task: Task) -> Rows:
     mix = np.eye(layout.levels) if layout.mixing is None else layout.mixing
     rows, high = [np.zeros((0, mix.shape[1]))], [np.zeros(0)]
     if layout.mixing is not None or layout.bits:
-        n = len(layout.ms)
-        on = np.array(layout.bits, bool)
+        n, on = len(layout.ms), np.array(layout.bits, bool)
         rows += [mix] if layout.ramps else [(mix[:n] + mix[n:])[on], (mix[:n] - mix[n:])[on]]
         high += [np.ones(len(r)) for r in rows[1:]]
     if layout.ramps and np.isfinite(task.slew):

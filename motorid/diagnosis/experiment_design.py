@@ -339,16 +339,16 @@ def design_experiment(found: Diagnosis | Fit | Sequence[Fit | Rival], *, goal: s
 def _optimised(task: Task, say: Callable[[str], None]) -> Found:
     """Return the best point that the search reaches from the best starts."""
     done: list[Found] = []
-    for name, (_, here, c) in list(_starts(task).items())[:SHARPENED if task.asked else DISTINGUISHED]:
-        if (start := _within(here, c)) is None:
+    for name, coarse in list(_starts(task).items())[:SHARPENED if task.asked else DISTINGUISHED]:
+        if (start := _within(coarse.task, coarse.c)) is None:
             continue
-        found = climb(_hardest(start[1], start[2]), start[2])
+        found = climb(_hardest(start.task, start.c), start.c)
         again = _within(replace(found.task, pairs=task.pairs), found.c)  # integration steps that suit what was found
         if again is not None:
-            if not found.stopped and abs(again[0] - found.value) > NEARLY:
-                found = climb(_hardest(again[1], again[2]), again[2])
+            if not found.stopped and abs(again.value - found.value) > NEARLY:
+                found = climb(_hardest(again.task, again.c), again.c)
                 again = _within(replace(found.task, pairs=task.pairs), found.c) or again
-            found = Found(again[1], again[2], again[0], found.stopped)
+            found = replace(again, stopped=found.stopped)
         done.append(found)
         say(f"optimised from the {name}: {found.value:.3g}")
         if found.stopped or found.value > task.enough - NEARLY:
@@ -474,8 +474,8 @@ def _task(rivals: Sequence[Rival], layout: Layout, limits: Mapping[str, tuple[fl
     return Task(driven, limits, errors, asked, pairs, slew or np.inf)
 
 
-def _starts(task: Task) -> dict[str, tuple[float, Task, Array]]:
-    """Return starts by name: worth, the task in their layout, unknowns within the limits; the best first."""
+def _starts(task: Task) -> dict[str, Found]:
+    """Return starts by name, each in its own layout and within the limits; the best first."""
     laid = {} if task.layout.ramps or not task.asked else _waves(task)
     laid |= {n: (task.layout, c) for n, c in _followed(task.layout, RIPPLES).items()}
     found = _best_first({n: _within(task.laid(layout), c, bool(task.asked)) for n, (layout, c) in laid.items()})
@@ -485,13 +485,11 @@ def _starts(task: Task) -> dict[str, tuple[float, Task, Array]]:
     return {n: found[n] for n in kinds.values()}
 
 
-def _best_first(found: Mapping[str, tuple[float, Task, Array] | None]) -> dict[str, tuple[float, Task, Array]]:
+def _best_first(found: Mapping[str, Found | None]) -> dict[str, Found]:
     """Return what is there, the best first; of those that tell enough, the gentlest."""
-    def order(entry: tuple[str, tuple[float, Task, Array]]) -> tuple[float, float]:
-        worth, task, c = entry[1]
-        return -worth, float(np.mean(task.layout.voltage(task.layout.of(c)) ** 2))
-
-    return dict(sorted(((n, w) for n, w in found.items() if w is not None), key=order))
+    there = {n: f for n, f in found.items() if f is not None}
+    power = {n: float(np.mean(f.task.layout.voltage(f.task.layout.of(f.c)) ** 2)) for n, f in there.items()}
+    return {n: there[n] for n in sorted(there, key=lambda n: (-there[n].value, power[n]))}
 
 
 def _followed(layout: Layout, ripples: Sequence[float]) -> dict[str, Array]:
@@ -578,8 +576,8 @@ def _between(task: Task, values: Mapping[str, float], speeds: Sequence[float], b
     return replace(task.layout, ms=tuple(ms), bits=tuple(bits)), c
 
 
-def _within(task: Task, c: Array, fine: bool = True) -> tuple[float, Task, Array] | None:
-    """Return worth, task (of fine steps) and unknowns, shrunk until the limits hold; None where they never do."""
+def _within(task: Task, c: Array, fine: bool = True) -> Found | None:
+    """Return the task (of fine steps) and unknowns, shrunk until the limits hold; None where they never do."""
     kept = _shrunk(task, c)
     if kept is not None and fine:
         task = task.refined(task.layout.of(kept[0]), ROUGH)
@@ -588,7 +586,7 @@ def _within(task: Task, c: Array, fine: bool = True) -> tuple[float, Task, Array
         return None
     levels = task.layout.of(kept[0])
     worth = np.array([w.value for w in task.criteria(levels, task.respond(levels), False)])
-    return task.worth(worth), task, kept[0]
+    return Found(task, kept[0], task.worth(worth))
 
 
 def _shrunk(task: Task, c: Array, displaced: Sequence[Array] = (),
@@ -619,8 +617,8 @@ def _fixed(task: Task) -> tuple[str, Task, Array]:
     starts = _best_first({n: _within(fine, c) for n, c in _followed(fine.layout, (0.0,)).items()})
     if not starts:
         raise FitError(NO_RECORD)
-    name, (_, fine, c) = next(iter(starts.items()))
-    return name, fine, c
+    name, best = next(iter(starts.items()))
+    return name, best.task, best.c
 
 
 def _safe(task: Task, c: Array) -> tuple[Array, dict[str, float]]:

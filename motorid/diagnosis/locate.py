@@ -162,15 +162,13 @@ def _regions(fit: Fit, signals: Sequence[Mapping[str, Array]]) -> dict[str, floa
 
 
 def _region_of_samples(s: Mapping[str, Array], top_speed: float, top_current: float) -> NDArray[np.str_]:
-    """Return the region of each sample, (N,)."""
     omega = s.get("omega", np.zeros_like(s["t"]))
     n = len(omega)
     still = np.abs(omega) < 0.02 * top_speed
     moving = np.where(still, 0, omega)
-    crossing = np.flatnonzero(np.diff(np.sign(moving)) != 0)
     reversal = np.zeros(n, bool)
     window = max(n // 200, 2)
-    for c in crossing:
+    for c in np.flatnonzero(np.diff(np.sign(moving))):
         if moving[max(c - window, 0)] * moving[min(c + window, n - 1)] < 0:
             reversal[max(c - window, 0) : c + window] = True
     rate = np.abs(np.gradient(omega, s["t"]))
@@ -210,8 +208,7 @@ def accounted(before: Fit, after: Fit) -> tuple[tuple[Array, ...], tuple[Array, 
 def _rates(fit: Fit, k: int, states: Mapping[str, Array]) -> dict[str, Array]:
     system, run = fit.problem.system, fit.problem.runs[k]
     x = np.vstack([states.get(n, np.zeros(run.experiment.n)) for n in system.states])
-    p = np.array([fit.values[n] for n in system.parameters])
-    f = np.asarray(system.rhs(x, run.grid.u.T, p))
+    f = np.asarray(system.rhs(x, run.grid.u.T, np.array([fit.values[n] for n in system.parameters])))
     return {n: f[j] for j, n in enumerate(system.states) if n != "i" or system.stored[j]}
 
 
@@ -245,26 +242,23 @@ def smooth(fit: Fit, k: int, walk: Array, linear: Linear) -> Smoothed:
     `walk` is the step size of the random walk, V/√s and N·m/√s (0: none); `linear` is where to begin, the same for
     every walk.
     """
-    run, system = fit.problem.runs[k], fit.problem.system
-    p = parameter_vector(fit, k)
-    y = fit.problem.measured[k].y
+    run, y = fit.problem.runs[k], fit.problem.measured[k].y
     weights = np.array([1.0 / run.sigma[c] if c in run.sigma else 0.0 for c in fit.problem.outputs])
     x = linear.x
     n, nx = x.shape
     d = np.zeros((n, 2))
     size = np.maximum(np.abs(x).max(axis=0), 1e-9)
     hold = np.where(walk > 0, 1.0 / np.maximum(walk, 1e-300), 0.0)
+    model = MODEL_ERROR * size * np.sqrt(np.median(run.grid.dt) / run.grid.dt.sum() * 100)
     for again in range(STEPS):
         if again:
             linear = _linear(fit, k, x, d)
         step = _banded_step(n, nx, (y - linear.out) * weights, linear.c * weights[None, :, None], linear.x_next - x[1:],
-                            linear.a, linear.b,
-                            MODEL_ERROR * size * np.sqrt(np.median(run.grid.dt) / run.grid.dt.sum() * 100), d, hold,
-                            run.grid.dt, walk > 0)
+                            linear.a, linear.b, model, d, hold, run.grid.dt, walk > 0)
         x, d = x + step[:, :nx], d + step[:, nx:]
         if np.max(np.abs(step[:, :nx]) / size) < 1e-4:
             break
-    out, _ = shown(system, run.grid, x, p)
+    out, _ = shown(fit.problem.system, run.grid, x, parameter_vector(fit, k))
     e = (y - out) * weights
     return Smoothed(d, x, float(np.nanmean(e[:, weights > 0] ** 2)))
 
@@ -286,8 +280,7 @@ def _linear(fit: Fit, k: int, x: Array, d: Array) -> Linear:
 def _banded_step(n, nx, misfit, c, defect, a, b, model, d, hold, dt, free) -> Array:
     """Solve one Gauss-Newton step for (δx, δd), (n, nx+2), by a banded Cholesky factorisation."""
     m = nx + 2
-    diagonal, below = np.zeros((n, m, m)), np.zeros((n - 1, m, m))
-    rhs = np.zeros((n, m))
+    diagonal, rhs = np.zeros((n, m, m)), np.zeros((n, m))
     e = np.where(np.isfinite(misfit), misfit, 0.0)
     cc = np.where(np.isfinite(misfit)[:, :, None], c, 0.0)
     diagonal[:, :nx, :nx] += np.einsum("nyi,nyj->nij", cc, cc)
@@ -298,7 +291,7 @@ def _banded_step(n, nx, misfit, c, defect, a, b, model, d, hold, dt, free) -> Ar
     w = defect / model
     diagonal[:-1] += np.einsum("nki,nkj->nij", g, g)
     diagonal[1:] += back.T @ back
-    below += np.einsum("ki,nkj->nij", back, g)
+    below = np.einsum("ki,nkj->nij", back, g)
     rhs[:-1] -= np.einsum("nki,nk->ni", g, w)
     rhs[1:] -= w @ back
     # (d_{k+1} - d_k)·hold/√dt

@@ -16,7 +16,6 @@ from motorid.diagnosis.score_test import Score
 from motorid.diagnosis.thresholds import ELSEWHERE, LARGER, LOST, MATERIAL
 from motorid.display.numbers import arrow, counted, listed, number, percent, with_error
 from motorid.estimation.result import Fit, parameter_cell
-from motorid.model.definition import Effect
 from motorid.numerics.autoregression import colour_of
 from motorid.numerics.signals import despiked
 from motorid.records.experiment import units_of
@@ -113,12 +112,8 @@ def _left(last: Fit, remaining: Adequacy, where: str = "") -> str:
 
 
 def _described(fit: Fit, name: str) -> str:
-    effect = next(e for e in fit.problem.model.effects if e.name == name)
-    return ", ".join([effect.title if name in effect.title else f"{effect.title} [{name}]", *_valued(fit, effect)])
-
-
-def _valued(fit: Fit, effect: Effect) -> list[str]:
-    found, std = [], _certain(fit)
+    effect, std = next(e for e in fit.problem.model.effects if e.name == name), _certain(fit)
+    said = [effect.title if name in effect.title else f"{effect.title} [{name}]"]
     for p in effect.parameters:
         unit = fit.problem.model.parameters[p.name].unit
         sd = std.get(p.name)
@@ -130,8 +125,8 @@ def _valued(fit: Fit, effect: Effect) -> list[str]:
             text = f"{volts.text.rpartition(', ')[2]} = {with_error(volts.value, volts.std, volts.unit)}"
         if p.name == "k_w" and abs(1 + fit.values[p.name] - RPM) < 0.3:
             text += ", the ratio of rpm to rad/s: the speed is probably in rpm"
-        found.append(text)
-    return found
+        said.append(text)
+    return ", ".join(said)
 
 
 def _certain(fit: Fit) -> dict[str, float | None]:
@@ -182,7 +177,6 @@ def _fall(was: Mapping[str, float], is_: Mapping[str, float]) -> float:
 
 
 def _matters(was: float, is_: float) -> bool:
-    """Tell whether an error rises by an amount that matters."""
     return is_ > was * (1 + MATERIAL)
 
 
