@@ -116,12 +116,15 @@ class Link(Protocol):
 
     def read(self, timeout: float) -> bytes:
         """Return what has come, at the latest after `timeout` s (then perhaps nothing); LinkLost at the end."""
+        ...
 
     def write(self, data: bytes) -> None:
         """Send; LinkLost if nobody is there."""
+        ...
 
     def close(self) -> None:
         """Let go."""
+        ...
 
 
 class SerialLink:

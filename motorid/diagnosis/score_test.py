@@ -335,9 +335,11 @@ class Added:
         at = self._at({**values, **null})
         to = np.zeros((len(at.p), len(sizes)))
         to[[self._place[p.name] for p in sizes], range(len(sizes))] = 1.0
-        problem = self._problem
-        trajs = (self._run(k, at, problem.unknowns.first_slopes(at, k, to), to) for k in range(len(problem.runs)))
-        return np.vstack([problem.run_residual(k, traj)[1] for k, traj in enumerate(trajs)])
+        parts = []
+        for k in range(len(self._problem.runs)):
+            traj = self._run(k, at, self._problem.unknowns.first_slopes(at, k, to), to)
+            parts.append(self._problem.run_residual(k, traj)[1])
+        return np.vstack(parts)
 
     def _change(self, values: Mapping[str, float]) -> Array | None:
         """Return the change (n,) that the effect makes at finite `values`."""
