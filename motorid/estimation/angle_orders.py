@@ -72,9 +72,7 @@ def highest_order(tangent: Tangent) -> int:
     Beyond half a period the samples alias, but along a measured angle each order still has its own pattern.
     """
     moving = _moving(tangent)
-    if not moving.size:
-        return 0
-    return int(np.clip(1.8 * np.pi / np.quantile(moving, SLOW_PART), 0, HIGHEST))
+    return int(np.clip(1.8 * np.pi / np.quantile(moving, SLOW_PART), 0, HIGHEST)) if moving.size else 0
 
 
 def _moving(tangent: Tangent) -> Array:

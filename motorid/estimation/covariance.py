@@ -152,8 +152,7 @@ def combinations(problem: Problem, q: Array, known: Certainty) -> dict[str, Quan
     """Return what engineers ask of a motor, as far as the data determine it, even where single parameters stay open."""
     values, found = problem.values(q), {}
     for name, (unit, text, law) in _laws(problem, values).items():
-        slope = np.array([_slope(law, values, p.name) for p in problem.unknown])
-        value, std = law(values), known.std_of(slope)
+        value, std = law(values), known.std_of(np.array([_slope(law, values, p.name) for p in problem.unknown]))
         if std is not None and np.isfinite(value) and std < UNDETERMINED * abs(value):
             found[name] = Quantity(value, std, unit, text)
     return found
@@ -161,9 +160,7 @@ def combinations(problem: Problem, q: Array, known: Certainty) -> dict[str, Quan
 
 def _slope(law: Law, values: Mapping[str, float], name: str) -> float:
     h = 1e-5 * abs(values.get(name, 0.0))
-    if not h:
-        return 0.0
-    return (law({**values, name: values[name] + h}) - law({**values, name: values[name] - h})) / (2 * h)
+    return (law({**values, name: values[name] + h}) - law({**values, name: values[name] - h})) / (2 * h) if h else 0.0
 
 
 def _laws(problem: Problem, values: Mapping[str, float]) -> dict[str, tuple[str, str, Law]]:

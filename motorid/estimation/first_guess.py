@@ -138,11 +138,9 @@ def _without_current(signals: list[dict], held: Mapping[str, float], loads: _Loa
 
 def _without_speed(signals: list[dict], held: Mapping[str, float]) -> dict[str, float]:
     """``∫v = L i + (R + Lb/J)∫i + (K² + Rb)/J ∬i − (b/J) ∬v``: K alone is assumed."""
-    rows = []
-    for s in signals:
-        t, qv = s["t"], s["flux"]
-        qi = integral(t, s["i"])
-        rows.append(_windowed(t, [s["i"], qi, integral(t, qi), -integral(t, qv)], qv))
+    moved = [(s, integral(s["t"], s["i"])) for s in signals]
+    rows = [_windowed(s["t"], [s["i"], qi, integral(s["t"], qi), -integral(s["t"], s["flux"])], s["flux"])
+            for s, qi in moved]
     z = _solve(rows, ["L", "R", "stiff", "rate"], {})
     k = held.get("K", 0.05)
     j = k**2 / max(z["stiff"] - z["R"] * z["rate"], 0.1 * z["stiff"])
