@@ -323,9 +323,9 @@ def design_experiment(found: Diagnosis | Fit | Sequence[Fit | Rival], *, goal: s
 
         whole = _task(rivals, layout, {s: x for s, x in limits.items() if s != "v"}, asked, slew)
         task = _judged(whole)
-        name, fine, at = _fixed(task)
-        fine = _exact(replace(fine, pairs=whole.pairs), rivals).refined(fine.layout.of(at), TOLERANCE)
-        fixed = name, fine, _safe(fine, at)[0]
+        name, plain = _fixed(task)
+        fine = _exact(replace(plain.task, pairs=whole.pairs), rivals).refined(plain.task.layout.of(plain.c), TOLERANCE)
+        fixed = name, fine, _safe(fine, plain.c)[0]
         say("compared fixed candidates")
         with limited_time(budget):
             best = _optimised(task, say)
@@ -608,8 +608,8 @@ def _exact(task: Task, rivals: Sequence[Rival]) -> Task:
     return replace(task, driven=tuple(replace(d, rival=r) for d, r in zip(task.driven, rivals, strict=True)))
 
 
-def _fixed(task: Task) -> tuple[str, Task, Array]:
-    """Return the best fixed candidate within the same limits, as a task of many steps and its unknowns."""
+def _fixed(task: Task) -> tuple[str, Found]:
+    """Return the best fixed candidate within the same limits, by its name and in many steps."""
     old = task.layout
     ms = _whole(max(1, round(sum(old.ms) / FINE)), old.dt)
     n = round(sum(old.ms) / ms)
@@ -617,8 +617,7 @@ def _fixed(task: Task) -> tuple[str, Task, Array]:
     starts = _best_first({n: _within(fine, c) for n, c in _followed(fine.layout, (0.0,)).items()})
     if not starts:
         raise FitError(NO_RECORD)
-    name, best = next(iter(starts.items()))
-    return name, best.task, best.c
+    return next(iter(starts.items()))
 
 
 def _safe(task: Task, c: Array) -> tuple[Array, dict[str, float]]:

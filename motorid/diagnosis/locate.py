@@ -74,8 +74,7 @@ def acting_like(missing: Missing, form: Form) -> Missing:
     apart = missing.where is not None or form.balance == "sensor"
     where = {"torque": "mechanical", "voltage": "electrical", "both": "electrical", "sensor": "sensor"}[form.balance]
     fails = {"both": "Both balances fail.", "sensor": "The measurement fails."}
-    lead = fails.get(form.balance, f"The {form.balance} balance fails.")
-    lead = lead if apart else missing.text.split(".")[0] + "."
+    lead = fails.get(form.balance, f"The {form.balance} balance fails.") if apart else missing.text.split(".")[0] + "."
     text = f"{lead} What is missing acts like {form.text}. {_region(missing.regions)}"
     return replace(missing, where=where if apart else None, acts_like=form.text, text=text)
 
@@ -259,8 +258,7 @@ def smooth(fit: Fit, k: int, walk: Array, linear: Linear) -> Smoothed:
         if np.max(np.abs(step[:, :nx]) / size) < 1e-4:
             break
     out, _ = shown(fit.problem.system, run.grid, x, parameter_vector(fit, k))
-    e = (y - out) * weights
-    return Smoothed(d, x, float(np.nanmean(e[:, weights > 0] ** 2)))
+    return Smoothed(d, x, float(np.nanmean(((y - out) * weights)[:, weights > 0] ** 2)))
 
 
 def begin(fit: Fit, k: int) -> Linear:

@@ -312,9 +312,8 @@ def suggestions(problem: Problem, q: Array, matrix: Array, missing: int) -> list
     """Return sentences on what to fix or to measure so that every singular value exceeds `LEVEL`."""
     said = []
     if sets := fixable(problem.model.free_names, matrix, missing):
-        first = " and ".join(sets[0])
         other = f" (or {' and '.join(sets[1])})" if len(sets) > 1 else ""
-        said.append(f"Fix {first}{other} where known, model.fix(…), and the rest is determined.")
+        said.append(f"Fix {' and '.join(sets[0])}{other} where known, model.fix(…), and the rest is determined.")
     return said + [f"Measure the {NAMES[channel]} as well: with 1 % of noise all of them are determined."
                    for channel in ("i", "omega") if _would_do(problem, q, channel)]
 
