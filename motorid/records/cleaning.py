@@ -42,15 +42,11 @@ def run_from_columns(columns: Mapping[str, Array], texts: Texts, layout: Layout,
     if not outputs:
         raise DataError(f"every sample of {', '.join(repr(places[c].column) for c in values)} is "
                         "missing; there is nothing measured to fit.")
-    parts = np.split(np.arange(len(t)), np.searchsorted(t, begun))
-    for part in parts:
+    for part in np.split(np.arange(len(t)), np.searchsorted(t, begun)):
         _note_gaps(t[part], said)
         if "theta" in outputs and places["theta"].unit.symbol == "rad":
             measured = {c: y[part] for c, y in outputs.items()}
-            outputs["theta"][part], turn, jumps = unwrapped(measured["theta"], t[part], measured.get("omega"))
-            if jumps:
-                by = "a turn" if turn == 2 * np.pi else f"{turn:.4g} rad, as a counter does,"
-                said.append(f"the angle '{places['theta'].column}' jumps by {by} {jumps} times; here it goes on.")
+            outputs["theta"][part] = _going_on(measured, t[part], places["theta"].column, said)
     for c, y in outputs.items():
         if (again := repeats(y)).any():
             outputs[c] = np.where(again, np.nan, y)
@@ -71,6 +67,15 @@ def run_from_columns(columns: Mapping[str, Array], texts: Texts, layout: Layout,
         return Experiment(t, inputs, outputs, sigma, cast(Any, hold), units, name, facts)
     except DataError as error:
         raise DataError(str(error).removeprefix(f"{name}: ")) from None
+
+
+def _going_on(measured: Mapping[str, Array], t: Array, column: str, said: list[str]) -> Array:
+    """Return the angle without the jumps of a counter or at a turn."""
+    theta, turn, jumps = unwrapped(measured["theta"], t, measured.get("omega"))
+    if jumps:
+        by = "a turn" if turn == 2 * np.pi else f"{turn:.4g} rad, as a counter does,"
+        said.append(f"the angle '{column}' jumps by {by} {jumps} times; here it goes on.")
+    return theta
 
 
 def _channel(columns: Mapping[str, Array], texts: Texts, place: Place, channel: str) -> Array:
