@@ -122,7 +122,7 @@ class Chain:
 
 
 def _lag(z: float, u0: float, u1: float, h: float, tau: float | None) -> float:
-    """First-order lag over h, exact for an input that goes from u0 to u1 in a straight line."""
+    """First-order lag over h, exact for an input straight from u0 to u1."""
     if not tau:
         return u1
     slope = (u1 - u0) / h
@@ -130,7 +130,7 @@ def _lag(z: float, u0: float, u1: float, h: float, tau: float | None) -> float:
 
 
 def _filtered(z: float, rate: float, u0: float, u1: float, h: float, T: float, zeta: float) -> tuple[float, float]:
-    """Second-order filter over h, T²z″ + 2ζTz′ + z = u, exact for an input that goes from u0 to u1 in a straight line."""
+    """Second-order filter over h, T²z″ + 2ζTz′ + z = u, exact for an input straight from u0 to u1."""
     slope = (u1 - u0) / h
     a, b = z - (u0 - 2 * zeta * T * slope), rate - slope  # off the straight line that is left at last
     root = cmath.sqrt(zeta * zeta - 1) or 1e-6

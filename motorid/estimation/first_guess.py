@@ -57,13 +57,13 @@ def _read_plainly(run: Experiment, model: Model) -> Experiment:
 
 
 def _signals(run: Experiment) -> dict[str, Array]:
-    """Return t, v, its integral, and on all samples what was measured of i, omega (or its slope) and theta."""
+    """Return t, v, its integral `v_dt`, and on all samples what was measured of i, omega (or its slope) and theta."""
     t = run.t
     measured = (c for c in CHANNELS if c in run.outputs and np.isfinite(run.outputs[c]).any())
     found: dict[str, Array] = {"t": t, **run.inputs, **{c: bridged(t, run.outputs[c]) for c in measured}}
     if "omega" not in found and "theta" in found:
         found["omega"] = slope(t, found["theta"], max(2, min(10, len(t) // 200)))
-    found["v_integral"] = integral(t, run.inputs["v"], run.hold == "zoh")
+    found["v_dt"] = integral(t, run.inputs["v"], run.hold == "zoh")
     return found
 
 
@@ -108,7 +108,7 @@ def _nonnegative(a: Array, b: Array, signed: NDArray[np.bool_]) -> Array:
 
 def _full(signals: list[dict], held: Mapping[str, float], loads: _Loads) -> dict[str, float]:
     moved = [(s, integral(s["t"], s["i"]), integral(s["t"], s["omega"])) for s in signals]
-    electrical = [_windowed(s["t"], [s["i"], qi, qw], s["v_integral"], 200) for s, qi, qw in moved]
+    electrical = [_windowed(s["t"], [s["i"], qi, qw], s["v_dt"], 200) for s, qi, qw in moved]
     found = _solve(electrical, ["L", "R", "K"], held)
     mechanical = [_windowed(s["t"], [s["omega"], qw, *loads.integrals(s, {**found, "b": 0.0, "J": 1.0})],
                             found["K"] * qi) for s, qi, qw in moved]
@@ -118,7 +118,7 @@ def _full(signals: list[dict], held: Mapping[str, float], loads: _Loads) -> dict
 def _torque_driven(signals: list[dict], held: Mapping[str, float], loads: _Loads) -> dict[str, float]:
     g = held.get("g", 1.0)
     rows = [_windowed(s["t"], [s["omega"], integral(s["t"], s["omega"]),
-                               *loads.integrals(s, {"g": g, "b": 0.0, "J": 1.0})], g * s["v_integral"]) for s in signals]
+                               *loads.integrals(s, {"g": g, "b": 0.0, "J": 1.0})], g * s["v_dt"]) for s in signals]
     return {"g": g} | loads.split(_solve(rows, ["J", "b", *loads.loads], held))
 
 
@@ -127,7 +127,7 @@ def _without_current(signals: list[dict], held: Mapping[str, float], loads: _Loa
     """``∫v = (RJ/K) Δω + (K + Rb/K) ∫ω + (R/K) ∫load``: two numbers and the loads; the rest is assumed."""
     unit = {"R": 1.0, "L": 1.0, "K": 1.0, "b": 0.0, "J": 1.0}
     rows = [_windowed(s["t"], [s["omega"], integral(s["t"], s["omega"]), *loads.integrals({**s, "i": s["v"]}, unit)],
-                      s["v_integral"]) for s in signals]
+                      s["v_dt"]) for s in signals]
     two = _solve(rows, ["slope", "gain", *loads.loads], {})
     r = held.get("R", 1.0)
     k = held.get("K", back_emf * two["gain"])
@@ -139,7 +139,7 @@ def _without_current(signals: list[dict], held: Mapping[str, float], loads: _Loa
 def _without_speed(signals: list[dict], held: Mapping[str, float]) -> dict[str, float]:
     """``∫v = L i + (R + Lb/J)∫i + (K² + Rb)/J ∬i − (b/J) ∬v``: K alone is assumed."""
     moved = [(s, integral(s["t"], s["i"])) for s in signals]
-    rows = [_windowed(s["t"], [s["i"], qi, integral(s["t"], qi), -integral(s["t"], s["v_integral"])], s["v_integral"])
+    rows = [_windowed(s["t"], [s["i"], qi, integral(s["t"], qi), -integral(s["t"], s["v_dt"])], s["v_dt"])
             for s, qi in moved]
     z = _solve(rows, ["L", "R", "stiff", "rate"], {})
     k = held.get("K", 0.05)
