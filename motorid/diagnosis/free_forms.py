@@ -193,11 +193,12 @@ def memories_of(form: Form, span: Span) -> Array:
     longest = span.ranges["t"][1]
     speed = max(map(abs, span.ranges["omega"])) if form.on == "path" else 1.0
     shortest = 2 * span.step
+    count = MEMORIES
     if form.on == "path":  # a reversal is slow
-        shortest, longest = 0.1 * span.step, min(longest, 100 * span.step)
+        shortest, longest, count = 0.1 * span.step, min(longest, 100 * span.step), MEMORIES * span.finer
     elif form.carrier:  # what runs in, or warms, sums up all that was
         longest *= LASTING
-    return speed * np.geomspace(shortest, max(longest, 2 * shortest), MEMORIES * span.finer)
+    return speed * np.geomspace(shortest, max(longest, 2 * shortest), count)
 
 
 def past(z: Array, along: Array, length: float, initial: float) -> Array:

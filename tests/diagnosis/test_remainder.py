@@ -386,11 +386,10 @@ def wound_field(m, k=mi.P(0.3, "", null=0.0)):
 @mi.effect(balance="torque")
 def whirl(m, tau=mi.P(0.03, "N·m", null=0.0)):
     """A shaft that shakes near one speed."""
-    m.torque -= tau * m.sign(m.omega) / (1 + ((ca.fabs(m.omega) - 50) / 4) ** 2)
+    m.torque -= tau * m.sign(m.omega) / (1 + ((ca.fabs(m.omega) - 50) / 8) ** 2)
 
 
 @pytest.mark.parametrize(("law", "channels", "follows"), [
-    (whirl, ANGLE[:2], "a torque that changes with the speed"),
     (tacho_drifts, ANGLE, "a gain of the speed sensor that changes with the time"),
     (loose_encoder, ANGLE, "an error of the angle sensor that depends on the distance since a reversal"),
     (governor, ANGLE[:2], "an inertia that changes with the speed"),
@@ -404,6 +403,16 @@ def test_what_changes_in_sensors_inertia_and_supply_is_found(law, channels, foll
     before, after = (mi.evaluate(f, runs[2]).nrmse for f in (found.best, fit))
     assert max(after[c] / floor[c] for c in after) < 1.1
     assert max(before[c] / after[c] for c in after) > 2.5
+
+
+def test_a_drag_that_peaks_near_one_speed_takes_knees_as_narrow(lab):
+    """Eight times the floor with as many as forms are compared by."""
+    runs, floor = _with_law(whirl, ANGLE[:2], lab)
+    found = mi.diagnose(mi.fit(mi.dc_motor(), runs[:2]), runs[2:], effects=("coulomb", "quadratic_drag"))
+    assert found.remainder.follows == "a torque that changes with the speed"
+    before, after = (mi.evaluate(f, runs[2]).nrmse for f in (found.best, found.remainder.fitted))
+    assert max(after[c] / floor[c] for c in after) < 1.6
+    assert min(before[c] / after[c] for c in after) > 10
 
 
 def _with_law(law, channels, lab):

@@ -164,6 +164,7 @@ def test_says_what_it_is_with_units_limits_and_source(effect):
             "mu",
             "r_load",
             "zeta_r",
+            "zeta_f",
             "r_gap",
             "zeta_c",
             "r_slip",
