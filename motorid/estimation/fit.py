@@ -90,9 +90,10 @@ def fit(model: Model, runs: Sequence[Experiment] | Experiment, *, solver: Any = 
     A plain motor takes one least-squares run. A model with a smooth sgn (friction) takes one per width of it,
     usually three. An effect over the angle whose order is not given takes the fit without it, one along the
     measured angle, and its own: three, or nine with friction. An effect that contains a simpler one takes the fit
-    with that, and a short run from either start. Further runs come only where an end is in doubt, a parameter has
-    collapsed, the model does not reach the noise in one channel far more than in another, or the sub-steps do not
-    suit the end.
+    with that, and a short run from either start. Where much more than noise is left the model is fitted without each
+    of its effects, too, and begins again from there if that costs less. Further runs come only where an end is in
+    doubt, a parameter has collapsed, the model does not reach the noise in one channel far more than in another, or
+    the sub-steps do not suit the end.
 
     Examples
     --------
@@ -250,7 +251,7 @@ def no_worse_than_smaller(found: Estimate, asked: Problem, effort: LevenbergMarq
     for effect in problem.model.effects:
         with contextlib.suppress(*FAILURES):
             smaller = asked.for_model(asked.model.without(effect.name)).tuned(noise_factors=problem.noise_factors)
-            end = minimise(with_start_values(smaller), effort)
+            end = restore_collapsed(by_continuation(with_start_values(smaller), effort), effort)  # in the same weights
             if end.cost > found.cost:
                 continue
             fresh = {p.name: suited(p, sizes).value for p in effect.parameters if p.vary and not p.given}
