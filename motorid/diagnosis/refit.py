@@ -150,7 +150,7 @@ def _released(measured: Problem) -> Estimate:
 def copies_the_angle(problem: Problem, q: Array) -> bool:
     """Tell whether the simulated angle follows changes of the measured one that goes in: then it predicts nothing.
 
-    The measured angle is shaken a little, and the simulated one nearer to the same shaking than to none.
+    The measured angle is shaken a little: a simulated one that does the same, to within half, copies.
     """
     rng, runs, shakes = np.random.default_rng(0), [], []
     for run in problem.runs:
@@ -160,7 +160,7 @@ def copies_the_angle(problem: Problem, q: Array) -> bool:
         shaken = run.experiment.with_(outputs={**run.experiment.outputs, "theta": theta + shakes[-1]})
         runs.append(with_inputs(replace(run, experiment=shaken), problem.system.inputs))
     there, column = problem.with_runs(tuple(runs)), problem.outputs.index("theta")
-    moved = [(p.simulate(q, k, derivatives=False).y[:, column]) for p in (problem, there) for k in range(len(runs))]
+    moved = [p.simulate(q, k, derivatives=False).y[:, column] for p in (problem, there) for k in range(len(runs))]
     answer, shake = np.concatenate(moved[len(runs):]) - np.concatenate(moved[:len(runs)]), np.concatenate(shakes)
     return bool(np.linalg.norm(answer - shake) < 0.5 * np.linalg.norm(shake))
 

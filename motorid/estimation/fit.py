@@ -185,7 +185,7 @@ def _fit(problem: Problem, effort: LevenbergMarquardt, callback: Callback = None
         effort = replace(effort, looks=min(effort.looks, 1))  # a misfit from there is the model's, not the start's
     found = minimise(problem, effort, callback, wide=auto)  # continuation, restarts, reweighting
     if auto:
-        found = no_worse_than_smaller(found, asked, effort, callback)
+        found = no_worse_than_smaller(found, asked, effort)
     found, error = _polished(found, effort, callback)  # finer sub-steps
     problem, q = found.problem, found.problem.unknowns.principal(found.q)
     status, message = _said(found, error)
@@ -239,7 +239,7 @@ def minimise(problem: Problem, effort: LevenbergMarquardt, callback: Callback = 
     return found
 
 
-def no_worse_than_smaller(found: Estimate, asked: Problem, effort: LevenbergMarquardt, callback: Callback) -> Estimate:
+def no_worse_than_smaller(found: Estimate, asked: Problem, effort: LevenbergMarquardt) -> Estimate:
     """Return an estimate that, where it leaves more than noise, costs no more than without one of its effects.
 
     A model contains the smaller one: if that does better, begun as `asked`, this one is in a side valley, and begins

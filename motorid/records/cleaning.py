@@ -141,14 +141,14 @@ def _rows_in_order(t: Array, column: str, said: list[str]) -> tuple[NDArray[np.i
     if len(stretches) > 1 and total < MIN_SAMPLES * len(stretches):  # in disorder, not begun anew
         raise DataError(f"time does not increase: '{column}' goes back {again} in {total} rows. Is it "
                         "the right column? Expected rows in order of time.")
-    stretches = [s for s in stretches if len(s) >= MIN_SAMPLES] or [longest]
-    if again != "0 times":
-        used = sum(map(len, stretches))
-        what = f"kept the longest stretch, {used}" if len(stretches) == 1 else f"a run each time, {used}"
+    long = [rows[s] for s in stretches if len(s) >= MIN_SAMPLES] or [rows[longest]]
+    if len(stretches) > 1:
+        used = sum(map(len, long))
+        what = f"kept the longest stretch, {used}" if len(long) == 1 else f"a run each time, {used}"
         said.append(f"time starts again {again}; {what} of {total} rows.")
         total = used
-    stretches = [rows[s] for s in stretches]
-    moving = [s[np.r_[True, t[s][1:] > np.maximum.accumulate(t[s])[:-1]]] for s in stretches]
+    moving = [s[np.r_[True, t[s][1:] > np.maximum.accumulate(t[s])[:-1]]] for s in long]
+    moving = [s for s in moving if len(s) >= MIN_SAMPLES] or moving[:1]
     kept = sum(map(len, moving))
     if kept < max(total / 2, MIN_SAMPLES):
         raise DataError(f"time stands still or goes back in {total - kept} of {total} rows of "

@@ -402,7 +402,7 @@ def test_a_model_that_misses_the_noise_fits_no_worse_than_without_one_of_its_eff
     asked = mi.Problem(model, records)
     begin = asked.start_at({"R": 300.0, "J": 1.0})
     astray = least_squares.least_squares(begin, mi.LevenbergMarquardt(max_iterations=1))
-    mended = no_worse_than_smaller(astray, asked, least_squares.FINISH, None)
+    mended = no_worse_than_smaller(astray, asked, least_squares.FINISH)
     smaller = [asked.for_model(model.without(e.name)) for e in model.effects]
     least = min(by_continuation(each, least_squares.FINISH).cost for each in smaller)
     assert mended.cost < 1.001 * least < 0.1 * astray.cost

@@ -331,6 +331,13 @@ def test_a_time_that_starts_again_begins_another_run(tmp_path):
     assert "gap" not in notes(runs[0])
 
 
+def test_a_time_that_starts_again_and_stands_still_begins_none(tmp_path):
+    run = read_csv(write(tmp_path, table([*range(20), *[0] * 9], [1] * 29, range(29))))
+    np.testing.assert_array_equal(run.t, np.arange(20))
+    assert "time starts again 1 time" in notes(run)
+    assert "left out 9 rows of 29" in notes(run)
+
+
 @pytest.mark.parametrize("every", [2, 5, 12])
 def test_a_sensor_read_more_often_than_it_measures_counts_once(every, tmp_path, rng):
     """What it repeats meanwhile would be taken for a delay; a rest, steps of a converter, lone equals stay."""
