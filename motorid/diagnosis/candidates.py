@@ -37,6 +37,7 @@ from motorid.numerics.signals import Array, noise_level
 from motorid.records.experiment import Experiment
 
 SHORTLIST = 6
+LITTLE = 1 - (1 - MATERIAL) ** 2  # of the squared misfit; of 361 refits that promised less none was worth it
 PAIRS = 3  # refitted where no single effect helps
 NEAR = 0.4  # of the best score: what a common effect must reach to be refitted too
 ALWAYS = ("compliance", "speed_lag", "speed_delay", "driver_coast")  # their score at null says little
@@ -129,13 +130,10 @@ class Search:
         if node.key not in self._scores:
             fresh, _ = self._takeable(node.fit.model)
             self.stages.at(f"ranking {len(fresh)} effects")
-            self._scores[node.key] = rank(node.fit, fresh, self._scores_before(node))
+            before = self._scores.get(node.parent.key, ()) if node.parent is not None and not far(node.fit) else ()
+            self._scores[node.key] = rank(node.fit, fresh, before)
             self.stages.done(f"ranked {len(fresh)} effects")
         return self._scores[node.key]
-
-    def _scores_before(self, node: Node) -> Sequence[Score]:
-        """Return the scores of the model that `node` came from, if it leaves hardly more than noise."""
-        return () if node.parent is None or far(node.fit) else self._scores.get(node.parent.key, ())
 
     def inseparable(self, node: Node) -> dict[str, tuple[str, ...]]:
         """Return the effects that do no more than a combination of parameters of effects that `node` has.
@@ -172,7 +170,9 @@ class Search:
         present = node.fit.model
         _, wider = self._takeable(present)
         scores = self.scores(node)
-        short = self._shortlist(node)
+        little = -np.inf if lost(node.fit) else LITTLE  # far from the records slopes say little
+        short = [s for s in self._shortlist(node)
+                 if s.drop > little or s.stands_out or not any(p.vary for p in s.effect.parameters)]
         tasks = [Task(node.fit, present + s.effect, s.effect, s.starts, s.drop) for s in short]
         for e in wider:
             with contextlib.suppress(ModelError):  # beside what is there it may describe the same twice
@@ -310,8 +310,10 @@ class Search:
         A later effect may have taken over what made an earlier one special: then its simple relative will do. What
         is left still predicts better than the model `before`: small losses, each by chance, may add up.
         """
+        known = {e.name: e for e in self.effects if e.name not in node.fit.model.effect_names}
         for e in node.fit.problem.model.effects:
-            simpler = [m for r in self._relatives(node, e) if (m := _in_place(node.fit.model, e, r)) is not None]
+            inside = [known[n] for n in e.includes if n in known]
+            simpler = [m for r in inside if (m := _in_place(node.fit.model, e, r)) is not None]
             alone = e.name == node.added and node.parent is not None and len(node.key - node.parent.key) == 1
             smaller = simpler if alone else [*simpler, *_without(node.fit.model, e.name)]
             for model in sorted(smaller, key=lambda m: len(m.free_names)):
@@ -336,12 +338,6 @@ class Search:
         self.nodes[node.key] = lower
         self._scores.pop(node.key, None)
         return lower
-
-    def _relatives(self, node: Node, effect: Effect) -> list[Effect]:
-        """Return the simpler effects, not in the model yet, that `effect` contains."""
-        have = set(node.fit.model.effect_names)
-        known = {e.name: e for e in self.effects}
-        return [known[n] for n in effect.includes if n in known and n not in have]
 
     def without(self, node: Node, name: str) -> Node | None:
         """Return the judged model without an effect; None where that is none."""
@@ -429,7 +425,7 @@ def _unseen(score: Score) -> str:
     """Say why an effect was not refitted."""
     if score.same_as:
         return f"these records do not distinguish it from {listed(score.same_as)} together"
-    return "not refitted: others ranked higher"
+    return "not refitted: " + ("others ranked higher" if score.drop > LITTLE else "no gain that matters is predicted")
 
 
 def _said(found: Evidence) -> str:

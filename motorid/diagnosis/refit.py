@@ -367,14 +367,21 @@ def completed(given_up: Sequence[GivenUp], map_: Callable[..., Iterable[Any]]) -
 
 
 def _outdone(tasks: Sequence[Task], races: Mapping[int, Raced], found: Mapping[int, Any]) -> dict[int, GivenUp]:
-    """Return the races that an undamped step from their end still leaves far behind, or with nothing gained."""
-    costs, given_up = sorted(race.cost for race in races.values()), {}
+    """Return the races that an undamped step from their end still leaves far behind, or with nothing gained.
+
+    Gained is what the model without the effect would not reach by such a step itself: a stalled fit promises much.
+    """
+    costs, given_up, own = sorted(race.cost for race in races.values()), {}, _own_reach(tasks[0].fit)
     for k, race in races.items():
-        before = tasks[k].fit.cost
-        nothing = race.reach > (1 - MATERIAL) ** 2 * before
+        before, less = tasks[k].fit.cost, (1 - MATERIAL) ** 2
+        nothing = race.reach > less * own and race.cost > less * before
         if k not in found and (nothing or (race.reach > OUTDONE * costs[0] and race.cost not in costs[:BEAM])):
             given_up[k] = GivenUp(NOTHING if nothing else LESS, 1 - race.cost / max(before, 1e-300), (tasks[k], race))
     return given_up
+
+
+def _own_reach(fit: Fit) -> float:
+    return _undamped(fit.residuals, fit.jacobian * fit.problem.scaling.slope(fit.q))
 
 
 def _leader(tasks: Sequence[Task]) -> int | None:

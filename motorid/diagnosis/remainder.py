@@ -296,8 +296,9 @@ class Remainder:
 
     @property
     def model(self) -> Model:
-        """The model to add the curve to, without effects that only approximated it if it does better so."""
-        return self._chosen.fit.model
+        """The model to add the curve to, at its values beside that; without what only approximated it if it does
+        better so."""
+        return self._chosen.fit.model.start_at(self.fitted.values)
 
     @property
     def fitted(self) -> Fit:

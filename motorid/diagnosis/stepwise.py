@@ -23,7 +23,7 @@ from motorid.diagnosis.misspecification import FormGain, Grade, better_forms, gr
 from motorid.diagnosis.model_comparison import Node, at_noise, beats, choose, evidence, far, group_of, node_of
 from motorid.diagnosis.predictive_score import is_sure
 from motorid.diagnosis.record_parts import affordable, thinned_alike
-from motorid.diagnosis.refit import BEAM, INTERRUPTED, OUT_OF_TIME
+from motorid.diagnosis.refit import BEAM, BEHIND, INTERRUPTED, OUT_OF_TIME
 from motorid.diagnosis.results import Adequacy, Candidate, Ladder, Rung
 from motorid.diagnosis.thresholds import MATERIAL
 from motorid.diagnosis.verdict import first_answer
@@ -313,12 +313,14 @@ def _without(group: Sequence[str], found: frozenset[str]) -> tuple[str, ...]:
 def _runners_up(best: Node, ordered: Sequence[Node], effects: Sequence[Effect]) -> list[Node]:
     """Return the next best child if it came near enough to be grown too, as one of another kind than the best.
 
-    What contains the best's effect and predicts no better is none: every later round tries it in that one's place.
+    Near is half as far as the best came, and no more than a few times its error. What contains the best's effect and
+    predicts no better is none: every later round tries it in that one's place.
     """
     if best.parent is None:
         return []
     goal, wider = evidence(best.parent, best).fall, {e.name for e in effects if best.added in e.includes}
-    near = (n for n in ordered if n.key != best.key and evidence(best.parent, n).fall > HALF_AS_GOOD * goal)
+    least = max(HALF_AS_GOOD * goal, 1 - np.sqrt(BEHIND) * (1 - goal))
+    near = (n for n in ordered if n.key != best.key and evidence(best.parent, n).fall > least)
     return [n for n in [*near][:BEAM - 1] if n.added not in wider or beats(n, best)]
 
 

@@ -267,7 +267,7 @@ def test_refits_that_cannot_win_are_given_up(lab):
     assert found.effects == ("coulomb",)
     why = {c.effect: c for c in found.ranking}
     assert "no better than coulomb" in why["stribeck"].reason
-    assert why["speed_lag"].reason == "rejected: coulomb alone already reaches the noise"
+    assert why["speed_lag"].reason == "not refitted: no gain that matters is predicted"
     assert why["stribeck"].predicted_drop > 0.9 > 0.5 > why["speed_lag"].predicted_drop
     assert why["stribeck"].refit_drop is why["speed_lag"].refit_drop is None  # neither was refitted
 
@@ -293,6 +293,19 @@ def test_beside_an_effect_that_leaves_noise_what_promises_little_is_not_even_beg
     assert lag.why == drop.why == trial.FAR_BEHIND.format("coulomb")
     assert asymmetric.drop is lag.drop is None  # neither was refitted, and no table may say so
     assert 0 < drop.drop < 1
+
+
+def test_what_an_unfinished_fit_would_reach_by_itself_is_no_effect_s_gain(lab):
+    moves = driven(lab, {"coulomb": {"tau_c": 8e-3}}, "stairs", 400, 1e-3, np.random.default_rng(8))
+    record_ = record(moves, "logger", ("i", "omega"), lab, np.random.default_rng(8), "run")
+    fit = mi.solve(mi.Problem(mi.dc_motor(), [record_]), mi.LevenbergMarquardt(max_iterations=1), start="model")
+    own = trial._own_reach(fit)
+    assert own < 0.9 * fit.cost
+    names = ("gravity", "coulomb", "spring")
+    tasks = [trial.Task(fit, fit.model + LIBRARY[n], LIBRARY[n], ({},)) for n in names]
+    ends = ((fit.cost, own), (fit.cost, 0.5 * own), (0.9 * fit.cost, own))
+    races = {k: trial.Raced(fit.problem, *end, False) for k, end in enumerate(ends)}
+    assert {k: g.why for k, g in trial._outdone(tasks, races, {}).items()} == {0: trial.NOTHING}
 
 
 def test_what_contains_the_leader_is_tried_where_one_step_promises_more():
@@ -409,6 +422,7 @@ def test_what_was_put_off_is_refitted_where_what_led_is_refused(lab, monkeypatch
     fit = mi.fit(mi.dc_motor(), run)
     looked = search.Search(fit, None, [mi.effects.coulomb, mi.effects.speed_lag], search.Stages())
     monkeypatch.setattr(trial, "far", lambda fit: [0])
+    monkeypatch.setattr(search, "LITTLE", -1.0)  # all is begun
     _, listed = looked.expand(looked.root)
     assert next(c for c in listed if c.effect == "speed_lag").fit is None
     monkeypatch.setattr(search, "objections", lambda *fits: "refused")
@@ -503,9 +517,10 @@ def test_what_the_ladder_left_again_is_not_called_accepted():
     assert later.reason == "added in a later step"
 
 
-def test_the_second_best_race_is_finished_however_far_it_is_behind():
+def test_the_second_best_race_is_finished_however_far_it_is_behind(monkeypatch):
     """The next round grows two models; what gains nothing, and all others far behind, stay given up."""
     fit, costs = SimpleNamespace(cost=100.0), (1.0, 2.5, 3.0, 99.9)
+    monkeypatch.setattr(trial, "_own_reach", lambda fit: fit.cost)  # it is at its optimum
     tasks = [SimpleNamespace(fit=fit) for _ in costs]
     races = {k: SimpleNamespace(cost=c, reach=c) for k, c in enumerate(costs)}
     given_up = trial._outdone(tasks, races, {0: None})
