@@ -171,8 +171,7 @@ class Search:
         _, wider = self._takeable(present)
         scores = self.scores(node)
         little = -np.inf if lost(node.fit) else LITTLE  # far from the records slopes say little
-        short = [s for s in self._shortlist(node)
-                 if s.drop > little or s.stands_out or not any(p.vary for p in s.effect.parameters)]
+        short = [s for s in self._shortlist(node) if s.drop > little or not any(p.vary for p in s.effect.parameters)]
         tasks = [Task(node.fit, present + s.effect, s.effect, s.starts, s.drop) for s in short]
         for e in wider:
             with contextlib.suppress(ModelError):  # beside what is there it may describe the same twice

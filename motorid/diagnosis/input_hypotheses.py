@@ -34,7 +34,7 @@ WINDOWS = (5, 15, 45)  # samples of a running median
 # Samples by which the voltage may be late; then, beside the best, whole ones and parts of one.
 DELAYS = ((-1.0, 1.0, 2.0, 3.0, 5.0, 8.0, 12.0), (-1.0, -0.5, 0.5, 1.0), (-0.25, 0.25), (-0.1, 0.1))
 NOISE = (0.9, 1.05)  # times what fast changes tell of the noise: errors that are all noise
-PLAIN = 0.1  # fall of the error with another reading
+PLAIN, PROMISING = 0.1, 0.05  # fall of the error with another reading, and after a few steps with it
 OTHER = {"zoh": "linear", "linear": "zoh"}
 AS_IT_IS = LevenbergMarquardt(looks=0)  # beside a fit whose end was looked into
 
@@ -88,7 +88,7 @@ def better_reading(fit: Fit, late: bool = False) -> Reading | None:
     seen = {"i", "omega", "theta"} & set(fit.problem.outputs)
     if late and "i" in seen and len(seen) > 1:  # current and motion both follow a late voltage, not a late sensor
         readings += _best_delay(fit)
-    for reading in readings:
+    for reading in (r for r in readings if _fall(fit, r) > PROMISING):
         try:
             after = reading.fitted(fit, AS_IT_IS)
             found = compare(*(Predictions(predictions_left_out(f) or {}, {}) for f in (fit, after)))

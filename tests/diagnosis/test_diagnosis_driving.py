@@ -8,6 +8,7 @@ from battery.excite import P
 from command import motorid_json
 
 import motorid as mi
+from motorid.diagnosis import input_hypotheses as readings
 from motorid.diagnosis.input_hypotheses import better_reading
 from motorid.records.reading import write_csv
 
@@ -66,6 +67,20 @@ def test_a_voltage_that_is_what_it_says_is_left_alone(lab, drive):
     v = stairs(900, rng) if drive == "steps" else np.repeat(sampled, FINE)
     fit = mi.fit(mi.dc_motor(), [recorded(lab, {}, v, 2e-3, rng)])
     assert better_reading(fit) is None
+
+
+def test_a_reading_that_a_few_steps_do_not_favour_is_not_fitted_to_its_end(lab, monkeypatch):
+    """What is missing is a friction: that takes its time to fit, and no reading of the voltage makes up for it."""
+    rng = np.random.default_rng(7)
+    runs = [recorded(lab, {"coulomb": {"tau_c": 0.008}}, waves(900, 2e-3, rng), 2e-3, rng)]
+    read_so = mi.fit(mi.dc_motor(), [r.with_(hold="linear") for r in runs])
+    fitted, solve = [], readings.solve
+    monkeypatch.setattr(readings, "solve", lambda *args, **words: fitted.append(args) or solve(*args, **words))
+    assert readings.better_reading(read_so) is None
+    assert not fitted
+    held = mi.fit(mi.dc_motor() + mi.effects.coulomb, runs)
+    assert readings.better_reading(held) is not None
+    assert fitted
 
 
 def test_a_running_median_keeps_steps_and_loses_noise():

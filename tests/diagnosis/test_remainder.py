@@ -120,6 +120,7 @@ def test_it_takes_the_place_of_what_only_approximates_it(beyond, lab):
     found = mi.diagnose(mi.fit(mi.dc_motor(), runs), check, effects=("quadratic_drag", "coulomb"))
     assert [(r.added, r.grade) for r in found.ladder.rungs[1:]] == [("quadratic_drag", "approximates")]
     assert found.remainder.model.effect_names == ()
+    assert found.remainder.model.values["b"] == pytest.approx(found.remainder.fitted.values["b"])  # beside the curve
     fit = mi.fit(found.remainder.model + found.remainder.as_effect(), runs)
     without, with_curve = (over_floor(f, check, clean[-1]) for f in (found.after, fit))
     assert all(with_curve[c] < min(0.3 * without[c], 1.3) for c in without)
