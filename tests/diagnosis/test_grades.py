@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from battery.excite import driven, record
 
 import motorid as mi
-from motorid.diagnosis import misspecification
+from motorid.diagnosis import misspecification, stepwise
 from motorid.diagnosis.admissibility import objections
 from motorid.diagnosis.candidates import library
 from motorid.diagnosis.cross_validation import HeldOut
@@ -161,6 +162,15 @@ def test_a_model_that_ties_with_the_best_is_grown_too_unless_it_contains_it(rubb
     assert tied(best, wider)
     assert _runners_up(best, [best, wider, worse], [mi.effects.constant_load]) == [wider]
     assert _runners_up(best, [best, wider, worse], library(None)) == []
+
+
+def test_a_rival_with_several_times_the_error_of_the_best_is_not_grown(monkeypatch):
+    """Both explain most: 3 % of the error is left by the best, 7 and 11 % by the others."""
+    falls = {"best": 0.97, "near": 0.93, "far": 0.89}
+    best, near, far = (SimpleNamespace(key=frozenset({n}), added=n, parent="root") for n in falls)
+    monkeypatch.setattr(stepwise, "evidence", lambda before, node: SimpleNamespace(fall=falls[node.added]))
+    assert _runners_up(best, [best, near, far], []) == [near]
+    assert _runners_up(best, [best, far], []) == []
 
 
 @pytest.mark.parametrize(("gain", "said"), [(1e4, True), (1.0, False)])
