@@ -21,7 +21,7 @@ from motorid.diagnosis.cross_validation import HeldOut
 from motorid.diagnosis.misspecification import LIMITER
 from motorid.diagnosis.model_comparison import COMMON, Node, beats, evidence, far, node_of, superfluous
 from motorid.diagnosis.predictive_score import Evidence
-from motorid.diagnosis.refit import GivenUp, Task, completed, hidden_in, lost, refit, refits, widened
+from motorid.diagnosis.refit import LITTLE, GivenUp, Task, completed, hidden_in, lost, refit, refits, widened
 from motorid.diagnosis.results import Candidate
 from motorid.diagnosis.score_test import Score, pairs_of, rank, uses_angle, with_phase_per_run, with_warm_start
 from motorid.diagnosis.thresholds import MATERIAL
@@ -37,7 +37,6 @@ from motorid.numerics.signals import Array, noise_level
 from motorid.records.experiment import Experiment
 
 SHORTLIST = 6
-LITTLE = 1 - (1 - MATERIAL) ** 2  # of the squared misfit; of 361 refits that promised less none was worth it
 PAIRS = 3  # refitted where no single effect helps
 NEAR = 0.4  # of the best score: what a common effect must reach to be refitted too
 ALWAYS = ("compliance", "speed_lag", "speed_delay", "driver_coast")  # their score at null says little

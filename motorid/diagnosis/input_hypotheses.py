@@ -84,11 +84,11 @@ def better_reading(fit: Fit, late: bool = False) -> Reading | None:
     if all(NOISE[0] < ratio < NOISE[1] for ratio in misfit_over_noise(fit.problem, fit.q).values()):
         return None
     chosen, fall = None, PLAIN
-    readings = list(_readings(fit.problem.experiments))
+    readings = [r for r in _readings(fit.problem.experiments) if _fall(fit, r) > PROMISING]
     seen = {"i", "omega", "theta"} & set(fit.problem.outputs)
     if late and "i" in seen and len(seen) > 1:  # current and motion both follow a late voltage, not a late sensor
         readings += _best_delay(fit)
-    for reading in (r for r in readings if _fall(fit, r) > PROMISING):
+    for reading in readings:
         try:
             after = reading.fitted(fit, AS_IT_IS)
             found = compare(*(Predictions(predictions_left_out(f) or {}, {}) for f in (fit, after)))
@@ -101,7 +101,7 @@ def better_reading(fit: Fit, late: bool = False) -> Reading | None:
 
 
 def _best_delay(fit: Fit) -> list[Reading]:
-    """Return the delay that lowers the error most after a few steps, tried ever more closely; nothing for none."""
+    """Return the delay that lowers the error most after a few steps, tried ever more closely; nothing for little."""
     falls = {0.0: 0.0}
     best = 0.0
     for moves in DELAYS:
@@ -109,7 +109,7 @@ def _best_delay(fit: Fit) -> list[Reading]:
             if samples not in falls:
                 falls[samples] = _fall(fit, _delay(fit, samples))
         best = max(falls, key=lambda n: falls[n])
-    return [_delay(fit, best)] if best else []
+    return [_delay(fit, best)] if falls[best] > PROMISING else []
 
 
 def _fall(fit: Fit, reading: Reading) -> float:

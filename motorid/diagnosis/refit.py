@@ -265,6 +265,7 @@ def _within(model: Model, values: Mapping[str, float]) -> Model:
     return model.start_at(inside)
 
 
+LITTLE = 1 - (1 - MATERIAL) ** 2  # of the squared misfit; of 361 refits that promised less none was worth it
 BEAM = 2  # models that the next round grows: that many are finished
 OUTDONE = 1.5  # times the least cost of a race: 20 nats away from a tie at 100 effective samples
 BEHIND = 10.0  # times the cost of a model that explains all but noise
@@ -373,8 +374,8 @@ def _outdone(tasks: Sequence[Task], races: Mapping[int, Raced], found: Mapping[i
     """
     costs, given_up, own = sorted(race.cost for race in races.values()), {}, _own_reach(tasks[0].fit)
     for k, race in races.items():
-        before, less = tasks[k].fit.cost, (1 - MATERIAL) ** 2
-        nothing = race.reach > less * own and race.cost > less * before
+        before = tasks[k].fit.cost
+        nothing = race.reach > (1 - LITTLE) * own and race.cost > (1 - LITTLE) * before
         if k not in found and (nothing or (race.reach > OUTDONE * costs[0] and race.cost not in costs[:BEAM])):
             given_up[k] = GivenUp(NOTHING if nothing else LESS, 1 - race.cost / max(before, 1e-300), (tasks[k], race))
     return given_up
