@@ -7,6 +7,7 @@ from types import MappingProxyType
 
 CHANNELS = ("i", "omega", "theta")  # what can be measured, in the order of states, tables and figures
 MEASURED_INPUTS = ("v_supply", "tau_load", "temp")  # what may be recorded beside the voltage, and drive the model too
+COMPUTED_INPUTS = ("since_change", "since_switch", "since_reversal")  # times, s, that follow from the voltage
 NAMES = {"t": "time", "v": "voltage", "i": "current", "omega": "speed", "theta": "angle",
          "v_supply": "supply voltage", "tau_load": "load torque", "temp": "temperature"}
 SYMBOLS = {"t": "t", "v": "v", "i": "i", "omega": "ω", "theta": "θ", "v_supply": "V", "tau_load": "τ", "temp": "T"}

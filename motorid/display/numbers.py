@@ -16,16 +16,8 @@ def with_error(value: float, std: float | None, unit: str = "", why: str = "not 
     """Return a value with its standard deviation, both rounded to what the error allows.
 
     The error keeps one or two digits by the rule of the Particle Data Group (Review of Particle Physics):
-    two where its first digits are 10–35, one from 36–94; the value is rounded to the same place.
-
-    Parameters
-    ----------
-    value : float
-    std : float or None
-        0: fixed, not estimated. None (or not finite): the data do not determine it.
-    unit : str
-    why : str
-        Said where there is no standard deviation.
+    two where its first digits are 10–35, one from 36–94; the value is rounded to the same place. A deviation of 0
+    means fixed, not estimated; for None (or not finite) `why` is said: the data do not determine the value.
 
     Examples
     --------

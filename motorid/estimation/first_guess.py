@@ -16,9 +16,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from motorid.channels import CHANNELS
+from motorid.channels import CHANNELS, COMPUTED_INPUTS
 from motorid.model.model import Model, dc_motor
 from motorid.numerics.signals import Array, bridged, integral, slope
+from motorid.problem.runs import time_since
 from motorid.records.experiment import Experiment
 
 BASE = ("R", "L", "K", "b", "J", "g")
@@ -63,6 +64,7 @@ def _signals(run: Experiment) -> dict[str, Array]:
     found: dict[str, Array] = {"t": t, **run.inputs, **{c: bridged(t, run.outputs[c]) for c in measured}}
     if "omega" not in found and "theta" in found:
         found["omega"] = slope(t, found["theta"], max(2, min(10, len(t) // 200)))
+    found |= {c: time_since(run, c) for c in COMPUTED_INPUTS}
     found["v_dt"] = integral(t, run.inputs["v"], run.hold == "zoh")
     return found
 

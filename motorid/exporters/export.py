@@ -82,8 +82,8 @@ def export(found: Fit | Model | Exported, path: str | os.PathLike[str], to: str 
     found : Fit, Model or Exported
         A fit brings its uncertainty, its records' inputs and the very steps of its simulation along.
     path : path
-        ``motor.casadi``, ``motor.c`` or ``motor.json``. C makes ``motor.h``, ``motor_main.c`` and
-        the records ``motor_run0.csv`` … beside it.
+        ``motor.casadi`` (CasADi alone reads it), ``motor.c`` or ``motor.json``. C makes ``motor.h``, ``motor_main.c``
+        and the records ``motor_run0.csv`` … beside it.
     to : {"casadi", "c", "json"}, optional
         Default: by the ending of `path`.
     force : bool
@@ -93,10 +93,6 @@ def export(found: Fit | Model | Exported, path: str | os.PathLike[str], to: str 
     -------
     Path
         The file written (of several, the main one).
-
-    Notes
-    -----
-    A ``.casadi`` file is read with CasADi alone, see the example.
 
     Raises
     ------

@@ -10,7 +10,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from motorid.channels import CHANNELS, MEASURED_INPUTS
+from motorid.channels import CHANNELS, COMPUTED_INPUTS, MEASURED_INPUTS
 from motorid.errors import ModelError, among, one_of
 from motorid.numerics.signals import Array
 
@@ -109,8 +109,12 @@ class Equations:
         return self.angle_state() if channel == "theta" else self.__getattr__(channel)
 
     def input(self, name: str) -> ca.SX:
-        """Return what was measured beside the voltage, e.g. ``"tau_load"``; the model's records must have it."""
-        among(name, MEASURED_INPUTS, "input", ModelError, f"{self.writer}: ")
+        """Return what was measured beside the voltage, e.g. ``"tau_load"``; the model's records must have it.
+
+        Computed from the voltage, in s: the time ``"since_change"``, ``"since_reversal"`` and ``"since_switch"``, the
+        last negative while it is off.
+        """
+        among(name, (*MEASURED_INPUTS, *COMPUTED_INPUTS), "input", ModelError, f"{self.writer}: ")
         return self.inputs.setdefault(name, ca.SX.sym(name))
 
     # -- writing ---------------------------------------------------------------------------------------

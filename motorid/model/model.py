@@ -324,9 +324,7 @@ BASES = {
                  Parameter("K", 0.05, "N·m/A", positive=True, doc="torque and back-EMF constant (V·s/rad)"),
                  Parameter("b", 1e-5, "N·m·s/rad", positive=True, doc="viscous friction"),
                  Parameter("J", 1e-5, "kg·m²", positive=True, doc="moment of inertia")),
-    "torque_driven": (
-        Parameter("g", 1.0, "N·m/V", positive=True, vary=False, doc="torque per unit of the command; fixed"),
-        Parameter("b", 1e-3, "N·m·s/rad", positive=True, doc="viscous friction"),
-        Parameter("J", 1e-3, "kg·m²", positive=True, doc="moment of inertia"),
-    ),
+    "torque_driven": (Parameter("g", 1.0, "N·m/V", positive=True, vary=False, doc="torque per command; fixed"),
+                      Parameter("b", 1e-3, "N·m·s/rad", positive=True, doc="viscous friction"),
+                      Parameter("J", 1e-3, "kg·m²", positive=True, doc="moment of inertia")),
 }

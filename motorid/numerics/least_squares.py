@@ -125,29 +125,12 @@ def levenberg_marquardt(residual: Callable[[Array], Array], both: Callable[[Arra
                         bounds: tuple[Array, Array] | None = None, options: LevenbergMarquardt | None = None,
                         callback: Callable[[int, float, Array], object] | None = None,
                         log: np.ndarray | None = None) -> Solution:
-    """Minimise ½‖r(q)‖² from `q0`.
+    """Minimise ½‖r(q)‖² from `q0` (nq,); `log` (nq,) tells which coordinates are logarithms.
 
-    Parameters
-    ----------
-    residual : callable
-        ``q -> r`` (n,); may raise `SimulationError`.
-    both : callable
-        ``q -> (r, jac)`` with jac (n, nq); called at the start and after every accepted step only, so that it
-        may refine what `residual` does there.
-    q0 : ndarray, shape (nq,)
-    bounds : pair of ndarray, optional
-    options : LevenbergMarquardt, optional
-    callback : callable, optional
-        Called as ``callback(iteration, cost, q)`` after each accepted step.
-    log : ndarray of bool, shape (nq,), optional
-        Coordinates on a logarithmic scale; none by default.
-
-    Raises
-    ------
-    FitError
-        If the residual cannot be computed at the start.
-    OutOfTime
-        If the budget of time around the call is spent.
+    `residual` is ``q -> r`` (n,) and may raise `SimulationError`; `both` is ``q -> (r, jac)``, jac (n, nq), called at
+    the start and after every accepted step only, so that it may refine what `residual` does there; the callback
+    (iteration, cost, q) is called then, too. FitError if the residual cannot be computed at the start, OutOfTime if
+    the budget of time around the call is spent.
     """
     o = options or LevenbergMarquardt()
     search = _Search(residual, both, np.asarray(q0, float), bounds, o, log)

@@ -287,23 +287,10 @@ def progress(text: str, total: float | None = None, *, quiet: bool = False, at_m
     log file, a worker process). Inside another one it only says what that one is at, so any function may use it
     whoever calls it. The time left is what it took so far, per task.
 
-    Parameters
-    ----------
-    text : str
-        What is being done, e.g. ``"Refitting"``.
-    total : float, optional
-        Number of tasks; then the time left is shown, too. None: what is at work, and for how long.
-    quiet : bool
-    at_most : bool
-        The total may not be reached, and the time left is said so.
-    short : bool
-        It is often over in a second: in a notebook, where a bar leaves an empty output, there is none before.
-
-    Yields
-    ------
-    callable
-        ``advance(n=1, at_work="", done=None, total=None)``: `at_work` takes the place of `text`; `done` is how many
-        tasks are, parts of one included.
+    `text` says what is being done. With a `total` of tasks the time left is shown, too, which may be less if the total
+    is `at_most`; without one, for how long. What is `short`, often over in a second, has no bar before in a notebook,
+    where a bar leaves an empty output. It yields ``advance(n=1, at_work="", done=None, total=None)``: `at_work` takes
+    the place of `text`; `done` is how many tasks are, parts of one included.
 
     Examples
     --------

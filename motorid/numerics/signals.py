@@ -159,8 +159,9 @@ def noise_level(y: ArrayLike, t: ArrayLike | None = None) -> float:
     keep, step = np.isfinite(values) & np.isfinite(times), quantum(values)
     values, times = values[keep], times[keep]
     fresh = np.diff(values, prepend=np.nan) != 0
-    if step == 0 and FEWEST_FRESH <= np.count_nonzero(fresh) < 0.5 * fresh.size:
-        values, times = values[fresh], times[fresh]
+    measured = np.count_nonzero(fresh)
+    if step == 0 and FEWEST_FRESH <= measured < 0.5 * fresh.size and np.unique(values).size > 0.5 * measured:
+        values, times = values[fresh], times[fresh]  # hardly one comes twice: no levels of a coarse counter
     return float(max(_from_differences(values, times, step), step / np.sqrt(12), _floor(values)))
 
 

@@ -14,7 +14,7 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from motorid.channels import CHANNELS, NAMES
+from motorid.channels import CHANNELS, COMPUTED_INPUTS, NAMES
 from motorid.errors import ModelError, among
 from motorid.integrate.engine import Grid
 from motorid.model.definition import Parameter
@@ -29,6 +29,7 @@ SGN_WIDTH_SHARE = 1e-3  # of the highest speed: wider smoothing looks like one m
 CREEP_SHARE = 0.2  # of the angle's noise that a stuck motor may creep
 NARROWEST = 1e-5  # of the highest speed
 FINEST = 256  # sub-steps per sample
+OFF = 0.02  # of the largest voltage: as good as none
 
 # A record is frozen, and so are its noise and its size.
 _levels: WeakKeyDictionary[Experiment, dict[str, float]] = WeakKeyDictionary()
@@ -67,6 +68,9 @@ def _grid(run: Experiment, inputs: Sequence[str]) -> Grid:
         if name == "theta_in":
             columns.append(angle_signal(run))
             held.append(False)
+        elif name in COMPUTED_INPUTS:
+            columns.append(time_since(run, name))
+            held.append(True)
         elif name in run.inputs:
             columns.append(run.inputs[name])
             held.append(run.hold == "zoh" and name == "v")
@@ -74,6 +78,26 @@ def _grid(run: Experiment, inputs: Sequence[str]) -> Grid:
             raise ModelError(f"{run.name}: the model needs the input '{name}' ({NAMES[name]}), which the record lacks. "
                              "Name its column with columns, or leave the effect out.")
     return Grid.of(run.t, np.column_stack(columns), np.array(held))
+
+
+def time_since(run: Experiment, name: str) -> Array:
+    """Return one of the inputs that are times since the voltage did something, in the middle of each sample, (N,), s.
+
+    A voltage that begins at zero is taken to have been there for as long as the run lasts, any other to begin.
+    """
+    t, v = run.t, run.inputs["v"]
+    off = np.abs(v) <= OFF * np.abs(v).max()
+    if name == "since_change":  # by more than noise, which a second difference has, a ramp hardly
+        moved = np.abs(np.diff(v)) > 3.4 * np.median(np.abs(np.diff(v, 2)))
+    elif name == "since_switch":
+        moved = off[1:] != off[:-1]
+    else:
+        known = np.maximum.accumulate(np.where(off, 0, np.arange(len(v))))
+        moved = v[known][1:] * v[known][:-1] < 0
+    first = t[0] - (t[-1] - t[0]) * (off[0] or name == "since_reversal")
+    last = np.maximum.accumulate(np.where(moved, t[1:], first))
+    since = t - np.concatenate([[first], last]) + 0.5 * run.dt
+    return np.where(off, -since, since) if name == "since_switch" else since
 
 
 def angle_signal(run: Experiment) -> Array:
@@ -185,8 +209,8 @@ def _may_rest(run: Experiment, sigma: Mapping[str, float], lead: int) -> bool:
             y = run.outputs[c][:checked]
             y = y[np.isfinite(y)]
             top = np.nanmax(np.abs(run.outputs[c]))
-            # A wild first sample or an offset of the sensor is not motion; a median above the noise is.
-            if y.size and abs(np.median(y)) > max(5 * sigma[c], 0.02 * top):
+            # A wild first sample or an offset of the sensor is no motion; a median above the noise, or half the top is.
+            if y.size and abs(np.median(y)) > min(max(5 * sigma[c], 0.02 * top), 0.5 * top):
                 return False
     return True
 

@@ -55,7 +55,7 @@ class Simulation:
 class Evaluation(Shown):
     """How well values explain records: NRMSE and RMSE per channel, over all runs and run by run.
 
-    NRMSE is RMSE divided by the RMS of the measured channel over the same samples.
+    NRMSE is RMSE divided by the RMS of the measured channel over the same samples, of an angle from where it begins.
     """
 
     simulations: tuple[Simulation, ...]
@@ -250,7 +250,7 @@ def judge(simulations: Sequence[Simulation]) -> Evaluation:
         errors = {}
         for c in channels:
             if c in s.experiment.outputs:
-                y = s.experiment.outputs[c]
+                y = s.experiment.moved(c)
                 ok = np.isfinite(y)
                 e = s.residual(c)[ok]
                 squares[c].append((float(e @ e), float(y[ok] @ y[ok]), int(ok.sum())))
@@ -315,7 +315,7 @@ def evaluate(fit_or_model: Any, runs: Sequence[Experiment] | Experiment, **optio
     return judge(simulate(model, runs, **options))
 
 
-NRMSE = "NRMSE: RMS of the error over RMS of the measured channel."
+NRMSE = "NRMSE: RMS of the error over RMS of the measured channel (of an angle: of its travel)."
 LEAST_FACTOR = 0.02  # a quick channel with few samples per time constant passes for noisy
 EXPLAINED = 0.25  # NRMSE above which a channel counts as poorly explained
 

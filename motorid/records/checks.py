@@ -33,6 +33,7 @@ _RATIOS = {
     2 * np.pi: "the speed in turns per second: units={'omega': 'rev/s'}",
     1 / (2 * np.pi): "the angle in turns: units={'theta': 'rev'}",
     6.0: "the speed in rpm and the angle in degrees: units={'omega': 'rpm', 'theta': 'deg'}",
+    1 / 60: "the speed in rpm and the angle in turns: units={'omega': 'rpm', 'theta': 'rev'}",
     **dict.fromkeys((1000.0, 1e-3), "one of them in thousandths"),
 }
 

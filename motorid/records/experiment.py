@@ -113,6 +113,12 @@ class Experiment(Shown):
         """Names of the measured output channels, in the order i, omega, theta."""
         return tuple(name for name in CHANNELS if name in self.outputs)
 
+    def moved(self, channel: str) -> Array:
+        """Return what errors of a channel are measured against, (N,): an angle from where its record begins, since its
+        zero may be anywhere; the others as they are."""
+        y = self.outputs[channel]
+        return y - self.meta.get("origin", y[np.isfinite(y)][:1].sum()) if channel == "theta" else y
+
     def with_(self, **changes: Any) -> Experiment:
         """Return a copy with some fields replaced, validated again."""
         for key in changes:
@@ -168,12 +174,16 @@ class Experiment(Shown):
     def delayed(self, seconds: float) -> Experiment:
         """Return the run with a voltage that acts later than its column says, earlier if `seconds` is negative.
 
-        Before the record it is as at its beginning; a held one that moves by parts of a sample is averaged over each.
+        Before the record there was none where the motor begins at rest, else as much as at its beginning; a held one
+        that moves by parts of a sample is averaged over each.
         """
         if not np.isfinite(seconds) or abs(seconds) >= self.duration:
             raise UsageError(f"{self.name}: a voltage can be delayed by less than the {self.duration:.4g} s of the "
                              f"run; got {seconds!r}.")
-        return self._with_inputs(lambda v: preprocessing.delayed(self.t, v, self.hold, seconds))
+        rates = [np.diff(y) if c == "theta" else y for c, y in self.outputs.items()]
+        rest = all(abs(r[0]) < 0.05 * np.nanmax(np.abs(r)) for r in rates)
+        before = 0.0 if rest else float(self.inputs["v"][0])
+        return self._with_inputs(lambda v: preprocessing.delayed(self.t, v, self.hold, seconds, before))
 
     def without_spikes(self) -> Experiment:
         """Return the run with single samples that stand far from both neighbours marked as missing.
@@ -235,8 +245,14 @@ def windows(experiment: Experiment, seconds: float) -> list[Experiment]:
         raise UsageError(f"a window takes a time in seconds; got {seconds!r}.")
     if seconds < 8 * experiment.dt:
         raise UsageError(f"a window of {seconds:g} s holds fewer than 8 samples, {experiment.dt:.3g} s apart.")
-    parts = split(experiment, max(round(experiment.duration / seconds), 1))
-    return [p.with_(meta={**experiment.meta, "record": record_of(experiment), "window": seconds}) for p in parts]
+    parts, meta = split(experiment, max(round(experiment.duration / seconds), 1)), part_meta(experiment)
+    return [p.with_(meta={**meta, "window": seconds}) for p in parts]
+
+
+def part_meta(run: Experiment) -> dict[str, Any]:
+    """Return what a part of a run, simulated from its own state, keeps: which record it is of, where that began."""
+    origin = {"origin": float(run.outputs["theta"][0] - run.moved("theta")[0])} if "theta" in run.outputs else {}
+    return {**run.meta, "record": record_of(run), **origin}
 
 
 def record_of(run: Experiment) -> str:

@@ -21,12 +21,9 @@ LEAST, MOST = 3, 0.05  # spikes of a channel: fewer may be chance, a larger shar
 
 
 def unwrapped(theta: Array, t: Array, omega: Array | None = None) -> tuple[Array, float, int]:
-    """Return an angle that was taken modulo a turn, or a counter's range, as it went on; the jump, and how many.
+    """Return an angle (N,) that was taken modulo a turn, or a counter's range, as it went on; the jump, and how many.
 
-    Parameters
-    ----------
-    theta, t, omega : ndarray, shape (N,)
-        rad, s and, if the speed was measured, rad/s: then it may turn by more than half a turn from sample to sample.
+    With a measured speed `omega`, rad/s, it may turn by more than half a turn from sample to sample.
     """
     seen = np.flatnonzero(np.isfinite(theta))
     turn, y = 2 * np.pi, theta[seen]
@@ -90,16 +87,16 @@ def levelled(v: Array) -> Array:
     return level
 
 
-def delayed(t: Array, v: Array, hold: str, seconds: float) -> Array:
-    """Return an input that acts `seconds` later; `hold` says how it goes on between samples.
+def delayed(t: Array, v: Array, hold: str, seconds: float, before: float) -> Array:
+    """Return an input that acts `seconds` later, and was `before` before; `hold` says how it goes on between samples.
 
-    A held one is averaged over each step; before the record it is as at its beginning.
+    A held one is averaged over each step.
     """
     at = t - seconds
     if hold == "linear":
-        return np.interp(at, t, v)
+        return np.interp(at, t, v, left=before)
     ends = np.concatenate([[min(at[0], t[0])], t, [max(at[-1], t[-1])]])
-    sums = integral(ends, np.pad(v, 1, "edge"), hold=True)
+    sums = integral(ends, np.concatenate([[before], v, v[-1:]]), hold=True)
     return np.append(np.diff(np.interp(at, ends, sums)) / np.diff(at), v[np.searchsorted(t, at[-1], side="right") - 1])
 
 

@@ -133,10 +133,8 @@ def bootstrap(fit: Fit, *, kind: str = "blocks", n: int = 200, block: int | None
         Length of a block in samples, at most that of the longest run; default from the residuals' correlation.
     seed : int
         The result depends on it alone, not on the pool.
-    map : callable, optional
-        Anything with the signature of `map`.
-    quiet : bool
-        No progress bar.
+    map, quiet
+        As in `multistart`.
 
     Raises
     ------

@@ -126,10 +126,8 @@ def profile(fit: Fit, name: str, *, level: float = 0.95, map: Map | None = None,
     name : str
         A free parameter.
     level : float
-    map : callable, optional
-        Anything with the signature of `map`; the two sides are two tasks.
-    quiet : bool
-        No progress bar.
+    map, quiet
+        As in `multistart`; the two sides are two tasks.
 
     Raises
     ------
@@ -252,12 +250,8 @@ def intervals(fit: Fit, *, level: float = 0.95, kind: str = "blocks", n: int = 2
     ----------
     fit : Fit
     level : float
-    kind, n, seed
+    kind, n, seed, map, quiet
         As in `bootstrap`.
-    map : callable, optional
-        Anything with the signature of `map`.
-    quiet : bool
-        No progress bars.
 
     Examples
     --------

@@ -186,3 +186,14 @@ def test_a_short_rest_tells_nothing_of_the_noise(rng):
     assert not repeated([rest, long], [rest]), "a rest is no record"
     dead = long.with_(outputs={"i": np.full(long.n, np.nan), **long.outputs})
     assert repeated([dead], [dead]), "whatever other channel is empty"
+
+
+def test_levels_of_a_coarse_counter_are_no_slow_sensor(rng):
+    """A speed of few counts per sample, whose period varies: it stays at one level or the other, now and then between.
+
+    The steps alone made 2.6 rad/s of rounding look like 12.
+    """
+    period = np.where(rng.random(1000) < 0.1, 0.011, 0.010)
+    counts = np.where(rng.random(1000) < 0.12, 9, 10)
+    y = np.concatenate([np.zeros(100), counts * 0.0523 / period])
+    assert noise_level(y) < 5

@@ -207,6 +207,14 @@ def test_the_speed_at_the_start_may_come_from_the_angle_alone(rng):
     )
 
 
+def test_a_speed_of_half_the_largest_is_no_rest_however_noisy_the_sensor(rng):
+    t = np.arange(300) * 0.01
+    omega = 50 + 12 * rng.standard_normal(300)
+    run = mi.Experiment(t, {"v": np.full(300, 6.0)}, {"omega": omega, "theta": 50 * t}, name="going")
+    begun = mi.Problem(mi.dc_motor(), [run]).runs[0]
+    assert abs(begun.start[1] - 50) < 40
+
+
 def test_a_record_that_begins_at_rest_may_do_so_however_few_counts_tell_its_first_speed(rng):
     """A quick start under 256 counts a turn: the speed that the first counts suggest is no limit."""
     t = 2e-3 * np.arange(3000)

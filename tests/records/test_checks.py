@@ -320,3 +320,9 @@ def test_a_driver_at_its_end_does_not_turn_the_speed_round(plant, lab):
     command = 1.5 * lab.v_max * t / t[-1]
     shown = plant.simulate(lab, {}, t, np.minimum(command, 0.5 * lab.v_max))
     assert "swapped" not in said(Experiment(t, {"v": command}, {"omega": shown["omega"]}))
+
+
+def test_a_speed_in_rpm_beside_an_angle_in_turns_is_told(good):
+    """Read as degrees per second, the ratio was taken for that of pi to 180."""
+    text = said(changed(good, omega=30 / np.pi, theta=1 / (2 * np.pi)))
+    assert "units={'omega': 'rpm', 'theta': 'rev'}" in text

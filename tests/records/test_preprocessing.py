@@ -212,3 +212,16 @@ def test_a_voltage_logged_without_its_sign_is_told(plant, lab, channel):
     swings = lost.with_(outputs={channel: turning[:100].tolist() + np.sin(np.arange(700) / 9).tolist()})
     assert unsigned_voltage(swings) is None, "never at rest"
     assert unsigned_voltage(lost.with_(outputs={channel: np.full(t.size, np.nan), "i": v})) is None, "a dead sensor"
+
+
+@pytest.mark.parametrize(("first", "before"), [(0.0, 0.0), (40.0, 6.0)], ids=["at rest", "running"])
+@pytest.mark.parametrize("hold", ["zoh", "linear"])
+def test_before_a_record_that_begins_at_rest_there_was_no_voltage(first, before, hold):
+    """A step response is often logged from the step on: a delay did nothing there."""
+    t = 1e-3 * np.arange(60)
+    omega = 50 + (first - 50) * np.exp(-t / 0.01)
+    theta = 50 * t if first else 50 * t**2
+    run = mi.Experiment(t, {"v": np.full(60, 6.0)}, {"omega": omega, "theta": theta}, hold=hold)
+    late = run.delayed(5e-3).inputs["v"]
+    assert np.allclose(late[:5], before)
+    assert np.allclose(late[5:], 6.0)

@@ -39,14 +39,8 @@ class _Point(NamedTuple):
 
 
 class ShootingNlp:
-    """Values and derivatives of one mesh at z, the last point kept.
-
-    Parameters
-    ----------
-    mesh : Mesh
-    z : ndarray
-        A point that can be simulated; it shows the sparsity.
-    """
+    """Values and derivatives of one mesh at z, the last point kept; the first, which can be simulated, shows the
+    sparsity."""
 
     def __init__(self, mesh: Mesh, z: Array) -> None:
         self.mesh = mesh
