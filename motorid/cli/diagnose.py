@@ -23,6 +23,7 @@ from motorid.estimation.fit import fit
 from motorid.estimation.result import Fit, parameter_table
 from motorid.exporters.json_file import fit_dict, write_json
 from motorid.model.model import dc_motor
+from motorid.numerics.parallel import budget as time_limit
 from motorid.numerics.parallel import interruption, processes, progress
 from motorid.problem.plain_data import model_from_json
 from motorid.problem.simulate import error_table
@@ -36,7 +37,8 @@ DEMO_SET = "hidden_friction"
 _limit = functools.partial(typer.Option, rich_help_panel="Limits")
 MaxEffects = Annotated[int, opt.result(min=0, metavar="N", help="Largest number of effects to add.")]
 TimeLimit = Annotated[float | None, opt.result(
-    min=0, metavar="SECONDS", help="Stop after this time with the best answer so far, as Ctrl-C does.")]
+    min=0, metavar="SECONDS", help="Stop after this time with the best answer so far, as Ctrl-C does; --remainder-to "
+                                   "may take as long again.")]
 RemainderFile = Annotated[Path | None, opt.result(
     metavar="FILE.py", help="Write what no effect explains as an effect, for --effects-from.")]
 Found = Annotated[Path, typer.Argument(metavar="FOUND.json", help="File written by diagnose --json.")]
@@ -87,12 +89,13 @@ def diagnose_command(runs: opt.Runs, options: opt.FitOptions, validate: opt.Vali
             _keep_fit(before, done, json, options.force)
         raise
     if json != "-":
-        _show_diagnosis(found, notes, report)
+        _show_diagnosis(found, notes, report, remainder_to)
     if json:
         write_json(found.to_dict() | {"notes": notes}, json, options.force)
-    if remainder_to:
-        _write_remainder(found, remainder_to, options.force)
     save_report(found, report, held_out, options.force)
+    if remainder_to:
+        with time_limit(budget):
+            _write_remainder(found, remainder_to, options.force)
     if found.stopped == STOPPED_BY_HAND:
         raise typer.Exit(INTERRUPTED)
 
@@ -114,9 +117,9 @@ def _write_remainder(found: Diagnosis, path: Path, force: bool) -> None:
     show(f"Written: {path}. Fit with it: --effects-from {path} --effects {effects}")
 
 
-def _show_diagnosis(found: Diagnosis, notes: Sequence[str], report: Path | None) -> None:
+def _show_diagnosis(found: Diagnosis, notes: Sequence[str], report: Path | None, remainder_to: Path | None) -> None:
     """Print a diagnosis: the answer, the errors before and after, the next step; then what it rests on."""
-    show(found.answer, "", ladder_table(found.ladder), _next_step(found, report), "")
+    show(found.answer, "", ladder_table(found.ladder), _next_step(found, report, remainder_to), "")
     say_notes(notes, "About the records")
     say_notes(found.details, "Details")
     if found.after is not found.before:
@@ -124,14 +127,14 @@ def _show_diagnosis(found: Diagnosis, notes: Sequence[str], report: Path | None)
     show(ranking_table(found.ranking, 8) if found.ranking else None)
 
 
-def _next_step(found: Diagnosis, report: Path | None = None) -> str:
+def _next_step(found: Diagnosis, report: Path | None = None, remainder_to: Path | None = None) -> str:
     """Return what to do next: more time, the experiment that decides, what remains, or the model to go on with."""
     if found.stopped:
         return "Next: the same command with more time; not all effects were tried."
     if found.suggestion:
         made = "\nOr design one: diagnose with --json found.json, then motorid design found.json"
         return f"Next: {found.suggestion[0].lower()}{found.suggestion[1:]}{made * found.suggestion.startswith('To ')}"
-    if found.remainder is not None and found.remainder.proposed:
+    if found.remainder is not None and found.remainder.proposed and remainder_to is None:
         command = next_command("diagnose", "--remainder-to", "remainder.py")
         return f"Next: {command}\nIt writes what remains as an effect."
     if found.effects:

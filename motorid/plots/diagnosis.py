@@ -116,7 +116,8 @@ def plot_answer(found: Diagnosis, ax: Axes | None = None) -> Axes:
     """
     style.refuse_other(found, Diagnosis, "plot_answer takes a diagnosis, mi.diagnose(fit)")
     m = found.missing
-    balance = "voltage" if found.where == "electrical" else "torque"
+    apart = any(np.any(v) for v in m.voltage)  # else the torque stands for both
+    balance = "voltage" if found.where == "electrical" and apart else "torque"
     had = accounted(found.before, found.after)[balance == "torque"] if found.after is not found.before else None
     against, periods = _quantity(found, balance, had)
     x = np.concatenate([np.asarray(s[against]) * periods for s in m.signals])

@@ -8,6 +8,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -506,6 +507,9 @@ def test_what_no_effect_and_no_curve_explains_is_looked_at_next_not_exported(mon
     open_ = replace(found, verdict="unexplained", remainder=None)
     assert _next_step(open_).startswith("Next: motorid diagnose run.csv --report found.html")
     assert _next_step(open_, Path("found.html")).startswith("Next: look at found.html.")
+    curved = replace(open_, remainder=SimpleNamespace(proposed=True))
+    assert "--remainder-to" in _next_step(curved)
+    assert "--remainder-to" not in _next_step(curved, None, Path("left.py"))  # it was asked for already
     assert "more time" in _next_step(replace(open_, stopped="the time is up"))
     assert _next_step(replace(open_, verdict="adequate")).endswith("Then: motorid export fit.json motor.casadi")
 

@@ -26,3 +26,13 @@ def test_a_file_that_is_there_is_not_written_over(tmp_path):
     assert done.status == 2
     assert "did not write it" in done.err
     assert file.read_text(encoding="utf-8") == "mine"
+
+
+def test_the_report_is_written_although_no_curve_is_left(tmp_path):
+    """All is explained: there is nothing to write down, and no reason to lose the rest."""
+    report, file = tmp_path / "found.html", tmp_path / "left.py"
+    done = motorid("diagnose", *RUNS, "--max-effects", 1, "--remainder-to", file, "--report", report)
+    assert done.status == 2
+    assert "nothing is left" in done.err
+    assert report.exists()
+    assert not file.exists()
