@@ -21,7 +21,7 @@ import scipy
 from numpy.typing import NDArray
 
 from motorid.channels import channel_name
-from motorid.diagnosis.misspecification import best_form
+from motorid.diagnosis.misspecification import better_forms
 from motorid.diagnosis.model_comparison import Node, far, finer
 from motorid.diagnosis.predictive_score import Predictions
 from motorid.diagnosis.results import Adequacy
@@ -246,5 +246,5 @@ def judge_adequacy(node: Node, scores: Sequence[Score] = ()) -> Adequacy:
         return judged
     larger = far(node.fit)  # a form that helps the others explains nothing here
     errors = {c: e for c, e in node.predictions.blocks.items() if c in larger}
-    found = best_form(node.fit, Predictions(errors, {})) if errors else None
+    found = next(iter(better_forms(node.fit, Predictions(errors, {}))), None) if errors else None
     return following(judged, found.form.text) if found else unpredicted(doubtful)

@@ -83,20 +83,14 @@ def identify_on(bench: str | Link, folder: str | Path = ".", *, goal: str = "dis
         Until no group of effects is left, or until `parameters` are known.
     until : float
         Relative standard deviation that is asked of each of them.
-    parameters : sequence of str, optional
-        By default all that are free.
-    v_max, i_max : float
-        V, A.
+    parameters, v_max, i_max, duration, **options
+        As in `design_experiment`.
     records : int
         Largest number of records.
-    duration : float
-        Of a designed record, s.
     first : str
         Excitation of the first record.
     progress : callable, optional
         Called with a sentence on each step.
-    **options
-        For `design_experiment`: `omega_max`, `shape`, `budget` …
 
     Raises
     ------

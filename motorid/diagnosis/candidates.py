@@ -33,7 +33,7 @@ from motorid.estimation.result import Fit
 from motorid.model.definition import Effect, Parameter
 from motorid.model.model import Model
 from motorid.numerics.parallel import check_time
-from motorid.numerics.signals import Array, noise_level
+from motorid.numerics.signals import noise_level
 from motorid.records.experiment import Experiment
 
 SHORTLIST = 6
@@ -115,7 +115,7 @@ class Search:
                  stages: Stages) -> None:
         stages.at("looking at the misfit")
         self.held = HeldOut.of(fit, validate)
-        law = _own_levels(fit.problem.experiments)
+        law = fit.model.base != "dc_motor" or _own_levels(fit.problem.experiments)  # a torque needs no supply
         self.effects = [e for e in effects if not (law and e.name in PER_RUN and e.balance == "voltage")]
         self.stages, self.map = stages, stages.map
         self.root = node_of(fit, self.held)
@@ -364,16 +364,10 @@ class Search:
 
 
 def _own_levels(runs: Sequence[Experiment]) -> bool:
-    """Tell whether every run has a voltage of its own: what is another in each of them is any law of the voltage."""
-    levels = [_level(run.inputs["v"]) for run in runs]
-    return None not in levels and len(set(levels)) > 1
-
-
-def _level(v: Array) -> float | None:
-    """Return the size of a voltage that is on or off, to two digits; None for one of several sizes."""
-    on = np.abs(v[np.abs(v) > ON * np.max(np.abs(v), initial=0.0)])
-    low, middle, high = np.quantile(on if on.size else [0.0], [ON, 0.5, 1 - ON])
-    return float(f"{middle:.1e}") if high - low <= ON * middle else None
+    """Tell whether every run has one voltage, on or off, of its own: what is another in each is any law of that."""
+    sizes = [np.abs(run.inputs["v"]) for run in runs]
+    ends = [np.quantile(on if (on := v[v > ON * v.max()]).size else v, [ON, 1 - ON]) for v in sizes]
+    return all(high - low <= ON * high for low, high in ends) and len({f"{high:.1e}" for _, high in ends}) > 1
 
 
 def _flat_topped(run: Experiment) -> bool:

@@ -132,7 +132,7 @@ def _told(found: Climb, driven: str, validated: bool) -> Diagnosis:
     details = tuple(t for t in (*details, *_remarks(found, driven)) if t)
     text = " ".join(t for t in (answer, *details, suggestion) if t)
     approximating = {g.effect: g.form for g in found.grades if g.grade == "approximates"}
-    remainder = Remainder(kind, ladder.best, forms, found.search.held, approximating)
+    remainder = Remainder(kind, ladder.best, forms, found.search.held, fit, approximating)
     return Diagnosis(verdict, text, where, names, judged, missing, ranking, ladder, groups, suggestion, fit,
                      ladder.best, remaining, remainder, found.stopped, answer, details)
 

@@ -14,6 +14,7 @@ from types import SimpleNamespace
 import numpy as np
 from numpy.typing import NDArray
 
+from motorid.channels import COMPUTED_INPUTS
 from motorid.diagnosis.thresholds import CONTAINED
 from motorid.effects import LIBRARY
 from motorid.errors import SimulationError
@@ -22,7 +23,7 @@ from motorid.estimation.linearisation import Response, Tangent, parameter_vector
 from motorid.estimation.result import Fit
 from motorid.numerics.signals import Array
 from motorid.problem.problem import Problem
-from motorid.problem.runs import angle_signal
+from motorid.problem.runs import angle_signal, time_since
 
 KNOTS = 9  # cosines over the range of a time, twice as many over that of an angle
 HARMONICS = 12  # of a turn
@@ -30,6 +31,7 @@ LINES = 2  # of the spectrum of the misfit over the angle
 PLACES = 12  # over a time or an angle at which something may set in
 SUDDEN = 60.0  # how quickly a curve over the time or the angle may step, per range
 FADES = (1, 3, 10, 30)  # lengths in a range of what fades over a time or a distance
+SOON = (3, 10, 30, 100, 300)  # the same of what fades after each switching
 STILL = 0.02  # of the highest speed: slower is standstill
 SHARP = 1e-3  # of the highest speed: below it a direction is not known
 SOFT = 0.01  # of the largest current or voltage: the width of a jump at zero
@@ -44,7 +46,10 @@ CHANGES = {"t": "changes with the time", "distance": "changes with the distance 
            "past v": "depends on the voltage before", "path": "depends on the distance since a reversal",
            "past speed": "depends on how fast it ran before", "past power": "depends on how fast it ran before",
            "past load": "depends on the power drawn before", "past size": "depends on the voltage before",
-           "most i": "depends on the largest current so far"}
+           "most i": "depends on the largest current so far",
+           "since_change": "depends on how long the voltage has not changed",
+           "since_switch": "depends on how long the voltage has been on or off",
+           "since_reversal": "depends on the time since the voltage was reversed"}
 PAST = ("past i", "past omega", "past v", "past speed", "past power", "past load", "past size", "path")
 MEMORIES = 8  # lengths of memory
 LASTING = 10.0  # times the longest run: a memory that forgets nothing in it
@@ -77,7 +82,7 @@ class Form:
     @property
     def remembers(self) -> bool:
         """Tell whether it is a function of what was before."""
-        return self.on in PAST
+        return self.on in (*PAST, *COMPUTED_INPUTS)
 
     @property
     def bends(self) -> bool:
@@ -86,13 +91,14 @@ class Form:
 
 
 _PUSHES = (  # words, balance, carrier, quantities
-    ("a friction", "torque", "direction", ("turn", "theta", "t", "distance", "i", "run", "past speed", "past power")),
+    ("a friction", "torque", "direction", ("turn", "theta", "t", "distance", "i", "run", "past speed", "past power",
+                                         *COMPUTED_INPUTS)),
     ("a load", "torque", "", ("turn", "theta", "t", "run")),
     ("a drag", "torque", "omega", ("t", "distance", "turn", "theta", "i", "run", "past speed", "past power")),
     ("a torque", "torque", "", ("omega", "i")),
     ("an inertia", "torque", "acceleration", ("turn", "t", "run", "omega")),
     ("a loss of voltage", "voltage", "", ("omega", "v", "i", "t", "run")),
-    ("a gain of the voltage", "voltage", "v", ("t", "turn", "past load")),
+    ("a gain of the voltage", "voltage", "v", ("t", "turn", "past load", *COMPUTED_INPUTS)),
     ("a resistance", "voltage", "i", ("t", "turn", "omega", "run")),
     ("a motor constant", "both", "", ("t", "turn", "omega", "i", "run", "past i", "past size", "most i")),
 )
@@ -159,10 +165,18 @@ def functions_of(form: Form, span: Span) -> list[str]:
     low, high = span.ranges[form.on]
     if form.on == "turn":
         return ["1.0", *(f"ca.{f}({k:.6g} * z)" for k in span.orders for f in ("sin", "cos"))]
-    if form.remembers:
+    if form.on in PAST:
         lags, top = [f"past(z, {length:.6g})" for length in memories_of(form, span)], f"{max(abs(low), abs(high)):.6g}"
         bent = [f"{lag} * ca.fabs({lag}) / {top}" for lag in lags if form.bends]
         return [f"{lag} / {top}" for lag in (*lags, *bent)] + ["1.0"] if form.carrier else lags + bent
+    if form.on in COMPUTED_INPUTS:
+        found = ["1.0"]
+        for sign, reach in (("", high), ("-", -low)):
+            if reach > span.step:  # what lasts for some samples, or fades
+                steps = np.unique(np.round(np.geomspace(span.step, reach, PLACES * span.finer**3) / span.step))
+                found += [f"({sign}z > {span.step * k:.9g})" for k in (0, *steps[:-1])]
+                found += [f"({sign}z > 0) * ca.exp(-ca.fabs(z) / {reach / k:.6g})" for k in SOON]
+        return found
     inside = f"ca.fmin(ca.fmax(z, {low:.9g}), {high:.9g})"  # nothing is known beyond
     if form.on in ("theta", "t", "distance"):
         scale = f"{np.pi / (high - low):.9g} * ({inside} - {low:.9g})"
@@ -327,6 +341,7 @@ def _signals(fit: Fit, k: int) -> dict[str, Array]:
         found["past load"], found["most i"] = found["v"] * found["i"], np.maximum.accumulate(np.abs(found["i"]))
         found["past size"] = np.abs(found["v"])
     found |= {f"past {c}": found[c] for c in ("v", "i", "omega") if c in found}
+    found |= {c: time_since(run, c) for c in COMPUTED_INPUTS}
     if "theta" in run.outputs or "omega" in run.outputs:
         found["theta"] = found["turn"] = angle_signal(run)
     return found
@@ -366,7 +381,8 @@ def _share(form: Form, basis: Array, answer: Response, balance: str) -> Array:
         basis = basis * (answer.states["i"] if balance == "torque" else -answer.states["omega"])[:, None]
     elif form.balance != balance:
         return np.zeros_like(basis[1:])
-    return basis[:-1] if "v" in (form.on, form.carrier) else 0.5 * (basis[:-1] + basis[1:])
+    held = form.on in ("v", *COMPUTED_INPUTS) or form.carrier == "v"
+    return basis[:-1] if held else 0.5 * (basis[:-1] + basis[1:])
 
 
 def _read(problem: Problem, form: Form, basis: Array, weights: Array) -> Array:

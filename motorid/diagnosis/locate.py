@@ -105,7 +105,8 @@ def _shares(fit: Fit, walk: Array, both: Sequence[Smoothed], begun: Sequence[Lin
 
 def _signals(fit: Fit, k: int, s: Smoothed) -> Mapping[str, Array]:
     run, states = fit.problem.experiments[k], fit.problem.system.states
-    found = {"t": run.t, **{c: s.x[:, states.index(c)] for c in ("i", "omega") if c in states}}
+    told = ("i", "omega") if "i" in fit.problem.outputs else ("omega",)  # a current that was not measured tells nothing
+    found = {"t": run.t - run.t[0], **{c: s.x[:, states.index(c)] for c in told if c in states}}
     if "theta" in run.outputs or "omega" in run.outputs:
         found["theta"] = angle_signal(run)
     if "i" in found:
@@ -194,11 +195,16 @@ def accounted(before: Fit, after: Fit) -> tuple[tuple[Array, ...], tuple[Array, 
     """Return per run the voltage (V) and torque (N·m) missing in `before` that `after` has.
 
     That is its effects and the shift of the parameters: what the balances of `before` lack along the motion of `after`.
+    A current that was not measured is each model's own, and the torque stands for both balances.
     """
-    every = []
-    scale = {"i": before.values.get("L", 0.0), "omega": before.values["J"]}
+    every, own = [], "i" in before.problem.system.states and "i" not in before.problem.outputs
+    scale = {"i": 0.0 if own else before.values.get("L", 0.0), "omega": before.values["J"]}
     for k, run in enumerate(after.problem.runs):
-        new, old = (_rates(f, k, after.simulations[k].states) for f in (after, before))
+        moved = alone = after.simulations[k].states
+        if own:
+            drive = run.experiment.inputs["v"] - before.values["K"] * moved["omega"]
+            alone = {**moved, "i": drive / before.values["R"]}
+        new, old = _rates(after, k, moved), _rates(before, k, alone)
         every.append([f * (new[n] - old[n]) if n in old else np.zeros(run.experiment.n) for n, f in scale.items()])
     voltages, torques = zip(*every, strict=True)
     return voltages, torques

@@ -56,11 +56,6 @@ class FormGain:
     predictions: Predictions
 
 
-def best_form(fit: Fit, rival: Predictions) -> FormGain | None:
-    """Return the form that added to `fit` predicts most beyond `rival`, if it is to be preferred."""
-    return next(iter(better_forms(fit, rival)), None)
-
-
 def better_forms(fit: Fit, rival: Predictions) -> list[FormGain]:
     """Return the forms that added to `fit` predict better than `rival`, the best first.
 
@@ -109,7 +104,8 @@ def chosen_functions(fit: Fit, linear: Linear, form: Form, chosen_before: Iterab
     Orthogonal matching pursuit (Pati, Rezaiifar & Krishnaprasad 1993): each time the function that takes most of what
     is left. Of the sets passed the smallest that predicts within one standard error of the best is taken (Breiman et
     al., Classification and Regression Trees, 1984, 3.4), if it is worth it. What the model's own parameters do already
-    is no function of its own. All sets are passed: the waves of a narrow dip help only together.
+    is no function of its own. The waves of a narrow dip help only together, so sets are passed as long as one function
+    more takes what no noise would give to the best of so many (Donoho & Johnstone, Biometrika 81(3), 1994).
     """
     before = form_predictions(fit, linear, form, ())
     if before is None:
@@ -138,7 +134,7 @@ def _pursued(fit: Fit, linear: Linear, form: Form, had: Sequence[int]) -> Iterat
         free[had] = False
         taken = np.where(free, np.abs(residual @ left) / np.where(free, norms, 1.0), 0.0)
         best = int(np.argmax(taken))
-        if not taken[best] > 0:
+        if not taken[best] ** 2 > 2 * np.log(len(taken)) * float(residual @ residual) / len(residual):
             return
         unit = left[:, best] / norms[best]
         left, residual = left - np.outer(unit, unit @ left), residual - unit * (unit @ residual)
@@ -200,8 +196,8 @@ def _more(fall: float, taken: float) -> float:
 def _insignificant(fit: Fit, effect: Effect, structure: bool) -> str:
     """Say so where every size of an effect is within two deviations of nothing.
 
-    One without a deviation may be any; of a law whose sizes are all open, although the current was measured, little is
-    known, unless it leaves noise alone.
+    One without a deviation may be any; of a law whose sizes are all open, as voltages too where no current is known,
+    little is known, unless it leaves noise alone.
     """
     own = [p for p in effect.parameters if fit.problem.model.parameters[p.name].vary]
     sizes = [p.name for p in own if p.null == 0]
@@ -210,8 +206,9 @@ def _insignificant(fit: Fit, effect: Effect, structure: bool) -> str:
     if sizes and not any(std is None or STANDARD_ERRORS * std < abs(value) for value, std in found):
         return f"{listed(sizes)} could as well be zero, within two standard deviations"
     open_ = [p.name for p in own if not sizes or p.name in sizes]
-    shown = "i" in fit.problem.outputs and not any(p.per_run for p in own)
-    if structure and open_ and shown and all(fit.std[n] is None for n in open_):
+    torques = {} if "i" in fit.problem.outputs else fit.determined
+    known = any(fit.std[n] is not None or f"{n}_voltage" in torques for n in open_) or any(p.per_run for p in own)
+    if structure and open_ and not known:
         return f"{listed(open_)} {'is' if len(open_) == 1 else 'are'} not determined, and the rest is not noise"
     return ""
 

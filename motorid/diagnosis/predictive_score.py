@@ -264,7 +264,7 @@ def by_channel(problem: Problem, residual: Array, blocks: Sequence[NDArray[np.in
     found = {}
     for j, c in enumerate(problem.outputs):
         if runs := [k for k, run in enumerate(problem.runs) if c in run.sigma]:
-            measured = np.concatenate([problem.experiments[k].outputs[c] for k in runs])
+            measured = np.concatenate([problem.experiments[k].moved(c) for k in runs])
             found[c] = Errors(tuple(parts[k][:, j] / weights[k][j] for k in runs), tuple(blocks[k] for k in runs),
                               float(np.sqrt(np.nanmean(measured**2))),
                               float(np.sqrt(np.mean([problem.runs[k].sigma[c] ** 2 for k in runs]))))
@@ -298,7 +298,7 @@ def errors_of(simulations: Sequence[Simulation], noise: Mapping[str, float],
     for sim, run, block in zip(simulations, runs, blocks, strict=True):
         for c, y in run.outputs.items():
             if c in sim.outputs and np.isfinite(y).any():
-                parts.setdefault(c, []).append((y - sim.outputs[c], block, y[np.isfinite(y)]))
+                parts.setdefault(c, []).append((y - sim.outputs[c], block, run.moved(c)[np.isfinite(y)]))
     return {c: Errors(tuple(r for r, _, _ in found), tuple(b for _, b, _ in found),
                       float(np.sqrt(np.mean(np.concatenate([y for _, _, y in found]) ** 2))), noise.get(c, 0.0))
             for c, found in parts.items()}

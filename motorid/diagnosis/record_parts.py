@@ -20,7 +20,7 @@ from motorid.integrate import limited
 from motorid.numerics.signals import Array
 from motorid.problem.problem import Problem
 from motorid.problem.runs import angle_signal
-from motorid.records.experiment import Experiment, record_of
+from motorid.records.experiment import Experiment, part_meta
 
 ENOUGH = 4000  # samples: what is left at least of those that their neighbours predict
 SMALL = 0.1  # of the error: a difference that changes no judgement
@@ -120,7 +120,7 @@ def _parts(run: Experiment, share: float) -> list[Experiment]:
     count = max(1, round(run.n * share / PART))
     if run.n < 2 * PART * count:
         return [run]
-    meta = {**run.meta, "part of": (run.name, run.n), "record": record_of(run)}
+    meta = {**part_meta(run), "part of": (run.name, run.n)}
     return [run.select(slice(a, a + PART)).with_(name=f"{run.name}[{k + 1}]", meta=meta)
             for k, a in enumerate(_telling(run, count))]
 
@@ -165,7 +165,8 @@ def parts_remark(fit: Fit) -> str:
         return thin
     share, seconds = _samples(used) / sum(whole.values()), float(np.median([r.duration for r in used]))
     return (f"The records are long: this rests on {len(used)} parts of {seconds:.2g} s, {100 * share:.0f} % of "
-            f"the samples; fit the model to all of them. {thin}".rstrip())
+            "the samples, each from a state of its own, so that errors are smaller there than over whole runs; fit the "
+            f"model to all of them. {thin}".rstrip())
 
 
 def _samples(runs: Sequence[Experiment]) -> int:

@@ -126,11 +126,7 @@ def refit(fit: Fit, model: Model, starts: Sequence[Mapping[str, float]]) -> Fit 
 
 def _released(measured: Problem) -> Estimate:
     """Let the model's own angle take the place of the measured one, if it is good enough, or where that is copied.
-
-    Raises
-    ------
-    FitError, SimulationError
-    """
+    Raises what a fit raises."""
     own = measured.for_model(replace(measured.model, angle_input=False, _systems={}))
     if not all("theta" in run.outputs for run in measured.experiments):
         return QUICKLY(own)
@@ -240,12 +236,7 @@ def _polished(fit: Fit, problem: Problem) -> Fit | None:
 
 
 def _converged(problem: Problem) -> Estimate:
-    """Descend, and go on where that ends at its limit: what is unfinished would be judged worse than it is.
-
-    Raises
-    ------
-    FitError, SimulationError
-    """
+    """Descend, and go on where that ends at its limit: what is unfinished would be judged worse than it is."""
     done = by_continuation(problem, POLISH, wide=False, narrow=False)
     for _ in range(GOING_ON):
         if done.solution.status != "limit":
@@ -372,17 +363,13 @@ def _outdone(tasks: Sequence[Task], races: Mapping[int, Raced], found: Mapping[i
 
     Gained is what the model without the effect would not reach by such a step itself: a stalled fit promises much.
     """
-    costs, given_up, own = sorted(race.cost for race in races.values()), {}, _own_reach(tasks[0].fit)
+    fit, costs, given_up = tasks[0].fit, sorted(race.cost for race in races.values()), {}
+    own = _undamped(fit.residuals, fit.jacobian * fit.problem.scaling.slope(fit.q))
     for k, race in races.items():
-        before = tasks[k].fit.cost
-        nothing = race.reach > (1 - LITTLE) * own and race.cost > (1 - LITTLE) * before
+        nothing = race.reach > (1 - LITTLE) * own and race.cost > (1 - LITTLE) * fit.cost
         if k not in found and (nothing or (race.reach > OUTDONE * costs[0] and race.cost not in costs[:BEAM])):
-            given_up[k] = GivenUp(NOTHING if nothing else LESS, 1 - race.cost / max(before, 1e-300), (tasks[k], race))
+            given_up[k] = GivenUp(NOTHING if nothing else LESS, 1 - race.cost / max(fit.cost, 1e-300), (tasks[k], race))
     return given_up
-
-
-def _own_reach(fit: Fit) -> float:
-    return _undamped(fit.residuals, fit.jacobian * fit.problem.scaling.slope(fit.q))
 
 
 def _leader(tasks: Sequence[Task]) -> int | None:
@@ -416,20 +403,17 @@ def _needless(tasks: Sequence[Task], leader: int, best: Fit, map_: Callable[...,
     return {k: GivenUp(why) for k, price in prices.items() if gains[k] < price}
 
 
-def _given_up(task: Task, cost: float, why: str) -> GivenUp:
-    return GivenUp(why, 1 - cost / max(task.fit.cost, 1e-300))
-
-
 def _beaten(tasks: Sequence[Task], costs: Mapping[int, float], first: int) -> dict[int, GivenUp]:
     """Return which tasks need not be finished beside the one that explains all but noise, and why."""
     winner, given_up = tasks[first], {}
     for k, cost in costs.items():
         if k == first:
             continue
+        drop = 1 - cost / max(winner.fit.cost, 1e-300)
         if cost > BEHIND * costs[first]:
-            given_up[k] = _given_up(winner, cost, FAR_BEHIND.format(winner.effect.name))
+            given_up[k] = GivenUp(FAR_BEHIND.format(winner.effect.name), drop)
         elif winner.effect.name in tasks[k].effect.includes and cost > costs[first] - (tasks[k].price - winner.price):
-            given_up[k] = _given_up(winner, cost, f"no better than {winner.effect.name}, its simpler special case")
+            given_up[k] = GivenUp(f"no better than {winner.effect.name}, its simpler special case", drop)
     return given_up
 
 
@@ -458,18 +442,13 @@ def _gain(task: Task) -> float:
     return max(task.fit.cost - promised(task.fit, task.model, task.starts), 0.0)
 
 
-def _sizes(fit: Fit, effect: Effect) -> list[float]:
-    """Sizes of an effect, those that vanish with it."""
-    return [fit.values[p.name] for p in effect.parameters if p.null == 0]
-
-
 def widened(fit: Fit, effect: Effect, above: float = ABOVE) -> Task:
     """Return the refit with `effect` in the place of those that it includes, from where they were.
 
     Sizes that are at least another start at `above` times that; a shape is that of the same unit, if there was one.
     """
     inside = [e for e in fit.model.effects if e.name in effect.includes]
-    level = max((size for e in inside for size in _sizes(fit, e)), default=0.0)
+    level = max((fit.values[p.name] for e in inside for p in e.parameters if p.null == 0), default=0.0)
     model = reduce(Model.without, (e.name for e in inside), fit.model) + effect
     natural = natural_sizes(fit.problem.experiments, fit.values)
     sizes = sizes_like(effect, level, above)

@@ -12,15 +12,17 @@ import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property, reduce
-from itertools import islice, product, zip_longest
+from itertools import chain, islice, product, zip_longest
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
+from motorid.channels import COMPUTED_INPUTS
 from motorid.diagnosis.cross_validation import HeldOut
 from motorid.diagnosis.free_forms import (
     FINER,
+    PAST,
     Form,
     Span,
     form_coefficients,
@@ -37,7 +39,7 @@ from motorid.diagnosis.model_comparison import Node, at_noise, far
 from motorid.diagnosis.predictive_score import compare
 from motorid.diagnosis.refit import refit
 from motorid.display.numbers import number, percent
-from motorid.errors import ModelError, UsageError
+from motorid.errors import ModelError, OutOfTime, UsageError
 from motorid.estimation.least_squares import FAILURES
 from motorid.estimation.result import Fit
 from motorid.model.definition import Effect, P
@@ -49,12 +51,14 @@ from motorid.numerics.signals import Array
 WHERE = {"torque": "mechanical", "voltage": "electrical", "both": "electrical", "sensor": "sensor"}
 TRIED = 4  # curves that are fitted, those that promise most
 FINE = 36  # harmonics of a turn in a curve that is fitted
+CLOSED = 300  # times that are tried as the end, or the beginning, of a constant
 ROUNDS = 3  # of choosing functions and fitting: near the optimum slopes show what the misfit hid before
 QUANTITIES = {"t": "m.state('clock')", "distance": "m.state('distance')", "turn": "m.theta", "theta": "m.theta",
               "omega": "m.omega", "i": "m.i", "v": "m.v", "past v": "m.v", "past i": "m.i", "past omega": "m.omega",
               "past speed": "ca.fabs(m.omega)", "past power": "m.omega**2", "path": "m.sign(m.omega)",
               "past load": "m.v * m.i", "past size": "ca.fabs(m.v)",
-              "most i": "m.state('most_i', ca.fabs(m.start['i']))"}
+              "most i": "m.state('most_i', ca.fabs(m.start['i']))",
+              **{c: f"m.input('{c}')" for c in COMPUTED_INPUTS}}
 RATES = {"t": "1.0", "distance": "ca.fabs(m.omega)", "most i": "ca.fmax(ca.fabs(m.i) - z, 0) / {step:.6g}"}
 SI = {"theta": "rad", "omega": "rad/s", "i": "A", "v": "V", "size": "V"}
 OVER = {"": "", "A": "/A", "V": "/V", "rad/s": "·s/rad"}
@@ -75,24 +79,12 @@ class Law:
 
 @dataclass(frozen=True, eq=False)
 class Curve:
-    """A free form beside a model, of as few functions as its records ask for.
+    """A free form beside a model, of as few functions as its records ask for."""
 
-    Attributes
-    ----------
-    fit : Fit
-        Of the model without the curve.
-    form : Form
-    coefficients : dict of int to float
-        Of the form's functions, those that are in the curve.
-    fitted : Fit or None
-        Of the model with the curve.
-    name : str
-    """
-
-    fit: Fit
+    fit: Fit  # of the model without the curve
     form: Form
-    coefficients: Mapping[int, float] = field(default_factory=dict)
-    fitted: Fit | None = None
+    coefficients: Mapping[int, float] = field(default_factory=dict)  # of the form's functions that are in the curve
+    fitted: Fit | None = None  # of the model with the curve
     name: str = "remainder"
 
     @property
@@ -127,7 +119,7 @@ class Curve:
         """Return closed forms beside the curve, the nearest first: in words with its size, and the share missed."""
         z, value = self.points
         forms, unit = _closed_forms(self.form.on, z), self.unit
-        if self.form.remembers:
+        if self.form.on in PAST:
             lags = np.concatenate([values_of(functions_of(self.form, self.span), self.form, s) for s in self._signals])
             over = "rad" if self.form.on == "path" else "s"
             base, also = ("a constant and ", [-1]) if self.form.carrier else ("", [])
@@ -162,11 +154,7 @@ class Curve:
 
     def grown(self) -> Curve | None:
         """Return the curve with the functions that by their slopes predict more, fitted with the model; None for none.
-
-        Raises
-        ------
-        FitError, SimulationError, ModelError
-        """
+        Raises what a fit raises."""
         last = self.fitted or self.fit
         linear = linearised(last, self.form, self.span)
         more = chosen_functions(last, linear, self.form, self.coefficients)
@@ -186,7 +174,7 @@ class Curve:
     def unit(self) -> str:
         """Of the coefficients."""
         form, own = self.form, self._own_unit
-        before = form.on.removeprefix("past ") if form.remembers and not form.carrier else ""
+        before = form.on.removeprefix("past ") if form.on in PAST and not form.carrier else ""
         by = [SI.get(n, "") for n in (before, form.carrier)]
         return "1" if form.carrier == "acceleration" or own in by else own + "".join(OVER[unit] for unit in by)
 
@@ -205,7 +193,7 @@ class Curve:
         if form.on in RATES:
             lines += [f"m.rate(z, {RATES[form.on].format(step=self.span.step)})"]
         terms = self._terms
-        if form.remembers:
+        if form.on in PAST:
             rate = " * ca.fabs(m.omega)" if form.on == "path" else ""
             for k, lag in enumerate(dict.fromkeys(re.findall(r"past\(z, .*?\)", " ".join(terms)))):
                 past, length = f"past_{k}", lag[len("past(z, "):-1]
@@ -245,6 +233,7 @@ class Remainder:
     fit: Fit
     forms: tuple[Form, ...] = ()
     _held: HeldOut | None = field(default=None, repr=False)
+    _root: Fit | None = field(default=None, repr=False)  # of the model that the search began with
     # effects that only approximate the rest, with the form that predicts better in their place, if one does
     _approximating: Mapping[str, Form | None] = field(default_factory=dict, repr=False)
 
@@ -266,7 +255,8 @@ class Remainder:
     @property
     def proposed(self) -> bool:
         """Tell whether slopes propose a curve; whether it helps, `as_effect` finds out."""
-        return self.kind == "structure" and self.form is not None and self.form.on != "run"
+        seen = self.form is not None and self.form.on != "run"
+        return self.kind == "structure" and (seen or self._anew is not None)
 
     def as_effect(self, name: str = "remainder") -> Effect:
         """Return what is left as an effect, a curve: ``found.remainder.model + found.remainder.as_effect()``.
@@ -278,17 +268,11 @@ class Remainder:
         UsageError
             If nothing is left that a curve could describe.
         """
-        return self._named(name).effect
+        return replace(self._chosen, name=name).effect
 
     def code(self, name: str = "remainder") -> str:
-        """Return the effect as Python source, for ``--effects-from FILE.py`` or a notebook: to edit and to name.
-
-        Raises
-        ------
-        UsageError
-            If nothing is left that a curve could describe.
-        """
-        return self._named(name).code
+        """Return the same as Python source, for ``--effects-from FILE.py`` or a notebook: to edit and to name."""
+        return replace(self._chosen, name=name).code
 
     def nearest(self) -> list[tuple[str, float]]:
         """Return closed forms beside the curve, the nearest first: in words with its size, and the share missed."""
@@ -311,20 +295,18 @@ class Remainder:
         """The quantity at the samples of all runs, and the missing torque, voltage or error there, SI."""
         return self._chosen.points
 
-    def _named(self, name: str) -> Curve:
-        return replace(self._chosen, name=name)
-
     @cached_property
     def _chosen(self) -> Curve:
         """The curve with which the model, fitted anew, predicts best."""
         if self.kind != "structure":
             raise UsageError(f"the remainder is {self.kind}: nothing is left that a curve over a quantity predicts.")
-        if self.form is not None and self.form.on == "run":
+        if self.form is not None and self.form.on == "run" and self._anew is None:
             raise UsageError(f"what is left is {self.form.text}: no curve, but another motor in every run. "
                              "Fit the runs apart.")
         held = self._held or HeldOut.of(self.fit, None)
-        tried = islice((t for t in self._tried(held) if t[1].on != "run"), TRIED)
-        if (best := _best(self.fit, tried, held)) is None:
+        both = self._tried(held), _beyond(self._anew, held)
+        each = (islice((t for t in some if t[1].on != "run"), TRIED) for some in both)
+        if (best := _best(self.fit, chain.from_iterable(each), held)) is None:
             raise UsageError("something predictable is left, but no curve over one quantity lowers the error on data "
                              "left out.")
         return best
@@ -337,13 +319,17 @@ class Remainder:
         replaced = {name: form for name, form in self._approximating.items() if form is not None}
         if (base := self._without(replaced)) is not None:
             yield from ((base, form) for form in dict.fromkeys(replaced.values()))
-        alone, beside = list[tuple[Fit, Form]](), [(self.fit, form) for form in self.forms]
+        beside = [(self.fit, form) for form in self.forms]
         yield from beside[:1]
-        with contextlib.suppress(*FAILURES):
-            if far(self.fit) and (base := self._without(self._approximating)) is not None:
-                alone = [(base, gain.form) for gain in better_forms(base, held.predictions(base))]
+        alone = _beyond(self._without(self._approximating) if far(self.fit) else None, held)
         for pair in zip_longest(alone, beside[1:]):
             yield from filter(None, pair)
+
+    @property
+    def _anew(self) -> Fit | None:
+        """The model that the search began with, where the last is far from noise: all that was found may only imitate
+        one thing that the library lacks."""
+        return self._root if far(self.fit) and self._root is not self.fit else None
 
     def _without(self, names: Iterable[str]) -> Fit | None:
         """Return the fit without these effects; None where there are none, or no fit is."""
@@ -354,6 +340,13 @@ class Remainder:
         return None
 
 
+def _beyond(base: Fit | None, held: HeldOut) -> Iterator[tuple[Fit, Form]]:
+    """Yield a model with each form that predicts more than it does, the best first."""
+    if base is not None:
+        with contextlib.suppress(*FAILURES):
+            yield from ((base, gain.form) for gain in better_forms(base, held.predictions(base)))
+
+
 @one_thread
 def _best(fit: Fit, tried: Iterable[tuple[Fit, Form]], held: HeldOut) -> Curve | None:
     """Return the curve, fitted with its model, that predicts most beyond `fit`; None where none does."""
@@ -362,7 +355,7 @@ def _best(fit: Fit, tried: Iterable[tuple[Fit, Form]], held: HeldOut) -> Curve |
         name += "_more"
     for base, form in tried:
         curve, better, after = Curve(base, form, name=name), None, before
-        with contextlib.suppress(*FAILURES):
+        with contextlib.suppress(*FAILURES, OutOfTime):  # the best so far, where a budget is spent
             for _ in range(ROUNDS):
                 if (larger := curve.grown()) is None or larger.fitted is None:
                     break
@@ -372,15 +365,22 @@ def _best(fit: Fit, tried: Iterable[tuple[Fit, Form]], held: HeldOut) -> Curve |
                     break
                 curve, better, after = larger, gained, predicted
         if better is not None and better.worth_it and curve.fitted is not None:
-            found.append((better.gain, curve))
+            found.append((better.gain, after, curve))
             if at_noise(Node(curve.fitted, None, after)):
                 break
-    return max(found, key=lambda f: f[0], default=(0.0, None))[1]
+    found.sort(key=lambda f: -f[0])  # which of two is better only a comparison of the two tells
+    return reduce(lambda best, f: f if compare(best[1], f[1]).worth_it else best, found)[2] if found else None
 
 
 def _closed_forms(on: str, z: Array) -> list[tuple[str, Array]]:
     """Return closed forms of a quantity: what they are called, and their functions, (n, m)."""
     one, side = np.ones_like(z), np.sign(z)
+    if on in COMPUTED_INPUTS:  # what lasts, or waits, for a time; below zero while the voltage is off
+        known = np.unique(np.abs(z))
+        between = 0.5 * (known[1:] + known[:-1])
+        steps = between[np.unique(np.geomspace(1, len(between), CLOSED).astype(int)) - 1]
+        return [(f"one value for the first {number(c, 3)} s{off}, another after", np.stack([one, way * z > c], axis=1))
+                for way, off in ((1, ""), (-1, " off")) if (way * z > 0).any() for c in steps]
     top = float(np.abs(z).max(initial=0.0)) or 1.0
     if on == "turn":
         return [(f"one wave, {k} to the turn", np.column_stack([np.sin(k * z), np.cos(k * z)])) for k in range(1, 13)]
@@ -401,4 +401,4 @@ def _closed(text: str, columns: Array, value: Array, unit: str) -> tuple[str, fl
     missed = value - columns @ size
     share = float(np.sqrt(missed @ missed / max(float(value @ value), 1e-300)))
     largest = float(np.abs(columns @ size).max(initial=0.0))
-    return f"{text}, at most {number(largest, 2)} {unit}", share
+    return f"{text}, at most {number(largest, 2)} {unit}".removesuffix(" 1"), share

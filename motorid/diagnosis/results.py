@@ -295,7 +295,7 @@ class Diagnosis(Shown):
 
     def to_dict(self) -> dict[str, Any]:
         """Return the contents of ``diagnose --json``."""
-        m = self.missing
+        m, seen = self.missing, Rival.as_allowed if len(self.rivals) > 1 and not self.stopped else Rival.of
         return {
             "verdict": self.verdict, "answer": self.answer, "text": self.text, "where": self.where,
             "location": {
@@ -303,26 +303,27 @@ class Diagnosis(Shown):
                 "depends_on": {k: [{"on": b.against, "explained": b.explained} for b in v] for k, v in m.bins.items()},
             },
             "ranking": [
-                {"effect": c.effect, "predicted_drop": c.predicted_drop, "refit_drop": c.refit_drop,
-                 "validation_nrmse": dict(c.validation_nrmse) if c.validation_nrmse else None,
-                 "held_out_gain": c.held_out_gain, "group": list(c.group), "parameters": dict(c.parameters),
-                 "accepted": c.accepted, "reason": c.reason}
-                for c in self.ranking
+                _plain(c, "effect", "predicted_drop", "refit_drop", "validation_nrmse", "held_out_gain", "group",
+                       "parameters", "accepted", "reason") for c in self.ranking
             ],
             "effects": list(self.effects),
             "ladder": [
-                {"added": r.added, "grade": r.grade, "why": r.why, "gain": r.gain, "gain_se": r.gain_se,
-                 "nrmse": dict(r.nrmse), "validation_nrmse": dict(r.validation_nrmse) if r.validation_nrmse else None}
+                _plain(r, "added", "grade", "why", "gain", "gain_se", "nrmse", "validation_nrmse")
                 for r in self.ladder.rungs
             ],
-            "remaining": {"adequate": self.remaining.adequate, "kind": self.remainder.kind if self.remainder else None,
-                          "where": self.remainder.where if self.remainder else None,
-                          "follows": self.remainder.follows if self.remainder else None, "text": self.remaining.text},
+            "remaining": {"adequate": self.remaining.adequate, **_plain(self.remainder, "kind", "where", "follows"),
+                          "text": self.remaining.text},
             "parameters_before": dict(self.before.values), "parameters_after": dict(self.after.values),
             "per_run": self.after.per_run, "groups": [list(g) for g in self.groups],
             "suggestion": self.suggestion, "stopped": self.stopped or None,
-            "rivals": [Rival.as_allowed(f).to_dict() for f in self.rivals], "best": Rival.of(self.best).to_dict(),
+            "rivals": [seen(f).to_dict() for f in self.rivals], "best": Rival.of(self.best).to_dict(),
         }
+
+
+def _plain(result: object, *names: str) -> dict[str, Any]:
+    """Return attributes as plain data, None where there is no result."""
+    each = {n: getattr(result, n, None) for n in names}
+    return {n: dict(a) if isinstance(a, Mapping) else list(a) if isinstance(a, tuple) else a for n, a in each.items()}
 
 
 def share_table(what: str, shares: Mapping[str, float]) -> Table:

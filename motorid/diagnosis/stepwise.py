@@ -378,15 +378,8 @@ def improve(fit: Fit, validate: Sequence[Experiment] | Experiment | None = None,
     ----------
     fit : Fit
         Of the model to begin with.
-    validate : Experiment or sequence of Experiment, optional
-        Held-out runs; without them, blocks of the fitted runs are held out in turn.
-    effects : iterable of Effect or str, optional
-        What to try; by default the whole library.
-    also : iterable of Effect, optional
-        Effects of your own, tried beside the library's.
-    max_effects : int
-    map : callable
-        Anything with the signature of `map`, for the refits (a process pool's, Dask's).
+    validate, effects, also, max_effects, map
+        As in `diagnose`.
     progress : callable, optional
         Called with a word on what was done.
 

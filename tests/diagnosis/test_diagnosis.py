@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
 from multiprocessing import get_context
 
 import numpy as np
@@ -14,6 +15,7 @@ from battery.excite import driven, record
 
 import motorid as mi
 from motorid.diagnosis.adequacy import adequacy
+from motorid.diagnosis.locate import accounted, binned
 from motorid.diagnosis.score_test import rank, score
 from motorid.diagnosis.verdict import moves
 from motorid.display.numbers import with_error
@@ -232,6 +234,26 @@ def test_without_a_current_voltage_and_torque_look_the_same(plant):
     missing = mi.locate(mi.fit(mi.dc_motor(), runs))
     assert missing.where is None
     assert "look the same" in missing.text
+    assert all("i" not in s and "heat" not in s for s in missing.signals)  # nobody measured it
+
+
+def test_the_time_that_something_follows_is_that_of_each_run(plain):
+    later = [r.with_(t=r.t + 1000 * k) for k, r in enumerate(plain.problem.experiments)]
+    missing = mi.locate(replace(plain, problem=plain.problem.with_(experiments=later, model=plain.model)))
+    assert max(s["t"].max() for s in missing.signals) < 100
+
+
+def test_what_was_added_has_the_size_of_what_was_missing_without_a_current(plant):
+    """The current and its scale are each model's own there, and the torque stands for both balances."""
+    wheel = plant.MOTORS["wheel"]
+    runs = runs_of(wheel, {"coulomb": {"tau_c": 0.05}}, ("stairs", "ramps"), ("omega",), dt=2e-3)
+    found = mi.diagnose(mi.fit(mi.dc_motor(), runs), effects=("coulomb",), max_effects=1)
+    voltages, torques = (np.concatenate(parts) for parts in accounted(found.before, found.after))
+    speed = np.concatenate([s["omega"] for s in found.missing.signals])
+    missing, added = (binned("omega", speed, y).mean for y in (np.concatenate(found.missing.torque), torques))
+    assert not voltages.any()
+    assert np.corrcoef(missing, added)[0, 1] > 0.85
+    assert np.std(added) == pytest.approx(np.std(missing), rel=0.5)
 
 
 # -- the whole answer --------------------------------------------------------------------------------------

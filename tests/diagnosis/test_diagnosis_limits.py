@@ -246,6 +246,8 @@ def test_a_long_record_is_looked_at_in_parts_and_that_is_said(lab, monkeypatch):
     assert found.effects == ("coulomb",)
     assert found.after.values["tau_c"] == pytest.approx(8e-3, rel=0.1)
     assert "2 parts of 0.5 s, 33 % of the samples" in found.text
+    worse = mi.diagnose(whole, [run.with_(outputs={c: 1.2 * y for c, y in run.outputs.items()})], effects=())
+    assert "larger on the held-out runs" not in worse.text  # which are looked at as a whole
 
 
 def test_samples_that_their_neighbours_predict_are_left_out_and_that_is_said(lab, monkeypatch):

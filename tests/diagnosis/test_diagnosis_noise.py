@@ -11,7 +11,7 @@ from battery.excite import P, driven, record
 import motorid as mi
 from motorid.diagnosis.adequacy import adequacy, judge_adequacy
 from motorid.diagnosis.cross_validation import HeldOut
-from motorid.diagnosis.misspecification import best_form
+from motorid.diagnosis.misspecification import better_forms
 from motorid.diagnosis.model_comparison import node_of
 from motorid.diagnosis.score_test import Score
 from motorid.diagnosis.verdict import _noise_feedback, closed_loop_remark, outliers_remark
@@ -73,7 +73,7 @@ def test_no_form_predicts_coloured_noise(lab):
         runs = runs_of(lab, {}, seed=seed, rho=0.93, size=0.02)
         fit = mi.fit(mi.dc_motor(), runs[:2])
         assert adequacy(fit).channels["omega"]["ratio"] > 2
-        assert best_form(fit, HeldOut.of(fit, None).predictions(fit)) is None
+        assert better_forms(fit, HeldOut.of(fit, None).predictions(fit)) == []
 
 
 def test_adequate_although_larger_than_the_noise_says_what_was_tried(lab):

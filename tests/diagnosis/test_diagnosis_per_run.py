@@ -105,6 +105,9 @@ def test_what_is_another_in_every_run_is_not_asked_of_runs_of_one_voltage_each()
     half = [r.with_(inputs={"v": np.where(t < 0.5, r.inputs["v"], 0.5 * r.inputs["v"])}) for r in runs]
     names = {e.name for e in Search(mi.fit(mi.dc_motor(), half), None, library(None), Stages()).effects}
     assert {"supply_per_run", "winding_warm_start"} <= names
+    drive_ = [r.with_(units={"v": "N·m"}) for r in half]
+    names = {e.name for e in Search(mi.fit(mi.torque_driven(), drive_), None, library(None), Stages()).effects}
+    assert not names & {"supply_per_run", "winding_warm_start"}  # no supply makes a commanded torque
 
 
 def test_what_was_named_without_an_angle_can_be_fitted_by_name():

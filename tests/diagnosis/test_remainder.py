@@ -11,12 +11,14 @@ from multiprocessing import get_context
 import casadi as ca
 import numpy as np
 import pytest
-from battery.excite import driven, record
+from battery.excite import driven, record, voltages
 from command import motorid_json
 
 import motorid as mi
+from motorid.channels import COMPUTED_INPUTS
 from motorid.cli.options import own_effects
 from motorid.diagnosis import remainder
+from motorid.diagnosis.cross_validation import HeldOut
 from motorid.diagnosis.free_forms import (
     PAST,
     Form,
@@ -256,7 +258,7 @@ def test_slopes_of_every_form_are_those_of_the_model_with_its_curve(lab):
     fit = mi.fit(mi.dc_motor() + mi.effects.coulomb, runs)
     linear = linearised(fit)
     remembering = [f for f in linear.forms if f.remembers]
-    assert {f.on for f in remembering} == set(PAST)
+    assert {f.on for f in remembering} == {*PAST, *COMPUTED_INPUTS}
     first = {f"{c}_0[{k}]": float(y[0]) for k, s in enumerate(fit.simulations) for c, y in s.states.items()}
     missed = {}
     for form in linear.forms:
@@ -264,7 +266,7 @@ def test_slopes_of_every_form_are_those_of_the_model_with_its_curve(lab):
             continue
         curve = Curve(fit, form)
         answers = linearised(fit, form, curve.span).forms[form]
-        some = range(0, answers.shape[1], 3)
+        some = range(0, answers.shape[1], max(3, answers.shape[1] // 40))
         answers, curve = answers[:, some], replace(curve, coefficients=dict.fromkeys(some, 0.0))
         problem = fit.problem.with_(model=fit.model + curve.effect, engine=mi.Rosenbrock(compiled=False))  # each once
         values = fit.values | first | dict.fromkeys(curve.sizes, 0.0)
@@ -450,3 +452,60 @@ def test_a_curve_over_the_speed_may_set_in_beyond_one(sides):
     basis = values_of(functions_of(form, span), form, {"omega": omega, "t": omega, "width": np.full(omega.size, 0.1)})
     left = brake - basis @ np.linalg.lstsq(basis, brake, rcond=1e-9)[0]
     assert np.std(left) < 0.03 * np.std(brake)  # 0.05 without knees
+
+
+def watchdog(t, v):
+    """A command that was not changed for 60 ms is taken as none."""
+    changed = np.maximum.accumulate(np.where(np.diff(v, prepend=0.0) != 0, t, t[0]))
+    return np.where(t - changed < 0.0595, v, 0.0)
+
+
+def pausing(t, v):
+    """A bridge that rests for 30 ms at each reversal."""
+    way = np.sign(v)[np.maximum.accumulate(np.where(v != 0, np.arange(len(v)), 0))]
+    turned = np.maximum.accumulate(np.where(np.diff(way, prepend=way[0]) * np.roll(way, 1) != 0, t, -1.0))
+    return np.where(t - turned < 0.0295, 0.0, v)
+
+
+def late_relay(t, v):
+    """A relay that closes 20 ms after the voltage was switched on."""
+    on = np.maximum.accumulate(np.where(np.diff((v != 0).astype(int), prepend=0) > 0, t, -1.0))
+    return np.where(t - on < 0.0195, 0.0, v)
+
+
+@pytest.mark.parametrize(("driver", "words", "follows", "closed"), [
+    (watchdog, ("steps", "stairs", "prbs"), "how long the voltage has not changed", "for the first 0.06 s"),
+    (pausing, ("prbs", "steps", "stairs"), "the time since the voltage was reversed", "for the first 0.03 s"),
+    (late_relay, ("pulses 0.8", "pulses 0.5", "pulses"), "how long the voltage has been on or off",
+     "for the first 0.02 s")])
+def test_what_a_driver_does_some_time_after_a_command_is_found(driver, words, follows, closed, plant, lab):
+    """As a curve over that time, whose nearest closed form tells how long."""
+    rng = np.random.default_rng(5)
+    runs, clean = [], {}
+    for w in words:
+        t, v = voltages(w, lab, 800, 1e-3, rng)
+        clean = plant.simulate(lab, {}, t, driver(t, v), substep=None) | {"v": v}
+        runs.append(record(clean, "logger", ("i", "omega"), lab, rng, w))
+    found = mi.diagnose(mi.fit(mi.dc_motor(), runs[:2]), runs[2:], effects=("coulomb", "driver_dead_band"))
+    effect = found.remainder.as_effect()
+    assert found.remainder.fitted.model.effects[-1].name == effect.name
+    assert f"a gain of the voltage that depends on {follows}" in found.remainder.code()
+    assert closed in found.remainder.nearest()[0][0]
+    fit = mi.fit(found.remainder.model + effect, runs[:2])
+    assert max(over_floor(fit, runs[2], clean).values()) < 1.2
+    assert max(over_floor(found.before, runs[2], clean).values()) > 4
+
+
+def test_it_may_take_the_place_of_all_that_was_found(beyond, lab):
+    """A stop that a spring and a weight imitate leaves no room for its curve beside them."""
+    rng = np.random.default_rng(4)
+    clean = [driven(lab, BRAKE, w, 600, 1e-3, rng) for w in FAST]
+    *runs, check = [record(c, "logger", ("i", "omega"), lab, rng, w) for c, w in zip(clean, FAST, strict=True)]
+    root = mi.fit(mi.dc_motor(), runs)
+    last = mi.fit(mi.dc_motor() + mi.effects.constant_load + mi.effects.quadratic_drag, runs)
+    assert not Remainder("structure", last).proposed
+    left = Remainder("structure", last, _root=root, _held=HeldOut.of(root, check))
+    assert left.proposed
+    fit = mi.fit(left.model + left.as_effect(), runs)
+    assert left.model.effect_names == ()
+    assert max(over_floor(fit, check, clean[-1]).values()) < 1.15
