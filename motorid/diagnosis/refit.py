@@ -364,12 +364,16 @@ def _outdone(tasks: Sequence[Task], races: Mapping[int, Raced], found: Mapping[i
     Gained is what the model without the effect would not reach by such a step itself: a stalled fit promises much.
     """
     fit, costs, given_up = tasks[0].fit, sorted(race.cost for race in races.values()), {}
-    own = _undamped(fit.residuals, fit.jacobian * fit.problem.scaling.slope(fit.q))
+    own = _own_reach(fit)
     for k, race in races.items():
         nothing = race.reach > (1 - LITTLE) * own and race.cost > (1 - LITTLE) * fit.cost
         if k not in found and (nothing or (race.reach > OUTDONE * costs[0] and race.cost not in costs[:BEAM])):
             given_up[k] = GivenUp(NOTHING if nothing else LESS, 1 - race.cost / max(fit.cost, 1e-300), (tasks[k], race))
     return given_up
+
+
+def _own_reach(fit: Fit) -> float:
+    return _undamped(fit.residuals, fit.jacobian * fit.problem.scaling.slope(fit.q))
 
 
 def _leader(tasks: Sequence[Task]) -> int | None:

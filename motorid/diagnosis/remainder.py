@@ -300,15 +300,16 @@ class Remainder:
         """The curve with which the model, fitted anew, predicts best."""
         if self.kind != "structure":
             raise UsageError(f"the remainder is {self.kind}: nothing is left that a curve over a quantity predicts.")
-        if self.form is not None and self.form.on == "run" and self._anew is None:
-            raise UsageError(f"what is left is {self.form.text}: no curve, but another motor in every run. "
-                             "Fit the runs apart.")
-        held = self._held or HeldOut.of(self.fit, None)
-        both = self._tried(held), _beyond(self._anew, held)
-        each = (islice((t for t in some if t[1].on != "run"), TRIED) for some in both)
-        if (best := _best(self.fit, chain.from_iterable(each), held)) is None:
-            raise UsageError("something predictable is left, but no curve over one quantity lowers the error on data "
-                             "left out.")
+        held, best = self._held or HeldOut.of(self.fit, None), None
+        apart = self.form is not None and self.form.on == "run"
+        if not apart or self._anew is not None:
+            both = self._tried(held), _beyond(self._anew, held)
+            each = (islice((t for t in some if t[1].on != "run"), TRIED) for some in both)
+            best = _best(self.fit, chain.from_iterable(each), held)
+        if best is None:
+            raise UsageError(f"what is left is {self.follows}: no curve, but another motor in every run. Fit the runs "
+                             "apart." if apart else "something predictable is left, but no curve over one quantity "
+                             "lowers the error on data left out.")
         return best
 
     def _tried(self, held: HeldOut) -> Iterator[tuple[Fit, Form]]:

@@ -31,8 +31,7 @@ from motorid.problem.simulate import integration_bias, integration_error, misfit
 from motorid.records.experiment import Experiment, windows
 
 NOISE = 1.2  # RMS of the residual over the noise that may be called noise
-FAILS = 3.0  # misfit over noise of a channel above which the misfits decide the weights
-UNEVEN = 1.5  # between channels, in misfit over what it counted as: another round
+IMBALANCE = 3.0  # between channels, in misfit over noise, above which the misfit decides the weights
 REWEIGHTINGS = 3  # at most
 ERROR_SHARE = 0.2  # integration error accepted beside noise or misfit
 BIAS = 0.2  # deviations by which it may move the estimate
@@ -247,7 +246,7 @@ def no_worse_than_smaller(found: Estimate, asked: Problem, effort: LevenbergMarq
     again from there.
     """
     problem, sizes = found.problem, natural_sizes(found.problem.experiments, found.values)
-    if not max(misfit_over_noise(problem, found.q).values(), default=0.0) > FAILS:
+    if not max(misfit_over_noise(problem, found.q).values(), default=0.0) > IMBALANCE:
         return found
     for effect in problem.model.effects:
         with contextlib.suppress(*FAILURES):
@@ -279,7 +278,7 @@ def _reweighted(found: Estimate) -> dict[str, float] | None:
         return None
     factors = misfit_over_noise(problem, found.q)
     relative = [factors[c] / problem.noise_factors.get(c, 1.0) for c in factors]
-    return factors if max(factors.values()) > FAILS and max(relative) > UNEVEN * min(relative) else None
+    return factors if max(relative) >= IMBALANCE * min(relative) else None
 
 
 def _polished(found: Estimate, effort: LevenbergMarquardt, callback: Callback) -> tuple[Estimate, float]:

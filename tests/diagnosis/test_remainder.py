@@ -476,8 +476,8 @@ def late_relay(t, v):
 @pytest.mark.parametrize(("driver", "words", "follows", "closed"), [
     (watchdog, ("steps", "stairs", "prbs"), "how long the voltage has not changed", "for the first 0.06 s"),
     (pausing, ("prbs", "steps", "stairs"), "the time since the voltage was reversed", "for the first 0.03 s"),
-    (late_relay, ("pulses 0.8", "pulses 0.5", "pulses"), "how long the voltage has been on or off",
-     "for the first 0.02 s")])
+    (late_relay, ("ternary 0.8", "ternary 0.6", "ternary"), "how long the voltage has been on or off",
+     "for the first 0.02")])
 def test_what_a_driver_does_some_time_after_a_command_is_found(driver, words, follows, closed, plant, lab):
     """As a curve over that time, whose nearest closed form tells how long."""
     rng = np.random.default_rng(5)

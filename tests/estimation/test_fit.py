@@ -471,16 +471,3 @@ def test_nothing_free_is_nothing_to_fit(runs):
     with pytest.raises(UsageError, match=r"model\.free\(.*mi\.evaluate"):
         mi.fit(mi.dc_motor(**VALUES).fix(*NAMES), runs)
     assert mi.evaluate(mi.dc_motor(**VALUES).fix(*NAMES), runs).nrmse["omega"] < 0.01
-
-
-def test_two_channels_that_both_fail_are_weighed_by_their_misfit(rng):
-    """4 and 7 times the noise: the finer channel decided, and by so little a larger model came to predict worse."""
-    t = 2e-3 * np.arange(800)
-    v = drive(t, 6.0)
-    blank = mi.Experiment(t, {"v": v}, {"omega": 0 * t, "theta": 0 * t})
-    hidden = mi.dc_motor(**VALUES) + mi.effects.stribeck(tau_c=4e-3, tau_s=9e-3, omega_s=20.0)
-    shown = mi.simulate(hidden, blank, initial="rest")[0].outputs
-    run = blank.with_(outputs={c: shown[c] + s * rng.normal(size=800) for c, s in (("omega", 0.3), ("theta", 2e-2))})
-    fit = mi.fit(mi.dc_motor(), run)
-    assert max(fit.misfit.values()) > 3
-    assert fit.problem.noise_factors == pytest.approx(dict(fit.misfit), rel=0.5)
