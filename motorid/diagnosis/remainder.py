@@ -354,21 +354,22 @@ def _best(fit: Fit, tried: Iterable[tuple[Fit, Form]], held: HeldOut) -> Curve |
     before, found, name = held.predictions(fit), [], "remainder"
     while name in fit.model.effect_names:  # a curve beside a curve
         name += "_more"
-    for base, form in tried:
-        curve, better, after = Curve(base, form, name=name), None, before
-        with contextlib.suppress(*FAILURES, OutOfTime):  # the best so far, where a budget is spent
-            for _ in range(ROUNDS):
-                if (larger := curve.grown()) is None or larger.fitted is None:
+    with contextlib.suppress(OutOfTime):  # what is tried takes fits to find, too
+        for base, form in tried:
+            curve, better, after = Curve(base, form, name=name), None, before
+            with contextlib.suppress(*FAILURES, OutOfTime):  # the best so far, where a budget is spent
+                for _ in range(ROUNDS):
+                    if (larger := curve.grown()) is None or larger.fitted is None:
+                        break
+                    predicted = held.predictions(larger.fitted)
+                    gained = compare(before, predicted)
+                    if better is not None and gained.gain < better.gain:  # slopes led astray
+                        break
+                    curve, better, after = larger, gained, predicted
+            if better is not None and better.worth_it and curve.fitted is not None:
+                found.append((better.gain, after, curve))
+                if at_noise(Node(curve.fitted, None, after)):
                     break
-                predicted = held.predictions(larger.fitted)
-                gained = compare(before, predicted)
-                if better is not None and gained.gain < better.gain:  # slopes led astray
-                    break
-                curve, better, after = larger, gained, predicted
-        if better is not None and better.worth_it and curve.fitted is not None:
-            found.append((better.gain, after, curve))
-            if at_noise(Node(curve.fitted, None, after)):
-                break
     found.sort(key=lambda f: -f[0])  # which of two is better only a comparison of the two tells
     return reduce(lambda best, f: f if compare(best[1], f[1]).worth_it else best, found)[2] if found else None
 

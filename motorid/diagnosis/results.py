@@ -295,7 +295,7 @@ class Diagnosis(Shown):
 
     def to_dict(self) -> dict[str, Any]:
         """Return the contents of ``diagnose --json``."""
-        m, seen = self.missing, Rival.as_allowed if len(self.rivals) > 1 and not self.stopped else Rival.of
+        m, seen = self.missing, Rival.as_allowed if len(self.rivals) > 1 else Rival.of
         return {
             "verdict": self.verdict, "answer": self.answer, "text": self.text, "where": self.where,
             "location": {

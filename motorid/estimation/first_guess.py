@@ -35,7 +35,7 @@ def first_guess(model: Model, runs: Sequence[Experiment], *, loaded: bool = Fals
     taken for back-EMF where no current distinguishes it from viscous friction.
     """
     held = {n: p.value for n, p in model.parameters.items() if p.given or not p.vary}
-    signals = [_signals(_read_plainly(r, model)) for r in runs]
+    signals = [_signals(_read_plainly(r, model), loaded) for r in runs]
     loads = _Loads(model, loads_of(model) if loaded else ())
     if model.base == "torque_driven":
         found = _torque_driven(signals, held, loads)
@@ -57,14 +57,14 @@ def _read_plainly(run: Experiment, model: Model) -> Experiment:
     return run
 
 
-def _signals(run: Experiment) -> dict[str, Array]:
+def _signals(run: Experiment, loaded: bool) -> dict[str, Array]:
     """Return t, v, its integral `v_dt`, and on all samples what was measured of i, omega (or its slope) and theta."""
     t = run.t
     measured = (c for c in CHANNELS if c in run.outputs and np.isfinite(run.outputs[c]).any())
     found: dict[str, Array] = {"t": t, **run.inputs, **{c: bridged(t, run.outputs[c]) for c in measured}}
     if "omega" not in found and "theta" in found:
         found["omega"] = slope(t, found["theta"], max(2, min(10, len(t) // 200)))
-    found |= {c: time_since(run, c) for c in COMPUTED_INPUTS}
+    found |= {c: time_since(run, c) for c in COMPUTED_INPUTS if loaded}
     found["v_dt"] = integral(t, run.inputs["v"], run.hold == "zoh")
     return found
 

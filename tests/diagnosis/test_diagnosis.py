@@ -15,6 +15,7 @@ from battery.excite import driven, record
 
 import motorid as mi
 from motorid.diagnosis.adequacy import adequacy
+from motorid.diagnosis.design_criteria import Rival
 from motorid.diagnosis.locate import accounted, binned
 from motorid.diagnosis.score_test import rank, score
 from motorid.diagnosis.verdict import moves
@@ -337,6 +338,13 @@ def same(one, other):
     if isinstance(one, float) and isinstance(other, float):
         return one == pytest.approx(other, rel=1e-5, abs=1e-9)
     return one == other
+
+
+def test_what_one_model_alone_would_let_an_experiment_see_is_not_fitted_for_its_json(found, monkeypatch):
+    """It took 26 s after the time was up; there is no other model to distinguish it from."""
+    monkeypatch.setattr(Rival, "as_allowed", None)
+    alone = replace(found[0], groups=())
+    assert len(alone.rivals) == len(alone.to_dict()["rivals"]) == 1
 
 
 def test_the_same_records_give_the_same_answer(rubbing, plain, found):

@@ -33,7 +33,7 @@ from motorid.diagnosis.free_forms import (
 from motorid.diagnosis.locate import locate
 from motorid.diagnosis.remainder import Curve, Remainder
 from motorid.exporters.export import load
-from motorid.numerics.parallel import one_thread
+from motorid.numerics.parallel import budget, one_thread
 from motorid.records.reading import write_csv
 
 ANGLE = ("i", "omega", "theta")
@@ -509,3 +509,14 @@ def test_it_may_take_the_place_of_all_that_was_found(beyond, lab):
     fit = mi.fit(left.model + left.as_effect(), runs)
     assert left.model.effect_names == ()
     assert max(over_floor(fit, check, clean[-1]).values()) < 1.15
+
+
+def test_a_budget_that_is_spent_ends_the_search_for_curves(lab):
+    """Also while a smaller model is fitted, beside which a curve is to be tried."""
+    rng = np.random.default_rng(4)
+    runs = [record(driven(lab, {}, w, 400, 1e-3, rng), "logger", ("i", "omega"), lab, rng, w) for w in FAST]
+    form = Form("a torque", "torque", "omega")
+    left = Remainder("structure", mi.fit(mi.dc_motor() + mi.effects.quadratic_drag, runs), (form,),
+                     _approximating={"quadratic_drag": form})
+    with budget(0.0), pytest.raises(mi.UsageError, match="no curve"):
+        left.as_effect()
