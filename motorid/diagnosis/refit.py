@@ -59,6 +59,7 @@ class Raced:
 def raced(fit: Fit, model: Model, starts: Sequence[Mapping[str, float]]) -> Raced | None:
     """Go a few steps from each start with `model` on the records of `fit`; None if none can be simulated.
 
+    Where no start can be (a friction that sticks at every turn), the values of `fit` are one: the smaller model could.
     Effects of the angle start along the measured angle, which the model's own angle, still wrong, would lead astray.
     """
     model = _bounded(fit, model)
@@ -78,6 +79,8 @@ def raced(fit: Fit, model: Model, starts: Sequence[Mapping[str, float]]) -> Race
                 reach = _undamped(done.solution.residual, done.solution.jac)
                 found.append(Raced(done.onward, float(done.cost), reach, along))
                 break
+    if not found and any(starts):
+        return raced(fit, model, ())
     return min(found, key=lambda r: r.cost, default=None)
 
 

@@ -53,6 +53,16 @@ def test_a_model_that_copies_the_measured_angle_predicts_none():
         assert trial.copies_the_angle(problem, problem.start) == copies
 
 
+def test_where_no_start_can_be_simulated_a_refit_begins_where_the_smaller_model_ended(monkeypatch):
+    race = trial._race
+    monkeypatch.setattr(trial, "_race", lambda p: None if p.model.parameters["tau_c"].value > 1 else race(p))
+    friction = mi.effects.coulomb(tau_c=8e-3)
+    fit = mi.fit(mi.dc_motor(**TRUE), _run(mi.dc_motor(**TRUE) + friction))
+    found = trial.refit(fit, fit.model + mi.effects.coulomb, [{"tau_c": 100.0}])
+    assert found is not None
+    assert found.values["tau_c"] == pytest.approx(8e-3, rel=0.05)
+
+
 def test_a_pool_that_breaks_costs_no_refit_and_the_budget_holds_beside_one():
     def breaking(function, tasks):
         yield function(tasks[0])
