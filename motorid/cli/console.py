@@ -121,9 +121,10 @@ class Group(_PlainHelp, TyperGroup):
         if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EFBIG, errno.EIO):
             os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # what is left of the output has no place
             return _say(f"cannot write the output: {error.strerror}.", FAILED)
-        if not hasattr(error, "format_message"):
+        told: Any = getattr(error, "format_message", None)
+        if told is None:
             raise error
-        text, context = error.format_message().strip(), getattr(error, "ctx", None)
+        text, context = told().strip(), getattr(error, "ctx", None)
         help_ = f" Help: {context.command_path if context else 'motorid'} --help"
         return _say(text + ("" if text.endswith((".", "?", "!")) else ".") + help_, WRONG)
 

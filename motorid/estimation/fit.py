@@ -151,7 +151,8 @@ def solve(problem: Problem, solver: Any = None, *, start: str = "auto", callback
     if not problem.unknown:
         raise UsageError("every parameter is fixed, there is nothing to fit. Free one, model.free('R'), or judge "
                          "the model as it is: mi.evaluate(model, runs).")
-    auto, effort = start == "auto", solver or FINISH
+    auto = start == "auto"
+    effort: Any = solver or FINISH
     if problem.unknowns.apart and hasattr(effort, "solve"):
         raise UsageError("multiple shooting knows no parameters per run: leave the solver out, or the effect.")
     if auto and any(p.unit == "rad" for *_, p in problem.unknowns.apart):

@@ -107,7 +107,7 @@ def mark_of(key: str) -> str | None:
     cc = compiler()
     if cc is None:
         return None
-    parts = "\0".join([key, *cc, *flags(), DRIVER, platform.machine(), ca.__version__])
+    parts = "\0".join([key, *cc, *flags(), DRIVER, platform.machine(), ca.CasadiMeta.version()])
     return "step-" + hashlib.sha256(parts.encode()).hexdigest()[:32]
 
 

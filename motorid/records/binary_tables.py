@@ -193,7 +193,7 @@ def frame_table(frame: Any) -> TextTable:
     columns, texts, notes = {}, {}, []
     for label, (_, series) in zip(labels, frame.items(), strict=True):
         if pd.api.types.is_string_dtype(series.dtype):
-            told = pd.to_numeric(series, errors="coerce")
+            told = pd.Series(pd.to_numeric(series, errors="coerce"))
             series = told if told.notna().sum() == series.notna().sum() else series
         if pd.api.types.is_numeric_dtype(series.dtype) and not pd.api.types.is_complex_dtype(series.dtype):
             columns[label], bad = numbers(series)
