@@ -98,6 +98,14 @@ class Stages:
         self._done = (begun + self._end) / 2 if every else begun
 
 
+def _in_doubt(node: Node, children: Sequence[Node]) -> bool:
+    """Tell whether a race, on the fitted runs alone, may have misled: physics speaks against all that was finished, or
+    the held-out runs prefer another to the one that leads."""
+    sound = [c for c in children if not c.objection]
+    led = max(sound, key=lambda c: evidence(node, c).gain, default=None)
+    return led is None or any(evidence(c, led).worse_there for c in sound if c is not led)
+
+
 def library(effects: Iterable[Effect | str] | None, also: Iterable[Effect] = ()) -> list[Effect]:
     """Return the effects to try: the whole library, or those named, and the user's own."""
     from motorid.effects import get
@@ -180,7 +188,7 @@ class Search:
         self.stages.done(f"refitted {sum(isinstance(f, Fit) for f in fits.values())} of {len(fits)}")
         found = {t.name: self._judge(node, t.added, fits[t.name]) for t in tasks}
         begun = {n: f for n, f in fits.items() if isinstance(f, GivenUp) and f.begun is not None}
-        if begun and all(child is None or child.objection for child, _ in found.values()):  # what led is refused
+        if begun and _in_doubt(node, [child for child, _ in found.values() if child is not None]):
             later = dict(zip(begun, completed(list(begun.values()), self.map), strict=True))
             found |= {t.name: self._judge(node, t.added, later[t.name]) for t in tasks if t.name in later}
         children = [child for child, _ in found.values() if child is not None]
