@@ -39,6 +39,7 @@ _OPTIONS = ((r"\b(columns|units)=\{(.*?)\}", lambda m: f"--{m[1]} {_pairs(m[2])}
             (r"\bwith (columns|units)\b", r"with --\1"),
             (r"\b(engine|hold|solver|initial|formulation)='([\w-]+)'", r"--\1 \2"),
             (r"\bdt=([\d.]+)", r"--dt \1"),
+            (r"\bmi\.torque_driven\(\) \((--drive torque)\)", r"\1"),
             (r"\bmodel\.without\('(\w+)'\)", r"--effects without \1"),
             (r"\bmodel\.(fix|free)\(…\)", r"--\1 NAME"),
             (r"\bmodel\.fix\('?(\w+)'?(=[^)]*)?\)", r"--fix \1\2"),
@@ -250,7 +251,7 @@ def _pairs(inside: str) -> str:
     """Return ``v=u_volt,omega=speed`` of ``'v': 'u_volt', 'omega': 'speed'``, quoted where a shell needs it."""
     pairs = re.findall(r"'(\w+)': ?(?:'([^']*)'|(\d+)|\.\.\.)", inside)
     words = ",".join(f"{name}={text or number or '...'}" for name, text, number in pairs)
-    return f'"{words}"' if " " in words else words
+    return f'"{words}"' if re.search(r"[^\w.,=:/%+-]", words) else words
 
 
 def _console() -> Any:

@@ -102,6 +102,13 @@ def unpredicted(judged: Adequacy) -> Adequacy:
                                 "function of time, angle, speed, current or voltage predicts them on data left out.")
 
 
+def within_noise(judged: Adequacy) -> Adequacy:
+    """Return a judgement that knows that nothing predicts how errors no larger than the noise follow the motion."""
+    text = (f"The errors ({_sizes(judged.channels)}) are within the noise; what of them depends on the motion no "
+            "effect and no free curve predicts on data left out.")
+    return replace(judged, adequate=True, text=text)
+
+
 def _sizes(channels: Mapping[str, Mapping[str, float]]) -> str:
     return ", ".join(f"{channel_name(c)} {number(f['ratio'], 2)}" for c, f in channels.items()) + " times the noise"
 

@@ -11,7 +11,7 @@ from motorid.diagnosis.thresholds import MATERIAL
 from motorid.display.numbers import number, percent
 from motorid.estimation.result import Fit
 from motorid.model.definition import Effect, Parameter
-from motorid.numerics.signals import Array, noise_level, quantum, window_slopes
+from motorid.numerics.signals import Array, integral, noise_level, quantum, window_slopes
 from motorid.problem.runs import angle_signal
 
 KNOWN = 0.3  # of a parameter, its standard deviation: determined
@@ -44,7 +44,7 @@ def objections(fit: Fit, added: Effect, before: Fit | None = None) -> str:
             physical = np.isfinite(limit) and limit in (declared.upper, declared.lower)  # not set for these records
             if p.vary and physical and sign * limit > 0 and max(sign * v for v in values) > 0.98 * sign * limit:
                 return f"{p.name} runs to {limit:g}, the limit of what is physical"
-    why = _too_large(fit, pars) or _alike(fit, added) or unresolved(fit, added)
+    why = _too_large(fit, pars) or _alike(fit, added) or unresolved(fit, added) or _belied(fit, added)
     return why or (_emptied(fit, added, before) if before else "")
 
 
@@ -92,6 +92,33 @@ def _emptied(fit: Fit, added: Effect, before: Fit) -> str:
     return ""
 
 
+def _belied(fit: Fit, added: Effect) -> str:
+    """Say so where the speed and the angle, as measured, agree better without an effect of the speed's sensor.
+
+    What a sensor makes of a turn Δθ adds up to (1 + k_w)·Δθ − T·Δω + w_0·Δt, whatever moves the motor; T is how late
+    it is, of a mean half its window.
+    """
+    known = {"k_w": 1.0, "w_0": 1.0, "T_w": 1.0, "T_d": 1.0, "T_a": 0.5}
+    sizes = {n: known[n] * fit.values[n] for n in known if n in fit.values}
+    own = {p.name for p in added.parameters} & set(sizes)
+    both = [r for r in fit.problem.experiments if {"omega", "theta"} <= set(r.outputs)]
+    if not own or not both:
+        return ""
+    errors = []
+    for gone in (set[str](), own):
+        at, found = {n: sizes.get(n, 0.0) * (n not in gone) for n in known}, 0.0
+        for run in both:
+            good = np.isfinite(run.outputs["omega"]) & np.isfinite(run.outputs["theta"])
+            t, omega, theta = run.t[good], run.outputs["omega"][good], run.outputs["theta"][good]
+            told, turn, change, time = (np.diff(y[::max(len(t) // PARTS, 1)])
+                                        for y in (integral(t, omega), theta, omega, t))
+            late = at["T_w"] + at["T_d"] + at["T_a"]
+            found += float(np.sum((told - (1 + at["k_w"]) * turn + late * change - at["w_0"] * time) ** 2))
+        errors.append(found)
+    return "speed and angle, as measured, agree better without it" if errors[0] > errors[1] else ""
+
+
+PARTS = 200  # of a run, in which a turn and the speed meanwhile are compared
 PASSAGE = 10  # samples that a motion through the shape must give
 FINEST = 4.0  # steps or standard deviations of the angle that it must be wide
 OFTEN = 0.75  # of the passages may be faster

@@ -18,6 +18,7 @@ import numpy as np
 
 from motorid.diagnosis.admissibility import objections
 from motorid.diagnosis.cross_validation import HeldOut
+from motorid.diagnosis.free_forms import own_levels
 from motorid.diagnosis.misspecification import LIMITER
 from motorid.diagnosis.model_comparison import COMMON, Node, beats, evidence, far, node_of, superfluous
 from motorid.diagnosis.predictive_score import Evidence
@@ -41,7 +42,6 @@ PAIRS = 3  # refitted where no single effect helps
 NEAR = 0.4  # of the best score: what a common effect must reach to be refitted too
 ALWAYS = ("compliance", "speed_lag", "speed_delay", "driver_coast")  # their score at null says little
 OFTEN = 3  # that a larger model may be taken back to the smaller one that it led out of a valley
-ON = 0.05  # of the largest voltage: a level by itself
 FLAT_TOP = 0.04  # of the samples: a current that is as large so often may have a limit
 
 
@@ -123,7 +123,7 @@ class Search:
                  stages: Stages) -> None:
         stages.at("looking at the misfit")
         self.held = HeldOut.of(fit, validate)
-        law = fit.model.base != "dc_motor" or _own_levels(fit.problem.experiments)  # a torque needs no supply
+        law = fit.model.base != "dc_motor" or own_levels(fit.problem.experiments)  # a torque needs no supply
         self.effects = [e for e in effects if not (law and e.name in PER_RUN and e.balance == "voltage")]
         self.stages, self.map = stages, stages.map
         self.root = node_of(fit, self.held)
@@ -369,13 +369,6 @@ class Search:
             except FAILURES:
                 return None
         return self.nodes[key]
-
-
-def _own_levels(runs: Sequence[Experiment]) -> bool:
-    """Tell whether every run has one voltage, on or off, of its own: what is another in each is any law of that."""
-    sizes = [np.abs(run.inputs["v"]) for run in runs]
-    ends = [np.quantile(on if (on := v[v > ON * v.max()]).size else v, [ON, 1 - ON]) for v in sizes]
-    return all(high - low <= ON * high for low, high in ends) and len({f"{high:.1e}" for _, high in ends}) > 1
 
 
 def _flat_topped(run: Experiment) -> bool:

@@ -24,7 +24,9 @@ from motorid.estimation.result import Fit
 from motorid.numerics.signals import Array
 from motorid.problem.problem import Problem
 from motorid.problem.runs import angle_signal, time_since
+from motorid.records.experiment import Experiment
 
+ON = 0.05  # of the largest voltage: a level by itself
 KNOTS = 9  # cosines over the range of a time, twice as many over that of an angle
 HARMONICS = 12  # of a turn
 LINES = 2  # of the spectrum of the misfit over the angle
@@ -147,6 +149,8 @@ def shown(form: Form, fit: Fit, ranges: Mapping[str, tuple[float, float]]) -> bo
         return False  # one sensor needs another to be told wrong
     if form.channel == "omega" and form.carrier and "theta" not in outputs:
         return False  # a gain is the motor constant's, unless the motion is measured twice
+    if form.on == "run" and own_levels(fit.problem.experiments):
+        return False
     if form.on not in ranges or ranges[form.on][0] == ranges[form.on][1]:
         return False
     if form.on == "path":  # both ways, by more than the creep of a smooth sgn or the ripple of a start
@@ -158,6 +162,13 @@ def shown(form: Form, fit: Fit, ranges: Mapping[str, tuple[float, float]]) -> bo
     if (form.remembers or form.on == "distance") and fit.window is not None:
         return False  # what was before a window is not known
     return form.on != "turn" or not fit.problem.linear
+
+
+def own_levels(runs: Sequence[Experiment]) -> bool:
+    """Tell whether every run has one voltage, on or off, of its own: what is another in each is any law of that."""
+    sizes = [np.abs(run.inputs["v"]) for run in runs]
+    ends = [np.quantile(on if (on := v[v > ON * v.max()]).size else v, [ON, 1 - ON]) for v in sizes]
+    return all(high - low <= ON * high for low, high in ends) and len({f"{high:.1e}" for _, high in ends}) > 1
 
 
 def functions_of(form: Form, span: Span) -> list[str]:

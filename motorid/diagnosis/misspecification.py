@@ -37,6 +37,7 @@ from motorid.diagnosis.predictive_score import (
 )
 from motorid.diagnosis.thresholds import MOST, STANDARD_ERRORS, SUPPLANTS, TRIFLE, UNCONTESTED
 from motorid.display.numbers import listed, percent
+from motorid.estimation.fit import follows
 from motorid.estimation.least_squares import FAILURES
 from motorid.estimation.linearisation import INSEPARABLE
 from motorid.estimation.result import Fit
@@ -158,11 +159,11 @@ def grades_of(last: Node, root: Node, groups: Sequence[Sequence[str]], beside: S
     """Return the grade of each effect that `last` has and `root` has not.
 
     A rung that predicts better stays, whatever it is. Its effect is *named* if its law is physical there and its size
-    more than two of its deviations, no rival predicts as well, no free form that contains it, or in its place, predicts
-    better by more than the trifle that a free curve follows in any real motor and by more than a trifle of what the
-    effect itself does, and it explains more than it leaves, unless that is noise (no `structure`). A form `beside` the
-    effect that predicts surely less than the best one only imitates that. `without` gives the model without one of the
-    effects, if there is one.
+    more than two of its deviations, the model with it follows the records, no rival predicts as well, no free form that
+    contains it, or in its place, predicts better by more than the trifle that a free curve follows in any real motor
+    and by more than a trifle of what the effect itself does, and it explains more than it leaves, unless that is noise
+    (no `structure`). A form `beside` the effect that predicts surely less than the best one only imitates that.
+    `without` gives the model without one of the effects, if there is one.
     """
     rivals = {g[0]: g[1:] for g in groups}
     limited = structure and LIMITER not in last.key and any(current_limit(run) for run in root.fit.problem.experiments)
@@ -170,6 +171,8 @@ def grades_of(last: Node, root: Node, groups: Sequence[Sequence[str]], beside: S
     for e in (e for e in last.fit.model.effects if e.name not in root.key):
         why, form = objections(last.fit, e, root.fit), None
         why = why or ("it may only stand in for the driver's current limit" if limited else "")
+        astray = structure and not follows(last.fit)
+        why = why or ("the model does not follow the records even with it" if astray else "")
         why = why or _insignificant(last.fit, e, structure) or _within_smoothing(last.fit, e)
         smaller = without(e.name) if not why and (structure or far(last.fit)) else None
         if smaller is not None:

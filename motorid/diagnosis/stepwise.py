@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from motorid.diagnosis.adequacy import judge_adequacy
+from motorid.diagnosis.adequacy import judge_adequacy, within_noise
 from motorid.diagnosis.candidates import Search, Stages, library
 from motorid.diagnosis.cross_validation import QUICK, HeldOut
 from motorid.diagnosis.input_hypotheses import Reading, better_reading, without_spikes
@@ -161,6 +161,8 @@ def _finished(found: Climb) -> Climb:
     groups = tuple((g[0], *rest) for g in found.groups if g and (rest := _without(g[1:], best.key)))
     structure = not found.remaining.adequate
     forms = better_forms(best.fit, best.predictions) if structure else []
+    if structure and not forms and at_noise(best) and not found.stopped:
+        found, structure = replace(found, remaining=within_noise(found.remaining)), False
     grades = grades_of(best, search.root, groups, forms, structure,
                        lambda name: None if found.stopped else search.without(best, name))
     return replace(found, rounds=rounds, groups=groups, forms=tuple(forms), grades=grades)

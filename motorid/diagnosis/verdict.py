@@ -49,6 +49,8 @@ def adequate_text(judged: Adequacy, ranking: Sequence[Candidate], large: bool = 
     if large:
         return ("Nothing that depends on the motion is missing, but the errors are larger than the noise: they "
                 "fluctuate by themselves, or the noise is slow."), tried
+    if judged.p_value <= judged.false_alarm:
+        return "Nothing that matters is missing: the errors are within the noise.", tried
     return "Nothing is missing: the errors do not depend on the motion.", tried
 
 

@@ -73,7 +73,8 @@ def description(found: Fit | Model) -> dict[str, Any]:
     for name, p in model.parameters.items():
         contents["parameters"][name] |= {k: v for k in ("lower", "upper") if np.isfinite(v := getattr(p, k))}
     return contents | {"motorid": version, "export": FORMAT, "order": list(system_of(found).parameters), "versions": {
-        "motorid": version, "casadi": ca.CasadiMeta.version(), "numpy": np.__version__, "python": platform.python_version()}}
+        "motorid": version, "casadi": ca.CasadiMeta.version(), "numpy": np.__version__,
+        "python": platform.python_version()}}
 
 
 def fingerprint(run: Experiment) -> dict[str, Any]:

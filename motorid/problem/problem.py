@@ -91,6 +91,10 @@ class Problem:
                 {"m", "m/s"} & set(r.units.values()) for r in self.experiments):
             raise ModelError("the records are in metres, and the model is one that turns: write "
                              "mi.torque_driven(axis='linear'), or state the units of the records.")
+        driven = next((r.units["v"] for r in self.experiments if r.units["v"] in ("A", "N·m", "N")), "")
+        if self.model.base == "dc_motor" and driven:
+            raise ModelError(f"v is in {driven}, and the model is driven by a voltage: a commanded current or torque "
+                             "drives mi.torque_driven() (--drive torque). If it is a voltage, state its unit.")
         self.model.check_visible(self.outputs)
         width = self.width or smoothing(self.experiments, self.model.parameters)
         if width is not None:

@@ -165,6 +165,9 @@ def _at_stop(y: Array, top: float) -> bool:
     there = y == top
     if top == 0 or there.sum() < 3 or there.all():
         return False
+    beside = y[~there][np.argmin(np.abs(y[~there] - top))]
+    if np.count_nonzero(y == beside) >= there.sum():
+        return False  # levels of a counter, wide apart where it times its pulses
     reach = np.ptp(y)
     step = quantum(y)
     entries = np.abs(y[np.flatnonzero(there[1:] & ~there[:-1])] - top)
@@ -282,12 +285,16 @@ def signs(run: Experiment) -> str | None:
         return None
     if len(against) == 2:
         return ("a positive voltage goes with a negative current and a negative speed: the sign of the "
-                "voltage is probably swapped. Turn it round, e.g. units={'v': '-1 V'}.")
-    channel, unit = ("i", "A") if against == ["current"] else ("omega" if "omega" in run.outputs else "theta",
-                                                               "rad/s" if "omega" in run.outputs else "rad")
+                f"voltage is probably swapped. Turn it round, e.g. units={{'v': '-1 {_told(run, 'v')}'}}.")
+    channel = "i" if against == ["current"] else "omega" if "omega" in run.outputs else "theta"
     else_ = " (or of the voltage)" if measured == against else ""
     return (f"a positive voltage goes with a negative {against[0]}: the sign of the {against[0]}{else_} "
-            f"is probably swapped. Turn it round, e.g. units={{'{channel}': '-1 {unit}'}}.")
+            f"is probably swapped. Turn it round, e.g. units={{'{channel}': '-1 {_told(run, channel)}'}}.")
+
+
+def _told(run: Experiment, channel: str) -> str:
+    """Return the unit of a channel as its file has it: a sign that is turned round must not lose a scale."""
+    return run.meta.get("original_units", {}).get(channel) or run.units[channel]
 
 
 def unsigned(run: Experiment) -> str | None:
@@ -335,7 +342,7 @@ def angle_against_speed(run: Experiment) -> str | None:
         return None
     if agree < 0:
         return ("the angle falls while the speed is positive: the sign of one of them is swapped. "
-                "Turn it round, e.g. units={'theta': '-1 rad'}.")
+                f"Turn it round, e.g. units={{'theta': '-1 {_told(run, 'theta')}'}}.")
     ratio = float(np.sum(travel * turned) / np.sum(turned**2))
     if 0.8 < ratio < 1.25:
         return None

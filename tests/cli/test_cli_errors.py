@@ -37,6 +37,12 @@ def test_all_that_is_missing_is_said_at_once_with_the_option_that_names_it(tmp_p
     path.write_text("a,b c,d\n" + "".join(f"{k},{k},{k}\n" for k in range(30)))
     wrong(motorid("check", path), "the time (t)", "the drive voltage (v)", "speed (omega)",
           '--columns "t=a,v=b c,omega=d"', "--dt 0.001")
+    path.write_text("t,steps(4),in(8bits)\n" + "".join(f"{k},{k},{k}\n" for k in range(30)))
+    wrong(motorid("check", path), '--columns "v=steps(4),omega=in(8bits)"')  # brackets mean something to a shell
+
+
+def test_a_current_is_no_drive_voltage():
+    wrong(motorid("fit", RUN, "--units", "v=A"), "v is in A", "a commanded current or torque drives --drive torque")
 
 
 def test_samples_a_fixed_time_apart_may_be_told(tmp_path):

@@ -10,7 +10,8 @@ import pytest
 from battery.excite import driven, record
 
 import motorid as mi
-from motorid.diagnosis import misspecification, stepwise
+from motorid.diagnosis import admissibility, candidates, free_forms, misspecification, stepwise
+from motorid.diagnosis.adequacy import adequacy
 from motorid.diagnosis.admissibility import objections
 from motorid.diagnosis.candidates import library
 from motorid.diagnosis.cross_validation import HeldOut
@@ -20,6 +21,7 @@ from motorid.diagnosis.model_comparison import node_of, tied
 from motorid.diagnosis.predictive_score import Evidence, Predictions
 from motorid.diagnosis.results import Candidate
 from motorid.diagnosis.stepwise import _outdoing, _runners_up
+from motorid.effects import LIBRARY
 
 HIDDEN = {"coulomb": {"tau_c": 8e-3}}
 DRIVES = ("stairs", "ramps", "steps")
@@ -141,6 +143,61 @@ def test_what_explains_less_than_it_leaves_is_not_named(rubbing, monkeypatch, sh
     assert ("30 % of the squared error, and the rest is not noise" in told.why) == (grade == "approximates")
     (told,) = misspecification.grades_of(last, root, (), (), False, lambda name: worse)
     assert told.grade == "named"
+
+
+def test_nothing_is_named_while_the_model_does_not_follow_the_records(rubbing, monkeypatch):
+    monkeypatch.setattr(misspecification, "follows", lambda fit: False)
+    monkeypatch.setattr(stepwise, "judge_adequacy", lambda node, scores=(): replace(adequacy(node.fit), adequate=False))
+    monkeypatch.setattr(stepwise, "at_noise", lambda node: False)
+    found = mi.diagnose(*rubbing, effects=("coulomb",))
+    assert [r.grade for r in found.ladder.rungs] == [None, "approximates"]
+    assert found.ladder.rungs[1].why == "the model does not follow the records even with it"
+
+
+@pytest.mark.parametrize(("sizes", "belied"), [({"k_w": 0.5}, True), ({"k_w": 0.04}, False), ({"w_0": 3.0}, True),
+                                               ({"T_w": 0.1}, True), ({"T_d": 0.02}, False), ({"T_a": 0.04}, False)])
+def test_speed_and_angle_tell_what_their_sensors_do(sizes, belied):
+    """A speed 5 % too large and 20 ms late beside the angle, whatever moves the motor."""
+    t = 2e-3 * np.arange(2000)
+    late = 1.05 * np.where(t > 0.02, np.interp(t - 0.02, t, 20 * np.sin(3 * t)), 0.0)
+    run = mi.Experiment(t, {"v": np.sin(3 * t)}, {"omega": late, "theta": 20 / 3 * (1 - np.cos(3 * t))})
+    effect = {"k_w": "speed_gain", "w_0": "speed_offset", "T_w": "speed_lag", "T_d": "speed_delay",
+              "T_a": "speed_average"}[next(iter(sizes))]
+    fit = SimpleNamespace(values=sizes, problem=SimpleNamespace(experiments=(run,)))
+    assert bool(admissibility._belied(fit, LIBRARY[effect])) == belied
+    blind = SimpleNamespace(values=sizes, problem=SimpleNamespace(experiments=(run.without("theta"),)))
+    assert not admissibility._belied(blind, LIBRARY[effect])
+
+
+@pytest.mark.parametrize(("worse", "finished"), [(True, True), (False, False)])
+def test_what_held_out_runs_prefer_to_the_leader_puts_a_race_in_doubt(monkeypatch, worse, finished):
+    """Races are run on the fitted records alone."""
+    led, other = (SimpleNamespace(objection="", gain=g) for g in (9.0, 5.0))
+    monkeypatch.setattr(candidates, "evidence", lambda old, new: SimpleNamespace(
+        gain=new.gain, worse_there=worse and (old, new) == (other, led)))
+    assert candidates._in_doubt(SimpleNamespace(), [other, led]) == finished
+    assert candidates._in_doubt(SimpleNamespace(), [SimpleNamespace(objection="a sign", gain=1.0)])
+
+
+def test_errors_within_the_noise_that_nothing_predicts_are_no_missing_effect(lab, monkeypatch):
+    fit = mi.fit(mi.dc_motor(), runs_of(lab, {}))
+    monkeypatch.setattr(stepwise, "judge_adequacy", lambda node, scores=(): replace(
+        adequacy(node.fit), adequate=False, p_value=1e-6))
+    found = mi.diagnose(fit, effects=("quadratic_drag",))
+    assert (found.verdict, found.remaining.adequate, found.remainder.kind) == ("adequate", True, "noise")
+    assert found.text.startswith("Nothing that matters is missing: the errors are within the noise.")
+    assert "no effect and no free curve predicts" in found.text
+
+
+def test_runs_of_one_voltage_each_do_not_differ_from_run_to_run(lab):
+    """What is another in each is any law of the voltage."""
+    rise = 1 - np.exp(-np.arange(400) / 40)
+    steps = [mi.Experiment(1e-3 * np.arange(400), {"v": np.full(400, 12.0 * k)},
+                           {"omega": 100 * k * rise, "i": 5 * k - 4 * k * rise}) for k in (0.3, 0.5, 0.8)]
+    for runs, told in (runs_of(lab, {}), True), (steps, False):
+        fit = mi.fit(mi.dc_motor(), runs)
+        span = free_forms.span_of(fit, free_forms.signals_along(fit))
+        assert free_forms.shown(Form("a load", "torque", "run"), fit, span.ranges) == told
 
 
 @pytest.mark.parametrize(("share", "grade"), [(0.9, "approximates"), (0.998, "named")])

@@ -366,6 +366,15 @@ def test_the_first_angle_of_the_finest_encoder_is_estimated():
     assert fit.misfit["theta"] < 1.1
 
 
+@pytest.mark.parametrize("unit", ["A", "N·m", "N"])
+def test_a_commanded_current_or_torque_is_no_voltage(unit):
+    t = np.arange(50) * 1e-2
+    run = mi.Experiment(t, {"v": np.ones(50)}, {"omega": t}, units={"v": unit})
+    with pytest.raises(mi.ModelError, match=rf"v is in {unit}.*torque_driven"):
+        mi.Problem(mi.dc_motor(), [run])
+    mi.Problem(mi.torque_driven(), [run])
+
+
 @pytest.mark.parametrize("units", [{"theta": "m"}, {"omega": "m/s"}])
 def test_records_in_metres_are_none_of_a_drive_that_turns(units):
     t = np.arange(50) * 1e-2
