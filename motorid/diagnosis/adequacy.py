@@ -30,7 +30,7 @@ from motorid.diagnosis.thresholds import LARGER, SEARCHED
 from motorid.display.numbers import listed, number, percent
 from motorid.estimation.result import Fit
 from motorid.numerics.autoregression import autocorrelation, effective_samples
-from motorid.numerics.signals import Array, despiked, outlier_limit, quantum
+from motorid.numerics.signals import Array, despiked, quantum, winsorised
 from motorid.problem.runs import angle_signal
 from motorid.records.experiment import Experiment
 
@@ -166,18 +166,13 @@ def _dependences(fit: Fit, channel: str) -> list[dict[str, Any]]:
     """Test the residual of `channel` against every signal of the motion."""
     parts = _residuals(fit, channel)
     motions = [motion_of(fit, k) for k, _ in parts]
-    residuals = [_winsorised(r) for _, r in parts]
+    residuals = [winsorised(r) for _, r in parts]
     found = []
     for name in (n for n in motions[0] if all(n in m for m in motions)):
         if (labels := _labels([m[name] for m in motions], 2 * BINS if name == "theta" else BINS)) is not None:
             share, p = _shift_test(labels, residuals)
             found.append({"channel": channel, "on": NAMES[name], "share": share, "p": p})
     return found
-
-
-def _winsorised(r: Array) -> Array:
-    limit = outlier_limit(r) + 1e-300
-    return np.where(np.isfinite(r), np.clip(r, -limit, limit), 0.0)
 
 
 def _labels(signals: Sequence[Array], bins: int) -> list[NDArray[np.intp]] | None:

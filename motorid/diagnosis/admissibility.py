@@ -99,23 +99,17 @@ def _belied(fit: Fit, added: Effect) -> str:
     it is, of a mean half its window.
     """
     known = {"k_w": 1.0, "w_0": 1.0, "T_w": 1.0, "T_d": 1.0, "T_a": 0.5}
-    sizes = {n: known[n] * fit.values[n] for n in known if n in fit.values}
-    own = {p.name for p in added.parameters} & set(sizes)
-    both = [r for r in fit.problem.experiments if {"omega", "theta"} <= set(r.outputs)]
-    if not own or not both:
-        return ""
-    errors = []
-    for gone in (set[str](), own):
-        at, found = {n: sizes.get(n, 0.0) * (n not in gone) for n in known}, 0.0
-        for run in both:
-            good = np.isfinite(run.outputs["omega"]) & np.isfinite(run.outputs["theta"])
-            t, omega, theta = run.t[good], run.outputs["omega"][good], run.outputs["theta"][good]
-            told, turn, change, time = (np.diff(y[::max(len(t) // PARTS, 1)])
-                                        for y in (integral(t, omega), theta, omega, t))
+    own, errors = {p.name for p in added.parameters} & set(known), {True: 0.0, False: 0.0}
+    for run in (r for r in fit.problem.experiments if own and {"omega", "theta"} <= set(r.outputs)):
+        good = np.isfinite(run.outputs["omega"]) & np.isfinite(run.outputs["theta"])
+        t, omega, theta = run.t[good], run.outputs["omega"][good], run.outputs["theta"][good]
+        step = max(len(t) // PARTS, 1)
+        told, turn, change, time = (np.diff(y[::step]) for y in (integral(t, omega), theta, omega, t))
+        for present in errors:
+            at = {n: known[n] * fit.values.get(n, 0.0) * (present or n not in own) for n in known}
             late = at["T_w"] + at["T_d"] + at["T_a"]
-            found += float(np.sum((told - (1 + at["k_w"]) * turn + late * change - at["w_0"] * time) ** 2))
-        errors.append(found)
-    return "speed and angle, as measured, agree better without it" if errors[0] > errors[1] else ""
+            errors[present] += float(np.sum((told - (1 + at["k_w"]) * turn + late * change - at["w_0"] * time) ** 2))
+    return "speed and angle, as measured, agree better without it" if errors[True] > errors[False] else ""
 
 
 PARTS = 200  # of a run, in which a turn and the speed meanwhile are compared
@@ -159,14 +153,10 @@ def _too_quick(fit: Fit, width: float) -> str:
 
 
 def _too_slow(fit: Fit, speed: float) -> str:
-    speeds = [abs(_speed(r)) for r in fit.problem.experiments]
+    seen = [(r, r.outputs.get("omega")) for r in fit.problem.experiments]
+    speeds = [np.abs(window_slopes(r.t, angle_signal(r)) if y is None else y[np.isfinite(y)]) for r, y in seen]
     below = sum(int(((s < 2 * speed) & (s > 1e-6 * s.max(initial=0.0))).sum()) for s in speeds)
     return f"only {below} samples in motion are so slow" if below < PASSAGE else ""
-
-
-def _speed(run) -> Array:
-    y = run.outputs.get("omega")
-    return y[np.isfinite(y)] if y is not None else window_slopes(run.t, angle_signal(run))
 
 
 def samples_within(angle: Array, width: float) -> list[int]:

@@ -31,7 +31,7 @@ from motorid.effects import LIBRARY, MEASURED, PER_RUN
 from motorid.errors import ModelError
 from motorid.estimation.least_squares import FAILURES
 from motorid.estimation.result import Fit
-from motorid.model.definition import Effect, Parameter
+from motorid.model.definition import Effect
 from motorid.model.model import Model
 from motorid.numerics.parallel import check_time
 from motorid.numerics.signals import noise_level
@@ -256,7 +256,9 @@ class Search:
         present, tasks = node.fit.model, []
         for a, b in pairs_of(node.fit, self._shortlist(node), PAIRS):
             with contextlib.suppress(ModelError):
-                tasks.append(Task(node.fit, present + a.effect + b.effect, a.effect, _merged(a, b)))
+                best = {**a.starts[0], **b.starts[0]}  # and the next best of either
+                starts = [best, *({**best, **s.starts[1]} for s in (a, b) if len(s.starts) > 1)]
+                tasks.append(Task(node.fit, present + a.effect + b.effect, a.effect, starts))
         return self._together(node, tasks)
 
     def expand_from(self, node: Node, refused: Candidate) -> list[Node]:
@@ -357,7 +359,9 @@ class Search:
             new = [e for e in model.effects if e.name not in node.fit.model.effect_names]
             gone = [e for e in node.fit.model.effects if e.name not in model.effect_names]
             for p in (p for e in new for p in e.parameters if p.name not in values):
-                if alike := [node.fit.values[o.name] for e in gone for o in e.parameters if _alike(p, o)]:
+                # What plays the same part: a size, or a shape of the same unit.
+                if alike := [node.fit.values[o.name] for e in gone for o in e.parameters if p.null == o.null == 0
+                             or (p.null is None and o.null is None and p.unit == o.unit)]:
                     values[p.name] = max(alike)
             self.stages.at(f"trying {model.title}")
             fit = refit(node.fit, model, (values,))
@@ -401,17 +405,6 @@ def _in_place(model: Model, old: Effect, new: Effect) -> Model | None:
         return (model.without(old.name) + new).with_(effects=effects)
     except ModelError:
         return None
-
-
-def _alike(p: Parameter, other: Parameter) -> bool:
-    """Tell whether two effects' parameters play the same part: a size, or a shape of the same unit."""
-    return p.null == other.null == 0 or (p.null is None and other.null is None and p.unit == other.unit)
-
-
-def _merged(a: Score, b: Score) -> list[dict[str, float]]:
-    """Return starts of two effects together: the best of both, and the next best of either."""
-    best = [{**dict(a.starts[0]), **dict(b.starts[0])}]
-    return best + [{**best[0], **dict(s.starts[1])} for s in (a, b) if len(s.starts) > 1]
 
 
 def _unseen(score: Score) -> str:

@@ -96,7 +96,7 @@ def diagnose(fit: Fit, validate: Sequence[Experiment] | Experiment | None = None
 def _told(found: Climb, driven: str, validated: bool) -> Diagnosis:
     """Return what a climb found, in words and as a result."""
     fit, ladder, remaining = found.search.root.fit, ladder_of(found, validated), found.remaining
-    missing, judged = locate(fit), found.first if len(found.path) > 1 else remaining
+    missing, judged = locate(fit), found.first
     names = tuple(g.effect for g in found.grades if g.grade != "approximates")
     ranking = found.rounds[0] if found.rounds else ()
     groups = tuple(g for g in found.groups if g[0] in names)
@@ -119,12 +119,14 @@ def _told(found: Climb, driven: str, validated: bool) -> Diagnosis:
         suggestion = _suggestion(found)
     elif len(found.path) > 1 or not remaining.adequate:
         verdict, where = "unexplained", missing.where
+        judged = judged if len(found.path) > 1 else remaining
         answer = unexplained_text(ranking, ladder.rungs, found.grades, like.text if like else "", remaining,
                                   done=not found.stopped)
         details = [] if len(found.path) > 1 else [judged.text]
         details += [missing.text, rises_text(ladder.rungs)]
     else:
-        verdict, where, (answer, *details) = "adequate", None, adequate_text(judged, ranking, bool(far(ladder.best)))
+        verdict, where, judged = "adequate", None, remaining
+        answer, *details = adequate_text(judged, ranking, bool(far(ladder.best)))
     kind = "structure" if not remaining.adequate else "fluctuation" if far(ladder.best) else "noise"
     if not names:
         details.append(unseen_remark(unseen))

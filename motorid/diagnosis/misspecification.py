@@ -171,8 +171,7 @@ def grades_of(last: Node, root: Node, groups: Sequence[Sequence[str]], beside: S
     for e in (e for e in last.fit.model.effects if e.name not in root.key):
         why, form = objections(last.fit, e, root.fit), None
         why = why or ("it may only stand in for the driver's current limit" if limited else "")
-        astray = structure and not follows(last.fit)
-        why = why or ("the model does not follow the records even with it" if astray else "")
+        why = why or ("the model does not follow the records with it" if structure and not follows(last.fit) else "")
         why = why or _insignificant(last.fit, e, structure) or _within_smoothing(last.fit, e)
         smaller = without(e.name) if not why and (structure or far(last.fit)) else None
         if smaller is not None:
@@ -180,7 +179,9 @@ def grades_of(last: Node, root: Node, groups: Sequence[Sequence[str]], beside: S
             free = [b for b in free if _swallows(last.fit, b.form, e)]
             free = free or better_forms(smaller.fit, last.predictions)
             taken = 1 - (1 - max(evidence(smaller, last).fall, 0.0)) ** 2
-            told = [b for b in free if b.evidence.fall > SUPPLANTS and _more(b.evidence.fall, taken) > TRIFLE]
+            # What a form explains that lets the error fall once more, over what the effect does, RMS of the outputs.
+            more = [np.sqrt((1 - taken) * (1 - (1 - b.evidence.fall) ** 2) / max(taken, 1e-12)) for b in free]
+            told = [b for b, m in zip(free, more, strict=True) if b.evidence.fall > SUPPLANTS and m > TRIFLE]
             better = next((b for b in told if beside and b.form == beside[0].form), told[0] if told else None)
             if better is not None:
                 form, why = better.form, f"{better.form.text}, which the library lacks, predicts better in its place"
@@ -189,11 +190,6 @@ def grades_of(last: Node, root: Node, groups: Sequence[Sequence[str]], beside: S
         kind = "approximates" if why else "group" if rivals.get(e.name) else "named"
         found.append(Grade(e.name, kind, why, form))
     return tuple(found)
-
-
-def _more(fall: float, taken: float) -> float:
-    """Return what a form that lets the error fall once more explains, over what the effect does, RMS of the outputs."""
-    return float(np.sqrt((1 - taken) * (1 - (1 - fall) ** 2) / max(taken, 1e-12)))
 
 
 def _insignificant(fit: Fit, effect: Effect, structure: bool) -> str:

@@ -96,15 +96,12 @@ class Table:
         shown = self.on_page
         head = "".join(f'<th scope="col">{escape(str(h))}</th>' for h in shown.header)
         caption = f"<caption>{escape(self.note)}</caption>" if self.note else ""
-        rows = "\n".join(_row(r) for r in shown.rows)
+        cells = ([c.to_html() if isinstance(c, Flag) else escape(c) for c in r] for r in shown.rows)
+        rows = "\n".join(f'<tr><th scope="row">{name}</th>' + "".join(f"<td>{t}</td>" for t in rest) + "</tr>"
+                         for name, *rest in cells)
         table = '<table class="wordy">' if shown.wordy else "<table>"
         return (f'<div class="scroll">{table}{caption}\n<thead><tr>{head}</tr></thead>\n<tbody>\n{rows}\n'
                 "</tbody></table></div>")
-
-
-def _row(cells: Sequence[Cell]) -> str:
-    name, *rest = (c.to_html() if isinstance(c, Flag) else escape(c) for c in cells)
-    return f'<tr><th scope="row">{name}</th>' + "".join(f"<td>{t}</td>" for t in rest) + "</tr>"
 
 
 def value_cell(value: float, std: float | None, unit: str = "", why: str = "not determined") -> Cell:

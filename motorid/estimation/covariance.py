@@ -76,11 +76,14 @@ def certainty(problem: Problem, q: Array, residuals: Array, jacobian: Array, fre
     `free` (k, m) are the directions that active constraints leave; ``method="white"`` takes samples as independent.
     """
     among(method, ("coloured", "white"), "method")
-    limits = [_limit(p.lower, p.upper, v) for p, v in zip(problem.unknown, problem.scaling.physical(q), strict=True)]
+    limits = ["at its lower limit" if v <= p.lower else "at its upper limit" if v >= p.upper else ""
+              for p, v in zip(problem.unknown, problem.scaling.physical(q), strict=True)]
     loose = np.array([not s for s in limits], bool)
     basis = np.eye(len(loose))[:, loose] if free is None else free
     blocks = channel_blocks(problem, residuals, jacobian)
-    colours = _colours(blocks, basis.shape[1], method)
+    colours = {c: colour_of([r for r, _ in parts], basis.shape[1] / len(blocks)) for c, parts in blocks.items()}
+    if method != "coloured":
+        colours = {c: Colour(np.zeros(0), k.variance, k.variance) for c, k in colours.items()}
     unit = np.maximum(problem.scaling.slope(q), np.abs(problem.scaling.physical(q)))
     influence = np.linalg.norm(jacobian * unit, axis=0)
     jacobian = np.where(influence > ROUNDING * influence.max(initial=0.0), jacobian, 0.0)
@@ -107,21 +110,10 @@ def _vague(problem: Problem, q: Array, matrix: Array) -> NDArray[np.bool_]:
     return np.sqrt(np.maximum(np.diag(matrix), 0.0)) > UNDETERMINED * np.maximum(np.abs(physical), least)
 
 
-def _limit(lower: float, upper: float, value: float) -> str:
-    if value <= lower:
-        return "at its lower limit"
-    return "at its upper limit" if value >= upper else ""
-
-
 def channel_blocks(problem: Problem, residuals: Array, jacobian: Array) -> dict[str, list[tuple[Array, Array]]]:
     """Return per channel and run the whitened residual (N,), NaN where missing, and its Jacobian (N, k), 0 there."""
     runs = list(zip(problem.runs, problem.unstack(residuals), problem.unstack(jacobian, 0.0), strict=True))
     return {c: [(r[:, j], jac[:, j]) for run, r, jac in runs if c in run.sigma] for j, c in enumerate(problem.outputs)}
-
-
-def _colours(blocks: Blocks, unknowns: int, method: str) -> dict[str, Colour]:
-    found = {c: colour_of([r for r, _ in parts], unknowns / len(blocks)) for c, parts in blocks.items()}
-    return found if method == "coloured" else {c: Colour(np.zeros(0), k.variance, k.variance) for c, k in found.items()}
 
 
 def _meat(problem: Problem, jacobian: Array, blocks: Blocks, colours: Mapping[str, Colour], along: Array) -> Array:

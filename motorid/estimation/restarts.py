@@ -57,7 +57,9 @@ def restarted_where_doubtful(found: Estimate, begin: Problem, effort: LevenbergM
         careful = replace(effort, damping=restart.damping)
         with suppress(*FAILURES):
             start = _shifted(begin, restart.shift, k) if restart.shift else begin
-            start = _by_other_weights(start, careful) if restart.other_weights else start
+            if restart.other_weights:
+                other = start.tuned(weights="noise" if start.weights == "rms" else "rms", noise_factors={})
+                start = start.start_at(least_squares(other, careful.at_most(RACE)).values)
             again = least_squares(start, careful, callback)
             found = replace(min(found, again, key=lambda e: e.cost), history=found.history + again.history)
     return found
@@ -84,12 +86,6 @@ def _shifted(problem: Problem, shift: float, seed: int) -> Problem:
     model = problem.model
     names = [p.name for p in problem.unknown if p.positive and p.vary and p.name in model.parameters]
     return problem.start_at({n: model.values[n] * float(np.exp(shift * rng.uniform(-1, 1))) for n in names})
-
-
-def _by_other_weights(problem: Problem, effort: LevenbergMarquardt) -> Problem:
-    weights = "noise" if problem.weights == "rms" else "rms"
-    found = least_squares(problem.tuned(weights=weights, noise_factors={}), effort.at_most(RACE))
-    return problem.start_at(found.values)
 
 
 # -- collapsed parameters --------------------------------------------------------------------------------------

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from motorid.numerics.signals import Array, outlier_limit
+from motorid.numerics.signals import Array, winsorised
 
 HIGHEST_ORDER = 30  # of a channel's model
 ORDER = 8  # of the filters
@@ -88,7 +88,7 @@ class Whitening:
         """Return the filters for `residuals`, one (N, ny) per run, NaN where missing."""
         found = []
         for j in range(residuals[0].shape[1]):
-            parts = [_filled(r[:, j]) for r in residuals]
+            parts = [winsorised(r[:, j]) for r in residuals]
             *_, (a, _) = _levinson(autocovariance(parts, ORDER))
             coefficients = np.concatenate([[1.0], -a, np.zeros(ORDER - len(a))])
             left = np.concatenate([_filtered(coefficients, x) for x in parts])
@@ -121,12 +121,6 @@ def _filtered(a: Array, x: Array) -> Array:
     """Return Σ a_k·x[n−k] along the first axis for n from ORDER on."""
     n = max(len(x) - ORDER, 0)
     return sum((c * x[ORDER - k : ORDER - k + n] for k, c in enumerate(a)), np.zeros((n, *x.shape[1:])))
-
-
-def _filled(x: Array) -> Array:
-    """Return `x` with zero for what is missing, outliers cut."""
-    limit = outlier_limit(x)
-    return np.clip(np.nan_to_num(x), -limit, limit) if limit > 0 else np.nan_to_num(x)
 
 
 def autocovariance(parts: Sequence[Array], lags: int) -> Array:

@@ -60,6 +60,12 @@ def outlier_limit(r: Array) -> float:
     return CLIP * robust_std(r)
 
 
+def winsorised(r: Array) -> Array:
+    """Return `r` with zero for what is missing, outliers cut."""
+    limit = outlier_limit(r)
+    return np.clip(np.nan_to_num(r), -limit, limit) if limit > 0 else np.nan_to_num(r)
+
+
 def despiked(r: Array) -> Array:
     """Return `r` (N,) without NaN, samples that stand alone far from both neighbours replaced by the middle of three.
 
@@ -162,12 +168,8 @@ def noise_level(y: ArrayLike, t: ArrayLike | None = None) -> float:
     measured = np.count_nonzero(fresh)
     if step == 0 and FEWEST_FRESH <= measured < 0.5 * fresh.size and np.unique(values).size > 0.5 * measured:
         values, times = values[fresh], times[fresh]  # hardly one comes twice: no levels of a coarse counter
-    return float(max(_from_differences(values, times, step), step / np.sqrt(12), _floor(values)))
-
-
-def _floor(values: Array) -> float:
     size = float(np.std(values) or np.abs(values).max()) if values.size else 0.0
-    return _FLOOR * size if size > 0 else 1.0
+    return float(max(_from_differences(values, times, step), step / np.sqrt(12), _FLOOR * size if size > 0 else 1.0))
 
 
 def _from_differences(values: Array, times: Array, step: float) -> float:

@@ -156,7 +156,9 @@ def initial_state(run: Experiment, sigma: Mapping[str, float],
             continue
         y = run.outputs[c]
         if c == "theta":
-            start[k] = _resting(y[:lead], sigma[c]) if known else _first(y)
+            lull = y[:lead][np.isfinite(y[:lead])]  # before the first voltage; the first samples where it creeps there
+            still = known and lull.size and np.ptp(lull) < REACH * sigma[c]
+            start[k] = lull.mean() if still else _first(y[:lead] if known else y)
             if initial in ("estimate", "auto"):
                 reach[c] = _reach(y, sigma[c])
         elif not known:
@@ -254,12 +256,6 @@ def _cubic(x: Array, y: Array) -> tuple[float, float]:
 def _first(y: Array) -> float:
     good = y[np.isfinite(y)][:3]
     return float(np.median(good)) if good.size else 0.0
-
-
-def _resting(y: Array, sigma: float) -> float:
-    """Return the mean of an angle before the first voltage; the first samples where it creeps meanwhile."""
-    good = y[np.isfinite(y)]
-    return float(good.mean()) if good.size and np.ptp(good) < REACH * sigma else _first(y)
 
 
 def _reach(y: Array, sigma: float) -> float:

@@ -81,16 +81,13 @@ def require_unit(text: object, channel: str) -> Unit:
         known += ["0.047 V (a factor)"] if channel == "v" else []
         raise DataError(f"the unit of '{channel}': {one_of(str(text), known, 'unit')}")
     if unit.dimension not in allowed:
-        raise DataError(f"'{channel}' cannot be in {unit.label}: that is {_a(unit.dimension)}, expected "
-                        f"{' or '.join(map(_a, allowed))}. Is it the right column?")
+        is_, *wanted = (f"a{'n' * d.startswith('a')} {d}" for d in (unit.dimension, *allowed))
+        raise DataError(f"'{channel}' cannot be in {unit.label}: that is {is_}, expected {' or '.join(wanted)}. "
+                        "Is it the right column?")
     if not math.isfinite(unit.factor):
         raise DataError(f"'{channel}' comes in encoder counts: say how many make one turn, "
                         f"e.g. units={{'{channel}': '{unit.label}:2048'}} (counts after quadrature).")
     return unit
-
-
-def _a(noun: str) -> str:
-    return f"an {noun}" if noun[0] in "aeiou" else f"a {noun}"
 
 
 def _counts(label: str, per_second: str | None, number: str | None) -> Unit:

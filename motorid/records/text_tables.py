@@ -175,7 +175,11 @@ def _header(above: list[str], comments: list[str], dialect: Dialect, width: int,
             return unique_labels(fitting[-1]), []
         return [str(k + 1) for k in range(width)], []
     # Names, units; or long names, units, short names.
-    at = next((k for k in (-1, -2) if len(rows) > -k and _is_unit_row(rows[k]) and len(rows[k - 1]) >= width), None)
+    def of_units(cells: list[str]) -> bool:
+        words = [c for c in cells if c.strip("[]()- ")]
+        return bool(words) and sum(parse_unit(c) is not None for c in words) >= 0.5 * len(words)
+
+    at = next((k for k in (-1, -2) if len(rows) > -k and of_units(rows[k]) and len(rows[k - 1]) >= width), None)
     units, names = ([], rows[-1]) if at is None else (rows[at], rows[-2] if at == -1 else rows[-1])
     if len(names) < width:
         hint = (" If the comma is the decimal mark, too, export with a semicolon between the cells."
@@ -196,11 +200,6 @@ def _names(line: str, dialect: Dialect, width: int) -> list[str]:
     while cells and not cells[-1]:
         cells.pop()
     return cells
-
-
-def _is_unit_row(cells: list[str]) -> bool:
-    words = [c for c in cells if c.strip("[]()- ")]
-    return bool(words) and sum(parse_unit(c) is not None for c in words) >= 0.5 * len(words)
 
 
 def _rows(lines: list[str], dialect: Dialect, width: int, notes: list[str]) -> list[str]:

@@ -73,7 +73,8 @@ def test_where_nothing_can_be_named_what_is_left_is_that_of_the_last_model(adequ
 
 
 def test_errors_beyond_the_noise_are_in_the_answer_where_nothing_is_missing():
-    judged = SimpleNamespace(text="The errors (speed 4 times the noise) do not depend on the motion.")
+    judged = SimpleNamespace(text="The errors (speed 4 times the noise) do not depend on the motion.", p_value=0.5,
+                             false_alarm=0.02)
     small, large = (adequate_text(judged, (), beyond)[0] for beyond in (False, True))
     assert small == "Nothing is missing: the errors do not depend on the motion."
     assert "larger than the noise" in large

@@ -151,7 +151,7 @@ def test_nothing_is_named_while_the_model_does_not_follow_the_records(rubbing, m
     monkeypatch.setattr(stepwise, "at_noise", lambda node: False)
     found = mi.diagnose(*rubbing, effects=("coulomb",))
     assert [r.grade for r in found.ladder.rungs] == [None, "approximates"]
-    assert found.ladder.rungs[1].why == "the model does not follow the records even with it"
+    assert found.ladder.rungs[1].why == "the model does not follow the records with it"
 
 
 @pytest.mark.parametrize(("sizes", "belied"), [({"k_w": 0.5}, True), ({"k_w": 0.04}, False), ({"w_0": 3.0}, True),
