@@ -179,9 +179,9 @@ def grades_of(last: Node, root: Node, groups: Sequence[Sequence[str]], beside: S
             free = [b for b in free if _swallows(last.fit, b.form, e)]
             free = free or better_forms(smaller.fit, last.predictions)
             taken = 1 - (1 - max(evidence(smaller, last).fall, 0.0)) ** 2
-            # What a form explains that lets the error fall once more, over what the effect does, RMS of the outputs.
-            more = [np.sqrt((1 - taken) * (1 - (1 - b.evidence.fall) ** 2) / max(taken, 1e-12)) for b in free]
-            told = [b for b, m in zip(free, more, strict=True) if b.evidence.fall > SUPPLANTS and m > TRIFLE]
+            told = [b for b in free if b.evidence.fall > SUPPLANTS]  # explains more, over what the effect does, RMS:
+            more = [np.sqrt((1 - taken) * (1 - (1 - b.evidence.fall) ** 2) / max(taken, 1e-12)) for b in told]
+            told = [b for b, m in zip(told, more, strict=True) if m > TRIFLE]
             better = next((b for b in told if beside and b.form == beside[0].form), told[0] if told else None)
             if better is not None:
                 form, why = better.form, f"{better.form.text}, which the library lacks, predicts better in its place"
