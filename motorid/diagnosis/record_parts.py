@@ -16,9 +16,7 @@ from numpy.typing import NDArray
 from motorid.errors import MotoridError
 from motorid.estimation.fit import solve
 from motorid.estimation.result import Fit
-from motorid.integrate import limited
 from motorid.numerics.signals import Array
-from motorid.problem.problem import Problem
 from motorid.problem.runs import angle_signal
 from motorid.records.experiment import Experiment, part_meta
 
@@ -27,8 +25,6 @@ SMALL = 0.1  # of the error: a difference that changes no judgement
 AFFORDABLE = 60_000  # steps of integration per simulation of all records
 WANTED = 24_000  # of what is longer
 PART = 1000  # samples
-SUBSTEPS = 10  # per sample: what needs more cannot be seen in these samples, unless it is cheap
-CHEAP = 60_000  # steps of integration
 LONG = 20_000  # samples: a first fit of their parts tells whether all of them are affordable
 FEW = 4 * PART  # samples of that first fit
 NEARLY_ALL = 0.7  # of the samples: no reason to leave out the rest
@@ -79,20 +75,6 @@ def _predicted(t: Array, model: Array, error: Array, k: int, noise: float) -> bo
     of_noise = noise * np.sqrt(np.sum(1 + w**2 + (1 - w) ** 2) / k)  # linear interpolation of white noise
     return (rms_between(error) < (1 + SMALL) * of_noise
             and rms_between(model) < SMALL * np.sqrt(np.mean(error[good] ** 2)))
-
-
-def worth_its_steps(problem: Problem) -> bool:
-    """Tell whether a problem takes no more sub-steps than its samples are worth."""
-    return sum(int(r.grid.substeps.sum()) for r in problem.runs) <= _most(problem)
-
-
-def _most(problem: Problem) -> int:
-    return max(SUBSTEPS * _samples(problem.experiments), CHEAP)
-
-
-def within_worth(problem: Problem) -> Problem:
-    """Return the problem with an engine that gives up where one record takes more sub-steps than that."""
-    return problem.tuned(engine=limited(problem.integrator, _most(problem)))
 
 
 def fit_affordably(runs: Sequence[Experiment], fit: Callable[[Sequence[Experiment]], Fit]) -> Fit:

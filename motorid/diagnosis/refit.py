@@ -13,7 +13,6 @@ import numpy as np
 
 from motorid.diagnosis.cross_validation import QUICK, ROUGH
 from motorid.diagnosis.model_comparison import far, size_of
-from motorid.diagnosis.record_parts import within_worth, worth_its_steps
 from motorid.diagnosis.score_test import believable_start, uses_angle
 from motorid.diagnosis.thresholds import MATERIAL, NATS
 from motorid.errors import OutOfTime
@@ -194,10 +193,10 @@ def _started(fit: Fit, model: Model, start: Mapping[str, float], angular: bool) 
 def _race(problem: Problem) -> Estimate | None:
     """Go a few steps; None where that fails or needs more sub-steps than the samples are worth."""
     try:
-        done = by_continuation(within_worth(problem), RACE, wide=False, narrow=False)
+        done = by_continuation(problem.within_worth(), RACE, wide=False, narrow=False)
     except FAILURES:
         return None
-    return replace(done, problem=done.problem.tuned(engine=problem.engine)) if worth_its_steps(done.problem) else None
+    return replace(done, problem=done.problem.tuned(engine=problem.engine)) if done.problem.worth_its_steps else None
 
 
 def _bounded(fit: Fit, model: Model) -> Model:
@@ -222,7 +221,7 @@ def _polished(fit: Fit, problem: Problem) -> Fit | None:
     """
     try:
         exact = problem.tuned(accuracy=fit.problem.accuracy)
-        problem = exact if worth_its_steps(exact.refined(exact.start)) else problem.tuned(accuracy=ROUGH)
+        problem = exact if exact.refined(exact.start).worth_its_steps else problem.tuned(accuracy=ROUGH)
         done = _converged(problem)
         if problem.noise_factors:
             factors = misfit_over_noise(done.problem, done.solution.q)

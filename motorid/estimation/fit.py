@@ -252,13 +252,14 @@ def no_worse_than_smaller(found: Estimate, asked: Problem, effort: LevenbergMarq
     for effect in problem.model.effects:
         with contextlib.suppress(*FAILURES):
             smaller = asked.for_model(asked.model.without(effect.name)).tuned(noise_factors=problem.noise_factors)
+            smaller = smaller.within_worth() if problem.worth_its_steps else smaller
             end = restore_collapsed(by_continuation(with_start_values(smaller), effort), effort)  # in the same weights
             if end.cost > found.cost:
                 continue
             fresh = {p.name: suited(p, sizes).value for p in effect.parameters if p.vary and not p.given}
             vanishing = [p.name for p in effect.parameters if p.null == 0]
             weak = {n: NEXT_TO_NOTHING * value for n, value in fresh.items() if n in vanishing}
-            there = end.onward.tuned(width=problem.width)
+            there = end.onward.tuned(width=problem.width, engine=problem.engine)
             starts = [there.for_model(problem.model.start_at(end.values | fresh | size)) for size in ({}, weak)]
             again = race(starts, effort, solve=by_continuation)
             if again is not None and again.cost < found.cost:

@@ -23,6 +23,9 @@ from motorid.problem.runs import Run, channels_of, noise_of, prepare_run, smooth
 from motorid.problem.unknowns import Point, Scaling, Unknowns
 from motorid.records.experiment import Experiment, between_pauses, units_of
 
+SUBSTEPS = 10  # per sample: what needs more cannot be seen in these samples, unless it is cheap
+CHEAP = 60_000  # steps of integration
+
 
 @dataclass(frozen=True, eq=False)
 class Problem:
@@ -214,6 +217,19 @@ class Problem:
     def with_finer_steps(self, factor: int) -> Problem:
         """Return the problem with `factor` times as many sub-steps everywhere."""
         return self.with_runs(tuple(replace(r, grid=r.grid.with_substeps(factor * r.grid.substeps)) for r in self.runs))
+
+    @property
+    def worth_its_steps(self) -> bool:
+        """Tell whether it takes no more sub-steps than its samples are worth."""
+        return sum(int(run.grid.substeps.sum()) for run in self.runs) <= self._most_steps
+
+    def within_worth(self) -> Problem:
+        """Return the problem with an engine that gives up where one record takes more sub-steps than that."""
+        return self.tuned(engine=limited(self.integrator, self._most_steps))
+
+    @property
+    def _most_steps(self) -> int:
+        return max(SUBSTEPS * sum(r.n for r in self.experiments), CHEAP)
 
     def with_runs(self, runs: tuple[Run, ...]) -> Problem:
         """Return a copy with other grids that keeps everything else already made."""

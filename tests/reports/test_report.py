@@ -3,7 +3,6 @@
 import dataclasses
 import os
 import re
-import time
 from html import unescape
 from itertools import pairwise
 from pathlib import Path
@@ -18,7 +17,6 @@ import motorid as mi
 from motorid.errors import UsageError
 
 LIMIT = 2_000_000  # bytes
-SECONDS = 5.0  # of the processor, for the report of a whole diagnosis
 
 
 @pytest.fixture(scope="module")
@@ -27,17 +25,11 @@ def found():
 
 
 @pytest.fixture(scope="module")
-def timed(found, tmp_path_factory):
-    """The report of a diagnosis, and the processor time it took."""
+def page(found, tmp_path_factory):
+    """The report of a whole diagnosis."""
     path = tmp_path_factory.mktemp("report") / "report.html"
-    began = time.process_time()
     mi.report(found, path, command="motorid diagnose run*.csv <here>", validate=hand_made.friction()[1])
-    return path, time.process_time() - began
-
-
-@pytest.fixture(scope="module")
-def page(timed):
-    return timed[0]
+    return path
 
 
 @pytest.fixture(scope="module")
@@ -66,10 +58,8 @@ def test_it_is_valid_html(tree):
     assert local(tree) == "html"
 
 
-def test_it_is_small_and_quick(timed):
-    path, seconds = timed
-    assert path.stat().st_size < LIMIT
-    assert seconds < SECONDS
+def test_it_is_small(page):
+    assert page.stat().st_size < LIMIT
 
 
 def test_it_needs_no_network_and_no_script(tree, text):
