@@ -105,7 +105,9 @@ def record(port: str | Link, out: str | Path, *, baud: int = 115_200, excite: st
         try:
             told, kept = (next(c for c in h.channels if c.name == "v") for h in (device, header))
             commanded = partial(_commanded, told, kept, device.rate, todo)
-            session = Session(client, header, file, len(todo.segments), commanded, _most(told, kept, *limits),
+            beside = abs(told.scale * (told.offset - kept.offset))  # what may be reported, as a calibration makes it
+            most = {"v": abs(kept.scale / told.scale) * (1.01 * limits[0] + beside), "i": limits[1]}
+            session = Session(client, header, file, len(todo.segments), commanded, most,
                               min((e for e in (todo.duration, duration) if e), default=None), duration,
                               max(timeout, 4 / header.rate), progress)
             if tail:
@@ -116,12 +118,6 @@ def record(port: str | Link, out: str | Path, *, baud: int = 115_200, excite: st
                 file.close()
     finally:
         link.close()
-
-
-def _most(told: Channel, kept: Channel, v_max: float, i_max: float) -> dict[str, float]:
-    """Return the largest voltage, in the units that a calibration makes of it, and current that may be reported."""
-    beside = abs(told.scale * (told.offset - kept.offset))
-    return {"v": abs(kept.scale / told.scale) * (1.01 * v_max + beside), "i": i_max}
 
 
 def _commanded(told: Channel, kept: Channel, rate: float, todo: Program, index: int) -> float | None:

@@ -59,7 +59,9 @@ def adequacy(fit: Fit, scores: Sequence[Score] = (), level: float = FALSE_ALARM)
     beyond = {c for c, facts in channels.items() if facts["ratio"] > LARGER and finer(fit, c)}  # scores see little else
     tests = [*(t for c in channels if c not in beyond for t in _dependences(fit, c)),
              *(_score_tests(scores) if not beyond else ())]
-    material = [t for t in tests if t["share"] > _material(channels, t["channel"])]
+    rounded = {c: f["rounded"] for c, f in channels.items()}
+    rounded |= {None: np.mean([*rounded.values()])}
+    material = [t for t in tests if t["share"] > MATERIAL + (ROUNDED - MATERIAL) * rounded[t["channel"]]]
     p_value = min([1.0, *(t["p"] * len(tests) for t in material)])
     far = [c for c, facts in channels.items()
            if facts["ratio"] > LARGEST_RATIO / (2 if c == "theta" else 1) and c not in beyond]
@@ -77,12 +79,6 @@ def fine_angle_remark(fit: Fit) -> str:
         return ""
     share, times = percent(fit.nrmse["theta"], 2), number(fit.misfit["theta"], 2)
     return f"The angle's error, {share}, is {times} times what its encoder shows, but no model is asked for less."
-
-
-def _material(channels: Mapping[str, Mapping[str, float]], channel: str | None) -> float:
-    """Return the share below which a dependence of `channel` (None: of all together) is not worth a word."""
-    own = [f["rounded"] for c, f in channels.items() if channel in (c, None)]
-    return MATERIAL + (ROUNDED - MATERIAL) * float(np.mean(own))
 
 
 def following(judged: Adequacy, what: str) -> Adequacy:

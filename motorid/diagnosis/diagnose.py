@@ -115,7 +115,9 @@ def _told(found: Climb, driven: str, validated: bool) -> Diagnosis:
         same = {name: p for node in found.path[1:] for name, p in found.search.inseparable(node).items()}
         hidden = found.search.hidden(found.path[-1])
         details = [moves(fit, ladder.best), rises_text(ladder.rungs), inseparable_remark(same), hidden_remark(hidden)]
-        groups = (*groups, *(_sharing(ladder.best, name, parameters) for name, parameters in same.items()))
+        for name, shared in same.items():  # what acts through these parameters, and that one
+            inside = (e.name for e in ladder.best.model.effects if {p.name for p in e.parameters} & {*shared})
+            groups = (*groups, (*inside, name))
         suggestion = _suggestion(found)
     elif len(found.path) > 1 or not remaining.adequate:
         verdict, where = "unexplained", missing.where
@@ -148,12 +150,6 @@ def _remarks(found: Climb, driven: str) -> list[str]:
     return [stopped, driven, window_remark(last), next(limits, ""), parts_remark(first), unfinished_remark(last),
             held_out_remark(found.path[-1]), own, measured_angle_remark(last), outliers_remark(last),
             closed_loop_remark(first)]
-
-
-def _sharing(fit: Fit, name: str, parameters: Sequence[str]) -> tuple[str, ...]:
-    """Return the effects whose parameters together do what another effect does, and that one."""
-    inside = (e.name for e in fit.model.effects if {p.name for p in e.parameters} & set(parameters))
-    return (*inside, name)
 
 
 def _suggestion(found: Climb) -> str | None:

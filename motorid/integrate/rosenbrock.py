@@ -98,8 +98,7 @@ class Rosenbrock:
             if astray is None and patience > 0:
                 waits = bad & _overshot(bad, traj.x.T / sizes, error)
                 finer[waits] = grid.substeps[waits]
-                patience -= 1
-                passes += waits.any()
+                patience, passes = patience - 1, passes + waits.any()
             passes -= 1 if astray is None else 1 / 16
             if np.array_equal(finer, grid.substeps):
                 break
