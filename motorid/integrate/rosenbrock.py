@@ -24,6 +24,7 @@ CHUNK = 256  # steps in one call of the virtual machine
 MOST_SUBSTEPS = 256
 MOST_PASSES = 6
 WAITING = 8  # passes at most in which an oscillation waits for what began it
+RUNS = 10  # at least, on a grid once chosen
 LOST_ERROR = 0.3  # error estimate, relative to the state so far, at which a step is lost
 LOST_GROWTH = 1e3  # growth of a state that shows it
 
@@ -97,8 +98,9 @@ class Rosenbrock:
             finer = np.clip(grid.substeps * np.clip(factor, 1, 16), 1, MOST_SUBSTEPS).astype(np.int64)
             if astray is None and patience > 0:
                 waits = bad & _overshot(bad, traj.x.T / sizes, error)
-                finer[waits] = grid.substeps[waits]
-                patience, passes = patience - 1, passes + waits.any()
+                patience -= 1
+                if RUNS * (finer - grid.substeps)[waits].sum() > grid.substeps.sum():  # another run takes less
+                    finer[waits], passes = grid.substeps[waits], passes + 1
             passes -= 1 if astray is None else 1 / 16
             if np.array_equal(finer, grid.substeps):
                 break

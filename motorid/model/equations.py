@@ -166,13 +166,11 @@ class Equations:
         marks = {s.name() for s in symbols}
         before, used = set[str](), set[str]()
         for _ in range(len(names) + 1):
-            before, used = used, set()
-            for e in expressions:
-                used |= {s.name() for s in ca.symvar(e)}
+            before, used = used, {s.name() for s in ca.symvar(ca.vertcat(*expressions))}
             if not used & marks:
                 return expressions
             definitions = ca.vertcat(*[self.definitions[n] for n in names])
-            expressions = [ca.substitute(e, ca.vertcat(*symbols), definitions) for e in expressions]
+            expressions = ca.substitute(expressions, [ca.vertcat(*symbols)], [definitions])
         circle = ", ".join(sorted(s[1:] for s in (before | used) & marks))
         raise ModelError(f"the definitions of {circle} go in a circle: an effect scales or replaces a "
                          "quantity by an expression that needs that same quantity.")
