@@ -23,8 +23,6 @@ PATIENCE = 1.5e7  # instructions of the virtual machine (0.05 s) before a step i
 CHUNK = 256  # steps in one call of the virtual machine
 MOST_SUBSTEPS = 256
 MOST_PASSES = 6
-WAITING = 8  # passes at most in which an oscillation waits for what began it
-RUNS = 10  # at least, on a grid once chosen
 LOST_ERROR = 0.3  # error estimate, relative to the state so far, at which a step is lost
 LOST_GROWTH = 1e3  # growth of a state that shows it
 
@@ -70,10 +68,9 @@ class Rosenbrock:
         (Hairer, Nørsett & Wanner, Solving Ordinary Differential Equations I, 1993, II.4): a current that settles
         before the next sample needs no steps of its own.
         Where the run fails, so does every later one on this grid: coarse steps would jump over what happens.
-        A step that goes astray spoils all after it, which is then neither refined for nor a measure of size. A step
-        that overshoots a stop of the shaft makes coarse steps oscillate about it: they wait until it is fine enough.
+        A step that goes astray spoils all after it, which is then neither refined for nor a measure of size.
         """
-        passes, patience = MOST_PASSES, WAITING
+        passes = MOST_PASSES
         while passes > 0:
             try:
                 traj = self.run(system, grid, x0, p, local_error=True)
@@ -86,35 +83,21 @@ class Rosenbrock:
                 traj = traj._replace(x=traj.x[:astray + 2], y=traj.y[:astray + 2])
                 size, error[:, astray + 1:] = size[:, :astray + 2], 0.0
             sizes = np.maximum(np.maximum(size[:, -1], stepper(system).shown_sizes(grid, traj, p)), 1e-12)[:, None]
-            error /= sizes
-            rows = np.flatnonzero(error.max(axis=0) > level)
+            relative = (error / sizes).max(axis=0)
+            rows = np.flatnonzero(relative > level)
             if len(rows):
-                error[:, rows] = stepper(system).halved(grid, rows, traj.x, p, self.compiled) / sizes
-            relative = error.max(axis=0)
-            bad = ~(relative <= 2 * level)  # or not a number
-            if not bad.any():
+                relative[rows] = (stepper(system).halved(grid, rows, traj.x, p, self.compiled) / sizes).max(axis=0)
+            if not np.max(relative, initial=0.0) > 2 * level:  # or not a number
                 break
+            passes -= 1 if astray is None else 1 / 16
             factor = np.ceil(1.1 * (np.maximum(relative, 1e-300) / level) ** (1 / ORDER))
             finer = np.clip(grid.substeps * np.clip(factor, 1, 16), 1, MOST_SUBSTEPS).astype(np.int64)
-            if astray is None and patience > 0:
-                waits = bad & _overshot(bad, traj.x.T / sizes, error)
-                patience -= 1
-                if RUNS * (finer - grid.substeps)[waits].sum() > grid.substeps.sum():  # another run takes less
-                    finer[waits], passes = grid.substeps[waits], passes + 1
-            passes -= 1 if astray is None else 1 / 16
             if np.array_equal(finer, grid.substeps):
                 break
             if self.most_steps is not None and finer.sum() > self.most_steps:
                 raise SimulationError(f"the model is too stiff: it takes more than {self.most_steps} steps.")
             grid = grid.with_substeps(finer)
         return grid
-
-
-def _overshot(bad: NDArray[np.bool_], x: Array, error: Array) -> NDArray[np.bool_]:
-    """Tell after which bad intervals a state x (nx, N) turns back, by an error (nx, N-1) as large as the turn."""
-    d = np.diff(x)
-    turns = ((d[:, 1:] * d[:, :-1] < 0) & (error[:, 1:] > LOST_ERROR * np.abs(d[:, 1:]))).any(axis=0)
-    return np.append(False, bad[:-1] & turns)
 
 
 def _by_state(traj: Trajectory) -> tuple[Array, Array]:

@@ -260,25 +260,6 @@ def test_a_current_that_settles_between_samples_takes_no_steps_of_its_own(engine
     assert (error < 1e-3 * np.abs(exact).max(axis=0)).all()
 
 
-@pytest.mark.parametrize("engine", [Rosenbrock(True), Rosenbrock(False)], ids=["compiled", "machine"])
-def test_a_shaft_that_stops_between_samples_takes_fine_steps_there_and_none_at_rest(engine):
-    """A coarse step jumps over the stop, and every later one back again: once all of the rest took 128 each."""
-    motor = {**VALUES, "tau_c": 8e-3, "sgn_width": 2e-3}
-    system = (mi.dc_motor(**VALUES) + mi.effects.coulomb).system(("i", "omega"))
-    p = np.array([motor[n] for n in system.parameters])
-    t = 0.02 * np.arange(600)
-    v = np.where((t % 3 > 1) & (t % 3 < 1.5), 6.0, 0.0)
-    coarse = Grid.of(t, v[:, None], np.array([True]))
-    grid = engine.prepare(system, coarse, np.zeros(2), p, 1e-5)
-    seen = engine.run(system, grid, np.zeros(2), p).x
-    exact = engine.run(system, coarse.with_substeps(np.full(len(t) - 1, 4000)), np.zeros(2), p).x
-    assert (np.abs(seen - exact).max(axis=0) < 1e-3 * np.abs(exact).max(axis=0)).all()
-    resting = np.abs(exact[:-1, 1]) < 1e-6 * exact[:, 1].max()
-    assert np.mean(resting & (v[:-1] == 0)) > 0.5
-    assert np.median(grid.substeps[resting & (v[:-1] == 0)]) == 1
-    assert grid.substeps.mean() < 10
-
-
 @pytest.mark.parametrize("effects", [(), ("coulomb",), ("stribeck", "speed_lag", "winding_heating"), ("backlash",),
                                      ("cogging", "gravity", "speed_delay"), ("driver_coast", "eddy_brake")])
 @pytest.mark.parametrize("hold", ["zoh", "linear"])
