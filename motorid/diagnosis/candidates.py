@@ -29,6 +29,7 @@ from motorid.diagnosis.thresholds import MATERIAL
 from motorid.display.numbers import listed
 from motorid.effects import LIBRARY, MEASURED, PER_RUN
 from motorid.errors import ModelError
+from motorid.estimation.fit import solve
 from motorid.estimation.least_squares import FAILURES
 from motorid.estimation.result import Fit
 from motorid.model.definition import Effect
@@ -346,6 +347,18 @@ class Search:
         self.nodes[node.key] = lower
         self._scores.pop(node.key, None)
         return lower
+
+    def brought_to_its_end(self, node: Node) -> Node:
+        """Return a model whose refit stopped short, with errors far beyond the noise, fitted on from there.
+
+        A rugged cost (the rebounds in a gear's play) stops a refit's few steps; the whole effort of a fit goes on.
+        """
+        if node.fit.status != "converged" and far(node.fit):
+            with contextlib.suppress(*FAILURES):
+                fit = solve(node.fit.problem.with_(model=node.fit.model, noise_factors={}), start="model")
+                onward = replace(node, fit=fit, predictions=self.held.predictions(fit))
+                return onward if beats(onward, node) else node
+        return node
 
     def without(self, node: Node, name: str) -> Node | None:
         """Return the judged model without an effect; None where that is none."""

@@ -110,12 +110,12 @@ def _rounds(found: Climb, max_effects: int) -> Iterator[Climb]:
         if chosen is None:
             yield replace(found, text="stopped: no further effect lowers the error on data left out")
             return
-        new, ordered = chosen
+        new, ordered = search.brought_to_its_end(chosen[0]), chosen[1]
         yield _with(found, new, new, new.parent is frontier[0], ())
         if not stopped and (lower := search.settled(new)) is not None:
             yield from _rounds(replace(before, path=tuple(_path(lower))), max_effects)
             return
-        search.nodes |= children
+        search.nodes |= children | {new.key: new}
         if stopped:
             return
         pruned = search.pruned(new, best)
@@ -264,7 +264,7 @@ def explored(fit: Fit, validate: Sequence[Experiment] | Experiment | None, effec
         if found.stopped and len(found.path) == 1:  # what was found before is worth more than nothing
             found = replace(whole, stopped=found.stopped)
     last = found.path[-1]
-    again = None
+    again = reading = None
     if not found.stopped and records is not as_it_was and as_it_was.suits(last):
         again = as_it_was
     elif not found.stopped and (reading := _late_reading(found.path)):
@@ -275,6 +275,8 @@ def explored(fit: Fit, validate: Sequence[Experiment] | Experiment | None, effec
         new = anew.path[-1]
         better = evidence(last, new)
         if better.gain > 0 and better.fall > 0:
+            if reading:
+                again = replace(again, remarks=(*records.remarks, reading.remark(last.fit, new.fit)))
             records, found = again, anew
     return found, " ".join(records.remarks)
 

@@ -243,7 +243,8 @@ def minimise(problem: Problem, effort: LevenbergMarquardt, callback: Callback = 
 def no_worse_than_smaller(found: Estimate, asked: Problem, effort: LevenbergMarquardt) -> Estimate:
     """Return an estimate that, where it leaves more than noise, costs no more than without one of its effects.
 
-    A model contains the smaller one: if that, begun as `asked`, does better, this one is in a side valley: again.
+    A model contains the smaller one: where that, begun as `asked`, ends lower, this one is in a side valley, and
+    begins again from there.
     """
     problem, sizes = found.problem, natural_sizes(found.problem.experiments, found.values)
     if not max(misfit_over_noise(problem, found.q).values(), default=0.0) > IMBALANCE:

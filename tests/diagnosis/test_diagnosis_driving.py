@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 from battery.excite import P
 from command import motorid_json
 
 import motorid as mi
+from motorid.channels import channel_name
 from motorid.diagnosis import input_hypotheses as readings
 from motorid.diagnosis.input_hypotheses import better_reading
+from motorid.display.numbers import number
 from motorid.records.reading import write_csv
 
 FINE = 8  # steps of the plant per sample
@@ -122,6 +126,10 @@ def test_a_voltage_that_acts_late_is_no_effect(lab, hidden):
     assert found.remaining.adequate
     assert "acts 3 ms later than it was logged" in found.text
     assert "--delay 0.003" in found.text
+    ends = [f"{channel_name(c)} {before} → {number(100 * e, 3)} %" for c, e in found.after.nrmse.items()
+            for before in re.findall(rf"falls \(.*?{channel_name(c)} (\S+)", found.text)]
+    assert all(text in found.text for text in ends)  # of the model with its effects, not of the one before
+    assert len(ends) == 2
 
 
 def test_a_late_speed_is_not_taken_for_a_late_voltage(lab):

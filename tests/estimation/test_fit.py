@@ -15,6 +15,7 @@ from motorid.estimation import least_squares
 from motorid.estimation.continuation import by_continuation
 from motorid.estimation.fit import no_worse_than_smaller
 from motorid.integrate import Rosenbrock
+from motorid.problem import problem as problem_module
 from motorid.records.datasets import truth
 from motorid.records.experiment import windows
 
@@ -405,19 +406,32 @@ def test_a_fit_takes_no_more_least_squares_runs_than_its_docstring_says(effects,
     assert len(fit.history) <= sum(len(end.history) for end in ends)
 
 
-def test_a_model_that_misses_the_noise_fits_no_worse_than_without_one_of_its_effects(rng):
-    """From a side valley it begins again where the smaller model ends."""
+@pytest.fixture
+def side_valley(rng):
+    """A problem, and an estimate of it that ended far from where even a smaller model leads."""
     hidden = mi.dc_motor(**VALUES) + mi.effects.quadratic_drag(c_2=3e-6) + mi.effects.voltage_offset(V_0=0.4)
     t = np.arange(500) * 1e-3
-    records = [noisy(simulated(t, drive(t, volt), model=hidden), rng) for volt in (6.0, -4.0)]
-    model = mi.dc_motor() + mi.effects.coulomb + mi.effects.speed_lag
-    asked = mi.Problem(model, records)
+    record = noisy(simulated(t, drive(t, 6.0), model=hidden), rng)
+    asked = mi.Problem(mi.dc_motor() + mi.effects.coulomb + mi.effects.speed_lag, [record])
     begin = asked.start_at({"R": 300.0, "J": 1.0})
-    astray = least_squares.least_squares(begin, mi.LevenbergMarquardt(max_iterations=1))
+    return asked, least_squares.least_squares(begin, mi.LevenbergMarquardt(max_iterations=1))
+
+
+def test_a_model_that_misses_the_noise_fits_no_worse_than_without_one_of_its_effects(side_valley):
+    """From a side valley it begins again where the smaller model ends."""
+    asked, astray = side_valley
     mended = no_worse_than_smaller(astray, asked, least_squares.FINISH)
-    smaller = [asked.for_model(model.without(e.name)) for e in model.effects]
+    smaller = [asked.for_model(asked.model.without(e.name)) for e in asked.model.effects]
     least = min(by_continuation(each, least_squares.FINISH).cost for each in smaller)
     assert mended.cost < 1.001 * least < 0.1 * astray.cost
+    assert mended.problem.engine == asked.engine  # without the limit on the smaller model's steps
+
+
+def test_a_smaller_model_is_given_up_where_it_takes_more_steps_than_the_record_is_worth(side_valley, monkeypatch):
+    asked, astray = side_valley
+    monkeypatch.setattr(problem_module, "SUBSTEPS", 0)
+    monkeypatch.setattr(problem_module, "CHEAP", int(astray.problem.runs[0].grid.substeps.sum()))
+    assert no_worse_than_smaller(astray, asked, least_squares.FINISH) is astray
 
 
 def test_a_fit_can_go_on_from_a_fit(runs):
