@@ -225,7 +225,7 @@ class Search:
     def _takeable(self, model: Model) -> tuple[list[Effect], list[Effect]]:
         """Split the effects into those that can be added and those that would take an earlier one's place."""
         fresh, wider = [], []
-        have = set(model.effect_names)
+        have, several = set(model.effect_names), len(set(self.root.fit.problem.unknowns.firsts)) > 1
         contained = {i for e in model.effects for i in e.includes}
         for e in self.effects:
             if e.name in have or e.name in contained:
@@ -234,8 +234,9 @@ class Search:
                 continue  # a phase in metres is none
             if contained & set(e.includes) and not have & set(e.includes):
                 continue  # two that contain the same simpler one share its size between them
-            if any(p.per_run for p in e.parameters) and not self._restarts(model, e):
-                continue
+            acts = several and (not uses_angle(e) or any(map(uses_angle, model.effects)))
+            if any(p.per_run for p in e.parameters) and not acts:
+                continue  # it begins anew in each of several records, and needs something there to act on
             if have & set(e.includes):
                 wider.append(e)
                 continue
@@ -246,11 +247,6 @@ class Search:
                 continue
             fresh.append(e)
         return fresh, wider
-
-    def _restarts(self, model: Model, effect: Effect) -> bool:
-        """Tell whether there are several records, and what an effect that begins anew in each acts on."""
-        several = len(set(self.root.fit.problem.unknowns.firsts)) > 1
-        return several and (not uses_angle(effect) or any(uses_angle(e) for e in model.effects))
 
     def expand_by_two(self, node: Node) -> list[Node]:
         """Return the judged models larger by two effects that only together show: each alone was refused."""

@@ -330,7 +330,8 @@ def design_experiment(found: Diagnosis | Fit | Sequence[Fit | Rival], *, goal: s
         with limited_time(budget):
             best = _optimised(task, say)
         task, layout = _exact(replace(best.task, pairs=whole.pairs), rivals), best.task.layout
-        c = best.c if layout.ramps else _without_traces(layout, best.c)
+        bits = np.append(np.zeros(len(best.c) // 2), layout.bits)  # of the unknowns, which begin with the levels
+        c = best.c if layout.ramps else np.where((bits > 0) & (np.abs(best.c) < TRACE), 0.0, best.c)
         c, peaks = _safe(task.refined(layout.of(c), TOLERANCE), c)
         return _told(task.refined(layout.of(c), TOLERANCE), c, peaks, fixed, limits,
                      "stopped early" if best.stopped else "designed")
@@ -375,12 +376,6 @@ def _judged(task: Task) -> Task:
     task = replace(task, nominal=hopeless(task))
     never = hopeless(replace(task, pairs=tuple(task.nominal))) if task.nominal else ()
     return replace(task, pairs=tuple(p for p in task.pairs if p not in never) or task.pairs)
-
-
-def _without_traces(layout: Layout, c: Array) -> Array:
-    """Return the unknowns of steps without binary signals that are next to nothing."""
-    n = len(c) // 2
-    return np.concatenate([c[:n], np.where((np.array(layout.bits) > 0) & (np.abs(c[n:]) < TRACE), 0.0, c[n:])])
 
 
 def _hardest(task: Task, c: Array) -> Task:

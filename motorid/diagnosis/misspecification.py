@@ -92,7 +92,7 @@ def form_predictions(fit: Fit, linear: Linear, form: Form, kept: Sequence[int] |
     together = np.column_stack([columns, linear.own])
     try:
         residual = linear.residual - together @ ridge(together, linear.residual)
-        blocks = blocks_of([run.n for run in problem.experiments])
+        blocks = blocks_of(problem.experiments)
         moved = left_out(residual, columns, stacked_labels(problem, blocks))
     except np.linalg.LinAlgError:
         return None

@@ -21,16 +21,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from motorid.diagnosis.thresholds import (
-    BLOCKS,
-    DEGREES_OF_FREEDOM,
-    LOST,
-    MATERIAL,
-    NATS,
-    PLAIN,
-    STANDARD_ERRORS,
-    UNRELIABLE,
-)
+from motorid.diagnosis import thresholds
 from motorid.estimation.result import Fit
 from motorid.numerics.autoregression import effective_samples
 from motorid.numerics.signals import Array, despiked
@@ -40,6 +31,7 @@ from motorid.records.experiment import Experiment
 
 SETTLED = 1e-6  # relative change of the scale at which its iteration stops
 ROUNDS = 50
+FINER = 10  # cells in which changes are told, per block
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,7 +92,7 @@ class Evidence:
         is none. A rise there beyond that refuses it.
         """
         fall = self.fall if self.everywhere is None else self.everywhere
-        return self.sure and fall > MATERIAL and not self.worse_there
+        return self.sure and fall > thresholds.MATERIAL and not self.worse_there
 
 
 def compare(old: Predictions, new: Predictions) -> Evidence:
@@ -111,21 +103,21 @@ def compare(old: Predictions, new: Predictions) -> Evidence:
     there, there_se = _summed(_differences(*unseen))
     blocks = _fall(old.blocks, new.blocks) or 0.0
     held_out = _fall(*unseen)
-    worse = held_out is not None and (held_out < -MATERIAL or is_sure(-there, there_se))
+    worse = held_out is not None and (held_out < -thresholds.MATERIAL or is_sure(-there, there_se))
     gain, se = here + there, float(np.hypot(here_se, there_se))
     if held_out is None:
         return Evidence(gain, se, blocks, None, worse)
     weights = [sum(np.isfinite(r).sum() for e in c.values() for r in e.values) for c in (new.blocks, new.held_out)]
     logs = np.log1p([-min(f, 1 - 1e-12) for f in (blocks, held_out)])
     everywhere = 1 - float(np.exp(np.average(logs, weights=weights if any(weights) else None)))
-    open_ = held_out > PLAIN and not worse and not is_sure(abs(gain), se)
-    plain = open_ and bool(-np.log1p(-held_out) > STANDARD_ERRORS * _fall_error(*unseen))
+    open_ = held_out > thresholds.PLAIN and not worse and not is_sure(abs(gain), se)
+    plain = open_ and bool(-np.log1p(-held_out) > thresholds.STANDARD_ERRORS * _fall_error(*unseen))
     return Evidence(gain, se, max(blocks, held_out), held_out, worse, everywhere, plain)
 
 
 def is_sure(gain: float, se: float) -> bool:
     """Tell whether a gain is more than chance."""
-    return gain > max(STANDARD_ERRORS * se, NATS)
+    return gain > max(thresholds.STANDARD_ERRORS * se, thresholds.NATS)
 
 
 def _summed(differences: Array) -> tuple[float, float]:
@@ -136,7 +128,7 @@ def _summed(differences: Array) -> tuple[float, float]:
 
 def lost_channels(old: Channels, new: Channels) -> tuple[str, ...]:
     """Return the channels that both models lose: zero is nearer to what was measured than either."""
-    return tuple(c for c in old if c in new and min(old[c].nrmse, new[c].nrmse) > LOST)
+    return tuple(c for c in old if c in new and min(old[c].nrmse, new[c].nrmse) > thresholds.LOST)
 
 
 def _fall(old: Channels, new: Channels) -> float | None:
@@ -193,7 +185,7 @@ def _log_densities(r: Array, labels: NDArray[np.intp], count: int, floor: float)
 
     A tenth of the sensor's noise (`floor`) is as good as none: ratios of tiny numbers must not decide.
     """
-    nu = DEGREES_OF_FREEDOM
+    nu = thresholds.DEGREES_OF_FREEDOM
     scale2 = float(np.median(r**2)) + 1e-300
     for _ in range(ROUNDS):  # expectation maximisation of the scale
         weights = (nu + 1) / (nu + r**2 / scale2)
@@ -220,14 +212,31 @@ def left_out(residual: Array, columns: Array, labels: NDArray[np.intp]) -> Array
     return found
 
 
-def blocks_of(lengths: Sequence[int]) -> list[NDArray[np.intp]]:
-    """Return the block of each sample of runs of these lengths, `BLOCKS` a run."""
+def blocks_of(runs: Sequence[Experiment]) -> list[NDArray[np.intp]]:
+    """Return the block of each sample, `BLOCKS` a run: equal shares of its time and of what its outputs do.
+
+    Of one step with a long rest, blocks of equal length would hold all that can be learnt in one or two: a gain there,
+    however large, would be no surer than chance.
+    """
     found, first = [], 0
-    for n in lengths:
-        parts = max(min(BLOCKS, n // 2), 1)
-        found.append(first + np.minimum(np.arange(n) * parts // n, parts - 1))
+    for run in runs:
+        parts = max(min(thresholds.BLOCKS, run.n // 2), 1)
+        passed = (np.arange(run.n) / run.n + _changed(run, min(FINER * parts, run.n))) / 2
+        found.append(first + np.minimum((passed * parts).astype(np.intp), parts - 1))
         first += parts
     return found
+
+
+def _changed(run: Experiment, cells: int) -> Array:
+    """Return which share of all changes of the outputs, between means over so many cells, each sample has behind it."""
+    edges, shares = np.arange(cells + 1) * run.n // cells, []
+    for c, y in run.outputs.items():
+        if (known := np.isfinite(y)).any() and cells > 1:
+            filled = np.interp(np.arange(run.n), np.flatnonzero(known), y[known])
+            change = np.gradient(np.add.reduceat(filled, edges[:-1]) / np.diff(edges))
+            path = np.cumsum(np.abs(np.gradient(change) if c == "theta" else change))
+            shares += [np.append(0.0, path / path[-1])] if path[-1] > 0 else []
+    return np.interp(np.arange(run.n), edges, np.mean(shares, axis=0) if shares else edges / run.n)
 
 
 def predictions_left_out(fit: Fit) -> Channels | None:
@@ -240,13 +249,13 @@ def predictions_left_out(fit: Fit) -> Channels | None:
     at_start = {p.name for *_, p in problem.unknowns.initial}
     free = [j for j, p in enumerate(problem.unknown) if p.name not in at_start | fit.at_bound]
     columns = (fit.jacobian[:n] * problem.scaling.slope(fit.q))[:, free]
-    blocks = blocks_of([run.n for run in problem.experiments])
+    blocks = blocks_of(problem.experiments)
     residual = fit.residuals[:n]
     try:
         moved = left_out(residual, columns, stacked_labels(problem, blocks))
     except np.linalg.LinAlgError:
         return None
-    if not np.isfinite(moved).all() or moved @ moved > UNRELIABLE**2 * (residual @ residual):
+    if not np.isfinite(moved).all() or moved @ moved > thresholds.UNRELIABLE**2 * (residual @ residual):
         return None
     return by_channel(problem, moved, blocks)
 
@@ -281,7 +290,7 @@ def held_out_errors(problem: Problem, noise: Mapping[str, float]) -> Channels:
     if not problem.unknowns.apart:
         return errors
     r, jac = problem.residual_and_jacobian(q)
-    blocks = blocks_of([run.n for run in problem.experiments])
+    blocks = blocks_of(problem.experiments)
     own = left_out(r, jac[:, len(problem.unknowns.initial) :], stacked_labels(problem, blocks))
     return {c: replace(errors[c], values=e.values) for c, e in by_channel(problem, own, blocks).items()}
 
@@ -293,7 +302,7 @@ def errors_of(simulations: Sequence[Simulation], noise: Mapping[str, float],
     `judged` gives other measurements on the same samples (a fold); `noise` is the sensor's per channel.
     """
     runs = judged if judged is not None else [s.experiment for s in simulations]
-    blocks = blocks_of([run.n for run in runs])
+    blocks = blocks_of(runs)
     parts: dict[str, list[tuple[Array, NDArray[np.intp], Array]]] = {}
     for sim, run, block in zip(simulations, runs, blocks, strict=True):
         for c, y in run.outputs.items():

@@ -1,7 +1,7 @@
 """Every judgement of the diagnosis that is a number: its meaning, its unit, and the case or curve that fixes it."""
 
 # -- the predictive score (see `predictive_score`) -------------------------------------------------------------
-BLOCKS = 20  # per run: enough for a standard error of their scatter, each longer than a motor's memory
+BLOCKS = 20  # per run: enough for a standard error of their scatter (where they end: `predictive_score.blocks_of`)
 DEGREES_OF_FREEDOM = 4  # of Student's t: a Gaussian takes offsets for friction on real records, whose errors have tails
 STANDARD_ERRORS = 2.0  # that a gain must be: chance lets 1 % of false effects in at 15 effective samples per run
 NATS = 4.0  # that a gain must be at least: 2 to 4 let the same in on 438 pairs of models

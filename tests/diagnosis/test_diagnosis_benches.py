@@ -30,6 +30,19 @@ def test_a_gear_that_another_inertia_hides_is_told_with_what_to_fix():
     assert "does the same" not in known.text
 
 
+@pytest.mark.parametrize(("effect", "motor", "size"), [
+    ("coulomb", "lab", {"tau_c": 8e-3}), ("speed_delay", "lab", {"T_d": 6e-3}),
+    ("speed_filter", "lab", {"T_f": 6e-3, "zeta_f": 0.5}), ("speed_lag", "lab", {"T_w": 6e-3}),
+    ("driver_lag", "lab", {"T_v": 6e-3}), ("inductance_saturation", "big", {"i_L": 35.0}),
+])
+def test_one_record_switched_on_and_off_tells_what_is_missing(effect, motor, size):
+    """All that happens does so within a tenth of the record; blocks of equal length told one of these six."""
+    runs, _ = Case("once", "single", motor, {effect: size}, ("coast",)).records()
+    found = mi.diagnose(mi.fit(mi.dc_motor(), runs))
+    assert found.effects == (effect,)
+    assert found.remaining.adequate
+
+
 def test_a_gain_of_the_current_hides_and_identifiability_says_in_what():
     case = Case("gain", "single", "lab", {"current_gain": {"k_i": 0.08}}, n=700)
     runs, _ = case.records()
