@@ -23,7 +23,6 @@ from numpy.typing import NDArray
 from motorid.channels import channel_name
 from motorid.diagnosis.misspecification import better_forms
 from motorid.diagnosis.model_comparison import Node, far, finer
-from motorid.diagnosis.predictive_score import Predictions
 from motorid.diagnosis.results import Adequacy
 from motorid.diagnosis.score_test import Score
 from motorid.diagnosis.thresholds import LARGER, SEARCHED
@@ -243,6 +242,5 @@ def judge_adequacy(node: Node, scores: Sequence[Score] = ()) -> Adequacy:
     if not far(node.fit) or not (doubtful := adequacy(node.fit, scores, level=CLEAR)).adequate:
         return judged
     larger = far(node.fit)  # a form that helps the others explains nothing here
-    errors = {c: e for c, e in node.predictions.blocks.items() if c in larger}
-    found = next(iter(better_forms(node.fit, Predictions(errors, {}))), None) if errors else None
+    found = next(iter(better_forms(node.fit, node.fit, larger)), None)
     return following(judged, found.form.text) if found else unpredicted(doubtful)

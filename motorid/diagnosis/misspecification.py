@@ -8,11 +8,12 @@ parametric law that is outdone by a nonparametric one is not the thing itself (H
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from motorid.channels import CHANNELS
 from motorid.diagnosis.admissibility import objections
 from motorid.diagnosis.free_forms import (
     Form,
@@ -33,6 +34,7 @@ from motorid.diagnosis.predictive_score import (
     by_channel,
     compare,
     left_out,
+    predictions_left_out,
     stacked_labels,
 )
 from motorid.diagnosis.thresholds import MOST, STANDARD_ERRORS, SUPPLANTS, TRIFLE, UNCONTESTED
@@ -57,8 +59,8 @@ class FormGain:
     predictions: Predictions
 
 
-def better_forms(fit: Fit, rival: Predictions) -> list[FormGain]:
-    """Return the forms that added to `fit` predict better than `rival`, the best first.
+def better_forms(fit: Fit, rival: Fit, channels: Container[str] = CHANNELS) -> list[FormGain]:
+    """Return the forms that added to `fit` predict these channels better than `rival`, the best first.
 
     What remembers comes after a function of the present that is not surely worse.
     """
@@ -66,11 +68,11 @@ def better_forms(fit: Fit, rival: Predictions) -> list[FormGain]:
         linear = linearised(fit)
     except FAILURES:
         return []
-    gains = []
+    gains, known = [], predictions_left_out(rival, evenly=True) or {}
     for form in linear.forms:
         predicted = form_predictions(fit, linear, form)
         if predicted is not None:
-            found = compare(Predictions(rival.blocks, {}), predicted)
+            found = compare(Predictions({c: e for c, e in known.items() if c in channels}, {}), predicted)
             found = replace(found, gain=found.gain - np.log(len(linear.forms)))  # the best of many gains by chance
             gains += [FormGain(form, found, predicted)] if found.worth_it else []
     gains.sort(key=lambda g: -g.evidence.gain)
@@ -92,7 +94,7 @@ def form_predictions(fit: Fit, linear: Linear, form: Form, kept: Sequence[int] |
     together = np.column_stack([columns, linear.own])
     try:
         residual = linear.residual - together @ ridge(together, linear.residual)
-        blocks = blocks_of(problem.experiments)
+        blocks = blocks_of(problem.experiments, evenly=True)
         moved = left_out(residual, columns, stacked_labels(problem, blocks))
     except np.linalg.LinAlgError:
         return None
@@ -177,7 +179,7 @@ def grades_of(last: Node, root: Node, groups: Sequence[Sequence[str]], beside: S
         if smaller is not None:
             free = [b for b in beside if not compare(b.predictions, beside[0].predictions).sure]
             free = [b for b in free if _swallows(last.fit, b.form, e)]
-            free = free or better_forms(smaller.fit, last.predictions)
+            free = free or better_forms(smaller.fit, last.fit)
             taken = 1 - (1 - max(evidence(smaller, last).fall, 0.0)) ** 2
             told = [b for b in free if b.evidence.fall > SUPPLANTS]  # explains more, over what the effect does, RMS:
             more = [np.sqrt((1 - taken) * (1 - (1 - b.evidence.fall) ** 2) / max(taken, 1e-12)) for b in told]

@@ -212,16 +212,17 @@ def left_out(residual: Array, columns: Array, labels: NDArray[np.intp]) -> Array
     return found
 
 
-def blocks_of(runs: Sequence[Experiment]) -> list[NDArray[np.intp]]:
+def blocks_of(runs: Sequence[Experiment], evenly: bool = False) -> list[NDArray[np.intp]]:
     """Return the block of each sample, `BLOCKS` a run: equal shares of its time and of what its outputs do.
 
-    Of one step with a long rest, blocks of equal length would hold all that can be learnt in one or two: a gain there,
-    however large, would be no surer than chance.
+    Of one step with a long rest, blocks of equal length (`evenly`) would hold all that can be learnt in one or two: a
+    gain there, however large, would be no surer than chance. But a free curve is only extended over a short block.
     """
     found, first = [], 0
     for run in runs:
         parts = max(min(thresholds.BLOCKS, run.n // 2), 1)
-        passed = (np.arange(run.n) / run.n + _changed(run, min(FINER * parts, run.n))) / 2
+        passed = np.arange(run.n) / run.n
+        passed = passed if evenly else (passed + _changed(run, min(FINER * parts, run.n))) / 2
         found.append(first + np.minimum((passed * parts).astype(np.intp), parts - 1))
         first += parts
     return found
@@ -239,7 +240,7 @@ def _changed(run: Experiment, cells: int) -> Array:
     return np.interp(np.arange(run.n), edges, np.mean(shares, axis=0) if shares else edges / run.n)
 
 
-def predictions_left_out(fit: Fit) -> Channels | None:
+def predictions_left_out(fit: Fit, evenly: bool = False) -> Channels | None:
     """Return the errors of `fit` on blocks of its own records, each left out in turn; None where that cannot be told.
 
     Initial states stay as they were fitted, and so do parameters at a limit. Where slopes lead nowhere (cogging far
@@ -249,7 +250,7 @@ def predictions_left_out(fit: Fit) -> Channels | None:
     at_start = {p.name for *_, p in problem.unknowns.initial}
     free = [j for j, p in enumerate(problem.unknown) if p.name not in at_start | fit.at_bound]
     columns = (fit.jacobian[:n] * problem.scaling.slope(fit.q))[:, free]
-    blocks = blocks_of(problem.experiments)
+    blocks = blocks_of(problem.experiments, evenly)
     residual = fit.residuals[:n]
     try:
         moved = left_out(residual, columns, stacked_labels(problem, blocks))

@@ -303,7 +303,7 @@ class Remainder:
         held, best = self._held or HeldOut.of(self.fit, None), None
         apart = self.form is not None and self.form.on == "run"
         if not apart or self._anew is not None:
-            both = self._tried(held), _beyond(self._anew, held)
+            both = self._tried(held), _beyond(self._anew)
             each = (islice((t for t in some if t[1].on != "run"), TRIED) for some in both)
             best = _best(self.fit, chain.from_iterable(each), held)
         if best is None:
@@ -322,7 +322,7 @@ class Remainder:
             yield from ((base, form) for form in dict.fromkeys(replaced.values()))
         beside = [(self.fit, form) for form in self.forms]
         yield from beside[:1]
-        alone = _beyond(self._without(self._approximating) if far(self.fit) else None, held)
+        alone = _beyond(self._without(self._approximating) if far(self.fit) else None)
         for pair in zip_longest(alone, beside[1:]):
             yield from filter(None, pair)
 
@@ -341,11 +341,11 @@ class Remainder:
         return None
 
 
-def _beyond(base: Fit | None, held: HeldOut) -> Iterator[tuple[Fit, Form]]:
+def _beyond(base: Fit | None) -> Iterator[tuple[Fit, Form]]:
     """Yield a model with each form that predicts more than it does, the best first."""
     if base is not None:
         with contextlib.suppress(*FAILURES):
-            yield from ((base, gain.form) for gain in better_forms(base, held.predictions(base)))
+            yield from ((base, gain.form) for gain in better_forms(base, base))
 
 
 @one_thread

@@ -160,7 +160,7 @@ def _finished(found: Climb) -> Climb:
     rounds = tuple(tuple(_as_it_ended(c, best.key, met) for c in r) for r in found.rounds)
     groups = tuple((g[0], *rest) for g in found.groups if g and (rest := _without(g[1:], best.key)))
     structure = not found.remaining.adequate
-    forms = better_forms(best.fit, best.predictions) if structure else []
+    forms = better_forms(best.fit, best.fit) if structure else []
     if structure and not forms and at_noise(best) and not found.stopped:
         found, structure = replace(found, remaining=within_noise(found.remaining)), False
     grades = grades_of(best, search.root, groups, forms, structure,
