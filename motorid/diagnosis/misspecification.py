@@ -68,11 +68,11 @@ def better_forms(fit: Fit, rival: Fit, channels: Container[str] = CHANNELS) -> l
         linear = linearised(fit)
     except FAILURES:
         return []
-    gains, known = [], predictions_left_out(rival, evenly=True) or {}
+    known, gains = {c: e for c, e in (predictions_left_out(rival, evenly=True) or {}).items() if c in channels}, []
     for form in linear.forms:
         predicted = form_predictions(fit, linear, form)
         if predicted is not None:
-            found = compare(Predictions({c: e for c, e in known.items() if c in channels}, {}), predicted)
+            found = compare(Predictions(known, {}), predicted)
             found = replace(found, gain=found.gain - np.log(len(linear.forms)))  # the best of many gains by chance
             gains += [FormGain(form, found, predicted)] if found.worth_it else []
     gains.sort(key=lambda g: -g.evidence.gain)

@@ -31,7 +31,7 @@ from motorid.records.experiment import Experiment
 
 SETTLED = 1e-6  # relative change of the scale at which its iteration stops
 ROUNDS = 50
-FINER = 10  # cells in which changes are told, per block
+CELLS = 10  # per block, between whose means changes are told
 
 
 @dataclass(frozen=True, eq=False)
@@ -221,9 +221,9 @@ def blocks_of(runs: Sequence[Experiment], evenly: bool = False) -> list[NDArray[
     found, first = [], 0
     for run in runs:
         parts = max(min(thresholds.BLOCKS, run.n // 2), 1)
-        passed = np.arange(run.n) / run.n
-        passed = passed if evenly else (passed + _changed(run, min(FINER * parts, run.n))) / 2
-        found.append(first + np.minimum((passed * parts).astype(np.intp), parts - 1))
+        place = np.arange(run.n) * parts / run.n  # in blocks
+        place = place if evenly else (place + parts * _changed(run, min(CELLS * parts, run.n))) / 2
+        found.append(first + np.minimum(place.astype(np.intp), parts - 1))
         first += parts
     return found
 

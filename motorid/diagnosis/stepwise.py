@@ -110,8 +110,9 @@ def _rounds(found: Climb, max_effects: int) -> Iterator[Climb]:
         if chosen is None:
             yield replace(found, text="stopped: no further effect lowers the error on data left out")
             return
-        new, ordered = search.brought_to_its_end(chosen[0]), chosen[1]
+        new, ordered = chosen
         yield _with(found, new, new, new.parent is frontier[0], ())
+        new = new if stopped else search.brought_to_its_end(new)
         if not stopped and (lower := search.settled(new)) is not None:
             yield from _rounds(replace(before, path=tuple(_path(lower))), max_effects)
             return
@@ -119,8 +120,7 @@ def _rounds(found: Climb, max_effects: int) -> Iterator[Climb]:
         if stopped:
             return
         pruned = search.pruned(new, best)
-        same = pruned.added != new.added and pruned.parent is new.parent
-        chosen_of = pruned if same else new
+        chosen_of = pruned if pruned.added != new.added and pruned.parent is new.parent else new
         group = group_of(chosen_of, ordered, {e.name: e.includes for e in search.effects})
         found = _with(found, pruned, chosen_of, new.parent is frontier[0], group)
         found = replace(found, remaining=judge_adequacy(pruned, search.scores(pruned)))

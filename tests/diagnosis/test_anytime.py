@@ -98,6 +98,16 @@ def test_a_budget_ends_with_its_block_and_an_inner_one_is_no_longer():
         check_time()
 
 
+def test_a_chosen_effect_is_not_lost_where_the_time_is_up_before_it_is_fitted_on(plain, monkeypatch):
+    def late(search, node):
+        raise OutOfTime
+
+    monkeypatch.setattr(candidates.Search, "brought_to_its_end", late)
+    found = mi.diagnose(plain, effects=["coulomb", "cogging"])
+    assert found.effects == ("coulomb",)
+    assert found.stopped
+
+
 def test_a_second_climb_that_is_cut_short_does_not_lose_the_first(plain, monkeypatch):
     """A pendulum is climbed again in windows; whoever stops that at its start still gets what was found."""
     climbs, climb = [], stepwise.climb

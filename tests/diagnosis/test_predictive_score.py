@@ -30,9 +30,9 @@ from motorid.records.experiment import Experiment
 
 
 def even(*lengths):
-    """Blocks of runs of these lengths that go on evenly."""
-    return blocks_of([Experiment(np.arange(float(n)), {"v": np.zeros(n)}, {"omega": np.arange(float(n))})
-                      for n in lengths])
+    """Blocks of equal length of runs of these lengths."""
+    runs = [Experiment(np.arange(float(n)), {"v": np.zeros(n)}, {"omega": np.zeros(n)}) for n in lengths]
+    return blocks_of(runs, evenly=True)
 
 
 def errors(measured=1e3, noise=0.0, **residuals) -> dict[str, Errors]:
@@ -50,10 +50,12 @@ def left(**residuals) -> Predictions:
 
 def test_every_sample_has_one_block_and_runs_share_none():
     first, second, short = even(1000, 90, 9)
+    assert all(np.array_equal(b - b[0], np.arange(len(b)) * parts // len(b))
+               for b, parts in ((first, BLOCKS), (second, BLOCKS), (short, 4)))
     assert len(set(first)) == len(set(second)) == BLOCKS
     assert len(set(short)) == 4  # of two samples at least
     assert not set(first) & set(second)
-    assert np.ptp(np.bincount(first)) <= 2
+    assert np.ptp(np.bincount(first)) == 0
     assert all(np.all(np.diff(b) >= 0) for b in (first, second, short))
 
 
@@ -71,8 +73,8 @@ def test_what_happens_shares_the_blocks_with_what_rests(channel, rng):
 
 
 def test_a_run_in_which_nothing_changes_is_cut_evenly():
-    labels = blocks_of([Experiment(np.arange(100.0), {"v": np.ones(100)}, {"omega": np.ones(100)})])[0]
-    assert np.ptp(np.bincount(labels)) <= 1
+    run = Experiment(np.arange(100.0), {"v": np.ones(100)}, {"omega": np.ones(100)})
+    assert np.ptp(np.bincount(blocks_of([run])[0])) == 0
 
 
 def test_a_linear_fit_without_a_block_is_known_exactly(rng):
