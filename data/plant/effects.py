@@ -198,6 +198,16 @@ def spring(m: Motor, k_s: float, theta_0: float = 0.0) -> Hooks:
 
 
 @_known
+def end_stop(m: Motor, k_stop: float, theta_lo: float, theta_hi: float, d_stop: float) -> Hooks:
+    """Two elastic stops that only push; what they give back is the less, the faster they are left."""
+
+    def push(depth: float, speed: float) -> float:
+        return k_stop * depth * max(0.0, 1 + d_stop * speed) if depth > 0 else 0.0
+
+    return {"torque": lambda i, w, th, t: push(theta_lo - th, -w) - push(th - theta_hi, w)}
+
+
+@_known
 def angular_friction(m: Motor, tau_m: float, a_f: float, N_f: float = 1, phi_f: float = 0.0) -> Hooks:
     """A bent shaft or an oval bearing: dry friction that depends on the angle."""
     return {"dry": lambda i, w, th, s, t: tau_m * (1 + a_f * sin(N_f * th + phi_f))}

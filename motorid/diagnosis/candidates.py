@@ -20,7 +20,7 @@ from motorid.diagnosis.admissibility import objections
 from motorid.diagnosis.cross_validation import HeldOut
 from motorid.diagnosis.free_forms import own_levels
 from motorid.diagnosis.misspecification import LIMITER
-from motorid.diagnosis.model_comparison import COMMON, Node, beats, evidence, far, node_of, superfluous
+from motorid.diagnosis.model_comparison import COMMON, Node, beats, evidence, far, node_of, preferred, superfluous
 from motorid.diagnosis.predictive_score import Evidence
 from motorid.diagnosis.refit import LITTLE, GivenUp, Task, completed, hidden_in, lost, refit, refits, widened
 from motorid.diagnosis.results import Candidate
@@ -323,7 +323,7 @@ class Search:
             smaller = simpler if alone else [*simpler, *_without(node.fit.model, e.name)]
             for model in sorted(smaller, key=lambda m: len(m.free_names)):
                 other = self.smaller(node, model)
-                if other is not None and superfluous(node, other) and beats(other, before):
+                if other is not None and superfluous(node, other) and preferred(other, before):
                     return self.pruned(other, before)
         return node
 

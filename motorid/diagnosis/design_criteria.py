@@ -37,7 +37,7 @@ from motorid.model.equations import System
 from motorid.model.model import Model
 from motorid.numerics.parallel import check_time, interruption
 from motorid.numerics.signals import Array
-from motorid.problem.runs import natural_sizes
+from motorid.problem.runs import natural_sizes, shapes_of
 from motorid.problem.unknowns import Scaling
 
 STEPS = 4  # Gauss-Newton steps of the rivals' refit within one evaluation
@@ -171,7 +171,7 @@ class Rival:
 
 def _grid(parameters: Sequence[Parameter], sizes: Mapping[str, float]) -> Iterator[dict[str, float]]:
     """Yield values of an effect's parameters: amounts from little to much together, at each of its shapes."""
-    axes = [[(p.name, g * sizes.get(p.unit, 1.0)) for g in p.grid] for p in parameters if p.grid]
+    axes = [[(p.name, value) for value in shapes_of(p, sizes)] for p in parameters if p.grid]
     amounts = [p for p in parameters if p.null == 0 and not p.grid]
     for amount, shape in product(AMOUNTS if amounts else (0.0,), product(*axes)):
         yield {p.name: p.value for p in parameters} | dict(shape) | {

@@ -84,6 +84,11 @@ def superfluous(node: Node, smaller: Node) -> bool:
     return not beats(node, smaller) and not evidence(smaller, node).sure
 
 
+def preferred(new: Node, old: Node) -> bool:
+    """Tell whether `new` is to be preferred to `old`: it predicts better, or it is the smaller on a tie."""
+    return beats(new, old) or (new.size < old.size and superfluous(old, new))
+
+
 def tied(a: Node, b: Node) -> bool:
     """Tell whether neither of two models is to be preferred."""
     return not beats(a, b) and not beats(b, a)

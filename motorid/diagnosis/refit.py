@@ -29,7 +29,7 @@ from motorid.numerics.least_squares import LevenbergMarquardt
 from motorid.numerics.parallel import interruption
 from motorid.numerics.signals import Array
 from motorid.problem.problem import Problem
-from motorid.problem.runs import natural_sizes, with_inputs
+from motorid.problem.runs import natural_sizes, shapes_of, with_inputs
 from motorid.problem.simulate import misfit_over_noise
 
 RACE = LevenbergMarquardt(max_iterations=6, ftol=1e-3, xtol=1e-4, looks=0)
@@ -206,8 +206,8 @@ def _bounded(fit: Fit, model: Model) -> Model:
     for e in model.effects:
         for p in (model.parameters[q.name] for q in e.parameters):
             if p.grid and p.null is None and p.vary and not (p.given or p.periodic):
-                size = natural.get(p.unit, 1.0)
-                low, high = max(p.lower, min(p.grid) * size / ROOM), min(p.upper, max(p.grid) * size * ROOM)
+                few, many = (f(shapes_of(p, natural)) for f in (min, max))
+                low, high = (few, many) if p.place else (max(p.lower, few / ROOM), min(p.upper, many * ROOM))
                 limits |= {p.name: (low, high)} if low < high else {}
     inside = {n: float(np.clip(model.parameters[n].value, *limits[n])) for n in limits}
     pars = {n: replace(model.parameters[n], value=inside[n], lower=lo, upper=hi) for n, (lo, hi) in limits.items()}
@@ -460,7 +460,7 @@ def widened(fit: Fit, effect: Effect, above: float = ABOVE) -> Task:
     sizes = sizes_like(effect, level, above)
     shaped = {p.unit: fit.values[p.name] for e in inside for p in e.parameters if p.null is None and p.vary}
     shapes = [[(p.name, shaped[p.unit])] if p.unit in shaped else
-              [(p.name, g * natural.get(p.unit, 1.0)) for g in p.grid]
+              [(p.name, value) for value in shapes_of(p, natural)]
               for p in effect.parameters if p.null is None and p.grid]
     starts = [{**sizes, **dict(point)} for point in itertools.product(*shapes)][:8]
     return Task(fit, model, effect, starts)

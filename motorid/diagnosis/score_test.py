@@ -26,6 +26,7 @@ from motorid.model.definition import Effect, Parameter
 from motorid.model.model import Model
 from motorid.numerics.signals import Array
 from motorid.problem.problem import Problem
+from motorid.problem.runs import shapes_of
 from motorid.problem.unknowns import Point
 
 ORDERS_TRIED = 8  # a race tells them apart: near friction and far from the optimum the highest line may be another
@@ -305,7 +306,7 @@ class Added:
     def grid(self) -> Iterator[dict[str, float]]:
         """Yield the values of the shape parameters to try."""
         tried = [p for p in self.pars if p.grid and not p.given]
-        axes = [[(p.name, g * self.natural.get(p.unit, 1.0)) for g in p.grid] for p in tried]
+        axes = [[(p.name, value) for value in shapes_of(p, self.natural)] for p in tried]
         yield from map(dict, itertools.product(*axes))
 
     def shape(self, values: Mapping[str, float]) -> Shape | None:

@@ -130,6 +130,20 @@ def spring(m: Equations, k_s=P(1e-3, "N·m/rad", null=0.0, lower=0.0, doc="stiff
 
 
 @effect(balance="torque")
+def end_stop(m: Equations, k_stop=P(1e-2, "N·m/rad", null=0.0, lower=0.0, doc="stiffness of the stops"),
+             theta_lo=P(-1.0, "rad", place=True, grid=(-0.1, 0.05, 0.3), doc="angle of the lower stop"),
+             theta_hi=P(1.0, "rad", place=True, grid=(1.1, 0.95, 0.7), doc="angle of the upper stop"),
+             d_stop=P(0.01, "s/rad", lower=0.0, grid=(0.3,), doc="damping of an impact, over its stiffness")):
+    """End stops of the travel, k·x·(1+d·dx/dt) at x beyond one. Hunt & Crossley, J. Appl. Mech. 42(2), 1975.
+
+    Seen as an angle that goes no further, however large the voltage: drive to both ends, angle measured. The angle of
+    a stop that was never reached is not determined.
+    """
+    above, below = ca.fmax(m.theta - theta_hi, 0), ca.fmax(theta_lo - m.theta, 0)
+    m.torque -= k_stop * (above * ca.fmax(1 + d_stop * m.omega, 0) - below * ca.fmax(1 - d_stop * m.omega, 0))
+
+
+@effect(balance="torque")
 def cogging(m: Equations, A=P(1e-3, "N·m", null=0.0, lower=0.0, doc="amplitude of the cogging torque"),
             N=P(12.0, "", order=True, vary=False, lower=1.0, doc="periods per turn, from the misfit, then fixed"),
             phi=P(0.0, "rad", periodic=True, doc="phase at theta = 0")):

@@ -15,7 +15,7 @@ from motorid.estimation.least_squares import LOOK, RACE, race, start_cost
 from motorid.model.definition import Effect, Parameter
 from motorid.model.model import BASES, Model
 from motorid.problem.problem import Problem
-from motorid.problem.runs import natural_sizes, suited
+from motorid.problem.runs import natural_sizes, shapes_of, suited
 from motorid.records.experiment import Experiment
 
 ABOVE = 1.3  # times: where a size starts that is at least another
@@ -125,8 +125,8 @@ def _shapes(problem: Problem, effect: Effect, asked: Model) -> list[dict[str, fl
     sizes = natural_sizes(problem.experiments, problem.model.values)
     axes = []
     for p in _untouched(asked, effect):
-        if (p.vary and (p.periodic or p.unit == RESONANCE)) or (not p.vary and len(p.grid) > 1):  # or a choice of kinds
-            values = PHASES if p.periodic else [g * sizes.get(p.unit, 1.0) for g in p.grid]
+        if (p.vary and (p.periodic or p.place or p.unit == RESONANCE)) or (not p.vary and len(p.grid) > 1):  # or a choice of kinds
+            values = PHASES if p.periodic else shapes_of(p, sizes)
             axes.append([(p.name, float(np.clip(v, p.lower, p.upper))) for v in values])
     return [dict(choice) for choice in product(*axes)]
 

@@ -45,6 +45,8 @@ class Parameter:
         A number of periods per turn, found from the spectrum of the misfit over the angle.
     per_run : bool
         Another in every run (an encoder's zero): `value` is that of the first run, the others are estimated apart.
+    place : bool
+        A place on the way of the angle: its `grid` is in shares of the travel, 0 the lowest and 1 the highest angle.
     given : bool
         Set by the user; then no first guess replaces it.
     at_least : str
@@ -71,6 +73,7 @@ class Parameter:
     periodic: bool = False
     order: bool = False
     per_run: bool = False
+    place: bool = False
     given: bool = False
     at_least: str = ""
     doc: str = ""
@@ -103,7 +106,7 @@ class Declared:
 
 def P(value: float, unit: str = "", null: float | None = None, *, lower: float = -np.inf, upper: float = np.inf,
       positive: bool = False, vary: bool = True, grid: Iterable[float] = (), periodic: bool = False,
-      order: bool = False, per_run: bool = False, at_least: str = "", doc: str = "") -> Any:
+      order: bool = False, per_run: bool = False, place: bool = False, at_least: str = "", doc: str = "") -> Any:
     """Declare a parameter of an effect as a default argument: ``tau_c=P(2e-3, "N·m", null=0)``.
 
     The name comes from the argument; what the others mean is told at `Parameter`.
@@ -116,7 +119,7 @@ def P(value: float, unit: str = "", null: float | None = None, *, lower: float =
     """
     return Declared({"value": value, "unit": unit, "null": null, "lower": lower, "upper": upper,
                      "positive": positive, "vary": vary, "grid": tuple(grid), "periodic": periodic,
-                     "order": order, "per_run": per_run, "at_least": at_least, "doc": doc})
+                     "order": order, "per_run": per_run, "place": place, "at_least": at_least, "doc": doc})
 
 
 BALANCES = ("voltage", "torque", "transmission", "sensor")

@@ -19,7 +19,7 @@ from motorid.model.equations import Equations, System, build_system
 
 SGN_WIDTH = Parameter("sgn_width", 1e-2, "rad/s", positive=True, vary=False, doc="speed over which sgn(ω) is smoothed")
 LINEAR_UNITS = {"N·m": "N", "rad/s": "m/s", "rad": "m", "kg·m²": "kg", "N·m·s/rad": "N·s/m",
-                "N·m·s²/rad²": "N·s²/m²", "N·m/rad": "N/m", "N·m·s²": "kg", "1/(N·m)": "1/N"}
+                "N·m·s²/rad²": "N·s²/m²", "N·m/rad": "N/m", "N·m·s²": "kg", "1/(N·m)": "1/N", "s/rad": "s/m"}
 
 
 @dataclass(frozen=True, eq=False)

@@ -300,12 +300,23 @@ def natural_sizes(runs: Sequence[Experiment], values: Mapping[str, float]) -> di
     heats = [(r.duration, resistance * s.mean_square_current(values)) for r, s in zip(runs, seen, strict=True)]
     duration, power = max(heats, key=lambda h: h[0] * h[1])
     span = max((s.span for s in seen if s.span is not None), default=1.0)
+    low, high = min(s.ends[0] for s in seen), max(s.ends[1] for s in seen)
     sizes = {"V": volt, "A": ampere, "rad/s": speed, "m/s": speed, "N·m": torque, "N": torque, "s": second,
              "Ω": volt / ampere, "1/s": 1 / second, "m": 0.01 * span,
              "K/W": 30 / max(power, 1e-9), "J/K": max(power * duration, 1e-9) / 30,
              **dict.fromkeys(("N·m·s/rad", "N·s/m"), torque / speed),
-             **dict.fromkeys(("N·m·s²/rad²", "N·s²/m²"), torque / speed**2)}
-    return {k: v if np.isfinite(v) and v > 0 else 1.0 for k, v in sizes.items()}
+             **dict.fromkeys(("N·m·s²/rad²", "N·s²/m²"), torque / speed**2),
+             **dict.fromkeys(("s/rad", "s/m"), 1 / speed),
+             **dict.fromkeys(("N·m/rad", "N/m"), torque / max(high - low, 1e-9))}
+    return {k: v if np.isfinite(v) and v > 0 else 1.0 for k, v in sizes.items()} | {"lowest": low, "highest": high}
+
+
+def shapes_of(parameter: Parameter, sizes: Mapping[str, float]) -> list[float]:
+    """Return the values in the grid of a shape parameter, in its unit, where these are the natural sizes."""
+    if parameter.place:
+        low, high = sizes["lowest"], sizes["highest"]
+        return [low + share * (high - low) for share in parameter.grid]
+    return [share * sizes.get(parameter.unit, 1.0) for share in parameter.grid]
 
 
 def spread_of(run: Experiment, channel: str) -> float:
@@ -326,7 +337,7 @@ def suited(parameter: Parameter, sizes: Mapping[str, float]) -> Parameter:
     if parameter.null == 0 and size is not None and not parameter.positive:
         value = 0.02 * size
     elif parameter.grid and (size is not None or parameter.null is None):
-        value = parameter.grid[len(parameter.grid) // 2] * (size or 1.0)
+        value = shapes_of(parameter, sizes)[len(parameter.grid) // 2]
     else:
         value = parameter.value
     return replace(parameter, value=float(np.clip(value, parameter.lower, parameter.upper)))
@@ -342,6 +353,7 @@ class _Sizes(NamedTuple):
     squared_volt: float
     squared_ampere: float | None
     spread: Mapping[str, float]
+    ends: tuple[float, float]
 
     def mean_square_current(self, values: Mapping[str, float]) -> float:
         """Mean square of the current, or about what the voltage would make."""
@@ -361,7 +373,8 @@ def _sizes_of(run: Experiment) -> _Sizes:
                              None if i is None else float(np.percentile(np.abs(i), 99.5)),
                              None if theta is None else float(np.ptp(theta)), float(np.mean(v**2)),
                              None if i is None else float(np.mean(i**2)),
-                             {c: float(np.std(y[np.isfinite(y)])) for c, y in run.outputs.items()})
+                             {c: float(np.std(y[np.isfinite(y)])) for c, y in run.outputs.items()},
+                             (float(np.min(angle := angle_signal(run))), float(np.max(angle))))
     return _sizes[run]
 
 

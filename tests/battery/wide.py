@@ -33,6 +33,12 @@ SIZES: dict[str, Callable[[P.Motor, float], dict[str, float]]] = {
         "k_s": 0.15 * m.J / time_constant(m) ** 2,
         "theta_0": 0.6 * u / m.K * time_constant(m),
     },
+    "end_stop": lambda m, u: {
+        "k_stop": 10 * m.J / time_constant(m) ** 2,
+        "theta_lo": -0.5 * u / m.K * time_constant(m),
+        "theta_hi": 1.5 * u / m.K * time_constant(m),
+        "d_stop": 0.5 * m.K / u,
+    },
     "angular_friction": lambda m, u: {"tau_m": 0.08 * m.K * u / m.R, "a_f": 0.7, "phi_f": 1.0},
     "slip_clutch": lambda m, u: {"tau_slip": 0.15 * m.K * u / m.R, "omega_slip": 0.005 * u / m.K, "b_slip": 0.1 * m.b,
                                  "J_l": m.J},
@@ -45,7 +51,7 @@ SIZES: dict[str, Callable[[P.Motor, float], dict[str, float]]] = {
     "supply_side_current": lambda m, u: {"V_dc": 1.0 * u},
 }
 KNOWN = {"driver_lag": ("L",), "gear_efficiency": ("J",), "current_gain": ("R",)}
-SEES_ANGLE = ("spring", "angular_friction", "speed_offset")
+SEES_ANGLE = ("spring", "end_stop", "angular_friction", "speed_offset")
 
 
 def _case(effect: str, motor: str, drive: str) -> Case:

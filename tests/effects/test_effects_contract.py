@@ -29,7 +29,7 @@ FRICTION = (
     "gear_efficiency",
 )
 UNITS = {
-    *("", "V", "A", "Ω", "s", "1/s", "rad", "rad/s", "1/K", "K/W", "J/K"),
+    *("", "V", "A", "Ω", "s", "1/s", "s/rad", "rad", "rad/s", "1/K", "K/W", "J/K"),
     *("N·m", "N·m/rad", "N·m·s/rad", "N·m·s²/rad²"),
 }
 every_effect = pytest.mark.parametrize("effect", LIBRARY.values(), ids=LIBRARY)
@@ -149,7 +149,7 @@ def model_torque(model, x, p):
 
 
 def test_every_torque_effect_is_either_friction_or_known_to_do_work():
-    drives = {"constant_load", "gravity", "spring", "cogging", "torque_ripple"}
+    drives = {"constant_load", "gravity", "spring", "end_stop", "cogging", "torque_ripple"}
     assert {n for n, e in LIBRARY.items() if e.balance == "torque"} == drives | set(FRICTION)
 
 

@@ -51,6 +51,7 @@ TRUTH = {
     "angular_friction": {"tau_m": 5e-3, "a_f": 0.5, "phi_f": 2.0},
     "gear_efficiency": {"mu_d": 0.1, "mu_b": 0.25},
     "spring": {"k_s": 4e-3, "theta_0": 1.5},
+    "end_stop": {"k_stop": 0.5, "theta_lo": -2.0, "theta_hi": 5.0, "d_stop": 5e-3},
     "speed_average": {"T_a": 9e-3},
     "speed_offset": {"w_0": 3.0},
     "current_gain": {"k_i": 0.05},
