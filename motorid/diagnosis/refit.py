@@ -207,7 +207,8 @@ def _bounded(fit: Fit, model: Model) -> Model:
         for p in (model.parameters[q.name] for q in e.parameters):
             if p.grid and p.null is None and p.vary and not (p.given or p.periodic):
                 few, many = (f(shapes_of(p, natural)) for f in (min, max))
-                low, high = (few, many) if p.place else (max(p.lower, few / ROOM), min(p.upper, many * ROOM))
+                few, many = (2 * few - many, 2 * many - few) if p.place else (few / ROOM, many * ROOM)
+                low, high = max(p.lower, few), min(p.upper, many)
                 limits |= {p.name: (low, high)} if low < high else {}
     inside = {n: float(np.clip(model.parameters[n].value, *limits[n])) for n in limits}
     pars = {n: replace(model.parameters[n], value=inside[n], lower=lo, upper=hi) for n, (lo, hi) in limits.items()}

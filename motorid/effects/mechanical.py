@@ -131,8 +131,8 @@ def spring(m: Equations, k_s=P(1e-3, "N·m/rad", null=0.0, lower=0.0, doc="stiff
 
 @effect(balance="torque")
 def end_stop(m: Equations, k_stop=P(1e-2, "N·m/rad", null=0.0, lower=0.0, doc="stiffness of the stops"),
-             theta_lo=P(-1.0, "rad", place=True, grid=(-0.1, 0.05, 0.3), doc="angle of the lower stop"),
-             theta_hi=P(1.0, "rad", place=True, grid=(1.1, 0.95, 0.7), doc="angle of the upper stop"),
+             theta_lo=P(-1.0, "rad", place=True, grid=(0.02, 0.1, 0.3), doc="angle of the lower stop"),
+             theta_hi=P(1.0, "rad", place=True, grid=(0.98, 0.9, 0.7), doc="angle of the upper stop"),
              d_stop=P(0.01, "s/rad", lower=0.0, grid=(0.3,), doc="damping of an impact, over its stiffness")):
     """End stops of the travel, k·x·(1+d·dx/dt) at x beyond one. Hunt & Crossley, J. Appl. Mech. 42(2), 1975.
 

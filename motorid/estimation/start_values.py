@@ -125,7 +125,8 @@ def _shapes(problem: Problem, effect: Effect, asked: Model) -> list[dict[str, fl
     sizes = natural_sizes(problem.experiments, problem.model.values)
     axes = []
     for p in _untouched(asked, effect):
-        if (p.vary and (p.periodic or p.place or p.unit == RESONANCE)) or (not p.vary and len(p.grid) > 1):  # or a choice of kinds
+        kinds = not p.vary and len(p.grid) > 1
+        if kinds or (p.vary and (p.periodic or p.place or p.unit == RESONANCE)):
             values = PHASES if p.periodic else shapes_of(p, sizes)
             axes.append([(p.name, float(np.clip(v, p.lower, p.upper))) for v in values])
     return [dict(choice) for choice in product(*axes)]

@@ -165,7 +165,7 @@ SINGLES = [
     ),
     single("eddy_brake", "wheel", {"c_e": 2e-3, "omega_b": 40.0}, train=("stairs", "ramps")),
     single("spring", "servo", {"k_s": 0.06, "theta_0": 0.3}, train=("stairs", "chirp"), channels=ANGLE),
-    single("end_stop", "servo", {"k_stop": 5.0, "theta_lo": -1.5, "theta_hi": 2.0, "d_stop": 0.05},
+    single("end_stop", "servo", {"k_stop": 5.0, "theta_lo": -1.0, "theta_hi": 2.0, "d_stop": 0.05},
            train=("stairs", "chirp"), channels=ANGLE),
     single(
         "angular_friction",
