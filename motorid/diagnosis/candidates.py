@@ -172,7 +172,6 @@ class Search:
                     found[inside[0], e.name] = hidden_in(node.fit, e)
         return {names: parameters for names, parameters in found.items() if parameters}
 
-    # -- expanding -------------------------------------------------------------------------------------
     def expand(self, node: Node) -> tuple[list[Node], list[Candidate]]:
         """Return the judged models one effect larger, and a candidate for every effect, best score first."""
         present = node.fit.model

@@ -139,7 +139,6 @@ def _prediction(fit: Fit, t: Array, v: Array, name: str) -> dict[str, Array]:
     return dict(simulate(fit.model, run, initial="rest", estimate_initial=False)[0].outputs)
 
 
-# -- designed ----------------------------------------------------------------------------------------------------
 GOALS, SHAPES = ("distinguish", "sharpen"), ("steps", "free", "multisine")
 LEVELS = 30  # a board takes 32 segments
 SHORTEST = 5  # ms of a segment

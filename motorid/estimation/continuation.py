@@ -1,9 +1,8 @@
 """Continuation in the width of sgn: from wide, where the misfit is smooth, to what the records ask for.
 
-Friction makes the misfit rugged: a parameter moves the instant at which a speed passes through zero. A wide
-sgn smooths this over, and its minimum leads to the right one (numerical continuation, Allgower & Georg,
-1990). On the EMPS record five starts within a factor of three ended at 2.61-3.01 mm with the final width
-alone, and all at 2.551 mm in stages.
+Friction makes the misfit rugged: a parameter moves the instant at which a speed passes through zero. A wide sgn smooths
+this over, and its minimum leads to the right one (numerical continuation, Allgower & Georg, 1990). On the EMPS record
+five starts within a factor of three ended at 2.61-3.01 mm with the final width alone, and all at 2.551 mm in stages.
 """
 
 from __future__ import annotations
@@ -89,8 +88,11 @@ def sharpened(found: Estimate, effort: LevenbergMarquardt, callback: Callback = 
         width, surely = narrower
         problem = found.problem.start_at(found.values).tuned(width=width)
         try:
-            if not surely and not _promises(found, problem):
-                return found
+            if not surely:  # then the slopes with the wider one must promise it
+                r, jac = problem.refined(found.q).residual(found.q), found.solution.jac
+                left = r - jac @ np.linalg.lstsq(jac, r, rcond=None)[0]
+                if 0.5 * float(left @ left) >= LOWER * found.cost:
+                    return found
             other = least_squares(problem, effort, callback)
         except FAILURES:  # so narrow that it cannot be followed
             return found
@@ -99,13 +101,6 @@ def sharpened(found: Estimate, effort: LevenbergMarquardt, callback: Callback = 
             return replace(found, history=history)
         found = replace(other, history=history)
     return found
-
-
-def _promises(found: Estimate, narrower: Problem) -> bool:
-    """Tell whether a narrower sgn lowers the cost, by the slopes with the wider one."""
-    r, jac = narrower.refined(found.q).residual(found.q), found.solution.jac
-    left = r - jac @ np.linalg.lstsq(jac, r, rcond=None)[0]
-    return 0.5 * float(left @ left) < LOWER * found.cost
 
 
 def smooths(problem: Problem) -> bool:

@@ -88,7 +88,6 @@ def _shifted(problem: Problem, shift: float, seed: int) -> Problem:
     return problem.start_at({n: model.values[n] * float(np.exp(shift * rng.uniform(-1, 1))) for n in names})
 
 
-# -- collapsed parameters --------------------------------------------------------------------------------------
 def restore_collapsed(found: Estimate, effort: LevenbergMarquardt) -> Estimate:
     """Return an estimate that collapsed parameters, put back, have led lower, or the same one.
 

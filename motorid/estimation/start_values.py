@@ -86,7 +86,6 @@ def _untouched(model: Model, effect: Effect) -> list[Parameter]:
     return [now for now, declared in here if now.value == declared.value and not now.given]
 
 
-# -- effects over the angle, and of several shapes -------------------------------------------------------------
 def _along_measured_angle(problem: Problem, asked: Model) -> Problem:
     """Return the problem started where the measured angle, or the integral of the speed, leads an effect of the turn.
 
@@ -132,7 +131,6 @@ def _shapes(problem: Problem, effect: Effect, asked: Model) -> list[dict[str, fl
     return [dict(choice) for choice in product(*axes)]
 
 
-# -- simpler models --------------------------------------------------------------------------------------------
 def _contained(model: Model) -> dict[Effect, Effect]:
     """Return the simplest effect that each of the model's effects contains, where it does and has nothing set."""
     found: dict[Effect, Effect] = {}
@@ -153,7 +151,6 @@ def sizes_like(effect: Effect, level: float, above: float = ABOVE) -> dict[str, 
     return {p.name: level * (above if p.at_least else 1.0) for p in effect.parameters if p.null == 0}
 
 
-# -- back-EMF and viscous friction without a current -----------------------------------------------------------
 def _shared_out(problem: Problem, asked: Model) -> Problem:
     """Return the problem with back-EMF and viscous friction shared out as suits the data best.
 

@@ -77,7 +77,9 @@ class Rosenbrock:
             except SimulationError:
                 break
             level = tolerance(traj) if callable(tolerance) else tolerance
-            size, error = _by_state(traj)
+            assert traj.error is not None
+            size, error = np.abs(np.ascontiguousarray(traj.x.T)), np.ascontiguousarray(traj.error.T)
+            np.maximum.accumulate(size, axis=1, out=size)  # so far; NumPy reduces long rows faster
             astray = _first_inaccurate(size, error)
             if astray is not None:
                 traj = traj._replace(x=traj.x[:astray + 2], y=traj.y[:astray + 2])
@@ -98,13 +100,6 @@ class Rosenbrock:
                 raise SimulationError(f"the model is too stiff: it takes more than {self.most_steps} steps.")
             grid = grid.with_substeps(finer)
         return grid
-
-
-def _by_state(traj: Trajectory) -> tuple[Array, Array]:
-    """Return the size so far (nx, N) and the error estimate (nx, N-1); NumPy reduces long rows faster."""
-    assert traj.error is not None
-    size = np.abs(np.ascontiguousarray(traj.x.T))
-    return np.maximum.accumulate(size, axis=1, out=size), np.ascontiguousarray(traj.error.T)
 
 
 def _first_inaccurate(size: Array, error: Array) -> int | None:

@@ -57,7 +57,6 @@ class Equations:
         self.symbols: dict[str, ca.SX] = {}
         self.writer = "the base model"
 
-    # -- reading ---------------------------------------------------------------------------------------
     def define(self, name: str, expression: Any) -> None:
         """Add the quantity `name` with its base definition (used by base models)."""
         self.placeholders[name] = ca.SX.sym(f"@{name}")  # "@": no parameter or state has such a name
@@ -117,7 +116,6 @@ class Equations:
         among(name, (*MEASURED_INPUTS, *COMPUTED_INPUTS), "input", ModelError, f"{self.writer}: ")
         return self.inputs.setdefault(name, ca.SX.sym(name))
 
-    # -- writing ---------------------------------------------------------------------------------------
     def scale(self, name: str, factor: Any) -> None:
         """Multiply the quantity `name` (e.g. ``"R"``) by `factor`; factors of several effects multiply."""
         self._known(name)
@@ -158,7 +156,6 @@ class Equations:
         if name not in self.placeholders:
             raise self._unknown(name, self.placeholders)
 
-    # -- closing ---------------------------------------------------------------------------------------
     def fill(self, expressions: list[ca.SX]) -> list[ca.SX]:
         """Return `expressions` with placeholders replaced by definitions; ModelError where these go in a circle."""
         names = list(self.placeholders)

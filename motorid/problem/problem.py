@@ -103,7 +103,6 @@ class Problem:
         if width is not None:
             object.__setattr__(self, "model", self.model.start_at({"sgn_width": width}))
 
-    # -- what is fitted --------------------------------------------------------------------------------
     @cached_property
     def outputs(self) -> tuple[str, ...]:
         """Measured channels that the model can show."""
@@ -147,7 +146,6 @@ class Problem:
         """Return all parameter values of the model at `q`, SI."""
         return self.unknowns.values(self.scaling.physical(q))
 
-    # -- simulation ------------------------------------------------------------------------------------
     @cached_property
     def integrator(self) -> Engine:
         """The engine itself."""

@@ -292,21 +292,18 @@ def natural_sizes(runs: Sequence[Experiment], values: Mapping[str, float]) -> di
     seen = [_sizes_of(r) for r in runs]
     volt = max(s.volt for s in seen) or 1.0
     speed = max(s.speed for s in seen) or volt / max(values.get("K", 1.0), 1e-9)
-    gain = values.get("g")
     resistance = values.get("R", 1.0)
     ampere = max(s.ampere or 0.0 for s in seen) or volt / resistance
-    torque = gain * volt if gain is not None else values.get("K", 1.0) * ampere
+    torque = values["g"] * volt if "g" in values else values.get("K", 1.0) * ampere
     second = float(np.median([r.dt for r in runs]))
     heats = [(r.duration, resistance * s.mean_square_current(values)) for r, s in zip(runs, seen, strict=True)]
     duration, power = max(heats, key=lambda h: h[0] * h[1])
-    span = max((s.span for s in seen if s.span is not None), default=1.0)
     low, high = min(s.ends[0] for s in seen), max(s.ends[1] for s in seen)
     sizes = {"V": volt, "A": ampere, "rad/s": speed, "m/s": speed, "N·m": torque, "N": torque, "s": second,
-             "Ω": volt / ampere, "1/s": 1 / second, "m": 0.01 * span,
-             "K/W": 30 / max(power, 1e-9), "J/K": max(power * duration, 1e-9) / 30,
+             "Ω": volt / ampere, "1/s": 1 / second, "m": 0.01 * (high - low), "K/W": 30 / max(power, 1e-9),
+             "J/K": max(power * duration, 1e-9) / 30, **dict.fromkeys(("s/rad", "s/m"), 1 / speed),
              **dict.fromkeys(("N·m·s/rad", "N·s/m"), torque / speed),
              **dict.fromkeys(("N·m·s²/rad²", "N·s²/m²"), torque / speed**2),
-             **dict.fromkeys(("s/rad", "s/m"), 1 / speed),
              **dict.fromkeys(("N·m/rad", "N/m"), torque / max(high - low, 1e-9))}
     return {k: v if np.isfinite(v) and v > 0 else 1.0 for k, v in sizes.items()} | {"lowest": low, "highest": high}
 
@@ -349,7 +346,6 @@ class _Sizes(NamedTuple):
     volt: float
     speed: float
     ampere: float | None
-    span: float | None
     squared_volt: float
     squared_ampere: float | None
     spread: Mapping[str, float]
@@ -371,14 +367,12 @@ def _sizes_of(run: Experiment) -> _Sizes:
         _sizes[run] = _Sizes(float(np.abs(v).max()),
                              float(np.percentile(np.abs(speeds), 99.5)) if speeds.size else 0.0,
                              None if i is None else float(np.percentile(np.abs(i), 99.5)),
-                             None if theta is None else float(np.ptp(theta)), float(np.mean(v**2)),
-                             None if i is None else float(np.mean(i**2)),
+                             float(np.mean(v**2)), None if i is None else float(np.mean(i**2)),
                              {c: float(np.std(y[np.isfinite(y)])) for c, y in run.outputs.items()},
                              (float(np.min(angle := angle_signal(run))), float(np.max(angle))))
     return _sizes[run]
 
 
-# -- the width of sgn ------------------------------------------------------------------------------------
 def smoothing(runs: Sequence[Experiment], parameters: Mapping[str, Any], noise: float = 1.0) -> float | None:
     """Return the width of sgn that suits the data, `noise` times as noisy as they seem; None if given or unused."""
     p = parameters.get("sgn_width")

@@ -108,7 +108,6 @@ class Unknowns:
         size = self.scaling.scale
         return np.where(turns, (np.remainder(q * size + np.pi, 2 * np.pi) - np.pi) / size, q)
 
-    # -- into the system's terms -----------------------------------------------------------------------
     @cached_property
     def _columns(self) -> NDArray[np.int64]:
         """Index into the system's p of each free parameter."""

@@ -86,7 +86,6 @@ class Explorer:
         self._quiet, self._figure = False, None
         self._build()
 
-    # -- what can be done --------------------------------------------------------------------------------
     def tick(self, name: str, on: bool = True) -> None:
         """Put the effect `name` into the model, at a size that suits the records, or take it out."""
         with self._reasons_said(self._show_controls):
@@ -134,7 +133,6 @@ class Explorer:
         self._say(done)
         self._draw()
 
-    # -- the widgets -------------------------------------------------------------------------------------
     def _build(self) -> None:
         import ipywidgets as w
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 from battery.cases import ANGLE, Case
+from battery.excite import P, level, record
 from battery.wide import SIZES, WIDE
 
 import motorid as mi
@@ -12,8 +14,8 @@ from motorid.diagnosis.candidates import Search, Stages, library
 
 def test_the_wide_battery_has_every_effect_of_benches_in_three_motors_under_three_drives():
     singles = [c for c in WIDE.values() if c.kind == "single"]
-    assert len(SIZES) == 18
-    assert len(singles) == 162
+    assert len(SIZES) == 19
+    assert len(singles) == 171
     assert {tuple(c.effects) for c in singles} == {(e,) for e in SIZES}
     assert sum(c.kind == "none" for c in WIDE.values()) == 54
 
@@ -41,6 +43,32 @@ def test_one_record_switched_on_and_off_tells_what_is_missing(effect, motor, siz
     found = mi.diagnose(mi.fit(mi.dc_motor(), runs))
     assert found.effects == (effect,)
     assert found.remaining.adequate
+
+
+def test_of_an_angle_that_went_one_way_no_friction_of_two_directions_is_kept():
+    """One was left over from a pruning; its other direction, which no sample shows, was any (held out 291 %)."""
+    motor, n, dt, rng = P.MOTORS["servo"], 1000, 2e-3, np.random.default_rng(0)
+    t = np.arange(n) * dt
+    v = np.where((t >= 0.1 * n * dt) & (t < 0.6 * n * dt), 0.9 * level(motor), 0.0)
+    moved = P.simulate(motor, {"coulomb": {"tau_c": 0.03}}, t, v, substep=None)
+    run = record(moved, "logger", ("theta",), motor, rng, "once")
+    found = mi.diagnose(mi.fit(mi.dc_motor(), [run]))
+    assert found.effects == ("coulomb",)
+    assert found.remaining.adequate
+
+
+@pytest.mark.parametrize("theta_lo", [-1.0, -5.0])
+def test_end_stops_are_found_where_they_were_reached(theta_lo):
+    hidden = {"k_stop": 5.0, "theta_lo": theta_lo, "theta_hi": 2.0, "d_stop": 0.05}
+    runs, _ = Case("stops", "single", "servo", {"end_stop": hidden}, ("stairs", "chirp"), channels=ANGLE).records()
+    assert min(np.nanmin(r.outputs["theta"]) for r in runs) == pytest.approx(-1.1, abs=0.1)
+    found = mi.diagnose(mi.fit(mi.dc_motor(), runs))
+    assert found.effects == ("end_stop",)
+    assert found.remaining.adequate
+    reached = hidden if theta_lo > -1.1 else {n: v for n, v in hidden.items() if n != "theta_lo"}
+    for n, value in reached.items():
+        assert found.after.values[n] == pytest.approx(value, rel=0.01), n
+    assert (found.after.std["theta_lo"] is None) == (theta_lo < -1.1)
 
 
 def test_a_gain_of_the_current_hides_and_identifiability_says_in_what():

@@ -68,7 +68,6 @@ class Mesh:
     # (nx,) process noise per state, unit/√s: gaps at the nodes are weighed by it instead of forbidden
     noise: Array | None = None
 
-    # -- layout ----------------------------------------------------------------------------------------
     @cached_property
     def intervals(self) -> tuple[Interval, ...]:
         """Intervals in the order of runs and time."""
@@ -124,7 +123,6 @@ class Mesh:
         """Return z of q and the states at the nodes (n, nx), physical."""
         return np.concatenate([q, (np.asarray(states).reshape(-1, self.nx) / self.scale).ravel()])
 
-    # -- simulation ------------------------------------------------------------------------------------
     def walk(self, z: Array, derivatives: bool) -> Walk:
         """Simulate every interval from its node; SimulationError if that fails."""
         problem, nx = self.problem, self.nx
@@ -141,7 +139,6 @@ class Mesh:
         runs = [[t for v, t in zip(self.intervals, found, strict=True) if v.run == k] for k in range(len(problem.runs))]
         return Walk(at, tuple(map(_joined, runs)), tuple(found))
 
-    # -- rows ------------------------------------------------------------------------------------------
     def residual(self, z: Array, walk: Walk) -> list[Block]:
         """Return whitened residuals: outputs, weighed gaps, priors, penalties; ½ of their squares is the cost."""
         problem = self.problem

@@ -108,7 +108,6 @@ class MultipleShooting:
             return fit_of(self._with_process_noise(bound, q), time.perf_counter() - began)
         return fit_of(self._with_refinement(bound, _under_heavier_penalties(bound, q)), time.perf_counter() - began)
 
-    # -- stages ----------------------------------------------------------------------------------------
     def _unconstrained(self, problem: Problem) -> tuple[Problem, Array]:
         """Return the problem with weights settled, and values near its solution without constraints."""
         if self.process_noise is not None:

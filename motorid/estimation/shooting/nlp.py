@@ -60,7 +60,6 @@ class ShootingNlp:
         self.lower = np.concatenate([zero, *(part.lower[own] for _, part, own in found)])
         self.upper = np.concatenate([zero, *(part.upper[own] for _, part, own in found)])
 
-    # -- one point -------------------------------------------------------------------------------------
     def _evaluate(self, z: Array, derivatives: bool) -> _Point:
         walk = self.mesh.walk(z, derivatives)
         residual = self.mesh.residual(z, walk)
@@ -79,7 +78,6 @@ class ShootingNlp:
         self._kept[derivatives] = key, found
         return found
 
-    # -- what IPOPT asks for ---------------------------------------------------------------------------
     def values(self, z: Array) -> list[Any]:
         """Return f and g."""
         point = self.at(z, False)
