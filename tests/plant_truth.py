@@ -43,7 +43,7 @@ NUMBERS = {  # one plausible size of every effect
     "magnet_heating": {"R_thm": 5.0, "C_thm": 4.0},
     "eddy_brake": {"c_e": 4e-4, "omega_b": 20.0},
     "spring": {"k_s": 3e-3, "theta_0": 0.4},
-    "end_stop": {"k_stop": 0.2, "theta_lo": -1.0, "theta_hi": 2.0, "d_stop": 2e-3},
+    "end_stop": {"k_stop": 0.2, "theta_lo": -0.2, "theta_hi": 0.5, "d_stop": 2e-3},
     "angular_friction": {"tau_m": 5e-3, "a_f": 0.6, "phi_f": 0.3},
     "gear_efficiency": {"mu_d": 0.1, "mu_b": 0.3},
     "speed_average": {"T_a": 8e-3},

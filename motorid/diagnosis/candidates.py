@@ -312,7 +312,7 @@ class Search:
         """Return `node` without the effects that have become superfluous, and with the simplest of each kind.
 
         A later effect may have taken over what made an earlier one special: then its simple relative will do. What
-        is left still predicts better than the model `before`: small losses, each by chance, may add up.
+        is left is still preferred to the model `before`: small losses, each by chance, may add up.
         """
         known = {e.name: e for e in self.effects if e.name not in node.fit.model.effect_names}
         for e in node.fit.problem.model.effects:

@@ -20,7 +20,7 @@ from motorid.effects import EVERY, LIBRARY
 RUN = Path(__file__).parents[1] / "battery" / "blind" / "run.py"
 
 
-LATER = {"driver_lag", "speed_filter", "driver_slew", "pwm_coast", "slip_clutch", "freewheel"}  # than the battery
+LATER = {"driver_lag", "speed_filter", "driver_slew", "pwm_coast", "slip_clutch", "freewheel", "end_stop"}  # than these
 
 
 def of(battery, kind):
