@@ -111,7 +111,7 @@ def supply_side_current(m: Equations, V_dc=P(12.0, "V", positive=True, vary=Fals
     """Current of the supply, not the motor's: d·i, d = abs(v)/V_dc. Mohan, Electric Machines and Drives, 2012.
 
     With u_i = 1 it counts positive out of the supply, whichever way the motor turns; what suits, unless given. Unless
-    V_dc is given it is the largest voltage of the records; where it is larger, R, L, b and J come out wrong by it.
+    V_dc is given it is the largest voltage of the records; a larger one leaves R, L, b and J wrong by that factor.
     Seen as next to no current at small duties, whatever the load.
     """
     duty = ca.fmin(ca.fabs(m.command) / V_dc, 1) * (1 + u_i * (ca.sign(m.command) - 1))

@@ -287,7 +287,7 @@ def natural_sizes(runs: Sequence[Experiment], values: Mapping[str, float]) -> di
     """Return the natural size of each unit in these records, for starting values and grids of effects.
 
     Torque is what the motor makes at its highest current, time is the sample time, heat is what the winding
-    loses during the longest run for a rise of 30 K.
+    loses during the longest run for a rise of 30 K; ``lowest`` and ``highest`` are the ends of the angle's travel.
     """
     seen = [_sizes_of(r) for r in runs]
     volt = max(s.volt for s in seen) or 1.0
@@ -310,10 +310,8 @@ def natural_sizes(runs: Sequence[Experiment], values: Mapping[str, float]) -> di
 
 def shapes_of(parameter: Parameter, sizes: Mapping[str, float]) -> list[float]:
     """Return the values in the grid of a shape parameter, in its unit, where these are the natural sizes."""
-    if parameter.place:
-        low, high = sizes["lowest"], sizes["highest"]
-        return [low + share * (high - low) for share in parameter.grid]
-    return [share * sizes.get(parameter.unit, 1.0) for share in parameter.grid]
+    ends = (sizes["lowest"], sizes["highest"]) if parameter.place else (0.0, sizes.get(parameter.unit, 1.0))
+    return [ends[0] + share * (ends[1] - ends[0]) for share in parameter.grid]
 
 
 def spread_of(run: Experiment, channel: str) -> float:
@@ -373,6 +371,7 @@ def _sizes_of(run: Experiment) -> _Sizes:
     return _sizes[run]
 
 
+# -- the width of sgn ------------------------------------------------------------------------------------
 def smoothing(runs: Sequence[Experiment], parameters: Mapping[str, Any], noise: float = 1.0) -> float | None:
     """Return the width of sgn that suits the data, `noise` times as noisy as they seem; None if given or unused."""
     p = parameters.get("sgn_width")
