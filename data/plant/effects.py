@@ -331,6 +331,12 @@ def speed_offset(m: Motor, w_0: float) -> Hooks:
 
 
 @_known
+def speed_ripple(m: Motor, a_w: float, N_w: float, phi_w: float = 0.0, e_w: float = 0.0) -> Hooks:
+    """A tacho's ripple over the turn; with e_w = 1 of an encoder, whose angle shows the integral of it."""
+    return {"sensor": ("speed_ripple", (a_w, N_w, phi_w, e_w))}
+
+
+@_known
 def current_gain(m: Motor, k_i: float) -> Hooks:
     return {"sensor": ("current_gain", 1 + k_i)}
 

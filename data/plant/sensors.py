@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import cmath
 from bisect import bisect_right
-from math import exp
+from math import cos, exp, sin
 
 import numpy as np
 
@@ -81,6 +81,7 @@ class Chain:
         self.delay, self.gain = has.get("speed_delay", 0.0), has.get("speed_gain", 1.0)
         self.offset, self.window = has.get("current_offset", 0.0), has.get("speed_average", 0.0)
         self.speed_offset, self.current_gain = has.get("speed_offset", 0.0), has.get("current_gain", 1.0)
+        self.ripple = has.get("speed_ripple", (0.0, 1.0, 0.0, 0.0))
         self.duty = has.get("duty", lambda v: 1.0)
         self.i, self.w = 0.0, float(omega0)
         self._last = (0.0, float(omega0))
@@ -109,7 +110,10 @@ class Chain:
         if self.window:
             w = (self._turned - self._delayed(t - self.window)) / self.window
         i = self.current_gain * self.duty(v) * self.i + self.offset
-        return {"i": i, "omega": self.gain * w + self.speed_offset, "theta": y[2]}
+        part, periods, phase, angle = self.ripple
+        w *= 1 + part * sin(periods * y[2] + phase)
+        theta = y[2] - angle * part / periods * cos(periods * y[2] + phase)
+        return {"i": i, "omega": self.gain * w + self.speed_offset, "theta": theta}
 
     def _delayed(self, t: float) -> float:
         k = bisect_right(self._times, t + 1e-12)

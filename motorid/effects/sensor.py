@@ -83,6 +83,23 @@ def speed_offset(m: Equations, w_0=P(0.5, "rad/s", null=0.0, doc="added by the s
 
 
 @effect(balance="sensor")
+def speed_ripple(m: Equations, a_w=P(0.02, "", null=0.0, lower=0.0, upper=1.0, doc="relative amplitude"),
+                 N_w=P(1.0, "", order=True, vary=False, lower=1.0, doc="periods per turn, from the misfit, then fixed"),
+                 phi_w=P(0.0, "rad", periodic=True, doc="phase at theta = 0"),
+                 e_w=P(0.0, "", vary=False, lower=0.0, upper=1.0, grid=(0.0, 1.0), doc="1: in the angle too, fixed")):
+    """Ripple of the speed as read, ω·(1+a·sin(Nθ+φ)): a tacho's; with e_w = 1 an encoder off centre, in its angle too.
+
+    What suits is taken, unless given. Isermann, Mechatronic Systems, 2005.
+    """
+    size, begun = e_w * a_w / N_w, 0.0  # the rate of the angle's ripple is the speed's
+    m.measure("omega", m.measured("omega") * (1 + a_w * ca.sin(N_w * m.theta + phi_w)))
+    m.measure("theta", m.measured("theta") - size * ca.cos(N_w * m.theta + phi_w))
+    for _ in range(3):  # the angle that shows as the first one read
+        begun = size * ca.cos(N_w * (m.start["theta"] + begun) + phi_w)
+    m.initial["theta"] += begun
+
+
+@effect(balance="sensor")
 def current_lag(m: Equations,
                 T_i=P(1e-3, "s", null=0.0, positive=True, grid=(0.5, 2.0, 8.0), doc="time constant of current filter")):
     """First-order lag of the current measurement. Åström & Murray, Feedback Systems, 2008."""
@@ -122,7 +139,7 @@ def supply_side_current(m: Equations, V_dc=P(12.0, "V", positive=True, vary=Fals
 def encoder_zero(m: Equations, z_0=P(0.0, "rad", null=0.0, per_run=True, doc="angle that the encoder calls 0")):
     """Zero of the encoder, another in every run: cogging keeps its phase. Isermann, Mechatronic Systems, 2005."""
     m.angle_state()
-    m.initial["theta"] = m.start["theta"] + z_0
+    m.initial["theta"] += z_0
     if "theta_in" in m.inputs:
         m.replace("zero", z_0)
     m.measure("theta", m.measured("theta") - z_0)

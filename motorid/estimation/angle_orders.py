@@ -1,4 +1,4 @@
-"""Orders of angle-periodic effects (cogging, torque ripple) from the model's response to every order.
+"""Orders of angle-periodic effects (cogging, ripple of torque or sensor) from the model's response to every order.
 
 The answer of the outputs to sin(Nθ) and cos(Nθ) torques along the measured angle, for all N at once, projected off
 the tangent space of the fit like any other score, both without their colour (`whitening`); no signal is
@@ -23,6 +23,7 @@ from motorid.model.definition import Effect, Parameter
 from motorid.model.model import Model, dc_motor, torque_driven
 from motorid.numerics.autoregression import Whitening
 from motorid.numerics.signals import Array
+from motorid.problem.problem import Problem
 from motorid.problem.runs import angle_signal
 
 WIDEST = 4e6  # numbers in the answers to all orders that are looked at together
@@ -38,13 +39,15 @@ ALIKE = 1e-7  # below one, the correlation at which the answers to sine and cosi
 SAMPLED = 8  # orders whose answers are worked out to know about how strong all are
 LOOKED_AT = 12  # of the best then
 STILL = 1e-9  # rad per sample: no motion
-KINDS = ("torque", "motor's torque", "K")  # what an order modulates: K both torque and back-EMF
+# What an order modulates: K both torque and back-EMF, an encoder both speed and angle as they are read.
+WAYS = {"torque": ("motor's torque", "K"), "sensor": ("speed", "encoder")}
+READ = {"speed": "omega", "encoder": "theta"}  # the channel without which there is nothing to modulate
 SURE = 30.0  # chi² of two degrees of freedom: the highest of 240 orders of noise reaches about 11
 
 
 @dataclass(frozen=True)
 class Line:
-    """One order in the spectrum of the misfit: torque −A·sin(Nθ+φ), or the motor's torque by 1+a·sin(Nθ+φ)."""
+    """One order in the spectrum of the misfit: torque −A·sin(Nθ+φ), or what is modulated by 1+a·sin(Nθ+φ)."""
 
     order: float
     share: float  # of the squared residual without its colour
@@ -120,26 +123,27 @@ def strongest_order(fit: Fit, effects: Sequence[Effect]) -> tuple[Effect, dict[s
 def spectrum(tangent: Tangent, effect: Effect) -> Spectrum:
     """Return what each order explains of the misfit.
 
-    `effect` tells what is modulated: the torque itself (an amplitude in N·m), or the torque made by the current
-    (a relative amplitude), by a fixed parameter of it the back-EMF too.
+    `effect` tells what is modulated: the torque itself (an amplitude in N·m), or the torque made by the current or
+    the speed as read (a relative amplitude), by a fixed parameter of it the back-EMF or the angle too.
     """
     if all(p.null != 0 or p.unit for p in effect.parameters):
         return _spectrum(tangent, "torque")
-    both = next((p.name for p in effect.parameters if not p.vary and p.grid), None)
+    both, kinds = next((p.name for p in effect.parameters if not p.vary and p.grid), None), WAYS[effect.balance]
     if both is None:
-        return _spectrum(tangent, "motor's torque")
-    ways = [(_spectrum(tangent, kind), {both: value}) for kind, value in (("motor's torque", 0.0), ("K", 1.0))]
+        return _spectrum(tangent, kinds[0])
+    ways = [(_spectrum(tangent, kind), {both: value}) for kind, value in zip(kinds, (0.0, 1.0), strict=True)]
     lines = [replace(line, choice=choice) for found, choice in ways for line in found.lines]
     return Spectrum(tuple(sorted(lines, key=lambda line: -line.share)), any(found.stands_out for found, _ in ways))
 
 
-@lru_cache(maxsize=4)
+@lru_cache(maxsize=8)
 def _spectrum(tangent: Tangent, kind: str) -> Spectrum:
     fit, top, relative = tangent.fit, highest_order(tangent), kind != "torque"
-    # A torque that repeats once per turn is gravity's, and what is to repeat must do so within the travel.
+    # A torque that repeats once per turn is gravity's, and what is to repeat must do so within the travel. A disc off
+    # centre is an encoder's commonest fault: that once per turn needs no proof.
     travel = max(float(np.ptp(angle_signal(r))) for r in fit.problem.experiments)
-    lowest = max(1 if relative else 2, int(np.ceil(PERIODS * 2 * np.pi / max(travel, 1e-9))))
-    if top < lowest or (relative and "i" not in fit.problem.system.states):
+    lowest = 1 if kind in READ else max(1 if relative else 2, int(np.ceil(PERIODS * 2 * np.pi / max(travel, 1e-9))))
+    if top < lowest or kind not in _kinds(fit.problem):
         return Spectrum((), False)
     shares, lines = _order_search(tangent).shares(lowest, kind)
     if not lines:
@@ -149,12 +153,24 @@ def _spectrum(tangent: Tangent, kind: str) -> Spectrum:
     return Spectrum(tuple(found), bool(sure))
 
 
+def _kinds(problem: Problem) -> list[str]:
+    """What an order may modulate in these records."""
+    return ["torque", *(WAYS["torque"] if "i" in problem.system.states else ()),
+            *(kind for kind, channel in READ.items() if channel in problem.outputs)]
+
+
 class Moments(NamedTuple):
     """Of exp(jNθ) put in, per order: the product with the residual of what it answers, and the sums Σ|z|² and Σz²."""
 
     pulls: Array
     sizes: Array
     squares: Array
+
+    def count(self, j: int, pull: complex, put: Array) -> None:
+        """Add what is put in at order `j`, and its product with the residual."""
+        self.pulls[j] += pull
+        self.sizes[j] += np.vdot(put, put).real
+        self.squares[j] += put @ put
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,6 +184,11 @@ class _OrderSearch:
     answers: Sequence[Response]
     orders: Array
     slow: Array
+
+    @property
+    def problem(self) -> Problem:
+        """What was fitted."""
+        return self.fit.problem
 
     def shares(self, lowest: int, kind: str) -> tuple[Array, list[Line]]:
         """Return about what each order explains, and exactly the lines of those that explain most.
@@ -215,33 +236,38 @@ class _OrderSearch:
     def moments(self) -> dict[str, Moments]:
         """The moments of all orders, by what they modulate."""
         n = len(self.orders)
-        found = {kind: Moments(np.zeros(n, complex), np.zeros(n), np.zeros(n, complex)) for kind in KINDS}
+        found = {kind: Moments(np.zeros(n, complex), np.zeros(n), np.zeros(n, complex)) for kind in _kinds(self.problem)}
         residuals = self.white.transposed(self.residual, [len(a.c) for a in self.answers])
         for k, answer in enumerate(self.answers):
-            angle = angle_signal(self.fit.problem.runs[k].experiment)
-            pull = answer.pulled(self._measured(k, residuals[k]))
-            pulls = {kind: (pull * self._pushes(k, kind)).sum(axis=1) for kind in found}
+            angle, seen = angle_signal(self.problem.runs[k].experiment), self._measured(k, residuals[k])
+            pull = answer.pulled(seen)
+            forces = {kind: ((pull * self._pushes(k, kind)).sum(axis=1), self._size(k, kind))
+                      for kind in found if kind not in READ}
             once, step = np.exp(1j * angle), np.diff(angle)
             still = np.abs(step) < STILL
             per_step = 1 / np.where(still, 1.0, 1j * step)
-            sizes = {kind: self._size(k, kind) for kind in found}
             wave = np.ones_like(once)
-            for j, n in enumerate(self.orders):
+            for j, order in enumerate(self.orders):
                 wave = wave * once
-                mean = np.where(still, wave[1:], np.diff(wave) * (per_step / n))  # of exp(jNθ) over each sample
-                mean[np.abs(step) > self.slow[j]] = 0.0
-                for kind, m in found.items():
-                    put = sizes[kind] * mean
-                    m.pulls[j] += pulls[kind] @ mean
-                    m.sizes[j] += np.vdot(put, put).real
-                    m.squares[j] += put @ put
+                quick = np.abs(step) > self.slow[j]
+                mean = np.where(still, wave[1:], np.diff(wave) * (per_step / order))  # of exp(jNθ) over each sample
+                mean[quick] = 0.0
+                for kind, (pulls, sizes) in forces.items():
+                    found[kind].count(j, pulls @ mean, sizes * mean)
+                for kind in found.keys() & READ.keys():
+                    put = np.where(quick[:, None], 0.0, self._read(k, kind, wave[:, None], order)[1:, :, 0])
+                    found[kind].count(j, np.vdot(seen[1:], put), put.ravel())
         return found
 
     def _columns(self, k: int, orders: Array, kind: str) -> Array:
         """Whitened outputs of run `k` to unit sine and cosine of all `orders`, (N, ny, 2 len(orders))."""
-        angle = angle_signal(self.fit.problem.runs[k].experiment)
+        angle = angle_signal(self.problem.runs[k].experiment)
         slow = self.slow[orders.astype(int) - 1]
         middle, step = (angle[1:] + angle[:-1]) / 2, np.diff(angle)
+        if kind in READ:
+            near = np.abs(np.diff(angle, prepend=angle[0]))[:, None] <= slow
+            put = self._read(k, kind, np.exp(1j * np.outer(angle, orders)), orders) * near[:, None]
+            return self._measured(k, np.concatenate([put.imag, put.real], axis=2))
         # Averaged over the sample, so that orders too fast for the sampling fade instead of posing as slower ones.
         fade = np.sinc(np.outer(orders, step) / (2 * np.pi)) * (np.abs(step) <= slow[:, None])
         turning = np.outer(orders, middle)
@@ -251,6 +277,16 @@ class _OrderSearch:
     def _pushes(self, k: int, kind: str) -> Array:
         """Return what moves the states at the end of each sample, (N-1, nx), if it is not modulated."""
         return np.einsum("nxd,dn->nx", self.answers[k].b, self._forces(k, kind))
+
+    def _read(self, k: int, kind: str, waves: Array, orders: Array) -> Array:
+        """Return what `waves` (N, m) of `orders` (m,) in a sensor put into the channels, (N, ny, m), in units of noise.
+
+        The angle of an encoder shows their integral, from what it shows at first.
+        """
+        outputs, weights = self.problem.outputs, self.problem.measured[k].weights
+        put = {"omega": waves * self.answers[k].states["omega"][:, None]}
+        put |= {"theta": (waves - waves[0]) / (1j * orders)} if kind == "encoder" else {}
+        return np.stack([put.get(c, 0 * waves) * w for c, w in zip(outputs, weights, strict=True)], 1)
 
     def _size(self, k: int, kind: str) -> Array:
         """Return how much is modulated, (N-1,), N·m, a voltage as the torque that it makes at standstill."""
@@ -266,7 +302,7 @@ class _OrderSearch:
 
     def _measured(self, k: int, outputs: Array) -> Array:
         """Return outputs (N, ny, …) with nothing where nothing was measured."""
-        run = self.fit.problem.measured[k]
+        run = self.problem.measured[k]
         if run.index is not None:
             outputs[~np.isfinite(run.y)] = 0.0
         return outputs

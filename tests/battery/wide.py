@@ -47,11 +47,12 @@ SIZES: dict[str, Callable[[P.Motor, float], dict[str, float]]] = {
     "speed_filter": lambda m, u: {"T_f": max(0.2 * time_constant(m), 3 * DT[m.name]), "zeta_f": 0.5},
     "speed_average": lambda m, u: {"T_a": max(0.5 * time_constant(m), 4 * DT[m.name])},
     "speed_offset": lambda m, u: {"w_0": 0.05 * u / m.K},
+    "speed_ripple": lambda m, u: {"a_w": 0.06, "N_w": 3.0, "phi_w": 1.0},
     "current_gain": lambda m, u: {"k_i": 0.08},
     "supply_side_current": lambda m, u: {"V_dc": 1.0 * u},
 }
 KNOWN = {"driver_lag": ("L",), "gear_efficiency": ("J",), "current_gain": ("R",)}
-SEES_ANGLE = ("spring", "end_stop", "angular_friction", "speed_offset")
+SEES_ANGLE = ("spring", "end_stop", "angular_friction", "speed_offset", "speed_ripple")
 
 
 def _case(effect: str, motor: str, drive: str) -> Case:

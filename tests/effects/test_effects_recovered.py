@@ -54,6 +54,7 @@ TRUTH = {
     "end_stop": {"k_stop": 0.5, "theta_lo": -2.0, "theta_hi": 5.0, "d_stop": 5e-3},
     "speed_average": {"T_a": 9e-3},
     "speed_offset": {"w_0": 3.0},
+    "speed_ripple": {"a_w": 0.06, "N_w": 4, "phi_w": 1.0},
     "current_gain": {"k_i": 0.05},
     "supply_side_current": {"V_dc": 9.0},
 }
