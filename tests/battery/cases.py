@@ -178,7 +178,8 @@ SINGLES = [
     single("speed_average", "lab", {"T_a": 0.02}, train=("prbs", "stairs")),
     single("speed_offset", "lab", {"w_0": 4.0}, train=("stairs", "chirp"), channels=ANGLE),
     single("speed_ripple", "lab", {"a_w": 0.05, "N_w": 4, "phi_w": 0.5}, train=("stairs", "chirp"), channels=ANGLE),
-    single("encoder_ripple", "servo", {"a_w": 0.1, "N_w": 1, "phi_w": 0.7, "e_w": 1.0}, train=("stairs", "chirp"), channels=ANGLE),
+    single("speed_ripple", "servo", {"a_w": 0.1, "N_w": 1, "phi_w": 0.7, "e_w": 1.0}, train=("stairs", "chirp"),
+           channels=ANGLE, name="encoder_ripple"),
     single("current_gain", "lab", {"k_i": 0.08}, train=("stairs", "multisine"), known=("R",)),
     single("supply_side_current", "lab", {"V_dc": 6.0}, train=("stairs", "multisine")),
     # The same effects in other motors, with other sensors, channels and drives.
