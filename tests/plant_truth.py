@@ -48,7 +48,7 @@ NUMBERS = {  # one plausible size of every effect
     "gear_efficiency": {"mu_d": 0.1, "mu_b": 0.3},
     "speed_average": {"T_a": 8e-3},
     "speed_offset": {"w_0": 2.0},
-    "speed_ripple": {"a_w": 0.05, "N_w": 3, "phi_w": 0.6, "e_w": 1.0},
+    "speed_ripple": {"a_w": 0.05, "N_w": 3, "phi_w": 0.6, "e_w": 0.0},
     "current_gain": {"k_i": 0.05},
     "supply_side_current": {"V_dc": 6.0},
     "tight_spot": {"tau_c": 5e-3, "c": 2.0},

@@ -6,11 +6,13 @@ from .loops import closed_loop, simulate_linear
 from .motion import Plant, simulate
 from .motors import MOTORS, Motor
 from .sensors import adc, coloured, dropouts, encoder, encoder_speed, outliers, resample, uneven, white
+from .sizes import SIZES
 
 __all__ = [
     "BEYOND",
     "LIBRARY",
     "MOTORS",
+    "SIZES",
     "Motor",
     "Plant",
     "adc",

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -26,8 +26,6 @@ NOISE = 0.5  # standard deviation of the converters' noise, in counts
 BLOCK = 256  # samples whose noise is drawn at once
 SIGNED = ("phi", "_0", "k_w", "b_a")  # in names of parameters that may be negative
 OVER_LIMIT = 3  # samples in a row beyond the current limit that switch the motor off
-
-Draw = Callable[[float, float], float]  # a number between two, evenly on a log scale
 
 
 class VirtualDevice:
@@ -229,14 +227,8 @@ class Truth:
 def hide(words: str = "random", motor: str = "lab", seed: int = 0) -> Truth:
     """Choose a motor and what is hidden in it; UsageError for a name or a number that is not known.
 
-    Parameters
-    ----------
-    words : str
-        ``none``, ``random``, or effects joined by commas, each bare (its size is drawn) or with its numbers:
-        ``coulomb:tau_c=0.01,brush_drop``.
-    motor : str
-        One of the plant's motors. Its constants are drawn within 10 % of the nominal ones.
-    seed : int
+    `words` are ``none``, ``random``, or effects joined by commas, each bare (its size is drawn) or with its numbers:
+    ``coulomb:tau_c=0.01,brush_drop``. The constants of `motor` are drawn within 10 % of the plant's.
     """
     plant = load_plant()
     among(motor, plant.MOTORS, "motor")
@@ -248,7 +240,7 @@ def hide(words: str = "random", motor: str = "lab", seed: int = 0) -> Truth:
         return float(np.exp(rng.uniform(np.log(low), np.log(high))))
 
     if words == "random":
-        words = str(rng.choice(list(SIZES)))
+        words = str(rng.choice(list(plant.SIZES)))
     effects = dict(_effect(word, real, draw) for word in words.split(",") if word and word != "none")
     try:
         plant.Plant(real, effects)
@@ -257,7 +249,7 @@ def hide(words: str = "random", motor: str = "lab", seed: int = 0) -> Truth:
     return Truth(real, effects, seed)
 
 
-def _effect(word: str, motor: Any, draw: Draw) -> tuple[str, dict[str, float]]:
+def _effect(word: str, motor: Any, draw: Callable[..., float]) -> tuple[str, dict[str, float]]:
     name, *numbers = word.strip().split(":")
     plant = load_plant()
     known = {**plant.LIBRARY, **plant.BEYOND}
@@ -272,33 +264,7 @@ def _effect(word: str, motor: Any, draw: Draw) -> tuple[str, dict[str, float]]:
             if not math.isfinite(value) or (value < 0 and not any(s in key for s in SIGNED)):
                 raise UsageError(f"'{word}': {key} must be a size, finite and not negative; got {value:g}.")
         return name, given
-    if name not in SIZES:
+    if name not in plant.SIZES:
         raise UsageError(f"no size is drawn for '{name}'; spell its numbers out, as in {name}:name=value. "
-                         f"Drawn are: {', '.join(SIZES)}.")
-    return name, SIZES[name](motor, draw)
-
-
-def _stall(m: Any) -> float:
-    return m.K * m.v_max / m.R  # N·m at v_max with the shaft held
-
-
-# Sizes by effect, from the motor's own scales. An effect that is not here needs its numbers spelt out.
-SIZES: Mapping[str, Callable[[Any, Draw], dict[str, float]]] = {
-    "coulomb": lambda m, draw: {"tau_c": _stall(m) * draw(0.02, 0.06)},
-    "coulomb_asymmetric": lambda m, draw: {"tau_cp": (tau := _stall(m) * draw(0.02, 0.05)),
-                                           "tau_cn": tau * draw(1.6, 2.5)},
-    "stribeck": lambda m, draw: {"tau_c": (tau_c := _stall(m) * draw(0.02, 0.04)), "tau_s": tau_c * draw(1.6, 2.2),
-                                 "omega_s": m.no_load_speed * draw(0.02, 0.05)},
-    "quadratic_drag": lambda m, draw: {"c_2": _stall(m) * draw(0.05, 0.15) / (0.6 * m.no_load_speed) ** 2},
-    "constant_load": lambda m, draw: {"tau_0": _stall(m) * draw(0.03, 0.08)},
-    "gravity": lambda m, draw: {"mgl": _stall(m) * draw(0.04, 0.1)},
-    "cogging": lambda m, draw: {"A": _stall(m) * draw(0.03, 0.06), "N": float(round(draw(3.6, 12.4))), "phi": 0.5},
-    "load_friction": lambda m, draw: {"mu": draw(0.06, 0.15)},
-    "brush_drop": lambda m, draw: {"V_b": m.v_max * draw(0.04, 0.08), "i_b": m.v_max / m.R * 0.01},
-    "driver_dead_band": lambda m, draw: {"V_d": m.v_max * draw(0.03, 0.07)},
-    "voltage_offset": lambda m, draw: {"V_0": m.v_max * draw(0.02, 0.05)},
-    "magnetic_saturation": lambda m, draw: {"i_K": m.v_max / m.R * draw(0.6, 1.0)},
-    "current_offset": lambda m, draw: {"i_0": m.v_max / m.R * draw(0.02, 0.05)},
-    "speed_lag": lambda m, draw: {"T_w": m.J * m.R / m.K**2 * draw(0.1, 0.25)},
-    "speed_delay": lambda m, draw: {"T_d": m.J * m.R / m.K**2 * draw(0.1, 0.2)},
-}
+                         f"Drawn are: {', '.join(plant.SIZES)}.")
+    return name, plant.SIZES[name](motor, draw)

@@ -18,7 +18,7 @@ from motorid.channels import COMPUTED_INPUTS
 from motorid.diagnosis.thresholds import CONTAINED
 from motorid.effects import LIBRARY
 from motorid.errors import SimulationError
-from motorid.estimation.angle_orders import likely_orders
+from motorid.estimation.angle_orders import likely_lines
 from motorid.estimation.linearisation import Response, Tangent, parameter_vector, responses
 from motorid.estimation.result import Fit
 from motorid.numerics.signals import Array
@@ -137,8 +137,9 @@ def span_of(fit: Fit, signals: Sequence[Mapping[str, Array]]) -> Span:
     step = float(np.median(np.concatenate([np.diff(s["t"]) for s in signals])))
     ranges = {n: (min(float(s[n].min()) for s in signals), max(float(s[n].max()) for s in signals)) for n in names}
     known = [fit.values[p.name] for e in fit.model.effects for p in e.parameters if p.order]
-    seen = likely_orders(Tangent.of(fit), LIBRARY["cogging"], LINES) if "theta" in fit.problem.outputs else []
-    orders = {*range(1, HARMONICS + 1), *(round(k * n) for n in known for k in range(1, 5)), *map(round, seen)}
+    lines = likely_lines(Tangent.of(fit), LIBRARY["cogging"], LINES) if "theta" in fit.problem.outputs else []
+    orders = {*range(1, HARMONICS + 1), *(round(k * n) for n in known for k in range(1, 5)),
+              *(round(line.order) for line in lines)}
     return Span(ranges, tuple(sorted(orders)), step)
 
 

@@ -84,11 +84,6 @@ def _moving(tangent: Tangent) -> Array:
     return steps[steps > 1e-6 * max(steps.max(initial=0.0), 1e-300)]
 
 
-def likely_orders(tangent: Tangent, effect: Effect, most: int) -> list[float]:
-    """Return the orders that explain most of the misfit, best first."""
-    return [line.order for line in likely_lines(tangent, effect, most)]
-
-
 @lru_cache(maxsize=256)
 def uses_angle(effect: Effect) -> bool:
     """Tell whether the effect reads the angle."""
@@ -114,10 +109,8 @@ def strongest_order(fit: Fit, effects: Sequence[Effect]) -> tuple[Effect, dict[s
     """Return which of `effects` has the strongest line in the misfit, with its order, size and phase; None for none."""
     tangent = Tangent.of(fit)
     lines = [(e, line) for e in effects for line in likely_lines(tangent, e, 1)]
-    if not lines:
-        return None
-    effect, line = max(lines, key=lambda pair: pair[1].share)
-    return effect, line.values(effect.parameters)
+    best = max(lines, key=lambda pair: pair[1].share, default=None)
+    return best and (best[0], best[1].values(best[0].parameters))
 
 
 def spectrum(tangent: Tangent, effect: Effect) -> Spectrum:
@@ -129,9 +122,8 @@ def spectrum(tangent: Tangent, effect: Effect) -> Spectrum:
     if all(p.null != 0 or p.unit for p in effect.parameters):
         return _spectrum(tangent, "torque")
     both, kinds = next((p.name for p in effect.parameters if not p.vary and p.grid), None), WAYS[effect.balance]
-    if both is None:
-        return _spectrum(tangent, kinds[0])
-    ways = [(_spectrum(tangent, kind), {both: value}) for kind, value in zip(kinds, (0.0, 1.0), strict=True)]
+    ways = [(_spectrum(tangent, kind), {both: value} if both else {})
+            for kind, value in zip(kinds[:2 if both else 1], (0.0, 1.0), strict=False)]
     lines = [replace(line, choice=choice) for found, choice in ways for line in found.lines]
     return Spectrum(tuple(sorted(lines, key=lambda line: -line.share)), any(found.stands_out for found, _ in ways))
 
@@ -169,7 +161,7 @@ class Moments(NamedTuple):
     def count(self, j: int, pull: complex, put: Array) -> None:
         """Add what is put in at order `j`, and its product with the residual."""
         self.pulls[j] += pull
-        self.sizes[j] += np.vdot(put, put).real
+        self.sizes[j] += np.vdot(put, put)
         self.squares[j] += put @ put
 
 
@@ -185,11 +177,6 @@ class _OrderSearch:
     orders: Array
     slow: Array
 
-    @property
-    def problem(self) -> Problem:
-        """What was fitted."""
-        return self.fit.problem
-
     def shares(self, lowest: int, kind: str) -> tuple[Array, list[Line]]:
         """Return about what each order explains, and exactly the lines of those that explain most.
 
@@ -201,6 +188,7 @@ class _OrderSearch:
         if len(few) == len(orders) or not (sizes > 0).any():
             return np.array([line.share for line in lines]), lines
         pulls, put_in, squares = (m[lowest - 1 :] for m in self.moments[kind])
+        put_in = put_in.real
         seen = few[sizes > 0]
         with np.errstate(divide="ignore", invalid="ignore"):
             answer = np.interp(np.log(orders), np.log(orders[seen]), np.log(sizes[sizes > 0] / put_in[seen]))
@@ -235,11 +223,10 @@ class _OrderSearch:
     @cached_property
     def moments(self) -> dict[str, Moments]:
         """The moments of all orders, by what they modulate."""
-        n = len(self.orders)
-        found = {kind: Moments(np.zeros(n, complex), np.zeros(n), np.zeros(n, complex)) for kind in _kinds(self.problem)}
+        found = {kind: Moments(*np.zeros((3, len(self.orders)), complex)) for kind in _kinds(self.fit.problem)}
         residuals = self.white.transposed(self.residual, [len(a.c) for a in self.answers])
         for k, answer in enumerate(self.answers):
-            angle, seen = angle_signal(self.problem.runs[k].experiment), self._measured(k, residuals[k])
+            angle, seen = angle_signal(self.fit.problem.runs[k].experiment), self._measured(k, residuals[k])
             pull = answer.pulled(seen)
             forces = {kind: ((pull * self._pushes(k, kind)).sum(axis=1), self._size(k, kind))
                       for kind in found if kind not in READ}
@@ -249,19 +236,18 @@ class _OrderSearch:
             wave = np.ones_like(once)
             for j, order in enumerate(self.orders):
                 wave = wave * once
-                quick = np.abs(step) > self.slow[j]
-                mean = np.where(still, wave[1:], np.diff(wave) * (per_step / order))  # of exp(jNθ) over each sample
-                mean[quick] = 0.0
+                slow = np.abs(step) <= self.slow[j]
+                mean = slow * np.where(still, wave[1:], np.diff(wave) * (per_step / order))  # of exp(jNθ) per sample
                 for kind, (pulls, sizes) in forces.items():
                     found[kind].count(j, pulls @ mean, sizes * mean)
                 for kind in found.keys() & READ.keys():
-                    put = np.where(quick[:, None], 0.0, self._read(k, kind, wave[:, None], order)[1:, :, 0])
-                    found[kind].count(j, np.vdot(seen[1:], put), put.ravel())
+                    put = (slow[:, None] * self._read(k, kind, wave[:, None], order)[1:, :, 0]).ravel()
+                    found[kind].count(j, seen[1:].ravel() @ put, put)
         return found
 
     def _columns(self, k: int, orders: Array, kind: str) -> Array:
         """Whitened outputs of run `k` to unit sine and cosine of all `orders`, (N, ny, 2 len(orders))."""
-        angle = angle_signal(self.problem.runs[k].experiment)
+        angle = angle_signal(self.fit.problem.runs[k].experiment)
         slow = self.slow[orders.astype(int) - 1]
         middle, step = (angle[1:] + angle[:-1]) / 2, np.diff(angle)
         if kind in READ:
@@ -283,7 +269,7 @@ class _OrderSearch:
 
         The angle of an encoder shows their integral, from what it shows at first.
         """
-        outputs, weights = self.problem.outputs, self.problem.measured[k].weights
+        outputs, weights = self.fit.problem.outputs, self.fit.problem.measured[k].weights
         put = {"omega": waves * self.answers[k].states["omega"][:, None]}
         put |= {"theta": (waves - waves[0]) / (1j * orders)} if kind == "encoder" else {}
         return np.stack([put.get(c, 0 * waves) * w for c, w in zip(outputs, weights, strict=True)], 1)
@@ -302,9 +288,7 @@ class _OrderSearch:
 
     def _measured(self, k: int, outputs: Array) -> Array:
         """Return outputs (N, ny, …) with nothing where nothing was measured."""
-        run = self.problem.measured[k]
-        if run.index is not None:
-            outputs[~np.isfinite(run.y)] = 0.0
+        outputs[~np.isfinite(self.fit.problem.measured[k].y)] = 0.0
         return outputs
 
 

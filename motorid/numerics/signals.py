@@ -136,6 +136,9 @@ def noise_level(y: ArrayLike, t: ArrayLike | None = None) -> float:
     long as that removes more signal. Parts in which nothing changes at all are left out, and so is what a sensor that
     measures every few samples repeats meanwhile. The result is never below
     what rounding alone does (step/√12, where the channel moves in steps), nor below 1e-5 of the channel's variation.
+    Noise that is itself smooth is underestimated: by a factor of about four for first-order noise with a correlation
+    of 0.9 between neighbours. A signal that never rests and has only two or three samples per time constant is
+    overestimated.
 
     Parameters
     ----------
@@ -148,12 +151,6 @@ def noise_level(y: ArrayLike, t: ArrayLike | None = None) -> float:
     -------
     float
         Standard deviation in the unit of `y`, always positive; 1.0 for a channel that is zero throughout.
-
-    Notes
-    -----
-    It sees what changes from sample to sample. Noise that is itself smooth is underestimated: by a factor
-    of about four for first-order noise with a correlation of 0.9 between neighbours. A signal that never
-    rests and has only two or three samples per time constant is overestimated.
 
     References
     ----------

@@ -25,8 +25,9 @@ from motorid.acquire import record
 from motorid.acquire.excitation import program
 from motorid.acquire.protocol import frame
 from motorid.acquire.server import Faults, Wire
-from motorid.acquire.virtual import SIZES, VirtualDevice, hide
+from motorid.acquire.virtual import VirtualDevice, hide
 from motorid.errors import DeviceError, UsageError
+from motorid.records.datasets import load_plant
 
 needs_pty = pytest.mark.skipif(not hasattr(os, "openpty"), reason="this system has no pseudo-terminals")
 SHORT = "rest:0.01,step:4:0.02,coast:0.01"
@@ -417,7 +418,7 @@ def test_numbers_that_make_no_sense_are_refused(out, bad):
 # ------------------------------------------------------------------------------------------ the virtual motor
 
 
-@pytest.mark.parametrize("name", sorted(SIZES))
+@pytest.mark.parametrize("name", sorted(load_plant().SIZES))
 @pytest.mark.parametrize("motor", ["micro", "big"])
 def test_every_drawn_effect_changes_the_record_and_lets_the_motor_turn(name, motor, out):
     truth, plain = hide(name, motor, seed=3), hide("none", motor, seed=3)

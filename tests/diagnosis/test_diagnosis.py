@@ -22,7 +22,7 @@ from motorid.diagnosis.verdict import moves
 from motorid.display.numbers import with_error
 from motorid.effects import LIBRARY
 from motorid.errors import FitError, ModelError, UsageError
-from motorid.estimation.angle_orders import highest_order, likely_orders
+from motorid.estimation.angle_orders import highest_order, likely_lines
 from motorid.estimation.linearisation import Tangent
 from motorid.numerics.autoregression import autocorrelation, effective_samples
 from motorid.records.datasets import data_path
@@ -176,7 +176,7 @@ def test_the_order_of_cogging_is_found_from_the_misfit(lab):
     hidden = {"cogging": {"A": 8e-3, "N": 16, "phi": 0.7}}
     runs = runs_of(lab, hidden, ("stairs 0.3", "ramps 0.3"), ANGLE)
     tangent = Tangent.of(mi.fit(mi.dc_motor(), runs))
-    assert likely_orders(tangent, LIBRARY["cogging"], 3)[0] == 16
+    assert likely_lines(tangent, LIBRARY["cogging"], 3)[0].order == 16
     assert 16 <= highest_order(tangent) < 2 * np.pi / (1e-3 * 20)
 
 

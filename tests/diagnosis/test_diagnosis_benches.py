@@ -14,8 +14,8 @@ from motorid.diagnosis.candidates import Search, Stages, library
 
 def test_the_wide_battery_has_every_effect_of_benches_in_three_motors_under_three_drives():
     singles = [c for c in WIDE.values() if c.kind == "single"]
-    assert len(SIZES) == 19
-    assert len(singles) == 171
+    assert len(SIZES) == 20
+    assert len(singles) == 180
     assert {tuple(c.effects) for c in singles} == {(e,) for e in SIZES}
     assert sum(c.kind == "none" for c in WIDE.values()) == 54
 
@@ -114,3 +114,21 @@ def test_two_frictions_that_contain_the_same_one_are_not_both_added():
     assert [s.effect.name for s in search.scores(search.root)] == ["quadratic_drag"]
     wider = Search(mi.fit(mi.dc_motor() + mi.effects.coulomb, runs[:1]), None, library(["stribeck"]), Stages())
     assert [c.effect for c in wider.expand(wider.root)[1]] == ["stribeck"]  # in the place of the one that it contains
+
+
+@pytest.mark.parametrize(("motor", "hidden", "channels"), [
+    ("lab", {"a_w": 0.05, "N_w": 4, "phi_w": 0.5}, ("i", "omega", "theta")),
+    ("servo", {"a_w": 0.1, "N_w": 1, "phi_w": 0.7, "e_w": 1.0}, ("i", "omega", "theta")),  # turns less than once
+    ("servo", {"a_w": 0.1, "N_w": 1, "phi_w": 0.7, "e_w": 1.0}, ("theta",)),
+], ids=["tacho", "encoder", "angle alone"])
+def test_a_ripple_of_the_sensor_over_the_turn_is_found_with_its_order(motor, hidden, channels):
+    case = Case("ripple", "single", motor, {"speed_ripple": hidden}, ("stairs", "chirp"), "prbs 0.6", channels=channels)
+    runs, check = case.records()
+    tried = ["speed_ripple", "cogging", "torque_ripple", "gravity", "coulomb", "speed_gain"]
+    found = mi.diagnose(mi.fit(mi.dc_motor(), runs), check, effects=tried)
+    assert found.effects == ("speed_ripple",)
+    assert found.remaining.adequate
+    values, std = found.best.values, found.best.std
+    assert (values["N_w"], values["e_w"]) == (hidden["N_w"], hidden.get("e_w", 0.0))
+    for name in ("a_w", "phi_w"):
+        assert abs(values[name] - hidden[name]) < 4 * std[name]

@@ -7,7 +7,7 @@ import pytest
 import motorid as mi
 from motorid.diagnosis.score_test import score
 from motorid.effects import LIBRARY
-from motorid.estimation.angle_orders import likely_orders
+from motorid.estimation.angle_orders import likely_lines
 from motorid.estimation.linearisation import Tangent
 from motorid.records.experiment import split
 
@@ -77,7 +77,7 @@ def test_odri_cogs_72_times_a_turn(real):
     run = mi.read_runs([real / "odri_mn4004" / "sine_current.txt"])[0].select(slice(7000, 11000))
     for model in (mi.dc_motor(), mi.dc_motor() + mi.effects.coulomb):
         tangent = Tangent.of(mi.fit(model, run))
-        assert likely_orders(tangent, LIBRARY["cogging"], 3)[0] == 72
+        assert likely_lines(tangent, LIBRARY["cogging"], 3)[0].order == 72
         assert score(tangent, LIBRARY["cogging"]).stands_out
 
 
