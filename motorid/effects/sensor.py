@@ -87,9 +87,9 @@ def speed_ripple(m: Equations, a_w=P(0.02, "", null=0.0, lower=0.0, upper=1.0, d
                  N_w=P(1.0, "", order=True, vary=False, lower=1.0, doc="periods per turn, from the misfit, then fixed"),
                  phi_w=P(0.0, "rad", periodic=True, doc="phase at theta = 0"),
                  e_w=P(0.0, "", vary=False, lower=0.0, upper=1.0, grid=(0.0, 1.0), doc="1: in the angle too, fixed")):
-    """Ripple of the speed as read, ω·(1+a·sin(Nθ+φ)): a tacho's; with e_w = 1 an encoder off centre, in its angle too.
+    """Ripple of the speed as read, ω·(1+a·sin(N·θ+φ)): a tacho's, an encoder's. Isermann, Mechatronic Systems, 2005.
 
-    What suits is taken, unless given. Isermann, Mechatronic Systems, 2005.
+    With e_w = 1 it is an encoder off centre, in whose angle it shows too. What suits is taken, unless given.
     """
     size, begun = e_w * a_w / N_w, 0.0  # the rate of the angle's ripple is the speed's
     m.measure("omega", m.measured("omega") * (1 + a_w * ca.sin(N_w * m.theta + phi_w)))
