@@ -95,7 +95,7 @@ def speed_ripple(m: Equations, a_w=P(0.02, "", null=0.0, lower=0.0, upper=1.0, d
     m.measure("omega", m.measured("omega") * (1 + a_w * ca.sin(N_w * m.theta + phi_w)))
     m.measure("theta", m.measured("theta") - size * ca.cos(N_w * m.theta + phi_w))
     for _ in range(3):  # the angle that shows as the first one read
-        begun = size * ca.cos(N_w * (m.start["theta"] + begun) + phi_w)
+        begun = size * ca.cos(N_w * (m.start["theta"] + m.zero + begun) + phi_w)
     m.initial["theta"] += begun
 
 
@@ -140,6 +140,5 @@ def encoder_zero(m: Equations, z_0=P(0.0, "rad", null=0.0, per_run=True, doc="an
     """Zero of the encoder, another in every run: cogging keeps its phase. Isermann, Mechatronic Systems, 2005."""
     m.angle_state()
     m.initial["theta"] += z_0
-    if "theta_in" in m.inputs:
-        m.replace("zero", z_0)
+    m.replace("zero", z_0)
     m.measure("theta", m.measured("theta") - z_0)

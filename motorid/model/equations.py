@@ -48,8 +48,7 @@ class Equations:
         self.definitions: dict[str, ca.SX] = {}
         self._replaced: dict[str, str] = {}
         self.define("smoothing", 1)  # factor on the width of sgn, which suits the speed as it is measured
-        if angle_input:
-            self.define("zero", 0)  # of the measured angle
+        self.define("zero", 0)  # of the measured angle
         self.voltage = ca.SX(0)
         self.torque = ca.SX(0)
         self.sensors: dict[str, ca.SX] = {}

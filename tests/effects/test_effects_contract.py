@@ -105,6 +105,17 @@ def test_order_of_adding_does_not_matter(rng):
             )
 
 
+@pytest.mark.parametrize("names", [("encoder_zero", "speed_ripple"), ("speed_ripple", "encoder_zero")])
+@pytest.mark.parametrize("begun", [0.0, 2.1, -3.0])
+def test_an_encoder_off_centre_shows_the_angle_that_it_was_started_with(names, begun):
+    model = motor(*(getattr(mi.effects, n) for n in names))
+    p = parameters(model, a_w=0.1, N_w=1.0, phi_w=0.7, e_w=1.0, z_0=0.3)
+    system = model.system(ALL)
+    x0 = system.first_state(np.array([0.0, 0.0, begun]), p)
+    shown = system.out(x0, np.zeros(system.sizes[1]), p).full()[2]
+    assert shown == pytest.approx(begun, abs=1e-4)
+
+
 @every_effect
 @pytest.mark.parametrize("v", [0.0, 6.0])
 def test_value_and_jacobian_are_finite_at_standstill(effect, v):
