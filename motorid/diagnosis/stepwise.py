@@ -165,7 +165,21 @@ def _finished(found: Climb) -> Climb:
         found, structure = replace(found, remaining=within_noise(found.remaining)), False
     grades = grades_of(best, search.root, groups, forms, structure,
                        lambda name: None if found.stopped else search.without(best, name))
+    if not found.stopped and any(g.grade != "approximates" for g in grades):
+        grades = _sure_alone(search, best, grades)
     return replace(found, rounds=rounds, groups=groups, forms=tuple(forms), grades=grades)
+
+
+def _sure_alone(search: Search, best: Node, grades: tuple[Grade, ...]) -> tuple[Grade, ...]:
+    """Return grades that hold without what only imitates a free form: that form may be in a sure effect's place, too."""
+    core: Node | None = best
+    for g in grades:
+        core = search.without(core, g.effect) if core is not None and g.form is not None else core
+    if core is None or core is best:
+        return grades
+    alone = grades_of(core, search.root, (), better_forms(core.fit, core.fit), True, partial(search.without, core))
+    told = {g.effect: g for g in alone if g.form is not None}
+    return tuple(g if g.grade == "approximates" else told.get(g.effect, g) for g in grades)
 
 
 def _as_it_ended(tried: Candidate, last: frozenset[str], met: frozenset[str]) -> Candidate:
