@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import builtins
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -79,8 +79,7 @@ def climb(search: Search, max_effects: int, seconds: float | None = None) -> Cli
     except (OutOfTime, KeyboardInterrupt) as error:
         interruption.heard()
         stopped = OUT_OF_TIME if isinstance(error, OutOfTime) else INTERRUPTED
-    stopped = stopped or found.stopped
-    if stopped:
+    if stopped := stopped or found.stopped:
         found = replace(found, stopped=stopped, text=f"stopped early: {stopped}; more may be missing",
                         rounds=found.rounds or (tuple(search.listed(scores, {}, stopped)),),
                         remaining=judge_adequacy(found.path[-1]))
@@ -158,46 +157,43 @@ def _finished(found: Climb) -> Climb:
     search, best = found.search, found.path[-1]
     met = frozenset[str]().union(*(node.key for node in found.path))
     rounds = tuple(tuple(_as_it_ended(c, best.key, met) for c in r) for r in found.rounds)
-    groups = tuple((g[0], *rest) for g in found.groups if g and (rest := _without(g[1:], best.key)))
+    groups = tuple((g[0], *rest) for g in found.groups if g and (rest := [n for n in g[1:] if n not in best.key]))
     structure = not found.remaining.adequate
     forms = better_forms(best.fit, best.fit) if structure else []
     if structure and not forms and at_noise(best) and not found.stopped:
         found, structure = replace(found, remaining=within_noise(found.remaining)), False
     grades = grades_of(best, search.root, groups, forms, structure,
                        lambda name: None if found.stopped else search.without(best, name))
-    if not found.stopped and any(g.grade != "approximates" for g in grades):
+    if not found.stopped and any(g.form for g in grades) and any(g.grade != "approximates" for g in grades):
         grades = _sure_alone(search, best, grades)
     return replace(found, rounds=rounds, groups=groups, forms=tuple(forms), grades=grades)
 
 
 def _sure_alone(search: Search, best: Node, grades: tuple[Grade, ...]) -> tuple[Grade, ...]:
-    """Return grades that hold without what only imitates a free form: that form may be in a sure effect's place, too."""
-    core: Node | None = best
-    for g in grades:
-        core = search.without(core, g.effect) if core is not None and g.form is not None else core
-    if core is None or core is best:
-        return grades
+    """Return grades that hold without what only imitates a free form: that may be in a sure effect's place, too."""
+    core = best
+    for g in (g for g in grades if g.form):
+        core = search.without(core, g.effect) or core
     alone = grades_of(core, search.root, (), better_forms(core.fit, core.fit), True, partial(search.without, core))
-    told = {g.effect: g for g in alone if g.form is not None}
+    told = {g.effect: g for g in alone if g.form}
     return tuple(g if g.grade == "approximates" else told.get(g.effect, g) for g in grades)
 
 
 def _as_it_ended(tried: Candidate, last: frozenset[str], met: frozenset[str]) -> Candidate:
     """Return a candidate as the `last` model has it; what no model on the way there `met` was not taken after all."""
-    tried = replace(tried, group=_without(tried.group, last))
+    tried = replace(tried, group=tuple(n for n in tried.group if n not in last))  # what was found is no rival
     if tried.accepted and not met.issuperset(tried.effect.split(" + ")):
         return replace(tried, accepted=False, reason="taken at first, but a model without it predicts better")
     return tried if tried.accepted or tried.effect not in last else replace(tried, reason="added in a later step")
 
 
-def _better(children: Iterable[Node], best: Node) -> tuple[Node, list[Node]] | None:
+def _better(children: Collection[Node], best: Node) -> tuple[Node, list[Node]] | None:
     """Return the best child, if it beats the best model so far, and all in order.
 
     What physics speaks against is taken only where nothing else helps, and where the held-out runs bear it out. Where
     the score is sure of nothing, a plain fall of the held-out error begins a ladder: of a motor that mostly rests the
     density prefers a model that never moves.
     """
-    children = list(children)
     better = [c for c in children if beats(c, best)]
     plain = [] if better else [c for c in children if not c.objection and evidence(best, c).plain]
     if plain and best.parent is None:
@@ -219,8 +215,7 @@ def _outdoing(listed: Sequence[Candidate], children: Sequence[Node], best: Node,
     first = max(known, key=lambda c: c.gain or 0.0, default=None)
     if first is None or any(first.effect in child.key for child in children):
         return None
-    than = evidence(best, chosen) if chosen is not None else None
-    gain, se = (than.gain, than.se) if than else (0.0, 0.0)
+    gain, se = ((than := evidence(best, chosen)).gain, than.se) if chosen is not None else (0.0, 0.0)
     return first if is_sure((first.gain or 0.0) - gain, float(np.hypot(first.gain_se or 0.0, se))) else None
 
 
@@ -323,11 +318,6 @@ def _late_reading(path: Sequence[Node]) -> Reading | None:
     return next((reading for reading in asked if reading is not None), None)
 
 
-def _without(group: Sequence[str], found: frozenset[str]) -> tuple[str, ...]:
-    """Return a group without what was found, too: that is no longer a rival."""
-    return tuple(n for n in group if n not in found)
-
-
 def _runners_up(best: Node, ordered: Sequence[Node], effects: Sequence[Effect]) -> list[Node]:
     """Return the next best child if it came near enough to be grown too, as one of another kind than the best.
 
@@ -366,9 +356,8 @@ def _path(last: Node) -> list[Node]:
 
 def ladder_of(found: Climb, validated: bool) -> Ladder:
     """Return the rungs of a climb."""
-    rungs: list[Rung] = []
     grades = {g.effect: g for g in found.grades}
-    before = found.path[0]
+    rungs, before = list[Rung](), found.path[0]
     for k, node in enumerate(found.path):
         names = [n for n in node.fit.problem.model.effect_names if n not in before.key]
         rung = Rung(" + ".join(names) or None, node.fit, node.fit.nrmse,

@@ -121,9 +121,9 @@ def spectrum(tangent: Tangent, effect: Effect) -> Spectrum:
     """
     if all(p.null != 0 or p.unit for p in effect.parameters):
         return _spectrum(tangent, "torque")
-    both, kinds = next((p.name for p in effect.parameters if not p.vary and p.grid), None), WAYS[effect.balance]
-    ways = [(_spectrum(tangent, kind), {both: value} if both else {})
-            for kind, value in zip(kinds[:2 if both else 1], (0.0, 1.0), strict=False)]
+    both = next((p.name for p in effect.parameters if not p.vary and p.grid), None)
+    choices: list[dict[str, float]] = [{both: 0.0}, {both: 1.0}] if both else [{}]
+    ways = [(_spectrum(tangent, k), choice) for k, choice in zip(WAYS[effect.balance], choices, strict=False)]
     lines = [replace(line, choice=choice) for found, choice in ways for line in found.lines]
     return Spectrum(tuple(sorted(lines, key=lambda line: -line.share)), any(found.stands_out for found, _ in ways))
 

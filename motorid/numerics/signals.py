@@ -134,11 +134,10 @@ def noise_level(y: ArrayLike, t: ArrayLike | None = None) -> float:
     smaller half of them ignores outliers and the few samples after a voltage step. On uneven samples the weights are
     those of divided differences, so missing and jittering samples do no harm. The order starts at two and grows as
     long as that removes more signal. Parts in which nothing changes at all are left out, and so is what a sensor that
-    measures every few samples repeats meanwhile. The result is never below
-    what rounding alone does (step/√12, where the channel moves in steps), nor below 1e-5 of the channel's variation.
-    Noise that is itself smooth is underestimated: by a factor of about four for first-order noise with a correlation
-    of 0.9 between neighbours. A signal that never rests and has only two or three samples per time constant is
-    overestimated.
+    measures every few samples repeats meanwhile. The result is never below what rounding alone does (step/√12, where
+    the channel moves in steps), nor below 1e-5 of the channel's variation. Noise that is itself smooth is
+    underestimated: by a factor of about four for first-order noise with a correlation of 0.9 between neighbours. A
+    signal that never rests and has only two or three samples per time constant is overestimated.
 
     Parameters
     ----------

@@ -16,7 +16,7 @@ from motorid.diagnosis.admissibility import objections
 from motorid.diagnosis.candidates import library
 from motorid.diagnosis.cross_validation import HeldOut
 from motorid.diagnosis.free_forms import Form
-from motorid.diagnosis.misspecification import FormGain
+from motorid.diagnosis.misspecification import FormGain, Grade
 from motorid.diagnosis.model_comparison import node_of, tied
 from motorid.diagnosis.predictive_score import Evidence, Predictions
 from motorid.diagnosis.results import Candidate
@@ -263,3 +263,26 @@ def test_a_load_of_less_than_a_thousandth_of_the_friction_beside_it_is_no_name(r
     fit = replace(both, values=both.values | {"tau_c": 8e-3, "tau_0": size})
     assert bool(misspecification._within_smoothing(fit, mi.effects.constant_load)) == said
     assert not misspecification._within_smoothing(fit, mi.effects.coulomb)
+
+
+@pytest.mark.parametrize(("alone", "kept"), [("the form is", False), ("it removes little", True), ("", True)])
+def test_what_stands_only_beside_imitators_of_a_free_form_is_not_named(monkeypatch, alone, kept):
+    """A tight spot of the turn: a ripple of the encoder took what told the friction beside it from a free curve."""
+    form = Form("a friction", "torque", "turn", "direction")
+    best, core = "coulomb + cogging + speed_ripple", "coulomb"
+    nodes = {name: SimpleNamespace(fit=name) for name in (best, core)}
+
+    def without(node, name):
+        return None if name == "cogging" else nodes[core]
+
+    def graded(last, root, groups, beside, structure, search_without):
+        assert (last, beside, search_without("cogging")) == (nodes[core], [core, core], None)
+        return (Grade("coulomb", "approximates" if alone else "named", alone, form if "form" in alone else None),)
+
+    monkeypatch.setattr(stepwise, "better_forms", lambda *fits: list(fits))
+    monkeypatch.setattr(stepwise, "grades_of", graded)
+    beside = (Grade("coulomb", "group"), Grade("cogging", "approximates", "a curve", form),
+              Grade("speed_ripple", "approximates", "a curve", form))
+    told = stepwise._sure_alone(SimpleNamespace(without=without, root=None), nodes[best], beside)
+    assert told[1:] == beside[1:]
+    assert told[0] == (beside[0] if kept else Grade("coulomb", "approximates", alone, form))
