@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, reduce
 from itertools import chain, islice, product, zip_longest
@@ -36,9 +36,9 @@ from motorid.diagnosis.free_forms import (
 )
 from motorid.diagnosis.misspecification import better_forms, chosen_functions
 from motorid.diagnosis.model_comparison import Node, at_noise, far
-from motorid.diagnosis.predictive_score import compare
+from motorid.diagnosis.predictive_score import Predictions, compare
 from motorid.diagnosis.refit import refit
-from motorid.display.numbers import number, percent
+from motorid.display.numbers import listed, number, percent
 from motorid.errors import ModelError, OutOfTime, UsageError
 from motorid.estimation.least_squares import FAILURES
 from motorid.estimation.result import Fit
@@ -52,6 +52,7 @@ WHERE = {"torque": "mechanical", "voltage": "electrical", "both": "electrical", 
 TRIED = 4  # curves that are fitted, those that promise most
 FINE = 36  # harmonics of a turn in a curve that is fitted
 CLOSED = 300  # times that are tried as the end, or the beginning, of a constant
+FURTHER = 3  # times that a form beside those of the curve is sought
 ROUNDS = 3  # of choosing functions and fitting: near the optimum slopes show what the misfit hid before
 QUANTITIES = {"t": "m.state('clock')", "distance": "m.state('distance')", "turn": "m.theta", "theta": "m.theta",
               "omega": "m.omega", "i": "m.i", "v": "m.v", "past v": "m.v", "past i": "m.i", "past omega": "m.omega",
@@ -59,7 +60,8 @@ QUANTITIES = {"t": "m.state('clock')", "distance": "m.state('distance')", "turn"
               "past load": "m.v * m.i", "past size": "ca.fabs(m.v)",
               "most i": "m.state('most_i', ca.fabs(m.start['i']))",
               **{c: f"m.input('{c}')" for c in COMPUTED_INPUTS}}
-RATES = {"t": "1.0", "distance": "ca.fabs(m.omega)", "most i": "ca.fmax(ca.fabs(m.i) - z, 0) / {step:.6g}"}
+STATES = {"t": "clock", "distance": "distance", "most i": "most_i"}
+RATES = {"t": "1.0", "distance": "ca.fabs(m.omega)", "most i": "ca.fmax(ca.fabs(m.i) - most_i, 0) / {step:.6g}"}
 SI = {"theta": "rad", "omega": "rad/s", "i": "A", "v": "V", "size": "V"}
 OVER = {"": "", "A": "/A", "V": "/V", "rad/s": "·s/rad"}
 FIRST = {"past i": ", m.start['i']", "past omega": ", m.start['omega']"}  # of a memory: as if it had been so before
@@ -77,132 +79,53 @@ class Law:
         exec(self.source, {"ca": ca, "m": m, **coefficients})
 
 
-@dataclass(frozen=True, eq=False)
-class Curve:
-    """A free form beside a model, of as few functions as its records ask for."""
+@dataclass(frozen=True)
+class Part:
+    """A free form in a curve, of as few functions as its records ask for."""
 
-    fit: Fit  # of the model without the curve
     form: Form
-    coefficients: Mapping[int, float] = field(default_factory=dict)  # of the form's functions that are in the curve
-    fitted: Fit | None = None  # of the model with the curve
-    name: str = "remainder"
+    span: Span  # with as many waves, places and knees as a curve that is fitted may have
+    chosen: tuple[int, ...] = ()  # functions of the form
+
+    @classmethod
+    def of(cls, fit: Fit, form: Form) -> Part:
+        """Return a part without functions, for records as `fit` goes through them."""
+        span = span_of(fit, signals_along(fit))
+        return cls(form, replace(span, orders=tuple(sorted({*span.orders, *range(1, FINE + 1)})), finer=FINER))
 
     @property
-    def effect(self) -> Effect:
-        """The curve as an effect."""
-        parameters = tuple(P(c, self.unit, null=0.0, doc="coefficient of the curve").named(n)
-                           for n, c in self.sizes.items())
-        return Effect(self.name, Law(self.law), parameters, self.balance, f"What is left: {self.form.text}.")
-
-    @property
-    def sizes(self) -> dict[str, float]:
-        """The coefficients by name."""
-        return {f"{self.name}_{k}": c for k, c in enumerate(self.coefficients.values())}
-
-    @property
-    def balance(self) -> str:
-        """The balance of the effect."""
-        return "voltage" if self.form.balance == "both" else self.form.balance
-
-    @property
-    def code(self) -> str:
-        """The curve as Python source of an effect."""
-        pars = [f'    {n}=mi.P({c:.9g}, "{self.unit}", null=0.0),' for n, c in self.sizes.items()]
-        known = [f"    Nearest closed form: {text} (misses {percent(miss, 2)} of the curve)."
-                 for text, miss in self.nearest()[:1]]
-        return "\n".join(["import casadi as ca", "", "import motorid as mi", "", "",
-                          f'@mi.effect(balance="{self.balance}")', f"def {self.name}(", "    m,", *pars, "):",
-                          f'    """What is left of the misfit: {self.form.text}.', *(["", *known, ""] if known else []),
-                          '    """', *("    " + line if line else "" for line in self.law.splitlines()), ""])
-
-    def nearest(self) -> list[tuple[str, float]]:
-        """Return closed forms beside the curve, the nearest first: in words with its size, and the share missed."""
-        z, value = self.points
-        forms, unit = _closed_forms(self.form.on, z), self.unit
-        if self.form.on in PAST:
-            lags = np.concatenate([values_of(functions_of(self.form, self.span), self.form, s) for s in self._signals])
-            over = "rad" if self.form.on == "path" else "s"
-            base, also = ("a constant and ", [-1]) if self.form.carrier else ("", [])
-            powers = ("", "the square of ")[: 1 + self.form.bends]
-            each = product(powers, memories_of(self.form, self.span))  # in the order of the functions
-            forms = [(f"{base}{power}one lag of {number(length, 2)} {over}", lags[:, [k, *also]])
-                     for k, (power, length) in enumerate(each)]
-            unit = self._own_unit
-        return sorted((_closed(text, columns, value, unit) for text, columns in forms), key=lambda f: f[1])
-
-    @cached_property
-    def points(self) -> tuple[Array, Array]:
-        """The quantity at the samples of all runs, and the curve there."""
-        z = np.concatenate([s[self.form.on] for s in self._signals])
-        values = np.concatenate([values_of(self._terms, self.form, s) for s in self._signals])
-        return z, values @ np.array(list(self.coefficients.values()))
-
-    @cached_property
-    def _signals(self) -> list[dict[str, Array]]:
-        return signals_along(self.fit)
-
-    @cached_property
-    def span(self) -> Span:
-        """What the form reaches over, and as many waves, places and knees as a curve that is fitted may have."""
-        span = span_of(self.fit, self._signals)
-        return replace(span, orders=tuple(sorted({*span.orders, *range(1, FINE + 1)})), finer=FINER)
-
-    @property
-    def _terms(self) -> list[str]:
+    def terms(self) -> list[str]:
+        """The functions as source."""
         functions = functions_of(self.form, self.span)
-        return [functions[k] for k in self.coefficients]
+        return [functions[k] for k in self.chosen]
 
-    def grown(self) -> Curve | None:
-        """Return the curve with the functions that by their slopes predict more, fitted with the model; None for none.
-        Raises what a fit raises."""
-        last = self.fitted or self.fit
-        linear = linearised(last, self.form, self.span)
-        more = chosen_functions(last, linear, self.form, self.coefficients)
-        if not more:
-            return None
-        free = form_coefficients(last, linear, self.form, more)
-        added = dict(zip(more, map(float, free), strict=True))
-        curve = replace(self, coefficients={**self.coefficients, **added})
-        without = curve.sizes | dict.fromkeys(list(curve.sizes)[len(self.coefficients):], 0.0)
-        done = refit(last, self.fit.model + curve.effect, (curve.sizes, without))
-        if done is None:
-            return None
-        values = (done.values[n] for n in curve.sizes)
-        return replace(curve, coefficients=dict(zip(curve.coefficients, values, strict=True)), fitted=done)
-
-    @property
-    def unit(self) -> str:
-        """Of the coefficients."""
-        form, own = self.form, self._own_unit
+    def unit(self, torque: str, bare: bool = False) -> str:
+        """Unit of the coefficients, or `bare` of what the part adds to its balance or its sensor, but for a carrier."""
+        form = self.form
+        own = {"torque": torque, "voltage": "V", "both": f"{torque}/A"}.get(form.balance, SI.get(form.channel, ""))
         before = form.on.removeprefix("past ") if form.on in PAST and not form.carrier else ""
         by = [SI.get(n, "") for n in (before, form.carrier)]
+        if bare:
+            return own
         return "1" if form.carrier == "acceleration" or own in by else own + "".join(OVER[unit] for unit in by)
 
-    @property
-    def _own_unit(self) -> str:
-        """Of what the curve adds to its balance or its sensor, but for a carrier."""
-        torque = "N" if self.fit.model.axis == "linear" else "N·m"
-        return {"torque": torque, "voltage": "V", "both": f"{torque}/A", "sensor": SI.get(self.form.channel, "")}[
-            self.form.balance]
-
-    @property
-    def law(self) -> str:
-        """The law as source."""
-        form, names = self.form, list(self.sizes)
-        lines = [f"z = {QUANTITIES[form.on]}"]
-        if form.on in RATES:
-            lines += [f"m.rate(z, {RATES[form.on].format(step=self.span.step)})"]
-        terms = self._terms
+    def law(self, names: Sequence[str], known: Container[str]) -> str:
+        """Return the law as source, its coefficients by name; states of `known` quantities are there already."""
+        form, terms, state = self.form, self.terms, STATES.get(self.form.on, "")
+        lines = [f"z = {state or QUANTITIES[form.on]}"]
+        if state and form.on not in known:
+            rate = RATES[form.on].format(step=self.span.step)
+            lines = [f"{state} = {QUANTITIES[form.on]}", f"m.rate({state}, {rate})", *lines]
         if form.on in PAST:
             rate = " * ca.fabs(m.omega)" if form.on == "path" else ""
             for k, lag in enumerate(dict.fromkeys(re.findall(r"past\(z, .*?\)", " ".join(terms)))):
                 past, length = f"past_{k}", lag[len("past(z, "):-1]
-                lines += [f"{past} = m.state('{self.name}_{past}'{FIRST.get(form.on, '')})",
+                lines += [f"{past} = m.state('{names[0]}_{past}'{FIRST.get(form.on, '')})",
                           f"m.rate({past}, (z - {past}){rate} / {length})"]
                 terms = [t.replace(lag, past) for t in terms]
         lines += ["curve = (", *(f"    + {n} * {t}" for n, t in zip(names, terms, strict=True)), ")"]
         if form.carrier == "acceleration" and form.on == "turn":  # kinetic energy that changes with the angle
-            slopes = slopes_over_turn(self._terms)
+            slopes = slopes_over_turn(self.terms)
             lines += ["slope = (", *(f"    + {n} * {t}" for n, t in zip(names, slopes, strict=True)), ")",
                       "m.torque -= 0.5 * m.J / (1 + curve) * slope * m.omega**2"]
         if form.carrier == "acceleration":
@@ -213,6 +136,131 @@ class Curve:
         if form.balance == "sensor":
             return "\n".join([*lines, f"m.measure('{form.channel}', m.measured('{form.channel}') - {carrier}curve)"])
         return "\n".join([*lines, f"m.{form.balance} -= {carrier}curve"])
+
+
+@dataclass(frozen=True, eq=False)
+class Curve:
+    """Free forms beside a model: mostly one, further ones where that leaves what another predicts."""
+
+    fit: Fit  # of the model without the curve
+    parts: tuple[Part, ...] = ()
+    values: tuple[float, ...] = ()  # of the coefficients, part by part
+    fitted: Fit | None = None  # of the model with the curve
+    name: str = "remainder"
+
+    @property
+    def effect(self) -> Effect:
+        """The curve as an effect."""
+        parameters = tuple(P(c, u, null=0.0, doc="coefficient of the curve").named(n)
+                           for (n, c), u in zip(self.sizes.items(), self._units, strict=True))
+        return Effect(self.name, Law(self.law), parameters, self.balance, f"What is left: {self.text}.")
+
+    @property
+    def text(self) -> str:
+        """What it is, in words."""
+        return listed([part.form.text for part in self.parts])
+
+    @property
+    def sizes(self) -> dict[str, float]:
+        """The coefficients by name."""
+        return {f"{self.name}_{k}": c for k, c in enumerate(self.values)}
+
+    @property
+    def balance(self) -> str:
+        """The balance of the effect."""
+        balance = self.parts[0].form.balance
+        return "voltage" if balance == "both" else balance
+
+    @property
+    def code(self) -> str:
+        """The curve as Python source of an effect."""
+        each = zip(self.sizes.items(), self._units, strict=True)
+        pars = [f'    {n}=mi.P({c:.9g}, "{unit}", null=0.0),' for (n, c), unit in each]
+        known = [f"    Nearest closed form: {text} (misses {percent(miss, 2)} of the curve)."
+                 for text, miss in self.nearest()[:1]]
+        return "\n".join(["import casadi as ca", "", "import motorid as mi", "", "",
+                          f'@mi.effect(balance="{self.balance}")', f"def {self.name}(", "    m,", *pars, "):",
+                          f'    """What is left of the misfit: {self.text}.', *(["", *known, ""] if known else []),
+                          '    """', *("    " + line if line else "" for line in self.law.splitlines()), ""])
+
+    def nearest(self) -> list[tuple[str, float]]:
+        """Return closed forms beside the first part, the nearest first: in words with its size, the share missed."""
+        part = self.parts[0]
+        z, value = self.points
+        forms, unit = _closed_forms(part.form.on, z), part.unit(self._torque)
+        if part.form.on in PAST:
+            functions = functions_of(part.form, part.span)
+            lags = np.concatenate([values_of(functions, part.form, s) for s in self._signals])
+            over = "rad" if part.form.on == "path" else "s"
+            base, also = ("a constant and ", [-1]) if part.form.carrier else ("", [])
+            powers = ("", "the square of ")[: 1 + part.form.bends]
+            each = product(powers, memories_of(part.form, part.span))  # in the order of the functions
+            forms = [(f"{base}{power}one lag of {number(length, 2)} {over}", lags[:, [k, *also]])
+                     for k, (power, length) in enumerate(each)]
+            unit = part.unit(self._torque, bare=True)
+        return sorted((_closed(text, columns, value, unit) for text, columns in forms), key=lambda f: f[1])
+
+    @cached_property
+    def points(self) -> tuple[Array, Array]:
+        """The quantity of the first part at the samples of all runs, and what that part is there."""
+        part = self.parts[0]
+        z = np.concatenate([s[part.form.on] for s in self._signals])
+        values = np.concatenate([values_of(part.terms, part.form, s) for s in self._signals])
+        return z, values @ np.array(self.values[: len(part.chosen)])
+
+    @cached_property
+    def _signals(self) -> list[dict[str, Array]]:
+        return signals_along(self.fit)
+
+    def with_form(self, form: Form) -> Curve:
+        """Return the curve with one more part, of no functions yet."""
+        return replace(self, parts=(*self.parts, Part.of(self.fitted or self.fit, form)))
+
+    def grown(self) -> Curve | None:
+        """Return the curve with the functions of its last part that by their slopes predict more, fitted with the
+        model; None for none. Raises what a fit raises."""
+        last, (*before, part) = self.fitted or self.fit, self.parts
+        linear = linearised(last, part.form, part.span)
+        more = chosen_functions(last, linear, part.form, part.chosen)
+        if not more:
+            return None
+        free = map(float, form_coefficients(last, linear, part.form, more))
+        parts = (*before, replace(part, chosen=(*part.chosen, *more)))
+        curve = replace(self, parts=parts, values=(*self.values, *free))
+        without = curve.sizes | dict.fromkeys(list(curve.sizes)[len(self.values):], 0.0)
+        done = refit(last, self.fit.model + curve.effect, (curve.sizes, without))
+        return done and curve.ended(done)
+
+    def without(self, k: int) -> Curve | None:
+        """Return the curve without a part, fitted anew; None where that fails."""
+        first = sum(len(part.chosen) for part in self.parts[:k])
+        values = (*self.values[:first], *self.values[first + len(self.parts[k].chosen):])
+        curve = replace(self, parts=(*self.parts[:k], *self.parts[k + 1:]), values=values)
+        done = refit(self.fitted or self.fit, self.fit.model + curve.effect, (curve.sizes,))
+        return done and curve.ended(done)
+
+    def ended(self, done: Fit) -> Curve:
+        """Return the curve as a fit with it has it."""
+        return replace(self, values=tuple(done.values[n] for n in self.sizes), fitted=done)
+
+    @property
+    def _torque(self) -> str:
+        return "N" if self.fit.model.axis == "linear" else "N·m"
+
+    @property
+    def _units(self) -> list[str]:
+        """Of the coefficients."""
+        return [part.unit(self._torque) for part in self.parts for _ in part.chosen]
+
+    @property
+    def law(self) -> str:
+        """The law as source."""
+        names, laws, first = list(self.sizes), [], 0
+        for k, part in enumerate(self.parts):
+            known = [before.form.on for before in self.parts[:k]]
+            laws.append(part.law(names[first : first + len(part.chosen)], known))
+            first += len(part.chosen)
+        return "\n".join(laws)
 
 
 @dataclass(frozen=True, eq=False)
@@ -351,12 +399,40 @@ def _beyond(base: Fit | None) -> Iterator[tuple[Fit, Form]]:
 @one_thread
 def _best(fit: Fit, tried: Iterable[tuple[Fit, Form]], held: HeldOut) -> Curve | None:
     """Return the curve, fitted with its model, that predicts most beyond `fit`; None where none does."""
-    before, found, name = held.predictions(fit), [], "remainder"
+    before, name = held.predictions(fit), "remainder"
     while name in fit.model.effect_names:  # a curve beside a curve
         name += "_more"
+    best = _better_curve(((Curve(base, name=name), form) for base, form in tried), before, held)
+    for _ in range(FURTHER):
+        if best is None or best[1].fitted is None or at_noise(Node(best[1].fitted, None, best[0])):
+            break
+        (predicted, curve), had = best, [part.form for part in best[1].parts]
+        beside = ((curve, form) for _, form in islice(_beyond(curve.fitted), TRIED) if form not in had)
+        if (larger := _better_curve(beside, predicted, held)) is None:
+            break
+        best = _sparser(larger, held)
+    return best and best[1]
+
+
+def _sparser(best: tuple[Predictions, Curve], held: HeldOut) -> tuple[Predictions, Curve]:
+    """Return a curve without the parts that have become superfluous: what came first may have imitated the others."""
+    for k in range(len(best[1].parts) - 1):
+        with contextlib.suppress(*FAILURES):
+            smaller = best[1].without(k)
+            if smaller is not None and smaller.fitted is not None:
+                predicted = held.predictions(smaller.fitted)
+                if not compare(predicted, best[0]).worth_it:
+                    return _sparser((predicted, smaller), held)
+    return best
+
+
+def _better_curve(tried: Iterable[tuple[Curve, Form]], before: Predictions,
+                  held: HeldOut) -> tuple[Predictions, Curve] | None:
+    """Return what the best of curves, each with a form more, predicts, and that; None where none does better."""
+    found = []
     with contextlib.suppress(OutOfTime):  # what is tried takes fits to find, too
-        for base, form in tried:
-            curve, better, after = Curve(base, form, name=name), None, before
+        for first, form in tried:
+            curve, better, after = first.with_form(form), None, before
             with contextlib.suppress(*FAILURES, OutOfTime):  # the best so far, where a budget is spent
                 for _ in range(ROUNDS):
                     if (larger := curve.grown()) is None or larger.fitted is None:
@@ -371,7 +447,7 @@ def _best(fit: Fit, tried: Iterable[tuple[Fit, Form]], held: HeldOut) -> Curve |
                 if at_noise(Node(curve.fitted, None, after)):
                     break
     found.sort(key=lambda f: -f[0])  # which of two is better only a comparison of the two tells
-    return reduce(lambda best, f: f if compare(best[1], f[1]).worth_it else best, found)[2] if found else None
+    return reduce(lambda best, f: f if compare(best[1], f[1]).worth_it else best, found)[1:] if found else None
 
 
 def _closed_forms(on: str, z: Array) -> list[tuple[str, Array]]:

@@ -31,7 +31,7 @@ from motorid.diagnosis.free_forms import (
     values_of,
 )
 from motorid.diagnosis.locate import locate
-from motorid.diagnosis.remainder import Curve, Remainder
+from motorid.diagnosis.remainder import Curve, Part, Remainder
 from motorid.exporters.export import load
 from motorid.numerics.parallel import budget, one_thread
 from motorid.records.reading import write_csv
@@ -126,6 +126,27 @@ def test_it_takes_the_place_of_what_only_approximates_it(beyond, lab):
     fit = mi.fit(found.remainder.model + found.remainder.as_effect(), runs)
     without, with_curve = (over_floor(f, check, clean[-1]) for f in (found.after, fit))
     assert all(with_curve[c] < min(0.3 * without[c], 1.3) for c in without)
+
+
+def test_of_two_laws_that_the_library_lacks_each_gets_a_curve(beyond, lab, tmp_path):
+    """The curve that alone does most only imitates both, and goes; both together are one effect, in code too."""
+    rng = np.random.default_rng(6)
+    hidden = {"eddy": {"top": 2e-2, "w": 25.0}, "dip": {"s": 0.25}}
+    clean = [driven(lab, hidden, w, 800, 1e-3, rng) for w in FAST]
+    *runs, check = [record(c, "logger", ("i", "omega"), lab, rng, w) for c, w in zip(clean, FAST, strict=True)]
+    found = mi.diagnose(mi.fit(mi.dc_motor(), runs), check, effects=("coulomb",))
+    effect = found.remainder.as_effect("both")
+    fit = mi.fit(found.remainder.model + effect, runs)
+    assert min(over_floor(found.best, check, clean[-1]).values()) > 4
+    assert max(over_floor(fit, check, clean[-1]).values()) < 1.15
+    assert effect.doc == ("What is left: a loss of voltage that changes with the voltage and a torque that changes "
+                          "with the speed.")
+    assert {p.unit for p in effect.parameters} == {"N·m", "V"}
+    (tmp_path / "own.py").write_text(found.remainder.code("both"), encoding="utf-8")
+    written = own_effects(tmp_path / "own.py")["both"]
+    one, other = (mi.simulate(found.remainder.model + e, check)[0].outputs for e in (effect, written))
+    for c, y in one.items():
+        assert y == pytest.approx(other[c], abs=1e-3 * np.std(y))
 
 
 def test_its_coefficients_are_parameters_with_deviations(outside):
@@ -264,10 +285,10 @@ def test_slopes_of_every_form_are_those_of_the_model_with_its_curve(lab):
     for form in linear.forms:
         if form.on == "run":
             continue
-        curve = Curve(fit, form)
-        answers = linearised(fit, form, curve.span).forms[form]
+        part = Part.of(fit, form)
+        answers = linearised(fit, form, part.span).forms[form]
         some = range(0, answers.shape[1], max(3, answers.shape[1] // 40))
-        answers, curve = answers[:, some], replace(curve, coefficients=dict.fromkeys(some, 0.0))
+        answers, curve = answers[:, some], Curve(fit, (replace(part, chosen=tuple(some)),), (0.0,) * len(some))
         problem = fit.problem.with_(model=fit.model + curve.effect, engine=mi.Rosenbrock(compiled=False))  # each once
         values = fit.values | first | dict.fromkeys(curve.sizes, 0.0)
         q = problem.scaling.scaled([values[p.name] for p in problem.unknown])
