@@ -39,6 +39,7 @@ SHARP = 1e-3  # of the highest speed: below it a direction is not known
 SOFT = 0.01  # of the largest current or voltage: the width of a jump at zero
 BENDS = (4, 12)  # times the largest speed, current or voltage goes a curve's bend into it
 KNEES = 9  # of a speed, current or voltage of either sign, beyond which something sets in
+BOTH_WAYS = 0.5  # of the larger side that the smaller one reaches at least: both are known alike
 FINER = 4  # times as many places and knees in a curve that is fitted: what is narrow stands between the few
 CHANGES = {"t": "changes with the time", "distance": "changes with the distance run",
            "turn": "changes with the angle within a turn", "theta": "changes with the angle",
@@ -194,13 +195,14 @@ def functions_of(form: Form, span: Span) -> list[str]:
         centres = np.linspace(low, high, PLACES * span.finer + 2)[1:-1]
         steep = f"{SUDDEN * span.finer / (high - low):.6g}"
         sudden = [f"ca.tanh((z - {c:.9g}) * {steep})" for c in centres]  # something sets in
-        if form.on == "theta":  # a stop, a slack
-            sudden += ["z", *(f"ca.fmax(z - {c:.9g}, 0)" for c in centres)]
-        else:  # what warms up, or runs in
+        sudden += ["z", *(f"ca.fmax(z - {c:.9g}, 0)" for c in centres)]  # a stop, a slack, a ramp
+        if form.on != "theta":  # what warms up, or runs in
             sudden += [f"ca.exp(-z / {(high - low) / k:.9g})" for k in FADES]
         most = 2 * KNOTS if form.on == "theta" else KNOTS
         return ["1.0", *(f"ca.cos({k} * {scale})" for k in range(1, most)), *sudden]
     top = max(abs(low), abs(high))
+    if min(-low, high) > BOTH_WAYS * top:  # what one side shows of the last bit may hold on the other
+        inside = f"ca.fmin(ca.fmax(z, {-top:.9g}), {top:.9g})"
     s = f"({inside} / {top:.6g})"
     size = f"ca.fabs{s}"
     smooth = [s, f"{s}**2", f"{s}**3", *(f"ca.tanh({k} * {s})" for k in BENDS)]
@@ -209,6 +211,7 @@ def functions_of(form: Form, span: Span) -> list[str]:
     smooth += [f"ca.fmax({sign}{s} - {c:.6g}, 0)" for sign in sides for c in knees]
     if not low < 0 < high:
         return ["1.0", *smooth]
+    smooth += [f"(ca.fmax({s} - {c:.6g}, 0) - ca.fmax(-{s} - {c:.6g}, 0))" for c in knees]  # the same either way
     side = "m.sign(z)" if form.on == "omega" else f"ca.tanh(z / {SOFT * top:.6g})"
     return [side, *smooth, f"{s} * {size}", "1.0", size, f"{size}**3", *(f"ca.tanh({k} * {size})" for k in BENDS)]
 
