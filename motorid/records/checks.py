@@ -227,7 +227,7 @@ def _slow_sampling(run: Experiment) -> str | None:
         return None
     v, i = run.inputs["v"], run.outputs["i"]
     jumps = np.flatnonzero(np.abs(np.diff(v)) > 0.3 * np.ptp(v)) + 1
-    jumps = jumps[(jumps >= 1) & (jumps + 3 < run.n)]
+    jumps = jumps[jumps + 3 < run.n]
     if not jumps.size:
         return None
     rise = np.abs(i[jumps[:, None] + np.arange(4)] - i[jumps - 1][:, None])
