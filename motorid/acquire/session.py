@@ -228,7 +228,6 @@ class Recording(Shown):
 
     Attributes
     ----------
-    path : Path
     header : Header
         Of the device, as calibrated.
     ended : str
