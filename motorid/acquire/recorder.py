@@ -90,7 +90,7 @@ def record(port: str | Link, out: str | Path, *, baud: int = 115_200, excite: st
     if not (isinstance(excite, str) and "standard" in excite):  # that one asks the device for its limit
         program(excite).check(limit_voltage, 1 << 30, "the limit you gave")
     link = SerialLink(port, baud) if isinstance(port, str) else port
-    try:
+    with contextlib.closing(link):
         client = Client(link)
         device = client.hello()
         header = calibrate(device, entries)
@@ -116,8 +116,6 @@ def record(port: str | Link, out: str | Path, *, baud: int = 115_200, excite: st
         finally:
             with contextlib.suppress(OSError):  # told already, where it matters
                 file.close()
-    finally:
-        link.close()
 
 
 def _commanded(told: Channel, kept: Channel, rate: float, todo: Program, index: int) -> float | None:
