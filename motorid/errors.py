@@ -9,7 +9,7 @@ import numbers
 import os
 import re
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping
 from contextvars import ContextVar
 from itertools import pairwise
 from types import TracebackType
@@ -122,8 +122,7 @@ def arguments_told(thing: _Thing) -> _Thing:
 
     signature = inspect.signature(thing)
     member = "." in thing.__qualname__
-    plain = {p.name: "" if p.kind in (p.VAR_POSITIONAL, p.VAR_KEYWORD) else str(p.annotation)
-             for p in signature.parameters.values()
+    plain = {p.name for p in signature.parameters.values()
              if set(re.findall(r"\w+", str(p.annotation))) <= (_SCALAR if member else _PLAIN)}
 
     @functools.wraps(thing)
@@ -163,11 +162,7 @@ def positive(hint: str = "", /, **given: float | None) -> None:
 
 
 def _wrong_argument(function: Callable[..., Any], signature: inspect.Signature, args: Any, kwargs: Any,
-                    among: Mapping[str, str] | None = None) -> str | None:
-    if among is not None:  # most calls: a name per value, as bound but for what a "*" collects, and nothing wrong
-        named = {**dict(zip(signature.parameters, args, strict=False)), **kwargs}
-        if all(kind and (n not in named or _fits(named[n], kind)) for n, kind in among.items()):
-            return None
+                    among: Container[str] | None = None) -> str | None:
     try:
         given = signature.bind(*args, **kwargs).arguments
     except TypeError:  # Python says it well enough

@@ -90,7 +90,7 @@ def record(port: str | Link, out: str | Path, *, baud: int = 115_200, excite: st
     if not (isinstance(excite, str) and "standard" in excite):  # that one asks the device for its limit
         program(excite).check(limit_voltage, 1 << 30, "the limit you gave")
     link = SerialLink(port, baud) if isinstance(port, str) else port
-    try:
+    with contextlib.closing(link):
         client = Client(link)
         device = client.hello()
         header = calibrate(device, entries)
@@ -116,8 +116,6 @@ def record(port: str | Link, out: str | Path, *, baud: int = 115_200, excite: st
         finally:
             with contextlib.suppress(OSError):  # told already, where it matters
                 file.close()
-    finally:
-        link.close()
 
 
 def _commanded(told: Channel, kept: Channel, rate: float, todo: Program, index: int) -> float | None:
@@ -194,11 +192,11 @@ def calibrate(header: Header, calibration: dict[str, dict[str, float]]) -> Heade
     names = [c.name for c in header.channels]
     for name in calibration:
         among(name, names, "channel", DataError, "the calibration names a channel that the device does not send: ")
-    return replace(header, channels=tuple(_calibrated(c, calibration.get(c.name, {})) for c in header.channels))
-
-
-def _calibrated(channel: Channel, entries: dict[str, float]) -> Channel:
-    offset = entries.get("offset", channel.offset)
-    scale = entries.get("scale", channel.scale) * entries.get("gain", 1.0) * entries.get("sign", 1)
-    # zero + scale·(raw − offset) is scale·(raw − (offset − zero/scale)).
-    return replace(channel, scale=scale, offset=offset - entries.get("zero", 0.0) / scale)
+    channels = []
+    for c in header.channels:
+        entries = calibration.get(c.name, {})
+        scale = entries.get("scale", c.scale) * entries.get("gain", 1.0) * entries.get("sign", 1)
+        # zero + scale·(raw − offset) is scale·(raw − (offset − zero/scale)).
+        offset = entries.get("offset", c.offset) - entries.get("zero", 0.0) / scale
+        channels.append(replace(c, scale=scale, offset=offset))
+    return replace(header, channels=tuple(channels))

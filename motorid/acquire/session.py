@@ -191,10 +191,9 @@ class Session:
 @contextlib.contextmanager
 def _stop_by_signal(stop: Callable[[], None]) -> Iterator[None]:
     """Turn Ctrl-C and a polite kill into an orderly end; a second Ctrl-C is not so patient."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = {s: signal.getsignal(s) for n in ("SIGINT", "SIGTERM", "SIGHUP") if (s := getattr(signal, n, None))}
+    # Only the main thread may handle signals.
+    names = ("SIGINT", "SIGTERM", "SIGHUP") if threading.current_thread() is threading.main_thread() else ()
+    before = {s: signal.getsignal(s) for n in names if (s := getattr(signal, n, None))}
     before = {s: old for s, old in before.items() if s == signal.SIGINT or old is not signal.SIG_IGN}  # nohup
 
     def handler(number: int, _: object) -> None:
@@ -228,7 +227,6 @@ class Recording(Shown):
 
     Attributes
     ----------
-    path : Path
     header : Header
         Of the device, as calibrated.
     ended : str

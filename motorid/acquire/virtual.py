@@ -26,6 +26,7 @@ NOISE = 0.5  # standard deviation of the converters' noise, in counts
 BLOCK = 256  # samples whose noise is drawn at once
 SIGNED = ("phi", "_0", "k_w", "b_a")  # in names of parameters that may be negative
 OVER_LIMIT = 3  # samples in a row beyond the current limit that switch the motor off
+STEP = 100  # samples that one reading of the wire makes
 
 
 class VirtualDevice:
@@ -142,8 +143,8 @@ class VirtualDevice:
 class VirtualLink:
     """A wire to a virtual device in this process, as fast as it is read."""
 
-    def __init__(self, device: VirtualDevice, step: int = 100) -> None:
-        self.device, self.step, self._out = device, step, b""
+    def __init__(self, device: VirtualDevice) -> None:
+        self.device, self._out = device, b""
 
     def write(self, data: bytes) -> None:
         """Send to the device."""
@@ -151,7 +152,7 @@ class VirtualLink:
 
     def read(self, timeout: float) -> bytes:
         """Return what the device says, after its next samples."""
-        data, self._out = self._out + b"".join(self.device.run(self.step)), b""
+        data, self._out = self._out + b"".join(self.device.run(STEP)), b""
         if not data:
             time.sleep(min(timeout, 0.002))
         return data

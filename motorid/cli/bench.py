@@ -83,26 +83,25 @@ def record_command(port: Port, out: Out, baud: Baud = 115_200, excite: Excite = 
 @contextmanager
 def _live(quiet: bool) -> Iterator[Callable[[Progress], None] | None]:
     """Progress on one line of the terminal, or a line every few seconds where there is none."""
-    if quiet:
-        yield None
-        return
     from rich.console import Console
     from rich.live import Live
     from rich.text import Text
 
-    console = Console(stderr=True)
-    if not console.is_terminal:
-        due = [0.0]
+    console, due = Console(stderr=True), 0.0
 
-        def show(p: Progress) -> None:
-            if p.elapsed >= due[0]:
-                typer.echo(_line(p), err=True)
-                due[0] = p.elapsed + 5.0
+    def show(p: Progress) -> None:
+        nonlocal due
+        if p.elapsed >= due:
+            typer.echo(_line(p), err=True)
+            due = p.elapsed + 5.0
 
+    if quiet:
+        yield None
+    elif not console.is_terminal:
         yield show
-        return
-    with Live(console=console, refresh_per_second=4, transient=True) as live:
-        yield lambda p: live.update(Text(_line(p)))
+    else:
+        with Live(console=console, refresh_per_second=4, transient=True) as live:
+            yield lambda p: live.update(Text(_line(p)))
 
 
 def _line(p: Progress) -> str:

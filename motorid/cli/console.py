@@ -39,6 +39,7 @@ _OPTIONS = ((r"\b(columns|units)=\{(.*?)\}", lambda m: f"--{m[1]} {_pairs(m[2])}
             (r"\bwith (columns|units)\b", r"with --\1"),
             (r"\b(engine|hold|solver|initial|formulation)='([\w-]+)'", r"--\1 \2"),
             (r"\bdt=([\d.]+)", r"--dt \1"),
+            (r"\brunning_median\(\)", "--median"),
             (r"\bmi\.torque_driven\(\) \((--drive torque)\)", r"\1"),
             (r"\bmodel\.without\('(\w+)'\)", r"--effects without \1"),
             (r"\bmodel\.(fix|free)\(…\)", r"--\1 NAME"),

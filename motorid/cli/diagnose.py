@@ -216,6 +216,6 @@ def _write_demo(found: Diagnosis, check: Sequence[Experiment], out: Path, force:
 
     drawn = {"fit.png": plot_fit(found.after, before=found.before), "missing.png": plot_missing(found),
              "ladder.png": plot_ladder(found)}
-    figures = write_files({out / name: png_of(axes, 120) for name, axes in drawn.items()}, force)
+    figures = write_files({out / name: png_of(axes) for name, axes in drawn.items()}, force)
     page = report(found, out / "report.html", command=f"motorid demo --out {out}", validate=check, force=force)
     return [str(page), *map(str, figures)]

@@ -79,10 +79,8 @@ class ReadingOptions:
     def read(self, paths: Sequence[str]) -> list[Experiment]:
         """Return the runs without the ignored channels, filtered, delayed and without spikes as asked."""
         runs, out = read_runs(paths, **self.reading), self._ignored
-        if self.median is not None and (self.median < 1 or self.median % 2 == 0):
-            raise UsageError(f"--median takes an odd number of samples, 1 or more; got {self.median}.")
         kept = [r.without(*(c for c in out if c in r.outputs)) for r in runs]
-        kept = [r.running_median(self.median) for r in kept] if self.median else kept
+        kept = [r.running_median(self.median) for r in kept] if self.median is not None else kept
         kept = [r.levelled() for r in kept] if self.levels else kept
         kept = [r.delayed(self.delay) for r in kept] if self.delay else kept
         return [r.without_spikes() for r in kept] if self.no_spikes else kept
@@ -150,8 +148,7 @@ class FitOptions(ReadingOptions):
         return model.replace(**begin).fix(*(w for w in fixed if "=" not in w), **values).free(*free)
 
     def keywords(self) -> dict[str, Any]:
-        """Return the keyword arguments of `motorid.fit`."""
-        self._check_words()
+        """Return the keyword arguments of `motorid.fit`; `model` has looked at the words."""
         hard = self.formulation == "hard"
         found: dict[str, Any] = {"engine": self.engine, "initial": self.initial,
                                  "loss": Huber() if self.loss == "huber" else None}

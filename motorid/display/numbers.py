@@ -130,7 +130,7 @@ def _place(std: float) -> int:
 
 
 def _power(size: float, smallest: int = -3) -> int:
-    decade = math.floor(math.log10(size)) if size > 0 else 0
+    decade = math.floor(math.log10(size))
     return 0 if smallest <= decade < _LARGEST else decade
 
 

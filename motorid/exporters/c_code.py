@@ -101,8 +101,8 @@ def _fields(found: Fit | Model, name: str) -> dict[str, Any]:
         code.add(f)
     sizes = dict(zip(("NX", "NU", "NP", "NY"), system.sizes, strict=True))
     starts = [s for _, s in casadi_file.runs_of(found)] if isinstance(found, Fit) else []
-    held = casadi_file.zoh_inputs(system.inputs, found.problem.experiments[0]) if isinstance(found, Fit) else [
-        n != "theta_in" for n in system.inputs]
+    hold = found.problem.experiments[0].hold if isinstance(found, Fit) else "zoh"
+    held = casadi_file.zoh_inputs(system.inputs, hold)
     rows = ",\n".join("  {" + ", ".join(map(repr, s.tolist())) + "}" for s in starts)
     runs = f"#define {name.upper()}_RUNS {len(starts)}\n" if starts else ""
     checked = check(found)

@@ -144,7 +144,7 @@ def records_of(found: Fit | Model | Problem) -> list[dict[str, Any]]:
     runs, system = ((runs_of(found), found.problem.system) if isinstance(found, Fit) else
                     ([(r, r.start) for r in found.runs], found.system))
     return [{"t": run.grid.t.tolist(), "s": start.tolist(), "u": run.grid.u.T.tolist(),
-             "substeps": run.grid.substeps.tolist(), "held": zoh_inputs(system.inputs, run.experiment)}
+             "substeps": run.grid.substeps.tolist(), "held": zoh_inputs(system.inputs, run.experiment.hold)}
             for run, start in runs[:MOST_RUNS]]
 
 
@@ -230,9 +230,9 @@ def simulation(name: str, functions: Mapping[str, ca.Function], t: Array, m: NDA
     return ca.Function(name, [s, u, p], [y, x], ["s", "u", "p"], ["y", "x"])
 
 
-def zoh_inputs(inputs: Sequence[str], run: Experiment) -> list[bool]:
+def zoh_inputs(inputs: Sequence[str], hold: str) -> list[bool]:
     """Tell which inputs stay constant between samples."""
-    return [run.hold == "zoh" and n != "theta_in" for n in inputs]
+    return [hold == "zoh" and n != "theta_in" for n in inputs]
 
 
 def words(contents: Mapping[str, Any]) -> list[str]:

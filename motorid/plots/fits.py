@@ -94,11 +94,11 @@ class LiveFit:
     """The figure of `plot_fit` as a PNG that follows its model fast: only what moves is drawn again."""
 
     @style.styled
-    def __init__(self, result: Any, *, before: Any = None, dpi: int = 90) -> None:
+    def __init__(self, result: Any, *, before: Any = None) -> None:
         with style.detached():
             self.axes, self._moving = _drawn(_simulations(result), before)
         figure = self.axes[0, 0].figure
-        figure.set_dpi(dpi)
+        figure.set_dpi(90)
         self._canvas = FigureCanvasAgg(figure)
         self._canvas.draw()
         figure.set_layout_engine("none")

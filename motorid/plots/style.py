@@ -100,11 +100,11 @@ def new_figure(width: float, height: float) -> Figure:
     return plt.figure(figsize=(width, height), layout="constrained")
 
 
-def png_of(axes: Any, dpi: int = 90) -> bytes:
+def png_of(axes: Any) -> bytes:
     """Return the figure of some axes as a PNG."""
     buffer = io.BytesIO()
     figure = np.ravel(np.asarray(axes, object))[0].figure
-    figure.savefig(buffer, format="png", dpi=dpi, metadata={"Software": "motorid"})
+    figure.savefig(buffer, format="png", dpi=120, metadata={"Software": "motorid"})
     return buffer.getvalue()
 
 

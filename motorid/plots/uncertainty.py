@@ -23,7 +23,7 @@ from motorid.uncertainty.profile import Intervals, Profile
 
 LEVEL = 0.95
 TITLE = 52  # characters of a line above half a figure
-_KINDS = {"good": style.PALETTE["blue"], "poor": style.PALETTE["orange"], "failed": style.PALETTE["grey"]}
+_KINDS = {"good": ("agree", "blue"), "poor": ("elsewhere", "orange"), "failed": ("failed", "grey")}  # word, colour
 
 
 @style.styled
@@ -226,11 +226,10 @@ def plot_waterfall(result: Multistart) -> np.ndarray:
 def _sorted_costs(ax: Axes, result: Multistart, ends: Sequence[tuple[StartResult, str]]) -> None:
     lowest = min([result.reference.cost, *(e.cost for e, _ in ends)])
     ratio = np.array([e.cost / lowest for e, _ in ends])
-    for kind, colour in _KINDS.items():
+    for kind, (word, colour) in _KINDS.items():
         where = np.flatnonzero([k == kind for _, k in ends])
         if where.size:
-            word = {"good": "agree", "poor": "elsewhere"}.get(kind, kind)
-            ax.plot(where + 1, ratio[where], "o", ms=4, color=colour, label=word)
+            ax.plot(where + 1, ratio[where], "o", ms=4, color=style.PALETTE[colour], label=word)
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     words = f"{result.good} of {len(result.results)} agree"
     words += f"; {result.failed} failed" * bool(result.failed) + f"; {result.poor} elsewhere:" * bool(result.poor)
@@ -248,9 +247,9 @@ def _starts_and_ends(ax: Axes, result: Multistart, ends: Sequence[tuple[StartRes
         starts = np.array([e.start[name] / middle for e in result.results if name in e.start])
         shift = np.linspace(-0.3, 0.0, max(len(starts), 1))[: len(starts)]
         ax.plot(j + shift, starts, ".", ms=3, color=style.PALETTE["grey"], alpha=0.7, label="start" if j == 0 else None)
-        for kind, colour in _KINDS.items():
+        for kind, (_, colour) in _KINDS.items():
             there = [1 + result.difference(name, e.values[name], middle) / middle for e, k in ends if k == kind]
-            ax.plot(np.full(len(there), j + 0.2), there, "o", ms=4, color=colour, alpha=0.8)
+            ax.plot(np.full(len(there), j + 0.2), there, "o", ms=4, color=style.PALETTE[colour], alpha=0.8)
     ax.axhline(1, color=style.MUTED, lw=0.7)
     if all(result.reference.values[n] > 0 for n in names):
         ax.set_yscale("log")

@@ -227,9 +227,7 @@ def _slow_sampling(run: Experiment) -> str | None:
         return None
     v, i = run.inputs["v"], run.outputs["i"]
     jumps = np.flatnonzero(np.abs(np.diff(v)) > 0.3 * np.ptp(v)) + 1
-    jumps = jumps[(jumps >= 1) & (jumps + 3 < run.n)]
-    if not jumps.size:
-        return None
+    jumps = jumps[jumps + 3 < run.n]
     rise = np.abs(i[jumps[:, None] + np.arange(4)] - i[jumps - 1][:, None])
     first, full = rise[:, :2].max(axis=1), rise.max(axis=1)  # the step itself may lie between two samples
     clear = full > 10 * noise_level(i, run.t)

@@ -69,7 +69,7 @@ def load_plant() -> ModuleType:
     if _PLANT in sys.modules:
         return sys.modules[_PLANT]
     path = _root() / "plant" / "__init__.py"
-    spec = importlib.util.spec_from_file_location(_PLANT, path, submodule_search_locations=[str(path.parent)])
+    spec = importlib.util.spec_from_file_location(_PLANT, path)  # a package, as its name says
     if not path.is_file() or spec is None or spec.loader is None:
         raise DataError(f"the motor plant was expected at {path} and is not there; reinstall motorid.")
     module = importlib.util.module_from_spec(spec)

@@ -134,7 +134,7 @@ def plain(value: Any) -> Any:
         return {str(k): plain(v) for k, v in value.items()}
     if isinstance(value, list | tuple | set | frozenset):
         return [plain(v) for v in value]
-    if isinstance(value, float | np.floating):
+    if isinstance(value, float):
         return float(value) if np.isfinite(value) else None
     if isinstance(value, np.ndarray | np.generic):
         return plain(value.tolist())

@@ -35,7 +35,7 @@ from motorid.uncertainty.covariance import covariance
 Records = Sequence[Experiment] | Experiment | str | Path | Sequence[str | Path]
 POOR = 3.0  # misfit over noise from which a row is flagged
 FEWEST = 5  # motors among which one can stand out
-LEVEL = 0.01  # chance of any false alarm in the whole batch
+LEVEL = 0.01  # chance of any false alarm in a whole batch of equal scatter
 
 
 @dataclass(frozen=True)
@@ -255,12 +255,11 @@ def motors_in(folder: str | Path) -> dict[str, list[Path]]:
     return found
 
 
-def outliers(rows: Sequence[Mapping[str, Any]], names: Sequence[str], positive: frozenset[str],
-             level: float = LEVEL) -> tuple[Outlier, ...]:
+def outliers(rows: Sequence[Mapping[str, Any]], names: Sequence[str], positive: frozenset[str]) -> tuple[Outlier, ...]:
     """Return the outliers of a batch, the most extreme first.
 
     `rows` have ``motor`` and per parameter in `names` its value and ``<name>_std``; those in `positive` are compared on
-    the logarithmic scale. `level` is the chance of a false alarm anywhere in a batch of equal scatter.
+    the logarithmic scale.
     """
     found = []
     for n in names:
@@ -270,7 +269,7 @@ def outliers(rows: Sequence[Mapping[str, Any]], names: Sequence[str], positive: 
         value = np.array([r[n] for r in known], float)
         std = np.array([r[f"{n}_std"] for r in known], float)
         z = scores(np.log(value), std / value) if n in positive else scores(value, std)
-        limit = float(scipy.special.stdtrit(max(len(known) - 2, 1), 1 - level / (2 * len(known) * len(names))))
+        limit = float(scipy.special.stdtrit(max(len(known) - 2, 1), 1 - LEVEL / (2 * len(known) * len(names))))
         for j in np.flatnonzero(np.abs(z) > limit):
             middle = float(np.median(value))
             side = "above" if z[j] > 0 else "below"

@@ -37,15 +37,11 @@ class Bootstrap(Printed):
 
     Attributes
     ----------
-    kind : str
-    names : tuple of str
     reference : ndarray, shape (k,)
         The fit's values.
     samples : ndarray, shape (n, k)
-    failures : tuple of Failure
     limited : dict of str to float
         Share of the refits that ended at a limit of the parameter.
-    units : tuple of str
     status : mapping of str to str
         As in `Covariance`. Refits start from the fit, so what the data do not determine hardly moves: their
         spread says nothing then, and neither a standard deviation nor an interval is given.

@@ -43,12 +43,10 @@ class Covariance(Printed):
         ``"determined"``, ``"not determined"``, ``"at its lower limit"`` or ``"at its upper limit"``.
     positive : tuple of bool
         Which unknowns cannot be zero or negative.
-    method : str
     dof : float
         Effective degrees of freedom of the residuals.
     colours : mapping of str to Colour
         Per channel, of the whitened residuals.
-    units : tuple of str
     """
 
     names: tuple[str, ...]

@@ -50,7 +50,6 @@ class WeakDirection:
         Relative changes (in units of the natural size where a parameter may be zero), the largest being 1.
     seen : float
         What this change does to all outputs together, in units of the noise.
-    text : str
     """
 
     parameters: Mapping[str, float]
@@ -64,10 +63,8 @@ class Identifiability(Printed):
 
     Attributes
     ----------
-    names : tuple of str
     values, sizes : ndarray, shape (k,)
         Parameters and what a relative change of one means: the value, or the natural size where it may be zero.
-    units : tuple of str
     t : tuple of ndarray
         Per run, s.
     sensitivities : tuple of dict of str to ndarray (N, k)
@@ -78,7 +75,6 @@ class Identifiability(Printed):
         Rows: right singular vectors.
     structural_rank : int
         Largest rank at random points: what any such experiment without noise determines.
-    weak : tuple of WeakDirection
     combinations : tuple of str
         Products that are determined although their factors are not, e.g. ``"R·J"``.
     remedies : tuple of str

@@ -136,7 +136,6 @@ class Multistart(Printed):
         Every start is off by up to this factor in each free parameter.
     guess : bool
         Whether the automatic first guess was allowed to take the start's place.
-    seconds : float
     interrupted : str
         Empty, or how far it came.
     """

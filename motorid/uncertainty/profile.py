@@ -39,7 +39,6 @@ class Profile(Printed):
 
     Attributes
     ----------
-    name, unit : str
     value : float
         The fit's.
     values : ndarray, shape (m,)
@@ -50,7 +49,6 @@ class Profile(Printed):
         How the other parameters followed.
     dof : float
         Effective degrees of freedom.
-    positive : bool
     """
 
     name: str
