@@ -7,6 +7,7 @@ Kautz models: Wahlberg, IEEE Trans. Automatic Control 36(5), 1991).
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import SimpleNamespace
@@ -31,6 +32,8 @@ KNOTS = 9  # cosines over the range of a time, twice as many over that of an ang
 HARMONICS = 12  # of a turn
 LINES = 2  # of the spectrum of the misfit over the angle
 PLACES = 12  # over a time or an angle at which something may set in
+SECTORS = 4  # widths of a sector of a turn, each twice the one before
+EDGE = 10.0  # how many of its edges, from one to zero, a sector is wide
 SUDDEN = 60.0  # how quickly a curve over the time or the angle may step, per range
 FADES = (1, 3, 10, 30)  # lengths in a range of what fades over a time or a distance
 SOON = (3, 10, 30, 100, 300)  # the same of what fades after each switching
@@ -172,13 +175,26 @@ def own_levels(runs: Sequence[Experiment]) -> bool:
     return all(high - low <= ON * high for low, high in ends) and len({f"{high:.1e}" for _, high in ends}) > 1
 
 
+PLACE = re.compile(r"<(\S+) (\S+) (\S+)>")  # of what bends, sets in or fades, with its limits: a curve may move it
+
+
+def _place(value: float, low: float, high: float) -> str:
+    return f"<{value:.9g} {low:.9g} {high:.9g}>"
+
+
 def functions_of(form: Form, span: Span) -> list[str]:
-    """Return the functions that a form is made of, as source in its quantity z; `m.sign` is the model's smooth sgn."""
+    """Return the functions that a form is made of, as source in its quantity z; `m.sign` is the model's smooth sgn.
+
+    Where they bend, set in or fade is written as a `PLACE`.
+    """
     low, high = span.ranges[form.on]
     if form.on == "turn":
-        return ["1.0", *(f"ca.{f}({k:.6g} * z)" for k in span.orders for f in ("sin", "cos"))]
+        waves = ["1.0", *(f"ca.{f}({k:.6g} * z)" for k in span.orders for f in ("sin", "cos"))]
+        return waves if form.carrier == "acceleration" else waves + _sectors(PLACES * span.finer)  # it needs slopes
     if form.on in PAST:
-        lags, top = [f"past(z, {length:.6g})" for length in memories_of(form, span)], f"{max(abs(low), abs(high)):.6g}"
+        lengths = memories_of(form, span)
+        lags = [f"past(z, {_place(length, lengths[0] / 10, lengths[-1] * 10)})" for length in lengths]
+        top = f"{max(abs(low), abs(high)):.6g}"
         bent = [f"{lag} * ca.fabs({lag}) / {top}" for lag in lags if form.bends]
         return [f"{lag} / {top}" for lag in (*lags, *bent)] + ["1.0"] if form.carrier else lags + bent
     if form.on in COMPUTED_INPUTS:
@@ -192,10 +208,10 @@ def functions_of(form: Form, span: Span) -> list[str]:
     inside = f"ca.fmin(ca.fmax(z, {low:.9g}), {high:.9g})"  # nothing is known beyond
     if form.on in ("theta", "t", "distance"):
         scale = f"{np.pi / (high - low):.9g} * ({inside} - {low:.9g})"
-        centres = np.linspace(low, high, PLACES * span.finer + 2)[1:-1]
+        centres = [_place(c, low, high) for c in np.linspace(low, high, PLACES * span.finer + 2)[1:-1]]
         steep = f"{SUDDEN * span.finer / (high - low):.6g}"
-        sudden = [f"ca.tanh((z - {c:.9g}) * {steep})" for c in centres]  # something sets in
-        sudden += ["z", *(f"ca.fmax(z - {c:.9g}, 0)" for c in centres)]  # a stop, a slack, a ramp
+        sudden = [f"ca.tanh((z - {c}) * {steep})" for c in centres]  # something sets in
+        sudden += ["z", *(f"ca.fmax(z - {c}, 0)" for c in centres)]  # a stop, a slack, a ramp
         if form.on != "theta":  # what warms up, or runs in
             sudden += [f"ca.exp(-z / {(high - low) / k:.9g})" for k in FADES]
         most = 2 * KNOTS if form.on == "theta" else KNOTS
@@ -207,13 +223,23 @@ def functions_of(form: Form, span: Span) -> list[str]:
     size = f"ca.fabs{s}"
     smooth = [s, f"{s}**2", f"{s}**3", *(f"ca.tanh({k} * {s})" for k in BENDS)]
     sides = [sign for sign, reach in (("", high), ("-", -low)) if reach > 0]
-    knees = np.linspace(0, 1, KNEES * span.finer + 2)[1:-1]
-    smooth += [f"ca.fmax({sign}{s} - {c:.6g}, 0)" for sign in sides for c in knees]
+    knees = [_place(c, 0, 1) for c in np.linspace(0, 1, KNEES * span.finer + 2)[1:-1]]
+    smooth += [f"ca.fmax({sign}{s} - {c}, 0)" for sign in sides for c in knees]
     if not low < 0 < high:
         return ["1.0", *smooth]
-    smooth += [f"(ca.fmax({s} - {c:.6g}, 0) - ca.fmax(-{s} - {c:.6g}, 0))" for c in knees]  # the same either way
+    smooth += [f"(ca.fmax({s} - {c}, 0) - ca.fmax(-{s} - {c}, 0))" for c in knees]  # the same either way
     side = "m.sign(z)" if form.on == "omega" else f"ca.tanh(z / {SOFT * top:.6g})"
     return [side, *smooth, f"{s} * {size}", "1.0", size, f"{size}**3", *(f"ca.tanh({k} * {size})" for k in BENDS)]
+
+
+def _sectors(count: int) -> list[str]:
+    """Return sectors of a turn as source, one inside and zero outside: a worn segment, a lobe, a bad tooth."""
+    found = []
+    for width in (w for k in range(SECTORS) if (w := 2**k * 2 * np.pi / count) < 2):
+        steep, half = EDGE / (width * np.sin(width / 2)), _place(width / 2, width / 8, min(2 * width, 3.0))
+        found += [f"0.5 * (1 + ca.tanh({steep:.4g} * (ca.cos(z - {_place(c, c - width, c + width)}) - ca.cos({half}))))"
+                  for c in np.arange(count) * 2 * np.pi / count]
+    return found
 
 
 def memories_of(form: Form, span: Span) -> Array:
@@ -248,7 +274,8 @@ def values_of(functions: Sequence[str], form: Form, signal: Mapping[str, Array])
     width = float(signal["width"][0])
     names = {"ca": np, "z": z, "m": SimpleNamespace(sign=lambda z: np.tanh(z / width)),
              "past": lambda z, length: past(z, along, length, first)}
-    return np.column_stack([np.broadcast_to(np.asarray(eval(f, names), float), z.shape) for f in functions])
+    fixed = (PLACE.sub(r"\1", f) for f in functions)
+    return np.column_stack([np.broadcast_to(np.asarray(eval(f, names), float), z.shape) for f in fixed])
 
 
 def slopes_over_turn(functions: Sequence[str]) -> list[str]:
@@ -458,7 +485,7 @@ def contains(fit: Fit, form: Form, size: str) -> bool:
     if size not in fit.problem.system.parameters or not shown(form, fit, span.ranges):
         return False
     push = pushes_of(fit, size)
-    if (place := _place(fit, form)) is None:
+    if (place := _column(fit, form)) is None:
         return False
     whole, own = float(np.sum(push**2)), push[:, place]
     basis = np.concatenate([basis_of(form, s, span) for s in signals])
@@ -466,7 +493,7 @@ def contains(fit: Fit, form: Form, size: str) -> bool:
     return float(left @ left) + whole - float(own @ own) < CONTAINED**2 * whole
 
 
-def _place(fit: Fit, form: Form) -> int | None:
+def _column(fit: Fit, form: Form) -> int | None:
     """Return the column of `pushes_of` in which a form acts, None where it is in none or in two."""
     states = fit.problem.system.states
     if form.balance == "sensor":
@@ -499,6 +526,6 @@ def force_of(fit: Fit, form: Form) -> float:
 
 def effect_force(fit: Fit, form: Form, size: str) -> float:
     """Return what the effect of that size does in the place of a form, RMS along all runs."""
-    rate = pushes_of(fit, size)[:, _place(fit, form)] / NUDGE
+    rate = pushes_of(fit, size)[:, _column(fit, form)] / NUDGE
     inertia = {"torque": "J", "voltage": "L"}.get(form.balance)
     return float(np.sqrt(np.mean(rate**2))) * (fit.values[inertia] if inertia else 1.0)

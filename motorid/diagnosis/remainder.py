@@ -2,7 +2,9 @@
 
 Structure comes as a curve over one quantity, or as lags of one, in one balance: an effect like any other, to add, fit,
 look at and export, and as source to edit and to name. Slopes propose the curves, the best are fitted with the rest of
-the model, and what then predicts best is the answer.
+the model, and what then predicts best is the answer. A few functions whose places are fitted, too (where a law bends
+or sets in, how long it remembers: splines with free knots, Jupp, SIAM J. Numer. Anal. 15(2), 1978) are preferred to
+many on a grid. Where one curve leaves what another predicts, there are several, those before chosen anew beside it.
 """
 
 from __future__ import annotations
@@ -13,7 +15,7 @@ from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, reduce
 from itertools import chain, islice, product, zip_longest
-from typing import Any
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -23,6 +25,7 @@ from motorid.diagnosis.cross_validation import HeldOut
 from motorid.diagnosis.free_forms import (
     FINER,
     PAST,
+    PLACE,
     Form,
     Span,
     form_coefficients,
@@ -53,6 +56,7 @@ TRIED = 4  # curves that are fitted, those that promise most
 FINE = 36  # harmonics of a turn in a curve that is fitted
 CLOSED = 300  # times that are tried as the end, or the beginning, of a constant
 FURTHER = 3  # times that a form beside those of the curve is sought
+FEW = 4  # functions at most whose places are fitted, too
 ROUNDS = 3  # of choosing functions and fitting: near the optimum slopes show what the misfit hid before
 QUANTITIES = {"t": "m.state('clock')", "distance": "m.state('distance')", "turn": "m.theta", "theta": "m.theta",
               "omega": "m.omega", "i": "m.i", "v": "m.v", "past v": "m.v", "past i": "m.i", "past omega": "m.omega",
@@ -79,25 +83,47 @@ class Law:
         exec(self.source, {"ca": ca, "m": m, **coefficients})
 
 
+def _each(function: str) -> Iterator[re.Match[str]]:
+    """Yield the places in the source of a function, each once."""
+    return iter({m[0]: m for m in PLACE.finditer(function)}.values())
+
+
 @dataclass(frozen=True)
 class Part:
-    """A free form in a curve, of as few functions as its records ask for."""
+    """A free form in a curve, of as few functions as its records ask for; if `moved`, their places are fitted too."""
 
     form: Form
     span: Span  # with as many waves, places and knees as a curve that is fitted may have
     chosen: tuple[int, ...] = ()  # functions of the form
+    moved: bool = False
 
     @classmethod
-    def of(cls, fit: Fit, form: Form) -> Part:
+    def of(cls, fit: Fit, form: Form, moved: bool = False) -> Part:
         """Return a part without functions, for records as `fit` goes through them."""
         span = span_of(fit, signals_along(fit))
-        return cls(form, replace(span, orders=tuple(sorted({*span.orders, *range(1, FINE + 1)})), finer=FINER))
+        orders = tuple(sorted({*span.orders, *range(1, FINE + 1)}))
+        return cls(form, replace(span, orders=orders, finer=FINER), moved=moved)
 
-    @property
-    def terms(self) -> list[str]:
-        """The functions as source."""
+    @cached_property
+    def functions(self) -> list[str]:
+        """Those chosen, as source."""
         functions = functions_of(self.form, self.span)
         return [functions[k] for k in self.chosen]
+
+    @property
+    def places(self) -> list[tuple[float, ...]]:
+        """Where each function bends, sets in or fades on the grid, and its limits; none if they stay there."""
+        found = (m.groups() for f in self.functions if self.moved for m in _each(f))
+        return [tuple(map(float, place)) for place in found]
+
+    def terms(self, places: Iterable[Any]) -> list[str]:
+        """The functions as source, with these names or values as their places, if they are `moved`."""
+        given, terms = iter(places), []
+        for f in self.functions:
+            for m in _each(f):
+                f = f.replace(m[0], str(next(given)) if self.moved else m[1])
+            terms.append(f)
+        return terms
 
     def unit(self, torque: str, bare: bool = False) -> str:
         """Unit of the coefficients, or `bare` of what the part adds to its balance or its sensor, but for a carrier."""
@@ -109,9 +135,15 @@ class Part:
             return own
         return "1" if form.carrier == "acceleration" or own in by else own + "".join(OVER[unit] for unit in by)
 
-    def law(self, names: Sequence[str], known: Container[str]) -> str:
-        """Return the law as source, its coefficients by name; states of `known` quantities are there already."""
-        form, terms, state = self.form, self.terms, STATES.get(self.form.on, "")
+    @property
+    def place_unit(self) -> str:
+        """Unit of the places."""
+        on = self.form.on
+        return "rad" if on in ("theta", "turn", "distance", "path") else "s" if on == "t" or on in PAST else "1"
+
+    def law(self, names: Sequence[str], places: Sequence[str], known: Container[str]) -> str:
+        """Return the law as source, coefficients and places by name; states of `known` quantities are there already."""
+        form, terms, state = self.form, self.terms(places), STATES.get(self.form.on, "")
         lines = [f"z = {state or QUANTITIES[form.on]}"]
         if state and form.on not in known:
             rate = RATES[form.on].format(step=self.span.step)
@@ -125,7 +157,7 @@ class Part:
                 terms = [t.replace(lag, past) for t in terms]
         lines += ["curve = (", *(f"    + {n} * {t}" for n, t in zip(names, terms, strict=True)), ")"]
         if form.carrier == "acceleration" and form.on == "turn":  # kinetic energy that changes with the angle
-            slopes = slopes_over_turn(self.terms)
+            slopes = slopes_over_turn(terms)
             lines += ["slope = (", *(f"    + {n} * {t}" for n, t in zip(names, slopes, strict=True)), ")",
                       "m.torque -= 0.5 * m.J / (1 + curve) * slope * m.omega**2"]
         if form.carrier == "acceleration":
@@ -151,9 +183,20 @@ class Curve:
     @property
     def effect(self) -> Effect:
         """The curve as an effect."""
-        parameters = tuple(P(c, u, null=0.0, doc="coefficient of the curve").named(n)
-                           for (n, c), u in zip(self.sizes.items(), self._units, strict=True))
-        return Effect(self.name, Law(self.law), parameters, self.balance, f"What is left: {self.text}.")
+        parameters = []
+        for part, sizes, places in self._apart(self.sizes.items()):
+            unit = part.unit(self._torque)
+            parameters += [P(c, unit, null=0.0, doc="coefficient of the curve").named(n) for n, c in sizes]
+            limits = [limits for _, *limits in part.places]
+            parameters += [P(c, part.place_unit, lower=low, upper=high, doc="place in the curve").named(n)
+                           for (n, c), (low, high) in zip(places, limits, strict=True)]
+        return Effect(self.name, Law(self.law), tuple(parameters), self.balance, f"What is left: {self.text}.")
+
+    def _apart(self, what: Iterable[Any]) -> Iterator[tuple[Part, list[Any], list[Any]]]:
+        """Yield the parts with what belongs to their coefficients, and to their places."""
+        rest = iter(what)
+        for part in self.parts:
+            yield part, list(islice(rest, len(part.chosen))), list(islice(rest, len(part.places)))
 
     @property
     def text(self) -> str:
@@ -162,7 +205,7 @@ class Curve:
 
     @property
     def sizes(self) -> dict[str, float]:
-        """The coefficients by name."""
+        """Coefficients and places by name."""
         return {f"{self.name}_{k}": c for k, c in enumerate(self.values)}
 
     @property
@@ -174,8 +217,10 @@ class Curve:
     @property
     def code(self) -> str:
         """The curve as Python source of an effect."""
-        each = zip(self.sizes.items(), self._units, strict=True)
-        pars = [f'    {n}=mi.P({c:.9g}, "{unit}", null=0.0),' for (n, c), unit in each]
+        pars = []
+        for p in self.effect.parameters:
+            rest = "null=0.0" if p.null == 0 else f"lower={p.lower:.9g}, upper={p.upper:.9g}"
+            pars.append(f'    {p.name}=mi.P({p.value:.9g}, "{p.unit}", {rest}),')
         known = [f"    Nearest closed form: {text} (misses {percent(miss, 2)} of the curve)."
                  for text, miss in self.nearest()[:1]]
         return "\n".join(["import casadi as ca", "", "import motorid as mi", "", "",
@@ -205,37 +250,40 @@ class Curve:
         """The quantity of the first part at the samples of all runs, and what that part is there."""
         part = self.parts[0]
         z = np.concatenate([s[part.form.on] for s in self._signals])
-        values = np.concatenate([values_of(part.terms, part.form, s) for s in self._signals])
-        return z, values @ np.array(self.values[: len(part.chosen)])
+        _, sizes, places = next(self._apart(self.values))
+        values = np.concatenate([values_of(part.terms(places), part.form, s) for s in self._signals])
+        return z, values @ np.array(sizes)
 
     @cached_property
     def _signals(self) -> list[dict[str, Array]]:
         return signals_along(self.fit)
 
-    def with_form(self, form: Form) -> Curve:
+    def with_form(self, form: Form, moved: bool = False) -> Curve:
         """Return the curve with one more part, of no functions yet."""
-        return replace(self, parts=(*self.parts, Part.of(self.fitted or self.fit, form)))
+        return replace(self, parts=(*self.parts, Part.of(self.fitted or self.fit, form, moved)))
 
     def grown(self) -> Curve | None:
         """Return the curve with the functions of its last part that by their slopes predict more, fitted with the
-        model; None for none. Raises what a fit raises."""
+        model; one at a time, if their places move. None for none. Raises what a fit raises."""
         last, (*before, part) = self.fitted or self.fit, self.parts
         linear = linearised(last, part.form, part.span)
-        more = chosen_functions(last, linear, part.form, part.chosen)
+        more = chosen_functions(last, linear, part.form, part.chosen)[: 1 if part.moved else None]
         if not more:
             return None
         free = map(float, form_coefficients(last, linear, part.form, more))
-        parts = (*before, replace(part, chosen=(*part.chosen, *more)))
-        curve = replace(self, parts=parts, values=(*self.values, *free))
-        without = curve.sizes | dict.fromkeys(list(curve.sizes)[len(self.values):], 0.0)
-        done = refit(last, self.fit.model + curve.effect, (curve.sizes, without))
+        *_, (_, sizes, places) = self._apart(self.values)
+        larger = replace(part, chosen=(*part.chosen, *more))
+        places += [place[0] for place in larger.places[len(places):]]
+        first = self.values[: len(self.values) - len(part.chosen) - len(part.places)]
+        curve, without = (replace(self, parts=(*before, larger), values=(*first, *sizes, *new, *places))
+                          for new in (free, [0.0] * len(more)))
+        done = refit(last, self.fit.model + curve.effect, (curve.sizes, without.sizes))
         return done and curve.ended(done)
 
     def without(self, k: int) -> Curve | None:
         """Return the curve without a part, fitted anew; None where that fails."""
-        first = sum(len(part.chosen) for part in self.parts[:k])
-        values = (*self.values[:first], *self.values[first + len(self.parts[k].chosen):])
-        curve = replace(self, parts=(*self.parts[:k], *self.parts[k + 1:]), values=values)
+        kept = [[*sizes, *places] for j, (_, sizes, places) in enumerate(self._apart(self.values)) if j != k]
+        curve = replace(self, parts=(*self.parts[:k], *self.parts[k + 1:]), values=tuple(chain.from_iterable(kept)))
         done = refit(self.fitted or self.fit, self.fit.model + curve.effect, (curve.sizes,))
         return done and curve.ended(done)
 
@@ -248,19 +296,11 @@ class Curve:
         return "N" if self.fit.model.axis == "linear" else "N·m"
 
     @property
-    def _units(self) -> list[str]:
-        """Of the coefficients."""
-        return [part.unit(self._torque) for part in self.parts for _ in part.chosen]
-
-    @property
     def law(self) -> str:
         """The law as source."""
-        names, laws, first = list(self.sizes), [], 0
-        for k, part in enumerate(self.parts):
-            known = [before.form.on for before in self.parts[:k]]
-            laws.append(part.law(names[first : first + len(part.chosen)], known))
-            first += len(part.chosen)
-        return "\n".join(laws)
+        each = enumerate(self._apart(self.sizes))
+        return "\n".join(part.law(sizes, places, [before.form.on for before in self.parts[:k]])
+                         for k, (part, sizes, places) in each)
 
 
 @dataclass(frozen=True, eq=False)
@@ -396,6 +436,20 @@ def _beyond(base: Fit | None) -> Iterator[tuple[Fit, Form]]:
             yield from ((base, gain.form) for gain in better_forms(base, base))
 
 
+class Grown(NamedTuple):
+    """A curve grown as far as that helps: what it gains, what it predicts, whether its form has nothing to add."""
+
+    gain: float
+    predictions: Predictions
+    curve: Curve
+    whole: bool = False
+
+    @property
+    def done(self) -> bool:
+        """Tell whether it leaves no more than noise."""
+        return self.curve.fitted is not None and at_noise(Node(self.curve.fitted, None, self.predictions))
+
+
 @one_thread
 def _best(fit: Fit, tried: Iterable[tuple[Fit, Form]], held: HeldOut) -> Curve | None:
     """Return the curve, fitted with its model, that predicts most beyond `fit`; None where none does."""
@@ -404,50 +458,72 @@ def _best(fit: Fit, tried: Iterable[tuple[Fit, Form]], held: HeldOut) -> Curve |
         name += "_more"
     best = _better_curve(((Curve(base, name=name), form) for base, form in tried), before, held)
     for _ in range(FURTHER):
-        if best is None or best[1].fitted is None or at_noise(Node(best[1].fitted, None, best[0])):
+        if best is None or best.done or (larger := _beside(best, held)) is None:
             break
-        (predicted, curve), had = best, [part.form for part in best[1].parts]
-        beside = ((curve, form) for _, form in islice(_beyond(curve.fitted), TRIED) if form not in had)
-        if (larger := _better_curve(beside, predicted, held)) is None:
-            break
-        best = _sparser(larger, held)
-    return best and best[1]
+        best = _revised(larger, held)
+    return best and best.curve
 
 
-def _sparser(best: tuple[Predictions, Curve], held: HeldOut) -> tuple[Predictions, Curve]:
-    """Return a curve without the parts that have become superfluous: what came first may have imitated the others."""
-    for k in range(len(best[1].parts) - 1):
-        with contextlib.suppress(*FAILURES):
-            smaller = best[1].without(k)
-            if smaller is not None and smaller.fitted is not None:
-                predicted = held.predictions(smaller.fitted)
-                if not compare(predicted, best[0]).worth_it:
-                    return _sparser((predicted, smaller), held)
+def _beside(best: Grown, held: HeldOut, only: Form | None = None) -> Grown | None:
+    """Return a curve with the further part that predicts most, or one of this form; None where that is no better."""
+    had = [part.form for part in best.curve.parts]
+    forms = [only] if only is not None else (f for _, f in islice(_beyond(best.curve.fitted), TRIED) if f not in had)
+    return _better_curve(((best.curve, form) for form in forms), best.predictions, held)
+
+
+def _revised(best: Grown, held: HeldOut) -> Grown:
+    """Return a curve without the parts that have become superfluous, or with them chosen anew beside the others.
+
+    What came first may have imitated all others together.
+    """
+    for k, part in enumerate(best.curve.parts[:-1]):
+        with contextlib.suppress(*FAILURES, OutOfTime):
+            smaller = best.curve.without(k)
+            if smaller is None or smaller.fitted is None:
+                continue
+            less = Grown(0.0, held.predictions(smaller.fitted), smaller)
+            if not compare(less.predictions, best.predictions).worth_it:
+                return _revised(less, held)
+            for form in (part.form, None):
+                other = None if best.done else _beside(less, held, form)
+                if other is not None and compare(best.predictions, other.predictions).worth_it:
+                    return _revised(other, held)
     return best
 
 
-def _better_curve(tried: Iterable[tuple[Curve, Form]], before: Predictions,
-                  held: HeldOut) -> tuple[Predictions, Curve] | None:
-    """Return what the best of curves, each with a form more, predicts, and that; None where none does better."""
-    found = []
+def _better_curve(tried: Iterable[tuple[Curve, Form]], before: Predictions, held: HeldOut) -> Grown | None:
+    """Return the best of curves, each with a form more; None where none does better."""
+    found: list[Grown] = []
     with contextlib.suppress(OutOfTime):  # what is tried takes fits to find, too
         for first, form in tried:
-            curve, better, after = first.with_form(form), None, before
-            with contextlib.suppress(*FAILURES, OutOfTime):  # the best so far, where a budget is spent
-                for _ in range(ROUNDS):
-                    if (larger := curve.grown()) is None or larger.fitted is None:
-                        break
-                    predicted = held.predictions(larger.fitted)
-                    gained = compare(before, predicted)
-                    if better is not None and gained.gain < better.gain:  # slopes led astray
-                        break
-                    curve, better, after = larger, gained, predicted
-            if better is not None and better.worth_it and curve.fitted is not None:
-                found.append((better.gain, after, curve))
-                if at_noise(Node(curve.fitted, None, after)):
-                    break
-    found.sort(key=lambda f: -f[0])  # which of two is better only a comparison of the two tells
-    return reduce(lambda best, f: f if compare(best[1], f[1]).worth_it else best, found)[1:] if found else None
+            few = _grown(first.with_form(form, moved=True), FEW, before, held)
+            many = None if few is not None and few.whole else _grown(first.with_form(form), ROUNDS, before, held)
+            found += [grown for grown in (few, many) if grown is not None]
+            if found and _best_of(found).done:
+                break
+    return _best_of(found) if found else None
+
+
+def _best_of(found: Iterable[Grown]) -> Grown:
+    """Return the best; which of two is better only a comparison of the two tells."""
+    ordered = sorted(found, key=lambda f: -f.gain)
+    return reduce(lambda best, f: f if compare(best.predictions, f.predictions).worth_it else best, ordered)
+
+
+def _grown(curve: Curve, rounds: int, before: Predictions, held: HeldOut) -> Grown | None:
+    """Return a curve with functions in its last part, as long as more of them help; None where it does no better."""
+    better, after, whole = None, before, False
+    with contextlib.suppress(*FAILURES, OutOfTime):  # the best so far, where a budget is spent
+        for _ in range(rounds):
+            if (larger := curve.grown()) is None or larger.fitted is None:
+                whole = larger is None
+                break
+            predicted = held.predictions(larger.fitted)
+            gained = compare(before, predicted)
+            if better is not None and gained.gain < better.gain:  # slopes led astray
+                break
+            curve, better, after = larger, gained, predicted
+    return Grown(better.gain, after, curve, whole) if better is not None and better.worth_it else None
 
 
 def _closed_forms(on: str, z: Array) -> list[tuple[str, Array]]:
