@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from numbers import Real
 from types import SimpleNamespace
 from typing import Any
@@ -58,17 +58,9 @@ class CurrentLimit(Relation):
         if "i" not in system.states:
             raise UsageError(f"{self.name}: the base '{problem.model.base}' has no current. Leave the limit out, "
                              "or use dc_motor() with a record of the applied voltage.")
-        place = system.states.index("i")
-        rows_of = local(system, lambda x, u, p, d: x[place] / self.limit, 0)
-        gradient = np.eye(len(system.states))[place] / self.limit
-        found = []
-        for k, run in enumerate(problem.runs):
-            n = len(run.experiment.t)
-            one, every = np.ones(n), np.arange(n)
-            labels = tuple(f"{self.name}, run {k}, t = {t:.6g} s" for t in run.experiment.t)
-            found.append(Part(k, rows_of, every, every, np.zeros((n, 0)), run.grid.u, np.ones(n, bool), -one, one,
-                              self.limit * one, self.weight * share(problem, k) * one, labels, ("A",) * n, gradient))
-        return tuple(found)
+        gradient = np.eye(len(system.states))[system.states.index("i")] / self.limit
+        between = Constraint(lambda m: m.i, -self.limit, self.limit, self.limit, self.weight, self.name, "A")
+        return tuple(replace(part, gradient=gradient) for part in between.parts(problem))
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,10 +105,7 @@ class SteadyState(Relation):
                 raise UsageError("SteadyState(at=…) takes (run, begin, end), runs counted from 0 and times in s; "
                                  f"got {part!r}.")
 
-    @property
-    def name(self) -> str:
-        """What messages call it."""
-        return "SteadyState()"
+    name = "SteadyState()"
 
     def segments(self, problem: Any) -> tuple[SteadySegment, ...]:
         """Return the steady parts of the records of `problem`: found in the data, or those given by `at`."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 import weakref
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -77,14 +77,11 @@ class Part:
 class Relation(ABC):
     """What all constraints share: parts once per problem, and their use as penalties."""
 
+    name = ""  # what messages call it
+
     @abstractmethod
     def _parts(self, problem: Any) -> tuple[Part, ...]:
         """Return the rows on each run of `problem`."""
-
-    @property
-    @abstractmethod
-    def name(self) -> str:
-        """What messages call it."""
 
     def parts(self, problem: Any) -> tuple[Part, ...]:
         """Return the rows on each run of `problem`, made once."""
@@ -119,18 +116,8 @@ class Weighed(Relation):
     relation: Relation
     factor: float
 
-    @property
-    def name(self) -> str:
-        """What messages call it."""
-        return self.relation.name
-
     def _parts(self, problem: Any) -> tuple[Part, ...]:
-        return self.relation.parts(problem)
-
-    def penalty(self, c: Array, part: Part) -> tuple[Array, Array]:
-        """Return residual and slope of what lies outside the limits."""
-        out, weight = part.violation(c), self.factor * part.weight
-        return weight * out, weight * (out != 0)
+        return tuple(replace(part, weight=self.factor * part.weight) for part in self.relation.parts(problem))
 
 
 _made: weakref.WeakKeyDictionary[Any, dict[int, tuple[Any, tuple[Part, ...]]]] = weakref.WeakKeyDictionary()
