@@ -19,7 +19,8 @@ from motorid.model.equations import Equations, System, build_system
 
 SGN_WIDTH = Parameter("sgn_width", 1e-2, "rad/s", positive=True, vary=False, doc="speed over which sgn(ω) is smoothed")
 LINEAR_UNITS = {"N·m": "N", "rad/s": "m/s", "rad": "m", "kg·m²": "kg", "N·m·s/rad": "N·s/m",
-                "N·m·s²/rad²": "N·s²/m²", "N·m/rad": "N/m", "N·m·s²": "kg", "1/(N·m)": "1/N", "s/rad": "s/m"}
+                "N·m·s²/rad²": "N·s²/m²", "N·m/rad": "N/m", "N·m·s²": "kg", "1/(N·m)": "1/N", "s/rad": "s/m",
+                "N·m/V": "N/V"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -308,9 +309,8 @@ def torque_driven(axis: str = "rotary", **values: float) -> Model:
     among(axis, ("rotary", "linear"), "axis", ModelError)
     pars = {p.name: p for p in BASES["torque_driven"]}
     if axis == "linear":
-        units = {"g": "N/V", "b": "N·s/m", "J": "kg"}
-        docs = {"g": "force per unit of the command; fixed", "J": "moving mass", "b": "viscous friction"}
-        pars = {n: replace(p, unit=units[n], doc=docs[n]) for n, p in pars.items()}
+        docs = {"g": "force per unit of the command; fixed", "J": "moving mass"}
+        pars = {n: replace(p, unit=LINEAR_UNITS[p.unit], doc=docs.get(n, p.doc)) for n, p in pars.items()}
     return Model("torque_driven", parameters=pars, axis=axis).replace(**values)
 
 
