@@ -6,7 +6,7 @@ Each is a penalty of the least-squares residual or a true constraint of `Multipl
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from numbers import Real
 from types import SimpleNamespace
@@ -139,7 +139,6 @@ class SteadyState(Relation):
         if not names:
             return None
         pick = np.unique(np.linspace(s.first, s.last, min(FEWEST, s.n)).round().astype(int))
-        data = np.tile([s.v, *[s.means[c] for c in known]], (len(pick), 1))
         one = np.ones(len(names))
         own = problem.model.values
         torque = abs(own["K"] * s.means["i"] if "K" in own else own["g"] * s.v) or 1.0
@@ -148,23 +147,23 @@ class SteadyState(Relation):
         weight = self.weight * np.sqrt(s.n) * share(problem, s.run) * one
         unit = "N" if problem.model.axis == "linear" else "N·m"
         labels = tuple(f"{self.name}, {n} balance, run {s.run}, {s.begin:.4g} to {s.end:.4g} s" for n in names)
-        return Part(s.run, local(system, _steady_rows(system, known), data.shape[1]), pick,
-                    np.zeros(len(pick), int), data, run.grid.u[pick], np.array(wanted), -allowed, allowed, size,
-                    weight, labels, tuple({"voltage": "V", "torque": unit}[n] for n in names))
+        rows_of = local(system, _steady_rows(system, s.v, {c: s.means[c] for c in known}))
+        return Part(s.run, rows_of, pick, True, run.grid.u[pick], np.array(wanted), -allowed, allowed, size, weight,
+                    labels, tuple({"voltage": "V", "torque": unit}[n] for n in names))
 
     def penalty(self, c: Array, part: Part) -> tuple[Array, Array]:
         """Return residual and slope as a penalty, the source paper's: zero only where the balance is."""
         return part.weight * c, part.weight
 
 
-def _steady_rows(system: Any, known: Sequence[str]) -> Callable[..., Any]:
-    """Return the relative balances as an expression of (x, u, p, d) with d = (mean v, measured means)."""
-    def rows(x: ca.SX, u: ca.SX, p: ca.SX, d: ca.SX) -> ca.SX:
-        u = ca.vertcat(*[d[0] if n == "v" else u[j] for j, n in enumerate(system.inputs)])
+def _steady_rows(system: Any, v: float, means: Mapping[str, float]) -> Callable[..., Any]:
+    """Return the relative balances as an expression of (x, u, p) at the measured means of voltage and channels."""
+    def rows(x: ca.SX, u: ca.SX, p: ca.SX) -> ca.SX:
+        u = ca.vertcat(*[v if n == "v" else u[j] for j, n in enumerate(system.inputs)])
         y = system.out(x, u, p)
         state = [x[j] for j in range(x.numel())]
-        for j, channel in enumerate(known, 1):
-            place, shown = system.states.index(channel), d[j]
+        for channel, shown in means.items():
+            place = system.states.index(channel)
             if channel in system.outputs:
                 # One Newton step undoes gains and offsets; a sensor with a lag has settled, it shows its input.
                 at = system.outputs.index(channel)
@@ -174,9 +173,8 @@ def _steady_rows(system: Any, known: Sequence[str]) -> Callable[..., Any]:
                 state[place] = shown
         balances = system.balances(ca.vertcat(*state), u, p)
         par = dict(zip(system.parameters, ca.vertsplit(p), strict=True))
-        electrical = "K" in par and "i" in known
-        drive = par["K"] * d[1 + known.index("i")] if electrical else par.get("g", 1.0) * d[0]
-        size = ca.vertcat(d[0], drive)
+        drive = par["K"] * means["i"] if "K" in par and "i" in means else par.get("g", 1.0) * v
+        size = ca.vertcat(v, drive)
         return balances / ca.if_else(size == 0, 1.0, size)
     return rows
 
@@ -236,7 +234,7 @@ class Constraint(Relation):
     def _parts(self, problem: Any) -> tuple[Part, ...]:
         system = problem.system
 
-        def rows(x: ca.SX, u: ca.SX, p: ca.SX, d: ca.SX) -> ca.SX:
+        def rows(x: ca.SX, u: ca.SX, p: ca.SX) -> ca.SX:
             named = (system.states, x), (system.inputs, u), (system.parameters, p)
             symbols = {n: s for names, v in named for n, s in zip(names, ca.vertsplit(v), strict=True)}
             try:
@@ -247,7 +245,7 @@ class Constraint(Relation):
                 raise ModelError(f"{self.title}: its expression is no formula of {', '.join(symbols)} "
                                  f"({type(error).__name__}: {str(error).partition(chr(10))[0]}).") from None
 
-        rows_of = local(system, rows, 0)
+        rows_of = local(system, rows)
         if rows_of.size1_out(0) != 1:
             raise ModelError(f"{self.title}: the expression must be one number, not {rows_of.size1_out(0)}.")
         constant = not rows_of.jac_sparsity(0, 0).nnz() and not rows_of.jac_sparsity(0, 1).nnz()
@@ -255,9 +253,9 @@ class Constraint(Relation):
         for k, run in enumerate(problem.runs[:1] if constant else problem.runs):
             t = run.experiment.t[:1] if constant else run.experiment.t
             n = len(t)
-            every, one = np.arange(n), np.ones(n)
+            one = np.ones(n)
             labels = [self.title if constant else f"{self.title}, run {k}, t = {at:.6g} s" for at in t]
-            found.append(Part(k, rows_of, every, every, np.zeros((n, 0)), run.grid.u[:n], np.ones(n, bool),
+            found.append(Part(k, rows_of, np.arange(n), False, run.grid.u[:n], np.ones(n, bool),
                               self.lower / self.size * one, self.upper / self.size * one, self.size * one,
                               self.weight * share(problem, k) * one, tuple(labels), (self.unit,) * n))
         return tuple(found)

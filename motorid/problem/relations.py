@@ -25,15 +25,14 @@ NEAR = 1e-6  # of a row's size: so near it stands at its limit
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """Rows of one constraint on one run: ``lower ≤ mean over its samples of local(x, u, p, d) ≤ upper``."""
+    """Rows of one constraint on one run: ``lower ≤ local(x, u, p) ≤ upper`` at each sample, or of their mean."""
 
     run: int
-    local: ca.Function  # ``(x, u, p, d) -> (c, dc/dx, dc/dp)``, c of shape (nc,), dimensionless
+    local: ca.Function  # ``(x, u, p) -> (c, dc/dx, dc/dp)``, c of shape (nc,), dimensionless
     samples: np.ndarray  # (m,) in ascending order
-    group: np.ndarray  # (m,) which row block each sample is averaged into
-    data: Array  # (m, nd)
+    averaged: bool  # one row block, the mean over the samples, not one at each
     u: Array  # (m, nu)
-    keep: np.ndarray  # (ng·nc,) which rows are used
+    keep: np.ndarray  # (nc,) or (m·nc,) which rows are used
     lower: Array  # (n,) of the rows kept
     upper: Array
     size: Array  # (n,) what one unit of a row is, in `unit`
@@ -47,7 +46,7 @@ class Part:
         if self.gradient is not None:
             return x @ self.gradient, None if dx is None else np.einsum("mxz,x->mz", dx, self.gradient)
         m, nc = len(self.samples), self.local.size1_out(0)
-        found = self._mapped(x.T, self.u.T, np.tile(np.asarray(p, float)[:, None], (1, m)), self.data.T)
+        found = self._mapped(x.T, self.u.T, np.tile(np.asarray(p, float)[:, None], (1, m)))
         mean = self._mean(np.asarray(found[0]).T).ravel()[self.keep]
         if dx is None or dp is None:
             return mean, None
@@ -67,11 +66,7 @@ class Part:
         return np.where(c > self.upper, c - self.upper, np.where(c < self.lower, c - self.lower, 0.0))
 
     def _mean(self, values: Array) -> Array:
-        if int(self.group[-1]) + 1 == len(self.group):
-            return values
-        starts = np.flatnonzero(np.diff(self.group, prepend=-1))
-        counts = np.diff(starts, append=len(self.group))
-        return np.add.reduceat(values, starts, axis=0) / counts.reshape(-1, *[1] * (values.ndim - 1))
+        return np.add.reduceat(values, [0], axis=0) / len(values) if self.averaged else values
 
 
 class Relation(ABC):
@@ -123,11 +118,11 @@ class Weighed(Relation):
 _made: weakref.WeakKeyDictionary[Any, dict[int, tuple[Any, tuple[Part, ...]]]] = weakref.WeakKeyDictionary()
 
 
-def local(system: Any, rows: Callable[..., Any], nd: int) -> ca.Function:
-    """Return ``(x, u, p, d) -> (c, dc/dx, dc/dp)`` of the expression `rows`."""
-    (x, u, p), d = system.rhs.sx_in(), ca.SX.sym("d", nd)
-    c = ca.SX(rows(x, u, p, d))
-    return ca.Function("rows", [x, u, p, d], [ca.densify(a) for a in (c, ca.jacobian(c, x), ca.jacobian(c, p))])
+def local(system: Any, rows: Callable[..., Any]) -> ca.Function:
+    """Return ``(x, u, p) -> (c, dc/dx, dc/dp)`` of the expression `rows`."""
+    x, u, p = system.rhs.sx_in()
+    c = ca.SX(rows(x, u, p))
+    return ca.Function("rows", [x, u, p], [ca.densify(a) for a in (c, ca.jacobian(c, x), ca.jacobian(c, p))])
 
 
 def share(problem: Any, k: int) -> float:

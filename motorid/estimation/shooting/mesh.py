@@ -186,7 +186,7 @@ class Mesh:
         x = traj.x[s]
         dp = np.hstack([np.zeros((len(walk.at.p), self.nx)), walk.at.dp])
         owner = self.owner[part.run][s]
-        if len(np.unique(part.group)) == len(s):
+        if not part.averaged:
             c, jac = part.rows(x, walk.at.p, None if traj.dx is None else traj.dx[s], dp)
             blocks = self._by_interval(c, jac, owner)
             ends = np.cumsum([len(b.values) for b in blocks])
