@@ -131,7 +131,6 @@ class SteadyState(Relation):
 
     def _part(self, problem: Any, s: SteadySegment) -> Part | None:
         system, run = problem.system, problem.runs[s.run]
-        known = tuple(c for c in ("i", "omega") if c in s.means)
         # The voltage and the torque balance need what was measured; at standstill friction is anything.
         electrical, current = "i" in system.states, "i" in s.means
         wanted = (electrical and current and s.v != 0, s.moving and "omega" in s.means and (current or not electrical))
@@ -143,11 +142,11 @@ class SteadyState(Relation):
         own = problem.model.values
         torque = abs(own["K"] * s.means["i"] if "K" in own else own["g"] * s.v) or 1.0
         size = np.array([abs(s.v) if n == "voltage" else torque for n in names])
-        allowed = (self.tolerance + 3 * sum(_relative_error(run, s, c) for c in known)) * one
+        allowed = (self.tolerance + 3 * sum(_relative_error(run, s, c) for c in s.means)) * one
         weight = self.weight * np.sqrt(s.n) * share(problem, s.run) * one
         unit = "N" if problem.model.axis == "linear" else "N·m"
         labels = tuple(f"{self.name}, {n} balance, run {s.run}, {s.begin:.4g} to {s.end:.4g} s" for n in names)
-        rows_of = local(system, _steady_rows(system, s.v, {c: s.means[c] for c in known}))
+        rows_of = local(system, _steady_rows(system, s.v, s.means))
         return Part(s.run, rows_of, pick, True, run.grid.u[pick], np.array(wanted), -allowed, allowed, size, weight,
                     labels, tuple({"voltage": "V", "torque": unit}[n] for n in names))
 
