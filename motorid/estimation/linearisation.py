@@ -128,8 +128,7 @@ def shown(system: System, grid, x: Array, p: Array) -> tuple[Array, Array]:
 def parameter_vector(fit: Fit, k: int) -> Array:
     """Return the system's p of a fit on its run `k`."""
     unknowns = fit.problem.unknowns
-    own = {n: fit.initial[p.name] for n, run, p in unknowns.apart if run == unknowns.firsts[k]}
-    return np.array([own.get(n, fit.values[n]) for n in fit.problem.system.parameters])
+    return unknowns.of_run(unknowns.point(fit.q), k).p
 
 
 @lru_cache(maxsize=2)

@@ -41,15 +41,17 @@ class Part:
     units: tuple[str, ...]
     gradient: Array | None = None  # (nx,) dc/dx where the row is this times x and nothing else, which is much faster
 
-    def rows(self, x: Array, p: Array, dx: Array | None, dp: Array | None) -> tuple[Array, Array | None]:
-        """Return the rows (n,) and d rows/dz (n, nz) at states (m, nx) with dx (m, nx, nz), dp (np, nz)."""
+    def rows(self, x: Array, p: Array, dx: Array | None, dp: Array) -> tuple[Array, Array]:
+        """Return the rows (n,) and d rows/dz (n, nz) at states (m, nx) with dx (m, nx, nz), dp (np, nz); nz = 0
+        without dx."""
         if self.gradient is not None:
-            return x @ self.gradient, None if dx is None else np.einsum("mxz,x->mz", dx, self.gradient)
+            dx = np.zeros((*x.shape, 0)) if dx is None else dx
+            return x @ self.gradient, np.einsum("mxz,x->mz", dx, self.gradient)
         m, nc = len(self.samples), self.local.size1_out(0)
         found = self._mapped(x.T, self.u.T, np.tile(np.asarray(p, float)[:, None], (1, m)))
         mean = self._mean(np.asarray(found[0]).T).ravel()[self.keep]
-        if dx is None or dp is None:
-            return mean, None
+        if dx is None:
+            return mean, np.zeros((len(mean), 0))
         cx, cp = (np.asarray(a).reshape(nc, m, -1).transpose(1, 0, 2) for a in found[1:])
         return mean, self._mean(cx @ dx + cp @ dp).reshape(-1, dx.shape[2])[self.keep]
 
@@ -99,8 +101,7 @@ class Relation(ABC):
             c, jac = part.rows(t.x[s], at.p, t.dx[s] if derivatives and t.dx is not None else None, at.dp)
             r, slope = self.penalty(c, part)
             rs.append(r)
-            if jac is not None:
-                jacs.append(slope[:, None] * jac)
+            jacs.append(slope[:, None] * jac)
         return np.concatenate(rs), np.concatenate(jacs) if derivatives else None
 
 

@@ -193,7 +193,7 @@ class Mesh:
             return [(b, np.arange(e - len(b.values), e)) for b, e in zip(blocks, ends, strict=True)]
         columns, dx, dp = self._spread(traj.dx, s, owner, walk.at.dp)
         c, jac = part.rows(x, walk.at.p, dx, dp)
-        return [(Block(c, jac if jac is not None else np.zeros((len(c), 0)), columns), np.arange(len(c)))]
+        return [(Block(c, jac, columns), np.arange(len(c)))]
 
     def _spread(self, dx: Array | None, samples: np.ndarray, owner: np.ndarray,
                 dq: Array) -> tuple[np.ndarray, Array | None, Array]:

@@ -200,8 +200,8 @@ def rows_at(problem: Problem, q: Array, relations: Sequence[Any] | None = None, 
     for c in problem.constraints if relations is None else relations:
         for part in c.parts(problem):
             x, dx = trajs[part.run].x, trajs[part.run].dx
-            values, jac = part.rows(x[part.samples], at.p, None if dx is None else dx[part.samples], at.dp)
-            found.append((c.name, part, values, np.empty((len(values), 0)) if jac is None else jac))
+            rows = part.rows(x[part.samples], at.p, None if dx is None else dx[part.samples], at.dp)
+            found.append((c.name, part, *rows))
     return found
 
 
