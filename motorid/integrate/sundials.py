@@ -9,7 +9,7 @@ return wrong derivatives silently (casadi issue 4383).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
@@ -19,7 +19,7 @@ import casadi as ca
 import numpy as np
 
 from motorid.errors import ModelError, SimulationError, positive
-from motorid.integrate.engine import Grid, Trajectory
+from motorid.integrate.engine import Engine, Grid, Trajectory
 from motorid.integrate.rosenbrock import Rosenbrock, Stepper, stepper
 from motorid.model.equations import System
 from motorid.numerics.signals import Array
@@ -31,7 +31,7 @@ LENGTHS = sorted([1 << k for k in range(12)] + [3 << k for k in range(10)])  # s
 
 
 @dataclass(frozen=True)
-class _Sundials:
+class _Sundials(Engine):
     rtol: float = 1e-8
     atol: float = 1e-10
 
@@ -71,11 +71,6 @@ class _Sundials:
             reason = next((w for w in REASONS if w in str(error)), "no convergence")
             raise SimulationError(f"{self.name} stopped after t = {grid.t[first]:.6g} s ({reason}). Try "
                                   "engine='rosenbrock', or parameters nearer to the motor's.") from None
-
-    def prepare(self, system: System, grid: Grid, x0: Array, p: Array,
-                tolerance: float | Callable[[Trajectory], float]) -> Grid:
-        """See `Engine.prepare`; these engines choose their own steps."""
-        return grid
 
 
 @dataclass(frozen=True)

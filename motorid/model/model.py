@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Any
@@ -13,7 +13,7 @@ import casadi as ca
 from motorid.channels import CHANNELS
 from motorid.display.cards import Card, Shown, Table
 from motorid.display.numbers import quantity
-from motorid.errors import ModelError, among, one_of
+from motorid.errors import ModelError, among
 from motorid.model.definition import Effect, Parameter
 from motorid.model.equations import Equations, System, build_system
 
@@ -194,7 +194,7 @@ class Model(Shown):
                                  "take m.sign, ca.if_else, ca.fabs and the like.") from None
         return m
 
-    def system(self, outputs: Iterable[str]) -> System:
+    def system(self, outputs: Collection[str]) -> System:
         """Return the CasADi functions of the model for the measured `outputs`, made once per choice.
 
         Raises
@@ -202,9 +202,9 @@ class Model(Shown):
         ModelError
             If the model cannot show a channel, or definitions go in a circle.
         """
-        chosen = tuple(c for c in CHANNELS if c in set(outputs))
-        for c in set(outputs) - set(chosen):
-            raise ModelError(one_of(c, CHANNELS, "channel"))
+        for c in outputs:
+            among(c, CHANNELS, "channel", ModelError)
+        chosen = tuple(c for c in CHANNELS if c in outputs)
         if "i" in chosen and "i" not in STATES[self.base]:
             raise ModelError(f"the base '{self.base}' has no current: leave the channel 'i' out, or use dc_motor().")
         key = (chosen, self.stored)
@@ -212,7 +212,7 @@ class Model(Shown):
             self._systems[key] = _shared_system(self, chosen)
         return self._systems[key]
 
-    def check_visible(self, outputs: Iterable[str]) -> None:
+    def check_visible(self, outputs: Collection[str]) -> None:
         """Refuse, by a `ModelError`, an effect of which nothing can be seen in the measured `outputs`."""
         system = self.system(outputs)
         for e in self.effects:

@@ -19,7 +19,7 @@ from motorid.model.model import Model
 from motorid.numerics.least_squares import Huber
 from motorid.numerics.signals import Array
 from motorid.problem.residuals import Measured, prior_residual
-from motorid.problem.runs import Run, channels_of, noise_of, prepare_run, smoothing, with_inputs
+from motorid.problem.runs import Run, noise_of, prepare_run, smoothing, with_inputs
 from motorid.problem.unknowns import Point, Scaling, Unknowns
 from motorid.records.experiment import Experiment, between_pauses, units_of
 
@@ -107,7 +107,7 @@ class Problem:
     def outputs(self) -> tuple[str, ...]:
         """Measured channels that the model can show."""
         shown = CHANNELS if self.model.base == "dc_motor" else ("omega", "theta")
-        return tuple(c for c in channels_of(self.experiments) if c in shown)
+        return tuple(c for c in shown if any(c in r.outputs for r in self.experiments))
 
     @cached_property
     def system(self) -> System:

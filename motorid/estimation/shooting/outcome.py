@@ -1,8 +1,4 @@
-"""The solution of multiple shooting as a `Fit`: status in words, multipliers, gaps, constraints that cannot be kept.
-
-`Solved` is a mesh with the solver's result, `fit_of` makes the fit of it. Below: violations and multipliers of the
-constraints, and what is said when they contradict one another or the records.
-"""
+"""The solution of multiple shooting as a `Fit`: status in words, multipliers, gaps, constraints that cannot be kept."""
 
 from __future__ import annotations
 
