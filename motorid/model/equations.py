@@ -261,10 +261,8 @@ def build_system(m: Equations, parameters: tuple[str, ...], outputs: tuple[str, 
         rates["i"] = (voltage + d[0]) * reciprocal(m.L) if "i" in stored else voltage + d[0]
     names = tuple(m.states)
     initial = {"i": m.start["i"], "omega": m.start["omega"], **m.initial}
-    filled = m.fill([*[ca.SX(rates[n]) for n in names], *shown, *[ca.SX(initial[n]) for n in names], voltage, torque])
-    n = len(names)
-    f, y = ca.vertcat(*filled[:n]), ca.vertcat(*filled[n:n + len(shown)])
-    x0, balances = ca.vertcat(*filled[n + len(shown):-2]), ca.vertcat(*filled[-2:])
+    f, y, x0, balances = m.fill([ca.vertcat(*[rates[n] for n in names]), ca.vertcat(*shown),
+                                 ca.vertcat(*[initial[n] for n in names]), ca.vertcat(voltage, torque)])
     x, u = ca.vertcat(*m.states.values()), ca.vertcat(*m.inputs.values())
     p, s = ca.vertcat(*[m.symbols[n] for n in parameters]), ca.vertcat(*m.start.values())
     quiet = ca.substitute(f, d, ca.DM.zeros(2))
