@@ -163,10 +163,8 @@ def _pieces(grid: Grid) -> Iterator[tuple[int, int]]:
     same = np.zeros(len(dt), bool)  # interval k continues interval k-1
     same[1:] = flat[1:] & flat[:-1] & (grid.u0[1:] == grid.u0[:-1]).all(axis=1) & (np.abs(np.diff(dt)) < 1e-6 * dt[1:])
     for a, b in pairwise([*np.flatnonzero(~same).tolist(), len(dt)]):
-        while a < b:
-            count = min(b - a, LENGTHS[-1])
-            yield a, count
-            a += count
+        for first in range(a, b, LENGTHS[-1]):
+            yield first, min(b - first, LENGTHS[-1])
 
 
 def _state_scale(system: System, grid: Grid, x0: Array, p: Array) -> Array:

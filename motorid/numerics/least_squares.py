@@ -135,7 +135,7 @@ def levenberg_marquardt(residual: Callable[[Array], Array], both: Callable[[Arra
     """
     o = options or LevenbergMarquardt()
     search = _Search(residual, both, np.asarray(q0, float), bounds, o, log)
-    history, end = [search.cost], "limit"
+    history, end, (back, share) = [search.cost], "limit", VALLEY
     for iteration in range(1, o.max_iterations + 1):
         check_time()
         before = search.q
@@ -144,16 +144,12 @@ def levenberg_marquardt(residual: Callable[[Array], Array], both: Callable[[Arra
             history.append(search.cost)
             if callback is not None:
                 callback(iteration, search.cost, search.q)
-        if reason or _crawls(history, o.ftol):
+        crawls = len(history) > back and 0 <= history[-1 - back] - history[-1] < share * o.ftol * history[-1]
+        if reason or crawls:
             end = reason or "valley"
             break
     status, message = ENDS[end]
     return Solution(search.q, search.r, search.jac, status, message.format(o.max_iterations), tuple(history))
-
-
-def _crawls(history: list[float], ftol: float) -> bool:
-    back, share = VALLEY
-    return len(history) > back and 0 <= history[-1 - back] - history[-1] < share * ftol * history[-1]
 
 
 class _Search:
