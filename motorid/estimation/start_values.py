@@ -30,14 +30,13 @@ def with_start_values(problem: Problem) -> Problem:
     From a first guess that takes all friction for viscous, bristles or a Stribeck curve find no way; Coulomb
     does. So a model whose effects contain simpler ones races against where the simpler model leads.
     """
-    begin, inner = _guessed(problem), _contained(problem.model)
-    if not inner:
-        return _shared_out(begin, problem.model)
-    simpler = problem.model
+    begin, simpler, inner = _guessed(problem), problem.model, _contained(problem.model)
     try:
         for effect, simple in inner.items():
             simpler = simpler.without(effect.name) + simple
     except ModelError:  # two of them contain the same
+        inner = {}
+    if not inner:
         return _shared_out(begin, problem.model)
     found = race([_shared_out(_guessed(problem.for_model(simpler)), simpler)], RACE, solve=by_continuation)
     if found is None:

@@ -114,7 +114,7 @@ class Mesh:
 
     @cached_property
     def scale(self) -> Array:
-        """Size of each state: the largest seen in the data or, where not measured, in the simulated intervals."""
+        """Size of each state: the largest seen in the data, 1 where it was not measured."""
         runs = self.problem.experiments
         return np.array([max([0.0, *(np.nanmax(np.abs(r.outputs[name])) for r in runs if name in r.outputs)]) or 1.0
                          for name in self.problem.system.states])
