@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -181,7 +181,7 @@ class Effect(Shown):
     def __reduce__(self) -> tuple[Any, ...]:
         # Only plain data crosses a process boundary: the law goes by the name of its module, if it has one, or as it
         # is if it is an object that carries its own source.
-        rest, law = (self.parameters, self.balance, self.doc, self.includes), self.law
+        rest, law = (self.parameters, self.balance, self.doc, self.includes), cast(Any, self.law)
         if not hasattr(law, "__qualname__"):
             return Effect, (self.name, law, *rest)
         importable = getattr(law, "__module__", None) not in (None, "__main__") and "<locals>" not in law.__qualname__

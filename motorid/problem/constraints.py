@@ -160,7 +160,7 @@ def _steady_rows(system: Any, v: float, means: Mapping[str, float]) -> Callable[
     def rows(x: ca.SX, u: ca.SX, p: ca.SX) -> ca.SX:
         u = ca.vertcat(*[v if n == "v" else u[j] for j, n in enumerate(system.inputs)])
         y = system.out(x, u, p)
-        state = [x[j] for j in range(x.numel())]
+        state: list[Any] = ca.vertsplit(x)
         for channel, shown in means.items():
             place = system.states.index(channel)
             if channel in system.outputs:
