@@ -352,7 +352,7 @@ def growth(fit: Fit) -> float:
 
     The model is followed in short windows, along what was measured, where it might be elsewhere without them.
     """
-    runs, model = fit.problem.experiments, replace(fit.model, angle_input=False, _systems={})
+    runs, model = fit.problem.experiments, fit.model.with_(angle_input=False)
     longest = max(r.duration for r in runs)
     parts = [windows(r, longest / max(WINDOWS)) if fit.window is None and r.n > FEWEST * max(WINDOWS) else [r]
              for r in runs]

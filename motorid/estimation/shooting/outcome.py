@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -75,10 +75,6 @@ class Solved:
         if np.abs(start.g).max(initial=0.0) > JOINED:
             return False
         return self.status != "converged" or (self.cost - start.f) * self.nlp.scale > SAME * max(1, start.f)
-
-    def kept(self, z: Array) -> Solved:
-        """Return the start instead of the end."""
-        return replace(self, result=self.result._replace(z=z, status=KEPT))
 
     @property
     def violation(self) -> float:
