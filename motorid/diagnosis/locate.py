@@ -87,12 +87,12 @@ def _region(regions: Mapping[str, float]) -> str:
 
 def _walk(fit: Fit, size: Array, begun: Sequence[Linear]) -> tuple[float, list[Smoothed]]:
     """Return the smallest random walk that explains the measurements, and the smoothed runs."""
-    walk, found = 0.0, []
+    found: list[Smoothed] = []
     for walk in WALKS:
         found = [smooth(fit, k, walk * size, at) for k, at in enumerate(begun)]
         if np.mean([s.chi2 for s in found]) <= 1.0:
-            break
-    return walk, found
+            return walk, found
+    return WALKS[-1], found
 
 
 def _shares(fit: Fit, walk: Array, both: Sequence[Smoothed], begun: Sequence[Linear]) -> dict[str, float]:
