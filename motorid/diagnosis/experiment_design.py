@@ -28,7 +28,7 @@ from motorid.numerics.parallel import budget as limited_time
 from motorid.numerics.parallel import one_thread
 from motorid.numerics.parallel import progress as bar
 from motorid.numerics.signals import Array
-from motorid.problem.simulate import simulate
+from motorid.problem.simulate import planned
 from motorid.records.experiment import Experiment
 from motorid.records.files import write_files
 
@@ -100,7 +100,7 @@ def suggest_experiment(fits: Sequence[Fit], *, v_max: float | None = None, i_max
     scores, kept = {}, {}
     for name, (v, _) in candidates(t, v_max).items():
         try:
-            answers = [_prediction(f, t, v, name) for f in fits]
+            answers = [planned(f.model, t, v, channels=f.problem.outputs, name=name).outputs for f in fits]
         except MotoridError:
             continue
         if not i_max or all(float(np.abs(y.get("i", 0.0)).max()) <= i_max for y in answers):
@@ -131,12 +131,6 @@ def candidates(t: Array, v_max: float) -> dict[str, tuple[Array, str]]:
                     "full voltage with short hard reversals, which also warms the winding"),
         "small steps": (v_max * (0.5 + 0.1 * np.sign(np.sin(2 * np.pi * 10 * s + 1e-9))), "small steps at half speed"),
     }
-
-
-def _prediction(fit: Fit, t: Array, v: Array, name: str) -> dict[str, Array]:
-    blank = {c: np.zeros_like(t) for c in fit.problem.outputs}
-    run = Experiment(t, {"v": v}, blank, sigma=dict.fromkeys(blank, 1.0), name=name)
-    return dict(simulate(fit.model, run, initial="rest", estimate_initial=False)[0].outputs)
 
 
 GOALS, SHAPES = ("distinguish", "sharpen"), ("steps", "free", "multisine")

@@ -10,6 +10,11 @@ from motorid.model.definition import P, effect
 from motorid.model.equations import Equations
 
 QUARTERS = (0.0, math.pi / 2, math.pi, 3 * math.pi / 2)  # of a turn
+# What several effects declare alike.
+ORDER = P(12.0, "", order=True, vary=False, lower=1.0, doc="periods per turn, from the misfit, then fixed")
+PHASE = P(0.0, "rad", periodic=True, doc="phase at theta = 0")
+SHARE = P(0.3, "", null=0.0, lower=0.0, upper=0.98, grid=(0.3, 0.7), doc="load's share of the inertia")
+DRAG = P(1e-6, "N·m·s/rad", lower=0.0, grid=(0.003, 0.1), doc="viscous friction of the load")
 
 
 @effect(balance="torque")
@@ -144,21 +149,16 @@ def end_stop(m: Equations, k_stop=P(1e-2, "N·m/rad", null=0.0, lower=0.0, doc="
 
 
 @effect(balance="torque")
-def cogging(m: Equations, A=P(1e-3, "N·m", null=0.0, lower=0.0, doc="amplitude of the cogging torque"),
-            N=P(12.0, "", order=True, vary=False, lower=1.0, doc="periods per turn, from the misfit, then fixed"),
-            phi=P(0.0, "rad", periodic=True, doc="phase at theta = 0")):
+def cogging(m: Equations, A=P(1e-3, "N·m", null=0.0, lower=0.0, doc="amplitude of the cogging torque"), N=ORDER,
+            phi=PHASE):
     """Cogging torque, A·sin(N·θ+φ). Hendershot & Miller, Brushless Permanent-Magnet Machines, 2010."""
     m.torque -= A * ca.sin(N * m.theta + phi)
 
 
 @effect(balance="torque")
-def torque_ripple(
-    m: Equations,
-    a_r=P(0.05, "", null=0.0, lower=0.0, upper=1.0, doc="relative amplitude"),
-    N_r=P(12.0, "", order=True, vary=False, lower=1.0, doc="periods per turn, from the misfit, then fixed"),
-    phi_r=P(0.0, "rad", periodic=True, doc="phase at theta = 0"),
-    e_r=P(0.0, "", vary=False, lower=0.0, upper=1.0, grid=(0.0, 1.0), doc="1: in the back-EMF too, fixed"),
-):
+def torque_ripple(m: Equations, a_r=P(0.05, "", null=0.0, lower=0.0, upper=1.0, doc="relative amplitude"), N_r=ORDER,
+                  phi_r=PHASE, e_r=P(0.0, "", vary=False, lower=0.0, upper=1.0, grid=(0.0, 1.0),
+                                     doc="1: in the back-EMF too, fixed")):
     """Torque ripple, K·i·(1+a·sin(N·θ+φ)), with e_r = 1 in the back-EMF too. Jahns & Soong, IEEE TIE 43(2), 1996.
 
     What suits is taken, unless given. A model without a current has its torque constant g ripple.
@@ -191,8 +191,7 @@ def _two_inertias(m: Equations, share, resonance, zeta, twist_of, name: str) -> 
 
 
 @effect(balance="transmission")
-def compliance(m: Equations,
-               r_load=P(0.3, "", null=0.0, lower=0.0, upper=0.98, grid=(0.3, 0.7), doc="load's share of the inertia"),
+def compliance(m: Equations, r_load=SHARE,
                omega_r=P(200.0, "1/s", positive=True, grid=(0.02, 0.06, 0.2, 0.6), doc="resonance of the two inertias"),
                zeta_r=P(0.05, "", positive=True, upper=2.0, grid=(0.05, 0.3), doc="damping ratio of the resonance")):
     """Elastic shaft between two inertias. Ellis, Control System Design Guide, ch. 16, 2012."""
@@ -200,8 +199,7 @@ def compliance(m: Equations,
 
 
 @effect(balance="transmission", includes=("compliance",))
-def backlash(m: Equations,
-             r_gap=P(0.3, "", null=0.0, lower=0.0, upper=0.98, grid=(0.3, 0.7), doc="load's share of the inertia"),
+def backlash(m: Equations, r_gap=SHARE,
              gap=P(0.02, "rad", positive=True, grid=(0.001, 0.01, 0.03, 0.1, 1.0), doc="total free play"),
              omega_c=P(500.0, "1/s", positive=True, grid=(0.1, 0.4), doc="resonance while in contact"),
              zeta_c=P(0.2, "", positive=True, upper=2.0, grid=(0.1, 0.5), doc="damping ratio while in contact")):
@@ -231,11 +229,10 @@ def _driven_load(m: Equations, share, drag, torque, name: str) -> None:
 
 
 @effect(balance="transmission")
-def slip_clutch(m: Equations,
-                r_slip=P(0.3, "", null=0.0, lower=0.0, upper=0.98, grid=(0.3, 0.7), doc="load's share of the inertia"),
+def slip_clutch(m: Equations, r_slip=SHARE,
                 tau_slip=P(0.01, "N·m", positive=True, grid=(0.1, 0.3, 0.6), doc="largest torque that it carries"),
                 omega_slip=P(1.0, "rad/s", positive=True, grid=(0.01,), doc="slip at which it carries 3/4 of that"),
-                b_slip=P(1e-6, "N·m·s/rad", lower=0.0, grid=(0.003, 0.1), doc="viscous friction of the load")):
+                b_slip=DRAG):
     """Load driven by friction that may slip, τ·tanh(Δω/ω_s): a clutch, a belt, a wheel. Awrejcewicz & Olejnik, 2005.
 
     Seen as a motor that runs up too fast with hard steps and not with soft ones: ramps and steps of several sizes.
@@ -244,10 +241,8 @@ def slip_clutch(m: Equations,
 
 
 @effect(balance="transmission")
-def freewheel(m: Equations,
-              r_free=P(0.3, "", null=0.0, lower=0.0, upper=0.98, grid=(0.3, 0.7), doc="load's share of the inertia"),
-              g_free=P(200.0, "1/s", positive=True, grid=(0.3,), doc="how fast it grips"),
-              b_free=P(1e-6, "N·m·s/rad", lower=0.0, grid=(0.003, 0.1), doc="viscous friction of the load"),
+def freewheel(m: Equations, r_free=SHARE,
+              g_free=P(200.0, "1/s", positive=True, grid=(0.3,), doc="how fast it grips"), b_free=DRAG,
               side=P(1.0, "", vary=False, lower=-1.0, upper=1.0, grid=(1.0, -1.0), doc="direction it drives, fixed")):
     """Load behind a freewheel (one-way clutch), driven in one direction and free to overrun. Zhu & Parker, JSV, 2005.
 

@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from motorid.estimation.least_squares import FAILURES, RACE, ROUNDS, Callback, Estimate, least_squares, start_cost
+from motorid.estimation.least_squares import FAILURES, RACE, ROUNDS, Callback, Estimate, cost_at, least_squares
 from motorid.estimation.restarts import restarted_where_doubtful
 from motorid.numerics.least_squares import LevenbergMarquardt, levenberg_marquardt
 from motorid.problem.problem import Problem
@@ -39,7 +39,7 @@ def by_continuation(problem: Problem, effort: LevenbergMarquardt, callback: Call
     here = problem
     for k, width in enumerate(widths):
         # What one width likes a narrower one may refuse; then the start is better.
-        stage = min((_at(p, width) for p in dict.fromkeys((here, problem))), key=start_cost) if k else _at(here, width)
+        stage = min((_at(p, width) for p in dict.fromkeys((here, problem))), key=cost_at) if k else _at(here, width)
         rough = effort if k == last else effort.at_most(RACE)
         try:
             done = least_squares(stage, rough, callback, rounds=ROUNDS if k in (0, last) else 1)

@@ -58,20 +58,20 @@ def _read_plainly(run: Experiment, model: Model) -> Experiment:
 
 
 def _signals(run: Experiment, loaded: bool) -> dict[str, Array]:
-    """Return t, v, its integral `v_dt`, and on all samples what was measured of i, omega (or its slope) and theta."""
+    """Return t, v, on all samples what was measured of i, omega (or its slope) and theta, and integrals, as `v_dt`."""
     t = run.t
     measured = (c for c in CHANNELS if c in run.outputs and np.isfinite(run.outputs[c]).any())
     found: dict[str, Array] = {"t": t, **run.inputs, **{c: bridged(t, run.outputs[c]) for c in measured}}
     if "omega" not in found and "theta" in found:
         found["omega"] = slope(t, found["theta"], max(2, min(10, len(t) // 200)))
     found |= {c: time_since(run, c) for c in COMPUTED_INPUTS if loaded}
-    found["v_dt"] = integral(t, run.inputs["v"], run.hold == "zoh")
-    return found
+    found |= {f"{c}_dt": integral(t, found[c]) for c in ("i", "omega") if c in found}
+    return found | {"v_dt": integral(t, run.inputs["v"], run.hold == "zoh")}
 
 
-def _windowed(t: Array, columns: Sequence[Array], target: Array, windows: int = 20) -> tuple[Array, Array]:
+def _windowed(columns: Sequence[Array], target: Array, windows: int = 20) -> tuple[Array, Array]:
     """Take differences over a window, so that slow drift of the integrals does not outweigh the transients."""
-    w = max(len(t) // windows, 1)
+    w = max(len(target) // windows, 1)
     return np.column_stack([c[w:] - c[:-w] for c in columns]), target[w:] - target[:-w]
 
 
@@ -109,18 +109,17 @@ def _nonnegative(a: Array, b: Array, signed: NDArray[np.bool_]) -> Array:
 
 
 def _full(signals: list[dict], held: Mapping[str, float], loads: _Loads) -> dict[str, float]:
-    moved = [(s, integral(s["t"], s["i"]), integral(s["t"], s["omega"])) for s in signals]
-    electrical = [_windowed(s["t"], [s["i"], qi, qw], s["v_dt"], 200) for s, qi, qw in moved]
+    electrical = [_windowed([s["i"], s["i_dt"], s["omega_dt"]], s["v_dt"], 200) for s in signals]
     found = _solve(electrical, ["L", "R", "K"], held)
-    mechanical = [_windowed(s["t"], [s["omega"], qw, *loads.integrals(s, {**found, "b": 0.0, "J": 1.0})],
-                            found["K"] * qi) for s, qi, qw in moved]
+    mechanical = [_windowed([s["omega"], s["omega_dt"], *loads.integrals(s, {**found, "b": 0.0, "J": 1.0})],
+                            found["K"] * s["i_dt"]) for s in signals]
     return found | loads.split(_solve(mechanical, ["J", "b", *loads.loads], held))
 
 
 def _torque_driven(signals: list[dict], held: Mapping[str, float], loads: _Loads) -> dict[str, float]:
     g = held.get("g", 1.0)
-    rows = [_windowed(s["t"], [s["omega"], integral(s["t"], s["omega"]),
-                               *loads.integrals(s, {"g": g, "b": 0.0, "J": 1.0})], g * s["v_dt"]) for s in signals]
+    rows = [_windowed([s["omega"], s["omega_dt"], *loads.integrals(s, {"g": g, "b": 0.0, "J": 1.0})], g * s["v_dt"])
+            for s in signals]
     return {"g": g} | loads.split(_solve(rows, ["J", "b", *loads.loads], held))
 
 
@@ -128,8 +127,8 @@ def _without_current(signals: list[dict], held: Mapping[str, float], loads: _Loa
                      back_emf: float) -> dict[str, float]:
     """``∫v = (RJ/K) Δω + (K + Rb/K) ∫ω + (R/K) ∫load``: two numbers and the loads; the rest is assumed."""
     unit = {"R": 1.0, "L": 1.0, "K": 1.0, "b": 0.0, "J": 1.0}
-    rows = [_windowed(s["t"], [s["omega"], integral(s["t"], s["omega"]), *loads.integrals({**s, "i": s["v"]}, unit)],
-                      s["v_dt"]) for s in signals]
+    rows = [_windowed([s["omega"], s["omega_dt"], *loads.integrals({**s, "i": s["v"]}, unit)], s["v_dt"])
+            for s in signals]
     two = _solve(rows, ["slope", "gain", *loads.loads], {})
     r = held.get("R", 1.0)
     k = held.get("K", back_emf * two["gain"])
@@ -140,9 +139,8 @@ def _without_current(signals: list[dict], held: Mapping[str, float], loads: _Loa
 
 def _without_speed(signals: list[dict], held: Mapping[str, float]) -> dict[str, float]:
     """``∫v = L i + (R + Lb/J)∫i + (K² + Rb)/J ∬i − (b/J) ∬v``: K alone is assumed."""
-    moved = [(s, integral(s["t"], s["i"])) for s in signals]
-    rows = [_windowed(s["t"], [s["i"], qi, integral(s["t"], qi), -integral(s["t"], s["v_dt"])], s["v_dt"])
-            for s, qi in moved]
+    rows = [_windowed([s["i"], s["i_dt"], integral(s["t"], s["i_dt"]), -integral(s["t"], s["v_dt"])], s["v_dt"])
+            for s in signals]
     z = _solve(rows, ["L", "R", "stiff", "rate"], {})
     k = held.get("K", 0.05)
     j = k**2 / max(z["stiff"] - z["R"] * z["rate"], 0.1 * z["stiff"])
@@ -197,7 +195,7 @@ class _Loads(NamedTuple):
         if not self.loads:
             return []
         system, zero = self.model.system(("omega",)), np.zeros(len(s["v"]))
-        along = {**s, "theta": s["theta"] if "theta" in s else integral(s["t"], s["omega"])}
+        along = {**s, "theta": s.get("theta", s["omega_dt"])}
         x = np.vstack([along.get(n, zero) for n in system.states])
         u = np.vstack([along["theta" if n == "theta_in" else n] for n in system.inputs])
         quiet = {n: base.get(n, p.value if p.null is None else p.null) for n, p in self.model.parameters.items()}

@@ -25,6 +25,7 @@ from motorid.integrate.rodas3 import ORDER
 from motorid.model.model import Model
 from motorid.numerics.least_squares import LevenbergMarquardt
 from motorid.numerics.parallel import one_thread, progress
+from motorid.problem.constraints import SteadyState
 from motorid.problem.problem import Problem, as_problem
 from motorid.problem.runs import natural_sizes, suited
 from motorid.problem.simulate import integration_bias, integration_error, misfit_over_noise, with_angles_apart
@@ -115,8 +116,6 @@ def fit(model: Model, runs: Sequence[Experiment] | Experiment, *, solver: Any = 
     if odd := [p for p in (*penalties, *constraints) if not hasattr(p, "evaluate")]:
         raise UsageError(f"penalties and constraints are like mi.CurrentLimit(8), mi.Constraint(…), not {odd[0]!r}.")
     if formulation == "penalty":
-        from motorid.problem.constraints import SteadyState
-
         penalties += tuple(constraints) or (SteadyState(),)
         constraints = ()
     problem = as_problem(model, runs, engine=engine, priors=dict(priors or {}), penalties=penalties, loss=loss,
@@ -353,7 +352,7 @@ def growth(fit: Fit) -> float:
 
     The model is followed in short windows, along what was measured, where it might be elsewhere without them.
     """
-    runs, model = fit.problem.experiments, replace(fit.model, angle_input=False, _systems={})
+    runs, model = fit.problem.experiments, fit.model.with_(angle_input=False)
     longest = max(r.duration for r in runs)
     parts = [windows(r, longest / max(WINDOWS)) if fit.window is None and r.n > FEWEST * max(WINDOWS) else [r]
              for r in runs]

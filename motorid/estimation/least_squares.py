@@ -85,13 +85,12 @@ def least_squares(problem: Problem, effort: LevenbergMarquardt, callback: Callba
     return Estimate(problem, found, history)
 
 
-def start_cost(problem: Problem, refine: bool = True) -> float:
-    """Return the cost at the values of the model; see `cost_at`."""
-    return cost_at(problem, problem.start, refine)
+def cost_at(problem: Problem, q: Array | None = None, *, refine: bool = True) -> float:
+    """Return the cost at `q`, by default the values of the model; infinite where it cannot be simulated.
 
-
-def cost_at(problem: Problem, q: Array, refine: bool = False) -> float:
-    """Return the cost at `q`, at sub-steps that suit it or as they are; infinite where it cannot be simulated."""
+    The sub-steps are those that suit it (`refine`), or as they are.
+    """
+    q = problem.start if q is None else q
     try:
         r = (problem.refined(q) if refine else problem).residual(q)
     except SimulationError:

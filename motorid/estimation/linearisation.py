@@ -66,13 +66,12 @@ def _disturbed(system: System) -> tuple[ca.Function, ca.Function]:
     nx, nu, np_, _ = system.sizes
     x, u0, u1 = ca.SX.sym("x", nx), ca.SX.sym("u0", nu), ca.SX.sym("u1", nu)
     h, p, d = ca.SX.sym("h"), ca.SX.sym("p", np_), ca.SX.sym("d", 2)
-    xs, us, ps, ds = ca.SX.sym("x", nx), ca.SX.sym("u", nu), ca.SX.sym("p", np_), ca.SX.sym("d", 2)
-    wider = replace(system, rhs=ca.Function("rhs", [xs, ca.vertcat(us, ds), ps], [system.forces(xs, us, ps, ds)]))
+    wider = replace(system, rhs=ca.Function("rhs", [x, ca.vertcat(u0, d), p], [system.forces(x, u0, p, d)]))
     x_next, _ = rosenbrock_step(wider, x, ca.vertcat(u0, d), ca.vertcat(u1, d), h, p)
     results = [x_next, ca.jacobian(x_next, x), ca.jacobian(x_next, d)]
     step = ca.Function("disturbed", [x, u0, u1, h, p, d], ca.cse([ca.densify(r) for r in results]))
-    y = system.out(xs, us, ps)
-    return step, ca.Function("shown", [xs, us, ps], [ca.densify(y), ca.densify(ca.jacobian(y, xs))])
+    y = system.out(x, u0, p)
+    return step, ca.Function("shown", [x, u0, p], [ca.densify(y), ca.densify(ca.jacobian(y, x))])
 
 
 @lru_cache(maxsize=64)
@@ -128,8 +127,7 @@ def shown(system: System, grid, x: Array, p: Array) -> tuple[Array, Array]:
 def parameter_vector(fit: Fit, k: int) -> Array:
     """Return the system's p of a fit on its run `k`."""
     unknowns = fit.problem.unknowns
-    own = {n: fit.initial[p.name] for n, run, p in unknowns.apart if run == unknowns.firsts[k]}
-    return np.array([own.get(n, fit.values[n]) for n in fit.problem.system.parameters])
+    return unknowns.of_run(unknowns.point(fit.q), k).p
 
 
 @lru_cache(maxsize=2)

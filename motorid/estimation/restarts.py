@@ -20,7 +20,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from motorid.estimation.least_squares import FAILURES, RACE, Callback, Estimate, least_squares, race, start_cost
+from motorid.estimation.least_squares import FAILURES, RACE, Callback, Estimate, cost_at, least_squares, race
 from motorid.estimation.result import Fit
 from motorid.model.definition import Parameter
 from motorid.model.model import Model
@@ -139,6 +139,6 @@ def collapsed_again(problem: Problem, fit: Fit) -> Problem:
     model, gain = restored(fit, fit.model), GAIN * _deviation(fit.problem, fit.residuals) ** 2
     for name in (n for n, p in model.parameters.items() if p.value != fit.model.parameters[n].value):
         other = problem.start_at({name: fit.values[name]})
-        if start_cost(other) < start_cost(problem) + gain:
+        if cost_at(other) < cost_at(problem) + gain:
             problem = other
     return problem

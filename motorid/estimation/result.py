@@ -274,7 +274,7 @@ class Fit(Shown):
         if self.formulation == "process noise":
             raise UsageError("a fit with process noise cannot be saved; its model can, mi.export(fit, 'motor.json').")
         head = {"model": model_dict(self.model), "parameters": {
-            n: {"value": self.values[n], "std": self.std[n] if p.vary else 0.0, "unit": p.unit, "fixed": not p.vary}
+            n: {"value": self.values[n], "std": self.std[n], "unit": p.unit, "fixed": not p.vary}
             for n, p in self.model.parameters.items()}, "verdict": self.verdict}
         end = {f: getattr(self, f) for f in SAVED} | {"cost": self.cost, "extra": {
             k: [asdict(m) for m in v] if k in ("multipliers", "active") else v for k, v in self.extra.items()}}
@@ -381,7 +381,7 @@ def parameter_cell(fit: Fit, name: str) -> Cell:
         return f"{quantity(fit.values[name], p.unit, 2)} (chosen from the data)"
     if p.vary and fit.std[name] is None:
         return Flag("not determined", "note")
-    return with_error(fit.values[name], fit.std[name] if p.vary else 0.0, p.unit)
+    return with_error(fit.values[name], fit.std[name], p.unit)
 
 
 def value_tables(fit: Fit) -> list[Table]:

@@ -11,7 +11,7 @@ from motorid.effects import LIBRARY
 from motorid.errors import ModelError
 from motorid.estimation.continuation import by_continuation
 from motorid.estimation.first_guess import first_guess, loads_of
-from motorid.estimation.least_squares import LOOK, RACE, race, start_cost
+from motorid.estimation.least_squares import LOOK, RACE, cost_at, race
 from motorid.model.definition import Effect, Parameter
 from motorid.model.model import BASES, Model
 from motorid.problem.problem import Problem
@@ -30,14 +30,13 @@ def with_start_values(problem: Problem) -> Problem:
     From a first guess that takes all friction for viscous, bristles or a Stribeck curve find no way; Coulomb
     does. So a model whose effects contain simpler ones races against where the simpler model leads.
     """
-    begin, inner = _guessed(problem), _contained(problem.model)
-    if not inner:
-        return _shared_out(begin, problem.model)
-    simpler = problem.model
+    begin, simpler, inner = _guessed(problem), problem.model, _contained(problem.model)
     try:
         for effect, simple in inner.items():
             simpler = simpler.without(effect.name) + simple
     except ModelError:  # two of them contain the same
+        inner = {}
+    if not inner:
         return _shared_out(begin, problem.model)
     found = race([_shared_out(_guessed(problem.for_model(simpler)), simpler)], RACE, solve=by_continuation)
     if found is None:
@@ -58,7 +57,7 @@ def _guessed(problem: Problem) -> Problem:
     if any(e.balance == "torque" for e in model.effects):
         candidates.append(model.start_at(first_guess(model, runs, loaded=True)))
     problems = [problem.for_model(with_suited_effects(m, runs)) for m in candidates]
-    best = problems[0] if len(problems) == 1 else min(problems, key=lambda p: start_cost(p, refine=False))
+    best = problems[0] if len(problems) == 1 else min(problems, key=lambda p: cost_at(p, refine=False))
     asked = candidates[problems.index(best)]
     best = _along_measured_angle(best, asked)
     for effect in model.effects:
@@ -102,7 +101,7 @@ def _along_measured_angle(problem: Problem, asked: Model) -> Problem:
         return problem
     other = problem.start_at(found.values)
     if all("theta" in r.outputs for r in problem.experiments):
-        return min(other, problem, key=lambda p: start_cost(p, refine=False))
+        return min(other, problem, key=lambda p: cost_at(p, refine=False))
     # An integral drifts: where either leads decides.
     best = race([other, problem], RACE, solve=by_continuation)
     return problem if best is None else problem.start_at(best.values)

@@ -31,7 +31,6 @@ from motorid.integrate.rodas3 import StepFunctions
 FLAGS = ("-Og", "-fPIC", "-shared", *(() if sys.platform == "darwin" else ("-Wl,-Bsymbolic",)),
          "-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math")
 GCC_FLAGS = ("--param", "ira-max-conflict-table-size=0")  # a third of the time for a step of 5,000 instructions less
-_told: set[str] = set()
 
 # What walks over a record with the code of a step, and where that ends in half the steps.
 DRIVER = "\n" + Path(__file__).with_name("driver.c").read_text("utf-8")
@@ -84,11 +83,10 @@ def flags() -> tuple[str, ...]:
     return (*FLAGS, *GCC_FLAGS) if gcc else FLAGS
 
 
+@lru_cache(maxsize=64)
 def say_once(text: str) -> None:
     """Print one line on standard error, the first time only."""
-    if text not in _told:
-        _told.add(text)
-        print(text, file=sys.stderr)
+    print(text, file=sys.stderr)
 
 
 def generate(functions: StepFunctions) -> str:

@@ -210,12 +210,6 @@ class Stepper:
         return Trajectory(y, dy, x, dx, error), int(bad)
 
 
-def content_key(system: System) -> str:
-    """Return a hash of the equations of `system`."""
-    text = "\0".join([system.rhs.serialize(), system.out.serialize(), str(system.stored)])
-    return hashlib.sha256(text.encode("utf-8", "surrogateescape")).hexdigest()
-
-
 @lru_cache(maxsize=512)
 def _stepper_of_content(key: str) -> list[Stepper]:
     return []
@@ -224,7 +218,8 @@ def _stepper_of_content(key: str) -> list[Stepper]:
 @lru_cache(maxsize=1024)
 def stepper(system: System) -> Stepper:
     """Return the stepper of `system`, one per content in this process."""
-    key = content_key(system)
+    text = "\0".join([system.rhs.serialize(), system.out.serialize(), str(system.stored)])
+    key = hashlib.sha256(text.encode("utf-8", "surrogateescape")).hexdigest()
     slot = _stepper_of_content(key)
     if not slot:
         slot.append(Stepper(system, key))
@@ -236,8 +231,7 @@ class Machine:
 
     def __init__(self, functions: StepFunctions) -> None:
         self.functions = functions
-        self.nx, self.nu, self.np = (functions.full.size1_in(k) for k in (0, 1, 4))
-        self.ny = functions.out.size1_out(0)
+        self.nx, self.np, self.ny = functions.full.size1_in(0), functions.full.size1_in(4), functions.out.size1_out(0)
         self.walk_of = lru_cache(maxsize=32)(self._walk)
         self.observation_of = lru_cache(maxsize=2)(self._observation)
 

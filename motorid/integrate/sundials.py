@@ -9,7 +9,7 @@ return wrong derivatives silently (casadi issue 4383).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
@@ -19,7 +19,7 @@ import casadi as ca
 import numpy as np
 
 from motorid.errors import ModelError, SimulationError, positive
-from motorid.integrate.engine import Grid, Trajectory
+from motorid.integrate.engine import Engine, Grid, Trajectory
 from motorid.integrate.rosenbrock import Rosenbrock, Stepper, stepper
 from motorid.model.equations import System
 from motorid.numerics.signals import Array
@@ -31,7 +31,7 @@ LENGTHS = sorted([1 << k for k in range(12)] + [3 << k for k in range(10)])  # s
 
 
 @dataclass(frozen=True)
-class _Sundials:
+class _Sundials(Engine):
     rtol: float = 1e-8
     atol: float = 1e-10
 
@@ -71,11 +71,6 @@ class _Sundials:
             reason = next((w for w in REASONS if w in str(error)), "no convergence")
             raise SimulationError(f"{self.name} stopped after t = {grid.t[first]:.6g} s ({reason}). Try "
                                   "engine='rosenbrock', or parameters nearer to the motor's.") from None
-
-    def prepare(self, system: System, grid: Grid, x0: Array, p: Array,
-                tolerance: float | Callable[[Trajectory], float]) -> Grid:
-        """See `Engine.prepare`; these engines choose their own steps."""
-        return grid
 
 
 @dataclass(frozen=True)
@@ -168,10 +163,8 @@ def _pieces(grid: Grid) -> Iterator[tuple[int, int]]:
     same = np.zeros(len(dt), bool)  # interval k continues interval k-1
     same[1:] = flat[1:] & flat[:-1] & (grid.u0[1:] == grid.u0[:-1]).all(axis=1) & (np.abs(np.diff(dt)) < 1e-6 * dt[1:])
     for a, b in pairwise([*np.flatnonzero(~same).tolist(), len(dt)]):
-        while a < b:
-            count = min(b - a, LENGTHS[-1])
-            yield a, count
-            a += count
+        for first in range(a, b, LENGTHS[-1]):
+            yield first, min(b - first, LENGTHS[-1])
 
 
 def _state_scale(system: System, grid: Grid, x0: Array, p: Array) -> Array:

@@ -5,10 +5,11 @@ from __future__ import annotations
 import importlib
 import inspect
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import Any
+from functools import partial
+from typing import Any, cast
 
 import numpy as np
 
@@ -93,17 +94,6 @@ class Parameter:
                              f"[{self.lower:g}, {self.upper:g}].")
 
 
-@dataclass(frozen=True)
-class Declared:
-    """A parameter of an effect without its name, which is that of the argument; see `P`."""
-
-    fields: Mapping[str, Any]
-
-    def named(self, name: str) -> Parameter:
-        """Return the `Parameter` called `name`."""
-        return Parameter(name, **self.fields)
-
-
 def P(value: float, unit: str = "", null: float | None = None, *, lower: float = -np.inf, upper: float = np.inf,
       positive: bool = False, vary: bool = True, grid: Iterable[float] = (), periodic: bool = False,
       order: bool = False, per_run: bool = False, place: bool = False, at_least: str = "", doc: str = "") -> Any:
@@ -117,9 +107,9 @@ def P(value: float, unit: str = "", null: float | None = None, *, lower: float =
     ... def fan(m, c_2=mi.P(1e-8, "N·m·s²/rad²", null=0, lower=0, doc="drag")):
     ...     m.torque -= c_2 * m.omega * abs(m.omega)
     """
-    return Declared({"value": value, "unit": unit, "null": null, "lower": lower, "upper": upper,
-                     "positive": positive, "vary": vary, "grid": tuple(grid), "periodic": periodic,
-                     "order": order, "per_run": per_run, "place": place, "at_least": at_least, "doc": doc})
+    return partial(Parameter, value=value, unit=unit, null=null, lower=lower, upper=upper, positive=positive, vary=vary,
+                   grid=tuple(grid), periodic=periodic, order=order, per_run=per_run, place=place, at_least=at_least,
+                   doc=doc)
 
 
 BALANCES = ("voltage", "torque", "transmission", "sensor")
@@ -165,9 +155,8 @@ class Effect(Shown):
 
     @property
     def size(self) -> Parameter | None:
-        """The parameter that makes the effect vanish at its null value, if there is just one such."""
-        sizes = [p for p in self.parameters if p.null is not None]
-        return sizes[0] if sizes else None
+        """The first parameter that makes the effect vanish at its null value, if there is one."""
+        return next((p for p in self.parameters if p.null is not None), None)
 
     def __call__(self, **values: float) -> Effect:
         """Return the effect with some parameters given, e.g. ``cogging(N=12)`` (fixed if it is an order)."""
@@ -192,22 +181,20 @@ class Effect(Shown):
     def __reduce__(self) -> tuple[Any, ...]:
         # Only plain data crosses a process boundary: the law goes by the name of its module, if it has one, or as it
         # is if it is an object that carries its own source.
-        if not hasattr(self.law, "__qualname__"):
-            return Effect, (self.name, self.law, self.parameters, self.balance, self.doc, self.includes)
-        module = getattr(self.law, "__module__", None)
-        qualname = getattr(self.law, "__qualname__", "")
-        importable = module not in (None, "__main__") and "<locals>" not in qualname
-        place = (module, qualname) if importable else None
-        return _restore_effect, (place, self.name, self.parameters, self.balance, self.doc, self.includes)
+        rest, law = (self.parameters, self.balance, self.doc, self.includes), cast(Any, self.law)
+        if not hasattr(law, "__qualname__"):
+            return Effect, (self.name, law, *rest)
+        importable = getattr(law, "__module__", None) not in (None, "__main__") and "<locals>" not in law.__qualname__
+        place = (law.__module__, law.__qualname__) if importable else None
+        return _restore_effect, (place, self.name, *rest)
 
 
-def _restore_effect(place: tuple[str, str] | None, name: str, parameters: tuple[Parameter, ...], balance: str,
-                    doc: str, includes: tuple[str, ...]) -> Effect:
+def _restore_effect(place: tuple[str, str] | None, name: str, *rest: Any) -> Effect:
     law = None
     if place is not None:
         with suppress(ImportError, AttributeError):
             law = getattr(importlib.import_module(place[0]), place[1]).law
-    return Effect(name, law, parameters, balance, doc, includes)
+    return Effect(name, law, *rest)
 
 
 def effect(*, balance: str, name: str | None = None,
@@ -243,9 +230,9 @@ def effect(*, balance: str, name: str | None = None,
         title = name or law.__name__
         pars = []
         for arg in list(inspect.signature(law).parameters.values())[1:]:
-            if not isinstance(arg.default, Declared):
+            if not isinstance(arg.default, partial):
                 raise ModelError(f"effect '{title}': argument '{arg.name}' needs a default P(value, unit, null=…).")
-            pars.append(arg.default.named(arg.name))
+            pars.append(arg.default(name=arg.name))
         names = [p.name for p in pars]
         for p in (p for p in pars if p.at_least):
             among(p.at_least, names, "parameter", ModelError, f"effect '{title}', at_least of '{p.name}': ")

@@ -196,13 +196,12 @@ class System:
     @cached_property
     def visible(self) -> frozenset[str]:
         """Parameters that can be seen in the outputs, by the structure of the equations."""
-        nx, nu, np_, _ = self.sizes
-        x, u, p, s = ca.SX.sym("x", nx), ca.SX.sym("u", nu), ca.SX.sym("p", np_), ca.SX.sym("s", 3)
+        (x, u, p), s = self.rhs.sx_in(), ca.SX.sym("s", 3)
         f, y, x0 = self.rhs(x, u, p), self.out(x, u, p), self.initial(s, p)
         f_x, f_p, y_x, y_p, x0_p = (np.asarray(ca.DM(ca.jacobian_sparsity(a, b), 1).full(), bool)
                                     for a, b in ((f, x), (f, p), (y, x), (y, p), (x0, p)))
         seen = y_x.any(axis=0)  # states that act on an output, directly or through other states
-        for _ in range(nx):
+        for _ in self.states:
             seen = seen | f_x[seen].any(axis=0)
         shown = np.vstack([y_p, f_p[seen], x0_p[seen]]).any(axis=0)
         return frozenset(self.parameters[k] for k in np.flatnonzero(shown))
@@ -262,10 +261,8 @@ def build_system(m: Equations, parameters: tuple[str, ...], outputs: tuple[str, 
         rates["i"] = (voltage + d[0]) * reciprocal(m.L) if "i" in stored else voltage + d[0]
     names = tuple(m.states)
     initial = {"i": m.start["i"], "omega": m.start["omega"], **m.initial}
-    filled = m.fill([*[ca.SX(rates[n]) for n in names], *shown, *[ca.SX(initial[n]) for n in names], voltage, torque])
-    n = len(names)
-    f, y = ca.vertcat(*filled[:n]), ca.vertcat(*filled[n:n + len(shown)])
-    x0, balances = ca.vertcat(*filled[n + len(shown):-2]), ca.vertcat(*filled[-2:])
+    f, y, x0, balances = m.fill([ca.vertcat(*[rates[n] for n in names]), ca.vertcat(*shown),
+                                 ca.vertcat(*[initial[n] for n in names]), ca.vertcat(voltage, torque)])
     x, u = ca.vertcat(*m.states.values()), ca.vertcat(*m.inputs.values())
     p, s = ca.vertcat(*[m.symbols[n] for n in parameters]), ca.vertcat(*m.start.values())
     quiet = ca.substitute(f, d, ca.DM.zeros(2))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Any
@@ -13,13 +13,14 @@ import casadi as ca
 from motorid.channels import CHANNELS
 from motorid.display.cards import Card, Shown, Table
 from motorid.display.numbers import quantity
-from motorid.errors import ModelError, among, one_of
+from motorid.errors import ModelError, among
 from motorid.model.definition import Effect, Parameter
 from motorid.model.equations import Equations, System, build_system
 
 SGN_WIDTH = Parameter("sgn_width", 1e-2, "rad/s", positive=True, vary=False, doc="speed over which sgn(ω) is smoothed")
 LINEAR_UNITS = {"N·m": "N", "rad/s": "m/s", "rad": "m", "kg·m²": "kg", "N·m·s/rad": "N·s/m",
-                "N·m·s²/rad²": "N·s²/m²", "N·m/rad": "N/m", "N·m·s²": "kg", "1/(N·m)": "1/N", "s/rad": "s/m"}
+                "N·m·s²/rad²": "N·s²/m²", "N·m/rad": "N/m", "N·m·s²": "kg", "1/(N·m)": "1/N", "s/rad": "s/m",
+                "N·m/V": "N/V"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,7 +194,7 @@ class Model(Shown):
                                  "take m.sign, ca.if_else, ca.fabs and the like.") from None
         return m
 
-    def system(self, outputs: Iterable[str]) -> System:
+    def system(self, outputs: Collection[str]) -> System:
         """Return the CasADi functions of the model for the measured `outputs`, made once per choice.
 
         Raises
@@ -201,9 +202,9 @@ class Model(Shown):
         ModelError
             If the model cannot show a channel, or definitions go in a circle.
         """
-        chosen = tuple(c for c in CHANNELS if c in set(outputs))
-        for c in set(outputs) - set(chosen):
-            raise ModelError(one_of(c, CHANNELS, "channel"))
+        for c in outputs:
+            among(c, CHANNELS, "channel", ModelError)
+        chosen = tuple(c for c in CHANNELS if c in outputs)
         if "i" in chosen and "i" not in STATES[self.base]:
             raise ModelError(f"the base '{self.base}' has no current: leave the channel 'i' out, or use dc_motor().")
         key = (chosen, self.stored)
@@ -211,7 +212,7 @@ class Model(Shown):
             self._systems[key] = _shared_system(self, chosen)
         return self._systems[key]
 
-    def check_visible(self, outputs: Iterable[str]) -> None:
+    def check_visible(self, outputs: Collection[str]) -> None:
         """Refuse, by a `ModelError`, an effect of which nothing can be seen in the measured `outputs`."""
         system = self.system(outputs)
         for e in self.effects:
@@ -308,9 +309,8 @@ def torque_driven(axis: str = "rotary", **values: float) -> Model:
     among(axis, ("rotary", "linear"), "axis", ModelError)
     pars = {p.name: p for p in BASES["torque_driven"]}
     if axis == "linear":
-        units = {"g": "N/V", "b": "N·s/m", "J": "kg"}
-        docs = {"g": "force per unit of the command; fixed", "J": "moving mass", "b": "viscous friction"}
-        pars = {n: replace(p, unit=units[n], doc=docs[n]) for n, p in pars.items()}
+        docs = {"g": "force per unit of the command; fixed", "J": "moving mass"}
+        pars = {n: replace(p, unit=LINEAR_UNITS[p.unit], doc=docs.get(n, p.doc)) for n, p in pars.items()}
     return Model("torque_driven", parameters=pars, axis=axis).replace(**values)
 
 

@@ -107,14 +107,15 @@ class Solution:
     history: tuple[float, ...]
 
 
-MESSAGES = {
-    "cost": "converged: a full step no longer lowers the cost",
-    "step": "converged: the step is below the tolerance",
-    "gradient": "converged: the gradient is zero within rounding",
-    "valley": "stalled: the cost hardly falls any more, by less than 0.03 % in 30 steps; identifiability() shows "
-              "whether parameters are determined",
-    "stalled": "stalled: no step lowers the cost; the model may be too stiff here. Try another start or engine",
-    "limit": "stopped after {} iterations; raise max_iterations or look at identifiability()",
+ENDS = {  # status and message
+    "cost": ("converged", "converged: a full step no longer lowers the cost"),
+    "step": ("converged", "converged: the step is below the tolerance"),
+    "gradient": ("converged", "converged: the gradient is zero within rounding"),
+    "valley": ("stalled", "stalled: the cost hardly falls any more, by less than 0.03 % in 30 steps; identifiability() "
+                          "shows whether parameters are determined"),
+    "stalled": ("stalled", "stalled: no step lowers the cost; the model may be too stiff here. Try another start or "
+                           "engine"),
+    "limit": ("limit", "stopped after {} iterations; raise max_iterations or look at identifiability()"),
 }
 VALLEY = (30, 3e5)  # so many iterations that lower the cost by less than this, times ftol, are enough
 PROMISED = 1e-3  # share of the cost that the undamped step may promise at an end without a step
@@ -134,26 +135,21 @@ def levenberg_marquardt(residual: Callable[[Array], Array], both: Callable[[Arra
     """
     o = options or LevenbergMarquardt()
     search = _Search(residual, both, np.asarray(q0, float), bounds, o, log)
-    history, status = [search.cost], ""
+    history, end, (back, share) = [search.cost], "limit", VALLEY
     for iteration in range(1, o.max_iterations + 1):
         check_time()
         before = search.q
-        status = search.step()
+        reason = search.step()
         if search.q is not before:
             history.append(search.cost)
             if callback is not None:
                 callback(iteration, search.cost, search.q)
-        if status or _crawls(history, o.ftol):
+        crawls = len(history) > back and 0 <= history[-1 - back] - history[-1] < share * o.ftol * history[-1]
+        if reason or crawls:
+            end = reason or "valley"
             break
-    reason = status or ("valley" if _crawls(history, o.ftol) else "limit")
-    ends = {"valley": "stalled", "stalled": "stalled", "limit": "limit"}
-    return Solution(search.q, search.r, search.jac, ends.get(reason, "converged"),
-                    MESSAGES[reason].format(o.max_iterations), tuple(history))
-
-
-def _crawls(history: list[float], ftol: float) -> bool:
-    back, share = VALLEY
-    return len(history) > back and 0 <= history[-1 - back] - history[-1] < share * ftol * history[-1]
+    status, message = ENDS[end]
+    return Solution(search.q, search.r, search.jac, status, message.format(o.max_iterations), tuple(history))
 
 
 class _Search:

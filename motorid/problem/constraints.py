@@ -6,8 +6,8 @@ Each is a penalty of the least-squares residual or a true constraint of `Multipl
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from numbers import Real
 from types import SimpleNamespace
 from typing import Any
@@ -58,17 +58,9 @@ class CurrentLimit(Relation):
         if "i" not in system.states:
             raise UsageError(f"{self.name}: the base '{problem.model.base}' has no current. Leave the limit out, "
                              "or use dc_motor() with a record of the applied voltage.")
-        place = system.states.index("i")
-        rows_of = local(system, lambda x, u, p, d: x[place] / self.limit, 0)
-        gradient = np.eye(len(system.states))[place] / self.limit
-        found = []
-        for k, run in enumerate(problem.runs):
-            n = len(run.experiment.t)
-            one, every = np.ones(n), np.arange(n)
-            labels = tuple(f"{self.name}, run {k}, t = {t:.6g} s" for t in run.experiment.t)
-            found.append(Part(k, rows_of, every, every, np.zeros((n, 0)), run.grid.u, np.ones(n, bool), -one, one,
-                              self.limit * one, self.weight * share(problem, k) * one, labels, ("A",) * n, gradient))
-        return tuple(found)
+        gradient = np.eye(len(system.states))[system.states.index("i")] / self.limit
+        between = Constraint(lambda m: m.i, -self.limit, self.limit, self.limit, self.weight, self.name, "A")
+        return tuple(replace(part, gradient=gradient) for part in between.parts(problem))
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,10 +105,7 @@ class SteadyState(Relation):
                 raise UsageError("SteadyState(at=…) takes (run, begin, end), runs counted from 0 and times in s; "
                                  f"got {part!r}.")
 
-    @property
-    def name(self) -> str:
-        """What messages call it."""
-        return "SteadyState()"
+    name = "SteadyState()"
 
     def segments(self, problem: Any) -> tuple[SteadySegment, ...]:
         """Return the steady parts of the records of `problem`: found in the data, or those given by `at`."""
@@ -142,7 +131,6 @@ class SteadyState(Relation):
 
     def _part(self, problem: Any, s: SteadySegment) -> Part | None:
         system, run = problem.system, problem.runs[s.run]
-        known = tuple(c for c in ("i", "omega") if c in s.means)
         # The voltage and the torque balance need what was measured; at standstill friction is anything.
         electrical, current = "i" in system.states, "i" in s.means
         wanted = (electrical and current and s.v != 0, s.moving and "omega" in s.means and (current or not electrical))
@@ -150,32 +138,31 @@ class SteadyState(Relation):
         if not names:
             return None
         pick = np.unique(np.linspace(s.first, s.last, min(FEWEST, s.n)).round().astype(int))
-        data = np.tile([s.v, *[s.means[c] for c in known]], (len(pick), 1))
         one = np.ones(len(names))
         own = problem.model.values
         torque = abs(own["K"] * s.means["i"] if "K" in own else own["g"] * s.v) or 1.0
         size = np.array([abs(s.v) if n == "voltage" else torque for n in names])
-        allowed = (self.tolerance + 3 * sum(_relative_error(run, s, c) for c in known)) * one
+        allowed = (self.tolerance + 3 * sum(_relative_error(run, s, c) for c in s.means)) * one
         weight = self.weight * np.sqrt(s.n) * share(problem, s.run) * one
         unit = "N" if problem.model.axis == "linear" else "N·m"
         labels = tuple(f"{self.name}, {n} balance, run {s.run}, {s.begin:.4g} to {s.end:.4g} s" for n in names)
-        return Part(s.run, local(system, _steady_rows(system, known), data.shape[1]), pick,
-                    np.zeros(len(pick), int), data, run.grid.u[pick], np.array(wanted), -allowed, allowed, size,
-                    weight, labels, tuple({"voltage": "V", "torque": unit}[n] for n in names))
+        rows_of = local(system, _steady_rows(system, s.v, s.means))
+        return Part(s.run, rows_of, pick, True, run.grid.u[pick], np.array(wanted), -allowed, allowed, size, weight,
+                    labels, tuple({"voltage": "V", "torque": unit}[n] for n in names))
 
     def penalty(self, c: Array, part: Part) -> tuple[Array, Array]:
         """Return residual and slope as a penalty, the source paper's: zero only where the balance is."""
         return part.weight * c, part.weight
 
 
-def _steady_rows(system: Any, known: Sequence[str]) -> Callable[..., Any]:
-    """Return the relative balances as an expression of (x, u, p, d) with d = (mean v, measured means)."""
-    def rows(x: ca.SX, u: ca.SX, p: ca.SX, d: ca.SX) -> ca.SX:
-        u = ca.vertcat(*[d[0] if n == "v" else u[j] for j, n in enumerate(system.inputs)])
+def _steady_rows(system: Any, v: float, means: Mapping[str, float]) -> Callable[..., Any]:
+    """Return the relative balances as an expression of (x, u, p) at the measured means of voltage and channels."""
+    def rows(x: ca.SX, u: ca.SX, p: ca.SX) -> ca.SX:
+        u = ca.vertcat(*[v if n == "v" else u[j] for j, n in enumerate(system.inputs)])
         y = system.out(x, u, p)
-        state = [x[j] for j in range(x.numel())]
-        for j, channel in enumerate(known, 1):
-            place, shown = system.states.index(channel), d[j]
+        state: list[Any] = ca.vertsplit(x)
+        for channel, shown in means.items():
+            place = system.states.index(channel)
             if channel in system.outputs:
                 # One Newton step undoes gains and offsets; a sensor with a lag has settled, it shows its input.
                 at = system.outputs.index(channel)
@@ -185,9 +172,8 @@ def _steady_rows(system: Any, known: Sequence[str]) -> Callable[..., Any]:
                 state[place] = shown
         balances = system.balances(ca.vertcat(*state), u, p)
         par = dict(zip(system.parameters, ca.vertsplit(p), strict=True))
-        electrical = "K" in par and "i" in known
-        drive = par["K"] * d[1 + known.index("i")] if electrical else par.get("g", 1.0) * d[0]
-        size = ca.vertcat(d[0], drive)
+        drive = par["K"] * means["i"] if "K" in par and "i" in means else par.get("g", 1.0) * v
+        size = ca.vertcat(v, drive)
         return balances / ca.if_else(size == 0, 1.0, size)
     return rows
 
@@ -247,7 +233,7 @@ class Constraint(Relation):
     def _parts(self, problem: Any) -> tuple[Part, ...]:
         system = problem.system
 
-        def rows(x: ca.SX, u: ca.SX, p: ca.SX, d: ca.SX) -> ca.SX:
+        def rows(x: ca.SX, u: ca.SX, p: ca.SX) -> ca.SX:
             named = (system.states, x), (system.inputs, u), (system.parameters, p)
             symbols = {n: s for names, v in named for n, s in zip(names, ca.vertsplit(v), strict=True)}
             try:
@@ -258,7 +244,7 @@ class Constraint(Relation):
                 raise ModelError(f"{self.title}: its expression is no formula of {', '.join(symbols)} "
                                  f"({type(error).__name__}: {str(error).partition(chr(10))[0]}).") from None
 
-        rows_of = local(system, rows, 0)
+        rows_of = local(system, rows)
         if rows_of.size1_out(0) != 1:
             raise ModelError(f"{self.title}: the expression must be one number, not {rows_of.size1_out(0)}.")
         constant = not rows_of.jac_sparsity(0, 0).nnz() and not rows_of.jac_sparsity(0, 1).nnz()
@@ -266,9 +252,9 @@ class Constraint(Relation):
         for k, run in enumerate(problem.runs[:1] if constant else problem.runs):
             t = run.experiment.t[:1] if constant else run.experiment.t
             n = len(t)
-            every, one = np.arange(n), np.ones(n)
+            one = np.ones(n)
             labels = [self.title if constant else f"{self.title}, run {k}, t = {at:.6g} s" for at in t]
-            found.append(Part(k, rows_of, every, every, np.zeros((n, 0)), run.grid.u[:n], np.ones(n, bool),
+            found.append(Part(k, rows_of, np.arange(n), False, run.grid.u[:n], np.ones(n, bool),
                               self.lower / self.size * one, self.upper / self.size * one, self.size * one,
                               self.weight * share(problem, k) * one, tuple(labels), (self.unit,) * n))
         return tuple(found)

@@ -18,8 +18,8 @@ from motorid.model.equations import System
 from motorid.model.model import Model
 from motorid.numerics.least_squares import Huber
 from motorid.numerics.signals import Array
-from motorid.problem.residuals import Levels, Measured, prior_residual
-from motorid.problem.runs import Run, channels_of, noise_of, prepare_run, smoothing, with_inputs
+from motorid.problem.residuals import Measured, prior_residual
+from motorid.problem.runs import Run, noise_of, prepare_run, smoothing, with_inputs
 from motorid.problem.unknowns import Point, Scaling, Unknowns
 from motorid.records.experiment import Experiment, between_pauses, units_of
 
@@ -107,7 +107,7 @@ class Problem:
     def outputs(self) -> tuple[str, ...]:
         """Measured channels that the model can show."""
         shown = CHANNELS if self.model.base == "dc_motor" else ("omega", "theta")
-        return tuple(c for c in channels_of(self.experiments) if c in shown)
+        return tuple(c for c in shown if any(c in r.outputs for r in self.experiments))
 
     @cached_property
     def system(self) -> System:
@@ -231,7 +231,7 @@ class Problem:
 
     def with_runs(self, runs: tuple[Run, ...]) -> Problem:
         """Return a copy with other grids that keeps everything else already made."""
-        made = ("outputs", "system", "unknowns", "integrator", "measured", "_levels")
+        made = ("outputs", "system", "unknowns", "integrator", "measured")
         return self._lending(replace(self, _runs=runs), made)
 
     def _lending(self, other: Problem, made: Sequence[str]) -> Problem:
@@ -240,11 +240,7 @@ class Problem:
 
     def _tolerance(self, k: int, slack: float = 1.0) -> float | Callable[[Trajectory], float]:
         """Local error relative to the largest state."""
-        return self.accuracy if self.accuracy is not None else self._levels[k].tolerance(slack)
-
-    @cached_property
-    def _levels(self) -> tuple[Levels, ...]:
-        return tuple(Levels.of(m) for m in self.measured)
+        return self.accuracy if self.accuracy is not None else self.measured[k].tolerance(slack)
 
     @cached_property
     def measured(self) -> tuple[Measured, ...]:
@@ -308,7 +304,7 @@ class Problem:
         other = replace(self, model=model, _runs=self.runs)
         if (inputs := other.system.inputs) != self.system.inputs:
             other = replace(other, _runs=tuple(with_inputs(run, inputs) for run in self.runs))
-        return self._lending(other, ("integrator", "measured", "_levels")) if other.outputs == self.outputs else other
+        return self._lending(other, ("integrator", "measured")) if other.outputs == self.outputs else other
 
     def start_at(self, values: Mapping[str, float]) -> Problem:
         """Return the problem with `values` as its start, each inside the limits of its parameter."""
@@ -330,7 +326,7 @@ class Problem:
     def tuned(self, **fields: Any) -> Problem:
         """Return the problem with other `noise_factors`, another `width` …; the records stay as prepared."""
         other = replace(self, **{"_runs": self.runs, **fields})
-        return self._lending(other, ("integrator", "measured", "_levels")) if fields.keys() == {"width"} else other
+        return self._lending(other, ("integrator", "measured")) if fields.keys() == {"width"} else other
 
     def with_(self, **fields: Any) -> Problem:
         """Return a copy with some fields changed, e.g. ``with_(model=…)``."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 import weakref
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -25,15 +25,14 @@ NEAR = 1e-6  # of a row's size: so near it stands at its limit
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """Rows of one constraint on one run: ``lower ≤ mean over its samples of local(x, u, p, d) ≤ upper``."""
+    """Rows of one constraint on one run: ``lower ≤ local(x, u, p) ≤ upper`` at each sample, or of their mean."""
 
     run: int
-    local: ca.Function  # ``(x, u, p, d) -> (c, dc/dx, dc/dp)``, c of shape (nc,), dimensionless
+    local: ca.Function  # ``(x, u, p) -> (c, dc/dx, dc/dp)``, c of shape (nc,), dimensionless
     samples: np.ndarray  # (m,) in ascending order
-    group: np.ndarray  # (m,) which row block each sample is averaged into
-    data: Array  # (m, nd)
+    averaged: bool  # one row block, the mean over the samples, not one at each
     u: Array  # (m, nu)
-    keep: np.ndarray  # (ng·nc,) which rows are used
+    keep: np.ndarray  # (nc,) or (m·nc,) which rows are used
     lower: Array  # (n,) of the rows kept
     upper: Array
     size: Array  # (n,) what one unit of a row is, in `unit`
@@ -42,15 +41,17 @@ class Part:
     units: tuple[str, ...]
     gradient: Array | None = None  # (nx,) dc/dx where the row is this times x and nothing else, which is much faster
 
-    def rows(self, x: Array, p: Array, dx: Array | None, dp: Array | None) -> tuple[Array, Array | None]:
-        """Return the rows (n,) and d rows/dz (n, nz) at states (m, nx) with dx (m, nx, nz), dp (np, nz)."""
+    def rows(self, x: Array, p: Array, dx: Array | None, dp: Array) -> tuple[Array, Array]:
+        """Return the rows (n,) and d rows/dz (n, nz) at states (m, nx) with dx (m, nx, nz), dp (np, nz); nz = 0
+        without dx."""
         if self.gradient is not None:
-            return x @ self.gradient, None if dx is None else np.einsum("mxz,x->mz", dx, self.gradient)
+            dx = np.zeros((*x.shape, 0)) if dx is None else dx
+            return x @ self.gradient, np.einsum("mxz,x->mz", dx, self.gradient)
         m, nc = len(self.samples), self.local.size1_out(0)
-        found = self._mapped(x.T, self.u.T, np.tile(np.asarray(p, float)[:, None], (1, m)), self.data.T)
+        found = self._mapped(x.T, self.u.T, np.tile(np.asarray(p, float)[:, None], (1, m)))
         mean = self._mean(np.asarray(found[0]).T).ravel()[self.keep]
-        if dx is None or dp is None:
-            return mean, None
+        if dx is None:
+            return mean, np.zeros((len(mean), 0))
         cx, cp = (np.asarray(a).reshape(nc, m, -1).transpose(1, 0, 2) for a in found[1:])
         return mean, self._mean(cx @ dx + cp @ dp).reshape(-1, dx.shape[2])[self.keep]
 
@@ -67,24 +68,17 @@ class Part:
         return np.where(c > self.upper, c - self.upper, np.where(c < self.lower, c - self.lower, 0.0))
 
     def _mean(self, values: Array) -> Array:
-        if int(self.group[-1]) + 1 == len(self.group):
-            return values
-        starts = np.flatnonzero(np.diff(self.group, prepend=-1))
-        counts = np.diff(starts, append=len(self.group))
-        return np.add.reduceat(values, starts, axis=0) / counts.reshape(-1, *[1] * (values.ndim - 1))
+        return np.add.reduceat(values, [0], axis=0) / len(values) if self.averaged else values
 
 
 class Relation(ABC):
     """What all constraints share: parts once per problem, and their use as penalties."""
 
+    name = ""  # what messages call it
+
     @abstractmethod
     def _parts(self, problem: Any) -> tuple[Part, ...]:
         """Return the rows on each run of `problem`."""
-
-    @property
-    @abstractmethod
-    def name(self) -> str:
-        """What messages call it."""
 
     def parts(self, problem: Any) -> tuple[Part, ...]:
         """Return the rows on each run of `problem`, made once."""
@@ -107,8 +101,7 @@ class Relation(ABC):
             c, jac = part.rows(t.x[s], at.p, t.dx[s] if derivatives and t.dx is not None else None, at.dp)
             r, slope = self.penalty(c, part)
             rs.append(r)
-            if jac is not None:
-                jacs.append(slope[:, None] * jac)
+            jacs.append(slope[:, None] * jac)
         return np.concatenate(rs), np.concatenate(jacs) if derivatives else None
 
 
@@ -119,28 +112,18 @@ class Weighed(Relation):
     relation: Relation
     factor: float
 
-    @property
-    def name(self) -> str:
-        """What messages call it."""
-        return self.relation.name
-
     def _parts(self, problem: Any) -> tuple[Part, ...]:
-        return self.relation.parts(problem)
-
-    def penalty(self, c: Array, part: Part) -> tuple[Array, Array]:
-        """Return residual and slope of what lies outside the limits."""
-        out, weight = part.violation(c), self.factor * part.weight
-        return weight * out, weight * (out != 0)
+        return tuple(replace(part, weight=self.factor * part.weight) for part in self.relation.parts(problem))
 
 
 _made: weakref.WeakKeyDictionary[Any, dict[int, tuple[Any, tuple[Part, ...]]]] = weakref.WeakKeyDictionary()
 
 
-def local(system: Any, rows: Callable[..., Any], nd: int) -> ca.Function:
-    """Return ``(x, u, p, d) -> (c, dc/dx, dc/dp)`` of the expression `rows`."""
-    (x, u, p), d = system.rhs.sx_in(), ca.SX.sym("d", nd)
-    c = ca.SX(rows(x, u, p, d))
-    return ca.Function("rows", [x, u, p, d], [ca.densify(a) for a in (c, ca.jacobian(c, x), ca.jacobian(c, p))])
+def local(system: Any, rows: Callable[..., Any]) -> ca.Function:
+    """Return ``(x, u, p) -> (c, dc/dx, dc/dp)`` of the expression `rows`."""
+    x, u, p = system.rhs.sx_in()
+    c = ca.SX(rows(x, u, p))
+    return ca.Function("rows", [x, u, p], [ca.densify(a) for a in (c, ca.jacobian(c, x), ca.jacobian(c, p))])
 
 
 def share(problem: Any, k: int) -> float:

@@ -15,6 +15,9 @@ from motorid.problem.runs import Run
 from motorid.problem.unknowns import Point, Unknowns
 
 LARGEST_SLOPE = 1e100  # of an output; beyond it the numbers mean nothing
+NOISE_SHARE = 0.01  # error of an interval over the noise
+MISFIT_SHARE = 0.1  # of the misfit, where it is what the noise would be
+TIGHTEST, LOOSEST = 1e-7, 3e-5  # and over the largest state
 
 
 class Measured(NamedTuple):
@@ -70,6 +73,23 @@ class Measured(NamedTuple):
         full[slice(None) if self.index is None else self.index] = rows
         return full.reshape(*self.y.shape, *rows.shape[1:])
 
+    def tolerance(self, slack: float = 1.0) -> float | Callable[[Trajectory], float]:
+        """Return the error of an interval allowed, relative to the largest state; see `Engine.prepare`."""
+        finite = np.isfinite(self.y)
+        count = np.maximum(finite.sum(axis=0), 1)
+        top = np.maximum(np.abs(np.where(finite, self.y, 0.0)).max(axis=0), 1e-300)
+        noise = self.noise / top
+        if NOISE_SHARE * noise.min() >= LOOSEST:
+            return slack * LOOSEST
+
+        def beside_misfit(traj: Trajectory) -> float:
+            e = np.where(finite, traj.y - self.y, 0.0)
+            rms = np.sqrt(np.einsum("ij,ij->j", e, e) / count) / top
+            share = float(np.maximum(noise, MISFIT_SHARE * rms).min())
+            return slack * min(max(NOISE_SHARE * share, TIGHTEST), LOOSEST)
+
+        return beside_misfit
+
 
 def prior_residual(priors: Mapping[str, tuple[float, float]], unknowns: Unknowns, at: Point) -> tuple[Array, Array]:
     """Return (value − mean)/std of each free parameter with a prior, and the derivatives with respect to q."""
@@ -79,42 +99,3 @@ def prior_residual(priors: Mapping[str, tuple[float, float]], unknowns: Unknowns
     jac = np.zeros((len(columns), len(names)))
     jac[np.arange(len(columns)), columns] = at.slope[columns] / std
     return (at.physical[columns] - mean) / std, jac
-
-
-NOISE_SHARE = 0.01  # error of an interval over the noise
-MISFIT_SHARE = 0.1  # of the misfit, where it is what the noise would be
-TIGHTEST, LOOSEST = 1e-7, 3e-5  # and over the largest state
-
-
-class Levels(NamedTuple):
-    """What one record tells about the accuracy it needs."""
-
-    y: Array  # (N, ny), measured
-    missing: NDArray[np.bool_] | None  # (N, ny); None where nothing is
-    top: Array  # (ny,), largest size
-    noise: Array  # (ny,), over that
-    count: Array  # (ny,), samples measured
-
-    @staticmethod
-    def of(measured: Measured) -> Levels:
-        """Return the levels of a record."""
-        y, finite = measured.y, np.isfinite(measured.y)
-        missing = None if finite.all() else ~finite
-        there = y if missing is None else np.where(missing, 0.0, y)
-        top = np.maximum(np.maximum(there.max(axis=0), -there.min(axis=0)), 1e-300)
-        count = np.full(y.shape[1], len(y)) if missing is None else np.maximum(finite.sum(axis=0), 1)
-        return Levels(y, missing, top, measured.noise / top, count)
-
-    def tolerance(self, slack: float = 1.0) -> float | Callable[[Trajectory], float]:
-        """Return the error of an interval allowed, relative to the largest state; see `Engine.prepare`."""
-        if NOISE_SHARE * self.noise.min() >= LOOSEST:
-            return slack * LOOSEST
-        return lambda traj: slack * self._beside(traj)
-
-    def _beside(self, traj: Trajectory) -> float:
-        e = traj.y - self.y
-        if self.missing is not None:
-            e[self.missing] = 0.0
-        rms = np.sqrt(np.einsum("ij,ij->j", e, e) / self.count) / self.top
-        share = float(np.maximum(self.noise, MISFIT_SHARE * rms).min())
-        return min(max(NOISE_SHARE * share, TIGHTEST), LOOSEST)

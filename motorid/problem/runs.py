@@ -1,8 +1,4 @@
-"""Records made ready for estimation: `prepare_run` gives a record its noise, its grid and its initial state.
-
-After that come what is known of the state at the first sample, the natural sizes of the units in these records, and the
-width of sgn that suits them.
-"""
+"""Records made ready for estimation: `prepare_run` gives a record its noise, its grid and its initial state."""
 
 from __future__ import annotations
 
@@ -107,11 +103,6 @@ def angle_signal(run: Experiment) -> Array:
     if "omega" in run.outputs:
         return integral(run.t, bridged(run.t, run.outputs["omega"]))
     return np.zeros(len(run.t))
-
-
-def channels_of(runs: Sequence[Experiment]) -> tuple[str, ...]:
-    """Channels measured in at least one run."""
-    return tuple(c for c in CHANNELS if any(c in r.outputs for r in runs))
 
 
 def noise_of(runs: Sequence[Experiment], channels: Sequence[str]) -> dict[str, float]:

@@ -103,7 +103,7 @@ def _from_start(task: tuple[Problem, dict[str, float], Any, bool], start: dict[s
         return Failure(start, "failed", str(error))
     said = end if isinstance(end, Fit) else end.solution
     # With the weights and steps of the reference, so that the results of all starts can be compared.
-    cost = cost_at(problem, problem.scaling.scaled(end.problem.scaling.physical(end.q)))
+    cost = cost_at(problem, problem.scaling.scaled(end.problem.scaling.physical(end.q)), refine=False)
     return StartResult(start, end.values, cost, judge(at(end.problem, end.q)).nrmse, said.status, said.message,
                        len(end.history) - 1, time.perf_counter() - began)
 

@@ -9,7 +9,7 @@ import pytest
 
 import motorid as mi
 from motorid.estimation.continuation import by_continuation, past_ripples
-from motorid.estimation.least_squares import FINISH, least_squares, start_cost
+from motorid.estimation.least_squares import FINISH, cost_at, least_squares
 from motorid.problem.problem import Problem, as_problem
 from motorid.problem.runs import SGN_WIDTH_SHARE, top_speed
 from motorid.records.experiment import Experiment
@@ -73,7 +73,7 @@ def test_what_a_wide_sgn_likes_is_left_where_a_narrow_one_refuses_it(stuck):
     good = problem(stuck, 0)
     good = good.for_model(good.model.start_at(TRUE))
     bad = good.for_model(good.model.start_at({"tau_c": 50.0}))
-    assert start_cost(good) < 0.1 * start_cost(bad)
+    assert cost_at(good) < 0.1 * cost_at(bad)
     assert by_continuation(bad, FINISH).cost == pytest.approx(by_continuation(good, FINISH).cost, rel=1e-3)
 
 

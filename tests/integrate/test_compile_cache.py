@@ -148,7 +148,7 @@ def test_another_compiler_or_other_flags_make_another_library(cache, builds, mon
 def test_a_cache_that_cannot_be_written_costs_speed_only(cache, tmp_path, monkeypatch, capsys):
     (tmp_path / "file").write_text("in the way")
     monkeypatch.setenv("MOTORID_CACHE", str(tmp_path / "file" / "cache"))
-    monkeypatch.setattr(cc, "_told", set())
+    cc.say_once.cache_clear()
     machine = simulate().x
     simulate()
     assert capsys.readouterr().err.count("cannot compile") == 1
@@ -160,7 +160,7 @@ def test_a_compiler_that_fails_is_told_once_and_not_asked_again(cache, builds, m
     broken.write_text('#!/bin/sh\n[ "$1" = --version ] && echo cc 1.0 && exit 0\necho no space >&2\nexit 1\n')
     broken.chmod(0o755)
     monkeypatch.setenv("MOTORID_CC", str(broken))
-    monkeypatch.setattr(cc, "_told", set())
+    cc.say_once.cache_clear()
     cc.compiler.cache_clear()
     try:
         first = simulate().x

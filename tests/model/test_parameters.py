@@ -38,7 +38,7 @@ def test_zero_is_allowed_for_a_positive_parameter_that_is_held():
 
 
 def test_a_declared_parameter_gets_its_name_and_keeps_its_fields():
-    p = P(2e-3, "N·m", null=0.0, lower=0.0, grid=[1, 2], at_least="tau_c", doc="d").named("tau_s")
+    p = P(2e-3, "N·m", null=0.0, lower=0.0, grid=[1, 2], at_least="tau_c", doc="d")(name="tau_s")
     assert p == Parameter("tau_s", 2e-3, "N·m", 0.0, null=0.0, grid=(1, 2), at_least="tau_c", doc="d")
 
 

@@ -114,7 +114,7 @@ class Mesh:
 
     @cached_property
     def scale(self) -> Array:
-        """Size of each state: the largest seen in the data or, where not measured, in the simulated intervals."""
+        """Size of each state: the largest seen in the data, 1 where it was not measured."""
         runs = self.problem.experiments
         return np.array([max([0.0, *(np.nanmax(np.abs(r.outputs[name])) for r in runs if name in r.outputs)]) or 1.0
                          for name in self.problem.system.states])
@@ -186,14 +186,14 @@ class Mesh:
         x = traj.x[s]
         dp = np.hstack([np.zeros((len(walk.at.p), self.nx)), walk.at.dp])
         owner = self.owner[part.run][s]
-        if len(np.unique(part.group)) == len(s):
+        if not part.averaged:
             c, jac = part.rows(x, walk.at.p, None if traj.dx is None else traj.dx[s], dp)
             blocks = self._by_interval(c, jac, owner)
             ends = np.cumsum([len(b.values) for b in blocks])
             return [(b, np.arange(e - len(b.values), e)) for b, e in zip(blocks, ends, strict=True)]
         columns, dx, dp = self._spread(traj.dx, s, owner, walk.at.dp)
         c, jac = part.rows(x, walk.at.p, dx, dp)
-        return [(Block(c, jac if jac is not None else np.zeros((len(c), 0)), columns), np.arange(len(c)))]
+        return [(Block(c, jac, columns), np.arange(len(c)))]
 
     def _spread(self, dx: Array | None, samples: np.ndarray, owner: np.ndarray,
                 dq: Array) -> tuple[np.ndarray, Array | None, Array]:

@@ -21,7 +21,7 @@ from motorid.estimation.result import Fit
 from motorid.estimation.shooting.mesh import Mesh
 from motorid.estimation.shooting.nlp import NlpResult, ShootingNlp, ipopt
 from motorid.estimation.shooting.nodes import first_noise, nodes_from_data, nodes_from_simulation, noise_of_gaps
-from motorid.estimation.shooting.outcome import Solved, below_steady, fit_of, violations
+from motorid.estimation.shooting.outcome import KEPT, Solved, below_steady, fit_of, violations
 from motorid.numerics.signals import Array
 from motorid.problem.problem import Problem
 from motorid.problem.relations import Relation, Weighed
@@ -117,7 +117,7 @@ class MultipleShooting:
         if self.warm == "model" or not _poor(problem, problem.start):
             return _least_squares(problem, True)
         q = self._from_poor_values(problem)
-        near = _least_squares(problem.for_model(problem.model.start_at(problem.values(q))), False)
+        near = _least_squares(problem.start_at(problem.values(q)), False)
         if not _poor(*near):
             return near
         return min(near, _least_squares(problem, True), key=lambda found: _misfit(*found))
@@ -150,7 +150,7 @@ class MultipleShooting:
         z = mesh.joined(q, self._nodes(mesh, q))
         done = self._solve(mesh, z)
         if not problem.constraints and done.worse_than(z):
-            return done.kept(z)
+            return replace(done, result=done.result._replace(z=z, status=KEPT))
         for _ in range(ROUNDS - 1):
             if done.problem.fine_enough(done.q):
                 break

@@ -1,13 +1,9 @@
-"""The solution of multiple shooting as a `Fit`: status in words, multipliers, gaps, constraints that cannot be kept.
-
-`Solved` is a mesh with the solver's result, `fit_of` makes the fit of it. Below: violations and multipliers of the
-constraints, and what is said when they contradict one another or the records.
-"""
+"""The solution of multiple shooting as a `Fit`: status in words, multipliers, gaps, constraints that cannot be kept."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -79,10 +75,6 @@ class Solved:
         if np.abs(start.g).max(initial=0.0) > JOINED:
             return False
         return self.status != "converged" or (self.cost - start.f) * self.nlp.scale > SAME * max(1, start.f)
-
-    def kept(self, z: Array) -> Solved:
-        """Return the start instead of the end."""
-        return replace(self, result=self.result._replace(z=z, status=KEPT))
 
     @property
     def violation(self) -> float:
@@ -200,8 +192,8 @@ def rows_at(problem: Problem, q: Array, relations: Sequence[Any] | None = None, 
     for c in problem.constraints if relations is None else relations:
         for part in c.parts(problem):
             x, dx = trajs[part.run].x, trajs[part.run].dx
-            values, jac = part.rows(x[part.samples], at.p, None if dx is None else dx[part.samples], at.dp)
-            found.append((c.name, part, values, np.empty((len(values), 0)) if jac is None else jac))
+            rows = part.rows(x[part.samples], at.p, None if dx is None else dx[part.samples], at.dp)
+            found.append((c.name, part, *rows))
     return found
 
 
