@@ -13,7 +13,6 @@ os.environ.setdefault("MPLBACKEND", "Agg")  # figures without a display, for pro
 
 from motorid.records.datasets import load_plant
 
-
 LONG = ("notebooks", "real_records", "remainder", "data/test_data", "diagnosis", "bench", "shooting", "recovered")
 
 
