@@ -13,6 +13,21 @@ os.environ.setdefault("MPLBACKEND", "Agg")  # figures without a display, for pro
 
 from motorid.records.datasets import load_plant
 
+LONG = ("notebooks", "real_records", "remainder", "data/test_data", "diagnosis", "bench", "shooting", "recovered")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Begin with the files whose tests take long: none is to run alone at the end while other workers wait."""
+    items.sort(key=lambda item: next((k for k, word in enumerate(LONG) if word in item.nodeid.split("::")[0]), 99))
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: object) -> object:
+    """Let idle workers take over what others have before them: xdist's default deals out long tests in one heap."""
+    from xdist.scheduler import WorkStealingScheduling
+
+    return WorkStealingScheduling(config, log) if config.getoption("dist") == "load" else None
+
 
 @pytest.fixture
 def rng() -> np.random.Generator:

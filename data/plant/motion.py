@@ -146,18 +146,22 @@ class Plant:
 
 
 def _rk4(f: Callable, y: list[float], v0: float, v1: float, h: float, s: int, t: float) -> list[float]:
-    half, mid = 0.5 * h, 0.5 * (v0 + v1)
-    k1 = f(y, v0, s, t)
-    k2 = f(_moved(y, half, k1), mid, s, t)
-    k3 = f(_moved(y, half, k2), mid, s, t)
-    k4 = f(_moved(y, h, k3), v1, s, t)
-    sixth = h / 6
-    return [a + sixth * (p + 2 * (q + r) + u) for a, p, q, r, u in zip(y, k1, k2, k3, k4)]  # noqa: B905  (fast)
+    half, mid, sixth = 0.5 * h, 0.5 * (v0 + v1), h / 6
+    k = f(y, v0, s, t)
+    if len(y) == 4:  # by far the most, and twice as fast
+        a, b, c, d = y
+        q = f([a + half * k[0], b + half * k[1], c + half * k[2], d + half * k[3]], mid, s, t)
+        r = f([a + half * q[0], b + half * q[1], c + half * q[2], d + half * q[3]], mid, s, t)
+        u = f([a + h * r[0], b + h * r[1], c + h * r[2], d + h * r[3]], v1, s, t)
+        return [a + sixth * (k[0] + 2 * (q[0] + r[0]) + u[0]), b + sixth * (k[1] + 2 * (q[1] + r[1]) + u[1]),
+                c + sixth * (k[2] + 2 * (q[2] + r[2]) + u[2]), d + sixth * (k[3] + 2 * (q[3] + r[3]) + u[3])]
+    q = f(_moved(y, half, k), mid, s, t)
+    r = f(_moved(y, half, q), mid, s, t)
+    u = f(_moved(y, h, r), v1, s, t)
+    return [a + sixth * (p + 2 * (b + c) + d) for a, p, b, c, d in zip(y, k, q, r, u)]  # noqa: B905  (fast)
 
 
 def _moved(y: list[float], h: float, k: list[float]) -> list[float]:
-    if len(y) == 4:  # by far the most, and twice as fast
-        return [y[0] + h * k[0], y[1] + h * k[1], y[2] + h * k[2], y[3] + h * k[3]]
     return [a + h * r for a, r in zip(y, k, strict=True)]
 
 
@@ -179,7 +183,8 @@ def _physics(m: Motor, hooks: list[dict], omega0: float, theta0: float) -> tuple
             fluxes += [(h["flux"], first, first + len(start))] if "flux" in h else []
             x0.extend(start)
     R0, L0, K0, b, J = m.R, m.L, m.K, m.b, m.J
-    plain = not (drives or bridges or drops or f_R or f_L or f_K or fluxes or f_Kt or f_Ke or diodes)
+    shaped, changed = drives or bridges or drops, f_L or f_K or fluxes or f_Kt or f_Ke  # empty loops take time
+    plain = not (shaped or changed or f_R or diodes)
 
     def every_level(i: float, w: float, th: float, s: int, t: float) -> float:
         return sum([f(i, w, th, s, t) for f in dries])
@@ -191,24 +196,26 @@ def _physics(m: Motor, hooks: list[dict], omega0: float, theta0: float) -> tuple
         i, w, th, dT = y[0], y[1], y[2], y[3]
         R, L, K, Kt, Ke = R0, L0, K0, 1.0, 1.0
         opened = diodes and v == 0
-        for f in drives:
-            v = f(v, w)
-        for f in bridges:
-            v = f(v, i)
-        for f in drops:
-            v -= f(i)
+        if shaped:
+            for f in drives:
+                v = f(v, w)
+            for f in bridges:
+                v = f(v, i)
+            for f in drops:
+                v -= f(i)
         for f in f_R:
             R *= f(dT)
-        for f in f_L:
-            L *= f(i)
-        for f in f_K:
-            K *= f(i)
-        for f, a, z in fluxes:
-            K *= f(y[a:z])
-        for f in f_Kt:
-            Kt *= f(th)
-        for f in f_Ke:
-            Ke *= f(th)
+        if changed:
+            for f in f_L:
+                L *= f(i)
+            for f in f_K:
+                K *= f(i)
+            for f, a, z in fluxes:
+                K *= f(y[a:z])
+            for f in f_Kt:
+                Kt *= f(th)
+            for f in f_Ke:
+                Ke *= f(th)
         if opened:
             v = -diodes[0] if i > 0 else diodes[0] if i < 0 else K * Ke * w  # no current, no voltage across the winding
         return v, R, L, K, Kt, Ke

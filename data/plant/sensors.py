@@ -85,11 +85,15 @@ class Chain:
         self.duty = has.get("duty", lambda v: 1.0)
         self.i, self.w = 0.0, float(omega0)
         self._last = (0.0, float(omega0))
+        self._at_once = not (self.lag_i or self.lag_w or self.filter or self.delay or self.window)
         self._turned, self._omega0 = 0.0, float(omega0)  # the integral of the speed
         self._times, self._speeds = [0.0], [0.0 if self.window else float(omega0)]
 
     def sample(self, t: float, h: float, i: float, w: float) -> None:
         """Follow the true current and speed, taken as straight lines over the last step of h seconds."""
+        if self._at_once:
+            self.i, self.w = i, w
+            return
         self.i = _lag(self.i, self._last[0], i, h, self.lag_i)
         if self.filter:
             self.w, self._rate = _filtered(self.w, self._rate, self._last[1], w, h, *self.filter)

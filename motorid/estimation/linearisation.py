@@ -171,10 +171,10 @@ class Tangent:
     sizes: Mapping[str, float]
 
     @staticmethod
+    @lru_cache(maxsize=4)  # what is cached by a tangent, as the spectrum of orders, is found again
     def of(fit: Fit) -> Tangent:
         """Return the tangent space of `fit`, singular directions left out."""
-        n = fit.problem.n_outputs
-        jac, r = fit.jacobian[:n], fit.residuals[:n]
+        jac, r = (a[: fit.problem.n_outputs] for a in (fit.jacobian, fit.residuals))
         norms = np.linalg.norm(jac, axis=0)
         basis = column_space(jac / np.where(norms > 0, norms, 1.0))
         return Tangent(fit, basis, r - basis @ (basis.T @ r), natural_sizes(fit.problem.experiments, fit.values))

@@ -13,8 +13,10 @@ from battery.excite import driven, record
 
 import motorid as mi
 from motorid.channels import channel_name
-from motorid.diagnosis.free_forms import linearised
+from motorid.diagnosis import remainder
+from motorid.diagnosis.free_forms import Form, linearised
 from motorid.diagnosis.model_comparison import far
+from motorid.diagnosis.remainder import Remainder
 from motorid.display.numbers import arrow
 from motorid.records.experiment import Experiment
 
@@ -144,23 +146,42 @@ def test_what_is_needed_beside_it_is_kept_and_the_rest_is_said(lab):
     assert not found.remaining.adequate
 
 
+def of_different_motors(lab, name, factors) -> list[Experiment]:
+    motors = [replace(lab, **{name: getattr(lab, name) * k}) for k in factors]
+    drives = ("stairs 0.5", "ramps 0.6", "prbs 0.5", "steps 0.5")
+    return [runs_of(m, {}, (d,), seed=4 + k, n=400)[0] for k, (m, d) in enumerate(zip(motors, drives, strict=True))]
+
+
+OTHER_CONSTANTS = (0.97, 1.0, 1.04, 1.0)
+
+
 @pytest.mark.parametrize(
     ("name", "factors", "form", "where"),
     [
         ("R", (0.8, 1.0, 1.25, 0.9), "a resistance that differs from run to run", "electrical"),
-        ("K", (0.97, 1.0, 1.04, 1.0), "a motor constant that differs from run to run", "electrical"),
+        ("K", OTHER_CONSTANTS, "a motor constant that differs from run to run", "electrical"),
         ("J", (0.8, 1.0, 1.3, 1.0), "an inertia that differs from run to run", "mechanical"),
     ],
 )
 def test_a_motor_that_is_another_in_every_run_lacks_no_effect(lab, name, factors, form, where):
     """Warm and cold, another supply, another load: no effect fits the runs together, each alone has no misfit."""
-    motors = [replace(lab, **{name: getattr(lab, name) * k}) for k in factors]
-    drives = ("stairs 0.5", "ramps 0.6", "prbs 0.5", "steps 0.5")
-    runs = [runs_of(m, {}, (d,), seed=4 + k)[0] for k, (m, d) in enumerate(zip(motors, drives, strict=True))]
-    found = diagnosed(runs, ("brush_drop", "coulomb", "load_friction"))
+    found = diagnosed(of_different_motors(lab, name, factors), ("brush_drop", "coulomb", "load_friction"))
     is_like(found, form, where)
     with pytest.raises(mi.UsageError, match="Fit the runs apart"):
         found.remainder.as_effect()
+
+
+def test_runs_are_to_be_fitted_apart_where_curves_were_tried_first(lab, monkeypatch):
+    """What was found may only imitate one thing, so curves are tried in its place, and none helps."""
+    runs, tried = of_different_motors(lab, "K", OTHER_CONSTANTS), []
+    root, last = (mi.fit(m, runs) for m in (mi.dc_motor(), mi.dc_motor() + mi.effects.brush_drop))
+    assert far(last)
+    monkeypatch.setattr(remainder, "chosen_functions", lambda fit, linear, form, had: tried.append(form) or [])
+    left = Remainder("structure", last, (Form("a motor constant", "both", "run"),), _root=root)
+    with pytest.raises(mi.UsageError, match="Fit the runs apart"):
+        left.as_effect()
+    assert tried
+    assert "run" not in {form.on for form in tried}
 
 
 def test_improve_grades_its_rungs_too(lab):

@@ -275,7 +275,7 @@ def test_slopes_of_every_form_are_those_of_the_model_with_its_curve(lab):
     """Sticking and voltage steps within samples included."""
     rng = np.random.default_rng(7)
     hidden = {"coulomb": {"tau_c": 6e-3}}
-    runs = [record(driven(lab, hidden, w, 150, 1e-3, rng), "logger", ANGLE, lab, rng, w) for w in FAST[:2]]
+    runs = [record(driven(lab, hidden, w, 100, 1e-3, rng), "logger", ANGLE, lab, rng, w) for w in FAST[:2]]
     fit = mi.fit(mi.dc_motor() + mi.effects.coulomb, runs)
     linear = linearised(fit)
     remembering = [f for f in linear.forms if f.remembers]

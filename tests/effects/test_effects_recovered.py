@@ -79,8 +79,8 @@ def volts(t: np.ndarray, kind: int) -> np.ndarray:
     return np.where(t < 0.02, 0, steps[np.minimum((t / 0.06).astype(int), 199)] + 2 * np.sin(4.4 * t))
 
 
-def records(effect, rng, **other):
-    t = np.arange(2400) * 1e-3
+def records(effect, rng, n=1500, **other):
+    t = np.arange(n) * 1e-3
     model = (mi.dc_motor(**VALUES) + effect).replace(**TRUTH[effect.name] | other)
     channels = tuple(NOISE)
     clean = [simulated(t, volts(t, k), channels, model) for k in (0, 1)]
@@ -125,7 +125,7 @@ def test_a_gap_of_radians_is_found(seed):
 
     Its rebounds make the cost rugged: of the noise of one record in three a refit alone stops far from the end.
     """
-    runs = records(LIBRARY["backlash"], np.random.default_rng(seed), gap=2.5)
+    runs = records(LIBRARY["backlash"], np.random.default_rng(seed), n=2400, gap=2.5)
     found = mi.diagnose(mi.fit(mi.dc_motor(), runs), effects=["backlash", "compliance"])
     assert found.effects == ("backlash",)
     assert found.after.values["gap"] == pytest.approx(2.5, rel=0.02)

@@ -14,7 +14,6 @@ import pytest
 from command import motorid, motorid_json
 
 import motorid as mi
-from motorid.problem.plain_data import model_from_json
 from motorid.problem.simulate import evaluate
 from motorid.records.experiment import split
 from motorid.records.reading import read_runs
@@ -137,28 +136,26 @@ def test_without_current_no_confident_r_comes_out(real, folder, words):
 
 
 # -- xl330: a servo lifting a pendulum ---------------------------------------------------------------------
-def xl330(real: Path, folder: Path, *words: str) -> float:
-    """Mean absolute error of the angle over the records, rad.
+def xl330(runs: list[mi.Experiment], *effects: mi.Effect) -> float:
+    """Mean absolute error of the angle over the records, rad, of a fit of every second sample.
 
     Such a mean is what the robust loss asks for, where the misfit is far above the noise.
     """
-    records = real / "xl330" / "*.csv"
-    found = motorid_json(folder, "fit", records, "--ignore", "omega", "--loss", "huber", *words)
-    judged = evaluate(model_from_json(found), [r.without("omega") for r in read_runs(records)])
-    return float(np.mean([np.nanmean(np.abs(s.residual("theta"))) for s in judged.simulations]))
+    model = sum(effects, mi.dc_motor()).fix(R=1)
+    fit = mi.fit(model, [r.decimate(2) for r in runs], loss=mi.Huber())
+    return float(np.mean([np.nanmean(np.abs(s.residual("theta"))) for s in evaluate(fit.model, runs).simulations]))
 
 
 @pytest.mark.slow
-def test_xl330_needs_friction_that_grows_with_the_load(real, tmp_path):
+def test_xl330_needs_friction_that_grows_with_the_load(real):
     """The README has 0.099 rad with gravity alone and 0.053 with load friction.
 
     Only that friction tells back-EMF from viscous friction here; a start with much of the former ends in another
     valley, at 0.06 rad.
     """
-    alone = xl330(real, tmp_path, "--effects", "gravity", "--fix", "R=1")
-    loaded = xl330(real, tmp_path, "--effects", "gravity,load_friction", "--fix", "R=1")
-    assert alone < 0.099
-    assert loaded < 0.053
+    runs = [r.without("omega") for r in read_runs(real / "xl330" / "*.csv")]
+    assert xl330(runs, mi.effects.gravity) < 0.099
+    assert xl330(runs, mi.effects.gravity, mi.effects.load_friction) < 0.053
 
 
 def test_initial_states_of_held_out_runs_are_found_where_friction_stalls_the_search(real):
