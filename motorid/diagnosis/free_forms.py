@@ -203,7 +203,8 @@ def functions_of(form: Form, span: Span) -> list[str]:
             if reach > span.step:  # what lasts for some samples, or fades
                 steps = np.unique(np.round(np.geomspace(span.step, reach, PLACES * span.finer**3) / span.step))
                 found += [f"({sign}z > {span.step * k:.9g})" for k in (0, *steps[:-1])]
-                found += [f"({sign}z > 0) * ca.exp(-ca.fabs(z) / {reach / k:.6g})" for k in SOON]
+                fades = (_place(reach / k, span.step, reach) for k in SOON)
+                found += [f"({sign}z > 0) * ca.exp(-ca.fabs(z) / {fade})" for fade in fades]
         return found
     inside = f"ca.fmin(ca.fmax(z, {low:.9g}), {high:.9g})"  # nothing is known beyond
     if form.on in ("theta", "t", "distance"):
@@ -213,7 +214,8 @@ def functions_of(form: Form, span: Span) -> list[str]:
         sudden = [f"ca.tanh((z - {c}) * {steep})" for c in centres]  # something sets in
         sudden += ["z", *(f"ca.fmax(z - {c}, 0)" for c in centres)]  # a stop, a slack, a ramp
         if form.on != "theta":  # what warms up, or runs in
-            sudden += [f"ca.exp(-z / {(high - low) / k:.9g})" for k in FADES]
+            whole = high - low
+            sudden += [f"ca.exp(-z / {_place(whole / k, whole / 300, whole * 10)})" for k in FADES]
         most = 2 * KNOTS if form.on == "theta" else KNOTS
         return ["1.0", *(f"ca.cos({k} * {scale})" for k in range(1, most)), *sudden]
     top = max(abs(low), abs(high))

@@ -139,7 +139,8 @@ class Part:
     def place_unit(self) -> str:
         """Unit of the places."""
         on = self.form.on
-        return "rad" if on in ("theta", "turn", "distance", "path") else "s" if on == "t" or on in PAST else "1"
+        over = "s" if on in ("t", *PAST, *COMPUTED_INPUTS) else "1"
+        return "rad" if on in ("theta", "turn", "distance", "path") else over
 
     def law(self, names: Sequence[str], places: Sequence[str], known: Container[str]) -> str:
         """Return the law as source, coefficients and places by name; states of `known` quantities are there already."""
@@ -186,9 +187,9 @@ class Curve:
         parameters = []
         for part, sizes, places in self._apart(self.sizes.items()):
             unit = part.unit(self._torque)
-            parameters += [P(c, unit, null=0.0, doc="coefficient of the curve").named(n) for n, c in sizes]
+            parameters += [P(c, unit, null=0.0, doc="coefficient of the curve")(n) for n, c in sizes]
             limits = [limits for _, *limits in part.places]
-            parameters += [P(c, part.place_unit, lower=low, upper=high, doc="place in the curve").named(n)
+            parameters += [P(c, part.place_unit, lower=low, upper=high, doc="place in the curve")(n)
                            for (n, c), (low, high) in zip(places, limits, strict=True)]
         return Effect(self.name, Law(self.law), tuple(parameters), self.balance, f"What is left: {self.text}.")
 

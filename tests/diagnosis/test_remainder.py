@@ -104,7 +104,7 @@ def test_with_the_remainder_the_held_out_error_falls_to_the_floor(outside, name)
     balance, quantity = FORMS[name]
     assert effect.balance == balance
     assert quantity in found.remainder.code()
-    fit = mi.fit(found.best.model + effect, runs[:2])
+    fit = mi.fit(found.remainder.model + effect, runs[:2])
     if name == "fading friction":  # nothing else in the model does the same: the fit ends where the curve began
         began, ended = np.array([(p.value, fit.values[p.name]) for p in effect.parameters]).T
         assert np.corrcoef(began, ended)[0, 1] > 0.5
