@@ -438,12 +438,11 @@ def _beyond(base: Fit | None) -> Iterator[tuple[Fit, Form]]:
 
 
 class Grown(NamedTuple):
-    """A curve grown as far as that helps: what it gains, what it predicts, whether its form has nothing to add."""
+    """A curve grown as far as that helps, what it gains, and what it predicts."""
 
     gain: float
     predictions: Predictions
     curve: Curve
-    whole: bool = False
 
     @property
     def done(self) -> bool:
@@ -497,9 +496,9 @@ def _better_curve(tried: Iterable[tuple[Curve, Form]], before: Predictions, held
     found: list[Grown] = []
     with contextlib.suppress(OutOfTime):  # what is tried takes fits to find, too
         for first, form in tried:
-            few = _grown(first.with_form(form, moved=True), FEW, before, held)
-            many = None if few is not None and few.whole else _grown(first.with_form(form), ROUNDS, before, held)
-            found += [grown for grown in (few, many) if grown is not None]
+            for moved, rounds in ((True, FEW), (False, ROUNDS)):
+                if (grown := _grown(first.with_form(form, moved), rounds, before, held)) is not None:
+                    found.append(grown)
             if found and _best_of(found).done:
                 break
     return _best_of(found) if found else None
@@ -513,18 +512,17 @@ def _best_of(found: Iterable[Grown]) -> Grown:
 
 def _grown(curve: Curve, rounds: int, before: Predictions, held: HeldOut) -> Grown | None:
     """Return a curve with functions in its last part, as long as more of them help; None where it does no better."""
-    better, after, whole = None, before, False
+    better, after = None, before
     with contextlib.suppress(*FAILURES, OutOfTime):  # the best so far, where a budget is spent
         for _ in range(rounds):
             if (larger := curve.grown()) is None or larger.fitted is None:
-                whole = larger is None
                 break
             predicted = held.predictions(larger.fitted)
             gained = compare(before, predicted)
             if better is not None and gained.gain < better.gain:  # slopes led astray
                 break
             curve, better, after = larger, gained, predicted
-    return Grown(better.gain, after, curve, whole) if better is not None and better.worth_it else None
+    return Grown(better.gain, after, curve) if better is not None and better.worth_it else None
 
 
 def _closed_forms(on: str, z: Array) -> list[tuple[str, Array]]:
