@@ -56,7 +56,7 @@ TRIED = 4  # curves that are fitted, those that promise most
 FINE = 36  # harmonics of a turn in a curve that is fitted
 CLOSED = 300  # times that are tried as the end, or the beginning, of a constant
 FURTHER = 3  # times that a form beside those of the curve is sought
-FEW = 4  # functions at most whose places are fitted, too
+FEW = 6  # functions at most whose places are fitted, too
 ROUNDS = 3  # of choosing functions and fitting: near the optimum slopes show what the misfit hid before
 QUANTITIES = {"t": "m.state('clock')", "distance": "m.state('distance')", "turn": "m.theta", "theta": "m.theta",
               "omega": "m.omega", "i": "m.i", "v": "m.v", "past v": "m.v", "past i": "m.i", "past omega": "m.omega",
@@ -494,8 +494,12 @@ def _revised(best: Grown, held: HeldOut) -> Grown:
 def _better_curve(tried: Iterable[tuple[Curve, Form]], before: Predictions, held: HeldOut) -> Grown | None:
     """Return the best of curves, each with a form more; None where none does better."""
     found: list[Grown] = []
+    met = set()
     with contextlib.suppress(OutOfTime):  # what is tried takes fits to find, too
         for first, form in tried:
+            if (first.fit.model.effect_names, form) in met:
+                continue
+            met.add((first.fit.model.effect_names, form))
             for moved, rounds in ((True, FEW), (False, ROUNDS)):
                 if (grown := _grown(first.with_form(form, moved), rounds, before, held)) is not None:
                     found.append(grown)
@@ -505,8 +509,8 @@ def _better_curve(tried: Iterable[tuple[Curve, Form]], before: Predictions, held
 
 
 def _best_of(found: Iterable[Grown]) -> Grown:
-    """Return the best; which of two is better only a comparison of the two tells."""
-    ordered = sorted(found, key=lambda f: -f.gain)
+    """Return the best, the smallest on a tie; which of two is better only a comparison of the two tells."""
+    ordered = sorted(found, key=lambda f: (len(f.curve.fitted.q) if f.curve.fitted else 0, -f.gain))
     return reduce(lambda best, f: f if compare(best.predictions, f.predictions).worth_it else best, ordered)
 
 
