@@ -35,13 +35,6 @@ class Step:
 @dataclass(frozen=True, eq=False, repr=False)
 class Campaign(Printed):
     """What `identify_on` did.
-
-    Attributes
-    ----------
-    steps : tuple of Step
-    runs : tuple of Experiment
-    reached : bool
-    text : str
     """
 
     steps: tuple[Step, ...]

@@ -206,22 +206,29 @@ def functions_of(form: Form, span: Span) -> list[str]:
                 fades = (_place(reach / k, span.step, reach) for k in SOON)
                 found += [f"({sign}z > 0) * ca.exp(-ca.fabs(z) / {fade})" for fade in fades]
         return found
-    inside = f"ca.fmin(ca.fmax(z, {low:.9g}), {high:.9g})"  # nothing is known beyond
-    if form.on in ("theta", "t", "distance"):
-        scale = f"{np.pi / (high - low):.9g} * ({inside} - {low:.9g})"
-        centres = [_place(c, low, high) for c in np.linspace(low, high, PLACES * span.finer + 2)[1:-1]]
-        steep = f"{SUDDEN * span.finer / (high - low):.6g}"
-        sudden = [f"ca.tanh((z - {c}) * {steep})" for c in centres]  # something sets in
-        sudden += ["z", *(f"ca.fmax(z - {c}, 0)" for c in centres)]  # a stop, a slack, a ramp
-        if form.on != "theta":  # what warms up, or runs in
-            whole = high - low
-            sudden += [f"ca.exp(-z / {_place(whole / k, whole / 300, whole * 10)})" for k in FADES]
-        most = 2 * KNOTS if form.on == "theta" else KNOTS
-        return ["1.0", *(f"ca.cos({k} * {scale})" for k in range(1, most)), *sudden]
+    return (_along if form.on in ("theta", "t", "distance") else _of_size)(form, span, low, high)
+
+
+def _along(form: Form, span: Span, low: float, high: float) -> list[str]:
+    """Return functions of a time, an angle or a distance, as source: waves, and what sets in, grows or fades."""
+    scale = f"{np.pi / (high - low):.9g} * (ca.fmin(ca.fmax(z, {low:.9g}), {high:.9g}) - {low:.9g})"
+    centres = [_place(c, low, high) for c in np.linspace(low, high, PLACES * span.finer + 2)[1:-1]]
+    steep = f"{SUDDEN * span.finer / (high - low):.6g}"
+    sudden = [f"ca.tanh((z - {c}) * {steep})" for c in centres]
+    sudden += ["z", *(f"ca.fmax(z - {c}, 0)" for c in centres)]  # a stop, a slack, a ramp
+    if form.on != "theta":  # what warms up, or runs in
+        whole = high - low
+        sudden += [f"ca.exp(-z / {_place(whole / k, whole / 300, whole * 10)})" for k in FADES]
+    most = 2 * KNOTS if form.on == "theta" else KNOTS
+    return ["1.0", *(f"ca.cos({k} * {scale})" for k in range(1, most)), *sudden]
+
+
+def _of_size(form: Form, span: Span, low: float, high: float) -> list[str]:
+    """Return functions of a speed, a current or a voltage, as source: powers, jumps and bends."""
     top = max(abs(low), abs(high))
     if min(-low, high) > BOTH_WAYS * top:  # what one side shows of the last bit may hold on the other
-        inside = f"ca.fmin(ca.fmax(z, {-top:.9g}), {top:.9g})"
-    s = f"({inside} / {top:.6g})"
+        low, high = -top, top
+    s = f"(ca.fmin(ca.fmax(z, {low:.9g}), {high:.9g}) / {top:.6g})"  # nothing is known beyond
     size = f"ca.fabs{s}"
     smooth = [s, f"{s}**2", f"{s}**3", *(f"ca.tanh({k} * {s})" for k in BENDS)]
     sides = [sign for sign, reach in (("", high), ("-", -low)) if reach > 0]

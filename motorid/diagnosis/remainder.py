@@ -493,13 +493,12 @@ def _revised(best: Grown, held: HeldOut) -> Grown:
 
 def _better_curve(tried: Iterable[tuple[Curve, Form]], before: Predictions, held: HeldOut) -> Grown | None:
     """Return the best of curves, each with a form more; None where none does better."""
-    found: list[Grown] = []
-    met = set()
+    found, met = list[Grown](), set[Any]()
     with contextlib.suppress(OutOfTime):  # what is tried takes fits to find, too
         for first, form in tried:
-            if (first.fit.model.effect_names, form) in met:
+            if (what := (first.fit.model.effect_names, form)) in met:
                 continue
-            met.add((first.fit.model.effect_names, form))
+            met.add(what)
             for moved, rounds in ((True, FEW), (False, ROUNDS)):
                 if (grown := _grown(first.with_form(form, moved), rounds, before, held)) is not None:
                     found.append(grown)

@@ -25,7 +25,6 @@ class Adequacy(Shown):
 
     Attributes
     ----------
-    adequate : bool
     p_value : float
         Probability of residuals at least this bad from noise alone, coloured noise allowed for.
     false_alarm : float
@@ -33,7 +32,6 @@ class Adequacy(Shown):
     channels : dict of str to dict
         Per channel: ``noise`` and ``rms`` of the residual (SI), ``ratio`` of the two, ``autocorrelation`` at lag 1,
         ``input_correlation`` (largest), ``effective_samples``, ``p_value``.
-    text : str
     """
 
     adequate: bool
@@ -84,8 +82,6 @@ class Missing(Shown):
         Share of the misfit by region: standstill, reversal, acceleration, steady, high current.
     bins : dict of str to tuple of Binned
         ``"voltage"`` and ``"torque"`` against i, omega, theta, heat, t; the best explanation first.
-    text : str
-    torque_unit : str
     acts_like : str
         What it is like where the library lacks it, e.g. "a load that changes with the angle"; else empty.
     """
@@ -132,7 +128,6 @@ class Candidate:
         Of the effect, SI: refitted values where there was a refit, else predicted.
     group : tuple of str
         Effects that these records do not distinguish from it.
-    accepted : bool
     reason : str
         Why it was taken or not.
     """
@@ -157,17 +152,13 @@ class Rung:
 
     Attributes
     ----------
-    added : str or None
-    fit : Fit
     nrmse, validation_nrmse : dict of str to float
         Per channel, on the fitted and on the held-out runs.
     removed : tuple of str
         Earlier effects that it made superfluous.
-    candidates : tuple of Candidate
     grade : {"named", "group", "approximates"} or None
         ``named``: the thing itself; ``group``: one of several that these data cannot distinguish; ``approximates``: it
         helps, and `why` says what speaks against its name.
-    why : str
     gain, gain_se : float or None
         Difference of the log predictive density on data left out (nats) from the rung before, and its standard error.
     """
@@ -225,7 +216,6 @@ class Diagnosis(Shown):
         Effects that these records do not distinguish.
     suggestion : str or None
         The experiment that would separate them.
-    before, after : Fit
     remaining : Adequacy
         Of the model after the last rung.
     remainder : Remainder or None

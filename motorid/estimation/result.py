@@ -55,7 +55,6 @@ class Fit(Shown):
         Why it ended, and what to try where it did not go well.
     history : tuple of float
         Cost after each iteration, cost = ½ rᵀr.
-    seconds : float
     integration_error : float
         Largest error of the integration, in units of the noise.
     extra : dict
@@ -437,11 +436,8 @@ class Comparison(Printed):
 
     Attributes
     ----------
-    fits : tuple of Fit
     names : tuple of str
         ``base + effects`` of each.
-    nrmse : tuple of dict of str to float
-    validation_nrmse : tuple of (dict of str to float or None)
     parameters : dict of str to tuple of (value, std) or None
         Per parameter, one entry per fit; None where a model lacks it.
     """

@@ -24,7 +24,6 @@ class Parameter:
 
     Attributes
     ----------
-    name : str
     value : float
         Present value, in `unit`.
     unit : str
@@ -53,7 +52,6 @@ class Parameter:
     at_least : str
         Name of a parameter that this one cannot physically fall below (breakaway friction, Coulomb friction);
         checked after a fit, by `diagnose`.
-    doc : str
 
     Examples
     --------
@@ -121,10 +119,8 @@ class Effect(Shown):
 
     Attributes
     ----------
-    name : str
     law : callable
         ``law(m, **symbols)``.
-    parameters : tuple of Parameter
     balance : str
         ``"voltage"``, ``"torque"``, ``"transmission"`` or ``"sensor"``.
     doc : str

@@ -31,7 +31,6 @@ class Model(Shown):
     ----------
     base : str
         ``"dc_motor"`` or ``"torque_driven"``.
-    effects : tuple of Effect
     parameters : dict of str to Parameter
         Of the base and all effects; `sgn_width` appears where an effect uses sgn.
     axis : {"rotary", "linear"}

@@ -34,7 +34,6 @@ class LevenbergMarquardt:
 
     Attributes
     ----------
-    max_iterations : int
     ftol : float
         Stop when a step lowers the cost by less than this share.
     xtol : float

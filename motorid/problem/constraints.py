@@ -195,14 +195,12 @@ class Constraint(Relation):
     expression : callable
         Of one argument with the states, inputs and parameters as CasADi symbols, e.g. ``lambda m: m.K * m.omega``. Of
         parameters alone: one row. With states or inputs: one row at every sample of every run.
-    lower, upper : float
     size : float
         Natural size of the expression, in its unit; scales the row.
     weight : float
         As a penalty: per row, on what lies outside the limits over `size`, in units as in `CurrentLimit`.
     title : str
         What messages call it.
-    unit : str
 
     Examples
     --------

@@ -33,8 +33,6 @@ class Problem:
 
     Attributes
     ----------
-    model : Model
-    experiments : tuple of Experiment
     priors : mapping of str to (mean, std)
         What is known of a parameter beforehand, in its unit.
     penalties, constraints : tuple
@@ -45,7 +43,6 @@ class Problem:
         Residuals divided by the channel's noise, or by the RMS of the measured channel (the source paper's).
     initial : {"auto", "rest", "measured", "estimate"}
         What is known of the state at the first sample.
-    engine : str or Engine
     noise_factors : mapping of str to float
         Factors on the noise per channel where the misfit, not the noise, decides (reweighting).
     accuracy : float, optional

@@ -36,10 +36,8 @@ class Simulation:
 
     Attributes
     ----------
-    experiment : Experiment
     outputs : dict of str to ndarray
         Model outputs at the samples, SI.
-    states : dict of str to ndarray
     """
 
     experiment: Experiment

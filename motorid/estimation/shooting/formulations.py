@@ -35,7 +35,6 @@ class Formulation:
     Attributes
     ----------
     name : {"plain", "penalty", "hard"}
-    result : Fit or Failure
     violations : dict of str to float
         Largest violation of each constraint, in the unit that its name ends with.
     steady_residual : float or None
@@ -75,7 +74,6 @@ class Formulations(Shown):
 
     Attributes
     ----------
-    plain, penalty, hard : Formulation
     path : tuple of PathPoint
         Penalties on what lies beyond the limits, weights as in the plain fit, from light to heavy.
     """

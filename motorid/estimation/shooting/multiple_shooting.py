@@ -58,7 +58,6 @@ class MultipleShooting:
         Standard deviation per state and √s (``{"omega": 3.0}``: rad/s per √s); gaps at the nodes are penalised
         by it instead of forbidden; other states get almost none. ``"auto"``: of current and speed, as large as
         their gaps are. Intervals then have 25 samples.
-    max_iterations : int
     tol : float
         IPOPT's tolerance on the scaled problem.
     verbose : bool

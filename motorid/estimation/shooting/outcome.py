@@ -158,7 +158,6 @@ class Multiplier:
         Which row, where and when; of a sum over rows: how many are active.
     value : float
         −d cost/d limit, cost = ½rᵀr, per `unit`: by how much the cost falls when the limit gives way by one unit.
-    unit : str
     active : int
         Rows that stand at their limit.
     """
