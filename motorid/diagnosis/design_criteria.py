@@ -82,8 +82,9 @@ class Rival:
         whole = jac.T @ jac / max(float(r @ r) / fit.dof, float(problem.weights == "noise"))
         # What is another in every run, initial states above all, is estimated too (Schur's complement).
         known = whole[:k, :k] - whole[:k, k:] @ np.linalg.pinv(whole[k:, k:], hermitian=True) @ whole[k:, :k]
-        seen = {c: max(float(np.nanmax(np.abs({**r.inputs, **r.outputs}[c]))) for r in runs
-                       if c in {**r.inputs, **r.outputs}) for c in ("v", *sigma)}
+        channels = [{**r.inputs, **r.outputs} for r in runs]
+        seen = {"omega": max(float(np.abs(s.states["omega"]).max()) for s in fit.simulations)}  # if not measured
+        seen |= {c: max(float(np.nanmax(np.abs(r[c]))) for r in channels if c in r) for c in ("v", *sigma)}
         seen |= {"duration": max(r.duration for r in runs), "dt": float(np.median([r.dt for r in runs]))}
         of_runs = [n for n, p in fit.model.parameters.items() if p.vary and p.per_run]  # as in the first run
         return Rival(name or fit.model.title, fit.model.with_(angle_input=False).fix(*of_runs), sigma,

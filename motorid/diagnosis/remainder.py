@@ -113,8 +113,7 @@ class Part:
     @property
     def places(self) -> list[tuple[float, ...]]:
         """Where each function bends, sets in or fades on the grid, and its limits; none if they stay there."""
-        found = (m.groups() for f in self.functions if self.moved for m in _each(f))
-        return [tuple(map(float, place)) for place in found]
+        return [tuple(map(float, m.groups())) for f in self.functions if self.moved for m in _each(f)]
 
     def terms(self, places: Iterable[Any]) -> list[str]:
         """The functions as source, with these names or values as their places, if they are `moved`."""

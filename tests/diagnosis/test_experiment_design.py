@@ -249,6 +249,17 @@ def test_by_default_it_stays_within_what_the_records_have_seen(first, fits):
     assert plan.peaks["i"] < plan.limits["i"]
 
 
+def test_records_of_an_angle_alone_limit_the_speed_that_they_had(plant, lab):
+    t = DT * np.arange(400)
+    v = 5 * np.sin(2 * np.pi * t / 0.4)
+    true = plant.simulate(lab, {}, t, v, substep=50e-6)
+    noise = 1e-3 * np.random.default_rng(6).standard_normal(len(t))
+    fit = mi.fit(mi.dc_motor(), mi.Experiment(t, {"v": v}, {"theta": true["theta"] + noise}))
+    design = mi.design_experiment(fit, duration=0.3, levels=4)
+    assert design.limits["omega"] == pytest.approx(np.abs(true["omega"]).max(), rel=0.05)
+    assert design.peaks["omega"] <= design.limits["omega"]
+
+
 def test_sharpening_lowers_the_deviation_that_was_asked_for(fits):
     plan = mi.design_experiment(fits[0], parameters=["J"], v_max=8, i_max=3, omega_max=120, duration=DURATION,
                                 levels=LEVELS)
