@@ -21,6 +21,7 @@ from motorid.errors import ModelError
 from motorid.estimation.angle_orders import likely_lines, spectrum
 from motorid.estimation.linearisation import Tangent
 from motorid.numerics.autoregression import Whitening
+from motorid.numerics.parallel import one_thread
 
 ANGLE = ("i", "omega", "theta")
 
@@ -142,6 +143,7 @@ def test_a_scale_of_the_speed_cannot_sharpen_a_friction_where_no_angle_tells_it(
 
 
 @pytest.mark.slow
+@one_thread
 def test_what_made_a_special_effect_special_may_be_taken_over(rubbing, monkeypatch):
     """Asymmetric friction on a motor that rubs alike both ways is Coulomb's, in the same place."""
     start = mi.fit(mi.dc_motor() + mi.effects.coulomb_asymmetric + mi.effects.constant_load, rubbing)
@@ -203,6 +205,7 @@ def test_an_order_needs_some_periods_within_the_travel(lab):
 
 
 @pytest.mark.parametrize("effect", ["cogging", "torque_ripple"])
+@one_thread
 def test_a_line_tells_order_size_and_phase(lab, effect):
     size, order, phase = {"cogging": ("A", "N", "phi"), "torque_ripple": ("a_r", "N_r", "phi_r")}[effect]
     value = {"cogging": 8e-3, "torque_ripple": 0.15}[effect]
@@ -214,6 +217,7 @@ def test_a_line_tells_order_size_and_phase(lab, effect):
 
 
 @pytest.mark.slow
+@one_thread
 def test_a_small_line_beside_a_large_misfit_gets_its_refit(lab):
     hidden = {"coulomb": {"tau_c": 1.2e-2}, "cogging": {"A": 1.5e-3, "N": 22, "phi": 0.3}}
     fit = mi.fit(mi.dc_motor(), runs_of(lab, hidden, ("stairs 0.4", "waves"), n=1200))

@@ -40,6 +40,7 @@ def rippled(run: Experiment, share: float = 0.05) -> Experiment:
     return run.with_(outputs={**run.outputs, "omega": run.outputs["omega"] * gain})
 
 
+@one_thread
 def test_friction_and_drag_that_bend_against_one_another_are_both_found(lab, rng):
     """Long steps of constant voltage: the residual is constant on each, and few samples of it count."""
     both, runs = {"coulomb": {"tau_c": 5e-3}, "quadratic_drag": {"c_2": 1e-7}}, []

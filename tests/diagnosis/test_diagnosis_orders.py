@@ -10,6 +10,7 @@ import motorid as mi
 from motorid.estimation import angle_orders as orders
 from motorid.estimation.linearisation import Response, Tangent
 from motorid.numerics.autoregression import ORDER, Whitening
+from motorid.numerics.parallel import one_thread
 
 
 def some(rng, n=40, nx=3, ny=2):
@@ -48,6 +49,7 @@ def test_the_transposed_filters_are_the_transpose(rng):
     ("torque_ripple", {"torque_ripple": {"a_r": 0.15, "N_r": 9, "phi_r": 0.7}}),
     ("cogging", {"coulomb": {"tau_c": 0.012}}),
 ])
+@one_thread
 def test_the_best_orders_are_those_of_a_look_at_all(lab, effect, hidden):
     rng = np.random.default_rng(6)
     runs = [

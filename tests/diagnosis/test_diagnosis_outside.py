@@ -18,6 +18,7 @@ from motorid.diagnosis.free_forms import Form, linearised
 from motorid.diagnosis.model_comparison import far
 from motorid.diagnosis.remainder import Remainder
 from motorid.display.numbers import arrow
+from motorid.numerics.parallel import one_thread
 from motorid.records.experiment import Experiment
 
 ANGLE = ("i", "omega", "theta")
@@ -211,6 +212,7 @@ def test_true_friction_is_kept_although_more_than_noise_is_left(lab):
     assert found.remainder.follows.startswith("a load that changes with the angle")
 
 
+@one_thread
 def test_a_form_answers_as_the_plant_does(lab):
     """The columns of a load over a turn hold what a small torque does to the outputs."""
     runs = runs_of(lab, {}, n=500)
@@ -239,6 +241,7 @@ def test_where_the_errors_are_too_large_to_be_linear_the_form_is_fitted(plant):
     is_like(found, "a friction that changes with the angle")
 
 
+@one_thread
 def test_a_sensor_is_blamed_only_where_another_contradicts_it(lab):
     """With an angle and nothing else, any error of the model would be one of the sensor."""
     both, alone = (mi.fit(mi.dc_motor(), runs_of(lab, {}, channels=c)) for c in (("i", "theta"), ("theta",)))

@@ -9,6 +9,7 @@ from motorid.diagnosis.score_test import score
 from motorid.effects import LIBRARY
 from motorid.estimation.angle_orders import likely_lines
 from motorid.estimation.linearisation import Tangent
+from motorid.numerics.parallel import one_thread
 from motorid.records.experiment import split
 
 pytestmark = pytest.mark.slow
@@ -73,6 +74,7 @@ def test_emps_has_no_bristles_that_seven_reversals_could_show(real):
         assert "cannot be seen in these samples" in lugre.reason
 
 
+@one_thread
 def test_odri_cogs_72_times_a_turn(real):
     run = mi.read_runs([real / "odri_mn4004" / "sine_current.txt"])[0].select(slice(7000, 11000))
     for model in (mi.dc_motor(), mi.dc_motor() + mi.effects.coulomb):

@@ -24,7 +24,7 @@ from motorid.effects import LIBRARY
 from motorid.errors import OutOfTime
 from motorid.estimation.continuation import by_continuation
 from motorid.estimation.restarts import MATTERS, collapsed_again, restored
-from motorid.numerics.parallel import budget
+from motorid.numerics.parallel import budget, one_thread
 from motorid.problem.problem import Problem
 from motorid.problem.simulate import simulate
 
@@ -105,6 +105,7 @@ def test_a_model_is_settled_from_one_that_took_another_effect_in_its_place():
     assert looked.settled(search.node_of(both[1], looked.held, "brush_drop", node)) is None
 
 
+@one_thread
 def test_a_climb_goes_on_from_the_settled_model(monkeypatch):
     truth = mi.dc_motor(**TRUE) + mi.effects.coulomb(tau_c=8e-3) + mi.effects.speed_lag(T_w=6e-3)
     fit, lower = mi.fit(mi.dc_motor(), [_run(truth, k) for k in range(2)]), []
@@ -134,6 +135,7 @@ def test_what_was_accepted_stays_where_the_time_ends_before_it_is_settled(monkey
     assert found.stopped == trial.OUT_OF_TIME
 
 
+@one_thread
 def test_a_phase_may_turn_either_way_in_a_refit(lab):
     """Its places to start from are quarters of a turn, which are no limits."""
     hidden = {"angular_friction": {"tau_m": 6e-3, "a_f": 0.6, "N_f": 1, "phi_f": -1.3}}

@@ -18,6 +18,7 @@ from motorid.errors import FitError, ModelError, SimulationError, UsageError
 from motorid.integrate import Cvodes, Grid, Idas, Rosenbrock, engine_of, limited
 from motorid.integrate.rosenbrock import stepper
 from motorid.model.equations import System
+from motorid.numerics.parallel import one_thread
 from motorid.problem.problem import as_problem
 from motorid.records.datasets import truth as truth_of
 
@@ -77,6 +78,7 @@ def experiment(
 @pytest.mark.parametrize(
     ("hold", "uneven"), [("zoh", False), ("linear", False), ("zoh", True), ("linear", True)]
 )
+@one_thread
 def test_linear_motor_agrees_with_the_matrix_exponential_and_its_derivatives(engine, hold, uneven):
     run = experiment(hold, uneven)
     system = mi.dc_motor().system(("i", "omega"))
