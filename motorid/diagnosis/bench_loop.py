@@ -34,8 +34,7 @@ class Step:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Campaign(Printed):
-    """What `identify_on` did.
-    """
+    """What `identify_on` did."""
 
     steps: tuple[Step, ...]
     runs: tuple[Experiment, ...]

@@ -203,7 +203,7 @@ def functions_of(form: Form, span: Span) -> list[str]:
             if reach > span.step:  # what lasts for some samples, or fades
                 steps = np.unique(np.round(np.geomspace(span.step, reach, PLACES * span.finer**3) / span.step))
                 found += [f"({sign}z > {span.step * k:.9g})" for k in (0, *steps[:-1])]
-                fades = (_place(reach / k, span.step, reach) for k in SOON)
+                fades = (_place(reach / k, min(span.step, reach / k), reach) for k in SOON)
                 found += [f"({sign}z > 0) * ca.exp(-ca.fabs(z) / {fade})" for fade in fades]
         return found
     return (_along if form.on in ("theta", "t", "distance") else _of_size)(form, span, low, high)

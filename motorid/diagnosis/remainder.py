@@ -48,7 +48,7 @@ from motorid.estimation.result import Fit
 from motorid.model.definition import Effect, P
 from motorid.model.equations import Equations
 from motorid.model.model import Model
-from motorid.numerics.parallel import one_thread
+from motorid.numerics.parallel import check_time, one_thread
 from motorid.numerics.signals import Array
 
 WHERE = {"torque": "mechanical", "voltage": "electrical", "both": "electrical", "sensor": "sensor"}
@@ -58,14 +58,13 @@ CLOSED = 300  # times that are tried as the end, or the beginning, of a constant
 FURTHER = 3  # times that a form beside those of the curve is sought
 FEW = 6  # functions at most whose places are fitted, too
 ROUNDS = 3  # of choosing functions and fitting: near the optimum slopes show what the misfit hid before
-QUANTITIES = {"t": "m.state('clock')", "distance": "m.state('distance')", "turn": "m.theta", "theta": "m.theta",
-              "omega": "m.omega", "i": "m.i", "v": "m.v", "past v": "m.v", "past i": "m.i", "past omega": "m.omega",
-              "past speed": "ca.fabs(m.omega)", "past power": "m.omega**2", "path": "m.sign(m.omega)",
-              "past load": "m.v * m.i", "past size": "ca.fabs(m.v)",
-              "most i": "m.state('most_i', ca.fabs(m.start['i']))",
+QUANTITIES = {"turn": "m.theta", "theta": "m.theta", "omega": "m.omega", "i": "m.i", "v": "m.v", "past v": "m.v",
+              "past i": "m.i", "past omega": "m.omega", "past speed": "ca.fabs(m.omega)", "past power": "m.omega**2",
+              "path": "m.sign(m.omega)", "past load": "m.v * m.i", "past size": "ca.fabs(m.v)",
               **{c: f"m.input('{c}')" for c in COMPUTED_INPUTS}}
-STATES = {"t": "clock", "distance": "distance", "most i": "most_i"}
-RATES = {"t": "1.0", "distance": "ca.fabs(m.omega)", "most i": "ca.fmax(ca.fabs(m.i) - most_i, 0) / {step:.6g}"}
+STATES = {  # quantities that are states of the curve's own: name, where it begins, rate
+    "t": ("clock", "0.0", "1.0"), "distance": ("distance", "0.0", "ca.fabs(m.omega)"),
+    "most i": ("most_i", "ca.fabs(m.start['i'])", "ca.fmax(ca.fabs(m.i) - most_i, 0) / {step:.6g}")}
 SI = {"theta": "rad", "omega": "rad/s", "i": "A", "v": "V", "size": "V"}
 OVER = {"": "", "A": "/A", "V": "/V", "rad/s": "·s/rad"}
 FIRST = {"past i": ", m.start['i']", "past omega": ", m.start['omega']"}  # of a memory: as if it had been so before
@@ -124,9 +123,9 @@ class Part:
             terms.append(f)
         return terms
 
-    def unit(self, torque: str, bare: bool = False) -> str:
+    def unit(self, fit: Fit, bare: bool = False) -> str:
         """Unit of the coefficients, or `bare` of what the part adds to its balance or its sensor, but for a carrier."""
-        form = self.form
+        form, torque = self.form, "N" if fit.model.axis == "linear" else "N·m"
         own = {"torque": torque, "voltage": "V", "both": f"{torque}/A"}.get(form.balance, SI.get(form.channel, ""))
         before = form.on.removeprefix("past ") if form.on in PAST and not form.carrier else ""
         by = [SI.get(n, "") for n in (before, form.carrier)]
@@ -135,24 +134,27 @@ class Part:
         return "1" if form.carrier == "acceleration" or own in by else own + "".join(OVER[unit] for unit in by)
 
     @property
-    def place_unit(self) -> str:
-        """Unit of the places."""
+    def place(self) -> tuple[str, str]:
+        """Unit of the places, and what they are."""
         on = self.form.on
-        over = "s" if on in ("t", *PAST, *COMPUTED_INPUTS) else "1"
-        return "rad" if on in ("theta", "turn", "distance", "path") else over
+        if on in ("omega", "i", "v"):
+            return "", f"where it bends, a share of {number(max(map(abs, self.span.ranges[on])), 4)} {SI[on]}"
+        unit = "rad" if on in ("theta", "turn", "distance", "path") else "s"
+        return unit, "how long it remembers" if on in PAST else "where it bends, sets in or fades"
 
     def law(self, names: Sequence[str], places: Sequence[str], known: Container[str]) -> str:
         """Return the law as source, coefficients and places by name; states of `known` quantities are there already."""
-        form, terms, state = self.form, self.terms(places), STATES.get(self.form.on, "")
+        form, terms, own = self.form, self.terms(places), names[0]
+        state, begins, rate = STATES.get(form.on, ("", "", ""))
         lines = [f"z = {state or QUANTITIES[form.on]}"]
         if state and form.on not in known:
-            rate = RATES[form.on].format(step=self.span.step)
-            lines = [f"{state} = {QUANTITIES[form.on]}", f"m.rate({state}, {rate})", *lines]
+            lines = [f"{state} = m.state('{own}_{state}', {begins})",
+                     f"m.rate({state}, {rate.format(step=self.span.step)})", *lines]
         if form.on in PAST:
             rate = " * ca.fabs(m.omega)" if form.on == "path" else ""
             for k, lag in enumerate(dict.fromkeys(re.findall(r"past\(z, .*?\)", " ".join(terms)))):
-                past, length = f"past_{k}", lag[len("past(z, "):-1]
-                lines += [f"{past} = m.state('{names[0]}_{past}'{FIRST.get(form.on, '')})",
+                past, length = f"lagged_{k}", lag[len("past(z, "):-1]
+                lines += [f"{past} = m.state('{own}_{past}'{FIRST.get(form.on, '')})",
                           f"m.rate({past}, (z - {past}){rate} / {length})"]
                 terms = [t.replace(lag, past) for t in terms]
         lines += ["curve = (", *(f"    + {n} * {t}" for n, t in zip(names, terms, strict=True)), ")"]
@@ -185,10 +187,10 @@ class Curve:
         """The curve as an effect."""
         parameters = []
         for part, sizes, places in self._apart(self.sizes.items()):
-            unit = part.unit(self._torque)
+            unit = part.unit(self.fit)
             parameters += [P(c, unit, null=0.0, doc="coefficient of the curve")(n) for n, c in sizes]
             limits = [limits for _, *limits in part.places]
-            parameters += [P(c, part.place_unit, lower=low, upper=high, doc="place in the curve")(n)
+            parameters += [P(c, part.place[0], lower=low, upper=high, doc=part.place[1])(n)
                            for (n, c), (low, high) in zip(places, limits, strict=True)]
         return Effect(self.name, Law(self.law), tuple(parameters), self.balance, f"What is left: {self.text}.")
 
@@ -211,17 +213,17 @@ class Curve:
     @property
     def balance(self) -> str:
         """The balance of the effect."""
-        balance = self.parts[0].form.balance
-        return "voltage" if balance == "both" else balance
+        return self.parts[0].form.balance.replace("both", "voltage")
 
     @property
     def code(self) -> str:
         """The curve as Python source of an effect."""
         pars = []
         for p in self.effect.parameters:
-            rest = "null=0.0" if p.null == 0 else f"lower={p.lower:.9g}, upper={p.upper:.9g}"
+            rest = "null=0.0" if p.null == 0 else f'lower={p.lower:.9g}, upper={p.upper:.9g}, doc="{p.doc}"'
             pars.append(f'    {p.name}=mi.P({p.value:.9g}, "{p.unit}", {rest}),')
-        known = [f"    Nearest closed form: {text} (misses {percent(miss, 2)} of the curve)."
+        what = "the curve" if len(self.parts) == 1 else "the first part"
+        known = [f"    Nearest closed form: {text} (misses {percent(miss, 2)} of {what})."
                  for text, miss in self.nearest()[:1]]
         return "\n".join(["import casadi as ca", "", "import motorid as mi", "", "",
                           f'@mi.effect(balance="{self.balance}")', f"def {self.name}(", "    m,", *pars, "):",
@@ -232,7 +234,7 @@ class Curve:
         """Return closed forms beside the first part, the nearest first: in words with its size, the share missed."""
         part = self.parts[0]
         z, value = self.points
-        forms, unit = _closed_forms(part.form.on, z), part.unit(self._torque)
+        forms, unit = _closed_forms(part.form.on, z), part.unit(self.fit)
         if part.form.on in PAST:
             functions = functions_of(part.form, part.span)
             lags = np.concatenate([values_of(functions, part.form, s) for s in self._signals])
@@ -242,7 +244,7 @@ class Curve:
             each = product(powers, memories_of(part.form, part.span))  # in the order of the functions
             forms = [(f"{base}{power}one lag of {number(length, 2)} {over}", lags[:, [k, *also]])
                      for k, (power, length) in enumerate(each)]
-            unit = part.unit(self._torque, bare=True)
+            unit = part.unit(self.fit, bare=True)
         return sorted((_closed(text, columns, value, unit) for text, columns in forms), key=lambda f: f[1])
 
     @cached_property
@@ -277,23 +279,18 @@ class Curve:
         first = self.values[: len(self.values) - len(part.chosen) - len(part.places)]
         curve, without = (replace(self, parts=(*before, larger), values=(*first, *sizes, *new, *places))
                           for new in (free, [0.0] * len(more)))
-        done = refit(last, self.fit.model + curve.effect, (curve.sizes, without.sizes))
-        return done and curve.ended(done)
+        return curve.refitted(last, curve.sizes, without.sizes)
 
     def without(self, k: int) -> Curve | None:
         """Return the curve without a part, fitted anew; None where that fails."""
         kept = [[*sizes, *places] for j, (_, sizes, places) in enumerate(self._apart(self.values)) if j != k]
         curve = replace(self, parts=(*self.parts[:k], *self.parts[k + 1:]), values=tuple(chain.from_iterable(kept)))
-        done = refit(self.fitted or self.fit, self.fit.model + curve.effect, (curve.sizes,))
-        return done and curve.ended(done)
+        return curve.refitted(self.fitted or self.fit, curve.sizes)
 
-    def ended(self, done: Fit) -> Curve:
-        """Return the curve as a fit with it has it."""
-        return replace(self, values=tuple(done.values[n] for n in self.sizes), fitted=done)
-
-    @property
-    def _torque(self) -> str:
-        return "N" if self.fit.model.axis == "linear" else "N·m"
+    def refitted(self, last: Fit, *starts: Mapping[str, float]) -> Curve | None:
+        """Return the curve fitted with the model, all else from where the `last` fit ended; None where that fails."""
+        done = refit(last, self.fit.model + self.effect, [{**last.values, **start} for start in starts])
+        return done and replace(self, values=tuple(done.values[n] for n in self.sizes), fitted=done)
 
     @property
     def law(self) -> str:
@@ -314,7 +311,7 @@ class Remainder:
     fit : Fit
         Of the model that leaves it.
     forms : tuple of Form
-        Free forms that predict something of it, the best first.
+        Free forms that by slopes predict something of it, the best first; fitted, the curve may be of others.
     """
 
     kind: str
@@ -363,7 +360,7 @@ class Remainder:
         return replace(self._chosen, name=name).code
 
     def nearest(self) -> list[tuple[str, float]]:
-        """Return closed forms beside the curve, the nearest first: in words with its size, and the share missed."""
+        """Return closed forms beside the curve's first part, nearest first: in words with size, the share missed."""
         return self._chosen.nearest()
 
     @property
@@ -380,7 +377,7 @@ class Remainder:
 
     @property
     def curve(self) -> tuple[Array, Array]:
-        """The quantity at the samples of all runs, and the missing torque, voltage or error there, SI."""
+        """The first part's quantity at the samples of all runs, and the missing torque, voltage or error there, SI."""
         return self._chosen.points
 
     @cached_property
@@ -393,7 +390,8 @@ class Remainder:
         if not apart or self._anew is not None:
             both = self._tried(held), _beyond(self._anew)
             each = (islice((t for t in some if t[1].on != "run"), TRIED) for some in both)
-            best = _best(self.fit, chain.from_iterable(each), held)
+            with contextlib.suppress(OutOfTime):
+                best = _best(self.fit, chain.from_iterable(each), held)
         if best is None:
             raise UsageError(f"what is left is {self.follows}: no curve, but another motor in every run. Fit the runs "
                              "apart." if apart else "something predictable is left, but no curve over one quantity "
@@ -466,40 +464,42 @@ def _best(fit: Fit, tried: Iterable[tuple[Fit, Form]], held: HeldOut) -> Curve |
 def _beside(best: Grown, held: HeldOut, only: Form | None = None) -> Grown | None:
     """Return a curve with the further part that predicts most, or one of this form; None where that is no better."""
     had = [part.form for part in best.curve.parts]
-    forms = [only] if only is not None else (f for _, f in islice(_beyond(best.curve.fitted), TRIED) if f not in had)
-    return _better_curve(((best.curve, form) for form in forms), best.predictions, held)
+    forms = [only] if only is not None else (f for _, f in _beyond(best.curve.fitted) if f not in had and f.on != "run")
+    return _better_curve(((best.curve, form) for form in islice(forms, TRIED)), best.predictions, held)
 
 
-def _revised(best: Grown, held: HeldOut) -> Grown:
+def _revised(best: Grown, held: HeldOut, times: int = FURTHER) -> Grown:
     """Return a curve without the parts that have become superfluous, or with them chosen anew beside the others.
 
     What came first may have imitated all others together.
     """
-    for k, part in enumerate(best.curve.parts[:-1]):
+    for k, part in enumerate(best.curve.parts[:-1] if times else ()):
         with contextlib.suppress(*FAILURES, OutOfTime):
+            check_time()
             smaller = best.curve.without(k)
             if smaller is None or smaller.fitted is None:
                 continue
             less = Grown(0.0, held.predictions(smaller.fitted), smaller)
             if not compare(less.predictions, best.predictions).worth_it:
-                return _revised(less, held)
+                return _revised(less, held, times)
             for form in (part.form, None):
                 other = None if best.done else _beside(less, held, form)
                 if other is not None and compare(best.predictions, other.predictions).worth_it:
-                    return _revised(other, held)
+                    return _revised(other, held, times - 1)
     return best
 
 
 def _better_curve(tried: Iterable[tuple[Curve, Form]], before: Predictions, held: HeldOut) -> Grown | None:
     """Return the best of curves, each with a form more; None where none does better."""
-    found, met = list[Grown](), set[Any]()
+    found, met = list[Grown](), list[Any]()
     with contextlib.suppress(OutOfTime):  # what is tried takes fits to find, too
         for first, form in tried:
+            check_time()
             if (what := (first.fit.model.effect_names, form)) in met:
                 continue
-            met.add(what)
+            met.append(what)
             for moved, rounds in ((True, FEW), (False, ROUNDS)):
-                if (grown := _grown(first.with_form(form, moved), rounds, before, held)) is not None:
+                if (grown := _grown(first, form, moved, rounds, before, held)) is not None:
                     found.append(grown)
             if found and _best_of(found).done:
                 break
@@ -512,10 +512,11 @@ def _best_of(found: Iterable[Grown]) -> Grown:
     return reduce(lambda best, f: f if compare(best.predictions, f.predictions).worth_it else best, ordered)
 
 
-def _grown(curve: Curve, rounds: int, before: Predictions, held: HeldOut) -> Grown | None:
-    """Return a curve with functions in its last part, as long as more of them help; None where it does no better."""
+def _grown(curve: Curve, form: Form, moved: bool, rounds: int, before: Predictions, held: HeldOut) -> Grown | None:
+    """Return a curve with a form more, of as many functions as help; None where it does no better."""
     better, after = None, before
     with contextlib.suppress(*FAILURES, OutOfTime):  # the best so far, where a budget is spent
+        curve = curve.with_form(form, moved)
         for _ in range(rounds):
             if (larger := curve.grown()) is None or larger.fitted is None:
                 break

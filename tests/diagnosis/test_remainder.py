@@ -53,8 +53,10 @@ FORMS = {
     "friction over a turn": ("torque", "m.theta"),
     "cam": ("torque", "m.theta"),
     "dip": ("voltage", "m.v"),
-    "fading friction": ("torque", "m.state('clock')"),
+    "fading friction": ("torque", "clock = m.state('remainder_0_clock', 0.0)"),
 }
+
+FORMS_BY_HAND = (Form("a torque", "torque", "omega"), Form("a loss of voltage", "voltage", "v"))
 
 
 @pytest.fixture(scope="module")
@@ -65,8 +67,9 @@ def beyond(plant):
     effects["shoes"] = lambda m, c, w: {
         "torque": lambda i, omega, th, t: -c * np.sign(omega) * np.maximum(np.abs(omega) / w - 1, 0.0) ** 2}
     effects["dip"] = lambda m, s: {"drive": lambda v, w: v * (1 - s * abs(v) / (m.i_max * m.R / 2))}
+    effects["kink"] = lambda m, s, level: {"drive": lambda v, w: v - s * np.sign(v) * max(abs(v) - level, 0.0)}
     yield plant
-    for name in ("eddy", "shoes", "dip"):
+    for name in ("eddy", "shoes", "dip", "kink"):
         effects.pop(name)
 
 
@@ -141,12 +144,47 @@ def test_of_two_laws_that_the_library_lacks_each_gets_a_curve(beyond, lab, tmp_p
     assert max(over_floor(fit, check, clean[-1]).values()) < 1.15
     assert effect.doc == ("What is left: a loss of voltage that changes with the voltage and a torque that changes "
                           "with the speed.")
-    assert {p.unit for p in effect.parameters} == {"N·m", "V"}
+    assert {p.unit for p in effect.parameters if p.null == 0} == {"N·m", "V"}
     (tmp_path / "own.py").write_text(found.remainder.code("both"), encoding="utf-8")
     written = own_effects(tmp_path / "own.py")["both"]
     one, other = (mi.simulate(found.remainder.model + e, check)[0].outputs for e in (effect, written))
     for c, y in one.items():
         assert y == pytest.approx(other[c], abs=1e-3 * np.std(y))
+
+
+def test_where_a_law_bends_is_a_parameter_of_its_curve(beyond, lab):
+    """Of an amplifier of less gain above a level, two numbers: how much less, and the level."""
+    rng = np.random.default_rng(8)
+    clean = [driven(lab, {"kink": {"s": 0.4, "level": 2.91}}, w, 800, 1e-3, rng) for w in FAST]
+    *runs, check = [record(c, "logger", ("i", "omega"), lab, rng, w) for c, w in zip(clean, FAST, strict=True)]
+    found = mi.diagnose(mi.fit(mi.dc_motor(), runs), check, effects=("coulomb",))
+    effect = found.remainder.as_effect()
+    size, place = effect.parameters
+    assert max(over_floor(found.remainder.fitted, check, clean[-1]).values()) < 1.05
+    top = max(float(np.abs(r.inputs["v"]).max()) for r in runs)
+    assert place.doc == f"where it bends, a share of {top:.4g} V"
+    assert place.value * top == pytest.approx(2.91, abs=0.1)
+    assert size.value == pytest.approx(0.4 * top, rel=0.05)
+    assert found.remainder.fitted.std[place.name] < 0.02
+
+
+def test_parts_keep_their_coefficients_and_places(outside):
+    """Of a curve written down by hand; one part less is the curve without it."""
+    fit = outside("eddy brake")[1].before
+    span = Part.of(fit, FORMS_BY_HAND[0]).span
+    knees = [[k for k, f in enumerate(functions_of(form, span)) if f.startswith("ca.fmax(")] for form in FORMS_BY_HAND]
+    first, second = (Part(form, span, tuple(at[3:5]), True) for form, at in zip(FORMS_BY_HAND, knees, strict=True))
+    curve = Curve(fit, (first, second), (1e-3, -2e-3, 0.25, 0.6, 0.3, -0.2, 0.1, 0.7))
+    z, value = curve.points
+    s = z / max(map(abs, span.ranges["omega"]))
+    assert value == pytest.approx(1e-3 * np.maximum(s - 0.25, 0) - 2e-3 * np.maximum(s - 0.6, 0), abs=1e-7)
+    assert [p.value for p in curve.effect.parameters] == list(curve.values)
+    assert [p.null for p in curve.effect.parameters] == [0, 0, None, None] * 2
+    assert "0.3 *" not in curve.law
+    assert all(curve.law.count(f"remainder_{k}") == 1 for k in range(8))
+    less = curve.without(0)
+    assert less.parts == (second,)
+    assert list(less.sizes) == ["remainder_0", "remainder_1", "remainder_2", "remainder_3"]
 
 
 def test_its_coefficients_are_parameters_with_deviations(outside):
@@ -156,7 +194,8 @@ def test_its_coefficients_are_parameters_with_deviations(outside):
     assert all(p.name.startswith("brake_") for p in effect.parameters)
     sizes, places = ([p for p in effect.parameters if (p.null == 0) == size] for size in (True, False))
     assert {p.unit for p in sizes} == {"N·m"}
-    assert {(p.unit, p.null) for p in places} <= {("1", None)}  # of the largest speed: where it bends
+    assert {(p.unit, p.null) for p in places} <= {("", None)}
+    assert all(p.doc.startswith("where it bends, a share of ") and p.doc.endswith(" rad/s") for p in places)
     assert all(p.lower < p.value < p.upper for p in places)
     fit = mi.fit(found.best.model + effect, runs[:2])
     assert all(fit.std[p.name] is None or fit.std[p.name] > 0 for p in effect.parameters)
@@ -367,7 +406,7 @@ def test_what_remembers_fades_or_is_narrow_is_found(law, channels, follows, clos
         unit = {"N·m"} if law is warmed else {"N·m·s/rad", "N·m/A"}  # what has a carrier is scaled
         coefficients = [p for p in found.remainder.as_effect().parameters if p.null == 0]
         assert {p.unit for p in coefficients} <= unit
-        assert re.search(r"m.rate\((past_\d), \(z - \1\) / ", found.remainder.code())
+        assert re.search(r"m.rate\((lagged_\d), \(z - \1\) / ", found.remainder.code())
         assert re.match("(a constant and )?(the square of )?one lag of .* N·m$", text)
         assert ("square" in text) == (law is ducted)
         assert miss < 0.3
