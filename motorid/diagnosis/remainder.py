@@ -288,8 +288,8 @@ class Curve:
         return curve.refitted(self.fitted or self.fit, curve.sizes)
 
     def refitted(self, last: Fit, *starts: Mapping[str, float]) -> Curve | None:
-        """Return the curve fitted with the model, all else from where the `last` fit ended; None where that fails."""
-        done = refit(last, self.fit.model + self.effect, [{**last.values, **start} for start in starts])
+        """Return the curve fitted with the model, from `starts` with and without the `last` values; None if that fails."""
+        done = refit(last, self.fit.model + self.effect, [{**w, **s} for s in starts for w in (last.values, {})])
         return done and replace(self, values=tuple(done.values[n] for n in self.sizes), fitted=done)
 
     @property
