@@ -188,9 +188,9 @@ class Curve:
         parameters = []
         for part, sizes, places in self._apart(self.sizes.items()):
             unit = part.unit(self.fit)
-            parameters += [P(c, unit, null=0.0, doc="coefficient of the curve")(n) for n, c in sizes]
+            parameters += [P(c, unit, null=0.0, given=True, doc="coefficient of the curve")(n) for n, c in sizes]
             limits = [limits for _, *limits in part.places]
-            parameters += [P(c, part.place[0], lower=low, upper=high, doc=part.place[1])(n)
+            parameters += [P(c, part.place[0], lower=low, upper=high, given=True, doc=part.place[1])(n)
                            for (n, c), (low, high) in zip(places, limits, strict=True)]
         return Effect(self.name, Law(self.law), tuple(parameters), self.balance, f"What is left: {self.text}.")
 
@@ -221,10 +221,9 @@ class Curve:
         pars = []
         for p in self.effect.parameters:
             rest = "null=0.0" if p.null == 0 else f'lower={p.lower:.9g}, upper={p.upper:.9g}, doc="{p.doc}"'
-            pars.append(f'    {p.name}=mi.P({p.value:.9g}, "{p.unit}", {rest}),')
-        what = "the curve" if len(self.parts) == 1 else "the first part"
-        known = [f"    Nearest closed form: {text} (misses {percent(miss, 2)} of {what})."
-                 for text, miss in self.nearest()[:1]]
+            pars.append(f'    {p.name}=mi.P({p.value:.9g}, "{p.unit}", given=True, {rest}),')
+        known = [f"    Nearest closed form{' of the first part' * (len(self.parts) > 1)}: {text} (misses "
+                 f"{percent(miss, 2)} of it)." for text, miss in self.nearest()[:1]]
         return "\n".join(["import casadi as ca", "", "import motorid as mi", "", "",
                           f'@mi.effect(balance="{self.balance}")', f"def {self.name}(", "    m,", *pars, "):",
                           f'    """What is left of the misfit: {self.text}.', *(["", *known, ""] if known else []),
@@ -288,7 +287,7 @@ class Curve:
         return curve.refitted(self.fitted or self.fit, curve.sizes)
 
     def refitted(self, last: Fit, *starts: Mapping[str, float]) -> Curve | None:
-        """Return the curve fitted with the model, from `starts` with and without the `last` values; None if that fails."""
+        """Return the curve fitted with the model, from `starts` beside the `last` values or not; None if that fails."""
         done = refit(last, self.fit.model + self.effect, [{**w, **s} for s in starts for w in (last.values, {})])
         return done and replace(self, values=tuple(done.values[n] for n in self.sizes), fitted=done)
 

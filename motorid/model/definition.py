@@ -94,7 +94,8 @@ class Parameter:
 
 def P(value: float, unit: str = "", null: float | None = None, *, lower: float = -np.inf, upper: float = np.inf,
       positive: bool = False, vary: bool = True, grid: Iterable[float] = (), periodic: bool = False,
-      order: bool = False, per_run: bool = False, place: bool = False, at_least: str = "", doc: str = "") -> Any:
+      order: bool = False, per_run: bool = False, place: bool = False, given: bool = False, at_least: str = "",
+      doc: str = "") -> Any:
     """Declare a parameter of an effect as a default argument: ``tau_c=P(2e-3, "N·m", null=0)``.
 
     The name comes from the argument; what the others mean is told at `Parameter`.
@@ -106,8 +107,8 @@ def P(value: float, unit: str = "", null: float | None = None, *, lower: float =
     ...     m.torque -= c_2 * m.omega * abs(m.omega)
     """
     return partial(Parameter, value=value, unit=unit, null=null, lower=lower, upper=upper, positive=positive, vary=vary,
-                   grid=tuple(grid), periodic=periodic, order=order, per_run=per_run, place=place, at_least=at_least,
-                   doc=doc)
+                   grid=tuple(grid), periodic=periodic, order=order, per_run=per_run, place=place, given=given,
+                   at_least=at_least, doc=doc)
 
 
 BALANCES = ("voltage", "torque", "transmission", "sensor")
