@@ -190,7 +190,8 @@ def functions_of(form: Form, span: Span) -> list[str]:
     low, high = span.ranges[form.on]
     if form.on == "turn":
         waves = ["1.0", *(f"ca.{f}({k:.6g} * z)" for k in span.orders for f in ("sin", "cos"))]
-        return waves if form.carrier == "acceleration" else waves + _sectors(PLACES * span.finer)  # it needs slopes
+        plain = form.carrier == "acceleration" or span.finer == 1  # one needs slopes, and forms compare better by few
+        return waves if plain else waves + _sectors(PLACES * span.finer)
     if form.on in PAST:
         lengths = memories_of(form, span)
         lags = [f"past(z, {_place(length, lengths[0] / 10, lengths[-1] * 10)})" for length in lengths]

@@ -100,8 +100,7 @@ class Part:
     def of(cls, fit: Fit, form: Form, moved: bool = False) -> Part:
         """Return a part without functions, for records as `fit` goes through them."""
         span = span_of(fit, signals_along(fit))
-        orders = tuple(sorted({*span.orders, *range(1, FINE + 1)}))
-        return cls(form, replace(span, orders=orders, finer=FINER), moved=moved)
+        return cls(form, replace(span, orders=tuple(sorted({*span.orders, *range(1, FINE + 1)})), finer=FINER), (), moved)
 
     @cached_property
     def functions(self) -> list[str]:
@@ -500,8 +499,8 @@ def _better_curve(tried: Iterable[tuple[Curve, Form]], before: Predictions, held
             for moved, rounds in ((True, FEW), (False, ROUNDS)):
                 if (grown := _grown(first, form, moved, rounds, before, held)) is not None:
                     found.append(grown)
-            if found and _best_of(found).done:
-                break
+                if found and _best_of(found).done:
+                    return _best_of(found)
     return _best_of(found) if found else None
 
 
