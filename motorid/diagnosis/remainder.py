@@ -53,7 +53,7 @@ from motorid.numerics.signals import Array
 
 WHERE = {"torque": "mechanical", "voltage": "electrical", "both": "electrical", "sensor": "sensor"}
 TRIED = 4  # curves that are fitted, those that promise most
-FINE = 36  # harmonics of a turn in a curve that is fitted
+FINE = range(1, 37)  # harmonics of a turn in a curve that is fitted
 CLOSED = 300  # times that are tried as the end, or the beginning, of a constant
 FURTHER = 3  # times that a form beside those of the curve is sought
 FEW = 6  # functions at most whose places are fitted, too
@@ -100,7 +100,7 @@ class Part:
     def of(cls, fit: Fit, form: Form, moved: bool = False) -> Part:
         """Return a part without functions, for records as `fit` goes through them."""
         span = span_of(fit, signals_along(fit))
-        return cls(form, replace(span, orders=tuple(sorted({*span.orders, *range(1, FINE + 1)})), finer=FINER), (), moved)
+        return cls(form, replace(span, orders=tuple(sorted({*span.orders, *FINE})), finer=FINER), (), moved)
 
     @cached_property
     def functions(self) -> list[str]:
