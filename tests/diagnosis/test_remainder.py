@@ -187,6 +187,27 @@ def test_parts_keep_their_coefficients_and_places(outside):
     assert list(less.sizes) == ["remainder_0", "remainder_1", "remainder_2", "remainder_3"]
 
 
+def test_what_differs_from_run_to_run_is_no_further_part(outside, monkeypatch):
+    """It has no law to write down: however much it promises, the curve found before it stays."""
+    fit = outside("eddy brake")[1].before
+    promised = [(fit, Form("a resistance", "voltage", "run", "i"))]
+    monkeypatch.setattr(remainder, "_beyond", lambda base: iter(promised))
+    monkeypatch.setattr(remainder, "chosen_functions", lambda *given: [0])
+    held = HeldOut.of(fit, None)
+    assert remainder._beside(remainder.Grown(0.0, held.predictions(fit), Curve(fit, fitted=fit)), held) is None
+
+
+def test_every_place_begins_within_its_limits(lab):
+    """Also in records of few samples, where what fades is soon over."""
+    rng = np.random.default_rng(7)
+    runs = [record(driven(lab, {}, w, 120, 1e-3, rng), "logger", ANGLE, lab, rng, w) for w in FAST[:2]]
+    fit = mi.fit(mi.dc_motor(), runs)
+    places = {f: Part(f, Part.of(fit, f).span, (), True) for f in linearised(fit).forms if f.on != "run"}
+    every = {f: replace(p, chosen=tuple(range(len(functions_of(f, p.span))))).places for f, p in places.items()}
+    assert all(low <= value <= high for found in every.values() for value, low, high in found)
+    assert {f.on for f, found in every.items() if found} >= {"omega", "v", "t", "turn", "since_change", "past v"}
+
+
 def test_its_coefficients_are_parameters_with_deviations(outside):
     runs, found, _ = outside("eddy brake")
     effect = found.remainder.as_effect("brake")
