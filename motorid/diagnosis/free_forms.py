@@ -10,6 +10,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from types import SimpleNamespace
 
 import numpy as np
@@ -30,9 +31,11 @@ from motorid.records.experiment import Experiment
 ON = 0.05  # of the largest voltage: a level by itself
 KNOTS = 9  # cosines over the range of a time, twice as many over that of an angle
 HARMONICS = 12  # of a turn
-LINES = 2  # of the spectrum of the misfit over the angle
+LINES = 2  # of the spectrum of the misfit over the angle, or the time
+AROUND = 31  # frequencies that such a line stands out of
 PLACES = 12  # over a time or an angle at which something may set in
 SECTORS = 4  # widths of a sector of a turn, each twice the one before
+LOBES = (0.15, 0.3, 0.6)  # rad: standard deviations of a lobe
 EDGE = 10.0  # how many of its edges, from one to zero, a sector is wide
 SUDDEN = 60.0  # how quickly a curve over the time or the angle may step, per range
 FADES = (1, 3, 10, 30)  # lengths in a range of what fades over a time or a distance
@@ -51,12 +54,13 @@ CHANGES = {"t": "changes with the time", "distance": "changes with the distance 
            "past i": "depends on the current before", "past omega": "depends on the speed before",
            "past v": "depends on the voltage before", "path": "depends on the distance since a reversal",
            "past speed": "depends on how fast it ran before", "past power": "depends on how fast it ran before",
-           "past load": "depends on the power drawn before", "past size": "depends on the voltage before",
+           "past load": "depends on the power drawn before", "past heat": "depends on the heat of the current before",
+           "past size": "depends on the voltage before",
            "most i": "depends on the largest current so far",
            "since_change": "depends on how long the voltage has not changed",
            "since_switch": "depends on how long the voltage has been on or off",
            "since_reversal": "depends on the time since the voltage was reversed"}
-PAST = ("past i", "past omega", "past v", "past speed", "past power", "past load", "past size", "path")
+PAST = ("past i", "past omega", "past v", "past speed", "past power", "past load", "past heat", "past size", "path")
 MEMORIES = 8  # lengths of memory
 LASTING = 10.0  # times the longest run: a memory that forgets nothing in it
 
@@ -92,8 +96,9 @@ class Form:
 
     @property
     def bends(self) -> bool:
-        """Tell whether the square of what was before counts, too: a fluid that follows late, or that friction warms."""
-        return self.balance == "torque" and self.carrier != "direction" and self.on in ("past omega", "past power")
+        """Tell whether the square of what was before counts, too: a fluid that follows late, a thermistor."""
+        fluid = self.balance == "torque" and self.carrier != "direction" and self.on in ("past omega", "past power")
+        return fluid or self.on == "past heat"
 
 
 _PUSHES = (  # words, balance, carrier, quantities
@@ -105,15 +110,14 @@ _PUSHES = (  # words, balance, carrier, quantities
     ("an inertia", "torque", "acceleration", ("turn", "t", "run", "omega")),
     ("a loss of voltage", "voltage", "", ("omega", "v", "i", "t", "run")),
     ("a gain of the voltage", "voltage", "v", ("t", "turn", "past load", *COMPUTED_INPUTS)),
-    ("a resistance", "voltage", "i", ("t", "turn", "omega", "run")),
+    ("a resistance", "voltage", "i", ("t", "turn", "omega", "run", "past heat")),
     ("a motor constant", "both", "", ("t", "turn", "omega", "i", "run", "past i", "past size", "most i")),
 )
 FORMS = (*(Form(words, balance, on, carrier) for words, balance, carrier, quantities in _PUSHES for on in quantities),
          *(Form("a gain of the speed sensor", "sensor", on, "omega", "omega") for on in ("turn", "t")),
          Form("a gain of the current sensor", "sensor", "t", "i", "i"),
-         Form("an error of the angle sensor", "sensor", "path", "", "theta"),
-         Form("an error of the angle sensor", "sensor", "turn", "", "theta"),
-         *(Form("an error of the speed sensor", "sensor", on, "", "omega") for on in ("omega", "t")),
+         *(Form("an error of the angle sensor", "sensor", on, "", "theta") for on in ("path", "turn", "omega", "i")),
+         *(Form("an error of the speed sensor", "sensor", on, "", "omega") for on in ("omega", "i", "t")),
          *(Form("an error of the current sensor", "sensor", on, "", "i") for on in ("i", "v", "omega", "t")),
          *(Form("a loss of voltage", "voltage", f"past {c}") for c in ("v", "i", "omega")),
          *(Form("a torque", "torque", on) for on in ("past i", "past omega", "path")),
@@ -130,6 +134,12 @@ class Span:
     orders: tuple[float, ...]
     step: float
     finer: int = 1
+    rates: tuple[float, ...] = ()  # of waves over the time, rad/s
+
+    @property
+    def reach(self) -> float:
+        """How far a rate may be from the one in a spectrum, rad/s."""
+        return 2 * np.pi / (self.ranges["t"][1] or 1.0)
 
 
 def span_of(fit: Fit, signals: Sequence[Mapping[str, Array]]) -> Span:
@@ -144,7 +154,26 @@ def span_of(fit: Fit, signals: Sequence[Mapping[str, Array]]) -> Span:
     lines = likely_lines(Tangent.of(fit), LIBRARY["cogging"], LINES) if "theta" in fit.problem.outputs else []
     orders = {*range(1, HARMONICS + 1), *(round(k * n) for n in known for k in range(1, 5)),
               *(round(line.order) for line in lines)}
-    return Span(ranges, tuple(sorted(orders)), step)
+    return Span(ranges, tuple(sorted(orders)), step, rates=_rates(fit, step))
+
+
+@lru_cache(maxsize=8)
+def _rates(fit: Fit, step: float) -> tuple[float, ...]:
+    """Return the rates (rad/s) of lines over the time that stand out of the spectrum of the misfit, at most a few."""
+    from scipy.ndimage import median_filter  # slow to import, and not needed before
+
+    length = 1 << max(s.experiment.n for s in fit.simulations).bit_length()
+    power = np.zeros(length // 2 + 1)
+    for run, sim in zip(fit.problem.runs, fit.simulations, strict=True):
+        even = np.arange(sim.experiment.t[0], sim.experiment.t[-1], step)[:length]
+        for c, sigma in run.sigma.items():
+            error = np.interp(even, sim.experiment.t, np.nan_to_num(sim.residual(c))) / sigma
+            power += np.abs(np.fft.rfft((error - error.mean()) * np.hanning(len(even)), length)) ** 2
+    around = np.log(2) * power / np.maximum(median_filter(power, AROUND), 1e-300)  # of noise, 1 in the mean
+    around[: KNOTS + 2] = 0.0  # cosines over the range do that
+    top = (around[1:-1] >= around[:-2]) & (around[1:-1] >= around[2:]) & (around[1:-1] > 2 * np.log(length))
+    lines = sorted(1 + np.flatnonzero(top), key=lambda k: -power[k])[:LINES]
+    return tuple(float(2 * np.pi * k / (length * step)) for k in lines)
 
 
 def shown(form: Form, fit: Fit, ranges: Mapping[str, tuple[float, float]]) -> bool:
@@ -175,11 +204,12 @@ def own_levels(runs: Sequence[Experiment]) -> bool:
     return all(high - low <= ON * high for low, high in ends) and len({f"{high:.1e}" for _, high in ends}) > 1
 
 
-PLACE = re.compile(r"<(\S+) (\S+) (\S+)>")  # of what bends, sets in or fades, with its limits: a curve may move it
+# Of what bends, sets in or fades, with its limits, and its unit where that is another: a curve may move it.
+PLACE = re.compile(r"<(\S+) (\S+) (\S+?)(?: (\S+))?>")
 
 
-def _place(value: float, low: float, high: float) -> str:
-    return f"<{value:.9g} {low:.9g} {high:.9g}>"
+def _place(value: float, low: float, high: float, unit: str = "") -> str:
+    return f"<{f'{value:.9g} {low:.9g} {high:.9g} {unit}'.rstrip()}>"
 
 
 def functions_of(form: Form, span: Span) -> list[str]:
@@ -191,7 +221,7 @@ def functions_of(form: Form, span: Span) -> list[str]:
     if form.on == "turn":
         waves = ["1.0", *(f"ca.{f}({k:.6g} * z)" for k in span.orders for f in ("sin", "cos"))]
         plain = form.carrier == "acceleration" or span.finer == 1  # one needs slopes, and forms compare better by few
-        return waves if plain else waves + _sectors(PLACES * span.finer)
+        return waves if plain else waves + _sectors(PLACES * span.finer) + _lobes()
     if form.on in PAST:
         lengths = memories_of(form, span)
         lags = [f"past(z, {_place(length, lengths[0] / 10, lengths[-1] * 10)})" for length in lengths]
@@ -216,7 +246,11 @@ def _along(form: Form, span: Span, low: float, high: float) -> list[str]:
     centres = [_place(c, low, high) for c in np.linspace(low, high, PLACES * span.finer + 2)[1:-1]]
     steep = f"{SUDDEN * span.finer / (high - low):.6g}"
     sudden = [f"ca.tanh((z - {c}) * {steep})" for c in centres]
-    sudden += ["z", *(f"ca.fmax(z - {c}, 0)" for c in centres)]  # a stop, a slack, a ramp
+    top = f"{max(abs(low), abs(high)):.6g}"  # a slope, a spring that hardens, a stop, a slack, a ramp
+    sudden += ["z", f"(z / {top})**2", f"(z / {top})**3", *(f"ca.fmax(z - {c}, 0)" for c in centres)]
+    if form.on == "t":  # what another machine does, or the mains
+        sudden += [f"ca.sin({_place(w, w - span.reach, w + span.reach, 'rad/s')} * z + {_place(phase, -4, 4, 'rad')})"
+                   for w in span.rates for phase in (0, np.pi / 2)]
     if form.on != "theta":  # what warms up, or runs in
         whole = high - low
         sudden += [f"ca.exp(-z / {_place(whole / k, whole / 300, whole * 10)})" for k in FADES]
@@ -250,6 +284,12 @@ def _sectors(count: int) -> list[str]:
         found += [f"0.5 * (1 + ca.tanh({steep:.4g} * (ca.cos(z - {_place(c, c - width, c + width)}) - ca.cos({half}))))"
                   for c in np.arange(count) * 2 * np.pi / count]
     return found
+
+
+def _lobes() -> list[str]:
+    """Return smooth lobes of a turn as source, von Mises' density to one at its top: a cam, a magnet, a tight spot."""
+    return [f"ca.exp((ca.cos(z - {_place(c, c - width, c + width)}) - 1) / {_place(width**2, width**2 / 8, 4)})"
+            for width in LOBES for c in np.arange(0, 2 * np.pi, 1.5 * width)]
 
 
 def memories_of(form: Form, span: Span) -> Array:
@@ -390,7 +430,7 @@ def _signals(fit: Fit, k: int) -> dict[str, Array]:
         found["past speed"], found["past power"] = np.abs(omega), omega**2
     if "i" in found:
         found["past load"], found["most i"] = found["v"] * found["i"], np.maximum.accumulate(np.abs(found["i"]))
-        found["past size"] = np.abs(found["v"])
+        found["past size"], found["past heat"] = np.abs(found["v"]), found["i"] ** 2
     found |= {f"past {c}": found[c] for c in ("v", "i", "omega") if c in found}
     found |= {c: time_since(run, c) for c in COMPUTED_INPUTS}
     if "theta" in run.outputs or "omega" in run.outputs:

@@ -48,6 +48,7 @@ from motorid.problem.runs import SGN_WIDTH_SHARE
 from motorid.records.checks import current_limit
 
 LIMITER = "driver_current_limit"
+IN_ITS_PLACE = "{}, which the library lacks, predicts better in its place"
 
 
 @dataclass(frozen=True)
@@ -186,7 +187,7 @@ def grades_of(last: Node, root: Node, groups: Sequence[Sequence[str]], beside: S
             told = [b for b, m in zip(told, more, strict=True) if m > TRIFLE]
             better = next((b for b in told if beside and b.form == beside[0].form), told[0] if told else None)
             if better is not None:
-                form, why = better.form, f"{better.form.text}, which the library lacks, predicts better in its place"
+                form, why = better.form, IN_ITS_PLACE.format(better.form.text)
             elif taken < (UNCONTESTED if e.balance == "transmission" else MOST):
                 why = f"it removes {percent(taken, 2)} of the squared error, and the rest is not noise"
         kind = "approximates" if why else "group" if rivals.get(e.name) else "named"

@@ -140,6 +140,7 @@ def finer(fit: Fit, channel: str) -> bool:
 
 
 def at_noise(node: Node) -> bool:
-    """Tell whether a model leaves hardly more than noise, on the held-out runs too."""
-    return not far(node.fit) and all(e.misfit < LARGER or (finer(node.fit, c) and e.nrmse < FINER)
-                                     for c, e in node.predictions.held_out.items())
+    """Tell whether a model leaves hardly more than noise, and no more on the held-out runs than on the fitted ones."""
+    return not far(node.fit) and all(
+        e.misfit < LARGER * max(node.fit.misfit[c], 1.0) or (finer(node.fit, c) and e.nrmse < FINER)
+        for c, e in node.predictions.held_out.items())

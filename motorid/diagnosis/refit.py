@@ -32,7 +32,8 @@ from motorid.problem.problem import Problem
 from motorid.problem.runs import natural_sizes, shapes_of, with_inputs
 from motorid.problem.simulate import misfit_over_noise
 
-RACE = LevenbergMarquardt(max_iterations=6, ftol=1e-3, xtol=1e-4, looks=0)
+BEGIN, RACE = (LevenbergMarquardt(max_iterations=n, ftol=1e-3, xtol=1e-4, looks=0) for n in (2, 4))
+HALVING = 2  # of the starts go on after the first steps (successive halving: Karnin, Koren & Somekh, ICML 2013)
 POLISH = LevenbergMarquardt(max_iterations=60, ftol=1e-5, xtol=1e-5, looks=0)
 GOING_ON = 4  # times, where the last descent ends at its limit
 LOST = 0.2  # NRMSE of a channel
@@ -62,25 +63,29 @@ def raced(fit: Fit, model: Model, starts: Sequence[Mapping[str, float]]) -> Race
     Effects of the angle start along the measured angle, which the model's own angle, still wrong, would lead astray.
     """
     model = _bounded(fit, model)
-    alive = restored(fit, model)
-    angular = _brings_in_the_angle(fit, model)
-    starts, found = starts or ({},), []
+    alive, angular, starts = restored(fit, model), _brings_in_the_angle(fit, model), starts or ({},)
+    # As it is where a parameter put back (an inductance that no sample shows) makes the model too stiff.
+    models = (alive,) if alive is model else (alive, model)
     # A guess of the larger model's own, along the records, is no longer led astray.
     entries = [(start, angular) for start in starts] + [
         (start, along) for start in _own_starts(fit, model, starts) for along in sorted({angular, False})]
-    for start, along in entries:
-        # As it is where a parameter put back (an inductance that no sample shows) makes the model too stiff.
-        for each in (alive,) if alive is model else (alive, model):
-            done = None
-            with contextlib.suppress(*FAILURES):  # a start that the model cannot take is none
-                done = _race(_started(fit, each, start, along))
-            if done is not None:
-                reach = _undamped(done.solution.residual, done.solution.jac)
-                found.append(Raced(done.onward, float(done.cost), reach, along))
-                break
-    if not found and any(starts):
+    begun = [(done, along) for start, along in entries if (done := _begun(fit, models, start, along)) is not None]
+    if not begun and any(starts):
         return raced(fit, model, ())
-    return min(found, key=lambda r: r.cost, default=None)
+    begun.sort(key=lambda entry: entry[0].cost)
+    ahead = begun[: max(len(begun) // HALVING, 1)]
+    found = [(_race(done.onward, RACE) or done, along) for done, along in ahead]
+    best, along = min(found, key=lambda entry: entry[0].cost, default=(None, False))
+    return best and Raced(best.onward, float(best.cost), _undamped(best.solution.residual, best.solution.jac), along)
+
+
+def _begun(fit: Fit, models: Iterable[Model], start: Mapping[str, float], along: bool) -> Estimate | None:
+    """Go the first steps from a start with the first model that can take it; None if none can."""
+    for model in models:
+        with contextlib.suppress(*FAILURES):
+            if (done := _race(_started(fit, model, start, along), BEGIN)) is not None:
+                return done
+    return None
 
 
 def _brings_in_the_angle(fit: Fit, model: Model) -> bool:
@@ -190,10 +195,10 @@ def _started(fit: Fit, model: Model, start: Mapping[str, float], angular: bool) 
     return problem.for_model(replace(problem.model, angle_input=True, _systems={})) if angular else problem
 
 
-def _race(problem: Problem) -> Estimate | None:
+def _race(problem: Problem, effort: LevenbergMarquardt) -> Estimate | None:
     """Go a few steps; None where that fails or needs more sub-steps than the samples are worth."""
     try:
-        done = by_continuation(problem.within_worth(), RACE, wide=False, narrow=False)
+        done = by_continuation(problem.within_worth(), effort, wide=False, narrow=False)
     except FAILURES:
         return None
     return replace(done, problem=done.problem.tuned(engine=problem.engine)) if done.problem.worth_its_steps else None

@@ -39,8 +39,9 @@ from motorid.diagnosis.free_forms import (
 )
 from motorid.diagnosis.misspecification import better_forms, chosen_functions
 from motorid.diagnosis.model_comparison import Node, at_noise, far
-from motorid.diagnosis.predictive_score import Predictions, compare
+from motorid.diagnosis.predictive_score import Evidence, Predictions, compare
 from motorid.diagnosis.refit import refit
+from motorid.diagnosis.thresholds import SUPPLANTS
 from motorid.display.numbers import listed, number, percent
 from motorid.errors import ModelError, OutOfTime, UsageError
 from motorid.estimation.least_squares import FAILURES
@@ -58,9 +59,12 @@ CLOSED = 300  # times that are tried as the end, or the beginning, of a constant
 FURTHER = 3  # times that a form beside those of the curve is sought
 FEW = 6  # functions at most whose places are fitted, too
 ROUNDS = 3  # of choosing functions and fitting: near the optimum slopes show what the misfit hid before
+TASTED = 2  # functions by which forms are compared, and
+AHEAD = 2  # how many then go on
 QUANTITIES = {"turn": "m.theta", "theta": "m.theta", "omega": "m.omega", "i": "m.i", "v": "m.v", "past v": "m.v",
               "past i": "m.i", "past omega": "m.omega", "past speed": "ca.fabs(m.omega)", "past power": "m.omega**2",
-              "path": "m.sign(m.omega)", "past load": "m.v * m.i", "past size": "ca.fabs(m.v)",
+              "path": "m.sign(m.omega)", "past load": "m.v * m.i", "past heat": "m.i**2",
+              "past size": "ca.fabs(m.v)",
               **{c: f"m.input('{c}')" for c in COMPUTED_INPUTS}}
 STATES = {  # quantities that are states of the curve's own: name, where it begins, rate
     "t": ("clock", "0.0", "1.0"), "distance": ("distance", "0.0", "ca.fabs(m.omega)"),
@@ -109,9 +113,10 @@ class Part:
         return [functions[k] for k in self.chosen]
 
     @property
-    def places(self) -> list[tuple[float, ...]]:
-        """Where each function bends, sets in or fades on the grid, and its limits; none if they stay there."""
-        return [tuple(map(float, m.groups())) for f in self.functions if self.moved for m in _each(f)]
+    def places(self) -> list[tuple[float, float, float, str]]:
+        """Where each function bends, sets in or fades on the grid, its limits and unit; none if they stay there."""
+        each = (m.groups() for f in self.functions if self.moved for m in _each(f))
+        return [(float(at), float(low), float(high), unit or self.place[0]) for at, low, high, unit in each]
 
     def terms(self, places: Iterable[Any]) -> list[str]:
         """The functions as source, with these names or values as their places, if they are `moved`."""
@@ -188,9 +193,8 @@ class Curve:
         for part, sizes, places in self._apart(self.sizes.items()):
             unit = part.unit(self.fit)
             parameters += [P(c, unit, null=0.0, given=True, doc="coefficient of the curve")(n) for n, c in sizes]
-            limits = [limits for _, *limits in part.places]
-            parameters += [P(c, part.place[0], lower=low, upper=high, given=True, doc=part.place[1])(n)
-                           for (n, c), (low, high) in zip(places, limits, strict=True)]
+            parameters += [P(c, unit, lower=low, upper=high, given=True, doc=part.place[1])(n)
+                           for (n, c), (_, low, high, unit) in zip(places, part.places, strict=True)]
         return Effect(self.name, Law(self.law), tuple(parameters), self.balance, f"What is left: {self.text}.")
 
     def _apart(self, what: Iterable[Any]) -> Iterator[tuple[Part, list[Any], list[Any]]]:
@@ -433,16 +437,17 @@ def _beyond(base: Fit | None) -> Iterator[tuple[Fit, Form]]:
 
 
 class Grown(NamedTuple):
-    """A curve grown as far as that helps, what it gains, and what it predicts."""
+    """A curve as far as it has grown, what it predicts, and what of that is better than without its last form."""
 
-    gain: float
+    gained: Evidence
     predictions: Predictions
     curve: Curve
 
     @property
     def done(self) -> bool:
         """Tell whether it leaves no more than noise."""
-        return self.curve.fitted is not None and at_noise(Node(self.curve.fitted, None, self.predictions))
+        return self.gained.worth_it and self.curve.fitted is not None and (
+            at_noise(Node(self.curve.fitted, None, self.predictions)))
 
 
 @one_thread
@@ -477,8 +482,9 @@ def _revised(best: Grown, held: HeldOut, times: int = FURTHER) -> Grown:
             smaller = best.curve.without(k)
             if smaller is None or smaller.fitted is None:
                 continue
-            less = Grown(0.0, held.predictions(smaller.fitted), smaller)
-            if not compare(less.predictions, best.predictions).worth_it:
+            predicted = held.predictions(smaller.fitted)
+            less = Grown(compare(predicted, best.predictions), predicted, smaller)
+            if not less.gained.worth_it:
                 return _revised(less, held, times)
             for form in (part.form, None):
                 other = None if best.done else _beside(less, held, form)
@@ -489,41 +495,77 @@ def _revised(best: Grown, held: HeldOut, times: int = FURTHER) -> Grown:
 
 def _better_curve(tried: Iterable[tuple[Curve, Form]], before: Predictions, held: HeldOut) -> Grown | None:
     """Return the best of curves, each with a form more; None where none does better."""
-    found, met = list[Grown](), list[Any]()
+    found = dict[Any, Grown]()
     with contextlib.suppress(OutOfTime):  # what is tried takes fits to find, too
-        for first, form in tried:
-            check_time()
-            if (what := (first.fit.model.effect_names, form)) in met:
-                continue
-            met.append(what)
-            for moved, rounds in ((True, FEW), (False, ROUNDS)):
-                if (grown := _grown(first, form, moved, rounds, before, held)) is not None:
-                    found.append(grown)
-                if found and _best_of(found).done:
-                    return _best_of(found)
-    return _best_of(found) if found else None
+        _race(found, tried, before, held)
+        for first, form in _ahead(found):
+            for grown in () if _leaves_noise(found) else _grown(first, form, False, before, held):
+                found[first, form, "grid"] = grown
+    better = [f for f in found.values() if f.gained.worth_it]
+    return _best_of(better) if better else None
+
+
+def _race(found: dict[Any, Grown], tried: Iterable[tuple[Curve, Form]], before: Predictions, held: HeldOut) -> None:
+    """Put into `found` the curves, each with a form more: the first to its end, of the others those that get furthest
+    with few functions (successive halving: Karnin, Koren & Somekh, ICML 2013), until one leaves noise."""
+    racing, met = dict[Any, Iterator[Grown]](), set[Any]()
+
+    def run(key: Any, functions: int) -> None:
+        for k, grown in enumerate(racing[key], 1):
+            found[key] = grown
+            if k >= functions and not grown.done:
+                return
+
+    for first, form in tried:
+        if (what := (first.fit.model.effect_names, form)) not in met:
+            met.add(what)
+            racing[first, form] = _grown(first, form, True, before, held)
+            run((first, form), TASTED if found else FEW)
+        if _leaves_noise(found):
+            return
+    for key in _ahead(found):
+        run(key, FEW)
+
+
+def _leaves_noise(found: Mapping[Any, Grown]) -> bool:
+    return any(f.done for f in found.values())
+
+
+def _ahead(found: Mapping[Any, Grown]) -> list[Any]:
+    return sorted(found, key=lambda key: -found[key].gained.gain)[:AHEAD]
+
+
+def alone_leaving_noise(last: Node, root: Fit, held: HeldOut) -> Form | None:
+    """Return the form that, fitted in the place of all that `last` has and `root` has not, leaves noise and predicts
+    better, by more than the trifle that a free curve follows in any motor; None for none."""
+    found = dict[Any, Grown]()
+    with contextlib.suppress(OutOfTime, *FAILURES):
+        forms = islice((f for _, f in _beyond(root) if f.on != "run"), TRIED)
+        _race(found, ((Curve(root), form) for form in forms), held.predictions(root), held)
+    gains = ((key[1], compare(last.predictions, f.predictions)) for key, f in found.items() if f.done)
+    return next((form for form, gain in gains if gain.worth_it and gain.fall > SUPPLANTS), None)
 
 
 def _best_of(found: Iterable[Grown]) -> Grown:
     """Return the best, the smallest on a tie; which of two is better only a comparison of the two tells."""
-    ordered = sorted(found, key=lambda f: (len(f.curve.fitted.q) if f.curve.fitted else 0, -f.gain))
+    ordered = sorted(found, key=lambda f: (len(f.curve.fitted.q) if f.curve.fitted else 0, -f.gained.gain))
     return reduce(lambda best, f: f if compare(best.predictions, f.predictions).worth_it else best, ordered)
 
 
-def _grown(curve: Curve, form: Form, moved: bool, rounds: int, before: Predictions, held: HeldOut) -> Grown | None:
-    """Return a curve with a form more, of as many functions as help; None where it does no better."""
-    better, after = None, before
-    with contextlib.suppress(*FAILURES, OutOfTime):  # the best so far, where a budget is spent
+def _grown(curve: Curve, form: Form, moved: bool, before: Predictions, held: HeldOut) -> Iterator[Grown]:
+    """Yield a curve with a form more, of ever more functions, as long as these help."""
+    best = float("-inf")
+    with contextlib.suppress(*FAILURES):
         curve = curve.with_form(form, moved)
-        for _ in range(rounds):
+        for _ in range(FEW if moved else ROUNDS):
+            check_time()
             if (larger := curve.grown()) is None or larger.fitted is None:
-                break
+                return
             predicted = held.predictions(larger.fitted)
-            gained = compare(before, predicted)
-            if better is not None and gained.gain < better.gain:  # slopes led astray
-                break
-            curve, better, after = larger, gained, predicted
-    return Grown(better.gain, after, curve) if better is not None and better.worth_it else None
+            if (gained := compare(before, predicted)).gain < best:  # slopes led astray
+                return
+            curve, best = larger, gained.gain
+            yield Grown(gained, predicted, curve)
 
 
 def _closed_forms(on: str, z: Array) -> list[tuple[str, Array]]:
@@ -539,7 +581,8 @@ def _closed_forms(on: str, z: Array) -> list[tuple[str, Array]]:
     if on == "turn":
         return [(f"one wave, {k} to the turn", np.column_stack([np.sin(k * z), np.cos(k * z)])) for k in range(1, 13)]
     if on in ("theta", "t"):
-        return [("a constant", one[:, None]), ("a straight line", np.column_stack([one, z]))]
+        return [("a constant", one[:, None]), ("a straight line", np.column_stack([one, z])),
+                ("its cube", z[:, None] ** 3)]
     found = [("a constant", one[:, None]), ("proportional to it", z[:, None]), ("its sign alone", side[:, None]),
              ("its square, with its sign", (z * np.abs(z))[:, None]),
              ("its sign and proportional to it", np.column_stack([side, z]))]

@@ -19,11 +19,12 @@ from motorid.diagnosis.adequacy import judge_adequacy, within_noise
 from motorid.diagnosis.candidates import Search, Stages, library
 from motorid.diagnosis.cross_validation import QUICK, HeldOut
 from motorid.diagnosis.input_hypotheses import Reading, better_reading, without_spikes
-from motorid.diagnosis.misspecification import FormGain, Grade, better_forms, grades_of
+from motorid.diagnosis.misspecification import IN_ITS_PLACE, FormGain, Grade, better_forms, grades_of
 from motorid.diagnosis.model_comparison import Node, at_noise, beats, choose, evidence, far, group_of, node_of
 from motorid.diagnosis.predictive_score import is_sure
 from motorid.diagnosis.record_parts import affordable, thinned_alike
 from motorid.diagnosis.refit import BEAM, BEHIND, INTERRUPTED, OUT_OF_TIME
+from motorid.diagnosis.remainder import alone_leaving_noise
 from motorid.diagnosis.results import Adequacy, Candidate, Ladder, Rung
 from motorid.diagnosis.thresholds import MATERIAL
 from motorid.diagnosis.verdict import first_answer
@@ -166,6 +167,11 @@ def _finished(found: Climb) -> Climb:
                        lambda name: None if found.stopped else search.without(best, name))
     if not found.stopped and any(g.form for g in grades) and any(g.grade != "approximates" for g in grades):
         grades = _sure_alone(search, best, grades)
+    if structure and not found.stopped and any(g.grade != "approximates" for g in grades):
+        # Forms are compared by slopes, which lead astray far from the records: fitted, one may be the thing.
+        form = alone_leaving_noise(best, search.root.fit, search.held)
+        why = form and IN_ITS_PLACE.format(form.text)
+        grades = tuple(replace(g, grade="approximates", why=why, form=form) if why and not g.why else g for g in grades)
     return replace(found, rounds=rounds, groups=groups, forms=tuple(forms), grades=grades)
 
 

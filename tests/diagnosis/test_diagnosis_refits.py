@@ -55,7 +55,8 @@ def test_a_model_that_copies_the_measured_angle_predicts_none():
 
 def test_where_no_start_can_be_simulated_a_refit_begins_where_the_smaller_model_ended(monkeypatch):
     race = trial._race
-    monkeypatch.setattr(trial, "_race", lambda p: None if p.model.parameters["tau_c"].value > 1 else race(p))
+    monkeypatch.setattr(trial, "_race",
+                        lambda p, effort: None if p.model.parameters["tau_c"].value > 1 else race(p, effort))
     friction = mi.effects.coulomb(tau_c=8e-3)
     fit = mi.fit(mi.dc_motor(**TRUE), _run(mi.dc_motor(**TRUE) + friction))
     found = trial.refit(fit, fit.model + mi.effects.coulomb, [{"tau_c": 100.0}])
@@ -408,6 +409,7 @@ def test_a_driver_that_limits_the_current_is_no_effect_of_the_motor(monkeypatch)
     monkeypatch.setattr(grades, "current_limit", lambda run: None)
     monkeypatch.setattr(grades, "better_forms", lambda fit, rival: [])
     monkeypatch.setattr(stepwise, "better_forms", lambda fit, rival: [])
+    monkeypatch.setattr(stepwise, "alone_leaving_noise", lambda *given: None)
     assert mi.diagnose(fit, runs[2:], effects=tried).effects  # the bait
     free = [limited(1e9, k, volts) for k, volts in enumerate(drives[:2])]
     assert "current limit" not in mi.diagnose(mi.fit(mi.dc_motor(), free), effects=tried).text
@@ -465,9 +467,10 @@ def test_where_a_fit_is_lost_a_guess_of_its_own_starts_along_either_angle(monkey
     assert trial.lost(fit)
     entered, race = [], trial._race
 
-    def seen(problem):
-        entered.append((problem.model.angle_input, problem.model.values["mgl"] > 4))
-        return race(problem)
+    def seen(problem, effort):
+        if effort is trial.BEGIN:
+            entered.append((problem.model.angle_input, problem.model.values["mgl"] > 4))
+        return race(problem, effort)
 
     monkeypatch.setattr(trial, "_race", seen)
     best = trial.raced(fit, fit.model + mi.effects.gravity, ({"mgl": 1.0},))
