@@ -504,6 +504,56 @@ def test_a_drag_that_peaks_near_one_speed_takes_knees_as_narrow(lab):
     assert min(before[c] / after[c] for c in after) > 10
 
 
+@mi.effect(balance="voltage")
+def humming(m, V_h=mi.P(0.6, "V", null=0.0)):
+    """A supply that hums."""
+    t = m.state("t_h")
+    m.rate(t, 1)
+    m.voltage -= V_h * ca.sin(2 * np.pi * 23.4 * t + 0.7)
+
+
+@mi.effect(balance="voltage")
+def thermistor(m, R_0=mi.P(1.0, "Ohm", null=0.0)):
+    """A resistance that falls as its current heats it."""
+    heat = m.state("heat")
+    m.rate(heat, (m.i**2 - heat) / 0.15)
+    m.voltage -= R_0 * m.i * ca.exp(-heat / 4)
+
+
+@mi.effect(balance="torque")
+def hardening(m, k_3=mi.P(2e-5, "N·m/rad^3", null=0.0)):
+    """A spring that hardens."""
+    m.torque -= k_3 * m.theta**3
+
+
+@mi.effect(balance="torque")
+def lobe(m, A=mi.P(2e-2, "N·m", null=0.0)):
+    """A tight spot of the turn."""
+    m.torque -= A * ca.exp((ca.cos(m.theta - 2) - 1) / 0.08)
+
+
+@mi.effect(balance="sensor")
+def shared_ground(m, k_g=mi.P(2.0, "rad/s/A", null=0.0)):
+    """A tacho that reads a share of the current, clipped."""
+    m.measure("omega", m.measured("omega") + k_g * ca.tanh(m.i / 0.7))
+
+
+@pytest.mark.parametrize(("law", "words"), [
+    (humming, "a loss of voltage that changes with the time"),
+    (thermistor, "a resistance that depends on the heat of the current before"),
+    (hardening, "a load that changes with the angle"),
+    (lobe, "a load that changes with the angle within a turn"),
+    (shared_ground, "an error of the speed sensor that changes with the current")])
+def test_what_hums_heats_hardens_or_is_a_lobe_is_found_with_few_functions(law, words, lab):
+    runs, floor = _with_law(law, ANGLE if law in (hardening, lobe) else ANGLE[:2], lab)
+    found = mi.diagnose(mi.fit(mi.dc_motor(), runs[:2]), runs[2:], effects=("coulomb", "brush_drop"))
+    effect = found.remainder.as_effect()
+    assert effect.doc == f"What is left: {words}."
+    after = mi.evaluate(found.remainder.fitted, runs[2]).nrmse
+    assert max(after[c] / max(floor[c], 1e-3) for c in after) < 1.15
+    assert sum(p.null == 0 for p in effect.parameters) <= 3
+
+
 def _with_law(law, channels, lab):
     """Return three runs of the lab motor with a law beside it, the last to hold out, and the error of its noise."""
     rng = np.random.default_rng(3)
