@@ -86,7 +86,7 @@ def climb(search: Search, max_effects: int, seconds: float | None = None) -> Cli
                         remaining=judge_adequacy(found.path[-1]))
     search.stages.round(max_effects + 1)
     search.stages.at("Looking at what remains")
-    return _finished(found)
+    return _finished(found, None if seconds is None else max(seconds - (time.monotonic() - began), 0.0))
 
 
 def _rounds(found: Climb, max_effects: int) -> Iterator[Climb]:
@@ -153,8 +153,11 @@ def _with(found: Climb, best: Node, chosen: Node, ranked: bool, group: tuple[str
     return replace(found, path=tuple(_path(best)), rounds=rounds, groups=groups)
 
 
-def _finished(found: Climb) -> Climb:
-    """Return a climb with the free forms that predict better beside all effects, and the grade of each effect."""
+def _finished(found: Climb, seconds: float | None) -> Climb:
+    """Return a climb with the free forms that predict better beside all effects, and the grade of each effect.
+
+    Forms are compared by slopes, which lead astray far from the records: one that is fitted, in `seconds`, may be it.
+    """
     search, best = found.search, found.path[-1]
     met = frozenset[str]().union(*(node.key for node in found.path))
     rounds = tuple(tuple(_as_it_ended(c, best.key, met) for c in r) for r in found.rounds)
@@ -168,8 +171,12 @@ def _finished(found: Climb) -> Climb:
     if not found.stopped and any(g.form for g in grades) and any(g.grade != "approximates" for g in grades):
         grades = _sure_alone(search, best, grades)
     if structure and not found.stopped and any(g.grade != "approximates" for g in grades):
-        # Forms are compared by slopes, which lead astray far from the records: fitted, one may be the thing.
-        form = alone_leaving_noise(best, search.root.fit, search.held)
+        try:
+            with budget(seconds):
+                form = alone_leaving_noise(best, search.root.fit, search.held)
+        except KeyboardInterrupt:
+            interruption.heard()
+            found, form = replace(found, stopped=INTERRUPTED), None
         why = form and IN_ITS_PLACE.format(form.text)
         grades = tuple(replace(g, grade="approximates", why=why, form=form) if why and not g.why else g for g in grades)
     return replace(found, rounds=rounds, groups=groups, forms=tuple(forms), grades=grades)

@@ -17,7 +17,8 @@ from command import motorid_json
 import motorid as mi
 from motorid.channels import COMPUTED_INPUTS
 from motorid.cli.options import own_effects
-from motorid.diagnosis import remainder
+from motorid.diagnosis import misspecification as grades
+from motorid.diagnosis import remainder, stepwise
 from motorid.diagnosis.cross_validation import HeldOut
 from motorid.diagnosis.free_forms import (
     PAST,
@@ -552,6 +553,32 @@ def test_what_hums_heats_hardens_or_is_a_lobe_is_found_with_few_functions(law, w
     after = mi.evaluate(found.remainder.fitted, runs[2]).nrmse
     assert max(after[c] / max(floor[c], 1e-3) for c in after) < 1.15
     assert sum(p.null == 0 for p in effect.parameters) <= 3
+
+
+@mi.effect(balance="torque")
+def run_in(m, tau=mi.P(2e-2, "N·m", null=0.0)):
+    """Dry friction that dies out with the distance run."""
+    distance = m.state("distance")
+    m.rate(distance, ca.fabs(m.omega))
+    m.torque -= tau * m.sign(m.omega) * ca.exp(-distance / 40)
+
+
+def test_what_a_curve_alone_leaves_as_noise_is_not_named(lab, monkeypatch):
+    """Where slopes do not say so, the curve does that is fitted; interrupted while that is, all else is kept."""
+    runs, _ = _with_law(run_in, ANGLE[:2], lab)
+    fit = mi.fit(mi.dc_motor(), runs[:2])
+    for slopes in (grades, stepwise):
+        monkeypatch.setattr(slopes, "better_forms", lambda *given: [])
+    found = mi.diagnose(fit, runs[2:], effects=("coulomb",))
+    assert (found.verdict, found.effects) == ("unexplained", ())
+    assert "a friction that changes with the distance run, which the library lacks" in found.ladder.rungs[1].why
+
+    def interrupted(*given):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(stepwise, "alone_leaving_noise", interrupted)
+    found = mi.diagnose(fit, runs[2:], effects=("coulomb",))
+    assert (found.verdict, found.effects, found.stopped) == ("missing", ("coulomb",), "interrupted")
 
 
 def _with_law(law, channels, lab):
