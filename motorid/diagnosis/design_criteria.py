@@ -182,18 +182,13 @@ def _grid(parameters: Sequence[Parameter], sizes: Mapping[str, float]) -> Iterat
 @cache
 def quiet_seeds(n: int) -> list[int]:
     """Return seeds of `n` bits whose running sum, as ±1, stays small; the best first."""
-    bits = _sequence()
+    bits = np.fromiter(lfsr_bits(1, 2 * PERIOD), dtype=np.int64)
     total = np.concatenate([[0], np.cumsum(2 * bits - 1)])
     reach = np.zeros(PERIOD, int)
     for k in range(1, n + 1):
         np.maximum(reach, np.abs(total[k:k + PERIOD] - total[:PERIOD]), out=reach)
     at = np.argsort(reach, kind="stable")[:MOST_SEGMENTS]
     return (bits[at[:, None] + np.arange(15)] @ (1 << np.arange(15))).tolist()
-
-
-@cache
-def _sequence() -> NDArray[np.int64]:
-    return np.fromiter(lfsr_bits(1, 2 * PERIOD), dtype=np.int64)
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,7 +10,6 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from types import SimpleNamespace
 
 import numpy as np
@@ -62,6 +61,7 @@ CHANGES = {"t": "changes with the time", "distance": "changes with the distance 
            "since_reversal": "depends on the time since the voltage was reversed"}
 PAST = ("past i", "past omega", "past v", "past speed", "past power", "past load", "past heat", "past size", "path")
 MEMORIES = 8  # lengths of memory
+PLAY = (0.01, 0.4)  # of the largest value: half of the least and of the largest play
 LASTING = 10.0  # times the longest run: a memory that forgets nothing in it
 
 
@@ -116,7 +116,8 @@ _PUSHES = (  # words, balance, carrier, quantities
 FORMS = (*(Form(words, balance, on, carrier) for words, balance, carrier, quantities in _PUSHES for on in quantities),
          *(Form("a gain of the speed sensor", "sensor", on, "omega", "omega") for on in ("turn", "t")),
          Form("a gain of the current sensor", "sensor", "t", "i", "i"),
-         *(Form("an error of the angle sensor", "sensor", on, "", "theta") for on in ("path", "turn", "omega", "i")),
+         *(Form("an error of the angle sensor", "sensor", on, "", "theta")
+           for on in ("path", "turn", "theta", "omega", "i")),
          *(Form("an error of the speed sensor", "sensor", on, "", "omega") for on in ("omega", "i", "t")),
          *(Form("an error of the current sensor", "sensor", on, "", "i") for on in ("i", "v", "omega", "t")),
          *(Form("a loss of voltage", "voltage", f"past {c}") for c in ("v", "i", "omega")),
@@ -157,7 +158,6 @@ def span_of(fit: Fit, signals: Sequence[Mapping[str, Array]]) -> Span:
     return Span(ranges, tuple(sorted(orders)), step, rates=_rates(fit, step))
 
 
-@lru_cache(maxsize=8)
 def _rates(fit: Fit, step: float) -> tuple[float, ...]:
     """Return the rates (rad/s) of lines over the time that stand out of the spectrum of the misfit, at most a few."""
     from scipy.ndimage import median_filter  # slow to import, and not needed before
@@ -167,7 +167,8 @@ def _rates(fit: Fit, step: float) -> tuple[float, ...]:
     for run, sim in zip(fit.problem.runs, fit.simulations, strict=True):
         even = np.arange(sim.experiment.t[0], sim.experiment.t[-1], step)[:length]
         for c, sigma in run.sigma.items():
-            error = np.interp(even, sim.experiment.t, np.nan_to_num(sim.residual(c))) / sigma
+            known = np.isfinite(residual := sim.residual(c))
+            error = np.interp(even, sim.experiment.t[known], residual[known]) / sigma
             power += np.abs(np.fft.rfft((error - error.mean()) * np.hanning(len(even)), length)) ** 2
     around = np.log(2) * power / np.maximum(median_filter(power, AROUND), 1e-300)  # of noise, 1 in the mean
     around[: KNOTS + 2] = 0.0  # cosines over the range do that
@@ -227,7 +228,9 @@ def functions_of(form: Form, span: Span) -> list[str]:
         lags = [f"past(z, {_place(length, lengths[0] / 10, lengths[-1] * 10)})" for length in lengths]
         top = f"{max(abs(low), abs(high)):.6g}"
         bent = [f"{lag} * ca.fabs({lag}) / {top}" for lag in lags if form.bends]
-        return [f"{lag} / {top}" for lag in (*lags, *bent)] + ["1.0"] if form.carrier else lags + bent
+        if form.carrier:
+            return [f"{lag} / {top}" for lag in (*lags, *bent)] + ["1.0"]
+        return lags + bent + _sided(form, lengths, max(abs(low), abs(high)))
     if form.on in COMPUTED_INPUTS:
         found = ["1.0"]
         for sign, reach in (("", high), ("-", -low)):
@@ -240,6 +243,19 @@ def functions_of(form: Form, span: Span) -> list[str]:
     return (_along if form.on in ("theta", "t", "distance") else _of_size)(form, span, low, high)
 
 
+def _sided(form: Form, lengths: Array, top: float) -> list[str]:
+    """Return functions of what does not come back the way it went, as source: play, ramps, what feels a change."""
+    z, sensor = form.on.removeprefix("past "), form.balance == "sensor"
+    if not (form.channel == z if sensor else (form.balance, z) == ("voltage", "v")):
+        return []
+    unit = {"v": "V", "i": "A", "omega": "rad/s"}[z]
+    found = [f"(z - play(z, {_place(w, w / 10, top, unit)}))" for w in top * np.geomspace(*PLAY, len(lengths))]
+    if sensor:
+        places = [_place(length, lengths[0] / 10, lengths[-1] * 10) for length in lengths]
+        return found + [f"(z - {f}(z, {place}))" for f in ("past", "hold") for place in places]
+    return found + [f"(z - ramp(z, {_place(r, r / 10, 10 * r, 'V/s')}))" for r in top / lengths]
+
+
 def _along(form: Form, span: Span, low: float, high: float) -> list[str]:
     """Return functions of a time, an angle or a distance, as source: waves, and what sets in, grows or fades."""
     scale = f"{np.pi / (high - low):.9g} * (ca.fmin(ca.fmax(z, {low:.9g}), {high:.9g}) - {low:.9g})"
@@ -247,8 +263,8 @@ def _along(form: Form, span: Span, low: float, high: float) -> list[str]:
     steep = f"{SUDDEN * span.finer / (high - low):.6g}"
     sudden = [f"ca.tanh((z - {c}) * {steep})" for c in centres]
     top = f"{max(abs(low), abs(high)):.6g}"  # a slope, a spring that hardens, a stop, a slack, a ramp
-    sudden += ["z", f"(z / {top})**2", f"(z / {top})**3", *(f"ca.fmax(z - {c}, 0)" for c in centres)]
-    if form.on == "t":  # what another machine does, or the mains
+    sudden += [*(f"(z / {top})**{k}" for k in (1, 2, 3)), *(f"ca.fmax((z - {c}) / {top}, 0)" for c in centres)]
+    if form.on == "t":  # what swings as the records begin: another machine, a table that turns
         sudden += [f"ca.sin({_place(w, w - span.reach, w + span.reach, 'rad/s')} * z + {_place(phase, -4, 4, 'rad')})"
                    for w in span.rates for phase in (0, np.pi / 2)]
     if form.on != "theta":  # what warms up, or runs in
@@ -288,8 +304,8 @@ def _sectors(count: int) -> list[str]:
 
 def _lobes() -> list[str]:
     """Return smooth lobes of a turn as source, von Mises' density to one at its top: a cam, a magnet, a tight spot."""
-    return [f"ca.exp((ca.cos(z - {_place(c, c - width, c + width)}) - 1) / {_place(width**2, width**2 / 8, 4)})"
-            for width in LOBES for c in np.arange(0, 2 * np.pi, 1.5 * width)]
+    return [f"ca.exp((ca.cos(z - {_place(c, c - w, c + w)}) - 1) / {_place(w**2, w**2 / 8, 4, 'rad^2')})"
+            for w in LOBES for c in np.arange(0, 2 * np.pi, 1.5 * w)]
 
 
 def memories_of(form: Form, span: Span) -> Array:
@@ -317,6 +333,20 @@ def past(z: Array, along: Array, length: float, initial: float) -> Array:
     return np.interp(along, even, np.concatenate([[initial], lagged]))
 
 
+STEPS = {  # from the last value to the next: of what plays, is ramped up and falls at once, or jumps up and falls late
+    "play": lambda last, z, width, dt: min(max(last, z - width), z + width),
+    "ramp": lambda last, z, rate, dt: np.sign(z) * min(abs(z), max(last * np.sign(z), 0.0) + rate * dt),
+    "hold": lambda last, z, length, dt: z if abs(z) > abs(last) else z + (last - z) * np.exp(-dt / length)}
+
+
+def _stepped(kind: str, z: Array, t: Array, place: float, last: float) -> Array:
+    """Return what follows `z` (N,) from sample to sample, beginning at `last`."""
+    found = []
+    for value, dt in zip(z.tolist(), np.diff(t, prepend=t[0]).tolist(), strict=True):
+        found.append(last := STEPS[kind](last, value, place, dt))
+    return np.array(found)
+
+
 def values_of(functions: Sequence[str], form: Form, signal: Mapping[str, Array]) -> Array:
     """Return functions of a form, given by their source, along one run, (N, m)."""
     z, along = signal[form.on], signal["distance" if form.on == "path" else "t"]
@@ -324,6 +354,7 @@ def values_of(functions: Sequence[str], form: Form, signal: Mapping[str, Array])
     width = float(signal["width"][0])
     names = {"ca": np, "z": z, "m": SimpleNamespace(sign=lambda z: np.tanh(z / width)),
              "past": lambda z, length: past(z, along, length, first)}
+    names |= {kind: lambda z, place, kind=kind: _stepped(kind, z, along, place, first) for kind in STEPS}
     fixed = (PLACE.sub(r"\1", f) for f in functions)
     return np.column_stack([np.broadcast_to(np.asarray(eval(f, names), float), z.shape) for f in fixed])
 

@@ -181,10 +181,9 @@ def grades_of(last: Node, root: Node, groups: Sequence[Sequence[str]], beside: S
             free = [b for b in beside if not compare(b.predictions, beside[0].predictions).sure]
             free = [b for b in free if _swallows(last.fit, b.form, e)]
             free = free or better_forms(smaller.fit, last.fit)
-            taken = 1 - (1 - max(evidence(smaller, last).fall, 0.0)) ** 2
-            told = [b for b in free if b.evidence.fall > SUPPLANTS]  # explains more, over what the effect does, RMS:
-            more = [np.sqrt((1 - taken) * (1 - (1 - b.evidence.fall) ** 2) / max(taken, 1e-12)) for b in told]
-            told = [b for b, m in zip(told, more, strict=True) if m > TRIFLE]
+            fall = evidence(smaller, last).fall
+            taken = 1 - (1 - max(fall, 0.0)) ** 2
+            told = [b for b in free if outdoes(fall, b.evidence.fall)]
             better = next((b for b in told if beside and b.form == beside[0].form), told[0] if told else None)
             if better is not None:
                 form, why = better.form, IN_ITS_PLACE.format(better.form.text)
@@ -193,6 +192,13 @@ def grades_of(last: Node, root: Node, groups: Sequence[Sequence[str]], beside: S
         kind = "approximates" if why else "group" if rivals.get(e.name) else "named"
         found.append(Grade(e.name, kind, why, form))
     return tuple(found)
+
+
+def outdoes(fall: float, further: float) -> bool:
+    """Tell whether a form in an effect's place, by which the error falls `further`, explains more than a trifle of what
+    the effect does, RMS, by which it falls."""
+    left = (1 - max(fall, 0.0)) ** 2
+    return further > SUPPLANTS and np.sqrt(left * (1 - (1 - further) ** 2) / max(1 - left, 1e-12)) > TRIFLE
 
 
 def _insignificant(fit: Fit, effect: Effect, structure: bool) -> str:

@@ -37,11 +37,10 @@ from motorid.diagnosis.free_forms import (
     span_of,
     values_of,
 )
-from motorid.diagnosis.misspecification import better_forms, chosen_functions
+from motorid.diagnosis.misspecification import FormGain, better_forms, chosen_functions
 from motorid.diagnosis.model_comparison import Node, at_noise, far
 from motorid.diagnosis.predictive_score import Evidence, Predictions, compare
 from motorid.diagnosis.refit import refit
-from motorid.diagnosis.thresholds import SUPPLANTS
 from motorid.display.numbers import listed, number, percent
 from motorid.errors import ModelError, OutOfTime, UsageError
 from motorid.estimation.least_squares import FAILURES
@@ -70,8 +69,16 @@ STATES = {  # quantities that are states of the curve's own: name, where it begi
     "t": ("clock", "0.0", "1.0"), "distance": ("distance", "0.0", "ca.fabs(m.omega)"),
     "most i": ("most_i", "ca.fabs(m.start['i'])", "ca.fmax(ca.fabs(m.i) - most_i, 0) / {step:.6g}")}
 SI = {"theta": "rad", "omega": "rad/s", "i": "A", "v": "V", "size": "V"}
+OTHER_PLACES = {"V": "half of its play", "A": "half of its play", "rad/s": "how fast it swings, or half of its play",
+                "V/s": "how fast it rises", "rad": "its phase", "rad^2": "its width, squared"}
 OVER = {"": "", "A": "/A", "V": "/V", "rad/s": "·s/rad"}
 FIRST = {"past i": ", m.start['i']", "past omega": ", m.start['omega']"}  # of a memory: as if it had been so before
+MEMORY = re.compile(r"((past|play|ramp|hold)\(z, (.*?)\))")
+MEMORIES = {  # rates of what follows z, with one place
+    "past": "(z - {s}) / {p}", "play": "(ca.fmax(z - {p} - {s}, 0) - ca.fmax({s} - z - {p}, 0)) / {step}",
+    "ramp": "ca.if_else((z * {s} >= 0) * (ca.fabs(z) > ca.fabs({s})), "
+            "ca.sign(z) * ca.fmin({p}, ca.fabs(z - {s}) / {step}), (z - {s}) / {step})",
+    "hold": "(z - {s}) / ca.if_else(ca.fabs(z) > ca.fabs({s}), {step}, {p})"}
 CARRIERS = {"": "", "direction": "m.sign(m.omega) * ", "omega": "m.omega * ", "i": "m.i * ", "v": "m.v * "}
 
 
@@ -156,10 +163,10 @@ class Part:
                      f"m.rate({state}, {rate.format(step=self.span.step)})", *lines]
         if form.on in PAST:
             rate = " * ca.fabs(m.omega)" if form.on == "path" else ""
-            for k, lag in enumerate(dict.fromkeys(re.findall(r"past\(z, .*?\)", " ".join(terms)))):
-                past, length = f"lagged_{k}", lag[len("past(z, "):-1]
-                lines += [f"{past} = m.state('{own}_{past}'{FIRST.get(form.on, '')})",
-                          f"m.rate({past}, (z - {past}){rate} / {length})"]
+            for k, (lag, kind, place) in enumerate(dict.fromkeys(MEMORY.findall(" ".join(terms)))):
+                past = f"lagged_{k}"
+                change = MEMORIES[kind].format(s=past, p=place, step=f"{self.span.step:.6g}") + rate
+                lines += [f"{past} = m.state('{own}_{past}'{FIRST.get(form.on, '')})", f"m.rate({past}, {change})"]
                 terms = [t.replace(lag, past) for t in terms]
         lines += ["curve = (", *(f"    + {n} * {t}" for n, t in zip(names, terms, strict=True)), ")"]
         if form.carrier == "acceleration" and form.on == "turn":  # kinetic energy that changes with the angle
@@ -193,7 +200,9 @@ class Curve:
         for part, sizes, places in self._apart(self.sizes.items()):
             unit = part.unit(self.fit)
             parameters += [P(c, unit, null=0.0, given=True, doc="coefficient of the curve")(n) for n, c in sizes]
-            parameters += [P(c, unit, lower=low, upper=high, given=True, doc=part.place[1])(n)
+            usual, words = part.place
+            parameters += [P(c, unit, lower=low, upper=high, given=True,
+                             doc=words if unit == usual else OTHER_PLACES[unit])(n)
                            for (n, c), (_, low, high, unit) in zip(places, part.places, strict=True)]
         return Effect(self.name, Law(self.law), tuple(parameters), self.balance, f"What is left: {self.text}.")
 
@@ -261,10 +270,6 @@ class Curve:
     @cached_property
     def _signals(self) -> list[dict[str, Array]]:
         return signals_along(self.fit)
-
-    def with_form(self, form: Form, moved: bool = False) -> Curve:
-        """Return the curve with one more part, of no functions yet."""
-        return replace(self, parts=(*self.parts, Part.of(self.fitted or self.fit, form, moved)))
 
     def grown(self) -> Curve | None:
         """Return the curve with the functions of its last part that by their slopes predict more, fitted with the
@@ -343,7 +348,8 @@ class Remainder:
     def proposed(self) -> bool:
         """Tell whether slopes propose a curve; whether it helps, `as_effect` finds out."""
         seen = self.form is not None and self.form.on != "run"
-        return self.kind == "structure" and (seen or self._anew is not None)
+        curve = seen or self._anew is not None or any(self._approximating.values())
+        return self.kind == "structure" and curve
 
     def as_effect(self, name: str = "remainder") -> Effect:
         """Return what is left as an effect, a curve: ``found.remainder.model + found.remainder.as_effect()``.
@@ -390,7 +396,7 @@ class Remainder:
         held, best = self._held or HeldOut.of(self.fit, None), None
         apart = self.form is not None and self.form.on == "run"
         if not apart or self._anew is not None:
-            both = self._tried(held), _beyond(self._anew)
+            both = self._tried(), _beyond(self._anew)
             each = (islice((t for t in some if t[1].on != "run"), TRIED) for some in both)
             with contextlib.suppress(OutOfTime):
                 best = _best(self.fit, chain.from_iterable(each), held)
@@ -400,7 +406,7 @@ class Remainder:
                              "lowers the error on data left out.")
         return best
 
-    def _tried(self, held: HeldOut) -> Iterator[tuple[Fit, Form]]:
+    def _tried(self) -> Iterator[tuple[Fit, Form]]:
         """Yield models and a form to fit with each, the likeliest first; what takes a fit to find only when asked for.
 
         Beside what only approximates a form there is no place for it; then the whole model, or without all that does.
@@ -453,9 +459,7 @@ class Grown(NamedTuple):
 @one_thread
 def _best(fit: Fit, tried: Iterable[tuple[Fit, Form]], held: HeldOut) -> Curve | None:
     """Return the curve, fitted with its model, that predicts most beyond `fit`; None where none does."""
-    before, name = held.predictions(fit), "remainder"
-    while name in fit.model.effect_names:  # a curve beside a curve
-        name += "_more"
+    before, name = held.predictions(fit), _name(fit)
     best = _better_curve(((Curve(base, name=name), form) for base, form in tried), before, held)
     for _ in range(FURTHER):
         if best is None or best.done or (larger := _beside(best, held)) is None:
@@ -482,9 +486,8 @@ def _revised(best: Grown, held: HeldOut, times: int = FURTHER) -> Grown:
             smaller = best.curve.without(k)
             if smaller is None or smaller.fitted is None:
                 continue
-            predicted = held.predictions(smaller.fitted)
-            less = Grown(compare(predicted, best.predictions), predicted, smaller)
-            if not less.gained.worth_it:
+            less = Grown(best.gained, held.predictions(smaller.fitted), smaller)
+            if not compare(less.predictions, best.predictions).worth_it:
                 return _revised(less, held, times)
             for form in (part.form, None):
                 other = None if best.done else _beside(less, held, form)
@@ -497,53 +500,56 @@ def _better_curve(tried: Iterable[tuple[Curve, Form]], before: Predictions, held
     """Return the best of curves, each with a form more; None where none does better."""
     found = dict[Any, Grown]()
     with contextlib.suppress(OutOfTime):  # what is tried takes fits to find, too
-        _race(found, tried, before, held)
-        for first, form in _ahead(found):
-            for grown in () if _leaves_noise(found) else _grown(first, form, False, before, held):
+        for first, form in _race(found, tried, before, held):
+            for grown in () if any(f.done for f in found.values()) else _grown(first, form, False, before, held):
                 found[first, form, "grid"] = grown
     better = [f for f in found.values() if f.gained.worth_it]
     return _best_of(better) if better else None
 
 
-def _race(found: dict[Any, Grown], tried: Iterable[tuple[Curve, Form]], before: Predictions, held: HeldOut) -> None:
+def _race(found: dict[Any, Grown], tried: Iterable[tuple[Curve, Form]], before: Predictions,
+          held: HeldOut) -> list[tuple[Curve, Form]]:
     """Put into `found` the curves, each with a form more: the first to its end, of the others those that get furthest
-    with few functions (successive halving: Karnin, Koren & Somekh, ICML 2013), until one leaves noise."""
-    racing, met = dict[Any, Iterator[Grown]](), set[Any]()
+    with few functions (successive halving: Karnin, Koren & Somekh, ICML 2013), until one leaves noise.
 
-    def run(key: Any, functions: int) -> None:
+    Returns those that got furthest of all; none where one leaves noise.
+    """
+    racing = dict[Any, Iterator[Grown]]()
+
+    def quiet(key: Any, functions: int) -> bool:
         for k, grown in enumerate(racing[key], 1):
             found[key] = grown
             if k >= functions and not grown.done:
-                return
+                break
+        return key in found and found[key].done
 
-    for first, form in tried:
-        if (what := (first.fit.model.effect_names, form)) not in met:
-            met.add(what)
-            racing[first, form] = _grown(first, form, True, before, held)
-            run((first, form), TASTED if found else FEW)
-        if _leaves_noise(found):
-            return
-    for key in _ahead(found):
-        run(key, FEW)
-
-
-def _leaves_noise(found: Mapping[Any, Grown]) -> bool:
-    return any(f.done for f in found.values())
+    for key in tried:
+        if (key[0].fit.model.effect_names, key[1]) not in {(c.fit.model.effect_names, f) for c, f in racing}:
+            racing[key] = _grown(*key, True, before, held)
+            if quiet(key, TASTED if found else FEW):
+                return []
+    ahead = sorted(found, key=lambda key: -found[key].gained.gain)
+    others = [key for key in ahead if key != next(iter(racing))]
+    return [] if any(quiet(key, FEW) for key in others[:AHEAD]) else (
+        sorted(found, key=lambda key: -found[key].gained.gain)[:AHEAD])
 
 
-def _ahead(found: Mapping[Any, Grown]) -> list[Any]:
-    return sorted(found, key=lambda key: -found[key].gained.gain)[:AHEAD]
-
-
-def alone_leaving_noise(last: Node, root: Fit, held: HeldOut) -> Form | None:
+def alone_leaving_noise(last: Node, root: Fit, held: HeldOut) -> FormGain | None:
     """Return the form that, fitted in the place of all that `last` has and `root` has not, leaves noise and predicts
-    better, by more than the trifle that a free curve follows in any motor; None for none."""
+    better; None for none. Raises OutOfTime."""
     found = dict[Any, Grown]()
-    with contextlib.suppress(OutOfTime, *FAILURES):
+    check_time()
+    with contextlib.suppress(*FAILURES):
         forms = islice((f for _, f in _beyond(root) if f.on != "run"), TRIED)
-        _race(found, ((Curve(root), form) for form in forms), held.predictions(root), held)
-    gains = ((key[1], compare(last.predictions, f.predictions)) for key, f in found.items() if f.done)
-    return next((form for form, gain in gains if gain.worth_it and gain.fall > SUPPLANTS), None)
+        _race(found, ((Curve(root, name=_name(root)), form) for form in forms), held.predictions(root), held)
+    each = (FormGain(key[1], compare(last.predictions, f.predictions), f.predictions)
+            for key, f in found.items() if f.done)
+    return next((gain for gain in each if gain.evidence.worth_it), None)
+
+
+def _name(fit: Fit) -> str:
+    """Return a name for a curve beside those that a model has."""
+    return "remainder" + "_more" * sum(n.startswith("remainder") for n in fit.model.effect_names)
 
 
 def _best_of(found: Iterable[Grown]) -> Grown:
@@ -556,7 +562,7 @@ def _grown(curve: Curve, form: Form, moved: bool, before: Predictions, held: Hel
     """Yield a curve with a form more, of ever more functions, as long as these help."""
     best = float("-inf")
     with contextlib.suppress(*FAILURES):
-        curve = curve.with_form(form, moved)
+        curve = replace(curve, parts=(*curve.parts, Part.of(curve.fitted or curve.fit, form, moved)))
         for _ in range(FEW if moved else ROUNDS):
             check_time()
             if (larger := curve.grown()) is None or larger.fitted is None:
@@ -582,7 +588,7 @@ def _closed_forms(on: str, z: Array) -> list[tuple[str, Array]]:
         return [(f"one wave, {k} to the turn", np.column_stack([np.sin(k * z), np.cos(k * z)])) for k in range(1, 13)]
     if on in ("theta", "t"):
         return [("a constant", one[:, None]), ("a straight line", np.column_stack([one, z])),
-                ("its cube", z[:, None] ** 3)]
+                ("its square", z[:, None] ** 2), ("its cube", z[:, None] ** 3)]
     found = [("a constant", one[:, None]), ("proportional to it", z[:, None]), ("its sign alone", side[:, None]),
              ("its square, with its sign", (z * np.abs(z))[:, None]),
              ("its sign and proportional to it", np.column_stack([side, z]))]

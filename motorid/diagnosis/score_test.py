@@ -253,7 +253,7 @@ class Shape:
 
     def weighed_like(self, fit: Fit) -> Shape:
         """Return the shape with the channels weighed as in another fit of the same records."""
-        new = weights_of(fit.problem)
+        new = tuple(m.weights for m in fit.problem.measured)
         if all(map(np.array_equal, new, self.weights)):
             return self
         rows = []
@@ -275,11 +275,6 @@ def believable_start(fit: Fit) -> dict[str, float]:
             most = 2 * float(np.abs(run.inputs["v"]).max()) / fit.values["R"]
             found[name] = float(np.clip(found[name], -most, most))
     return found
-
-
-def weights_of(problem: Problem) -> tuple[Array, ...]:
-    """Return the weights of the channels, per run."""
-    return tuple(m.weights for m in problem.measured)
 
 
 @dataclass(frozen=True, eq=False)
@@ -315,7 +310,7 @@ class Added:
         """
         sizes = tuple(p for p in self.pars if p.null is not None and not p.positive)
         finite = any(p.null is not None and p.positive for p in self.pars)
-        weights = weights_of(self._problem)
+        weights = tuple(m.weights for m in self._problem.measured)
         if finite or any(p.name in values for p in sizes):
             change = self._change(values)
             return None if change is None else Shape(values, change[:, None], (), None, weights)

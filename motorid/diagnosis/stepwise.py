@@ -19,7 +19,7 @@ from motorid.diagnosis.adequacy import judge_adequacy, within_noise
 from motorid.diagnosis.candidates import Search, Stages, library
 from motorid.diagnosis.cross_validation import QUICK, HeldOut
 from motorid.diagnosis.input_hypotheses import Reading, better_reading, without_spikes
-from motorid.diagnosis.misspecification import IN_ITS_PLACE, FormGain, Grade, better_forms, grades_of
+from motorid.diagnosis.misspecification import IN_ITS_PLACE, FormGain, Grade, better_forms, grades_of, outdoes
 from motorid.diagnosis.model_comparison import Node, at_noise, beats, choose, evidence, far, group_of, node_of
 from motorid.diagnosis.predictive_score import is_sure
 from motorid.diagnosis.record_parts import affordable, thinned_alike
@@ -86,7 +86,7 @@ def climb(search: Search, max_effects: int, seconds: float | None = None) -> Cli
                         remaining=judge_adequacy(found.path[-1]))
     search.stages.round(max_effects + 1)
     search.stages.at("Looking at what remains")
-    return _finished(found, None if seconds is None else max(seconds - (time.monotonic() - began), 0.0))
+    return _finished(found)
 
 
 def _rounds(found: Climb, max_effects: int) -> Iterator[Climb]:
@@ -153,11 +153,8 @@ def _with(found: Climb, best: Node, chosen: Node, ranked: bool, group: tuple[str
     return replace(found, path=tuple(_path(best)), rounds=rounds, groups=groups)
 
 
-def _finished(found: Climb, seconds: float | None) -> Climb:
-    """Return a climb with the free forms that predict better beside all effects, and the grade of each effect.
-
-    Forms are compared by slopes, which lead astray far from the records: one that is fitted, in `seconds`, may be it.
-    """
+def _finished(found: Climb) -> Climb:
+    """Return a climb with the free forms that predict better beside all effects, and the grade of each effect."""
     search, best = found.search, found.path[-1]
     met = frozenset[str]().union(*(node.key for node in found.path))
     rounds = tuple(tuple(_as_it_ended(c, best.key, met) for c in r) for r in found.rounds)
@@ -170,16 +167,29 @@ def _finished(found: Climb, seconds: float | None) -> Climb:
                        lambda name: None if found.stopped else search.without(best, name))
     if not found.stopped and any(g.form for g in grades) and any(g.grade != "approximates" for g in grades):
         grades = _sure_alone(search, best, grades)
-    if structure and not found.stopped and any(g.grade != "approximates" for g in grades):
-        try:
-            with budget(seconds):
-                form = alone_leaving_noise(best, search.root.fit, search.held)
-        except KeyboardInterrupt:
-            interruption.heard()
-            found, form = replace(found, stopped=INTERRUPTED), None
-        why = form and IN_ITS_PLACE.format(form.text)
-        grades = tuple(replace(g, grade="approximates", why=why, form=form) if why and not g.why else g for g in grades)
     return replace(found, rounds=rounds, groups=groups, forms=tuple(forms), grades=grades)
+
+
+def _beside_curves(found: Climb, seconds: float | None) -> Climb:
+    """Return a climb with grades that hold beside a curve, fitted in the place of all that was found.
+
+    Forms are compared by slopes, and these lead astray far from the records.
+    """
+    search, best, grades = found.search, found.path[-1], list(found.grades)
+    if found.stopped or found.remaining.adequate or all(g.grade == "approximates" for g in grades):
+        return found
+    try:
+        with budget(seconds):
+            curve = alone_leaving_noise(best, search.root.fit, search.held)
+    except (OutOfTime, KeyboardInterrupt) as error:
+        interruption.heard()
+        stopped = OUT_OF_TIME if isinstance(error, OutOfTime) else INTERRUPTED
+        return replace(found, stopped=stopped, text=f"stopped early: {stopped}; what was named may be a curve")
+    for k, g in enumerate(grades if curve else ()):
+        if g.grade != "approximates" and (smaller := search.without(best, g.effect)) is not None and (
+                outdoes(evidence(smaller, best).fall, curve.evidence.fall)):
+            grades[k] = Grade(g.effect, "approximates", IN_ITS_PLACE.format(curve.form.text), curve.form)
+    return replace(found, grades=tuple(grades))
 
 
 def _sure_alone(search: Search, best: Node, grades: tuple[Grade, ...]) -> tuple[Grade, ...]:
@@ -300,7 +310,8 @@ def explored(fit: Fit, validate: Sequence[Experiment] | Experiment | None, effec
             if reading:
                 again = replace(again, remarks=(*records.remarks, reading.remark(last.fit, new.fit)))
             records, found = again, anew
-    return found, " ".join(records.remarks)
+    left = None if seconds is None else max(seconds - (time.monotonic() - began), 0.0)
+    return _beside_curves(found, left), " ".join(records.remarks)
 
 
 def _in_windows(found: Climb) -> Fit | None:

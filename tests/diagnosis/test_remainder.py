@@ -362,7 +362,9 @@ def test_slopes_of_every_form_are_those_of_the_model_with_its_curve(lab):
         own *= np.sign(np.sum(own * answers))
         missed[form] = float(np.linalg.norm(own - answers) / np.linalg.norm(answers))
     within = {f for f in missed if f.on == "turn" or (f.on, f.channel) == ("path", "theta")}  # quicker than samples
-    assert max(miss for f, miss in missed.items() if f not in within) < 0.12
+    sided = {f for f in missed if f.on == f"past {f.channel}"}  # a state takes a sample to jump
+    assert max(miss for f, miss in missed.items() if f not in within | sided) < 0.12
+    assert max(missed[f] for f in sided) < 0.2
     assert np.median(list(missed.values())) < 0.03
 
 
@@ -388,6 +390,55 @@ def warmed(m, tau_c=mi.P(8e-3, "N·m", null=0.0), t=mi.P(0.1, "s", positive=True
     z = m.state("warmth")
     m.rate(z, (ca.fabs(m.omega) / 100 - z) / t)
     m.torque -= tau_c * m.sign(m.omega) / (1 + z)
+
+
+STEP = 1e-3  # s, of these records
+
+
+@mi.effect(balance="voltage")
+def slack_driver(m, w=mi.P(0.9, "V", null=0.0)):
+    """A driver whose output has play."""
+    z = m.state("z")
+    m.rate(z, (ca.fmax(m.v - w - z, 0) - ca.fmax(z - m.v - w, 0)) / STEP)
+    m.voltage -= m.v - z
+
+
+@mi.effect(balance="voltage")
+def soft_start(m, share=mi.P(1.0, "", null=0.0)):
+    """A driver that ramps the voltage up, and lets it fall at once."""
+    z = m.state("z")
+    up = (z * m.v >= 0) * (ca.fabs(m.v) > ca.fabs(z))
+    m.rate(z, ca.if_else(up, ca.sign(m.v) * ca.fmin(90, ca.fabs(m.v - z) / STEP), (m.v - z) / STEP))
+    m.voltage -= share * (m.v - z)
+
+
+@mi.effect(balance="sensor")
+def sticking_core(m, w=mi.P(0.25, "A", null=0.0)):
+    """A current sensor whose core has play."""
+    z = m.state("z", m.start["i"])
+    m.rate(z, (ca.fmax(m.i - w - z, 0) - ca.fmax(z - m.i - w, 0)) / STEP)
+    m.measure("i", m.measured("i") + z - m.i)
+
+
+@mi.effect(balance="sensor")
+def peak_detector(m, share=mi.P(1.0, "", null=0.0)):
+    """A current sensor, up quickly, down late."""
+    z = m.state("z", m.start["i"])
+    m.rate(z, (m.i - z) / ca.if_else(ca.fabs(m.i) > ca.fabs(z), STEP, 0.03))
+    m.measure("i", m.measured("i") + share * (z - m.i))
+
+
+@pytest.mark.parametrize(("law", "words"), [
+    (slack_driver, "a loss of voltage that depends on the voltage before"),
+    (soft_start, "a loss of voltage that depends on the voltage before"),
+    (sticking_core, "an error of the current sensor that depends on the current before"),
+    (peak_detector, "an error of the current sensor that depends on the current before")])
+def test_what_does_not_come_back_the_way_it_went_is_found(law, words, lab):
+    runs, floor = _with_law(law, ANGLE[:2], lab)
+    found = mi.diagnose(mi.fit(mi.dc_motor(), runs[:2]), runs[2:], effects=("coulomb", "brush_drop"))
+    assert found.remainder.as_effect().doc == f"What is left: {words}."
+    after = mi.evaluate(found.remainder.fitted, runs[2]).nrmse
+    assert max(after[c] / floor[c] for c in after) < 1.15
 
 
 @mi.effect(balance="torque")
