@@ -279,7 +279,7 @@ def _of_size(form: Form, span: Span, low: float, high: float) -> list[str]:
     top = max(abs(low), abs(high))
     if min(-low, high) > BOTH_WAYS * top:  # what one side shows of the last bit may hold on the other
         low, high = -top, top
-    s = f"(ca.fmin(ca.fmax(z, {low:.9g}), {high:.9g}) / {top:.6g})"  # nothing is known beyond
+    s = f"(ca.fmin(ca.fmax(z, {low:.9g}), {high:.9g}) / {top:.6g})"
     size = f"ca.fabs{s}"
     smooth = [s, f"{s}**2", f"{s}**3", *(f"ca.tanh({k} * {s})" for k in BENDS)]
     sides = [sign for sign, reach in (("", high), ("-", -low)) if reach > 0]

@@ -73,6 +73,7 @@ OTHER_PLACES = {"V": "half of its play", "A": "half of its play", "rad/s": "how 
                 "V/s": "how fast it rises", "rad": "its phase", "rad^2": "its width, squared"}
 OVER = {"": "", "A": "/A", "V": "/V", "rad/s": "·s/rad"}
 FIRST = {"past i": ", m.start['i']", "past omega": ", m.start['omega']"}  # of a memory: as if it had been so before
+CLIPPED = re.compile(r"ca\.fmin\(ca\.fmax\(z, \S+\), \S+\)")
 MEMORY = re.compile(r"((past|play|ramp|hold)\(z, (.*?)\))")
 MEMORIES = {  # rates of what follows z, with one place
     "past": "(z - {s}) / {p}", "play": "(ca.fmax(z - {p} - {s}, 0) - ca.fmax({s} - z - {p}, 0)) / {step}",
@@ -131,7 +132,9 @@ class Part:
         for f in self.functions:
             for m in _each(f):
                 f = f.replace(m[0], str(next(given)) if self.moved else m[1])
-            terms.append(f)
+            # Few functions are a law, which goes on; of many on a grid nothing is known beyond, nor what they drive.
+            goes_on = self.moved and self.form.balance == "sensor" and self.form.on in ("omega", "i", "v")
+            terms.append(CLIPPED.sub("z", f) if goes_on else f)
         return terms
 
     def unit(self, fit: Fit, bare: bool = False) -> str:
