@@ -32,7 +32,7 @@ from motorid.problem.problem import Problem
 from motorid.problem.runs import natural_sizes, shapes_of, with_inputs
 from motorid.problem.simulate import misfit_over_noise
 
-BEGIN, RACE = (LevenbergMarquardt(max_iterations=n, ftol=1e-3, xtol=1e-4, looks=0) for n in (2, 4))
+BEGIN, RACE = (LevenbergMarquardt(max_iterations=n, ftol=1e-3, xtol=1e-4, looks=0) for n in (2, 6))
 HALVING = 2  # of the starts go on after the first steps (successive halving: Karnin, Koren & Somekh, ICML 2013)
 POLISH = LevenbergMarquardt(max_iterations=60, ftol=1e-5, xtol=1e-5, looks=0)
 GOING_ON = 4  # times, where the last descent ends at its limit
@@ -69,21 +69,24 @@ def raced(fit: Fit, model: Model, starts: Sequence[Mapping[str, float]]) -> Race
     # A guess of the larger model's own, along the records, is no longer led astray.
     entries = [(start, angular) for start in starts] + [
         (start, along) for start in _own_starts(fit, model, starts) for along in sorted({angular, False})]
-    begun = [(done, along) for start, along in entries if (done := _begun(fit, models, start, along)) is not None]
+    first = BEGIN if len(entries) > BEAM else RACE
+    each = ((_begun(fit, models, start, along, first), along) for start, along in entries)
+    begun = [(done, along) for done, along in each if done is not None]
     if not begun and any(starts):
         return raced(fit, model, ())
     begun.sort(key=lambda entry: entry[0].cost)
-    ahead = begun[: max(len(begun) // HALVING, 1)]
-    found = [(_race(done.onward, RACE) or done, along) for done, along in ahead]
+    ahead = begun[: max(-(-len(begun) // HALVING), BEAM)]
+    found = begun if first is RACE else [(_race(done.onward, RACE) or done, along) for done, along in ahead]
     best, along = min(found, key=lambda entry: entry[0].cost, default=(None, False))
     return best and Raced(best.onward, float(best.cost), _undamped(best.solution.residual, best.solution.jac), along)
 
 
-def _begun(fit: Fit, models: Iterable[Model], start: Mapping[str, float], along: bool) -> Estimate | None:
+def _begun(fit: Fit, models: Iterable[Model], start: Mapping[str, float], along: bool,
+           effort: LevenbergMarquardt) -> Estimate | None:
     """Go the first steps from a start with the first model that can take it; None if none can."""
     for model in models:
         with contextlib.suppress(*FAILURES):
-            if (done := _race(_started(fit, model, start, along), BEGIN)) is not None:
+            if (done := _race(_started(fit, model, start, along), effort)) is not None:
                 return done
     return None
 
