@@ -185,7 +185,9 @@ def _beside_curves(found: Climb, seconds: float | None) -> Climb:
         interruption.heard()
         stopped = OUT_OF_TIME if isinstance(error, OutOfTime) else INTERRUPTED
         return replace(found, stopped=stopped, text=f"stopped early: {stopped}; what was named may be a curve")
-    for k, g in enumerate(grades if curve else ()):
+    if curve is None:
+        return found
+    for k, g in enumerate(grades):
         if g.grade != "approximates" and (smaller := search.without(best, g.effect)) is not None and (
                 outdoes(evidence(smaller, best).fall, curve.evidence.fall)):
             grades[k] = Grade(g.effect, "approximates", IN_ITS_PLACE.format(curve.form.text), curve.form)
