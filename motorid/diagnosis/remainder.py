@@ -56,7 +56,7 @@ TRIED = 4  # curves that are fitted, those that promise most
 FINE = range(1, 37)  # harmonics of a turn in a curve that is fitted
 CLOSED = 300  # times that are tried as the end, or the beginning, of a constant
 FURTHER = 3  # times that a form beside those of the curve is sought
-FEW = 6  # functions at most whose places are fitted, too
+FEW = 8  # functions at most whose places are fitted, too
 ROUNDS = 3  # of choosing functions and fitting: near the optimum slopes show what the misfit hid before
 TASTED = 2  # functions by which forms are compared, and
 AHEAD = 2  # how many then go on
@@ -75,7 +75,7 @@ OVER = {"": "", "A": "/A", "V": "/V", "rad/s": "·s/rad"}
 FIRST = {"past i": ", m.start['i']", "past omega": ", m.start['omega']"}  # of a memory: as if it had been so before
 CLIPPED = re.compile(r"ca\.fmin\(ca\.fmax\(z, \S+\), \S+\)")
 MEMORY = re.compile(r"((past|play|ramp|hold)\(z, (.*?)\))")
-MEMORIES = {  # rates of what follows z, with one place
+RATES = {  # of what follows z, with one place
     "past": "(z - {s}) / {p}", "play": "(ca.fmax(z - {p} - {s}, 0) - ca.fmax({s} - z - {p}, 0)) / {step}",
     "ramp": "ca.if_else((z * {s} >= 0) * (ca.fabs(z) > ca.fabs({s})), "
             "ca.sign(z) * ca.fmin({p}, ca.fabs(z - {s}) / {step}), (z - {s}) / {step})",
@@ -168,7 +168,7 @@ class Part:
             rate = " * ca.fabs(m.omega)" if form.on == "path" else ""
             for k, (lag, kind, place) in enumerate(dict.fromkeys(MEMORY.findall(" ".join(terms)))):
                 past = f"lagged_{k}"
-                change = MEMORIES[kind].format(s=past, p=place, step=f"{self.span.step:.6g}") + rate
+                change = RATES[kind].format(s=past, p=place, step=f"{self.span.step:.6g}") + rate
                 lines += [f"{past} = m.state('{own}_{past}'{FIRST.get(form.on, '')})", f"m.rate({past}, {change})"]
                 terms = [t.replace(lag, past) for t in terms]
         lines += ["curve = (", *(f"    + {n} * {t}" for n, t in zip(names, terms, strict=True)), ")"]
