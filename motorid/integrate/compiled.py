@@ -112,12 +112,13 @@ def mark_of(key: str) -> str | None:
 def find(mark: str) -> Path | None:
     """Return the library called `mark` in the cache, if it is there and whole.
 
-    Its file name ends in a digest of its bytes: loading half a file would end the process.
+    It is in a folder of its own, so that no other is looked at; its name is a digest of its bytes: loading half a file
+    would end the process.
     """
     folder = cache_dir()
-    for path in folder.glob(f"{mark}-*.so") if folder else ():
+    for path in (folder / mark).glob("*.so") if folder else ():
         with suppress(OSError):
-            if path.stem == f"{mark}-{_digest(path.read_bytes())}":
+            if path.stem == _digest(path.read_bytes()):
                 return path
             path.unlink(missing_ok=True)
     return None
@@ -151,7 +152,8 @@ class _Compilation:
                 first = (self.here / "said").read_text(errors="replace").splitlines() or ["no message"]
                 raise OSError(f"the C compiler failed ({first[0]})")
             made = self.here / "step.so"
-            path = self.cache / f"{self.mark}-{_digest(made.read_bytes())}.so"
+            path = self.cache / self.mark / f"{_digest(made.read_bytes())}.so"
+            path.parent.mkdir(mode=0o700, exist_ok=True)
             os.replace(made, path)
             return path
         finally:
