@@ -17,6 +17,7 @@ import stat
 import subprocess
 import sys
 import tempfile
+import threading
 from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
@@ -147,8 +148,10 @@ class _Compilation:
         ------
         OSError, subprocess.SubprocessError
         """
+        hangs = threading.Timer(300, self.process.kill)
+        hangs.start()
         try:
-            if self.process.wait(timeout=300):
+            if self.process.wait():  # with a timeout it would look again every now and then
                 first = (self.here / "said").read_text(errors="replace").splitlines() or ["no message"]
                 raise OSError(f"the C compiler failed ({first[0]})")
             made = self.here / "step.so"
@@ -157,6 +160,7 @@ class _Compilation:
             os.replace(made, path)
             return path
         finally:
+            hangs.cancel()
             self.drop()
 
     def drop(self) -> None:
