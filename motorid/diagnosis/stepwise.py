@@ -317,14 +317,19 @@ def explored(fit: Fit, validate: Sequence[Experiment] | Experiment | None, effec
 
 
 def _in_windows(found: Climb) -> Fit | None:
-    """Return the first model's fit in windows, if the last one carries small errors too far over the whole records.
+    """Return the first model's fit in windows, if one that it led to carries small errors too far over whole records.
 
-    A pendulum upright says so only once its weight is in the model.
+    A pendulum upright says so only once its weight is in the model, and detents may have been refused since the motor
+    rested in others.
     """
     first, last = found.path[0].fit, found.path[-1].fit
-    if follows(last) and not last.model.angle_input:
+    refused = [c for c in (found.rounds[-1] if found.rounds else ()) if c.fit is not None and not c.accepted]
+    best = max(refused, key=lambda c: c.gain or 0.0, default=None)
+    lost = not follows(last) or last.model.angle_input
+    fit = last if lost else best.fit if best is not None and far(last) else None
+    if fit is None or growth(fit) < TOO_FAR:
         return None
-    if growth(last) < TOO_FAR or (part := in_windows(last, partial(solve, solver=QUICK, start="model"))) is None:
+    if (part := in_windows(fit, partial(solve, solver=QUICK, start="model"))) is None:
         return None
     try:
         return solve(part.problem.with_(model=first.model, noise_factors={}))

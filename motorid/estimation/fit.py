@@ -129,7 +129,7 @@ def fit(model: Model, runs: Sequence[Experiment] | Experiment, *, solver: Any = 
             advance(1, f"{text}: iteration {k}"), callback and callback(k, *rest)))
         found = again(problem, start=start)
         if window == "auto" and start == "auto" and not hasattr(solver, "solve"):
-            found = found if follows(found) else in_windows(found, again) or found
+            found = in_windows(found, again) or found
     _ = found.evaluation, found.std  # kept with the fit: showing it then computes nothing
     return found
 
@@ -331,20 +331,29 @@ def follows(fit: Fit) -> bool:
 def in_windows(fit: Fit, solve: Callable[[Problem], Fit] = solve) -> Fit | None:
     """Return the fit of the same model in the longest windows that it follows, if it amplifies errors; else None.
 
-    `solve` fits a problem.
+    Of records that it follows as a whole only where it leaves noise there, and more than that on the whole: a detent
+    that catches the motor or not turns on what no sensor shows. `solve` fits a problem.
     """
-    problem = fit.problem
+    problem, model = fit.problem, fit.model.with_(angle_input=False)
+    whole = follows(fit) and not fit.model.angle_input
     longest = max(r.duration for r in problem.experiments)
     if fit.window is not None or problem.initial != "auto" or not any(uses_angle(e) for e in fit.model.effects):
         return None  # a torque that does not know the angle cannot drive a small error on
+    if whole and (leaves_noise(fit) or growth(fit) < TOO_FAR):
+        return None
     for count in WINDOWS:
         enough = [r for r in problem.experiments if r.n > FEWEST * count]
         runs = tuple(p for r in enough for p in windows(r, longest / count))
         with contextlib.suppress(*FAILURES):
-            part = solve(problem.with_(experiments=runs, model=fit.model, noise_factors={})) if runs else None
-            if part is not None and follows(part):
-                return part if growth(part) > TOO_FAR else None
+            part = solve(problem.with_(experiments=runs, model=model, noise_factors={})) if runs else None
+            if part is not None and follows(part) and (not whole or leaves_noise(part)):
+                return part if whole or growth(part) > TOO_FAR else None
     return None
+
+
+def leaves_noise(fit: Fit) -> bool:
+    """Tell whether the errors of a fit are no larger than the noise of the sensors."""
+    return max(fit.misfit.values(), default=0.0) < NOISE
 
 
 def growth(fit: Fit) -> float:

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,6 +13,8 @@ from typer.testing import CliRunner
 
 import motorid as mi
 from motorid.cli.app import app
+from motorid.diagnosis.results import Candidate
+from motorid.diagnosis.stepwise import _in_windows
 from motorid.errors import UsageError
 from motorid.estimation.fit import TOO_FAR, follows, growth
 from motorid.records.datasets import data_path
@@ -110,3 +115,37 @@ def test_the_option_of_the_command_line(tmp_path):
     assert done.exit_code == 0, done.output
     assert json.loads(out.read_text())["window"] == 0.2
     assert CliRunner().invoke(app, ["fit", run, "--window", "long"]).exit_code == 2
+
+
+def in_detents(seed: int) -> mi.Experiment:
+    """A small motor that detents catch at low voltages, its angle so noisy that none says in which it began."""
+    rng, t = np.random.default_rng(seed), np.arange(0, 1, 5e-4)
+    v = np.interp(t, [0.01, 0.12, 0.34, 0.57, 0.79, 1], [0, 1, -1, 1, -1, 0.9])
+    if not seed % 2:
+        v = np.where(t < 0.01, 0.0, np.repeat(rng.uniform(-1, 1, 10), 200))
+    motor = mi.dc_motor(R=11.4, L=1.7e-3, K=4.3e-3, b=6.7e-8, J=4.3e-8) + mi.effects.cogging(A=9.4e-5, N=12, phi=0.4)
+    noise = {"i": 3e-4, "omega": 1.0, "theta": 0.07}
+    still = mi.Experiment(t, {"v": v}, {c: np.zeros_like(t) for c in noise})
+    shown = mi.simulate(motor, still, initial="rest")[0].outputs
+    return still.with_(outputs={c: shown[c] + rng.normal(0, s, len(t)) for c, s in noise.items()})
+
+
+def test_where_detents_decide_a_motor_is_followed_in_windows_if_these_leave_noise():
+    runs = [in_detents(3), in_detents(4)]
+    model = mi.dc_motor() + mi.effects.cogging(N=12)
+    whole, fit, plain = mi.fit(model, runs, window=None), mi.fit(model, runs), mi.fit(mi.dc_motor(), runs)
+    assert follows(whole)
+    assert min(whole.misfit.values()) > 3  # this is what it is about
+    assert fit.window == pytest.approx(0.125, rel=0.01)
+    assert fit.fits == "noise"
+    assert fit.values["A"] == pytest.approx(9.4e-5, rel=0.01)
+    assert fit.values["phi"] == pytest.approx(0.4, abs=0.03)
+    assert plain.window is None
+    refused = Candidate("cogging", 0.8, fit=whole, gain=60.0)
+    climb: Any = SimpleNamespace(path=[SimpleNamespace(fit=plain)], rounds=[[refused]])
+    again = _in_windows(climb)  # a search that refused it since its own errors grew begins anew so
+    assert again is not None
+    assert again.window == pytest.approx(0.125, rel=0.01)
+    assert again.model.effect_names == ()
+    climb.rounds = [[replace(refused, fit=plain)]]  # what amplifies nothing asks for none
+    assert _in_windows(climb) is None
