@@ -176,22 +176,28 @@ def _beside_curves(found: Climb, seconds: float | None) -> Climb:
     Forms are compared by slopes, and these lead astray far from the records.
     """
     search, best, grades = found.search, found.path[-1], list(found.grades)
-    if found.stopped or found.remaining.adequate or all(g.grade == "approximates" for g in grades):
+    if all(g.grade == "approximates" for g in grades):
         return found
-    try:
-        with budget(seconds):
-            curve = alone_leaving_noise(best, search.root.fit, search.held)
-    except (OutOfTime, KeyboardInterrupt) as error:
-        interruption.heard()
-        stopped = OUT_OF_TIME if isinstance(error, OutOfTime) else INTERRUPTED
-        return replace(found, stopped=stopped, text=f"stopped early: {stopped}; what was named may be a curve")
-    if curve is None:
-        return found
-    for k, g in enumerate(grades):
+    found, curve = _curve_alone(found, search.root.fit, search.held, seconds)
+    for k, g in enumerate(grades if curve is not None else ()):
         if g.grade != "approximates" and (smaller := search.without(best, g.effect)) is not None and (
                 outdoes(evidence(smaller, best).fall, curve.evidence.fall)):
             grades[k] = Grade(g.effect, "approximates", IN_ITS_PLACE.format(curve.form.text), curve.form)
     return replace(found, grades=tuple(grades))
+
+
+def _curve_alone(found: Climb, root: Fit, held: HeldOut, seconds: float | None) -> tuple[Climb, FormGain | None]:
+    """Return a climb, stopped where the time is up, and the form that in the place of all that was found, beside
+    `root`, leaves noise; None where there is none, or no structure is left."""
+    if found.stopped or found.remaining.adequate:
+        return found, None
+    try:
+        with budget(seconds):
+            return found, alone_leaving_noise(found.path[-1], root, held)
+    except (OutOfTime, KeyboardInterrupt) as error:
+        interruption.heard()
+        stopped = OUT_OF_TIME if isinstance(error, OutOfTime) else INTERRUPTED
+        return replace(found, stopped=stopped, text=f"stopped early: {stopped}; what was named may be a curve"), None
 
 
 def _sure_alone(search: Search, best: Node, grades: tuple[Grade, ...]) -> tuple[Grade, ...]:
@@ -279,10 +285,12 @@ def explored(fit: Fit, validate: Sequence[Experiment] | Experiment | None, effec
     """
     began = time.monotonic()
 
-    def climbed(records: Records) -> Climb:
-        left = None if seconds is None else max(seconds - (time.monotonic() - began), 0.0)
+    def left() -> float | None:
+        return None if seconds is None else max(seconds - (time.monotonic() - began), 0.0)
+
+    def climbed(records: Records, most: int = max_effects) -> Climb:
         stages.climb()
-        return climb(Search(records.fit, records.held_out, effects, stages), max_effects, left)
+        return climb(Search(records.fit, records.held_out, effects, stages), most, left())
 
     fit, held_out = affordable(fit), [validate] if isinstance(validate, Experiment) else validate
     records = Records(fit, held_out and thinned_alike(fit, held_out))
@@ -312,8 +320,12 @@ def explored(fit: Fit, validate: Sequence[Experiment] | Experiment | None, effec
             if reading:
                 again = replace(again, remarks=(*records.remarks, reading.remark(last.fit, new.fit)))
             records, found = again, anew
-    left = None if seconds is None else max(seconds - (time.monotonic() - began), 0.0)
-    return _beside_curves(found, left), " ".join(records.remarks)
+    if records.remarks != as_it_was.remarks:  # what is missing may look like another reading
+        held = HeldOut.of(as_it_was.fit, as_it_was.held_out)
+        found, curve = _curve_alone(found, as_it_was.fit, held, left())
+        if curve is not None:
+            records, found = as_it_was, climbed(as_it_was, 0)
+    return _beside_curves(found, left()), " ".join(records.remarks)
 
 
 def _in_windows(found: Climb) -> Fit | None:

@@ -248,3 +248,27 @@ def test_a_sensor_is_blamed_only_where_another_contradicts_it(lab):
     balances = [{f.balance for f in linearised(fit).forms} for fit in (both, alone)]
     assert "sensor" in balances[0]
     assert "sensor" not in balances[1]
+
+
+def test_eddy_currents_in_the_iron_are_no_voltage_that_acts_before_it_was_logged(rng):
+    @mi.effect(balance="voltage")
+    def shunted(m, R_2=mi.P(2.3, "ohm", given=True), T_2=mi.P(1e-3, "s", given=True)):
+        """A part of the inductance is shunted by a resistance, as eddy currents in solid iron do."""
+        i_2 = m.state("i_2", 0.0)
+        m.rate(i_2, (m.i - i_2) / T_2)
+        m.voltage -= R_2 * (m.i - i_2)
+
+    motor, t = mi.dc_motor(R=1.03, L=1.7e-3, K=0.041, b=1e-4, J=1.1e-4) + shunted, np.arange(1500) * 2e-4
+    chirp, noise = 12 * np.sin(2 * np.pi * (20 * t + 1200 * t**2)), {"i": 0.02, "omega": 0.15}
+    runs = []
+    for v in (np.repeat(rng.choice([-12.0, 12.0], 188), 8)[:1500], chirp, np.repeat(rng.choice([-12.0, 12.0], 300), 5)):
+        still = mi.Experiment(t, {"v": v}, {c: np.zeros_like(t) for c in noise})
+        shown = mi.simulate(motor, still, initial="rest")[0].outputs
+        runs.append(still.with_(outputs={c: shown[c] + rng.normal(0, s, 1500) for c, s in noise.items()}))
+    rivals = ["inductance_saturation", "speed_lag", "current_lag", "brush_drop"]
+    found = mi.diagnose(mi.fit(mi.dc_motor(), runs[:2]), runs[2], effects=rivals)
+    assert found.verdict == "unexplained"
+    assert found.remainder.follows == "a loss of voltage that depends on the current before"
+    assert "earlier" not in found.text
+    found.remainder.as_effect()
+    assert max(found.remainder.fitted.misfit.values()) < 1.1
