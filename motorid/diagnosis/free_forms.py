@@ -49,7 +49,7 @@ FINER = 4  # times as many places and knees in a curve that is fitted: what is n
 CHANGES = {"t": "changes with the time", "distance": "changes with the distance run",
            "turn": "changes with the angle within a turn", "theta": "changes with the angle",
            "omega": "changes with the speed", "i": "changes with the current", "v": "changes with the voltage",
-           "run": "differs from run to run",
+           "load": "changes with the power drawn", "run": "differs from run to run",
            "past i": "depends on the current before", "past omega": "depends on the speed before",
            "past v": "depends on the voltage before", "path": "depends on the distance since a reversal",
            "past speed": "depends on how fast it ran before", "past power": "depends on how fast it ran before",
@@ -61,6 +61,7 @@ CHANGES = {"t": "changes with the time", "distance": "changes with the distance 
            "since_reversal": "depends on the time since the voltage was reversed"}
 PAST = ("past i", "past omega", "past v", "past speed", "past power", "past load", "past heat", "past size", "path")
 MEMORIES = 8  # lengths of memory
+TRIPS = (0.02, 0.05, 0.1, 0.2, 0.4)  # of the largest heat: where a fuse or a derating sets in
 PLAY = (0.01, 0.4)  # of the largest value: half of the least and of the largest play
 LASTING = 10.0  # times the longest run: a memory that forgets nothing in it
 
@@ -103,13 +104,15 @@ class Form:
 
 _PUSHES = (  # words, balance, carrier, quantities
     ("a friction", "torque", "direction", ("turn", "theta", "t", "distance", "i", "run", "past speed", "past power",
-                                         *COMPUTED_INPUTS)),
+                                         "past heat", *COMPUTED_INPUTS)),
     ("a load", "torque", "", ("turn", "theta", "t", "run")),
-    ("a drag", "torque", "omega", ("t", "distance", "turn", "theta", "i", "run", "past speed", "past power")),
+    ("a drag", "torque", "omega", ("t", "distance", "turn", "theta", "i", "run", "past speed", "past power",
+                                 "past heat")),
     ("a torque", "torque", "", ("omega", "i")),
-    ("an inertia", "torque", "acceleration", ("turn", "t", "run", "omega")),
+    ("an inertia", "torque", "acceleration", ("turn", "theta", "t", "run", "omega")),
     ("a loss of voltage", "voltage", "", ("omega", "v", "i", "t", "run")),
-    ("a gain of the voltage", "voltage", "v", ("t", "turn", "past load", *COMPUTED_INPUTS)),
+    ("a gain of the voltage", "voltage", "v", ("t", "turn", "load", "past load", "past heat",
+                                            *COMPUTED_INPUTS)),
     ("a resistance", "voltage", "i", ("t", "turn", "omega", "run", "past heat")),
     ("a motor constant", "both", "", ("t", "turn", "omega", "i", "run", "past i", "past size", "most i")),
 )
@@ -221,7 +224,7 @@ def functions_of(form: Form, span: Span) -> list[str]:
     low, high = span.ranges[form.on]
     if form.on == "turn":
         waves = ["1.0", *(f"ca.{f}({k:.6g} * z)" for k in span.orders for f in ("sin", "cos"))]
-        plain = form.carrier == "acceleration" or span.finer == 1  # one needs slopes, and forms compare better by few
+        plain = form.carrier == "acceleration" or span.finer == 1  # none jumps, and forms compare better by few
         return waves if plain else waves + _sectors(PLACES * span.finer) + _lobes()
     if form.on in PAST:
         lengths = memories_of(form, span)
@@ -229,7 +232,9 @@ def functions_of(form: Form, span: Span) -> list[str]:
         top = f"{max(abs(low), abs(high)):.6g}"
         bent = [f"{lag} * ca.fabs({lag}) / {top}" for lag in lags if form.bends]
         if form.carrier:
-            return [f"{lag} / {top}" for lag in (*lags, *bent)] + ["1.0"]
+            trips = [f"ca.fmax({lag} / {top} - {_place(level, 0, 1, '1')}, 0)" for lag in lags if form.on == "past heat"
+                     for level in TRIPS]
+            return [f"{lag} / {top}" for lag in (*lags, *bent)] + trips + ["1.0"]
         return lags + bent + _sided(form, lengths, max(abs(low), abs(high)))
     if form.on in COMPUTED_INPUTS:
         found = ["1.0"]
@@ -261,7 +266,7 @@ def _along(form: Form, span: Span, low: float, high: float) -> list[str]:
     scale = f"{np.pi / (high - low):.9g} * (ca.fmin(ca.fmax(z, {low:.9g}), {high:.9g}) - {low:.9g})"
     centres = [_place(c, low, high) for c in np.linspace(low, high, PLACES * span.finer + 2)[1:-1]]
     steep = f"{SUDDEN * span.finer / (high - low):.6g}"
-    sudden = [f"ca.tanh((z - {c}) * {steep})" for c in centres]
+    sudden = [f"ca.tanh((z - {c}) * {steep})" for c in centres if form.carrier != "acceleration" or form.on == "t"]
     top = f"{max(abs(low), abs(high)):.6g}"  # a slope, a spring that hardens, a stop, a slack, a ramp
     sudden += [*(f"(z / {top})**{k}" for k in (1, 2, 3)), *(f"ca.fmax((z - {c}) / {top}, 0)" for c in centres)]
     if form.on == "t":  # what swings as the records begin: another machine, a table that turns
@@ -359,16 +364,6 @@ def values_of(functions: Sequence[str], form: Form, signal: Mapping[str, Array])
     return np.column_stack([np.broadcast_to(np.asarray(eval(f, names), float), z.shape) for f in fixed])
 
 
-def slopes_over_turn(functions: Sequence[str]) -> list[str]:
-    """Return the slopes of functions over a turn, as source."""
-    slopes = []
-    for f in functions:
-        name, _, rest = f.partition("(")
-        k = rest.split(" *")[0]
-        slopes.append({"ca.sin": f"{k} * ca.cos({rest}", "ca.cos": f"-{k} * ca.sin({rest}"}.get(name, "0.0"))
-    return slopes
-
-
 def basis_of(form: Form, signal: Mapping[str, Array], span: Span) -> Array:
     """Return the form's functions, times its carrier, along one run, (N, m)."""
     z = signal[form.on]
@@ -377,9 +372,10 @@ def basis_of(form: Form, signal: Mapping[str, Array], span: Span) -> Array:
     else:
         source = functions_of(form, span)
         functions = values_of(source, form, signal)
-        if form.carrier == "acceleration" and form.on == "turn":  # kinetic energy that changes with the angle
-            return functions * signal["acceleration"][:, None] + (
-                signal["energy"][:, None] * values_of(slopes_over_turn(source), form, signal))
+        if form.carrier == "acceleration" and form.on in ("turn", "theta"):  # kinetic energy changes with the angle
+            step = NUDGE * (span.ranges[form.on][1] - span.ranges[form.on][0])
+            there = values_of(source, form, {**signal, form.on: z + step})
+            return functions * signal["acceleration"][:, None] + signal["energy"][:, None] * (there - functions) / step
     return functions * signal[form.carrier][:, None] if form.carrier else functions
 
 
@@ -460,7 +456,8 @@ def _signals(fit: Fit, k: int) -> dict[str, Array]:
         found["path"], found["distance"] = found["direction"], np.concatenate([[0.0], gone])
         found["past speed"], found["past power"] = np.abs(omega), omega**2
     if "i" in found:
-        found["past load"], found["most i"] = found["v"] * found["i"], np.maximum.accumulate(np.abs(found["i"]))
+        found["load"] = found["past load"] = found["v"] * found["i"]
+        found["most i"] = np.maximum.accumulate(np.abs(found["i"]))
         found["past size"], found["past heat"] = np.abs(found["v"]), found["i"] ** 2
     found |= {f"past {c}": found[c] for c in ("v", "i", "omega") if c in found}
     found |= {c: time_since(run, c) for c in COMPUTED_INPUTS}

@@ -33,7 +33,6 @@ from motorid.diagnosis.free_forms import (
     linearised,
     memories_of,
     signals_along,
-    slopes_over_turn,
     span_of,
     values_of,
 )
@@ -62,14 +61,15 @@ TASTED = 2  # functions by which forms are compared, and
 AHEAD = 2  # how many then go on
 QUANTITIES = {"turn": "m.theta", "theta": "m.theta", "omega": "m.omega", "i": "m.i", "v": "m.v", "past v": "m.v",
               "past i": "m.i", "past omega": "m.omega", "past speed": "ca.fabs(m.omega)", "past power": "m.omega**2",
-              "path": "m.sign(m.omega)", "past load": "m.v * m.i", "past heat": "m.i**2",
+              "path": "m.sign(m.omega)", "load": "m.v * m.i", "past load": "m.v * m.i", "past heat": "m.i**2",
               "past size": "ca.fabs(m.v)",
               **{c: f"m.input('{c}')" for c in COMPUTED_INPUTS}}
 STATES = {  # quantities that are states of the curve's own: name, where it begins, rate
     "t": ("clock", "0.0", "1.0"), "distance": ("distance", "0.0", "ca.fabs(m.omega)"),
     "most i": ("most_i", "ca.fabs(m.start['i'])", "ca.fmax(ca.fabs(m.i) - most_i, 0) / {step:.6g}")}
-SI = {"theta": "rad", "omega": "rad/s", "i": "A", "v": "V", "size": "V"}
-OTHER_PLACES = {"V": "half of its play", "A": "half of its play", "rad/s": "how fast it swings, or half of its play",
+SI = {"theta": "rad", "omega": "rad/s", "i": "A", "v": "V", "size": "V", "load": "W"}
+OTHER_PLACES = {"1": "where it sets in, a share of the largest", "V": "half of its play", "A": "half of its play",
+                "rad/s": "how fast it swings, or half of its play",
                 "V/s": "how fast it rises", "rad": "its phase", "rad^2": "its width, squared"}
 OVER = {"": "", "A": "/A", "V": "/V", "rad/s": "·s/rad"}
 FIRST = {"past i": ", m.start['i']", "past omega": ", m.start['omega']"}  # of a memory: as if it had been so before
@@ -151,7 +151,7 @@ class Part:
     def place(self) -> tuple[str, str]:
         """Unit of the places, and what they are."""
         on = self.form.on
-        if on in ("omega", "i", "v"):
+        if on in ("omega", "i", "v", "load"):
             return "", f"where it bends, a share of {number(max(map(abs, self.span.ranges[on])), 4)} {SI[on]}"
         unit = "rad" if on in ("theta", "turn", "distance", "path") else "s"
         return unit, "how long it remembers" if on in PAST else "where it bends, sets in or fades"
@@ -172,9 +172,9 @@ class Part:
                 lines += [f"{past} = m.state('{own}_{past}'{FIRST.get(form.on, '')})", f"m.rate({past}, {change})"]
                 terms = [t.replace(lag, past) for t in terms]
         lines += ["curve = (", *(f"    + {n} * {t}" for n, t in zip(names, terms, strict=True)), ")"]
-        if form.carrier == "acceleration" and form.on == "turn":  # kinetic energy that changes with the angle
-            slopes = slopes_over_turn(terms)
-            lines += ["slope = (", *(f"    + {n} * {t}" for n, t in zip(names, slopes, strict=True)), ")",
+        if form.carrier == "acceleration" and form.on in ("turn", "theta"):  # kinetic energy changes with the angle
+            lines[0] = "z = ca.SX.sym('z')"
+            lines += ["slope, curve = (ca.substitute(f, z, m.theta) for f in (ca.jacobian(curve, z), curve))",
                       "m.torque -= 0.5 * m.J / (1 + curve) * slope * m.omega**2"]
         if form.carrier == "acceleration":
             return "\n".join([*lines, "m.scale('J', 1 + curve)"])
@@ -445,6 +445,9 @@ def _beyond(base: Fit | None) -> Iterator[tuple[Fit, Form]]:
             yield from ((base, gain.form) for gain in better_forms(base, base))
 
 
+CLEAN = 1.05  # times the noise, of which no more is known than that: what leaves less cannot be told from the law
+
+
 class Grown(NamedTuple):
     """A curve as far as it has grown, what it predicts, and what of that is better than without its last form."""
 
@@ -457,6 +460,11 @@ class Grown(NamedTuple):
         """Tell whether it leaves no more than noise."""
         return self.gained.worth_it and self.curve.fitted is not None and (
             at_noise(Node(self.curve.fitted, None, self.predictions)))
+
+    @property
+    def clean(self) -> bool:
+        """Tell whether no other curve could do better."""
+        return self.done and self.curve.fitted is not None and max(self.curve.fitted.misfit.values()) < CLEAN
 
 
 @one_thread
@@ -513,9 +521,9 @@ def _better_curve(tried: Iterable[tuple[Curve, Form]], before: Predictions, held
 def _race(found: dict[Any, Grown], tried: Iterable[tuple[Curve, Form]], before: Predictions,
           held: HeldOut) -> list[tuple[Curve, Form]]:
     """Put into `found` the curves, each with a form more: the first to its end, of the others those that get furthest
-    with few functions (successive halving: Karnin, Koren & Somekh, ICML 2013), until one leaves noise.
+    with few functions (successive halving: Karnin, Koren & Somekh, ICML 2013), until one leaves nothing but noise.
 
-    Returns those that got furthest of all; none where one leaves noise.
+    Returns those that got furthest of all; none where one leaves nothing more.
     """
     racing = dict[Any, Iterator[Grown]]()
 
@@ -524,7 +532,7 @@ def _race(found: dict[Any, Grown], tried: Iterable[tuple[Curve, Form]], before: 
             found[key] = grown
             if k >= functions and not grown.done:
                 break
-        return key in found and found[key].done
+        return key in found and found[key].clean
 
     for key in tried:
         if (key[0].fit.model.effect_names, key[1]) not in {(c.fit.model.effect_names, f) for c, f in racing}:

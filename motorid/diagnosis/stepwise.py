@@ -176,10 +176,12 @@ def _beside_curves(found: Climb, seconds: float | None) -> Climb:
     Forms are compared by slopes, and these lead astray far from the records.
     """
     search, best, grades = found.search, found.path[-1], list(found.grades)
-    if all(g.grade == "approximates" for g in grades):
+    if found.remaining.adequate or all(g.grade == "approximates" for g in grades):
         return found
     found, curve = _curve_alone(found, search.root.fit, search.held, seconds)
-    for k, g in enumerate(grades if curve is not None else ()):
+    if curve is None:
+        return found
+    for k, g in enumerate(grades):
         if g.grade != "approximates" and (smaller := search.without(best, g.effect)) is not None and (
                 outdoes(evidence(smaller, best).fall, curve.evidence.fall)):
             grades[k] = Grade(g.effect, "approximates", IN_ITS_PLACE.format(curve.form.text), curve.form)
@@ -188,8 +190,8 @@ def _beside_curves(found: Climb, seconds: float | None) -> Climb:
 
 def _curve_alone(found: Climb, root: Fit, held: HeldOut, seconds: float | None) -> tuple[Climb, FormGain | None]:
     """Return a climb, stopped where the time is up, and the form that in the place of all that was found, beside
-    `root`, leaves noise; None where there is none, or no structure is left."""
-    if found.stopped or found.remaining.adequate:
+    `root`, leaves noise and predicts better; None where there is none."""
+    if found.stopped:
         return found, None
     try:
         with budget(seconds):

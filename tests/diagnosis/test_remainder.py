@@ -143,8 +143,8 @@ def test_of_two_laws_that_the_library_lacks_each_gets_a_curve(beyond, lab, tmp_p
     fit = mi.fit(found.remainder.model + effect, runs)
     assert min(over_floor(found.best, check, clean[-1]).values()) > 4
     assert max(over_floor(fit, check, clean[-1]).values()) < 1.15
-    assert effect.doc == ("What is left: a loss of voltage that changes with the voltage and a torque that changes "
-                          "with the speed.")
+    assert set(effect.doc.removeprefix("What is left: ").removesuffix(".").split(" and ")) == {
+        "a loss of voltage that changes with the voltage", "a torque that changes with the speed"}
     assert {p.unit for p in effect.parameters if p.null == 0} == {"N·m", "V"}
     (tmp_path / "own.py").write_text(found.remainder.code("both"), encoding="utf-8")
     written = own_effects(tmp_path / "own.py")["both"]
@@ -525,6 +525,35 @@ def wound_field(m, k=mi.P(0.3, "", null=0.0)):
 
 
 @mi.effect(balance="torque")
+def tightening(m, tau=mi.P(8e-3, "N·m", null=0.0)):
+    """A bearing that loses its play as the winding's heat reaches it."""
+    heat = m.state("heat")
+    m.rate(heat, (m.i**2 - heat) / 0.15)
+    m.torque -= tau * m.sign(m.omega) * heat
+
+
+@mi.effect(balance="torque")
+def reel(m, c=mi.P(0.03, "1/rad", null=0.0)):
+    """What it winds up grows."""
+    radius, inertia = 1 + c * m.theta, m.symbols["J"]
+    m.torque -= inertia * radius * c * m.omega**2
+    m.scale("J", radius**2)
+
+
+@mi.effect(balance="voltage")
+def derated(m, g=mi.P(0.4, "", null=0.0)):
+    """A drive that takes back its voltage after too much current."""
+    heat = m.state("heat")
+    m.rate(heat, (m.i**2 - heat) / 0.1)
+    m.voltage -= m.v * ca.fmin(g * ca.fmax(heat / 0.3 - 1, 0), 0.8)
+
+
+@mi.effect(balance="voltage")
+def of_limited_power(m, share=mi.P(1.0, "", null=0.0)):
+    m.voltage -= m.v * share * (1 - 2.0 / ca.fmax(m.v * m.i, 2.0))
+
+
+@mi.effect(balance="torque")
 def whirl(m, tau=mi.P(0.03, "N·m", null=0.0)):
     """A shaft that shakes near one speed."""
     m.torque -= tau * m.sign(m.omega) / (1 + ((ca.fabs(m.omega) - 50) / 8) ** 2)
@@ -535,7 +564,8 @@ def whirl(m, tau=mi.P(0.03, "N·m", null=0.0)):
     (loose_encoder, ANGLE, "an error of the angle sensor that depends on the distance since a reversal"),
     (governor, ANGLE[:2], "an inertia that changes with the speed"),
     (pumped, ANGLE[:2], "a gain of the voltage that depends on the power drawn before"),
-    (wound_field, ANGLE[:2], "a motor constant that depends on the voltage before")])
+    (wound_field, ANGLE[:2], "a motor constant that depends on the voltage before"),
+    (tightening, ANGLE[:2], "a friction that depends on the heat of the current before")])
 def test_what_changes_in_sensors_inertia_and_supply_is_found(law, channels, follows, lab):
     runs, floor = _with_law(law, channels, lab)
     found = mi.diagnose(mi.fit(mi.dc_motor(), runs[:2]), runs[2:], effects=("coulomb", "quadratic_drag"))
@@ -544,6 +574,19 @@ def test_what_changes_in_sensors_inertia_and_supply_is_found(law, channels, foll
     before, after = (mi.evaluate(f, runs[2]).nrmse for f in (found.best, fit))
     assert max(after[c] / floor[c] for c in after) < 1.1
     assert max(before[c] / after[c] for c in after) > 2.5
+
+
+@pytest.mark.parametrize(("law", "channels", "follows"), [
+    (reel, ANGLE, "an inertia that changes with the angle"),
+    (derated, ANGLE[:2], "a gain of the voltage that depends on the heat of the current before"),
+    (of_limited_power, ANGLE[:2], "a gain of the voltage that changes with the power drawn")])
+def test_what_grows_trips_or_is_limited_is_found_as_far_as_the_records_go(law, channels, follows, lab):
+    """The held-out run goes further, where no curve is known."""
+    runs, _ = _with_law(law, channels, lab)
+    found = mi.diagnose(mi.fit(mi.dc_motor(), runs[:2]), runs[2:], effects=("coulomb", "quadratic_drag"))
+    assert found.remainder.follows == follows
+    assert max(found.best.misfit.values()) > 10
+    assert max(found.remainder.fitted.misfit.values()) < 1.1
 
 
 def test_a_drag_that_peaks_near_one_speed_takes_knees_as_narrow(lab):
