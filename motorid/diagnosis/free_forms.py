@@ -111,8 +111,7 @@ _PUSHES = (  # words, balance, carrier, quantities
     ("a torque", "torque", "", ("omega", "i")),
     ("an inertia", "torque", "acceleration", ("turn", "theta", "t", "run", "omega")),
     ("a loss of voltage", "voltage", "", ("omega", "v", "i", "t", "run")),
-    ("a gain of the voltage", "voltage", "v", ("t", "turn", "load", "past load", "past heat",
-                                            *COMPUTED_INPUTS)),
+    ("a gain of the voltage", "voltage", "v", ("t", "turn", "load", "past load", "past heat", *COMPUTED_INPUTS)),
     ("a resistance", "voltage", "i", ("t", "turn", "omega", "run", "past heat")),
     ("a motor constant", "both", "", ("t", "turn", "omega", "i", "run", "past i", "past size", "most i")),
 )
@@ -194,7 +193,8 @@ def shown(form: Form, fit: Fit, ranges: Mapping[str, tuple[float, float]]) -> bo
         low, high = ranges["omega"]
         if min(-low, high) <= STILL * max(-low, high):
             return False
-    if "i" not in outputs and (form.balance in ("voltage", "both") or form.on == "i"):
+    of_the_drive = form.on in ("v", "past v") or (form.carrier == "v" and form.on in ("t", *COMPUTED_INPUTS))
+    if "i" not in outputs and not of_the_drive and (form.balance in ("voltage", "both") or form.on == "i"):
         return False  # there a torque over the speed says the same
     if (form.remembers or form.on == "distance") and fit.window is not None:
         return False  # what was before a window is not known
