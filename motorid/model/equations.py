@@ -23,16 +23,10 @@ def reciprocal(x: ca.SX) -> ca.SX:
 class Equations:
     """Balances, quantities, states and sensors of one model while it is being written.
 
-    An effect reads ``m.i, m.omega, m.theta, m.v, m.R, m.K, …`` and writes ``m.voltage``, ``m.torque``,
-    `scale`, `replace`, `state`/`rate` and `measure`. A quantity that is read is a placeholder, filled when
-    the model closes, so the order of effects does not matter.
-
-    Parameters
-    ----------
-    states : tuple of str
-        The states of the base, among ``i, omega``.
-    angle_input : bool
-        The angle seen by the effects is a given signal instead of the model's own state.
+    An effect reads ``m.i, m.omega, m.theta, m.v, m.R, m.K, …`` and writes ``m.voltage``, ``m.torque``, `scale`,
+    `replace`, `state`/`rate` and `measure`. A quantity that is read is a placeholder, filled when the model closes, so
+    the order of effects does not matter. `states` are those of the base, among ``i, omega``; with `angle_input` the
+    angle seen by the effects is a given signal instead of the model's own state.
     """
 
     def __init__(self, states: tuple[str, ...], angle_input: bool = False) -> None:
@@ -266,7 +260,10 @@ def build_system(m: Equations, parameters: tuple[str, ...], outputs: tuple[str, 
     x, u = ca.vertcat(*m.states.values()), ca.vertcat(*m.inputs.values())
     p, s = ca.vertcat(*[m.symbols[n] for n in parameters]), ca.vertcat(*m.start.values())
     quiet = ca.substitute(f, d, ca.DM.zeros(2))
-    _check_closed(ca.vertcat(quiet, y, balances), ca.vertcat(x, u, p))
+    used, defined = ({s.name() for s in ca.symvar(ca.vertcat(*e))} for e in ((quiet, y, balances), (x, u, p)))
+    if stray := sorted(used - defined):
+        raise ModelError(f"the model uses {', '.join(stray)}, which nothing defines. Effects may use only the sheet m "
+                         "and their own parameters.")
     return System(names, tuple(m.inputs), outputs, parameters,
                   tuple(k in stored or k not in ("i", "omega") for k in names),
                   ca.Function("rhs", [x, u, p], [ca.densify(quiet)], ["x", "u", "p"], ["f"]),
@@ -274,10 +271,3 @@ def build_system(m: Equations, parameters: tuple[str, ...], outputs: tuple[str, 
                   ca.Function("initial", [s, p], [ca.densify(x0)], ["s", "p"], ["x0"]),
                   ca.Function("balances", [x, u, p], [ca.densify(balances)], ["x", "u", "p"], ["balance"]),
                   ca.Function("forces", [x, u, p, d], [ca.densify(f)], ["x", "u", "p", "d"], ["f"]))
-
-
-def _check_closed(expression: ca.SX, known: ca.SX) -> None:
-    defined, used = ({s.name() for s in ca.symvar(e)} for e in (known, expression))
-    if stray := sorted(used - defined):
-        raise ModelError(f"the model uses {', '.join(stray)}, which nothing defines. Effects may use only "
-                         "the sheet m and their own parameters.")

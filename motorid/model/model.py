@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Any
@@ -72,7 +72,8 @@ class Model(Shown):
                                  "rename it in the effect, or leave one of the two effects out.")
         added = {p.name: self._in_units(p) for p in other.parameters}
         model = self.with_(effects=(*self.effects, other), parameters={**self.parameters, **added})
-        if _smooths(model) and "sgn_width" not in model.parameters:
+        smooth = _once(model, lambda m: m.write().sgn_width is not None)  # ModelError if effects contradict one another
+        if smooth and "sgn_width" not in model.parameters:
             model = model.with_(parameters={**model.parameters, "sgn_width": self._in_units(SGN_WIDTH)})
         return model
 
@@ -196,10 +197,7 @@ class Model(Shown):
     def system(self, outputs: Collection[str]) -> System:
         """Return the CasADi functions of the model for the measured `outputs`, made once per choice.
 
-        Raises
-        ------
-        ModelError
-            If the model cannot show a channel, or definitions go in a circle.
+        ModelError if the model cannot show a channel, or definitions go in a circle.
         """
         for c in outputs:
             among(c, CHANNELS, "channel", ModelError)
@@ -208,7 +206,7 @@ class Model(Shown):
             raise ModelError(f"the base '{self.base}' has no current: leave the channel 'i' out, or use dc_motor().")
         key = (chosen, self.stored)
         if key not in self._systems:
-            self._systems[key] = _shared_system(self, chosen)
+            self._systems[key] = _once(self, _system, *key)
         return self._systems[key]
 
     def check_visible(self, outputs: Collection[str]) -> None:
@@ -237,41 +235,33 @@ def _known_of(structure: Any) -> list[Any]:
     return []
 
 
-def _structure(model: Model) -> tuple[Any, ...]:
-    """All that the equations depend on; values are no part of it."""
+def _once(model: Model, make: Callable[..., Any], *more: Any) -> Any:
+    """Return ``make(model, *more)``, made once for all models whose equations are the same: values are no part."""
     laws = tuple((e.name, e.law) for e in model.effects)
-    return (model.base, laws, tuple(model.parameters), model.angle_input)
-
-
-def _smooths(model: Model) -> bool:
-    """Tell whether an effect uses a smooth sgn; ModelError if the effects contradict one another."""
-    slot = _known_of(_structure(model))
+    slot = _known_of((model.base, laws, tuple(model.parameters), model.angle_input, *more))
     if not slot:
-        slot.append(model.write().sgn_width is not None)
+        slot.append(make(model, *more))
     return slot[0]
 
 
-def _shared_system(model: Model, outputs: tuple[str, ...]) -> System:
-    """Return the system of the model's structure, shared by all models that differ in values only."""
-    slot = _known_of((*_structure(model), outputs, model.stored))
-    if not slot:
-        equations, title = model.write(), model.name
-        try:
-            system = build_system(equations, tuple(model.parameters), outputs, model.stored)
-            _ = system.visible  # its slopes
-        except (RuntimeError, IndexError, TypeError) as error:  # CasADi's, and of shapes that are no single number
-            raise ModelError(f"the equations of {title} cannot be built and differentiated: "
-                             f"{str(error).splitlines()[-1]}.") from None
-        f = system.rhs
-        if any(f.instruction_id(k) == ca.OP_CALL for k in range(f.n_instructions())):
-            raise ModelError(f"the equations of {title} call a function that is no arithmetic, so they cannot be "
-                             "differentiated: write it with CasADi's own operations.")
-        if not all(math.isfinite(f.instruction_constant(k)) for k in range(f.n_instructions())
-                   if f.instruction_id(k) == ca.OP_CONST):
-            raise ModelError(f"the equations of {title} hold a number that is not finite: did a law turn a symbol into "
-                             "a float?")
-        slot.append(system)
-    return slot[0]
+def _system(model: Model, outputs: tuple[str, ...], stored: tuple[str, ...]) -> System:
+    """Return the system of the model's structure, its slopes known."""
+    equations, title = model.write(), model.name
+    try:
+        system = build_system(equations, tuple(model.parameters), outputs, stored)
+        _ = system.visible  # its slopes
+    except (RuntimeError, IndexError, TypeError) as error:  # CasADi's, and of shapes that are no single number
+        raise ModelError(f"the equations of {title} cannot be built and differentiated: "
+                         f"{str(error).splitlines()[-1]}.") from None
+    f = system.rhs
+    operations = [(f.instruction_id(k), k) for k in range(f.n_instructions())]
+    if any(operation == ca.OP_CALL for operation, _ in operations):
+        raise ModelError(f"the equations of {title} call a function that is no arithmetic, so they cannot be "
+                         "differentiated: write it with CasADi's own operations.")
+    if not all(math.isfinite(f.instruction_constant(k)) for operation, k in operations if operation == ca.OP_CONST):
+        raise ModelError(f"the equations of {title} hold a number that is not finite: did a law turn a symbol into a "
+                         "float?")
+    return system
 
 
 def dc_motor(**values: float) -> Model:
