@@ -51,8 +51,11 @@ def plot_current_limit(*results: Fit | Formulations, limit: float | None = None,
         raise UsageError("no CurrentLimit in these fits; say which one to draw: mi.plot_current_limit(fit, limit=8.0).")
     if not all("i" in s.outputs for f in fits for s in f.simulations):
         raise UsageError("these fits have no current: it was not measured, or the model has none.")
+    words = labels or [f.formulation for f in fits]
+    if len(words) != len(fits):
+        raise UsageError(f"plot_current_limit takes one label per fit, {len(fits)} in all; got {len(words)}.")
     axes = style.grid(len(fits), min(len(fits[0].simulations), 3), row=1.5, sharex="col", sharey="row")
-    for row, fit, word in zip(axes, fits, labels or [f.formulation for f in fits], strict=False):
+    for row, fit, word in zip(axes, fits, words, strict=True):
         for ax, s in zip(row, fit.simulations, strict=False):
             _against_limit(ax, s, limit)
         row[0].set(ylabel=f"{word}\n{style.axis_label('i')}")

@@ -304,6 +304,7 @@ def test_binned_means_follow_the_curve(rng):
         (lambda d: plots.plot_waterfall(d.before), "plot_waterfall takes"),
         (lambda d: plots.plot_current_limit(d.before), "no CurrentLimit"),
         (lambda d: plots.plot_current_limit(), "plot_current_limit takes fits"),
+        (lambda d: plots.plot_current_limit(d.before, d.after, limit=1.0, labels=["one"]), "one label per fit"),
     ],
 )
 def test_a_wrong_argument_is_told_what_to_pass(found, call, words):
