@@ -87,7 +87,8 @@ def _emptied(fit: Fit, added: Effect, before: Fit) -> str:
         return ""
     for p, std in zip(before.problem.unknown, before.certainty("white").std, strict=True):
         was, now = (f.values.get(p.name, 0.0) for f in (before, fit))
-        if p.positive and std is not None and std < KNOWN * was and now < EMPTIED * was:
+        told = (fit.std.get(p.name) or np.inf) < KNOWN * now  # small, but not zero: what was missing had made it large
+        if p.positive and std is not None and std < KNOWN * was and now < EMPTIED * was and not told:
             return f"{p.name} goes to zero with it, although the data determine it without it"
     return ""
 

@@ -237,13 +237,12 @@ def _polished(fit: Fit, problem: Problem) -> Fit | None:
             if max(abs(np.log(factors[c] / problem.noise_factors.get(c, 1.0))) for c in factors) > 0.1:
                 done = _converged(done.onward.tuned(noise_factors=factors))
         done = sharpened(past_ripples(done, POLISH), POLISH)
-    except FAILURES:
+        found, problem = done.solution, done.problem
+        fit = Fit(problem, problem.values(found.q), found.residual, found.jac / problem.scaling.slope(found.q), found.q,
+                  found.status, found.message, done.history)
+        return fit if np.isfinite(found.jac).all() and fit.simulations else None
+    except FAILURES:  # also where the optimum lies at the edge of what can be simulated
         return None
-    found, problem = done.solution, done.problem
-    if not np.isfinite(found.jac).all():
-        return None
-    return Fit(problem, problem.values(found.q), found.residual, found.jac / problem.scaling.slope(found.q), found.q,
-               found.status, found.message, done.history)
 
 
 def _converged(problem: Problem) -> Estimate:

@@ -228,6 +228,19 @@ def test_a_sensor_that_empties_a_known_parameter_is_refused():
     assert "goes to zero" not in objections(after, LIBRARY["current_lag"], before)
     emptied = replace(after, values={**after.values, "L": 1e-9})
     assert "L goes to zero" in objections(emptied, LIBRARY["current_lag"], before)
+    before = replace(before, values={**before.values, "L": 200 * after.values["L"]})  # which made up for a slew rate
+    assert "goes to zero" not in objections(after, LIBRARY["current_lag"], before)
+
+
+def test_a_refit_that_ends_where_nothing_can_be_simulated_is_none(monkeypatch):
+    """Of a whisk's record on the world's bench the derivatives were finite there, and the diagnosis ended."""
+    before = mi.fit(mi.dc_motor(**TRUE), _run(mi.dc_motor(**TRUE)))
+
+    def lost(fit):
+        raise mi.SimulationError("left the finite numbers")
+
+    monkeypatch.setattr(trial.Fit, "simulations", property(lost))
+    assert trial.finished(before, trial.Raced(before.problem, 1.0, 1.0, False)) is None
 
 
 def test_parts_show_both_directions_and_what_is_rare():
