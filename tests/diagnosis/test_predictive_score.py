@@ -424,5 +424,6 @@ def test_a_plain_fall_of_the_held_out_error_is_told_where_the_density_is_not_sur
 
     root = node(None, moves, None)
     child, refused = node("gravity", moving, root), node("spring", moving, root, "goes to zero")
-    assert stepwise._better([refused, child], root) == (child, [child])  # it begins a ladder
+    assert stepwise._better([refused, child], root) == (child, [child, refused])  # it begins a ladder
+    assert stepwise._better([refused], root) == (refused, [refused])  # also against physics, as an approximation
     assert stepwise._better([child], node("coulomb", moves, root)) is None  # and adds no rung to one
