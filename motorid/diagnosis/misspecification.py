@@ -39,6 +39,7 @@ from motorid.diagnosis.predictive_score import (
 )
 from motorid.diagnosis.thresholds import MOST, STANDARD_ERRORS, SUPPLANTS, TRIFLE, UNCONTESTED
 from motorid.display.numbers import listed, percent
+from motorid.estimation.angle_orders import uses_angle
 from motorid.estimation.fit import follows
 from motorid.estimation.least_squares import FAILURES
 from motorid.estimation.linearisation import INSEPARABLE
@@ -191,7 +192,15 @@ def grades_of(last: Node, root: Node, groups: Sequence[Sequence[str]], beside: S
                 why = f"it removes {percent(taken, 2)} of the squared error, and the rest is not noise"
         kind = "approximates" if why else "group" if rivals.get(e.name) else "named"
         found.append(Grade(e.name, kind, why, form))
-    return tuple(found)
+    return _with_zeros_alike(tuple(found), last.fit)
+
+
+def _with_zeros_alike(grades: tuple[Grade, ...], fit: Fit) -> tuple[Grade, ...]:
+    """Return grades where an encoder's zero of every run is no surer than the effects over the angle beside it."""
+    over = {e.name: any(p.per_run for p in e.parameters) for e in fit.model.effects if uses_angle(e)}
+    asking = [g for g in grades if over.get(g.effect) is False]
+    alike = len(asking) == sum(not zero for zero in over.values()) and {g.grade for g in asking} == {"approximates"}
+    return tuple(replace(asking[0], effect=g.effect) if alike and over.get(g.effect) else g for g in grades)
 
 
 def outdoes(fall: float, further: float) -> bool:

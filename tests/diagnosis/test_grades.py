@@ -286,3 +286,17 @@ def test_what_stands_only_beside_imitators_of_a_free_form_is_not_named(monkeypat
     told = stepwise._sure_alone(SimpleNamespace(without=without, root=None), nodes[best], beside)
     assert told[1:] == beside[1:]
     assert told[0] == (beside[0] if kept else Grade("coulomb", "approximates", alone, form))
+
+
+def test_a_zero_of_the_encoder_is_no_surer_than_what_asks_for_it(lab):
+    """Of a robot's wheels the ripple ran to its limit, and the zero beside it was named."""
+    runs = runs_of(lab, HIDDEN, channels=("omega", "theta"), n=200)
+    fit = mi.fit(mi.dc_motor() + mi.effects.torque_ripple + mi.effects.encoder_zero + mi.effects.coulomb, runs[:2])
+    ripple = Grade("torque_ripple", "approximates", "a_r runs to 1")
+    grades = ripple, Grade("encoder_zero", "named"), Grade("coulomb", "named")
+    told = misspecification._with_zeros_alike(grades, fit)
+    assert [g.grade for g in told] == ["approximates", "approximates", "named"]
+    assert told[1].why == ripple.why
+    sure = replace(ripple, grade="named"), *grades[1:]
+    assert misspecification._with_zeros_alike(sure, fit) == sure
+    assert misspecification._with_zeros_alike(grades[1:], fit) == grades[1:]  # of a ripple that was there before
