@@ -42,7 +42,7 @@ SOON = (3, 10, 30, 100, 300)  # the same of what fades after each switching
 STILL = 0.02  # of the highest speed: slower is standstill
 SHARP = 1e-3  # of the highest speed: below it a direction is not known
 SOFT = 0.01  # of the largest current or voltage: the width of a jump at zero
-BENDS = (4, 12)  # times the largest speed, current or voltage goes a curve's bend into it
+BENDS = (0.25, 0.08)  # of the largest speed, current or voltage: within which a curve bends
 KNEES = 9  # of a speed, current or voltage of either sign, beyond which something sets in
 BOTH_WAYS = 0.5  # of the larger side that the smaller one reaches at least: both are known alike
 FINER = 4  # times as many places and knees in a curve that is fitted: what is narrow stands between the few
@@ -53,13 +53,15 @@ CHANGES = {"t": "changes with the time", "distance": "changes with the distance 
            "past i": "depends on the current before", "past omega": "depends on the speed before",
            "past v": "depends on the voltage before", "path": "depends on the distance since a reversal",
            "past speed": "depends on how fast it ran before", "past power": "depends on how fast it ran before",
-           "past load": "depends on the power drawn before", "past heat": "depends on the heat of the current before",
+           "past load": "depends on the power drawn before", "past braking": "depends on the power fed back before",
+           "past heat": "depends on the heat of the current before",
            "past size": "depends on the voltage before",
            "most i": "depends on the largest current so far",
            "since_change": "depends on how long the voltage has not changed",
            "since_switch": "depends on how long the voltage has been on or off",
            "since_reversal": "depends on the time since the voltage was reversed"}
-PAST = ("past i", "past omega", "past v", "past speed", "past power", "past load", "past heat", "past size", "path")
+PAST = ("past i", "past omega", "past v", "past speed", "past power", "past load", "past braking", "past heat",
+        "past size", "path")
 MEMORIES = 8  # lengths of memory
 TRIPS = (0.02, 0.05, 0.1, 0.2, 0.4)  # of the largest heat: where a fuse or a derating sets in
 PLAY = (0.01, 0.4)  # of the largest value: half of the least and of the largest play
@@ -103,15 +105,16 @@ class Form:
 
 
 _PUSHES = (  # words, balance, carrier, quantities
-    ("a friction", "torque", "direction", ("turn", "theta", "t", "distance", "i", "run", "past speed", "past power",
-                                         "past heat", *COMPUTED_INPUTS)),
+    ("a friction", "torque", "direction", ("turn", "theta", "t", "distance", "i", "v", "run", "past speed",
+                                         "past power", "past heat", *COMPUTED_INPUTS)),
     ("a load", "torque", "", ("turn", "theta", "t", "run")),
     ("a drag", "torque", "omega", ("t", "distance", "turn", "theta", "i", "run", "past speed", "past power",
                                  "past heat")),
     ("a torque", "torque", "", ("omega", "i")),
     ("an inertia", "torque", "acceleration", ("turn", "theta", "t", "run", "omega")),
     ("a loss of voltage", "voltage", "", ("omega", "v", "i", "t", "run")),
-    ("a gain of the voltage", "voltage", "v", ("t", "turn", "load", "past load", "past heat", *COMPUTED_INPUTS)),
+    ("a gain of the voltage", "voltage", "v", ("t", "turn", "load", "past load", "past braking",
+                                                   "past heat", *COMPUTED_INPUTS)),
     ("a resistance", "voltage", "i", ("t", "turn", "omega", "run", "past heat")),
     ("a motor constant", "both", "", ("t", "turn", "omega", "i", "run", "past i", "past size", "most i")),
 )
@@ -286,7 +289,8 @@ def _of_size(form: Form, span: Span, low: float, high: float) -> list[str]:
         low, high = -top, top
     s = f"(ca.fmin(ca.fmax(z, {low:.9g}), {high:.9g}) / {top:.6g})"
     size = f"ca.fabs{s}"
-    smooth = [s, f"{s}**2", f"{s}**3", *(f"ca.tanh({k} * {s})" for k in BENDS)]
+    bends = [_place(bend, SOFT, 1) if form.carrier else bend for bend in BENDS]
+    smooth = [s, f"{s}**2", f"{s}**3", *(f"ca.tanh({s} / {bend})" for bend in bends)]
     sides = [sign for sign, reach in (("", high), ("-", -low)) if reach > 0]
     knees = [_place(c, 0, 1) for c in np.linspace(0, 1, KNEES * span.finer + 2)[1:-1]]
     smooth += [f"ca.fmax({sign}{s} - {c}, 0)" for sign in sides for c in knees]
@@ -294,7 +298,7 @@ def _of_size(form: Form, span: Span, low: float, high: float) -> list[str]:
         return ["1.0", *smooth]
     smooth += [f"(ca.fmax({s} - {c}, 0) - ca.fmax(-{s} - {c}, 0))" for c in knees]  # the same either way
     side = "m.sign(z)" if form.on == "omega" else f"ca.tanh(z / {SOFT * top:.6g})"
-    return [side, *smooth, f"{s} * {size}", "1.0", size, f"{size}**3", *(f"ca.tanh({k} * {size})" for k in BENDS)]
+    return [side, *smooth, f"{s} * {size}", "1.0", size, f"{size}**3", *(f"ca.tanh({size} / {bend})" for bend in bends)]
 
 
 def _sectors(count: int) -> list[str]:
@@ -458,6 +462,7 @@ def _signals(fit: Fit, k: int) -> dict[str, Array]:
     if "i" in found:
         found["load"] = found["past load"] = found["v"] * found["i"]
         found["most i"] = np.maximum.accumulate(np.abs(found["i"]))
+        found["past braking"] = np.maximum(-found["load"], 0.0)
         found["past size"], found["past heat"] = np.abs(found["v"]), found["i"] ** 2
     found |= {f"past {c}": found[c] for c in ("v", "i", "omega") if c in found}
     found |= {c: time_since(run, c) for c in COMPUTED_INPUTS}

@@ -59,14 +59,15 @@ FEW = 8  # functions at most whose places are fitted, too
 ROUNDS = 3  # of choosing functions and fitting: near the optimum slopes show what the misfit hid before
 TASTED = 2  # functions by which forms are compared, and
 AHEAD = 2  # how many then go on
+AT_ONCE = 20  # parts of a sample, in one of which follows what does so at once; a hundred are too stiff to fit
 QUANTITIES = {"turn": "m.theta", "theta": "m.theta", "omega": "m.omega", "i": "m.i", "v": "m.v", "past v": "m.v",
               "past i": "m.i", "past omega": "m.omega", "past speed": "ca.fabs(m.omega)", "past power": "m.omega**2",
-              "path": "m.sign(m.omega)", "load": "m.v * m.i", "past load": "m.v * m.i", "past heat": "m.i**2",
-              "past size": "ca.fabs(m.v)",
+              "path": "m.sign(m.omega)", "load": "m.v * m.i", "past load": "m.v * m.i",
+              "past braking": "ca.fmax(-m.v * m.i, 0)", "past heat": "m.i**2", "past size": "ca.fabs(m.v)",
               **{c: f"m.input('{c}')" for c in COMPUTED_INPUTS}}
 STATES = {  # quantities that are states of the curve's own: name, where it begins, rate
     "t": ("clock", "0.0", "1.0"), "distance": ("distance", "0.0", "ca.fabs(m.omega)"),
-    "most i": ("most_i", "ca.fabs(m.start['i'])", "ca.fmax(ca.fabs(m.i) - most_i, 0) / {step:.6g}")}
+    "most i": ("most_i", "ca.fabs(m.start['i'])", "ca.fmax(ca.fabs(m.i) - most_i, 0) / {step}")}
 SI = {"theta": "rad", "omega": "rad/s", "i": "A", "v": "V", "size": "V", "load": "W"}
 OTHER_PLACES = {"1": "where it sets in, a share of the largest", "V": "half of its play", "A": "half of its play",
                 "rad/s": "how fast it swings, or half of its play",
@@ -79,7 +80,7 @@ RATES = {  # of what follows z, with one place
     "past": "(z - {s}) / {p}", "play": "(ca.fmax(z - {p} - {s}, 0) - ca.fmax({s} - z - {p}, 0)) / {step}",
     "ramp": "ca.if_else((z * {s} >= 0) * (ca.fabs(z) > ca.fabs({s})), "
             "ca.sign(z) * ca.fmin({p}, ca.fabs(z - {s}) / {step}), (z - {s}) / {step})",
-    "hold": "(z - {s}) / ca.if_else(ca.fabs(z) > ca.fabs({s}), {step}, {p})"}
+    "hold": "(z - {s}) / ca.if_else(ca.fabs(z) > ca.fabs({s}), {sample}, {p})"}
 CARRIERS = {"": "", "direction": "m.sign(m.omega) * ", "omega": "m.omega * ", "i": "m.i * ", "v": "m.v * "}
 
 
@@ -160,15 +161,16 @@ class Part:
         """Return the law as source, coefficients and places by name; states of `known` quantities are there already."""
         form, terms, own = self.form, self.terms(places), names[0]
         state, begins, rate = STATES.get(form.on, ("", "", ""))
+        step = f"{self.span.step / AT_ONCE:.6g}"
         lines = [f"z = {state or QUANTITIES[form.on]}"]
         if state and form.on not in known:
             lines = [f"{state} = m.state('{own}_{state}', {begins})",
-                     f"m.rate({state}, {rate.format(step=self.span.step)})", *lines]
+                     f"m.rate({state}, {rate.format(step=step)})", *lines]
         if form.on in PAST:
             rate = " * ca.fabs(m.omega)" if form.on == "path" else ""
             for k, (lag, kind, place) in enumerate(dict.fromkeys(MEMORY.findall(" ".join(terms)))):
                 past = f"lagged_{k}"
-                change = RATES[kind].format(s=past, p=place, step=f"{self.span.step:.6g}") + rate
+                change = RATES[kind].format(s=past, p=place, step=step, sample=self.span.step) + rate
                 lines += [f"{past} = m.state('{own}_{past}'{FIRST.get(form.on, '')})", f"m.rate({past}, {change})"]
                 terms = [t.replace(lag, past) for t in terms]
         lines += ["curve = (", *(f"    + {n} * {t}" for n, t in zip(names, terms, strict=True)), ")"]

@@ -392,7 +392,7 @@ def warmed(m, tau_c=mi.P(8e-3, "N·m", null=0.0), t=mi.P(0.1, "s", positive=True
     m.torque -= tau_c * m.sign(m.omega) / (1 + z)
 
 
-STEP = 1e-3  # s, of these records
+STEP = 5e-5  # s, a twentieth of a sample of these records
 
 
 @mi.effect(balance="voltage")
@@ -424,7 +424,7 @@ def sticking_core(m, w=mi.P(0.25, "A", null=0.0)):
 def peak_detector(m, share=mi.P(1.0, "", null=0.0)):
     """A current sensor, up quickly, down late."""
     z = m.state("z", m.start["i"])
-    m.rate(z, (m.i - z) / ca.if_else(ca.fabs(m.i) > ca.fabs(z), STEP, 0.03))
+    m.rate(z, (m.i - z) / ca.if_else(ca.fabs(m.i) > ca.fabs(z), 1e-3, 0.03))
     m.measure("i", m.measured("i") + share * (z - m.i))
 
 
@@ -515,6 +515,20 @@ def pumped(m, k=mi.P(0.04, "1/W", null=0.0)):
 
 
 @mi.effect(balance="voltage")
+def pumped_up(m, k=mi.P(0.3, "1/W", null=0.0)):
+    """A supply behind a diode, whose capacitor only braking fills."""
+    z = m.state("bus")
+    m.rate(z, (ca.fmax(-m.v * m.i, 0) - z) / 0.1)
+    m.voltage += m.v * k * z
+
+
+@mi.effect(balance="torque")
+def holding(m, tau=mi.P(1.5e-2, "N·m", null=0.0)):
+    """A brake that closes where the command is none."""
+    m.torque -= tau * m.sign(m.omega) * (1 - ca.tanh(ca.fabs(m.v) / 0.2))
+
+
+@mi.effect(balance="voltage")
 def wound_field(m, k=mi.P(0.3, "", null=0.0)):
     """Part of the field by a winding across the terminals, rectified, that follows late."""
     z = m.state("field")
@@ -570,6 +584,8 @@ def whirl(m, tau=mi.P(0.03, "N·m", null=0.0)):
     (loose_encoder, ANGLE, "an error of the angle sensor that depends on the distance since a reversal"),
     (governor, ANGLE[:2], "an inertia that changes with the speed"),
     (pumped, ANGLE[:2], "a gain of the voltage that depends on the power drawn before"),
+    (pumped_up, ANGLE[:2], "a gain of the voltage that depends on the power fed back before"),
+    (holding, ANGLE[:2], "a friction that changes with the voltage"),
     (wound_field, ANGLE[:2], "a motor constant that depends on the voltage before"),
     (tightening, ANGLE[:2], "a friction that depends on the heat of the current before")])
 def test_what_changes_in_sensors_inertia_and_supply_is_found(law, channels, follows, lab):
