@@ -196,9 +196,10 @@ def shown(form: Form, fit: Fit, ranges: Mapping[str, tuple[float, float]]) -> bo
         low, high = ranges["omega"]
         if min(-low, high) <= STILL * max(-low, high):
             return False
-    of_the_drive = form.on in ("v", "past v") or (form.carrier == "v" and form.on in ("t", *COMPUTED_INPUTS))
-    if "i" not in outputs and not of_the_drive and (form.balance in ("voltage", "both") or form.on == "i"):
-        return False  # there a torque over the speed says the same
+    of_the_drive = form.balance == "voltage" and (
+        form.on in ("v", "past v") or (form.carrier == "v" and form.on in ("t", *COMPUTED_INPUTS)))
+    if "i" not in outputs and not of_the_drive and (form.balance in ("voltage", "both") or form.on in ("i", "v")):
+        return False  # there a torque over the speed, or a loss of voltage, says the same
     if (form.remembers or form.on == "distance") and fit.window is not None:
         return False  # what was before a window is not known
     return form.on != "turn" or not fit.problem.linear

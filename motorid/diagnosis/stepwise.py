@@ -228,10 +228,10 @@ def _better(children: Collection[Node], best: Node) -> tuple[Node, list[Node]] |
     density prefers a model that never moves.
     """
     better = [c for c in children if beats(c, best)]
-    if not better and best.parent is None:
-        plain = [c for c in children if evidence(best, c).plain]
+    plain = [] if better else [c for c in children if evidence(best, c).plain]
+    if plain and best.parent is None:
         plain.sort(key=lambda c: (bool(c.objection), -(evidence(best, c).held_out_fall or 0.0)))
-        return (plain[0], plain) if plain else None
+        return plain[0], plain
     falls = ((c, evidence(best, c).held_out_fall) for c in better)
     sound = [c for c in better if not c.objection]
     return choose(sound or [c for c, fall in falls if fall is None or fall > MATERIAL], best)
