@@ -72,8 +72,7 @@ class Model(Shown):
                                  "rename it in the effect, or leave one of the two effects out.")
         added = {p.name: self._in_units(p) for p in other.parameters}
         model = self.with_(effects=(*self.effects, other), parameters={**self.parameters, **added})
-        smooth = _once(model, lambda m: m.write().sgn_width is not None)  # ModelError if effects contradict one another
-        if smooth and "sgn_width" not in model.parameters:
+        if _once(model, _smooths) and "sgn_width" not in model.parameters:
             model = model.with_(parameters={**model.parameters, "sgn_width": self._in_units(SGN_WIDTH)})
         return model
 
@@ -197,7 +196,10 @@ class Model(Shown):
     def system(self, outputs: Collection[str]) -> System:
         """Return the CasADi functions of the model for the measured `outputs`, made once per choice.
 
-        ModelError if the model cannot show a channel, or definitions go in a circle.
+        Raises
+        ------
+        ModelError
+            If the model cannot show a channel, or definitions go in a circle.
         """
         for c in outputs:
             among(c, CHANNELS, "channel", ModelError)
@@ -238,10 +240,15 @@ def _known_of(structure: Any) -> list[Any]:
 def _once(model: Model, make: Callable[..., Any], *more: Any) -> Any:
     """Return ``make(model, *more)``, made once for all models whose equations are the same: values are no part."""
     laws = tuple((e.name, e.law) for e in model.effects)
-    slot = _known_of((model.base, laws, tuple(model.parameters), model.angle_input, *more))
+    slot = _known_of((make, model.base, laws, tuple(model.parameters), model.angle_input, *more))
     if not slot:
         slot.append(make(model, *more))
     return slot[0]
+
+
+def _smooths(model: Model) -> bool:
+    """Tell whether an effect uses a smooth sgn; ModelError if the effects contradict one another."""
+    return model.write().sgn_width is not None
 
 
 def _system(model: Model, outputs: tuple[str, ...], stored: tuple[str, ...]) -> System:
