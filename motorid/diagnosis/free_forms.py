@@ -290,7 +290,7 @@ def _of_size(form: Form, span: Span, low: float, high: float) -> list[str]:
         low, high = -top, top
     s = f"(ca.fmin(ca.fmax(z, {low:.9g}), {high:.9g}) / {top:.6g})"
     size = f"ca.fabs{s}"
-    bends = [_place(bend, SOFT, 1) if form.carrier else bend for bend in BENDS]
+    bends = [_place(bend, SOFT, 1) if form.carrier == "direction" else bend for bend in BENDS]
     smooth = [s, f"{s}**2", f"{s}**3", *(f"ca.tanh({s} / {bend})" for bend in bends)]
     sides = [sign for sign, reach in (("", high), ("-", -low)) if reach > 0]
     knees = [_place(c, 0, 1) for c in np.linspace(0, 1, KNEES * span.finer + 2)[1:-1]]

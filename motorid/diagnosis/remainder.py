@@ -59,7 +59,8 @@ FEW = 8  # functions at most whose places are fitted, too
 ROUNDS = 3  # of choosing functions and fitting: near the optimum slopes show what the misfit hid before
 TASTED = 2  # functions by which forms are compared, and
 AHEAD = 2  # how many then go on
-AT_ONCE = 20  # parts of a sample, in one of which follows what does so at once; a hundred are too stiff to fit
+AT_ONCE = 20  # parts of a sample, in one of which follows what does so at once; more are too stiff to fit,
+INPUT_AT_ONCE = 80  # but not of an input, which jumps at samples only
 QUANTITIES = {"turn": "m.theta", "theta": "m.theta", "omega": "m.omega", "i": "m.i", "v": "m.v", "past v": "m.v",
               "past i": "m.i", "past omega": "m.omega", "past speed": "ca.fabs(m.omega)", "past power": "m.omega**2",
               "path": "m.sign(m.omega)", "load": "m.v * m.i", "past load": "m.v * m.i",
@@ -78,8 +79,8 @@ CLIPPED = re.compile(r"ca\.fmin\(ca\.fmax\(z, \S+\), \S+\)")
 MEMORY = re.compile(r"((past|play|ramp|hold)\(z, (.*?)\))")
 RATES = {  # of what follows z, with one place
     "past": "(z - {s}) / {p}", "play": "(ca.fmax(z - {p} - {s}, 0) - ca.fmax({s} - z - {p}, 0)) / {step}",
-    "ramp": "ca.if_else((z * {s} >= 0) * (ca.fabs(z) > ca.fabs({s})), "
-            "ca.sign(z) * ca.fmin({p}, ca.fabs(z - {s}) / {step}), (z - {s}) / {step})",
+    "ramp": "ca.if_else(z < 0, -1, 1) * (ca.fmin({p}, (ca.fabs(z) - ca.if_else(z < 0, -{s}, {s})) / {step})"
+            " + ca.fmax(ca.if_else(z < 0, {s}, -{s}), 0) / {step})",
     "hold": "(z - {s}) / ca.if_else(ca.fabs(z) > ca.fabs({s}), {sample}, {p})"}
 CARRIERS = {"": "", "direction": "m.sign(m.omega) * ", "omega": "m.omega * ", "i": "m.i * ", "v": "m.v * "}
 
@@ -161,7 +162,7 @@ class Part:
         """Return the law as source, coefficients and places by name; states of `known` quantities are there already."""
         form, terms, own = self.form, self.terms(places), names[0]
         state, begins, rate = STATES.get(form.on, ("", "", ""))
-        step = f"{self.span.step / AT_ONCE:.6g}"
+        step = f"{self.span.step / (INPUT_AT_ONCE if form.on == 'past v' else AT_ONCE):.6g}"
         lines = [f"z = {state or QUANTITIES[form.on]}"]
         if state and form.on not in known:
             lines = [f"{state} = m.state('{own}_{state}', {begins})",
