@@ -37,7 +37,7 @@ from motorid.model.equations import System
 from motorid.model.model import Model
 from motorid.numerics.parallel import check_time, interruption
 from motorid.numerics.signals import Array
-from motorid.problem.runs import natural_sizes, shapes_of
+from motorid.problem.runs import combined, natural_sizes, shapes_of
 from motorid.problem.unknowns import Scaling
 
 STEPS = 4  # Gauss-Newton steps of the rivals' refit within one evaluation
@@ -172,10 +172,10 @@ class Rival:
 
 def _grid(parameters: Sequence[Parameter], sizes: Mapping[str, float]) -> Iterator[dict[str, float]]:
     """Yield values of an effect's parameters: amounts from little to much together, at each of its shapes."""
-    axes = [[(p.name, value) for value in shapes_of(p, sizes)] for p in parameters if p.grid]
+    shapes = combined({p.name: shapes_of(p, sizes) for p in parameters if p.grid})
     amounts = [p for p in parameters if p.null == 0 and not p.grid]
-    for amount, shape in product(AMOUNTS if amounts else (0.0,), product(*axes)):
-        yield {p.name: p.value for p in parameters} | dict(shape) | {
+    for amount, shape in product(AMOUNTS if amounts else (0.0,), shapes):
+        yield {p.name: p.value for p in parameters} | shape | {
             p.name: amount * sizes.get(p.unit, 1.0) * (ABOVE if p.at_least else 1.0) for p in amounts}
 
 

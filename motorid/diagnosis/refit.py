@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import itertools
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial, reduce
@@ -29,7 +28,7 @@ from motorid.numerics.least_squares import LevenbergMarquardt
 from motorid.numerics.parallel import interruption
 from motorid.numerics.signals import Array
 from motorid.problem.problem import Problem
-from motorid.problem.runs import natural_sizes, shapes_of, with_inputs
+from motorid.problem.runs import combined, natural_sizes, shapes_of, with_inputs
 from motorid.problem.simulate import misfit_over_noise
 
 BEGIN, RACE = (LevenbergMarquardt(max_iterations=n, ftol=1e-3, xtol=1e-4, looks=0) for n in (2, 6))
@@ -467,11 +466,9 @@ def widened(fit: Fit, effect: Effect, above: float = ABOVE) -> Task:
     natural = natural_sizes(fit.problem.experiments, fit.values)
     sizes = sizes_like(effect, level, above)
     shaped = {p.unit: fit.values[p.name] for e in inside for p in e.parameters if p.null is None and p.vary}
-    shapes = [[(p.name, shaped[p.unit])] if p.unit in shaped else
-              [(p.name, value) for value in shapes_of(p, natural)]
-              for p in effect.parameters if p.null is None and p.grid]
-    starts = [{**sizes, **dict(point)} for point in itertools.product(*shapes)][:8]
-    return Task(fit, model, effect, starts)
+    shapes = {p.name: [shaped[p.unit]] if p.unit in shaped else shapes_of(p, natural)
+              for p in effect.parameters if p.null is None and p.grid}
+    return Task(fit, model, effect, [{**sizes, **point} for point in combined(shapes)][:8])
 
 
 def hidden_in(fit: Fit, effect: Effect) -> tuple[str, ...]:

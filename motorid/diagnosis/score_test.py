@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import itertools
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -26,7 +26,7 @@ from motorid.model.definition import Effect, Parameter
 from motorid.model.model import Model
 from motorid.numerics.signals import Array
 from motorid.problem.problem import Problem
-from motorid.problem.runs import shapes_of
+from motorid.problem.runs import combined, shapes_of
 from motorid.problem.unknowns import Point
 
 ORDERS_TRIED = 8  # a race tells them apart: near friction and far from the optimum the highest line may be another
@@ -297,11 +297,9 @@ class Added:
             model = replace(model, angle_input=True, _systems={})
         return Added(fit, model, [model.parameters[p.name] for p in effect.parameters], tangent.sizes)
 
-    def grid(self) -> Iterator[dict[str, float]]:
-        """Yield the values of the shape parameters to try."""
-        tried = [p for p in self.pars if p.grid and not p.given]
-        axes = [[(p.name, value) for value in shapes_of(p, self.natural)] for p in tried]
-        yield from map(dict, itertools.product(*axes))
+    def grid(self) -> list[dict[str, float]]:
+        """Return the values of the shape parameters to try."""
+        return combined({p.name: shapes_of(p, self.natural) for p in self.pars if p.grid and not p.given})
 
     def shape(self, values: Mapping[str, float]) -> Shape | None:
         """Return what the effect adds at `values`; None where that cannot be simulated, or is nothing.

@@ -382,13 +382,9 @@ def _marked(listed: Sequence[Candidate], node: Node, group: tuple[str, ...]) -> 
     names = node.key - node.parent.key if node.parent is not None else frozenset()
     if len(names) < 2 or not node.reason:
         return tuple(replace(c, accepted=True, group=group) if c.effect == node.added else c for c in listed)
-    told = []
-    for c in listed:
-        if c.effect in names:
-            why = f"together with {' and '.join(sorted(names - {c.effect}))} {node.reason}"
-            c = replace(c, accepted=True, group=group if c.effect == node.added else (), reason=why)
-        told.append(c)
-    return tuple(told)
+    why = {n: f"together with {' and '.join(sorted(names - {n}))} {node.reason}" for n in names}
+    return tuple(replace(c, accepted=True, group=group if c.effect == node.added else (), reason=why[c.effect])
+                 if c.effect in names else c for c in listed)
 
 
 def _path(last: Node) -> list[Node]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import product
 
 import numpy as np
 
@@ -15,7 +14,7 @@ from motorid.estimation.least_squares import LOOK, RACE, cost_at, race
 from motorid.model.definition import Effect, Parameter
 from motorid.model.model import BASES, Model
 from motorid.problem.problem import Problem
-from motorid.problem.runs import natural_sizes, shapes_of, suited
+from motorid.problem.runs import combined, natural_sizes, shapes_of, suited
 from motorid.records.experiment import Experiment
 
 ABOVE = 1.3  # times: where a size starts that is at least another
@@ -121,13 +120,13 @@ def _shaped(problem: Problem, effect: Effect, asked: Model) -> Problem:
 
 def _shapes(problem: Problem, effect: Effect, asked: Model) -> list[dict[str, float]]:
     sizes = natural_sizes(problem.experiments, problem.model.values)
-    axes = []
+    axes = {}
     for p in _untouched(asked, effect):
         kinds = not p.vary and len(p.grid) > 1
         if kinds or (p.vary and (p.periodic or p.place or p.unit == RESONANCE)):
             values = PHASES if p.periodic else shapes_of(p, sizes)
-            axes.append([(p.name, float(np.clip(v, p.lower, p.upper))) for v in values])
-    return [dict(choice) for choice in product(*axes)]
+            axes[p.name] = np.clip(values, p.lower, p.upper).tolist()
+    return combined(axes)
 
 
 def _contained(model: Model) -> dict[Effect, Effect]:

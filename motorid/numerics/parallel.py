@@ -25,6 +25,7 @@ from contextvars import ContextVar
 from dataclasses import dataclass, field
 from functools import lru_cache
 from importlib.util import find_spec
+from itertools import accumulate, groupby
 from typing import Any, NamedTuple
 
 from motorid.errors import OutOfTime, UsageError
@@ -32,7 +33,7 @@ from motorid.errors import OutOfTime, UsageError
 Map = Callable[..., Iterable[Any]]
 # Those of this system; the alarm repeats Ctrl-C.
 SIGNALS = [getattr(signal, n) for n in ("SIGINT", "SIGALRM", "SIGTERM", "SIGHUP") if hasattr(signal, n)]
-WAVE = 4e6  # bytes of records handed to a pool at once; two waves are under way
+WAVE = 4_000_000  # bytes of records handed to a pool at once; two waves are under way
 MOST_TASKS = 64  # when many small pieces go to a pool together: few enough to ship, many enough to share out
 
 
@@ -263,16 +264,9 @@ def _in_waves(way: Map, tasks: Sequence[Task]) -> Iterator[list[Any]]:
 
 
 def _waves(tasks: Sequence[Task]) -> Iterator[list[Task]]:
-    wave: list[Task] = []
-    size = 0
-    for task in tasks:
-        size += len(task.items.data) + (0 if wave else len(task.shared.data))
-        wave.append(task)
-        if size > WAVE:
-            yield wave
-            wave, size = [], 0
-    if wave:
-        yield wave
+    sizes = accumulate(len(task.items.data) for task in tasks)
+    for _, wave in groupby(zip(sizes, tasks, strict=True), lambda pair: pair[0] // WAVE):
+        yield [task for _, task in wave]
 
 
 _outer: ContextVar[Callable[..., None] | None] = ContextVar("motorid_progress", default=None)

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
+from itertools import product
 from typing import Any, NamedTuple
 from weakref import WeakKeyDictionary
 
@@ -303,6 +304,11 @@ def shapes_of(parameter: Parameter, sizes: Mapping[str, float]) -> list[float]:
     """Return the values in the grid of a shape parameter, in its unit, where these are the natural sizes."""
     ends = (sizes["lowest"], sizes["highest"]) if parameter.place else (0.0, sizes.get(parameter.unit, 1.0))
     return [ends[0] + share * (ends[1] - ends[0]) for share in parameter.grid]
+
+
+def combined(axes: Mapping[str, Iterable[float]]) -> list[dict[str, float]]:
+    """Return all combinations of values by name; of no axis the one of nothing."""
+    return [dict(zip(axes, point, strict=True)) for point in product(*axes.values())]
 
 
 def spread_of(run: Experiment, channel: str) -> float:
