@@ -43,6 +43,7 @@ _OPTIONS = ((r"\b(columns|units)=\{(.*?)\}", lambda m: f"--{m[1]} {_pairs(m[2])}
             (r"\bmi\.torque_driven\(\) \((--drive torque)\)", r"\1"),
             (r"\bmodel\.without\('(\w+)'\)", r"--effects without \1"),
             (r"\bmodel\.(fix|free)\(…\)", r"--\1 NAME"),
+            (r"\bmodel\.replace\(…\)", "--set NAME=VALUE"),
             (r"\bmodel\.fix\('?(\w+)'?(=[^)]*)?\)", r"--fix \1\2"),
             (r"\bmodel\.free\('?(\w+)'?\)", r"--free \1"),
             (r"\bmi\.evaluate\(model, runs\)", "motorid simulate FIT.json RUN..."),

@@ -10,7 +10,7 @@ from motorid.effects import LIBRARY
 from motorid.errors import ModelError
 from motorid.estimation.continuation import by_continuation
 from motorid.estimation.first_guess import first_guess, loads_of
-from motorid.estimation.least_squares import LOOK, RACE, cost_at, race
+from motorid.estimation.least_squares import LOOK, RACE, Estimate, cost_at, race
 from motorid.model.definition import Effect, Parameter
 from motorid.model.model import BASES, Model
 from motorid.problem.problem import Problem
@@ -43,8 +43,7 @@ def with_start_values(problem: Problem) -> Problem:
     values = found.values
     for effect, simple in inner.items():
         values |= sizes_like(effect, max(found.values[p.name] for p in simple.parameters))
-    best = race([begin, begin.start_at(values)], LOOK)
-    return begin if best is None else begin.start_at(best.values)
+    return _led(begin, race([begin, begin.start_at(values)], LOOK))
 
 
 def _guessed(problem: Problem) -> Problem:
@@ -86,9 +85,7 @@ def _untouched(model: Model, effect: Effect) -> list[Parameter]:
 
 def _along_measured_angle(problem: Problem, asked: Model) -> Problem:
     """Return the problem started where the measured angle, or the integral of the speed, leads an effect of the turn.
-
-    While the model's own angle is still wrong by a period, its cogging pushes the wrong way.
-    """
+    While the model's own angle is still wrong by a period, its cogging pushes the wrong way."""
     orders = any(p.order for e in problem.model.effects for p in e.parameters)
     if not orders or not all({"theta", "omega"} & set(r.outputs) for r in problem.experiments):
         return problem
@@ -102,20 +99,22 @@ def _along_measured_angle(problem: Problem, asked: Model) -> Problem:
     if all("theta" in r.outputs for r in problem.experiments):
         return min(other, problem, key=lambda p: cost_at(p, refine=False))
     # An integral drifts: where either leads decides.
-    best = race([other, problem], RACE, solve=by_continuation)
-    return problem if best is None else problem.start_at(best.values)
+    return _led(problem, race([other, problem], RACE, solve=by_continuation))
 
 
 def _shaped(problem: Problem, effect: Effect, asked: Model) -> Problem:
-    """Return the problem started at the best of the shapes of `effect`.
-
-    Phases and resonances have side valleys; least squares finds knees, lags and heat capacities by itself.
-    """
+    """Return the problem started at the best of the shapes of `effect`. Phases and resonances have side valleys; least
+    squares finds knees, lags and heat capacities by itself."""
     shapes = _shapes(problem, effect, asked)
     if len(shapes) < 2:
         return problem
-    best = race([problem.start_at(s) for s in shapes], LOOK)
-    return problem if best is None else problem.start_at(best.values)
+    return _led(problem, race([problem.start_at(s) for s in shapes], LOOK))
+
+
+def _led(problem: Problem, best: Estimate | None) -> Problem:
+    """Return the problem begun where a race ended, unless it got there only by steps too coarse to see it diverge."""
+    led = problem if best is None else problem.start_at(best.values)
+    return led if np.isfinite(cost_at(led)) else problem
 
 
 def _shapes(problem: Problem, effect: Effect, asked: Model) -> list[dict[str, float]]:
@@ -150,14 +149,12 @@ def sizes_like(effect: Effect, level: float, above: float = ABOVE) -> dict[str, 
 
 
 def _shared_out(problem: Problem, asked: Model) -> Problem:
-    """Return the problem with back-EMF and viscous friction shared out as suits the data best.
-
-    Without a current a linear motor leaves this open; a loss that is a share of the motor's torque does not.
-    """
+    """Return the problem with back-EMF and viscous friction shared out as suits the data best. Without a current a
+    linear motor leaves this open; a loss that is a share of the motor's torque does not."""
     model, runs = problem.model, problem.experiments
     open_ = model.base == "dc_motor" and "i" not in problem.outputs and not _was_fitted(asked)
     if not open_ or asked.parameters["K"].given or not any(load.ratio for load in loads_of(asked)):
         return problem
     others = [problem.start_at(first_guess(asked, runs, loaded=True, back_emf=share)) for share in BACK_EMF_SHARES]
-    best = race([p.for_model(p.model.fix("R")) for p in (problem, *others)], RACE, solve=by_continuation)
-    return problem if best is None else problem.start_at(best.values)
+    fixed = [p.for_model(p.model.fix("R")) for p in (problem, *others)]
+    return _led(problem, race(fixed, RACE, solve=by_continuation))

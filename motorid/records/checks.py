@@ -107,13 +107,18 @@ def _one_column_for_two(run: Experiment) -> str | None:
 
 def _excitation(run: Experiment) -> str | None:
     v = run.inputs["v"]
-    if np.ptp(v) <= 1e-6 * np.abs(v).max():
-        return (f"the voltage is {quantity(v[0], run.units['v'])} from beginning to end: such a run shows one "
-                "steady speed and at most a start. Add runs with steps or a sweep of the voltage.")
-    if still := [c for c, y in run.outputs.items() if np.nanmax(y) == np.nanmin(y)]:
-        return (f"the {NAMES[still[0]]} never changes although the voltage does; a dead sensor, a "
-                "locked rotor, or too little voltage to move?")
-    return None
+    return (f"the voltage is {quantity(v[0], run.units['v'])} from beginning to end: such a run shows one "
+            "steady speed and at most a start. Add runs with steps or a sweep of the voltage."
+            ) if np.ptp(v) <= 1e-6 * np.abs(v).max() else None
+
+
+def _still(run: Experiment) -> str | None:
+    """Under one voltage a motor may run steadily, but neither its angle nor what reads zero may stay."""
+    v = run.inputs["v"]
+    still = [c for c, y in run.outputs.items() if np.nanmax(y) == np.nanmin(y) and v.any()
+             and (np.ptp(v) > 0 or c == "theta" or not np.nanmax(y))]
+    return (f"the {NAMES[still[0]]} never changes although there is a voltage; a dead sensor, a locked rotor, or too "
+            "little voltage to move?") if still else None
 
 
 def _missing(run: Experiment) -> str | None:
@@ -556,6 +561,6 @@ def _holds(values: Array) -> float:
 
 _CHECKS: tuple[Check, ...] = (
     signs, unsigned, unsigned_voltage, angle_against_speed, magnitudes, implied_constants, _one_column_for_two,
-    swapped_columns, _offset, _excitation, _missing, _clipped, current_limit, _coarse, _spikes, _noisy, _uneven,
+    swapped_columns, _offset, _excitation, _still, _missing, _clipped, current_limit, _coarse, _spikes, _noisy, _uneven,
     _slow_sampling, _never_settles,
 )

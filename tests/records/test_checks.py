@@ -266,6 +266,11 @@ def test_no_excitation_is_told(steps):
     assert "from beginning to end" in said(constant)
     dead = steps.with_(outputs={"omega": np.zeros(steps.n), "i": steps.outputs["i"]})
     assert "speed never changes" in said(dead)
+    steady = steps.with_(inputs={"v": np.full(steps.n, 6.0)})
+    frozen = steady.with_(outputs={**steps.outputs, "theta": np.full(steps.n, 7.0)})
+    assert "from beginning to end" in said(steady, frozen)
+    assert "angle never changes" in said(steady, frozen)
+    assert "never changes" not in said(steady.with_(outputs={"omega": np.full(steps.n, 7.0)}))  # a steady speed
 
 
 def test_a_run_that_never_settles_is_told():
