@@ -10,7 +10,7 @@ from typing import Any
 from motorid.acquire.client import Link
 from motorid.acquire.recorder import record
 from motorid.diagnosis.diagnose import diagnose
-from motorid.diagnosis.experiment_design import Design, design_experiment
+from motorid.diagnosis.experiment_design import Design, design_experiment, names_apart
 from motorid.diagnosis.results import Diagnosis
 from motorid.display.cards import Card, Flag, Printed, Table
 from motorid.display.numbers import percent
@@ -130,7 +130,7 @@ def identify_on(bench: str | Link, folder: str | Path = ".", *, goal: str = "dis
 def _open(found: Diagnosis, goal: str, until: float, parameters: Sequence[str] | None) -> str:
     """Say what is still open; empty where the goal is reached."""
     if goal == "distinguish":
-        return ", ".join(f.model.effect_names[-1] for f in found.rivals) if len(found.rivals) > 1 else ""
+        return ", ".join(names_apart([f.model for f in found.rivals])) if len(found.rivals) > 1 else ""
     std, values = found.best.std, found.best.values
     asked = parameters or found.best.model.free_names
     return ", ".join(n for n in asked if n not in values or (s := std[n]) is None or s > until * abs(values[n]))

@@ -360,6 +360,15 @@ class Search:
         """Return the judged model without an effect; None where that is none."""
         return next((self.smaller(node, model) for model in _without(node.fit.model, name)), None)
 
+    def in_place(self, node: Node, old: str, new: str, known: bool = False) -> Node | None:
+        """Return the judged model with an effect where another was; None where that is no model, or if only what is
+        `known` is asked for and it was not met."""
+        effects = {e.name: e for e in (*self.effects, *node.fit.model.effects)}
+        model = _in_place(node.fit.model, effects[old], effects[new])
+        if model is None or known:
+            return self.nodes.get(frozenset(model.effect_names)) if model else None
+        return self.smaller(node, model)
+
     def smaller(self, node: Node, model: Model) -> Node | None:
         """Return the judged model, one that is contained in `node`'s; None where it is no model by itself."""
         key = frozenset(model.effect_names)
@@ -405,10 +414,8 @@ def _without(model: Model, name: str) -> list[Model]:
 
 
 def _in_place(model: Model, old: Effect, new: Effect) -> Model | None:
-    """Return the model with `new` where `old` was, so that the order in which effects were found stays.
-
-    None where another effect of the model contains `new`, too.
-    """
+    """Return the model with `new` where `old` was, so that the order in which effects were found stays. None where
+    another effect of the model contains `new`, too."""
     effects = tuple(new if e is old else e for e in model.effects)
     try:
         return (model.without(old.name) + new).with_(effects=effects)

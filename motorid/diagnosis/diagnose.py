@@ -100,6 +100,7 @@ def _told(found: Climb, driven: str, validated: bool) -> Diagnosis:
     names = tuple(g.effect for g in found.grades if g.grade != "approximates")
     ranking = found.rounds[0] if found.rounds else ()
     groups = tuple(g for g in found.groups if g[0] in names)
+    rivals = found.rivals if groups[:1] == found.groups[:1] else ()
     forms, suggestion = tuple(f.form for f in found.forms), None
     unseen = found.search.unseen(found.path[-1])
     form = next(iter(forms), None)
@@ -118,7 +119,7 @@ def _told(found: Climb, driven: str, validated: bool) -> Diagnosis:
         for name, shared in same.items():  # what acts through these parameters, and that one
             inside = (e.name for e in ladder.best.model.effects if {p.name for p in e.parameters} & {*shared})
             groups = (*groups, (*inside, name))
-        suggestion = _suggestion(found)
+        suggestion = _suggestion(rivals, groups)
     elif len(found.path) > 1 or not remaining.adequate:
         verdict, where = "unexplained", missing.where
         judged = judged if len(found.path) > 1 else remaining
@@ -137,7 +138,7 @@ def _told(found: Climb, driven: str, validated: bool) -> Diagnosis:
     approximating = {g.effect: g.form for g in found.grades if g.grade == "approximates"}
     remainder = Remainder(kind, ladder.best, forms, found.search.held, fit, approximating)
     return Diagnosis(verdict, text, where, names, judged, missing, ranking, ladder, groups, suggestion, fit,
-                     ladder.best, remaining, remainder, found.stopped, answer, details)
+                     ladder.best, remaining, remainder, found.stopped, answer, details, rivals or (ladder.best,))
 
 
 def _remarks(found: Climb, driven: str) -> list[str]:
@@ -152,14 +153,11 @@ def _remarks(found: Climb, driven: str) -> list[str]:
             closed_loop_remark(first)]
 
 
-def _suggestion(found: Climb) -> str | None:
-    """Say which experiment would separate the first group, if there is one."""
-    if not found.groups:
+def _suggestion(fits: Sequence[Fit], groups: Sequence[Sequence[str]]) -> str | None:
+    """Say which experiment would separate the rivals of the first group, if there is one."""
+    if len(fits) < 2 or not groups:
         return None
-    names = found.groups[0]
-    fits = [c.fit for c in found.rounds[0] if c.effect in names and c.fit is not None]
-    if len(fits) < 2:
-        return None
+    names = groups[0]
     try:
         best = suggest_experiment(fits[:4])
     except MotoridError:

@@ -24,6 +24,7 @@ from motorid.display.cards import Card, Flag, Printed, Shown, Table
 from motorid.display.numbers import number, quantity
 from motorid.errors import FitError, MotoridError, UsageError, among, at_least, chosen, positive
 from motorid.estimation.result import Fit
+from motorid.model.model import Model
 from motorid.numerics.parallel import budget as limited_time
 from motorid.numerics.parallel import one_thread
 from motorid.numerics.parallel import progress as bar
@@ -353,10 +354,8 @@ def _optimised(task: Task, say: Callable[[str], None]) -> Found:
 
 
 def _judged(task: Task) -> Task:
-    """Return the task without the pairs that no fixed candidate distinguishes, if there are others.
-
-    Where within its uncertainty no candidate would do, the truth is as it was fitted.
-    """
+    """Return the task without the pairs that no fixed candidate distinguishes, if there are others. Where within its
+    uncertainty no candidate would do, the truth is as it was fitted."""
     kept = [_shrunk(task, c) for c in _followed(task.layout, (0.0,)).values()] if task.pairs else []
     every = [task.layout.of(k[0]) for k in kept if k is not None]
     if not every:
@@ -395,9 +394,14 @@ def _rivals(found: Any, goal: str | None) -> tuple[list[Rival], str]:
         raise UsageError("an experiment is designed for models: give a diagnosis or at least one fit.")
     as_rival = Rival.as_allowed if goal == "distinguish" else Rival.of
     rivals = [f if isinstance(f, Rival) else as_rival(f) for f in fits[:MOST_RIVALS if goal == "distinguish" else 1]]
-    common = set.intersection(*(set(r.model.effect_names) for r in rivals)) if len(rivals) > 1 else set()
-    names = [" + ".join(n for n in r.model.effect_names if n not in common) or "none" for r in rivals]
+    names = names_apart([r.model for r in rivals])
     return [replace(r, name=n) for r, n in zip(rivals, names, strict=True)], goal
+
+
+def names_apart(models: Sequence[Model]) -> list[str]:
+    """Return the effects of each model that not all of them have."""
+    common = set.intersection(*(set(m.effect_names) for m in models)) if len(models) > 1 else set()
+    return [" + ".join(n for n in m.effect_names if n not in common) or "none" for m in models]
 
 
 def _check_span(duration: float, dt: float) -> None:
@@ -502,9 +506,7 @@ NEAR = 0.95  # share of a limit at which a wave is drawn
 
 def _waves(task: Task) -> dict[str, tuple[Layout, Array]]:
     """Return waves that stand at the limits: layouts of ramps and steps with binary signals, and their unknowns.
-
-    Between two speeds the current is at its limit (a jump of the voltage, then a ramp with the back-EMF).
-    """
+    Between two speeds the current is at its limit (a jump of the voltage, then a ramp with the back-EMF)."""
     old, found = task.layout, {}
     total, most = sum(old.ms), len(old.ms)
     quick = max(1, round(2e3 * old.dt))

@@ -243,10 +243,8 @@ def _within_smoothing(fit: Fit, effect: Effect) -> str:
 
 
 def _swallows(fit: Fit, form: Form, effect: Effect) -> bool:
-    """Tell whether an effect is a special case of a form that differs from it by more than a trifle.
-
-    A constant friction is one of a friction that changes with the angle.
-    """
+    """Tell whether an effect is a special case of a form that differs from it by more than a trifle. A constant
+    friction is one of a friction that changes with the angle."""
     sizes = [p.name for p in effect.parameters if p.null == 0]
     return bool(sizes) and all(contains(fit, form, name) for name in sizes) and (
         force_of(fit, form) > TRIFLE * max(effect_force(fit, form, name) for name in sizes))

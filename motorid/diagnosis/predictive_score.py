@@ -132,10 +132,8 @@ def lost_channels(old: Channels, new: Channels) -> tuple[str, ...]:
 
 
 def _fall(old: Channels, new: Channels) -> float | None:
-    """Return the relative fall of the error, lone samples left aside, geometric mean over channels and samples.
-
-    Each run counts by its length, not by its size: what a wide swing misses must not hide all others.
-    """
+    """Return the relative fall of the error, lone samples left aside, geometric mean over channels and samples. Each
+    run counts by its length, not by its size: what a wide swing misses must not hide all others."""
     both = [c for c in old if c in new]
     return 1 - float(np.exp(np.mean([_log_rms(new[c]) - _log_rms(old[c]) for c in both]))) if both else None
 
@@ -150,10 +148,8 @@ def _fall_error(old: Channels, new: Channels) -> float:
 
 
 def _log_rms(errors: Errors, left_out: int = -1) -> float:
-    """Return the logarithm of the RMS of errors, mean over runs; a tenth of the noise is as good as none.
-
-    `left_out` is a block that does not count.
-    """
+    """Return the logarithm of the RMS of errors, mean over runs; a tenth of the noise is as good as none. `left_out` is
+    a block that does not count."""
     each = [despiked(v)[b[np.isfinite(v)] != left_out] for v, b in zip(errors.values, errors.blocks, strict=True)]
     runs = [r for r in each if len(r)]
     logs = [0.5 * np.log(np.mean(r**2) + (0.1 * errors.noise) ** 2 + 1e-300) for r in runs]
@@ -181,10 +177,8 @@ def _differences(old: Channels, new: Channels) -> Array:
 
 
 def _log_densities(r: Array, labels: NDArray[np.intp], count: int, floor: float) -> Array:
-    """Return the log density of each block of `r` under Student's t, its scale from the other blocks, (count,).
-
-    A tenth of the sensor's noise (`floor`) is as good as none: ratios of tiny numbers must not decide.
-    """
+    """Return the log density of each block of `r` under Student's t, its scale from the other blocks, (count,). A tenth
+    of the sensor's noise (`floor`) is as good as none: ratios of tiny numbers must not decide."""
     nu = thresholds.DEGREES_OF_FREEDOM
     scale2 = float(np.median(r**2)) + 1e-300
     for _ in range(ROUNDS):  # expectation maximisation of the scale

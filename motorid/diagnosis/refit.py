@@ -176,10 +176,8 @@ def lost(fit: Fit) -> bool:
 
 
 def _own_starts(fit: Fit, model: Model, starts: Sequence[Mapping[str, float]]) -> list[dict[str, float]]:
-    """Return `starts` with the larger model's own first guess, where the smaller one's fit is no place to begin.
-
-    An arm without its weight is fitted by a motor that hardly moves; from there nothing leads back.
-    """
+    """Return `starts` with the larger model's own first guess, where the smaller one's fit is no place to begin. An arm
+    without its weight is fitted by a motor that hardly moves; from there nothing leads back."""
     if not lost(fit):
         return []
     with contextlib.suppress(*FAILURES):
@@ -223,10 +221,8 @@ def _bounded(fit: Fit, model: Model) -> Model:
 
 
 def _polished(fit: Fit, problem: Problem) -> Fit | None:
-    """Converge from a good start, channels weighed anew where the misfit has changed.
-
-    Where that takes more sub-steps than the samples are worth, it is done as roughly as the race.
-    """
+    """Converge from a good start, channels weighed anew where the misfit has changed. Where that takes more sub-steps
+    than the samples are worth, it is done as roughly as the race."""
     try:
         exact = problem.tuned(accuracy=fit.problem.accuracy)
         problem = exact if exact.refined(exact.start).worth_its_steps else problem.tuned(accuracy=ROUGH)
@@ -368,10 +364,8 @@ def completed(given_up: Sequence[GivenUp], map_: Callable[..., Iterable[Any]]) -
 
 
 def _outdone(tasks: Sequence[Task], races: Mapping[int, Raced], found: Mapping[int, Any]) -> dict[int, GivenUp]:
-    """Return the races that an undamped step from their end still leaves far behind, or with nothing gained.
-
-    Gained is what the model without the effect would not reach by such a step itself: a stalled fit promises much.
-    """
+    """Return the races that an undamped step from their end still leaves far behind, or with nothing gained. Gained is
+    what the model without the effect would not reach by such a step itself: a stalled fit promises much."""
     fit, costs, given_up = tasks[0].fit, sorted(race.cost for race in races.values()), {}
     own = _own_reach(fit)
     for k, race in races.items():

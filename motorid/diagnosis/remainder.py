@@ -490,10 +490,8 @@ def _beside(best: Grown, held: HeldOut, only: Form | None = None) -> Grown | Non
 
 
 def _revised(best: Grown, held: HeldOut, times: int = FURTHER) -> Grown:
-    """Return a curve without the parts that have become superfluous, or with them chosen anew beside the others.
-
-    What came first may have imitated all others together.
-    """
+    """Return a curve without the parts that have become superfluous, or with them chosen anew beside the others. What
+    came first may have imitated all others together."""
     for k, part in enumerate(best.curve.parts[:-1] if times else ()):
         with contextlib.suppress(*FAILURES, OutOfTime):
             check_time()

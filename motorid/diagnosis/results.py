@@ -226,6 +226,9 @@ class Diagnosis(Shown):
         The verdict in a few sentences: what is missing and how large, how the error changes, what remains.
     details : tuple of str
         What else a reader should know.
+    rivals : tuple of Fit
+        The last fit, and what it is with the others of the first group in its effect's place: what an experiment is to
+        distinguish.
     """
 
     verdict: str
@@ -245,6 +248,7 @@ class Diagnosis(Shown):
     stopped: str = ""
     answer: str = ""
     details: tuple[str, ...] = ()
+    rivals: tuple[Fit, ...] = ()
 
     @property
     def best(self) -> Fit:
@@ -262,16 +266,6 @@ class Diagnosis(Shown):
         if self.remainder is not None and self.remainder.proposed:
             after.append(("found.remainder.as_effect()", "what remains, as an effect to add"))
         return (*after, ("mi.plot_missing(found)", "see it"), ('mi.report(found, "report.html")', "all on one page"))
-
-    @property
-    def rivals(self) -> tuple[Fit, ...]:
-        """The fits of the first group, which an experiment is to distinguish; without one, the last fit alone."""
-        for rung in self.ladder.rungs:
-            for group in self.groups:
-                fits = tuple(c.fit for c in rung.candidates if c.effect in group and c.fit is not None)
-                if len(fits) > 1:
-                    return fits
-        return (self.after,)
 
     def card(self) -> Card:
         """Return the answer, then what it rests on: place, parameters before and after, the effects tried."""

@@ -7,6 +7,7 @@ load) can be overtaken, and after each addition the earlier effects are tried wi
 from __future__ import annotations
 
 import builtins
+import contextlib
 import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -15,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from motorid.diagnosis.adequacy import judge_adequacy, within_noise
+from motorid.diagnosis.adequacy import following, judge_adequacy, within_noise
 from motorid.diagnosis.candidates import Search, Stages, library
 from motorid.diagnosis.cross_validation import QUICK, HeldOut
 from motorid.diagnosis.input_hypotheses import Reading, better_reading, without_spikes
@@ -46,6 +47,7 @@ class Climb:
     """What the loop went through: the final path, per round the candidates, the groups of what was chosen.
 
     `forms` are the free forms that predict better beside all effects, the best first; `grades` are of the effects.
+    `rivals` are the last model, and what it is with the others of the first group.
     `stopped` says why it ended before it was done, if it did.
     """
 
@@ -59,6 +61,7 @@ class Climb:
     forms: tuple[FormGain, ...] = ()
     grades: tuple[Grade, ...] = ()
     stopped: str = ""
+    rivals: tuple[Fit, ...] = ()
 
 
 def climb(search: Search, max_effects: int, seconds: float | None = None) -> Climb:
@@ -157,8 +160,9 @@ def _finished(found: Climb) -> Climb:
     """Return a climb with the free forms that predict better beside all effects, and the grade of each effect."""
     search, best = found.search, found.path[-1]
     met = frozenset[str]().union(*(node.key for node in found.path))
-    rounds = tuple(tuple(_as_it_ended(c, best.key, met) for c in r) for r in found.rounds)
-    groups = tuple((g[0], *rest) for g in found.groups if g and (rest := [n for n in g[1:] if n not in best.key]))
+    groups, rivals = _still_alike(found)
+    alike = frozenset[str]().union(*groups)
+    rounds = tuple(tuple(_as_it_ended(c, best.key, met, alike) for c in r) for r in found.rounds)
     structure = not found.remaining.adequate
     forms = better_forms(best.fit, best.fit) if structure else []
     if structure and not forms and at_noise(best) and not found.stopped:
@@ -167,16 +171,29 @@ def _finished(found: Climb) -> Climb:
                        lambda name: None if found.stopped else search.without(best, name))
     if not found.stopped and any(g.form for g in grades) and any(g.grade != "approximates" for g in grades):
         grades = _sure_alone(search, best, grades)
-    return replace(found, rounds=rounds, groups=groups, forms=tuple(forms), grades=grades)
+    return replace(found, rounds=rounds, groups=groups, rivals=rivals, forms=tuple(forms), grades=grades)
+
+
+def _still_alike(found: Climb) -> tuple[tuple[tuple[str, ...], ...], tuple[Fit, ...]]:
+    """Return the groups that are left once more is known, and the rivals of the first. What predicted as well on an
+    early rung may not beside what was found after it."""
+    search, best, groups, rivals = found.search, found.path[-1], list[tuple[str, ...]](), tuple[Fit, ...]()
+    for first, *others in (g for g in found.groups if g[0] in best.key):
+        swapped = {n: search.in_place(best, first, n, bool(found.stopped))
+                   for n in others if n not in best.key}
+        alike = {n: node for n, node in swapped.items() if node is None or not beats(best, node)}
+        if alike:
+            groups.append((first, *alike))
+            rivals = rivals or (best.fit, *(node.fit for node in alike.values() if node is not None))
+    return tuple(groups), rivals
 
 
 def _beside_curves(found: Climb, seconds: float | None) -> Climb:
-    """Return a climb with grades that hold beside a curve, fitted in the place of all that was found.
-
-    Forms are compared by slopes, and these lead astray far from the records.
-    """
+    """Return a climb with grades that hold beside a curve, fitted in the place of all that was found. Forms are
+    compared by slopes, and these lead astray far from the records."""
     search, best, grades = found.search, found.path[-1], list(found.grades)
-    if found.remaining.adequate or all(g.grade == "approximates" for g in grades):
+    noise = found.remaining.adequate and not far(best.fit)
+    if noise or all(g.grade == "approximates" for g in grades):
         return found
     found, curve = _curve_alone(found, search.root.fit, search.held, seconds)
     if curve is None:
@@ -185,6 +202,7 @@ def _beside_curves(found: Climb, seconds: float | None) -> Climb:
         if g.grade != "approximates" and (smaller := search.without(best, g.effect)) is not None and (
                 outdoes(evidence(smaller, best).fall, curve.evidence.fall)):
             grades[k] = Grade(g.effect, "approximates", IN_ITS_PLACE.format(curve.form.text), curve.form)
+            found = replace(found, remaining=following(found.remaining, curve.form.text))
     return replace(found, grades=tuple(grades))
 
 
@@ -212,9 +230,9 @@ def _sure_alone(search: Search, best: Node, grades: tuple[Grade, ...]) -> tuple[
     return tuple(g if g.grade == "approximates" else told.get(g.effect, g) for g in grades)
 
 
-def _as_it_ended(tried: Candidate, last: frozenset[str], met: frozenset[str]) -> Candidate:
+def _as_it_ended(tried: Candidate, last: frozenset[str], met: frozenset[str], alike: frozenset[str]) -> Candidate:
     """Return a candidate as the `last` model has it; what no model on the way there `met` was not taken after all."""
-    tried = replace(tried, group=tuple(n for n in tried.group if n not in last))  # what was found is no rival
+    tried = replace(tried, group=tuple(n for n in tried.group if n in alike - last))  # what was found is no rival
     if tried.accepted and not met.issuperset(tried.effect.split(" + ")):
         return replace(tried, accepted=False, reason="taken at first, but a model without it predicts better")
     return tried if tried.accepted or tried.effect not in last else replace(tried, reason="added in a later step")
@@ -303,10 +321,9 @@ def explored(fit: Fit, validate: Sequence[Experiment] | Experiment | None, effec
         records = records.read(reading)
     found = climbed(records)
     if not found.stopped and (windowed := _in_windows(found)) is not None:
-        whole, records = found, replace(records, fit=windowed)
-        found = climbed(records)
-        if found.stopped and len(found.path) == 1:  # what was found before is worth more than nothing
-            found = replace(whole, stopped=found.stopped)
+        parts = replace(records, fit=windowed)
+        anew = climbed(parts)
+        found, records = (replace(found, stopped=anew.stopped), records) if _explains(found, anew) else (anew, parts)
     last = found.path[-1]
     again = reading = None
     if not found.stopped and records is not as_it_was and as_it_was.suits(last):
@@ -322,6 +339,7 @@ def explored(fit: Fit, validate: Sequence[Experiment] | Experiment | None, effec
             if reading:
                 again = replace(again, remarks=(*records.remarks, reading.remark(last.fit, new.fit)))
             records, found = again, anew
+        found = replace(found, stopped=anew.stopped)
     if records.remarks != as_it_was.remarks:  # what is missing may look like another reading
         held = HeldOut.of(as_it_was.fit, as_it_was.held_out)
         found, curve = _curve_alone(found, as_it_was.fit, held, left())
@@ -351,11 +369,22 @@ def _in_windows(found: Climb) -> Fit | None:
         return None
 
 
+def _explains(whole: Climb, windowed: Climb) -> bool:
+    """Tell whether what was found on whole records, which it follows, predicts windows of them better than what was
+    found there, or is all that there is."""
+    last, there = whole.path[-1].fit, windowed.search
+    if windowed.stopped and len(windowed.path) == 1:
+        return True
+    with contextlib.suppress(*FAILURES):
+        if len(whole.path) > 1 and follows(last):
+            problem = there.root.fit.problem.with_(model=last.model.with_(angle_input=False), noise_factors={})
+            return beats(node_of(solve(problem, QUICK, start="model"), there.held), windowed.path[-1])
+    return False
+
+
 def _late_reading(path: Sequence[Node]) -> Reading | None:
     """Return the reading that the model before any effect of a sensor asks for, since lags imitate one, or the last.
-
-    None where neither leaves more than noise; a model that does not follow the records would ask for anything.
-    """
+    None where neither leaves more than noise; a model that does not follow the records would ask for anything."""
     balances = [[e.balance for e in node.fit.model.effects if e.name not in path[0].key] for node in path]
     plain = max(k for k, kinds in enumerate(balances) if "sensor" not in kinds)
     fits = (path[k].fit for k in dict.fromkeys((plain, len(path) - 1)))

@@ -306,10 +306,8 @@ def closed_loop_remark(fit: Fit) -> str:
 
 
 def _noise_feedback(v, y) -> float:
-    """Correlation of the fast changes of the voltage with those of the measurement just before.
-
-    None where the voltage tells its own next value, as a sweep of sines does: that passes on no noise.
-    """
+    """Correlation of the fast changes of the voltage with those of the measurement just before. None where the voltage
+    tells its own next value, as a sweep of sines does: that passes on no noise."""
     if y is None or np.ptp(v) == 0:
         return 0.0
     dv, dy = np.diff(v, 2), np.diff(np.nan_to_num(y), 2)

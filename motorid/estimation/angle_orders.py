@@ -266,9 +266,7 @@ class _OrderSearch:
 
     def _read(self, k: int, kind: str, waves: Array, orders: Array) -> Array:
         """Return what `waves` (N, m) of `orders` (m,) in a sensor put into the channels, (N, ny, m), in units of noise.
-
-        The angle of an encoder shows their integral, from what it shows at first.
-        """
+        The angle of an encoder shows their integral, from what it shows at first."""
         outputs, weights = self.fit.problem.outputs, self.fit.problem.measured[k].weights
         put = {"omega": waves * self.answers[k].states["omega"][:, None]}
         put |= {"theta": (waves - waves[0]) / (1j * orders)} if kind == "encoder" else {}

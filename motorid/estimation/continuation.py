@@ -133,9 +133,7 @@ def _narrow_enough(problem: Problem) -> float:
 
 def _narrower(found: Estimate) -> tuple[float, bool] | None:
     """Return a narrower width to try, and whether the creep of a loaded, stuck motor in the angle surely asks for it.
-
-    None where there is no room: narrower than what a sub-step gains in speed.
-    """
+    None where there is no room: narrower than what a sub-step gains in speed."""
     problem = found.problem
     if problem.width is None or not smooths(problem) or problem.width > 1.01 * _narrow_enough(problem):
         return None

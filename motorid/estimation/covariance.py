@@ -118,9 +118,7 @@ def channel_blocks(problem: Problem, residuals: Array, jacobian: Array) -> dict[
 
 def _meat(problem: Problem, jacobian: Array, blocks: Blocks, colours: Mapping[str, Colour], along: Array) -> Array:
     """Covariance of (J along)ᵀr: outputs with their colour, priors as observations of variance 1, penalties fixed.
-
-    `along` (k, m) comes first: afterwards, what far weaker directions have would be rounding.
-    """
+    `along` (k, m) comes first: afterwards, what far weaker directions have would be rounding."""
     total = np.zeros((along.shape[1],) * 2)
     for c, parts in blocks.items():
         for _, jac in parts:

@@ -95,10 +95,8 @@ def _solve(rows: list[tuple[Array, Array]], names: Sequence[str | Load], held: M
 
 
 def _nonnegative(a: Array, b: Array, signed: NDArray[np.bool_]) -> Array:
-    """Return the z (n,) of least ‖a z − b‖ of which only the `signed` may be negative.
-
-    Zeros are tried, the fewest first, until none would rather be positive. To import SciPy's `nnls` takes longer.
-    """
+    """Return the z (n,) of least ‖a z − b‖ of which only the `signed` may be negative. Zeros are tried, the fewest
+    first, until none would rather be positive. To import SciPy's `nnls` takes longer."""
     bound = np.flatnonzero(~signed)
     for zero in (list(c) for k in range(len(bound) + 1) for c in combinations(bound, k)):
         z, rest = np.zeros(len(signed)), np.delete(np.arange(len(signed)), zero)

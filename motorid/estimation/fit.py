@@ -175,10 +175,8 @@ def check_solver(solver: Any) -> None:
 
 def _fit(problem: Problem, effort: LevenbergMarquardt, callback: Callback = None, *, auto: bool = True,
          formulation: str = "plain", began: float = 0.0) -> Fit:
-    """Fit with the orders over the angle that the model has: start values, minimum, polish.
-
-    The covariance follows from the Jacobian there.
-    """
+    """Fit with the orders over the angle that the model has: start values, minimum, polish. The covariance follows from
+    the Jacobian there."""
     asked = problem
     if auto:
         problem = with_start_values(problem)  # first guess, race of starts
@@ -302,10 +300,8 @@ def _misfit(found: Estimate) -> float:
 
 
 def _said(found: Estimate, error: float) -> tuple[str, str]:
-    """Return the status, and the message with what to try.
-
-    Friction makes the cost too rugged to go lower: a misfit that is noise is converged all the same.
-    """
+    """Return the status, and the message with what to try. Friction makes the cost too rugged to go lower: a misfit
+    that is noise is converged all the same."""
     status, message = found.solution.status, found.solution.message
     problem = found.problem
     if status == "stalled" and problem.weights == "noise" and \

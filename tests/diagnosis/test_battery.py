@@ -12,6 +12,7 @@ import pytest
 from battery import cases as battery
 from battery.score import figures, run_case
 
+import motorid as mi
 from motorid.effects import LIBRARY
 
 HERE = Path(__file__).parents[1]
@@ -134,3 +135,17 @@ def test_the_script_runs_cases_and_goes_on_where_it_stopped(tmp_path):
     )
     assert unknown.returncode != 0
     assert "no_such" in unknown.stderr
+
+
+@pytest.mark.parametrize(("name", "rival"), [("coulomb+cogging", "eddy_brake"),
+                                             ("quadratic_drag+voltage_offset", "speed_offset"),
+                                             ("coulomb+speed_lag", "speed_average")])
+def test_what_does_as_well_as_the_first_effect_alone_is_no_rival_once_the_second_is_known(name, rival):
+    case = battery.CASES[name]
+    runs, check = case.records()
+    found = mi.diagnose(mi.fit(mi.dc_motor(), runs), check, effects=[*case.effects, rival])
+    assert next(c for c in found.ranking if c.effect == rival).reason.startswith("lowers the held-out error")
+    assert set(found.effects) == set(case.effects)
+    assert found.groups == ()
+    assert found.rivals == (found.best,)
+    assert rival not in found.text

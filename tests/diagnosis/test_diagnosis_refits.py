@@ -533,15 +533,15 @@ def test_a_cogging_that_no_current_of_the_motor_overcomes_is_refused():
 
 def test_what_the_ladder_left_again_is_not_called_accepted():
     first = Candidate("supply_sag", 0.9, accepted=True, reason="lowers the held-out error")
-    last = frozenset({"pwm_coast", "coulomb"})
-    left = stepwise._as_it_ended(first, last, last)
+    last, none = frozenset({"pwm_coast", "coulomb"}), frozenset()
+    left = stepwise._as_it_ended(first, last, last, none)
     assert not left.accepted
     assert "a model without it predicts better" in left.reason
     pair = replace(first, effect="pwm_coast + coulomb")
-    assert stepwise._as_it_ended(pair, last, last).accepted
-    replaced = stepwise._as_it_ended(first, last, last | {"supply_sag"})
+    assert stepwise._as_it_ended(pair, last, last, none).accepted
+    replaced = stepwise._as_it_ended(first, last, last | {"supply_sag"}, none)
     assert replaced.accepted, "its rung is there, whatever came in its place"
-    later = stepwise._as_it_ended(replace(first, effect="coulomb", accepted=False), last, last)
+    later = stepwise._as_it_ended(replace(first, effect="coulomb", accepted=False), last, last, none)
     assert later.reason == "added in a later step"
 
 
@@ -554,3 +554,25 @@ def test_the_second_best_race_is_finished_however_far_it_is_behind(monkeypatch):
     given_up = trial._outdone(tasks, races, {0: None})
     assert {k: g.why for k, g in given_up.items()} == {2: trial.LESS, 3: trial.NOTHING}
     assert set(trial._outdone(tasks[:1] + tasks[3:], {0: races[0], 1: races[3]}, {})) == {1}
+
+
+def test_what_was_found_on_whole_records_is_kept_where_it_explains_windows_of_them_better(monkeypatch):
+    model = (mi.dc_motor() + mi.effects.coulomb).replace(**TRUE, tau_c=0.01)
+    runs = [_run(model, seed) for seed in (0, 1)]
+    plain, climb, most = mi.fit(mi.dc_motor(), runs[0]), stepwise.climb, []
+
+    def next_climb(search, max_effects, seconds=None):
+        return climb(search, most.pop(), seconds)
+
+    def window():
+        return mi.diagnose(plain, runs[1], effects=["coulomb"]).best.window
+
+    monkeypatch.setattr(stepwise, "_in_windows", lambda found: mi.fit(mi.dc_motor(), runs[0], window=0.1))
+    monkeypatch.setattr(stepwise, "climb", next_climb)
+    most += [0, 3]  # the second climb finds nothing
+    assert window() is None
+    most += [3, 3]  # it finds the same: windows carry no error far
+    assert window() == pytest.approx(0.1, rel=0.05)
+    monkeypatch.setattr(stepwise, "follows", lambda fit: False)
+    most += [0, 3]  # a model that lost the whole records explains nothing
+    assert window() == pytest.approx(0.1, rel=0.05)

@@ -704,6 +704,13 @@ def test_what_a_curve_alone_leaves_as_noise_is_not_named(lab, monkeypatch):
     found = mi.diagnose(fit, runs[2:], effects=("coulomb",))
     assert (found.verdict, found.effects) == ("unexplained", ())
     assert "a friction that changes with the distance run, which the library lacks" in found.ladder.rungs[1].why
+    judge = stepwise.judge_adequacy
+    with monkeypatch.context() as patch:  # also where no slope predicts what is larger than the noise
+        patch.setattr(stepwise, "judge_adequacy", lambda node, *scores: replace(
+            judge(node, *scores), adequate=node.parent is not None))
+        found = mi.diagnose(fit, runs[2:], effects=("coulomb",))
+    assert (found.verdict, found.remainder.kind) == ("unexplained", "structure")
+    assert "follow a friction that changes with the distance run" in found.text
 
     def interrupted(*given):
         raise KeyboardInterrupt
