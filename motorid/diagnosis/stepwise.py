@@ -370,15 +370,15 @@ def _in_windows(found: Climb) -> Fit | None:
 
 
 def _explains(whole: Climb, windowed: Climb) -> bool:
-    """Tell whether what was found on whole records, which it follows, predicts windows of them better than what was
-    found there, or is all that there is."""
+    """Tell whether what was found on whole records, which it follows, surely predicts more of windows of them than
+    what was found there, or is all that there is."""
     last, there = whole.path[-1].fit, windowed.search
     if windowed.stopped and len(windowed.path) == 1:
         return True
     with contextlib.suppress(*FAILURES):
         if len(whole.path) > 1 and follows(last):
             problem = there.root.fit.problem.with_(model=last.model.with_(angle_input=False), noise_factors={})
-            return beats(node_of(solve(problem, QUICK, start="model"), there.held), windowed.path[-1])
+            return evidence(windowed.path[-1], node_of(solve(problem, QUICK, start="model"), there.held)).sure
     return False
 
 
