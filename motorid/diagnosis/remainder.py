@@ -519,12 +519,13 @@ def _better_curve(tried: Iterable[tuple[Curve, Form]], before: Predictions, held
     return _best_of(better) if better else None
 
 
-def _race(found: dict[Any, Grown], tried: Iterable[tuple[Curve, Form]], before: Predictions,
-          held: HeldOut) -> list[tuple[Curve, Form]]:
+def _race(found: dict[Any, Grown], tried: Iterable[tuple[Curve, Form]], before: Predictions, held: HeldOut,
+          rival: Predictions | None = None) -> list[tuple[Curve, Form]]:
     """Put into `found` the curves, each with a form more: the first to its end, of the others those that get furthest
     with few functions (successive halving: Karnin, Koren & Somekh, ICML 2013), until one leaves nothing but noise.
 
-    Returns those that got furthest of all; none where one leaves nothing more.
+    Returns those that got furthest of all; none where one leaves nothing more. With a `rival` all have few functions,
+    and go on where these predict more than it.
     """
     racing = dict[Any, Iterator[Grown]]()
 
@@ -538,10 +539,11 @@ def _race(found: dict[Any, Grown], tried: Iterable[tuple[Curve, Form]], before: 
     for key in tried:
         if (key[0].fit.model.effect_names, key[1]) not in {(c.fit.model.effect_names, f) for c, f in racing}:
             racing[key] = _grown(*key, True, before, held)
-            if quiet(key, TASTED if found else FEW):
+            if quiet(key, TASTED if found or rival is not None else FEW):
                 return []
     ahead = sorted(found, key=lambda key: -found[key].gained.gain)
-    others = [key for key in ahead if key != next(iter(racing))]
+    others = [key for key in ahead if key != next(iter(racing))] if rival is None else [
+        key for key in ahead if compare(rival, found[key].predictions).gain > 0]
     return [] if any(quiet(key, FEW) for key in others[:AHEAD]) else (
         sorted(found, key=lambda key: -found[key].gained.gain)[:AHEAD])
 
@@ -553,7 +555,8 @@ def alone_leaving_noise(last: Node, root: Fit, held: HeldOut) -> FormGain | None
     check_time()
     with contextlib.suppress(*FAILURES):
         forms = islice((f for _, f in _beyond(root) if f.on != "run"), TRIED)
-        _race(found, ((Curve(root, name=_name(root)), form) for form in forms), held.predictions(root), held)
+        tried = ((Curve(root, name=_name(root)), form) for form in forms)
+        _race(found, tried, held.predictions(root), held, last.predictions)
     each = (FormGain(key[1], compare(last.predictions, f.predictions), f.predictions)
             for key, f in found.items() if f.done)
     return next((gain for gain in each if gain.evidence.worth_it), None)

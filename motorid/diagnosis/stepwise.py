@@ -403,7 +403,7 @@ def _runners_up(best: Node, ordered: Sequence[Node], effects: Sequence[Effect]) 
     goal, wider = evidence(best.parent, best).fall, {e.name for e in effects if best.added in e.includes}
     least = max(HALF_AS_GOOD * goal, 1 - np.sqrt(BEHIND) * (1 - goal))
     near = (n for n in ordered if n.key != best.key and evidence(best.parent, n).fall > least)
-    return [n for n in [*near][:BEAM - 1] if n.added not in wider or beats(n, best)]
+    return [n for n in [*near][:BEAM - 1] if not (n.added in wider or n.key > best.key) or beats(n, best)]
 
 
 def _marked(listed: Sequence[Candidate], node: Node, group: tuple[str, ...]) -> tuple[Candidate, ...]:

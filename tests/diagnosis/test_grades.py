@@ -230,6 +230,10 @@ def test_a_model_that_ties_with_the_best_is_grown_too_unless_it_contains_it(rubb
     assert tied(best, wider)
     assert _runners_up(best, [best, wider, worse], [mi.effects.constant_load]) == [wider]
     assert _runners_up(best, [best, wider, worse], library(None)) == []
+    both = node_of(mi.fit(best.fit.model + mi.effects.constant_load, plain.problem.experiments), held, "constant_load",
+                   root)
+    assert tied(best, both)
+    assert _runners_up(best, [best, both], []) == [], "it is the best with what was superfluous"
 
 
 def test_a_rival_with_several_times_the_error_of_the_best_is_not_grown(monkeypatch):
