@@ -39,6 +39,7 @@ from motorid.display.numbers import listed
 from motorid.errors import MotoridError, at_least, numbers_told
 from motorid.estimation.result import Fit, checked
 from motorid.model.definition import Effect
+from motorid.model.model import Model
 from motorid.numerics.parallel import one_thread
 from motorid.numerics.parallel import progress as shown
 from motorid.records.checks import current_limit
@@ -113,7 +114,7 @@ def _told(found: Climb, driven: str, validated: bool) -> Diagnosis:
         verdict, where = "missing", balance_of(ladder.best, names[0])
         answer = missing_text(ladder.rungs, remaining, groups, found.grades, bool(held_out_remark(found.path[-1])),
                               found.stopped)
-        same = {name: p for node in found.path[1:] for name, p in found.search.inseparable(node).items()}
+        same = _inseparable(found, ladder.best.model)
         hidden = found.search.hidden(found.path[-1])
         details = [moves(fit, ladder.best), rises_text(ladder.rungs), inseparable_remark(same), hidden_remark(hidden)]
         for name, shared in same.items():  # what acts through these parameters, and that one
@@ -151,6 +152,12 @@ def _remarks(found: Climb, driven: str) -> list[str]:
     return [stopped, driven, window_remark(last), next(limits, ""), parts_remark(first), unfinished_remark(last),
             held_out_remark(found.path[-1]), own, measured_angle_remark(last), outliers_remark(last),
             closed_loop_remark(first)]
+
+
+def _inseparable(found: Climb, model: Model) -> dict[str, tuple[str, ...]]:
+    """Return the effects that `model` lacks, and parameters of its own that do the same."""
+    met = {name: p for node in found.path[1:] for name, p in found.search.inseparable(node).items()}
+    return {n: p for n, p in met.items() if model.parameters.keys() >= {*p} and n not in model.effect_names}
 
 
 def _suggestion(fits: Sequence[Fit], groups: Sequence[Sequence[str]]) -> str | None:

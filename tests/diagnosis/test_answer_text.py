@@ -10,6 +10,7 @@ from battery.excite import driven, record
 from lab_records import VALUES, noisy, pair, simulated
 
 import motorid as mi
+from motorid.diagnosis import diagnose
 from motorid.diagnosis.misspecification import Grade
 from motorid.diagnosis.results import Rung
 from motorid.diagnosis.verdict import (
@@ -132,3 +133,11 @@ def test_what_is_another_in_every_run_is_said_to_be_estimated_in_the_held_out_ru
     assert one.startswith("g_v is another in every run, and so estimated in the held-out runs too")
     assert "z_0 and g_v are others" in own_in_every_run_remark(SimpleNamespace(per_run={"z_0": {}, "g_v": {}}))
     assert own_in_every_run_remark(SimpleNamespace(per_run={})) == ""
+
+
+def test_what_only_a_model_on_the_way_does_as_well_is_not_said_of_the_last_one():
+    """`constant_load` was told to be like two frictions that a simpler one had replaced."""
+    model = mi.dc_motor() + mi.effects.coulomb + mi.effects.spring
+    same = {"constant_load": ("tau_cp", "tau_cn"), "gravity": ("k_s",), "spring": ("tau_c",)}
+    found = SimpleNamespace(path=(None, "node"), search=SimpleNamespace(inseparable=lambda node: same))
+    assert diagnose._inseparable(found, model) == {"gravity": ("k_s",)}
