@@ -28,6 +28,7 @@ def run_from_columns(columns: Mapping[str, Array], texts: Texts, layout: Layout,
     `notes` and those made here end up in ``meta["notes"]``.
     """
     said = [*notes, *layout.notes]
+    columns = {n: np.where(np.isnan(c), np.nan, c) for n, c in columns.items()}  # one of a damaged file may signal
     places = dict(layout.places)
     t = _time(columns, texts, places.pop("t"), said)
     values = {c: _channel(columns, texts, place, c) for c, place in places.items()}

@@ -75,6 +75,7 @@ def test_any_bytes_give_a_data_error_or_a_run(tmp_path, data):
 @pytest.mark.parametrize("kind", [".mat", ".parquet"])
 @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(start=st.integers(0, 1000), junk=st.binary(min_size=1, max_size=40))
+@example(start=649, junk=bytes(13) + b"\xf1\x7f")  # a NaN that signals
 def test_damaged_binary_formats_give_a_data_error_or_a_run(tmp_path, kind, start, junk):
     good = tmp_path / f"good{kind}"
     if not good.exists():
