@@ -498,6 +498,7 @@ def test_lines_are_cut_between_words_but_not_before_a_unit():
     assert "12.5 %" in text
     assert max(map(len, text.splitlines())) <= 80
     assert wrapped(12 * "a long word 1.25 % ").count("1.25 %") == 12
+    assert wrapped("Start elsewhere with model.replace(…).") == "Start elsewhere with --set NAME=VALUE."
 
 
 def test_what_no_effect_and_no_curve_explains_is_looked_at_next_not_exported(monkeypatch):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import casadi as ca
 import numpy as np
 import pytest
@@ -9,7 +11,9 @@ from lab_records import VALUES, noisy, simulated
 from scipy.optimize import lsq_linear
 
 import motorid as mi
+from motorid.estimation import start_values
 from motorid.estimation.first_guess import _nonnegative, first_guess
+from motorid.problem.problem import Problem
 
 TRUTH = {"R": 2.0, "L": 1e-3, "K": 0.05, "b": 1e-5, "J": 2e-5}
 T = np.arange(0, 4, 2e-3)
@@ -160,3 +164,13 @@ def test_frictions_whose_simpler_relatives_exclude_each_other_are_fitted():
     truth = (mi.dc_motor() + mi.effects.coulomb_asymmetric).replace(**GEARED, tau_cp=0.004, tau_cn=0.006)
     run = record(truth, "i theta", swinging())
     assert mi.fit(model, run).values["tau_cn"] == pytest.approx(0.006, rel=0.2)
+
+
+def test_where_a_race_ends_only_by_steps_too_coarse_to_see_it_diverge_nothing_begins(monkeypatch):
+    """A hoist's friction could not be fitted: "the model cannot be simulated at the start"."""
+    problem = Problem(mi.dc_motor(), (record(mi.dc_motor().replace(**TRUTH), "omega", swinging()),))
+    end = SimpleNamespace(values=problem.model.values | {"R": 3.0})
+    assert start_values._led(problem, None) is problem
+    assert start_values._led(problem, end).model.values["R"] == 3.0
+    monkeypatch.setattr(start_values, "cost_at", lambda problem: np.inf)
+    assert start_values._led(problem, end) is problem
