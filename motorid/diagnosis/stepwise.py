@@ -73,23 +73,23 @@ def climb(search: Search, max_effects: int, seconds: float | None = None) -> Cli
     scores = search.scores(search.root)
     first = judge_adequacy(search.root, scores)
     search.stages.done(first_answer(search.root.fit, first, scores))
-    found, stopped = Climb(search, (search.root,), (), (), "", first, first), ""
+    found = Climb(search, (search.root,), (), (), "", first, first)
     steps = _rounds(found, max_effects)
     looked = time.monotonic() - began  # about as long as to look at what remains
     try:
         with budget(seconds and max(seconds - 2 * looked, 0.0)):
             while (further := next(steps, None)) is not None:
                 found = further
+        search.stages.round(max_effects + 1)
+        search.stages.at("Looking at what remains")
+        if not found.stopped:
+            return _finished(found)
     except (OutOfTime, KeyboardInterrupt) as error:
         interruption.heard()
-        stopped = OUT_OF_TIME if isinstance(error, OutOfTime) else INTERRUPTED
-    if stopped := stopped or found.stopped:
-        found = replace(found, stopped=stopped, text=f"stopped early: {stopped}; more may be missing",
-                        rounds=found.rounds or (tuple(search.listed(scores, {}, stopped)),),
-                        remaining=judge_adequacy(found.path[-1]))
-    search.stages.round(max_effects + 1)
-    search.stages.at("Looking at what remains")
-    return _finished(found)
+        found = replace(found, stopped=OUT_OF_TIME if isinstance(error, OutOfTime) else INTERRUPTED)
+    return _finished(replace(found, text=f"stopped early: {found.stopped}; more may be missing",
+                             rounds=found.rounds or (tuple(search.listed(scores, {}, found.stopped)),),
+                             remaining=judge_adequacy(found.path[-1])))
 
 
 def _rounds(found: Climb, max_effects: int) -> Iterator[Climb]:

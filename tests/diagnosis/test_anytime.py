@@ -108,6 +108,20 @@ def test_a_chosen_effect_is_not_lost_where_the_time_is_up_before_it_is_fitted_on
     assert found.stopped
 
 
+def test_what_was_found_is_kept_where_the_look_at_what_remains_is_interrupted(plain, monkeypatch):
+    graded, left = stepwise.grades_of, [1]
+
+    def pressed(*given):
+        if left.pop():
+            left.append(0)
+            raise KeyboardInterrupt
+        return graded(*given)
+
+    monkeypatch.setattr(stepwise, "grades_of", pressed)
+    found = mi.diagnose(plain, effects=["coulomb"])
+    assert (found.effects, found.stopped) == (("coulomb",), refit.INTERRUPTED)
+
+
 def test_a_second_climb_that_is_cut_short_does_not_lose_the_first(plain, monkeypatch):
     """A pendulum is climbed again in windows; whoever stops that at its start still gets what was found."""
     climbs, climb = [], stepwise.climb
