@@ -264,8 +264,9 @@ def _in_waves(way: Map, tasks: Sequence[Task]) -> Iterator[list[Any]]:
 
 
 def _waves(tasks: Sequence[Task]) -> Iterator[list[Task]]:
+    room = max(WAVE - sum(len(task.shared.data) for task in tasks[:1]), 1)  # beside what all of a wave share
     sizes = accumulate(len(task.items.data) for task in tasks)
-    for _, wave in groupby(zip(sizes, tasks, strict=True), lambda pair: pair[0] // WAVE):
+    for _, wave in groupby(zip(sizes, tasks, strict=True), lambda pair: pair[0] // room):
         yield [task for _, task in wave]
 
 

@@ -12,6 +12,7 @@ import pytest
 from threadpoolctl import ThreadpoolController
 
 import motorid as mi
+from motorid.numerics import parallel
 from motorid.numerics.parallel import map_items, one_thread
 
 MANY = 2
@@ -96,3 +97,13 @@ ROOT = Path(__file__).resolve().parents[2]
 def test_no_test_and_no_benchmark_sets_threads_that_users_would_not_have():
     given = [*(ROOT / "tests").rglob("*.py"), ROOT / "pyproject.toml", *(ROOT / ".ci").glob("*")]
     assert {str(p): found for p in given if (found := THREADS.findall(p.read_text("utf-8")))} == {}
+
+
+@pytest.mark.parametrize(("shared", "waves"), [(10, [3, 4, 3]), (parallel.WAVE, [1] * 10)])
+def test_a_pool_is_handed_as_much_at_once_as_it_can_hold_whatever_its_tasks_share(shared, waves):
+    def parcel(size):
+        return parallel.Parcel("", bytes(size))
+
+    tasks = [parallel.Task(parcel(shared), parcel(1_000_000), len) for _ in range(10)]
+    assert [len(wave) for wave in parallel._waves(tasks)] == waves
+    assert list(parallel._waves([])) == []
