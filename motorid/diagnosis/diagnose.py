@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 from motorid.channels import channel_name
+from motorid.diagnosis import verdict as words
 from motorid.diagnosis.adequacy import following
 from motorid.diagnosis.candidates import Stages, library
 from motorid.diagnosis.experiment_design import suggest_experiment
@@ -17,24 +18,6 @@ from motorid.diagnosis.record_parts import parts_remark
 from motorid.diagnosis.remainder import Remainder
 from motorid.diagnosis.results import Diagnosis
 from motorid.diagnosis.stepwise import Climb, explored, ladder_of
-from motorid.diagnosis.verdict import (
-    adequate_text,
-    balance_of,
-    closed_loop_remark,
-    held_out_remark,
-    hidden_remark,
-    inseparable_remark,
-    measured_angle_remark,
-    missing_text,
-    moves,
-    outliers_remark,
-    own_in_every_run_remark,
-    rises_text,
-    unexplained_text,
-    unfinished_remark,
-    unseen_remark,
-    window_remark,
-)
 from motorid.display.numbers import listed
 from motorid.errors import MotoridError, at_least, numbers_told
 from motorid.estimation.result import Fit, checked
@@ -111,12 +94,12 @@ def _told(found: Climb, driven: str, validated: bool) -> Diagnosis:
     if like is not None and not names:
         missing = acting_like(missing, like)
     if names:
-        verdict, where = "missing", balance_of(ladder.best, names[0])
-        answer = missing_text(ladder.rungs, remaining, groups, found.grades, bool(held_out_remark(found.path[-1])),
-                              found.stopped)
+        verdict, where = "missing", words.balance_of(ladder.best, names[0])
+        rises = bool(words.held_out_remark(found.path[-1]))
+        answer = words.missing_text(ladder.rungs, remaining, groups, found.grades, rises, found.stopped)
         same = _inseparable(found, ladder.best.model)
-        hidden = found.search.hidden(found.path[-1])
-        details = [moves(fit, ladder.best), rises_text(ladder.rungs), inseparable_remark(same), hidden_remark(hidden)]
+        also = words.hidden_remark(found.search.hidden(found.path[-1]))
+        details = [words.moves(fit, ladder.best), words.rises_text(ladder.rungs), words.inseparable_remark(same), also]
         for name, shared in same.items():  # what acts through these parameters, and that one
             inside = (e.name for e in ladder.best.model.effects if {p.name for p in e.parameters} & {*shared})
             groups = (*groups, (*inside, name))
@@ -124,16 +107,16 @@ def _told(found: Climb, driven: str, validated: bool) -> Diagnosis:
     elif len(found.path) > 1 or not remaining.adequate:
         verdict, where = "unexplained", missing.where
         judged = judged if len(found.path) > 1 else remaining
-        answer = unexplained_text(ranking, ladder.rungs, found.grades, like.text if like else "", remaining,
-                                  done=not found.stopped)
+        answer = words.unexplained_text(ranking, ladder.rungs, found.grades, like.text if like else "", remaining,
+                                        done=not found.stopped)
         details = [] if len(found.path) > 1 else [judged.text]
-        details += [missing.text, rises_text(ladder.rungs)]
+        details += [missing.text, words.rises_text(ladder.rungs)]
     else:
         verdict, where, judged = "adequate", None, remaining
-        answer, *details = adequate_text(judged, ranking, bool(far(ladder.best)))
+        answer, *details = words.adequate_text(judged, ranking, bool(far(ladder.best)))
     kind = "structure" if not remaining.adequate else "fluctuation" if far(ladder.best) else "noise"
     if not names:
-        details.append(unseen_remark(unseen))
+        details.append(words.unseen_remark(unseen))
     details = tuple(t for t in (*details, *_remarks(found, driven)) if t)
     text = " ".join(t for t in (answer, *details, suggestion) if t)
     approximating = {g.effect: g.form for g in found.grades if g.grade == "approximates"}
@@ -148,10 +131,10 @@ def _remarks(found: Climb, driven: str) -> list[str]:
     limits = (f"In {run.name} {limit}" for run in first.problem.experiments if LIMITER not in found.path[-1].key
               and (limit := current_limit(run)))
     stopped = f"Stopped early: {found.stopped}; more may be missing." if found.stopped else ""
-    own = own_in_every_run_remark(last) if found.search.held.validation is not None else ""
-    return [stopped, driven, window_remark(last), next(limits, ""), parts_remark(first), unfinished_remark(last),
-            held_out_remark(found.path[-1]), own, measured_angle_remark(last), outliers_remark(last),
-            closed_loop_remark(first)]
+    own = words.own_in_every_run_remark(last) if found.search.held.validation is not None else ""
+    return [stopped, driven, words.window_remark(last), next(limits, ""), parts_remark(first),
+            words.unfinished_remark(last), words.held_out_remark(found.path[-1]), own,
+            words.measured_angle_remark(last), words.outliers_remark(last), words.closed_loop_remark(first)]
 
 
 def _inseparable(found: Climb, model: Model) -> dict[str, tuple[str, ...]]:

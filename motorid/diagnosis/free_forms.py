@@ -34,8 +34,9 @@ LINES = 2  # of the spectrum of the misfit over the angle, or the time
 AROUND = 31  # frequencies that such a line stands out of
 PLACES = 12  # over a time or an angle at which something may set in
 SECTORS = 4  # widths of a sector of a turn, each twice the one before
-LOBES = (0.15, 0.3, 0.6)  # rad: standard deviations of a lobe
+LOBES = (0.15, 0.3, 0.6)  # rad: half of the width of a lobe, and of its edges
 EDGE = 10.0  # how many of its edges, from one to zero, a sector is wide
+SOFTEST = 100.0  # width of an edge, rad: as good as a Gaussian lobe
 SUDDEN = 60.0  # how quickly a curve over the time or the angle may step, per range
 FADES = (1, 3, 10, 30)  # lengths in a range of what fades over a time or a distance
 SOON = (3, 10, 30, 100, 300)  # the same of what fades after each switching
@@ -134,13 +135,14 @@ FORMS = (*(Form(words, balance, on, carrier) for words, balance, carrier, quanti
 @dataclass(frozen=True)
 class Span:
     """What a form reaches over: the range of every quantity, the orders of a turn, the time between samples (s); how
-    many places and knees it has, for each of the few by which forms are compared."""
+    many places and knees it has, for each of the few by which forms are compared; how often it repeats in a turn."""
 
     ranges: Mapping[str, tuple[float, float]]
     orders: tuple[float, ...]
     step: float
     finer: int = 1
     rates: tuple[float, ...] = ()  # of waves over the time, rad/s
+    pitches: int = 1
 
     @property
     def reach(self) -> float:
@@ -227,9 +229,9 @@ def functions_of(form: Form, span: Span) -> list[str]:
     """
     low, high = span.ranges[form.on]
     if form.on == "turn":
-        waves = ["1.0", *(f"ca.{f}({k:.6g} * z)" for k in span.orders for f in ("sin", "cos"))]
+        waves = ["1.0", *(f"ca.{f}({k:.6g} * z)" for k in waves_of(span) for f in ("sin", "cos"))]
         plain = form.carrier == "acceleration" or span.finer == 1  # none jumps, and forms compare better by few
-        return waves if plain else waves + _sectors(PLACES * span.finer) + _lobes()
+        return waves if plain else waves + _sectors(PLACES * span.finer, span.pitches)
     if form.on in PAST:
         lengths = memories_of(form, span)
         lags = [f"past(z, {_place(length, lengths[0] / 10, lengths[-1] * 10)})" for length in lengths]
@@ -302,20 +304,24 @@ def _of_size(form: Form, span: Span, low: float, high: float) -> list[str]:
     return [side, *smooth, f"{s} * {size}", "1.0", size, f"{size}**3", *(f"ca.tanh({size} / {bend})" for bend in bends)]
 
 
-def _sectors(count: int) -> list[str]:
-    """Return sectors of a turn as source, one inside and zero outside: a worn segment, a lobe, a bad tooth."""
-    found = []
-    for width in (w for k in range(SECTORS) if (w := 2**k * 2 * np.pi / count) < 2):
-        steep, half = EDGE / (width * np.sin(width / 2)), _place(width / 2, width / 8, min(2 * width, 3.0))
-        found += [f"0.5 * (1 + ca.tanh({steep:.4g} * (ca.cos(z - {_place(c, c - width, c + width)}) - ca.cos({half}))))"
-                  for c in np.arange(count) * 2 * np.pi / count]
+def waves_of(span: Span) -> list[float]:
+    """Return the orders of a turn that repeat as often as a span does."""
+    own = {span.pitches * k for k in range(1, HARMONICS + 1)} if span.pitches > 1 else set()
+    return sorted(own | {k for k in span.orders if k % span.pitches == 0})
+
+
+def _sectors(count: int, pitches: int) -> list[str]:
+    """Return sectors and lobes of a pitch as source, one inside and zero outside: a worn segment, a cam, a tooth."""
+    sectors = [(c, w / 2, w / EDGE) for k in range(SECTORS) if (w := 2**k * 2 * np.pi / count) < 2
+               for c in np.arange(count) * 2 * np.pi / count]
+    lobes = [(c, w, w) for w in LOBES for c in np.arange(0, 2 * np.pi, 1.5 * w)]
+    z, found = f"{pitches} * z" if pitches > 1 else "z", []
+    for c, half, edge in sectors + lobes:
+        at, wide = _place(c, c - 2 * half, c + 2 * half), _place(half, half / 4, min(4 * half, 3.0))
+        soft = _place(edge, 2 * np.pi / count / EDGE, SOFTEST)
+        inside = f"(ca.cos({z} - {at}) - ca.cos({wide})) / ca.sin({wide}) / {soft}"
+        found.append(f"0.5 * (1 + ca.tanh({inside}))")
     return found
-
-
-def _lobes() -> list[str]:
-    """Return smooth lobes of a turn as source, von Mises' density to one at its top: a cam, a magnet, a tight spot."""
-    return [f"ca.exp((ca.cos(z - {_place(c, c - w, c + w)}) - 1) / {_place(w**2, w**2 / 8, 4, 'rad^2')})"
-            for w in LOBES for c in np.arange(0, 2 * np.pi, 1.5 * w)]
 
 
 def memories_of(form: Form, span: Span) -> Array:
@@ -387,6 +393,7 @@ def basis_of(form: Form, signal: Mapping[str, Array], span: Span) -> Array:
 BALANCES = ("voltage", "torque")
 STATES = {"torque": "omega", "voltage": "i"}  # whose rate a balance is
 NUDGE = 1e-3  # of a size
+EXACT = 1e-12  # share of a square that sums of products still tell
 UNBOUNDED = 1e9  # in units of the noise, per unit of what a form puts in
 
 
@@ -468,7 +475,8 @@ def _signals(fit: Fit, k: int) -> dict[str, Array]:
     found |= {f"past {c}": found[c] for c in ("v", "i", "omega") if c in found}
     found |= {c: time_since(run, c) for c in COMPUTED_INPUTS}
     if "theta" in run.outputs or "omega" in run.outputs:
-        found["theta"] = found["turn"] = angle_signal(run)
+        zero = dict(zip(fit.problem.system.parameters, parameter_vector(fit, k), strict=True)).get("z_0", 0.0)
+        found["theta"] = found["turn"] = angle_signal(run) + zero
     return found
 
 
@@ -491,23 +499,22 @@ def _driven(answer: Response, bases: Mapping[Form, Array]) -> Array:
     n, ny, _ = answer.c.shape
     if not bases:
         return np.zeros((n * ny, 0))
-    forces = [np.stack([_share(f, b, answer, on) for on in BALANCES], axis=2) for f, b in bases.items()]
     with np.errstate(over="ignore", invalid="ignore"):
-        out = answer.driven(np.einsum("nxf,nmf->mnx", answer.b, np.concatenate(forces, axis=1), optimize=True))
+        out = answer.driven(np.concatenate([_pushes(f, b, answer) for f, b in bases.items()]))
     unit = max(1.0, *(float(np.abs(b).max(initial=0.0)) for b in bases.values()))
     if not np.all(np.abs(out) < UNBOUNDED * unit):  # or not a number
         raise SimulationError("the model's answer to small changes grows without bound along these records.")
     return out.reshape(n * ny, -1)
 
 
-def _share(form: Form, basis: Array, answer: Response, balance: str) -> Array:
-    """Return what a form puts in a balance over each sample, (N-1, m); only the voltage jumps."""
+def _pushes(form: Form, basis: Array, answer: Response) -> Array:
+    """Return what a form's functions push on the states over each sample, (m, N-1, nx); only the voltage jumps."""
+    shares = {form.balance: basis}
     if form.balance == "both":
-        basis = basis * (answer.states["i"] if balance == "torque" else -answer.states["omega"])[:, None]
-    elif form.balance != balance:
-        return np.zeros_like(basis[1:])
+        shares = {"voltage": -answer.states["omega"][:, None] * basis, "torque": answer.states["i"][:, None] * basis}
     held = form.on in ("v", *COMPUTED_INPUTS) or form.carrier == "v"
-    return basis[:-1] if held else 0.5 * (basis[:-1] + basis[1:])
+    over = {k: (b[:-1] if held else 0.5 * (b[:-1] + b[1:])).T for k, b in shares.items()}
+    return np.sum([b[:, :, None] * answer.b[:, :, BALANCES.index(k)] for k, b in over.items()], axis=0)
 
 
 def _read(problem: Problem, form: Form, basis: Array, weights: Array) -> Array:
@@ -531,7 +538,8 @@ def form_coefficients(fit: Fit, linear: Linear, form: Form, kept: Sequence[int] 
     first = linear.slopes.shape[1]
     chosen = list(range(len(sizes)) if kept is None else kept)
     together = np.column_stack([columns[:, :first], columns[:, first:][:, chosen], linear.own])
-    return ridge(together, linear.residual)[first : first + len(chosen)] * sizes[chosen]
+    found = ridge(together.T @ together, together.T @ linear.residual, linear.residual)
+    return found[first : first + len(chosen)] * sizes[chosen]
 
 
 def form_columns(fit: Fit, linear: Linear, form: Form) -> tuple[Array, Array]:
@@ -545,17 +553,19 @@ def form_columns(fit: Fit, linear: Linear, form: Form) -> tuple[Array, Array]:
     norms = np.linalg.norm(answers, axis=0)
     sizes = np.where(norms > 0, size / np.where(norms > 0, norms, 1.0), 0.0)
     free = problem.scaling.slope(fit.q)[: linear.slopes.shape[1]]
+    free = free * [p.name not in fit.at_bound for p in problem.unknown[: len(free)]]
     return np.column_stack([linear.slopes * free, answers * sizes]), sizes
 
 
-def ridge(columns: Array, residual: Array) -> Array:
-    """Return least-squares coefficients with a prior of one unit at the scale of what is left."""
-    norms = np.linalg.norm(columns, axis=0)
+def ridge(normal: Array, products: Array, residual: Array) -> Array:
+    """Return least-squares coefficients, by normal equations, with a prior of one unit at the scale of what is left."""
+    norms = np.sqrt(np.diagonal(normal))
     norms = np.where(norms > 0, norms, 1.0)
-    rough = residual - columns @ (np.linalg.lstsq(columns / norms, residual, rcond=1e-7)[0] / norms)
-    scale2 = float(rough @ rough) / len(residual)
-    normal = columns.T @ columns + scale2 * np.eye(columns.shape[1])
-    return np.asarray(np.linalg.solve(normal, columns.T @ residual), float)
+    unit = products / norms
+    square = float(residual @ residual)
+    taken = float(unit @ np.linalg.lstsq(normal / np.outer(norms, norms), unit, rcond=EXACT)[0])
+    scale2 = max(square - taken, EXACT * square) / len(residual)
+    return np.asarray(np.linalg.solve(normal + scale2 * np.eye(len(normal)), products), float)
 
 
 def contains(fit: Fit, form: Form, size: str) -> bool:

@@ -8,35 +8,18 @@ parametric law that is outdone by a nonparametric one is not the thing itself (H
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Container, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from motorid.channels import CHANNELS
+from motorid.diagnosis import free_forms, predictive_score
 from motorid.diagnosis.admissibility import objections
-from motorid.diagnosis.free_forms import (
-    Form,
-    Linear,
-    contains,
-    effect_force,
-    force_of,
-    form_columns,
-    linearised,
-    pushes_of,
-    ridge,
-)
+from motorid.diagnosis.free_forms import Form, Linear, Span
 from motorid.diagnosis.model_comparison import Node, evidence, far
-from motorid.diagnosis.predictive_score import (
-    Evidence,
-    Predictions,
-    blocks_of,
-    by_channel,
-    compare,
-    left_out,
-    predictions_left_out,
-    stacked_labels,
-)
+from motorid.diagnosis.predictive_score import Evidence, Predictions, compare
 from motorid.diagnosis.thresholds import MOST, STANDARD_ERRORS, SUPPLANTS, TRIFLE, UNCONTESTED
 from motorid.display.numbers import listed, percent
 from motorid.estimation.angle_orders import uses_angle
@@ -67,12 +50,13 @@ def better_forms(fit: Fit, rival: Fit, channels: Container[str] = CHANNELS) -> l
     What remembers comes after a function of the present that is not surely worse.
     """
     try:
-        linear = linearised(fit)
+        linear = free_forms.linearised(fit)
     except FAILURES:
         return []
-    known, gains = {c: e for c, e in (predictions_left_out(rival, evenly=True) or {}).items() if c in channels}, []
+    known, gains = predictive_score.predictions_left_out(rival, evenly=True) or {}, []
+    known = {c: e for c, e in known.items() if c in channels}
     for form in linear.forms:
-        predicted = form_predictions(fit, linear, form)
+        predicted = Answers(fit, linear, form).predictions()
         if predicted is not None:
             found = compare(Predictions(known, {}), predicted)
             found = replace(found, gain=found.gain - np.log(len(linear.forms)))  # the best of many gains by chance
@@ -84,27 +68,34 @@ def better_forms(fit: Fit, rival: Fit, channels: Container[str] = CHANNELS) -> l
     return gains
 
 
-def form_predictions(fit: Fit, linear: Linear, form: Form, kept: Sequence[int] | None = None) -> Predictions | None:
-    """Return what `fit` with a free form, or those functions of it, predicts of blocks left out, by its slopes.
+class Answers:
+    """A model's slopes and its answers to the functions of a form, with what all sets of these functions share."""
 
-    None where they lead nowhere.
-    """
-    problem, first = fit.problem, linear.slopes.shape[1]
-    columns, _ = form_columns(fit, linear, form)
-    if kept is not None:
-        columns = np.column_stack([columns[:, :first], columns[:, first:][:, list(kept)]])
-    together = np.column_stack([columns, linear.own])
-    try:
-        residual = linear.residual - together @ ridge(together, linear.residual)
-        blocks = blocks_of(problem.experiments, evenly=True)
-        moved = left_out(residual, columns, stacked_labels(problem, blocks))
-    except np.linalg.LinAlgError:
-        return None
-    return Predictions(by_channel(problem, moved, blocks), {}) if np.isfinite(moved).all() else None
+    def __init__(self, fit: Fit, linear: Linear, form: Form) -> None:
+        self.problem, self.residual, self.known = fit.problem, linear.residual, linear.slopes.shape[1]
+        self.columns = np.asfortranarray(np.column_stack([free_forms.form_columns(fit, linear, form)[0], linear.own]))
+        self.functions = self.columns.shape[1] - self.known - linear.own.shape[1]
+        self.normal, self.products = self.columns.T @ self.columns, self.columns.T @ self.residual
+        self.blocks = predictive_score.blocks_of(self.problem.experiments, evenly=True)
+        self.labels = predictive_score.stacked_labels(self.problem, self.blocks)
+
+    def predictions(self, kept: Sequence[int] | None = None) -> Predictions | None:
+        """Return what the model with those functions, or all, predicts of blocks left out; None if slopes mislead."""
+        functions = [self.known + k for k in (range(self.functions) if kept is None else kept)]
+        both = [*range(self.known), *functions, *range(self.known + self.functions, self.columns.shape[1])]
+        try:
+            sizes = free_forms.ridge(self.normal[np.ix_(both, both)], self.products[both], self.residual)
+            residual = self.residual - (columns := self.columns[:, both]) @ sizes
+            moved = predictive_score.left_out(residual, columns[:, : self.known + len(functions)], self.labels)
+        except np.linalg.LinAlgError:
+            return None
+        found = predictive_score.by_channel(self.problem, moved, self.blocks)
+        return Predictions(found, {}) if np.isfinite(moved).all() else None
 
 
-def chosen_functions(fit: Fit, linear: Linear, form: Form, chosen_before: Iterable[int] = ()) -> list[int]:
-    """Return the fewest functions of a form that beside `fit` predict blocks left out, the most useful first.
+def chosen_functions(fit: Fit, linear: Linear, form: Form, chosen_before: Iterable[int] = (),
+                     first: bool = False) -> list[int]:
+    """Return the fewest functions of a form that beside `fit` predict blocks left out, or the `first` of them alone.
 
     Orthogonal matching pursuit (Pati, Rezaiifar & Krishnaprasad 1993): each time the function that takes most of what
     is left. Of the sets passed the smallest that predicts within one standard error of the best is taken (Breiman et
@@ -112,40 +103,56 @@ def chosen_functions(fit: Fit, linear: Linear, form: Form, chosen_before: Iterab
     is no function of its own. The waves of a narrow dip help only together, so sets are passed as long as one function
     more takes what no noise would give to the best of so many (Donoho & Johnstone, Biometrika 81(3), 1994).
     """
-    before = form_predictions(fit, linear, form, ())
+    answers = Answers(fit, linear, form)
+    before = answers.predictions(())
     if before is None:
         return []
     best = tuple[int, ...](), before
-    sets = [best]
-    for chosen in _pursued(fit, linear, form, list(chosen_before)):
-        if (after := form_predictions(fit, linear, form, chosen)) is not None:
+    sets, passed = [best], list(_pursued(answers, list(chosen_before)))
+    if first:  # sets of twice as many as the one before, and the last, tell whether any is worth it
+        passed = [some for some in passed if not len(some) & (len(some) - 1) or some is passed[-1]]
+    for chosen in passed:
+        if (after := answers.predictions(chosen)) is not None:
+            if first and compare(before, after).worth_it:
+                return [chosen[0]]
             sets.append((chosen, after))
             best = (chosen, after) if compare(best[1], after).gain > 0 else best
     chosen, after = next(s for s in sets if (e := compare(s[1], best[1])).gain <= e.se)
-    return list(chosen) if compare(before, after).worth_it else []
+    return list(chosen) if not first and compare(before, after).worth_it else []
 
 
-def _pursued(fit: Fit, linear: Linear, form: Form, had: Sequence[int]) -> Iterator[tuple[int, ...]]:
-    """Yield sets of functions, each with one more: that which takes most of what is left, beside those it `had`."""
-    columns, _ = form_columns(fit, linear, form)
-    known, answers = np.split(columns, [linear.slopes.shape[1]], axis=1)
+def pitches_of(fit: Fit, form: Form, span: Span) -> int:
+    """Return how often to the turn a curve repeats: the most times for which waves that do predict as well as all."""
+    with contextlib.suppress(*FAILURES):
+        answers = Answers(fit, free_forms.linearised(fit, form, span), form)
+        orders = [0, *np.repeat(free_forms.waves_of(span), 2)]
+        each = {n: answers.predictions([j for j, k in enumerate(orders) if k % n == 0])
+                for n in range(1, int(max(orders)) // 2)}
+        return max((n for n, p in each.items() if p and (all_ := each[1]) and not compare(p, all_).worth_it), default=1)
+    return 1
+
+
+def _pursued(answers: Answers, had: Sequence[int]) -> Iterator[tuple[int, ...]]:
+    """Yield sets of functions, each with one more: that which takes most of what is left, beside those it `had`; by
+    products alone (Rubinstein, Zibulevsky & Elad, Technion CS-2008-08)."""
+    own = slice(answers.known, answers.known + answers.functions)
+    known = answers.columns[:, : answers.known]
     known = np.linalg.svd(known[:, np.linalg.norm(known, axis=0) > 0], full_matrices=False)[0]
-    left, sizes = answers - known @ (known.T @ answers), np.linalg.norm(answers, axis=0)
-    residual = linear.residual - known @ (known.T @ linear.residual)
+    across, along = known.T @ answers.columns[:, own], known.T @ answers.residual
+    left, products = answers.normal[own, own] - across.T @ across, answers.products[own] - along @ across
+    square, least = float(answers.residual @ answers.residual - along @ along), np.diagonal(answers.normal)[own]
     chosen: tuple[int, ...] = ()
     while True:
-        norms = np.linalg.norm(left, axis=0)
-        free = norms > INSEPARABLE * sizes
-        free[had] = False
-        taken = np.where(free, np.abs(residual @ left) / np.where(free, norms, 1.0), 0.0)
+        free = np.diagonal(left) > INSEPARABLE**2 * least
+        free[[*had, *chosen]] = False
+        norms = np.sqrt(np.where(free, np.diagonal(left), 1.0))
+        taken = np.where(free, np.abs(products) / norms, 0.0)
         best = int(np.argmax(taken))
-        if not taken[best] ** 2 > 2 * np.log(len(taken)) * float(residual @ residual) / len(residual):
+        if not taken[best] ** 2 > 2 * np.log(len(taken)) * square / len(answers.residual):
             return
-        unit = left[:, best] / norms[best]
-        left, residual = left - np.outer(unit, unit @ left), residual - unit * (unit @ residual)
-        left[:, best] = 0.0
-        chosen = (*chosen, best)
-        yield chosen
+        unit, product = left[:, best] / norms[best], products[best] / norms[best]
+        left, products, square = left - np.outer(unit, unit), products - product * unit, square - product**2
+        yield (chosen := (*chosen, best))
 
 
 @dataclass(frozen=True)
@@ -197,10 +204,15 @@ def grades_of(last: Node, root: Node, groups: Sequence[Sequence[str]], beside: S
 
 def _with_zeros_alike(grades: tuple[Grade, ...], fit: Fit) -> tuple[Grade, ...]:
     """Return grades where an encoder's zero of every run is no surer than the effects over the angle beside it."""
-    over = {e.name: any(p.per_run for p in e.parameters) for e in fit.model.effects if uses_angle(e)}
+    over = {e.name: tells_the_zero(e) for e in fit.model.effects if uses_angle(e)}
     asking = [g for g in grades if over.get(g.effect) is False]
     alike = len(asking) == sum(not zero for zero in over.values()) and {g.grade for g in asking} == {"approximates"}
     return tuple(replace(asking[0], effect=g.effect) if alike and over.get(g.effect) else g for g in grades)
+
+
+def tells_the_zero(effect: Effect) -> bool:
+    """Tell whether an effect is a zero of the angle of every run's own."""
+    return uses_angle(effect) and any(p.per_run for p in effect.parameters)
 
 
 def outdoes(fall: float, further: float) -> bool:
@@ -235,7 +247,7 @@ def _within_smoothing(fit: Fit, effect: Effect) -> str:
     if effect.balance != "torque" or "sgn_width" not in fit.values:
         return ""
     at = fit.problem.system.states.index("omega")
-    forces = {e.name: max((float(np.sqrt(np.mean(pushes_of(fit, p.name)[:, at] ** 2))) for p in e.parameters
+    forces = {e.name: max((float(np.sqrt(np.mean(free_forms.pushes_of(fit, p.name)[:, at] ** 2))) for p in e.parameters
                            if p.null == 0 and p.vary), default=0.0) for e in fit.model.effects if e.balance == "torque"}
     if forces[effect.name] < SGN_WIDTH_SHARE * max(forces.values()):
         return f"it does less than {percent(SGN_WIDTH_SHARE, 1)} of what the others do, as a smooth sgn gets wrong"
@@ -246,5 +258,5 @@ def _swallows(fit: Fit, form: Form, effect: Effect) -> bool:
     """Tell whether an effect is a special case of a form that differs from it by more than a trifle. A constant
     friction is one of a friction that changes with the angle."""
     sizes = [p.name for p in effect.parameters if p.null == 0]
-    return bool(sizes) and all(contains(fit, form, name) for name in sizes) and (
-        force_of(fit, form) > TRIFLE * max(effect_force(fit, form, name) for name in sizes))
+    return bool(sizes) and all(free_forms.contains(fit, form, name) for name in sizes) and (
+        free_forms.force_of(fit, form) > TRIFLE * max(free_forms.effect_force(fit, form, name) for name in sizes))

@@ -198,11 +198,12 @@ def _log_densities(r: Array, labels: NDArray[np.intp], count: int, floor: float)
 def left_out(residual: Array, columns: Array, labels: NDArray[np.intp]) -> Array:
     """Return what `residual` (n,) would be in each block, left out of the fit of `columns` (n, k)."""
     scale2 = float(residual @ residual) / max(len(residual), 1)
-    normal = columns.T @ columns + scale2 * np.eye(columns.shape[1])
     found, order = residual.copy(), np.argsort(labels, kind="stable")
-    for rows in np.split(order, np.flatnonzero(np.diff(labels[order])) + 1):
-        j, r = columns[rows], residual[rows]
-        found[rows] = r + j @ np.linalg.solve(normal - j.T @ j, j.T @ r)
+    blocks = [(rows, j := columns[rows], j.T @ j)
+              for rows in np.split(order, np.flatnonzero(np.diff(labels[order])) + 1)]
+    normal = sum(own for *_, own in blocks) + scale2 * np.eye(columns.shape[1])
+    for rows, j, own in blocks:
+        found[rows] += j @ np.linalg.solve(normal - own, j.T @ residual[rows])
     return found
 
 

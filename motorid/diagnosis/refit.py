@@ -367,16 +367,12 @@ def _outdone(tasks: Sequence[Task], races: Mapping[int, Raced], found: Mapping[i
     """Return the races that an undamped step from their end still leaves far behind, or with nothing gained. Gained is
     what the model without the effect would not reach by such a step itself: a stalled fit promises much."""
     fit, costs, given_up = tasks[0].fit, sorted(race.cost for race in races.values()), {}
-    own = _own_reach(fit)
+    own = _undamped(fit.residuals, fit.jacobian * fit.problem.scaling.slope(fit.q))
     for k, race in races.items():
         nothing = race.reach > (1 - LITTLE) * own and race.cost > (1 - LITTLE) * fit.cost
         if k not in found and (nothing or (race.reach > OUTDONE * costs[0] and race.cost not in costs[:BEAM])):
             given_up[k] = GivenUp(NOTHING if nothing else LESS, 1 - race.cost / max(fit.cost, 1e-300), (tasks[k], race))
     return given_up
-
-
-def _own_reach(fit: Fit) -> float:
-    return _undamped(fit.residuals, fit.jacobian * fit.problem.scaling.slope(fit.q))
 
 
 def _leader(tasks: Sequence[Task]) -> int | None:

@@ -21,22 +21,10 @@ import casadi as ca
 import numpy as np
 
 from motorid.channels import COMPUTED_INPUTS
+from motorid.diagnosis import free_forms
 from motorid.diagnosis.cross_validation import HeldOut
-from motorid.diagnosis.free_forms import (
-    FINER,
-    PAST,
-    PLACE,
-    Form,
-    Span,
-    form_coefficients,
-    functions_of,
-    linearised,
-    memories_of,
-    signals_along,
-    span_of,
-    values_of,
-)
-from motorid.diagnosis.misspecification import FormGain, better_forms, chosen_functions
+from motorid.diagnosis.free_forms import FINER, PAST, PLACE, Form, Span
+from motorid.diagnosis.misspecification import FormGain, better_forms, chosen_functions, pitches_of, tells_the_zero
 from motorid.diagnosis.model_comparison import Node, at_noise, far
 from motorid.diagnosis.predictive_score import Evidence, Predictions, compare
 from motorid.diagnosis.refit import refit
@@ -72,7 +60,7 @@ STATES = {  # quantities that are states of the curve's own: name, where it begi
 SI = {"theta": "rad", "omega": "rad/s", "i": "A", "v": "V", "size": "V", "load": "W"}
 OTHER_PLACES = {"1": "where it sets in, a share of the largest", "V": "half of its play", "A": "half of its play",
                 "rad/s": "how fast it swings, or half of its play",
-                "V/s": "how fast it rises", "rad": "its phase", "rad^2": "its width, squared"}
+                "V/s": "how fast it rises", "rad": "its phase"}
 OVER = {"": "", "A": "/A", "V": "/V", "rad/s": "·s/rad"}
 FIRST = {"past i": ", m.start['i']", "past omega": ", m.start['omega']"}  # of a memory: as if it had been so before
 CLIPPED = re.compile(r"ca\.fmin\(ca\.fmax\(z, \S+\), \S+\)")
@@ -113,13 +101,15 @@ class Part:
     @classmethod
     def of(cls, fit: Fit, form: Form, moved: bool = False) -> Part:
         """Return a part without functions, for records as `fit` goes through them."""
-        span = span_of(fit, signals_along(fit))
-        return cls(form, replace(span, orders=tuple(sorted({*span.orders, *FINE})), finer=FINER), (), moved)
+        span = free_forms.span_of(fit, free_forms.signals_along(fit))
+        span = replace(span, orders=tuple(sorted({*span.orders, *FINE})))
+        pitches = pitches_of(fit, form, span) if form.on == "turn" else 1
+        return cls(form, replace(span, pitches=pitches, finer=FINER), (), moved)
 
     @cached_property
     def functions(self) -> list[str]:
         """Those chosen, as source."""
-        functions = functions_of(self.form, self.span)
+        functions = free_forms.functions_of(self.form, self.span)
         return [functions[k] for k in self.chosen]
 
     @property
@@ -156,7 +146,7 @@ class Part:
         if on in ("omega", "i", "v", "load"):
             return "", f"where it bends, a share of {number(max(map(abs, self.span.ranges[on])), 4)} {SI[on]}"
         unit = "rad" if on in ("theta", "turn", "distance", "path") else "s"
-        return unit, "how long it remembers" if on in PAST else "where it bends, sets in or fades"
+        return unit, "how long it remembers" if on in PAST else "where it bends, sets in or fades, or how wide it is"
 
     def law(self, names: Sequence[str], places: Sequence[str], known: Container[str]) -> str:
         """Return the law as source, coefficients and places by name; states of `known` quantities are there already."""
@@ -253,12 +243,12 @@ class Curve:
         z, value = self.points
         forms, unit = _closed_forms(part.form.on, z), part.unit(self.fit)
         if part.form.on in PAST:
-            functions = functions_of(part.form, part.span)
-            lags = np.concatenate([values_of(functions, part.form, s) for s in self._signals])
+            functions = free_forms.functions_of(part.form, part.span)
+            lags = np.concatenate([free_forms.values_of(functions, part.form, s) for s in self._signals])
             over = "rad" if part.form.on == "path" else "s"
             base, also = ("a constant and ", [-1]) if part.form.carrier else ("", [])
             powers = ("", "the square of ")[: 1 + part.form.bends]
-            each = product(powers, memories_of(part.form, part.span))  # in the order of the functions
+            each = product(powers, free_forms.memories_of(part.form, part.span))  # in the order of the functions
             forms = [(f"{base}{power}one lag of {number(length, 2)} {over}", lags[:, [k, *also]])
                      for k, (power, length) in enumerate(each)]
             unit = part.unit(self.fit, bare=True)
@@ -270,22 +260,22 @@ class Curve:
         part = self.parts[0]
         z = np.concatenate([s[part.form.on] for s in self._signals])
         _, sizes, places = next(self._apart(self.values))
-        values = np.concatenate([values_of(part.terms(places), part.form, s) for s in self._signals])
+        values = np.concatenate([free_forms.values_of(part.terms(places), part.form, s) for s in self._signals])
         return z, values @ np.array(sizes)
 
     @cached_property
     def _signals(self) -> list[dict[str, Array]]:
-        return signals_along(self.fit)
+        return free_forms.signals_along(self.fit)
 
     def grown(self) -> Curve | None:
         """Return the curve with the functions of its last part that by their slopes predict more, fitted with the
         model; one at a time, if their places move. None for none. Raises what a fit raises."""
         last, (*before, part) = self.fitted or self.fit, self.parts
-        linear = linearised(last, part.form, part.span)
-        more = chosen_functions(last, linear, part.form, part.chosen)[: 1 if part.moved else None]
+        linear = free_forms.linearised(last, part.form, part.span)
+        more = chosen_functions(last, linear, part.form, part.chosen, first=part.moved)
         if not more:
             return None
-        free = map(float, form_coefficients(last, linear, part.form, more))
+        free = map(float, free_forms.form_coefficients(last, linear, part.form, more))
         *_, (_, sizes, places) = self._apart(self.values)
         larger = replace(part, chosen=(*part.chosen, *more))
         places += [place[0] for place in larger.places[len(places):]]
@@ -430,12 +420,17 @@ class Remainder:
     def _anew(self) -> Fit | None:
         """The model that the search began with, where the last is far from noise: all that was found may only imitate
         one thing that the library lacks."""
-        return self._root if far(self.fit) and self._root is not self.fit else None
+        if self._root is None or self._root is self.fit or not far(self.fit):
+            return None
+        added = {e.name: e for e in self.fit.model.effects if e.name not in self._root.model.effect_names}
+        return self._without(added) if any(map(tells_the_zero, added.values())) else self._root
 
     def _without(self, names: Iterable[str]) -> Fit | None:
-        """Return the fit without these effects; None where there are none, or no fit is."""
+        """Return the fit without these effects, but for what tells where a turn begins in every run; None where there
+        are none, or no fit is."""
         with contextlib.suppress(ModelError):
-            model = reduce(Model.without, names, self.fit.model)
+            zeros = {e.name for e in self.fit.model.effects if tells_the_zero(e)}
+            model = reduce(Model.without, (n for n in names if n not in zeros), self.fit.model)
             values = {n: v for n, v in self.fit.values.items() if n in model.parameters}
             return None if model is self.fit.model else refit(self.fit, model, (values,))
         return None
@@ -466,8 +461,10 @@ class Grown(NamedTuple):
 
     @property
     def clean(self) -> bool:
-        """Tell whether no other curve could do better."""
-        return self.done and self.curve.fitted is not None and max(self.curve.fitted.misfit.values()) < CLEAN
+        """Tell whether no other curve could do better: it leaves noise, or what is larger and nothing predicts."""
+        fitted = self.curve.fitted
+        return self.done and fitted is not None and (
+            max(fitted.misfit.values()) < CLEAN or next(_beyond(fitted), None) is None)
 
 
 @one_thread

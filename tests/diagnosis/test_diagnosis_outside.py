@@ -177,7 +177,7 @@ def test_runs_are_to_be_fitted_apart_where_curves_were_tried_first(lab, monkeypa
     runs, tried = of_different_motors(lab, "K", OTHER_CONSTANTS), []
     root, last = (mi.fit(m, runs) for m in (mi.dc_motor(), mi.dc_motor() + mi.effects.brush_drop))
     assert far(last)
-    monkeypatch.setattr(remainder, "chosen_functions", lambda fit, linear, form, had: tried.append(form) or [])
+    monkeypatch.setattr(remainder, "chosen_functions", lambda fit, linear, form, *_, **__: tried.append(form) or [])
     left = Remainder("structure", last, (Form("a motor constant", "both", "run"),), _root=root)
     with pytest.raises(mi.UsageError, match="Fit the runs apart"):
         left.as_effect()

@@ -194,7 +194,7 @@ def test_what_differs_from_run_to_run_is_no_further_part(outside, monkeypatch):
     fit = outside("eddy brake")[1].before
     promised = [(fit, Form("a resistance", "voltage", "run", "i"))]
     monkeypatch.setattr(remainder, "_beyond", lambda base: iter(promised))
-    monkeypatch.setattr(remainder, "chosen_functions", lambda *given: [0])
+    monkeypatch.setattr(remainder, "chosen_functions", lambda *_, **__: [0])
     held = HeldOut.of(fit, None)
     assert remainder._beside(remainder.Grown(0.0, held.predictions(fit), Curve(fit, fitted=fit)), held) is None
 
@@ -313,7 +313,7 @@ def test_noise_is_no_effect(lab):
 def test_a_curve_that_predicts_nothing_is_not_offered(lab, monkeypatch, forced):
     """Neither are functions chosen for it, nor would they, once fitted, be believed."""
     if forced:
-        monkeypatch.setattr(remainder, "chosen_functions", lambda *given: [4])
+        monkeypatch.setattr(remainder, "chosen_functions", lambda *_, **__: [4])
     rng = np.random.default_rng(2)
     runs = [record(driven(lab, {}, w, 500, 1e-3, rng), "logger", ("i", "omega"), lab, rng, w) for w in FAST]
     left = Remainder("structure", mi.fit(mi.dc_motor(), runs), (Form("a torque", "torque", "omega"),))
