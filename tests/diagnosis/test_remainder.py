@@ -822,3 +822,40 @@ def test_a_budget_that_is_spent_ends_the_search_for_curves(lab):
                      _approximating={"quadratic_drag": form})
     with budget(0.0), pytest.raises(mi.UsageError, match="no curve"):
         left.as_effect()
+
+
+@mi.effect(balance="torque")
+def ratchet(m, A=mi.P(1.2e-2, "N·m", null=0.0)):
+    """Detents, six to the turn, that rise slowly and fall at once."""
+    place = ca.atan2(ca.sin(6 * m.theta), ca.cos(6 * m.theta)) / np.pi  # from -1 to 1 along each
+    m.torque -= A * ca.fmin(place / 0.85, (1 - place) / 0.15)
+
+
+@mi.effect(balance="torque")
+def rubbing(m, tau=mi.P(1.5e-2, "N·m", null=0.0)):
+    """A seal that rubs on a sector of the turn."""
+    m.torque -= tau * m.sign(m.omega) * 0.5 * (1 + ca.tanh(40 * (ca.cos(m.theta - 1.8) - ca.cos(0.8))))
+
+
+@mi.effect(balance="voltage")
+def burnt(m, R_b=mi.P(2.0, "Ω", null=0.0)):
+    """Commutator segments, two to the turn, that make bad contact."""
+    m.voltage -= R_b * m.i * 0.5 * (1 + ca.tanh(20 * (ca.cos(2 * m.theta - 3.6) - ca.cos(0.7))))
+
+
+@pytest.mark.parametrize(("law", "words", "pitches", "most", "near"), [
+    (ratchet, "a load that changes with the angle within a turn", 6, 9, 2.5),
+    (rubbing, "a friction that changes with the angle within a turn", 1, 3, 1.15),
+    (burnt, "a resistance that changes with the angle within a turn", 2, 3, 1.15)])
+def test_what_repeats_within_a_turn_is_found_with_few_functions(law, words, pitches, most, near, lab):
+    """A tooth has a corner and an edge, which its functions only come near."""
+    runs, floor = _with_law(law, ANGLE, lab)
+    root = mi.fit(mi.dc_motor(), runs[:2])
+    forms = tuple(gain.form for gain in grades.better_forms(root, root))
+    left = Remainder("structure", root, forms, HeldOut.of(root, runs[2:]))
+    effect = left.as_effect()
+    assert effect.doc == f"What is left: {words}."
+    assert left._chosen.parts[0].span.pitches == pitches
+    assert sum(p.null == 0 for p in effect.parameters) <= most
+    after = mi.evaluate(left.fitted, runs[2]).nrmse
+    assert max(after[c] / max(floor[c], 1e-3) for c in after) < near
