@@ -197,7 +197,7 @@ class Curve:
             unit = part.unit(self.fit)
             parameters += [P(c, unit, null=0.0, given=True, doc="coefficient of the curve")(n) for n, c in sizes]
             usual, words = part.place
-            parameters += [P(c, unit, lower=low, upper=high, given=True,
+            parameters += [P(min(max(c, low), high), unit, lower=low, upper=high, given=True,  # a fit rounds
                              doc=words if unit == usual else OTHER_PLACES[unit])(n)
                            for (n, c), (_, low, high, unit) in zip(places, part.places, strict=True)]
         return Effect(self.name, Law(self.law), tuple(parameters), self.balance, f"What is left: {self.text}.")

@@ -192,7 +192,7 @@ def _beside_curves(found: Climb, seconds: float | None) -> Climb:
     """Return a climb with grades that hold beside a curve, fitted in the place of all that was found. Forms are
     compared by slopes, and these lead astray far from the records."""
     search, best, grades = found.search, found.path[-1], list(found.grades)
-    noise = found.remaining.adequate and not far(best.fit)
+    noise = found.remaining.adequate and at_noise(best)  # on held-out runs, too
     if noise or all(g.grade == "approximates" for g in grades):
         return found
     found, curve = _curve_alone(found, search.root.fit, search.held, seconds)
