@@ -96,8 +96,8 @@ def _rounds(found: Climb, max_effects: int) -> Iterator[Climb]:
     """Yield how far the loop is, after every step that may be the last."""
     search, best = found.search, found.path[-1]
     frontier, before = [best], found
-    for k in range(max_effects):
-        search.stages.round(k + 1)
+    for k in range(2 * max_effects):  # what comes in the place of two leaves room for another
+        search.stages.round(min(k + 1, max_effects))
         room = max_effects - len(best.key) + len(search.root.key)  # two effects may have come at once
         if room < 1 or (found.remaining.adequate and at_noise(best)):
             break

@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import re
 import time
+from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 from typer.testing import CliRunner
@@ -138,3 +140,29 @@ def test_a_second_climb_that_is_cut_short_does_not_lose_the_first(plain, monkeyp
     assert len(climbs) == 2
     assert found.effects == ("coulomb",)
     assert found.stopped == refit.OUT_OF_TIME
+
+
+def test_what_comes_in_the_place_of_two_leaves_room_for_another(monkeypatch):
+    """The limit counts effects, not rounds: friction over a turn took the place of friction and of a sensor's offset,
+    which was never looked for again."""
+    keys = iter(map(frozenset, ("a", "ab", "cd", "cde", "cdef")))
+
+    def node(key=frozenset()):
+        return SimpleNamespace(key=key, added=max(key, default=None), fit=None, parent=None)
+
+    def grown(search, frontier):
+        child = node(next(keys))
+        return {child.key: child}, [], ""
+
+    stages = SimpleNamespace(round=lambda k: None, done=lambda words: None)
+    search = SimpleNamespace(root=node(), stages=stages, effects=(), nodes={}, brought_to_its_end=lambda new: new,
+                             settled=lambda new: None, pruned=lambda new, best: new, scores=lambda new: [])
+    for name, instead in {"at_noise": lambda best: False, "far": lambda fit: [], "_grown": grown,
+                          "_better": lambda some, best: (next(iter(some)), list(some)), "group_of": lambda *_: (),
+                          "judge_adequacy": lambda *_: SimpleNamespace(adequate=False), "_runners_up": lambda *_: [],
+                          "_with": lambda found, best, *_: replace(found, path=(*found.path, best))}.items():
+        monkeypatch.setattr(stepwise, name, instead)
+    begun = stepwise.Climb(search, (search.root,), (), (), "", None, SimpleNamespace(adequate=False))
+    *_, last = stepwise._rounds(begun, 3)
+    assert last.path[-1].key == frozenset("cde")
+    assert last.text == "stopped at the limit of 3 effects"
