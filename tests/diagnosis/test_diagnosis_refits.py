@@ -325,7 +325,7 @@ def test_what_an_unfinished_fit_would_reach_by_itself_is_no_effect_s_gain(lab):
     moves = driven(lab, {"coulomb": {"tau_c": 8e-3}}, "stairs", 400, 1e-3, np.random.default_rng(8))
     record_ = record(moves, "logger", ("i", "omega"), lab, np.random.default_rng(8), "run")
     fit = mi.solve(mi.Problem(mi.dc_motor(), [record_]), mi.LevenbergMarquardt(max_iterations=1), start="model")
-    own = trial._own_reach(fit)
+    own = trial._undamped(fit.residuals, fit.jacobian * fit.problem.scaling.slope(fit.q))
     assert own < 0.9 * fit.cost
     names = ("gravity", "coulomb", "spring")
     tasks = [trial.Task(fit, fit.model + LIBRARY[n], LIBRARY[n], ({},)) for n in names]
@@ -547,8 +547,9 @@ def test_what_the_ladder_left_again_is_not_called_accepted():
 
 def test_the_second_best_race_is_finished_however_far_it_is_behind(monkeypatch):
     """The next round grows two models; what gains nothing, and all others far behind, stay given up."""
-    fit, costs = SimpleNamespace(cost=100.0), (1.0, 2.5, 3.0, 99.9)
-    monkeypatch.setattr(trial, "_own_reach", lambda fit: fit.cost)  # it is at its optimum
+    problem, costs = SimpleNamespace(scaling=SimpleNamespace(slope=lambda q: 1.0)), (1.0, 2.5, 3.0, 99.9)
+    fit = SimpleNamespace(cost=100.0, residuals=None, jacobian=1.0, q=None, problem=problem)
+    monkeypatch.setattr(trial, "_undamped", lambda r, jac: fit.cost)  # it is at its optimum
     tasks = [SimpleNamespace(fit=fit) for _ in costs]
     races = {k: SimpleNamespace(cost=c, reach=c) for k, c in enumerate(costs)}
     given_up = trial._outdone(tasks, races, {0: None})
