@@ -317,8 +317,8 @@ def _sectors(count: int, pitches: int) -> list[str]:
     lobes = [(c, w, w) for w in LOBES for c in np.arange(0, 2 * np.pi, 1.5 * w)]
     z, found = f"{pitches} * z" if pitches > 1 else "z", []
     for c, half, edge in sectors + lobes:
-        at, wide = _place(c, c - 2 * half, c + 2 * half), _place(half, half / 4, min(4 * half, 3.0))
-        soft = _place(edge, 2 * np.pi / count / EDGE, SOFTEST)
+        at, wide = _place(c, c - 2 * half, c + 2 * half), _place(half, half / 4, min(4 * half, 3.0), "rad:wide")
+        soft = _place(edge, 2 * np.pi / count / EDGE, SOFTEST, "rad:edge")
         inside = f"(ca.cos({z} - {at}) - ca.cos({wide})) / ca.sin({wide}) / {soft}"
         found.append(f"0.5 * (1 + ca.tanh({inside}))")
     return found

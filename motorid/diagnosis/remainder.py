@@ -60,7 +60,8 @@ STATES = {  # quantities that are states of the curve's own: name, where it begi
 SI = {"theta": "rad", "omega": "rad/s", "i": "A", "v": "V", "size": "V", "load": "W"}
 OTHER_PLACES = {"1": "where it sets in, a share of the largest", "V": "half of its play", "A": "half of its play",
                 "rad/s": "how fast it swings, or half of its play",
-                "V/s": "how fast it rises", "rad": "its phase"}
+                "V/s": "how fast it rises", "rad": "its phase",
+                "rad:wide": "half of its width", "rad:edge": "how wide its edges are"}
 OVER = {"": "", "A": "/A", "V": "/V", "rad/s": "·s/rad"}
 FIRST = {"past i": ", m.start['i']", "past omega": ", m.start['omega']"}  # of a memory: as if it had been so before
 CLIPPED = re.compile(r"ca\.fmin\(ca\.fmax\(z, \S+\), \S+\)")
@@ -146,7 +147,7 @@ class Part:
         if on in ("omega", "i", "v", "load"):
             return "", f"where it bends, a share of {number(max(map(abs, self.span.ranges[on])), 4)} {SI[on]}"
         unit = "rad" if on in ("theta", "turn", "distance", "path") else "s"
-        return unit, "how long it remembers" if on in PAST else "where it bends, sets in or fades, or how wide it is"
+        return unit, "how long it remembers" if on in PAST else "where it lies, bends, sets in or fades"
 
     def law(self, names: Sequence[str], places: Sequence[str], known: Container[str]) -> str:
         """Return the law as source, coefficients and places by name; states of `known` quantities are there already."""
@@ -196,8 +197,8 @@ class Curve:
         for part, sizes, places in self._apart(self.sizes.items()):
             unit = part.unit(self.fit)
             parameters += [P(c, unit, null=0.0, given=True, doc="coefficient of the curve")(n) for n, c in sizes]
-            usual, words = part.place
-            parameters += [P(min(max(c, low), high), unit, lower=low, upper=high, given=True,  # a fit rounds
+            usual, words = part.place  # a fit rounds what is at its limit
+            parameters += [P(min(max(c, low), high), unit.partition(":")[0], lower=low, upper=high, given=True,
                              doc=words if unit == usual else OTHER_PLACES[unit])(n)
                            for (n, c), (_, low, high, unit) in zip(places, part.places, strict=True)]
         return Effect(self.name, Law(self.law), tuple(parameters), self.balance, f"What is left: {self.text}.")

@@ -857,5 +857,6 @@ def test_what_repeats_within_a_turn_is_found_with_few_functions(law, words, pitc
     assert effect.doc == f"What is left: {words}."
     assert left._chosen.parts[0].span.pitches == pitches
     assert sum(p.null == 0 for p in effect.parameters) <= most
+    assert {"half of its width", "how wide its edges are"} <= {p.doc for p in effect.parameters} or law is ratchet
     after = mi.evaluate(left.fitted, runs[2]).nrmse
     assert max(after[c] / max(floor[c], 1e-3) for c in after) < near
