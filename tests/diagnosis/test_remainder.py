@@ -860,3 +860,20 @@ def test_what_repeats_within_a_turn_is_found_with_few_functions(law, words, pitc
     assert {"half of its width", "how wide its edges are"} <= {p.doc for p in effect.parameters} or law is ratchet
     after = mi.evaluate(left.fitted, runs[2]).nrmse
     assert max(after[c] / max(floor[c], 1e-3) for c in after) < near
+
+
+def test_a_place_that_a_fit_rounds_beyond_its_limit_is_at_it_and_an_angle_counts_from_its_zero(lab):
+    rng = np.random.default_rng(5)
+    run = record(driven(lab, {}, "stairs", 400, 1e-3, rng), "logger", ANGLE, lab, rng, "run")
+    fit, form = mi.fit(mi.dc_motor(), run), Form("a load", "torque", "turn")
+    span = replace(Part.of(fit, form).span, pitches=2)
+    sector = next(k for k, f in enumerate(functions_of(form, span)) if "tanh" in f)
+    part = Part(form, span, (sector,), True)
+    lowest = [float(np.nextafter(low, -10)) for _, low, *_ in part.places]
+    effect = Curve(fit, (part,), (1e-3, *lowest)).effect
+    assert [p.value for p in effect.parameters[1:]] == [p.lower for p in effect.parameters[1:]]
+    assert "ca.cos(2 * z - " in Curve(fit, (part,), (1e-3, *lowest)).law
+    zeroed = (fit.model + mi.effects.cogging(A=1e-6, N=7) + mi.effects.encoder_zero).fix("A", "N", "phi", z_0=0.3)
+    turned = mi.fit(zeroed, run)
+    moved = signals_along(turned)[0]["turn"] - signals_along(fit)[0]["turn"]
+    assert moved == pytest.approx(0.3)
