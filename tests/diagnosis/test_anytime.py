@@ -14,6 +14,7 @@ from typer.testing import CliRunner
 import motorid as mi
 from motorid.cli.app import app
 from motorid.diagnosis import candidates, refit, stepwise
+from motorid.diagnosis.misspecification import Grade
 from motorid.errors import OutOfTime
 from motorid.numerics.parallel import budget, check_time
 from motorid.records.datasets import data_path
@@ -166,3 +167,16 @@ def test_what_comes_in_the_place_of_two_leaves_room_for_another(monkeypatch):
     *_, last = stepwise._rounds(begun, 3)
     assert last.path[-1].key == frozenset("cde")
     assert last.text == "stopped at the limit of 3 effects"
+
+
+@pytest.mark.parametrize("noise", [True, False])
+def test_curves_are_asked_where_held_out_runs_hold_more_than_noise(monkeypatch, noise):
+    """A battery that polarises was fitted to its noise by three effects, and missed by three times that elsewhere."""
+    asked = []
+    monkeypatch.setattr(stepwise, "at_noise", lambda best: noise)
+    monkeypatch.setattr(stepwise, "_curve_alone", lambda found, *_: asked.append(found) or (found, None))
+    search, best = SimpleNamespace(root=SimpleNamespace(fit=None), held=None), SimpleNamespace(fit=None)
+    found = stepwise.Climb(search, (best,), (), (), "", None, SimpleNamespace(adequate=True),
+                           grades=(Grade("winding_heating", "named"),))
+    assert stepwise._beside_curves(found, None) is found
+    assert bool(asked) is not noise
