@@ -319,8 +319,7 @@ def _sectors(count: int, pitches: int) -> list[str]:
     for c, half, edge in sectors + lobes:
         at, wide = _place(c, c - 2 * half, c + 2 * half), _place(half, half / 4, min(4 * half, 3.0), "rad:wide")
         soft = _place(edge, 2 * np.pi / count / EDGE, SOFTEST, "rad:edge")
-        inside = f"(ca.cos({z} - {at}) - ca.cos({wide})) / ca.sin({wide}) / {soft}"
-        found.append(f"0.5 * (1 + ca.tanh({inside}))")
+        found.append(f"0.5 * (1 + ca.tanh((ca.cos({z} - {at}) - ca.cos({wide})) / ca.sin({wide}) / {soft}))")
     return found
 
 
@@ -475,7 +474,8 @@ def _signals(fit: Fit, k: int) -> dict[str, Array]:
     found |= {f"past {c}": found[c] for c in ("v", "i", "omega") if c in found}
     found |= {c: time_since(run, c) for c in COMPUTED_INPUTS}
     if "theta" in run.outputs or "omega" in run.outputs:
-        zero = dict(zip(fit.problem.system.parameters, parameter_vector(fit, k), strict=True)).get("z_0", 0.0)
+        own, zeroed = parameter_vector(fit, k), "encoder_zero" in fit.model.effect_names
+        zero = own[fit.problem.system.parameters.index("z_0")] if zeroed else 0.0
         found["theta"] = found["turn"] = angle_signal(run) + zero
     return found
 

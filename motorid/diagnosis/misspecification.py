@@ -126,9 +126,11 @@ def pitches_of(fit: Fit, form: Form, span: Span) -> int:
     with contextlib.suppress(*FAILURES):
         answers = Answers(fit, free_forms.linearised(fit, form, span), form)
         orders = [0, *np.repeat(free_forms.waves_of(span), 2)]
-        each = {n: answers.predictions([j for j, k in enumerate(orders) if k % n == 0])
-                for n in range(1, int(max(orders)) // 2)}
-        return max((n for n, p in each.items() if p and (all_ := each[1]) and not compare(p, all_).worth_it), default=1)
+        none, whole = answers.predictions(()), answers.predictions()
+        for n in range(int(max(orders)) // 2, 1, -1):
+            some = answers.predictions([j for j, k in enumerate(orders) if k % n == 0])
+            if none and some and whole and compare(none, some).worth_it and not compare(some, whole).worth_it:
+                return n
     return 1
 
 

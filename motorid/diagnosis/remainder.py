@@ -59,8 +59,7 @@ STATES = {  # quantities that are states of the curve's own: name, where it begi
     "most i": ("most_i", "ca.fabs(m.start['i'])", "ca.fmax(ca.fabs(m.i) - most_i, 0) / {step}")}
 SI = {"theta": "rad", "omega": "rad/s", "i": "A", "v": "V", "size": "V", "load": "W"}
 OTHER_PLACES = {"1": "where it sets in, a share of the largest", "V": "half of its play", "A": "half of its play",
-                "rad/s": "how fast it swings, or half of its play",
-                "V/s": "how fast it rises", "rad": "its phase",
+                "rad/s": "how fast it swings, or half of its play", "V/s": "how fast it rises", "rad": "its phase",
                 "rad:wide": "half of its width", "rad:edge": "how wide its edges are"}
 OVER = {"": "", "A": "/A", "V": "/V", "rad/s": "·s/rad"}
 FIRST = {"past i": ", m.start['i']", "past omega": ", m.start['omega']"}  # of a memory: as if it had been so before
@@ -427,8 +426,7 @@ class Remainder:
         return self._without(added) if any(map(tells_the_zero, added.values())) else self._root
 
     def _without(self, names: Iterable[str]) -> Fit | None:
-        """Return the fit without these effects, but for what tells where a turn begins in every run; None where there
-        are none, or no fit is."""
+        """Return the fit without these effects, but for every run's own zero of the angle; None where there is none."""
         with contextlib.suppress(ModelError):
             zeros = {e.name for e in self.fit.model.effects if tells_the_zero(e)}
             model = reduce(Model.without, (n for n in names if n not in zeros), self.fit.model)
