@@ -19,8 +19,7 @@ From the device
     ``A,<command>,…``
         A command was carried out: ``A,L,<mV>,<mA>`` (the limits now in force), ``A,S,<index>``,
         ``A,G,<counter of the first sample>,<its time µs>``.
-    ``E,done,<samples made>,<why>`` with why ``end``, ``stop``, ``limit``, ``emergency`` or ``silent``;
-    ``E,refused,<why>``.
+    ``E,done,<samples made>,<why>``, why: ``end``, ``stop``, ``limit``, ``emergency``, ``silent``; ``E,refused,<why>``.
 
 From the computer
     ``?`` send the header · ``L,<mV>,<mA>`` set limits and forget the program · ``S,<index>,<segment>`` one

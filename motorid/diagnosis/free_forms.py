@@ -109,6 +109,8 @@ _PUSHES = (  # words, balance, carrier, quantities
     ("a friction", "torque", "direction", ("turn", "theta", "t", "distance", "i", "v", "run", "past speed",
                                          "past power", "past heat", *COMPUTED_INPUTS)),
     ("a load", "torque", "", ("turn", "theta", "t", "run")),
+    ("a torque with the square of the current", "torque", "past heat", ("turn",)),
+    ("a torque with the square of the speed", "torque", "past power", ("turn",)),
     ("a drag", "torque", "omega", ("t", "distance", "turn", "theta", "i", "run", "past speed", "past power",
                                  "past heat")),
     ("a torque", "torque", "", ("omega", "i")),
@@ -191,7 +193,7 @@ def shown(form: Form, fit: Fit, ranges: Mapping[str, tuple[float, float]]) -> bo
         return False  # one sensor needs another to be told wrong
     if form.channel == "omega" and form.carrier and "theta" not in outputs:
         return False  # a gain is the motor constant's, unless the motion is measured twice
-    if form.on not in ranges or ranges[form.on][0] == ranges[form.on][1] or (
+    if not {form.on, form.carrier} <= {"", *ranges} or ranges[form.on][0] == ranges[form.on][1] or (
             form.on == "run" and own_levels(fit.problem.experiments)):
         return False
     if form.on == "path":  # both ways, by more than the creep of a smooth sgn or the ripple of a start

@@ -244,8 +244,7 @@ class Linear(NamedTuple):
 def smooth(fit: Fit, k: int, walk: Array, linear: Linear) -> Smoothed:
     """Return the smoothed run `k`.
 
-    `walk` is the step size of the random walk, V/√s and N·m/√s (0: none); `linear` is where to begin, the same for
-    every walk.
+    `walk` is the step size of the random walk, V/√s and N·m/√s (0: none); `linear` is where every walk begins.
     """
     run, y = fit.problem.runs[k], fit.problem.measured[k].y
     weights = np.array([1.0 / run.sigma[c] if c in run.sigma else 0.0 for c in fit.problem.outputs])

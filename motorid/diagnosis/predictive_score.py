@@ -3,14 +3,12 @@
 Each run is cut into contiguous blocks (block cross-validation: Racine, J. Econometrics 99, 2000). What a fit would have
 predicted without a block follows from its sensitivities, without a refit: ``r_b⁽⁻ᵇ⁾ = (I − H_bb)⁻¹ r_b`` with
 ``H = J(JᵀJ + s²I)⁻¹Jᵀ`` (PRESS by blocks: Allen, Technometrics 16(1), 1974), J in solver coordinates, s the scale of
-the residual: a prior of one unit, a factor of e, keeps open directions finite. Blocks of held-out runs are predicted as
-they are.
+the residual: a prior of one unit, a factor of e, keeps open directions finite. Held-out blocks are predicted as is.
 
 Two models are compared by the difference of their log predictive densities, summed over blocks, and its standard error
 from their scatter (Vehtari, Gelman & Gabry, Stat. Comput. 27, 2017; Sivula et al., arXiv 2008.10296). The density is
 Student's t, with each model's own scale per channel from the other blocks: the discrepancy of a model, not the noise of
-the sensor, sets what counts. Samples of coloured errors repeat one another; each channel counts by the effective share
-of its samples.
+the sensor, sets what counts. Coloured errors repeat themselves; a channel counts by the effective share of its samples.
 """
 
 from __future__ import annotations

@@ -116,8 +116,7 @@ def _undamped(r: Array, jac: Array) -> float:
 def finished(fit: Fit, best: Raced) -> Fit | None:
     """Return the refit that a race began, converged; None if it fails.
 
-    Where it went along the measured angle the model's own takes over, unless it drifts too far (periods of the
-    angle pass).
+    Where it went along the measured angle the model's own takes over, unless it drifts too far (by periods).
     """
     stages = "sgn_width" in best.problem.model.parameters and "sgn_width" not in fit.model.parameters
     try:

@@ -227,8 +227,7 @@ class Diagnosis(Shown):
     details : tuple of str
         What else a reader should know.
     rivals : tuple of Fit
-        The last fit, and what it is with the others of the first group in its effect's place: what an experiment is to
-        distinguish.
+        The last fit, and those with others of the first group in its effect's place: for an experiment to distinguish.
     """
 
     verdict: str

@@ -97,14 +97,14 @@ def with_phase_per_run(fit: Fit, scores: Sequence[Score], zero: Effect) -> list[
     """
     tangent, runs = Tangent.of(fit), sorted(set(fit.problem.unknowns.firsts))
     apart = [f"{zero.parameters[0].name}[{k}]" for k in runs]
-    found = []
+    found, parts = [], list[Tangent]()
     for s in scores if len(runs) > 1 else ():
         phase = next((p for p in s.effect.parameters if p.periodic and not p.grid), None)
         if phase is None or not uses_angle(s.effect):
             continue
         tried, added = [], Added.of(tangent, s.effect)
         order = next((p.name for p in added.pars if p.order and not p.given), "")
-        parts = [Tangent.of(alone(fit, k)) for k in runs] if order else []
+        parts = parts or [Tangent.of(alone(fit, k)) for k in runs if order]
         for n in {line.order for part in parts for line in likely_lines(part, s.effect, PER_RUN)} if order else (1.0,):
             shape = added.shape({order: n} if order else {})
             if shape is None or not shape.sizes:

@@ -27,7 +27,7 @@ from motorid.diagnosis.record_parts import affordable, thinned_alike
 from motorid.diagnosis.refit import BEAM, BEHIND, INTERRUPTED, OUT_OF_TIME
 from motorid.diagnosis.remainder import alone_leaving_noise
 from motorid.diagnosis.results import Adequacy, Candidate, Ladder, Rung
-from motorid.diagnosis.thresholds import MATERIAL
+from motorid.diagnosis.thresholds import ELSEWHERE, MATERIAL
 from motorid.diagnosis.verdict import first_answer
 from motorid.errors import OutOfTime, at_least
 from motorid.estimation.fit import TOO_FAR, follows, growth, in_windows, solve
@@ -39,6 +39,8 @@ from motorid.numerics.parallel import progress as shown
 from motorid.records.experiment import Experiment
 
 ORDER = ("named", "group", "approximates")  # grades, the surest first
+FITTED_TOO = ("The fitted runs alone leave nothing but noise, and the model that they determine fails on the held-out "
+              "ones: these were fitted, too, and none are left to judge by.")
 HALF_AS_GOOD = 0.5  # of the best child's fall: what a second model must reach to be carried along
 
 
@@ -259,8 +261,7 @@ def _outdoing(listed: Sequence[Candidate], children: Sequence[Node], best: Node,
               chosen: Node | None) -> Candidate | None:
     """Return what surely predicts more on the whole than the best child, although held-out runs refuse it.
 
-    It may be right where these lack something else as well: a spring whose motor friction holds there, a weight
-    beside a cogging.
+    It may be right where these lack something else as well: a spring held there by friction, a weight beside a cogging.
     """
     known = [c for c in listed if c.fit is not None and c.gain is not None and c.gain_se is not None]
     first = max(known, key=lambda c: c.gain or 0.0, default=None)
@@ -324,8 +325,7 @@ def explored(fit: Fit, validate: Sequence[Experiment] | Experiment | None, effec
         parts = replace(records, fit=windowed)
         anew = climbed(parts)
         found, records = (replace(found, stopped=anew.stopped), records) if _explains(found, anew) else (anew, parts)
-    last = found.path[-1]
-    again = reading = None
+    last, again, reading = found.path[-1], None, None
     if not found.stopped and records is not as_it_was and as_it_was.suits(last):
         again = as_it_was
     elif not found.stopped and (reading := _late_reading(found.path)):
@@ -345,14 +345,27 @@ def explored(fit: Fit, validate: Sequence[Experiment] | Experiment | None, effec
         found, curve = _curve_alone(found, as_it_was.fit, held, left())
         if curve is not None:
             records, found = as_it_was, climbed(as_it_was, 0)
+    found, records = _with_held_out(found, records, climbed)
     return _beside_curves(found, left()), " ".join(records.remarks)
+
+
+def _with_held_out(found: Climb, records: Records, climbed: Callable[[Records], Climb]) -> tuple[Climb, Records]:
+    """Return a climb with the held-out runs among the fitted ones, where the first model leaves noise alone on its own
+    and fails on those: what is missing shows there, or they determine what the others do not."""
+    last, fit = found.path[-1], found.path[-1].fit
+    noise = len(found.path) == 1 and found.remaining.adequate and not (found.stopped or far(fit) or fit.window)
+    with contextlib.suppress(*FAILURES):
+        if noise and not at_noise(last) and max(e.misfit for e in last.predictions.held_out.values()) > ELSEWHERE:
+            runs = (*fit.problem.experiments, *(records.held_out or ()))
+            both = solve(fit.problem.with_(experiments=runs, model=fit.model, noise_factors={}), start="model")
+            return climbed(joint := Records(both, None, (*records.remarks, FITTED_TOO))), joint
+    return found, records
 
 
 def _in_windows(found: Climb) -> Fit | None:
     """Return the first model's fit in windows, if one that it led to carries small errors too far over whole records.
 
-    A pendulum upright says so only once its weight is in the model, and detents may have been refused since the motor
-    rested in others.
+    A pendulum upright says so only with its weight in the model; detents may be refused as the motor rested in others.
     """
     first, last = found.path[0].fit, found.path[-1].fit
     refused = [c for c in (found.rounds[-1] if found.rounds else ()) if c.fit is not None and not c.accepted]

@@ -128,7 +128,7 @@ def spectrum(tangent: Tangent, effect: Effect) -> Spectrum:
     return Spectrum(tuple(sorted(lines, key=lambda line: -line.share)), any(found.stands_out for found, _ in ways))
 
 
-@lru_cache(maxsize=8)
+@lru_cache(maxsize=64)
 def _spectrum(tangent: Tangent, kind: str) -> Spectrum:
     fit, top, relative = tangent.fit, highest_order(tangent), kind != "torque"
     # A torque that repeats once per turn is gravity's, and what is to repeat must do so within the travel. A disc off
@@ -290,7 +290,7 @@ class _OrderSearch:
         return outputs
 
 
-@lru_cache(maxsize=2)
+@lru_cache(maxsize=8)  # of the whole, and of every run
 def _order_search(tangent: Tangent) -> _OrderSearch:
     """Return what is there to be looked into; outputs count in units of their noise."""
     unstack = tangent.fit.problem.unstack

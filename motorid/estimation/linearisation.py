@@ -130,7 +130,7 @@ def parameter_vector(fit: Fit, k: int) -> Array:
     return unknowns.of_run(unknowns.point(fit.q), k).p
 
 
-@lru_cache(maxsize=2)
+@lru_cache(maxsize=4)
 def responses(fit: Fit) -> list[Response]:
     """Return the linear response of every run of `fit`."""
     problem, found = fit.problem, []

@@ -113,8 +113,7 @@ def mark_of(key: str) -> str | None:
 def find(mark: str) -> Path | None:
     """Return the library called `mark` in the cache, if it is there and whole.
 
-    It is in a folder of its own, so that no other is looked at; its name is a digest of its bytes: loading half a file
-    would end the process.
+    It is alone in its folder, where no other is looked at; its name is a digest, as half a file would end the process.
     """
     folder = cache_dir()
     for path in (folder / mark).glob("*.so") if folder else ():

@@ -97,8 +97,7 @@ def _blas() -> Any:
 
 class Interruption:
     """Ctrl-C, or a polite kill, that arrives: C libraries swallow the exception at times, or make another one of it, so
-    it is raised again until someone says `heard`. `asked` tells that it came. Only where `listen` was called, in the
-    command line.
+    it is raised again until someone says `heard`. `asked` tells that it came. Only after `listen`, in the command line.
     """
 
     AGAIN = 0.5  # s

@@ -42,8 +42,7 @@ class Part:
     gradient: Array | None = None  # (nx,) dc/dx where the row is this times x and nothing else, which is much faster
 
     def rows(self, x: Array, p: Array, dx: Array | None, dp: Array) -> tuple[Array, Array]:
-        """Return the rows (n,) and d rows/dz (n, nz) at states (m, nx) with dx (m, nx, nz), dp (np, nz); nz = 0
-        without dx."""
+        """Return the rows (n,) and d rows/dz (n, nz) at states (m, nx); dx (m, nx, nz) or none, dp (np, nz)."""
         if self.gradient is not None:
             dx = np.zeros((*x.shape, 0)) if dx is None else dx
             return x @ self.gradient, np.einsum("mxz,x->mz", dx, self.gradient)

@@ -32,8 +32,7 @@ Element = tuple[int, bytes]
 def mat_table(data: bytes) -> TextTable:
     """Read the numeric arrays of one length from the bytes of a MATLAB file (up to version 7).
 
-    Fields of structures and columns of matrices become columns of their own; of several lengths the most
-    frequent is taken.
+    Fields of structures and columns of matrices become columns; of several lengths the most frequent is taken.
     """
     if data.startswith(b"\x89HDF") or b"MATLAB 7.3" in data[:128]:
         raise DataError("it is a MATLAB 7.3 file; save it with save(..., '-v7'), or export CSV.")

@@ -53,8 +53,7 @@ _LETTERS = str.maketrans({"°": "deg", "º": "deg", "µ": "u", "μ": "u", "⁻":
 def parse_unit(text: str) -> Unit | None:
     """Read a unit such as ``rpm``, ``[deg/s]``, ``counts:2048``, ``0.0049 A`` or ``-1 A``; None if unknown.
 
-    Encoder counts need the number of counts per turn after a colon. A number before the unit scales it, or
-    turns a sign round.
+    Encoder counts need their number per turn after a colon. A number before the unit scales it, or turns a sign.
     """
     label = text.strip("[](){}<> \t")
     if scaled := _SCALED.fullmatch(label):
@@ -156,8 +155,7 @@ def classify(label: str, unit: Unit | None = None) -> HeaderMatch | None:
     """Tell which channel a header, as it stands in the file, names, or None if none.
 
     `unit` is that of a row of units; without it the header itself is searched for one. Scores: 4 the very name of a
-    channel; 3 with words that change nothing ("motor speed"); 2 with unknown words; 1 told by the unit alone; lower: a
-    last resort.
+    channel; 3 with idle words ("motor speed"); 2 with unknown words; 1 by the unit alone; lower: a last resort.
     """
     for text in (label, _CAMEL.sub(" ", label)):
         name, inner, explicit = unit_in(text)

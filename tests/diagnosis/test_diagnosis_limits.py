@@ -301,3 +301,27 @@ def test_the_share_done_never_falls_and_a_second_climb_makes_the_whole_longer():
     assert done == sorted(done)
     assert all(share < total for _, share, total in seen)
     assert ("Round 2/3: fitting once more, 2 of 4", 1.125, 4) in seen
+
+
+def test_what_only_held_out_runs_show_is_looked_for_there(rng):
+    """A fan's drag is less than noise at a tenth of the speed: those runs alone say that nothing is missing."""
+    fan = mi.dc_motor(R=1.2, L=2e-3, K=0.055, b=1.5e-5, J=2.5e-5) + mi.effects.quadratic_drag(c_2=1.2e-6)
+    noise = {"i": 0.02, "omega": 0.5}
+
+    def recorded(volts: float) -> mi.Experiment:
+        v = np.where(np.arange(1500) < 20, 0.0, volts * rng.choice([-1.0, -0.5, 0.5, 1.0], 15).repeat(100))
+        blank = mi.Experiment(np.arange(1500) * 1e-3, {"v": v}, {c: np.zeros(1500) for c in noise})
+        shown = mi.simulate(fan, blank, initial="rest")[0].outputs
+        return blank.with_(outputs={c: y + noise[c] * rng.standard_normal(1500) for c, y in shown.items()})
+
+    slow, fast = [recorded(1.0), recorded(0.8)], recorded(12.0)
+    fit = mi.fit(mi.dc_motor(), slow)
+    assert mi.diagnose(fit, effects=("quadratic_drag", "coulomb")).verdict == "adequate"
+    found = mi.diagnose(fit, fast, effects=("quadratic_drag", "coulomb"))
+    assert found.effects == ("quadratic_drag",)
+    assert "fails on the held-out ones: these were fitted, too" in found.text
+    assert len(found.best.problem.experiments) == 3
+    assert found.best.values["c_2"] == pytest.approx(1.2e-6, rel=0.05)
+    alike = mi.diagnose(fit, recorded(0.9), effects=("quadratic_drag", "coulomb"))
+    assert alike.verdict == "adequate"
+    assert "fitted, too" not in alike.text

@@ -292,8 +292,7 @@ def measured_states(run: Experiment, states: tuple[str, ...]) -> dict[int, Array
 class Gaps:
     """What is missing at each of n nodes: the state there minus the end of the interval before.
 
-    J·gap/span of the speed is the mean torque that was missing in an interval that is short beside the mechanical time
-    constant.
+    J·gap/span of the speed is the mean torque missing in an interval that is short beside the mechanical time constant.
     """
 
     run: np.ndarray  # (n,) of int

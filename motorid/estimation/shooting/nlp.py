@@ -39,8 +39,7 @@ class _Point(NamedTuple):
 
 
 class ShootingNlp:
-    """Values and derivatives of one mesh at z, the last point kept; the first, which can be simulated, shows the
-    sparsity."""
+    """Values and derivatives of one mesh at z, the last point kept; the first, to be simulated, shows sparsity."""
 
     def __init__(self, mesh: Mesh, z: Array) -> None:
         self.mesh = mesh
