@@ -109,8 +109,6 @@ _PUSHES = (  # words, balance, carrier, quantities
     ("a friction", "torque", "direction", ("turn", "theta", "t", "distance", "i", "v", "run", "past speed",
                                          "past power", "past heat", *COMPUTED_INPUTS)),
     ("a load", "torque", "", ("turn", "theta", "t", "run")),
-    ("a torque with the square of the current", "torque", "past heat", ("turn",)),
-    ("a torque with the square of the speed", "torque", "past power", ("turn",)),
     ("a drag", "torque", "omega", ("t", "distance", "turn", "theta", "i", "run", "past speed", "past power",
                                  "past heat")),
     ("a torque", "torque", "", ("omega", "i")),

@@ -57,12 +57,11 @@ QUANTITIES = {"turn": "m.theta", "theta": "m.theta", "omega": "m.omega", "i": "m
 STATES = {  # quantities that are states of the curve's own: name, where it begins, rate
     "t": ("clock", "0.0", "1.0"), "distance": ("distance", "0.0", "ca.fabs(m.omega)"),
     "most i": ("most_i", "ca.fabs(m.start['i'])", "ca.fmax(ca.fabs(m.i) - most_i, 0) / {step}")}
-SI = {"theta": "rad", "omega": "rad/s", "i": "A", "v": "V", "size": "V", "load": "W", "past heat": "A²",
-      "past power": "(rad/s)²"}
+SI = {"theta": "rad", "omega": "rad/s", "i": "A", "v": "V", "size": "V", "load": "W"}
 OTHER_PLACES = {"1": "where it sets in, a share of the largest", "V": "half of its play", "A": "half of its play",
                 "rad/s": "how fast it swings, or half of its play", "V/s": "how fast it rises", "rad": "its phase",
                 "rad:wide": "half of its width", "rad:edge": "how wide its edges are"}
-OVER = {"": "", "A": "/A", "V": "/V", "rad/s": "·s/rad", "A²": "/A²", "(rad/s)²": "·s²/rad²"}
+OVER = {"": "", "A": "/A", "V": "/V", "rad/s": "·s/rad"}
 FIRST = {"past i": ", m.start['i']", "past omega": ", m.start['omega']"}  # of a memory: as if it had been so before
 CLIPPED = re.compile(r"ca\.fmin\(ca\.fmax\(z, \S+\), \S+\)")
 MEMORY = re.compile(r"((past|play|ramp|hold)\(z, (.*?)\))")
@@ -71,8 +70,7 @@ RATES = {  # of what follows z, with one place
     "ramp": "ca.if_else(z < 0, -1, 1) * (ca.fmin({p}, (ca.fabs(z) - ca.if_else(z < 0, -{s}, {s})) / {step})"
             " + ca.fmax(ca.if_else(z < 0, {s}, -{s}), 0) / {step})",
     "hold": "(z - {s}) / ca.if_else(ca.fabs(z) > ca.fabs({s}), {sample}, {p})"}
-CARRIERS = {"": "", "direction": "m.sign(m.omega) * ", "omega": "m.omega * ", "i": "m.i * ", "v": "m.v * ",
-            "past heat": "m.i**2 * ", "past power": "m.omega**2 * "}
+CARRIERS = {"": "", "direction": "m.sign(m.omega) * ", "omega": "m.omega * ", "i": "m.i * ", "v": "m.v * "}
 
 
 @dataclass(frozen=True)
