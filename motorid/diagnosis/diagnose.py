@@ -42,7 +42,8 @@ def diagnose(fit: Fit, validate: Sequence[Experiment] | Experiment | None = None
     fit : Fit
         Of the model as it is, e.g. ``mi.fit(mi.dc_motor(), runs)``.
     validate : Experiment or sequence of Experiment, optional
-        Held-out runs: no effect may raise the error there. Blocks of the fitted runs are left out in turn, too.
+        Held-out runs: no effect may raise the error there. Blocks of the fitted runs are left out in turn, too. Where
+        `fit` leaves only noise and fails there, these runs are fitted as well, which `Diagnosis` says.
     effects : iterable of Effect or str, optional
         What to try; by default the whole library.
     also : iterable of Effect, optional

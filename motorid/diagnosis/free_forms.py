@@ -191,7 +191,7 @@ def shown(form: Form, fit: Fit, ranges: Mapping[str, tuple[float, float]]) -> bo
         return False  # one sensor needs another to be told wrong
     if form.channel == "omega" and form.carrier and "theta" not in outputs:
         return False  # a gain is the motor constant's, unless the motion is measured twice
-    if not {form.on, form.carrier} <= {"", *ranges} or ranges[form.on][0] == ranges[form.on][1] or (
+    if form.on not in ranges or ranges[form.on][0] == ranges[form.on][1] or (
             form.on == "run" and own_levels(fit.problem.experiments)):
         return False
     if form.on == "path":  # both ways, by more than the creep of a smooth sgn or the ripple of a start

@@ -369,7 +369,8 @@ class Remainder:
 
     @property
     def model(self) -> Model:
-        """The model to add the curve to, at its values beside that; if better so, without what only imitated it."""
+        """The model to add the curve to, at its values beside that; without what only approximated it if it does
+        better so."""
         return self._chosen.fit.model.start_at(self.fitted.values)
 
     @property

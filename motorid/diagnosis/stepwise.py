@@ -354,12 +354,14 @@ def _with_held_out(found: Climb, records: Records, climbed: Callable[[Records], 
     and fails on those: what is missing shows there, or they determine what the others do not."""
     last, fit = found.path[-1], found.path[-1].fit
     noise = len(found.path) == 1 and found.remaining.adequate and not (found.stopped or far(fit) or fit.window)
-    with contextlib.suppress(*FAILURES):
-        if noise and not at_noise(last) and max(e.misfit for e in last.predictions.held_out.values()) > ELSEWHERE:
-            runs = (*fit.problem.experiments, *(records.held_out or ()))
-            both = solve(fit.problem.with_(experiments=runs, model=fit.model, noise_factors={}), start="model")
-            return climbed(joint := Records(both, None, (*records.remarks, FITTED_TOO))), joint
-    return found, records
+    if not noise or at_noise(last) or max(e.misfit for e in last.predictions.held_out.values()) <= ELSEWHERE:
+        return found, records
+    runs = (*fit.problem.experiments, *(records.held_out or ()))
+    try:
+        both = solve(fit.problem.with_(experiments=runs, model=fit.model, noise_factors={}), start="model")
+    except FAILURES:
+        return found, records
+    return climbed(joint := Records(both, None, (*records.remarks, FITTED_TOO))), joint
 
 
 def _in_windows(found: Climb) -> Fit | None:

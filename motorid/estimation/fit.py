@@ -175,7 +175,8 @@ def check_solver(solver: Any) -> None:
 
 def _fit(problem: Problem, effort: LevenbergMarquardt, callback: Callback = None, *, auto: bool = True,
          formulation: str = "plain", began: float = 0.0) -> Fit:
-    """Fit with the orders over the angle that the model has: start values, minimum, polish, covariance's slopes."""
+    """Fit with the orders over the angle that the model has: start values, minimum, polish. The covariance follows from
+    the Jacobian there."""
     asked = problem
     if auto:
         problem = with_start_values(problem)  # first guess, race of starts

@@ -258,7 +258,8 @@ def motors_in(folder: str | Path) -> dict[str, list[Path]]:
 def outliers(rows: Sequence[Mapping[str, Any]], names: Sequence[str], positive: frozenset[str]) -> tuple[Outlier, ...]:
     """Return the outliers of a batch, the most extreme first.
 
-    `rows` have ``motor`` and per parameter in `names` its value and ``<name>_std``; `positive`: in logarithms.
+    `rows` have ``motor`` and per parameter in `names` its value and ``<name>_std``; those in `positive` are compared on
+    the logarithmic scale.
     """
     found = []
     for n in names:

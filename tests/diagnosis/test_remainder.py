@@ -825,8 +825,11 @@ def test_a_budget_that_is_spent_ends_the_search_for_curves(lab):
 
 
 @mi.effect(balance="torque")
-def ratchet(m, A=mi.P(1.2e-2, "N·m", null=0.0)):
-    """Detents, six to the turn, that rise slowly and fall at once."""
+def ratchet(m, A=mi.P(0.9e-2, "N·m", null=0.0)):
+    """Detents, six to the turn, that rise slowly and fall at once.
+
+    Stiffer ones (1.2e-2) let the last digit decide in which tooth the motor rests: 2.5 or 3.9 times the floor.
+    """
     place = ca.atan2(ca.sin(6 * m.theta), ca.cos(6 * m.theta)) / np.pi  # from -1 to 1 along each
     m.torque -= A * ca.fmin(place / 0.85, (1 - place) / 0.15)
 
@@ -844,8 +847,7 @@ def burnt(m, R_b=mi.P(2.0, "Ω", null=0.0)):
 
 
 @pytest.mark.parametrize(("law", "words", "pitches", "most", "near"), [
-    # 2.4 to 2.55 times, by what the linear algebra of a machine rounds
-    (ratchet, "a load that changes with the angle within a turn", 6, 9, 2.7),
+    (ratchet, "a load that changes with the angle within a turn", 6, 6, 1.4),
     (rubbing, "a friction that changes with the angle within a turn", 1, 3, 1.15),
     (burnt, "a resistance that changes with the angle within a turn", 2, 3, 1.15)])
 def test_what_repeats_within_a_turn_is_found_with_few_functions(law, words, pitches, most, near, lab):
