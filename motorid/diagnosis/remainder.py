@@ -14,7 +14,7 @@ import re
 from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, reduce
-from itertools import chain, islice, product, zip_longest
+from itertools import chain, islice, product, takewhile, zip_longest
 from typing import Any, NamedTuple
 
 import casadi as ca
@@ -472,17 +472,22 @@ def _best(fit: Fit, tried: Iterable[tuple[Fit, Form]], held: HeldOut) -> Curve |
     before, name = held.predictions(fit), _name(fit)
     best = _better_curve(((Curve(base, name=name), form) for base, form in tried), before, held)
     for _ in range(FURTHER):
-        if best is None or best.done or (larger := _beside(best, held)) is None:
+        if best is None or best.done or (larger := _beside(best, held, _further(best))) is None:
             break
         best = _revised(larger, held)
     return best and best.curve
 
 
-def _beside(best: Grown, held: HeldOut, only: Form | None = None) -> Grown | None:
-    """Return a curve with the further part that predicts most, or one of this form; None where that is no better."""
-    had = [part.form for part in best.curve.parts]
-    forms = [only] if only is not None else (f for _, f in _beyond(best.curve.fitted) if f not in had and f.on != "run")
+def _beside(best: Grown, held: HeldOut, forms: Iterable[Form]) -> Grown | None:
+    """Return a curve with the further part of these forms that predicts most; None where none is better."""
     return _better_curve(((best.curve, form) for form in islice(forms, TRIED)), best.predictions, held)
+
+
+def _further(best: Grown, than: Form | None = None) -> Iterator[Form]:
+    """Yield the forms that promise more than a curve does, the best first; those that promise more than one does."""
+    had = [part.form for part in best.curve.parts]
+    forms = (form for _, form in _beyond(best.curve.fitted) if form not in had and form.on != "run")
+    yield from takewhile(lambda form: form != than, forms)
 
 
 def _revised(best: Grown, held: HeldOut, times: int = FURTHER) -> Grown:
@@ -497,8 +502,8 @@ def _revised(best: Grown, held: HeldOut, times: int = FURTHER) -> Grown:
             less = Grown(best.gained, held.predictions(smaller.fitted), smaller)
             if not compare(less.predictions, best.predictions).worth_it:
                 return _revised(less, held, times)
-            for form in (part.form, None):
-                other = None if best.done else _beside(less, held, form)
+            for forms in ([part.form], _further(less, part.form)):
+                other = None if best.done else _beside(less, held, forms)
                 if other is not None and compare(best.predictions, other.predictions).worth_it:
                     return _revised(other, held, times - 1)
     return best
