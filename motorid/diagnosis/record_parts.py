@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from motorid.errors import MotoridError
 from motorid.estimation.fit import solve
+from motorid.estimation.least_squares import FAILURES
 from motorid.estimation.result import Fit
 from motorid.numerics.signals import Array
 from motorid.problem.runs import angle_signal
@@ -37,9 +38,9 @@ def affordable(fit: Fit) -> Fit:
     if fit.problem.initial != "auto":
         return fit
     if (k := _every(fit)) > 1:
-        fit = _again(fit, [r.decimate(k).with_(meta={**r.meta, "every": k}) for r in fit.problem.experiments])
+        fit = fitted_to(fit, [r.decimate(k).with_(meta={**r.meta, "every": k}) for r in fit.problem.experiments])
     work = sum(int(r.grid.substeps.sum()) for r in fit.problem.runs)
-    return _again(fit, parts_of(fit.problem.experiments, WANTED / work)) if work > AFFORDABLE else fit
+    return fitted_to(fit, parts_of(fit.problem.experiments, WANTED / work)) if work > AFFORDABLE else fit
 
 
 def thinned_alike(fit: Fit, runs: Sequence[Experiment]) -> list[Experiment]:
@@ -47,11 +48,12 @@ def thinned_alike(fit: Fit, runs: Sequence[Experiment]) -> list[Experiment]:
     return [r.decimate(k) for r in runs] if (k := fit.problem.experiments[0].meta.get("every", 1)) > 1 else list(runs)
 
 
-def _again(fit: Fit, runs: Sequence[Experiment] | None) -> Fit:
+def fitted_to(fit: Fit, runs: Sequence[Experiment] | None) -> Fit:
+    """Return the fit of the same model to other runs, from where it is; `fit` itself for none, or where that fails."""
     try:
         return fit if runs is None else solve(
             fit.problem.with_(experiments=runs, model=fit.model, noise_factors={}), start="model")
-    except MotoridError:
+    except (MotoridError, *FAILURES):
         return fit
 
 

@@ -472,22 +472,17 @@ def _best(fit: Fit, tried: Iterable[tuple[Fit, Form]], held: HeldOut) -> Curve |
     before, name = held.predictions(fit), _name(fit)
     best = _better_curve(((Curve(base, name=name), form) for base, form in tried), before, held)
     for _ in range(FURTHER):
-        if best is None or best.done or (larger := _beside(best, held, _further(best))) is None:
+        if best is None or best.done or (larger := _better_curve(_further(best), best.predictions, held)) is None:
             break
         best = _revised(larger, held)
     return best and best.curve
 
 
-def _beside(best: Grown, held: HeldOut, forms: Iterable[Form]) -> Grown | None:
-    """Return a curve with the further part of these forms that predicts most; None where none is better."""
-    return _better_curve(((best.curve, form) for form in islice(forms, TRIED)), best.predictions, held)
-
-
-def _further(best: Grown, than: Form | None = None) -> Iterator[Form]:
-    """Yield the forms that promise more than a curve does, the best first; those that promise more than one does."""
+def _further(best: Grown, than: Form | None = None) -> Iterator[tuple[Curve, Form]]:
+    """Yield a curve with each of a few forms that promise more than it does alone, and more `than` one, best first."""
     had = [part.form for part in best.curve.parts]
     forms = (form for _, form in _beyond(best.curve.fitted) if form not in had and form.on != "run")
-    yield from takewhile(lambda form: form != than, forms)
+    yield from ((best.curve, form) for form in islice(takewhile(lambda form: form != than, forms), TRIED))
 
 
 def _revised(best: Grown, held: HeldOut, times: int = FURTHER) -> Grown:
@@ -502,8 +497,8 @@ def _revised(best: Grown, held: HeldOut, times: int = FURTHER) -> Grown:
             less = Grown(best.gained, held.predictions(smaller.fitted), smaller)
             if not compare(less.predictions, best.predictions).worth_it:
                 return _revised(less, held, times)
-            for forms in ([part.form], _further(less, part.form)):
-                other = None if best.done else _beside(less, held, forms)
+            for tried in ([(smaller, part.form)], _further(less, part.form)):
+                other = None if best.done else _better_curve(tried, less.predictions, held)
                 if other is not None and compare(best.predictions, other.predictions).worth_it:
                     return _revised(other, held, times - 1)
     return best

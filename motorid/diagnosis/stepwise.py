@@ -23,7 +23,7 @@ from motorid.diagnosis.input_hypotheses import Reading, better_reading, without_
 from motorid.diagnosis.misspecification import IN_ITS_PLACE, FormGain, Grade, better_forms, grades_of, outdoes
 from motorid.diagnosis.model_comparison import Node, at_noise, beats, choose, evidence, far, group_of, node_of
 from motorid.diagnosis.predictive_score import is_sure
-from motorid.diagnosis.record_parts import affordable, thinned_alike
+from motorid.diagnosis.record_parts import affordable, fitted_to, thinned_alike
 from motorid.diagnosis.refit import BEAM, BEHIND, INTERRUPTED, OUT_OF_TIME
 from motorid.diagnosis.remainder import alone_leaving_noise
 from motorid.diagnosis.results import Adequacy, Candidate, Ladder, Rung
@@ -356,12 +356,9 @@ def _with_held_out(found: Climb, records: Records, climbed: Callable[[Records], 
     noise = len(found.path) == 1 and found.remaining.adequate and not (found.stopped or far(fit) or fit.window)
     if not noise or at_noise(last) or max(e.misfit for e in last.predictions.held_out.values()) <= ELSEWHERE:
         return found, records
-    runs = (*fit.problem.experiments, *(records.held_out or ()))
-    try:
-        both = solve(fit.problem.with_(experiments=runs, model=fit.model, noise_factors={}), start="model")
-    except FAILURES:
-        return found, records
-    return climbed(joint := Records(both, None, (*records.remarks, FITTED_TOO))), joint
+    both = fitted_to(fit, (*fit.problem.experiments, *(records.held_out or ())))
+    joint = Records(both, None, (*records.remarks, FITTED_TOO))
+    return (found, records) if both is fit else (climbed(joint), joint)
 
 
 def _in_windows(found: Climb) -> Fit | None:

@@ -10,9 +10,8 @@ Residuals that depend on the motion, of a model that lacks something, are not no
 A quantity is determined if two things hold. It stays where it is along every direction that has no influence on the
 outputs: what such a direction carries away could be anything. Both are measured in relative changes (natural sizes for
 what may be zero), in which symmetries of the equations are plain numbers such as R, L, 1/J, 1/b; in records without a
-current, shipped and real, what a direction carries away shifts by 0.01 to 1 along it, and what stays by less than
-0.0001. And its 95 % interval does not reach zero; where zero is a value like others, the deviation is less than
-half the natural size.
+current, shipped and real, what it carries away shifts by 0.01 to 1 along it, and what stays by less than 0.0001. And
+its 95 % interval does not reach zero; where zero is a value like others, the deviation is below half the natural size.
 """
 
 from __future__ import annotations

@@ -197,7 +197,7 @@ def test_what_differs_from_run_to_run_is_no_further_part(outside, monkeypatch):
     monkeypatch.setattr(remainder, "chosen_functions", lambda *_, **__: [0])
     held = HeldOut.of(fit, None)
     found = remainder.Grown(0.0, held.predictions(fit), Curve(fit, fitted=fit))
-    assert remainder._beside(found, held, remainder._further(found)) is None
+    assert remainder._better_curve(remainder._further(found), found.predictions, held) is None
 
 
 def test_every_place_begins_within_its_limits(lab):
