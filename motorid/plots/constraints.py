@@ -42,8 +42,8 @@ def plot_current_limit(*results: Fit | Formulations, limit: float | None = None,
     >>> axes = mi.plot_current_limit(better, limit=8.0)
     """
     fits = [f for r in results for f in ([c.fit for c in r.all if c.fit] if isinstance(r, Formulations) else [r])]
-    if not fits or not all(isinstance(f, Fit) for f in fits):
-        raise UsageError("plot_current_limit takes fits: mi.plot_current_limit(fit, hard, limit=8.0).")
+    if not all(isinstance(f, Fit) for f in fits) or len({len(f.simulations) for f in fits}) != 1:
+        raise UsageError("plot_current_limit takes fits of the same runs: mi.plot_current_limit(fit, hard, limit=8.0).")
     positive(limit=limit)
     relations = (c for f in fits for c in (*f.problem.constraints, *f.problem.penalties))
     limit = limit or next((c.limit for c in relations if isinstance(c, CurrentLimit)), None)

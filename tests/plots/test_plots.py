@@ -304,6 +304,8 @@ def test_binned_means_follow_the_curve(rng):
         (lambda d: plots.plot_waterfall(d.before), "plot_waterfall takes"),
         (lambda d: plots.plot_current_limit(d.before), "no CurrentLimit"),
         (lambda d: plots.plot_current_limit(), "plot_current_limit takes fits"),
+        (lambda d: plots.plot_current_limit(d.before, mi.fit(mi.dc_motor(), d.before.problem.experiments[0]), limit=1),
+         "fits of the same runs"),
         (lambda d: plots.plot_current_limit(d.before, d.after, limit=1.0, labels=["one"]), "one label per fit"),
     ],
 )
