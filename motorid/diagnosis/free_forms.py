@@ -8,12 +8,11 @@ fading memory (Laguerre and Kautz models: Wahlberg, IEEE Trans. Automatic Contro
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import SimpleNamespace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from motorid.channels import COMPUTED_INPUTS
 from motorid.diagnosis.thresholds import CONTAINED
@@ -404,19 +403,28 @@ class Linear:
     slopes: Array  # (n, number of free parameters)
     own: Array  # (n, number of estimated initial states), to half of the range in which each may lie
     forms: Mapping[Form, Array]  # (n, number of coefficients)
-    place: Array  # (n,), of each residual: where in its run it is, from 0 to 1
-    channel: Array  # (n,), and which output
 
-    def part(self, rows: NDArray[np.bool_]) -> Linear:
-        """Return the rows chosen by a mask."""
-        return Linear(self.residual[rows], self.slopes[rows], self.own[rows],
-                      {f: c[rows] for f, c in self.forms.items()}, self.place[rows], self.channel[rows])
+
+class Answering(Mapping[Form, Array]):
+    """What a model answers to each form, worked out when it is asked for: all together fill the memory."""
+
+    def __init__(self, forms: Iterable[Form], answer: Callable[[Form], Array]) -> None:
+        self._forms, self._answer = tuple(forms), answer
+
+    def __getitem__(self, form: Form) -> Array:
+        return self._answer(form)
+
+    def __iter__(self) -> Iterator[Form]:
+        return iter(self._forms)
+
+    def __len__(self) -> int:
+        return len(self._forms)
 
 
 def linearised(fit: Fit, only: Form | None = None, span: Span | None = None) -> Linear:
     """Return the model of `fit` on its records, with the forms that these can show, or `only` one over a span.
 
-    SimulationError where its answer to small changes grows without bound.
+    SimulationError where its answer to small changes grows without bound; of all forms, when one is asked for.
     """
     problem = fit.problem
     residual, jac = _at(problem, fit)
@@ -424,14 +432,15 @@ def linearised(fit: Fit, only: Form | None = None, span: Span | None = None) -> 
     span = span or span_of(fit, signals)
     forms = [f for f in FORMS if shown(f, fit, span.ranges)] if only is None else [only]
     free, n, runs = len(problem.model.free_names), problem.n_outputs, range(len(signals))
-    answers = responses(fit)
-    bases = [{f: basis_of(f, signal, span) for f in forms} for signal in signals]
-    parts = [_answers(problem, k, answers[k], bases[k]) for k in runs]
-    columns = {f: np.vstack([part[f] for part in parts]) for f in forms}
-    place, channel = np.concatenate([_labels(problem, k) for k in runs], axis=1)
+    seen = [replace(a, c=a.c * m.weights[:, None]) for a, m in zip(responses(fit), problem.measured, strict=True)]
     own = jac[:n, free:] * [reach if np.isfinite(reach := 0.5 * (p.upper - p.lower)) else 1.0
                             for p in problem.unknown[free:]]
-    return Linear(residual[:n], jac[:n, :free], own, columns, place, channel)
+
+    def answer(form: Form) -> Array:
+        return np.vstack([_answer(problem, k, seen[k], form, basis_of(form, signals[k], span)) for k in runs])
+
+    answers = Answering(forms, answer) if only is None else {only: answer(only)}
+    return Linear(residual[:n], jac[:n, :free], own, answers)
 
 
 def _at(problem: Problem, fit: Fit) -> tuple[Array, Array]:
@@ -480,31 +489,20 @@ def _signals(fit: Fit, k: int) -> dict[str, Array]:
     return found
 
 
-def _answers(problem: Problem, k: int, answer: Response, bases: Mapping[Form, Array]) -> dict[Form, Array]:
-    """Return the whitened outputs of run `k` to every function of every form."""
-    if not bases:
-        return {}
+def _answer(problem: Problem, k: int, seen: Response, form: Form, basis: Array) -> Array:
+    """Return the whitened outputs of run `k` to every function of a form; `seen` is its response, whitened."""
     _, weights, index = problem.measured[k][:3]
-    answer = replace(answer, c=answer.c * weights[None, :, None])
-    inside = {f: b for f, b in bases.items() if f.balance != "sensor"}
-    read = {f: b for f, b in bases.items() if f not in inside}
-    flat = np.concatenate([_driven(answer, inside), *(_read(problem, f, b, weights) for f, b in read.items())], axis=1)
-    flat = flat if index is None else flat[index]
-    ends = np.cumsum([b.shape[1] for b in (*inside.values(), *read.values())])[:-1]
-    return dict(zip((*inside, *read), np.split(flat, ends, axis=1), strict=True))
+    flat = _read(problem, form, basis, weights) if form.balance == "sensor" else _driven(seen, form, basis)
+    return flat if index is None else flat[index]
 
 
-def _driven(answer: Response, bases: Mapping[Form, Array]) -> Array:
+def _driven(seen: Response, form: Form, basis: Array) -> Array:
     """Return the outputs, (N·ny, m), to functions in the balances."""
-    n, ny, _ = answer.c.shape
-    if not bases:
-        return np.zeros((n * ny, 0))
     with np.errstate(over="ignore", invalid="ignore"):
-        out = answer.driven(np.concatenate([_pushes(f, b, answer) for f, b in bases.items()]))
-    unit = max(1.0, *(float(np.abs(b).max(initial=0.0)) for b in bases.values()))
-    if not np.all(np.abs(out) < UNBOUNDED * unit):  # or not a number
+        out = seen.driven(_pushes(form, basis, seen))
+    if not np.all(np.abs(out) < UNBOUNDED * max(1.0, float(np.abs(basis).max(initial=0.0)))):  # or not a number
         raise SimulationError("the model's answer to small changes grows without bound along these records.")
-    return out.reshape(n * ny, -1)
+    return out.reshape(-1, out.shape[2])
 
 
 def _pushes(form: Form, basis: Array, answer: Response) -> Array:
@@ -523,13 +521,6 @@ def _read(problem: Problem, form: Form, basis: Array, weights: Array) -> Array:
     j = problem.outputs.index(form.channel)
     out[:, j] = basis * weights[j]
     return out.reshape(-1, basis.shape[1])
-
-
-def _labels(problem: Problem, k: int) -> Array:
-    """Return place in the run and channel of every residual of run `k`, (2, n)."""
-    y, _, index = problem.measured[k][:3]
-    both = np.stack([np.repeat(np.arange(len(y)) / len(y), y.shape[1]), np.tile(np.arange(y.shape[1]), len(y))])
-    return both if index is None else both[:, index]
 
 
 def form_coefficients(fit: Fit, linear: Linear, form: Form, kept: Sequence[int] | None = None) -> Array:

@@ -51,12 +51,12 @@ def better_forms(fit: Fit, rival: Fit, channels: Container[str] = CHANNELS) -> l
     """
     try:
         linear = free_forms.linearised(fit)
+        answers = {form: Answers(fit, linear, form).predictions() for form in linear.forms}
     except FAILURES:
         return []
     known, gains = predictive_score.predictions_left_out(rival, evenly=True) or {}, []
     known = {c: e for c, e in known.items() if c in channels}
-    for form in linear.forms:
-        predicted = Answers(fit, linear, form).predictions()
+    for form, predicted in answers.items():
         if predicted is not None:
             found = compare(Predictions(known, {}), predicted)
             found = replace(found, gain=found.gain - np.log(len(linear.forms)))  # the best of many gains by chance
