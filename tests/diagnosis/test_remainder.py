@@ -200,6 +200,14 @@ def test_what_differs_from_run_to_run_is_no_further_part(outside, monkeypatch):
     assert remainder._better_curve(remainder._further(found), found.predictions, held) is None
 
 
+def test_only_what_promises_more_than_a_part_is_raced_in_its_place(outside, monkeypatch):
+    fit, forms = outside("eddy brake")[1].before, [Form("", "torque", on) for on in ("omega", "v", "i", "run", "theta")]
+    monkeypatch.setattr(remainder, "_beyond", lambda base: iter([(base, form) for form in forms]))
+    found = remainder.Grown(None, None, Curve(fit, fitted=fit))
+    assert [form.on for _, form in remainder._further(found, forms[2])] == ["omega", "v"]
+    assert [form.on for _, form in remainder._further(found)] == ["omega", "v", "i", "theta"]
+
+
 def test_every_place_begins_within_its_limits(lab):
     """Also in records of few samples, where what fades is soon over."""
     rng = np.random.default_rng(7)
