@@ -305,15 +305,15 @@ def test_beside_an_effect_that_leaves_noise_what_promises_little_is_not_even_beg
     fit = mi.fit(mi.dc_motor(), record(moves, "logger", ("i", "omega"), lab, rng, "run"))
     promises = {"coulomb_asymmetric": 0.97, "coulomb": 0.95, "speed_lag": 0.01, "brush_drop": 0.6}
     tasks = [trial.Task(fit, fit.model + LIBRARY[n], LIBRARY[n], ({},), p) for n, p in promises.items()]
-    begun, race = [], trial.raced
+    entered, begun = [], trial.begun
 
     def seen(fit, model, *starts):
-        begun.append(model.effect_names)
-        return race(fit, model, *starts)
+        entered.append(model.effect_names)
+        return begun(fit, model, *starts)
 
-    monkeypatch.setattr(trial, "raced", seen)
+    monkeypatch.setattr(trial, "begun", seen)
     asymmetric, coulomb, lag, drop = trial.refits(tasks, map)
-    assert begun == [("coulomb",), ("brush_drop",)]
+    assert entered == [("coulomb",), ("brush_drop",)]
     assert isinstance(coulomb, mi.Fit)
     assert asymmetric.why == "no better than coulomb, its simpler special case"
     assert lag.why == drop.why == trial.FAR_BEHIND.format("coulomb")

@@ -10,7 +10,9 @@ from battery.cases import CASES
 from battery.excite import driven, record
 
 import motorid as mi
+from motorid.diagnosis.model_comparison import finer
 from motorid.diagnosis.score_test import score
+from motorid.diagnosis.thresholds import FINER, FINER_RATE
 from motorid.effects import LIBRARY
 from motorid.estimation.linearisation import Tangent
 from motorid.records.experiment import Experiment
@@ -185,14 +187,14 @@ def test_what_held_out_runs_refuse_for_the_lack_of_another_is_found_with_that(pl
     assert found.after.fits == "noise"
 
 
-def fine_encoder(motor, effects, seed=5) -> list[Experiment]:
+def fine_encoder(motor, effects, seed=5, lowest=-8.0) -> list[Experiment]:
     """An encoder that sees a millionth of a turn; the driver's voltage wanders by a thousandth, which none records."""
     runs, rng, t = [], np.random.default_rng(seed), 2e-3 * np.arange(1500)
     model = mi.dc_motor(R=motor.R, L=motor.L, K=motor.K, b=motor.b, J=motor.J)
     for name, sizes in effects.items():
         model += LIBRARY[name](**sizes)
     for k in range(3):
-        v = np.repeat(rng.uniform(-8, 8, 30), 50)
+        v = np.repeat(rng.uniform(lowest, 8, 30), 50)
         wander = sum(rng.normal() * np.sin(w * t + rng.uniform(0, 6)) for w in rng.uniform(3, 40, 6))
         blank = Experiment(t, {"v": v * (1 + 1e-3 * wander / np.std(wander))}, dict.fromkeys(ANGLE, 0 * t))
         clean = mi.simulate(model, blank, initial="rest")[0].outputs
@@ -209,6 +211,26 @@ def test_an_encoder_finer_than_any_model_invites_no_effect(lab):
     assert found.after.misfit["theta"] > 30
     assert found.remaining.adequate
     assert "no model is asked for less" in found.text
+
+
+@pytest.mark.parametrize(("hidden", "close"), [({}, True), ({"cogging": {"A": 3e-2, "N": 12, "phi": 0.5}}, False)])
+def test_the_jumps_of_an_encoder_s_counts_are_no_error_of_the_model(hidden, close, lab):
+    """Their rate is a per cent of the speed's, cogging's too; over many turns an angle shows neither."""
+    turn = 2 * np.pi / 1000
+    runs = [run.with_(outputs={**run.outputs, "theta": turn * np.floor(run.outputs["theta"] / turn)})
+            for run in fine_encoder(lab, hidden, lowest=1.0)]
+    fit = mi.fit(mi.dc_motor(), runs[:2])
+    assert fit.nrmse["theta"] < FINER
+    sigma, dt = fit.problem.runs[0].sigma["theta"], float(np.median(np.diff(runs[0].t)))
+    assert np.sqrt(2) * sigma / dt > FINER_RATE * np.sqrt(np.mean(runs[0].outputs["omega"] ** 2))
+    assert finer(fit, "theta") is close
+
+
+def test_an_error_is_not_taken_for_noise_where_the_noise_is_thought_larger_than_it_is(lab):
+    fit = mi.fit(mi.dc_motor(), fine_encoder(lab, {"cogging": {"A": 1.8e-2, "N": 12, "phi": 0.5}}, lowest=1.0)[:2])
+    assert fit.nrmse["theta"] < FINER
+    assert fit.problem.runs[0].sigma["theta"] > 5 * 5e-6  # the encoder's
+    assert not finer(fit, "theta")
 
 
 def test_what_an_angle_shows_within_a_turn_is_still_asked_of_it(lab):
