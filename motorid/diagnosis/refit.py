@@ -31,7 +31,7 @@ from motorid.problem.problem import Problem
 from motorid.problem.runs import combined, natural_sizes, shapes_of, with_inputs
 from motorid.problem.simulate import misfit_over_noise
 
-BEGIN, RACE = (LevenbergMarquardt(max_iterations=n, ftol=1e-3, xtol=1e-4, looks=0) for n in (2, 6))
+BEGIN, RACE = (LevenbergMarquardt(max_iterations=n, ftol=1e-3, xtol=1e-4, looks=0) for n in (1, 6))
 POLISH = LevenbergMarquardt(max_iterations=60, ftol=1e-5, xtol=1e-5, looks=0)
 GOING_ON = 4  # times, where the last descent ends at its limit
 LOST = 0.2  # NRMSE of a channel
