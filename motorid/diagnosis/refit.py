@@ -45,42 +45,39 @@ SHAKES = 20  # places at which it is drawn
 
 @dataclass(frozen=True, eq=False)
 class Raced:
-    """The best of several starts of one model after a few steps: the cost it has reached, and the one that an undamped
-    step from there promises.
-
-    `ahead` are the best after the first steps, if the others were left behind then: what goes on from there is raced.
-    """
+    """Where a few steps from one start of a model led: the cost reached, and what an undamped step promises there.
+    `whole` tells a race from its first steps."""
 
     problem: Problem
     cost: float
     reach: float
     angular: bool
-    ahead: tuple[Raced, ...] = ()
+    whole: bool = True
 
     @staticmethod
-    def of(done: Estimate, angular: bool) -> Raced:
-        """Return where the steps from one start ended."""
-        return Raced(done.onward, float(done.cost), _undamped(done.solution.residual, done.solution.jac), angular)
+    def of(done: Estimate, angular: bool, whole: bool) -> Raced:
+        """Return where an estimate ended."""
+        reach = _undamped(done.solution.residual, done.solution.jac)
+        return Raced(done.onward, float(done.cost), reach, angular, whole)
 
-    def run_on(self) -> Raced:
-        """Return the best of those that were ahead after a few steps more."""
-        ends = [Raced.of(done, r.angular) if (done := _race(r.problem, RACE)) is not None else r for r in self.ahead]
-        return min(ends, key=lambda r: r.cost, default=self)
+    def drop(self, cost: float) -> float | None:
+        """Share of `cost` that is gone; None after the first steps, which tell little of it."""
+        return 1 - self.cost / max(cost, 1e-300) if self.whole else None
 
 
 def raced(fit: Fit, model: Model, starts: Sequence[Mapping[str, float]]) -> Raced | None:
     """Go a few steps from the best starts with `model` on the records of `fit`; None if none can be simulated."""
-    best = begun(fit, model, starts)
-    return best and best.run_on()
+    ends = _begun(fit, model, starts)
+    return _run_on(ends) if ends else None
 
 
-def begun(fit: Fit, model: Model, starts: Sequence[Mapping[str, float]]) -> Raced | None:
-    """Go the first steps from each start with `model` on the records of `fit`; None if none can be simulated.
+def _begun(fit: Fit, model: Model, starts: Sequence[Mapping[str, float]]) -> list[Raced]:
+    """Return the starts that are ahead after the first steps, the best first; none if none can be simulated.
 
     Where no start can be (a friction that sticks at every turn), the values of `fit` are one: the smaller model could.
     Effects of the angle start along the measured angle, which the model's own angle, still wrong, would lead astray.
-    The two best are ahead then (successive halving: Karnin, Koren & Somekh, ICML 2013): of 234 races of more starts one
-    in 13 ended more than 2 % lower where all went on, one in 60 more than 20 %.
+    Two go on (successive halving: Karnin, Koren & Somekh, ICML 2013): of 234 races of more starts one in 13 ended more
+    than 2 % lower where all went on, one in 60 more than 20 %.
     """
     model = _bounded(fit, model)
     alive, angular, starts = restored(fit, model), _brings_in_the_angle(fit, model), starts or ({},)
@@ -89,20 +86,23 @@ def begun(fit: Fit, model: Model, starts: Sequence[Mapping[str, float]]) -> Race
     # A guess of the larger model's own, along the records, is no longer led astray.
     entries = [(start, angular) for start in starts] + [
         (start, along) for start in _own_starts(fit, model, starts) for along in sorted({angular, False})]
-    first = BEGIN if len(entries) > BEAM else RACE
-    each = ((_first_steps(fit, models, start, along, first), along) for start, along in entries)
-    ends = sorted((Raced.of(done, along) for done, along in each if done is not None), key=lambda r: r.cost)
-    if not ends:
-        return begun(fit, model, ()) if any(starts) else None
-    return replace(ends[0], ahead=tuple(ends[:BEAM])) if first is BEGIN else ends[0]
+    each = ((_first_steps(fit, models, start, along), along) for start, along in entries)
+    ends = sorted((Raced.of(done, along, False) for done, along in each if done is not None), key=lambda end: end.cost)
+    return ends[:BEAM] or (_begun(fit, model, ()) if any(starts) else [])
 
 
-def _first_steps(fit: Fit, models: Iterable[Model], start: Mapping[str, float], along: bool,
-                 effort: LevenbergMarquardt) -> Estimate | None:
+def _run_on(ends: Sequence[Raced]) -> Raced:
+    """Return the best after a few steps more from each of `ends`."""
+    further = [replace(end, whole=True) if (done := _race(end.problem, RACE)) is None else
+               Raced.of(done, end.angular, True) for end in ends]
+    return min(further, key=lambda end: end.cost)
+
+
+def _first_steps(fit: Fit, models: Iterable[Model], start: Mapping[str, float], along: bool) -> Estimate | None:
     """Go the first steps from a start with the first model that can take it; None if none can."""
     for model in models:
         with contextlib.suppress(*FAILURES):
-            if (done := _race(_started(fit, model, start, along), effort)) is not None:
+            if (done := _race(_started(fit, model, start, along), BEGIN)) is not None:
                 return done
     return None
 
@@ -358,15 +358,13 @@ def _refit_all(tasks: Sequence[Task], map_: Callable[..., Iterable[Any]],
     entered = [k for k in range(len(tasks)) if k not in races and k not in found]
     for k in entered if ahead else ():
         _foresee(tasks[k], alone)
-    ends, behind = _tournament(tasks, entered, alone, [race.cost for race in races.values()], map_)
-    races |= ends
-    found.update(behind)
+    races |= _tournament(tasks, entered, alone, [race.cost for race in races.values()], map_)
     if races:
         first = min(races, key=lambda k: races[k].cost + tasks[k].price)
         if first not in found:
             found[first] = _finish((tasks[first], races[first]))
         if _quiet(found[first]) is not None:
-            found.update(_beaten(tasks, {k: race.cost for k, race in races.items()}, first) | found)
+            found.update(_beaten(tasks, races, first) | found)
         found.update(_outdone(tasks, races, found))
     rest = sorted((k for k in races if k not in found), key=lambda k: races[k].cost)
     for k, fit in zip(rest, map_(_finish, [(tasks[k], races[k]) for k in rest]), strict=True):
@@ -381,26 +379,21 @@ def completed(given_up: Sequence[GivenUp], map_: Callable[..., Iterable[Any]]) -
 
 
 def _tournament(tasks: Sequence[Task], entered: Sequence[int], alone: bool, costs: Sequence[float],
-                map_: Callable[..., Iterable[Any]]) -> tuple[dict[int, Raced], dict[int, GivenUp]]:
-    """Race the tasks `entered` beside those that reached `costs`; what is given up after the first steps comes second.
+                map_: Callable[..., Iterable[Any]]) -> dict[int, Raced]:
+    """Race the tasks `entered` beside those that reached `costs`, the two that promise most first.
 
-    The one that promises most goes on first; an undamped step from the first ones leaves others twice as far behind as
-    at the end of a race: of 147 races that led to a refit one would not have been run.
+    What an undamped step from the first ones leaves twice as far behind as at the end of a race ends there: of 147
+    races that led to a refit one would not have been run.
     """
     begun = zip(entered, map_(_begin, [(tasks[k], alone) for k in entered]), strict=True)
-    started = {k: race for k, race in begun if race is not None}
-    races, given_up = {k: race for k, race in started.items() if not race.ahead}, dict[int, GivenUp]()
-    order = sorted((k for k in started if k not in races), key=lambda k: started[k].reach)
-    for some in (order[:1], order[1:]):
-        least = min((*costs, *(race.cost for race in races.values())), default=np.inf)
-        going = [k for k in some if started[k].reach < OUTDONE**2 * least]
-        given_up |= {k: _less(tasks[k], started[k]) for k in some if k not in going}
-        races |= zip(going, map_(_go_on, [(tasks[k], started[k]) for k in going]), strict=True)
-    return races, given_up
-
-
-def _less(task: Task, race: Raced, why: str = LESS) -> GivenUp:
-    return GivenUp(why, 1 - race.cost / max(task.fit.cost, 1e-300), (task, race))
+    ends = {k: found for k, found in begun if found}
+    reach = {k: min(end.reach for end in found) for k, found in ends.items()}
+    order, races = sorted(ends, key=reach.__getitem__), {k: found[0] for k, found in ends.items()}
+    for some in (order[:BEAM], order[BEAM:]):
+        far = OUTDONE**2 * min((*costs, *(race.cost for race in races.values())), default=np.inf)
+        going = [k for k in some if reach[k] <= far or k in order[:BEAM]]
+        races |= zip(going, map_(_go_on, [(tasks[k], ends[k]) for k in going]), strict=True)
+    return races
 
 
 def _outdone(tasks: Sequence[Task], races: Mapping[int, Raced], found: Mapping[int, Any]) -> dict[int, GivenUp]:
@@ -411,7 +404,7 @@ def _outdone(tasks: Sequence[Task], races: Mapping[int, Raced], found: Mapping[i
     for k, race in races.items():
         nothing = race.reach > (1 - LITTLE) * own and race.cost > (1 - LITTLE) * fit.cost
         if k not in found and (nothing or (race.reach > OUTDONE * costs[0] and race.cost not in costs[:BEAM])):
-            given_up[k] = _less(tasks[k], race, NOTHING if nothing else LESS)
+            given_up[k] = GivenUp(NOTHING if nothing else LESS, race.drop(fit.cost), (tasks[k], race))
     return given_up
 
 
@@ -446,28 +439,27 @@ def _needless(tasks: Sequence[Task], leader: int, best: Fit, map_: Callable[...,
     return {k: GivenUp(why) for k, price in prices.items() if gains[k] < price}
 
 
-def _beaten(tasks: Sequence[Task], costs: Mapping[int, float], first: int) -> dict[int, GivenUp]:
+def _beaten(tasks: Sequence[Task], races: Mapping[int, Raced], first: int) -> dict[int, GivenUp]:
     """Return which tasks need not be finished beside the one that explains all but noise, and why."""
-    winner, given_up = tasks[first], {}
-    for k, cost in costs.items():
-        if k == first:
-            continue
-        drop = 1 - cost / max(winner.fit.cost, 1e-300)
-        if cost > BEHIND * costs[first]:
-            given_up[k] = GivenUp(FAR_BEHIND.format(winner.effect.name), drop)
-        elif winner.effect.name in tasks[k].effect.includes and cost > costs[first] - (tasks[k].price - winner.price):
-            given_up[k] = GivenUp(f"no better than {winner.effect.name}, its simpler special case", drop)
+    winner, least, given_up = tasks[first], races[first].cost, {}
+    for k, race in races.items():
+        included = winner.effect.name in tasks[k].effect.includes
+        if k != first and race.cost > BEHIND * least:
+            given_up[k] = GivenUp(FAR_BEHIND.format(winner.effect.name), race.drop(winner.fit.cost))
+        elif k != first and included and race.cost > least - (tasks[k].price - winner.price):
+            why = f"no better than {winner.effect.name}, its simpler special case"
+            given_up[k] = GivenUp(why, race.drop(winner.fit.cost))
     return given_up
 
 
-def _begin(entry: tuple[Task, bool]) -> Raced | None:
+def _begin(entry: tuple[Task, bool]) -> list[Raced]:
     """Begin a task; its best start alone, where only what comes near a winner matters."""
     task, alone = entry
-    return begun(task.fit, task.model, task.starts[:1] if alone else task.starts)
+    return _begun(task.fit, task.model, task.starts[:1] if alone else task.starts)
 
 
-def _go_on(begun: tuple[Task, Raced]) -> Raced:
-    return begun[1].run_on()
+def _go_on(begun: tuple[Task, Sequence[Raced]]) -> Raced:
+    return _run_on(begun[1])
 
 
 def _foresee(task: Task, alone: bool) -> None:
