@@ -77,11 +77,6 @@ class Stages:
         self._show(0, words if last else f"Round {max(self._round, 1)}/{self._rounds}: {words}", self._done,
                    self._total)
 
-    @property
-    def alone(self) -> bool:
-        """Tell whether all is done in this process."""
-        return self._map is map
-
     def map(self, function: Callable[[Any], Any], tasks: Iterable[Any]) -> Iterator[Any]:
         """Do the same as `map`, saying which effect is being fitted."""
         every, begun = list(tasks), self._done
@@ -184,7 +179,7 @@ class Search:
             with contextlib.suppress(ModelError):  # beside what is there it may describe the same twice
                 tasks.append(widened(node.fit, e))
         tasks += self._restarting(node)
-        fits = dict(zip((t.name for t in tasks), refits(tasks, self.map, ahead=self.stages.alone), strict=True))
+        fits = dict(zip((t.name for t in tasks), refits(tasks, self.map), strict=True))
         self.stages.done(f"refitted {sum(isinstance(f, Fit) for f in fits.values())} of {len(fits)}")
         found = {t.name: self._judge(node, t.added, fits[t.name]) for t in tasks}
         begun = {n: f for n, f in fits.items() if isinstance(f, GivenUp) and f.begun is not None}
@@ -266,7 +261,7 @@ class Search:
 
     def _together(self, node: Node, tasks: Sequence[Task]) -> list[Node]:
         first = len(node.fit.model.effects)
-        fits = zip(tasks, refits(tasks, self.map, ahead=self.stages.alone), strict=True)
+        fits = zip(tasks, refits(tasks, self.map), strict=True)
         judged = [self._judge(node, task.model.effects[first:], fit)[0] for task, fit in fits]
         self.stages.done(f"refitted {len(tasks)} pairs")
         return [child for child in judged if child is not None]

@@ -21,7 +21,6 @@ from motorid.estimation.least_squares import FAILURES, Estimate
 from motorid.estimation.restarts import collapsed_again, restored
 from motorid.estimation.result import Fit
 from motorid.estimation.start_values import ABOVE, sizes_like
-from motorid.integrate import ahead as engine_ahead
 from motorid.model.definition import Effect
 from motorid.model.model import Model
 from motorid.numerics.least_squares import LevenbergMarquardt
@@ -330,14 +329,12 @@ class GivenUp:
     begun: tuple[Task, Raced] | None = None
 
 
-def refits(tasks: Sequence[Task], map_: Callable[..., Iterable[Any]], *,
-           ahead: bool = False) -> list[Fit | GivenUp | None]:
+def refits(tasks: Sequence[Task], map_: Callable[..., Iterable[Any]]) -> list[Fit | GivenUp | None]:
     """Return the refit of each task, None where none can be simulated; what is not done when the time is up, or when
-    it is interrupted, is given up. All are on the same records. `ahead` compiles beside the work at hand.
-    """
+    it is interrupted, is given up. All are on the same records."""
     found: dict[int, Fit | GivenUp | None] = {}
     try:
-        _refit_all(tasks, map_, found, ahead)
+        _refit_all(tasks, map_, found)
     except (OutOfTime, KeyboardInterrupt) as error:
         interruption.heard()
         why = GivenUp(OUT_OF_TIME if isinstance(error, OutOfTime) else INTERRUPTED)
@@ -346,7 +343,7 @@ def refits(tasks: Sequence[Task], map_: Callable[..., Iterable[Any]], *,
 
 
 def _refit_all(tasks: Sequence[Task], map_: Callable[..., Iterable[Any]],
-               found: dict[int, Fit | GivenUp | None], ahead: bool) -> None:
+               found: dict[int, Fit | GivenUp | None]) -> None:
     """Put the refit of each task into `found` as it comes: the one that promises most first, then by their races."""
     races: dict[int, Raced] = {}
     leader, alone = _leader(tasks), False
@@ -356,8 +353,6 @@ def _refit_all(tasks: Sequence[Task], map_: Callable[..., Iterable[Any]],
             alone = True
             found.update(_unpromising(tasks, leader) | _needless(tasks, leader, best, map_))
     entered = [k for k in range(len(tasks)) if k not in races and k not in found]
-    for k in entered if ahead else ():
-        _foresee(tasks[k], alone)
     races |= _tournament(tasks, entered, alone, [race.cost for race in races.values()], map_)
     if races:
         first = min(races, key=lambda k: races[k].cost + tasks[k].price)
@@ -460,16 +455,6 @@ def _begin(entry: tuple[Task, bool]) -> list[Raced]:
 
 def _go_on(begun: tuple[Task, Sequence[Raced]]) -> Raced:
     return _run_on(begun[1])
-
-
-def _foresee(task: Task, alone: bool) -> None:
-    """Tell the engine what a race of a task will ask for."""
-    with contextlib.suppress(*FAILURES):
-        starts = task.starts[:1 if alone else None] or ({},)
-        model, angular = _bounded(task.fit, task.model), _brings_in_the_angle(task.fit, task.model)
-        problem = _started(task.fit, model, starts[0], angular)
-        steps = sum(run.n for run in problem.experiments) * RACE.max_iterations * len(starts)
-        engine_ahead(problem.integrator, problem.system, steps)
 
 
 def _finish(begun: tuple[Task, Raced]) -> Fit | None:

@@ -8,7 +8,6 @@ from motorid.errors import among
 from motorid.integrate.engine import Engine, Grid, Trajectory
 from motorid.integrate.rosenbrock import Rosenbrock
 from motorid.integrate.sundials import Cvodes, Idas
-from motorid.model.equations import System
 
 ENGINES = {"rosenbrock": Rosenbrock, "cvodes": Cvodes, "idas": Idas}
 
@@ -26,10 +25,4 @@ def limited(engine: Engine, steps: int) -> Engine:
     return replace(engine, most_steps=steps) if isinstance(engine, Rosenbrock) else engine
 
 
-def ahead(engine: Engine, system: System, steps: int) -> None:
-    """Tell an engine that compiles that so many steps of a system, with derivatives, will soon be asked for."""
-    if isinstance(engine, Rosenbrock):
-        engine.ahead(system, steps)
-
-
-__all__ = ["ENGINES", "Cvodes", "Engine", "Grid", "Idas", "Rosenbrock", "Trajectory", "ahead", "engine_of", "limited"]
+__all__ = ["ENGINES", "Cvodes", "Engine", "Grid", "Idas", "Rosenbrock", "Trajectory", "engine_of", "limited"]

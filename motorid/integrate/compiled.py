@@ -6,7 +6,6 @@ nothing is compiled again for another run length, number of sub-steps or set of 
 
 from __future__ import annotations
 
-import atexit
 import ctypes
 import hashlib
 import os
@@ -128,108 +127,36 @@ def _digest(data: bytes) -> str:
     return hashlib.sha256(data).hexdigest()[:16]
 
 
-class _Compilation:
-    """One run of the compiler, in a folder of its own in the cache."""
-
-    def __init__(self, functions: StepFunctions, mark: str, cc: str, cache: Path) -> None:
-        self.mark, self.cache = mark, cache
-        self.folder = tempfile.TemporaryDirectory(dir=cache, ignore_cleanup_errors=True)
-        self.here = Path(self.folder.name)
-        (self.here / "step.c").write_text(generate(functions))
-        with (self.here / "said").open("wb") as said:
-            self.process = subprocess.Popen([cc, *flags(), "step.c", "-o", "step.so", "-lm"], cwd=self.here,
-                                            stdin=subprocess.DEVNULL, stdout=said, stderr=said)
-
-    def finished(self) -> Path:
-        """Wait for the compiler, and return the library, put into the cache atomically.
-
-        Raises
-        ------
-        OSError, subprocess.SubprocessError
-        """
-        hangs = threading.Timer(300, self.process.kill)
-        hangs.start()
-        try:
-            if self.process.wait():  # with a timeout it would look again every now and then
-                first = (self.here / "said").read_text(errors="replace").splitlines() or ["no message"]
-                raise OSError(f"the C compiler failed ({first[0]})")
-            made = self.here / "step.so"
-            path = self.cache / self.mark / f"{_digest(made.read_bytes())}.so"
-            path.parent.mkdir(mode=0o700, exist_ok=True)
-            os.replace(made, path)
-            return path
-        finally:
-            hangs.cancel()
-            self.drop()
-
-    def drop(self) -> None:
-        """End it, and leave nothing behind."""
-        if self.process.poll() is None:
-            self.process.kill()
-            self.process.wait()
-        self.folder.cleanup()
-
-
-class _Ahead:
-    """Steps that will soon be needed, compiled one after the other beside the work at hand."""
-
-    def __init__(self) -> None:
-        self.waiting: dict[str, StepFunctions] = {}
-        self.running: _Compilation | None = None
-        self.process = os.getpid()
-        atexit.register(self.clear)
-
-    def clear(self) -> None:
-        self.waiting.clear()
-        if self.running is not None and self.process == os.getpid():  # a fork has its parent's in its memory
-            self.running.drop()
-        self.running = None
-
-    def tend(self) -> None:
-        """Put into the cache what is done, and go on with the next."""
-        if self.process != os.getpid():  # a fork has begun nothing
-            self.waiting, self.running, self.process = {}, None, os.getpid()
-        if self.running is not None and self.running.process.poll() is not None:
-            self.take(self.running.mark)
-        while self.running is None and self.waiting:
-            mark = next(iter(self.waiting))
-            functions = self.waiting.pop(mark)
-            if (cc := compiler()) and (cache := cache_dir()) and find(mark) is None:
-                with suppress(OSError):
-                    self.running = _Compilation(functions, mark, cc[0], cache)
-
-    def take(self, mark: str) -> Path | None:
-        """Return a library that is being made, None if it is not; whoever needs it then makes it, and tells why not."""
-        self.waiting.pop(mark, None)
-        if self.running is None or self.running.mark != mark or self.process != os.getpid():
-            return None
-        running, self.running = self.running, None
-        with suppress(OSError, subprocess.SubprocessError):
-            return running.finished()
-        return None
-
-
-_ahead = _Ahead()
-tend = _ahead.tend
-
-
-def begin(functions: StepFunctions, mark: str) -> None:
-    """Have a library made beside the work at hand, if it is not in the cache when its turn comes."""
-    _ahead.waiting[mark] = functions
-    tend()
-
-
 def build(functions: StepFunctions, mark: str) -> Path | None:
     """Compile into the cache, atomically, and return the library; None (said once) if that does not work."""
-    if (path := _ahead.take(mark)) is not None:
-        return path
     cc, cache = compiler(), cache_dir()
     if cc is None or cache is None:
         return None
     try:
-        return _Compilation(functions, mark, cc[0], cache).finished()
+        with tempfile.TemporaryDirectory(dir=cache, ignore_cleanup_errors=True) as folder:
+            return _compiled(functions, cc[0], Path(folder), cache / mark)
     except (OSError, subprocess.SubprocessError) as error:
         return _without(f"cannot compile: {error}")
+
+
+def _compiled(functions: StepFunctions, cc: str, here: Path, to: Path) -> Path:
+    """Return the library compiled in the folder `here`, then in `to`. Raises OSError or SubprocessError."""
+    (here / "step.c").write_text(generate(functions))
+    with subprocess.Popen([cc, *flags(), "step.c", "-o", "step.so", "-lm"], cwd=here, stdin=subprocess.DEVNULL,
+                          stdout=subprocess.PIPE, stderr=subprocess.STDOUT) as process:
+        hangs = threading.Timer(300, process.kill)  # with a timeout of its own it would look again every now and then
+        hangs.start()
+        try:
+            said = process.communicate()[0]
+        finally:
+            hangs.cancel()
+    if process.returncode:
+        first = said.decode(errors="replace").splitlines() or ["no message"]
+        raise OSError(f"the C compiler failed ({first[0]})")
+    path = to / f"{_digest((here / 'step.so').read_bytes())}.so"
+    to.mkdir(mode=0o700, exist_ok=True)
+    os.replace(here / "step.so", path)
+    return path
 
 
 def load(path: Path) -> tuple[Any, Any] | None:

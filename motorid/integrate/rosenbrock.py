@@ -55,11 +55,6 @@ class Rosenbrock:
         """See `Engine.run`; on request with the error estimate of each state."""
         return stepper(system).run(grid, x0, p, dx0, dp, local_error, self.compiled)
 
-    def ahead(self, system: System, steps: int) -> None:
-        """Tell that so many steps with derivatives will soon be asked for."""
-        if self.compiled is None:
-            stepper(system).ahead(steps)
-
     def prepare(self, system: System, grid: Grid, x0: Array, p: Array,
                 tolerance: float | Callable[[Trajectory], float]) -> Grid:
         """See `Engine.prepare`. Errors are relative to the largest size of each state on the record.
@@ -132,7 +127,6 @@ class Stepper:
         x0, p = np.ascontiguousarray(x0, float), np.ascontiguousarray(p, float)
         if dp is not None and dx0 is not None:
             dx0, dp = np.ascontiguousarray(dx0, float), np.ascontiguousarray(dp, float)
-        cc.tend()
         library = self._load(compiled)
         if library is not None:
             traj, bad = self._run_compiled(library, grid, x0, p, dx0, dp, local_error)
@@ -193,12 +187,6 @@ class Stepper:
                 self._library = cc.load(path)
                 self._refused = self._library is None
         return self._library
-
-    def ahead(self, steps: int) -> None:
-        """Have the step compiled beside the work at hand, if so many steps with derivatives are worth it."""
-        worth_it = self.functions.full.n_instructions() * steps > PATIENCE
-        if worth_it and self._library is None and not self._refused and (mark := cc.mark_of(self.key)) is not None:
-            cc.begin(self.functions, mark)
 
     def _run_compiled(self, library: Any, grid: Grid, x0: Array, p: Array, dx0: Array | None,
                       dp: Array | None, local_error: bool) -> tuple[Trajectory, int]:

@@ -28,7 +28,6 @@ def cache(tmp_path, monkeypatch):
 
 
 def forget():
-    cc._ahead.clear()
     rb.stepper.cache_clear()
     rb._stepper_of_content.cache_clear()
 
@@ -174,57 +173,6 @@ def test_a_compiler_that_fails_is_told_once_and_not_asked_again(cache, builds, m
     )
     assert len(builds) == 1
     assert np.isfinite(first).all()
-
-
-def system_with(effect):
-    return (mi.dc_motor() + mi.effects.LIBRARY[effect]).system(("i", "omega"))
-
-
-@needs_compiler
-def test_what_will_be_needed_is_compiled_beside_the_work_at_hand(cache, builds):
-    engine, system = Rosenbrock(), system_with("coulomb")
-    engine.ahead(system, 10**6)
-    assert cc._ahead.running is not None
-    cc._ahead.running.process.wait()
-    assert not list(cache.glob("step-*/*.so"))
-    cc.tend()
-    assert len(list(cache.glob("step-*/*.so"))) == 1
-    assert rb.stepper(system)._load(None) is not None
-    assert not builds
-    assert cc._ahead.running is None
-    assert list(cache.glob("tmp*")) == []
-
-
-@needs_compiler
-def test_who_needs_it_before_waits_for_it_and_the_next_is_not_begun_twice(cache, builds):
-    engine, systems = Rosenbrock(), [system_with(n) for n in ("coulomb", "constant_load", "stribeck")]
-    for system in systems:
-        engine.ahead(system, 10**6)
-    for system in reversed(systems):  # the last of them first
-        assert rb.stepper(system)._load(True) is not None
-    assert len(list(cache.glob("step-*/*.so"))) == 3
-    assert cc._ahead.running is None
-    assert not cc._ahead.waiting
-
-
-@needs_compiler
-def test_little_work_is_not_compiled_ahead(cache):
-    Rosenbrock().ahead(system_with("coulomb"), 1000)
-    Rosenbrock(compiled=False).ahead(system_with("coulomb"), 10**6)
-    assert cc._ahead.running is None
-    assert not cc._ahead.waiting
-
-
-@needs_compiler
-def test_a_process_that_ends_leaves_nothing_of_what_it_had_begun(tmp_path):
-    code = ("import motorid as mi; from motorid.integrate import Rosenbrock\n"
-            "for e in ('lugre', 'compliance'):\n"
-            "    Rosenbrock().ahead((mi.dc_motor() + mi.effects.LIBRARY[e]).system(('i', 'omega')), 10**6)\n")
-    folder = tmp_path / "cache"
-    done = subprocess.run([sys.executable, "-c", code], env={**os.environ, "MOTORID_CACHE": str(folder)},
-                          capture_output=True, text=True, check=True)
-    assert done.stderr == ""
-    assert list(folder.iterdir()) == []
 
 
 @pytest.mark.parametrize(("line", "own"), [
