@@ -566,13 +566,13 @@ def test_what_the_first_steps_leave_far_behind_is_not_raced_on(monkeypatch):
         gone_on.append([end.cost for end in ends])
         return ended(0.5 * ends[0].cost, whole=True)
 
-    gone_on, costs = [], {"a": (8.0, 9.0), "b": (50.0,), "c": (20.0, 30.0), "d": (10.0,), "e": (), "f": (8.9,)}
+    gone_on, costs = [], {"a": (8.0, 9.0), "b": (50.0,), "c": (21.0, 30.0), "d": (10.0,), "e": (), "f": (8.9,)}
     monkeypatch.setattr(trial, "_begun", lambda fit, model, starts: [ended(c) for c in costs[model]])
     monkeypatch.setattr(trial, "_run_on", further)
     tasks = [SimpleNamespace(fit=None, model=name, starts=({},)) for name in costs]
     races = trial._tournament(tasks, range(6), False, [], map)
-    assert gone_on == [[8.0, 9.0], [8.9]]  # 4 is reached, and 2.25 times that is 9
-    assert {k: race.drop(100.0) for k, race in races.items()} == {0: 0.96, 1: None, 2: None, 3: None, 5: 0.9555}
+    assert gone_on == [[8.0, 9.0], [8.9], [10.0]]  # 4 is reached, and 5.06 times that is 20.3
+    assert {k: race.drop(100.0) for k, race in races.items()} == {0: 0.96, 1: None, 2: None, 3: 0.95, 5: 0.9555}
     assert trial._tournament(tasks[3:4], [0], False, [1.0], map)[0].whole  # two go on wherever others are
 
 
