@@ -30,7 +30,8 @@ from motorid.problem.problem import Problem
 from motorid.problem.runs import combined, natural_sizes, shapes_of, with_inputs
 from motorid.problem.simulate import misfit_over_noise
 
-BEGIN, RACE = (LevenbergMarquardt(max_iterations=n, ftol=1e-3, xtol=1e-4, looks=0) for n in (1, 6))
+BEGIN, RACE = (LevenbergMarquardt(max_iterations=n, ftol=1e-3, xtol=1e-4, looks=0) for n in (2, 6))
+HALVING = 2  # of the starts go on after the first steps (successive halving: Karnin, Koren & Somekh, ICML 2013)
 POLISH = LevenbergMarquardt(max_iterations=60, ftol=1e-5, xtol=1e-5, looks=0)
 GOING_ON = 4  # times, where the last descent ends at its limit
 LOST = 0.2  # NRMSE of a channel
@@ -44,39 +45,20 @@ SHAKES = 20  # places at which it is drawn
 
 @dataclass(frozen=True, eq=False)
 class Raced:
-    """Where a few steps from one start of a model led: the cost reached, and what an undamped step promises there.
-    `whole` tells a race from its first steps."""
+    """The best of several starts of one model after a few steps: the cost it has reached, and the one that an undamped
+    step from there promises."""
 
     problem: Problem
     cost: float
     reach: float
     angular: bool
-    whole: bool = True
-
-    @staticmethod
-    def of(done: Estimate, angular: bool, whole: bool) -> Raced:
-        """Return where an estimate ended."""
-        reach = _undamped(done.solution.residual, done.solution.jac)
-        return Raced(done.onward, float(done.cost), reach, angular, whole)
-
-    def drop(self, cost: float) -> float | None:
-        """Share of `cost` that is gone; None after the first steps, which tell little of it."""
-        return 1 - self.cost / max(cost, 1e-300) if self.whole else None
 
 
 def raced(fit: Fit, model: Model, starts: Sequence[Mapping[str, float]]) -> Raced | None:
-    """Go a few steps from the best starts with `model` on the records of `fit`; None if none can be simulated."""
-    ends = _begun(fit, model, starts)
-    return _run_on(ends) if ends else None
-
-
-def _begun(fit: Fit, model: Model, starts: Sequence[Mapping[str, float]]) -> list[Raced]:
-    """Return the starts that are ahead after the first steps, the best first; none if none can be simulated.
+    """Go a few steps from each start with `model` on the records of `fit`; None if none can be simulated.
 
     Where no start can be (a friction that sticks at every turn), the values of `fit` are one: the smaller model could.
     Effects of the angle start along the measured angle, which the model's own angle, still wrong, would lead astray.
-    Two go on (successive halving: Karnin, Koren & Somekh, ICML 2013): of 234 races of more starts one in 13 ended more
-    than 2 % lower where all went on, one in 60 more than 20 %.
     """
     model = _bounded(fit, model)
     alive, angular, starts = restored(fit, model), _brings_in_the_angle(fit, model), starts or ({},)
@@ -85,23 +67,24 @@ def _begun(fit: Fit, model: Model, starts: Sequence[Mapping[str, float]]) -> lis
     # A guess of the larger model's own, along the records, is no longer led astray.
     entries = [(start, angular) for start in starts] + [
         (start, along) for start in _own_starts(fit, model, starts) for along in sorted({angular, False})]
-    each = ((_first_steps(fit, models, start, along), along) for start, along in entries)
-    ends = sorted((Raced.of(done, along, False) for done, along in each if done is not None), key=lambda end: end.cost)
-    return ends[:BEAM] or (_begun(fit, model, ()) if any(starts) else [])
+    first = BEGIN if len(entries) > BEAM else RACE
+    each = ((_begun(fit, models, start, along, first), along) for start, along in entries)
+    begun = [(done, along) for done, along in each if done is not None]
+    if not begun and any(starts):
+        return raced(fit, model, ())
+    begun.sort(key=lambda entry: entry[0].cost)
+    ahead = begun[: max(-(-len(begun) // HALVING), BEAM)]
+    found = begun if first is RACE else [(_race(done.onward, RACE) or done, along) for done, along in ahead]
+    best, along = min(found, key=lambda entry: entry[0].cost, default=(None, False))
+    return best and Raced(best.onward, float(best.cost), _undamped(best.solution.residual, best.solution.jac), along)
 
 
-def _run_on(ends: Sequence[Raced]) -> Raced:
-    """Return the best after a few steps more from each of `ends`."""
-    further = [replace(end, whole=True) if (done := _race(end.problem, RACE)) is None else
-               Raced.of(done, end.angular, True) for end in ends]
-    return min(further, key=lambda end: end.cost)
-
-
-def _first_steps(fit: Fit, models: Iterable[Model], start: Mapping[str, float], along: bool) -> Estimate | None:
+def _begun(fit: Fit, models: Iterable[Model], start: Mapping[str, float], along: bool,
+           effort: LevenbergMarquardt) -> Estimate | None:
     """Go the first steps from a start with the first model that can take it; None if none can."""
     for model in models:
         with contextlib.suppress(*FAILURES):
-            if (done := _race(_started(fit, model, start, along), BEGIN)) is not None:
+            if (done := _race(_started(fit, model, start, along), effort)) is not None:
                 return done
     return None
 
@@ -321,7 +304,7 @@ class Task:
 
 @dataclass(frozen=True)
 class GivenUp:
-    """A refit that was not finished: why, which share of the squared misfit it had taken away, if it was raced, and how
+    """A refit that was not finished: why, which share of the squared misfit it had taken away, if it was begun, and how
     to finish it, if that may be asked for."""
 
     why: str
@@ -347,19 +330,20 @@ def _refit_all(tasks: Sequence[Task], map_: Callable[..., Iterable[Any]],
     """Put the refit of each task into `found` as it comes: the one that promises most first, then by their races."""
     races: dict[int, Raced] = {}
     leader, alone = _leader(tasks), False
-    if leader is not None and (race := raced(tasks[leader].fit, tasks[leader].model, tasks[leader].starts)):
+    if leader is not None and (race := _race_tournament((tasks[leader], alone))) is not None:
         races[leader], found[leader] = race, _finish((tasks[leader], race))
         if (best := _quiet(found[leader])) is not None:
             alone = True
             found.update(_unpromising(tasks, leader) | _needless(tasks, leader, best, map_))
     entered = [k for k in range(len(tasks)) if k not in races and k not in found]
-    races |= _tournament(tasks, entered, alone, [race.cost for race in races.values()], map_)
+    done = map_(_race_tournament, [(tasks[k], alone) for k in entered])
+    races |= {k: race for k, race in zip(entered, done, strict=True) if race is not None}
     if races:
         first = min(races, key=lambda k: races[k].cost + tasks[k].price)
         if first not in found:
             found[first] = _finish((tasks[first], races[first]))
         if _quiet(found[first]) is not None:
-            found.update(_beaten(tasks, races, first) | found)
+            found.update(_beaten(tasks, {k: race.cost for k, race in races.items()}, first) | found)
         found.update(_outdone(tasks, races, found))
     rest = sorted((k for k in races if k not in found), key=lambda k: races[k].cost)
     for k, fit in zip(rest, map_(_finish, [(tasks[k], races[k]) for k in rest]), strict=True):
@@ -373,24 +357,6 @@ def completed(given_up: Sequence[GivenUp], map_: Callable[..., Iterable[Any]]) -
     return [next(done) if g.begun is not None else g for g in given_up]
 
 
-def _tournament(tasks: Sequence[Task], entered: Sequence[int], alone: bool, costs: Sequence[float],
-                map_: Callable[..., Iterable[Any]]) -> dict[int, Raced]:
-    """Race the tasks `entered` beside those that reached `costs`, the two that promise most first.
-
-    What an undamped step from the first ones leaves four times as far behind, in nats, as at the end of a race ends
-    there: of 21 that were not given up then one was left so far, and others of its kind took its place.
-    """
-    begun = zip(entered, map_(_begin, [(tasks[k], alone) for k in entered]), strict=True)
-    ends = {k: found for k, found in begun if found}
-    reach = {k: min(end.reach for end in found) for k, found in ends.items()}
-    order, races = sorted(ends, key=reach.__getitem__), {k: found[0] for k, found in ends.items()}
-    for some in (order[:BEAM], order[BEAM:]):
-        far = OUTDONE**4 * min((*costs, *(race.cost for race in races.values())), default=np.inf)
-        going = [k for k in some if reach[k] <= far or k in order[:BEAM]]
-        races |= zip(going, map_(_go_on, [(tasks[k], ends[k]) for k in going]), strict=True)
-    return races
-
-
 def _outdone(tasks: Sequence[Task], races: Mapping[int, Raced], found: Mapping[int, Any]) -> dict[int, GivenUp]:
     """Return the races that an undamped step from their end still leaves far behind, or with nothing gained. Gained is
     what the model without the effect would not reach by such a step itself: a stalled fit promises much."""
@@ -399,7 +365,7 @@ def _outdone(tasks: Sequence[Task], races: Mapping[int, Raced], found: Mapping[i
     for k, race in races.items():
         nothing = race.reach > (1 - LITTLE) * own and race.cost > (1 - LITTLE) * fit.cost
         if k not in found and (nothing or (race.reach > OUTDONE * costs[0] and race.cost not in costs[:BEAM])):
-            given_up[k] = GivenUp(NOTHING if nothing else LESS, race.drop(fit.cost), (tasks[k], race))
+            given_up[k] = GivenUp(NOTHING if nothing else LESS, 1 - race.cost / max(fit.cost, 1e-300), (tasks[k], race))
     return given_up
 
 
@@ -434,27 +400,24 @@ def _needless(tasks: Sequence[Task], leader: int, best: Fit, map_: Callable[...,
     return {k: GivenUp(why) for k, price in prices.items() if gains[k] < price}
 
 
-def _beaten(tasks: Sequence[Task], races: Mapping[int, Raced], first: int) -> dict[int, GivenUp]:
+def _beaten(tasks: Sequence[Task], costs: Mapping[int, float], first: int) -> dict[int, GivenUp]:
     """Return which tasks need not be finished beside the one that explains all but noise, and why."""
-    winner, least, given_up = tasks[first], races[first].cost, {}
-    for k, race in races.items():
-        included = winner.effect.name in tasks[k].effect.includes
-        if k != first and race.cost > BEHIND * least:
-            given_up[k] = GivenUp(FAR_BEHIND.format(winner.effect.name), race.drop(winner.fit.cost))
-        elif k != first and included and race.cost > least - (tasks[k].price - winner.price):
-            why = f"no better than {winner.effect.name}, its simpler special case"
-            given_up[k] = GivenUp(why, race.drop(winner.fit.cost))
+    winner, given_up = tasks[first], {}
+    for k, cost in costs.items():
+        if k == first:
+            continue
+        drop = 1 - cost / max(winner.fit.cost, 1e-300)
+        if cost > BEHIND * costs[first]:
+            given_up[k] = GivenUp(FAR_BEHIND.format(winner.effect.name), drop)
+        elif winner.effect.name in tasks[k].effect.includes and cost > costs[first] - (tasks[k].price - winner.price):
+            given_up[k] = GivenUp(f"no better than {winner.effect.name}, its simpler special case", drop)
     return given_up
 
 
-def _begin(entry: tuple[Task, bool]) -> list[Raced]:
-    """Begin a task; its best start alone, where only what comes near a winner matters."""
+def _race_tournament(entry: tuple[Task, bool]) -> Raced | None:
+    """Race a task; its best start alone, where only what comes near a winner matters."""
     task, alone = entry
-    return _begun(task.fit, task.model, task.starts[:1] if alone else task.starts)
-
-
-def _go_on(begun: tuple[Task, Sequence[Raced]]) -> Raced:
-    return _run_on(begun[1])
+    return raced(task.fit, task.model, task.starts[:1] if alone else task.starts)
 
 
 def _finish(begun: tuple[Task, Raced]) -> Fit | None:

@@ -305,15 +305,15 @@ def test_beside_an_effect_that_leaves_noise_what_promises_little_is_not_even_beg
     fit = mi.fit(mi.dc_motor(), record(moves, "logger", ("i", "omega"), lab, rng, "run"))
     promises = {"coulomb_asymmetric": 0.97, "coulomb": 0.95, "speed_lag": 0.01, "brush_drop": 0.6}
     tasks = [trial.Task(fit, fit.model + LIBRARY[n], LIBRARY[n], ({},), p) for n, p in promises.items()]
-    entered, begun = [], trial._begun
+    begun, race = [], trial.raced
 
     def seen(fit, model, *starts):
-        entered.append(model.effect_names)
-        return begun(fit, model, *starts)
+        begun.append(model.effect_names)
+        return race(fit, model, *starts)
 
-    monkeypatch.setattr(trial, "_begun", seen)
+    monkeypatch.setattr(trial, "raced", seen)
     asymmetric, coulomb, lag, drop = trial.refits(tasks, map)
-    assert entered == [("coulomb",), ("brush_drop",)]
+    assert begun == [("coulomb",), ("brush_drop",)]
     assert isinstance(coulomb, mi.Fit)
     assert asymmetric.why == "no better than coulomb, its simpler special case"
     assert lag.why == drop.why == trial.FAR_BEHIND.format("coulomb")
@@ -551,47 +551,10 @@ def test_the_second_best_race_is_finished_however_far_it_is_behind(monkeypatch):
     fit = SimpleNamespace(cost=100.0, residuals=None, jacobian=1.0, q=None, problem=problem)
     monkeypatch.setattr(trial, "_undamped", lambda r, jac: fit.cost)  # it is at its optimum
     tasks = [SimpleNamespace(fit=fit) for _ in costs]
-    races = {k: trial.Raced(problem, c, c, False) for k, c in enumerate(costs)}
+    races = {k: SimpleNamespace(cost=c, reach=c) for k, c in enumerate(costs)}
     given_up = trial._outdone(tasks, races, {0: None})
     assert {k: g.why for k, g in given_up.items()} == {2: trial.LESS, 3: trial.NOTHING}
     assert set(trial._outdone(tasks[:1] + tasks[3:], {0: races[0], 1: races[3]}, {})) == {1}
-
-
-def test_what_the_first_steps_leave_far_behind_is_not_raced_on(monkeypatch):
-    """Nor is any but the two best starts of one model; what was not raced has no drop that a table might show."""
-    def ended(cost, whole=False):
-        return trial.Raced(None, cost, cost, False, whole)
-
-    def further(ends):
-        gone_on.append([end.cost for end in ends])
-        return ended(0.5 * ends[0].cost, whole=True)
-
-    gone_on, costs = [], {"a": (8.0, 9.0), "b": (50.0,), "c": (21.0, 30.0), "d": (10.0,), "e": (), "f": (8.9,)}
-    monkeypatch.setattr(trial, "_begun", lambda fit, model, starts: [ended(c) for c in costs[model]])
-    monkeypatch.setattr(trial, "_run_on", further)
-    tasks = [SimpleNamespace(fit=None, model=name, starts=({},)) for name in costs]
-    races = trial._tournament(tasks, range(6), False, [], map)
-    assert gone_on == [[8.0, 9.0], [8.9], [10.0]]  # 4 is reached, and 5.06 times that is 20.3
-    assert {k: race.drop(100.0) for k, race in races.items()} == {0: 0.96, 1: None, 2: None, 3: 0.95, 5: 0.9555}
-    assert trial._tournament(tasks[3:4], [0], False, [1.0], map)[0].whole  # two go on wherever others are
-
-
-def test_of_many_starts_the_two_best_are_raced(lab, monkeypatch):
-    rng = np.random.default_rng(8)
-    moves = driven(lab, {"coulomb": {"tau_c": 8e-3}}, "stairs", 800, 1e-3, rng)
-    fit = mi.fit(mi.dc_motor(), record(moves, "logger", ("i", "omega"), lab, rng, "run"))
-    seen, race = [], trial._race
-
-    def raced(problem, effort):
-        done = race(problem, effort)
-        seen.append((effort is trial.RACE, done.cost))
-        return done
-
-    monkeypatch.setattr(trial, "_race", raced)
-    best = trial.raced(fit, fit.model + mi.effects.coulomb, [{"tau_c": c} for c in (0.08, 0.03, 0.006, 3e-4)])
-    assert [further for further, _ in seen] == [False] * 4 + [True] * 2
-    first, onward = (sorted(cost for further, cost in seen if further is which) for which in (False, True))
-    assert best.cost == onward[0] < first[0]
 
 
 def test_what_was_found_on_whole_records_is_kept_where_it_explains_windows_of_them_better(monkeypatch):
