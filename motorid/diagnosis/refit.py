@@ -61,7 +61,8 @@ def raced(fit: Fit, model: Model, starts: Sequence[Mapping[str, float]]) -> Race
     Effects of the angle start along the measured angle, which the model's own angle, still wrong, would lead astray.
     """
     model = _bounded(fit, model)
-    alive, angular, starts = restored(fit, model), _brings_in_the_angle(fit, model), starts or ({},)
+    alive, starts = restored(fit, model), starts or ({},)
+    angular = any(map(uses_angle, model.effects)) and not any(map(uses_angle, fit.model.effects))
     # As it is where a parameter put back (an inductance that no sample shows) makes the model too stiff.
     models = (alive,) if alive is model else (alive, model)
     # A guess of the larger model's own, along the records, is no longer led astray.
@@ -87,11 +88,6 @@ def _begun(fit: Fit, models: Iterable[Model], start: Mapping[str, float], along:
             if (done := _race(_started(fit, model, start, along), effort)) is not None:
                 return done
     return None
-
-
-def _brings_in_the_angle(fit: Fit, model: Model) -> bool:
-    """Tell whether the model is the first with effects of the angle."""
-    return any(uses_angle(e) for e in model.effects) and not any(uses_angle(e) for e in fit.model.effects)
 
 
 def promised(fit: Fit, model: Model, starts: Sequence[Mapping[str, float]]) -> float:

@@ -18,7 +18,7 @@ from motorid.channels import CHANNELS
 from motorid.errors import UsageError
 from motorid.estimation.result import Fit
 from motorid.exporters.json_file import fit_dict
-from motorid.integrate.rodas3 import step_functions
+from motorid.integrate.rodas3 import StepFunctions
 from motorid.model.equations import System
 from motorid.model.model import Model
 from motorid.numerics.signals import Array
@@ -99,7 +99,7 @@ def functions_of(found: Fit | Model) -> list[ca.Function]:
 
 def plain_functions(system: System, prefix: str = "") -> list[ca.Function]:
     """Return ``rhs``, ``outputs``, ``initial`` and ``step``, see `functions_of`, with dense results."""
-    sparse = {"rhs": system.rhs, "outputs": system.out, "initial": system.initial, "step": step_functions(system).light}
+    sparse = {"rhs": system.rhs, "outputs": system.out, "initial": system.initial, "step": StepFunctions(system).light}
     found = []
     for name, f in sparse.items():
         args = f.sx_in()

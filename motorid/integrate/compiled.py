@@ -92,11 +92,11 @@ def say_once(text: str) -> None:
 def generate(functions: StepFunctions) -> str:
     """Return the C source of the step functions and the driver."""
     code = ca.CodeGenerator("motorid_code", {"casadi_int": "long long", "with_header": False})
-    for f in functions:
-        code.add(f)
-    f = functions.full
+    every = _, f, _ = functions.light, functions.full, functions.out
+    for function in every:
+        code.add(function)
     sizes = {"NX": f.size1_in(0), "NU": f.size1_in(1), "NP": f.size1_in(4), "NY": functions.out.size1_out(0)}
-    sizes |= {f"N_{n.upper()}": max(getattr(f, f"sz_{n}")() for f in functions) for n in ("arg", "res", "iw", "w")}
+    sizes |= {f"N_{n.upper()}": max(getattr(e, f"sz_{n}")() for e in every) for n in ("arg", "res", "iw", "w")}
     return code.dump() + "".join(f"#define {k} {max(v, 1)}\n" for k, v in sizes.items()) + DRIVER
 
 

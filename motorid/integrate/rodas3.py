@@ -7,7 +7,8 @@ order 2, stiffly accurate, so that it also carries algebraic balances (a motor w
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from dataclasses import dataclass
+from functools import cached_property
 
 import casadi as ca
 
@@ -22,37 +23,47 @@ WEIGHTS = (2.0, 0.0, 1.0, 1.0)
 ORDER = 3  # the error at the end of an interval falls with the third power of its sub-steps
 
 
-class StepFunctions(NamedTuple):
-    """The discrete model.
+@dataclass(frozen=True, eq=False)
+class StepFunctions:
+    """The discrete model of a system. Each function is made when first needed: a step compiled before needs none."""
 
-    light : ``(x, u0, u1, h, p) -> (x⁺, e)``, the input going from u0 to u1 over h, e the local error.
-    full : ``(x, u0, u1, h, p) -> (x⁺, A, B)`` with A = dx⁺/dx and B = dx⁺/dp.
-    out : ``(x, u, p) -> (y, C, D)`` with C = dy/dx and D = dy/dp.
-    """
+    system: System
 
-    light: ca.Function
-    full: ca.Function
-    out: ca.Function
+    @cached_property
+    def light(self) -> ca.Function:
+        """``(x, u0, u1, h, p) -> (x⁺, e)``, the input going from u0 to u1 over h, e the local error."""
+        x_next, error = self._step
+        return _dense("motorid_light", self._args, {"x_next": x_next, "error": error})
+
+    @cached_property
+    def full(self) -> ca.Function:
+        """``(x, u0, u1, h, p) -> (x⁺, A, B)`` with A = dx⁺/dx and B = dx⁺/dp, exact for the discrete step itself."""
+        x_next, nx = self._step[0], self._step[0].numel()
+        # In adjoint form: one sweep per state costs less than one per state and parameter.
+        slopes = ca.jtimes(x_next, ca.vertcat(self._args["x"], self._args["p"]), ca.DM.eye(nx), True).T
+        return _dense("motorid_full", self._args, {"x_next": x_next, "A": slopes[:, :nx], "B": slopes[:, nx:]})
+
+    @cached_property
+    def out(self) -> ca.Function:
+        """``(x, u, p) -> (y, C, D)`` with C = dy/dx and D = dy/dp."""
+        x, u, p = (self._args[n] for n in ("x", "u0", "p"))
+        y = self.system.out(x, u, p)
+        slopes = {"C": ca.jacobian(y, x), "D": ca.jacobian(y, p)}
+        return _dense("motorid_out", {"x": x, "u": u, "p": p}, {"y": y, **slopes})
+
+    @cached_property
+    def _args(self) -> dict[str, ca.SX]:
+        nx, nu, np_, _ = self.system.sizes
+        return {n: ca.SX.sym(n, size) for n, size in (("x", nx), ("u0", nu), ("u1", nu), ("h", 1), ("p", np_))}
+
+    @cached_property
+    def _step(self) -> tuple[ca.SX, ca.SX]:
+        return rosenbrock_step(self.system, *self._args.values())
 
 
-def step_functions(system: System) -> StepFunctions:
-    """Return the step of `system` with exact derivatives of the discrete step itself."""
-    nx, nu, np_, _ = system.sizes
-    x, u0, u1 = ca.SX.sym("x", nx), ca.SX.sym("u0", nu), ca.SX.sym("u1", nu)
-    h, p = ca.SX.sym("h"), ca.SX.sym("p", np_)
-    x_next, error = rosenbrock_step(system, x, u0, u1, h, p)
-    args, names = [x, u0, u1, h, p], ["x", "u0", "u1", "h", "p"]
-    light = _dense("motorid_light", args, [x_next, error], names, ["x_next", "error"])
-    # In adjoint form: one sweep per state costs less than one per state and parameter.
-    slopes = ca.jtimes(x_next, ca.vertcat(x, p), ca.DM.eye(nx), True).T
-    full = _dense("motorid_full", args, [x_next, slopes[:, :nx], slopes[:, nx:]], names, ["x_next", "A", "B"])
-    y = system.out(x, u0, p)
-    out = _dense("motorid_out", [x, u0, p], [y, ca.jacobian(y, x), ca.jacobian(y, p)], ["x", "u", "p"], ["y", "C", "D"])
-    return StepFunctions(light, full, out)
-
-
-def _dense(name: str, args: list[ca.SX], results: list[ca.SX], names: list[str], shown: list[str]) -> ca.Function:
-    return ca.Function(name, args, ca.cse([ca.densify(r) for r in results]), names, shown)
+def _dense(name: str, args: dict[str, ca.SX], results: dict[str, ca.SX]) -> ca.Function:
+    made = ca.cse([ca.densify(r) for r in results.values()])
+    return ca.Function(name, [*args.values()], made, [*args], [*results])
 
 
 def rosenbrock_step(system: System, x, u0, u1, h, p):

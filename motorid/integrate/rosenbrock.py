@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from motorid.errors import SimulationError, at_least
 from motorid.integrate import compiled as cc
 from motorid.integrate.engine import Grid, Trajectory, address
-from motorid.integrate.rodas3 import ORDER, StepFunctions, step_functions
+from motorid.integrate.rodas3 import ORDER, StepFunctions
 from motorid.model.equations import System
 from motorid.numerics.signals import Array
 
@@ -113,13 +113,11 @@ class Stepper:
 
     def __init__(self, system: System, key: str) -> None:
         self.system, self.key = system, key
-        self.functions: StepFunctions = step_functions(system)
+        self.functions = StepFunctions(system)
         self.machine = Machine(self.functions)
         self.nx, _, _, self.ny = system.sizes
         self._library: Any = None
-        self._refused = False
-        self._spent = 0
-        self._next_look = 0
+        self._refused, self._spent, self._next_look = False, 0, 0
 
     def run(self, grid: Grid, x0: Array, p: Array, dx0: Array | None, dp: Array | None, local_error: bool,
             compiled: bool | None) -> Trajectory:
@@ -134,7 +132,8 @@ class Stepper:
             traj = self.machine.run(grid, x0, p, dx0, dp, local_error)
             finite = np.isfinite(traj.x).all(axis=1)
             bad = -1 if finite.all() else int(np.argmin(finite))
-            self._spent += self.functions[dp is not None].n_instructions() * int(grid.substeps.sum())
+            step = self.functions.light if dp is None else self.functions.full
+            self._spent += step.n_instructions() * int(grid.substeps.sum())
         if bad >= 0:
             raise SimulationError(f"the simulation left the finite numbers at t = {grid.t[bad]:.6g} s; the "
                                   "parameters make the model unstable or stiff beyond the step.")
@@ -154,19 +153,11 @@ class Stepper:
 
     def shown_sizes(self, grid: Grid, traj: Trajectory, p: Array) -> Array:
         """Size (nx,) that the largest output lends the states it shows: a small part need not be exact."""
-        slopes = self._constant_slopes
-        if slopes is None:
-            middle = len(traj.x) // 2
-            slopes = np.abs(np.asarray(self.functions.out(traj.x[middle], grid.u[middle], p)[1]))
+        middle = len(traj.x) // 2
+        slopes = np.abs(np.asarray(self.functions.out(traj.x[middle], grid.u[middle], p)[1]))
         tops = np.abs(np.ascontiguousarray(traj.y.T)).max(axis=1)  # long rows are quicker
         with np.errstate(over="ignore"):  # a model that runs away
             return np.where(slopes > 1e-6, tops[:, None] / np.maximum(slopes, 1e-6), 0.0).max(axis=0)
-
-    @cached_property
-    def _constant_slopes(self) -> Array | None:
-        """|dy/dx|, if it is the same everywhere."""
-        slopes = self.functions.out(*self.functions.out.sx_in())[1]
-        return None if ca.symvar(slopes) else np.abs(np.asarray(ca.DM(ca.evalf(slopes))))
 
     def _load(self, compiled: bool | None) -> Any:
         """Return the compiled driver if it is there, or worth making now; else None."""
@@ -219,7 +210,7 @@ class Machine:
 
     def __init__(self, functions: StepFunctions) -> None:
         self.functions = functions
-        self.nx, self.np, self.ny = functions.full.size1_in(0), functions.full.size1_in(4), functions.out.size1_out(0)
+        self.nx, _, self.np, self.ny = functions.system.sizes
         self.walk_of = lru_cache(maxsize=32)(self._walk)
         self.observation_of = lru_cache(maxsize=2)(self._observation)
 
