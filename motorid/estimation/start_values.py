@@ -106,9 +106,7 @@ def _shaped(problem: Problem, effect: Effect, asked: Model) -> Problem:
     """Return the problem started at the best of the shapes of `effect`. Phases and resonances have side valleys; least
     squares finds knees, lags and heat capacities by itself."""
     shapes = _shapes(problem, effect, asked)
-    if len(shapes) < 2:
-        return problem
-    return _led(problem, race([problem.start_at(s) for s in shapes], LOOK))
+    return problem if len(shapes) < 2 else _led(problem, race([problem.start_at(s) for s in shapes], LOOK))
 
 
 def _led(problem: Problem, best: Estimate | None) -> Problem:

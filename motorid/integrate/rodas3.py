@@ -48,8 +48,7 @@ class StepFunctions:
         """``(x, u, p) -> (y, C, D)`` with C = dy/dx and D = dy/dp."""
         x, u, p = (self._args[n] for n in ("x", "u0", "p"))
         y = self.system.out(x, u, p)
-        slopes = {"C": ca.jacobian(y, x), "D": ca.jacobian(y, p)}
-        return _dense("motorid_out", {"x": x, "u": u, "p": p}, {"y": y, **slopes})
+        return _dense("motorid_out", {"x": x, "u": u, "p": p}, {"y": y, "C": ca.jacobian(y, x), "D": ca.jacobian(y, p)})
 
     @cached_property
     def _args(self) -> dict[str, ca.SX]:

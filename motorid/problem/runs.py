@@ -372,9 +372,7 @@ def _sizes_of(run: Experiment) -> _Sizes:
 def smoothing(runs: Sequence[Experiment], parameters: Mapping[str, Any], noise: float = 1.0) -> float | None:
     """Return the width of sgn that suits the data, `noise` times as noisy as they seem; None if given or unused."""
     p = parameters.get("sgn_width")
-    if p is None or p.given:
-        return None
-    return _suited_width(tuple(runs), noise)
+    return None if p is None or p.given else _suited_width(tuple(runs), noise)
 
 
 @lru_cache(maxsize=64)
