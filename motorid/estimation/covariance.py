@@ -57,9 +57,7 @@ class Certainty:
 
     def std_of(self, slope: Array) -> float | None:
         """Return one standard deviation of a quantity with gradient `slope` (k,); None where it is not determined."""
-        if _shifts(self.blind, self.unit * slope):
-            return None
-        return float(np.sqrt(slope @ self._linear @ slope))
+        return None if _shifts(self.blind, self.unit * slope) else float(np.sqrt(slope @ self._linear @ slope))
 
     @cached_property
     def _linear(self) -> Array:

@@ -63,9 +63,10 @@ class Rosenbrock:
         (Hairer, Nørsett & Wanner, Solving Ordinary Differential Equations I, 1993, II.4): a current that settles
         before the next sample needs no steps of its own.
         Where the run fails, so does every later one on this grid: coarse steps would jump over what happens.
-        A step that goes astray spoils all after it, which is then neither refined for nor a measure of size.
+        A step that goes astray spoils all after it, which is then neither refined for nor a measure of size. It has not
+        where half the steps end alike, or no more are to be had.
         """
-        passes = MOST_PASSES
+        passes, right = float(MOST_PASSES), 0
         while passes > 0:
             try:
                 traj = self.run(system, grid, x0, p, local_error=True)
@@ -75,7 +76,7 @@ class Rosenbrock:
             assert traj.error is not None
             size, error = np.abs(np.ascontiguousarray(traj.x.T)), np.ascontiguousarray(traj.error.T)
             np.maximum.accumulate(size, axis=1, out=size)  # so far; NumPy reduces long rows faster
-            astray = _first_inaccurate(size, error)
+            astray = _first_inaccurate(size, error, right)
             if astray is not None:
                 traj = traj._replace(x=traj.x[:astray + 2], y=traj.y[:astray + 2])
                 size, error[:, astray + 1:] = size[:, :astray + 2], 0.0
@@ -84,22 +85,26 @@ class Rosenbrock:
             rows = np.flatnonzero(relative > level)
             if len(rows):
                 relative[rows] = (stepper(system).halved(grid, rows, traj.x, p, self.compiled) / sizes).max(axis=0)
-            if not np.max(relative, initial=0.0) > 2 * level:  # or not a number
-                break
             passes -= 1 if astray is None else 1 / 16
-            factor = np.ceil(1.1 * (np.maximum(relative, 1e-300) / level) ** (1 / ORDER))
-            finer = np.clip(grid.substeps * np.clip(factor, 1, 16), 1, MOST_SUBSTEPS).astype(np.int64)
+            finer = grid.substeps
+            if np.max(relative, initial=0.0) > 2 * level:  # not where it is no number
+                factor = np.ceil(1.1 * (np.maximum(relative, 1e-300) / level) ** (1 / ORDER))
+                finer = np.clip(finer * np.clip(factor, 1, 16), 1, MOST_SUBSTEPS).astype(np.int64)
             if np.array_equal(finer, grid.substeps):
-                break
+                if astray is None:
+                    break
+                right = astray + 1
+                continue
             if self.most_steps is not None and finer.sum() > self.most_steps:
                 raise SimulationError(f"the model is too stiff: it takes more than {self.most_steps} steps.")
             grid = grid.with_substeps(finer)
         return grid
 
 
-def _first_inaccurate(size: Array, error: Array) -> int | None:
-    """Return the first interval whose error is as large as the state, if the state leaves its size there."""
+def _first_inaccurate(size: Array, error: Array, begin: int) -> int | None:
+    """Return the first interval from `begin` on whose error is as large as the state, if that leaves its size there."""
     lost = (error > LOST_ERROR * np.maximum(size[:, 1:], 1e-12)).any(axis=0)
+    lost = lost & (np.arange(len(lost)) >= begin)
     if not lost.any():
         return None
     k = int(np.argmax(lost))

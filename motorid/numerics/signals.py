@@ -193,9 +193,7 @@ def _of_order(values: Array, times: Array | None, still: NDArray[np.bool_], orde
     if not still.any():
         return _typical(size)
     live, same = ~_at_rest(still, order)[whole], sliding_window_view(still, order)[whole]
-    if not live.any():
-        return 0.0
-    return _typical(size if step and same[live].mean() > _DITHERED else size[live])
+    return 0.0 if not live.any() else _typical(size if step and same[live].mean() > _DITHERED else size[live])
 
 
 def _weights(t: Array) -> Array:

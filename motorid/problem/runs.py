@@ -398,9 +398,7 @@ def _speed_gained(run: Experiment) -> float:
     if "theta" not in run.outputs:
         return 0.0
     speeds = window_slopes(run.t, run.outputs["theta"])
-    if len(speeds) < 3:
-        return 0.0
-    return float(np.percentile(np.abs(np.diff(speeds)), 95)) * len(speeds) / run.n
+    return 0.0 if len(speeds) < 3 else float(np.percentile(np.abs(np.diff(speeds)), 95)) * len(speeds) / run.n
 
 
 def _longest_standstill(run: Experiment, speed: float) -> float:

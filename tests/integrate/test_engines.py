@@ -298,6 +298,27 @@ def test_half_the_steps_change_the_same_with_and_without_a_compiler(rng):
     np.testing.assert_array_equal(*found)
 
 
+@mi.effect(balance="sensor")
+def play_of_a_tacho(m, w=mi.P(10.0, "rad/s", null=0.0)):
+    """It follows at once, when its play is taken up."""
+    z = m.state("follows")
+    m.rate(z, (ca.fmax(m.omega - w - z, 0) - ca.fmax(z - m.omega - w, 0)) / 1e-4)
+    m.measure("omega", z)
+
+
+@pytest.mark.parametrize("w", [10.64, 11.0, 12.92])
+def test_a_state_that_leaves_its_rest_all_at_once_has_not_gone_astray(w):
+    """Where a play is taken up as an interval ends, what shows there is far smaller than what follows."""
+    values = {"R": 1.2, "L": 2e-3, "K": 0.05, "b": 1e-5, "J": 1e-4, "w": w}
+    system = (mi.dc_motor() + play_of_a_tacho).system(("i", "omega"))
+    p = np.array([values[n] for n in system.parameters])
+    t = np.arange(0, 0.8, 1e-3)
+    v = np.where((t > 0.02) & (t < 0.4), 6.0, -3.0) * (t > 0.02)
+    grid = Rosenbrock().prepare(system, Grid.of(t, v[:, None], np.array([True])), np.zeros(3), p, 1e-4)
+    x, fine = (Rosenbrock().run(system, grid.with_substeps(k * grid.substeps), np.zeros(3), p).x for k in (1, 16))
+    assert np.max(np.abs(x - fine) / np.abs(fine).max(axis=0)) < 2e-3
+
+
 def without_inductance(t, v, p):
     """Exact omega and i of the motor with L = 0."""
     r, k, b, j = p
