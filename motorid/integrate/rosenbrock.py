@@ -103,11 +103,11 @@ class Rosenbrock:
 
 def _first_inaccurate(size: Array, error: Array, begin: int) -> int | None:
     """Return the first interval from `begin` on whose error is as large as the state, if that leaves its size there."""
-    lost = (error > LOST_ERROR * np.maximum(size[:, 1:], 1e-12)).any(axis=0)
-    lost = lost & (np.arange(len(lost)) >= begin)
-    if not lost.any():
+    lost = np.flatnonzero((error > LOST_ERROR * np.maximum(size[:, 1:], 1e-12)).any(axis=0))
+    lost = lost[lost >= begin]
+    if not len(lost):
         return None
-    k = int(np.argmax(lost))
+    k = int(lost[0])
     before, after = np.maximum(size[:, k], 1e-12), np.maximum(size[:, k + 1], 1e-12)
     jumped = (after > LOST_GROWTH * before) & (before > 1e-12)
     return k if np.any(jumped | (size[:, -1] > LOST_GROWTH * after)) else None
