@@ -115,7 +115,7 @@ _PUSHES = (  # words, balance, carrier, quantities
     ("a loss of voltage", "voltage", "", ("omega", "v", "i", "t", "run")),
     ("a gain of the voltage", "voltage", "v", ("t", "turn", "load", "past load", "past braking",
                                                    "past heat", *COMPUTED_INPUTS)),
-    ("a resistance", "voltage", "i", ("t", "turn", "omega", "run", "past heat")),
+    ("a resistance", "voltage", "i", ("t", "turn", "omega", "load", "run", "past heat")),
     ("a motor constant", "both", "", ("t", "turn", "omega", "i", "run", "past i", "past size", "most i")),
 )
 FORMS = (*(Form(words, balance, on, carrier) for words, balance, carrier, quantities in _PUSHES for on in quantities),
@@ -299,8 +299,10 @@ def _of_size(form: Form, span: Span, low: float, high: float) -> list[str]:
     if not low < 0 < high:
         return ["1.0", *smooth]
     smooth += [f"(ca.fmax({s} - {c}, 0) - ca.fmax(-{s} - {c}, 0))" for c in knees]  # the same either way
-    side = "m.sign(z)" if form.on == "omega" else f"ca.tanh(z / {SOFT * top:.6g})"
-    return [side, *smooth, f"{s} * {size}", "1.0", size, f"{size}**3", *(f"ca.tanh({size} / {bend})" for bend in bends)]
+    jumps = ["m.sign(z)" if form.on == "omega" else f"ca.tanh(z / {SOFT * top:.6g})"]
+    if form.on == "load" and form.carrier == "i":  # braking takes small powers: the jump is far narrower than that
+        jumps = [f"ca.tanh(ca.fmax({sign}{s}, 0) / {_place(SOFT, SOFT**2, 1)})" for sign in sides]
+    return [*jumps, *smooth, f"{s} * {size}", "1.0", size, f"{size}**3", *(f"ca.tanh({size} / {bend})" for bend in bends)]
 
 
 def waves_of(span: Span) -> list[float]:

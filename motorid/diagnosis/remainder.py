@@ -603,6 +603,8 @@ def _closed_forms(on: str, z: Array) -> list[tuple[str, Array]]:
     found = [("a constant", one[:, None]), ("proportional to it", z[:, None]), ("its sign alone", side[:, None]),
              ("its square, with its sign", (z * np.abs(z))[:, None]),
              ("its sign and proportional to it", np.column_stack([side, z]))]
+    if z.min(initial=0.0) < 0 < z.max(initial=0.0):
+        found += [(f"a constant {way} zero", (s * z > 0)[:, None]) for way, s in (("above", 1), ("below", -1))]
     if on == "omega":
         found += [(f"an eddy-current brake, strongest at {number(w, 2)} rad/s", (z / (1 + (z / w) ** 2))[:, None])
                   for w in np.geomspace(0.03 * top, top, 12)]

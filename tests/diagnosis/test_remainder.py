@@ -546,6 +546,12 @@ def pumped_up(m, k=mi.P(0.3, "1/W", null=0.0)):
     m.voltage += m.v * k * z
 
 
+@mi.effect(balance="voltage")
+def one_way(m, R_b=mi.P(2.0, "Ohm", null=0.0)):
+    """A supply that takes no power back: braking goes through a resistor."""
+    m.voltage -= R_b * m.i * (m.v * m.i < 0)
+
+
 @mi.effect(balance="torque")
 def holding(m, tau=mi.P(1.5e-2, "N·m", null=0.0)):
     """A brake that closes where the command is none."""
@@ -620,6 +626,18 @@ def test_what_changes_in_sensors_inertia_and_supply_is_found(law, channels, foll
     before, after = (mi.evaluate(f, runs[2]).nrmse for f in (found.best, fit))
     assert max(after[c] / floor[c] for c in after) < 1.1
     assert max(before[c] / after[c] for c in after) > 2.5
+
+
+def test_what_acts_while_power_is_fed_back_alone_is_one_constant(lab):
+    """Braking takes small powers: the jump is far narrower than a hundredth of the largest."""
+    runs, floor = _with_law(one_way, ANGLE[:2], lab)
+    found = mi.diagnose(mi.fit(mi.dc_motor(), runs[:2]), runs[2:], effects=("coulomb", "quadratic_drag"))
+    assert found.remainder.follows == "a resistance that changes with the power drawn"
+    fit = mi.fit(found.remainder.model + found.remainder.as_effect(), runs[:2])
+    after = mi.evaluate(fit, runs[2]).nrmse
+    assert max(after[c] / floor[c] for c in after) < 1.1
+    assert fit.values["remainder_0"] == pytest.approx(2.0, rel=0.01)
+    assert re.match("a constant below zero, at most 2 V/A", found.remainder.nearest()[0][0])
 
 
 @pytest.mark.parametrize(("law", "channels", "follows"), [
