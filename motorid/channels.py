@@ -1,7 +1,5 @@
 """The channels of a record: their names, what people call them, their SI units, their order."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from types import MappingProxyType
 

@@ -1,7 +1,5 @@
 """The record on disk: a CSV file that only ever grows by whole lines, and never over something else."""
 
-from __future__ import annotations
-
 import errno
 import math
 import os

@@ -1,7 +1,5 @@
 """From wrapped counters to a continuous record: where every sample belongs, and what is missing."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from typing import NamedTuple

@@ -9,8 +9,6 @@ effective samples, see what bins cannot. Where both are silent but the errors ex
 asks whether a free form predicts them on data that it was not fitted to: coloured noise cannot be predicted.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache

@@ -1,7 +1,5 @@
 """Why a refit must not be believed, whatever its error: signs, limits, phases, what the data leave open."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

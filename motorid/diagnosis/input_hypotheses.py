@@ -6,8 +6,6 @@ than the sample beside which it stands. Read wrongly, any of these leaves a misf
 seems to explain. A few spikes of a sensor hide everything else.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 

@@ -6,8 +6,6 @@ parametric law that is outdone by a nonparametric one is not the thing itself (H
 1993); a model that no form outdoes leaves nothing that can be predicted.
 """
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Callable, Container, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace

@@ -11,8 +11,6 @@ Student's t, with each model's own scale per channel from the other blocks: the 
 the sensor, sets what counts. Coloured errors repeat themselves; a channel counts by the effective share of its samples.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 

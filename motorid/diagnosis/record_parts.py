@@ -6,8 +6,6 @@ all voltages, early and late. Every part begins where the motor then is, so that
 lasts. What takes longer than a part to show (heating) is seen between the parts only.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 
 import numpy as np

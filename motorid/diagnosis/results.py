@@ -1,7 +1,5 @@
 """What a diagnosis found, as plain frozen results."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any

@@ -1,7 +1,5 @@
 """The answer in words: what is missing, how large, how sure, what the records do not distinguish, what moved."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Mapping, Sequence
 

@@ -1,7 +1,5 @@
 """Numbers for people: values with errors, per cent, durations. One place, so that every table agrees."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Sequence

@@ -6,8 +6,6 @@ differentiated. Each order is looked for where the motion is slow enough to show
 period per sample no alias and no delay of a sensor can pose as it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace

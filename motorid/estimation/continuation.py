@@ -5,8 +5,6 @@ this over, and its minimum leads to the right one (numerical continuation, Allgo
 five starts within a factor of three ended at 2.61-3.01 mm with the final width alone, and all at 2.551 mm in stages.
 """
 
-from __future__ import annotations
-
 from contextlib import suppress
 from dataclasses import replace
 

@@ -14,8 +14,6 @@ current, shipped and real, what it carries away shifts by 0.01 to 1 along it, an
 its 95 % interval does not reach zero; where zero is a value like others, the deviation is below half the natural size.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property

@@ -5,8 +5,6 @@ goes, and the run is repeated while they do not suit its end. Three efforts serv
 itself, which knows no problem, is `motorid.numerics.least_squares`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass

@@ -11,8 +11,6 @@ A parameter that a run has driven to nothing has collapsed: on a logarithmic sca
 minimum or not. Put back to where it would matter, it comes to its value, or goes away again.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import replace

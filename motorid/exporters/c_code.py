@@ -1,7 +1,5 @@
 """A fitted model as C: source, header and an example program, with no dependency but the C library."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping, Sequence
 from functools import lru_cache

@@ -1,7 +1,5 @@
 """A fitted model as plain CasADi functions, and what travels with it: values, uncertainty, data, versions."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import platform

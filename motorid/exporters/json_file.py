@@ -1,7 +1,5 @@
 """Results as plain data for JSON, written to a file; and remarks on a fit: what its numbers do not say."""
 
-from __future__ import annotations
-
 import json
 import sys
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """Engines: Rosenbrock (fast, compiled) and SUNDIALS' CVODES and IDAS (reference); `engine_of` gives one by name."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 from motorid.errors import among

@@ -4,8 +4,6 @@ The library holds CasADi's code of one step and a short driver that walks over a
 nothing is compiled again for another run length, number of sub-steps or set of free parameters.
 """
 
-from __future__ import annotations
-
 import ctypes
 import hashlib
 import os

@@ -5,8 +5,6 @@ solvers", Atmospheric Environment 31(20), 1997: four stages, three right-hand si
 order 2, stiffly accurate, so that it also carries algebraic balances (a motor without inductance).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 

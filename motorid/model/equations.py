@@ -1,7 +1,5 @@
 """The sheet on which the base motor and its effects write their physics."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property

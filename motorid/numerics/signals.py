@@ -1,7 +1,5 @@
 """Sampled signals: gaps, integrals, slopes; steps, outliers, noise. Time is the first axis, NaN a missing sample."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import ArrayLike, NDArray

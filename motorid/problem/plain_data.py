@@ -1,7 +1,5 @@
 """Models and problems as plain data for JSON, and back; only what the library holds is built, nothing is run."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, replace
 from typing import Any

@@ -4,8 +4,6 @@ Each relation is used in two ways. As a *penalty* it adds rows to the least-squa
 *true constraint* of `MultipleShooting` it keeps rows between limits (`parts`).
 """
 
-from __future__ import annotations
-
 import weakref
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence

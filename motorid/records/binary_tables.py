@@ -1,7 +1,5 @@
 """Tables of numbers from the bytes of MATLAB and Parquet files."""
 
-from __future__ import annotations
-
 import io
 import math
 import struct

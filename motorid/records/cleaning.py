@@ -1,7 +1,5 @@
 """From columns as they were logged to a valid run: order in time, gaps, missing cells; each loss is noted."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any, cast

@@ -1,7 +1,5 @@
 """Files in and out: what is read is a file of bounded size; what is written is whole, and over nothing else."""
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import json

@@ -1,7 +1,5 @@
 """Units and headers: what a unit means in SI, and which channel a column's name stands for (en, de, fr, es)."""
 
-from __future__ import annotations
-
 import math
 import re
 from dataclasses import dataclass

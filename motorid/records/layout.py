@@ -1,7 +1,5 @@
 """Which column is which channel, in which unit: as the user says, then as the header says; every guess is noted."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,5 @@
 """Preprocessing of signals: unwrap an angle, filter or delay the voltage, mark the spikes of a sensor as missing."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Steady parts of a record: where the input is held and no measured channel moves any more."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 

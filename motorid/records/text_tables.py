@@ -1,7 +1,5 @@
 """A table of numbers from the bytes of a text file: encoding, dialect, header, row of units, rows; pandas parses."""
 
-from __future__ import annotations
-
 import csv
 import io
 import re

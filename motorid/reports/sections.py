@@ -1,7 +1,5 @@
 """Sections of a report, each with its text, figures and tables."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any

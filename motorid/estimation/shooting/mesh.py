@@ -6,8 +6,6 @@ speak of the same discrete model. Unknowns are z = (q, nodes/scale); the first s
 Nodes begin at measured channels or on a simulation; their gaps are process noise.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass

@@ -5,8 +5,6 @@ nonlinear programming", Mathematical Programming 106, 2006. The functions are ha
 that the compiled step of the least-squares engine is used here too.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 

@@ -1,7 +1,5 @@
 """The solution of multiple shooting as a `Fit`: status in words, multipliers, gaps, constraints that cannot be kept."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
