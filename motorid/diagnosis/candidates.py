@@ -4,14 +4,13 @@ A child must predict data that it was not fitted to better, by more than chance 
 `predictive_score`. What else speaks against its effect is kept with it, and tells what it may be called.
 """
 
-from __future__ import annotations
-
 import contextlib
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import BrokenExecutor
 from dataclasses import replace
 from functools import reduce
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -309,10 +308,8 @@ class Search:
         A later effect may have taken over what made an earlier one special: then its simple relative will do. What
         is left is still preferred to the model `before`: small losses, each by chance, may add up.
         """
-        known = {e.name: e for e in self.effects if e.name not in node.fit.model.effect_names}
         for e in node.fit.problem.model.effects:
-            inside = [known[n] for n in e.includes if n in known]
-            simpler = [m for r in inside if (m := _in_place(node.fit.model, e, r)) is not None]
+            simpler = self._simpler(node.fit.model, e)
             alone = e.name == node.added and node.parent is not None and len(node.key - node.parent.key) == 1
             smaller = simpler if alone else [*simpler, *_without(node.fit.model, e.name)]
             for model in sorted(smaller, key=lambda m: len(m.free_names)):
@@ -320,6 +317,23 @@ class Search:
                 if other is not None and superfluous(node, other) and preferred(other, before):
                     return self.pruned(other, before)
         return node
+
+    def exchanged(self, node: Node, before: Node) -> Node:
+        """Return a smaller model that does the same as `node` with an effect that these records cannot tell from a
+        combination of its own; `node` itself for none. An offset of the voltage is one of the current and a load."""
+        alike = [e for e in self.effects if e.name in (self.inseparable(node) if self.scores(node) else ())]
+        for grown, e in product((node.fit.model + e for e in alike), node.fit.model.effects):
+            for model in (*self._simpler(grown, e), *_without(grown, e.name)):
+                other = self.smaller(node, model)
+                if other is not None and superfluous(node, other) and (
+                        (other := self.pruned(other, before)).size < node.size):
+                    return other
+        return node
+
+    def _simpler(self, model: Model, effect: Effect) -> list[Model]:
+        """Return the model with each simpler one of its kind in the place of an effect."""
+        inside = [e for e in self.effects if e.name in effect.includes and e.name not in model.effect_names]
+        return [m for e in inside if (m := _in_place(model, effect, e)) is not None]
 
     def settled(self, larger: Node) -> Node | None:
         """Return the model that `larger` was grown from, fitted anew from there, if that predicts better.

@@ -5,8 +5,6 @@ kinks at zero for what has a sign; for what remembers, first-order lags of many 
 fading memory (Laguerre and Kautz models: Wahlberg, IEEE Trans. Automatic Control 36(5), 1991).
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -302,7 +300,7 @@ def _of_size(form: Form, span: Span, low: float, high: float) -> list[str]:
     jumps = ["m.sign(z)" if form.on == "omega" else f"ca.tanh(z / {SOFT * top:.6g})"]
     if form.on == "load" and form.carrier == "i":  # braking takes small powers: the jump is far narrower than that
         jumps = [f"ca.tanh(ca.fmax({sign}{s}, 0) / {_place(SOFT, SOFT**2, 1)})" for sign in sides]
-    return [*jumps, *smooth, f"{s} * {size}", "1.0", size, f"{size}**3", *(f"ca.tanh({size} / {bend})" for bend in bends)]
+    return [*jumps, *smooth, f"{s} * {size}", "1.0", size, f"{size}**3", *(f"ca.tanh({size} / {b})" for b in bends)]
 
 
 def waves_of(span: Span) -> list[float]:

@@ -1,11 +1,10 @@
 """Trying an effect for real: refit with it, judge it on data that it never saw, refuse what is not identifiable."""
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial, reduce
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -20,7 +19,7 @@ from motorid.estimation.first_guess import first_guess
 from motorid.estimation.least_squares import FAILURES, Estimate
 from motorid.estimation.restarts import collapsed_again, restored
 from motorid.estimation.result import Fit
-from motorid.estimation.start_values import ABOVE, sizes_like
+from motorid.estimation.start_values import ABOVE, exchanged_poles, sizes_like
 from motorid.model.definition import Effect
 from motorid.model.model import Model
 from motorid.numerics.least_squares import LevenbergMarquardt
@@ -61,7 +60,9 @@ def raced(fit: Fit, model: Model, starts: Sequence[Mapping[str, float]]) -> Race
     Effects of the angle start along the measured angle, which the model's own angle, still wrong, would lead astray.
     """
     model = _bounded(fit, model)
-    alive, starts = restored(fit, model), starts or ({},)
+    new = (e for e in model.effects if e.name not in fit.model.effect_names)
+    starts = [*(starts or ({},)), *chain.from_iterable(exchanged_poles(model, e) for e in new)]
+    alive = restored(fit, model)
     angular = any(map(uses_angle, model.effects)) and not any(map(uses_angle, fit.model.effects))
     # As it is where a parameter put back (an inductance that no sample shows) makes the model too stiff.
     models = (alive,) if alive is model else (alive, model)

@@ -124,7 +124,7 @@ def _rounds(found: Climb, max_effects: int) -> Iterator[Climb]:
         search.nodes |= children | {new.key: new}
         if stopped:
             return
-        pruned = search.pruned(new, best)
+        pruned = search.exchanged(search.pruned(new, best), best)
         chosen_of = pruned if pruned.added != new.added and pruned.parent is new.parent else new
         group = group_of(chosen_of, ordered, {e.name: e.includes for e in search.effects})
         found = _with(found, pruned, chosen_of, new.parent is frontier[0], group)

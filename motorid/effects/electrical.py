@@ -114,7 +114,7 @@ def driver_current_limit(m: Equations, I_lim=P(5.0, "A", null=float("inf"), posi
 
 
 @effect(balance="voltage")
-def driver_lag(m: Equations, T_v=P(5e-3, "s", null=0.0, positive=True, grid=(1.0, 4.0, 16.0),
+def driver_lag(m: Equations, T_v=P(5e-3, "s", null=0.0, positive=True, grid=(1.0, 4.0, 16.0), pole=True,
                                    doc="time constant of the driver's output")):
     """First-order lag of the driver: an output filter, a slow amplifier. Åström & Murray, Feedback Systems, 2008.
 

@@ -19,7 +19,7 @@ from motorid.estimation.continuation import by_continuation
 from motorid.estimation.least_squares import FAILURES, FINISH, Callback, Estimate, least_squares, race
 from motorid.estimation.restarts import restore_collapsed
 from motorid.estimation.result import Fit
-from motorid.estimation.start_values import with_start_values
+from motorid.estimation.start_values import exchanged_poles, with_start_values
 from motorid.integrate.engine import Engine
 from motorid.integrate.rodas3 import ORDER
 from motorid.model.model import Model
@@ -92,7 +92,8 @@ def fit(model: Model, runs: Sequence[Experiment] | Experiment, *, solver: Any = 
     usually three. An effect over the angle whose order is not given takes the fit without it, one along the
     measured angle, and its own: three, or nine with friction. An effect that contains a simpler one takes the fit
     with that, and a short run from either start. Where much more than noise is left the model is fitted without each
-    of its effects, too, and begins again from there if that costs less. Further runs come only where an end is in
+    of its effects, too, and begins again from there if that costs less; with a lag of the driver or of the current's
+    sensor it begins again with that in the winding's place. Further runs come only where an end is in
     doubt, a parameter has collapsed, the model does not reach the noise in one channel far more than in another, or
     the sub-steps do not suit the end.
 
@@ -241,8 +242,13 @@ def no_worse_than_smaller(found: Estimate, asked: Problem, effort: LevenbergMarq
     """Return an estimate that, where it leaves more than noise, costs no more than without one of its effects.
 
     A model contains the smaller one: where that, begun as `asked`, ends lower, this one is in a side valley, and
-    begins again from there.
+    begins again from there. The other side of a lag beside the winding's is tried as well.
     """
+    begin, left = found.onward, max(misfit_over_noise(found.problem, found.q).values(), default=0.0)
+    if left > NOISE and (poles := [s for e in begin.model.effects for s in exchanged_poles(begin.model, e)]):
+        again = race(map(begin.start_at, poles), effort, solve=by_continuation)
+        if again is not None and again.cost < found.cost:
+            found = replace(again, history=found.history + again.history)
     problem, sizes = found.problem, natural_sizes(found.problem.experiments, found.values)
     if not max(misfit_over_noise(problem, found.q).values(), default=0.0) > IMBALANCE:
         return found

@@ -1,7 +1,5 @@
 """Start values: a first guess of the motor, natural sizes of its effects, and a race where these leave a choice."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np
@@ -19,6 +17,7 @@ from motorid.records.experiment import Experiment
 
 ABOVE = 1.3  # times: where a size starts that is at least another
 RESONANCE = "1/s"
+LEFT = 0.1  # of an inductance, where another lag takes the rest
 BACK_EMF_SHARES = (0.3, 0.03)
 PHASES = tuple(np.arange(4) * np.pi / 2)
 
@@ -124,6 +123,15 @@ def _shapes(problem: Problem, effect: Effect, asked: Model) -> list[dict[str, fl
             values = PHASES if p.periodic else shapes_of(p, sizes)
             axes[p.name] = np.clip(values, p.lower, p.upper).tolist()
     return combined(axes)
+
+
+def exchanged_poles(model: Model, effect: Effect) -> list[dict[str, float]]:
+    """Return the start at which a lag of an effect has changed places with the winding's own, L/R, and is nearly as
+    long as that: half as long it would be where the one valley ends and the other begins."""
+    free = {n for n, p in model.parameters.items() if p.vary and not p.given}
+    lags = [p.name for p in effect.parameters if p.pole and p.name in free] if "L" in free else []
+    own = model.parameters["L"].value if lags else 0.0
+    return [{n: (1 - LEFT) * own / model.parameters["R"].value, "L": LEFT * own} for n in lags]
 
 
 def _contained(model: Model) -> dict[Effect, Effect]:

@@ -47,6 +47,8 @@ class Parameter:
         Another in every run (an encoder's zero): `value` is that of the first run, the others are estimated apart.
     place : bool
         A place on the way of the angle: its `grid` is in shares of the travel, 0 the lowest and 1 the highest angle.
+    pole : bool
+        A lag in series with the winding's own, L/R, for which a fit may take it: it starts from both places.
     given : bool
         Set by the user; then no first guess replaces it.
     at_least : str
@@ -73,6 +75,7 @@ class Parameter:
     order: bool = False
     per_run: bool = False
     place: bool = False
+    pole: bool = False
     given: bool = False
     at_least: str = ""
     doc: str = ""
@@ -94,8 +97,8 @@ class Parameter:
 
 def P(value: float, unit: str = "", null: float | None = None, *, lower: float = -np.inf, upper: float = np.inf,
       positive: bool = False, vary: bool = True, grid: Iterable[float] = (), periodic: bool = False,
-      order: bool = False, per_run: bool = False, place: bool = False, given: bool = False, at_least: str = "",
-      doc: str = "") -> Any:
+      order: bool = False, per_run: bool = False, place: bool = False, pole: bool = False, given: bool = False,
+      at_least: str = "", doc: str = "") -> Any:
     """Declare a parameter of an effect as a default argument: ``tau_c=P(2e-3, "N·m", null=0)``.
 
     The name comes from the argument; what the others mean is told at `Parameter`.
@@ -107,8 +110,8 @@ def P(value: float, unit: str = "", null: float | None = None, *, lower: float =
     ...     m.torque -= c_2 * m.omega * abs(m.omega)
     """
     return partial(Parameter, value=value, unit=unit, null=null, lower=lower, upper=upper, positive=positive, vary=vary,
-                   grid=tuple(grid), periodic=periodic, order=order, per_run=per_run, place=place, given=given,
-                   at_least=at_least, doc=doc)
+                   grid=tuple(grid), periodic=periodic, order=order, per_run=per_run, place=place, pole=pole,
+                   given=given, at_least=at_least, doc=doc)
 
 
 BALANCES = ("voltage", "torque", "transmission", "sensor")

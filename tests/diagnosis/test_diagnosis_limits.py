@@ -157,6 +157,21 @@ def test_what_made_a_special_effect_special_may_be_taken_over(rubbing, monkeypat
     assert search.pruned(search.root, search.root).fit.model.effect_names == ("coulomb",)
 
 
+@one_thread
+def test_what_two_effects_imitate_together_takes_their_place(lab):
+    """An offset of the voltage is one of the current's sensor and a constant torque: with friction that differs with
+    the direction, three sizes do what two in truth did."""
+    runs = runs_of(lab, {"coulomb": {"tau_c": 8e-3}, "voltage_offset": {"V_0": 0.3}}, ("stairs 0.5", "waves"))
+    start = mi.fit(mi.dc_motor() + mi.effects.coulomb_asymmetric + mi.effects.current_offset, runs)
+    search = searched(start)
+    plain = node_of(mi.fit(mi.dc_motor(), runs), search.held)
+    assert search.pruned(search.root, plain) is search.root
+    assert search.exchanged(search.root, plain).key == {"coulomb", "voltage_offset"}
+    other = mi.fit(mi.dc_motor() + mi.effects.coulomb + mi.effects.voltage_offset, runs)
+    search = searched(other)
+    assert search.exchanged(search.root, plain) is search.root
+
+
 def test_a_friction_that_two_effects_contain_takes_the_place_of_neither():
     """As a model it would describe the same twice; a diagnosis goes on without it."""
     model = mi.dc_motor() + LIBRARY["coulomb_asymmetric"] + LIBRARY["angular_friction"]

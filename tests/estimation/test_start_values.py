@@ -11,6 +11,7 @@ from lab_records import VALUES, noisy, simulated
 from scipy.optimize import lsq_linear
 
 import motorid as mi
+from motorid.diagnosis.refit import refit
 from motorid.estimation import start_values
 from motorid.estimation.first_guess import _nonnegative, first_guess
 from motorid.problem.problem import Problem
@@ -174,3 +175,36 @@ def test_where_a_race_ends_only_by_steps_too_coarse_to_see_it_diverge_nothing_be
     assert start_values._led(problem, end).model.values["R"] == 3.0
     monkeypatch.setattr(start_values, "cost_at", lambda problem: np.inf)
     assert start_values._led(problem, end) is problem
+
+
+@pytest.fixture(scope="module")
+def slow_driver():
+    """A winding of 0.35 ms, rubbing, behind a driver of 7 ms."""
+    t = 1e-3 * np.arange(2500)
+    v = np.where(t > 1.2, 1.5, 4.0) * np.sign(np.sin(6.2 * np.pi * t)) * (t > 0.05) * (np.sin(3.1 * np.pi * t) > -0.7)
+    truth = mi.dc_motor(R=0.2, L=7e-5, K=0.25, b=3e-3, J=0.018) + mi.effects.coulomb(tau_c=0.3)
+    blank = mi.Experiment(t, {"v": v}, {c: np.zeros(len(t)) for c in ("i", "omega")}, sigma={"i": 0.05, "omega": 0.05})
+    clean = mi.simulate(truth + mi.effects.driver_lag(T_v=7e-3), blank, initial="rest")[0].outputs
+    rng = np.random.default_rng(0)
+    return blank.with_(outputs={c: y + 0.05 * rng.standard_normal(len(t)) for c, y in clean.items()})
+
+
+def test_a_lag_that_changed_places_with_the_winding_s_is_found(slow_driver):
+    """The other way round, 0.35 ms in the driver and 6 ms in the winding, is a valley of its own: R 12 % too large."""
+    lag = mi.effects.driver_lag
+    whole = mi.fit(mi.dc_motor() + mi.effects.coulomb + lag, slow_driver)
+    rubbing = mi.fit(mi.dc_motor() + mi.effects.coulomb, slow_driver)
+    for found in (whole, refit(rubbing, rubbing.model + lag, [{"T_v": 4e-4}, {"T_v": 1.6e-3}])):
+        assert found is not None
+        assert max(found.misfit.values()) < 1.05
+        assert found.values["T_v"] == pytest.approx(7e-3, rel=0.02)
+        assert found.values["R"] == pytest.approx(0.2, rel=0.01)
+
+
+@pytest.mark.parametrize("known", [{"L": 7e-5}, {"T_v": 4e-4}])
+def test_what_the_user_gave_changes_no_places(known):
+    model = mi.dc_motor() + mi.effects.driver_lag
+    (start,) = start_values.exchanged_poles(model, model.effects[0])
+    assert start["T_v"] + start["L"] / model.values["R"] == pytest.approx(model.values["L"] / model.values["R"])
+    assert start_values.exchanged_poles(model.replace(**known), model.effects[0]) == []
+    assert start_values.exchanged_poles(mi.torque_driven() + mi.effects.speed_lag, mi.effects.speed_lag) == []
