@@ -61,13 +61,13 @@ def raced(fit: Fit, model: Model, starts: Sequence[Mapping[str, float]]) -> Race
     """
     model = _bounded(fit, model)
     new = (e for e in model.effects if e.name not in fit.model.effect_names)
-    starts = [*(starts or ({},)), *chain.from_iterable(exchanged_poles(model, e) for e in new)]
-    alive = restored(fit, model)
+    poles = chain.from_iterable(exchanged_poles(model, e) for e in new)
+    alive, starts = restored(fit, model), starts or ({},)
     angular = any(map(uses_angle, model.effects)) and not any(map(uses_angle, fit.model.effects))
     # As it is where a parameter put back (an inductance that no sample shows) makes the model too stiff.
     models = (alive,) if alive is model else (alive, model)
     # A guess of the larger model's own, along the records, is no longer led astray.
-    entries = [(start, angular) for start in starts] + [
+    entries = [(start, angular) for start in (*starts, *poles)] + [
         (start, along) for start in _own_starts(fit, model, starts) for along in sorted({angular, False})]
     first = BEGIN if len(entries) > BEAM else RACE
     each = ((_begun(fit, models, start, along, first), along) for start, along in entries)

@@ -11,6 +11,7 @@ from lab_records import VALUES, noisy, simulated
 from scipy.optimize import lsq_linear
 
 import motorid as mi
+from motorid.diagnosis import refit as trial
 from motorid.diagnosis.refit import refit
 from motorid.estimation import start_values
 from motorid.estimation.first_guess import _nonnegative, first_guess
@@ -208,3 +209,9 @@ def test_what_the_user_gave_changes_no_places(known):
     assert start["T_v"] + start["L"] / model.values["R"] == pytest.approx(model.values["L"] / model.values["R"])
     assert start_values.exchanged_poles(model.replace(**known), model.effects[0]) == []
     assert start_values.exchanged_poles(mi.torque_driven() + mi.effects.speed_lag, mi.effects.speed_lag) == []
+
+
+def test_where_neither_place_can_be_simulated_a_race_has_no_winner(slow_driver, monkeypatch):
+    rubbing = mi.fit(mi.dc_motor() + mi.effects.coulomb, slow_driver)
+    monkeypatch.setattr(trial, "_race", lambda problem, effort: None)
+    assert refit(rubbing, rubbing.model + mi.effects.driver_lag, [{"T_v": 4e-4}]) is None
