@@ -321,8 +321,8 @@ class Search:
     def exchanged(self, node: Node, before: Node) -> Node:
         """Return a smaller model that does the same as `node` with an effect that these records cannot tell from a
         combination of its own; `node` itself for none. An offset of the voltage is one of the current and a load."""
-        alike = [e for e in self.effects if e.name in (self.inseparable(node) if self.scores(node) else ())]
-        for grown, e in product((node.fit.model + e for e in alike), node.fit.model.effects):
+        same = self.inseparable(node) if self.scores(node) else {}
+        for grown, e in product((node.fit.model + e for e in self.effects if e.name in same), node.fit.model.effects):
             for model in (*self._simpler(grown, e), *_without(grown, e.name)):
                 other = self.smaller(node, model)
                 if other is not None and superfluous(node, other) and (

@@ -100,8 +100,8 @@ def speed_ripple(m: Equations, a_w=P(0.02, "", null=0.0, lower=0.0, upper=1.0, d
 
 
 @effect(balance="sensor")
-def current_lag(m: Equations,
-                T_i=P(1e-3, "s", null=0.0, positive=True, grid=(0.5, 2.0, 8.0), pole=True, doc="of current filter")):
+def current_lag(m: Equations, T_i=P(1e-3, "s", null=0.0, positive=True, grid=(0.5, 2.0, 8.0), pole=True,
+                                    doc="time constant of current filter")):
     """First-order lag of the current measurement. Åström & Murray, Feedback Systems, 2008."""
     _lag(m, "i", T_i)
 

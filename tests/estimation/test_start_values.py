@@ -208,7 +208,7 @@ def test_what_the_user_gave_changes_no_places(known):
     (start,) = start_values.exchanged_poles(model, model.effects[0])
     assert start["T_v"] + start["L"] / model.values["R"] == pytest.approx(model.values["L"] / model.values["R"])
     assert start_values.exchanged_poles(model.replace(**known), model.effects[0]) == []
-    assert start_values.exchanged_poles(mi.torque_driven() + mi.effects.speed_lag, mi.effects.speed_lag) == []
+    assert start_values.exchanged_poles(mi.dc_motor() + mi.effects.speed_lag, mi.effects.speed_lag) == []
 
 
 def test_where_neither_place_can_be_simulated_a_race_has_no_winner(slow_driver, monkeypatch):
