@@ -116,13 +116,13 @@ def spikes(t: Array, y: Array, v: Array) -> NDArray[np.intp]:
     seen = np.flatnonzero(np.isfinite(y))
     if len(seen) < FEWEST:
         return np.empty(0, int)
-    noise = noise_level(y, t)
+    noise, step = noise_level(y, t), float(np.diff(np.unique(y[seen])).min(initial=np.inf))  # one count is no spike
     before, here, after = y[seen[:-2]], y[seen[1:-1]], y[seen[2:]]
     off, apart = here - (before + after) / 2, np.abs(after - before)
     jumps = np.flatnonzero(np.abs(np.diff(v)) > 0.02 * np.ptp(v))
     calm = ~np.isin(seen[1:-1], jumps[:, None] + np.arange(PEAK + 1))
     alone = calm & (apart < 0.3 * np.abs(off))
     # Smooth or not, a channel bends everywhere alike; nine in ten tell how much. A spike bends three samples.
-    beside = np.convolve(alone & (np.abs(off) > 12 * noise), np.ones(3), "same") > 0
+    beside = np.convolve(alone & (np.abs(off) > max(12 * noise, 1.5 * step)), np.ones(3), "same") > 0
     usual = float(np.quantile(np.abs(off[calm & ~beside]), 0.9)) if (calm & ~beside).any() else np.inf
-    return seen[1:-1][alone & (np.abs(off) > max(12 * noise, 8 * usual))]
+    return seen[1:-1][alone & (np.abs(off) > max(12 * noise, 8 * usual, 1.5 * step))]

@@ -161,6 +161,17 @@ def test_spikes_are_left_out_and_nothing_else():
     assert np.array_equal(quiet.outputs["omega"], run.outputs["omega"])
 
 
+def test_a_count_up_and_down_is_no_spike():
+    """A counted speed, rounded in the file, that rests on a count and now and then shows the one below."""
+    k = np.arange(955)
+    counts = np.floor(19.9 * (1 - np.exp(-np.maximum(k - 206, 0) / 12)))
+    counts[330::40] -= 1
+    speed, v = 0.13 + 4.0244 * counts + 0.1298 * np.floor(counts / 4), np.where(k < 206, 0.0, 6.0)
+    assert not len(spikes(2e-3 * k, speed, v))
+    speed[[401, 555, 777]] = 0.0, 160.0, 20.0
+    assert list(spikes(2e-3 * k, speed, v)) == [401, 555, 777]
+
+
 def test_a_peak_of_the_current_at_a_step_is_no_spike():
     run, _ = spiked(0)
     assert run.without_spikes() is run
