@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any
 
@@ -212,23 +212,18 @@ def settled(problem: Problem, estimate_initial: bool = True) -> tuple[Problem, A
 
 def with_angles_apart(problem: Problem) -> Problem:
     """Return the problem with an angle that is another in every run at the best of many, one run after another."""
-    for name, k, _ in (a for a in problem.unknowns.apart if a[2].unit == "rad"):
+    q, first = problem.start.copy(), len(problem.unknown) - len(problem.unknowns.apart)
+    for j, (_, k, parameter) in enumerate(problem.unknowns.apart, first):
         costs = {}
-        for value in TURN.tolist():
-            trial = _with_apart(problem, k, name, value)
+        for value in TURN.tolist() if parameter.unit == "rad" else ():
+            q[j] = value / problem.scaling.scale[j]
             with contextlib.suppress(SimulationError):
-                traj = trial.simulate(trial.start, k, derivatives=False)
-                costs[value] = float(np.sum(trial.run_residual(k, traj)[0] ** 2))
-        if costs:  # of those a period apart the nearest
-            near = [z for z, cost in costs.items() if cost < ALIKE * min(costs.values())]
-            problem = _with_apart(problem, k, name, min(near, key=abs))
-    return problem
-
-
-def _with_apart(problem: Problem, k: int, name: str, value: float) -> Problem:
-    runs = list(problem.runs)
-    runs[k] = replace(runs[k], apart={**runs[k].apart, name: value})
-    return problem.tuned(_runs=tuple(runs))
+                r, _ = problem.run_residual(k, problem.simulate(q, k, derivatives=False))
+                costs[value] = float(r @ r)
+        # of those a period apart the nearest
+        near = [z for z, cost in costs.items() if cost < ALIKE * min(costs.values())]
+        q[j] = min(near, key=abs) / problem.scaling.scale[j] if near else problem.start[j]
+    return problem.begun_at(q)
 
 
 def at(problem: Problem, q: Array) -> tuple[Simulation, ...]:

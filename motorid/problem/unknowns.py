@@ -126,6 +126,13 @@ class Unknowns:
             places[k][1].append(j)
         return places
 
+    @cached_property
+    def seen_by(self) -> tuple[NDArray[np.int64], ...]:
+        """Per run: the columns of q that it depends on, what all share and its own."""
+        shared, initial, apart = [True] * len(self.free), [k for _, k, _ in self.initial], [k for _, k, _ in self.apart]
+        return tuple(np.flatnonzero([*shared, *(j == k for j in initial), *(j == first for j in apart)])
+                     for k, first in enumerate(self.firsts))
+
     def point(self, q: Array) -> Point:
         """Return `q` in the system's terms."""
         physical = self.scaling.physical(q)

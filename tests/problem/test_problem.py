@@ -254,6 +254,25 @@ def test_an_angle_that_is_not_measured_starts_at_zero_and_is_no_unknown(runs):
 
 
 # -- sub-steps -----------------------------------------------------------------------------------------------
+@pytest.mark.parametrize("engine", ["rosenbrock", "cvodes"])
+def test_a_run_is_differentiated_by_what_it_depends_on_alone(runs, engine, monkeypatch):
+    """Of many runs with initial states, or a zero each, the unknowns of all others cost as much as its own."""
+    model = TRUE + mi.effects.gravity + mi.effects.encoder_zero
+    problem = as_problem(model.start_at({"tau_g": 2e-3}), runs, initial="estimate", engine=engine)
+    own = [len(problem.model.free_names) + 2 + k for k in range(2)]  # the first run's zero is that of the angle
+    widths, integrator = [], problem.integrator
+    integrate = type(integrator).run
+    monkeypatch.setattr(type(integrator), "run", lambda self, system, grid, x0, p, *slopes, **kw: (
+        widths.append(slopes[1].shape[1] if slopes else 0), integrate(self, system, grid, x0, p, *slopes, **kw))[1])
+    jac = problem.jacobian(problem.start)
+    assert widths == own
+    assert jac.shape[1] == len(problem.unknown) > max(own)
+    for j, p in enumerate(problem.unknown):
+        step = 1e-3 * (np.arange(len(problem.unknown)) == j)
+        slope = (problem.residual(problem.start + step) - problem.residual(problem.start - step)) / 2e-3
+        assert np.allclose(jac[:, j], slope, atol=1e-2 * max(np.abs(slope).max(), 1.0)), p.name
+
+
 def test_refined_keeps_the_integration_error_well_below_the_noise(runs):
     from motorid.problem.simulate import integration_error
 
