@@ -57,24 +57,27 @@ def fitted_to(fit: Fit, runs: Sequence[Experiment] | None) -> Fit:
 
 def _every(fit: Fit) -> int:
     """Return k (a power of two) where every k-th sample tells as much as all do, but for noise."""
-    k, runs = 1, list(zip(fit.simulations, fit.problem.runs, strict=True))
-    while _samples(fit.problem.experiments) >= 2 * k * ENOUGH and all(
-            _predicted(s.experiment.t, s.outputs[c], s.residual(c), 2 * k, run.sigma[c])
-            for s, run in runs for c in run.sigma):
+    k = 1
+    while _samples(fit.problem.experiments) >= 2 * k * ENOUGH and _predicted(fit, 2 * k):
         k *= 2
     return k
 
 
-def _predicted(t: Array, model: Array, error: Array, k: int, noise: float) -> bool:
-    """Tell whether every k-th sample predicts those between: the model by far, its error as well as noise allows."""
-    def rms_between(y: Array) -> float:
-        at, seen = t[good], y[good]
-        return float(np.sqrt(np.mean((seen - np.interp(at, at[::k], seen[::k])) ** 2)))
-
-    good, w = np.isfinite(error), np.arange(1, k) / k
-    of_noise = noise * np.sqrt(np.sum(1 + w**2 + (1 - w) ** 2) / k)  # linear interpolation of white noise
-    return (rms_between(error) < (1 + SMALL) * of_noise
-            and rms_between(model) < SMALL * np.sqrt(np.mean(error[good] ** 2)))
+def _predicted(fit: Fit, k: int) -> bool:
+    """Tell whether every k-th sample predicts those between: the model, in each run, by far; its error in all runs
+    together, whose noise is one, as well as noise allows: counts dither in one run and not in another."""
+    w, channels = np.arange(1, k) / k, dict[str, Array]()
+    for s, run in zip(fit.simulations, fit.problem.runs, strict=True):
+        for c, sigma in run.sigma.items():
+            error, good = s.residual(c), np.isfinite(s.residual(c))
+            t, total2 = s.experiment.t[good], float(np.sum(error[good] ** 2))
+            model2, error2 = (float(np.sum((y[good] - np.interp(t, t[::k], y[good][::k])) ** 2))
+                              for y in (s.outputs[c], error))
+            if not model2 < SMALL**2 * total2:
+                return False
+            noise2 = len(t) * sigma**2 * float(np.sum(1 + w**2 + (1 - w) ** 2)) / k  # linearly interpolated, if white
+            channels[c] = channels.get(c, 0.0) + np.array([error2, noise2])
+    return all(error2 < (1 + SMALL) ** 2 * noise2 for error2, noise2 in channels.values())
 
 
 def fit_affordably(runs: Sequence[Experiment], fit: Callable[[Sequence[Experiment]], Fit]) -> Fit:

@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from battery.excite import driven, record
+from lab_records import simulated
 
 import motorid as mi
 from motorid.diagnosis import candidates
@@ -284,6 +285,24 @@ def test_samples_that_their_neighbours_predict_are_left_out_and_that_is_said(lab
     assert found.effects == ("coulomb",)
     assert found.after.values["tau_c"] == pytest.approx(8e-3, rel=0.03)
     assert "One sample of 4 was used" in found.text
+
+
+def test_a_counted_speed_that_dithers_in_one_run_only_is_thinned_too(monkeypatch):
+    """Of a speed in steps, one run rested on a count and another flickered between two: louder than their mean noise,
+    it kept all samples of all runs, and a diagnosis took eight times as long."""
+    monkeypatch.setattr(parts, "ENOUGH", 400)
+    t, q = np.arange(0, 1.6, 1e-3), 4.0
+    runs = []
+    for volts in (3.0, 4.0, 5.0):
+        run = simulated(t, np.where(t < 0.2, 0.0, volts), ("omega",))
+        omega = run.outputs["omega"]
+        dither = np.where(np.random.default_rng(1).random(t.size) < 0.5, q / 2, -q / 2) if volts == 4.0 else 0.0
+        counted = q * np.round(omega / q) + np.where(omega > 0.9 * omega[-1], dither, 0.0)
+        runs.append(run.with_(outputs={"omega": counted}))
+    fit = mi.fit(mi.dc_motor(), runs)
+    louder = fit.problem.with_(experiments=(runs[1],), model=fit.model)
+    assert louder.runs[0].sigma["omega"] > (1 + parts.SMALL) * fit.problem.runs[1].sigma["omega"]
+    assert parts.affordable(fit).problem.experiments[0].n < t.size
 
 
 @pytest.mark.parametrize(("hidden", "voltage", "channels"), [
