@@ -148,6 +148,8 @@ def _grown(search: Search, frontier: Sequence[Node]) -> tuple[dict[frozenset[str
         children |= {c.key: c for c in grown if c.key not in children}
         if stopped := next((c.reason for c in listed if c.reason in (OUT_OF_TIME, INTERRUPTED)), ""):
             return children, first, stopped
+        if any(at_noise(c) and not c.objection for c in grown):  # no other branch can leave less
+            break
     return children, first, ""
 
 
@@ -181,8 +183,7 @@ def _still_alike(found: Climb) -> tuple[tuple[tuple[str, ...], ...], tuple[Fit, 
     early rung may not beside what was found after it."""
     search, best, groups, rivals = found.search, found.path[-1], list[tuple[str, ...]](), tuple[Fit, ...]()
     for first, *others in (g for g in found.groups if g[0] in best.key):
-        swapped = {n: search.in_place(best, first, n, bool(found.stopped))
-                   for n in others if n not in best.key}
+        swapped = {n: search.in_place(best, first, n, bool(found.stopped)) for n in others if n not in best.key}
         alike = {n: node for n, node in swapped.items() if node is None or not beats(best, node)}
         if alike:
             groups.append((first, *alike))

@@ -170,6 +170,18 @@ def test_what_comes_in_the_place_of_two_leaves_room_for_another(monkeypatch):
     assert last.text == "stopped at the limit of 3 effects"
 
 
+@pytest.mark.parametrize(("leaves", "grown"), [("noise", 1), ("more", 2), ("noise against physics", 2)])
+def test_a_second_branch_is_grown_only_where_the_first_leaves_more_than_noise(monkeypatch, leaves, grown):
+    expanded = []
+    child = SimpleNamespace(key=frozenset("ab"), objection="a wrong sign" if leaves == "noise against physics" else "")
+    search = SimpleNamespace(expand=lambda node: (expanded.append(node) or [child], []))
+    monkeypatch.setattr(stepwise, "at_noise", lambda node: leaves != "more")
+    children, _, stopped = stepwise._grown(search, ["first", "second"])
+    assert len(expanded) == grown
+    assert children == {child.key: child}
+    assert not stopped
+
+
 @pytest.mark.parametrize("noise", [True, False])
 def test_curves_are_asked_where_held_out_runs_hold_more_than_noise(monkeypatch, noise):
     """A battery that polarises was fitted to its noise by three effects, and missed by three times that elsewhere."""
