@@ -233,12 +233,9 @@ class Search:
             if have & set(e.includes):
                 wider.append(e)
                 continue
-            try:
-                grown = model + e
-                self.root.fit.problem.for_model(grown)
-            except ModelError:
-                continue
-            fresh.append(e)
+            with contextlib.suppress(ModelError):
+                self.root.fit.problem.for_model(model + e)
+                fresh.append(e)
         return fresh, wider
 
     def expand_by_two(self, node: Node) -> list[Node]:
@@ -394,12 +391,10 @@ class Search:
             fit = refit(node.fit, model, (values,))
             if fit is None or any(objections(fit, e) for e in new):  # what takes its place must be sound
                 return None
-            try:
+            with contextlib.suppress(*FAILURES):
                 added = node.added if node.added in model.effect_names or not new else new[0].name
                 self.nodes[key] = node_of(fit, self.held, added, node.parent)
-            except FAILURES:
-                return None
-        return self.nodes[key]
+        return self.nodes.get(key)
 
 
 def _flat_topped(run: Experiment) -> bool:

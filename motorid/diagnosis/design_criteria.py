@@ -14,6 +14,7 @@ parameters enters as a Gaussian prior with their information matrix (Gauss-Newto
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
@@ -420,15 +421,13 @@ def separation(truth: Driven, rival: Driven, levels: Array, ra: Response, rb: Re
             break
         for share in (1.0, 0.5, 0.2):
             trial = delta + share * step
-            try:
+            with contextlib.suppress(SimulationError):
                 ta, tb = (f.respond(levels, d, by_parameter=True)
                           for f, d in zip(both, np.split(trial, [k]), strict=True))
-            except SimulationError:
-                continue
-            value = float(np.sum((ta.y - tb.y) ** 2) + trial @ prior[1] @ trial)
-            if value < chi2:
-                delta, chi2, ra, rb = trial, value, ta, tb
-                break
+                value = float(np.sum((ta.y - tb.y) ** 2) + trial @ prior[1] @ trial)
+                if value < chi2:
+                    delta, chi2, ra, rb = trial, value, ta, tb
+                    break
         if chi2 > (1 - SETTLED) * before:
             break
     if not slopes:

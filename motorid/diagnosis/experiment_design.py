@@ -7,6 +7,7 @@ noise is what a record would add to the evidence between them (Hunter & Reiner, 
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from io import StringIO
@@ -100,13 +101,11 @@ def suggest_experiment(fits: Sequence[Fit], *, v_max: float | None = None, i_max
 
     scores, kept = {}, {}
     for name, (v, _) in candidates(t, v_max).items():
-        try:
+        with contextlib.suppress(MotoridError):
             answers = [planned(f.model, t, v, channels=f.problem.outputs, name=name).outputs for f in fits]
-        except MotoridError:
-            continue
-        if not i_max or all(float(np.abs(y.get("i", 0.0)).max()) <= i_max for y in answers):
-            scores[name] = min(difference(a, b) for a, b in combinations(answers, 2))
-            kept[name] = Experiment(t, {"v": v}, answers[0], name=name)
+            if not i_max or all(float(np.abs(y.get("i", 0.0)).max()) <= i_max for y in answers):
+                scores[name] = min(difference(a, b) for a, b in combinations(answers, 2))
+                kept[name] = Experiment(t, {"v": v}, answers[0], name=name)
     if not scores:
         raise FitError("no candidate experiment stays within the limits with all models; raise i_max or v_max.")
     best = max(scores, key=lambda n: scores[n])

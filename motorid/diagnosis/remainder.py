@@ -399,7 +399,7 @@ class Remainder:
         if best is None:
             raise UsageError(f"what is left is {self.follows}: no curve, but another motor in every run. Fit the runs "
                              "apart." if apart else "something predictable is left, but no curve over one quantity "
-                             "lowers the error on data left out.")
+                             "lowers the error on data left out; do these hold voltages or speeds that others lack?")
         return best
 
     def _tried(self) -> Iterator[tuple[Fit, Form]]:

@@ -88,14 +88,13 @@ def fit(model: Model, runs: Sequence[Experiment] | Experiment, *, solver: Any = 
 
     Notes
     -----
-    A plain motor takes one least-squares run. A model with a smooth sgn (friction) takes one per width of it,
-    usually three. An effect over the angle whose order is not given takes the fit without it, one along the
-    measured angle, and its own: three, or nine with friction. An effect that contains a simpler one takes the fit
-    with that, and a short run from either start. Where much more than noise is left the model is fitted without each
-    of its effects, too, and begins again from there if that costs less; with a lag of the driver or of the current's
-    sensor it begins again with that in the winding's place. Further runs come only where an end is in
-    doubt, a parameter has collapsed, the model does not reach the noise in one channel far more than in another, or
-    the sub-steps do not suit the end.
+    A plain motor takes one least-squares run. A model with a smooth sgn (friction) takes one per width of it, usually
+    three. An effect over the angle whose order is not given takes the fit without it, one along the measured angle, and
+    its own: three, or nine with friction. An effect that contains a simpler one takes the fit with that, and a short
+    run from either start. Where much more than noise is left the model is fitted without each of its effects, too, and
+    begins again from there if that costs less; with a lag of the driver or of the current's sensor it begins again with
+    that in the winding's place. Further runs come only where an end is in doubt, a parameter has collapsed, the model
+    does not reach the noise in one channel far more than in another, or the sub-steps do not suit the end.
 
     Examples
     --------

@@ -61,10 +61,9 @@ class Rosenbrock:
 
         Where the error estimate of a step is too large, what half the steps change at the end of its interval decides
         (Hairer, Nørsett & Wanner, Solving Ordinary Differential Equations I, 1993, II.4): a current that settles
-        before the next sample needs no steps of its own.
-        Where the run fails, so does every later one on this grid: coarse steps would jump over what happens.
-        A step that goes astray spoils all after it, which is then neither refined for nor a measure of size. It has not
-        where half the steps end alike, or no more are to be had.
+        before the next sample needs no steps of its own. Where the run fails, so does every later one on this grid:
+        coarse steps would jump over what happens. A step that goes astray spoils all after it, which is then neither
+        refined for nor a measure of size. It has not where half the steps end alike, or no more are to be had.
         """
         passes, right = float(MOST_PASSES), 0
         while passes > 0:

@@ -4,8 +4,7 @@ What all long work shares is here, too: a budget of time, Ctrl-C in the command 
 each public call, keeps the linear algebra to one thread, see `one_thread`: its matrices are small.
 
 `map` is anything with the signature of the built-in one: ``executor.map`` of `concurrent.futures`,
-``client.get_executor(pure=False).map`` of Dask, ``lambda f, xs: joblib.Parallel(2)(joblib.delayed(f)(x) for
-x in xs)``.
+``client.get_executor(pure=False).map`` of Dask, ``lambda f, xs: joblib.Parallel(2)(joblib.delayed(f)(x) for x in xs)``.
 """
 
 from __future__ import annotations
