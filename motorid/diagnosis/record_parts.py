@@ -66,18 +66,18 @@ def _every(fit: Fit) -> int:
 def _predicted(fit: Fit, k: int) -> bool:
     """Tell whether every k-th sample predicts those between: the model, in each run, by far; its error in all runs
     together, whose noise is one, as well as noise allows: counts dither in one run and not in another."""
-    w, channels = np.arange(1, k) / k, dict[str, Array]()
+    w, sums = np.arange(1, k) / k, dict[str, Array]()
     for s, run in zip(fit.simulations, fit.problem.runs, strict=True):
         for c, sigma in run.sigma.items():
-            error, good = s.residual(c), np.isfinite(s.residual(c))
+            good = np.isfinite(error := s.residual(c))
             t, total2 = s.experiment.t[good], float(np.sum(error[good] ** 2))
             model2, error2 = (float(np.sum((y[good] - np.interp(t, t[::k], y[good][::k])) ** 2))
                               for y in (s.outputs[c], error))
             if not model2 < SMALL**2 * total2:
                 return False
             noise2 = len(t) * sigma**2 * float(np.sum(1 + w**2 + (1 - w) ** 2)) / k  # linearly interpolated, if white
-            channels[c] = channels.get(c, 0.0) + np.array([error2, noise2])
-    return all(error2 < (1 + SMALL) ** 2 * noise2 for error2, noise2 in channels.values())
+            sums[c] = sums.get(c, 0.0) + np.array([error2, noise2])
+    return all(error2 < (1 + SMALL) ** 2 * noise2 for error2, noise2 in sums.values())
 
 
 def fit_affordably(runs: Sequence[Experiment], fit: Callable[[Sequence[Experiment]], Fit]) -> Fit:

@@ -289,7 +289,7 @@ def test_samples_that_their_neighbours_predict_are_left_out_and_that_is_said(lab
 
 def test_a_counted_speed_that_dithers_in_one_run_only_is_thinned_too(monkeypatch):
     """Of a speed in steps, one run rested on a count and another flickered between two: louder than their mean noise,
-    it kept all samples of all runs, and a diagnosis took eight times as long."""
+    it kept all samples of all runs, and a diagnosis took seven times as long."""
     monkeypatch.setattr(parts, "ENOUGH", 400)
     t, q = np.arange(0, 1.6, 1e-3), 4.0
     runs = []

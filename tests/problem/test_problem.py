@@ -273,6 +273,15 @@ def test_a_run_is_differentiated_by_what_it_depends_on_alone(runs, engine, monke
         assert np.allclose(jac[:, j], slope, atol=1e-2 * max(np.abs(slope).max(), 1.0)), p.name
 
 
+def test_a_run_without_an_unknown_of_its_own_has_no_slopes(runs):
+    held = TRUE.fix(*TRUE.free_names)
+    problem = as_problem(held, [runs[0], runs[1].select(slice(250, None))])
+    jac, n = problem.jacobian(problem.start), problem.measured[0].size
+    assert {run for _, run, _ in problem.unknowns.initial} == {1}
+    assert not jac[:n].any()
+    assert np.linalg.norm(jac[n:], axis=0).all()
+
+
 def test_refined_keeps_the_integration_error_well_below_the_noise(runs):
     from motorid.problem.simulate import integration_error
 
