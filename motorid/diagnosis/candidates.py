@@ -21,7 +21,7 @@ from motorid.diagnosis.free_forms import own_levels
 from motorid.diagnosis.misspecification import LIMITER
 from motorid.diagnosis.model_comparison import COMMON, Node, beats, evidence, far, node_of, preferred, superfluous
 from motorid.diagnosis.predictive_score import Evidence
-from motorid.diagnosis.refit import LITTLE, GivenUp, Task, completed, hidden_in, lost, refit, refits, widened
+from motorid.diagnosis.refit import LITTLE, GivenUp, Task, completed, hidden_in, led_on, lost, refit, refits, widened
 from motorid.diagnosis.results import Candidate
 from motorid.diagnosis.score_test import Score, pairs_of, rank, uses_angle, with_phase_per_run, with_warm_start
 from motorid.diagnosis.thresholds import MATERIAL
@@ -350,10 +350,14 @@ class Search:
         return lower
 
     def brought_to_its_end(self, node: Node) -> Node:
-        """Return a model whose refit stopped short, with errors far beyond the noise, fitted on from there.
+        """Return a model fitted on to its optimum; a refit ends where it tells no two models apart.
 
-        A rugged cost (the rebounds in a gear's play) stops a refit's few steps; the whole effort of a fit goes on.
+        A rugged cost (the rebounds in a gear's play) stops a refit's few steps, with errors far beyond the noise; there
+        the whole effort of a fit goes on.
         """
+        with contextlib.suppress(*FAILURES):
+            if (fit := led_on(node.fit)) is not None:
+                node = self.nodes[node.key] = replace(node, fit=fit, predictions=self.held.predictions(fit))
         if node.fit.status != "converged" and far(node.fit):
             with contextlib.suppress(*FAILURES):
                 problem = node.fit.problem.with_(model=node.fit.model, noise_factors={})

@@ -93,7 +93,7 @@ class Evidence:
 
 def compare(old: Predictions, new: Predictions) -> Evidence:
     """Return what `new` predicts better than `old` on the same data."""
-    gone = lost_channels(old.held_out, new.held_out)
+    gone = (*lost_channels(old.held_out, new.held_out), *_fine_enough(old.held_out, new.held_out))
     unseen = [{c: e for c, e in model.held_out.items() if c not in gone} for model in (old, new)]
     here, here_se = _summed(_differences(old.blocks, new.blocks))
     there, there_se = _summed(_differences(*unseen))
@@ -125,6 +125,12 @@ def _summed(differences: Array) -> tuple[float, float]:
 def lost_channels(old: Channels, new: Channels) -> tuple[str, ...]:
     """Return the channels that both models lose: zero is nearer to what was measured than either."""
     return tuple(c for c in old if c in new and min(old[c].nrmse, new[c].nrmse) > thresholds.LOST)
+
+
+def _fine_enough(old: Channels, new: Channels) -> tuple[str, ...]:
+    """Return the angle, where both models err by so little of it that its error is asked no more, beside others."""
+    fine = [c for c in ("theta",) if c in old and c in new and max(old[c].nrmse, new[c].nrmse) < thresholds.FINER]
+    return tuple(fine) if len(old) > len(fine) else ()
 
 
 def _fall(old: Channels, new: Channels) -> float | None:

@@ -31,7 +31,9 @@ from motorid.problem.simulate import misfit_over_noise
 
 BEGIN, RACE = (LevenbergMarquardt(max_iterations=n, ftol=1e-3, xtol=1e-4, looks=0) for n in (2, 6))
 HALVING = 2  # of the starts go on after the first steps (successive halving: Karnin, Koren & Somekh, ICML 2013)
-POLISH = LevenbergMarquardt(max_iterations=60, ftol=1e-5, xtol=1e-5, looks=0)
+POLISH = LevenbergMarquardt(max_iterations=60, ftol=1e-3, xtol=1e-5, looks=0, patience=10, crawl=3.0)
+TOLD = 0.1  # nats that a step must gain: less tells no two models apart
+OPTIMUM = LevenbergMarquardt(max_iterations=60, ftol=1e-5, xtol=1e-5, looks=0)
 GOING_ON = 4  # times, where the last descent ends at its limit
 LOST = 0.2  # NRMSE of a channel
 ROOM = 10.0  # factor beyond its grid that a shape parameter may run to
@@ -109,8 +111,8 @@ def _undamped(r: Array, jac: Array) -> float:
     return 0.5 * float(np.sum(triangle[jac.shape[1] :, -1] ** 2))
 
 
-def finished(fit: Fit, best: Raced) -> Fit | None:
-    """Return the refit that a race began, converged; None if it fails.
+def finished(fit: Fit, best: Raced, effort: LevenbergMarquardt) -> Fit | None:
+    """Return the refit that a race began, converged with `effort`; None if it fails.
 
     Where it went along the measured angle the model's own takes over, unless it drifts too far (by periods).
     """
@@ -119,13 +121,14 @@ def finished(fit: Fit, best: Raced) -> Fit | None:
         done = _released(best.problem) if best.angular else QUICKLY(best.problem, wide=stages)
     except FAILURES:
         return None
-    return _polished(fit, collapsed_again(done.onward, fit))
+    return _polished(fit, collapsed_again(done.onward, fit), effort)
 
 
 def refit(fit: Fit, model: Model, starts: Sequence[Mapping[str, float]]) -> Fit | None:
-    """Return the best refit of `model` on the records of `fit` from several starts; None if none can be simulated."""
+    """Return the best refit of `model` on the records of `fit` from several starts, at its optimum; None if none can be
+    simulated."""
     best = raced(fit, model, starts)
-    return None if best is None else finished(fit, best)
+    return None if best is None else finished(fit, best, OPTIMUM)
 
 
 def _released(measured: Problem) -> Estimate:
@@ -166,18 +169,23 @@ def copies_the_angle(problem: Problem, q: Array) -> bool:
 
 
 def lost(fit: Fit) -> bool:
-    """Tell whether a fit is so far from its records that neither its values nor slopes there lead anywhere."""
-    return max(fit.nrmse.values(), default=0.0) > LOST
+    """Tell whether a fit is so far from its records that neither its values nor slopes there lead anywhere.
+
+    The motion tells, where it was measured: a current that no model comes near leaves the slopes along it as they are.
+    """
+    motion = [error for c, error in fit.nrmse.items() if c != "i"]
+    return max(motion or fit.nrmse.values(), default=0.0) > LOST
 
 
 def _own_starts(fit: Fit, model: Model, starts: Sequence[Mapping[str, float]]) -> list[dict[str, float]]:
     """Return `starts` with the larger model's own first guess, where the smaller one's fit is no place to begin. An arm
-    without its weight is fitted by a motor that hardly moves; from there nothing leads back."""
-    if not lost(fit):
+    without its weight is fitted by a motor that hardly moves; from there nothing leads back. Where that fit is near the
+    motion, and far from the current alone, the best start has a guess of its own."""
+    if max(fit.nrmse.values(), default=0.0) <= LOST:
         return []
     with contextlib.suppress(*FAILURES):
         guess = first_guess(model, fit.problem.experiments, loaded=True)
-        return [{**start, **guess} for start in starts]
+        return [{**start, **guess} for start in (starts if lost(fit) else starts[:1])]
     return []
 
 
@@ -215,35 +223,56 @@ def _bounded(fit: Fit, model: Model) -> Model:
     return model.with_(parameters={**model.parameters, **pars})
 
 
-def _polished(fit: Fit, problem: Problem) -> Fit | None:
+def _polished(fit: Fit, problem: Problem, effort: LevenbergMarquardt) -> Fit | None:
     """Converge from a good start, channels weighed anew where the misfit has changed. Where that takes more sub-steps
     than the samples are worth, it is done as roughly as the race."""
     try:
         exact = problem.tuned(accuracy=fit.problem.accuracy)
         problem = exact if exact.refined(exact.start).worth_its_steps else problem.tuned(accuracy=ROUGH)
-        done = _converged(problem)
+        done = _converged(problem, effort)
         if problem.noise_factors:
             factors = misfit_over_noise(done.problem, done.solution.q)
             if max(abs(np.log(factors[c] / problem.noise_factors.get(c, 1.0))) for c in factors) > 0.1:
-                done = _converged(done.onward.tuned(noise_factors=factors))
-        done = sharpened(past_ripples(done, POLISH), POLISH)
-        found, problem = done.solution, done.problem
-        fit = Fit(problem, problem.values(found.q), found.residual, found.jac / problem.scaling.slope(found.q), found.q,
-                  found.status, found.message, done.history)
-        return fit if np.isfinite(found.jac).all() and fit.simulations else None
+                done = _converged(done.onward.tuned(noise_factors=factors), effort)
+        effort = _telling(done, effort)
+        return _fit_of(sharpened(past_ripples(done, effort), effort))
     except FAILURES:  # also where the optimum lies at the edge of what can be simulated
         return None
 
 
-def _converged(problem: Problem) -> Estimate:
-    """Descend, and go on where that ends at its limit: what is unfinished would be judged worse than it is."""
-    done = by_continuation(problem, POLISH, wide=False, narrow=False)
+def led_on(fit: Fit) -> Fit | None:
+    """Return a refit, which ends where further steps tell no two models apart, led on to its optimum; None for none."""
+    with contextlib.suppress(*FAILURES):
+        done = by_continuation(fit.problem.begun_at(fit.q), OPTIMUM, wide=False, narrow=False)
+        return _fit_of(done) if done.cost < fit.cost else None
+    return None
+
+
+def _fit_of(done: Estimate) -> Fit | None:
+    found, problem = done.solution, done.problem
+    fit = Fit(problem, problem.values(found.q), found.residual, found.jac / problem.scaling.slope(found.q), found.q,
+              found.status, found.message, done.history)
+    return fit if np.isfinite(found.jac).all() and fit.simulations else None
+
+
+def _converged(problem: Problem, effort: LevenbergMarquardt) -> Estimate:
+    """Descend as far as it tells anything, and go on where that ends at its limit: what is unfinished would be judged
+    worse than it is."""
+    history = ()
     for _ in range(GOING_ON):
-        if done.solution.status != "limit":
+        done = by_continuation(problem, effort, wide=False, narrow=False)
+        done = replace(done, history=history + done.history)
+        finer = _telling(done, effort)
+        if done.solution.status != "limit" and finer.ftol > 0.5 * effort.ftol:
             break
-        again = by_continuation(done.onward, POLISH, wide=False, narrow=False)
-        done = replace(again, history=done.history + again.history)
+        problem, effort, history = done.onward, finer, done.history
     return done
+
+
+def _telling(done: Estimate, effort: LevenbergMarquardt) -> LevenbergMarquardt:
+    """Return the effort that goes on while a step gains `TOLD` by the samples that the residual is worth."""
+    residual = done.solution.residual[: done.problem.n_outputs]
+    return replace(effort, ftol=float(np.clip(TOLD / done.problem.worth(residual), OPTIMUM.ftol, effort.ftol)))
 
 
 def _within(model: Model, values: Mapping[str, float]) -> Model:
@@ -418,7 +447,7 @@ def _race_tournament(entry: tuple[Task, bool]) -> Raced | None:
 
 
 def _finish(begun: tuple[Task, Raced]) -> Fit | None:
-    return finished(begun[0].fit, begun[1])
+    return finished(begun[0].fit, begun[1], POLISH)
 
 
 def _gain(task: Task) -> float:

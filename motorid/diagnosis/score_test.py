@@ -182,7 +182,7 @@ def _scored(tangent: Tangent, effect: Effect, shapes: tuple[Shape, ...]) -> Scor
     same_as = best.same_as if all(t.same_as for t in tried) else ()
     starts = tuple(_distinct([t.values for t in tried]))
     drop = 0.0 if same_as else best.drop
-    effective = tangent.effective(best.left) if drop * tangent.chi2 > 1 else 0.0
+    effective = tangent.fit.problem.worth(best.left) if drop * tangent.chi2 > 1 else 0.0
     return Score(effect, drop, starts, effective, same_as, shapes=shapes)
 
 
@@ -195,7 +195,7 @@ def _score_orders(tangent: Tangent, added: Added, effect: Effect) -> Score:
         return Score(effect, 0.0, ({},))
     best, starts = _tried(tangent, shape), tuple(line.values(added.pars) for line in lines)
     out = spectrum(tangent, effect).stands_out
-    return Score(effect, best.drop, starts, tangent.effective(best.left), best.same_as, out, (shape,))
+    return Score(effect, best.drop, starts, tangent.fit.problem.worth(best.left), best.same_as, out, (shape,))
 
 
 def _distinct(starts: list[dict[str, float]], most: int = 3) -> list[dict[str, float]]:

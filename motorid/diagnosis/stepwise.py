@@ -125,11 +125,13 @@ def _rounds(found: Climb, max_effects: int) -> Iterator[Climb]:
         if stopped:
             return
         pruned = search.exchanged(search.pruned(new, best), best)
+        pruned = pruned if pruned is new else search.brought_to_its_end(pruned)
         chosen_of = pruned if pruned.added != new.added and pruned.parent is new.parent else new
         group = group_of(chosen_of, ordered, {e.name: e.includes for e in search.effects})
         found = _with(found, pruned, chosen_of, new.parent is frontier[0], group)
         found = replace(found, remaining=judge_adequacy(pruned, search.scores(pruned)))
-        best, frontier = pruned, [pruned, *_runners_up(pruned, ordered, search.effects)]
+        others = map(search.brought_to_its_end, _runners_up(pruned, ordered, search.effects))
+        best, frontier = pruned, [pruned, *others]
         search.stages.done(f"accepted {chosen_of.added}")
         before = found
         yield found

@@ -19,7 +19,6 @@ from motorid.estimation.result import Fit
 from motorid.integrate.engine import Grid
 from motorid.integrate.rodas3 import rosenbrock_step
 from motorid.model.equations import System
-from motorid.numerics.autoregression import effective_samples
 from motorid.numerics.signals import Array
 from motorid.problem.runs import natural_sizes
 
@@ -184,10 +183,6 @@ class Tangent:
         """Sum of squares of the residuals of the outputs."""
         r = self.fit.residuals[: len(self.residual)]
         return float(r @ r)
-
-    def effective(self, residual: Array) -> float:
-        """Return how many independent samples a stacked residual is worth."""
-        return sum(effective_samples(column) for part in self.fit.problem.unstack(residual) for column in part.T)
 
     def off(self, columns: Array) -> Array:
         """Return `columns` (n, k) projected off the tangent space."""

@@ -218,12 +218,13 @@ class Machine:
         self.walk_of = lru_cache(maxsize=32)(self._walk)
         self.observation_of = lru_cache(maxsize=2)(self._observation)
 
-    def _walk(self, nq: int) -> ca.Function:
+    def _walk(self, nq: int, nonzeros: tuple[int, ...]) -> ca.Function:
         """Return CHUNK steps in a row; sensitivities go transposed, so that time comes first in memory."""
         if not nq:
             return self.functions.light.mapaccum("walk", CHUNK)
         x, u0, u1, h, p = self.functions.full.sx_in()
-        s, dp = ca.SX.sym("S", nq, self.nx), ca.SX.sym("dp", nq, self.np)
+        places = ca.Sparsity.triplet(nq, self.np, [k % nq for k in nonzeros], [k // nq for k in nonzeros])
+        s, dp = ca.SX.sym("S", nq, self.nx), ca.SX.sym("dp", places)  # a product with zeros costs as much as another
         x_next, a, b = self.functions.full(x, u0, u1, h, p)
         one = ca.Function("one", [x, s, u0, u1, h, p, dp], [x_next, ca.densify(s @ a.T + dp @ b.T)])
         return one.mapaccum("walk", CHUNK, 2, {})
@@ -241,12 +242,12 @@ class Machine:
         n = len(h)
         x, s, e = np.empty((n + 1, self.nx)), np.empty((n + 1, self.nx, nq)), np.empty((n, self.nx))
         x[0] = x0
-        steady = [_repeated(p)]
+        steady, nonzeros = [_repeated(p)], np.flatnonzero(0 if dp is None else dp)
         if dp is not None:
             s[0] = dx0
-            steady.append(_repeated(dp))  # column-major (nq, np) is dp itself
+            steady.append(_repeated(dp.ravel()[nonzeros]))  # column-major (nq, np) is dp itself
         moving, results = ([x, s, ua, ub, h], [x[1:], s[1:]]) if nq else ([x, ua, ub, h], [x[1:], e])
-        _in_chunks(self.walk_of(nq), n, moving, steady, results)
+        _in_chunks(self.walk_of(nq, tuple(nonzeros.tolist())), n, moving, steady, results)
         y, dy = self.observe(grid, x[ends], s[ends] if nq else None, p, dp)
         error = np.maximum.reduceat(np.abs(e[:ends[-1]]), ends[:-1]) if local_error else None
         return Trajectory(y, dy, x[ends], s[ends] if nq else None, error)

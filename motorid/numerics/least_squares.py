@@ -38,6 +38,10 @@ class LevenbergMarquardt:
         Stop when a step lowers the cost by less than this share.
     xtol : float
         Stop when the step is shorter than this, relative to 1 + abs(q).
+    patience : int
+        Stop when so many steps together lower the cost by less than
+    crawl : float
+        times ftol for each of them.
     damping : float
         First λ; 0 is Gauss-Newton.
     longest_step : float
@@ -53,6 +57,8 @@ class LevenbergMarquardt:
     max_iterations: int = 200
     ftol: float = 1e-9
     xtol: float = 1e-9
+    patience: int = 30
+    crawl: float = 1e4
     damping: float = 0.1
     longest_step: float = 2.0
     looks: int = 5
@@ -110,13 +116,13 @@ ENDS = {  # status and message
     "cost": ("converged", "converged: a full step no longer lowers the cost"),
     "step": ("converged", "converged: the step is below the tolerance"),
     "gradient": ("converged", "converged: the gradient is zero within rounding"),
-    "valley": ("stalled", "stalled: the cost hardly falls any more, by less than 0.03 % in 30 steps; identifiability() "
-                          "shows whether parameters are determined"),
+    "valley": ("stalled", "stalled: the cost hardly falls any more, by less than {enough:.2g} % in {o.patience} "
+                          "steps; identifiability() shows whether parameters are determined"),
     "stalled": ("stalled", "stalled: no step lowers the cost; the model may be too stiff here. Try another start or "
                            "engine"),
-    "limit": ("limit", "stopped after {} iterations; raise max_iterations or look at identifiability()"),
+    "limit": ("limit", "stopped after {o.max_iterations} iterations; raise max_iterations or look at "
+                       "identifiability()"),
 }
-VALLEY = (30, 3e5)  # so many iterations that lower the cost by less than this, times ftol, are enough
 PROMISED = 1e-3  # share of the cost that the undamped step may promise at an end without a step
 SLACK = 1.0  # λ above which a small gain does not mean the end: the step was short, not the way
 
@@ -134,7 +140,7 @@ def levenberg_marquardt(residual: Callable[[Array], Array], both: Callable[[Arra
     """
     o = options or LevenbergMarquardt()
     search = _Search(residual, both, np.asarray(q0, float), bounds, o, log)
-    history, end, (back, share) = [search.cost], "limit", VALLEY
+    history, end, enough = [search.cost], "limit", o.patience * o.crawl * o.ftol
     for iteration in range(1, o.max_iterations + 1):
         check_time()
         before = search.q
@@ -143,12 +149,12 @@ def levenberg_marquardt(residual: Callable[[Array], Array], both: Callable[[Arra
             history.append(search.cost)
             if callback is not None:
                 callback(iteration, search.cost, search.q)
-        crawls = len(history) > back and 0 <= history[-1 - back] - history[-1] < share * o.ftol * history[-1]
+        crawls = len(history) > o.patience and 0 <= history[-1 - o.patience] - history[-1] < enough * history[-1]
         if reason or crawls:
             end = reason or "valley"
             break
     status, message = ENDS[end]
-    return Solution(search.q, search.r, search.jac, status, message.format(o.max_iterations), tuple(history))
+    return Solution(search.q, search.r, search.jac, status, message.format(o=o, enough=100 * enough), tuple(history))
 
 
 class _Search:

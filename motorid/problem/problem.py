@@ -16,6 +16,7 @@ from motorid.integrate.engine import Engine, Trajectory
 from motorid.model.definition import Parameter
 from motorid.model.equations import System
 from motorid.model.model import Model
+from motorid.numerics.autoregression import effective_samples
 from motorid.numerics.least_squares import Huber
 from motorid.numerics.signals import Array
 from motorid.problem.residuals import Measured, prior_residual
@@ -257,6 +258,10 @@ class Problem:
         ends = np.cumsum([m.size for m in self.measured])
         parts = np.split(rows[:ends[-1]], ends[:-1])
         return [m.unstack(part, missing) for m, part in zip(self.measured, parts, strict=True)]
+
+    def worth(self, rows: Array) -> float:
+        """Return how many independent samples stacked residuals are worth."""
+        return sum(effective_samples(column) for part in self.unstack(rows) for column in part.T)
 
     def residual(self, q: Array) -> Array:
         """Return the whitened residual: outputs run by run, then priors, then penalties; or raise `SimulationError`."""

@@ -153,7 +153,7 @@ def test_a_refit_goes_on_beyond_its_limit_of_iterations(monkeypatch):
     monkeypatch.setattr(trial, "POLISH", replace(trial.POLISH, max_iterations=2))
     far = Problem(mi.dc_motor(R=3.0, L=5e-3, K=0.08, b=1e-4, J=8e-5), (run,))
     once = by_continuation(far, trial.POLISH, wide=False)
-    on = trial._converged(far)
+    on = trial._converged(far, trial.POLISH)
     assert once.solution.status == "limit"
     assert on.history[-1] < 0.5 * once.history[-1]
 
@@ -240,7 +240,7 @@ def test_a_refit_that_ends_where_nothing_can_be_simulated_is_none(monkeypatch):
         raise mi.SimulationError("left the finite numbers")
 
     monkeypatch.setattr(trial.Fit, "simulations", property(lost))
-    assert trial.finished(before, trial.Raced(before.problem, 1.0, 1.0, False)) is None
+    assert trial.finished(before, trial.Raced(before.problem, 1.0, 1.0, False), trial.POLISH) is None
 
 
 def test_parts_show_both_directions_and_what_is_rare():
@@ -460,9 +460,9 @@ def test_what_was_put_off_is_refitted_where_what_led_is_refused(lab, monkeypatch
 def test_what_takes_too_many_steps_is_polished_roughly(monkeypatch):
     fit = mi.fit(mi.dc_motor(), _run(mi.dc_motor(**TRUE)))
     problem = fit.problem.for_model(fit.model)
-    assert trial._polished(fit, problem).problem.accuracy is None
+    assert trial._polished(fit, problem, trial.POLISH).problem.accuracy is None
     monkeypatch.setattr(type(problem), "worth_its_steps", False)
-    rough = trial._polished(fit, problem)
+    rough = trial._polished(fit, problem, trial.POLISH)
     assert rough.problem.accuracy == held.ROUGH
     assert rough.values["K"] == pytest.approx(fit.values["K"], rel=1e-3)
 
@@ -490,6 +490,41 @@ def test_where_a_fit_is_lost_a_guess_of_its_own_starts_along_either_angle(monkey
     assert entered == [(True, False), (False, True), (True, True)]
     assert best is not None
     assert best.problem.model.values["mgl"] == pytest.approx(8, rel=0.05)
+
+
+def test_a_current_alone_that_is_lost_asks_for_one_guess_more():
+    """Where no model comes near it (a driver's ripple), every start of every effect would go its way twice."""
+    run = _run(mi.dc_motor(**TRUE))
+    noise = np.random.default_rng(1).standard_normal(run.n)
+    rippled = run.with_(outputs={**run.outputs, "i": run.outputs["i"] + 2 * np.std(run.outputs["i"]) * noise})
+    fit, starts = mi.fit(mi.dc_motor(), rippled), [{"tau_c": 1e-3}, {"tau_c": 2e-3}]
+    assert fit.nrmse["i"] > trial.LOST > fit.nrmse["omega"]
+    assert not trial.lost(fit)
+    larger = fit.model + mi.effects.coulomb
+    assert len(trial._own_starts(fit, larger, starts)) == 1
+    alone = mi.fit(mi.dc_motor(), rippled.without("omega"))
+    assert trial.lost(alone)  # nothing else tells
+    assert len(trial._own_starts(alone, larger, starts)) == 2
+    assert trial._own_starts(mi.fit(mi.dc_motor(), run), larger, starts) == []
+
+
+def test_a_refit_ends_where_a_step_tells_no_two_models_apart_and_is_led_on_where_it_is_chosen(rng):
+    """What a residual is worth tells: a thousand white samples a hundred times as much as ten."""
+    fit = mi.fit(mi.dc_motor(), _run(mi.dc_motor(**TRUE), n=1500))
+    n = fit.problem.n_outputs
+
+    def effort(residual):
+        done = SimpleNamespace(problem=fit.problem, solution=SimpleNamespace(residual=residual))
+        return trial._telling(done, trial.POLISH)
+
+    assert effort(rng.standard_normal(n)).ftol == pytest.approx(trial.TOLD / n, rel=0.3)
+    assert effort(np.sin(np.arange(n) / 300)).ftol == trial.POLISH.ftol
+    off = fit.problem.begun_at(fit.q + 0.01)
+    before = replace(fit, problem=off, q=off.start, residuals=off.residual(off.start))
+    after = trial.led_on(before)
+    assert after is not None
+    assert after.cost == pytest.approx(fit.cost, rel=1e-6)
+    assert trial.led_on(replace(fit, residuals=0.5 * fit.residuals)) is None  # what is no lower is no better
 
 
 def test_a_winding_hotter_than_any_stands_is_refused():

@@ -1,6 +1,6 @@
 """The least-squares core on the certified problems of NIST: values to six digits, standard errors to four."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import casadi as ca
@@ -163,3 +163,19 @@ def test_slopes_that_overflow_where_outputs_do_not_shorten_the_step():
     assert 0.4 < steps.q[0] < 0.5, "as near as it can come in steps that are trusted"
     over = levenberg_marquardt(residual, both, np.array([0.0]), options=LevenbergMarquardt(damping=0, longest_step=9))
     assert over.q[0] == pytest.approx(3.0, abs=1e-6), "in one step it comes to the other side"
+
+
+@pytest.mark.parametrize(("patience", "crawl", "fewer"), [(5, 3e4, True), (5, 1e2, False)])
+def test_a_descent_that_crawls_ends_when_patience_does(patience, crawl, fewer):
+    """Rosenbrock's valley, strongly damped: many small steps that all lower the cost."""
+    def both(q):
+        return np.array([10 * (q[1] - q[0] ** 2), 1 - q[0]]), np.array([[-20 * q[0], 10.0], [-1.0, 0.0]])
+
+    begin, short = np.array([-1.2, 1.0]), LevenbergMarquardt(longest_step=0.01, ftol=1e-6)
+    whole = levenberg_marquardt(lambda q: both(q)[0], both, begin, options=replace(short, patience=1000))
+    found = levenberg_marquardt(lambda q: both(q)[0], both, begin,
+                                options=replace(short, patience=patience, crawl=crawl))
+    assert (len(found.history) < len(whole.history)) is fewer
+    if fewer:
+        assert found.status == "stalled"
+        assert f"less than {100 * patience * crawl * 1e-6:.2g} % in {patience} steps" in found.message
