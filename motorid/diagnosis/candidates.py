@@ -311,7 +311,7 @@ class Search:
             smaller = simpler if alone else [*simpler, *_without(node.fit.model, e.name)]
             for model in sorted(smaller, key=lambda m: len(m.free_names)):
                 other = self.smaller(node, model)
-                if other is not None and superfluous(node, other) and preferred(other, before):
+                if other and not other.objection and superfluous(node, other) and preferred(other, before):
                     return self.pruned(other, before)
         return node
 
@@ -322,7 +322,7 @@ class Search:
         for grown, e in product((node.fit.model + e for e in self.effects if e.name in same), node.fit.model.effects):
             for model in (*self._simpler(grown, e), *_without(grown, e.name)):
                 other = self.smaller(node, model)
-                if other is not None and superfluous(node, other) and (
+                if other and not other.objection and superfluous(node, other) and (
                         (other := self.pruned(other, before)).size < node.size):
                     return other
         return node
@@ -392,12 +392,11 @@ class Search:
                              or (p.null is None and o.null is None and p.unit == o.unit)]:
                     values[p.name] = max(alike)
             self.stages.at(f"trying {model.title}")
-            fit = refit(node.fit, model, (values,))
-            if fit is None or any(objections(fit, e) for e in new):  # what takes its place must be sound
-                return None
             with contextlib.suppress(*FAILURES):
-                added = node.added if node.added in model.effect_names or not new else new[0].name
-                self.nodes[key] = node_of(fit, self.held, added, node.parent)
+                if (fit := refit(node.fit, model, (values,))) is not None:
+                    added = node.added if node.added in model.effect_names or not new else new[0].name
+                    why = next((w for e in new if (w := objections(fit, e))), "")  # what takes its place must be sound
+                    self.nodes[key] = replace(node_of(fit, self.held, added, node.parent), objection=why)
         return self.nodes.get(key)
 
 

@@ -224,8 +224,9 @@ def _bounded(fit: Fit, model: Model) -> Model:
 
 
 def _polished(fit: Fit, problem: Problem, effort: LevenbergMarquardt) -> Fit | None:
-    """Converge from a good start, channels weighed anew where the misfit has changed. Where that takes more sub-steps
-    than the samples are worth, it is done as roughly as the race."""
+    """Converge from a good start, channels weighed anew where the misfit has changed, to compare (`POLISH`) or past the
+    ripples of a narrow sgn, too (`OPTIMUM`). Where that takes more sub-steps than the samples are worth, it is done as
+    roughly as the race."""
     try:
         exact = problem.tuned(accuracy=fit.problem.accuracy)
         problem = exact if exact.refined(exact.start).worth_its_steps else problem.tuned(accuracy=ROUGH)
@@ -234,8 +235,7 @@ def _polished(fit: Fit, problem: Problem, effort: LevenbergMarquardt) -> Fit | N
             factors = misfit_over_noise(done.problem, done.solution.q)
             if max(abs(np.log(factors[c] / problem.noise_factors.get(c, 1.0))) for c in factors) > 0.1:
                 done = _converged(done.onward.tuned(noise_factors=factors), effort)
-        effort = _telling(done, effort)
-        return _fit_of(sharpened(past_ripples(done, effort), effort))
+        return _fit_of(done if effort is POLISH else sharpened(past_ripples(done, effort), effort))
     except FAILURES:  # also where the optimum lies at the edge of what can be simulated
         return None
 
@@ -243,7 +243,7 @@ def _polished(fit: Fit, problem: Problem, effort: LevenbergMarquardt) -> Fit | N
 def led_on(fit: Fit) -> Fit | None:
     """Return a refit, which ends where further steps tell no two models apart, led on to its optimum; None for none."""
     with contextlib.suppress(*FAILURES):
-        done = by_continuation(fit.problem.begun_at(fit.q), OPTIMUM, wide=False, narrow=False)
+        done = by_continuation(fit.problem.begun_at(fit.q), OPTIMUM, wide=False)
         return _fit_of(done) if done.cost < fit.cost else None
     return None
 
@@ -256,23 +256,17 @@ def _fit_of(done: Estimate) -> Fit | None:
 
 
 def _converged(problem: Problem, effort: LevenbergMarquardt) -> Estimate:
-    """Descend as far as it tells anything, and go on where that ends at its limit: what is unfinished would be judged
-    worse than it is."""
+    """Descend while a step gains `TOLD` by the samples that the residual is worth, and go on where that ends at its
+    limit: what is unfinished would be judged worse than it is."""
     history = ()
     for _ in range(GOING_ON):
         done = by_continuation(problem, effort, wide=False, narrow=False)
         done = replace(done, history=history + done.history)
-        finer = _telling(done, effort)
-        if done.solution.status != "limit" and finer.ftol > 0.5 * effort.ftol:
+        told = float(np.clip(TOLD / done.problem.worth(done.solution.residual), OPTIMUM.ftol, effort.ftol))
+        if done.solution.status != "limit" and told > 0.5 * effort.ftol:
             break
-        problem, effort, history = done.onward, finer, done.history
+        problem, effort, history = done.onward, replace(effort, ftol=told), done.history
     return done
-
-
-def _telling(done: Estimate, effort: LevenbergMarquardt) -> LevenbergMarquardt:
-    """Return the effort that goes on while a step gains `TOLD` by the samples that the residual is worth."""
-    residual = done.solution.residual[: done.problem.n_outputs]
-    return replace(effort, ftol=float(np.clip(TOLD / done.problem.worth(residual), OPTIMUM.ftol, effort.ftol)))
 
 
 def _within(model: Model, values: Mapping[str, float]) -> Model:

@@ -186,7 +186,7 @@ def _still_alike(found: Climb) -> tuple[tuple[tuple[str, ...], ...], tuple[Fit, 
     search, best, groups, rivals = found.search, found.path[-1], list[tuple[str, ...]](), tuple[Fit, ...]()
     for first, *others in (g for g in found.groups if g[0] in best.key):
         swapped = {n: search.in_place(best, first, n, bool(found.stopped)) for n in others if n not in best.key}
-        alike = {n: node for n, node in swapped.items() if node is None or not beats(best, node)}
+        alike = {n: node for n, node in swapped.items() if node is None or not (node.objection or beats(best, node))}
         if alike:
             groups.append((first, *alike))
             rivals = rivals or (best.fit, *(node.fit for node in alike.values() if node is not None))

@@ -259,9 +259,10 @@ class Problem:
         parts = np.split(rows[:ends[-1]], ends[:-1])
         return [m.unstack(part, missing) for m, part in zip(self.measured, parts, strict=True)]
 
-    def worth(self, rows: Array) -> float:
-        """Return how many independent samples stacked residuals are worth."""
-        return sum(effective_samples(column) for part in self.unstack(rows) for column in part.T)
+    def worth(self, residual: Array) -> float:
+        """Return how many independent samples a residual (n, …) is worth, priors and penalties left aside."""
+        parts = self.unstack(residual[: self.n_outputs])
+        return sum(effective_samples(column) for part in parts for column in part.T)
 
     def residual(self, q: Array) -> Array:
         """Return the whitened residual: outputs run by run, then priors, then penalties; or raise `SimulationError`."""

@@ -23,6 +23,7 @@ from motorid.diagnosis.verdict import measured_angle_remark
 from motorid.effects import LIBRARY
 from motorid.errors import OutOfTime
 from motorid.estimation.continuation import by_continuation
+from motorid.estimation.least_squares import Estimate
 from motorid.estimation.restarts import MATTERS, collapsed_again, restored
 from motorid.numerics.parallel import budget, one_thread
 from motorid.problem.problem import Problem
@@ -508,17 +509,25 @@ def test_a_current_alone_that_is_lost_asks_for_one_guess_more():
     assert trial._own_starts(mi.fit(mi.dc_motor(), run), larger, starts) == []
 
 
-def test_a_refit_ends_where_a_step_tells_no_two_models_apart_and_is_led_on_where_it_is_chosen(rng):
+def test_a_refit_ends_where_a_step_tells_no_two_models_apart_and_is_led_on_where_it_is_chosen(monkeypatch, rng):
     """What a residual is worth tells: a thousand white samples a hundred times as much as ten."""
     fit = mi.fit(mi.dc_motor(), _run(mi.dc_motor(**TRUE), n=1500))
     n = fit.problem.n_outputs
 
-    def effort(residual):
-        done = SimpleNamespace(problem=fit.problem, solution=SimpleNamespace(residual=residual))
-        return trial._telling(done, trial.POLISH)
+    used = []
 
-    assert effort(rng.standard_normal(n)).ftol == pytest.approx(trial.TOLD / n, rel=0.3)
-    assert effort(np.sin(np.arange(n) / 300)).ftol == trial.POLISH.ftol
+    def descended(problem, effort, **_):
+        used.append(effort.ftol)
+        return Estimate(fit.problem, SimpleNamespace(residual=r, status="converged", q=fit.q), ())
+
+    monkeypatch.setattr(trial, "by_continuation", descended)
+    for r, last in ((rng.standard_normal(n), trial.TOLD / n),  # noqa: B007, descended() returns it
+                    (np.sin(np.arange(n) / 300), trial.POLISH.ftol)):
+        trial._converged(fit.problem, trial.POLISH)
+        assert used[0] == trial.POLISH.ftol
+        assert used[-1] == pytest.approx(last, rel=0.3)
+        used.clear()
+    monkeypatch.undo()
     off = fit.problem.begun_at(fit.q + 0.01)
     before = replace(fit, problem=off, q=off.start, residuals=off.residual(off.start))
     after = trial.led_on(before)
