@@ -5,7 +5,6 @@ A child must predict data that it was not fitted to better, by more than chance 
 """
 
 import contextlib
-from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import BrokenExecutor
 from dataclasses import replace
@@ -41,7 +40,6 @@ SHORTLIST = 6
 PAIRS = 3  # refitted where no single effect helps
 NEAR = 0.4  # of the best score: what a common effect must reach to be refitted too
 ALWAYS = ("compliance", "speed_lag", "speed_delay", "driver_coast")  # their score at null says little
-OFTEN = 3  # that a larger model may be taken back to the smaller one that it led out of a valley
 FLAT_TOP = 0.04  # of the samples: a current that is as large so often may have a limit
 
 
@@ -123,7 +121,6 @@ class Search:
         self.stages, self.map = stages, stages.map
         self.root = node_of(fit, self.held)
         self._scores: dict[frozenset[str], list[Score]] = {}
-        self._settled: Counter[frozenset[str]] = Counter()  # how often a larger model was taken back to one
         self._always = (*ALWAYS, LIMITER) if any(map(_flat_topped, fit.problem.experiments)) else ALWAYS
         self.nodes: dict[frozenset[str], Node] = {self.root.key: self.root}
 
@@ -332,23 +329,6 @@ class Search:
         inside = [e for e in self.effects if e.name in effect.includes and e.name not in model.effect_names]
         return [m for e in inside if (m := _in_place(model, effect, e)) is not None]
 
-    def settled(self, larger: Node) -> Node | None:
-        """Return the model that `larger` was grown from, fitted anew from there, if that predicts better.
-
-        It had not come to its optimum, and what was added may have done no more than to lead it out of a valley.
-        """
-        node = larger.parent
-        if node is None or node.parent is None or self._settled[node.key] == OFTEN:
-            return None
-        self._settled[node.key] += 1
-        fit = refit(larger.fit, node.fit.model, ({n: larger.fit.values.get(n, v) for n, v in node.fit.values.items()},))
-        lower = node_of(fit, self.held, node.added, node.parent) if fit is not None else None
-        if lower is None or not beats(lower, node):
-            return None
-        self.nodes[node.key] = lower
-        self._scores.pop(node.key, None)
-        return lower
-
     def brought_to_its_end(self, node: Node) -> Node:
         """Return a model fitted on to its optimum; a refit ends where it tells no two models apart.
 
@@ -423,11 +403,9 @@ def _without(model: Model, name: str) -> list[Model]:
 def _in_place(model: Model, old: Effect, new: Effect) -> Model | None:
     """Return the model with `new` where `old` was, so that the order in which effects were found stays. None where
     another effect of the model contains `new`, too."""
-    effects = tuple(new if e is old else e for e in model.effects)
-    try:
-        return (model.without(old.name) + new).with_(effects=effects)
-    except ModelError:
-        return None
+    with contextlib.suppress(ModelError):
+        return (model.without(old.name) + new).with_(effects=tuple(new if e is old else e for e in model.effects))
+    return None
 
 
 def _unseen(score: Score) -> str:

@@ -93,18 +93,6 @@ def _begun(fit: Fit, models: Iterable[Model], start: Mapping[str, float], along:
     return None
 
 
-def promised(fit: Fit, model: Model, starts: Sequence[Mapping[str, float]]) -> float:
-    """Return the lowest cost that one undamped step from any of the starts promises `model`; infinite for none."""
-    lowest, like = np.inf, None
-    for start in starts:
-        with contextlib.suppress(*FAILURES):
-            problem = _started(fit, _bounded(fit, model), start, angular=False)
-            problem = problem.refined(problem.start) if like is None else replace(problem, _runs=like.runs)
-            like = problem
-            lowest = min(lowest, _undamped(*problem.residual_and_jacobian(problem.start)))
-    return lowest
-
-
 def _undamped(r: Array, jac: Array) -> float:
     """Return the cost that one undamped step promises."""
     triangle: Array = np.asarray(np.linalg.qr(np.column_stack([jac, r]), mode="r"))
@@ -138,16 +126,14 @@ def _released(measured: Problem) -> Estimate:
     if not all("theta" in run.outputs for run in measured.experiments):
         return QUICKLY(own)
     along = QUICKLY(measured)
-    values = along.problem.values(along.solution.q)
-    own = along.onward.for_model(own.model.start_at(values))
+    own = along.onward.for_model(own.model.start_at(along.values))
     if copies_the_angle(along.problem, along.q):
         first = {n: measured.model.parameters[n].value for n in measured.model.free_names}
         return QUICKLY(measured.for_model(own.model.start_at(first)))
-    try:
-        free = QUICKLY(own)
-    except FAILURES:
-        return along
-    return free if free.solution.history[-1] < WORSE * along.solution.history[-1] else along
+    with contextlib.suppress(*FAILURES):
+        if (free := QUICKLY(own)).cost < WORSE * along.cost:
+            return free
+    return along
 
 
 def copies_the_angle(problem: Problem, q: Array) -> bool:
@@ -169,23 +155,19 @@ def copies_the_angle(problem: Problem, q: Array) -> bool:
 
 
 def lost(fit: Fit) -> bool:
-    """Tell whether a fit is so far from its records that neither its values nor slopes there lead anywhere.
-
-    The motion tells, where it was measured: a current that no model comes near leaves the slopes along it as they are.
-    """
+    """Tell whether a fit is so far from its records that neither its values nor slopes there lead anywhere: from the
+    motion, where that was measured. A current that no model comes near leaves slopes along the motion as they are."""
     motion = [error for c, error in fit.nrmse.items() if c != "i"]
     return max(motion or fit.nrmse.values(), default=0.0) > LOST
 
 
 def _own_starts(fit: Fit, model: Model, starts: Sequence[Mapping[str, float]]) -> list[dict[str, float]]:
-    """Return `starts` with the larger model's own first guess, where the smaller one's fit is no place to begin. An arm
-    without its weight is fitted by a motor that hardly moves; from there nothing leads back. Where that fit is near the
-    motion, and far from the current alone, the best start has a guess of its own."""
-    if max(fit.nrmse.values(), default=0.0) <= LOST:
-        return []
+    """Return `starts` with the larger model's own first guess, where the smaller one's fit is no place to begin (an arm
+    without its weight is fitted by a motor that hardly moves): the best alone where only the current is far off."""
     with contextlib.suppress(*FAILURES):
-        guess = first_guess(model, fit.problem.experiments, loaded=True)
-        return [{**start, **guess} for start in (starts if lost(fit) else starts[:1])]
+        if max(fit.nrmse.values(), default=0.0) > LOST:
+            guess = first_guess(model, fit.problem.experiments, loaded=True)
+            return [{**start, **guess} for start in (starts if lost(fit) else starts[:1])]
     return []
 
 
@@ -200,11 +182,11 @@ def _started(fit: Fit, model: Model, start: Mapping[str, float], angular: bool) 
 
 def _race(problem: Problem, effort: LevenbergMarquardt) -> Estimate | None:
     """Go a few steps; None where that fails or needs more sub-steps than the samples are worth."""
-    try:
+    with contextlib.suppress(*FAILURES):
         done = by_continuation(problem.within_worth(), effort, wide=False, narrow=False)
-    except FAILURES:
-        return None
-    return replace(done, problem=done.problem.tuned(engine=problem.engine)) if done.problem.worth_its_steps else None
+        if done.problem.worth_its_steps:
+            return replace(done, problem=done.problem.tuned(engine=problem.engine))
+    return None
 
 
 def _bounded(fit: Fit, model: Model) -> Model:
@@ -224,10 +206,9 @@ def _bounded(fit: Fit, model: Model) -> Model:
 
 
 def _polished(fit: Fit, problem: Problem, effort: LevenbergMarquardt) -> Fit | None:
-    """Converge from a good start, channels weighed anew where the misfit has changed, to compare (`POLISH`) or past the
-    ripples of a narrow sgn, too (`OPTIMUM`). Where that takes more sub-steps than the samples are worth, it is done as
-    roughly as the race."""
-    try:
+    """Converge from a good start, channels weighed anew where the misfit has changed: to compare (`POLISH`), or past
+    the ripples of a narrow sgn (`OPTIMUM`); roughly where else it takes more sub-steps than samples are worth."""
+    with contextlib.suppress(*FAILURES):  # also where the optimum lies at the edge of what can be simulated
         exact = problem.tuned(accuracy=fit.problem.accuracy)
         problem = exact if exact.refined(exact.start).worth_its_steps else problem.tuned(accuracy=ROUGH)
         done = _converged(problem, effort)
@@ -236,8 +217,7 @@ def _polished(fit: Fit, problem: Problem, effort: LevenbergMarquardt) -> Fit | N
             if max(abs(np.log(factors[c] / problem.noise_factors.get(c, 1.0))) for c in factors) > 0.1:
                 done = _converged(done.onward.tuned(noise_factors=factors), effort)
         return _fit_of(done if effort is POLISH else sharpened(past_ripples(done, effort), effort))
-    except FAILURES:  # also where the optimum lies at the edge of what can be simulated
-        return None
+    return None
 
 
 def led_on(fit: Fit) -> Fit | None:
@@ -445,8 +425,14 @@ def _finish(begun: tuple[Task, Raced]) -> Fit | None:
 
 
 def _gain(task: Task) -> float:
-    """Return by how much one step promises to lower the cost, not less than nothing."""
-    return max(task.fit.cost - promised(task.fit, task.model, task.starts), 0.0)
+    """Return by how much one undamped step from any start promises to lower the cost, not less than nothing."""
+    fit, lowest, like = task.fit, task.fit.cost, None
+    for start in task.starts:
+        with contextlib.suppress(*FAILURES):
+            problem = _started(fit, _bounded(fit, task.model), start, angular=False)
+            like = problem = problem.refined(problem.start) if like is None else replace(problem, _runs=like.runs)
+            lowest = min(lowest, _undamped(*problem.residual_and_jacobian(problem.start)))
+    return fit.cost - lowest
 
 
 def widened(fit: Fit, effect: Effect, above: float = ABOVE) -> Task:

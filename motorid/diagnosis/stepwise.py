@@ -97,7 +97,7 @@ def climb(search: Search, max_effects: int, seconds: float | None = None) -> Cli
 def _rounds(found: Climb, max_effects: int) -> Iterator[Climb]:
     """Yield how far the loop is, after every step that may be the last."""
     search, best = found.search, found.path[-1]
-    frontier, before = [best], found
+    frontier = [best]
     for k in range(2 * max_effects):  # what comes in the place of two leaves room for another
         search.stages.round(min(k + 1, max_effects))
         room = max_effects - len(best.key) + len(search.root.key)  # two effects may have come at once
@@ -118,9 +118,6 @@ def _rounds(found: Climb, max_effects: int) -> Iterator[Climb]:
         new, ordered = chosen
         yield _with(found, new, new, new.parent is frontier[0], ())
         new = new if stopped else search.brought_to_its_end(new)
-        if not stopped and (lower := search.settled(new)) is not None:
-            yield from _rounds(replace(before, path=tuple(_path(lower))), max_effects)
-            return
         search.nodes |= children | {new.key: new}
         if stopped:
             return
@@ -133,7 +130,6 @@ def _rounds(found: Climb, max_effects: int) -> Iterator[Climb]:
         others = map(search.brought_to_its_end, _runners_up(pruned, ordered, search.effects))
         best, frontier = pruned, [pruned, *others]
         search.stages.done(f"accepted {chosen_of.added}")
-        before = found
         yield found
     done = found.remaining.adequate and at_noise(best)
     yield replace(found, text="stopped: what remains is noise" if done

@@ -38,10 +38,8 @@ class LevenbergMarquardt:
         Stop when a step lowers the cost by less than this share.
     xtol : float
         Stop when the step is shorter than this, relative to 1 + abs(q).
-    patience : int
-        Stop when so many steps together lower the cost by less than
-    crawl : float
-        times ftol for each of them.
+    patience, crawl : int, float
+        Stop when `patience` steps lower the cost by less than `crawl` times ftol each.
     damping : float
         First λ; 0 is Gauss-Newton.
     longest_step : float

@@ -157,7 +157,7 @@ def test_what_comes_in_the_place_of_two_leaves_room_for_another(monkeypatch):
 
     stages = SimpleNamespace(round=lambda k: None, done=lambda words: None)
     search = SimpleNamespace(root=node(), stages=stages, effects=(), nodes={}, brought_to_its_end=lambda new: new,
-                             settled=lambda new: None, pruned=lambda new, best: new, scores=lambda new: [],
+                             pruned=lambda new, best: new, scores=lambda new: [],
                              exchanged=lambda new, best: new)
     for name, instead in {"at_noise": lambda best: False, "far": lambda fit: [], "_grown": grown,
                           "_better": lambda some, best: (next(iter(some)), list(some)), "group_of": lambda *_: (),

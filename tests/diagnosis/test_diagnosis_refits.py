@@ -76,62 +76,13 @@ def test_a_pool_that_breaks_costs_no_refit_and_the_budget_holds_beside_one():
         list(stages.map(abs, [-1]))
 
 
-def test_a_model_left_in_a_valley_is_settled_before_a_larger_one_counts():
-    """What was added may have done no more than to lead it out."""
-    truth = mi.dc_motor(**TRUE) + mi.effects.coulomb(tau_c=8e-3)
-    fit = mi.fit(mi.dc_motor(), [_run(truth, k) for k in range(2)])
-    looked = search.Search(fit, None, [mi.effects.coulomb, mi.effects.speed_lag], search.Stages())
-    begun = mi.Problem(fit.model + mi.effects.coulomb, fit.problem.experiments)
-    one_step = mi.LevenbergMarquardt(max_iterations=1)
-    halted = mi.solve(begun.start_at({"R": 3.0, "tau_c": 1e-4}), solver=one_step, start="model")
-    valley = search.node_of(halted, looked.held, "coulomb", looked.root)
-    larger = search.node_of(mi.solve(begun.with_(model=begun.model + mi.effects.speed_lag)), looked.held, "speed_lag",
-                            valley)
-    assert looked.settled(valley) is None, "the model to begin with is as it was given"
-    lower = looked.settled(larger)
-    assert lower.key == valley.key
-    assert lower.parent is looked.root
-    assert lower.fit.values["tau_c"] == pytest.approx(8e-3, rel=0.02)
-    assert looked.settled(replace(larger, parent=lower)) is None
-    assert looked.settled(larger) is not None
-    assert looked.settled(larger) is None, "often enough"
-
-
-def test_a_model_is_settled_from_one_that_took_another_effect_in_its_place():
-    truth = mi.dc_motor(**TRUE) + mi.effects.coulomb(tau_c=8e-3)
-    fit = mi.fit(mi.dc_motor(), [_run(truth, k) for k in range(2)])
-    looked = search.Search(fit, None, [mi.effects.coulomb, mi.effects.brush_drop], search.Stages())
-    models = (fit.model + e for e in (mi.effects.coulomb, mi.effects.brush_drop))
-    both = [mi.solve(mi.Problem(m, fit.problem.experiments)) for m in models]
-    node = search.node_of(both[0], looked.held, "coulomb", looked.root)
-    assert looked.settled(search.node_of(both[1], looked.held, "brush_drop", node)) is None
-
-
-@one_thread
-def test_a_climb_goes_on_from_the_settled_model(monkeypatch):
-    truth = mi.dc_motor(**TRUE) + mi.effects.coulomb(tau_c=8e-3) + mi.effects.speed_lag(T_w=6e-3)
-    fit, lower = mi.fit(mi.dc_motor(), [_run(truth, k) for k in range(2)]), []
-
-    def once(self, larger):
-        if larger.parent is not self.root and not lower:
-            lower.append(replace(larger.parent, reason="settled"))
-            return lower[0]
-        return None
-
-    monkeypatch.setattr(search.Search, "settled", once)
-    found, _ = stepwise.explored(fit, None, [mi.effects.coulomb, mi.effects.speed_lag], search.Stages(), 3)
-    assert found.path[1] is lower[0]
-    assert found.path[-1].key == {"coulomb", "speed_lag"}
-    assert len(found.rounds) == 2, "the round that led back is not told"
-
-
-def test_what_was_accepted_stays_where_the_time_ends_before_it_is_settled(monkeypatch):
+def test_what_was_accepted_stays_where_the_time_ends_before_it_is_looked_at_again(monkeypatch):
     fit = mi.fit(mi.dc_motor(), [_run(mi.dc_motor(**TRUE) + mi.effects.coulomb(tau_c=8e-3), k) for k in range(2)])
 
-    def out_of_time(self, larger):
+    def out_of_time(self, *given):
         raise OutOfTime
 
-    monkeypatch.setattr(search.Search, "settled", out_of_time)
+    monkeypatch.setattr(search.Search, "exchanged", out_of_time)
     found, _ = stepwise.explored(fit, None, [mi.effects.coulomb], search.Stages(), 3)
     assert found.path[-1].key == {"coulomb"}
     assert found.stopped == trial.OUT_OF_TIME
