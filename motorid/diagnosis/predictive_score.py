@@ -129,8 +129,8 @@ def lost_channels(old: Channels, new: Channels) -> tuple[str, ...]:
 
 def _fine_enough(old: Channels, new: Channels) -> tuple[str, ...]:
     """Return the angle, where both models err by so little of it that its error is asked no more, beside others."""
-    fine = [c for c in ("theta",) if c in old and c in new and max(old[c].nrmse, new[c].nrmse) < thresholds.FINER]
-    return tuple(fine) if len(old) > len(fine) else ()
+    beside = len(old) > 1 and "theta" in old and "theta" in new
+    return ("theta",) if beside and max(old["theta"].nrmse, new["theta"].nrmse) < thresholds.FINER else ()
 
 
 def _fall(old: Channels, new: Channels) -> float | None:

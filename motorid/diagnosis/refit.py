@@ -34,7 +34,7 @@ HALVING = 2  # of the starts go on after the first steps (successive halving: Ka
 POLISH = LevenbergMarquardt(max_iterations=60, ftol=1e-3, xtol=1e-5, looks=0, patience=10, crawl=3.0)
 TOLD = 0.1  # nats that a step must gain: less tells no two models apart
 OPTIMUM = LevenbergMarquardt(max_iterations=60, ftol=1e-5, xtol=1e-5, looks=0)
-GOING_ON = 4  # times, where the last descent ends at its limit
+GOING_ON = 4  # descents at most: the last one ended at its limit, or what it left asks for a finer end
 LOST = 0.2  # NRMSE of a channel
 ROOM = 10.0  # factor beyond its grid that a shape parameter may run to
 ALONE = 0.1  # of an answer: what is left of it without the others', if these do the same

@@ -38,14 +38,14 @@ class LevenbergMarquardt:
         Stop when a step lowers the cost by less than this share.
     xtol : float
         Stop when the step is shorter than this, relative to 1 + abs(q).
-    patience, crawl : int, float
-        Stop when `patience` steps lower the cost by less than `crawl` times ftol each.
     damping : float
         First λ; 0 is Gauss-Newton.
     longest_step : float
         Largest change of one coordinate per iteration: e² on the logarithmic scale.
     looks : int
         How often a fit restarts where its end is in doubt; see `motorid.estimation.restarts`.
+    patience, crawl : int, float
+        Stop when `patience` steps lower the cost by less than `crawl` times ftol each.
 
     Examples
     --------
@@ -55,11 +55,11 @@ class LevenbergMarquardt:
     max_iterations: int = 200
     ftol: float = 1e-9
     xtol: float = 1e-9
-    patience: int = 30
-    crawl: float = 1e4
     damping: float = 0.1
     longest_step: float = 2.0
     looks: int = 5
+    patience: int = 30
+    crawl: float = 1e4
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():

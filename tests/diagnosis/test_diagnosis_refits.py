@@ -465,19 +465,19 @@ def test_a_refit_ends_where_a_step_tells_no_two_models_apart_and_is_led_on_where
     fit = mi.fit(mi.dc_motor(), _run(mi.dc_motor(**TRUE), n=1500))
     n = fit.problem.n_outputs
 
-    used = []
+    def tolerances(residual):
+        used, solution = [], SimpleNamespace(residual=residual, status="converged", q=fit.q)
 
-    def descended(problem, effort, **_):
-        used.append(effort.ftol)
-        return Estimate(fit.problem, SimpleNamespace(residual=r, status="converged", q=fit.q), ())
+        def descended(problem, effort, **_):
+            used.append(effort.ftol)
+            return Estimate(fit.problem, solution, ())
 
-    monkeypatch.setattr(trial, "by_continuation", descended)
-    for r, last in ((rng.standard_normal(n), trial.TOLD / n),  # noqa: B007, descended() returns it
-                    (np.sin(np.arange(n) / 300), trial.POLISH.ftol)):
+        monkeypatch.setattr(trial, "by_continuation", descended)
         trial._converged(fit.problem, trial.POLISH)
-        assert used[0] == trial.POLISH.ftol
-        assert used[-1] == pytest.approx(last, rel=0.3)
-        used.clear()
+        return used
+
+    assert tolerances(np.sin(np.arange(n) / 300)) == [trial.POLISH.ftol]
+    assert tolerances(rng.standard_normal(n)) == [trial.POLISH.ftol, pytest.approx(trial.TOLD / n, rel=0.3)]
     monkeypatch.undo()
     off = fit.problem.begun_at(fit.q + 0.01)
     before = replace(fit, problem=off, q=off.start, residuals=off.residual(off.start))

@@ -282,6 +282,17 @@ def test_with_and_without_a_compiler_results_are_the_same_to_the_last_bit(effect
         np.testing.assert_array_equal(compiled, machine)
 
 
+def test_slopes_by_the_initial_state_alone_need_no_parameter():
+    """Of the products with the parameters' slopes none is left."""
+    system, t = mi.dc_motor(**VALUES).system(("i", "omega")), np.arange(600) * 1e-3
+    p, grid = np.array([VALUES[n] for n in system.parameters]), Grid.of(t, np.full((600, 1), 6.0), np.array([True]))
+    slopes = np.eye(2), np.zeros((len(p), 2))
+    one, other = (Rosenbrock(c).run(system, grid, np.zeros(2), p, *slopes) for c in (True, False))
+    np.testing.assert_array_equal(one.dx, other.dx)
+    moved = Rosenbrock().run(system, grid, np.array([0.1, 0.0]), p).x - Rosenbrock().run(system, grid, np.zeros(2), p).x
+    np.testing.assert_allclose(other.dx[:, :, 0], 10 * moved, atol=1e-6)
+
+
 def test_half_the_steps_change_the_same_with_and_without_a_compiler(rng):
     system = (mi.dc_motor(**VALUES) + mi.effects.coulomb).system(("i", "omega"))
     p = np.array([{**VALUES, "tau_c": 5e-3, "sgn_width": 1e-1}[n] for n in system.parameters])
