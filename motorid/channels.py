@@ -16,8 +16,7 @@ SI = {"time": "s", "voltage": "V", "current": "A", "speed": "rad/s", "linear spe
 DIMENSIONS: Mapping[str, tuple[str, ...]] = MappingProxyType({
     "t": ("time",), "v": ("voltage", "current", "torque", "force", "ratio"), "i": ("current",),
     "omega": ("speed", "linear speed"), "theta": ("angle", "length"),
-    "v_supply": ("voltage",), "tau_load": ("torque", "force"), "temp": ("temperature",),
-})
+    "v_supply": ("voltage",), "tau_load": ("torque", "force"), "temp": ("temperature",)})
 UNITS = MappingProxyType({c: tuple(SI[d] for d in dimensions) for c, dimensions in DIMENSIONS.items()})
 
 

@@ -188,16 +188,14 @@ def _stairs(first: float, last: float, n: float, seconds: float) -> list[Segment
     return [s for v in np.linspace(first, last, int(n)) for s in _ramp(float(v), float(v), seconds)]
 
 
-def _chirp(amplitude: float, low: float, high: float, seconds: float, offset: float = 0.0) -> list[Segment]:
-    return [Segment("C", _milli(seconds), (_milli(offset), _milli(amplitude), _milli(low), _milli(high)))]
-
-
 def _prbs(amplitude: float, bit: float, seconds: float, offset: float = 0.0, seed: float = 1.0) -> list[Segment]:
     return [Segment("P", _milli(seconds), (_milli(offset), _milli(amplitude), round(bit * 1e6), int(seed)))]
 
 
 _REST = (lambda seconds: _ramp(0.0, 0.0, seconds), 1, 1)
 _WORDS = {"rest": _REST, "coast": _REST, "step": (lambda volts, seconds: _ramp(volts, volts, seconds), 2, 2),
-          "stairs": (_stairs, 4, 4), "ramp": (_ramp, 3, 3), "chirp": (_chirp, 4, 5), "prbs": (_prbs, 3, 5)}
+          "stairs": (_stairs, 4, 4), "ramp": (_ramp, 3, 3), "prbs": (_prbs, 3, 5),
+          "chirp": (lambda amplitude, low, high, seconds, offset=0.0: [
+              Segment("C", _milli(seconds), tuple(map(_milli, (offset, amplitude, low, high))))], 4, 5)}
 _EXAMPLES = {"rest": "rest:0.2", "coast": "coast:1", "step": "step:6:0.5", "stairs": "stairs:1:6:5:0.3",
              "ramp": "ramp:-3:3:2", "chirp": "chirp:4:0.5:50:5", "prbs": "prbs:6:0.05:5"}

@@ -224,8 +224,7 @@ def _options(cells: Sequence[str], room: int) -> dict[int, tuple[int, int]]:
     """Return the lines of the header and Σ lines² of the cells below for each width; to break a word costs most."""
     least = _least(cells)
     counts = ((w, [1 if len(c) <= w else -(-len(c) // w) if w < least else 1 + _filled(c, w).count("\n")
-                   for c in cells])
-              for w in range(1, max(1, min(max(map(len, cells)), room)) + 1))
+                   for c in cells]) for w in range(1, max(1, min(max(map(len, cells)), room)) + 1))
     return {w: (head, sum(n**2 for n in below) + 1000 * max(least - w, 0) ** 2) for w, (head, *below) in counts}
 
 

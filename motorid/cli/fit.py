@@ -69,8 +69,7 @@ def _show_fit(found: Fit, records: list[Experiment], notes: list[str], judged: E
     plain = found.fits == "noise" and max(found.misfit.values(), default=0.0) < PLAIN
     show(found.verdict, _held_out(found, judged) if judged else None, NRMSE,
          f"Next: {next_command('fit', '--json', 'fit.json')}\nThen: motorid export fit.json motor.casadi" if plain
-         else f"Next: {next_command('diagnose')}",
-         f"\n{found.model.title}, {_amount(records)}. {ended(found)}\n")
+         else f"Next: {next_command('diagnose')}", f"\n{found.model.title}, {_amount(records)}. {ended(found)}\n")
     say_notes(notes, "About the records")
     show(*value_tables(found))
     say_notes(remarks(found), "What to know about these values")

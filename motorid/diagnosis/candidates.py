@@ -37,7 +37,7 @@ from motorid.numerics.signals import noise_level
 from motorid.records.experiment import Experiment
 
 SHORTLIST = 6
-PAIRS = 3  # refitted where no single effect helps
+PAIRS = 3  # refitted where no single effect helps, and beside one that is refused
 NEAR = 0.4  # of the best score: what a common effect must reach to be refitted too
 ALWAYS = ("compliance", "speed_lag", "speed_delay", "driver_coast")  # their score at null says little
 FLAT_TOP = 0.04  # of the samples: a current that is as large so often may have a limit
@@ -249,7 +249,7 @@ class Search:
         """Return the judged models with a refused effect and one more, sought from where the first leads."""
         assert refused.fit is not None
         half, model = replace(node, fit=refused.fit, added=refused.effect, parent=node), refused.fit.model
-        scores = self._shortlist(half)
+        scores = self._shortlist(half)[:PAIRS]
         return self._together(node, [Task(half.fit, model + s.effect, s.effect, s.starts, s.drop) for s in scores])
 
     def _together(self, node: Node, tasks: Sequence[Task]) -> list[Node]:

@@ -129,8 +129,7 @@ def candidates(t: Array, v_max: float) -> dict[str, tuple[Array, str]]:
         "chirp": (0.7 * v_max * chirp / max(np.abs(chirp).max(), 1e-12), "a chirp"),
         "warm-up": (np.where((10 * s) % 1 < 0.8, v_max, -v_max),
                     "full voltage with short hard reversals, which also warms the winding"),
-        "small steps": (v_max * (0.5 + 0.1 * np.sign(np.sin(2 * np.pi * 10 * s + 1e-9))), "small steps at half speed"),
-    }
+        "small steps": (v_max * (0.5 + 0.1 * np.sign(np.sin(2 * np.pi * 10 * s + 1e-9))), "small steps at half speed")}
 
 
 GOALS, SHAPES = ("distinguish", "sharpen"), ("steps", "free", "multisine")

@@ -151,6 +151,5 @@ def finer(fit: Fit, channel: str) -> bool:
 def at_noise(node: Node) -> bool:
     """Tell whether a model leaves hardly more than noise, and hardly more on the held-out runs than on the others."""
     least = {c: float(np.clip(m, 1.0, LARGER)) for c, m in node.fit.misfit.items()}
-    return not far(node.fit) and all(
-        e.misfit < LARGER * least.get(c, 1.0) or (finer(node.fit, c) and e.nrmse < FINER)
-        for c, e in node.predictions.held_out.items())
+    return not far(node.fit) and all(e.misfit < LARGER * least.get(c, 1.0) or (finer(node.fit, c) and e.nrmse < FINER)
+                                     for c, e in node.predictions.held_out.items())

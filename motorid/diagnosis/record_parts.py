@@ -35,7 +35,10 @@ def affordable(fit: Fit) -> Fit:
     """Return `fit`, or the fit of the same model to less of its records if these are too long for many refits."""
     if fit.problem.initial != "auto":
         return fit
-    if (k := _every(fit)) > 1:
+    k = 1  # a power of two: every k-th sample tells as much as all do, but for noise
+    while _samples(fit.problem.experiments) >= 2 * k * ENOUGH and _predicted(fit, 2 * k):
+        k *= 2
+    if k > 1:
         fit = fitted_to(fit, [r.decimate(k).with_(meta={**r.meta, "every": k}) for r in fit.problem.experiments])
     work = sum(int(r.grid.substeps.sum()) for r in fit.problem.runs)
     return fitted_to(fit, parts_of(fit.problem.experiments, WANTED / work)) if work > AFFORDABLE else fit
@@ -53,14 +56,6 @@ def fitted_to(fit: Fit, runs: Sequence[Experiment] | None) -> Fit:
             fit.problem.with_(experiments=runs, model=fit.model, noise_factors={}), start="model")
     except (MotoridError, *FAILURES):
         return fit
-
-
-def _every(fit: Fit) -> int:
-    """Return k (a power of two) where every k-th sample tells as much as all do, but for noise."""
-    k = 1
-    while _samples(fit.problem.experiments) >= 2 * k * ENOUGH and _predicted(fit, 2 * k):
-        k *= 2
-    return k
 
 
 def _predicted(fit: Fit, k: int) -> bool:

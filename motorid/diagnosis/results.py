@@ -297,8 +297,7 @@ class Diagnosis(Shown):
             "parameters_before": dict(self.before.values), "parameters_after": dict(self.after.values),
             "per_run": self.after.per_run, "groups": [list(g) for g in self.groups],
             "suggestion": self.suggestion, "stopped": self.stopped or None,
-            "rivals": [seen(f).to_dict() for f in self.rivals], "best": Rival.of(self.best).to_dict(),
-        }
+            "rivals": [seen(f).to_dict() for f in self.rivals], "best": Rival.of(self.best).to_dict()}
 
 
 def _plain(result: object, *names: str) -> dict[str, Any]:

@@ -27,10 +27,10 @@ from motorid.diagnosis.record_parts import affordable, fitted_to, thinned_alike
 from motorid.diagnosis.refit import BEAM, BEHIND, INTERRUPTED, OUT_OF_TIME
 from motorid.diagnosis.remainder import alone_leaving_noise
 from motorid.diagnosis.results import Adequacy, Candidate, Ladder, Rung
-from motorid.diagnosis.thresholds import ELSEWHERE, MATERIAL
+from motorid.diagnosis.thresholds import ELSEWHERE, LARGER, MATERIAL
 from motorid.diagnosis.verdict import first_answer
 from motorid.errors import OutOfTime, at_least
-from motorid.estimation.fit import TOO_FAR, follows, growth, in_windows, solve
+from motorid.estimation.fit import TOO_FAR, UNFOLLOWED, follows, growth, in_windows, solve
 from motorid.estimation.least_squares import FAILURES
 from motorid.estimation.result import Fit, checked
 from motorid.model.definition import Effect
@@ -325,7 +325,7 @@ def explored(fit: Fit, validate: Sequence[Experiment] | Experiment | None, effec
         anew = climbed(parts)
         found, records = (replace(found, stopped=anew.stopped), records) if _explains(found, anew) else (anew, parts)
     last, again, reading = found.path[-1], None, None
-    if not found.stopped and records is not as_it_was and as_it_was.suits(last):
+    if not found.stopped and not last.fit.window and records.remarks != as_it_was.remarks and as_it_was.suits(last):
         again = as_it_was
     elif not found.stopped and (reading := _late_reading(found.path)):
         late = records.read(reading)
@@ -364,20 +364,20 @@ def _in_windows(found: Climb) -> Fit | None:
     """Return the first model's fit in windows, if one that it led to carries small errors too far over whole records.
 
     A pendulum upright says so only with its weight in the model; detents may be refused as the motor rested in others.
+    Where the last model loses a channel, an axis drifts: no force is known so well that its sum is the motion.
     """
     first, last = found.path[0].fit, found.path[-1].fit
     refused = [c for c in (found.rounds[-1] if found.rounds else ()) if c.fit is not None and not c.accepted]
     best = max(refused, key=lambda c: c.gain or 0.0, default=None)
     lost = not follows(last) or last.model.angle_input
     fit = last if lost else best.fit if best is not None and far(last) else None
-    if fit is None or growth(fit) < TOO_FAR:
-        return None
-    if (part := in_windows(fit, partial(solve, solver=QUICK, start="model"))) is None:
-        return None
-    try:
-        return solve(part.problem.with_(model=first.model, noise_factors={}))
-    except FAILURES:
-        return None
+    astray = (e.nrmse**2 > UNFOLLOWED and e.misfit > LARGER for e in found.path[-1].predictions.held_out.values())
+    part = in_windows(fit, partial(solve, solver=QUICK, start="model")) if fit and growth(fit) >= TOO_FAR else None
+    if part is None and (not follows(last) or any(astray)):
+        part = in_windows(first, partial(solve, solver=QUICK), drifts=True)
+    with contextlib.suppress(*FAILURES):
+        return part and solve(part.problem.with_(model=first.model, noise_factors={}))
+    return None
 
 
 def _explains(whole: Climb, windowed: Climb) -> bool:

@@ -71,8 +71,7 @@ class Table:
         lines = [tuple(self.header), *(tuple(str(cell) for cell in row) for row in self.rows)]
         widths = [max(len(line[k]) for line in lines) for k in range(len(self.header))]
         body = ["  ".join(cell.ljust(w) if k in self.left else cell.rjust(w)
-                          for k, (cell, w) in enumerate(zip(line, widths, strict=True))).rstrip()
-                for line in lines]
+                          for k, (cell, w) in enumerate(zip(line, widths, strict=True))).rstrip() for line in lines]
         body.insert(1, "  ".join("─" * w for w in widths))
         return "\n".join([part for part in (self.title, *body, self.note) if part])
 

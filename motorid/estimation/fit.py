@@ -319,26 +319,27 @@ def _said(found: Estimate, error: float) -> tuple[str, str]:
 
 
 def follows(fit: Fit) -> bool:
-    """Tell whether a fit explains three quarters of the variance of each channel."""
+    """Tell whether a fit explains three quarters of the variance of each channel, or leaves noise alone there."""
     left, whole = dict.fromkeys(fit.nrmse, 0.0), dict.fromkeys(fit.nrmse, 0.0)
     for s in fit.simulations:
         for c in (c for c in left if c in s.experiment.outputs):
             y = s.experiment.outputs[c]
             left[c] += float(np.nansum(s.residual(c) ** 2))
             whole[c] += float(np.nansum((y - np.nanmean(y)) ** 2))
-    return all(left[c] < UNFOLLOWED * whole[c] for c in left)
+    return all(left[c] < UNFOLLOWED * whole[c] or fit.misfit.get(c, np.inf) < NOISE for c in left)
 
 
-def in_windows(fit: Fit, solve: Callable[[Problem], Fit] = solve) -> Fit | None:
+def in_windows(fit: Fit, solve: Callable[[Problem], Fit] = solve, drifts: bool = False) -> Fit | None:
     """Return the fit of the same model in the longest windows that it follows, if it amplifies errors; else None.
 
     Of records that it follows as a whole only where it leaves noise there, and more than that on the whole: a detent
-    that catches the motor or not turns on what no sensor shows. `solve` fits a problem.
+    that catches the motor or not turns on what no sensor shows. `solve` fits a problem. What `drifts` sums up a small
+    error of a force instead, and only windows that it follows are asked for.
     """
     problem, model = fit.problem, fit.model.with_(angle_input=False)
-    whole = follows(fit) and not fit.model.angle_input
+    whole = follows(fit) and not fit.model.angle_input and not drifts
     longest = max(r.duration for r in problem.experiments)
-    if fit.window is not None or problem.initial != "auto" or not any(uses_angle(e) for e in fit.model.effects):
+    if fit.window is not None or problem.initial != "auto" or not (drifts or any(map(uses_angle, model.effects))):
         return None  # a torque that does not know the angle cannot drive a small error on
     if whole and (leaves_noise(fit) or growth(fit) < TOO_FAR):
         return None
@@ -348,7 +349,7 @@ def in_windows(fit: Fit, solve: Callable[[Problem], Fit] = solve) -> Fit | None:
         with contextlib.suppress(*FAILURES):
             part = solve(problem.with_(experiments=runs, model=model, noise_factors={})) if runs else None
             if part is not None and follows(part) and (not whole or leaves_noise(part)):
-                return part if whole or growth(part) > TOO_FAR else None
+                return part if whole or drifts or growth(part) > TOO_FAR else None
     return None
 
 

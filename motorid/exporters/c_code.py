@@ -116,8 +116,7 @@ def _fields(found: Fit | Model, name: str) -> dict[str, Any]:
                            " /* (current, speed, angle) at the start of the records of the fit */\n" if starts else "",
         "starts": f"const double {name}_starts[{len(starts)}][3] = {{\n{rows}\n}};\n" if starts else "",
         **{size: max(least, *(getattr(f, size)() for f in functions))
-           for size, least in (("sz_arg", 1), ("sz_res", 2), ("sz_iw", 1), ("sz_w", 1))},
-    }
+           for size, least in (("sz_arg", 1), ("sz_res", 2), ("sz_iw", 1), ("sz_w", 1))}}
 
 
 def _strings(names: Sequence[str]) -> str:

@@ -50,8 +50,7 @@ def fit_dict(fit: Fit, held_out: Evaluation | None = None) -> dict[str, Any]:
         "per_run": fit.per_run, "initial": dict(fit.initial), "window": fit.window,
         "runs": [run_dict(r) | {"nrmse": dict(e)}
                  for r, e in zip(problem.experiments, fit.evaluation.by_run, strict=True)],
-        "remarks": remarks(fit),
-    }
+        "remarks": remarks(fit)}
 
 
 def constraint_violations(fit: Fit) -> dict[str, float]:

@@ -225,10 +225,17 @@ class _Search:
         return np.clip(self.q + step, self.low, self.high) - self.q
 
 
+MANY = 24  # unknowns, of which some are likely to act on a few rows only: the first states of many runs
+ROWS = 256  # that are reduced together then, to a triangle of the unknowns that act there
+
+
 def _reduce(jac: Array, r: Array) -> tuple[Array, Array]:
     """Return R and Qᵀr of jac = QR, through the R of [J r], which needs no Q."""
-    full: Array = np.asarray(np.linalg.qr(np.column_stack([jac, r]), mode="r"))
-    n = jac.shape[1]
+    full, n = np.column_stack([jac, r]), jac.shape[1]
+    if n > MANY:
+        lots, one = ((rows, rows.any(axis=0)) for rows in np.split(full, range(ROWS, len(full), ROWS))), np.eye(n + 1)
+        full = np.concatenate([np.linalg.qr(rows[:, acts], mode="r") @ one[acts] for rows, acts in lots])
+    full = np.asarray(np.linalg.qr(full, mode="r"))
     if full.shape[0] < n:  # fewer residuals than unknowns
         full = np.vstack([full, np.zeros((n - full.shape[0], n + 1))])
     return full[:n, :n], full[:n, n]

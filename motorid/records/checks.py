@@ -8,7 +8,7 @@ from itertools import pairwise, permutations, product
 import numpy as np
 from numpy.typing import NDArray
 
-from motorid.channels import NAMES
+from motorid.channels import NAMES, channel_name
 from motorid.display.numbers import quantity
 from motorid.numerics.signals import Array, bridged, integral, noise_level, quantum
 from motorid.records.experiment import Experiment
@@ -34,8 +34,7 @@ _RATIOS = {
     1 / (2 * np.pi): "the angle in turns: units={'theta': 'rev'}",
     6.0: "the speed in rpm and the angle in degrees: units={'omega': 'rpm', 'theta': 'deg'}",
     1 / 60: "the speed in rpm and the angle in turns: units={'omega': 'rpm', 'theta': 'rev'}",
-    **dict.fromkeys((1000.0, 1e-3), "one of them in thousandths"),
-}
+    **dict.fromkeys((1000.0, 1e-3), "one of them in thousandths")}
 
 
 def check_runs(runs: Sequence[Experiment]) -> list[str]:
@@ -341,8 +340,13 @@ def angle_against_speed(run: Experiment) -> str | None:
     if len(edges) < 6 or np.isfinite(omega).sum() < 2:
         return None
     travel, turned = np.diff(theta[edges]), np.diff(integral(run.t, bridged(run.t, omega))[edges])
-    if np.std(travel) < 5 * noise_level(theta, run.t) or abs(agree := _cosine(travel, turned)) < 0.9:
+    agree = _cosine(travel, turned)
+    if np.std(travel) < 5 * noise_level(theta, run.t) or 0.5 < abs(agree) < 0.9:
         return None
+    if abs(agree) < 0.9:
+        name = channel_name("theta", run.units.get("theta", ""))
+        return (f"the {name} does not follow from the speed (correlation of their changes {agree:.2g}): do both belong "
+                "to the same axis? Leave one out, e.g. with --ignore theta.")
     if agree < 0:
         return ("the angle falls while the speed is positive: the sign of one of them is swapped. "
                 f"Turn it round, e.g. units={{'theta': '-1 {_told(run, 'theta')}'}}.")
@@ -559,8 +563,6 @@ def _holds(values: Array) -> float:
     return float(np.mean(np.diff(values)[live] == 0)) if live.sum() > 20 else 0.0
 
 
-_CHECKS: tuple[Check, ...] = (
-    signs, unsigned, unsigned_voltage, angle_against_speed, magnitudes, implied_constants, _one_column_for_two,
-    swapped_columns, _offset, _excitation, _still, _missing, _clipped, current_limit, _coarse, _spikes, _noisy, _uneven,
-    _slow_sampling, _never_settles,
-)
+_CHECKS: tuple[Check, ...] = (signs, unsigned, unsigned_voltage, angle_against_speed, magnitudes, implied_constants,
+                              _one_column_for_two, swapped_columns, _offset, _excitation, _still, _missing, _clipped,
+                              current_limit, _coarse, _spikes, _noisy, _uneven, _slow_sampling, _never_settles)

@@ -57,8 +57,7 @@ def run_from_columns(columns: Mapping[str, Array], texts: Texts, layout: Layout,
         said.append(f"left out columns of text: {', '.join(sorted(set(texts) - used))}.")
     if begun:
         meta = {**meta, "parts": sorted({*meta.get("parts", ()), *begun})}
-    facts = {**meta, "notes": said, "extra": extra,
-             "columns": {c: p.column for c, p in layout.places.items()},
+    facts = {**meta, "notes": said, "extra": extra, "columns": {c: p.column for c, p in layout.places.items()},
              "original_units": {c: p.unit.label for c, p in layout.places.items()},
              "assumed_units": [c for c, p in layout.places.items() if not p.stated]}
     units = {c: places[c].unit.symbol for c in (*inputs, *outputs)}

@@ -11,6 +11,7 @@ from motorid.records import headers
 from motorid.records.headers import Unit
 
 _PERCENT = re.compile(r"%|pct|per_?cent|prozent")
+_DRIVES = re.compile("input|output|control|command|drive")  # words of a column that may well be the drive voltage
 _MEANING = {c: f"the {name}" for c, name in NAMES.items()} | {"v": "the drive voltage"}
 Units = Mapping[str, Unit | None]
 
@@ -176,11 +177,18 @@ def _require(places: Mapping[str, Place], labels: Sequence[str]) -> None:
     one = "0.12 V" if duty and _PERCENT.search(duty[0].lower()) else "12 V"
     more = (f" '{duty[0]}' is a duty cycle; with a constant supply of, say, 12 V ('12 V' for 0 to 1, '0.12 V' for per "
             f"cent, '0.047 V' for 0 to 255): columns={{'v': '{duty[0]}'}}, units={{'v': '{one}'}}.") if duty else ""
+    if "v" in missing and (i := places.get("i", places.get("tau_load"))):
+        more += (f" If '{i.column}' is what commands a drive with a current loop of its own: "
+                 f"columns={{'v': '{i.column}'}}, with mi.torque_driven() (--drive torque).")
     used = {*duty, *(p.column for p in places.values())}
     untimed = " Samples a fixed time apart need no column of time: dt=0.001 says how far, s." * ("t" in missing)
     asked = [c for c in missing if c != "v" or not duty]
+    stated = {c: unit for c in labels for _, unit, sure in [headers.unit_in(c)] if unit and sure}
+    free = [c for c in labels if c not in used and not headers.is_reference(c)
+            and (c not in stated or stated[c].dimension in DIMENSIONS["v"])]
+    free.sort(key=lambda c: not _DRIVES.search(c.lower()))
     raise DataError(f"no column looks like {', nor like '.join(missing.values())}. "
-                    f"{_say_which(labels, asked, [c for c in labels if c not in used])}{more}{untimed}")
+                    f"{_say_which(labels, asked, free)}{more}{untimed}")
 
 
 def _say_which(labels: Sequence[str], channels: Sequence[str], free: Sequence[str]) -> str:

@@ -13,8 +13,9 @@ from typer.testing import CliRunner
 
 import motorid as mi
 from motorid.cli.app import app
+from motorid.diagnosis.candidates import Search, Stages, library
 from motorid.diagnosis.results import Candidate
-from motorid.diagnosis.stepwise import _in_windows
+from motorid.diagnosis.stepwise import _in_windows, climb
 from motorid.errors import UsageError
 from motorid.estimation.fit import TOO_FAR, follows, growth
 from motorid.records.datasets import data_path
@@ -142,10 +143,55 @@ def test_where_detents_decide_a_motor_is_followed_in_windows_if_these_leave_nois
     assert fit.values["phi"] == pytest.approx(0.4, abs=0.03)
     assert plain.window is None
     refused = Candidate("cogging", 0.8, fit=whole, gain=60.0)
-    climb: Any = SimpleNamespace(path=[SimpleNamespace(fit=plain)], rounds=[[refused]])
-    again = _in_windows(climb)  # a search that refused it since its own errors grew begins anew so
+    root = SimpleNamespace(fit=plain, predictions=SimpleNamespace(held_out={}))
+    found: Any = SimpleNamespace(path=[root], rounds=[[refused]])
+    again = _in_windows(found)  # a search that refused it since its own errors grew begins anew so
     assert again is not None
     assert again.window == pytest.approx(0.125, rel=0.01)
     assert again.model.effect_names == ()
-    climb.rounds = [[replace(refused, fit=plain)]]  # what amplifies nothing asks for none
-    assert _in_windows(climb) is None
+    found.rounds = [[replace(refused, fit=plain)]]  # what amplifies nothing asks for none
+    assert _in_windows(found) is None
+
+
+def on_a_rail(seed: int) -> mi.Experiment:
+    """A cart that a relay drives to and fro; the load along the rail is another on every day."""
+    rng, dt, fine = np.random.default_rng(seed), 8e-3, 8
+    waves, phase = 0.3 * rng.standard_normal(6), rng.uniform(0, 2 * np.pi, 6)
+    n, x, w, way, k = 2000, 0.0, 0.0, 1.0, np.arange(6)
+    t, v, y = np.arange(n) * dt, np.zeros(n), np.zeros((2, n))
+    for j in range(n):
+        way = -1.0 if x > 0.02 else 1.0 if x < -0.02 else way
+        v[j], y[:, j] = 4 * way, (w, x)
+        for _ in range(fine):
+            load = 1.0 + waves @ np.cos(40 * k * x + phase + 0.05 * k * t[j])
+            w += (v[j] - 4 * w - 0.6 * np.tanh(w / 1e-3) - load) / 2 * dt / fine
+            x += w * dt / fine
+    y += rng.normal(size=y.shape) * np.array([[2e-3], [1e-4]])
+    return mi.Experiment(t, {"v": v}, {"omega": y[0], "theta": y[1]}, units={"omega": "m/s", "theta": "m"})
+
+
+def test_an_axis_that_sums_up_every_force_is_followed_in_windows_where_held_out_runs_are_lost():
+    fitted, other = on_a_rail(1), on_a_rail(2)
+    fit = mi.fit(mi.torque_driven(axis="linear"), fitted)
+    assert fit.values["b"] > 1e3  # of an axis that never moves: its friction, summed up, would lead it away
+    whole = climb(Search(fit, [other], library(["constant_load"], ()), Stages()), 1)
+    lost = whole.path[-1].predictions.held_out["theta"]
+    assert lost.nrmse > 1  # although the fitted run is followed
+    assert follows(whole.path[-1].fit)
+    parts = _in_windows(whole)
+    assert parts is not None
+    assert parts.window == pytest.approx(0.5, rel=0.01)
+    assert parts.model.effect_names == ()
+    assert parts.values["J"] == pytest.approx(2, rel=0.15)
+    followed = climb(Search(fit, [fitted], library(["constant_load"], ()), Stages()), 1)
+    assert _in_windows(followed) is None
+
+
+def test_a_channel_that_is_all_noise_is_followed_by_a_model_that_leaves_no_more():
+    run = mi.read_csv(data_path("hidden_friction") / "run1.csv")
+    noise = 3 * np.nanstd(run.outputs["i"]) * np.random.default_rng(0).standard_normal(run.n)
+    noisy = run.with_(outputs={**run.outputs, "i": run.outputs["i"] + noise})
+    fit = mi.fit(mi.dc_motor() + mi.effects.coulomb, noisy)
+    assert fit.nrmse["i"] > 0.5
+    assert fit.misfit["i"] < 1.2
+    assert follows(fit)

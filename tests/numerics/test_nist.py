@@ -9,7 +9,7 @@ import pytest
 
 from motorid.errors import SimulationError
 from motorid.model.definition import Parameter
-from motorid.numerics.least_squares import LevenbergMarquardt, levenberg_marquardt, seen_directions
+from motorid.numerics.least_squares import MANY, ROWS, LevenbergMarquardt, _reduce, levenberg_marquardt, seen_directions
 from motorid.problem.unknowns import Scaling
 
 FOLDER = Path(__file__).parent / "nist"
@@ -179,3 +179,18 @@ def test_a_descent_that_crawls_ends_when_patience_does(patience, crawl, fewer):
     if fewer:
         assert found.status == "stalled"
         assert f"less than {100 * patience * crawl * 1e-6:.2g} % in {patience} steps" in found.message
+
+
+def test_what_acts_on_a_few_rows_only_is_reduced_there_first():
+    """First states of many runs beside a few parameters of all: the same RᵀR and RᵀQᵀr as of all rows at once."""
+    rng, runs, each = np.random.default_rng(0), MANY, ROWS // 3 + 7  # ends of runs are no ends of lots of rows
+    jac = np.hstack([rng.standard_normal((runs * each, 3)), np.zeros((runs * each, runs))])
+    for k in range(runs):
+        jac[k * each : (k + 1) * each, 3 + k] = rng.standard_normal(each)
+    jac[:, 5] = 0.0  # what acts nowhere
+    r = rng.standard_normal(runs * each)
+    triangle, rotated = _reduce(jac, r)
+    assert triangle.shape == (3 + runs, 3 + runs)
+    np.testing.assert_array_equal(triangle, np.triu(triangle))
+    np.testing.assert_allclose(triangle.T @ triangle, jac.T @ jac, atol=1e-9)
+    np.testing.assert_allclose(triangle.T @ rotated, jac.T @ r, atol=1e-9)

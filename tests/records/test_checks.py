@@ -177,6 +177,15 @@ def test_a_speed_that_is_measured_now_and_then_is_no_voltage(gain):
     assert "columns swapped" not in said(Experiment(t, {"v": v}, {"omega": shown}))
 
 
+def test_an_angle_that_is_another_axis_s_is_said(steps):
+    turned = np.cumsum(steps.outputs["omega"]) * float(np.diff(steps.t).mean())
+    own = steps.with_(outputs={**steps.outputs, "theta": turned})
+    other = own.with_(outputs={**own.outputs, "theta": 3 * np.sin(7 * steps.t)})
+    assert "does not follow from the speed" not in said(own)
+    assert "the angle does not follow from the speed" in said(other)
+    assert "--ignore theta" in said(other)
+
+
 # -- quality ------------------------------------------------------------------------------------------------
 
 

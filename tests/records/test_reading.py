@@ -191,6 +191,17 @@ def test_a_duty_and_the_names_of_control_lectures_are_met_with_the_right_line(tm
     assert "Say which is which" not in str(told.value)
 
 
+def test_without_a_voltage_what_may_drive_the_motor_is_named(tmp_path):
+    body = rows(pattern="{t:.3f},{i:.3f},{w:.3f}\n")
+    with pytest.raises(DataError, match=r"If 'current \[A\]' is what commands .*'v': 'current \[A\]'.*--drive torque"):
+        read_csv(write(tmp_path, "time [s],current [A],speed [rad/s]\n" + body))
+    with pytest.raises(DataError, match=r"e\.g\. columns={'v': 'plant_input'}") as told:  # and not the angle beside it
+        read_csv(write(tmp_path, "t,alpha,plant_input,theta\n" + rows(pattern="{t:.3f},{w:.3f},{v},{w:.3f}\n")))
+    assert "torque" not in str(told.value)
+    with pytest.raises(DataError, match=r"e\.g\. columns={'v': '\.\.\.'}"):  # what can be none is no example
+        read_csv(write(tmp_path, "t,speed_ref,speed_2 [rad/s],omega\n" + rows(pattern="{t:.3f},{v},{w:.3f},{w:.3f}\n")))
+
+
 def test_units_in_the_header_are_converted(tmp_path):
     run = read_csv(write(tmp_path, "t_ms,voltage_mV,current_mA,speed_rpm,angle_deg\n" + rows(
         pattern="{t:.3f},{v},{i:.3f},{w:.3f},{w:.3f}\n")))

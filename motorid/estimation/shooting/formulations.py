@@ -101,9 +101,8 @@ class Formulations(Shown):
         if first is None:
             return []
         model, units = first.problem.model, units_of(first.problem.experiments)
-        rows: list[Sequence[Cell]] = [
-            [n, *(value_cell(f.values[n], f.std[n], model.parameters[n].unit) if f else NONE for f in fits)]
-            for n in model.free_names]
+        rows: list[Sequence[Cell]] = [[n, *(value_cell(f.values[n], f.std[n], model.parameters[n].unit) if f else NONE
+                                            for f in fits)] for n in model.free_names]
         rows += [[f"NRMSE {channel_name(c, units.get(c, ''))}", *(percent(f.nrmse[c]) if f else NONE for f in fits)]
                  for c in first.nrmse]
         rows.append(["steady-state residual", *(percent(f.steady_residual) for f in self.all)])
