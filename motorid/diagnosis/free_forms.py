@@ -198,7 +198,7 @@ def shown(form: Form, fit: Fit, ranges: Mapping[str, tuple[float, float]]) -> bo
         form.on in ("v", "past v") or (form.carrier == "v" and form.on in ("t", *COMPUTED_INPUTS)))
     if "i" not in outputs and not of_the_drive and (form.balance in ("voltage", "both") or form.on in ("i", "v")):
         return False  # there a torque over the speed, or a loss of voltage, says the same
-    if (form.remembers or form.on == "distance") and fit.window is not None:
+    if (form.remembers or form.on in ("distance", "run")) and fit.window is not None:
         return False  # what was before a window is not known
     return form.on != "turn" or not fit.problem.linear
 

@@ -194,8 +194,8 @@ def test_runs_of_one_voltage_each_do_not_differ_from_run_to_run(lab):
     rise = 1 - np.exp(-np.arange(400) / 40)
     steps = [mi.Experiment(1e-3 * np.arange(400), {"v": np.full(400, 12.0 * k)},
                            {"omega": 100 * k * rise, "i": 5 * k - 4 * k * rise}) for k in (0.3, 0.5, 0.8)]
-    for runs, told in (runs_of(lab, {}), True), (steps, False):
-        fit = mi.fit(mi.dc_motor(), runs)
+    for runs, window, told in (runs_of(lab, {}), None, True), (runs_of(lab, {}), 0.2, False), (steps, None, False):
+        fit = mi.fit(mi.dc_motor(), runs, window=window)  # windows of a run are no runs
         span = free_forms.span_of(fit, free_forms.signals_along(fit))
         assert free_forms.shown(Form("a load", "torque", "run"), fit, span.ranges) == told
 
