@@ -339,8 +339,8 @@ def in_windows(fit: Fit, solve: Callable[[Problem], Fit] = solve, drifts: bool =
     problem, model = fit.problem, fit.model.with_(angle_input=False)
     whole = follows(fit) and not fit.model.angle_input and not drifts
     longest = max(r.duration for r in problem.experiments)
-    if fit.window is not None or problem.initial != "auto" or not (drifts or any(map(uses_angle, model.effects))):
-        return None  # a torque that does not know the angle cannot drive a small error on
+    if fit.window is not None or problem.initial != "auto" or any(map(uses_angle, model.effects)) is drifts:
+        return None  # a torque that does not know the angle cannot drive a small error on; one that does holds an axis
     if whole and (leaves_noise(fit) or growth(fit) < TOO_FAR):
         return None
     for count in WINDOWS:

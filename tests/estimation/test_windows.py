@@ -17,7 +17,7 @@ from motorid.diagnosis.candidates import Search, Stages, library
 from motorid.diagnosis.results import Candidate
 from motorid.diagnosis.stepwise import _in_windows, climb
 from motorid.errors import UsageError
-from motorid.estimation.fit import TOO_FAR, follows, growth
+from motorid.estimation.fit import TOO_FAR, follows, growth, in_windows
 from motorid.records.datasets import data_path
 from motorid.records.experiment import windows
 
@@ -57,6 +57,7 @@ def test_what_the_whole_record_gives_absurdly_windows_give_truly(records, fitted
     whole = mi.fit(PENDULUM, records[0], window=None)
     assert whole.window is None
     assert not follows(whole)
+    assert in_windows(whole, drifts=True) is None  # a weight holds it somewhere: what it sums up comes back
     assert abs(np.log(whole.values["J"] / TRUE["J"])) > 1  # this is what it is about
     assert fitted.window == pytest.approx(1, rel=0.01)
     assert fitted.fits == "noise"
