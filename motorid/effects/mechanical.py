@@ -231,7 +231,7 @@ def _driven_load(m: Equations, share, drag, torque, name: str) -> None:
 @effect(balance="transmission")
 def slip_clutch(m: Equations, r_slip=SHARE,
                 tau_slip=P(0.01, "N·m", positive=True, grid=(0.1, 0.3, 0.6), doc="largest torque that it carries"),
-                omega_slip=P(1.0, "rad/s", positive=True, grid=(0.01,), doc="slip for 3/4 of that"), b_slip=DRAG):
+                omega_slip=P(1.0, "rad/s", positive=True, grid=(0.01,), doc="slip at 3/4 of that"), b_slip=DRAG):
     """Load driven by friction that may slip, τ·tanh(Δω/ω_s): a clutch, a belt, a wheel. Awrejcewicz & Olejnik, 2005.
 
     Seen as a motor that runs up too fast with hard steps and not with soft ones: ramps and steps of several sizes.

@@ -147,12 +147,12 @@ class Identifiability(Printed):
 
     def to_dict(self) -> dict[str, Any]:
         """Return the contents of ``identifiability --json``."""
-        condition = self.condition_number
-        return {"singular_values": self.singular_values.tolist(), "rank": self.rank,
-                "condition_number": condition if np.isfinite(condition) else None, "parameters": list(self.names),
-                "structural_rank": self.structural_rank, "remedies": list(self.remedies), "std": self.std,
+        condition = self.condition_number if np.isfinite(self.condition_number) else None
+        return {"singular_values": self.singular_values.tolist(), "condition_number": condition, "rank": self.rank,
+                "structural_rank": self.structural_rank, "parameters": list(self.names),
                 "weak_directions": [{"parameters": dict(w.parameters), "text": w.text} for w in self.weak],
-                "combinations": list(self.combinations), "noise_std": self.noise_std, "text": self.text}
+                "combinations": list(self.combinations), "remedies": list(self.remedies), "std": self.std,
+                "noise_std": self.noise_std, "text": self.text}
 
     def card(self) -> Card:
         """Return the verdict, and what a fit would know of each parameter."""
