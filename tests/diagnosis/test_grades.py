@@ -259,6 +259,18 @@ def test_what_surely_predicts_far_more_than_the_best_child_is_not_forgotten(rubb
     assert _outdoing(listed, [child], root, child) is None
 
 
+def test_beside_a_refused_effect_only_the_most_promising_are_refitted(rubbing, monkeypatch):
+    """Each from where that one leads; all others would cost as much as a round."""
+    plain, check = rubbing
+    search, tried = candidates.Search(plain, check, library(None), candidates.Stages()), []
+    monkeypatch.setattr(candidates, "refits", lambda tasks, map_: [tried.append(t) for t in tasks])
+    half = mi.fit(plain.model + mi.effects.quadratic_drag, plain.problem.experiments)
+    assert search.expand_from(search.root, Candidate("quadratic_drag", 0.1, fit=half)) == []
+    assert len(tried) == candidates.PAIRS
+    assert [t.promise for t in tried] == sorted((t.promise for t in tried), reverse=True)
+    assert all(t.fit is half and t.model.effect_names == ("quadratic_drag", t.effect.name) for t in tried)
+
+
 @pytest.mark.parametrize(("size", "said"), [(4e-6, True), (4e-4, False)])
 def test_a_load_of_less_than_a_thousandth_of_the_friction_beside_it_is_no_name(rubbing, size, said):
     """A smooth sgn gets as much wrong, which a fine encoder sees."""
