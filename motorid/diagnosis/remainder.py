@@ -511,8 +511,9 @@ def _better_curve(tried: Iterable[tuple[Curve, Form]], before: Predictions, held
         for first, form in _race(found, tried, before, held):
             for grown in () if any(f.done for f in found.values()) else _grown(first, form, False, before, held):
                 found[first, form, "grid"] = grown
-    better = [f for f in found.values() if f.gained.worth_it]
-    return _best_of(better) if better else None
+    better = sorted((f for f in found.values() if f.gained.worth_it),  # the smallest on a tie, where only
+                    key=lambda f: (len(f.curve.fitted.q) if f.curve.fitted else 0, -f.gained.gain))  # comparing tells
+    return reduce(lambda a, b: b if compare(a.predictions, b.predictions).worth_it else a, better) if better else None
 
 
 def _race(found: dict[Any, Grown], tried: Iterable[tuple[Curve, Form]], before: Predictions, held: HeldOut,
@@ -561,12 +562,6 @@ def alone_leaving_noise(last: Node, root: Fit, held: HeldOut) -> FormGain | None
 def _name(fit: Fit) -> str:
     """Return a name for a curve beside those that a model has."""
     return "remainder" + "_more" * sum(n.startswith("remainder") for n in fit.model.effect_names)
-
-
-def _best_of(found: Iterable[Grown]) -> Grown:
-    """Return the best, the smallest on a tie; which of two is better only a comparison of the two tells."""
-    ordered = sorted(found, key=lambda f: (len(f.curve.fitted.q) if f.curve.fitted else 0, -f.gained.gain))
-    return reduce(lambda best, f: f if compare(best.predictions, f.predictions).worth_it else best, ordered)
 
 
 def _grown(curve: Curve, form: Form, moved: bool, before: Predictions, held: HeldOut) -> Iterator[Grown]:

@@ -103,11 +103,12 @@ def _fields(found: Fit | Model, name: str) -> dict[str, Any]:
     held = casadi_file.zoh_inputs(system.inputs, hold)
     rows = ",\n".join("  {" + ", ".join(map(repr, s.tolist())) + "}" for s in starts)
     runs = f"#define {name.upper()}_RUNS {len(starts)}\n" if starts else ""
-    checked = check(found)
+    checked = check(found)  # names of runs come from files: none may end a comment or continue a line
+    harmless = (re.sub(r"[*/\\?]{2,}", "_", printable(" ".join(line.split()))).rstrip("\\") for line in about)
     return {
         "checked": checked.text, "dt": checked.dt, "substeps": checked.substeps,
         "name": name, "NAME": name.upper(), "title": f"{name}: a motor model as C", "generated": code.dump(),
-        "about": "\n".join(f" * {_harmless(line)}".rstrip() for line in about),
+        "about": "\n".join(f" * {line}".rstrip() for line in harmless),
         "sizes": "\n".join(f"#define {name.upper()}_{k} {v}" for k, v in sizes.items()),
         "states": _strings(system.states), "inputs": _strings(system.inputs), "outputs": _strings(system.outputs),
         "parameter_names": _strings(system.parameters), "held": ", ".join(str(int(h)) for h in held),
@@ -121,11 +122,6 @@ def _fields(found: Fit | Model, name: str) -> dict[str, Any]:
 
 def _strings(names: Sequence[str]) -> str:
     return ", ".join('"' + re.sub(r'["\\?\s]', "_", printable(n)) + '"' for n in names)
-
-
-def _harmless(line: str) -> str:
-    """Return text that cannot end a comment or continue a line: names of runs come from files."""
-    return re.sub(r"[*/\\?]{2,}", "_", printable(" ".join(line.split()))).rstrip("\\")
 
 
 def _record(grid: Any, inputs: Sequence[str]) -> str:

@@ -1,6 +1,6 @@
 """Generated C, compiled once per model and kept on disk by content; never needed, only faster.
 
-The library holds CasADi's code of one step and a short driver that walks over a record of any length, so
+A library holds CasADi's code of one step, another the driver that walks over a record of any length with any step, so
 nothing is compiled again for another run length, number of sub-steps or set of free parameters.
 """
 
@@ -15,8 +15,9 @@ import subprocess
 import sys
 import tempfile
 import threading
+from collections.abc import Sequence
 from contextlib import suppress
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -30,8 +31,10 @@ FLAGS = ("-Og", "-fPIC", "-shared", *(() if sys.platform == "darwin" else ("-Wl,
          "-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math")
 GCC_FLAGS = ("--param", "ira-max-conflict-table-size=0")  # a third of the time for a step of 5,000 instructions less
 
-# What walks over a record with the code of a step, and where that ends in half the steps.
-DRIVER = "\n" + Path(__file__).with_name("driver.c").read_text("utf-8")
+# What walks over a record with the code of a step, and where that ends in half the steps: built once, and so for speed.
+DRIVER, DRIVER_FLAGS = Path(__file__).with_name("driver.c").read_text("utf-8"), ("-O3",)
+MAKER = Path(__file__).with_name("rodas3.py").read_text("utf-8")  # what a step is made by
+ABOUT = re.compile(r"^\S+ int \w+_checkout\(.*?(?=^/\* motorid_|\Z)", re.DOTALL | re.MULTILINE)  # a function: not asked
 
 
 def cache_dir() -> Path | None:
@@ -88,23 +91,19 @@ def say_once(text: str) -> None:
 
 
 def generate(functions: StepFunctions) -> str:
-    """Return the C source of the step functions and the driver."""
+    """Return the C source of the step functions."""
     code = ca.CodeGenerator("motorid_code", {"casadi_int": "long long", "with_header": False})
-    every = _, f, _ = functions.light, functions.full, functions.out
-    for function in every:
+    for function in (functions.light, functions.full, functions.out):
         code.add(function)
-    sizes = {"NX": f.size1_in(0), "NU": f.size1_in(1), "NP": f.size1_in(4), "NY": functions.out.size1_out(0)}
-    sizes |= {f"N_{n.upper()}": max(getattr(e, f"sz_{n}")() for e in every) for n in ("arg", "res", "iw", "w")}
-    return code.dump() + "".join(f"#define {k} {max(v, 1)}\n" for k, v in sizes.items()) + DRIVER
+    return ABOUT.sub("", code.dump())
 
 
-def mark_of(key: str) -> str | None:
+def mark_of(key: str, kind: str = "step") -> str | None:
     """Return the name of the library for the content `key`, by all that goes in; None without a compiler."""
-    cc = compiler()
-    if cc is None:
+    if (cc := compiler()) is None:
         return None
-    parts = "\0".join([key, *cc, *flags(), DRIVER, platform.machine(), ca.CasadiMeta.version()])
-    return "step-" + hashlib.sha256(parts.encode()).hexdigest()[:32]
+    parts = [key, *cc, *flags(), MAKER, platform.machine(), ca.CasadiMeta.version()]
+    return f"{kind}-{hashlib.sha256(chr(0).join(parts).encode()).hexdigest()[:32]}"
 
 
 def find(mark: str) -> Path | None:
@@ -125,22 +124,22 @@ def _digest(data: bytes) -> str:
     return hashlib.sha256(data).hexdigest()[:16]
 
 
-def build(functions: StepFunctions, mark: str) -> Path | None:
+def build(source: str, mark: str, *more: str) -> Path | None:
     """Compile into the cache, atomically, and return the library; None (said once) if that does not work."""
     cc, cache = compiler(), cache_dir()
     if cc is None or cache is None:
         return None
     try:
         with tempfile.TemporaryDirectory(dir=cache, ignore_cleanup_errors=True) as folder:
-            return _compiled(functions, cc[0], Path(folder), cache / mark)
+            return _compiled(source, [cc[0], *flags(), *more], Path(folder), cache / mark)
     except (OSError, subprocess.SubprocessError) as error:
         return _without(f"cannot compile: {error}")
 
 
-def _compiled(functions: StepFunctions, cc: str, here: Path, to: Path) -> Path:
+def _compiled(source: str, cc: Sequence[str], here: Path, to: Path) -> Path:
     """Return the library compiled in the folder `here`, then in `to`. Raises OSError or SubprocessError."""
-    (here / "step.c").write_text(generate(functions))
-    with subprocess.Popen([cc, *flags(), "step.c", "-o", "step.so", "-lm"], cwd=here, stdin=subprocess.DEVNULL,
+    (here / "step.c").write_text(source)
+    with subprocess.Popen([*cc, "step.c", "-o", "step.so", "-lm"], cwd=here, stdin=subprocess.DEVNULL,
                           stdout=subprocess.PIPE, stderr=subprocess.STDOUT) as process:
         hangs = threading.Timer(300, process.kill)  # with a timeout of its own it would look again every now and then
         hangs.start()
@@ -157,17 +156,29 @@ def _compiled(functions: StepFunctions, cc: str, here: Path, to: Path) -> Path:
     return path
 
 
-def load(path: Path) -> tuple[Any, Any] | None:
-    """Return the drivers in the library at `path`; None (said once) if it cannot be loaded."""
+def load(path: Path, sizes: tuple[int, ...]) -> tuple[Any, Any] | None:
+    """Return walks over a record, and in half the steps, by the library at `path`; None (said once) if that fails."""
+    mark = mark_of(f"{DRIVER}{DRIVER_FLAGS}", "driver")
+    driver = mark and (find(mark) or build(DRIVER, mark, *DRIVER_FLAGS))
+    if not driver:
+        return None
     try:
-        library = ctypes.CDLL(str(path))
-        run, halved = library.motorid_run, library.motorid_halved
+        step, walks = ctypes.CDLL(str(path)), _driver(str(driver))
+        code = [ctypes.cast(getattr(step, f"motorid_{n}"), ctypes.c_void_p) for n in ("light", "full", "out")]
     except (OSError, AttributeError) as error:
         return _without(f"cannot load {path} ({error}; MOTORID_CACHE names another folder)")
+    return partial(walks[0], *sizes, *code), partial(walks[1], *sizes[:2], code[0])
+
+
+@lru_cache(maxsize=8)
+def _driver(path: str) -> tuple[Any, Any]:
+    """Return the functions of the driver at `path`. Raises OSError or AttributeError."""
+    library = ctypes.CDLL(path)
+    run, halved = library.motorid_run, library.motorid_halved
     pointer, integer = ctypes.c_void_p, ctypes.c_longlong
     run.restype = integer
-    run.argtypes = [integer, *[pointer] * 7, integer, *[pointer] * 7]
-    halved.restype, halved.argtypes = None, [integer, *[pointer] * 8]
+    run.argtypes = [*[integer] * 4, *[pointer] * 3, integer, *[pointer] * 7, integer, *[pointer] * 7]
+    halved.restype, halved.argtypes = None, [*[integer] * 2, pointer, integer, *[pointer] * 8]
     return run, halved
 
 

@@ -1,24 +1,20 @@
+/* Walks over a record with the code of one step, of any system. Built once: as far as a step's code goes, nothing is won
+   by more than a quick look of the compiler. */
 #include <math.h>
 #include <stdlib.h>
 #include <string.h>
 
-/* Its loops over the unknowns are all that is worth a vector unit; the code of a step gains nothing, and takes longer to
-   compile. */
-#if defined(__GNUC__) && !defined(__clang__)
-#define FAST __attribute__((optimize("O3", "fp-contract=off")))
-#else
-#define FAST
-#endif
+/* Of scalar functions in CasADi: they need no work space. */
+typedef int (*code)(const double** arg, double** res, long long* iw, double* w, int mem);
 
 /* out = A S + B Pq; A and B column-major with `rows` rows, Pq by its nonzeros, mostly one per unknown. */
-FAST static void propagate(double* out, int rows, const double* A, const double* B, const double* S, long long nq,
-                           long long nz, const long long* param, const long long* unknown, const double* slope) {
-  long long j;
-  int r, c;
+static void propagate(double* out, long long rows, long long nx, const double* A, const double* B, const double* S,
+                      long long nq, long long nz, const long long* param, const long long* unknown, const double* slope) {
+  long long j, r, c;
   memset(out, 0, rows * nq * sizeof(double));
   for (r = 0; r < rows; r++) {
     double *row = out + r * nq, direct = 0;
-    for (c = 0; c < NX; c++) {
+    for (c = 0; c < nx; c++) {
       double a = A[c * rows + r];
       const double* other = S + c * nq;
       if (a != 0) for (j = 0; j < nq; j++) row[j] += a * other[j];
@@ -32,57 +28,57 @@ FAST static void propagate(double* out, int rows, const double* A, const double*
 }
 
 /* Length and inputs of sub-step s of m in interval k. */
-static void part(long long k, long long s, long long m, const double* dt, const double* u0, const double* u1,
+static void part(long long k, long long s, long long m, long long nu, const double* dt, const double* u0, const double* u1,
                  double* ua, double* ub, double* h) {
-  int c;
+  long long c;
   double share = 1.0 / m, slope;
   *h = dt[k] * share;
-  for (c = 0, u0 += k * NU, u1 += k * NU; c < NU; c++) {
+  for (c = 0, u0 += k * nu, u1 += k * nu; c < nu; c++) {
     slope = (u1[c] - u0[c]) * share; ua[c] = u0[c] + slope * s; ub[c] = ua[c] + slope;
   }
 }
 
 /* x over one record, E: the largest error estimate in each interval, without S0; returns -1, or the index of the first
    sample whose state is not finite. */
-long long motorid_run(long long n, const long long* nsub, const double* dt, const double* u0, const double* u1,
+long long motorid_run(long long nx, long long nu, long long np, long long ny, code light, code full, code out,
+                      long long n, const long long* nsub, const double* dt, const double* u0, const double* u1,
                       const double* us, const double* x0, const double* p, long long nq, const double* S0,
                       const double* Pq, double* Y, double* DY, double* X, double* DX, double* E) {
-  const double* arg[N_ARG];
-  double *res[N_RES], w[N_W], *S = malloc((2 * NX * nq + 1) * sizeof(double)), *T = S + NX * nq, *both = S;
-  casadi_int iw[N_IW];
-  long long nz = 0, *param = malloc((2 * NP * nq + 1) * sizeof(long long)), *unknown = param + NP * nq;
-  double* slope = malloc((NP * nq + 1) * sizeof(double));
-  double x[NX], xn[NX], e[NX], h, A[NX * NX], B[NX * NP], ua[NU], ub[NU], y[NY], C[NY * NX], D[NY * NP];
-  long long k, s, bad = -1;
-  memcpy(x, x0, sizeof(x));
-  if (nq) memcpy(S, S0, NX * nq * sizeof(double));
-  for (k = 0; k < NP * nq; k++) if (Pq[k % NP * nq + k / NP] != 0) {
-    param[nz] = k % NP; unknown[nz] = k / NP; slope[nz++] = Pq[k % NP * nq + k / NP];
+  const double* arg[5];
+  double *res[3], *S = malloc((2 * nx * nq + 1) * sizeof(double)), *T = S + nx * nq, *both = S;
+  long long nz = 0, *param = malloc((2 * np * nq + 1) * sizeof(long long)), *unknown = param + np * nq;
+  double* slope = malloc((np * nq + 1) * sizeof(double));
+  double pair[2 * nx], *x = pair, *xn = pair + nx, e[nx], h, A[nx * nx], B[nx * np], ua[nu], ub[nu];
+  double C[ny * nx], D[ny * np];
+  long long k, s, r, bad = -1;
+  memcpy(x, x0, nx * sizeof(double));
+  if (nq) memcpy(S, S0, nx * nq * sizeof(double));
+  for (k = 0; k < np * nq; k++) if (Pq[k % np * nq + k / np] != 0) {
+    param[nz] = k % np; unknown[nz] = k / np; slope[nz++] = Pq[k % np * nq + k / np];
   }
   for (k = 0; k < n; k++) {
-    int r, c;
-    for (r = 0; r < NX; r++) if (!isfinite(x[r])) bad = k;
+    for (r = 0; r < nx; r++) if (!isfinite(x[r])) bad = k;
     if (bad >= 0) break;
-    if (X) memcpy(X + k * NX, x, sizeof(x));
-    if (DX) memcpy(DX + k * NX * nq, S, NX * nq * sizeof(double));
-    arg[0] = x; arg[1] = us + k * NU; arg[2] = p;
-    res[0] = y; res[1] = nq ? C : 0; res[2] = nq ? D : 0;
-    motorid_out(arg, res, iw, w, 0);
-    memcpy(Y + k * NY, y, sizeof(y));
-    if (nq) propagate(DY + k * NY * nq, NY, C, D, S, nq, nz, param, unknown, slope);
+    if (X) for (r = 0; r < nx; r++) X[k * nx + r] = x[r];
+    if (DX) memcpy(DX + k * nx * nq, S, nx * nq * sizeof(double));
+    arg[0] = x; arg[1] = us + k * nu; arg[2] = p;
+    res[0] = Y + k * ny; res[1] = C; res[2] = D;
+    out(arg, res, 0, 0, 0);
+    if (nq) propagate(DY + k * ny * nq, ny, nx, C, D, S, nq, nz, param, unknown, slope);
     if (k == n - 1) break;
-    if (E) memset(E + k * NX, 0, NX * sizeof(double));
+    if (E) for (r = 0; r < nx; r++) E[k * nx + r] = 0;
     for (s = 0; s < nsub[k]; s++) {
-      part(k, s, nsub[k], dt, u0, u1, ua, ub, &h);
+      double *old = x, *before = S;
+      part(k, s, nsub[k], nu, dt, u0, u1, ua, ub, &h);
       arg[0] = x; arg[1] = ua; arg[2] = ub; arg[3] = &h; arg[4] = p;
       res[0] = xn; res[1] = nq ? A : e; res[2] = B;
       if (nq) {
-        motorid_full(arg, res, iw, w, 0);
-        propagate(T, NX, A, B, S, nq, nz, param, unknown, slope);
-        double* old = S; S = T; T = old;
-      } else motorid_light(arg, res, iw, w, 0);
-      if (E) for (r = 0; r < NX; r++) { double q = fabs(e[r]); if (!(q <= E[k * NX + r])) E[k * NX + r] = q; }
-      memcpy(x, xn, sizeof(x));
+        full(arg, res, 0, 0, 0);
+        propagate(T, nx, nx, A, B, S, nq, nz, param, unknown, slope);
+        S = T; T = before;
+      } else light(arg, res, 0, 0, 0);
+      if (E) for (r = 0; r < nx; r++) { double q = fabs(e[r]); if (!(q <= E[k * nx + r])) E[k * nx + r] = q; }
+      x = xn; xn = old;
     }
   }
   free(both); free(param); free(slope);
@@ -90,21 +86,21 @@ long long motorid_run(long long n, const long long* nsub, const double* dt, cons
 }
 
 /* Where intervals `rows` end from X in half the steps. */
-void motorid_halved(long long n, const long long* rows, const long long* nsub, const double* dt, const double* u0,
-                    const double* u1, const double* X, const double* p, double* ends) {
-  const double* arg[N_ARG];
-  double *res[N_RES], w[N_W], x[NX], h, ua[NU], ub[NU];
-  casadi_int iw[N_IW];
-  long long j, s;
-  for (j = 0; j < n; j++, ends += NX) {
+void motorid_halved(long long nx, long long nu, code light, long long n, const long long* rows, const long long* nsub,
+                    const double* dt, const double* u0, const double* u1, const double* X, const double* p,
+                    double* ends) {
+  const double* arg[5];
+  double *res[2], x[nx], e[nx], h, ua[nu], ub[nu];
+  long long j, s, r;
+  for (j = 0; j < n; j++, ends += nx) {
     long long k = rows[j], m = 2 * nsub[k];
-    memcpy(x, X + k * NX, sizeof(x));
+    for (r = 0; r < nx; r++) x[r] = X[k * nx + r];
     for (s = 0; s < m; s++) {
-      part(k, s, m, dt, u0, u1, ua, ub, &h);
+      part(k, s, m, nu, dt, u0, u1, ua, ub, &h);
       arg[0] = x; arg[1] = ua; arg[2] = ub; arg[3] = &h; arg[4] = p;
-      res[0] = ends; res[1] = 0;
-      motorid_light(arg, res, iw, w, 0);
-      memcpy(x, ends, sizeof(x));
+      res[0] = ends; res[1] = e;
+      light(arg, res, 0, 0, 0);
+      for (r = 0; r < nx; r++) x[r] = ends[r];
     }
   }
 }

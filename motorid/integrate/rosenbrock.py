@@ -176,10 +176,10 @@ class Stepper:
                 return None
             path = cc.find(mark)
             if path is None and (compiled or self._spent > PATIENCE):
-                path = cc.build(self.functions, mark)
+                path = cc.build(cc.generate(self.functions), mark)
                 self._refused = path is None
             if path is not None:
-                self._library = cc.load(path)
+                self._library = cc.load(path, self.system.sizes)
                 self._refused = self._library is None
         return self._library
 
