@@ -43,7 +43,7 @@ class FormGain:
 
 
 def better_forms(fit: Fit, rival: Fit, channels: Container[str] = CHANNELS) -> list[FormGain]:
-    """Return the forms that added to `fit` predict these channels better than `rival`, the best first.
+    """Return the forms that added to `fit` predict these channels, and all, better than `rival`, the best first.
 
     What remembers comes after a function of the present that is not surely worse.
     """
@@ -53,12 +53,13 @@ def better_forms(fit: Fit, rival: Fit, channels: Container[str] = CHANNELS) -> l
     except FAILURES:
         return []
     known, gains = predictive_score.predictions_left_out(rival, evenly=True) or {}, []
-    known = {c: e for c, e in known.items() if c in channels}
+    asked = Predictions({c: e for c, e in known.items() if c in channels}, {})
     for form, predicted in answers.items():
         if predicted is not None:
-            found = compare(Predictions(known, {}), predicted)
+            found = compare(asked, predicted)
             found = replace(found, gain=found.gain - np.log(len(linear.forms)))  # the best of many gains by chance
-            gains += [FormGain(form, found, predicted)] if found.worth_it else []
+            both = found.worth_it and compare(Predictions(known, {}), predicted).worth_it  # not to the others' cost
+            gains += [FormGain(form, found, predicted)] if both else []
     gains.sort(key=lambda g: -g.evidence.gain)
     if gains and gains[0].form.remembers:
         best = gains[0].predictions

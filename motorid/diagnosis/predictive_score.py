@@ -141,8 +141,7 @@ def _fall(old: Channels, new: Channels) -> float | None:
 
 
 def _fall_error(old: Channels, new: Channels) -> float:
-    """Return the standard error of the logarithm of `_fall`, by the jackknife over blocks (Efron & Stein, Annals of
-    Statistics 9(3), 1981)."""
+    """Return the standard error of the logarithm of `_fall`: jackknife (Efron & Stein, Ann. Statist. 9(3), 1981)."""
     both = [c for c in old if c in new]
     count = 1 + max(int(b.max()) for c in both for b in old[c].blocks)
     without = np.mean([[_log_rms(new[c], k) - _log_rms(old[c], k) for c in both] for k in range(count)], axis=1)

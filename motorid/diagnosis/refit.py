@@ -113,8 +113,7 @@ def finished(fit: Fit, best: Raced, effort: LevenbergMarquardt) -> Fit | None:
 
 
 def refit(fit: Fit, model: Model, starts: Sequence[Mapping[str, float]]) -> Fit | None:
-    """Return the best refit of `model` on the records of `fit` from several starts, at its optimum; None if none can be
-    simulated."""
+    """Return the best refit of `model` on the records of `fit` from several starts, at its optimum; None for none."""
     best = raced(fit, model, starts)
     return None if best is None else finished(fit, best, OPTIMUM)
 

@@ -369,8 +369,7 @@ class Remainder:
 
     @property
     def model(self) -> Model:
-        """The model to add the curve to, at its values beside that; without what only approximated it if it does
-        better so."""
+        """The model to add the curve to, at its values beside that; without what only approximated it, if better so."""
         return self._chosen.fit.model.start_at(self.fitted.values)
 
     @property

@@ -175,8 +175,7 @@ def check_solver(solver: Any) -> None:
 
 def _fit(problem: Problem, effort: LevenbergMarquardt, callback: Callback = None, *, auto: bool = True,
          formulation: str = "plain", began: float = 0.0) -> Fit:
-    """Fit with the orders over the angle that the model has: start values, minimum, polish. The covariance follows from
-    the Jacobian there."""
+    """Fit with the orders over the angle that the model has: start values, minimum, polish; covariance by slopes."""
     asked = problem
     if auto:
         problem = with_start_values(problem)  # first guess, race of starts

@@ -77,6 +77,19 @@ def test_no_form_predicts_coloured_noise(lab):
         assert better_forms(fit, fit) == []
 
 
+def test_a_hum_that_is_a_trifle_of_all_errors_is_no_missing_physics(lab):
+    """Alone the speed's error would fall by more than 1 %, with the current's by less; its noise is stated too small."""
+    runs = []
+    for r in runs_of(lab, {}, n=3000):
+        sigma = 0.005 * float(np.std(r.outputs["omega"]))
+        hum = 0.3 * sigma * np.sin(2 * np.pi * 50 * r.t + 1)
+        outputs = {"i": r.outputs["i"], "omega": r.outputs["omega"] + hum}
+        runs.append(r.without("theta").with_(outputs=outputs, sigma={"omega": sigma / 2.5}))
+    fit = mi.fit(mi.dc_motor(), runs[:2])
+    assert fit.misfit["omega"] > 2
+    assert judge_adequacy(node_of(fit, HeldOut.of(fit, runs[2:])), ()).adequate
+
+
 def test_adequate_although_larger_than_the_noise_says_what_was_tried(lab):
     runs = runs_of(lab, {}, seed=2, rho=0.93, size=0.02)
     found = mi.diagnose(mi.fit(mi.dc_motor(), runs[:2]), runs[2:], effects=("coulomb", "brush_drop"))
