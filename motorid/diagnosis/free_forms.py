@@ -325,8 +325,7 @@ def memories_of(form: Form, span: Span) -> Array:
     """Return lengths of memory, from two samples to all of the longest run: s, or rad for the way since a reversal."""
     longest = span.ranges["t"][1]
     speed = max(map(abs, span.ranges["omega"])) if form.on == "path" else 1.0
-    shortest = 2 * span.step
-    count = MEMORIES
+    shortest, count = 2 * span.step, MEMORIES
     if form.on == "path":  # a reversal is slow
         shortest, longest, count = 0.1 * span.step, min(longest, 100 * span.step), MEMORIES * span.finer
     elif form.carrier:  # what runs in, or warms, sums up all that was
@@ -364,8 +363,7 @@ def values_of(functions: Sequence[str], form: Form, signal: Mapping[str, Array])
     """Return functions of a form, given by their source, along one run, (N, m)."""
     z, along = signal[form.on], signal["distance" if form.on == "path" else "t"]
     first = float(z[0]) if form.on in ("past i", "past omega") else 0.0
-    width = float(signal["width"][0])
-    names = {"ca": np, "z": z, "m": SimpleNamespace(sign=lambda z: np.tanh(z / width)),
+    names = {"ca": np, "z": z, "m": SimpleNamespace(sign=lambda z: np.tanh(z / signal["width"][0])),
              "past": lambda z, length: past(z, along, length, first)}
     names |= {kind: lambda z, place, kind=kind: _stepped(kind, z, along, place, first) for kind in STEPS}
     fixed = (PLACE.sub(r"\1", f) for f in functions)

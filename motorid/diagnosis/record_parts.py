@@ -11,10 +11,13 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from motorid.diagnosis.cross_validation import ROUGH
+from motorid.effects import LIBRARY
 from motorid.errors import MotoridError
 from motorid.estimation.fit import solve
 from motorid.estimation.least_squares import FAILURES
 from motorid.estimation.result import Fit
+from motorid.estimation.start_values import with_suited_effects
 from motorid.numerics.signals import Array
 from motorid.problem.runs import angle_signal
 from motorid.records.experiment import Experiment, part_meta
@@ -40,8 +43,15 @@ def affordable(fit: Fit) -> Fit:
         k *= 2
     if k > 1:
         fit = fitted_to(fit, [r.decimate(k).with_(meta={**r.meta, "every": k}) for r in fit.problem.experiments])
-    work = sum(int(r.grid.substeps.sum()) for r in fit.problem.runs)
-    return fitted_to(fit, parts_of(fit.problem.experiments, WANTED / work)) if work > AFFORDABLE else fit
+    return fitted_to(fit, parts_of(fit.problem.experiments, WANTED / w)) if (w := _work(fit)) > AFFORDABLE else fit
+
+
+def _work(fit: Fit) -> int:
+    """Return the sub-steps of one simulation of all records, with dry friction, too: what is missing asks for more."""
+    model, runs = fit.model, fit.problem.experiments
+    model = model if "sgn_width" in model.parameters else with_suited_effects(model + LIBRARY["coulomb"], runs)
+    rubbing = fit.problem.for_model(model).tuned(accuracy=ROUGH)
+    return max(sum(int(r.grid.substeps.sum()) for r in p.runs) for p in (fit.problem, rubbing.refined(rubbing.start)))
 
 
 def thinned_alike(fit: Fit, runs: Sequence[Experiment]) -> list[Experiment]:
@@ -82,7 +92,7 @@ def fit_affordably(runs: Sequence[Experiment], fit: Callable[[Sequence[Experimen
     if parts is None:
         return fit(runs)
     few = fit(parts)
-    work = sum(int(r.grid.substeps.sum()) for r in few.problem.runs) * total / _samples(parts)
+    work = _work(few) * total / _samples(parts)
     if work <= AFFORDABLE or few.problem.initial != "auto":
         return fit(runs)
     wanted = parts_of(runs, WANTED / work)

@@ -80,10 +80,9 @@ def doubtful(found: Estimate, begin: Problem) -> bool:
 
 
 def _shifted(problem: Problem, shift: float, seed: int) -> Problem:
-    rng = np.random.default_rng(seed)
-    model = problem.model
-    names = [p.name for p in problem.unknown if p.positive and p.vary and p.name in model.parameters]
-    return problem.start_at({n: model.values[n] * float(np.exp(shift * rng.uniform(-1, 1))) for n in names})
+    rng, values = np.random.default_rng(seed), problem.model.values
+    names = (p.name for p in problem.unknown if p.positive and p.vary and p.name in values)
+    return problem.start_at({n: values[n] * float(np.exp(shift * rng.uniform(-1, 1))) for n in names})
 
 
 def restore_collapsed(found: Estimate, effort: LevenbergMarquardt) -> Estimate:

@@ -111,8 +111,7 @@ def find(mark: str) -> Path | None:
 
     It is alone in its folder, where no other is looked at; its name is a digest, as half a file would end the process.
     """
-    folder = cache_dir()
-    for path in (folder / mark).glob("*.so") if folder else ():
+    for path in (folder / mark).glob("*.so") if (folder := cache_dir()) else ():
         with suppress(OSError):
             if path.stem == _digest(path.read_bytes()):
                 return path

@@ -211,8 +211,7 @@ def _may_rest(run: Experiment, sigma: Mapping[str, float], lead: int) -> bool:
 
 def _starts_from_rest(theta: Array, t: Array, sigma: float, speed: float) -> bool:
     """Tell whether the first samples of an angle speak for rest and against `speed`, which later ones suggest."""
-    moved, after = theta[1:FIRST] - theta[0], t[1:FIRST] - t[0]
-    noise = 4 * np.sqrt(2) * sigma
+    moved, after, noise = theta[1:FIRST] - theta[0], t[1:FIRST] - t[0], 4 * np.sqrt(2) * sigma
     return bool(np.all(np.abs(moved[:2]) <= noise) and np.any(np.abs(moved - speed * after) > noise))
 
 

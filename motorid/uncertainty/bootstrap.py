@@ -184,9 +184,8 @@ def _source(fit: Fit, kind: str, block: int | None) -> _Source:
 
 def _block_length(colours: Mapping[str, Colour], residuals: Sequence[Mapping[str, Array]]) -> int:
     """Several correlation times, at least the cube root of the samples, at most a fifth of a run."""
-    n = min(len(e) for r in residuals for e in r.values())
-    times = [1.0 / max(c.effective_share, 1e-3) for c in colours.values()]
-    return int(np.clip(CORRELATIONS * max(times), np.ceil(n ** (1 / 3)), max(n // 5, 1)))
+    n, share = min(len(e) for r in residuals for e in r.values()), min(c.effective_share for c in colours.values())
+    return int(np.clip(CORRELATIONS / max(share, 1e-3), np.ceil(n ** (1 / 3)), max(n // 5, 1)))
 
 
 def _refit(source: _Source, seed: np.random.SeedSequence) -> dict[str, float] | Failure:

@@ -273,6 +273,18 @@ def test_a_long_record_is_looked_at_in_parts_and_that_is_said(lab, monkeypatch):
     assert "larger on the held-out runs" not in worse.text  # which are looked at as a whole
 
 
+@pytest.mark.parametrize(("hertz", "more"), [(60, True), (0.2, False)])
+def test_dry_friction_counts_in_the_work_of_a_long_record(hertz, more, rng):
+    """What turns round every few samples takes sub-steps with friction that the plain motor does not ask for."""
+    t = np.arange(2000) * 1e-3
+    run = mi.planned(mi.dc_motor(), t, 6 * np.sin(2 * np.pi * hertz * t), channels=("theta",))
+    theta = run.outputs["theta"]
+    run = run.with_(outputs={"theta": theta + 0.01 * np.std(theta) * rng.normal(size=run.n)}, sigma={})
+    fit = mi.fit(mi.dc_motor(), run)
+    plain = sum(int(r.grid.substeps.sum()) for r in fit.problem.runs)
+    assert (parts._work(fit) > 1.5 * plain) is more
+
+
 def test_samples_that_their_neighbours_predict_are_left_out_and_that_is_said(lab, monkeypatch):
     monkeypatch.setattr(parts, "ENOUGH", 400)
     run, check = runs_of(lab, {"coulomb": {"tau_c": 8e-3}}, ("ramps 0.3", "waves"), ("theta",), n=3200)

@@ -78,7 +78,7 @@ def test_no_form_predicts_coloured_noise(lab):
 
 
 def test_a_hum_that_is_a_trifle_of_all_errors_is_no_missing_physics(lab):
-    """Alone the speed's error would fall by more than 1 %, with the current's by less; its noise is stated too small."""
+    """Alone the speed's error would fall by more than 1 %, with the current's by less; its noise is stated too low."""
     runs = []
     for r in runs_of(lab, {}, n=3000):
         sigma = 0.005 * float(np.std(r.outputs["omega"]))
