@@ -7,6 +7,7 @@ lasts. What takes longer than a part to show (heating) is seen between the parts
 """
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,10 +49,11 @@ def affordable(fit: Fit) -> Fit:
 
 def _work(fit: Fit) -> int:
     """Return the sub-steps of one simulation of all records, with dry friction, too: what is missing asks for more."""
-    model, runs = fit.model, fit.problem.experiments
-    model = model if "sgn_width" in model.parameters else with_suited_effects(model + LIBRARY["coulomb"], runs)
-    rubbing = fit.problem.for_model(model).tuned(accuracy=ROUGH)
-    return max(sum(int(r.grid.substeps.sum()) for r in p.runs) for p in (fit.problem, rubbing.refined(rubbing.start)))
+    problems = [fit.problem]
+    with suppress(*FAILURES):  # it rubs already
+        rubbing = fit.problem.for_model(with_suited_effects(fit.model + LIBRARY["coulomb"], fit.problem.experiments))
+        problems.append(rubbing.tuned(accuracy=ROUGH).refined(rubbing.start))
+    return max(sum(int(run.grid.substeps.sum()) for run in problem.runs) for problem in problems)
 
 
 def thinned_alike(fit: Fit, runs: Sequence[Experiment]) -> list[Experiment]:
@@ -88,12 +90,10 @@ def _predicted(fit: Fit, k: int) -> bool:
 def fit_affordably(runs: Sequence[Experiment], fit: Callable[[Sequence[Experiment]], Fit]) -> Fit:
     """Return the fit of `runs` to begin a diagnosis with: of parts, where to fit all would take long."""
     total = _samples(runs)
-    parts = parts_of(runs, FEW / total) if total > LONG else None
-    if parts is None:
+    if (parts := parts_of(runs, FEW / total) if total > LONG else None) is None:
         return fit(runs)
     few = fit(parts)
-    work = _work(few) * total / _samples(parts)
-    if work <= AFFORDABLE or few.problem.initial != "auto":
+    if (work := _work(few) * total / _samples(parts)) <= AFFORDABLE or few.problem.initial != "auto":
         return fit(runs)
     wanted = parts_of(runs, WANTED / work)
     return few if wanted is None or len(wanted) == len(parts) else fit(wanted)

@@ -283,6 +283,8 @@ def test_dry_friction_counts_in_the_work_of_a_long_record(hertz, more, rng):
     fit = mi.fit(mi.dc_motor(), run)
     plain = sum(int(r.grid.substeps.sum()) for r in fit.problem.runs)
     assert (parts._work(fit) > 1.5 * plain) is more
+    rubs = fit.problem.for_model(fit.model + mi.effects.lugre)  # beside which there is no dry friction
+    assert parts._work(replace(fit, problem=rubs)) == sum(int(r.grid.substeps.sum()) for r in rubs.runs)
 
 
 def test_samples_that_their_neighbours_predict_are_left_out_and_that_is_said(lab, monkeypatch):
