@@ -504,14 +504,14 @@ def _revised(best: Grown, held: HeldOut, times: int = FURTHER) -> Grown:
 
 
 def _better_curve(tried: Iterable[tuple[Curve, Form]], before: Predictions, held: HeldOut) -> Grown | None:
-    """Return the best of curves, each with a form more; None where none does better."""
+    """Return the best of curves, each with a form more, the smallest on a tie; None where none does better."""
     found = dict[Any, Grown]()
     with contextlib.suppress(OutOfTime):  # what is tried takes fits to find, too
         for first, form in _race(found, tried, before, held):
             for grown in () if any(f.done for f in found.values()) else _grown(first, form, False, before, held):
                 found[first, form, "grid"] = grown
-    better = sorted((f for f in found.values() if f.gained.worth_it),  # the smallest on a tie, where only
-                    key=lambda f: (len(f.curve.fitted.q) if f.curve.fitted else 0, -f.gained.gain))  # comparing tells
+    better = sorted((f for f in found.values() if f.gained.worth_it),
+                    key=lambda f: (len(f.curve.fitted.q) if f.curve.fitted else 0, -f.gained.gain))
     return reduce(lambda a, b: b if compare(a.predictions, b.predictions).worth_it else a, better) if better else None
 
 

@@ -34,7 +34,7 @@ GCC_FLAGS = ("--param", "ira-max-conflict-table-size=0")  # a third of the time 
 # What walks over a record with the code of a step, and where that ends in half the steps: built once, and so for speed.
 DRIVER, DRIVER_FLAGS = Path(__file__).with_name("driver.c").read_text("utf-8"), ("-O3",)
 MAKER = Path(__file__).with_name("rodas3.py").read_text("utf-8")  # what a step is made by
-ABOUT = re.compile(r"^\S+ int \w+_checkout\(.*?(?=^/\* motorid_|\Z)", re.DOTALL | re.MULTILINE)  # a function: not asked
+ABOUT = re.compile(r"^\S+ int \w+_checkout\(.*?(?=^/\* motorid_|\Z)", re.DOTALL | re.MULTILINE)  # what nobody asks
 
 
 def cache_dir() -> Path | None:

@@ -94,6 +94,32 @@ def test_a_damaged_library_is_replaced_and_not_loaded(cache, builds, damage):
 
 
 @needs_compiler
+def test_a_damaged_driver_is_replaced_and_not_loaded(cache, builds):
+    first = simulate().x
+    (path,) = cache.glob("driver-*/*.so")
+    data = path.read_bytes()
+    path.unlink()
+    path.write_bytes(data[: len(data) // 2])
+    forget()
+    assert np.array_equal(simulate().x, first)
+    assert [p.read_bytes() for p in cache.glob("driver-*/*.so")] == [data]
+    assert len(builds) == 1
+
+
+@needs_compiler
+def test_a_step_holds_its_functions_alone_and_goes_with_what_made_it(cache, builds, monkeypatch):
+    source = cc.generate(rodas3.StepFunctions(mi.dc_motor().system(("i", "omega"))))
+    assert all(f"int motorid_{name}(" in source for name in ("light", "full", "out"))
+    assert "checkout" not in source
+    assert "sparsity" not in source
+    simulate()
+    forget()
+    monkeypatch.setattr(cc, "MAKER", cc.MAKER + "# another method")
+    simulate()
+    assert len(builds) == 2
+
+
+@needs_compiler
 def test_two_processes_at_once(cache):
     code = """
 import numpy as np, time, sys, motorid as mi
