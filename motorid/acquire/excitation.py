@@ -20,7 +20,6 @@ bit>,<seed>``. All numbers are whole, so device and computer mean the same progr
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import accumulate
@@ -71,17 +70,14 @@ class Segment:
             f1, f2 = rest[0] / 1e3, rest[1] / 1e3
             return (a + b * np.sin(2 * np.pi * (f1 * t + (f2 - f1) * t * t / (2 * T)))) / 1e3
         which = (np.round(t * 1e6).astype(np.int64) // rest[0])
-        bits = np.fromiter(lfsr_bits(rest[1], int(which[-1]) + 1), dtype=np.int64)
-        return (a + np.where(bits[which] > 0, b, -b)) / 1e3
+        return (a + np.where(lfsr_bits(rest[1], int(which[-1]) + 1)[which] > 0, b, -b)) / 1e3
 
 
-def lfsr_bits(seed: int, n: int) -> Iterator[int]:
-    """Yield n bits of the maximum-length sequence of x¹⁵ + x¹⁴ + 1 (period 32767)."""
-    state = seed
-    for _ in range(n):
-        yield state & 1
-        bit = (state ^ (state >> 1)) & 1
-        state = (state >> 1) | (bit << 14)
+def lfsr_bits(seed: int, n: int) -> NDArray[np.int64]:
+    """Return n bits of the maximum-length sequence of x¹⁵ + x¹⁴ + 1 (period 32767)."""
+    from scipy.signal import max_len_seq  # slow to import, and not needed before
+
+    return max_len_seq(15, [seed >> k & 1 for k in range(15)], n, [1])[0].astype(np.int64)
 
 
 _volts = lru_cache(maxsize=4)(Segment.volts)
@@ -188,13 +184,11 @@ def _stairs(first: float, last: float, n: float, seconds: float) -> list[Segment
     return [s for v in np.linspace(first, last, int(n)) for s in _ramp(float(v), float(v), seconds)]
 
 
-def _prbs(amplitude: float, bit: float, seconds: float, offset: float = 0.0, seed: float = 1.0) -> list[Segment]:
-    return [Segment("P", _milli(seconds), (_milli(offset), _milli(amplitude), round(bit * 1e6), int(seed)))]
-
-
 _REST = (lambda seconds: _ramp(0.0, 0.0, seconds), 1, 1)
 _WORDS = {"rest": _REST, "coast": _REST, "step": (lambda volts, seconds: _ramp(volts, volts, seconds), 2, 2),
-          "stairs": (_stairs, 4, 4), "ramp": (_ramp, 3, 3), "prbs": (_prbs, 3, 5),
+          "stairs": (_stairs, 4, 4), "ramp": (_ramp, 3, 3),
+          "prbs": (lambda amplitude, bit, seconds, offset=0.0, seed=1.0: [
+              Segment("P", _milli(seconds), (*map(_milli, (offset, amplitude)), round(bit * 1e6), int(seed)))], 3, 5),
           "chirp": (lambda amplitude, low, high, seconds, offset=0.0: [
               Segment("C", _milli(seconds), tuple(map(_milli, (offset, amplitude, low, high))))], 4, 5)}
 _EXAMPLES = {"rest": "rest:0.2", "coast": "coast:1", "step": "step:6:0.5", "stairs": "stairs:1:6:5:0.3",

@@ -183,7 +183,7 @@ def _grid(parameters: Sequence[Parameter], sizes: Mapping[str, float]) -> Iterat
 @cache
 def quiet_seeds(n: int) -> list[int]:
     """Return seeds of `n` bits whose running sum, as ±1, stays small; the best first."""
-    bits = np.fromiter(lfsr_bits(1, 2 * PERIOD), dtype=np.int64)
+    bits = lfsr_bits(1, 2 * PERIOD)
     total = np.concatenate([[0], np.cumsum(2 * bits - 1)])
     reach = np.zeros(PERIOD, int)
     for k in range(1, n + 1):

@@ -9,26 +9,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from html import escape
+from pathlib import Path
 
 from motorid.display.numbers import with_error
 
-_STYLE = """
-.motorid{font-size:13px;line-height:1.45;max-width:60rem}
-.motorid table{border-collapse:collapse;margin:.5em 0 .5em 0;font-variant-numeric:tabular-nums}
-.motorid caption{text-align:left;padding:.2em 0}
-.motorid table th,.motorid table td{text-align:left!important;padding:.2em .9em .2em 0}
-.motorid table th,.motorid table td{border-bottom:1px solid rgba(128,128,128,.35)}
-.motorid thead th{border-bottom:2px solid rgba(128,128,128,.6);font-weight:600}
-.motorid tbody th{font-weight:600}
-.motorid .flag{border-radius:.7em;padding:.05em .6em;font-size:12px;font-weight:600;white-space:nowrap}
-.motorid .muted{opacity:.75}
-.motorid p{margin:.35em 0}
-.motorid .scroll{overflow-x:auto}
-@media screen and (max-width:40rem){.motorid .wordy,.motorid .wordy :is(caption,thead,tbody){display:block}
-.motorid .wordy tr{display:flex;flex-wrap:wrap}
-.motorid .wordy tr>*{flex:1 1 0;min-width:0;border:0}.motorid .wordy tr>:first-child{flex-grow:2}
-.motorid .wordy tr>:last-child{flex:1 0 100%}}
-"""
+STYLE = Path(__file__).with_name("templates") / "card.css"
 # Words first, colour second: each pair has a contrast of 5.5 or more, on a light page and on a dark one.
 COLOURS = {"good": ("#0b5a26", "#d7f5df"), "note": ("#6b4100", "#fdf0c8"), "bad": ("#8f1220", "#ffe3e4"),
            "plain": ("#3a444f", "#e6eaef")}
@@ -132,7 +117,7 @@ class Card:
     def to_html(self) -> str:
         """Return HTML that stands by itself, readable on light and dark pages."""
         flags = " ".join(f.to_html() for f in self.flags)
-        parts = [f'<div class="motorid">\n<style>{_STYLE}</style>',
+        parts = [f'<div class="motorid">\n<style>\n{STYLE.read_text("utf-8")}</style>',
                  f"<p><strong>{escape(self.title)}</strong> {flags}</p>"]
         parts += [f"<p>{escape(t)}</p>" for t in self.text if t]
         parts += [t.to_html() for t in self.tables]

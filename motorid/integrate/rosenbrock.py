@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Any
+from weakref import WeakValueDictionary
 
 import casadi as ca
 import numpy as np
@@ -193,9 +194,7 @@ class Stepper:
         return Trajectory(y, dy, x, dx, error), int(bad)
 
 
-@lru_cache(maxsize=512)
-def _stepper_of_content(key: str) -> list[Stepper]:
-    return []
+_known: WeakValueDictionary[str, Stepper] = WeakValueDictionary()  # by content, as long as one of `stepper` is
 
 
 @lru_cache(maxsize=1024)
@@ -203,10 +202,8 @@ def stepper(system: System) -> Stepper:
     """Return the stepper of `system`, one per content in this process."""
     text = "\0".join([system.rhs.serialize(), system.out.serialize(), str(system.stored)])
     key = hashlib.sha256(text.encode("utf-8", "surrogateescape")).hexdigest()
-    slot = _stepper_of_content(key)
-    if not slot:
-        slot.append(Stepper(system, key))
-    return slot[0]
+    _known[key] = found = _known.get(key) or Stepper(system, key)
+    return found
 
 
 class Machine:

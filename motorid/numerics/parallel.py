@@ -183,14 +183,10 @@ class Parcel:
         data = pickle.dumps(content, protocol=pickle.HIGHEST_PROTOCOL)
         return Parcel(hashlib.sha256(data).hexdigest(), data)
 
+    @lru_cache(maxsize=8)  # noqa: B019
     def open(self) -> Any:
         """Return the content; one object per process, so it must not be changed."""
-        return _opened(self)
-
-
-@lru_cache(maxsize=8)
-def _opened(parcel: Parcel) -> Any:
-    return pickle.loads(parcel.data)
+        return pickle.loads(self.data)
 
 
 class Task(NamedTuple):

@@ -26,6 +26,7 @@ from motorid.records.experiment import Experiment, between_pauses, units_of
 
 SUBSTEPS = 10  # per sample: what needs more cannot be seen in these samples, unless it is cheap
 CHEAP = 60_000  # steps of integration
+UNTOUCHED = {"width": ("integrator", "measured"), "engine": ("outputs", "system", "unknowns", "measured")}
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,12 +76,13 @@ class Problem:
         runs = (self.experiments,) if isinstance(self.experiments, Experiment) else tuple(self.experiments)
         if not runs or not all(isinstance(r, Experiment) for r in runs):
             raise UsageError("a problem needs at least one Experiment: runs = mi.read_runs('run*.csv').")
-        object.__setattr__(self, "experiments", tuple(_without_empty(r) for r in runs))
+        measured = ([c for c, y in r.outputs.items() if np.isfinite(y[0]) or np.isfinite(y).any()] for r in runs)
+        object.__setattr__(self, "experiments", tuple(map(_with_only, runs, measured)))
         among(self.weights, ("noise", "rms"), "weights")
         if not self.outputs:
             raise ModelError("none of the channels that the model shows was measured; a fit needs at least "
                              "one of i, omega, theta (torque_driven: omega or theta).")
-        object.__setattr__(self, "experiments", tuple(_shown(r, self.outputs) for r in self.experiments))
+        object.__setattr__(self, "experiments", tuple(_with_only(r, self.outputs) for r in self.experiments))
         for name in self.priors:
             among(name, self.model.parameters, "parameter", where="prior: ")
             if not (np.isfinite(self.priors[name]).all() and self.priors[name][1] > 0):
@@ -333,23 +335,17 @@ class Problem:
     def tuned(self, **fields: Any) -> Problem:
         """Return the problem with other `noise_factors`, another `width` …; the records stay as prepared."""
         other = replace(self, **{"_runs": self.runs, **fields})
-        return self._lending(other, ("integrator", "measured")) if fields.keys() == {"width"} else other
+        return self._lending(other, UNTOUCHED.get("".join(fields), ()))
 
     def with_(self, **fields: Any) -> Problem:
         """Return a copy with some fields changed, e.g. ``with_(model=…)``."""
         return replace(self, **{"_runs": None, **fields})
 
 
-def _shown(run: Experiment, outputs: Sequence[str]) -> Experiment:
-    """Return a run with the channels that the model shows: a torque-driven one has no current."""
-    unseen = [c for c in run.channels if c not in outputs]
-    return run.without(*unseen) if unseen and len(unseen) < len(run.channels) else run
-
-
-def _without_empty(run: Experiment) -> Experiment:
-    """Leave out channels that have not a single sample."""
-    empty = [c for c, y in run.outputs.items() if not (np.isfinite(y[0]) or np.isfinite(y).any())]
-    return run.without(*empty) if empty else run
+def _with_only(run: Experiment, channels: Sequence[str]) -> Experiment:
+    """Return a run with these channels alone, if it has any of them."""
+    gone = [c for c in run.channels if c not in channels]
+    return run.without(*gone) if gone and len(gone) < len(run.channels) else run
 
 
 def as_problem(model: Model, runs: Sequence[Experiment] | Experiment, **fields: Any) -> Problem:

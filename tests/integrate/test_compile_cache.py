@@ -29,7 +29,7 @@ def cache(tmp_path, monkeypatch):
 
 def forget():
     rb.stepper.cache_clear()
-    rb._stepper_of_content.cache_clear()
+    rb._known.clear()
 
 
 @pytest.fixture
