@@ -41,6 +41,8 @@ def first_guess(model: Model, runs: Sequence[Experiment], *, loaded: bool = Fals
         found = _torque_driven(signals, held, loads)
     elif any("i" in s and "omega" in s for s in signals):
         found = _full([s for s in signals if "i" in s and "omega" in s], held, loads)
+        if _rings(found, signals):  # a current that is not the motor's
+            found = _without_current([s for s in signals if "omega" in s], held, loads, back_emf)
     elif any("omega" in s for s in signals):
         found = _without_current([s for s in signals if "omega" in s], held, loads, back_emf)
     else:
@@ -112,6 +114,12 @@ def _full(signals: list[dict], held: Mapping[str, float], loads: _Loads) -> dict
     mechanical = [_windowed([s["omega"], s["omega_dt"], *loads.integrals(s, {**found, "b": 0.0, "J": 1.0})],
                             found["K"] * s["i_dt"]) for s in signals]
     return found | loads.split(_solve(mechanical, ["J", "b", *loads.loads], held))
+
+
+def _rings(motor: Mapping[str, float], signals: list[dict]) -> bool:
+    """Tell whether a motor rings more than once per sample, and on beyond it."""
+    dt, (r, k, b, j) = min(float(np.median(np.diff(s["t"]))) for s in signals), (motor[n] for n in "RKbJ")
+    return (k * dt / np.pi) ** 2 > (lj := motor["L"] * j) and (r * j + b * motor["L"]) * dt < 2 * lj
 
 
 def _torque_driven(signals: list[dict], held: Mapping[str, float], loads: _Loads) -> dict[str, float]:

@@ -93,8 +93,8 @@ def fit(model: Model, runs: Sequence[Experiment] | Experiment, *, solver: Any = 
     its own: three, or nine with friction. An effect that contains a simpler one takes the fit with that, and a short
     run from either start. Where much more than noise is left the model is fitted without each of its effects, too, and
     begins again from there if that costs less; with a lag of the driver or of the current's sensor it begins again with
-    that in the winding's place. Further runs come only where an end is in doubt, a parameter has collapsed, the model
-    does not reach the noise in one channel far more than in another, or the sub-steps do not suit the end.
+    that in the winding's place. Further runs come only where the first guess is worse than none, an end is in doubt, a
+    parameter has collapsed, one channel is far further from its noise than another, or the sub-steps do not suit.
 
     Examples
     --------
@@ -180,7 +180,10 @@ def _fit(problem: Problem, effort: LevenbergMarquardt, callback: Callback = None
     if auto:
         problem = with_start_values(problem)  # first guess, race of starts
         effort = replace(effort, looks=min(effort.looks, 1))  # a misfit from there is the model's, not the start's
-    found = minimise(problem, effort, callback, wide=auto)  # continuation, restarts, reweighting
+    descend = partial(minimise, callback=callback, wide=auto)  # continuation, restarts, reweighting
+    # If possible not by way of a motor that rings more between samples than these can show.
+    found = race([problem.within_worth()], effort, solve=descend) or descend(problem, effort)
+    found = replace(found, problem=found.problem.tuned(engine=problem.engine))
     if auto:
         found = no_worse_than_smaller(found, asked, effort)
     found, error = _polished(found, effort, callback)  # finer sub-steps

@@ -17,6 +17,7 @@ from motorid.records.experiment import Experiment
 
 ABOVE = 1.3  # times: where a size starts that is at least another
 RESONANCE = "1/s"
+STOPPED = 100.0  # times the friction and the back-EMF, where friction leaves a hundredth of the motion
 LEFT = 0.1  # of an inductance, where another lag takes the rest
 BACK_EMF_SHARES = (0.3, 0.03)
 PHASES = tuple(np.arange(4) * np.pi / 2)
@@ -56,10 +57,21 @@ def _guessed(problem: Problem) -> Problem:
     problems = [problem.for_model(with_suited_effects(m, runs)) for m in candidates]
     best = problems[0] if len(problems) == 1 else min(problems, key=lambda p: cost_at(p, refine=False))
     asked = candidates[problems.index(best)]
-    best = _along_measured_angle(best, asked)
+    best = _along_measured_angle(_better_than_still(best), asked)
     for effect in model.effects:
         best = _shaped(best, effect, asked)
     return best
+
+
+def _better_than_still(guess: Problem) -> Problem:
+    """Return the problem at its guess, or where that costs more than to predict nothing (an arm without its weight
+    swings where the real one hangs) at the better of what it and a motor that friction all but stops lead to."""
+    values, b = guess.model.values, guess.model.parameters["b"]
+    nothing = 0.5 * sum(float(np.nansum((m.y * m.weights) ** 2)) for m in guess.measured)
+    if b.given or not b.vary or cost_at(guess, refine=False) < nothing:
+        return guess
+    still = guess.start_at({"b": STOPPED * (b.value + values.get("K", 0.0) ** 2 / values.get("R", 1.0))})
+    return _led(guess, race([p.within_worth() for p in (guess, still)], LOOK))
 
 
 def _was_fitted(model: Model) -> bool:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import pytest
@@ -15,6 +15,7 @@ from motorid.estimation import least_squares
 from motorid.estimation.continuation import by_continuation
 from motorid.estimation.fit import no_worse_than_smaller
 from motorid.integrate import Rosenbrock
+from motorid.integrate.rosenbrock import Stepper
 from motorid.problem import problem as problem_module
 from motorid.records.datasets import truth
 from motorid.records.experiment import windows
@@ -292,11 +293,11 @@ class Fragile(Rosenbrock):
     """Fails where friction exceeds a limit, and counts its refusals."""
 
     limit: float = np.inf
-    refused: tuple = ()
+    refused: list = field(default_factory=list)
 
     def run(self, system, grid, x0, p, dx0=None, dp=None, local_error=False):
         if p[system.parameters.index("b")] > self.limit:
-            object.__setattr__(self, "refused", (*self.refused, p))
+            self.refused.append(p)
             raise SimulationError("too much friction for this engine.")
         return super().run(system, grid, x0, p, dx0, dp, local_error)
 
@@ -329,6 +330,38 @@ def test_integration_errors_move_no_estimate_by_more_than_a_share_of_its_deviati
     assert shift() < limit
     monkeypatch.setattr(stages, "BIAS", np.inf)
     assert shift() > limit
+
+
+@pytest.fixture
+def steps(monkeypatch):
+    """Lengths of all integrations, in sub-steps."""
+    found, run = [], Stepper.run
+
+    def counted(self, grid, *rest):
+        found.append(int(grid.substeps.sum()))
+        return run(self, grid, *rest)
+
+    monkeypatch.setattr(Stepper, "run", counted)
+    return found
+
+
+def test_an_arm_without_its_weight_begins_with_a_motor_that_hardly_moves(rng, steps):
+    t = np.arange(2000) * 4e-3
+    arm = (mi.dc_motor(R=2.0, L=1e-3, K=0.02, b=1e-5, J=1e-4) + mi.effects.gravity).replace(mgl=0.03)
+    run = simulated(t, 2 * np.sin(np.pi * t**2 / t[-1]), ["omega"], arm)
+    fit = mi.fit(mi.dc_motor(), noisy(run, rng, {"omega": 0.1}))
+    assert fit.nrmse["omega"] < 1.01  # as good as standing still
+    assert sum(steps) < 2000 * run.n  # 5300 by way of one that rings
+
+
+def test_a_current_that_is_not_the_motors_leads_to_no_motor_that_rings(rng, steps):
+    t = np.arange(1000) * 1e-3
+    v = np.where(t < 0.05, 0.0, 12 * np.sin(8 * np.pi * t**2))
+    run = simulated(t, v)
+    run = noisy(run.with_(outputs={**run.outputs, "i": run.outputs["i"] * v / 12}), rng)  # that of the supply
+    fit = mi.fit(mi.dc_motor(), run)
+    assert fit.nrmse["omega"] < 0.01
+    assert sum(steps) < 4000 * run.n  # 115,000 by way of one that rings
 
 
 def test_a_start_that_cannot_be_simulated_is_an_error_that_says_what_to_do(runs):
