@@ -16,7 +16,7 @@ from motorid.diagnosis.thresholds import MATERIAL, NATS
 from motorid.errors import OutOfTime
 from motorid.estimation.continuation import by_continuation, past_ripples, sharpened
 from motorid.estimation.first_guess import first_guess
-from motorid.estimation.least_squares import FAILURES, Estimate
+from motorid.estimation.least_squares import FAILURES, Estimate, cost_at
 from motorid.estimation.restarts import collapsed_again, restored
 from motorid.estimation.result import Fit
 from motorid.estimation.start_values import ABOVE, exchanged_poles, sizes_like
@@ -333,7 +333,10 @@ def _refit_all(tasks: Sequence[Task], map_: Callable[..., Iterable[Any]],
         races[leader], found[leader] = race, _finish((tasks[leader], race))
         if (best := _quiet(found[leader])) is not None:
             alone = True
-            found.update(_unpromising(tasks, leader) | _needless(tasks, leader, best, map_))
+            far_less = FAR_LESS * (tasks[leader].promise or 0.0)
+            found.update({k: GivenUp(FAR_BEHIND.format(tasks[leader].effect.name)) for k, task in enumerate(tasks)
+                          if task.promise is not None and task.promise < far_less})
+            found.update(_needless(tasks, leader, best, map_))
     entered = [k for k in range(len(tasks)) if k not in races and k not in found]
     done = map_(_race_tournament, [(tasks[k], alone) for k in entered])
     races |= {k: race for k, race in zip(entered, done, strict=True) if race is not None}
@@ -369,22 +372,27 @@ def _outdone(tasks: Sequence[Task], races: Mapping[int, Raced], found: Mapping[i
 
 
 def _leader(tasks: Sequence[Task]) -> int | None:
-    """Return which task promises most, the smallest of those that promise nearly as much; None if none does."""
+    """Return which task promises most, the smallest of those that promise nearly as much; None if none does. Where the
+    model is lost, and slopes say little, the one that costs least at its own first guess, if that is less."""
+    costs = {k: _guessed_cost(task) for k, task in enumerate(tasks) if lost(task.fit)}
+    if costs and costs[least := min(costs, key=lambda k: costs[k])] < tasks[least].fit.cost:
+        return least
     promises = {k: task.promise for k, task in enumerate(tasks) if task.promise is not None}
     near = [k for k, promise in promises.items() if promise > NEARLY * max(promises.values())]
     return min(near, key=lambda k: (size_of(tasks[k].model, tasks[k].fit.problem), -promises[k]), default=None)
 
 
+def _guessed_cost(task: Task) -> float:
+    """Return the cost of a task at the first guess of its own."""
+    with contextlib.suppress(*FAILURES):
+        guess = first_guess(task.model, task.fit.problem.experiments, loaded=True)
+        return cost_at(_started(task.fit, _bounded(task.fit, task.model), guess, angular=False).within_worth())
+    return np.inf
+
+
 def _quiet(fit: Fit | GivenUp | None) -> Fit | None:
     """Return a fit that leaves hardly more than noise, or None."""
     return fit if isinstance(fit, Fit) and not far(fit) else None
-
-
-def _unpromising(tasks: Sequence[Task], leader: int) -> dict[int, GivenUp]:
-    """Return the tasks of which far less is promised than of an effect that leaves only noise."""
-    promises = {k: task.promise for k, task in enumerate(tasks) if task.promise is not None}
-    why = FAR_BEHIND.format(tasks[leader].effect.name)
-    return {k: GivenUp(why) for k, p in promises.items() if p < FAR_LESS * promises[leader]}
 
 
 def _needless(tasks: Sequence[Task], leader: int, best: Fit, map_: Callable[..., Iterable[Any]]) -> dict[int, GivenUp]:

@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from battery.excite import driven, record
+from lab_records import noisy, simulated
 
 import motorid as mi
 from motorid.diagnosis import candidates as search
@@ -442,6 +443,19 @@ def test_where_a_fit_is_lost_a_guess_of_its_own_starts_along_either_angle(monkey
     assert entered == [(True, False), (False, True), (True, True)]
     assert best is not None
     assert best.problem.model.values["mgl"] == pytest.approx(8, rel=0.05)
+
+
+def test_where_a_fit_is_lost_the_effect_leads_whose_own_first_guess_comes_nearest(rng):
+    """The slopes of a motor that hardly moves promise nothing: here more of every other effect."""
+    t = np.arange(1500) * 4e-3
+    arm = (mi.dc_motor(R=2.0, L=1e-3, K=0.02, b=1e-5, J=1e-4) + mi.effects.gravity).replace(mgl=0.03)
+    run = noisy(simulated(t, 2 * np.sin(np.pi * t**2 / t[-1]), ["theta"], arm), rng)
+    fit = mi.fit(mi.dc_motor(), run)
+    promises = {"coulomb": 0.9, "quadratic_drag": 0.5, "gravity": 0.1, "brush_drop": 0.3}
+    tasks = [trial.Task(fit, fit.model + LIBRARY[n], LIBRARY[n], ({},), p) for n, p in promises.items()]
+    assert trial.lost(fit)
+    assert tasks[trial._leader(tasks)].name == "gravity"
+    assert trial._leader(tasks[:2]) == 0  # of guesses that cost more than the fit none leads
 
 
 def test_a_current_alone_that_is_lost_asks_for_one_guess_more():
