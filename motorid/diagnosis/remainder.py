@@ -35,10 +35,11 @@ from motorid.estimation.result import Fit
 from motorid.model.definition import Effect, P
 from motorid.model.equations import Equations
 from motorid.model.model import Model
-from motorid.numerics.parallel import check_time, one_thread
+from motorid.numerics.parallel import budget, check_time, one_thread
 from motorid.numerics.signals import Array
 
 WHERE = {"torque": "mechanical", "voltage": "electrical", "both": "electrical", "sensor": "sensor"}
+SECONDS = 120.0  # after which the best curve so far is taken
 TRIED = 4  # curves that are fitted, those that promise most
 FINE = range(1, 37)  # harmonics of a turn in a curve that is fitted
 CLOSED = 300  # times that are tried as the end, or the beginning, of a constant
@@ -393,7 +394,7 @@ class Remainder:
         if not apart or self._anew is not None:
             both = self._tried(), _beyond(self._anew)
             each = (islice((t for t in some if t[1].on != "run"), TRIED) for some in both)
-            with contextlib.suppress(OutOfTime):
+            with contextlib.suppress(OutOfTime), budget(SECONDS):
                 best = _best(self.fit, chain.from_iterable(each), held)
         if best is None:
             raise UsageError(f"what is left is {self.follows}: no curve, but another motor in every run. Fit the runs "

@@ -851,6 +851,18 @@ def test_a_budget_that_is_spent_ends_the_search_for_curves(lab):
         left.as_effect()
 
 
+def test_a_search_for_curves_has_an_end_of_its_own(beyond, lab, monkeypatch):
+    rng = np.random.default_rng(4)
+    runs = [record(driven(lab, {"eddy": {"top": 2e-2, "w": 25.0}}, w, 400, 1e-3, rng), "logger", ("i", "omega"), lab,
+                   rng, w) for w in FAST]
+    left = Remainder("structure", mi.fit(mi.dc_motor(), runs), (Form("a torque", "torque", "omega"),))
+    monkeypatch.setattr(remainder, "SECONDS", 0.0)
+    with pytest.raises(mi.UsageError, match="no curve"):
+        left.as_effect()
+    monkeypatch.undo()
+    assert left.as_effect().balance == "torque"
+
+
 @mi.effect(balance="torque")
 def ratchet(m, A=mi.P(0.9e-2, "N·m", null=0.0)):
     """Detents, six to the turn, that rise slowly and fall at once.
