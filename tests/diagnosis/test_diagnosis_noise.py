@@ -77,6 +77,7 @@ def test_no_form_predicts_coloured_noise(lab):
         assert better_forms(fit, fit) == []
 
 
+@one_thread
 def test_a_hum_that_is_a_trifle_of_all_errors_is_no_missing_physics(lab):
     """Alone the speed's error would fall by more than 1 %, with the current's by less; its noise is stated too low."""
     runs = []
