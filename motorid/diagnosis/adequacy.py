@@ -19,7 +19,7 @@ import scipy
 from numpy.typing import NDArray
 
 from motorid.channels import channel_name
-from motorid.diagnosis.misspecification import better_forms
+from motorid.diagnosis.misspecification import better_forms, hum_of
 from motorid.diagnosis.model_comparison import Node, far, finer
 from motorid.diagnosis.results import Adequacy
 from motorid.diagnosis.score_test import Score
@@ -240,5 +240,7 @@ def judge_adequacy(node: Node, scores: Sequence[Score] = ()) -> Adequacy:
     if not far(node.fit) or not (doubtful := adequacy(node.fit, scores, level=CLEAR)).adequate:
         return judged
     larger = far(node.fit)  # a form that helps the others explains nothing here
-    found = next(iter(better_forms(node.fit, node.fit, larger)), None)
-    return following(judged, found.form.text) if found else unpredicted(doubtful)
+    found = better_forms(node.fit, node.fit, larger)
+    if hum := hum_of(node.fit, found):
+        return replace(doubtful, hum=hum, text=f"{doubtful.text} What can be predicted of them is {hum}.")
+    return following(judged, found[0].form.text) if found else unpredicted(doubtful)

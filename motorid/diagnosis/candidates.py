@@ -293,8 +293,7 @@ class Search:
                 c = Candidate(s.effect.name, s.drop, parameters=dict(s.starts[0]) if s.starts else {},
                               reason=why or _unseen(s))
             listed.append(replace(c, predicted_drop=s.drop))
-        rest = [c for n, c in judged.items() if n not in {s.effect.name for s in scores}]
-        return listed + rest
+        return listed + [c for n, c in judged.items() if n not in {s.effect.name for s in scores}]
 
     def pruned(self, node: Node, before: Node) -> Node:
         """Return `node` without the effects that have become superfluous, and with the simplest of each kind.

@@ -602,8 +602,7 @@ def force_of(fit: Fit, form: Form) -> float:
     signals = signals_along(fit)
     span = span_of(fit, signals)
     basis = np.concatenate([basis_of(form, s, span) for s in signals])
-    force = basis @ form_coefficients(fit, linearised(fit, form), form)
-    return float(np.sqrt(np.mean(force**2)))
+    return float(np.sqrt(np.mean((basis @ form_coefficients(fit, linearised(fit, form), form)) ** 2)))
 
 
 def effect_force(fit: Fit, form: Form, size: str) -> float:

@@ -12,14 +12,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from motorid.channels import CHANNELS
+from motorid.channels import CHANNELS, channel_name
 from motorid.diagnosis import free_forms, predictive_score
 from motorid.diagnosis.admissibility import objections
 from motorid.diagnosis.free_forms import Form, Linear, Span
 from motorid.diagnosis.model_comparison import Node, evidence, far
 from motorid.diagnosis.predictive_score import Evidence, Predictions, compare
 from motorid.diagnosis.thresholds import MOST, STANDARD_ERRORS, SUPPLANTS, TRIFLE, UNCONTESTED
-from motorid.display.numbers import listed, percent
+from motorid.display.numbers import listed, number, percent
 from motorid.estimation.angle_orders import uses_angle
 from motorid.estimation.fit import follows
 from motorid.estimation.least_squares import FAILURES
@@ -65,6 +65,21 @@ def better_forms(fit: Fit, rival: Fit, channels: Container[str] = CHANNELS) -> l
         best = gains[0].predictions
         gains.sort(key=lambda g: g.form.remembers or compare(g.predictions, best).sure)
     return gains
+
+
+def hum_of(fit: Fit, gains: Sequence[FormGain]) -> str:
+    """Return in words the hum that predicts as well as any function of the time in a sensor, if none of the `gains` is
+    surely better than that, and it surely better than all that follow the motion; empty for none."""
+    best = next((g for g in gains if g.form.on == "t" and g.form.balance == "sensor"), None)
+    if best is None or compare(best.predictions, gains[0].predictions).sure or not all(
+            compare(g.predictions, best.predictions).sure for g in gains if g.form.on != "t"):
+        return ""
+    span = free_forms.span_of(fit, free_forms.signals_along(fit))
+    waves = [k for k, f in enumerate(free_forms.functions_of(best.form, span)) if f.startswith("ca.sin(")]
+    alone = Answers(fit, free_forms.linearised(fit, best.form), best.form).predictions(waves) if waves else None
+    if alone is None or compare(alone, best.predictions).worth_it:
+        return ""
+    return f"a hum of {number(span.rates[0] / 2 / np.pi, 3)} Hz in the sensor of {channel_name(best.form.channel)}"
 
 
 class Answers:

@@ -48,8 +48,7 @@ class Errors:
     @property
     def nrmse(self) -> float:
         """RMS of the errors over that of the measured samples."""
-        r = np.concatenate(self.values)
-        return float(np.sqrt(np.nanmean(r**2))) / max(self.measured, 1e-300)
+        return float(np.sqrt(np.nanmean(np.concatenate(self.values) ** 2))) / max(self.measured, 1e-300)
 
 
 Channels = Mapping[str, Errors]

@@ -8,7 +8,6 @@ lasts. What takes longer than a part to show (heating) is seen between the parts
 
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,14 +16,13 @@ from motorid.diagnosis.cross_validation import ROUGH
 from motorid.effects import LIBRARY
 from motorid.errors import MotoridError
 from motorid.estimation.fit import solve
-from motorid.estimation.least_squares import FAILURES, FINISH
+from motorid.estimation.least_squares import FAILURES
 from motorid.estimation.result import Fit
 from motorid.estimation.start_values import with_suited_effects
 from motorid.numerics.signals import Array
 from motorid.problem.runs import angle_signal
 from motorid.records.experiment import Experiment, part_meta
 
-HERE = replace(FINISH, looks=0)  # the start is known
 ENOUGH = 4000  # samples: what is left at least of those that their neighbours predict
 SMALL = 0.1  # of the error: a difference that changes no judgement
 AFFORDABLE = 60_000  # steps of integration per simulation of all records
@@ -67,7 +65,7 @@ def fitted_to(fit: Fit, runs: Sequence[Experiment] | None) -> Fit:
     """Return the fit of the same model to other runs, from where it is; `fit` itself for none, or where that fails."""
     try:
         return fit if runs is None else solve(
-            fit.problem.with_(experiments=runs, model=fit.model, noise_factors={}), HERE, start="model")
+            fit.problem.with_(experiments=runs, model=fit.model, noise_factors={}), start="model")
     except (MotoridError, *FAILURES):
         return fit
 

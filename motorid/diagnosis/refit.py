@@ -333,9 +333,8 @@ def _refit_all(tasks: Sequence[Task], map_: Callable[..., Iterable[Any]],
         races[leader], found[leader] = race, _finish((tasks[leader], race))
         if (best := _quiet(found[leader])) is not None:
             alone = True
-            far_less = FAR_LESS * (tasks[leader].promise or 0.0)
-            found.update({k: GivenUp(FAR_BEHIND.format(tasks[leader].effect.name)) for k, task in enumerate(tasks)
-                          if task.promise is not None and task.promise < far_less})
+            why, least = GivenUp(FAR_BEHIND.format(tasks[leader].effect.name)), FAR_LESS * (tasks[leader].promise or 0)
+            found.update({k: why for k, t in enumerate(tasks) if t.promise is not None and t.promise < least})
             found.update(_needless(tasks, leader, best, map_))
     entered = [k for k in range(len(tasks)) if k not in races and k not in found]
     done = map_(_race_tournament, [(tasks[k], alone) for k in entered])

@@ -37,6 +37,7 @@ class Adequacy(Shown):
     false_alarm: float
     channels: Mapping[str, Mapping[str, float]]
     text: str
+    hum: str = ""  # what predicts errors larger than the noise, and is no motor's, in words
 
     def card(self) -> Card:
         """Return the verdict, and what it rests on per channel."""

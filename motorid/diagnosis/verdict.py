@@ -45,8 +45,8 @@ def adequate_text(judged: Adequacy, ranking: Sequence[Candidate], large: bool = 
     """Return the answer when nothing is missing, and how many effects were tried; `large`: errors beyond the noise."""
     tried = f"{judged.text} None of the {len(ranking)} effects tried is worth adding." if ranking else judged.text
     if large:
-        return ("Nothing that depends on the motion is missing, but the errors are larger than the noise: they "
-                "fluctuate by themselves, or the noise is slow."), tried
+        why = judged.hum or "they fluctuate by themselves, or the noise is slow"
+        return f"Nothing that depends on the motion is missing, but the errors are larger than the noise: {why}.", tried
     if judged.p_value <= judged.false_alarm:
         return "Nothing that matters is missing: the errors are within the noise.", tried
     return "Nothing is missing: the errors do not depend on the motion.", tried
@@ -107,7 +107,8 @@ def _left(last: Fit, remaining: Adequacy, where: str = "") -> str:
         return f"Not everything is explained: {remaining.text.removeprefix('Something is missing: ')}"
     large = [f"{channel_name(c)} {number(last.misfit[c], 2)} times" for c in far(last)]
     if large:
-        return f"What remains is larger than the noise ({', '.join(large)}), but nothing tried predicts it."
+        what = f"for {remaining.hum}" if remaining.hum else "but nothing tried predicts it"
+        return f"What remains is larger than the noise ({', '.join(large)}), {what}."
     return f"What remains is noise{where}. {fine_angle_remark(last)}".rstrip()
 
 

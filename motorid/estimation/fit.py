@@ -181,8 +181,7 @@ def _fit(problem: Problem, effort: LevenbergMarquardt, callback: Callback = None
         problem = with_start_values(problem)  # first guess, race of starts
         effort = replace(effort, looks=min(effort.looks, 1))  # a misfit from there is the model's, not the start's
     descend = partial(minimise, callback=callback, wide=auto)  # continuation, restarts, reweighting
-    # If possible not by way of a motor that rings more between samples than these can show.
-    found = race([problem.within_worth()], effort, solve=descend) or descend(problem, effort)
+    found = race([problem.within_worth()], effort, solve=descend) or descend(problem, effort)  # best without ringing
     found = replace(found, problem=found.problem.tuned(engine=problem.engine))
     if auto:
         found = no_worse_than_smaller(found, asked, effort)

@@ -334,8 +334,7 @@ class Problem:
 
     def tuned(self, **fields: Any) -> Problem:
         """Return the problem with other `noise_factors`, another `width` …; the records stay as prepared."""
-        other = replace(self, **{"_runs": self.runs, **fields})
-        return self._lending(other, UNTOUCHED.get("".join(fields), ()))
+        return self._lending(replace(self, **{"_runs": self.runs, **fields}), UNTOUCHED.get("".join(fields), ()))
 
     def with_(self, **fields: Any) -> Problem:
         """Return a copy with some fields changed, e.g. ``with_(model=…)``."""

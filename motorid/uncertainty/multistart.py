@@ -178,20 +178,9 @@ class Multistart(Printed):
     def _ends(self, *kinds: str) -> list[StartResult]:
         return [e for e, k in zip(self.results, self.kinds, strict=True) if k in kinds and isinstance(e, StartResult)]
 
-    @property
-    def good(self) -> int:
-        """Number of good fits."""
-        return self.kinds.count("good")
-
-    @property
-    def poor(self) -> int:
-        """Number of fits that ended elsewhere."""
-        return self.kinds.count("poor")
-
-    @property
-    def failed(self) -> int:
-        """Number of starts without a result."""
-        return self.kinds.count("failed")
+    good = property(lambda self: self.kinds.count("good"), doc="Number of good fits.")
+    poor = property(lambda self: self.kinds.count("poor"), doc="Number of fits that ended elsewhere.")
+    failed = property(lambda self: self.kinds.count("failed"), doc="Number of starts without a result.")
 
     @cached_property
     def table(self) -> Any:

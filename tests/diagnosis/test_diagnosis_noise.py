@@ -91,6 +91,26 @@ def test_a_hum_that_is_a_trifle_of_all_errors_is_no_missing_physics(lab):
     assert judge_adequacy(node_of(fit, HeldOut.of(fit, runs[2:])), ()).adequate
 
 
+@pytest.mark.parametrize(("channel", "named"), [("omega", "speed"), ("i", "current")])
+def test_a_hum_in_a_sensor_is_said_and_is_no_missing_physics(lab, channel, named):
+    runs = []
+    for r in runs_of(lab, {}, n=3000):
+        y = r.outputs[channel]
+        hum = 0.02 * float(np.std(y)) * np.sin(2 * np.pi * 50 * r.t + 1)
+        runs.append(r.without("theta").with_(outputs={c: r.outputs[c] for c in ("i", "omega")} | {channel: y + hum}))
+    found = mi.diagnose(mi.fit(mi.dc_motor(), runs[:2]), runs[2:], effects=("coulomb", "quadratic_drag"))
+    assert found.verdict == "adequate", found.text
+    assert found.answer.endswith(f"larger than the noise: a hum of 50 Hz in the sensor of {named}."), found.answer
+
+
+def test_what_swings_with_the_motion_is_no_hum(lab):
+    """At one speed a ripple over the turn is a tone, too; the others tell."""
+    runs = [rippled(r) for r in runs_of(lab, {})]
+    fit = mi.fit(mi.dc_motor(), runs[:2])
+    judged = judge_adequacy(node_of(fit, HeldOut.of(fit, runs[2:])), ())
+    assert (judged.adequate, judged.hum) == (False, "")
+
+
 def test_adequate_although_larger_than_the_noise_says_what_was_tried(lab):
     runs = runs_of(lab, {}, seed=2, rho=0.93, size=0.02)
     found = mi.diagnose(mi.fit(mi.dc_motor(), runs[:2]), runs[2:], effects=("coulomb", "brush_drop"))
