@@ -70,7 +70,7 @@ def parse_unit(text: str) -> Unit | None:
 
 def require_unit(text: object, channel: str) -> Unit:
     """Read the unit that a user gave for a channel; a number may touch it (0.047V), which in a header is a name."""
-    unit = parse_unit(re.sub(r"^([-+]?[\d.]+(?:e[-+]?\d+)?)(?=[A-Za-z°%µμ])", r"\1 ", str(text)))
+    unit = parse_unit(re.sub(r"(?i)^((?>[-+]?[\d.]+(?:e[-+]?\d+)?))(?=[a-z°%µμ])", r"\1 ", str(text)))
     allowed = DIMENSIONS[channel]
     if unit is None:
         known = [w for d in allowed for words in _SPELLINGS[d].values() for w in words.split()[:1]]

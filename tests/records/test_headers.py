@@ -87,6 +87,7 @@ def test_what_is_no_unit_is_none(text):
 
 def test_a_number_may_touch_the_unit_that_a_user_gives():
     assert require_unit("0.047V", "v").factor == 0.047
+    assert [require_unit(u, "theta").factor for u in ("6.5e-5 m", "6.5e-5m", "-2E+1 mm")] == [6.5e-5, 6.5e-5, -0.02]
     assert require_unit("-1rad/s", "omega").factor == -1
     assert parse_unit("12V") is None, "in a header that is a name"
 
