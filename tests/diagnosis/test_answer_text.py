@@ -50,7 +50,7 @@ def test_an_error_that_is_printed_alike_stays():
     (False, "What remains is noise."), (True, "What remains is noise on the fitted runs, not on the held-out ones.")])
 def test_noise_that_remains_is_where_it_remains(elsewhere, said):
     errors = {"held_out": ((0.02, 0.2), (0.02, 0.19))}
-    noise = SimpleNamespace(adequate=True, text="")
+    noise = SimpleNamespace(adequate=True, text="", hum="")
     small = missing_text(rungs_of((0.02, 0.2), (0.02, 0.02), **errors, speed=1.0), noise, (), (), elsewhere)
     assert small.endswith(said)
     stopped = missing_text(rungs_of((0.02, 0.2), (0.02, 0.02), **errors), noise, (), (), stopped="the time is up")
@@ -58,6 +58,9 @@ def test_noise_that_remains_is_where_it_remains(elsewhere, said):
     larger = missing_text(rungs_of((0.02, 0.2), (0.02, 0.02), **errors, speed=9.4), noise, (), (), elsewhere)
     assert "remains is noise" not in larger
     assert larger.endswith("What remains is larger than the noise (speed 9.4 times), but nothing tried predicts it.")
+    noise.hum = "a hum of 50 Hz"
+    hums = missing_text(rungs_of((0.02, 0.2), (0.02, 0.02), **errors, speed=9.4), noise, (), (), elsewhere)
+    assert hums.endswith("What remains is larger than the noise (speed 9.4 times), for a hum of 50 Hz.")
 
 
 @pytest.mark.parametrize(("adequate", "lead", "left"), [
@@ -65,8 +68,8 @@ def test_noise_that_remains_is_where_it_remains(elsewhere, said):
     (False, "Unexplained: something is missing, and no effect of the library explains it.",
      "Not everything is explained: the errors (speed 3 times the noise) are not noise.")])
 def test_where_nothing_can_be_named_what_is_left_is_that_of_the_last_model(adequate, lead, left):
-    remaining = SimpleNamespace(adequate=adequate, text="Something is missing: the errors (speed 3 times the noise) "
-                                                        "are not noise.")
+    text = "Something is missing: the errors (speed 3 times the noise) are not noise."
+    remaining = SimpleNamespace(adequate=adequate, hum="", text=text)
     grades = [Grade("lugre", "approximates", "theta_s cannot be seen")]
     answer = unexplained_text((), rungs_of((0.02, 0.2), (0.02, 0.02), speed=1.0), grades, "", remaining)
     assert answer.startswith(f"{lead} 'lugre' helps, but only approximates it: theta_s cannot be seen. Error: ")
@@ -75,7 +78,7 @@ def test_where_nothing_can_be_named_what_is_left_is_that_of_the_last_model(adequ
 
 def test_errors_beyond_the_noise_are_in_the_answer_where_nothing_is_missing():
     judged = SimpleNamespace(text="The errors (speed 4 times the noise) do not depend on the motion.", p_value=0.5,
-                             false_alarm=0.02)
+                             false_alarm=0.02, hum="")
     small, large = (adequate_text(judged, (), beyond)[0] for beyond in (False, True))
     assert small == "Nothing is missing: the errors do not depend on the motion."
     assert "larger than the noise" in large
