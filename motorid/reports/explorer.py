@@ -239,7 +239,7 @@ def _can_be_seen(fit: Fit, effect: Effect) -> bool:
     try:
         Problem(fit.model + effect, fit.problem.experiments)
     except ModelError as error:
-        return "same friction" in str(error) or "takes" in str(error)  # it may be ticked once the other is not
+        return "describe the same" in str(error) or "takes" in str(error)  # it may be ticked once the other is not
     return True
 
 

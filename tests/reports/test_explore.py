@@ -2,12 +2,14 @@
 
 import builtins
 import sys
+from types import SimpleNamespace
 
 import hand_made
 import pytest
 
 import motorid as mi
 from motorid.errors import MissingDependency, UsageError
+from motorid.reports.explorer import _can_be_seen
 
 
 @pytest.fixture(scope="module")
@@ -161,3 +163,11 @@ def test_a_browser_that_rounds_what_it_shows_moves_nothing(fit):
     fresh.sliders["R"].value *= 1.01
     assert fresh.model.values["R"] == pytest.approx(1.01 * before["R"], rel=1e-3)
     assert fresh.message == "moved"
+
+
+@pytest.mark.parametrize(("present", "kin"), [("driver_lag", "driver_slew"), ("speed_lag", "speed_filter"),
+                                              ("compliance", "backlash"), ("coulomb", "stribeck")])
+def test_what_would_take_the_place_of_an_effect_is_offered_in_every_balance(fit, present, kin):
+    model = mi.dc_motor() + mi.effects.get(present)
+    there = SimpleNamespace(model=model, problem=fit.problem)
+    assert _can_be_seen(there, mi.effects.get(kin))
