@@ -351,7 +351,7 @@ class Remainder:
     def as_effect(self, name: str = "remainder") -> Effect:
         """Return what is left as an effect, a curve: ``found.remainder.model + found.remainder.as_effect()``.
 
-        The first call fits the model with each of the best curves: seconds, a minute or two where much is missing.
+        The first call fits the model with each of the best curves: seconds, at most two minutes for the best so far.
 
         Raises
         ------

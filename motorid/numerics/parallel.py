@@ -183,7 +183,7 @@ class Parcel:
         data = pickle.dumps(content, protocol=pickle.HIGHEST_PROTOCOL)
         return Parcel(hashlib.sha256(data).hexdigest(), data)
 
-    @lru_cache(maxsize=8)  # noqa: B019
+    @lru_cache(maxsize=8)  # noqa: B019 a few parcels are kept on purpose
     def open(self) -> Any:
         """Return the content; one object per process, so it must not be changed."""
         return pickle.loads(self.data)

@@ -11,7 +11,8 @@ from battery.excite import P, driven, record
 import motorid as mi
 from motorid.diagnosis.adequacy import adequacy, judge_adequacy
 from motorid.diagnosis.cross_validation import HeldOut
-from motorid.diagnosis.misspecification import better_forms
+from motorid.diagnosis.free_forms import Form
+from motorid.diagnosis.misspecification import better_forms, hum_of
 from motorid.diagnosis.model_comparison import node_of
 from motorid.diagnosis.score_test import Score
 from motorid.diagnosis.verdict import _noise_feedback, closed_loop_remark, outliers_remark
@@ -103,12 +104,19 @@ def test_a_hum_in_a_sensor_is_said_and_is_no_missing_physics(lab, channel, named
     assert found.answer.endswith(f"larger than the noise: a hum of 50 Hz in the sensor of {named}."), found.answer
 
 
-def test_what_swings_with_the_motion_is_no_hum(lab):
-    """At one speed a ripple over the turn is a tone, too; the others tell."""
-    runs = [rippled(r) for r in runs_of(lab, {})]
+@one_thread
+def test_what_follows_the_motion_as_well_is_no_hum(lab):
+    runs = []
+    for r in runs_of(lab, {}, n=3000):
+        hum = 0.02 * float(np.std(r.outputs["omega"])) * np.sin(2 * np.pi * 50 * r.t + 1)
+        runs.append(r.without("theta").with_(outputs={"i": r.outputs["i"], "omega": r.outputs["omega"] + hum}))
     fit = mi.fit(mi.dc_motor(), runs[:2])
-    judged = judge_adequacy(node_of(fit, HeldOut.of(fit, runs[2:])), ())
-    assert (judged.adequate, judged.hum) == (False, "")
+    found = better_forms(fit, fit)
+    assert "50 Hz" in hum_of(fit, found)
+    along = replace(found[0], form=Form("a friction", "torque", "omega"))
+    assert not hum_of(fit, [found[0], along])
+    assert not hum_of(fit, [along])
+    assert not hum_of(fit, [])
 
 
 def test_adequate_although_larger_than_the_noise_says_what_was_tried(lab):
