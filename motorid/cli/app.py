@@ -1,7 +1,5 @@
 """The command line: ``motorid fit RUN...`` and its fellows."""
 
-from __future__ import annotations
-
 from typing import Annotated
 
 import typer

@@ -1,7 +1,5 @@
 """The commands `record`, which records from a bench, and `bench`, which serves a virtual one."""
 
-from __future__ import annotations
-
 import math
 import secrets
 import signal

@@ -1,7 +1,5 @@
 """What all commands share: exit statuses, one clear sentence for a mistake, tables on the screen."""
 
-from __future__ import annotations
-
 import codecs
 import contextlib
 import errno

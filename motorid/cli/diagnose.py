@@ -1,7 +1,5 @@
 """The commands `diagnose`, `design`, which plans what would decide, and `demo`, the story on shipped records."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Sequence
 from json import loads

@@ -1,7 +1,5 @@
 """The commands on one model: `fit`, `fit-many`, how far to trust it, `simulate` and `export`."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any

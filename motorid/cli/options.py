@@ -4,8 +4,6 @@
 `with_options` puts them on a command. Below them: effects and models from the user's files, and remarks on records.
 """
 
-from __future__ import annotations
-
 import functools
 import importlib.util
 import inspect

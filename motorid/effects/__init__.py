@@ -4,8 +4,6 @@ Every effect that a module here defines is in it: a new one is a function there,
 ``measured_…`` are for records in which a supply voltage, a load torque or a temperature was measured too.
 """
 
-from __future__ import annotations
-
 from motorid.effects import electrical, mechanical, sensor
 from motorid.effects.electrical import *  # noqa: F403
 from motorid.effects.mechanical import *  # noqa: F403

@@ -1,7 +1,5 @@
 """Effects on the voltage balance: brushes, driver, magnetic circuit."""
 
-from __future__ import annotations
-
 import casadi as ca
 
 from motorid.errors import ModelError

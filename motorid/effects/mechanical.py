@@ -1,7 +1,5 @@
 """Effects on the torque balance: friction, load, angle-dependent torque."""
 
-from __future__ import annotations
-
 import math
 
 import casadi as ca

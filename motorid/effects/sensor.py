@@ -1,7 +1,5 @@
 """Effects of the measuring chain; the motor itself is not touched."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import casadi as ca

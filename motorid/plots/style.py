@@ -1,7 +1,5 @@
 """One restrained style for all figures: colours, labels, sizes, decimation that keeps peaks; figures as PNG and SVG."""
 
-from __future__ import annotations
-
 import io
 import re
 from collections.abc import Callable, Iterator, Mapping
