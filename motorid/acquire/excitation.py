@@ -25,6 +25,7 @@ from functools import lru_cache
 from itertools import accumulate
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from motorid.errors import UsageError, among
@@ -75,9 +76,7 @@ class Segment:
 
 def lfsr_bits(seed: int, n: int) -> NDArray[np.int64]:
     """Return n bits of the maximum-length sequence of x¹⁵ + x¹⁴ + 1 (period 32767)."""
-    from scipy.signal import max_len_seq  # slow to import, and not needed before
-
-    return max_len_seq(15, [seed >> k & 1 for k in range(15)], n, [1])[0].astype(np.int64)
+    return scipy.signal.max_len_seq(15, [seed >> k & 1 for k in range(15)], n, [1])[0].astype(np.int64)
 
 
 _volts = lru_cache(maxsize=4)(Segment.volts)

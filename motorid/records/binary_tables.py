@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
+import scipy
 
 from motorid.display.numbers import counted
 from motorid.errors import DataError, MissingDependency
@@ -129,11 +130,9 @@ def _check_children(parts: list[Element], order: str, count: int, named: bool, d
 
 
 def _load(data: bytes) -> dict[str, object]:
-    from scipy.io import loadmat
-
     with warnings.catch_warnings(action="ignore"):
         try:
-            found = loadmat(io.BytesIO(data), simplify_cells=True)
+            found = scipy.io.loadmat(io.BytesIO(data), simplify_cells=True)
         except Exception as error:  # a damaged file makes loadmat fail in every way there is
             raise DataError(f"it cannot be read as a MATLAB file ({_first_line(error)}).") from None
     return {k: v for k, v in found.items() if not k.startswith("__")}
