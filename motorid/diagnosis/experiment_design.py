@@ -26,9 +26,7 @@ from motorid.display.numbers import number, quantity
 from motorid.errors import FitError, MotoridError, UsageError, among, at_least, chosen, positive
 from motorid.estimation.result import Fit
 from motorid.model.model import Model
-from motorid.numerics.parallel import budget as limited_time
-from motorid.numerics.parallel import one_thread
-from motorid.numerics.parallel import progress as bar
+from motorid.numerics import parallel
 from motorid.numerics.signals import Array
 from motorid.problem.simulate import planned
 from motorid.records.experiment import Experiment
@@ -58,7 +56,7 @@ class Suggestion(Shown):
                     (("mi.plot_runs(suggestion.experiment)", "see it"),))
 
 
-@one_thread
+@parallel.one_thread
 def suggest_experiment(fits: Sequence[Fit], *, v_max: float | None = None, i_max: float | None = None,
                        duration: float | None = None) -> Suggestion:
     """Choose the experiment that best distinguishes the models of `fits`.
@@ -239,7 +237,7 @@ class Design(Printed):
                 "peaks": dict(self.peaks), "limits": dict(self.limits), "fixed": self.fixed}
 
 
-@one_thread
+@parallel.one_thread
 def design_experiment(found: Diagnosis | Fit | Sequence[Fit | Rival], *, goal: str | None = None,
                       parameters: Sequence[str] | None = None, v_max: float | None = None, i_max: float | None = None,
                       omega_max: float | None = None, theta_range: tuple[float, float] | None = None,
@@ -309,7 +307,7 @@ def design_experiment(found: Diagnosis | Fit | Sequence[Fit | Rival], *, goal: s
     _check_span(duration, dt)
     limits = _limits(rivals, v_max or seen["v"], i_max, omega_max, theta_range, temp_max)
     layout = _layout(shape, levels, duration, max(dt, 0.5 * duration / SAMPLES), limits["v"][1])
-    with bar("Designing", 1 + (SHARPENED if asked else DISTINGUISHED), at_most=True) as advance:
+    with parallel.progress("Designing", 1 + (SHARPENED if asked else DISTINGUISHED), at_most=True) as advance:
         def say(word: str) -> None:
             _ = advance(1, f"Designing: {word.partition(':')[0]}"), progress and progress(word)
 
@@ -319,7 +317,7 @@ def design_experiment(found: Diagnosis | Fit | Sequence[Fit | Rival], *, goal: s
         fine = _exact(replace(plain.task, pairs=whole.pairs), rivals).refined(plain.task.layout.of(plain.c), TOLERANCE)
         fixed = name, fine, _safe(fine, plain.c)[0]
         say("compared fixed candidates")
-        with limited_time(budget):
+        with parallel.budget(budget):
             best = _optimised(task, say)
         task, layout = _exact(replace(best.task, pairs=whole.pairs), rivals), best.task.layout
         bits = np.append(np.zeros(len(best.c) // 2), layout.bits)  # of the unknowns, which begin with the levels
