@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
-from motorid.channels import CHANNELS
 from motorid.errors import DataError, chosen
 from motorid.estimation.result import Fit
 from motorid.numerics.autoregression import autocorrelation, effective_samples
@@ -43,9 +42,8 @@ def plot_residuals(fit: Fit, channels: Sequence[str] | None = None) -> np.ndarra
     --------
     >>> axes = mi.plot_residuals(fit)
     """
-    present = [c for c in CHANNELS if any(c in s.experiment.outputs and c in s.outputs for s in fit.simulations)]
-    names = chosen(channels, present, "channel")
-    against = [c for c in ("omega", "i", "theta") if c in present]
+    names = chosen(channels, fit.problem.outputs, "channel")
+    against = [c for c in ("omega", "i", "theta") if c in fit.problem.outputs]
     figure = style.new_figure(style.WIDTH, 3.0 * len(names) + 0.2)
     rows = figure.add_gridspec(2 * len(names), 1)
     axes = np.empty((len(names), 4 + len(against)), object)
@@ -75,12 +73,10 @@ def _channel(axes: np.ndarray, fit: Fit, channel: str, against: Sequence[str]) -
     _autocorrelation(axes[3], residuals)
     for ax, other in zip(axes[4:], against, strict=True):
         # The model's own: the measured one shares its noise with the residual, which then seems to depend.
-        with_other = [s for s in sims if other in s.outputs]
-        _against(ax, [s.outputs[other] for s in with_other], [s.residual(channel) for s in with_other], sigma)
+        _against(ax, np.concatenate([s.outputs[other] for s in sims]), every, sigma)
         ax.set(xlabel=style.axis_label(other, run), title=f"Against {style.axis_label(other, run).split(' (')[0]}")
         ax.sharey(axes[4])
-    if len(axes) > 4:
-        axes[4].set_ylabel(f"residual ({unit})")
+    axes[4].set_ylabel(f"residual ({unit})")
 
 
 def _over_time(ax: Axes, sims: Sequence[Simulation], channel: str, sigma: float) -> None:
@@ -139,18 +135,14 @@ def _autocorrelation(ax: Axes, residuals: Sequence[Array]) -> None:
     ax.set(xlabel="lag (samples)", ylabel="correlation", title="Autocorrelation")
 
 
-def _against(ax: Axes, x: Sequence[Array], r: Sequence[Array], sigma: float) -> None:
-    if not x:
-        ax.set_axis_off()
-        return
-    xs, rs = np.concatenate(list(x)), np.concatenate(list(r))
-    ok = np.isfinite(xs) & np.isfinite(rs)
-    xs, rs = xs[ok], rs[ok]
+def _against(ax: Axes, x: Array, r: Array, sigma: float) -> None:
+    ok = np.isfinite(x) & np.isfinite(r)
+    x, r = x[ok], r[ok]
     style.band(ax, 2 * sigma)
-    scatter(ax, xs, rs)
-    centre, mean, half = binned_means(xs, rs)
+    scatter(ax, x, r)
+    centre, mean, half = binned_means(x, r)
     ax.errorbar(centre, mean, yerr=half, fmt="o", ms=2.5, lw=1.1, color=style.INK)
-    gaps = np.flatnonzero(np.diff(centre) > 1.5 * np.ptp(xs) / BINS) + 1  # no line over empty bins
+    gaps = np.flatnonzero(np.diff(centre) > 1.5 * np.ptp(x) / BINS) + 1  # no line over empty bins
     ax.plot(np.insert(centre, gaps, np.nan), np.insert(mean, gaps, np.nan), lw=1.1, color=style.INK)
 
 
