@@ -403,7 +403,5 @@ def _speed_gained(run: Experiment) -> float:
 def _longest_standstill(run: Experiment, speed: float) -> float:
     """Longest time without motion, s, from the angle."""
     s = np.abs(window_slopes(run.t, run.outputs["theta"])) < 0.01 * speed
-    if not s.any():
-        return 0.0
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], s.astype(int), [0]])))
-    return float(np.max(edges[1::2] - edges[::2])) * run.duration / len(s)
+    edges = np.flatnonzero(np.diff(s.astype(int), prepend=0, append=0))
+    return float(np.max(edges[1::2] - edges[::2], initial=0)) * run.duration / max(len(s), 1)
