@@ -73,7 +73,7 @@ class Rival:
     fitted: Array  # (k,) from the model's values to the fitted ones, where these are others; see `as_allowed`
 
     @staticmethod
-    def of(fit: Fit, name: str = "") -> Rival:
+    def of(fit: Fit) -> Rival:
         """Return the rival that a fit is."""
         problem, k = fit.problem, len(fit.problem.unknowns.free)
         runs = problem.experiments
@@ -88,7 +88,7 @@ class Rival:
         seen |= {c: max(float(np.nanmax(np.abs(r[c]))) for r in channels if c in r) for c in ("v", *sigma)}
         seen |= {"duration": max(r.duration for r in runs), "dt": float(np.median([r.dt for r in runs]))}
         of_runs = [n for n, p in fit.model.parameters.items() if p.vary and p.per_run]  # as in the first run
-        return Rival(name or fit.model.title, fit.model.with_(angle_input=False).fix(*of_runs), sigma,
+        return Rival(fit.model.title, fit.model.with_(angle_input=False).fix(*of_runs), sigma,
                      problem.scaling.scale[:k], known, seen, np.zeros(k))
 
     @staticmethod
