@@ -21,8 +21,7 @@ from motorid.estimation.fit import fit
 from motorid.estimation.result import Fit, parameter_table
 from motorid.exporters.json_file import fit_dict, write_json
 from motorid.model.model import dc_motor
-from motorid.numerics.parallel import budget as time_limit
-from motorid.numerics.parallel import interruption, processes, progress
+from motorid.numerics import parallel
 from motorid.problem.plain_data import model_from_json
 from motorid.problem.simulate import error_table
 from motorid.records.datasets import data_path
@@ -79,11 +78,11 @@ def diagnose_command(runs: opt.Runs, options: opt.FitOptions, validate: opt.Vali
             show(f"{word[0].upper()}{word[1:]}\n")
 
     try:
-        with processes(jobs) as over:
+        with parallel.processes(jobs) as over:
             found = diagnose(before, held_out or None, also=own, max_effects=max_effects, budget=budget,
                              map=over or map, progress=as_it_comes)
     except (Exception, KeyboardInterrupt) as error:
-        if interruption.behind(error):
+        if parallel.interruption.behind(error):
             _keep_fit(before, done, json, options.force)
         raise
     if json != "-":
@@ -92,7 +91,7 @@ def diagnose_command(runs: opt.Runs, options: opt.FitOptions, validate: opt.Vali
         write_json(found.to_dict() | {"notes": notes}, json, options.force)
     save_report(found, report, held_out, options.force)
     if remainder_to:
-        with time_limit(budget):
+        with parallel.budget(budget):
             _write_remainder(found, remainder_to, options.force)
     if found.stopped == STOPPED_BY_HAND:
         raise typer.Exit(INTERRUPTED)
@@ -100,7 +99,7 @@ def diagnose_command(runs: opt.Runs, options: opt.FitOptions, validate: opt.Vali
 
 def _keep_fit(before: Fit, done: Sequence[str], json: opt.Json, force: bool) -> None:
     """Show and write what an interrupted diagnosis began with, and how far it came."""
-    interruption.heard()
+    parallel.interruption.heard()
     if json != "-":
         show(f"Interrupted after: {', '.join(done) or 'the fit'}. The original model:", parameter_table(before))
     if json:
@@ -169,7 +168,7 @@ def design_command(found_json: Found, out: Plan = None, goal: Goal = None, param
     if out is not None:
         path = design.to_csv(out, force)
         show(f"Written: {path}" if json != "-" else None)
-    if interruption.asked:
+    if parallel.interruption.asked:
         raise typer.Exit(INTERRUPTED)
 
 
@@ -200,7 +199,7 @@ def demo_command(out: DemoFolder = Path("motorid-demo"), json: opt.Json = None, 
     show(found.text, found.missing.text, "", ranking_table(found.ranking, 4),
          "4. Added, one line of code: fit.model + mi.effects." + (found.effects or ("…",))[0],
          ladder_table(found.ladder), parameter_table(found.after, found.before))
-    with progress("Writing the figures"):
+    with parallel.progress("Writing the figures"):
         files = _write_demo(found, check, out, force)
     show("Written: " + ", ".join(files), "Now your own: motorid diagnose RUN... --report yours.html")
     if json:
