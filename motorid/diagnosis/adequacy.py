@@ -162,16 +162,12 @@ def _dependences(fit: Fit, channel: str) -> list[dict[str, Any]]:
     residuals = [winsorised(r) for _, r in parts]
     found = []
     for name in (n for n in motions[0] if all(n in m for m in motions)):
-        if (labels := _labels([m[name] for m in motions], 2 * BINS if name == "theta" else BINS)) is not None:
-            share, p = _shift_test(labels, residuals)
+        signals, bins = [m[name] for m in motions], 2 * BINS if name == "theta" else BINS
+        edges = np.unique(np.quantile(np.concatenate(signals), np.linspace(0, 1, bins + 1)[1:-1]))
+        if edges.size:
+            share, p = _shift_test([np.searchsorted(edges, s, side="right") for s in signals], residuals)
             found.append({"channel": channel, "on": NAMES[name], "share": share, "p": p})
     return found
-
-
-def _labels(signals: Sequence[Array], bins: int) -> list[NDArray[np.intp]] | None:
-    """Return bin numbers by quantiles of the signal over all runs."""
-    edges = np.unique(np.quantile(np.concatenate(list(signals)), np.linspace(0, 1, bins + 1)[1:-1]))
-    return [np.searchsorted(edges, s, side="right") for s in signals] if edges.size else None
 
 
 def _shift_test(labels: Sequence[NDArray[np.intp]], residuals: Sequence[Array]) -> tuple[float, float]:

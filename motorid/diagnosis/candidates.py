@@ -20,14 +20,14 @@ from motorid.diagnosis.free_forms import own_levels
 from motorid.diagnosis.misspecification import LIMITER
 from motorid.diagnosis.model_comparison import COMMON, Node, beats, evidence, far, node_of, preferred, superfluous
 from motorid.diagnosis.predictive_score import Evidence
-from motorid.diagnosis.refit import LITTLE, GivenUp, Task, completed, hidden_in, led_on, lost, refit, refits, widened
+from motorid.diagnosis.refit import LITTLE, GivenUp, Task, completed, hidden_in, led_on, refit, refits, widened
 from motorid.diagnosis.results import Candidate
 from motorid.diagnosis.score_test import Score, pairs_of, rank, uses_angle, with_phase_per_run, with_warm_start
 from motorid.diagnosis.thresholds import MATERIAL
 from motorid.display.numbers import listed
 from motorid.effects import LIBRARY, MEASURED, PER_RUN
 from motorid.errors import ModelError
-from motorid.estimation.fit import solve
+from motorid.estimation.fit import lost, solve
 from motorid.estimation.least_squares import FAILURES
 from motorid.estimation.result import Fit
 from motorid.model.definition import Effect

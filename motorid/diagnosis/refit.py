@@ -16,6 +16,7 @@ from motorid.diagnosis.thresholds import MATERIAL, NATS
 from motorid.errors import OutOfTime
 from motorid.estimation.continuation import by_continuation, past_ripples, sharpened
 from motorid.estimation.first_guess import first_guess
+from motorid.estimation.fit import LOST, lost
 from motorid.estimation.least_squares import FAILURES, Estimate, cost_at
 from motorid.estimation.restarts import collapsed_again, restored
 from motorid.estimation.result import Fit
@@ -35,7 +36,6 @@ POLISH = LevenbergMarquardt(max_iterations=60, ftol=1e-3, xtol=1e-5, looks=0, pa
 TOLD = 0.1  # nats that a step must gain: less tells no two models apart
 OPTIMUM = LevenbergMarquardt(max_iterations=60, ftol=1e-5, xtol=1e-5, looks=0)
 GOING_ON = 4  # descents at most: the last one ended at its limit, or what it left asks for a finer end
-LOST = 0.2  # NRMSE of a channel
 ROOM = 10.0  # factor beyond its grid that a shape parameter may run to
 ALONE = 0.1  # of an answer: what is left of it without the others', if these do the same
 QUICKLY = partial(by_continuation, effort=QUICK, wide=False, narrow=False)  # nearly to the end
@@ -113,9 +113,10 @@ def finished(fit: Fit, best: Raced, effort: LevenbergMarquardt) -> Fit | None:
 
 
 def refit(fit: Fit, model: Model, starts: Sequence[Mapping[str, float]]) -> Fit | None:
-    """Return the best refit of `model` on the records of `fit` from several starts, at its optimum; None for none."""
+    """Return the best refit of `model` on the records of `fit` from several starts, at its optimum, or in windows near
+    enough to compare; None for none."""
     best = raced(fit, model, starts)
-    return None if best is None else finished(fit, best, OPTIMUM)
+    return None if best is None else finished(fit, best, POLISH if fit.window else OPTIMUM)
 
 
 def _released(measured: Problem) -> Estimate:
@@ -151,13 +152,6 @@ def copies_the_angle(problem: Problem, q: Array) -> bool:
     moved = [p.simulate(q, k, derivatives=False).y[:, column] for p in (problem, there) for k in range(len(runs))]
     answer, shake = np.concatenate(moved[len(runs):]) - np.concatenate(moved[:len(runs)]), np.concatenate(shakes)
     return bool(np.linalg.norm(answer - shake) < 0.5 * np.linalg.norm(shake))
-
-
-def lost(fit: Fit) -> bool:
-    """Tell whether a fit is so far from its records that neither its values nor slopes there lead anywhere: from the
-    motion, where that was measured. A current that no model comes near leaves slopes along the motion as they are."""
-    motion = [error for c, error in fit.nrmse.items() if c != "i"]
-    return max(motion or fit.nrmse.values(), default=0.0) > LOST
 
 
 def _own_starts(fit: Fit, model: Model, starts: Sequence[Mapping[str, float]]) -> list[dict[str, float]]:

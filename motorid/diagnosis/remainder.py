@@ -13,7 +13,7 @@ import contextlib
 import re
 from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property, reduce
+from functools import cached_property, partial, reduce
 from itertools import chain, islice, product, takewhile, zip_longest
 from typing import Any, NamedTuple
 
@@ -22,7 +22,7 @@ import numpy as np
 
 from motorid.channels import COMPUTED_INPUTS
 from motorid.diagnosis import free_forms
-from motorid.diagnosis.cross_validation import HeldOut
+from motorid.diagnosis.cross_validation import QUICK, HeldOut
 from motorid.diagnosis.free_forms import FINER, PAST, PLACE, Form, Span
 from motorid.diagnosis.misspecification import FormGain, better_forms, chosen_functions, pitches_of, tells_the_zero
 from motorid.diagnosis.model_comparison import Node, at_noise, far
@@ -30,6 +30,7 @@ from motorid.diagnosis.predictive_score import Evidence, Predictions, compare
 from motorid.diagnosis.refit import refit
 from motorid.display.numbers import listed, number, percent
 from motorid.errors import ModelError, OutOfTime, UsageError
+from motorid.estimation.fit import over_moments, solve
 from motorid.estimation.least_squares import FAILURES
 from motorid.estimation.result import Fit
 from motorid.model.definition import Effect, P
@@ -47,7 +48,8 @@ FURTHER = 3  # times that a form beside those of the curve is sought
 FEW = 8  # functions at most whose places are fitted, too
 ROUNDS = 3  # of choosing functions and fitting: near the optimum slopes show what the misfit hid before
 TASTED = 2  # functions by which forms are compared, and
-AHEAD = 2  # how many then go on
+AHEAD = 2  # how many then go on, of those in short windows one
+_moments = partial(over_moments, solve=partial(solve, solver=QUICK))
 AT_ONCE = 20  # parts of a sample, in one of which follows what does so at once; more are too stiff to fit,
 INPUT_AT_ONCE = 80  # but not of an input, which jumps at samples only
 QUANTITIES = {"turn": "m.theta", "theta": "m.theta", "omega": "m.omega", "i": "m.i", "v": "m.v", "past v": "m.v",
@@ -189,6 +191,8 @@ class Curve:
     values: tuple[float, ...] = ()  # of the coefficients, part by part
     fitted: Fit | None = None  # of the model with the curve
     name: str = "remainder"
+    begun: Curve | None = None  # the same as it grew in short windows, where it begins
+    trial: bool = False  # in short windows, to see what is worth fitting to the records
 
     @property
     def effect(self) -> Effect:
@@ -392,8 +396,9 @@ class Remainder:
         held, best = self._held or HeldOut.of(self.fit, None), None
         apart = self.form is not None and self.form.on == "run"
         if not apart or self._anew is not None:
-            both = self._tried(), _beyond(self._anew)
-            each = (islice((t for t in some if t[1].on != "run"), TRIED) for some in both)
+            root = self._root or self.fit
+            every = _grown_in(_moments(root), root, self.forms), self._tried(), _beyond(self._anew)
+            each = (islice((t for t in some if t[1].on != "run"), TRIED) for some in every)
             with contextlib.suppress(OutOfTime), budget(SECONDS):
                 best = _best(self.fit, chain.from_iterable(each), held)
         if best is None:
@@ -402,15 +407,15 @@ class Remainder:
                              "lowers the error on data left out; do these hold voltages or speeds that others lack?")
         return best
 
-    def _tried(self) -> Iterator[tuple[Fit, Form]]:
+    def _tried(self) -> Iterator[tuple[Curve, Form]]:
         """Yield models and a form to fit with each, the likeliest first; what takes a fit to find only when asked for.
 
         Beside what only approximates a form there is no place for it; then the whole model, or without all that does.
         """
         replaced = {name: form for name, form in self._approximating.items() if form is not None}
         if (base := self._without(replaced)) is not None:
-            yield from ((base, form) for form in dict.fromkeys(replaced.values()))
-        beside = [(self.fit, form) for form in self.forms]
+            yield from ((Curve(base), form) for form in dict.fromkeys(replaced.values()))
+        beside = [(Curve(self.fit), form) for form in self.forms]
         yield from beside[:1]
         alone = _beyond(self._without(self._approximating) if far(self.fit) else None)
         for pair in zip_longest(alone, beside[1:]):
@@ -435,11 +440,23 @@ class Remainder:
         return None
 
 
-def _beyond(base: Fit | None) -> Iterator[tuple[Fit, Form]]:
-    """Yield a model with each form that predicts more than it does, the best first."""
+def _beyond(base: Fit | None) -> Iterator[tuple[Curve, Form]]:
+    """Yield a model, without a curve yet, with each form that predicts more than it does, the best first."""
     if base is not None:
         with contextlib.suppress(*FAILURES):
-            yield from ((base, gain.form) for gain in better_forms(base, base))
+            yield from ((Curve(base, name=_name(base)), gain.form) for gain in better_forms(base, base))
+
+
+def _grown_in(there: Fit | None, base: Fit, asked: Sequence[Form], quiet: bool = False) -> Iterator[tuple[Curve, Form]]:
+    """Yield curves, best first, of forms that grew furthest in short windows or are `asked` for; or the quiet alone."""
+    if there is not None:
+        here, found = HeldOut.of(there, None), dict[Any, Grown]()
+        also = ((Curve(there), f) for f in asked[:AHEAD] if not f.remembers and f.on not in ("distance", "run"))
+        before, tried = here.predictions(there), chain(islice(_beyond(there), TRIED), also)
+        _race(found, ((replace(curve, trial=True), form) for curve, form in tried), before, here, before)
+        for key in sorted(found, key=lambda key: -found[key].gained.gain):
+            if found[key].done if quiet else found[key].gained.worth_it:
+                yield Curve(base, name=_name(base), begun=replace(found[key].curve, trial=False)), key[1]
 
 
 CLEAN = 1.05  # times the noise, of which no more is known than that: what leaves less cannot be told from the law
@@ -463,14 +480,14 @@ class Grown(NamedTuple):
         """Tell whether no other curve could do better: it leaves noise, or what is larger and nothing predicts."""
         fitted = self.curve.fitted
         return self.done and fitted is not None and (
-            max(fitted.misfit.values()) < CLEAN or next(_beyond(fitted), None) is None)
+            self.curve.trial or max(fitted.misfit.values()) < CLEAN or next(_beyond(fitted), None) is None)
 
 
 @one_thread
-def _best(fit: Fit, tried: Iterable[tuple[Fit, Form]], held: HeldOut) -> Curve | None:
+def _best(fit: Fit, tried: Iterable[tuple[Curve, Form]], held: HeldOut) -> Curve | None:
     """Return the curve, fitted with its model, that predicts most beyond `fit`; None where none does."""
     before, name = held.predictions(fit), _name(fit)
-    best = _better_curve(((Curve(base, name=name), form) for base, form in tried), before, held)
+    best = _better_curve(((replace(curve, name=name), form) for curve, form in tried), before, held)
     for _ in range(FURTHER):
         if best is None or best.done or (larger := _better_curve(_further(best), best.predictions, held)) is None:
             break
@@ -529,33 +546,34 @@ def _race(found: dict[Any, Grown], tried: Iterable[tuple[Curve, Form]], before: 
     def quiet(key: Any, functions: int) -> bool:
         for k, grown in enumerate(racing[key], 1):
             found[key] = grown
-            if k >= functions and not grown.done:
+            if grown.curve.trial if grown.done else k >= functions:
                 break
         return key in found and found[key].clean
 
     for key in tried:
-        if (key[0].fit.model.effect_names, key[1]) not in {(c.fit.model.effect_names, f) for c, f in racing}:
+        alike = {(c.fit.model.effect_names, f, c.begun is None) for c, f in racing}
+        if (key[0].fit.model.effect_names, key[1], key[0].begun is None) not in alike:
             racing[key] = _grown(*key, True, before, held)
             if quiet(key, TASTED if found or rival is not None else FEW):
                 return []
     ahead = sorted(found, key=lambda key: -found[key].gained.gain)
     others = [key for key in ahead if key != next(iter(racing))] if rival is None else [
         key for key in ahead if compare(rival, found[key].predictions).gain > 0]
-    return [] if any(quiet(key, FEW) for key in others[:AHEAD]) else (
+    return [] if any(quiet(key, FEW) for key in others[: 1 if rival is before else AHEAD]) else (
         sorted(found, key=lambda key: -found[key].gained.gain)[:AHEAD])
 
 
-def alone_leaving_noise(last: Node, root: Fit, held: HeldOut) -> FormGain | None:
+def alone_leaving_noise(last: Node, root: Fit, held: HeldOut, forms: Sequence[Form] = ()) -> FormGain | None:
     """Return the form that, fitted in the place of all that `last` has and `root` has not, leaves noise and predicts
-    better; None for none. Raises OutOfTime."""
+    better, or leaves it in short windows where `root` loses itself; None for none. Raises OutOfTime."""
     found = dict[Any, Grown]()
     check_time()
     with contextlib.suppress(*FAILURES):
-        forms = islice((f for _, f in _beyond(root) if f.on != "run"), TRIED)
-        tried = ((Curve(root, name=_name(root)), form) for form in forms)
-        _race(found, tried, held.predictions(root), held, last.predictions)
+        there, before = _moments(root), held.predictions(root)
+        whole = (t for t in _beyond(root) if t[1].on != "run" and (there is None or t[1].remembers))
+        _race(found, islice(chain(_grown_in(there, root, forms, True), whole), TRIED), before, held, last.predictions)
     each = (FormGain(key[1], compare(last.predictions, f.predictions), f.predictions)
-            for key, f in found.items() if f.done)
+            for key, f in found.items() if f.done or key[0].begun is not None)
     return next((gain for gain in each if gain.evidence.worth_it), None)
 
 
@@ -566,12 +584,16 @@ def _name(fit: Fit) -> str:
 
 def _grown(curve: Curve, form: Form, moved: bool, before: Predictions, held: HeldOut) -> Iterator[Grown]:
     """Yield a curve with a form more, of ever more functions, as long as these help."""
-    best = float("-inf")
+    best, led = float("-inf"), None
     with contextlib.suppress(*FAILURES):
+        if moved and curve.begun is not None and curve.begun.fitted is not None:
+            there = {n: v for n, v in curve.begun.fitted.values.items() if n != "sgn_width"}
+            led = replace(curve.begun, fit=curve.fit, name=curve.name).refitted(curve.fit, there)
         curve = replace(curve, parts=(*curve.parts, Part.of(curve.fitted or curve.fit, form, moved)))
         for _ in range(FEW if moved else ROUNDS):
             check_time()
-            if (larger := curve.grown()) is None or larger.fitted is None:
+            larger, led = led or curve.grown(), None
+            if larger is None or larger.fitted is None:
                 return
             predicted = held.predictions(larger.fitted)
             if (gained := compare(before, predicted)).gain < best:  # slopes led astray

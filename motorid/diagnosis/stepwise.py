@@ -214,7 +214,7 @@ def _curve_alone(found: Climb, root: Fit, held: HeldOut, seconds: float | None) 
         return found, None
     try:
         with budget(seconds):
-            return found, alone_leaving_noise(found.path[-1], root, held)
+            return found, alone_leaving_noise(found.path[-1], root, held, [gain.form for gain in found.forms])
     except (OutOfTime, KeyboardInterrupt) as error:
         interruption.heard()
         stopped = OUT_OF_TIME if isinstance(error, OutOfTime) else INTERRUPTED

@@ -38,6 +38,8 @@ ERROR_SHARE = 0.2  # integration error accepted beside noise or misfit
 BIAS = 0.2  # deviations by which it may move the estimate
 WINDOWS = (8, 32)  # of the longest record, where it is not followed as a whole
 FEWEST = 50  # samples of a window
+LOST = 0.2  # NRMSE of a channel
+MOMENT, MIN_MOMENT, MOST_MOMENTS = 2.0, 16, 24  # time constants and samples of a short window, and how many at most
 UNFOLLOWED = 0.25  # share of a channel's variance left unexplained
 TOO_FAR = 100.0  # times that an error in the state grows: one of 1 % would be all of the motion
 NEXT_TO_NOTHING = 0.01  # times the natural size of an effect
@@ -330,6 +332,13 @@ def follows(fit: Fit) -> bool:
     return all(left[c] < UNFOLLOWED * whole[c] or fit.misfit.get(c, np.inf) < NOISE for c in left)
 
 
+def lost(fit: Fit) -> bool:
+    """Tell whether a fit is so far from its records that neither its values nor slopes there lead anywhere: from the
+    motion, where that was measured. A current that no model comes near leaves slopes along the motion as they are."""
+    motion = [error for c, error in fit.nrmse.items() if c != "i"]
+    return max(motion or fit.nrmse.values(), default=0.0) > LOST
+
+
 def in_windows(fit: Fit, solve: Callable[[Problem], Fit] = solve, drifts: bool = False) -> Fit | None:
     """Return the fit of the same model in the longest windows that it follows, if it amplifies errors; else None.
 
@@ -351,6 +360,22 @@ def in_windows(fit: Fit, solve: Callable[[Problem], Fit] = solve, drifts: bool =
             part = solve(problem.with_(experiments=runs, model=model, noise_factors={})) if runs else None
             if part is not None and follows(part) and (not whole or leaves_noise(part)):
                 return part if whole or drifts or growth(part) > TOO_FAR else None
+    return None
+
+
+def over_moments(fit: Fit, solve: Callable[[Problem], Fit] = solve) -> Fit | None:
+    """Return the fit of the same model in windows of a few time constants, of long records here and there, where slopes
+    lead (Ribeiro et al., Automatica 121, 2020, 109158); None for one that is not far off, or of too short records."""
+    v, runs, model = fit.values, fit.problem.experiments, fit.model.with_(angle_input=False)
+    seconds = MOMENT * v["J"] / (v["b"] + v.get("K", 0.0) ** 2 / v.get("R", 1.0))
+    few = not MIN_MOMENT * max(r.dt for r in runs) < seconds < min(r.duration for r in runs) / 2
+    if few or (follows(fit) and not lost(fit)):
+        return None
+    whole = (r.with_(meta={k: x for k, x in r.meta.items() if k != "window"}) for r in runs)
+    parts = [p for r in whole for p in windows(r, seconds)]
+    some = tuple(parts[k] for k in np.unique(np.linspace(0, len(parts) - 1, MOST_MOMENTS).round().astype(int)))
+    with contextlib.suppress(*FAILURES):
+        return solve(fit.problem.with_(experiments=some, model=model, initial="auto", noise_factors={}))
     return None
 
 

@@ -34,8 +34,10 @@ from motorid.diagnosis.free_forms import (
 )
 from motorid.diagnosis.locate import locate
 from motorid.diagnosis.remainder import Curve, Part, Remainder
+from motorid.estimation.fit import over_moments, solve
 from motorid.exporters.export import load
 from motorid.numerics.parallel import budget, one_thread
+from motorid.records.experiment import record_of, windows
 from motorid.records.reading import write_csv
 
 ANGLE = ("i", "omega", "theta")
@@ -921,3 +923,52 @@ def test_a_place_that_a_fit_rounds_beyond_its_limit_is_at_it_and_an_angle_counts
     turned = mi.fit(zeroed, run)
     moved = signals_along(turned)[0]["turn"] - signals_along(fit)[0]["turn"]
     assert moved == pytest.approx(0.3)
+
+
+@pytest.fixture(scope="module")
+def rubbed():
+    """Three runs of a motor with a brake that rubs within a part of each turn, and the noise of its sensors."""
+    rng, t = np.random.default_rng(9), np.arange(1200) * 1e-3
+
+    @mi.effect(balance="torque")
+    def rubbing(m, tau=mi.P(0.2, "N·m", null=0.0)):
+        m.torque -= tau * m.sign(m.omega) * 0.5 * (1 + ca.tanh((ca.cos(m.theta - 1.6) - np.cos(0.6)) / 0.02))
+
+    motor = mi.dc_motor(R=1.38, L=1.72e-3, K=0.0462, b=6.5e-5, J=2.35e-5)
+    noise = {"i": 0.02, "omega": 0.5, "theta": 2e-3}
+    runs = []
+    for _ in range(3):
+        still = mi.Experiment(t, {"v": np.repeat(rng.uniform(-12, 12, 12), 100)}, {c: np.zeros_like(t) for c in noise})
+        shown = mi.simulate(motor + rubbing, still, initial="rest")[0].outputs
+        runs.append(still.with_(outputs={c: shown[c] + s * rng.standard_normal(len(t)) for c, s in noise.items()}))
+    return runs, noise
+
+
+@one_thread
+def test_what_leads_a_motor_astray_grows_in_short_windows(rubbed):
+    """Slopes along the plain motor's whole records lead nowhere."""
+    runs, noise = rubbed
+    found = mi.diagnose(mi.fit(mi.dc_motor(), runs[:2]), runs[2:], effects=("stribeck",))
+    assert (found.verdict, found.effects) == ("unexplained", ())
+    assert found.remainder.as_effect().doc == "What is left: a friction that changes with the angle within a turn."
+    left = mi.evaluate(found.remainder.fitted, runs[2]).rmse
+    assert mi.evaluate(found.best, runs[2]).rmse["i"] > 20 * noise["i"]
+    assert all(left[c] < 1.1 * noise[c] for c in ("i", "omega"))
+
+
+@one_thread
+def test_short_windows_last_two_time_constants_and_are_a_few_of_all(rubbed):
+    runs, _ = rubbed
+    fit = mi.fit(mi.dc_motor(), runs[:2])
+    there, v = over_moments(fit), fit.values
+    assert there is not None
+    assert there.window == pytest.approx(2 * v["J"] / (v["b"] + v["K"] ** 2 / v["R"]))
+    parts = there.problem.experiments
+    assert len(parts) == 24
+    assert all(p.duration == pytest.approx(there.window, abs=3 * p.dt) for p in parts)
+    assert {p.meta["record"] for p in parts} == {record_of(r) for r in runs[:2]}
+    assert there.values["K"] == pytest.approx(0.0462, rel=0.1)  # nearer than over whole records, although it rubs
+    longer = fit.problem.with_(experiments=tuple(p for r in runs[:2] for p in windows(r, r.duration)), noise_factors={})
+    again = over_moments(solve(longer))
+    assert again is not None
+    assert again.window == pytest.approx(there.window, rel=0.5)  # of records that are cut already
