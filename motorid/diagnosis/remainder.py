@@ -49,7 +49,7 @@ FEW = 8  # functions at most whose places are fitted, too
 ROUNDS = 3  # of choosing functions and fitting: near the optimum slopes show what the misfit hid before
 TASTED = 2  # functions by which forms are compared, and
 AHEAD = 2  # how many then go on, of those in short windows one
-_moments = partial(over_moments, solve=partial(solve, solver=QUICK))
+_moments = partial(over_moments, solve=partial(solve, solver=QUICK))  # a model that is far off, in short windows
 AT_ONCE = 20  # parts of a sample, in one of which follows what does so at once; more are too stiff to fit,
 INPUT_AT_ONCE = 80  # but not of an input, which jumps at samples only
 QUANTITIES = {"turn": "m.theta", "theta": "m.theta", "omega": "m.omega", "i": "m.i", "v": "m.v", "past v": "m.v",
@@ -396,8 +396,8 @@ class Remainder:
         held, best = self._held or HeldOut.of(self.fit, None), None
         apart = self.form is not None and self.form.on == "run"
         if not apart or self._anew is not None:
-            root = self._root or self.fit
-            every = _grown_in(_moments(root), root, self.forms), self._tried(), _beyond(self._anew)
+            short = (t for root in [self._root or self.fit] for t in _grown_in(_moments(root), root, self.forms))
+            every = short, self._tried(), _beyond(self._anew)
             each = (islice((t for t in some if t[1].on != "run"), TRIED) for some in every)
             with contextlib.suppress(OutOfTime), budget(SECONDS):
                 best = _best(self.fit, chain.from_iterable(each), held)
