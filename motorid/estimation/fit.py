@@ -366,8 +366,8 @@ def in_windows(fit: Fit, solve: Callable[[Problem], Fit] = solve, drifts: bool =
 def over_moments(fit: Fit, solve: Callable[[Problem], Fit] = solve) -> Fit | None:
     """Return the fit of the same model in windows of a few time constants, of long records here and there, where slopes
     lead (Ribeiro et al., Automatica 121, 2020, 109158); None for one that is not far off, or of too short records."""
-    v, runs, model = fit.values, fit.problem.experiments, fit.model.with_(angle_input=False)
-    seconds = MOMENT * v["J"] / (v["b"] + v.get("K", 0.0) ** 2 / v.get("R", 1.0))
+    v, runs, model = {"R": 1.0, "K": 0.0, **fit.values}, fit.problem.experiments, fit.model.with_(angle_input=False)
+    seconds = MOMENT * v["J"] * v["R"] / (v["b"] * v["R"] + v["K"] ** 2 or np.inf)  # none without friction
     few = not MIN_MOMENT * max(r.dt for r in runs) < seconds < min(r.duration for r in runs) / 2
     if few or (follows(fit) and not lost(fit)):
         return None

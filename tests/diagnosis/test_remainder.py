@@ -972,3 +972,12 @@ def test_short_windows_last_two_time_constants_and_are_a_few_of_all(rubbed):
     again = over_moments(solve(longer))
     assert again is not None
     assert again.window == pytest.approx(there.window, rel=0.5)  # of records that are cut already
+
+
+def test_an_axis_without_friction_has_no_short_windows(rubbed):
+    runs, _ = rubbed
+    turned = [run.with_(outputs={"omega": np.cumsum(run.inputs["v"] - 9 * np.sign(run.outputs["omega"])) * 1e-2})
+              for run in runs[:1]]
+    fit = mi.fit(mi.torque_driven().fix(b=0), turned)
+    assert fit.nrmse["omega"] > 0.2
+    assert over_moments(fit) is None
