@@ -105,8 +105,10 @@ def with_phase_per_run(fit: Fit, scores: Sequence[Score], zero: Effect) -> list[
         tried, added = [], Added.of(tangent, s.effect)
         order = next((p.name for p in added.pars if p.order and not p.given), "")
         parts = parts or [Tangent.of(alone(fit, k)) for k in runs if order]
-        for n in {line.order for part in parts for line in likely_lines(part, s.effect, PER_RUN)} if order else (1.0,):
-            shape = added.shape({order: n} if order else {})
+        lines = (line for part in parts for line in likely_lines(part, s.effect, PER_RUN)) if order else ()
+        tried_at = [{order: line.order, **line.choice} for line in lines] if order else [{}]
+        for values in {tuple(at.items()): at for at in tried_at}.values():
+            n, shape = values.get(order, 1.0), added.shape(values)
             if shape is None or not shape.sizes:
                 continue
             drop, a, _ = tangent.explained(np.hstack(by_record(fit.problem, shape.columns)), [False] * 2 * len(runs))

@@ -17,12 +17,13 @@ BASE = mi.dc_motor(**VALUES)
 
 
 def records(models, volts, rng, noise=(0.02, 0.3), dt=1e-3, n=500):
+    """`noise` of current, speed and, where there are three, angle."""
     t, found = np.arange(n) * dt, []
+    sizes = dict(zip(("i", "omega", "theta"), noise, strict=False))
     for model, volt in zip(models, volts, strict=True):
-        bare = mi.Experiment(t, {"v": drive(t, volt)}, {"i": np.zeros(n), "omega": np.zeros(n)}, name=f"{volt} V")
+        bare = mi.Experiment(t, {"v": drive(t, volt)}, dict.fromkeys(sizes, np.zeros(n)), name=f"{volt} V")
         shown = mi.simulate(model, bare, initial="rest")[0].outputs
-        sizes = zip(("i", "omega"), noise, strict=True)
-        found.append(bare.with_(outputs={c: shown[c] + s * rng.normal(size=n) for c, s in sizes}))
+        found.append(bare.with_(outputs={c: shown[c] + s * rng.normal(size=n) for c, s in sizes.items()}))
     return found
 
 
@@ -43,6 +44,18 @@ def test_cogging_under_an_encoder_zeroed_at_every_start_is_named_with_the_zeros(
     assert found.text.count("rad, by run") == 1
     assert "Parameters per run" in str(found.best.card())
     assert mi.identifiability(found.best).rank == 7
+
+
+def test_a_ripple_of_torque_and_back_emf_under_such_an_encoder_is_named_with_its_angle_measured(rng):
+    def rippling(zero):
+        return (BASE + mi.effects.torque_ripple + mi.effects.constant_load).replace(
+            a_r=0.3, N_r=6.0, phi_r=0.7 + 6 * zero, e_r=1.0, tau_0=0.01)
+
+    runs = records(map(rippling, (0.0, 0.43, -0.13)), (6.0, -5.0, 5.5), rng, noise=(0.02, 0.3, 2e-4))
+    found = mi.diagnose(mi.fit(mi.dc_motor(), runs[:2]), runs[2:], effects=[*TRIED, "constant_load"])
+    assert set(found.effects) == {"torque_ripple", "constant_load", "encoder_zero"}, found.text
+    assert found.after.values["e_r"] == 1.0
+    assert found.after.values["a_r"] == pytest.approx(0.3, rel=0.02)
 
 
 def test_no_zero_is_asked_for_where_the_phase_stays(rng):

@@ -116,6 +116,16 @@ def test_an_encoder_off_centre_shows_the_angle_that_it_was_started_with(names, b
     assert shown == pytest.approx(begun, abs=1e-4)
 
 
+@pytest.mark.parametrize("effect", ["cogging", "torque_ripple"])  # written before and after the encoder's zero
+def test_beside_the_zero_of_an_encoder_an_effect_sees_the_measured_angle_where_that_is_given(effect):
+    model = motor(mi.effects.get(effect), mi.effects.encoder_zero)
+    system = model.with_(angle_input=True).system(ALL)
+    x, u, p = ca.SX.sym("x", len(system.states)), ca.SX.sym("u", system.sizes[1]), ca.SX.sym("p", system.sizes[2])
+    torque = system.rhs(x, u, p)[system.states.index("omega")]
+    assert not ca.depends_on(torque, x[system.states.index("theta")])
+    assert ca.depends_on(torque, u[system.inputs.index("theta_in")])
+
+
 @every_effect
 @pytest.mark.parametrize("v", [0.0, 6.0])
 def test_value_and_jacobian_are_finite_at_standstill(effect, v):
