@@ -13,6 +13,7 @@ from types import SimpleNamespace
 import numpy as np
 
 from motorid.channels import COMPUTED_INPUTS
+from motorid.diagnosis.score_test import by_record
 from motorid.diagnosis.thresholds import CONTAINED
 from motorid.effects import LIBRARY
 from motorid.errors import SimulationError
@@ -71,7 +72,7 @@ class Form:
     """A free function of the quantity `on` times `carrier`, in one balance; `words` says what that is.
 
     In the balance ``"sensor"`` it is added to the output `channel`; ``"both"`` is the motor constant, which makes
-    torque of current and voltage of speed.
+    torque of current and voltage of speed. A `zeroed` one is over an angle whose zero is another in every run.
     """
 
     words: str
@@ -79,11 +80,12 @@ class Form:
     on: str
     carrier: str = ""
     channel: str = ""
+    zeroed: bool = False
 
     @property
     def text(self) -> str:
         """What it is, in words."""
-        return f"{self.words} that {CHANGES[self.on]}"
+        return f"{self.words} that {CHANGES[self.on]}{', its zero another in every run' * self.zeroed}"
 
     @property
     def local(self) -> bool:
@@ -528,6 +530,23 @@ def form_coefficients(fit: Fit, linear: Linear, form: Form, kept: Sequence[int] 
     together = np.column_stack([columns[:, :first], columns[:, first:][:, chosen], linear.own])
     found = ridge(together.T @ together, together.T @ linear.residual, linear.residual)
     return found[first : first + len(chosen)] * sizes[chosen]
+
+
+def zeroed(fit: Fit, linear: Linear, form: Form) -> Linear:
+    """Return a form with coefficients of its own on every record."""
+    return replace(linear, forms={form: np.hstack(by_record(fit.problem, linear.forms[form]))})
+
+
+def zeros_of(fit: Fit, form: Form) -> dict[str, float]:
+    """Return the zero of the angle in every record but the first, by name: where its own curve is most like that."""
+    span, runs = span_of(fit, signals_along(fit)), sorted(set(fit.problem.unknowns.firsts))
+    own = form_coefficients(fit, zeroed(fit, linearised(fit), form), form)
+    angle = np.linspace(-np.pi, np.pi, 720, endpoint=False)
+    waves = values_of(functions_of(form, span), form, {"turn": angle, "t": angle})
+    curves = waves[:, 1:] @ own.reshape(len(runs), -1)[:, 1:].T  # without the constant
+    alike = np.fft.irfft(np.conj(np.fft.rfft(curves, axis=0)) * np.fft.rfft(curves[:, :1], axis=0), axis=0)
+    return {f"z_0[{k}]": float(angle[j] % (2 * np.pi) - np.pi)
+            for k, j in zip(runs[1:], alike.argmax(axis=0)[1:], strict=True)}
 
 
 def form_columns(fit: Fit, linear: Linear, form: Form) -> tuple[Array, Array]:

@@ -65,7 +65,8 @@ def raced(fit: Fit, model: Model, starts: Sequence[Mapping[str, float]]) -> Race
     new = (e for e in model.effects if e.name not in fit.model.effect_names)
     poles = chain.from_iterable(exchanged_poles(model, e) for e in new)
     alive, starts = restored(fit, model), starts or ({},)
-    angular = any(map(uses_angle, model.effects)) and not any(map(uses_angle, fit.model.effects))
+    before = [e for e in fit.model.effects if e.name != "encoder_zero"]  # which alone moves nothing
+    angular = any(map(uses_angle, model.effects)) and not any(map(uses_angle, before))
     # As it is where a parameter put back (an inductance that no sample shows) makes the model too stiff.
     models = (alive,) if alive is model else (alive, model)
     # A guess of the larger model's own, along the records, is no longer led astray.

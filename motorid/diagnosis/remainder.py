@@ -29,6 +29,7 @@ from motorid.diagnosis.model_comparison import Node, at_noise, far
 from motorid.diagnosis.predictive_score import Evidence, Predictions, compare
 from motorid.diagnosis.refit import refit
 from motorid.display.numbers import listed, number, percent
+from motorid.effects import PER_RUN
 from motorid.errors import ModelError, OutOfTime, UsageError
 from motorid.estimation.fit import over_moments, solve
 from motorid.estimation.least_squares import FAILURES
@@ -415,10 +416,10 @@ class Remainder:
         replaced = {name: form for name, form in self._approximating.items() if form is not None}
         if (base := self._without(replaced)) is not None:
             yield from ((Curve(base), form) for form in dict.fromkeys(replaced.values()))
-        beside = [(Curve(self.fit), form) for form in self.forms]
-        yield from beside[:1]
+        beside = _over_zeros(self.fit, self.forms)
+        yield from islice(beside, 1)
         alone = _beyond(self._without(self._approximating) if far(self.fit) else None)
-        for pair in zip_longest(alone, beside[1:]):
+        for pair in zip_longest(alone, beside):
             yield from filter(None, pair)
 
     @property
@@ -444,7 +445,15 @@ def _beyond(base: Fit | None) -> Iterator[tuple[Curve, Form]]:
     """Yield a model, without a curve yet, with each form that predicts more than it does, the best first."""
     if base is not None:
         with contextlib.suppress(*FAILURES):
-            yield from ((Curve(base, name=_name(base)), gain.form) for gain in better_forms(base, base))
+            yield from _over_zeros(base, (gain.form for gain in better_forms(base, base)))
+
+
+def _over_zeros(base: Fit, forms: Iterable[Form]) -> Iterator[tuple[Curve, Form]]:
+    """Yield a model, without a curve yet, with each form, beside the zero of every run where the form has one."""
+    for form in forms:
+        model = base.model + PER_RUN["encoder_zero"] if form.zeroed else base.model
+        if (fit := refit(base, model, [free_forms.zeros_of(base, form)]) if form.zeroed else base) is not None:
+            yield Curve(fit, name=_name(base)), replace(form, zeroed=False)
 
 
 def _grown_in(there: Fit | None, base: Fit, asked: Sequence[Form], quiet: bool = False) -> Iterator[tuple[Curve, Form]]:

@@ -925,6 +925,28 @@ def test_a_place_that_a_fit_rounds_beyond_its_limit_is_at_it_and_an_angle_counts
     assert moved == pytest.approx(0.3)
 
 
+@mi.effect(balance="voltage")
+def worn(m, R_w=mi.P(2.0, "Ω", null=0.0)):
+    """A commutator of which one half is worn more than the other."""
+    m.voltage -= R_w * m.i * ca.exp(ca.cos(m.theta - 1) - 1)
+
+
+def test_over_the_turn_of_an_encoder_zeroed_at_every_start_a_curve_is_found_with_the_zeros(lab):
+    runs, floor = _with_law(worn, ANGLE, lab)
+    zeros = 0.0, 1.9, -0.8
+    runs = [run.with_(outputs={**run.outputs, "theta": run.outputs["theta"] - z})
+            for run, z in zip(runs, zeros, strict=True)]
+    found = mi.diagnose(mi.fit(mi.dc_motor(), runs[:2]), runs[2:], effects=("coulomb", "quadratic_drag"))
+    assert found.remainder.follows == (
+        "a resistance that changes with the angle within a turn, its zero another in every run")
+    assert found.remainder.as_effect().doc == "What is left: a resistance that changes with the angle within a turn."
+    fit = mi.fit(found.remainder.model + found.remainder.as_effect(), runs[:2])
+    assert fit.per_run["z_0"][runs[1].name]["value"] == pytest.approx(zeros[1], abs=0.02)
+    assert fit.nrmse["i"] < 0.2 * found.best.nrmse["i"]
+    after = mi.evaluate(fit, runs[2]).nrmse
+    assert all(after[c] < 1.1 * floor[c] for c in ("i", "omega"))
+
+
 @pytest.fixture(scope="module")
 def rubbed():
     """Three runs of a motor with a brake that rubs within a part of each turn, and the noise of its sensors."""
