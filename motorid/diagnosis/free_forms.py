@@ -212,6 +212,7 @@ def own_levels(runs: Sequence[Experiment]) -> bool:
     return all(high - low <= ON * high for low, high in ends) and len({f"{high:.1e}" for _, high in ends}) > 1
 
 
+Z = re.compile(r"\bz\b")
 # Of what bends, sets in or fades, with its limits, and its unit where that is another: a curve may move it.
 PLACE = re.compile(r"<(\S+) (\S+) (\S+?)(?: (\S+))?>")
 
@@ -249,7 +250,16 @@ def functions_of(form: Form, span: Span) -> list[str]:
                 fades = (_place(reach / k, min(span.step, reach / k), reach) for k in SOON)
                 found += [f"({sign}z > 0) * ca.exp(-ca.fabs(z) / {fade})" for fade in fades]
         return found
-    return (_along if form.on in ("theta", "t", "distance") else _of_size)(form, span, low, high)
+    found = (_along if form.on in ("theta", "t", "distance") else _of_size)(form, span, low, high)
+    if form.carrier != "acceleration":
+        return found
+    middle = f"{0.5 * max(abs(low), abs(high)) if form.on == 'omega' else 0.5 * (low + high):.9g}"
+    return [f"({f} - {_number(Z.sub(middle, f))})" for f in found]  # the motor's own J is the one in the middle
+
+
+def _number(source: str) -> str:
+    """Return what a source without a `PLACE` amounts to."""
+    return source if PLACE.search(source) else f"{eval(source, {'ca': np, 'm': SimpleNamespace(sign=np.sign)}):.9g}"
 
 
 def _sided(form: Form, lengths: Array, top: float) -> list[str]:

@@ -74,6 +74,7 @@ RATES = {  # of what follows z, with one place
     "ramp": "ca.if_else(z < 0, -1, 1) * (ca.fmin({p}, (ca.fabs(z) - ca.if_else(z < 0, -{s}, {s})) / {step})"
             " + ca.fmax(ca.if_else(z < 0, {s}, -{s}), 0) / {step})",
     "hold": "(z - {s}) / ca.if_else(ca.fabs(z) > ca.fabs({s}), {sample}, {p})"}
+POSITIVE = "ca.fmax(curve, -0.5) - 0.25 / ca.fmin(curve, -0.5) - 0.5"  # above -1, smooth; from -0.5 on as it is
 CARRIERS = {"": "", "direction": "m.sign(m.omega) * ", "omega": "m.omega * ", "i": "m.i * ", "v": "m.v * "}
 
 
@@ -169,6 +170,8 @@ class Part:
                 lines += [f"{past} = m.state('{own}_{past}'{FIRST.get(form.on, '')})", f"m.rate({past}, {change})"]
                 terms = [t.replace(lag, past) for t in terms]
         lines += ["curve = (", *(f"    + {n} * {t}" for n, t in zip(names, terms, strict=True)), ")"]
+        if form.carrier == "acceleration":
+            lines += [f"curve = {POSITIVE}  # an inertia stays above zero"]
         if form.carrier == "acceleration" and form.on in ("turn", "theta"):  # kinetic energy changes with the angle
             lines[0] = "z = ca.SX.sym('z')"
             lines += ["slope, curve = (ca.substitute(f, z, m.theta) for f in (ca.jacobian(curve, z), curve))",
@@ -267,7 +270,8 @@ class Curve:
         z = np.concatenate([s[part.form.on] for s in self._signals])
         _, sizes, places = next(self._apart(self.values))
         values = np.concatenate([free_forms.values_of(part.terms(places), part.form, s) for s in self._signals])
-        return z, values @ np.array(sizes)
+        curve = values @ np.array(sizes)
+        return z, eval(POSITIVE, {"ca": np, "curve": curve}) if part.form.carrier == "acceleration" else curve
 
     @cached_property
     def _signals(self) -> list[dict[str, Array]]:

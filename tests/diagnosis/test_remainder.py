@@ -947,6 +947,29 @@ def test_over_the_turn_of_an_encoder_zeroed_at_every_start_a_curve_is_found_with
     assert all(after[c] < 1.1 * floor[c] for c in ("i", "omega"))
 
 
+@pytest.mark.parametrize("on", ["omega", "theta", "turn"])
+def test_an_inertia_that_changes_stays_above_zero_and_is_the_motors_own_in_the_middle(on, lab):
+    rng = np.random.default_rng(5)
+    run = record(driven(lab, {}, "stairs", 400, 1e-3, rng), "logger", ANGLE, lab, rng, "run")
+    fit, form = mi.fit(mi.dc_motor(), run), Form("an inertia", "torque", on, "acceleration")
+    span = Part.of(fit, form).span
+    chosen = tuple(range(1, len(functions_of(form, span)), 9))[:3]
+    curve = Curve(fit, (Part(form, span, chosen, True),), (-4.0,) * len(chosen))
+    curve = replace(curve, values=(*curve.values, *(at for at, *_ in curve.parts[0].places)))
+    if on != "turn":
+        low, high = span.ranges[on]
+        middle = {"omega": 0.5 * max(-low, high), "theta": 0.5 * (low + high)}[on]
+        there = {on: np.full(2, middle), "t": np.ones(2), "width": np.ones(2)}
+        assert values_of(functions_of(form, span), form, there) == pytest.approx(0.0, abs=1e-6)
+    lowest = curve.points[1].min()
+    assert -1 < lowest < -0.8
+    system = (fit.model + curve.effect).system(ANGLE)
+    values = {**fit.values, **curve.sizes}
+    rates = [float(system.rhs(x, [0.0], [values[n] for n in system.parameters])[system.states.index("omega")])
+             for x in np.diag([1.0] * len(system.states))]
+    assert 0 < rates[system.states.index("i")] < 1e4 * fit.values["K"] / fit.values["J"]  # it speeds up
+
+
 @pytest.fixture(scope="module")
 def rubbed():
     """Three runs of a motor with a brake that rubs within a part of each turn, and the noise of its sensors."""
