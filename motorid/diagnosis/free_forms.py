@@ -17,7 +17,7 @@ from motorid.diagnosis.score_test import by_record
 from motorid.diagnosis.thresholds import CONTAINED
 from motorid.effects import LIBRARY
 from motorid.errors import SimulationError
-from motorid.estimation.angle_orders import likely_lines
+from motorid.estimation.angle_orders import likely_lines, uses_angle
 from motorid.estimation.linearisation import Response, Tangent, parameter_vector, responses
 from motorid.estimation.result import Fit
 from motorid.numerics.signals import Array
@@ -540,6 +540,16 @@ def form_coefficients(fit: Fit, linear: Linear, form: Form, kept: Sequence[int] 
     together = np.column_stack([columns[:, :first], columns[:, first:][:, chosen], linear.own])
     found = ridge(together.T @ together, together.T @ linear.residual, linear.residual)
     return found[first : first + len(chosen)] * sizes[chosen]
+
+
+def may_be_zeroed(fit: Fit) -> bool:
+    """Tell whether records could show that each has a zero of the angle of its own: all go through a whole turn, and
+    nothing in the model is over the angle yet."""
+    signals, firsts = signals_along(fit), fit.problem.unknowns.firsts
+    if len(set(firsts)) < 2 or "turn" not in signals[0] or any(map(uses_angle, fit.model.effects)):
+        return False
+    angles = [[s["turn"] for s, f in zip(signals, firsts, strict=True) if f == first] for first in set(firsts)]
+    return min(float(np.ptp(np.concatenate(parts))) for parts in angles) > 2 * np.pi
 
 
 def zeroed(fit: Fit, linear: Linear, form: Form) -> Linear:

@@ -50,7 +50,7 @@ def better_forms(fit: Fit, rival: Fit, channels: Container[str] = CHANNELS) -> l
     try:
         linear = free_forms.linearised(fit)
         answers = {form: Answers(fit, linear, form).predictions() for form in linear.forms}
-        if far(fit) and len(set(fit.problem.unknowns.firsts)) > 1 and not any(map(uses_angle, fit.model.effects)):
+        if far(fit) and free_forms.may_be_zeroed(fit):
             for form in [f for f, plain in answers.items() if f.on == "turn" and plain]:
                 own = Answers(fit, free_forms.zeroed(fit, linear, form), form).predictions()
                 if own is not None and compare(answers[form], own).sure:
