@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 
 from motorid.channels import channel_name
 from motorid.diagnosis.misspecification import better_forms, hum_of
-from motorid.diagnosis.model_comparison import Node, far, finer
+from motorid.diagnosis.model_comparison import Node, far
+from motorid.diagnosis.predictive_score import finer
 from motorid.diagnosis.results import Adequacy
 from motorid.diagnosis.score_test import Score
 from motorid.diagnosis.thresholds import LARGER, SEARCHED

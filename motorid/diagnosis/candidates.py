@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from motorid.diagnosis.admissibility import objections
-from motorid.diagnosis.cross_validation import QUICK, HeldOut
+from motorid.diagnosis.cross_validation import HeldOut
 from motorid.diagnosis.free_forms import own_levels
 from motorid.diagnosis.misspecification import LIMITER
 from motorid.diagnosis.model_comparison import COMMON, Node, beats, evidence, far, node_of, preferred, superfluous
@@ -340,7 +340,7 @@ class Search:
         if node.fit.status != "converged" and far(node.fit):
             with contextlib.suppress(*FAILURES):
                 problem = node.fit.problem.with_(model=node.fit.model, noise_factors={})
-                fit = solve(problem, solver=QUICK, start="model")
+                fit = solve(problem, start="model")
                 onward = replace(node, fit=fit, predictions=self.held.predictions(fit))
                 return onward if beats(onward, node) else node
         return node

@@ -230,7 +230,8 @@ def functions_of(form: Form, span: Span) -> list[str]:
     if form.on == "turn":
         waves = ["1.0", *(f"ca.{f}({k:.6g} * z)" for k in waves_of(span) for f in ("sin", "cos"))]
         plain = form.carrier == "acceleration" or span.finer == 1  # none jumps, and forms compare better by few
-        return waves if plain else waves + _sectors(PLACES * span.finer, span.pitches)
+        load = form.balance == "torque" and not form.carrier
+        return waves if plain else waves + _sectors(PLACES * span.finer, span.pitches, load)
     if form.on in PAST:
         lengths = memories_of(form, span)
         lags = [f"past(z, {_place(length, lengths[0] / 10, lengths[-1] * 10)})" for length in lengths]
@@ -320,8 +321,9 @@ def waves_of(span: Span) -> list[float]:
     return sorted(own | {k for k in span.orders if k % span.pitches == 0})
 
 
-def _sectors(count: int, pitches: int) -> list[str]:
-    """Return sectors and lobes of a pitch as source, one inside and zero outside: a worn segment, a cam, a tooth."""
+def _sectors(count: int, pitches: int, load: bool) -> list[str]:
+    """Return sectors and lobes of a pitch as source, one inside and zero outside: a worn segment, a tooth; of a `load`
+    also what is climbed over, against the motion and then with it: a catch, a cam."""
     sectors = [(c, w / 2, w / EDGE) for k in range(SECTORS) if (w := 2**k * 2 * np.pi / count) < 2
                for c in np.arange(count) * 2 * np.pi / count]
     lobes = [(c, w, w) for w in LOBES for c in np.arange(0, 2 * np.pi, 1.5 * w)]
@@ -329,7 +331,8 @@ def _sectors(count: int, pitches: int) -> list[str]:
     for c, half, edge in sectors + lobes:
         at, wide = _place(c, c - 2 * half, c + 2 * half), _place(half, half / 4, min(4 * half, 3.0), "rad:wide")
         soft = _place(edge, 2 * np.pi / count / EDGE, SOFTEST, "rad:edge")
-        found.append(f"0.5 * (1 + ca.tanh((ca.cos({z} - {at}) - ca.cos({wide})) / ca.sin({wide}) / {soft}))")
+        inside = f"0.5 * (1 + ca.tanh((ca.cos({z} - {at}) - ca.cos({wide})) / ca.sin({wide}) / {soft}))"
+        found += [inside, f"ca.sin({z} - {at}) / ca.sin({wide}) * {inside}"] if load and edge == half else [inside]
     return found
 
 

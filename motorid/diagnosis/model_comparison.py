@@ -12,11 +12,10 @@ from functools import lru_cache, reduce
 import numpy as np
 
 from motorid.diagnosis.cross_validation import HeldOut
-from motorid.diagnosis.predictive_score import Evidence, Predictions, compare
-from motorid.diagnosis.thresholds import FINER, FINER_RATE, LARGER, SEARCHED
+from motorid.diagnosis.predictive_score import Evidence, Predictions, compare, finer
+from motorid.diagnosis.thresholds import FINER, LARGER, SEARCHED
 from motorid.estimation.result import Fit
 from motorid.model.model import Model
-from motorid.numerics.signals import Array
 from motorid.problem.problem import Problem
 
 COMMON = ("coulomb", "gravity", "brush_drop", "winding_heating", "cogging", "load_friction", "quadratic_drag",
@@ -128,24 +127,6 @@ def rarity(name: str | None) -> int:
 def far(fit: Fit) -> list[str]:
     """Return the channels whose errors are plainly larger than their noise, and than what can be asked of a model."""
     return [c for c in fit.problem.outputs if fit.misfit[c] > LARGER and not finer(fit, c)]
-
-
-def finer(fit: Fit, channel: str) -> bool:
-    """Tell whether a channel is an angle followed as closely as can be asked: it sums up every trifle of a run.
-
-    What its noise, white as the jumps of an encoder's counts are, makes of the rate of its error is not the model's.
-    """
-    if channel != "theta" or not fit.nrmse[channel] < FINER:
-        return False
-    squares = list[Array]()
-    for s, run in zip(fit.simulations, fit.problem.runs, strict=True):
-        if channel in s.experiment.outputs:
-            dt, r = np.diff(s.experiment.t), s.residual(channel)
-            white = min(run.sigma[channel] ** 2, float(np.nanmean(np.diff(r, 2) ** 2)) / 6)
-            rates = (np.diff(y) / dt for y in (r, s.experiment.outputs[channel]))
-            squares.append(np.array([*(rate**2 for rate in rates), 2 * white / dt**2]))
-    error, speed, noise = np.nanmean(np.concatenate(squares, axis=1), axis=1)
-    return bool(error - noise < FINER_RATE**2 * speed)
 
 
 def at_noise(node: Node) -> bool:

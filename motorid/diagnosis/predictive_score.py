@@ -11,7 +11,7 @@ Student's t, with each model's own scale per channel from the other blocks: the 
 the sensor, sets what counts. Coloured errors repeat themselves; a channel counts by the effective share of its samples.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -38,6 +38,7 @@ class Errors:
     blocks: tuple[NDArray[np.intp], ...]  # number of the block of each sample, counted over all runs
     measured: float  # RMS of the measured samples
     noise: float  # standard deviation of the sensor's noise
+    fine: bool = False  # an angle followed as closely as can be asked
 
     @property
     def misfit(self) -> float:
@@ -92,11 +93,12 @@ class Evidence:
 
 def compare(old: Predictions, new: Predictions) -> Evidence:
     """Return what `new` predicts better than `old` on the same data."""
-    gone = (*lost_channels(old.held_out, new.held_out), *_fine_enough(old.held_out, new.held_out))
-    unseen = [{c: e for c, e in model.held_out.items() if c not in gone} for model in (old, new)]
-    here, here_se = _summed(_differences(old.blocks, new.blocks))
+    gone = {*lost_channels(old.held_out, new.held_out), *_fine_enough(old.held_out, new.held_out)}
+    unseen = [_without(model.held_out, gone) for model in (old, new)]
+    seen = [_without(model.blocks, _fine_enough(old.blocks, new.blocks)) for model in (old, new)]
+    here, here_se = _summed(_differences(*seen))
     there, there_se = _summed(_differences(*unseen))
-    blocks = _fall(old.blocks, new.blocks) or 0.0
+    blocks = _fall(*seen) or 0.0
     held_out = _fall(*unseen)
     worse = held_out is not None and (held_out < -thresholds.MATERIAL or is_sure(-there, there_se))
     gain, se = here + there, float(np.hypot(here_se, there_se))
@@ -127,9 +129,12 @@ def lost_channels(old: Channels, new: Channels) -> tuple[str, ...]:
 
 
 def _fine_enough(old: Channels, new: Channels) -> tuple[str, ...]:
-    """Return the angle, where both models err by so little of it that its error is asked no more, beside others."""
-    beside = len(old) > 1 and "theta" in old and "theta" in new
-    return ("theta",) if beside and max(old["theta"].nrmse, new["theta"].nrmse) < thresholds.FINER else ()
+    """Return the angle, where both models follow it so closely that its error is asked no more, beside others."""
+    return tuple(c for c in old if len(old) > 1 and c in new and old[c].fine and new[c].fine)
+
+
+def _without(channels: Channels, gone: Collection[str]) -> Channels:
+    return {c: e for c, e in channels.items() if c not in gone}
 
 
 def _fall(old: Channels, new: Channels) -> float | None:
@@ -235,6 +240,24 @@ def _changed(run: Experiment, cells: int) -> Array:
     return np.interp(np.arange(run.n), edges, np.mean(shares, axis=0) if shares else edges / run.n)
 
 
+def finer(fit: Fit, channel: str) -> bool:
+    """Tell whether a channel is an angle followed as closely as can be asked: it sums up every trifle of a run.
+
+    What its noise, white as the jumps of an encoder's counts are, makes of the rate of its error is not the model's.
+    """
+    if channel != "theta" or not fit.nrmse[channel] < thresholds.FINER:
+        return False
+    squares = list[Array]()
+    for s, run in zip(fit.simulations, fit.problem.runs, strict=True):
+        if channel in s.experiment.outputs:
+            dt, r = np.diff(s.experiment.t), s.residual(channel)
+            white = min(run.sigma[channel] ** 2, float(np.nanmean(np.diff(r, 2) ** 2)) / 6)
+            rates = (np.diff(y) / dt for y in (r, s.experiment.outputs[channel]))
+            squares.append(np.array([*(rate**2 for rate in rates), 2 * white / dt**2]))
+    error, speed, noise = np.nanmean(np.concatenate(squares, axis=1), axis=1)
+    return bool(error - noise < thresholds.FINER_RATE**2 * speed)
+
+
 def predictions_left_out(fit: Fit, evenly: bool = False) -> Channels | None:
     """Return the errors of `fit` on blocks of its own records, each left out in turn; None where that cannot be told.
 
@@ -253,7 +276,8 @@ def predictions_left_out(fit: Fit, evenly: bool = False) -> Channels | None:
         return None
     if not np.isfinite(moved).all() or moved @ moved > thresholds.UNRELIABLE**2 * (residual @ residual):
         return None
-    return by_channel(problem, moved, blocks)
+    found = by_channel(problem, moved, blocks)
+    return {c: replace(e, fine=finer(fit, c)) for c, e in found.items()}
 
 
 def stacked_labels(problem: Problem, blocks: Sequence[NDArray[np.intp]]) -> NDArray[np.intp]:
@@ -283,12 +307,12 @@ def held_out_errors(problem: Problem, noise: Mapping[str, float]) -> Channels:
     """
     problem, q = settled(problem)
     errors = errors_of(at(problem, q), noise)
-    if not problem.unknowns.apart:
-        return errors
-    r, jac = problem.residual_and_jacobian(q)
-    blocks = blocks_of(problem.experiments)
-    own = left_out(r, jac[:, len(problem.unknowns.initial) :], stacked_labels(problem, blocks))
-    return {c: replace(errors[c], values=e.values) for c, e in by_channel(problem, own, blocks).items()}
+    if problem.unknowns.apart:
+        r, jac = problem.residual_and_jacobian(q)
+        blocks = blocks_of(problem.experiments)
+        own = left_out(r, jac[:, len(problem.unknowns.initial) :], stacked_labels(problem, blocks))
+        errors = {c: replace(errors[c], values=e.values) for c, e in by_channel(problem, own, blocks).items()}
+    return {c: replace(e, fine=c == "theta" and e.nrmse < thresholds.FINER) for c, e in errors.items()}
 
 
 def errors_of(simulations: Sequence[Simulation], noise: Mapping[str, float],

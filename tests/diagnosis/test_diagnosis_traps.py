@@ -10,7 +10,7 @@ from battery.cases import CASES
 from battery.excite import driven, record
 
 import motorid as mi
-from motorid.diagnosis.model_comparison import finer
+from motorid.diagnosis.predictive_score import finer
 from motorid.diagnosis.score_test import score
 from motorid.diagnosis.thresholds import FINER, FINER_RATE
 from motorid.effects import LIBRARY
