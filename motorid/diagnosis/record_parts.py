@@ -25,8 +25,8 @@ from motorid.records.experiment import Experiment, part_meta
 
 ENOUGH = 4000  # samples: what is left at least of those that their neighbours predict
 SMALL = 0.1  # of the error: a difference that changes no judgement
-AFFORDABLE = 60_000  # steps of integration per simulation of all records
-WANTED = 24_000  # of what is longer
+AFFORDABLE = 24_000  # steps of integration per simulation of all records
+WANTED = 12_000  # of what is longer
 PART = 1000  # samples
 LONG = 20_000  # samples: a first fit of their parts tells whether all of them are affordable
 FEW = 4 * PART  # samples of that first fit
