@@ -138,7 +138,7 @@ def simulate(model: Model, runs: Sequence[Experiment] | Experiment, *, engine: s
     >>> predicted[0].outputs["omega"].shape == check[0].t.shape
     True
     """
-    return list(simulated(as_problem(model, runs, engine=engine, initial=initial), estimate_initial))
+    return list(at(*settled(as_problem(model, runs, engine=engine, initial=initial), estimate_initial)))
 
 
 @one_thread
@@ -180,14 +180,9 @@ def with_channels(model: Model, run: Experiment, channels: Sequence[str],
     """Return the run with `channels` filled in from the model, with their noise (default 1 % of the RMS)."""
     blank = run.with_(outputs={**run.outputs, **{c: np.zeros(run.n) for c in channels}},
                       sigma={**run.sigma, **dict.fromkeys(channels, 1.0)})
-    shown = simulated(Problem(model, (blank,), initial="rest"), estimate_initial=False)[0].outputs
+    shown = at(*settled(Problem(model, (blank,), initial="rest"), estimate_initial=False))[0].outputs
     noise = {c: (sigma or {}).get(c) or ASSUMED_NOISE * float(np.sqrt(np.mean(shown[c] ** 2))) or 1.0 for c in channels}
     return blank.with_(outputs={**run.outputs, **{c: shown[c] for c in channels}}, sigma={**run.sigma, **noise})
-
-
-def simulated(problem: Problem, estimate_initial: bool = True) -> tuple[Simulation, ...]:
-    """Return the simulations of a problem at the model's values."""
-    return at(*settled(problem, estimate_initial))
 
 
 def settled(problem: Problem, estimate_initial: bool = True) -> tuple[Problem, Array]:
