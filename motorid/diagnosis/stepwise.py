@@ -155,7 +155,7 @@ def _with(found: Climb, best: Node, chosen: Node, ranked: bool, group: tuple[str
     """Return a climb that has come to `best`; the candidate that was chosen is marked where it was `ranked`."""
     rounds = (*found.rounds[:-1], _marked(found.rounds[-1], chosen, group)) if ranked else found.rounds
     groups = (*found.groups, (chosen.added or "", *group)) if group else found.groups
-    return replace(found, path=tuple(_path(best)), rounds=rounds, groups=groups)
+    return replace(found, path=_path(best), rounds=rounds, groups=groups)
 
 
 def _finished(found: Climb) -> Climb:
@@ -427,12 +427,9 @@ def _marked(listed: Sequence[Candidate], node: Node, group: tuple[str, ...]) -> 
                  if c.effect in names else c for c in listed)
 
 
-def _path(last: Node) -> list[Node]:
+def _path(last: Node) -> tuple[Node, ...]:
     """Return the models from the root to `last`, as they were grown."""
-    path = [last]
-    while path[0].parent is not None:
-        path.insert(0, path[0].parent)
-    return path
+    return (*_path(last.parent), last) if last.parent is not None else (last,)
 
 
 def ladder_of(found: Climb, validated: bool) -> Ladder:
