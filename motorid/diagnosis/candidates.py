@@ -25,7 +25,7 @@ from motorid.diagnosis.results import Candidate
 from motorid.diagnosis.score_test import Score, pairs_of, rank, uses_angle, with_phase_per_run, with_warm_start
 from motorid.diagnosis.thresholds import MATERIAL
 from motorid.display.numbers import listed
-from motorid.effects import LIBRARY, MEASURED, PER_RUN
+from motorid.effects import LIBRARY, MEASURED, PER_RUN, get
 from motorid.errors import ModelError
 from motorid.estimation.fit import lost, solve
 from motorid.estimation.least_squares import FAILURES
@@ -101,8 +101,6 @@ def _in_doubt(node: Node, children: Sequence[Node]) -> bool:
 
 def library(effects: Iterable[Effect | str] | None, also: Iterable[Effect] = ()) -> list[Effect]:
     """Return the effects to try: the whole library, or those named, and the user's own."""
-    from motorid.effects import get
-
     named = [*LIBRARY, *MEASURED, *PER_RUN] if effects is None else effects
     chosen = [get(e) if isinstance(e, str) else e for e in named]
     own = {e.name: e for e in also}  # in the place of one of the library with the same name
@@ -140,18 +138,17 @@ class Search:
         Only of a model that was expanded: one with nothing but noise left has no use for them. A combination with
         the motor's own parameters (the gain of a sensor among them) is nothing that a reader would ask for.
         """
-        if node.key not in self._scores:
-            return {}
         added = {p.name for e in node.fit.model.effects for p in e.parameters}
-        return {s.effect.name: s.same_as for s in self.scores(node) if s.same_as and added >= set(s.same_as)}
+        return {s.effect.name: s.same_as for s in self._scores.get(node.key, ())
+                if s.same_as and added >= set(s.same_as)}
 
     def unseen(self, node: Node) -> dict[str, tuple[str, ...]]:
         """Return the effects that other values of the motor's own parameters imitate in these records.
 
         Beside the scales of sensors, which do so in any record.
         """
-        scores = self.scores(node) if node.key in self._scores else ()
-        return {s.effect.name: s.same_as for s in scores if s.same_as and s.effect.balance != "sensor"}
+        return {s.effect.name: s.same_as for s in self._scores.get(node.key, ())
+                if s.same_as and s.effect.balance != "sensor"}
 
     def hidden(self, node: Node) -> dict[tuple[str, str], tuple[str, ...]]:
         """Return the parameters that hide a wider effect (two sizes, no shape) than one of `node`, by both names."""
