@@ -281,18 +281,13 @@ class Diagnosis(Shown):
         return {
             "verdict": self.verdict, "answer": self.answer, "text": self.text, "where": self.where,
             "location": {
-                "shares": dict(m.shares), "regions": dict(m.regions), "text": m.text, "acts_like": m.acts_like or None,
-                "depends_on": {k: [{"on": b.against, "explained": b.explained} for b in v] for k, v in m.bins.items()},
-            },
-            "ranking": [
-                _plain(c, "effect", "predicted_drop", "refit_drop", "validation_nrmse", "held_out_gain", "group",
-                       "parameters", "accepted", "reason") for c in self.ranking
-            ],
+                **_plain(m, "shares", "regions", "text"), "acts_like": m.acts_like or None,
+                "depends_on": {k: [{"on": b.against, "explained": b.explained} for b in v] for k, v in m.bins.items()}},
+            "ranking": [_plain(c, "effect", "predicted_drop", "refit_drop", "validation_nrmse", "held_out_gain",
+                               "group", "parameters", "accepted", "reason") for c in self.ranking],
             "effects": list(self.effects),
-            "ladder": [
-                _plain(r, "added", "grade", "why", "gain", "gain_se", "nrmse", "validation_nrmse")
-                for r in self.ladder.rungs
-            ],
+            "ladder": [_plain(r, "added", "grade", "why", "gain", "gain_se", "nrmse", "validation_nrmse")
+                       for r in self.ladder.rungs],
             "remaining": {"adequate": self.remaining.adequate, **_plain(self.remainder, "kind", "where", "follows"),
                           "text": self.remaining.text},
             "parameters_before": dict(self.before.values), "parameters_after": dict(self.after.values),
