@@ -75,7 +75,10 @@ def certainty(problem: Problem, q: Array, residuals: Array, jacobian: Array, fre
               for p, v in zip(problem.unknown, problem.scaling.physical(q), strict=True)]
     loose = np.array([not s for s in limits], bool)
     basis = np.eye(len(loose))[:, loose] if free is None else free
-    blocks = channel_blocks(problem, residuals, jacobian)
+    runs = list(zip(problem.runs, problem.unstack(residuals), problem.unstack(jacobian, 0.0), strict=True))
+    # Per channel and run the whitened residual (N,), NaN where missing, and its Jacobian (N, k), 0 there.
+    blocks = {c: [(r[:, j], jac[:, j]) for run, r, jac in runs if c in run.sigma]
+              for j, c in enumerate(problem.outputs)}
     colours = {c: colour_of([r for r, _ in parts], basis.shape[1] / len(blocks)) for c, parts in blocks.items()}
     if method != "coloured":
         colours = {c: Colour(np.zeros(0), k.variance, k.variance) for c, k in colours.items()}
@@ -103,12 +106,6 @@ def _vague(problem: Problem, q: Array, matrix: Array) -> NDArray[np.bool_]:
     sizes, physical = natural_sizes(problem.experiments, problem.values(q)), problem.scaling.physical(q)
     least = np.array([0.0 if p.positive else sizes.get(p.unit, np.inf) for p in problem.unknown])
     return np.sqrt(np.maximum(np.diag(matrix), 0.0)) > UNDETERMINED * np.maximum(np.abs(physical), least)
-
-
-def channel_blocks(problem: Problem, residuals: Array, jacobian: Array) -> dict[str, list[tuple[Array, Array]]]:
-    """Return per channel and run the whitened residual (N,), NaN where missing, and its Jacobian (N, k), 0 there."""
-    runs = list(zip(problem.runs, problem.unstack(residuals), problem.unstack(jacobian, 0.0), strict=True))
-    return {c: [(r[:, j], jac[:, j]) for run, r, jac in runs if c in run.sigma] for j, c in enumerate(problem.outputs)}
 
 
 def _meat(problem: Problem, jacobian: Array, blocks: Blocks, colours: Mapping[str, Colour], along: Array) -> Array:
