@@ -93,9 +93,8 @@ class Model(Shown):
 
     def start_at(self, values: Mapping[str, float]) -> Model:
         """Return the model at values, within their limits; unlike after `replace`, a fit may start elsewhere."""
-        known = {n: float(v) for n, v in values.items() if n in self.parameters}
-        return self._change({n: {"value": min(max(v, self.parameters[n].lower), self.parameters[n].upper)}
-                             for n, v in known.items()})
+        return self._change({n: {"value": min(max(float(v), p.lower), p.upper)} for n, v in values.items()
+                             if (p := self.parameters.get(n)) is not None})
 
     def fix(self, *names: str, **values: float) -> Model:
         """Return the model with parameters fixed: ``fix(R=1.2)`` there, ``fix("R")`` at the value it has."""
