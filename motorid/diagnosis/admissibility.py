@@ -26,7 +26,7 @@ def objections(fit: Fit, added: Effect, before: Fit | None = None) -> str:
     `before` is the fit without the effect.
     """
     pars = [fit.problem.model.parameters[p.name] for p in added.parameters]
-    for p in pars:
+    for p, declared in zip(pars, added.parameters, strict=True):
         if p.at_least and fit.values[p.name] < 0.98 * fit.values[p.at_least]:
             return f"{p.name} < {p.at_least}, which is not physical"
         inside = 1.02 * p.lower < fit.values[p.name] < 0.98 * p.upper
@@ -35,7 +35,6 @@ def objections(fit: Fit, added: Effect, before: Fit | None = None) -> str:
             return f"{p.name} runs to its limit: nothing of this shape is in the records"
         if p.vary and p.null is not None and not p.positive and fit.values[p.name] <= p.lower == p.null:
             return f"{p.name} goes to {p.null:g}: the records show none of it, or only with the wrong sign"
-        declared = next(q for q in added.parameters if q.name == p.name)
         others = fit.per_run.get(p.name, {}).values() if p.per_run else ()
         values = [fit.values[p.name], *(own["value"] for own in others)]
         for limit, sign in ((p.upper, 1), (p.lower, -1)):
