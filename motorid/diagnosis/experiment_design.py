@@ -467,10 +467,8 @@ def _starts(task: Task) -> dict[str, Found]:
     laid = {} if task.layout.ramps or not task.asked else _waves(task)
     laid |= {n: (task.layout, c) for n, c in _followed(task.layout, RIPPLES).items()}
     found = _best_first({n: _within(task.laid(layout), c, bool(task.asked)) for n, (layout, c) in laid.items()})
-    kinds: dict[str, str] = {}
-    for name in found:
-        kinds.setdefault(name.split(" + ")[0], name)
-    return {n: found[n] for n in kinds.values()}
+    kinds = {n.split(" + ")[0]: n for n in reversed(found)}  # the best of each, which comes last
+    return {n: f for n, f in found.items() if n in kinds.values()}
 
 
 def _best_first(found: Mapping[str, Found | None]) -> dict[str, Found]:
