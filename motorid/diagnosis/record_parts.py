@@ -123,11 +123,10 @@ def _telling(run: Experiment, count: int) -> list[int]:
     shown = counted[begins + PART] - counted[begins]
     chosen: list[int] = []
     for _ in range(count):
-        have = shown[chosen].sum(axis=0) if chosen else np.zeros(shown.shape[1])
         free = [k for k, a in enumerate(begins) if all(abs(a - begins[c]) >= PART for c in chosen)]
         if not free:
             break
-        chosen.append(max(free, key=lambda k: float(np.sqrt(have + shown[k]).sum())))
+        chosen.append(max(free, key=lambda k: float(np.sqrt(shown[[*chosen, k]].sum(axis=0)).sum())))
     return sorted(int(begins[k]) for k in chosen)
 
 
