@@ -57,10 +57,7 @@ def _guessed(problem: Problem) -> Problem:
     problems = [problem.for_model(with_suited_effects(m, runs)) for m in candidates]
     best = problems[0] if len(problems) == 1 else min(problems, key=lambda p: cost_at(p, refine=False))
     asked = candidates[problems.index(best)]
-    best = _along_measured_angle(_better_than_still(best), asked)
-    for effect in model.effects:
-        best = _shaped(best, effect, asked)
-    return best
+    return _shaped(_along_measured_angle(_better_than_still(best), asked), asked)
 
 
 def _better_than_still(guess: Problem) -> Problem:
@@ -100,9 +97,7 @@ def _along_measured_angle(problem: Problem, asked: Model) -> Problem:
     orders = any(p.order for e in problem.model.effects for p in e.parameters)
     if not orders or not all({"theta", "omega"} & set(r.outputs) for r in problem.experiments):
         return problem
-    led = problem.for_model(problem.model.with_(angle_input=True))
-    for effect in problem.model.effects:
-        led = _shaped(led, effect, asked)
+    led = _shaped(problem.for_model(problem.model.with_(angle_input=True)), asked)
     found = race([led], RACE, solve=by_continuation)
     if found is None:
         return problem
@@ -113,11 +108,13 @@ def _along_measured_angle(problem: Problem, asked: Model) -> Problem:
     return _led(problem, race([other, problem], RACE, solve=by_continuation))
 
 
-def _shaped(problem: Problem, effect: Effect, asked: Model) -> Problem:
-    """Return the problem started at the best of the shapes of `effect`. Phases and resonances have side valleys; least
-    squares finds knees, lags and heat capacities by itself."""
-    shapes = _shapes(problem, effect, asked)
-    return problem if len(shapes) < 2 else _led(problem, race([problem.start_at(s) for s in shapes], LOOK))
+def _shaped(problem: Problem, asked: Model) -> Problem:
+    """Return the problem started at the best of the shapes of each effect in turn. Phases and resonances have side
+    valleys; least squares finds knees, lags and heat capacities by itself."""
+    for effect in problem.model.effects:
+        if len(shapes := _shapes(problem, effect, asked)) > 1:
+            problem = _led(problem, race([problem.start_at(s) for s in shapes], LOOK))
+    return problem
 
 
 def _led(problem: Problem, best: Estimate | None) -> Problem:
