@@ -310,15 +310,14 @@ EXPLAINED = 0.25  # NRMSE above which a channel counts as poorly explained
 
 def misfit_over_noise(problem: Problem, q: Array) -> dict[str, float]:
     """Return the RMS of the residual over the noise per channel; far below 1 where the noise was overestimated."""
-    sums = {c: [0.0, 0] for c in problem.outputs}
+    sums = {c: np.zeros(2) for c in problem.outputs}
     for k, run in enumerate(problem.runs):
         y = problem.simulate(q, k, derivatives=False).y
         for j, c in enumerate(problem.outputs):
             if c in run.sigma:
                 e = (run.experiment.outputs[c] - y[:, j]) / run.sigma[c]
                 e = e[np.isfinite(e)]
-                sums[c][0] += float(e @ e)
-                sums[c][1] += e.size
+                sums[c] += e @ e, e.size
     return {c: max(float(np.sqrt(s / max(n, 1))), LEAST_FACTOR) for c, (s, n) in sums.items()}
 
 
