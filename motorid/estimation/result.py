@@ -250,8 +250,7 @@ class Fit(Shown):
     @property
     def noise(self) -> dict[str, float]:
         """Standard deviation of the sensor's noise per channel, SI; of several runs the smallest."""
-        sigmas = [run.sigma for run in self.problem.runs]
-        return {c: min(s[c] for s in sigmas if c in s) for c in self.nrmse}
+        return {c: min(run.sigma[c] for run in self.problem.runs if c in run.sigma) for c in self.nrmse}
 
     def save(self, path: str | os.PathLike[str], *, force: bool = False) -> Path:
         """Write the fit with its records as JSON; `motorid.load` gives it back without fitting again.
