@@ -155,7 +155,7 @@ class Mesh:
             rows = np.arange(len(r)) if index is None else index
             blocks += self._by_interval(r, jac, self.owner[k][rows // len(problem.outputs)])
         if self.noise is not None:
-            blocks += self.gaps(z, walk, weighed=True)
+            blocks += self.gaps(z, walk, self.noise)
         if problem.priors:
             r, jac = prior_residual(problem.priors, problem.unknowns, walk.at)
             blocks.append(Block(r, jac, np.arange(self.nq)))
@@ -165,16 +165,15 @@ class Mesh:
             blocks += [Block(r[rows], slope[rows, None] * b.jac, b.columns) for b, rows in found]
         return blocks
 
-    def gaps(self, z: Array, walk: Walk, weighed: bool) -> list[Block]:
-        """Return, per inner node, the node's state minus the end of the interval before it."""
+    def gaps(self, z: Array, walk: Walk, noise: Array | None = None) -> list[Block]:
+        """Return, per inner node, its state minus the end of the interval before it; over process `noise`, if given."""
         states = z[self.nq:].reshape(self.n_nodes, self.nx)
         blocks = []
         for v, traj in zip(self.intervals, walk.intervals, strict=True):
             if v.next < 0:
                 continue
-            factor = np.ones(self.nx)
-            if weighed and self.noise is not None:
-                factor = self.scale / (self.noise * np.sqrt(v.grid.t[-1] - v.grid.t[0]))
+            span = v.grid.t[-1] - v.grid.t[0]
+            factor = np.ones(self.nx) if noise is None else self.scale / (noise * np.sqrt(span))
             values = (states[v.next] - traj.x[-1] / self.scale) * factor
             jac = np.zeros((self.nx, 0))
             if traj.dx is not None:
@@ -303,7 +302,7 @@ class Gaps:
 def gaps_of(mesh: Mesh, z: Array) -> Gaps:
     """Return the gaps at `z`."""
     before = [v for v in mesh.intervals if v.next >= 0]
-    blocks = mesh.gaps(z, mesh.walk(z, False), weighed=False)
+    blocks = mesh.gaps(z, mesh.walk(z, False))
     values = np.array([b.values * mesh.scale for b in blocks]).reshape(-1, mesh.nx)
     return Gaps(np.array([v.run for v in before], int), np.array([v.grid.t[-1] for v in before]),
                 np.array([v.grid.t[-1] - v.grid.t[0] for v in before]), mesh.problem.system.states, values)
@@ -319,11 +318,10 @@ def first_noise(given: Any, mesh: Mesh) -> Array:
     return np.array([given.get(n, NEXT_TO_NONE * s) for n, s in sizes.items()])
 
 
-def noise_of_gaps(done: Any) -> Array:
-    """Return the process noise that the gaps of a solved mesh show, (nx,); of undisturbed states as it was."""
-    mesh: Mesh = done.mesh
+def noise_of_gaps(mesh: Mesh, z: Array) -> Array:
+    """Return the process noise that the gaps at a solution `z` show, (nx,); of undisturbed states as it was."""
     assert mesh.noise is not None
-    gaps = gaps_of(mesh, done.result.z)
+    gaps = gaps_of(mesh, z)
     shown = np.sqrt(np.mean(gaps.values**2 / gaps.span[:, None], axis=0))
     acted_on = np.array([n in DISTURBED for n in gaps.states])
     return np.where(acted_on, np.maximum(shown, NEXT_TO_NONE * mesh.scale), mesh.noise)

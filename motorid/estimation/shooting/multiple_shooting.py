@@ -169,7 +169,7 @@ class MultipleShooting:
         mesh = replace(mesh, noise=noise)
         done = self._solve(mesh, mesh.joined(q, nodes_from_data(mesh, q)), rough=self.process_noise == "auto")
         for _ in range(NOISE_ROUNDS if self.process_noise == "auto" else 0):
-            before, noise = noise, noise_of_gaps(done)
+            before, noise = noise, noise_of_gaps(done.mesh, done.result.z)
             done = self._solve(replace(done.mesh, noise=noise), done.result.z, history=done.history)
             if (np.abs(np.log(noise / before)) < NOISE_KNOWN).all():
                 break

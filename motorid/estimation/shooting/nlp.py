@@ -60,7 +60,7 @@ class ShootingNlp:
     def _evaluate(self, z: Array, derivatives: bool) -> _Point:
         walk = self.mesh.walk(z, derivatives)
         residual = self.mesh.residual(z, walk)
-        rows = [] if self.mesh.noise is not None else self.mesh.gaps(z, walk, weighed=False)
+        rows = [] if self.mesh.noise is not None else self.mesh.gaps(z, walk)
         rows += [b for b, _, _ in self.mesh.constraints(walk)]
         f = 0.5 * sum(float(b.values @ b.values) for b in residual)
         return _Point(f, np.concatenate([np.zeros(0), *(b.values for b in rows)]), residual, rows)
