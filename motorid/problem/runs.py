@@ -287,7 +287,10 @@ def natural_sizes(runs: Sequence[Experiment], values: Mapping[str, float]) -> di
     ampere = max(s.ampere or 0.0 for s in seen) or volt / resistance
     torque = values["g"] * volt if "g" in values else values.get("K", 1.0) * ampere
     second = float(np.median([r.dt for r in runs]))
-    heats = [(r.duration, resistance * s.mean_square_current(values)) for r, s in zip(runs, seen, strict=True)]
+    # A current that was not measured is taken for about what the voltage would make.
+    squares = (s.squared_volt / max(resistance, 1e-9) ** 2 / 4 if s.squared_ampere is None else s.squared_ampere
+               for s in seen)
+    heats = [(r.duration, resistance * square) for r, square in zip(runs, squares, strict=True)]
     duration, power = max(heats, key=lambda h: h[0] * h[1])
     low, high = min(s.ends[0] for s in seen), max(s.ends[1] for s in seen)
     sizes = {"V": volt, "A": ampere, "rad/s": speed, "m/s": speed, "N·m": torque, "N": torque, "s": second,
@@ -344,12 +347,6 @@ class _Sizes(NamedTuple):
     squared_ampere: float | None
     spread: Mapping[str, float]
     ends: tuple[float, float]
-
-    def mean_square_current(self, values: Mapping[str, float]) -> float:
-        """Mean square of the current, or about what the voltage would make."""
-        if self.squared_ampere is not None:
-            return self.squared_ampere
-        return self.squared_volt / max(values.get("R", 1.0), 1e-9) ** 2 / 4
 
 
 def _sizes_of(run: Experiment) -> _Sizes:
