@@ -89,10 +89,7 @@ def restore_collapsed(found: Estimate, effort: LevenbergMarquardt) -> Estimate:
 
     All are put back together first, then one by one.
     """
-    log, sd = found.problem.scaling.log, _deviation(found.problem, found.solution.residual)
-    influence = np.linalg.norm(found.solution.jac, axis=0)
-    if not (influence[log] < MATTERS * sd).any():
-        return found
+    sd, influence = _deviation(found.problem, found.solution.residual), np.linalg.norm(found.solution.jac, axis=0)
     values = found.values
     parameters = [replace(p, value=values[p.name]) for p in found.problem.model.parameters.values() if p.vary]
     named = dict(zip((p.name for p in found.problem.unknown), influence, strict=True))
