@@ -79,13 +79,11 @@ class Model(Shown):
     def without(self, name: str) -> Model:
         """Return the model without the effect called `name`."""
         among(name, self.effect_names, "effect in this model", ModelError)
-        base = {k: v for k, v in self.parameters.items() if k in {p.name for p in BASES[self.base]}}
-        model = self.with_(effects=(), parameters=base)
+        model = self.with_(effects=(), parameters={p.name: self.parameters[p.name] for p in BASES[self.base]})
         for e in self.effects:
             if e.name != name:
                 model = model + e
-        kept = {k: self.parameters[k] for k in model.parameters if k in self.parameters}
-        return model.with_(parameters={**model.parameters, **kept})
+        return model.with_(parameters={n: self.parameters[n] for n in model.parameters})
 
     def replace(self, **values: float) -> Model:
         """Return the model with parameter values set (in SI units); a fit starts from them."""
