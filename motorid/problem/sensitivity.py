@@ -150,8 +150,6 @@ def relative_jacobian(problem: Problem, q: Array) -> Array:
     slopes: list[Any] = [problem.simulate(q, j).dy for j in range(len(problem.runs))]
     jac = np.concatenate([m.stack(dy / m.noise[:, None]) for m, dy in zip(problem.measured, slopes, strict=True)])
     nuisance = jac[:, k:]
-    if not nuisance.any():
-        return jac[:, :k]
     basis = np.linalg.qr(nuisance[:, np.linalg.norm(nuisance, axis=0) > 0])[0]
     return jac[:, :k] - basis @ (basis.T @ jac[:, :k])
 
