@@ -103,8 +103,6 @@ class Unknowns:
     def principal(self, q: Array) -> Array:
         """Return `q` with its phase angles, whole turns of which mean nothing, within ±π."""
         turns = np.array([p.periodic and np.isinf([p.lower, p.upper]).all() for p in self.all], bool)
-        if not turns.any():
-            return q
         size = self.scaling.scale
         return np.where(turns, (np.remainder(q * size + np.pi, 2 * np.pi) - np.pi) / size, q)
 
