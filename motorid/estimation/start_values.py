@@ -78,8 +78,6 @@ def _was_fitted(model: Model) -> bool:
 
 def with_suited_effects(model: Model, runs: Sequence[Experiment]) -> Model:
     """Return the model with starting values of its effects' parameters that suit the data."""
-    if not model.effects:
-        return model
     sizes = natural_sizes(runs, model.values)
     untouched = (p for e in model.effects for p in _untouched(model, e))
     return model.start_at({p.name: suited(p, sizes).value for p in untouched})
