@@ -60,21 +60,14 @@ def with_inputs(run: Run, inputs: Sequence[str]) -> Run:
 
 
 def _grid(run: Experiment, inputs: Sequence[str]) -> Grid:
-    columns, held = [], []
     for name in inputs:
-        if name == "theta_in":
-            columns.append(angle_signal(run))
-            held.append(False)
-        elif name in COMPUTED_INPUTS:
-            columns.append(time_since(run, name))
-            held.append(True)
-        elif name in run.inputs:
-            columns.append(run.inputs[name])
-            held.append(run.hold == "zoh" and name == "v")
-        else:
+        if name not in ("theta_in", *COMPUTED_INPUTS, *run.inputs):
             raise ModelError(f"{run.name}: the model needs the input '{name}' ({NAMES[name]}), which the record lacks. "
                              "Name its column with columns, or leave the effect out.")
-    return Grid.of(run.t, np.column_stack(columns), np.array(held))
+    columns = [angle_signal(run) if n == "theta_in" else time_since(run, n) if n in COMPUTED_INPUTS else run.inputs[n]
+               for n in inputs]
+    held = np.array([n in COMPUTED_INPUTS or (n == "v" and run.hold == "zoh") for n in inputs])
+    return Grid.of(run.t, np.column_stack(columns), held)
 
 
 def time_since(run: Experiment, name: str) -> Array:
