@@ -127,12 +127,8 @@ def unresolved(fit: Fit, effect: Effect) -> str:
         value, std = fit.values[p.name], fit.std.get(p.name)
         if std is not None and std < KNOWN * value and not far(fit):
             continue  # a fit that leaves noise alone determines it
-        if p.unit in ("rad", "m"):
-            why = _too_fine(fit, value) or _too_quick(fit, value)
-        elif p.unit in ("rad/s", "m/s"):
-            why = _too_slow(fit, value)
-        else:
-            continue
+        why = (_too_fine(fit, value) or _too_quick(fit, value) if p.unit in LENGTHS else
+               _too_slow(fit, value) if p.unit in ("rad/s", "m/s") else "")
         if why:
             return f"{p.name} = {value:.3g} {p.unit} cannot be seen in these samples: {why}"
     return ""
