@@ -232,8 +232,7 @@ def at(problem: Problem, q: Array) -> tuple[Simulation, ...]:
 def judge(simulations: Sequence[Simulation]) -> Evaluation:
     """Return the errors of `simulations` against what was measured."""
     channels = [c for c in CHANNELS if any(c in s.experiment.outputs and c in s.outputs for s in simulations)]
-    squares: dict[str, list[Any]] = {c: [] for c in channels}
-    by_run = []
+    sums, by_run = {c: np.zeros(3) for c in channels}, []
     for s in simulations:
         errors = {}
         for c in channels:
@@ -241,10 +240,9 @@ def judge(simulations: Sequence[Simulation]) -> Evaluation:
                 y = s.experiment.moved(c)
                 ok = np.isfinite(y)
                 e = s.residual(c)[ok]
-                squares[c].append((float(e @ e), float(y[ok] @ y[ok]), int(ok.sum())))
+                sums[c] += e @ e, y[ok] @ y[ok], ok.sum()
                 errors[c] = float(np.sqrt(e @ e / max(y[ok] @ y[ok], 1e-300)))
         by_run.append(errors)
-    sums = {c: np.sum(squares[c], axis=0) for c in channels}
     return Evaluation(tuple(simulations), {c: float(np.sqrt(s[0] / max(s[1], 1e-300))) for c, s in sums.items()},
                       {c: float(np.sqrt(s[0] / max(s[2], 1))) for c, s in sums.items()}, tuple(by_run))
 
