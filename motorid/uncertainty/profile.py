@@ -86,15 +86,11 @@ class Profile(Printed):
     def text(self) -> str:
         """Value and interval in words."""
         low, high = self.interval()
-        below = low == 0 if self.positive else not np.isfinite(low)
-        if below and not np.isfinite(high):
-            said = "not limited on either side"
-        elif below:
-            said = f"below {quantity(high, self.unit)} (95 %), no lower limit"
-        elif not np.isfinite(high):
-            said = f"above {quantity(low, self.unit)} (95 %), no upper limit"
-        else:
-            said = f"{interval_text((low, high))} {self.unit} (95 %)"
+        open_ends = (low == 0 if self.positive else not np.isfinite(low)), not np.isfinite(high)
+        said = {(True, True): "not limited on either side",
+                (True, False): f"below {quantity(high, self.unit)} (95 %), no lower limit",
+                (False, True): f"above {quantity(low, self.unit)} (95 %), no upper limit",
+                (False, False): f"{interval_text((low, high))} {self.unit} (95 %)"}[open_ends]
         return f"{self.name} = {quantity(self.value, self.unit, 5)}: {said}."
 
     def card(self) -> Card:
