@@ -322,15 +322,13 @@ class Problem:
     def begun_at(self, q: Array) -> Problem:
         """Return the problem with the values at `q` as its start, those of each run and initial states too."""
         physical = dict(zip([p.name for p in self.unknown], self.scaling.physical(q), strict=True))
-        runs = []
-        for k, run in enumerate(self.runs):
-            start = run.start.copy()
-            for j, c in enumerate(("i", "omega", "theta")):
-                if f"{c}_0[{k}]" in physical:  # rounding must not put it outside its limits
-                    start[j] = np.clip(physical[f"{c}_0[{k}]"], *run.limits[c])
-            apart = {n: physical[p.name] for n, r, p in self.unknowns.apart if r == k}
-            runs.append(replace(run, start=start, apart={**run.apart, **apart}))
-        return replace(self, model=self.model.start_at(self.values(q)), _runs=tuple(runs))
+        starts, own = [run.start.copy() for run in self.runs], [dict(run.apart) for run in self.runs]
+        for c, k, p in self.unknowns.initial:  # rounding must not put it outside its limits
+            starts[k][CHANNELS.index(c)] = np.clip(physical[p.name], *self.runs[k].limits[c])
+        for n, k, p in self.unknowns.apart:
+            own[k][n] = physical[p.name]
+        runs = tuple(replace(run, start=s, apart=a) for run, s, a in zip(self.runs, starts, own, strict=True))
+        return replace(self, model=self.model.start_at(self.values(q)), _runs=runs)
 
     def tuned(self, **fields: Any) -> Problem:
         """Return the problem with other `noise_factors`, another `width` …; the records stay as prepared."""
