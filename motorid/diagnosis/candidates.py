@@ -283,14 +283,10 @@ class Search:
     @staticmethod
     def listed(scores: Sequence[Score], judged: Mapping[str, Candidate], why: str = "") -> list[Candidate]:
         """Return a candidate for every effect, best score first; `why` those that were not judged were not refitted."""
-        listed = []
-        for s in scores:
-            c = judged.get(s.effect.name)
-            if c is None:
-                c = Candidate(s.effect.name, s.drop, parameters=dict(s.starts[0]) if s.starts else {},
-                              reason=why or _unseen(s))
-            listed.append(replace(c, predicted_drop=s.drop))
-        return listed + [c for n, c in judged.items() if n not in {s.effect.name for s in scores}]
+        scored = {s.effect.name: Candidate(s.effect.name, s.drop, parameters=dict(s.starts[0]) if s.starts else {},
+                                           reason=why or _unseen(s)) for s in scores}
+        listed = [replace(judged.get(n, c), predicted_drop=c.predicted_drop) for n, c in scored.items()]
+        return listed + [c for n, c in judged.items() if n not in scored]
 
     def pruned(self, node: Node, before: Node) -> Node:
         """Return `node` without the effects that have become superfluous, and with the simplest of each kind.
