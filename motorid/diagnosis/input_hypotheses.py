@@ -100,12 +100,10 @@ def better_reading(fit: Fit, late: bool = False) -> Reading | None:
 
 def _best_delay(fit: Fit) -> list[Reading]:
     """Return the delay that lowers the error most after a few steps, tried ever more closely; nothing for little."""
-    falls = {0.0: 0.0}
-    best = 0.0
+    falls, best = {0.0: 0.0}, 0.0
     for moves in DELAYS:
-        for samples in (round(best + n, 6) for n in moves):
-            if samples not in falls:
-                falls[samples] = _fall(fit, _delay(fit, samples))
+        samples = [round(best + n, 6) for n in moves]
+        falls |= {n: _fall(fit, _delay(fit, n)) for n in samples if n not in falls}
         best = max(falls, key=lambda n: falls[n])
     return [_delay(fit, best)] if falls[best] > PROMISING else []
 
