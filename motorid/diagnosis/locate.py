@@ -150,15 +150,11 @@ def _regions(fit: Fit, signals: Sequence[Mapping[str, Array]]) -> dict[str, floa
     """Share of the squared, whitened misfit by region of operation."""
     top_speed = max((float(np.abs(s["omega"]).max()) for s in signals if "omega" in s), default=0.0) or 1.0
     top_current = max((float(np.abs(s["i"]).max()) for s in signals if "i" in s), default=0.0) or np.inf
-    sums: dict[str, float] = dict.fromkeys(REGIONS, 0.0)
-    for k, s in enumerate(signals):
-        sigma, sim = fit.problem.runs[k].sigma, fit.simulations[k]
-        r2 = np.sum([np.nan_to_num(sim.residual(c) / sigma[c]) ** 2 for c in sigma], axis=0)
-        region = _region_of_samples(s, top_speed, top_current)
-        for name in REGIONS:
-            sums[name] += float(np.sum(r2[region == name]))
-    total = sum(sums.values()) or 1.0
-    return {name: v / total for name, v in sums.items()}
+    region = np.concatenate([_region_of_samples(s, top_speed, top_current) for s in signals])
+    r2 = np.concatenate([np.sum([np.nan_to_num(sim.residual(c) / run.sigma[c]) ** 2 for c in run.sigma], axis=0)
+                         for sim, run in zip(fit.simulations, fit.problem.runs, strict=True)])
+    total = float(np.sum(r2)) or 1.0
+    return {name: float(np.sum(r2[region == name])) / total for name in REGIONS}
 
 
 def _region_of_samples(s: Mapping[str, Array], top_speed: float, top_current: float) -> NDArray[np.str_]:
@@ -316,11 +312,10 @@ def _solve_blocks(diagonal: Array, below: Array, rhs: Array) -> Array:
     diagonal = diagonal * scale[:, :, None] * scale[:, None, :]
     below = below * scale[1:, :, None] * scale[:-1, None, :]
     band = np.zeros((2 * m, n * m))  # lower form: band[i - j, j]
-    for r in range(m):
-        for c in range(m):
-            if r >= c:
-                band[r - c, c::m] = diagonal[:, r, c]
-            band[m + r - c, c : (n - 1) * m : m] = below[:, r, c]
+    for r, c in np.ndindex(m, m):
+        if r >= c:
+            band[r - c, c::m] = diagonal[:, r, c]
+        band[m + r - c, c : (n - 1) * m : m] = below[:, r, c]
     band[0] += 1e-12
     try:
         z = scipy.linalg.solveh_banded(band, (rhs * scale).ravel(), lower=True, check_finite=False)
