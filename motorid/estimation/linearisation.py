@@ -54,9 +54,8 @@ class Response:
         """The matrix of x⁺ − A x = pushes over all samples, lower bands (2 nx, N nx), its diagonal left out."""
         n, nx, _ = self.a.shape
         band = np.zeros((2 * nx, (n + 1) * nx), order="F")
-        for r in range(nx):
-            for c in range(nx):
-                band[nx + r - c, c : n * nx : nx] = -self.a[:, r, c]
+        for r, c in np.ndindex(nx, nx):
+            band[nx + r - c, c : n * nx : nx] = -self.a[:, r, c]
         return band
 
 
