@@ -111,10 +111,8 @@ def _vague(problem: Problem, q: Array, matrix: Array) -> NDArray[np.bool_]:
 def _meat(problem: Problem, jacobian: Array, blocks: Blocks, colours: Mapping[str, Colour], along: Array) -> Array:
     """Covariance of (J along)ᵀr: outputs with their colour, priors as observations of variance 1, penalties fixed.
     `along` (k, m) comes first: afterwards, what far weaker directions have would be rounding."""
-    total = np.zeros((along.shape[1],) * 2)
-    for c, parts in blocks.items():
-        for _, jac in parts:
-            total += weighed(jac @ along, colours[c].autocovariance(len(jac)))
+    total = sum((weighed(jac @ along, colours[c].autocovariance(len(jac))) for c, parts in blocks.items()
+                 for _, jac in parts), np.zeros((along.shape[1],) * 2))
     n, unknown = problem.n_outputs, {p.name for p in problem.unknown}
     prior = jacobian[n:n + len(unknown & set(problem.priors))] @ along
     return total + prior.T @ prior
