@@ -315,7 +315,7 @@ def misfit_over_noise(problem: Problem, q: Array) -> dict[str, float]:
             if c in run.sigma:
                 e = (run.experiment.outputs[c] - y[:, j]) / run.sigma[c]
                 e = e[np.isfinite(e)]
-                sums[c] += e @ e, e.size
+                sums[c] += float(e @ e), e.size
     return {c: max(float(np.sqrt(s / max(n, 1))), LEAST_FACTOR) for c, (s, n) in sums.items()}
 
 
