@@ -23,13 +23,12 @@ from motorid.errors import MotoridError, at_least, numbers_told
 from motorid.estimation.result import Fit, checked
 from motorid.model.definition import Effect
 from motorid.model.model import Model
-from motorid.numerics.parallel import one_thread
-from motorid.numerics.parallel import progress as shown
+from motorid.numerics import parallel
 from motorid.records.checks import current_limit
 from motorid.records.experiment import Experiment, repeated
 
 
-@one_thread
+@parallel.one_thread
 @numbers_told()
 def diagnose(fit: Fit, validate: Sequence[Experiment] | Experiment | None = None, *,
              effects: Iterable[Effect | str] | None = None, also: Iterable[Effect] = (), max_effects: int = 3,
@@ -70,7 +69,7 @@ def diagnose(fit: Fit, validate: Sequence[Experiment] | Experiment | None = None
     """
     at_least(0, max_effects=max_effects, budget=budget)
     tried = library(effects, also)
-    with shown("Looking for what is missing", max_effects + 1, at_most=True) as show:
+    with parallel.progress("Looking for what is missing", max_effects + 1, at_most=True) as show:
         stages = Stages(max_effects, progress, show, map)
         found, driven = explored(checked(fit, "diagnose"), validate, tried, stages, max_effects, budget)
         stages.done("located what is missing")

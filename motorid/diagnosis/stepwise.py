@@ -34,8 +34,7 @@ from motorid.estimation.fit import TOO_FAR, UNFOLLOWED, follows, growth, in_wind
 from motorid.estimation.least_squares import FAILURES
 from motorid.estimation.result import Fit, checked
 from motorid.model.definition import Effect
-from motorid.numerics.parallel import budget, interruption, one_thread
-from motorid.numerics.parallel import progress as shown
+from motorid.numerics import parallel
 from motorid.records.experiment import Experiment
 
 ORDER = ("named", "group", "approximates")  # grades, the surest first
@@ -79,7 +78,7 @@ def climb(search: Search, max_effects: int, seconds: float | None = None) -> Cli
     steps = _rounds(found, max_effects)
     looked = time.monotonic() - began  # about as long as to look at what remains
     try:
-        with budget(seconds and max(seconds - 2 * looked, 0.0)):
+        with parallel.budget(seconds and max(seconds - 2 * looked, 0.0)):
             while (further := next(steps, None)) is not None:
                 found = further
         search.stages.round(max_effects + 1)
@@ -87,7 +86,7 @@ def climb(search: Search, max_effects: int, seconds: float | None = None) -> Cli
         if not found.stopped:
             return _finished(found)
     except (OutOfTime, KeyboardInterrupt) as error:
-        interruption.heard()
+        parallel.interruption.heard()
         found = replace(found, stopped=OUT_OF_TIME if isinstance(error, OutOfTime) else INTERRUPTED)
     return _finished(replace(found, text=f"stopped early: {found.stopped}; more may be missing",
                              rounds=found.rounds or (tuple(search.listed(scores, {}, found.stopped)),),
@@ -213,10 +212,10 @@ def _curve_alone(found: Climb, root: Fit, held: HeldOut, seconds: float | None) 
     if found.stopped:
         return found, None
     try:
-        with budget(seconds):
+        with parallel.budget(seconds):
             return found, alone_leaving_noise(found.path[-1], root, held, [gain.form for gain in found.forms])
     except (OutOfTime, KeyboardInterrupt) as error:
-        interruption.heard()
+        parallel.interruption.heard()
         stopped = OUT_OF_TIME if isinstance(error, OutOfTime) else INTERRUPTED
         return replace(found, stopped=stopped, text=f"stopped early: {stopped}; what was named may be a curve"), None
 
@@ -453,7 +452,7 @@ def ladder_of(found: Climb, validated: bool) -> Ladder:
     return Ladder(tuple(rungs), found.text)
 
 
-@one_thread
+@parallel.one_thread
 def improve(fit: Fit, validate: Sequence[Experiment] | Experiment | None = None, *,
             effects: Iterable[Effect | str] | None = None, also: Iterable[Effect] = (), max_effects: int = 3,
             map: Callable[..., Iterable[Any]] = builtins.map, progress: Callable[[str], None] | None = None) -> Ladder:
@@ -480,7 +479,7 @@ def improve(fit: Fit, validate: Sequence[Experiment] | Experiment | None = None,
     ('coulomb',)
     """
     at_least(0, max_effects=max_effects)
-    with shown("Looking for what is missing", max_effects + 1, at_most=True) as show:
+    with parallel.progress("Looking for what is missing", max_effects + 1, at_most=True) as show:
         stages = Stages(max_effects, progress, show, map)
         found, _ = explored(checked(fit, "improve"), validate, library(effects, also), stages, max_effects)
     return ladder_of(found, validate is not None)
