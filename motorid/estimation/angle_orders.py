@@ -136,11 +136,9 @@ def _spectrum(tangent: Tangent, kind: str) -> Spectrum:
     if top < lowest or kind not in _kinds(fit.problem):
         return Spectrum((), False)
     shares, lines = _order_search(tangent).shares(lowest, kind)
-    if not lines:
-        return Spectrum((), False)
-    found = sorted(lines, key=lambda line: -line.share)
-    sure = found[0].share * tangent.residual.size > SURE and found[0].share > STANDS_OUT * float(np.median(shares))
-    return Spectrum(tuple(found), bool(sure))
+    best = max((line.share for line in lines), default=0.0)
+    sure = best * tangent.residual.size > SURE and best > STANDS_OUT * float(np.median(shares))
+    return Spectrum(tuple(sorted(lines, key=lambda line: -line.share)), sure)
 
 
 def _kinds(problem: Problem) -> list[str]:
