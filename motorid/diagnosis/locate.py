@@ -87,12 +87,11 @@ def _region(regions: Mapping[str, float]) -> str:
 
 def _walk(fit: Fit, size: Array, begun: Sequence[Linear]) -> tuple[float, list[Smoothed]]:
     """Return the smallest random walk that explains the measurements, and the smoothed runs."""
-    found: list[Smoothed] = []
     for walk in WALKS:
         found = [smooth(fit, k, walk * size, at) for k, at in enumerate(begun)]
         if np.mean([s.chi2 for s in found]) <= 1.0:
-            return walk, found
-    return WALKS[-1], found
+            break
+    return walk, found
 
 
 def _shares(fit: Fit, walk: Array, both: Sequence[Smoothed], begun: Sequence[Linear]) -> dict[str, float]:
