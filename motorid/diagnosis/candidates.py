@@ -156,7 +156,7 @@ class Search:
         for e in self._takeable(node.fit.model)[1]:
             inside = [n for n in node.fit.model.effect_names if n in e.includes and n not in self.root.key]
             if inside and all(p.null == 0 for p in e.parameters):
-                with contextlib.suppress(*FAILURES, ModelError):
+                with contextlib.suppress(*FAILURES):
                     found[inside[0], e.name] = hidden_in(node.fit, e)
         return {names: parameters for names, parameters in found.items() if parameters}
 
