@@ -74,8 +74,7 @@ def require_unit(text: object, channel: str) -> Unit:
     allowed = DIMENSIONS[channel]
     if unit is None:
         known = [w for d in allowed for words in _SPELLINGS[d].values() for w in words.split()[:1]]
-        known += ["counts:2048"] if channel == "theta" else []
-        known += ["0.047 V (a factor)"] if channel == "v" else []
+        known += {"theta": ["counts:2048"], "v": ["0.047 V (a factor)"]}.get(channel, [])
         raise DataError(f"the unit of '{channel}': {one_of(str(text), known, 'unit')}")
     if unit.dimension not in allowed:
         is_, *wanted = (f"a{'n' * d.startswith('a')} {d}" for d in (unit.dimension, *allowed))
