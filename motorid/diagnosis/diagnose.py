@@ -22,7 +22,7 @@ from motorid.display.numbers import listed
 from motorid.errors import MotoridError, at_least, numbers_told
 from motorid.estimation.result import Fit, checked
 from motorid.model.definition import Effect
-from motorid.model.model import Model
+from motorid.model.model import SHOWN, Model
 from motorid.numerics import parallel
 from motorid.records.checks import current_limit
 from motorid.records.experiment import Experiment, repeated
@@ -154,8 +154,7 @@ def _suggestion(fits: Sequence[Fit], groups: Sequence[Sequence[str]]) -> str | N
         return None
     if best.discrimination[best.name] < 1e-3:
         problem = fits[0].problem
-        shown = ("i", "omega", "theta") if problem.model.base == "dc_motor" else ("omega", "theta")
-        more = [channel_name(c) for c in shown if c not in problem.outputs]
+        more = [channel_name(c) for c in SHOWN[problem.model.base] if c not in problem.outputs]
         told = f"; measure the {' or '.join(more)} too" if more else ""
         return f"No voltage record of these channels within the limits would distinguish {listed(names)}{told}."
     return f"To distinguish {listed(names)}, record {best.text}."

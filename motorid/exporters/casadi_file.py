@@ -18,7 +18,7 @@ from motorid.estimation.result import Fit
 from motorid.exporters.json_file import fit_dict
 from motorid.integrate.rodas3 import StepFunctions
 from motorid.model.equations import System
-from motorid.model.model import Model
+from motorid.model.model import SHOWN, Model
 from motorid.numerics.signals import Array
 from motorid.problem.plain_data import model_dict
 from motorid.problem.problem import Problem
@@ -47,7 +47,7 @@ def system_of(found: Fit | Model) -> System:
     """Return the model's functions for the channels of the fit; of a model, for all that it can show."""
     if isinstance(found, Fit):
         return found.problem.system
-    return found.system(CHANNELS if found.base == "dc_motor" else ("omega", "theta"))
+    return found.system(SHOWN[found.base])
 
 
 def values_of(found: Fit | Model, system: System) -> Array:

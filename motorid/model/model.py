@@ -309,6 +309,7 @@ def torque_driven(axis: str = "rotary", **values: float) -> Model:
 
 TITLES = {"dc_motor": "DC motor", "torque_driven": "torque-driven axis"}
 STATES = {"dc_motor": ("i", "omega"), "torque_driven": ("omega",)}
+SHOWN = {"dc_motor": CHANNELS, "torque_driven": ("omega", "theta")}  # channels
 QUANTITIES = {"dc_motor": ("R", "L", "K", "K_t", "K_e", "b", "J"), "torque_driven": ("g", "b", "J")}
 DERIVED = {"K_t": lambda m: m.K, "K_e": lambda m: m.K}
 BASES = {

@@ -15,7 +15,7 @@ from motorid.integrate import engine_of, limited
 from motorid.integrate.engine import Engine, Trajectory
 from motorid.model.definition import Parameter
 from motorid.model.equations import System
-from motorid.model.model import Model
+from motorid.model.model import SHOWN, Model
 from motorid.numerics.autoregression import effective_samples
 from motorid.numerics.least_squares import Huber
 from motorid.numerics.signals import Array
@@ -106,8 +106,7 @@ class Problem:
     @cached_property
     def outputs(self) -> tuple[str, ...]:
         """Measured channels that the model can show."""
-        shown = CHANNELS if self.model.base == "dc_motor" else ("omega", "theta")
-        return tuple(c for c in shown if any(c in r.outputs for r in self.experiments))
+        return tuple(c for c in SHOWN[self.model.base] if any(c in r.outputs for r in self.experiments))
 
     @cached_property
     def system(self) -> System:

@@ -24,7 +24,7 @@ from motorid.display.numbers import number, quantity
 from motorid.errors import DataError, FitError, MissingDependency, OutputError, UsageError, printable
 from motorid.estimation.fit import fit
 from motorid.estimation.result import Fit
-from motorid.model.model import Model
+from motorid.model.model import SHOWN, Model
 from motorid.numerics.parallel import Map, interruption, map_items, one_thread
 from motorid.numerics.signals import Array, robust_std
 from motorid.records.experiment import Experiment
@@ -335,7 +335,7 @@ def checkpoint_key(model: Model, options: Mapping[str, Any], reading: Mapping[st
 def _equations(model: Model) -> bytes:
     """Return the equations as traced, whatever names, globals or files a law took them from."""
     try:
-        system = model.system(CHANNELS if model.base == "dc_motor" else ("omega", "theta"))
+        system = model.system(SHOWN[model.base])
         return "".join(f.serialize() for f in (system.rhs, system.out, system.initial)).encode()
     except Exception as error:  # of the user's law; then no motor can be fitted
         return repr(error).encode()
