@@ -51,9 +51,9 @@ def better_forms(fit: Fit, rival: Fit, channels: Container[str] = CHANNELS) -> l
         linear = free_forms.linearised(fit)
         answers = {form: Answers(fit, linear, form).predictions() for form in linear.forms}
         if far(fit) and free_forms.may_be_zeroed(fit):
-            for form in [f for f, plain in answers.items() if f.on == "turn" and plain]:
+            for form, plain in [(f, known) for f, known in answers.items() if f.on == "turn"]:
                 own = Answers(fit, free_forms.zeroed(fit, linear, form), form).predictions()
-                if own is not None and compare(answers[form], own).sure:
+                if plain and own and compare(plain, own).sure:
                     answers[replace(form, zeroed=True)] = own
     except FAILURES:
         return []
