@@ -11,6 +11,7 @@ from motorid.diagnosis import verdict as words
 from motorid.diagnosis.adequacy import following
 from motorid.diagnosis.candidates import Stages, library
 from motorid.diagnosis.experiment_design import suggest_experiment
+from motorid.diagnosis.free_forms import WHERE
 from motorid.diagnosis.locate import acting_like, locate
 from motorid.diagnosis.misspecification import LIMITER
 from motorid.diagnosis.model_comparison import far
@@ -94,7 +95,7 @@ def _told(found: Climb, driven: str, validated: bool) -> Diagnosis:
     if like is not None and not names:
         missing = acting_like(missing, like)
     if names:
-        verdict, where = "missing", words.balance_of(ladder.best, names[0])
+        verdict, where = "missing", WHERE[{e.name: e.balance for e in ladder.best.model.effects}[names[0]]]
         rises = bool(words.held_out_remark(found.path[-1]))
         answer = words.missing_text(ladder.rungs, remaining, groups, found.grades, rises, found.stopped)
         same = _inseparable(found, ladder.best.model)

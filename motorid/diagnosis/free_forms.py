@@ -45,6 +45,8 @@ BENDS = (0.25, 0.08)  # of the largest speed, current or voltage: within which a
 KNEES = 9  # of a speed, current or voltage of either sign, beyond which something sets in
 BOTH_WAYS = 0.5  # of the larger side that the smaller one reaches at least: both are known alike
 FINER = 4  # times as many places and knees in a curve that is fitted: what is narrow stands between the few
+WHERE = {"torque": "mechanical", "transmission": "mechanical", "voltage": "electrical", "both": "electrical",
+         "sensor": "sensor"}
 CHANGES = {"t": "changes with the time", "distance": "changes with the distance run",
            "turn": "changes with the angle within a turn", "theta": "changes with the angle",
            "omega": "changes with the speed", "i": "changes with the current", "v": "changes with the voltage",
@@ -213,6 +215,7 @@ def own_levels(runs: Sequence[Experiment]) -> bool:
 
 
 Z = re.compile(r"\bz\b")
+NUMBERS = {"ca": np, "m": SimpleNamespace(sign=np.sign)}  # for a source without a `PLACE`
 # Of what bends, sets in or fades, with its limits, and its unit where that is another: a curve may move it.
 PLACE = re.compile(r"<(\S+) (\S+) (\S+?)(?: (\S+))?>")
 
@@ -255,12 +258,8 @@ def functions_of(form: Form, span: Span) -> list[str]:
     if form.carrier != "acceleration":
         return found
     middle = f"{0.5 * max(abs(low), abs(high)) if form.on == 'omega' else 0.5 * (low + high):.9g}"
-    return [f"({f} - {_number(Z.sub(middle, f))})" for f in found]  # the motor's own J is the one in the middle
-
-
-def _number(source: str) -> str:
-    """Return what a source without a `PLACE` amounts to."""
-    return source if PLACE.search(source) else f"{eval(source, {'ca': np, 'm': SimpleNamespace(sign=np.sign)}):.9g}"
+    there = {f: Z.sub(middle, f) for f in found}  # where the motor's own J is the inertia
+    return [f"({f} - {at if PLACE.search(at) else f'{eval(at, NUMBERS):.9g}'})" for f, at in there.items()]
 
 
 def _sided(form: Form, lengths: Array, top: float) -> list[str]:

@@ -11,7 +11,7 @@ import scipy
 from numpy.typing import NDArray
 
 from motorid.channels import UNITS
-from motorid.diagnosis.free_forms import Form
+from motorid.diagnosis.free_forms import WHERE, Form
 from motorid.diagnosis.results import Binned, Missing
 from motorid.estimation.linearisation import linear_steps, parameter_vector, shown
 from motorid.estimation.result import Fit
@@ -72,11 +72,10 @@ def locate(fit: Fit) -> Missing:
 def acting_like(missing: Missing, form: Form) -> Missing:
     """Return `missing` with what is known of its form: which balance it acts in, and what it changes with."""
     apart = missing.where is not None or form.balance == "sensor"
-    where = {"torque": "mechanical", "voltage": "electrical", "both": "electrical", "sensor": "sensor"}[form.balance]
     fails = {"both": "Both balances fail.", "sensor": "The measurement fails."}
     lead = fails.get(form.balance, f"The {form.balance} balance fails.") if apart else missing.text.split(".")[0] + "."
     text = f"{lead} What is missing acts like {form.text}. {_region(missing.regions)}"
-    return replace(missing, where=where if apart else None, acts_like=form.text, text=text)
+    return replace(missing, where=WHERE[form.balance] if apart else None, acts_like=form.text, text=text)
 
 
 def _region(regions: Mapping[str, float]) -> str:

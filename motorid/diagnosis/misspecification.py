@@ -20,12 +20,14 @@ from motorid.diagnosis.model_comparison import Node, evidence, far
 from motorid.diagnosis.predictive_score import Evidence, Predictions, compare
 from motorid.diagnosis.thresholds import MOST, STANDARD_ERRORS, SUPPLANTS, TRIFLE, UNCONTESTED
 from motorid.display.numbers import listed, number, percent
+from motorid.errors import ModelError
 from motorid.estimation.angle_orders import uses_angle
 from motorid.estimation.fit import follows
 from motorid.estimation.least_squares import FAILURES
 from motorid.estimation.linearisation import INSEPARABLE
 from motorid.estimation.result import Fit
 from motorid.model.definition import Effect
+from motorid.model.model import Model
 from motorid.problem.runs import SGN_WIDTH_SHARE
 from motorid.records.checks import current_limit
 
@@ -220,15 +222,35 @@ def grades_of(last: Node, root: Node, groups: Sequence[Sequence[str]], beside: S
                 why = f"it removes {percent(taken, 2)} of the squared error, and the rest is not noise"
         kind = "approximates" if why else "group" if rivals.get(e.name) else "named"
         found.append(Grade(e.name, kind, why, form))
-    return _with_zeros_alike(tuple(found), last.fit)
+    return _no_surer_than_what_they_act_on(tuple(found), last.fit)
 
 
-def _with_zeros_alike(grades: tuple[Grade, ...], fit: Fit) -> tuple[Grade, ...]:
-    """Return grades where an encoder's zero of every run is no surer than the effects over the angle beside it."""
-    over = {e.name: tells_the_zero(e) for e in fit.model.effects if uses_angle(e)}
-    asking = [g for g in grades if over.get(g.effect) is False]
-    alike = len(asking) == sum(not zero for zero in over.values()) and {g.grade for g in asking} == {"approximates"}
-    return tuple(replace(asking[0], effect=g.effect) if alike and over.get(g.effect) else g for g in grades)
+def _no_surer_than_what_they_act_on(grades: tuple[Grade, ...], fit: Fit) -> tuple[Grade, ...]:
+    """Return grades where what begins anew in every run is no surer than the effects that it acts on: an encoder's zero
+    than those over the angle, a warm start than the heating."""
+    found = []
+    for g in grades:
+        on = _acted_on(fit.model, g.effect)
+        asking = [other for other in grades if other.effect in on]
+        alike = len(asking) == len(on) > 0 and {other.grade for other in asking} == {"approximates"}
+        found.append(replace(asking[0], effect=g.effect) if alike else g)
+    return tuple(found)
+
+
+def _acted_on(model: Model, name: str) -> list[str]:
+    """Return the effects without which one that is another in every run says nothing, or cannot be."""
+    acting, *others = sorted(model.effects, key=lambda e: e.name != name)
+    if tells_the_zero(acting):
+        return [e.name for e in others if uses_angle(e)]
+    alone = model.without(name) if any(p.per_run for p in acting.parameters) else model
+    return [e.name for e in others if _may_go(alone, e.name) and not _may_go(model, e.name)]
+
+
+def _may_go(model: Model, name: str) -> bool:
+    """Tell whether no other effect needs that one."""
+    with contextlib.suppress(ModelError):
+        return model.without(name) is not model
+    return False
 
 
 def tells_the_zero(effect: Effect) -> bool:

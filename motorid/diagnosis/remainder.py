@@ -23,7 +23,7 @@ import numpy as np
 from motorid.channels import COMPUTED_INPUTS
 from motorid.diagnosis import free_forms
 from motorid.diagnosis.cross_validation import QUICK, HeldOut
-from motorid.diagnosis.free_forms import FINER, PAST, PLACE, Form, Span
+from motorid.diagnosis.free_forms import FINER, PAST, PLACE, WHERE, Form, Span
 from motorid.diagnosis.misspecification import FormGain, better_forms, chosen_functions, pitches_of, tells_the_zero
 from motorid.diagnosis.model_comparison import Node, at_noise, far
 from motorid.diagnosis.predictive_score import Evidence, Predictions, compare
@@ -40,7 +40,6 @@ from motorid.model.model import Model
 from motorid.numerics.parallel import budget, check_time, one_thread
 from motorid.numerics.signals import Array
 
-WHERE = {"torque": "mechanical", "voltage": "electrical", "both": "electrical", "sensor": "sensor"}
 SECONDS = 120.0  # after which the best curve so far is taken
 TRIED = 4  # curves that are fitted, those that promise most
 FINE = range(1, 37)  # harmonics of a turn in a curve that is fitted

@@ -266,12 +266,6 @@ def hidden_remark(hidden: Mapping[tuple[str, str], tuple[str, ...]]) -> str:
                     f"them, fix one of these where it is known." for (name, wider), parameters in hidden.items())
 
 
-def balance_of(fit: Fit, name: str) -> str:
-    """Return where an effect of a model acts: electrical, mechanical or sensor."""
-    return {"voltage": "electrical", "torque": "mechanical", "transmission": "mechanical",
-            "sensor": "sensor"}[next(e.balance for e in fit.model.effects if e.name == name)]
-
-
 def outliers_remark(fit: Fit) -> str:
     """Say so when a few samples that stand alone make most of a channel's error: they hide the rest."""
     if fit.problem.loss is not None:

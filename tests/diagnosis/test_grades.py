@@ -310,9 +310,23 @@ def test_a_zero_of_the_encoder_is_no_surer_than_what_asks_for_it(lab):
     fit = mi.fit(mi.dc_motor() + mi.effects.torque_ripple + mi.effects.encoder_zero + mi.effects.coulomb, runs[:2])
     ripple = Grade("torque_ripple", "approximates", "a_r runs to 1")
     grades = ripple, Grade("encoder_zero", "named"), Grade("coulomb", "named")
-    told = misspecification._with_zeros_alike(grades, fit)
+    told = misspecification._no_surer_than_what_they_act_on(grades, fit)
     assert [g.grade for g in told] == ["approximates", "approximates", "named"]
     assert told[1].why == ripple.why
     sure = replace(ripple, grade="named"), *grades[1:]
-    assert misspecification._with_zeros_alike(sure, fit) == sure
-    assert misspecification._with_zeros_alike(grades[1:], fit) == grades[1:]  # of a ripple that was there before
+    assert misspecification._no_surer_than_what_they_act_on(sure, fit) == sure
+    assert misspecification._no_surer_than_what_they_act_on(grades[1:], fit) == grades[1:]  # a ripple from before
+
+
+def test_a_warm_start_is_no_surer_than_the_heating_that_it_begins(lab):
+    """Of a small robot the heating was not determined, and a winding 83 K colder than in the first run named."""
+    runs = runs_of(lab, HIDDEN, channels=("omega",), n=200)
+    heated = mi.dc_motor() + mi.effects.winding_heating + mi.effects.winding_warm_start
+    fit = mi.fit(heated + mi.effects.supply_per_run, runs[:2])
+    heating = Grade("winding_heating", "approximates", "R_th and C_th are not determined")
+    grades = heating, Grade("winding_warm_start", "named"), Grade("supply_per_run", "named")
+    told = misspecification._no_surer_than_what_they_act_on(grades, fit)
+    assert told == (heating, replace(heating, effect="winding_warm_start"), grades[2])
+    sure = replace(heating, grade="named"), *grades[1:]
+    assert misspecification._no_surer_than_what_they_act_on(sure, fit) == sure
+
