@@ -240,6 +240,8 @@ class Curve:
             pars.append(f'    {p.name}=mi.P({p.value:.9g}, "{p.unit}", given=True, {rest}),')
         known = [f"    Nearest closed form{' of the first part' * (len(self.parts) > 1)}: {text} (misses "
                  f"{percent(miss, 2)} of it)." for text, miss in self.nearest()[:1]]
+        if "encoder_zero" in self.fit.model.effect_names:
+            known.append("    To add with mi.effects.encoder_zero: the angle has another zero in every run.")
         return "\n".join(["import casadi as ca", "", "import motorid as mi", "", "",
                           f'@mi.effect(balance="{self.balance}")', f"def {self.name}(", "    m,", *pars, "):",
                           f'    """What is left of the misfit: {self.text}.', *(["", *known, ""] if known else []),

@@ -947,6 +947,7 @@ def test_over_the_turn_of_an_encoder_zeroed_at_every_start_a_curve_is_found_with
     assert found.remainder.follows == (
         "a resistance that changes with the angle within a turn, its zero another in every run")
     assert found.remainder.as_effect().doc == "What is left: a resistance that changes with the angle within a turn."
+    assert "mi.effects.encoder_zero" in found.remainder.code()
     fit = mi.fit(found.remainder.model + found.remainder.as_effect(), runs[:2])
     assert fit.per_run["z_0"][runs[1].name]["value"] == pytest.approx(zeros[1], abs=0.02)
     assert fit.nrmse["i"] < 0.2 * found.best.nrmse["i"]
