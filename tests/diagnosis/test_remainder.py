@@ -578,6 +578,12 @@ def tightening(m, tau=mi.P(8e-3, "N·m", null=0.0)):
     m.torque -= tau * m.sign(m.omega) * heat
 
 
+@mi.effect(balance="voltage")
+def rail(m, R_r=mi.P(1.0, "Ω", null=0.0)):
+    """A conductor rail that is fed from one end."""
+    m.voltage -= R_r * m.i * (1 + ca.tanh(m.theta / 40))
+
+
 @mi.effect(balance="torque")
 def reel(m, c=mi.P(0.03, "1/rad", null=0.0)):
     """What it winds up grows."""
@@ -644,6 +650,7 @@ def test_what_acts_while_power_is_fed_back_alone_is_one_constant(lab):
 
 @pytest.mark.parametrize(("law", "channels", "follows"), [
     (reel, ANGLE, "an inertia that changes with the angle"),
+    (rail, ANGLE, "a resistance that changes with the angle"),
     (derated, ANGLE[:2], "a gain of the voltage that depends on the heat of the current before"),
     (of_limited_power, ANGLE[:2], "a gain of the voltage that changes with the power drawn"),
     (fired, ("omega",), "a loss of voltage that changes with the voltage")])
@@ -700,6 +707,14 @@ def latch(m, A=mi.P(1.2e-2, "N·m", null=0.0)):
     m.torque -= A * ca.sin(m.theta - 2) / 0.15 * ca.exp(0.5 - (ca.sin((m.theta - 2) / 2) / 0.106) ** 2)
 
 
+@mi.effect(balance="voltage")
+def coil(m, k=mi.P(0.3, "", null=0.0)):
+    """A coil that leaves its magnet."""
+    share = 1 - k * ca.tanh(m.theta / 60) ** 2
+    m.scale("K_t", share)
+    m.scale("K_e", share)
+
+
 @mi.effect(balance="sensor")
 def shared_ground(m, k_g=mi.P(2.0, "rad/s/A", null=0.0)):
     """A tacho that reads a share of the current's square: held-out currents are larger, and the law goes on."""
@@ -712,9 +727,10 @@ def shared_ground(m, k_g=mi.P(2.0, "rad/s/A", null=0.0)):
     (hardening, "a load that changes with the angle"),
     (lobe, "a load that changes with the angle within a turn"),
     (latch, "a load that changes with the angle within a turn"),
+    (coil, "a motor constant that changes with the angle"),
     (shared_ground, "an error of the speed sensor that changes with the current")])
 def test_what_hums_heats_hardens_or_is_a_lobe_is_found_with_few_functions(law, words, lab):
-    runs, floor = _with_law(law, ANGLE if law in (hardening, lobe, latch) else ANGLE[:2], lab)
+    runs, floor = _with_law(law, ANGLE if law in (hardening, lobe, latch, coil) else ANGLE[:2], lab)
     found = mi.diagnose(mi.fit(mi.dc_motor(), runs[:2]), runs[2:], effects=("coulomb", "brush_drop"))
     effect = found.remainder.as_effect()
     assert effect.doc == f"What is left: {words}."
