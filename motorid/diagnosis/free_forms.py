@@ -548,7 +548,7 @@ def may_be_zeroed(fit: Fit) -> bool:
     """Tell whether records could show that each has a zero of the angle of its own: all go through a whole turn, and
     nothing in the model is over the angle yet."""
     signals, firsts = signals_along(fit), fit.problem.unknowns.firsts
-    if len(set(firsts)) < 2 or "turn" not in signals[0] or any(map(uses_angle, fit.model.effects)):
+    if len(set(firsts)) < 2 or any("turn" not in s for s in signals) or any(map(uses_angle, fit.model.effects)):
         return False
     angles = [[s["turn"] for s, f in zip(signals, firsts, strict=True) if f == first] for first in set(firsts)]
     return min(float(np.ptp(np.concatenate(parts))) for parts in angles) > 2 * np.pi

@@ -27,6 +27,7 @@ from motorid.diagnosis.free_forms import (
     Span,
     functions_of,
     linearised,
+    may_be_zeroed,
     shown,
     signals_along,
     span_of,
@@ -992,6 +993,21 @@ def test_an_inertia_that_changes_stays_above_zero_and_is_the_motors_own_in_the_m
     rates = [float(system.rhs(x, [0.0], [values[n] for n in system.parameters])[system.states.index("omega")])
              for x in np.diag([1.0] * len(system.states))]
     assert 0 < rates[system.states.index("i")] < 1e4 * fit.values["K"] / fit.values["J"]  # it speeds up
+
+
+def test_records_show_a_zero_of_their_own_where_all_go_through_a_turn(lab):
+    rng = np.random.default_rng(5)
+    one, two, still = (record(driven(lab, {}, w, 400, 1e-3, rng), "logger", ANGLE, lab, rng, w)
+                       for w in ("stairs", "waves", "stairs 0.05"))
+    assert np.ptp(still.outputs["theta"]) < 2 * np.pi < np.ptp(two.outputs["theta"])
+    shown = [(mi.dc_motor(), [one, two], True), (mi.dc_motor(), [one], False), (mi.dc_motor(), [one, still], False),
+             (mi.dc_motor() + mi.effects.gravity, [one, two], False),
+             (mi.dc_motor(), [one, two.without("omega").without("theta")], False)]
+    for model, runs, may in shown:
+        assert may_be_zeroed(mi.fit(model, runs)) is may
+    parts = [p for run in (one, two) for p in windows(run, 0.05)]
+    assert max(np.ptp(p.outputs["theta"]) for p in parts) < 2 * np.pi
+    assert may_be_zeroed(mi.fit(mi.dc_motor(), parts))  # parts of one record belong together
 
 
 @pytest.fixture(scope="module")
