@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from motorid.diagnosis.admissibility import objections
-from motorid.diagnosis.cross_validation import HeldOut
+from motorid.diagnosis.cross_validation import QUICK, HeldOut
 from motorid.diagnosis.free_forms import own_levels
 from motorid.diagnosis.misspecification import LIMITER
 from motorid.diagnosis.model_comparison import COMMON, Node, beats, evidence, far, node_of, preferred, superfluous
@@ -28,7 +28,7 @@ from motorid.display.numbers import listed
 from motorid.effects import LIBRARY, MEASURED, PER_RUN, get
 from motorid.errors import ModelError
 from motorid.estimation.fit import lost, solve
-from motorid.estimation.least_squares import FAILURES
+from motorid.estimation.least_squares import FAILURES, RACE
 from motorid.estimation.result import Fit
 from motorid.model.definition import Effect
 from motorid.model.model import Model
@@ -333,7 +333,9 @@ class Search:
         if node.fit.status != "converged" and far(node.fit):
             with contextlib.suppress(*FAILURES):
                 problem = node.fit.problem.with_(model=node.fit.model, noise_factors={})
-                fit = solve(problem, start="model")
+                fit = solve(problem, QUICK, start="model")
+                if fit.status == "limit":  # on its way still
+                    fit = solve(problem.with_(model=fit.model), RACE, start="model")
                 onward = replace(node, fit=fit, predictions=self.held.predictions(fit))
                 return onward if beats(onward, node) else node
         return node

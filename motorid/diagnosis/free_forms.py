@@ -545,8 +545,7 @@ def form_coefficients(fit: Fit, linear: Linear, form: Form, kept: Sequence[int] 
 
 
 def may_be_zeroed(fit: Fit) -> bool:
-    """Tell whether records could show that each has a zero of the angle of its own: all go through a whole turn, and
-    nothing in the model is over the angle yet."""
+    """Tell whether records could show a zero of the angle of each: all go round, and nothing is over the angle yet."""
     signals, firsts = signals_along(fit), fit.problem.unknowns.firsts
     if len(set(firsts)) < 2 or any("turn" not in s for s in signals) or any(map(uses_angle, fit.model.effects)):
         return False

@@ -226,8 +226,7 @@ def grades_of(last: Node, root: Node, groups: Sequence[Sequence[str]], beside: S
 
 
 def _no_surer_than_what_they_act_on(grades: tuple[Grade, ...], fit: Fit) -> tuple[Grade, ...]:
-    """Return grades where what begins anew in every run is no surer than the effects that it acts on: an encoder's zero
-    than those over the angle, a warm start than the heating."""
+    """Return grades where an encoder's zero, or a warm start, of every run is no surer than the effects it acts on."""
     found = []
     for g in grades:
         on = _acted_on(fit.model, g.effect)

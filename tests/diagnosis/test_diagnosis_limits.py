@@ -15,11 +15,13 @@ from motorid.diagnosis import candidates
 from motorid.diagnosis import record_parts as parts
 from motorid.diagnosis.admissibility import objections, samples_within, unresolved
 from motorid.diagnosis.candidates import Search, Stages, library
+from motorid.diagnosis.cross_validation import QUICK
 from motorid.diagnosis.model_comparison import node_of
 from motorid.diagnosis.score_test import believable_start, score
 from motorid.effects import LIBRARY
 from motorid.errors import ModelError
 from motorid.estimation.angle_orders import likely_lines, spectrum
+from motorid.estimation.least_squares import RACE
 from motorid.estimation.linearisation import Tangent
 from motorid.numerics.autoregression import Whitening
 from motorid.numerics.parallel import one_thread
@@ -179,6 +181,21 @@ def test_a_friction_that_two_effects_contain_takes_the_place_of_neither():
     assert candidates._in_place(model, model.effects[0], LIBRARY["coulomb"]) is None
     alone = model.without("angular_friction")
     assert candidates._in_place(alone, alone.effects[0], LIBRARY["coulomb"]).effect_names == ("coulomb",)
+
+
+@pytest.mark.parametrize(("ended", "efforts"), [("limit", [QUICK, RACE]), ("stalled", [QUICK])])
+def test_what_is_on_its_way_after_a_quick_solve_goes_on(rubbing, monkeypatch, ended, efforts):
+    """The current of a supply was found at 25 % of it, and gravity beside it for what the rest of the way takes."""
+    search, tried = searched(mi.fit(mi.dc_motor(), rubbing)), []
+
+    def solve(problem, effort, start):
+        tried.append(effort)
+        return replace(search.root.fit, status=ended)
+
+    monkeypatch.setattr(candidates, "solve", solve)
+    monkeypatch.setattr(candidates, "led_on", lambda fit: None)
+    search.brought_to_its_end(replace(search.root, fit=replace(search.root.fit, status="stalled")))
+    assert tried == efforts
 
 
 # -- limits of physics -------------------------------------------------------------------------------------
