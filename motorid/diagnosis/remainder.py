@@ -420,7 +420,7 @@ class Remainder:
         """
         replaced = {name: form for name, form in self._approximating.items() if form is not None}
         if (base := self._without(replaced)) is not None:
-            yield from ((Curve(base), form) for form in dict.fromkeys(replaced.values()))
+            yield from _over_zeros(base, dict.fromkeys(replaced.values()))
         beside = _over_zeros(self.fit, self.forms)
         yield from islice(beside, 1)
         alone = _beyond(self._without(self._approximating) if far(self.fit) else None)

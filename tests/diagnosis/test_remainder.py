@@ -995,6 +995,18 @@ def test_an_inertia_that_changes_stays_above_zero_and_is_the_motors_own_in_the_m
     assert 0 < rates[system.states.index("i")] < 1e4 * fit.values["K"] / fit.values["J"]  # it speeds up
 
 
+def test_in_the_place_of_an_effect_too_such_a_form_comes_with_the_zeros(lab):
+    runs, _ = _with_law(worn, ANGLE, lab)
+    runs = [run.with_(outputs={**run.outputs, "theta": run.outputs["theta"] - z})
+            for run, z in zip(runs[:2], (0.0, 1.9), strict=True)]
+    fit = mi.fit(mi.dc_motor() + mi.effects.coulomb, runs)
+    form = replace(Form("a resistance", "voltage", "turn", "i"), zeroed=True)
+    curve, plain = next(Remainder("structure", fit, _approximating={"coulomb": form})._tried())
+    assert curve.fit.model.effect_names == ("encoder_zero",)
+    assert curve.fit.per_run["z_0"][runs[1].name]["value"] == pytest.approx(1.9, abs=0.1)
+    assert plain == replace(form, zeroed=False)
+
+
 def test_records_show_a_zero_of_their_own_where_all_go_through_a_turn(lab):
     rng = np.random.default_rng(5)
     one, two, still = (record(driven(lab, {}, w, 400, 1e-3, rng), "logger", ANGLE, lab, rng, w)
