@@ -16,8 +16,6 @@ class Row(NamedTuple):
 
 
 class _Mark(NamedTuple):
-    counter: int
-    time: int  # as it came, wrapped
     index: int
     micros: int  # since the first sample, unwrapped
     host: float  # clock of the computer, s
@@ -38,8 +36,8 @@ class Timeline:
         self.clipped: Counter[str] = Counter()
         self.received = 0
         self._wrap = 1 << header.counter_bits, 1 << header.timer_bits
-        period = round(1e6 / header.rate)
-        self._last = _Mark((counter - 1) % self._wrap[0], (time - period) % self._wrap[1], -1, -period, host)
+        self._first = counter, time
+        self._last = _Mark(-1, -round(1e6 / header.rate), host)
         self._doubtful: tuple[_Mark, Sample] | None = None
         self._unwrappers = {k: _Unwrapper(c.span) for k, c in enumerate(header.channels) if c.wraps}
 
@@ -86,8 +84,8 @@ class Timeline:
 
     def _follow(self, last: _Mark, sample: Sample, host: float) -> _Mark | str:
         """Where `sample` is, coming after `last`, or why it cannot come after it."""
-        step = (sample.counter - last.counter) % self._wrap[0]
-        micros = (sample.time - last.time) % self._wrap[1]
+        step = (sample.counter - self._first[0] - last.index) % self._wrap[0]
+        micros = (sample.time - self._first[1] - last.micros) % self._wrap[1]
         elapsed = (host - last.host) * 1e6
         if step == 0 and micros == 0 and elapsed < self._wrap[1] / 2:
             return "repeated"
@@ -95,7 +93,7 @@ class Timeline:
             return "out of order"
         micros += self._wrap[1] * max(0, round((elapsed - micros) / self._wrap[1]))
         step += self._wrap[0] * max(0, round((micros * 1e-6 * self.header.rate - step) / self._wrap[0]))
-        return _Mark(sample.counter, sample.time, last.index + step, last.micros + micros, host)
+        return _Mark(last.index + step, last.micros + micros, host)
 
     def _agree(self, last: _Mark, mark: _Mark) -> bool:
         step = mark.index - last.index
