@@ -308,15 +308,10 @@ EXPLAINED = 0.25  # NRMSE above which a channel counts as poorly explained
 
 def misfit_over_noise(problem: Problem, q: Array) -> dict[str, float]:
     """Return the RMS of the residual over the noise per channel; far below 1 where the noise was overestimated."""
-    sums = {c: np.zeros(2) for c in problem.outputs}
-    for k, run in enumerate(problem.runs):
-        y = problem.simulate(q, k, derivatives=False).y
-        for j, c in enumerate(problem.outputs):
-            if c in run.sigma:
-                e = (run.experiment.outputs[c] - y[:, j]) / run.sigma[c]
-                e = e[np.isfinite(e)]
-                sums[c] += float(e @ e), e.size
-    return {c: max(float(np.sqrt(s / max(n, 1))), LEAST_FACTOR) for c, (s, n) in sums.items()}
+    trajs = (problem.simulate(q, k, derivatives=False) for k in range(len(problem.runs)))
+    errors = np.concatenate([(m.y - traj.y) / m.noise for m, traj in zip(problem.measured, trajs, strict=True)])
+    found = {c: e[np.isfinite(e)] for c, e in zip(problem.outputs, errors.T, strict=True)}
+    return {c: max(float(np.sqrt(e @ e / max(e.size, 1))), LEAST_FACTOR) for c, e in found.items()}
 
 
 def poorly_explained(problem: Problem, q: Array) -> bool:
