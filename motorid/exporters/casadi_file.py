@@ -45,9 +45,7 @@ def model_of(found: Fit | Model) -> Model:
 
 def system_of(found: Fit | Model) -> System:
     """Return the model's functions for the channels of the fit; of a model, for all that it can show."""
-    if isinstance(found, Fit):
-        return found.problem.system
-    return found.system(SHOWN[found.base])
+    return found.problem.system if isinstance(found, Fit) else found.system(SHOWN[found.base])
 
 
 def values_of(found: Fit | Model, system: System) -> Array:
