@@ -164,9 +164,8 @@ class Model(Shown):
     @property
     def stored(self) -> tuple[str, ...]:
         """Base states whose balance has storage; with L fixed at 0 the current is algebraic."""
-        inductance = self.parameters.get("L")
-        algebraic = inductance is not None and inductance.value == 0 and not inductance.vary
-        return tuple(s for s in STATES[self.base] if not (s == "i" and algebraic))
+        pars = self.parameters
+        return tuple(s for s in STATES[self.base] if s != "i" or pars["L"].vary or pars["L"].value != 0)
 
     def write(self) -> Equations:
         """Return the filled sheet: the base and the effects, in an order that does not depend on adding."""
