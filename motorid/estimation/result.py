@@ -208,12 +208,10 @@ class Fit(Shown):
     @cached_property
     def misfit(self) -> Mapping[str, float]:
         """RMS of the residual over the noise of the sensor, per channel, samples that stand alone left aside."""
-        found = {}
-        for c in self.problem.outputs:
-            pairs = zip(self.simulations, self.problem.runs, strict=True)
-            r = np.concatenate([despiked(s.residual(c)) / run.sigma[c] for s, run in pairs if c in run.sigma])
-            found[c] = float(np.sqrt(np.mean(r**2)))
-        return found
+        pairs = list(zip(self.simulations, self.problem.runs, strict=True))
+        left = {c: np.concatenate([despiked(s.residual(c)) / run.sigma[c] for s, run in pairs if c in run.sigma])
+                for c in self.problem.outputs}
+        return {c: float(np.sqrt(np.mean(r**2))) for c, r in left.items()}
 
     @property
     def nrmse(self) -> Mapping[str, float]:
