@@ -110,12 +110,9 @@ def _deviation(problem: Problem, residual: Array) -> float:
 def restored_values(parameters: Iterable[Parameter], influence: Mapping[str, float],
                     deviation: float = 1.0) -> dict[str, float]:
     """Return the values at which collapsed parameters would matter, whose logarithms change the residual so much."""
-    back = {}
-    for p in parameters:
-        if p.positive and p.vary and 0 < influence.get(p.name, 0.0) < MATTERS * deviation:
-            where = 3 * MATTERS / influence[p.name] * p.value
-            back[p.name] = float(np.clip(where, p.lower, min(p.upper, FURTHEST * p.value)))
-    return back
+    weak = (p for p in parameters if p.positive and p.vary and 0 < influence.get(p.name, 0.0) < MATTERS * deviation)
+    return {p.name: float(np.clip(3 * MATTERS / influence[p.name] * p.value, p.lower, min(p.upper, FURTHEST * p.value)))
+            for p in weak}
 
 
 def restored(fit: Fit, model: Model) -> Model:
