@@ -72,8 +72,7 @@ def _better_than_still(guess: Problem) -> Problem:
 
 
 def _was_fitted(model: Model) -> bool:
-    present = ((model.parameters[p.name], p) for p in BASES[model.base])
-    return any(now.value != declared.value and not now.given for now, declared in present)
+    return any((now := model.parameters[p.name]).value != p.value and not now.given for p in BASES[model.base])
 
 
 def with_suited_effects(model: Model, runs: Sequence[Experiment]) -> Model:
@@ -85,8 +84,7 @@ def with_suited_effects(model: Model, runs: Sequence[Experiment]) -> Model:
 
 def _untouched(model: Model, effect: Effect) -> list[Parameter]:
     """Parameters of an effect that still have the value they were declared with."""
-    here = ((model.parameters[p.name], p) for p in effect.parameters)
-    return [now for now, declared in here if now.value == declared.value and not now.given]
+    return [now for p in effect.parameters if (now := model.parameters[p.name]).value == p.value and not now.given]
 
 
 def _along_measured_angle(problem: Problem, asked: Model) -> Problem:
