@@ -125,8 +125,7 @@ def _shapes(problem: Problem, effect: Effect, asked: Model) -> list[dict[str, fl
     for p in _untouched(asked, effect):
         kinds = not p.vary and len(p.grid) > 1
         if kinds or (p.vary and (p.periodic or p.place or p.unit == RESONANCE)):
-            values = PHASES if p.periodic else shapes_of(p, sizes)
-            axes[p.name] = np.clip(values, p.lower, p.upper).tolist()
+            axes[p.name] = np.clip(PHASES if p.periodic else shapes_of(p, sizes), p.lower, p.upper).tolist()
     return combined(axes)
 
 
