@@ -37,16 +37,14 @@ def first_guess(model: Model, runs: Sequence[Experiment], *, loaded: bool = Fals
     held = {n: p.value for n, p in model.parameters.items() if p.given or not p.vary}
     signals = [_signals(_read_plainly(r, model), loaded) for r in runs]
     loads = _Loads(model, loads_of(model) if loaded else ())
+    turning = [s for s in signals if "omega" in s]
+    both = [s for s in turning if "i" in s]
     if model.base == "torque_driven":
         found = _torque_driven(signals, held, loads)
-    elif any("i" in s and "omega" in s for s in signals):
-        found = _full([s for s in signals if "i" in s and "omega" in s], held, loads)
-        if _rings(found, signals):  # a current that is not the motor's
-            found = _without_current([s for s in signals if "omega" in s], held, loads, back_emf)
-    elif any("omega" in s for s in signals):
-        found = _without_current([s for s in signals if "omega" in s], held, loads, back_emf)
-    else:
+    elif not turning:
         found = _without_speed([s for s in signals if "i" in s], held)
+    elif not both or _rings(found := _full(both, held, loads), signals):  # with a current that is not the motor's
+        found = _without_current(turning, held, loads, back_emf)
     base = {n: held.get(n, v) for n, v in found.items() if n in model.parameters and np.isfinite(v)}
     return {n: v for n, v in base.items() if v > 0 or n not in BASE}
 
