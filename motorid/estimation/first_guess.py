@@ -52,9 +52,8 @@ def first_guess(model: Model, runs: Sequence[Experiment], *, loaded: bool = Fals
 def _read_plainly(run: Experiment, model: Model) -> Experiment:
     """Return the run without a current that is not the motor's, as an effect without a free parameter says."""
     fixed = [e for e in model.effects if e.balance == "sensor" and not any(p.vary for p in e.parameters)]
-    if "i" in run.outputs and len(run.outputs) > 1 and any("i" in (dc_motor() + e).write().sensors for e in fixed):
-        return run.without("i")
-    return run
+    beside = "i" in run.outputs and len(run.outputs) > 1
+    return run.without("i") if beside and any("i" in (dc_motor() + e).write().sensors for e in fixed) else run
 
 
 def _signals(run: Experiment, loaded: bool) -> dict[str, Array]:
