@@ -310,14 +310,12 @@ def _misfit(found: Estimate) -> float:
 def _said(found: Estimate, error: float) -> tuple[str, str]:
     """Return the status, and the message with what to try. Friction makes the cost too rugged to go lower: a misfit
     that is noise is converged all the same."""
-    status, message = found.solution.status, found.solution.message
-    problem = found.problem
+    problem, status, message = found.problem, found.solution.status, found.solution.message
     if status == "stalled" and problem.weights == "noise" and \
             max(misfit_over_noise(problem, found.q).values(), default=np.inf) <= NOISE:
         status, message = "converged", "converged: the misfit is noise, and no step lowers it"
     if status == "converged" and error > max(1.0, ERROR_SHARE * _misfit(found)):
-        return status, (f"{message}; but the integration error is {error:.2g} times the noise: try engine='cvodes' or "
-                        "a finer record.")
+        message += f"; but the integration error is {error:.2g} times the noise: try engine='cvodes' or a finer record"
     return status, f"{message}."
 
 
