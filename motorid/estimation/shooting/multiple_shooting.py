@@ -116,9 +116,7 @@ class MultipleShooting:
             return _least_squares(problem, True)
         q = self._from_poor_values(problem)
         near = _least_squares(problem.start_at(problem.values(q)), False)
-        if not _poor(*near):
-            return near
-        return min(near, _least_squares(problem, True), key=lambda found: _misfit(*found))
+        return min(near, _least_squares(problem, True), key=lambda found: _misfit(*found)) if _poor(*near) else near
 
     def _from_poor_values(self, problem: Problem) -> Array:
         """Return values that a fit finds whose intervals join loosely, then tightly, from poor ones."""
