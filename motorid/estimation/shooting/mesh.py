@@ -188,16 +188,15 @@ class Mesh:
 
     def _part(self, part: Part, walk: Walk) -> list[tuple[Block, np.ndarray]]:
         traj, s = walk.runs[part.run], part.samples
-        x = traj.x[s]
-        dp = np.hstack([np.zeros((len(walk.at.p), self.nx)), walk.at.dp])
         owner = self.owner[part.run][s]
         if not part.averaged:
-            c, jac = part.rows(x, walk.at.p, None if traj.dx is None else traj.dx[s], dp)
+            dp = np.hstack([np.zeros((len(walk.at.p), self.nx)), walk.at.dp])
+            c, jac = part.rows(traj.x[s], walk.at.p, None if traj.dx is None else traj.dx[s], dp)
             blocks = self._by_interval(c, jac, owner)
             ends = np.cumsum([len(b.values) for b in blocks])
             return [(b, np.arange(e - len(b.values), e)) for b, e in zip(blocks, ends, strict=True)]
         columns, dx, dp = self._spread(traj.dx, s, owner, walk.at.dp)
-        c, jac = part.rows(x, walk.at.p, dx, dp)
+        c, jac = part.rows(traj.x[s], walk.at.p, dx, dp)
         return [(Block(c, jac, columns), np.arange(len(c)))]
 
     def _spread(self, dx: Array | None, samples: np.ndarray, owner: np.ndarray,
