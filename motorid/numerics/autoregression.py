@@ -97,11 +97,9 @@ class Whitening:
 
     def __call__(self, stacks: Sequence[Array]) -> Array:
         """Return (N, ny, …) per run, filtered over time and stacked as rows; the first samples are left out."""
-        parts = []
-        for y in stacks:
-            done = [_filtered(a, np.nan_to_num(y[:, j])) for j, a in enumerate(self.filters)]
-            parts.append(np.stack(done, axis=1).reshape(-1, *y.shape[2:]))
-        return np.concatenate(parts)
+        parts = (np.stack([_filtered(a, np.nan_to_num(y[:, j])) for j, a in enumerate(self.filters)], axis=1)
+                 for y in stacks)
+        return np.concatenate([part.reshape(-1, *part.shape[2:]) for part in parts])
 
     def transposed(self, rows: Array, lengths: Sequence[int]) -> list[Array]:
         """Return the transposed filters on stacked `rows`, (N, ny) for each run of N samples in `lengths`."""
