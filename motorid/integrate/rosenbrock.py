@@ -130,8 +130,7 @@ class Stepper:
         x0, p = np.ascontiguousarray(x0, float), np.ascontiguousarray(p, float)
         if dp is not None and dx0 is not None:
             dx0, dp = np.ascontiguousarray(dx0, float), np.ascontiguousarray(dp, float)
-        library = self._load(compiled)
-        if library is not None:
+        if (library := self._load(compiled)) is not None:
             traj, bad = self._run_compiled(library, grid, x0, p, dx0, dp, local_error)
         else:
             traj = self.machine.run(grid, x0, p, dx0, dp, local_error)
@@ -147,8 +146,7 @@ class Stepper:
     def halved(self, grid: Grid, rows: NDArray[np.int64], x: Array, p: Array, compiled: bool | None) -> Array:
         """Return by how much half the steps change where the intervals `rows` of a trajectory x end, (nx, n)."""
         x, p = np.ascontiguousarray(x, float), np.ascontiguousarray(p, float)
-        library = self._load(compiled)
-        if library is not None:
+        if (library := self._load(compiled)) is not None:
             ends = np.empty((len(rows), self.nx))
             library[1](len(rows), *map(address, (rows, grid.substeps, grid.dt, grid.u0, grid.u1, x, p, ends)))
         else:
@@ -170,8 +168,7 @@ class Stepper:
             return None
         if self._library is None and (compiled or self._spent >= self._next_look):
             self._next_look = min(2 * self._spent + 1, PATIENCE + 1)  # another process may have made it meanwhile
-            mark = cc.mark_of(self.key)
-            if mark is None:
+            if (mark := cc.mark_of(self.key)) is None:
                 self._refused = True
                 cc.say_once("motorid: no C compiler found; using CasADi's virtual machine, same results, slower.")
                 return None
