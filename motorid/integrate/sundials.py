@@ -44,9 +44,8 @@ class _Sundials(Engine):
             dp: Array | None = None) -> Trajectory:
         """See `Engine.run`."""
         nx, nq = len(system.states), 0 if dp is None else dp.shape[1]
-        n = len(grid.t)
         scale = _state_scale(system, grid, x0, p)
-        x, dx = np.empty((n, nx)), np.empty((n, nx, nq))
+        x, dx = np.empty((len(grid.t), nx)), np.empty((len(grid.t), nx, nq))
         x[0] = x0
         if nq:
             dx[0] = dx0
