@@ -617,9 +617,7 @@ def _linear_step(task: Task, c: Array, values: Array, slopes: Array, rows: Seque
                  radius: float) -> tuple[Array, float]:
     """Return the step within `radius` that raises the linearised worth most, and by how much."""
     n, truths = len(c), len(task.truths)
-    owner = np.zeros((len(values), truths))
-    for k, each in enumerate(task.truths):
-        owner[each, k] = 1.0
+    owner = np.array([[k in each for each in task.truths] for k in range(len(values))], float)
     a, b = [np.hstack([-slopes, owner])], [values]
     for y, dy, low, high in rows:
         for sign, limit in ((1.0, high), (-1.0, -low)):
