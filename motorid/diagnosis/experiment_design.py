@@ -98,18 +98,16 @@ def suggest_experiment(fits: Sequence[Fit], *, v_max: float | None = None, i_max
         return float(np.mean([np.mean(((a[c] - b[c]) / sigma[c]) ** 2) for c in a if c in sigma]))
 
     scores, kept = {}, {}
-    for name, (v, _) in candidates(t, v_max).items():
+    for name, (v, what) in candidates(t, v_max).items():
         with contextlib.suppress(MotoridError):
             answers = [planned(f.model, t, v, channels=f.problem.outputs, name=name).outputs for f in fits]
             if not i_max or all(float(np.abs(y.get("i", 0.0)).max()) <= i_max for y in answers):
                 scores[name] = min(difference(a, b) for a, b in combinations(answers, 2))
-                kept[name] = Experiment(t, {"v": v}, answers[0], name=name)
+                text = f"{what} (up to {quantity(v_max, runs[0].units['v'], 3)}, {duration:.3g} s)"
+                kept[name] = Suggestion(name, text, Experiment(t, {"v": v}, answers[0], name=name), scores)
     if not scores:
         raise FitError("no candidate experiment stays within the limits with all models; raise i_max or v_max.")
-    best = max(scores, key=lambda n: scores[n])
-    what = candidates(t, v_max)[best][1]
-    unit = runs[0].units["v"]
-    return Suggestion(best, f"{what} (up to {quantity(v_max, unit, 3)}, {duration:.3g} s)", kept[best], scores)
+    return kept[max(scores, key=lambda n: scores[n])]
 
 
 def candidates(t: Array, v_max: float) -> dict[str, tuple[Array, str]]:
