@@ -405,8 +405,6 @@ def _beaten(tasks: Sequence[Task], costs: Mapping[int, float], first: int) -> di
     """Return which tasks need not be finished beside the one that explains all but noise, and why."""
     winner, given_up = tasks[first], {}
     for k, cost in costs.items():
-        if k == first:
-            continue
         drop = 1 - cost / max(winner.fit.cost, 1e-300)
         if cost > BEHIND * costs[first]:
             given_up[k] = GivenUp(FAR_BEHIND.format(winner.effect.name), drop)
