@@ -342,8 +342,7 @@ def _refit_all(tasks: Sequence[Task], map_: Callable[..., Iterable[Any]],
             found.update(_beaten(tasks, {k: race.cost for k, race in races.items()}, first) | found)
         found.update(_outdone(tasks, races, found))
     rest = sorted((k for k in races if k not in found), key=lambda k: races[k].cost)
-    for k, fit in zip(rest, map_(_finish, [(tasks[k], races[k]) for k in rest]), strict=True):
-        found[k] = fit
+    found.update(zip(rest, map_(_finish, [(tasks[k], races[k]) for k in rest]), strict=True))
 
 
 def completed(given_up: Sequence[GivenUp], map_: Callable[..., Iterable[Any]]) -> list[Fit | GivenUp | None]:
