@@ -249,9 +249,7 @@ class Shape:
     @property
     def nonnegative(self) -> list[bool]:
         """Which columns may not count negatively."""
-        if self.phase is not None:
-            return [False, False]
-        return [p.lower == 0 for p in self.sizes] if self.sizes else [True]
+        return [False, False] if self.phase is not None else [p.lower == 0 for p in self.sizes] or [True]
 
     def weighed_like(self, fit: Fit) -> Shape:
         """Return the shape with the channels weighed as in another fit of the same records."""
