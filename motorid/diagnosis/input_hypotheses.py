@@ -67,10 +67,8 @@ def without_spikes(fit: Fit) -> Reading | None:
     runs = fit.problem.experiments
     count = sum(int(np.isfinite(y).sum() - np.isfinite(quiet.outputs[c]).sum())
                 for run, quiet in ((r, r.without_spikes()) for r in runs) for c, y in run.outputs.items())
-    if not count:
-        return None
     says = f"{count} single samples stand far from both neighbours, which no motor can do, and are left out"
-    return Reading(says, "--no-spikes", Experiment.without_spikes)
+    return Reading(says, "--no-spikes", Experiment.without_spikes) if count else None
 
 
 def better_reading(fit: Fit, late: bool = False) -> Reading | None:
