@@ -35,10 +35,9 @@ def first_answer(fit: Fit, judged: Adequacy, scores: Sequence[Score]) -> str:
 
 def window_remark(fit: Fit) -> str:
     """Say that the records were simulated in windows, and why."""
-    if fit.window is None:
-        return ""
-    return (f"The records are simulated in windows of {number(fit.window, 2)} s, each from an estimated state, because "
-            "over whole records small errors of this model grow too large. Errors are those of a window ahead.")
+    return "" if fit.window is None else (
+        f"The records are simulated in windows of {number(fit.window, 2)} s, each from an estimated state, because "
+        "over whole records small errors of this model grow too large. Errors are those of a window ahead.")
 
 
 def adequate_text(judged: Adequacy, ranking: Sequence[Candidate], large: bool = False) -> tuple[str, str]:
@@ -215,11 +214,9 @@ def measured_angle_remark(fit: Fit) -> str:
 
 def own_in_every_run_remark(fit: Fit) -> str:
     """Say so where parameters are others in every run: those of held-out runs are estimated there."""
-    if not fit.per_run:
-        return ""
     are = "are others" if len(fit.per_run) > 1 else "is another"
     return (f"{listed(list(fit.per_run))} {are} in every run, and so estimated in the held-out runs too, for each "
-            "block by the others: these prove that it stays, not how large it is.")
+            "block by the others: these prove that it stays, not how large it is.") if fit.per_run else ""
 
 
 def unfinished_remark(fit: Fit) -> str:
@@ -252,12 +249,11 @@ def inseparable_remark(same: Mapping[str, tuple[str, ...]]) -> str:
 
 def unseen_remark(same: Mapping[str, tuple[str, ...]]) -> str:
     """Say which effects these records cannot show, since the motor's own parameters imitate them, and which would."""
-    if not same:
-        return ""
     parameters = listed(list(dict.fromkeys(itertools.chain(*same.values()))), "or")
     shown = "it" if len(same) == 1 else "them"
     return (f"These records cannot show {listed(list(same), 'or')}: other values of {parameters} do the same. Steps of "
-            f"several sizes in both directions, with current and speed measured, are likelier to show {shown}.")
+            f"several sizes in both directions, with current and speed measured, are likelier to show {shown}."
+            ) if same else ""
 
 
 def hidden_remark(hidden: Mapping[tuple[str, str], tuple[str, ...]]) -> str:
