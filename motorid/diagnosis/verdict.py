@@ -221,9 +221,8 @@ def own_in_every_run_remark(fit: Fit) -> str:
 
 def unfinished_remark(fit: Fit) -> str:
     """Say so where the last fit did not converge: its values, and what is said of them, are not the best there are."""
-    if fit.status == "converged" or max(fit.misfit.values(), default=0.0) < LARGER:
-        return ""
-    return f"The last fit did not converge ({fit.status}): its values, and this verdict, are provisional."
+    text = f"The last fit did not converge ({fit.status}): its values, and this verdict, are provisional."
+    return "" if fit.status == "converged" or max(fit.misfit.values(), default=0.0) < LARGER else text
 
 
 def held_out_remark(node: Node) -> str:
