@@ -115,10 +115,9 @@ def _described(fit: Fit, name: str) -> str:
     effect, std = next(e for e in fit.problem.model.effects if e.name == name), _certain(fit)
     said = [effect.title if name in effect.title else f"{effect.title} [{name}]"]
     for p in effect.parameters:
-        unit = fit.problem.model.parameters[p.name].unit
-        sd = std.get(p.name)
-        known = sd is not None or not fit.problem.model.parameters[p.name].vary
-        text = f"{p.name} = {with_error(fit.values[p.name], sd, unit)}" if known else f"{p.name} not determined"
+        now, sd = fit.problem.model.parameters[p.name], std.get(p.name)
+        known = sd is not None or not now.vary
+        text = f"{p.name} = {with_error(fit.values[p.name], sd, now.unit)}" if known else f"{p.name} not determined"
         if p.name in fit.per_run:
             text = f"{p.name} = {parameter_cell(fit, p.name)}"
         if not known and (volts := fit.determined.get(f"{p.name}_voltage")) is not None:
