@@ -334,8 +334,7 @@ def ranking_table(candidates: Sequence[Candidate], most: int = 10) -> Table:
 def ladder_table(ladder: Ladder) -> Table:
     """Return the errors of the model on each rung, as fitted and held out."""
     first = ladder.rungs[0]
-    units = units_of(first.fit.problem.experiments)
-    channels = {c: channel_name(c, units.get(c, "")) for c in first.nrmse}
+    channels = {c: channel_name(c, units_of(first.fit.problem.experiments).get(c, "")) for c in first.nrmse}
     held_out = any(r.validation_nrmse for r in ladder.rungs)
     header = ["model", *(f"{name}, fitted" for name in channels.values()),
               *(f"{name}, held out" for name in channels.values() if held_out)]
