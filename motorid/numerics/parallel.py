@@ -287,8 +287,7 @@ def progress(text: str, total: float | None = None, *, quiet: bool = False, at_m
     ...     for _ in range(3):
     ...         advance()
     """
-    outer = _outer.get()
-    if outer is not None:
+    if (outer := _outer.get()) is not None:
         outer(0, text)
     if quiet or outer is not None or not _watched():
         yield lambda n=1.0, at_work="", done=None, total=None: None
