@@ -103,12 +103,10 @@ class Whitening:
 
     def transposed(self, rows: Array, lengths: Sequence[int]) -> list[Array]:
         """Return the transposed filters on stacked `rows`, (N, ny) for each run of N samples in `lengths`."""
-        found, first = [], 0
-        for n in lengths:
-            shape = max(n - ORDER, 0), len(self.filters)
-            part = rows[first : first + shape[0] * shape[1]].reshape(shape)
-            first += part.size
-            out = np.zeros((n, shape[1]))
+        found, ny = [], len(self.filters)
+        ends = np.cumsum([max(n - ORDER, 0) for n in lengths])
+        for n, part in zip(lengths, np.split(rows.reshape(-1, ny), ends[:-1]), strict=True):
+            out = np.zeros((n, ny))
             for j, a in enumerate(self.filters if part.size else ()):
                 out[:, j] = np.convolve(part[:, j], a[::-1])
             found.append(out)
