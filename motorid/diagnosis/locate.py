@@ -31,10 +31,6 @@ REGIONS = ("standstill", "reversal", "acceleration", "high current", "steady")
 def locate(fit: Fit) -> Missing:
     """Estimate the unknown voltage and torque that would make the model match, and say where they act.
 
-    Parameters
-    ----------
-    fit : Fit
-
     Returns
     -------
     Missing
