@@ -173,8 +173,7 @@ def _text(where: str | None, shares: Mapping[str, float], regions: Mapping[str, 
     region, name = _region(regions), "voltage" if where == "electrical" else "torque"
     lead = (f"The {name} balance fails ({100 * shares[where]:.0f} % of the squared error)." if where else
             "Without current and speed both measured, a missing voltage and a missing torque look the same.")
-    best = bins.get(name, ())
-    if best and best[0].explained > 0.2:
+    if (best := bins.get(name, ())) and best[0].explained > 0.2:
         what = WORDS[best[0].against]
         share = f"{100 * best[0].explained:.0f} % of the missing {name}"
         return f"{lead} {what[0].upper()}{what[1:]} explains {share}. {region}"
