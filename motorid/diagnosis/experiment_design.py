@@ -93,16 +93,13 @@ def suggest_experiment(fits: Sequence[Fit], *, v_max: float | None = None, i_max
     dt = max(dt, duration / SAMPLES)
     t = np.arange(0.0, duration, dt)
     sigma = {c: s for run in fits[0].problem.runs for c, s in run.sigma.items()}
-
-    def difference(a: Mapping[str, Array], b: Mapping[str, Array]) -> float:
-        return float(np.mean([np.mean(((a[c] - b[c]) / sigma[c]) ** 2) for c in a if c in sigma]))
-
     scores, kept = {}, {}
     for name, (v, what) in candidates(t, v_max).items():
         with contextlib.suppress(MotoridError):
             answers = [planned(f.model, t, v, channels=f.problem.outputs, name=name).outputs for f in fits]
             if not i_max or all(float(np.abs(y.get("i", 0.0)).max()) <= i_max for y in answers):
-                scores[name] = min(difference(a, b) for a, b in combinations(answers, 2))
+                scores[name] = min(float(np.mean([np.mean(((a[c] - b[c]) / sigma[c]) ** 2) for c in a if c in sigma]))
+                                   for a, b in combinations(answers, 2))
                 text = f"{what} (up to {quantity(v_max, runs[0].units['v'], 3)}, {duration:.3g} s)"
                 kept[name] = Suggestion(name, text, Experiment(t, {"v": v}, answers[0], name=name), scores)
     if not scores:
