@@ -90,8 +90,7 @@ def suggest_experiment(fits: Sequence[Fit], *, v_max: float | None = None, i_max
     duration = duration or max(r.duration for r in runs)
     dt = float(np.median([r.dt for r in runs]))
     _check_span(duration, dt)
-    dt = max(dt, duration / SAMPLES)
-    t = np.arange(0.0, duration, dt)
+    t = np.arange(0.0, duration, max(dt, duration / SAMPLES))
     sigma = {c: s for run in fits[0].problem.runs for c, s in run.sigma.items()}
     scores, kept = {}, {}
     for name, (v, what) in candidates(t, v_max).items():
