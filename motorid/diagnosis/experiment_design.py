@@ -384,8 +384,7 @@ def _rivals(found: Any, goal: str | None) -> tuple[list[Rival], str]:
         raise UsageError("an experiment is designed for models: give a diagnosis or at least one fit.")
     as_rival = Rival.as_allowed if goal == "distinguish" else Rival.of
     rivals = [f if isinstance(f, Rival) else as_rival(f) for f in fits[:MOST_RIVALS if goal == "distinguish" else 1]]
-    names = names_apart([r.model for r in rivals])
-    return [replace(r, name=n) for r, n in zip(rivals, names, strict=True)], goal
+    return [replace(r, name=n) for r, n in zip(rivals, names_apart([r.model for r in rivals]), strict=True)], goal
 
 
 def names_apart(models: Sequence[Model]) -> list[str]:
@@ -556,8 +555,7 @@ def _between(task: Task, values: Mapping[str, float], speeds: Sequence[float], b
 
 def _within(task: Task, c: Array, fine: bool = True) -> Found | None:
     """Return the task (of fine steps) and unknowns, shrunk until the limits hold; None where they never do."""
-    kept = _shrunk(task, c)
-    if kept is not None and fine:
+    if (kept := _shrunk(task, c)) is not None and fine:
         task = task.refined(task.layout.of(kept[0]), ROUGH)
         kept = _shrunk(task, kept[0])
     if kept is None:
@@ -601,8 +599,7 @@ def _fixed(task: Task) -> tuple[str, Found]:
 def _safe(task: Task, c: Array) -> tuple[Array, dict[str, float]]:
     """Return the unknowns, shrunk until drawn parameters keep the limits too, and the largest size of each state."""
     rng = np.random.default_rng(0)
-    kept = _shrunk(task, c, [d.rival.draws(DRAWS, rng) for d in task.driven])
-    if kept is None:
+    if (kept := _shrunk(task, c, [d.rival.draws(DRAWS, rng) for d in task.driven])) is None:
         raise FitError(NO_RECORD)
     c, reach = kept
     return c, {"v": float(np.abs(task.layout.of(c)).max()), **{s: max(-a, b) for s, (a, b) in reach.items()}}
