@@ -105,8 +105,7 @@ class Rival:
         unit = max(2 * fit.cost / fit.dof, float(problem.weights == "noise"))
         for values in _grid(unseen, natural_sizes(problem.experiments, fit.values)) if unseen else ():
             trial = problem.for_model(fit.model.start_at(values).fix(*values))
-            end = race([trial], LOOK)
-            if end is not None and end.cost - fit.cost <= 0.5 * unit * REGION**2:
+            if (end := race([trial], LOOK)) is not None and end.cost - fit.cost <= 0.5 * unit * REGION**2:
                 found.append((end.cost, values, trial.scaling.physical(end.q)))
         if not found:
             return Rival.of(fit)
