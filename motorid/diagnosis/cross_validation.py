@@ -48,8 +48,7 @@ class HeldOut:
             # As finely as it was fitted: a tiny noise asks for many sub-steps that change nothing here.
             there = self.validation.for_model(fit.model).tuned(accuracy=fit.problem.accuracy)
             held_out = held_out_errors(there, self.noise)
-        blocks = predictions_left_out(fit)
-        if blocks is None and not held_out:
+        if (blocks := predictions_left_out(fit)) is None and not held_out:
             blocks = self._refitted(fit)
         return Predictions(blocks or {}, held_out)
 
