@@ -124,8 +124,7 @@ def _delay(fit: Fit, samples: float) -> Reading:
 
 def _readings(runs: Sequence[Experiment]) -> Iterator[Reading]:
     """Yield the readings that could make a difference."""
-    moving = [r for r in runs if _changes(r)]
-    if not moving:
+    if not (moving := [r for r in runs if _changes(r)]):
         return
     hold = OTHER[moving[0].hold]
     how = f"is {'linear' if hold == 'linear' else 'constant'} between samples"
