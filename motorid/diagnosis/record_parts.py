@@ -123,8 +123,7 @@ def _telling(run: Experiment, count: int) -> list[int]:
     shown = counted[begins + PART] - counted[begins]
     chosen: list[int] = []
     for _ in range(count):
-        free = [k for k, a in enumerate(begins) if all(abs(a - begins[c]) >= PART for c in chosen)]
-        if not free:
+        if not (free := [k for k, a in enumerate(begins) if all(abs(a - begins[c]) >= PART for c in chosen)]):
             break
         chosen.append(max(free, key=lambda k: float(np.sqrt(shown[[*chosen, k]].sum(axis=0)).sum())))
     return sorted(int(begins[k]) for k in chosen)
