@@ -4,7 +4,6 @@ import contextlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial, reduce
-from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -62,8 +61,7 @@ def raced(fit: Fit, model: Model, starts: Sequence[Mapping[str, float]]) -> Race
     Effects of the angle start along the measured angle, which the model's own angle, still wrong, would lead astray.
     """
     model = _bounded(fit, model)
-    new = (e for e in model.effects if e.name not in fit.model.effect_names)
-    poles = chain.from_iterable(exchanged_poles(model, e) for e in new)
+    poles = [pole for e in model.effects if e.name not in fit.model.effect_names for pole in exchanged_poles(model, e)]
     alive, starts = restored(fit, model), starts or ({},)
     before = [e for e in fit.model.effects if e.name != "encoder_zero"]  # which alone moves nothing
     angular = any(map(uses_angle, model.effects)) and not any(map(uses_angle, before))
