@@ -104,8 +104,7 @@ def _left(last: Fit, remaining: Adequacy, where: str = "") -> str:
     """Say what is left beside what was found."""
     if not remaining.adequate:
         return f"Not everything is explained: {remaining.text.removeprefix('Something is missing: ')}"
-    large = [f"{channel_name(c)} {number(last.misfit[c], 2)} times" for c in far(last)]
-    if large:
+    if large := [f"{channel_name(c)} {number(last.misfit[c], 2)} times" for c in far(last)]:
         what = f"for {remaining.hum}" if remaining.hum else "but nothing tried predicts it"
         return f"What remains is larger than the noise ({', '.join(large)}), {what}."
     return f"What remains is noise{where}. {fine_angle_remark(last)}".rstrip()
@@ -196,13 +195,11 @@ def moves(before: Fit, after: Fit) -> str:
     was, is_ = _certain(before), _certain(after)
     known = [n for n in base if was[n] is not None and is_[n] is not None]
     moved = [n for n in known if abs(after.values[n] / max(before.values[n], 1e-300) - 1) > MOVED]
-    if not moved:
-        return ""
     units = {n: p.unit for n, p in after.problem.model.parameters.items()}
     said = [f"{n} from {with_error(before.values[n], was[n])} to {with_error(after.values[n], is_[n], units[n])}"
             for n in moved]
-    several = len(after.model.effects) > len(before.model.effects) + 1
-    return f"Without {'them' if several else 'it'}, other parameters had compensated: {', '.join(said)}."
+    what = "them" if len(after.model.effects) > len(before.model.effects) + 1 else "it"
+    return f"Without {what}, other parameters had compensated: {', '.join(said)}." if moved else ""
 
 
 def measured_angle_remark(fit: Fit) -> str:
@@ -262,9 +259,7 @@ def hidden_remark(hidden: Mapping[tuple[str, str], tuple[str, ...]]) -> str:
 
 def outliers_remark(fit: Fit) -> str:
     """Say so when a few samples that stand alone make most of a channel's error: they hide the rest."""
-    if fit.problem.loss is not None:
-        return ""
-    for c in fit.problem.outputs:
+    for c in fit.problem.outputs if fit.problem.loss is None else ():
         parts = [s.residual(c) for s in fit.simulations if c in s.experiment.outputs]
         r = np.concatenate([p[np.isfinite(p)] for p in parts])
         kept = np.concatenate([despiked(p) for p in parts])
