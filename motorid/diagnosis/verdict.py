@@ -223,8 +223,7 @@ def unfinished_remark(fit: Fit) -> str:
 
 def held_out_remark(node: Node) -> str:
     """Say so where the held-out runs are predicted far worse than the fitted ones, both as a whole."""
-    parts = "part of" in node.fit.problem.experiments[0].meta
-    fitted = {} if parts else node.predictions.blocks
+    fitted = {} if "part of" in node.fit.problem.experiments[0].meta else node.predictions.blocks
     worse = {c: e.nrmse / max(fitted[c].nrmse, 1e-300) for c, e in node.predictions.held_out.items() if c in fitted}
     said = [f"{c} {number(r, 2)} times" for c, r in worse.items()
             if r > ELSEWHERE and node.predictions.held_out[c].misfit > LARGER]
