@@ -118,8 +118,7 @@ def fit(model: Model, runs: Sequence[Experiment] | Experiment, *, solver: Any = 
     if odd := [p for p in (*penalties, *constraints) if not hasattr(p, "evaluate")]:
         raise UsageError(f"penalties and constraints are like mi.CurrentLimit(8), mi.Constraint(…), not {odd[0]!r}.")
     if formulation == "penalty":
-        penalties += tuple(constraints) or (SteadyState(),)
-        constraints = ()
+        penalties, constraints = penalties + (tuple(constraints) or (SteadyState(),)), ()
     problem = as_problem(model, runs, engine=engine, priors=dict(priors or {}), penalties=penalties, loss=loss,
                          constraints=tuple(constraints), initial=initial,
                          weights=weights or ("rms" if formulation == "penalty" else "noise"))
@@ -209,15 +208,13 @@ def _with_orders(problem: Problem) -> Problem:
     for effect in (*waiting, *(zeros if waiting else ())):  # a zero is seen by what it shifts alone
         present = present.without(effect.name)
     while waiting:
-        smaller = problem.for_model(present).tuned(constraints=())  # an order shows without them
-        if not smaller.unknown:
+        if not (smaller := problem.for_model(present).tuned(constraints=())).unknown:  # an order shows without them
             break
         try:
             fit = _fit(smaller, FINISH)
         except FAILURES:
             break
-        found = strongest_order(fit, waiting)
-        if found is None:
+        if (found := strongest_order(fit, waiting)) is None:
             break
         effect, values = found
         model, present = model.start_at({**fit.values, **values}), (fit.model + effect).start_at(values)
@@ -230,8 +227,7 @@ def minimise(problem: Problem, effort: LevenbergMarquardt, callback: Callback = 
     found = restore_collapsed(by_continuation(problem, effort, callback, wide=wide), effort)
     effort = replace(effort, looks=0)
     for k in range(REWEIGHTINGS):
-        factors = _reweighted(found)
-        if factors is None:
+        if (factors := _reweighted(found)) is None:
             break
         begin = found.problem.start_at(found.values) if k else problem
         again = by_continuation(begin.tuned(noise_factors=factors), effort, callback, wide=wide and k == 0)
