@@ -94,8 +94,7 @@ def _along_measured_angle(problem: Problem, asked: Model) -> Problem:
     if not orders or not all({"theta", "omega"} & set(r.outputs) for r in problem.experiments):
         return problem
     led = _shaped(problem.for_model(problem.model.with_(angle_input=True)), asked)
-    found = race([led], RACE, solve=by_continuation)
-    if found is None:
+    if (found := race([led], RACE, solve=by_continuation)) is None:
         return problem
     other = problem.start_at(found.values)
     if all("theta" in r.outputs for r in problem.experiments):
