@@ -246,8 +246,7 @@ def _inside(triangle: Array, rotated: Array, size: Array, lam: float, low: Array
     while loose.any():
         rest = rotated + triangle[:, ~loose] @ step[~loose]
         step[loose] = _damped(triangle[:, loose], rest, size[loose], lam)
-        out = loose & ((step < low) | (step > high))
-        if not out.any():
+        if not (out := loose & ((step < low) | (step > high))).any():
             break
         step[out] = np.clip(step, low, high)[out]
         loose &= ~out
