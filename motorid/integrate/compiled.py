@@ -66,8 +66,7 @@ def cache_dir() -> Path | None:
 @lru_cache(maxsize=1)
 def compiler() -> tuple[str, str] | None:
     """Return (path, version line) of a C compiler, or None; ``$MOTORID_CC`` names one; ``none``: none."""
-    wanted = os.environ.get("MOTORID_CC")
-    if wanted == "none" or sys.platform == "win32":
+    if (wanted := os.environ.get("MOTORID_CC")) == "none" or sys.platform == "win32":
         return None
     for name in (wanted,) if wanted else ("cc", "gcc", "clang"):
         if path := shutil.which(name):
