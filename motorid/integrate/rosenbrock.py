@@ -76,8 +76,7 @@ class Rosenbrock:
             assert traj.error is not None
             size, error = np.abs(np.ascontiguousarray(traj.x.T)), np.ascontiguousarray(traj.error.T)
             np.maximum.accumulate(size, axis=1, out=size)  # so far; NumPy reduces long rows faster
-            astray = _first_inaccurate(size, error, right)
-            if astray is not None:
+            if (astray := _first_inaccurate(size, error, right)) is not None:
                 traj = traj._replace(x=traj.x[:astray + 2], y=traj.y[:astray + 2])
                 size, error[:, astray + 1:] = size[:, :astray + 2], 0.0
             sizes = np.maximum(np.maximum(size[:, -1], stepper(system).shown_sizes(grid, traj, p)), 1e-12)[:, None]
@@ -103,11 +102,10 @@ class Rosenbrock:
 
 def _first_inaccurate(size: Array, error: Array, begin: int) -> int | None:
     """Return the first interval from `begin` on whose error is as large as the state, if that leaves its size there."""
-    lost = np.flatnonzero((error > LOST_ERROR * np.maximum(size[:, 1:], 1e-12)).any(axis=0))
-    lost = lost[lost >= begin]
+    lost = np.flatnonzero((error[:, begin:] > LOST_ERROR * np.maximum(size[:, begin + 1:], 1e-12)).any(axis=0))
     if not len(lost):
         return None
-    k = int(lost[0])
+    k = begin + int(lost[0])
     before, after = np.maximum(size[:, k], 1e-12), np.maximum(size[:, k + 1], 1e-12)
     jumped = (after > LOST_GROWTH * before) & (before > 1e-12)
     return k if np.any(jumped | (size[:, -1] > LOST_GROWTH * after)) else None
