@@ -367,8 +367,7 @@ def parameter_cell(fit: Fit, name: str) -> Cell:
     if name not in fit.values:
         return "–"
     p = fit.model.parameters[name]
-    if name in fit.per_run:
-        runs = fit.per_run[name]
+    if runs := fit.per_run.get(name):
         if len(runs) == 1:
             return "".join(f"{with_error(**own)} in {run}" for run, own in runs.items())
         values = [own["value"] for own in runs.values()]
