@@ -150,8 +150,7 @@ def _laws(problem: Problem, values: Mapping[str, float]) -> dict[str, tuple[str,
     it; with dry friction alone the no-load speed.
     """
     model, runs, motor = problem.model, problem.experiments, problem.model.base == "dc_motor"
-    volt, linear = runs[0].units["v"], problem.linear
-    speed = "m/s" if linear else "rad/s"
+    volt, speed = runs[0].units["v"], "m/s" if problem.linear else "rad/s"
 
     def gain(p: Mapping[str, float]) -> float:
         return p["K"] / (p["K"] ** 2 + p["R"] * p["b"]) if motor else p["g"] / (p["b"] or np.nan)
