@@ -195,8 +195,7 @@ class Tangent:
         scale = np.where(usable, norms, 1.0)
         c = np.where(usable, c / scale, 0.0)
         signed = [j for j, positive in enumerate(nonnegative) if not positive]
-        a = np.column_stack([c, -c[:, signed]])
-        triangle = np.linalg.qr(np.column_stack([a, -self.residual]), mode="r")
+        triangle = np.linalg.qr(np.column_stack([c, -c[:, signed], -self.residual]), mode="r")
         z, rest = scipy.optimize.nnls(np.asarray(triangle)[:, :-1], np.asarray(triangle)[:, -1])
         coefficients = z[: c.shape[1]].copy()
         coefficients[signed] -= z[c.shape[1] :]
