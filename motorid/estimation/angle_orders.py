@@ -105,8 +105,7 @@ def effects_of_unknown_order(model: Model) -> list[Effect]:
 
 def strongest_order(fit: Fit, effects: Sequence[Effect]) -> tuple[Effect, dict[str, float]] | None:
     """Return which of `effects` has the strongest line in the misfit, with its order, size and phase; None for none."""
-    tangent = Tangent.of(fit)
-    lines = [(e, line) for e in effects for line in likely_lines(tangent, e, 1)]
+    lines = [(e, line) for e in effects for line in likely_lines(Tangent.of(fit), e, 1)]
     best = max(lines, key=lambda pair: pair[1].share, default=None)
     return best and (best[0], best[1].values(best[0].parameters))
 
