@@ -169,9 +169,7 @@ class Mesh:
         """Return, per inner node, its state minus the end of the interval before it; over process `noise`, if given."""
         states = z[self.nq:].reshape(self.n_nodes, self.nx)
         blocks = []
-        for v, traj in zip(self.intervals, walk.intervals, strict=True):
-            if v.next < 0:
-                continue
+        for v, traj in ((v, t) for v, t in zip(self.intervals, walk.intervals, strict=True) if v.next >= 0):
             span = v.grid.t[-1] - v.grid.t[0]
             factor = np.ones(self.nx) if noise is None else self.scale / (noise * np.sqrt(span))
             values = (states[v.next] - traj.x[-1] / self.scale) * factor
