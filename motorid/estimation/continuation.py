@@ -33,8 +33,7 @@ def by_continuation(problem: Problem, effort: LevenbergMarquardt, callback: Call
     restarts at the first width. Raises `FitError` if the model cannot be simulated at the start.
     """
     widths = _widths(problem) if wide and smooths(problem) else (problem.width,)
-    history, last, ends = (), len(widths) - 1, []
-    here = problem
+    here, history, ends, last = problem, (), [], len(widths) - 1
     for k, width in enumerate(widths):
         # What one width likes a narrower one may refuse; then the start is better.
         stage = min((_at(p, width) for p in dict.fromkeys((here, problem))), key=cost_at) if k else _at(here, width)
