@@ -34,8 +34,7 @@ def stribeck(m: Equations, tau_c=P(2e-3, "N·m", null=0.0, lower=0.0, doc="Coulo
              tau_s=P(3e-3, "N·m", null=0.0, lower=0.0, at_least="tau_c", doc="breakaway torque"),
              omega_s=P(5.0, "rad/s", positive=True, grid=(0.01, 0.03, 0.1, 0.3), doc="Stribeck speed")):
     """Friction with breakaway (Stribeck), (tau_c + (tau_s−tau_c)·exp(−(ω/ω_s)²))·sgn ω. Armstrong et al., 1994."""
-    level = tau_c + (tau_s - tau_c) * ca.exp(-((m.omega / omega_s) ** 2))
-    m.torque -= level * m.sign(m.omega)
+    m.torque -= (tau_c + (tau_s - tau_c) * ca.exp(-((m.omega / omega_s) ** 2))) * m.sign(m.omega)
 
 
 @effect(balance="torque", includes=("coulomb", "coulomb_asymmetric", "stribeck"))
