@@ -165,8 +165,8 @@ def _own_starts(fit: Fit, model: Model, starts: Sequence[Mapping[str, float]]) -
 
 def _started(fit: Fit, model: Model, start: Mapping[str, float], angular: bool) -> Problem:
     """Return the problem of a refit, at its start."""
-    names = [n for n in start if n in model.parameters]
-    problem = fit.problem.for_model(_within(model, {n: start[n] for n in names})).tuned(accuracy=ROUGH)
+    own = {n: max(v, 1e-12) if model.parameters[n].positive else v for n, v in start.items() if n in model.parameters}
+    problem = fit.problem.for_model(model.start_at(own)).tuned(accuracy=ROUGH)
     apart = {**{n: v for n, v in start.items() if n not in model.parameters}, **believable_start(fit)}
     problem = problem.begun_at(problem.scaling.scaled([apart.get(p.name, p.value) for p in problem.unknown]))
     return problem.for_model(replace(problem.model, angle_input=True, _systems={})) if angular else problem
@@ -239,16 +239,6 @@ def _converged(problem: Problem, effort: LevenbergMarquardt) -> Estimate:
             break
         problem, effort, history = done.onward, replace(effort, ftol=told), done.history
     return done
-
-
-def _within(model: Model, values: Mapping[str, float]) -> Model:
-    """Return the model started at `values`, kept inside the limits of each parameter."""
-    inside = {}
-    for n, v in values.items():
-        p = model.parameters[n]
-        v = float(np.clip(v, p.lower, p.upper))
-        inside[n] = max(v, 1e-12) if p.positive else v
-    return model.start_at(inside)
 
 
 LITTLE = 1 - (1 - MATERIAL) ** 2  # of the squared misfit; of 361 refits that promised less none was worth it
