@@ -187,12 +187,11 @@ class Design(Printed):
         long = f"This record of {self.t[-1] - self.t[0]:.3g} s"
         if self.goal == "sharpen":
             return f"{long} is expected to sharpen the parameters as below."
-        weak = sorted({tuple(sorted(pair)) for pair, (_, nats) in self.evidence.items() if nats < WORTH})
+        if weak := sorted({tuple(sorted(pair)) for pair, (_, nats) in self.evidence.items() if nats < WORTH}):
+            pairs = "; ".join(" and ".join(pair) for pair in weak)
+            return f"No record of this length within the limits is expected to distinguish {pairs}."
         names = ", ".join(dict.fromkeys(n for pair in self.evidence for n in pair))
-        if not weak:
-            return f"{long} is expected to distinguish {names}."
-        pairs = "; ".join(" and ".join(pair) for pair in weak)
-        return f"No record of this length within the limits is expected to distinguish {pairs}."
+        return f"{long} is expected to distinguish {names}."
 
     def card(self) -> Card:
         """Return what is expected of it, and how to play it."""
