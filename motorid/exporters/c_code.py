@@ -16,6 +16,7 @@ from motorid.exporters import casadi_file
 from motorid.model.model import Model
 from motorid.numerics.signals import Array
 from motorid.problem.problem import Problem
+from motorid.problem.runs import zoh_inputs
 from motorid.problem.simulate import planned
 
 ACCURATE = 1e-3  # of the span of an output, that the exported step may differ from the model
@@ -34,7 +35,7 @@ def c_files(found: Fit | Model, path: Path) -> dict[Path, str]:
              for ending, file in ((".c", "model.c"), (".h", "model.h"), ("_main.c", "main.c"))}
     if isinstance(found, Fit):
         files |= {path.with_name(f"{name}_run{k}.csv"): _record(run.grid, found.problem.system.inputs)
-                  for k, (run, _) in enumerate(casadi_file.runs_of(found))}
+                  for k, (run, *_) in enumerate(casadi_file.runs_of(found.problem, found.q))}
     return files
 
 
@@ -51,7 +52,6 @@ def check(found: Fit | Model) -> Checked:
     """Walk the exported step over the records of a fit (of a model: over a falling square wave), in equal sub-steps,
     twice as many until it agrees with the simulation to `ACCURATE` of the span of each output."""
     functions = {f.name(): f for f in casadi_file.functions_of(found)}
-    p = functions["parameters"]()["p"]
     if isinstance(found, Fit):
         records, what = casadi_file.records_of(found)[:3], "the records of the fit"
     else:
@@ -67,18 +67,18 @@ def check(found: Fit | Model) -> Checked:
             return Checked(1e-3, 1, f"not checked, since the model cannot follow {what}.")
     dt = float(np.median(np.diff(records[0]["t"])))
     for m in (2**k for k in range(11)):
-        error = max(_error(functions, r, m, p) for r in records)
+        error = max(_error(functions, r, m) for r in records)
         if error < ACCURATE:
             break
     return Checked(dt, m, f"with {m} in {dt:.3g} s it differs from the model by at most {error:.2g} of the span, "
                           f"on {what}.")
 
 
-def _error(functions: Mapping[str, ca.Function], record: Mapping[str, Any], m: int, p: ca.DM) -> float:
+def _error(functions: Mapping[str, ca.Function], record: Mapping[str, Any], m: int) -> float:
     """Return the largest difference of an output between `m` sub-steps and those of the record, over its span."""
     n = max(min(len(record["t"]), MOST_STEPS // m), 2)
     t, u, fine = np.array(record["t"][:n]), np.array(record["u"])[:, :n], np.array(record["substeps"][:n - 1])
-    y, told = (np.array(casadi_file.simulation("walk", functions, t, k, record["held"])(record["s"], u, p)[0])
+    y, told = (np.array(casadi_file.simulation("walk", functions, t, k, record["held"])(record["s"], u, record["p"])[0])
                for k in (np.full(n - 1, m), fine))
     span = np.maximum(np.ptp(told, axis=1), 1e-300)
     error = float((np.abs(y - told).max(axis=1) / span).max())
@@ -98,11 +98,12 @@ def _fields(found: Fit | Model, name: str) -> dict[str, Any]:
     for f in functions:
         code.add(f)
     sizes = dict(zip(("NX", "NU", "NP", "NY"), system.sizes, strict=True))
-    starts = [s for _, s in casadi_file.runs_of(found)] if isinstance(found, Fit) else []
+    own = [own for _, *own in casadi_file.runs_of(found.problem, found.q)] if isinstance(found, Fit) else []
     hold = found.problem.experiments[0].hold if isinstance(found, Fit) else "zoh"
-    held = casadi_file.zoh_inputs(system.inputs, hold)
-    rows = ",\n".join("  {" + ", ".join(map(repr, s.tolist())) + "}" for s in starts)
-    runs = f"#define {name.upper()}_RUNS {len(starts)}\n" if starts else ""
+    held = zoh_inputs(system.inputs, hold)
+    starts, parameters = (",\n".join("  {" + ", ".join(map(repr, run[j].tolist())) + "}" for run in own)
+                          for j in (0, 1))
+    runs, size = f"#define {name.upper()}_RUNS {len(own)}\n" if own else "", f"[{len(own)}][{name.upper()}_NP]"
     checked = check(found)  # names of runs come from files: none may end a comment or continue a line
     harmless = (re.sub(r"[*/\\?]{2,}", "_", printable(" ".join(line.split()))).rstrip("\\") for line in about)
     return {
@@ -113,9 +114,12 @@ def _fields(found: Fit | Model, name: str) -> dict[str, Any]:
         "states": _strings(system.states), "inputs": _strings(system.inputs), "outputs": _strings(system.outputs),
         "parameter_names": _strings(system.parameters), "held": ", ".join(str(int(h)) for h in held),
         "parameters": ",\n  ".join(f"{v!r}" for v in casadi_file.values_of(found, system).tolist()),
-        "starts_declared": f"{runs}extern const double {name}_starts[{len(starts)}][3];"
-                           " /* (current, speed, angle) at the start of the records of the fit */\n" if starts else "",
-        "starts": f"const double {name}_starts[{len(starts)}][3] = {{\n{rows}\n}};\n" if starts else "",
+        "starts_declared": f"{runs}extern const double {name}_starts[{len(own)}][3];"
+                           " /* (current, speed, angle) at the start of the records of the fit */\n"
+                           f"extern const double {name}_run_parameters{size};\n" if own else "",
+        "starts": f"const double {name}_starts[{len(own)}][3] = {{\n{starts}\n}};\n"
+                  f"const double {name}_run_parameters{size} = {{\n{parameters}\n}};\n"
+                  if own else "",
         **{size: max(least, *(getattr(f, size)() for f in functions))
            for size, least in (("sz_arg", 1), ("sz_res", 2), ("sz_iw", 1), ("sz_w", 1))}}
 

@@ -22,7 +22,7 @@ from motorid.model.model import SHOWN, Model
 from motorid.numerics.signals import Array
 from motorid.problem.plain_data import model_dict
 from motorid.problem.problem import Problem
-from motorid.problem.runs import Run
+from motorid.problem.runs import Run, zoh_inputs
 from motorid.records.experiment import Experiment
 from motorid.records.files import package_version
 
@@ -86,7 +86,7 @@ def functions_of(found: Fit | Model) -> list[ca.Function]:
 
     ``rhs(x, u, p)``, ``outputs(x, u, p)``, ``initial(s, p)`` with s = (i, omega, theta) at the start,
     ``step(x, u0, u1, h, p)`` (the input runs from u0 to u1 over h), ``parameters()``; of a fit also, per record,
-    ``record_k()`` (t, s, u) and ``simulate_k(s, u, p)`` with the very steps of the fit. Columns are samples.
+    ``record_k()`` (t, s, u, p) and ``simulate_k(s, u, p)`` with the very steps of the fit. Columns are samples.
     """
     system = system_of(found)
     functions = [*plain_functions(system), ca.Function("parameters", [], [ca.DM(values_of(found, system))], [], ["p"])]
@@ -134,14 +134,13 @@ def read_casadi(data: bytes) -> tuple[dict[str, ca.Function], dict[str, Any]]:
 
 
 def records_of(found: Fit | Model | Problem) -> list[dict[str, Any]]:
-    """Return the records of a fit or problem as plain data: samples, start, inputs (nu, N), sub-steps."""
+    """Return the records of a fit or problem as plain data: samples, start, inputs (nu, N), sub-steps, parameters."""
     if isinstance(found, Model):
         return []
-    runs, system = ((runs_of(found), found.problem.system) if isinstance(found, Fit) else
-                    ([(r, r.start) for r in found.runs], found.system))
-    return [{"t": run.grid.t.tolist(), "s": start.tolist(), "u": run.grid.u.T.tolist(),
-             "substeps": run.grid.substeps.tolist(), "held": zoh_inputs(system.inputs, run.experiment.hold)}
-            for run, start in runs[:MOST_RUNS]]
+    problem, q = (found.problem, found.q) if isinstance(found, Fit) else (found, found.start)
+    return [{"t": run.grid.t.tolist(), "s": start.tolist(), "p": p.tolist(), "u": run.grid.u.T.tolist(),
+             "substeps": run.grid.substeps.tolist(), "held": zoh_inputs(problem.system.inputs, run.experiment.hold)}
+            for run, start, p in runs_of(problem, q)[:MOST_RUNS]]
 
 
 def _instructions(f: ca.Function) -> dict[str, Any]:
@@ -189,19 +188,21 @@ def _simulations(functions: Mapping[str, ca.Function], records: Sequence[Mapping
         t, u, m = np.array(r["t"], float), np.array(r["u"], float), np.array(r["substeps"], np.int64)
         if m.min() < 1 or m.sum() > MOST_SCALARS or (len(t), len(m)) != (u.shape[1], len(t) - 1):
             raise ValueError(f"record {k}")
-        found += [ca.Function(f"record_{k}", [], [ca.DM(t).T, ca.DM(r["s"]), ca.DM(u)], [], ["t", "s", "u"]),
+        p = ca.DM(r["p"]) if "p" in r else functions["parameters"]()["p"]
+        found += [ca.Function(f"record_{k}", [], [ca.DM(t).T, ca.DM(r["s"]), ca.DM(u), p], [], ["t", "s", "u", "p"]),
                   simulation(f"simulate_{k}", functions, t, m, r["held"])]
     return found
 
 
-def runs_of(fit: Fit) -> list[tuple[Run, Array]]:
-    """Return the records with the steps of the fit, and (i, omega, theta) at their start, (3,)."""
-    problem: Problem = fit.problem
+def runs_of(problem: Problem, q: Array) -> list[tuple[Run, Array, Array]]:
+    """Return the records with the steps of a fit, (i, omega, theta) at their start, (3,), and their parameters."""
     if getattr(problem.integrator, "name", "") != "rosenbrock":
         # Another engine chose its own steps: take those that suit ours.
-        problem = replace(problem, engine="rosenbrock").refined(fit.q)
-    return [(run, np.array([fit.initial.get(f"{c}_0[{k}]", s) for c, s in zip(CHANNELS, run.start, strict=True)]))
-            for k, run in enumerate(problem.runs)]
+        problem = replace(problem, engine="rosenbrock").refined(q)
+    point = problem.unknowns.point(q)
+    known = dict(zip([p.name for p in problem.unknown], point.physical.tolist(), strict=True))
+    return [(run, np.array([known.get(f"{c}_0[{k}]", s) for c, s in zip(CHANNELS, run.start, strict=True)]),
+             problem.unknowns.of_run(point, k).p) for k, run in enumerate(problem.runs)]
 
 
 def simulation(name: str, functions: Mapping[str, ca.Function], t: Array, m: NDArray[np.int64],
@@ -224,11 +225,6 @@ def simulation(name: str, functions: Mapping[str, ca.Function], t: Array, m: NDA
     x = ca.horzcat(x0, walked[:, (first[1:] - 1).tolist()])
     y = outputs.map(len(t))(x, u, ca.repmat(p, 1, len(t)))
     return ca.Function(name, [s, u, p], [y, x], ["s", "u", "p"], ["y", "x"])
-
-
-def zoh_inputs(inputs: Sequence[str], hold: str) -> list[bool]:
-    """Tell which inputs stay constant between samples."""
-    return [hold == "zoh" and n != "theta_in" for n in inputs]
 
 
 def words(contents: Mapping[str, Any]) -> list[str]:

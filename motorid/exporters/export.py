@@ -69,7 +69,7 @@ class Exported:
             raise UsageError(f"no simulation of record {k} in this file; it has {', '.join(known) or 'none'}.")
         record = self.functions[f"record_{k}"]()
         drive = record["u"] if u is None else np.asarray(u, float).reshape(-1, record["u"].shape[0]).T
-        found = self.functions[f"simulate_{k}"](s=record["s"], u=drive, p=self.functions["parameters"]()["p"])
+        found = self.functions[f"simulate_{k}"](s=record["s"], u=drive, p=record["p"])
         return np.asarray(found["y"]).T
 
 
@@ -107,8 +107,8 @@ def export(found: Fit | Model | Exported, path: str | os.PathLike[str], to: str 
     >>> import casadi
     >>> file = casadi.FileDeserializer("motor.casadi")
     >>> functions = {f.name(): f for f in file.unpack()}
-    >>> record, p = functions["record_0"](), functions["parameters"]()["p"]
-    >>> y = functions["simulate_0"](s=record["s"], u=record["u"], p=p)["y"]  # (channels, samples)
+    >>> record = functions["record_0"]()
+    >>> y = functions["simulate_0"](s=record["s"], u=record["u"], p=record["p"])["y"]  # (channels, samples)
     """
     target = Path(os.path.expanduser(path))
     form = to or FORMS.get(target.suffix.lower())

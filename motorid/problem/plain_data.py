@@ -124,7 +124,8 @@ def model_from_json(contents: Mapping[str, Any], effects: Iterable[Effect] = ())
               if "lower" in p or "upper" in p}
     fixed = {n: values[n] for n in fixed_names}  # first: what is fixed may be zero, what is free may not
     free = {n: v for n, v in values.items() if n not in fixed}
-    return model.fix(**fixed).replace(**free).bounded(**limits).free(*free)
+    shared = {n: v for n, v in free.items() if not model.parameters[n].per_run}  # others are of the first run alone
+    return model.fix(**fixed).replace(**shared).bounded(**limits).start_at(free).free(*free)
 
 
 def _assembled(head: Mapping[str, Any], effects: Iterable[Effect],

@@ -66,8 +66,12 @@ def _grid(run: Experiment, inputs: Sequence[str]) -> Grid:
                              "Name its column with columns, or leave the effect out.")
     columns = [angle_signal(run) if n == "theta_in" else time_since(run, n) if n in COMPUTED_INPUTS else run.inputs[n]
                for n in inputs]
-    held = np.array([n in COMPUTED_INPUTS or (n == "v" and run.hold == "zoh") for n in inputs])
-    return Grid.of(run.t, np.column_stack(columns), held)
+    return Grid.of(run.t, np.column_stack(columns), np.array(zoh_inputs(inputs, run.hold)))
+
+
+def zoh_inputs(inputs: Sequence[str], hold: str) -> list[bool]:
+    """Tell which inputs stay constant between samples: what is measured goes on, and so may the voltage."""
+    return [n in COMPUTED_INPUTS or (n == "v" and hold == "zoh") for n in inputs]
 
 
 def time_since(run: Experiment, name: str) -> Array:

@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import sys
 
+import casadi as ca
 import numpy as np
 import pytest
 
@@ -117,6 +118,66 @@ def test_what_travels_along_is_complete(fit, tmp_path):
     assert file.info == info
     assert file.values == fit.model.values
     assert file.model.values == fit.model.values
+
+
+@pytest.fixture(scope="module")
+def per_run():
+    """A fit of three runs whose supplies differ, and a check with another."""
+    t, rng, motor = np.arange(400) * 1e-3, np.random.default_rng(3), mi.dc_motor(R=1.2, L=1e-3, K=0.05, b=2e-5, J=5e-5)
+    runs = []
+    for k, gain in enumerate((1.0, 1.1, 0.9, 1.15)):
+        v = np.repeat(rng.uniform(-6, 6, 8), 50)
+        shown = mi.planned(motor, t, gain * v).outputs
+        runs.append(mi.Experiment(t, {"v": v}, {"i": shown["i"] + 0.02 * rng.normal(size=400),
+                                                "omega": shown["omega"] + 0.3 * rng.normal(size=400)}, name=f"r{k}"))
+    return mi.fit(mi.dc_motor() + mi.effects.supply_per_run, runs[:3]), runs[3]
+
+
+def test_an_export_simulates_every_run_with_its_own_parameters(per_run, tmp_path):
+    fit, _ = per_run
+    found = load(export(fit, tmp_path / "motor.casadi"))
+    for k, s in enumerate(fit.simulations):
+        assert found.simulate(k) == pytest.approx(np.column_stack([s.outputs[c] for c in ("i", "omega")]), abs=1e-9)
+
+
+@pytest.mark.skipif(COMPILER is None, reason="needs a C compiler")
+def test_a_c_program_walks_every_run_with_its_own_parameters(per_run, tmp_path):
+    fit, _ = per_run
+    export(fit, tmp_path / "motor", to="c")
+    subprocess.run([COMPILER, "-O1", "motor_main.c", "motor.c", "-lm", "-o", "motor"], cwd=tmp_path, check=True)
+    for k, s in enumerate(fit.simulations):
+        out = subprocess.run(["./motor", f"motor_run{k}.csv", str(k)], cwd=tmp_path, check=True, capture_output=True)
+        rows = np.array([[float(x) for x in line.split(",")] for line in out.stdout.decode().splitlines()[1:]])
+        assert rows[:, 2] == pytest.approx(s.outputs["omega"], abs=1e-6 * np.abs(s.outputs["omega"]).max())
+
+
+@pytest.mark.parametrize("name", ["motor.json", "motor.casadi"])
+def test_a_model_read_back_is_judged_on_other_runs_as_the_fit_is(name, per_run, tmp_path):
+    """What each run has for itself is what that run says."""
+    fit, check = per_run
+    again = load(export(fit, tmp_path / name))
+    assert mi.evaluate(again if isinstance(again, mi.Model) else again.model, check).nrmse == pytest.approx(
+        mi.evaluate(fit, check).nrmse, rel=1e-3)
+
+
+@mi.effect(balance="torque")
+def rubbing_soon(m, tau=mi.P(5e-3, "N·m", null=0.0)):
+    """A friction that fades after each change of the voltage."""
+    m.torque -= tau * m.sign(m.omega) * ca.exp(-m.input("since_change") / 0.05)
+
+
+@pytest.mark.parametrize("hold", ["zoh", "linear"])
+def test_between_samples_an_export_goes_on_as_the_fit_does(hold, tmp_path):
+    """What was measured beside the voltage goes on, and so may that; times since a change do not."""
+    t = np.arange(200) * 5e-3
+    inputs = {"v": np.where((4 * t).astype(int) % 2, 0.0, 6.0), "tau_load": 0.05 * np.sin(60 * t)}
+    blank = mi.Experiment(t, inputs, {"i": 0 * t, "omega": 0 * t}, hold=hold)
+    model = mi.dc_motor(R=1.3, L=2e-3, K=0.05, b=2e-5, J=3e-5) + mi.effects.measured_load + rubbing_soon
+    shown = mi.simulate(model, blank, initial="rest")[0].outputs
+    fit = mi.fit(model, blank.with_(outputs=shown, sigma={"i": 0.01, "omega": 0.3}))
+    again = load(export(fit, tmp_path / "motor.casadi")).simulate(0)
+    wanted = np.column_stack([fit.simulations[0].outputs[c] for c in ("i", "omega")])
+    assert again == pytest.approx(wanted, abs=1e-9 * np.abs(wanted).max())
 
 
 def test_exported_step_follows_other_inputs(tmp_path):
