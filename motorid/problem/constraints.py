@@ -111,15 +111,17 @@ class SteadyState(Relation):
         """Return the steady parts of the records of `problem`: found in the data, or those given by `at`."""
         if self.at is None:
             return find_segments(problem.experiments, [run.sigma for run in problem.runs])
-        found = []
+        found, firsts = [], problem.unknowns.firsts
+        records = sorted(set(firsts))  # of which a window, or what lies between pauses, is a part
         for k, begin, end in self.at:
-            if not 0 <= k < len(problem.experiments):
+            if not 0 <= k < len(records):
                 raise UsageError(f"SteadyState(at=…): there is no run {k}; runs are counted from 0 to "
-                                 f"{len(problem.experiments) - 1}.")
-            segment = segment_between(k, problem.experiments[k], begin, end)
-            if segment is None:
+                                 f"{len(records) - 1}.")
+            parts = [segment_between(j, problem.experiments[j], begin, end)
+                     for j, first in enumerate(firsts) if first == records[k]]
+            if not any(parts):
                 raise UsageError(f"SteadyState(at=…): run {k} has no samples between {begin:g} and {end:g} s.")
-            found.append(segment)
+            found += filter(None, parts)
         return tuple(found)
 
     def _parts(self, problem: Any) -> tuple[Part, ...]:

@@ -92,9 +92,9 @@ class Relation(ABC):
     def evaluate(self, problem: Any, q: Array, trajs: Sequence[Trajectory]) -> tuple[Array, Array | None]:
         """Return the residual (n,) as a penalty and its Jacobian (n, nq), None if the trajectories have none."""
         rs, jacs = [np.zeros(0)], [np.zeros((0, len(q)))]
-        derivatives, at = all(t.dx is not None for t in trajs), problem.unknowns.point(q)
+        derivatives, point = all(t.dx is not None for t in trajs), problem.unknowns.point(q)
         for part in self.parts(problem):
-            t, s = trajs[part.run], part.samples
+            t, s, at = trajs[part.run], part.samples, problem.unknowns.of_run(point, part.run)
             c, jac = part.rows(t.x[s], at.p, t.dx[s] if derivatives and t.dx is not None else None, at.dp)
             r, slope = self.penalty(c, part)
             rs.append(r)

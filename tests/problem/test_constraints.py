@@ -7,6 +7,7 @@ import pytest
 
 import motorid as mi
 from motorid.errors import ModelError, UsageError
+from motorid.estimation.shooting.outcome import violations
 from motorid.problem.constraints import Constraint, CurrentLimit, SteadyState
 from motorid.problem.problem import as_problem
 
@@ -49,6 +50,27 @@ def test_derivatives_of_penalties_are_exact(noisy, relation, effects):
                                    for e in np.eye(len(q))])
     assert np.abs(r).max() > 0  # it has something to say here
     assert np.abs(jac - differences).max() <= 1e-5 * max(np.abs(differences).max(), 1.0)
+
+
+def test_what_a_run_has_for_itself_counts_in_relations(noisy):
+    """The second run's supply gave a sixth more than was recorded."""
+    runs = [noisy[0], noisy[1].with_(inputs={"v": noisy[1].inputs["v"] / 1.15})]
+    plain, penalty = (mi.fit(mi.dc_motor() + mi.effects.supply_per_run, runs, **asked) for asked in (
+        {}, {"formulation": "penalty", "constraints": [SteadyState()]}))
+    for fit in (plain, penalty):
+        assert fit.per_run["g_v"][runs[1].name]["value"] == pytest.approx(0.15, abs=0.01)
+        assert violations(fit.problem, fit.q, [SteadyState()])["SteadyState(), V"] < 0.05
+    assert penalty.nrmse["omega"] == pytest.approx(plain.nrmse["omega"], rel=0.05)
+
+
+def test_named_steady_parts_are_those_of_the_record_whatever_it_is_cut_into(noisy):
+    end = noisy[1].t[-1]
+    for window in (None, end / 2, end / 4):
+        fit = mi.fit(mi.dc_motor(), noisy, formulation="penalty", window=window,
+                     constraints=[SteadyState(at=[(1, 0.8 * end, 0.95 * end)])])
+        found = fit.problem.penalties[0].segments(fit.problem)
+        assert {fit.problem.experiments[s.run].name.split("[")[0] for s in found} == {noisy[1].name}
+        assert [s.v for s in found] == pytest.approx([8.0] * len(found), rel=0.01)
 
 
 def test_steady_parts_are_found_where_nothing_moves_any_more(noisy):

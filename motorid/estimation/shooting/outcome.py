@@ -182,12 +182,12 @@ def rows_at(problem: Problem, q: Array, relations: Sequence[Any] | None = None, 
     `relations` are the problem's constraints unless given; without `derivatives` there are no columns. SimulationError
     if the model cannot be simulated there.
     """
-    at = problem.unknowns.point(q)
+    point = problem.unknowns.point(q)
     trajs = [problem.simulate(q, k, derivatives=derivatives) for k in range(len(problem.runs))]
     found = []
     for c in problem.constraints if relations is None else relations:
         for part in c.parts(problem):
-            x, dx = trajs[part.run].x, trajs[part.run].dx
+            x, dx, at = trajs[part.run].x, trajs[part.run].dx, problem.unknowns.of_run(point, part.run)
             rows = part.rows(x[part.samples], at.p, None if dx is None else dx[part.samples], at.dp)
             found.append((c.name, part, *rows))
     return found
