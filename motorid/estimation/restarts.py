@@ -91,7 +91,7 @@ def restore_collapsed(found: Estimate, effort: LevenbergMarquardt) -> Estimate:
     """
     sd, influence = _deviation(found.problem, found.solution.residual), np.linalg.norm(found.solution.jac, axis=0)
     values = found.values
-    parameters = [replace(p, value=values[p.name]) for p in found.problem.model.parameters.values() if p.vary]
+    parameters = [p for p in found.problem.model.start_at(values).parameters.values() if p.vary]  # inside their limits
     named = dict(zip((p.name for p in found.problem.unknown), influence, strict=True))
     back = {n: v for n, v in restored_values(parameters, named, sd).items() if v != values[n]}
     each = [{n: v} for n, v in back.items()][:MOST] if len(back) > 1 else []

@@ -51,6 +51,8 @@ class Problem:
         Local error of the integration relative to the largest state; by default a small part of the noise.
     width : float, optional
         Width of sgn, rad/s, in place of the model's or the one that suits the records (continuation).
+    first_stands : bool
+        The first run has no parameters of its own, whatever else is free (where one is fixed for its profile).
 
     Examples
     --------
@@ -70,6 +72,7 @@ class Problem:
     noise_factors: Mapping[str, float] = field(default_factory=dict)
     accuracy: float | None = None
     width: float | None = None
+    first_stands: bool = False
     _runs: tuple[Run, ...] | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
@@ -85,6 +88,8 @@ class Problem:
         object.__setattr__(self, "experiments", tuple(_with_only(r, self.outputs) for r in self.experiments))
         for name in self.priors:
             among(name, self.model.parameters, "parameter", where="prior: ")
+            if self.model.parameters[name].per_run and self.model.parameters[name].vary:
+                raise UsageError(f"'{name}' is another in every run, and takes no prior; fix it, or leave that out.")
             if not (np.isfinite(self.priors[name]).all() and self.priors[name][1] > 0):
                 raise UsageError(f"the prior of '{name}' takes (mean, std), finite, std above zero; got "
                                  f"{self.priors[name]}.")
@@ -124,7 +129,7 @@ class Problem:
     @cached_property
     def unknowns(self) -> Unknowns:
         """The unknowns and how they enter the system."""
-        return Unknowns(self.system, self.model.parameters, self.runs)
+        return Unknowns(self.system, self.model.parameters, self.runs, self.first_stands)
 
     @property
     def unknown(self) -> tuple[Parameter, ...]:

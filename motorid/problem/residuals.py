@@ -43,7 +43,7 @@ class Measured(NamedTuple):
             size = noise * [factors.get(c, 1.0) for c in outputs]
         else:
             squares = [float(np.nanmean(out[c] ** 2)) if c in out else np.inf for c in outputs]
-            size = np.sqrt(np.maximum(squares, 1e-300))
+            size = np.maximum(np.sqrt(squares), noise)  # of a stuck motor's speed
         finite = np.isfinite(y)
         index = None if finite.all() else np.flatnonzero(finite.ravel())
         return Measured(y, 1.0 / size, index, noise, run.experiment.name)

@@ -35,6 +35,7 @@ class Unknowns:
     system: System
     parameters: Mapping[str, Parameter]  # all of the model, fixed ones too
     runs: tuple[Run, ...]
+    first_stands: bool = False  # the first run's own parameters are none, whatever else is free
 
     @cached_property
     def free(self) -> tuple[Parameter, ...]:
@@ -50,7 +51,7 @@ class Unknowns:
         """
         own = [p for p in self.parameters.values() if p.vary and p.per_run]
         return tuple((p.name, k, replace(p, name=f"{p.name}[{k}]", value=self.runs[k].apart.get(p.name, p.value)))
-                     for p in own for k in sorted(set(self.firsts))[1 if self.free else 0:])
+                     for p in own for k in sorted(set(self.firsts))[1 if self.free or self.first_stands else 0:])
 
     @cached_property
     def firsts(self) -> tuple[int, ...]:

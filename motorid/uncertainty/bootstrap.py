@@ -29,6 +29,7 @@ KINDS = ("blocks", "parametric", "runs")
 CORRELATIONS = 8
 FEWEST_RUNS = 4  # resampled as wholes: fewer make too few different samples
 SOLVER = LevenbergMarquardt(max_iterations=60, ftol=1e-7, xtol=1e-7)  # from the fit, next to the optimum
+EXACTLY = replace(SOLVER, ftol=1e-10)  # what priors say is a small part of the cost
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -149,6 +150,9 @@ def bootstrap(fit: Fit, *, kind: str = "blocks", n: int = 200, block: int | None
     if kind == "runs" and len(fit.problem.experiments) < FEWEST_RUNS:
         raise UsageError(f"resampling runs needs at least {FEWEST_RUNS} of them; this fit has {len(fit.problem.runs)}. "
                          "Use kind='blocks', or cut runs with motorid.records.experiment.split.")
+    if kind == "runs" and fit.problem.unknowns.apart:
+        raise UsageError("resampling runs knows no parameters per run, which say how each differs from the first. Use "
+                         "kind='blocks'.")
     source = _source(fit, kind, block)
     seeds = np.random.SeedSequence(seed).spawn(n)
     found, interrupted = map_items(_refit, source, seeds, map, "Refitting resampled records", quiet=quiet)
@@ -176,10 +180,16 @@ def _source(fit: Fit, kind: str, block: int | None) -> _Source:
         colours[c] = colour_of(parts, spent)
         count = sum(int(np.isfinite(p).sum()) for p in parts)
         scale[c] = np.sqrt(count / max(count - spent, 1.0))
-    residuals = tuple({c: scale[c] * (e - np.nanmean(e)) for c, e in r.items()} for r in residuals)
+    residuals = tuple({c: scale[c] * _filled(e - np.nanmean(e)) for c, e in r.items()} for r in residuals)
     at_fit = problem.for_model(problem.model.start_at(fit.values))
     block = min(block or _block_length(colours, residuals), max(s.experiment.n for s in fit.simulations))
     return _Source(at_fit, tuple(dict(s.outputs) for s in fit.simulations), residuals, colours, kind, block)
+
+
+def _filled(e: Array) -> Array:
+    """Return residuals with those that are missing as the nearest one: a block may come to where they were measured."""
+    known = np.flatnonzero(np.isfinite(e))
+    return e[known[np.interp(np.arange(len(e)), known, np.arange(len(known))).round().astype(int)]]
 
 
 def _block_length(colours: Mapping[str, Colour], residuals: Sequence[Mapping[str, Array]]) -> int:
@@ -197,7 +207,9 @@ def _refit(source: _Source, seed: np.random.SeedSequence) -> dict[str, float] | 
                             _runs=tuple(problem.runs[k] for k in drawn))
         else:
             again = problem.with_(experiments=tuple(_resampled(source, k, rng) for k in range(len(problem.runs))))
-        return least_squares(again, SOLVER).values
+        if problem.priors:  # what they know is an observation, too
+            again = again.tuned(priors={n: (rng.normal(mean, std), std) for n, (mean, std) in problem.priors.items()})
+        return least_squares(again, EXACTLY if problem.priors else SOLVER).values
     except (MotoridError, np.linalg.LinAlgError) as error:
         return Failure(problem.model.values, "failed", str(error))
 
@@ -220,5 +232,4 @@ def _blocks(source: _Source, k: int, rng: np.random.Generator) -> dict[str, Arra
         donor = donors[rng.integers(len(donors))]
         size = donor.shape[1]
         pieces.append(donor[:, (rng.integers(size) + np.arange(source.block)) % size])
-    joined = np.concatenate(pieces, axis=1)[:, :n]
-    return dict(zip(here, np.where(np.isfinite(joined), joined, 0.0), strict=True))
+    return dict(zip(here, np.concatenate(pieces, axis=1)[:, :n], strict=True))

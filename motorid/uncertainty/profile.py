@@ -180,7 +180,7 @@ def _side(reference: tuple[Problem, dict[str, float], float],
     while len(points) < MOST and abs(at - q0) < farthest:
         at = float(np.clip(at + side * step, low, high))
         p = float(scale.scale[j] * np.exp(at) if scale.log[j] else scale.scale[j] * at)
-        here = problem.for_model(problem.model.start_at(values).fix(**{name: p}))
+        here = problem.for_model(problem.model.start_at(values).fix(**{name: p})).tuned(first_stands=True)
         try:
             found = least_squares(here, SOLVER)
         except (MotoridError, np.linalg.LinAlgError):

@@ -172,6 +172,26 @@ def test_limits_are_kept_and_a_value_at_its_limit_has_no_uncertainty(runs):
         assert fit.values[n] == pytest.approx(held.values[n], rel=1e-4)
 
 
+def test_a_value_that_rounds_to_beyond_its_limit_stays_inside(runs):
+    """The logarithms in which a fit moves do not give every number back."""
+    for limit in np.linspace(0.02, 0.045, 40):
+        assert mi.fit(mi.dc_motor(K=0.9 * limit).bounded(K=(1e-3, limit)), runs).model.parameters["K"].value <= limit
+
+
+def test_a_channel_that_is_zero_in_one_run_weighs_no_more_than_its_noise(runs):
+    """The speed of a motor that a small voltage does not move."""
+    stuck = runs[0].with_(inputs={"v": np.full(runs[0].n, 0.1)}, outputs={"i": 0.07 + 0 * runs[0].t,
+                                                                        "omega": 0 * runs[0].t})
+    model = mi.dc_motor() + mi.effects.coulomb
+    by_noise, by_rms = (mi.fit(model, [*runs, stuck], weights=w, window=None) for w in ("noise", "rms"))
+    assert by_rms.values["K"] == pytest.approx(by_noise.values["K"], rel=0.02)
+
+
+def test_a_prior_on_what_is_another_in_every_run_is_refused(runs):
+    with pytest.raises(UsageError, match="'g_v' is another in every run"):
+        mi.fit(mi.dc_motor() + mi.effects.supply_per_run, runs, priors={"g_v": (0.5, 0.1)})
+
+
 def test_a_prior_pulls_as_its_width_says(runs):
     plain = mi.fit(mi.dc_motor(), runs)
     std = plain.std["R"]

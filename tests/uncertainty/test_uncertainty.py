@@ -246,7 +246,44 @@ def test_interrupted_bootstrap_keeps_what_is_done(fit):
     assert "Interrupted after 25 of 320" in str(refits)
 
 
+def test_bootstrap_knows_that_a_prior_is_not_certain(speed_only):
+    priors = {"R": (MOTOR["R"], 0.1), "L": (MOTOR["L"], 1e-4), "K": (MOTOR["K"], 2e-3)}
+    held = mi.fit(mi.dc_motor(), speed_only.problem.experiments, priors=priors)
+    found = bootstrap(held, n=60, quiet=True)
+    for name in ("R", "K"):
+        assert 0.6 < found.std[name] / held.std[name] < 1.5
+
+
+def test_bootstrap_of_a_slower_sensor_agrees_with_the_covariance(runs):
+    slower = [r.with_(outputs={**r.outputs, "omega": np.where(np.arange(r.n) % 10, np.nan, r.outputs["omega"])})
+              for r in runs]
+    fit = mi.fit(mi.dc_motor(), slower)
+    found = bootstrap(fit, n=60, quiet=True)
+    for name in ("K", "b", "J"):
+        assert 0.75 < found.std[name] / fit.std[name] < 1.35
+
+
+def per_run():
+    """Three runs of a commanded axis whose supplies differ."""
+    rng, t, axis = np.random.default_rng(4), np.arange(600) * 1e-3, mi.torque_driven(g=0.05, b=1e-4, J=5e-5)
+    runs = []
+    for k, gain in enumerate((1.0, 1.1, 0.9, 1.05)):
+        v = np.repeat(rng.uniform(-1, 1, 12), 50)
+        omega = mi.planned(axis, t, v * gain, channels=("omega",)).outputs["omega"]
+        runs.append(mi.Experiment(t, {"v": v}, {"omega": omega + 0.3 * rng.normal(size=600)}, name=f"r{k}"))
+    return axis, runs
+
+
+def test_where_a_profile_fixes_what_all_runs_share_the_first_run_s_own_value_stands():
+    axis, runs = per_run()
+    fit = mi.fit(axis.fix("b", "J").free("g") + mi.effects.supply_per_run, runs)
+    assert profile(fit, "g", quiet=True).interval() == pytest.approx(covariance(fit).interval("g"), rel=1e-3)
+
+
 def test_bootstrap_says_what_it_cannot_do(fit):
+    axis, runs = per_run()
+    with pytest.raises(UsageError, match="parameters per run"):
+        bootstrap(mi.fit(axis + mi.effects.supply_per_run, runs), kind="runs")
     with pytest.raises(UsageError, match="at least 4"):
         bootstrap(fit, kind="runs")
     with pytest.raises(UsageError, match="Did you mean 'blocks'"):
