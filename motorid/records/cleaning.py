@@ -7,6 +7,7 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from motorid.channels import MEASURED_INPUTS
 from motorid.display.numbers import counted
 from motorid.errors import DataError
 from motorid.numerics.signals import Array, repeats
@@ -34,8 +35,9 @@ def run_from_columns(columns: Mapping[str, Array], texts: Texts, layout: Layout,
     first = _first_input(values["v"][rows], places["v"].column, said)
     rows, t = rows[first:], t[first:]
     values = {c: a[rows] for c, a in values.items()}
-    inputs = {c: _filled_forward(values.pop(c), places[c].column, said) for c in INPUTS if c in values
-              if c == "v" or _has_values(c, values[c], places[c].column, [])}
+    empty = [c for c in MEASURED_INPUTS if c in values and np.isnan(values[c]).all()]
+    said += [f"left out '{places[c].column}' ({c}): every sample is missing." for c in empty]
+    inputs = {c: _filled_forward(values[c], places[c].column, said) for c in INPUTS if c in values and c not in empty}
     values = {c: a for c, a in values.items() if c not in INPUTS}
     outputs = {c: a for c, a in values.items() if _has_values(c, a, places[c].column, said)}
     if not outputs:

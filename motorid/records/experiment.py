@@ -150,8 +150,8 @@ class Experiment(Shown):
     def decimate(self, k: int) -> Experiment:
         """Return every k-th sample.
 
-        Outputs are picked, not filtered: a filter would add a lag that looks like physics. A held input is
-        averaged over each longer step, which keeps its integral; a linear one is picked.
+        Outputs are picked, not filtered: a filter would add a lag that looks like physics. A held voltage is
+        averaged over each longer step, which keeps its integral; a linear one is picked, and other inputs are.
         """
         if int(k) != k or k < 1:
             raise UsageError(f"decimate() takes a whole number of at least 1; got {k!r}.")
@@ -160,8 +160,8 @@ class Experiment(Shown):
             return coarse
         starts, width = np.arange(0, self.n, int(k)), np.diff(self.t)
         width = np.append(width, width[-1])  # the last sample is held for as long as the one before
-        means = {c: np.add.reduceat(a * width, starts) / np.add.reduceat(width, starts) for c, a in self.inputs.items()}
-        return coarse.with_(inputs=means)
+        mean = np.add.reduceat(self.inputs["v"] * width, starts) / np.add.reduceat(width, starts)
+        return coarse.with_(inputs={**coarse.inputs, "v": mean})
 
     def running_median(self, samples: int) -> Experiment:
         """Return the run with its voltage, noisy as it was measured, replaced by the median over `samples` (odd)."""
@@ -280,12 +280,12 @@ def between_pauses(run: Experiment) -> list[Experiment]:
     told = np.searchsorted(run.t, np.asarray(run.meta.get("parts", ()), float) - run.dt / 2) - 1
     cuts = np.union1d(pauses(run.t), told[(told >= 0) & (told < run.n - 1)])
     parts = [slice(a, b) for a, b in pairwise([0, *(cuts + 1).tolist(), run.n]) if b - a >= MIN_SAMPLES]
-    if not cuts.size or not parts:
+    live = [s for s in parts if any(np.isfinite(y[s]).any() for y in run.outputs.values())]
+    if not cuts.size or not live:
         return [run]
-    live = [run.select(s) for s in parts if any(np.isfinite(y[s]).any() for y in run.outputs.values())]
     told = {"parts": None, "record": record_of(run)}
-    return [part.with_(name=f"{run.name}[{k}]", meta={**part.meta, **told,
-                       "notes": run.meta.get("notes", ()) if k == 1 else ()}) for k, part in enumerate(live, 1)]
+    return [part.with_(name=f"{run.name}[{k}]", meta={**part.meta, **told, "notes": run.meta.get("notes", ()) if k == 1
+                       else ()}) for k, part in enumerate(map(run.select, live), 1)]
 
 
 def _frozen_array(values: ArrayLike, what: str, run: str) -> Array:

@@ -71,12 +71,12 @@ def read_runs(paths: Path_ | Iterable[Path_], *, columns: Mapping[str, object] |
     """
     given = paths if isinstance(paths, list | tuple) else [paths]
     if any(hasattr(p, "reset_index") for p in given):
-        return [_of_table(frame_table(p), columns, units, hold, dt, f"run{k}", {}) for k, p in enumerate(given, 1)]
-    files = find_records(paths)
-    stems = Counter(f.stem for f in files)
-    names = [f.stem if stems[f.stem] == 1 else f"{f.parent.name}/{f.name}" for f in files]
-    runs = (_read(f, FORMATS.get(f.suffix.lower(), parse_table), columns, units, hold, dt, name)
-            for f, name in zip(files, names, strict=True))
+        runs = [_of_table(frame_table(p), columns, units, hold, dt, f"run{k}", {}) for k, p in enumerate(given, 1)]
+    else:
+        files = find_records(paths)
+        stems = Counter(f.stem for f in files)
+        runs = (_read(f, FORMATS.get(f.suffix.lower(), parse_table), columns, units, hold, dt,
+                      f.stem if stems[f.stem] == 1 else f"{f.parent.name}/{f.name}") for f in files)
     return [part for run in runs for part in between_pauses(run)]
 
 

@@ -189,6 +189,8 @@ def test_decimate_picks_outputs_and_keeps_the_integral_of_a_held_input():
     np.testing.assert_array_equal(coarse.outputs["omega"], 2 * T[::4])
     np.testing.assert_allclose(coarse.inputs["v"], [0, 1, 0, 0, 0, 0, 0, 0, 0, 0], atol=1e-12)
     assert run.with_(hold="linear").decimate(4).inputs["v"].max() == 0
+    load = make(inputs={"v": v, "tau_load": v}).decimate(4)
+    np.testing.assert_array_equal(load.inputs["tau_load"], v[::4])  # goes on between samples
     np.testing.assert_array_equal(run.decimate(1).inputs["v"], v)
     uneven = make(t=np.cumsum(np.linspace(0.01, 0.05, N)), inputs={"v": np.sin(np.arange(N))})
     fine, wide = np.diff(uneven.t), np.diff(uneven.decimate(3).t)

@@ -478,6 +478,32 @@ def test_matlab_variables_structures_and_matrices(tmp_path):
     np.testing.assert_array_equal(c.outputs["theta"], np.cos(t))
 
 
+def test_a_table_in_memory_is_cut_at_a_pause_as_its_file_is(tmp_path):
+    pd = pytest.importorskip("pandas")
+    t = np.concatenate([np.arange(100), np.arange(11000, 11100)]) * 1e-3
+    frame = pd.DataFrame({"time_s": t, "voltage_V": np.sign(np.sin(90 * t)), "speed_rad_s": np.cos(9 * t)})
+    frame.to_csv(tmp_path / "a.csv", index=False)
+    assert [run.n for run in read_runs(frame)] == [run.n for run in read_runs(tmp_path / "a.csv")] == [100, 100]
+
+
+def test_a_run_that_was_measured_only_before_a_pause_is_not_lost(tmp_path):
+    pd = pytest.importorskip("pandas")
+    t = np.concatenate([np.arange(5), 5000 + np.arange(500)]) * 1e-3
+    seen = np.where(np.arange(505) < 5, t, np.nan)
+    frame = pd.DataFrame({"time_s": t, "voltage_V": np.sign(np.sin(9 * t)), "speed_rad_s": seen})
+    frame.to_csv(tmp_path / "a.csv", index=False)
+    assert [run.n for run in read_runs(tmp_path / "a.csv")] == [505]
+
+
+def test_a_measured_input_without_a_value_is_left_out_with_a_word():
+    pd = pytest.importorskip("pandas")
+    t = np.arange(100) * 1e-3
+    [run] = read_runs(pd.DataFrame({"time_s": t, "voltage_V": np.sign(np.sin(9 * t)), "speed_rad_s": np.cos(9 * t),
+                                    "supply_V": np.nan}))
+    assert "v_supply" not in run.inputs
+    assert "left out 'supply_V' (v_supply): every sample is missing." in run.meta["notes"]
+
+
 def test_parquet(tmp_path):
     pd = pytest.importorskip("pandas")
     pytest.importorskip("pyarrow")
