@@ -23,8 +23,8 @@ from motorid.reports.sections import Section
 PACKAGES = ("motorid", "casadi", "numpy", "scipy", "pandas", "matplotlib")
 
 
-def report(result: Any, path: str | Path, *, title: str = "", command: str = "", validate: Sequence[Any] = (),
-           force: bool = False) -> Path:
+def report(result: Any, path: str | Path, *, title: str = "", command: str = "",
+           validate: Sequence[Any] | Experiment = (), force: bool = False) -> Path:
     """Write the story of a result as one HTML page: no network, no script, figures inside.
 
     The answer first, with its figure, the errors before and after and the next step; then parameters, fits, held-out
@@ -39,7 +39,7 @@ def report(result: Any, path: str | Path, *, title: str = "", command: str = "",
     title : str, optional
     command : str, optional
         The command or code that made it, for the last section.
-    validate : sequence of Experiment, optional
+    validate : Experiment or sequence of them, optional
         Records that the fit never saw, to judge it on.
     force : bool
         Also over a file that motorid did not write.
@@ -66,8 +66,9 @@ def report(result: Any, path: str | Path, *, title: str = "", command: str = "",
     for r in results:
         if not isinstance(r, Shown):
             raise UsageError(f"report takes results of motorid, such as a fit or a diagnosis; got {type(r).__name__}.")
-    story = tell(results, title=title, validate=list(validate))
-    story.sections.append(_provenance(story, command, list(validate)))
+    check = [validate] if isinstance(validate, Experiment) else list(validate)
+    story = tell(results, title=title, validate=check)
+    story.sections.append(_provenance(story, command, check))
     if Path(path).suffix.lower() not in (".html", ".htm"):
         raise UsageError(f"a report is an HTML page: '{Path(path).name}' must end in .html (a browser prints it).")
     return write_files({Path(path): _page(story)}, force)[0]

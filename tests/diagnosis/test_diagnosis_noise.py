@@ -184,3 +184,6 @@ def test_an_angle_that_follows_a_smooth_drive_is_no_closed_loop(lab, plant):
     wheel = plant.MOTORS["wheel"]
     looped = record(driven(wheel, {}, "loop", 900, 2e-3, rng), "logger", ("i", "omega"), wheel, rng, "loop")
     assert "closed loop" in closed_loop_remark(mi.fit(mi.dc_motor(), looped))
+    for volts, said in ((np.full(smooth.n, 3.3), False), (np.sin(9 * smooth.t), True)):
+        told = smooth.with_(meta={**smooth.meta, "extra": {"adc_vref": volts}})
+        assert ("closed loop" in closed_loop_remark(mi.fit(mi.dc_motor(), told))) is said  # a sensor's own stands still
