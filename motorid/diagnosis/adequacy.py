@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from motorid.channels import channel_name
 from motorid.diagnosis.misspecification import better_forms, hum_of
 from motorid.diagnosis.model_comparison import Node, far
-from motorid.diagnosis.predictive_score import finer
+from motorid.diagnosis.predictive_score import finer, undecided
 from motorid.diagnosis.results import Adequacy
 from motorid.diagnosis.score_test import Score
 from motorid.diagnosis.thresholds import LARGER, SEARCHED
@@ -54,15 +54,14 @@ def adequacy(fit: Fit, scores: Sequence[Score] = (), level: float = FALSE_ALARM)
     of 0.9 between neighbours. Residuals beyond ten times the noise (five for an angle) are not noise of any colour.
     """
     channels = {c: _channel(fit, c) for c in fit.problem.outputs}
-    beyond = {c for c, facts in channels.items() if facts["ratio"] > LARGER and finer(fit, c)}  # scores see little else
-    tests = [*(t for c in channels if c not in beyond for t in _dependences(fit, c)),
-             *(_score_tests(scores) if not beyond else ())]
+    asked = [c for c in channels if c not in undecided(fit)]
+    tests = [*(t for c in asked for t in _dependences(fit, c)), *(_score_tests(scores) if asked else ())]
     rounded = {c: f["rounded"] for c, f in channels.items()}
     rounded |= {None: np.mean([*rounded.values()])}
     material = [t for t in tests if t["share"] > MATERIAL + (ROUNDED - MATERIAL) * rounded[t["channel"]]]
     p_value = min([1.0, *(t["p"] * len(tests) for t in material)])
     far = [c for c, facts in channels.items()
-           if facts["ratio"] > LARGEST_RATIO / (2 if c == "theta" else 1) and c not in beyond]
+           if facts["ratio"] > LARGEST_RATIO / (2 if c == "theta" else 1) and c in asked]
     exact = max(fit.nrmse.values(), default=1.0) < EXACT
     adequate = exact or (p_value > level and not far)
     for c, facts in channels.items():

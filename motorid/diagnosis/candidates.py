@@ -19,7 +19,7 @@ from motorid.diagnosis.cross_validation import QUICK, HeldOut
 from motorid.diagnosis.free_forms import own_levels
 from motorid.diagnosis.misspecification import LIMITER
 from motorid.diagnosis.model_comparison import COMMON, Node, beats, evidence, far, node_of, preferred, superfluous
-from motorid.diagnosis.predictive_score import Evidence
+from motorid.diagnosis.predictive_score import Evidence, deciding
 from motorid.diagnosis.refit import LITTLE, GivenUp, Task, completed, hidden_in, led_on, refit, refits, widened
 from motorid.diagnosis.results import Candidate
 from motorid.diagnosis.score_test import Score, pairs_of, rank, uses_angle, with_phase_per_run, with_warm_start
@@ -128,7 +128,7 @@ class Search:
             fresh, _ = self._takeable(node.fit.model)
             self.stages.at(f"ranking {len(fresh)} effects")
             before = self._scores.get(node.parent.key, ()) if node.parent is not None and not far(node.fit) else ()
-            self._scores[node.key] = rank(node.fit, fresh, before)
+            self._scores[node.key] = rank(deciding(node.fit), fresh, before)
             self.stages.done(f"ranked {len(fresh)} effects")
         return self._scores[node.key]
 
@@ -189,10 +189,10 @@ class Search:
         if not far(node.fit) or len(set(node.fit.problem.unknowns.firsts)) < 2:
             return []
         if (zero := own.get("encoder_zero")) and zero.name not in model.effect_names:
-            found = with_phase_per_run(node.fit, self.scores(node), zero)
+            found = with_phase_per_run(deciding(node.fit), self.scores(node), zero)
             tasks += [Task(node.fit, model + s.effect + zero, s.effect, s.starts, s.drop) for s in found]
         if warm := own.get("winding_warm_start"):
-            found = with_warm_start(node.fit, self.scores(node), LIBRARY["winding_heating"])
+            found = with_warm_start(deciding(node.fit), self.scores(node), LIBRARY["winding_heating"])
             tasks += [Task(node.fit, model + s.effect + warm, s.effect, s.starts, s.drop) for s in found]
         return tasks
 
@@ -235,7 +235,7 @@ class Search:
     def expand_by_two(self, node: Node) -> list[Node]:
         """Return the judged models larger by two effects that only together show: each alone was refused."""
         present, tasks = node.fit.model, []
-        for a, b in pairs_of(node.fit, self._shortlist(node), PAIRS):
+        for a, b in pairs_of(deciding(node.fit), self._shortlist(node), PAIRS):
             with contextlib.suppress(ModelError):
                 best = {**a.starts[0], **b.starts[0]}  # and the next best of either
                 starts = [best, *({**best, **s.starts[1]} for s in (a, b) if len(s.starts) > 1)]

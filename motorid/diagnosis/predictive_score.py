@@ -13,6 +13,7 @@ the sensor, sets what counts. Coloured errors repeat themselves; a channel count
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +28,7 @@ from motorid.records.experiment import Experiment
 
 SETTLED = 1e-6  # relative change of the scale at which its iteration stops
 ROUNDS = 50
+IDLE = 1e4  # times its noise, of a channel that decides nothing
 CELLS = 10  # per block, between whose means changes are told
 
 
@@ -245,7 +247,7 @@ def finer(fit: Fit, channel: str) -> bool:
 
     What its noise, white as the jumps of an encoder's counts are, makes of the rate of its error is not the model's.
     """
-    if channel != "theta" or not fit.nrmse[channel] < thresholds.FINER:
+    if channel != "theta" or not fit.nrmse.get(channel, np.inf) < thresholds.FINER:
         return False
     squares = list[Array]()
     for s, run in zip(fit.simulations, fit.problem.runs, strict=True):
@@ -256,6 +258,22 @@ def finer(fit: Fit, channel: str) -> bool:
             squares.append(np.array([*(rate**2 for rate in rates), 2 * white / dt**2]))
     error, speed, noise = np.nanmean(np.concatenate(squares, axis=1), axis=1)
     return bool(error - noise < thresholds.FINER_RATE**2 * speed)
+
+
+def undecided(fit: Fit) -> set[str]:
+    """Return the angle, where it decides nothing: followed so closely beside other channels, or than its noise."""
+    return {c for c in fit.problem.outputs
+            if finer(fit, c) and (len(fit.problem.outputs) > 1 or fit.misfit[c] > thresholds.LARGER)}
+
+
+@lru_cache(maxsize=4)
+def deciding(fit: Fit) -> Fit:
+    """Return the fit as effects are to be scored on it: a channel that decides nothing counts for next to nothing."""
+    if not (idle := undecided(fit)) or len(idle) == len(fit.problem.outputs):
+        return fit
+    problem = fit.problem.tuned(noise_factors={**fit.problem.noise_factors, **dict.fromkeys(idle, IDLE)})
+    return replace(fit, problem=problem, **dict(zip(("residuals", "jacobian"), problem.residual_and_jacobian(fit.q),
+                                                    strict=True)))
 
 
 def predictions_left_out(fit: Fit, evenly: bool = False) -> Channels | None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from battery.cases import ANGLE, Case
-from battery.excite import P, level, record
+from battery.excite import P, driven, level, record
 from battery.wide import SIZES, WIDE
 
 import motorid as mi
@@ -135,3 +135,12 @@ def test_a_ripple_of_the_sensor_over_the_turn_is_found_with_its_order(motor, hid
     assert (values["N_w"], values["e_w"]) == (hidden["N_w"], hidden.get("e_w", 0.0))
     for name in ("a_w", "phi_w"):
         assert abs(values[name] - hidden[name]) < 4 * std[name]
+
+
+def test_held_out_runs_may_show_a_channel_more_than_the_fitted_ones(lab):
+    rng = np.random.default_rng(3)
+    clean = [driven(lab, {"coulomb": {"tau_c": 8e-3}}, w, 600, 1e-3, rng) for w in ("stairs", "waves", "stairs")]
+    channels = ("i", "omega"), ("i", "omega"), ("i", "omega", "theta")
+    runs = [record(c, "logger", each, lab, rng, "run") for c, each in zip(clean, channels, strict=True)]
+    found = mi.diagnose(mi.fit(mi.dc_motor(), runs[:2]), runs[2:], effects=("coulomb",))
+    assert found.effects == ("coulomb",)

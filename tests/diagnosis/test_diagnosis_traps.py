@@ -10,9 +10,10 @@ from battery.cases import CASES
 from battery.excite import driven, record
 
 import motorid as mi
-from motorid.diagnosis.predictive_score import finer
-from motorid.diagnosis.score_test import score
-from motorid.diagnosis.thresholds import FINER, FINER_RATE
+from motorid.diagnosis.adequacy import adequacy
+from motorid.diagnosis.predictive_score import deciding, finer
+from motorid.diagnosis.score_test import rank, score
+from motorid.diagnosis.thresholds import FINER, FINER_RATE, LARGER
 from motorid.effects import LIBRARY
 from motorid.estimation.linearisation import Tangent
 from motorid.records.experiment import Experiment
@@ -211,6 +212,31 @@ def test_an_encoder_finer_than_any_model_invites_no_effect(lab):
     assert found.after.misfit["theta"] > 30
     assert found.remaining.adequate
     assert "no model is asked for less" in found.text
+
+
+def test_what_an_angle_that_decides_nothing_hides_is_seen_in_the_other_channels(lab):
+    """Its errors are eleven times its noise, whatever there is; those of the current and of the speed are the noise."""
+    judged = {}
+    for size in (0.0, 1e-3):
+        fit = mi.fit(mi.dc_motor(), fine_encoder(lab, {"cogging": {"A": size, "N": 12, "phi": 0.5}}, lowest=1.0)[:2])
+        assert finer(fit, "theta")
+        assert fit.misfit["theta"] > 10
+        scores = rank(deciding(fit), [LIBRARY["cogging"]])
+        judged[size] = adequacy(fit, scores)
+        assert (scores[0].drop > 0.05) is bool(size)
+    assert [a.adequate for a in judged.values()] == [True, False]
+
+
+def test_a_fine_angle_is_not_asked_either_what_its_noise_nearly_hides(lab):
+    rng = np.random.default_rng(1)
+    runs = [run.with_(outputs={**run.outputs, "theta": run.outputs["theta"] + 0.01 * rng.standard_normal(run.n)})
+            for run in fine_encoder(lab, {}, lowest=1.0)[:2]]
+    fit = mi.fit(mi.dc_motor(), runs)
+    assert finer(fit, "theta")
+    assert 1.2 < fit.misfit["theta"] < LARGER
+    assert adequacy(fit).channels["theta"]["p_value"] == 1.0
+    alone = mi.fit(mi.dc_motor().fix(R=lab.R, L=lab.L), [run.without("i", "omega") for run in runs])
+    assert deciding(alone) is alone  # what is measured alone is asked all
 
 
 @pytest.mark.parametrize(("hidden", "close"), [({}, True), ({"cogging": {"A": 3e-2, "N": 12, "phi": 0.5}}, False)])
