@@ -7,7 +7,7 @@ fading memory (Laguerre and Kautz models: Wahlberg, IEEE Trans. Automatic Contro
 
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -29,6 +29,7 @@ ON = 0.05  # of the largest voltage: a level by itself
 KNOTS = 9  # cosines over the range of a time, twice as many over that of an angle
 HARMONICS = 12  # of a turn
 LINES = 2  # of the spectrum of the misfit over the angle, or the time
+FINEST = 64  # parts of a turn in which lines that are no orders of it are looked for
 AROUND = 31  # frequencies that such a line stands out of
 PLACES = 12  # over a time or an angle at which something may set in
 SECTORS = 4  # widths of a sector of a turn, each twice the one before
@@ -125,7 +126,7 @@ FORMS = (*(Form(words, balance, on, carrier) for words, balance, carrier, quanti
          *(Form("an error of the angle sensor", "sensor", on, "", "theta")
            for on in ("path", "turn", "theta", "omega", "i")),
          *(Form("an error of the speed sensor", "sensor", on, "", "omega") for on in ("omega", "i", "t")),
-         *(Form("an error of the current sensor", "sensor", on, "", "i") for on in ("i", "v", "omega", "t")),
+         *(Form("an error of the current sensor", "sensor", on, "", "i") for on in ("i", "v", "omega", "t", "turn")),
          *(Form("a loss of voltage", "voltage", f"past {c}") for c in ("v", "i", "omega")),
          *(Form("a torque", "torque", on) for on in ("past i", "past omega", "path")),
          *(Form("an error of the current sensor", "sensor", f"past {c}", "", "i") for c in ("i", "v")),
@@ -141,13 +142,8 @@ class Span:
     orders: tuple[float, ...]
     step: float
     finer: int = 1
-    rates: tuple[float, ...] = ()  # of waves over the time, rad/s
+    rates: Mapping[str, Sequence[float]] = field(default_factory=dict)  # of waves over the time, rad/s, or the angle
     pitches: int = 1
-
-    @property
-    def reach(self) -> float:
-        """How far a rate may be from the one in a spectrum, rad/s."""
-        return 2 * np.pi / (self.ranges["t"][1] or 1.0)
 
 
 def span_of(fit: Fit, signals: Sequence[Mapping[str, Array]]) -> Span:
@@ -162,26 +158,32 @@ def span_of(fit: Fit, signals: Sequence[Mapping[str, Array]]) -> Span:
     lines = likely_lines(Tangent.of(fit), LIBRARY["cogging"], LINES) if "theta" in fit.problem.outputs else []
     orders = {*range(1, HARMONICS + 1), *(round(k * n) for n in known for k in range(1, 5)),
               *(round(line.order) for line in lines)}
-    return Span(ranges, tuple(sorted(orders)), step, rates=_rates(fit, step))
+    rates = {"t": _rates(fit, [s["t"] for s in signals], step)}
+    if "theta" in ranges:  # a belt, a gear's slow shaft: whole orders of a turn are its own
+        travel = float(np.ptp(ranges["theta"]))
+        cell = max(2 * np.pi / FINEST, travel / max(len(s["theta"]) for s in signals))
+        found = _rates(fit, [s["theta"] for s in signals], cell)
+        rates["theta"] = [w for w in found if abs(w - round(w)) * travel > 2 * np.pi]
+    return Span(ranges, tuple(sorted(orders)), step, rates={on: own[:LINES] for on, own in rates.items()})
 
 
-def _rates(fit: Fit, step: float) -> tuple[float, ...]:
-    """Return the rates (rad/s) of lines over the time that stand out of the spectrum of the misfit, at most a few."""
+def _rates(fit: Fit, along: Sequence[Array], step: float) -> list[float]:
+    """Return the rates of lines over a quantity that stand out of the spectrum of the misfit, the strongest first."""
     from scipy.ndimage import median_filter  # slow to import, and not needed before
 
-    length = 1 << max(s.experiment.n for s in fit.simulations).bit_length()
+    length = 1 << int(max(np.ptp(z) for z in along) / step + 1).bit_length()
     power = np.zeros(length // 2 + 1)
-    for run, sim in zip(fit.problem.runs, fit.simulations, strict=True):
-        even = np.arange(sim.experiment.t[0], sim.experiment.t[-1], step)[:length]
+    for run, sim, z in zip(fit.problem.runs, fit.simulations, along, strict=True):
+        even = z.min() + step * np.arange(max(np.ptp(z) // step, 1))
         for c, sigma in run.sigma.items():
-            known = np.isfinite(residual := sim.residual(c))
-            error = np.interp(even, sim.experiment.t[known], residual[known]) / sigma
+            known = np.flatnonzero(np.isfinite(residual := sim.residual(c)))
+            rows = known[np.argsort(z[known], kind="stable")]
+            error = np.interp(even, z[rows], residual[rows]) / sigma
             power += np.abs(np.fft.rfft((error - error.mean()) * np.hanning(len(even)), length)) ** 2
     around = np.log(2) * power / np.maximum(median_filter(power, AROUND), 1e-300)  # of noise, 1 in the mean
     around[: KNOTS + 2] = 0.0  # cosines over the range do that
     top = (around[1:-1] >= around[:-2]) & (around[1:-1] >= around[2:]) & (around[1:-1] > 2 * np.log(length))
-    lines = sorted(1 + np.flatnonzero(top), key=lambda k: -power[k])[:LINES]
-    return tuple(float(2 * np.pi * k / (length * step)) for k in lines)
+    return [float(2 * np.pi * k / (length * step)) for k in sorted(1 + np.flatnonzero(top), key=lambda k: -power[k])]
 
 
 def shown(form: Form, fit: Fit, ranges: Mapping[str, tuple[float, float]]) -> bool:
@@ -239,7 +241,8 @@ def functions_of(form: Form, span: Span) -> list[str]:
         lengths = memories_of(form, span)
         lags = [f"past(z, {_place(length, lengths[0] / 10, lengths[-1] * 10)})" for length in lengths]
         top = f"{max(abs(low), abs(high)):.6g}"
-        bent = [f"{lag} * ca.fabs({lag}) / {top}" for lag in lags if form.bends]
+        slips = [f"(z - {lag})" for lag in lags if form.on == "past omega" and span.finer > 1]
+        bent = [f"{lag} * ca.fabs({lag}) / {top}" for lag in (*lags, *slips) if form.bends]
         if form.carrier:
             trips = [f"ca.fmax({lag} / {top} - {_place(level, 0, 1, '1')}, 0)" for lag in lags if form.on == "past heat"
                      for level in TRIPS]
@@ -283,9 +286,9 @@ def _along(form: Form, span: Span, low: float, high: float) -> list[str]:
     sudden = [f"ca.tanh((z - {c}) * {steep})" for c in centres if form.carrier != "acceleration" or form.on == "t"]
     top = f"{max(abs(low), abs(high)):.6g}"  # a slope, a spring that hardens, a stop, a slack, a ramp
     sudden += [*(f"(z / {top})**{k}" for k in (1, 2, 3)), *(f"ca.fmax((z - {c}) / {top}, 0)" for c in centres)]
-    if form.on == "t":  # what swings as the records begin: another machine, a table that turns
-        sudden += [f"ca.sin({_place(w, w - span.reach, w + span.reach, 'rad/s')} * z + {_place(phase, -4, 4, 'rad')})"
-                   for w in span.rates for phase in (0, np.pi / 2)]
+    unit, reach = "rad/s" if form.on == "t" else "1:wave", 2 * np.pi / (high - low)
+    sudden += [f"ca.sin({_place(w, w - reach, w + reach, unit)} * z + {_place(phase, -4, 4, 'rad:phase')})"
+               for w in span.rates.get(form.on, ()) for phase in (0, np.pi / 2)]  # what swings, or repeats, by itself
     if form.on != "theta":  # what warms up, or runs in
         whole = high - low
         sudden += [f"ca.exp(-z / {_place(whole / k, whole / 300, whole * 10)})" for k in FADES]
@@ -494,10 +497,14 @@ def _signals(fit: Fit, k: int) -> dict[str, Array]:
     found |= {f"past {c}": found[c] for c in ("v", "i", "omega") if c in found}
     found |= {c: time_since(run, c) for c in COMPUTED_INPUTS}
     if "theta" in run.outputs or "omega" in run.outputs:
-        own, zeroed = parameter_vector(fit, k), "encoder_zero" in fit.model.effect_names
-        zero = own[fit.problem.system.parameters.index("z_0")] if zeroed else 0.0
-        found["theta"] = found["turn"] = angle_signal(run) + zero
+        found["theta"] = found["turn"] = angle_signal(run) + zero_of(fit, k)
     return found
+
+
+def zero_of(fit: Fit, k: int) -> float:
+    """Return the angle that the encoder of run `k` calls zero."""
+    parameters = fit.problem.system.parameters
+    return float(parameter_vector(fit, k)[parameters.index("z_0")]) if "z_0" in parameters else 0.0
 
 
 def _answer(problem: Problem, k: int, seen: Response, form: Form, basis: Array) -> Array:
@@ -545,12 +552,19 @@ def form_coefficients(fit: Fit, linear: Linear, form: Form, kept: Sequence[int] 
 
 
 def may_be_zeroed(fit: Fit) -> bool:
-    """Tell whether records could show a zero of the angle of each: all go round, and nothing is over the angle yet."""
-    signals, firsts = signals_along(fit), fit.problem.unknowns.firsts
-    if len(set(firsts)) < 2 or any("turn" not in s for s in signals) or any(map(uses_angle, fit.model.effects)):
+    """Tell whether records could show a zero of the angle of each: one goes round, all others go a radian, which tells
+    the phase of a wave, and nothing is over the angle yet."""
+    signals, few = signals_along(fit), len(set(fit.problem.unknowns.firsts)) < 2
+    if few or any("turn" not in s for s in signals) or any(map(uses_angle, fit.model.effects)):
         return False
-    angles = [[s["turn"] for s, f in zip(signals, firsts, strict=True) if f == first] for first in set(firsts)]
-    return min(float(np.ptp(np.concatenate(parts))) for parts in angles) > 2 * np.pi
+    return min(travels := _travels(fit, signals)) > 1 and max(travels) > 2 * np.pi
+
+
+def _travels(fit: Fit, signals: Sequence[Mapping[str, Array]]) -> list[float]:
+    """Return how far every record goes, rad."""
+    firsts = fit.problem.unknowns.firsts
+    angles = [[s["turn"] for s, f in zip(signals, firsts, strict=True) if f == first] for first in sorted(set(firsts))]
+    return [float(np.ptp(np.concatenate(parts))) for parts in angles]
 
 
 def zeroed(fit: Fit, linear: Linear, form: Form) -> Linear:
@@ -559,15 +573,17 @@ def zeroed(fit: Fit, linear: Linear, form: Form) -> Linear:
 
 
 def zeros_of(fit: Fit, form: Form) -> dict[str, float]:
-    """Return the zero of the angle in every record but the first, by name: where its own curve is most like that."""
-    span, runs = span_of(fit, signals_along(fit)), sorted(set(fit.problem.unknowns.firsts))
+    """Return the zero of the angle in every record but the first, by name: where its own curve is most like that of the
+    one that goes furthest."""
+    signals, runs = signals_along(fit), sorted(set(fit.problem.unknowns.firsts))
+    span, most = span_of(fit, signals), int(np.argmax(_travels(fit, signals)))
     own = form_coefficients(fit, zeroed(fit, linearised(fit), form), form)
     angle = np.linspace(-np.pi, np.pi, 720, endpoint=False)
     waves = values_of(functions_of(form, span), form, {"turn": angle, "t": angle})
     curves = waves[:, 1:] @ own.reshape(len(runs), -1)[:, 1:].T  # without the constant
-    alike = np.fft.irfft(np.conj(np.fft.rfft(curves, axis=0)) * np.fft.rfft(curves[:, :1], axis=0), axis=0)
-    return {f"z_0[{k}]": float(angle[j] % (2 * np.pi) - np.pi)
-            for k, j in zip(runs[1:], alike.argmax(axis=0)[1:], strict=True)}
+    alike = np.fft.irfft(np.conj(np.fft.rfft(curves, axis=0)) * np.fft.rfft(curves[:, [most]], axis=0), axis=0)
+    best = alike.argmax(axis=0)
+    return {f"z_0[{k}]": float(angle[j] % (2 * np.pi) - np.pi) for k, j in zip(runs, best - best[0], strict=True) if k}
 
 
 def form_columns(fit: Fit, linear: Linear, form: Form) -> tuple[Array, Array]:

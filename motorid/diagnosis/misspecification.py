@@ -42,6 +42,7 @@ class FormGain:
     form: Form
     evidence: Evidence
     predictions: Predictions
+    smaller: bool = False  # it leaves noise with no more parameters than that model has
 
 
 def better_forms(fit: Fit, rival: Fit, channels: Container[str] = CHANNELS) -> list[FormGain]:
@@ -86,7 +87,7 @@ def hum_of(fit: Fit, gains: Sequence[FormGain]) -> str:
     alone = Answers(fit, free_forms.linearised(fit, best.form), best.form).predictions(waves) if waves else None
     if alone is None or compare(alone, best.predictions).worth_it:
         return ""
-    return f"a hum of {number(span.rates[0] / 2 / np.pi, 3)} Hz in the sensor of {channel_name(best.form.channel)}"
+    return f"a hum of {number(span.rates['t'][0] / 2 / np.pi, 3)} Hz in the sensor of {channel_name(best.form.channel)}"
 
 
 class Answers:

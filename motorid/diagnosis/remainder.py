@@ -62,8 +62,9 @@ STATES = {  # quantities that are states of the curve's own: name, where it begi
     "most i": ("most_i", "ca.fabs(m.start['i'])", "ca.fmax(ca.fabs(m.i) - most_i, 0) / {step}")}
 SI = {"theta": "rad", "omega": "rad/s", "i": "A", "v": "V", "size": "V", "load": "W"}
 OTHER_PLACES = {"1": "where it sets in, a share of the largest", "V": "half of its play", "A": "half of its play",
-                "rad/s": "how fast it swings, or half of its play", "V/s": "how fast it rises", "rad": "its phase",
-                "rad:wide": "half of its width", "rad:edge": "how wide its edges are"}
+                "rad/s": "how fast it swings, or half of its play", "V/s": "how fast it rises",
+                "1:wave": "how many to the turn", "rad:phase": "its phase", "rad:wide": "half of its width",
+                "rad:edge": "how wide its edges are"}
 OVER = {"": "", "A": "/A", "V": "/V", "rad/s": "·s/rad"}
 FIRST = {"past i": ", m.start['i']", "past omega": ", m.start['omega']"}  # of a memory: as if it had been so before
 CLIPPED = re.compile(r"ca\.fmin\(ca\.fmax\(z, \S+\), \S+\)")
@@ -196,6 +197,7 @@ class Curve:
     name: str = "remainder"
     begun: Curve | None = None  # the same as it grew in short windows, where it begins
     trial: bool = False  # in short windows, to see what is worth fitting to the records
+    first: Curve | None = None  # the same with its first functions only
 
     @property
     def effect(self) -> Effect:
@@ -303,8 +305,15 @@ class Curve:
 
     def refitted(self, last: Fit, *starts: Mapping[str, float]) -> Curve | None:
         """Return the curve fitted with the model, from `starts` beside the `last` values or not; None if that fails."""
-        done = refit(last, self.fit.model + self.effect, [{**w, **s} for s in starts for w in (last.values, {})])
+        own = {n: p.value for n, p in self.fit.model.parameters.items()}
+        known = (last.values,) if {**last.values, **own} == last.values else (last.values, {})  # each once
+        done = refit(last, self.fit.model + self.effect, [{**w, **s} for s in starts for w in known])
         return done and replace(self, values=tuple(done.values[n] for n in self.sizes), fitted=done)
+
+    def led_by(self, begun: Curve) -> Curve | None:
+        """Return one that was fitted in short windows, fitted to the records of this one."""
+        there = {n: v for n, v in (begun.fitted or begun.fit).values.items() if n != "sgn_width"}
+        return replace(begun, fit=self.fit, name=self.name, first=None).refitted(self.fit, there)
 
     @property
     def law(self) -> str:
@@ -456,21 +465,37 @@ def _beyond(base: Fit | None) -> Iterator[tuple[Curve, Form]]:
 def _over_zeros(base: Fit, forms: Iterable[Form]) -> Iterator[tuple[Curve, Form]]:
     """Yield a model, without a curve yet, with each form, beside the zero of every run where the form has one."""
     for form in forms:
-        model = base.model + PER_RUN["encoder_zero"] if form.zeroed else base.model
-        if (fit := refit(base, model, [free_forms.zeros_of(base, form)]) if form.zeroed else base) is not None:
+        if (fit := _zeroed(base, free_forms.zeros_of(base, form)) if form.zeroed else base) is not None:
             yield Curve(fit, name=_name(base)), replace(form, zeroed=False)
 
 
+def _zeroed(base: Fit, zeros: Mapping[str, float]) -> Fit | None:
+    """Return a fit with the zero of the angle of every run, beginning at `zeros`."""
+    return refit(base, base.model + PER_RUN["encoder_zero"], [zeros])
+
+
 def _grown_in(there: Fit | None, base: Fit, asked: Sequence[Form], quiet: bool = False) -> Iterator[tuple[Curve, Form]]:
-    """Yield curves, best first, of forms that grew furthest in short windows or are `asked` for; or the quiet alone."""
+    """Yield curves, best first, of forms that grew furthest in short windows or are `asked` for; only the first, and
+    those that leave noise there, as `quiet` ones."""
     if there is not None:
         here, found = HeldOut.of(there, None), dict[Any, Grown]()
         also = ((Curve(there), f) for f in asked[:AHEAD] if not f.remembers and f.on not in ("distance", "run"))
         before, tried = here.predictions(there), chain(islice(_beyond(there), TRIED), also)
         _race(found, ((replace(curve, trial=True), form) for curve, form in tried), before, here, before)
-        for key in sorted(found, key=lambda key: -found[key].gained.gain):
-            if found[key].done if quiet else found[key].gained.worth_it:
-                yield Curve(base, name=_name(base), begun=replace(found[key].curve, trial=False)), key[1]
+        for k, key in enumerate(sorted(found, key=lambda key: -found[key].gained.gain)):
+            begun, helps = replace(found[key].curve, trial=False), found[key].gained.worth_it and not (quiet and k)
+            whole = _zeroed_like(base, begun.fitted or begun.fit) if found[key].done or helps else None
+            if whole is not None:
+                yield Curve(whole, name=_name(base), begun=begun), key[1]
+
+
+def _zeroed_like(base: Fit, there: Fit) -> Fit | None:
+    """Return a fit with the zero of the angle of every run where that in short windows of its records has one."""
+    runs, windows = (sorted(set(fit.problem.unknowns.firsts))[1:] for fit in (base, there))
+    before, after = (sum(map(tells_the_zero, fit.model.effects)) for fit in (base, there))
+    if before == after or len(runs) != len(windows):
+        return base
+    return _zeroed(base, {f"z_0[{k}]": free_forms.zero_of(there, w) for k, w in zip(runs, windows, strict=True)})
 
 
 CLEAN = 1.05  # times the noise, of which no more is known than that: what leaves less cannot be told from the law
@@ -586,7 +611,8 @@ def alone_leaving_noise(last: Node, root: Fit, held: HeldOut, forms: Sequence[Fo
         there, before = _moments(root), held.predictions(root)
         whole = (t for t in _beyond(root) if t[1].on != "run" and (there is None or t[1].remembers))
         _race(found, islice(chain(_grown_in(there, root, forms, True), whole), TRIED), before, held, last.predictions)
-    each = (FormGain(key[1], compare(last.predictions, f.predictions), f.predictions)
+    each = (FormGain(key[1], compare(last.predictions, f.predictions), f.predictions,
+                     f.done and f.curve.fitted is not None and len(f.curve.fitted.q) <= len(last.fit.q))
             for key, f in found.items() if f.done or key[0].begun is not None)
     return next((gain for gain in each if gain.evidence.worth_it), None)
 
@@ -600,9 +626,10 @@ def _grown(curve: Curve, form: Form, moved: bool, before: Predictions, held: Hel
     """Yield a curve with a form more, of ever more functions, as long as these help."""
     best, led = float("-inf"), None
     with contextlib.suppress(*FAILURES):
-        if moved and curve.begun is not None and curve.begun.fitted is not None:
-            there = {n: v for n, v in curve.begun.fitted.values.items() if n != "sgn_width"}
-            led = replace(curve.begun, fit=curve.fit, name=curve.name).refitted(curve.fit, there)
+        for begun in dict.fromkeys((curve.begun.first or curve.begun, curve.begun)) if moved and curve.begun else ():
+            led = curve.led_by(begun)  # in windows noise is not always reached, and what imitates it grows there
+            if led and led.fitted and at_noise(Node(led.fitted, None, held.predictions(led.fitted))):
+                break
         curve = replace(curve, parts=(*curve.parts, Part.of(curve.fitted or curve.fit, form, moved)))
         for _ in range(FEW if moved else ROUNDS):
             check_time()
@@ -612,7 +639,7 @@ def _grown(curve: Curve, form: Form, moved: bool, before: Predictions, held: Hel
             predicted = held.predictions(larger.fitted)
             if (gained := compare(before, predicted)).gain < best:  # slopes led astray
                 return
-            curve, best = larger, gained.gain
+            curve, best = replace(larger, first=curve.first or larger), gained.gain
             yield Grown(gained, predicted, curve)
 
 

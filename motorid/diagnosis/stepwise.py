@@ -200,7 +200,7 @@ def _beside_curves(found: Climb, seconds: float | None) -> Climb:
         return found
     for k, g in enumerate(grades):
         if g.grade != "approximates" and (smaller := search.without(best, g.effect)) is not None and (
-                outdoes(evidence(smaller, best).fall, curve.evidence.fall)):
+                curve.smaller or outdoes(evidence(smaller, best).fall, curve.evidence.fall)):
             grades[k] = Grade(g.effect, "approximates", IN_ITS_PLACE.format(curve.form.text), curve.form)
             found = replace(found, remaining=following(found.remaining, curve.form.text))
     return replace(found, grades=tuple(grades))

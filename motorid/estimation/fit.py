@@ -362,8 +362,10 @@ def over_moments(fit: Fit, solve: Callable[[Problem], Fit] = solve) -> Fit | Non
     lead (Ribeiro et al., Automatica 121, 2020, 109158); None for one that is not far off, or of too short records."""
     v, runs, model = {"R": 1.0, "K": 0.0, **fit.values}, fit.problem.experiments, fit.model.with_(angle_input=False)
     seconds = MOMENT * v["J"] * v["R"] / (v["b"] * v["R"] + v["K"] ** 2 or np.inf)  # none without friction
-    few = not MIN_MOMENT * max(r.dt for r in runs) < seconds < min(r.duration for r in runs) / 2
-    if few or (follows(fit) and not lost(fit)):
+    shortest, longest = MIN_MOMENT * max(r.dt for r in runs), min(r.duration for r in runs)
+    if lost(fit) and not shortest < seconds < longest / 2:  # its time constants are those of no motor
+        seconds = longest / MIN_MOMENT
+    if not shortest < seconds < longest / 2 or (follows(fit) and not lost(fit)):
         return None
     whole = (r.with_(meta={k: x for k, x in r.meta.items() if k != "window"}) for r in runs)
     parts = [p for r in whole for p in windows(r, seconds)]

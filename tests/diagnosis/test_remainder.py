@@ -18,8 +18,8 @@ from command import motorid_json
 import motorid as mi
 from motorid.channels import COMPUTED_INPUTS
 from motorid.cli.options import own_effects
+from motorid.diagnosis import free_forms, remainder, stepwise
 from motorid.diagnosis import misspecification as grades
-from motorid.diagnosis import remainder, stepwise
 from motorid.diagnosis.cross_validation import HeldOut
 from motorid.diagnosis.free_forms import (
     PAST,
@@ -510,6 +510,39 @@ def test_what_remembers_fades_or_is_narrow_is_found(law, channels, follows, clos
         assert re.match("(a constant and )?(the square of )?one lag of .* N·m$", text)
         assert ("square" in text) == (law is ducted)
         assert miss < 0.3
+
+
+def _only(monkeypatch, words, on):
+    """Leave one free form: to look at all takes its time."""
+    monkeypatch.setattr(free_forms, "FORMS", tuple(f for f in free_forms.FORMS if (f.words, f.on) == (words, on)))
+
+
+@mi.effect(balance="sensor")
+def pickup(m, A=mi.P(0.05, "A", null=0.0)):
+    """A current sensor that a magnet on the shaft disturbs."""
+    m.measure("i", m.measured("i") + A * ca.sin(2 * m.theta + 0.7))
+
+
+@mi.effect(balance="torque")
+def drum(m, c_2=mi.P(2e-5, "N·m·s²/rad²", null=0.0), a=mi.P(0.1, "1/rad", positive=True)):
+    """Water in a drum, dragged along by the square of the slip."""
+    z = m.state("water")
+    slip = (m.omega - z) * ca.fabs(m.omega - z)
+    m.rate(z, a * slip)
+    m.torque -= c_2 * slip
+
+
+@pytest.mark.parametrize(("law", "form", "channels", "falls", "over"), [
+    (pickup, ("an error of the current sensor", "turn"), ANGLE, 8, 1.1),
+    (drum, ("a torque", "past omega"), ANGLE[:2], 5, 6)], ids=["pickup", "drum"])
+def test_what_a_magnet_adds_to_a_current_or_slips_is_found(law, form, channels, falls, over, lab, monkeypatch):
+    """Of the water a first-order lag is only near the law."""
+    _only(monkeypatch, *form)
+    runs, floor = _with_law(law, channels, lab)
+    found = mi.diagnose(mi.fit(mi.dc_motor(), runs[:2]), runs[2:], effects=("coulomb", "quadratic_drag"))
+    before, after = (mi.evaluate(fit, runs[2]).nrmse for fit in (found.best, found.remainder.fitted))
+    assert before["i"] / after["i"] > falls
+    assert max(after[c] / floor[c] for c in after) < over
 
 
 @mi.effect(balance="sensor")
@@ -1007,12 +1040,15 @@ def test_in_the_place_of_an_effect_too_such_a_form_comes_with_the_zeros(lab):
     assert plain == replace(form, zeroed=False)
 
 
-def test_records_show_a_zero_of_their_own_where_all_go_through_a_turn(lab):
+def test_records_show_a_zero_of_their_own_where_one_goes_round_and_all_go_a_part_of_a_turn(lab):
     rng = np.random.default_rng(5)
     one, two, still = (record(driven(lab, {}, w, 400, 1e-3, rng), "logger", ANGLE, lab, rng, w)
                        for w in ("stairs", "waves", "stairs 0.05"))
-    assert np.ptp(still.outputs["theta"]) < 2 * np.pi < np.ptp(two.outputs["theta"])
+    gone = np.abs(two.outputs["theta"] - two.outputs["theta"][0])
+    half = two.select(slice(int(np.argmax(gone > np.pi))))
+    assert np.ptp(still.outputs["theta"]) < 1 < np.ptp(half.outputs["theta"]) < 2 * np.pi < np.ptp(two.outputs["theta"])
     shown = [(mi.dc_motor(), [one, two], True), (mi.dc_motor(), [one], False), (mi.dc_motor(), [one, still], False),
+             (mi.dc_motor(), [one, half], True), (mi.dc_motor(), [half, half.with_(name="again")], False),
              (mi.dc_motor() + mi.effects.gravity, [one, two], False),
              (mi.dc_motor(), [one, two.without("omega").without("theta")], False)]
     for model, runs, may in shown:
@@ -1020,6 +1056,51 @@ def test_records_show_a_zero_of_their_own_where_all_go_through_a_turn(lab):
     parts = [p for run in (one, two) for p in windows(run, 0.05)]
     assert max(np.ptp(p.outputs["theta"]) for p in parts) < 2 * np.pi
     assert may_be_zeroed(mi.fit(mi.dc_motor(), parts))  # parts of one record belong together
+
+
+@one_thread
+def test_a_smaller_law_that_leaves_noise_takes_the_place_of_what_explains_most(monkeypatch):
+    """Of a lever that the plain motor loses: stops leave a tenth of its motion, a spring that hardens leaves noise."""
+    _only(monkeypatch, "a load", "theta")
+    rng, t = np.random.default_rng(2), np.arange(800) * 5e-3
+
+    @mi.effect(balance="torque")
+    def hardening(m, k_h=mi.P(1e-3, "N·m/rad³", null=0.0)):
+        m.torque -= k_h * m.theta**3
+
+    motor, runs = mi.dc_motor(R=2.0, L=2e-3, K=0.05, b=4e-4, J=2e-4) + hardening, []
+    for _ in range(3):
+        still = mi.Experiment(t, {"v": np.repeat(rng.uniform(-3, 3, 16), 50)}, {"theta": 0 * t})
+        theta = mi.simulate(motor, still, initial="rest")[0].outputs["theta"]
+        runs.append(still.with_(outputs={"theta": theta + 2e-3 * rng.standard_normal(len(t))}))
+    fit = mi.fit(mi.dc_motor(), runs[:2])
+    assert fit.nrmse["theta"] > 0.9
+    assert over_moments(fit).nrmse["theta"] < 0.3  # not of its own time constants, which are those of no motor
+    found = mi.diagnose(fit, runs[2:], effects=("end_stop",))
+    assert (found.effects, found.ladder.rungs[1].grade) == ((), "approximates")
+    assert len(found.remainder.as_effect().parameters) == 1
+    assert mi.evaluate(found.remainder.fitted, runs[2]).rmse["theta"] == pytest.approx(2e-3, rel=0.1)
+
+
+def test_what_repeats_in_another_length_than_a_turn_is_found_with_it():
+    rng, t = np.random.default_rng(2), np.arange(1500) * 2e-3
+
+    @mi.effect(balance="torque")
+    def belt(m, A=mi.P(4e-3, "N·m", null=0.0)):
+        m.torque -= A * ca.sin(1.83 * m.theta + 0.4)
+
+    noise = {"i": 0.02, "omega": 0.3, "theta": 2e-3}
+    motor, runs = mi.dc_motor(R=1.2, L=2e-3, K=0.05, b=2e-4, J=6e-5) + belt, []
+    for _ in range(3):
+        still = mi.Experiment(t, {"v": np.repeat(rng.uniform(2, 8, 10), 150)}, dict.fromkeys(noise, 0 * t))
+        shown = mi.simulate(motor, still, initial="rest")[0].outputs
+        runs.append(still.with_(outputs={c: shown[c] + s * rng.standard_normal(len(t)) for c, s in noise.items()}))
+    found = mi.diagnose(mi.fit(mi.dc_motor(), runs[:2]), runs[2:], effects=("coulomb", "gravity"))
+    assert found.remainder.follows == "a load that changes with the angle"
+    size, often, phase = found.remainder.as_effect().parameters
+    assert (size.value, often.value, phase.value) == pytest.approx((4e-3, 1.83, 0.4), rel=0.03)
+    left = mi.evaluate(found.remainder.fitted, runs[2]).rmse
+    assert all(left[c] < 1.1 * noise[c] for c in noise)
 
 
 @pytest.fixture(scope="module")
