@@ -435,14 +435,19 @@ class Answering(Mapping[Form, Array]):
         return len(self._forms)
 
 
-def linearised(fit: Fit, only: Form | None = None, span: Span | None = None) -> Linear:
-    """Return the model of `fit` on its records, with the forms that these can show, or `only` one over a span.
+def linearised(fit: Fit, only: Form | None = None, span: Span | None = None,
+               zeros: Mapping[str, float] | None = None) -> Linear:
+    """Return the model of `fit` on its records, with the forms that these can show, or `only` one over a span; over a
+    turn that begins at these `zeros`, by name as in `zeros_of`.
 
     SimulationError where its answer to small changes grows without bound; of all forms, when one is asked for.
     """
     problem = fit.problem
     residual, jac = _at(problem, fit)
     signals = signals_along(fit)
+    if zeros:
+        firsts = problem.unknowns.firsts
+        signals = [{**s, "turn": s["turn"] + zeros.get(f"z_0[{k}]", 0.0)} for s, k in zip(signals, firsts, strict=True)]
     span = span or span_of(fit, signals)
     forms = [f for f in FORMS if shown(f, fit, span.ranges)] if only is None else [only]
     free, n, runs = len(problem.model.free_names), problem.n_outputs, range(len(signals))

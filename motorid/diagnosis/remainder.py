@@ -305,9 +305,7 @@ class Curve:
 
     def refitted(self, last: Fit, *starts: Mapping[str, float]) -> Curve | None:
         """Return the curve fitted with the model, from `starts` beside the `last` values or not; None if that fails."""
-        own = {n: p.value for n, p in self.fit.model.parameters.items()}
-        known = (last.values,) if {**last.values, **own} == last.values else (last.values, {})  # each once
-        done = refit(last, self.fit.model + self.effect, [{**w, **s} for s in starts for w in known])
+        done = refit(last, self.fit.model + self.effect, [{**w, **s} for s in starts for w in (last.values, {})])
         return done and replace(self, values=tuple(done.values[n] for n in self.sizes), fitted=done)
 
     def led_by(self, begun: Curve) -> Curve | None:

@@ -363,7 +363,7 @@ def over_moments(fit: Fit, solve: Callable[[Problem], Fit] = solve) -> Fit | Non
     v, runs, model = {"R": 1.0, "K": 0.0, **fit.values}, fit.problem.experiments, fit.model.with_(angle_input=False)
     seconds = MOMENT * v["J"] * v["R"] / (v["b"] * v["R"] + v["K"] ** 2 or np.inf)  # none without friction
     shortest, longest = MIN_MOMENT * max(r.dt for r in runs), min(r.duration for r in runs)
-    if lost(fit) and not shortest < seconds < longest / 2:  # its time constants are those of no motor
+    if lost(fit) and seconds > 0 and not shortest < seconds < longest / 2:  # its time constants are those of no motor
         seconds = longest / MIN_MOMENT
     if not shortest < seconds < longest / 2 or (follows(fit) and not lost(fit)):
         return None
