@@ -56,7 +56,7 @@ def better_forms(fit: Fit, rival: Fit, channels: Container[str] = CHANNELS) -> l
         if far(fit) and free_forms.may_be_zeroed(fit):
             for form, plain in [(f, known) for f, known in answers.items() if f.on == "turn"]:
                 own = Answers(fit, free_forms.zeroed(fit, linear, form), form).predictions()
-                if plain and own and compare(plain, own).sure:  # one curve, shifted, is to do it, and not its size alone
+                if plain and own and compare(plain, own).sure:  # one curve, shifted, is to do it, not its size alone
                     shifted = free_forms.linearised(fit, form, zeros=free_forms.zeros_of(fit, form))
                     one, size = Answers(fit, shifted, form).predictions(), answers.get(replace(form, on="run"))
                     if one and compare(plain, one).sure and not (size and not compare(size, one).sure):

@@ -134,7 +134,8 @@ def _spectrum(tangent: Tangent, kind: str) -> Spectrum:
     lowest = 1 if kind in READ else max(1 if relative else 2, int(np.ceil(PERIODS * 2 * np.pi / max(travel, 1e-9))))
     if top < lowest or kind not in _kinds(fit.problem):
         return Spectrum((), False)
-    shares, lines = _order_search(tangent).shares(lowest, kind)
+    with np.errstate(over="ignore", invalid="ignore"):  # of a motor that runs away no order explains anything
+        shares, lines = _order_search(tangent).shares(lowest, kind)
     best = max((line.share for line in lines), default=0.0)
     sure = best * tangent.residual.size > SURE and best > STANDS_OUT * float(np.median(shares))
     return Spectrum(tuple(sorted(lines, key=lambda line: -line.share)), sure)
