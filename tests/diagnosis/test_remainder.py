@@ -1040,6 +1040,19 @@ def test_in_the_place_of_an_effect_too_such_a_form_comes_with_the_zeros(lab):
     assert plain == replace(form, zeroed=False)
 
 
+def test_zeros_found_in_short_windows_are_those_of_their_records(lab):
+    runs, _ = _with_law(worn, ANGLE, lab)
+    whole = mi.fit(mi.dc_motor(), runs[:2])
+    parts = mi.fit(mi.dc_motor(), [p for run in runs[:2] for p in windows(run, run.duration / 4)])
+    assert sorted(set(parts.problem.unknowns.firsts)) == [0, 4]
+    there = remainder._zeroed(parts, {"z_0[4]": 1.9})
+    again = remainder._zeroed_like(whole, there)
+    assert again.model.effect_names == ("encoder_zero",)
+    assert again.per_run["z_0"][runs[1].name]["value"] == pytest.approx(1.9, abs=0.1)
+    assert remainder._zeroed_like(again, there) is again
+    assert remainder._zeroed_like(whole, parts) is whole
+
+
 def test_records_show_a_zero_of_their_own_where_one_goes_round_and_all_go_a_part_of_a_turn(lab):
     rng = np.random.default_rng(5)
     one, two, still = (record(driven(lab, {}, w, 400, 1e-3, rng), "logger", ANGLE, lab, rng, w)
