@@ -11,6 +11,7 @@ from battery.excite import driven, record
 
 import motorid as mi
 from motorid.diagnosis.adequacy import adequacy
+from motorid.diagnosis.candidates import Search, Stages
 from motorid.diagnosis.predictive_score import deciding, finer
 from motorid.diagnosis.score_test import rank, score
 from motorid.diagnosis.thresholds import FINER, FINER_RATE, LARGER
@@ -221,9 +222,12 @@ def test_what_an_angle_that_decides_nothing_hides_is_seen_in_the_other_channels(
         fit = mi.fit(mi.dc_motor(), fine_encoder(lab, {"cogging": {"A": size, "N": 12, "phi": 0.5}}, lowest=1.0)[:2])
         assert finer(fit, "theta")
         assert fit.misfit["theta"] > 10
-        scores = rank(deciding(fit), [LIBRARY["cogging"]])
+        search = Search(fit, None, [LIBRARY["cogging"], LIBRARY["coulomb"]], Stages())
+        scores = search.scores(search.root)
+        drops, beside = ({s.effect.name: s.drop for s in found} for found in (scores, rank(fit, search.effects)))
+        assert drops["coulomb"] < 0.3 * beside["coulomb"]  # which the wandering angle asks for
         judged[size] = adequacy(fit, scores)
-        assert (scores[0].drop > 0.05) is bool(size)
+        assert (drops["cogging"] > 0.05) is bool(size)
     assert [a.adequate for a in judged.values()] == [True, False]
 
 

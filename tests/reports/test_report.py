@@ -37,6 +37,14 @@ def text(page):
     return page.read_text(encoding="utf-8")
 
 
+def test_one_run_to_validate_is_taken_as_a_list_of_it_is(found, tmp_path):
+    check = hand_made.friction()[1][0]
+    one, several = (mi.report(found, tmp_path / f"{k}.html", validate=v).read_text(encoding="utf-8")
+                    for k, v in enumerate((check, [check])))
+    assert one.count("<h2") == several.count("<h2")
+    assert one.count(check.name) == several.count(check.name) > 0
+
+
 @pytest.fixture(scope="module")
 def tree(text):
     return html5lib.HTMLParser(strict=True, namespaceHTMLElements=False).parse(text)
