@@ -16,10 +16,12 @@ from motorid.diagnosis.locate import acting_like, locate
 from motorid.diagnosis.misspecification import LIMITER
 from motorid.diagnosis.model_comparison import far
 from motorid.diagnosis.record_parts import parts_remark
+from motorid.diagnosis.refit import with_lags_exchanged
 from motorid.diagnosis.remainder import Remainder
 from motorid.diagnosis.results import Diagnosis
 from motorid.diagnosis.stepwise import Climb, explored, ladder_of
 from motorid.display.numbers import listed
+from motorid.effects import LIBRARY
 from motorid.errors import MotoridError, at_least, numbers_told
 from motorid.estimation.result import Fit, checked
 from motorid.model.definition import Effect
@@ -100,7 +102,8 @@ def _told(found: Climb, driven: str, validated: bool) -> Diagnosis:
         answer = words.missing_text(ladder.rungs, remaining, groups, found.grades, rises, found.stopped)
         same = _inseparable(found, ladder.best.model)
         also = words.hidden_remark(found.search.hidden(found.path[-1]))
-        details = [words.moves(fit, ladder.best), words.rises_text(ladder.rungs), words.inseparable_remark(same), also]
+        details = [words.moves(fit, ladder.best), words.rises_text(ladder.rungs), words.inseparable_remark(same), also,
+                   words.exchanged_remark({} if found.stopped else with_lags_exchanged(ladder.best))]
         for name, shared in same.items():  # what acts through these parameters, and that one
             inside = (e.name for e in ladder.best.model.effects if {p.name for p in e.parameters} & {*shared})
             groups = (*groups, (*inside, name))
@@ -109,7 +112,8 @@ def _told(found: Climb, driven: str, validated: bool) -> Diagnosis:
         verdict, where = "unexplained", missing.where
         judged = judged if len(found.path) > 1 else remaining
         answer = words.unexplained_text(ranking, ladder.rungs, found.grades, like.text if like else "", remaining,
-                                        done=not found.stopped)
+                                        whole={*LIBRARY} <= {e.name for e in found.search.effects},
+                                        done=bool(found.rounds) and not found.stopped)
         details = [] if len(found.path) > 1 else [judged.text]
         details += [missing.text, words.rises_text(ladder.rungs)]
     else:

@@ -43,6 +43,7 @@ class FormGain:
     evidence: Evidence
     predictions: Predictions
     smaller: bool = False  # it leaves noise with no more parameters than that model has
+    beside: bool = False  # it leaves noise beside that model, not in its place
 
 
 def better_forms(fit: Fit, rival: Fit, channels: Container[str] = CHANNELS) -> list[FormGain]:
@@ -214,7 +215,7 @@ def grades_of(last: Node, root: Node, groups: Sequence[Sequence[str]], beside: S
         smaller = without(e.name) if not why and (structure or far(last.fit)) else None
         if smaller is not None:
             free = [b for b in beside if not compare(b.predictions, beside[0].predictions).sure]
-            free = [b for b in free if _swallows(last.fit, b.form, e)]
+            free = [b for b in free if swallows(last.fit, b.form, e)]
             free = free or better_forms(smaller.fit, last.fit)
             fall = evidence(smaller, last).fall
             taken = 1 - (1 - max(fall, 0.0)) ** 2
@@ -278,10 +279,12 @@ def _insignificant(fit: Fit, effect: Effect, structure: bool) -> str:
     sizes = [p.name for p in own if p.null == 0]
     found = [(fit.values[n], fit.std[n]) for n in sizes]
     found += [(own["value"], own["std"]) for n in sizes for own in fit.per_run.get(n, {}).values()]
+    # Unless current and speed are both measured the motor's constant stays open, and with it every torque.
+    torques = {} if {"i", "omega"} <= {*fit.problem.outputs} else fit.determined
+    found += [(q.value, q.std) for n in sizes if (q := torques.get(f"{n}_voltage")) is not None]
     if sizes and not any(std is None or STANDARD_ERRORS * std < abs(value) for value, std in found):
         return f"{listed(sizes)} could as well be zero, within two standard deviations"
     open_ = [p.name for p in own if not sizes or p.name in sizes]
-    torques = {} if "i" in fit.problem.outputs else fit.determined
     known = any(fit.std[n] is not None or f"{n}_voltage" in torques for n in open_) or any(p.per_run for p in own)
     if structure and open_ and not known:
         return f"{listed(open_)} {'is' if len(open_) == 1 else 'are'} not determined, and the rest is not noise"
@@ -300,7 +303,7 @@ def _within_smoothing(fit: Fit, effect: Effect) -> str:
     return ""
 
 
-def _swallows(fit: Fit, form: Form, effect: Effect) -> bool:
+def swallows(fit: Fit, form: Form, effect: Effect) -> bool:
     """Tell whether an effect is a special case of a form that differs from it by more than a trifle. A constant
     friction is one of a friction that changes with the angle."""
     sizes = [p.name for p in effect.parameters if p.null == 0]

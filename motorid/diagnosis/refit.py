@@ -36,6 +36,7 @@ TOLD = 0.1  # nats that a step must gain: less tells no two models apart
 OPTIMUM = LevenbergMarquardt(max_iterations=60, ftol=1e-5, xtol=1e-5, looks=0)
 GOING_ON = 4  # descents at most: the last one ended at its limit, or what it left asks for a finer end
 ROOM = 10.0  # factor beyond its grid that a shape parameter may run to
+EXCHANGED = 1.5  # times another value of a lag: fewer is the same valley
 ALONE = 0.1  # of an answer: what is left of it without the others', if these do the same
 QUICKLY = partial(by_continuation, effort=QUICK, wide=False, narrow=False)  # nearly to the end
 WORSE = 1.02  # of the cost along the measured angle: the model's own angle must do as well
@@ -218,6 +219,20 @@ def led_on(fit: Fit) -> Fit | None:
         done = by_continuation(fit.problem.begun_at(fit.q), OPTIMUM, wide=False)
         return _fit_of(done) if done.cost < fit.cost else None
     return None
+
+
+def with_lags_exchanged(fit: Fit) -> dict[str, Fit]:
+    """Return, by the names of lags, the fit in which each has changed places with the winding's own, L/R, where that
+    does as well: of two lags in a row the records tell no order."""
+    found, model = {}, fit.problem.model
+    free = {n for n, p in model.parameters.items() if p.vary and not p.given}
+    for name in (p.name for e in model.effects for p in e.parameters if p.pole and free >= {p.name, "L"}):
+        start = {name: fit.values["L"] / fit.values["R"], "L": fit.values[name] * fit.values["R"]}
+        with contextlib.suppress(*FAILURES):
+            done = by_continuation(fit.problem.start_at(start), OPTIMUM, wide=False)
+            if done.cost < fit.cost + NATS and abs(np.log(done.values[name] / fit.values[name])) > np.log(EXCHANGED):
+                found |= {name: other} if (other := _fit_of(done)) else {}
+    return found
 
 
 def _fit_of(done: Estimate) -> Fit | None:

@@ -615,6 +615,13 @@ def alone_leaving_noise(last: Node, root: Fit, held: HeldOut, forms: Sequence[Fo
     return next((gain for gain in each if gain.evidence.worth_it), None)
 
 
+def beside_leaving_noise(last: Node, form: Form, held: HeldOut) -> FormGain | None:
+    """Return the form where, fitted beside all that `last` has, it leaves no more than noise. Raises OutOfTime."""
+    check_time()
+    grown = _grown(Curve(last.fit, name=_name(last.fit)), form, True, last.predictions, held)
+    return next((FormGain(form, g.gained, g.predictions, beside=True) for g in grown if g.done), None)
+
+
 def _name(fit: Fit) -> str:
     """Return a name for a curve beside those that a model has."""
     return "remainder" + "_more" * sum(n.startswith("remainder") for n in fit.model.effect_names)

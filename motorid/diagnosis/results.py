@@ -119,8 +119,8 @@ class Candidate:
     validation_nrmse : dict of str to float or None
         Held-out errors after refitting.
     held_out_gain : float or None
-        Relative fall of the error on held-out runs, or on held-out blocks without them; None where it came to no
-        such test.
+        Relative fall of the error on held-out runs, or on held-out blocks without them: geometric mean over channels
+        and runs, lone wrong samples left aside; None where it came to no such test.
     gain, gain_se : float or None
         Difference of the log predictive density on data left out (nats), and its standard error.
     parameters : dict of str to float
@@ -327,7 +327,7 @@ def ranking_table(candidates: Sequence[Candidate], most: int = 10) -> Table:
         refit = None if c.refit_drop is None else round(c.refit_drop, 5)
         rows.append([c.effect, percent(round(c.predicted_drop, 5)), percent(refit), *gain, verdict])
     note = ("Fall of the squared error, predicted from sensitivities and refitted; held out (runs, or blocks left "
-            "out): fall of the NRMSE.")
+            "out): fall of the error, mean over channels and runs, lone wrong samples left aside.")
     return Table(header, rows, "Effects tried", note, left=(0, len(header) - 1))
 
 

@@ -20,12 +20,20 @@ from motorid.diagnosis.adequacy import following, judge_adequacy, within_noise
 from motorid.diagnosis.candidates import Search, Stages, library
 from motorid.diagnosis.cross_validation import QUICK, HeldOut
 from motorid.diagnosis.input_hypotheses import Reading, better_reading, without_spikes
-from motorid.diagnosis.misspecification import IN_ITS_PLACE, FormGain, Grade, better_forms, grades_of, outdoes
+from motorid.diagnosis.misspecification import (
+    IN_ITS_PLACE,
+    FormGain,
+    Grade,
+    better_forms,
+    grades_of,
+    outdoes,
+    swallows,
+)
 from motorid.diagnosis.model_comparison import Node, at_noise, beats, choose, evidence, far, group_of, node_of
 from motorid.diagnosis.predictive_score import is_sure
 from motorid.diagnosis.record_parts import affordable, fitted_to, thinned_alike
 from motorid.diagnosis.refit import BEAM, BEHIND, INTERRUPTED, OUT_OF_TIME
-from motorid.diagnosis.remainder import alone_leaving_noise
+from motorid.diagnosis.remainder import alone_leaving_noise, beside_leaving_noise
 from motorid.diagnosis.results import Adequacy, Candidate, Ladder, Rung
 from motorid.diagnosis.thresholds import ELSEWHERE, LARGER, MATERIAL
 from motorid.diagnosis.verdict import first_answer
@@ -111,14 +119,18 @@ def _rounds(found: Climb, max_effects: int) -> Iterator[Climb]:
                 pairs += search.expand_from(best, refused)
             children |= {c.key: c for c in pairs}
             chosen = _better(pairs, best) or chosen
-        if chosen is None:
+        search.nodes |= children
+        while chosen is not None:
+            new, ordered = chosen
+            yield _with(found, new, new, new.parent is frontier[0], ())
+            if stopped:
+                return
+            search.nodes[new.key] = new = search.brought_to_its_end(new)
+            if _better([new], best):
+                break
+            chosen = _better([c for c in ordered if c.key != new.key], best)  # at its optimum it predicts no more
+        else:
             yield replace(found, text="stopped: no further effect lowers the error on data left out")
-            return
-        new, ordered = chosen
-        yield _with(found, new, new, new.parent is frontier[0], ())
-        new = new if stopped else search.brought_to_its_end(new)
-        search.nodes |= children | {new.key: new}
-        if stopped:
             return
         pruned = search.exchanged(search.pruned(new, best), best)
         pruned = pruned if pruned is new else search.brought_to_its_end(pruned)
@@ -189,31 +201,37 @@ def _still_alike(found: Climb) -> tuple[tuple[tuple[str, ...], ...], tuple[Fit, 
 
 
 def _beside_curves(found: Climb, seconds: float | None) -> Climb:
-    """Return a climb with grades that hold beside a curve, fitted in the place of all that was found. Forms are
-    compared by slopes, and these lead astray far from the records."""
+    """Return a climb with grades that hold beside a curve, fitted in the place of all that was found, or beside an
+    effect that is a special case of it. Forms are compared by slopes, and these lead astray far from the records."""
     search, best, grades = found.search, found.path[-1], list(found.grades)
     noise = found.remaining.adequate and at_noise(best)  # on held-out runs, too
     if noise or all(g.grade == "approximates" for g in grades):
         return found
-    found, curve = _curve_alone(found, search.root.fit, search.held, seconds)
+    within = [e.name for gain in found.forms[:1] for e in best.fit.model.effects
+              if e.name not in search.root.key and swallows(best.fit, gain.form, e)]
+    found, curve = _curve_alone(found, search.root.fit, search.held, seconds, bool(within))
     if curve is None:
         return found
     for k, g in enumerate(grades):
         if g.grade != "approximates" and (smaller := search.without(best, g.effect)) is not None and (
+                g.effect in within if curve.beside else
                 curve.smaller or outdoes(evidence(smaller, best).fall, curve.evidence.fall)):
             grades[k] = Grade(g.effect, "approximates", IN_ITS_PLACE.format(curve.form.text), curve.form)
             found = replace(found, remaining=following(found.remaining, curve.form.text))
     return replace(found, grades=tuple(grades))
 
 
-def _curve_alone(found: Climb, root: Fit, held: HeldOut, seconds: float | None) -> tuple[Climb, FormGain | None]:
+def _curve_alone(found: Climb, root: Fit, held: HeldOut, seconds: float | None,
+                 beside: bool = False) -> tuple[Climb, FormGain | None]:
     """Return a climb, stopped where the time is up, and the form that in the place of all that was found, beside
-    `root`, leaves noise and predicts better; None where there is none."""
+    `root`, leaves noise and predicts better, or does so `beside` all; None where there is none."""
     if found.stopped:
         return found, None
     try:
         with parallel.budget(seconds):
-            return found, alone_leaving_noise(found.path[-1], root, held, [gain.form for gain in found.forms])
+            last, forms = found.path[-1], [gain.form for gain in found.forms]
+            alone = alone_leaving_noise(last, root, held, forms)
+            return found, alone or (beside_leaving_noise(last, forms[0], held) if beside else None)
     except (OutOfTime, KeyboardInterrupt) as error:
         parallel.interruption.heard()
         stopped = OUT_OF_TIME if isinstance(error, OutOfTime) else INTERRUPTED

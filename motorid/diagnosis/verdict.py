@@ -35,10 +35,10 @@ def first_answer(fit: Fit, judged: Adequacy, scores: Sequence[Score]) -> str:
 
 
 def window_remark(fit: Fit) -> str:
-    """Say that the records were simulated in windows, and why."""
+    """Say that the records were simulated in windows, and what these are for."""
     return "" if fit.window is None else (
-        f"The records are simulated in windows of {number(fit.window, 2)} s, each from an estimated state, because "
-        "over whole records small errors of this model grow too large. Errors are those of a window ahead.")
+        f"The records are simulated in windows of {number(fit.window, 2)} s, each from an estimated state: over whole "
+        "records small errors of a model may grow. Errors are those of a window ahead.")
 
 
 def adequate_text(judged: Adequacy, ranking: Sequence[Candidate], large: bool = False) -> tuple[str, str]:
@@ -53,14 +53,15 @@ def adequate_text(judged: Adequacy, ranking: Sequence[Candidate], large: bool = 
 
 
 def unexplained_text(ranking: Sequence[Candidate], rungs: Sequence[Rung], grades: Sequence[Grade], like: str,
-                     remaining: Adequacy, *, done: bool = True) -> str:
+                     remaining: Adequacy, *, whole: bool = True, done: bool = True) -> str:
     """Return the answer when something is missing that the library does not have, or only something like it.
 
-    Not `done`: the search was stopped before all effects were tried.
+    Not `whole`: only some effects were asked for. Not `done`: the search was stopped before all of these were tried.
     """
-    lead = f"Unexplained: {like}, which no effect of the library describes." if like else (
+    none = "no effect of the library" if whole else "none of the effects asked for"
+    lead = f"Unexplained: {like}, which {none} describes." if like else (
         "Something is missing, and these records do not show what." if grades and remaining.adequate else
-        "Unexplained: something is missing, and no effect of the library explains it.")
+        f"Unexplained: something is missing, and {none} explains it.")
     lead = lead if done else f"Unexplained so far: {like or 'something is missing'}; not all effects were tried."
     if grades:
         curve = f"{like}, which the library lacks, predicts better in its place"  # the same in few words
@@ -255,6 +256,12 @@ def hidden_remark(hidden: Mapping[tuple[str, str], tuple[str, ...]]) -> str:
     """Say which wider effects than those found do the same with other values of parameters, and what would tell."""
     return " ".join(f"'{wider}' with other values of {listed(parameters)} does the same as '{name}'. To distinguish "
                     f"them, fix one of these where it is known." for (name, wider), parameters in hidden.items())
+
+
+def exchanged_remark(exchanged: Mapping[str, Fit]) -> str:
+    """Say with which other values a lag and the winding's own do the same."""
+    return " ".join(f"{n} and L/R may as well be exchanged: {n} = {parameter_cell(fit, n)}, L = "
+                    f"{parameter_cell(fit, 'L')} do no worse." for n, fit in exchanged.items())
 
 
 def outliers_remark(fit: Fit) -> str:

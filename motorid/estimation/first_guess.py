@@ -25,6 +25,7 @@ from motorid.records.experiment import Experiment
 BASE = ("R", "L", "K", "b", "J", "g")
 BACK_EMF = 0.9
 FLOOR = 1e-3  # share of its natural size given to a parameter that comes out as zero
+FASTEST = 0.2  # samples, L/R at least: from below the cost of an inductance has a valley of its own
 
 
 def first_guess(model: Model, runs: Sequence[Experiment], *, loaded: bool = False,
@@ -45,6 +46,8 @@ def first_guess(model: Model, runs: Sequence[Experiment], *, loaded: bool = Fals
         found = _without_speed([s for s in signals if "i" in s], held)
     elif not both or _rings(found := _full(both, held, loads), signals):  # with a current that is not the motor's
         found = _without_current(turning, held, loads, back_emf)
+    if "L" in found:
+        found["L"] = max(found["L"], FASTEST * found["R"] * min(float(np.median(np.diff(s["t"]))) for s in signals))
     base = {n: held.get(n, v) for n, v in found.items() if n in model.parameters and np.isfinite(v)}
     return {n: v for n, v in base.items() if v > 0 or n not in BASE}
 

@@ -10,7 +10,7 @@ import pytest
 from battery.excite import driven, record
 
 import motorid as mi
-from motorid.diagnosis import admissibility, candidates, free_forms, misspecification, stepwise
+from motorid.diagnosis import admissibility, candidates, free_forms, misspecification, refit, stepwise
 from motorid.diagnosis.adequacy import adequacy
 from motorid.diagnosis.admissibility import objections
 from motorid.diagnosis.candidates import library
@@ -36,6 +36,15 @@ def weak_friction(m, tau_w=mi.P(1e-3, "N·m", null=0.0, lower=0.0, upper=5e-3)):
 def runs_of(motor, hidden, drives=DRIVES, channels=("i", "omega"), n=600):
     rng = np.random.default_rng(6)
     return [record(driven(motor, hidden, w, n, 1e-3, rng), "logger", channels, motor, rng, w) for w in drives]
+
+
+def stepped(model, seed, n=1000, dt=1e-3, most=6.0, steps=12, **noise):
+    """A record of random voltage steps with these deviations of the noise, integrated finely."""
+    rng, t = np.random.default_rng(seed), np.arange(n) * dt
+    v = np.repeat(rng.uniform(-most, most, steps), -(-n // steps))[:n]
+    still = mi.Experiment(t, {"v": v}, dict.fromkeys(noise, 0 * t), sigma=noise, name=f"run{seed}")
+    shown = mi.simulate(model, still, initial="rest")[0].outputs
+    return still.with_(outputs={c: shown[c] + s * rng.standard_normal(n) for c, s in noise.items()}, sigma=None)
 
 
 @pytest.fixture(scope="module")
@@ -330,3 +339,65 @@ def test_a_warm_start_is_no_surer_than_the_heating_that_it_begins(lab):
     sure = replace(heating, grade="named"), *grades[1:]
     assert misspecification._no_surer_than_what_they_act_on(sure, fit) == sure
 
+
+
+@pytest.mark.parametrize("seed", [2, 4, 8])
+def test_what_a_wider_law_beside_it_explains_to_the_noise_approximates(monkeypatch, seed):
+    """A spring that hardens: stops do 95 % of what it does, and a curve over the angle the rest."""
+    form = next(f for f in free_forms.FORMS if (f.words, f.on) == ("a load", "theta"))
+    monkeypatch.setattr(free_forms, "FORMS", (form,))
+    monkeypatch.setattr(stepwise, "alone_leaving_noise", lambda *given: None)
+
+    @mi.effect(balance="torque")
+    def hardening(m, k_h=mi.P(1e-5, "N·m/rad³", null=0.0)):
+        m.torque -= k_h * m.theta**3
+
+    motor = mi.dc_motor(R=2.0, L=2e-3, K=0.05, b=4e-4, J=2e-4) + hardening
+    runs = [stepped(motor, 10 * seed + k, 600, 5e-3, 3.0, theta=2e-3) for k in range(3)]
+    found = mi.diagnose(mi.fit(mi.dc_motor(), runs[:2]), runs[2:], effects=("end_stop",))
+    rung = found.ladder.rungs[1]
+    assert (rung.added, rung.grade) == ("end_stop", "approximates"), found.text
+    assert "a load that changes with the angle" in rung.why
+
+
+def test_friction_is_known_from_the_current_alone_as_a_voltage():
+    """The motor's constant stays open there, and with it every torque."""
+    motor = mi.dc_motor(R=1.2, L=1e-3, K=0.05, b=2e-5, J=5e-5) + mi.effects.coulomb(tau_c=8e-3)
+    runs = [stepped(motor, seed, i=0.02) for seed in range(3)]
+    found = mi.diagnose(mi.fit(mi.dc_motor(), runs[:2]), runs[2:], effects=("coulomb", "constant_load", "current_lag"))
+    assert (found.verdict, found.effects) == ("missing", ("coulomb",)), found.text
+    volts = found.after.determined["tau_c_voltage"]
+    assert volts.value == pytest.approx(0.192, abs=3 * volts.std) and volts.std < 0.005
+    assert "R·tau_c/K = 0.19" in found.answer
+
+
+def test_of_two_lags_in_a_row_the_other_order_is_told():
+    truth = {"R": 1.2, "L": 1e-3, "K": 0.05, "b": 2e-5, "J": 5e-5}
+    runs = [stepped(mi.dc_motor(**truth) + mi.effects.driver_lag(T_v=4e-3), seed, i=0.02, omega=0.3)
+            for seed in range(3)]
+    found = mi.diagnose(mi.fit(mi.dc_motor(), runs[:2]), runs[2:], effects=("driver_lag", "coulomb"))
+    assert found.effects == ("driver_lag",)
+    said = next(d for d in found.details if "may as well be exchanged" in d)
+    values, other = found.after.values, refit.with_lags_exchanged(found.after)["T_v"].values
+    assert min(abs(v["T_v"] / 4e-3 - 1) + abs(v["L"] / 1e-3 - 1) for v in (values, other)) < 0.05
+    assert "T_v = (8." in said or "T_v = (4.0" in said or "T_v = (3.9" in said
+
+
+def test_what_predicts_no_more_at_its_optimum_is_not_taken(monkeypatch, rubbing):
+    taken, whole = [], candidates.Search.brought_to_its_end
+
+    def worse(self, node):
+        """The optimum of a wider law, which a refit had not reached, predicts no better than before."""
+        taken.append(node.added)
+        return replace(node, predictions=self.root.predictions) if node.added == "stribeck" else whole(self, node)
+
+    monkeypatch.setattr(candidates.Search, "brought_to_its_end", worse)
+    found = mi.diagnose(*rubbing, effects=("stribeck", "quadratic_drag"))
+    assert taken[0] == "stribeck" and "stribeck" not in found.effects
+    assert all(rung.gain > 0 for rung in found.ladder.rungs[1:])
+
+
+def test_an_answer_names_the_library_only_where_it_was_tried(rubbing):
+    some, none = mi.diagnose(*rubbing, effects=("cogging",)), mi.diagnose(*rubbing, max_effects=0)
+    assert "none of the effects asked for" in some.answer and "library" not in some.answer
+    assert "not all effects were tried" in none.answer
