@@ -5,6 +5,7 @@ import math
 import os
 import threading
 from collections.abc import Callable, Mapping
+from datetime import datetime
 from pathlib import Path
 from typing import NamedTuple
 
@@ -50,7 +51,8 @@ def check_target(out: Path, resume: bool, force: bool) -> None:
 
 
 def read_tail(out: Path) -> Tail:
-    """Read where a record ends; a last line that was cut off does not count. DataError if motorid did not make it."""
+    """Read where a record ends; a last line that was cut off does not count. DataError if motorid did not make it, or
+    not these notes of it."""
     meta: dict[str, str] = {}
     columns, last = "", ""
     with open(out, encoding="utf-8", errors="replace", newline="") as file:
@@ -62,6 +64,12 @@ def read_tail(out: Path) -> Tail:
                 columns = line.strip()
             elif line.endswith("\n"):
                 last = line
+    for key, read in (("started", datetime.fromisoformat), ("segments done", int), ("part begins", float)):
+        try:
+            read(meta[key]) if key in meta else None
+        except ValueError:
+            raise DataError(f"{out}, '# {key}: {meta[key]}' is damaged, so it cannot be continued. Mend that line, or "
+                            "choose another name for --out.") from None
     try:
         cells = dict(zip(columns.split(","), last.split(","), strict=True))
         return Tail(columns, int(cells["sample"]), float(cells["time_s"]), meta)

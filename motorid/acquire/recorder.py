@@ -107,11 +107,11 @@ def record(port: str | Link, out: str | Path, *, baud: int = 115_200, excite: st
             commanded = partial(_commanded, told, kept, device.rate, todo)
             beside = abs(told.scale * (told.offset - kept.offset))  # what may be reported, as a calibration makes it
             most = {"v": abs(kept.scale / told.scale) * (1.01 * limits[0] + beside), "i": limits[1]}
+            if tail:
+                _begin_part(file, tail, len(whole.segments) - len(todo.segments))  # before anything moves
             session = Session(client, header, file, len(todo.segments), commanded, most,
                               min((e for e in (todo.duration, duration) if e), default=None), duration,
                               max(timeout, 4 / header.rate), progress)
-            if tail:
-                _begin_part(file, tail, len(whole.segments) - len(todo.segments))
             return session.run()
         finally:
             with contextlib.suppress(OSError):  # told already, where it matters
@@ -151,7 +151,7 @@ def _begin_part(file: RecordFile, tail: Tail, done: int) -> None:
     """Set the time axis of a resumed record, by the clock of this computer, and mark the pause."""
     now, at = datetime.now().astimezone(), tail.time + 2 / file.rate
     if "started" in tail.meta:
-        at = max(at, (now - datetime.fromisoformat(tail.meta["started"])).total_seconds())
+        at = max(at, (now - datetime.fromisoformat(tail.meta["started"]).astimezone()).total_seconds())
     at = math.ceil(at * file.rate) / file.rate
     file.pause(tail, at)
     file.note({"resumed": now.isoformat(timespec="milliseconds"), "part begins": f"{at:.6f}", "segments done": done,

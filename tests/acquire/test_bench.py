@@ -26,7 +26,7 @@ from motorid.acquire.excitation import program
 from motorid.acquire.protocol import frame
 from motorid.acquire.server import Faults, Wire
 from motorid.acquire.virtual import VirtualDevice, hide
-from motorid.errors import DeviceError, UsageError
+from motorid.errors import DataError, DeviceError, UsageError
 from motorid.records.datasets import load_plant
 
 needs_pty = pytest.mark.skipif(not hasattr(os, "openpty"), reason="this system has no pseudo-terminals")
@@ -382,6 +382,25 @@ def test_resume_twice_still_knows_what_is_left(out):
     volts = [float(r["voltage_V"]) for r in rows(out)]
     assert [v for v in (1.0, 2.0, 3.0) if volts.count(v) < 100] == []
     assert volts[-100:] == [3.0] * 100
+
+
+@pytest.mark.parametrize(("was", "is_"), [(r"# started: \S+", "# started: yesterday"),
+                                          ("# segments done: 0", "# segments done: some")])
+def test_a_record_with_damaged_notes_is_not_resumed_and_nothing_moves(out, was, is_):
+    record(MemoryLink(device(), step=10, unplug_after=1000), out, excite="step:1:0.1,step:2:0.1")
+    record(MemoryLink(device(), step=10, unplug_after=1000), out, resume=True)
+    out.write_text(re.sub(was, is_, text := out.read_text()))
+    assert out.read_text() != text
+    motor = device()
+    with pytest.raises(DataError, match=f"'{is_}' is damaged"):
+        record(MemoryLink(motor), out, resume=True)
+    assert not motor.running
+
+
+def test_a_start_without_a_time_zone_is_of_this_computer_s(out):
+    record(MemoryLink(device(), step=10, unplug_after=1000), out, excite="step:1:0.1,step:2:0.1")
+    out.write_text(re.sub(r"(# started: [^+\n]+)\S*", r"\1", out.read_text()))
+    assert record(MemoryLink(device()), out, resume=True).ended == "done"
 
 
 def test_resume_without_a_file_just_records(out):
