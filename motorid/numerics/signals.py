@@ -53,14 +53,9 @@ def robust_std(r: Array) -> float:
     return 1.4826 * float(np.median(size)) if size.size else 0.0
 
 
-def outlier_limit(r: Array) -> float:
-    """Return the size beyond which a residual counts as an outlier."""
-    return CLIP * robust_std(r)
-
-
 def winsorised(r: Array) -> Array:
     """Return `r` with zero for what is missing, outliers cut."""
-    limit = outlier_limit(r)
+    limit = CLIP * robust_std(r)
     return np.clip(np.nan_to_num(r), -limit, limit) if limit > 0 else np.nan_to_num(r)
 
 
@@ -74,7 +69,7 @@ def despiked(r: Array) -> Array:
         return r
     before, after = np.concatenate([r[1:2], r[:-1]]), np.concatenate([r[1:], r[-2:-1]])
     middle = np.maximum(np.minimum(before, r), np.minimum(np.maximum(before, r), after))
-    return np.where(np.abs(r - middle) > outlier_limit(r), middle, r)
+    return np.where(np.abs(r - middle) > CLIP * robust_std(r), middle, r)
 
 
 def quantum(y: ArrayLike) -> float:
