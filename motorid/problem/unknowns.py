@@ -108,15 +108,6 @@ class Unknowns:
         return np.where(turns, (np.remainder(q * size + np.pi, 2 * np.pi) - np.pi) / size, q)
 
     @cached_property
-    def _columns(self) -> NDArray[np.int64]:
-        """Index into the system's p of each free parameter."""
-        return np.array([self.system.parameters.index(p.name) for p in self.free], int)
-
-    @cached_property
-    def _fixed(self) -> Array:
-        return np.array([self.parameters[n].value for n in self.system.parameters])
-
-    @cached_property
     def _places(self) -> Sequence[tuple[list[int], list[int]]]:
         """Per run: indices into (i, omega, theta) at the start, and the columns of q that they are."""
         places: list[tuple[list[int], list[int]]] = [([], []) for _ in self.runs]
@@ -136,10 +127,11 @@ class Unknowns:
         """Return `q` in the system's terms."""
         physical = self.scaling.physical(q)
         slope = np.where(self.scaling.log, physical, self.scaling.scale)
-        p, n = self._fixed.copy(), len(self.free)
-        p[self._columns] = physical[:n]
+        names, n = self.system.parameters, len(self.free)
+        p, places = np.array([self.parameters[n].value for n in names]), [names.index(f.name) for f in self.free]
+        p[places] = physical[:n]
         dp = np.zeros((len(p), len(q)))
-        dp[self._columns, np.arange(n)] = slope[:n]
+        dp[places, np.arange(n)] = slope[:n]
         return Point(q, physical, slope, p, dp)
 
     def of_run(self, at: Point, k: int) -> Point:
