@@ -197,10 +197,8 @@ def with_options(kind: type) -> Callable[[Callable[..., None]], Callable[..., No
             taken = {f.name: given.pop(f.name) for f in fields(kind)}
             command(**given, options=kind(**taken))
 
-        required = [p for p in mine if p.default is p.empty]
-        every = [*required, *parts, *(p for p in mine if p not in required)]
-        run.__signature__ = inspect.Signature(every)  # type: ignore[attr-defined]
-        run.__annotations__ = {p.name: p.annotation for p in every}
+        run.__signature__ = inspect.Signature([*parts, *mine])  # type: ignore[attr-defined]
+        run.__annotations__ = {p.name: p.annotation for p in (*parts, *mine)}
         return run
 
     return wrap
