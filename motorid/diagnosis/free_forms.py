@@ -136,7 +136,8 @@ FORMS = (*(Form(words, balance, on, carrier) for words, balance, carrier, quanti
 @dataclass(frozen=True)
 class Span:
     """What a form reaches over: the range of every quantity, the orders of a turn, the time between samples (s); how
-    many places and knees it has, for each of the few by which forms are compared; how often it repeats in a turn."""
+    many places and knees it has, for each of the few by which forms are compared; how often it repeats in a turn; the
+    channels whose sensor's gain the motor's own parameters make up."""
 
     ranges: Mapping[str, tuple[float, float]]
     orders: tuple[float, ...]
@@ -144,6 +145,7 @@ class Span:
     finer: int = 1
     rates: Mapping[str, Sequence[float]] = field(default_factory=dict)  # of waves over the time, rad/s, or the angle
     pitches: int = 1
+    unscaled: tuple[str, ...] = ()
 
 
 def span_of(fit: Fit, signals: Sequence[Mapping[str, Array]]) -> Span:
@@ -164,7 +166,10 @@ def span_of(fit: Fit, signals: Sequence[Mapping[str, Array]]) -> Span:
         cell = max(2 * np.pi / FINEST, travel / max(len(s["theta"]) for s in signals))
         found = _rates(fit, [s["theta"] for s in signals], cell)
         rates["theta"] = [w for w in found if abs(w - round(w)) * travel > 2 * np.pi]
-    return Span(ranges, tuple(sorted(orders)), step, rates={on: own[:LINES] for on, own in rates.items()})
+    free, moving = set(fit.problem.model.free_names), len({"omega", "theta"} & {*fit.problem.outputs})
+    unscaled = tuple(c for c, own in (("i", "RLbJ"), ("omega", "KbJ")) if free >= {*own} and (c == "i" or moving == 1))
+    rates = {on: own[:LINES] for on, own in rates.items()}
+    return Span(ranges, tuple(sorted(orders)), step, rates=rates, unscaled=unscaled)
 
 
 def _rates(fit: Fit, along: Sequence[Array], step: float) -> list[float]:
@@ -258,11 +263,13 @@ def functions_of(form: Form, span: Span) -> list[str]:
                 found += [f"({sign}z > 0) * ca.exp(-ca.fabs(z) / {fade})" for fade in fades]
         return found
     found = (_along if form.on in ("theta", "t", "distance") else _of_size)(form, span, low, high)
-    if form.carrier != "acceleration":
+    middle = f"{0.5 * max(low, high, key=abs) if form.on in ('i', 'omega') else 0.5 * (low + high):.9g}"
+    there = {f: at if PLACE.search(at := Z.sub(f"({middle})", f)) else f"{eval(at, NUMBERS):.9g}" for f in found}
+    if form.carrier == "acceleration":  # there the motor's own J is the inertia
+        return [f"({f} - {at})" for f, at in there.items()]
+    if form.balance != "sensor" or form.channel != form.on or form.on not in span.unscaled:
         return found
-    middle = f"{0.5 * max(abs(low), abs(high)) if form.on == 'omega' else 0.5 * (low + high):.9g}"
-    there = {f: Z.sub(middle, f) for f in found}  # where the motor's own J is the inertia
-    return [f"({f} - {at if PLACE.search(at) else f'{eval(at, NUMBERS):.9g}'})" for f, at in there.items()]
+    return ["1.0", *(f"({f} - z / ({middle}) * {at})" for f, at in there.items() if f not in ("1.0", found[1]))]  # 1: z
 
 
 def _sided(form: Form, lengths: Array, top: float) -> list[str]:
@@ -303,7 +310,8 @@ def _of_size(form: Form, span: Span, low: float, high: float) -> list[str]:
         low, high = -top, top
     s = f"(ca.fmin(ca.fmax(z, {low:.9g}), {high:.9g}) / {top:.6g})"
     size = f"ca.fabs{s}"
-    bends = [_place(bend, SOFT, 1) if form.carrier == "direction" else bend for bend in BENDS]
+    moved = form.carrier == "direction" or form.channel == form.on in span.unscaled
+    bends = [_place(bend, SOFT, 1) if moved else bend for bend in BENDS]
     smooth = [s, f"{s}**2", f"{s}**3", *(f"ca.tanh({s} / {bend})" for bend in bends)]
     sides = [sign for sign, reach in (("", high), ("-", -low)) if reach > 0]
     knees = [_place(c, 0, 1) for c in np.linspace(0, 1, KNEES * span.finer + 2)[1:-1]]

@@ -1095,6 +1095,28 @@ def test_a_smaller_law_that_leaves_noise_takes_the_place_of_what_explains_most(m
     assert mi.evaluate(found.remainder.fitted, runs[2]).rmse["theta"] == pytest.approx(2e-3, rel=0.1)
 
 
+def test_an_error_of_a_sensor_leaves_the_motor_its_parameters(monkeypatch):
+    """A curve over what its sensor reads would be a gain, too, and that R, L, b and J together: R was 2.1 ± 0.1 Ω."""
+    _only(monkeypatch, "an error of the current sensor", "i")
+
+    @mi.effect(balance="sensor")
+    def offset_with_load(m, c=mi.P(0.3, "A", null=0.0)):
+        m.measure("i", m.measured("i") + c * ca.tanh(m.measured("i") / 0.5) ** 2)
+
+    noise, t, truth = {"i": 0.02, "omega": 0.3}, np.arange(1000) * 1e-3, {"R": 1.2, "L": 1e-3, "J": 5e-5}
+    motor, runs = mi.dc_motor(**truth, K=0.05, b=2e-5) + offset_with_load, []
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        still = mi.Experiment(t, {"v": rng.uniform(-6, 6, 12)[np.arange(1000) * 12 // 1000]}, dict.fromkeys(noise, 0 * t))
+        shown = mi.simulate(motor, still, initial="rest")[0].outputs
+        runs.append(still.with_(outputs={c: shown[c] + s * rng.standard_normal(1000) for c, s in noise.items()}))
+    found = mi.diagnose(mi.fit(mi.dc_motor(), runs[:2]), runs[2:], effects=("current_offset",))
+    with_curve = found.remainder.fitted
+    assert mi.evaluate(with_curve, runs[2]).rmse["i"] < 1.25 * noise["i"]
+    for name, value in truth.items():  # the sensor is taken to be right at half of its range, where it reads 6 % more
+        assert with_curve.values[name] == pytest.approx(value, rel=0.12)
+
+
 def test_what_repeats_in_another_length_than_a_turn_is_found_with_it():
     rng, t = np.random.default_rng(2), np.arange(1500) * 2e-3
 
