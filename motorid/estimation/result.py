@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from motorid.channels import channel_name
+from motorid.channels import CHANNELS, channel_name
 from motorid.display.cards import Card, Cell, Flag, Printed, Shown, Table
-from motorid.display.numbers import counted, duration, number, percent, quantity, sentence, with_error
+from motorid.display.numbers import counted, duration, listed, number, percent, quantity, sentence, with_error
 from motorid.errors import UsageError, name_of
 from motorid.estimation.covariance import Certainty, Quantity, certainty, combinations
 from motorid.model.model import Model
@@ -169,7 +169,9 @@ class Fit(Shown):
         if self.fits == "noise" and self.problem.unknown and not any([*self.std.values(), *self.determined]):
             said = "Nothing is determined: the records do not show what the motor does, and any values fit them"
         if self.window:
+            anew = [s for s in self.problem.system.states if s not in (*CHANNELS, "clock", "distance")]
             said += f", a window of {number(self.window, 2)} s ahead"
+            said += f"; {listed(anew)} begin{'s' * (len(anew) == 1)} anew in each" if anew else ""
         end = "" if self.status == "converged" else f" Not converged ({self.status}): the values are not an optimum."
         return f"{said} (NRMSE {self.evaluation.words}).{end}"
 

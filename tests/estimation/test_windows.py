@@ -132,6 +132,15 @@ def in_detents(seed: int) -> mi.Experiment:
     return still.with_(outputs={c: shown[c] + rng.normal(0, s, len(t)) for c, s in noise.items()})
 
 
+def test_what_no_sensor_shows_begins_anew_in_each_window_which_is_said():
+    t = np.arange(600) * 1e-2
+    run = mi.Experiment(t, {"v": 4 * np.sign(np.sin(3 * t))}, {"i": 0 * t, "omega": 0 * t})
+    warm = mi.dc_motor(R=1.2, L=1e-3, K=0.05, b=2e-5, J=5e-5) + mi.effects.winding_heating
+    run = run.with_(outputs=mi.simulate(warm, run, initial="rest")[0].outputs)
+    assert "; dT begins anew in each" in mi.fit(warm, run, window=2.0).verdict
+    assert "anew" not in mi.fit(warm.without("winding_heating"), run, window=2.0).verdict
+
+
 def test_where_detents_decide_a_motor_is_followed_in_windows_if_these_leave_noise():
     runs = [in_detents(3), in_detents(4)]
     model = mi.dc_motor() + mi.effects.cogging(N=12)
