@@ -367,7 +367,8 @@ def test_friction_is_known_from_the_current_alone_as_a_voltage():
     found = mi.diagnose(mi.fit(mi.dc_motor(), runs[:2]), runs[2:], effects=("coulomb", "constant_load", "current_lag"))
     assert (found.verdict, found.effects) == ("missing", ("coulomb",)), found.text
     volts = found.after.determined["tau_c_voltage"]
-    assert volts.value == pytest.approx(0.192, abs=3 * volts.std) and volts.std < 0.005
+    assert volts.value == pytest.approx(0.192, abs=3 * volts.std)
+    assert volts.std < 0.005
     assert "R·tau_c/K = 0.19" in found.answer
 
 
@@ -393,11 +394,13 @@ def test_what_predicts_no_more_at_its_optimum_is_not_taken(monkeypatch, rubbing)
 
     monkeypatch.setattr(candidates.Search, "brought_to_its_end", worse)
     found = mi.diagnose(*rubbing, effects=("stribeck", "quadratic_drag"))
-    assert taken[0] == "stribeck" and "stribeck" not in found.effects
+    assert taken[0] == "stribeck"
+    assert "stribeck" not in found.effects
     assert all(rung.gain > 0 for rung in found.ladder.rungs[1:])
 
 
 def test_an_answer_names_the_library_only_where_it_was_tried(rubbing):
     some, none = mi.diagnose(*rubbing, effects=("cogging",)), mi.diagnose(*rubbing, max_effects=0)
-    assert "none of the effects asked for" in some.answer and "library" not in some.answer
+    assert "none of the effects asked for" in some.answer
+    assert "library" not in some.answer
     assert "not all effects were tried" in none.answer

@@ -1107,7 +1107,8 @@ def test_an_error_of_a_sensor_leaves_the_motor_its_parameters(monkeypatch):
     motor, runs = mi.dc_motor(**truth, K=0.05, b=2e-5) + offset_with_load, []
     for seed in range(3):
         rng = np.random.default_rng(seed)
-        still = mi.Experiment(t, {"v": rng.uniform(-6, 6, 12)[np.arange(1000) * 12 // 1000]}, dict.fromkeys(noise, 0 * t))
+        v = rng.uniform(-6, 6, 12)[np.arange(1000) * 12 // 1000]
+        still = mi.Experiment(t, {"v": v}, dict.fromkeys(noise, 0 * t))
         shown = mi.simulate(motor, still, initial="rest")[0].outputs
         runs.append(still.with_(outputs={c: shown[c] + s * rng.standard_normal(1000) for c, s in noise.items()}))
     found = mi.diagnose(mi.fit(mi.dc_motor(), runs[:2]), runs[2:], effects=("current_offset",))

@@ -153,7 +153,7 @@ def test_a_current_that_is_not_the_motor_s_is_no_first_guess(rng):
 
 
 def test_an_inductance_is_led_out_of_the_valley_below_the_samples():
-    """Friction that the plain motor lacks makes the integral's inductance negative: begun near zero, it stayed there."""
+    """Friction that the plain motor lacks makes the integral's inductance negative: begun near zero it stayed there."""
     motor = mi.dc_motor(R=1.2, L=1e-3, K=0.05, b=2e-5, J=5e-5) + mi.effects.coulomb(tau_c=8e-3)
     t, draws = np.arange(1000) * 1e-3, [np.random.default_rng(k) for k in (1, 2)]
     runs = [noisy(simulated(t, rng.uniform(-6, 6, 12)[np.arange(1000) * 12 // 1000], ("i",), motor), rng, {"i": 0.02})
