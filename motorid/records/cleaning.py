@@ -11,7 +11,7 @@ from motorid.channels import MEASURED_INPUTS
 from motorid.display.numbers import counted
 from motorid.errors import DataError
 from motorid.numerics.signals import Array, repeats
-from motorid.records.experiment import INPUTS, MIN_SAMPLES, Experiment, pauses
+from motorid.records.experiment import INPUTS, MIN_SAMPLES, PARTS, Experiment, pauses
 from motorid.records.layout import Layout, Place
 from motorid.records.preprocessing import unwrapped
 
@@ -21,10 +21,11 @@ _LATE = 2  # this many rows in a row may come late before it counts as a new sta
 
 
 def run_from_columns(columns: Mapping[str, Array], texts: Texts, layout: Layout, *, name: str, hold: str,
-                     sigma: Mapping[str, float], meta: Mapping[str, Any], notes: Sequence[str]) -> Experiment:
+                     sigma: Mapping[str, float], meta: Mapping[str, Any], notes: Sequence[str],
+                     resumed: Sequence[float] = ()) -> Experiment:
     """Make a valid run of the columns of a file: numbers with NaN where missing, and `texts`, which may be dates.
 
-    `notes` and those made here end up in ``meta["notes"]``.
+    `notes` and those made here end up in ``meta["notes"]``; `resumed` are the times (s) at which a recording went on.
     """
     said = [*notes, *layout.notes]
     columns = {n: np.where(np.isnan(c), np.nan, c) for n, c in columns.items()}  # one of a damaged file may signal
@@ -57,8 +58,8 @@ def run_from_columns(columns: Mapping[str, Array], texts: Texts, layout: Layout,
     extra = {c: a[rows] for c, a in columns.items() if c not in used}
     if set(texts) - used:
         said.append(f"left out columns of text: {', '.join(sorted(set(texts) - used))}.")
-    if begun:
-        meta = {**meta, "parts": sorted({*meta.get("parts", ()), *begun})}
+    for column, times, late in zip(PARTS, (begun, resumed), (0.0, float(np.median(np.diff(t))) / 2), strict=True):
+        extra |= {column: np.searchsorted(times, t + late, "right")} if len(times) else {}
     facts = {**meta, "notes": said, "extra": extra, "columns": {c: p.column for c, p in layout.places.items()},
              "original_units": {c: p.unit.label for c, p in layout.places.items()},
              "assumed_units": [c for c, p in layout.places.items() if not p.stated]}

@@ -24,6 +24,7 @@ from motorid.records import preprocessing
 
 INPUTS = ("v", *MEASURED_INPUTS)
 MIN_SAMPLES = 8
+PARTS = ("motorid record", "motorid part")  # extra columns that change where the clock starts again, a part begins
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,6 +124,8 @@ class Experiment(Shown):
         """Return a copy with some fields replaced, validated again."""
         for key in changes:
             among(key, (f.name for f in dataclasses.fields(self)), "field", where="with_(): ")
+        if np.size(changes.get("t", self.t)) != self.n:  # its extra columns were of other samples
+            changes = {"meta": {k: x for k, x in self.meta.items() if k != "extra"}, **changes}
         return dataclasses.replace(self, **changes)
 
     def select(self, keep: slice | ArrayLike) -> Experiment:
@@ -148,28 +151,31 @@ class Experiment(Shown):
         return self.with_(outputs={k: a for k, a in self.outputs.items() if k not in channels})
 
     def decimate(self, k: int) -> Experiment:
-        """Return every k-th sample.
+        """Return every k-th sample, of each part between pauses by itself.
 
         Outputs are picked, not filtered: a filter would add a lag that looks like physics. A held voltage is
         averaged over each longer step, which keeps its integral; a linear one is picked, and other inputs are.
         """
         if int(k) != k or k < 1:
             raise UsageError(f"decimate() takes a whole number of at least 1; got {k!r}.")
-        coarse = self.select(slice(None, None, int(k)))
+        parts = parts_of(self)
+        starts = np.concatenate([np.arange(s.start, s.stop, int(k)) for s in parts])
+        cuts = [s.start for s in parts[1:]]  # which a longer step may no longer show
+        told = {PARTS[1]: np.searchsorted(cuts, np.arange(self.n), "right")} if cuts else {}
+        coarse = self.with_(meta={**self.meta, "extra": {**self.meta.get("extra", {}), **told}}).select(starts)
         if self.hold == "linear" or k == 1:
             return coarse
-        starts, width = np.arange(0, self.n, int(k)), np.diff(self.t)
-        width = np.append(width, width[-1])  # the last sample is held for as long as the one before
+        width = self._by_parts(np.zeros(self.n), lambda s: np.diff(self.t[s], append=2 * self.t[s][-1] - self.t[s][-2]))
         mean = np.add.reduceat(self.inputs["v"] * width, starts) / np.add.reduceat(width, starts)
         return coarse.with_(inputs={**coarse.inputs, "v": mean})
 
     def running_median(self, samples: int) -> Experiment:
         """Return the run with its voltage, noisy as it was measured, replaced by the median over `samples` (odd)."""
-        return self._with_inputs(lambda v: preprocessing.running_median(v, samples))
+        return self._with_voltage(lambda s: preprocessing.running_median(self.inputs["v"][s], samples))
 
     def levelled(self) -> Experiment:
         """Return the run with a voltage that is constant between its steps, but was measured with noise, made so."""
-        return self._with_inputs(preprocessing.levelled)
+        return self._with_voltage(lambda s: preprocessing.levelled(self.inputs["v"][s]))
 
     def delayed(self, seconds: float) -> Experiment:
         """Return the run with a voltage that acts later than its column says, earlier if `seconds` is negative.
@@ -180,21 +186,33 @@ class Experiment(Shown):
         if not np.isfinite(seconds) or abs(seconds) >= self.duration:
             raise UsageError(f"{self.name}: a voltage can be delayed by less than the {self.duration:.4g} s of the "
                              f"run; got {seconds!r}.")
-        rates = [np.diff(y) if c == "theta" else y for c, y in self.outputs.items()]
-        rest = all(abs(r[0]) < 0.05 * np.nanmax(np.abs(r)) for r in rates)
-        before = 0.0 if rest else float(self.inputs["v"][0])
-        return self._with_inputs(lambda v: preprocessing.delayed(self.t, v, self.hold, seconds, before))
+        def later(s: slice) -> Array:
+            v, rates = self.inputs["v"][s], [np.diff(y[s]) if c == "theta" else y[s] for c, y in self.outputs.items()]
+            rest = all(abs(r[0]) < 0.05 * np.abs(r).max(initial=0.0, where=np.isfinite(r)) for r in rates)
+            return preprocessing.delayed(self.t[s], v, self.hold, seconds, 0.0 if rest else float(v[0]))
+
+        return self._with_voltage(later)
 
     def without_spikes(self) -> Experiment:
         """Return the run with single samples that stand far from both neighbours marked as missing.
 
         Not next to jumps of the voltage, where the motor is quick; at least three, at most 5 % of a channel.
         """
-        outputs = {c: preprocessing.without_spikes(self.t, y, self.inputs["v"]) for c, y in self.outputs.items()}
-        return self.with_(outputs=outputs) if any(outputs[c] is not y for c, y in self.outputs.items()) else self
+        t, v = self.t, self.inputs["v"]
+        outputs = {c: self._by_parts(y, lambda s, y=y: preprocessing.without_spikes(t[s], y[s], v[s]))
+                   for c, y in self.outputs.items()}
+        same = all(np.array_equal(outputs[c], y, equal_nan=True) for c, y in self.outputs.items())
+        return self if same else self.with_(outputs=outputs)
 
-    def _with_inputs(self, read: Callable[[Array], Array]) -> Experiment:
-        return self.with_(inputs={**self.inputs, "v": read(self.inputs["v"])})
+    def _with_voltage(self, read: Callable[[slice], Array]) -> Experiment:
+        return self.with_(inputs={**self.inputs, "v": self._by_parts(self.inputs["v"], read)})
+
+    def _by_parts(self, y: Array, read: Callable[[slice], Array]) -> Array:
+        """Return `y` read anew, each part between pauses by itself: nothing of one goes into the next."""
+        y = y.copy()
+        for s in parts_of(self):
+            y[s] = read(s)
+        return y
 
     def __reduce__(self) -> tuple[Any, ...]:
         # A mappingproxy cannot be pickled, so hand plain dicts to the constructor of the other process.
@@ -245,8 +263,8 @@ def windows(experiment: Experiment, seconds: float) -> list[Experiment]:
         raise UsageError(f"a window takes a time in seconds; got {seconds!r}.")
     if seconds < 8 * experiment.dt:
         raise UsageError(f"a window of {seconds:g} s holds fewer than 8 samples, {experiment.dt:.3g} s apart.")
-    parts, meta = split(experiment, max(round(experiment.duration / seconds), 1)), part_meta(experiment)
-    return [p.with_(meta={**meta, "window": seconds}) for p in parts]
+    return [p.with_(meta={**part_meta(r), **p.meta, "window": seconds}) for r in between_pauses(experiment)
+            for p in split(r, max(min(round(r.duration / seconds), r.n // MIN_SAMPLES), 1))]
 
 
 def part_meta(run: Experiment) -> dict[str, Any]:
@@ -269,23 +287,29 @@ def pauses(t: Array) -> NDArray[np.intp]:
     return np.flatnonzero(steps > max(5 * usual, min(0.1, (t[-1] - t[0]) / 100)))
 
 
-def between_pauses(run: Experiment) -> list[Experiment]:
-    """Return the parts of a run between pauses as runs of their own, since nobody saw what the motor did meanwhile.
+def parts_of(run: Experiment) -> list[slice]:
+    """Return the parts of a run between pauses: gaps in time, see `pauses`, or changes in its extra columns `PARTS`.
 
-    A pause is a gap in time, see `pauses`, or begins a part by ``meta["parts"]`` (s). Parts of fewer than 8 samples are
-    left out, where others are left.
+    Parts of fewer than 8 samples, or without a value, are left out, where others are left.
     """
-    if run.meta.get("parts", ()) is None:  # it is such a part
-        return [run]
-    told = np.searchsorted(run.t, np.asarray(run.meta.get("parts", ()), float) - run.dt / 2) - 1
-    cuts = np.union1d(pauses(run.t), told[(told >= 0) & (told < run.n - 1)])
+    marks = [np.flatnonzero(np.diff(a)) for c, a in run.meta.get("extra", {}).items() if c in PARTS]
+    cuts = np.unique(np.concatenate([pauses(run.t), *marks])) if run.meta.get("parts", ()) is not None else np.empty(0)
     parts = [slice(a, b) for a, b in pairwise([0, *(cuts + 1).tolist(), run.n]) if b - a >= MIN_SAMPLES]
-    live = [s for s in parts if any(np.isfinite(y[s]).any() for y in run.outputs.values())]
-    if not cuts.size or not live:
+    return [s for s in parts if any(np.isfinite(y[s]).any() for y in run.outputs.values())] or [slice(0, run.n)]
+
+
+def between_pauses(run: Experiment) -> list[Experiment]:
+    """Return the parts of a run as runs of their own, since nobody saw what the motor did meanwhile.
+
+    Where the clock starts again so does a record, and with it what is another in every run.
+    """
+    if (parts := parts_of(run)) == [slice(0, run.n)]:
         return [run]
-    told = {"parts": None, "record": record_of(run)}
-    return [part.with_(name=f"{run.name}[{k}]", meta={**part.meta, **told, "notes": run.meta.get("notes", ()) if k == 1
-                       else ()}) for k, part in enumerate(map(run.select, live), 1)]
+    clock, whole = run.meta.get("extra", {}).get(PARTS[0]), record_of(run)
+    own = [{"parts": None, "record": whole if clock is None else f"{whole}/{clock[s.start]:g}"} for s in parts]
+    own[1:] = [{**told, "notes": ()} for told in own[1:]]  # which are told once
+    return [p.with_(name=f"{run.name}[{k}]", meta={**p.meta, **told})
+            for k, (p, told) in enumerate(zip(map(run.select, parts), own, strict=True), 1)]
 
 
 def _frozen_array(values: ArrayLike, what: str, run: str) -> Array:

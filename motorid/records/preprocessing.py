@@ -95,7 +95,8 @@ def delayed(t: Array, v: Array, hold: str, seconds: float, before: float) -> Arr
         return np.interp(at, t, v, left=before)
     ends = np.concatenate([[min(at[0], t[0])], t, [max(at[-1], t[-1])]])
     sums = integral(ends, np.concatenate([[before], v, v[-1:]]), hold=True)
-    return np.append(np.diff(np.interp(at, ends, sums)) / np.diff(at), v[np.searchsorted(t, at[-1], side="right") - 1])
+    return np.append(np.diff(np.interp(at, ends, sums)) / np.diff(at),
+                     np.append(before, v)[np.searchsorted(t, at[-1], side="right")])
 
 
 def without_spikes(t: Array, y: Array, v: Array) -> Array:

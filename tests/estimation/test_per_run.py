@@ -58,3 +58,24 @@ def test_a_supply_and_a_warm_winding_of_every_run(rng):
     lower = [found[0], found[0].with_(inputs={"v": found[0].inputs["v"] / 0.9})]
     supply = mi.fit(mi.dc_motor() + mi.effects.supply_per_run, lower)
     assert supply.initial["g_v[1]"] == pytest.approx(-0.1, abs=2e-3)
+
+
+def two_supplies(rng):
+    """Two records of one motor, the second's supply 15 % higher than it says."""
+    t, found = np.arange(300) * 2e-3, []
+    for gain, volt in ((1.0, 6.0), (1.15, -5.0)):
+        bare = mi.Experiment(t, {"v": gain * drive(t, volt)}, {c: np.zeros(300) for c in ("i", "omega")})
+        shown = mi.simulate(mi.dc_motor(**VALUES), bare, initial="rest")[0].outputs
+        noisy = {c: y + 2e-3 * np.ptp(y) * rng.normal(size=300) for c, y in shown.items()}
+        found.append(bare.with_(inputs={"v": drive(t, volt)}, outputs=noisy))
+    return found
+
+
+@pytest.mark.parametrize("window", [None, 0.3])
+def test_where_the_clock_of_one_file_starts_again_a_record_does(rng, tmp_path, window):
+    first, second = (mi.records.reading.csv_text(r).splitlines()[2:] for r in two_supplies(rng))
+    path = tmp_path / "both.csv"
+    path.write_text("\n".join([*first, *second[1:]]), encoding="utf-8")
+    for runs in (mi.read_csv(path), mi.read_runs(path)):
+        fit = mi.fit(mi.dc_motor() + mi.effects.supply_per_run, runs, window=window)
+        assert [v["value"] for v in fit.per_run["g_v"].values()] == pytest.approx([0.15], abs=5e-3)

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from motorid.errors import DataError, UsageError
-from motorid.records.experiment import Experiment, split
+from motorid.records.experiment import Experiment, between_pauses, split
+from motorid.records.reading import read_csv, write_csv
 
 N = 40
 T = np.arange(N) * 0.01
@@ -213,3 +214,43 @@ def test_split_gives_contiguous_blocks_that_lose_nothing():
         split(make(), 6)
     with pytest.raises(UsageError):
         split(make(), 0)
+
+
+@pytest.fixture(params=["clock starts again", "pause", "resumed"])
+def parted(request, tmp_path, rng):
+    """Two parts in one run, as a file or an array has them, with spikes that count in either part by itself."""
+    rows, begins = [], {"clock starts again": 0.0, "pause": 0.9, "resumed": 0.502}[request.param]
+    for first, n, volt in ((0.0, 251, 6.0), (begins, 301, -4.0)):
+        omega = volt * (1 - np.exp(-np.arange(n) / 40)) + 0.01 * rng.normal(size=n)
+        omega[[80, 120, 160, 200]] += 30
+        volts = np.where(np.arange(n) < 200, volt, volt / 2) + 0.01 * rng.normal(size=n)
+        rows += [f"{first + 2e-3 * k:.3f},{v:.4f},{w:.4f}" for k, (v, w) in enumerate(zip(volts, omega, strict=True))]
+    told = ["# part begins: 0.502000"] if request.param == "resumed" else []
+    path = tmp_path / "run.csv"
+    path.write_text("\n".join(["time_s,voltage_V,speed_rad_s", *told, *rows]), encoding="utf-8")
+    return read_csv(path)
+
+
+@pytest.mark.parametrize("change", [
+    lambda r: r.decimate(3), lambda r: r.decimate(30), lambda r: r.delayed(0.013), lambda r: r.delayed(-0.013),
+    lambda r: r.running_median(9), lambda r: r.levelled(), lambda r: r.without_spikes(),
+    lambda r: r.with_(t=1.3 * r.t + 0.3), lambda r: r.select(slice(40, 400)), lambda r: r.decimate(2).decimate(2)])
+def test_nothing_of_a_part_goes_into_the_next_and_none_is_lost(parted, change, tmp_path):
+    changed = change(parted)
+    again = read_csv(write_csv(changed, tmp_path / "again.csv"))
+    first, second = between_pauses(parted)
+    assert (first.n, second.n) == (251, 301)
+    apart = [change(first), change(second)]
+    if changed.n == 360:  # a slice of the whole is another one in each part
+        apart = [first.select(slice(40, None)), second.select(slice(0, 149))]
+    for parts in (between_pauses(changed), between_pauses(again)):
+        assert [p.n for p in parts] == [p.n for p in apart]
+        for mine, alone in zip(parts, apart, strict=True):
+            np.testing.assert_allclose(mine.inputs["v"], alone.inputs["v"], atol=1e-9)
+            np.testing.assert_array_equal(mine.outputs["omega"], alone.outputs["omega"])
+
+
+def test_extra_columns_of_other_samples_are_not_kept(parted):
+    other = parted.with_(t=parted.t[:300], inputs={"v": np.ones(300)}, outputs={"omega": np.ones(300)})
+    assert "extra" not in other.meta
+    assert sum(p.n for p in between_pauses(other)) == 300
