@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import time
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -125,6 +126,9 @@ def fit(model: Model, runs: Sequence[Experiment] | Experiment, *, solver: Any = 
     if unset := problem.model.without_value:
         raise ModelError(f"{listed(unset)} {'is' if len(unset) == 1 else 'are'} to be fixed, but at which value? "
                          f"Give it, in SI units: model.fix({unset[0]}=…).")
+    own = [n for n, p in problem.model.parameters.items() if p.vary and p.per_run]
+    if own and len(problem.experiments) > 1 and not problem.unknowns.apart:
+        warnings.warn(f"{listed(own)} differs between records; these are parts of one, and it stays.", stacklevel=3)
     with progress(text := f"Fitting {problem.model.title}", short=True) as advance:
         again = partial(solve, solver=solver, formulation=formulation, callback=lambda k, *rest: (
             advance(1, f"{text}: iteration {k}"), callback and callback(k, *rest)))

@@ -79,3 +79,12 @@ def test_where_the_clock_of_one_file_starts_again_a_record_does(rng, tmp_path, w
     for runs in (mi.read_csv(path), mi.read_runs(path)):
         fit = mi.fit(mi.dc_motor() + mi.effects.supply_per_run, runs, window=window)
         assert [v["value"] for v in fit.per_run["g_v"].values()] == pytest.approx([0.15], abs=5e-3)
+
+
+def test_of_parts_of_one_record_none_has_parameters_of_its_own_which_is_said(rng):
+    first, second = two_supplies(rng)
+    t = np.r_[first.t, second.t + 5]
+    run = first.with_(t=t, inputs={"v": np.r_[first.inputs["v"], second.inputs["v"]]},
+                      outputs={c: np.r_[first.outputs[c], second.outputs[c]] for c in first.outputs})
+    with pytest.warns(UserWarning, match="g_v differs between records; these are parts of one"):
+        assert mi.fit(mi.dc_motor() + mi.effects.supply_per_run, run).per_run == {}
