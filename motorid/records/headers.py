@@ -43,7 +43,7 @@ _SPELLINGS = {
 }
 _KNOWN = {word: (dimension, factor) for dimension, sizes in _SPELLINGS.items()
           for factor, words in sizes.items() for word in words.split()}
-_COUNTS = re.compile(r"(?:counts?|cnts?|ticks?|inc|increments?|pulses?|steps?)(/s)?(?::(.*))?")
+_COUNTS = re.compile(r"(?:counts?|cnts?|ticks?|inc|in[ck]rement[es]?|pulses?|impulse|steps?)(/s)?(?::(.*))?")
 _SCALED = re.compile(r"([-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?)\s*[*·x]?\s+(\S.*)", re.IGNORECASE)
 _LETTERS = str.maketrans({"°": "deg", "º": "deg", "µ": "u", "μ": "u", "⁻": "-", "¹": "1", "−": "-"})
 
@@ -134,7 +134,7 @@ _COMMAND = _set("command cmd commanded input eingang")
 _DUTY = _set("duty pwm dutycycle tastgrad")
 _DERIVATIVE = _set("dot rate dt derivative")
 _BRACKETS = re.compile(r"(.*?)[\s_,:/]*[\[({<]([^\])}>]*)[\])}>]\s*")
-_IN = re.compile(r"(.*\S)(?:\s+in\s+|\s+/\s*|\s*,\s+|:\s*)(\S.*)", re.IGNORECASE)
+_IN = re.compile(r"(.*\S)(?:\s+in\s+|\s+/\s*|\s*,\s+|[\s_.-]+(?=[a-z]+(?:/s)?:\d)|:\s*(?!\d+$))(\S.*)", re.IGNORECASE)
 _SEPARATORS = re.compile(r"[\s_.\-:/]+")
 _CAMEL = re.compile(r"(?<=[a-zäöü][a-zäöü])(?=[A-ZÄÖÜ])")
 _BY_UNIT = {"time": "t", "voltage": "v", "current": "i", "speed": "omega", "linear speed": "omega", "angle": "theta"}
@@ -221,7 +221,9 @@ def _by_words(words: list[str], unit: Unit | None, explicit: bool) -> HeaderMatc
     if unit is None or _goes_with(channel, unit, words):
         if score < 1 or (unit is None and _ONLY_LENGTHS & set(words)):
             return None
-        known = unit or (parse_unit("counts") if _WEAK & set(words) and channel == "theta" else None)
+        counted = (_WEAK & set(words) and channel == "theta") or any(
+            len(w) > 4 and _COUNTS.fullmatch(w.rstrip("0123456789")) for w in words)  # inc, step may be other words
+        known = unit or (parse_unit({"theta": "counts", "omega": "counts/s"}.get(channel, "")) if counted else None)
         return HeaderMatch(channel, known, 2.0 if unit is None and known else score)
     longest = max(len(w) for w in words if _CHANNEL.get(w.rstrip("0123456789"), channel) == channel)
     if not explicit:  # u_a, theta_m: the letter is an index, not a unit; but speed_V is a tacho

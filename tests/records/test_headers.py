@@ -58,6 +58,25 @@ def test_the_unit_in_a_header_is_understood(header, unit, factor):
     assert (found.unit.symbol, found.unit.factor) == (unit, pytest.approx(factor))
 
 
+@pytest.mark.parametrize(("header", "per_turn"), [
+    ("angle_counts:40000", 40000), ("angle [counts:40000]", 40000), ("Winkel counts:512", 512),
+    ("speed_counts/s:2048", 2048), ("angle_counts", None), ("theta_counts_4096", None), ("angle_counts_raw", None),
+    ("Winkel_Inkremente", None), ("Winkel_Inkremente_roh", None), ("speed_ticks_raw", None)])
+def test_an_angle_in_counts_is_in_no_radians(header, per_turn):
+    found = classify(header)
+    assert found is not None
+    assert found.unit is not None
+    assert found.unit.factor == pytest.approx(2 * math.pi / (per_turn or math.nan), nan_ok=True)
+    layout = assign(["time_s", "voltage_V", "current_A", header])
+    assert (found.channel in layout.places) == bool(per_turn)
+    assert any("encoder counts" in n for n in layout.notes) == (not per_turn)
+
+
+def test_a_step_or_an_inclination_is_no_count():
+    for header in ("step_angle_cmp", "inc_angle"):
+        assert classify(header) == ("theta", None, 2.0)
+
+
 def test_supply_and_duty_are_told_apart():
     assert all(map(is_supply, ["bus_V", "Vsupply", "Vbat", "dc_link", "v_bus"]))
     assert not any(map(is_supply, ["supply_current", "voltage", "v"]))
