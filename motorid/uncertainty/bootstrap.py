@@ -180,16 +180,10 @@ def _source(fit: Fit, kind: str, block: int | None) -> _Source:
         colours[c] = colour_of(parts, spent)
         count = sum(int(np.isfinite(p).sum()) for p in parts)
         scale[c] = np.sqrt(count / max(count - spent, 1.0))
-    residuals = tuple({c: scale[c] * _filled(e - np.nanmean(e)) for c, e in r.items()} for r in residuals)
+    residuals = tuple({c: scale[c] * (e - np.nanmean(e)) for c, e in r.items()} for r in residuals)
     at_fit = problem.for_model(problem.model.start_at(fit.values))
     block = min(block or _block_length(colours, residuals), max(s.experiment.n for s in fit.simulations))
     return _Source(at_fit, tuple(dict(s.outputs) for s in fit.simulations), residuals, colours, kind, block)
-
-
-def _filled(e: Array) -> Array:
-    """Return residuals with those that are missing as the nearest one: a block may come to where they were measured."""
-    known = np.flatnonzero(np.isfinite(e))
-    return e[known[np.interp(np.arange(len(e)), known, np.arange(len(known))).round().astype(int)]]
 
 
 def _block_length(colours: Mapping[str, Colour], residuals: Sequence[Mapping[str, Array]]) -> int:
@@ -224,12 +218,17 @@ def _resampled(source: _Source, k: int, rng: np.random.Generator) -> Experiment:
 
 
 def _blocks(source: _Source, k: int, rng: np.random.Generator) -> dict[str, Array]:
-    """Blocks of residuals from any run with the same channels, the same stretch for all channels."""
-    here, n = source.residuals[k], source.problem.runs[k].experiment.n
-    donors = [np.array([r[c] for c in here]) for r in source.residuals if set(r) == set(here)]
-    pieces = []
-    for _ in range(-(-n // source.block)):
+    """Blocks of residuals from any run with the same channels, the same stretch for all channels.
+
+    Missing samples neither take nor give one: residuals go on from those measured to those to be measured.
+    """
+    here = source.residuals[k]
+    drawn, donors = {c: e.copy() for c, e in here.items()}, [r for r in source.residuals if set(r) == set(here)]
+    for first in range(0, source.problem.runs[k].experiment.n, source.block):
         donor = donors[rng.integers(len(donors))]
-        size = donor.shape[1]
-        pieces.append(donor[:, (rng.integers(size) + np.arange(source.block)) % size])
-    return dict(zip(here, np.concatenate(pieces, axis=1)[:, :n], strict=True))
+        begin = rng.integers(len(next(iter(donor.values()))))
+        for c, e in donor.items():
+            wanted = first + np.flatnonzero(np.isfinite(here[c][first:first + source.block]))
+            known = np.flatnonzero(np.isfinite(e))
+            drawn[c][wanted] = e[known[(np.searchsorted(known, begin) + np.arange(len(wanted))) % len(known)]]
+    return drawn

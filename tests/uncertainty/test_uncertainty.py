@@ -263,6 +263,15 @@ def test_bootstrap_of_a_slower_sensor_agrees_with_the_covariance(runs):
         assert 0.75 < found.std[name] / fit.std[name] < 1.35
 
 
+def test_bootstrap_keeps_white_noise_white_where_samples_are_missing_at_random(clean):
+    rng = np.random.default_rng(3)
+    holes = [r.with_(outputs={c: np.where(rng.random(r.n) < 0.4, np.nan, y) for c, y in r.outputs.items()})
+             for r in measured(clean, rng, 0.0)]
+    fit = mi.fit(mi.dc_motor(), holes)
+    found = bootstrap(fit, n=100, quiet=True)
+    assert np.mean([found.std[n] / fit.std[n] for n in MOTOR]) == pytest.approx(1.0, abs=0.1)
+
+
 def per_run():
     """Three runs of a commanded axis whose supplies differ."""
     rng, t, axis = np.random.default_rng(4), np.arange(600) * 1e-3, mi.torque_driven(g=0.05, b=1e-4, J=5e-5)
