@@ -157,9 +157,9 @@ class Identifiability(Printed):
     def card(self) -> Card:
         """Return the verdict, and what a fit would know of each parameter."""
         rows = []
-        for (n, sd), value, unit, size in zip(self.std.items(), self.values, self.units, self.sizes, strict=True):
-            share = Flag("not determined", "note") if sd is None else percent(sd / size, 2)
-            rows.append([n, "–" if sd is None else quantity(float(value), unit), quantity(sd, unit, 2), share])
+        for (n, sd), value, unit in zip(self.std.items(), map(float, self.values), self.units, strict=True):
+            share = Flag("not determined", "note") if sd is None else percent(sd / abs(value) if value else None, 2)
+            rows.append([n, "–" if sd is None else quantity(value, unit), quantity(sd, unit, 2), share])
         k = len(self.names)
         partly = Flag(f"{self.rank} of {k} directions determined", "note")
         values = ", ".join(number(s, 3) for s in self.singular_values)

@@ -39,6 +39,15 @@ def test_two_steps_determine_all_five_parameters(name, condition):
     assert "full rank" in found.text
 
 
+def test_relative_is_relative_to_the_value_beside_it(noisy):
+    """Also of a load that may be zero, which the size of a relative change is not that of."""
+    found = identifiability(mi.fit(mi.dc_motor() + mi.effects.constant_load, noisy))
+    shown = {row[0]: row[3] for row in found.card().tables[0].rows}
+    for name, value in zip(found.names, found.values, strict=True):
+        said = float(shown[name].removesuffix(" %"))
+        assert said == pytest.approx(100 * found.std[name] / abs(value), rel=0.06), name
+
+
 @pytest.mark.parametrize("name", ["two_step_noisy", "two_step_small"])
 def test_promised_standard_deviations_are_those_of_the_fit(name):
     fit = mi.fit(mi.dc_motor(), records(name))
