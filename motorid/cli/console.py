@@ -39,7 +39,7 @@ _OPTIONS = ((r"\b(columns|units)=\{(.*?)\}", lambda m: f"--{m[1]} {_pairs(m[2])}
             (r"\bdt=([\d.]+)", r"--dt \1"),
             (r"\brunning_median\(\)", "--median"),
             (r"\bmi\.torque_driven\(\) \((--drive torque)\)", r"\1"),
-            (r"\bmodel\.without\('(\w+)'\)", r"--effects without \1"),
+            (r"\bmodel\.without\('(\w+)'\)", r"leave \1 out of --effects"),
             (r"\bmodel\.(fix|free)\(…\)", r"--\1 NAME"),
             (r"\bmodel\.replace\(…\)", "--set NAME=VALUE"),
             (r"\bmodel\.fix\('?(\w+)'?(=[^)]*)?\)", r"--fix \1\2"),

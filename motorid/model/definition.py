@@ -85,9 +85,10 @@ class Parameter:
             raise ModelError(f"parameter '{self.name}' needs a finite value, got {self.value}.")
         if self.given and self.value and not 1e-20 < abs(self.value) < 1e20:
             raise ModelError(f"parameter '{self.name}' = {self.value:g} is not plausible; give it in SI units.")
-        if self.positive and (self.value < 0 or (self.vary and self.value == 0)):
-            raise ModelError(f"parameter '{self.name}' must be positive, got {self.value:g}. "
-                             f"To leave it out of the model, set it to zero and fix it: model.fix({self.name}=0).")
+        if self.positive and (self.value < 0 or (self.value == 0 and (self.vary or self.name in ("R", "J")))):
+            hint = (f"To leave it out of the model, set it to zero and fix it: model.fix({self.name}=0)."
+                    if self.name in ("L", "b") else "Say what it is, in SI units, or leave it to the fit.")
+            raise ModelError(f"parameter '{self.name}' must be positive, got {self.value:g}. {hint}")
         if self.lower > self.upper:
             raise ModelError(f"parameter '{self.name}': lower limit {self.lower:g} above upper {self.upper:g}.")
         if not self.lower <= self.value <= self.upper:

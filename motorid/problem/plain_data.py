@@ -104,14 +104,17 @@ def model_from_json(contents: Mapping[str, Any], effects: Iterable[Effect] = ())
     effects : sequence of Effect, optional
         Effects of your own that the model uses; they go before the library's of the same name.
     """
+    part, values, fixed = "model", {}, {}  # fixed first: what is fixed may be zero, what is free may not
     try:
-        head, pars = dict(contents["model"]), dict(contents["parameters"])
-        _ = head["base"], list(head["effects"])
-        values = {n: float(p["value"]) for n, p in pars.items()}
-        fixed_names = [n for n, p in pars.items() if p["fixed"]]
-    except (KeyError, TypeError, ValueError) as error:
-        raise DataError(f"this is not a fitted model: {error!s} is missing or wrong; expected model.base, "
-                        "model.effects and parameters with value and fixed.") from None
+        head = dict(contents[part])
+        _, part = (head["base"], list(head["effects"])), "parameters"
+        pars = dict(contents[part])
+        for part, p in pars.items():
+            values[part] = float(p["value"])
+            fixed |= {part: values[part]} if p["fixed"] else {}
+    except (KeyError, TypeError, ValueError):
+        raise DataError(f"this is not a fitted model, or damaged: '{part}' is missing or wrong; expected model.base, "
+                        "model.effects and parameters, each with a number as value, and fixed.") from None
     model = _assembled(head, effects)
     missing = set(model.parameters) ^ set(values)
     if missing:
@@ -122,7 +125,6 @@ def model_from_json(contents: Mapping[str, Any], effects: Iterable[Effect] = ())
             raise DataError(f"the file gives {name} in {p['unit']}, the model in {model.parameters[name].unit or '1'}.")
     limits = {n: (p.get("lower", -np.inf), p.get("upper", np.inf)) for n, p in pars.items()
               if "lower" in p or "upper" in p}
-    fixed = {n: values[n] for n in fixed_names}  # first: what is fixed may be zero, what is free may not
     free = {n: v for n, v in values.items() if n not in fixed}
     shared = {n: v for n, v in free.items() if not model.parameters[n].per_run}  # others are of the first run alone
     return model.fix(**fixed).replace(**shared).bounded(**limits).start_at(free).free(*free)

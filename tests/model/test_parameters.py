@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+import motorid as mi
 from motorid.errors import ModelError
 from motorid.model.definition import P, Parameter
 from motorid.problem.unknowns import Scaling
@@ -22,7 +23,7 @@ MIXED = [
     [
         ({"value": float("nan")}, "finite"),
         ({"value": float("inf")}, "finite"),
-        ({"value": -1.0, "positive": True}, r"model\.fix\(x=0\)"),
+        ({"value": -1.0, "positive": True}, r"got -1\. Say what it is"),
         ({"value": 0.0, "positive": True}, r"must be positive"),
         ({"value": 1.0, "lower": 2.0, "upper": 1.0}, "above upper"),
         ({"value": 3.0, "lower": 0.0, "upper": 2.0}, r"outside its limits \[0, 2\]"),
@@ -31,6 +32,17 @@ MIXED = [
 def test_a_value_that_cannot_be_is_refused_with_a_reason(fields, words):
     with pytest.raises(ModelError, match=words):
         Parameter("x", **fields)
+
+
+@pytest.mark.parametrize("name", ["R", "J"])
+def test_what_no_motor_is_without_is_not_zero_and_no_message_says_so(name):
+    for value in (0.0, -1.0):
+        with pytest.raises(ModelError, match=f"'{name}' must be positive") as refused:
+            mi.dc_motor().fix(**{name: value})
+        assert "leave it to the fit" in str(refused.value)
+        assert "=0" not in str(refused.value)
+    with pytest.raises(ModelError, match=r"model\.fix\(L=0\)"):
+        mi.dc_motor(L=-1.0)
 
 
 def test_zero_is_allowed_for_a_positive_parameter_that_is_held():
