@@ -88,8 +88,7 @@ def _solve(rows: list[tuple[Array, Array]], names: Sequence[str | Load], held: M
     a = a[:, [n not in held for n in names]]
     norms = np.where((norms := np.linalg.norm(a, axis=0)) > 0, norms, 1.0)
     triangle: Array = np.asarray(np.linalg.qr(np.column_stack([a / norms, b]), mode="r"))
-    signed = np.array([isinstance(n, Load) and n.signed for n in free])
-    z = _nonnegative(triangle[:, :-1], triangle[:, -1], signed)
+    z = _nonnegative(triangle[:, :-1], triangle[:, -1], np.array([isinstance(n, Load) and n.signed for n in free]))
     # A coefficient that comes out as zero starts where its term would carry a thousandth of the right-hand side.
     motor = np.array([isinstance(n, str) for n in free])
     z = np.where(motor, np.maximum(z, FLOOR * np.linalg.norm(b)), z) / norms

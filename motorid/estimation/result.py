@@ -384,8 +384,7 @@ def parameter_cell(fit: Fit, name: str) -> Cell:
 def value_tables(fit: Fit) -> list[Table]:
     """Return the parameters and what follows from them; what is determined goes first."""
     tables = parameter_table(fit), determined_table(fit)
-    ordered = tables[::-1] if None in fit.std.values() else tables
-    return [t for t in (*ordered, per_run_table(fit)) if t is not None]
+    return [t for t in (*(tables[::-1] if None in fit.std.values() else tables), per_run_table(fit)) if t is not None]
 
 
 def per_run_table(fit: Fit) -> Table | None:

@@ -165,5 +165,4 @@ def _shared_out(problem: Problem, asked: Model) -> Problem:
     if not open_ or asked.parameters["K"].given or not any(load.ratio for load in loads_of(asked)):
         return problem
     others = [problem.start_at(first_guess(asked, runs, loaded=True, back_emf=share)) for share in BACK_EMF_SHARES]
-    fixed = [p.for_model(p.model.fix("R")) for p in (problem, *others)]
-    return _led(problem, race(fixed, RACE, solve=by_continuation))
+    return _led(problem, race([p.for_model(p.model.fix("R")) for p in (problem, *others)], RACE, solve=by_continuation))

@@ -99,8 +99,7 @@ def _fields(found: Fit | Model, name: str) -> dict[str, Any]:
         code.add(f)
     sizes = dict(zip(("NX", "NU", "NP", "NY"), system.sizes, strict=True))
     own = [own for _, *own in casadi_file.runs_of(found.problem, found.q)] if isinstance(found, Fit) else []
-    hold = found.problem.experiments[0].hold if isinstance(found, Fit) else "zoh"
-    held = zoh_inputs(system.inputs, hold)
+    held = zoh_inputs(system.inputs, found.problem.experiments[0].hold if isinstance(found, Fit) else "zoh")
     starts, parameters = (",\n".join("  {" + ", ".join(map(repr, run[j].tolist())) + "}" for run in own)
                           for j in (0, 1))
     runs, size = f"#define {name.upper()}_RUNS {len(own)}\n" if own else "", f"[{len(own)}][{name.upper()}_NP]"

@@ -69,8 +69,7 @@ class Exported:
             raise UsageError(f"no simulation of record {k} in this file; it has {', '.join(known) or 'none'}.")
         record = self.functions[f"record_{k}"]()
         drive = record["u"] if u is None else np.asarray(u, float).reshape(-1, record["u"].shape[0]).T
-        found = self.functions[f"simulate_{k}"](s=record["s"], u=drive, p=record["p"])
-        return np.asarray(found["y"]).T
+        return np.asarray(self.functions[f"simulate_{k}"](s=record["s"], u=drive, p=record["p"])["y"]).T
 
 
 def export(found: Fit | Model | Exported, path: str | os.PathLike[str], to: str | None = None, *,

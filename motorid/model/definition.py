@@ -186,8 +186,7 @@ class Effect(Shown):
         if not hasattr(law, "__qualname__"):
             return Effect, (self.name, law, *rest)
         importable = getattr(law, "__module__", None) not in (None, "__main__") and "<locals>" not in law.__qualname__
-        place = (law.__module__, law.__qualname__) if importable else None
-        return _restore_effect, (place, self.name, *rest)
+        return _restore_effect, ((law.__module__, law.__qualname__) if importable else None, self.name, *rest)
 
 
 def _restore_effect(place: tuple[str, str] | None, name: str, *rest: Any) -> Effect:

@@ -26,8 +26,7 @@ def bridged(t: Array, y: Array) -> Array:
 
 def integral(t: Array, y: Array, hold: bool = False) -> Array:
     """Return ∫y dt (N,) from the first sample on; straight lines between samples, or each held until the next."""
-    steps = np.diff(t) * (y[:-1] if hold else (y[1:] + y[:-1]) / 2)
-    return np.concatenate([[0.0], np.cumsum(steps)])
+    return np.concatenate([[0.0], np.cumsum(np.diff(t) * (y[:-1] if hold else (y[1:] + y[:-1]) / 2))])
 
 
 def slope(t: Array, y: Array, half: int) -> Array:

@@ -98,9 +98,7 @@ def angle_signal(run: Experiment) -> Array:
     """Return the angle from the measurements, (N,): the measured one, bridged over gaps, or ∫ω dt."""
     if "theta" in run.outputs:
         return bridged(run.t, run.outputs["theta"])
-    if "omega" in run.outputs:
-        return integral(run.t, bridged(run.t, run.outputs["omega"]))
-    return np.zeros(len(run.t))
+    return integral(run.t, bridged(run.t, run.outputs["omega"])) if "omega" in run.outputs else np.zeros(len(run.t))
 
 
 def noise_of(runs: Sequence[Experiment], channels: Sequence[str]) -> dict[str, float]:
@@ -165,8 +163,7 @@ def initial_state(run: Experiment, sigma: Mapping[str, float],
         return start, {}
     if initial == "estimate":
         return start, dict.fromkeys(reach, (-np.inf, np.inf))
-    places = {c: start[CHANNELS.index(c)] for c in reach}
-    return start, {c: (x - reach[c], x + reach[c]) for c, x in places.items()}
+    return start, {c: (start[CHANNELS.index(c)] - r, start[CHANNELS.index(c)] + r) for c, r in reach.items()}
 
 
 def at_rest(run: Experiment, sigma: Mapping[str, float]) -> tuple[bool, int]:

@@ -70,8 +70,7 @@ class Unknowns:
                     unit = run.experiment.units.get(c, UNITS[c][0])
                     if any(p.null == 0 and p.unit == UNITS[c][0] for p in self.parameters.values()):
                         low, high = min(low, 0.0), max(high, 0.0)  # what was measured there may be the sensor's offset
-                    value = float(run.start[CHANNELS.index(c)])
-                    found.append((c, k, Parameter(f"{c}_0[{k}]", value, unit, low, high)))
+                    found.append((c, k, Parameter(f"{c}_0[{k}]", float(run.start[CHANNELS.index(c)]), unit, low, high)))
         return tuple(found)
 
     @cached_property
@@ -84,8 +83,7 @@ class Unknowns:
         """Solver coordinates: logarithmic for positive parameters, else in natural sizes of the records."""
         sizes = [abs(p.value) for p in self.free]
         if not all(p.positive for p in self.free):
-            values = {n: p.value for n, p in self.parameters.items()}
-            natural = natural_sizes([r.experiment for r in self.runs], values)
+            natural = natural_sizes([r.experiment for r in self.runs], {n: p.value for n, p in self.parameters.items()})
             sizes = [s if p.positive else max(s, natural.get(p.unit, 0.0))
                      for p, s in zip(self.free, sizes, strict=True)]
         spreads = [spread_of(self.runs[k].experiment, c) for c, k, _ in self.initial]

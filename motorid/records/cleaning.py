@@ -21,11 +21,10 @@ _LATE = 2  # this many rows in a row may come late before it counts as a new sta
 
 
 def run_from_columns(columns: Mapping[str, Array], texts: Texts, layout: Layout, *, name: str, hold: str,
-                     sigma: Mapping[str, float], meta: Mapping[str, Any], notes: Sequence[str],
-                     resumed: Sequence[float] = ()) -> Experiment:
+                     sigma: Mapping[str, float], meta: Mapping[str, Any], notes: Sequence[str]) -> Experiment:
     """Make a valid run of the columns of a file: numbers with NaN where missing, and `texts`, which may be dates.
 
-    `notes` and those made here end up in ``meta["notes"]``; `resumed` are the times (s) at which a recording went on.
+    `notes` and those made here end up in ``meta["notes"]``; a recording was resumed at ``meta["parts"]``, s.
     """
     said = [*notes, *layout.notes]
     columns = {n: np.where(np.isnan(c), np.nan, c) for n, c in columns.items()}  # one of a damaged file may signal
@@ -58,8 +57,8 @@ def run_from_columns(columns: Mapping[str, Array], texts: Texts, layout: Layout,
     extra = {c: a[rows] for c, a in columns.items() if c not in used}
     if set(texts) - used:
         said.append(f"left out columns of text: {', '.join(sorted(set(texts) - used))}.")
-    for column, times, late in zip(PARTS, (begun, resumed), (0.0, float(np.median(np.diff(t))) / 2), strict=True):
-        extra |= {column: np.searchsorted(times, t + late, "right")} if len(times) else {}
+    begins = {PARTS[0]: begun, PARTS[1]: np.subtract(meta.get("parts", ()), np.median(np.diff(t)) / 2)}
+    extra |= {c: np.searchsorted(times, t, "right") for c, times in begins.items() if len(times)}
     facts = {**meta, "notes": said, "extra": extra, "columns": {c: p.column for c, p in layout.places.items()},
              "original_units": {c: p.unit.label for c, p in layout.places.items()},
              "assumed_units": [c for c, p in layout.places.items() if not p.stated]}

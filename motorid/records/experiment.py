@@ -124,8 +124,6 @@ class Experiment(Shown):
         """Return a copy with some fields replaced, validated again."""
         for key in changes:
             among(key, (f.name for f in dataclasses.fields(self)), "field", where="with_(): ")
-        if np.size(changes.get("t", self.t)) != self.n:  # its extra columns were of other samples
-            changes = {"meta": {k: x for k, x in self.meta.items() if k != "extra"}, **changes}
         return dataclasses.replace(self, **changes)
 
     def select(self, keep: slice | ArrayLike) -> Experiment:
@@ -138,9 +136,8 @@ class Experiment(Shown):
             return {k: np.asarray(a)[which] for k, a in arrays.items()}
 
         try:
-            extra = {"extra": picked(self.meta["extra"])} if "extra" in self.meta else {}
             return self.with_(t=self.t[which], inputs=picked(self.inputs), outputs=picked(self.outputs),
-                              meta={**self.meta, **extra})
+                              meta={**self.meta, "extra": picked(self.meta.get("extra", {}))})
         except IndexError as error:
             raise UsageError(f"{self.name}: select() takes a slice, a mask or indices: {error}.") from None
 
@@ -186,6 +183,7 @@ class Experiment(Shown):
         if not np.isfinite(seconds) or abs(seconds) >= self.duration:
             raise UsageError(f"{self.name}: a voltage can be delayed by less than the {self.duration:.4g} s of the "
                              f"run; got {seconds!r}.")
+
         def later(s: slice) -> Array:
             v, rates = self.inputs["v"][s], [np.diff(y[s]) if c == "theta" else y[s] for c, y in self.outputs.items()]
             rest = all(abs(r[0]) < 0.05 * np.abs(r).max(initial=0.0, where=np.isfinite(r)) for r in rates)
@@ -292,7 +290,7 @@ def parts_of(run: Experiment) -> list[slice]:
 
     Parts of fewer than 8 samples, or without a value, are left out, where others are left.
     """
-    marks = [np.flatnonzero(np.diff(a)) for c, a in run.meta.get("extra", {}).items() if c in PARTS]
+    marks = [np.flatnonzero(np.diff(a)) for c, a in run.meta.get("extra", {}).items() if c in PARTS and len(a) == run.n]
     cuts = np.unique(np.concatenate([pauses(run.t), *marks])) if run.meta.get("parts", ()) is not None else np.empty(0)
     parts = [slice(a, b) for a, b in pairwise([0, *(cuts + 1).tolist(), run.n]) if b - a >= MIN_SAMPLES]
     return [s for s in parts if any(np.isfinite(y[s]).any() for y in run.outputs.values())] or [slice(0, run.n)]
@@ -305,11 +303,9 @@ def between_pauses(run: Experiment) -> list[Experiment]:
     """
     if (parts := parts_of(run)) == [slice(0, run.n)]:
         return [run]
-    clock, whole = run.meta.get("extra", {}).get(PARTS[0]), record_of(run)
-    own = [{"parts": None, "record": whole if clock is None else f"{whole}/{clock[s.start]:g}"} for s in parts]
-    own[1:] = [{**told, "notes": ()} for told in own[1:]]  # which are told once
-    return [p.with_(name=f"{run.name}[{k}]", meta={**p.meta, **told})
-            for k, (p, told) in enumerate(zip(map(run.select, parts), own, strict=True), 1)]
+    whole, notes = record_of(run), [run.meta.get("notes", ()), *[()] * len(parts)]  # told once
+    return [p.with_(name=f"{run.name}[{k + 1}]", meta={**p.meta, "parts": None, "notes": notes[k], "record":
+            f"{whole}/{p.meta.get('extra', {}).get(PARTS[0], '0')[0]}"}) for k, p in enumerate(map(run.select, parts))]
 
 
 def _frozen_array(values: ArrayLike, what: str, run: str) -> Array:

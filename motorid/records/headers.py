@@ -227,8 +227,7 @@ def _by_words(words: list[str], unit: Unit | None, explicit: bool) -> HeaderMatc
         return HeaderMatch(channel, known, 2.0 if unit is None and known else score)
     longest = max(len(w) for w in words if _CHANNEL.get(w.rstrip("0123456789"), channel) == channel)
     if not explicit:  # u_a, theta_m: the letter is an index, not a unit; but speed_V is a tacho
-        lost = score < 1 or (longest > 2 and unit.label in ("V", "A"))
-        return None if lost else HeaderMatch(channel, None, score)
+        return None if score < 1 or (longest > 2 and unit.label in ("V", "A")) else HeaderMatch(channel, None, score)
     return _by_unit(words, unit, explicit) if longest < 3 else None
 
 
@@ -251,8 +250,7 @@ def _channel_of(words: list[str]) -> tuple[str | None, float]:
     unknown = [w for w in words if w not in known and w not in _CHANNEL]
     score = 2.0 if commanded or unknown else 3.0
     channel = channels.pop()
-    letter = max(map(len, hits)) == 1
-    return channel, 0.9 if letter and (unknown or channel == "t") else score
+    return channel, 0.9 if max(map(len, hits)) == 1 and (unknown or channel == "t") else score
 
 
 def _goes_with(channel: str, unit: Unit, words: list[str]) -> bool:

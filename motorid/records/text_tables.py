@@ -106,9 +106,7 @@ def _encoding(data: bytes) -> str:
         return "utf-16"
     start = data[:4000]
     odd, even, half = start[1::2].count(0), start[::2].count(0), max(len(start) // 2, 1)
-    if odd > 0.6 * half > even:
-        return "utf-16-le"
-    return "utf-16-be" if even > 0.6 * half > odd else "utf-8-sig"
+    return "utf-16-le" if odd > 0.6 * half > even else "utf-16-be" if even > 0.6 * half > odd else "utf-8-sig"
 
 
 @dataclass(frozen=True)

@@ -218,10 +218,7 @@ def _resampled(source: _Source, k: int, rng: np.random.Generator) -> Experiment:
 
 
 def _blocks(source: _Source, k: int, rng: np.random.Generator) -> dict[str, Array]:
-    """Blocks of residuals from any run with the same channels, the same stretch for all channels.
-
-    Missing samples neither take nor give one: residuals go on from those measured to those to be measured.
-    """
+    """Blocks of residuals from any run with the same channels, the same stretch for all; none for missing samples."""
     here = source.residuals[k]
     drawn, donors = {c: e.copy() for c, e in here.items()}, [r for r in source.residuals if set(r) == set(here)]
     for first in range(0, source.problem.runs[k].experiment.n, source.block):

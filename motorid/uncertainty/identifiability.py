@@ -298,9 +298,7 @@ def monomials(names: Sequence[str], weak: Array) -> list[str]:
 def _product(names: Sequence[str], powers: Array) -> str:
     factors = [(f"{n}²" if abs(p) == 2 else n, p) for n, p in zip(names, powers, strict=True)]
     above, below = "·".join(f for f, p in factors if p > 0) or "1", [f for f, p in factors if p < 0]
-    if not below:
-        return above
-    return f"{above}/{below[0]}" if len(below) == 1 else f"{above}/({'·'.join(below)})"
+    return above if not below else f"{above}/{below[0]}" if len(below) == 1 else f"{above}/({'·'.join(below)})"
 
 
 def suggestions(problem: Problem, q: Array, matrix: Array, missing: int) -> list[str]:

@@ -183,9 +183,12 @@ def test_numbers_that_cannot_be_meant_are_said(words, says, rng, tmp_path):
     assert says in done.err
 
 
-def test_a_motor_without_resistance_is_fitted(rng, tmp_path):
+@pytest.mark.parametrize("name", ["R", "J"])
+def test_a_motor_without_resistance_or_inertia_is_refused_by_name(rng, tmp_path, name):
     path = mi.records.reading.write_csv(record(rng, "lab", "step", 0.5), tmp_path / "run.csv")
-    assert motorid("fit", path, "--fix", "R=0").status in (0, 1)
+    done = motorid("fit", path, "--fix", f"{name}=0")
+    assert (done.status, done.out) == (2, "")
+    assert f"'{name}' must be positive" in done.err
 
 
 OWN = """import motorid as mi

@@ -250,7 +250,6 @@ def test_nothing_of_a_part_goes_into_the_next_and_none_is_lost(parted, change, t
             np.testing.assert_array_equal(mine.outputs["omega"], alone.outputs["omega"])
 
 
-def test_extra_columns_of_other_samples_are_not_kept(parted):
+def test_parts_are_not_those_of_other_samples(parted):
     other = parted.with_(t=parted.t[:300], inputs={"v": np.ones(300)}, outputs={"omega": np.ones(300)})
-    assert "extra" not in other.meta
     assert sum(p.n for p in between_pauses(other)) == 300

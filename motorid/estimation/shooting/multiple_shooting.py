@@ -114,8 +114,7 @@ class MultipleShooting:
             return problem, self._from_poor_values(problem) if _poor(problem, problem.start) else problem.start
         if self.warm == "model" or not _poor(problem, problem.start):
             return _least_squares(problem, True)
-        q = self._from_poor_values(problem)
-        near = _least_squares(problem.start_at(problem.values(q)), False)
+        near = _least_squares(problem.start_at(problem.values(self._from_poor_values(problem))), False)
         return min(near, _least_squares(problem, True), key=lambda found: _misfit(*found)) if _poor(*near) else near
 
     def _from_poor_values(self, problem: Problem) -> Array:
