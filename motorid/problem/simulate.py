@@ -178,11 +178,14 @@ def planned(model: Model, t: Sequence[float] | Array, v: Sequence[float] | Array
 def with_channels(model: Model, run: Experiment, channels: Sequence[str],
                   sigma: Mapping[str, float] | None = None) -> Experiment:
     """Return the run with `channels` filled in from the model, with their noise (default 1 % of the RMS)."""
-    blank = run.with_(outputs={**run.outputs, **{c: np.zeros(run.n) for c in channels}},
-                      sigma={**run.sigma, **dict.fromkeys(channels, 1.0)})
-    shown = at(*settled(Problem(model, (blank,), initial="rest"), estimate_initial=False))[0].outputs
-    noise = {c: (sigma or {}).get(c) or ASSUMED_NOISE * float(np.sqrt(np.mean(shown[c] ** 2))) or 1.0 for c in channels}
-    return blank.with_(outputs={**run.outputs, **{c: shown[c] for c in channels}}, sigma={**run.sigma, **noise})
+    shown, noise = {c: np.zeros(run.n) for c in channels}, dict.fromkeys(channels, 1.0)
+    for _ in range(2):  # first as exactly as the voltage asks, then as this noise does; the speed says how wide sgn is
+        full = run.with_(outputs={**run.outputs, **shown}, sigma={**run.sigma, **noise})
+        outputs = at(*settled(Problem(model, (full,), initial="rest"), estimate_initial=False))[0].outputs
+        shown = {c: outputs[c] for c in channels}
+        noise = {c: (sigma or {}).get(c) or ASSUMED_NOISE * float(np.sqrt(np.mean(y ** 2))) or 1.0
+                 for c, y in shown.items()}
+    return run.with_(outputs={**run.outputs, **shown}, sigma={**run.sigma, **noise})
 
 
 def settled(problem: Problem, estimate_initial: bool = True) -> tuple[Problem, Array]:

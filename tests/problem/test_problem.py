@@ -318,6 +318,28 @@ def test_a_misfit_far_above_the_noise_spares_steps(rng):
     assert further[1] < 0.2 * further[0]
 
 
+def test_a_plan_is_as_exact_as_the_noise_that_it_states():
+    motor = mi.torque_driven(g=0.05, b=2e-4, J=5e-5)
+    model = motor + mi.effects.coulomb(tau_c=4e-3) + mi.effects.gravity(mgl=5e-3, phi_g=0.3)
+    model = model.replace(sgn_width=1e-2)  # the same however fast the plan is
+    sigma = {"omega": 0.3, "theta": 5e-3}
+    t = np.arange(0, 1, 1e-3)
+    volts = np.random.default_rng(1).uniform(-3, 3, 12)
+    plan = mi.planned(model, t, volts[np.arange(1000) * 12 // 1000], channels=tuple(sigma), sigma=sigma)
+    quiet = plan.with_(sigma={c: 1e-3 * s for c, s in sigma.items()})
+    exact = simulate(model, quiet, initial="rest", engine="cvodes")[0]
+    for c, s in sigma.items():
+        assert np.abs(exact.residual(c)).max() < 0.1 * s
+
+
+def test_a_plan_of_a_slow_axis_has_a_sgn_for_its_speeds():
+    model = mi.torque_driven(axis="linear", g=10.0, b=5.0, J=2.0) + mi.effects.coulomb(tau_c=8.0)
+    t = np.arange(0, 1, 1e-3)
+    plan = mi.planned(model, t, np.where(t < 0.02, 0.0, 0.85 * np.sign(np.sin(6 * np.pi * t))), channels=["omega"])
+    exact = simulate(model.replace(sgn_width=1e-5), plan, initial="rest", engine="cvodes")[0]
+    assert np.abs(exact.residual("omega")).max() < 0.01 * np.abs(exact.outputs["omega"]).max()
+
+
 def test_a_problem_for_another_model_keeps_noise_and_beginnings(runs):
     problem = as_problem(TRUE, runs)
     other = problem.for_model(TRUE + mi.effects.coulomb)
