@@ -20,7 +20,7 @@ from motorid.numerics.autoregression import effective_samples
 from motorid.numerics.least_squares import Huber
 from motorid.numerics.signals import Array
 from motorid.problem.residuals import Measured, prior_residual
-from motorid.problem.runs import Run, noise_of, prepare_run, smoothing, with_inputs
+from motorid.problem.runs import Run, first_width, noise_of, prepare_run, with_inputs
 from motorid.problem.unknowns import Point, Scaling, Unknowns
 from motorid.records.experiment import Experiment, between_pauses, units_of
 
@@ -104,7 +104,7 @@ class Problem:
             raise ModelError(f"v is in {driven}, and the model is driven by a voltage: a commanded current or torque "
                              "drives mi.torque_driven() (--drive torque). If it is a voltage, state its unit.")
         self.model.check_visible(self.outputs)
-        width = self.width or smoothing(self.experiments, self.model.parameters)
+        width = self.width or first_width(self.experiments, self.model.parameters)
         if width is not None:
             object.__setattr__(self, "model", self.model.start_at({"sgn_width": width}))
 

@@ -359,6 +359,13 @@ def _sizes_of(run: Experiment) -> _Sizes:
 
 
 # -- the width of sgn ------------------------------------------------------------------------------------
+def first_width(runs: Sequence[Experiment], parameters: Mapping[str, Parameter]) -> float | None:
+    """Return the width of sgn to begin with; where no speed was measured, what the voltage allows may narrow it."""
+    if (width := smoothing(runs, parameters)) or (p := parameters.get("sgn_width")) is None or p.given:
+        return width
+    return min(p.value, SGN_WIDTH_SHARE * natural_sizes(runs, {n: q.value for n, q in parameters.items()})["rad/s"])
+
+
 def smoothing(runs: Sequence[Experiment], parameters: Mapping[str, Any], noise: float = 1.0) -> float | None:
     """Return the width of sgn that suits the data, `noise` times as noisy as they seem; None if given or unused."""
     p = parameters.get("sgn_width")
@@ -367,8 +374,7 @@ def smoothing(runs: Sequence[Experiment], parameters: Mapping[str, Any], noise: 
 
 @lru_cache(maxsize=64)
 def _suited_width(runs: tuple[Experiment, ...], noise: float) -> float | None:
-    speed = top_speed(runs)
-    if speed <= 0:
+    if (speed := top_speed(runs)) <= 0:
         return None
     # A smooth sgn lets a loaded, stuck motor creep; over the longest standstill that must stay below the noise of
     # the angle, or the creep looks like an effect of its own.
@@ -385,9 +391,7 @@ def narrowest_width(runs: Sequence[Experiment]) -> float:
 
 def _speed_gained(run: Experiment) -> float:
     """Change of speed per sample where the angle is accelerated most, rad/s; 0 without an angle."""
-    if "theta" not in run.outputs:
-        return 0.0
-    speeds = window_slopes(run.t, run.outputs["theta"])
+    speeds = window_slopes(run.t, run.outputs["theta"]) if "theta" in run.outputs else ()
     return 0.0 if len(speeds) < 3 else float(np.percentile(np.abs(np.diff(speeds)), 95)) * len(speeds) / run.n
 
 

@@ -340,6 +340,20 @@ def test_a_plan_of_a_slow_axis_has_a_sgn_for_its_speeds():
     assert np.abs(exact.residual("omega")).max() < 0.01 * np.abs(exact.outputs["omega"]).max()
 
 
+def test_a_slow_motor_of_which_the_current_alone_was_measured_has_a_sgn_for_its_speeds():
+    model = mi.dc_motor(R=1.2, L=1e-3, K=30.0, b=3.0, J=20.0) + mi.effects.coulomb(tau_c=8.0)
+    t = np.arange(0, 1, 1e-3)
+    volts = np.random.default_rng(1).uniform(-3, 3, 12)[np.arange(1000) * 12 // 1000]
+    run = mi.planned(model.replace(sgn_width=2e-5), t, volts, channels=["i"])
+    assert mi.evaluate(model, run).nrmse["i"] < 2e-3
+    plan = mi.planned(model, t, volts, channels=["i"])
+    assert np.allclose(plan.outputs["i"], run.outputs["i"], rtol=0, atol=run.sigma["i"])
+    narrow = model.start_at({"sgn_width": 1e-5})  # a fit of these records chose it
+    assert as_problem(narrow, run).model.values["sgn_width"] == 1e-5
+    fast = as_problem(model.start_at({"K": 0.03}), run)
+    assert fast.model.values["sgn_width"] == 0.01
+
+
 def test_a_problem_for_another_model_keeps_noise_and_beginnings(runs):
     problem = as_problem(TRUE, runs)
     other = problem.for_model(TRUE + mi.effects.coulomb)
