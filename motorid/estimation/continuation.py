@@ -14,7 +14,7 @@ from motorid.estimation.least_squares import FAILURES, RACE, ROUNDS, Callback, E
 from motorid.estimation.restarts import restarted_where_doubtful
 from motorid.numerics.least_squares import LevenbergMarquardt, levenberg_marquardt
 from motorid.problem.problem import Problem
-from motorid.problem.runs import SGN_WIDTH_SHARE, narrowest_width, smoothing, top_speed
+from motorid.problem.runs import SGN_WIDTH_SHARE, narrowest_width, suited_width, top_speed
 from motorid.problem.simulate import misfit_over_noise
 
 WIDEST = 0.03  # first width of sgn over the highest speed
@@ -108,7 +108,7 @@ def smooths(problem: Problem) -> bool:
 
 def _widths(problem: Problem) -> tuple[float, ...]:
     """Return the widths of sgn, wide to narrow; the last is the one that the speeds of the records ask for."""
-    width = _narrow_enough(problem)
+    width = max(SGN_WIDTH_SHARE * top_speed(problem.experiments), _narrowest(problem))
     ratio = max(WIDEST * top_speed(problem.experiments) / width, 1.0)
     steps = int(np.ceil(np.log(ratio) / np.log(STEP)))
     return (*(width * np.geomspace(ratio, 1.0, steps + 1)[:-1]), width)
@@ -120,19 +120,14 @@ def _at(problem: Problem, width: float | None) -> Problem:
 
 def _narrowest(problem: Problem, noise: float = 1.0) -> float:
     """Return the width of sgn that the noise of the records asks for, `noise` times what was estimated."""
-    return smoothing(problem.experiments, problem.model.parameters, noise) or problem.model.values["sgn_width"]
-
-
-def _narrow_enough(problem: Problem) -> float:
-    """Return the width of sgn that the speeds of the records ask for, whatever their noise."""
-    return max(SGN_WIDTH_SHARE * top_speed(problem.experiments), _narrowest(problem))
+    return suited_width(problem.experiments, noise) or problem.model.values["sgn_width"]
 
 
 def _narrower(found: Estimate) -> tuple[float, bool] | None:
     """Return a narrower width to try, and whether the creep of a loaded, stuck motor in the angle surely asks for it.
     None where there is no room: narrower than what a sub-step gains in speed."""
     problem = found.problem
-    if problem.width is None or not smooths(problem) or problem.width > 1.01 * _narrow_enough(problem):
+    if problem.width is None or not smooths(problem) or problem.width > 1.01 * _widths(problem)[-1]:
         return None
     misfit = misfit_over_noise(problem, found.q).get("theta")
     asked = problem.width if misfit is None else _narrowest(problem, min(misfit, 1.0))

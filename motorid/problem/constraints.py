@@ -165,13 +165,12 @@ def _steady_rows(system: Any, v: float, means: Mapping[str, float]) -> Callable[
         state: list[Any] = ca.vertsplit(x)
         for channel, shown in means.items():
             place = system.states.index(channel)
+            state[place] = shown
             if channel in system.outputs:
                 # One Newton step undoes gains and offsets; a sensor with a lag has settled, it shows its input.
                 at = system.outputs.index(channel)
                 slope = ca.jacobian(y[at], x[place])
-                state[place] = x[place] + (shown - y[at]) / slope if not slope.is_zero() else shown
-            else:
-                state[place] = shown
+                state[place] = shown if slope.is_zero() else x[place] + (shown - y[at]) / slope
         balances = system.balances(ca.vertcat(*state), u, p)
         par = dict(zip(system.parameters, ca.vertsplit(p), strict=True))
         drive = par["K"] * means["i"] if "K" in par and "i" in means else par.get("g", 1.0) * v
@@ -251,8 +250,7 @@ class Constraint(Relation):
         found = []
         for k, run in enumerate(problem.runs[:1] if constant else problem.runs):
             t = run.experiment.t[:1] if constant else run.experiment.t
-            n = len(t)
-            one = np.ones(n)
+            n, one = len(t), np.ones(len(t))
             labels = [self.title if constant else f"{self.title}, run {k}, t = {at:.6g} s" for at in t]
             found.append(Part(k, rows_of, np.arange(n), False, run.grid.u[:n], np.ones(n, bool),
                               self.lower / self.size * one, self.upper / self.size * one, self.size * one,

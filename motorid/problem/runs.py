@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from itertools import product
-from typing import Any, NamedTuple
+from typing import NamedTuple
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -321,13 +321,11 @@ def suited(parameter: Parameter, sizes: Mapping[str, float]) -> Parameter:
     """Return a parameter of an effect with a starting value that suits the data, unless the user gave one."""
     if parameter.given or parameter.name == "sgn_width":
         return parameter
-    size = sizes.get(parameter.unit)
+    size, value = sizes.get(parameter.unit), parameter.value
     if parameter.null == 0 and size is not None and not parameter.positive:
         value = 0.02 * size
     elif parameter.grid and (size is not None or parameter.null is None):
         value = shapes_of(parameter, sizes)[len(parameter.grid) // 2]
-    else:
-        value = parameter.value
     return replace(parameter, value=float(np.clip(value, parameter.lower, parameter.upper)))
 
 
@@ -359,21 +357,17 @@ def _sizes_of(run: Experiment) -> _Sizes:
 
 
 # -- the width of sgn ------------------------------------------------------------------------------------
-def first_width(runs: Sequence[Experiment], parameters: Mapping[str, Parameter]) -> float | None:
-    """Return the width of sgn to begin with; where no speed was measured, what the voltage allows may narrow it."""
-    if (width := smoothing(runs, parameters)) or (p := parameters.get("sgn_width")) is None or p.given:
-        return width
-    return min(p.value, SGN_WIDTH_SHARE * natural_sizes(runs, {n: q.value for n, q in parameters.items()})["rad/s"])
-
-
-def smoothing(runs: Sequence[Experiment], parameters: Mapping[str, Any], noise: float = 1.0) -> float | None:
-    """Return the width of sgn that suits the data, `noise` times as noisy as they seem; None if given or unused."""
-    p = parameters.get("sgn_width")
-    return None if p is None or p.given else _suited_width(tuple(runs), noise)
+def first_width(runs: tuple[Experiment, ...], parameters: Mapping[str, Parameter]) -> float | None:
+    """Return the width of sgn to begin with, None if given or unused; the voltage narrows it where no speed does."""
+    if (p := parameters.get("sgn_width")) is None or p.given:
+        return None
+    values = {n: q.value for n, q in parameters.items()}
+    return suited_width(runs, 1.0) or min(p.value, SGN_WIDTH_SHARE * natural_sizes(runs, values)["rad/s"])
 
 
 @lru_cache(maxsize=64)
-def _suited_width(runs: tuple[Experiment, ...], noise: float) -> float | None:
+def suited_width(runs: tuple[Experiment, ...], noise: float) -> float | None:
+    """Return the width of sgn that suits the speeds in the data, `noise` times as noisy as they seem."""
     if (speed := top_speed(runs)) <= 0:
         return None
     # A smooth sgn lets a loaded, stuck motor creep; over the longest standstill that must stay below the noise of

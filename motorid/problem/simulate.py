@@ -106,10 +106,9 @@ def run_table(evaluation: Evaluation, title: str = "Errors run by run") -> Table
     """Return the NRMSE of each run per channel; of many runs the first ones."""
     shown = list(zip(evaluation.simulations, evaluation.by_run, strict=True))
     units = units_of(s.experiment for s, _ in shown)
-    header = ["run", *(f"NRMSE {channel_name(c, units.get(c, ''))}" for c in evaluation.nrmse)]
     rows = [[s.experiment.name, *(percent(e.get(c)) for c in evaluation.nrmse)] for s, e in shown[:MOST_RUNS]]
     note = f"and {counted(len(shown) - MOST_RUNS, 'more run')}" if len(shown) > MOST_RUNS else ""
-    return Table(header, rows, title, note)
+    return Table(["run", *(f"NRMSE {channel_name(c, units.get(c, ''))}" for c in evaluation.nrmse)], rows, title, note)
 
 
 @one_thread
@@ -192,8 +191,7 @@ def settled(problem: Problem, estimate_initial: bool = True) -> tuple[Problem, A
     """Return a problem with all that runs share fixed at the model's values, and where the rest fits the records."""
     held = problem.with_(model=problem.model.fix(*problem.model.shared_names), priors={}, penalties=())
     held = with_angles_apart(held) if estimate_initial else held
-    q = held.start
-    held = held.refined(q)
+    q, held = held.start, held.refined(held.start)
     for _ in range(SETTLES if len(q) and estimate_initial else 0):  # friction turns elsewhere: other sub-steps there
         try:
             found = levenberg_marquardt(held.residual, held.residual_and_jacobian, q, held.scaling.bounds,
@@ -238,13 +236,12 @@ def judge(simulations: Sequence[Simulation]) -> Evaluation:
     sums, by_run = {c: np.zeros(3) for c in channels}, []
     for s in simulations:
         errors = {}
-        for c in channels:
-            if c in s.experiment.outputs:
-                y = s.experiment.moved(c)
-                ok = np.isfinite(y)
-                e = s.residual(c)[ok]
-                sums[c] += e @ e, y[ok] @ y[ok], ok.sum()
-                errors[c] = float(np.sqrt(e @ e / max(y[ok] @ y[ok], 1e-300)))
+        for c in (c for c in channels if c in s.experiment.outputs):
+            y = s.experiment.moved(c)
+            ok = np.isfinite(y)
+            e = s.residual(c)[ok]
+            sums[c] += e @ e, y[ok] @ y[ok], ok.sum()
+            errors[c] = float(np.sqrt(e @ e / max(y[ok] @ y[ok], 1e-300)))
         by_run.append(errors)
     return Evaluation(tuple(simulations), {c: float(np.sqrt(s[0] / max(s[1], 1e-300))) for c, s in sums.items()},
                       {c: float(np.sqrt(s[0] / max(s[2], 1))) for c, s in sums.items()}, tuple(by_run))

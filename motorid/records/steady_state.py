@@ -5,12 +5,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from motorid.numerics.signals import Array, window_slopes
+from motorid.numerics.signals import Array, bridged, integral, slope, window_slopes
 from motorid.records.experiment import Experiment
 
 LEAST = 16  # samples
 INPUT_SHARE = 0.02  # of the largest input: how far a held input may wander, and below which it counts as off
 DRIFT_SHARE = 1e-3  # of a channel's largest value: a smaller change between the halves is no drift
+DRIVE_SHARE = 0.05  # of what drives a motor: as much may still accelerate it, hidden by noise
 MOVING_SHARE = 0.01  # of the top speed: slower than this is standstill
 
 
@@ -44,8 +45,8 @@ class SteadySegment:
 def find_segments(runs: Sequence[Experiment], sigma: Sequence[Mapping[str, float]]) -> tuple[SteadySegment, ...]:
     """Return the steady parts of `runs`, at most one per stretch of held input, the longest that ends it.
 
-    A stretch counts where the two halves of its tail agree in every channel within four standard errors or
-    0.1 % of the channel's largest value. Parts without input and without motion say nothing and are left out.
+    A stretch counts where the two halves of its tail agree in every channel within four standard errors or 0.1 % of its
+    largest value, and at most 5 % of the drive still accelerate. Parts without input and motion do not.
     """
     return tuple(tail for k, run in enumerate(runs) for first, last in _constant_stretches(run.inputs["v"])
                  if (tail := _steady_tail(k, run, sigma[k], first, last)))
@@ -76,10 +77,25 @@ def _steady_tail(k: int, run: Experiment, sigma: Mapping[str, float], first: int
         if last - begin + 1 < LEAST:
             return None
         if all(_level(run, c, sigma, begin, last) for c in run.outputs):
-            segment = _segment(k, run, begin, last)
-            idle = abs(segment.v) <= INPUT_SHARE * float(np.abs(run.inputs["v"]).max()) and not segment.moving
-            return None if idle else segment
+            s = _segment(k, run, begin, last)
+            idle = abs(s.v) <= INPUT_SHARE * float(np.abs(run.inputs["v"]).max()) and not s.moving
+            if not s.moving or "omega" not in s.means or _accelerating(run, first, s) <= DRIVE_SHARE:
+                return None if idle else s
     return None
+
+
+def _accelerating(run: Experiment, first: int, s: SteadySegment) -> float:
+    """Return the share of the drive that still accelerates in a part, by the way there from sample `first` on.
+
+    That takes J/K Δω = ∫(i − ī)dt, and what is left falls with ∫(ω̄ − ω)dt/Δω; without a current friction is viscous.
+    """
+    way, level = slice(first, s.first + 1), s.means.get("i", s.means["omega"]) or 1.0
+    y = bridged(run.t, run.outputs["omega" if "omega" in run.outputs else "theta"])
+    short = s.means["omega"] - (y if "omega" in run.outputs else slope(run.t, y, 4))
+    drive = bridged(run.t, run.outputs["i"]) - s.means["i"] if "i" in s.means else short
+    lag = integral(run.t[way], short[way])[-1] / (short[first:first + 3].mean() or 1.0)
+    left = np.exp(-(s.begin - run.t[first]) / max(lag, run.dt)) / (s.end - s.begin)
+    return float(abs(integral(run.t[way], drive[way])[-1] / level) * left)
 
 
 def _level(run: Experiment, channel: str, sigma: Mapping[str, float], first: int, last: int) -> bool:

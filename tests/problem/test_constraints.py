@@ -92,6 +92,23 @@ def test_no_steady_part_in_a_sweep_is_said(rng):
         assert SteadyState().parts(problem_of([run])) == ()
 
 
+@pytest.mark.parametrize("channel", ["omega", "theta"])
+@pytest.mark.parametrize(("samples", "kept"), [(83, 0), (250, 4)])
+def test_where_noise_hides_that_the_drive_still_accelerates_is_no_steady_part(channel, samples, kept):
+    """83 ms into a step a motor of 24 ms puts as much into its inertia as into its friction; 250 ms into it nothing."""
+    rng, t = np.random.default_rng(1), np.arange(1000) * 1e-3
+    model = mi.dc_motor(R=1.2, L=1e-3, K=0.05, b=2e-5, J=5e-5)
+    plan = mi.planned(model, t, rng.uniform(-6, 6, 13)[np.arange(1000) // samples], channels=["i", channel])
+    noise = {"i": 0.02, channel: {"omega": 0.3, "theta": 1e-3}[channel]}
+    run = plan.with_(outputs={c: y + s * rng.normal(size=1000) for (c, y), s in zip(
+        plan.outputs.items(), noise.values(), strict=True)}, sigma=noise)
+    found, exact = SteadyState().segments(as_problem(model, run)), as_problem(model, plan)
+    assert len(found) == kept
+    for s in found:
+        omega = exact.simulate(exact.start, 0).x[s.first:s.last + 1, 1]
+        assert 5e-5 * abs(omega[-1] - omega[0]) / (s.end - s.begin) < 0.1 * 2e-5 * abs(s.means["omega"])
+
+
 def test_the_relation_at_the_steady_state_is_that_of_the_textbook(noisy):
     problem = problem_of(noisy)
     r, _ = evaluated(SteadyState(), problem, problem.start)
