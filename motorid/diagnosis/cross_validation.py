@@ -45,9 +45,9 @@ class HeldOut:
         """
         held_out: Mapping[str, Errors] = {}
         if self.validation is not None:
-            # As finely as it was fitted: a tiny noise asks for many sub-steps that change nothing here.
-            there = self.validation.for_model(fit.model).tuned(accuracy=fit.problem.accuracy)
-            held_out = held_out_errors(there, self.noise)
+            # As finely and sharply as it was fitted: a tiny noise asks for many sub-steps that change nothing here.
+            fitted = {"accuracy": fit.problem.accuracy, "width": fit.values.get("sgn_width")}
+            held_out = held_out_errors(self.validation.for_model(fit.model).tuned(**fitted), self.noise)
         if (blocks := predictions_left_out(fit)) is None and not held_out:
             blocks = self._refitted(fit)
         return Predictions(blocks or {}, held_out)

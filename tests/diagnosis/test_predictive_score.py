@@ -342,6 +342,19 @@ def test_which_angle_is_followed_as_closely_as_can_be_asked(lab):
     assert not predictions_left_out(missed)["theta"].fine
 
 
+@pytest.mark.parametrize("channels", [("i", "omega"), ("theta",)])
+def test_held_out_errors_are_those_of_evaluate_also_of_a_slower_run_with_friction(lab, channels):
+    """The sgn is the fit's own, not one for the speeds of the held-out run."""
+    rng = np.random.default_rng(5)
+    fast, slow = (record(driven(lab, {"coulomb": {"tau_c": 8e-3}}, "stairs", 400, 1e-3, rng), "logger", channels, lab,
+                         rng, name) for name in ("fast", "slow"))
+    slow = slow.with_(inputs={"v": 0.5 * slow.inputs["v"]}, outputs={c: 0.5 * y for c, y in slow.outputs.items()})
+    plain = mi.fit(mi.dc_motor(), fast)
+    for fit in (plain, mi.fit(mi.dc_motor() + mi.effects.coulomb, fast)):
+        errors = HeldOut.of(plain, slow).predictions(fit).held_out
+        assert {c: e.nrmse for c, e in errors.items()} == pytest.approx(dict(mi.evaluate(fit, slow).nrmse), rel=1e-9)
+
+
 def test_what_the_records_need_is_not_superfluous_for_a_held_out_run_that_says_nothing(rng):
     r, h = rng.normal(size=(2, 1000))
     whole, smaller = both(0.1 * r, 0.5 * h), both(0.9 * r, 0.499 * h)
