@@ -89,20 +89,18 @@ def _told(found: Climb, driven: str, validated: bool) -> Diagnosis:
     groups = tuple(g for g in found.groups if g[0] in names)
     rivals = found.rivals if groups[:1] == found.groups[:1] else ()
     forms, suggestion = tuple(f.form for f in found.forms), None
-    unseen = found.search.unseen(found.path[-1])
-    form = next(iter(forms), None)
-    if form is not None:
-        remaining = following(remaining, form.text)
-    like = form or next((g.form for g in found.grades if g.form is not None), None)
+    if forms:
+        remaining = following(remaining, forms[0].text)
+    like = next(iter(forms), None) or next((g.form for g in found.grades if g.form is not None), None)
     if like is not None and not names:
         missing = acting_like(missing, like)
     if names:
         verdict, where = "missing", WHERE[{e.name: e.balance for e in ladder.best.model.effects}[names[0]]]
-        rises = bool(words.held_out_remark(found.path[-1]))
-        answer = words.missing_text(ladder.rungs, remaining, groups, found.grades, rises, found.stopped)
+        answer = words.missing_text(ladder.rungs, remaining, groups, found.grades,
+                                    bool(words.held_out_remark(found.path[-1])), found.stopped)
         same = _inseparable(found, ladder.best.model)
-        also = words.hidden_remark(found.search.hidden(found.path[-1]))
-        details = [words.moves(fit, ladder.best), words.rises_text(ladder.rungs), words.inseparable_remark(same), also,
+        details = [words.moves(fit, ladder.best), words.rises_text(ladder.rungs), words.inseparable_remark(same),
+                   words.hidden_remark(found.search.hidden(found.path[-1])),
                    words.exchanged_remark({} if found.stopped else with_lags_exchanged(ladder.best))]
         for name, shared in same.items():  # what acts through these parameters, and that one
             inside = (e.name for e in ladder.best.model.effects if {p.name for p in e.parameters} & {*shared})
@@ -121,7 +119,7 @@ def _told(found: Climb, driven: str, validated: bool) -> Diagnosis:
         answer, *details = words.adequate_text(judged, ranking, bool(far(ladder.best)))
     kind = "structure" if not remaining.adequate else "fluctuation" if far(ladder.best) else "noise"
     if not names:
-        details.append(words.unseen_remark(unseen))
+        details.append(words.unseen_remark(found.search.unseen(found.path[-1])))
     details = tuple(t for t in (*details, *_remarks(found, driven)) if t)
     text = " ".join(t for t in (answer, *details, suggestion) if t)
     approximating = {g.effect: g.form for g in found.grades if g.grade == "approximates"}

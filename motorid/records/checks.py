@@ -177,11 +177,11 @@ def _at_stop(y: Array, top: float) -> bool:
     entries = np.abs(y[np.flatnonzero(there[1:] & ~there[:-1])] - top)
     if there.sum() >= max(10, 0.01 * len(y)) and entries.size and np.median(entries) > max(3 * step, 0.005 * reach):
         return True
-    if step or noise_level(y[~there]) <= 1e-4 * reach:
+    if noise_level(y[~there]) <= max(1e-4 * reach, step):
         return False
     between = np.sort(y[(y > y.min()) & (y < y.max())])
-    stays = there.sum() > 3 and float(np.mean(there[1:][there[:-1]])) > 0.5
-    return stays or not (np.diff(between) == 0).any()  # noise that is not rounded makes no two samples alike
+    stays = there.sum() > 3 and float(np.mean(there[1:][there[:-1]])) > 0.5  # where noise moves all others
+    return stays or not (step or (np.diff(between) == 0).any())  # noise that is not rounded makes no two samples alike
 
 
 def _coarse(run: Experiment) -> str | None:

@@ -349,3 +349,14 @@ def test_a_speed_in_rpm_beside_an_angle_in_turns_is_told(good):
     """Read as degrees per second, the ratio was taken for that of pi to 180."""
     text = said(changed(good, omega=30 / np.pi, theta=1 / (2 * np.pi)))
     assert "units={'omega': 'rpm', 'theta': 'rev'}" in text
+
+
+def test_a_coarse_current_that_stays_where_noise_moves_all_others_is_clipped(rng):
+    """3 % of a converter's samples at the end of its range were taken for the driver's current limit."""
+    t = np.arange(2000) * 2e-3
+    v = np.sign(np.sin(2 * np.pi * t))
+    noisy = 0.5 * v * np.exp(-(t % 0.5) / 0.02) + 4e-3 * rng.normal(size=2000)
+    coarse = np.clip(np.round(noisy / 2e-3) * 2e-3, -0.34, 0.34)
+    run = Experiment(t, {"v": v}, {"i": coarse, "omega": 10 * v * (1 - np.exp(-(t % 0.5) / 0.1))})
+    assert "the current stays at exactly 0.34 A" in said(run)
+    assert "clipped" not in said(run.with_(outputs={**run.outputs, "i": np.round(noisy / 2e-3) * 2e-3}))
