@@ -1095,6 +1095,27 @@ def test_a_smaller_law_that_leaves_noise_takes_the_place_of_what_explains_most(m
     assert mi.evaluate(found.remainder.fitted, runs[2]).rmse["theta"] == pytest.approx(2e-3, rel=0.1)
 
 
+def test_a_curve_reaches_as_far_as_the_motor_got(monkeypatch):
+    """A constant that falls with the speed lets the motor run faster than the plain model, where a curve ended."""
+    _only(monkeypatch, "a motor constant", "omega")
+
+    @mi.effect(balance="torque")
+    def late_commutation(m, w_h=mi.P(130.0, "rad/s")):
+        m.scale("K", 1 / (1 + (m.omega / w_h) ** 2))
+
+    noise, t = {"i": 0.01, "omega": 0.3}, np.arange(1500) * 1e-3
+    motor, runs = mi.dc_motor(R=2.0, L=2e-3, K=0.05, b=2e-5, J=2e-5) + late_commutation, []
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        still = mi.Experiment(t, {"v": np.repeat(rng.uniform(-6, 6, 10), 150)}, dict.fromkeys(noise, 0 * t))
+        shown = mi.simulate(motor, still, initial="rest")[0].outputs
+        runs.append(still.with_(outputs={c: shown[c] + s * rng.standard_normal(1500) for c, s in noise.items()}))
+    found = mi.diagnose(mi.fit(mi.dc_motor(), runs[:2]), runs[2:], effects=("quadratic_drag",))
+    assert str(found.remainder.follows) == "a motor constant that changes with the speed"
+    errors = mi.evaluate(found.remainder.fitted, runs[2]).rmse
+    assert all(errors[c] < 1.1 * noise[c] for c in noise), errors
+
+
 def test_an_error_of_a_sensor_leaves_the_motor_its_parameters(monkeypatch):
     """A curve over what its sensor reads would be a gain, too, and that R, L, b and J together: R was 2.1 ± 0.1 Ω."""
     _only(monkeypatch, "an error of the current sensor", "i")
