@@ -42,6 +42,7 @@ def objections(fit: Fit, added: Effect, before: Fit | None = None) -> str:
             if p.vary and physical and sign * limit > 0 and max(sign * v for v in values) > 0.98 * sign * limit:
                 return f"{p.name} runs to {limit:g}, the limit of what is physical"
     why = _too_large(fit, pars) or _alike(fit, added) or unresolved(fit, added) or _belied(fit, added)
+    why = why or _blurred(fit, added)
     return why or (_emptied(fit, added, before) if before else "")
 
 
@@ -51,6 +52,15 @@ def _alike(fit: Fit, added: Effect) -> str:
     if added.includes and len(sizes) > 1 and max(sizes) - min(sizes) < MATERIAL * max(sizes):
         return f"its sizes differ by less than {percent(MATERIAL, 1)}: no more than {added.includes[0]}"
     return ""
+
+
+def _blurred(fit: Fit, added: Effect) -> str:
+    """Say so where the measured angle that leads an effect over the turn is uncertain by a radian of its phase."""
+    if not (fit.problem.model.angle_input and any(p.periodic for p in added.parameters)):
+        return ""
+    order = max((fit.values[p.name] for p in added.parameters if p.order), default=1.0)
+    noise = min(noise_level(r.outputs["theta"], r.t) for r in fit.problem.experiments)
+    return f"the angle that it follows is measured to {number(noise, 2)} rad" if order * noise > 1 else ""
 
 
 def _too_large(fit: Fit, pars: Sequence[Parameter]) -> str:

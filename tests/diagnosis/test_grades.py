@@ -404,3 +404,13 @@ def test_an_answer_names_the_library_only_where_it_was_tried(rubbing):
     assert "none of the effects asked for" in some.answer
     assert "library" not in some.answer
     assert "not all effects were tried" in none.answer
+
+
+@pytest.mark.parametrize(("noise", "objected"), [(0.02, False), (2.5, True)])
+def test_what_follows_an_angle_that_is_noise_by_more_than_a_turn_is_no_weight(noise, objected):
+    """A wheel located by radio: "gravity" lowered the error, led by an angle that was right to 2.5 rad."""
+    model = mi.dc_motor(R=1.2, L=1e-3, K=0.05, b=2e-4, J=5e-4) + mi.effects.gravity(mgl=5e-3, phi_g=0.3)
+    led = replace(model, angle_input=True, _systems={})
+    fit = mi.fit(led, [stepped(model, 1, 600, 5e-3, theta=noise)])
+    assert fit.problem.model.angle_input
+    assert ("the angle that it follows is measured to 2." in objections(fit, mi.effects.gravity)) is objected
