@@ -41,8 +41,8 @@ def objections(fit: Fit, added: Effect, before: Fit | None = None) -> str:
             physical = np.isfinite(limit) and limit in (declared.upper, declared.lower)  # not set for these records
             if p.vary and physical and sign * limit > 0 and max(sign * v for v in values) > 0.98 * sign * limit:
                 return f"{p.name} runs to {limit:g}, the limit of what is physical"
-    why = _too_large(fit, pars) or _alike(fit, added) or unresolved(fit, added) or _belied(fit, added)
-    why = why or _blurred(fit, added)
+    why = (_too_large(fit, pars) or _alike(fit, added) or unresolved(fit, added) or _belied(fit, added)
+           or _blurred(fit, added))
     return why or (_emptied(fit, added, before) if before else "")
 
 

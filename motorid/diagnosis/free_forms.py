@@ -134,7 +134,6 @@ FORMS = (*(Form(words, balance, on, carrier) for words, balance, carrier, quanti
 
 
 USUAL = 0.998  # of the samples of a channel: no lone one tells how far it reaches
-EMPTY = np.empty(0)
 
 
 @dataclass(frozen=True)
@@ -161,8 +160,8 @@ def span_of(fit: Fit, signals: Sequence[Mapping[str, Array]]) -> Span:
     step = float(np.median(np.concatenate([np.diff(s["t"]) for s in signals])))
     ranges = {n: (min(float(s[n].min()) for s in signals), max(float(s[n].max()) for s in signals)) for n in names}
     for c in ranges.keys() & {*fit.problem.outputs}:  # a model that lacks something may not get as far as the motor
-        seen = np.concatenate([y[np.isfinite(y)] for r in fit.problem.experiments for y in (r.outputs.get(c, EMPTY),)])
-        least, most = np.quantile(seen, [0.5 - USUAL / 2, 0.5 + USUAL / 2]).tolist()
+        seen = np.concatenate([r.outputs[c] for r in fit.problem.experiments if c in r.outputs])
+        least, most = np.nanquantile(seen, [0.5 - USUAL / 2, 0.5 + USUAL / 2]).tolist()
         ranges[c] = min(ranges[c][0], least), max(ranges[c][1], most)
     known = [fit.values[p.name] for e in fit.model.effects for p in e.parameters if p.order]
     lines = likely_lines(Tangent.of(fit), LIBRARY["cogging"], LINES) if "theta" in fit.problem.outputs else []

@@ -20,15 +20,7 @@ from motorid.diagnosis.adequacy import following, judge_adequacy, within_noise
 from motorid.diagnosis.candidates import Search, Stages, library
 from motorid.diagnosis.cross_validation import QUICK, HeldOut
 from motorid.diagnosis.input_hypotheses import Reading, better_reading, without_spikes
-from motorid.diagnosis.misspecification import (
-    IN_ITS_PLACE,
-    FormGain,
-    Grade,
-    better_forms,
-    grades_of,
-    outdoes,
-    swallows,
-)
+from motorid.diagnosis.misspecification import IN_ITS_PLACE, FormGain, Grade, better_forms, grades_of, outdoes, swallows
 from motorid.diagnosis.model_comparison import Node, at_noise, beats, choose, evidence, far, group_of, node_of
 from motorid.diagnosis.predictive_score import is_sure
 from motorid.diagnosis.record_parts import affordable, fitted_to, thinned_alike
