@@ -19,7 +19,7 @@ from motorid.errors import UsageError, at_least
 from motorid.numerics.signals import Array
 from motorid.plots import style
 from motorid.plots.fits import what_changed
-from motorid.plots.residuals import scatter
+from motorid.plots.residuals import means, scatter
 
 FINE = 60  # bins of a mean that is drawn as a curve
 LOWEST_GAIN = -0.12  # drawn; what lies below is shown by an arrow
@@ -90,12 +90,7 @@ def _binned(ax: Axes, b: Binned, signals: Sequence[Mapping[str, Array]], values:
     ok = np.isfinite(x) & np.isfinite(y) & (x >= b.centre.min()) & (x <= b.centre.max())
     if ok.any():
         scatter(ax, x[ok], y[ok], most=800, color=style.MUTED)
-    gaps = np.diff(b.centre)
-    cuts = np.flatnonzero(gaps > max(4 * float(np.median(gaps)), 0.15 * float(np.ptp(b.centre)))) + 1
-    for part in np.split(np.arange(len(b.centre)), cuts):  # no curve where there are no samples
-        x = b.centre[part]
-        ax.fill_between(x, b.low[part] * factor, b.high[part] * factor, color=colour, alpha=0.3, lw=0)
-        ax.plot(x, b.mean[part] * factor, "-" if len(part) > 1 else "o", ms=3, color=colour, lw=1.5)
+    means(ax, b, factor, color=colour)
     ax.axhline(0, color=style.MUTED, lw=0.6)
     name = style.axis_label(b.against)
     label = f"{name.split(' (')[0]} ({b.unit})" if b.unit else name

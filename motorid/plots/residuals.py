@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
+from motorid.diagnosis.locate import binned
+from motorid.diagnosis.results import Binned
 from motorid.errors import DataError, chosen
 from motorid.estimation.result import Fit
 from motorid.numerics.autoregression import autocorrelation, effective_samples
@@ -16,7 +18,6 @@ from motorid.plots import style
 from motorid.problem.simulate import Simulation
 
 LAGS = 60
-BINS = 24
 
 
 @style.styled
@@ -73,7 +74,7 @@ def _channel(axes: np.ndarray, fit: Fit, channel: str, against: Sequence[str]) -
     _autocorrelation(axes[3], residuals)
     for ax, other in zip(axes[4:], against, strict=True):
         # The model's own: the measured one shares its noise with the residual, which then seems to depend.
-        _against(ax, np.concatenate([s.outputs[other] for s in sims]), every, sigma)
+        _against(ax, other, np.concatenate([s.outputs[other] for s in sims]), every, sigma)
         ax.set(xlabel=style.axis_label(other, run), title=f"Against {style.axis_label(other, run).split(' (')[0]}")
         ax.sharey(axes[4])
     axes[4].set_ylabel(f"residual ({unit})")
@@ -135,15 +136,12 @@ def _autocorrelation(ax: Axes, residuals: Sequence[Array]) -> None:
     ax.set(xlabel="lag (samples)", ylabel="correlation", title="Autocorrelation")
 
 
-def _against(ax: Axes, x: Array, r: Array, sigma: float) -> None:
+def _against(ax: Axes, against: str, x: Array, r: Array, sigma: float) -> None:
     ok = np.isfinite(x) & np.isfinite(r)
     x, r = x[ok], r[ok]
     style.band(ax, 2 * sigma)
     scatter(ax, x, r)
-    centre, mean, half = binned_means(x, r)
-    ax.errorbar(centre, mean, yerr=half, fmt="o", ms=2.5, lw=1.1, color=style.INK)
-    gaps = np.flatnonzero(np.diff(centre) > 1.5 * np.ptp(x) / BINS) + 1  # no line over empty bins
-    ax.plot(np.insert(centre, gaps, np.nan), np.insert(mean, gaps, np.nan), lw=1.1, color=style.INK)
+    means(ax, binned(against, x, r), color=style.INK)
 
 
 def scatter(ax: Axes, x: Any, y: Any, most: int = 1500, color: str = style.RESIDUAL) -> None:
@@ -153,10 +151,11 @@ def scatter(ax: Axes, x: Any, y: Any, most: int = 1500, color: str = style.RESID
     ax.plot(x[keep], y[keep], ".", ms=2, color=color, alpha=0.35, mew=0, rasterized=len(keep) > 400, zorder=1)
 
 
-def binned_means(x: Array, y: Array) -> tuple[Array, Array, Array]:
-    """Return centres, means and 1.96 standard errors of y in equal bins of x with five samples or more."""
-    count, edges = np.histogram(x, BINS)
-    n, full = np.maximum(count, 1), count >= 5
-    mean, square = (np.histogram(x, edges, weights=w)[0] / n for w in (y, y**2))
-    half = 1.96 * np.sqrt(np.maximum(square - mean**2, 0) / n)
-    return ((edges[:-1] + edges[1:]) / 2)[full], mean[full], half[full]
+def means(ax: Axes, b: Binned, factor: float = 1.0, *, color: str) -> None:
+    """Draw means with their interval of 95 %, times a factor; no curve where there are no samples."""
+    gaps = np.diff(b.centre)
+    wide = gaps > max(4 * float(np.median(gaps)) if gaps.size else 0.0, 0.15 * float(np.ptp(b.centre)))
+    for part in np.split(np.arange(len(b.centre)), np.flatnonzero(wide) + 1):
+        x = b.centre[part]
+        ax.fill_between(x, b.low[part] * factor, b.high[part] * factor, color=color, alpha=0.3, lw=0)
+        ax.plot(x, b.mean[part] * factor, "-" if len(part) > 1 else "o", ms=3, color=color, lw=1.5)

@@ -17,10 +17,10 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 import motorid as mi
 from motorid import plots
+from motorid.diagnosis.locate import binned
 from motorid.errors import UsageError
 from motorid.estimation.shooting.formulations import compare_formulations
 from motorid.plots.fits import LiveFit
-from motorid.plots.residuals import binned_means
 from motorid.plots.style import axis_label, detached, envelope, svg_of
 from motorid.problem.constraints import CurrentLimit
 from motorid.uncertainty.identifiability import identifiability
@@ -281,8 +281,8 @@ def test_sensitivities_are_what_one_per_cent_of_a_parameter_does(found):
 
 def test_binned_means_follow_the_curve(rng):
     x = rng.uniform(-1, 1, 5000)
-    centre, mean, half = binned_means(x, x**3 + rng.normal(0, 0.1, 5000))
-    assert np.mean(np.abs(mean - centre**3) < 2 * half) > 0.9
+    b = binned("omega", x, x**3 + rng.normal(0, 0.1, 5000))
+    assert np.mean(np.abs(b.mean - b.centre**3) < b.high - b.low) > 0.9
 
 
 @pytest.mark.parametrize(
