@@ -138,10 +138,8 @@ def _largest_cross_correlation(u: Array, r: Array) -> float:
     size = np.linalg.norm(a) * np.linalg.norm(b)
     if size <= 0:
         return 0.0
-    n = len(u)
-    length = 1 << (2 * n).bit_length()
-    lags = np.fft.irfft(np.fft.rfft(b, length) * np.conj(np.fft.rfft(a, length)), length)
-    return float(np.abs(lags[: n // 4 + 1]).max() / size)
+    lags = scipy.signal.correlate(b, a, method="fft")[len(u) - 1 :]
+    return float(np.abs(lags[: len(u) // 4 + 1]).max() / size)
 
 
 def motion_of(fit: Fit, k: int) -> dict[str, Array]:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+import scipy
 from matplotlib.axes import Axes
 
 from motorid.diagnosis.locate import binned
@@ -111,15 +112,15 @@ def _histogram(ax: Axes, r: Array, sigma: float) -> None:
 def _with_input(ax: Axes, sims: Sequence[Simulation], channel: str) -> None:
     """Correlate the residual with the input at lags of either sign; both share the band of coloured residuals."""
     lags = min(LAGS, min(s.experiment.n for s in sims) // 3)
-    k = np.arange(-lags, lags + 1)
-    total, size, worth = np.zeros(len(k)), np.zeros(2), 0.0
+    total, size, worth = np.zeros(2 * lags + 1), np.zeros(2), 0.0
     for s in sims:
         r, u = np.nan_to_num(s.residual(channel)), s.experiment.inputs["v"]
         r, u = r - r.mean(), u - u.mean()
-        total += np.array([r[max(j, 0):len(r) + min(j, 0)] @ u[max(-j, 0):len(u) - max(j, 0)] for j in k])
+        total += scipy.signal.correlate(r, u)[len(r) - 1 - lags:len(r) + lags]
         size += r @ r, u @ u
         worth += effective_samples(r)
     style.band(ax, 1.96 / np.sqrt(max(worth, 1.0)))
+    k = np.arange(-lags, lags + 1)
     ax.vlines(k, 0, total / np.sqrt(np.prod(size) or 1.0), color=style.PALETTE["purple"], lw=0.9)
     ax.axhline(0, color=style.MUTED, lw=0.6)
     ax.set(ylim=(-0.6, 0.6), xlabel="lag (samples)", title="Input correlation")
