@@ -8,18 +8,21 @@ from motorid.model.definition import P, effect
 from motorid.model.equations import Equations
 
 
-def _lag(m: Equations, channel: str, time_constant) -> None:
-    reaching = m.measured(channel)
-    z = m.state(f"{channel}_lagged", m.start[channel])
-    m.rate(z, (reaching - z) / time_constant)
-    m.measure(channel, z)
+def _filter(m: Equations, channel: str, name: str, T, a: tuple, b: tuple = ()) -> None:
+    """Let a channel pass a₀(1 + b₁x + …)/(a₀ + a₁x + … + xⁿ) at x = Ts, in a row of n states."""
+    reaching, z = m.measured(channel), [m.state(f"{channel}_{name}", m.start[channel])]
+    z += [m.state(f"{channel}_{name}_{k}") for k in range(2, len(a) + 1)]
+    for slow, fast in pairwise(z):
+        m.rate(slow, fast / T)
+    m.rate(z[-1], (a[0] * (reaching - z[0]) - sum(k * x for k, x in zip(a[1:], z[1:], strict=True))) / T)
+    m.measure(channel, z[0] + sum(k * x for k, x in zip(b, z[1:], strict=False)))
 
 
 @effect(balance="sensor")
 def speed_lag(m: Equations, T_w=P(5e-3, "s", null=0.0, positive=True, grid=(1.0, 4.0, 16.0),
                                   doc="time constant of the speed filter")):
     """First-order lag of the speed measurement. Åström & Murray, Feedback Systems, 2008."""
-    _lag(m, "omega", T_w)
+    _filter(m, "omega", "lagged", T_w, (1,))
 
 
 @effect(balance="sensor", includes=("speed_lag",))
@@ -27,10 +30,7 @@ def speed_filter(m: Equations, T_f=P(5e-3, "s", null=0.0, positive=True, grid=(1
                                      doc="1/natural frequency"),
                  zeta_f=P(0.7, "", positive=True, upper=5.0, grid=(0.1, 0.7), doc="damping ratio")):
     """Second-order filter of the speed: Butterworth, tracking loop, tacho's coupling. Åström & Murray, 2008, ch. 6."""
-    reaching, z, rate = m.measured("omega"), m.state("omega_filtered", m.start["omega"]), m.state("omega_filtered_rate")
-    m.rate(z, rate / T_f)
-    m.rate(rate, (reaching - z - 2 * zeta_f * rate) / T_f)
-    m.measure("omega", z)
+    _filter(m, "omega", "filtered", T_f, (1, 2 * zeta_f))
 
 
 @effect(balance="sensor")
@@ -38,12 +38,8 @@ def speed_delay(m: Equations,
                 T_d=P(5e-3, "s", null=0.0, positive=True, grid=(1.0, 4.0, 16.0), doc="delay of the speed measurement")):
     """Delay of the speed measurement, Padé of orders 4 and 5. Golub & Van Loan, 2013, sec. 9.3."""
     # With fewer zeros than poles a jump does not pass at once; x = Ts, (15120 − 6720x + …)/(15120 + 8400x + …).
-    reaching, z = m.measured("omega"), [m.state("omega_delayed", m.start["omega"])]
-    z += [m.state(f"omega_delayed_{k}") for k in range(2, 6)]
-    for slow, fast in pairwise(z):
-        m.rate(slow, fast / T_d)
-    m.rate(z[4], (15120 * (reaching - z[0]) - 8400 * z[1] - 2100 * z[2] - 300 * z[3] - 25 * z[4]) / T_d)
-    m.measure("omega", z[0] - (6720 * z[1] - 1260 * z[2] + 120 * z[3] - 5 * z[4]) / 15120)
+    b = tuple(k / 15120 for k in (-6720, 1260, -120, 5))
+    _filter(m, "omega", "delayed", T_d, (15120, 8400, 2100, 300, 25), b)
 
 
 @effect(balance="sensor")
@@ -53,12 +49,7 @@ def speed_average(m: Equations, T_a=P(5e-3, "s", null=0.0, positive=True, grid=(
     Seen as straight flanks that come late after reversals.
     """
     # (1 − e⁻ˣ)/x = (120 + 2x²)/(120 + 60x + 12x² + x³) at x = Ts, exact up to x⁵.
-    reaching = m.measured("omega")
-    z = [m.state("omega_mean", m.start["omega"]), m.state("omega_mean_2"), m.state("omega_mean_3")]
-    m.rate(z[0], z[1] / T_a)
-    m.rate(z[1], z[2] / T_a)
-    m.rate(z[2], (120 * (reaching - z[0]) - 60 * z[1] - 12 * z[2]) / T_a)
-    m.measure("omega", z[0] + z[2] / 60)
+    _filter(m, "omega", "mean", T_a, (120, 60, 12), (0, 1 / 60))
 
 
 @effect(balance="sensor")
@@ -101,7 +92,7 @@ def speed_ripple(m: Equations, a_w=P(0.02, "", null=0.0, lower=0.0, upper=1.0, d
 def current_lag(m: Equations, T_i=P(1e-3, "s", null=0.0, positive=True, grid=(0.5, 2.0, 8.0), pole=True,
                                     doc="time constant of current filter")):
     """First-order lag of the current measurement. Åström & Murray, Feedback Systems, 2008."""
-    _lag(m, "i", T_i)
+    _filter(m, "i", "lagged", T_i, (1,))
 
 
 @effect(balance="sensor")
