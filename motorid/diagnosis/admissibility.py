@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 
 import numpy as np
+import scipy
 
 from motorid.diagnosis.model_comparison import far
 from motorid.diagnosis.thresholds import MATERIAL
@@ -175,14 +176,5 @@ def samples_within(angle: Array, width: float) -> list[int]:
 
 def _turning_points(y: Array, least: float) -> list[int]:
     """Indices at which `y` turns by more than `least`, the first sample among them."""
-    turns, far, way = [0], 0, 0.0
-    for k, value in enumerate(y):
-        if way == 0:
-            if abs(value - y[0]) > least:
-                way, far = float(np.sign(value - y[0])), k
-        elif (value - y[far]) * way > 0:
-            far = k
-        elif (y[far] - value) * way > least:
-            turns.append(far)
-            way, far = -way, k
-    return turns
+    peaks, valleys = (scipy.signal.find_peaks(side, prominence=least)[0].tolist() for side in (y, -y))
+    return sorted([0, *peaks, *valleys])
