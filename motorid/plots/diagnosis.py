@@ -92,9 +92,7 @@ def _binned(ax: Axes, b: Binned, signals: Sequence[Mapping[str, Array]], values:
         scatter(ax, x[ok], y[ok], most=800, color=style.MUTED)
     means(ax, b, factor, color=colour)
     ax.axhline(0, color=style.MUTED, lw=0.6)
-    name = style.axis_label(b.against)
-    label = f"{name.split(' (')[0]} ({b.unit})" if b.unit else name
-    ax.set(xlabel=label, title=f"explains {100 * b.explained:.0f} %")
+    ax.set(xlabel=style.axis_label(b.against), title=f"explains {100 * b.explained:.0f} %")
 
 
 @style.styled
