@@ -256,11 +256,8 @@ class Shape:
         new = tuple(m.weights for m in fit.problem.measured)
         if all(map(np.array_equal, new, self.weights)):
             return self
-        rows = []
-        for k, (w, old) in enumerate(zip(new, self.weights, strict=True)):
-            y, _, index = fit.problem.measured[k][:3]
-            ratio = np.broadcast_to(np.where(old > 0, w / np.where(old > 0, old, 1.0), 0.0), y.shape).ravel()
-            rows.append(ratio if index is None else ratio[index])
+        rows = [m.stack(np.broadcast_to(np.divide(m.weights, old, out=np.zeros_like(old), where=old > 0), m.y.shape))
+                for m, old in zip(fit.problem.measured, self.weights, strict=True)]
         return replace(self, columns=self.columns * np.concatenate(rows)[:, None], weights=new)
 
 
@@ -327,7 +324,7 @@ class Added:
         null = {p.name: (p.null or 0.0) + NUDGE * (k + 1) * self.natural.get(p.unit, 1.0) for k, p in enumerate(sizes)}
         at = self._at({**values, **null})
         to = np.zeros((len(at.p), len(sizes)))
-        to[[self._place[p.name] for p in sizes], range(len(sizes))] = 1.0
+        to[[self._problem.system.parameters.index(p.name) for p in sizes], range(len(sizes))] = 1.0
         parts = []
         for k in range(len(self._problem.runs)):
             traj = self._run(k, at, self._problem.unknowns.first_slopes(at, k, to), to)
@@ -354,15 +351,11 @@ class Added:
         problem, initial = self._problem, believable_start(self.fit)
         return problem.unknowns.point(problem.scaling.scaled([initial.get(p.name, p.value) for p in problem.unknown]))
 
-    @cached_property
-    def _place(self) -> dict[str, int]:
-        return {n: j for j, n in enumerate(self._problem.system.parameters)}
-
     def _at(self, values: Mapping[str, float]) -> Point:
         p = self._point.p.copy()
         for n, value in values.items():
             limits = self.model.parameters[n]
-            p[self._place[n]] = np.clip(value, limits.lower, limits.upper)
+            p[self._problem.system.parameters.index(n)] = np.clip(value, limits.lower, limits.upper)
         return self._point._replace(p=p)
 
     def _run(self, k: int, at: Point, *slopes: Array) -> Trajectory:
