@@ -145,14 +145,9 @@ def _quantity(found: Diagnosis, balance: str, had: Sequence[Array] | None) -> tu
     bins = [b for b in bins if b.against not in ("t", "heat")] or bins
     if orders or not bins or had is None:
         return ("theta", orders[0]) if orders else (bins[0].against if bins else "t", 1.0)
-    y = np.concatenate(had)
-
-    def scatter_about(b: Binned) -> float:
-        x = np.concatenate([np.asarray(s[b.against]) for s in found.missing.signals])
-        fine = binned(b.against, x, y, bins=FINE)
-        return float(np.nanvar(y - np.interp(x, fine.centre, fine.mean)))
-
-    return min(bins, key=scatter_about).against, 1.0
+    x = {b.against: np.concatenate([np.asarray(s[b.against]) for s in found.missing.signals]) for b in bins}
+    told = {n: binned(n, x[n], np.concatenate(had), bins=FINE).explained for n in x}
+    return max(told, key=lambda n: told[n]), 1.0
 
 
 @style.styled
