@@ -19,6 +19,7 @@ import scipy
 from numpy.typing import NDArray
 
 from motorid.channels import channel_name
+from motorid.diagnosis.free_forms import signals_along
 from motorid.diagnosis.misspecification import better_forms, hum_of
 from motorid.diagnosis.model_comparison import Node, far
 from motorid.diagnosis.predictive_score import finer, undecided
@@ -29,7 +30,6 @@ from motorid.display.numbers import listed, number, percent
 from motorid.estimation.result import Fit
 from motorid.numerics.autoregression import autocorrelation, effective_samples
 from motorid.numerics.signals import Array, despiked, quantum, winsorised
-from motorid.problem.runs import angle_signal
 from motorid.records.experiment import Experiment
 
 FALSE_ALARM = 0.02
@@ -142,25 +142,17 @@ def _largest_cross_correlation(u: Array, r: Array) -> float:
     return float(np.abs(lags[: len(u) // 4 + 1]).max() / size)
 
 
-def motion_of(fit: Fit, k: int) -> dict[str, Array]:
-    """Return what the motor was doing in run `k`, (N,) each, from the model's own signals."""
-    sim, run = fit.simulations[k], fit.problem.experiments[k]
-    signals = {"v": run.inputs["v"], **{c: sim.states[c] for c in ("i", "omega") if c in sim.states}}
-    if "theta" in run.outputs or "omega" in run.outputs:
-        signals["theta"] = np.mod(angle_signal(run), 2 * np.pi)
-    if "omega" in sim.states:
-        signals["acceleration"] = np.gradient(sim.states["omega"], run.t)
-    return signals
-
-
 def _dependences(fit: Fit, channel: str) -> list[dict[str, Any]]:
     """Test the residual of `channel` against every signal of the motion."""
     parts = _residuals(fit, channel)
-    motions = [motion_of(fit, k) for k, _ in parts]
+    every = signals_along(fit)
+    motions = [every[k] for k, _ in parts]
     residuals = [winsorised(r) for _, r in parts]
     found = []
-    for name in (n for n in motions[0] if all(n in m for m in motions)):
-        signals, bins = [m[name] for m in motions], 2 * BINS if name == "theta" else BINS
+    for name in (n for n in NAMES if all(n in m for m in motions)):
+        signals, bins = [m[name] for m in motions], BINS
+        if name == "theta":
+            signals, bins = [np.mod(s, 2 * np.pi) for s in signals], 2 * BINS
         edges = np.unique(np.quantile(np.concatenate(signals), np.linspace(0, 1, bins + 1)[1:-1]))
         if edges.size:
             share, p = _shift_test([np.searchsorted(edges, s, side="right") for s in signals], residuals)
