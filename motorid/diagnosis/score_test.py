@@ -333,12 +333,13 @@ class Added:
 
     def _change(self, values: Mapping[str, float]) -> Array | None:
         """Return the change (n,) that the effect makes at finite `values`."""
-        at = self._at(values)
+        at, fit = self._at(values), self.fit
         try:
             parts = [self._problem.run_residual(k, self._run(k, at))[0] for k in range(len(self._problem.runs))]
         except SimulationError:
             return None
-        change = np.concatenate(parts) - plain_residual(self.fit)
+        plain = fit.residuals if fit.problem.loss is None else fit.problem.tuned(loss=None).residual(fit.q)
+        change = np.concatenate(parts) - plain[:fit.problem.n_outputs]
         return change if np.any(change) else None
 
     @cached_property
@@ -363,12 +364,3 @@ class Added:
         at = problem.unknowns.of_run(at, k)
         x0 = problem.unknowns.first_state(at, k)
         return problem.integrator.run(problem.system, problem.runs[k].grid, x0, at.p, *slopes)
-
-
-def plain_residual(fit: Fit) -> Array:
-    """Return the whitened output residuals (n,) of a fit without its robust loss."""
-    problem = fit.problem
-    if problem.loss is None:
-        return fit.residuals[: problem.n_outputs]
-    sims = (problem.simulate(fit.q, k, derivatives=False) for k in range(len(problem.runs)))
-    return np.concatenate([problem.run_residual(k, s)[0] for k, s in enumerate(sims)])
