@@ -49,9 +49,15 @@ def locate(fit: Fit) -> Missing:
     apart = "i" in fit.problem.outputs and len(fit.problem.outputs) > 1  # else the torque stands for both
     size = np.array([natural["V"] if electrical and apart else 0.0, natural[unit]])
     begun = [begin(fit, k) for k in range(len(fit.problem.runs))]
-    walk, both = _walk(fit, size, begun)
-    if apart:
-        shares = _shares(fit, walk * size, both, begun)
+    for share in WALKS:
+        walk = share * size
+        both = [smooth(fit, k, walk, at) for k, at in enumerate(begun)]
+        if (left := float(np.mean([s.chi2 for s in both]))) <= 1.0:
+            break
+    if apart:  # what one unknown input alone leaves, the other has to explain
+        alone = [[smooth(fit, k, walk * keep, at).chi2 for k, at in enumerate(begun)] for keep in np.eye(2)]
+        missed = [max(float(np.mean(chi2)) - max(left, 1.0), 0.0) + 1e-3 for chi2 in alone]
+        shares = {"electrical": missed[1] / sum(missed), "mechanical": missed[0] / sum(missed)}
         where = max(shares, key=lambda s: shares[s])
     else:
         shares = {"electrical": 0.5, "mechanical": 0.5} if electrical else {"mechanical": 1.0}
@@ -78,23 +84,6 @@ def _region(regions: Mapping[str, float]) -> str:
     first = max(regions, key=lambda r: regions[r])
     place = "steady motion" if first == "steady" else first
     return f"{100 * regions[first]:.0f} % of the squared error lies in {place}."
-
-
-def _walk(fit: Fit, size: Array, begun: Sequence[Linear]) -> tuple[float, list[Smoothed]]:
-    """Return the smallest random walk that explains the measurements, and the smoothed runs."""
-    for walk in WALKS:
-        found = [smooth(fit, k, walk * size, at) for k, at in enumerate(begun)]
-        if np.mean([s.chi2 for s in found]) <= 1.0:
-            break
-    return walk, found
-
-
-def _shares(fit: Fit, walk: Array, both: Sequence[Smoothed], begun: Sequence[Linear]) -> dict[str, float]:
-    """Share of the misfit by balance: what one unknown input alone leaves, the other has to explain."""
-    alone = [np.mean([smooth(fit, k, walk * keep, at).chi2 for k, at in enumerate(begun)]) for keep in ([1, 0], [0, 1])]
-    rest = max(float(np.mean([s.chi2 for s in both])), 1.0)
-    missed = [max(float(chi2) - rest, 0.0) + 1e-3 for chi2 in alone]
-    return {"electrical": missed[1] / sum(missed), "mechanical": missed[0] / sum(missed)}
 
 
 def _signals(fit: Fit, k: int, s: Smoothed) -> Mapping[str, Array]:
