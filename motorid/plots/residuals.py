@@ -75,7 +75,11 @@ def _channel(axes: np.ndarray, fit: Fit, channel: str, against: Sequence[str]) -
     _autocorrelation(axes[3], residuals)
     for ax, other in zip(axes[4:], against, strict=True):
         # The model's own: the measured one shares its noise with the residual, which then seems to depend.
-        _against(ax, other, np.concatenate([s.outputs[other] for s in sims]), every, sigma)
+        x = np.concatenate([s.outputs[other] for s in sims])
+        ok = np.isfinite(x) & np.isfinite(every)
+        style.band(ax, 2 * sigma)
+        scatter(ax, x[ok], every[ok])
+        means(ax, binned(other, x[ok], every[ok]), color=style.INK)
         ax.set(xlabel=style.axis_label(other, run), title=f"Against {style.axis_label(other, run).split(' (')[0]}")
         ax.sharey(axes[4])
     axes[4].set_ylabel(f"residual ({unit})")
@@ -135,14 +139,6 @@ def _autocorrelation(ax: Axes, residuals: Sequence[Array]) -> None:
     ax.axhline(0, color=style.MUTED, lw=0.6)
     ax.set_ylim(min(-0.25, float(rho.min()) * 1.1), max(0.4, min(1.05, float(rho[1:].max(initial=0)) * 1.25)))
     ax.set(xlabel="lag (samples)", ylabel="correlation", title="Autocorrelation")
-
-
-def _against(ax: Axes, against: str, x: Array, r: Array, sigma: float) -> None:
-    ok = np.isfinite(x) & np.isfinite(r)
-    x, r = x[ok], r[ok]
-    style.band(ax, 2 * sigma)
-    scatter(ax, x, r)
-    means(ax, binned(against, x, r), color=style.INK)
 
 
 def scatter(ax: Axes, x: Any, y: Any, most: int = 1500, color: str = style.RESIDUAL) -> None:
