@@ -5,7 +5,7 @@ Efron & Tibshirani, An Introduction to the Bootstrap, 1993; blocks: Künsch, Ann
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -182,14 +182,11 @@ def _source(fit: Fit, kind: str, block: int | None) -> _Source:
         scale[c] = np.sqrt(count / max(count - spent, 1.0))
     residuals = tuple({c: scale[c] * (e - np.nanmean(e)) for c, e in r.items()} for r in residuals)
     at_fit = problem.for_model(problem.model.start_at(fit.values))
-    block = min(block or _block_length(colours, residuals), max(s.experiment.n for s in fit.simulations))
+    if block is None:  # several correlation times, at least the cube root of the samples, at most a fifth of a run
+        n, share = min(len(e) for r in residuals for e in r.values()), min(c.effective_share for c in colours.values())
+        block = int(np.clip(CORRELATIONS / max(share, 1e-3), np.ceil(n ** (1 / 3)), max(n // 5, 1)))
+    block = min(block, max(s.experiment.n for s in fit.simulations))
     return _Source(at_fit, tuple(dict(s.outputs) for s in fit.simulations), residuals, colours, kind, block)
-
-
-def _block_length(colours: Mapping[str, Colour], residuals: Sequence[Mapping[str, Array]]) -> int:
-    """Several correlation times, at least the cube root of the samples, at most a fifth of a run."""
-    n, share = min(len(e) for r in residuals for e in r.values()), min(c.effective_share for c in colours.values())
-    return int(np.clip(CORRELATIONS / max(share, 1e-3), np.ceil(n ** (1 / 3)), max(n // 5, 1)))
 
 
 def _refit(source: _Source, seed: np.random.SeedSequence) -> dict[str, float] | Failure:
