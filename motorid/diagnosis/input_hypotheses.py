@@ -33,7 +33,6 @@ WINDOWS = (5, 15, 45)  # samples of a running median
 DELAYS = ((-1.0, 1.0, 2.0, 3.0, 5.0, 8.0, 12.0), (-1.0, -0.5, 0.5, 1.0), (-0.25, 0.25), (-0.1, 0.1))
 NOISE = (0.9, 1.05)  # times what fast changes tell of the noise: errors that are all noise
 PLAIN, PROMISING = 0.1, 0.05  # fall of the error with another reading, and after a few steps with it
-OTHER = {"zoh": "linear", "linear": "zoh"}
 AS_IT_IS = LevenbergMarquardt(looks=0)  # beside a fit whose end was looked into
 
 
@@ -126,7 +125,7 @@ def _readings(runs: Sequence[Experiment]) -> Iterator[Reading]:
     """Yield the readings that could make a difference."""
     if not (moving := [r for r in runs if _changes(r)]):
         return
-    hold = OTHER[moving[0].hold]
+    hold = "linear" if moving[0].hold == "zoh" else "zoh"
     how = f"is {'linear' if hold == 'linear' else 'constant'} between samples"
     yield Reading(f"The voltage {how}", f"--hold {hold}", lambda r: r.with_(hold=hold) if _changes(r) else r)
     if any(_noisy(r) for r in moving):
