@@ -83,7 +83,7 @@ def diagnose(fit: Fit, validate: Sequence[Experiment] | Experiment | None = None
 def _told(found: Climb, driven: str, validated: bool) -> Diagnosis:
     """Return what a climb found, in words and as a result."""
     fit, ladder, remaining = found.search.root.fit, ladder_of(found, validated), found.remaining
-    missing, judged = locate(fit), found.first
+    missing, judged, last = locate(fit), found.first, found.path[-1]
     names = tuple(g.effect for g in found.grades if g.grade != "approximates")
     ranking = found.rounds[0] if found.rounds else ()
     groups = tuple(g for g in found.groups if g[0] in names)
@@ -91,16 +91,16 @@ def _told(found: Climb, driven: str, validated: bool) -> Diagnosis:
     forms, suggestion = tuple(f.form for f in found.forms), None
     if forms:
         remaining = following(remaining, forms[0].text)
-    like = next(iter(forms), None) or next((g.form for g in found.grades if g.form is not None), None)
+    like = forms[0] if forms else next((g.form for g in found.grades if g.form is not None), None)
     if like is not None and not names:
         missing = acting_like(missing, like)
     if names:
         verdict, where = "missing", WHERE[{e.name: e.balance for e in ladder.best.model.effects}[names[0]]]
         answer = words.missing_text(ladder.rungs, remaining, groups, found.grades,
-                                    bool(words.held_out_remark(found.path[-1])), found.stopped)
+                                    bool(words.held_out_remark(last)), found.stopped)
         same = _inseparable(found, ladder.best.model)
         details = [words.moves(fit, ladder.best), words.rises_text(ladder.rungs), words.inseparable_remark(same),
-                   words.hidden_remark(found.search.hidden(found.path[-1])),
+                   words.hidden_remark(found.search.hidden(last)),
                    words.exchanged_remark({} if found.stopped else with_lags_exchanged(ladder.best))]
         for name, shared in same.items():  # what acts through these parameters, and that one
             inside = (e.name for e in ladder.best.model.effects if {p.name for p in e.parameters} & {*shared})
@@ -119,7 +119,7 @@ def _told(found: Climb, driven: str, validated: bool) -> Diagnosis:
         answer, *details = words.adequate_text(judged, ranking, bool(far(ladder.best)))
     kind = "structure" if not remaining.adequate else "fluctuation" if far(ladder.best) else "noise"
     if not names:
-        details.append(words.unseen_remark(found.search.unseen(found.path[-1])))
+        details.append(words.unseen_remark(found.search.unseen(last)))
     details = tuple(t for t in (*details, *_remarks(found, driven)) if t)
     text = " ".join(t for t in (answer, *details, suggestion) if t)
     approximating = {g.effect: g.form for g in found.grades if g.grade == "approximates"}

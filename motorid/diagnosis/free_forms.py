@@ -175,8 +175,7 @@ def span_of(fit: Fit, signals: Sequence[Mapping[str, Array]]) -> Span:
         rates["theta"] = [w for w in found if abs(w - round(w)) * travel > 2 * np.pi]
     free, moving = set(fit.problem.model.free_names), len({"omega", "theta"} & {*fit.problem.outputs})
     unscaled = tuple(c for c, own in (("i", "RLbJ"), ("omega", "KbJ")) if free >= {*own} and (c == "i" or moving == 1))
-    rates = {on: own[:LINES] for on, own in rates.items()}
-    return Span(ranges, tuple(sorted(orders)), step, rates=rates, unscaled=unscaled)
+    return Span(ranges, tuple(sorted(orders)), step, rates={n: w[:LINES] for n, w in rates.items()}, unscaled=unscaled)
 
 
 def _rates(fit: Fit, along: Sequence[Array], step: float) -> list[float]:

@@ -87,6 +87,7 @@ def _balance(row: np.ndarray, missing: Missing, balance: str, run: int | None) -
 def _binned(ax: Axes, b: Binned, signals: Sequence[Mapping[str, Array]], values: Sequence[Array], factor: float,
             colour: str) -> None:
     x, y = np.concatenate([np.asarray(s[b.against]) for s in signals]), np.concatenate(list(values)) * factor
+    x = np.mod(x, 2 * np.pi) if b.against == "theta" else x
     ok = np.isfinite(x) & np.isfinite(y) & (x >= b.centre.min()) & (x <= b.centre.max())
     if ok.any():
         scatter(ax, x[ok], y[ok], most=800, color=style.MUTED)

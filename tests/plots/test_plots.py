@@ -20,6 +20,7 @@ from motorid import plots
 from motorid.diagnosis.locate import binned
 from motorid.errors import UsageError
 from motorid.estimation.shooting.formulations import compare_formulations
+from motorid.plots import diagnosis as plots_of_diagnosis
 from motorid.plots.fits import LiveFit
 from motorid.plots.style import axis_label, detached, envelope, svg_of
 from motorid.problem.constraints import CurrentLimit
@@ -349,3 +350,14 @@ def test_what_was_added_lies_on_what_was_missing(effect, folder, axis):
     assert effect in added.get_label()
     assert np.corrcoef(missing.get_ydata(), added.get_ydata())[0, 1] > 0.95
     assert np.std(added.get_ydata()) == pytest.approx(np.std(missing.get_ydata()), rel=0.4)
+
+
+def test_dots_over_a_turn_are_of_all_turns():
+    """The means over an angle are taken within a turn; dots were drawn of the first turn only."""
+    theta, missing = np.linspace(0, 8 * np.pi, 400), np.sin(np.linspace(0, 8 * np.pi, 400))
+    ax = plt.figure().add_subplot()
+    plots_of_diagnosis._binned(ax, binned("theta", np.mod(theta, 2 * np.pi), missing), [{"theta": theta}], [missing],
+                               1.0, "k")
+    (dots,) = [line for line in ax.lines if line.get_linestyle() == "None"]
+    assert len(dots.get_xdata()) == np.count_nonzero(np.isfinite(dots.get_ydata())) > 300
+    plt.close(ax.figure)
