@@ -60,7 +60,7 @@ def _blurred(fit: Fit, added: Effect) -> str:
     if not (fit.problem.model.angle_input and any(p.periodic for p in added.parameters)):
         return ""
     order = max((fit.values[p.name] for p in added.parameters if p.order), default=1.0)
-    noise = min(noise_level(r.outputs["theta"], r.t) for r in fit.problem.experiments)
+    noise = min(r.sigma.get("theta", 0.0) for r in fit.problem.runs)  # 0 where it is the integral of the speed
     return f"the angle that it follows is measured to {number(noise, 2)} rad" if order * noise > 1 else ""
 
 

@@ -414,3 +414,5 @@ def test_what_follows_an_angle_that_is_noise_by_more_than_a_turn_is_no_weight(no
     fit = mi.fit(led, [stepped(model, 1, 600, 5e-3, theta=noise)])
     assert fit.problem.model.angle_input
     assert ("the angle that it follows is measured to 2." in objections(fit, mi.effects.gravity)) is objected
+    integral = mi.fit(led, [stepped(model, 1, 600, 5e-3, omega=0.3)])  # the angle is that of the speed
+    assert "measured to" not in objections(integral, mi.effects.gravity)
