@@ -25,7 +25,7 @@ from motorid.records.experiment import Experiment
 BASE = ("R", "L", "K", "b", "J", "g")
 BACK_EMF = 0.9
 FLOOR = 1e-3  # share of its natural size given to a parameter that comes out as zero
-FASTEST = 0.2  # samples, L/R at least: from below the cost of an inductance has a valley of its own
+FASTEST = 0.2  # samples, L/R at least: of a current alone, from below the inductance has a valley of its own
 
 
 def first_guess(model: Model, runs: Sequence[Experiment], *, loaded: bool = False,
@@ -46,8 +46,6 @@ def first_guess(model: Model, runs: Sequence[Experiment], *, loaded: bool = Fals
         found = _without_speed([s for s in signals if "i" in s], held)
     elif not both or _rings(found := _full(both, held, loads), signals):  # with a current that is not the motor's
         found = _without_current(turning, held, loads, back_emf)
-    if "L" in found:
-        found["L"] = max(found["L"], FASTEST * found["R"] * min(float(np.median(np.diff(s["t"]))) for s in signals))
     base = {n: held.get(n, v) for n, v in found.items() if n in model.parameters and np.isfinite(v)}
     return {n: v for n, v in base.items() if v > 0 or n not in BASE}
 
@@ -149,7 +147,8 @@ def _without_speed(signals: list[dict], held: Mapping[str, float]) -> dict[str, 
     z = _solve(rows, ["L", "R", "stiff", "rate"], {})
     k = held.get("K", 0.05)
     j = k**2 / max(z["stiff"] - z["R"] * z["rate"], 0.1 * z["stiff"])
-    return {"R": z["R"], "L": z["L"], "K": k, "J": j, "b": z["rate"] * j}
+    least = FASTEST * z["R"] * min(float(np.median(np.diff(s["t"]))) for s in signals)
+    return {"R": z["R"], "L": max(z["L"], least), "K": k, "J": j, "b": z["rate"] * j}
 
 
 WIDE = 0.02  # width of sgn over the highest speed: a measured speed is noise around standstill
