@@ -51,8 +51,7 @@ def check_target(out: Path, resume: bool, force: bool) -> None:
 
 
 def read_tail(out: Path) -> Tail:
-    """Read where a record ends; a last line that was cut off does not count. DataError if motorid did not make it, or
-    not these notes of it."""
+    """Read where a record ends, but for a last line cut off. DataError if motorid did not make it, or not its notes."""
     meta: dict[str, str] = {}
     columns, last = "", ""
     with open(out, encoding="utf-8", errors="replace", newline="") as file:

@@ -20,7 +20,7 @@ from motorid.errors import SimulationError
 from motorid.estimation.angle_orders import likely_lines, uses_angle
 from motorid.estimation.linearisation import Response, Tangent, parameter_vector, responses
 from motorid.estimation.result import Fit
-from motorid.numerics.signals import Array
+from motorid.numerics.signals import Array, despiked
 from motorid.problem.problem import Problem
 from motorid.problem.runs import angle_signal, time_since
 from motorid.records.experiment import Experiment
@@ -32,6 +32,7 @@ LINES = 2  # of the spectrum of the misfit over the angle, or the time
 FINEST = 64  # parts of a turn in which lines that are no orders of it are looked for
 AROUND = 31  # frequencies that such a line stands out of
 PLACES = 12  # over a time or an angle at which something may set in
+USUAL = 0.998  # of the samples of a channel: no lone one tells how far it reaches
 SECTORS = 4  # widths of a sector of a turn, each twice the one before
 LOBES = (0.15, 0.3, 0.6)  # rad: half of the width of a lobe, and of its edges
 EDGE = 10.0  # how many of its edges, from one to zero, a sector is wide
@@ -133,14 +134,10 @@ FORMS = (*(Form(words, balance, on, carrier) for words, balance, carrier, quanti
          *(Form("an error of the speed sensor", "sensor", f"past {c}", "", "omega") for c in ("omega", "i")))
 
 
-USUAL = 0.998  # of the samples of a channel: no lone one tells how far it reaches
-
-
 @dataclass(frozen=True)
 class Span:
     """What a form reaches over: the range of every quantity, the orders of a turn, the time between samples (s); how
-    many places and knees it has, for each of the few by which forms are compared; how often it repeats in a turn; the
-    channels whose sensor's gain the motor's own parameters make up."""
+    many places and knees it has, for each of the few by which forms are compared; how often it repeats in a turn."""
 
     ranges: Mapping[str, tuple[float, float]]
     orders: tuple[float, ...]
@@ -148,7 +145,7 @@ class Span:
     finer: int = 1
     rates: Mapping[str, Sequence[float]] = field(default_factory=dict)  # of waves over the time, rad/s, or the angle
     pitches: int = 1
-    unscaled: tuple[str, ...] = ()
+    unscaled: tuple[str, ...] = ()  # channels the gain of whose sensor the motor's own parameters make up
 
 
 def span_of(fit: Fit, signals: Sequence[Mapping[str, Array]]) -> Span:
@@ -159,9 +156,9 @@ def span_of(fit: Fit, signals: Sequence[Mapping[str, Array]]) -> Span:
     names = set.intersection(*(set(s) for s in signals))
     step = float(np.median(np.concatenate([np.diff(s["t"]) for s in signals])))
     ranges = {n: (min(float(s[n].min()) for s in signals), max(float(s[n].max()) for s in signals)) for n in names}
-    for c in ranges.keys() & {*fit.problem.outputs}:  # a model that lacks something may not get as far as the motor
-        seen = np.concatenate([r.outputs[c] for r in fit.problem.experiments if c in r.outputs])
-        least, most = np.nanquantile(seen, [0.5 - USUAL / 2, 0.5 + USUAL / 2]).tolist()
+    for c in ranges.keys() & {*fit.problem.outputs} - {"theta"}:  # a model that lacks something may not get so far
+        seen = np.concatenate([despiked(r.outputs[c]) for r in fit.problem.experiments if c in r.outputs])
+        least, most = np.quantile(seen, [0.5 - USUAL / 2, 0.5 + USUAL / 2]).tolist()
         ranges[c] = min(ranges[c][0], least), max(ranges[c][1], most)
     known = [fit.values[p.name] for e in fit.model.effects for p in e.parameters if p.order]
     lines = likely_lines(Tangent.of(fit), LIBRARY["cogging"], LINES) if "theta" in fit.problem.outputs else []

@@ -279,8 +279,7 @@ def _insignificant(fit: Fit, effect: Effect, structure: bool) -> str:
     sizes = [p.name for p in own if p.null == 0]
     found = [(fit.values[n], fit.std[n]) for n in sizes]
     found += [(own["value"], own["std"]) for n in sizes for own in fit.per_run.get(n, {}).values()]
-    # Unless current and speed are both measured the motor's constant stays open, and with it every torque.
-    torques = {} if {"i", "omega"} <= {*fit.problem.outputs} else fit.determined
+    torques = {} if {"i", "omega"} <= {*fit.problem.outputs} else fit.determined  # K stays open, and every torque
     found += [(q.value, q.std) for n in sizes if (q := torques.get(f"{n}_voltage")) is not None]
     if sizes and not any(std is None or STANDARD_ERRORS * std < abs(value) for value, std in found):
         return f"{listed(sizes)} could as well be zero, within two standard deviations"

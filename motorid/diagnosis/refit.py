@@ -222,16 +222,16 @@ def led_on(fit: Fit) -> Fit | None:
 
 
 def with_lags_exchanged(fit: Fit) -> dict[str, Fit]:
-    """Return, by the names of lags, the fit in which each has changed places with the winding's own, L/R, where that
-    does as well: of two lags in a row the records tell no order."""
+    """Return, by names of lags, the fit where each has changed places with the winding's own, L/R, and does as well."""
     found, model = {}, fit.problem.model
     free = {n for n, p in model.parameters.items() if p.vary and not p.given}
     for name in (p.name for e in model.effects for p in e.parameters if p.pole and free >= {p.name, "L"}):
         start = {name: fit.values["L"] / fit.values["R"], "L": fit.values[name] * fit.values["R"]}
         with contextlib.suppress(*FAILURES):
             done = by_continuation(fit.problem.start_at(start), OPTIMUM, wide=False)
-            if done.cost < fit.cost + NATS and abs(np.log(done.values[name] / fit.values[name])) > np.log(EXCHANGED):
-                found |= {name: other} if (other := _fit_of(done)) else {}
+            other, ends = _fit_of(done), np.abs(np.log([done.values[name] / at[name] for at in (start, fit.values)]))
+            if done.cost < fit.cost + NATS and ends[0] < np.log(EXCHANGED) < ends[1] and other and other.std[name]:
+                found[name] = other
     return found
 
 

@@ -79,7 +79,7 @@ def _channel(axes: np.ndarray, fit: Fit, channel: str, against: Sequence[str]) -
         ok = np.isfinite(x) & np.isfinite(every)
         style.band(ax, 2 * sigma)
         scatter(ax, x[ok], every[ok])
-        means(ax, binned(other, x[ok], every[ok]), color=style.INK)
+        means(ax, binned(other, x[ok], every[ok]) if ok.any() else None, color=style.INK)
         ax.set(xlabel=style.axis_label(other, run), title=f"Against {style.axis_label(other, run).split(' (')[0]}")
         ax.sharey(axes[4])
     axes[4].set_ylabel(f"residual ({unit})")
@@ -148,8 +148,10 @@ def scatter(ax: Axes, x: Any, y: Any, most: int = 1500, color: str = style.RESID
     ax.plot(x[keep], y[keep], ".", ms=2, color=color, alpha=0.35, mew=0, rasterized=len(keep) > 400, zorder=1)
 
 
-def means(ax: Axes, b: Binned, factor: float = 1.0, *, color: str) -> None:
+def means(ax: Axes, b: Binned | None, factor: float = 1.0, *, color: str) -> None:
     """Draw means with their interval of 95 %, times a factor; no curve where there are no samples."""
+    if b is None or not b.centre.size:
+        return
     gaps = np.diff(b.centre)
     wide = gaps > max(4 * float(np.median(gaps)) if gaps.size else 0.0, 0.15 * float(np.ptp(b.centre)))
     for part in np.split(np.arange(len(b.centre)), np.flatnonzero(wide) + 1):

@@ -177,7 +177,7 @@ def _at_stop(y: Array, top: float) -> bool:
     entries = np.abs(y[np.flatnonzero(there[1:] & ~there[:-1])] - top)
     if there.sum() >= max(10, 0.01 * len(y)) and entries.size and np.median(entries) > max(3 * step, 0.005 * reach):
         return True
-    if noise_level(y[~there]) <= max(1e-4 * reach, step):
+    if noise_level(y[~there]) <= max(1e-4 * reach, step) or (step and abs(top) < 0.1 * reach):  # a coarse one at rest
         return False
     between = np.sort(y[(y > y.min()) & (y < y.max())])
     stays = there.sum() > 3 and float(np.mean(there[1:][there[:-1]])) > 0.5  # where noise moves all others

@@ -155,7 +155,7 @@ class Experiment(Shown):
         """
         if int(k) != k or k < 1:
             raise UsageError(f"decimate() takes a whole number of at least 1; got {k!r}.")
-        parts = parts_of(self)
+        parts = parts_of(self) if k > 1 else [slice(0, self.n)]
         starts = np.concatenate([np.arange(s.start, s.stop, int(k)) for s in parts])
         cuts = [s.start for s in parts[1:]]  # which a longer step may no longer show
         told = {PARTS[1]: np.searchsorted(cuts, np.arange(self.n), "right")} if cuts else {}
@@ -168,11 +168,11 @@ class Experiment(Shown):
 
     def running_median(self, samples: int) -> Experiment:
         """Return the run with its voltage, noisy as it was measured, replaced by the median over `samples` (odd)."""
-        return self._with_voltage(lambda s: preprocessing.running_median(self.inputs["v"][s], samples))
+        return self.with_(inputs={**self.inputs, "v": preprocessing.running_median(self.inputs["v"], samples)})
 
     def levelled(self) -> Experiment:
         """Return the run with a voltage that is constant between its steps, but was measured with noise, made so."""
-        return self._with_voltage(lambda s: preprocessing.levelled(self.inputs["v"][s]))
+        return self.with_(inputs={**self.inputs, "v": preprocessing.levelled(self.inputs["v"])})
 
     def delayed(self, seconds: float) -> Experiment:
         """Return the run with a voltage that acts later than its column says, earlier if `seconds` is negative.
@@ -189,21 +189,15 @@ class Experiment(Shown):
             rest = all(abs(r[0]) < 0.05 * np.abs(r).max(initial=0.0, where=np.isfinite(r)) for r in rates)
             return preprocessing.delayed(self.t[s], v, self.hold, seconds, 0.0 if rest else float(v[0]))
 
-        return self._with_voltage(later)
+        return self.with_(inputs={**self.inputs, "v": self._by_parts(self.inputs["v"], later)})
 
     def without_spikes(self) -> Experiment:
         """Return the run with single samples that stand far from both neighbours marked as missing.
 
         Not next to jumps of the voltage, where the motor is quick; at least three, at most 5 % of a channel.
         """
-        t, v = self.t, self.inputs["v"]
-        outputs = {c: self._by_parts(y, lambda s, y=y: preprocessing.without_spikes(t[s], y[s], v[s]))
-                   for c, y in self.outputs.items()}
-        same = all(np.array_equal(outputs[c], y, equal_nan=True) for c, y in self.outputs.items())
-        return self if same else self.with_(outputs=outputs)
-
-    def _with_voltage(self, read: Callable[[slice], Array]) -> Experiment:
-        return self.with_(inputs={**self.inputs, "v": self._by_parts(self.inputs["v"], read)})
+        outputs = {c: preprocessing.without_spikes(self.t, y, self.inputs["v"]) for c, y in self.outputs.items()}
+        return self.with_(outputs=outputs) if any(outputs[c] is not y for c, y in self.outputs.items()) else self
 
     def _by_parts(self, y: Array, read: Callable[[slice], Array]) -> Array:
         """Return `y` read anew, each part between pauses by itself: nothing of one goes into the next."""
@@ -290,7 +284,9 @@ def parts_of(run: Experiment) -> list[slice]:
 
     Parts of fewer than 8 samples, or without a value, are left out, where others are left.
     """
-    marks = [np.flatnonzero(np.diff(a)) for c, a in run.meta.get("extra", {}).items() if c in PARTS and len(a) == run.n]
+    extra = dict(run.meta["extra"]) if isinstance(run.meta.get("extra"), Mapping) else {}
+    told = (a for c in PARTS if (a := np.asarray(extra.get(c))).shape == run.t.shape)
+    marks = [np.flatnonzero(np.nan_to_num(np.diff(a))) for a in told if a.dtype.kind in "biuf"]
     cuts = np.unique(np.concatenate([pauses(run.t), *marks])) if run.meta.get("parts", ()) is not None else np.empty(0)
     parts = [slice(a, b) for a, b in pairwise([0, *(cuts + 1).tolist(), run.n]) if b - a >= MIN_SAMPLES]
     return [s for s in parts if any(np.isfinite(y[s]).any() for y in run.outputs.values())] or [slice(0, run.n)]

@@ -135,6 +135,7 @@ _DUTY = _set("duty pwm dutycycle tastgrad")
 _DERIVATIVE = _set("dot rate dt derivative")
 _BRACKETS = re.compile(r"(.*?)[\s_,:/]*[\[({<]([^\])}>]*)[\])}>]\s*")
 _IN = re.compile(r"(.*\S)(?:\s+in\s+|\s+/\s*|\s*,\s+|[\s_.-]+(?=[a-z]+(?:/s)?:\d)|:\s*(?!\d+$))(\S.*)", re.IGNORECASE)
+_NUMBERED = re.compile(r"(.*\S)\s*:\s*\d+\s*")  # of the logger's channel
 _SEPARATORS = re.compile(r"[\s_.\-:/]+")
 _CAMEL = re.compile(r"(?<=[a-zäöü][a-zäöü])(?=[A-ZÄÖÜ])")
 _BY_UNIT = {"time": "t", "voltage": "v", "current": "i", "speed": "omega", "linear speed": "omega", "angle": "theta"}
@@ -163,6 +164,8 @@ def classify(label: str, unit: Unit | None = None) -> HeaderMatch | None:
 
 def unit_in(label: str) -> tuple[str, Unit | None, bool]:
     """Split a header into its name, its unit, and whether that is surely a unit (``u_a`` is no current)."""
+    if (numbered := _NUMBERED.fullmatch(label)) and not _COUNTS.fullmatch((_tokens(numbered[1]) or [""])[-1]):
+        label = numbered[1]
     if bracket := _BRACKETS.fullmatch(label):
         unit = parse_unit(bracket[2])
         inside = "" if unit or bracket[2].strip() == "t" else bracket[2]  # u(t)
@@ -221,8 +224,8 @@ def _by_words(words: list[str], unit: Unit | None, explicit: bool) -> HeaderMatc
     if unit is None or _goes_with(channel, unit, words):
         if score < 1 or (unit is None and _ONLY_LENGTHS & set(words)):
             return None
-        counted = (_WEAK & set(words) and channel == "theta") or any(
-            len(w) > 4 and _COUNTS.fullmatch(w.rstrip("0123456789")) for w in words)  # inc, step may be other words
+        last = next((w for w in reversed(words) if not (w in _NEUTRAL or w.isdigit())), "").rstrip("0123456789")
+        counted = (_WEAK & set(words) and channel == "theta") or (len(last) > 4 and _COUNTS.fullmatch(last))  # no inc
         known = unit or (parse_unit({"theta": "counts", "omega": "counts/s"}.get(channel, "")) if counted else None)
         return HeaderMatch(channel, known, 2.0 if unit is None and known else score)
     longest = max(len(w) for w in words if _CHANNEL.get(w.rstrip("0123456789"), channel) == channel)

@@ -11,6 +11,7 @@ from motorid.records.experiment import Experiment
 LEAST = 16  # samples
 INPUT_SHARE = 0.02  # of the largest input: how far a held input may wander, and below which it counts as off
 DRIFT_SHARE = 1e-3  # of a channel's largest value: a smaller change between the halves is no drift
+FAR, DEPARTED = 4.0, 0.65  # standard deviations, and share of the farthest: a motor on its way
 DRIVE_SHARE = 0.05  # of what drives a motor: as much may still accelerate it, hidden by noise
 MOVING_SHARE = 0.01  # of the top speed: slower than this is standstill
 
@@ -85,16 +86,20 @@ def _steady_tail(k: int, run: Experiment, sigma: Mapping[str, float], first: int
 
 
 def _accelerating(run: Experiment, first: int, s: SteadySegment) -> float:
-    """Return the share of the drive that still accelerates in a part, by the way there from sample `first` on.
-
-    That takes J/K Δω = ∫(i − ī)dt, and what is left falls with ∫(ω̄ − ω)dt/Δω; without a current friction is viscous.
+    """Return the share of the drive that still accelerates in a part, by the way there from sample `first` on since the
+    speed was last about as far away as ever; 0 where it never was. That takes J/K Δω = ∫(i − ī)dt, and what is left
+    falls with ∫(ω̄ − ω)dt/Δω; without a current friction is viscous.
     """
-    way, level = slice(first, s.first + 1), s.means.get("i", s.means["omega"]) or 1.0
-    y = bridged(run.t, run.outputs["omega" if "omega" in run.outputs else "theta"])
+    seen, level = run.outputs["omega" if "omega" in run.outputs else "theta"], s.means.get("i", s.means["omega"]) or 1.0
+    y = bridged(run.t, seen)
     short = s.means["omega"] - (y if "omega" in run.outputs else slope(run.t, y, 4))
+    far = np.abs(short[first:s.first + 1]) * np.isfinite(seen[first:s.first + 1])
+    if far.max() <= FAR * short[s.first:s.last + 1].std():
+        return 0.0
+    way = slice(begin := first + int(np.flatnonzero(far > DEPARTED * far.max())[-1]), s.first + 1)
     drive = bridged(run.t, run.outputs["i"]) - s.means["i"] if "i" in s.means else short
-    lag = integral(run.t[way], short[way])[-1] / (short[first:first + 3].mean() or 1.0)
-    left = np.exp(-(s.begin - run.t[first]) / max(lag, run.dt)) / (s.end - s.begin)
+    lag = integral(run.t[way], short[way])[-1] / (short[begin:begin + 3].mean() or 1.0)
+    left = np.exp(-(s.begin - run.t[begin]) / max(lag, run.dt)) / (s.end - s.begin)
     return float(abs(integral(run.t[way], drive[way])[-1] / level) * left)
 
 

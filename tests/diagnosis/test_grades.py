@@ -416,3 +416,10 @@ def test_what_follows_an_angle_that_is_noise_by_more_than_a_turn_is_no_weight(no
     assert ("the angle that it follows is measured to 2." in objections(fit, mi.effects.gravity)) is objected
     integral = mi.fit(led, [stepped(model, 1, 600, 5e-3, omega=0.3)])  # the angle is that of the speed
     assert "measured to" not in objections(integral, mi.effects.gravity)
+
+
+def test_lags_that_are_gone_are_not_exchanged():
+    """Of a winding faster than the samples "T_i = not determined, L = not determined do no worse" was said."""
+    run = stepped(mi.dc_motor(R=1.0, L=2e-4, K=0.05, b=1e-4, J=5e-5), 3, 400, i=0.6, omega=0.5)
+    fit = mi.fit(mi.dc_motor() + mi.effects.current_lag, run)
+    assert all(other.std[n] and other.values[n] > 1e-6 for n, other in refit.with_lags_exchanged(fit).items())

@@ -1095,6 +1095,17 @@ def test_a_smaller_law_that_leaves_noise_takes_the_place_of_what_explains_most(m
     assert mi.evaluate(found.remainder.fitted, runs[2]).rmse["theta"] == pytest.approx(2e-3, rel=0.1)
 
 
+def test_a_lone_wrong_sample_tells_no_curve_how_far_it_reaches():
+    t = np.arange(400) * 1e-3
+    run = mi.Experiment(t, {"v": 6 * np.sign(np.sin(20 * t))}, {"i": 0 * t, "omega": 0 * t})
+    motor = mi.dc_motor(R=1.0, L=1e-3, K=0.05, b=1e-4, J=5e-5)
+    shown = dict(mi.simulate(motor, run, initial="rest")[0].outputs)
+    reach = np.abs(shown["omega"]).max()
+    shown["omega"] = np.where(np.arange(400) == 200, 1e4, shown["omega"])
+    fit = mi.fit(motor, run.with_(outputs=shown), loss=mi.Huber())
+    assert free_forms.span_of(fit, free_forms.signals_along(fit)).ranges["omega"][1] < 1.5 * reach
+
+
 def test_a_curve_reaches_as_far_as_the_motor_got(monkeypatch):
     """A constant that falls with the speed lets the motor run faster than the plain model, where a curve ended."""
     _only(monkeypatch, "a motor constant", "omega")

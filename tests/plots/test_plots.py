@@ -361,3 +361,15 @@ def test_dots_over_a_turn_are_of_all_turns():
     (dots,) = [line for line in ax.lines if line.get_linestyle() == "None"]
     assert len(dots.get_xdata()) == np.count_nonzero(np.isfinite(dots.get_ydata())) > 300
     plt.close(ax.figure)
+
+
+@pytest.mark.parametrize("n", [8, 200])
+def test_residuals_of_few_samples_are_drawn(n):
+    t = np.arange(n) * 1e-3
+    run = mi.Experiment(t, {"v": np.ones(n)}, {"i": 0 * t, "omega": 0 * t})
+    motor = mi.dc_motor(R=1.0, L=1e-3, K=0.05, b=1e-5, J=1e-5)
+    run = run.with_(outputs={c: y + 1e-3 * np.random.default_rng(0).normal(size=n)
+                             for c, y in mi.simulate(motor, run, initial="rest")[0].outputs.items()})
+    sparse = np.where(np.arange(n) % 100 == 5, run.outputs["omega"], np.nan) if n > 8 else run.outputs["omega"]
+    fit = mi.fit(motor, run.with_(outputs={**run.outputs, "omega": sparse}))
+    assert plots.plot_residuals(fit) is not None

@@ -109,6 +109,26 @@ def test_where_noise_hides_that_the_drive_still_accelerates_is_no_steady_part(ch
         assert 5e-5 * abs(omega[-1] - omega[0]) / (s.end - s.begin) < 0.1 * 2e-5 * abs(s.means["omega"])
 
 
+@pytest.mark.parametrize("case", ["held until late", "speed missing at first", "from the start", "without any noise"])
+def test_what_came_to_its_speed_at_last_is_steady(case):
+    """The way there begins where the motor last set off, not with the voltage; where it was never far there is none."""
+    rng, t = np.random.default_rng(1), np.arange(2000) * 2e-3
+    model = mi.dc_motor(R=1.0, L=1e-3, K=0.05, b=3e-5, J=5e-5)
+    moved = np.maximum(t - 1.5 * (case == "held until late"), 0)
+    moved = moved if case in ("held until late", "speed missing at first") else np.inf
+    omega = 118.0 * (1 - np.exp(-moved / 0.02)) + 0 * t
+    i = 6.0 - 0.05 * omega
+    shown = {"i": i, "omega": omega}
+    if case != "without any noise":
+        shown = {c: y + s * rng.normal(size=2000) for (c, y), s in zip(shown.items(), (0.01, 0.2), strict=True)}
+    if case == "speed missing at first":
+        shown["omega"][:700] = np.nan
+    run = mi.Experiment(t, {"v": np.full(2000, 6.0)}, shown, sigma={"i": 0.01, "omega": 0.2})
+    (found,) = SteadyState().segments(as_problem(model, run))
+    assert found.begin == pytest.approx(2.0 if case == "held until late" else 1.0, abs=0.01)
+    assert found.means["omega"] == pytest.approx(118.0, abs=0.1)
+
+
 def test_the_relation_at_the_steady_state_is_that_of_the_textbook(noisy):
     problem = problem_of(noisy)
     r, _ = evaluated(SteadyState(), problem, problem.start)

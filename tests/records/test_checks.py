@@ -360,3 +360,11 @@ def test_a_coarse_current_that_stays_where_noise_moves_all_others_is_clipped(rng
     run = Experiment(t, {"v": v}, {"i": coarse, "omega": 10 * v * (1 - np.exp(-(t % 0.5) / 0.1))})
     assert "the current stays at exactly 0.34 A" in said(run)
     assert "clipped" not in said(run.with_(outputs={**run.outputs, "i": np.round(noisy / 2e-3) * 2e-3}))
+
+
+def test_a_coarse_sensor_s_offset_at_rest_is_no_limit(rng):
+    t = np.arange(6000) * 1e-3
+    motion = np.where(t < 3, -80 * (1 - np.exp(-t / 0.3)), -80 * np.exp(-(t - 3) / 0.3))
+    rippled = np.minimum(motion * (1 + 0.05 * rng.normal(size=6000)), -1)
+    speed = np.round(np.where(motion < -0.5, rippled, 0)) + 1.0
+    assert "clipped" not in said(Experiment(t, {"v": np.where(t < 3, -6.0, 0.0)}, {"omega": speed}))

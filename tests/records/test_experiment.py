@@ -233,7 +233,7 @@ def parted(request, tmp_path, rng):
 
 @pytest.mark.parametrize("change", [
     lambda r: r.decimate(3), lambda r: r.decimate(30), lambda r: r.delayed(0.013), lambda r: r.delayed(-0.013),
-    lambda r: r.running_median(9), lambda r: r.levelled(), lambda r: r.without_spikes(),
+    lambda r: r.without_spikes(),
     lambda r: r.with_(t=1.3 * r.t + 0.3), lambda r: r.select(slice(40, 400)), lambda r: r.decimate(2).decimate(2)])
 def test_nothing_of_a_part_goes_into_the_next_and_none_is_lost(parted, change, tmp_path):
     changed = change(parted)
@@ -253,3 +253,20 @@ def test_nothing_of_a_part_goes_into_the_next_and_none_is_lost(parted, change, t
 def test_parts_are_not_those_of_other_samples(parted):
     other = parted.with_(t=parted.t[:300], inputs={"v": np.ones(300)}, outputs={"omega": np.ones(300)})
     assert sum(p.n for p in between_pauses(other)) == 300
+
+
+@pytest.mark.parametrize("extra", ["a note", None, [1, 2], {"motorid part": 3}, {"motorid part": np.array(["a"] * 50)},
+                                   {"motorid part": np.where(np.arange(50) == 20, np.nan, 0.0)}])
+def test_what_a_user_keeps_beside_a_run_makes_no_parts(extra):
+    run = Experiment(np.arange(50) * 1e-3, {"v": np.ones(50)}, {"omega": np.arange(50.0)}, meta={"extra": extra})
+    assert between_pauses(run) == [run]
+
+
+def test_short_parts_and_spikes_that_are_few_in_each_part_are_not_lost():
+    t = np.concatenate([np.arange(500) * 1e-3, 1 + np.arange(5) * 1e-3, 2 + np.arange(500) * 1e-3])
+    speed = 100 + 0.1 * np.random.default_rng(0).normal(size=1005)
+    speed[[100, 300, 600, 800]] = 500
+    run = Experiment(t, {"v": np.ones(1005)}, {"omega": speed})
+    assert run.decimate(1).n == 1005
+    assert np.isnan(run.without_spikes().outputs["omega"]).sum() == 4
+    assert run.select(np.r_[0:10, 510:1005]).running_median(15).n == 505

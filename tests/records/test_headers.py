@@ -77,6 +77,17 @@ def test_a_step_or_an_inclination_is_no_count():
         assert classify(header) == ("theta", None, 2.0)
 
 
+@pytest.mark.parametrize(("header", "unit"), [("time ms:1", "ms"), ("voltage mV:2", "mV"), ("current [mA]:3", "mA"),
+                                              ("current_mA:1", "mA"), ("speed rpm:4", "rpm"), ("n_rpm:2", "rpm")])
+def test_a_number_of_the_logger_s_channel_hides_no_unit(header, unit):
+    assert classify(header).unit.label == unit
+
+
+@pytest.mark.parametrize("header", ["speed pulse response", "motor speed - pulse test", "speed: steps test"])
+def test_the_name_of_a_test_is_no_count(header):
+    assert classify(header) == ("omega", None, 2.0)
+
+
 def test_supply_and_duty_are_told_apart():
     assert all(map(is_supply, ["bus_V", "Vsupply", "Vbat", "dc_link", "v_bus"]))
     assert not any(map(is_supply, ["supply_current", "voltage", "v"]))
