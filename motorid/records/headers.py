@@ -118,7 +118,7 @@ _ONLY_LENGTHS = _set("x weg stroke travel displacement hub")
 _LENGTHS = _ONLY_LENGTHS | _set("position pos posicion lage")
 _WEAK = _set("encoder enc")
 _NEUTRAL = _set("motor mot measured meas ist istwert actual act armature anker winding applied drive shaft "
-                "rotor joint axis sensor angular the in of signal raw filtered a m")
+                "rotor joint axis sensor angular the in of signal raw roh filtered a m")
 # A column with one of these words is something else, whatever the other words are.
 _OTHER = _set("goal target set sp desired des wanted soll sollwert consigne error err limit lim max min mean "
               "std sigma variance flag enable enabled id ud vd temp temperature temperatur torque force "
@@ -164,8 +164,8 @@ def classify(label: str, unit: Unit | None = None) -> HeaderMatch | None:
 
 def unit_in(label: str) -> tuple[str, Unit | None, bool]:
     """Split a header into its name, its unit, and whether that is surely a unit (``u_a`` is no current)."""
-    if (numbered := _NUMBERED.fullmatch(label)) and not _COUNTS.fullmatch((_tokens(numbered[1]) or [""])[-1]):
-        label = numbered[1]
+    if (nth := _NUMBERED.fullmatch(label)) and not _COUNTS.fullmatch(re.split(r"[\s_.-]", nth[1].lower())[-1]):
+        label = nth[1]
     if bracket := _BRACKETS.fullmatch(label):
         unit = parse_unit(bracket[2])
         inside = "" if unit or bracket[2].strip() == "t" else bracket[2]  # u(t)
