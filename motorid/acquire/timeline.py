@@ -97,7 +97,7 @@ class Timeline:
 
     def _agree(self, last: _Mark, mark: _Mark) -> bool:
         step = mark.index - last.index
-        return step > 0 and abs(((mark.micros - last.micros) * 1e-6 * self.header.rate) - step) <= 5 + 0.2 * step
+        return step > 0 and abs((mark.micros - last.micros) * 1e-6 * self.header.rate - step) <= 5 + 0.2 * step
 
     def _row(self, mark: _Mark, sample: Sample) -> Row:
         step, self._last = mark.index - self._last.index, mark

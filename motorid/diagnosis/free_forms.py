@@ -266,12 +266,12 @@ def functions_of(form: Form, span: Span) -> list[str]:
                 found += [f"({sign}z > 0) * ca.exp(-ca.fabs(z) / {fade})" for fade in fades]
         return found
     found = (_along if form.on in ("theta", "t", "distance") else _of_size)(form, span, low, high)
+    if form.carrier != "acceleration" and not form.channel == form.on in span.unscaled:
+        return found
     middle = f"{0.5 * max(low, high, key=abs) if form.on in ('i', 'omega') else 0.5 * (low + high):.9g}"
     there = {f: at if PLACE.search(at := Z.sub(f"({middle})", f)) else f"{eval(at, NUMBERS):.9g}" for f in found}
     if form.carrier == "acceleration":  # there the motor's own J is the inertia
         return [f"({f} - {at})" for f, at in there.items()]
-    if form.balance != "sensor" or form.channel != form.on or form.on not in span.unscaled:
-        return found
     return ["1.0", *(f"({f} - z / ({middle}) * {at})" for f, at in there.items() if f not in ("1.0", found[1]))]  # 1: z
 
 
