@@ -23,7 +23,7 @@ from motorid.diagnosis.input_hypotheses import Reading, better_reading, without_
 from motorid.diagnosis.misspecification import IN_ITS_PLACE, FormGain, Grade, better_forms, grades_of, outdoes, swallows
 from motorid.diagnosis.model_comparison import Node, at_noise, beats, choose, evidence, far, group_of, node_of
 from motorid.diagnosis.predictive_score import is_sure
-from motorid.diagnosis.record_parts import affordable, fitted_to, thinned_alike
+from motorid.diagnosis.record_parts import affordable, fitted_to, in_parts, thinned_alike
 from motorid.diagnosis.refit import BEAM, BEHIND, INTERRUPTED, OUT_OF_TIME
 from motorid.diagnosis.remainder import alone_leaving_noise, beside_leaving_noise
 from motorid.diagnosis.results import Adequacy, Candidate, Ladder, Rung
@@ -321,14 +321,12 @@ def explored(fit: Fit, validate: Sequence[Experiment] | Experiment | None, effec
         stages.climb()
         return climb(Search(records.fit, records.held_out, effects, stages), most, left())
 
-    fit, held_out = affordable(fit), [validate] if isinstance(validate, Experiment) else validate
-    records = Records(fit, held_out and thinned_alike(fit, held_out))
-    if spikes := without_spikes(records.fit):
-        records = records.read(spikes)
-    as_it_was = records
-    if reading := better_reading(records.fit):
-        records = records.read(reading)
+    held_out = [validate] if isinstance(validate, Experiment) else validate
+    as_it_was, records = _as_read(less := affordable(fit), held_out)
     found = climbed(records)
+    if not found.stopped and not found.remaining.adequate and in_parts(less) and _remembers(found, fit, held_out):
+        as_it_was, records = _as_read(fit, held_out)
+        found = climbed(records)
     if not found.stopped and (windowed := _in_windows(found)) is not None:
         parts = replace(records, fit=windowed)
         anew = climbed(parts)
@@ -355,6 +353,27 @@ def explored(fit: Fit, validate: Sequence[Experiment] | Experiment | None, effec
             records, found = as_it_was, climbed(as_it_was, 0)
     found, records = _with_held_out(found, records, climbed)
     return _beside_curves(found, left()), " ".join(records.remarks)
+
+
+def _as_read(fit: Fit, held_out: Sequence[Experiment] | None) -> tuple[Records, Records]:
+    """Return the records as they are, but for spikes, and as they are better read."""
+    records = Records(fit, held_out and thinned_alike(fit, held_out))
+    if spikes := without_spikes(records.fit):
+        records = records.read(spikes)
+    return records, records.read(reading) if (reading := better_reading(records.fit)) else records
+
+
+def _remembers(found: Climb, whole: Fit, held_out: Sequence[Experiment] | None) -> bool:
+    """Tell whether a model with a memory, which begins anew in every part of a record, leaves noise on whole ones: one
+    on the way, or the most promising that was refused."""
+    refused = [c for tried in found.rounds[-1:] for c in tried if c.fit is not None and c.fit.memories]
+    refused.sort(key=lambda c: c.gain or 0.0)
+    for fit in (*(node.fit for node in found.path[1:]), *(c.fit for c in refused[-1:])):
+        with contextlib.suppress(*FAILURES):
+            if fit and fit.memories and at_noise(node_of(
+                    fitted_to(fit, whole.problem.experiments), HeldOut.of(whole, held_out))):
+                return True
+    return False
 
 
 def _with_held_out(found: Climb, records: Records, climbed: Callable[[Records], Climb]) -> tuple[Climb, Records]:

@@ -153,7 +153,7 @@ def cogging(m: Equations, A=P(1e-3, "N·m", null=0.0, lower=0.0, doc="amplitude 
 
 
 @effect(balance="torque")
-def torque_ripple(m: Equations, a_r=P(0.05, "", null=0.0, lower=0.0, upper=1.0, doc="relative amplitude"), N_r=ORDER,
+def torque_ripple(m: Equations, a_r=P(0.05, "", null=0.0, lower=0.0, upper=0.5, doc="relative amplitude"), N_r=ORDER,
                   phi_r=PHASE, e_r=P(0.0, "", vary=False, lower=0.0, upper=1.0, grid=(0.0, 1.0),
                                      doc="1: in the back-EMF too, fixed")):
     """Torque ripple, K·i·(1+a·sin(N·θ+φ)), with e_r = 1 in the back-EMF too. Jahns & Soong, IEEE TIE 43(2), 1996.

@@ -169,11 +169,15 @@ class Fit(Shown):
         if self.fits == "noise" and self.problem.unknown and not any([*self.std.values(), *self.determined]):
             said = "Nothing is determined: the records do not show what the motor does, and any values fit them"
         if self.window:
-            anew = [s for s in self.problem.system.states if s not in (*CHANNELS, "clock", "distance")]
             said += f", a window of {number(self.window, 2)} s ahead"
-            said += f"; {listed(anew)} begin{'s' * (len(anew) == 1)} anew in each" if anew else ""
+            said += f"; {listed(anew)} begin{'s' * (len(anew) == 1)} anew in each" if (anew := self.memories) else ""
         end = "" if self.status == "converged" else f" Not converged ({self.status}): the values are not an optimum."
         return f"{said} (NRMSE {self.evaluation.words}).{end}"
+
+    @property
+    def memories(self) -> list[str]:
+        """States that no channel shows: they begin anew in every window or part of a record."""
+        return [s for s in self.problem.system.states if s not in (*CHANNELS, "clock", "distance")]
 
     @property
     def window(self) -> float | None:

@@ -216,6 +216,15 @@ def test_a_size_at_the_limit_of_what_is_physical_is_refused(rubbing):
     assert "the limit of what is physical" in objections(at_limit, LIBRARY["load_friction"])
 
 
+def test_no_motor_loses_more_than_half_its_torque_at_some_angle(lab):
+    """Of a motor with a coil open half is left; ripples of 96 % were named that imitated friction at the start."""
+    (run,) = runs_of(lab, {}, ("stairs 0.5",))
+    fit = mi.fit(mi.dc_motor() + mi.effects.torque_ripple(N_r=7), [run])
+    for size, refused in ((0.4, False), (0.5, True), (0.96, True)):
+        far = replace(fit, values={**fit.values, "a_r": size})
+        assert ("the limit of what is physical" in objections(far, LIBRARY["torque_ripple"])) == refused
+
+
 def test_what_turns_is_not_tried_on_a_linear_axis(lab):
     runs = runs_of(lab, {"coulomb": {"tau_c": 8e-3}}, ("stairs 0.5",), ("theta",))
     runs = [r.with_(units={**r.units, "theta": "m"}) for r in runs]
@@ -288,6 +297,25 @@ def test_a_long_record_is_looked_at_in_parts_and_that_is_said(lab, monkeypatch):
     assert "2 parts of 0.5 s, 33 % of the samples" in found.text
     worse = mi.diagnose(whole, [run.with_(outputs={c: 1.2 * y for c, y in run.outputs.items()})], effects=())
     assert "larger on the held-out runs" not in worse.text  # which are looked at as a whole
+
+
+def test_what_remembers_is_looked_at_on_whole_records(monkeypatch):
+    """In parts of 0.3 s the load behind a freewheel began anew, and "only approximated" what it is."""
+    t, rng = np.arange(1800) * 1e-3, np.random.default_rng(2)
+    model = mi.dc_motor().start_at({"J": 6e-5}) + mi.effects.freewheel(r_free=0.5, g_free=150.0, b_free=2e-5)
+    runs = []
+    for seed in (1, 2, 3):
+        v = np.repeat(np.random.default_rng(seed).uniform(-10, 10, 9), 200)
+        clean = mi.planned(model, t, v, channels=("i", "omega"))
+        runs.append(clean.with_(sigma={}, outputs={
+            c: y + 0.01 * np.sqrt(np.mean(y**2)) * rng.standard_normal(1800) for c, y in clean.outputs.items()}))
+    whole = mi.fit(mi.dc_motor(), runs[:2])
+    monkeypatch.setattr(parts, "AFFORDABLE", 100)
+    monkeypatch.setattr(parts, "PART", 300)
+    monkeypatch.setattr(parts, "WANTED", parts._work(whole) / 3)
+    found = mi.diagnose(whole, runs[2], effects=("freewheel", "coulomb", "quadratic_drag"))
+    assert (found.verdict, found.effects) == ("missing", ("freewheel",))
+    assert "parts of" not in found.text
 
 
 @pytest.mark.parametrize(("hertz", "more"), [(60, True), (0.2, False)])
