@@ -247,6 +247,18 @@ def test_a_slow_start_that_an_encoder_counts_is_motion_and_rest_is_rest(rng):
     assert found.misfit["theta"] < 1.3
 
 
+def test_what_runs_out_before_the_first_voltage_is_in_motion(rng):
+    """A part that began in the last slow turns of a motor running out was taken for one at rest: 27 times the noise."""
+    count, t = 2 * np.pi / 4000, np.arange(2500) * 1e-3
+    whole = simulated(t, np.where(t < 0.5, 8.0, np.where(t < 2.0, 0.0, -6.0)), ("i", "omega", "theta"))
+    outputs = {"i": whole.outputs["i"] + rng.normal(0, 0.01, len(t)),
+               "theta": np.round(whole.outputs["theta"] / count) * count}
+    slow = int(np.argmax((t > 0.5) & (whole.outputs["omega"] < 0.02 * np.max(whole.outputs["omega"]))))
+    found = mi.fit(TRUE, whole.with_(outputs=outputs).select(slice(slow, None)))
+    assert found.initial["omega_0[0]"] == pytest.approx(whole.outputs["omega"][slow], rel=0.2)
+    assert found.misfit["theta"] < 1.3
+
+
 def test_an_angle_that_is_not_measured_starts_at_zero_and_is_no_unknown(runs):
     problem = as_problem(TRUE + mi.effects.gravity, runs)
     assert "theta" in problem.system.states
