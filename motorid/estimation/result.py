@@ -22,7 +22,8 @@ from motorid.numerics.parallel import one_thread
 from motorid.numerics.signals import Array, despiked
 from motorid.problem.plain_data import model_dict, problem_dict
 from motorid.problem.problem import Problem
-from motorid.problem.simulate import NRMSE, Evaluation, Simulation, at, error_table, evaluate, judge, steady_errors
+from motorid.problem.simulate import (NRMSE, Evaluation, Simulation, at, error_table, evaluate, judge, largest, moving,
+                                      steady_errors)
 from motorid.records.experiment import Experiment, units_of
 from motorid.records.files import json_text, write_files
 
@@ -154,7 +155,7 @@ class Fit(Shown):
         ``"noise"``: no error is more than three times the noise, which colour can do; ``"poor"``: some is;
         ``"lost"``: a channel is not followed at all, or there is no result.
         """
-        if self.status == "failed" or any(not e < LOST for e in self.nrmse.values()):
+        if self.status == "failed" or largest(self.nrmse) >= LOST:
             return "lost"
         return "poor" if max(self.misfit.values(), default=0.0) > COLOURED else "noise"
 
@@ -302,7 +303,7 @@ class Fit(Shown):
         return Card(f"Fit of {self.model.title}", flags, text, [t for t in tables if t], after)
 
     def __repr__(self) -> str:
-        errors = ", ".join(f"{c} {100 * e:.2f} %" for c, e in self.nrmse.items())
+        errors = ", ".join(f"{c} {100 * e:.2f} %" for c, e in moving(self.nrmse).items())
         end = "" if self.status == "converged" else f", {self.status}"
         return f"<fit of {self.problem.model.name}: {FLAGS[self.fits]}{end}, NRMSE {errors}>"
 

@@ -24,6 +24,7 @@ from motorid.records import preprocessing
 
 INPUTS = ("v", *MEASURED_INPUTS)
 MIN_SAMPLES = 8
+ROUNDING = 1e-12  # of a channel, or of its SI unit: what sums of doubles leave of a motion that is none
 PARTS = ("motorid record", "motorid part")  # extra columns that change where the clock starts again, a part begins
 
 
@@ -116,9 +117,11 @@ class Experiment(Shown):
 
     def moved(self, channel: str) -> Array:
         """Return what errors of a channel are measured against, (N,): an angle from where its record begins, since its
-        zero may be anywhere; the others as they are."""
+        zero may be anywhere; the others as they are. Where nothing but rounding moves it is zero."""
         y = self.outputs[channel]
-        return y - self.meta.get("origin", y[np.isfinite(y)][:1].sum()) if channel == "theta" else y
+        known = y[np.isfinite(y)]
+        moved = y - self.meta.get("origin", known[:1].sum()) if channel == "theta" else y
+        return np.where(np.abs(moved) < ROUNDING * max(np.abs(known).max(initial=0.0), 1.0), 0.0, moved)
 
     def with_(self, **changes: Any) -> Experiment:
         """Return a copy with some fields replaced, validated again."""

@@ -83,6 +83,34 @@ def test_a_channel_that_is_not_followed_at_all_is_lost(runs):
     assert fit.verdict.startswith("Does not fit")
 
 
+def still(run, angle=0.0):
+    """The same voltage on a shaft that is held fast, its encoder anywhere."""
+    return run.with_(outputs={"omega": 0 * run.t, "theta": angle + 1e-15 * np.sin(run.t)}, sigma={}, name="fast")
+
+
+def test_an_error_over_a_motion_that_is_none_is_no_number_and_decides_nothing(runs):
+    """A share of nothing was 7.64·10¹⁵⁰ %."""
+    moved = [r.with_(outputs={"omega": r.outputs["omega"]}) for r in runs]
+    fast = still(moved[0], 0.1)
+    fit = mi.fit(mi.dc_motor(), moved)
+    both = mi.evaluate(fit, [moved[1], fast.without("theta")])
+    assert both.by_run[0]["omega"] < 1
+    assert np.isnan(both.by_run[1]["omega"])
+    assert "10¹" not in str(both.card())
+    there = mi.evaluate(fit, fast)
+    assert np.isnan([*there.nrmse.values(), *there.by_run[0].values()]).all()
+    assert repr(there) == "<evaluation of 1 runs: NRMSE >"
+    assert {"omega", "theta"} == {*there.nrmse}
+    # All that was measured beside the current stands still: the current alone says whether it fits.
+    locked = [r.with_(outputs={"i": r.inputs["v"] / 1.5 * (1 + 1e-3 * np.sin(9 * r.t)), "omega": 0 * r.t}) for r in runs]
+    resting = mi.fit(mi.dc_motor().fix(L=0.0), locked[:1])
+    assert resting.fits != "lost"
+    assert "speed –" in resting.verdict
+    found = mi.diagnose(resting, locked[1:], effects=["coulomb", "brush_drop"])
+    assert "10¹" not in str(found.card())
+    assert "nan" not in found.text
+
+
 def test_what_is_determined_does_not_depend_on_where_a_fit_without_current_ends(runs):
     """Currents ten thousand times as large beside an R as much smaller are the same motor; first currents are some."""
     fit = mi.fit(mi.dc_motor(), [r.without("i") for r in runs], window=0.4)
