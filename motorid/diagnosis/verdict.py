@@ -14,6 +14,7 @@ from motorid.diagnosis.results import Adequacy, Candidate, Rung
 from motorid.diagnosis.score_test import Score
 from motorid.diagnosis.thresholds import ELSEWHERE, LARGER, LOST, MATERIAL
 from motorid.display.numbers import arrow, counted, listed, number, percent, with_error
+from motorid.estimation.covariance import UNDETERMINED
 from motorid.estimation.result import Fit, parameter_cell
 from motorid.numerics.autoregression import colour_of
 from motorid.numerics.signals import despiked
@@ -131,9 +132,10 @@ def _described(fit: Fit, name: str) -> str:
 
 
 def _certain(fit: Fit) -> dict[str, float | None]:
-    """Return one standard deviation per parameter; None for a size that is not known even to itself."""
+    """Return one standard deviation per parameter; None for a size within two of them from zero: that is no answer."""
     sizes = {n for n, p in fit.model.parameters.items() if p.positive or p.null == 0}
-    return {n: None if n in sizes and s is not None and s > abs(fit.values[n]) else s for n, s in fit.std.items()}
+    return {n: None if n in sizes and s is not None and s > UNDETERMINED * abs(fit.values[n]) else s
+            for n, s in fit.std.items()}
 
 
 def errors_text(rungs: Sequence[Rung]) -> str:

@@ -31,7 +31,8 @@ LOST = 1.0  # NRMSE at which zero is as near to what was measured
 PLAIN = 1.5  # times the noise: up to here errors are said to be at its level
 COLOURED = 3.0  # times the noise from fast changes: what a correlation of 0.9 between neighbours makes of it
 SAVED = ("q", "status", "message", "history", "seconds", "integration_error", "formulation")  # plain fields
-FLAGS = {"noise": Flag("fits", "good"), "poor": Flag("fits poorly", "bad"), "lost": Flag("does not fit", "bad")}
+FLAGS = {"noise": Flag("fits", "good"), "open": Flag("no optimum", "note"), "poor": Flag("fits poorly", "bad"),
+         "lost": Flag("does not fit", "bad")}
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,10 +162,11 @@ class Fit(Shown):
 
     @property
     def verdict(self) -> str:
-        """Whether it fits, in a sentence."""
-        times = max(self.misfit.values(), default=0.0)
-        said = {"noise": "Fits: errors at the level of the noise" if times < PLAIN else
-                f"Fits: errors up to {number(times, 2)} times the noise, which correlated noise can explain",
+        """Whether it fits, in a sentence: by the size of the errors, which is no answer before an optimum."""
+        times, lead = max(self.misfit.values(), default=0.0), "Fits: errors" if self.status == "converged" else "Errors"
+        said = {"noise": f"{lead} at the level of the noise" if times < PLAIN else
+                f"{lead} up to {number(times, 2)} times the noise, which correlated noise can explain; whether it does, "
+                "a diagnosis tells",
                 "poor": f"Fits poorly: errors up to {number(times, 2)} times the noise",
                 "lost": "Does not fit: predicting zero would be closer"}[self.fits]
         if self.fits == "noise" and self.problem.unknown and not any([*self.std.values(), *self.determined]):
@@ -175,6 +177,10 @@ class Fit(Shown):
             said += f"; {listed(anew)} begin{'s' * (len(anew) == 1)} anew in each" if anew else ""
         end = "" if self.status == "converged" else f" Not converged ({self.status}): the values are not an optimum."
         return f"{said} (NRMSE {self.evaluation.words}).{end}"
+
+    @property
+    def _flag(self) -> Flag:
+        return FLAGS["open" if self.fits == "noise" and self.status != "converged" else self.fits]
 
     @property
     def window(self) -> float | None:
@@ -290,7 +296,7 @@ class Fit(Shown):
     def card(self) -> Card:
         """Return how it ended, parameters, errors, and what constraints cost."""
         vague = [n for n, s in self.std.items() if s is None]
-        flags = [FLAGS[self.fits], *([] if self.status == "converged" else [Flag(self.status, "bad")])]
+        flags = [self._flag, *([] if self.status == "converged" else [Flag(self.status, "bad")])]
         flags += [Flag(self.formulation)] if self.formulation != "plain" else []
         flags += [Flag(f"{len(vague)} not determined", "note")] if vague else []
         amount = f"{counted(len(self.problem.experiments), 'run')}, {self.problem.n_outputs} measured values."
@@ -305,7 +311,7 @@ class Fit(Shown):
     def __repr__(self) -> str:
         errors = ", ".join(f"{c} {100 * e:.2f} %" for c, e in moving(self.nrmse).items())
         end = "" if self.status == "converged" else f", {self.status}"
-        return f"<fit of {self.problem.model.name}: {FLAGS[self.fits]}{end}, NRMSE {errors}>"
+        return f"<fit of {self.problem.model.name}: {self._flag}{end}, NRMSE {errors}>"
 
 
 def checked(fit: Any, caller: str) -> Fit:

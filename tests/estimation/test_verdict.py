@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -74,6 +75,18 @@ def test_coloured_noise_is_no_poor_fit_and_the_missing_effect_makes_it_good(runs
     assert clean.fits == better.fits == "noise"
     assert clean.verdict.startswith("Fits: errors up to 2.5 times the noise, which correlated noise can explain")
     assert better.verdict.startswith("Fits: errors at the level of the noise")
+    assert "which correlated noise can explain; whether it does, a diagnosis tells (NRMSE" in clean.verdict
+    assert "diagnosis" not in better.verdict
+
+
+def test_errors_as_small_as_the_noise_are_no_fit_before_an_optimum(runs):
+    """A fit that had stalled said "Fits …" and, a sentence later, that its values are none of an optimum."""
+    fit = replace(mi.fit(mi.dc_motor() + mi.effects.coulomb, runs), status="stalled")
+    assert fit.fits == "noise"
+    assert fit.verdict.startswith("Errors at the level of the noise (NRMSE")
+    assert "Not converged (stalled)" in fit.verdict
+    assert [f.mood for f in fit.card().flags[:2]] == ["note", "bad"]
+    assert "fits" not in repr(fit)
 
 
 def test_a_channel_that_is_not_followed_at_all_is_lost(runs):
