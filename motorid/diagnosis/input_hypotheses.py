@@ -43,6 +43,7 @@ class Reading:
     says: str
     option: str
     of: Callable[[Experiment], Experiment]
+    start: str = "model"  # where the fit begins; "auto" where what it followed is gone
 
     def problem(self, fit: Fit) -> Problem:
         """Return the problem of the same model on records read so."""
@@ -51,7 +52,7 @@ class Reading:
 
     def fitted(self, fit: Fit, solver: LevenbergMarquardt | None = None) -> Fit:
         """Return the fit of the same model to records read so; FitError or SimulationError where there is none."""
-        return solve(self.problem(fit), solver, start="model")
+        return solve(self.problem(fit), solver, start=self.start)
 
     def remark(self, before: Fit, after: Fit) -> str:
         """Say what was done to the records and what that did to the errors."""
@@ -64,10 +65,12 @@ def without_spikes(fit: Fit) -> Reading | None:
     if fit.problem.loss is not None:
         return None
     runs = fit.problem.experiments
-    count = sum(int(np.isfinite(y).sum() - np.isfinite(quiet.outputs[c]).sum())
-                for run, quiet in ((r, r.without_spikes()) for r in runs) for c, y in run.outputs.items())
-    says = f"{count} single samples stand far from both neighbours, which no motor can do, and are left out"
-    return Reading(says, "--no-spikes", Experiment.without_spikes) if count else None
+    gone = [np.isfinite(y) & ~np.isfinite(quiet.outputs[c])
+            for run, quiet in ((r, r.without_spikes()) for r in runs) for c, y in run.outputs.items()]
+    count, in_a_row = sum(map(np.count_nonzero, gone)), any((g[1:] & g[:-1]).any() for g in gone)
+    says = (f"{count} {'samples, some of them in a row,' if in_a_row else 'single samples'} stand far from both "
+            "neighbours, which no motor can do, and are left out")
+    return Reading(says, "--no-spikes", Experiment.without_spikes, "auto") if count else None
 
 
 def better_reading(fit: Fit, late: bool = False) -> Reading | None:

@@ -22,8 +22,18 @@ from motorid.numerics.parallel import one_thread
 from motorid.numerics.signals import Array, despiked
 from motorid.problem.plain_data import model_dict, problem_dict
 from motorid.problem.problem import Problem
-from motorid.problem.simulate import (NRMSE, Evaluation, Simulation, at, error_table, evaluate, judge, largest, moving,
-                                      steady_errors)
+from motorid.problem.simulate import (
+    NRMSE,
+    Evaluation,
+    Simulation,
+    at,
+    error_table,
+    evaluate,
+    judge,
+    largest,
+    moving,
+    steady_errors,
+)
 from motorid.records.experiment import Experiment, units_of
 from motorid.records.files import json_text, write_files
 
@@ -165,8 +175,8 @@ class Fit(Shown):
         """Whether it fits, in a sentence: by the size of the errors, which is no answer before an optimum."""
         times, lead = max(self.misfit.values(), default=0.0), "Fits: errors" if self.status == "converged" else "Errors"
         said = {"noise": f"{lead} at the level of the noise" if times < PLAIN else
-                f"{lead} up to {number(times, 2)} times the noise, which correlated noise can explain; whether it does, "
-                "a diagnosis tells",
+                f"{lead} up to {number(times, 2)} times the noise, which correlated noise can explain; whether it "
+                "does, a diagnosis tells",
                 "poor": f"Fits poorly: errors up to {number(times, 2)} times the noise",
                 "lost": "Does not fit: predicting zero would be closer"}[self.fits]
         if self.fits == "noise" and self.problem.unknown and not any([*self.std.values(), *self.determined]):

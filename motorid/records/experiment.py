@@ -197,9 +197,11 @@ class Experiment(Shown):
     def without_spikes(self) -> Experiment:
         """Return the run with single samples that stand far from both neighbours marked as missing.
 
-        Not next to jumps of the voltage, where the motor is quick; at least three, at most 5 % of a channel.
+        Not next to jumps of the voltage, where the motor is quick; at least three, at most 5 % of a channel. Of speed
+        and angle, two or three in a row that jump there and back are left out too: a mass cannot.
         """
-        outputs = {c: preprocessing.without_spikes(self.t, y, self.inputs["v"]) for c, y in self.outputs.items()}
+        outputs = {c: preprocessing.without_spikes(self.t, y, self.inputs["v"], inert=c != "i")
+                   for c, y in self.outputs.items()}
         return self.with_(outputs=outputs) if any(outputs[c] is not y for c, y in self.outputs.items()) else self
 
     def _by_parts(self, y: Array, read: Callable[[slice], Array]) -> Array:

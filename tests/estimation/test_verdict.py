@@ -115,7 +115,8 @@ def test_an_error_over_a_motion_that_is_none_is_no_number_and_decides_nothing(ru
     assert repr(there) == "<evaluation of 1 runs: NRMSE >"
     assert {"omega", "theta"} == {*there.nrmse}
     # All that was measured beside the current stands still: the current alone says whether it fits.
-    locked = [r.with_(outputs={"i": r.inputs["v"] / 1.5 * (1 + 1e-3 * np.sin(9 * r.t)), "omega": 0 * r.t}) for r in runs]
+    locked = [r.with_(outputs={"i": r.inputs["v"] / 1.5 * (1 + 1e-3 * np.sin(9 * r.t)), "omega": 0 * r.t})
+              for r in runs]
     resting = mi.fit(mi.dc_motor().fix(L=0.0), locked[:1])
     assert resting.fits != "lost"
     assert "speed –" in resting.verdict
