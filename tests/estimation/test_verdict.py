@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -143,6 +144,28 @@ def test_a_motor_on_a_linear_axis_has_a_speed_in_metres(runs):
     cart = [r.without("i").with_(outputs={"omega": 0.03 * r.outputs["omega"]}, units={"omega": "m/s"}) for r in runs]
     known = mi.fit(mi.dc_motor(), cart).determined
     assert known["gain"].unit == "m/s per V"
+
+
+def test_a_motor_on_a_linear_axis_has_a_mass_and_forces_wherever_it_is_shown(runs, tmp_path):
+    """Tables said N·m/A and kg·m² of a cart, and a remark that N/A and kg were meant."""
+    cart = [r.with_(outputs={"i": r.outputs["i"], "omega": 0.03 * r.outputs["omega"]}, sigma={},
+                    units={"omega": "m/s"}) for r in runs]
+    fit = mi.fit(mi.dc_motor(), cart)
+    units = {"R": "Ω", "L": "H", "K": "N/A", "b": "N·s/m", "J": "kg"}
+    assert {n: p.unit for n, p in fit.model.parameters.items()} == units
+    assert (fit.model.parameters["J"].doc, fit.model.axis) == ("moving mass", "linear")
+    turning = mi.fit(mi.dc_motor(), runs)
+    assert fit.values["J"] == pytest.approx(turning.values["J"] / 0.03**2, rel=1e-3)
+    found = mi.diagnose(fit, effects=("coulomb", "speed_offset"))
+    assert found.effects == ("coulomb",)
+    assert re.search(r"tau_c = [\d.]+ ± [\d.]+ N[;,.]", found.answer), found.answer
+    page = mi.report(found, tmp_path / "cart.html").read_text(encoding="utf-8")
+    assert not re.search(r"N·m(?!/)|kg·m²|V·s/rad", page + str(found.card()) + str(fit.card()))
+    saved = json.loads(fit.save(tmp_path / "cart.json").read_text(encoding="utf-8"))
+    assert {n: p["unit"] for n, p in saved["parameters"].items()} == units
+    assert mi.load(tmp_path / "cart.json").values == pytest.approx(fit.values)
+    assert {n: p.unit for n, p in mi.load(tmp_path / "cart.json").model.parameters.items()} == units
+    mi.export(fit, tmp_path / "motor.json")
 
 
 def test_voltage_and_speed_alone_determine_gain_times_and_friction_in_volts(runs):
