@@ -189,10 +189,6 @@ class Fit(Shown):
         return f"{said} (NRMSE {self.evaluation.words}).{end}"
 
     @property
-    def _flag(self) -> Flag:
-        return FLAGS["open" if self.fits == "noise" and self.status != "converged" else self.fits]
-
-    @property
     def window(self) -> float | None:
         """Length of the windows that the records are simulated in, s; None where they are simulated as a whole."""
         return self.problem.experiments[0].meta.get("window")
@@ -306,7 +302,7 @@ class Fit(Shown):
     def card(self) -> Card:
         """Return how it ended, parameters, errors, and what constraints cost."""
         vague = [n for n, s in self.std.items() if s is None]
-        flags = [self._flag, *([] if self.status == "converged" else [Flag(self.status, "bad")])]
+        flags = [flag_of(self), *([] if self.status == "converged" else [Flag(self.status, "bad")])]
         flags += [Flag(self.formulation)] if self.formulation != "plain" else []
         flags += [Flag(f"{len(vague)} not determined", "note")] if vague else []
         amount = f"{counted(len(self.problem.experiments), 'run')}, {self.problem.n_outputs} measured values."
@@ -321,7 +317,7 @@ class Fit(Shown):
     def __repr__(self) -> str:
         errors = ", ".join(f"{c} {100 * e:.2f} %" for c, e in moving(self.nrmse).items())
         end = "" if self.status == "converged" else f", {self.status}"
-        return f"<fit of {self.problem.model.name}: {self._flag}{end}, NRMSE {errors}>"
+        return f"<fit of {self.problem.model.name}: {flag_of(self)}{end}, NRMSE {errors}>"
 
 
 def checked(fit: Any, caller: str) -> Fit:
@@ -329,6 +325,11 @@ def checked(fit: Any, caller: str) -> Fit:
     if not isinstance(fit, Fit):
         raise UsageError(f"{caller} takes a fit, mi.{caller}(mi.fit(mi.dc_motor(), runs)); got {name_of(fit)}.")
     return fit
+
+
+def flag_of(fit: Fit) -> Flag:
+    """Return in a word whether a model fits: errors like noise are no fit before an optimum."""
+    return FLAGS["open" if fit.fits == "noise" and fit.status != "converged" else fit.fits]
 
 
 def ended(fit: Fit) -> str:

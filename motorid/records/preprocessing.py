@@ -125,13 +125,13 @@ def bursts(t: Array, y: Array, v: Array) -> NDArray[np.intp]:
     if len(seen) < FEWEST:
         return np.empty(0, int)
     changes, level = np.diff(y[seen]), np.append(0, np.cumsum(np.abs(np.diff(v)) > 0.02 * np.ptp(v)))  # of the voltage
-    sizes = np.abs(changes)
-    large = np.flatnonzero(sizes > max(8 * np.quantile(sizes, 0.9), 12 * noise_level(y, t)))
+    sizes, least = np.abs(changes), 12 * noise_level(y, t)
+    large = np.flatnonzero(sizes > max(8 * np.quantile(sizes, 0.9), least))
     found = [(a, b) for a, b in pairwise(large.tolist()) if b - a <= LONGEST and -2 < changes[a] / changes[b] < -0.5
              and level[seen[b]] == level[seen[a + 1]] < level[max(seen[a] - PEAK, 0)] + 2]
     usual = np.delete(sizes, np.array(found, int).ravel()).max(initial=0.0)
     far = [seen[a + 1:b + 1] for a, b in found
-           if min(sizes[a], sizes[b]) > 2 * usual and max(np.abs(y[seen[[a, b + 1]]])) > usual]
+           if min(sizes[a], sizes[b]) > 2 * usual and max(np.abs(y[seen[[a, b + 1]]])) > least]
     return np.concatenate([np.empty(0, int), *far])
 
 
