@@ -13,7 +13,7 @@ from motorid.display.cards import Table
 from motorid.display.numbers import counted, duration, number, quantity
 from motorid.effects import EVERY
 from motorid.errors import DataError, among
-from motorid.estimation.result import COLOURED, PLAIN, Fit, constraint_table, ended, steady_table, value_tables
+from motorid.estimation.result import PLAIN, Fit, constraint_table, ended, steady_table, value_tables
 from motorid.exporters.c_code import check
 from motorid.exporters.export import FORMS, export
 from motorid.exporters.json_file import constraint_violations, fit_dict, remarks, run_dict, write_json
@@ -64,7 +64,8 @@ def fit_command(runs: opt.Runs, options: opt.FitOptions, validate: opt.Validate 
 
 
 def _show_fit(found: Fit, records: list[Experiment], notes: list[str], judged: Evaluation | None = None) -> None:
-    plain = found.fits == "noise" and max(found.misfit.values(), default=0.0) < PLAIN
+    noise = found.fits == "noise" and found.status == "converged"
+    plain = noise and max(found.misfit.values(), default=0.0) < PLAIN
     show(found.verdict, _held_out(found, judged) if judged else None, NRMSE,
          f"Next: {next_command('fit', '--json', 'fit.json')}\nThen: motorid export fit.json motor.casadi" if plain
          else f"Next: {next_command('diagnose')}", f"\n{found.model.title}, {_amount(records)}. {ended(found)}\n")
@@ -80,7 +81,7 @@ def _show_fit(found: Fit, records: list[Experiment], notes: list[str], judged: E
 def _held_out(found: Fit, judged: Evaluation) -> str:
     """Say how large the held-out errors are beside the noise, since another record may have smaller signals."""
     times = max((judged.rmse[c] / s for c, s in found.noise.items() if c in judged.rmse), default=0.0)
-    said = "at the level of the noise" if times <= COLOURED else f"up to {number(times, 2)} times the noise"
+    said = "at the level of the noise" if times < PLAIN else f"up to {number(times, 2)} times the noise"
     return f"Held out: errors {said} (NRMSE {judged.words})."
 
 

@@ -70,7 +70,8 @@ class ReadingOptions:
     delay: Annotated[float | None, _reading(
         metavar="S", help="Seconds by which the voltage acts later than its column says.")] = None
     no_spikes: Annotated[bool, _reading(
-        "--no-spikes", help="Leave out single samples that stand far from both neighbours.")] = False
+        "--no-spikes", help="Leave out single samples that stand far from both neighbours, of speed and angle two or "
+        "three in a row too.")] = False
     ignore: Annotated[str | None, _reading(metavar="i,theta", help="Measured channels to leave out.")] = None
     force: Force = False
 

@@ -30,6 +30,7 @@ from motorid.display.numbers import listed, number, percent
 from motorid.estimation.result import Fit
 from motorid.numerics.autoregression import autocorrelation, effective_samples
 from motorid.numerics.signals import Array, despiked, quantum, winsorised
+from motorid.problem.simulate import largest
 from motorid.records.experiment import Experiment
 
 FALSE_ALARM = 0.02
@@ -62,7 +63,7 @@ def adequacy(fit: Fit, scores: Sequence[Score] = (), level: float = FALSE_ALARM)
     p_value = min([1.0, *(t["p"] * len(tests) for t in material)])
     far = [c for c, facts in channels.items()
            if facts["ratio"] > LARGEST_RATIO / (2 if c == "theta" else 1) and c in asked]
-    exact = max(fit.nrmse.values(), default=1.0) < EXACT
+    exact = largest(fit.nrmse) < EXACT
     adequate = exact or (p_value > level and not far)
     for c, facts in channels.items():
         facts["p_value"] = min([1.0, *(t["p"] for t in tests if t["channel"] == c)])

@@ -23,7 +23,7 @@ from motorid.estimation.least_squares import FAILURES
 from motorid.estimation.result import Fit
 from motorid.numerics.least_squares import LevenbergMarquardt
 from motorid.problem.problem import Problem
-from motorid.problem.simulate import at, judge, misfit_over_noise
+from motorid.problem.simulate import at, judge, misfit_over_noise, moving
 from motorid.records.experiment import Experiment
 
 CHANGING = 0.5  # of the samples at which the voltage must change for its reading to matter
@@ -43,6 +43,7 @@ class Reading:
     says: str
     option: str
     of: Callable[[Experiment], Experiment]
+    start: str = "model"  # where the fit begins; "auto" where what it followed is gone
 
     def problem(self, fit: Fit) -> Problem:
         """Return the problem of the same model on records read so."""
@@ -51,11 +52,11 @@ class Reading:
 
     def fitted(self, fit: Fit, solver: LevenbergMarquardt | None = None) -> Fit:
         """Return the fit of the same model to records read so; FitError or SimulationError where there is none."""
-        return solve(self.problem(fit), solver, start="model")
+        return solve(self.problem(fit), solver, start=self.start)
 
     def remark(self, before: Fit, after: Fit) -> str:
         """Say what was done to the records and what that did to the errors."""
-        falls = ", ".join(f"{channel_name(c)} {arrow(e, after.nrmse[c])}" for c, e in before.nrmse.items())
+        falls = ", ".join(f"{channel_name(c)} {arrow(e, after.nrmse[c])}" for c, e in moving(before.nrmse).items())
         return f"{self.says}: with {self.option} the error falls ({falls}), and this diagnosis uses it."
 
 
@@ -64,10 +65,12 @@ def without_spikes(fit: Fit) -> Reading | None:
     if fit.problem.loss is not None:
         return None
     runs = fit.problem.experiments
-    count = sum(int(np.isfinite(y).sum() - np.isfinite(quiet.outputs[c]).sum())
-                for run, quiet in ((r, r.without_spikes()) for r in runs) for c, y in run.outputs.items())
-    says = f"{count} single samples stand far from both neighbours, which no motor can do, and are left out"
-    return Reading(says, "--no-spikes", Experiment.without_spikes) if count else None
+    gone = [np.isfinite(y) & ~np.isfinite(quiet.outputs[c])
+            for run, quiet in ((r, r.without_spikes()) for r in runs) for c, y in run.outputs.items()]
+    count, in_a_row = sum(map(np.count_nonzero, gone)), any((g[1:] & g[:-1]).any() for g in gone)
+    says = (f"{count} {'samples, some of them in a row,' if in_a_row else 'single samples'} stand far from both "
+            "neighbours, which no motor can do, and are left out")
+    return Reading(says, "--no-spikes", Experiment.without_spikes, "auto") if count else None
 
 
 def better_reading(fit: Fit, late: bool = False) -> Reading | None:
@@ -89,7 +92,7 @@ def better_reading(fit: Fit, late: bool = False) -> Reading | None:
             found = compare(*(Predictions(predictions_left_out(f) or {}, {}) for f in (fit, after)))
         except FAILURES:
             continue
-        rises = max(e / max(fit.nrmse[c], 1e-300) for c, e in after.nrmse.items()) > 1 + MATERIAL
+        rises = max(e / max(fit.rmse[c], 1e-300) for c, e in after.rmse.items()) > 1 + MATERIAL
         if found.fall > fall and found.worth_it and not rises:
             chosen, fall = reading, found.fall
     return chosen
@@ -109,8 +112,8 @@ def _fall(fit: Fit, reading: Reading) -> float:
     """Return about how much a reading lowers the error: after a few steps from where the fit is."""
     try:
         done = by_continuation(reading.problem(fit).tuned(accuracy=ROUGH), RACE, wide=False, narrow=False)
-        after = judge(at(done.problem, done.solution.q)).nrmse
-        return 1 - float(np.exp(np.mean([np.log(after[c] / e) for c, e in fit.nrmse.items()])))
+        after = judge(at(done.problem, done.solution.q)).rmse
+        return 1 - float(np.exp(np.mean([np.log(max(after[c], 1e-300) / max(e, 1e-300)) for c, e in fit.rmse.items()])))
     except FAILURES:
         return -np.inf
 

@@ -23,7 +23,7 @@ from motorid.estimation.result import Fit
 from motorid.numerics.autoregression import effective_samples
 from motorid.numerics.signals import Array, despiked
 from motorid.problem.problem import Problem
-from motorid.problem.simulate import Simulation, at, settled
+from motorid.problem.simulate import Simulation, at, normalised, settled
 from motorid.records.experiment import Experiment
 
 SETTLED = 1e-6  # relative change of the scale at which its iteration stops
@@ -50,8 +50,8 @@ class Errors:
 
     @property
     def nrmse(self) -> float:
-        """RMS of the errors over that of the measured samples."""
-        return float(np.sqrt(np.nanmean(np.concatenate(self.values) ** 2))) / max(self.measured, 1e-300)
+        """RMS of the errors over that of the measured samples; NaN where these do not move."""
+        return normalised(float(np.sqrt(np.nanmean(np.concatenate(self.values) ** 2))), self.measured)
 
 
 Channels = Mapping[str, Errors]

@@ -27,7 +27,7 @@ from motorid.numerics.parallel import interruption
 from motorid.numerics.signals import Array
 from motorid.problem.problem import Problem
 from motorid.problem.runs import combined, natural_sizes, shapes_of, with_inputs
-from motorid.problem.simulate import misfit_over_noise
+from motorid.problem.simulate import largest, misfit_over_noise
 
 BEGIN, RACE = (LevenbergMarquardt(max_iterations=n, ftol=1e-3, xtol=1e-4, looks=0) for n in (2, 6))
 HALVING = 2  # of the starts go on after the first steps (successive halving: Karnin, Koren & Somekh, ICML 2013)
@@ -158,7 +158,7 @@ def _own_starts(fit: Fit, model: Model, starts: Sequence[Mapping[str, float]]) -
     """Return `starts` with the larger model's own first guess, where the smaller one's fit is no place to begin (an arm
     without its weight is fitted by a motor that hardly moves): the best alone where only the current is far off."""
     with contextlib.suppress(*FAILURES):
-        if max(fit.nrmse.values(), default=0.0) > LOST:
+        if largest(fit.nrmse) > LOST:
             guess = first_guess(model, fit.problem.experiments, loaded=True)
             return [{**start, **guess} for start in (starts if lost(fit) else starts[:1])]
     return []

@@ -14,9 +14,11 @@ from motorid.diagnosis.results import Adequacy, Candidate, Rung
 from motorid.diagnosis.score_test import Score
 from motorid.diagnosis.thresholds import ELSEWHERE, LARGER, LOST, MATERIAL
 from motorid.display.numbers import arrow, counted, listed, number, percent, with_error
+from motorid.estimation.covariance import UNDETERMINED
 from motorid.estimation.result import Fit, parameter_cell
 from motorid.numerics.autoregression import colour_of
 from motorid.numerics.signals import despiked
+from motorid.problem.simulate import moving
 from motorid.records.experiment import units_of
 
 MOVED = 0.1  # relative change of a motor parameter that is worth a word
@@ -130,16 +132,18 @@ def _described(fit: Fit, name: str) -> str:
 
 
 def _certain(fit: Fit) -> dict[str, float | None]:
-    """Return one standard deviation per parameter; None for a size that is not known even to itself."""
+    """Return one standard deviation per parameter; None for a size within two of them from zero: that is no answer."""
     sizes = {n for n, p in fit.model.parameters.items() if p.positive or p.null == 0}
-    return {n: None if n in sizes and s is not None and s > abs(fit.values[n]) else s for n, s in fit.std.items()}
+    return {n: None if n in sizes and s is not None and s > UNDETERMINED * abs(fit.values[n]) else s
+            for n, s in fit.std.items()}
 
 
 def errors_text(rungs: Sequence[Rung]) -> str:
     """Say how the error changed, on held-out runs where there are any: what fell, then what rose and why."""
-    was, is_, last = rungs[0].validation_nrmse, rungs[-1].validation_nrmse, rungs[-1]
+    last = rungs[-1]
+    was, is_ = (moving(r.validation_nrmse or {}) for r in (rungs[0], last))
     held_out = bool(was and is_)
-    was, is_ = (was, is_) if was and is_ else (rungs[0].nrmse, last.nrmse)
+    was, is_ = (was, is_) if held_out else (moving(rungs[0].nrmse), moving(last.nrmse))
     noise = {c for c in was if last.fit.misfit.get(c, 0.0) < LARGER}
     words = [_changed(last, c, was[c], is_[c]) for c in sorted(was, key=lambda c: is_[c] > was[c])]
     noisy = tuple(f"{_name(last, c)} rises" for c in noise)
@@ -158,8 +162,8 @@ def rises_text(rungs: Sequence[Rung]) -> str:
     """Say which errors rose from rung to rung and what decided, beside what `errors_text` says; empty if none."""
     told, small = [], set()
     for a, b in itertools.pairwise(rungs):
-        there = a.validation_nrmse or {}, b.validation_nrmse or {}
-        kinds = [((a.nrmse, b.nrmse), "fitted"), (there, "held-out")][:1 if len(rungs) == 2 else 2]
+        there = moving(a.validation_nrmse or {}), moving(b.validation_nrmse or {})
+        kinds = [((moving(a.nrmse), moving(b.nrmse)), "fitted"), (there, "held-out")][:1 if len(rungs) == 2 else 2]
         for (was, is_), where in kinds if there[0] or len(rungs) > 2 else ():
             risen = [c for c in was if is_[c] > was[c]]
             large = [_changed(b, c, was[c], is_[c]) for c in risen if _matters(was[c], is_[c])]

@@ -29,7 +29,7 @@ from motorid.numerics.parallel import one_thread, progress
 from motorid.problem.constraints import SteadyState
 from motorid.problem.problem import Problem, as_problem
 from motorid.problem.runs import natural_sizes, suited
-from motorid.problem.simulate import integration_bias, integration_error, misfit_over_noise, with_angles_apart
+from motorid.problem.simulate import integration_bias, integration_error, largest, misfit_over_noise, with_angles_apart
 from motorid.records.experiment import Experiment, windows
 
 NOISE = 1.2  # RMS of the residual over the noise that may be called noise
@@ -333,8 +333,8 @@ def follows(fit: Fit) -> bool:
 def lost(fit: Fit) -> bool:
     """Tell whether a fit is so far from its records that neither its values nor slopes there lead anywhere: from the
     motion, where that was measured. A current that no model comes near leaves slopes along the motion as they are."""
-    motion = [error for c, error in fit.nrmse.items() if c != "i"]
-    return max(motion or fit.nrmse.values(), default=0.0) > LOST
+    motion = {c: error for c, error in fit.nrmse.items() if c != "i"}
+    return largest(motion or fit.nrmse) > LOST
 
 
 def in_windows(fit: Fit, solve: Callable[[Problem], Fit] = solve, drifts: bool = False) -> Fit | None:

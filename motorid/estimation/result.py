@@ -22,7 +22,18 @@ from motorid.numerics.parallel import one_thread
 from motorid.numerics.signals import Array, despiked
 from motorid.problem.plain_data import model_dict, problem_dict
 from motorid.problem.problem import Problem
-from motorid.problem.simulate import NRMSE, Evaluation, Simulation, at, error_table, evaluate, judge, steady_errors
+from motorid.problem.simulate import (
+    NRMSE,
+    Evaluation,
+    Simulation,
+    at,
+    error_table,
+    evaluate,
+    judge,
+    largest,
+    moving,
+    steady_errors,
+)
 from motorid.records.experiment import Experiment, units_of
 from motorid.records.files import json_text, write_files
 
@@ -30,7 +41,8 @@ LOST = 1.0  # NRMSE at which zero is as near to what was measured
 PLAIN = 1.5  # times the noise: up to here errors are said to be at its level
 COLOURED = 3.0  # times the noise from fast changes: what a correlation of 0.9 between neighbours makes of it
 SAVED = ("q", "status", "message", "history", "seconds", "integration_error", "formulation")  # plain fields
-FLAGS = {"noise": Flag("fits", "good"), "poor": Flag("fits poorly", "bad"), "lost": Flag("does not fit", "bad")}
+FLAGS = {"noise": Flag("fits", "good"), "open": Flag("no optimum", "note"), "poor": Flag("fits poorly", "bad"),
+         "lost": Flag("does not fit", "bad")}
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,16 +166,17 @@ class Fit(Shown):
         ``"noise"``: no error is more than three times the noise, which colour can do; ``"poor"``: some is;
         ``"lost"``: a channel is not followed at all, or there is no result.
         """
-        if self.status == "failed" or any(not e < LOST for e in self.nrmse.values()):
+        if self.status == "failed" or largest(self.nrmse) >= LOST:
             return "lost"
         return "poor" if max(self.misfit.values(), default=0.0) > COLOURED else "noise"
 
     @property
     def verdict(self) -> str:
-        """Whether it fits, in a sentence."""
-        times = max(self.misfit.values(), default=0.0)
-        said = {"noise": "Fits: errors at the level of the noise" if times < PLAIN else
-                f"Fits: errors up to {number(times, 2)} times the noise, which correlated noise can explain",
+        """Whether it fits, in a sentence: by the size of the errors, which is no answer before an optimum."""
+        times, lead = max(self.misfit.values(), default=0.0), "Fits: errors" if self.status == "converged" else "Errors"
+        said = {"noise": f"{lead} at the level of the noise" if times < PLAIN else
+                f"{lead} up to {number(times, 2)} times the noise, which correlated noise can explain; whether it "
+                "does, a diagnosis tells",
                 "poor": f"Fits poorly: errors up to {number(times, 2)} times the noise",
                 "lost": "Does not fit: predicting zero would be closer"}[self.fits]
         if self.fits == "noise" and self.problem.unknown and not any([*self.std.values(), *self.determined]):
@@ -293,7 +306,7 @@ class Fit(Shown):
     def card(self) -> Card:
         """Return how it ended, parameters, errors, and what constraints cost."""
         vague = [n for n, s in self.std.items() if s is None]
-        flags = [FLAGS[self.fits], *([] if self.status == "converged" else [Flag(self.status, "bad")])]
+        flags = [flag_of(self), *([] if self.status == "converged" else [Flag(self.status, "bad")])]
         flags += [Flag(self.formulation)] if self.formulation != "plain" else []
         flags += [Flag(f"{len(vague)} not determined", "note")] if vague else []
         amount = f"{counted(len(self.problem.experiments), 'run')}, {self.problem.n_outputs} measured values."
@@ -306,9 +319,9 @@ class Fit(Shown):
         return Card(f"Fit of {self.model.title}", flags, text, [t for t in tables if t], after)
 
     def __repr__(self) -> str:
-        errors = ", ".join(f"{c} {100 * e:.2f} %" for c, e in self.nrmse.items())
+        errors = ", ".join(f"{c} {100 * e:.2f} %" for c, e in moving(self.nrmse).items())
         end = "" if self.status == "converged" else f", {self.status}"
-        return f"<fit of {self.problem.model.name}: {FLAGS[self.fits]}{end}, NRMSE {errors}>"
+        return f"<fit of {self.problem.model.name}: {flag_of(self)}{end}, NRMSE {errors}>"
 
 
 def checked(fit: Any, caller: str) -> Fit:
@@ -316,6 +329,11 @@ def checked(fit: Any, caller: str) -> Fit:
     if not isinstance(fit, Fit):
         raise UsageError(f"{caller} takes a fit, mi.{caller}(mi.fit(mi.dc_motor(), runs)); got {name_of(fit)}.")
     return fit
+
+
+def flag_of(fit: Fit) -> Flag:
+    """Return in a word whether a model fits: errors like noise are no fit before an optimum."""
+    return FLAGS["open" if fit.fits == "noise" and fit.status != "converged" else fit.fits]
 
 
 def ended(fit: Fit) -> str:

@@ -74,8 +74,6 @@ def remarks(fit: Fit) -> list[str]:
     at_limit = [f"{n} ended at {fit.values[n]:.3g}, the limit of what is physical: these records show no sign of it."
                 for n in undetermined if n not in vague]
     said = []
-    if model.base == "dc_motor" and any("m" in r.units.values() for r in fit.problem.experiments):
-        said.append("The record moves in m: read K in N/A, b in N·s/m, J as a mass in kg, torques as forces in N.")
     motor = [n for n in vague if n in MOTOR]
     if model.base == "dc_motor" and motor and ("i" not in measured or not {"omega", "theta"} & set(measured)):
         said.append(f"The current was not measured, so {listed(motor)} are not determined one by one, only their "

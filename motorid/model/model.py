@@ -20,7 +20,9 @@ from motorid.model.equations import Equations, System, build_system
 SGN_WIDTH = Parameter("sgn_width", 1e-2, "rad/s", positive=True, vary=False, doc="speed over which sgn(ω) is smoothed")
 LINEAR_UNITS = {"N·m": "N", "rad/s": "m/s", "rad": "m", "kg·m²": "kg", "N·m·s/rad": "N·s/m",
                 "N·m·s²/rad²": "N·s²/m²", "N·m/rad": "N/m", "N·m·s²": "kg", "1/(N·m)": "1/N", "s/rad": "s/m",
-                "N·m/V": "N/V"}
+                "N·m/V": "N/V", "N·m/A": "N/A"}
+LINEAR_DOCS = {"g": "force per unit of the command; fixed", "J": "moving mass",
+               "K": "force and back-EMF constant (V·s/m)"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,8 +145,14 @@ class Model(Shown):
         """Names of the parameters that are the same in every run, as they are or since the user gave them."""
         return tuple(n for n, p in self.parameters.items() if not p.per_run or p.given)
 
+    def on_linear_axis(self) -> Model:
+        """Return the model of what moves in metres: masses and forces for inertias and torques."""
+        model = self.with_(axis="linear")
+        return model.with_(parameters={n: model._in_units(p) for n, p in self.parameters.items()})
+
     def _in_units(self, p: Parameter) -> Parameter:
-        return replace(p, unit=LINEAR_UNITS.get(p.unit, p.unit)) if self.axis == "linear" else p
+        linear = replace(p, unit=LINEAR_UNITS.get(p.unit, p.unit), doc=LINEAR_DOCS.get(p.name, p.doc))
+        return linear if self.axis == "linear" else p
 
     def _change(self, changes: Mapping[str, Mapping[str, Any]]) -> Model:
         pars = dict(self.parameters)
@@ -299,11 +307,8 @@ def torque_driven(axis: str = "rotary", **values: float) -> Model:
     <model torque_driven: b, J>
     """
     among(axis, ("rotary", "linear"), "axis", ModelError)
-    pars = {p.name: p for p in BASES["torque_driven"]}
-    if axis == "linear":
-        docs = {"g": "force per unit of the command; fixed", "J": "moving mass"}
-        pars = {n: replace(p, unit=LINEAR_UNITS[p.unit], doc=docs.get(n, p.doc)) for n, p in pars.items()}
-    return Model("torque_driven", parameters=pars, axis=axis).replace(**values)
+    model = Model("torque_driven", parameters={p.name: p for p in BASES["torque_driven"]})
+    return (model.on_linear_axis() if axis == "linear" else model).replace(**values)
 
 
 TITLES = {"dc_motor": "DC motor", "torque_driven": "torque-driven axis"}

@@ -20,6 +20,7 @@ from motorid.numerics.signals import Array
 from motorid.plots import style
 from motorid.plots.fits import what_changed
 from motorid.plots.residuals import means, scatter
+from motorid.problem.simulate import moving
 
 FINE = 60  # bins of a mean that is drawn as a curve
 LOWEST_GAIN = -0.12  # drawn; what lies below is shown by an arrow
@@ -226,7 +227,7 @@ def plot_ladder(result: Ladder | Diagnosis, ax: Axes | None = None) -> Axes:
     ax.set_yscale("log")
     style.plain_decades(ax)
     for k in sorted({0, len(rungs) - 1}):
-        _error_labels(ax, k, {c: 100 * e for c, e in rungs[k].nrmse.items()})
+        _error_labels(ax, k, {c: 100 * e for c, e in moving(rungs[k].nrmse).items()})
     started = what_changed(rungs[0].fit, None)
     ax.set_xticks(x, [started if r.added is None else "+ " + r.added.replace(" + ", "\n+ ") for r in rungs])
     ax.set(xlim=(-0.45, len(rungs) - 0.55), ylabel="NRMSE (%)", title="Error as effects are added")

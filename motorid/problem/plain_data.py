@@ -135,7 +135,8 @@ def _assembled(head: Mapping[str, Any], effects: Iterable[Effect],
     """Return base and effects; `given` are parameters that the user set in an effect."""
     base, axis = str(head["base"]), head.get("axis", "rotary")
     among(base, ("dc_motor", "torque_driven"), "base", DataError)
-    model = dc_motor() if base == "dc_motor" else torque_driven(axis)
+    model = dc_motor() if base == "dc_motor" else torque_driven()
+    model = model.on_linear_axis() if axis == "linear" else model
     own = {e.name: e for e in effects}
     for name in map(str, head["effects"]):
         model = model + _effect(name, own, head.get("own_effects", {}).get(name))(**(given or {}).get(name, {}))

@@ -103,6 +103,8 @@ class Problem:
         if self.model.base == "dc_motor" and driven:
             raise ModelError(f"v is in {driven}, and the model is driven by a voltage: a commanded current or torque "
                              "drives mi.torque_driven() (--drive torque). If it is a voltage, state its unit.")
+        if self.model.axis == "rotary" and self.linear:
+            object.__setattr__(self, "model", self.model.on_linear_axis())
         self.model.check_visible(self.outputs)
         width = self.width or first_width(self.experiments, self.model.parameters)
         if width is not None:

@@ -53,7 +53,8 @@ class Simulation:
 class Evaluation(Shown):
     """How well values explain records: NRMSE and RMSE per channel, over all runs and run by run.
 
-    NRMSE is RMSE divided by the RMS of the measured channel over the same samples, of an angle from where it begins.
+    NRMSE is RMSE divided by the RMS of the measured channel over the same samples, of an angle from where it begins;
+    NaN where nothing moves.
     """
 
     simulations: tuple[Simulation, ...]
@@ -78,7 +79,7 @@ class Evaluation(Shown):
                     tables=(error_table({"": self}), run_table(self)), after=(("mi.plot_fit(evaluation)", "see it"),))
 
     def __repr__(self) -> str:
-        errors = ", ".join(f"{c} {100 * e:.2f} %" for c, e in self.nrmse.items())
+        errors = ", ".join(f"{c} {100 * e:.2f} %" for c, e in moving(self.nrmse).items())
         return f"<evaluation of {len(self.simulations)} runs: NRMSE {errors}>"
 
 
@@ -241,10 +242,25 @@ def judge(simulations: Sequence[Simulation]) -> Evaluation:
             ok = np.isfinite(y)
             e = s.residual(c)[ok]
             sums[c] += e @ e, y[ok] @ y[ok], ok.sum()
-            errors[c] = float(np.sqrt(e @ e / max(y[ok] @ y[ok], 1e-300)))
+            errors[c] = normalised(float(np.linalg.norm(e)), float(np.linalg.norm(y[ok])))
         by_run.append(errors)
-    return Evaluation(tuple(simulations), {c: float(np.sqrt(s[0] / max(s[1], 1e-300))) for c, s in sums.items()},
+    return Evaluation(tuple(simulations), {c: normalised(*np.sqrt(s[:2])) for c, s in sums.items()},
                       {c: float(np.sqrt(s[0] / max(s[2], 1))) for c, s in sums.items()}, tuple(by_run))
+
+
+def normalised(error: float, size: float) -> float:
+    """Return an error over the size of what was measured; NaN where that does not move: no share tells anything."""
+    return float(error / size) if size > 0 else float("nan")
+
+
+def moving(shares: Mapping[str, float]) -> dict[str, float]:
+    """Return the NRMSE of the channels that move."""
+    return {c: e for c, e in shares.items() if not np.isnan(e)}
+
+
+def largest(shares: Mapping[str, float]) -> float:
+    """Return the largest NRMSE of the channels that move; NaN, neither large nor small, without any."""
+    return max(moving(shares).values(), default=float("nan"))
 
 
 def steady_errors(simulations: Sequence[Simulation], sigma: Sequence[Mapping[str, float]]) -> dict[str, float]:

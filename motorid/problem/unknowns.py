@@ -68,7 +68,7 @@ class Unknowns:
             for c, (low, high) in run.limits.items():
                 if c in free:  # an algebraic current follows from the rest
                     unit = run.experiment.units.get(c, UNITS[c][0])
-                    if any(p.null == 0 and p.unit == UNITS[c][0] for p in self.parameters.values()):
+                    if any(p.null == 0 and p.unit == unit for p in self.parameters.values()):
                         low, high = min(low, 0.0), max(high, 0.0)  # what was measured there may be the sensor's offset
                     found.append((c, k, Parameter(f"{c}_0[{k}]", float(run.start[CHANNELS.index(c)]), unit, low, high)))
         return tuple(found)

@@ -24,6 +24,7 @@ from motorid.records import preprocessing
 
 INPUTS = ("v", *MEASURED_INPUTS)
 MIN_SAMPLES = 8
+ROUNDING = 1e-12  # of a channel, or of its SI unit: what sums of doubles leave of a motion that is none
 PARTS = ("motorid record", "motorid part")  # extra columns that change where the clock starts again, a part begins
 
 
@@ -116,9 +117,11 @@ class Experiment(Shown):
 
     def moved(self, channel: str) -> Array:
         """Return what errors of a channel are measured against, (N,): an angle from where its record begins, since its
-        zero may be anywhere; the others as they are."""
+        zero may be anywhere; the others as they are. Where nothing but rounding moves it is zero."""
         y = self.outputs[channel]
-        return y - self.meta.get("origin", y[np.isfinite(y)][:1].sum()) if channel == "theta" else y
+        known = y[np.isfinite(y)]
+        moved = y - self.meta.get("origin", known[:1].sum()) if channel == "theta" else y
+        return np.where(np.abs(moved) < ROUNDING * max(np.abs(known).max(initial=0.0), 1.0), 0.0, moved)
 
     def with_(self, **changes: Any) -> Experiment:
         """Return a copy with some fields replaced, validated again."""
@@ -194,9 +197,11 @@ class Experiment(Shown):
     def without_spikes(self) -> Experiment:
         """Return the run with single samples that stand far from both neighbours marked as missing.
 
-        Not next to jumps of the voltage, where the motor is quick; at least three, at most 5 % of a channel.
+        Not next to jumps of the voltage, where the motor is quick; at least three, at most 5 % of a channel. Of speed
+        and angle, two or three in a row that jump there and back are left out too: a mass cannot.
         """
-        outputs = {c: preprocessing.without_spikes(self.t, y, self.inputs["v"]) for c, y in self.outputs.items()}
+        outputs = {c: preprocessing.without_spikes(self.t, y, self.inputs["v"], inert=c != "i")
+                   for c, y in self.outputs.items()}
         return self.with_(outputs=outputs) if any(outputs[c] is not y for c, y in self.outputs.items()) else self
 
     def _by_parts(self, y: Array, read: Callable[[slice], Array]) -> Array:

@@ -16,6 +16,7 @@ SHORTEST = 6  # samples that have a level
 PEAK = 6  # samples after a jump of the voltage, where the current has a peak
 FEWEST = 20  # finite samples among which one can stand out
 LEAST, MOST = 3, 0.05  # spikes of a channel: fewer may be chance, a larger share is no accident
+LONGEST = 3  # samples of a burst: a logger's line or two that are lost; longer ones may be a blow
 
 
 def unwrapped(theta: Array, t: Array, omega: Array | None = None) -> tuple[Array, float, int]:
@@ -99,17 +100,39 @@ def delayed(t: Array, v: Array, hold: str, seconds: float, before: float) -> Arr
                      np.append(before, v)[np.searchsorted(t, at[-1], side="right")])
 
 
-def without_spikes(t: Array, y: Array, v: Array) -> Array:
-    """Return an output with single samples that no motor makes marked as missing; the same array where there are none.
+def without_spikes(t: Array, y: Array, v: Array, inert: bool = False) -> Array:
+    """Return an output with samples that no motor makes marked as missing; the same array where there are none.
 
-    A few may be chance, and a large share is no accident: both are left.
+    Single ones, of which a few may be chance; of what is `inert`, short bursts too. A large share is no accident: it is
+    left.
     """
-    at = spikes(t, y, v)
-    if not LEAST <= len(at) <= MOST * len(t):
+    at = at if len(at := spikes(t, y, v)) >= LEAST else at[:0]
+    at = np.union1d(at, bursts(t, y, v)) if inert else at
+    if not 0 < len(at) <= MOST * len(t):
         return y
     y = y.copy()
     y[at] = np.nan
     return y
+
+
+def bursts(t: Array, y: Array, v: Array) -> NDArray[np.intp]:
+    """Return which samples, up to `LONGEST` in a row, jump away and back, more than twice as far as the channel changes
+    from sample to sample anywhere else, at one voltage: what has a mass cannot.
+
+    From rest and back to it, it slips; what rings swings back by less than half, or again by more than half of that.
+    """
+    seen = np.flatnonzero(np.isfinite(y))
+    if len(seen) < FEWEST:
+        return np.empty(0, int)
+    changes, level = np.diff(y[seen]), np.append(0, np.cumsum(np.abs(np.diff(v)) > 0.02 * np.ptp(v)))  # of the voltage
+    sizes, least = np.abs(changes), 12 * noise_level(y, t)
+    large = np.flatnonzero(sizes > max(8 * np.quantile(sizes, 0.9), least))
+    found = [(a, b) for a, b in pairwise(large.tolist()) if b - a <= LONGEST and -2 < changes[a] / changes[b] < -0.5
+             and level[seen[b]] == level[seen[a + 1]] < level[max(seen[a] - PEAK, 0)] + 2]
+    usual = np.delete(sizes, np.array(found, int).ravel()).max(initial=0.0)
+    far = [seen[a + 1:b + 1] for a, b in found
+           if min(sizes[a], sizes[b]) > 2 * usual and max(np.abs(y[seen[[a, b + 1]]])) > least]
+    return np.concatenate([np.empty(0, int), *far])
 
 
 def spikes(t: Array, y: Array, v: Array) -> NDArray[np.intp]:

@@ -19,6 +19,7 @@ import motorid as mi
 from motorid.cli.app import app
 from motorid.cli.console import _spread, next_command, show, wrapped
 from motorid.cli.diagnose import _next_step
+from motorid.cli.fit import _held_out
 from motorid.display.cards import Table
 from motorid.records.datasets import data_path, truth
 from motorid.records.reading import read_runs, write_csv
@@ -523,3 +524,12 @@ def test_help_cuts_no_name_at_80_columns(monkeypatch):
             assert not p.metavar or p.metavar in shown, (name, p.metavar)
             assert all(o in shown for o in p.opts if o.startswith("--")), name
         assert not re.search(r"<\w", shown), name  # no type of Python
+
+
+@pytest.mark.parametrize(("times", "told"), [(1.2, "at the level of the noise"), (2.4, "up to 2.4 times the noise")])
+def test_fitted_and_held_out_errors_are_called_noise_by_one_rule(times, told):
+    """Fitted errors were "up to 1.7 times the noise", and held-out ones of 2.4 times "at the level of the noise"."""
+    runs = mi.read_runs(data_path("clean") / "run*.csv")
+    fit = mi.fit(mi.dc_motor(), runs[:1])
+    judged = replace(fit.evaluation, rmse={c: times * s for c, s in fit.noise.items()})
+    assert _held_out(fit, judged).startswith(f"Held out: errors {told} (NRMSE")

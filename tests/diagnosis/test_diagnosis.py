@@ -18,7 +18,7 @@ from motorid.diagnosis.adequacy import adequacy
 from motorid.diagnosis.design_criteria import Rival
 from motorid.diagnosis.locate import accounted, binned
 from motorid.diagnosis.score_test import rank, score
-from motorid.diagnosis.verdict import moves
+from motorid.diagnosis.verdict import _described, moves
 from motorid.display.numbers import with_error
 from motorid.effects import LIBRARY
 from motorid.errors import FitError, ModelError, UsageError
@@ -468,3 +468,15 @@ def test_without_a_current_a_torque_is_said_as_the_voltage_that_the_records_dete
     volts = float(re.search(r"R·tau_c/K = ([\d.]+) ±", found.text).group(1))
     assert volts == pytest.approx(values["R"] * values["tau_c"] / values["K"], rel=1e-3)
     assert "tau_c not determined" not in found.text
+
+
+@pytest.mark.parametrize("share", [0.45, 0.8])
+def test_a_size_within_two_deviations_from_zero_is_no_answer(share):
+    """As of a stalled fit without a current, "tau_c = 1.9 ± 1.5 N·m": its voltage is known to 7 %."""
+    fit = mi.fit(mi.dc_motor() + mi.effects.coulomb,
+                 [r.without("i") for r in mi.read_runs(data_path("hidden_friction") / "run*.csv")])
+    fit.__dict__["std"] = {**fit.std, "tau_c": share * fit.values["tau_c"]}
+    told = _described(fit, "coulomb")
+    assert ("R·tau_c/K = " in told, "tau_c = " in told) == (share > 0.5, share < 0.5)
+    fit.__dict__["determined"] = {}
+    assert ("tau_c not determined" in _described(fit, "coulomb")) == (share > 0.5)

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import scipy
 from battery.excite import P, driven, record
 
 import motorid as mi
@@ -170,6 +171,20 @@ def test_outliers_are_left_out_and_what_is_not_is_said(lab, rng):
     alone = runs_of(lab, {})[0]
     alone = alone.with_(outputs={**alone.outputs, "i": alone.outputs["i"] + 400.0 * (np.arange(alone.n) == 500)})
     assert outliers_remark(mi.fit(mi.dc_motor(), alone)).startswith("1 outlier (single samples) makes")
+
+
+def test_two_wrong_samples_in_a_row_are_left_out_first_and_no_friction_is_made_of_them(rng):
+    """After the only step of a record in coarse counts: they made the winding ring, and "a friction … of the heat"."""
+    t, v = 2e-2 * np.arange(300), np.where(np.arange(300) < 100, 0.0, 9.0)
+    speed = 1.25 * scipy.signal.lfilter([0, 1 - np.exp(-1 / 3)], [1, -np.exp(-1 / 3)], v)
+    speed = 0.73 * np.round((speed + (v > 0) * rng.normal(0, 0.25, 300)) / 0.73)
+    speed[101:103] = 16.0, 16.73
+    run = Experiment(t, {"v": v}, {"omega": speed})
+    found = mi.diagnose(mi.fit(mi.dc_motor(), run), effects=("coulomb", "winding_heating", "speed_lag"))
+    assert "2 samples, some of them in a row, stand far" in found.text
+    assert "heat" not in found.answer
+    assert found.before.determined["time_constant"].value == pytest.approx(0.06, rel=0.2)
+    assert found.before.nrmse["omega"] < 0.04
 
 
 def test_an_angle_that_follows_a_smooth_drive_is_no_closed_loop(lab, plant):

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -74,6 +76,18 @@ def test_coloured_noise_is_no_poor_fit_and_the_missing_effect_makes_it_good(runs
     assert clean.fits == better.fits == "noise"
     assert clean.verdict.startswith("Fits: errors up to 2.5 times the noise, which correlated noise can explain")
     assert better.verdict.startswith("Fits: errors at the level of the noise")
+    assert "which correlated noise can explain; whether it does, a diagnosis tells (NRMSE" in clean.verdict
+    assert "diagnosis" not in better.verdict
+
+
+def test_errors_as_small_as_the_noise_are_no_fit_before_an_optimum(runs):
+    """A fit that had stalled said "Fits …" and, a sentence later, that its values are none of an optimum."""
+    fit = replace(mi.fit(mi.dc_motor() + mi.effects.coulomb, runs), status="stalled")
+    assert fit.fits == "noise"
+    assert fit.verdict.startswith("Errors at the level of the noise (NRMSE")
+    assert "Not converged (stalled)" in fit.verdict
+    assert [f.mood for f in fit.card().flags[:2]] == ["note", "bad"]
+    assert "fits" not in repr(fit)
 
 
 def test_a_channel_that_is_not_followed_at_all_is_lost(runs):
@@ -81,6 +95,35 @@ def test_a_channel_that_is_not_followed_at_all_is_lost(runs):
     fit = mi.fit(mi.dc_motor().fix(R=1.38, L=1.7e-3, K=0.0462, b=6.5e-5), turned)
     assert fit.fits == "lost"
     assert fit.verdict.startswith("Does not fit")
+
+
+def still(run, angle=0.0):
+    """The same voltage on a shaft that is held fast, its encoder anywhere."""
+    return run.with_(outputs={"omega": 0 * run.t, "theta": angle + 1e-15 * np.sin(run.t)}, sigma={}, name="fast")
+
+
+def test_an_error_over_a_motion_that_is_none_is_no_number_and_decides_nothing(runs):
+    """A share of nothing was 7.64·10¹⁵⁰ %."""
+    moved = [r.with_(outputs={"omega": r.outputs["omega"]}) for r in runs]
+    fast = still(moved[0], 0.1)
+    fit = mi.fit(mi.dc_motor(), moved)
+    both = mi.evaluate(fit, [moved[1], fast.without("theta")])
+    assert both.by_run[0]["omega"] < 1
+    assert np.isnan(both.by_run[1]["omega"])
+    assert "10¹" not in str(both.card())
+    there = mi.evaluate(fit, fast)
+    assert np.isnan([*there.nrmse.values(), *there.by_run[0].values()]).all()
+    assert repr(there) == "<evaluation of 1 runs: NRMSE >"
+    assert {"omega", "theta"} == {*there.nrmse}
+    # All that was measured beside the current stands still: the current alone says whether it fits.
+    locked = [r.with_(outputs={"i": r.inputs["v"] / 1.5 * (1 + 1e-3 * np.sin(9 * r.t)), "omega": 0 * r.t})
+              for r in runs]
+    resting = mi.fit(mi.dc_motor().fix(L=0.0), locked[:1])
+    assert resting.fits != "lost"
+    assert "speed –" in resting.verdict
+    found = mi.diagnose(resting, locked[1:], effects=["coulomb", "brush_drop"])
+    assert "10¹" not in str(found.card())
+    assert "nan" not in found.text
 
 
 def test_what_is_determined_does_not_depend_on_where_a_fit_without_current_ends(runs):
@@ -101,6 +144,28 @@ def test_a_motor_on_a_linear_axis_has_a_speed_in_metres(runs):
     cart = [r.without("i").with_(outputs={"omega": 0.03 * r.outputs["omega"]}, units={"omega": "m/s"}) for r in runs]
     known = mi.fit(mi.dc_motor(), cart).determined
     assert known["gain"].unit == "m/s per V"
+
+
+def test_a_motor_on_a_linear_axis_has_a_mass_and_forces_wherever_it_is_shown(runs, tmp_path):
+    """Tables said N·m/A and kg·m² of a cart, and a remark that N/A and kg were meant."""
+    cart = [r.with_(outputs={"i": r.outputs["i"], "omega": 0.03 * r.outputs["omega"]}, sigma={},
+                    units={"omega": "m/s"}) for r in runs]
+    fit = mi.fit(mi.dc_motor(), cart)
+    units = {"R": "Ω", "L": "H", "K": "N/A", "b": "N·s/m", "J": "kg"}
+    assert {n: p.unit for n, p in fit.model.parameters.items()} == units
+    assert (fit.model.parameters["J"].doc, fit.model.axis) == ("moving mass", "linear")
+    turning = mi.fit(mi.dc_motor(), runs)
+    assert fit.values["J"] == pytest.approx(turning.values["J"] / 0.03**2, rel=1e-3)
+    found = mi.diagnose(fit, effects=("coulomb", "speed_offset"))
+    assert found.effects == ("coulomb",)
+    assert re.search(r"tau_c = [\d.]+ ± [\d.]+ N[;,.]", found.answer), found.answer
+    page = mi.report(found, tmp_path / "cart.html").read_text(encoding="utf-8")
+    assert not re.search(r"N·m(?!/)|kg·m²|V·s/rad", page + str(found.card()) + str(fit.card()))
+    saved = json.loads(fit.save(tmp_path / "cart.json").read_text(encoding="utf-8"))
+    assert {n: p["unit"] for n, p in saved["parameters"].items()} == units
+    assert mi.load(tmp_path / "cart.json").values == pytest.approx(fit.values)
+    assert {n: p.unit for n, p in mi.load(tmp_path / "cart.json").model.parameters.items()} == units
+    mi.export(fit, tmp_path / "motor.json")
 
 
 def test_voltage_and_speed_alone_determine_gain_times_and_friction_in_volts(runs):

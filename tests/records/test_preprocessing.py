@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import scipy
 from command import motorid_json
 from lab_records import simulated
 
 import motorid as mi
 from motorid.records.checks import unsigned, unsigned_voltage
-from motorid.records.preprocessing import spikes, unwrapped
+from motorid.records.experiment import Experiment
+from motorid.records.preprocessing import bursts, spikes, unwrapped
 from motorid.records.reading import write_csv
 
 T = 1e-3 * np.arange(800)
@@ -177,6 +179,47 @@ def test_a_peak_of_the_current_at_a_step_is_no_spike():
     assert run.without_spikes() is run
     few, _ = spiked(2)
     assert few.without_spikes() is few
+
+
+def counted(v):
+    """The speed of a geared motor in counts of 0.73 rad/s, 20 ms apart, 60 ms slow."""
+    return 0.73 * np.round(1.8 * scipy.signal.lfilter([1 - np.exp(-1 / 3)], [1, -np.exp(-1 / 3)], v) / 0.73)
+
+
+@pytest.mark.parametrize(("at", "wrong"), [(100, (24.0, 25.0)), (150, (24.0, 25.0)), (180, (40.0, 41.0, 40.0)),
+                                           (100, (30.0,)), (220, (-30.0, -31.0))])
+def test_a_few_samples_in_a_row_that_no_mass_makes_are_left_out(at, wrong):
+    """Two wrong samples after the only step made 79 % of the squared error, and "a friction that depends on heat"."""
+    t, v = 2e-2 * np.arange(300), np.where(np.arange(300) < 100, 0.0, 6.0)
+    good = counted(v)
+    assert not len(bursts(t, good, v))
+    speed, whole = good.copy(), slice(at, at + len(wrong))
+    speed[whole] = wrong
+    run = Experiment(t, {"v": v}, {"omega": speed})
+    gone = np.isnan(run.without_spikes().outputs["omega"])
+    assert list(np.flatnonzero(gone)) == list(range(300))[whole]
+    current = run.with_(outputs={"i": speed})  # that can
+    assert current.without_spikes() is current
+
+
+def test_what_a_motor_does_is_no_burst():
+    t, k = 2e-2 * np.arange(300), np.arange(300)
+    slips, rest = np.zeros(300), np.zeros(300)
+    slips[[100, 101, 180]] = 5.0, 5.2, 4.8  # from rest and back to it
+    rest[200:] = 6.0
+    assert not len(bursts(t, slips, rest))
+    pulse = np.where((k >= 100) & (k < 102), 6.0, 1.0)  # its answer comes a sample later
+    answer = np.where((k >= 101) & (k < 103), 20.0, 3.0)
+    assert not len(bursts(t, answer, pulse))
+    blow = np.full(300, 20.0)
+    blow[100:104] = 3.0
+    assert not len(bursts(t, blow, rest))
+    step = np.where(k < 100, 0.0, 6.0)
+    for damping in (0.1, 0.2, 0.3, 0.5):  # it rings, with one to four samples per swing
+        for turn in (0.8, 1.5, 2.5, 3.1):
+            after, fades = np.maximum(k - 99.5, 0), damping / np.sqrt(1 - damping**2)
+            rings = np.exp(-fades * turn * after) * (np.cos(turn * after) + fades * np.sin(turn * after))
+            assert not len(bursts(t, 20 * (1 - rings), step)), (damping, turn)
 
 
 def test_spikes_beside_missing_samples_are_found():
