@@ -523,3 +523,13 @@ def test_help_cuts_no_name_at_80_columns(monkeypatch):
             assert not p.metavar or p.metavar in shown, (name, p.metavar)
             assert all(o in shown for o in p.opts if o.startswith("--")), name
         assert not re.search(r"<\w", shown), name  # no type of Python
+
+
+@pytest.mark.parametrize("command", [["fit"], ["diagnose", "--max-effects", "0"]])
+def test_a_held_out_record_of_another_scale_is_told(tmp_path, command):
+    """A duty cycle for the voltage makes held-out errors that say nothing of the model."""
+    for name, volt in (("run", 1.0), ("check", 12.0)):
+        run = mi.read_csv(STEPS / "step_6V.csv")
+        write_csv(run.with_(inputs={"v": run.inputs["v"] / volt}), tmp_path / f"{name}.csv")
+    found = motorid_json(tmp_path, *command, tmp_path / "run.csv", "--validate", tmp_path / "check.csv")
+    assert any("12 times the speed in check as in run" in note for note in found["notes"])
