@@ -19,7 +19,7 @@ from motorid.exporters.export import FORMS, export
 from motorid.exporters.json_file import constraint_violations, fit_dict, remarks, run_dict, write_json
 from motorid.numerics.parallel import processes
 from motorid.problem.simulate import NRMSE, Evaluation, error_table, evaluate, run_table
-from motorid.records.experiment import Experiment
+from motorid.records.experiment import Experiment, repeated
 from motorid.records.files import write_files
 from motorid.records.reading import csv_text
 from motorid.uncertainty.batch import Batch, fit_many, motors_in
@@ -51,7 +51,7 @@ def fit_command(runs: opt.Runs, options: opt.FitOptions, validate: opt.Validate 
     """
     records = options.read(runs)
     held_out = options.read(validate) if validate else []
-    notes = opt.notes_of(records, held_out)
+    notes = [*filter(None, [repeated(records, held_out)]), *opt.notes_of(records, held_out)]
     found = options.fit(records)
     judged = evaluate(found, held_out) if held_out else None
     if json != "-":

@@ -29,7 +29,7 @@ from motorid.numerics.least_squares import Huber
 from motorid.numerics.parallel import interruption
 from motorid.problem.constraints import CurrentLimit, SteadyState
 from motorid.records.checks import check_runs, reading_notes
-from motorid.records.experiment import Experiment, repeated
+from motorid.records.experiment import Experiment
 from motorid.records.layout import parse_pairs
 from motorid.records.reading import read_runs
 
@@ -252,7 +252,7 @@ def make_folder(out: Path) -> None:
 
 def notes_of(runs: Sequence[Experiment], held_out: Sequence[Experiment] = ()) -> list[str]:
     """Return what a person should know about the records: how they were read, and what looks wrong."""
-    return [note for note in (*reading_notes(runs), repeated(runs, held_out), *check_runs(runs)) if note]
+    return [*reading_notes(runs), *check_runs(runs, held_out)]
 
 
 def _words(*texts: str | None) -> list[str]:

@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from motorid.channels import NAMES, channel_name
 from motorid.display.numbers import quantity
-from motorid.numerics.signals import Array, bridged, integral, noise_level, quantum
+from motorid.numerics.signals import FEWEST_FRESH, WINDOWS, Array, bridged, integral, noise_level, quantum, slope
 from motorid.records.experiment import Experiment
+from motorid.records.headers import parse_unit
 
 Check = Callable[[Experiment], str | None]
 Reading = tuple[tuple[int, ...], tuple[int, int]]  # order of v, i, omega; signs of i and omega
@@ -22,6 +23,8 @@ CLEAR = 0.15  # of what the stated columns leave, so much at most
 RESOLVED = 1e-3  # share that noise and the integration from sample to sample leave of any balance
 LOAD = 2.0  # largest torque of a load, as a multiple of the largest current
 STILL = 0.02  # of the largest speed: standstill
+RUNNING = 0.92  # cosine of |v| and |omega|: runs under its voltage; of what swings under a constant one it is 0.90
+OTHER_SCALE = 5.0  # times the speed per voltage: a wrong unit makes 6 and more, a duty cycle for the voltage at least 5
 ROUGH = 0.05  # of the speed: sampled so slowly that its balance cannot be integrated
 BALANCE_BLOCKS = 150
 # Ratio of the angle's rate to the speed, and what was then mistaken for SI.
@@ -37,16 +40,18 @@ _RATIOS = {
     **dict.fromkeys((1000.0, 1e-3), "one of them in thousandths")}
 
 
-def check_runs(runs: Sequence[Experiment]) -> list[str]:
+def check_runs(runs: Sequence[Experiment], held_out: Sequence[Experiment] = ()) -> list[str]:
     """Look for what is wrong with records, and for what they cannot show.
 
     Swapped signs and columns, wrong units, clipped or coarse channels, spikes, too slow sampling, missing samples, a
-    motor that never settles or is never excited, a voltage that never reverses.
+    motor that never settles or is never excited, a drive that is off, a voltage that never reverses.
 
     Parameters
     ----------
     runs : sequence of Experiment
         Runs that will be used together.
+    held_out : sequence of Experiment
+        Runs that these will be judged by: only whether their scales agree.
 
     Returns
     -------
@@ -65,7 +70,8 @@ def check_runs(runs: Sequence[Experiment]) -> list[str]:
         hits = [(run.name, text) for run in (runs if check in (_missing, _spikes) else plain) if (text := check(run))]
         if hits:
             remarks.append(_told_once(hits[0][1], [name for name, _ in hits]))
-    return remarks + [text for text in (_the_same_twice(runs), _never_reverses(runs)) if text]
+    scales = _other_scale([*plain, *(run.without_spikes() for run in held_out)])
+    return remarks + [text for text in (_the_same_twice(runs), scales, _never_reverses(runs)) if text]
 
 
 def reading_notes(runs: Sequence[Experiment]) -> list[str]:
@@ -93,6 +99,36 @@ def _the_same_twice(runs: Sequence[Experiment]) -> str | None:
     return None
 
 
+def _other_scale(runs: Sequence[Experiment]) -> str | None:
+    """Compare what the speed per voltage is at least (RMS over the largest voltage) with what another's is at most.
+
+    That is its largest speed over the mean of the best tenth of its voltage, which a fast excitation makes small.
+    """
+    gains = []
+    for run in runs:
+        v, omega, tenth = run.inputs["v"], _speed(run), run.n // 10
+        if omega is None or not tenth or run.units["v"] != "V" or _cosine(np.abs(v), np.abs(omega)) < RUNNING:
+            continue
+        volts = np.cumsum(np.r_[0.0, v])
+        lasting = float(np.abs(volts[tenth:] - volts[:-tenth]).max()) / tenth
+        gains.append((float(np.sqrt(np.mean(omega**2)) / np.abs(v).max()),
+                      float(np.abs(omega).max() / max(lasting, 1e-300)), run.name))
+    if len(gains) < 2:
+        return None
+    (fast, _, one), (_, slow, other) = max(gains), min(gains, key=lambda g: g[1])
+    return (f"the same voltage gives at least {fast / slow:.0f} times the speed in {one} as in {other}: do their units "
+            "differ (volts and a duty cycle, turns and radians)? Read each in its own, or leave one out."
+            ) if fast > OTHER_SCALE * slow else None
+
+
+def _speed(run: Experiment) -> Array | None:
+    """Return the speed (N,), the slope of the angle where it was not measured; None where neither was."""
+    known = {c: bridged(run.t, y) for c, y in run.outputs.items() if np.isfinite(y).any()}
+    if "omega" in known or "theta" not in known:
+        return known.get("omega")
+    return slope(run.t, known["theta"], max(run.n // WINDOWS, 1))
+
+
 def _one_column_for_two(run: Experiment) -> str | None:
     """Two channels of the very same numbers are one column, taken twice."""
     seen: dict[bytes, str] = {}
@@ -105,7 +141,13 @@ def _one_column_for_two(run: Experiment) -> str | None:
 
 
 def _excitation(run: Experiment) -> str | None:
-    v = run.inputs["v"]
+    v, omega = run.inputs["v"], _speed(run)
+    if not v.any() and omega is not None and "tau_load" not in run.inputs:
+        omega = omega * np.sign(omega[np.argmax(np.abs(omega))])
+        start, late, top = np.median(omega[:run.n // 20 + 1]), np.median(omega[run.n // 2:]), omega.max()
+        if max(start, -omega.min()) < 0.5 * top < late:  # set off, and neither swings nor runs down
+            return ("the voltage is 0 from beginning to end, yet the motor accelerates by itself: is it the wrong "
+                    "column, or was it not logged? Say which one holds it, columns={'v': ...}, or leave the run out.")
     return (f"the voltage is {quantity(v[0], run.units['v'])} from beginning to end: such a run shows one "
             "steady speed and at most a start. Add runs with steps or a sweep of the voltage."
             ) if np.ptp(v) <= 1e-6 * np.abs(v).max() else None
@@ -118,6 +160,26 @@ def _still(run: Experiment) -> str | None:
              and (np.ptp(v) > 0 or c == "theta" or not np.nanmax(y))]
     return (f"the {NAMES[still[0]]} never changes although there is a voltage; a dead sensor, a locked rotor, or too "
             "little voltage to move?") if still else None
+
+
+def _disabled(run: Experiment) -> str | None:
+    """At standstill a winding draws most per volt; where it draws next to nothing, it is not driven."""
+    v, i, omega = run.inputs["v"], run.outputs.get("i"), _speed(run)
+    if i is None or omega is None or run.units["v"] != "V" or not v.any() or run.n < 300:
+        return None
+    edges, i = np.linspace(0, run.n, 101).astype(int), bridged(run.t, i)
+    volts, drawn, along, ahead = (np.add.reduceat(y, edges[:-1]) / np.diff(edges)
+                                  for y in (np.abs(v), np.abs(i), i * np.sign(v), omega * np.sign(v)))
+    top, on = np.maximum.reduceat(np.abs(v), edges[:-1]), volts > 0.1 * volts.max()
+    usual, slow = np.quantile(along[on] / volts[on], 0.9) * volts, STILL * np.abs(ahead).max()
+    off = on & (drawn < 0.2 * usual) & (np.abs(ahead) < slow)
+    least = top[on & (along > 0.5 * usual) & (ahead > -slow)].min(initial=np.inf)  # braking needs no drive
+    ends = np.flatnonzero(np.diff(off.astype(int), prepend=0, append=0))
+    parts = [f"{run.t[edges[a]]:.3g} to {run.t[edges[b] - 1]:.3g} s" for a, b in zip(ends[::2], ends[1::2], strict=True)
+             if b - a >= 3 and top[a:b].max() >= least]  # shorter ones may be chance
+    return (f"neither current nor motion follows the voltage from {' and from '.join(parts)}, while elsewhere the same "
+            "voltage drives both: was the drive disabled? Leave these samples out, in the file or with run.select()."
+            ) if parts else None
 
 
 def _missing(run: Experiment) -> str | None:
@@ -209,11 +271,25 @@ def _spikes(run: Experiment) -> str | None:
 
 def _noisy(run: Experiment) -> str | None:
     for channel, y in run.outputs.items():
-        size, noise = float(np.nanstd(y)), noise_level(y, run.t)
+        size, noise = float(np.nanstd(y)), min(noise_level(y, run.t), _beside_voltage(run, y))
         if noise > 0.5 * size > 0:
             return (f"the {NAMES[channel]} is mostly noise (RMS {min(noise, size):.2g} of {size:.2g} "
                     f"{run.units[channel]}) and tells a fit little. Drive the motor harder or filter before sampling.")
     return None
+
+
+def _beside_voltage(run: Experiment, y: Array) -> float:
+    """Return the standard deviation of what the voltage, now or two measurements before, does not explain of `y` (N,).
+
+    What follows a voltage that jumps with every measurement looks like noise, and is none.
+    """
+    at = np.flatnonzero(np.isfinite(y))
+    at = at[np.diff(y[at], prepend=np.nan) != 0]
+    if len(at) < FEWEST_FRESH:
+        return np.inf
+    v = run.inputs["v"][at]
+    causes = np.column_stack([v[2:], v[1:-1], v[:-2], np.ones(len(at) - 2)])
+    return float(np.std(y[at[2:]] - causes @ np.linalg.lstsq(causes, y[at[2:]], rcond=None)[0]))
 
 
 def _uneven(run: Experiment) -> str | None:
@@ -290,7 +366,9 @@ def signs(run: Experiment) -> str | None:
                 f"voltage is probably swapped. Turn it round, e.g. units={{'v': '-1 {_told(run, 'v')}'}}.")
     channel = "i" if against == ["current"] else "omega" if "omega" in run.outputs else "theta"
     else_ = " (or of the voltage)" if measured == against else ""
-    return (f"a positive voltage goes with a negative {against[0]}: the sign of the {against[0]}{else_} "
+    what = channel_name("theta", run.units["theta"]) if channel == "theta" else against[0]
+    goes = f"moves the {what} backwards" if channel == "theta" else f"goes with a negative {what}"
+    return (f"a positive voltage {goes}: the sign of the {what}{else_} "
             f"is probably swapped. Turn it round, e.g. units={{'{channel}': '-1 {_told(run, channel)}'}}.")
 
 
@@ -326,9 +404,20 @@ def unsigned_voltage(run: Experiment) -> str | None:
     most = np.abs(travel).max(initial=0.0)
     travel = travel[(np.abs(before) < 0.02 * most) & (np.abs(travel) > 0.1 * most)]
     if not travel.size or travel.min() > 0 or travel.max() < 0:
-        return None
+        return _reverses_alone(run)
     return ("the voltage is never negative, yet switched on at rest it turns the motor backwards "
             f"{np.sum(travel < 0)} of {travel.size} times: logged without its sign? Give it that of the direction.")
+
+
+def _reverses_alone(run: Experiment) -> str | None:
+    """As fast backwards, under as much voltage: no load does that, and what swings does not run along (`RUNNING`)."""
+    v, omega = run.inputs["v"], np.asarray(_speed(run))
+    back, ahead = np.maximum(-omega, 0), np.maximum(omega, 0)
+    if (min(back.max(), ahead.max()) < 0.5 * np.abs(omega).max() or _cosine(v, np.abs(omega)) < RUNNING
+            or v @ back / back.sum() < 0.9 * (v @ ahead / ahead.sum())):
+        return None
+    return ("the speed reverses although the voltage never does, and is as fast both ways under as much of it: is the "
+            "voltage without its sign (a duty cycle beside a direction)? Give it that of the direction.")
 
 
 def angle_against_speed(run: Experiment) -> str | None:
@@ -373,13 +462,21 @@ def magnitudes(run: Experiment) -> str | None:
             if channel == "v" and stated.get(channel, "")[:1].isdigit():
                 return (f"v reaches {top:.4g} V{was}: that unit is the voltage of a whole duty cycle. Is the column in "
                         "per cent, or in counts of a timer? Then give the voltage of one: units={'v': '0.12 V'}.")
-            return (f"{channel} reaches {top:.4g} {unit}{was}; is it in {likely}? "
-                    f"If so: units={{'{channel}': '{likely}'}}.")
+            return f"{channel} reaches {top:.4g} {unit}{was}; {_remedy(run, channel, likely)}"
     if run.dt > 0.2:
         likely = "ms" if run.dt < 200 else "us"
         return (f"there are {run.dt:.3g} s between samples, too long for a motor; is the time in {likely}? "
                 f"If so: units={{'t': '{likely}'}}.")
     return f"there are only {run.dt:.3g} s between samples; is the unit of the time right?" if run.dt < 1e-6 else None
+
+
+def _remedy(run: Experiment, channel: str, likely: str) -> str:
+    """Ask for the likely unit of a channel that is too large; for its scale if it was read in that unit already."""
+    stated, unit = parse_unit(_told(run, channel)), parse_unit(likely)
+    if stated and unit and np.isclose(abs(stated.factor), unit.factor):
+        return (f"it is read in {likely} already: is its scale right (of a speed: the counts per turn, the time over "
+                f"which they were counted)? A factor can be given: units={{'{channel}': '0.01 {likely}'}}.")
+    return f"is it in {likely}? If so: units={{'{channel}': '{likely}'}}."
 
 
 def implied_constants(run: Experiment) -> str | None:
@@ -397,11 +494,9 @@ def implied_constants(run: Experiment) -> str | None:
     found = dict(zip(names, np.linalg.lstsq(rows, run.inputs["v"][good], rcond=None)[0], strict=True))
     K, R = found.get("omega", 1.0), found.get("i", 1.0)
     if 0 < K < 1e-3:
-        return (f"voltage over speed is about {K:.2g} V·s/rad, far less than motors have; is the speed "
-                "in rpm or deg/s? If so: units={'omega': 'rpm'}.")
+        return f"voltage over speed is {K:.2g} V·s/rad, far less than usual: the speed, {_remedy(run, 'omega', 'rpm')}"
     if 0 < R < 0.01:
-        return (f"voltage over current is about {R:.2g} Ω, far less than motors have; is the current in "
-                "mA? If so: units={'i': 'mA'}.")
+        return f"voltage over current is {R:.2g} Ω, far less than usual: the current, {_remedy(run, 'i', 'mA')}"
     if R > 3000:
         return (f"voltage over current is about {R:.2g} Ω, far more than motors have; is the current in "
                 "A and not in mA, or the voltage in mV?")
@@ -531,11 +626,17 @@ def _cosine(a: Array, b: Array | None) -> float:
 
 
 def _speed_cosine(run: Experiment) -> float:
-    """Return the cosine of the integral of the voltage and the travel, where no speed was measured."""
+    """Return the cosine of the integral of the voltage and the travel, where no speed was measured.
+
+    Against a spring or a weight the angle itself follows the voltage. By chance, or under a controller, it may lie
+    against it, yet bends along its steps: then it does not count.
+    """
     theta = run.outputs.get("theta")
     if theta is None or len(edges := _block_edges(theta)) < 6:
         return 0.0
-    return _cosine(np.diff(integral(run.t, run.inputs["v"])[edges]), np.diff(theta[edges]))
+    v, angle = run.inputs["v"], bridged(run.t, theta)
+    place = max(_cosine(v - v.mean(), angle - angle.mean()), _follows(angle, v, 0.3 * np.ptp(v)))
+    return min(_cosine(np.diff(integral(run.t, v)[edges]), np.diff(theta[edges])), place)
 
 
 def _block_edges(theta: Array) -> NDArray[np.intp]:
@@ -544,14 +645,15 @@ def _block_edges(theta: Array) -> NDArray[np.intp]:
     return known[np.unique(np.linspace(0, len(known) - 1, min(_BLOCKS, len(known) // 5) + 1).astype(int))]
 
 
-def _follows(y: Array, cause: Array) -> float:
-    """Return the cosine of the jumps of a cause and the bends of y there.
+def _follows(y: Array, cause: Array, least: float = 0.0) -> float:
+    """Return the cosine of the jumps of a cause and the bends of y there; if only `least` jumps, of those that last.
 
     Near 1 where a speed follows a voltage, near -1 where a controller's voltage follows a speed that is sampled slowly.
     """
-    at = np.flatnonzero(np.abs(np.diff(cause)) > 0) + 1
+    at = np.flatnonzero(np.abs(np.diff(cause)) > least) + 1
     stays = np.diff(np.r_[0, at, len(cause)])
     near = np.maximum(np.minimum(stays[:-1], stays[1:]) // 4, 1)
+    at, near = (x[near > 2 * (least > 0)] for x in (at, near))
     before = (y[at - 1] - y[np.maximum(at - 1 - near, 0)]) / near
     after = (y[np.minimum(at + near, len(y) - 1)] - y[at - 1]) / (near + 1)
     return _cosine(cause[at] - cause[at - 1], after - before)
@@ -563,6 +665,7 @@ def _holds(values: Array) -> float:
     return float(np.mean(np.diff(values)[live] == 0)) if live.sum() > 20 else 0.0
 
 
-_CHECKS: tuple[Check, ...] = (signs, unsigned, unsigned_voltage, angle_against_speed, magnitudes, implied_constants,
-                              _one_column_for_two, swapped_columns, _offset, _excitation, _still, _missing, _clipped,
-                              current_limit, _coarse, _spikes, _noisy, _uneven, _slow_sampling, _never_settles)
+_CHECKS: tuple[Check, ...] = (signs, unsigned, unsigned_voltage, _disabled, angle_against_speed, magnitudes,
+                              implied_constants, _one_column_for_two, swapped_columns, _offset, _excitation, _still,
+                              _missing, _clipped, current_limit, _coarse, _spikes, _noisy, _uneven, _slow_sampling,
+                              _never_settles)

@@ -7,11 +7,13 @@ from dataclasses import dataclass, replace
 
 from motorid.channels import DIMENSIONS, MEASURED_INPUTS, NAMES, SI
 from motorid.errors import DataError, UsageError, one_of
+from motorid.numerics.signals import Array
 from motorid.records import headers
 from motorid.records.headers import Unit
 
 _PERCENT = re.compile(r"%|pct|per_?cent|prozent")
 _DRIVES = re.compile("input|output|control|command|drive")  # words of a column that may well be the drive voltage
+_WHOLE = 1, 100, 255, 1023, 4095, 65535  # of a duty cycle: its share, per cent, counts of a timer of 8 to 16 bits
 _MEANING = {c: f"the {name}" for c, name in NAMES.items()} | {"v": "the drive voltage"}
 Units = Mapping[str, Unit | None]
 
@@ -36,11 +38,13 @@ class Layout:
 
 
 def assign(labels: Sequence[str], *, columns: Mapping[str, object] | None = None,
-           units: Mapping[str, object] | None = None, unit_row: Mapping[str, str] | None = None) -> Layout:
+           units: Mapping[str, object] | None = None, unit_row: Mapping[str, str] | None = None,
+           values: Mapping[str, Array] | None = None) -> Layout:
     """Decide which column of `labels` holds which channel; without a header they are the positions "1", "2", ...
 
     `columns` gives the name or position of a channel (t, v, i, omega, theta, v_supply, tau_load, temp), None for one to
-    be left out, `units` the unit of a channel or column, `unit_row` what the row below the header says.
+    be left out, `units` the unit of a channel or column, `unit_row` what the row below the header says, `values` what
+    the columns hold, which tells how far a duty cycle reaches.
     """
     if not labels:
         raise DataError("it has no columns.")
@@ -55,7 +59,7 @@ def assign(labels: Sequence[str], *, columns: Mapping[str, object] | None = None
     _settle_counts(places, notes)
     notes += [f"'{c}' looks like the reference of a controller: what drives the model is the voltage; it is not used."
               for c in labels if headers.is_reference(c) and c not in {p.column for p in places.values()}]
-    _require(places, labels)
+    _require(places, labels, values or {})
     return Layout({c: places[c] for c in DIMENSIONS if c in places}, [*notes, *_assumed(places)])
 
 
@@ -167,16 +171,18 @@ def _settle_counts(places: dict[str, Place], notes: list[str]) -> None:
                      f"known; to use it, say units={{'{channel}': 'counts:2048'}}.")
 
 
-def _require(places: Mapping[str, Place], labels: Sequence[str]) -> None:
+def _require(places: Mapping[str, Place], labels: Sequence[str], values: Mapping[str, Array]) -> None:
     missing = {c: f"{_MEANING[c]} ({c})" for c in ("t", "v") if c not in places}
     if not {"i", "omega", "theta"} & set(places):
         missing["omega"] = "a measured current (i), speed (omega) or angle (theta)"
     if not missing:
         return
     duty = [c for c in labels if headers.is_duty(c)] if "v" in missing else []
-    one = "0.12 V" if duty and _PERCENT.search(duty[0].lower()) else "12 V"
+    top = max((abs(y) for c in duty[:1] for y in values.get(c, ()) if math.isfinite(y)), default=0.0)
+    whole = 100 if duty and _PERCENT.search(duty[0].lower()) else next((n for n in _WHOLE if top <= n), top)
     more = (f" '{duty[0]}' is a duty cycle; with a constant supply of, say, 12 V ('12 V' for 0 to 1, '0.12 V' for per "
-            f"cent, '0.047 V' for 0 to 255): columns={{'v': '{duty[0]}'}}, units={{'v': '{one}'}}.") if duty else ""
+            f"cent, '0.047 V' for 0 to 255; it reaches {top:.4g} here): columns={{'v': '{duty[0]}'}}, "
+            f"units={{'v': '{12 / whole:.2g} V'}}.") if duty else ""
     if "v" in missing and (i := places.get("i", places.get("tau_load"))):
         more += (f" If '{i.column}' is what commands a drive with a current loop of its own: "
                  f"columns={{'v': '{i.column}'}}, with mi.torque_driven() (--drive torque).")

@@ -140,6 +140,29 @@ def test_a_speed_of_no_stated_unit_is_suspected_sooner(tmp_path):
     assert "is it in rpm" not in said(read_csv(tmp_path / "a.csv", units={"omega": "rpm"}))
 
 
+def test_a_speed_that_is_too_large_in_rpm_is_not_asked_to_be_in_rpm(tmp_path):
+    """Counts every 4 ms that were scaled as if they were every second."""
+    rows = "".join(f"{4 * k},{(k // 50) % 4},{9000 * ((k // 50) % 4)}\n" for k in range(400))
+    (tmp_path / "a.csv").write_text("time_ms,voltage_V,speed_rpm\n" + rows)
+    text = said(read_csv(tmp_path / "a.csv"))
+    assert "omega reaches 2827 rad/s" not in text  # 27,000 rpm is possible
+    assert "V·s/rad, far less than motors have" not in text
+    (tmp_path / "b.csv").write_text("time_ms,voltage_V,speed_RPM\n" + rows.replace("000\n", "0000\n"))
+    text = said(read_csv(tmp_path / "b.csv"))
+    assert "read as RPM" in text
+    assert "is read in rpm already: is its scale right" in text
+    assert "is it in rpm" not in text
+
+
+@pytest.mark.parametrize(("whole", "one"), [(1, "12 V"), (100, "0.12 V"), (255, "0.047 V"), (200, "0.047 V"),
+                                            (1023, "0.012 V")])
+def test_the_hint_for_a_duty_cycle_knows_how_far_it_reaches(tmp_path, whole, one):
+    rows = "".join(f"{0.01 * k:.2f},{whole * (k // 50 % 3 - 1)},{k % 7}\n" for k in range(200))
+    (tmp_path / "a.csv").write_text("t,pwm,omega\n" + rows)
+    with pytest.raises(DataError, match=f"reaches {whole} here.*units={{'v': '{one}'}}"):
+        read_csv(tmp_path / "a.csv")
+
+
 def test_a_tiny_or_a_huge_constant_points_to_the_unit(steps):
     tiny = changed(steps, v=0.01)
     assert "V·s/rad, far less" in said(tiny.without("i"))
@@ -184,6 +207,96 @@ def test_an_angle_that_is_another_axis_s_is_said(steps):
     assert "does not follow from the speed" not in said(own)
     assert "the angle does not follow from the speed" in said(other)
     assert "--ignore theta" in said(other)
+
+
+def carriage(v: np.ndarray, spring: float = 100.0, weight: float = 0.0, dt: float = 5e-3) -> tuple[np.ndarray, ...]:
+    """Return current and place of a motor of R = 1, K = 1, J = 0.1 that pulls a spring and a weight."""
+    x, speed, shown = 0.0, 0.0, []
+    for u in v:
+        shown.append((u - speed, x))
+        for _ in range(10):
+            speed += 0.1 * dt * (u - speed - 1.0 * speed - spring * x - weight) / 0.1
+            x += 0.1 * dt * speed
+    i, x = np.array(shown).T
+    return i, x
+
+
+PULSES = np.repeat([0, 3, -3, 3, -3, 3, 0, 3, -3, 0], 400).astype(float)
+
+
+@pytest.mark.parametrize("v", [PULSES, np.abs(PULSES) * (np.arange(4000) // 200 % 2)], ids=["both ways", "one way"])
+def test_the_swapped_sign_of_an_angle_against_a_spring_is_told(v):
+    """The angle comes back with the voltage, so the travel says nothing."""
+    i, x = carriage(v)
+    run = Experiment(5e-3 * np.arange(len(v)), {"v": v}, {"i": i, "theta": x}, units={"theta": "m"})
+    assert "swapped" not in said(run)
+    text = said(changed(run, theta=-1))
+    assert "moves the position backwards: the sign of the position is probably swapped" in text
+    assert "'theta': '-1 m'" in text
+
+
+@pytest.mark.parametrize("late", [0, 20])
+def test_a_voltage_that_jumps_at_random_and_is_logged_late_turns_no_angle_round(late, rng):
+    """A jump says something of the one before, but not of the one to come, which moves the angle."""
+    v = np.repeat(rng.uniform(-3, 3, 400), 20)
+    _, x = carriage(v, spring=3000.0)
+    logged = np.roll(v, late)
+    run = Experiment(5e-3 * np.arange(len(v)), {"v": logged}, {"theta": x + 1e-5 * rng.normal(size=len(v))})
+    assert "swapped" not in said(run)
+    if not late:
+        assert "sign of the angle" in said(changed(run, theta=-1))
+
+
+def test_a_servo_that_answers_noise_turns_no_angle_round(rng):
+    """Its voltage falls where the angle seems to rise."""
+    x, speed, shown = 0.0, 0.0, []
+    for k in range(4000):
+        seen = np.round((x + 1e-3 * rng.normal()) / 1e-3) * 1e-3
+        u = float(np.clip(400 * (0.01 * np.sign(np.sin(k / 300)) - seen), -5, 5))
+        shown.append((u, seen))
+        for _ in range(10):
+            speed += 5e-5 * (u - 2 * speed) / 0.01
+            x += 5e-5 * speed
+    v, theta = np.array(shown).T
+    assert "swapped" not in said(Experiment(5e-4 * np.arange(4000), {"v": v}, {"theta": theta}))
+
+
+def duty(plant, lab, signed: np.ndarray, effects: dict | None = None) -> tuple[np.ndarray, np.ndarray]:
+    t = 5e-3 * np.arange(len(signed))
+    return t, plant.simulate(lab, effects or {}, t, signed, substep=1e-3)["omega"]
+
+
+@pytest.mark.parametrize("channel", ["omega", "theta"])
+def test_a_speed_that_reverses_alone_is_told(plant, lab, channel):
+    """A duty cycle beside its direction that never rests."""
+    signed = np.repeat([-6.0, 5, 3, -4, 6, 2, -3, -6], 100)
+    t, omega = duty(plant, lab, signed)
+    y = {"omega": omega, "theta": np.cumsum(omega) * 5e-3}[channel]
+    assert "reverses" not in said(Experiment(t, {"v": signed}, {channel: y}))
+    text = said(Experiment(t, {"v": np.abs(signed)}, {channel: y}))
+    assert "the speed reverses although the voltage never does" in text
+    assert "without its sign" in text
+
+
+@pytest.mark.parametrize("case", ["hoist", "spring", "spring at a constant voltage", "coasting", "one quadrant"])
+def test_a_motor_that_is_turned_back_is_not_taken_for_a_voltage_without_its_sign(plant, lab, case, rng):
+    v = np.repeat([3.0, 1.0, 2.5, 0.5, 3.0, 0.0, 2.0, 3.0], 300)
+    t = 5e-3 * np.arange(len(v))
+    if case == "hoist":  # raised under 3 V, lowered as fast under 1
+        outputs = {"omega": np.gradient(carriage(v, spring=0.0, weight=2.0)[1], t)}
+    elif case == "spring":
+        outputs = {"omega": np.gradient(carriage(v, spring=1000.0)[1], t)}
+    elif case == "spring at a constant voltage":
+        v[:] = 3.0
+        outputs = {"omega": 5 * np.sin(9 * t)}
+    elif case == "coasting":  # thrown backwards, then driven
+        v[:300] = 0.0
+        outputs = {"omega": np.where(t < 1.5, -40 * np.exp(-t / 0.5), 15 * v)}
+    else:
+        outputs = {"omega": duty(plant, lab, v)[1] + 0.1 * rng.normal(size=len(v))}
+    text = said(Experiment(t, {"v": v}, outputs))
+    assert "without its sign" not in text
+    assert "reverses although" not in text
 
 
 # -- quality ------------------------------------------------------------------------------------------------
@@ -267,6 +380,43 @@ def test_sampling_too_slow_for_the_inductance_is_told(steps):
     assert "too slow for the inductance" in said(*read_runs(data_path("two_step_small")))  # L/R is 0.1 ms
 
 
+@pytest.mark.parametrize("late", [0, 1])
+def test_a_current_that_follows_a_random_voltage_is_no_noise(late, rng):
+    """Sampled more often than it is measured, once for every jump of the voltage: its differences look like noise."""
+    levels = rng.uniform(-3, 3, 200)
+    i = np.roll(levels, late) / 4 + 0.05 * rng.normal(size=200)
+    t = 5e-3 * np.arange(4000)
+    fresh = np.arange(4000) % 20 == 0
+    stairs = Experiment(t, {"v": np.repeat(levels, 20)}, {"i": np.repeat(i, 20)})
+    assert "mostly noise" not in said(stairs)
+    assert "mostly noise" not in said(stairs.with_(outputs={"i": np.where(fresh, stairs.outputs["i"], np.nan)}))
+    assert "mostly noise" in said(stairs.with_(outputs={"i": np.repeat(rng.normal(size=200), 20)}))
+
+
+def test_a_drive_that_was_off_is_told_with_its_times(rng):
+    v = np.repeat([3, -3, 3, -3, 3, 0, 3, -3, 3, -3], 400).astype(float)
+    t = 5e-3 * np.arange(len(v))
+    on = (t > 2.6) & (t < 18.5)
+    i, x = carriage(np.where(on, v, 0))
+    run = Experiment(t, {"v": v}, {"i": i + 0.02 * rng.normal(size=len(v)), "theta": x}, units={"theta": "m"})
+    text = said(run)
+    assert "neither current nor motion follows the voltage from 0 to 2.4 s and from 18.8 to 20 s" in text
+    assert "was the drive disabled?" in text
+    assert "run.select()" in text
+    assert "disabled" not in said(run.select(on))
+    assert "disabled" not in said(run.without("i")), "it may as well stick"
+
+
+@pytest.mark.parametrize("case", ["dead band", "sticks", "no voltage"])
+def test_a_motor_that_rests_is_not_taken_for_a_drive_that_is_off(case):
+    v = np.repeat([0.8, 3, 0.5, -3, 0.9, 3, -0.7, 3, -3, 0.8], 400)
+    v = np.where(np.abs(v) < 1, 0.0, v) if case == "no voltage" else v
+    driven = np.where(np.abs(v) < 1, 0.0, v)
+    i, x = carriage(driven, spring=0.0)
+    i = np.where(np.abs(v) < 1, v, i) if case == "sticks" else i
+    assert "disabled" not in said(Experiment(5e-3 * np.arange(len(v)), {"v": v}, {"i": i, "theta": x}))
+
+
 # -- what the records cannot show ---------------------------------------------------------------------------
 
 
@@ -280,6 +430,49 @@ def test_no_excitation_is_told(steps):
     assert "from beginning to end" in said(steady, frozen)
     assert "angle never changes" in said(steady, frozen)
     assert "never changes" not in said(steady.with_(outputs={"omega": np.full(steps.n, 7.0)}))  # a steady speed
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_a_motor_that_accelerates_without_a_voltage_is_told(sign, rng):
+    t = 1e-2 * np.arange(200)
+    omega = sign * 10 * (1 - np.exp(-t / 0.3)) + 0.2 * rng.normal(size=200)
+    run = Experiment(t, {"v": np.zeros(200)}, {"omega": omega, "theta": np.cumsum(omega) * 1e-2})
+    for seen in (run, run.without("omega")):
+        text = said(seen)
+        assert "from beginning to end, yet the motor accelerates by itself: is it the wrong column" in text
+        assert "at most a start" not in text
+    dragged = run.with_(inputs={"v": np.zeros(200), "tau_load": np.ones(200)})
+    swings, coasts, rests = np.sin(6 * t) * np.exp(-t), 10 * np.exp(-t), 0.1 * rng.normal(size=200)
+    for other in (dragged, run.with_(inputs={"v": np.full(200, 6.0)}),
+                  *(run.with_(outputs={"omega": y}) for y in (swings, coasts, rests))):
+        assert "by itself" not in said(other)
+        assert "at most a start" in said(other)
+
+
+@pytest.mark.parametrize("channel", ["omega", "theta"])
+def test_scales_that_contradict_each_other_are_told(plant, lab, channel):
+    v = np.repeat([0.0, 2, 4, 6, 3, 1], 150)
+    t, omega = duty(plant, lab, v)
+    outputs = {"omega": {"omega": omega}, "theta": {"theta": np.cumsum(omega) * 5e-3}}[channel]
+    run = Experiment(t, {"v": v}, outputs, name="in volts")
+    share = run.with_(inputs={"v": v / 12}, name="as a share")
+    rpm = run.with_(outputs={c: 30 / np.pi * y for c, y in outputs.items()}, name="in rpm")
+    for other in (share, rpm):
+        text = said(run, other)
+        assert f"times the speed in {other.name} as in in volts: do their units differ" in text
+        assert "times the speed" in "".join(check_runs([run], [other])), "held out"
+        assert "times the speed" not in said(other)
+
+
+@pytest.mark.parametrize("case", ["half", "fast", "stuck", "friction", "rest"])
+def test_runs_that_differ_have_no_other_scale(plant, lab, case):
+    v = np.repeat([0.0, 2, 4, 6, -6, 1], 150)
+    t, omega = duty(plant, lab, v, {"coulomb": {"tau_c": 8e-3}})
+    run = Experiment(t, {"v": v}, {"omega": omega})
+    other = {"half": v / 2, "fast": 6 * np.sign(np.sin(100 * t)), "stuck": v, "rest": 0 * v,
+             "friction": np.full(len(t), 0.3 + 8e-3 * lab.R / lab.K)}[case]
+    turned = np.where(v > 5, 1e-3, 0.0) if case == "stuck" else duty(plant, lab, other, {"coulomb": {"tau_c": 8e-3}})[1]
+    assert "times the speed" not in said(run, Experiment(t, {"v": other}, {"omega": turned}, name="other"))
 
 
 def test_a_run_that_never_settles_is_told():
