@@ -94,7 +94,8 @@ def diagnose_command(runs: opt.Runs, options: opt.FitOptions, validate: opt.Vali
         assert found.remainder is not None
         name = remainder_to.stem
         with parallel.budget(budget):
-            write_files({remainder_to: found.remainder.code(name if name.isidentifier() else "remainder")}, options.force)
+            law = found.remainder.code(name if name.isidentifier() else "remainder")
+        write_files({remainder_to: law}, options.force)
         effects = ",".join((*found.remainder.model.effect_names, name))
         show(f"Written: {remainder_to}. Fit with it: --effects-from {remainder_to} --effects {effects}")
     if found.stopped == STOPPED_BY_HAND:
