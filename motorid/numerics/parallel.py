@@ -189,7 +189,12 @@ class Parcel:
         return pickle.loads(self.data)
 
 
-Task = tuple[Parcel, Parcel, Callable[[Any, Any], Any]]  # what all share, items, the function applied to both
+class Task(NamedTuple):
+    """What a pool is handed: a function, and what it is applied to."""
+
+    shared: Parcel
+    items: Parcel
+    function: Callable[[Any, Any], Any]
 
 
 class Done(NamedTuple):
@@ -210,7 +215,7 @@ def map_items(function: Callable[[Any, Any], Any], shared: Any, items: Sequence[
     """
     parcel = Parcel.of(shared)
     size = 1 if map is None or map is builtins.map else max(-(-len(items) // MOST_TASKS), 1)
-    tasks: list[Task] = [(parcel, Parcel.of(items[k:k + size]), function) for k in range(0, len(items), size)]
+    tasks = [Task(parcel, Parcel.of(items[k:k + size]), function) for k in range(0, len(items), size)]
     results: list[Any] = []
     done = 0
     with progress(text, total=len(tasks), quiet=quiet) as advance:
@@ -240,8 +245,7 @@ def map_items(function: Callable[[Any, Any], Any], shared: Any, items: Sequence[
 
 def _apply(task: Task) -> list[Any]:
     with one_thread:  # for its linear algebra, in whatever process it runs
-        shared, items, function = task
-        return [function(shared.open(), item) for item in items.open()]
+        return [task.function(task.shared.open(), item) for item in task.items.open()]
 
 
 def _in_waves(way: Map, tasks: Sequence[Task]) -> Iterator[list[Any]]:
@@ -254,8 +258,8 @@ def _in_waves(way: Map, tasks: Sequence[Task]) -> Iterator[list[Any]]:
 
 
 def _waves(tasks: Sequence[Task]) -> Iterator[list[Task]]:
-    room = max(WAVE - sum(len(shared.data) for shared, *_ in tasks[:1]), 1)  # beside what all of a wave share
-    sizes = accumulate(len(items.data) for _, items, _ in tasks)
+    room = max(WAVE - sum(len(task.shared.data) for task in tasks[:1]), 1)  # beside what all of a wave share
+    sizes = accumulate(len(task.items.data) for task in tasks)
     for _, wave in groupby(zip(sizes, tasks, strict=True), lambda pair: pair[0] // room):
         yield [task for _, task in wave]
 

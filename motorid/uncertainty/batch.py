@@ -315,7 +315,11 @@ class Checkpoint:
 def checkpoint_key(model: Model, options: Mapping[str, Any], reading: Mapping[str, Any] | None, records: Any) -> str:
     """Return a hash of all that a result depends on: versions, equations, values, options, contents of the records."""
     mark = hashlib.sha256(repr([package_version(p) for p in ("motorid", "casadi", "numpy", "scipy")]).encode())
-    mark.update(_equations(model))
+    try:  # the equations as traced, whatever names, globals or files a law took them from
+        system = model.system(SHOWN[model.base])
+        mark.update("".join(f.serialize() for f in (system.rhs, system.out, system.initial)).encode())
+    except Exception as error:  # of the user's law; then no motor can be fitted
+        mark.update(repr(error).encode())
     mark.update(repr((model.base, model.axis, model.effect_names, sorted(model.parameters.items()))).encode())
     told = sorted(options.items()), sorted((reading or {}).items())
     text = repr(told)
@@ -323,15 +327,6 @@ def checkpoint_key(model: Model, options: Mapping[str, Any], reading: Mapping[st
     for part in _contents(records):
         mark.update(part)
     return mark.hexdigest()
-
-
-def _equations(model: Model) -> bytes:
-    """Return the equations as traced, whatever names, globals or files a law took them from."""
-    try:
-        system = model.system(SHOWN[model.base])
-        return "".join(f.serialize() for f in (system.rhs, system.out, system.initial)).encode()
-    except Exception as error:  # of the user's law; then no motor can be fitted
-        return repr(error).encode()
 
 
 def _contents(records: Any) -> list[bytes]:
