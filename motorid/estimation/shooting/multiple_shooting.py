@@ -22,8 +22,8 @@ from motorid.estimation.shooting.mesh import Mesh, first_noise, nodes_from_data,
 from motorid.estimation.shooting.nlp import NlpResult, ShootingNlp, ipopt
 from motorid.estimation.shooting.outcome import KEPT, Solved, below_steady, fit_of, violations
 from motorid.numerics.signals import Array
+from motorid.problem.constraints import Relation, Weighed
 from motorid.problem.problem import Problem
-from motorid.problem.relations import Relation, Weighed
 from motorid.problem.simulate import at, judge, misfit_over_noise
 
 ROUNDS = 4  # of refining the sub-steps

@@ -14,9 +14,8 @@ from motorid.estimation.shooting.mesh import Mesh, gaps_of, reduced
 from motorid.estimation.shooting.nlp import NlpResult, ShootingNlp
 from motorid.numerics.least_squares import LevenbergMarquardt, levenberg_marquardt
 from motorid.numerics.signals import Array
-from motorid.problem.constraints import CurrentLimit, SteadyState
+from motorid.problem.constraints import CurrentLimit, Part, SteadyState
 from motorid.problem.problem import Problem
-from motorid.problem.relations import Part
 from motorid.problem.simulate import integration_error
 
 GOOD = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
