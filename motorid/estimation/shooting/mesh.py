@@ -20,8 +20,7 @@ from motorid.errors import SimulationError, among
 from motorid.integrate.engine import Grid, Trajectory
 from motorid.numerics.signals import Array, bridged, slope
 from motorid.problem.constraints import Part
-from motorid.problem.problem import Problem
-from motorid.problem.residuals import prior_residual
+from motorid.problem.problem import Problem, prior_residual
 from motorid.problem.unknowns import Point
 from motorid.records.experiment import Experiment
 
