@@ -120,11 +120,9 @@ class Link(Protocol):
 
     def write(self, data: bytes) -> None:
         """Send; LinkLost if nobody is there."""
-        ...
 
     def close(self) -> None:
         """Let go."""
-        ...
 
 
 class SerialLink:

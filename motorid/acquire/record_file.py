@@ -187,7 +187,12 @@ class Appender:
         self._trouble: OSError | None = None
         self._over = threading.Event()
         if mode == "resume":
-            self._cut_back(path)
+            with open(path, "rb") as file:
+                file.seek(max(0, self._size - 4096))
+                end = file.read()
+            if cut := len(end) - (end.rfind(b"\n") + 1):
+                self._size -= cut
+                os.ftruncate(self._fd, self._size)
         self._thread = threading.Thread(target=self._keep_syncing, name=f"syncing {path}", daemon=True)
         self._thread.start()
 
@@ -234,14 +239,6 @@ class Appender:
         if size != self._synced:
             os.fsync(self._fd)
             self._synced = size
-
-    def _cut_back(self, path: Path) -> None:
-        with open(path, "rb") as file:
-            file.seek(max(0, self._size - 4096))
-            end = file.read()
-        if cut := len(end) - (end.rfind(b"\n") + 1):
-            self._size -= cut
-            os.ftruncate(self._fd, self._size)
 
 
 def _open(path: Path, mode: str) -> int:

@@ -110,14 +110,11 @@ class Session:
             elif rows := self.timeline.accept(item, now):
                 self.file.add(rows, self.commanded)
                 self.last, self._heard = rows[-1], now
-                self._check_limits(rows)
-
-    def _check_limits(self, rows: list[Row]) -> None:
-        for row in rows:
-            over = [n for k, n, most in self._limits if abs(row.values[k]) > most]
-            self._over = self._over + 1 if over else 0
-            if self._over >= OVER_LIMIT:
-                self._end("limit" if "i" in over else "voltage")
+                for row in rows:
+                    over = [n for k, n, most in self._limits if abs(row.values[k]) > most]
+                    self._over = self._over + 1 if over else 0
+                    if self._over >= OVER_LIMIT:
+                        self._end("limit" if "i" in over else "voltage")
 
     def _message(self, fields: list[str]) -> None:
         made = int(fields[2]) if fields[:2] == ["E", "done"] and "".join(fields[2:3]).isdigit() else None

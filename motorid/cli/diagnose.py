@@ -91,8 +91,13 @@ def diagnose_command(runs: opt.Runs, options: opt.FitOptions, validate: opt.Vali
         write_json(found.to_dict() | {"notes": notes}, json, options.force)
     save_report(found, report, held_out, options.force)
     if remainder_to:
+        assert found.remainder is not None
+        name = remainder_to.stem
         with parallel.budget(budget):
-            _write_remainder(found, remainder_to, options.force)
+            law = found.remainder.code(name if name.isidentifier() else "remainder")
+        write_files({remainder_to: law}, options.force)
+        effects = ",".join((*found.remainder.model.effect_names, name))
+        show(f"Written: {remainder_to}. Fit with it: --effects-from {remainder_to} --effects {effects}")
     if found.stopped == STOPPED_BY_HAND:
         raise typer.Exit(INTERRUPTED)
 
@@ -104,14 +109,6 @@ def _keep_fit(before: Fit, done: Sequence[str], json: opt.Json, force: bool) -> 
         show(f"Interrupted after: {', '.join(done) or 'the fit'}. The original model:", parameter_table(before))
     if json:
         write_json(fit_dict(before) | {"interrupted": list(done)}, json, force)
-
-
-def _write_remainder(found: Diagnosis, path: Path, force: bool) -> None:
-    """Write what is left as an effect to edit; it may have been edited, so never over a file that is there."""
-    assert found.remainder is not None
-    write_files({path: found.remainder.code(path.stem if path.stem.isidentifier() else "remainder")}, force)
-    effects = ",".join((*found.remainder.model.effect_names, path.stem))
-    show(f"Written: {path}. Fit with it: --effects-from {path} --effects {effects}")
 
 
 def _show_diagnosis(found: Diagnosis, notes: Sequence[str], report: Path | None, remainder_to: Path | None) -> None:

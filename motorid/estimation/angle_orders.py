@@ -295,16 +295,12 @@ def _order_search(tangent: Tangent) -> _OrderSearch:
     residual = residual - basis @ (basis.T @ residual)
     answers = [replace(answer, c=answer.c * run.weights[None, :, None])
                for answer, run in zip(responses(tangent.fit), tangent.fit.problem.measured, strict=True)]
-    orders = np.arange(1.0, highest_order(tangent) + 1)
-    return _OrderSearch(tangent.fit, white, basis, residual, answers, orders, _slow_enough(_moving(tangent), orders))
-
-
-def _slow_enough(moving: Array, orders: Array) -> Array:
-    """Return the change of the angle per sample up to which each order is looked for; 0 where it would be an alias."""
-    counted = np.sort(moving)
+    # Up to which change of the angle per sample each order is looked for; 0 where it would be an alias.
+    orders, counted = np.arange(1.0, highest_order(tangent) + 1), np.sort(_moving(tangent))
     sure, some = (np.searchsorted(counted, part / orders, side="right") for part in (QUARTER, np.pi))
-    slow = np.where(some > SLOW_PART * moving.size, np.pi / orders, 0.0)
-    return np.where(sure > max(SAMPLES, SURE_PART * moving.size), QUARTER / orders, slow)
+    slow = np.where(some > SLOW_PART * counted.size, np.pi / orders, 0.0)
+    slow = np.where(sure > max(SAMPLES, SURE_PART * counted.size), QUARTER / orders, slow)
+    return _OrderSearch(tangent.fit, white, basis, residual, answers, orders, slow)
 
 
 def _lines(orders: Array, sines: Array, cosines: Array, residual: Array) -> list[Line]:

@@ -19,7 +19,6 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from motorid.errors import among
 from motorid.numerics.autoregression import Colour, colour_of, weighed
@@ -71,8 +70,9 @@ def certainty(problem: Problem, q: Array, residuals: Array, jacobian: Array, fre
     `free` (k, m) are the directions that active constraints leave; ``method="white"`` takes samples as independent.
     """
     among(method, ("coloured", "white"), "method")
+    physical = problem.scaling.physical(q)
     limits = ["at its lower limit" if v <= p.lower else "at its upper limit" if v >= p.upper else ""
-              for p, v in zip(problem.unknown, problem.scaling.physical(q), strict=True)]
+              for p, v in zip(problem.unknown, physical, strict=True)]
     loose = np.array([not s for s in limits], bool)
     basis = np.eye(len(loose))[:, loose] if free is None else free
     runs = list(zip(problem.runs, problem.unstack(residuals), problem.unstack(jacobian, 0.0), strict=True))
@@ -82,14 +82,18 @@ def certainty(problem: Problem, q: Array, residuals: Array, jacobian: Array, fre
     colours = {c: colour_of([r for r, _ in parts], basis.shape[1] / len(blocks)) for c, parts in blocks.items()}
     if method != "coloured":
         colours = {c: Colour(np.zeros(0), k.variance, k.variance) for c, k in colours.items()}
-    unit = np.maximum(problem.scaling.slope(q), np.abs(problem.scaling.physical(q)))
+    unit = np.maximum(problem.scaling.slope(q), np.abs(physical))
     influence = np.linalg.norm(jacobian * unit, axis=0)
     jacobian = np.where(influence > ROUNDING * influence.max(initial=0.0), jacobian, 0.0)
     half, blind = seen_directions(jacobian @ basis)
     through = basis @ half
     matrix = through @ _meat(problem, jacobian, blocks, colours, through) @ through.T
     blind = np.linalg.qr((blind @ basis.T / unit).T)[0]
-    open_ = np.array([_shifts(blind, e) for e in np.eye(len(loose))], bool) | _vague(problem, q, matrix)
+    # Vague: a deviation of half the value, or half the natural size where it may be zero.
+    sizes = natural_sizes(problem.experiments, problem.values(q))
+    least = np.array([0.0 if p.positive else sizes.get(p.unit, np.inf) for p in problem.unknown])
+    vague = np.sqrt(np.maximum(np.diag(matrix), 0.0)) > UNDETERMINED * np.maximum(np.abs(physical), least)
+    open_ = np.array([_shifts(blind, e) for e in np.eye(len(loose))], bool) | vague
     status = tuple(s or ("not determined" if no else "determined") for s, no in zip(limits, open_, strict=True))
     samples = {c: sum(int(np.isfinite(r).sum()) for r, _ in parts) for c, parts in blocks.items()}
     effective = sum(n * colours[c].effective_share for c, n in samples.items())
@@ -99,13 +103,6 @@ def certainty(problem: Problem, q: Array, residuals: Array, jacobian: Array, fre
 def _shifts(blind: Array, slope: Array) -> bool:
     """Tell whether a quantity of gradient `slope` (k,), to relative changes, changes along `blind` (k, m)."""
     return bool(np.linalg.norm(slope @ blind) > BLIND * np.linalg.norm(slope))
-
-
-def _vague(problem: Problem, q: Array, matrix: Array) -> NDArray[np.bool_]:
-    """Tell of each unknown whether its deviation is half its value, or half the natural size where it may be zero."""
-    sizes, physical = natural_sizes(problem.experiments, problem.values(q)), problem.scaling.physical(q)
-    least = np.array([0.0 if p.positive else sizes.get(p.unit, np.inf) for p in problem.unknown])
-    return np.sqrt(np.maximum(np.diag(matrix), 0.0)) > UNDETERMINED * np.maximum(np.abs(physical), least)
 
 
 def _meat(problem: Problem, jacobian: Array, blocks: Blocks, colours: Mapping[str, Colour], along: Array) -> Array:

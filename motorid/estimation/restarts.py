@@ -13,7 +13,6 @@ minimum or not. Put back to where it would matter, it comes to its value, or goe
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -26,17 +25,8 @@ from motorid.numerics.signals import Array
 from motorid.problem.problem import Problem
 from motorid.problem.simulate import poorly_explained
 
-
-class Restart(NamedTuple):
-    """How to begin again: from where the other weights lead?, first damping, start moved by up to e to this power."""
-
-    other_weights: bool
-    damping: float
-    shift: float = 0.0
-
-
-RESTARTS = (Restart(True, 0.1), Restart(False, 10.0), Restart(True, 10.0), Restart(False, 1.0, 1.5),
-            Restart(True, 1.0, 1.5))
+# How to begin again: from where the other weights lead?, first damping, start moved by up to e to this power.
+RESTARTS = (True, 0.1, 0.0), (False, 10.0, 0.0), (True, 10.0, 0.0), (False, 1.0, 1.5), (True, 1.0, 1.5)
 FLAT = 0.03  # of the misfit: what a change by a factor of e does at least, if the data have a say in it
 FAR = 1.0  # on the logarithmic scale: an end nearer to its start is in no doubt
 MATTERS = 10.0  # standard deviations that a change by a factor of e makes
@@ -48,13 +38,13 @@ MOST = 3  # parameters that are put back one by one
 def restarted_where_doubtful(found: Estimate, begin: Problem, effort: LevenbergMarquardt,
                              callback: Callback = None) -> Estimate:
     """Return the best of an estimate and up to `effort.looks` restarts, as long as it is in doubt."""
-    for k, restart in enumerate(RESTARTS[:effort.looks]):
+    for k, (other_weights, damping, shift) in enumerate(RESTARTS[:effort.looks]):
         if not doubtful(found, begin):
             break
-        careful = replace(effort, damping=restart.damping)
+        careful = replace(effort, damping=damping)
         with suppress(*FAILURES):
-            start = _shifted(begin, restart.shift, k) if restart.shift else begin
-            if restart.other_weights:
+            start = _shifted(begin, shift, k) if shift else begin
+            if other_weights:
                 other = start.tuned(weights="noise" if start.weights == "rms" else "rms", noise_factors={})
                 start = start.start_at(least_squares(other, careful.at_most(RACE)).values)
             again = least_squares(start, careful, callback)

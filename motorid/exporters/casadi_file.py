@@ -96,12 +96,8 @@ def functions_of(found: Fit | Model) -> list[ca.Function]:
 def plain_functions(system: System, prefix: str = "") -> list[ca.Function]:
     """Return ``rhs``, ``outputs``, ``initial`` and ``step``, see `functions_of`, with dense results."""
     sparse = {"rhs": system.rhs, "outputs": system.out, "initial": system.initial, "step": StepFunctions(system).light}
-    found = []
-    for name, f in sparse.items():
-        args = f.sx_in()
-        results = [ca.densify(r) for r in f.call(args)]
-        found.append(ca.Function(f"{prefix}{name}", args, results, f.name_in(), f.name_out()))
-    return found
+    return [ca.Function(f"{prefix}{name}", args := f.sx_in(), [ca.densify(r) for r in f.call(args)], f.name_in(),
+                        f.name_out()) for name, f in sparse.items()]
 
 
 def casadi_file(found: Fit | Model, path: Path) -> dict[Path, str]:

@@ -11,7 +11,7 @@ import numpy as np
 from motorid.display.numbers import listed, number, quantity
 from motorid.estimation.result import Fit
 from motorid.estimation.shooting.outcome import violations
-from motorid.problem.relations import Relation
+from motorid.problem.constraints import Relation
 from motorid.problem.simulate import Evaluation
 from motorid.records.files import json_text, write_files
 

@@ -129,7 +129,13 @@ class Stepper:
         if dp is not None and dx0 is not None:
             dx0, dp = np.ascontiguousarray(dx0, float), np.ascontiguousarray(dp, float)
         if (library := self._load(compiled)) is not None:
-            traj, bad = self._run_compiled(library, grid, x0, p, dx0, dp, local_error)
+            n, nq = len(grid.t), 0 if dp is None else dp.shape[1]
+            y, x = np.empty((n, self.ny)), np.empty((n, self.nx))
+            dy, dx = (np.empty((n, self.ny, nq)), np.empty((n, self.nx, nq))) if nq else (None, None)
+            error = np.empty((n - 1, self.nx)) if local_error else None
+            more = map(address, (dx0, dp, y, dy, x, dx, error))
+            bad = library[0](n, *grid.addresses, address(x0), address(p), nq, *more)
+            traj = Trajectory(y, dy, x, dx, error)
         else:
             traj = self.machine.run(grid, x0, p, dx0, dp, local_error)
             finite = np.isfinite(traj.x).all(axis=1)
@@ -178,15 +184,6 @@ class Stepper:
                 self._library = cc.load(path, self.system.sizes)
                 self._refused = self._library is None
         return self._library
-
-    def _run_compiled(self, library: Any, grid: Grid, x0: Array, p: Array, dx0: Array | None,
-                      dp: Array | None, local_error: bool) -> tuple[Trajectory, int]:
-        n, nq = len(grid.t), 0 if dp is None else dp.shape[1]
-        y, x = np.empty((n, self.ny)), np.empty((n, self.nx))
-        dy, dx = (np.empty((n, self.ny, nq)), np.empty((n, self.nx, nq))) if nq else (None, None)
-        error = np.empty((n - 1, self.nx)) if local_error else None
-        bad = library[0](n, *grid.addresses, address(x0), address(p), nq, *map(address, (dx0, dp, y, dy, x, dx, error)))
-        return Trajectory(y, dy, x, dx, error), int(bad)
 
 
 _known: WeakValueDictionary[str, Stepper] = WeakValueDictionary()  # by content, as long as one of `stepper` is

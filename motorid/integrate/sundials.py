@@ -44,7 +44,11 @@ class _Sundials(Engine):
             dp: Array | None = None) -> Trajectory:
         """See `Engine.run`."""
         nx, nq = len(system.states), 0 if dp is None else dp.shape[1]
-        scale = _state_scale(system, grid, x0, p)
+        try:
+            size = np.abs(Rosenbrock().run(system, grid, x0, p).x).max(axis=0)
+        except SimulationError:
+            size = np.abs(x0)
+        scale = np.where((size > 1e-12) & np.isfinite(size), size, 1.0)  # rough, for the solver's tolerances only
         x, dx = np.empty((len(grid.t), nx)), np.empty((len(grid.t), nx, nq))
         x[0] = x0
         if nq:
@@ -164,13 +168,4 @@ def _pieces(grid: Grid) -> Iterator[tuple[int, int]]:
     for a, b in pairwise([*np.flatnonzero(~same).tolist(), len(dt)]):
         for first in range(a, b, LENGTHS[-1]):
             yield first, min(b - first, LENGTHS[-1])
-
-
-def _state_scale(system: System, grid: Grid, x0: Array, p: Array) -> Array:
-    """Rough sizes of the states on this record, for the solver's tolerances only."""
-    try:
-        size = np.abs(Rosenbrock().run(system, grid, x0, p).x).max(axis=0)
-    except SimulationError:
-        size = np.abs(x0)
-    return np.where((size > 1e-12) & np.isfinite(size), size, 1.0)
 

@@ -110,9 +110,7 @@ def P(value: float, unit: str = "", null: float | None = None, *, lower: float =
     ... def fan(m, c_2=mi.P(1e-8, "N·m·s²/rad²", null=0, lower=0, doc="drag")):
     ...     m.torque -= c_2 * m.omega * abs(m.omega)
     """
-    return partial(Parameter, value=value, unit=unit, null=null, lower=lower, upper=upper, positive=positive, vary=vary,
-                   grid=tuple(grid), periodic=periodic, order=order, per_run=per_run, place=place, pole=pole,
-                   given=given, at_least=at_least, doc=doc)
+    return partial(Parameter, **{**locals(), "grid": tuple(grid)})
 
 
 BALANCES = ("voltage", "torque", "transmission", "sensor")

@@ -189,11 +189,6 @@ def plot_ranking(result: Diagnosis | Sequence[Candidate], ax: Axes | None = None
            xlim=(lowest - 3 if lowest < 0 else 0, 103), xlabel="fall of the squared error (%)",
            title=f"Which effect is missing?{more}")
     ax.grid(axis="y", visible=False)
-    _ranking_legend(ax, chosen)
-    return ax
-
-
-def _ranking_legend(ax: Axes, chosen: Sequence[Candidate]) -> None:
     handles: list[Any] = [Patch(fill=False, edgecolor=style.INK, label="predicted")]
     for accepted, colour, label in ((True, "blue", "refitted, accepted"), (False, "grey", "refitted, not accepted")):
         if any(c.accepted == accepted and c.refit_drop is not None for c in chosen):
@@ -202,6 +197,7 @@ def _ranking_legend(ax: Axes, chosen: Sequence[Candidate]) -> None:
         orange = style.PALETTE["orange"]
         handles.append(Line2D([], [], marker="D", ls="", color=orange, label="fall of the held-out error"))
     ax.legend(handles=handles, loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    return ax
 
 
 @style.styled

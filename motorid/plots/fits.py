@@ -262,7 +262,12 @@ def _one_parameter(ax: Axes, fits: Sequence[Any], name: str, truth: float | None
         ax.errorbar(k + 1, value / 10.0**power, yerr=2 * (std or 0.0) / 10.0**power, fmt="o", ms=5,
                     capsize=3 if std else 0, lw=1.4, color=colour, mfc="none" if std is None else colour)
     ax.set(xlim=(0.4, len(fits) + 0.6), xticks=range(1, len(fits) + 1))
-    _around(ax, values / 10.0**power)
+    values = values / 10.0**power
+    low, high = ax.get_ylim()
+    least = 0.1 * float(np.max(np.abs(values))) or 1.0
+    if high - low < least:  # a change of a thousandth must not look like a leap
+        middle = float(values.min() + values.max()) / 2
+        ax.set_ylim(middle - least / 2, middle + least / 2)
     for k in (k for k in known if fits[k].std.get(name) is None):
         y = fits[k].values[name] / 10.0**power
         below = y > sum(ax.get_ylim()) / 2  # above it may be the title
@@ -270,15 +275,6 @@ def _one_parameter(ax: Axes, fits: Sequence[Any], name: str, truth: float | None
                     va="top" if below else "bottom", fontsize=7, color=style.MUTED)
     ax.set(title=style.scaled_title(name, parameter.unit, power))
     ax.grid(axis="x", visible=False)
-
-
-def _around(ax: Axes, values: np.ndarray) -> None:
-    """Keep a change of a thousandth from looking like a leap."""
-    low, high = ax.get_ylim()
-    least = 0.1 * float(np.max(np.abs(values))) or 1.0
-    if high - low < least:
-        middle = float(values.min() + values.max()) / 2
-        ax.set_ylim(middle - least / 2, middle + least / 2)
 
 
 def what_changed(fit: Any, previous: Any) -> str:

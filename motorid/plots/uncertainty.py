@@ -57,18 +57,13 @@ def plot_singular_values(result: Identifiability) -> np.ndarray:
     style.plain_decades(ax)
     ax.text(0.98, 0.97, "grey: not determined", transform=ax.transAxes, ha="right", va="top", fontsize=8,
             color=style.MUTED)
-    _directions(axes[1], result)
-    return axes
-
-
-def _directions(ax: Axes, result: Identifiability) -> None:
     for row, direction in enumerate(result.directions, 1):
         for column, weight in enumerate(direction):
             colour = style.PALETTE["blue"] if weight > 0 else style.PALETTE["orange"]
-            ax.scatter(column, row, s=180 * abs(float(weight)) ** 1.5, color=colour, alpha=0.85, lw=0)
-    k = len(result.names)
-    ax.set(xlim=(-0.6, k - 0.4), ylim=(k + 0.6, 0.4), xticks=range(k), xticklabels=result.names, yticks=range(1, k + 1),
-           ylabel="direction", title="What each direction is made of (area: weight)")
+            axes[1].scatter(column, row, s=180 * abs(float(weight)) ** 1.5, color=colour, alpha=0.85, lw=0)
+    axes[1].set(xlim=(-0.6, k - 0.4), ylim=(k + 0.6, 0.4), xticks=range(k), xticklabels=result.names, yticks=rows,
+                ylabel="direction", title="What each direction is made of (area: weight)")
+    return axes
 
 
 @style.styled

@@ -21,6 +21,8 @@ MOST_STEPS = 10_000_000  # of a simulation that a file asks for
 KINDS = {kind.__name__: kind for kind in (CurrentLimit, SteadyState, Huber, *ENGINES.values())}
 PLAIN = ("weights", "initial", "noise_factors", "priors", "accuracy", "width")  # a problem's fields that are plain data
 OPTIONS = ("loss", "engine", "penalties", "constraints")  # and those that are objects
+RECORD = ("t", "inputs", "outputs", "sigma", "hold", "units", "name", "meta")  # fields of a record
+OWN = ("sigma", "start", "limits", "apart")  # and of the run made of it
 KEPT = ("value", "vary", "given", "lower", "upper")  # fields of a parameter that may differ from the library's
 
 
@@ -38,7 +40,9 @@ def problem_dict(problem: Problem) -> dict[str, Any]:
     model = problem.model
     given = {e.name: {p.name: p.value for p in e.parameters if p.given} for e in model.effects}
     return {"parameters": {n: {f: getattr(p, f) for f in KEPT} for n, p in model.parameters.items()},
-            "given": given, "runs": [_run_dict(run) for run in problem.runs],
+            "given": given, "runs": [
+                {"record": {f: getattr(r.experiment, f) for f in RECORD}, **{f: getattr(r, f) for f in OWN},
+                 "substeps": r.grid.substeps} for r in problem.runs],
             **{f: getattr(problem, f) for f in PLAIN}, **{f: _options(getattr(problem, f)) for f in OPTIONS}}
 
 
@@ -53,13 +57,6 @@ def problem_of(about: Mapping[str, Any], data: Mapping[str, Any], effects: Itera
     problem = Problem(model, tuple(runs), **{f: data[f] for f in PLAIN}, **{f: _built(data[f]) for f in OPTIONS})
     ready = [_run_of(problem, run, r) for run, r in zip(problem.experiments, data["runs"], strict=True)]
     return problem.with_runs(tuple(ready))
-
-
-def _run_dict(run: Run) -> dict[str, Any]:
-    e = run.experiment
-    record = {f: getattr(e, f) for f in ("t", "inputs", "outputs", "sigma", "hold", "units", "name", "meta")}
-    return {"record": record, "sigma": run.sigma, "start": run.start, "limits": run.limits, "apart": run.apart,
-            "substeps": run.grid.substeps}
 
 
 def _run_of(problem: Problem, record: Experiment, data: Mapping[str, Any]) -> Run:

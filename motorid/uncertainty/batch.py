@@ -174,7 +174,10 @@ def fit_many(model: Model, motors: Mapping[str, Records], *, journal: str | Path
         raise UsageError("fit_many takes a mapping {name: runs}; it is empty. See motors_in(folder).")
     inspect.signature(fit).bind(model, motors, **options)  # a wrong option is no failure of every motor
     inspect.signature(read_runs).bind("", **(reading or {}))
-    _carry_laws(model)
+    if any(e.__reduce__()[1][0] is None for e in model.effects):  # another process cannot import the law: functions now
+        for outputs in (c for n in (1, 2, 3) for c in combinations(CHANNELS, n)):
+            with suppress(Exception):  # a channel that this model does not have
+                model.system(outputs)
     done = Checkpoint(Path(journal)) if journal is not None else None
     marks = {n: checkpoint_key(model, options, reading, runs) for n, runs in motors.items()} if done else {}
     known = {n: {**done.rows[m], "motor": n} for n, m in marks.items() if m in done.rows} if done else {}
@@ -186,16 +189,6 @@ def fit_many(model: Model, motors: Mapping[str, Records], *, journal: str | Path
     return Batch(tuple(rows[name] for name in motors if name in rows), model.free_names,
                  frozenset(n for n, p in model.parameters.items() if p.positive), said,
                  {n: p.unit for n, p in model.parameters.items()})
-
-
-def _carry_laws(model: Model) -> None:
-    """Make the model's functions now, where a law cannot be imported by another process."""
-    if all(e.__reduce__()[1][0] is not None for e in model.effects):
-        return
-    for n in (1, 2, 3):
-        for outputs in combinations(CHANNELS, n):
-            with suppress(Exception):  # a channel that this model does not have
-                model.system(outputs)
 
 
 def _fit_one(task: tuple[Model, Mapping[str, Any], Mapping[str, Any]], motor: tuple[str, Records]) -> dict[str, Any]:
@@ -322,7 +315,11 @@ class Checkpoint:
 def checkpoint_key(model: Model, options: Mapping[str, Any], reading: Mapping[str, Any] | None, records: Any) -> str:
     """Return a hash of all that a result depends on: versions, equations, values, options, contents of the records."""
     mark = hashlib.sha256(repr([package_version(p) for p in ("motorid", "casadi", "numpy", "scipy")]).encode())
-    mark.update(_equations(model))
+    try:  # the equations as traced, whatever names, globals or files a law took them from
+        system = model.system(SHOWN[model.base])
+        mark.update("".join(f.serialize() for f in (system.rhs, system.out, system.initial)).encode())
+    except Exception as error:  # of the user's law; then no motor can be fitted
+        mark.update(repr(error).encode())
     mark.update(repr((model.base, model.axis, model.effect_names, sorted(model.parameters.items()))).encode())
     told = sorted(options.items()), sorted((reading or {}).items())
     text = repr(told)
@@ -330,15 +327,6 @@ def checkpoint_key(model: Model, options: Mapping[str, Any], reading: Mapping[st
     for part in _contents(records):
         mark.update(part)
     return mark.hexdigest()
-
-
-def _equations(model: Model) -> bytes:
-    """Return the equations as traced, whatever names, globals or files a law took them from."""
-    try:
-        system = model.system(SHOWN[model.base])
-        return "".join(f.serialize() for f in (system.rhs, system.out, system.initial)).encode()
-    except Exception as error:  # of the user's law; then no motor can be fitted
-        return repr(error).encode()
 
 
 def _contents(records: Any) -> list[bytes]:

@@ -334,7 +334,7 @@ def test_a_simulation_that_fails_on_the_way_shortens_the_step(runs):
 
 def test_integration_errors_move_no_estimate_by_more_than_a_share_of_its_deviation(runs, monkeypatch):
     from motorid.estimation import fit as stages
-    from motorid.problem import residuals as accuracy
+    from motorid.problem import problem as accuracy
 
     def shift() -> float:
         """Against the estimate with eight times as many steps, over the deviations."""
@@ -391,7 +391,7 @@ def test_a_start_that_cannot_be_simulated_is_an_error_that_says_what_to_do(runs)
 
 def test_integration_errors_that_add_up_are_mended_by_finer_steps(runs, monkeypatch):
     from motorid.estimation import fit as fitting
-    from motorid.problem import residuals as accuracy
+    from motorid.problem import problem as accuracy
 
     monkeypatch.setattr(accuracy, "LOOSEST", 2e-2)
     monkeypatch.setattr(accuracy, "NOISE_SHARE", 1.0)

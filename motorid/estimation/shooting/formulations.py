@@ -18,9 +18,8 @@ from motorid.estimation.result import Failure, Fit
 from motorid.estimation.shooting.multiple_shooting import MultipleShooting
 from motorid.estimation.shooting.outcome import Multiplier, steady_residual, violations
 from motorid.numerics.parallel import one_thread
-from motorid.problem.constraints import SteadyState
+from motorid.problem.constraints import Relation, SteadyState, Weighed
 from motorid.problem.problem import Problem
-from motorid.problem.relations import Relation, Weighed
 from motorid.problem.simulate import NRMSE
 from motorid.records.experiment import units_of
 

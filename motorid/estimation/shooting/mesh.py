@@ -19,9 +19,8 @@ import scipy
 from motorid.errors import SimulationError, among
 from motorid.integrate.engine import Grid, Trajectory
 from motorid.numerics.signals import Array, bridged, slope
-from motorid.problem.problem import Problem
-from motorid.problem.relations import Part
-from motorid.problem.residuals import prior_residual
+from motorid.problem.constraints import Part
+from motorid.problem.problem import Problem, prior_residual
 from motorid.problem.unknowns import Point
 from motorid.records.experiment import Experiment
 
@@ -193,25 +192,17 @@ class Mesh:
             blocks = self._by_interval(c, jac, owner)
             ends = np.cumsum([len(b.values) for b in blocks])
             return [(b, np.arange(e - len(b.values), e)) for b, e in zip(blocks, ends, strict=True)]
-        columns, dx, dp = self._spread(traj.dx, s, owner, walk.at.dp)
+        nodes = [int(j) for j in np.unique(owner) if self.intervals[j].node >= 0]  # spread over all that are concerned
+        columns = np.concatenate([np.arange(self.nq), *(self.columns(self.intervals[j])[:self.nx] for j in nodes)])
+        dp, dx = np.hstack([walk.at.dp, np.zeros((len(walk.at.dp), len(columns) - self.nq))]), None
+        if traj.dx is not None:
+            dx = np.zeros((len(s), self.nx, len(columns)))
+            dx[:, :, :self.nq] = traj.dx[s][:, :, self.nx:]
+            for j, a in zip(nodes, range(self.nq, len(columns), self.nx), strict=True):
+                mine = owner == j
+                dx[mine, :, a:a + self.nx] = traj.dx[s[mine]][:, :, :self.nx]
         c, jac = part.rows(traj.x[s], walk.at.p, dx, dp)
         return [(Block(c, jac, columns), np.arange(len(c)))]
-
-    def _spread(self, dx: Array | None, samples: np.ndarray, owner: np.ndarray,
-                dq: Array) -> tuple[np.ndarray, Array | None, Array]:
-        """Return the columns of all intervals concerned, and dx and dp spread over them."""
-        nodes = [int(j) for j in np.unique(owner) if self.intervals[j].node >= 0]
-        columns = np.concatenate([np.arange(self.nq), *(self.columns(self.intervals[j])[:self.nx] for j in nodes)])
-        dp = np.hstack([dq, np.zeros((len(dq), len(columns) - self.nq))])
-        if dx is None:
-            return columns, None, dp
-        wide = np.zeros((len(samples), self.nx, len(columns)))
-        wide[:, :, :self.nq] = dx[samples][:, :, self.nx:]
-        for place, j in enumerate(nodes):
-            mine = owner == j
-            a = self.nq + place * self.nx
-            wide[mine, :, a:a + self.nx] = dx[samples[mine]][:, :, :self.nx]
-        return columns, wide, dp
 
     def _by_interval(self, values: Array, jac: Array | None, owner: np.ndarray) -> list[Block]:
         """Cut rows with local derivatives (n, nx + nq) where the interval changes."""

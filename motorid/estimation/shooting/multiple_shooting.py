@@ -22,8 +22,8 @@ from motorid.estimation.shooting.mesh import Mesh, first_noise, nodes_from_data,
 from motorid.estimation.shooting.nlp import NlpResult, ShootingNlp, ipopt
 from motorid.estimation.shooting.outcome import KEPT, Solved, below_steady, fit_of, violations
 from motorid.numerics.signals import Array
+from motorid.problem.constraints import Relation, Weighed
 from motorid.problem.problem import Problem
-from motorid.problem.relations import Relation, Weighed
 from motorid.problem.simulate import at, judge, misfit_over_noise
 
 ROUNDS = 4  # of refining the sub-steps
@@ -99,7 +99,13 @@ class MultipleShooting:
             be simulated at the start.
         """
         began = time.perf_counter()
-        _check(problem)
+        for c in (*problem.constraints, *problem.penalties):
+            if not isinstance(c, Relation):
+                raise UsageError(f"MultipleShooting takes CurrentLimit, SteadyState and Constraint, not "
+                                 f"{type(c).__name__}.")
+            c.parts(problem)
+        if contradiction := below_steady(problem):
+            raise FitError(contradiction)
         near, q = self._unconstrained(replace(problem, constraints=()))
         bound = replace(near, constraints=problem.constraints)
         if self.process_noise is not None:
@@ -188,16 +194,6 @@ class MultipleShooting:
                        {"max_iter": most, "tol": tol, "print_level": 5 if self.verbose else 0}, warm,
                        near=not rough and self.warm != "data")
         return Solved(mesh, nlp, result, history + result.history)
-
-
-def _check(problem: Problem) -> None:
-    for c in (*problem.constraints, *problem.penalties):
-        if not isinstance(c, Relation):
-            raise UsageError(f"MultipleShooting takes CurrentLimit, SteadyState and Constraint, not "
-                             f"{type(c).__name__}.")
-        c.parts(problem)
-    if contradiction := below_steady(problem):
-        raise FitError(contradiction)
 
 
 def _least_noise(problem: Problem) -> dict[str, float]:

@@ -14,9 +14,8 @@ from motorid.estimation.shooting.mesh import Mesh, gaps_of, reduced
 from motorid.estimation.shooting.nlp import NlpResult, ShootingNlp
 from motorid.numerics.least_squares import LevenbergMarquardt, levenberg_marquardt
 from motorid.numerics.signals import Array
-from motorid.problem.constraints import CurrentLimit, SteadyState
+from motorid.problem.constraints import CurrentLimit, Part, SteadyState
 from motorid.problem.problem import Problem
-from motorid.problem.relations import Part
 from motorid.problem.simulate import integration_error
 
 GOOD = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
@@ -74,12 +73,6 @@ class Solved:
         return self.status != "converged" or (self.cost - start.f) * self.nlp.scale > SAME * max(1, start.f)
 
     @property
-    def violation(self) -> float:
-        """Largest row outside its limits."""
-        g = self.nlp.values(self.result.z)[1]
-        return float(np.max(np.maximum(self.nlp.lower - g, g - self.nlp.upper), initial=0.0))
-
-    @property
     def status(self) -> str:
         """``"converged"``, ``"stalled"``, ``"limit"`` or ``"failed"``."""
         return self._verdict[0]
@@ -96,9 +89,11 @@ class Solved:
             return "converged", "converged: the optimality conditions hold"
         if status in SAID:
             return SAID[status]
-        if self.violation < JOINED:
+        g = self.nlp.values(self.result.z)[1]
+        off = float(np.max(np.maximum(self.nlp.lower - g, g - self.nlp.upper), initial=0.0))  # at most
+        if off < JOINED:
             return "stalled", f"stalled ({status}): no step lowers the cost; look at identifiability()"
-        return "failed", f"failed ({status}): some rows are still off by {self.violation:.2g} of their size"
+        return "failed", f"failed ({status}): some rows are still off by {off:.2g} of their size"
 
 
 def fit_of(done: Solved, seconds: float) -> Fit:
@@ -122,10 +117,12 @@ def _extra(done: Solved) -> dict[str, Any]:
         extra |= {"gaps": gaps, "process_noise": dict(zip(problem.system.states, mesh.noise.tolist(), strict=True))}
     if problem.constraints:
         totals, rows = summed(_with_multipliers(done))
-        active = [np.zeros((1, len(done.q))),
-                  *(jac[part.at_limit(values)] for _, part, values, jac in rows_at(problem, done.q))]
+        active = np.concatenate([np.zeros((1, len(done.q))),
+                                 *(jac[part.at_limit(c)] for _, part, c, jac in rows_at(problem, done.q))])
+        active /= np.maximum(np.linalg.norm(active, axis=1, keepdims=True), 1e-300)
+        free = scipy.linalg.null_space(np.linalg.qr(active, mode="r"), rcond=1e-8)  # changes that keep them as they are
         extra |= {"multipliers": totals, "active": rows, "violations": violations(problem, done.q),
-                  "free": free_directions(np.concatenate(active), problem.scaling.slope(done.q))}
+                  "free": problem.scaling.slope(done.q)[:, None] * free}
     return extra
 
 
@@ -231,12 +228,6 @@ def summed(found: Sequence[tuple[str, Part, Array, Array]]) -> tuple[tuple[Multi
     totals = tuple(Multiplier(name, labels[active], value, unit, active)
                    for (name, unit), (value, active) in sums.items())
     return totals, tuple(sorted(rows, key=lambda m: -m.value))
-
-
-def free_directions(jac: Array, slope: Array) -> Array:
-    """Return a basis (nq, n) of the physical unknowns' changes that keep active rows (m, nq in q) as they are."""
-    size = np.maximum(np.linalg.norm(jac, axis=1, keepdims=True), 1e-300)
-    return slope[:, None] * scipy.linalg.null_space(np.linalg.qr(jac / size, mode="r"), rcond=1e-8)
 
 
 def below_steady(problem: Problem) -> str | None:
