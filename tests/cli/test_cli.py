@@ -526,7 +526,6 @@ def test_help_cuts_no_name_at_80_columns(monkeypatch):
         assert not re.search(r"<\w", shown), name  # no type of Python
 
 
-<<<<<<< HEAD
 @pytest.mark.parametrize(("times", "told"), [(1.2, "at the level of the noise"), (2.4, "up to 2.4 times the noise")])
 def test_fitted_and_held_out_errors_are_called_noise_by_one_rule(times, told):
     """Fitted errors were "up to 1.7 times the noise", and held-out ones of 2.4 times "at the level of the noise"."""
@@ -534,7 +533,8 @@ def test_fitted_and_held_out_errors_are_called_noise_by_one_rule(times, told):
     fit = mi.fit(mi.dc_motor(), runs[:1])
     judged = replace(fit.evaluation, rmse={c: times * s for c, s in fit.noise.items()})
     assert _held_out(fit, judged).startswith(f"Held out: errors {told} (NRMSE")
-=======
+
+
 @pytest.mark.parametrize("command", [["fit"], ["diagnose", "--max-effects", "0"]])
 def test_a_held_out_record_of_another_scale_is_told(tmp_path, command):
     """A duty cycle for the voltage makes held-out errors that say nothing of the model."""
@@ -543,4 +543,3 @@ def test_a_held_out_record_of_another_scale_is_told(tmp_path, command):
         write_csv(run.with_(inputs={"v": run.inputs["v"] / volt}), tmp_path / f"{name}.csv")
     found = motorid_json(tmp_path, *command, tmp_path / "run.csv", "--validate", tmp_path / "check.csv")
     assert any("12 times the speed in check as in run" in note for note in found["notes"])
->>>>>>> a63f6d30dc1e57da21f451c22069c5bf0ce2d192
