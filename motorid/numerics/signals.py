@@ -98,10 +98,13 @@ def quantum(y: ArrayLike) -> float:
 def repeats(y: Array) -> NDArray[np.bool_]:
     """Tell which samples of `y` (N,) only repeat the one before: the sensor is read more often than it measures.
 
-    None of a channel that changes irregularly, moves in steps, or rests: that is as it was measured.
+    None of a channel that changes irregularly, moves in steps, or rests: that is as it was measured. Where all of its
+    changes, steps or not, are a multiple of so many samples apart, it was measured then, and no chance would do that.
     """
     changes = np.flatnonzero(np.diff(y, prepend=np.nan) != 0)
     lengths = np.diff(changes, append=len(y))
+    if len(lengths) > FEWEST_FRESH + 2 and (apart := np.gcd.reduce(lengths[1:-1])) > 1:
+        return np.isfinite(y) & ((np.arange(len(y)) - changes[1]) % apart != 0)
     every = float(np.median(lengths)) if len(lengths) else 0.0
     even = np.abs(lengths - every) <= every / 4
     if len(lengths) < FEWEST_FRESH or every < 2 or np.mean(even) < _MOSTLY or quantum(y) > 0:

@@ -525,7 +525,8 @@ def swapped_columns(run: Experiment) -> str | None:
         what = " and ".join(NAMES[c] for c in moved)
         return (f"{what} fit the equations of a motor far better if their columns are exchanged. Say which is which: "
                 f"columns={{{', '.join(f'{c!r}: ...' for c in moved)}}}.")
-    jump, reach = float(np.nanmax(np.abs(np.diff(omega)))), float(np.nanmax(omega) - np.nanmin(omega))
+    known = omega[np.isfinite(omega)]
+    jump, reach = float(np.abs(np.diff(known)).max(initial=0.0)), float(np.ptp(known))
     if (_holds(omega) > 0.8 and _holds(run.inputs["v"]) < 0.3 and jump > 0.3 * reach > 0
             and _follows(run.inputs["v"], omega) > 0.1):
         return ("the speed jumps and then stays exactly the same, while the voltage changes smoothly: "

@@ -367,6 +367,21 @@ def test_a_sensor_read_more_often_than_it_measures_counts_once(every, tmp_path, 
     assert np.array_equal(read_runs(_written(table, tmp_path))[0].outputs["omega"], rounded)
 
 
+def test_a_coarse_sensor_read_more_often_than_it_measures_counts_once_too(tmp_path, rng):
+    """A bus that brings a speed in steps every 20 samples: what stays the same for two of these is measured twice."""
+    n = 3000
+    speed = np.round(5 * np.sin(np.arange(n) / 400) + 0.05 * rng.normal(size=n), 1)
+    sent = speed[np.arange(n) // 20 * 20]
+    lengths = np.diff(np.flatnonzero(np.diff(sent)))
+    assert np.mean(lengths > 20) > 0.2
+    table = pd.DataFrame({"t": np.arange(n) * 2e-3, "v": 1.0, "speed_rad_s": sent})
+    run = read_runs(_written(table, tmp_path))[0]
+    assert np.array_equal(np.flatnonzero(np.isfinite(run.outputs["omega"])), np.arange(0, n, 20))
+    assert not any("swapped" in told for told in mi.check_runs([run]))
+    table["speed_rad_s"] = speed  # as coarse, and measured every time
+    assert np.array_equal(read_runs(_written(table, tmp_path))[0].outputs["omega"], speed)
+
+
 def _written(table, folder):
     path = folder / "run.csv"
     table.to_csv(path, index=False)
