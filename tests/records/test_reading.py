@@ -373,11 +373,11 @@ def test_a_coarse_sensor_read_more_often_than_it_measures_counts_once_too(tmp_pa
     speed = np.round(5 * np.sin(np.arange(n) / 400) + 0.05 * rng.normal(size=n), 1)
     sent = speed[np.arange(n) // 20 * 20]
     lengths = np.diff(np.flatnonzero(np.diff(sent)))
-    assert np.mean(lengths > 20) > 0.2
+    assert np.mean(lengths > 20) > 0.1
     table = pd.DataFrame({"t": np.arange(n) * 2e-3, "v": 1.0, "speed_rad_s": sent})
     run = read_runs(_written(table, tmp_path))[0]
     assert np.array_equal(np.flatnonzero(np.isfinite(run.outputs["omega"])), np.arange(0, n, 20))
-    assert not any("swapped" in told for told in mi.check_runs([run]))
+    assert not any("swapped" in told for told in check_runs([run]))
     table["speed_rad_s"] = speed  # as coarse, and measured every time
     assert np.array_equal(read_runs(_written(table, tmp_path))[0].outputs["omega"], speed)
 
