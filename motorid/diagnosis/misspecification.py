@@ -285,9 +285,8 @@ def _insignificant(fit: Fit, effect: Effect, structure: bool) -> str:
         return f"{listed(sizes)} could as well be zero, within two standard deviations"
     open_ = [p.name for p in own if not sizes or p.name in sizes]
     known = any(fit.std[n] is not None or f"{n}_voltage" in torques for n in open_) or any(p.per_run for p in own)
-    if open_ and not known and (structure or not sizes):
-        rest = ", and the rest is not noise" if structure else ""
-        return f"{listed(open_)} {'is' if len(open_) == 1 else 'are'} not determined{rest}"
+    if structure and open_ and not known:
+        return f"{listed(open_)} {'is' if len(open_) == 1 else 'are'} not determined, and the rest is not noise"
     return ""
 
 

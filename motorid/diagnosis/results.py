@@ -299,7 +299,8 @@ class Diagnosis(Shown):
 def _plain(result: object, *names: str) -> dict[str, Any]:
     """Return attributes as plain data, None where there is no result."""
     each = {n: getattr(result, n, None) for n in names}
-    return {n: dict(a) if isinstance(a, Mapping) else list(a) if isinstance(a, tuple) else a for n, a in each.items()}
+    return {n: {k: None if v != v else v for k, v in a.items()} if isinstance(a, Mapping)  # NaN: nothing moves
+            else list(a) if isinstance(a, tuple) else a for n, a in each.items()}
 
 
 def share_table(what: str, shares: Mapping[str, float]) -> Table:

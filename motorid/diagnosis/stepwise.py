@@ -322,11 +322,13 @@ def explored(fit: Fit, validate: Sequence[Experiment] | Experiment | None, effec
         return climb(Search(records.fit, records.held_out, effects, stages), most, left())
 
     held_out = [validate] if isinstance(validate, Experiment) else validate
-    as_it_was, records = _as_read(less := affordable(fit), held_out)
+    as_it_was, records = _as_read(affordable(fit), held_out)
     found = climbed(records)
-    if not found.stopped and not found.remaining.adequate and in_parts(less) and _remembers(found, fit, held_out):
-        as_it_was, records = _as_read(fit, held_out)
-        found = climbed(records)
+    time_for_all = seconds is None or time.monotonic() - began < seconds / 3
+    if not found.stopped and time_for_all and _remembers(found, fit, held_out):
+        whole = _as_read(fit, held_out)
+        found = replace(found, stopped=anew.stopped) if (anew := climbed(whole[1])).stopped else anew
+        as_it_was, records = whole if found is anew else (as_it_was, records)
     if not found.stopped and (windowed := _in_windows(found)) is not None:
         parts = replace(records, fit=windowed)
         anew = climbed(parts)
@@ -366,6 +368,8 @@ def _as_read(fit: Fit, held_out: Sequence[Experiment] | None) -> tuple[Records, 
 def _remembers(found: Climb, whole: Fit, held_out: Sequence[Experiment] | None) -> bool:
     """Tell whether a model with a memory, which begins anew in every part of a record, leaves noise on whole ones: one
     on the way, or the most promising that was refused."""
+    if found.remaining.adequate or not in_parts(found.search.root.fit):
+        return False
     refused = [c for tried in found.rounds[-1:] for c in tried if c.fit is not None and c.fit.memories]
     refused.sort(key=lambda c: c.gain or 0.0)
     for fit in (*(node.fit for node in found.path[1:]), *(c.fit for c in refused[-1:])):

@@ -166,7 +166,7 @@ class Fit(Shown):
         ``"noise"``: no error is more than three times the noise, which colour can do; ``"poor"``: some is;
         ``"lost"``: a channel is not followed at all, or there is no result.
         """
-        if self.status == "failed" or largest(self.nrmse) >= LOST:
+        if self.status == "failed" or not largest(self.nrmse) < LOST:
             return "lost"
         return "poor" if max(self.misfit.values(), default=0.0) > COLOURED else "noise"
 
@@ -179,7 +179,8 @@ class Fit(Shown):
                 "does, a diagnosis tells",
                 "poor": f"Fits poorly: errors up to {number(times, 2)} times the noise",
                 "lost": "Does not fit: predicting zero would be closer"}[self.fits]
-        if self.fits == "noise" and self.problem.unknown and not any([*self.std.values(), *self.determined]):
+        known = not self.problem.unknown or any([*self.std.values(), *self.determined])
+        if self.status != "failed" and (not moving(self.nrmse) or (self.fits == "noise" and not known)):
             said = "Nothing is determined: the records do not show what the motor does, and any values fit them"
         if self.window:
             said += f", a window of {number(self.window, 2)} s ahead"
@@ -319,7 +320,7 @@ class Fit(Shown):
         return Card(f"Fit of {self.model.title}", flags, text, [t for t in tables if t], after)
 
     def __repr__(self) -> str:
-        errors = ", ".join(f"{c} {100 * e:.2f} %" for c, e in moving(self.nrmse).items())
+        errors = ", ".join(f"{c} {100 * e:.2f} %" for c, e in moving(self.nrmse).items()) or "–"
         end = "" if self.status == "converged" else f", {self.status}"
         return f"<fit of {self.problem.model.name}: {flag_of(self)}{end}, NRMSE {errors}>"
 

@@ -152,7 +152,7 @@ class Model(Shown):
 
     def _in_units(self, p: Parameter) -> Parameter:
         linear = replace(p, unit=LINEAR_UNITS.get(p.unit, p.unit), doc=LINEAR_DOCS.get(p.name, p.doc))
-        return linear if self.axis == "linear" else p
+        return linear if self.axis == "linear" and not p.periodic else p
 
     def _change(self, changes: Mapping[str, Mapping[str, Any]]) -> Model:
         pars = dict(self.parameters)

@@ -174,9 +174,9 @@ def at_rest(run: Experiment, sigma: Mapping[str, float]) -> tuple[bool, int]:
     if "omega" not in run.outputs and "theta" in run.outputs:
         y, t = run.outputs["theta"], run.t
         speed, _ = _first_speed(y, t, sigma["theta"])
-        lull = y[:lead][np.isfinite(y[:lead])]
-        if lull.size and np.ptp(lull) >= REACH * sigma["theta"]:  # it moves before the first voltage, however slowly
-            return False, 1
+        early, late = (part[np.isfinite(part)] for part in (y[:lead][:FIRST], y[lead - lead // 3:lead]))
+        if early.size and late.size and abs(np.median(late) - np.median(early)) > REACH * sigma["theta"]:
+            return False, 1  # it moves before the first voltage, however slowly
         moving = abs(speed) > 0.05 * np.max(np.abs(window_slopes(t, y)), initial=0.0)
         if (moving and not _starts_from_rest(y, t, sigma["theta"], speed)) or (
                 _creeps(y[max(lead - 1, 0):], t[max(lead - 1, 0):], sigma["theta"])):

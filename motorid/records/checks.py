@@ -112,13 +112,13 @@ def _other_scale(runs: Sequence[Experiment]) -> str | None:
         volts = np.cumsum(np.r_[0.0, v])
         lasting = float(np.abs(volts[tenth:] - volts[:-tenth]).max()) / tenth
         gains.append((float(np.sqrt(np.mean(omega**2)) / np.abs(v).max()),
-                      float(np.abs(omega).max() / max(lasting, 1e-300)), run.name))
+                      float(np.abs(omega).max() / max(lasting, 1e-300)), run.name, np.abs(v).max()))
     if len(gains) < 2:
         return None
-    (fast, _, one), (_, slow, other) = max(gains), min(gains, key=lambda g: g[1])
+    (fast, _, one, volts), (_, slow, other, more) = max(gains), min(gains, key=lambda g: g[1])
     return (f"the same voltage gives at least {fast / slow:.0f} times the speed in {one} as in {other}: do their units "
             "differ (volts and a duty cycle, turns and radians)? Read each in its own, or leave one out."
-            ) if fast > OTHER_SCALE * slow else None
+            ) if fast > OTHER_SCALE * slow and volts < 1.1 * more else None  # friction holds what little drives
 
 
 def _speed(run: Experiment) -> Array | None:
@@ -147,7 +147,8 @@ def _excitation(run: Experiment) -> str | None:
         start, late, top = np.median(omega[:run.n // 20 + 1]), np.median(omega[run.n // 2:]), omega.max()
         if max(start, -omega.min()) < 0.5 * top < late:  # set off, and neither swings nor runs down
             return ("the voltage is 0 from beginning to end, yet the motor accelerates by itself: is it the wrong "
-                    "column, or was it not logged? Say which one holds it, columns={'v': ...}, or leave the run out.")
+                    "column, was it not logged, or does a load drive it? Say which one holds it, columns={'v': ...}, "
+                    "or leave the run out.")
     return (f"the voltage is {quantity(v[0], run.units['v'])} from beginning to end: such a run shows one "
             "steady speed and at most a start. Add runs with steps or a sweep of the voltage."
             ) if np.ptp(v) <= 1e-6 * np.abs(v).max() else None
@@ -172,7 +173,7 @@ def _disabled(run: Experiment) -> str | None:
                                   for y in (np.abs(v), np.abs(i), i * np.sign(v), omega * np.sign(v)))
     top, on = np.maximum.reduceat(np.abs(v), edges[:-1]), volts > 0.1 * volts.max()
     usual, slow = np.quantile(along[on] / volts[on], 0.9) * volts, STILL * np.abs(ahead).max()
-    off = on & (drawn < 0.2 * usual) & (np.abs(ahead) < slow)
+    off = on & (drawn < 0.2 * np.minimum(usual, drawn.max())) & (np.abs(ahead) < slow)
     least = top[on & (along > 0.5 * usual) & (ahead > -slow)].min(initial=np.inf)  # braking needs no drive
     ends = np.flatnonzero(np.diff(off.astype(int), prepend=0, append=0))
     parts = [f"{run.t[edges[a]]:.3g} to {run.t[edges[b] - 1]:.3g} s" for a, b in zip(ends[::2], ends[1::2], strict=True)
@@ -629,15 +630,20 @@ def _cosine(a: Array, b: Array | None) -> float:
 def _speed_cosine(run: Experiment) -> float:
     """Return the cosine of the integral of the voltage and the travel, where no speed was measured.
 
-    Against a spring or a weight the angle itself follows the voltage. By chance, or under a controller, it may lie
-    against it, yet bends along its steps: then it does not count.
+    Against a spring the angle itself follows the voltage: if only where it has come to rest under several of them.
     """
     theta = run.outputs.get("theta")
     if theta is None or len(edges := _block_edges(theta)) < 6:
         return 0.0
     v, angle = run.inputs["v"], bridged(run.t, theta)
-    place = max(_cosine(v - v.mean(), angle - angle.mean()), _follows(angle, v, 0.3 * np.ptp(v)))
-    return min(_cosine(np.diff(integral(run.t, v)[edges]), np.diff(theta[edges])), place)
+    begins = np.r_[0, np.flatnonzero(np.abs(np.diff(v)) > 0.02 * np.ptp(v)) + 1, run.n]
+    late = [slice(b - (b - a) // 3, b) for a, b in pairwise(begins.tolist()) if b - a >= 30]
+    places = np.array([(v[s].mean(), angle[s].mean()) for s in late if np.ptp(angle[s]) < 0.1 * np.ptp(angle)])
+    apart = len(places) > 3 and np.ptp(places[:, 0]) > 0.3 * np.ptp(v)
+    against = _cosine(*(places - places.mean(axis=0)).T) if apart else 0.0
+    # A controller stops against friction, too, and one of two voltages turns with its reference.
+    against = max(against, _cosine(v - v.mean(), angle - angle.mean()), _follows(angle, v, 0.3 * np.ptp(v)))
+    return min(_cosine(np.diff(integral(run.t, v)[edges]), np.diff(theta[edges])), against)
 
 
 def _block_edges(theta: Array) -> NDArray[np.intp]:

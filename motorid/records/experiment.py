@@ -200,7 +200,8 @@ class Experiment(Shown):
         Not next to jumps of the voltage, where the motor is quick; at least three, at most 5 % of a channel. Of speed
         and angle, two or three in a row that jump there and back are left out too: a mass cannot.
         """
-        outputs = {c: preprocessing.without_spikes(self.t, y, self.inputs["v"], inert=c != "i")
+        free = "tau_load" not in self.inputs  # a blow of the load may be as short
+        outputs = {c: preprocessing.without_spikes(self.t, y, self.inputs["v"], inert=free and c != "i")
                    for c, y in self.outputs.items()}
         return self.with_(outputs=outputs) if any(outputs[c] is not y for c, y in self.outputs.items()) else self
 

@@ -116,18 +116,19 @@ def without_spikes(t: Array, y: Array, v: Array, inert: bool = False) -> Array:
 
 
 def bursts(t: Array, y: Array, v: Array) -> NDArray[np.intp]:
-    """Return which samples, up to `LONGEST` in a row, jump away and back, more than twice as far as the channel changes
-    from sample to sample anywhere else, at one voltage: what has a mass cannot.
+    """Return which samples, two to `LONGEST` in a row, jump away and back, more than twice as far as the channel
+    changes from sample to sample anywhere else, at one voltage: what has a mass cannot.
 
     From rest and back to it, it slips; what rings swings back by less than half, or again by more than half of that.
     """
     seen = np.flatnonzero(np.isfinite(y))
-    if len(seen) < FEWEST:
+    if len(seen) < FEWEST or np.ptp(v) == 0:  # no voltage that shows how fast the motor is
         return np.empty(0, int)
     changes, level = np.diff(y[seen]), np.append(0, np.cumsum(np.abs(np.diff(v)) > 0.02 * np.ptp(v)))  # of the voltage
     sizes, least = np.abs(changes), 12 * noise_level(y, t)
     large = np.flatnonzero(sizes > max(8 * np.quantile(sizes, 0.9), least))
-    found = [(a, b) for a, b in pairwise(large.tolist()) if b - a <= LONGEST and -2 < changes[a] / changes[b] < -0.5
+    found = [(a, b) for a, b in pairwise(large.tolist())
+             if 2 <= b - a <= LONGEST and -2 < changes[a] / changes[b] < -0.5
              and level[seen[b]] == level[seen[a + 1]] < level[max(seen[a] - PEAK, 0)] + 2]
     usual = np.delete(sizes, np.array(found, int).ravel()).max(initial=0.0)
     far = [seen[a + 1:b + 1] for a, b in found

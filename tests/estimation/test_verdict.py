@@ -102,6 +102,14 @@ def still(run, angle=0.0):
     return run.with_(outputs={"omega": 0 * run.t, "theta": angle + 1e-15 * np.sin(run.t)}, sigma={}, name="fast")
 
 
+def test_a_motor_that_never_moves_determines_nothing(runs):
+    """A speed of zero under half a volt "fits", and its export was advised."""
+    fit = mi.fit(mi.dc_motor(), [still(r).without("theta") for r in runs])
+    assert fit.verdict.startswith("Nothing is determined: ")
+    assert fit.fits == "lost"
+    assert repr(fit).endswith("NRMSE –>")
+
+
 def test_an_error_over_a_motion_that_is_none_is_no_number_and_decides_nothing(runs):
     """A share of nothing was 7.64·10¹⁵⁰ %."""
     moved = [r.with_(outputs={"omega": r.outputs["omega"]}) for r in runs]

@@ -102,6 +102,8 @@ def test_a_linear_axis_shows_linear_units():
     model = mi.torque_driven("linear") + mi.effects.coulomb + mi.effects.quadratic_drag
     units = {n: p.unit for n, p in model.parameters.items()}
     assert units == {"g": "N/V", "b": "N·s/m", "J": "kg", "tau_c": "N", "c_2": "N·s²/m²", "sgn_width": "m/s"}
+    phase = (model + mi.effects.cogging).parameters["phi"]
+    assert phase.unit == "rad"  # of a wave, over a metre as over a turn
 
 
 def test_an_effect_may_read_what_a_later_one_changes():

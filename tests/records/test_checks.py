@@ -261,9 +261,41 @@ def test_a_servo_that_answers_noise_turns_no_angle_round(rng):
     assert "swapped" not in said(Experiment(5e-4 * np.arange(4000), {"v": v}, {"theta": theta}))
 
 
+def test_a_controller_that_jumps_between_two_voltages_turns_no_angle_round():
+    """It turns the voltage round where the angle crosses its reference, and lies against the voltage all the while."""
+    t, theta, speed, shown = 1e-3 * np.arange(6000), 0.0, 0.0, []
+    for now in t:
+        v = 12.0 if 20 * np.sign(np.sin(25 * now)) > theta else -12.0
+        shown.append((v, theta))
+        speed += 1e-3 * (612 * v / 12 - speed) / 0.03
+        theta += 1e-3 * speed
+    v, theta = np.array(shown).T
+    assert "swapped" not in said(Experiment(t, {"v": v}, {"theta": theta}))
+
+
+def test_a_motor_that_is_stalled_at_the_limit_of_its_current_is_not_off():
+    t = 1e-3 * np.arange(3000)
+    v = np.where(t < 1.8, 2.5 * np.sign(np.sin(12 * t)), 24.0)
+    i = np.where(t < 1.8, 0.4 * np.sign(v), 0.4)
+    omega = np.where(t < 1.8, 20 * np.sign(v), 0.0)
+    assert "disabled" not in said(Experiment(t, {"v": v}, {"i": i, "omega": omega}))
+
+
 def duty(plant, lab, signed: np.ndarray, effects: dict | None = None) -> tuple[np.ndarray, np.ndarray]:
     t = 5e-3 * np.arange(len(signed))
     return t, plant.simulate(lab, effects or {}, t, signed, substep=1e-3)["omega"]
+
+
+def test_friction_that_holds_a_motor_back_is_no_other_scale(plant, lab):
+    """One run of 2 V, of which friction takes 1.8, and one of 12 V: the slow one shows the friction."""
+    t = 1e-3 * np.arange(2000)
+    runs = []
+    for volts in (2.0, 12.0):
+        omega = (volts - 1.8) / 0.05 * (1 - np.exp(-t / 0.1))
+        runs.append(Experiment(t, {"v": np.full(2000, volts)}, {"omega": omega}, name=f"{volts:.0f} V"))
+    assert "times the speed" not in said(*runs)
+    small = runs[1].with_(inputs={"v": runs[1].inputs["v"] / 12}, name="duty")
+    assert "times the speed in duty as in 12 V" in said(small, runs[1])
 
 
 @pytest.mark.parametrize("channel", ["omega", "theta"])

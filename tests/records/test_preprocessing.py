@@ -187,7 +187,7 @@ def counted(v):
 
 
 @pytest.mark.parametrize(("at", "wrong"), [(100, (24.0, 25.0)), (150, (24.0, 25.0)), (180, (40.0, 41.0, 40.0)),
-                                           (100, (30.0,)), (220, (-30.0, -31.0))])
+                                           (220, (-30.0, -31.0))])
 def test_a_few_samples_in_a_row_that_no_mass_makes_are_left_out(at, wrong):
     """Two wrong samples after the only step made 79 % of the squared error, and "a friction that depends on heat"."""
     t, v = 2e-2 * np.arange(300), np.where(np.arange(300) < 100, 0.0, 6.0)
@@ -200,6 +200,22 @@ def test_a_few_samples_in_a_row_that_no_mass_makes_are_left_out(at, wrong):
     assert list(np.flatnonzero(gone)) == list(range(300))[whole]
     current = run.with_(outputs={"i": speed})  # that can
     assert current.without_spikes() is current
+
+
+def test_a_measured_blow_of_the_load_is_no_burst_and_a_lone_sample_may_be_chance():
+    t, v = 2e-2 * np.arange(300), np.where(np.arange(300) < 100, 0.0, 6.0)
+    speed, load = counted(v), np.zeros(300)
+    speed[200:202], load[200:202] = -12.0, 1.0
+    run = Experiment(t, {"v": v}, {"omega": speed})
+    assert np.isnan(run.without_spikes().outputs["omega"][200:202]).all()
+    told = run.with_(inputs={"v": v, "tau_load": load})
+    assert told.without_spikes() is told
+    steady = run.with_(inputs={"v": np.full(300, 6.0)})  # no voltage shows how quick the motor is
+    assert not np.isnan(steady.without_spikes().outputs["omega"]).any()
+    lone = counted(v)
+    lone[200] = -12.0
+    lone = run.with_(outputs={"omega": lone})
+    assert lone.without_spikes() is lone
 
 
 def test_what_a_motor_does_is_no_burst():
