@@ -89,13 +89,6 @@ def following(judged: Adequacy, what: str) -> Adequacy:
     return replace(judged, text=f"{judged.text} They follow {what}.")
 
 
-def unpredicted(judged: Adequacy) -> Adequacy:
-    """Return a judgement that knows that no free form predicts errors larger than the noise."""
-    larger = " and ".join(channel_name(c) for c, f in judged.channels.items() if f["ratio"] > LARGER)
-    return replace(judged, text=f"{judged.text} Those of {larger} are larger than the fast noise, but no smooth "
-                                "function of time, angle, speed, current or voltage predicts them on data left out.")
-
-
 def within_noise(judged: Adequacy) -> Adequacy:
     """Return a judgement that knows that nothing predicts how errors no larger than the noise follow the motion."""
     text = (f"The errors ({_sizes(judged.channels)}) are within the noise; what of them depends on the motion no "
@@ -226,8 +219,11 @@ def judge_adequacy(node: Node, scores: Sequence[Score] = ()) -> Adequacy:
     judged = adequacy(node.fit, scores)
     if not far(node.fit) or not (doubtful := adequacy(node.fit, scores, level=CLEAR)).adequate:
         return judged
-    larger = far(node.fit)  # a form that helps the others explains nothing here
-    found = better_forms(node.fit, node.fit, larger)
+    found = better_forms(node.fit, node.fit, far(node.fit))  # a form that helps the others explains nothing here
     if hum := hum_of(node.fit, found):
         return replace(doubtful, hum=hum, text=f"{doubtful.text} What can be predicted of them is {hum}.")
-    return following(judged, found[0].form.text) if found else unpredicted(doubtful)
+    if found:
+        return following(judged, found[0].form.text)
+    names = " and ".join(channel_name(c) for c, f in doubtful.channels.items() if f["ratio"] > LARGER)
+    return replace(doubtful, text=f"{doubtful.text} Those of {names} are larger than the fast noise, but no smooth "
+                                  "function of time, angle, speed, current or voltage predicts them on data left out.")

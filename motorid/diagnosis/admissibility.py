@@ -166,15 +166,10 @@ def _too_slow(fit: Fit, speed: float) -> str:
 
 def samples_within(angle: Array, width: float) -> list[int]:
     """Count, for each turning point of `angle` (N,), the samples on the way from it to a distance of `width`."""
-    turns, found = _turning_points(angle, width), []
+    peaks, valleys = (scipy.signal.find_peaks(side, prominence=width)[0].tolist() for side in (angle, -angle))
+    turns, found = sorted([0, *peaks, *valleys]), []
     for a, b in zip(turns, [*turns[1:], len(angle)], strict=True):
         away = np.abs(angle[a:b] - angle[a]) / width
         left = np.flatnonzero(away > 1)
         found.append(int((away[: left[0] if len(left) else b - a] > STARTED).sum()))
     return found
-
-
-def _turning_points(y: Array, least: float) -> list[int]:
-    """Indices at which `y` turns by more than `least`, the first sample among them."""
-    peaks, valleys = (scipy.signal.find_peaks(side, prominence=least)[0].tolist() for side in (y, -y))
-    return sorted([0, *peaks, *valleys])

@@ -530,26 +530,23 @@ def _between(task: Task, values: Mapping[str, float], speeds: Sequence[float], b
     R, K, J, b = (values[n] for n in ("R", "K", "J", "b"))
     V, I = task.layout.v_max, NEAR * task.limits["i"][1]
     top = NEAR * min(task.limits["omega"][1], V / (K + R * b / K))
-    ms, bits, first, second, w = [], [], [], [], 0.0
-    unit = _unit(task.layout)
+    unit, w, segments = _unit(task.layout), 0.0, []  # segments: ms, ms per bit, first and second level
     for share, length in zip(speeds, _split(task.layout, len(speeds)), strict=True):
         need = 1e3 * J * abs(share * top - w) / (K * I)
         if need < unit or length < unit:
             return None
         go = min(length, unit * round(need / unit))
         to = w + (share * top - w) * min(1.0, length / need)
-        push = R * I * np.sign(share * top - w)
-        ms, bits = [*ms, go], [*bits, 0]
-        first, second, w = [*first, push + K * w], [*second, push + K * to], to
-        if length - go > max(bit, 1):
-            ms, bits = [*ms, length - go], [*bits, max(bit, 1)]
-            first, second = [*first, (K + R * b / K) * w], [*second, ripple * V]
-        else:
-            ms[-1] = length
+        push, stays = R * I * np.sign(share * top - w), length - go > max(bit, 1)
+        segments.append((go if stays else length, 0, push + K * w, push + K * to))
+        if stays:
+            segments.append((length - go, max(bit, 1), (K + R * b / K) * to, ripple * V))
+        w = to
+    ms, bits, first, second = zip(*segments, strict=True)
     c = np.clip(np.array([*first, *second]) / V, -1, 1)
     n, on = len(ms), np.array(bits) > 0
     c[n:][on] = np.minimum(c[n:][on], 1 - np.abs(c[:n][on]))
-    return replace(task.layout, ms=tuple(ms), bits=tuple(bits)), c
+    return replace(task.layout, ms=ms, bits=bits), c
 
 
 def _within(task: Task, c: Array, fine: bool = True) -> Found | None:

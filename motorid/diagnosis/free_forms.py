@@ -6,7 +6,7 @@ fading memory (Laguerre and Kautz models: Wahlberg, IEEE Trans. Automatic Contro
 """
 
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
 
@@ -381,10 +381,8 @@ STEPS = {  # from the last value to the next: of what plays, is ramped up and fa
 
 def _stepped(kind: str, z: Array, t: Array, place: float, last: float) -> Array:
     """Return what follows `z` (N,) from sample to sample, beginning at `last`."""
-    found = []
-    for value, dt in zip(z.tolist(), np.diff(t, prepend=t[0]).tolist(), strict=True):
-        found.append(last := STEPS[kind](last, value, place, dt))
-    return np.array(found)
+    every = zip(z.tolist(), np.diff(t, prepend=t[0]).tolist(), strict=True)
+    return np.array([last := STEPS[kind](last, value, place, dt) for value, dt in every])
 
 
 def values_of(functions: Sequence[str], form: Form, signal: Mapping[str, Array]) -> Array:
@@ -427,23 +425,8 @@ class Linear:
     residual: Array  # (n,)
     slopes: Array  # (n, number of free parameters)
     own: Array  # (n, number of estimated initial states), to half of the range in which each may lie
-    forms: Mapping[Form, Array]  # (n, number of coefficients)
-
-
-class Answering(Mapping[Form, Array]):
-    """What a model answers to each form, worked out when it is asked for: all together fill the memory."""
-
-    def __init__(self, forms: Iterable[Form], answer: Callable[[Form], Array]) -> None:
-        self._forms, self._answer = tuple(forms), answer
-
-    def __getitem__(self, form: Form) -> Array:
-        return self._answer(form)
-
-    def __iter__(self) -> Iterator[Form]:
-        return iter(self._forms)
-
-    def __len__(self) -> int:
-        return len(self._forms)
+    forms: Sequence[Form]
+    answer: Callable[[Form], Array]  # to a form, (n, number of coefficients); of all together they fill the memory
 
 
 def linearised(fit: Fit, only: Form | None = None, span: Span | None = None,
@@ -469,8 +452,8 @@ def linearised(fit: Fit, only: Form | None = None, span: Span | None = None,
     def answer(form: Form) -> Array:
         return np.vstack([_answer(problem, k, seen[k], form, basis_of(form, signals[k], span)) for k in runs])
 
-    answers = Answering(forms, answer) if only is None else {only: answer(only)}
-    return Linear(residual[:n], jac[:n, :free], own, answers)
+    known = answer if only is None else {only: answer(only)}.__getitem__
+    return Linear(residual[:n], jac[:n, :free], own, forms, known)
 
 
 def _at(problem: Problem, fit: Fit) -> tuple[Array, Array]:
@@ -526,17 +509,22 @@ def zero_of(fit: Fit, k: int) -> float:
 def _answer(problem: Problem, k: int, seen: Response, form: Form, basis: Array) -> Array:
     """Return the whitened outputs of run `k` to every function of a form; `seen` is its response, whitened."""
     _, weights, index = problem.measured[k][:3]
-    flat = _read(problem, form, basis, weights) if form.balance == "sensor" else _driven(seen, form, basis)
+    if form.balance == "sensor":  # added to one output
+        out, j = np.zeros((len(basis), len(problem.outputs), basis.shape[1])), problem.outputs.index(form.channel)
+        out[:, j] = basis * weights[j]
+    else:
+        out = _driven(seen, form, basis)
+    flat = out.reshape(-1, out.shape[2])
     return flat if index is None else flat[index]
 
 
 def _driven(seen: Response, form: Form, basis: Array) -> Array:
-    """Return the outputs, (N·ny, m), to functions in the balances."""
+    """Return the outputs, (N, ny, m), to functions in the balances."""
     with np.errstate(over="ignore", invalid="ignore"):
         out = seen.driven(_pushes(form, basis, seen))
     if not np.all(np.abs(out) < UNBOUNDED * max(1.0, float(np.abs(basis).max(initial=0.0)))):  # or not a number
         raise SimulationError("the model's answer to small changes grows without bound along these records.")
-    return out.reshape(-1, out.shape[2])
+    return out
 
 
 def _pushes(form: Form, basis: Array, answer: Response) -> Array:
@@ -547,14 +535,6 @@ def _pushes(form: Form, basis: Array, answer: Response) -> Array:
     held = form.on in ("v", *COMPUTED_INPUTS) or form.carrier == "v"
     over = {k: (b[:-1] if held else 0.5 * (b[:-1] + b[1:])).T for k, b in shares.items()}
     return np.sum([b[:, :, None] * answer.b[:, :, BALANCES.index(k)] for k, b in over.items()], axis=0)
-
-
-def _read(problem: Problem, form: Form, basis: Array, weights: Array) -> Array:
-    """Return the outputs, (N·ny, m), to functions added to one output."""
-    out = np.zeros((len(basis), len(problem.outputs), basis.shape[1]))
-    j = problem.outputs.index(form.channel)
-    out[:, j] = basis * weights[j]
-    return out.reshape(-1, basis.shape[1])
 
 
 def form_coefficients(fit: Fit, linear: Linear, form: Form, kept: Sequence[int] | None = None) -> Array:
@@ -585,7 +565,7 @@ def _travels(fit: Fit, signals: Sequence[Mapping[str, Array]]) -> list[float]:
 
 def zeroed(fit: Fit, linear: Linear, form: Form) -> Linear:
     """Return a form with coefficients of its own on every record."""
-    return replace(linear, forms={form: np.hstack(by_record(fit.problem, linear.forms[form]))})
+    return replace(linear, answer={form: np.hstack(by_record(fit.problem, linear.answer(form)))}.__getitem__)
 
 
 def zeros_of(fit: Fit, form: Form) -> dict[str, float]:
@@ -607,7 +587,7 @@ def form_columns(fit: Fit, linear: Linear, form: Form) -> tuple[Array, Array]:
 
     A unit of each coefficient makes an answer as large as what was measured.
     """
-    problem, n, answers = fit.problem, len(linear.residual), linear.forms[form]
+    problem, n, answers = fit.problem, len(linear.residual), linear.answer(form)
     measured = [(m.y * m.weights)[:, m.weights > 0] ** 2 for m in problem.measured]
     size = np.sqrt(n) * float(np.sqrt(np.mean([np.nanmean(y2) for y2 in measured])))
     norms = np.linalg.norm(answers, axis=0)

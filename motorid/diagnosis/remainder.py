@@ -172,11 +172,10 @@ class Part:
         lines += ["curve = (", *(f"    + {n} * {t}" for n, t in zip(names, terms, strict=True)), ")"]
         if form.carrier == "acceleration":
             lines += [f"curve = {POSITIVE}  # an inertia stays above zero"]
-        if form.carrier == "acceleration" and form.on in ("turn", "theta"):  # kinetic energy changes with the angle
-            lines[0] = "z = ca.SX.sym('z')"
-            lines += ["slope, curve = (ca.substitute(f, z, m.theta) for f in (ca.jacobian(curve, z), curve))",
-                      "m.torque -= 0.5 * m.J / (1 + curve) * slope * m.omega**2"]
-        if form.carrier == "acceleration":
+            if form.on in ("turn", "theta"):  # kinetic energy changes with the angle
+                lines[0] = "z = ca.SX.sym('z')"
+                lines += ["slope, curve = (ca.substitute(f, z, m.theta) for f in (ca.jacobian(curve, z), curve))",
+                          "m.torque -= 0.5 * m.J / (1 + curve) * slope * m.omega**2"]
             return "\n".join([*lines, "m.scale('J', 1 + curve)"])
         if form.balance == "both":
             return "\n".join([*lines, "m.torque -= curve * m.i", "m.voltage += curve * m.omega"])

@@ -171,7 +171,8 @@ def score(tangent: Tangent, effect: Effect) -> Score:
     added = Added.of(tangent, effect)
     if any(p.order and not p.given for p in added.pars):
         return _score_orders(tangent, added, effect)
-    return _scored(tangent, effect, tuple(s for values in added.grid() if (s := added.shape(values)) is not None))
+    grid = combined({p.name: shapes_of(p, added.natural) for p in added.pars if p.grid and not p.given})
+    return _scored(tangent, effect, tuple(s for values in grid if (s := added.shape(values)) is not None))
 
 
 def _scored(tangent: Tangent, effect: Effect, shapes: tuple[Shape, ...]) -> Score:
@@ -293,10 +294,6 @@ class Added:
         if uses_angle(effect) and not model.angle_input and not any(uses_angle(e) for e in fit.model.effects):
             model = replace(model, angle_input=True, _systems={})
         return Added(fit, model, [model.parameters[p.name] for p in effect.parameters], tangent.sizes)
-
-    def grid(self) -> list[dict[str, float]]:
-        """Return the values of the shape parameters to try."""
-        return combined({p.name: shapes_of(p, self.natural) for p in self.pars if p.grid and not p.given})
 
     def shape(self, values: Mapping[str, float]) -> Shape | None:
         """Return what the effect adds at `values`; None where that cannot be simulated, or is nothing.

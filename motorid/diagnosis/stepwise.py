@@ -477,9 +477,8 @@ def ladder_of(found: Climb, validated: bool) -> Ladder:
             known = [grades[n] for n in names if n in grades]
             worst = max(known, key=lambda g: ORDER.index(g.grade), default=None)
             gained = evidence(before, node)
-            rung = replace(rung, grade=worst.grade if worst else "approximates",
-                           why=worst.why if worst else "a later effect took its place", gain=gained.gain,
-                           gain_se=gained.se)
+            rung = replace(rung, grade=worst.grade if worst else "approximates", gain=gained.gain, gain_se=gained.se,
+                           why=worst.why if worst else "a later effect took its place")
         rungs.append(rung)
         before = node
     return Ladder(tuple(rungs), found.text)

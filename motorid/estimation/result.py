@@ -20,20 +20,10 @@ from motorid.estimation.covariance import Certainty, Quantity, certainty, combin
 from motorid.model.model import Model
 from motorid.numerics.parallel import one_thread
 from motorid.numerics.signals import Array, despiked
+from motorid.problem import simulate
 from motorid.problem.plain_data import model_dict, problem_dict
 from motorid.problem.problem import Problem
-from motorid.problem.simulate import (
-    NRMSE,
-    Evaluation,
-    Simulation,
-    at,
-    error_table,
-    evaluate,
-    judge,
-    largest,
-    moving,
-    steady_errors,
-)
+from motorid.problem.simulate import NRMSE, Evaluation, Simulation, error_table, evaluate, judge, largest, moving
 from motorid.records.experiment import Experiment, units_of
 from motorid.records.files import json_text, write_files
 
@@ -213,7 +203,7 @@ class Fit(Shown):
     @cached_property
     def simulations(self) -> tuple[Simulation, ...]:
         """The fitted model on the records of the fit."""
-        return at(self.problem, self.q)
+        return simulate.at(self.problem, self.q)
 
     @cached_property
     def evaluation(self) -> Evaluation:
@@ -223,7 +213,7 @@ class Fit(Shown):
     @cached_property
     def steady_state_error(self) -> dict[str, float]:
         """RMS difference of measured and simulated means over the steady parts of the records, SI, per channel."""
-        return steady_errors(self.simulations, [run.sigma for run in self.problem.runs])
+        return simulate.steady_errors(self.simulations, [run.sigma for run in self.problem.runs])
 
     @cached_property
     def misfit(self) -> Mapping[str, float]:

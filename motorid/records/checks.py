@@ -251,9 +251,9 @@ def _coarse(run: Experiment) -> str | None:
     for channel, y in run.outputs.items():
         step, reach = quantum(y), float(np.nanmax(y) - np.nanmin(y))
         if 0 < reach < 16 * step:
-            return (f"the {NAMES[channel]} moves in steps of {step:.3g} {run.units[channel]} and "
-                    f"covers only {reach / step:.0f} of them, too few counts to fit well. Use more of "
-                    "the range, a finer sensor or a longer counting time.")
+            return (f"the {NAMES[channel]} moves in steps of {step:.3g} {run.units[channel]} and covers only "
+                    f"{reach / step:.0f} of them, too few counts to fit well. Use more of the range, a finer sensor or "
+                    "a longer counting time.")
     return None
 
 
@@ -295,11 +295,10 @@ def _beside_voltage(run: Experiment, y: Array) -> float:
 
 def _uneven(run: Experiment) -> str | None:
     steps = np.diff(run.t)
-    if np.mean(np.abs(steps - run.dt) > 0.25 * run.dt) > 0.05:
-        low, high = np.quantile(steps, (0.02, 0.98))
-        return (f"sampling is uneven, {1e3 * low:.3g} to {1e3 * high:.3g} ms apart. Each sample is used "
-                "at its own time; make sure that the stamps say when it was taken, not when it arrived.")
-    return None
+    low, high = np.quantile(steps, (0.02, 0.98))
+    return (f"sampling is uneven, {1e3 * low:.3g} to {1e3 * high:.3g} ms apart. Each sample is used at its own time; "
+            "make sure that the stamps say when it was taken, not when it arrived."
+            ) if np.mean(np.abs(steps - run.dt) > 0.25 * run.dt) > 0.05 else None
 
 
 def _slow_sampling(run: Experiment) -> str | None:
@@ -312,10 +311,9 @@ def _slow_sampling(run: Experiment) -> str | None:
     rise = np.abs(i[jumps[:, None] + np.arange(4)] - i[jumps - 1][:, None])
     first, full = rise[:, :2].max(axis=1), rise.max(axis=1)  # the step itself may lie between two samples
     clear = full > 10 * noise_level(i, run.t)
-    if clear.any() and float(np.median(first[clear] / full[clear])) > 0.9:
-        return (f"the current follows a voltage step within one sample ({1e3 * run.dt:.3g} ms): the sampling is "
-                "too slow for the inductance, so L will be uncertain. Sample faster, or fix L at its data-sheet value.")
-    return None
+    return (f"the current follows a voltage step within one sample ({1e3 * run.dt:.3g} ms): the sampling is too slow "
+            "for the inductance, so L will be uncertain. Sample faster, or fix L at its data-sheet value."
+            ) if clear.any() and float(np.median(first[clear] / full[clear])) > 0.9 else None
 
 
 def _never_settles(run: Experiment) -> str | None:
@@ -334,19 +332,17 @@ def _never_settles(run: Experiment) -> str | None:
         if np.isfinite(early).any() and np.isfinite(late).any():
             drifts.append(abs(float(np.nanmean(late) - np.nanmean(early))))
     spread = 5 * noise_level(y, run.t) / np.sqrt(run.n / 10 / (len(drifts) + 1))
-    if drifts and min(drifts) > max(0.05 * reach, spread):
-        return (f"the {NAMES[channel]} never settles while the voltage is constant; friction and "
-                "steady state will be uncertain. Hold the voltage longer in at least one run.")
-    return None
+    return (f"the {NAMES[channel]} never settles while the voltage is constant; friction and steady state will be "
+            "uncertain. Hold the voltage longer in at least one run."
+            ) if drifts and min(drifts) > max(0.05 * reach, spread) else None
 
 
 def _never_reverses(runs: Sequence[Experiment]) -> str | None:
-    low = min((r.inputs["v"].min() for r in runs), default=0.0)
-    high = max((r.inputs["v"].max() for r in runs), default=0.0)
-    if low > -0.02 * high or high < -0.02 * low:
-        return ("the voltage never reverses in any run: effects that depend on the direction (dry friction against a "
-                "constant load, asymmetry, backlash) cannot be distinguished. Add a run with both signs.")
-    return None
+    ends = [end for r in runs for end in (r.inputs["v"].min(), r.inputs["v"].max())] or [0.0]
+    low, high = min(ends), max(ends)
+    return ("the voltage never reverses in any run: effects that depend on the direction (dry friction against a "
+            "constant load, asymmetry, backlash) cannot be distinguished. Add a run with both signs."
+            ) if low > -0.02 * high or high < -0.02 * low else None
 
 
 def signs(run: Experiment) -> str | None:
@@ -498,10 +494,8 @@ def implied_constants(run: Experiment) -> str | None:
         return f"voltage over speed is {K:.2g} V·s/rad, far less than usual: the speed, {_remedy(run, 'omega', 'rpm')}"
     if 0 < R < 0.01:
         return f"voltage over current is {R:.2g} Ω, far less than usual: the current, {_remedy(run, 'i', 'mA')}"
-    if R > 3000:
-        return (f"voltage over current is about {R:.2g} Ω, far more than motors have; is the current in "
-                "A and not in mA, or the voltage in mV?")
-    return None
+    return (f"voltage over current is about {R:.2g} Ω, far more than motors have; is the current in A and not in mA, "
+            "or the voltage in mV?") if R > 3000 else None
 
 
 def _offset(run: Experiment) -> str | None:
@@ -528,11 +522,10 @@ def swapped_columns(run: Experiment) -> str | None:
                 f"columns={{{', '.join(f'{c!r}: ...' for c in moved)}}}.")
     known = omega[np.isfinite(omega)]
     jump, reach = float(np.abs(np.diff(known)).max(initial=0.0)), float(np.ptp(known))
-    if (_holds(omega) > 0.8 and _holds(run.inputs["v"]) < 0.3 and jump > 0.3 * reach > 0
-            and _follows(run.inputs["v"], omega) > 0.1):
-        return ("the speed jumps and then stays exactly the same, while the voltage changes smoothly: "
-                "are the two columns swapped? Say which is which: columns={'v': ..., 'omega': ...}.")
-    return None
+    stays = _holds(omega) > 0.8 and _holds(run.inputs["v"]) < 0.3 and jump > 0.3 * reach > 0
+    return ("the speed jumps and then stays exactly the same, while the voltage changes smoothly: are the two columns "
+            "swapped? Say which is which: columns={'v': ..., 'omega': ...}."
+            ) if stays and _follows(run.inputs["v"], omega) > 0.1 else None
 
 
 def _as_balances_want(run: Experiment) -> Reading:

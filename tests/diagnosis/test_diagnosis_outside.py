@@ -226,7 +226,7 @@ def test_a_form_answers_as_the_plant_does(lab):
     factors = [plain.problem.noise_factors.get(c, 1.0) for c in ANGLE]
     change = np.concatenate(shifts) / np.tile(factors, sum(r.n for r in runs))
     form = next(f for f in linear.forms if (f.on, f.carrier) == ("turn", ""))
-    columns = np.concatenate([linear.forms[form], linear.own], axis=1)
+    columns = np.concatenate([linear.answer(form), linear.own], axis=1)
     left = change - columns @ np.linalg.lstsq(columns, change, rcond=None)[0]
     assert np.linalg.norm(left) < 0.02 * np.linalg.norm(change)
 

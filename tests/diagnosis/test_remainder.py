@@ -364,7 +364,7 @@ def test_slopes_of_every_form_are_those_of_the_model_with_its_curve(lab):
         if form.on == "run":
             continue
         part = Part.of(fit, form)
-        answers = linearised(fit, form, part.span).forms[form]
+        answers = linearised(fit, form, part.span).answer(form)
         some = range(0, answers.shape[1], max(3, answers.shape[1] // 40))
         answers, curve = answers[:, some], Curve(fit, (replace(part, chosen=tuple(some)),), (0.0,) * len(some))
         problem = fit.problem.with_(model=fit.model + curve.effect, engine=mi.Rosenbrock(compiled=False))  # each once
