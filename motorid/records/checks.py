@@ -451,9 +451,7 @@ def magnitudes(run: Experiment) -> str | None:
               "omega": (800.0 if "omega" in run.meta.get("assumed_units", ()) else 3000.0, "rad/s", "rpm")}
     for channel, (limit, unit, likely) in limits.items():
         values = run.inputs.get(channel, run.outputs.get(channel))
-        if values is None or run.units[channel] != unit:
-            continue
-        if (top := float(np.nanmax(np.abs(values)))) > limit:
+        if values is not None and run.units[channel] == unit and (top := float(np.nanmax(np.abs(values)))) > limit:
             was = f" (read as {stated[channel]})" if channel in stated else ""
             if channel == "v" and stated.get(channel, "")[:1].isdigit():
                 return (f"v reaches {top:.4g} V{was}: that unit is the voltage of a whole duty cycle. Is the column in "
