@@ -376,11 +376,10 @@ def _told(run: Experiment, channel: str) -> str:
 def unsigned(run: Experiment) -> str | None:
     """A motor that is driven both ways draws current both ways."""
     v = run.inputs["v"]
-    for c in ("i", "omega"):
-        y = run.outputs.get(c)
-        if y is None or min(-v.min(), v.max()) < 0.2 * np.abs(v).max():
-            continue
-        backward, noise = v < -0.2 * np.abs(v).max(), noise_level(y, run.t)
+    both_ways = min(-v.min(), v.max()) >= 0.2 * np.abs(v).max()
+    for c in (c for c in ("i", "omega") if both_ways and c in run.outputs):
+        y, backward = run.outputs[c], v < -0.2 * np.abs(v).max()
+        noise = noise_level(y, run.t)
         if np.nanmin(y) > -2 * noise and np.mean(backward) > 0.05 and np.nanmedian(y[backward]) > 5 * noise:
             return (f"the {NAMES[c]} is never negative although the voltage is in {100 * np.mean(v < 0):.0f} % of the "
                     f"samples: logged without its sign? A fit needs the sign; leave it out with --ignore {c}.")
