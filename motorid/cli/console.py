@@ -42,8 +42,7 @@ _OPTIONS = ((r"\b(columns|units)=\{(.*?)\}", lambda m: f"--{m[1]} {_pairs(m[2])}
             (r"\bmodel\.without\('(\w+)'\)", r"leave \1 out of --effects"),
             (r"\bmodel\.(fix|free)\(…\)", r"--\1 NAME"),
             (r"\bmodel\.replace\(…\)", "--set NAME=VALUE"),
-            (r"\bmodel\.fix\('?(\w+)'?(=[^)]*)?\)", r"--fix \1\2"),
-            (r"\bmodel\.free\('?(\w+)'?\)", r"--free \1"),
+            (r"\bmodel\.(fix|free)\('?(\w+)'?(=[^)]*)?\)", r"--\1 \2\3"),
             (r"\bmi\.evaluate\(model, runs\)", "motorid simulate FIT.json RUN..."),
             (r"\bmi\.load\(path, effects=\[\w+\]\)", "--effects-from FILE.py"),
             (r" If you know where it comes from, mi\.load.*", ""))

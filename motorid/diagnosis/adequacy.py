@@ -81,12 +81,9 @@ def fine_angle_remark(fit: Fit) -> str:
 
 def following(judged: Adequacy, what: str) -> Adequacy:
     """Return a judgement that knows what the errors follow, e.g. "a load that changes with the time"."""
-    if what in judged.text:
-        return judged
-    if judged.adequate:
-        text = f"Something is missing: the errors ({_sizes(judged.channels)}) follow {what}."
-        return replace(judged, adequate=False, text=text)
-    return replace(judged, text=f"{judged.text} They follow {what}.")
+    text = (f"Something is missing: the errors ({_sizes(judged.channels)}) follow {what}." if judged.adequate else
+            f"{judged.text} They follow {what}.")
+    return judged if what in judged.text else replace(judged, adequate=False, text=text)
 
 
 def within_noise(judged: Adequacy) -> Adequacy:

@@ -133,14 +133,12 @@ def unresolved(fit: Fit, effect: Effect) -> str:
     if not effect.includes or effect.balance != "torque":
         return ""  # a gap shows in how its far side strikes, however quickly the near side passes through it
     for p in (fit.problem.model.parameters[q.name] for q in effect.parameters):
-        if not (p.positive and p.vary and p.null is None):
-            continue
         value, std = fit.values[p.name], fit.std.get(p.name)
-        if std is not None and std < KNOWN * value and not far(fit):
-            continue  # a fit that leaves noise alone determines it
-        why = (_too_fine(fit, value) or _too_quick(fit, value) if p.unit in LENGTHS else
-               _too_slow(fit, value) if p.unit in ("rad/s", "m/s") else "")
-        if why:
+        known = std is not None and std < KNOWN * value and not far(fit)  # a fit that leaves noise alone determines it
+        if known or not (p.positive and p.vary and p.null is None):
+            continue
+        if why := (_too_fine(fit, value) or _too_quick(fit, value) if p.unit in LENGTHS else
+                   _too_slow(fit, value) if p.unit in ("rad/s", "m/s") else ""):
             return f"{p.name} = {value:.3g} {p.unit} cannot be seen in these samples: {why}"
     return ""
 

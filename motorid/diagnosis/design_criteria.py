@@ -239,9 +239,8 @@ class Layout:
 
     def voltage(self, levels: Array) -> Array:
         """Return the voltage at each sample and the end, (N+1,)."""
-        n = len(self.ms)
-        owner = np.minimum(np.searchsorted(self.edges, np.arange(self.edges[-1] + 1), "right") - 1, n - 1)
-        low, high, ripple = np.array([self.at(levels, j) for j in range(n)])[owner].T
+        each = [self.at(levels, j) for j in range(len(self.ms))]
+        low, high, ripple = np.repeat([*each, each[-1]], [*np.diff(self.edges), 1], axis=0).T
         return low + (high - low) * self.inputs[:, 0] + ripple * self.inputs[:, 1]
 
     def _riding(self, j: int, level: float, amplitude: float) -> str:

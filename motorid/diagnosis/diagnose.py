@@ -20,7 +20,7 @@ from motorid.diagnosis.refit import with_lags_exchanged
 from motorid.diagnosis.remainder import Remainder
 from motorid.diagnosis.results import Diagnosis
 from motorid.diagnosis.stepwise import Climb, explored, ladder_of
-from motorid.display.numbers import listed
+from motorid.display.numbers import listed, number
 from motorid.effects import LIBRARY
 from motorid.errors import MotoridError, at_least, numbers_told
 from motorid.estimation.result import Fit, checked
@@ -133,9 +133,12 @@ def _remarks(found: Climb, driven: str) -> list[str]:
     first, last = found.path[0].fit, found.path[-1].fit
     limits = (f"In {run.name} {limit}" for run in first.problem.experiments if LIMITER not in found.path[-1].key
               and (limit := current_limit(run)))
+    windows = "" if last.window is None else (
+        f"The records are simulated in windows of {number(last.window, 2)} s, each from an estimated state: over whole "
+        "records small errors of a model may grow. Errors are those of a window ahead.")
     stopped = f"Stopped early: {found.stopped}; more may be missing." if found.stopped else ""
     own = words.own_in_every_run_remark(last) if found.search.held.validation is not None else ""
-    return [stopped, driven, words.window_remark(last), next(limits, ""), parts_remark(first),
+    return [stopped, driven, windows, next(limits, ""), parts_remark(first),
             words.unfinished_remark(last), words.held_out_remark(found.path[-1]), own,
             words.measured_angle_remark(last), words.outliers_remark(last), words.closed_loop_remark(first)]
 

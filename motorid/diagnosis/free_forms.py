@@ -57,14 +57,12 @@ CHANGES = {"t": "changes with the time", "distance": "changes with the distance 
            "past v": "depends on the voltage before", "path": "depends on the distance since a reversal",
            "past speed": "depends on how fast it ran before", "past power": "depends on how fast it ran before",
            "past load": "depends on the power drawn before", "past braking": "depends on the power fed back before",
-           "past heat": "depends on the heat of the current before",
-           "past size": "depends on the voltage before",
+           "past heat": "depends on the heat of the current before", "past size": "depends on the voltage before",
            "most i": "depends on the largest current so far",
            "since_change": "depends on how long the voltage has not changed",
            "since_switch": "depends on how long the voltage has been on or off",
            "since_reversal": "depends on the time since the voltage was reversed"}
-PAST = ("past i", "past omega", "past v", "past speed", "past power", "past load", "past braking", "past heat",
-        "past size", "path")
+PAST = (*(on for on in CHANGES if on.startswith("past ")), "path")
 MEMORIES = 8  # lengths of memory
 TRIPS = (0.02, 0.05, 0.1, 0.2, 0.4)  # of the largest heat: where a fuse or a derating sets in
 PLAY = (0.01, 0.4)  # of the largest value: half of the least and of the largest play

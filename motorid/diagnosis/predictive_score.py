@@ -340,9 +340,8 @@ def errors_of(simulations: Sequence[Simulation], noise: Mapping[str, float],
     `judged` gives other measurements on the same samples (a fold); `noise` is the sensor's per channel.
     """
     runs = judged if judged is not None else [s.experiment for s in simulations]
-    blocks = blocks_of(runs)
     parts: dict[str, list[tuple[Array, NDArray[np.intp], Array]]] = {}
-    for sim, run, block in zip(simulations, runs, blocks, strict=True):
+    for sim, run, block in zip(simulations, runs, blocks_of(runs), strict=True):
         for c, y in run.outputs.items():
             if c in sim.outputs and np.isfinite(y).any():
                 parts.setdefault(c, []).append((y - sim.outputs[c], block, run.moved(c)[np.isfinite(y)]))

@@ -260,10 +260,10 @@ class Curve:
             base, also = ("a constant and ", [-1]) if part.form.carrier else ("", [])
             powers = ("", "the square of ")[: 1 + part.form.bends]
             each = product(powers, free_forms.memories_of(part.form, part.span))  # in the order of the functions
-            forms = [(f"{base}{power}one lag of {number(length, 2)} {over}", lags[:, [k, *also]])
+            forms = [(f"{base}{power}one lag of {number(length, 2)} {over}", [lags[:, j] for j in (k, *also)])
                      for k, (power, length) in enumerate(each)]
             unit = part.unit(self.fit, bare=True)
-        return sorted((_closed(text, columns, value, unit) for text, columns in forms), key=lambda f: f[1])
+        return sorted((_closed(text, functions, value, unit) for text, functions in forms), key=lambda f: f[1])
 
     @cached_property
     def points(self) -> tuple[Array, Array]:
@@ -306,11 +306,6 @@ class Curve:
         """Return the curve fitted with the model, from `starts` beside the `last` values or not; None if that fails."""
         done = refit(last, self.fit.model + self.effect, [{**w, **s} for s in starts for w in (last.values, {})])
         return done and replace(self, values=tuple(done.values[n] for n in self.sizes), fitted=done)
-
-    def led_by(self, begun: Curve) -> Curve | None:
-        """Return one that was fitted in short windows, fitted to the records of this one."""
-        there = {n: v for n, v in (begun.fitted or begun.fit).values.items() if n != "sgn_width"}
-        return replace(begun, fit=self.fit, name=self.name, first=None).refitted(self.fit, there)
 
     @property
     def law(self) -> str:
@@ -631,7 +626,9 @@ def _grown(curve: Curve, form: Form, moved: bool, before: Predictions, held: Hel
     best, led = float("-inf"), None
     with contextlib.suppress(*FAILURES):
         for begun in dict.fromkeys((curve.begun.first or curve.begun, curve.begun)) if moved and curve.begun else ():
-            led = curve.led_by(begun)  # in windows noise is not always reached, and what imitates it grows there
+            there = {n: v for n, v in (begun.fitted or begun.fit).values.items() if n != "sgn_width"}
+            # In windows noise is not always reached, and what imitates it grows there.
+            led = replace(begun, fit=curve.fit, name=curve.name, first=None).refitted(curve.fit, there)
             if led and led.fitted and at_noise(Node(led.fitted, None, held.predictions(led.fitted))):
                 break
         curve = replace(curve, parts=(*curve.parts, Part.of(curve.fitted or curve.fit, form, moved)))
@@ -647,34 +644,33 @@ def _grown(curve: Curve, form: Form, moved: bool, before: Predictions, held: Hel
             yield Grown(gained, predicted, curve)
 
 
-def _closed_forms(on: str, z: Array) -> list[tuple[str, Array]]:
-    """Return closed forms of a quantity: what they are called, and their functions, (n, m)."""
+def _closed_forms(on: str, z: Array) -> list[tuple[str, Sequence[Array]]]:
+    """Return closed forms of a quantity: what they are called, and their functions, (n,) each."""
     one, side = np.ones_like(z), np.sign(z)
     if on in COMPUTED_INPUTS:  # what lasts, or waits, for a time; below zero while the voltage is off
         known = np.unique(np.abs(z))
         between = 0.5 * (known[1:] + known[:-1])
         steps = between[np.unique(np.geomspace(1, len(between), CLOSED).astype(int)) - 1]
-        return [(f"one value for the first {number(c, 3)} s{off}, another after", np.stack([one, way * z > c], axis=1))
+        return [(f"one value for the first {number(c, 3)} s{off}, another after", [one, way * z > c])
                 for way, off in ((1, ""), (-1, " off")) if (way * z > 0).any() for c in steps]
     top = float(np.abs(z).max(initial=0.0)) or 1.0
     if on == "turn":
-        return [(f"one wave, {k} to the turn", np.column_stack([np.sin(k * z), np.cos(k * z)])) for k in range(1, 13)]
+        return [(f"one wave, {k} to the turn", [np.sin(k * z), np.cos(k * z)]) for k in range(1, 13)]
     if on in ("theta", "t"):
-        return [("a constant", one[:, None]), ("a straight line", np.column_stack([one, z])),
-                ("its square", z[:, None] ** 2), ("its cube", z[:, None] ** 3)]
-    found = [("a constant", one[:, None]), ("proportional to it", z[:, None]), ("its sign alone", side[:, None]),
-             ("its square, with its sign", (z * np.abs(z))[:, None]),
-             ("its sign and proportional to it", np.column_stack([side, z]))]
+        return [("a constant", [one]), ("a straight line", [one, z]), ("its square", [z**2]), ("its cube", [z**3])]
+    found = [("a constant", [one]), ("proportional to it", [z]), ("its sign alone", [side]),
+             ("its square, with its sign", [z * np.abs(z)]), ("its sign and proportional to it", [side, z])]
     if z.min(initial=0.0) < 0 < z.max(initial=0.0):
-        found += [(f"a constant {way} zero", (s * z > 0)[:, None]) for way, s in (("above", 1), ("below", -1))]
+        found += [(f"a constant {way} zero", [s * z > 0]) for way, s in (("above", 1), ("below", -1))]
     if on == "omega":
-        found += [(f"an eddy-current brake, strongest at {number(w, 2)} rad/s", (z / (1 + (z / w) ** 2))[:, None])
+        found += [(f"an eddy-current brake, strongest at {number(w, 2)} rad/s", [z / (1 + (z / w) ** 2)])
                   for w in np.geomspace(0.03 * top, top, 12)]
     return found
 
 
-def _closed(text: str, columns: Array, value: Array, unit: str) -> tuple[str, float]:
+def _closed(text: str, functions: Sequence[Array], value: Array, unit: str) -> tuple[str, float]:
     """Return a closed form with its size, and the share of the curve that it misses."""
+    columns = np.column_stack(functions)
     size = np.linalg.lstsq(columns, value, rcond=None)[0]
     missed = value - columns @ size
     share = float(np.sqrt(missed @ missed / max(float(value @ value), 1e-300)))

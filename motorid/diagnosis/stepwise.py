@@ -296,14 +296,12 @@ class Records:
     def suits(self, node: Node) -> bool:
         """Tell whether the model of `node`, fitted to other readings, predicts these records better: an effect that
         was missing may have asked for another reading."""
-        if len(node.fit.model.effects) == len(self.fit.model.effects):
-            return False
-        try:
-            problem = self.fit.problem.with_(model=node.fit.model, noise_factors={})
-            own = node_of(solve(problem, start="model"), HeldOut.of(self.fit, self.held_out))
-        except FAILURES:
-            return False
-        return evidence(node, own).gain > 0
+        with contextlib.suppress(*FAILURES):
+            if len(node.fit.model.effects) != len(self.fit.model.effects):
+                problem = self.fit.problem.with_(model=node.fit.model, noise_factors={})
+                own = node_of(solve(problem, start="model"), HeldOut.of(self.fit, self.held_out))
+                return evidence(node, own).gain > 0
+        return False
 
 
 def explored(fit: Fit, validate: Sequence[Experiment] | Experiment | None, effects: Sequence[Effect],

@@ -36,13 +36,6 @@ def first_answer(fit: Fit, judged: Adequacy, scores: Sequence[Score]) -> str:
     return f"first answer: {fit.verdict}{next_}"
 
 
-def window_remark(fit: Fit) -> str:
-    """Say that the records were simulated in windows, and what these are for."""
-    return "" if fit.window is None else (
-        f"The records are simulated in windows of {number(fit.window, 2)} s, each from an estimated state: over whole "
-        "records small errors of a model may grow. Errors are those of a window ahead.")
-
-
 def adequate_text(judged: Adequacy, ranking: Sequence[Candidate], large: bool = False) -> tuple[str, str]:
     """Return the answer when nothing is missing, and how many effects were tried; `large`: errors beyond the noise."""
     tried = f"{judged.text} None of the {len(ranking)} effects tried is worth adding." if ranking else judged.text

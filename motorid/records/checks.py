@@ -377,11 +377,10 @@ def _told(run: Experiment, channel: str) -> str:
 def unsigned(run: Experiment) -> str | None:
     """A motor that is driven both ways draws current both ways."""
     v = run.inputs["v"]
-    for c in ("i", "omega"):
-        y = run.outputs.get(c)
-        if y is None or min(-v.min(), v.max()) < 0.2 * np.abs(v).max():
-            continue
-        backward, noise = v < -0.2 * np.abs(v).max(), noise_level(y, run.t)
+    both_ways = min(-v.min(), v.max()) >= 0.2 * np.abs(v).max()
+    for c in (c for c in ("i", "omega") if both_ways and c in run.outputs):
+        y, backward = run.outputs[c], v < -0.2 * np.abs(v).max()
+        noise = noise_level(y, run.t)
         if np.nanmin(y) > -2 * noise and np.mean(backward) > 0.05 and np.nanmedian(y[backward]) > 5 * noise:
             return (f"the {NAMES[c]} is never negative although the voltage is in {100 * np.mean(v < 0):.0f} % of the "
                     f"samples: logged without its sign? A fit needs the sign; leave it out with --ignore {c}.")
@@ -452,9 +451,7 @@ def magnitudes(run: Experiment) -> str | None:
               "omega": (800.0 if "omega" in run.meta.get("assumed_units", ()) else 3000.0, "rad/s", "rpm")}
     for channel, (limit, unit, likely) in limits.items():
         values = run.inputs.get(channel, run.outputs.get(channel))
-        if values is None or run.units[channel] != unit:
-            continue
-        if (top := float(np.nanmax(np.abs(values)))) > limit:
+        if values is not None and run.units[channel] == unit and (top := float(np.nanmax(np.abs(values)))) > limit:
             was = f" (read as {stated[channel]})" if channel in stated else ""
             if channel == "v" and stated.get(channel, "")[:1].isdigit():
                 return (f"v reaches {top:.4g} V{was}: that unit is the voltage of a whole duty cycle. Is the column in "

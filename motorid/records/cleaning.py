@@ -7,7 +7,6 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from motorid.channels import MEASURED_INPUTS
 from motorid.display.numbers import counted
 from motorid.errors import DataError
 from motorid.numerics.signals import Array, repeats
@@ -35,11 +34,13 @@ def run_from_columns(columns: Mapping[str, Array], texts: Texts, layout: Layout,
     first = _first_input(values["v"][rows], places["v"].column, said)
     rows, t = rows[first:], t[first:]
     values = {c: a[rows] for c, a in values.items()}
-    empty = [c for c in MEASURED_INPUTS if c in values and np.isnan(values[c]).all()]
+    empty = [c for c, a in values.items() if np.isnan(a).all()]
     said += [f"left out '{places[c].column}' ({c}): every sample is missing." for c in empty]
     inputs = {c: _filled_forward(values[c], places[c].column, said) for c in INPUTS if c in values and c not in empty}
     values = {c: a for c, a in values.items() if c not in INPUTS}
-    outputs = {c: a for c, a in values.items() if _has_values(c, a, places[c].column, said)}
+    outputs = {c: a for c, a in values.items() if c not in empty}
+    said += [f"'{places[c].column}' ({c}) is missing in {np.count_nonzero(np.isnan(a))} of {len(a)} rows."
+             for c, a in outputs.items() if np.isnan(a).any()]
     if not outputs:
         raise DataError(f"every sample of {', '.join(repr(places[c].column) for c in values)} is "
                         "missing; there is nothing measured to fit.")
@@ -194,15 +195,6 @@ def _filled_forward(v: Array, column: str, said: list[str]) -> Array:
                 "it was held from the last known value.")
     first = int(np.argmin(missing))  # before it only what is measured beside the voltage may be missing
     return v[np.maximum.accumulate(np.where(missing, first, np.arange(len(v))))]
-
-
-def _has_values(channel: str, values: Array, column: str, said: list[str]) -> bool:
-    missing = np.isnan(values)
-    if missing.all():
-        said.append(f"left out '{column}' ({channel}): every sample is missing.")
-    elif missing.any():
-        said.append(f"'{column}' ({channel}) is missing in {np.count_nonzero(missing)} of {len(values)} rows.")
-    return not missing.all()
 
 
 def _note_gaps(t: Array, said: list[str]) -> None:

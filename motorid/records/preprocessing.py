@@ -106,8 +106,10 @@ def without_spikes(t: Array, y: Array, v: Array, inert: bool = False) -> Array:
     Single ones, of which a few may be chance; of what is `inert`, short bursts too. A large share is no accident: it is
     left.
     """
+    if np.isfinite(y).sum() < FEWEST:
+        return y
     at = at if len(at := spikes(t, y, v)) >= LEAST else at[:0]
-    at = np.union1d(at, bursts(t, y, v)) if inert else at
+    at = np.union1d(at, bursts(t, y, v)) if inert and np.ptp(v) > 0 else at  # a step shows how fast the motor is
     if not 0 < len(at) <= MOST * len(t):
         return y
     y = y.copy()
@@ -122,8 +124,6 @@ def bursts(t: Array, y: Array, v: Array) -> NDArray[np.intp]:
     From rest and back to it, it slips; what rings swings back by less than half, or again by more than half of that.
     """
     seen = np.flatnonzero(np.isfinite(y))
-    if len(seen) < FEWEST or np.ptp(v) == 0:  # no voltage that shows how fast the motor is
-        return np.empty(0, int)
     changes, level = np.diff(y[seen]), np.append(0, np.cumsum(np.abs(np.diff(v)) > 0.02 * np.ptp(v)))  # of the voltage
     sizes, least = np.abs(changes), 12 * noise_level(y, t)
     large = np.flatnonzero(sizes > max(8 * np.quantile(sizes, 0.9), least))
@@ -139,8 +139,6 @@ def bursts(t: Array, y: Array, v: Array) -> NDArray[np.intp]:
 def spikes(t: Array, y: Array, v: Array) -> NDArray[np.intp]:
     """Return which samples of an output stand far from neighbours that agree, not where the voltage jumps."""
     seen = np.flatnonzero(np.isfinite(y))
-    if len(seen) < FEWEST:
-        return np.empty(0, int)
     noise, step = noise_level(y, t), float(np.diff(np.unique(y[seen])).min(initial=np.inf))  # one count is no spike
     before, here, after = y[seen[:-2]], y[seen[1:-1]], y[seen[2:]]
     off, apart = here - (before + after) / 2, np.abs(after - before)

@@ -215,9 +215,8 @@ def _of_table(table: TextTable, columns: Mapping[str, object] | None, units: Map
         labels = [*labels, columns["t"]]
     layout = assign(labels, columns=columns, units=units, unit_row=table.unit_row, values=table.columns)
     parts = tuple(float(m[1]) for m in map(_PART.fullmatch, table.comments) if m)
-    return run_from_columns(table.columns, table.texts, layout, name=name, notes=table.notes,
-                            hold=hold or own.get("hold", "zoh"), sigma=_sigma(own.get("sigma")),
-                            meta={**meta, "parts": parts})
+    return run_from_columns(table.columns, table.texts, layout, name=name, hold=hold or own.get("hold", "zoh"),
+                            sigma=_sigma(own.get("sigma")), meta={**meta, "parts": parts}, notes=table.notes)
 
 
 def _timed(table: TextTable, columns: Mapping[str, object], units: Mapping[str, object],

@@ -7,7 +7,7 @@ import warnings
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import count
+from itertools import count, starmap
 
 import numpy as np
 from numpy.typing import NDArray
@@ -140,8 +140,7 @@ def sniff(body: list[str]) -> tuple[Dialect, int]:
     """Find the dialect under which most cells are numbers, and how many cells a row has."""
     sample = body[max(0, len(body) // 2 - 20):len(body) // 2 + 20]
     best, result = 0.0, (Dialect(",", "."), 1)
-    for delimiter, decimal in _DIALECTS:
-        dialect = Dialect(delimiter, decimal)
+    for dialect in starmap(Dialect, _DIALECTS):
         rows = [dialect.cells(line) for line in sample]
         cells = [c for row in rows for c in row if c.lower() not in MISSING]
         good = sum(map(dialect.is_number, cells))
