@@ -143,18 +143,13 @@ def _level(y: Array) -> NDArray[np.int_]:
     return np.clip(LEVELS * (y - low) / max(high - low, 1e-300), 0, LEVELS - 1).astype(int)
 
 
-def in_parts(fit: Fit) -> bool:
-    """Tell whether a fit looked at parts of its records alone."""
-    return any("part of" in r.meta for r in fit.problem.experiments)
-
-
 def parts_remark(fit: Fit) -> str:
     """Say which part of the records a fit looked at, if not all."""
     used = fit.problem.experiments
     k = used[0].meta.get("every", 1)
     thin = f"One sample of {k} was used: those between differ by noise alone." if k > 1 else ""
     whole = dict(r.meta.get("part of", (r.name, r.n)) for r in used)
-    if not in_parts(fit):
+    if not any("part of" in r.meta for r in used):
         return thin
     share, seconds = _samples(used) / sum(whole.values()), float(np.median([r.duration for r in used]))
     return (f"The records are long: this rests on {len(used)} parts of {seconds:.2g} s, {100 * share:.0f} % of "

@@ -23,7 +23,7 @@ from motorid.diagnosis.input_hypotheses import Reading, better_reading, without_
 from motorid.diagnosis.misspecification import IN_ITS_PLACE, FormGain, Grade, better_forms, grades_of, outdoes, swallows
 from motorid.diagnosis.model_comparison import Node, at_noise, beats, choose, evidence, far, group_of, node_of
 from motorid.diagnosis.predictive_score import is_sure
-from motorid.diagnosis.record_parts import affordable, fitted_to, in_parts, thinned_alike
+from motorid.diagnosis.record_parts import affordable, fitted_to, thinned_alike
 from motorid.diagnosis.refit import BEAM, BEHIND, INTERRUPTED, OUT_OF_TIME
 from motorid.diagnosis.remainder import alone_leaving_noise, beside_leaving_noise
 from motorid.diagnosis.results import Adequacy, Candidate, Ladder, Rung
@@ -366,7 +366,7 @@ def _as_read(fit: Fit, held_out: Sequence[Experiment] | None) -> tuple[Records, 
 def _remembers(found: Climb, whole: Fit, held_out: Sequence[Experiment] | None) -> bool:
     """Tell whether a model with a memory, which begins anew in every part of a record, leaves noise on whole ones: one
     on the way, or the most promising that was refused."""
-    if found.remaining.adequate or not in_parts(found.search.root.fit):
+    if found.remaining.adequate or not any("part of" in r.meta for r in found.search.root.fit.problem.experiments):
         return False
     refused = [c for tried in found.rounds[-1:] for c in tried if c.fit is not None and c.fit.memories]
     refused.sort(key=lambda c: c.gain or 0.0)

@@ -146,7 +146,7 @@ def errors_text(rungs: Sequence[Rung]) -> str:
         return f"{text} Both models lose {listed(lost)} there; {DECIDED}."
     if held_out and _fall(was, is_) <= 0:
         return f"{text} It does not fall over all channels; {DECIDED}."
-    if any(_matters(was[c], is_[c]) for c in was if c not in noise):
+    if any(is_[c] > was[c] * (1 + MATERIAL) for c in was if c not in noise):
         text += f" Over all channels it falls by {percent(_fall(was, is_), 2)}."
     return text
 
@@ -159,8 +159,8 @@ def rises_text(rungs: Sequence[Rung]) -> str:
         kinds = [((moving(a.nrmse), moving(b.nrmse)), "fitted"), (there, "held-out")][:1 if len(rungs) == 2 else 2]
         for (was, is_), where in kinds if there[0] or len(rungs) > 2 else ():
             risen = [c for c in was if is_[c] > was[c]]
-            large = [_changed(b, c, was[c], is_[c]) for c in risen if _matters(was[c], is_[c])]
-            small |= {_name(b, c) for c in risen if not _matters(was[c], is_[c])}
+            large = [_changed(b, c, was[c], is_[c]) for c in risen if is_[c] > was[c] * (1 + MATERIAL)]
+            small |= {_name(b, c) for c in risen if is_[c] <= was[c] * (1 + MATERIAL)}
             told += [f"With '{b.added}' {', '.join(large)} on the {where} runs."] if large else []
         if there[0] and len(rungs) > 2 and _fall(*there) <= 0:
             told.append(f"With '{b.added}' the held-out error does not fall; {DECIDED}.")
@@ -171,10 +171,6 @@ def rises_text(rungs: Sequence[Rung]) -> str:
 def _fall(was: Mapping[str, float], is_: Mapping[str, float]) -> float:
     """Return the relative fall of the error, geometric mean over channels."""
     return 1 - float(np.exp(np.mean([np.log(max(is_[c], 1e-300) / max(e, 1e-300)) for c, e in was.items()])))
-
-
-def _matters(was: float, is_: float) -> bool:
-    return is_ > was * (1 + MATERIAL)
 
 
 def _changed(rung: Rung, c: str, was: float, is_: float) -> str:

@@ -397,13 +397,9 @@ def parameter_cell(fit: Fit, name: str) -> Cell:
 def value_tables(fit: Fit) -> list[Table]:
     """Return the parameters and what follows from them; what is determined goes first."""
     tables = parameter_table(fit), determined_table(fit)
-    return [t for t in (*(tables[::-1] if None in fit.std.values() else tables), per_run_table(fit)) if t is not None]
-
-
-def per_run_table(fit: Fit) -> Table | None:
-    """Return the parameters that are others in every run; None without any."""
     rows = [(name, run, with_error(**own)) for name, runs in fit.per_run.items() for run, own in runs.items()]
-    return Table(("parameter", "run", "value ± std"), rows, "Parameters per run", left=(0, 1, 2)) if rows else None
+    own = Table(("parameter", "run", "value ± std"), rows, "Parameters per run", left=(0, 1, 2)) if rows else None
+    return [t for t in (*(tables[::-1] if None in fit.std.values() else tables), own) if t is not None]
 
 
 def determined_table(fit: Fit) -> Table | None:
