@@ -40,6 +40,7 @@ from motorid.records.experiment import Experiment
 ORDER = ("named", "group", "approximates")  # grades, the surest first
 FITTED_TOO = ("The fitted runs alone leave nothing but noise, and the model that they determine fails on the held-out "
               "ones: these were fitted, too, and none are left to judge by.")
+WHOLE = 10  # times as long as of its parts: what a search on whole records may take, where its end is known
 HALF_AS_GOOD = 0.5  # of the best child's fall: what a second model must reach to be carried along
 
 
@@ -358,22 +359,22 @@ def explored(fit: Fit, validate: Sequence[Experiment] | Experiment | None, effec
 def _as_read(fit: Fit, held_out: Sequence[Experiment] | None) -> tuple[Records, Records]:
     """Return the records as they are, but for spikes, and as they are better read."""
     records = Records(fit, held_out and thinned_alike(fit, held_out))
-    if spikes := without_spikes(records.fit):
-        records = records.read(spikes)
+    records = records.read(spikes) if (spikes := without_spikes(records.fit)) else records
     return records, records.read(reading) if (reading := better_reading(records.fit)) else records
 
 
 def _remembers(found: Climb, whole: Fit, held_out: Sequence[Experiment] | None) -> bool:
     """Tell whether a model with a memory, which begins anew in every part of a record, leaves noise on whole ones: one
-    on the way, or the most promising that was refused."""
-    if found.remaining.adequate or not any("part of" in r.meta for r in found.search.root.fit.problem.experiments):
+    on the way, or the most promising that was refused. Not where these would take more than `WHOLE` times as long."""
+    parts, runs = found.search.root.fit.problem.experiments, whole.problem.experiments
+    long = sum(r.n for r in runs) > WHOLE * sum(r.n for r in parts)
+    if found.remaining.adequate or long or not any("part of" in r.meta for r in parts):
         return False
-    refused = [c for tried in found.rounds[-1:] for c in tried if c.fit is not None and c.fit.memories]
-    refused.sort(key=lambda c: c.gain or 0.0)
-    for fit in (*(node.fit for node in found.path[1:]), *(c.fit for c in refused[-1:])):
+    refused = (c for tried in found.rounds[-1:] for c in tried if c.fit is not None and c.fit.memories)
+    best = max(refused, key=lambda c: c.gain or 0.0, default=None)
+    for fit in (*(node.fit for node in found.path[1:]), best and best.fit):
         with contextlib.suppress(*FAILURES):
-            if fit and fit.memories and at_noise(node_of(
-                    fitted_to(fit, whole.problem.experiments), HeldOut.of(whole, held_out))):
+            if fit and fit.memories and at_noise(node_of(fitted_to(fit, runs), HeldOut.of(whole, held_out))):
                 return True
     return False
 

@@ -11,7 +11,7 @@ from battery.excite import driven, record
 from lab_records import simulated
 
 import motorid as mi
-from motorid.diagnosis import candidates
+from motorid.diagnosis import candidates, stepwise
 from motorid.diagnosis import record_parts as parts
 from motorid.diagnosis.admissibility import objections, samples_within, unresolved
 from motorid.diagnosis.candidates import Search, Stages, library
@@ -316,6 +316,8 @@ def test_what_remembers_is_looked_at_on_whole_records(monkeypatch):
     found = mi.diagnose(whole, runs[2], effects=("freewheel", "coulomb", "quadratic_drag"))
     assert (found.verdict, found.effects) == ("missing", ("freewheel",))
     assert "parts of" not in found.text
+    monkeypatch.setattr(stepwise, "WHOLE", 2)  # these are three times as long
+    assert "parts of" in mi.diagnose(whole, runs[2], effects=("freewheel",)).text
 
 
 @pytest.mark.parametrize(("hertz", "more"), [(60, True), (0.2, False)])
