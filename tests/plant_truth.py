@@ -37,6 +37,7 @@ NUMBERS = {  # one plausible size of every effect
     "driver_coast": {"V_c": 12.0},
     "pwm_coast": {"s_c": 0.8, "V_s": 3.0},
     "driver_current_limit": {"I_lim": 1.0},
+    "driver_voltage_limit": {"V_lim": 1.5},
     "driver_lag": {"T_v": 0.02},
     "driver_slew": {"T_r": 0.03, "V_s": 3.0},
     "supply_sag": {"R_s": 0.5, "V_s": 3.0},

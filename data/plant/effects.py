@@ -88,6 +88,11 @@ def driver_dead_band(m: Motor, V_d: float) -> Hooks:
 
 
 @_known
+def driver_voltage_limit(m: Motor, V_lim: float) -> Hooks:
+    return {"drive": lambda v, w: min(max(v, -V_lim), V_lim)}
+
+
+@_known
 def voltage_offset(m: Motor, V_0: float) -> Hooks:
     return {"drive": lambda v, w: v + V_0}
 

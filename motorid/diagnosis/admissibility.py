@@ -17,6 +17,7 @@ KNOWN = 0.3  # of a parameter, its standard deviation: determined
 MOST_LOST = 0.6  # of the largest voltage that a drop or a dead band may be
 MOST_OFFSET = 0.3  # and an offset, which turns the motor by itself
 HOTTEST = 300.0  # K above the surroundings: enamel of the best class ends at 220 °C
+RUNS_ON = 0.1  # of its highest speed: slower, at the end of a record, is near enough to a stop
 EMPTIED = 1e-2  # of its value before: it has vanished
 LENGTHS = ("rad", "m")  # a gap that runs to its limit is none
 
@@ -43,7 +44,7 @@ def objections(fit: Fit, added: Effect, before: Fit | None = None) -> str:
             if p.vary and physical and sign * limit > 0 and max(sign * v for v in values) > 0.98 * sign * limit:
                 return f"{p.name} runs to {limit:g}, the limit of what is physical"
     why = (_too_large(fit, pars) or _alike(fit, added) or unresolved(fit, added) or _belied(fit, added)
-           or _blurred(fit, added))
+           or _blurred(fit, added) or _run_through(fit, added))
     return why or (_emptied(fit, added, before) if before else "")
 
 
@@ -52,6 +53,17 @@ def _alike(fit: Fit, added: Effect) -> str:
     sizes = [fit.values[p.name] for p in added.parameters if p.null == 0 and p.unit in ("N·m", "N")]
     if added.includes and len(sizes) > 1 and max(sizes) - min(sizes) < MATERIAL * max(sizes):
         return f"its sizes differ by less than {percent(MATERIAL, 1)}: no more than {added.includes[0]}"
+    return ""
+
+
+def _run_through(fit: Fit, added: Effect) -> str:
+    """Say so where the motor runs on through a stop: what stops it makes it stand, or turn back."""
+    for name, sign in (("theta_lo", -1), ("theta_hi", 1)):
+        for s in fit.simulations if name in {p.name for p in added.parameters} else ():
+            omega, beyond = sign * s.states["omega"], np.flatnonzero(sign * (s.states["theta"] - fit.values[name]) > 0)
+            for k in np.split(beyond, np.flatnonzero(np.diff(beyond) > 1) + 1) if len(beyond) else ():
+                if np.min(omega[k[0]:k[-1] + 2]) > RUNS_ON * np.max(np.abs(omega)):
+                    return f"the motor runs on through {name} = {number(fit.values[name], 3)} rad"
     return ""
 
 

@@ -395,16 +395,19 @@ def _in_windows(found: Climb) -> Fit | None:
     """Return the first model's fit in windows, if one that it led to carries small errors too far over whole records.
 
     A pendulum upright says so only with its weight in the model; detents may be refused as the motor rested in others.
-    Where the last model loses a channel, an axis drifts: no force is known so well that its sum is the motion.
+    Where the last model loses a channel, an axis drifts: no force is known so well that its sum is the motion. So it
+    may where a spring draws back what the first one loses: in a position loop that helps, whatever is missing.
     """
     first, last = found.path[0].fit, found.path[-1].fit
     refused = [c for c in (found.rounds[-1] if found.rounds else ()) if c.fit is not None and not c.accepted]
     best = max(refused, key=lambda c: c.gain or 0.0, default=None)
     lost = not follows(last) or last.model.angle_input
     fit = last if lost else best.fit if best is not None and far(last) else None
-    astray = (e.nrmse**2 > UNFOLLOWED and e.misfit > LARGER for e in found.path[-1].predictions.held_out.values())
+    astray = [any(e.nrmse**2 > UNFOLLOWED and e.misfit > LARGER for e in node.predictions.held_out.values())
+              or not follows(node.fit) for node in (found.path[0], found.path[-1])]
     part = in_windows(fit, partial(solve, solver=QUICK, start="model")) if fit and growth(fit) >= TOO_FAR else None
-    if part is None and (not follows(last) or any(astray)):
+    drawn_back = {"spring", "end_stop"} & (found.path[-1].key - found.path[0].key) and astray[0]
+    if part is None and (drawn_back or astray[1]):
         part = in_windows(first, partial(solve, solver=QUICK), drifts=True)
     with contextlib.suppress(*FAILURES):
         return part and solve(part.problem.with_(model=first.model, noise_factors={}))

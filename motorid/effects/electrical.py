@@ -64,6 +64,16 @@ def driver_dead_band(m: Equations, V_d=P(0.2, "V", null=0.0, lower=0.0, doc="hal
     m.replace("v", m.command - ca.fmax(-V_d, ca.fmin(V_d, m.command)))
 
 
+@effect(balance="voltage")
+def driver_voltage_limit(m: Equations, V_lim=P(5.0, "V", null=float("inf"), positive=True, grid=(0.95, 0.8, 0.6, 0.4),
+                                               doc="largest voltage of the driver")):
+    """Saturation of the driver: larger commands than ±V_lim give no more. Åström & Murray, Feedback Systems, 2008.
+
+    Seen in the logs of controllers that ask for more than the supply has: commands beyond it change nothing.
+    """
+    m.voltage -= ca.fmax(m.v - V_lim, 0) - ca.fmax(-m.v - V_lim, 0)
+
+
 OPEN = 1e-6  # V: a command that opens the bridge
 
 

@@ -72,7 +72,7 @@ def speed_offset(m: Equations, w_0=P(0.5, "rad/s", null=0.0, doc="added by the s
 
 
 @effect(balance="sensor")
-def speed_ripple(m: Equations, a_w=P(0.02, "", null=0.0, lower=0.0, upper=1.0, doc="relative amplitude"),
+def speed_ripple(m: Equations, a_w=P(0.02, "", null=0.0, lower=0.0, upper=0.3, doc="relative amplitude"),
                  N_w=P(1.0, "", order=True, vary=False, lower=1.0, doc="periods per turn, from the misfit, then fixed"),
                  phi_w=P(0.0, "rad", periodic=True, doc="phase at theta = 0"),
                  e_w=P(0.0, "", vary=False, lower=0.0, upper=1.0, grid=(0.0, 1.0), doc="1: in the angle too, fixed")):

@@ -11,6 +11,7 @@ from battery.excite import driven, record
 
 import motorid as mi
 from motorid.diagnosis.adequacy import adequacy
+from motorid.diagnosis.admissibility import objections
 from motorid.diagnosis.candidates import Search, Stages
 from motorid.diagnosis.predictive_score import deciding, finer
 from motorid.diagnosis.score_test import rank, score
@@ -270,3 +271,44 @@ def test_what_an_angle_shows_within_a_turn_is_still_asked_of_it(lab):
     fit = mi.fit(mi.dc_motor().fix(R=lab.R, L=lab.L), runs[:2])
     found = mi.diagnose(fit, runs[2:], effects=("cogging", "coulomb", "quadratic_drag"))
     assert found.effects == ("cogging",)
+
+
+def position_loop(step: float, rate: float, seconds: float = 8.0, dt: float = 5e-3) -> mi.Experiment:
+    """A geared motor in a position loop, rad: its bridge adds 0.4 V, it rubs, and `step` is one count of the encoder."""
+    omega = theta = 0.0
+    t, v, y = np.arange(0, seconds, dt), [], []
+    for now in t:
+        y.append(step * np.round(theta / step))
+        v.append(float(np.clip(6 * (np.sin(rate * now) - y[-1]), -12, 12)))
+        for _ in range(10):
+            torque = 0.4 * (v[-1] + 0.4 - 0.4 * omega) / 4 - 2e-3 * omega - 0.05 * np.tanh(omega / 0.05)
+            omega += dt / 10 * torque / 4e-3
+            theta += dt / 10 * omega
+    return mi.Experiment(t=t, inputs={"v": np.array(v)}, outputs={"theta": np.array(y)})
+
+
+def test_what_draws_a_drifting_axis_back_is_not_named_for_it():
+    """In a position loop an angle that is simulated drifts; a spring or stops help, whatever is missing."""
+    runs, check = [position_loop(0.06, 2.0)], [position_loop(0.06, 1.6)]
+    tried = ("coulomb", "coulomb_asymmetric", "spring", "end_stop", "gravity", "speed_ripple")
+    found = mi.diagnose(mi.fit(mi.dc_motor(), runs), check, effects=tried)
+    assert not {"spring", "end_stop", "gravity", "speed_ripple"} & set(found.effects)
+    assert found.after.window is not None
+
+
+def test_a_command_beyond_the_supply_is_a_voltage_limit_and_no_stop(rng):
+    """Of the speed alone: what no longer rises with the command was 'end stops' at thousands of radians."""
+    t = np.arange(0, 8, 5e-3)
+    runs = []
+    for v in (np.repeat([2, 5, 8, 11, 14, 17, 20, 6.0], 200), 2.5 * t):
+        omega, y = 0.0, []
+        for volts in np.minimum(v, 12.0):
+            y.append(omega)
+            omega += 5e-3 * (20 * max(volts - 0.7, 0.0) - omega) / 0.1
+        runs.append(mi.Experiment(t=t, inputs={"v": v}, outputs={"omega": np.array(y) + rng.normal(0, 1.0, len(t))}))
+    fit = mi.fit(mi.dc_motor(), runs)
+    found = mi.diagnose(fit)
+    assert found.effects[0] == "driver_voltage_limit"
+    assert found.after.values["V_lim"] == pytest.approx(12, rel=5e-3)
+    stopped = mi.fit(mi.dc_motor() + mi.effects.end_stop, runs)
+    assert objections(stopped, mi.effects.end_stop).startswith("the motor runs on through theta_hi")

@@ -43,6 +43,7 @@ TRUTH = {
     "slip_clutch": {"r_slip": 0.5, "tau_slip": 0.03, "omega_slip": 2.0, "b_slip": 2e-5},
     "freewheel": {"r_free": 0.5, "g_free": 500.0, "b_free": 2e-5, "side": 1.0},
     "driver_current_limit": {"I_lim": 2.5},
+    "driver_voltage_limit": {"V_lim": 5.0},
     "driver_lag": {"T_v": 6e-3},
     "driver_slew": {"T_r": 0.04, "V_s": 8.0, "V_w": 0.3},
     "supply_sag": {"R_s": 0.4, "V_s": 8.0},
