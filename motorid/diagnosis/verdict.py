@@ -61,7 +61,8 @@ def unexplained_text(ranking: Sequence[Candidate], rungs: Sequence[Rung], grades
     if grades:
         curve = f"{like}, which the library lacks, predicts better in its place"  # the same in few words
         helps = approximations_text(grades).replace(curve, "a free curve predicts better")
-        return f"{lead} {helps} {errors_text(rungs)} {_left(rungs[-1].fit, remaining)}"
+        law = next((f" Nearest: {_described(rungs[-1].fit, g.effect)}." for g in grades if g.form), "")
+        return f"{lead}{law} {helps} {errors_text(rungs)} {_left(rungs[-1].fit, remaining)}"
     best = max((c for c in ranking if c.refit_drop is not None), key=lambda c: c.refit_drop or 0.0, default=None)
     if best is None or (best.refit_drop or 0) <= 0.05:
         return lead

@@ -275,7 +275,8 @@ def _noisy(run: Experiment) -> str | None:
         size, noise = float(np.nanstd(y)), min(noise_level(y, run.t), _beside_voltage(run, y))
         if noise > 0.5 * size > 0:
             return (f"the {NAMES[channel]} is mostly noise (RMS {min(noise, size):.2g} of {size:.2g} "
-                    f"{run.units[channel]}) and tells a fit little. Drive the motor harder or filter before sampling.")
+                    f"{run.units[channel]}) and tells a fit little. Drive the motor harder, filter before sampling, "
+                    f"or leave it out: --ignore {channel}.")
     return None
 
 

@@ -274,7 +274,7 @@ def test_what_an_angle_shows_within_a_turn_is_still_asked_of_it(lab):
 
 
 def position_loop(step: float, rate: float, seconds: float = 8.0, dt: float = 5e-3) -> mi.Experiment:
-    """A geared motor in a position loop, rad: its bridge adds 0.4 V, it rubs, and `step` is one count of the encoder."""
+    """A geared motor that rubs in a position loop, rad; its bridge adds 0.4 V, its encoder counts by `step`."""
     omega = theta = 0.0
     t, v, y = np.arange(0, seconds, dt), [], []
     for now in t:
