@@ -98,8 +98,7 @@ _Thing = TypeVar("_Thing", bound=Callable[..., Any])
 _SCALAR = {"float", "int", "bool", "str", "None"}
 _PLAIN = _SCALAR | {"Sequence", "Iterable", "Mapping", "tuple", "Callable", "Map", "Callback", "object", "Any"}
 _KINDS: dict[str, Any] = {**dict.fromkeys(("Path", "PathLike", "Path_"), (str, os.PathLike)), "Mapping": Mapping,
-                          **dict.fromkeys(("Callable", "Map", "Callback"), Callable), "Records": object,
-                          "Link": _Wire,
+                          **dict.fromkeys(("Callable", "Map", "Callback"), Callable), "Records": object, "Link": _Wire,
                           **dict.fromkeys(("Sequence", "Iterable", "tuple", "Array", "ArrayLike"), Iterable)}
 _choices = functools.cache(functools.partial(re.split, r" \| (?![^\[]*\])"))  # what an annotation allows
 

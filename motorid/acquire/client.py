@@ -84,16 +84,14 @@ class Client:
                         return item.fields
                     elif item.fields[:2] == ["E", "refused"]:
                         raise DeviceError(f"the device refuses '{command}': {','.join(item.fields[2:])}.")
-        silent = f"the device did not answer '{command}' within {within:g} s."
-        raise DeviceError(self._nobody() if command == "?" else silent)
-
-    def _nobody(self) -> str:
-        seen, bad = self.decoder.seen, sum(self.decoder.bad.values())
-        if not seen:
-            return (f"nothing answered within {BOOT:g} s. Is it the right port, and does the board run the "
-                    "motorid firmware?")
+        if command != "?":
+            raise DeviceError(f"the device did not answer '{command}' within {within:g} s.")
+        if not self.decoder.seen:
+            raise DeviceError(f"nothing answered within {BOOT:g} s. Is it the right port, and does the board run the "
+                              "motorid firmware?")
+        bad = any(self.decoder.bad.values())
         why = "none of it in the protocol. Is the baud rate right?" if bad else "but no header came."
-        return f"no bench answered within {BOOT:g} s: {seen} bytes came, {why}"
+        raise DeviceError(f"no bench answered within {BOOT:g} s: {self.decoder.seen} bytes came, {why}")
 
 
 def _complete(fields: list[str]) -> bool:

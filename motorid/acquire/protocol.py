@@ -208,17 +208,13 @@ class Decoder:
 
 
 def _read(body: bytes) -> Sample | Message | None:
-    if not body.startswith(b"D,"):
-        try:
-            return Message(printable(body.decode("ascii")).split(","))
-        except UnicodeDecodeError:
-            return None
-    _, counter, time, *raw = body.split(b",") if body.count(b",") >= 3 else (b"", b"-", b"-")
-    if not (counter.isdigit() and time.isdigit()):
-        return None
     try:
-        values = tuple([float(r) if r else math.nan for r in raw])
-    except ValueError:
+        if not body.startswith(b"D,"):
+            return Message(printable(body.decode("ascii")).split(","))
+        _, counter, time, *raw = body.split(b",")
+        values = [float(r) if r else math.nan for r in raw]
+    except ValueError:  # no number, too few of them, or not ASCII
         return None
     known = tuple([r if math.isfinite(r) else math.nan for r in values])
-    return Sample(int(counter), int(time), known) if any(map(math.isfinite, values)) else None
+    good = counter.isdigit() and time.isdigit() and any(map(math.isfinite, values))
+    return Sample(int(counter), int(time), known) if good else None

@@ -102,8 +102,7 @@ class RecordFile:
                             "Record into another file.")
         self._disk = Appender(out, mode)
         self.note(meta)
-        if not tail:
-            self._pending.append(self.columns + "\n")
+        self._pending += [] if tail else [self.columns + "\n"]
         try:
             self.flush()
         except OSError as error:

@@ -109,10 +109,9 @@ def record(port: str | Link, out: str | Path, *, baud: int = 115_200, excite: st
             most = {"v": abs(kept.scale / told.scale) * (1.01 * limits[0] + beside), "i": limits[1]}
             if tail:
                 _begin_part(file, tail, len(whole.segments) - len(todo.segments))  # before anything moves
-            session = Session(client, header, file, len(todo.segments), commanded, most,
-                              min((e for e in (todo.duration, duration) if e), default=None), duration,
-                              max(timeout, 4 / header.rate), progress)
-            return session.run()
+            total = min((e for e in (todo.duration, duration) if e), default=None)
+            return Session(client, header, file, len(todo.segments), commanded, most, total, duration,
+                           max(timeout, 4 / header.rate), progress).run()
         finally:
             with contextlib.suppress(OSError):  # told already, where it matters
                 file.close()
@@ -136,10 +135,8 @@ def _head(port: str | Link, header: Header, whole: Program, limits: tuple[float,
 
 
 def _left(whole: Program, tail: Tail) -> Program:
-    """Return what a record lacks of the whole program; UsageError if it lacks nothing.
-
-    The segment that was interrupted is repeated from its start, since the motor stood still meanwhile.
-    """
+    """Return what a record lacks of the whole program; UsageError if it lacks nothing. The segment that was interrupted
+    is repeated from its start, since the motor stood still meanwhile."""
     left = Program(whole.segments[int(tail.meta.get("segments done", 0)):], whole.words).after(
         tail.time - float(tail.meta.get("part begins", 0)))
     if tail.meta.get("ended") == "done" or (whole.segments and not left.segments):

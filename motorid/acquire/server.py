@@ -77,10 +77,8 @@ class _Bench:
             self.over = True
 
     def _due(self, now: float) -> int:
-        """Number of samples to make now.
-
-        A bench that was kept from running makes up for it as fast as it is read: late is not lost.
-        """
+        """Number of samples to make now. A bench that was kept from running makes up for it as fast as it is read: late
+        is not lost."""
         rate, stalled = self.device.header.rate, now - self.read_at > STALLED
         if not self.pace.speed:
             return 0 if self.out else 100

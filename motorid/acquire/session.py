@@ -38,8 +38,7 @@ SENTENCES = {
     "unplugged": "The device is gone (unplugged, or its port was closed). Plug it in again and continue with --resume.",
     "silent": "The device stopped sending. Check its power, then continue with --resume.",
     "restarted": "The device restarted during the run (a reset, or its supply failed). Continue with --resume.",
-    "disk": "The disk refused the data; the motor was stopped. Make room, then continue with --resume.",
-}
+    "disk": "The disk refused the data; the motor was stopped. Make room, then continue with --resume."}
 COMPLETE = ("done", "duration", "interrupted")
 
 

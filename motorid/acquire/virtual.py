@@ -71,8 +71,7 @@ class VirtualDevice:
         """Make up to n samples and return their frames; the last one is followed by ``E,done``."""
         frames: list[bytes] = []
         while self.running and len(frames) < n:
-            over = self._made >= self._length and self._segments
-            frames.append(self._stop("end") if over else self._sample())
+            frames.append(self._stop("end") if self._made >= self._length and self._segments else self._sample())
             if self._over >= OVER_LIMIT:
                 frames.append(self._stop("limit"))
         return frames

@@ -174,10 +174,8 @@ class _OrderSearch:
     slow: Array
 
     def shares(self, lowest: int, kind: str) -> tuple[Array, list[Line]]:
-        """Return about what each order explains, and exactly the lines of those that explain most.
-
-        How much the outputs answer is worked out for a few orders; between them it follows what is put in.
-        """
+        """Return about what each order explains, and exactly the lines of those that explain most. How much the outputs
+        answer is worked out for a few orders; between them it follows what is put in."""
         orders = self.orders[lowest - 1 :]
         few = np.unique(np.geomspace(1, len(orders), SAMPLED).round().astype(int) - 1)
         lines, sizes = self.exact(orders[few], kind)

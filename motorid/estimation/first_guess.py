@@ -193,9 +193,7 @@ class _Loads(NamedTuple):
 
     def integrals(self, s: Mapping[str, Array], base: Mapping[str, float]) -> list[Array]:
         """Return the integral over time of the torque against the motion per unit of each load, along the signals `s`.
-
-        `base` are the values of the base parameters; those of effects are taken at their null, shapes as they are.
-        """
+        `base` are the values of the base parameters; those of effects are taken at their null, shapes as they are."""
         if not self.loads:
             return []
         system, zero = self.model.system(("omega",)), np.zeros(len(s["v"]))

@@ -90,11 +90,9 @@ def remarks(fit: Fit) -> list[str]:
 
 
 def _of_no_motor(fit: Fit) -> list[str]:
-    """Say what no winding can be, whatever its size, turns or gear: a sign of a wrong unit.
-
-    Copper of density D and resistivity ρ in a field B has J ≥ D·V·r² and K²/R ≤ B²·V·r²/ρ, so R·J/K² is at least
-    D·ρ/B². The flux of the winding, L·v/R, over that of the magnets, K, is the angle turned without load in L/R.
-    """
+    """Say what no winding can be, whatever its size, turns or gear: a sign of a wrong unit. Copper of density D and
+    resistivity ρ in a field B has J ≥ D·V·r² and K²/R ≤ B²·V·r²/ρ, so R·J/K² is at least D·ρ/B². The flux of the
+    winding, L·v/R, over that of the magnets, K, is the angle turned without load in L/R."""
     model, std, p = fit.problem.model, fit.std, fit.values
     if model.base != "dc_motor" or any(std[n] is None for n in ("R", "K")):
         return []

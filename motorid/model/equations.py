@@ -41,8 +41,7 @@ class Equations:
         self._replaced: dict[str, str] = {}
         self.define("smoothing", 1)  # factor on the width of sgn, which suits the speed as it is measured
         self.define("zero", 0)  # of the measured angle
-        self.voltage = ca.SX(0)
-        self.torque = ca.SX(0)
+        self.voltage, self.torque = ca.SX(0), ca.SX(0)
         self.sensors: dict[str, ca.SX] = {}
         self.sgn_width: ca.SX | None = None
         self.symbols: dict[str, ca.SX] = {}

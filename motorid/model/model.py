@@ -18,9 +18,8 @@ from motorid.model.definition import Effect, Parameter
 from motorid.model.equations import Equations, System, build_system
 
 SGN_WIDTH = Parameter("sgn_width", 1e-2, "rad/s", positive=True, vary=False, doc="speed over which sgn(ω) is smoothed")
-LINEAR_UNITS = {"N·m": "N", "rad/s": "m/s", "rad": "m", "kg·m²": "kg", "N·m·s/rad": "N·s/m",
-                "N·m·s²/rad²": "N·s²/m²", "N·m/rad": "N/m", "N·m·s²": "kg", "1/(N·m)": "1/N", "s/rad": "s/m",
-                "N·m/V": "N/V", "N·m/A": "N/A"}
+LINEAR_UNITS = {"N·m": "N", "rad/s": "m/s", "rad": "m", "kg·m²": "kg", "N·m·s/rad": "N·s/m", "N·m·s²/rad²": "N·s²/m²",
+                "N·m/rad": "N/m", "N·m·s²": "kg", "1/(N·m)": "1/N", "s/rad": "s/m", "N·m/V": "N/V", "N·m/A": "N/A"}
 LINEAR_DOCS = {"g": "force per unit of the command; fixed", "J": "moving mass",
                "K": "force and back-EMF constant (V·s/m)"}
 
@@ -324,5 +323,4 @@ BASES = {
                  Parameter("J", 1e-5, "kg·m²", positive=True, doc="moment of inertia")),
     "torque_driven": (Parameter("g", 1.0, "N·m/V", positive=True, vary=False, doc="torque per command; fixed"),
                       Parameter("b", 1e-3, "N·m·s/rad", positive=True, doc="viscous friction"),
-                      Parameter("J", 1e-3, "kg·m²", positive=True, doc="moment of inertia")),
-}
+                      Parameter("J", 1e-3, "kg·m²", positive=True, doc="moment of inertia"))}

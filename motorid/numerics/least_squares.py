@@ -118,8 +118,7 @@ ENDS = {  # status and message
     "stalled": ("stalled", "stalled: no step lowers the cost; the model may be too stiff here. Try another start or "
                            "engine"),
     "limit": ("limit", "stopped after {o.max_iterations} iterations; raise max_iterations or look at "
-                       "identifiability()"),
-}
+                       "identifiability()")}
 PROMISED = 1e-3  # share of the cost that the undamped step may promise at an end without a step
 SLACK = 1.0  # λ above which a small gain does not mean the end: the step was short, not the way
 
@@ -140,8 +139,7 @@ def levenberg_marquardt(residual: Callable[[Array], Array], both: Callable[[Arra
     history, end, enough = [search.cost], "limit", o.patience * o.crawl * o.ftol
     for iteration in range(1, o.max_iterations + 1):
         check_time()
-        before = search.q
-        reason = search.step()
+        before, reason = search.q, search.step()
         if search.q is not before:
             history.append(search.cost)
             if callback is not None:
@@ -189,11 +187,13 @@ class _Search:
         triangle, rotated = _reduce(self.jac[:, free], self.r)
         # The undamped step promises ½‖Qᵀr‖²: while that is much, a place without a better one is no minimum.
         end = "step" if 0.5 * float(rotated @ rotated) <= PROMISED * self.cost else "stalled"
+        longest = o.longest_step * np.where(self.log, 1.0, np.maximum(np.abs(self.q), 1.0))
         while True:
             step = np.zeros(len(self.q))
             step[free] = _inside(triangle, rotated, weight, self.lam, (self.low - self.q)[free],
                                  (self.high - self.q)[free])
-            step = self._shortened(step)
+            step /= max(float(np.max(np.abs(step) / longest)), 1.0)  # no coordinate changes by more than is trusted
+            step = np.clip(self.q + step, self.low, self.high) - self.q
             predicted = -float(g @ step) - 0.5 * float(np.sum((triangle @ step[free]) ** 2))
             small = bool(np.max(np.abs(step) / (np.abs(self.q) + 1.0)) < o.xtol)
             r, cost = _cost(self.residual, self.q + step)
@@ -217,12 +217,6 @@ class _Search:
             self.lam = 100 * max(self.lam, 1e-3)
         return ""
 
-    def _shortened(self, step: Array) -> Array:
-        """Return the step, no coordinate changing by more than is trusted, within the bounds."""
-        longest = self.o.longest_step * np.where(self.log, 1.0, np.maximum(np.abs(self.q), 1.0))
-        step = step / max(float(np.max(np.abs(step) / longest)), 1.0)
-        return np.clip(self.q + step, self.low, self.high) - self.q
-
 
 MANY = 24  # unknowns, of which some are likely to act on a few rows only: the first states of many runs
 ROWS = 256  # that are reduced together then, to a triangle of the unknowns that act there
@@ -244,8 +238,7 @@ def _inside(triangle: Array, rotated: Array, size: Array, lam: float, low: Array
     """Damped step within the box: what would leave it goes on its bound, and the others are solved again."""
     step, loose = np.zeros(len(size)), np.ones(len(size), bool)
     while loose.any():
-        rest = rotated + triangle[:, ~loose] @ step[~loose]
-        step[loose] = _damped(triangle[:, loose], rest, size[loose], lam)
+        step[loose] = _damped(triangle[:, loose], rotated + triangle[:, ~loose] @ step[~loose], size[loose], lam)
         if not (out := loose & ((step < low) | (step > high))).any():
             break
         step[out] = np.clip(step, low, high)[out]

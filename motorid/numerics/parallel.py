@@ -216,8 +216,7 @@ def map_items(function: Callable[[Any, Any], Any], shared: Any, items: Sequence[
     parcel = Parcel.of(shared)
     size = 1 if map is None or map is builtins.map else max(-(-len(items) // MOST_TASKS), 1)
     tasks = [Task(parcel, Parcel.of(items[k:k + size]), function) for k in range(0, len(items), size)]
-    results: list[Any] = []
-    done = 0
+    results, done = [], 0
     with progress(text, total=len(tasks), quiet=quiet) as advance:
         try:
             for way in ([map] if map is not None else []) + [builtins.map]:
@@ -328,5 +327,4 @@ def _watched() -> bool:
 
 def in_jupyter() -> bool:
     """Tell whether this process is the kernel of a notebook."""
-    shell = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()
-    return type(shell).__name__ == "ZMQInteractiveShell"
+    return type(getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()).__name__ == "ZMQInteractiveShell"

@@ -187,7 +187,11 @@ def _of_order(values: Array, times: Array | None, still: NDArray[np.bool_], orde
         size = np.abs(np.sum(_weights(t[whole]) * (y - y[:, :1])[whole], axis=1))
     if not still.any():
         return _typical(size)
-    live, same = ~_at_rest(still, order)[whole], sliding_window_view(still, order)[whole]
+    # At rest, where nothing changes at all, lie the windows of order + 1 samples within a standstill.
+    stretch = np.r_[0, np.cumsum(~still)]
+    first, last = stretch[:-order], stretch[order:]
+    live = ((first != last) | (np.bincount(stretch)[first] < _REST))[whole]
+    same = sliding_window_view(still, order)[whole]
     return 0.0 if not live.any() else _typical(size if step and same[live].mean() > _DITHERED else size[live])
 
 
@@ -199,13 +203,6 @@ def _weights(t: Array) -> Array:
 
 
 _EVENLY = {order: _weights(np.arange(order + 1.0)[None])[0] for order in ORDERS}
-
-
-def _at_rest(still: NDArray[np.bool_], order: int) -> NDArray[np.bool_]:
-    """Tell which windows of order + 1 samples lie in a standstill, where nothing changes at all."""
-    stretch = np.r_[0, np.cumsum(~still)]
-    first, last = stretch[:-order], stretch[order:]
-    return (first == last) & (np.bincount(stretch)[first] >= _REST)
 
 
 def _typical(size: Array) -> float:

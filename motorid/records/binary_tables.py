@@ -51,10 +51,8 @@ def mat_table(data: bytes) -> TextTable:
 
 
 def _check_whole(data: bytes) -> None:
-    """Walk through the bytes of a version 5 file and see whether sizes and types agree.
-
-    SciPy trusts them: a damaged size can end the process, or take all memory, instead of raising an error.
-    """
+    """Walk through the bytes of a version 5 file and see whether sizes and types agree. SciPy trusts them: a damaged
+    size can end the process, or take all memory, instead of raising an error."""
     if (order := {b"IM": "<", b"MI": ">"}.get(data[126:128])) is None:
         return  # version 4 or no MATLAB file at all: SciPy says so without harm
     left = MOST_UNPACKED

@@ -120,10 +120,8 @@ def _dates(cells: Sequence[object], column: str) -> Array:
 
 
 def _rows_in_order(t: Array, column: str, said: list[str]) -> tuple[NDArray[np.intp], Array, list[float]]:
-    """Return the rows with a time that moves on, without repeats, their times, and when it started again.
-
-    What is long enough goes on a step after what was before.
-    """
+    """Return the rows with a time that moves on, without repeats, their times, and when it started again. What is long
+    enough goes on a step after what was before."""
     rows = np.flatnonzero(np.isfinite(t))
     if len(rows) < len(t):
         said.append(f"left out {counted(len(t) - len(rows), 'row')} of {len(t)}: no time is given.")
@@ -137,12 +135,11 @@ def _rows_in_order(t: Array, column: str, said: list[str]) -> tuple[NDArray[np.i
     ahead = (now[1:-1] > now[2:]) & (now[2:] > now[:-2])  # a stamp that jumps ahead and is not followed
     rows = rows[np.r_[True, ~ahead, True]]
     stretches = _stretches(t[rows])
-    longest = max(stretches, key=len)
     again = counted(len(stretches) - 1, "time")
     if len(stretches) > 1 and total < MIN_SAMPLES * len(stretches):  # in disorder, not begun anew
         raise DataError(f"time does not increase: '{column}' goes back {again} in {total} rows. Is it "
                         "the right column? Expected rows in order of time.")
-    long = [rows[s] for s in stretches if len(s) >= MIN_SAMPLES] or [rows[longest]]
+    long = [rows[s] for s in stretches if len(s) >= MIN_SAMPLES] or [rows[max(stretches, key=len)]]
     if len(stretches) > 1:
         used = sum(map(len, long))
         what = f"kept the longest stretch, {used}" if len(long) == 1 else f"a run each time, {used}"

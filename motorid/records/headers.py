@@ -39,8 +39,7 @@ _SPELLINGS = {
     "torque": {1.0: "nm", 1e-3: "mnm", 1e-2: "ncm"},
     "force": {1.0: "n newton", 1e3: "kn"},
     "ratio": {1.0: "1 -", 1e-2: "% percent"},
-    "temperature": {1.0: "degc celsius c k kelvin"},
-}
+    "temperature": {1.0: "degc celsius c k kelvin"}}
 _KNOWN = {word: (dimension, factor) for dimension, sizes in _SPELLINGS.items()
           for factor, words in sizes.items() for word in words.split()}
 _COUNTS = re.compile(r"(?:counts?|cnts?|ticks?|inc|in[ck]rement[es]?|pulses?|impulse|steps?)(/s)?(?::(.*))?")
@@ -111,8 +110,7 @@ _WORDS = {
     "omega": "omega w speed spd velocity velo vel rpm drehzahl geschwindigkeit winkelgeschwindigkeit vitesse "
              "velocidad thetadot phidot qdot posdot dtheta dphi dq qd ω",
     "theta": "theta angle position pos phi q winkel lage drehwinkel posicion encoder enc x weg stroke "
-             "travel displacement hub θ φ",
-}
+             "travel displacement hub θ φ"}
 _CHANNEL = {word: channel for channel, words in _WORDS.items() for word in words.split()}
 _ONLY_LENGTHS = _set("x weg stroke travel displacement hub")
 _LENGTHS = _ONLY_LENGTHS | _set("position pos posicion lage")

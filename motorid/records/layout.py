@@ -60,7 +60,11 @@ def assign(labels: Sequence[str], *, columns: Mapping[str, object] | None = None
     notes += [f"'{c}' looks like the reference of a controller: what drives the model is the voltage; it is not used."
               for c in labels if headers.is_reference(c) and c not in {p.column for p in places.values()}]
     _require(places, labels, values or {})
-    return Layout({c: places[c] for c in DIMENSIONS if c in places}, [*notes, *_assumed(places)])
+    guesses = [f"'{p.column}' as {_MEANING[c]}" for c, p in places.items() if p.score <= 1]
+    plain = [f"{c} ('{p.column}') in {p.unit.symbol}" for c, p in places.items() if not p.stated]
+    notes += [f"took {', '.join(guesses)}, a guess from the headers; override with columns."] if guesses else []
+    notes += [f"no unit stated, assuming {', '.join(plain)}; override with units."] if plain else []
+    return Layout({c: places[c] for c in DIMENSIONS if c in places}, notes)
 
 
 def _named_by_user(labels: Sequence[str], columns: Mapping[str, object], units: Mapping[str, object],
@@ -204,13 +208,6 @@ def _say_which(labels: Sequence[str], channels: Sequence[str], free: Sequence[st
     listed = ", ".join(f"'{c}'" for c in labels[:20]) + (" ..." if len(labels) > 20 else "")
     example = ", ".join(f"'{c}': '{column}'" for c, column in zip(channels, [*free, "...", "...", "..."], strict=False))
     return f"Columns here: {listed}." + (f" Say which is which, e.g. columns={{{example}}}." if channels else "")
-
-
-def _assumed(places: Mapping[str, Place]) -> list[str]:
-    guesses = [f"'{p.column}' as {_MEANING[c]}" for c, p in places.items() if p.score <= 1]
-    plain = [f"{c} ('{p.column}') in {p.unit.symbol}" for c, p in places.items() if not p.stated]
-    told = [f"took {', '.join(guesses)}, a guess from the headers; override with columns."] if guesses else []
-    return told + ([f"no unit stated, assuming {', '.join(plain)}; override with units."] if plain else [])
 
 
 def _default(channel: str) -> Unit:

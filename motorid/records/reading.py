@@ -215,8 +215,12 @@ def _of_table(table: TextTable, columns: Mapping[str, object] | None, units: Map
         labels = [*labels, columns["t"]]
     layout = assign(labels, columns=columns, units=units, unit_row=table.unit_row, values=table.columns)
     parts = tuple(float(m[1]) for m in map(_PART.fullmatch, table.comments) if m)
+    try:
+        sigma = {c: float(s) for c, s in parse_pairs(own["sigma"], "sigma").items()} if own.get("sigma") else {}
+    except ValueError:
+        raise DataError(f"cannot read the noise levels '{own['sigma']}' in its comments.") from None
     return run_from_columns(table.columns, table.texts, layout, name=name, hold=hold or own.get("hold", "zoh"),
-                            sigma=_sigma(own.get("sigma")), meta={**meta, "parts": parts}, notes=table.notes)
+                            sigma=sigma, meta={**meta, "parts": parts}, notes=table.notes)
 
 
 def _timed(table: TextTable, columns: Mapping[str, object], units: Mapping[str, object],
@@ -229,10 +233,3 @@ def _timed(table: TextTable, columns: Mapping[str, object], units: Mapping[str, 
     label = "sample times" + "'" * ("sample times" in table.labels)
     numbers = {**table.columns, label: dt * np.arange(n)}
     return replace(table, columns=numbers), {**columns, "t": label}, {**units, "t": "s"}
-
-
-def _sigma(text: str | None) -> dict[str, float]:
-    try:
-        return {c: float(s) for c, s in parse_pairs(text, "sigma").items()} if text else {}
-    except ValueError:
-        raise DataError(f"cannot read the noise levels '{text}' in its comments.") from None

@@ -36,8 +36,7 @@ _MAGIC = {
     b"MATLAB": "a MATLAB file; give it the ending .mat",
     b"PAR1": "a Parquet file; give it the ending .parquet",
     b"%PDF": "a PDF document",
-    b"\x89PNG": "a picture",
-}
+    b"\x89PNG": "a picture"}
 
 
 @dataclass(frozen=True)
@@ -146,8 +145,7 @@ def sniff(body: list[str]) -> tuple[Dialect, int]:
         good = sum(map(dialect.is_number, cells))
         score = good * good / max(len(cells), 1)
         # A row ends with its last filled cell; a delimiter after that means nothing.
-        widths = Counter(max((k + 1 for k, c in enumerate(row) if c), default=0) for row in rows)
-        width = widths.most_common(1)[0][0]
+        width = Counter(max((k + 1 for k, c in enumerate(row) if c), default=0) for row in rows).most_common(1)[0][0]
         if score > best and width > 1:
             best, result = score, (dialect, width)
     return result

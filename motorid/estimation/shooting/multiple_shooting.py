@@ -216,10 +216,8 @@ def _least_squares(problem: Problem, stages: bool) -> tuple[Problem, Array]:
 
 
 def _under_heavier_penalties(problem: Problem, q: Array) -> Array:
-    """Return values near the constrained solution: penalties on what is violated at `q`, heavier and heavier.
-
-    A current peak is lowered by resistance or by inductance, and the cost has a valley for each.
-    """
+    """Return values near the constrained solution: penalties on what is violated at `q`, heavier and heavier. A current
+    peak is lowered by resistance or by inductance, and the cost has a valley for each."""
     try:
         if max(violations(problem, q).values(), default=0.0) == 0.0:
             return q
