@@ -76,18 +76,11 @@ class _Bench:
         if not self.device.running and self.ran and self.pace.once and now - self.device.heard > SILENCE:
             self.over = True
 
-    def _due(self, now: float) -> int:
-        """Number of samples to make now. A bench that was kept from running makes up for it as fast as it is read: late
-        is not lost."""
-        rate, stalled = self.device.header.rate, now - self.read_at > STALLED
-        if not self.pace.speed:
-            return 0 if self.out else 100
-        if len(self.out) > BUFFER // 2 and not stalled:
-            return 0
-        return min(int((now - self.began) * rate * self.pace.speed) - self.sent, int(0.05 * rate) + 1)
-
     def _run(self, now: float) -> None:
-        rate, n = self.device.header.rate, self._due(now)
+        # A bench that was kept from running makes up for it as fast as it is read: late is not lost.
+        rate, behind = self.device.header.rate, len(self.out) > BUFFER // 2 and now - self.read_at <= STALLED
+        due = min(int((now - self.began) * rate * self.pace.speed) - self.sent, int(0.05 * rate) + 1)
+        n = (0 if behind else due) if self.pace.speed else (0 if self.out else 100)
         if self.unplug_at is not None:
             n = min(n, int(self.unplug_at * rate) - self.sent)
         data = self.wire.carry(self.device.run(n))

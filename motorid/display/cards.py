@@ -111,14 +111,12 @@ class Card:
         return ", ".join([self.title, *(f.text for f in self.flags)])
 
     def __str__(self) -> str:
-        head = "\n".join([self.line, *(t for t in self.text if t)])
-        return "\n\n".join([head, *(str(t) for t in self.tables)])
+        return "\n\n".join(["\n".join([self.line, *(t for t in self.text if t)]), *(str(t) for t in self.tables)])
 
     def to_html(self) -> str:
         """Return HTML that stands by itself, readable on light and dark pages."""
-        flags = " ".join(f.to_html() for f in self.flags)
         parts = [f'<div class="motorid">\n<style>\n{STYLE.read_text("utf-8")}</style>',
-                 f"<p><strong>{escape(self.title)}</strong> {flags}</p>"]
+                 f"<p><strong>{escape(self.title)}</strong> {' '.join(f.to_html() for f in self.flags)}</p>"]
         parts += [f"<p>{escape(t)}</p>" for t in self.text if t]
         parts += [t.to_html() for t in self.tables]
         if self.after:

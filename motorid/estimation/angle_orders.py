@@ -192,8 +192,7 @@ class _OrderSearch:
             shares = (np.abs(pulls) ** 2 - turned) / np.maximum(1 - np.abs(alike) ** 2, ALIKE)
             shares /= np.exp(answer) * put_in * float(self.residual @ self.residual)
         shares = np.where(put_in > 0, shares, 0.0)
-        best = [k for k in np.argsort(-shares)[:LOOKED_AT] if k not in few]
-        lines += self.exact(orders[best], kind)[0]
+        lines += self.exact(orders[[k for k in np.argsort(-shares)[:LOOKED_AT] if k not in few]], kind)[0]
         for line in lines:
             shares[int(line.order) - lowest] = line.share
         return shares[shares > 0], lines

@@ -110,8 +110,7 @@ def _widths(problem: Problem) -> tuple[float, ...]:
     """Return the widths of sgn, wide to narrow; the last is the one that the speeds of the records ask for."""
     width = max(SGN_WIDTH_SHARE * top_speed(problem.experiments), _narrowest(problem))
     ratio = max(WIDEST * top_speed(problem.experiments) / width, 1.0)
-    steps = int(np.ceil(np.log(ratio) / np.log(STEP)))
-    return (*(width * np.geomspace(ratio, 1.0, steps + 1)[:-1]), width)
+    return (*(width * np.geomspace(ratio, 1.0, int(np.ceil(np.log(ratio) / np.log(STEP))) + 1)[:-1]), width)
 
 
 def _at(problem: Problem, width: float | None) -> Problem:
@@ -134,5 +133,4 @@ def _narrower(found: Estimate) -> tuple[float, bool] | None:
     creeps = asked * WORTH_IT < problem.width
     width = max(asked if creeps else narrowest_width(problem.experiments), problem.width / STEP)
     # Below its noise an angle says little: the noise may seem larger than it is.
-    surely = creeps and misfit is not None and misfit > NOISE
-    return (width, surely) if width * WORTH_IT < problem.width else None
+    return (width, creeps and misfit is not None and misfit > NOISE) if width * WORTH_IT < problem.width else None

@@ -88,8 +88,7 @@ def _solve(rows: list[tuple[Array, Array]], names: Sequence[str | Load], held: M
     triangle: Array = np.asarray(np.linalg.qr(np.column_stack([a / norms, b]), mode="r"))
     z = _nonnegative(triangle[:, :-1], triangle[:, -1], np.array([isinstance(n, Load) and n.signed for n in free]))
     # A coefficient that comes out as zero starts where its term would carry a thousandth of the right-hand side.
-    motor = np.array([isinstance(n, str) for n in free])
-    z = np.where(motor, np.maximum(z, FLOOR * np.linalg.norm(b)), z) / norms
+    z = np.where([isinstance(n, str) for n in free], np.maximum(z, FLOOR * np.linalg.norm(b)), z) / norms
     return known | dict(zip(free, z.tolist(), strict=True))
 
 
@@ -204,8 +203,7 @@ class _Loads(NamedTuple):
         quiet["sgn_width"] = WIDE * float(np.max(np.abs(s["omega"]), initial=0.0)) or 1.0
 
         def torque(changes: Mapping[str, float]) -> Array:
-            p = np.array([{**quiet, **changes}[n] for n in system.parameters])
-            return np.asarray(system.balances(x, u, p))[1]
+            return np.asarray(system.balances(x, u, np.array([{**quiet, **changes}[n] for n in system.parameters])))[1]
 
         silence = torque({})
         acts = [silence - torque({load.name: 1.0} | ({load.phase: load.angle} if load.phase else {}))

@@ -396,18 +396,14 @@ def parameter_cell(fit: Fit, name: str) -> Cell:
 
 def value_tables(fit: Fit) -> list[Table]:
     """Return the parameters and what follows from them; what is determined goes first."""
-    tables = parameter_table(fit), determined_table(fit)
-    rows = [(name, run, with_error(**own)) for name, runs in fit.per_run.items() for run, own in runs.items()]
-    own = Table(("parameter", "run", "value ± std"), rows, "Parameters per run", left=(0, 1, 2)) if rows else None
-    return [t for t in (*(tables[::-1] if None in fit.std.values() else tables), own) if t is not None]
-
-
-def determined_table(fit: Fit) -> Table | None:
-    """Return gain, time constants, damping, torques as voltages, as far as the records determine them."""
-    rows = [(d.text, with_error(d.value, d.std, d.unit)) for d in fit.determined.values()]
+    # Gain, time constants, damping, torques as voltages, as far as the records determine them.
+    known = [(d.text, with_error(d.value, d.std, d.unit)) for d in fit.determined.values()]
     if (top := fit.determined.get("no_load_speed")) and top.unit == "rad/s":
-        rows += [("no-load speed in rpm", quantity(top.value * 30 / np.pi, "rpm", 3))]
-    return Table(("what the records determine", "value ± std"), rows, left=(0, 1)) if rows else None
+        known += [("no-load speed in rpm", quantity(top.value * 30 / np.pi, "rpm", 3))]
+    tables = parameter_table(fit), Table(("what the records determine", "value ± std"), known, left=(0, 1))
+    rows = [(name, run, with_error(**own)) for name, runs in fit.per_run.items() for run, own in runs.items()]
+    own = Table(("parameter", "run", "value ± std"), rows, "Parameters per run", left=(0, 1, 2))
+    return [t for t in (*(tables[::-1] if None in fit.std.values() else tables), own) if t.rows]
 
 
 def steady_table(fit: Fit) -> Table | None:
@@ -427,10 +423,9 @@ def constraint_table(fit: Fit, violations: Mapping[str, float] = MappingProxyTyp
     for name in dict.fromkeys([*violations, *multipliers]):
         label, _, unit = name.rpartition(", ")
         m = multipliers.get(name)
-        beyond = [quantity(violations.get(name), unit, 3)] if violations else []
         place = "weighted, not enforced" if m is None else Flag(m.label, "note") if m.active else m.label
         cost = "–" if m is None else f"{number(m.value, 3)} per {m.unit or 'unit'}"
-        rows.append([label or name, *beyond, place, cost])
+        rows.append([label or name, *([quantity(violations.get(name), unit, 3)] if violations else []), place, cost])
     header = ["constraint", *(["largest violation"] if violations else []), "at the solution",
               "multiplier (fall of the cost if relaxed)"]
     return Table(header, rows, "Constraints", left=(0, len(header) - 2)) if rows else None
@@ -484,10 +479,9 @@ def compare(fits: Sequence[Fit], validate: Sequence[Experiment] | Experiment | N
     if not fits:
         raise UsageError("compare() takes a list of fits: mi.compare([fit, better]).")
     held = tuple(None if validate is None else dict(evaluate(f, validate).nrmse) for f in fits)
-    names = list(dict.fromkeys(n for f in fits for n in f.values if n != "sgn_width"))
-    parameters = {n: tuple((f.values[n], f.std[n]) if n in f.values else None for f in fits) for n in names}
+    names = dict.fromkeys(n for f in fits for n in f.values if n != "sgn_width")
     return Comparison(tuple(fits), tuple(f.problem.model.name for f in fits), tuple(dict(f.nrmse) for f in fits), held,
-                      parameters)
+                      {n: tuple((f.values[n], f.std[n]) if n in f.values else None for f in fits) for n in names})
 
 
 def comparison_table(fits: Sequence[tuple[str, Fit]], held_out: Sequence[Mapping[str, float] | None] = ()) -> Table:

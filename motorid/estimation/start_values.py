@@ -107,7 +107,11 @@ def _shaped(problem: Problem, asked: Model) -> Problem:
     """Return the problem started at the best of the shapes of each effect in turn. Phases and resonances have side
     valleys; least squares finds knees, lags and heat capacities by itself."""
     for effect in problem.model.effects:
-        if len(shapes := _shapes(problem, effect, asked)) > 1:
+        sizes, axes = natural_sizes(problem.experiments, problem.model.values), {}
+        for p in _untouched(asked, effect):
+            if (not p.vary and len(p.grid) > 1) or (p.vary and (p.periodic or p.place or p.unit == RESONANCE)):
+                axes[p.name] = np.clip(PHASES if p.periodic else shapes_of(p, sizes), p.lower, p.upper).tolist()
+        if len(shapes := combined(axes)) > 1:
             problem = _led(problem, race([problem.start_at(s) for s in shapes], LOOK))
     return problem
 
@@ -116,16 +120,6 @@ def _led(problem: Problem, best: Estimate | None) -> Problem:
     """Return the problem begun where a race ended, unless it got there only by steps too coarse to see it diverge."""
     led = problem if best is None else problem.start_at(best.values)
     return led if np.isfinite(cost_at(led)) else problem
-
-
-def _shapes(problem: Problem, effect: Effect, asked: Model) -> list[dict[str, float]]:
-    sizes = natural_sizes(problem.experiments, problem.model.values)
-    axes = {}
-    for p in _untouched(asked, effect):
-        kinds = not p.vary and len(p.grid) > 1
-        if kinds or (p.vary and (p.periodic or p.place or p.unit == RESONANCE)):
-            axes[p.name] = np.clip(PHASES if p.periodic else shapes_of(p, sizes), p.lower, p.upper).tolist()
-    return combined(axes)
 
 
 def exchanged_poles(model: Model, effect: Effect) -> list[dict[str, float]]:

@@ -80,8 +80,7 @@ def _error(functions: Mapping[str, ca.Function], record: Mapping[str, Any], m: i
     t, u, fine = np.array(record["t"][:n]), np.array(record["u"])[:, :n], np.array(record["substeps"][:n - 1])
     y, told = (np.array(casadi_file.simulation("walk", functions, t, k, record["held"])(record["s"], u, record["p"])[0])
                for k in (np.full(n - 1, m), fine))
-    span = np.maximum(np.ptp(told, axis=1), 1e-300)
-    error = float((np.abs(y - told).max(axis=1) / span).max())
+    error = float((np.abs(y - told).max(axis=1) / np.maximum(np.ptp(told, axis=1), 1e-300)).max())
     return error if np.isfinite(error) else np.inf
 
 

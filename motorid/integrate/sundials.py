@@ -116,7 +116,7 @@ class _Integrators:
         self.stored = np.array(system.stored)
         self.integrator_of = lru_cache(maxsize=None)(self._integrator)
 
-    def _dae(self) -> dict[str, Any]:
+    def _integrator(self, count: int) -> tuple[ca.Function, ca.Function | None]:
         nx, nu, np_, _ = self.system.sizes
         z, theta = ca.SX.sym("z", nx), ca.SX.sym("theta", np_ + 2 * nu + 1 + nx)
         p, u0, u1, h, scale = ca.vertsplit(theta, np.cumsum([0, np_, nu, nu, 1, nx]).tolist())
@@ -124,12 +124,10 @@ class _Integrators:
         f = self.system.rhs(z * scale, u0 + tau * (u1 - u0), p)
         differential, algebraic = (np.flatnonzero(kind).tolist() for kind in (self.stored, ~self.stored))
         dae = {"x": z[differential], "ode": (f * h / scale)[differential], "p": theta, "t": tau}
-        return dae | {"z": z[algebraic], "alg": f[algebraic]} if algebraic else dae
-
-    def _integrator(self, count: int) -> tuple[ca.Function, ca.Function | None]:
+        dae |= {"z": z[algebraic], "alg": f[algebraic]} if algebraic else {}
         # Times are in steps; the slope of a linear input is only used with count = 1.
-        f = ca.integrator(f"walk{count}", self.plugin, self._dae(), 0.0, list(np.arange(1.0, count + 1)), self.options)
-        return f, f.forward(self.nq) if self.nq else None
+        walk = ca.integrator(f"walk{count}", self.plugin, dae, 0.0, list(np.arange(1.0, count + 1)), self.options)
+        return walk, walk.forward(self.nq) if self.nq else None
 
     def walk(self, grid: Grid, first: int, count: int, x: Array, dx: Array, p: Array, dp: Array | None,
              scale: Array) -> None:

@@ -288,7 +288,9 @@ def progress(text: str, total: float | None = None, *, quiet: bool = False, at_m
     """
     if (outer := _outer.get()) is not None:
         outer(0, text)
-    if quiet or outer is not None or not _watched():
+    # A person sees standard error on a terminal, or in Jupyter; there without ipywidgets Rich warns instead of drawing.
+    if quiet or outer is not None or not (find_spec("ipywidgets") is not None if in_jupyter() else
+                                          getattr(sys.stderr, "isatty", lambda: False)()):
         yield lambda n=1.0, at_work="", done=None, total=None: None
         return
     from rich import progress as rich
@@ -316,13 +318,6 @@ def progress(text: str, total: float | None = None, *, quiet: bool = False, at_m
     finally:
         _outer.reset(token)
         bar.stop()
-
-
-def _watched() -> bool:
-    """Tell whether a person sees standard error: a terminal, or a Jupyter front end."""
-    if in_jupyter():
-        return find_spec("ipywidgets") is not None  # without it Rich warns instead of drawing
-    return bool(getattr(sys.stderr, "isatty", lambda: False)())
 
 
 def in_jupyter() -> bool:

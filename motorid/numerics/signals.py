@@ -160,18 +160,15 @@ def noise_level(y: ArrayLike, t: ArrayLike | None = None) -> float:
     if step == 0 and FEWEST_FRESH <= measured < 0.5 * fresh.size and np.unique(values).size > 0.5 * measured:
         values, times = values[fresh], times[fresh]  # hardly one comes twice: no levels of a coarse counter
     size = float(np.std(values) or np.abs(values).max()) if values.size else 0.0
-    return float(max(_from_differences(values, times, step), step / np.sqrt(12), _FLOOR * size if size > 0 else 1.0))
-
-
-def _from_differences(values: Array, times: Array, step: float) -> float:
     level, gaps, still = np.inf, np.diff(times), np.diff(values) == 0
     even = gaps.size > 0 and np.ptp(gaps) < _EVEN * gaps.mean()
     for order in ORDERS:
         finer = _of_order(values, None if even else times, still, order, step)
         if finer > 0.85 * level:  # no more signal was removed: what is left is noise
-            return level
+            break
         level = finer
-    return level if np.isfinite(level) else 0.0
+    level = level if np.isfinite(level) else 0.0
+    return float(max(level, step / np.sqrt(12), _FLOOR * size if size > 0 else 1.0))
 
 
 def _of_order(values: Array, times: Array | None, still: NDArray[np.bool_], order: int, step: float) -> float:

@@ -46,8 +46,7 @@ STYLE: Mapping[Any, Any] = {
     "axes.edgecolor": MUTED, "xtick.color": MUTED, "ytick.color": MUTED, "axes.prop_cycle": cycler(color=CYCLE),
     "figure.facecolor": PAPER, "axes.facecolor": PAPER, "savefig.facecolor": PAPER, "figure.dpi": 100,
     "savefig.dpi": 150, "svg.fonttype": "none", "axes.formatter.useoffset": False, "axes.formatter.limits": (-4, 5),
-    "text.parse_math": False, "axes.unicode_minus": True, "axes.xmargin": 0.02,
-}
+    "text.parse_math": False, "axes.unicode_minus": True, "axes.xmargin": 0.02}
 
 _detached: ContextVar[bool] = ContextVar("motorid_detached_figures", default=False)
 

@@ -175,7 +175,12 @@ def plot_sensitivities(fit: Fit, *, run: int = 0, names: Sequence[str] | None = 
         step = 0.01 * (abs(fit.values[name]) or problem.scaling.scale[j])
         for ax, c in zip(row, channels, strict=True):
             change = trajectory.dy[:, problem.outputs.index(c), j] / slope[j] * step
-            _sensitivity(ax, record.t, change, problem.runs[run].sigma[c], record.units[c])
+            most, sigma = float(np.max(np.abs(change))) or 1.0, problem.runs[run].sigma[c]
+            style.band(ax, sigma, "noise, ±σ")
+            style.line(ax, record.t, change, color=style.PALETTE["blue"])
+            ax.set(ylim=(-1.2 * most, 1.9 * most), yticks=[0.0], yticklabels=[""])  # room for the words
+            ax.text(0.995, 0.97, f"up to {quantity(most, record.units[c], 2)} = {number(most / sigma, 2)} σ",
+                    transform=ax.transAxes, ha="right", va="top", fontsize=8, color=style.INK)
         row[0].set_ylabel(name, rotation=0, ha="right", va="center")
     for top, bottom, c in zip(axes[0], axes[-1], channels, strict=True):
         top.set(title=f"{style.axis_label(c, record)}: change for +1 %")
@@ -183,15 +188,6 @@ def plot_sensitivities(fit: Fit, *, run: int = 0, names: Sequence[str] | None = 
     axes[0, 0].figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper right")
     axes[0, 0].figure.align_ylabels(axes[:, 0])
     return axes
-
-
-def _sensitivity(ax: Axes, t: Array, change: Array, sigma: float, unit: str) -> None:
-    most = float(np.max(np.abs(change))) or 1.0
-    style.band(ax, sigma, "noise, ±σ")
-    style.line(ax, t, change, color=style.PALETTE["blue"])
-    ax.set(ylim=(-1.2 * most, 1.9 * most), yticks=[0.0], yticklabels=[""])  # room for the words
-    ax.text(0.995, 0.97, f"up to {quantity(most, unit, 2)} = {number(most / sigma, 2)} σ", transform=ax.transAxes,
-            ha="right", va="top", fontsize=8, color=style.INK)
 
 
 @style.styled

@@ -36,7 +36,12 @@ def mat_table(data: bytes) -> TextTable:
     if data.startswith(b"\x89HDF") or b"MATLAB 7.3" in data[:128]:
         raise DataError("it is a MATLAB 7.3 file; save it with save(..., '-v7'), or export CSV.")
     _check_whole(data)
-    arrays = dict(_arrays("", _load(data)))
+    with warnings.catch_warnings(action="ignore"):
+        try:
+            found = scipy.io.loadmat(io.BytesIO(data), simplify_cells=True)
+        except Exception as error:  # a damaged file makes loadmat fail in every way there is
+            raise DataError(f"it cannot be read as a MATLAB file ({_first_line(error)}).") from None
+    arrays = dict(_arrays("", {k: v for k, v in found.items() if not k.startswith("__")}))
     if not arrays:
         raise DataError(f"it holds no numeric arrays of at least {MIN_SAMPLES} samples.")
     lengths = Counter(len(a) for a in arrays.values())
@@ -106,34 +111,22 @@ def _check_matrix(content: bytes, order: str, depth: int) -> None:
     shape = struct.unpack(f"{order}{len(parts[1][1]) // 4}i", parts[1][1])
     _need(min(shape) >= 0 and parts[2][0] in (1, 2, 16))
     count = math.prod(shape)
-    if family in (_CELL, _STRUCT):
-        _check_children(parts[3:], order, count, family == _STRUCT, depth)
+    parts = parts[3:]
+    if family not in (_CELL, _STRUCT):
+        _need(len(parts) == (2 if is_complex else 1))
+        for kind, values in parts:
+            _need(kind in _SIZES and (family == _CHAR or len(values) == count * _SIZES[kind]))
         return
-    _need(len(parts) == (5 if is_complex else 4))
-    for kind, values in parts[3:]:
-        _need(kind in _SIZES and (family == _CHAR or len(values) == count * _SIZES[kind]))
-
-
-def _check_children(parts: list[Element], order: str, count: int, named: bool, depth: int) -> None:
-    if named:
+    if family == _STRUCT:  # length of the names, names
         _need(len(parts) >= 2 and parts[0][0] in _INT32 and len(parts[0][1]) == 4 and parts[1][0] in (1, 2))
         width = struct.unpack(f"{order}i", parts[0][1])[0]
         _need(width > 0 and len(parts[1][1]) % width == 0)
         count *= len(parts[1][1]) // width
         parts = parts[2:]
     _need(len(parts) == count)
-    for kind, content in parts:
+    for kind, inner in parts:
         _need(kind == _MATRIX)
-        _check_matrix(content, order, depth + 1)
-
-
-def _load(data: bytes) -> dict[str, object]:
-    with warnings.catch_warnings(action="ignore"):
-        try:
-            found = scipy.io.loadmat(io.BytesIO(data), simplify_cells=True)
-        except Exception as error:  # a damaged file makes loadmat fail in every way there is
-            raise DataError(f"it cannot be read as a MATLAB file ({_first_line(error)}).") from None
-    return {k: v for k, v in found.items() if not k.startswith("__")}
+        _check_matrix(inner, order, depth + 1)
 
 
 def _arrays(name: str, value: object, depth: int = 0) -> Iterator[tuple[str, np.ndarray]]:

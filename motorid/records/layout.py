@@ -56,7 +56,12 @@ def assign(labels: Sequence[str], *, columns: Mapping[str, object] | None = None
     _named_by_header(places, free, row, notes, [c for c, column in (columns or {}).items() if column is None])
     _last_resorts(places, labels, notes)
     _apply_units(places, labels, units, notes)
-    _settle_counts(places, notes)
+    # An angle in counts of unknown size is left out, unless it is all there is.
+    for channel in [c for c in ("theta", "omega") if c in places and math.isnan(places[c].unit.factor)]:
+        if {"i", "omega", "theta"} & set(places) == {channel}:
+            headers.require_unit(places[channel].unit.label, channel)
+        notes.append(f"left out '{places.pop(channel).column}': it is in encoder counts, and how many make one turn is "
+                     f"not known; to use it, say units={{'{channel}': 'counts:2048'}}.")
     notes += [f"'{c}' looks like the reference of a controller: what drives the model is the voltage; it is not used."
               for c in labels if headers.is_reference(c) and c not in {p.column for p in places.values()}]
     _require(places, labels, values or {})
@@ -163,16 +168,6 @@ def _apply_units(places: dict[str, Place], labels: Sequence[str], units: Mapping
     theta, omega = places.get("theta"), places.get("omega")
     if theta and omega and theta.unit.dimension == "length" and not omega.stated:
         places["omega"] = replace(omega, unit=Unit("linear speed", 1.0, "m/s", "m/s"))
-
-
-def _settle_counts(places: dict[str, Place], notes: list[str]) -> None:
-    """Leave out an angle in counts of unknown size, unless it is all there is."""
-    for channel in [c for c in ("theta", "omega") if c in places and math.isnan(places[c].unit.factor)]:
-        if {"i", "omega", "theta"} & set(places) == {channel}:
-            headers.require_unit(places[channel].unit.label, channel)
-        place = places.pop(channel)
-        notes.append(f"left out '{place.column}': it is in encoder counts, and how many make one turn is not "
-                     f"known; to use it, say units={{'{channel}': 'counts:2048'}}.")
 
 
 def _require(places: Mapping[str, Place], labels: Sequence[str], values: Mapping[str, Array]) -> None:

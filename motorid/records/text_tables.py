@@ -88,8 +88,12 @@ def decode(data: bytes) -> tuple[str, list[str]]:
     for magic, what in _MAGIC.items():
         if data.startswith(magic):
             raise DataError(f"it is {what}.")
+    start = data[:4000]
+    odd, even, half = start[1::2].count(0), start[::2].count(0), max(len(start) // 2, 1)
+    encoding = ("utf-16" if data[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-16-le" if odd > 0.6 * half > even else
+                "utf-16-be" if even > 0.6 * half > odd else "utf-8-sig")
     try:
-        text = data.decode(_encoding(data))
+        text = data.decode(encoding)
     except UnicodeDecodeError:
         text = data.decode("latin-1")
     control = len(_CONTROL.findall(text.rstrip("\0")))
@@ -98,14 +102,6 @@ def decode(data: bytes) -> tuple[str, list[str]]:
     if not control and not text.endswith("\0"):
         return text, []
     return _CONTROL.sub("", text), ["removed control characters; was the logger switched off while writing?"]
-
-
-def _encoding(data: bytes) -> str:
-    if data[:2] in (b"\xff\xfe", b"\xfe\xff"):
-        return "utf-16"
-    start = data[:4000]
-    odd, even, half = start[1::2].count(0), start[::2].count(0), max(len(start) // 2, 1)
-    return "utf-16-le" if odd > 0.6 * half > even else "utf-16-be" if even > 0.6 * half > odd else "utf-8-sig"
 
 
 @dataclass(frozen=True)
@@ -171,7 +167,6 @@ def _header(above: list[str], comments: list[str], dialect: Dialect, width: int,
     def of_units(cells: list[str]) -> bool:
         words = [c for c in cells if c.strip("[]()- ")]
         return bool(words) and sum(parse_unit(c) is not None for c in words) >= 0.5 * len(words)
-
     at = next((k for k in (-1, -2) if len(rows) > -k and of_units(rows[k]) and len(rows[k - 1]) >= width), None)
     units, names = ([], rows[-1]) if at is None else (rows[at], rows[-2] if at == -1 else rows[-1])
     if len(names) < width:

@@ -156,8 +156,7 @@ def _of_ladder(ladder: Ladder) -> Story:
     first, best = ladder.rungs[0].fit, ladder.best
     told = [_data(first.problem.experiments), _steps(ladder), _parameters(first, best),
             _fitted(best, "The last model", before=first if best is not first else None)]
-    return Story("Models of growing detail", ladder.text, (), _error_facts(ladder), told,
-                 first.problem.experiments)
+    return Story("Models of growing detail", ladder.text, (), _error_facts(ladder), told, first.problem.experiments)
 
 
 def _of_fit(fit: Fit, validate: Sequence[Experiment]) -> Story:
@@ -210,10 +209,9 @@ def _fitted(fit: Fit, title: str, *, key: str = "fit", before: Fit | None = None
     caption = "Measured, model, and residual beside the band of the noise."
     caption += " The thin curve is the original model." if before is not None else ""
     alt = f"Measured and modelled channels of {fit.model.title}, with residuals. " + f"NRMSE: {fit.evaluation.words}."
-    text = [f"{fit.model.title}. {fit.verdict} {ended(fit)}"] if told else []
     figures = [_figure(key, caption, alt, "plot_fit", fit, before=before)] if drawn else []
     tables = [*(value_tables(fit) if values else ()), error_table({"": fit.evaluation}, fit.noise)]
-    return Section(key, title, text, (), figures, tables)
+    return Section(key, title, [f"{fit.model.title}. {fit.verdict} {ended(fit)}"] if told else [], (), figures, tables)
 
 
 def _residuals(fit: Fit) -> Section:

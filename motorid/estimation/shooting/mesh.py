@@ -139,8 +139,7 @@ class Mesh:
             x0, dx0 = (states[v.node], inner) if v.node >= 0 else (problem.unknowns.first_state(at, v.run), None)
             if dx0 is None and derivatives:
                 dx0 = np.hstack([np.zeros((nx, nx)), problem.unknowns.first_slopes(at, v.run)])
-            slopes = (dx0, dp) if derivatives else ()
-            found.append(problem.integrator.run(problem.system, v.grid, x0, at.p, *slopes))
+            found.append(problem.integrator.run(problem.system, v.grid, x0, at.p, *((dx0, dp) if derivatives else ())))
         runs = [[t for v, t in zip(self.intervals, found, strict=True) if v.run == k] for k in range(len(problem.runs))]
         return Walk(at, tuple(map(_joined, runs)), tuple(found))
 
@@ -169,8 +168,7 @@ class Mesh:
         states = z[self.nq:].reshape(self.n_nodes, self.nx)
         blocks = []
         for v, traj in ((v, t) for v, t in zip(self.intervals, walk.intervals, strict=True) if v.next >= 0):
-            span = v.grid.t[-1] - v.grid.t[0]
-            factor = np.ones(self.nx) if noise is None else self.scale / (noise * np.sqrt(span))
+            factor = np.ones(self.nx) if noise is None else self.scale / (noise * np.sqrt(v.grid.t[-1] - v.grid.t[0]))
             values = (states[v.next] - traj.x[-1] / self.scale) * factor
             jac = np.zeros((self.nx, 0))
             if traj.dx is not None:

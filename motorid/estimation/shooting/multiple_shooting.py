@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -125,17 +124,15 @@ class MultipleShooting:
 
     def _from_poor_values(self, problem: Problem) -> Array:
         """Return values that a fit finds whose intervals join loosely, then tightly, from poor ones."""
-        best = _lowest([self._roughly(problem, q) for q in _with_resets(problem, self._loosely_joined(problem).q)])
-        # Once the others are right, a parameter that ran off to where nothing depends on it finds its way back.
-        return _lowest([best, *(self._roughly(problem, q) for q in _with_resets(problem, best.q)[1:])]).q
-
-    def _loosely_joined(self, problem: Problem) -> Solved:
-        """Solve with short intervals that need not join."""
+        # With short intervals that need not join.
         every, size = LOOSE
         mesh = Mesh(problem.tuned(noise_factors=_least_noise(problem)), every)
         step = float(np.median([run.experiment.dt for run in problem.runs]))
         mesh = replace(mesh, noise=size * mesh.scale / np.sqrt(every * step))
-        return self._solve(mesh, mesh.joined(problem.start, nodes_from_data(mesh, problem.start)), rough=True)
+        loose = self._solve(mesh, mesh.joined(problem.start, nodes_from_data(mesh, problem.start)), rough=True)
+        best = _lowest([self._roughly(problem, q) for q in _with_resets(problem, loose.q)])
+        # Once the others are right, a parameter that ran off to where nothing depends on it finds its way back.
+        return _lowest([best, *(self._roughly(problem, q) for q in _with_resets(problem, best.q)[1:])]).q
 
     def _roughly(self, problem: Problem, q: Array) -> Solved:
         """Solve from `q` not very far, with one step per sample: a lost parameter may ask for very many."""
@@ -145,10 +142,12 @@ class MultipleShooting:
 
     def _with_refinement(self, problem: Problem, q: Array) -> Solved:
         """Solve, refine the sub-steps at the solution, and again while they do not suffice."""
-        if not problem.fine_enough(q):
-            problem = problem.refined(q)
-        mesh = Mesh(problem, self.every)
-        z = mesh.joined(q, self._nodes(mesh, q))
+        mesh = Mesh(problem if problem.fine_enough(q) else problem.refined(q), self.every)
+        nodes = nodes_from_data if self.warm == "data" else nodes_from_simulation
+        try:
+            z = mesh.joined(q, nodes(mesh, q))
+        except SimulationError:
+            z = mesh.joined(q, nodes_from_data(mesh, q))
         done = self._solve(mesh, z)
         if not problem.constraints and done.worse_than(z):
             return replace(done, result=done.result._replace(z=z, status=KEPT))
@@ -158,12 +157,6 @@ class MultipleShooting:
             finer = replace(done.mesh, problem=done.problem.refined(done.q))
             done = self._solve(finer, done.result.z, done.result, done.history)
         return done
-
-    def _nodes(self, mesh: Mesh, q: Array) -> Array:
-        if self.warm != "data":
-            with suppress(SimulationError):
-                return nodes_from_simulation(mesh, q)
-        return nodes_from_data(mesh, q)
 
     def _with_process_noise(self, problem: Problem, q: Array) -> Solved:
         """Solve with process noise; with ``"auto"`` again until the gaps are as large as was taken."""

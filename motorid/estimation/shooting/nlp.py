@@ -51,7 +51,12 @@ class ShootingNlp:
         rows, columns = places(at.rows)
         self._jac_order = np.lexsort((rows, columns))  # the blocks' entries fill it column by column
         self.jac_pattern = _ccs(rows[self._jac_order], columns[self._jac_order], self.m, self.n)
-        self.hess_pattern, self._hess_mask, self._hess_place = _hessian_pattern(at.residual, self.n)
+        # The upper triangle of the Hessian: which entries of the blocks lie in it, and where they go.
+        rows = np.concatenate([np.repeat(b.columns, len(b.columns)) for b in at.residual])
+        columns = np.concatenate([np.tile(b.columns, len(b.columns)) for b in at.residual])
+        self._hess_mask = rows <= columns
+        keys, self._hess_place = np.unique((columns * self.n + rows)[self._hess_mask], return_inverse=True)
+        self.hess_pattern = _ccs(keys % self.n, keys // self.n, self.n, self.n)
         zero = np.zeros(0 if mesh.noise is not None else mesh.n_nodes * mesh.nx)
         found = mesh.constraints(mesh.walk(z, False))
         self.lower = np.concatenate([zero, *(part.lower[own] for _, part, own in found)])
@@ -143,15 +148,6 @@ class _Function(ca.Callback):
         except SimulationError:  # not a number: IPOPT takes a shorter step
             found = [np.full(s.nnz(), np.nan) for _, s in self._results]
         return [ca.DM(s, np.atleast_1d(v)) for (_, s), v in zip(self._results, found, strict=True)]
-
-
-def _hessian_pattern(blocks: Sequence[Block], n: int) -> tuple[ca.Sparsity, np.ndarray, np.ndarray]:
-    """Return the sparsity of the upper triangle, which entries of the blocks lie in it, and where they go."""
-    rows = np.concatenate([np.repeat(b.columns, len(b.columns)) for b in blocks])
-    columns = np.concatenate([np.tile(b.columns, len(b.columns)) for b in blocks])
-    mask = rows <= columns
-    keys, place = np.unique(columns[mask] * n + rows[mask], return_inverse=True)
-    return _ccs(keys % n, keys // n, n, n), mask, place
 
 
 def _ccs(rows: np.ndarray, columns: np.ndarray, m: int, n: int) -> ca.Sparsity:

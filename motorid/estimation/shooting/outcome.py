@@ -37,8 +37,7 @@ SAID = {
                   "a least-squares fit with warm='model'"),
     "Invalid_Number_Detected": (
         "failed", "the model could not be simulated on the way; bound the parameters with model.bounded(…), or "
-                  "shorten the intervals with every=…"),
-}
+                  "shorten the intervals with every=…")}
 
 
 @dataclass(frozen=True, eq=False)
@@ -241,8 +240,7 @@ def below_steady(problem: Problem) -> str | None:
     steady = [c for c in problem.constraints if isinstance(c, SteadyState)]
     segments = (steady[0] if steady else SteadyState()).segments(problem)
     for s in sorted(segments, key=lambda s: -abs(s.means.get("i", 0.0))):
-        noise = 3 * problem.runs[s.run].sigma.get("i", 0.0) / np.sqrt(s.n)
-        if abs(s.means.get("i", 0.0)) > lowest.limit + noise:
+        if abs(s.means.get("i", 0.0)) > lowest.limit + 3 * problem.runs[s.run].sigma.get("i", 0.0) / np.sqrt(s.n):
             names = " and ".join(c.name for c in (lowest, *steady[:1]))
             return (f"{names} {'contradict one another' if steady else 'contradicts the records'}: run {s.run} holds "
                     f"{abs(s.means['i']):.4g} A from {s.begin:.4g} to {s.end:.4g} s. Raise the limit above that, or "
