@@ -1,7 +1,5 @@
 """Errors for people: every message says what was expected, what came, and what to do; Ctrl-C while a command loads."""
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import inspect

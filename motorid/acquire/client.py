@@ -131,7 +131,15 @@ class SerialLink:
 
     def __init__(self, port: str, baud: int = 115_200) -> None:
         self.port = port
-        self._serial = _open(port, baud)
+        try:
+            import serial
+        except ImportError:
+            raise MissingDependency("recording needs pyserial: pip install pyserial") from None
+        own = {} if "://" in port else {"baudrate": baud, "exclusive": True}
+        try:
+            self._serial = serial.serial_for_url(port, timeout=0.05, write_timeout=1.0, **own)
+        except (OSError, ValueError, TypeError) as error:  # TypeError: an address without its port
+            raise DeviceError(_why_not(port, baud, error)) from None
         self._queue: SimpleQueue[bytes | Exception] = SimpleQueue()
         self._closing = False
         self._lost: LinkLost | None = None
@@ -193,18 +201,6 @@ def _read_once(serial: Any) -> bytes:
     if not data:
         raise OSError(errno.EIO, "closed by the other end")
     return data
-
-
-def _open(port: str, baud: int) -> Any:
-    try:
-        import serial
-    except ImportError:
-        raise MissingDependency("recording needs pyserial: pip install pyserial") from None
-    own = {} if "://" in port else {"baudrate": baud, "exclusive": True}
-    try:
-        return serial.serial_for_url(port, timeout=0.05, write_timeout=1.0, **own)
-    except (OSError, ValueError, TypeError) as error:  # TypeError: an address without its port
-        raise DeviceError(_why_not(port, baud, error)) from None
 
 
 def _why_not(port: str, baud: int, error: Exception) -> str:

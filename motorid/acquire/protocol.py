@@ -190,8 +190,7 @@ class Decoder:
             else:
                 found.append(read)
         keep = buffer.rfind(b"$", end)
-        if keep < 0 or not _UNFINISHED.fullmatch(buffer, keep):
-            keep = len(buffer)
+        keep = keep if keep >= 0 and _UNFINISHED.fullmatch(buffer, keep) else len(buffer)
         self._discard(buffer[end:keep])
         self._rest = buffer[keep:]
         return found

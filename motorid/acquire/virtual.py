@@ -40,7 +40,12 @@ class VirtualDevice:
                  channels: tuple[str, ...] = ("v", *CHANNELS), counter_bits: int = 32,
                  timer_bits: int = 32, counter0: int = 0, time0: int = 0, encoder_bits: int = 32) -> None:
         self.truth, m = truth, truth.motor
-        known = _channels(m, encoder_bits)
+        # A count of a converter has three significant digits, as a header would say it.
+        current, speed = (float(f"{most / 2048:.3g}")
+                          for most in (1.25 * max(m.i_max, m.v_max / m.R), 1.3 * m.no_load_speed))
+        known = {"v": Channel("v", "V", 1e-3), "i": Channel("i", "A", current, 2048, "a12"),
+                 "omega": Channel("omega", "rad/s", speed, 2048, "a12"),
+                 "theta": Channel("theta", "rad", 2 * math.pi / LINES_PER_TURN, 0, f"w{encoder_bits}")}
         for name in channels:
             among(name, known, "channel")
         self.header = Header("virtual motor", rate, tuple(known[c] for c in channels), counter_bits,
@@ -191,15 +196,6 @@ def virtual_bench(effect: str = "random", motor: str = "lab", seed: int = 0, rat
     """
     at_least(0, seed=seed)
     return VirtualLink(VirtualDevice(hide(effect, motor, seed), rate))
-
-
-def _channels(m: Any, encoder_bits: int) -> dict[str, Channel]:
-    """Return the channels; a count of a converter has three significant digits, as a header would say it."""
-    current, speed = (float(f"{most / 2048:.3g}")
-                      for most in (1.25 * max(m.i_max, m.v_max / m.R), 1.3 * m.no_load_speed))
-    return {"v": Channel("v", "V", 1e-3), "i": Channel("i", "A", current, 2048, "a12"),
-            "omega": Channel("omega", "rad/s", speed, 2048, "a12"),
-            "theta": Channel("theta", "rad", 2 * math.pi / LINES_PER_TURN, 0, f"w{encoder_bits}")}
 
 
 def _count(channel: Channel, value: float, noise: float) -> int:

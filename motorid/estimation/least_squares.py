@@ -121,16 +121,14 @@ class _Refining:
 
     def residual_and_jacobian(self, q: Array) -> tuple[Array, Array]:
         if np.max(np.abs(q - self._chosen_at), initial=0.0) > FAR:
-            self._choose(q)
+            self.problem, self._chosen_at = self.problem.refined(q), q
         r, jac = self.problem.residual_and_jacobian(q)
+        # A sgn that the steps jump over makes slopes of nothing.
         if np.max(np.abs(jac), initial=0.0) > WILD * np.linalg.norm(r) and not np.array_equal(q, self._chosen_at):
-            self._choose(q)  # a sgn that these steps jump over makes slopes of nothing
+            self.problem, self._chosen_at = self.problem.refined(q), q
             r, jac = self.problem.residual_and_jacobian(q)
         return r, jac
 
     def suits(self, q: Array) -> bool:
         """Tell whether the sub-steps are right at `q` too: chosen nearby, or still fine enough."""
         return bool(np.max(np.abs(q - self._chosen_at), initial=0.0) < NEAR) or self.problem.fine_enough(q)
-
-    def _choose(self, q: Array) -> None:
-        self.problem, self._chosen_at = self.problem.refined(q), q

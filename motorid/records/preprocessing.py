@@ -126,8 +126,7 @@ def bursts(t: Array, y: Array, v: Array) -> NDArray[np.intp]:
     seen = np.flatnonzero(np.isfinite(y))
     changes, level = np.diff(y[seen]), np.append(0, np.cumsum(np.abs(np.diff(v)) > 0.02 * np.ptp(v)))  # of the voltage
     sizes, least = np.abs(changes), 12 * noise_level(y, t)
-    large = np.flatnonzero(sizes > max(8 * np.quantile(sizes, 0.9), least))
-    found = [(a, b) for a, b in pairwise(large.tolist())
+    found = [(a, b) for a, b in pairwise(np.flatnonzero(sizes > max(8 * np.quantile(sizes, 0.9), least)).tolist())
              if 2 <= b - a <= LONGEST and -2 < changes[a] / changes[b] < -0.5
              and level[seen[b]] == level[seen[a + 1]] < level[max(seen[a] - PEAK, 0)] + 2]
     usual = np.delete(sizes, np.array(found, int).ravel()).max(initial=0.0)

@@ -150,19 +150,15 @@ class Explorer:
                        layout=w.Layout(width="25rem", flex="0 0 auto"))
         shown = w.VBox([self._picture, self._errors], layout=w.Layout(flex="1 1 30rem"))
         side = w.HBox([moved, shown], layout=w.Layout(flex_flow="row wrap", width="100%"))
-        self.widget = w.VBox([side, *self._groups()], layout=w.Layout(width="100%"))
-        self._draw()
-        self._show_controls()
-
-    def _groups(self) -> list[Any]:
-        """Return the ticks by balance, under titles."""
-        w, found = self._w, []
+        ticks = [w.HTML("Effects, with the share of the first fit's squared error that each is predicted to remove; "
+                        "hover for the law.")]
         for balance, title in TITLES.items():
             boxes = [self.boxes[n] for n, e in self._effects.items() if e.balance == balance]
             grid = w.GridBox(boxes, layout=w.Layout(grid_template_columns="repeat(auto-fill, minmax(15rem, 1fr))"))
-            found += [w.HTML(f"<b>{title}</b>"), grid] if boxes else []
-        return [w.HTML("Effects, with the share of the first fit's squared error that each is predicted to remove; "
-                       "hover for the law."), *found]
+            ticks += [w.HTML(f"<b>{title}</b>"), grid] if boxes else []
+        self.widget = w.VBox([side, *ticks], layout=w.Layout(width="100%"))
+        self._draw()
+        self._show_controls()
 
     def _box(self, name: str) -> Any:
         gain = self._gains.get(name, 0.0)

@@ -164,8 +164,10 @@ def _of_fit(fit: Fit, validate: Sequence[Experiment]) -> Story:
     facts = [(f"Error of the {NAMES[c]}", percent(e)) for c, e in fit.nrmse.items()]
     known = [fit.determined[n] for n in ("gain", "time_constant") if n in fit.determined]
     facts += [(q.text.capitalize(), with_error(q.value, q.std, q.unit)) for q in known]
+    figure = _figure("residuals", "Noise alone would leave means of zero against every quantity and no correlation in "
+                     "time.", "Residuals over time and against speed and current", "plot_residuals", fit)
     told = [_fitted(fit, "The fit", told=False), *([_held_out(fit, validate)] if validate else []),
-            _residuals(fit), _data(runs)]
+            Section("residuals", "Residuals", (), (), [figure]), _data(runs)]
     return Story(card.title, " ".join(t for t in card.text if t), card.flags[1:], facts, told, runs)
 
 
@@ -212,13 +214,6 @@ def _fitted(fit: Fit, title: str, *, key: str = "fit", before: Fit | None = None
     figures = [_figure(key, caption, alt, "plot_fit", fit, before=before)] if drawn else []
     tables = [*(value_tables(fit) if values else ()), error_table({"": fit.evaluation}, fit.noise)]
     return Section(key, title, [f"{fit.model.title}. {fit.verdict} {ended(fit)}"] if told else [], (), figures, tables)
-
-
-def _residuals(fit: Fit) -> Section:
-    """What the fit leaves over."""
-    caption = "Noise alone would leave means of zero against every quantity and no correlation in time."
-    figure = _figure("residuals", caption, "Residuals over time and against speed and current", "plot_residuals", fit)
-    return Section("residuals", "Residuals", (), (), [figure])
 
 
 def _held_out(fit: Fit, validate: Sequence[Experiment]) -> Section:

@@ -152,8 +152,7 @@ class Mesh:
             index = problem.measured[k].index
             rows = np.arange(len(r)) if index is None else index
             blocks += self._by_interval(r, jac, self.owner[k][rows // len(problem.outputs)])
-        if self.noise is not None:
-            blocks += self.gaps(z, walk, self.noise)
+        blocks += [] if self.noise is None else self.gaps(z, walk, self.noise)
         if problem.priors:
             r, jac = prior_residual(problem.priors, problem.unknowns, walk.at)
             blocks.append(Block(r, jac, np.arange(self.nq)))
@@ -204,10 +203,9 @@ class Mesh:
 
     def _by_interval(self, values: Array, jac: Array | None, owner: np.ndarray) -> list[Block]:
         """Cut rows with local derivatives (n, nx + nq) where the interval changes."""
-        cuts = [0, *(np.flatnonzero(np.diff(owner)) + 1).tolist(), len(values)]
         wide = np.zeros((len(values), 0)) if jac is None else jac
         return [_present(Block(values[a:b], wide[a:b], self.columns(self.intervals[owner[a]])))
-                for a, b in pairwise(cuts) if b > a]
+                for a, b in pairwise([0, *(np.flatnonzero(np.diff(owner)) + 1).tolist(), len(values)]) if b > a]
 
 
 def _present(b: Block) -> Block:
@@ -288,8 +286,7 @@ class Gaps:
 def gaps_of(mesh: Mesh, z: Array) -> Gaps:
     """Return the gaps at `z`."""
     before = [v for v in mesh.intervals if v.next >= 0]
-    blocks = mesh.gaps(z, mesh.walk(z, False))
-    values = np.array([b.values * mesh.scale for b in blocks]).reshape(-1, mesh.nx)
+    values = np.array([b.values * mesh.scale for b in mesh.gaps(z, mesh.walk(z, False))]).reshape(-1, mesh.nx)
     return Gaps(np.array([v.run for v in before], int), np.array([v.grid.t[-1] for v in before]),
                 np.array([v.grid.t[-1] - v.grid.t[0] for v in before]), mesh.problem.system.states, values)
 
