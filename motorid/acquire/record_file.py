@@ -196,11 +196,8 @@ class Appender:
         self._thread.start()
 
     def append(self, data: bytes) -> None:
-        """Hand whole lines to the operating system.
-
-        If it refuses (the disk is full, say), the file is cut back to the last whole line that fitted, and
-        the OSError passed on; so is trouble that the disk had with earlier lines.
-        """
+        """Hand whole lines to the operating system. If it refuses (the disk is full, say), the file is cut back to the
+        last whole line that fitted, and the OSError passed on; so is trouble that the disk had with earlier lines."""
         if self._trouble:
             raise self._trouble
         written = 0

@@ -126,10 +126,8 @@ class Card:
 
 
 class Shown:
-    """Base of results: each writes its own `card`, shown in a notebook, in a report and as one line anywhere.
-
-    Nothing is computed to show a result. Dataclasses need ``repr=False`` to keep the line.
-    """
+    """Base of results: each writes its own `card`, shown in a notebook, in a report and as one line anywhere. Nothing
+    is computed to show a result. Dataclasses need ``repr=False`` to keep the line."""
 
     def card(self) -> Card:
         """Return what the result shows of itself."""

@@ -68,10 +68,8 @@ class Spectrum:
 
 
 def highest_order(tangent: Tangent) -> int:
-    """Highest order that the samples can show: less than a period per sample for a part of the motion.
-
-    Beyond half a period the samples alias, but along a measured angle each order still has its own pattern.
-    """
+    """Highest order that the samples can show: less than a period per sample for a part of the motion. Beyond half a
+    period the samples alias, but along a measured angle each order still has its own pattern."""
     moving = _moving(tangent)
     return int(np.clip(1.8 * np.pi / np.quantile(moving, SLOW_PART), 0, HIGHEST)) if moving.size else 0
 

@@ -77,10 +77,8 @@ def past_ripples(found: Estimate, effort: LevenbergMarquardt, callback: Callback
 
 
 def sharpened(found: Estimate, effort: LevenbergMarquardt, callback: Callback = None) -> Estimate:
-    """Return the estimate with a narrower sgn, as long as that lowers the cost.
-
-    Where it does not, the creep of a stuck motor does not matter, and a sgn so narrow only makes the model stiff.
-    """
+    """Return the estimate with a narrower sgn, as long as that lowers the cost. Where it does not, the creep of a stuck
+    motor does not matter, and a sgn so narrow only makes the model stiff."""
     while (narrower := _narrower(found)) is not None:
         width, surely = narrower
         problem = found.problem.start_at(found.values).tuned(width=width)

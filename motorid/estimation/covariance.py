@@ -65,10 +65,8 @@ class Certainty:
 
 def certainty(problem: Problem, q: Array, residuals: Array, jacobian: Array, free: Array | None = None,
               method: str = "coloured") -> Certainty:
-    """Return what `residuals` (n,) and `jacobian` (n, k) at solver coordinates `q` say of the unknowns.
-
-    `free` (k, m) are the directions that active constraints leave; ``method="white"`` takes samples as independent.
-    """
+    """Return what `residuals` (n,) and `jacobian` (n, k) at solver coordinates `q` say of the unknowns. `free` (k, m)
+    are the directions that active constraints leave; ``method="white"`` takes samples as independent."""
     among(method, ("coloured", "white"), "method")
     physical = problem.scaling.physical(q)
     limits = ["at its lower limit" if v <= p.lower else "at its upper limit" if v >= p.upper else ""

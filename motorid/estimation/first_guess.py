@@ -154,10 +154,8 @@ WIDE = 0.02  # width of sgn over the highest speed: a measured speed is noise ar
 
 
 class Load(NamedTuple):
-    """One size to be found: parameter `name`, or with `phase` the part at that phase angle.
-
-    `signed`: it may be negative. `ratio`: a share of the motor's torque, not a torque.
-    """
+    """One size to be found: parameter `name`, or with `phase` the part at that phase angle. `signed`: it may be
+    negative. `ratio`: a share of the motor's torque, not a torque."""
 
     name: str
     phase: str = ""

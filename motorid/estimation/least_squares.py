@@ -84,10 +84,8 @@ def least_squares(problem: Problem, effort: LevenbergMarquardt, callback: Callba
 
 
 def cost_at(problem: Problem, q: Array | None = None, *, refine: bool = True) -> float:
-    """Return the cost at `q`, by default the values of the model; infinite where it cannot be simulated.
-
-    The sub-steps are those that suit it (`refine`), or as they are.
-    """
+    """Return the cost at `q`, by default the values of the model; infinite where it cannot be simulated. The sub-steps
+    are those that suit it (`refine`), or as they are."""
     q = problem.start if q is None else q
     try:
         r = (problem.refined(q) if refine else problem).residual(q)

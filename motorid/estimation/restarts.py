@@ -53,10 +53,8 @@ def restarted_where_doubtful(found: Estimate, begin: Problem, effort: LevenbergM
 
 
 def doubtful(found: Estimate, begin: Problem) -> bool:
-    """Tell whether an estimate went far from where it began and ended where it should not.
-
-    That is: without convergence, with a channel poorly explained, or in a direction that the data do not ask for.
-    """
+    """Tell whether an estimate went far from where it began and ended where it should not. That is: without
+    convergence, with a channel poorly explained, or in a direction that the data do not ask for."""
     log, physical = begin.scaling.log, found.problem.scaling.physical(found.q)
     moved = np.log(physical[log] / begin.scaling.physical(begin.start)[log])
     if np.max(np.abs(moved), initial=0.0) < FAR:
@@ -75,10 +73,8 @@ def _shifted(problem: Problem, shift: float, seed: int) -> Problem:
 
 
 def restore_collapsed(found: Estimate, effort: LevenbergMarquardt) -> Estimate:
-    """Return an estimate that collapsed parameters, put back, have led lower, or the same one.
-
-    All are put back together first, then one by one.
-    """
+    """Return an estimate that collapsed parameters, put back, have led lower, or the same one. All are put back
+    together first, then one by one."""
     sd, influence = _deviation(found.problem, found.solution.residual), np.linalg.norm(found.solution.jac, axis=0)
     values = found.values
     parameters = [p for p in found.problem.model.start_at(values).parameters.values() if p.vary]  # inside their limits

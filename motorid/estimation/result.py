@@ -358,10 +358,8 @@ class Failure(Shown):
 
 
 def parameter_table(fit: Fit, before: Fit | None = None) -> Table:
-    """Return the parameters as value ± standard deviation, beside those of another fit where one is given.
-
-    Those that no fit determines share a row; beside another fit what is determined instead follows.
-    """
+    """Return the parameters as value ± standard deviation, beside those of another fit where one is given. Those that
+    no fit determines share a row; beside another fit what is determined instead follows."""
     fits = [f for f in (before, fit) if f is not None]
     pars = [p for p in fit.model.parameters.values() if before is None or p.name != "sgn_width"]
     open_ = [p for p in pars if p.vary and all(f.std.get(p.name) is None for f in fits)]
@@ -414,10 +412,8 @@ def steady_table(fit: Fit) -> Table | None:
 
 
 def constraint_table(fit: Fit, violations: Mapping[str, float] = MappingProxyType({})) -> Table | None:
-    """Return what each true constraint costs to keep, and how far each is violated where that is given.
-
-    `violations` is by name and unit, ``"CurrentLimit(8 A), A"``; relations that are only weighed stand there too.
-    """
+    """Return what each true constraint costs to keep, and how far each is violated where that is given. `violations` is
+    by name and unit, ``"CurrentLimit(8 A), A"``; relations that are only weighed stand there too."""
     multipliers = {f"{m.name}, {m.unit}": m for m in fit.extra.get("multipliers", ())}
     rows = []
     for name in dict.fromkeys([*violations, *multipliers]):

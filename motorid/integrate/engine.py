@@ -59,10 +59,8 @@ def address(a: NDArray | None) -> int | None:
 
 
 class Trajectory(NamedTuple):
-    """What an engine returns: y (N, ny); dy (N, ny, nq) or None; x (N, nx); dx (N, nx, nq) or None.
-
-    `error` (N-1, nx) is the largest error estimate of a step in each interval, where it was asked for.
-    """
+    """What an engine returns: y (N, ny); dy (N, ny, nq) or None; x (N, nx); dx (N, nx, nq) or None. `error` (N-1, nx)
+    is the largest error estimate of a step in each interval, where it was asked for."""
 
     y: Array
     dy: Array | None

@@ -50,10 +50,8 @@ class Colour:
 
 
 def colour_of(parts: Sequence[Array], spent: float = 0.0) -> Colour:
-    """Return the autoregression of residuals, one (N,) per run, NaN where missing.
-
-    The degrees of freedom `spent` by the fit enlarge the variance.
-    """
+    """Return the autoregression of residuals, one (N,) per run, NaN where missing. The degrees of freedom `spent` by
+    the fit enlarge the variance."""
     counts = [int(np.isfinite(p).sum()) for p in parts]
     n = sum(counts)
     most = max(min(HIGHEST_ORDER, int(10 * np.log10(max(n, 1))), n // 4, min(len(p) for p in parts) - 2), 0)
@@ -120,10 +118,8 @@ def _filtered(a: Array, x: Array) -> Array:
 
 
 def autocovariance(parts: Sequence[Array], lags: int) -> Array:
-    """Return the sample autocovariance of residuals, one (N,) per run, at lags 0 … `lags`.
-
-    Missing samples count as zero, the mean too; the divisor, the number of samples, keeps it positive definite.
-    """
+    """Return the sample autocovariance of residuals, one (N,) per run, at lags 0 … `lags`. Missing samples count as
+    zero, the mean too; the divisor, the number of samples, keeps it positive definite."""
     total = np.zeros(lags + 1)
     for r in parts:
         r = np.where(np.isfinite(r), r, 0.0)

@@ -106,10 +106,8 @@ def png_of(axes: Any) -> bytes:
 
 
 def svg_of(draw: Callable[..., Any], *args: Any, name: str, alt: str, **options: Any) -> str:
-    """Draw with `draw`, e.g. `plot_fit`, and return an inline ``<svg>`` element.
-
-    `name` is the prefix of the names inside, unique on the page; `alt` says what the figure shows.
-    """
+    """Draw with `draw`, e.g. `plot_fit`, and return an inline ``<svg>`` element. `name` is the prefix of the names
+    inside, unique on the page; `alt` says what the figure shows."""
     with detached():
         figure = np.ravel(np.asarray(draw(*args, **options), object))[0].figure
     if (engine := figure.get_layout_engine()) is not None:  # once, and not again while saving
@@ -173,10 +171,8 @@ def axis_label(channel: str, run: Experiment | None = None) -> str:
 
 
 def envelope(x: Array, y: Array) -> tuple[Array, Array]:
-    """Return fewer points whose line looks the same: the lowest and highest sample of each stretch.
-
-    Peaks of a single sample stay; a stretch with missing samples keeps a gap.
-    """
+    """Return fewer points whose line looks the same: the lowest and highest sample of each stretch. Peaks of a single
+    sample stay; a stretch with missing samples keeps a gap."""
     x, y = np.asarray(x, float), np.asarray(y, float)
     if len(x) <= POINTS:
         return x, y

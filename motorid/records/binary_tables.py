@@ -29,10 +29,8 @@ Element = tuple[int, bytes]
 
 
 def mat_table(data: bytes) -> TextTable:
-    """Read the numeric arrays of one length from the bytes of a MATLAB file (up to version 7).
-
-    Fields of structures and columns of matrices become columns; of several lengths the most frequent is taken.
-    """
+    """Read the numeric arrays of one length from the bytes of a MATLAB file (up to version 7). Fields of structures and
+    columns of matrices become columns; of several lengths the most frequent is taken."""
     if data.startswith(b"\x89HDF") or b"MATLAB 7.3" in data[:128]:
         raise DataError("it is a MATLAB 7.3 file; save it with save(..., '-v7'), or export CSV.")
     _check_whole(data)

@@ -22,9 +22,7 @@ _LATE = 2  # this many rows in a row may come late before it counts as a new sta
 def run_from_columns(columns: Mapping[str, Array], texts: Texts, layout: Layout, *, name: str, hold: str,
                      sigma: Mapping[str, float], meta: Mapping[str, Any], notes: Sequence[str]) -> Experiment:
     """Make a valid run of the columns of a file: numbers with NaN where missing, and `texts`, which may be dates.
-
-    `notes` and those made here end up in ``meta["notes"]``; a recording was resumed at ``meta["parts"]``, s.
-    """
+    `notes` and those made here end up in ``meta["notes"]``; a recording was resumed at ``meta["parts"]``, s."""
     said = [*notes, *layout.notes]
     columns = {n: np.where(np.isnan(c), np.nan, c) for n, c in columns.items()}  # one of a damaged file may signal
     places = dict(layout.places)

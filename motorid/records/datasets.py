@@ -62,10 +62,8 @@ def truth(name: str) -> dict[str, Any]:
 
 
 def load_plant() -> ModuleType:
-    """The independent motor plant in ``data/plant``: Motor, MOTORS, Plant, simulate, excitations and sensors.
-
-    It is loaded by path, since it is data, not part of the library: it shares no code with the models.
-    """
+    """The independent motor plant in ``data/plant``: Motor, MOTORS, Plant, simulate, excitations and sensors. It is
+    loaded by path, since it is data, not part of the library: it shares no code with the models."""
     if _PLANT in sys.modules:
         return sys.modules[_PLANT]
     path = _root() / "plant" / "__init__.py"

@@ -81,10 +81,8 @@ def check_output(path: str | Path, force: bool = False) -> Path:
 
 
 def write_files(files: Mapping[Path, str | bytes], force: bool = False) -> list[Path]:
-    """Write `files` (str as UTF-8, or bytes) whole or not at all: aside, carried to the disk, then renamed.
-
-    The only way in which outputs are written; `force`: also over files that motorid did not write.
-    """
+    """Write `files` (str as UTF-8, or bytes) whole or not at all: aside, carried to the disk, then renamed. The only
+    way in which outputs are written; `force`: also over files that motorid did not write."""
     targets = [check_output(path, force) for path in files]
     try:
         with contextlib.ExitStack() as aside:
@@ -140,10 +138,8 @@ def plain(value: Any) -> Any:
 
 
 def json_text(contents: Mapping[str, Any], bulk: Mapping[str, Any] | None = None) -> str:
-    """Return JSON that says that motorid wrote it, `bulk` on a line of its own.
-
-    Control characters and lone surrogates are escaped.
-    """
+    """Return JSON that says that motorid wrote it, `bulk` on a line of its own. Control characters and lone surrogates
+    are escaped."""
     signed = plain({"motorid": package_version("motorid"), **contents})
     text = json.dumps(signed, indent=1, ensure_ascii=False, allow_nan=False)
     if bulk is not None:

@@ -48,10 +48,8 @@ _LETTERS = str.maketrans({"°": "deg", "º": "deg", "µ": "u", "μ": "u", "⁻":
 
 
 def parse_unit(text: str) -> Unit | None:
-    """Read a unit such as ``rpm``, ``[deg/s]``, ``counts:2048``, ``0.0049 A`` or ``-1 A``; None if unknown.
-
-    Encoder counts need their number per turn after a colon. A number before the unit scales it, or turns a sign.
-    """
+    """Read a unit such as ``rpm``, ``[deg/s]``, ``counts:2048``, ``0.0049 A`` or ``-1 A``; None if unknown. Encoder
+    counts need their number per turn after a colon. A number before the unit scales it, or turns a sign."""
     label = text.strip("[](){}<> \t")
     if scaled := _SCALED.fullmatch(label):
         unit, factor = parse_unit(scaled[2]), float(scaled[1])

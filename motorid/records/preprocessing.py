@@ -21,9 +21,7 @@ LONGEST = 3  # samples of a burst: a logger's line or two that are lost; longer 
 
 def unwrapped(theta: Array, t: Array, omega: Array | None = None) -> tuple[Array, float, int]:
     """Return an angle (N,) that was taken modulo a turn, or a counter's range, as it went on; the jump, and how many.
-
-    With a measured speed `omega`, rad/s, it may turn by more than half a turn from sample to sample.
-    """
+    With a measured speed `omega`, rad/s, it may turn by more than half a turn from sample to sample."""
     seen = np.flatnonzero(np.isfinite(theta))
     turn, y = 2 * np.pi, theta[seen]
     steps = np.diff(y)
@@ -87,10 +85,8 @@ def levelled(v: Array) -> Array:
 
 
 def delayed(t: Array, v: Array, hold: str, seconds: float, before: float) -> Array:
-    """Return an input that acts `seconds` later, and was `before` before; `hold` says how it goes on between samples.
-
-    A held one is averaged over each step.
-    """
+    """Return an input that acts `seconds` later, and was `before` before; `hold` says how it goes on between samples. A
+    held one is averaged over each step."""
     at = t - seconds
     if hold == "linear":
         return np.interp(at, t, v, left=before)

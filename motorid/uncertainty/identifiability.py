@@ -236,10 +236,8 @@ def _structural_rank(problem: Problem, q: Array, points: int, seed: int) -> int:
 
 
 def basis_in_words(names: Sequence[str], weak: Array, matrix: Array) -> tuple[WeakDirection, ...]:
-    """Return the weak directions with as few parts as possible, and what a step of 10 % along each does.
-
-    `weak` (d, k) has orthonormal rows, `matrix` (n, k) the whitened outputs per relative change.
-    """
+    """Return the weak directions with as few parts as possible, and what a step of 10 % along each does. `weak` (d, k)
+    has orthonormal rows, `matrix` (n, k) the whitened outputs per relative change."""
     found = []
     for row in sparse_basis(weak):
         row = row / row[np.argmax(np.abs(row))]
@@ -274,10 +272,8 @@ def sparse_basis(weak: Array) -> Array:
 
 
 def monomials(names: Sequence[str], weak: Array) -> list[str]:
-    """Return simple products of powers that stay the same along all weak directions, e.g. ``"R·J/K²"``.
-
-    Only parameters that are not determined themselves take part; an independent set, the simplest first.
-    """
+    """Return simple products of powers that stay the same along all weak directions, e.g. ``"R·J/K²"``. Only parameters
+    that are not determined themselves take part; an independent set, the simplest first."""
     involved = [j for j in range(len(names)) if np.linalg.norm(weak[:, j]) > 0.01]
     wanted = len(involved) - np.linalg.matrix_rank(weak[:, involved], tol=0.3)
     if wanted <= 0 or len(involved) > 7:

@@ -32,10 +32,8 @@ DISTURBED = ("i", "omega")  # an unknown voltage, an unknown torque
 
 
 class Interval(NamedTuple):
-    """Samples `first` to `last` of a run; the last belongs to the next interval where there is one.
-
-    `node` and `next` count the nodes of all runs; -1: none (the first state of a run is a function of q).
-    """
+    """Samples `first` to `last` of a run; the last belongs to the next interval where there is one. `node` and `next`
+    count the nodes of all runs; -1: none (the first state of a run is a function of q)."""
 
     run: int
     first: int
@@ -54,10 +52,8 @@ class Block(NamedTuple):
 
 
 class Walk(NamedTuple):
-    """All intervals simulated, and put together run by run.
-
-    Local columns of derivatives are (own node, q), in scaled coordinates. `at` is q in the system's terms.
-    """
+    """All intervals simulated, and put together run by run. Local columns of derivatives are (own node, q), in scaled
+    coordinates. `at` is q in the system's terms."""
 
     at: Point
     runs: tuple[Trajectory, ...]

@@ -190,10 +190,8 @@ def rows_at(problem: Problem, q: Array, relations: Sequence[Any] | None = None, 
 
 
 def violations(problem: Problem, q: Array, relations: Sequence[Any] | None = None) -> dict[str, float]:
-    """Return the largest violation of each relation, beyond its limits, in the unit of its rows.
-
-    Where a relation has rows in several units (voltage and torque), there is one entry for each.
-    """
+    """Return the largest violation of each relation, beyond its limits, in the unit of its rows. Where a relation has
+    rows in several units (voltage and torque), there is one entry for each."""
     found: dict[str, float] = {}
     for name, part, values, _ in rows_at(problem, q, relations):
         beyond = np.abs(part.violation(values)) * part.size
@@ -230,10 +228,8 @@ def summed(found: Sequence[tuple[str, Part, Array, Array]]) -> tuple[tuple[Multi
 
 
 def below_steady(problem: Problem) -> str | None:
-    """Return a sentence if a current limit lies below a current that the records hold steadily; else None.
-
-    Values that keep such a limit exist, but they describe another motor.
-    """
+    """Return a sentence if a current limit lies below a current that the records hold steadily; else None. Values that
+    keep such a limit exist, but they describe another motor."""
     limits = (c for c in problem.constraints if isinstance(c, CurrentLimit))
     if (lowest := min(limits, key=lambda c: c.limit, default=None)) is None:
         return None
