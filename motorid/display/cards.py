@@ -117,8 +117,7 @@ class Card:
         """Return HTML that stands by itself, readable on light and dark pages."""
         parts = [f'<div class="motorid">\n<style>\n{STYLE.read_text("utf-8")}</style>',
                  f"<p><strong>{escape(self.title)}</strong> {' '.join(f.to_html() for f in self.flags)}</p>"]
-        parts += [f"<p>{escape(t)}</p>" for t in self.text if t]
-        parts += [t.to_html() for t in self.tables]
+        parts += [*(f"<p>{escape(t)}</p>" for t in self.text if t), *(t.to_html() for t in self.tables)]
         if self.after:
             steps = " · ".join(f"{escape(what)}: <code>{escape(code)}</code>" for code, what in self.after)
             parts.append(f'<p class="muted">Next: {steps}</p>')

@@ -61,6 +61,8 @@ def report(result: Any, path: str | Path, *, title: str = "", command: str = "",
     --------
     >>> path = mi.report(found, "motor.html")
     """
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
     results = list(result) if isinstance(result, list | tuple) else [result]
     if not results:
         raise UsageError("report needs a result: mi.report(mi.diagnose(fit), 'report.html').")
@@ -72,18 +74,13 @@ def report(result: Any, path: str | Path, *, title: str = "", command: str = "",
     story.sections.append(_provenance(story, command, check))
     if Path(path).suffix.lower() not in (".html", ".htm"):
         raise UsageError(f"a report is an HTML page: '{Path(path).name}' must end in .html (a browser prints it).")
-    return write_files({Path(path): _page(story)}, force)[0]
-
-
-def _page(story: Story) -> str:
-    from jinja2 import Environment, PackageLoader, StrictUndefined
-
     environment = Environment(loader=PackageLoader("motorid.reports", "templates"), autoescape=True,
                               undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     environment.filters["glued"] = glued
     date = datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z")
     page = environment.get_template("report.html").render(story=story, version=package_version("motorid"), date=date)
-    return printable(page)  # control characters in names of files are not HTML
+    # Control characters in names of files are not HTML.
+    return write_files({Path(path): printable(page)}, force)[0]
 
 
 def _provenance(story: Story, command: str, held_out: Sequence[Experiment]) -> Section:
