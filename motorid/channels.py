@@ -1,5 +1,6 @@
 """The channels of a record: their names, what people call them, their SI units, their order."""
 
+import re
 from collections.abc import Mapping
 from types import MappingProxyType
 
@@ -20,6 +21,15 @@ DIMENSIONS: Mapping[str, tuple[str, ...]] = MappingProxyType({
 UNITS = MappingProxyType({c: tuple(SI[d] for d in dimensions) for c, dimensions in DIMENSIONS.items()})
 
 
+_BY_UNIT = {("theta", "m"): "position", ("v", "A"): "current", ("v", "N·m"): "torque", ("v", "N"): "force",
+            ("v", "1"): "command"}
+
+
 def channel_name(channel: str, unit: str = "") -> str:
     """Return what people call a channel: the angle of a linear axis, in m, is its position."""
-    return "position" if channel == "theta" and unit == "m" else NAMES.get(channel, channel)
+    return _BY_UNIT.get((channel, unit), NAMES.get(channel, channel))
+
+
+def worded(text: str, unit: str) -> str:
+    """Return a text on the input v with the name that it has in such a unit: what drives an axis may be no voltage."""
+    return re.sub(r"(?<= )voltage(?=s?[ ,;:.?])", channel_name("v", unit), text)

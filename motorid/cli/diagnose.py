@@ -67,7 +67,7 @@ def diagnose_command(runs: opt.Runs, options: opt.FitOptions, validate: opt.Vali
     """
     records = options.read(runs)
     held_out = options.read(validate) if validate else []
-    notes = opt.notes_of(records, held_out)
+    notes = options.notes(records, held_out)
     before = fit_affordably(records, options.fit)
     own = list(opt.own_effects(options.effects_from).values()) if options.effects_from else []
     done: list[str] = []

@@ -51,7 +51,7 @@ def fit_command(runs: opt.Runs, options: opt.FitOptions, validate: opt.Validate 
     """
     records = options.read(runs)
     held_out = options.read(validate) if validate else []
-    notes = [*filter(None, [repeated(records, held_out)]), *opt.notes_of(records, held_out)]
+    notes = [*filter(None, [repeated(records, held_out)]), *options.notes(records, held_out)]
     found = options.fit(records)
     judged = evaluate(found, held_out) if held_out else None
     if json != "-":
@@ -123,14 +123,14 @@ def _readable(options: opt.FitOptions, files: list[Path]) -> list[Any]:
         return []
 
 
-@opt.with_options(opt.ReadingOptions)
-def check_command(runs: opt.Runs, options: opt.ReadingOptions, json: opt.Json = None) -> None:
+@opt.with_options(opt.DriveOptions)
+def check_command(runs: opt.Runs, options: opt.DriveOptions, json: opt.Json = None) -> None:
     """Show how records are read, column by column, and what looks wrong with them, before any fit.
 
     Example: motorid check run*.csv
     """
     records = options.read(runs)
-    notes = opt.notes_of(records)
+    notes = options.notes(records)
     if json:
         write_json({"runs": [run_dict(r) | {"columns": r.meta.get("columns"), "units": dict(r.units)} for r in records],
                     "notes": notes}, json, options.force)
@@ -138,9 +138,9 @@ def check_command(runs: opt.Runs, options: opt.ReadingOptions, json: opt.Json = 
         show(f"{_amount(records)}. {counted(len(notes), 'remark') if notes else 'No problem found'}.\n")
         say_notes(notes)
         show(*(_channel_table(r) for r in records[:MOST_SHOWN]))
-        driven = ("--drive", "torque") if records[0].units["v"] in ("A", "N·m", "N") else ()
+        torque = options.drive != "torque" and records[0].units["v"] in ("A", "N·m", "N")
         show(f"and {counted(len(records) - MOST_SHOWN, 'more run')}\n" if len(records) > MOST_SHOWN else None,
-             f"Next: {next_command('fit', *driven)}")
+             f"Next: {next_command('fit', *(('--drive', 'torque') if torque else ()))}")
 
 
 def _channel_table(run: Experiment) -> Table:

@@ -1,7 +1,7 @@
 """The options that commands have in common, and what they become: records, a model, a fit.
 
 `FitOptions` holds those of every command that fits, `ReadingOptions` those of every command that reads records;
-`with_options` puts them on a command. Below them: effects and models from the user's files, and remarks on records.
+`with_options` puts them on a command. Below them: effects and models from the user's files.
 """
 
 import functools
@@ -101,7 +101,27 @@ class ReadingOptions:
 
 
 @dataclass(frozen=True)
-class FitOptions(ReadingOptions):
+class DriveOptions(ReadingOptions):
+    """How to read records, and what drives the motor in them."""
+
+    drive: Annotated[str, _model(
+        metavar="voltage|torque",
+        help="torque: a drive that closes its own current loop; v is its command.")] = "voltage"
+
+    def notes(self, runs: Sequence[Experiment], held_out: Sequence[Experiment] = ()) -> list[str]:
+        """Return what a person should know about the records: how they were read, and what looks wrong."""
+        among(self.drive, ("voltage", "torque"), "drive", where="--drive: ")
+        said = reading_notes(runs)
+        if self.drive == "torque":  # its command is no voltage of a winding, in volts or not
+            said += ["the current i is not used: a torque-driven model has none."
+                     ] if any("i" in r.outputs for r in runs) else []
+            runs, held_out = ([r.with_(units={**r.units, "v": r.units["v"].replace("V", "1")}, outputs={
+                c: y for c, y in r.outputs.items() if c != "i"} or r.outputs) for r in of] for of in (runs, held_out))
+        return [*said, *check_runs(runs, held_out)]
+
+
+@dataclass(frozen=True)
+class FitOptions(DriveOptions):
     """What a command that fits may be told: how to read, which model, how to estimate."""
 
     effects: Annotated[str | None, _model(metavar="a,b", help="Effects in the model beside the plain motor.")] = None
@@ -109,9 +129,6 @@ class FitOptions(ReadingOptions):
         metavar="R=1.2", help="Fix parameters at values (SI units); L=0 leaves the inductance out.")] = None
     set_: Annotated[list[str] | None, _model("--set", metavar="R=1.2", help="Values to start from (SI units).")] = None
     free: Annotated[list[str] | None, _model(metavar="g", help="Estimate parameters that are fixed by default.")] = None
-    drive: Annotated[str, _model(
-        metavar="voltage|torque",
-        help="torque: a drive that closes its own current loop; v is its command.")] = "voltage"
     effects_from: Annotated[Path | None, _model(
         metavar="FILE.py", help="Python file with effects of your own (@mi.effect).")] = None
     solver: Annotated[str | None, _solving(
@@ -248,11 +265,6 @@ def make_folder(out: Path) -> None:
     except OSError as error:
         raise UsageError(f"cannot write to {out}: {error.strerror or error}. Choose another folder: --out "
                          "DIR") from None
-
-
-def notes_of(runs: Sequence[Experiment], held_out: Sequence[Experiment] = ()) -> list[str]:
-    """Return what a person should know about the records: how they were read, and what looks wrong."""
-    return [*reading_notes(runs), *check_runs(runs, held_out)]
 
 
 def _words(*texts: str | None) -> list[str]:

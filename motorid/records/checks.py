@@ -8,7 +8,7 @@ from itertools import pairwise, permutations, product
 import numpy as np
 from numpy.typing import NDArray
 
-from motorid.channels import NAMES, channel_name
+from motorid.channels import NAMES, channel_name, worded
 from motorid.display.numbers import quantity
 from motorid.numerics.signals import FEWEST_FRESH, WINDOWS, Array, bridged, integral, noise_level, quantum, slope
 from motorid.records.experiment import Experiment
@@ -71,7 +71,8 @@ def check_runs(runs: Sequence[Experiment], held_out: Sequence[Experiment] = ()) 
         if hits:
             remarks.append(_told_once(hits[0][1], [name for name, _ in hits]))
     scales = _other_scale([*plain, *(run.without_spikes() for run in held_out)])
-    return remarks + [text for text in (_the_same_twice(runs), scales, _never_reverses(runs)) if text]
+    remarks += [text for text in (_the_same_twice(runs), scales, _never_reverses(runs)) if text]
+    return [worded(text, runs[0].units["v"]) for text in remarks]
 
 
 def reading_notes(runs: Sequence[Experiment]) -> list[str]:

@@ -62,9 +62,10 @@ def assign(labels: Sequence[str], *, columns: Mapping[str, object] | None = None
             headers.require_unit(places[channel].unit.label, channel)
         notes.append(f"left out '{places.pop(channel).column}': it is in encoder counts, and how many make one turn is "
                      f"not known; to use it, say units={{'{channel}': 'counts:2048'}}.")
-    notes += [f"'{c}' looks like the reference of a controller: what drives the model is the voltage; it is not used."
-              for c in labels if headers.is_reference(c) and c not in {p.column for p in places.values()}]
     _require(places, labels, values or {})
+    notes += [f"'{c}' looks like the reference of a controller: what drives the model is '{places['v'].column}'; "
+              f"'{c}' is not used." for c in labels if headers.is_reference(c) and c not in {
+                  p.column for p in places.values()}]
     guesses = [f"'{p.column}' as {_MEANING[c]}" for c, p in places.items() if p.score <= 1]
     plain = [f"{c} ('{p.column}') in {p.unit.symbol}" for c, p in places.items() if not p.stated]
     notes += [f"took {', '.join(guesses)}, a guess from the headers; override with columns."] if guesses else []

@@ -429,6 +429,27 @@ def test_check_shows_which_column_is_which_channel_and_what_to_type_next(tmp_pat
     assert "--drive torque" in driven.out.splitlines()[-1]  # however long the path
 
 
+@pytest.mark.parametrize(("unit", "word"), [("Nm", "torque"), ("A", "current"), ("V", "command")])
+def test_check_takes_the_drive_as_fit_does_and_says_what_drives(unit, word, tmp_path, monkeypatch):
+    """It knew no --drive, called a torque a voltage, and took one in volts for the voltage of a winding."""
+    t = np.arange(300) * 0.01
+    rows = zip(t, 1 + np.arange(300) // 30 % 3, 0.01 * t, 1e6 * t, strict=True)
+    path = tmp_path / "rig.csv"
+    path.write_text(f"time_s,drive ({unit}),motor_A,speed (rad/s)\n" + "".join(
+        f"{a:.2f},{b},{c:.5f},{d:.0f}\n" for a, b, c, d in rows))
+    words = ["check", str(path), "--drive", "torque", "--columns", f"v=drive ({unit}),i=motor_A"]
+    monkeypatch.setattr("sys.argv", ["motorid", *words])
+    done = motorid(*words)
+    said = " ".join(done.out.split())
+    assert done.status == 0, done.err
+    assert f"the {word} never reverses in any run" in said
+    assert "voltage" not in said
+    assert "the current i is not used: a torque-driven model has none." in said
+    assert done.out.splitlines()[-1].count("--drive torque") == 1
+    assert "voltage over" not in said
+    assert motorid(*words[:2], "--drive", "tork").status == 2
+
+
 def test_effects_lists_the_library_and_shows_one():
     assert re.search(r"coulomb +torque +dry \(Coulomb\) friction +tau_c", motorid("effects").out)
     shown = motorid("effects", "stribeck")

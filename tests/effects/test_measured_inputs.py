@@ -64,7 +64,8 @@ def test_they_come_with_the_file_and_go_back_into_one(tmp_path, rng):
     assert list(run.inputs) == ["v", "v_supply", "tau_load", "temp"]
     assert run.inputs["tau_load"] == pytest.approx(-0.05 * t, abs=1e-6)
     assert run.inputs["temp"] == pytest.approx(26.85 + t, abs=1e-6)
-    assert any("'speed_ref' looks like the reference of a controller" in n for n in run.meta["notes"])
+    assert any("'speed_ref' looks like the reference of a controller: what drives the model is 'voltage_V'" in n
+               for n in run.meta["notes"])
     again = mi.read_runs(write_csv(run, tmp_path / "again.csv"))[0]
     assert all(np.allclose(again.inputs[c], y) for c, y in run.inputs.items())
     assert "tau_load" in repr(run)
