@@ -137,8 +137,10 @@ def test_a_second_climb_that_is_cut_short_does_not_lose_the_first(plain, monkeyp
 
     monkeypatch.setattr(stepwise, "climb", cut)
     monkeypatch.setattr(stepwise, "_in_windows", lambda found: found.path[0].fit)
-    found = mi.diagnose(plain, effects=["coulomb"])
+    words = []
+    found = mi.diagnose(plain, effects=["coulomb"], progress=words.append)
     assert len(climbs) == 2
+    assert sum(w.startswith("first answer") for w in words) == 1, "the second climb gave another one"
     assert found.effects == ("coulomb",)
     assert found.stopped == refit.OUT_OF_TIME
 
