@@ -10,7 +10,7 @@ import typer
 from motorid.cli import options as opt
 from motorid.cli.console import FAILED, INTERRUPTED, next_command, save_report, say_notes, show
 from motorid.display.cards import Table
-from motorid.display.numbers import counted, duration, number, quantity
+from motorid.display.numbers import counted, duration, factor, number, quantity
 from motorid.effects import EVERY
 from motorid.errors import DataError, among
 from motorid.estimation.result import PLAIN, Fit, constraint_table, ended, steady_table, value_tables
@@ -80,7 +80,7 @@ def _show_fit(found: Fit, records: list[Experiment], notes: list[str], judged: E
 def _held_out(found: Fit, judged: Evaluation) -> str:
     """Say how large the held-out errors are beside the noise, since another record may have smaller signals."""
     times = max((judged.rmse[c] / s for c, s in found.noise.items() if c in judged.rmse), default=0.0)
-    said = "at the level of the noise" if times < PLAIN else f"up to {number(times, 2)} times the noise"
+    said = "at the level of the noise" if times < PLAIN else f"{factor(times, 'up to ')} times the noise"
     return f"Held out: errors {said} (NRMSE {judged.words})."
 
 

@@ -26,7 +26,7 @@ from motorid.diagnosis.predictive_score import finer, undecided
 from motorid.diagnosis.results import Adequacy
 from motorid.diagnosis.score_test import Score
 from motorid.diagnosis.thresholds import LARGER, SEARCHED
-from motorid.display.numbers import listed, number, percent
+from motorid.display.numbers import factor, listed, percent
 from motorid.estimation.result import Fit
 from motorid.numerics.autoregression import autocorrelation, effective_samples
 from motorid.numerics.signals import Array, despiked, quantum, winsorised
@@ -75,7 +75,7 @@ def fine_angle_remark(fit: Fit) -> str:
     """Say so where the angle is followed less closely than its encoder shows, but as closely as can be asked."""
     if not any(fit.misfit[c] > LARGER and finer(fit, c) for c in fit.problem.outputs):
         return ""
-    share, times = percent(fit.nrmse["theta"], 2), number(fit.misfit["theta"], 2)
+    share, times = percent(fit.nrmse["theta"], 2), factor(fit.misfit["theta"])
     return f"The angle's error, {share}, is {times} times what its encoder shows, but no model is asked for less."
 
 
@@ -94,7 +94,7 @@ def within_noise(judged: Adequacy) -> Adequacy:
 
 
 def _sizes(channels: Mapping[str, Mapping[str, float]]) -> str:
-    return ", ".join(f"{channel_name(c)} {number(f['ratio'], 2)}" for c, f in channels.items()) + " times the noise"
+    return ", ".join(f"{channel_name(c)} {factor(f['ratio'])}" for c, f in channels.items()) + " times the noise"
 
 
 def _residuals(fit: Fit, channel: str) -> list[tuple[int, Array]]:

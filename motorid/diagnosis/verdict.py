@@ -13,7 +13,7 @@ from motorid.diagnosis.model_comparison import Node, far
 from motorid.diagnosis.results import Adequacy, Candidate, Rung
 from motorid.diagnosis.score_test import Score
 from motorid.diagnosis.thresholds import ELSEWHERE, LARGER, LOST, MATERIAL
-from motorid.display.numbers import arrow, counted, listed, number, percent, with_error
+from motorid.display.numbers import arrow, counted, factor, listed, percent, with_error
 from motorid.estimation.covariance import UNDETERMINED
 from motorid.estimation.result import Fit, parameter_cell
 from motorid.numerics.autoregression import colour_of
@@ -102,7 +102,7 @@ def _left(last: Fit, remaining: Adequacy, where: str = "") -> str:
     """Say what is left beside what was found."""
     if not remaining.adequate:
         return f"Not everything is explained: {remaining.text.removeprefix('Something is missing: ')}"
-    if large := [f"{channel_name(c)} {number(last.misfit[c], 2)} times" for c in far(last)]:
+    if large := [f"{channel_name(c)} {factor(last.misfit[c])} times" for c in far(last)]:
         what = f"for {remaining.hum}" if remaining.hum else "but nothing tried predicts it"
         return f"What remains is larger than the noise ({', '.join(large)}), {what}."
     return f"What remains is noise{where}. {fine_angle_remark(last)}".rstrip()
@@ -221,7 +221,7 @@ def held_out_remark(node: Node) -> str:
     """Say so where the held-out runs are predicted far worse than the fitted ones, both as a whole."""
     fitted = {} if "part of" in node.fit.problem.experiments[0].meta else node.predictions.blocks
     worse = {c: e.nrmse / max(fitted[c].nrmse, 1e-300) for c, e in node.predictions.held_out.items() if c in fitted}
-    said = [f"{c} {number(r, 2)} times" for c, r in worse.items()
+    said = [f"{c} {factor(r)} times" for c, r in worse.items()
             if r > ELSEWHERE and node.predictions.held_out[c].misfit > LARGER]
     return (f"The error is larger on the held-out runs than on the fitted ones ({', '.join(said)}): the fitted records "
             "do not determine the model there, or another effect acts there.") if said else ""

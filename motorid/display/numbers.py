@@ -7,6 +7,7 @@ from decimal import ROUND_HALF_EVEN, Decimal
 
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 NO_BREAK = "\u00a0"
+MOST = 1000  # times, or %: a larger one says how small what it is measured by is, no more of the error
 _LARGEST = 5  # decades below it are written out, from 1e-3 on (with an error: from 1e-2 on)
 
 
@@ -66,8 +67,15 @@ def quantity(value: float | None, unit: str = "", digits: int = 4) -> str:
 
 
 def percent(share: float | None, digits: int = 3) -> str:
-    """Return a share as per cent: ``0.0123`` is ``1.23 %``."""
+    """Return a share as per cent: ``0.0123`` is ``1.23 %``, 155 is ``over 1000 %``."""
+    if share is not None and abs(share) > MOST / 100:
+        return f"{'over ' if share > 0 else 'below −'}{MOST} %"
     return "–" if share is None or math.isnan(share) else f"{number(100 * share, digits)} %"
+
+
+def factor(ratio: float, lead: str = "") -> str:
+    """Return how many times: ``up to 16``, after `lead`; ``over 1000`` beyond."""
+    return f"{lead}{number(ratio, 2)}" if ratio <= MOST else f"over {MOST}"
 
 
 def arrow(before: float, after: float) -> str:

@@ -14,7 +14,7 @@ import numpy as np
 
 from motorid.channels import CHANNELS, channel_name
 from motorid.display.cards import Card, Cell, Flag, Printed, Shown, Table
-from motorid.display.numbers import counted, duration, listed, number, percent, quantity, sentence, with_error
+from motorid.display.numbers import counted, duration, factor, listed, number, percent, quantity, sentence, with_error
 from motorid.errors import UsageError, name_of
 from motorid.estimation.covariance import Certainty, Quantity, certainty, combinations
 from motorid.model.model import Model
@@ -167,7 +167,7 @@ class Fit(Shown):
         said = {"noise": f"{lead} at the level of the noise" if times < PLAIN else
                 f"{lead} up to {number(times, 2)} times the noise, which correlated noise can explain; whether it "
                 "does, a diagnosis tells",
-                "poor": f"Fits poorly: errors up to {number(times, 2)} times the noise",
+                "poor": f"Fits poorly: errors {factor(times, 'up to ')} times the noise",
                 "lost": "Does not fit: predicting zero would be closer"}[self.fits]
         known = not self.problem.unknown or any([*self.std.values(), *self.determined])
         if self.status != "failed" and (not moving(self.nrmse) or (self.fits == "noise" and not known)):

@@ -547,7 +547,8 @@ def test_help_cuts_no_name_at_80_columns(monkeypatch):
         assert not re.search(r"<\w", shown), name  # no type of Python
 
 
-@pytest.mark.parametrize(("times", "told"), [(1.2, "at the level of the noise"), (2.4, "up to 2.4 times the noise")])
+@pytest.mark.parametrize(("times", "told"), [(1.2, "at the level of the noise"), (2.4, "up to 2.4 times the noise"),
+                                             (17000, "over 1000 times the noise")])
 def test_fitted_and_held_out_errors_are_called_noise_by_one_rule(times, told):
     """Fitted errors were "up to 1.7 times the noise", and held-out ones of 2.4 times "at the level of the noise"."""
     runs = mi.read_runs(data_path("clean") / "run*.csv")

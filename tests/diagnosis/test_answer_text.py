@@ -58,6 +58,8 @@ def test_noise_that_remains_is_where_it_remains(elsewhere, said):
     larger = missing_text(rungs_of((0.02, 0.2), (0.02, 0.02), **errors, speed=9.4), noise, (), (), elsewhere)
     assert "remains is noise" not in larger
     assert larger.endswith("What remains is larger than the noise (speed 9.4 times), but nothing tried predicts it.")
+    fine = missing_text(rungs_of((0.02, 0.2), (0.02, 0.02), **errors, speed=8700), noise, (), (), elsewhere)
+    assert "(speed over 1000 times)" in fine
     noise.hum = "a hum of 50 Hz"
     hums = missing_text(rungs_of((0.02, 0.2), (0.02, 0.02), **errors, speed=9.4), noise, (), (), elsewhere)
     assert hums.endswith("What remains is larger than the noise (speed 9.4 times), for a hum of 50 Hz.")

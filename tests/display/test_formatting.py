@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from motorid.display.numbers import duration, number, percent, quantity, with_error
+from motorid.display.numbers import duration, factor, number, percent, quantity, with_error
 
 
 @pytest.mark.parametrize(("value", "std", "unit", "text"), [
@@ -50,6 +50,9 @@ def test_numbers_keep_four_significant_digits(value, text):
 def test_words_for_shares_units_and_times():
     assert percent(0.0123) == "1.23 %"
     assert percent(None) == "–"
+    assert [percent(s) for s in (10.0, 155.0, -155.0, math.inf)] == ["1000 %", "over 1000 %", "below −1000 %",
+                                                                     "over 1000 %"]
+    assert [factor(r, "up to ") for r in (16.4, 1000, 17000)] == ["up to 16", "up to 1000", "over 1000"]
     assert quantity(None, "Ω") == "–"
     assert quantity(5e-3, "N·m") == "0.005 N·m"
     assert quantity(0.4, "1") == "0.4"  # a duty

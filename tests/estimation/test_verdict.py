@@ -236,3 +236,15 @@ def test_a_slope_of_rounding_determines_nothing(plain):
     tiny = certainty(plain.problem, plain.q, 1e-15 * plain.residuals, jac)
     assert tiny.status[3] == "not determined"
     assert tiny.status[0] == "determined"
+
+
+def test_errors_beside_which_the_noise_is_nothing_are_over_a_thousand_times_it():
+    """An encoder of a million counts made errors of "17000 times the noise" of an ordinary misfit."""
+    t = np.arange(0, 2, 1e-3)
+    motor = mi.dc_motor(R=1.4, L=1e-3, K=0.05, b=1e-5, J=1e-4) + mi.effects.coulomb(tau_c=0.02)
+    exact = mi.planned(motor, t, 4 * np.sin(4 * np.pi * t), channels=("theta",))
+    counts = np.round(exact.outputs["theta"] * 1e6)
+    fit = mi.fit(mi.dc_motor(), exact.with_(outputs={"theta": counts * 1e-6}, sigma={}))
+    assert fit.verdict.startswith("Fits poorly: errors over 1000 times the noise (NRMSE angle")
+    assert "angle over 1000 times the noise" in mi.diagnose(fit, max_effects=0).text
+    assert fit.misfit["theta"] > 1000  # as a number it stays
