@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -87,7 +88,11 @@ BROKEN = [
     Broken("a PDF", _file(b"%PDF-1.7\n1 0 obj\n"), "PDF"),
     Broken("a web page", _file("<html><body><p>404 not found</p></body></html>\n"),
            "rows of at least two"),
-    Broken("JSON", _file('{"t": [0, 1, 2], "v": [1, 2, 3]}\n'), "rows of at least two"),
+    Broken("JSON of arrays", _file(json.dumps({"slow": [[0.01 * k, 1.5 * k, 2.5] for k in range(40)]}, indent=2)),
+           "it is JSON, not a table"),
+    Broken("JSON lines", _file("".join(f'{{"t": {k}, "v": {k % 5}, "omega": {k}}}\n' for k in range(40))),
+           "it is JSON, not a table"),
+    Broken("JSON", _file('{"t": [0, 1, 2], "v": [1, 2, 3]}\n'), "it is JSON, not a table"),
     Broken("serial chatter", _file("".join(f"RPM: {k} Temp: warm\n" for k in range(40))),
            "rows of at least two"),
     Broken("decimal and separating comma", _file(HEADER + "0,00,6,0,1,5,2,5\n" * 30), "semicolon"),

@@ -26,6 +26,7 @@ _SPACES = " '’\u00a0\u2009\u202f"  # may stand there, too
 _GROUPED = {mark: rf"[-+]?[1-9]\d{{0,2}}(?:[{group}{_SPACES}]\d{{3}})+(?:\{mark}\d*)?"
             for mark, group in _GROUPS.items()}
 _CONTROL = re.compile(r"[\x00-\x08\x0e-\x1f\x7f]")
+_JSON = re.compile(r'\s*(\{\s*["}]|\[\s*[\[{])')  # objects, arrays of arrays or of objects
 # Delimiter (None: white space) and decimal mark, in the order in which a tie is decided.
 _DIALECTS = (("\t", "."), (";", "."), (",", "."), ("\t", ","), (";", ","), (",", ","), (None, "."), (None, ","))
 _MAGIC = {
@@ -71,6 +72,8 @@ def parse_table(data: bytes) -> TextTable:
     if cells > MOST_COLUMNS:
         raise DataError(f"a row has about {cells} cells; at most {MOST_COLUMNS} columns are read. Is there one row per "
                         "sample?")
+    if _JSON.match(text):
+        raise DataError("it is JSON, not a table. Write it as CSV: a row of names, then one row per sample.")
     dialect, width = sniff(body)
     first = next((k for k, line in enumerate(body) if is_data(dialect.cells(line), dialect, width)), None)
     if first is None:

@@ -489,6 +489,13 @@ def test_matlab_variables_structures_and_matrices(tmp_path):
     savemat(tmp_path / "b.mat", {"log": {"time": t, "voltage_V": np.sin(t), "speed_rpm": t},
                                  "cell": np.array(["a", 1.0], dtype=object), "none": []}, do_compression=True)
     assert read_runs(tmp_path / "b.mat")[0].n == 40
+    savemat(tmp_path / "y.mat", {"u": np.sin(t), "i": np.cos(t), "e": t, "y": 2 * t, "T_degC": t})
+    (tmp_path / "y.csv").write_text("u,i,e,y,T_degC,note\n" + "".join(f"{a:g},{a:g},1,{a:g},30,warm\n" for a in t))
+    for of in ("y.mat", "y.csv"):  # the speed was lost without a word
+        lost = read_runs(tmp_path / of, dt=0.01)[0].meta["notes"]
+        assert any("not used: e, y; " in n and "name it with columns={'omega': 'y'}" in n for n in lost), of
+        left_out = read_runs(tmp_path / of, dt=0.01, columns={"omega": None})[0].meta["notes"]
+        assert not any("not used" in n for n in left_out), of
     savemat(tmp_path / "c.mat", {"data": np.column_stack([t, np.sin(t), np.cos(t)])})
     c = read_mat(tmp_path / "c.mat", columns={"t": "data_1", "v": "data_2", "theta": 3})
     np.testing.assert_array_equal(c.outputs["theta"], np.cos(t))
