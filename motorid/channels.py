@@ -21,13 +21,10 @@ DIMENSIONS: Mapping[str, tuple[str, ...]] = MappingProxyType({
 UNITS = MappingProxyType({c: tuple(SI[d] for d in dimensions) for c, dimensions in DIMENSIONS.items()})
 
 
-_BY_UNIT = {("theta", "m"): "position", ("v", "A"): "current", ("v", "N·m"): "torque", ("v", "N"): "force",
-            ("v", "1"): "command"}
-
-
 def channel_name(channel: str, unit: str = "") -> str:
     """Return what people call a channel: the angle of a linear axis, in m, is its position."""
-    return _BY_UNIT.get((channel, unit), NAMES.get(channel, channel))
+    special = {"theta": {"m": "position"}, "v": {"A": "current", "N·m": "torque", "N": "force", "1": "command"}}
+    return special.get(channel, {}).get(unit, NAMES.get(channel, channel))
 
 
 def worded(text: str, unit: str) -> str:

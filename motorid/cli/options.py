@@ -113,8 +113,7 @@ class DriveOptions(ReadingOptions):
         among(self.drive, ("voltage", "torque"), "drive", where="--drive: ")
         said = reading_notes(runs)
         if self.drive == "torque":  # its command is no voltage of a winding, in volts or not
-            said += ["the current i is not used: a torque-driven model has none."
-                     ] if any("i" in r.outputs for r in runs) else []
+            said += ["the current i is not used: a torque-driven model has none."] * any("i" in r.outputs for r in runs)
             runs, held_out = ([r.with_(units={**r.units, "v": r.units["v"].replace("V", "1")}, outputs={
                 c: y for c, y in r.outputs.items() if c != "i"} or r.outputs) for r in of] for of in (runs, held_out))
         return [*said, *check_runs(runs, held_out)]

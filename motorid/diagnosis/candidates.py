@@ -52,16 +52,11 @@ class Stages:
     def __init__(self, rounds: int = 0, say: Callable[[str], None] | None = None,
                  show: Callable[..., None] | None = None, map_: Callable[..., Iterable[Any]] = map) -> None:
         self.done, self._show, self._map = say or (lambda word: None), show or (lambda *_, **__: None), map_
-        self._rounds, self._total, self._done, self._round = rounds, 0, 0.0, 0
+        self._rounds, self._total, self._done, self._round, self.again = rounds, 0, 0.0, 0, 0
 
     def climb(self) -> None:
         """Begin a climb; a second one, with the records read otherwise, makes the whole longer."""
-        self._done, self._total, self._round = float(self._total), self._total + self._rounds + 1, 0
-
-    def first(self, answer: str) -> None:
-        """Say the first answer: that of a climb begun anew is none."""
-        if self._total <= self._rounds + 1:
-            self.done(answer)
+        self._done, self._total, self._round, self.again = self._total, self._total + self._rounds + 1, 0, self._total
 
     def round(self, number: int) -> None:
         """Begin a round; the one after the last looks at what remains."""

@@ -6,7 +6,7 @@ import builtins
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
-from motorid.channels import channel_name
+from motorid.channels import channel_name, worded
 from motorid.diagnosis import verdict as words
 from motorid.diagnosis.adequacy import following
 from motorid.diagnosis.candidates import Stages, library
@@ -83,7 +83,7 @@ def diagnose(fit: Fit, validate: Sequence[Experiment] | Experiment | None = None
 def _told(found: Climb, driven: str, validated: bool) -> Diagnosis:
     """Return what a climb found, in words and as a result."""
     fit, ladder, remaining = found.search.root.fit, ladder_of(found, validated), found.remaining
-    missing, judged, last = locate(fit), found.first, found.path[-1]
+    missing, judged, last, unit = locate(fit), found.first, found.path[-1], fit.problem.experiments[0].units["v"]
     names = tuple(g.effect for g in found.grades if g.grade != "approximates")
     ranking = found.rounds[0] if found.rounds else ()
     groups = tuple(g for g in found.groups if g[0] in names)
@@ -119,13 +119,13 @@ def _told(found: Climb, driven: str, validated: bool) -> Diagnosis:
         answer, *details = words.adequate_text(judged, ranking, bool(far(ladder.best)))
     kind = "structure" if not remaining.adequate else "fluctuation" if far(ladder.best) else "noise"
     if not names:
-        details.append(words.unseen_remark(found.search.unseen(last)))
-    details = tuple(t for t in (*details, *_remarks(found, driven)) if t)
+        details.append(words.unseen_remark(found.search.unseen(last), fit.model.base))
+    answer, *details = (worded(t, unit) for t in (answer, *details, *_remarks(found, driven)) if t)
     text = " ".join(t for t in (answer, *details, suggestion) if t)
     approximating = {g.effect: g.form for g in found.grades if g.grade == "approximates"}
     remainder = Remainder(kind, ladder.best, forms, found.search.held, fit, approximating)
     return Diagnosis(verdict, text, where, names, judged, missing, ranking, ladder, groups, suggestion, fit,
-                     ladder.best, remaining, remainder, found.stopped, answer, details, rivals or (ladder.best,))
+                     ladder.best, remaining, remainder, found.stopped, answer, tuple(details), rivals or (ladder.best,))
 
 
 def _remarks(found: Climb, driven: str) -> list[str]:
@@ -158,9 +158,9 @@ def _suggestion(fits: Sequence[Fit], groups: Sequence[Sequence[str]]) -> str | N
         best = suggest_experiment(fits[:4])
     except MotoridError:
         return None
+    problem, text = fits[0].problem, f"To distinguish {listed(names)}, record {best.text}."
     if best.discrimination[best.name] < 1e-3:
-        problem = fits[0].problem
         more = [channel_name(c) for c in SHOWN[problem.model.base] if c not in problem.outputs]
         told = f"; measure the {' or '.join(more)} too" if more else ""
-        return f"No voltage record of these channels within the limits would distinguish {listed(names)}{told}."
-    return f"To distinguish {listed(names)}, record {best.text}."
+        text = f"No voltage record of these channels within the limits would distinguish {listed(names)}{told}."
+    return worded(text, problem.experiments[0].units["v"])

@@ -74,7 +74,8 @@ def climb(search: Search, max_effects: int, seconds: float | None = None) -> Cli
     began = time.monotonic()
     scores = search.scores(search.root)
     first = judge_adequacy(search.root, scores)
-    search.stages.first(first_answer(search.root.fit, first, scores))
+    if not search.stages.again:
+        search.stages.done(first_answer(search.root.fit, first, scores))
     found = Climb(search, (search.root,), (), (), "", first, first)
     steps = _rounds(found, max_effects)
     looked = time.monotonic() - began  # about as long as to look at what remains

@@ -16,6 +16,7 @@ from motorid.diagnosis.thresholds import ELSEWHERE, LARGER, LOST, MATERIAL
 from motorid.display.numbers import arrow, counted, factor, listed, percent, with_error
 from motorid.estimation.covariance import UNDETERMINED
 from motorid.estimation.result import Fit, parameter_cell
+from motorid.model.model import SHOWN
 from motorid.numerics.autoregression import colour_of
 from motorid.numerics.signals import despiked
 from motorid.problem.simulate import moving
@@ -237,12 +238,12 @@ def inseparable_remark(same: Mapping[str, tuple[str, ...]]) -> str:
                     for parameters, names in by_parameters.items())
 
 
-def unseen_remark(same: Mapping[str, tuple[str, ...]]) -> str:
+def unseen_remark(same: Mapping[str, tuple[str, ...]], base: str) -> str:
     """Say which effects these records cannot show, since the motor's own parameters imitate them, and which would."""
     parameters = listed(list(dict.fromkeys(itertools.chain(*same.values()))), "or")
-    shown = "it" if len(same) == 1 else "them"
+    shown, measured = "it" if len(same) == 1 else "them", listed([channel_name(c) for c in SHOWN[base][:-1]])
     return (f"These records cannot show {listed(list(same), 'or')}: other values of {parameters} do the same. Steps of "
-            f"several sizes in both directions, with current and speed measured, are likelier to show {shown}."
+            f"several sizes in both directions, with {measured} measured, are likelier to show {shown}."
             ) if same else ""
 
 

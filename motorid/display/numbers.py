@@ -7,7 +7,6 @@ from decimal import ROUND_HALF_EVEN, Decimal
 
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 NO_BREAK = "\u00a0"
-MOST = 1000  # times, or %: a larger one says how small what it is measured by is, no more of the error
 _LARGEST = 5  # decades below it are written out, from 1e-3 on (with an error: from 1e-2 on)
 
 
@@ -68,14 +67,12 @@ def quantity(value: float | None, unit: str = "", digits: int = 4) -> str:
 
 def percent(share: float | None, digits: int = 3) -> str:
     """Return a share as per cent: ``0.0123`` is ``1.23 %``, 155 is ``over 1000 %``."""
-    if share is not None and abs(share) > MOST / 100:
-        return f"{'over ' if share > 0 else 'below −'}{MOST} %"
-    return "–" if share is None or math.isnan(share) else f"{number(100 * share, digits)} %"
+    return "–" if share is None or math.isnan(share) else f"{factor(100 * share, '', digits)} %"
 
 
-def factor(ratio: float, lead: str = "") -> str:
-    """Return how many times: ``up to 16``, after `lead`; ``over 1000`` beyond."""
-    return f"{lead}{number(ratio, 2)}" if ratio <= MOST else f"over {MOST}"
+def factor(ratio: float, lead: str = "", digits: int = 2) -> str:
+    """Return ``up to 16``, after `lead`; or ``over 1000``: beyond, it says how small the measure is, no more."""
+    return f"{lead}{number(ratio, digits)}" if abs(ratio) <= 1000 else f"{('over ', 'below −')[ratio < 0]}1000"
 
 
 def arrow(before: float, after: float) -> str:

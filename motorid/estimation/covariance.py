@@ -20,6 +20,7 @@ from functools import cached_property
 
 import numpy as np
 
+from motorid.channels import channel_name
 from motorid.errors import among
 from motorid.numerics.autoregression import Colour, colour_of, weighed
 from motorid.numerics.least_squares import seen_directions
@@ -143,7 +144,7 @@ def _laws(problem: Problem, values: Mapping[str, float]) -> dict[str, tuple[str,
     gain and the poles; every torque as the voltage R·τ/K that overcomes it; with dry friction alone the no-load
     speed."""
     model, runs, motor = problem.model, problem.experiments, problem.model.base == "dc_motor"
-    volt, speed = runs[0].units["v"], "m/s" if problem.linear else "rad/s"
+    volt, speed, drive = (u := runs[0].units["v"]), "m/s" if problem.linear else "rad/s", channel_name("v", u)
 
     def gain(p: Mapping[str, float]) -> float:
         return p["K"] / (p["K"] ** 2 + p["R"] * p["b"]) if motor else p["g"] / (p["b"] or np.nan)
@@ -158,7 +159,7 @@ def _laws(problem: Problem, values: Mapping[str, float]) -> dict[str, tuple[str,
     def as_voltage(name: str) -> Law:
         return lambda p: p[name] * (p["R"] / p["K"] if motor else 1 / p["g"])
 
-    laws: dict[str, tuple[str, str, Law]] = {"gain": (f"{speed} per {volt}", "speed per voltage, steady", gain)}
+    laws: dict[str, tuple[str, str, Law]] = {"gain": (f"{speed} per {volt}", f"speed per {drive}, steady", gain)}
     half, product = times(values)
     if product <= half**2:
         laws["time_constant"] = "s", "time constant, slow (mechanical)", lambda p: (
@@ -174,7 +175,7 @@ def _laws(problem: Problem, values: Mapping[str, float]) -> dict[str, tuple[str,
     for n in (p.name for e in model.effects for p in e.parameters):  # torques, and what makes one of speed or angle
         p = model.parameters[n]
         if p.unit.startswith(force):
-            words = f"{p.doc or n} as a voltage, {'R·' * motor}{n}/{'K' if motor else 'g'}"
+            words = f"{p.doc or n} as a {drive}, {'R·' * motor}{n}/{'K' if motor else 'g'}"
             laws[f"{n}_voltage"] = p.unit.replace(force, volt, 1), words, as_voltage(n)
     if model.effect_names in ((), ("coulomb",)):
         most = max(float(np.abs(run.inputs["v"]).max()) for run in runs)

@@ -110,6 +110,9 @@ class Problem:
         if self.model.base == "dc_motor" and driven:
             raise ModelError(f"v is in {driven}, and the model is driven by a voltage: a commanded current or torque "
                              "drives mi.torque_driven() (--drive torque). If it is a voltage, state its unit.")
+        if driven and (g := self.model.parameters["g"]):
+            g = replace(g, unit="" if g.unit == f"{driven}/V" else g.unit.replace("V", driven))
+            object.__setattr__(self, "model", self.model.with_(parameters={**self.model.parameters, "g": g}))
         if self.model.axis == "rotary" and self.linear:
             object.__setattr__(self, "model", self.model.on_linear_axis())
         self.model.check_visible(self.outputs)

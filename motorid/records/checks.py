@@ -70,9 +70,8 @@ def check_runs(runs: Sequence[Experiment], held_out: Sequence[Experiment] = ()) 
         hits = [(run.name, text) for run in (runs if check in (_missing, _spikes) else plain) if (text := check(run))]
         if hits:
             remarks.append(_told_once(hits[0][1], [name for name, _ in hits]))
-    scales = _other_scale([*plain, *(run.without_spikes() for run in held_out)])
-    remarks += [text for text in (_the_same_twice(runs), scales, _never_reverses(runs)) if text]
-    return [worded(text, runs[0].units["v"]) for text in remarks]
+    more = _the_same_twice(runs), _other_scale([*plain, *(r.without_spikes() for r in held_out)]), _never_reverses(runs)
+    return [worded(text, runs[0].units["v"]) for text in (*remarks, *more) if text]
 
 
 def reading_notes(runs: Sequence[Experiment]) -> list[str]:

@@ -63,13 +63,13 @@ def assign(labels: Sequence[str], *, columns: Mapping[str, object] | None = None
         notes.append(f"left out '{places.pop(channel).column}': it is in encoder counts, and how many make one turn is "
                      f"not known; to use it, say units={{'{channel}': 'counts:2048'}}.")
     _require(places, labels, values or {})
-    if not {"omega", "theta"} & {*places, *(columns or {})} and (free := _free(
-            [c for c in labels if c in (values or labels)], places, ("omega", "theta"))):
-        notes.append(f"not used: {', '.join(free[:20])}; if one of them is the speed or the angle, name it with "
-                     f"columns={{'omega': '{'y' if 'y' in free else free[0]}'}}.")
+    free = [c for c in labels if c not in {x for p in places.values() for x in (p.column, p.times)}]
+    others = [c for c in free if c in (values or labels) and not headers.is_reference(c)]
+    if others and not {"omega", "theta"} & {*places, *(columns or {})}:
+        notes.append(f"not used: {', '.join(others[:20])}; if one of them is the speed or the angle, name it with "
+                     f"columns={{'omega': '{'y' if 'y' in others else others[0]}'}}.")
     notes += [f"'{c}' looks like the reference of a controller: what drives the model is '{places['v'].column}'; "
-              f"'{c}' is not used." for c in labels if headers.is_reference(c) and c not in {
-                  p.column for p in places.values()}]
+              f"'{c}' is not used." for c in free if headers.is_reference(c)]
     guesses = [f"'{p.column}' as {_MEANING[c]}" for c, p in places.items() if p.score <= 1]
     plain = [f"{c} ('{p.column}') in {p.unit.symbol}" for c, p in places.items() if not p.stated]
     notes += [f"took {', '.join(guesses)}, a guess from the headers; override with columns."] if guesses else []
@@ -190,19 +190,15 @@ def _require(places: Mapping[str, Place], labels: Sequence[str], values: Mapping
     if "v" in missing and (i := places.get("i", places.get("tau_load"))):
         more += (f" If '{i.column}' is what commands a drive with a current loop of its own: "
                  f"columns={{'v': '{i.column}'}}, with mi.torque_driven() (--drive torque).")
+    used = {*duty, *(p.column for p in places.values())}
     untimed = " Samples a fixed time apart need no column of time: dt=0.001 says how far, s." * ("t" in missing)
     asked = [c for c in missing if c != "v" or not duty]
-    free = sorted(_free([c for c in labels if c not in duty], places, "v"), key=lambda c: not _DRIVES.search(c.lower()))
+    stated = {c: unit for c in labels for _, unit, sure in [headers.unit_in(c)] if unit and sure}
+    free = [c for c in labels if c not in used and not headers.is_reference(c)
+            and (c not in stated or stated[c].dimension in DIMENSIONS["v"])]
+    free.sort(key=lambda c: not _DRIVES.search(c.lower()))
     raise DataError(f"no column looks like {', nor like '.join(missing.values())}. "
                     f"{_say_which(labels, asked, free)}{more}{untimed}")
-
-
-def _free(labels: Sequence[str], places: Mapping[str, Place], channels: Sequence[str]) -> list[str]:
-    """Return the columns that may be one of `channels`, by the units that they surely have."""
-    taken = {column for p in places.values() for column in (p.column, p.times)}
-    units = {c: unit.dimension for c in labels for _, unit, sure in [headers.unit_in(c)] if unit and sure}
-    asked = {None, *(d for c in channels for d in DIMENSIONS[c])}
-    return [c for c in labels if c not in taken and not headers.is_reference(c) and units.get(c) in asked]
 
 
 def _say_which(labels: Sequence[str], channels: Sequence[str], free: Sequence[str]) -> str:

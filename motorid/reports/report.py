@@ -9,7 +9,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from motorid.channels import NAMES
+from motorid.channels import NAMES, worded
 from motorid.diagnosis.results import Diagnosis, Ladder, ladder_table, ranking_table, share_table
 from motorid.display.cards import Flag, Shown, Table
 from motorid.display.numbers import counted, duration, glued, number, percent, sentence, with_error
@@ -236,10 +236,11 @@ def _where(d: Diagnosis) -> Section:
     m = d.missing
     best = [f"{balance}: {b.against} explains {percent(b.explained, 2)}"
             for balance, bins in m.bins.items() for b in bins[:1]]
-    caption = "The voltage and torque that would make the model match, and what explains them."
-    figure = _figure("missing", caption, "Missing voltage and torque. " + "; ".join(best), "plot_missing", d)
+    caption = f"The {' and '.join(m.bins)} that would make the model match, and what explains it."
+    figure = _figure("missing", caption, "What is missing. " + "; ".join(best), "plot_missing", d)
     tables = [share_table("region", m.regions)] if m.regions else []
-    return Section("where", "Where it fails", [d.adequacy.text, m.text], (), [figure], tables)
+    text = [worded(t, d.before.problem.experiments[0].units["v"]) for t in (d.adequacy.text, m.text)]
+    return Section("where", "Where it fails", text, (), [figure], tables)
 
 
 def _which(d: Diagnosis) -> Section:

@@ -138,7 +138,7 @@ class Identifiability(Printed):
         said = [f"These records determine {self.rank} combinations of the {k} parameters "
                 f"{', '.join(self.names)}, not each of them."]
         if self.structural_rank <= self.rank:
-            said.append("That is so for any voltage and without noise: it is in the equations and channels.")
+            said.append("That is so for any input and without noise: it is in the equations and channels.")
         elif self.structural_rank == k:
             said.append("The equations would allow all; these records excite too little, or are too noisy.")
         if self.combinations:

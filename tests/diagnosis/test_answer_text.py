@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,6 +11,7 @@ from battery.excite import driven, record
 from lab_records import VALUES, noisy, pair, simulated
 
 import motorid as mi
+from motorid.channels import worded
 from motorid.diagnosis import diagnose
 from motorid.diagnosis.misspecification import Grade
 from motorid.diagnosis.results import Rung
@@ -20,6 +22,7 @@ from motorid.diagnosis.verdict import (
     own_in_every_run_remark,
     rises_text,
     unexplained_text,
+    unseen_remark,
 )
 
 
@@ -146,3 +149,35 @@ def test_what_only_a_model_on_the_way_does_as_well_is_not_said_of_the_last_one()
     same = {"constant_load": ("tau_cp", "tau_cn"), "gravity": ("k_s",), "spring": ("tau_c",)}
     found = SimpleNamespace(path=(None, "node"), search=SimpleNamespace(inseparable=lambda node: same))
     assert diagnose._inseparable(found, model) == {"gravity": ("k_s",)}
+
+
+@pytest.mark.parametrize(("unit", "word"), [("N·m", "torque"), ("A", "current")])
+def test_of_a_drive_no_voltage_is_spoken_of(unit, word, rng, tmp_path):
+    """A torque was "as a voltage", its gain of 1 in N·m/V, and the next experiment "at full voltage"."""
+    t = np.arange(1500) * 2e-3
+    model = mi.torque_driven(b=2e-3, J=1e-3) + mi.effects.coulomb(tau_c=0.3) + mi.effects.constant_load(tau_0=0.1)
+    runs = [mi.planned(model, t, v, channels=("omega",)) for v in (
+        np.sign(np.sin(9 * t)), 1.2 * np.sin(5 * t), np.repeat([0.0, 0.5, 1.0, -0.5, -1.0], 300))]
+    runs = [r.with_(outputs={"omega": r.outputs["omega"] + 0.3 * rng.normal(size=r.n)}, sigma={},
+                    units={**r.units, "v": unit}) for r in runs]
+    fit = mi.fit(mi.torque_driven() + mi.effects.coulomb, runs[:2])
+    assert fit.determined["gain"].text == f"speed per {word}, steady"
+    assert fit.determined["tau_c_voltage"].text.endswith(f"as a {word}, tau_c/g")
+    assert fit.problem.model.parameters["g"].unit == ("" if unit == "N·m" else "N·m/A")
+    assert "voltage" not in fit.card().to_html()
+    found = mi.diagnose(mi.fit(mi.torque_driven(), runs[:2]), runs[2], effects=["coulomb", "stribeck", "lugre"],
+                        max_effects=2)
+    told = " ".join([found.text, mi.report(found, tmp_path / "found.html").read_text(encoding="utf-8")])
+    assert "voltage" not in told, [told[m.start() - 60:m.start() + 30] for m in re.finditer("voltage", told)]
+
+
+def test_what_would_show_an_effect_is_asked_of_channels_that_the_model_has():
+    same = {"constant_load": ("tau_cp", "tau_cn")}
+    assert "with current and speed measured, are" in unseen_remark(same, "dc_motor")
+    assert "with speed measured, are" in unseen_remark(same, "torque_driven")
+
+
+def test_a_suggestion_names_what_drives():
+    assert worded("No voltage record; reversals at full voltage (up to 1 A). 'voltage_offset'; two voltages.", "A") == (
+        "No current record; reversals at full current (up to 1 A). 'voltage_offset'; two currents.")
+    assert worded("a loss of voltage.", "V") == "a loss of voltage."
