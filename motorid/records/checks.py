@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from motorid.channels import NAMES, channel_name, worded
-from motorid.display.numbers import quantity
+from motorid.display.numbers import number, quantity
 from motorid.numerics.signals import FEWEST_FRESH, WINDOWS, Array, bridged, integral, noise_level, quantum, slope
 from motorid.records.experiment import Experiment
 from motorid.records.headers import parse_unit
@@ -27,6 +27,7 @@ RUNNING = 0.92  # cosine of |v| and |omega|: runs under its voltage; of what swi
 OTHER_SCALE = 5.0  # times the speed per voltage: a wrong unit makes 6 and more, a duty cycle for the voltage at least 5
 ROUGH = 0.05  # of the speed: sampled so slowly that its balance cannot be integrated
 BALANCE_BLOCKS = 150
+BEGUN, RISEN = 0.1, 0.63  # of its range, a step of the voltage; of their change, where outputs begin and a lag has come
 # Ratio of the angle's rate to the speed, and what was then mistaken for SI.
 _RATIOS = {
     2 * np.pi / 60: "the speed in rpm: units={'omega': 'rpm'}",
@@ -44,7 +45,7 @@ def check_runs(runs: Sequence[Experiment], held_out: Sequence[Experiment] = ()) 
     """Look for what is wrong with records, and for what they cannot show.
 
     Swapped signs and columns, wrong units, clipped or coarse channels, spikes, too slow sampling, missing samples, a
-    motor that never settles or is never excited, a drive that is off, a voltage that never reverses.
+    motor that never settles or is never excited, a drive that is off, a voltage that never reverses or acts late.
 
     Parameters
     ----------
@@ -66,12 +67,53 @@ def check_runs(runs: Sequence[Experiment], held_out: Sequence[Experiment] = ()) 
     remarks = []
     # A few wild samples say nothing of units, limits or the sensor, nor does a channel without a sample.
     plain = [run.without(*(c for c, y in run.outputs.items() if np.isnan(y).all())).without_spikes() for run in runs]
+    late = dead_times(plain)  # what a dead time looks like otherwise: a drive that is off, another column
+    plain = [run.delayed(min(dead_times([run]) or [0.0])) for run in plain] if late else plain
     for check in _CHECKS:
         hits = [(run.name, text) for run in (runs if check in (_missing, _spikes) else plain) if (text := check(run))]
         if hits:
             remarks.append(_told_once(hits[0][1], [name for name, _ in hits]))
-    more = _the_same_twice(runs), _other_scale([*plain, *(r.without_spikes() for r in held_out)]), _never_reverses(runs)
+    scales = _other_scale([*plain, *(run.without_spikes() for run in held_out)])
+    more = _late(late), _the_same_twice(runs), scales, _never_reverses(runs)
     return [worded(text, runs[0].units["v"]) for text in (*remarks, *more) if text]
+
+
+def dead_times(runs: Sequence[Experiment]) -> list[float]:
+    """Return how long nothing follows each step of the voltage, s, and then all comes in less time, as not even behind
+    six equal lags; none where any step is followed sooner. At rest friction and a soft start may do so to the speed."""
+    found = list[float]()
+    for run in runs:
+        v, seen = run.inputs["v"], {c: bridged(run.t, run.outputs[c]) for c in ("i", "omega") if c in run.outputs}
+        edges = [0, *(np.flatnonzero(np.abs(np.diff(v)) > BEGUN * np.ptp(v)) + 1).tolist(), run.n]
+        for first, a, end in zip(edges, edges[1:], edges[2:], strict=False):
+            half, level = (first + a) // 2, BEGUN * abs(v[a] - v[a - 1])
+            if min(a - half, end - a) < FEWEST_FRESH or max(np.ptp(v[first:a]), np.ptp(v[a:end])) > level:
+                continue
+            turns = any(abs(np.median(y[half:a])) > STILL * np.abs(y).max() for y in seen.values())
+            ways = [_way(y[half:a], y[a:end]) for y in seen.values() if "i" in seen or turns]
+            if ways and all(ways):
+                waits, comes = min(way for way in ways if way)
+                found.append(float(run.t[a + waits] - run.t[a]) if waits > comes - waits else 0.0)
+    return found if all(found) else []
+
+
+def _way(before: Array, after: Array) -> tuple[int, int] | None:
+    """Return after how many samples a channel still is as it was, and when most of its way is done; None for noise."""
+    way, noise = np.abs(after - np.median(before)), 4 * float(np.std(before))
+    at = [int(np.argmax(way > max(share * (top := float(np.quantile(way, 0.9))), noise))) for share in (BEGUN, RISEN)]
+    return (at[0] - 1, at[1]) if 2 * noise < top else None
+
+
+def span(dead: Sequence[float]) -> str:
+    """Say how long dead times are, and whether they differ."""
+    least, most = (number(1e3 * s, 3) for s in (min(dead), max(dead)))
+    return f"{least} ms" if max(dead) < (1 + BEGUN) * min(dead) else f"{least} to {most} ms, another time at each step,"
+
+
+def _late(dead: Sequence[float]) -> str | None:
+    return (f"current and motion follow a step of the voltage only after {span(dead)} and then in less time than that: "
+            f"does it act later than it was logged? If so: --delay {min(dead):.3g}, run.delayed({min(dead):.3g})."
+            ) if dead else None
 
 
 def reading_notes(runs: Sequence[Experiment]) -> list[str]:

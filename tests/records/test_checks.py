@@ -425,6 +425,26 @@ def test_a_current_that_follows_a_random_voltage_is_no_noise(late, rng):
     assert "mostly noise" in said(stairs.with_(outputs={"i": np.repeat(rng.normal(size=200), 20)}))
 
 
+def test_a_voltage_that_acts_late_is_no_drive_that_is_off_and_no_other_column(plant, rng):
+    """A computer's command: 240 to 300 ms of nothing were said to be a disabled drive, its columns exchanged."""
+    machine, t = plant.MOTORS["lab"], 1e-3 * np.arange(1600)
+    commanded = np.where((t >= 0.5) & (t < 1.1), 6.0, 0.0)
+    runs = []
+    for k, dead in enumerate((0.24, 0.3)):
+        clean = plant.simulate_linear(machine, t, np.where((t >= 0.5 + dead) & (t < 1.1 + dead), 6.0, 0.0))
+        noisy = {c: clean[c] + rng.normal(0, 1e-3 * np.abs(clean[c]).max(), t.size) for c in ("i", "omega")}
+        runs.append(Experiment(t, {"v": commanded}, noisy, name=f"run{k + 1}"))
+    text = said(*runs)
+    assert "only after 240 to 300 ms, another time at each step," in text
+    assert "--delay 0.24, run.delayed(0.24)" in text
+    assert "disabled" not in text
+    assert "exchanged" not in text
+    assert "only after 240 ms and" in said(runs[0])
+    assert "only after" not in said(runs[0].delayed(0.24))
+    assert "only after" in said(runs[0].without("i")), "it slows down late, too"
+    assert "only after" not in said(runs[0].without("i").select(slice(0, 1000))), "from rest a friction may do so"
+
+
 def test_a_drive_that_was_off_is_told_with_its_times(rng):
     v = np.repeat([3, -3, 3, -3, 3, 0, 3, -3, 3, -3], 400).astype(float)
     t = 5e-3 * np.arange(len(v))
