@@ -24,6 +24,7 @@ from motorid.estimation.result import Fit
 from motorid.numerics.least_squares import LevenbergMarquardt
 from motorid.problem.problem import Problem
 from motorid.problem.simulate import at, judge, misfit_over_noise, moving
+from motorid.records.checks import dead_times, span
 from motorid.records.experiment import Experiment
 
 CHANGING = 0.5  # of the samples at which the voltage must change for its reading to matter
@@ -43,7 +44,7 @@ class Reading:
     says: str
     option: str
     of: Callable[[Experiment], Experiment]
-    start: str = "model"  # where the fit begins; "auto" where what it followed is gone
+    start: str = "model"  # where the fit begins; "auto" where records alone say so
 
     def problem(self, fit: Fit) -> Problem:
         """Return the problem of the same model on records read so."""
@@ -73,19 +74,23 @@ def without_spikes(fit: Fit) -> Reading | None:
     return Reading(says, "--no-spikes", Experiment.without_spikes, "auto") if count else None
 
 
-def better_reading(fit: Fit, late: bool = False) -> Reading | None:
+def better_reading(fit: Fit, late: bool = False, earlier: bool = False) -> Reading | None:
     """Return the reading of the voltage that the records ask for; None if it is the one they have.
 
     It must make the error of `fit` plainly smaller, and that of no channel larger; errors that are all noise cannot
-    become so. `late`: all effects that help are in, and what could stand in for one is tried too.
+    become so. Dead times that show at the steps come first: friction and inductance would adapt to them. `late`: all
+    effects that help are in, and what could stand in for one is tried too. `earlier`: only a voltage that acts earlier
+    is, whatever is missing; no motor answers before it is asked.
     """
     if all(NOISE[0] < ratio < NOISE[1] for ratio in misfit_over_noise(fit.problem, fit.q).values()):
         return None
-    chosen, fall = None, PLAIN
-    readings = [r for r in _readings(fit.problem.experiments) if _fall(fit, r) > PROMISING]
+    chosen, fall, runs = None, PLAIN, fit.problem.experiments
+    readings = [r for r in _readings(runs) if not earlier and _fall(fit, r) > PROMISING]
     seen = {"i", "omega", "theta"} & set(fit.problem.outputs)
     if late and "i" in seen and len(seen) > 1:  # current and motion both follow a late voltage, not a late sensor
         readings += _best_delay(fit)
+    elif not late:
+        readings += [_delay(min(d), span(d))] if not earlier and (d := dead_times(runs)) else _best_delay(fit, True)
     for reading in readings:
         try:
             after = reading.fitted(fit, AS_IT_IS)
@@ -93,19 +98,20 @@ def better_reading(fit: Fit, late: bool = False) -> Reading | None:
         except FAILURES:
             continue
         rises = max(e / max(fit.rmse[c], 1e-300) for c, e in after.rmse.items()) > 1 + MATERIAL
-        if found.fall > fall and found.worth_it and not rises:
+        if found.fall > fall and (found.worth_it or reading.start == "auto") and not rises:
             chosen, fall = reading, found.fall
     return chosen
 
 
-def _best_delay(fit: Fit) -> list[Reading]:
+def _best_delay(fit: Fit, earlier: bool = False) -> list[Reading]:
     """Return the delay that lowers the error most after a few steps, tried ever more closely; nothing for little."""
     falls, best = {0.0: 0.0}, 0.0
+    dt = float(np.median(np.concatenate([np.diff(r.t) for r in fit.problem.experiments])))
     for moves in DELAYS:
-        samples = [round(best + n, 6) for n in moves]
-        falls |= {n: _fall(fit, _delay(fit, n)) for n in samples if n not in falls}
+        samples = [n for move in moves if (n := round(best + move, 6)) < 0 or not earlier]
+        falls |= {n: _fall(fit, _delay(n * dt)) for n in samples if n not in falls}
         best = max(falls, key=lambda n: falls[n])
-    return [_delay(fit, best)] if falls[best] > PROMISING else []
+    return [_delay(best * dt)] if falls[best] > PROMISING else []
 
 
 def _fall(fit: Fit, reading: Reading) -> float:
@@ -118,10 +124,10 @@ def _fall(fit: Fit, reading: Reading) -> float:
         return -np.inf
 
 
-def _delay(fit: Fit, samples: float) -> Reading:
-    seconds = samples * float(np.median(np.concatenate([np.diff(r.t) for r in fit.problem.experiments])))
-    how = f"acts {number(abs(seconds) * 1e3, 3)} ms {'later' if seconds > 0 else 'earlier'} than it was logged"
-    return Reading(f"The voltage {how}", f"--delay {seconds:.3g}", lambda r: r.delayed(seconds))
+def _delay(seconds: float, seen: str = "") -> Reading:
+    how = f"{seen or f'{number(abs(seconds) * 1e3, 3)} ms'} {'later' if seconds > 0 else 'earlier'} than it was logged"
+    option = f"--delay{' ' if seconds > 0 else '='}{seconds:.3g}"
+    return Reading(f"The voltage acts {how}", option, lambda r: r.delayed(seconds), "auto" if seen else "model")
 
 
 def _readings(runs: Sequence[Experiment]) -> Iterator[Reading]:

@@ -50,7 +50,7 @@ class Climb:
 
     `forms` are the free forms that predict better beside all effects, the best first; `grades` are of the effects.
     `rivals` are the last model, and what it is with the others of the first group.
-    `stopped` says why it ended before it was done, if it did.
+    `stopped` says why it ended before it was done, if it did; `misread` is the reading for which it was left.
     """
 
     search: Search
@@ -64,12 +64,13 @@ class Climb:
     grades: tuple[Grade, ...] = ()
     stopped: str = ""
     rivals: tuple[Fit, ...] = ()
+    misread: Reading | None = None
 
 
-def climb(search: Search, max_effects: int, seconds: float | None = None) -> Climb:
+def climb(search: Search, max_effects: int, seconds: float | None = None, early: bool = False) -> Climb:
     """Run the loop until nothing more is worth adding, until the time is up, or until it is interrupted (Ctrl-C).
 
-    What was found by then is the answer; `stopped` says so.
+    What was found by then is the answer; `stopped` says so. `early`: also until a voltage turns out to act earlier.
     """
     began = time.monotonic()
     scores = search.scores(search.root)
@@ -83,6 +84,8 @@ def climb(search: Search, max_effects: int, seconds: float | None = None) -> Cli
         with parallel.budget(seconds and max(seconds - 2 * looked, 0.0)):
             while (further := next(steps, None)) is not None:
                 found = further
+                if early and far(fit := found.path[-1].fit) and (misread := better_reading(fit, earlier=True)):
+                    return replace(found, misread=misread)
         search.stages.round(max_effects + 1)
         search.stages.at("Looking at what remains")
         if not found.stopped:
@@ -288,22 +291,23 @@ class Records:
     fit: Fit
     held_out: Sequence[Experiment] | None
     remarks: tuple[str, ...] = ()
+    reading: Reading | None = None  # the last one, of which the last remark tells
 
     def read(self, reading: Reading) -> Records:
         """Return all records read in another way."""
         after = reading.fitted(self.fit)
         held_out = self.held_out and [reading.of(r) for r in self.held_out]
-        return Records(after, held_out, (*self.remarks, reading.remark(self.fit, after)))
+        return Records(after, held_out, (*self.remarks, reading.remark(self.fit, after)), reading)
 
-    def suits(self, node: Node) -> bool:
-        """Tell whether the model of `node`, fitted to other readings, predicts these records better: an effect that
-        was missing may have asked for another reading."""
+    def suited(self, node: Node) -> tuple[Fit | None, bool]:
+        """Return the model of `node`, fitted to other readings, fitted to these records, and whether it predicts these
+        better: an effect that was missing may have asked for another reading."""
         with contextlib.suppress(*FAILURES):
             if len(node.fit.model.effects) != len(self.fit.model.effects):
                 problem = self.fit.problem.with_(model=node.fit.model, noise_factors={})
                 own = node_of(solve(problem, start="model"), HeldOut.of(self.fit, self.held_out))
-                return evidence(node, own).gain > 0
-        return False
+                return own.fit, evidence(node, own).gain > 0
+        return None, False
 
 
 def explored(fit: Fit, validate: Sequence[Experiment] | Experiment | None, effects: Sequence[Effect],
@@ -317,51 +321,57 @@ def explored(fit: Fit, validate: Sequence[Experiment] | Experiment | None, effec
     def left() -> float | None:
         return None if seconds is None else max(seconds - (time.monotonic() - began), 0.0)
 
-    def climbed(records: Records, most: int = max_effects) -> Climb:
+    def climbed(records: Records, most: int = max_effects, early: bool = False) -> Climb:
         stages.climb()
-        return climb(Search(records.fit, records.held_out, effects, stages), most, left())
+        return climb(Search(records.fit, records.held_out, effects, stages), most, left(), early)
 
     held_out = [validate] if isinstance(validate, Experiment) else validate
-    as_it_was, records = _as_read(affordable(fit), held_out)
-    found = climbed(records)
+    as_it_was, records, found = _read_and_climbed(affordable(fit), held_out, climbed)
     time_for_all = seconds is None or time.monotonic() - began < seconds / 3
     if not found.stopped and time_for_all and _remembers(found, fit, held_out):
-        whole = _as_read(fit, held_out)
-        found = replace(found, stopped=anew.stopped) if (anew := climbed(whole[1])).stopped else anew
+        *whole, anew = _read_and_climbed(fit, held_out, climbed)
+        found = replace(found, stopped=anew.stopped) if anew.stopped else anew
         as_it_was, records = whole if found is anew else (as_it_was, records)
     if not found.stopped and (windowed := _in_windows(found)) is not None:
-        parts = replace(records, fit=windowed)
-        anew = climbed(parts)
+        anew = climbed(parts := replace(records, fit=windowed))
         found, records = (replace(found, stopped=anew.stopped), records) if _explains(found, anew) else (anew, parts)
     last, again, reading = found.path[-1], None, None
-    if not found.stopped and not last.fit.window and records.remarks != as_it_was.remarks and as_it_was.suits(last):
+    reread = not (found.stopped or last.fit.window) and records.remarks != as_it_was.remarks
+    own, suits = as_it_was.suited(last) if reread else (None, False)
+    if own and records.reading:  # of the model with its effects
+        records = replace(records, remarks=(*records.remarks[:-1], records.reading.remark(own, last.fit)))
+    if suits:
         again = as_it_was
     elif not found.stopped and (reading := _late_reading(found.path)):
         late = records.read(reading)
-        again = late if len(found.path) == 1 or late.suits(last) else None
+        again = late if len(found.path) == 1 or late.suited(last)[1] else None
     if again is not None:
         anew = climbed(again)
-        new = anew.path[-1]
-        better = evidence(last, new)
+        better = evidence(last, new := anew.path[-1])
         if better.gain > 0 and better.fall > 0:
             if reading:
                 again = replace(again, remarks=(*records.remarks, reading.remark(last.fit, new.fit)))
             records, found = again, anew
         found = replace(found, stopped=anew.stopped)
     if records.remarks != as_it_was.remarks:  # what is missing may look like another reading
-        held = HeldOut.of(as_it_was.fit, as_it_was.held_out)
-        found, curve = _curve_alone(found, as_it_was.fit, held, left())
+        found, curve = _curve_alone(found, as_it_was.fit, HeldOut.of(as_it_was.fit, as_it_was.held_out), left())
         if curve is not None:
             records, found = as_it_was, climbed(as_it_was, 0)
     found, records = _with_held_out(found, records, climbed)
     return _beside_curves(found, left()), " ".join(records.remarks)
 
 
-def _as_read(fit: Fit, held_out: Sequence[Experiment] | None) -> tuple[Records, Records]:
-    """Return the records as they are, but for spikes, and as they are better read."""
+def _read_and_climbed(fit: Fit, held_out: Sequence[Experiment] | None,
+                      climbed: Callable[..., Climb]) -> tuple[Records, Records, Climb]:
+    """Return the records as they are, but for spikes, as they are better read, and a climb on those."""
     records = Records(fit, held_out and thinned_alike(fit, held_out))
-    records = records.read(spikes) if (spikes := without_spikes(records.fit)) else records
-    return records, records.read(reading) if (reading := better_reading(records.fit)) else records
+    as_it_was = records.read(spikes) if (spikes := without_spikes(records.fit)) else records
+    records = as_it_was.read(reading) if (reading := better_reading(as_it_was.fit)) else as_it_was
+    found = climbed(records, early=True)
+    if found.misread is not None:
+        better = evidence(found.path[-1], (anew := climbed(again := records.read(found.misread))).path[-1])
+        records, found = (again, anew) if min(better.gain, better.fall) > 0 else (records, climbed(records))
+    return as_it_was, records, found
 
 
 def _remembers(found: Climb, whole: Fit, held_out: Sequence[Experiment] | None) -> bool:

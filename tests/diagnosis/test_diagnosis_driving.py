@@ -14,6 +14,7 @@ from motorid.channels import channel_name
 from motorid.diagnosis import input_hypotheses as readings
 from motorid.diagnosis.input_hypotheses import better_reading
 from motorid.display.numbers import number
+from motorid.records.checks import dead_times
 from motorid.records.reading import write_csv
 
 FINE = 8  # steps of the plant per sample
@@ -130,6 +131,54 @@ def test_a_voltage_that_acts_late_is_no_effect(lab, hidden):
             for before in re.findall(rf"falls \(.*?{channel_name(c)} (\S+)", found.text)]
     assert all(text in found.text for text in ends)  # of the model with its effects, not of the one before
     assert len(ends) == 2
+
+
+@pytest.mark.parametrize("differs", [False, True])
+def test_a_dead_time_of_the_command_is_seen_before_friction_and_inductance_adapt_to_it(lab, differs):
+    """From a computer that commands 60 ms late; it was sought among 12 samples, after a search on what looked so."""
+    rng = np.random.default_rng(12)
+    v = np.repeat([0.0, 6.0, 0.0, 3.0], 200 * FINE)
+    runs = [recorded(lab, {"coulomb": {"tau_c": 0.008}}, v, 1e-3, rng, name=f"r{k}") for k in range(2)]
+    runs = [late(run, 60 + 40 * k * differs) for k, run in enumerate(runs)]
+    reading = better_reading(mi.fit(mi.dc_motor(), runs))
+    assert reading is not None
+    assert reading.says.startswith(f"The voltage acts 60 {'to 100 ms, another time' if differs else 'ms later than'}")
+    assert reading.option == "--delay 0.06"
+    if not differs:
+        found = mi.diagnose(mi.fit(mi.dc_motor(), runs), effects=("coulomb", "speed_delay", "driver_lag"))
+        assert "--delay 0.06" in found.text
+        assert found.effects == ("coulomb",)
+        assert found.remaining.adequate
+        assert found.after.values["L"] == pytest.approx(lab.L, rel=0.05)
+
+
+@pytest.mark.parametrize(("effect", "size"), [
+    ("driver_lag", {"T_v": 0.03}), ("driver_slew", {"T_r": 0.1, "V_s": 6.0, "V_w": 0.06})])
+def test_what_comes_slowly_is_no_dead_time(lab, effect, size):
+    rng, v = np.random.default_rng(13), np.repeat([0.0, 6.0, 0.0, 3.0], 200 * FINE)
+    model = mi.dc_motor(R=1.0, L=2e-3, K=0.05, b=1e-4, J=1e-4) + mi.effects.coulomb(tau_c=0.02)
+    blank = mi.Experiment(1e-3 * np.arange(800), {"v": v[::FINE]}, {"i": v[::FINE], "omega": v[::FINE]})
+    shown = mi.simulate(model + getattr(mi.effects, effect)(**size), blank, initial="rest")[0].outputs
+    run = blank.with_(outputs={c: y + rng.normal(0, 1e-3 * np.abs(y).max(), 800) for c, y in shown.items()})
+    assert dead_times([run]) == []
+    plain = blank.with_(outputs=dict(mi.simulate(model, blank, initial="rest")[0].outputs))
+    assert dead_times([late(plain, 60)]) == pytest.approx(2 * [0.06], abs=2e-3)  # 3 V move nothing
+
+
+def test_a_speed_logged_with_the_step_that_caused_it_is_no_end_stop():
+    """A row holds a command and the speed that it led to: the voltage acts one sample earlier, which no effect does."""
+    rng, stairs = np.random.default_rng(14), np.arange(1.0, 41.0)
+    v = np.tile(np.concatenate([stairs, -stairs]), 4)
+    omega = 2.0 * np.sign(v) * np.maximum(np.abs(v) - 8, 0)
+    runs = [mi.Experiment(np.arange(v.size), {"v": v}, {"omega": omega + rng.normal(0, 0.3, v.size)}, name=f"r{k}")
+            for k in range(2)]
+    tried = ("driver_dead_band", "end_stop", "coulomb", "speed_delay")
+    found = mi.diagnose(mi.fit(mi.dc_motor(), runs[:1]), runs[1:], effects=tried)
+    assert "acts 1000 ms earlier than it was logged" in found.text
+    assert "--delay=-1" in found.text
+    assert found.ladder.rungs[0].fit.problem.experiments[0].inputs["v"][0] == v[1]
+    assert "end_stop" not in found.effects
+    assert found.after.nrmse["omega"] < 0.03
 
 
 def test_a_late_speed_is_not_taken_for_a_late_voltage(lab):
