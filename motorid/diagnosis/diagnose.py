@@ -136,9 +136,11 @@ def _remarks(found: Climb, driven: str) -> list[str]:
     windows = "" if last.window is None else (
         f"The records are simulated in windows of {number(last.window, 2)} s, each from an estimated state: over whole "
         "records small errors of a model may grow. Errors are those of a window ahead.")
+    late = "" if set(last.problem.outputs) != {"omega"} or "speed_delay" not in found.path[-1].key else (
+        f"The speed alone cannot tell a late sensor from a voltage that acts late: --delay {last.values['T_d']:.3g}.")
     stopped = f"Stopped early: {found.stopped}; more may be missing." if found.stopped else ""
     own = words.own_in_every_run_remark(last) if found.search.held.validation is not None else ""
-    return [stopped, driven, windows, next(limits, ""), parts_remark(first),
+    return [stopped, driven, windows, late, next(limits, ""), parts_remark(first),
             words.unfinished_remark(last), words.held_out_remark(found.path[-1]), own,
             words.measured_angle_remark(last), words.outliers_remark(last), words.closed_loop_remark(first)]
 

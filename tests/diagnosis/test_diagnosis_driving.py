@@ -181,6 +181,14 @@ def test_a_speed_logged_with_the_step_that_caused_it_is_no_end_stop():
     assert found.after.nrmse["omega"] < 0.03
 
 
+def test_of_a_late_speed_alone_a_late_voltage_is_named_too(lab):
+    rng = np.random.default_rng(8)
+    runs = [late(recorded(lab, {}, stairs(1500, rng), 1e-3, rng, name=f"r{k}"), 8).without("i") for k in range(3)]
+    found = mi.diagnose(mi.fit(mi.dc_motor(), runs[:2]), runs[2:], effects=("speed_delay", "coulomb"))
+    assert found.effects == ("speed_delay",)
+    assert "a voltage that acts late: --delay 0.007" in found.text  # fitted: 7.5 ms
+
+
 def test_a_late_speed_is_not_taken_for_a_late_voltage(lab):
     rng = np.random.default_rng(8)
     runs = [recorded(lab, {}, stairs(1500, rng), 1e-3, rng, name=f"r{k}") for k in range(3)]
