@@ -44,7 +44,7 @@ def objections(fit: Fit, added: Effect, before: Fit | None = None) -> str:
             if p.vary and physical and sign * limit > 0 and max(sign * v for v in values) > 0.98 * sign * limit:
                 return f"{p.name} runs to {limit:g}, the limit of what is physical"
     why = (_too_large(fit, pars) or _alike(fit, added) or unresolved(fit, added) or _belied(fit, added)
-           or _blurred(fit, added) or _run_through(fit, added))
+           or _blurred(fit, added))
     return why or (_emptied(fit, added, before) if before else "")
 
 
@@ -56,7 +56,7 @@ def _alike(fit: Fit, added: Effect) -> str:
     return ""
 
 
-def _run_through(fit: Fit, added: Effect) -> str:
+def run_through(fit: Fit, added: Effect) -> str:
     """Say so where the motor runs on through a stop: what stops it makes it stand, or turn back."""
     for name, sign in (("theta_lo", -1), ("theta_hi", 1)):
         for s in fit.simulations if name in {p.name for p in added.parameters} else ():

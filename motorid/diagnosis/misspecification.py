@@ -18,7 +18,7 @@ from motorid.diagnosis.admissibility import objections
 from motorid.diagnosis.free_forms import Form, Linear, Span
 from motorid.diagnosis.model_comparison import Node, evidence, far
 from motorid.diagnosis.predictive_score import Evidence, Predictions, compare
-from motorid.diagnosis.thresholds import MOST, STANDARD_ERRORS, SUPPLANTS, TRIFLE, UNCONTESTED
+from motorid.diagnosis.thresholds import MOST, PLAIN, STANDARD_ERRORS, SUPPLANTS, TRIFLE, UNCONTESTED
 from motorid.display.numbers import listed, number, percent
 from motorid.errors import ModelError
 from motorid.estimation.angle_orders import uses_angle
@@ -211,7 +211,7 @@ def grades_of(last: Node, root: Node, groups: Sequence[Sequence[str]], beside: S
         why, form = objections(last.fit, e, root.fit), None
         why = why or ("it may only stand in for the driver's current limit" if limited else "")
         why = why or ("the model does not follow the records with it" if structure and not follows(last.fit) else "")
-        why = why or _insignificant(last.fit, e, structure, root.fit) or _within_smoothing(last.fit, e)
+        why = why or _insignificant(last, e, structure, root, without) or _within_smoothing(last.fit, e)
         smaller = without(e.name) if not why and (structure or far(last.fit)) else None
         if smaller is not None:
             free = [b for b in beside if not compare(b.predictions, beside[0].predictions).sure]
@@ -269,12 +269,14 @@ def outdoes(fall: float, further: float) -> bool:
     return further > SUPPLANTS and np.sqrt(left * (1 - (1 - further) ** 2) / max(1 - left, 1e-12)) > TRIFLE
 
 
-def _insignificant(fit: Fit, effect: Effect, structure: bool, first: Fit) -> str:
+def _insignificant(last: Node, effect: Effect, structure: bool, root: Node,
+                   without: Callable[[str], Node | None]) -> str:
     """Say so where every size of an effect is within two deviations of nothing.
 
     One without a deviation may be any; of a law whose sizes are all open, as voltages too where no current is known,
-    little is known. One without a size (a heating) may leave noise alone, where the `first` model did not.
+    little is known, unless it leaves noise, as the first model does not, and the error falls plainly by its size.
     """
+    fit = last.fit
     own = [p for p in effect.parameters if fit.problem.model.parameters[p.name].vary]
     sizes = [p.name for p in own if p.null == 0]
     found = [(fit.values[n], fit.std[n]) for n in sizes]
@@ -285,9 +287,11 @@ def _insignificant(fit: Fit, effect: Effect, structure: bool, first: Fit) -> str
         return f"{listed(sizes)} could as well be zero, within two standard deviations"
     open_ = [p.name for p in own if not sizes or p.name in sizes]
     known = any(fit.std[n] is not None or f"{n}_voltage" in torques for n in open_) or any(p.per_run for p in own)
-    if open_ and not known and (structure or sizes or not far(first)):
-        rest = ", and the rest is not noise" * structure
-        return f"{listed(open_)} {'is' if len(open_) == 1 else 'are'} not determined{rest}"
+    if open_ and not known:
+        smaller = without(effect.name) if sizes and not structure and far(root.fit) else None
+        if structure or not far(root.fit) or (smaller is not None and evidence(smaller, last).fall < PLAIN):
+            rest = ", and the rest is not noise" * structure
+            return f"{listed(open_)} {'is' if len(open_) == 1 else 'are'} not determined{rest}"
     return ""
 
 

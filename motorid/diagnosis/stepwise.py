@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from motorid.diagnosis.adequacy import following, judge_adequacy, within_noise
+from motorid.diagnosis.admissibility import run_through
 from motorid.diagnosis.candidates import Search, Stages, library
 from motorid.diagnosis.cross_validation import QUICK, HeldOut
 from motorid.diagnosis.input_hypotheses import Reading, better_reading, without_spikes
@@ -218,6 +219,14 @@ def _beside_curves(found: Climb, seconds: float | None) -> Climb:
     return replace(found, grades=tuple(grades))
 
 
+def _without_stops_run_through(found: Climb) -> Climb:
+    """Return a climb in which stops that the motor runs through are named no more."""
+    fit = found.path[-1].fit
+    told = {e.name: run_through(fit, e) for e in fit.model.effects}
+    return replace(found, grades=tuple(g if g.grade == "approximates" or not told[g.effect] else Grade(
+        g.effect, "approximates", told[g.effect]) for g in found.grades))
+
+
 def _curve_alone(found: Climb, root: Fit, held: HeldOut, seconds: float | None,
                  beside: bool = False) -> tuple[Climb, FormGain | None]:
     """Return a climb, stopped where the time is up, and the form that in the place of all that was found, beside
@@ -358,7 +367,7 @@ def explored(fit: Fit, validate: Sequence[Experiment] | Experiment | None, effec
         if curve is not None:
             records, found = as_it_was, climbed(as_it_was, 0)
     found, records = _with_held_out(found, records, climbed)
-    return _beside_curves(found, left()), " ".join(records.remarks)
+    return _without_stops_run_through(_beside_curves(found, left())), " ".join(records.remarks)
 
 
 def _read_and_climbed(fit: Fit, held_out: Sequence[Experiment] | None,

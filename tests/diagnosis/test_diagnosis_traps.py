@@ -11,7 +11,7 @@ from battery.excite import driven, record
 
 import motorid as mi
 from motorid.diagnosis.adequacy import adequacy
-from motorid.diagnosis.admissibility import objections
+from motorid.diagnosis.admissibility import run_through
 from motorid.diagnosis.candidates import Search, Stages
 from motorid.diagnosis.predictive_score import deciding, finer
 from motorid.diagnosis.score_test import rank, score
@@ -311,4 +311,4 @@ def test_a_command_beyond_the_supply_is_a_voltage_limit_and_no_stop(rng):
     assert found.effects[0] == "driver_voltage_limit"
     assert found.after.values["V_lim"] == pytest.approx(12, rel=5e-3)
     stopped = mi.fit(mi.dc_motor() + mi.effects.end_stop, runs)
-    assert objections(stopped, mi.effects.end_stop).startswith("the motor runs on through theta_hi")
+    assert run_through(stopped, mi.effects.end_stop).startswith("the motor runs on through theta_hi")
