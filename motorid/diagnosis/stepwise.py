@@ -436,12 +436,14 @@ def _in_windows(found: Climb) -> Fit | None:
 
 def _explains(whole: Climb, windowed: Climb) -> bool:
     """Tell whether what was found on whole records, which it follows, surely predicts more of windows of them than
-    what was found there, or is all that there is."""
+    what was found there, or is the same, or all that there is."""
     last, there = whole.path[-1].fit, windowed.search
     if windowed.stopped and len(windowed.path) == 1:
         return True
     with contextlib.suppress(*FAILURES):
         if len(whole.path) > 1 and follows(last):
+            if windowed.path[-1].key == whole.path[-1].key:
+                return True
             problem = there.root.fit.problem.with_(model=last.model.with_(angle_input=False), noise_factors={})
             return evidence(windowed.path[-1], node_of(solve(problem, QUICK, start="model"), there.held)).sure
     return False
