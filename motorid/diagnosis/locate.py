@@ -89,7 +89,7 @@ def _region(regions: Mapping[str, float]) -> str:
 def _signals(fit: Fit, k: int, s: Smoothed) -> Mapping[str, Array]:
     run, states = fit.problem.experiments[k], fit.problem.system.states
     told = ("i", "omega") if "i" in fit.problem.outputs else ("omega",)  # a current that was not measured tells nothing
-    found = {"t": run.t - run.t[0], **{c: s.x[:, states.index(c)] for c in told if c in states}}
+    found = {"t": run.t - run.t[0], "v": run.inputs["v"], **{c: s.x[:, states.index(c)] for c in told if c in states}}
     if "theta" in run.outputs or "omega" in run.outputs:
         found["theta"] = angle_signal(run)
     if "i" in found:

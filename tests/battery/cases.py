@@ -150,7 +150,7 @@ SINGLES = [
     single("speed_gain", "servo", {"k_w": 0.04}, train=("stairs", "multisine"), channels=ANGLE),
     single("driver_coast", "lab", {"V_c": 12.0}, train=("pulses", "pulses 0.7"), check="pulses 0.5"),
     single("driver_current_limit", "lab", {"I_lim": 3.0}, train=("stairs", "prbs 0.8")),
-    single("driver_voltage_limit", "lab", {"V_lim": 7.0}, train=("stairs", "prbs 0.8")),
+    single("driver_voltage_limit", "lab", {"V_lim": 2.5}, train=("stairs", "prbs 0.8")),
     single("driver_lag", "servo", {"T_v": 8e-3}, train=("stairs", "prbs 0.8")),
     single("driver_slew", "lab", {"T_r": 0.05, "V_s": 12.0}, train=("stairs", "prbs 0.8")),
     single("pwm_coast", "servo", {"s_c": 0.8, "V_s": 7.6}, train=("stairs", "steps 0.7")),

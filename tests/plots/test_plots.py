@@ -352,6 +352,19 @@ def test_what_was_added_lies_on_what_was_missing(effect, folder, axis):
     assert np.std(added.get_ydata()) == pytest.approx(np.std(missing.get_ydata()), rel=0.4)
 
 
+def test_what_a_driver_lacks_is_drawn_over_its_command():
+    """Of a speed alone: over the angle, which passes through each turn, any course was a curve."""
+    t, runs, rng = np.arange(0, 8, 5e-3), [], np.random.default_rng(0)
+    for v in (np.repeat([2, 5, 8, 11, 14, 17, 20, 6.0], 200), 2.5 * t):
+        omega, y = 0.0, []
+        for volts in np.minimum(v, 12.0):
+            y.append(omega)
+            omega += 5e-3 * (20 * max(volts - 0.7, 0.0) - omega) / 0.1
+        runs.append(mi.Experiment(t, {"v": v}, {"omega": np.array(y) + rng.normal(0, 1.0, len(t))}))
+    ax = plots.plot_answer(mi.diagnose(mi.fit(mi.dc_motor(), runs), effects=["driver_voltage_limit"]))
+    assert ax.get_xlabel() == "voltage v (V)"
+
+
 def test_dots_over_a_turn_are_of_all_turns():
     """The means over an angle are taken within a turn; dots were drawn of the first turn only."""
     theta, missing = np.linspace(0, 8 * np.pi, 400), np.sin(np.linspace(0, 8 * np.pi, 400))
