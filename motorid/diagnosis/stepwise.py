@@ -42,6 +42,7 @@ ORDER = ("named", "group", "approximates")  # grades, the surest first
 FITTED_TOO = ("The fitted runs alone leave nothing but noise, and the model that they determine fails on the held-out "
               "ones: these were fitted, too, and none are left to judge by.")
 WHOLE = 10  # times as long as of its parts: what a search on whole records may take, where its end is known
+DRAWS_BACK = frozenset(("spring", "end_stop"))  # what drifts, whatever is missing
 HALF_AS_GOOD = 0.5  # of the best child's fall: what a second model must reach to be carried along
 
 
@@ -426,7 +427,7 @@ def _in_windows(found: Climb) -> Fit | None:
     astray = [any(e.nrmse**2 > UNFOLLOWED and e.misfit > LARGER for e in node.predictions.held_out.values())
               or not follows(node.fit) for node in (found.path[0], found.path[-1])]
     part = in_windows(fit, partial(solve, solver=QUICK, start="model")) if fit and growth(fit) >= TOO_FAR else None
-    drawn_back = {"spring", "end_stop"} & (found.path[-1].key - found.path[0].key) and astray[0]
+    drawn_back = DRAWS_BACK & (found.path[-1].key - found.path[0].key) and astray[0]
     if part is None and (drawn_back or astray[1]):
         part = in_windows(first, partial(solve, solver=QUICK), drifts=True)
     with contextlib.suppress(*FAILURES):
@@ -436,13 +437,13 @@ def _in_windows(found: Climb) -> Fit | None:
 
 def _explains(whole: Climb, windowed: Climb) -> bool:
     """Tell whether what was found on whole records, which it follows, surely predicts more of windows of them than
-    what was found there, or is the same, or all that there is."""
+    what was found there, or is all that there is; or that both are what draws back a drift."""
     last, there = whole.path[-1].fit, windowed.search
     if windowed.stopped and len(windowed.path) == 1:
         return True
     with contextlib.suppress(*FAILURES):
         if len(whole.path) > 1 and follows(last):
-            if windowed.path[-1].key == whole.path[-1].key:
+            if windowed.path[-1].key == whole.path[-1].key and whole.path[-1].key & DRAWS_BACK:
                 return True
             problem = there.root.fit.problem.with_(model=last.model.with_(angle_input=False), noise_factors={})
             return evidence(windowed.path[-1], node_of(solve(problem, QUICK, start="model"), there.held)).sure

@@ -129,11 +129,11 @@ def test_a_second_climb_that_is_cut_short_does_not_lose_the_first(plain, monkeyp
     """A pendulum is climbed again in windows; whoever stops that at its start still gets what was found."""
     climbs, climb = [], stepwise.climb
 
-    def cut(search, max_effects, seconds=None):
+    def cut(search, max_effects, seconds=None, early=False):
         climbs.append(search)
         if len(climbs) > 1:
             seconds = 0.0
-        return climb(search, max_effects, seconds)
+        return climb(search, max_effects, seconds, early)
 
     monkeypatch.setattr(stepwise, "climb", cut)
     monkeypatch.setattr(stepwise, "_in_windows", lambda found: found.path[0].fit)

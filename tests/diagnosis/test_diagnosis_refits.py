@@ -571,8 +571,8 @@ def test_what_was_found_on_whole_records_is_kept_where_it_explains_windows_of_th
     runs = [_run(model, seed) for seed in (0, 1)]
     plain, climb, most = mi.fit(mi.dc_motor(), runs[0]), stepwise.climb, []
 
-    def next_climb(search, max_effects, seconds=None):
-        return climb(search, most.pop(), seconds)
+    def next_climb(search, max_effects, seconds=None, early=False):
+        return climb(search, most.pop(), seconds, early)
 
     def window():
         return mi.diagnose(plain, runs[1], effects=["coulomb"]).best.window
