@@ -71,7 +71,7 @@ def driver_voltage_limit(m: Equations, V_lim=P(5.0, "V", null=float("inf"), posi
 
     Seen in the logs of controllers that ask for more than the supply has: commands beyond it change nothing.
     """
-    m.voltage -= ca.fmax(m.v - V_lim, 0) - ca.fmax(-m.v - V_lim, 0)
+    m.limit("v", V_lim)
 
 
 OPEN = 1e-6  # V: a command that opens the bridge
@@ -98,7 +98,7 @@ def pwm_coast(m: Equations, s_c=P(0.5, "", null=0.0, lower=0.0, upper=1.1, doc="
     given it is the largest voltage of the records. Seen as a motor that hardly brakes, and runs too fast at small duty:
     several duties, with steps down.
     """
-    m.voltage += s_c * ca.fmax(1 - ca.fabs(m.command) / V_s, 0) * m.K_e * m.omega
+    m.voltage += s_c * ca.fmax(1 - ca.fabs(m.v) / V_s, 0) * m.K_e * m.omega
 
 
 LIMITER_GAIN, LIMITER_WIDTH = 5.0, 0.004  # in R: how firmly the current is led to its limit; of R·I_lim: how softly
@@ -162,7 +162,7 @@ def supply_sag(m: Equations, R_s=P(0.1, "Ω", null=0.0, lower=0.0, doc="resistan
     Only R_s/V_s² acts. Unless V_s is given it is the largest voltage of the records: the duty is one there.
     Seen as a voltage missing with the duty squared and the current: steps to several duties, under load.
     """
-    m.voltage -= R_s * (m.command / V_s) ** 2 * m.i
+    m.voltage -= R_s * (m.v / V_s) ** 2 * m.i
 
 
 @effect(balance="voltage")

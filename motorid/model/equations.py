@@ -39,6 +39,7 @@ class Equations:
         self.placeholders: dict[str, ca.SX] = {}
         self.definitions: dict[str, ca.SX] = {}
         self._replaced: dict[str, str] = {}
+        self._limits: dict[str, ca.SX] = {}
         self.define("smoothing", 1)  # factor on the width of sgn, which suits the speed as it is measured
         self.define("zero", 0)  # of the measured angle
         self.voltage, self.torque = ca.SX(0), ca.SX(0)
@@ -120,6 +121,15 @@ class Equations:
         self._replaced[name] = self.writer
         self.definitions[name] = ca.SX(expression)
 
+    def limit(self, name: str, size: Any) -> None:
+        """Keep the quantity `name`, whatever else scales or replaces it, within ± `size`."""
+        self._known(name)
+        self._limits[name] = size
+
+    def _defined(self, name: str) -> ca.SX:
+        found, size = self.definitions[name], self._limits.get(name)
+        return found if size is None else ca.fmax(-size, ca.fmin(size, found))
+
     def state(self, name: str, initial: Any = 0.0) -> ca.SX:
         """Add a state; `initial` may use ``m.start["omega"]`` and the like. Its `rate` must follow."""
         if name in self.states:
@@ -156,7 +166,7 @@ class Equations:
             before, used = used, {s.name() for s in ca.symvar(ca.vertcat(*expressions))}
             if not used & marks:
                 return expressions
-            definitions = ca.vertcat(*[self.definitions[n] for n in names])
+            definitions = ca.vertcat(*map(self._defined, names))
             expressions = ca.substitute(expressions, [ca.vertcat(*symbols)], [definitions])
         circle = ", ".join(sorted(s[1:] for s in (before | used) & marks))
         raise ModelError(f"the definitions of {circle} go in a circle: an effect scales or replaces a "

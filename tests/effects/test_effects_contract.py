@@ -220,7 +220,8 @@ def linear_record():
 
 @every_effect
 def test_a_linear_axis_shows_no_rotary_units(effect):
-    electrical = effect.balance == "voltage" and effect.name != "driver_dead_band"  # any command has that
+    any_command = effect.name in ("driver_dead_band", "driver_voltage_limit")
+    electrical = effect.balance == "voltage" and not any_command
     if electrical or "current" in effect.name:
         with pytest.raises(ModelError, match=r"dc_motor\(\)"):
             mi.Problem(mi.torque_driven("linear") + effect, linear_record())
@@ -241,3 +242,19 @@ def test_survives_a_trip_to_another_process(effect):
     a, b = model.system(ALL), there.system(ALL)
     assert a.rhs.serialize() == b.rhs.serialize()
     assert there.values == model.values
+
+
+@pytest.mark.parametrize("name", ["driver_current_limit", "driver_lag", "driver_slew", "supply_sag", "pwm_coast"])
+def test_a_limited_voltage_is_what_others_of_the_driver_see(name):
+    """As if the command had been clipped before."""
+    t = np.arange(600) * 1e-3
+    v = np.repeat([0.0, 12, -12, 3], 150)
+    sizes = {"driver_current_limit": {"I_lim": 3.0}, "supply_sag": {"R_s": 0.3}}.get(name, {})
+    motor = mi.dc_motor(R=1.0, L=2e-3, K=0.05, b=1e-4, J=1e-4) + LIBRARY[name](**sizes)
+    limited = motor + mi.effects.driver_voltage_limit(V_lim=8.0)
+    seen = []
+    for model, volts in ((limited, v), (motor, np.clip(v, -8, 8))):
+        run = mi.Experiment(t, {"v": volts}, {"i": 0 * t, "omega": 0 * t})
+        seen.append(mi.simulate(model, run, initial="rest")[0].outputs)
+    for c, y in seen[0].items():
+        assert y == pytest.approx(seen[1][c], abs=1e-6 * np.abs(y).max())
