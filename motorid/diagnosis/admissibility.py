@@ -17,7 +17,7 @@ KNOWN = 0.3  # of a parameter, its standard deviation: determined
 MOST_LOST = 0.6  # of the largest voltage that a drop or a dead band may be
 MOST_OFFSET = 0.3  # and an offset, which turns the motor by itself
 HOTTEST = 300.0  # K above the surroundings: enamel of the best class ends at 220 °C
-RUNS_ON = 0.1  # of its highest speed: slower, at the end of a record, is near enough to a stop
+RUNS_ON = 0.1  # of its highest speed: slower is near enough to a stop; and of the travel: an impact is less deep
 EMPTIED = 1e-2  # of its value before: it has vanished
 LENGTHS = ("rad", "m")  # a gap that runs to its limit is none
 
@@ -57,13 +57,16 @@ def _alike(fit: Fit, added: Effect) -> str:
 
 
 def run_through(fit: Fit, added: Effect) -> str:
-    """Say so where the motor runs on through a stop: what stops it makes it stand, or turn back."""
-    for name, sign in (("theta_lo", -1), ("theta_hi", 1)):
-        for s in fit.simulations if name in {p.name for p in added.parameters} else ():
-            omega, beyond = sign * s.states["omega"], np.flatnonzero(sign * (s.states["theta"] - fit.values[name]) > 0)
-            for k in np.split(beyond, np.flatnonzero(np.diff(beyond) > 1) + 1) if len(beyond) else ():
-                if np.min(omega[k[0]:k[-1] + 2]) > RUNS_ON * np.max(np.abs(omega)):
-                    return f"the motor runs on through {name} = {number(fit.values[name], 3)} rad"
+    """Say so where the motor runs on through a stop: what stops it makes it stand, or turn back. What a record's end
+    cuts off may be an impact, unless it goes far."""
+    for p in (p for p in added.parameters if p.name in ("theta_lo", "theta_hi")):
+        sign = 1 if p.name == "theta_hi" else -1
+        for s in (s for s in fit.simulations if "theta" in s.states):
+            omega, depth = sign * s.states["omega"], sign * (s.states["theta"] - fit.values[p.name])
+            for k in np.split(np.arange(len(depth)), np.flatnonzero(np.diff(depth > 0)) + 1):
+                far = k[-1] + 1 < len(depth) or np.max(depth[k]) > RUNS_ON * np.ptp(depth)
+                if depth[k[0]] > 0 and far and np.min(omega[k[0] : k[-1] + 2]) > RUNS_ON * np.max(np.abs(omega)):
+                    return f"the motor runs on through {p.name} = {number(fit.values[p.name], 3)} {p.unit}"
     return ""
 
 

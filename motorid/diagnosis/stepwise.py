@@ -380,7 +380,12 @@ def _read_and_climbed(fit: Fit, held_out: Sequence[Experiment] | None,
     found = climbed(records, early=True)
     if found.misread is not None:
         better = evidence(found.path[-1], (anew := climbed(again := records.read(found.misread))).path[-1])
-        records, found = (again, anew) if min(better.gain, better.fall) > 0 else (records, climbed(records))
+        if min(better.gain, better.fall) > 0:
+            records, found = again, anew
+        elif anew.stopped:  # what was found by then is the answer
+            found = replace(found, stopped=anew.stopped, text=anew.text, remaining=judge_adequacy(found.path[-1]))
+        else:
+            found = climbed(records)
     return as_it_was, records, found
 
 

@@ -176,9 +176,9 @@ def _fall(was: Mapping[str, float], is_: Mapping[str, float]) -> float:
 
 
 def _changed(rung: Rung, c: str, was: float, is_: float) -> str:
-    if percent(was) == percent(is_):
+    if (change := arrow(was, is_)) == arrow(is_, was):
         return f"{_name(rung, c)} stays {percent(is_)}"
-    return f"{_name(rung, c)} {'rises ' * (is_ > was)}{arrow(was, is_)}"
+    return f"{_name(rung, c)} {'rises ' * (is_ > was)}{change}"
 
 
 def _name(rung: Rung, c: str) -> str:

@@ -72,13 +72,13 @@ def percent(share: float | None, digits: int = 3) -> str:
 
 def factor(ratio: float, lead: str = "", digits: int = 2) -> str:
     """Return ``up to 16``, after `lead`; or ``over 1000``: beyond, it says how small the measure is, no more."""
-    return f"{lead}{number(ratio, digits)}" if abs(ratio) <= 1000 else f"{('over ', 'below −')[ratio < 0]}1000"
+    return f"{lead}{number(ratio, digits)}" if not abs(ratio) > 1000 else f"{('over ', 'below −')[ratio < 0]}1000"
 
 
 def arrow(before: float, after: float) -> str:
-    """Return how a share changed: ``12.7 → 1.02 %``."""
-    first, last = percent(before), percent(after)
-    return f"{first.removesuffix(' %')} → {last}" if last.endswith("%") else f"{first} → {last}"
+    """Return how a share changed: ``12.7 → 1.02 %``, however large it is."""
+    first, last = ("–" if math.isnan(share) else number(100 * share, 3) for share in (before, after))
+    return f"{first} → {last}{' %' * (last != '–')}"
 
 
 def duration(seconds: float) -> str:

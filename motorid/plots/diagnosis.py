@@ -147,7 +147,7 @@ def _quantity(found: Diagnosis, balance: str, had: Sequence[Array] | None) -> tu
     bins = [b for b in bins if b.against not in ("t", "heat")] or bins
     if orders or not bins or had is None:
         return ("theta", orders[0]) if orders else (bins[0].against if bins else "t", 1.0)
-    names = (*(b.against for b in bins), "v")
+    names = [*(b.against for b in bins), *(n for n in found.missing.signals[0] if n == "v")]
     x = {n: np.concatenate([np.asarray(s[n]) for s in found.missing.signals]) for n in names}
     x |= {"theta": np.mod(x["theta"], 2 * np.pi)} if "theta" in x else {}
     told = {n: binned(n, x[n], np.concatenate(had), bins=FINE).explained for n in x}

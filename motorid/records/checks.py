@@ -86,11 +86,11 @@ def dead_times(runs: Sequence[Experiment]) -> list[float]:
         v, seen = run.inputs["v"], {c: bridged(run.t, run.outputs[c]) for c in ("i", "omega") if c in run.outputs}
         edges = [0, *(np.flatnonzero(np.abs(np.diff(v)) > BEGUN * np.ptp(v)) + 1).tolist(), run.n]
         for first, a, end in zip(edges, edges[1:], edges[2:], strict=False):
-            half, level = (first + a) // 2, BEGUN * abs(v[a] - v[a - 1])
-            if min(a - half, end - a) < FEWEST_FRESH or max(np.ptp(v[first:a]), np.ptp(v[a:end])) > level:
+            last, level = a - (a - first) // 4, BEGUN * abs(v[a] - v[a - 1])
+            if min((a - first) // 2, end - a) < FEWEST_FRESH or max(np.ptp(v[first:a]), np.ptp(v[a:end])) > level:
                 continue
-            turns = any(abs(np.median(y[half:a])) > STILL * np.abs(y).max() for y in seen.values())
-            ways = [_way(y[half:a], y[a:end]) for y in seen.values() if "i" in seen or turns]
+            turns = any(abs(np.median(y[last:a])) > STILL * np.abs(y).max() for y in seen.values())
+            ways = [_way(y[last:a], y[a:end]) for y in seen.values() if "i" in seen or turns]
             if ways and all(ways):
                 waits, comes = min(way for way in ways if way)
                 found.append(float(run.t[a + waits] - run.t[a]) if waits > comes - waits else 0.0)
@@ -98,10 +98,15 @@ def dead_times(runs: Sequence[Experiment]) -> list[float]:
 
 
 def _way(before: Array, after: Array) -> tuple[int, int] | None:
-    """Return after how many samples a channel still is as it was, and when most of its way is done; None for noise."""
+    """Return after how many samples a channel still is as it was, and when most of its way is done; None for noise, for
+    what still moved before, and where the sensor may only have waited for its next measurement."""
     way, noise = np.abs(after - np.median(before)), 4 * float(np.std(before))
-    at = [int(np.argmax(way > max(share * (top := float(np.quantile(way, 0.9))), noise))) for share in (BEGUN, RISEN)]
-    return (at[0] - 1, at[1]) if 2 * noise < top else None
+    early, late = np.array_split(before, 2)
+    top, moved = float(np.quantile(way, 0.9)), abs(float(np.median(late) - np.median(early)))
+    begun, most = (int(np.argmax(way > max(share * top, noise))) for share in (BEGUN, RISEN))
+    fresh = np.diff(np.flatnonzero(np.diff(after)))  # samples between measurements
+    told = begun - 1 > (float(np.median(fresh)) if len(fresh) else 0.0) or begun < 3
+    return (begun - 1, most) if 6 * noise < top and moved < 0.5 * BEGUN * top and told else None
 
 
 def span(dead: Sequence[float]) -> str:
@@ -111,7 +116,7 @@ def span(dead: Sequence[float]) -> str:
 
 
 def _late(dead: Sequence[float]) -> str | None:
-    return (f"current and motion follow a step of the voltage only after {span(dead)} and then in less time than that: "
+    return (f"what was measured follows a step of the voltage only after {span(dead)} and then in less time than that: "
             f"does it act later than it was logged? If so: --delay {min(dead):.3g}, run.delayed({min(dead):.3g})."
             ) if dead else None
 

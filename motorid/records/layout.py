@@ -57,7 +57,7 @@ def assign(labels: Sequence[str], *, columns: Mapping[str, object] | None = None
     _last_resorts(places, labels, notes)
     _apply_units(places, labels, units, notes)
     # An angle in counts of unknown size is left out, unless it is all there is.
-    for channel in [c for c in ("theta", "omega") if c in places and math.isnan(places[c].unit.factor)]:
+    for channel in (unscaled := [c for c in ("theta", "omega") if c in places and math.isnan(places[c].unit.factor)]):
         if {"i", "omega", "theta"} & set(places) == {channel}:
             headers.require_unit(places[channel].unit.label, channel)
         notes.append(f"left out '{places.pop(channel).column}': it is in encoder counts, and how many make one turn is "
@@ -65,7 +65,7 @@ def assign(labels: Sequence[str], *, columns: Mapping[str, object] | None = None
     _require(places, labels, values or {})
     free = [c for c in labels if c not in {x for p in places.values() for x in (p.column, p.times)}]
     others = [c for c in free if c in (values or labels) and not headers.is_reference(c)]
-    if others and not {"omega", "theta"} & {*places, *(columns or {})}:
+    if others and not {"omega", "theta"} & {*places, *(columns or {}), *unscaled}:
         notes.append(f"not used: {', '.join(others[:20])}; if one of them is the speed or the angle, name it with "
                      f"columns={{'omega': '{'y' if 'y' in others else others[0]}'}}.")
     notes += [f"'{c}' looks like the reference of a controller: what drives the model is '{places['v'].column}'; "

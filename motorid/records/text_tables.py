@@ -1,7 +1,9 @@
 """A table of numbers from the bytes of a text file: encoding, dialect, header, row of units, rows; pandas parses."""
 
+import contextlib
 import csv
 import io
+import json
 import re
 import warnings
 from collections import Counter, defaultdict
@@ -72,7 +74,7 @@ def parse_table(data: bytes) -> TextTable:
     if cells > MOST_COLUMNS:
         raise DataError(f"a row has about {cells} cells; at most {MOST_COLUMNS} columns are read. Is there one row per "
                         "sample?")
-    if _JSON.match(text):
+    if _JSON.match(text) and (_is_json(text) or all(map(_is_json, body[:2]))):
         raise DataError("it is JSON, not a table. Write it as CSV: a row of names, then one row per sample.")
     dialect, width = sniff(body)
     first = next((k for k, line in enumerate(body) if is_data(dialect.cells(line), dialect, width)), None)
@@ -82,6 +84,12 @@ def parse_table(data: bytes) -> TextTable:
     labels, unit_row = _header(body[:first], comments, dialect, width, notes)
     columns, texts = _parse(_rows(body[first:], dialect, len(labels), notes), dialect, labels, notes)
     return TextTable(columns, texts, labels, dict(zip(labels, unit_row, strict=False)), comments, notes)
+
+
+def _is_json(text: str) -> bool:
+    with contextlib.suppress(ValueError):
+        return isinstance(json.loads(text), dict | list)
+    return False
 
 
 def decode(data: bytes) -> tuple[str, list[str]]:

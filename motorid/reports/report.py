@@ -236,7 +236,7 @@ def _where(d: Diagnosis) -> Section:
     m = d.missing
     best = [f"{balance}: {b.against} explains {percent(b.explained, 2)}"
             for balance, bins in m.bins.items() for b in bins[:1]]
-    caption = f"The {' and '.join(m.bins)} that would make the model match, and what explains it."
+    caption = f"The {' and '.join(m.bins)} that would make the model match, with its explanation."
     figure = _figure("missing", caption, "What is missing. " + "; ".join(best), "plot_missing", d)
     tables = [share_table("region", m.regions)] if m.regions else []
     text = [worded(t, d.before.problem.experiments[0].units["v"]) for t in (d.adequacy.text, m.text)]

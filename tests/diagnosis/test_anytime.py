@@ -8,6 +8,7 @@ import time
 from dataclasses import replace
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
@@ -195,3 +196,28 @@ def test_curves_are_asked_where_held_out_runs_hold_more_than_noise(monkeypatch, 
                            grades=(Grade("winding_heating", "named"),))
     assert stepwise._beside_curves(found, None) is found
     assert bool(asked) is not noise
+
+
+def test_what_was_found_before_a_voltage_was_read_as_earlier_outlives_the_end_of_the_time(monkeypatch):
+    """The logged voltage is a sample late, beside dry friction; the time is up when all is climbed again."""
+    motor = mi.dc_motor(R=1.0, L=2e-3, K=0.05, b=1e-4, J=1e-4) + mi.effects.coulomb(tau_c=0.1)
+    motor, t, runs = motor + mi.effects.quadratic_drag(c_2=2e-5), np.arange(800) * 5e-3, []
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        v = np.repeat(rng.uniform(-8, 8, 20), 40)
+        blank = mi.Experiment(t, {"v": v}, {"i": v, "omega": v})
+        omega = mi.simulate(motor, blank, initial="rest")[0].outputs["omega"] + rng.normal(0, 0.3, 800)
+        runs.append(mi.Experiment(t, {"v": np.concatenate([[0.0], v[:-1]])}, {"omega": omega}))
+    climb, climbs = stepwise.climb, []
+
+    def cut(search, max_effects, seconds=None, early=False):
+        climbs.append(climb(search, max_effects, 0.0 if climbs else seconds, early))
+        return climbs[-1]
+
+    monkeypatch.setattr(stepwise, "climb", cut)
+    found = mi.diagnose(mi.fit(mi.dc_motor(), runs[:2]), runs[2:], effects=("coulomb", "quadratic_drag"))
+    assert climbs[0].misread is not None
+    assert "coulomb" in climbs[0].path[-1].key
+    assert len(climbs) == 2
+    assert "coulomb" in found.after.model.effect_names
+    assert found.stopped == refit.OUT_OF_TIME

@@ -162,7 +162,7 @@ def test_what_comes_slowly_is_no_dead_time(lab, effect, size):
     run = blank.with_(outputs={c: y + rng.normal(0, 1e-3 * np.abs(y).max(), 800) for c, y in shown.items()})
     assert dead_times([run]) == []
     plain = blank.with_(outputs=dict(mi.simulate(model, blank, initial="rest")[0].outputs))
-    assert dead_times([late(plain, 60)]) == pytest.approx(2 * [0.06], abs=2e-3)  # 3 V move nothing
+    assert dead_times([late(plain, 60)]) == pytest.approx(3 * [0.06], abs=2e-3)  # 3 V move the current alone
 
 
 def test_a_speed_logged_with_the_step_that_caused_it_is_no_end_stop():

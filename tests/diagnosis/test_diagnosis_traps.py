@@ -312,3 +312,18 @@ def test_a_command_beyond_the_supply_is_a_voltage_limit_and_no_stop(rng):
     assert found.after.values["V_lim"] == pytest.approx(12, rel=5e-3)
     stopped = mi.fit(mi.dc_motor() + mi.effects.end_stop, runs)
     assert run_through(stopped, mi.effects.end_stop).startswith("the motor runs on through theta_hi")
+
+
+def test_a_record_that_ends_during_an_impact_does_not_refute_the_stop(rng):
+    """Before it turns back the motor moves on; what a record's end cuts off is no passage."""
+    t = np.arange(0, 3, 2e-3)
+    blank = mi.Experiment(t, {"v": 6 * np.sign(np.sin(2 * t + 0.1))}, {"i": 0 * t, "theta": 0 * t})
+    motor = mi.dc_motor(R=1.0, L=2e-3, K=0.05, b=1e-4, J=1e-4) + mi.effects.end_stop(
+        k_stop=1.0, theta_lo=-3.0, theta_hi=2.0, d_stop=1e-3)
+    clean = mi.simulate(motor, blank, initial="rest")[0].outputs
+    entered = np.flatnonzero(np.diff((clean["theta"] > 2.0).astype(int)) == 1)
+    assert len(entered) > 1
+    run = blank.with_(outputs={c: y + rng.normal(0, 1e-3, len(t)) for c, y in clean.items()})
+    for last in (entered[-1] + 3, len(t)):
+        fit = mi.fit(motor, run.select(slice(0, int(last))))
+        assert run_through(fit, mi.effects.end_stop) == ""

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from motorid.display.numbers import duration, factor, number, percent, quantity, with_error
+from motorid.display.numbers import arrow, duration, factor, number, percent, quantity, with_error
 
 
 @pytest.mark.parametrize(("value", "std", "unit", "text"), [
@@ -57,3 +57,8 @@ def test_words_for_shares_units_and_times():
     assert quantity(5e-3, "N·m") == "0.005 N·m"
     assert quantity(0.4, "1") == "0.4"  # a duty
     assert [duration(s) for s in (0.0352, 1.234, 59.99, 200)] == ["35 ms", "1.23 s", "1 min", "3 min 20 s"]
+
+
+def test_a_change_between_two_large_errors_is_told():
+    assert arrow(50.0, 12.0) == "5000 → 1200 %"
+    assert arrow(float("nan"), 0.01) == "– → 1 %"

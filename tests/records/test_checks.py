@@ -7,7 +7,7 @@ import pytest
 
 from motorid.channels import CHANNELS
 from motorid.errors import DataError
-from motorid.records.checks import check_runs, reading_notes
+from motorid.records.checks import check_runs, dead_times, reading_notes
 from motorid.records.datasets import data_path, datasets
 from motorid.records.experiment import Experiment
 from motorid.records.reading import read_csv, read_runs
@@ -613,3 +613,16 @@ def test_a_coarse_sensor_s_offset_at_rest_is_no_limit(rng):
     rippled = np.minimum(motion * (1 + 0.05 * rng.normal(size=6000)), -1)
     speed = np.round(np.where(motion < -0.5, rippled, 0)) + 1.0
     assert "clipped" not in said(Experiment(t, {"v": np.where(t < 3, -6.0, 0.0)}, {"omega": speed}))
+
+
+@pytest.mark.parametrize("levels", [(0, 6, -6, 6, -6, 3, -3), (0, 4, 8, -8, 6)])
+def test_a_slow_motor_that_is_reversed_before_it_settles_is_not_late(rng, levels):
+    """It falls back through what it was just before; nor is a sensor that is read every few samples late."""
+    v, omega = np.repeat(levels, 300).astype(float), [0.0]
+    for volts in v[1:]:
+        omega.append(20 * volts + (omega[-1] - 20 * volts) * np.exp(-1e-3 / 0.4))
+    y = np.array(omega) + rng.normal(0, 0.05, v.size)
+    run = Experiment(1e-3 * np.arange(v.size), {"v": v}, {"omega": y})
+    assert dead_times([run]) == []
+    kept = np.repeat(y[::12], 12)
+    assert dead_times([run.with_(outputs={"omega": kept})]) == []

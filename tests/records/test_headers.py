@@ -70,6 +70,7 @@ def test_an_angle_in_counts_is_in_no_radians(header, per_turn):
     layout = assign(["time_s", "voltage_V", "current_A", header])
     assert (found.channel in layout.places) == bool(per_turn)
     assert any("encoder counts" in n for n in layout.notes) == (not per_turn)
+    assert not any("not used" in n for n in layout.notes)  # how to use it is said
 
 
 def test_a_step_or_an_inclination_is_no_count():

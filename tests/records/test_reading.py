@@ -146,6 +146,7 @@ DIALECTS = {
     "row of units": "time;voltage;current;speed\ns;V;A;rad/s\n" + SEMICOLON,
     "long names, units, short names": "Time;Drive;Current;Motor speed\ns;V;A;rad/s\nt;u;i;w\n" + SEMICOLON,
     "row of units in brackets": "Time,Voltage,Current,Speed\n(s),(V),(A),(rad/s)\n" + rows(),
+    "JSON above the header": '{"device": "x"}\n' + GOOD,
     "lines above the header": "Scope 7\nSampling rate, 100\nOperator: me\n\n" + GOOD,
     "quoted header": '"time_s","voltage_V","current_A","speed_rad_s"\n' + rows(),
     "quoted cells with decimal comma": '"t","u","i","w"\n' + rows(
