@@ -383,7 +383,8 @@ def _read_and_climbed(fit: Fit, held_out: Sequence[Experiment] | None,
         if min(better.gain, better.fall) > 0:
             records, found = again, anew
         elif anew.stopped:  # what was found by then is the answer
-            found = replace(found, stopped=anew.stopped, text=anew.text, remaining=judge_adequacy(found.path[-1]))
+            last = judge_adequacy(found.path[-1])
+            found = _finished(replace(found, stopped=anew.stopped, text=anew.text, remaining=last))
         else:
             found = climbed(records)
     return as_it_was, records, found

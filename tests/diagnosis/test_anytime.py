@@ -219,5 +219,5 @@ def test_what_was_found_before_a_voltage_was_read_as_earlier_outlives_the_end_of
     assert climbs[0].misread is not None
     assert "coulomb" in climbs[0].path[-1].key
     assert len(climbs) == 2
-    assert "coulomb" in found.after.model.effect_names
+    assert "coulomb" in {rung.added for rung in found.ladder.rungs if rung.grade}
     assert found.stopped == refit.OUT_OF_TIME
