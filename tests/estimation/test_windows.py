@@ -153,7 +153,7 @@ def test_where_detents_decide_a_motor_is_followed_in_windows_if_these_leave_nois
     assert fit.values["phi"] == pytest.approx(0.4, abs=0.03)
     assert plain.window is None
     refused = Candidate("cogging", 0.8, fit=whole, gain=60.0)
-    root = SimpleNamespace(fit=plain, predictions=SimpleNamespace(held_out={}))
+    root = SimpleNamespace(fit=plain, key=frozenset(), predictions=SimpleNamespace(held_out={}))
     found: Any = SimpleNamespace(path=[root], rounds=[[refused]])
     again = _in_windows(found)  # a search that refused it since its own errors grew begins anew so
     assert again is not None
