@@ -105,6 +105,16 @@ _choices = functools.cache(functools.partial(re.split, r" \| (?![^\[]*\])"))  # 
 _within: ContextVar[bool] = ContextVar("motorid_within_a_call", default=False)
 
 
+@contextlib.contextmanager
+def looked_at() -> Iterator[None]:
+    """Take the arguments of all calls in the block as looked at, as the command line has done."""
+    token = _within.set(True)
+    try:
+        yield
+    finally:
+        _within.reset(token)
+
+
 def arguments_told(thing: _Thing) -> _Thing:
     """Let a function, or what a class is made with and its methods, say which argument is not what its annotation says.
 

@@ -58,7 +58,7 @@ class _PlainHelp:
 
     def get_params(self, ctx: Any) -> list[Any]:
         """See click."""
-        params: list[Any] = super().get_params(ctx)  # type: ignore[misc]
+        params: list[Any] = super().get_params(ctx)  # type: ignore[misc]  # a mixin
         for p in params:
             if p.param_type_name == "argument":
                 p.display_type_rich = lambda ctx: ""

@@ -18,7 +18,7 @@ import typer
 
 from motorid import effects as library
 from motorid.channels import CHANNELS
-from motorid.errors import ModelError, UsageError, among
+from motorid.errors import ModelError, UsageError, among, looked_at
 from motorid.estimation.fit import fit
 from motorid.estimation.result import Fit
 from motorid.estimation.shooting.multiple_shooting import MultipleShooting
@@ -212,9 +212,10 @@ def with_options(kind: type) -> Callable[[Callable[..., None]], Callable[..., No
         @functools.wraps(command)
         def run(**given: Any) -> None:
             taken = {f.name: given.pop(f.name) for f in fields(kind)}
-            command(**given, options=kind(**taken))
+            with looked_at():
+                command(**given, options=kind(**taken))
 
-        run.__signature__ = inspect.Signature([*parts, *mine])  # type: ignore[attr-defined]
+        run.__signature__ = inspect.Signature([*parts, *mine])  # type: ignore[attr-defined]  # Typer reads it
         run.__annotations__ = {p.name: p.annotation for p in (*parts, *mine)}
         return run
 

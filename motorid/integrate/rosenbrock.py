@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Any
@@ -160,11 +160,17 @@ class Stepper:
 
     def shown_sizes(self, grid: Grid, traj: Trajectory, p: Array) -> Array:
         """Size (nx,) that the largest output lends the states it shows: a small part need not be exact."""
-        middle = len(traj.x) // 2
-        slopes = np.abs(np.asarray(self.functions.out(traj.x[middle], grid.u[middle], p)[1]))
+        middle, slopes = len(traj.x) // 2, np.empty((self.nx, self.ny))  # column-major, as CasADi has it
+        given, skip = (traj.x[middle], np.ascontiguousarray(grid.u[middle]), p), np.empty(self.ny * len(p) + self.ny)
+        _called(*self._out, given, (skip, slopes, skip[self.ny:]))
+        slopes = np.abs(slopes.T)
         tops = np.abs(np.ascontiguousarray(traj.y.T)).max(axis=1)  # long rows are quicker
         with np.errstate(over="ignore"):  # a model that runs away
             return np.where(slopes > 1e-6, tops[:, None] / np.maximum(slopes, 1e-6), 0.0).max(axis=0)
+
+    @cached_property
+    def _out(self) -> Any:
+        return self.functions.out.buffer()
 
     def _load(self, compiled: bool | None) -> Any:
         """Return the compiled driver if it is there, or worth making now; else None."""
@@ -297,15 +303,18 @@ def _padded(a: Array, n: int) -> Array:
 def _in_chunks(f: Any, n: int, moving: Sequence[Array], steady: Sequence[Array], results: Sequence[Array]) -> None:
     """Fill `results` by calls of `f` over `CHUNK` rows each; of a chunk of `moving` a call reads what it takes."""
     call, trigger = f.buffer()
-    for k, a in enumerate(steady, len(moving)):
-        call.set_arg(k, _view(a))
     for first in range(0, n, CHUNK):
         rows = slice(first, first + CHUNK)
-        for k, a in enumerate(moving):
-            call.set_arg(k, _view(a[rows]))
-        for k, a in enumerate(results):
-            call.set_res(k, _view(a[rows]))
-        trigger()
+        _called(call, trigger, (*(a[rows] for a in moving), *steady), [a[rows] for a in results])
+
+
+def _called(call: Any, trigger: Callable[[], object], given: Iterable[Array], results: Iterable[Array]) -> None:
+    """Evaluate CasADi's `call` on contiguous arrays in place: a tenth of the time that a call with NumPy's takes."""
+    for k, a in enumerate(given):
+        call.set_arg(k, _view(a))
+    for k, a in enumerate(results):
+        call.set_res(k, _view(a))
+    trigger()
 
 
 def _view(a: Any) -> memoryview:
