@@ -247,7 +247,10 @@ class Search:
         assert refused.fit is not None
         half, model = replace(node, fit=refused.fit, added=refused.effect, parent=node), refused.fit.model
         scores = self._shortlist(half)[:PAIRS]
-        return self._together(node, [Task(half.fit, model + s.effect, s.effect, s.starts, s.drop) for s in scores])
+        found = self._together(node, [Task(half.fit, model + s.effect, s.effect, s.starts, s.drop) for s in scores])
+        first = next(e for e in model.effects if e.name == refused.effect)
+        simpler = [self.smaller(c, m) for c in found if c.objection for m in self._simpler(c.fit.model, first)]
+        return found + [c for c in simpler if c is not None]
 
     def _together(self, node: Node, tasks: Sequence[Task]) -> list[Node]:
         first = len(node.fit.model.effects)

@@ -290,6 +290,8 @@ def _outdoing(listed: Sequence[Candidate], children: Sequence[Node], best: Node,
     first = max(known, key=lambda c: c.gain or 0.0, default=None)
     if first is None or any(first.effect in child.key for child in children):
         return None
+    if chosen is None and (first.gain or 0.0) > 0:
+        return first
     gain, se = ((than := evidence(best, chosen)).gain, than.se) if chosen is not None else (0.0, 0.0)
     return first if is_sure((first.gain or 0.0) - gain, float(np.hypot(first.gain_se or 0.0, se))) else None
 
