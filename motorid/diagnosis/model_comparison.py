@@ -13,7 +13,7 @@ import numpy as np
 
 from motorid.diagnosis.cross_validation import HeldOut
 from motorid.diagnosis.predictive_score import Evidence, Predictions, compare, finer
-from motorid.diagnosis.thresholds import FINER, LARGER, SEARCHED
+from motorid.diagnosis.thresholds import FINER, LARGER, MOST, SEARCHED
 from motorid.estimation.result import Fit
 from motorid.model.model import Model
 from motorid.problem.problem import Problem
@@ -105,11 +105,33 @@ def choose(children: Sequence[Node], parent: Node) -> tuple[Node, list[Node]] | 
     ordered = sorted(children, key=lambda n: -evidence(parent, n).gain)
     chosen = reduce(lambda best, n: n if beats(n, best) else best, ordered)
     while True:  # ties are not transitive: what is tied with the smaller model may be smaller still
-        near = [n for n in ordered if n is chosen or not beats(chosen, n)]
-        smaller = min(near, key=lambda n: (n.size, rarity(n.added), -evidence(parent, n).gain))
-        if smaller is chosen or (smaller.size, rarity(smaller.added)) >= (chosen.size, rarity(chosen.added)):
+        near = [n for n in ordered if n is chosen or not beats(chosen, n) or _as_likely(n, chosen)]
+        smaller = min(near, key=lambda n: (*_price(n), -evidence(parent, n).gain))
+        if smaller is chosen or _price(smaller) >= _price(chosen):
             return chosen, ordered
         chosen = smaller
+
+
+def _price(node: Node) -> tuple[bool, int, int]:
+    """What decides between equals: whether a model has a rare device in the place of dry friction, then its size."""
+    return _imitates(node), node.size, rarity(node.added)
+
+
+def _imitates(node: Node) -> bool:
+    """Tell whether a model brakes like an eddy current and does not rub: all that turns rubs, and few were built so."""
+    return "eddy_brake" in node.key and not rubs(node)
+
+
+def rubs(node: Node) -> bool:
+    """Tell whether a model has dry friction."""
+    return any("coulomb" in (e.name, *e.includes) for e in node.fit.model.effects)
+
+
+def _as_likely(node: Node, chosen: Node) -> bool:
+    """Tell whether a model that rubs predicts hardly worse than one with a rare device that leaves more than noise:
+    what is missing beside either may make the difference, where that is less than what is left."""
+    rare = _imitates(chosen) and rubs(node) and not node.objection and bool(far(chosen.fit))
+    return rare and (1 - evidence(node, chosen).fall) ** 2 > MOST
 
 
 def group_of(chosen: Node, siblings: Sequence[Node], includes: Mapping[str, tuple[str, ...]]) -> tuple[str, ...]:
