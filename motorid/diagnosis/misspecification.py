@@ -271,7 +271,7 @@ def outdoes(fall: float, further: float) -> bool:
 
 def _insignificant(last: Node, effect: Effect, structure: bool, root: Node,
                    without: Callable[[str], Node | None]) -> str:
-    """Say so where every size of an effect is within two deviations of nothing.
+    """Say so where every size of an effect is within two deviations of nothing, and without it the error hardly rises.
 
     One without a deviation may be any; of a law whose sizes are all open, as voltages too where no current is known,
     little is known, unless it leaves noise, as the first model does not, and the error falls plainly by its size.
@@ -284,7 +284,9 @@ def _insignificant(last: Node, effect: Effect, structure: bool, root: Node,
     torques = {} if {"i", "omega"} <= {*fit.problem.outputs} else fit.determined  # K stays open, and every torque
     found += [(q.value, q.std) for n in sizes if (q := torques.get(f"{n}_voltage")) is not None]
     if sizes and not any(std is None or STANDARD_ERRORS * std < abs(value) for value, std in found):
-        return f"{listed(sizes)} could as well be zero, within two standard deviations"
+        smaller = without(effect.name)  # deviations are of slopes, and zero may be far from where these hold
+        if smaller is None or evidence(smaller, last).fall < PLAIN:
+            return f"{listed(sizes)} could as well be zero, within two standard deviations"
     open_ = [p.name for p in own if not sizes or p.name in sizes]
     known = any(fit.std[n] is not None or f"{n}_voltage" in torques for n in open_) or any(p.per_run for p in own)
     if open_ and not known:

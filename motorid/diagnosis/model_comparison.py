@@ -14,6 +14,7 @@ import numpy as np
 from motorid.diagnosis.cross_validation import HeldOut
 from motorid.diagnosis.predictive_score import Evidence, Predictions, compare, finer
 from motorid.diagnosis.thresholds import FINER, LARGER, MOST, SEARCHED
+from motorid.estimation.fit import follows
 from motorid.estimation.result import Fit
 from motorid.model.model import Model
 from motorid.problem.problem import Problem
@@ -130,8 +131,8 @@ def rubs(node: Node) -> bool:
 def _as_likely(node: Node, chosen: Node) -> bool:
     """Tell whether a model that rubs predicts hardly worse than one with a rare device that leaves more than noise:
     what is missing beside either may make the difference, where that is less than what is left."""
-    rare = _imitates(chosen) and rubs(node) and not node.objection and bool(far(chosen.fit))
-    return rare and (1 - evidence(node, chosen).fall) ** 2 > MOST
+    rare = _imitates(chosen) and rubs(node) and not node.objection
+    return rare and bool(far(chosen.fit)) and follows(chosen.fit) and (1 - evidence(node, chosen).fall) ** 2 > MOST
 
 
 def group_of(chosen: Node, siblings: Sequence[Node], includes: Mapping[str, tuple[str, ...]]) -> tuple[str, ...]:

@@ -162,7 +162,8 @@ class Stepper:
         """Size (nx,) that the largest output lends the states it shows: a small part need not be exact."""
         middle, slopes = len(traj.x) // 2, np.empty((self.nx, self.ny))  # column-major, as CasADi has it
         given, skip = (traj.x[middle], np.ascontiguousarray(grid.u[middle]), p), np.empty(self.ny * len(p) + self.ny)
-        _called(*self._out, given, (skip, slopes, skip[self.ny:]))
+        call, trigger = self._out
+        _called(call, trigger, given, (skip, slopes, skip[self.ny:]))
         slopes = np.abs(slopes.T)
         tops = np.abs(np.ascontiguousarray(traj.y.T)).max(axis=1)  # long rows are quicker
         with np.errstate(over="ignore"):  # a model that runs away

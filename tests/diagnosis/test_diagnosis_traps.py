@@ -327,3 +327,40 @@ def test_a_record_that_ends_during_an_impact_does_not_refute_the_stop(rng):
     for last in (entered[-1] + 3, len(t)):
         fit = mi.fit(motor, run.select(slice(0, int(last))))
         assert run_through(fit, mi.effects.end_stop) == ""
+
+
+def test_a_size_that_is_open_is_not_zero_where_the_error_needs_it():
+    """Of a speed under one sign of the voltage deviations, from slopes, allow no pulsed bridge at all; nothing else
+    makes the speeds fall behind the voltage so."""
+    values = {"R": 1.18, "L": 0.0149, "K": 0.3, "b": 0.0164, "J": 0.015, "tau_c": 0.56, "s_c": 0.86, "V_s": 12.0}
+    true = (mi.dc_motor() + mi.effects.coulomb + mi.effects.pwm_coast).replace(**values)
+    v, rng = np.repeat([0.0, 3, 6, 9, 12, 0], 300), np.random.default_rng(1)
+    still = Experiment(0.01 * np.arange(len(v)), {"v": v}, {"omega": 0 * v})
+    speed = mi.simulate(true, [still])[0].outputs["omega"]
+    runs = [still.with_(outputs={"omega": speed + 0.3 * rng.normal(size=len(v))}) for _ in range(2)]
+    found = diagnosed(runs)
+    assert set(found.effects) == {"coulomb", "pwm_coast"}
+    assert "could as well be zero" not in found.text
+
+
+def rubbing(v, rng, dt=0.01, steps=10):
+    """A speed of a motor whose friction falls with the speed, under a torque that nothing predicts."""
+    R, K, J, b, h, omega, other, speeds = 2.0, 0.05, 1e-4, 2e-5, dt / steps, 0.0, 0.0, []
+    stays = np.exp(-h / 0.05)
+    for volt in v:
+        speeds.append(omega)
+        for _ in range(steps):
+            other = stays * other + np.sqrt(1 - stays**2) * 1e-3 * rng.normal()
+            free, dry = K * (volt - K * omega) / R - b * omega + other, 6e-3 * (1 + 1.5 * np.exp(-abs(omega) / 40))
+            if omega or abs(free) > dry:
+                moved = omega + h * (free - dry * np.sign(omega or free)) / J
+                omega = 0.0 if omega * moved < 0 else moved
+    noisy = np.array(speeds) + 0.2 * rng.normal(size=len(v))
+    return Experiment(dt * np.arange(len(v)), {"v": v}, {"omega": noisy})
+
+
+def test_dry_friction_is_not_called_a_brake_that_few_motors_have():
+    levels = ([3.0, 6, 9, 12, 5, 8, 2, 10], [4.0, 10, 7, 12, 3, 6])
+    found = diagnosed([rubbing(np.repeat(each, 150), np.random.default_rng(k)) for k, each in enumerate(levels, 1)])
+    assert found.effects[0] == "stribeck"
+    assert "eddy_brake" not in found.effects
