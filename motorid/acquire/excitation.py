@@ -128,8 +128,7 @@ class Program:
 
 
 def program(words: str | Program | None, v_max: float = math.inf) -> Program:
-    """Read an excitation from words (see the module); `v_max` in V is what ``standard`` is scaled to. UsageError for a
-    word that is not known, or numbers that make no sense."""
+    """Read an excitation in words (see the module), ``standard`` scaled to `v_max`, V; UsageError for wrong ones."""
     if isinstance(words, Program) or not words:
         return words or Program()
     segments: list[Segment] = []

@@ -80,11 +80,8 @@ def read_tail(out: Path) -> Tail:
 
 
 class RecordFile:
-    """Appends rows to a record; gaps become rows whose measured cells are empty.
-
-    Every call of `flush` hands whole lines to the operating system, and a thread hands them to the disk every 0.5 s;
-    see `Appender`. `meta` is written as comment lines ``# key: value`` at the head, or where a record is continued.
-    """
+    """Appends rows to a record by way of an `Appender`; gaps become rows whose measured cells are empty. `meta` is
+    written as comment lines ``# key: value`` at the head, or where a record is continued."""
 
     def __init__(self, out: Path, channels: tuple[Channel, ...], rate: float, meta: Mapping[str, object],
                  mode: str = "new") -> None:

@@ -30,11 +30,8 @@ STEP = 100  # samples that one reading of the wire makes
 
 
 class VirtualDevice:
-    """A device that answers commands and makes samples of `channels`, ``v`` first, `rate` times a second.
-
-    At the start of every run the shaft of the motor `truth` stands still at angle zero. The counters have so many bits
-    and stand at `counter0` and `time0` when the device is switched on.
-    """
+    """A device that answers commands and makes samples of `channels`, ``v`` first, `rate` times a second. Its counters
+    begin at `counter0` and `time0`; in every run the shaft of the motor `truth` begins at rest at angle zero."""
 
     def __init__(self, truth: Truth, rate: float = 1000.0,
                  channels: tuple[str, ...] = ("v", *CHANNELS), counter_bits: int = 32,
