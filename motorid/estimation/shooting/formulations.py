@@ -56,15 +56,12 @@ class Formulation:
 
 @dataclass(frozen=True)
 class PathPoint:
-    """A penalty solution on the way to the hard one: weight, values, violations, distance.
-
-    `distance` is the largest relative difference from the hard solution, of the parameters determined there.
-    """
+    """A penalty solution on the way to the hard one."""
 
     weight: float
     values: Mapping[str, float]
     violations: Mapping[str, float]
-    distance: float
+    distance: float  # largest relative difference from the hard solution, of the parameters determined there
 
 
 @dataclass(frozen=True, eq=False, repr=False)

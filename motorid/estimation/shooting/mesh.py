@@ -32,14 +32,13 @@ DISTURBED = ("i", "omega")  # an unknown voltage, an unknown torque
 
 
 class Interval(NamedTuple):
-    """Samples `first` to `last` of a run; the last belongs to the next interval where there is one. `node` and `next`
-    count the nodes of all runs; -1: none (the first state of a run is a function of q)."""
+    """A stretch of a run from one node to the next."""
 
     run: int
-    first: int
-    last: int
-    node: int
-    next: int
+    first: int  # sample
+    last: int  # sample, which belongs to the next interval where there is one
+    node: int  # counted over all runs; -1: none (the first state of a run is a function of q)
+    next: int  # likewise
     grid: Grid
 
 
@@ -52,10 +51,9 @@ class Block(NamedTuple):
 
 
 class Walk(NamedTuple):
-    """All intervals simulated, and put together run by run. Local columns of derivatives are (own node, q), in scaled
-    coordinates. `at` is q in the system's terms."""
+    """All intervals simulated, and put together run by run; columns of derivatives are (own node, q), both scaled."""
 
-    at: Point
+    at: Point  # q in the system's terms
     runs: tuple[Trajectory, ...]
     intervals: tuple[Trajectory, ...]
 
@@ -267,10 +265,8 @@ def measured_states(run: Experiment, states: tuple[str, ...]) -> dict[int, Array
 
 @dataclass(frozen=True, eq=False)
 class Gaps:
-    """What is missing at each of n nodes: the state there minus the end of the interval before.
-
-    J·gap/span of the speed is the mean torque missing in an interval that is short beside the mechanical time constant.
-    """
+    """What is missing at each of n nodes: the state there minus the end of the interval before. J·gap/span of the speed
+    is the mean torque missing in an interval that is short beside the mechanical time constant."""
 
     run: np.ndarray  # (n,) of int
     t: Array  # (n,), s
@@ -307,11 +303,8 @@ def noise_of_gaps(mesh: Mesh, z: Array) -> Array:
 
 
 def reduced(mesh: Mesh, z: Array) -> tuple[Array, Array]:
-    """Return residuals (n,) at `z`, and what of their Jacobian (n, nq) the nodes cannot take over.
-
-    The columns of q are projected off those of the nodes, so that JᵀJ is the Schur complement and its inverse
-    the covariance of q with the nodes unknown.
-    """
+    """Return residuals (n,) at `z` and their Jacobian (n, nq), the columns projected off those of the nodes: JᵀJ is the
+    Schur complement, its inverse the covariance of q with the nodes unknown."""
     blocks = mesh.residual(z, mesh.walk(z, True))
     residual = np.concatenate([b.values for b in blocks])
     entries = np.concatenate([b.jac.ravel() for b in blocks])

@@ -173,11 +173,8 @@ class Multiplier:
 
 def rows_at(problem: Problem, q: Array, relations: Sequence[Any] | None = None, *,
             derivatives: bool = True) -> list[tuple[str, Part, Array, Array]]:
-    """Return (name, part, rows, d rows/dq) of `relations` on the simulated trajectories at `q`.
-
-    `relations` are the problem's constraints unless given; without `derivatives` there are no columns. SimulationError
-    if the model cannot be simulated there.
-    """
+    """Return (name, part, rows, d rows/dq) of `relations`, by default the problem's constraints, simulated at `q`; no
+    columns without `derivatives`. SimulationError if the model cannot be simulated there."""
     point = problem.unknowns.point(q)
     trajs = [problem.simulate(q, k, derivatives=derivatives) for k in range(len(problem.runs))]
     found = []
@@ -190,8 +187,7 @@ def rows_at(problem: Problem, q: Array, relations: Sequence[Any] | None = None, 
 
 
 def violations(problem: Problem, q: Array, relations: Sequence[Any] | None = None) -> dict[str, float]:
-    """Return the largest violation of each relation, beyond its limits, in the unit of its rows. Where a relation has
-    rows in several units (voltage and torque), there is one entry for each."""
+    """Return the largest violation of each relation, beyond its limits, one for each unit that its rows have."""
     found: dict[str, float] = {}
     for name, part, values, _ in rows_at(problem, q, relations):
         beyond = np.abs(part.violation(values)) * part.size
