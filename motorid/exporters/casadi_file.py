@@ -112,13 +112,8 @@ def casadi_file(found: Fit | Model, path: Path) -> dict[Path, str]:
 
 
 def read_casadi(data: bytes) -> tuple[dict[str, ca.Function], dict[str, Any]]:
-    """Return functions and description from the JSON in a ``.casadi`` file; CasADi's own part is not looked at.
-
-    Raises
-    ------
-    ValueError, KeyError, TypeError, IndexError, AttributeError, RuntimeError, RecursionError
-        If it holds no such JSON, or nonsense.
-    """
+    """Return functions and description from the JSON in a ``.casadi`` file; CasADi's own part is not looked at. Raises
+    ValueError, TypeError, AttributeError, LookupError or RuntimeError if there is none, or nonsense."""
     _, found, text = data.rpartition(PLAIN.encode())
     if not found:
         raise KeyError("JSON")
