@@ -44,7 +44,6 @@ class Equations:
         self.define("zero", 0)  # of the measured angle
         self.voltage, self.torque = ca.SX(0), ca.SX(0)
         self.sensors: dict[str, ca.SX] = {}
-        self.sgn_width: ca.SX | None = None
         self.symbols: dict[str, ca.SX] = {}
         self.writer = "the base model"
 
@@ -80,16 +79,14 @@ class Equations:
     def angle_state(self) -> ca.SX:
         """Return the model's own angle, adding ``dθ/dt = ω`` where it is first used."""
         if "theta" not in self.states:
-            self.states["theta"] = ca.SX.sym("theta")
+            self.state("theta", self.start["theta"])
             self.rates["theta"] = self.states["omega"]
-            self.initial["theta"] = self.start["theta"]
         return self.states["theta"]
 
     def sign(self, x: ca.SX) -> ca.SX:
         """Return a smooth sgn(x); the width (rad/s) is chosen from the data, well below the slowest speed."""
-        if self.sgn_width is None:
-            self.sgn_width = self.symbols.setdefault("sgn_width", ca.SX.sym("sgn_width"))
-        return ca.tanh(x * reciprocal(self.sgn_width * self.smoothing))
+        width = self.symbols.setdefault("sgn_width", ca.SX.sym("sgn_width"))
+        return ca.tanh(x * reciprocal(width * self.smoothing))
 
     def measured(self, channel: str) -> ca.SX:
         """Return what the sensor of `channel` shows so far (several sensor effects follow one another)."""
@@ -166,8 +163,7 @@ class Equations:
             before, used = used, {s.name() for s in ca.symvar(ca.vertcat(*expressions))}
             if not used & marks:
                 return expressions
-            definitions = ca.vertcat(*map(self._defined, names))
-            expressions = ca.substitute(expressions, [ca.vertcat(*symbols)], [definitions])
+            expressions = ca.substitute(expressions, [ca.vertcat(*symbols)], [ca.vertcat(*map(self._defined, names))])
         circle = ", ".join(sorted(s[1:] for s in (before | used) & marks))
         raise ModelError(f"the definitions of {circle} go in a circle: an effect scales or replaces a "
                          "quantity by an expression that needs that same quantity.")

@@ -251,7 +251,7 @@ def _once(model: Model, make: Callable[..., Any], *more: Any) -> Any:
 
 def _smooths(model: Model) -> bool:
     """Tell whether an effect uses a smooth sgn; ModelError if the effects contradict one another."""
-    return model.write().sgn_width is not None
+    return "sgn_width" in model.write().symbols
 
 
 def _system(model: Model, outputs: tuple[str, ...], stored: tuple[str, ...]) -> System:
