@@ -138,8 +138,7 @@ def plain(value: Any) -> Any:
 
 
 def json_text(contents: Mapping[str, Any], bulk: Mapping[str, Any] | None = None) -> str:
-    """Return JSON that says that motorid wrote it, `bulk` on a line of its own. Control characters and lone surrogates
-    are escaped."""
+    """Return JSON signed by motorid, `bulk` on a line of its own, control characters and lone surrogates escaped."""
     signed = plain({"motorid": package_version("motorid"), **contents})
     text = json.dumps(signed, indent=1, ensure_ascii=False, allow_nan=False)
     if bulk is not None:

@@ -40,12 +40,8 @@ class Layout:
 def assign(labels: Sequence[str], *, columns: Mapping[str, object] | None = None,
            units: Mapping[str, object] | None = None, unit_row: Mapping[str, str] | None = None,
            values: Mapping[str, Array] | None = None) -> Layout:
-    """Decide which column of `labels` holds which channel; without a header they are the positions "1", "2", ...
-
-    `columns` gives the name or position of a channel (t, v, i, omega, theta, v_supply, tau_load, temp), None for one to
-    be left out, `units` the unit of a channel or column, `unit_row` what the row below the header says, `values` what
-    the columns hold, which tells how far a duty cycle reaches.
-    """
+    """Decide which column of `labels`, without a header "1", "2", ..., holds which channel. `columns` and `units` are
+    those of `read_runs`, `unit_row` is what the row below the header says; `values` tell how far a duty cycle goes."""
     if not labels:
         raise DataError("it has no columns.")
     row = {label: headers.parse_unit((unit_row or {}).get(label, "")) for label in labels}

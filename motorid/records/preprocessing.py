@@ -85,8 +85,7 @@ def levelled(v: Array) -> Array:
 
 
 def delayed(t: Array, v: Array, hold: str, seconds: float, before: float) -> Array:
-    """Return an input that acts `seconds` later, and was `before` before; `hold` says how it goes on between samples. A
-    held one is averaged over each step."""
+    """Return an input that acts `seconds` later, and was `before` before; a held one is averaged over each step."""
     at = t - seconds
     if hold == "linear":
         return np.interp(at, t, v, left=before)
@@ -97,10 +96,8 @@ def delayed(t: Array, v: Array, hold: str, seconds: float, before: float) -> Arr
 
 
 def without_spikes(t: Array, y: Array, v: Array, inert: bool = False) -> Array:
-    """Return an output with samples that no motor makes marked as missing; the same array where there are none.
-
-    Single ones, of which a few may be chance; of what is `inert`, short bursts too. A large share is no accident: it is
-    left.
+    """Return an output with samples that no motor makes marked as missing, the same array where there are none. Single
+    ones, of which a few may be chance; of what is `inert`, short bursts too. A large share is no accident: it is left.
     """
     if np.isfinite(y).sum() < FEWEST:
         return y

@@ -18,20 +18,16 @@ MOVING_SHARE = 0.01  # of the top speed: slower than this is standstill
 
 @dataclass(frozen=True)
 class SteadySegment:
-    """One steady part: run (index), first and last sample, times (s), mean input, mean of each channel.
+    """One steady part of a run."""
 
-    `means` holds i (A), omega (rad/s) where measured; without a speed, omega is the slope of the angle.
-    `moving` is False at standstill, where dry friction makes the torque balance undetermined.
-    """
-
-    run: int
-    first: int
+    run: int  # its index
+    first: int  # sample
     last: int
-    begin: float
+    begin: float  # s
     end: float
-    v: float
-    means: Mapping[str, float]
-    moving: bool
+    v: float  # mean input
+    means: Mapping[str, float]  # i (A), omega (rad/s) where measured; without a speed omega is the slope of the angle
+    moving: bool  # False at standstill, where dry friction makes the torque balance undetermined
 
     @property
     def n(self) -> int:
@@ -88,8 +84,7 @@ def _steady_tail(k: int, run: Experiment, sigma: Mapping[str, float], first: int
 def _accelerating(run: Experiment, first: int, s: SteadySegment) -> float:
     """Return the share of the drive that still accelerates in a part, by the way there from sample `first` on since the
     speed was last about as far away as ever; 0 where it never was. That takes J/K Δω = ∫(i − ī)dt, and what is left
-    falls with ∫(ω̄ − ω)dt/Δω; without a current friction is viscous.
-    """
+    falls with ∫(ω̄ − ω)dt/Δω; without a current friction is viscous."""
     seen, level = run.outputs["omega" if "omega" in run.outputs else "theta"], s.means.get("i", s.means["omega"]) or 1.0
     y = bridged(run.t, seen)
     short = s.means["omega"] - (y if "omega" in run.outputs else slope(run.t, y, 4))

@@ -44,26 +44,19 @@ _MAGIC = {
 
 @dataclass(frozen=True)
 class TextTable:
-    """A file as columns, of which no one has said yet what they mean.
+    """A file as columns, of which no one has said yet what they mean."""
 
-    `columns` holds (N,) numbers, NaN where a cell is missing; `texts` the columns that are no numbers;
-    `labels` all of them in the order of the file; `unit_row` column to unit, from the row below the header.
-    """
-
-    columns: Mapping[str, NDArray[np.float64]]
-    texts: Mapping[str, Sequence[object]] = field(default_factory=dict)
-    labels: Sequence[str] = ()
-    unit_row: Mapping[str, str] = field(default_factory=dict)
+    columns: Mapping[str, NDArray[np.float64]]  # (N,) numbers, NaN where a cell is missing
+    texts: Mapping[str, Sequence[object]] = field(default_factory=dict)  # columns that are no numbers
+    labels: Sequence[str] = ()  # all columns in the order of the file
+    unit_row: Mapping[str, str] = field(default_factory=dict)  # column to unit, from the row below the header
     comments: Sequence[str] = ()
     notes: Sequence[str] = ()
 
 
 def parse_table(data: bytes) -> TextTable:
-    """Read a table of numbers from the bytes of a text file.
-
-    Delimiter (comma, semicolon, tab, white space), decimal mark, encoding, comment lines, header and row of
-    units are found out. Without a header the columns are called "1", "2", ...
-    """
+    """Read a table of numbers from the bytes of a text file. Delimiter, decimal mark, encoding, comment lines, header
+    and row of units are found out. Without a header the columns are called "1", "2", ..."""
     text, notes = decode(data)
     lines = [line for line in re.split(r"\r\n|\r|\n", text) if line.strip()]
     comments = [line.strip() for line in lines if line.lstrip().startswith(_COMMENT)]
