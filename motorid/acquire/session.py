@@ -1,7 +1,4 @@
-"""A recording session: take what comes, keep the device awake, notice every way in which it can end.
-
-`Session` leads to a `Recording`; `Progress` is what the user sees meanwhile.
-"""
+"""A recording session: take what comes, keep the device awake, notice every way in which it can end."""
 
 from __future__ import annotations
 

@@ -1,8 +1,7 @@
 """A bench made of software: a motor with a hidden effect behind a converter and an encoder, speaking the protocol.
 
-`VirtualDevice` knows nothing of wires or clocks: bytes go in, bytes come out, and `run` makes the next
-samples. What serves it over a pseudo-terminal in real time is in `motorid.acquire.server`. `hide` chooses the motor
-and what is hidden in it; its equations are those of the plant, which shares no code with the models.
+`VirtualDevice` knows nothing of wires or clocks: `server` serves it over a pseudo-terminal in real time. The equations
+are those of the plant, which shares no code with the models.
 """
 
 from __future__ import annotations
