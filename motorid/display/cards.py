@@ -1,8 +1,4 @@
-"""Tables and cards: what a result shows of itself, as text and as HTML.
-
-`Table` is laid out as text by `str`, as HTML by `to_html`; a `Card` is a title with flags, sentences and tables.
-`Shown` gives every result its card in a notebook and its line anywhere.
-"""
+"""Tables and cards: what a result shows of itself, as text and as HTML."""
 
 from __future__ import annotations
 

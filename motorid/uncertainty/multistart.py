@@ -1,8 +1,4 @@
-"""Fits from many random starts: do they all lead to the same place?
-
-The study of the source paper: starts drawn log-uniformly within a factor `spread` of the best fit, the error
-and the parameters of every fit, and how many of them are good.
-"""
+"""Fits from many random starts, the study of the source paper: do they all lead to the same place?"""
 
 from __future__ import annotations
 
