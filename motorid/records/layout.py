@@ -5,7 +5,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from motorid.channels import DIMENSIONS, MEASURED_INPUTS, NAMES, SI
+from motorid.channels import CHANNELS, DIMENSIONS, MEASURED_INPUTS, NAMES, SI
 from motorid.errors import DataError, UsageError, one_of
 from motorid.numerics.signals import Array
 from motorid.records import headers
@@ -111,7 +111,7 @@ def _find(labels: Sequence[str], column: object) -> str:
 def _named_by_header(places: dict[str, Place], labels: Sequence[str], row: Units, notes: list[str],
                      without: Sequence[str]) -> None:
     """Add the channels that the header names, where the user has not named them, or wants to do `without`."""
-    found: dict[str, list[Place]] = {}
+    found, named = dict[str, list[Place]](), {*CHANNELS} & {*places}  # who names one need not want another
     for label in labels:
         if hit := headers.classify(first_of_its_name(label, labels), row[label]):
             place = Place(label, hit.unit or _default(hit.channel), hit.unit is not None, hit.score)
@@ -129,6 +129,8 @@ def _named_by_header(places: dict[str, Place], labels: Sequence[str], row: Units
             raise DataError(f"{names} look equally like {_MEANING[channel]} ({channel}); say which one "
                             f"is meant, e.g. columns={{'{channel}': '{best[0].column}'}}.{speed}")
         places[channel] = best[0]
+        more = f"also took '{best[0].column}' as {_MEANING[channel]} ({channel}); --ignore {channel} leaves it out."
+        notes += [more] * bool(named and channel in CHANNELS)
         notes += [f"'{p.column}' looks like {_MEANING[channel]}, too; '{best[0].column}' is used."
                   for p in hits if p is not best[0] and p.score == best[0].score]
 

@@ -623,3 +623,13 @@ def test_real_records_open_as_they_are(folder, real):
 def test_the_speed_of_unmotor_is_in_degrees_per_second(real):
     run = read_runs(real / "unmotor" / "step.csv", units={"omega": "deg/s"})[0]
     assert run.outputs["omega"][0] == pytest.approx(257.14288330 * np.pi / 180)
+
+
+def test_a_column_that_is_taken_beside_those_that_were_named_is_said(tmp_path):
+    path = tmp_path / "wheel.csv"
+    path.write_text("t_s,current_A,frame_angle,speed_rad_s\n" + "".join(f"{k},{k % 3},{k},{k % 5}\n" for k in range(9)))
+    named = {"t": "t_s", "v": "current_A", "omega": "speed_rad_s"}
+    told = "also took 'frame_angle' as the angle (theta); --ignore theta leaves it out."
+    assert told in read_csv(path, columns=named).meta["notes"]
+    assert told not in read_csv(path, columns={**named, "theta": "frame_angle"}).meta["notes"]
+    assert told not in read_csv(path, columns={"v": "current_A"}).meta["notes"], "of the input alone"
