@@ -28,7 +28,7 @@ from motorid.model.model import Model, dc_motor, torque_driven
 from motorid.numerics.least_squares import Huber
 from motorid.numerics.parallel import interruption
 from motorid.problem.constraints import CurrentLimit, SteadyState
-from motorid.records.checks import check_runs, reading_notes
+from motorid.records.checks import as_command, check_runs, reading_notes
 from motorid.records.experiment import Experiment
 from motorid.records.layout import parse_pairs
 from motorid.records.reading import read_runs
@@ -114,8 +114,7 @@ class DriveOptions(ReadingOptions):
         said = reading_notes(runs)
         if self.drive == "torque":  # its command is no voltage of a winding, in volts or not
             said += ["the current i is not used: a torque-driven model has none."] * any("i" in r.outputs for r in runs)
-            runs, held_out = ([r.with_(units={**r.units, "v": r.units["v"].replace("V", "1")}, outputs={
-                c: y for c, y in r.outputs.items() if c != "i"} or r.outputs) for r in of] for of in (runs, held_out))
+            runs, held_out = (list(map(as_command, of)) for of in (runs, held_out))
         return [*said, *check_runs(runs, held_out)]
 
 

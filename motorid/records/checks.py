@@ -64,18 +64,38 @@ def check_runs(runs: Sequence[Experiment], held_out: Sequence[Experiment] = ()) 
     >>> for remark in mi.check_runs(runs):
     ...     print(remark)
     """
-    remarks = []
-    # A few wild samples say nothing of units, limits or the sensor, nor does a channel without a sample.
-    plain = [run.without(*(c for c, y in run.outputs.items() if np.isnan(y).all())).without_spikes() for run in runs]
-    late = dead_times(plain)  # what a dead time looks like otherwise: a drive that is off, another column
-    plain = [run.delayed(min(dead_times([run]) or [0.0])) for run in plain] if late else plain
-    for check in _CHECKS:
-        hits = [(run.name, text) for run in (runs if check in (_missing, _spikes) else plain) if (text := check(run))]
-        if hits:
-            remarks.append(_told_once(hits[0][1], [name for name, _ in hits]))
+    plain, late = _plain(runs)
+    remarks = [text for check in _CHECKS if (text := _said(check, runs if check in (_missing, _spikes) else plain))]
     scales = _other_scale([*plain, *(run.without_spikes() for run in held_out)])
     more = _late(late), _the_same_twice(runs), scales, _never_reverses(runs)
     return [worded(text, runs[0].units["v"]) for text in (*remarks, *more) if text]
+
+
+def contradictions(runs: Sequence[Experiment]) -> str:
+    """Say how channels of these runs contradict one another; empty if they do not."""
+    plain = _plain(runs)[0]
+    found = [*(_said(check, plain) for check in _CONTRADICTIONS), _other_scale(plain)]
+    return worded(" ".join(text for text in found if text), runs[0].units["v"])
+
+
+def as_command(run: Experiment) -> Experiment:
+    """Return a run as a torque-driven axis has it: its input is no voltage, in volts or not, and no current is used."""
+    kept = {c: y for c, y in run.outputs.items() if c != "i"} or run.outputs
+    return run.with_(units={**run.units, "v": run.units["v"].replace("V", "1")}, outputs=kept)
+
+
+def _plain(runs: Sequence[Experiment]) -> tuple[list[Experiment], list[float]]:
+    """Return runs without what looks like another fault: wild samples, channels without any, dead times; and these."""
+    plain = [run.without(*(c for c, y in run.outputs.items() if np.isnan(y).all())).without_spikes() for run in runs]
+    late = dead_times(plain)
+    return [run.delayed(min(dead_times([run]) or [0.0])) for run in plain] if late else plain, late
+
+
+def _said(check: Check, runs: Sequence[Experiment]) -> str | None:
+    """Return what a check says of runs, naming them. Who logs one negative voltage logs signs."""
+    signed = check is unsigned_voltage and any(run.inputs["v"].min() < 0 for run in runs)
+    hits = [] if signed else [(run.name, text) for run in runs if (text := check(run))]
+    return _told_once(hits[0][1], [name for name, _ in hits]) if hits else None
 
 
 def dead_times(runs: Sequence[Experiment]) -> list[float]:
@@ -395,6 +415,8 @@ def _never_reverses(runs: Sequence[Experiment]) -> str | None:
 
 def signs(run: Experiment) -> str | None:
     """Positive voltage must drive positive current and, on the whole, positive speed."""
+    if run.units["v"] != "V":
+        return _accelerates_backwards(run)
     if "omega" in run.outputs:  # a motor that brakes goes against its voltage, too: the balances know
         order, turned = _as_balances_want(run)
         if order != (0, 1, 2):
@@ -417,6 +439,19 @@ def signs(run: Experiment) -> str | None:
             f"is probably swapped. Turn it round, e.g. units={{'{channel}': '-1 {_told(run, channel)}'}}.")
 
 
+def _accelerates_backwards(run: Experiment) -> str | None:
+    """A commanded torque accelerates, but for friction and for what loads do: a constant one, a weight, a spring."""
+    if (omega := _speed(run)) is None or run.n < 30:
+        return None
+    b = _Balances(run, [run.inputs["v"], omega])
+    drive, drag, dry, *loads = (np.diff(y) for y in (b.sums[0], b.sums[2], b.signs[2], *b.loads[2]))
+    others = [-drag, -dry, *(s * x for x in (b.sums[2][1:], *loads) for s in (1, -1))]
+    left, turned = (_share_left(np.diff(b.at[2]), s * drive, *others) for s in (1, -1))
+    return ("a positive voltage accelerates the axis backwards: the sign of the voltage (or of what was measured) is "
+            f"probably swapped. Turn it round, e.g. units={{'v': '-1 {_told(run, 'v')}'}}."
+            ) if turned < 0.5 * left else None
+
+
 def _told(run: Experiment, channel: str) -> str:
     """Return the unit of a channel as its file has it: a sign that is turned round must not lose a scale."""
     return run.meta.get("original_units", {}).get(channel) or run.units[channel]
@@ -428,8 +463,8 @@ def unsigned(run: Experiment) -> str | None:
     both_ways = min(-v.min(), v.max()) >= 0.2 * np.abs(v).max()
     for c in (c for c in ("i", "omega") if both_ways and c in run.outputs):
         y, backward = run.outputs[c], v < -0.2 * np.abs(v).max()
-        noise = noise_level(y, run.t)
-        if np.nanmin(y) > -2 * noise and np.mean(backward) > 0.05 and np.nanmedian(y[backward]) > 5 * noise:
+        noise, runs = noise_level(y, run.t), c == "i" or _cosine(np.abs(v), y) > RUNNING  # not shaken
+        if runs and np.nanmin(y) > -2 * noise and np.mean(backward) > 0.05 and np.nanmedian(y[backward]) > 5 * noise:
             return (f"the {NAMES[c]} is never negative although the voltage is in {100 * np.mean(v < 0):.0f} % of the "
                     f"samples: logged without its sign? A fit needs the sign; leave it out with --ignore {c}.")
     return None
@@ -474,7 +509,7 @@ def angle_against_speed(run: Experiment) -> str | None:
         return None
     travel, turned = np.diff(theta[edges]), np.diff(integral(run.t, bridged(run.t, omega))[edges])
     agree = _cosine(travel, turned)
-    if np.std(travel) < 5 * noise_level(theta, run.t) or 0.5 < abs(agree) < 0.9:
+    if np.std(travel) < 5 * noise_level(theta, run.t) or 0.5 < agree**2 < 0.8:  # beyond: most of one is not the other
         return None
     if abs(agree) < 0.9:
         name = channel_name("theta", run.units.get("theta", ""))
@@ -714,3 +749,4 @@ _CHECKS: tuple[Check, ...] = (signs, unsigned, unsigned_voltage, _disabled, angl
                               implied_constants, _one_column_for_two, swapped_columns, _offset, _excitation, _still,
                               _missing, _clipped, current_limit, _coarse, _spikes, _noisy, _uneven, _slow_sampling,
                               _never_settles)
+_CONTRADICTIONS: tuple[Check, ...] = (signs, unsigned, unsigned_voltage, angle_against_speed, swapped_columns)

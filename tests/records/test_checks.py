@@ -626,3 +626,55 @@ def test_a_slow_motor_that_is_reversed_before_it_settles_is_not_late(rng, levels
     assert dead_times([run]) == []
     kept = np.repeat(y[::12], 12)
     assert dead_times([run.with_(outputs={"omega": kept})]) == []
+
+
+def servo(load: float, sign: float = 1.0, unit: str = "A") -> Experiment:
+    """An axis that a controller of its place drives by torque, with dry friction and against a weight of `load`."""
+    t, omega, angle = np.arange(6000) * 1e-3, 0.0, 0.0
+    shown = []
+    for now in t:
+        wanted = 0.8 * np.sin(2 * np.pi * 0.9 * now) + 0.4 * np.sign(np.sin(2 * np.pi * 0.37 * now))
+        u = 8.0 * (wanted - angle) - 0.5 * omega
+        shown.append((u, omega, angle))
+        omega += 1e-3 / 0.02 * (u - 0.05 * omega - 0.4 * np.tanh(omega / 0.05) - load * np.sin(angle))
+        angle += 1e-3 * omega
+    u, omega, angle = np.array(shown).T
+    return Experiment(t, {"v": sign * u}, {"omega": omega, "theta": angle}, units={"v": unit})
+
+
+@pytest.mark.parametrize("load", [0.0, 2.0, 12.0])
+@pytest.mark.parametrize("channel", ["omega", "theta"])
+def test_the_swapped_sign_of_a_commanded_torque_is_told(load, channel):
+    """A weight that is moved slowly asks for a torque against its acceleration, too: that is no swapped sign."""
+    true, turned = (servo(load, sign).without({"omega": "theta", "theta": "omega"}[channel]) for sign in (1, -1))
+    assert "swapped" not in said(true)
+    assert "a positive current accelerates the axis backwards: the sign of the current" in said(turned)
+    assert "units={'v': '-1 A'}" in said(turned)
+
+
+def test_an_angle_that_follows_the_speed_for_a_smaller_part_is_another_axis_s(steps):
+    turned = np.cumsum(steps.outputs["omega"]) * float(np.diff(steps.t).mean())
+    rate = np.std(steps.outputs["omega"])
+    both = steps.with_(outputs={**steps.outputs, "theta": turned + rate * np.cumsum(np.sin(40 * steps.t)) * steps.dt})
+    frame = 0.1 * turned + 0.03 * np.std(turned) * np.sin(40 * steps.t)  # leans as the wheel is turned, and swings
+    assert "does not follow from the speed" not in said(both)
+    assert "does not follow from the speed" in said(steps.with_(outputs={**steps.outputs, "theta": frame}))
+
+
+def test_a_logger_that_writes_a_negative_voltage_logs_its_sign(plant, lab):
+    t, v = plant.staircase([6, 0, 6, 0, 4, 0, 4, 0], hold=0.3)
+    s = plant.simulate(lab, {}, t, v)
+    direction = np.repeat([1, 1, -1, -1, 1, 1, -1, -1], len(t) // 8 + 1)[:len(t)]
+    lost = Experiment(t, {"v": v}, {"omega": direction * s["omega"]}, name="lost")
+    signed = Experiment(t, {"v": direction * v}, {"omega": direction * s["omega"]}, name="signed")
+    assert "logged without its sign" in said(lost)
+    assert "logged without its sign" not in said(lost, signed)
+
+
+def test_a_fast_voltage_that_only_shakes_a_speed_leaves_no_doubt_of_its_sign():
+    t = np.arange(3000) * 1e-3
+    v = 12 * np.sin(2 * np.pi * 25 * t)
+    omega = 30 * (1 - np.cos(2 * np.pi * 25 * t))
+    assert "never negative" not in said(Experiment(t, {"v": v}, {"omega": omega}))
+    slow = 12 * np.sign(np.sin(2 * np.pi * t))
+    assert "the speed is never negative" in said(Experiment(t, {"v": slow}, {"omega": 20 * np.abs(slow)}))
