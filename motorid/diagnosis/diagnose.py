@@ -12,6 +12,7 @@ from motorid.diagnosis.adequacy import following
 from motorid.diagnosis.candidates import Stages, library
 from motorid.diagnosis.experiment_design import suggest_experiment
 from motorid.diagnosis.free_forms import WHERE
+from motorid.diagnosis.input_hypotheses import consistent
 from motorid.diagnosis.locate import acting_like, locate
 from motorid.diagnosis.misspecification import LIMITER
 from motorid.diagnosis.model_comparison import far
@@ -74,14 +75,16 @@ def diagnose(fit: Fit, validate: Sequence[Experiment] | Experiment | None = None
     tried = library(effects, also)
     with parallel.progress("Looking for what is missing", max_effects + 1, at_most=True) as show:
         stages = Stages(max_effects, progress, show, map)
-        found, driven = explored(checked(fit, "diagnose"), validate, tried, stages, max_effects, budget)
+        held_out = [validate] if isinstance(validate, Experiment) else validate or ()
+        twice = repeated(checked(fit, "diagnose").problem.experiments, held_out)
+        misread, fit, held_out = consistent(fit, held_out)
+        found, driven = explored(fit, None if validate is None else held_out, tried, stages, max_effects, budget)
         stages.done("located what is missing")
-        twice = repeated(fit.problem.experiments, [validate] if isinstance(validate, Experiment) else validate or ())
-        return _told(found, " ".join(w for w in (twice, driven) if w), validate is not None)
+        return _told(found, misread, " ".join(w for w in (twice, driven) if w), validate is not None)
 
 
-def _told(found: Climb, driven: str, validated: bool) -> Diagnosis:
-    """Return what a climb found, in words and as a result."""
+def _told(found: Climb, misread: str, driven: str, validated: bool) -> Diagnosis:
+    """Return what a climb found, in words and as a result; first how the records contradict themselves, `misread`."""
     fit, ladder, remaining = found.search.root.fit, ladder_of(found, validated), found.remaining
     missing, judged, last, unit = locate(fit), found.first, found.path[-1], fit.problem.experiments[0].units["v"]
     names = tuple(g.effect for g in found.grades if g.grade != "approximates")
@@ -120,7 +123,7 @@ def _told(found: Climb, driven: str, validated: bool) -> Diagnosis:
     kind = "structure" if not remaining.adequate else "fluctuation" if far(ladder.best) else "noise"
     if not names:
         details.append(words.unseen_remark(found.search.unseen(last), fit.model.base))
-    answer, *details = (worded(t, unit) for t in (answer, *details, *_remarks(found, driven)) if t)
+    answer, *details = (worded(t, unit) for t in (misread + answer, *details, *_remarks(found, driven)) if t)
     text = " ".join(t for t in (answer, *details, suggestion) if t)
     approximating = {g.effect: g.form for g in found.grades if g.grade == "approximates"}
     remainder = Remainder(kind, ladder.best, forms, found.search.held, fit, approximating)

@@ -6,6 +6,8 @@ than the sample beside which it stands. Read wrongly, any of these leaves a misf
 seems to explain. A few spikes of a sensor hide everything else.
 """
 
+import contextlib
+import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
@@ -17,14 +19,16 @@ from motorid.diagnosis.predictive_score import Predictions, compare, predictions
 from motorid.diagnosis.refit import RACE
 from motorid.diagnosis.thresholds import MATERIAL
 from motorid.display.numbers import arrow, number
+from motorid.errors import MotoridError
 from motorid.estimation.continuation import by_continuation
 from motorid.estimation.fit import solve
 from motorid.estimation.least_squares import FAILURES
 from motorid.estimation.result import Fit
+from motorid.model.model import SHOWN
 from motorid.numerics.least_squares import LevenbergMarquardt
 from motorid.problem.problem import Problem
 from motorid.problem.simulate import at, judge, misfit_over_noise, moving
-from motorid.records.checks import dead_times, span
+from motorid.records.checks import as_command, contradictions, dead_times, span
 from motorid.records.experiment import Experiment
 
 CHANGING = 0.5  # of the samples at which the voltage must change for its reading to matter
@@ -57,8 +61,24 @@ class Reading:
 
     def remark(self, before: Fit, after: Fit) -> str:
         """Say what was done to the records and what that did to the errors."""
-        falls = ", ".join(f"{channel_name(c)} {arrow(e, after.nrmse[c])}" for c, e in moving(before.nrmse).items())
-        return f"{self.says}: with {self.option} the error falls ({falls}), and this diagnosis uses it."
+        both = {c: (e, after.nrmse[c]) for c, e in moving(before.nrmse).items()}
+        how = "falls" if all(now < (1 - MATERIAL) * was for was, now in both.values()) else "becomes"
+        said = ", ".join(f"{channel_name(c)} {arrow(*pair)}" for c, pair in both.items())
+        return f"{self.says}: with {self.option} the error {how} ({said}), and this diagnosis uses it."
+
+
+def consistent(fit: Fit, held_out: Sequence[Experiment]) -> tuple[str, Fit, Sequence[Experiment]]:
+    """Return how the records contradict themselves, "" if they do not, and a fit and held-out runs without a channel
+    that cannot be mended, where the motion is still known: an effect would only imitate what is wrong with it."""
+    runs = fit.problem.experiments
+    said = contradictions(runs if "i" in SHOWN[fit.model.base] else [as_command(r) for r in runs])
+    lead, gone = f"The records contradict themselves; mend that first. {said}", re.findall(r"--ignore (\w+)", said)[:1]
+    less = [[r.without(*{*gone} & {*r.outputs}) for r in of] for of in (runs, held_out)]
+    with contextlib.suppress(MotoridError, *FAILURES):
+        if gone and all({"omega", "theta"} & {*r.outputs} for of in less for r in of):
+            out = solve(fit.problem.with_(experiments=tuple(less[0]), noise_factors={})), less[1]
+            return f"{lead} This diagnosis leaves the {channel_name(gone[0])} out. ", *out
+    return f"{lead} As they are: " if said else "", fit, held_out
 
 
 def without_spikes(fit: Fit) -> Reading | None:

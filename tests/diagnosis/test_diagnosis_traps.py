@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from battery.cases import CASES
 from battery.excite import driven, record
+from lab_records import VALUES, pair
 
 import motorid as mi
 from motorid.diagnosis.adequacy import adequacy
 from motorid.diagnosis.admissibility import run_through
 from motorid.diagnosis.candidates import Search, Stages
+from motorid.diagnosis.input_hypotheses import Reading
 from motorid.diagnosis.predictive_score import deciding, finer
 from motorid.diagnosis.score_test import rank, score
 from motorid.diagnosis.thresholds import FINER, FINER_RATE, LARGER
@@ -364,3 +367,45 @@ def test_dry_friction_is_not_called_a_brake_that_few_motors_have():
     found = diagnosed([rubbing(np.repeat(each, 150), np.random.default_rng(k)) for k, each in enumerate(levels, 1)])
     assert found.effects[0] == "stribeck"
     assert "eddy_brake" not in found.effects
+
+
+def test_a_current_without_its_sign_is_said_first_and_left_out(rng):
+    hidden = mi.dc_motor(**VALUES) + mi.effects.coulomb(tau_c=8e-3)
+    true = pair(rng, model=hidden)
+    runs = [run.with_(outputs={**run.outputs, "i": np.abs(run.outputs["i"])}) for run in true]
+    found = mi.diagnose(mi.fit(mi.dc_motor(), runs[:1]), runs[1:], effects=["coulomb", "eddy_brake", "current_offset"])
+    assert found.answer.startswith("The records contradict themselves; mend that first. run: the current is never neg")
+    assert "This diagnosis leaves the current out. Missing: dry (Coulomb) friction" in found.answer
+    assert found.after.problem.outputs == ("omega",)
+    good = mi.diagnose(mi.fit(mi.dc_motor(), true[:1]), true[1:], effects=["coulomb", "eddy_brake", "current_offset"])
+    assert good.answer.startswith("Missing: dry (Coulomb) friction")
+
+
+def test_an_angle_of_another_axis_is_said_first_and_left_out(rng):
+    hidden = mi.dc_motor(**VALUES) + mi.effects.coulomb(tau_c=8e-3)
+    runs = [run.with_(outputs={**run.outputs, "theta": 0.3 * np.sin(23 * run.t) + 1e-3 * rng.normal(size=run.n)})
+            for run in pair(rng, model=hidden)]
+    found = mi.diagnose(mi.fit(mi.dc_motor(), runs[:1]), runs[1], effects=["coulomb", "speed_ripple", "speed_gain"])
+    assert "mend that first. run: the angle does not follow from the speed" in found.answer
+    assert "This diagnosis leaves the angle out. Missing: dry (Coulomb) friction" in found.answer
+
+
+def test_where_nothing_can_be_left_out_the_contradiction_is_said_first():
+    t, rng = np.arange(1500) * 1e-3, np.random.default_rng(4)
+    u = rng.choice([-2.0, -1.0, 1.0, 2.0], 15).repeat(100)
+    bare = mi.Experiment(t, {"v": u}, {"omega": np.zeros(1500)}, units={"v": "A"})
+    axis = mi.torque_driven(g=0.1, b=0.01, J=1e-3)
+    shown = mi.simulate(axis, bare, initial="rest")[0].outputs["omega"]
+    turned = bare.with_(inputs={"v": -u}, outputs={"omega": shown + 0.05 * rng.normal(size=1500)})
+    found = mi.diagnose(mi.fit(mi.torque_driven(g=0.1).fix("g"), turned), effects=["coulomb"])
+    assert found.answer.startswith("The records contradict themselves; mend that first. run: a positive current accel")
+    assert " As they are: " in found.answer
+
+
+def test_an_error_that_rises_where_spikes_are_left_out_does_not_fall():
+    """Of the smaller signal without them it is a larger share."""
+    was, now = (SimpleNamespace(nrmse={"omega": e}) for e in (0.524, 0.538))
+    read = Reading("Spikes are left out", "--no-spikes", mi.Experiment.without_spikes)
+    assert "with --no-spikes the error becomes (speed 52.4 → 53.8 %)" in read.remark(was, now)
+    assert "with --no-spikes the error falls (speed 53.8 → 52.4 %)" in read.remark(now, was)
+    assert "the error becomes (speed 53.8 → 53.8 %)" in read.remark(now, now)
