@@ -77,7 +77,7 @@ def consistent(fit: Fit, held_out: Sequence[Experiment]) -> tuple[str, Fit, Sequ
     with contextlib.suppress(MotoridError, *FAILURES):
         if gone and all({"omega", "theta"} & {*r.outputs} for of in less for r in of):
             out = solve(fit.problem.with_(experiments=tuple(less[0]), noise_factors={})), less[1]
-            return f"{lead} This diagnosis leaves the {channel_name(gone[0])} out. ", *out
+            return f"{lead} This diagnosis leaves the {channel_name(gone[0])} out (--ignore {gone[0]}). ", *out
     return f"{lead} As they are: " if said else "", fit, held_out
 
 

@@ -375,7 +375,7 @@ def test_a_current_without_its_sign_is_said_first_and_left_out(rng):
     runs = [run.with_(outputs={**run.outputs, "i": np.abs(run.outputs["i"])}) for run in true]
     found = mi.diagnose(mi.fit(mi.dc_motor(), runs[:1]), runs[1:], effects=["coulomb", "eddy_brake", "current_offset"])
     assert found.answer.startswith("The records contradict themselves; mend that first. run: the current is never neg")
-    assert "This diagnosis leaves the current out. Missing: dry (Coulomb) friction" in found.answer
+    assert "This diagnosis leaves the current out (--ignore i). Missing: dry (Coulomb) friction" in found.answer
     assert found.after.problem.outputs == ("omega",)
     good = mi.diagnose(mi.fit(mi.dc_motor(), true[:1]), true[1:], effects=["coulomb", "eddy_brake", "current_offset"])
     assert good.answer.startswith("Missing: dry (Coulomb) friction")
@@ -387,7 +387,7 @@ def test_an_angle_of_another_axis_is_said_first_and_left_out(rng):
             for run in pair(rng, model=hidden)]
     found = mi.diagnose(mi.fit(mi.dc_motor(), runs[:1]), runs[1], effects=["coulomb", "speed_ripple", "speed_gain"])
     assert "mend that first. run: the angle does not follow from the speed" in found.answer
-    assert "This diagnosis leaves the angle out. Missing: dry (Coulomb) friction" in found.answer
+    assert "This diagnosis leaves the angle out (--ignore theta). Missing: dry (Coulomb) friction" in found.answer
 
 
 def test_where_nothing_can_be_left_out_the_contradiction_is_said_first():
