@@ -190,11 +190,11 @@ def _require(places: Mapping[str, Place], labels: Sequence[str], values: Mapping
                  f"columns={{'v': '{i.column}'}}, with mi.torque_driven() (--drive torque).")
     used = {*duty, *(p.column for p in places.values())}
     untimed = " Samples a fixed time apart need no column of time: dt=0.001 says how far, s." * ("t" in missing)
-    asked = [c for c in missing if c != "v" or not duty]
     stated = {c: unit for c in labels for _, unit, sure in [headers.unit_in(c)] if unit and sure}
     free = [c for c in labels if c not in used and not headers.is_reference(c)
             and (c not in stated or stated[c].dimension in DIMENSIONS["v"])]
     free.sort(key=lambda c: not _DRIVES.search(c.lower()))
+    asked = [c for c in missing if c != "v" or not more or (free and not duty)]
     raise DataError(f"no column looks like {', nor like '.join(missing.values())}. "
                     f"{_say_which(labels, asked, free)}{more}{untimed}")
 

@@ -195,8 +195,10 @@ def test_a_duty_and_the_names_of_control_lectures_are_met_with_the_right_line(tm
 
 def test_without_a_voltage_what_may_drive_the_motor_is_named(tmp_path):
     body = rows(pattern="{t:.3f},{i:.3f},{w:.3f}\n")
-    with pytest.raises(DataError, match=r"If 'current \[A\]' is what commands .*'v': 'current \[A\]'.*--drive torque"):
+    commands = r"If 'current \[A\]' is what commands .*'v': 'current \[A\]'.*--drive torque"
+    with pytest.raises(DataError, match=commands) as told:
         read_csv(write(tmp_path, "time [s],current [A],speed [rad/s]\n" + body))
+    assert "'...'" not in str(told.value), "one line to write, and no other"
     with pytest.raises(DataError, match=r"e\.g\. columns={'v': 'plant_input'}") as told:  # and not the angle beside it
         read_csv(write(tmp_path, "t,alpha,plant_input,theta\n" + rows(pattern="{t:.3f},{w:.3f},{v},{w:.3f}\n")))
     assert "torque" not in str(told.value)
