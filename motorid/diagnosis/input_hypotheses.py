@@ -17,8 +17,9 @@ from motorid.channels import channel_name
 from motorid.diagnosis.cross_validation import ROUGH
 from motorid.diagnosis.predictive_score import Predictions, compare, predictions_left_out
 from motorid.diagnosis.refit import RACE
-from motorid.diagnosis.thresholds import MATERIAL
+from motorid.diagnosis.thresholds import MATERIAL, MOST
 from motorid.display.numbers import arrow, number
+from motorid.effects import LIBRARY
 from motorid.errors import MotoridError
 from motorid.estimation.continuation import by_continuation
 from motorid.estimation.fit import solve
@@ -75,10 +76,18 @@ def consistent(fit: Fit, held_out: Sequence[Experiment]) -> tuple[str, Fit, Sequ
     lead, gone = f"The records contradict themselves; mend that first. {said}", re.findall(r"--ignore (\w+)", said)[:1]
     less = [[r.without(*{*gone} & {*r.outputs}) for r in of] for of in (runs, held_out)]
     with contextlib.suppress(MotoridError, *FAILURES):
+        if gone == ["i"] and _supplied(fit):
+            return "", fit, held_out
         if gone and all({"omega", "theta"} & {*r.outputs} for of in less for r in of):
             out = solve(fit.problem.with_(experiments=tuple(less[0]), noise_factors={})), less[1]
             return f"{lead} This diagnosis leaves the {channel_name(gone[0])} out (--ignore {gone[0]}). ", *out
     return f"{lead} As they are: " if said else "", fit, held_out
+
+
+def _supplied(fit: Fit) -> bool:
+    """Tell whether a current that is never negative is that of the supply: an effect, and no contradiction."""
+    model = fit.model + LIBRARY["supply_side_current"]
+    return solve(fit.problem.with_(model=model, noise_factors={})).nrmse["i"] ** 2 < MOST * fit.nrmse["i"] ** 2
 
 
 def without_spikes(fit: Fit) -> Reading | None:

@@ -74,7 +74,9 @@ def check_runs(runs: Sequence[Experiment], held_out: Sequence[Experiment] = ()) 
 def contradictions(runs: Sequence[Experiment]) -> str:
     """Say how channels of these runs contradict one another; empty if they do not."""
     plain = _plain(runs)[0]
-    found = [*(_said(check, plain) for check in _CONTRADICTIONS), _other_scale(plain)]
+    # What one run of several says of signs an effect may have done: a current of the supply, a load that drives.
+    some = {c for c in (signs, swapped_columns) if 2 * sum(c(run) is not None for run in plain) <= len(plain)}
+    found = [*(_said(check, plain) for check in _CONTRADICTIONS if check not in some), _other_scale(plain)]
     return worded(" ".join(text for text in found if text), runs[0].units["v"])
 
 

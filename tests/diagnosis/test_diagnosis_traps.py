@@ -409,3 +409,17 @@ def test_an_error_that_rises_where_spikes_are_left_out_does_not_fall():
     assert "with --no-spikes the error becomes (speed 52.4 → 53.8 %)" in read.remark(was, now)
     assert "with --no-spikes the error falls (speed 53.8 → 52.4 %)" in read.remark(now, was)
     assert "the error becomes (speed 53.8 → 53.8 %)" in read.remark(now, now)
+
+
+def test_a_current_that_is_never_negative_may_be_the_supply_s():
+    runs, motor = [], mi.dc_motor(R=1.2, L=1e-3, K=0.05, b=2e-5, J=8e-5)
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        v = np.repeat(rng.choice([-10.0, -6, -3, 0, 4, 8, 11], 16), 80)
+        still = Experiment(2e-3 * np.arange(len(v)), {"v": v}, {"i": 0 * v, "omega": 0 * v})
+        seen, noise = mi.simulate(motor, [still])[0].outputs, rng.normal(size=(2, len(v)))
+        drawn = np.maximum(np.sign(v) * seen["i"], 0) * np.abs(v) / 12 + 0.02 * noise[0]
+        runs.append(still.with_(outputs={"i": np.maximum(drawn, 0), "omega": seen["omega"] + 0.3 * noise[1]}))
+    found = diagnosed(runs)
+    assert found.effects == ("supply_side_current",)
+    assert "contradict" not in found.text
