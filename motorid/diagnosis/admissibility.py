@@ -17,6 +17,7 @@ KNOWN = 0.3  # of a parameter, its standard deviation: determined
 MOST_LOST = 0.6  # of the largest voltage that a drop or a dead band may be
 MOST_OFFSET = 0.3  # and an offset, which turns the motor by itself
 HOTTEST = 300.0  # K above the surroundings: enamel of the best class ends at 220 °C
+MELTS = 1060.0  # K above the surroundings: copper
 RUNS_ON = 0.1  # of its highest speed: slower is near enough to a stop; and of the travel: an impact is less deep
 EMPTIED = 1e-2  # of its value before: it has vanished
 LENGTHS = ("rad", "m")  # a gap that runs to its limit is none
@@ -83,10 +84,9 @@ def _too_large(fit: Fit, pars: Sequence[Parameter]) -> str:
     """Say so where a voltage lost or added is of the size of what is applied: another parameter has paid for it; where
     cogging is more than the motor ever makes: it would not leave its notch; or where a winding is hotter than any."""
     top = max(float(np.abs(r.inputs["v"]).max()) for r in fit.problem.experiments)
-    if any(p.unit in ("K", "K/W") for p in pars):
-        hottest = max((float(np.abs(s.states["dT"]).max()) for s in fit.simulations if "dT" in s.states), default=0.0)
-        if hottest > HOTTEST:
-            return f"the winding would be {number(hottest, 2)} K warmer, which none stands"
+    if any(p.unit in ("K", "K/W") for p in pars) and (hottest := _hottest(fit)) > HOTTEST:
+        rise, why = (f"over {MELTS:.0f}", ": copper melts") if hottest > MELTS else (number(hottest, 2), "")
+        return f"the winding would be {rise} K warmer, which none stands{why}"
     for p in pars:
         if p.vary and p.unit in ("N·m", "N") and any(q.order for q in pars):
             made = max(fit.values["g"] * top if "g" in fit.values else
@@ -98,6 +98,15 @@ def _too_large(fit: Fit, pars: Sequence[Parameter]) -> str:
             share = percent(abs(fit.values[p.name]) / top, 2)
             return f"{p.name} = {fit.values[p.name]:.3g} V is {share} of the largest voltage, which is not plausible"
     return ""
+
+
+def melts(fit: Fit) -> bool:
+    """Tell whether copper would melt: then the resistance of the winding is that of nothing, and the model no motor."""
+    return _hottest(fit) > MELTS
+
+
+def _hottest(fit: Fit) -> float:
+    return max((float(np.abs(s.states["dT"]).max()) for s in fit.simulations if "dT" in s.states), default=0.0)
 
 
 def _emptied(fit: Fit, added: Effect, before: Fit) -> str:

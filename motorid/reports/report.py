@@ -14,6 +14,7 @@ from motorid.diagnosis.results import Diagnosis, Ladder, ladder_table, ranking_t
 from motorid.display.cards import Flag, Shown, Table
 from motorid.display.numbers import counted, duration, glued, number, percent, sentence, with_error
 from motorid.errors import UsageError, printable
+from motorid.estimation.least_squares import FAILURES
 from motorid.estimation.result import Fit, ended, parameter_table, value_tables
 from motorid.numerics.parallel import progress
 from motorid.problem.simulate import error_table, evaluate
@@ -22,6 +23,7 @@ from motorid.records.experiment import Experiment
 from motorid.records.files import package_version, write_files
 
 PACKAGES = ("motorid", "casadi", "numpy", "scipy", "pandas", "matplotlib")
+LEFT_OUT = "{} is left out, because it could not be made: {}"
 
 
 def report(result: Any, path: str | Path, *, title: str = "", command: str = "",
@@ -215,7 +217,10 @@ def _fitted(fit: Fit, title: str, *, key: str = "fit", before: Fit | None = None
 
 def _held_out(fit: Fit, validate: Sequence[Experiment]) -> Section:
     """The model on records that it was not fitted to."""
-    judged = evaluate(fit, validate)
+    try:
+        judged = evaluate(fit, validate)
+    except FAILURES as error:
+        return Section("held-out", "Held-out records", [LEFT_OUT.format("The comparison", error)])
     figure = _figure("held-out", "Records that the fit never saw.", f"Measured and modelled. NRMSE: {judged.words}.",
                      "plot_fit", judged)
     return Section("held-out", "Held-out records", (), (), [figure], [error_table({"": judged})])
@@ -278,8 +283,11 @@ def _figure(name: str, caption: str, alt: str, draw: str, *args: Any, small: boo
     from motorid import plots
     from motorid.plots.style import svg_of
 
-    with progress(f"Writing the report: figure {name}"):
-        return Figure(svg_of(getattr(plots, draw), *args, name=name, alt=alt, **options), caption, small)
+    try:
+        with progress(f"Writing the report: figure {name}"):
+            return Figure(svg_of(getattr(plots, draw), *args, name=name, alt=alt, **options), caption, small)
+    except FAILURES as error:
+        return Figure("", LEFT_OUT.format("This figure", error), small)
 
 
 def _error_facts(steps: Ladder) -> list[tuple[str, str]]:

@@ -513,6 +513,28 @@ def test_a_winding_hotter_than_any_stands_is_refused():
     assert "K warmer, which none stands" in objections(hot, LIBRARY["winding_heating"])
 
 
+def test_a_winding_that_would_melt_is_no_step_of_a_ladder(rng):
+    t = np.arange(1500) * 2e-3
+    v = np.repeat(rng.uniform(-6, 6, 15), 100)
+    motor = mi.dc_motor(R=2.0, L=2e-3, K=0.05, b=4e-5, J=3e-5) + mi.effects.coulomb(tau_c=5e-3)
+    blank = mi.Experiment(t, {"v": v}, {"i": 0 * t, "omega": 0 * t})
+    shown = mi.simulate(motor, blank, initial="rest")[0].outputs
+    run = blank.with_(outputs={c: y + 1e-3 * np.abs(y).max() * rng.standard_normal(len(t)) for c, y in shown.items()})
+    heating = LIBRARY["winding_heating"]
+    climb = search.Search(mi.fit(mi.dc_motor(), run), None, [heating], search.Stages(1))
+    warm = mi.fit(motor + mi.effects.winding_heating(R_th=4.0, C_th=1.0), run, start="model")
+    node, tried = climb._judge(climb.root, [heating], warm)
+    assert node is not None
+    assert tried.fit is warm
+    hot = replace(warm)
+    vars(hot)["simulations"] = tuple(replace(s, states={**s.states, "dT": np.full(s.experiment.n, 7.7e52)})
+                                     for s in warm.simulations)
+    assert objections(hot, heating) == "the winding would be over 1060 K warmer, which none stands: copper melts"
+    node, tried = climb._judge(climb.root, [heating], hot)
+    assert (node, tried.fit) == (None, None)
+    assert "copper melts" in tried.reason
+
+
 def test_a_parameter_of_every_run_keeps_within_what_is_physical():
     warm = mi.effects.winding_warm_start
     assert (warm.parameters[0].lower, warm.parameters[0].upper) == (-200, 200)

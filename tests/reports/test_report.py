@@ -1,6 +1,7 @@
 """The report: one page that stands alone, can be read by anybody, and tells the whole story."""
 
 import dataclasses
+import importlib
 import os
 import re
 from html import unescape
@@ -282,3 +283,17 @@ def test_a_report_is_refused_under_the_name_of_another_format(found, tmp_path):
     with pytest.raises(UsageError, match=r"must end in \.html"):
         mi.report(found, tmp_path / "found.pdf")
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(("where", "broken", "left"), [("motorid.reports.report", "evaluate", "The comparison"),
+                                                       ("motorid.plots", "plot_fit", "This figure")])
+def test_what_cannot_be_made_is_left_out_and_the_page_is_written(found, tmp_path, monkeypatch, where, broken, left):
+    def fails(*_args, **_options):
+        raise mi.SimulationError("the simulation left the finite numbers at t = 6 s.")
+
+    monkeypatch.setattr(importlib.import_module(where), broken, fails)
+    page = mi.report(found, tmp_path / "page.html", validate=hand_made.friction()[1]).read_text(encoding="utf-8")
+    html5lib.HTMLParser(strict=True, namespaceHTMLElements=False).parse(page)
+    assert f"{left} is left out, because it could not be made: the simulation left the finite numbers" in page
+    assert "Held-out records" in page
+    assert "What the checks found" in page or "The checks found no problem" in page
