@@ -84,9 +84,9 @@ def _too_large(fit: Fit, pars: Sequence[Parameter]) -> str:
     """Say so where a voltage lost or added is of the size of what is applied: another parameter has paid for it; where
     cogging is more than the motor ever makes: it would not leave its notch; or where a winding is hotter than any."""
     top = max(float(np.abs(r.inputs["v"]).max()) for r in fit.problem.experiments)
-    if any(p.unit in ("K", "K/W") for p in pars) and (hottest := _hottest(fit)) > HOTTEST:
-        rise, why = (f"over {MELTS:.0f}", ": copper melts") if hottest > MELTS else (number(hottest, 2), "")
-        return f"the winding would be {rise} K warmer, which none stands{why}"
+    if any(p.unit in ("K", "K/W") for p in pars) and (rise := hottest(fit)) > HOTTEST:
+        much, why = (f"over {MELTS:.0f}", ": copper melts") if rise > MELTS else (number(rise, 2), "")
+        return f"the winding would be {much} K warmer, which none stands{why}"
     for p in pars:
         if p.vary and p.unit in ("N·m", "N") and any(q.order for q in pars):
             made = max(fit.values["g"] * top if "g" in fit.values else
@@ -100,12 +100,8 @@ def _too_large(fit: Fit, pars: Sequence[Parameter]) -> str:
     return ""
 
 
-def melts(fit: Fit) -> bool:
-    """Tell whether copper would melt: then the resistance of the winding is that of nothing, and the model no motor."""
-    return _hottest(fit) > MELTS
-
-
-def _hottest(fit: Fit) -> float:
+def hottest(fit: Fit) -> float:
+    """Return by how much a winding heats up at most, K; beyond `MELTS` its resistance is that of nothing."""
     return max((float(np.abs(s.states["dT"]).max()) for s in fit.simulations if "dT" in s.states), default=0.0)
 
 

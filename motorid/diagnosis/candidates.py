@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from motorid.diagnosis.admissibility import melts, objections
+from motorid.diagnosis.admissibility import MELTS, hottest, objections
 from motorid.diagnosis.cross_validation import QUICK, HeldOut
 from motorid.diagnosis.free_forms import own_levels
 from motorid.diagnosis.misspecification import LIMITER
@@ -281,7 +281,7 @@ class Search:
         if not (found.worth_it or (found.plain and node is self.root)):
             return None, candidate
         candidate = replace(candidate, reason=f"{candidate.reason}, but {objection}") if objection else candidate
-        if melts(fit) and not melts(node.fit):  # nor is it one to go on from
+        if hottest(fit) > MELTS >= hottest(node.fit):  # nor is it one to go on from
             return None, replace(candidate, fit=None)
         return replace(child, reason=candidate.reason), candidate
 
@@ -333,7 +333,7 @@ class Search:
         the whole effort of a fit goes on.
         """
         with contextlib.suppress(*FAILURES):
-            if (fit := led_on(node.fit)) is not None and not melts(fit):
+            if (fit := led_on(node.fit)) is not None and hottest(fit) <= MELTS:
                 node = self.nodes[node.key] = replace(node, fit=fit, predictions=self.held.predictions(fit))
         if node.fit.status != "converged" and far(node.fit):
             with contextlib.suppress(*FAILURES):
@@ -342,7 +342,7 @@ class Search:
                 if fit.status == "limit":  # on its way still
                     fit = solve(problem.with_(model=fit.model), RACE, start="model")
                 onward = replace(node, fit=fit, predictions=self.held.predictions(fit))
-                return onward if beats(onward, node) and not melts(fit) else node
+                return onward if beats(onward, node) and hottest(fit) <= MELTS else node
         return node
 
     def without(self, node: Node, name: str) -> Node | None:

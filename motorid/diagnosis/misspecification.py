@@ -16,7 +16,7 @@ from motorid.channels import CHANNELS, channel_name
 from motorid.diagnosis import free_forms, predictive_score
 from motorid.diagnosis.admissibility import objections
 from motorid.diagnosis.free_forms import Form, Linear, Span
-from motorid.diagnosis.model_comparison import Node, evidence, far
+from motorid.diagnosis.model_comparison import Node, evidence, far, share_of
 from motorid.diagnosis.predictive_score import Evidence, Predictions, compare
 from motorid.diagnosis.thresholds import MOST, PLAIN, STANDARD_ERRORS, SUPPLANTS, TRIFLE, UNCONTESTED
 from motorid.display.numbers import listed, number, percent
@@ -224,7 +224,8 @@ def grades_of(last: Node, root: Node, groups: Sequence[Sequence[str]], beside: S
             if better is not None:
                 form, why = better.form, IN_ITS_PLACE.format(better.form.text)
             elif taken < (UNCONTESTED if e.balance == "transmission" else MOST):
-                why = f"it removes {percent(taken, 2)} of the squared error, and the rest is not noise"
+                share = percent(share_of(e.name, last, smaller), 2)
+                why = f"it removes {share} of the squared error, and the rest is not noise"
         kind = "approximates" if why else "group" if rivals.get(e.name) else "named"
         found.append(Grade(e.name, kind, why, form))
     return _no_surer_than_what_they_act_on(tuple(found), last.fit)

@@ -9,10 +9,10 @@ import numpy as np
 from motorid.channels import channel_name
 from motorid.diagnosis.adequacy import fine_angle_remark
 from motorid.diagnosis.misspecification import Grade
-from motorid.diagnosis.model_comparison import Node, far
+from motorid.diagnosis.model_comparison import Node, far, share_removed
 from motorid.diagnosis.results import Adequacy, Candidate, Rung
 from motorid.diagnosis.score_test import Score
-from motorid.diagnosis.thresholds import ELSEWHERE, LARGER, LOST, MATERIAL
+from motorid.diagnosis.thresholds import ELSEWHERE, LARGER, LOST, MATERIAL, MOST
 from motorid.display.numbers import arrow, counted, factor, listed, percent, with_error
 from motorid.estimation.covariance import UNDETERMINED
 from motorid.estimation.result import Fit, parameter_cell
@@ -62,13 +62,24 @@ def unexplained_text(ranking: Sequence[Candidate], rungs: Sequence[Rung], grades
     if grades:
         curve = f"{like}, which the library lacks, predicts better in its place"  # the same in few words
         helps = approximations_text(grades).replace(curve, "a free curve predicts better")
-        law = next((f" Nearest: {_described(rungs[-1].fit, g.effect)}." for g in grades if g.form), "")
-        return f"{lead}{law} {helps} {errors_text(rungs)} {_left(rungs[-1].fit, remaining)}"
+        return f"{lead}{_nearest(rungs, grades)} {helps} {errors_text(rungs)} {_left(rungs[-1].fit, remaining)}"
     best = max((c for c in ranking if c.refit_drop is not None), key=lambda c: c.refit_drop or 0.0, default=None)
     if best is None or (best.refit_drop or 0) <= 0.05:
         return lead
     return (f"{lead} The nearest, '{best.effect}', removes {percent(best.refit_drop, 2)} of the squared error, but "
             f"was not added: {best.reason}.")
+
+
+def _nearest(rungs: Sequence[Rung], grades: Sequence[Grade]) -> str:
+    """Name the effect that removed most of the squared error, where a curve takes its place or that is most of it."""
+    shares = {name: share_removed(*(r.validation_nrmse or r.nrmse for r in (a, b)))
+              for a, b in itertools.pairwise(rungs) for name in (b.added or "").split(" + ")}
+    best = max(grades, key=lambda g: shares.get(g.effect, 0.0))
+    share = shares.get(best.effect, 0.0)
+    if share <= (0.0 if any(g.form for g in grades) else MOST):
+        return ""
+    what = _described(rungs[-1].fit, best.effect)
+    return f" Nearest: {what}, which removes {percent(share, 2)} of the squared error."
 
 
 def approximations_text(grades: Sequence[Grade], what: str = "it") -> str:
@@ -172,7 +183,7 @@ def rises_text(rungs: Sequence[Rung]) -> str:
 
 def _fall(was: Mapping[str, float], is_: Mapping[str, float]) -> float:
     """Return the relative fall of the error, geometric mean over channels."""
-    return 1 - float(np.exp(np.mean([np.log(max(is_[c], 1e-300) / max(e, 1e-300)) for c, e in was.items()])))
+    return 1 - float(np.sqrt(1 - share_removed(was, is_)))
 
 
 def _changed(rung: Rung, c: str, was: float, is_: float) -> str:

@@ -81,6 +81,32 @@ def test_where_nothing_can_be_named_what_is_left_is_that_of_the_last_model(adequ
     assert answer.endswith(left)
 
 
+@pytest.mark.parametrize(("errors", "nearest", "share"), [
+    ((0.0955, 0.0448, 0.0372), "coulomb", "60 %"), ((0.0955, 0.09, 0.0372), "quadratic_drag", "81 %")])
+def test_nearest_is_what_removes_most_of_the_squared_error_by_the_measure_of_the_table(errors, nearest, share):
+    """Held out where there are such runs; a curve may be in the place of another effect."""
+    t = np.arange(600) * 2e-3
+    v = 6 * np.sign(np.sin(9 * t + 0.1))
+    both = mi.dc_motor(R=2.0, L=2e-3, K=0.05, b=4e-5, J=3e-5) + mi.effects.coulomb(tau_c=5e-3)
+    both += mi.effects.quadratic_drag(c_2=1e-6)
+    blank = mi.Experiment(t, {"v": v}, {"omega": 0 * t})
+    fit = mi.fit(both, blank.with_(outputs={"omega": mi.simulate(both, blank, initial="rest")[0].outputs["omega"]}))
+    there = {0.0448: (0.0813, 0.0512, 0.0361), 0.09: (0.0813, 0.0813, 0.0356)}[errors[1]]
+    rungs = [Rung(added, fit, {"omega": e}, {"omega": h}) for added, e, h in
+             zip((None, "coulomb", "quadratic_drag"), errors, there, strict=True)]
+    form = SimpleNamespace(text="an inertia that changes with the time")
+    grades = [Grade("coulomb", "approximates", "it removes little, and the rest is not noise"),
+              Grade("quadratic_drag", "approximates", "a free curve predicts better", form)]
+    remaining = SimpleNamespace(adequate=False, hum="", text="Something is missing.")
+    answer = unexplained_text((), rungs, grades, form.text, remaining)
+    said = answer.split(" Nearest: ")[1].split(". ")[0]
+    assert f"[{nearest}]" in said
+    assert answer.count(f", which removes {share} of the squared error.") == 1
+    bare = [Grade(g.effect, g.grade, g.why) for g in grades]
+    assert f"[{nearest}]" in unexplained_text((), rungs, bare, "", remaining)  # most of it needs no curve
+    assert "Nearest" not in unexplained_text((), rungs[:2], bare[1:], "", remaining)
+
+
 def test_errors_beyond_the_noise_are_in_the_answer_where_nothing_is_missing():
     judged = SimpleNamespace(text="The errors (speed 4 times the noise) do not depend on the motion.", p_value=0.5,
                              false_alarm=0.02, hum="")

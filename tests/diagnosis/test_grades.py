@@ -154,6 +154,17 @@ def test_what_explains_less_than_it_leaves_is_not_named(rubbing, monkeypatch, sh
     assert told.grade == "named"
 
 
+def test_a_share_is_that_of_the_step_where_the_effect_came(rubbing, monkeypatch):
+    """The same measure as the ladder's: runs add up, whatever each alone would say."""
+    root, last, worse = explaining(0.3, rubbing)
+    errors = {c: replace(e, values=tuple(v * np.sqrt(2.5) for v in e.values))
+              for c, e in last.predictions.held_out.items()}
+    before = replace(worse, predictions=Predictions({}, errors), fit=root.fit)
+    monkeypatch.setattr(misspecification, "better_forms", lambda fit, rival: [])
+    (told,) = misspecification.grades_of(replace(last, parent=before), root, (), (), True, lambda name: worse)
+    assert told.why == "it removes 60 % of the squared error, and the rest is not noise"
+
+
 def test_nothing_is_named_while_the_model_does_not_follow_the_records(rubbing, monkeypatch):
     monkeypatch.setattr(misspecification, "follows", lambda fit: False)
     monkeypatch.setattr(stepwise, "judge_adequacy", lambda node, scores=(): replace(adequacy(node.fit), adequate=False))
