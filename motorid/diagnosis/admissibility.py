@@ -85,8 +85,7 @@ def _too_large(fit: Fit, pars: Sequence[Parameter]) -> str:
     cogging is more than the motor ever makes: it would not leave its notch; or where a winding is hotter than any."""
     top = max(float(np.abs(r.inputs["v"]).max()) for r in fit.problem.experiments)
     if any(p.unit in ("K", "K/W") for p in pars) and (rise := hottest(fit)) > HOTTEST:
-        much, why = (f"over {MELTS:.0f}", ": copper melts") if rise > MELTS else (number(rise, 2), "")
-        return f"the winding would be {much} K warmer, which none stands{why}"
+        return f"the winding would be {'over ' * (rise > MELTS)}{min(rise, MELTS):.0f} K warmer, which none stands"
     for p in pars:
         if p.vary and p.unit in ("N·m", "N") and any(q.order for q in pars):
             made = max(fit.values["g"] * top if "g" in fit.values else

@@ -29,7 +29,7 @@ from motorid.model.model import SHOWN
 from motorid.numerics.least_squares import LevenbergMarquardt
 from motorid.problem.problem import Problem
 from motorid.problem.simulate import at, judge, misfit_over_noise, moving
-from motorid.records.checks import as_command, contradictions, dead_times, span
+from motorid.records.checks import as_command, contradictions, dead_times, span, unresolved
 from motorid.records.experiment import Experiment
 
 CHANGING = 0.5  # of the samples at which the voltage must change for its reading to matter
@@ -166,7 +166,7 @@ def _readings(runs: Sequence[Experiment]) -> Iterator[Reading]:
     hold = "linear" if moving[0].hold == "zoh" else "zoh"
     how = f"is {'linear' if hold == 'linear' else 'constant'} between samples"
     yield Reading(f"The voltage {how}", f"--hold {hold}", lambda r: r.with_(hold=hold) if _changes(r) else r)
-    if any(_noisy(r) for r in moving):
+    if any(_noisy(r) for r in moving) and not any(map(unresolved, runs)):  # such noise did drive the motor
         noise = "The voltage was measured with noise that the motor did not see"
         yield Reading(f"{noise}, and is constant between its steps", "--levels", Experiment.levelled)
         for n in WINDOWS:

@@ -77,21 +77,18 @@ def evidence(old: Node, new: Node) -> Evidence:
 
 
 def share_removed(was: Mapping[str, float], is_: Mapping[str, float]) -> float:
-    """Return which share of the squared error is gone, geometric mean over channels: of the NRMSE that a ladder shows.
-    """
+    """Return which share of the squared error is gone, by the NRMSE of channels: their geometric mean."""
     logs = [np.log(max(is_[c], 1e-300) / max(e, 1e-300)) for c, e in moving(was).items()]
     return 1 - float(np.exp(2 * np.mean(logs))) if logs else 0.0
 
 
 def share_of(effect: str, last: Node, without: Node) -> float:
-    """Return the share of the squared error that an effect removed where it came on the way to `last`, else that the
-    model `without` it has not: held out where there are such runs, as a ladder shows it."""
+    """Return the share of the squared error that an effect removed where it came on the way to `last`."""
     node = last
     while node.parent is not None and effect in node.parent.key:
         node = node.parent
     both = (without, last) if node.parent is None else (node.parent, node)
-    was, is_ = ({c: e.nrmse for c, e in n.predictions.held_out.items()} or n.fit.nrmse for n in both)
-    return share_removed(was, is_)
+    return share_removed(*({c: e.nrmse for c, e in n.predictions.held_out.items()} or n.fit.nrmse for n in both))
 
 
 def beats(new: Node, old: Node) -> bool:

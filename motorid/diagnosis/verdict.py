@@ -62,24 +62,17 @@ def unexplained_text(ranking: Sequence[Candidate], rungs: Sequence[Rung], grades
     if grades:
         curve = f"{like}, which the library lacks, predicts better in its place"  # the same in few words
         helps = approximations_text(grades).replace(curve, "a free curve predicts better")
-        return f"{lead}{_nearest(rungs, grades)} {helps} {errors_text(rungs)} {_left(rungs[-1].fit, remaining)}"
+        shares = {name: share_removed(*(r.validation_nrmse or r.nrmse for r in (a, b)))
+                  for a, b in itertools.pairwise(rungs) for name in (b.added or "").split(" + ")}
+        share, name = max((shares.get(g.effect, 0.0), g.effect) for g in grades)
+        law = (f" Nearest: {_described(rungs[-1].fit, name)}, which removes {percent(share, 2)} of the squared error."
+               if share > (0.0 if any(g.form for g in grades) else MOST) else "")
+        return f"{lead}{law} {helps} {errors_text(rungs)} {_left(rungs[-1].fit, remaining)}"
     best = max((c for c in ranking if c.refit_drop is not None), key=lambda c: c.refit_drop or 0.0, default=None)
     if best is None or (best.refit_drop or 0) <= 0.05:
         return lead
     return (f"{lead} The nearest, '{best.effect}', removes {percent(best.refit_drop, 2)} of the squared error, but "
             f"was not added: {best.reason}.")
-
-
-def _nearest(rungs: Sequence[Rung], grades: Sequence[Grade]) -> str:
-    """Name the effect that removed most of the squared error, where a curve takes its place or that is most of it."""
-    shares = {name: share_removed(*(r.validation_nrmse or r.nrmse for r in (a, b)))
-              for a, b in itertools.pairwise(rungs) for name in (b.added or "").split(" + ")}
-    best = max(grades, key=lambda g: shares.get(g.effect, 0.0))
-    share = shares.get(best.effect, 0.0)
-    if share <= (0.0 if any(g.form for g in grades) else MOST):
-        return ""
-    what = _described(rungs[-1].fit, best.effect)
-    return f" Nearest: {what}, which removes {percent(share, 2)} of the squared error."
 
 
 def approximations_text(grades: Sequence[Grade], what: str = "it") -> str:
@@ -157,10 +150,10 @@ def errors_text(rungs: Sequence[Rung]) -> str:
     text = f"{'Held-out error' if held_out else 'Error'}: {', '.join(said)}."
     if held_out and (lost := [c for c, e in was.items() if min(e, is_[c]) > LOST]):
         return f"{text} Both models lose {listed(lost)} there; {DECIDED}."
-    if held_out and _fall(was, is_) <= 0:
+    if held_out and share_removed(was, is_) <= 0:
         return f"{text} It does not fall over all channels; {DECIDED}."
     if any(is_[c] > was[c] * (1 + MATERIAL) for c in was if c not in noise):
-        text += f" Over all channels it falls by {percent(_fall(was, is_), 2)}."
+        text += f" Over all channels it falls by {percent(1 - np.sqrt(1 - share_removed(was, is_)), 2)}."
     return text
 
 
@@ -175,15 +168,10 @@ def rises_text(rungs: Sequence[Rung]) -> str:
             large = [_changed(b, c, was[c], is_[c]) for c in risen if is_[c] > was[c] * (1 + MATERIAL)]
             small |= {_name(b, c) for c in risen if is_[c] <= was[c] * (1 + MATERIAL)}
             told += [f"With '{b.added}' {', '.join(large)} on the {where} runs."] if large else []
-        if there[0] and len(rungs) > 2 and _fall(*there) <= 0:
+        if there[0] and len(rungs) > 2 and share_removed(*there) <= 0:
             told.append(f"With '{b.added}' the held-out error does not fall; {DECIDED}.")
     told += [f"Other rises are below {percent(MATERIAL)} of the error: {', '.join(sorted(small))}."] if small else []
     return " ".join(told)
-
-
-def _fall(was: Mapping[str, float], is_: Mapping[str, float]) -> float:
-    """Return the relative fall of the error, geometric mean over channels."""
-    return 1 - float(np.sqrt(1 - share_removed(was, is_)))
 
 
 def _changed(rung: Rung, c: str, was: float, is_: float) -> str:

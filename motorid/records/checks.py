@@ -28,6 +28,8 @@ OTHER_SCALE = 5.0  # times the speed per voltage: a wrong unit makes 6 and more,
 ROUGH = 0.05  # of the speed: sampled so slowly that its balance cannot be integrated
 BALANCE_BLOCKS = 150
 BEGUN, RISEN = 0.1, 0.63  # of its range, a step of the voltage; of their change, where outputs begin and a lag has come
+PART, LEVELS = 20, 16  # samples of a voltage that are looked at together; levels that a stair may have
+FAST, WHITE = 0.6, 0.25  # cosine of the phase from sample to sample: sines of 0.3 or 0.7 Nyquist; noise: about 0
 # Ratio of the angle's rate to the speed, and what was then mistaken for SI.
 _RATIOS = {
     2 * np.pi / 60: "the speed in rpm: units={'omega': 'rpm'}",
@@ -339,6 +341,34 @@ def _spikes(run: Experiment) -> str | None:
     return None
 
 
+def unresolved(run: Experiment) -> str | None:
+    """Say so where the voltage changed faster than its log: noise that no speed follows, or a sweep that folds back."""
+    v, n = run.inputs["v"], run.n // PART
+    if n < 4 or len(np.unique(v)) < LEVELS:
+        return None
+    parts = v[:n * PART].reshape(n, PART) - v[:n * PART].reshape(n, PART).mean(axis=1, keepdims=True)
+    power = np.sum(parts**2, axis=1)
+    strong = np.flatnonzero(power > 0.1 * power.max())
+    turns = np.sum(parts[strong, 1:] * parts[strong, :-1], axis=1) / power[strong]  # cosine of its phase per sample
+    what = next((f"from {run.t[strong[k] * PART]:.3g} s on the voltage swings faster than its samples can show"
+                 for k in range(3, len(turns)) if turns[k] < -FAST and (np.diff(turns[k - 3:k + 1]) < 0).all()
+                 and min(turns[:k].max(), turns[k:].max()) > FAST), "")
+    if not what and len(turns) > 2 and abs(np.median(turns)) < WHITE and power.sum() > 0.5 * v @ v and _unanswered(run):
+        what = "the voltage is another in every sample, at random, and the speed does not follow it"
+    return (f"{what}: did it change more often than it was logged? Then the column does not tell what acted between "
+            "samples. Log faster, or leave these samples out, in the file or with run.select().") if what else None
+
+
+def _unanswered(run: Experiment) -> bool:
+    """Tell whether means of the voltage, where noise is small, say next to nothing of those of the speed."""
+    if (y := _speed(run)) is None or len(y) < PART**2 or abs(y.mean()) > 0.5 * y.std():  # it runs by itself
+        return False
+    a, b = (x[:len(x) // 10 * 10].reshape(-1, 10).mean(axis=1) for x in (run.inputs["v"], y))
+    causes = np.column_stack([b[1:-1], b[:-2], np.ones(len(b) - 2), a[2:], a[1:-1], a[:-2]])
+    own, all_ = (np.var(b[2:] - x @ np.linalg.lstsq(x, b[2:], rcond=None)[0]) for x in (causes[:, :3], causes))
+    return bool(all_ > 0.75 * own)
+
+
 def _noisy(run: Experiment) -> str | None:
     for channel, y in run.outputs.items():
         size, noise = float(np.nanstd(y)), min(noise_level(y, run.t), _beside_voltage(run, y))
@@ -364,8 +394,7 @@ def _beside_voltage(run: Experiment, y: Array) -> float:
 
 
 def _uneven(run: Experiment) -> str | None:
-    steps = np.diff(run.t)
-    low, high = np.quantile(steps, (0.02, 0.98))
+    low, high = np.quantile(steps := np.diff(run.t), (0.02, 0.98))
     return (f"sampling is uneven, {1e3 * low:.3g} to {1e3 * high:.3g} ms apart. Each sample is used at its own time; "
             "make sure that the stamps say when it was taken, not when it arrived."
             ) if np.mean(np.abs(steps - run.dt) > 0.25 * run.dt) > 0.05 else None
@@ -749,6 +778,6 @@ def _holds(values: Array) -> float:
 
 _CHECKS: tuple[Check, ...] = (signs, unsigned, unsigned_voltage, _disabled, angle_against_speed, magnitudes,
                               implied_constants, _one_column_for_two, swapped_columns, _offset, _excitation, _still,
-                              _missing, _clipped, current_limit, _coarse, _spikes, _noisy, _uneven, _slow_sampling,
-                              _never_settles)
+                              _missing, _clipped, current_limit, _coarse, _spikes, _noisy, unresolved, _uneven,
+                              _slow_sampling, _never_settles)
 _CONTRADICTIONS: tuple[Check, ...] = (signs, unsigned, unsigned_voltage, angle_against_speed, swapped_columns)

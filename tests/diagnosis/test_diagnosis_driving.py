@@ -40,6 +40,23 @@ def stairs(n, rng):
     return np.repeat(rng.uniform(-6, 6, n // 150), 150 * FINE)
 
 
+@pytest.mark.parametrize("alias", [False, True])
+def test_a_command_that_changes_faster_than_its_log_is_not_taken_for_noise_of_its_measurement(alias):
+    """Of a bench that plays noise at 8 kHz and logs every 43rd sample of it, and steps."""
+    rng, n = np.random.default_rng(2), 900
+    noise = rng.uniform(-0.5, 0.5, 43 * n) if alias else np.repeat(np.repeat(rng.uniform(-3, 3, n // 150), 150) + (
+        0.05 * rng.normal(size=n)), 43)
+    runs = []
+    for v in (noise, np.repeat([0.0, 0.3, -0.3, 0.0], 43 * n // 4)):
+        speed = np.zeros(len(v))
+        for k in range(1, len(v)):
+            speed[k] = speed[k - 1] + (100 * v[k - 1] - speed[k - 1]) / 80
+        t, y = 125e-6 * np.arange(n) * 43, speed[::43]
+        runs.append(mi.Experiment(t, {"v": v[::43]}, {"omega": y + 0.1 * rng.normal(size=n)}))
+    options = {reading.option for reading in readings._readings(runs)}
+    assert ("--levels" in options) != alias
+
+
 def test_an_amplifier_s_voltage_goes_on_between_samples(lab):
     """Read as held it is half a sample late, which lags and heating would make up for."""
     rng = np.random.default_rng(3)

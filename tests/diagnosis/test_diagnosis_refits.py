@@ -529,10 +529,10 @@ def test_a_winding_that_would_melt_is_no_step_of_a_ladder(rng):
     hot = replace(warm)
     vars(hot)["simulations"] = tuple(replace(s, states={**s.states, "dT": np.full(s.experiment.n, 7.7e52)})
                                      for s in warm.simulations)
-    assert objections(hot, heating) == "the winding would be over 1060 K warmer, which none stands: copper melts"
+    assert objections(hot, heating) == "the winding would be over 1060 K warmer, which none stands"
     node, tried = climb._judge(climb.root, [heating], hot)
     assert (node, tried.fit) == (None, None)
-    assert "copper melts" in tried.reason
+    assert "over 1060 K" in tried.reason
 
 
 def test_a_parameter_of_every_run_keeps_within_what_is_physical():

@@ -122,6 +122,12 @@ def test_with_the_remainder_the_held_out_error_falls_to_the_floor(outside, name)
     assert all(after[c] < before[c] for c in after)
 
 
+def test_an_inertia_over_the_time_is_said_to_be_a_transient_first():
+    """A pendulum that still swung when each short record began was "an inertia that changes with the time"."""
+    (form,) = (f for f in free_forms.FORMS if (f.on, f.carrier) == ("t", "acceleration"))
+    assert form.text == "a transient from each run's initial state, or an inertia that changes with the time"
+
+
 def test_it_takes_the_place_of_what_only_approximates_it(beyond, lab):
     """Brake shoes touch above a speed: a drag that cannot be negative would leave the curve beside it no room."""
     rng = np.random.default_rng(4)

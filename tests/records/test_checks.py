@@ -425,6 +425,48 @@ def test_a_current_that_follows_a_random_voltage_is_no_noise(late, rng):
     assert "mostly noise" in said(stairs.with_(outputs={"i": np.repeat(rng.normal(size=200), 20)}))
 
 
+def logged(command, tau, rng, noise=0.0, every=43, jitter=0, name="run"):
+    """A speed that follows the command (125 µs a sample) with a lag, logged every so often, at uneven times."""
+    speed, a = np.zeros(len(command)), np.exp(-125e-6 / tau)
+    for k in range(1, len(speed)):
+        speed[k] = a * speed[k - 1] + (1 - a) * 100 * command[k - 1]
+    at = np.arange(every, len(command), every)
+    at = at - rng.integers(0, jitter + 1, len(at))
+    y = speed[at] + noise * rng.normal(size=len(at))
+    return Experiment(at * 125e-6, {"v": command[at]}, {"omega": y}, name=name)
+
+
+def swept(top, seconds=7.0):
+    t = np.arange(0, seconds, 125e-6)
+    return 0.25 * np.sin(np.pi * top / seconds * t**2)
+
+
+FAST_LOG = "Then the column does not tell what acted between samples."
+
+
+@pytest.mark.parametrize("tau", [4e-3, 0.1])
+def test_a_command_that_changes_faster_than_its_log_is_told(tau, rng):
+    random = said(logged(rng.uniform(-0.5, 0.5, 56000), tau, rng, jitter=10))
+    assert "run: the voltage is another in every sample, at random, and the speed does not follow it" in random
+    chirp = said(logged(swept(250.0), tau, rng, jitter=3))
+    assert "s on the voltage swings faster than its samples can show: did it change more often" in chirp
+    assert FAST_LOG in chirp
+    assert 1.7 < float(chirp.partition("run: from ")[2].split()[0]) < 2.7  # from 2.6 s on it is beyond 93 Hz
+
+
+@pytest.mark.parametrize("tau", [4e-3, 0.1, 1.0])
+@pytest.mark.parametrize("case", ["random", "two levels", "uneven", "slow sweep", "measured", "coasting"])
+def test_a_command_that_is_held_from_sample_to_sample_is_resolved(tau, case, rng):
+    n = 1300
+    values = rng.choice([-0.5, 0.5], n) if case == "two levels" else rng.uniform(-0.5, 0.5, n)
+    command = {"slow sweep": swept(60.0), "measured": 3 + 0.02 * rng.normal(size=43 * n),
+               "coasting": 1e-3 * rng.normal(size=43 * n)}.get(case, np.repeat(values, 43))
+    run = logged(command, tau, rng, noise=1.0, jitter=10 * (case == "uneven"))
+    if case == "coasting":
+        run = run.with_(outputs={"omega": 100 * np.exp(-run.t / 3) + rng.normal(size=run.n)})
+    assert FAST_LOG not in said(run)
+
+
 def test_a_voltage_that_acts_late_is_no_drive_that_is_off_and_no_other_column(plant, rng):
     """A computer's command: 240 to 300 ms of nothing were said to be a disabled drive, its columns exchanged."""
     machine, t = plant.MOTORS["lab"], 1e-3 * np.arange(1600)
