@@ -111,9 +111,10 @@ def better_reading(fit: Fit, late: bool = False, earlier: bool = False) -> Readi
     effects that help are in, and what could stand in for one is tried too. `earlier`: only a voltage that acts earlier
     is, whatever is missing; no motor answers before it is asked.
     """
-    if all(NOISE[0] < ratio < NOISE[1] for ratio in misfit_over_noise(fit.problem, fit.q).values()):
-        return None
     chosen, fall, runs = None, PLAIN, fit.problem.experiments
+    calm = all(NOISE[0] < ratio < NOISE[1] for ratio in misfit_over_noise(fit.problem, fit.q).values())
+    if calm or any(map(unresolved, runs)):  # what acted between samples, no reading of them tells
+        return None
     readings = [r for r in _readings(runs) if not earlier and _fall(fit, r) > PROMISING]
     seen = {"i", "omega", "theta"} & set(fit.problem.outputs)
     if late and "i" in seen and len(seen) > 1:  # current and motion both follow a late voltage, not a late sensor
@@ -166,7 +167,7 @@ def _readings(runs: Sequence[Experiment]) -> Iterator[Reading]:
     hold = "linear" if moving[0].hold == "zoh" else "zoh"
     how = f"is {'linear' if hold == 'linear' else 'constant'} between samples"
     yield Reading(f"The voltage {how}", f"--hold {hold}", lambda r: r.with_(hold=hold) if _changes(r) else r)
-    if any(_noisy(r) for r in moving) and not any(map(unresolved, runs)):  # such noise did drive the motor
+    if any(_noisy(r) for r in moving):
         noise = "The voltage was measured with noise that the motor did not see"
         yield Reading(f"{noise}, and is constant between its steps", "--levels", Experiment.levelled)
         for n in WINDOWS:

@@ -218,12 +218,11 @@ def grades_of(last: Node, root: Node, groups: Sequence[Sequence[str]], beside: S
             free = [b for b in free if swallows(last.fit, b.form, e)]
             free = free or better_forms(smaller.fit, last.fit)
             fall = evidence(smaller, last).fall
-            taken = 1 - (1 - max(fall, 0.0)) ** 2
             told = [b for b in free if outdoes(fall, b.evidence.fall)]
             better = next((b for b in told if beside and b.form == beside[0].form), told[0] if told else None)
             if better is not None:
                 form, why = better.form, IN_ITS_PLACE.format(better.form.text)
-            elif taken < (UNCONTESTED if e.balance == "transmission" else MOST):
+            elif 1 - (1 - max(fall, 0.0)) ** 2 < (UNCONTESTED if e.balance == "transmission" else MOST):
                 share = percent(share_of(e.name, last, smaller), 2)
                 why = f"it removes {share} of the squared error, and the rest is not noise"
         kind = "approximates" if why else "group" if rivals.get(e.name) else "named"

@@ -350,13 +350,13 @@ def unresolved(run: Experiment) -> str | None:
     power = np.sum(parts**2, axis=1)
     strong = np.flatnonzero(power > 0.1 * power.max())
     turns = np.sum(parts[strong, 1:] * parts[strong, :-1], axis=1) / power[strong]  # cosine of its phase per sample
-    what = next((f"from {run.t[strong[k] * PART]:.3g} s on the voltage swings faster than its samples can show"
+    what = next((f"the voltage changes faster than its samples can show from {run.t[strong[k] * PART]:.3g} s on"
                  for k in range(3, len(turns)) if turns[k] < -FAST and (np.diff(turns[k - 3:k + 1]) < 0).all()
                  and min(turns[:k].max(), turns[k:].max()) > FAST), "")
     if not what and len(turns) > 2 and abs(np.median(turns)) < WHITE and power.sum() > 0.5 * v @ v and _unanswered(run):
-        what = "the voltage is another in every sample, at random, and the speed does not follow it"
-    return (f"{what}: did it change more often than it was logged? Then the column does not tell what acted between "
-            "samples. Log faster, or leave these samples out, in the file or with run.select().") if what else None
+        what = "the voltage changes faster than its samples can show, at random: the speed does not follow it"
+    return (f"{what}. If it did change more often than it was logged, the column does not tell what acted between: log "
+            "faster, or leave these samples out, in the file or with run.select().") if what else None
 
 
 def _unanswered(run: Experiment) -> bool:
