@@ -71,11 +71,9 @@ LASTING = 10.0  # times the longest run: a memory that forgets nothing in it
 
 @dataclass(frozen=True)
 class Form:
-    """A free function of the quantity `on` times `carrier`, in one balance; `words` says what that is.
-
-    In the balance ``"sensor"`` it is added to the output `channel`; ``"both"`` is the motor constant, which makes
-    torque of current and voltage of speed. A `zeroed` one is over an angle whose zero is another in every run.
-    """
+    """A free function of the quantity `on` times `carrier`, in one balance; `words` says what that is. In the balance
+    ``"sensor"`` it is added to the output `channel`; ``"both"`` is the motor constant, which makes torque of current
+    and voltage of speed. A `zeroed` one is over an angle whose zero is another in every run."""
 
     words: str
     balance: str
@@ -148,10 +146,8 @@ class Span:
 
 
 def span_of(fit: Fit, signals: Sequence[Mapping[str, Array]]) -> Span:
-    """Return the smallest and the largest value of every quantity known in all runs, and orders of a turn.
-
-    These are the lowest, the harmonics of those in the model, and what stands out of the misfit.
-    """
+    """Return the smallest and the largest value of every quantity known in all runs, and orders of a turn: the lowest,
+    the harmonics of those in the model, and what stands out of the misfit."""
     names = set.intersection(*(set(s) for s in signals))
     step = float(np.median(np.concatenate([np.diff(s["t"]) for s in signals])))
     ranges = {n: (min(float(s[n].min()) for s in signals), max(float(s[n].max()) for s in signals)) for n in names}
@@ -235,9 +231,7 @@ def _place(value: float, low: float, high: float, unit: str = "") -> str:
 
 def functions_of(form: Form, span: Span) -> list[str]:
     """Return the functions that a form is made of, as source in its quantity z; `m.sign` is the model's smooth sgn.
-
-    Where they bend, set in or fade is written as a `PLACE`.
-    """
+    Where they bend, set in or fade is written as a `PLACE`."""
     low, high = span.ranges[form.on]
     if form.on == "turn":
         waves = ["1.0", *(f"ca.{f}({k:.6g} * z)" for k in waves_of(span) for f in ("sin", "cos"))]
@@ -431,10 +425,8 @@ class Linear:
 def linearised(fit: Fit, only: Form | None = None, span: Span | None = None,
                zeros: Mapping[str, float] | None = None) -> Linear:
     """Return the model of `fit` on its records, with the forms that these can show, or `only` one over a span; over a
-    turn that begins at these `zeros`, by name as in `zeros_of`.
-
-    SimulationError where its answer to small changes grows without bound; of all forms, when one is asked for.
-    """
+    turn that begins at these `zeros`, by name as in `zeros_of`. SimulationError where its answer to small changes grows
+    without bound; of all forms, when one is asked for."""
     problem = fit.problem
     residual, jac = _at(problem, fit)
     signals = signals_along(fit)
@@ -466,10 +458,8 @@ def _at(problem: Problem, fit: Fit) -> tuple[Array, Array]:
 
 
 def signals_along(fit: Fit) -> list[dict[str, Array]]:
-    """Return what a form may be a function of, along each run, (N,) each; the direction as smooth as the model's own.
-
-    ``"width"`` is that of the smooth sgn.
-    """
+    """Return what a form may be a function of, along each run, (N,) each; the direction as smooth as the model's own
+    sgn, whose width is ``"width"``."""
     return [_signals(fit, k) for k in range(len(fit.simulations))]
 
 
@@ -512,18 +502,12 @@ def _answer(problem: Problem, k: int, seen: Response, form: Form, basis: Array) 
         out, j = np.zeros((len(basis), len(problem.outputs), basis.shape[1])), problem.outputs.index(form.channel)
         out[:, j] = basis * weights[j]
     else:
-        out = _driven(seen, form, basis)
+        with np.errstate(over="ignore", invalid="ignore"):
+            out = seen.driven(_pushes(form, basis, seen))
+        if not np.all(np.abs(out) < UNBOUNDED * max(1.0, float(np.abs(basis).max(initial=0.0)))):  # or not a number
+            raise SimulationError("the model's answer to small changes grows without bound along these records.")
     flat = out.reshape(-1, out.shape[2])
     return flat if index is None else flat[index]
-
-
-def _driven(seen: Response, form: Form, basis: Array) -> Array:
-    """Return the outputs, (N, ny, m), to functions in the balances."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        out = seen.driven(_pushes(form, basis, seen))
-    if not np.all(np.abs(out) < UNBOUNDED * max(1.0, float(np.abs(basis).max(initial=0.0)))):  # or not a number
-        raise SimulationError("the model's answer to small changes grows without bound along these records.")
-    return out
 
 
 def _pushes(form: Form, basis: Array, answer: Response) -> Array:
@@ -582,10 +566,8 @@ def zeros_of(fit: Fit, form: Form) -> dict[str, float]:
 
 
 def form_columns(fit: Fit, linear: Linear, form: Form) -> tuple[Array, Array]:
-    """Return the slopes in solver coordinates with the form's answers, and the sizes by which these were scaled.
-
-    A unit of each coefficient makes an answer as large as what was measured.
-    """
+    """Return the slopes in solver coordinates with the form's answers, and the sizes by which these were scaled: a unit
+    of each coefficient makes an answer as large as what was measured."""
     problem, n, answers = fit.problem, len(linear.residual), linear.answer(form)
     measured = [(m.y * m.weights)[:, m.weights > 0] ** 2 for m in problem.measured]
     size = np.sqrt(n) * float(np.sqrt(np.mean([np.nanmean(y2) for y2 in measured])))
@@ -608,11 +590,8 @@ def ridge(normal: Array, products: Array, residual: Array) -> Array:
 
 
 def contains(fit: Fit, form: Form, size: str) -> bool:
-    """Tell whether a form in the place of an effect can be the effect whose size is the parameter `size`.
-
-    What the size puts into the balance, or adds to the output, along the model's trajectory is compared with the
-    form's functions there.
-    """
+    """Tell whether a form in the place of an effect can be the effect whose size is the parameter `size`: along the
+    model's trajectory, what this puts into the balance or the output is compared with the form's functions."""
     signals = signals_along(fit)
     span = span_of(fit, signals)
     if size not in fit.problem.system.parameters or not shown(form, fit, span.ranges):
