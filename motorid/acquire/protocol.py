@@ -163,12 +163,9 @@ class Message(NamedTuple):
 
 @dataclass
 class Decoder:
-    """Takes bytes in pieces of any size and returns the frames in them.
-
-    Arbitrary bytes never raise. What was not a valid frame is counted in `bad`: ``wrong CRC`` (frames),
-    ``cut`` (a ``$`` that never became a frame), ``not understood`` (a valid CRC around nonsense), and ``stray
-    bytes`` outside of frames. How the bytes are cut into pieces makes no difference.
-    """
+    """Takes bytes in pieces of any size, which makes no difference, and returns the frames in them. Arbitrary bytes
+    never raise: what was no valid frame is counted in `bad`: ``wrong CRC`` (frames), ``cut`` (a ``$`` that never became
+    a frame), ``not understood`` (a valid CRC around nonsense), and ``stray bytes`` outside of frames."""
 
     bad: Counter[str] = field(default_factory=Counter)
     seen: int = 0  # bytes
