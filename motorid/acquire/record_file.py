@@ -169,11 +169,9 @@ class RecordFile:
 
 
 class Appender:
-    """Appends lines. A thread carries them to the disk, so that a slow one does not hold up the recording.
-
-    With `mode` ``new`` the file must not exist; one to ``resume`` is cut back to its last whole line; else ``replace``.
-    Raises `UsageError` if the file may not be written, has appeared meanwhile, or another recorder has it.
-    """
+    """Appends lines, which a thread carries to the disk, so that a slow one does not hold up the recording. With `mode`
+    ``new`` the file must not exist; one to ``resume`` is cut back to its last whole line; else ``replace``. Raises
+    `UsageError` if the file may not be written, has appeared meanwhile, or another recorder has it."""
 
     def __init__(self, path: Path, mode: str) -> None:
         self.lines = 0  # handed to the operating system by this object
