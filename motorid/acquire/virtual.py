@@ -217,11 +217,9 @@ class Truth:
 
 
 def hide(words: str = "random", motor: str = "lab", seed: int = 0) -> Truth:
-    """Choose a motor and what is hidden in it; UsageError for a name or a number that is not known.
-
-    `words` are ``none``, ``random``, or effects joined by commas, each bare (its size is drawn) or with its numbers:
-    ``coulomb:tau_c=0.01,brush_drop``. The constants of `motor` are drawn within 10 % of the plant's.
-    """
+    """Choose a motor and what is hidden in it; UsageError for a name or a number that is not known. `words` are
+    ``none``, ``random``, or effects joined by commas, each bare (its size is drawn) or with its numbers:
+    ``coulomb:tau_c=0.01,brush_drop``. The constants of `motor` are drawn within 10 % of the plant's."""
     plant = load_plant()
     among(motor, plant.MOTORS, "motor")
     rng = np.random.default_rng(seed)
