@@ -49,10 +49,9 @@ def adequacy(fit: Fit, scores: Sequence[Score] = (), level: float = FALSE_ALARM)
     """Judge whether the residuals of `fit` are noise, by `scores` of effects that might be added (see `rank`) too.
 
     `FALSE_ALARM` is the probability of calling an adequate model inadequate; `level` the p-value that does so, another
-    one where another test has a say too.
-
-    The noise is estimated from fast changes, which understates coloured noise by 1/√(1−ρ): 3 times at a correlation
-    of 0.9 between neighbours. Residuals beyond ten times the noise (five for an angle) are not noise of any colour.
+    one where another test has a say too. The noise is estimated from fast changes, which understates coloured noise by
+    1/√(1−ρ): 3 times at a correlation of 0.9 between neighbours. Residuals beyond ten times the noise (five for an
+    angle) are not noise of any colour.
     """
     channels = {c: _channel(fit, c) for c in fit.problem.outputs}
     asked = [c for c in channels if c not in undecided(fit)]
@@ -209,10 +208,8 @@ CLEAR = 1e-3  # p-value of errors larger than the noise that needs no second tes
 
 
 def judge_adequacy(node: Node, scores: Sequence[Score] = ()) -> Adequacy:
-    """Judge whether the residuals of a model are noise; errors larger than it are, if no free form predicts them.
-
-    Unless what they depend on is beyond doubt.
-    """
+    """Judge whether the residuals of a model are noise; errors larger than it are, if no free form predicts them,
+    unless what they depend on is beyond doubt."""
     judged = adequacy(node.fit, scores)
     if not far(node.fit) or not (doubtful := adequacy(node.fit, scores, level=CLEAR)).adequate:
         return judged
