@@ -44,10 +44,8 @@ FLAT_TOP = 0.04  # of the samples: a current that is as large so often may have 
 
 
 class Stages:
-    """What a search is at: words on what was done (`say`), and one bar over all rounds that it may take (`show`).
-
-    How many refits a round takes shows on the way: each lot of them is taken for half of what is left of the round.
-    """
+    """What a search is at: words on what was done (`say`), and one bar over all rounds that it may take (`show`), on
+    which each lot of refits is taken for half of what is left of its round."""
 
     def __init__(self, rounds: int = 0, say: Callable[[str], None] | None = None,
                  show: Callable[..., None] | None = None, map_: Callable[..., Iterable[Any]] = map) -> None:
@@ -133,20 +131,16 @@ class Search:
         return self._scores[node.key]
 
     def inseparable(self, node: Node) -> dict[str, tuple[str, ...]]:
-        """Return the effects that do no more than a combination of parameters of effects that `node` has.
-
-        Only of a model that was expanded: one with nothing but noise left has no use for them. A combination with
-        the motor's own parameters (the gain of a sensor among them) is nothing that a reader would ask for.
-        """
+        """Return the effects that do no more than a combination of parameters of effects that `node` has. Only of a
+        model that was expanded: one with nothing but noise left has no use for them. For a combination with the motor's
+        own parameters (the gain of a sensor among them) no reader would ask."""
         added = {p.name for e in node.fit.model.effects for p in e.parameters}
         return {s.effect.name: s.same_as for s in self._scores.get(node.key, ())
                 if s.same_as and added >= set(s.same_as)}
 
     def unseen(self, node: Node) -> dict[str, tuple[str, ...]]:
-        """Return the effects that other values of the motor's own parameters imitate in these records.
-
-        Beside the scales of sensors, which do so in any record.
-        """
+        """Return the effects that other values of the motor's own parameters imitate in these records, beside the
+        scales of sensors, which do so in any record."""
         return {s.effect.name: s.same_as for s in self._scores.get(node.key, ())
                 if s.same_as and s.effect.balance != "sensor"}
 
@@ -197,11 +191,9 @@ class Search:
         return tasks
 
     def _shortlist(self, node: Node) -> list[Score]:
-        """Return what is worth a refit: the best, what is common and near the best, and what a score cannot show.
-
-        Far from the records slopes say little, and everything that is common is tried; what has no free parameter has
-        no slope. A line in the spectrum over the angle is no accident, however small beside the rest of the misfit.
-        """
+        """Return what is worth a refit: the best, what is common and near the best, and what a score cannot show. Far
+        from the records slopes say little, and all that is common is tried; what has no free parameter has no slope; a
+        line in the spectrum over the angle is no accident, however small beside the rest of the misfit."""
         scores, astray, unmet = self.scores(node), lost(node.fit), bool(far(node.fit))
         near = NEAR * max((s.drop for s in scores), default=0.0)
         return [s for k, s in enumerate(scores)
@@ -294,11 +286,9 @@ class Search:
         return listed + [c for n, c in judged.items() if n not in scored]
 
     def pruned(self, node: Node, before: Node) -> Node:
-        """Return `node` without the effects that have become superfluous, and with the simplest of each kind.
-
-        A later effect may have taken over what made an earlier one special: then its simple relative will do. What
-        is left is still preferred to the model `before`: small losses, each by chance, may add up.
-        """
+        """Return `node` without the effects that have become superfluous, and with the simplest of each kind: a later
+        effect may have taken over what made an earlier one special. What is left is still preferred to the model
+        `before`: small losses, each by chance, may add up."""
         for e in node.fit.problem.model.effects:
             simpler = self._simpler(node.fit.model, e)
             alone = e.name == node.added and node.parent is not None and len(node.key - node.parent.key) == 1
@@ -327,11 +317,8 @@ class Search:
         return [m for e in inside if (m := _in_place(model, effect, e)) is not None]
 
     def brought_to_its_end(self, node: Node) -> Node:
-        """Return a model fitted on to its optimum; a refit ends where it tells no two models apart.
-
-        A rugged cost (the rebounds in a gear's play) stops a refit's few steps, with errors far beyond the noise; there
-        the whole effort of a fit goes on.
-        """
+        """Return a model fitted on to its optimum; a refit ends where it tells no two models apart. A rugged cost (the
+        rebounds in a gear's play) stops its few steps with errors far beyond the noise: there a whole fit goes on."""
         with contextlib.suppress(*FAILURES):
             if (fit := led_on(node.fit)) is not None and hottest(fit) <= MELTS:
                 node = self.nodes[node.key] = replace(node, fit=fit, predictions=self.held.predictions(fit))
