@@ -39,10 +39,8 @@ class HeldOut:
         return HeldOut(problem, noise)
 
     def predictions(self, fit: Fit) -> Predictions:
-        """Return what `fit` predicts of data that it was not fitted to.
-
-        SimulationError if it cannot be simulated on the held-out runs.
-        """
+        """Return what `fit` predicts of data that it was not fitted to; SimulationError if it cannot be simulated on
+        the held-out runs."""
         held_out: Mapping[str, Errors] = {}
         if self.validation is not None:
             # As finely and sharply as it was fitted: a tiny noise asks for many sub-steps that change nothing here.
