@@ -93,11 +93,9 @@ class Rival:
 
     @staticmethod
     def as_allowed(fit: Fit) -> Rival:
-        """Return the rival that a fit is, an effect that its records leave open as large as they allow.
-
-        As fitted it may be nothing, and no experiment would show it. Of sizes on a grid, the one is taken that, all
-        else fitted anew, raises χ² most, but by `REGION`² at most.
-        """
+        """Return the rival that a fit is, an effect that its records leave open as large as they allow: as fitted it
+        may be nothing, and no experiment would show it. Of sizes on a grid, the one is taken that, all else fitted
+        anew, raises χ² most, but by `REGION`² at most."""
         problem, names = fit.problem, [p.name for p in fit.problem.unknowns.free]
         own = ([p for p in e.parameters if p.name in names] for e in fit.model.effects)
         unseen = [p for pars in own for p in pars if all(fit.std[other.name] is None for other in pars)]
@@ -141,10 +139,8 @@ class Rival:
         return dict(zip(names, (np.sqrt(variances) * slope).tolist(), strict=True))
 
     def draws(self, n: int, rng: np.random.Generator) -> Array:
-        """Return `n` displacements (n, k) of the parameters as uncertain as the records leave them, none the first.
-
-        Every other one is from the fitted values.
-        """
+        """Return `n` displacements (n, k) of the parameters as uncertain as the records leave them, none the first;
+        every other one is from the fitted values."""
         draws = rng.multivariate_normal(np.zeros(len(self.scale)), np.linalg.inv(self.known), n, method="eigh")
         draws[:2] = 0.0
         draws[1::2] += self.fitted
@@ -193,11 +189,9 @@ def quiet_seeds(n: int) -> list[int]:
 
 @dataclass(frozen=True, eq=False)
 class Layout:
-    """How unknowns become a voltage: segments of whole milliseconds, each a step or a ramp between two levels.
-
-    On a step, a pseudo-random binary signal of its own amplitude may ride: it shows what is quick. Its seed is the one
-    whose running sum stays smallest, so that the speed moves little and the current may be large.
-    """
+    """How unknowns become a voltage: segments of whole milliseconds, each a step or a ramp between two levels. On a
+    step, a pseudo-random binary signal of its own amplitude may ride: it shows what is quick. Its seed is the one whose
+    running sum stays smallest, so that the speed moves little and the current may be large."""
 
     ms: tuple[int, ...]  # lengths of the segments
     dt: float  # s between samples
@@ -274,10 +268,8 @@ class Layout:
 
 
 def voltage_as_parameters(system: System) -> System:
-    """Return the system with voltages as parameters.
-
-    To its input come v_from … v_to, as a second input goes from 0 to 1, and v_on times a third.
-    """
+    """Return the system with voltages as parameters: to its input come v_from … v_to, as a second input goes from 0 to
+    1, and v_on times a third."""
     nx, _, k, _ = system.sizes
     x, u, p, s, d = (ca.SX.sym(n, m) for n, m in (("x", nx), ("u", 3), ("p", k + 3), ("s", 3), ("d", 2)))
     v, own = u[0] + p[k] + (p[k + 1] - p[k]) * u[1] + p[k + 2] * u[2], p[:k]
@@ -395,11 +387,9 @@ class Value(NamedTuple):
 
 def separation(truth: Driven, rival: Driven, levels: Array, ra: Response, rb: Response, slopes: bool,
                region: float = REGION) -> Value:
-    """Return the χ² that a rival leaves where another model is the truth, once fitted to old and new records.
-
-    The truth is the least favourable one within `region` standard deviations of its values. `ra` and `rb` are the
-    answers at the values of the old records, with slopes by parameter.
-    """
+    """Return the χ² that a rival leaves, once fitted to old and new records, where another model is the truth: the
+    least favourable one within `region` standard deviations of its values. `ra` and `rb` are the answers at the values
+    of the old records, with slopes by parameter."""
     k, both = len(truth.rival.scale), (truth, rival)
     prior = np.zeros((2, k + len(rival.rival.scale), k + len(rival.rival.scale)))
     prior[0, :k, :k], prior[1, k:, k:] = truth.rival.known, rival.rival.known
