@@ -170,11 +170,9 @@ def _text(where: str | None, shares: Mapping[str, float], regions: Mapping[str, 
 
 
 def accounted(before: Fit, after: Fit) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
-    """Return per run the voltage (V) and torque (N·m) missing in `before` that `after` has.
-
-    That is its effects and the shift of the parameters: what the balances of `before` lack along the motion of `after`.
-    A current that was not measured is each model's own, and the torque stands for both balances.
-    """
+    """Return per run the voltage (V) and torque (N·m) missing in `before` that `after` has, by its effects and the
+    shift of the parameters: what the balances of `before` lack along the motion of `after`. A current that was not
+    measured is each model's own, and the torque stands for both balances."""
     every, own = [], "i" in before.problem.system.states and "i" not in before.problem.outputs
     scale = {"i": 0.0 if own else before.values.get("L", 0.0), "omega": before.values["J"]}
     for k, run in enumerate(after.problem.runs):
@@ -220,10 +218,8 @@ class Linear(NamedTuple):
 
 
 def smooth(fit: Fit, k: int, walk: Array, linear: Linear) -> Smoothed:
-    """Return the smoothed run `k`.
-
-    `walk` is the step size of the random walk, V/√s and N·m/√s (0: none); `linear` is where every walk begins.
-    """
+    """Return the smoothed run `k`; `walk` is the step size of the random walk, V/√s and N·m/√s (0: none), `linear`
+    where every walk begins."""
     run, y = fit.problem.runs[k], fit.problem.measured[k].y
     weights = np.array([1.0 / run.sigma[c] if c in run.sigma else 0.0 for c in fit.problem.outputs])
     x = linear.x
