@@ -85,10 +85,8 @@ class Evidence:
     @property
     def worth_it(self) -> bool:
         """Tell whether the new model is to be preferred: surely better, by an amount that matters, and not worse there.
-
         The amount is that over all samples predicted: where held-out runs rise by as much as blocks fall by chance, it
-        is none. A rise there beyond that refuses it.
-        """
+        is none. A rise there beyond that refuses it."""
         fall = self.fall if self.everywhere is None else self.everywhere
         return self.sure and fall > thresholds.MATERIAL and not self.worse_there
 
@@ -215,11 +213,9 @@ def left_out(residual: Array, columns: Array, labels: NDArray[np.intp]) -> Array
 
 
 def blocks_of(runs: Sequence[Experiment], evenly: bool = False) -> list[NDArray[np.intp]]:
-    """Return the block of each sample, `BLOCKS` a run: equal shares of its time and of what its outputs do.
-
-    Of one step with a long rest, blocks of equal length (`evenly`) would hold all that can be learnt in one or two: a
-    gain there, however large, would be no surer than chance. But a free curve is only extended over a short block.
-    """
+    """Return the block of each sample, `BLOCKS` a run: equal shares of its time and of what its outputs do. Of one step
+    with a long rest, blocks of equal length (`evenly`) would hold all that can be learnt in one or two: a gain there
+    would be no surer than chance. But a free curve is only extended over a short block."""
     found, first = [], 0
     for run in runs:
         parts = max(min(thresholds.BLOCKS, run.n // 2), 1)
@@ -243,10 +239,8 @@ def _changed(run: Experiment, cells: int) -> Array:
 
 
 def finer(fit: Fit, channel: str) -> bool:
-    """Tell whether a channel is an angle followed as closely as can be asked: it sums up every trifle of a run.
-
-    What its noise, white as the jumps of an encoder's counts are, makes of the rate of its error is not the model's.
-    """
+    """Tell whether a channel is an angle followed as closely as can be asked: it sums up every trifle of a run. What
+    its noise, white as the jumps of an encoder's counts are, makes of the rate of its error is not the model's."""
     if channel != "theta" or not fit.nrmse.get(channel, np.inf) < thresholds.FINER:
         return False
     squares = list[Array]()
@@ -277,11 +271,9 @@ def deciding(fit: Fit) -> Fit:
 
 
 def predictions_left_out(fit: Fit, evenly: bool = False) -> Channels | None:
-    """Return the errors of `fit` on blocks of its own records, each left out in turn; None where that cannot be told.
-
-    Initial states stay as they were fitted, and so do parameters at a limit. Where slopes lead nowhere (cogging far
-    from its phase) the linear prediction explodes, and tells nothing.
-    """
+    """Return the errors of `fit` on blocks of its own records, each left out in turn; None where that cannot be told:
+    where slopes lead nowhere (cogging far from its phase) the linear prediction explodes. Initial states stay as they
+    were fitted, and so do parameters at a limit."""
     problem, n = fit.problem, fit.problem.n_outputs
     at_start = {p.name for *_, p in problem.unknowns.initial}
     free = [j for j, p in enumerate(problem.unknown) if p.name not in at_start | fit.at_bound]
@@ -319,10 +311,8 @@ def by_channel(problem: Problem, residual: Array, blocks: Sequence[NDArray[np.in
 
 
 def held_out_errors(problem: Problem, noise: Mapping[str, float]) -> Channels:
-    """Return the errors of a problem's model on its runs, which it was not fitted to.
-
-    What these runs have for themselves (an encoder's zero) counts for each block as the others tell it.
-    """
+    """Return the errors of a problem's model on its runs, which it was not fitted to; what these have for themselves
+    (an encoder's zero) counts for each block as the others tell it."""
     problem, q = settled(problem)
     errors = errors_of(at(problem, q), noise)
     if problem.unknowns.apart:
@@ -335,10 +325,8 @@ def held_out_errors(problem: Problem, noise: Mapping[str, float]) -> Channels:
 
 def errors_of(simulations: Sequence[Simulation], noise: Mapping[str, float],
               judged: Sequence[Experiment] | None = None) -> Channels:
-    """Return the errors of `simulations` as they are, in blocks of each run.
-
-    `judged` gives other measurements on the same samples (a fold); `noise` is the sensor's per channel.
-    """
+    """Return the errors of `simulations` as they are, in blocks of each run; `judged` gives other measurements on the
+    same samples (a fold), `noise` is the sensor's per channel."""
     runs = judged if judged is not None else [s.experiment for s in simulations]
     parts: dict[str, list[tuple[Array, NDArray[np.intp], Array]]] = {}
     for sim, run, block in zip(simulations, runs, blocks_of(runs), strict=True):
