@@ -56,11 +56,9 @@ class Raced:
 
 
 def raced(fit: Fit, model: Model, starts: Sequence[Mapping[str, float]]) -> Raced | None:
-    """Go a few steps from each start with `model` on the records of `fit`; None if none can be simulated.
-
-    Where no start can be (a friction that sticks at every turn), the values of `fit` are one: the smaller model could.
-    Effects of the angle start along the measured angle, which the model's own angle, still wrong, would lead astray.
-    """
+    """Go a few steps from each start with `model` on the records of `fit`; None if none can be simulated. Where no
+    start can be (a friction that sticks at every turn), the values of `fit` are one: the smaller model could. Effects
+    of the angle start along the measured angle, which the model's own angle, still wrong, would lead astray."""
     model = _bounded(fit, model)
     poles = [pole for e in model.effects if e.name not in fit.model.effect_names for pole in exchanged_poles(model, e)]
     alive, starts = restored(fit, model), starts or ({},)
@@ -100,10 +98,8 @@ def _undamped(r: Array, jac: Array) -> float:
 
 
 def finished(fit: Fit, best: Raced, effort: LevenbergMarquardt) -> Fit | None:
-    """Return the refit that a race began, converged with `effort`; None if it fails.
-
-    Where it went along the measured angle the model's own takes over, unless it drifts too far (by periods).
-    """
+    """Return the refit that a race began, converged with `effort`; None if it fails. Where it went along the measured
+    angle the model's own takes over, unless it drifts too far (by periods)."""
     stages = "sgn_width" in best.problem.model.parameters and "sgn_width" not in fit.model.parameters
     try:
         done = _released(best.problem) if best.angular else QUICKLY(best.problem, wide=stages)
@@ -137,10 +133,8 @@ def _released(measured: Problem) -> Estimate:
 
 
 def copies_the_angle(problem: Problem, q: Array) -> bool:
-    """Tell whether the simulated angle follows changes of the measured one that goes in: then it predicts nothing.
-
-    The measured angle is shaken a little: a simulated one that does the same, to within half, copies.
-    """
+    """Tell whether the simulated angle follows changes of the measured one that goes in: then it predicts nothing. That
+    is shaken a little: a simulated one that does the same, to within half, copies."""
     rng, runs, shakes = np.random.default_rng(0), [], []
     for run in problem.runs:
         theta = run.experiment.outputs["theta"]
@@ -272,10 +266,8 @@ NEARLY = 0.9  # of the best promise: a smaller model with that is the favourite
 
 @dataclass(frozen=True)
 class Task:
-    """A model to be refitted on the records of `fit`, for an effect, from several starts.
-
-    `promise` is the share of the squared misfit that a score says it takes away, None without a score.
-    """
+    """A model to be refitted on the records of `fit`, for an effect, from several starts. `promise` is the share of the
+    squared misfit that a score says it takes away, None without a score."""
 
     fit: Fit
     model: Model
@@ -437,10 +429,8 @@ def _gain(task: Task) -> float:
 
 
 def widened(fit: Fit, effect: Effect, above: float = ABOVE) -> Task:
-    """Return the refit with `effect` in the place of those that it includes, from where they were.
-
-    Sizes that are at least another start at `above` times that; a shape is that of the same unit, if there was one.
-    """
+    """Return the refit with `effect` in the place of those that it includes, from where they were: sizes that are at
+    least another start at `above` times that; a shape is that of the same unit, if there was one."""
     inside = [e for e in fit.model.effects if e.name in effect.includes]
     level = max((fit.values[p.name] for e in inside for p in e.parameters if p.null == 0), default=0.0)
     model = reduce(Model.without, (e.name for e in inside), fit.model) + effect
@@ -453,10 +443,8 @@ def widened(fit: Fit, effect: Effect, above: float = ABOVE) -> Task:
 
 
 def hidden_in(fit: Fit, effect: Effect) -> tuple[str, ...]:
-    """Return the parameters whose other values make up for `effect` in the place of those that it contains.
-
-    Empty if its sizes are determined, or nothing else does the same.
-    """
+    """Return the parameters whose other values make up for `effect` in the place of those that it contains; empty if
+    its sizes are determined, or nothing else does the same."""
     task = widened(fit, effect, 1.0)
     problem = _started(fit, task.model, task.starts[0], angular=False)
     jac = problem.residual_and_jacobian(problem.start)[1] / problem.scaling.slope(problem.start)
