@@ -65,11 +65,9 @@ class Tried(NamedTuple):
 
 
 def rank(fit: Fit, effects: Sequence[Effect], known: Sequence[Score] = ()) -> list[Score]:
-    """Score `effects` on `fit`, best first; effects that the model cannot take are left out.
-
-    `known`: scores of the same effects on a smaller model's fit to the same records. Where `fit` leaves hardly more
-    than noise, what they added there tells which add nothing here.
-    """
+    """Score `effects` on `fit`, best first; effects that the model cannot take are left out. `known`: scores of the
+    same effects on a smaller model's fit to the same records. Where `fit` leaves hardly more than noise, what they
+    added there tells which add nothing here."""
     tangent = Tangent.of(fit)
     before = {s.effect.name: s for s in known}
     scores = []
@@ -91,10 +89,8 @@ def pairs_of(fit: Fit, scores: Sequence[Score], most: int) -> list[tuple[Score, 
 
 
 def with_phase_per_run(fit: Fit, scores: Sequence[Score], zero: Effect) -> list[Score]:
-    """Return the effects over the angle that explain more with a phase in every run, and where each zero then is.
-
-    `scores` are those of single effects, `zero` is that of the encoder, of one parameter per run.
-    """
+    """Return the effects over the angle that explain more with a phase in every run, and where each zero then is;
+    `scores` are those of single effects, `zero` is that of the encoder, of one parameter per run."""
     tangent, runs = Tangent.of(fit), sorted(set(fit.problem.unknowns.firsts))
     apart = [f"{zero.parameters[0].name}[{k}]" for k in runs]
     found, parts = [], list[Tangent]()
@@ -235,11 +231,9 @@ NUDGE = 1e-9  # of the natural size: where sizes start, so that fmax(tau_s - tau
 
 @dataclass(frozen=True, eq=False)
 class Shape:
-    """What an effect adds at one shape of it, to the whitened outputs of a fit.
-
-    The columns (n, k) are slopes to each of `sizes`, those at a quarter of a period later after them if there is a
-    `phase`; or the one change that the effect as it is makes, where there are no `sizes`.
-    """
+    """What an effect adds at one shape of it, to the whitened outputs of a fit: columns (n, k), the slopes to each of
+    `sizes`, those at a quarter of a period later after them if there is a `phase`; or the one change that the effect as
+    it is makes, where there are no `sizes`."""
 
     values: Mapping[str, float]  # of parameters that are no sizes
     columns: Array
@@ -263,10 +257,8 @@ class Shape:
 
 
 def believable_start(fit: Fit) -> dict[str, float]:
-    """Return the estimated initial states of a fit, no current larger than twice the voltage drives through R.
-
-    With next to no inductance a current of megamperes is but a kick at the start, and would melt a winding that heats.
-    """
+    """Return the estimated initial states of a fit, no current larger than twice the voltage drives through R: with
+    next to no inductance megamperes are but a kick at the start, and would melt a winding that heats."""
     found = dict(fit.initial)
     for k, run in enumerate(fit.problem.experiments) if "R" in fit.values else ():
         if (name := f"i_0[{k}]") in found and "i" not in run.outputs:
@@ -286,20 +278,16 @@ class Added:
 
     @staticmethod
     def of(tangent: Tangent, effect: Effect) -> Added:
-        """Return the fit's model with `effect`; the first one over the angle goes along the measured angle.
-
-        ModelError if the effect does not go with the model.
-        """
+        """Return the fit's model with `effect`, the first one over the angle along the measured angle; ModelError if
+        the effect does not go with the model."""
         fit, model = tangent.fit, tangent.fit.model + effect
         if uses_angle(effect) and not model.angle_input and not any(uses_angle(e) for e in fit.model.effects):
             model = replace(model, angle_input=True, _systems={})
         return Added(fit, model, [model.parameters[p.name] for p in effect.parameters], tangent.sizes)
 
     def shape(self, values: Mapping[str, float]) -> Shape | None:
-        """Return what the effect adds at `values`; None where that cannot be simulated, or is nothing.
-
-        SimulationError where it vanishes.
-        """
+        """Return what the effect adds at `values`; None where that cannot be simulated, or is nothing, SimulationError
+        where it vanishes."""
         sizes = tuple(p for p in self.pars if p.null is not None and not p.positive)
         finite = any(p.null is not None and p.positive for p in self.pars)
         weights = tuple(m.weights for m in self._problem.measured)
