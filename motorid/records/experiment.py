@@ -242,10 +242,8 @@ def units_of(runs: Iterable[Experiment]) -> dict[str, str]:
 
 
 def split(experiment: Experiment, n: int = 2) -> list[Experiment]:
-    """Cut a run into `n` contiguous blocks of about equal length, e.g. to hold one out.
-
-    Blocks and not random samples: neighbouring samples tell nearly the same. Each block keeps its time.
-    """
+    """Cut a run into `n` contiguous blocks of about equal length, each with its time, e.g. to hold one out: of random
+    samples, neighbours would tell nearly the same."""
     if int(n) != n or n < 1:
         raise UsageError(f"split() takes a whole number of blocks of at least 1; got {n!r}.")
     edges = np.linspace(0, experiment.n, int(n) + 1).round().astype(int)
@@ -287,9 +285,7 @@ def pauses(t: Array) -> NDArray[np.intp]:
 
 def parts_of(run: Experiment) -> list[slice]:
     """Return the parts of a run between pauses: gaps in time, see `pauses`, or changes in its extra columns `PARTS`.
-
-    Parts of fewer than 8 samples, or without a value, are left out, where others are left.
-    """
+    Those of fewer than 8 samples, or without a value, are left out, where others are left."""
     extra = dict(run.meta["extra"]) if isinstance(run.meta.get("extra"), Mapping) else {}
     told = (a for c in PARTS if (a := np.asarray(extra.get(c))).shape == run.t.shape)
     marks = [np.flatnonzero(np.nan_to_num(np.diff(a))) for a in told if a.dtype.kind in "biuf"]
@@ -299,10 +295,8 @@ def parts_of(run: Experiment) -> list[slice]:
 
 
 def between_pauses(run: Experiment) -> list[Experiment]:
-    """Return the parts of a run as runs of their own, since nobody saw what the motor did meanwhile.
-
-    Where the clock starts again so does a record, and with it what is another in every run.
-    """
+    """Return the parts of a run as runs of their own, since nobody saw what the motor did meanwhile. Where the clock
+    starts again so does a record, and with it what is another in every run."""
     if (parts := parts_of(run)) == [slice(0, run.n)]:
         return [run]
     whole, notes = record_of(run), [run.meta.get("notes", ()), *[()] * len(parts)]  # told once
