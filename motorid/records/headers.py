@@ -146,11 +146,9 @@ class HeaderMatch(NamedTuple):
 
 
 def classify(label: str, unit: Unit | None = None) -> HeaderMatch | None:
-    """Tell which channel a header, as it stands in the file, names, or None if none.
-
-    `unit` is that of a row of units; without it the header itself is searched for one. Scores: 4 the very name of a
-    channel; 3 with idle words ("motor speed"); 2 with unknown words; 1 by the unit alone; lower: a last resort.
-    """
+    """Tell which channel a header, as it stands in the file, names, or None if none; `unit` is that of a row of units,
+    without which the header is searched for one. Scores: 4 the very name of a channel; 3 with idle words ("motor
+    speed"); 2 with unknown words; 1 by the unit alone; lower: a last resort."""
     for text in (label, _CAMEL.sub(" ", label)):
         name, inner, explicit = unit_in(text)
         if hit := _by_words(_tokens(name) or _tokens(text), unit or inner, explicit or unit is not None):
