@@ -96,9 +96,8 @@ def delayed(t: Array, v: Array, hold: str, seconds: float, before: float) -> Arr
 
 
 def without_spikes(t: Array, y: Array, v: Array, inert: bool = False) -> Array:
-    """Return an output with samples that no motor makes marked as missing, the same array where there are none. Single
-    ones, of which a few may be chance; of what is `inert`, short bursts too. A large share is no accident: it is left.
-    """
+    """Return an output with samples that no motor makes marked as missing, the same array for none: single ones, of
+    which a few may be chance; of what is `inert`, short bursts too. A large share is no accident: it is left."""
     if np.isfinite(y).sum() < FEWEST:
         return y
     at = at if len(at := spikes(t, y, v)) >= LEAST else at[:0]
@@ -112,10 +111,8 @@ def without_spikes(t: Array, y: Array, v: Array, inert: bool = False) -> Array:
 
 def bursts(t: Array, y: Array, v: Array) -> NDArray[np.intp]:
     """Return which samples, two to `LONGEST` in a row, jump away and back, more than twice as far as the channel
-    changes from sample to sample anywhere else, at one voltage: what has a mass cannot.
-
-    From rest and back to it, it slips; what rings swings back by less than half, or again by more than half of that.
-    """
+    changes from sample to sample anywhere else, at one voltage: what has a mass cannot. From rest and back to it, it
+    slips; what rings swings back by less than half, or again by more than half of that."""
     seen = np.flatnonzero(np.isfinite(y))
     changes, level = np.diff(y[seen]), np.append(0, np.cumsum(np.abs(np.diff(v)) > 0.02 * np.ptp(v)))  # of the voltage
     sizes, least = np.abs(changes), 12 * noise_level(y, t)
