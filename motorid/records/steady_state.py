@@ -40,11 +40,9 @@ class SteadySegment:
 
 
 def find_segments(runs: Sequence[Experiment], sigma: Sequence[Mapping[str, float]]) -> tuple[SteadySegment, ...]:
-    """Return the steady parts of `runs`, at most one per stretch of held input, the longest that ends it.
-
-    A stretch counts where the two halves of its tail agree in every channel within four standard errors or 0.1 % of its
-    largest value, and at most 5 % of the drive still accelerate. Parts without input and motion do not.
-    """
+    """Return the steady parts of `runs`, at most one per stretch of held input, the longest that ends it. It counts
+    where the two halves of the stretch's tail agree in every channel within four standard errors or 0.1 % of its
+    largest value, and at most 5 % of the drive still accelerate. Parts without input and motion do not."""
     return tuple(tail for k, run in enumerate(runs) for first, last in _constant_stretches(run.inputs["v"])
                  if (tail := _steady_tail(k, run, sigma[k], first, last)))
 
