@@ -26,6 +26,7 @@ from motorid.problem.problem import Problem
 from motorid.problem.simulate import NRMSE, Evaluation, Simulation, error_table, evaluate, judge, largest, moving
 from motorid.records.experiment import Experiment, units_of
 from motorid.records.files import json_text, write_files
+from motorid.records.steady_state import find_segments
 
 LOST = 1.0  # NRMSE at which zero is as near to what was measured
 PLAIN = 1.5  # times the noise: up to here errors are said to be at its level
@@ -213,7 +214,13 @@ class Fit(Shown):
     @cached_property
     def steady_state_error(self) -> dict[str, float]:
         """RMS difference of measured and simulated means over the steady parts of the records, SI, per channel."""
-        return simulate.steady_errors(self.simulations, [run.sigma for run in self.problem.runs])
+        errors: dict[str, list[float]] = {}
+        for part in find_segments([s.experiment for s in self.simulations], [run.sigma for run in self.problem.runs]):
+            s = self.simulations[part.run]
+            for c in part.means:
+                if c in s.experiment.outputs and c in s.outputs:
+                    errors.setdefault(c, []).append(float(np.nanmean(s.residual(c)[part.first:part.last + 1])))
+        return {c: float(np.sqrt(np.mean(np.square(e)))) for c, e in errors.items()}
 
     @cached_property
     def misfit(self) -> Mapping[str, float]:

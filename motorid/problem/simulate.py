@@ -21,7 +21,6 @@ from motorid.numerics.parallel import one_thread
 from motorid.numerics.signals import Array
 from motorid.problem.problem import Problem, as_problem
 from motorid.records.experiment import Experiment, units_of, windows
-from motorid.records.steady_state import find_segments
 
 TURN = np.arange(-60, 60) * np.pi / 60  # where the zero of an encoder may be
 ALIKE = 1.1  # times the least cost
@@ -85,11 +84,8 @@ class Evaluation(Shown):
 
 def error_table(evaluations: Mapping[str, Evaluation | None], noise: Mapping[str, float] = MappingProxyType({})
                 ) -> Table:
-    """Return RMSE and NRMSE per channel of each named evaluation, side by side; None is left out.
-
-    The name goes before the heads of its columns, e.g. ``held-out``. Where `noise` is given, the standard deviation of
-    the sensor's per channel, SI, it is a column of its own.
-    """
+    """Return RMSE and NRMSE per channel of each evaluation but None, under its name (``held-out``), side by side; the
+    `noise` of the sensors, SI, is a column of its own where it is given."""
     shown = {name: e for name, e in evaluations.items() if e is not None}
     units = units_of(s.experiment for e in shown.values() for s in e.simulations)
     header = ["channel", *(f"{name} {what}".strip() for name in shown for what in ("RMSE", "NRMSE"))]
@@ -263,17 +259,6 @@ def largest(shares: Mapping[str, float]) -> float:
     return max(moving(shares).values(), default=float("nan"))
 
 
-def steady_errors(simulations: Sequence[Simulation], sigma: Sequence[Mapping[str, float]]) -> dict[str, float]:
-    """Return the RMS difference of measured and simulated means over the steady parts, SI; empty without any."""
-    errors: dict[str, list[float]] = {}
-    for part in find_segments([s.experiment for s in simulations], sigma):
-        s = simulations[part.run]
-        for c in part.means:
-            if c in s.experiment.outputs and c in s.outputs:
-                errors.setdefault(c, []).append(float(np.nanmean(s.residual(c)[part.first:part.last + 1])))
-    return {c: float(np.sqrt(np.mean(np.square(e)))) for c, e in errors.items()}
-
-
 def cut_alike(fitted: Sequence[Experiment], runs: Sequence[Experiment] | Experiment) -> list[Experiment]:
     """Return `runs` in windows, if the `fitted` ones are."""
     runs = [runs] if isinstance(runs, Experiment) else list(runs)
@@ -346,11 +331,9 @@ def integration_error(problem: Problem, q: Array) -> float:
 
 
 def integration_bias(problem: Problem, q: Array, jac: Array) -> tuple[float, float]:
-    """Return the integration error, and by how many deviations it moves the estimate at most, in any direction.
-
-    Half the steps change the residual by Δr, and so the estimate by −(JᵀJ)⁻¹JᵀΔr, whose length in the metric of the
-    covariance is that of the part of Δr that J can express.
-    """
+    """Return the integration error, and by how many deviations it moves the estimate at most, in any direction. Half
+    the steps change the residual by Δr, and so the estimate by −(JᵀJ)⁻¹JᵀΔr, whose length in the metric of the
+    covariance is that of the part of Δr that J can express."""
     error, change = _halved_steps(problem, q)
     jac = jac[:len(change)]
     pull = jac.T @ change
