@@ -109,7 +109,9 @@ def check_derivatives(problem: Problem, q: Array | None = None, *, steps: Sequen
                          f"problem has {len(problem.start)}, q has {q.size}.")
     fine = problem.refined(q)
     _, jac = fine.residual_and_jacobian(q)
-    names, group = _groups(fine, len(jac))
+    names, group = fine.outputs, np.concatenate([np.nonzero(np.isfinite(m.y))[1] for m in fine.measured])  # per row
+    if len(group) < len(jac):
+        group, names = np.append(group, np.full(len(jac) - len(group), len(names))), (*names, "others")
     slope = _largest(jac, group, len(names))
     numeric = (np.column_stack([_slope(fine, q, j, h) for j in range(len(q))]) for h in steps)
     difference = np.min([_largest(jac - n, group, len(names)) for n in numeric], axis=0)
@@ -125,27 +127,14 @@ def _largest(rows: Array, group: NDArray[np.intp], n: int) -> Array:
 
 
 def _slope(problem: Problem, q: Array, j: int, h: float) -> Array:
-    def moved(steps: int) -> Array:
-        beside = q.copy()
-        beside[j] += steps * h
-        return problem.residual(beside)
-
-    return (8 * (moved(1) - moved(-1)) - (moved(2) - moved(-2))) / (12 * h)
-
-
-def _groups(problem: Problem, n: int) -> tuple[tuple[str, ...], NDArray[np.intp]]:
-    """Return the names of groups of residuals, and the group of each of the `n` rows."""
-    group, names = np.concatenate([np.nonzero(np.isfinite(m.y))[1] for m in problem.measured]), problem.outputs
-    if len(group) < n:
-        group, names = np.append(group, np.full(n - len(group), len(names))), (*names, "others")
-    return names, group
+    step = h * np.eye(len(q))[j]
+    near, far = (problem.residual(q + n * step) - problem.residual(q - n * step) for n in (1, 2))
+    return (8 * near - far) / (12 * h)
 
 
 def relative_jacobian(problem: Problem, q: Array) -> Array:
-    """Return d(outputs over noise)/d(relative parameters), shape (n, k), initial states projected out.
-
-    A relative change of one is a factor of e for positive parameters, the natural size of the unit for others.
-    """
+    """Return d(outputs over noise)/d(relative parameters), shape (n, k), initial states projected out. A relative
+    change of one is a factor of e for positive parameters, the natural size of the unit for others."""
     k = len(problem.model.free_names)
     slopes: list[Any] = [problem.simulate(q, j).dy for j in range(len(problem.runs))]
     jac = np.concatenate([m.stack(dy / m.noise[:, None]) for m, dy in zip(problem.measured, slopes, strict=True)])
