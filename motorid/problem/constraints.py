@@ -1,8 +1,7 @@
 """What a fit must respect beside the data: a current limit, the steady state, a relation of the user's own.
 
-Each is rows: functions of state, input and parameters at samples, or their means. As a *penalty* they add to the
-least-squares residual (`Relation.evaluate`); as a *true constraint* of `MultipleShooting` they stay between limits
-(`Relation.parts`).
+As a *penalty* its rows add to the least-squares residual (`Relation.evaluate`); as a *true constraint* of
+`MultipleShooting` they stay between limits (`Relation.parts`).
 """
 
 from __future__ import annotations
@@ -12,7 +11,7 @@ import weakref
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from numbers import Real
 from types import SimpleNamespace
 from typing import Any
@@ -271,7 +270,7 @@ class SteadyState(Relation):
         weight = self.weight * np.sqrt(s.n) * share(problem, s.run) * one
         unit = "N" if problem.model.axis == "linear" else "N·m"
         labels = tuple(f"{self.name}, {n} balance, run {s.run}, {s.begin:.4g} to {s.end:.4g} s" for n in names)
-        rows_of = local(system, _steady_rows(system, s.v, s.means))
+        rows_of = local(system, partial(_steady_rows, system, s.v, s.means))
         return Part(s.run, rows_of, pick, True, run.grid.u[pick], np.array(wanted), -allowed, allowed, size, weight,
                     labels, tuple({"voltage": "V", "torque": unit}[n] for n in names))
 
@@ -280,26 +279,24 @@ class SteadyState(Relation):
         return part.weight * c, part.weight
 
 
-def _steady_rows(system: Any, v: float, means: Mapping[str, float]) -> Callable[..., Any]:
+def _steady_rows(system: Any, v: float, means: Mapping[str, float], x: ca.SX, u: ca.SX, p: ca.SX) -> ca.SX:
     """Return the relative balances as an expression of (x, u, p) at the measured means of voltage and channels."""
-    def rows(x: ca.SX, u: ca.SX, p: ca.SX) -> ca.SX:
-        u = ca.vertcat(*[v if n == "v" else u[j] for j, n in enumerate(system.inputs)])
-        y = system.out(x, u, p)
-        state: list[Any] = ca.vertsplit(x)
-        for channel, shown in means.items():
-            place = system.states.index(channel)
-            state[place] = shown
-            if channel in system.outputs:
-                # One Newton step undoes gains and offsets; a sensor with a lag has settled, it shows its input.
-                at = system.outputs.index(channel)
-                slope = ca.jacobian(y[at], x[place])
-                state[place] = shown if slope.is_zero() else x[place] + (shown - y[at]) / slope
-        balances = system.balances(ca.vertcat(*state), u, p)
-        par = dict(zip(system.parameters, ca.vertsplit(p), strict=True))
-        drive = par["K"] * means["i"] if "K" in par and "i" in means else par.get("g", 1.0) * v
-        size = ca.vertcat(v, drive)
-        return balances / ca.if_else(size == 0, 1.0, size)
-    return rows
+    u = ca.vertcat(*[v if n == "v" else u[j] for j, n in enumerate(system.inputs)])
+    y = system.out(x, u, p)
+    state: list[Any] = ca.vertsplit(x)
+    for channel, shown in means.items():
+        place = system.states.index(channel)
+        state[place] = shown
+        if channel in system.outputs:
+            # One Newton step undoes gains and offsets; a sensor with a lag has settled, it shows its input.
+            at = system.outputs.index(channel)
+            slope = ca.jacobian(y[at], x[place])
+            state[place] = shown if slope.is_zero() else x[place] + (shown - y[at]) / slope
+    balances = system.balances(ca.vertcat(*state), u, p)
+    par = dict(zip(system.parameters, ca.vertsplit(p), strict=True))
+    drive = par["K"] * means["i"] if "K" in par and "i" in means else par.get("g", 1.0) * v
+    size = ca.vertcat(v, drive)
+    return balances / ca.if_else(size == 0, 1.0, size)
 
 
 def _relative_error(run: Any, s: SteadySegment, channel: str) -> float:
