@@ -75,10 +75,8 @@ def zoh_inputs(inputs: Sequence[str], hold: str) -> list[bool]:
 
 
 def time_since(run: Experiment, name: str) -> Array:
-    """Return one of the inputs that are times since the voltage did something, in the middle of each sample, (N,), s.
-
-    A voltage that begins at zero is taken to have been there for as long as the run lasts, any other to begin.
-    """
+    """Return one of the times since the voltage did something, in the middle of each sample, (N,), s. A voltage that
+    begins at zero is taken to have been there for as long as the run lasts, any other to begin."""
     t, v = run.t, run.inputs["v"]
     off = np.abs(v) <= OFF * np.abs(v).max()
     if name == "since_change":  # by more than noise, which a second difference has, a ramp hardly
@@ -102,10 +100,8 @@ def angle_signal(run: Experiment) -> Array:
 
 
 def noise_of(runs: Sequence[Experiment], channels: Sequence[str]) -> dict[str, float]:
-    """Noise per channel, estimated once for all runs (quadratic mean over samples) where no run states it.
-
-    A channel that never moves in a run tells nothing there.
-    """
+    """Noise per channel, estimated once for all runs where none states it: the quadratic mean over the samples of those
+    in which the channel moves; it tells nothing in others."""
     levels = {}
     for c in channels:
         each = [r.sigma.get(c) or _level(r, c) for r in runs if c in r.outputs]
@@ -146,8 +142,7 @@ def initial_state(run: Experiment, sigma: Mapping[str, float],
             lull = y[:lead][np.isfinite(y[:lead])]  # before the first voltage; the first samples where it creeps there
             still = known and lull.size and np.ptp(lull) < REACH * sigma[c]
             start[k] = lull.mean() if still else _first(y[:lead] if known else y)
-            if initial in ("estimate", "auto"):
-                reach[c] = _reach(y, sigma[c])
+            reach[c] = _reach(y, sigma[c])
         elif not known:
             start[k] = _first(y)
             reach[c] = _reach(y, sigma[c])
@@ -252,10 +247,8 @@ def _reach(y: Array, sigma: float) -> float:
 
 
 def _first_speed(theta: Array, t: Array, sigma: float) -> tuple[float, float]:
-    """Return the first speed and its reach, over the shortest window that noise leaves useful.
-
-    The mean speed of a window is that of its middle; a motor started at the first sample is still at rest there.
-    """
+    """Return the first speed and its reach, over the shortest window that noise leaves useful, whose mean speed is that
+    of its middle; a motor started at the first sample is still at rest there."""
     good = np.isfinite(theta)
     y, s = theta[good], t[good]
     if len(y) < 4:
@@ -272,11 +265,9 @@ def _first_speed(theta: Array, t: Array, sigma: float) -> tuple[float, float]:
 
 # -- natural sizes ---------------------------------------------------------------------------------------
 def natural_sizes(runs: Sequence[Experiment], values: Mapping[str, float]) -> dict[str, float]:
-    """Return the natural size of each unit in these records, for starting values and grids of effects.
-
-    Torque is what the motor makes at its highest current, time is the sample time, heat is what the winding
-    loses during the longest run for a rise of 30 K; ``lowest`` and ``highest`` are the ends of the angle's travel.
-    """
+    """Return the natural size of each unit in these records, for starting values and grids of effects: torque is what
+    the motor makes at its highest current, time the sample time, heat what the winding loses during the longest run for
+    a rise of 30 K; ``lowest`` and ``highest`` are the ends of the angle's travel."""
     seen = [_sizes_of(r) for r in runs]
     volt = max(s.volt for s in seen) or 1.0
     speed = max(s.speed for s in seen) or volt / max(values.get("K", 1.0), 1e-9)
