@@ -1,7 +1,4 @@
-"""A fitting problem: model, records and what is asked of them, as residual(q) and jacobian(q).
-
-`Measured` is one record as residuals see it, in standard deviations, and how exact an integration it asks for.
-"""
+"""A fitting problem: model, records and what is asked of them, as residual(q) and jacobian(q)."""
 
 from __future__ import annotations
 
@@ -375,16 +372,12 @@ def as_problem(model: Model, runs: Sequence[Experiment] | Experiment, **fields: 
 
 
 class Measured(NamedTuple):
-    """One record as residuals see it.
+    """One record as residuals see it, in standard deviations, and how exact an integration it asks for."""
 
-    y (N, ny), NaN where missing; weights (ny,), 0 for channels not measured; `index` of the finite samples in
-    the flattened y, None for all; noise (ny,), infinite for channels not measured.
-    """
-
-    y: Array
-    weights: Array
-    index: NDArray[np.int64] | None
-    noise: Array
+    y: Array  # (N, ny), NaN where missing
+    weights: Array  # (ny,), 0 for channels not measured
+    index: NDArray[np.int64] | None  # of the finite samples in the flattened y, None for all
+    noise: Array  # (ny,), infinite for channels not measured
     name: str
 
     @staticmethod
