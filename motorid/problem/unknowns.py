@@ -44,11 +44,8 @@ class Unknowns:
 
     @cached_property
     def apart(self) -> tuple[tuple[str, int, Parameter], ...]:
-        """(name, run, unknown) of each parameter that is another in every run.
-
-        The first run's value stands, since phases or resistances take it up; unless nothing else is free, as where a
-        model is judged on other runs. Parts of one record share theirs.
-        """
+        """(name, run, unknown) of each parameter that is another in every run; parts of one record share theirs. The
+        first's value stands, since phases or resistances take it up; unless nothing else is free, as on other runs."""
         own = [p for p in self.parameters.values() if p.vary and p.per_run]
         return tuple((p.name, k, replace(p, name=f"{p.name}[{k}]", value=self.runs[k].apart.get(p.name, p.value)))
                      for p in own for k in sorted(set(self.firsts))[1 if self.free or self.first_stands else 0:])
