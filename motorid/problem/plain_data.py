@@ -92,15 +92,8 @@ def _built(told: Any) -> Any:
 
 
 def model_from_json(contents: Mapping[str, Any], effects: Iterable[Effect] = ()) -> Model:
-    """Return the `Model`, at its values, of what ``fit --json`` or `export` wrote.
-
-    Parameters
-    ----------
-    contents : mapping
-        Needs ``model.base``, ``model.effects`` and ``parameters``; more does no harm.
-    effects : sequence of Effect, optional
-        Effects of your own that the model uses; they go before the library's of the same name.
-    """
+    """Return the `Model`, at its values, of what ``fit --json`` or `export` wrote; more in it does no harm. `effects`
+    of the user's own go before the library's of the same name."""
     part, values, fixed = "model", {}, {}  # fixed first: what is fixed may be zero, what is free may not
     try:
         head = dict(contents[part])
