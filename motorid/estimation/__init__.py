@@ -1,4 +1,1 @@
-"""From a problem to a fit: `fit.fit`, and `fit.solve` for a problem that is already posed; see there for the plan.
-
-Every stage is one call in `least_squares`; what comes out is `result.Fit`.
-"""
+"""From a problem to a fit: `fit` has the stages in order, each a call in `least_squares`; `result` what comes out."""

@@ -1,4 +1,1 @@
-"""A model on records: `problem.Problem` gives whitened residuals and their exact Jacobian.
-
-`runs` makes records ready, `unknowns` says what is sought, `simulate` shows a model on records and judges it there.
-"""
+"""A model on records: `problem` has residual and Jacobian, of `runs` by `unknowns`; `simulate` shows and judges."""
