@@ -95,18 +95,14 @@ class Huber:
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """Where the solver ended: q, residual, jac (in q), status, message, history of costs.
-
-    jac is that of the last step but one where the last one changed next to nothing.
-    `status` is ``"converged"``, ``"stalled"`` (no step lowers the cost) or ``"limit"`` (of iterations).
-    """
+    """Where the solver ended."""
 
     q: Array
     residual: Array
-    jac: Array
-    status: str
+    jac: Array  # in q; that of the last step but one where the last one changed next to nothing
+    status: str  # "converged", "stalled" (no step lowers the cost) or "limit" (of iterations)
     message: str
-    history: tuple[float, ...]
+    history: tuple[float, ...]  # of costs
 
 
 ENDS = {  # status and message
