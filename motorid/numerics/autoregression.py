@@ -2,8 +2,7 @@
 
 An autoregression describes noise whose neighbours are alike with few numbers, and its covariance is always
 that of some noise (positive definite), which a truncated sample autocovariance is not (Percival & Walden,
-Spectral Analysis for Physical Applications, 1993, ch. 9). `Colour` is the model of one channel, its order
-chosen by Akaike's criterion, 0 for white noise; `Whitening` are filters of a fixed order for all channels.
+Spectral Analysis for Physical Applications, 1993, ch. 9).
 """
 
 from __future__ import annotations
@@ -50,8 +49,8 @@ class Colour:
 
 
 def colour_of(parts: Sequence[Array], spent: float = 0.0) -> Colour:
-    """Return the autoregression of residuals, one (N,) per run, NaN where missing. The degrees of freedom `spent` by
-    the fit enlarge the variance."""
+    """Return the autoregression of residuals, one (N,) per run, NaN where missing, of the order that Akaike's criterion
+    chooses, 0 for white noise. The degrees of freedom `spent` by the fit enlarge the variance."""
     counts = [int(np.isfinite(p).sum()) for p in parts]
     n = sum(counts)
     most = max(min(HIGHEST_ORDER, int(10 * np.log10(max(n, 1))), n // 4, min(len(p) for p in parts) - 2), 0)
@@ -135,11 +134,8 @@ def autocorrelation(r: Array | Sequence[Array], lags: int) -> Array:
 
 
 def effective_samples(r: Array) -> float:
-    """Return how many independent samples `r` (N,) is worth.
-
-    n coloured samples are worth n/(1+2Σρ) independent ones (Bayley & Hammersley, J. R. Stat. Soc. Suppl. 8(2),
-    1946), the sum ending at the first negative pair of autocorrelations (Geyer, Stat. Sci. 7(4), 1992).
-    """
+    """Return how many independent samples `r` (N,) is worth: n coloured ones n/(1+2Σρ) (Bayley & Hammersley, J. R.
+    Stat. Soc. Suppl. 8(2), 1946), up to the first negative pair of autocorrelations (Geyer, Stat. Sci. 7(4), 1992)."""
     return _worth(int(np.isfinite(r).sum()), autocovariance([r], len(r) // 2))
 
 
