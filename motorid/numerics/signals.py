@@ -70,11 +70,8 @@ def despiked(r: Array) -> Array:
 
 
 def quantum(y: ArrayLike) -> float:
-    """Return the step in which a channel moves (encoder count, converter bit), or 0.0 if it shows none.
-
-    Second differences of a smooth signal that moves in steps are small whole multiples of the step, even if
-    the signal itself passes many steps per sample.
-    """
+    """Return the step in which a channel moves (encoder count, converter bit), or 0.0 if it shows none. Second
+    differences of a smooth signal in steps are small whole multiples of one, even if it passes many per sample."""
     whole = np.asarray(y, dtype=float)
     values = whole[np.isfinite(whole)]
     jumps = np.abs(np.diff(whole, 2))  # of neighbours: across a gap a steady motion is one large step
@@ -121,7 +118,8 @@ def _plausible(jumps: Array, guesses: Array) -> NDArray[np.bool_]:
 
 
 def noise_level(y: ArrayLike, t: ArrayLike | None = None) -> float:
-    """Estimate the standard deviation of the measurement noise of one channel.
+    """Return the standard deviation of the measurement noise of samples `y` (N,), NaN where missing, at times `t` in s,
+    evenly spaced without them. It is always positive: 1.0 for a channel that is zero throughout.
 
     High-order differences remove the signal, which is smooth over a few samples, and keep the noise; averaging the
     smaller half of them ignores outliers and the few samples after a voltage step. On uneven samples the weights are
@@ -132,20 +130,6 @@ def noise_level(y: ArrayLike, t: ArrayLike | None = None) -> float:
     underestimated: by a factor of about four for first-order noise with a correlation of 0.9 between neighbours. A
     signal that never rests and has only two or three samples per time constant is overestimated.
 
-    Parameters
-    ----------
-    y : (N,) array
-        Samples of the channel; NaN where missing.
-    t : (N,) array, optional
-        Their times in s. Without it even spacing is taken.
-
-    Returns
-    -------
-    float
-        Standard deviation in the unit of `y`, always positive; 1.0 for a channel that is zero throughout.
-
-    References
-    ----------
     Gasser, Sroka and Jennen-Steinmetz, "Residual variance and residual pattern in nonlinear regression",
     Biometrika 73(3), 1986; Hall, Kay and Titterington, Biometrika 77(3), 1990.
     """
