@@ -1,7 +1,4 @@
-"""Many independent pieces of work over any `map`: shipped once, kept when done, finished without the pool.
-
-What all long work shares is here, too: a budget of time, Ctrl-C in the command line, a progress bar. Each piece, and
-each public call, keeps the linear algebra to one thread, see `one_thread`: its matrices are small.
+"""What all long work shares: pieces over any `map`, a budget of time, Ctrl-C, a progress bar, one thread for BLAS.
 
 `map` is anything with the signature of the built-in one: ``executor.map`` of `concurrent.futures`,
 ``client.get_executor(pure=False).map`` of Dask, ``lambda f, xs: joblib.Parallel(2)(joblib.delayed(f)(x) for x in xs)``.
@@ -207,9 +204,8 @@ def map_items(function: Callable[[Any, Any], Any], shared: Any, items: Sequence[
     """Return ``[function(shared, item) for item in items]`` by way of `map`, with a progress bar that says `text`.
 
     `function` stands at a module's top level and returns failures instead of raising them. `shared` travels once per
-    process, small items travel in chunks; `each` is called with every result as it comes. An interruption (Ctrl-C)
-    keeps what is done. If the pool breaks, for instance because a worker was killed, the rest is done in this process:
-    that costs time, not results.
+    process, small items in chunks; `each` is called with every result as it comes. An interruption keeps what is done;
+    if the pool breaks (a worker was killed), the rest is done in this process: that costs time, not results.
     """
     parcel = Parcel.of(shared)
     size = 1 if map is None or map is builtins.map else max(-(-len(items) // MOST_TASKS), 1)
@@ -270,13 +266,11 @@ def progress(text: str, total: float | None = None, *, quiet: bool = False, at_m
     """Show a bar while the block runs; call what it yields once per finished task.
 
     The bar stands on standard error and vanishes at the end. There is none if `quiet`, or if nobody looks (a pipe, a
-    log file, a worker process). Inside another one it only says what that one is at, so any function may use it
-    whoever calls it. The time left is what it took so far, per task.
-
-    `text` says what is being done. With a `total` of tasks the time left is shown, too, which may be less if the total
-    is `at_most`; without one, for how long. What is `short`, often over in a second, has no bar before in a notebook,
-    where a bar leaves an empty output. It yields ``advance(n=1, at_work="", done=None, total=None)``: `at_work` takes
-    the place of `text`; `done` is how many tasks are, parts of one included.
+    log file, a worker process). Inside another one it only says what that one is at, so any function may use it. With a
+    `total` of tasks it shows the time left, at the pace so far, which may be less if the total is `at_most`. What is
+    `short`, often over in a second, has no bar before in a notebook, where a bar leaves an empty output. It yields
+    ``advance(n=1, at_work="", done=None, total=None)``: `at_work` takes the place of `text`; `done` is how many tasks
+    are, parts of one included.
 
     Examples
     --------
