@@ -30,11 +30,9 @@ FASTEST = 0.2  # samples, L/R at least: of a current alone, from below the induc
 
 def first_guess(model: Model, runs: Sequence[Experiment], *, loaded: bool = False,
                 back_emf: float = BACK_EMF) -> dict[str, float]:
-    """Return values of the base parameters, SI, that suit `runs`; given and fixed ones keep their value.
-
-    `loaded`: the sizes of the model's torque effects as well. `back_emf` is the share of the voltage per speed that is
-    taken for back-EMF where no current distinguishes it from viscous friction.
-    """
+    """Return values of the base parameters, SI, that suit `runs`, given and fixed ones as they are; if `loaded` the
+    sizes of the model's torque effects as well. `back_emf` is the share of the voltage per speed that is taken for
+    back-EMF where no current distinguishes it from viscous friction."""
     held = {n: p.value for n, p in model.parameters.items() if p.given or not p.vary}
     signals = [_signals(_read_plainly(r, model), loaded) for r in runs]
     loads = _Loads(model, loads_of(model) if loaded else ())
@@ -154,14 +152,13 @@ WIDE = 0.02  # width of sgn over the highest speed: a measured speed is noise ar
 
 
 class Load(NamedTuple):
-    """One size to be found: parameter `name`, or with `phase` the part at that phase angle. `signed`: it may be
-    negative. `ratio`: a share of the motor's torque, not a torque."""
+    """One size to be found: a parameter, or with `phase` its part at that phase angle."""
 
     name: str
     phase: str = ""
     angle: float = 0.0
-    signed: bool = False
-    ratio: bool = False
+    signed: bool = False  # it may be negative
+    ratio: bool = False  # a share of the motor's torque, not a torque
 
 
 def loads_of(model: Model) -> tuple[Load, ...]:
@@ -172,13 +169,9 @@ def loads_of(model: Model) -> tuple[Load, ...]:
         if e.balance != "torque" or any(p.order and not p.given for p in pars):
             continue
         phases = [p.name for p in pars if p.periodic and p.vary and not p.given]
-        for p in pars:
-            if p.null == 0 and p.vary and not p.given:
-                ratio = p.unit == ""
-                if len(phases) == 1:
-                    found += [Load(p.name, phases[0], angle, True, ratio) for angle in (0.0, np.pi / 2)]
-                else:
-                    found.append(Load(p.name, signed=p.lower < 0, ratio=ratio))
+        for p in (p for p in pars if p.null == 0 and p.vary and not p.given):
+            parts = [(phases[0], 0.0), (phases[0], np.pi / 2)] if len(phases) == 1 else [("", 0.0)]
+            found += [Load(p.name, *part, len(phases) == 1 or p.lower < 0, p.unit == "") for part in parts]
     return tuple(found)
 
 
