@@ -1,9 +1,4 @@
-"""One least-squares run on a problem, and a race of several: every stage of a fit is one of these two calls.
-
-Sub-steps chosen far from the solution hide what rings between samples, so they are chosen again where the run
-goes, and the run is repeated while they do not suit its end. Three efforts serve all purposes. The solver
-itself, which knows no problem, is `motorid.numerics.least_squares`.
-"""
+"""One least-squares run on a problem, and a race of several: every stage of a fit is one of these two calls."""
 
 from collections.abc import Callable, Iterable
 from contextlib import suppress
@@ -64,8 +59,9 @@ def least_squares(problem: Problem, effort: LevenbergMarquardt, callback: Callba
                   q: Array | None = None, refine: bool = True, rounds: int = ROUNDS) -> Estimate:
     """Minimise the cost of `problem` from the values of its model, or from `q`.
 
-    `refine` chooses the sub-steps anew where the solution goes; the run is repeated at most `rounds` times where they
-    do not suit its end. Raises `FitError` if the model cannot be simulated at the start.
+    `refine` chooses the sub-steps anew where the solution goes, since those chosen far from it hide what rings between
+    samples; the run is repeated at most `rounds` times while they do not suit its end. Raises `FitError` if the model
+    cannot be simulated at the start.
     """
     q, history = problem.start if q is None else q, ()
     for _ in range(rounds):
@@ -96,11 +92,8 @@ def cost_at(problem: Problem, q: Array | None = None, *, refine: bool = True) ->
 
 def race(problems: Iterable[Problem], effort: LevenbergMarquardt, *,
          solve: Callable[[Problem, LevenbergMarquardt], Estimate] = least_squares) -> Estimate | None:
-    """Minimise the cost of each problem from the values of its model; return the lowest end, None if all failed.
-
-    The problems have the same records and weights; of equals the first wins. `effort` is `LOOK` for a few steps, `RACE`
-    for nearly the whole way, or `FINISH`; `solve` minimises, e.g. `by_continuation`.
-    """
+    """Minimise the cost of each problem, of the same records and weights, from the values of its model; return the
+    lowest end, of equals the first, None if all failed. `solve` minimises, e.g. `by_continuation`."""
     ends = []
     for problem in problems:
         with suppress(*FAILURES):
