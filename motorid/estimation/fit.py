@@ -201,11 +201,8 @@ def _fit(problem: Problem, effort: LevenbergMarquardt, callback: Callback = None
 
 
 def _with_orders(problem: Problem) -> Problem:
-    """Return the problem with the orders over the angle that the records show, started at them.
-
-    The model is fitted without the effects of unknown order; the strongest line of what is left over the angle
-    gives the order, size and phase of one of them, and so on with the next.
-    """
+    """Return the problem started at the orders over the angle that the records show: of what a fit without the effects
+    of unknown order leaves, the strongest line gives order, size and phase of one of them, and so on with the next."""
     model = present = problem.model
     waiting = effects_of_unknown_order(model)
     zeros = [e for e in model.effects if e.name == "encoder_zero" and "theta" not in problem.outputs]
@@ -241,11 +238,9 @@ def minimise(problem: Problem, effort: LevenbergMarquardt, callback: Callback = 
 
 
 def no_worse_than_smaller(found: Estimate, asked: Problem, effort: LevenbergMarquardt) -> Estimate:
-    """Return an estimate that, where it leaves more than noise, costs no more than without one of its effects.
-
-    A model contains the smaller one: where that, begun as `asked`, ends lower, this one is in a side valley, and
-    begins again from there. The other side of a lag beside the winding's is tried as well.
-    """
+    """Return an estimate that, where it leaves more than noise, costs no more than without one of its effects. A model
+    contains the smaller one: where that, begun as `asked`, ends lower, this one is in a side valley, and begins again
+    from there. The other side of a lag beside the winding's is tried as well."""
     begin, left = found.onward, max(misfit_over_noise(found.problem, found.q).values(), default=0.0)
     if left > NOISE and (poles := [s for e in begin.model.effects for s in exchanged_poles(begin.model, e)]):
         again = race(map(begin.start_at, poles), effort, solve=by_continuation)
@@ -385,10 +380,8 @@ def leaves_noise(fit: Fit) -> bool:
 
 
 def growth(fit: Fit) -> float:
-    """Return how many times a small error in the state grows at most along the records, each state in its RMS.
-
-    The model is followed in short windows, along what was measured, where it might be elsewhere without them.
-    """
+    """Return how many times a small error in the state, each in its RMS, grows at most along the records: in short
+    windows, along what was measured, where the model might be elsewhere without them."""
     runs, model = fit.problem.experiments, fit.model.with_(angle_input=False)
     longest = max(r.duration for r in runs)
     parts = [windows(r, longest / max(WINDOWS)) if fit.window is None and r.n > FEWEST * max(WINDOWS) else [r]
