@@ -109,11 +109,9 @@ def strongest_order(fit: Fit, effects: Sequence[Effect]) -> tuple[Effect, dict[s
 
 
 def spectrum(tangent: Tangent, effect: Effect) -> Spectrum:
-    """Return what each order explains of the misfit.
-
-    `effect` tells what is modulated: the torque itself (an amplitude in N·m), or the torque made by the current or
-    the speed as read (a relative amplitude), by a fixed parameter of it the back-EMF or the angle too.
-    """
+    """Return what each order explains of the misfit. `effect` tells what is modulated: the torque itself (an amplitude
+    in N·m), or the torque made by the current or the speed as read (a relative amplitude), by a fixed parameter of it
+    the back-EMF or the angle too."""
     if all(p.null != 0 or p.unit for p in effect.parameters):
         return _spectrum(tangent, "torque")
     both = next((p.name for p in effect.parameters if not p.vary and p.grid), None)
