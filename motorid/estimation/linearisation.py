@@ -1,7 +1,6 @@
 """How the fitted model answers to an unknown voltage and an unknown torque, sample by sample.
 
-Along the model's own trajectory, ``δx⁺ = A δx + B d`` and ``δy = C δx`` with d = (voltage, torque) held over each
-sample. Both the search for angle orders and the estimate of what is missing rest on these matrices.
+Along the model's own trajectory, ``δx⁺ = A δx + B d`` and ``δy = C δx`` with d = (voltage, torque) held over a sample.
 """
 
 from __future__ import annotations
