@@ -438,7 +438,8 @@ def test_a_child_that_may_not_be_taken_does_not_keep_a_worse_one_out(rng):
     r, h = rng.normal(size=(2, 1000))
 
     def node(added, fitted, held_out):
-        return SimpleNamespace(added=added, size=6, search=0.0, objection="", predictions=both(fitted, held_out))
+        return SimpleNamespace(added=added, key={added}, size=6, search=0.0, objection="",
+                               predictions=both(fitted, held_out))
 
     best, refused, sound = node("coulomb", r, h), node("gravity", 0.2 * r, 1.5 * h), node("cogging", 0.5 * r, 0.9 * h)
     chosen, _ = stepwise._better([refused, sound], best)
@@ -453,7 +454,8 @@ def test_what_physics_speaks_against_must_help_on_held_out_runs(rng, there, take
     def node(objection, fitted, share):
         predictions = both(fitted, h if there is None else share * h)
         predictions = predictions if there is not None else replace(predictions, held_out={})
-        return SimpleNamespace(added="stribeck", size=6, search=0.0, objection=objection, predictions=predictions)
+        return SimpleNamespace(added="stribeck", key={"stribeck"}, size=6, search=0.0, objection=objection,
+                               predictions=predictions)
 
     found = stepwise._better([node("omega_s runs to its limit", 0.5 * r, there)], node("", r, 1.0))
     assert (found is not None) == taken
@@ -475,7 +477,7 @@ def test_a_plain_fall_of_the_held_out_error_is_told_where_the_density_is_not_sur
     assert not compare(both(r, once, measured=10.0), both(r, 0.8 * once, measured=10.0)).plain
 
     def node(added, held_out, parent, objection=""):
-        return SimpleNamespace(added=added, size=6, search=0.0, objection=objection, parent=parent,
+        return SimpleNamespace(added=added, key={added}, size=6, search=0.0, objection=objection, parent=parent,
                                predictions=both(r, held_out, measured=10.0))
 
     root = node(None, moves, None)
