@@ -75,10 +75,13 @@ def check_runs(runs: Sequence[Experiment], held_out: Sequence[Experiment] = ()) 
 
 def contradictions(runs: Sequence[Experiment]) -> str:
     """Say how channels of these runs contradict one another; empty if they do not."""
-    plain = _plain(runs)[0]
+    plain, late = _plain(runs)
     # What one run of several says of signs an effect may have done: a current of the supply, a load that drives.
     some = {c for c in (signs, swapped_columns) if 2 * sum(c(run) is not None for run in plain) <= len(plain)}
     found = [*(_said(check, plain) for check in _CONTRADICTIONS if check not in some), _other_scale(plain)]
+    if late and max(late) > (1 + BEGUN) * min(late) + 3 * max(run.dt for run in runs):  # by more than is read off
+        found.append(f"what was measured follows a step of the voltage {span(late)} after it, which no one delay mends: "
+                     "log the voltage when it takes effect.")
     return worded(" ".join(text for text in found if text), runs[0].units["v"])
 
 
