@@ -80,8 +80,8 @@ def contradictions(runs: Sequence[Experiment]) -> str:
     some = {c for c in (signs, swapped_columns) if 2 * sum(c(run) is not None for run in plain) <= len(plain)}
     found = [*(_said(check, plain) for check in _CONTRADICTIONS if check not in some), _other_scale(plain)]
     if late and max(late) > (1 + BEGUN) * min(late) + 3 * max(run.dt for run in runs):  # by more than is read off
-        found.append(f"what was measured follows a step of the voltage after {span(late)} which no one delay mends: log "
-                     "the voltage when it takes effect.")
+        found.append(f"what was measured follows a step of the voltage after {span(late)} which no one delay mends: "
+                     "log the voltage when it takes effect.")
     return worded(" ".join(text for text in found if text), runs[0].units["v"])
 
 
