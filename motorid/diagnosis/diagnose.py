@@ -12,7 +12,6 @@ from motorid.diagnosis.adequacy import following
 from motorid.diagnosis.candidates import Stages, library
 from motorid.diagnosis.experiment_design import suggest_experiment
 from motorid.diagnosis.free_forms import WHERE
-from motorid.diagnosis.input_hypotheses import consistent
 from motorid.diagnosis.locate import acting_like, locate
 from motorid.diagnosis.misspecification import LIMITER
 from motorid.diagnosis.model_comparison import far
@@ -28,7 +27,7 @@ from motorid.estimation.result import Fit, checked
 from motorid.model.definition import Effect
 from motorid.model.model import SHOWN, Model
 from motorid.numerics import parallel
-from motorid.records.checks import current_limit
+from motorid.records.checks import as_command, contradictions, current_limit
 from motorid.records.experiment import Experiment, repeated
 
 
@@ -75,12 +74,22 @@ def diagnose(fit: Fit, validate: Sequence[Experiment] | Experiment | None = None
     tried = library(effects, also)
     with parallel.progress("Looking for what is missing", max_effects + 1, at_most=True) as show:
         stages = Stages(max_effects, progress, show, map)
-        held_out = [validate] if isinstance(validate, Experiment) else validate or ()
-        twice = repeated(checked(fit, "diagnose").problem.experiments, held_out)
-        misread, fit, held_out = consistent(fit, held_out)
-        found, driven = explored(fit, None if validate is None else held_out, tried, stages, max_effects, budget)
+        found, driven = explored(checked(fit, "diagnose"), validate, tried, stages, max_effects, budget)
         stages.done("located what is missing")
+        twice = repeated(fit.problem.experiments, [validate] if isinstance(validate, Experiment) else validate or ())
+        misread = _contradicting(found.path[-1].fit, found.remaining.adequate, fit.problem.experiments)
         return _told(found, misread, " ".join(w for w in (twice, driven) if w), validate is not None)
+
+
+def _contradicting(last: Fit, adequate: bool, runs: Sequence[Experiment]) -> str:
+    """Say how channels of the runs contradict one another. Where a model leaves noise they do not, whatever it seems: a
+    hoist's current has one sign, too."""
+    if adequate or not far(last):
+        return ""
+    bare = "supply_side_current" in last.model.effect_names  # that of a supply is never negative
+    plain = [r.without("i") if bare and len(r.outputs) > 1 and "i" in r.outputs else r for r in runs]
+    said = contradictions(plain if "i" in SHOWN[last.model.base] else [as_command(r) for r in plain])
+    return f"The records seem to contradict themselves; check first: {said} Taken as they are: " if said else ""
 
 
 def _told(found: Climb, misread: str, driven: str, validated: bool) -> Diagnosis:

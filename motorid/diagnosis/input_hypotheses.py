@@ -6,8 +6,6 @@ than the sample beside which it stands. Read wrongly, any of these leaves a misf
 seems to explain. A few spikes of a sensor hide everything else.
 """
 
-import contextlib
-import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
@@ -17,19 +15,16 @@ from motorid.channels import channel_name
 from motorid.diagnosis.cross_validation import ROUGH
 from motorid.diagnosis.predictive_score import Predictions, compare, predictions_left_out
 from motorid.diagnosis.refit import RACE
-from motorid.diagnosis.thresholds import MATERIAL, MOST
+from motorid.diagnosis.thresholds import MATERIAL
 from motorid.display.numbers import arrow, number
-from motorid.effects import LIBRARY
-from motorid.errors import MotoridError
 from motorid.estimation.continuation import by_continuation
 from motorid.estimation.fit import solve
 from motorid.estimation.least_squares import FAILURES
 from motorid.estimation.result import Fit
-from motorid.model.model import SHOWN
 from motorid.numerics.least_squares import LevenbergMarquardt
 from motorid.problem.problem import Problem
 from motorid.problem.simulate import at, judge, misfit_over_noise, moving
-from motorid.records.checks import as_command, contradictions, dead_times, span, unresolved
+from motorid.records.checks import dead_times, span, unresolved
 from motorid.records.experiment import Experiment
 
 CHANGING = 0.5  # of the samples at which the voltage must change for its reading to matter
@@ -68,28 +63,6 @@ class Reading:
         return f"{self.says}: with {self.option} the error {how} ({said}), and this diagnosis uses it."
 
 
-def consistent(fit: Fit, held_out: Sequence[Experiment]) -> tuple[str, Fit, Sequence[Experiment]]:
-    """Return how the records contradict themselves, "" if they do not, and a fit and held-out runs without a channel
-    that cannot be mended, where the motion is still known: an effect would only imitate what is wrong with it."""
-    runs = fit.problem.experiments
-    said = contradictions(runs if "i" in SHOWN[fit.model.base] else [as_command(r) for r in runs])
-    lead, gone = f"The records contradict themselves; mend that first. {said}", re.findall(r"--ignore (\w+)", said)[:1]
-    less = [[r.without(*{*gone} & {*r.outputs}) for r in of] for of in (runs, held_out)]
-    with contextlib.suppress(MotoridError, *FAILURES):
-        if gone == ["i"] and _supplied(fit):
-            return "", fit, held_out
-        if gone and all({"omega", "theta"} & {*r.outputs} for of in less for r in of):
-            out = solve(fit.problem.with_(experiments=tuple(less[0]), noise_factors={})), less[1]
-            return f"{lead} This diagnosis leaves the {channel_name(gone[0])} out (--ignore {gone[0]}). ", *out
-    return f"{lead} As they are: " if said else "", fit, held_out
-
-
-def _supplied(fit: Fit) -> bool:
-    """Tell whether a current that is never negative is that of the supply: an effect, and no contradiction."""
-    model = fit.model + LIBRARY["supply_side_current"]
-    return solve(fit.problem.with_(model=model, noise_factors={})).nrmse["i"] ** 2 < MOST * fit.nrmse["i"] ** 2
-
-
 def without_spikes(fit: Fit) -> Reading | None:
     """Return the reading that leaves out the spikes of a sensor; None without any, or if the loss forgives them."""
     if fit.problem.loss is not None:
@@ -113,7 +86,8 @@ def better_reading(fit: Fit, late: bool = False, earlier: bool = False) -> Readi
     """
     chosen, fall, runs = None, PLAIN, fit.problem.experiments
     calm = all(NOISE[0] < ratio < NOISE[1] for ratio in misfit_over_noise(fit.problem, fit.q).values())
-    if calm or any(map(unresolved, runs)):  # what acted between samples, no reading of them tells
+    lost = sum(run.n for run in runs if unresolved(run))
+    if calm or 2 * lost > sum(run.n for run in runs):  # what acted between samples, no reading of them tells
         return None
     readings = [r for r in _readings(runs) if not earlier and _fall(fit, r) > PROMISING]
     seen = {"i", "omega", "theta"} & set(fit.problem.outputs)

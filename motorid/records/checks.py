@@ -353,18 +353,22 @@ def unresolved(run: Experiment) -> str | None:
     power = np.sum(parts**2, axis=1)
     strong = np.flatnonzero(power > 0.1 * power.max())
     turns = np.sum(parts[strong, 1:] * parts[strong, :-1], axis=1) / power[strong]  # cosine of its phase per sample
-    what = next((f"the voltage changes faster than its samples can show from {run.t[strong[k] * PART]:.3g} s on"
+    what = next((f"the voltage seems to change faster than its samples can show from {run.t[strong[k] * PART]:.3g} s on"
                  for k in range(3, len(turns)) if turns[k] < -FAST and (np.diff(turns[k - 3:k + 1]) < 0).all()
                  and min(turns[:k].max(), turns[k:].max()) > FAST), "")
     if not what and len(turns) > 2 and abs(np.median(turns)) < WHITE and power.sum() > 0.5 * v @ v and _unanswered(run):
-        what = "the voltage changes faster than its samples can show, at random: the speed does not follow it"
-    return (f"{what}. If it did change more often than it was logged, the column does not tell what acted between: log "
-            "faster, or leave these samples out, in the file or with run.select().") if what else None
+        what = "the voltage seems to change faster than its samples can show, at random: no speed follows it"
+    return (f"{what}. The column does not tell what acted between its samples: log faster, or leave these samples out, "
+            "in the file or with run.select().") if what else None
 
 
 def _unanswered(run: Experiment) -> bool:
-    """Tell whether means of the voltage, where noise is small, say next to nothing of those of the speed."""
-    if (y := _speed(run)) is None or len(y) < PART**2 or abs(y.mean()) > 0.5 * y.std():  # it runs by itself
+    """Tell whether means of the voltage, where noise is small, say next to nothing of those of the speed.
+
+    A current would answer where friction or a heavy load lets no speed, and the slopes of an angle are mostly noise.
+    """
+    y = bridged(run.t, run.outputs["omega"]) if {"i", "omega"} & {*run.outputs} == {"omega"} else np.empty(0)
+    if len(y) < PART**2 or abs(y.mean()) > 0.5 * y.std():  # it runs by itself
         return False
     a, b = (x[:len(x) // 10 * 10].reshape(-1, 10).mean(axis=1) for x in (run.inputs["v"], y))
     causes = np.column_stack([b[1:-1], b[:-2], np.ones(len(b) - 2), a[2:], a[1:-1], a[:-2]])
@@ -449,7 +453,7 @@ def _never_reverses(runs: Sequence[Experiment]) -> str | None:
 
 def signs(run: Experiment) -> str | None:
     """Positive voltage must drive positive current and, on the whole, positive speed."""
-    if run.units["v"] != "V":
+    if run.units["v"] != "V" and _speed_is_that_of_the_angle(run):
         return _accelerates_backwards(run)
     if "omega" in run.outputs:  # a motor that brakes goes against its voltage, too: the balances know
         order, turned = _as_balances_want(run)
@@ -471,6 +475,14 @@ def signs(run: Experiment) -> str | None:
     goes = f"moves the {what} backwards" if channel == "theta" else f"goes with a negative {what}"
     return (f"a positive voltage {goes}: the sign of the {what}{else_} "
             f"is probably swapped. Turn it round, e.g. units={{'{channel}': '-1 {_told(run, channel)}'}}.")
+
+
+def _speed_is_that_of_the_angle(run: Experiment) -> bool:
+    """Tell whether a speed was measured, or slopes of the angle add up to it: of what is fast they turn the phase."""
+    if "omega" in run.outputs or (speed := _speed(run)) is None:
+        return True
+    moved, added = (np.diff(y[::3]) for y in (bridged(run.t, run.outputs["theta"]), integral(run.t, speed)))
+    return bool(np.std(moved - added) < 0.5 * np.std(moved))
 
 
 def _accelerates_backwards(run: Experiment) -> str | None:
