@@ -87,7 +87,7 @@ def better_reading(fit: Fit, late: bool = False, earlier: bool = False) -> Readi
     chosen, fall, runs = None, PLAIN, fit.problem.experiments
     calm = all(NOISE[0] < ratio < NOISE[1] for ratio in misfit_over_noise(fit.problem, fit.q).values())
     lost = sum(run.n for run in runs if unresolved(run))
-    if calm or 2 * lost > sum(run.n for run in runs):  # what acted between samples, no reading of them tells
+    if calm or 2 * lost >= sum(run.n for run in runs):  # what acted between samples, no reading of them tells
         return None
     readings = [r for r in _readings(runs) if not earlier and _fall(fit, r) > PROMISING]
     seen = {"i", "omega", "theta"} & set(fit.problem.outputs)

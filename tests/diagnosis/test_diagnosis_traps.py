@@ -446,6 +446,6 @@ def test_a_current_that_is_never_negative_may_be_the_supply_s():
         seen, noise = mi.simulate(motor, [still])[0].outputs, rng.normal(size=(2, len(v)))
         drawn = np.maximum(np.sign(v) * seen["i"], 0) * np.abs(v) / 12 + 0.02 * noise[0]
         runs.append(still.with_(outputs={"i": np.maximum(drawn, 0), "omega": seen["omega"] + 0.3 * noise[1]}))
-    found = diagnosed(runs)
+    found = diagnosed(runs, ("supply_side_current", "coulomb", "brush_drop", "current_gain"))
     assert found.effects == ("supply_side_current",)
     assert "contradict" not in found.text
