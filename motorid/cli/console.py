@@ -135,7 +135,7 @@ def prepare_process() -> None:
     sys.stdout, sys.stderr = (s or open(os.devnull, "w") for s in (sys.stdout, sys.stderr))  # noqa: SIM115 closed by `>&-`
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
-            stream.reconfigure(errors="motorid")  # type: ignore[union-attr]
+            stream.reconfigure(errors="motorid")  # type: ignore[union-attr]  # asked the line above
     os.environ["MPLBACKEND"] = "agg"  # figures go to files, whatever backend a shell names
     logging.getLogger("matplotlib").setLevel(logging.ERROR)  # where it keeps its fonts is no user's business
     warnings.simplefilter("ignore", RuntimeWarning)  # of arithmetic: what came of it is said

@@ -161,17 +161,14 @@ class Stepper:
     def shown_sizes(self, grid: Grid, traj: Trajectory, p: Array) -> Array:
         """Size (nx,) that the largest output lends the states it shows: a small part need not be exact."""
         middle, slopes = len(traj.x) // 2, np.empty((self.nx, self.ny))  # column-major, as CasADi has it
-        given, skip = (traj.x[middle], np.ascontiguousarray(grid.u[middle]), p), np.empty(self.ny * len(p) + self.ny)
-        call, trigger = self._out
+        p = np.ascontiguousarray(p, float)
+        given, skip = (traj.x[middle], np.ascontiguousarray(grid.u[middle]), p), np.empty(self.ny * (len(p) + 1))
+        call, trigger = self.functions.out.buffer()  # a new one, as another thread may ask, too
         _called(call, trigger, given, (skip, slopes, skip[self.ny:]))
         slopes = np.abs(slopes.T)
         tops = np.abs(np.ascontiguousarray(traj.y.T)).max(axis=1)  # long rows are quicker
         with np.errstate(over="ignore"):  # a model that runs away
             return np.where(slopes > 1e-6, tops[:, None] / np.maximum(slopes, 1e-6), 0.0).max(axis=0)
-
-    @cached_property
-    def _out(self) -> Any:
-        return self.functions.out.buffer()
 
     def _load(self, compiled: bool | None) -> Any:
         """Return the compiled driver if it is there, or worth making now; else None."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import casadi as ca
@@ -465,3 +466,30 @@ print(fit.chi2.hex())
     assert len(told["none"].stderr.splitlines()) == 1
     values = [[float.fromhex(x) for x in told[cc].stdout.split()] for cc in told]
     assert values[0] == pytest.approx(values[1], rel=1e-7)
+
+
+def test_threads_that_share_a_model_do_not_share_its_numbers():
+    """A map may be one of threads; what one looks at must not be where another one's numbers go."""
+    t = np.arange(400) * 1e-3
+    v = 6 * np.sign(np.sin(30 * t))
+    run = mi.Experiment(t, {"v": v}, {"i": v, "omega": v})
+    problem = mi.Problem(mi.dc_motor(**VALUES) + mi.effects.speed_gain, run)
+    at, grid, walks = problem.unknowns.point(problem.start), problem.runs[0].grid, stepper(problem.system)
+    place, cases = problem.system.parameters.index("k_w"), []
+    for gain in (0.0, 1.0, 2.0, 3.0):
+        p = at.p.copy()
+        p[place] = gain
+        traj = walks.run(grid, problem.unknowns.first_state(at, 0), p, None, None, False, False)
+        cases.append((traj, p, walks.shown_sizes(grid, traj, p)))
+
+    def same(case) -> bool:
+        traj, p, alone = case
+        return all(np.array_equal(walks.shown_sizes(grid, traj, p), alone) for _ in range(1500))
+
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    try:
+        with ThreadPoolExecutor(4) as pool:
+            assert all(pool.map(same, cases))
+    finally:
+        sys.setswitchinterval(interval)
