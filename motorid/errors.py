@@ -99,8 +99,6 @@ _KINDS: dict[str, Any] = {**dict.fromkeys(("Path", "PathLike", "Path_"), (str, o
                           **dict.fromkeys(("Callable", "Map", "Callback"), Callable), "Records": object, "Link": _Wire,
                           **dict.fromkeys(("Sequence", "Iterable", "tuple", "Array", "ArrayLike"), Iterable)}
 _choices = functools.cache(functools.partial(re.split, r" \| (?![^\[]*\])"))  # what an annotation allows
-
-
 # Within a public call: what it calls in turn need not be looked at before it fails.
 _within: ContextVar[bool] = ContextVar("motorid_within_a_call", default=False)
 

@@ -1,9 +1,8 @@
 """How the records are read: what was measured is right, but the voltage or single samples may not be what they seem.
 
-A logger writes the voltage of an instant: of a digital controller it is held until the next sample, of an amplifier
-it goes on. A commanded voltage is exact, a measured one carries noise that the motor never saw. Either may act later
-than the sample beside which it stands. Read wrongly, any of these leaves a misfit that a lag or a loss of voltage
-seems to explain. A few spikes of a sensor hide everything else.
+A logger writes the voltage of an instant: a digital controller holds it until the next sample, that of an amplifier
+goes on. A commanded one is exact, a measured one carries noise that the motor never saw, either may act later. Read
+wrongly it leaves a misfit that a lag or a loss of voltage seems to explain. A few spikes hide everything else.
 """
 
 from collections.abc import Callable, Iterator, Sequence

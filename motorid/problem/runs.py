@@ -210,9 +210,8 @@ def _starts_from_rest(theta: Array, t: Array, sigma: float, speed: float) -> boo
 def _creeps(theta: Array, t: Array, sigma: float) -> bool:
     """Tell whether an angle has a first speed that its noise does not explain, however slow.
 
-    A cubic over half of the longest window in which one describes the angle: there what it leaves out of a motion
-    that begins at rest is far below the noise of its slope. It describes a window twice as long if what is left
-    grows no more than chance allows (the noise of slow counts is easily overrated).
+    A cubic over half of the longest window in which one describes the angle: there what it leaves out of a motion that
+    begins at rest is far below its slope's noise. It does in a window twice as long if no more is left than by chance.
     """
     good = np.flatnonzero(np.isfinite(theta))[:LONGEST]
     y, x, n = theta[good], t[good] - t[0], 8

@@ -69,7 +69,11 @@ def check_runs(runs: Sequence[Experiment], held_out: Sequence[Experiment] = ()) 
     plain, late = _plain(runs)
     remarks = [text for check in _CHECKS if (text := _said(check, runs if check in (_missing, _spikes) else plain))]
     scales = _other_scale([*plain, *(run.without_spikes() for run in held_out)])
-    more = _late(late), _the_same_twice(runs), scales, _never_reverses(runs)
+    if late:
+        remarks.append(f"what was measured follows a step of the voltage only after {span(late)} and then in less time "
+                       f"than that: does it act later than it was logged? If so: --delay {min(late):.3g}, "
+                       f"run.delayed({min(late):.3g}).")
+    more = _the_same_twice(runs), scales, _never_reverses(runs)
     return [worded(text, runs[0].units["v"]) for text in (*remarks, *more) if text]
 
 
@@ -140,12 +144,6 @@ def span(dead: Sequence[float]) -> str:
     """Say how long dead times are, and whether they differ."""
     least, most = (number(1e3 * s, 3) for s in (min(dead), max(dead)))
     return f"{least} ms" if max(dead) < (1 + BEGUN) * min(dead) else f"{least} to {most} ms, another time at each step,"
-
-
-def _late(dead: Sequence[float]) -> str | None:
-    return (f"what was measured follows a step of the voltage only after {span(dead)} and then in less time than that: "
-            f"does it act later than it was logged? If so: --delay {min(dead):.3g}, run.delayed({min(dead):.3g})."
-            ) if dead else None
 
 
 def reading_notes(runs: Sequence[Experiment]) -> list[str]:

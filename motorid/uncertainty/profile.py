@@ -1,9 +1,8 @@
 """Profile likelihood: how much worse does the best fit become when one parameter is fixed elsewhere?
 
-The only interval that can say "no upper end": where the cost stays low however far the parameter moves, the
-data do not limit it on that side (Raue et al., Bioinformatics 25, 2009). Coloured residuals are allowed for
-by dividing the rise of the cost by the factor by which they enlarge the parameter's variance (Kent,
-Biometrika 69, 1982). At the end, `intervals` puts it beside covariance and bootstrap.
+The only interval that can say "no upper end": where the cost stays low however far the parameter moves, the data do not
+limit it on that side (Raue et al., Bioinformatics 25, 2009). The rise of the cost is divided by the factor by which
+coloured residuals enlarge the parameter's variance (Kent, Biometrika 69, 1982). `intervals`: beside other methods.
 """
 
 from __future__ import annotations

@@ -1,9 +1,8 @@
 """A problem cut at shooting nodes: states there are unknowns beside q, each interval is simulated by itself.
 
-Bock & Plitt, "A multiple shooting algorithm for direct solution of optimal control problems", IFAC World
-Congress, 1984. The engine is the one of the least-squares fit, with the same sub-steps, so both formulations
-speak of the same discrete model. Unknowns are z = (q, nodes/scale); the first state of a run is a function of q.
-Nodes begin at measured channels or on a simulation; their gaps are process noise.
+Bock & Plitt, "A multiple shooting algorithm for direct solution of optimal control problems", IFAC World Congress,
+1984. Engine and sub-steps are those of least squares: both formulations speak of the same discrete model. Unknowns are
+z = (q, nodes/scale); the first state of a run is a function of q. Nodes begin at measured channels or on a simulation.
 """
 
 from collections.abc import Sequence
