@@ -19,6 +19,7 @@ from motorid.estimation.fit import solve
 from motorid.estimation.least_squares import FAILURES
 from motorid.estimation.result import Fit
 from motorid.estimation.start_values import with_suited_effects
+from motorid.numerics.least_squares import LevenbergMarquardt
 from motorid.numerics.signals import Array
 from motorid.problem.runs import angle_signal
 from motorid.records.experiment import Experiment, part_meta
@@ -61,11 +62,11 @@ def thinned_alike(fit: Fit, runs: Sequence[Experiment]) -> list[Experiment]:
     return [r.decimate(k) for r in runs] if (k := fit.problem.experiments[0].meta.get("every", 1)) > 1 else list(runs)
 
 
-def fitted_to(fit: Fit, runs: Sequence[Experiment] | None) -> Fit:
+def fitted_to(fit: Fit, runs: Sequence[Experiment] | None, effort: LevenbergMarquardt | None = None) -> Fit:
     """Return the fit of the same model to other runs, from where it is; `fit` itself for none, or where that fails."""
     try:
         return fit if runs is None else solve(
-            fit.problem.with_(experiments=runs, model=fit.model, noise_factors={}), start="model")
+            fit.problem.with_(experiments=runs, model=fit.model, noise_factors={}), effort, start="model")
     except (MotoridError, *FAILURES):
         return fit
 

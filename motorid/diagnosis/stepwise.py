@@ -266,9 +266,8 @@ def _as_it_ended(tried: Candidate, last: frozenset[str], met: frozenset[str], al
 def _better(children: Collection[Node], best: Node) -> tuple[Node, list[Node]] | None:
     """Return the best child, if it beats the best model so far, and all in order.
 
-    What physics speaks against is taken only where nothing else helps, and where the held-out runs bear it out. Where
-    the score is sure of nothing, a plain fall of the held-out error begins a ladder: of a motor that mostly rests the
-    density prefers a model that never moves.
+    What physics speaks against is taken only where nothing else helps and held-out runs bear it out. Where the score is
+    sure of nothing, a plain fall of their error begins a ladder: at rest the density prefers what never moves.
     """
     better = [c for c in children if beats(c, best)]
     plain = [] if better else [c for c in children if evidence(best, c).plain]
@@ -403,7 +402,7 @@ def _remembers(found: Climb, whole: Fit, held_out: Sequence[Experiment] | None) 
     best = max(refused, key=lambda c: c.gain or 0.0, default=None)
     for fit in (*(node.fit for node in found.path[1:]), best and best.fit):
         with contextlib.suppress(*FAILURES):
-            if fit and fit.memories and at_noise(node_of(fitted_to(fit, runs), HeldOut.of(whole, held_out))):
+            if fit and fit.memories and at_noise(node_of(fitted_to(fit, runs, QUICK), HeldOut.of(whole, held_out))):
                 return True
     return False
 
