@@ -69,6 +69,9 @@ class Trajectory(NamedTuple):
     error: Array | None
 
 
+Tolerance = float | Callable[[Trajectory], tuple[float, float, Array]]
+
+
 class Engine(Protocol):
     """Integrates a system over a grid, with exact forward sensitivities."""
 
@@ -78,19 +81,15 @@ class Engine(Protocol):
             dp: Array | None = None) -> Trajectory:
         """Return the trajectory from `x0` (nx,) with parameters `p` (np,).
 
-        `dx0` (nx, nq) and `dp` (np, nq) are the derivatives of both with respect to the unknowns q.
-
-        Raises
-        ------
-        SimulationError
-            If the integration does not reach the end; it names the time.
+        `dx0` (nx, nq) and `dp` (np, nq) are the derivatives of both with respect to the unknowns q. SimulationError,
+        which names the time, if the integration does not reach the end.
         """
         ...
 
-    def prepare(self, system: System, grid: Grid, x0: Array, p: Array,
-                tolerance: float | Callable[[Trajectory], float]) -> Grid:
+    def prepare(self, system: System, grid: Grid, x0: Array, p: Array, tolerance: Tolerance) -> Grid:
         """Return the grid with its sub-steps chosen for an error of `tolerance` per interval, relative to the states.
 
-        The tolerance may depend on the trajectory reached so far. An engine that chooses its own steps takes any grid.
+        It may depend on the trajectory reached so far: then it is a smaller and a larger one, and the error (ny,) of
+        each output that decides between these for each state. An engine that chooses its own steps takes any grid.
         """
         return grid

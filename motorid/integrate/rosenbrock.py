@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from motorid.errors import SimulationError, at_least
 from motorid.integrate import compiled as cc
-from motorid.integrate.engine import Grid, Trajectory, address
+from motorid.integrate.engine import Grid, Tolerance, Trajectory, address
 from motorid.integrate.rodas3 import ORDER, StepFunctions
 from motorid.model.equations import System
 from motorid.numerics.signals import Array
@@ -24,6 +24,7 @@ PATIENCE = 1.5e7  # instructions of the virtual machine (0.05 s) before a step i
 CHUNK = 256  # steps in one call of the virtual machine
 MOST_SUBSTEPS = 256
 MOST_PASSES = 6
+PLACES = 8  # of a record, from which a small change is followed
 LOST_ERROR = 0.3  # error estimate, relative to the state so far, at which a step is lost
 LOST_GROWTH = 1e3  # growth of a state that shows it
 
@@ -56,8 +57,7 @@ class Rosenbrock:
         """See `Engine.run`; on request with the error estimate of each state."""
         return stepper(system).run(grid, x0, p, dx0, dp, local_error, self.compiled)
 
-    def prepare(self, system: System, grid: Grid, x0: Array, p: Array,
-                tolerance: float | Callable[[Trajectory], float]) -> Grid:
+    def prepare(self, system: System, grid: Grid, x0: Array, p: Array, tolerance: Tolerance) -> Grid:
         """See `Engine.prepare`. Errors are relative to the largest size of each state on the record.
 
         Where the error estimate of a step is too large, what half the steps change at the end of its interval decides
@@ -66,13 +66,13 @@ class Rosenbrock:
         coarse steps would jump over what happens. A step that goes astray spoils all after it, which is then neither
         refined for nor a measure of size. It has not where half the steps end alike, or no more are to be had.
         """
-        passes, right = float(MOST_PASSES), 0
+        passes, right, shown = float(MOST_PASSES), 0, None
         while passes > 0:
             try:
                 traj = self.run(system, grid, x0, p, local_error=True)
             except SimulationError:
                 break
-            level = tolerance(traj) if callable(tolerance) else tolerance
+            level, loose, asked = tolerance(traj) if callable(tolerance) else (tolerance, tolerance, None)
             assert traj.error is not None
             size, error = np.abs(np.ascontiguousarray(traj.x.T)), np.ascontiguousarray(traj.error.T)
             np.maximum.accumulate(size, axis=1, out=size)  # so far; NumPy reduces long rows faster
@@ -83,7 +83,13 @@ class Rosenbrock:
             relative = (error / sizes).max(axis=0)
             rows = np.flatnonzero(relative > level)
             if len(rows):
-                relative[rows] = (stepper(system).halved(grid, rows, traj.x, p, self.compiled) / sizes).max(axis=0)
+                error[:, rows] = stepper(system).halved(grid, rows, traj.x, p, self.compiled)
+                relative[rows] = (error[:, rows] / sizes).max(axis=0)
+            if asked is not None and min(loose, np.max(relative, initial=0.0)) > 2 * level:
+                shown = stepper(system).shown_ever(grid, traj, p, self.compiled) if shown is None else shown
+                few = np.isfinite(asked)
+                own = np.min(asked[few, None] / np.maximum(shown[few], 1e-300), axis=0)[:, None]
+                relative = (error / np.clip(own / level, sizes, loose / level * sizes)).max(axis=0)
             passes -= 1 if astray is None else 1 / 16
             finer = grid.substeps
             if np.max(relative, initial=0.0) > 2 * level:  # not where it is no number
@@ -169,6 +175,20 @@ class Stepper:
         tops = np.abs(np.ascontiguousarray(traj.y.T)).max(axis=1)  # long rows are quicker
         with np.errstate(over="ignore"):  # a model that runs away
             return np.where(slopes > 1e-6, tops[:, None] / np.maximum(slopes, 1e-6), 0.0).max(axis=0)
+
+    def shown_ever(self, grid: Grid, traj: Trajectory, p: Array, compiled: bool | None) -> Array:
+        """Largest change (ny, nx) of each output, at any time, per change of a state, as the linearised model goes on
+        from a few places of a trajectory; infinite of an output of states that do more than sum up others."""
+        n, one, none = len(traj.x), np.eye(self.nx), np.zeros((len(p), self.nx))
+        near = [self.run(grid.part(k, k + 1), traj.x[k], p, one, none, False, compiled)
+                for k in np.unique(np.linspace(0, n - 2, PLACES).astype(int))]
+        shown, step = np.array([r.dy[0] for r in near if r.dy is not None]), np.array([r.dx for r in near])[:, 1]
+        more = np.diff(self.system.rhs.jac_sparsity(0, 0).colind()) > 0  # than that: a detent holds the motor
+        largest = np.where((shown[:, :, more] != 0).any(axis=(0, 2))[:, None], np.inf, np.abs(shown).max(axis=0))
+        with np.errstate(all="ignore"):
+            for _ in range(int(np.log2(n)) + 1):
+                largest, step = np.maximum(largest, np.abs(shown @ step).max(axis=0)), step @ step
+        return np.nan_to_num(largest, nan=np.inf, posinf=np.inf)
 
     def _load(self, compiled: bool | None) -> Any:
         """Return the compiled driver if it is there, or worth making now; else None."""
@@ -306,18 +326,13 @@ def _in_chunks(f: Any, n: int, moving: Sequence[Array], steady: Sequence[Array],
         _called(call, trigger, (*(a[rows] for a in moving), *steady), [a[rows] for a in results])
 
 
-def _called(call: Any, trigger: Callable[[], object], given: Iterable[Array], results: Iterable[Array]) -> None:
+def _called(call: Any, trigger: Callable[[], object], given: Iterable[Any], results: Iterable[Any]) -> None:
     """Evaluate CasADi's `call` on contiguous arrays in place: a tenth of the time that a call with NumPy's takes."""
     for k, a in enumerate(given):
-        call.set_arg(k, _view(a))
+        call.set_arg(k, memoryview(a.reshape(-1)))
     for k, a in enumerate(results):
-        call.set_res(k, _view(a))
+        call.set_res(k, memoryview(a.reshape(-1)))
     trigger()
-
-
-def _view(a: Any) -> memoryview:
-    """Return the memory of the contiguous array `a`, for CasADi."""
-    return memoryview(a.reshape(-1))
 
 
 def _repeated(a: Array) -> Array:

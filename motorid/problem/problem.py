@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from motorid.channels import CHANNELS
 from motorid.errors import ModelError, SimulationError, UsageError, among, name_of
 from motorid.integrate import engine_of, limited
-from motorid.integrate.engine import Engine, Trajectory
+from motorid.integrate.engine import Engine, Tolerance, Trajectory
 from motorid.model.definition import Parameter
 from motorid.model.equations import System
 from motorid.model.model import SHOWN, Model
@@ -255,9 +255,9 @@ class Problem:
         other.__dict__.update({n: self.__dict__[n] for n in made if n in self.__dict__})
         return other
 
-    def _tolerance(self, k: int, slack: float = 1.0) -> float | Callable[[Trajectory], float]:
+    def _tolerance(self, k: int, slack: float = 1.0) -> Tolerance:
         """Local error relative to the largest state."""
-        return self.accuracy if self.accuracy is not None else self.measured[k].tolerance(slack)
+        return self.accuracy if self.accuracy is not None else partial(self.measured[k].tolerance, slack=slack)
 
     @cached_property
     def measured(self) -> tuple[Measured, ...]:
@@ -378,6 +378,7 @@ class Measured(NamedTuple):
     weights: Array  # (ny,), 0 for channels not measured
     index: NDArray[np.int64] | None  # of the finite samples in the flattened y, None for all
     noise: Array  # (ny,), infinite for channels not measured
+    angle: NDArray[np.bool_]  # (ny,), which one sums up the motion
     name: str
 
     @staticmethod
@@ -393,7 +394,7 @@ class Measured(NamedTuple):
             size = np.maximum(np.sqrt(squares), noise)  # of a stuck motor's speed
         finite = np.isfinite(y)
         index = None if finite.all() else np.flatnonzero(finite.ravel())
-        return Measured(y, 1.0 / size, index, noise, run.experiment.name)
+        return Measured(y, 1.0 / size, index, noise, np.array([c == "theta" for c in outputs]), run.experiment.name)
 
     @property
     def size(self) -> int:
@@ -420,22 +421,18 @@ class Measured(NamedTuple):
         full[slice(None) if self.index is None else self.index] = rows
         return full.reshape(*self.y.shape, *rows.shape[1:])
 
-    def tolerance(self, slack: float = 1.0) -> float | Callable[[Trajectory], float]:
-        """Return the error of an interval allowed, relative to the largest state; see `Engine.prepare`."""
+    def tolerance(self, traj: Trajectory, slack: float) -> tuple[float, float, Array]:
+        """Return the error of an interval allowed, relative to the largest state; see `Engine.prepare`. An angle, where
+        errors of all intervals add up, asks of other states what it shows of them."""
         finite = np.isfinite(self.y)
         count = np.maximum(finite.sum(axis=0), 1)
         top = np.maximum(np.abs(np.where(finite, self.y, 0.0)).max(axis=0), 1e-300)
-        noise = self.noise / top
-        if NOISE_SHARE * noise.min() >= LOOSEST:
-            return slack * LOOSEST
-
-        def beside_misfit(traj: Trajectory) -> float:
-            e = np.where(finite, traj.y - self.y, 0.0)
-            rms = np.sqrt(np.einsum("ij,ij->j", e, e) / count) / top
-            share = float(np.maximum(noise, MISFIT_SHARE * rms).min())
-            return slack * min(max(NOISE_SHARE * share, TIGHTEST), LOOSEST)
-
-        return beside_misfit
+        e = np.where(finite, traj.y - self.y, 0.0)
+        rms = np.sqrt(np.einsum("ij,ij->j", e, e) / count)
+        asked = slack * NOISE_SHARE * np.maximum(self.noise, MISFIT_SHARE * rms)
+        least, beside = (np.clip((asked / top)[some].min(initial=slack * LOOSEST), slack * TIGHTEST, slack * LOOSEST)
+                         for some in (slice(None), ~self.angle))
+        return least, beside, np.where(self.angle, asked / np.sqrt(count), np.inf)
 
 
 def prior_residual(priors: Mapping[str, tuple[float, float]], unknowns: Unknowns, at: Point) -> tuple[Array, Array]:

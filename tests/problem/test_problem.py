@@ -330,6 +330,21 @@ def test_a_misfit_far_above_the_noise_spares_steps(rng):
     assert further[1] < 0.2 * further[0]
 
 
+def test_an_angle_of_many_turns_asks_of_other_states_what_it_shows_of_them(rng):
+    """An encoder knows a millionth of its travel, and nothing like it of a current; where a torque follows the angle,
+    a small error may grow."""
+    from motorid.problem.simulate import integration_error
+
+    t, noise = np.arange(1500) * 1e-3, {**NOISE, "theta": 1e-3}
+    run = noisy(simulated(t, drive(t, 6.0), channels=("i", "omega", "theta")), rng, noise).with_(sigma=noise)
+    problem = as_problem(TRUE, run)
+    spring = TRUE + mi.effects.spring(k_s=0.0)
+    further = [(p.refined(p.start).runs[0].grid.substeps - 1).sum() for p in (
+        problem, problem.for_model(spring), problem.with_(experiments=(run.without("theta"),)))]
+    assert further[2] < 1.1 * further[0] < 0.5 * further[1]
+    assert integration_error(problem.refined(problem.start), problem.start) < 0.1
+
+
 def test_a_plan_is_as_exact_as_the_noise_that_it_states():
     motor = mi.torque_driven(g=0.05, b=2e-4, J=5e-5)
     model = motor + mi.effects.coulomb(tau_c=4e-3) + mi.effects.gravity(mgl=5e-3, phi_g=0.3)
