@@ -28,7 +28,6 @@ from motorid.records.experiment import Experiment
 
 SETTLED = 1e-6  # relative change of the scale at which its iteration stops
 ROUNDS = 50
-IDLE = 1e4  # times its noise, of a channel that decides nothing
 CELLS = 10  # per block, between whose means changes are told
 
 
@@ -247,11 +246,12 @@ def finer(fit: Fit, channel: str) -> bool:
     for s, run in zip(fit.simulations, fit.problem.runs, strict=True):
         if channel in s.experiment.outputs:
             dt, r = np.diff(s.experiment.t), s.residual(channel)
-            white = min(run.sigma[channel] ** 2, float(np.nanmean(np.diff(r, 2) ** 2)) / 6)
+            white = min((thresholds.LARGER * run.sigma[channel]) ** 2, float(np.nanmean(np.diff(r, 2) ** 2)) / 6)
             rates = (np.diff(y) / dt for y in (r, s.experiment.outputs[channel]))
             squares.append(np.array([*(rate**2 for rate in rates), 2 * white / dt**2]))
-    error, speed, noise = np.nanmean(np.concatenate(squares, axis=1), axis=1)
-    return bool(error - noise < thresholds.FINER_RATE**2 * speed)
+    error, speed, noise = np.nanmean(every := np.concatenate(squares, axis=1), axis=1)
+    sure = 1 + thresholds.STANDARD_ERRORS * np.sqrt(3 / every.shape[1])  # of a mean square of differences of noise
+    return bool(error - sure * noise < thresholds.FINER_RATE**2 * speed)
 
 
 def undecided(fit: Fit) -> set[str]:
@@ -262,10 +262,11 @@ def undecided(fit: Fit) -> set[str]:
 
 @lru_cache(maxsize=4)
 def deciding(fit: Fit) -> Fit:
-    """Return the fit as effects are to be scored on it: a channel that decides nothing counts for next to nothing."""
+    """Return the fit as effects are to be scored on it: a channel that decides nothing counts by what can be asked."""
     if not (idle := undecided(fit)) or len(idle) == len(fit.problem.outputs):
         return fit
-    problem = fit.problem.tuned(noise_factors={**fit.problem.noise_factors, **dict.fromkeys(idle, IDLE)})
+    asked = {c: thresholds.FINER * fit.misfit[c] / max(fit.nrmse[c], 1e-300) for c in idle}
+    problem = fit.problem.tuned(noise_factors={**fit.problem.noise_factors, **asked})
     return replace(fit, problem=problem, **dict(zip(("residuals", "jacobian"), problem.residual_and_jacobian(fit.q),
                                                     strict=True)))
 
