@@ -64,13 +64,14 @@ def unexplained_text(ranking: Sequence[Candidate], rungs: Sequence[Rung], grades
         shares = {name: share_removed(*(r.validation_nrmse or r.nrmse for r in (a, b)))
                   for a, b in itertools.pairwise(rungs) for name in (b.added or "").split(" + ")}
         most = max(grades, key=lambda g: (shares.get(g.effect, 0.0), g.effect))
-        share, told, law = shares.get(most.effect, 0.0), most.why.startswith("it removes"), ""
+        share, told, near = shares.get(most.effect, 0.0), most.why.startswith("it removes"), ""
         if share > (0.0 if any(g.form for g in grades) else MOST):
-            removes = f": {most.why}" if told else f", which removes {percent(share, 2)} of the squared error"
-            law = f" Nearest: {_described(rungs[-1].fit, most.effect)}{removes}."
-        others = [g for g in grades if not (law and told and g is most)]
-        helps = approximations_text(others).replace(curve, "a free curve predicts better")
-        return " ".join(t for t in (lead + law, helps, errors_text(rungs), _left(rungs[-1].fit, remaining)) if t)
+            near = f"{_described(rungs[-1].fit, most.effect)}, which removes {percent(share, 2)} of the squared error"
+        lead = (f"Unexplained, but close to {near}; better still is {like}, which {none} describes."
+                if near and like and done and share > MOST else f"{lead} Nearest: {near}." if near else lead)
+        helps = approximations_text([g for g in grades if not (near and told and g is most)])
+        helps = helps.replace(curve, "a free curve predicts better")
+        return " ".join(t for t in (lead, helps, errors_text(rungs), _left(rungs[-1].fit, remaining)) if t)
     best = max((c for c in ranking if c.refit_drop is not None), key=lambda c: c.refit_drop or 0.0, default=None)
     if best is None or (best.refit_drop or 0) <= 0.05:
         return lead

@@ -100,8 +100,10 @@ def test_nearest_is_what_removes_most_of_the_squared_error_by_the_measure_of_the
               Grade("quadratic_drag", "approximates", "a free curve predicts better", form)]
     remaining = SimpleNamespace(adequate=False, hum="", text="Something is missing.")
     answer = unexplained_text((), rungs, grades, form.text, remaining)
-    said = answer.split(" Nearest: ")[1].split(". ")[0]
+    assert answer.startswith("Unexplained, but close to ")  # what does most first
+    said, better = answer.split("; better still is ")
     assert f"[{nearest}]" in said
+    assert better.startswith(f"{form.text}, which no effect of the library describes.")
     assert answer.count(f"removes {share} of the squared error") == 1  # not once more beside what only approximates
     bare = [Grade(g.effect, g.grade, g.why) for g in grades]
     assert f"[{nearest}]" in unexplained_text((), rungs, bare, "", remaining)  # most of it needs no curve

@@ -135,7 +135,7 @@ def test_it_takes_the_place_of_what_only_approximates_it(beyond, lab):
     *runs, check = [record(c, "logger", ("i", "omega"), lab, rng, w) for c, w in zip(clean, FAST, strict=True)]
     found = mi.diagnose(mi.fit(mi.dc_motor(), runs), check, effects=("quadratic_drag", "coulomb"))
     assert [(r.added, r.grade) for r in found.ladder.rungs[1:]] == [("quadratic_drag", "approximates")]
-    assert re.search(r"Nearest: .*\[quadratic_drag\], c_2 = ", found.text)
+    assert re.search(r"close to .*\[quadratic_drag\], c_2 = ", found.text)
     assert found.remainder.model.effect_names == ()
     assert found.remainder.model.values["b"] == pytest.approx(found.remainder.fitted.values["b"])  # beside the curve
     fit = mi.fit(found.remainder.model + found.remainder.as_effect(), runs)
