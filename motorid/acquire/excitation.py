@@ -3,15 +3,17 @@
 A program is a list of segments that the device itself runs, sample by sample, so that its timing does not
 hang on the computer. Words are joined by commas, numbers by colons, in V, s and Hz::
 
-    rest:T                        nothing for T step:V:T                      V for T stairs:V1:V2:N:T              N
-    levels from V1 to V2, T each ramp:V1:V2:T                  a straight line from V1 to V2 chirp:A:F1:F2:T[:V0]
-    V0 ± A, frequency from F1 to F2 prbs:A:BIT:T[:V0[:SEED]]      V0 ± A, by a 15-bit shift register clocked every BIT
-    seconds coast:T                       coast-down: 0 V, the terminals joined, so that the input stays known standard
-    steps, stairs, a ramp and a PRBS within 0.6 of the voltage limit, 8.2 s
+    rest:T                        nothing for T
+    step:V:T                      V for T
+    stairs:V1:V2:N:T              N levels from V1 to V2, T each
+    ramp:V1:V2:T                  a straight line from V1 to V2
+    chirp:A:F1:F2:T[:V0]          V0 ± A, frequency from F1 to F2
+    prbs:A:BIT:T[:V0[:SEED]]      V0 ± A, by a 15-bit shift register clocked every BIT seconds
+    coast:T                       coast-down: 0 V, the terminals joined, so that the input stays known
+    standard                      steps, stairs, a ramp and a PRBS within 0.6 of the voltage limit, 8.2 s
 
-On the line a segment is ``R,<ms>,<mV from>,<mV to>``, or
-``C,<ms>,<mV offset>,<mV amplitude>,<mHz from>,<mHz to>``, or ``P,<ms>,<mV offset>,<mV amplitude>,<µs per
-bit>,<seed>``. All numbers are whole, so device and computer mean the same program.
+On the line a segment is ``R,<ms>,<mV from>,<mV to>``, ``C,<ms>,<mV offset>,<mV amplitude>,<mHz from>,<mHz to>`` or
+``P,<ms>,<mV offset>,<mV amplitude>,<µs per bit>,<seed>``, all whole, so device and computer mean the same program.
 """
 
 from __future__ import annotations

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import re
 import subprocess
 import sys
 from binascii import crc_hqx
@@ -13,6 +14,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from motorid.acquire import excitation
 from motorid.acquire.excitation import Program, Segment, lfsr_bits, program
 from motorid.acquire.protocol import Channel, Decoder, Header, Message, Sample, crc16, frame
 from motorid.acquire.record_file import RecordFile, check_target, column, read_tail
@@ -223,6 +225,11 @@ def test_a_line_with_the_wrong_number_of_values_is_not_understood():
 
 
 # ----------------------------------------------------------------------------------------------- excitation
+def test_the_words_of_an_excitation_are_a_line_each_in_the_docstring():
+    told = re.findall(r"^    (\w+)[: ]", str(excitation.__doc__), re.MULTILINE)
+    assert told == ["rest", "step", "stairs", "ramp", "chirp", "prbs", "coast", "standard"]
+
+
 
 
 def test_words_become_the_voltage_they_say():
