@@ -69,7 +69,7 @@ class Trajectory(NamedTuple):
     error: Array | None
 
 
-Tolerance = float | Callable[[Trajectory], tuple[float, float, Array]]
+Tolerance = float | Callable[[Trajectory], tuple[float, float, Array | None]]
 
 
 class Engine(Protocol):

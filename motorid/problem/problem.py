@@ -378,6 +378,7 @@ class Measured(NamedTuple):
     weights: Array  # (ny,), 0 for channels not measured
     index: NDArray[np.int64] | None  # of the finite samples in the flattened y, None for all
     noise: Array  # (ny,), infinite for channels not measured
+    top: Array  # (ny,), largest size
     angle: NDArray[np.bool_]  # (ny,), which one sums up the motion
     name: str
 
@@ -394,7 +395,9 @@ class Measured(NamedTuple):
             size = np.maximum(np.sqrt(squares), noise)  # of a stuck motor's speed
         finite = np.isfinite(y)
         index = None if finite.all() else np.flatnonzero(finite.ravel())
-        return Measured(y, 1.0 / size, index, noise, np.array([c == "theta" for c in outputs]), run.experiment.name)
+        top = np.maximum(np.abs(np.where(finite, y, 0.0)).max(axis=0), 1e-300)
+        angle = np.array([c == "theta" for c in outputs])
+        return Measured(y, 1.0 / size, index, noise, top, angle, run.experiment.name)
 
     @property
     def size(self) -> int:
@@ -421,16 +424,16 @@ class Measured(NamedTuple):
         full[slice(None) if self.index is None else self.index] = rows
         return full.reshape(*self.y.shape, *rows.shape[1:])
 
-    def tolerance(self, traj: Trajectory, slack: float) -> tuple[float, float, Array]:
+    def tolerance(self, traj: Trajectory, slack: float) -> tuple[float, float, Array | None]:
         """Return the error of an interval allowed, relative to the largest state; see `Engine.prepare`. An angle, where
         errors of all intervals add up, asks of other states what it shows of them."""
-        finite = np.isfinite(self.y)
-        count = np.maximum(finite.sum(axis=0), 1)
-        top = np.maximum(np.abs(np.where(finite, self.y, 0.0)).max(axis=0), 1e-300)
-        e = np.where(finite, traj.y - self.y, 0.0)
-        rms = np.sqrt(np.einsum("ij,ij->j", e, e) / count)
+        loosest = slack * LOOSEST
+        if NOISE_SHARE * (self.noise / self.top).min() >= LOOSEST:
+            return loosest, loosest, None
+        e = np.where(finite := np.isfinite(self.y), traj.y - self.y, 0.0)
+        rms = np.sqrt(np.einsum("ij,ij->j", e, e) / (count := np.maximum(finite.sum(axis=0), 1)))
         asked = slack * NOISE_SHARE * np.maximum(self.noise, MISFIT_SHARE * rms)
-        least, beside = (np.clip((asked / top)[some].min(initial=slack * LOOSEST), slack * TIGHTEST, slack * LOOSEST)
+        least, beside = (np.clip((asked / self.top)[some].min(initial=loosest), slack * TIGHTEST, loosest)
                          for some in (slice(None), ~self.angle))
         return least, beside, np.where(self.angle, asked / np.sqrt(count), np.inf)
 
