@@ -114,8 +114,7 @@ def tied(a: Node, b: Node) -> bool:
 def choose(children: Sequence[Node], parent: Node) -> tuple[Node, list[Node]] | None:
     """Return the best child, the smaller on a tie, and the children in order; None without any.
 
-    Gains on the parent, each in effective samples of its own residual, order the children; which of two is better only
-    a comparison of the two tells.
+    Gains on the parent, in effective samples of a child's own residual, order them; which of two is better, both tell.
     """
     if not children:
         return None

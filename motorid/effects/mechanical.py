@@ -173,7 +173,7 @@ WIDE = 0.1  # rad: which a corner wider than a thousandth of a radian is, howeve
 def _two_inertias(m: Equations, share, resonance, zeta, twist_of, name: str) -> None:
     """Split J into motor and load joined by a shaft; `twist_of` shapes the elastic twist (a gap).
 
-    With load share r, stiffness ω_r²·J·r·(1−r) and damping 2·ζ·ω_r·J·r·(1−r): all vanishes smoothly as r → 0.
+    The total stays J. With load share r, stiffness ω_r²·J·r·(1−r), damping 2·ζ·ω_r·J·r·(1−r), all vanishes as r → 0.
     """
     twist, omega_load = m.state(f"twist_{name}"), m.state(f"omega_{name}", m.start["omega"])
     slip = m.omega - omega_load

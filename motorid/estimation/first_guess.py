@@ -1,10 +1,9 @@
 """A first guess of the motor, and of the loads on it, from the data alone.
 
-The balances are integrated over time, so nothing is differentiated, and solved as non-negative linear least
-squares: ``∫v dt = L Δi + R ∫i dt + K ∫ω dt`` and ``K ∫i dt = J Δω + b ∫ω dt`` (Garnier & Wang, Identification of
-Continuous-time Models from Sampled Data, 2008, ch. 1). Where the current or the speed was not measured, it is
-eliminated and what the record cannot tell is taken from the values given, or from round numbers. Torques of
-the model's effects enter as further columns.
+The balances are integrated over time, so nothing is differentiated, and solved as non-negative linear least squares:
+``∫v dt = L Δi + R ∫i dt + K ∫ω dt`` and ``K ∫i dt = J Δω + b ∫ω dt`` (Garnier & Wang, Identification of Continuous-time
+Models from Sampled Data, 2008, ch. 1). A current or a speed that was not measured is eliminated; what the record cannot
+tell is taken from the values given, or from round numbers. Torques of the model's effects are further columns.
 """
 
 from __future__ import annotations

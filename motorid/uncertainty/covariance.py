@@ -74,8 +74,7 @@ class Covariance(Printed):
     def interval(self, name: str, level: float = 0.95) -> tuple[float, float] | None:
         """Return the two-sided confidence interval of one unknown; None where the data do not determine it.
 
-        Student's t on the effective degrees of freedom; on the logarithmic scale where a positive parameter's
-        interval would come near zero.
+        Student's t on the effective degrees of freedom; on the logarithmic scale where a positive one comes near zero.
         """
         among(name, self.names, "parameter")
         check_level(level)

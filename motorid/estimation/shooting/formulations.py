@@ -127,10 +127,9 @@ def compare_formulations(problem: Problem | Fit, constraints: Sequence[Relation]
                          weights: Sequence[float] = WEIGHTS) -> Formulations:
     """Fit the same data three times: plain, with penalties, with true constraints.
 
-    *Plain* leaves the constraints out. *Penalty* is the source paper's: errors over the RMS of each channel,
-    penalties with their own weights. *Hard* is multiple shooting with true constraints and the weights of the
-    plain fit. Along the path penalties on what lies beyond the limits grow heavier, so that their solution
-    walks from the plain to the hard one.
+    *Plain* leaves the constraints out. *Penalty* is the source paper's: errors over the RMS of each channel, penalties
+    with their own weights. *Hard* is multiple shooting with true constraints and the weights of the plain fit. Along
+    the path penalties on what lies beyond the limits grow heavier: their solution walks from the plain to the hard one.
 
     Parameters
     ----------
