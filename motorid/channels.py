@@ -27,6 +27,7 @@ def channel_name(channel: str, unit: str = "") -> str:
     return special.get(channel, {}).get(unit, NAMES.get(channel, channel))
 
 
-def worded(text: str, unit: str) -> str:
-    """Return a text on the input v with the name that it has in such a unit: what drives an axis may be no voltage."""
-    return re.sub(r"(?<= )voltage(?=s?[ ,;:.?])", channel_name("v", unit), text)
+def worded(text: str, units: Mapping[str, str]) -> str:
+    """Return a text with the names that channels have in such units: what drives an axis may be no voltage."""
+    text = re.sub(r"(?<=[ (])angle(?=[ ,;:.?)])", channel_name("theta", units.get("theta", "")), text)
+    return re.sub(r"(?<= )voltage(?=s?[ ,;:.?])", channel_name("v", units["v"]), text)

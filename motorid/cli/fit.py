@@ -64,7 +64,8 @@ def fit_command(runs: opt.Runs, options: opt.FitOptions, validate: opt.Validate 
 
 
 def _show_fit(found: Fit, records: list[Experiment], notes: list[str], judged: Evaluation | None = None) -> None:
-    plain = found.fits == "noise" and found.status == "converged" and max(found.misfit.values(), default=0.0) < PLAIN
+    fits = found.fits == "noise" and max(found.misfit.values(), default=0.0) < PLAIN and not found.mostly_noise
+    plain = fits and found.status == "converged"
     show(found.verdict, _held_out(found, judged) if judged else None, NRMSE,
          f"Next: {next_command('fit', '--json', 'fit.json')}\nThen: motorid export fit.json motor.casadi" if plain
          else f"Next: {next_command('diagnose')}", f"\n{found.model.title}, {_amount(records)}. {ended(found)}\n")

@@ -174,6 +174,13 @@ class Search:
             later = dict(zip(begun, completed(list(begun.values()), self.map), strict=True))
             found |= {t.name: self._judge(node, t.added, later[t.name]) for t in tasks if t.name in later}
         children = [child for child, _ in found.values() if child is not None]
+        inside = {name for c in children if c.objection for e in c.fit.model.effects if e.name == c.added
+                  for name in e.includes if name not in found}
+        if again := [Task(node.fit, present + s.effect, s.effect, s.starts, s.drop) for s in scores
+                     if s.effect.name in inside and s.starts]:  # what is refused may hide the simpler one of its kind
+            more = zip(again, refits(again, self.map), strict=True)
+            found |= {t.name: self._judge(node, t.added, fit) for t, fit in more}
+            children = [child for child, _ in found.values() if child is not None]
         tried = sorted((candidate for _, candidate in found.values()), key=lambda c: c.gain or 0.0)
         return children, self.listed(scores, {c.effect: c for c in tried})
 

@@ -28,7 +28,7 @@ from motorid.model.definition import Effect
 from motorid.model.model import SHOWN, Model
 from motorid.numerics import parallel
 from motorid.records.checks import as_command, contradictions, current_limit
-from motorid.records.experiment import Experiment, repeated
+from motorid.records.experiment import Experiment, repeated, units_of
 
 
 @parallel.one_thread
@@ -95,7 +95,7 @@ def _contradicting(last: Fit, adequate: bool, runs: Sequence[Experiment]) -> str
 def _told(found: Climb, misread: str, driven: str, validated: bool) -> Diagnosis:
     """Return what a climb found, in words and as a result; first how the records contradict themselves, `misread`."""
     fit, ladder, remaining = found.search.root.fit, ladder_of(found, validated), found.remaining
-    missing, judged, last, unit = locate(fit), found.first, found.path[-1], fit.problem.experiments[0].units["v"]
+    missing, judged, last, units = locate(fit), found.first, found.path[-1], units_of(fit.problem.experiments)
     names = tuple(g.effect for g in found.grades if g.grade != "approximates")
     ranking = found.rounds[0] if found.rounds else ()
     groups = tuple(g for g in found.groups if g[0] in names)
@@ -128,11 +128,11 @@ def _told(found: Climb, misread: str, driven: str, validated: bool) -> Diagnosis
         details += [missing.text, words.rises_text(ladder.rungs)]
     else:
         verdict, where, judged = "adequate", None, remaining
-        answer, *details = words.adequate_text(judged, ranking, bool(far(ladder.best)))
+        answer, *details = words.adequate_text(judged, ranking, bool(far(ladder.best)), ladder.best.mostly_noise)
     kind = "structure" if not remaining.adequate else "fluctuation" if far(ladder.best) else "noise"
     if not names:
         details.append(words.unseen_remark(found.search.unseen(last), fit.model.base))
-    answer, *details = (worded(t, unit) for t in (misread + answer, *details, *_remarks(found, driven)) if t)
+    answer, *details = (worded(t, units) for t in (misread + answer, *details, *_remarks(found, driven)) if t)
     text = " ".join(t for t in (answer, *details, suggestion) if t)
     approximating = {g.effect: g.form for g in found.grades if g.grade == "approximates"}
     remainder = Remainder(kind, ladder.best, forms, found.search.held, fit, approximating)
@@ -177,4 +177,4 @@ def _suggestion(fits: Sequence[Fit], groups: Sequence[Sequence[str]]) -> str | N
         more = [channel_name(c) for c in SHOWN[problem.model.base] if c not in problem.outputs]
         told = f"; measure the {' or '.join(more)} too" if more else ""
         text = f"No voltage record of these channels within the limits would distinguish {listed(names)}{told}."
-    return worded(text, problem.experiments[0].units["v"])
+    return worded(text, units_of(problem.experiments))

@@ -223,8 +223,9 @@ def grades_of(last: Node, root: Node, groups: Sequence[Sequence[str]], beside: S
             if better is not None:
                 form, why = better.form, IN_ITS_PLACE.format(better.form.text)
             elif 1 - (1 - max(fall, 0.0)) ** 2 < (UNCONTESTED if e.balance == "transmission" else MOST):
-                share = percent(share_of(e.name, last, smaller), 2)
-                why = f"it removes {share} of the squared error, and the rest is not noise"
+                share = share_of(e.name, last, smaller)
+                most = f"{percent(share, 2)} of" if share > 0 else "nothing, over all channels, of"
+                why = f"it removes {most} the squared error, and the rest is not noise"
         kind = "approximates" if why else "group" if rivals.get(e.name) else "named"
         found.append(Grade(e.name, kind, why, form))
     return _no_surer_than_what_they_act_on(tuple(found), last.fit)

@@ -13,7 +13,7 @@ import numpy as np
 
 from motorid.diagnosis.cross_validation import HeldOut
 from motorid.diagnosis.predictive_score import Evidence, Predictions, compare, finer
-from motorid.diagnosis.thresholds import FINER, LARGER, MOST, SEARCHED
+from motorid.diagnosis.thresholds import FINER, LARGER, MOST, SEARCHED, TRIFLE
 from motorid.estimation.fit import follows
 from motorid.estimation.result import Fit
 from motorid.model.model import Model
@@ -124,8 +124,26 @@ def choose(children: Sequence[Node], parent: Node) -> tuple[Node, list[Node]] | 
         near = [n for n in ordered if n is chosen or not beats(chosen, n) or _as_likely(n, chosen)]
         smaller = min(near, key=lambda n: (*_price(n), -evidence(parent, n).gain))
         if smaller is chosen or _price(smaller) >= _price(chosen):
-            return chosen, ordered
+            break
         chosen = smaller
+    laws = _laws_as_good(chosen, children, parent)
+    best = choose(laws, parent) if laws else None
+    return best[0] if best else chosen, ordered
+
+
+def _laws_as_good(chosen: Node, children: Sequence[Node], parent: Node) -> list[Node]:
+    """Return the models with one law for all runs that remove all but a trifle of what sizes of every run's own do, and
+    leave more than noise. Such a size describes a run, a held-out one too, and explains none."""
+    if len(chosen.fit.per_run) == len(parent.fit.per_run) or not far(chosen.fit):
+        return []
+    least = (1 - TRIFLE) * _removed(parent, chosen)
+    return [n for n in children if len(n.fit.per_run) == len(parent.fit.per_run) and not n.objection
+            and _removed(parent, n) > least]
+
+
+def _removed(parent: Node, node: Node) -> float:
+    """Return the share of the squared error that a model removes."""
+    return 1 - (1 - evidence(parent, node).fall) ** 2
 
 
 def _price(node: Node) -> tuple[bool, int, int]:

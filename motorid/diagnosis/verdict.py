@@ -12,7 +12,7 @@ from motorid.diagnosis.misspecification import Grade
 from motorid.diagnosis.model_comparison import Node, far, share_removed
 from motorid.diagnosis.results import Adequacy, Candidate, Rung
 from motorid.diagnosis.score_test import Score
-from motorid.diagnosis.thresholds import ELSEWHERE, LARGER, LOST, MATERIAL, MOST
+from motorid.diagnosis.thresholds import ELSEWHERE, LARGER, LOST, MATERIAL, MOST, UNCONTESTED
 from motorid.display.numbers import arrow, counted, factor, listed, percent, with_error
 from motorid.estimation.covariance import UNDETERMINED
 from motorid.estimation.result import Fit, parameter_cell
@@ -26,6 +26,7 @@ MOVED = 0.1  # relative change of a motor parameter that is worth a word
 SPIKED = 0.5  # of a channel's squared error: what outliers must make to be worth a word
 NOISELESS = 0.1  # of its fast changes: what of a voltage its own past does not tell
 RPM = 30 / np.pi
+OPEN = " not determined"
 DECIDED = "blocks left out of the fitted runs decided"
 
 
@@ -37,12 +38,16 @@ def first_answer(fit: Fit, judged: Adequacy, scores: Sequence[Score]) -> str:
     return f"first answer: {fit.verdict}{next_}"
 
 
-def adequate_text(judged: Adequacy, ranking: Sequence[Candidate], large: bool = False) -> tuple[str, str]:
-    """Return the answer when nothing is missing, and how many effects were tried; `large`: errors beyond the noise."""
+def adequate_text(judged: Adequacy, ranking: Sequence[Candidate], large: bool = False,
+                  noisy: bool = False) -> tuple[str, str]:
+    """Return the answer when nothing is missing, and how many effects were tried; `large`: errors beyond the noise;
+    `noisy`: this is most of the records."""
     tried = f"{judged.text} None of the {len(ranking)} effects tried is worth adding." if ranking else judged.text
     if large:
         why = judged.hum or "they fluctuate by themselves, or the noise is slow"
         return f"Nothing that depends on the motion is missing, but the errors are larger than the noise: {why}.", tried
+    if noisy:
+        return "These records are mostly noise: nothing that is missing would show in them.", tried
     if judged.p_value <= judged.false_alarm:
         return "Nothing that matters is missing: the errors are within the noise.", tried
     return "Nothing is missing: the errors do not depend on the motion.", tried
@@ -61,15 +66,10 @@ def unexplained_text(ranking: Sequence[Candidate], rungs: Sequence[Rung], grades
     lead = lead if done else f"Unexplained so far: {like or 'something is missing'}; not all effects were tried."
     if grades:
         curve = f"{like}, which the library lacks, predicts better in its place"  # the same in few words
-        shares = {name: share_removed(*(r.validation_nrmse or r.nrmse for r in (a, b)))
-                  for a, b in itertools.pairwise(rungs) for name in (b.added or "").split(" + ")}
-        most = max(grades, key=lambda g: (shares.get(g.effect, 0.0), g.effect))
-        share, told, near = shares.get(most.effect, 0.0), most.why.startswith("it removes"), ""
-        if share > (0.0 if any(g.form for g in grades) else MOST):
-            near = f"{_described(rungs[-1].fit, most.effect)}, which removes {percent(share, 2)} of the squared error"
+        near, share, nearest = _nearest(rungs, grades, ranking)
         lead = (f"Unexplained, but close to {near}; better still is {like}, which {none} describes."
                 if near and like and done and share > MOST else f"{lead} Nearest: {near}." if near else lead)
-        helps = approximations_text([g for g in grades if not (near and told and g is most)])
+        helps = approximations_text([g for g in grades if g not in nearest or not g.why.startswith("it removes")])
         helps = helps.replace(curve, "a free curve predicts better")
         return " ".join(t for t in (lead, helps, errors_text(rungs), _left(rungs[-1].fit, remaining)) if t)
     best = max((c for c in ranking if c.refit_drop is not None), key=lambda c: c.refit_drop or 0.0, default=None)
@@ -77,6 +77,32 @@ def unexplained_text(ranking: Sequence[Candidate], rungs: Sequence[Rung], grades
         return lead
     return (f"{lead} The nearest, '{best.effect}', removes {percent(best.refit_drop, 2)} of the squared error, but "
             f"was not added: {best.reason}.")
+
+
+def _nearest(rungs: Sequence[Rung], grades: Sequence[Grade],
+             ranking: Sequence[Candidate]) -> tuple[str, float, list[Grade]]:
+    """Say which effects came with the largest fall of the error, and return the share of the squared error that they
+    remove, and their grades. What took an earlier one's place removes what both do. Where the sizes of what would be
+    named are open, what alone does nearly as much, and is determined."""
+    shares = dict[str, float]()
+    for k, rung in enumerate(rungs):
+        came = [j for j, r in enumerate(rungs[:k]) if {*rung.removed} & {*(r.added or "").split(" + ")}]
+        before, after = rungs[max(min([*came, k]) - 1, 0)], rung
+        share = share_removed(*(r.validation_nrmse or r.nrmse for r in (before, after)))
+        shares |= dict.fromkeys((rung.added or "").split(" + "), share)
+    share = max((shares.get(g.effect, 0.0) for g in grades), default=0.0)
+    nearest = [g for g in grades if shares.get(g.effect, 0.0) == share]
+    if share <= (0.0 if any(g.form for g in grades) else MOST):
+        return "", share, []
+    said, alone = " with ".join(_described(rungs[-1].fit, g.effect) for g in nearest), ""
+    if any(OPEN in text for text in (said, *(g.why for g in nearest))):
+        others = [c for c in ranking if c.fit and not c.fit.per_run and (c.refit_drop or 0.0) > UNCONTESTED * share
+                  and ", but " not in c.reason and all(c.effect != g.effect for g in grades)
+                  and OPEN not in _described(c.fit, c.effect)]
+        if best := max(others, key=lambda c: c.refit_drop or 0.0, default=None):
+            said, share, nearest, alone = _described(best.fit, best.effect), best.refit_drop or 0.0, [], " alone"
+    some = "s" * (len(nearest) < 2)
+    return f"{said}, which{alone} remove{some} {percent(share, 2)} of the squared error", share, nearest
 
 
 def approximations_text(grades: Sequence[Grade], what: str = "it") -> str:
@@ -123,7 +149,7 @@ def _described(fit: Fit, name: str) -> str:
     for p in effect.parameters:
         now, sd = fit.problem.model.parameters[p.name], std.get(p.name)
         known = sd is not None or not now.vary
-        text = f"{p.name} = {with_error(fit.values[p.name], sd, now.unit)}" if known else f"{p.name} not determined"
+        text = f"{p.name} = {with_error(fit.values[p.name], sd, now.unit)}" if known else f"{p.name}{OPEN}"
         if p.name in fit.per_run:
             text = f"{p.name} = {parameter_cell(fit, p.name)}"
         if not known and (volts := fit.determined.get(f"{p.name}_voltage")) is not None:

@@ -162,6 +162,11 @@ class Fit(Shown):
         return "poor" if max(self.misfit.values(), default=0.0) > COLOURED else "noise"
 
     @property
+    def mostly_noise(self) -> bool:
+        """Whether the model explains less of every channel that moves than it leaves, by the squared error."""
+        return min(moving(self.nrmse).values(), default=0.0) ** 2 > 0.5
+
+    @property
     def verdict(self) -> str:
         """Whether it fits, in a sentence: by the size of the errors, which is no answer before an optimum."""
         times, lead = max(self.misfit.values(), default=0.0), "Fits: errors" if self.status == "converged" else "Errors"
@@ -170,6 +175,8 @@ class Fit(Shown):
                 "does, a diagnosis tells",
                 "poor": f"Fits poorly: errors {factor(times, 'up to ')} times the noise",
                 "lost": "Does not fit: predicting zero would be closer"}[self.fits]
+        if self.mostly_noise and self.fits == "noise":
+            said = "Fits records that are mostly noise" + said.removeprefix("Fits")
         known = not self.problem.unknown or any([*self.std.values(), *self.determined])
         if self.status != "failed" and (not moving(self.nrmse) or (self.fits == "noise" and not known)):
             said = "Nothing is determined: the records do not show what the motor does, and any values fit them"

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from motorid.channels import NAMES, channel_name, worded
 from motorid.display.numbers import number, quantity
 from motorid.numerics.signals import FEWEST_FRESH, WINDOWS, Array, bridged, integral, noise_level, quantum, slope
-from motorid.records.experiment import Experiment
+from motorid.records.experiment import Experiment, units_of
 from motorid.records.headers import parse_unit
 
 Check = Callable[[Experiment], str | None]
@@ -74,7 +74,7 @@ def check_runs(runs: Sequence[Experiment], held_out: Sequence[Experiment] = ()) 
                        f"than that: does it act later than it was logged? If so: --delay {min(late):.3g}, "
                        f"run.delayed({min(late):.3g}).")
     more = _the_same_twice(runs), scales, _never_reverses(runs)
-    return [worded(text, runs[0].units["v"]) for text in (*remarks, *more) if text]
+    return [worded(text, units_of(runs)) for text in (*remarks, *more) if text]
 
 
 def contradictions(runs: Sequence[Experiment]) -> str:
@@ -86,7 +86,7 @@ def contradictions(runs: Sequence[Experiment]) -> str:
     if late and max(late) > (1 + BEGUN) * min(late) + 3 * max(run.dt for run in runs):  # by more than is read off
         found.append(f"what was measured follows a step of the voltage after {span(late)} which no one delay mends: "
                      "log the voltage when it takes effect.")
-    return worded(" ".join(text for text in found if text), runs[0].units["v"])
+    return worded(" ".join(text for text in found if text), units_of(runs))
 
 
 def as_command(run: Experiment) -> Experiment:
@@ -376,11 +376,13 @@ def _unanswered(run: Experiment) -> bool:
 
 def _noisy(run: Experiment) -> str | None:
     for channel, y in run.outputs.items():
-        size, noise = float(np.nanstd(y)), min(noise_level(y, run.t), _beside_voltage(run, y))
+        pairs = y[:len(y) // 2 * 2].reshape(-1, 2).mean(axis=1)  # of what is no noise but alternates, they show little
+        size, noise = float(np.nanstd(y)), min(noise_level(y, run.t), 2**0.5 * noise_level(pairs),
+                                               _beside_voltage(run, y))
         if noise > 0.5 * size > 0:
             return (f"the {NAMES[channel]} is mostly noise (RMS {min(noise, size):.2g} of {size:.2g} "
-                    f"{run.units[channel]}) and tells a fit little. Drive the motor harder, filter before sampling, "
-                    f"or leave it out: --ignore {channel}.")
+                    f"{run.units[channel]}) and tells a fit little. Drive the motor harder, or filter before "
+                    "sampling" + (f"; or leave it out: --ignore {channel}." if len(run.outputs) > 1 else "."))
     return None
 
 
@@ -571,6 +573,9 @@ def angle_against_speed(run: Experiment) -> str | None:
     return f"the angle advances {ratio:.4g} times as fast as the speed says: {guess}?"
 
 
+TIMERS = (1023.0, 4095.0, 65535.0)  # whole duty cycles in counts of 10 to 16 bits
+
+
 def magnitudes(run: Experiment) -> str | None:
     """Sizes no laboratory motor has point to a wrong unit."""
     stated = run.meta.get("original_units", {})
@@ -580,9 +585,10 @@ def magnitudes(run: Experiment) -> str | None:
         values = run.inputs.get(channel, run.outputs.get(channel))
         if values is not None and run.units[channel] == unit and (top := float(np.nanmax(np.abs(values)))) > limit:
             was = f" (read as {stated[channel]})" if channel in stated else ""
-            if channel == "v" and stated.get(channel, "")[:1].isdigit():
-                return (f"v reaches {top:.4g} V{was}: that unit is the voltage of a whole duty cycle. Is the column in "
-                        "per cent, or in counts of a timer? Then give the voltage of one: units={'v': '0.12 V'}.")
+            if channel == "v" and (top in TIMERS or stated.get(channel, "")[:1].isdigit()):
+                whole = "that unit is the voltage of a whole duty cycle. " * (top not in TIMERS)
+                return (f"v reaches {top:.5g} V{was}: {whole}Is the column in per cent, or in counts of a timer? Then "
+                        f"give the voltage of one, of a supply of 12 V: units={{'v': '{12 / top:.2g} V'}}.")
             return f"{channel} reaches {top:.4g} {unit}{was}; {_remedy(run, channel, likely)}"
     if run.dt > 0.2:
         likely = "ms" if run.dt < 200 else "us"

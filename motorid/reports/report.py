@@ -19,7 +19,7 @@ from motorid.estimation.result import Fit, ended, parameter_table, value_tables
 from motorid.numerics.parallel import progress
 from motorid.problem.simulate import error_table, evaluate
 from motorid.records.checks import check_runs, reading_notes
-from motorid.records.experiment import Experiment
+from motorid.records.experiment import Experiment, units_of
 from motorid.records.files import package_version, write_files
 
 PACKAGES = ("motorid", "casadi", "numpy", "scipy", "pandas", "matplotlib")
@@ -244,7 +244,7 @@ def _where(d: Diagnosis) -> Section:
     caption = f"The {' and '.join(m.bins)} that would make the model match, with its explanation."
     figure = _figure("missing", caption, "What is missing. " + "; ".join(best), "plot_missing", d)
     tables = [share_table("region", m.regions)] if m.regions else []
-    text = [worded(t, d.before.problem.experiments[0].units["v"]) for t in (d.adequacy.text, m.text)]
+    text = [worded(t, units_of(d.before.problem.experiments)) for t in (d.adequacy.text, m.text)]
     return Section("where", "Where it fails", text, (), [figure], tables)
 
 

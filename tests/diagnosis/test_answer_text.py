@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -14,7 +15,7 @@ import motorid as mi
 from motorid.channels import worded
 from motorid.diagnosis import diagnose
 from motorid.diagnosis.misspecification import Grade
-from motorid.diagnosis.results import Rung
+from motorid.diagnosis.results import Candidate, Rung
 from motorid.diagnosis.verdict import (
     adequate_text,
     errors_text,
@@ -110,10 +111,39 @@ def test_nearest_is_what_removes_most_of_the_squared_error_by_the_measure_of_the
     assert "Nearest" not in unexplained_text((), rungs[:2], bare[1:], "", remaining)
 
 
+def test_nearest_is_a_pair_by_what_both_removed_and_what_is_determined(rng):
+    """What took an earlier effect's place removed what both do; sizes that are open are no headline beside known ones.
+    (EV3: a speed filter for dry friction that differs by direction; a cart: a winding 90 +- 100 K colder for a limit.)
+    """
+    plain, t = mi.dc_motor(R=2.0, L=2e-3, K=0.05, b=4e-5, J=3e-5), np.arange(600) * 2e-3
+    known = plain + mi.effects.coulomb(tau_c=5e-3) + mi.effects.viscous_asymmetric(b_a=1e-5)
+    run = noisy(simulated(t, 6 * np.sign(np.sin(9 * t + 0.1)), model=known), rng)
+    known = mi.fit(known, run)
+    rungs = [Rung(added, known, {"omega": e}, None, removed) for added, e, removed in (
+        (None, 0.040, ()), ("coulomb_asymmetric", 0.027, ()),
+        ("coulomb + viscous_asymmetric", 0.024, ("coulomb_asymmetric",)), ("speed_filter", 0.018, ()))]
+    grades = [Grade(n, "approximates", "a curve is better", SimpleNamespace(text="a torque"))
+              for n in ("coulomb", "viscous_asymmetric", "speed_filter")]
+    remaining = SimpleNamespace(adequate=False, hum="", text="Something is missing.")
+    answer = unexplained_text((), rungs, grades, "a torque", remaining)
+    assert "[coulomb]" in answer.split(" with ")[0]
+    assert "[viscous_asymmetric]" in answer
+    assert "which remove 64 % of the squared error" in answer
+    open_ = [Grade("coulomb", "approximates", "R_th and C_th are not determined, and the rest is not noise")]
+    rungs = [rungs[0], Rung("coulomb", known, {"omega": 0.004}, None)]
+    rival = Candidate("coulomb", 0.3, fit=mi.fit(plain + mi.effects.coulomb, run), refit_drop=0.97)
+    rivals = (replace(rival, effect="viscous_asymmetric", fit=known), replace(rival, refit_drop=0.99, reason="a, but b"))
+    answer = unexplained_text(rivals, rungs, open_, "", remaining)
+    assert "[viscous_asymmetric]" in answer
+    assert "which alone removes 97 % of the squared error" in answer
+    assert "[coulomb]" in unexplained_text(rivals[1:], rungs, open_, "", remaining)
+
+
 def test_errors_beyond_the_noise_are_in_the_answer_where_nothing_is_missing():
     judged = SimpleNamespace(text="The errors (speed 4 times the noise) do not depend on the motion.", p_value=0.5,
                              false_alarm=0.02, hum="")
     small, large = (adequate_text(judged, (), beyond)[0] for beyond in (False, True))
+    assert adequate_text(judged, (), noisy=True)[0].startswith("These records are mostly noise")
     assert small == "Nothing is missing: the errors do not depend on the motion."
     assert "larger than the noise" in large
 
@@ -207,6 +237,14 @@ def test_what_would_show_an_effect_is_asked_of_channels_that_the_model_has():
 
 
 def test_a_suggestion_names_what_drives():
-    assert worded("No voltage record; reversals at full voltage (up to 1 A). 'voltage_offset'; two voltages.", "A") == (
+    assert worded("No voltage record; reversals at full voltage (up to 1 A). 'voltage_offset'; two voltages.",
+                  {"v": "A"}) == (
         "No current record; reversals at full current (up to 1 A). 'voltage_offset'; two currents.")
-    assert worded("a loss of voltage.", "V") == "a loss of voltage."
+    assert worded("a loss of voltage.", {"v": "V"}) == "a loss of voltage."
+
+
+def test_the_angle_of_a_linear_axis_is_a_position():
+    told = "The errors (angle 32 times the noise) follow a load that changes with the angle; phase angles."
+    assert worded(told, {"v": "V", "theta": "rad"}) == told
+    assert worded(told, {"v": "V", "theta": "m"}) == (
+        "The errors (position 32 times the noise) follow a load that changes with the position; phase angles.")

@@ -363,6 +363,29 @@ def test_a_channel_of_noise_is_told(steps, rng):
     assert "mostly noise" in said(steps.with_(outputs={"i": rng.normal(size=steps.n)}))
 
 
+def test_counts_that_alternate_are_not_taken_for_noise_and_the_only_channel_is_kept(rng):
+    """Differences of successive samples make 3.6 times of it; without the only channel nothing is left to fit."""
+    t = np.arange(300) * 0.01
+    speed = 20 * (1 - np.exp(-t / 0.4)) + 60
+    run = Experiment(t, {"v": np.full(300, 6.0)}, {"omega": speed + 5.0 * (-1.0) ** np.arange(300)})
+    assert "mostly noise" not in said(run)
+    noisy = said(run.with_(outputs={"omega": speed + 20 * rng.normal(size=300)}))
+    assert "the speed is mostly noise" in noisy
+    assert "--ignore" not in noisy
+    both = {"omega": speed + 20 * rng.normal(size=300), "theta": np.cumsum(speed) * 0.01}
+    assert "--ignore omega" in said(run.with_(outputs=both))
+
+
+@pytest.mark.parametrize("whole", [1023, 4095, 65535])
+def test_counts_of_a_timer_are_not_taken_for_millivolts(whole):
+    t = np.arange(300) * 0.01
+    run = Experiment(t, {"v": np.where(t > 1, float(whole), 0.3 * whole)}, {"omega": 50 * (1 - np.exp(-t))})
+    remarks = said(run)
+    assert "counts of a timer" in remarks
+    assert f"units={{'v': '{12 / whole:.2g} V'}}" in remarks
+    assert "mV" not in remarks
+
+
 def test_spikes_are_told_and_what_forgives_them(steps, rng):
     y = steps.outputs["i"].copy()
     where = rng.choice(steps.n, 9, replace=False)
