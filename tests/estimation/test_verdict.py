@@ -248,3 +248,14 @@ def test_errors_beside_which_the_noise_is_nothing_are_over_a_thousand_times_it()
     assert fit.verdict.startswith("Fits poorly: errors over 1000 times the noise (NRMSE angle")
     assert "angle over 1000 times the noise" in mi.diagnose(fit, max_effects=0).text
     assert fit.misfit["theta"] > 1000  # as a number it stays
+
+
+def test_a_fit_of_what_is_mostly_noise_says_so(rng):
+    """A speed of 66 rad/s, 65 of it noise, fits at the level of the noise, and nothing would show in it."""
+    t = np.arange(600) * 0.01
+    speed = 20 * (1 - np.exp(-t / 0.5))
+    noisy, quiet = (mi.fit(mi.dc_motor(), mi.Experiment(t, {"v": np.where(t < 0.01, 0.0, 6.0)}, {
+        "omega": speed + noise * rng.normal(size=600)})) for noise in (60.0, 2.0))
+    assert noisy.verdict.startswith("Fits records that are mostly noise: errors at the level of the noise")
+    assert quiet.verdict.startswith("Fits: errors at the level of the noise")
+    assert (noisy.mostly_noise, quiet.mostly_noise) == (True, False)
