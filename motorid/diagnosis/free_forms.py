@@ -233,6 +233,8 @@ def functions_of(form: Form, span: Span) -> list[str]:
     """Return the functions that a form is made of, as source in its quantity z; `m.sign` is the model's smooth sgn.
     Where they bend, set in or fade is written as a `PLACE`."""
     low, high = span.ranges[form.on]
+    if form.on == "run":
+        return ["1.0"]
     if form.on == "turn":
         waves = ["1.0", *(f"ca.{f}({k:.6g} * z)" for k in waves_of(span) for f in ("sin", "cos"))]
         plain = form.carrier == "acceleration" or span.finer == 1  # none jumps, and forms compare better by few

@@ -52,7 +52,8 @@ AHEAD = 2  # how many then go on, of those in short windows one
 _moments = partial(over_moments, solve=partial(solve, solver=QUICK))  # a model that is far off, in short windows
 AT_ONCE = 20  # parts of a sample, in one of which follows what does so at once; more are too stiff to fit,
 INPUT_AT_ONCE = 80  # but not of an input, which jumps at samples only
-QUANTITIES = {"turn": "m.theta", "theta": "m.theta", "omega": "m.omega", "i": "m.i", "v": "m.v", "past v": "m.v",
+QUANTITIES = {"run": "0.0", "turn": "m.theta",
+              "theta": "m.theta", "omega": "m.omega", "i": "m.i", "v": "m.v", "past v": "m.v",
               "past i": "m.i", "past omega": "m.omega", "past speed": "ca.fabs(m.omega)", "past power": "m.omega**2",
               "path": "m.sign(m.omega)", "load": "m.v * m.i", "past load": "m.v * m.i",
               "past braking": "ca.fmax(-m.v * m.i, 0)", "past heat": "m.i**2", "past size": "ca.fabs(m.v)",
@@ -110,6 +111,16 @@ class Part:
         span = replace(span, orders=tuple(sorted({*span.orders, *FINE})))
         pitches = pitches_of(fit, form, span) if form.on == "turn" else 1
         return cls(form, replace(span, pitches=pitches, finer=FINER), (), moved)
+
+    @property
+    def by_run(self) -> bool:
+        """Tell whether it is one size that is another in every run."""
+        return self.form.on == "run"
+
+    @property
+    def doc(self) -> str:
+        """What its sizes are."""
+        return "relative to the first run" if self.by_run else "coefficient of the curve"
 
     @cached_property
     def functions(self) -> list[str]:
@@ -204,7 +215,8 @@ class Curve:
         parameters = []
         for part, sizes, places in self._apart(self.sizes.items()):
             unit = part.unit(self.fit)
-            parameters += [P(c, unit, null=0.0, given=True, doc="coefficient of the curve")(n) for n, c in sizes]
+            parameters += [P(c, unit, null=0.0, given=not part.by_run, per_run=part.by_run, doc=part.doc)(n)
+                           for n, c in sizes]
             usual, words = part.place  # a fit rounds what is at its limit
             parameters += [P(min(max(c, low), high), unit.partition(":")[0], lower=low, upper=high, given=True,
                              doc=words if unit == usual else OTHER_PLACES[unit])(n)
@@ -237,6 +249,9 @@ class Curve:
         """The curve as Python source of an effect."""
         pars = []
         for p in self.effect.parameters:
+            if p.per_run:
+                pars.append(f'    {p.name}=mi.P(0.0, "{p.unit}", null=0.0, per_run=True, doc="{p.doc}"),')
+                continue
             rest = "null=0.0" if p.null == 0 else f'lower={p.lower:.9g}, upper={p.upper:.9g}, doc="{p.doc}"'
             pars.append(f'    {p.name}=mi.P({p.value:.9g}, "{p.unit}", given=True, {rest}),')
         known = [f"    Nearest closed form{' of the first part' * (len(self.parts) > 1)}: {text} (misses "
@@ -251,6 +266,8 @@ class Curve:
     def nearest(self) -> list[tuple[str, float]]:
         """Return closed forms beside the first part, the nearest first: in words with its size, the share missed."""
         part = self.parts[0]
+        if part.by_run:
+            return []
         z, value = self.points
         forms, unit = _closed_forms(part.form.on, z), part.unit(self.fit)
         if part.form.on in PAST:
@@ -271,8 +288,13 @@ class Curve:
         part = self.parts[0]
         z = np.concatenate([s[part.form.on] for s in self._signals])
         _, sizes, places = next(self._apart(self.values))
-        values = np.concatenate([free_forms.values_of(part.terms(places), part.form, s) for s in self._signals])
-        curve = values @ np.array(sizes)
+        each = [free_forms.values_of(part.terms(places), part.form, s) for s in self._signals]
+        if part.by_run and self.fitted is not None:
+            firsts = self.fitted.problem.unknowns.firsts
+            own = [self.fitted.initial.get(f"{self.name}_0[{k}]", 0.0) for k in firsts]
+            each = [size * ones for size, ones in zip(own, each, strict=True)]
+            sizes = [1.0]
+        curve = np.concatenate(each) @ np.array(sizes)
         return z, eval(POSITIVE, {"ca": np, "curve": curve}) if part.form.carrier == "acceleration" else curve
 
     @cached_property
@@ -283,7 +305,15 @@ class Curve:
         """Return the curve with the functions of its last part that by their slopes predict more, fitted with the
         model; one at a time, if their places move. None for none. Raises what a fit raises."""
         last, (*before, part) = self.fitted or self.fit, self.parts
+        if part.by_run and part.chosen:
+            return None
         linear = free_forms.linearised(last, part.form, part.span)
+        if part.by_run:
+            first, *others = sorted(set(last.problem.unknowns.firsts))
+            own = free_forms.form_coefficients(last, linear, part.form)
+            curve = replace(self, parts=(*before, replace(part, chosen=(0,))), values=(*self.values, 0.0))
+            start = {f"{self.name}_{len(self.values)}[{k}]": float(own[k] - own[first]) for k in others}
+            return curve.refitted(last, curve.sizes | start, curve.sizes)
         more = chosen_functions(last, linear, part.form, part.chosen, first=part.moved)
         if not more:
             return None
@@ -355,8 +385,7 @@ class Remainder:
     @property
     def proposed(self) -> bool:
         """Tell whether slopes propose a curve; whether it helps, `as_effect` finds out."""
-        seen = self.form is not None and self.form.on != "run"
-        curve = seen or self._anew is not None or any(self._approximating.values())
+        curve = self.form is not None or self._anew is not None or any(self._approximating.values())
         return self.kind == "structure" and curve
 
     def as_effect(self, name: str = "remainder") -> Effect:
@@ -401,17 +430,13 @@ class Remainder:
         if self.kind != "structure":
             raise UsageError(f"the remainder is {self.kind}: nothing is left that a curve over a quantity predicts.")
         held, best = self._held or HeldOut.of(self.fit, None), None
-        apart = self.form is not None and self.form.on == "run"
-        if not apart or self._anew is not None:
-            short = (t for root in [self._root or self.fit] for t in _grown_in(_moments(root), root, self.forms))
-            every = short, self._tried(), _beyond(self._anew)
-            each = (islice((t for t in some if t[1].on != "run"), TRIED) for some in every)
-            with contextlib.suppress(OutOfTime), budget(SECONDS):
-                best = _best(self.fit, chain.from_iterable(each), held)
+        short = (t for root in [self._root or self.fit] for t in _grown_in(_moments(root), root, self.forms))
+        every = short, self._tried(), _beyond(self._anew)
+        with contextlib.suppress(OutOfTime), budget(SECONDS):
+            best = _best(self.fit, chain.from_iterable(islice(some, TRIED) for some in every), held)
         if best is None:
-            raise UsageError(f"what is left is {self.follows}: no curve, but another motor in every run. Fit the runs "
-                             "apart." if apart else "something predictable is left, but no curve over one quantity "
-                             "lowers the error on data left out; do these hold voltages or speeds that others lack?")
+            raise UsageError("something predictable is left, but no curve over one quantity lowers the error on data "
+                             "left out; do these hold voltages or speeds that others lack?")
         return best
 
     def _tried(self) -> Iterator[tuple[Curve, Form]]:
@@ -601,7 +626,7 @@ def alone_leaving_noise(last: Node, root: Fit, held: HeldOut, forms: Sequence[Fo
     check_time()
     with contextlib.suppress(*FAILURES):
         there, before = _moments(root), held.predictions(root)
-        whole = (t for t in _beyond(root) if t[1].on != "run" and (there is None or t[1].remembers))
+        whole = (t for t in _beyond(root) if there is None or t[1].remembers)
         _race(found, islice(chain(_grown_in(there, root, forms, True), whole), TRIED), before, held, last.predictions)
     each = (FormGain(key[1], compare(last.predictions, f.predictions), f.predictions,
                      f.done and f.curve.fitted is not None and len(f.curve.fitted.q) <= len(last.fit.q))

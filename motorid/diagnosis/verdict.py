@@ -101,6 +101,8 @@ def _nearest(rungs: Sequence[Rung], grades: Sequence[Grade],
                   and OPEN not in _described(c.fit, c.effect)]
         if best := max(others, key=lambda c: c.refit_drop or 0.0, default=None):
             said, share, nearest, alone = _described(best.fit, best.effect), best.refit_drop or 0.0, [], " alone"
+        elif any(g.form for g in grades):
+            return "", share, []
     some = "s" * (len(nearest) < 2)
     return f"{said}, which{alone} remove{some} {percent(share, 2)} of the squared error", share, nearest
 

@@ -78,13 +78,13 @@ class Unknowns:
     @cached_property
     def scaling(self) -> Scaling:
         """Solver coordinates: logarithmic for positive parameters, else in natural sizes of the records."""
-        sizes = [abs(p.value) for p in self.free]
-        if not all(p.positive for p in self.free):
+        sizes, natural = [abs(p.value) for p in self.free], dict[str, float]()
+        if self.apart or not all(p.positive for p in self.free):
             natural = natural_sizes([r.experiment for r in self.runs], {n: p.value for n, p in self.parameters.items()})
             sizes = [s if p.positive else max(s, natural.get(p.unit, 0.0))
                      for p, s in zip(self.free, sizes, strict=True)]
         spreads = [spread_of(self.runs[k].experiment, c) for c, k, _ in self.initial]
-        return Scaling.of(self.all, [*sizes, *spreads, *(1.0 for _ in self.apart)])
+        return Scaling.of(self.all, [*sizes, *spreads, *(natural.get(p.unit, 1.0) for *_, p in self.apart)])
 
     @cached_property
     def start(self) -> Array:

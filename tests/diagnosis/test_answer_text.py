@@ -131,8 +131,8 @@ def test_nearest_is_a_pair_by_what_both_removed_and_what_is_determined(rng):
     assert "which remove 64 % of the squared error" in answer
     open_ = [Grade("coulomb", "approximates", "R_th and C_th are not determined, and the rest is not noise")]
     rungs = [rungs[0], Rung("coulomb", known, {"omega": 0.004}, None)]
-    rival = Candidate("coulomb", 0.3, fit=mi.fit(plain + mi.effects.coulomb, run), refit_drop=0.97)
-    rivals = (replace(rival, effect="viscous_asymmetric", fit=known), replace(rival, refit_drop=0.99, reason="a, but b"))
+    rubs = Candidate("coulomb", 0.3, fit=mi.fit(plain + mi.effects.coulomb, run), refit_drop=0.97)
+    rivals = (replace(rubs, effect="viscous_asymmetric", fit=known), replace(rubs, refit_drop=0.99, reason="a, but b"))
     answer = unexplained_text(rivals, rungs, open_, "", remaining)
     assert "[viscous_asymmetric]" in answer
     assert "which alone removes 97 % of the squared error" in answer

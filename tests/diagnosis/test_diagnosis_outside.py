@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import runpy
 from dataclasses import replace
 from itertools import pairwise
 
@@ -13,10 +14,8 @@ from battery.excite import driven, record
 
 import motorid as mi
 from motorid.channels import channel_name
-from motorid.diagnosis import remainder
-from motorid.diagnosis.free_forms import Form, linearised
+from motorid.diagnosis.free_forms import linearised
 from motorid.diagnosis.model_comparison import far
-from motorid.diagnosis.remainder import Remainder
 from motorid.display.numbers import arrow
 from motorid.numerics.parallel import one_thread
 from motorid.records.experiment import Experiment
@@ -150,7 +149,8 @@ def test_what_is_needed_beside_it_is_kept_and_the_rest_is_said(lab):
 def of_different_motors(lab, name, factors) -> list[Experiment]:
     motors = [replace(lab, **{name: getattr(lab, name) * k}) for k in factors]
     drives = ("stairs 0.5", "ramps 0.6", "prbs 0.5", "steps 0.5")
-    return [runs_of(m, {}, (d,), seed=4 + k, n=400)[0] for k, (m, d) in enumerate(zip(motors, drives, strict=True))]
+    every = [runs_of(m, {}, (d,), seed=4 + k, n=400)[0] for k, (m, d) in enumerate(zip(motors, drives, strict=True))]
+    return [run.with_(name=f"run{k + 1}") for k, run in enumerate(every)]
 
 
 OTHER_CONSTANTS = (0.97, 1.0, 1.04, 1.0)
@@ -164,25 +164,25 @@ OTHER_CONSTANTS = (0.97, 1.0, 1.04, 1.0)
         ("J", (0.8, 1.0, 1.3, 1.0), "an inertia that differs from run to run", "mechanical"),
     ],
 )
-def test_a_motor_that_is_another_in_every_run_lacks_no_effect(lab, name, factors, form, where):
-    """Warm and cold, another supply, another load: no effect fits the runs together, each alone has no misfit."""
-    found = diagnosed(of_different_motors(lab, name, factors), ("brush_drop", "coulomb", "load_friction"))
+def test_a_motor_that_is_another_in_every_run_lacks_a_size_of_each(lab, name, factors, form, where, tmp_path):
+    """Warm and cold, another supply, another load: no law fits the runs together. As an effect it has a size in every
+    run, relative to the first, which a run held out estimates for itself."""
+    runs = of_different_motors(lab, name, factors)
+    found = diagnosed(runs, ("brush_drop", "coulomb", "load_friction"))
     is_like(found, form, where)
-    with pytest.raises(mi.UsageError, match="Fit the runs apart"):
-        found.remainder.as_effect()
-
-
-def test_runs_are_to_be_fitted_apart_where_curves_were_tried_first(lab, monkeypatch):
-    """What was found may only imitate one thing, so curves are tried in its place, and none helps."""
-    runs, tried = of_different_motors(lab, "K", OTHER_CONSTANTS), []
-    root, last = (mi.fit(m, runs) for m in (mi.dc_motor(), mi.dc_motor() + mi.effects.brush_drop))
-    assert far(last)
-    monkeypatch.setattr(remainder, "chosen_functions", lambda fit, linear, form, *_, **__: tried.append(form) or [])
-    left = Remainder("structure", last, (Form("a motor constant", "both", "run"),), _root=root)
-    with pytest.raises(mi.UsageError, match="Fit the runs apart"):
-        left.as_effect()
-    assert tried
-    assert "run" not in {form.on for form in tried}
+    left = found.remainder
+    assert left.proposed
+    better = mi.fit(left.model + left.as_effect(), runs[:-1])
+    assert max(better.misfit.values()) < 1.1
+    unit = {"R": 1 / lab.R, "K": -1 / lab.K, "J": factors[0]}[name]  # losses; of an inertia relative to the first run's
+    sizes = [run["value"] * unit for run in better.per_run["remainder_0"].values()]
+    assert sizes == pytest.approx([f - factors[0] for f in factors[1:-1]], abs=0.02)
+    held_out, plain = (mi.evaluate(f, runs[-1]).nrmse for f in (better, found.before))
+    assert all(e < 0.6 * plain[c] for c, e in held_out.items())
+    assert len(np.unique(left.curve[1])) == len(runs) - 1
+    (tmp_path / "own.py").write_text(left.code("own"))
+    again = runpy.run_path(str(tmp_path / "own.py"))["own"]
+    assert mi.fit(left.model + again, runs[:-1]).misfit == pytest.approx(better.misfit, rel=1e-3)
 
 
 def test_improve_grades_its_rungs_too(lab):

@@ -264,9 +264,10 @@ def test_a_model_that_ties_with_the_best_is_grown_too_unless_it_contains_it(rubb
     assert _runners_up(best, [best, both], []) == [], "it is the best with what was superfluous"
 
 
-@pytest.mark.parametrize(("law", "noise", "chosen"), [(0.86, False, "law"), (0.60, False, "own"), (0.86, True, "own")])
+@pytest.mark.parametrize(("law", "noise", "chosen"), [
+    (0.86, False, "law"), (0.60, False, "own"), (0.86, True, "own")])
 def test_one_law_for_all_runs_comes_before_sizes_of_every_runs_own(monkeypatch, law, noise, chosen):
-    """A cart's amplifier that gave less at 4 V was a winding 90 K colder in that run, re-estimated in held-out ones. Not
+    """A cart's amplifier that gave less at 4 V was a winding 90 K colder, re-estimated in every held-out run. Not
     where the law does plainly less, or the sizes leave noise."""
     root = SimpleNamespace(fit=SimpleNamespace(per_run={}))
     nodes = {n: SimpleNamespace(fit=SimpleNamespace(per_run=own, model=SimpleNamespace(effects=())), added=n, size=6,
