@@ -96,11 +96,12 @@ def _nearest(rungs: Sequence[Rung], grades: Sequence[Grade],
         return "", share, []
     said, alone = " with ".join(_described(rungs[-1].fit, g.effect) for g in nearest), ""
     if any(OPEN in text for text in (said, *(g.why for g in nearest))):
-        others = [c for c in ranking if c.fit and not c.fit.per_run and (c.refit_drop or 0.0) > UNCONTESTED * share
-                  and ", but " not in c.reason and all(c.effect != g.effect for g in grades)
-                  and OPEN not in _described(c.fit, c.effect)]
-        if best := max(others, key=lambda c: c.refit_drop or 0.0, default=None):
-            said, share, nearest, alone = _described(best.fit, best.effect), best.refit_drop or 0.0, [], " alone"
+        others = {c.refit_drop or 0.0: _described(c.fit, c.effect) for c in ranking if c.fit and not c.fit.per_run
+                  and ", but " not in c.reason and all(c.effect != g.effect for g in grades)}
+        known = {drop: text for drop, text in others.items() if drop > UNCONTESTED * share and OPEN not in text}
+        if known:
+            share, alone, nearest = max(known), " alone", []
+            said = known[share]
         elif any(g.form for g in grades):
             return "", share, []
     some = "s" * (len(nearest) < 2)
