@@ -78,6 +78,9 @@ def raced(fit: Fit, model: Model, starts: Sequence[Mapping[str, float]]) -> Race
     ahead = begun[: max(-(-len(begun) // HALVING), BEAM)]
     found = begun if first is RACE else [(_race(done.onward, RACE) or done, along) for done, along in ahead]
     best, along = min(found, key=lambda entry: entry[0].cost, default=(None, False))
+    if best and best.cost > fit.cost and fit.status != "converged":  # it contains the smaller model, and went astray
+        anew = (_begun(fit, models, start, along, RACE) for start in _guessed_starts(model, fit, starts))
+        best = min([best, *(done for done in anew if done is not None)], key=lambda done: done.cost)
     return best and Raced(best.onward, float(best.cost), _undamped(best.solution.residual, best.solution.jac), along)
 
 
@@ -151,10 +154,14 @@ def copies_the_angle(problem: Problem, q: Array) -> bool:
 def _own_starts(fit: Fit, model: Model, starts: Sequence[Mapping[str, float]]) -> list[dict[str, float]]:
     """Return `starts` with the larger model's own first guess, where the smaller one's fit is no place to begin (an arm
     without its weight is fitted by a motor that hardly moves): the best alone where only the current is far off."""
+    return _guessed_starts(model, fit, starts if lost(fit) else starts[:1]) if largest(fit.nrmse) > LOST else []
+
+
+def _guessed_starts(model: Model, fit: Fit, starts: Sequence[Mapping[str, float]]) -> list[dict[str, float]]:
+    """Return `starts` with a model's own first guess; none where that fails."""
     with contextlib.suppress(*FAILURES):
-        if largest(fit.nrmse) > LOST:
-            guess = first_guess(model, fit.problem.experiments, loaded=True)
-            return [{**start, **guess} for start in (starts if lost(fit) else starts[:1])]
+        guess = first_guess(model, fit.problem.experiments, loaded=True)
+        return [{**start, **guess} for start in starts]
     return []
 
 
