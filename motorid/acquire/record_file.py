@@ -79,95 +79,6 @@ def read_tail(out: Path) -> Tail:
                         "name for --out.") from None
 
 
-class RecordFile:
-    """Appends rows to a record by way of an `Appender`; gaps become rows whose measured cells are empty. `meta` is
-    written as comment lines ``# key: value`` at the head, or where a record is continued."""
-
-    def __init__(self, out: Path, channels: tuple[Channel, ...], rate: float, meta: Mapping[str, object],
-                 mode: str = "new") -> None:
-        self.out, self.rate = out, rate
-        known = [k for name in ("v", *CHANNELS) for k, c in enumerate(channels) if c.name == name]
-        self._order = known + [k for k in range(len(channels)) if k not in known]
-        self._v = next(k for k, c in enumerate(channels) if c.name == "v")
-        self.columns = ",".join(["time_s", *(column(channels[k]) for k in self._order), "sample"])
-        self._pending: list[str] = []
-        self._next, self._index0, self._time0 = 0, 0, 0.0
-        self._last = Row(-1, -1 / rate, (0.0,) * len(channels))  # at rest, before the first one
-        tail = read_tail(out) if mode == "resume" and out.stat().st_size else None
-        if tail and tail.columns != self.columns:
-            raise DataError(f"{out} has the columns {tail.columns}, but the device now sends {self.columns}. "
-                            "Record into another file.")
-        self._disk = Appender(out, mode)
-        self.note(meta)
-        self._pending += [] if tail else [self.columns + "\n"]
-        try:
-            self.flush()
-        except OSError as error:
-            self._disk.close(sync=False)
-            if mode == "new":
-                out.unlink()
-            raise UsageError(f"{out} cannot be written: {error.strerror}.") from None
-
-    @property
-    def lines(self) -> int:
-        """Number of lines written, whole."""
-        return self._disk.lines
-
-    def pause(self, tail: Tail, until: float) -> None:
-        """Mark the pause of a resumed record by one row at 0 V; what follows begins at `until` s."""
-        if tail.index >= 0:
-            self._index0, self._time0 = tail.index + 1, tail.time
-            self._pending.append(self._line(0, 1 / self.rate, self._nothing_but(0.0)))
-        self._index0, self._time0 = max(round(until * self.rate), tail.index + 2), until
-
-    def add(self, rows: list[Row], commanded: Commanded = lambda _: None) -> None:
-        """Append rows; `commanded` tells the voltage (V) of samples that were lost, where it is known."""
-        for row in rows:
-            if row.index > self._next:
-                self._fill(row, commanded)
-            self._pending.append(self._line(row.index, row.time, row.values))
-            self._next, self._last = row.index + 1, row
-
-    def mark_missing(self, until: int, commanded: Commanded = lambda _: None) -> None:
-        """Mark as missing what was made up to sample `until` (not included) and never came."""
-        if until > self._next:
-            end = Row(until, self._last.time + (until - self._next + 1) / self.rate, (math.nan,) * len(self._order))
-            self._fill(end, commanded)
-            self._next = until
-
-    def note(self, meta: Mapping[str, object]) -> None:
-        """Append comment lines ``# key: value``."""
-        self._pending += [f"# {k}: {' '.join(str(v).split())}\n" for k, v in meta.items()]
-
-    def flush(self) -> None:
-        """Hand everything to the operating system; OSError if it refuses."""
-        data = "".join(self._pending).encode()
-        self._pending.clear()
-        self._disk.append(data)
-
-    def close(self) -> None:
-        """Close the file; what was not flushed is not written."""
-        self._disk.close()
-
-    def _line(self, index: int, time_s: float, values: tuple[float, ...]) -> str:
-        measured = ("" if math.isnan(values[k]) else f"{values[k]:.9g}" for k in self._order)
-        return ",".join([f"{self._time0 + time_s:.6f}", *measured, f"{self._index0 + index}\n"])
-
-    def _nothing_but(self, v: float) -> tuple[float, ...]:
-        """Return the values of a sample of which only the voltage is known."""
-        return tuple(v if k == self._v else math.nan for k in range(len(self._order)))
-
-    def _fill(self, end: Row, commanded: Commanded) -> None:
-        """Mark the samples from the next one due up to `end` (not included) as missing."""
-        first, n = self._next, end.index - self._next
-        start, held = self._last.time, self._last.values[self._v]
-        step = (end.time - start) / (n + 1)
-        for k in range(n) if n <= min(FILL_UP_TO * self.rate, MOST_FILLED) else (0, n - 1):
-            known = commanded(first + k)
-            held = held if known is None else known
-            self._pending.append(self._line(first + k, start + (k + 1) * step, self._nothing_but(held)))
-
-
 class Appender:
     """Appends lines, which a thread carries to the disk, so that a slow one does not hold up the recording. With `mode`
     ``new`` the file must not exist; one to ``resume`` is cut back to its last whole line; else ``replace``. Raises
@@ -184,9 +95,8 @@ class Appender:
             with open(path, "rb") as file:
                 file.seek(max(0, self._size - 4096))
                 end = file.read()
-            if cut := len(end) - (end.rfind(b"\n") + 1):
-                self._size -= cut
-                os.ftruncate(self._fd, self._size)
+            self._size -= len(end) - (end.rfind(b"\n") + 1)
+            os.ftruncate(self._fd, self._size)
         self._thread = threading.Thread(target=self._keep_syncing, name=f"syncing {path}", daemon=True)
         self._thread.start()
 
@@ -230,6 +140,86 @@ class Appender:
         if size != self._synced:
             os.fsync(self._fd)
             self._synced = size
+
+
+class RecordFile(Appender):
+    """Appends rows to a record; gaps become rows whose measured cells are empty. `meta` is written as comment lines
+    ``# key: value`` at the head, or where a record is continued. What was not flushed before `close` is not written."""
+
+    def __init__(self, out: Path, channels: tuple[Channel, ...], rate: float, meta: Mapping[str, object],
+                 mode: str = "new") -> None:
+        self.out, self.rate = out, rate
+        known = [k for name in ("v", *CHANNELS) for k, c in enumerate(channels) if c.name == name]
+        self._order = known + [k for k in range(len(channels)) if k not in known]
+        self._v = next(k for k, c in enumerate(channels) if c.name == "v")
+        self.columns = ",".join(["time_s", *(column(channels[k]) for k in self._order), "sample"])
+        self._pending: list[str] = []
+        self._next, self._index0, self._time0 = 0, 0, 0.0
+        self._last = Row(-1, -1 / rate, (0.0,) * len(channels))  # at rest, before the first one
+        tail = read_tail(out) if mode == "resume" and out.stat().st_size else None
+        if tail and tail.columns != self.columns:
+            raise DataError(f"{out} has the columns {tail.columns}, but the device now sends {self.columns}. "
+                            "Record into another file.")
+        super().__init__(out, mode)
+        self.note(meta)
+        self._pending += [] if tail else [self.columns + "\n"]
+        try:
+            self.flush()
+        except OSError as error:
+            self.close(sync=False)
+            if mode == "new":
+                out.unlink()
+            raise UsageError(f"{out} cannot be written: {error.strerror}.") from None
+
+    def pause(self, tail: Tail, until: float) -> None:
+        """Mark the pause of a resumed record by one row at 0 V; what follows begins at `until` s."""
+        if tail.index >= 0:
+            self._index0, self._time0 = tail.index + 1, tail.time
+            self._pending.append(self._line(0, 1 / self.rate, self._nothing_but(0.0)))
+        self._index0, self._time0 = max(round(until * self.rate), tail.index + 2), until
+
+    def add(self, rows: list[Row], commanded: Commanded = lambda _: None) -> None:
+        """Append rows; `commanded` tells the voltage (V) of samples that were lost, where it is known."""
+        for row in rows:
+            if row.index > self._next:
+                self._fill(row, commanded)
+            self._pending.append(self._line(row.index, row.time, row.values))
+            self._next, self._last = row.index + 1, row
+
+    def mark_missing(self, until: int, commanded: Commanded = lambda _: None) -> None:
+        """Mark as missing what was made up to sample `until` (not included) and never came."""
+        if until > self._next:
+            end = Row(until, self._last.time + (until - self._next + 1) / self.rate, (math.nan,) * len(self._order))
+            self._fill(end, commanded)
+            self._next = until
+
+    def note(self, meta: Mapping[str, object]) -> None:
+        """Append comment lines ``# key: value``."""
+        self._pending += [f"# {k}: {' '.join(str(v).split())}\n" for k, v in meta.items()]
+
+    def flush(self) -> None:
+        """Hand everything to the operating system; OSError if it refuses."""
+        data = "".join(self._pending).encode()
+        self._pending.clear()
+        self.append(data)
+
+    def _line(self, index: int, time_s: float, values: tuple[float, ...]) -> str:
+        measured = ("" if math.isnan(values[k]) else f"{values[k]:.9g}" for k in self._order)
+        return ",".join([f"{self._time0 + time_s:.6f}", *measured, f"{self._index0 + index}\n"])
+
+    def _nothing_but(self, v: float) -> tuple[float, ...]:
+        """Return the values of a sample of which only the voltage is known."""
+        return tuple(v if k == self._v else math.nan for k in range(len(self._order)))
+
+    def _fill(self, end: Row, commanded: Commanded) -> None:
+        """Mark the samples from the next one due up to `end` (not included) as missing."""
+        first, n = self._next, end.index - self._next
+        start, held = self._last.time, self._last.values[self._v]
+        step = (end.time - start) / (n + 1)
+        for k in range(n) if n <= min(FILL_UP_TO * self.rate, MOST_FILLED) else (0, n - 1):
+            known = commanded(first + k)
+            held = held if known is None else known
+            self._pending.append(self._line(first + k, start + (k + 1) * step, self._nothing_but(held)))
 
 
 def _open(path: Path, mode: str) -> int:

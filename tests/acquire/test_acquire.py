@@ -410,7 +410,7 @@ def test_trouble_in_the_background_is_told_at_the_next_line(tmp_path, monkeypatc
     monkeypatch.setattr(os, "fsync", broken)
     file.add(rows(0))
     file.flush()
-    file._disk._thread.join(timeout=10)
+    file._thread.join(timeout=10)
     file.add(rows(1))
     with pytest.raises(OSError, match="Input/output"):
         file.flush()
