@@ -8,13 +8,12 @@ import tomllib
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from datetime import datetime
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 from motorid.acquire.client import Client, Link, SerialLink
 from motorid.acquire.excitation import Program, program
-from motorid.acquire.protocol import VERSION, Channel, Header
+from motorid.acquire.protocol import VERSION, Header
 from motorid.acquire.record_file import RecordFile, Tail, check_target, read_tail
 from motorid.acquire.session import Progress, Recording, Session
 from motorid.errors import DataError, UsageError, among, positive
@@ -89,8 +88,7 @@ def record(port: str | Link, out: str | Path, *, baud: int = 115_200, excite: st
         excite = tail.meta.get("excitation")
     if not (isinstance(excite, str) and "standard" in excite):  # that one asks the device for its limit
         program(excite).check(limit_voltage, 1 << 30, "the limit you gave")
-    link = SerialLink(port, baud) if isinstance(port, str) else port
-    with contextlib.closing(link):
+    with contextlib.closing(SerialLink(port, baud) if isinstance(port, str) else port) as link:
         client = Client(link)
         device = client.hello()
         header = calibrate(device, entries)
@@ -104,7 +102,11 @@ def record(port: str | Link, out: str | Path, *, baud: int = 115_200, excite: st
         file = RecordFile(out, header.channels, header.rate, head if not tail else {}, mode)
         try:
             told, kept = (next(c for c in h.channels if c.name == "v") for h in (device, header))
-            commanded = partial(_commanded, told, kept, device.rate, todo)
+
+            def commanded(index: int) -> float | None:  # what the device applies, in the units of the record
+                volts = todo.at(index, device.rate)
+                return None if volts is None else kept.scale * (volts / told.scale + told.offset - kept.offset)
+
             beside = abs(told.scale * (told.offset - kept.offset))  # what may be reported, as a calibration makes it
             most = {"v": abs(kept.scale / told.scale) * (1.01 * limits[0] + beside), "i": limits[1]}
             if tail:
@@ -115,12 +117,6 @@ def record(port: str | Link, out: str | Path, *, baud: int = 115_200, excite: st
         finally:
             with contextlib.suppress(OSError):  # told already, where it matters
                 file.close()
-
-
-def _commanded(told: Channel, kept: Channel, rate: float, todo: Program, index: int) -> float | None:
-    """The voltage that the device applies at a sample, in the units of the record."""
-    volts = todo.at(index, rate)
-    return None if volts is None else kept.scale * (volts / told.scale + told.offset - kept.offset)
 
 
 def _head(port: str | Link, header: Header, whole: Program, limits: tuple[float, float],

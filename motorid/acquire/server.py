@@ -73,8 +73,7 @@ class _Bench:
         if taken or not self.out:
             self.read_at = now
         self.out = self.out[taken:]
-        if not self.device.running and self.ran and self.pace.once and now - self.device.heard > SILENCE:
-            self.over = True
+        self.over |= not self.device.running and self.ran and self.pace.once and now - self.device.heard > SILENCE
 
     def _run(self, now: float) -> None:
         # A bench that was kept from running makes up for it as fast as it is read: late is not lost.
