@@ -191,12 +191,9 @@ class MultipleShooting:
 
 def _least_noise(problem: Problem) -> dict[str, float]:
     """Return factors for the noise of each channel, so that a nearly noise-free one does not rule the loose fit."""
-    found: dict[str, float] = {}
-    for run in problem.runs:
-        for c, sigma in run.sigma.items():
-            rms = float(np.sqrt(np.nanmean(run.experiment.outputs[c] ** 2)))
-            found[c] = max(found.get(c, 1.0), LEAST_NOISE * rms / sigma)
-    return found
+    least = [(c, LEAST_NOISE * float(np.sqrt(np.nanmean(run.experiment.outputs[c] ** 2))) / sigma)
+             for run in problem.runs for c, sigma in run.sigma.items()]
+    return {c: max(1.0, *(factor for of, factor in least if of == c)) for c, _ in least}
 
 
 def _least_squares(problem: Problem, stages: bool) -> tuple[Problem, Array]:
@@ -249,7 +246,7 @@ def _with_resets(problem: Problem, q: Array) -> list[Array]:
 
 
 def _lowest(found: list[Solved]) -> Solved:
-    return min([d for d in found if d.status == "converged"] or found, key=lambda d: d.cost)
+    return min([d for d in found if d.verdict[0] == "converged"] or found, key=lambda d: d.cost)
 
 
 def _poor(problem: Problem, q: Array) -> bool:

@@ -69,20 +69,11 @@ class Solved:
         start = self.nlp.at(z, False)
         if np.abs(start.g).max(initial=0.0) > JOINED:
             return False
-        return self.status != "converged" or (self.cost - start.f) * self.nlp.scale > SAME * max(1, start.f)
+        return self.verdict[0] != "converged" or (self.cost - start.f) * self.nlp.scale > SAME * max(1, start.f)
 
     @property
-    def status(self) -> str:
-        """``"converged"``, ``"stalled"``, ``"limit"`` or ``"failed"``."""
-        return self._verdict[0]
-
-    @property
-    def message(self) -> str:
-        """Why it ended, and what to try."""
-        return self._verdict[1] + "."
-
-    @property
-    def _verdict(self) -> tuple[str, str]:
+    def verdict(self) -> tuple[str, str]:
+        """``"converged"``, ``"stalled"``, ``"limit"`` or ``"failed"``; why it ended, and what to try."""
         status = self.result.status
         if status in GOOD:
             return "converged", "converged: the optimality conditions hold"
@@ -97,13 +88,13 @@ class Solved:
 
 def fit_of(done: Solved, seconds: float) -> Fit:
     """Return the `Fit`; FitError if the constraints cannot be kept, its message names those in conflict."""
-    problem, q = done.problem, done.q
-    if done.status == "failed" and problem.constraints and (found := contradiction(problem, q)):
+    (status, why), problem, q = done.verdict, done.problem, done.q
+    if status == "failed" and problem.constraints and (found := contradiction(problem, q)):
         raise FitError(found)
     noisy = done.mesh.noise is not None
     residuals, jac = reduced(done.mesh, done.result.z) if noisy else problem.residual_and_jacobian(q)
     name = "process noise" if noisy else "hard" if problem.constraints else "plain"
-    return Fit(problem, problem.values(q), residuals, jac / problem.scaling.slope(q), q, done.status, done.message,
+    return Fit(problem, problem.values(q), residuals, jac / problem.scaling.slope(q), q, status, f"{why}.",
                done.history, seconds, integration_error(problem, q), name, _extra(done))
 
 
