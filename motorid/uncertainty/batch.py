@@ -209,11 +209,10 @@ def _row(found: Fit) -> dict[str, Any]:
     if found.status == "failed":
         raise FitError(found.message)
     certain = covariance(found)
-    values: dict[str, Any] = {}
-    for n in found.problem.model.free_names:
-        values |= {n: found.values[n], f"{n}_std": certain.std[n]}
+    free = found.problem.model.free_names
+    values = {f"{n}{what}": of[n] for n in free for what, of in (("", found.values), ("_std", certain.std))}
     flags = [] if found.status == "converged" else [found.status]
-    flags += [f"{n} {certain.status[n]}" for n in found.problem.model.free_names if certain.status[n] != "determined"]
+    flags += [f"{n} {certain.status[n]}" for n in free if certain.status[n] != "determined"]
     if (misfit := float(np.sqrt(found.chi2 / found.dof))) > POOR:
         flags.append(f"misfit {misfit:.2g} times the noise")
     return {"status": found.status, "message": found.message, "flags": flags, **values,
