@@ -264,8 +264,7 @@ class Recording(Shown):
         """The outcome as it is written at the end of the file."""
         lost = str(self.lost) + ("" if self.tail_known else " before the last one received, then unknown")
         return {"ended": self.ended, "samples received": self.received, "samples lost": lost,
-                **({"not valid": _list(self.bad)} if self.bad else {}),
-                **({"clipped": _list(self.clipped)} if self.clipped else {})}
+                **{k: _list(n) for k, n in (("not valid", self.bad), ("clipped", self.clipped)) if n}}
 
     def card(self) -> Card:
         """Return how it ended and what was received."""

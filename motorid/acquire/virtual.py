@@ -83,8 +83,10 @@ class VirtualDevice:
         if not self._made % BLOCK:
             self._noise = self._rng.normal(0.0, NOISE, size=(BLOCK, 2)).tolist()
         noise: dict[str, float] = dict(zip(("i", "omega"), self._noise[self._made % BLOCK], strict=True))
-        raw = (_count(c, seen[c.name], noise.get(c.name, 0.0)) for c in self.header.channels)
-        line = frame("D", self._counter, self._time, *raw)
+        # At the start of a run the shaft stands in the middle of a count; what a converter shows ends with its counts.
+        raw = ((c, round(seen[c.name] / c.scale + c.offset + noise.get(c.name, 0.0))) for c in self.header.channels)
+        sent = [min(max(n, 0), c.span - 1) if c.span and not c.wraps else n for c, n in raw]
+        line = frame("D", self._counter, self._time, *sent)
         self._over = self._over + 1 if abs(seen["i"]) > self._limits[1] else 0
         self._plant.step(mv / 1e3, 1 / self.header.rate)
         self._made += 1
@@ -192,12 +194,6 @@ def virtual_bench(effect: str = "random", motor: str = "lab", seed: int = 0, rat
     """
     at_least(0, seed=seed)
     return VirtualLink(VirtualDevice(hide(effect, motor, seed), rate))
-
-
-def _count(channel: Channel, value: float, noise: float) -> int:
-    """Return the raw value that a channel sends; at the start of a run the shaft stands in the middle of a count."""
-    raw = round(value / channel.scale + channel.offset + noise)
-    return raw if channel.wraps or not channel.span else min(max(raw, 0), channel.span - 1)
 
 
 @dataclass(frozen=True, eq=False)
