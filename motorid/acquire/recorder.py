@@ -84,8 +84,7 @@ def record(port: str | Link, out: str | Path, *, baud: int = 115_200, excite: st
     entries = (read_calibration(calibration) if isinstance(calibration, str | Path)
                else _checked(dict(calibration or {}), "the calibration"))
     tail = read_tail(out) if resume and out.exists() else None  # without an excitation, it goes on with its own
-    if tail and excite is None:
-        excite = tail.meta.get("excitation")
+    excite = tail.meta.get("excitation") if tail and excite is None else excite
     if not (isinstance(excite, str) and "standard" in excite):  # that one asks the device for its limit
         program(excite).check(limit_voltage, 1 << 30, "the limit you gave")
     with contextlib.closing(SerialLink(port, baud) if isinstance(port, str) else port) as link:

@@ -225,8 +225,7 @@ def hide(words: str = "random", motor: str = "lab", seed: int = 0) -> Truth:
     def draw(low: float, high: float) -> float:
         return float(np.exp(rng.uniform(np.log(low), np.log(high))))
 
-    if words == "random":
-        words = str(rng.choice(list(plant.SIZES)))
+    words = str(rng.choice(list(plant.SIZES))) if words == "random" else words
     effects = dict(_effect(word, real, draw) for word in words.split(",") if word and word != "none")
     try:
         plant.Plant(real, effects)
