@@ -285,8 +285,7 @@ def gaps_of(mesh: Mesh, z: Array) -> Gaps:
 def first_noise(given: Any, mesh: Mesh) -> Array:
     """Return process noise to begin with, (nx,): the user's by state, or ``"auto"``; next to none in other states."""
     sizes = dict(zip(mesh.problem.system.states, mesh.scale, strict=True))
-    if given == "auto":
-        given = {n: FIRST * s for n, s in sizes.items() if n in DISTURBED}
+    given = {n: FIRST * s for n, s in sizes.items() if n in DISTURBED} if given == "auto" else given
     for name in given:
         among(name, sizes, "state", where="process_noise: ")
     return np.array([given.get(n, NEXT_TO_NONE * s) for n, s in sizes.items()])
