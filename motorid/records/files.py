@@ -20,9 +20,8 @@ MOST_BYTES = 256_000_000  # of a file that is read; a table takes about eight ti
 _LOOK = 65_536  # bytes at either end in which an output says that motorid wrote it
 # What the outputs carry: JSON, page, C, table of motors, record of an export, simulated run, figure, CasADi file.
 _OURS = re.compile(rb'"motorid": ?"(\d|unknown)|name="generator" content="motorid|[Ww]ritten by motorid|'
-                   rb'\Amotor,status,message,'
-                   rb'|"motor":"[^"]*",\s*"status"|"index_columns": \["motor"\]|\At,[\w,]*substeps\n'
-                   rb"|\A# motorid columns: |Software\0motorid")
+                   rb'\Amotor,status,message,|"motor":"[^"]*",\s*"status"|"index_columns": \["motor"\]'
+                   rb"|\At,[\w,]*substeps\n|\A# motorid columns: |Software\0motorid")
 _ODD = re.compile("[\x7f-\x9f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
 _WRONG_PLACE = (errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.EACCES, errno.EPERM, errno.EROFS, errno.ENAMETOOLONG)
 

@@ -127,8 +127,7 @@ def csv_text(run: Experiment) -> str:
 
 def find_records(paths: Path_ | Iterable[Path_]) -> list[Path]:
     """Return the files meant by names, directories and patterns, each once, in natural order."""
-    if isinstance(paths, str | os.PathLike):
-        paths = [paths]
+    paths = [paths] if isinstance(paths, str | os.PathLike) else paths
     if not isinstance(paths, Iterable):
         raise UsageError(f"expected a file, a directory, a pattern or a list of these; got {paths!r}.")
     files: dict[Path, None] = {}

@@ -200,10 +200,8 @@ def _rows(lines: list[str], dialect: Dialect, width: int, notes: list[str]) -> l
     kept, long, short = [], 0, 0
     for line in lines:
         bare = line.rstrip(ending)
-        if '"' in line or dialect.delimiter is None:
-            filled, all_cells = len(dialect.cells(bare)), len(dialect.cells(line))
-        else:
-            filled, all_cells = bare.count(dialect.delimiter) + 1, line.count(dialect.delimiter) + 1
+        filled, all_cells = (len(dialect.cells(part)) if '"' in line or dialect.delimiter is None else
+                             part.count(dialect.delimiter) + 1 for part in (bare, line))
         short += all_cells < width
         if filled > width:
             long += 1
