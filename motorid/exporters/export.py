@@ -117,8 +117,7 @@ def export(found: Fit | Model | Exported, path: str | os.PathLike[str], to: str 
         raise UsageError(f"what to write is not clear from '{target.name}': end it with {', '.join(FORMS)}, or say "
                          "to='casadi'.")
     among(form, _CONTENTS, "form")
-    if isinstance(found, Exported):
-        found = found.model
+    found = found.model if isinstance(found, Exported) else found
     model_of(found)
     with contextlib.suppress(OSError):  # said when it is written
         target.parent.mkdir(parents=True, exist_ok=True)

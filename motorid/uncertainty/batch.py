@@ -131,8 +131,7 @@ class Batch:
         first = [f"{len(poor)} of {len(good)} motors fit poorly, errors over {POOR:g} times the noise: {shown}. "
                  "Next: diagnose the records of one of them."] if poor else []
         said = [*first, str(table), *(f"{name}: failed. {why}" for name, why in self.failed.items())]
-        said += [o.text for o in self.outliers]
-        return "\n".join([*said, *([self.interrupted] if self.interrupted else [])])
+        return "\n".join([*said, *(o.text for o in self.outliers), *([self.interrupted] if self.interrupted else [])])
 
     __repr__ = __str__
 
