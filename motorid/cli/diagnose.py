@@ -13,7 +13,7 @@ from motorid.cli.console import INTERRUPTED, next_command, save_report, say_note
 from motorid.diagnosis.design_criteria import Rival
 from motorid.diagnosis.diagnose import diagnose
 from motorid.diagnosis.experiment_design import LEVELS, design_experiment
-from motorid.diagnosis.record_parts import fit_affordably
+from motorid.diagnosis.record_versions import fit_affordably
 from motorid.diagnosis.refit import INTERRUPTED as STOPPED_BY_HAND
 from motorid.diagnosis.results import Diagnosis, ladder_table, ranking_table
 from motorid.errors import DataError

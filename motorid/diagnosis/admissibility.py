@@ -94,8 +94,8 @@ def _too_large(fit: Fit, pars: Sequence[Parameter]) -> str:
                 return f"{p.name} is {number(fit.values[p.name] / made, 2)} times the largest torque of the motor"
         stalled = fit.values["g"] * top if "g" in fit.values else fit.values["K"] * top / fit.values["R"]
         if p.name == "tau_0" and p.vary and abs(fit.values[p.name]) > stalled:
-            times = number(abs(fit.values[p.name]) / max(stalled, 1e-300), 2)
-            return f"{p.name} is {times} times what the motor holds at the largest voltage"
+            share = number(abs(fit.values[p.name]) / max(stalled, 1e-300), 2)
+            return f"{p.name} is {share} times what the motor holds at the largest voltage"
         most = MOST_OFFSET if p.lower < 0 else MOST_LOST
         if p.vary and p.unit == "V" and p.null == 0 and abs(fit.values[p.name]) > most * top:
             share = percent(abs(fit.values[p.name]) / top, 2)

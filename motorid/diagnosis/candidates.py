@@ -15,11 +15,10 @@ from typing import Any
 import numpy as np
 
 from motorid.diagnosis.admissibility import MELTS, hottest, objections
-from motorid.diagnosis.cross_validation import QUICK, HeldOut
 from motorid.diagnosis.free_forms import own_levels
 from motorid.diagnosis.misspecification import LIMITER
 from motorid.diagnosis.model_comparison import COMMON, Node, beats, evidence, far, node_of, preferred, superfluous
-from motorid.diagnosis.predictive_score import Evidence, deciding
+from motorid.diagnosis.predictive_score import QUICK, Evidence, HeldOut, deciding
 from motorid.diagnosis.refit import LITTLE, GivenUp, Task, completed, hidden_in, led_on, refit, refits, widened
 from motorid.diagnosis.results import Candidate
 from motorid.diagnosis.score_test import Score, pairs_of, rank, uses_angle, with_phase_per_run, with_warm_start
@@ -176,11 +175,11 @@ class Search:
         children = [child for child, _ in found.values() if child is not None]
         inside = {name for c in children if c.objection for e in c.fit.model.effects if e.name == c.added
                   for name in e.includes if name not in found}
-        if again := [Task(node.fit, present + s.effect, s.effect, s.starts, s.drop) for s in scores
-                     if s.effect.name in inside and s.starts]:  # what is refused may hide the simpler one of its kind
-            more = zip(again, refits(again, self.map), strict=True)
-            found |= {t.name: self._judge(node, t.added, fit) for t, fit in more}
-            children = [child for child, _ in found.values() if child is not None]
+        again = [Task(node.fit, present + s.effect, s.effect, s.starts, s.drop) for s in scores
+                 if s.effect.name in inside and s.starts]  # what is refused may hide the simpler one of its kind
+        more = {t.name: self._judge(node, t.added, f) for t, f in zip(again, refits(again, self.map), strict=True)}
+        found |= more
+        children += [child for child, _ in more.values() if child is not None]
         tried = sorted((candidate for _, candidate in found.values()), key=lambda c: c.gain or 0.0)
         return children, self.listed(scores, {c.effect: c for c in tried})
 

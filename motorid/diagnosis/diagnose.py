@@ -15,7 +15,7 @@ from motorid.diagnosis.free_forms import WHERE
 from motorid.diagnosis.locate import acting_like, locate
 from motorid.diagnosis.misspecification import LIMITER
 from motorid.diagnosis.model_comparison import far
-from motorid.diagnosis.record_parts import parts_remark
+from motorid.diagnosis.record_versions import parts_remark
 from motorid.diagnosis.refit import with_lags_exchanged
 from motorid.diagnosis.remainder import Remainder
 from motorid.diagnosis.results import Diagnosis
@@ -128,7 +128,7 @@ def _told(found: Climb, misread: str, driven: str, validated: bool) -> Diagnosis
         details += [missing.text, words.rises_text(ladder.rungs)]
     else:
         verdict, where, judged = "adequate", None, remaining
-        answer, *details = words.adequate_text(judged, ranking, bool(far(ladder.best)), ladder.best.mostly_noise)
+        answer, *details = words.adequate_text(judged, ranking, ladder.best)
     kind = "structure" if not remaining.adequate else "fluctuation" if far(ladder.best) else "noise"
     if not names:
         details.append(words.unseen_remark(found.search.unseen(last), fit.model.base))

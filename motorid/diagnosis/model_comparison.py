@@ -11,8 +11,7 @@ from functools import lru_cache, reduce
 
 import numpy as np
 
-from motorid.diagnosis.cross_validation import HeldOut
-from motorid.diagnosis.predictive_score import Evidence, Predictions, compare, finer
+from motorid.diagnosis.predictive_score import Evidence, HeldOut, Predictions, compare, finer
 from motorid.diagnosis.thresholds import FINER, LARGER, MOST, SEARCHED, TRIFLE
 from motorid.estimation.fit import follows
 from motorid.estimation.result import Fit

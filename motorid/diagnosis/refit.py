@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from motorid.diagnosis.cross_validation import QUICK, ROUGH
 from motorid.diagnosis.model_comparison import far, size_of
+from motorid.diagnosis.predictive_score import QUICK, ROUGH
 from motorid.diagnosis.score_test import believable_start, uses_angle
 from motorid.diagnosis.thresholds import MATERIAL, NATS
 from motorid.errors import OutOfTime

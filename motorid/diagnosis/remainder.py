@@ -22,11 +22,10 @@ import numpy as np
 
 from motorid.channels import COMPUTED_INPUTS
 from motorid.diagnosis import free_forms
-from motorid.diagnosis.cross_validation import QUICK, HeldOut
 from motorid.diagnosis.free_forms import FINER, PAST, PLACE, WHERE, Form, Span
 from motorid.diagnosis.misspecification import FormGain, better_forms, chosen_functions, pitches_of, tells_the_zero
 from motorid.diagnosis.model_comparison import Node, at_noise, far
-from motorid.diagnosis.predictive_score import Evidence, Predictions, compare
+from motorid.diagnosis.predictive_score import QUICK, Evidence, HeldOut, Predictions, compare
 from motorid.diagnosis.refit import refit
 from motorid.display.numbers import listed, number, percent
 from motorid.effects import PER_RUN
@@ -116,11 +115,6 @@ class Part:
     def by_run(self) -> bool:
         """Tell whether it is one size that is another in every run."""
         return self.form.on == "run"
-
-    @property
-    def doc(self) -> str:
-        """What its sizes are."""
-        return "relative to the first run" if self.by_run else "coefficient of the curve"
 
     @cached_property
     def functions(self) -> list[str]:
@@ -215,7 +209,8 @@ class Curve:
         parameters = []
         for part, sizes, places in self._apart(self.sizes.items()):
             unit = part.unit(self.fit)
-            parameters += [P(c, unit, null=0.0, given=not part.by_run, per_run=part.by_run, doc=part.doc)(n)
+            parameters += [P(c, unit, null=0.0, given=not part.by_run, per_run=part.by_run,
+                             doc="relative to the first run" if part.by_run else "coefficient of the curve")(n)
                            for n, c in sizes]
             usual, words = part.place  # a fit rounds what is at its limit
             parameters += [P(min(max(c, low), high), unit.partition(":")[0], lower=low, upper=high, given=True,
@@ -249,11 +244,9 @@ class Curve:
         """The curve as Python source of an effect."""
         pars = []
         for p in self.effect.parameters:
-            if p.per_run:
-                pars.append(f'    {p.name}=mi.P(0.0, "{p.unit}", null=0.0, per_run=True, doc="{p.doc}"),')
-                continue
             rest = "null=0.0" if p.null == 0 else f'lower={p.lower:.9g}, upper={p.upper:.9g}, doc="{p.doc}"'
-            pars.append(f'    {p.name}=mi.P({p.value:.9g}, "{p.unit}", given=True, {rest}),')
+            rest = f"{rest}, per_run=True" if p.per_run else f"given=True, {rest}"
+            pars.append(f'    {p.name}=mi.P({p.value:.9g}, "{p.unit}", {rest}),')
         known = [f"    Nearest closed form{' of the first part' * (len(self.parts) > 1)}: {text} (misses "
                  f"{percent(miss, 2)} of it)." for text, miss in self.nearest()[:1]]
         if "encoder_zero" in self.fit.model.effect_names:
@@ -288,13 +281,11 @@ class Curve:
         part = self.parts[0]
         z = np.concatenate([s[part.form.on] for s in self._signals])
         _, sizes, places = next(self._apart(self.values))
-        each = [free_forms.values_of(part.terms(places), part.form, s) for s in self._signals]
+        values = np.concatenate([free_forms.values_of(part.terms(places), part.form, s) for s in self._signals])
+        curve = values @ np.array(sizes)
         if part.by_run and self.fitted is not None:
-            firsts = self.fitted.problem.unknowns.firsts
-            own = [self.fitted.initial.get(f"{self.name}_0[{k}]", 0.0) for k in firsts]
-            each = [size * ones for size, ones in zip(own, each, strict=True)]
-            sizes = [1.0]
-        curve = np.concatenate(each) @ np.array(sizes)
+            own = [self.fitted.initial.get(f"{self.name}_0[{k}]", 0.0) for k in self.fitted.problem.unknowns.firsts]
+            curve = np.array(own)[z.astype(int)]
         return z, eval(POSITIVE, {"ca": np, "curve": curve}) if part.form.carrier == "acceleration" else curve
 
     @cached_property

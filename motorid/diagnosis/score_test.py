@@ -13,7 +13,7 @@ import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -310,17 +310,16 @@ class Added:
         at = self._at({**values, **null})
         to = np.zeros((len(at.p), len(sizes)))
         to[[self._problem.system.parameters.index(p.name) for p in sizes], range(len(sizes))] = 1.0
-        parts = []
-        for k in range(len(self._problem.runs)):
-            traj = self._run(k, at, self._problem.unknowns.first_slopes(at, k, to), to)
-            parts.append(self._problem.run_residual(k, traj)[1])
-        return np.vstack(parts)
+        each = (self._run(k, at, self._problem.unknowns.first_slopes(at, k, to), to)
+                for k in range(len(self._problem.runs)))
+        slopes: list[Any] = [m.residual(traj)[1] for m, traj in zip(self._problem.measured, each, strict=True)]
+        return np.vstack(slopes)
 
     def _change(self, values: Mapping[str, float]) -> Array | None:
         """Return the change (n,) that the effect makes at finite `values`."""
         at, fit = self._at(values), self.fit
         try:
-            parts = [self._problem.run_residual(k, self._run(k, at))[0] for k in range(len(self._problem.runs))]
+            parts = [m.residual(self._run(k, at))[0] for k, m in enumerate(self._problem.measured)]
         except SimulationError:
             return None
         plain = fit.residuals if fit.problem.loss is None else fit.problem.tuned(loss=None).residual(fit.q)

@@ -19,12 +19,17 @@ import numpy as np
 from motorid.diagnosis.adequacy import following, judge_adequacy, within_noise
 from motorid.diagnosis.admissibility import run_through
 from motorid.diagnosis.candidates import Search, Stages, library
-from motorid.diagnosis.cross_validation import QUICK, HeldOut
-from motorid.diagnosis.input_hypotheses import Reading, better_reading, without_spikes
 from motorid.diagnosis.misspecification import IN_ITS_PLACE, FormGain, Grade, better_forms, grades_of, outdoes, swallows
 from motorid.diagnosis.model_comparison import Node, at_noise, beats, choose, evidence, far, group_of, node_of
-from motorid.diagnosis.predictive_score import is_sure
-from motorid.diagnosis.record_parts import affordable, fitted_to, thinned_alike
+from motorid.diagnosis.predictive_score import QUICK, HeldOut, is_sure
+from motorid.diagnosis.record_versions import (
+    Reading,
+    affordable,
+    better_reading,
+    fitted_to,
+    thinned_alike,
+    without_spikes,
+)
 from motorid.diagnosis.refit import BEAM, BEHIND, INTERRUPTED, OUT_OF_TIME
 from motorid.diagnosis.remainder import alone_leaving_noise, beside_leaving_noise
 from motorid.diagnosis.results import Adequacy, Candidate, Ladder, Rung

@@ -38,15 +38,13 @@ def first_answer(fit: Fit, judged: Adequacy, scores: Sequence[Score]) -> str:
     return f"first answer: {fit.verdict}{next_}"
 
 
-def adequate_text(judged: Adequacy, ranking: Sequence[Candidate], large: bool = False,
-                  noisy: bool = False) -> tuple[str, str]:
-    """Return the answer when nothing is missing, and how many effects were tried; `large`: errors beyond the noise;
-    `noisy`: this is most of the records."""
+def adequate_text(judged: Adequacy, ranking: Sequence[Candidate], last: Fit) -> tuple[str, str]:
+    """Return the answer when nothing is missing, of the last model, and how many effects were tried."""
     tried = f"{judged.text} None of the {len(ranking)} effects tried is worth adding." if ranking else judged.text
-    if large:
+    if far(last):
         why = judged.hum or "they fluctuate by themselves, or the noise is slow"
         return f"Nothing that depends on the motion is missing, but the errors are larger than the noise: {why}.", tried
-    if noisy:
+    if last.mostly_noise:
         return "These records are mostly noise: nothing that is missing would show in them.", tried
     if judged.p_value <= judged.false_alarm:
         return "Nothing that matters is missing: the errors are within the noise.", tried
@@ -94,18 +92,17 @@ def _nearest(rungs: Sequence[Rung], grades: Sequence[Grade],
     nearest = [g for g in grades if shares.get(g.effect, 0.0) == share]
     if share <= (0.0 if any(g.form for g in grades) else MOST):
         return "", share, []
-    said, alone = " with ".join(_described(rungs[-1].fit, g.effect) for g in nearest), ""
+    said = " with ".join(_described(rungs[-1].fit, g.effect) for g in nearest)
+    removes = "removes" if len(nearest) == 1 else "remove"
     if any(OPEN in text for text in (said, *(g.why for g in nearest))):
         others = {c.refit_drop or 0.0: _described(c.fit, c.effect) for c in ranking if c.fit and not c.fit.per_run
                   and ", but " not in c.reason and all(c.effect != g.effect for g in grades)}
         known = {drop: text for drop, text in others.items() if drop > UNCONTESTED * share and OPEN not in text}
         if known:
-            share, alone, nearest = max(known), " alone", []
-            said = known[share]
+            said, share, removes, nearest = known[max(known)], max(known), "alone removes", []
         elif any(g.form for g in grades):
             return "", share, []
-    some = "s" * (len(nearest) < 2)
-    return f"{said}, which{alone} remove{some} {percent(share, 2)} of the squared error", share, nearest
+    return f"{said}, which {removes} {percent(share, 2)} of the squared error", share, nearest
 
 
 def approximations_text(grades: Sequence[Grade], what: str = "it") -> str:

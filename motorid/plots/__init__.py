@@ -1,9 +1,7 @@
 """Figures, one function per result; the only place that imports matplotlib."""
 
-from motorid.plots.constraints import plot_current_limit, plot_formulations
-from motorid.plots.diagnosis import plot_answer, plot_design, plot_ladder, plot_missing, plot_ranking
-from motorid.plots.fits import plot_fit, plot_parameters, plot_runs
-from motorid.plots.residuals import plot_residuals
+from motorid.plots.diagnosis import plot_answer, plot_design, plot_ladder, plot_missing, plot_ranking, plot_residuals
+from motorid.plots.fits import plot_current_limit, plot_fit, plot_formulations, plot_parameters, plot_runs
 from motorid.plots.uncertainty import plot_profile, plot_sensitivities, plot_singular_values, plot_waterfall
 
 __all__ = ["plot_answer", "plot_current_limit", "plot_design", "plot_fit", "plot_formulations", "plot_ladder",

@@ -264,10 +264,6 @@ class Problem:
         """The records as residuals see them, one per run."""
         return tuple(Measured.of(run, self.outputs, self.weights, self.noise_factors) for run in self.runs)
 
-    def run_residual(self, k: int, traj: Trajectory) -> tuple[Array, Array | None]:
-        """Return whitened residual and Jacobian, before the loss, of run `k`, without missing samples."""
-        return self.measured[k].residual(traj)
-
     def unstack(self, rows: Array, missing: float = np.nan) -> list[Array]:
         """Return stacked rows (n, …) of the outputs as (N, ny, …) per run, `missing` where there was no sample."""
         ends = np.cumsum([m.size for m in self.measured])
@@ -297,7 +293,8 @@ class Problem:
         q = np.asarray(q, float)
         at = self.unknowns.point(q)
         trajs = [self._simulate(at, k, derivatives) for k in range(len(self.runs))]
-        parts: list[tuple[Array, Any]] = [self.with_loss(*self.run_residual(k, t)) for k, t in enumerate(trajs)]
+        each = zip(self.measured, trajs, strict=True)
+        parts: list[tuple[Array, Any]] = [self.with_loss(*m.residual(traj)) for m, traj in each]
         parts += [prior_residual(self.priors, self.unknowns, at)] if self.priors else []
         parts += [penalty.evaluate(self, q, trajs) for penalty in self.penalties]
         if len(parts) == 1:

@@ -210,7 +210,7 @@ def with_angles_apart(problem: Problem) -> Problem:
         for value in TURN.tolist() if parameter.unit == "rad" else ():
             q[j] = value / problem.scaling.scale[j]
             with contextlib.suppress(SimulationError):
-                r, _ = problem.run_residual(k, problem.simulate(q, k, derivatives=False))
+                r, _ = problem.measured[k].residual(problem.simulate(q, k, derivatives=False))
                 costs[value] = float(r @ r)
         # of those a period apart the nearest
         near = [z for z, cost in costs.items() if cost < ALIKE * min(costs.values())]

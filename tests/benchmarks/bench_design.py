@@ -20,9 +20,8 @@ import numpy as np
 
 import motorid as mi
 from motorid.diagnosis import experiment_design as ed
-from motorid.diagnosis.cross_validation import HeldOut
 from motorid.diagnosis.model_comparison import beats, node_of
-from motorid.diagnosis.predictive_score import predictions_left_out
+from motorid.diagnosis.predictive_score import HeldOut, predictions_left_out
 from motorid.records.datasets import load_plant
 
 PLANT = load_plant()

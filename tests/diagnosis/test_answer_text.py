@@ -142,8 +142,11 @@ def test_nearest_is_a_pair_by_what_both_removed_and_what_is_determined(rng):
 def test_errors_beyond_the_noise_are_in_the_answer_where_nothing_is_missing():
     judged = SimpleNamespace(text="The errors (speed 4 times the noise) do not depend on the motion.", p_value=0.5,
                              false_alarm=0.02, hum="")
-    small, large = (adequate_text(judged, (), beyond)[0] for beyond in (False, True))
-    assert adequate_text(judged, (), noisy=True)[0].startswith("These records are mostly noise")
+    quiet, loud = (SimpleNamespace(problem=SimpleNamespace(outputs=["omega"]), misfit={"omega": m},
+                                   nrmse={"omega": 0.1}, mostly_noise=False) for m in (1.0, 4.0))
+    small, large = (adequate_text(judged, (), last)[0] for last in (quiet, loud))
+    quiet.mostly_noise = True
+    assert adequate_text(judged, (), quiet)[0].startswith("These records are mostly noise")
     assert small == "Nothing is missing: the errors do not depend on the motion."
     assert "larger than the noise" in large
 

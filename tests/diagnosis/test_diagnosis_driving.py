@@ -11,8 +11,8 @@ from command import motorid_json
 
 import motorid as mi
 from motorid.channels import channel_name
-from motorid.diagnosis import input_hypotheses as readings
-from motorid.diagnosis.input_hypotheses import better_reading
+from motorid.diagnosis import record_versions as readings
+from motorid.diagnosis.record_versions import better_reading
 from motorid.display.numbers import number
 from motorid.records.checks import contradictions, dead_times
 from motorid.records.reading import write_csv

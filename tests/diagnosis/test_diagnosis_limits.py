@@ -12,11 +12,11 @@ from lab_records import simulated
 
 import motorid as mi
 from motorid.diagnosis import candidates, stepwise
-from motorid.diagnosis import record_parts as parts
+from motorid.diagnosis import record_versions as parts
 from motorid.diagnosis.admissibility import objections, samples_within, unresolved
 from motorid.diagnosis.candidates import Search, Stages, library
-from motorid.diagnosis.cross_validation import QUICK
 from motorid.diagnosis.model_comparison import node_of
+from motorid.diagnosis.predictive_score import QUICK
 from motorid.diagnosis.score_test import believable_start, score
 from motorid.effects import LIBRARY
 from motorid.errors import ModelError

@@ -11,10 +11,10 @@ from battery.excite import P, driven, record
 
 import motorid as mi
 from motorid.diagnosis.adequacy import adequacy, judge_adequacy
-from motorid.diagnosis.cross_validation import HeldOut
 from motorid.diagnosis.free_forms import Form
 from motorid.diagnosis.misspecification import better_forms, hum_of
 from motorid.diagnosis.model_comparison import node_of
+from motorid.diagnosis.predictive_score import HeldOut
 from motorid.diagnosis.score_test import Score
 from motorid.diagnosis.verdict import _noise_feedback, closed_loop_remark, outliers_remark
 from motorid.effects import LIBRARY

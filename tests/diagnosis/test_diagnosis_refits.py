@@ -12,9 +12,9 @@ from lab_records import noisy, simulated
 
 import motorid as mi
 from motorid.diagnosis import candidates as search
-from motorid.diagnosis import cross_validation as held
 from motorid.diagnosis import misspecification as grades
-from motorid.diagnosis import record_parts as parts
+from motorid.diagnosis import predictive_score as held
+from motorid.diagnosis import record_versions as parts
 from motorid.diagnosis import refit as trial
 from motorid.diagnosis import score_test as ranking
 from motorid.diagnosis import stepwise
@@ -611,8 +611,8 @@ def test_what_was_found_on_whole_records_is_kept_where_it_explains_windows_of_th
 
 
 def test_a_refit_above_the_model_that_it_contains_begins_anew_at_a_guess_of_its_own():
-    """Of a bridge that opens in its pauses the plain motor is fitted by one that hardly moves; of a real one refits from
-    there ended above it, and backlash was named."""
+    """Of a bridge that opens in its pauses the plain motor is fitted by one that hardly moves; of a real one refits
+    from there ended above it, and backlash was named."""
     t = np.arange(900) * 0.03
     true = mi.dc_motor(R=1.0, L=1e-2, K=0.5, b=0.02, J=0.35) + mi.effects.pwm_coast(s_c=0.8, V_s=10.9)
     whole = simulated(t, np.repeat([6.5, 9.0, 7.5, 10.9, 6.5, 8.2], 150), ("omega",), true)

@@ -15,8 +15,8 @@ import motorid as mi
 from motorid.diagnosis.adequacy import adequacy
 from motorid.diagnosis.admissibility import run_through
 from motorid.diagnosis.candidates import Search, Stages
-from motorid.diagnosis.input_hypotheses import Reading
 from motorid.diagnosis.predictive_score import deciding, finer
+from motorid.diagnosis.record_versions import Reading
 from motorid.diagnosis.score_test import rank, score
 from motorid.diagnosis.thresholds import FINER, FINER_RATE, LARGER
 from motorid.effects import LIBRARY

@@ -22,11 +22,10 @@ from motorid.diagnosis import (
 from motorid.diagnosis.adequacy import adequacy
 from motorid.diagnosis.admissibility import objections
 from motorid.diagnosis.candidates import library
-from motorid.diagnosis.cross_validation import HeldOut
 from motorid.diagnosis.free_forms import Form
 from motorid.diagnosis.misspecification import FormGain, Grade
 from motorid.diagnosis.model_comparison import node_of, tied
-from motorid.diagnosis.predictive_score import Evidence, Predictions
+from motorid.diagnosis.predictive_score import Evidence, HeldOut, Predictions
 from motorid.diagnosis.results import Candidate
 from motorid.diagnosis.stepwise import _outdoing, _runners_up
 from motorid.effects import LIBRARY

@@ -11,11 +11,11 @@ from battery.excite import driven, record
 
 import motorid as mi
 from motorid.diagnosis import stepwise
-from motorid.diagnosis.cross_validation import HeldOut
 from motorid.diagnosis.model_comparison import evidence, node_of
 from motorid.diagnosis.predictive_score import (
     Errors,
     Evidence,
+    HeldOut,
     Predictions,
     blocks_of,
     compare,

@@ -20,7 +20,6 @@ from motorid.channels import COMPUTED_INPUTS
 from motorid.cli.options import own_effects
 from motorid.diagnosis import free_forms, remainder, stepwise
 from motorid.diagnosis import misspecification as grades
-from motorid.diagnosis.cross_validation import HeldOut
 from motorid.diagnosis.free_forms import (
     PAST,
     Form,
@@ -34,6 +33,7 @@ from motorid.diagnosis.free_forms import (
     values_of,
 )
 from motorid.diagnosis.locate import locate
+from motorid.diagnosis.predictive_score import HeldOut
 from motorid.diagnosis.remainder import Curve, Part, Remainder
 from motorid.estimation.fit import over_moments, solve
 from motorid.exporters.export import load

@@ -141,7 +141,7 @@ class Mesh:
         problem = self.problem
         blocks = []
         for k in range(len(problem.runs)):
-            r, jac = problem.with_loss(*problem.run_residual(k, walk.runs[k]))
+            r, jac = problem.with_loss(*problem.measured[k].residual(walk.runs[k]))
             index = problem.measured[k].index
             rows = np.arange(len(r)) if index is None else index
             blocks += self._by_interval(r, jac, self.owner[k][rows // len(problem.outputs)])
