@@ -175,7 +175,7 @@ class Fit(Shown):
                 "does, a diagnosis tells",
                 "poor": f"Fits poorly: errors {factor(times, 'up to ')} times the noise",
                 "lost": "Does not fit: predicting zero would be closer"}[self.fits]
-        if self.mostly_noise and self.fits == "noise":
+        if self.fits == "noise" and self.mostly_noise:
             said = "Fits records that are mostly noise" + said.removeprefix("Fits")
         known = not self.problem.unknown or any([*self.std.values(), *self.determined])
         if self.status != "failed" and (not moving(self.nrmse) or (self.fits == "noise" and not known)):

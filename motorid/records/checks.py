@@ -586,9 +586,9 @@ def magnitudes(run: Experiment) -> str | None:
         if values is not None and run.units[channel] == unit and (top := float(np.nanmax(np.abs(values)))) > limit:
             was = f" (read as {stated[channel]})" if channel in stated else ""
             if channel == "v" and (top in TIMERS or stated.get(channel, "")[:1].isdigit()):
-                whole = "that unit is the voltage of a whole duty cycle. " * (top not in TIMERS)
-                return (f"v reaches {top:.5g} V{was}: {whole}Is the column in per cent, or in counts of a timer? Then "
-                        f"give the voltage of one, of a supply of 12 V: units={{'v': '{12 / top:.2g} V'}}.")
+                one = 12 / top if top in TIMERS else 0.12
+                return (f"v reaches {top:.5g} V{was}: is the column a duty cycle, in per cent or in counts of a timer? "
+                        f"Then give the voltage of one: units={{'v': '{one:.2g} V'}}.")
             return f"{channel} reaches {top:.4g} {unit}{was}; {_remedy(run, channel, likely)}"
     if run.dt > 0.2:
         likely = "ms" if run.dt < 200 else "us"

@@ -128,7 +128,8 @@ def test_a_duty_in_per_cent_read_as_a_share_is_said(tmp_path):
         read_csv(tmp_path / "a.csv")
     right, wrong = (read_csv(tmp_path / "a.csv", columns={"v": "duty_pct"}, units={"v": u}) for u in ("0.12 V", "12 V"))
     assert right.inputs["v"].max() < 12
-    assert "Is the column in per cent" in said(wrong)
+    assert "is the column a duty cycle, in per cent" in said(wrong)
+    assert "units={'v': '0.12 V'}" in said(wrong)
 
 
 def test_a_speed_of_no_stated_unit_is_suspected_sooner(tmp_path):
