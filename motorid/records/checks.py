@@ -535,11 +535,11 @@ def unsigned_voltage(run: Experiment) -> str | None:
 
 
 def _reverses_alone(run: Experiment) -> str | None:
-    """As fast backwards, under as much voltage: no load does that, and what swings does not run along (`RUNNING`)."""
+    """As fast backwards, under as much voltage, for more than a slip: no load does so, what swings is not `RUNNING`."""
     v, omega = run.inputs["v"], np.asarray(_speed(run))
     back, ahead = np.maximum(-omega, 0), np.maximum(omega, 0)
-    if (min(back.max(), ahead.max()) < 0.5 * np.abs(omega).max() or _cosine(v, np.abs(omega)) < RUNNING
-            or v @ back / back.sum() < 0.9 * (v @ ahead / ahead.sum())):
+    short = any(min(f(back), f(ahead)) < share * f(np.abs(omega)) for f, share in ((np.max, 0.5), (np.sum, 0.1)))
+    if short or _cosine(v, np.abs(omega)) < RUNNING or v @ back / back.sum() < 0.9 * (v @ ahead / ahead.sum()):
         return None
     return ("the speed reverses although the voltage never does, and is as fast both ways under as much of it: is the "
             "voltage without its sign (a duty cycle beside a direction)? Give it that of the direction.")

@@ -311,7 +311,8 @@ def test_a_speed_that_reverses_alone_is_told(plant, lab, channel):
     assert "without its sign" in text
 
 
-@pytest.mark.parametrize("case", ["hoist", "spring", "spring at a constant voltage", "coasting", "one quadrant"])
+@pytest.mark.parametrize("case", ["hoist", "spring", "spring at a constant voltage", "coasting", "one quadrant",
+                                  "slip"])
 def test_a_motor_that_is_turned_back_is_not_taken_for_a_voltage_without_its_sign(plant, lab, case, rng):
     v = np.repeat([3.0, 1.0, 2.5, 0.5, 3.0, 0.0, 2.0, 3.0], 300)
     t = 5e-3 * np.arange(len(v))
@@ -325,6 +326,8 @@ def test_a_motor_that_is_turned_back_is_not_taken_for_a_voltage_without_its_sign
     elif case == "coasting":  # thrown backwards, then driven
         v[:300] = 0.0
         outputs = {"omega": np.where(t < 1.5, -40 * np.exp(-t / 0.5), 15 * v)}
+    elif case == "slip":  # of the counter, where the current is switched on
+        outputs = {"omega": np.where((t > 6.0) & (t < 6.03), -40.0, 15 * v)}
     else:
         outputs = {"omega": duty(plant, lab, v)[1] + 0.1 * rng.normal(size=len(v))}
     text = said(Experiment(t, {"v": v}, outputs))
