@@ -119,14 +119,14 @@ def approximations_text(grades: Sequence[Grade], what: str = "it") -> str:
 
 def missing_text(rungs: Sequence[Rung], remaining: Adequacy, groups: Sequence[Sequence[str]],
                  grades: Sequence[Grade], elsewhere: bool = False, stopped: str = "") -> str:
-    """Return the answer when effects were found: what, how large, what the error becomes, what remains.
-
-    `elsewhere`: the held-out runs are predicted far worse than the fitted ones. `stopped`: why before all were tried.
+    """Return the answer when effects were found: what, how large, what the error becomes, what remains. `elsewhere`:
+    held-out runs are predicted far worse than the fitted ones. `stopped`: why before all were tried.
     """
     after = rungs[-1].fit
-    names = [g.effect for g in grades if g.grade != "approximates"]
+    names, (near, share, nearest) = [g.effect for g in grades if g.grade != "approximates"], _nearest(rungs, grades, ())
+    first = [f"something close to {near}"] * (share > MOST and {g.grade for g in nearest} == {"approximates"})
     lead = f"Missing so far ({stopped})" if stopped else "Missing"
-    parts = [f"{lead}: {'; '.join(_described(after, n) for n in names)}."]
+    parts = [f"{lead}: {'; '.join([*first, *(_described(after, n) for n in names)])}."]
     parts += [f"These records do not distinguish {g[0]} from {' or '.join(g[1:])}." for g in groups]
     parts += [approximations_text(grades, "the rest")] if len(names) < len(grades) else []
     parts += [errors_text(rungs), _left(after, remaining, " on the fitted runs, not on the held-out ones" * elsewhere)]

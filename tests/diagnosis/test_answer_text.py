@@ -118,6 +118,7 @@ def test_nearest_is_a_pair_by_what_both_removed_and_what_is_determined(rng):
     plain, t = mi.dc_motor(R=2.0, L=2e-3, K=0.05, b=4e-5, J=3e-5), np.arange(600) * 2e-3
     known = plain + mi.effects.coulomb(tau_c=5e-3) + mi.effects.viscous_asymmetric(b_a=1e-5)
     run = noisy(simulated(t, 6 * np.sign(np.sin(9 * t + 0.1)), model=known), rng)
+    filtered = mi.fit(known + mi.effects.speed_filter, run)
     known = mi.fit(known, run)
     rungs = [Rung(added, known, {"omega": e}, None, removed) for added, e, removed in (
         (None, 0.040, ()), ("coulomb_asymmetric", 0.027, ()),
@@ -129,6 +130,12 @@ def test_nearest_is_a_pair_by_what_both_removed_and_what_is_determined(rng):
     assert "[coulomb]" in answer.split(" with ")[0]
     assert "[viscous_asymmetric]" in answer
     assert "which remove 64 % of the squared error" in answer
+    largest = [*grades[:1], Grade("viscous_asymmetric", "approximates"), Grade("speed_filter", "named")]
+    answer = missing_text([*rungs[:3], replace(rungs[3], fit=filtered)], remaining, (), largest)
+    assert answer.startswith("Missing: something close to dry (Coulomb) friction [coulomb], ")  # what removes most first
+    assert "of the squared error; second-order filter of the speed [speed_filter]" in answer
+    named = [Grade("coulomb", "named"), *largest[1:]]
+    assert "something close to" not in missing_text([*rungs[:3], replace(rungs[3], fit=filtered)], remaining, (), named)
     open_ = [Grade("coulomb", "approximates", "R_th and C_th are not determined, and the rest is not noise")]
     rungs = [rungs[0], Rung("coulomb", known, {"omega": 0.004}, None)]
     rubs = Candidate("coulomb", 0.3, fit=mi.fit(plain + mi.effects.coulomb, run), refit_drop=0.97)
