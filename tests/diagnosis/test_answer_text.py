@@ -132,7 +132,7 @@ def test_nearest_is_a_pair_by_what_both_removed_and_what_is_determined(rng):
     assert "which remove 64 % of the squared error" in answer
     largest = [*grades[:1], Grade("viscous_asymmetric", "approximates"), Grade("speed_filter", "named")]
     answer = missing_text([*rungs[:3], replace(rungs[3], fit=filtered)], remaining, (), largest)
-    assert answer.startswith("Missing: something close to dry (Coulomb) friction [coulomb], ")  # what removes most first
+    assert answer.startswith("Missing: something close to dry (Coulomb) friction [coulomb], ")
     assert "of the squared error; second-order filter of the speed [speed_filter]" in answer
     named = [Grade("coulomb", "named"), *largest[1:]]
     assert "something close to" not in missing_text([*rungs[:3], replace(rungs[3], fit=filtered)], remaining, (), named)
