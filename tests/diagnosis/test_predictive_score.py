@@ -433,12 +433,15 @@ def test_an_order_that_was_searched_for_is_paid_for():
     assert evidence(cogs, bare).gain == pytest.approx(np.log(SEARCHED))
 
 
+SHARED = SimpleNamespace(per_run={})  # a fit without sizes of every run's own
+
+
 def test_a_child_that_may_not_be_taken_does_not_keep_a_worse_one_out(rng):
     """What gains most may come from another model of the beam, and predict held-out runs worse than the best."""
     r, h = rng.normal(size=(2, 1000))
 
     def node(added, fitted, held_out):
-        return SimpleNamespace(added=added, key={added}, size=6, search=0.0, objection="",
+        return SimpleNamespace(added=added, key={added}, size=6, search=0.0, objection="", fit=SHARED,
                                predictions=both(fitted, held_out))
 
     best, refused, sound = node("coulomb", r, h), node("gravity", 0.2 * r, 1.5 * h), node("cogging", 0.5 * r, 0.9 * h)
@@ -454,7 +457,7 @@ def test_what_physics_speaks_against_must_help_on_held_out_runs(rng, there, take
     def node(objection, fitted, share):
         predictions = both(fitted, h if there is None else share * h)
         predictions = predictions if there is not None else replace(predictions, held_out={})
-        return SimpleNamespace(added="stribeck", key={"stribeck"}, size=6, search=0.0, objection=objection,
+        return SimpleNamespace(added="stribeck", key={"stribeck"}, size=6, search=0.0, objection=objection, fit=SHARED,
                                predictions=predictions)
 
     found = stepwise._better([node("omega_s runs to its limit", 0.5 * r, there)], node("", r, 1.0))
