@@ -92,9 +92,9 @@ def _too_large(fit: Fit, pars: Sequence[Parameter]) -> str:
                        fit.values["K"] * float(np.abs(s.states["i"]).max()) for s in fit.simulations)
             if fit.values[p.name] > made:
                 return f"{p.name} is {number(fit.values[p.name] / made, 2)} times the largest torque of the motor"
-        stalled = fit.values["g"] * top if "g" in fit.values else fit.values["K"] * top / fit.values["R"]
-        if p.name == "tau_0" and p.vary and abs(fit.values[p.name]) > stalled:
-            share = number(abs(fit.values[p.name]) / max(stalled, 1e-300), 2)
+        holds = fit.values.get("g", fit.values.get("K", 0.0) / max(fit.values.get("R", 1.0), 1e-300)) * top
+        if p.name == "tau_0" and p.vary and abs(fit.values[p.name]) > holds > 0 and far(fit):  # which drags it, else
+            share = number(abs(fit.values[p.name]) / holds, 2)
             return f"{p.name} is {share} times what the motor holds at the largest voltage"
         most = MOST_OFFSET if p.lower < 0 else MOST_LOST
         if p.vary and p.unit == "V" and p.null == 0 and abs(fit.values[p.name]) > most * top:

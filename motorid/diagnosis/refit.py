@@ -78,7 +78,8 @@ def raced(fit: Fit, model: Model, starts: Sequence[Mapping[str, float]]) -> Race
     ahead = begun[: max(-(-len(begun) // HALVING), BEAM)]
     found = begun if first is RACE else [(_race(done.onward, RACE) or done, along) for done, along in ahead]
     best, along = min(found, key=lambda entry: entry[0].cost, default=(None, False))
-    if best and best.cost > fit.cost and fit.status != "converged":  # it contains the smaller model, and went astray
+    open_ = fit.status != "converged" and not lost(fit)
+    if best and open_ and best.cost > HARDLY * fit.cost:  # it does all that the smaller model does, and went astray
         anew = (_begun(fit, models, start, along, RACE) for start in _guessed_starts(model, fit, starts))
         best = min([best, *(done for done in anew if done is not None)], key=lambda done: done.cost)
     return best and Raced(best.onward, float(best.cost), _undamped(best.solution.residual, best.solution.jac), along)

@@ -79,14 +79,12 @@ def unexplained_text(ranking: Sequence[Candidate], rungs: Sequence[Rung], grades
 
 def _nearest(rungs: Sequence[Rung], grades: Sequence[Grade],
              ranking: Sequence[Candidate]) -> tuple[str, float, list[Grade]]:
-    """Say which effects came with the largest fall of the error, and return the share of the squared error that they
-    remove, and their grades. What took an earlier one's place removes what both do. Where the sizes of what would be
-    named are open, what alone does nearly as much, and is determined."""
+    """Return in words what came with the largest fall of the error, the share of the squared error that it removes with
+    what it took the place of, and its grades; where its sizes are open, what alone does nearly as much, determined."""
     shares = dict[str, float]()
     for k, rung in enumerate(rungs):
-        came = [j for j, r in enumerate(rungs[:k]) if {*rung.removed} & {*(r.added or "").split(" + ")}]
-        before, after = rungs[max(min([*came, k]) - 1, 0)], rung
-        share = share_removed(*(r.validation_nrmse or r.nrmse for r in (before, after)))
+        left = 1 - share_removed(*(r.validation_nrmse or r.nrmse for r in (rungs[max(k - 1, 0)], rung)))
+        share = 1 - left * float(np.prod([1 - s for s in {shares.get(n, 0.0) for n in rung.removed}]))
         shares |= dict.fromkeys((rung.added or "").split(" + "), share)
     share = max((shares.get(g.effect, 0.0) for g in grades), default=0.0)
     nearest = [g for g in grades if shares.get(g.effect, 0.0) == share]
@@ -95,9 +93,10 @@ def _nearest(rungs: Sequence[Rung], grades: Sequence[Grade],
     said = " with ".join(_described(rungs[-1].fit, g.effect) for g in nearest)
     removes = "removes" if len(nearest) == 1 else "remove"
     if any(OPEN in text for text in (said, *(g.why for g in nearest))):
-        others = {c.refit_drop or 0.0: _described(c.fit, c.effect) for c in ranking if c.fit and not c.fit.per_run
+        others = {c.refit_drop or 0.0: _described(c.fit, c.effect) for c in ranking
+                  if c.fit and (c.refit_drop or 0.0) > UNCONTESTED * share and not c.fit.per_run
                   and ", but " not in c.reason and all(c.effect != g.effect for g in grades)}
-        known = {drop: text for drop, text in others.items() if drop > UNCONTESTED * share and OPEN not in text}
+        known = {drop: text for drop, text in others.items() if OPEN not in text}
         if known:
             said, share, removes, nearest = known[max(known)], max(known), "alone removes", []
         elif any(g.form for g in grades):

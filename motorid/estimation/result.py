@@ -163,8 +163,8 @@ class Fit(Shown):
 
     @property
     def mostly_noise(self) -> bool:
-        """Whether the model explains less of every channel that moves than it leaves, by the squared error."""
-        return min(moving(self.nrmse).values(), default=0.0) ** 2 > 0.5
+        """Whether a model that fits explains less of every channel that moves than it leaves, by the squared error."""
+        return self.fits == "noise" and min(moving(self.nrmse).values(), default=0.0) ** 2 > 0.5
 
     @property
     def verdict(self) -> str:
@@ -175,8 +175,8 @@ class Fit(Shown):
                 "does, a diagnosis tells",
                 "poor": f"Fits poorly: errors {factor(times, 'up to ')} times the noise",
                 "lost": "Does not fit: predicting zero would be closer"}[self.fits]
-        if self.fits == "noise" and self.mostly_noise:
-            said = "Fits records that are mostly noise" + said.removeprefix("Fits")
+        if self.mostly_noise:
+            said = "Fits records that are mostly noise: errors" + said[len(lead):]
         known = not self.problem.unknown or any([*self.std.values(), *self.determined])
         if self.status != "failed" and (not moving(self.nrmse) or (self.fits == "noise" and not known)):
             said = "Nothing is determined: the records do not show what the motor does, and any values fit them"

@@ -376,9 +376,9 @@ def _unanswered(run: Experiment) -> bool:
 
 def _noisy(run: Experiment) -> str | None:
     for channel, y in run.outputs.items():
-        pairs = y[:len(y) // 2 * 2].reshape(-1, 2).mean(axis=1)  # of what is no noise but alternates, they show little
-        size, noise = float(np.nanstd(y)), min(noise_level(y, run.t), 2**0.5 * noise_level(pairs),
-                                               _beside_voltage(run, y))
+        pairs = (seen := y[np.isfinite(y)])[:len(seen) // 2 * 2].reshape(-1, 2).mean(axis=1)  # alternate in nothing
+        alone = min(noise_level(y, run.t), 2**0.5 * noise_level(pairs) if len(pairs) > FEWEST_FRESH else np.inf)
+        size, noise = float(np.nanstd(y)), min(alone, _beside_voltage(run, y))
         if noise > 0.5 * size > 0:
             return (f"the {NAMES[channel]} is mostly noise (RMS {min(noise, size):.2g} of {size:.2g} "
                     f"{run.units[channel]}) and tells a fit little. Drive the motor harder, or filter before "
@@ -538,7 +538,7 @@ def _reverses_alone(run: Experiment) -> str | None:
     """As fast backwards, under as much voltage, for more than a slip: no load does so, what swings is not `RUNNING`."""
     v, omega = run.inputs["v"], np.asarray(_speed(run))
     back, ahead = np.maximum(-omega, 0), np.maximum(omega, 0)
-    short = any(min(f(back), f(ahead)) < share * f(np.abs(omega)) for f, share in ((np.max, 0.5), (np.sum, 0.1)))
+    short = any(min(f(back), f(ahead)) < share * f(np.abs(omega)) for f, share in ((np.max, 0.5), (np.sum, 0.02)))
     if short or _cosine(v, np.abs(omega)) < RUNNING or v @ back / back.sum() < 0.9 * (v @ ahead / ahead.sum()):
         return None
     return ("the speed reverses although the voltage never does, and is as fast both ways under as much of it: is the "

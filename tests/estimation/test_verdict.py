@@ -258,4 +258,6 @@ def test_a_fit_of_what_is_mostly_noise_says_so(rng):
         "omega": speed + noise * rng.normal(size=600)})) for noise in (60.0, 2.0))
     assert noisy.verdict.startswith("Fits records that are mostly noise: errors at the level of the noise")
     assert quiet.verdict.startswith("Fits: errors at the level of the noise")
+    assert replace(noisy, status="limit").verdict.startswith(
+        "Fits records that are mostly noise: errors at the level of the noise (NRMSE")
     assert (noisy.mostly_noise, quiet.mostly_noise) == (True, False)

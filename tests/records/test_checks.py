@@ -376,6 +376,8 @@ def test_counts_that_alternate_are_not_taken_for_noise_and_the_only_channel_is_k
     noisy = said(run.with_(outputs={"omega": speed + 20 * rng.normal(size=300)}))
     assert "the speed is mostly noise" in noisy
     assert "--ignore" not in noisy
+    gaps = np.where(np.arange(300) % 2, np.nan, 1e4 * rng.normal(size=300))  # of a logger of several rates
+    assert "mostly noise" in said(run.with_(outputs={"omega": gaps, "i": speed}))
     both = {"omega": speed + 20 * rng.normal(size=300), "theta": np.cumsum(speed) * 0.01}
     assert "--ignore omega" in said(run.with_(outputs=both))
 
