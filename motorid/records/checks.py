@@ -376,7 +376,7 @@ def _unanswered(run: Experiment) -> bool:
 
 def _noisy(run: Experiment) -> str | None:
     for channel, y in run.outputs.items():
-        pairs = (seen := y[np.isfinite(y)])[:len(seen) // 2 * 2].reshape(-1, 2).mean(axis=1)  # alternate in nothing
+        pairs = (seen := y[np.isfinite(y)])[:len(seen) // 2 * 2].reshape(-1, 2).mean(axis=1)  # none alternates
         alone = min(noise_level(y, run.t), 2**0.5 * noise_level(pairs) if len(pairs) > FEWEST_FRESH else np.inf)
         size, noise = float(np.nanstd(y)), min(alone, _beside_voltage(run, y))
         if noise > 0.5 * size > 0:
