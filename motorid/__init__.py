@@ -57,7 +57,7 @@ from motorid.uncertainty.multistart import multistart
 from motorid.uncertainty.profile import intervals, profile, profiles
 
 if _TYPE_CHECKING:
-    from motorid.plots import *  # noqa: F403
+    from motorid.plots import *  # noqa: F403  what `plots` lists
 
 _FIGURES = ("plot_answer", "plot_current_limit", "plot_design", "plot_fit", "plot_formulations", "plot_ladder",
             "plot_missing", "plot_parameters", "plot_profile", "plot_ranking", "plot_residuals", "plot_runs",

@@ -29,5 +29,5 @@ def channel_name(channel: str, unit: str = "") -> str:
 
 def worded(text: str, units: Mapping[str, str]) -> str:
     """Return a text with the names that channels have in such units: what drives an axis may be no voltage."""
-    text = re.sub(r"(?<=[ (])angle(?=[ ,;:.?)])", channel_name("theta", units.get("theta", "")), text)
+    text = re.sub(r"(?<=[ (])angle(?=[ ,;:.?)]|$)", channel_name("theta", units.get("theta", "")), text)
     return re.sub(r"(?<= )voltage(?=s?[ ,;:.?])", channel_name("v", units["v"]), text)

@@ -466,8 +466,9 @@ def signals_along(fit: Fit) -> list[dict[str, Array]]:
 
 
 def _signals(fit: Fit, k: int) -> dict[str, Array]:
-    run, sim = fit.problem.experiments[k], fit.simulations[k]
-    found = {"t": run.t - run.t[0], "v": run.inputs["v"], "run": np.full(run.n, float(k)), "width": np.ones(run.n)}
+    run, sim, firsts = fit.problem.experiments[k], fit.simulations[k], fit.problem.unknowns.firsts
+    record = np.full(run.n, float(sorted(set(firsts)).index(firsts[k])))  # parts of one are one
+    found = {"t": run.t - run.t[0], "v": run.inputs["v"], "run": record, "width": np.ones(run.n)}
     found |= {c: np.asarray(sim.states[c]) for c in ("i", "omega") if c in sim.states}
     if "omega" in found:
         omega = found["omega"]

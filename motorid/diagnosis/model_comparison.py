@@ -111,7 +111,7 @@ def tied(a: Node, b: Node) -> bool:
 
 
 def choose(children: Sequence[Node], parent: Node) -> tuple[Node, list[Node]] | None:
-    """Return the best child, the smaller on a tie, and the children in order; None without any.
+    """Return the best child, the smaller on a tie, a law before sizes of every run, and all in order; None without any.
 
     Gains on the parent, in effective samples of a child's own residual, order them; which of two is better, both tell.
     """
@@ -135,14 +135,9 @@ def _laws_as_good(chosen: Node, children: Sequence[Node], parent: Node) -> list[
     leave more than noise. Such a size describes a run, a held-out one too, and explains none."""
     if len(chosen.fit.per_run) == len(parent.fit.per_run) or not far(chosen.fit):
         return []
-    least = (1 - TRIFLE) * _removed(parent, chosen)
-    return [n for n in children if len(n.fit.per_run) == len(parent.fit.per_run) and not n.objection
-            and _removed(parent, n) > least]
-
-
-def _removed(parent: Node, node: Node) -> float:
-    """Return the share of the squared error that a model removes."""
-    return 1 - (1 - evidence(parent, node).fall) ** 2
+    most, *shares = (1 - (1 - evidence(parent, n).fall) ** 2 for n in (chosen, *children))  # of the squared error
+    return [n for n, share in zip(children, shares, strict=True) if share > (1 - TRIFLE) * most
+            and len(n.fit.per_run) == len(parent.fit.per_run) and not n.objection]
 
 
 def _price(node: Node) -> tuple[bool, int, int]:

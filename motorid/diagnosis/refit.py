@@ -57,8 +57,9 @@ class Raced:
 
 def raced(fit: Fit, model: Model, starts: Sequence[Mapping[str, float]]) -> Raced | None:
     """Go a few steps from each start with `model` on the records of `fit`; None if none can be simulated. Where no
-    start can be (a friction that sticks at every turn), the values of `fit` are one: the smaller model could. Effects
-    of the angle start along the measured angle, which the model's own angle, still wrong, would lead astray."""
+    start can be (a friction that sticks at every turn), the values of `fit` are one: the smaller model could. What ends
+    above `fit`, where that is no optimum, begins anew at a first guess. Effects of the angle start along the measured
+    angle, which the model's own angle, still wrong, would lead astray."""
     model = _bounded(fit, model)
     poles = [pole for e in model.effects if e.name not in fit.model.effect_names for pole in exchanged_poles(model, e)]
     alive, starts = restored(fit, model), starts or ({},)

@@ -147,7 +147,8 @@ class Part:
         by = [SI.get(n, "") for n in (before, form.carrier)]
         if bare:
             return own
-        return "1" if form.carrier == "acceleration" or own in by else own + "".join(OVER[unit] for unit in by)
+        over = "".join(OVER[unit] for unit in by).replace("rad", "m" if torque == "N" else "rad")
+        return "1" if form.carrier == "acceleration" or own in by else own + over
 
     @property
     def place(self) -> tuple[str, str]:
@@ -284,8 +285,8 @@ class Curve:
         values = np.concatenate([free_forms.values_of(part.terms(places), part.form, s) for s in self._signals])
         curve = values @ np.array(sizes)
         if part.by_run and self.fitted is not None:
-            own = [self.fitted.initial.get(f"{self.name}_0[{k}]", 0.0) for k in self.fitted.problem.unknowns.firsts]
-            curve = np.array(own)[z.astype(int)]
+            sizes = (self.fitted.initial.get(f"{self.name}_0[{k}]", 0.0) for k in self.fitted.problem.unknowns.firsts)
+            curve = np.repeat(list(sizes), [len(s["t"]) for s in self._signals])
         return z, eval(POSITIVE, {"ca": np, "curve": curve}) if part.form.carrier == "acceleration" else curve
 
     @cached_property
@@ -300,10 +301,10 @@ class Curve:
             return None
         linear = free_forms.linearised(last, part.form, part.span)
         if part.by_run:
-            first, *others = sorted(set(last.problem.unknowns.firsts))
-            own = free_forms.form_coefficients(last, linear, part.form)
+            first, *own = free_forms.form_coefficients(last, linear, part.form).tolist()
             curve = replace(self, parts=(*before, replace(part, chosen=(0,))), values=(*self.values, 0.0))
-            start = {f"{self.name}_{len(self.values)}[{k}]": float(own[k] - own[first]) for k in others}
+            others = zip(sorted(set(last.problem.unknowns.firsts))[1:], own, strict=True)
+            start = {f"{self.name}_{len(self.values)}[{k}]": size - first for k, size in others}
             return curve.refitted(last, curve.sizes | start, curve.sizes)
         more = chosen_functions(last, linear, part.form, part.chosen, first=part.moved)
         if not more:
@@ -573,7 +574,8 @@ def _better_curve(tried: Iterable[tuple[Curve, Form]], before: Predictions, held
     found = dict[Any, Grown]()
     with contextlib.suppress(OutOfTime):  # what is tried takes fits to find, too
         for first, form in _race(found, tried, before, held):
-            for grown in () if any(f.done for f in found.values()) else _grown(first, form, False, before, held):
+            known = any(f.done for f in found.values()) or form.on == "run"  # a size of each run has no grid
+            for grown in () if known else _grown(first, form, False, before, held):
                 found[first, form, "grid"] = grown
     better = sorted((f for f in found.values() if f.gained.worth_it),
                     key=lambda f: (len(f.curve.fitted.q) if f.curve.fitted else 0, -f.gained.gain))

@@ -5,9 +5,9 @@ Every effect that a module here defines is in it: a new one is a function there,
 """
 
 from motorid.effects import electrical, mechanical, sensor
-from motorid.effects.electrical import *  # noqa: F403
-from motorid.effects.mechanical import *  # noqa: F403
-from motorid.effects.sensor import *  # noqa: F403
+from motorid.effects.electrical import *  # noqa: F403  every effect is public
+from motorid.effects.mechanical import *  # noqa: F403  every effect is public
+from motorid.effects.sensor import *  # noqa: F403  every effect is public
 from motorid.errors import ModelError, among, one_of
 from motorid.model.definition import Effect
 

@@ -53,7 +53,7 @@ def explore(fit: Fit, *, effects: Iterable[Effect | str] | None = None) -> Explo
     """
     checked(fit, "explore")
     try:
-        import ipywidgets  # noqa: F401
+        import ipywidgets  # noqa: F401  whether it is installed
     except ImportError:
         raise MissingDependency("mi.explore needs ipywidgets: pip install 'motorid[notebooks]'.") from None
     chosen = LIBRARY.values() if effects is None else [get(e) if isinstance(e, str) else e for e in effects]

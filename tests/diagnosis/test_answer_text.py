@@ -136,6 +136,10 @@ def test_nearest_is_a_pair_by_what_both_removed_and_what_is_determined(rng):
     assert "of the squared error; second-order filter of the speed [speed_filter]" in answer
     named = [Grade("coulomb", "named"), *largest[1:]]
     assert "something close to" not in missing_text([*rungs[:3], replace(rungs[3], fit=filtered)], remaining, (), named)
+    between = [replace(rungs[0], nrmse={"omega": e}, added=n, removed=r) for n, e, r in (
+        (None, 0.10, ()), ("coulomb_asymmetric", 0.09, ()), ("coulomb", 0.02, ()),
+        ("viscous_asymmetric", 0.019, ("coulomb_asymmetric",)))]  # what came between is not its own
+    assert "[coulomb]" in unexplained_text((), between, grades[:2], "", remaining).split(", which removes 95 %")[0]
     open_ = [Grade("coulomb", "approximates", "R_th and C_th are not determined, and the rest is not noise")]
     rungs = [rungs[0], Rung("coulomb", known, {"omega": 0.004}, None)]
     rubs = Candidate("coulomb", 0.3, fit=mi.fit(plain + mi.effects.coulomb, run), refit_drop=0.97)

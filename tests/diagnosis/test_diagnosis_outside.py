@@ -7,6 +7,7 @@ import re
 import runpy
 from dataclasses import replace
 from itertools import pairwise
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,11 +15,12 @@ from battery.excite import driven, record
 
 import motorid as mi
 from motorid.channels import channel_name
-from motorid.diagnosis.free_forms import linearised
+from motorid.diagnosis.free_forms import Form, Span, linearised, signals_along
 from motorid.diagnosis.model_comparison import far
+from motorid.diagnosis.remainder import Curve, Part
 from motorid.display.numbers import arrow
 from motorid.numerics.parallel import one_thread
-from motorid.records.experiment import Experiment
+from motorid.records.experiment import Experiment, part_meta
 
 ANGLE = ("i", "omega", "theta")
 FRICTION = ("coulomb", "coulomb_asymmetric", "constant_load", "quadratic_drag")
@@ -183,6 +185,27 @@ def test_a_motor_that_is_another_in_every_run_lacks_a_size_of_each(lab, name, fa
     (tmp_path / "own.py").write_text(left.code("own"))
     again = runpy.run_path(str(tmp_path / "own.py"))["own"]
     assert mi.fit(left.model + again, runs[:-1]).misfit == pytest.approx(better.misfit, rel=1e-3)
+
+
+def test_parts_of_one_record_are_one_motor(lab):
+    """A size of each record: what parts of one show differs with the time, not from run to run."""
+    whole = of_different_motors(lab, "J", (0.8, 1.3, 1.0, 1.0))[:2]
+    parts = [run.select(cut).with_(meta=part_meta(run)) for run in whole for cut in (slice(0, 200), slice(200, None))]
+    both, one = (mi.fit(mi.dc_motor(), runs) for runs in (parts, parts[:2]))
+    assert [s["run"][0] for s in signals_along(both)] == [0, 0, 1, 1]
+    asked = {form.on for form in linearised(both).forms}
+    assert "run" in asked
+    assert "run" not in {form.on for form in linearised(one).forms}
+    inertia = Form("an inertia", "torque", "run", "acceleration")
+    grown = Curve(both, (Part.of(both, inertia, True),)).grown()
+    assert list(grown.fitted.initial)[-1] == "remainder_0[2]"  # of the second record, whose first part is the third
+    assert np.unique(grown.points[1]).tolist() == pytest.approx([0.0, 1.3 / 0.8 - 1], abs=0.03)
+
+
+@pytest.mark.parametrize(("axis", "unit"), [("rotary", "N·m·s/rad"), ("linear", "N·s/m")])
+def test_a_drag_that_is_another_in_every_run_is_in_the_units_of_its_axis(axis, unit):
+    drag = Part(Form("a drag", "torque", "run", "omega"), Span({"run": (0.0, 1.0)}, (), 1e-3))
+    assert drag.unit(SimpleNamespace(model=SimpleNamespace(axis=axis))) == unit
 
 
 def test_improve_grades_its_rungs_too(lab):
