@@ -19,7 +19,7 @@ from motorid.diagnosis.free_forms import own_levels
 from motorid.diagnosis.misspecification import LIMITER
 from motorid.diagnosis.model_comparison import COMMON, Node, beats, evidence, far, node_of, preferred, superfluous
 from motorid.diagnosis.predictive_score import QUICK, Evidence, HeldOut, deciding
-from motorid.diagnosis.refit import LITTLE, GivenUp, Task, completed, hidden_in, led_on, refit, refits, widened
+from motorid.diagnosis.refit import LITTLE, STOPPED, GivenUp, Task, completed, hidden_in, led_on, refit, refits, widened
 from motorid.diagnosis.results import Candidate
 from motorid.diagnosis.score_test import Score, pairs_of, rank, uses_angle, with_phase_per_run, with_warm_start
 from motorid.diagnosis.thresholds import MATERIAL
@@ -113,7 +113,7 @@ class Search:
         self.held = HeldOut.of(fit, validate)
         law = fit.model.base != "dc_motor" or own_levels(fit.problem.experiments)  # a torque needs no supply
         self.effects = [e for e in effects if not (law and e.name in PER_RUN and e.balance == "voltage")]
-        self.stages, self.map = stages, stages.map
+        self.stages, self.map, self.stopped = stages, stages.map, ""
         self.root = node_of(fit, self.held)
         self._scores: dict[frozenset[str], list[Score]] = {}
         self._always = (*ALWAYS, LIMITER) if any(map(_flat_topped, fit.problem.experiments)) else ALWAYS
@@ -155,9 +155,8 @@ class Search:
 
     def expand(self, node: Node) -> tuple[list[Node], list[Candidate]]:
         """Return the judged models one effect larger, and a candidate for every effect, best score first."""
-        present = node.fit.model
+        present, scores = node.fit.model, self.scores(node)
         _, wider = self._takeable(present)
-        scores = self.scores(node)
         little = -np.inf if lost(node.fit) else LITTLE  # far from the records slopes say little
         short = [s for s in self._shortlist(node) if s.drop > little or not any(p.vary for p in s.effect.parameters)]
         tasks = [Task(node.fit, present + s.effect, s.effect, s.starts, s.drop) for s in short]
@@ -165,21 +164,19 @@ class Search:
             with contextlib.suppress(ModelError):  # beside what is there it may describe the same twice
                 tasks.append(widened(node.fit, e))
         tasks += self._restarting(node)
-        fits = dict(zip((t.name for t in tasks), refits(tasks, self.map), strict=True))
+        fits = dict(zip((t.name for t in tasks), self._refits(tasks), strict=True))
         self.stages.done(f"refitted {sum(isinstance(f, Fit) for f in fits.values())} of {len(fits)}")
         found = {t.name: self._judge(node, t.added, fits[t.name]) for t in tasks}
         begun = {n: f for n, f in fits.items() if isinstance(f, GivenUp) and f.begun is not None}
-        if begun and _in_doubt(node, [child for child, _ in found.values() if child is not None]):
+        if begun and not self.stopped and _in_doubt(node, [c for c, _ in found.values() if c is not None]):
             later = dict(zip(begun, completed(list(begun.values()), self.map), strict=True))
             found |= {t.name: self._judge(node, t.added, later[t.name]) for t in tasks if t.name in later}
+        inside = {name for c, _ in found.values() if c is not None and c.objection for e in c.fit.model.effects
+                  if e.name == c.added for name in e.includes if name not in found}
+        again = [Task(node.fit, present + s.effect, s.effect, s.starts, s.drop) for s in scores if not self.stopped
+                 and s.effect.name in inside and s.starts]  # what is refused may hide the simpler one of its kind
+        found |= {t.name: self._judge(node, t.added, f) for t, f in zip(again, self._refits(again), strict=True)}
         children = [child for child, _ in found.values() if child is not None]
-        inside = {name for c in children if c.objection for e in c.fit.model.effects if e.name == c.added
-                  for name in e.includes if name not in found}
-        again = [Task(node.fit, present + s.effect, s.effect, s.starts, s.drop) for s in scores
-                 if s.effect.name in inside and s.starts]  # what is refused may hide the simpler one of its kind
-        more = {t.name: self._judge(node, t.added, f) for t, f in zip(again, refits(again, self.map), strict=True)}
-        found |= more
-        children += [child for child, _ in more.values() if child is not None]
         tried = sorted((candidate for _, candidate in found.values()), key=lambda c: c.gain or 0.0)
         return children, self.listed(scores, {c.effect: c for c in tried})
 
@@ -247,15 +244,21 @@ class Search:
         scores = self._shortlist(half)[:PAIRS]
         found = self._together(node, [Task(half.fit, model + s.effect, s.effect, s.starts, s.drop) for s in scores])
         first = next(e for e in model.effects if e.name == refused.effect)
-        simpler = [self.smaller(c, m) for c in found if c.objection for m in self._simpler(c.fit.model, first)]
+        simpler = [self.smaller(c, m) for c in found if c.objection and not self.stopped
+                   for m in self._simpler(c.fit.model, first)]
         return found + [c for c in simpler if c is not None]
 
     def _together(self, node: Node, tasks: Sequence[Task]) -> list[Node]:
-        first = len(node.fit.model.effects)
-        fits = zip(tasks, refits(tasks, self.map), strict=True)
-        judged = [self._judge(node, task.model.effects[first:], fit)[0] for task, fit in fits]
+        fits, had = zip(tasks, self._refits(tasks), strict=True), len(node.fit.model.effects)
+        judged = [self._judge(node, task.model.effects[had:], fit)[0] for task, fit in fits]
         self.stages.done(f"refitted {len(tasks)} pairs")
         return [child for child in judged if child is not None]
+
+    def _refits(self, tasks: Sequence[Task]) -> list[Fit | GivenUp | None]:
+        """Return the refit of each task; where they are `stopped`, nothing more is to begin."""
+        fits = refits(tasks, self.map)
+        self.stopped = next((f.why for f in fits if isinstance(f, GivenUp) and f.why in STOPPED), self.stopped)
+        return fits
 
     def _judge(self, node: Node, effects: Sequence[Effect], fit: Fit | GivenUp | None) -> tuple[Node | None, Candidate]:
         effect = effects[0]

@@ -265,8 +265,7 @@ OUTDONE = 1.5  # times the least cost of a race: 20 nats away from a tie at 100 
 BEHIND = 10.0  # times the cost of a model that explains all but noise
 HARDLY = 1.01  # times: near enough that a slope tells what more would do
 FAR_LESS = 0.3  # of the promise that was kept
-OUT_OF_TIME = "the time is up"
-INTERRUPTED = "interrupted"
+STOPPED = OUT_OF_TIME, INTERRUPTED = "the time is up", "interrupted"
 LESS = "rejected: far behind others after the first steps of a refit"
 NOTHING = "rejected: no gain after the first steps of a refit"
 FAR_BEHIND = "rejected: {} alone already reaches the noise"

@@ -115,14 +115,14 @@ def _rounds(found: Climb, max_effects: int) -> Iterator[Climb]:
         if room < 1 or (found.remaining.adequate and at_noise(best)):
             break
         children, listed, stopped = _grown(search, frontier)
-        found = replace(found, rounds=(*found.rounds, tuple(listed)), stopped=stopped)
         chosen = _better(children.values(), best)
         if room > 1 and not stopped and far(best.fit):
             pairs = [] if chosen else search.expand_by_two(best)
-            if (refused := _outdoing(listed, list(children.values()), best, chosen and chosen[0])) is not None:
-                pairs += search.expand_from(best, refused)
+            refused = _outdoing(listed, list(children.values()), best, chosen and chosen[0])
+            pairs += search.expand_from(best, refused) if refused is not None and not search.stopped else []
             children |= {c.key: c for c in pairs}
-            chosen = _better(pairs, best) or chosen
+            chosen, stopped = _better(pairs, best) or chosen, search.stopped
+        found = replace(found, rounds=(*found.rounds, tuple(listed)), stopped=stopped)
         search.nodes |= children
         while chosen is not None:
             new, ordered = chosen
@@ -159,11 +159,9 @@ def _grown(search: Search, frontier: Sequence[Node]) -> tuple[dict[frozenset[str
         grown, listed = search.expand(node)
         first = first or listed
         children |= {c.key: c for c in grown if c.key not in children}
-        if stopped := next((c.reason for c in listed if c.reason in (OUT_OF_TIME, INTERRUPTED)), ""):
-            return children, first, stopped
-        if any(at_noise(c) and not c.objection for c in grown):  # no other branch can leave less
+        if search.stopped or any(at_noise(c) and not c.objection for c in grown):  # no other branch can leave less
             break
-    return children, first, ""
+    return children, first, search.stopped
 
 
 def _with(found: Climb, best: Node, chosen: Node, ranked: bool, group: tuple[str, ...]) -> Climb:

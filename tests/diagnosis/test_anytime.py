@@ -177,7 +177,7 @@ def test_what_comes_in_the_place_of_two_leaves_room_for_another(monkeypatch):
 def test_a_second_branch_is_grown_only_where_the_first_leaves_more_than_noise(monkeypatch, leaves, grown):
     expanded = []
     child = SimpleNamespace(key=frozenset("ab"), objection="a wrong sign" if leaves == "noise against physics" else "")
-    search = SimpleNamespace(expand=lambda node: (expanded.append(node) or [child], []))
+    search = SimpleNamespace(expand=lambda node: (expanded.append(node) or [child], []), stopped="")
     monkeypatch.setattr(stepwise, "at_noise", lambda node: leaves != "more")
     children, _, stopped = stepwise._grown(search, ["first", "second"])
     assert len(expanded) == grown
@@ -221,3 +221,42 @@ def test_what_was_found_before_a_voltage_was_read_as_earlier_outlives_the_end_of
     assert len(climbs) == 2
     assert "coulomb" in {rung.added for rung in found.ladder.rungs if rung.grade}
     assert found.stopped == refit.OUT_OF_TIME
+
+
+def interrupted_after_the_first_of(monkeypatch, number: int) -> list[list[str]]:
+    """Press Ctrl-C when the first refit of the list of this number is done; return the lists that are asked for."""
+    asked, refits = list[list[str]](), refit.refits
+
+    def pressed(tasks, map_):
+        if not tasks:
+            return []
+        asked.append([task.name for task in tasks])
+        if len(asked) != number:
+            return refits(tasks, map_)
+        return [*refits(tasks[:1], map_), *(refit.GivenUp(refit.INTERRUPTED) for _ in tasks[1:])]
+
+    monkeypatch.setattr(candidates, "refits", pressed)
+    return asked
+
+
+def test_after_an_interruption_no_simpler_kin_is_tried(plain, monkeypatch):
+    effects = candidates.library(("stribeck", "coulomb", "brush_drop"))
+    search = candidates.Search(plain, None, effects, candidates.Stages())
+    short = [s for s in search.scores(search.root) if s.effect.name != "coulomb"]
+    monkeypatch.setattr(search, "_shortlist", lambda node: short)
+    monkeypatch.setattr(candidates, "objections", lambda *fits: "refused")
+    asked = interrupted_after_the_first_of(monkeypatch, 1)
+    children, listed = search.expand(search.root)
+    assert [c.added for c in children] == ["stribeck"]
+    assert "interrupted" in {c.reason for c in listed}
+    assert asked == [["stribeck", "brush_drop"]]
+
+
+def test_a_diagnosis_interrupted_among_its_pairs_ends_there(plain, monkeypatch):
+    expand = candidates.Search.expand
+    monkeypatch.setattr(candidates.Search, "expand", lambda search, node: ([], expand(search, node)[1]))
+    asked = interrupted_after_the_first_of(monkeypatch, 2)
+    found = mi.diagnose(plain, effects=["coulomb", "quadratic_drag", "cogging", "brush_drop"])
+    assert found.stopped == refit.INTERRUPTED
+    assert len(asked) == 2
+    assert len(found.after.model.effects) in (0, 2)
