@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import builtins
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
+from functools import partial
 from typing import Any
 
 from motorid.channels import channel_name, worded
@@ -101,11 +103,9 @@ def _told(found: Climb, misread: str, driven: str, validated: bool) -> Diagnosis
     groups = tuple(g for g in found.groups if g[0] in names)
     rivals = found.rivals if groups[:1] == found.groups[:1] else ()
     forms, suggestion = tuple(f.form for f in found.forms), None
-    if forms:
-        remaining = following(remaining, forms[0].text)
+    remaining = following(remaining, forms[0].text) if forms else remaining
     like = forms[0] if forms else next((g.form for g in found.grades if g.form is not None), None)
-    if like is not None and not names:
-        missing = acting_like(missing, like)
+    missing = acting_like(missing, like) if like is not None and not names else missing
     if names:
         verdict, where = "missing", WHERE[{e.name: e.balance for e in ladder.best.model.effects}[names[0]]]
         answer = words.missing_text(ladder.rungs, remaining, groups, found.grades,
@@ -130,9 +130,11 @@ def _told(found: Climb, misread: str, driven: str, validated: bool) -> Diagnosis
         verdict, where, judged = "adequate", None, remaining
         answer, *details = words.adequate_text(judged, ranking, ladder.best)
     kind = "structure" if not remaining.adequate else "fluctuation" if far(ladder.best) else "noise"
-    if not names:
-        details.append(words.unseen_remark(found.search.unseen(last), fit.model.base))
-    answer, *details = (worded(t, units) for t in (misread + answer, *details, *_remarks(found, driven)) if t)
+    details += [] if names else [words.unseen_remark(found.search.unseen(last), fit.model.base)]
+    told = partial(worded, units=units)
+    answer, *details = (told(t) for t in (misread + answer, *details, *_remarks(found, driven)) if t)
+    missing = replace(missing, text=told(missing.text), acts_like=told(missing.acts_like))
+    judged, remaining = (replace(a, text=told(a.text)) for a in (judged, remaining))
     text = " ".join(t for t in (answer, *details, suggestion) if t)
     approximating = {g.effect: g.form for g in found.grades if g.grade == "approximates"}
     remainder = Remainder(kind, ladder.best, forms, found.search.held, fit, approximating)

@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 
-from motorid.channels import COMPUTED_INPUTS
+from motorid.channels import COMPUTED_INPUTS, worded
 from motorid.diagnosis import free_forms
 from motorid.diagnosis.free_forms import FINER, PAST, PLACE, WHERE, Form, Span
 from motorid.diagnosis.misspecification import FormGain, better_forms, chosen_functions, pitches_of, tells_the_zero
@@ -38,6 +38,7 @@ from motorid.model.equations import Equations
 from motorid.model.model import Model
 from motorid.numerics.parallel import budget, check_time, one_thread
 from motorid.numerics.signals import Array
+from motorid.records.experiment import units_of
 
 SECONDS = 120.0  # after which the best curve so far is taken
 TRIED = 4  # curves that are fitted, those that promise most
@@ -372,7 +373,7 @@ class Remainder:
     @property
     def follows(self) -> str | None:
         """What it follows, in words."""
-        return None if self.form is None else self.form.text
+        return None if self.form is None else worded(self.form.text, units_of(self.fit.problem.experiments))
 
     @property
     def proposed(self) -> bool:

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from motorid.channels import worded
 from motorid.diagnosis.adequacy import following, judge_adequacy, within_noise
 from motorid.diagnosis.admissibility import run_through
 from motorid.diagnosis.candidates import Search, Stages, library
@@ -41,7 +42,7 @@ from motorid.estimation.least_squares import FAILURES
 from motorid.estimation.result import Fit, checked
 from motorid.model.definition import Effect
 from motorid.numerics import parallel
-from motorid.records.experiment import Experiment
+from motorid.records.experiment import Experiment, units_of
 
 ORDER = ("named", "group", "approximates")  # grades, the surest first
 FITTED_TOO = ("The fitted runs alone leave nothing but noise, and the model that they determine fails on the held-out "
@@ -502,7 +503,7 @@ def _path(last: Node) -> tuple[Node, ...]:
 def ladder_of(found: Climb, validated: bool) -> Ladder:
     """Return the rungs of a climb."""
     grades = {g.effect: g for g in found.grades}
-    rungs, before = list[Rung](), found.path[0]
+    rungs, before, units = list[Rung](), found.path[0], units_of(found.path[0].fit.problem.experiments)
     for k, node in enumerate(found.path):
         names = [n for n in node.fit.problem.model.effect_names if n not in before.key]
         rung = Rung(" + ".join(names) or None, node.fit, node.fit.nrmse,
@@ -513,7 +514,7 @@ def ladder_of(found: Climb, validated: bool) -> Ladder:
             worst = max(known, key=lambda g: ORDER.index(g.grade), default=None)
             gained = evidence(before, node)
             rung = replace(rung, grade=worst.grade if worst else "approximates", gain=gained.gain, gain_se=gained.se,
-                           why=worst.why if worst else "a later effect took its place")
+                           why=worded(worst.why, units) if worst else "a later effect took its place")
         rungs.append(rung)
         before = node
     return Ladder(tuple(rungs), found.text)

@@ -20,7 +20,6 @@ from motorid.model.model import SHOWN
 from motorid.numerics.autoregression import colour_of
 from motorid.numerics.signals import despiked
 from motorid.problem.simulate import moving
-from motorid.records.experiment import units_of
 
 MOVED = 0.1  # relative change of a motor parameter that is worth a word
 SPIKED = 0.5  # of a channel's squared error: what outliers must make to be worth a word
@@ -173,8 +172,8 @@ def errors_text(rungs: Sequence[Rung]) -> str:
     held_out = bool(was and is_)
     was, is_ = (was, is_) if held_out else (moving(rungs[0].nrmse), moving(last.nrmse))
     noise = {c for c in was if last.fit.misfit.get(c, 0.0) < LARGER}
-    words = [_changed(last, c, was[c], is_[c]) for c in sorted(was, key=lambda c: is_[c] > was[c])]
-    noisy = tuple(f"{_name(last, c)} rises" for c in noise)
+    words = [_changed(c, was[c], is_[c]) for c in sorted(was, key=lambda c: is_[c] > was[c])]
+    noisy = tuple(f"{channel_name(c)} rises" for c in noise)
     said = [w + " (mostly noise)" * w.startswith(noisy) for w in words]
     text = f"{'Held-out error' if held_out else 'Error'}: {', '.join(said)}."
     if held_out and (lost := [c for c, e in was.items() if min(e, is_[c]) > LOST]):
@@ -194,8 +193,8 @@ def rises_text(rungs: Sequence[Rung]) -> str:
         kinds = [((moving(a.nrmse), moving(b.nrmse)), "fitted"), (there, "held-out")][:1 if len(rungs) == 2 else 2]
         for (was, is_), where in kinds if there[0] or len(rungs) > 2 else ():
             risen = [c for c in was if is_[c] > was[c]]
-            large = [_changed(b, c, was[c], is_[c]) for c in risen if is_[c] > was[c] * (1 + MATERIAL)]
-            small |= {_name(b, c) for c in risen if is_[c] <= was[c] * (1 + MATERIAL)}
+            large = [_changed(c, was[c], is_[c]) for c in risen if is_[c] > was[c] * (1 + MATERIAL)]
+            small |= {channel_name(c) for c in risen if is_[c] <= was[c] * (1 + MATERIAL)}
             told += [f"With '{b.added}' {', '.join(large)} on the {where} runs."] if large else []
         if there[0] and len(rungs) > 2 and share_removed(*there) <= 0:
             told.append(f"With '{b.added}' the held-out error does not fall; {DECIDED}.")
@@ -203,14 +202,10 @@ def rises_text(rungs: Sequence[Rung]) -> str:
     return " ".join(told)
 
 
-def _changed(rung: Rung, c: str, was: float, is_: float) -> str:
+def _changed(c: str, was: float, is_: float) -> str:
     if (change := arrow(was, is_)) == arrow(is_, was):
-        return f"{_name(rung, c)} stays {percent(is_)}"
-    return f"{_name(rung, c)} {'rises ' * (is_ > was)}{change}"
-
-
-def _name(rung: Rung, c: str) -> str:
-    return channel_name(c, units_of(rung.fit.problem.experiments).get(c, ""))
+        return f"{channel_name(c)} stays {percent(is_)}"
+    return f"{channel_name(c)} {'rises ' * (is_ > was)}{change}"
 
 
 def moves(before: Fit, after: Fit) -> str:

@@ -9,7 +9,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from motorid.channels import NAMES, worded
+from motorid.channels import NAMES
 from motorid.diagnosis.results import Diagnosis, Ladder, ladder_table, ranking_table, share_table
 from motorid.display.cards import Flag, Shown, Table
 from motorid.display.numbers import counted, duration, glued, number, percent, sentence, with_error
@@ -19,7 +19,7 @@ from motorid.estimation.result import Fit, ended, parameter_table, value_tables
 from motorid.numerics.parallel import progress
 from motorid.problem.simulate import error_table, evaluate
 from motorid.records.checks import check_runs, reading_notes
-from motorid.records.experiment import Experiment, units_of
+from motorid.records.experiment import Experiment
 from motorid.records.files import package_version, write_files
 
 PACKAGES = ("motorid", "casadi", "numpy", "scipy", "pandas", "matplotlib")
@@ -244,8 +244,7 @@ def _where(d: Diagnosis) -> Section:
     caption = f"The {' and '.join(m.bins)} that would make the model match, with its explanation."
     figure = _figure("missing", caption, "What is missing. " + "; ".join(best), "plot_missing", d)
     tables = [share_table("region", m.regions)] if m.regions else []
-    text = [worded(t, units_of(d.before.problem.experiments)) for t in (d.adequacy.text, m.text)]
-    return Section("where", "Where it fails", text, (), [figure], tables)
+    return Section("where", "Where it fails", (d.adequacy.text, m.text), (), [figure], tables)
 
 
 def _which(d: Diagnosis) -> Section:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import re
 from dataclasses import replace
 from types import SimpleNamespace
 
+import casadi as ca
 import numpy as np
 import pytest
 from battery.excite import driven, record
@@ -262,3 +264,35 @@ def test_the_angle_of_a_linear_axis_is_a_position():
     assert worded(told, {"v": "V", "theta": "rad"}) == told
     assert worded(told, {"v": "V", "theta": "m"}) == (
         "The errors (position 32 times the noise) follow a load that changes with the position; phase angles.")
+
+
+@mi.effect(balance="torque")
+def ramp(m, slope=mi.P(0.0, "N/m", null=0.0)):
+    """A rail that rises on one side."""
+    m.torque -= slope * ca.fmax(m.theta, 0)
+
+
+def on_a_ramp(rng, names):
+    """Records of a carriage, driven by forces, on a rail that rises on one side."""
+    t, found = np.arange(500) * 8e-3, []
+    model = mi.torque_driven(axis="linear", b=0.5, J=0.4, g=1.0) + ramp(slope=0.5)
+    for name, f in zip(names, (2.0, 3.1, 1.3), strict=True):
+        drive, still = 2 * np.sin(f * t) + 0.8 * np.sin(5.3 * f * t), dict.fromkeys(("omega", "theta"), 0 * t)
+        bare = mi.Experiment(t, {"v": drive}, still, units={"v": "N", "omega": "m/s", "theta": "m"}, name=name)
+        shown = mi.simulate(model, bare, initial="rest")[0].outputs
+        found.append(bare.with_(outputs={c: y + 1e-3 * np.ptp(y) * rng.normal(size=500) for c, y in shown.items()}))
+    return found
+
+
+def test_all_that_a_diagnosis_says_of_a_linear_axis_calls_its_angle_a_position(rng, tmp_path):
+    """Its answer did; the judgements, the grades and the place of what is missing, in JSON, did not."""
+    runs = on_a_ramp(rng, ("one", "other", "check"))
+    found = mi.diagnose(mi.fit(mi.torque_driven(axis="linear"), runs[:2], window=None), runs[2],
+                        effects=["coulomb", "spring"])
+    assert found.remainder.follows == found.missing.acts_like == "a load that changes with the position"
+    assert "position" in found.adequacy.text
+    assert "changes with the position, which the library lacks" in found.ladder.rungs[-1].why
+    assert "They follow a load that changes with the position." in found.remaining.text
+    assert [w for w in re.findall(r"\w* ?angle\b", json.dumps(found.to_dict())) if "phase" not in w] == []
+    page = mi.report(found, tmp_path / "found.html").read_text(encoding="utf-8")
+    assert "acts like a load that changes with the position" in page
