@@ -1,7 +1,7 @@
 """The channels of a record: their names, what people call them, their SI units, their order."""
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from types import MappingProxyType
 
 CHANNELS = ("i", "omega", "theta")  # what can be measured, in the order of states, tables and figures
@@ -27,7 +27,9 @@ def channel_name(channel: str, unit: str = "") -> str:
     return special.get(channel, {}).get(unit, NAMES.get(channel, channel))
 
 
-def worded(text: str, units: Mapping[str, str]) -> str:
-    """Return a text with the names that channels have in such units: what drives an axis may be no voltage."""
-    text = re.sub(r"(?<=[ (])angle(?=[ ,;:.?)]|$)", channel_name("theta", units.get("theta", "")), text)
-    return re.sub(r"(?<= )voltage(?=s?[ ,;:.?])", channel_name("v", units["v"]), text)
+def worded(text: str, units: Mapping[str, str], names: Iterable[str] = ()) -> str:
+    """Return a text with the names that channels have in such units; `names` of records, if of several words, stay."""
+    now = {"angle": channel_name("theta", units.get("theta", "")), "voltage": channel_name("v", units["v"])}
+    kept = sorted((re.escape(n) for n in names if " " in n), key=len, reverse=True)
+    found = "|".join([*kept, r"(?<=[ (])angle(?=[ ,;:.?)]|$)", r"(?<= )voltage(?=s?[ ,;:.?])"])
+    return re.sub(found, lambda m: now.get(m[0], m[0]), text)

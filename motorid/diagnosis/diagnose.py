@@ -131,7 +131,7 @@ def _told(found: Climb, misread: str, driven: str, validated: bool) -> Diagnosis
         answer, *details = words.adequate_text(judged, ranking, ladder.best)
     kind = "structure" if not remaining.adequate else "fluctuation" if far(ladder.best) else "noise"
     details += [] if names else [words.unseen_remark(found.search.unseen(last), fit.model.base)]
-    told = partial(worded, units=units)
+    told = partial(worded, units=units, names=[run.name for run in fit.problem.experiments])
     answer, *details = (told(t) for t in (misread + answer, *details, *_remarks(found, driven)) if t)
     missing = replace(missing, text=told(missing.text), acts_like=told(missing.acts_like))
     judged, remaining = (replace(a, text=told(a.text)) for a in (judged, remaining))

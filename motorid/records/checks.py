@@ -74,7 +74,7 @@ def check_runs(runs: Sequence[Experiment], held_out: Sequence[Experiment] = ()) 
                        f"than that: does it act later than it was logged? If so: --delay {min(late):.3g}, "
                        f"run.delayed({min(late):.3g}).")
     more = _the_same_twice(runs), scales, _never_reverses(runs)
-    return [worded(text, units_of(runs)) for text in (*remarks, *more) if text]
+    return [worded(text, units_of(runs), [r.name for r in (*runs, *held_out)]) for text in (*remarks, *more) if text]
 
 
 def contradictions(runs: Sequence[Experiment]) -> str:
@@ -86,7 +86,7 @@ def contradictions(runs: Sequence[Experiment]) -> str:
     if late and max(late) > (1 + BEGUN) * min(late) + 3 * max(run.dt for run in runs):  # by more than is read off
         found.append(f"what was measured follows a step of the voltage after {span(late)} which no one delay mends: "
                      "log the voltage when it takes effect.")
-    return worded(" ".join(text for text in found if text), units_of(runs))
+    return worded(" ".join(text for text in found if text), units_of(runs), [run.name for run in runs])
 
 
 def as_command(run: Experiment) -> Experiment:

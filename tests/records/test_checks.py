@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from motorid.channels import CHANNELS
+from motorid.channels import CHANNELS, worded
 from motorid.errors import DataError
 from motorid.records.checks import check_runs, dead_times, reading_notes
 from motorid.records.datasets import data_path, datasets
@@ -749,3 +749,15 @@ def test_a_fast_voltage_that_only_shakes_a_speed_leaves_no_doubt_of_its_sign():
     assert "never negative" not in said(Experiment(t, {"v": v}, {"omega": omega}))
     slow = 12 * np.sign(np.sin(2 * np.pi * t))
     assert "the speed is never negative" in said(Experiment(t, {"v": slow}, {"omega": 20 * np.abs(slow)}))
+
+
+def test_names_of_records_keep_their_words_where_another_drive_is_spoken_of():
+    t = np.arange(600) * 1e-3
+    first = Experiment(t, {"v": np.full(600, 2.0)}, {"omega": 1 - np.exp(-t / 0.05)},
+                       units={"v": "N", "omega": "m/s"}, name="low voltage")
+    told = check_runs([first, first.with_(name="low voltage (2)")])[0]
+    assert told.startswith("low voltage: the force is 2 N from beginning to end")
+    assert told.endswith("Add runs with steps or a sweep of the force. (The same in low voltage (2).)")
+    said = "The voltage and the angle in a run, voltage test, of angle tests, and their voltages."
+    assert worded(said, {"v": "A", "theta": "m"}, ["voltage", "run", "voltage test", "angle tests"]) == (
+        "The current and the position in a run, voltage test, of angle tests, and their currents.")
