@@ -146,10 +146,9 @@ class Part:
         own = {"torque": torque, "voltage": "V", "both": f"{torque}/A"}.get(form.balance, SI.get(form.channel, ""))
         before = form.on.removeprefix("past ") if form.on in PAST and not form.carrier else ""
         by = [SI.get(n, "") for n in (before, form.carrier)]
-        if bare:
-            return own
         over = "".join(OVER[unit] for unit in by).replace("rad", "m" if torque == "N" else "rad")
-        return "1" if form.carrier == "acceleration" or own in by else own + over
+        unit = "Ω" if self.by_run and own + over == "V/A" else own + over
+        return own if bare else "1" if form.carrier == "acceleration" or own in by else unit
 
     @property
     def place(self) -> tuple[str, str]:

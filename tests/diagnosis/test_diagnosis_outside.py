@@ -208,6 +208,13 @@ def test_a_drag_that_is_another_in_every_run_is_in_the_units_of_its_axis(axis, u
     assert drag.unit(SimpleNamespace(model=SimpleNamespace(axis=axis))) == unit
 
 
+def test_a_resistance_that_is_another_in_every_run_is_in_ohms():
+    motor = SimpleNamespace(model=SimpleNamespace(axis="rotary"))
+    winding, constant = Form("a resistance", "voltage", "run", "i"), Form("a motor constant", "both", "run")
+    parts = (Part(form, Span({"run": (0.0, 1.0)}, (), 1e-3)) for form in (winding, constant))
+    assert [part.unit(motor) for part in parts] == ["Ω", "N·m/A"]
+
+
 def test_improve_grades_its_rungs_too(lab):
     runs = runs_of(lab, {"angular_friction": {"tau_m": 8e-3, "a_f": 0.7}})
     ladder = mi.improve(mi.fit(mi.dc_motor(), runs[:-1]), runs[-1:], effects=FRICTION)
