@@ -138,7 +138,7 @@ def _next_step(found: Diagnosis, report: Path | None = None, remainder_to: Path 
         command = f"look at {report}." if report else next_command("diagnose", "--report", "found.html")
         return f"Next: {command}\nIt shows where the model fails."
     if found.after.mostly_noise:
-        return "Next: record again, with larger steps of the voltage or less noise: these records tell a fit little."
+        return "Next: record again, driven by larger steps or with less noise: these records tell a fit little."
     return f"Next: {next_command('fit', '--json', 'fit.json')}\nThen: motorid export fit.json motor.casadi"
 
 

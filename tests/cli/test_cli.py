@@ -537,6 +537,15 @@ def test_what_no_effect_and_no_curve_explains_is_looked_at_next_not_exported(mon
     assert _next_step(replace(open_, verdict="adequate")).endswith("Then: motorid export fit.json motor.casadi")
 
 
+def test_what_is_mostly_noise_is_recorded_again_whatever_drives_it():
+    """A drive that is given a torque was to be recorded with larger steps of the voltage."""
+    last = SimpleNamespace(mostly_noise=True, model=mi.torque_driven())
+    told = _next_step(SimpleNamespace(stopped="", suggestion=None, remainder=None, effects=(), verdict="adequate",
+                                      after=last))
+    assert told.startswith("Next: record again, driven by larger steps or with less noise")
+    assert "voltage" not in told
+
+
 def test_help_cuts_no_name_at_80_columns(monkeypatch):
     monkeypatch.setenv("COLUMNS", "80")
     for name, command in get_command(app).commands.items():
