@@ -137,12 +137,12 @@ class Fit(Shown):
 
     @cached_property
     def per_run(self) -> dict[str, dict[str, dict[str, Any]]]:
-        """Value, std and unit of each parameter that is another in every run, by run; the first run's value stands."""
+        """Value, std and unit of what is another in every run, by run (of one name ``run (2)``); the first's stands."""
         known = dict(zip((p.name for p in self.problem.unknown), self._certainty.std, strict=True))
-        found: dict[str, dict[str, dict[str, Any]]] = {}
+        names, found = [r.name for r in self.problem.experiments], dict[str, dict[str, dict[str, Any]]]()
         for name, k, p in self.problem.unknowns.apart:
-            own = {"value": self.initial[p.name], "std": known[p.name], "unit": p.unit}
-            found.setdefault(name, {})[self.problem.experiments[k].name] = own
+            run = names[k] if names.count(names[k]) == 1 else f"{names[k]} ({k + 1})"
+            found.setdefault(name, {})[run] = {"value": self.initial[p.name], "std": known[p.name], "unit": p.unit}
         return found
 
     @cached_property

@@ -88,3 +88,14 @@ def test_of_parts_of_one_record_none_has_parameters_of_its_own_which_is_said(rng
                       outputs={c: np.r_[first.outputs[c], second.outputs[c]] for c in first.outputs})
     with pytest.warns(UserWarning, match="g_v differs between records; these are parts of one"):
         assert mi.fit(mi.dc_motor() + mi.effects.supply_per_run, run).per_run == {}
+
+
+def test_records_of_one_name_have_a_row_each(rng, tmp_path):
+    """Two of three records shared one, where the last one's size stood for both."""
+    first, second = two_supplies(rng)
+    third = second.with_(inputs={"v": second.inputs["v"] / 0.8})
+    fit = mi.fit(mi.dc_motor() + mi.effects.supply_per_run, [first, second, third, first.with_(name="other")])
+    found = {run: own["value"] for run, own in fit.per_run["g_v"].items()}
+    assert found == pytest.approx({"run (2)": 0.15, "run (3)": -0.08, "other": 0.0}, abs=5e-3)
+    assert list(mi.load(fit.save(tmp_path / "fit.json")).per_run["g_v"]) == list(found)
+    assert [row[1] for row in next(t for t in fit.card().tables if t.title == "Parameters per run").rows] == list(found)
