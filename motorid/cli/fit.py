@@ -10,17 +10,17 @@ import typer
 from motorid.cli import options as opt
 from motorid.cli.console import FAILED, INTERRUPTED, next_command, save_report, say_notes, show
 from motorid.display.cards import Table
-from motorid.display.numbers import counted, duration, factor, number, quantity
+from motorid.display.numbers import counted, duration, factor, number, quantity, sentence
 from motorid.effects import EVERY
 from motorid.errors import DataError, among
 from motorid.estimation.result import PLAIN, Fit, constraint_table, ended, steady_table, value_tables
 from motorid.exporters.c_code import check
-from motorid.exporters.export import FORMS, export
+from motorid.exporters.export import FORMS, MOSTLY_NOISE, export
 from motorid.exporters.json_file import constraint_violations, fit_dict, remarks, run_dict, write_json
 from motorid.numerics.parallel import processes
 from motorid.problem.simulate import NRMSE, Evaluation, error_table, evaluate, run_table
 from motorid.records.experiment import Experiment, repeated
-from motorid.records.files import write_files
+from motorid.records.files import read_bytes, write_files
 from motorid.records.reading import csv_text
 from motorid.uncertainty.batch import Batch, fit_many, motors_in
 from motorid.uncertainty.identifiability import Identifiability, identifiability
@@ -108,8 +108,7 @@ def fit_many_command(directories: Motors, options: opt.FitOptions, out: MotorTab
     with processes(min(jobs, len(motors))) as over:
         found = fit_many(model, motors, map=over, journal=journal, reading=options.reading, **options.keywords())
     _give(found, json, options.force)
-    if out:
-        show(f"Table: {found.save(out, options.force)}")
+    show(f"Table: {found.save(out, options.force)}" if out else None)
     if found.interrupted:
         raise typer.Exit(INTERRUPTED)
     if len(found.failed) == len(found.rows):
@@ -212,8 +211,9 @@ def export_command(fit_json: SavedModel, path: Target, to: Form = None, effects_
     if to is not None:
         among(to, FORMS.values(), "form", where="--to: ")
     model = opt.saved_model(fit_json, effects_from)
-    written = export(model, path, to, force=force)
-    show(f"Written: {written}", f"Sub-steps: {check(model).text}" if written.suffix == ".c" else None)
+    written, noisy = export(model, path, to, force=force), b"Fits records that are mostly noise" in read_bytes(fit_json)
+    show(f"Written: {written}", sentence(MOSTLY_NOISE) if noisy else None,
+         f"Sub-steps: {check(model).text}" if written.suffix == ".c" else None)
 
 
 @opt.with_options(opt.FitOptions)
@@ -245,7 +245,6 @@ def robustness_command(runs: opt.Runs, options: opt.FitOptions, starts: Starts =
 
 
 def _give(found: Batch | Identifiability | Multistart, json: opt.Json, force: bool) -> None:
-    if json != "-":
-        show(str(found))
+    show(str(found) if json != "-" else None)
     if json:
         write_json(found.to_dict(), json, force)

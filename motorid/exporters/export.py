@@ -34,6 +34,7 @@ NO_FMU = ("an FMU is not offered: those that CasADi 3.8.2 writes do not pass FMP
           "initial unknowns), and FMPy simulates them with other trajectories. Take to='c' or to='casadi'.")
 SAME = 1e-4  # relative difference of costs that machines and engines make
 NOT_OURS = "it is no model or fit that motorid wrote"
+MOSTLY_NOISE = "this fit is of records that are mostly noise: its values mean little; record again."
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,6 +120,8 @@ def export(found: Fit | Model | Exported, path: str | os.PathLike[str], to: str 
     among(form, _CONTENTS, "form")
     found = found.model if isinstance(found, Exported) else found
     model_of(found)
+    if isinstance(found, Fit) and found.mostly_noise:
+        warnings.warn(MOSTLY_NOISE, stacklevel=2)
     with contextlib.suppress(OSError):  # said when it is written
         target.parent.mkdir(parents=True, exist_ok=True)
     return write_files(_CONTENTS[form](found, target), force)[0]
@@ -187,9 +190,8 @@ def _fit_of(contents: Mapping[str, Any], effects: Iterable[Effect], name: str) -
         residuals, jac = problem.residual_and_jacobian(q)
         extra = {k: tuple(Multiplier(**m) for m in v) if k in ("multipliers", "active") else np.array(v, float)
                  if k == "free" else v for k, v in told["extra"].items()}
-        plain = {f: told[f] for f in SAVED} | {"q": q, "history": tuple(told["history"]), "extra": extra}
-        if plain["integration_error"] is None:
-            plain["integration_error"] = float("nan")
+        plain: dict[str, Any] = {f: np.nan if told[f] is None else told[f] for f in SAVED}  # as JSON has it
+        plain |= {"q": q, "history": tuple(told["history"]), "extra": extra}
         cost = float(told["cost"])
         found = Fit(problem, problem.values(q), residuals, jac / problem.scaling.slope(q), **plain)
     except MotoridError:

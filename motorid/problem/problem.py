@@ -22,7 +22,7 @@ from motorid.numerics.least_squares import Huber
 from motorid.numerics.signals import Array
 from motorid.problem.runs import Run, first_width, noise_of, prepare_run, with_inputs
 from motorid.problem.unknowns import Point, Scaling, Unknowns
-from motorid.records.experiment import Experiment, between_pauses, units_of
+from motorid.records.experiment import Experiment, between_pauses
 
 SUBSTEPS = 10  # per sample: what needs more cannot be seen in these samples, unless it is cheap
 CHEAP = 60_000  # steps of integration
@@ -99,8 +99,7 @@ class Problem:
                                  f"{self.priors[name]}.")
         if self.loss is not None and (not hasattr(self.loss, "pseudo") or isinstance(self.loss, type)):
             raise UsageError(f"loss takes mi.Huber() or None; got {name_of(self.loss)}.")
-        if self.model.base == "torque_driven" and self.model.axis == "rotary" and any(
-                {"m", "m/s"} & set(r.units.values()) for r in self.experiments):
+        if self.model.base == "torque_driven" and self.model.axis == "rotary" and self.linear:
             raise ModelError("the records are in metres, and the model is one that turns: write "
                              "mi.torque_driven(axis='linear'), or state the units of the records.")
         driven = next((r.units["v"] for r in self.experiments if r.units["v"] in ("A", "N·m", "N")), "")
@@ -311,7 +310,7 @@ class Problem:
     @property
     def linear(self) -> bool:
         """Tell whether the angle is a position in metres: nothing comes back with a turn."""
-        return self.model.axis == "linear" or not {"m", "m/s"}.isdisjoint(units_of(self.experiments).values())
+        return self.model.axis == "linear" or any({"m", "m/s"} & {*r.units.values()} for r in self.experiments)
 
     @property
     def n_outputs(self) -> int:

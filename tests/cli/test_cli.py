@@ -267,8 +267,22 @@ def test_export_writes_every_form(fitted, tmp_path, name):
     path, _ = fitted
     done = motorid("export", path, tmp_path / name)
     assert done.status == 0, done.err
+    assert "noise" not in done.out
     assert (tmp_path / name).stat().st_size > 500
     assert name in " ".join(done.out.split())
+
+
+def test_who_exports_a_fit_of_what_is_mostly_noise_is_told(rng, tmp_path):
+    t = np.arange(600) * 0.01
+    run = mi.Experiment(t, {"v": np.where(t < 0.01, 0.0, 6.0)}, {"omega": 20 + 60 * rng.normal(size=600)})
+    path, said = write_csv(run, tmp_path / "noisy.csv"), "This fit is of records that are mostly noise"
+    motorid_json(tmp_path, "fit", path)
+    fit = mi.fit(mi.dc_motor(), run)
+    assert fit.mostly_noise
+    for saved in (tmp_path / "result.json", fit.save(tmp_path / "fit.json")):
+        assert said in " ".join(motorid("export", saved, tmp_path / "motor.json", "--force").out.split())
+    with pytest.warns(UserWarning, match="records that are mostly noise: its values mean little"):
+        mi.export(fit, tmp_path / "motor.json", force=True)
 
 
 def test_export_to_json_and_casadi_come_back(fitted, tmp_path):
