@@ -105,18 +105,23 @@ class _Refining:
     """A problem whose sub-steps follow the solution."""
 
     def __init__(self, problem: Problem) -> None:
-        self.problem, self._chosen_at = problem, np.full(len(problem.start), np.inf)
+        self.problem, self._first, self._chosen_at = problem, problem, np.full(len(problem.start), np.inf)
+
+    def _follow(self, q: Array) -> None:
+        before, self.problem, self._chosen_at = self.problem, self.problem.refined(q), q
+        if before is not self._first:  # it holds its trajectories, and the next
+            before.forget()
 
     def residual(self, q: Array) -> Array:
         return self.problem.residual(q)
 
     def residual_and_jacobian(self, q: Array) -> tuple[Array, Array]:
         if np.max(np.abs(q - self._chosen_at), initial=0.0) > FAR:
-            self.problem, self._chosen_at = self.problem.refined(q), q
+            self._follow(q)
         r, jac = self.problem.residual_and_jacobian(q)
         # A sgn that the steps jump over makes slopes of nothing.
         if np.max(np.abs(jac), initial=0.0) > WILD * np.linalg.norm(r) and not np.array_equal(q, self._chosen_at):
-            self.problem, self._chosen_at = self.problem.refined(q), q
+            self._follow(q)
             r, jac = self.problem.residual_and_jacobian(q)
         return r, jac
 

@@ -169,17 +169,16 @@ class Problem:
 
     def _simulate(self, at: Point, k: int, derivatives: bool) -> Trajectory:
         known, seen, count = self._latest.get(k), self.unknowns.seen_by[k], len(at.q)
-        if known is not None and np.array_equal(known[0], at.q[seen]) and (known[1].dy is not None or not derivatives):
-            return known[1]
-        at = self.unknowns.of_run(at, k)
-        x0, grid = self.unknowns.first_state(at, k), self.runs[k].grid
-        slopes = (self.unknowns.first_slopes(at, k)[:, seen], at.dp[:, seen]) if derivatives and len(seen) else ()
-        traj = self.integrator.run(self.system, grid, x0, at.p, *slopes)
-        if derivatives and len(seen) < count:  # what is another run's changes nothing here
+        if known is None or not np.array_equal(known[0], at.q[seen]) or (known[1].dy is None and derivatives):
+            at = self.unknowns.of_run(at, k)
+            x0, grid = self.unknowns.first_state(at, k), self.runs[k].grid
+            slopes = (self.unknowns.first_slopes(at, k)[:, seen], at.dp[:, seen]) if derivatives and len(seen) else ()
+            known = self._latest[k] = at.q[seen], self.integrator.run(self.system, grid, x0, at.p, *slopes)
+        traj = known[1]
+        if derivatives and len(seen) < count:  # what is another run's changes nothing here, and takes no memory
             dy, dx = np.zeros((*traj.y.shape, count)), np.zeros((*traj.x.shape, count))
             dy[..., seen], dx[..., seen] = (0.0, 0.0) if traj.dy is None else (traj.dy, traj.dx)
             traj = traj._replace(dy=dy, dx=dx)
-        self._latest[k] = (at.q[seen], traj)
         return traj
 
     @cached_property

@@ -11,9 +11,11 @@ from lab_records import NOISE, VALUES, drive, noisy, pair, simulated
 
 import motorid as mi
 from motorid.errors import DataError, ModelError, UsageError
+from motorid.estimation.least_squares import RACE, least_squares
 from motorid.problem.problem import as_problem
 from motorid.problem.runs import initial_state
 from motorid.problem.simulate import simulate
+from motorid.records.experiment import windows
 
 TRUE = mi.dc_motor(**VALUES)
 
@@ -473,3 +475,16 @@ def test_records_in_metres_are_none_of_a_drive_that_turns(units):
     with pytest.raises(mi.ModelError, match=r"metres.*torque_driven\(axis='linear'\)"):
         mi.Problem(mi.torque_driven(), [run])
     assert mi.Problem(mi.torque_driven(axis="linear"), [run]).outputs == tuple(units)
+
+
+def test_a_fit_keeps_the_trajectories_of_where_it_is_alone():
+    """Not of all sub-steps on its way, and of a window those by its own states: else windows fill the memory."""
+    run = pair(np.random.default_rng(2))[0]
+    parts = windows(run, run.duration / 10)
+    problem = as_problem(mi.dc_motor(R=20.0, K=0.2, J=1e-3), parts)
+    end, links, there = least_squares(problem, RACE).problem, 0, problem
+    while (known := there._latest.get("refined")) is not None:
+        links, there = links + 1, known[1]
+    assert links <= 2
+    assert end.simulate(end.start, 3).dx.shape[2] == len(end.unknown)
+    assert end._latest[3][1].dx.shape[2] < len(end.unknown) / 2
