@@ -125,8 +125,7 @@ def _head(port: str | Link, header: Header, whole: Program, limits: tuple[float,
             "started": datetime.now().astimezone().isoformat(timespec="milliseconds"),
             "rate_Hz": f"{header.rate:g}", "limits": f"{limits[0]:g} V, {limits[1]:g} A", "excitation": whole.words,
             **{f"channel {c.name}": f"{c.scale:.9g} {c.unit} per count, zero at {c.offset:.9g}, kind {c.kind}"
-               for c in header.channels},
-            **({"calibration": entries} if entries else {})}
+               for c in header.channels}, **({"calibration": entries} if entries else {})}
 
 
 def _left(whole: Program, tail: Tail) -> Program:

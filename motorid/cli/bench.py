@@ -34,8 +34,7 @@ Force = Annotated[bool, typer.Option("--force", help="Replace a file that exists
 Timeout = Annotated[float, typer.Option(metavar="S", help="End the recording after so many seconds of silence.")]
 Quiet = Annotated[bool, typer.Option("--quiet", help="No live progress.")]
 
-HiddenEffect = Annotated[str, typer.Option(
-    metavar="a,b",
+HiddenEffect = Annotated[str, typer.Option(metavar="a,b",
     help="What is hidden: none, random, or effects joined by commas, with or without values: coulomb:tau_c=0.01.")]
 MotorName = Annotated[str, typer.Option(metavar="NAME", help="Which motor: micro, lab, servo, wheel, big.")]
 Seed = Annotated[int | None, typer.Option(
@@ -47,8 +46,7 @@ Probability = Annotated[float, typer.Option(metavar="P", min=0.0, max=1.0, help=
 UnplugAfter = Annotated[float | None, typer.Option(metavar="S", help="Unplug the bench so long into a run.")]
 PlugAfter = Annotated[float | None, typer.Option(metavar="S", help="Plug it in again after so long.")]
 LinkName = Annotated[Path | None, typer.Option(metavar="PATH", help="A name for the port that stays the same.")]
-SocketPort = Annotated[int | None, typer.Option(
-    metavar="PORT", min=0, max=65_535,
+SocketPort = Annotated[int | None, typer.Option(metavar="PORT", min=0, max=65_535,
     help="Serve socket:// on this port of the loopback address (0: any) instead of a pseudo-terminal.")]
 Once = Annotated[bool, typer.Option("--once", help="End after the first run.")]
 Reveal = Annotated[bool, typer.Option("--reveal", help="At the end, show what was hidden.")]

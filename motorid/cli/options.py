@@ -45,8 +45,7 @@ Report = Annotated[Path | None, result("--report", metavar="PATH.html", help="Wr
 Force = Annotated[bool, result("--force", help="Write over inputs and over files that motorid did not write.")]
 Jobs = Annotated[int, result("--jobs", min=1, metavar="N", help="Processes that share the work.")]
 EffectsFrom = Annotated[Path | None, typer.Option(metavar="FILE.py", help="Effects of your own.")]
-Validate = Annotated[list[str] | None, result(
-    "--validate", metavar="RUN...",
+Validate = Annotated[list[str] | None, result("--validate", metavar="RUN...",
     help="Held-out records, never fitted; put it after the records, since it takes all names that follow.")]
 
 
@@ -54,8 +53,7 @@ Validate = Annotated[list[str] | None, result(
 class ReadingOptions:
     """How to read records."""
 
-    columns: Annotated[str | None, _reading(
-        metavar="t=…,v=…",
+    columns: Annotated[str | None, _reading(metavar="t=…,v=…",
         help="Which column is which channel, where the header does not say: t=time,v=u_volt.")] = None
     units: Annotated[str | None, _reading(
         metavar="omega=rpm", help="Units of channels, where the header does not say.")] = None
@@ -104,8 +102,7 @@ class ReadingOptions:
 class DriveOptions(ReadingOptions):
     """How to read records, and what drives the motor in them."""
 
-    drive: Annotated[str, _model(
-        metavar="voltage|torque",
+    drive: Annotated[str, _model(metavar="voltage|torque",
         help="torque: a drive that closes its own current loop; v is its command.")] = "voltage"
 
     def notes(self, runs: Sequence[Experiment], held_out: Sequence[Experiment] = ()) -> list[str]:
@@ -131,8 +128,7 @@ class FitOptions(DriveOptions):
         metavar="FILE.py", help="Python file with effects of your own (@mi.effect).")] = None
     solver: Annotated[str | None, _solving(
         metavar="lm|multiple-shooting", show_default=False, help="By default lm; multiple-shooting for hard.")] = None
-    formulation: Annotated[str, _solving(
-        metavar="plain|penalty|hard",
+    formulation: Annotated[str, _solving(metavar="plain|penalty|hard",
         help="Constraints beside the data: none, weighted penalties, or hard ones.")] = "plain"
     current_limit: Annotated[float | None, _solving(
         metavar="A", help="The current never exceeds this (penalty, hard).")] = None

@@ -141,13 +141,9 @@ def _laws_as_good(chosen: Node, children: Sequence[Node], parent: Node) -> list[
 
 
 def _price(node: Node) -> tuple[bool, int, int]:
-    """What decides between equals: whether a model has a rare device in the place of dry friction, then its size."""
-    return _imitates(node), node.size, rarity(node.added)
-
-
-def _imitates(node: Node) -> bool:
-    """Tell whether a model brakes like an eddy current and does not rub: all that turns rubs, and few were built so."""
-    return "eddy_brake" in node.key and not rubs(node)
+    """What decides between equals: whether a model has a rare device in the place of dry friction (all that turns rubs,
+    and few were built to brake like an eddy current), then its size."""
+    return "eddy_brake" in node.key and not rubs(node), node.size, rarity(node.added)
 
 
 def rubs(node: Node) -> bool:
@@ -158,7 +154,7 @@ def rubs(node: Node) -> bool:
 def _as_likely(node: Node, chosen: Node) -> bool:
     """Tell whether a model that rubs predicts hardly worse than one with a rare device that leaves more than noise:
     what is missing beside either may make the difference, where that is less than what is left."""
-    rare = _imitates(chosen) and rubs(node) and not node.objection
+    rare = _price(chosen)[0] and rubs(node) and not node.objection
     return rare and bool(far(chosen.fit)) and follows(chosen.fit) and (1 - evidence(node, chosen).fall) ** 2 > MOST
 
 

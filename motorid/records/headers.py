@@ -36,10 +36,8 @@ _SPELLINGS = {
     "angle": {1.0: "rad radian radians", 1e-3: "mrad", _DEGREE: "deg degree degrees grad",
               _TURN: "rev revs revolution revolutions turn turns tr umdrehungen"},
     "length": {1.0: "m meter meters metre metres", 1e-2: "cm", 1e-3: "mm", 1e-6: "um"},
-    "torque": {1.0: "nm", 1e-3: "mnm", 1e-2: "ncm"},
-    "force": {1.0: "n newton", 1e3: "kn"},
-    "ratio": {1.0: "1 -", 1e-2: "% percent"},
-    "temperature": {1.0: "degc celsius c k kelvin"}}
+    "torque": {1.0: "nm", 1e-3: "mnm", 1e-2: "ncm"}, "force": {1.0: "n newton", 1e3: "kn"},
+    "ratio": {1.0: "1 -", 1e-2: "% percent"}, "temperature": {1.0: "degc celsius c k kelvin"}}
 _KNOWN = {word: (dimension, factor) for dimension, sizes in _SPELLINGS.items()
           for factor, words in sizes.items() for word in words.split()}
 _COUNTS = re.compile(r"(?:counts?|cnts?|ticks?|inc|in[ck]rement[es]?|pulses?|impulse|steps?)(/s)?(?::(.*))?")
