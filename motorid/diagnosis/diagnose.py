@@ -80,7 +80,8 @@ def diagnose(fit: Fit, validate: Sequence[Experiment] | Experiment | None = None
         stages.done("located what is missing")
         twice = repeated(fit.problem.experiments, [validate] if isinstance(validate, Experiment) else validate or ())
         misread = _contradicting(found.path[-1].fit, found.remaining.adequate, fit.problem.experiments)
-        return _told(found, misread, " ".join(w for w in (twice, driven) if w), validate is not None)
+        records = () if driven else fit.problem.experiments  # as they were read
+        return _told(found, misread, " ".join(w for w in (twice, driven) if w), validate is not None, records)
 
 
 def _contradicting(last: Fit, adequate: bool, runs: Sequence[Experiment]) -> str:
@@ -94,7 +95,7 @@ def _contradicting(last: Fit, adequate: bool, runs: Sequence[Experiment]) -> str
     return f"The records seem to contradict themselves; check first: {said} Taken as they are: " if said else ""
 
 
-def _told(found: Climb, misread: str, driven: str, validated: bool) -> Diagnosis:
+def _told(found: Climb, misread: str, driven: str, validated: bool, records: Sequence[Experiment]) -> Diagnosis:
     """Return what a climb found, in words and as a result; first how the records contradict themselves, `misread`."""
     fit, ladder, remaining = found.search.root.fit, ladder_of(found, validated), found.remaining
     missing, judged, last, units = locate(fit), found.first, found.path[-1], units_of(fit.problem.experiments)
@@ -137,7 +138,7 @@ def _told(found: Climb, misread: str, driven: str, validated: bool) -> Diagnosis
     judged, remaining = (replace(a, text=told(a.text)) for a in (judged, remaining))
     text = " ".join(t for t in (answer, *details, suggestion) if t)
     approximating = {g.effect: g.form for g in found.grades if g.grade == "approximates"}
-    remainder = Remainder(kind, ladder.best, forms, found.search.held, fit, approximating)
+    remainder = Remainder(kind, ladder.best, forms, found.search.held, fit, approximating, records)
     return Diagnosis(verdict, text, where, names, judged, missing, ranking, ladder, groups, suggestion, fit,
                      ladder.best, remaining, remainder, found.stopped, answer, tuple(details), rivals or (ladder.best,))
 

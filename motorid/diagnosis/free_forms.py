@@ -106,12 +106,12 @@ class Form:
 
 _PUSHES = (  # words, balance, carrier, quantities
     ("a friction", "torque", "direction", ("turn", "theta", "t", "distance", "i", "v", "run", "past speed",
-                                         "past power", "past heat", *COMPUTED_INPUTS)),
+                                         "past power", "past heat", "most i", *COMPUTED_INPUTS)),
     ("a load", "torque", "", ("turn", "theta", "t", "run")),
     ("a drag", "torque", "omega", ("t", "distance", "turn", "theta", "i", "run", "past speed", "past power",
                                  "past heat")),
     ("a torque", "torque", "", ("omega", "i")),
-    ("an inertia", "torque", "acceleration", ("turn", "theta", "run", "omega")),
+    ("an inertia", "torque", "acceleration", ("turn", "theta", "run", "omega", "most i")),
     ("a transient from each run's initial state, or an inertia", "torque", "acceleration", ("t",)),
     ("a loss of voltage", "voltage", "", ("omega", "v", "i", "t", "run")),
     ("a gain of the voltage", "voltage", "v", ("t", "turn", "load", "past load", "past braking",
@@ -120,7 +120,7 @@ _PUSHES = (  # words, balance, carrier, quantities
     ("a motor constant", "both", "", ("t", "turn", "theta", "omega", "i", "run", "past i", "past size", "most i")))
 FORMS = (*(Form(words, balance, on, carrier) for words, balance, carrier, quantities in _PUSHES for on in quantities),
          *(Form("a gain of the speed sensor", "sensor", on, "omega", "omega") for on in ("turn", "t")),
-         Form("a gain of the current sensor", "sensor", "t", "i", "i"),
+         *(Form("a gain of the current sensor", "sensor", on, "i", "i") for on in ("t", "past heat")),
          *(Form("an error of the angle sensor", "sensor", on, "", "theta")
            for on in ("path", "turn", "theta", "omega", "i")),
          *(Form("an error of the speed sensor", "sensor", on, "", "omega") for on in ("omega", "i", "t")),
@@ -314,6 +314,10 @@ def _of_size(form: Form, span: Span, low: float, high: float) -> list[str]:
     sides = [sign for sign, reach in (("", high), ("-", -low)) if reach > 0]
     knees = [_place(c, 0, 1) for c in np.linspace(0, 1, KNEES * span.finer + 2)[1:-1]]
     smooth += [f"ca.fmax({sign}{s} - {c}, 0)" for sign in sides for c in knees]
+    level, wide = size if form.carrier else s, _place(SOFT, SOFT**2, 1)  # of what is switched there
+    both = low < 0 and not form.carrier
+    smooth += [f"(ca.tanh(({s} - {c}) / {wide}) + ca.tanh(({s} + {c}) / {wide}))" if both else
+               f"ca.tanh(({level} - {c}) / {wide})" for c in knees if form.on != "load"]
     if not low < 0 < high:
         return ["1.0", *smooth]
     smooth += [f"(ca.fmax({s} - {c}, 0) - ca.fmax(-{s} - {c}, 0))" for c in knees]  # the same either way
@@ -452,7 +456,7 @@ def linearised(fit: Fit, only: Form | None = None, span: Span | None = None,
 def _at(problem: Problem, fit: Fit) -> tuple[Array, Array]:
     """Return residual and slopes (SI) of the fitted model, without loss and priors."""
     first = {f"{c}_0[{k}]": float(y[0]) for k, s in enumerate(fit.simulations) for c, y in s.states.items()}
-    values = {**fit.initial, **fit.values, **first}
+    values = {**first, **fit.initial, **fit.values}  # an angle begins where the encoder reads so, whatever its zero
     q = problem.scaling.scaled([values.get(p.name, p.value) for p in problem.unknown])
     problem = replace(problem, loss=None, priors={}, penalties=(), _runs=problem.refined(q).runs)
     residual, jac = problem.residual_and_jacobian(q)

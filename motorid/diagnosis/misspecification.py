@@ -32,6 +32,7 @@ from motorid.problem.runs import SGN_WIDTH_SHARE
 from motorid.records.checks import current_limit
 
 LIMITER = "driver_current_limit"
+SINCE_START = ("t", "distance", "most i")  # which begin anew in every part of a record, as what remembers does
 IN_ITS_PLACE = "{}, which the library lacks, predicts better in its place"
 
 
@@ -46,13 +47,13 @@ class FormGain:
     beside: bool = False  # it leaves noise beside that model, not in its place
 
 
-def better_forms(fit: Fit, rival: Fit, channels: Container[str] = CHANNELS) -> list[FormGain]:
-    """Return the forms that added to `fit` predict these channels, and all, better than `rival`, the best first.
-
-    What remembers comes after a function of the present that is not surely worse.
+def better_forms(fit: Fit, rival: Fit, channels: Container[str] = CHANNELS, past: bool = False) -> list[FormGain]:
+    """Return the forms, or of the `past` alone, that added to `fit` predict these channels, and all, better than
+    `rival`, the best first. What remembers comes after a function of the present that is not surely worse.
     """
     try:
         linear = free_forms.linearised(fit)
+        linear = replace(linear, forms=[f for f in linear.forms if not past or f.remembers or f.on in SINCE_START])
         answers = {form: Answers(fit, linear, form).predictions() for form in linear.forms}
         if far(fit) and free_forms.may_be_zeroed(fit):
             for form, plain in [(f, known) for f, known in answers.items() if f.on == "turn"]:

@@ -48,6 +48,7 @@ FEW = 4 * PART  # samples of that first fit
 NEARLY_ALL = 0.7  # of the samples: no reason to leave out the rest
 LEVELS = 8  # of speed and of voltage that parts are to show
 TIMES = 4  # and parts of the record
+WHOLE = 10  # times as long as of its parts: what is worth looking at on whole records, where memory counts
 
 
 def affordable(fit: Fit) -> Fit:

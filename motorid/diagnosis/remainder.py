@@ -26,6 +26,7 @@ from motorid.diagnosis.free_forms import FINER, PAST, PLACE, WHERE, Form, Span
 from motorid.diagnosis.misspecification import FormGain, better_forms, chosen_functions, pitches_of, tells_the_zero
 from motorid.diagnosis.model_comparison import Node, at_noise, far
 from motorid.diagnosis.predictive_score import QUICK, Evidence, HeldOut, Predictions, compare
+from motorid.diagnosis.record_versions import WHOLE, fitted_to, thinned_alike
 from motorid.diagnosis.refit import refit
 from motorid.display.numbers import listed, number, percent
 from motorid.effects import PER_RUN
@@ -38,7 +39,7 @@ from motorid.model.equations import Equations
 from motorid.model.model import Model
 from motorid.numerics.parallel import budget, check_time, one_thread
 from motorid.numerics.signals import Array
-from motorid.records.experiment import units_of
+from motorid.records.experiment import Experiment, units_of
 
 SECONDS = 120.0  # after which the best curve so far is taken
 TRIED = 4  # curves that are fitted, those that promise most
@@ -90,11 +91,6 @@ class Law:
         exec(self.source, {"ca": ca, "m": m, **coefficients})
 
 
-def _each(function: str) -> Iterator[re.Match[str]]:
-    """Yield the places in the source of a function, each once."""
-    return iter({m[0]: m for m in PLACE.finditer(function)}.values())
-
-
 @dataclass(frozen=True)
 class Part:
     """A free form in a curve, of as few functions as its records ask for; if `moved`, their places are fitted too."""
@@ -126,14 +122,14 @@ class Part:
     @property
     def places(self) -> list[tuple[float, float, float, str]]:
         """Where each function bends, sets in or fades on the grid, its limits and unit; none if they stay there."""
-        each = (m.groups() for f in self.functions if self.moved for m in _each(f))
+        each = (m.groups() for f in self.functions if self.moved for m in {m[0]: m for m in PLACE.finditer(f)}.values())
         return [(float(at), float(low), float(high), unit or self.place[0]) for at, low, high, unit in each]
 
     def terms(self, places: Iterable[Any]) -> list[str]:
         """The functions as source, with these names or values as their places, if they are `moved`."""
         given, terms = iter(places), []
         for f in self.functions:
-            for m in _each(f):
+            for m in {m[0]: m for m in PLACE.finditer(f)}.values():  # each once
                 f = f.replace(m[0], str(next(given)) if self.moved else m[1])
             # Few functions are a law, which goes on; of many on a grid nothing is known beyond, nor what they drive.
             goes_on = self.moved and self.form.balance == "sensor" and self.form.on in ("omega", "i", "v")
@@ -358,6 +354,7 @@ class Remainder:
     _root: Fit | None = field(default=None, repr=False)  # of the model that the search began with
     # effects that only approximate the rest, with the form that predicts better in their place, if one does
     _approximating: Mapping[str, Form | None] = field(default_factory=dict, repr=False)
+    _records: Sequence[Experiment] = field(default=(), repr=False)  # of which the fit may be of parts
 
     @property
     def form(self) -> Form | None:
@@ -421,15 +418,35 @@ class Remainder:
         """The curve with which the model, fitted anew, predicts best."""
         if self.kind != "structure":
             raise UsageError(f"the remainder is {self.kind}: nothing is left that a curve over a quantity predicts.")
-        held, best = self._held or HeldOut.of(self.fit, None), None
-        short = (t for root in [self._root or self.fit] for t in _grown_in(_moments(root), root, self.forms))
-        every = short, self._tried(), _beyond(self._anew)
+        best = None
         with contextlib.suppress(OutOfTime), budget(SECONDS):
-            best = _best(self.fit, chain.from_iterable(islice(some, TRIED) for some in every), held)
+            best = self._grown
+            whole = None if best is not None and best.done else self._on_whole
+            other = whole and whole._grown
+            there = [Predictions({}, g.predictions.held_out) for g in (best, other) if g]
+            best = other if other and (len(there) < 2 or compare(*there).worth_it) else best
         if best is None:
             raise UsageError("something predictable is left, but no curve over one quantity lowers the error on data "
                              "left out; do these hold voltages or speeds that others lack?")
-        return best
+        return best.curve
+
+    @property
+    def _grown(self) -> Grown | None:
+        """The same, as far as it has grown; None where none helps. Raises OutOfTime before there is any."""
+        short = (t for root in [self._root or self.fit] for t in _grown_in(_moments(root), root, self.forms))
+        every = chain.from_iterable(islice(some, TRIED) for some in (short, self._tried(), _beyond(self._anew)))
+        return _best(self.fit, every, self._held or HeldOut.of(self.fit, None))
+
+    @property
+    def _on_whole(self) -> Remainder | None:
+        """The same on whole `_records`, where the fit is of parts, if what is lost between them predicts more."""
+        parts, runs = self.fit.problem.experiments, thinned_alike(self.fit, self._records)
+        if "part of" not in parts[0].meta or not 0 < sum(r.n for r in runs) <= WHOLE * sum(r.n for r in parts):
+            return None
+        last, root = (fitted_to(f, runs, QUICK) for f in (self.fit, self._root or self.fit))
+        gains = (g for f in (last, root) for g in better_forms(f, f, past=True))
+        forms = tuple(g.form for g in sorted(gains, key=lambda g: -g.evidence.gain))
+        return Remainder(self.kind, last, forms, self._held, root) if forms else None
 
     def _tried(self) -> Iterator[tuple[Curve, Form]]:
         """Yield models and a form to fit with each, the likeliest first; what takes a fit to find only when asked for.
@@ -532,7 +549,7 @@ class Grown(NamedTuple):
 
 
 @one_thread
-def _best(fit: Fit, tried: Iterable[tuple[Curve, Form]], held: HeldOut) -> Curve | None:
+def _best(fit: Fit, tried: Iterable[tuple[Curve, Form]], held: HeldOut) -> Grown | None:
     """Return the curve, fitted with its model, that predicts most beyond `fit`; None where none does."""
     before, name = held.predictions(fit), _name(fit)
     best = _better_curve(((replace(curve, name=name), form) for curve, form in tried), before, held)
@@ -540,7 +557,7 @@ def _best(fit: Fit, tried: Iterable[tuple[Curve, Form]], held: HeldOut) -> Curve
         if best is None or best.done or (larger := _better_curve(_further(best), best.predictions, held)) is None:
             break
         best = _revised(larger, held)
-    return best and best.curve
+    return best
 
 
 def _further(best: Grown, than: Form | None = None) -> Iterator[tuple[Curve, Form]]:

@@ -17,20 +17,13 @@ from typing import Any
 import numpy as np
 
 from motorid.channels import worded
+from motorid.diagnosis import record_versions as versions
 from motorid.diagnosis.adequacy import following, judge_adequacy, within_noise
 from motorid.diagnosis.admissibility import run_through
 from motorid.diagnosis.candidates import Search, Stages, library
 from motorid.diagnosis.misspecification import IN_ITS_PLACE, FormGain, Grade, better_forms, grades_of, outdoes, swallows
 from motorid.diagnosis.model_comparison import Node, at_noise, beats, choose, evidence, far, group_of, node_of
 from motorid.diagnosis.predictive_score import QUICK, HeldOut, is_sure
-from motorid.diagnosis.record_versions import (
-    Reading,
-    affordable,
-    better_reading,
-    fitted_to,
-    thinned_alike,
-    without_spikes,
-)
 from motorid.diagnosis.refit import BEAM, BEHIND, INTERRUPTED, OUT_OF_TIME
 from motorid.diagnosis.remainder import alone_leaving_noise, beside_leaving_noise
 from motorid.diagnosis.results import Adequacy, Candidate, Ladder, Rung
@@ -47,7 +40,6 @@ from motorid.records.experiment import Experiment, units_of
 ORDER = ("named", "group", "approximates")  # grades, the surest first
 FITTED_TOO = ("The fitted runs alone leave nothing but noise, and the model that they determine fails on the held-out "
               "ones: these were fitted, too, and none are left to judge by.")
-WHOLE = 10  # times as long as of its parts: what a search on whole records may take, where its end is known
 DRAWS_BACK = frozenset(("spring", "end_stop"))  # what drifts, whatever is missing
 HALF_AS_GOOD = 0.5  # of the best child's fall: what a second model must reach to be carried along
 
@@ -72,7 +64,7 @@ class Climb:
     grades: tuple[Grade, ...] = ()
     stopped: str = ""
     rivals: tuple[Fit, ...] = ()
-    misread: Reading | None = None
+    misread: versions.Reading | None = None
 
 
 def climb(search: Search, max_effects: int, seconds: float | None = None, early: bool = False) -> Climb:
@@ -92,7 +84,7 @@ def climb(search: Search, max_effects: int, seconds: float | None = None, early:
         with parallel.budget(seconds and max(seconds - 2 * looked, 0.0)):
             while (further := next(steps, None)) is not None:
                 found = further
-                if early and far(fit := found.path[-1].fit) and (misread := better_reading(fit, earlier=True)):
+                if early and far(fit := found.path[-1].fit) and (misread := versions.better_reading(fit, earlier=True)):
                     return replace(found, misread=misread)
         search.stages.round(max_effects + 1)
         search.stages.at("Looking at what remains")
@@ -306,9 +298,9 @@ class Records:
     fit: Fit
     held_out: Sequence[Experiment] | None
     remarks: tuple[str, ...] = ()
-    reading: Reading | None = None  # the last one, of which the last remark tells
+    reading: versions.Reading | None = None  # the last one, of which the last remark tells
 
-    def read(self, reading: Reading) -> Records:
+    def read(self, reading: versions.Reading) -> Records:
         """Return all records read in another way."""
         after = reading.fitted(self.fit)
         held_out = self.held_out and [reading.of(r) for r in self.held_out]
@@ -341,7 +333,7 @@ def explored(fit: Fit, validate: Sequence[Experiment] | Experiment | None, effec
         return climb(Search(records.fit, records.held_out, effects, stages), most, left(), early)
 
     held_out = [validate] if isinstance(validate, Experiment) else validate
-    as_it_was, records, found = _read_and_climbed(affordable(fit), held_out, climbed)
+    as_it_was, records, found = _read_and_climbed(versions.affordable(fit), held_out, climbed)
     time_for_all = seconds is None or time.monotonic() - began < seconds / 3
     if not found.stopped and time_for_all and _remembers(found, fit, held_out):
         *whole, anew = _read_and_climbed(fit, held_out, climbed)
@@ -379,9 +371,9 @@ def explored(fit: Fit, validate: Sequence[Experiment] | Experiment | None, effec
 def _read_and_climbed(fit: Fit, held_out: Sequence[Experiment] | None,
                       climbed: Callable[..., Climb]) -> tuple[Records, Records, Climb]:
     """Return the records as they are, but for spikes, as they are better read, and a climb on those."""
-    records = Records(fit, held_out and thinned_alike(fit, held_out))
-    as_it_was = records.read(spikes) if (spikes := without_spikes(records.fit)) else records
-    records = as_it_was.read(reading) if (reading := better_reading(as_it_was.fit)) else as_it_was
+    records = Records(fit, held_out and versions.thinned_alike(fit, held_out))
+    as_it_was = records.read(spikes) if (spikes := versions.without_spikes(records.fit)) else records
+    records = as_it_was.read(reading) if (reading := versions.better_reading(as_it_was.fit)) else as_it_was
     found = climbed(records, early=True)
     if found.misread is not None:
         better = evidence(found.path[-1], (anew := climbed(again := records.read(found.misread))).path[-1])
@@ -399,14 +391,15 @@ def _remembers(found: Climb, whole: Fit, held_out: Sequence[Experiment] | None) 
     """Tell whether a model with a memory, which begins anew in every part of a record, leaves noise on whole ones: one
     on the way, or the most promising that was refused. Not where these would take more than `WHOLE` times as long."""
     parts, runs = found.search.root.fit.problem.experiments, whole.problem.experiments
-    long = sum(r.n for r in runs) > WHOLE * sum(r.n for r in parts)
+    long = sum(r.n for r in runs) > versions.WHOLE * sum(r.n for r in parts)
     if found.remaining.adequate or long or not any("part of" in r.meta for r in parts):
         return False
     refused = (c for tried in found.rounds[-1:] for c in tried if c.fit is not None and c.fit.memories)
     best = max(refused, key=lambda c: c.gain or 0.0, default=None)
     for fit in (*(node.fit for node in found.path[1:]), best and best.fit):
         with contextlib.suppress(*FAILURES):
-            if fit and fit.memories and at_noise(node_of(fitted_to(fit, runs, QUICK), HeldOut.of(whole, held_out))):
+            again = versions.fitted_to(fit, runs, QUICK) if fit and fit.memories else None
+            if again is not None and at_noise(node_of(again, HeldOut.of(whole, held_out))):
                 return True
     return False
 
@@ -418,7 +411,7 @@ def _with_held_out(found: Climb, records: Records, climbed: Callable[[Records], 
     noise = len(found.path) == 1 and found.remaining.adequate and not (found.stopped or far(fit) or fit.window)
     if not noise or at_noise(last) or max(e.misfit for e in last.predictions.held_out.values()) <= ELSEWHERE:
         return found, records
-    both = fitted_to(fit, (*fit.problem.experiments, *(records.held_out or ())))
+    both = versions.fitted_to(fit, (*fit.problem.experiments, *(records.held_out or ())))
     joint = Records(both, None, (*records.remarks, FITTED_TOO))
     return (found, records) if both is fit else (climbed(joint), joint)
 
@@ -461,13 +454,13 @@ def _explains(whole: Climb, windowed: Climb) -> bool:
     return False
 
 
-def _late_reading(path: Sequence[Node]) -> Reading | None:
+def _late_reading(path: Sequence[Node]) -> versions.Reading | None:
     """Return the reading that the model before any effect of a sensor asks for, since lags imitate one, or the last.
     None where neither leaves more than noise; a model that does not follow the records would ask for anything."""
     balances = [[e.balance for e in node.fit.model.effects if e.name not in path[0].key] for node in path]
     plain = max(k for k, kinds in enumerate(balances) if "sensor" not in kinds)
     fits = (path[k].fit for k in dict.fromkeys((plain, len(path) - 1)))
-    asked = (better_reading(fit, late=True) for fit in fits if far(fit) and follows(fit))
+    asked = (versions.better_reading(fit, late=True) for fit in fits if far(fit) and follows(fit))
     return next((reading for reading in asked if reading is not None), None)
 
 

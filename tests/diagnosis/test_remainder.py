@@ -652,6 +652,28 @@ def fired(m, share=mi.P(1.0, "", null=0.0)):
     m.voltage -= share * (m.v - 6 * m.v / (ca.fabs(m.v) + 1e-9) * (1 - ca.cos(np.pi / 6 * ca.fabs(m.v))) / 2)
 
 
+@mi.effect(balance="voltage")
+def swallowing(m, share=mi.P(1.0, "", null=0.0)):
+    """A driver that gives nothing below a third of its supply, and all that is asked for above."""
+    m.voltage -= share * m.v * (ca.fabs(m.v) < 2.0)
+
+
+@mi.effect(balance="torque")
+def shear_pin(m, share=mi.P(0.5, "", null=0.0)):
+    """A flywheel that is lost at the first current beyond a limit."""
+    most = m.state("most")
+    m.rate(most, ca.fmax(ca.fabs(m.i) - most, 0) / 1e-4)
+    m.scale("J", 1 - share / (1 + ca.exp(-(most - 1.0) / 0.01)))
+
+
+@mi.effect(balance="sensor")
+def warm_shunt(m, g=mi.P(0.3, "", null=0.0)):
+    """A shunt of copper, which the current warms."""
+    heat = m.state("heat")
+    m.rate(heat, (m.i**2 - heat) / 0.15)
+    m.measure("i", m.measured("i") * (1 + g * heat))
+
+
 @mi.effect(balance="torque")
 def whirl(m, tau=mi.P(0.03, "N·m", null=0.0)):
     """A shaft that shakes near one speed."""
@@ -666,7 +688,8 @@ def whirl(m, tau=mi.P(0.03, "N·m", null=0.0)):
     (pumped_up, ANGLE[:2], "a gain of the voltage that depends on the power fed back before"),
     (holding, ANGLE[:2], "a friction that changes with the voltage"),
     (wound_field, ANGLE[:2], "a motor constant that depends on the voltage before"),
-    (tightening, ANGLE[:2], "a friction that depends on the heat of the current before")])
+    (tightening, ANGLE[:2], "a friction that depends on the heat of the current before"),
+    (warm_shunt, ANGLE[:2], "a gain of the current sensor that depends on the heat of the current before")])
 def test_what_changes_in_sensors_inertia_and_supply_is_found(law, channels, follows, lab):
     runs, floor = _with_law(law, channels, lab)
     found = mi.diagnose(mi.fit(mi.dc_motor(), runs[:2]), runs[2:], effects=("coulomb", "quadratic_drag"))
@@ -675,6 +698,29 @@ def test_what_changes_in_sensors_inertia_and_supply_is_found(law, channels, foll
     before, after = (mi.evaluate(f, runs[2]).nrmse for f in (found.best, fit))
     assert max(after[c] / floor[c] for c in after) < 1.1
     assert max(before[c] / after[c] for c in after) > 2.5
+
+
+def test_what_happened_before_a_part_of_a_record_shows_on_whole_ones(lab):
+    """In parts the distance run is that of each alone."""
+    runs, floor = _with_law(run_in, ANGLE[:2], lab)
+    cut = [(r, p) for r in runs[:2] for p in windows(r, r.duration / 5)]
+    cut = [p.with_(meta={**p.meta, "part of": (r.name, r.n)}) for r, p in cut]
+    parts = mi.fit(mi.dc_motor(), cut)
+    left = Remainder("structure", parts, _held=HeldOut.of(parts, runs[2:]), _root=parts, _records=runs[:2])
+    assert left._grown is None or not left._grown.done
+    assert left.as_effect().doc == "What is left: a friction that changes with the distance run."
+    after = mi.evaluate(left.fitted, runs[2]).nrmse
+    assert max(after[c] / floor[c] for c in after) < 1.1
+
+
+def test_a_law_may_jump_at_a_level(lab):
+    """With bends alone the held-out run is 20 times the floor."""
+    runs, floor = _with_law(swallowing, ANGLE[:2], lab)
+    found = mi.diagnose(mi.fit(mi.dc_motor(), runs[:2]), runs[2:], effects=("coulomb", "quadratic_drag"))
+    assert found.remainder.follows == "a loss of voltage that changes with the voltage"
+    after = mi.evaluate(found.remainder.fitted, runs[2]).nrmse
+    assert max(after[c] / floor[c] for c in after) < 3
+    assert max(found.remainder.fitted.misfit.values()) < 1.2
 
 
 def test_what_acts_while_power_is_fed_back_alone_is_one_constant(lab):
@@ -1045,6 +1091,22 @@ def test_in_the_place_of_an_effect_too_such_a_form_comes_with_the_zeros(lab):
     assert curve.fit.model.effect_names == ("encoder_zero",)
     assert curve.fit.per_run["z_0"][runs[1].name]["value"] == pytest.approx(1.9, abs=0.1)
     assert plain == replace(form, zeroed=False)
+
+
+def test_parts_of_a_record_begin_where_its_encoder_reads_so_whatever_its_zero(lab):
+    """Of a residual that is elsewhere no function takes a share."""
+    runs, floor = _with_law(pickup, ANGLE, lab)
+    runs = [run.with_(outputs={**run.outputs, "theta": run.outputs["theta"] - z})
+            for run, z in zip(runs, (0.0, 1.9, -0.8), strict=True)]
+    parts = mi.fit(mi.dc_motor(), [p for run in runs[:2] for p in windows(run, run.duration / 4)])
+    there = remainder._zeroed(parts, {"z_0[4]": 1.9})
+    form = Form("an error of the current sensor", "sensor", "turn", "", "i")
+    residual = linearised(there, form).residual
+    assert residual @ residual == pytest.approx(there.residuals @ there.residuals, rel=0.01)
+    left = Remainder("structure", parts, (replace(form, zeroed=True),), HeldOut.of(parts, runs[2:]))
+    left.as_effect()
+    after = mi.evaluate(left.fitted, runs[2]).nrmse
+    assert after["i"] < 1.1 * floor["i"]
 
 
 def test_zeros_found_in_short_windows_are_those_of_their_records(lab):
