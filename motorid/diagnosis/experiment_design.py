@@ -112,8 +112,7 @@ def candidates(t: Array, v_max: float) -> dict[str, tuple[Array, str]]:
     levels = np.array([0, 0.3, 0.6, 1.0, 0.6, 0.3, -0.3, -0.6, -1.0, -0.6, -0.3, 0.15, -0.15])
     staircase = v_max * levels[np.minimum((s * len(levels)).astype(int), len(levels) - 1)]
     chirp = v_max * np.sin(2 * np.pi * (t[-1] * 1.0 * (s + 10 * s**2)) / max(t[-1], 1e-12) * 3)
-    return {
-        "reversals": (v_max * np.sign(np.sin(2 * np.pi * 4 * s + 1e-9)), "reversals at full voltage"),
+    return {"reversals": (v_max * np.sign(np.sin(2 * np.pi * 4 * s + 1e-9)), "reversals at full voltage"),
         "staircase": (staircase, "a staircase through zero, both directions"),
         "slow sweep": (v_max * (2 * np.abs(2 * ((s + 0.25) % 1) - 1) - 1), "a slow triangle through zero"),
         "low speed": (0.25 * v_max * np.sin(2 * np.pi * 3 * s), "slow reversals at a quarter of the voltage"),
