@@ -317,8 +317,9 @@ def _of_size(form: Form, span: Span, low: float, high: float) -> list[str]:
     smooth += [f"ca.fmax({sign}{s} - {c}, 0)" for sign in sides for c in knees]
     level, wide = size if form.carrier else s, _place(SOFT, SOFT**2, 1)  # of what is switched there
     both = low < 0 and not form.carrier
-    smooth += [f"(ca.tanh(({s} - {c}) / {wide}) + ca.tanh(({s} + {c}) / {wide}))" if both else
-               f"ca.tanh(({level} - {c}) / {wide})" for c in knees if form.on != "load"]
+    if (span.finer > 1 and form.on != "load") or form.on == "most i":  # others compare better by few
+        smooth += [f"(ca.tanh(({s} - {c}) / {wide}) + ca.tanh(({s} + {c}) / {wide}))" if both else
+                   f"ca.tanh(({level} - {c}) / {wide})" for c in knees]
     if not low < 0 < high:
         return ["1.0", *smooth]
     smooth += [f"(ca.fmax({s} - {c}, 0) - ca.fmax(-{s} - {c}, 0))" for c in knees]  # the same either way

@@ -316,7 +316,7 @@ def test_what_remembers_is_looked_at_on_whole_records(monkeypatch):
     found = mi.diagnose(whole, runs[2], effects=("freewheel", "coulomb", "quadratic_drag"))
     assert (found.verdict, found.effects) == ("missing", ("freewheel",))
     assert "parts of" not in found.text
-    monkeypatch.setattr(stepwise, "WHOLE", 2)  # these are three times as long
+    monkeypatch.setattr(stepwise.versions, "WHOLE", 2)  # these are three times as long
     assert "parts of" in mi.diagnose(whole, runs[2], effects=("freewheel",)).text
 
 
