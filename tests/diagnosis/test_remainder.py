@@ -674,12 +674,6 @@ def warm_shunt(m, g=mi.P(0.3, "", null=0.0)):
     m.measure("i", m.measured("i") * (1 + g * heat))
 
 
-@mi.effect(balance="voltage")
-def burnt(m, R_c=mi.P(1.5, "Ω", null=0.0)):
-    """A relay that reverses the motor, with a burnt contact on one side."""
-    m.voltage -= R_c * m.i * (m.v < 0)
-
-
 @mi.effect(balance="torque")
 def whirl(m, tau=mi.P(0.03, "N·m", null=0.0)):
     """A shaft that shakes near one speed."""
@@ -695,7 +689,6 @@ def whirl(m, tau=mi.P(0.03, "N·m", null=0.0)):
     (holding, ANGLE[:2], "a friction that changes with the voltage"),
     (wound_field, ANGLE[:2], "a motor constant that depends on the voltage before"),
     (tightening, ANGLE[:2], "a friction that depends on the heat of the current before"),
-    (burnt, ANGLE[:2], "a resistance that changes with the voltage"),
     (warm_shunt, ANGLE[:2], "a gain of the current sensor that depends on the heat of the current before")])
 def test_what_changes_in_sensors_inertia_and_supply_is_found(law, channels, follows, lab):
     runs, floor = _with_law(law, channels, lab)
