@@ -443,10 +443,9 @@ class Remainder:
         parts, runs = self.fit.problem.experiments, thinned_alike(self.fit, self._records)
         if "part of" not in parts[0].meta or not 0 < sum(r.n for r in runs) <= WHOLE * sum(r.n for r in parts):
             return None
-        last, root = (fitted_to(f, runs, QUICK) for f in (self.fit, self._root or self.fit))
-        gains = (g for f in (last, root) for g in better_forms(f, f, past=True))
-        forms = tuple(g.form for g in sorted(gains, key=lambda g: -g.evidence.gain))
-        return Remainder(self.kind, last, forms, self._held, root) if forms else None
+        fits = [fitted_to(f, runs, QUICK) for f in dict.fromkeys((self.fit, self._root or self.fit))]
+        forms = tuple(dict.fromkeys(gain.form for f in fits for gain in better_forms(f, f, past=True)))
+        return Remainder(self.kind, fits[0], forms, self._held, fits[-1]) if forms else None
 
     def _tried(self) -> Iterator[tuple[Curve, Form]]:
         """Yield models and a form to fit with each, the likeliest first; what takes a fit to find only when asked for.

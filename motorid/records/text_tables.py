@@ -31,7 +31,8 @@ _CONTROL = re.compile(r"[\x00-\x08\x0e-\x1f\x7f]")
 _JSON = re.compile(r'\s*(\{\s*["}]|\[\s*[\[{])')  # objects, arrays of arrays or of objects
 # Delimiter (None: white space) and decimal mark, in the order in which a tie is decided.
 _DIALECTS = (("\t", "."), (";", "."), (",", "."), ("\t", ","), (";", ","), (",", ","), (None, "."), (None, ","))
-_MAGIC = {b"PK\x03\x04": "an Excel or zip file; export the sheet as CSV",
+_MAGIC = {
+    b"PK\x03\x04": "an Excel or zip file; export the sheet as CSV",
     b"\xd0\xcf\x11\xe0": "an old Excel file; export the sheet as CSV", b"\x1f\x8b": "a gzip file; unpack it first",
     b"\x89HDF": "an HDF5 file; export CSV, or save from MATLAB with save(..., '-v7')",
     b"MATLAB": "a MATLAB file; give it the ending .mat", b"PAR1": "a Parquet file; give it the ending .parquet",

@@ -689,6 +689,7 @@ def whirl(m, tau=mi.P(0.03, "N·m", null=0.0)):
     (holding, ANGLE[:2], "a friction that changes with the voltage"),
     (wound_field, ANGLE[:2], "a motor constant that depends on the voltage before"),
     (tightening, ANGLE[:2], "a friction that depends on the heat of the current before"),
+    (shear_pin, ANGLE[:2], "an inertia that depends on the largest current so far"),
     (warm_shunt, ANGLE[:2], "a gain of the current sensor that depends on the heat of the current before")])
 def test_what_changes_in_sensors_inertia_and_supply_is_found(law, channels, follows, lab):
     runs, floor = _with_law(law, channels, lab)
