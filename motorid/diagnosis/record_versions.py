@@ -3,7 +3,8 @@
 A diagnosis refits dozens of models. Of long records, samples that their neighbours predict as well as noise allows are
 left out; of what is still too long it looks at parts, contiguous and chosen so that together they show what the records
 show: both directions, slow and fast, all voltages, early and late. Every part begins where the motor then is, so that
-an angle drifts no longer than one part lasts; what takes longer to show (heating) is seen between the parts only.
+an angle drifts no longer than one part lasts, and runs in before it is judged: a lag remembers what was before. What
+takes longer to show (heating) is seen between the parts only.
 
 What was measured is right, but the voltage or single samples may not be what they seem. A logger writes the voltage of
 an instant: a digital controller holds it until the next sample, that of an amplifier goes on. A commanded one is exact,
@@ -42,7 +43,8 @@ ENOUGH = 4000  # samples: what is left at least of those that their neighbours p
 SMALL = 0.1  # of the error: a difference that changes no judgement
 AFFORDABLE = 24_000  # steps of integration per simulation of all records
 WANTED = 12_000  # of what is longer
-PART = 1000  # samples
+PART = 1000  # samples, and before them
+RUN_IN = 100
 LONG = 20_000  # samples: a first fit of their parts tells whether all of them are affordable
 FEW = 4 * PART  # samples of that first fit
 NEARLY_ALL = 0.7  # of the samples: no reason to leave out the rest
@@ -127,8 +129,9 @@ def _parts(run: Experiment, share: float) -> list[Experiment]:
     if run.n < 2 * PART * count:
         return [run]
     meta = {**part_meta(run), "part of": (run.name, run.n)}
-    return [run.select(slice(a, a + PART)).with_(name=f"{run.name}[{k + 1}]", meta=meta)
-            for k, a in enumerate(_telling(run, count))]
+    each = ((a, run.select(slice(max(a - RUN_IN, 0), a + PART))) for a in _telling(run, count))
+    return [part.with_(name=f"{run.name}[{k}]", meta={**meta, "judged from": run.t[a]})
+            for k, (a, part) in enumerate(each, 1)]
 
 
 def _telling(run: Experiment, count: int) -> list[int]:
@@ -167,7 +170,9 @@ def parts_remark(fit: Fit) -> str:
     whole = dict(r.meta.get("part of", (r.name, r.n)) for r in used)
     if not any("part of" in r.meta for r in used):
         return thin
-    share, seconds = _samples(used) / sum(whole.values()), float(np.median([r.duration for r in used]))
+    judged = [1 - r.run_in / r.n for r in used]
+    share = sum(r.n * f for r, f in zip(used, judged, strict=True)) / sum(whole.values())
+    seconds = float(np.median([r.duration * f for r, f in zip(used, judged, strict=True)]))
     return (f"The records are long: this rests on {len(used)} parts of {seconds:.2g} s, {100 * share:.0f} % of "
             "the samples, each from a state of its own, so that errors are smaller there than over whole runs; fit the "
             f"model to all of them. {thin}".rstrip())

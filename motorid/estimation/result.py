@@ -224,7 +224,7 @@ class Fit(Shown):
         errors: dict[str, list[float]] = {}
         for part in find_segments([s.experiment for s in self.simulations], [run.sigma for run in self.problem.runs]):
             s = self.simulations[part.run]
-            for c in part.means:
+            for c in part.means if part.first >= s.experiment.run_in else ():
                 if c in s.experiment.outputs and c in s.outputs:
                     errors.setdefault(c, []).append(float(np.nanmean(s.residual(c)[part.first:part.last + 1])))
         return {c: float(np.sqrt(np.mean(np.square(e)))) for c, e in errors.items()}

@@ -369,7 +369,7 @@ def as_problem(model: Model, runs: Sequence[Experiment] | Experiment, **fields: 
 class Measured(NamedTuple):
     """One record as residuals see it, in standard deviations, and how exact an integration it asks for."""
 
-    y: Array  # (N, ny), NaN where missing
+    y: Array  # (N, ny), NaN where missing or not judged
     weights: Array  # (ny,), 0 for channels not measured
     index: NDArray[np.int64] | None  # of the finite samples in the flattened y, None for all
     noise: Array  # (ny,), infinite for channels not measured
@@ -382,6 +382,7 @@ class Measured(NamedTuple):
         """Return `run` with `weights` ``"noise"``, times the factor of each channel, or ``"rms"``."""
         out = run.experiment.outputs
         y = np.column_stack([out.get(c, np.full(run.experiment.n, np.nan)) for c in outputs])
+        y[: run.experiment.run_in] = np.nan
         noise = np.array([run.sigma.get(c, np.inf) for c in outputs])
         if weights == "noise":
             size = noise * [factors.get(c, 1.0) for c in outputs]

@@ -44,8 +44,10 @@ class Simulation:
     states: Mapping[str, Array]
 
     def residual(self, channel: str) -> Array:
-        """Return measured minus model, (N,), NaN where missing."""
-        return self.experiment.outputs[channel] - self.outputs[channel]
+        """Return measured minus model, (N,), NaN where missing, or where a part of a record runs in."""
+        left = self.experiment.outputs[channel] - self.outputs[channel]
+        left[: self.experiment.run_in] = np.nan
+        return left
 
 
 @dataclass(frozen=True, eq=False)
@@ -234,8 +236,8 @@ def judge(simulations: Sequence[Simulation]) -> Evaluation:
         errors = {}
         for c in (c for c in channels if c in s.experiment.outputs):
             y = s.experiment.moved(c)
-            ok = np.isfinite(y)
-            e = s.residual(c)[ok]
+            ok = np.isfinite(e := s.residual(c))
+            e = e[ok]
             sums[c] += e @ e, y[ok] @ y[ok], ok.sum()
             errors[c] = normalised(float(np.linalg.norm(e)), float(np.linalg.norm(y[ok])))
         by_run.append(errors)

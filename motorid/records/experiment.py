@@ -115,6 +115,11 @@ class Experiment(Shown):
         """Names of the measured output channels, in the order i, omega, theta."""
         return tuple(name for name in CHANNELS if name in self.outputs)
 
+    @property
+    def run_in(self) -> int:
+        """Number of first samples by which no model is judged: of a part of a record, what fades from before it."""
+        return int(np.searchsorted(self.t, self.meta.get("judged from", -np.inf)))
+
     def moved(self, channel: str) -> Array:
         """Return what errors of a channel are measured against, (N,): an angle from where its record begins, since its
         zero may be anywhere; the others as they are. Where nothing but rounding moves it is zero."""
@@ -259,7 +264,8 @@ def windows(experiment: Experiment, seconds: float) -> list[Experiment]:
         raise UsageError(f"a window takes a time in seconds; got {seconds!r}.")
     if seconds < 8 * experiment.dt:
         raise UsageError(f"a window of {seconds:g} s holds fewer than 8 samples, {experiment.dt:.3g} s apart.")
-    return [p.with_(meta={**part_meta(r), **p.meta, "window": seconds}) for r in between_pauses(experiment)
+    own = {"window": seconds, "judged from": -np.inf}
+    return [p.with_(meta={**part_meta(r), **p.meta, **own}) for r in between_pauses(experiment)
             for p in split(r, max(min(round(r.duration / seconds), r.n // MIN_SAMPLES), 1))]
 
 

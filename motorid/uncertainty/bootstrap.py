@@ -209,7 +209,7 @@ def _resampled(source: _Source, k: int, rng: np.random.Generator) -> Experiment:
     run = source.problem.runs[k]
     e = ({c: source.colours[c].draw(len(r), rng) for c, r in source.residuals[k].items()}
          if source.kind == "parametric" else _blocks(source, k, rng))
-    outputs = {c: np.where(np.isfinite(y), source.predicted[k][c] + e[c], np.nan) if c in e else y
+    outputs = {c: np.where(np.isfinite(y + e[c]), source.predicted[k][c] + e[c], y) if c in e else y
                for c, y in run.experiment.outputs.items()}
     return run.experiment.with_(outputs=outputs, sigma=dict(run.sigma))
 

@@ -29,6 +29,7 @@ from motorid.estimation.restarts import MATTERS, collapsed_again, restored
 from motorid.numerics.parallel import budget, one_thread
 from motorid.problem.problem import Problem
 from motorid.problem.simulate import simulate
+from motorid.records.experiment import windows
 
 TRUE = {"R": 1.2, "L": 2e-3, "K": 0.05, "b": 2e-5, "J": 3e-5}
 
@@ -207,7 +208,24 @@ def test_parts_show_both_directions_and_what_is_rare():
     speeds = np.concatenate([p.outputs["omega"] for p in chosen])
     assert speeds.min() < -40
     assert speeds.max() > 40
-    assert all(p.n == parts.PART for p in chosen)
+    assert all(p.n - p.run_in == parts.PART for p in chosen)
+
+
+def test_parts_run_in_before_they_are_judged_so_that_what_was_before_leaves_nothing(rng):
+    """Of a speed that lags by 25 samples nobody knows where it is as a part begins; windows are judged from there."""
+    t, v = 1e-3 * np.arange(12000), np.repeat(rng.uniform(-12, 12, 200), 60)
+    model = mi.dc_motor(**TRUE) + mi.effects.speed_lag(T_w=0.025)
+    clean = mi.simulate(model, mi.Experiment(t, {"v": v}, {"i": 0 * t, "omega": 0 * t}), initial="rest")[0].outputs
+    run = mi.Experiment(t, {"v": v}, {c: y + 5e-3 * y.std() * rng.standard_normal(len(t)) for c, y in clean.items()})
+    chosen = parts.parts_of([run], 0.4)
+    assert chosen is not None
+    assert {p.run_in for p in chosen[1:]} == {parts.RUN_IN}
+    fit = mi.fit(mi.dc_motor() + mi.effects.speed_lag, chosen)
+    assert max(fit.misfit.values()) < 1.05
+    assert fit.nrmse["omega"] < 6e-3
+    assert all(np.isnan(s.residual("omega")[:s.experiment.run_in]).all() for s in fit.simulations)
+    assert fit.problem.n_outputs == 2 * sum(p.n - p.run_in for p in chosen)
+    assert {w.run_in for p in chosen for w in windows(p, 0.2)} == {0}
 
 
 def test_parts_that_are_nearly_all_are_not_taken():

@@ -17,7 +17,7 @@ from motorid.diagnosis.admissibility import run_through
 from motorid.diagnosis.candidates import Search, Stages
 from motorid.diagnosis.predictive_score import deciding, finer
 from motorid.diagnosis.record_versions import Reading
-from motorid.diagnosis.score_test import rank, score
+from motorid.diagnosis.score_test import Score, rank, score
 from motorid.diagnosis.thresholds import FINER, FINER_RATE, LARGER
 from motorid.effects import LIBRARY
 from motorid.estimation.linearisation import Tangent
@@ -234,6 +234,20 @@ def test_what_an_angle_that_decides_nothing_hides_is_seen_in_the_other_channels(
         judged[size] = adequacy(fit, scores)
         assert (drops["cogging"] > 0.05) is bool(size)
     assert [a.adequate for a in judged.values()] == [True, False]
+
+
+def test_an_effect_that_takes_up_what_an_angle_is_asked_no_more_says_nothing(lab):
+    """A flap's angle was followed to 0.04 %, twice its counts: all else was noise, and a curve was sought for a minute."""
+    runs = [run.with_(outputs={**run.outputs, "theta": y + 8e-4 * np.sqrt(np.mean(y**2)) * np.sin(3 * run.t)})
+            for run in fine_encoder(lab, {}, lowest=1.0)[:2] for y in [run.outputs["theta"]]]
+    fit = mi.fit(mi.dc_motor(), runs)
+    assert finer(fit, "theta")
+    scored = deciding(fit)
+    squares = np.sum([np.nansum(r**2, axis=0) for r in scored.problem.unstack(scored.residuals)], axis=0)
+    share = squares[fit.problem.outputs.index("theta")] / squares.sum()
+    assert 0.03 < share < 0.3
+    told = [adequacy(fit, [Score(LIBRARY["coulomb"], drop, ({},), 3000.0)]) for drop in (share, share + 0.04)]
+    assert [a.adequate for a in told] == [True, False]
 
 
 def test_a_fine_angle_is_not_asked_either_what_its_noise_nearly_hides(lab):
