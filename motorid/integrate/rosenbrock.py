@@ -29,6 +29,14 @@ LOST_ERROR = 0.3  # error estimate, relative to the state so far, at which a ste
 LOST_GROWTH = 1e3  # growth of a state that shows it
 
 
+class LeftFinite(SimulationError):
+    """A simulation whose state is not finite from a `sample` on."""
+
+    def __init__(self, message: str, sample: int = 0) -> None:
+        super().__init__(message)
+        self.sample = sample
+
+
 @dataclass(frozen=True)
 class Rosenbrock:
     """RODAS3, sub-steps chosen by halving them; the exact derivative of the discrete step goes along.
@@ -62,16 +70,16 @@ class Rosenbrock:
 
         Where the error estimate of a step is too large, what half the steps change at the end of its interval decides
         (Hairer, Nørsett & Wanner, Solving Ordinary Differential Equations I, 1993, II.4): a current that settles
-        before the next sample needs no steps of its own. Where the run fails, so does every later one on this grid:
-        coarse steps would jump over what happens. A step that goes astray spoils all after it, which is then neither
-        refined for nor a measure of size. It has not where half the steps end alike, or no more are to be had.
+        before the next sample needs no steps of its own. A step that goes astray, or leaves the finite numbers, spoils
+        all after it, which is then neither refined for nor a measure of size. It has not where half the steps end
+        alike; where no more are to be had, every later run on this grid fails, too.
         """
         passes, right, shown = float(MOST_PASSES), 0, None
         while passes > 0:
             try:
                 traj = self.run(system, grid, x0, p, local_error=True)
-            except SimulationError:
-                break
+            except LeftFinite as failed:
+                traj = self._as_far(system, grid, x0, p, failed.sample)
             level, loose, asked = tolerance(traj) if callable(tolerance) else (tolerance, tolerance, None)
             assert traj.error is not None
             size, error = np.abs(np.ascontiguousarray(traj.x.T)), np.ascontiguousarray(traj.error.T)
@@ -79,24 +87,26 @@ class Rosenbrock:
             if (astray := _first_inaccurate(size, error, right)) is not None:
                 traj = traj._replace(x=traj.x[:astray + 2], y=traj.y[:astray + 2])
                 size, error[:, astray + 1:] = size[:, :astray + 2], 0.0
+            gone = np.isinf(error).any(axis=0)
             sizes = np.maximum(np.maximum(size[:, -1], stepper(system).shown_sizes(grid, traj, p)), 1e-12)[:, None]
             relative = (error / sizes).max(axis=0)
             rows = np.flatnonzero(relative > level)
             if len(rows):
                 error[:, rows] = stepper(system).halved(grid, rows, traj.x, p, self.compiled)
+                error[:, gone] = np.inf
                 relative[rows] = (error[:, rows] / sizes).max(axis=0)
             if asked is not None and min(loose, np.max(relative, initial=0.0)) > 2 * level:
                 shown = stepper(system).shown_ever(grid, traj, p, self.compiled) if shown is None else shown
                 few = np.isfinite(asked)
                 own = np.min(asked[few, None] / np.maximum(shown[few], 1e-300), axis=0)[:, None]
                 relative = (error / np.clip(own / level, sizes, loose / level * sizes)).max(axis=0)
-            passes -= 1 if astray is None else 1 / 16
+            passes -= 1 if astray is None and not gone.any() else 1 / 16
             finer = grid.substeps
             if np.max(relative, initial=0.0) > 2 * level:  # not where it is no number
                 factor = np.ceil(1.1 * (np.maximum(relative, 1e-300) / level) ** (1 / ORDER))
                 finer = np.clip(finer * np.clip(factor, 1, 16), 1, MOST_SUBSTEPS).astype(np.int64)
             if np.array_equal(finer, grid.substeps):
-                if astray is None:
+                if astray is None or gone.any():
                     break
                 right = astray + 1
                 continue
@@ -104,6 +114,19 @@ class Rosenbrock:
                 raise SimulationError(f"the model is too stiff: it takes more than {self.most_steps} steps.")
             grid = grid.with_substeps(finer)
         return grid
+
+    def _as_far(self, system: System, grid: Grid, x0: Array, p: Array, sample: int) -> Trajectory:
+        """Return the trajectory to where it leaves the finite numbers, and as it was there from `sample` on; the error
+        of the interval before that is infinite. SimulationError where even the finest steps leave them at once."""
+        near = grid.part(0, max(sample - 1, 1))
+        near = self.run(system, near if sample > 1 else near.with_substeps(np.array([MOST_SUBSTEPS])), x0, p,
+                        local_error=True)
+        y, x = (np.concatenate([a[:sample], np.repeat(a[sample - 1:sample], len(grid.t) - sample, axis=0)])
+                for a in (near.y, near.x))
+        error = np.zeros((len(x) - 1, x.shape[1]))
+        error[:sample - 1] = near.error[:sample - 1]
+        error[sample - 1] = np.inf
+        return Trajectory(y, None, x, None, error)
 
 
 def _first_inaccurate(size: Array, error: Array, begin: int) -> int | None:
@@ -113,8 +136,8 @@ def _first_inaccurate(size: Array, error: Array, begin: int) -> int | None:
         return None
     k = begin + int(lost[0])
     before, after = np.maximum(size[:, k], 1e-12), np.maximum(size[:, k + 1], 1e-12)
-    jumped = (after > LOST_GROWTH * before) & (before > 1e-12)
-    return k if np.any(jumped | (size[:, -1] > LOST_GROWTH * after)) else None
+    jumped = (after / LOST_GROWTH > before) & (before > 1e-12)
+    return k if np.any(jumped | (size[:, -1] / LOST_GROWTH > after)) else None
 
 
 class Stepper:
@@ -149,8 +172,8 @@ class Stepper:
             step = self.functions.light if dp is None else self.functions.full
             self._spent += step.n_instructions() * int(grid.substeps.sum())
         if bad >= 0:
-            raise SimulationError(f"the simulation left the finite numbers at t = {grid.t[bad]:.6g} s; the "
-                                  "parameters make the model unstable or stiff beyond the step.")
+            raise LeftFinite(f"the simulation left the finite numbers at t = {grid.t[bad]:.6g} s; the parameters make "
+                             "the model unstable or stiff beyond the step.", bad)
         return traj
 
     def halved(self, grid: Grid, rows: NDArray[np.int64], x: Array, p: Array, compiled: bool | None) -> Array:

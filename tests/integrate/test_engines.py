@@ -250,6 +250,29 @@ def test_substeps_follow_the_tolerance_and_keep_the_error():
 
 
 @pytest.mark.parametrize("engine", [Rosenbrock(True), Rosenbrock(False)], ids=["compiled", "machine"])
+@pytest.mark.parametrize("volts", [40.05, 40.45])
+def test_where_a_coarse_step_leaves_the_finite_numbers_there_are_finer_ones(engine, volts):
+    """As its iron saturates a current grows ever faster for a moment: one step there has no solution; a true pair of
+    effects was refused for it."""
+    model = mi.dc_motor(R=1.66, L=0.0148, K=0.162, b=4.7e-4, J=1.42e-3) + mi.effects.quadratic_drag(c_2=2e-5)
+    model += mi.effects.inductance_saturation(i_L=2.9)
+    system, t = model.system(("i", "omega")), 5e-4 * np.arange(400)
+    p = np.array([model.values[n] for n in system.parameters])
+    coarse = Grid.of(t, np.full((400, 1), volts), np.array([True]))
+    with pytest.raises(SimulationError, match="left the finite numbers"):
+        engine.run(system, coarse, np.zeros(2), p)
+    fine = engine.run(system, coarse.with_substeps(np.full(399, 256)), np.zeros(2), p).x
+    for tolerance, allowed in ((1e-2, 1e-2), (1e-4, 1e-3)):
+        grid = engine.prepare(system, coarse, np.zeros(2), p, tolerance)
+        assert grid.substeps.mean() < 1.2
+        error = np.abs(engine.run(system, grid, np.zeros(2), p).x - fine).max(axis=0)
+        assert (error < allowed * np.abs(fine).max(axis=0)).all()
+    first = coarse.with_substeps(np.ones(399, np.int64)), np.array([-1e150, 1e150])
+    with pytest.raises(SimulationError, match="left the finite numbers"):  # no steps help
+        engine.run(system, engine.prepare(system, *first, p, 1e-4), first[1], p)
+
+
+@pytest.mark.parametrize("engine", [Rosenbrock(True), Rosenbrock(False)], ids=["compiled", "machine"])
 def test_a_current_that_settles_between_samples_takes_no_steps_of_its_own(engine, rng):
     """Its transient is over at the next sample, and so is the error of a step that jumps over it."""
     motor = {**VALUES, "L": 0.02 * VALUES["R"] * 1e-3}
