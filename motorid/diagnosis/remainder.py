@@ -496,7 +496,8 @@ def _over_zeros(base: Fit, forms: Iterable[Form]) -> Iterator[tuple[Curve, Form]
 
 def _zeroed(base: Fit, zeros: Mapping[str, float]) -> Fit | None:
     """Return a fit with the zero of the angle of every run, beginning at `zeros`; what has one is that already."""
-    return base if any(map(tells_the_zero, base.model.effects)) else refit(base, base.model + PER_RUN["encoder_zero"], [zeros])
+    known = any(map(tells_the_zero, base.model.effects))
+    return base if known else refit(base, base.model + PER_RUN["encoder_zero"], [zeros])
 
 
 def _grown_in(there: Fit | None, base: Fit, asked: Sequence[Form], quiet: bool = False) -> Iterator[tuple[Curve, Form]]:

@@ -9,10 +9,10 @@ import numpy as np
 from motorid.channels import channel_name
 from motorid.diagnosis.adequacy import fine_angle_remark
 from motorid.diagnosis.misspecification import Grade
-from motorid.diagnosis.model_comparison import Node, far, share_removed
+from motorid.diagnosis.model_comparison import Node, far, rarity, share_removed
 from motorid.diagnosis.results import Adequacy, Candidate, Rung
 from motorid.diagnosis.score_test import Score
-from motorid.diagnosis.thresholds import ELSEWHERE, LARGER, LOST, MATERIAL, MOST, UNCONTESTED
+from motorid.diagnosis.thresholds import ELSEWHERE, LARGER, LOST, MATERIAL, MOST, TRIFLE, UNCONTESTED
 from motorid.display.numbers import arrow, counted, factor, listed, percent, with_error
 from motorid.estimation.covariance import UNDETERMINED
 from motorid.estimation.result import Fit, parameter_cell
@@ -92,12 +92,13 @@ def _nearest(rungs: Sequence[Rung], grades: Sequence[Grade],
     said = " with ".join(_described(rungs[-1].fit, g.effect) for g in nearest)
     removes = "removes" if len(nearest) == 1 else "remove"
     if any(OPEN in text for text in (said, *(g.why for g in nearest))):
-        others = {c.refit_drop or 0.0: _described(c.fit, c.effect) for c in ranking
-                  if c.fit and (c.refit_drop or 0.0) > UNCONTESTED * share and not c.fit.per_run
-                  and ", but " not in c.reason and all(c.effect != g.effect for g in grades)}
-        known = {drop: text for drop, text in others.items() if OPEN not in text}
-        if known:
-            said, share, removes, nearest = known[max(known)], max(known), "alone removes", []
+        others = [(rarity(c.effect), drop, _described(c.fit, c.effect)) for c in ranking
+                  if c.fit and (drop := c.refit_drop or 0.0) > UNCONTESTED * share and not c.fit.per_run
+                  and ", but " not in c.reason and all(c.effect != g.effect for g in grades)]
+        if known := [other for other in others if OPEN not in other[2]]:
+            left = (1 + TRIFLE) * (1 - max(drop for _, drop, _ in known))  # of what leaves hardly more, the commonest
+            _, share, said = min((other for other in known if 1 - other[1] <= left), key=lambda other: other[0])
+            removes, nearest = "alone removes", []
         elif any(g.form for g in grades):
             return "", share, []
     return f"{said}, which {removes} {percent(share, 2)} of the squared error", share, nearest

@@ -152,6 +152,22 @@ def test_nearest_is_a_pair_by_what_both_removed_and_what_is_determined(rng):
     assert "[coulomb]" in unexplained_text(rivals[1:], rungs, open_, "", remaining)
 
 
+def test_of_what_alone_leaves_hardly_more_the_commonest_is_the_nearest(rng):
+    """A micromouse that hardly ran backwards: friction of another size there removed 88.6 %, the same friction 88.3 %."""
+    plain, t = mi.dc_motor(R=2.0, L=2e-3, K=0.05, b=4e-5, J=3e-5), np.arange(600) * 2e-3
+    run = noisy(simulated(t, 6 * np.sign(np.sin(9 * t + 0.1)), model=plain + mi.effects.coulomb(tau_c=5e-3)), rng)
+    fits = {n: mi.fit(plain + mi.effects.get(n), run) for n in ("coulomb", "coulomb_asymmetric", "speed_filter")}
+    rungs = [Rung(added, fits["speed_filter"], {"omega": e}, None) for added, e in ((None, 0.1), ("speed_filter", 0.02))]
+    grades = [Grade("speed_filter", "approximates", "T_f is not determined, and the rest is not noise")]
+    remaining = SimpleNamespace(adequate=False, hum="", text="Something is missing.")
+    for both, nearest in ((0.97, "coulomb_asymmetric"), (0.976, "coulomb")):
+        drops = {"coulomb_asymmetric": 0.978, "coulomb": both}
+        tried = [Candidate(n, 0.3, fit=fits[n], refit_drop=drop) for n, drop in drops.items()]
+        answer = unexplained_text(tried, rungs, grades, "", remaining)
+        assert f"[{nearest}]" in answer
+        assert f"alone removes {100 * drops[nearest]:.0f} %" in answer
+
+
 def test_errors_beyond_the_noise_are_in_the_answer_where_nothing_is_missing():
     judged = SimpleNamespace(text="The errors (speed 4 times the noise) do not depend on the motion.", p_value=0.5,
                              false_alarm=0.02, hum="")
