@@ -153,11 +153,12 @@ def test_nearest_is_a_pair_by_what_both_removed_and_what_is_determined(rng):
 
 
 def test_of_what_alone_leaves_hardly_more_the_commonest_is_the_nearest(rng):
-    """A micromouse that hardly ran backwards: friction of another size there removed 88.6 %, the same friction 88.3 %."""
+    """A micromouse hardly ran backwards: friction of another size there removed 88.6 %, the same friction 88.3 %."""
     plain, t = mi.dc_motor(R=2.0, L=2e-3, K=0.05, b=4e-5, J=3e-5), np.arange(600) * 2e-3
     run = noisy(simulated(t, 6 * np.sign(np.sin(9 * t + 0.1)), model=plain + mi.effects.coulomb(tau_c=5e-3)), rng)
     fits = {n: mi.fit(plain + mi.effects.get(n), run) for n in ("coulomb", "coulomb_asymmetric", "speed_filter")}
-    rungs = [Rung(added, fits["speed_filter"], {"omega": e}, None) for added, e in ((None, 0.1), ("speed_filter", 0.02))]
+    filtered = fits["speed_filter"]
+    rungs = [Rung(None, filtered, {"omega": 0.1}, None), Rung("speed_filter", filtered, {"omega": 0.02}, None)]
     grades = [Grade("speed_filter", "approximates", "T_f is not determined, and the rest is not noise")]
     remaining = SimpleNamespace(adequate=False, hum="", text="Something is missing.")
     for both, nearest in ((0.97, "coulomb_asymmetric"), (0.976, "coulomb")):

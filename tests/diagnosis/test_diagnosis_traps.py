@@ -237,7 +237,7 @@ def test_what_an_angle_that_decides_nothing_hides_is_seen_in_the_other_channels(
 
 
 def test_an_effect_that_takes_up_what_an_angle_is_asked_no_more_says_nothing(lab):
-    """A flap's angle was followed to 0.04 %, twice its counts: all else was noise, and a curve was sought for a minute."""
+    """A flap's angle was followed to 0.04 %, twice its counts: all else was noise, and a curve was sought for long."""
     runs = [run.with_(outputs={**run.outputs, "theta": y + 8e-4 * np.sqrt(np.mean(y**2)) * np.sin(3 * run.t)})
             for run in fine_encoder(lab, {}, lowest=1.0)[:2] for y in [run.outputs["theta"]]]
     fit = mi.fit(mi.dc_motor(), runs)
