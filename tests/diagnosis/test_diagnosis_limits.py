@@ -320,6 +320,29 @@ def test_what_remembers_is_looked_at_on_whole_records(monkeypatch):
     assert "parts of" in mi.diagnose(whole, runs[2], effects=("freewheel",)).text
 
 
+def test_a_zero_that_drifts_over_a_record_is_seen_on_whole_ones(monkeypatch):
+    """In parts it fluctuated: a gyro's zero was said to depend on nothing, five times the noise."""
+    t, runs, rng = np.arange(4800) * 1e-3, [], np.random.default_rng(0)
+    for seed in (1, 2, 3):
+        v = np.repeat(np.random.default_rng(seed).uniform(-10, 10, 80), 60)
+        clean = mi.planned(mi.dc_motor().start_at({"J": 6e-5}), t, v, channels=("i", "omega"))
+        noise = {c: 0.01 * np.sqrt(np.mean(y**2)) for c, y in clean.outputs.items()}
+        outputs = {c: y + s * (rng.standard_normal(4800) + 5 * (c == "omega") * (t / t[-1] - 0.5))
+                   for (c, y), s in zip(clean.outputs.items(), noise.values(), strict=True)}
+        runs.append(clean.with_(sigma={}, outputs=outputs))
+    whole = mi.fit(mi.dc_motor(), runs[:2])
+    monkeypatch.setattr(parts, "AFFORDABLE", 100)
+    monkeypatch.setattr(parts, "PART", 200)
+    monkeypatch.setattr(parts, "RUN_IN", 20)
+    monkeypatch.setattr(parts, "WANTED", parts._work(whole) / 2.5)
+    found = mi.diagnose(whole, runs[2], effects=("coulomb",))
+    assert "parts of" in found.text
+    assert found.verdict == "unexplained"
+    assert found.remainder.follows == "an error of the speed sensor that changes with the time"
+    assert mi.evaluate(mi.fit(found.remainder.model + found.remainder.as_effect(), runs[:2]), runs[2]).rmse[
+        "omega"] < 1.1 * noise["omega"]
+
+
 @pytest.mark.parametrize(("hertz", "more"), [(60, True), (0.2, False)])
 def test_dry_friction_counts_in_the_work_of_a_long_record(hertz, more, rng):
     """What turns round every few samples takes sub-steps with friction that the plain motor does not ask for."""
