@@ -79,6 +79,12 @@ def thinned_alike(fit: Fit, runs: Sequence[Experiment]) -> list[Experiment]:
     return [r.decimate(k) for r in runs] if (k := fit.problem.experiments[0].meta.get("every", 1)) > 1 else list(runs)
 
 
+def whole_of(fit: Fit, records: Sequence[Experiment]) -> list[Experiment]:
+    """Return whole `records`, as many samples of each, where a fit is of parts of them that are not much shorter."""
+    parts, runs = fit.problem.experiments, thinned_alike(fit, records)
+    return runs if any("part of" in r.meta for r in parts) and _samples(runs) <= WHOLE * _samples(parts) else []
+
+
 def fitted_to(fit: Fit, runs: Sequence[Experiment] | None, effort: LevenbergMarquardt | None = None) -> Fit:
     """Return the fit of the same model to other runs, from where it is; `fit` itself for none, or where that fails."""
     try:

@@ -26,7 +26,7 @@ from motorid.diagnosis.free_forms import FINER, PAST, PLACE, WHERE, Form, Span
 from motorid.diagnosis.misspecification import FormGain, better_forms, chosen_functions, pitches_of, tells_the_zero
 from motorid.diagnosis.model_comparison import Node, at_noise, far
 from motorid.diagnosis.predictive_score import QUICK, Evidence, HeldOut, Predictions, compare
-from motorid.diagnosis.record_versions import WHOLE, fitted_to, thinned_alike
+from motorid.diagnosis.record_versions import fitted_to, whole_of
 from motorid.diagnosis.refit import refit
 from motorid.display.numbers import listed, number, percent
 from motorid.effects import PER_RUN
@@ -440,8 +440,7 @@ class Remainder:
     @property
     def _on_whole(self) -> Remainder | None:
         """The same on whole `_records`, where the fit is of parts, if what is lost between them predicts more."""
-        parts, runs = self.fit.problem.experiments, thinned_alike(self.fit, self._records)
-        if "part of" not in parts[0].meta or not 0 < sum(r.n for r in runs) <= WHOLE * sum(r.n for r in parts):
+        if not (runs := whole_of(self.fit, self._records)):
             return None
         fits = [fitted_to(f, runs, QUICK) for f in dict.fromkeys((self.fit, self._root or self.fit))]
         forms = tuple(dict.fromkeys(gain.form for f in fits for gain in better_forms(f, f, past=True)))

@@ -390,8 +390,8 @@ def _read_and_climbed(fit: Fit, held_out: Sequence[Experiment] | None,
 def _remembers(found: Climb, whole: Fit, held_out: Sequence[Experiment] | None) -> bool:
     """Tell whether a model with a memory, which begins anew in every part of a record, leaves noise on whole ones: one
     on the way, or the most promising that was refused. Not where these would take more than `WHOLE` times as long."""
-    runs = whole.problem.experiments
-    if found.remaining.adequate or not _of_parts(found, whole):
+    runs = versions.whole_of(found.search.root.fit, whole.problem.experiments)
+    if found.remaining.adequate or not runs:
         return False
     refused = (c for tried in found.rounds[-1:] for c in tried if c.fit is not None and c.fit.memories)
     best = max(refused, key=lambda c: c.gain or 0.0, default=None)
@@ -403,20 +403,13 @@ def _remembers(found: Climb, whole: Fit, held_out: Sequence[Experiment] | None) 
     return False
 
 
-def _of_parts(found: Climb, whole: Fit) -> bool:
-    """Tell whether a climb looked at parts of records that as a whole are not much longer."""
-    parts, runs = found.path[-1].fit.problem.experiments, whole.problem.experiments
-    return any("part of" in r.meta for r in parts) and (
-        sum(r.n for r in runs) <= versions.WHOLE * sum(r.n for r in parts))
-
-
 def _seen_on_whole(found: Climb, whole: Fit) -> Climb:
     """Return a climb that knows what of the time, or of what was before, predicts on whole records what is larger than
     the noise and nothing predicts in parts of them: a sensor's zero that drifts."""
-    last = found.path[-1].fit
-    if found.stopped or not (found.remaining.adequate and far(last) and _of_parts(found, whole)):
+    runs = versions.whole_of(last := found.path[-1].fit, whole.problem.experiments)
+    if found.stopped or not (runs and found.remaining.adequate and far(last)):
         return found
-    there = versions.fitted_to(last, versions.thinned_alike(last, whole.problem.experiments), QUICK)
+    there = versions.fitted_to(last, runs, QUICK)
     forms = better_forms(there, there, past=True)
     return replace(found, forms=tuple(forms), remaining=following(found.remaining, forms[0].form.text)
                    ) if forms else found
