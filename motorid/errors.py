@@ -49,6 +49,8 @@ class UsageError(MotoridError):
 class SimulationError(MotoridError):
     """An integration did not reach the end of the record (exit status 1)."""
 
+    sample = 0  # the first whose state is not finite, where that is known
+
 
 class FitError(MotoridError):
     """An estimation could not be carried out (exit status 1)."""
@@ -90,6 +92,17 @@ class _Wire(Protocol):
     read: Any
     write: Any
     close: Any
+
+
+_T = TypeVar("_T")
+
+
+def otherwise(default: _T, failures: type[Exception] | tuple[type[Exception], ...], asked: Callable[[], _T]) -> _T:
+    """Return what is asked for, or a default where that fails so."""
+    try:
+        return asked()
+    except failures:
+        return default
 
 
 _Thing = TypeVar("_Thing", bound=Callable[..., Any])

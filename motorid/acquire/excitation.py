@@ -27,7 +27,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from motorid.errors import UsageError, among
+from motorid.errors import UsageError, among, otherwise
 
 LONGEST = 3600.0  # s of one segment
 _SHAPES = {"R": 2, "C": 4, "P": 4}  # numbers after the duration
@@ -147,10 +147,7 @@ def program(words: str | Program | None, v_max: float = math.inf) -> Program:
 
 
 def _number(text: str, word: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
+    value = otherwise(math.nan, ValueError, lambda: float(text))
     if not abs(value) < 1e6:
         raise UsageError(f"'{text}' in the excitation '{word}' is not a usable number.")
     return value

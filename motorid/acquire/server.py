@@ -16,7 +16,7 @@ import numpy as np
 
 from motorid.acquire.protocol import SILENCE
 from motorid.acquire.virtual import VirtualDevice
-from motorid.errors import UsageError
+from motorid.errors import UsageError, otherwise
 
 BUFFER = 65_536  # bytes a device keeps for a computer that does not read; what is more is lost, as in reality
 STALLED = 0.5  # s without a byte taken after which the computer counts as one that does not read
@@ -142,17 +142,11 @@ class Pty:
 
     def read(self) -> bytes:
         """Return what the computer sent."""
-        try:
-            return os.read(self._master, 4096)
-        except OSError:
-            return b""
+        return otherwise(b"", OSError, lambda: os.read(self._master, 4096))
 
     def write(self, data: bytes) -> int:
         """Return how many bytes were taken."""
-        try:
-            return os.write(self._master, data)
-        except BlockingIOError:
-            return 0
+        return otherwise(0, BlockingIOError, lambda: os.write(self._master, data))
 
 
 class Socket:

@@ -17,7 +17,7 @@ import numpy as np
 from motorid.acquire.excitation import Program, Segment
 from motorid.acquire.protocol import SILENCE, Channel, Decoder, Header, Message, frame
 from motorid.channels import CHANNELS
-from motorid.errors import UsageError, among, at_least, one_of
+from motorid.errors import UsageError, among, at_least, one_of, otherwise
 from motorid.records.datasets import load_plant
 
 LINES_PER_TURN = 4096  # encoder counts, after quadrature
@@ -100,10 +100,8 @@ class VirtualDevice:
             "X": lambda: self._stop("stop"), "K": lambda: b"" if self.running else self._done()}
         if (handler := handlers.get(fields[0])) is None:
             return frame("E", "refused", "unknown command")
-        try:
-            return handler(*fields[1:])
-        except (TypeError, ValueError, UsageError):
-            return frame("E", "refused", "the numbers make no sense")
+        no_sense = frame("E", "refused", "the numbers make no sense")
+        return otherwise(no_sense, (TypeError, ValueError, UsageError), lambda: handler(*fields[1:]))
 
     def _set_limits(self, mv: str, ma: str) -> bytes:
         if self.running:

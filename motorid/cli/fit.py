@@ -12,7 +12,7 @@ from motorid.cli.console import FAILED, INTERRUPTED, next_command, save_report, 
 from motorid.display.cards import Table
 from motorid.display.numbers import counted, duration, factor, number, quantity, sentence
 from motorid.effects import EVERY
-from motorid.errors import DataError, among
+from motorid.errors import DataError, among, otherwise
 from motorid.estimation.result import PLAIN, Fit, constraint_table, ended, steady_table, value_tables
 from motorid.exporters.c_code import check
 from motorid.exporters.export import FORMS, MOSTLY_NOISE, export
@@ -117,10 +117,7 @@ def fit_many_command(directories: Motors, options: opt.FitOptions, out: MotorTab
 
 def _readable(options: opt.FitOptions, files: list[Path]) -> list[Any]:
     """Return the records of one motor, none where they cannot be read: its row says why."""
-    try:
-        return list(options.read([str(f) for f in files]))
-    except DataError:
-        return []
+    return otherwise([], DataError, lambda: list(options.read([str(f) for f in files])))
 
 
 @opt.with_options(opt.DriveOptions)

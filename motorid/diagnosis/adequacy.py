@@ -9,7 +9,7 @@ effective samples, see what bins cannot. Where both are silent but the errors ex
 asks whether a free form predicts them on data that it was not fitted to: coloured noise cannot be predicted.
 """
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from typing import Any
@@ -22,10 +22,10 @@ from motorid.channels import channel_name
 from motorid.diagnosis.free_forms import signals_along
 from motorid.diagnosis.misspecification import better_forms, hum_of
 from motorid.diagnosis.model_comparison import Node, far
-from motorid.diagnosis.predictive_score import deciding, finer, undecided
+from motorid.diagnosis.predictive_score import finer, undecided
 from motorid.diagnosis.results import Adequacy
 from motorid.diagnosis.score_test import Score
-from motorid.diagnosis.thresholds import LARGER, SEARCHED
+from motorid.diagnosis.thresholds import FINER, LARGER, SEARCHED
 from motorid.display.numbers import factor, listed, percent
 from motorid.estimation.result import Fit
 from motorid.numerics.autoregression import autocorrelation, effective_samples
@@ -56,10 +56,12 @@ def adequacy(fit: Fit, scores: Sequence[Score] = (), level: float = FALSE_ALARM)
     channels = {c: _channel(fit, c) for c in fit.problem.outputs}
     asked = [c for c in channels if c not in (idle := undecided(fit))]
     tests = [*(t for c in asked for t in _dependences(fit, c)), *(_score_tests(scores) if asked else ())]
-    rounded = {c: f["rounded"] for c, f in channels.items()}
-    rounded |= {None: np.mean([*rounded.values()])}
-    least = {c: MATERIAL + (ROUNDED - MATERIAL) * share for c, share in rounded.items()}
-    least[None] += _share_of(idle, fit)  # an effect that takes up what is asked no more says nothing
+    least: dict[str | None, float] = {
+        c: MATERIAL + (ROUNDED - MATERIAL) * f["rounded"] for c, f in channels.items()}
+    # An effect that takes up what is asked no more says nothing: so much of the error that is, as effects are scored.
+    sizes = {c: fit.misfit[c] / fit.problem.noise_factors.get(c, 1.0) for c in channels}
+    squares = {c: (fit.nrmse[c] / FINER if c in idle else size) ** 2 for c, size in sizes.items()}
+    least[None] = float(np.mean([*least.values()])) + sum(squares[c] for c in idle) / max(sum(squares.values()), 1e-300)
     material = [t for t in tests if t["share"] > least[t["channel"]]]
     p_value = min([1.0, *(t["p"] * len(tests) for t in material)])
     far = [c for c, facts in channels.items()
@@ -70,15 +72,6 @@ def adequacy(fit: Fit, scores: Sequence[Score] = (), level: float = FALSE_ALARM)
         facts["p_value"] = min([1.0, *(t["p"] for t in tests if t["channel"] == c)])
     text = "The errors are below a millionth of what was measured." if exact else _text(adequate, channels, material)
     return Adequacy(adequate, float(p_value), FALSE_ALARM, channels, f"{text} {fine_angle_remark(fit)}".rstrip())
-
-
-def _share_of(channels: Collection[str], fit: Fit) -> float:
-    """Return the share of the squared error that these channels have as effects are scored."""
-    if not channels:
-        return 0.0
-    scored = deciding(fit)
-    squares = np.sum([np.nansum(r**2, axis=0) for r in scored.problem.unstack(scored.residuals)], axis=0)
-    return float(sum(squares[fit.problem.outputs.index(c)] for c in channels) / squares.sum())
 
 
 def fine_angle_remark(fit: Fit) -> str:

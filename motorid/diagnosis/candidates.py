@@ -25,7 +25,7 @@ from motorid.diagnosis.score_test import Score, pairs_of, rank, uses_angle, with
 from motorid.diagnosis.thresholds import MATERIAL
 from motorid.display.numbers import listed
 from motorid.effects import LIBRARY, MEASURED, PER_RUN, get
-from motorid.errors import ModelError
+from motorid.errors import ModelError, otherwise
 from motorid.estimation.fit import lost, solve
 from motorid.estimation.least_squares import FAILURES, RACE
 from motorid.estimation.result import Fit
@@ -398,9 +398,8 @@ def _without(model: Model, name: str) -> list[Model]:
 def _in_place(model: Model, old: Effect, new: Effect) -> Model | None:
     """Return the model with `new` where `old` was, so that the order in which effects were found stays. None where
     another effect of the model contains `new`, too."""
-    with contextlib.suppress(ModelError):
-        return (model.without(old.name) + new).with_(effects=tuple(new if e is old else e for e in model.effects))
-    return None
+    effects = tuple(new if e is old else e for e in model.effects)
+    return otherwise(None, ModelError, lambda: (model.without(old.name) + new).with_(effects=effects))
 
 
 def _unseen(score: Score) -> str:

@@ -24,7 +24,7 @@ from motorid.diagnosis.results import Diagnosis
 from motorid.diagnosis.stepwise import Climb, explored, ladder_of
 from motorid.display.numbers import listed, number
 from motorid.effects import LIBRARY
-from motorid.errors import MotoridError, at_least, numbers_told
+from motorid.errors import MotoridError, at_least, numbers_told, otherwise
 from motorid.estimation.result import Fit, checked
 from motorid.model.definition import Effect
 from motorid.model.model import SHOWN, Model
@@ -170,10 +170,8 @@ def _suggestion(fits: Sequence[Fit], groups: Sequence[Sequence[str]]) -> str | N
     """Say which experiment would separate the rivals of the first group, if there is one."""
     if len(fits) < 2 or not groups:
         return None
-    names = groups[0]
-    try:
-        best = suggest_experiment(fits[:4])
-    except MotoridError:
+    names, best = groups[0], otherwise(None, MotoridError, lambda: suggest_experiment(fits[:4]))
+    if best is None:
         return None
     problem, text = fits[0].problem, f"To distinguish {listed(names)}, record {best.text}."
     if best.discrimination[best.name] < 1e-3:

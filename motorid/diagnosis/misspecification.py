@@ -20,7 +20,7 @@ from motorid.diagnosis.model_comparison import Node, evidence, far, share_of
 from motorid.diagnosis.predictive_score import Evidence, Predictions, compare
 from motorid.diagnosis.thresholds import MOST, PLAIN, STANDARD_ERRORS, SUPPLANTS, TRIFLE, UNCONTESTED
 from motorid.display.numbers import listed, number, percent
-from motorid.errors import ModelError
+from motorid.errors import ModelError, otherwise
 from motorid.estimation.angle_orders import uses_angle
 from motorid.estimation.fit import follows
 from motorid.estimation.least_squares import FAILURES
@@ -254,9 +254,7 @@ def _acted_on(model: Model, name: str) -> list[str]:
 
 def _may_go(model: Model, name: str) -> bool:
     """Tell whether no other effect needs that one."""
-    with contextlib.suppress(ModelError):
-        return model.without(name) is not model
-    return False
+    return otherwise(False, ModelError, lambda: model.without(name) is not model)
 
 
 def tells_the_zero(effect: Effect) -> bool:

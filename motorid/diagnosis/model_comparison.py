@@ -175,10 +175,8 @@ def far(fit: Fit) -> list[str]:
     return [c for c in fit.problem.outputs if fit.misfit[c] > LARGER and not finer(fit, c)]
 
 
-def at_noise(node: Node, most: float = LARGER) -> bool:
-    """Tell whether a model leaves hardly more than noise, at `most` so many times what the sensor's fast changes tell
-    of it, and hardly more on the held-out runs than on the others."""
-    least = {c: float(np.clip(m, 1.0, most)) for c, m in node.fit.misfit.items()}
-    return all(node.fit.misfit[c] <= most for c in far(node.fit)) and all(
-        e.misfit < LARGER * least.get(c, 1.0) or (finer(node.fit, c) and e.nrmse < FINER)
-        for c, e in node.predictions.held_out.items())
+def at_noise(node: Node) -> bool:
+    """Tell whether a model leaves hardly more than noise, and hardly more on the held-out runs than on the others."""
+    least = {c: float(np.clip(m, 1.0, LARGER)) for c, m in node.fit.misfit.items()}
+    return not far(node.fit) and all(e.misfit < LARGER * least.get(c, 1.0) or (finer(node.fit, c) and e.nrmse < FINER)
+                                     for c, e in node.predictions.held_out.items())

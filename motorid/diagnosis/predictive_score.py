@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from motorid.diagnosis import thresholds
+from motorid.errors import otherwise
 from motorid.estimation.continuation import by_continuation
 from motorid.estimation.least_squares import FAILURES
 from motorid.estimation.result import Fit
@@ -289,10 +290,8 @@ def predictions_left_out(fit: Fit, evenly: bool = False) -> Channels | None:
     columns = (fit.jacobian[:n] * problem.scaling.slope(fit.q))[:, free]
     blocks = blocks_of(problem.experiments, evenly)
     residual = fit.residuals[:n]
-    try:
-        moved = left_out(residual, columns, stacked_labels(problem, blocks))
-    except np.linalg.LinAlgError:
-        return None
+    labels = stacked_labels(problem, blocks)
+    moved = otherwise(np.array([np.inf]), np.linalg.LinAlgError, lambda: left_out(residual, columns, labels))
     if not np.isfinite(moved).all() or moved @ moved > thresholds.UNRELIABLE**2 * (residual @ residual):
         return None
     found = by_channel(problem, moved, blocks)

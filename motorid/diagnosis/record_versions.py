@@ -43,8 +43,7 @@ ENOUGH = 4000  # samples: what is left at least of those that their neighbours p
 SMALL = 0.1  # of the error: a difference that changes no judgement
 AFFORDABLE = 24_000  # steps of integration per simulation of all records
 WANTED = 12_000  # of what is longer
-PART = 1000  # samples, and before them
-RUN_IN = 100
+PART, RUN_IN = 1000, 100  # samples, and those before them that are not judged
 LONG = 20_000  # samples: a first fit of their parts tells whether all of them are affordable
 FEW = 4 * PART  # samples of that first fit
 NEARLY_ALL = 0.7  # of the samples: no reason to leave out the rest
@@ -176,9 +175,8 @@ def parts_remark(fit: Fit) -> str:
     whole = dict(r.meta.get("part of", (r.name, r.n)) for r in used)
     if not any("part of" in r.meta for r in used):
         return thin
-    judged = [1 - r.run_in / r.n for r in used]
-    share = sum(r.n * f for r, f in zip(used, judged, strict=True)) / sum(whole.values())
-    seconds = float(np.median([r.duration * f for r, f in zip(used, judged, strict=True)]))
+    share = sum(r.n - r.run_in for r in used) / sum(whole.values())
+    seconds = float(np.median([r.t[-1] - r.t[r.run_in] for r in used]))
     return (f"The records are long: this rests on {len(used)} parts of {seconds:.2g} s, {100 * share:.0f} % of "
             "the samples, each from a state of its own, so that errors are smaller there than over whole runs; fit the "
             f"model to all of them. {thin}".rstrip())

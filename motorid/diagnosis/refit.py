@@ -12,7 +12,7 @@ from motorid.diagnosis.model_comparison import far, size_of
 from motorid.diagnosis.predictive_score import QUICK, ROUGH
 from motorid.diagnosis.score_test import believable_start, uses_angle
 from motorid.diagnosis.thresholds import MATERIAL, NATS
-from motorid.errors import OutOfTime
+from motorid.errors import OutOfTime, otherwise
 from motorid.estimation.continuation import by_continuation, past_ripples, sharpened
 from motorid.estimation.first_guess import first_guess
 from motorid.estimation.fit import LOST, lost
@@ -106,11 +106,9 @@ def finished(fit: Fit, best: Raced, effort: LevenbergMarquardt) -> Fit | None:
     """Return the refit that a race began, converged with `effort`; None if it fails. Where it went along the measured
     angle the model's own takes over, unless it drifts too far (by periods)."""
     stages = "sgn_width" in best.problem.model.parameters and "sgn_width" not in fit.model.parameters
-    try:
-        done = _released(best.problem) if best.angular else QUICKLY(best.problem, wide=stages)
-    except FAILURES:
-        return None
-    return _polished(fit, collapsed_again(done.onward, fit), effort)
+    along = partial(_released, best.problem) if best.angular else partial(QUICKLY, best.problem, wide=stages)
+    done = otherwise(None, FAILURES, along)
+    return done and _polished(fit, collapsed_again(done.onward, fit), effort)
 
 
 def refit(fit: Fit, model: Model, starts: Sequence[Mapping[str, float]]) -> Fit | None:

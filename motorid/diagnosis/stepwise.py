@@ -29,7 +29,7 @@ from motorid.diagnosis.remainder import alone_leaving_noise, beside_leaving_nois
 from motorid.diagnosis.results import Adequacy, Candidate, Ladder, Rung
 from motorid.diagnosis.thresholds import ELSEWHERE, LARGER, MATERIAL
 from motorid.diagnosis.verdict import first_answer
-from motorid.errors import OutOfTime, at_least
+from motorid.errors import OutOfTime, at_least, otherwise
 from motorid.estimation.fit import TOO_FAR, UNFOLLOWED, follows, growth, in_windows, solve
 from motorid.estimation.least_squares import FAILURES
 from motorid.estimation.result import Fit, checked
@@ -199,7 +199,7 @@ def _beside_curves(found: Climb, seconds: float | None) -> Climb:
     """Return a climb with grades that hold beside a curve, fitted in the place of all that was found, or beside an
     effect that is a special case of it. Forms are compared by slopes, and these lead astray far from the records."""
     search, best, grades = found.search, found.path[-1], list(found.grades)
-    noise = found.remaining.adequate and at_noise(best, most=np.inf)  # on held-out runs, too; nothing predicts it
+    noise = found.remaining.adequate and at_noise(best)  # on held-out runs, too
     if noise or all(g.grade == "approximates" for g in grades):
         return found
     within = [e.name for gain in found.forms[:1] for e in best.fit.model.effects
@@ -445,9 +445,7 @@ def _in_windows(found: Climb) -> Fit | None:
     drawn_back = DRAWS_BACK & (found.path[-1].key - found.path[0].key) and astray[0]
     if part is None and (drawn_back or astray[1]):
         part = in_windows(first, partial(solve, solver=QUICK), drifts=True)
-    with contextlib.suppress(*FAILURES):
-        return part and solve(part.problem.with_(model=first.model, noise_factors={}))
-    return None
+    return otherwise(None, FAILURES, lambda: part and solve(part.problem.with_(model=first.model, noise_factors={})))
 
 
 def _explains(whole: Climb, windowed: Climb) -> bool:

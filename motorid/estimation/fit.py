@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from motorid.display.numbers import listed
-from motorid.errors import ModelError, UsageError, among, name_of, numbers_told, one_of
+from motorid.errors import ModelError, UsageError, among, name_of, numbers_told, one_of, otherwise
 from motorid.estimation.angle_orders import effects_of_unknown_order, strongest_order, uses_angle
 from motorid.estimation.continuation import by_continuation
 from motorid.estimation.least_squares import FAILURES, FINISH, Callback, Estimate, least_squares, race
@@ -211,11 +211,8 @@ def _with_orders(problem: Problem) -> Problem:
     while waiting:
         if not (smaller := problem.for_model(present).tuned(constraints=())).unknown:  # an order shows without them
             break
-        try:
-            fit = _fit(smaller, FINISH)
-        except FAILURES:
-            break
-        if (found := strongest_order(fit, waiting)) is None:
+        fit = otherwise(None, FAILURES, partial(_fit, smaller, FINISH))
+        if fit is None or (found := strongest_order(fit, waiting)) is None:
             break
         effect, values = found
         model, present = model.start_at({**fit.values, **values}), (fit.model + effect).start_at(values)
@@ -291,11 +288,9 @@ def _polished(found: Estimate, effort: LevenbergMarquardt, callback: Callback) -
     if not finer > 1 or found.solution.status != "converged":
         return found, error
     problem = problem.with_finer_steps(int(min(finer, MOST_FINER)))
-    try:
-        again = least_squares(problem, effort, callback, q=found.q, refine=False)
-    except FAILURES:
-        return found, error
-    return replace(again, history=found.history + again.history), integration_error(problem, again.q)
+    again = otherwise(None, FAILURES, lambda: least_squares(problem, effort, callback, q=found.q, refine=False))
+    return (found, error) if again is None else (
+        replace(again, history=found.history + again.history), integration_error(problem, again.q))
 
 
 def _misfit(found: Estimate) -> float:
@@ -369,9 +364,8 @@ def over_moments(fit: Fit, solve: Callable[[Problem], Fit] = solve) -> Fit | Non
     whole = (r.with_(meta={k: x for k, x in r.meta.items() if k != "window"}) for r in runs)
     parts = [p for r in whole for p in windows(r, seconds)]
     some = tuple(parts[k] for k in np.unique(np.linspace(0, len(parts) - 1, MOST_MOMENTS).round().astype(int)))
-    with contextlib.suppress(*FAILURES):
-        return solve(fit.problem.with_(experiments=some, model=model, initial="auto", noise_factors={}))
-    return None
+    problem = fit.problem.with_(experiments=some, model=model, initial="auto", noise_factors={})
+    return otherwise(None, FAILURES, lambda: solve(problem))
 
 
 def leaves_noise(fit: Fit) -> bool:

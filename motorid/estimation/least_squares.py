@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from motorid.errors import FitError, ModelError, SimulationError
+from motorid.errors import FitError, ModelError, SimulationError, otherwise
 from motorid.numerics.least_squares import LevenbergMarquardt, Solution, levenberg_marquardt
 from motorid.numerics.signals import Array
 from motorid.problem.problem import Problem
@@ -83,10 +83,7 @@ def cost_at(problem: Problem, q: Array | None = None, *, refine: bool = True) ->
     """Return the cost at `q`, by default the values of the model; infinite where it cannot be simulated. The sub-steps
     are those that suit it (`refine`), or as they are."""
     q = problem.start if q is None else q
-    try:
-        r = (problem.refined(q) if refine else problem).residual(q)
-    except SimulationError:
-        return np.inf
+    r = otherwise(np.array([np.inf]), SimulationError, lambda: (problem.refined(q) if refine else problem).residual(q))
     return 0.5 * float(r @ r) if np.isfinite(r).all() else np.inf
 
 

@@ -29,14 +29,6 @@ LOST_ERROR = 0.3  # error estimate, relative to the state so far, at which a ste
 LOST_GROWTH = 1e3  # growth of a state that shows it
 
 
-class LeftFinite(SimulationError):
-    """A simulation whose state is not finite from a `sample` on."""
-
-    def __init__(self, message: str, sample: int = 0) -> None:
-        super().__init__(message)
-        self.sample = sample
-
-
 @dataclass(frozen=True)
 class Rosenbrock:
     """RODAS3, sub-steps chosen by halving them; the exact derivative of the discrete step goes along.
@@ -78,7 +70,9 @@ class Rosenbrock:
         while passes > 0:
             try:
                 traj = self.run(system, grid, x0, p, local_error=True)
-            except LeftFinite as failed:
+            except SimulationError as failed:
+                if not failed.sample:
+                    raise
                 traj = self._as_far(system, grid, x0, p, failed.sample)
             level, loose, asked = tolerance(traj) if callable(tolerance) else (tolerance, tolerance, None)
             assert traj.error is not None
@@ -124,7 +118,7 @@ class Rosenbrock:
         y, x = (np.concatenate([a[:sample], np.repeat(a[sample - 1:sample], len(grid.t) - sample, axis=0)])
                 for a in (near.y, near.x))
         error = np.zeros((len(x) - 1, x.shape[1]))
-        error[:sample - 1] = near.error[:sample - 1]
+        error[:sample - 1] = 0.0 if near.error is None else near.error[:sample - 1]
         error[sample - 1] = np.inf
         return Trajectory(y, None, x, None, error)
 
@@ -172,8 +166,10 @@ class Stepper:
             step = self.functions.light if dp is None else self.functions.full
             self._spent += step.n_instructions() * int(grid.substeps.sum())
         if bad >= 0:
-            raise LeftFinite(f"the simulation left the finite numbers at t = {grid.t[bad]:.6g} s; the parameters make "
-                             "the model unstable or stiff beyond the step.", bad)
+            error = SimulationError(f"the simulation left the finite numbers at t = {grid.t[bad]:.6g} s; the "
+                                    "parameters make the model unstable or stiff beyond the step.")
+            error.sample = bad
+            raise error
         return traj
 
     def halved(self, grid: Grid, rows: NDArray[np.int64], x: Array, p: Array, compiled: bool | None) -> Array:

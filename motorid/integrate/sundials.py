@@ -17,7 +17,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from motorid.errors import ModelError, SimulationError, positive
+from motorid.errors import ModelError, SimulationError, otherwise, positive
 from motorid.integrate.engine import Engine, Grid, Trajectory
 from motorid.integrate.rosenbrock import Rosenbrock, Stepper, stepper
 from motorid.model.equations import System
@@ -43,11 +43,10 @@ class _Sundials(Engine):
             dp: Array | None = None) -> Trajectory:
         """See `Engine.run`."""
         nx, nq = len(system.states), 0 if dp is None else dp.shape[1]
-        try:
-            size = np.abs(Rosenbrock().run(system, grid, x0, p).x).max(axis=0)
-        except SimulationError:
-            size = np.abs(x0)
-        scale = np.where((size > 1e-12) & np.isfinite(size), size, 1.0)  # rough, for the solver's tolerances only
+        rough = Rosenbrock()  # tolerances are relative to the sizes of states
+        size = otherwise(np.abs(x0), SimulationError, lambda: np.abs(
+            rough.run(system, rough.prepare(system, grid, x0, p, 1e-2), x0, p).x).max(axis=0))
+        scale = np.where((size > 1e-12) & np.isfinite(size), size, 1.0)
         x, dx = np.empty((len(grid.t), nx)), np.empty((len(grid.t), nx, nq))
         x[0] = x0
         if nq:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from motorid.channels import CHANNELS
-from motorid.errors import ModelError, SimulationError, UsageError, among, name_of
+from motorid.errors import ModelError, SimulationError, UsageError, among, name_of, otherwise
 from motorid.integrate import engine_of, limited
 from motorid.integrate.engine import Engine, Tolerance, Trajectory
 from motorid.model.definition import Parameter
@@ -209,10 +209,8 @@ class Problem:
     def _suits(self, k: int, at: Point) -> bool:
         grid, x0 = self.runs[k].grid, self.unknowns.first_state(at, k)
         engine = limited(self.integrator, int(grid.substeps.sum()))  # the first that is finer tells
-        try:
-            return engine.prepare(self.system, grid, x0, at.p, self._tolerance(k, 2.0)) is grid
-        except SimulationError:
-            return False
+        finer = partial(engine.prepare, self.system, grid, x0, at.p, self._tolerance(k, 2.0))
+        return otherwise(None, SimulationError, finer) is grid
 
     def _refined_run(self, k: int, at: Point) -> Run:
         # From one step per sample on, so that the grid depends on q alone and not on the way there.
@@ -220,11 +218,6 @@ class Problem:
         run, x0 = self.runs[k], self.unknowns.first_state(at, k)
         coarse = run.grid.with_substeps(np.ones_like(run.grid.substeps))
         grid = self.integrator.prepare(self.system, coarse, x0, at.p, self._tolerance(k))
-        if grid is coarse and np.any(run.grid.substeps > 1):
-            try:
-                self.integrator.run(self.system, coarse, x0, at.p)
-            except SimulationError:  # only finer steps get through
-                grid = self.integrator.prepare(self.system, run.grid, x0, at.p, self._tolerance(k))
         return run if np.array_equal(grid.substeps, run.grid.substeps) else replace(run, grid=grid)
 
     def with_finer_steps(self, factor: int) -> Problem:

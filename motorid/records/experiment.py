@@ -264,8 +264,8 @@ def windows(experiment: Experiment, seconds: float) -> list[Experiment]:
         raise UsageError(f"a window takes a time in seconds; got {seconds!r}.")
     if seconds < 8 * experiment.dt:
         raise UsageError(f"a window of {seconds:g} s holds fewer than 8 samples, {experiment.dt:.3g} s apart.")
-    own = {"window": seconds, "judged from": -np.inf}
-    return [p.with_(meta={**part_meta(r), **p.meta, **own}) for r in between_pauses(experiment)
+    return [p.with_(meta={**part_meta(r), **p.meta, "window": seconds, "judged from": p.t[0]})
+            for r in between_pauses(experiment)
             for p in split(r, max(min(round(r.duration / seconds), r.n // MIN_SAMPLES), 1))]
 
 

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from motorid.errors import DataError, OutputError, UsageError
+from motorid.errors import DataError, OutputError, UsageError, otherwise
 
 MOST_BYTES = 256_000_000  # of a file that is read; a table takes about eight times as much memory
 _LOOK = 65_536  # bytes at either end in which an output says that motorid wrote it
@@ -28,10 +28,7 @@ _WRONG_PLACE = (errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.EACCES, errno.E
 
 def package_version(package: str) -> str:
     """Return the version of an installed package."""
-    try:
-        return metadata.version(package)
-    except metadata.PackageNotFoundError:
-        return "unknown"
+    return otherwise("unknown", metadata.PackageNotFoundError, lambda: metadata.version(package))
 
 
 def read_bytes(path: Path) -> bytes:

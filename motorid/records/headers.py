@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from motorid.channels import DIMENSIONS, SI
-from motorid.errors import DataError, one_of
+from motorid.errors import DataError, one_of, otherwise
 
 
 @dataclass(frozen=True)
@@ -85,10 +85,7 @@ def _counts(label: str, per_second: str | None, number: str | None) -> Unit:
     dimension = "speed" if per_second else "angle"
     if number is None:  # recognised, but of no size yet
         return Unit(dimension, math.nan, SI[dimension], label)
-    try:
-        per_turn = float(label.split(":", 1)[1])
-    except ValueError:
-        per_turn = math.nan
+    per_turn = otherwise(math.nan, ValueError, lambda: float(label.split(":", 1)[1]))
     if not (math.isfinite(per_turn) and per_turn > 0):
         raise DataError(f"counts per turn must be a positive number; got '{label}'. Example: counts:2048.")
     return Unit(dimension, _TURN / per_turn, SI[dimension], label)

@@ -1,6 +1,5 @@
 """A table of numbers from the bytes of a text file: encoding, dialect, header, row of units, rows; pandas parses."""
 
-import contextlib
 import csv
 import io
 import json
@@ -15,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from motorid.display.numbers import counted
-from motorid.errors import DataError
+from motorid.errors import DataError, otherwise
 from motorid.records.headers import parse_unit
 
 _COMMENT = ("#", "%", "//")
@@ -77,9 +76,7 @@ def parse_table(data: bytes) -> TextTable:
 
 
 def _is_json(text: str) -> bool:
-    with contextlib.suppress(ValueError):
-        return isinstance(json.loads(text), dict | list)
-    return False
+    return otherwise(False, ValueError, lambda: isinstance(json.loads(text), dict | list))
 
 
 def decode(data: bytes) -> tuple[str, list[str]]:
@@ -118,10 +115,8 @@ class Dialect:
             return [c.strip('"') for c in line.split()]
         if '"' not in line:
             return [c.strip() for c in line.split(self.delimiter)]
-        try:
-            return [c.strip() for c in next(csv.reader([line], delimiter=self.delimiter, skipinitialspace=True), [])]
-        except csv.Error:
-            return [line]
+        cells = csv.reader([line], delimiter=self.delimiter, skipinitialspace=True)
+        return otherwise([line], csv.Error, lambda: [c.strip() for c in next(cells, [])])
 
     def is_number(self, cell: str) -> bool:
         """Tell whether a cell is one number in this dialect."""

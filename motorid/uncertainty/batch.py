@@ -21,7 +21,7 @@ import scipy
 from motorid.channels import CHANNELS
 from motorid.display.cards import Table
 from motorid.display.numbers import number, quantity
-from motorid.errors import DataError, FitError, MissingDependency, OutputError, UsageError, printable
+from motorid.errors import DataError, FitError, MissingDependency, OutputError, UsageError, otherwise, printable
 from motorid.estimation.fit import fit
 from motorid.estimation.result import Fit
 from motorid.model.model import SHOWN, Model
@@ -330,8 +330,6 @@ def _contents(records: Any) -> list[bytes]:
                 *(a.tobytes() for a in (records.t, *records.inputs.values())),
                 *(c.encode() + a.tobytes() for c, a in records.outputs.items())]
     if isinstance(records, str | Path):
-        try:
-            return [Path(f).read_bytes() for f in find_records(records)]
-        except (DataError, OSError):
-            return [str(records).encode()]
+        return otherwise([str(records).encode()], (DataError, OSError),
+                         lambda: [Path(f).read_bytes() for f in find_records(records)])
     return [part for r in records for part in _contents(r)]

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from motorid.errors import FitError, SimulationError, UsageError, among, at_least, positive
+from motorid.errors import FitError, SimulationError, UsageError, among, at_least, otherwise, positive
 from motorid.estimation.fit import minimise
 from motorid.estimation.least_squares import FINISH, least_squares
 from motorid.estimation.result import Fit
@@ -198,20 +198,14 @@ def _least_noise(problem: Problem) -> dict[str, float]:
 
 def _least_squares(problem: Problem, stages: bool) -> tuple[Problem, Array]:
     """Return the problem with weights settled and its solution without constraints, in one piece."""
-    try:
-        done = minimise(problem, replace(FINISH, ftol=TIGHT), wide=stages)
-    except FitError:  # the intervals will have to find it
-        return problem, problem.start
-    return done.problem, done.q
+    done = otherwise(None, FitError, lambda: minimise(problem, replace(FINISH, ftol=TIGHT), wide=stages))
+    return (done.problem, done.q) if done else (problem, problem.start)  # the intervals will have to find it
 
 
 def _under_heavier_penalties(problem: Problem, q: Array) -> Array:
     """Return values near the constrained solution: penalties on what is violated at `q`, heavier and heavier. A current
     peak is lowered by resistance or by inductance, and the cost has a valley for each."""
-    try:
-        if max(violations(problem, q).values(), default=0.0) == 0.0:
-            return q
-    except SimulationError:
+    if not any(otherwise({}, SimulationError, lambda: violations(problem, q)).values()):
         return q
     names = [p.name for p in problem.unknown]
     starts = [q, q + VALLEY * np.array([n == "L" for n in names])] if "L" in names else [q]
@@ -233,10 +227,8 @@ def _under_penalties(problem: Problem, q: Array) -> tuple[float, Array]:
 
 def _misfit(problem: Problem, q: Array) -> float:
     """Return the misfit over all channels, on a scale that does not depend on their weights."""
-    try:
-        return float(np.sum(np.log(list(misfit_over_noise(problem, q).values()))))
-    except SimulationError:
-        return np.inf
+    errors = otherwise({"": np.inf}, SimulationError, lambda: misfit_over_noise(problem, q))
+    return float(np.sum(np.log(list(errors.values()))))
 
 
 def _with_resets(problem: Problem, q: Array) -> list[Array]:
@@ -251,8 +243,5 @@ def _lowest(found: list[Solved]) -> Solved:
 
 def _poor(problem: Problem, q: Array) -> bool:
     """Tell whether the model explains less than half of some channel at `q`."""
-    try:
-        errors = judge(at(problem, q)).by_run
-    except SimulationError:
-        return True
+    errors = otherwise(({"": np.inf},), SimulationError, lambda: judge(at(problem, q)).by_run)
     return not all(e < POOR for run in errors for e in run.values())
