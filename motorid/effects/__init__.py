@@ -1,4 +1,4 @@
-"""The library of physical effects: `get` gives one by its name; a user's own effect has the same form.
+"""The library of physical effects: ``print(mi.effects.cogging.card())`` shows one, `get` gives one by its name.
 
 Every effect that a module here defines is in it: a new one is a function there, and nothing else. Those called
 ``measured_…`` are for records in which a supply voltage, a load torque or a temperature was measured too.

@@ -274,6 +274,19 @@ def test_where_a_coarse_step_leaves_the_finite_numbers_there_are_finer_ones(engi
         engine.run(system, engine.prepare(system, *first, p, 1e-4), first[1], p)
 
 
+@pytest.mark.parametrize("tolerance", [1e-3, 3e-5])
+def test_every_step_that_goes_astray_is_found_however_many_there_are(tolerance):
+    """Sixty steps of the voltage, and at each the current of a saturating winding: the last ones read 1e10 A."""
+    system = (mi.dc_motor() + mi.effects.inductance_saturation).system(("i", "omega"))
+    known = {"R": 1.66, "L": 0.0148, "K": 0.162, "b": 4.7e-4, "J": 1.42e-3, "i_L": 2.9}
+    p, t = np.array([known[n] for n in system.parameters]), 2e-3 * np.arange(1500)
+    v = np.repeat(np.random.default_rng(3).choice([-100.0, 100.0, 0.0, 50.0], 60), 25)
+    coarse = Grid.of(t, v[:, None], np.array([True]))
+    fine = Rosenbrock().run(system, coarse.with_substeps(np.full(1499, 256)), np.zeros(2), p).x
+    found = Rosenbrock().run(system, Rosenbrock().prepare(system, coarse, np.zeros(2), p, tolerance), np.zeros(2), p).x
+    assert (np.abs(found - fine).max(axis=0) < 20 * tolerance * np.abs(fine).max(axis=0)).all()
+
+
 @pytest.mark.parametrize("engine", [Rosenbrock(True), Rosenbrock(False)], ids=["compiled", "machine"])
 def test_a_current_that_settles_between_samples_takes_no_steps_of_its_own(engine, rng):
     """Its transient is over at the next sample, and so is the error of a step that jumps over it."""
