@@ -1120,6 +1120,7 @@ def test_zeros_found_in_short_windows_are_those_of_their_records(lab):
     assert again.model.effect_names == ("encoder_zero",)
     assert again.per_run["z_0"][runs[1].name]["value"] == pytest.approx(1.9, abs=0.1)
     assert remainder._zeroed_like(again, there) is again
+    assert remainder._zeroed(again, {"z_0[1]": 0.3}) is again  # a model has one at most
     assert remainder._zeroed_like(whole, parts) is whole
 
 
