@@ -364,7 +364,7 @@ def explored(fit: Fit, validate: Sequence[Experiment] | Experiment | None, effec
         found, curve = _curve_alone(found, as_it_was.fit, HeldOut.of(as_it_was.fit, as_it_was.held_out), left())
         if curve is not None:
             records, found = as_it_was, climbed(as_it_was, 0)
-    found, records = _with_held_out(_seen_on_whole(found, fit), records, climbed)
+    found, records = _with_held_out(_seen_on_whole(found, fit, left()), records, climbed)
     return _without_stops_run_through(_beside_curves(found, left())), " ".join(records.remarks)
 
 
@@ -403,11 +403,11 @@ def _remembers(found: Climb, whole: Fit, held_out: Sequence[Experiment] | None) 
     return False
 
 
-def _seen_on_whole(found: Climb, whole: Fit) -> Climb:
+def _seen_on_whole(found: Climb, whole: Fit, seconds: float | None) -> Climb:
     """Return a climb that knows what of the time, or of what was before, predicts on whole records what is larger than
     the noise and nothing predicts in parts of them: a sensor's zero that drifts."""
     runs = versions.whole_of(last := found.path[-1].fit, whole.problem.experiments)
-    if found.stopped or not (runs and found.remaining.adequate and far(last)):
+    if found.stopped or seconds == 0 or not (runs and found.remaining.adequate and far(last)):
         return found
     there = versions.fitted_to(last, runs, QUICK)
     forms = better_forms(there, there, past=True)

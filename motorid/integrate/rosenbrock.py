@@ -94,7 +94,7 @@ class Rosenbrock:
                 few = np.isfinite(asked)
                 own = np.min(asked[few, None] / np.maximum(shown[few], 1e-300), axis=0)[:, None]
                 relative = (error / np.clip(own / level, sizes, loose / level * sizes)).max(axis=0)
-            passes -= 1 if astray is None and not gone.any() else 1 / 128
+            passes -= 1 if astray is None and not gone.any() else 1 / 128  # a record has hundreds
             finer = grid.substeps
             if np.max(relative, initial=0.0) > 2 * level:  # not where it is no number
                 factor = np.ceil(1.1 * (np.maximum(relative, 1e-300) / level) ** (1 / ORDER))
