@@ -183,8 +183,7 @@ def _finished(found: Climb) -> Climb:
 
 
 def _still_alike(found: Climb) -> tuple[tuple[tuple[str, ...], ...], tuple[Fit, ...]]:
-    """Return the groups that are left once more is known, and the rivals of the first. What predicted as well on an
-    early rung may not beside what was found after it."""
+    """Return the groups left beside what was found after them, and the rivals of the first."""
     search, best, groups, rivals = found.search, found.path[-1], list[tuple[str, ...]](), tuple[Fit, ...]()
     for first, *others in (g for g in found.groups if g[0] in best.key):
         swapped = {n: search.in_place(best, first, n, bool(found.stopped)) for n in others if n not in best.key}
@@ -195,7 +194,7 @@ def _still_alike(found: Climb) -> tuple[tuple[tuple[str, ...], ...], tuple[Fit, 
     return tuple(groups), rivals
 
 
-def _beside_curves(found: Climb, seconds: float | None) -> Climb:
+def _beside_curves(found: Climb) -> Climb:
     """Return a climb with grades that hold beside a curve, fitted in the place of all that was found, or beside an
     effect that is a special case of it. Forms are compared by slopes, and these lead astray far from the records."""
     search, best, grades = found.search, found.path[-1], list(found.grades)
@@ -204,7 +203,9 @@ def _beside_curves(found: Climb, seconds: float | None) -> Climb:
         return found
     within = [e.name for gain in found.forms[:1] for e in best.fit.model.effects
               if e.name not in search.root.key and swallows(best.fit, gain.form, e)]
-    found, curve = _curve_alone(found, search.root.fit, search.held, seconds, bool(within))
+    forms = [gain.form for gain in found.forms]
+    curve = alone_leaving_noise(best, search.root.fit, search.held, forms) or (
+        beside_leaving_noise(best, forms[0], search.held) if within else None)
     if curve is None:
         return found
     for k, g in enumerate(grades):
@@ -222,23 +223,6 @@ def _without_stops_run_through(found: Climb) -> Climb:
     told = {e.name: run_through(fit, e) for e in fit.model.effects}
     return replace(found, grades=tuple(g if g.grade == "approximates" or not told[g.effect] else Grade(
         g.effect, "approximates", told[g.effect]) for g in found.grades))
-
-
-def _curve_alone(found: Climb, root: Fit, held: HeldOut, seconds: float | None,
-                 beside: bool = False) -> tuple[Climb, FormGain | None]:
-    """Return a climb, stopped where the time is up, and the form that in the place of all that was found, beside
-    `root`, leaves noise and predicts better, or does so `beside` all; None where there is none."""
-    if found.stopped:
-        return found, None
-    try:
-        with parallel.budget(seconds):
-            last, forms = found.path[-1], [gain.form for gain in found.forms]
-            alone = alone_leaving_noise(last, root, held, forms)
-            return found, alone or (beside_leaving_noise(last, forms[0], held) if beside else None)
-    except (OutOfTime, KeyboardInterrupt) as error:
-        parallel.interruption.heard()
-        stopped = OUT_OF_TIME if isinstance(error, OutOfTime) else INTERRUPTED
-        return replace(found, stopped=stopped, text=f"stopped early: {stopped}; what was named may be a curve"), None
 
 
 def _sure_alone(search: Search, best: Node, grades: tuple[Grade, ...]) -> tuple[Grade, ...]:
@@ -319,10 +303,7 @@ class Records:
 
 def explored(fit: Fit, validate: Sequence[Experiment] | Experiment | None, effects: Sequence[Effect],
              stages: Stages, max_effects: int, seconds: float | None = None) -> tuple[Climb, str]:
-    """Return the climb, and what to say of how the records were read.
-
-    A misfit that something missing dominates may hide a better reading of the voltage; then it is climbed again.
-    """
+    """Return the climb, as far as it came where the time is up or it is interrupted, and how the records were read."""
     began = time.monotonic()
 
     def left() -> float | None:
@@ -332,24 +313,64 @@ def explored(fit: Fit, validate: Sequence[Experiment] | Experiment | None, effec
         stages.climb()
         return climb(Search(records.fit, records.held_out, effects, stages), most, left(), early)
 
-    held_out = [validate] if isinstance(validate, Experiment) else validate
+    looks = _looks(fit, [validate] if isinstance(validate, Experiment) else validate, climbed, left)
+    found, records = next(looks)
+    try:
+        while not found.stopped and (further := next(looks, None)) is not None:
+            found, records = further
+    except (OutOfTime, KeyboardInterrupt) as error:
+        parallel.interruption.heard()
+        why = OUT_OF_TIME if isinstance(error, OutOfTime) else INTERRUPTED
+        found = replace(found, stopped=why, text=f"stopped early: {why}; not all was looked at")
+    return _without_stops_run_through(found), " ".join(records.remarks)
+
+
+def _looks(fit: Fit, held_out: Sequence[Experiment] | None, climbed: Callable[..., Climb],
+           left: Callable[[], float | None]) -> Iterator[tuple[Climb, Records]]:
+    """Yield the climb and its records after every look that may be the last; each has the time that is `left`.
+
+    A misfit that something missing dominates may hide a better reading of the voltage; then it is climbed again.
+    """
+    def look(at: Callable[..., Any], *given: Any) -> Any:
+        with parallel.budget(left()):
+            return at(*given)
+
+    seconds = left()
     as_it_was, records, found = _read_and_climbed(versions.affordable(fit), held_out, climbed)
-    time_for_all = seconds is None or time.monotonic() - began < seconds / 3
-    if not found.stopped and time_for_all and _remembers(found, fit, held_out):
+    yield found, records
+    time_for_all = seconds is None or (left() or 0.0) > 2 * seconds / 3
+    if time_for_all and look(_remembers, found, fit, held_out):
         *whole, anew = _read_and_climbed(fit, held_out, climbed)
         found = replace(found, stopped=anew.stopped) if anew.stopped else anew
         as_it_was, records = whole if found is anew else (as_it_was, records)
-    if not found.stopped and (windowed := _in_windows(found)) is not None:
+        yield found, records
+    if (windowed := look(_in_windows, found)) is not None:
         anew = climbed(parts := replace(records, fit=windowed))
         found, records = (replace(found, stopped=anew.stopped), records) if _explains(found, anew) else (anew, parts)
+        yield found, records
+    found, records = _read_late(found, records, as_it_was, climbed, look)
+    yield found, records
+    if records.remarks != as_it_was.remarks:  # what is missing may look like another reading
+        here = HeldOut.of(as_it_was.fit, as_it_was.held_out)
+        if look(alone_leaving_noise, found.path[-1], as_it_was.fit, here, [gain.form for gain in found.forms]):
+            yield (found := climbed(as_it_was, 0)), (records := as_it_was)
+    yield (found := look(_seen_on_whole, found, fit)), records
+    found, records = _with_held_out(found, records, climbed)
+    yield found, records
+    yield look(_beside_curves, found), records
+
+
+def _read_late(found: Climb, records: Records, as_it_was: Records, climbed: Callable[..., Climb],
+               look: Callable[..., Any]) -> tuple[Climb, Records]:
+    """Return the climb of records as the model with its effects asks for them, where that differs and predicts more."""
     last, again, reading = found.path[-1], None, None
-    reread = not (found.stopped or last.fit.window) and records.remarks != as_it_was.remarks
-    own, suits = as_it_was.suited(last) if reread else (None, False)
+    reread = not last.fit.window and records.remarks != as_it_was.remarks
+    own, suits = look(as_it_was.suited, last) if reread else (None, False)
     if own and records.reading:  # of the model with its effects
         records = replace(records, remarks=(*records.remarks[:-1], records.reading.remark(own, last.fit)))
     if suits:
         again = as_it_was
-    elif not found.stopped and (reading := _late_reading(found.path)):
+    elif reading := look(_late_reading, found.path):
         late = records.read(reading)
         again = late if len(found.path) == 1 or late.suited(last)[1] else None
     if again is not None:
@@ -360,12 +381,7 @@ def explored(fit: Fit, validate: Sequence[Experiment] | Experiment | None, effec
                 again = replace(again, remarks=(*records.remarks, reading.remark(last.fit, new.fit)))
             records, found = again, anew
         found = replace(found, stopped=anew.stopped)
-    if records.remarks != as_it_was.remarks:  # what is missing may look like another reading
-        found, curve = _curve_alone(found, as_it_was.fit, HeldOut.of(as_it_was.fit, as_it_was.held_out), left())
-        if curve is not None:
-            records, found = as_it_was, climbed(as_it_was, 0)
-    found, records = _with_held_out(_seen_on_whole(found, fit, left()), records, climbed)
-    return _without_stops_run_through(_beside_curves(found, left())), " ".join(records.remarks)
+    return found, records
 
 
 def _read_and_climbed(fit: Fit, held_out: Sequence[Experiment] | None,
@@ -403,11 +419,11 @@ def _remembers(found: Climb, whole: Fit, held_out: Sequence[Experiment] | None) 
     return False
 
 
-def _seen_on_whole(found: Climb, whole: Fit, seconds: float | None) -> Climb:
+def _seen_on_whole(found: Climb, whole: Fit) -> Climb:
     """Return a climb that knows what of the time, or of what was before, predicts on whole records what is larger than
     the noise and nothing predicts in parts of them: a sensor's zero that drifts."""
     runs = versions.whole_of(last := found.path[-1].fit, whole.problem.experiments)
-    if found.stopped or seconds == 0 or not (runs and found.remaining.adequate and far(last)):
+    if not (runs and found.remaining.adequate and far(last)):
         return found
     there = versions.fitted_to(last, runs, QUICK)
     forms = better_forms(there, there, past=True)
@@ -419,7 +435,7 @@ def _with_held_out(found: Climb, records: Records, climbed: Callable[[Records], 
     """Return a climb with the held-out runs among the fitted ones, where the first model leaves noise alone on its own
     and fails on those: what is missing shows there, or they determine what the others do not."""
     last, fit = found.path[-1], found.path[-1].fit
-    noise = len(found.path) == 1 and found.remaining.adequate and not (found.stopped or far(fit) or fit.window)
+    noise = len(found.path) == 1 and found.remaining.adequate and not (far(fit) or fit.window)
     if not noise or at_noise(last) or max(e.misfit for e in last.predictions.held_out.values()) <= ELSEWHERE:
         return found, records
     both = versions.fitted_to(fit, (*fit.problem.experiments, *(records.held_out or ())))

@@ -126,6 +126,34 @@ def test_what_was_found_is_kept_where_the_look_at_what_remains_is_interrupted(pl
     assert (found.effects, found.stopped) == (("coulomb",), refit.INTERRUPTED)
 
 
+@pytest.mark.parametrize("error", [KeyboardInterrupt, OutOfTime])
+@pytest.mark.parametrize("look", ["_remembers", "_in_windows", "_late_reading", "_seen_on_whole", "_beside_curves"])
+def test_what_was_found_is_kept_where_a_look_after_the_search_is_interrupted(plain, monkeypatch, look, error):
+    asked = []
+
+    def pressed(*given):
+        asked.append(given)
+        raise error
+
+    monkeypatch.setattr(stepwise, look, pressed)
+    found = mi.diagnose(plain, effects=["coulomb"])
+    assert len(asked) == 1  # and nothing new begins
+    assert (found.verdict, found.effects) == ("missing", ("coulomb",))
+    assert found.stopped == (refit.INTERRUPTED if error is KeyboardInterrupt else refit.OUT_OF_TIME)
+    assert "Stopped early" in found.text
+
+
+def test_a_look_after_the_search_has_the_time_that_is_left(plain, monkeypatch):
+    def slow(found):
+        time.sleep(2.0)
+        check_time()
+
+    monkeypatch.setattr(stepwise, "_in_windows", slow)
+    found = mi.diagnose(plain, effects=["coulomb"], budget=2.0)
+    assert (found.effects, found.stopped) == (("coulomb",), refit.OUT_OF_TIME)
+    assert mi.diagnose(plain, effects=["coulomb"], budget=60.0).stopped == ""
+
+
 def test_a_second_climb_that_is_cut_short_does_not_lose_the_first(plain, monkeypatch):
     """A pendulum is climbed again in windows; whoever stops that at its start still gets what was found."""
     climbs, climb = [], stepwise.climb
@@ -190,11 +218,11 @@ def test_curves_are_asked_where_held_out_runs_hold_more_than_noise(monkeypatch, 
     """A battery that polarises was fitted to its noise by three effects, and missed by three times that elsewhere."""
     asked = []
     monkeypatch.setattr(stepwise, "at_noise", lambda best: noise)
-    monkeypatch.setattr(stepwise, "_curve_alone", lambda found, *_: asked.append(found) or (found, None))
+    monkeypatch.setattr(stepwise, "alone_leaving_noise", lambda *_: asked.append(best))
     search, best = SimpleNamespace(root=SimpleNamespace(fit=None), held=None), SimpleNamespace(fit=None)
     found = stepwise.Climb(search, (best,), (), (), "", None, SimpleNamespace(adequate=True),
                            grades=(Grade("winding_heating", "named"),))
-    assert stepwise._beside_curves(found, None) is found
+    assert stepwise._beside_curves(found) is found
     assert bool(asked) is not noise
 
 

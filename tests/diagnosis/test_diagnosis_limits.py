@@ -339,9 +339,6 @@ def test_a_zero_that_drifts_over_a_record_is_seen_on_whole_ones(monkeypatch):
     assert "parts of" in found.text
     assert found.verdict == "unexplained"
     assert found.remainder.follows == "an error of the speed sensor that changes with the time"
-    climb = SimpleNamespace(path=(SimpleNamespace(fit=found.best),), stopped="")
-    climb.remaining = SimpleNamespace(adequate=True)
-    assert stepwise._seen_on_whole(climb, whole, 0.0) is climb  # the time is up
     assert mi.evaluate(mi.fit(found.remainder.model + found.remainder.as_effect(), runs[:2]), runs[2]).rmse[
         "omega"] < 1.1 * noise["omega"]
 
