@@ -12,7 +12,7 @@ from functools import lru_cache, reduce
 import numpy as np
 
 from motorid.diagnosis.predictive_score import Evidence, HeldOut, Predictions, compare, finer
-from motorid.diagnosis.thresholds import FINER, LARGER, MOST, SEARCHED, TRIFLE
+from motorid.diagnosis.thresholds import FINER, LARGER, MOST, PLAIN, SEARCHED, TRIFLE
 from motorid.estimation.fit import follows
 from motorid.estimation.result import Fit
 from motorid.model.model import Model
@@ -119,12 +119,12 @@ def choose(children: Sequence[Node], parent: Node) -> tuple[Node, list[Node]] | 
         return None
     ordered = sorted(children, key=lambda n: -evidence(parent, n).gain)
     chosen = reduce(lambda best, n: n if beats(n, best) else best, ordered)
-    while True:  # ties are not transitive: what is tied with the smaller model may be smaller still
+    for _ in ordered:  # ties are not transitive: what is tied with the smaller model may be smaller still
         near = [n for n in ordered if n is chosen or not beats(chosen, n) or _as_likely(n, chosen)]
-        smaller = min(near, key=lambda n: (*_price(n), -evidence(parent, n).gain))
-        if smaller is chosen or _price(smaller) >= _price(chosen):
-            break
-        chosen = smaller
+        near = [n for n in near if _price(n)[:2] == min(_price(m)[:2] for m in near)]
+        least = min(1 - evidence(parent, n).fall for n in near)  # no equal leaves plainly more, however unsure that is
+        near = [n for n in near if (1 - PLAIN) * (1 - evidence(parent, n).fall) <= least]
+        chosen = min(near, key=lambda n: (rarity(n.added), -evidence(parent, n).gain))
     laws = _laws_as_good(chosen, children, parent)
     best = choose(laws, parent) if laws else None
     return best[0] if best else chosen, ordered

@@ -281,6 +281,20 @@ def test_one_law_for_all_runs_comes_before_sizes_of_every_runs_own(monkeypatch, 
     assert (best.added, ordered[0].added) == (chosen, "own")
 
 
+@pytest.mark.parametrize(("rare", "chosen"), [(0.48, "pwm_coast"), (0.35, "quadratic_drag")])
+def test_what_is_met_more_often_is_no_equal_of_what_leaves_plainly_less(monkeypatch, rare, chosen):
+    """A student's motor shield drove a motor that slowed by itself: a fan's drag took the place of its bridge, since a
+    slow drift, of few effective samples, left neither surely better."""
+    root = SimpleNamespace(fit=SimpleNamespace(per_run={}))
+    falls = {"quadratic_drag": 0.30, "pwm_coast": rare}
+    nodes = [SimpleNamespace(fit=SimpleNamespace(per_run={}), added=n, size=7, objection="", parent=root,
+                             key=frozenset({n})) for n in falls]
+    monkeypatch.setattr(model_comparison, "evidence", lambda old, new: SimpleNamespace(
+        fall=falls[new.added] if old is root else 0.0, gain=7.0, plain=False))
+    monkeypatch.setattr(model_comparison, "beats", lambda new, old: False)
+    assert model_comparison.choose(nodes, root)[0].added == chosen
+
+
 def test_beside_what_physics_speaks_against_its_simpler_kin_is_tried(rubbing, monkeypatch):
     """Where a friction that grows with the speed is no Stribeck, dry friction was in no table."""
     plain, check = rubbing
