@@ -36,6 +36,7 @@ NUMBERS = {  # one plausible size of every effect
     "speed_gain": {"k_w": 0.05},
     "driver_coast": {"V_c": 12.0},
     "pwm_coast": {"s_c": 0.8, "V_s": 3.0},
+    "pwm_fast_decay": {"a_p": 1.5, "V_s": 3.0},
     "driver_current_limit": {"I_lim": 1.0},
     "driver_voltage_limit": {"V_lim": 1.5},
     "driver_lag": {"T_v": 0.02},

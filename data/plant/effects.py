@@ -22,7 +22,7 @@ An effect is a function of the motor and its own numbers that returns what it do
 from __future__ import annotations
 
 from collections.abc import Callable
-from math import cos, exp, pi, sin, sqrt, tanh
+from math import cos, exp, log, pi, sin, sqrt, tanh
 from typing import Any
 
 from .motors import Motor
@@ -105,6 +105,19 @@ def driver_coast(m: Motor, V_c: float) -> Hooks:
 @_known
 def pwm_coast(m: Motor, s_c: float, V_s: float) -> Hooks:
     return {"drive": lambda v, w: v + s_c * max(1 - abs(v) / V_s, 0.0) * m.K * w}
+
+
+@_known
+def pwm_fast_decay(m: Motor, a_p: float, V_s: float) -> Hooks:
+    def mean(v: float, w: float) -> float:
+        e = m.K * w if v >= 0 else -m.K * w
+        on = min(abs(v) / V_s, 1.0)
+        peak = (V_s - e) * (1 - exp(-a_p * on))  # times R: of the current that begins at nothing
+        back = min(log((V_s + e + peak) / (V_s + e)) / a_p, 1 - on)
+        u = on * V_s - back * V_s + (1 - on - back) * e
+        return u if v >= 0 else -u
+
+    return {"drive": mean}
 
 
 @_known

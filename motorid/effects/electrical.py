@@ -6,6 +6,8 @@ from motorid.errors import ModelError
 from motorid.model.definition import P, effect
 from motorid.model.equations import Equations
 
+SUPPLY = P(12.0, "V", positive=True, vary=False, grid=(1.0,), doc="supply, the voltage of full duty, fixed")
+
 
 @effect(balance="voltage")
 def brush_drop(m: Equations, V_b=P(0.5, "V", null=0.0, lower=0.0, doc="voltage lost at the brushes"),
@@ -90,15 +92,32 @@ def driver_coast(m: Equations, R_c=P(50.0, "Ω", null=0.0, positive=True, grid=(
 
 
 @effect(balance="voltage")
-def pwm_coast(m: Equations, s_c=P(0.5, "", null=0.0, lower=0.0, upper=1.1, doc="share of the pauses without current"),
-              V_s=P(12.0, "V", positive=True, vary=False, grid=(1.0,), doc="supply, the voltage of full duty, fixed")):
+def pwm_coast(m: Equations, s_c=P(0.5, "", null=0.0, lower=0.0, upper=1.5, doc="share of the pauses without current"),
+              V_s=SUPPLY):
     """PWM whose bridge opens in its pauses: no back-EMF acts there, K·ω·(1−s·(1−d)), d = abs(v)/V_s. Mohan, 2012.
 
     Drivers switched by their enable pin, "fast decay": s is near 1 where a pause is long against L/R. Unless V_s is
-    given it is the largest voltage of the records. Seen as a motor that hardly brakes, and runs too fast at small duty:
-    several duties, with steps down.
+    given it is the largest voltage of the records; s above 1 says that it is more. Seen as a motor that hardly brakes,
+    and runs too fast at small duty: several duties, with steps down.
     """
     m.voltage += s_c * ca.fmax(1 - ca.fabs(m.v) / V_s, 0) * m.K_e * m.omega
+
+
+@effect(balance="voltage")
+def pwm_fast_decay(m: Equations, a_p=P(1.0, "", positive=True, grid=(0.3, 1.0, 3.0), doc="period of the PWM over L/R"),
+                   s_f=P(1.0, "", null=0.0, vary=False, doc="share of the pauses that do so, fixed"),
+                   V_s=P(12.0, "V", positive=True, grid=(1.3, 1.0), doc="supply, the voltage of full duty")):
+    """PWM whose pauses lead the current back into the supply, then open. Mohan et al., Power Electronics, 2003.
+
+    The bridge gives (d−φ)·V_s + (1−d−φ)·e in the mean, with e the back-EMF along the command and φ, at most 1−d, the
+    share of a period in which the current ends, ln(1 + (V_s−e)/(V_s+e)·(1−exp(−a·d)))/a. Drivers switched by their
+    enable pin; a far above 1 is `pwm_coast` with s = 1. Seen as small duties that hardly drive: steps to all duties.
+    """
+    d, sign = ca.fmin(ca.fabs(m.v) / V_s, 1), ca.if_else(m.v < 0, -1, 1)
+    e = sign * m.K_e * m.omega
+    falls = ca.fmax(V_s - e, 0) / ca.fmax(V_s + e, 0.05 * V_s) * (1 - ca.exp(-a_p * d))
+    ends = ca.fmin(ca.log1p(falls) / a_p, 1 - d)
+    m.voltage += s_f * sign * ((1 - d - ends) * e - ends * V_s)
 
 
 LIMITER_GAIN, LIMITER_WIDTH = 5.0, 0.004  # in R: how firmly the current is led to its limit; of R·I_lim: how softly
@@ -140,8 +159,7 @@ NO_RAMP = 6e-8  # s: a ramp quicker than that is a lag of it, which a step of an
 
 @effect(balance="voltage", includes=("driver_lag",))
 def driver_slew(m: Equations, T_r=P(0.1, "s", null=0.0, positive=True, grid=(4.0, 16.0, 64.0, 256.0),
-                                    doc="time of a change by V_s"),
-                V_s=P(12.0, "V", positive=True, vary=False, grid=(1.0,), doc="supply, the voltage of full duty, fixed"),
+                                    doc="time of a change by V_s"), V_s=SUPPLY,
                 V_w=P(0.1, "V", positive=True, grid=(0.01, 0.1), doc="how far behind it is at 3/4 of its fastest")):
     """Slew-rate limit of the driver (ramp, soft start), V_s/T_r·tanh(Δv/V_w). Franco, Operational Amplifiers, 2015.
 
@@ -155,8 +173,7 @@ def driver_slew(m: Equations, T_r=P(0.1, "s", null=0.0, positive=True, grid=(4.0
 
 
 @effect(balance="voltage")
-def supply_sag(m: Equations, R_s=P(0.1, "Ω", null=0.0, lower=0.0, doc="resistance of supply and leads"),
-               V_s=P(12.0, "V", positive=True, vary=False, grid=(1.0,), doc="supply without load, fixed")):
+def supply_sag(m: Equations, R_s=P(0.1, "Ω", null=0.0, lower=0.0, doc="resistance of supply and leads"), V_s=SUPPLY):
     """Sag of the supply, d·(V_s − R_s·d·i), d = v/V_s. Mohan, Electric Machines and Drives, 2012.
 
     Only R_s/V_s² acts. Unless V_s is given it is the largest voltage of the records: the duty is one there.

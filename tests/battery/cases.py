@@ -154,6 +154,7 @@ SINGLES = [
     single("driver_lag", "servo", {"T_v": 8e-3}, train=("stairs", "prbs 0.8")),
     single("driver_slew", "lab", {"T_r": 0.05, "V_s": 12.0}, train=("stairs", "prbs 0.8")),
     single("pwm_coast", "servo", {"s_c": 0.8, "V_s": 7.6}, train=("stairs", "steps 0.7")),
+    single("pwm_fast_decay", "lab", {"a_p": 1.5, "V_s": 6.0}, train=("stairs", "steps 0.7")),
     single("supply_sag", "wheel", {"R_s": 0.15, "V_s": 13.0}, train=("stairs", "ramps")),
     single(
         "magnet_heating",

@@ -23,6 +23,7 @@ COASTING = {
 SIZES: dict[str, Callable[[P.Motor, float], dict[str, float]]] = {
     "driver_coast": lambda m, u: {"V_c": m.v_max + 1.4},
     "pwm_coast": lambda m, u: {"s_c": 0.7, "V_s": 1.05 * u},
+    "pwm_fast_decay": lambda m, u: {"a_p": 1.5, "V_s": 1.05 * u},
     "driver_current_limit": lambda m, u: {"I_lim": 0.2 * m.i_max},
     "driver_voltage_limit": lambda m, u: {"V_lim": 0.6 * u},
     "driver_lag": lambda m, u: {"T_v": max(0.2 * time_constant(m), 2 * DT[m.name])},

@@ -14,8 +14,8 @@ from motorid.diagnosis.candidates import Search, Stages, library
 
 def test_the_wide_battery_has_every_effect_of_benches_in_three_motors_under_three_drives():
     singles = [c for c in WIDE.values() if c.kind == "single"]
-    assert len(SIZES) == 21
-    assert len(singles) == 189
+    assert len(SIZES) == 22
+    assert len(singles) == 198
     assert {tuple(c.effects) for c in singles} == {(e,) for e in SIZES}
     assert sum(c.kind == "none" for c in WIDE.values()) == 54
 

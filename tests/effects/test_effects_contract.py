@@ -200,6 +200,8 @@ def test_says_what_it_is_with_units_limits_and_source(effect):
             "e_r",
             "k_w",
             "s_c",
+            "a_p",
+            "s_f",
             "s_b",
             "a_f",
             "N_f",
@@ -244,7 +246,8 @@ def test_survives_a_trip_to_another_process(effect):
     assert there.values == model.values
 
 
-@pytest.mark.parametrize("name", ["driver_current_limit", "driver_lag", "driver_slew", "supply_sag", "pwm_coast"])
+@pytest.mark.parametrize("name", ["driver_current_limit", "driver_lag", "driver_slew", "supply_sag", "pwm_coast",
+                                  "pwm_fast_decay"])
 def test_a_limited_voltage_is_what_others_of_the_driver_see(name):
     """As if the command had been clipped before."""
     t = np.arange(600) * 1e-3
@@ -258,3 +261,25 @@ def test_a_limited_voltage_is_what_others_of_the_driver_see(name):
         seen.append(mi.simulate(model, run, initial="rest")[0].outputs)
     for c, y in seen[0].items():
         assert y == pytest.approx(seen[1][c], abs=1e-6 * np.abs(y).max())
+
+
+@pytest.mark.parametrize("period", [0.4, 1.5, 6.0])
+def test_a_bridge_that_returns_its_current_drives_the_mean_current_of_its_switching(period):
+    """Steps through periods of a current that rises, falls against the supply and ends; the last one counts."""
+    supply, R, L, K, n = 12.0, 2.0, 1e-3, 0.05, 2000
+    duty, emf = (a.ravel() for a in np.meshgrid([0.0, 0.2, 0.5, 0.8, 1.0], supply * np.array([-0.3, 0.0, 0.6])))
+    i = np.zeros_like(emf)
+    for _ in range(30):
+        total = np.zeros_like(i)
+        for k in range(n):
+            on = k < duty * n
+            i = i + (np.where(on, supply, -supply) - emf - R * i) * period / (R * n)
+            i = np.where(on, i, np.maximum(i, 0.0))
+            total += i / n
+    model = mi.dc_motor(R=R, L=L, K=K) + mi.effects.pwm_fast_decay(a_p=period, V_s=supply)
+    system = model.system(("i", "omega"))
+    p = np.array([model.values[name] for name in system.parameters])
+    for sign in (1, -1):
+        for d, e, mean in zip(duty, emf, total, strict=True):
+            rates = np.array(system.rhs(np.array([0.0, sign * e / K]), sign * d * supply, p)).ravel()
+            assert sign * rates[0] * L / R == pytest.approx(mean, abs=3e-3 * supply / R)

@@ -40,6 +40,7 @@ TRUTH = {
     "speed_gain": {"k_w": 0.04},
     "driver_coast": {"R_c": 9.0},
     "pwm_coast": {"s_c": 0.6, "V_s": 8.0},
+    "pwm_fast_decay": {"a_p": 1.5, "V_s": 8.0},
     "slip_clutch": {"r_slip": 0.5, "tau_slip": 0.03, "omega_slip": 2.0, "b_slip": 2e-5},
     "freewheel": {"r_free": 0.5, "g_free": 500.0, "b_free": 2e-5, "side": 1.0},
     "driver_current_limit": {"I_lim": 2.5},
@@ -120,7 +121,7 @@ def test_is_found_again_from_its_own_data(name, rng):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [0, 8])
+@pytest.mark.parametrize("seed", [1, 8])
 def test_a_gap_of_radians_is_found(seed):
     """At the shaft of a geared motor the play of its gear is as many times as large.
 
