@@ -19,16 +19,20 @@ from motorid.diagnosis import refit as trial
 from motorid.diagnosis import score_test as ranking
 from motorid.diagnosis import stepwise
 from motorid.diagnosis.admissibility import objections
+from motorid.diagnosis.model_comparison import node_of
 from motorid.diagnosis.results import Candidate
 from motorid.diagnosis.verdict import measured_angle_remark
 from motorid.effects import LIBRARY
 from motorid.errors import OutOfTime
 from motorid.estimation.continuation import by_continuation
+from motorid.estimation.fit import solve
 from motorid.estimation.least_squares import Estimate
 from motorid.estimation.restarts import MATTERS, collapsed_again, restored
+from motorid.numerics.least_squares import LevenbergMarquardt
 from motorid.numerics.parallel import budget, one_thread
 from motorid.problem.problem import Problem
 from motorid.problem.simulate import simulate
+from motorid.records.datasets import data_path
 from motorid.records.experiment import windows
 
 TRUE = {"R": 1.2, "L": 2e-3, "K": 0.05, "b": 2e-5, "J": 3e-5}
@@ -642,3 +646,17 @@ def test_a_refit_above_the_model_that_it_contains_begins_anew_at_a_guess_of_its_
     done = trial.refit(plain, plain.model + mi.effects.pwm_coast, [begun])
     assert done.values["s_c"] == pytest.approx(0.8, abs=0.02)
     assert max(done.misfit.values()) < 1.1
+
+
+def test_what_stopped_far_from_the_noise_goes_on_as_a_whole_fit(monkeypatch):
+    """Rebounds in a gear's play stopped the few steps of a refit at eight times the noise."""
+    runs = mi.read_runs(data_path("hidden_friction") / "run*.csv")
+    tried = search.Search(mi.fit(mi.dc_motor(), runs), None, search.library(("coulomb",)), search.Stages())
+    problem = tried.root.fit.problem.with_(model=tried.root.fit.model + mi.effects.coulomb, noise_factors={})
+    begun = solve(problem.start_at({"tau_c": 1e-4, "R": 5.0, "J": 1e-3}), LevenbergMarquardt(max_iterations=1, looks=0),
+                  start="model")
+    node = node_of(begun, tried.held, "coulomb", tried.root)
+    assert begun.status != "converged"
+    monkeypatch.setattr(search, "led_on", lambda fit: None)
+    found = tried.brought_to_its_end(node).fit
+    assert max(found.misfit.values()) < 1.5 < max(begun.misfit.values()) / 2, found.misfit
