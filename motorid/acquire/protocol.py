@@ -59,8 +59,7 @@ def crc16(body: bytes) -> int:
 
 
 def frame(*fields: object) -> bytes:
-    """Return one line of the protocol, CRC and newline included; ValueError where it is too long, or a field holds one
-    of ``$ *`` or a control character."""
+    """Return one line, with CRC and newline; ValueError where too long, or with ``$ *`` or control characters."""
     body = ",".join(map(str, fields)).encode("ascii")
     if not 1 <= len(body) <= LONGEST or any(c < 32 or c in b"$*\x7f" for c in body):
         raise ValueError(f"not a frame of the protocol: {body!r}")

@@ -41,8 +41,7 @@ COMPLETE = ("done", "duration", "interrupted")
 
 @dataclass(eq=False)
 class Session:
-    """Starts the device, records until something ends it, stops it, and says what came of it. Its fields are settled
-    before the motor moves."""
+    """Starts the device, records until something ends it, stops it, says what came of it. Fields are settled before."""
 
     client: Client
     header: Header  # channels calibrated

@@ -212,8 +212,7 @@ CLEAR = 1e-3  # p-value of errors larger than the noise that needs no second tes
 
 
 def judge_adequacy(node: Node, scores: Sequence[Score] = ()) -> Adequacy:
-    """Judge whether the residuals of a model are noise; errors larger than it are, if no free form predicts them,
-    unless what they depend on is beyond doubt."""
+    """Judge whether residuals are noise; larger ones are if no form predicts them, unless they surely follow one."""
     judged = adequacy(node.fit, scores)
     if not far(node.fit) or not (doubtful := adequacy(node.fit, scores, level=CLEAR)).adequate:
         return judged

@@ -58,8 +58,7 @@ def _alike(fit: Fit, added: Effect) -> str:
 
 
 def run_through(fit: Fit, added: Effect) -> str:
-    """Say so where the motor runs on through a stop: what stops it makes it stand, or turn back. What a record's end
-    cuts off may be an impact, unless it goes far."""
+    """Say so where the motor runs on through a stop; what the end of a record cuts off may be an impact."""
     for p in (p for p in added.parameters if p.name in ("theta_lo", "theta_hi")):
         sign = 1 if p.name == "theta_hi" else -1
         for s in (s for s in fit.simulations if "theta" in s.states):

@@ -38,7 +38,7 @@ from motorid.records.experiment import Experiment
 SHORTLIST = 6
 PAIRS = 3  # refitted where no single effect helps, and beside one that is refused
 NEAR = 0.4  # of the best score: what a common effect must reach to be refitted too
-ALWAYS = ("compliance", "speed_lag", "speed_delay", "driver_coast")  # their score at null says little
+ALWAYS = ("compliance", "speed_lag", "speed_delay", "driver_coast", "pwm_fast_decay")  # their score at null says little
 FLAT_TOP = 0.04  # of the samples: a current that is as large so often may have a limit
 
 
@@ -89,8 +89,7 @@ class Stages:
 
 
 def _in_doubt(node: Node, children: Sequence[Node]) -> bool:
-    """Tell whether a race, on the fitted runs alone, may have misled: physics speaks against all that was finished, or
-    the held-out runs prefer another to the one that leads."""
+    """Tell whether a race on the fitted runs misled: physics or held-out runs speak against what leads."""
     sound = [c for c in children if not c.objection]
     led = max(sound, key=lambda c: evidence(node, c).gain, default=None)
     return led is None or any(evidence(c, led).worse_there for c in sound if c is not led)
@@ -138,8 +137,7 @@ class Search:
                 if s.same_as and added >= set(s.same_as)}
 
     def unseen(self, node: Node) -> dict[str, tuple[str, ...]]:
-        """Return the effects that other values of the motor's own parameters imitate in these records, beside the
-        scales of sensors, which do so in any record."""
+        """Return the effects that other values of the motor's own parameters imitate here, scales of sensors aside."""
         return {s.effect.name: s.same_as for s in self._scores.get(node.key, ())
                 if s.same_as and s.effect.balance != "sensor"}
 
@@ -346,8 +344,7 @@ class Search:
         return next((self.smaller(node, model) for model in _without(node.fit.model, name)), None)
 
     def in_place(self, node: Node, old: str, new: str, known: bool = False) -> Node | None:
-        """Return the judged model with an effect where another was; None where that is no model, or if only what is
-        `known` is asked for and it was not met."""
+        """Return the judged model with an effect where another was, only if met where `known`; None for none."""
         effects = {e.name: e for e in (*self.effects, *node.fit.model.effects)}
         model = _in_place(node.fit.model, effects[old], effects[new])
         if model is None or known:
@@ -396,8 +393,7 @@ def _without(model: Model, name: str) -> list[Model]:
 
 
 def _in_place(model: Model, old: Effect, new: Effect) -> Model | None:
-    """Return the model with `new` where `old` was, so that the order in which effects were found stays. None where
-    another effect of the model contains `new`, too."""
+    """Return the model with `new` where `old` was, in the same order; None where another effect contains `new`."""
     effects = tuple(new if e is old else e for e in model.effects)
     return otherwise(None, ModelError, lambda: (model.without(old.name) + new).with_(effects=effects))
 

@@ -139,8 +139,7 @@ class Rival:
         return dict(zip(names, (np.sqrt(variances) * slope).tolist(), strict=True))
 
     def draws(self, n: int, rng: np.random.Generator) -> Array:
-        """Return `n` displacements (n, k) of the parameters as uncertain as the records leave them, none the first;
-        every other one is from the fitted values."""
+        """Return `n` displacements (n, k) of parameters as uncertain as the records leave them, none the first."""
         draws = rng.multivariate_normal(np.zeros(len(self.scale)), np.linalg.inv(self.known), n, method="eigh")
         draws[:2] = 0.0
         draws[1::2] += self.fitted
@@ -268,8 +267,7 @@ class Layout:
 
 
 def voltage_as_parameters(system: System) -> System:
-    """Return the system with voltages as parameters: to its input come v_from … v_to, as a second input goes from 0 to
-    1, and v_on times a third."""
+    """Return the system with voltages as parameters: v_from … v_to as a second input goes 0 … 1, v_on times a third."""
     nx, _, k, _ = system.sizes
     x, u, p, s, d = (ca.SX.sym(n, m) for n, m in (("x", nx), ("u", 3), ("p", k + 3), ("s", 3), ("d", 2)))
     v, own = u[0] + p[k] + (p[k + 1] - p[k]) * u[1] + p[k + 2] * u[2], p[:k]

@@ -85,8 +85,7 @@ def diagnose(fit: Fit, validate: Sequence[Experiment] | Experiment | None = None
 
 
 def _contradicting(last: Fit, adequate: bool, runs: Sequence[Experiment]) -> str:
-    """Say how channels of the runs contradict one another. Where a model leaves noise they do not, whatever it seems: a
-    hoist's current has one sign, too."""
+    """Say how channels contradict one another; where a model leaves noise (a hoist's current has one sign) nothing."""
     if adequate or not far(last):
         return ""
     bare = "supply_side_current" in last.model.effect_names  # that of a supply is never negative

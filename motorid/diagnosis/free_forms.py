@@ -465,8 +465,7 @@ def _at(problem: Problem, fit: Fit) -> tuple[Array, Array]:
 
 
 def signals_along(fit: Fit) -> list[dict[str, Array]]:
-    """Return what a form may be a function of, along each run, (N,) each; the direction as smooth as the model's own
-    sgn, whose width is ``"width"``."""
+    """Return what a form may be a function of, along each run, (N,) each; ``"width"`` is that of the model's sgn."""
     return [_signals(fit, k) for k in range(len(fit.simulations))]
 
 
@@ -539,8 +538,7 @@ def form_coefficients(fit: Fit, linear: Linear, form: Form, kept: Sequence[int] 
 
 
 def may_be_zeroed(fit: Fit) -> bool:
-    """Tell whether records could show a zero of the angle of each: one goes round, all others go a radian, which tells
-    the phase of a wave, and nothing is over the angle yet."""
+    """Tell whether records show a zero of each: one goes round, others a radian; nothing is over the angle yet."""
     signals, few = signals_along(fit), len(set(fit.problem.unknowns.firsts)) < 2
     if few or any("turn" not in s for s in signals) or any(map(uses_angle, fit.model.effects)):
         return False
@@ -560,8 +558,7 @@ def zeroed(fit: Fit, linear: Linear, form: Form) -> Linear:
 
 
 def zeros_of(fit: Fit, form: Form) -> dict[str, float]:
-    """Return the zero of the angle in every record but the first, by name: where its own curve is most like that of the
-    one that goes furthest."""
+    """Return the zero of the angle in every record but the first, by name: where its curve is most like the longest."""
     signals, runs = signals_along(fit), sorted(set(fit.problem.unknowns.firsts))
     span, most = span_of(fit, signals), int(np.argmax(_travels(fit, signals)))
     own = form_coefficients(fit, zeroed(fit, linearised(fit), form), form)

@@ -263,8 +263,7 @@ def tells_the_zero(effect: Effect) -> bool:
 
 
 def outdoes(fall: float, further: float) -> bool:
-    """Tell whether a form in an effect's place, by which the error falls `further`, explains more than a trifle of what
-    the effect does, RMS, by which it falls."""
+    """Tell whether the error falls `further` by a form in an effect's place, by more than a trifle of its fall, RMS."""
     left = (1 - max(fall, 0.0)) ** 2
     return further > SUPPLANTS and np.sqrt(left * (1 - (1 - further) ** 2) / max(1 - left, 1e-12)) > TRIFLE
 

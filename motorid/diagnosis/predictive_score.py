@@ -161,8 +161,7 @@ def _fall_error(old: Channels, new: Channels) -> float:
 
 
 def _log_rms(errors: Errors, left_out: int = -1) -> float:
-    """Return the logarithm of the RMS of errors, mean over runs; a tenth of the noise is as good as none. `left_out` is
-    a block that does not count."""
+    """Return the logarithm of the RMS of errors, mean over runs, a tenth of the noise at least; not of `left_out`."""
     each = [despiked(v)[b[np.isfinite(v)] != left_out] for v, b in zip(errors.values, errors.blocks, strict=True)]
     runs = [r for r in each if len(r)]
     logs = [0.5 * np.log(np.mean(r**2) + (0.1 * errors.noise) ** 2 + 1e-300) for r in runs]
@@ -364,8 +363,7 @@ class HeldOut:
         return HeldOut(problem, noise)
 
     def predictions(self, fit: Fit) -> Predictions:
-        """Return what `fit` predicts of data that it was not fitted to; SimulationError if it cannot be simulated on
-        the held-out runs."""
+        """Return what `fit` predicts of data it was not fitted to; SimulationError where held-out runs allow none."""
         held_out: Mapping[str, Errors] = {}
         if self.validation is not None:
             # As finely and sharply as it was fitted: a tiny noise asks for many sub-steps that change nothing here.

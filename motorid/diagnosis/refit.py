@@ -46,8 +46,7 @@ SHAKES = 20  # places at which it is drawn
 
 @dataclass(frozen=True, eq=False)
 class Raced:
-    """The best of several starts of one model after a few steps: the cost it has reached, and the one that an undamped
-    step from there promises."""
+    """The best of several starts of one model after a few steps: its cost, and what an undamped step promises."""
 
     problem: Problem
     cost: float
@@ -112,15 +111,13 @@ def finished(fit: Fit, best: Raced, effort: LevenbergMarquardt) -> Fit | None:
 
 
 def refit(fit: Fit, model: Model, starts: Sequence[Mapping[str, float]]) -> Fit | None:
-    """Return the best refit of `model` on the records of `fit` from several starts, at its optimum, or in windows near
-    enough to compare; None for none."""
+    """Return the best refit of `model` on the records of `fit` from several starts, at or near its optimum, or None."""
     best = raced(fit, model, starts)
     return None if best is None else finished(fit, best, POLISH if fit.window else OPTIMUM)
 
 
 def _released(measured: Problem) -> Estimate:
-    """Let the model's own angle take the place of the measured one, if it is good enough, or where that is copied.
-    Raises what a fit raises."""
+    """Let the model's own angle take the place of the measured one, if good enough, or copied; raises as a fit."""
     own = measured.for_model(replace(measured.model, angle_input=False, _systems={}))
     if not all("theta" in run.outputs for run in measured.experiments):
         return QUICKLY(own)
@@ -299,8 +296,7 @@ class Task:
 
 @dataclass(frozen=True)
 class GivenUp:
-    """A refit that was not finished: why, which share of the squared misfit it had taken away, if it was begun, and how
-    to finish it, if that may be asked for."""
+    """A refit that was not finished: why, its share of the squared misfit if begun, how to finish it if ever."""
 
     why: str
     drop: float | None = None

@@ -462,8 +462,7 @@ class Remainder:
 
     @property
     def _anew(self) -> Fit | None:
-        """The model that the search began with, where the last is far from noise: all that was found may only imitate
-        one thing that the library lacks."""
+        """The model that the search began with, where the last is far from noise: all found may imitate one thing."""
         if self._root is None or self._root is self.fit or not far(self.fit):
             return None
         added = {e.name: e for e in self.fit.model.effects if e.name not in self._root.model.effect_names}
@@ -500,8 +499,7 @@ def _zeroed(base: Fit, zeros: Mapping[str, float]) -> Fit | None:
 
 
 def _grown_in(there: Fit | None, base: Fit, asked: Sequence[Form], quiet: bool = False) -> Iterator[tuple[Curve, Form]]:
-    """Yield curves, best first, of forms that grew furthest in short windows or are `asked` for; only the first, and
-    those that leave noise there, as `quiet` ones."""
+    """Yield curves, best first, of forms that grew in short windows or are `asked`; `quiet`: what leaves noise."""
     if there is not None:
         here, found = HeldOut.of(there, None), dict[Any, Grown]()
         also = ((Curve(there), f) for f in asked[:AHEAD] if not f.remembers and f.on not in ("distance", "run"))
@@ -567,8 +565,7 @@ def _further(best: Grown, than: Form | None = None) -> Iterator[tuple[Curve, For
 
 
 def _revised(best: Grown, held: HeldOut, times: int = FURTHER) -> Grown:
-    """Return a curve without the parts that have become superfluous, or with them chosen anew beside the others. What
-    came first may have imitated all others together."""
+    """Return a curve without superfluous parts, or with them chosen anew: the first may have imitated all others."""
     for k, part in enumerate(best.curve.parts[:-1] if times else ()):
         with contextlib.suppress(*FAILURES, OutOfTime):
             check_time()

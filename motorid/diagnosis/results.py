@@ -309,8 +309,7 @@ def share_table(what: str, shares: Mapping[str, float]) -> Table:
 
 
 def ranking_table(candidates: Sequence[Candidate], most: int = 10) -> Table:
-    """Return the effects accepted, then the best others up to `most`, that which the refits liked best among them; the
-    held-out error only where there is one."""
+    """Return the effects accepted, then others up to `most`, the best refitted among them; held-out errors if any."""
     nearest = max((c for c in candidates if c.refit_drop is not None), key=lambda c: c.refit_drop or 0.0, default=None)
     shown = sorted((c for k, c in enumerate(candidates) if k < most or c.accepted or c is nearest),
                    key=lambda c: not c.accepted)

@@ -278,16 +278,14 @@ class Added:
 
     @staticmethod
     def of(tangent: Tangent, effect: Effect) -> Added:
-        """Return the fit's model with `effect`, the first one over the angle along the measured angle; ModelError if
-        the effect does not go with the model."""
+        """Return the fit's model with `effect`, a first one over the angle along that measured; ModelError if unfit."""
         fit, model = tangent.fit, tangent.fit.model + effect
         if uses_angle(effect) and not model.angle_input and not any(uses_angle(e) for e in fit.model.effects):
             model = replace(model, angle_input=True, _systems={})
         return Added(fit, model, [model.parameters[p.name] for p in effect.parameters], tangent.sizes)
 
     def shape(self, values: Mapping[str, float]) -> Shape | None:
-        """Return what the effect adds at `values`; None where that cannot be simulated, or is nothing, SimulationError
-        where it vanishes."""
+        """Return what the effect adds at `values`, None if nothing or failing; SimulationError where it vanishes."""
         sizes = tuple(p for p in self.pars if p.null is not None and not p.positive)
         finite = any(p.null is not None and p.positive for p in self.pars)
         weights = tuple(m.weights for m in self._problem.measured)

@@ -298,8 +298,7 @@ def _misfit(found: Estimate) -> float:
 
 
 def _said(found: Estimate, error: float) -> tuple[str, str]:
-    """Return the status, and the message with what to try. Friction makes the cost too rugged to go lower: a misfit
-    that is noise is converged all the same."""
+    """Return the status, and the message with what to try. Of a rugged cost (friction) noise is converged, too."""
     problem, status, message = found.problem, found.solution.status, found.solution.message
     if status == "stalled" and problem.weights == "noise" and \
             max(misfit_over_noise(problem, found.q).values(), default=np.inf) <= NOISE:

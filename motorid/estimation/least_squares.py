@@ -80,8 +80,7 @@ def least_squares(problem: Problem, effort: LevenbergMarquardt, callback: Callba
 
 
 def cost_at(problem: Problem, q: Array | None = None, *, refine: bool = True) -> float:
-    """Return the cost at `q`, by default the values of the model; infinite where it cannot be simulated. The sub-steps
-    are those that suit it (`refine`), or as they are."""
+    """Return the cost at `q`, by default at the model's values; infinite where it fails. `refine`: the sub-steps."""
     q = problem.start if q is None else q
     r = otherwise(np.array([np.inf]), SimulationError, lambda: (problem.refined(q) if refine else problem).residual(q))
     return 0.5 * float(r @ r) if np.isfinite(r).all() else np.inf

@@ -73,8 +73,7 @@ def _shifted(problem: Problem, shift: float, seed: int) -> Problem:
 
 
 def restore_collapsed(found: Estimate, effort: LevenbergMarquardt) -> Estimate:
-    """Return an estimate that collapsed parameters, put back, have led lower, or the same one. All are put back
-    together first, then one by one."""
+    """Return an estimate that collapsed parameters, put back together or one by one, have led lower, or the same."""
     sd, influence = _deviation(found.problem, found.solution.residual), np.linalg.norm(found.solution.jac, axis=0)
     values = found.values
     parameters = [p for p in found.problem.model.start_at(values).parameters.values() if p.vary]  # inside their limits

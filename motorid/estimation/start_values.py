@@ -142,8 +142,7 @@ def _contained(model: Model) -> dict[Effect, Effect]:
 
 
 def sizes_like(effect: Effect, level: float, above: float = ABOVE) -> dict[str, float]:
-    """Return the sizes of an effect in the place of a simpler one of size `level`. Sizes that are at least another
-    start at `above` times that."""
+    """Return the sizes of an effect in the place of one of size `level`; those at least another start `above` it."""
     return {p.name: level * (above if p.at_least else 1.0) for p in effect.parameters if p.null == 0}
 
 

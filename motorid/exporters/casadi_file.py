@@ -101,8 +101,7 @@ def plain_functions(system: System, prefix: str = "") -> list[ca.Function]:
 
 
 def casadi_file(found: Fit | Model, path: Path) -> dict[Path, str]:
-    """Return the contents of a ``.casadi`` file: for CasADi its functions and a text; for `read_casadi`, which runs
-    nothing, the same as JSON."""
+    """Return the contents of a ``.casadi`` file: functions and a text; for `read_casadi`, which runs none, as JSON."""
     functions, about = functions_of(found), description(found)
     file = ca.StringSerializer({})
     file.pack(functions)

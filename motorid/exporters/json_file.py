@@ -21,8 +21,7 @@ MOTOR = ("R", "L", "K", "b", "J")
 
 
 def fit_dict(fit: Fit, held_out: Evaluation | None = None) -> dict[str, Any]:
-    """Return the contents of ``fit --json``. Standard deviations are coloured: null where the data do not determine the
-    value, 0 where it was fixed."""
+    """Return the contents of ``fit --json``. Standard deviations: coloured, null if not determined, 0 if fixed."""
     model, problem, std = fit.problem.model, fit.problem, fit.std
     def known(*names: str) -> bool:
         return all(std.get(n) is not None for n in names if n in std)

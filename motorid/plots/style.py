@@ -171,8 +171,7 @@ def axis_label(channel: str, run: Experiment | None = None) -> str:
 
 
 def envelope(x: Array, y: Array) -> tuple[Array, Array]:
-    """Return fewer points whose line looks the same: the lowest and highest sample of each stretch. Peaks of a single
-    sample stay; a stretch with missing samples keeps a gap."""
+    """Return fewer points whose line looks the same, lowest and highest of each stretch: peaks and gaps stay."""
     x, y = np.asarray(x, float), np.asarray(y, float)
     if len(x) <= POINTS:
         return x, y

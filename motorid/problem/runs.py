@@ -100,8 +100,7 @@ def angle_signal(run: Experiment) -> Array:
 
 
 def noise_of(runs: Sequence[Experiment], channels: Sequence[str]) -> dict[str, float]:
-    """Noise per channel, estimated once for all runs where none states it: the quadratic mean over the samples of those
-    in which the channel moves; it tells nothing in others."""
+    """Noise per channel where none states it: the quadratic mean over the samples of all runs in which it moves."""
     levels = {}
     for c in channels:
         each = [r.sigma.get(c) or _level(r, c) for r in runs if c in r.outputs]

@@ -118,8 +118,7 @@ def _dates(cells: Sequence[object], column: str) -> Array:
 
 
 def _rows_in_order(t: Array, column: str, said: list[str]) -> tuple[NDArray[np.intp], Array, list[float]]:
-    """Return the rows with a time that moves on, without repeats, their times, and when it started again. What is long
-    enough goes on a step after what was before."""
+    """Return the rows whose time moves on, without repeats, their times, and when it began again; long parts go on."""
     rows = np.flatnonzero(np.isfinite(t))
     if len(rows) < len(t):
         said.append(f"left out {counted(len(t) - len(rows), 'row')} of {len(t)}: no time is given.")
