@@ -38,7 +38,7 @@ from motorid.records.experiment import Experiment
 SHORTLIST = 6
 PAIRS = 3  # refitted where no single effect helps, and beside one that is refused
 NEAR = 0.4  # of the best score: what a common effect must reach to be refitted too
-ALWAYS = ("compliance", "speed_lag", "speed_delay", "driver_coast", "pwm_fast_decay")  # their score at null says little
+ALWAYS = ("compliance", "speed_lag", "speed_delay", "driver_coast")  # their score at null says little
 FLAT_TOP = 0.04  # of the samples: a current that is as large so often may have a limit
 
 

@@ -143,7 +143,7 @@ def _contained(model: Model) -> dict[Effect, Effect]:
 
 def sizes_like(effect: Effect, level: float, above: float = ABOVE) -> dict[str, float]:
     """Return the sizes of an effect in the place of one of size `level`; those at least another start `above` it."""
-    return {p.name: level * (above if p.at_least else 1.0) for p in effect.parameters if p.null == 0}
+    return {p.name: level * (above if p.at_least else 1.0) for p in effect.parameters if p.null == 0 and p.vary}
 
 
 def _shared_out(problem: Problem, asked: Model) -> Problem:
