@@ -19,7 +19,7 @@ from motorid.estimation.linearisation import Response, Tangent, column_space, re
 from motorid.estimation.result import Fit
 from motorid.model.definition import Effect, Parameter
 from motorid.model.model import Model, dc_motor, torque_driven
-from motorid.numerics.autoregression import Whitening
+from motorid.numerics.autoregression import ORDER, Whitening
 from motorid.numerics.signals import Array
 from motorid.problem.problem import Problem
 from motorid.problem.runs import angle_signal
@@ -128,7 +128,7 @@ def _spectrum(tangent: Tangent, kind: str) -> Spectrum:
     # centre is an encoder's commonest fault: that once per turn needs no proof.
     travel = max(float(np.ptp(angle_signal(r))) for r in fit.problem.experiments)
     lowest = 1 if kind in READ else max(1 if relative else 2, int(np.ceil(PERIODS * 2 * np.pi / max(travel, 1e-9))))
-    if top < lowest or kind not in _kinds(fit.problem):
+    if top < lowest or kind not in _kinds(fit.problem) or max(r.n for r in fit.problem.experiments) <= ORDER:
         return Spectrum((), False)
     with np.errstate(over="ignore", invalid="ignore"):  # of a motor that runs away no order explains anything
         shares, lines = _order_search(tangent).shares(lowest, kind)

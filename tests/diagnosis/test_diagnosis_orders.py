@@ -83,3 +83,16 @@ def test_a_ripple_of_the_torque_is_told_from_one_of_the_back_emf_too(lab, shared
     assert found.after.fits == "noise"
     assert mi.fit(mi.dc_motor() + mi.effects.torque_ripple, runs).values["e_r"] == shared
     assert mi.fit(mi.dc_motor() + mi.effects.torque_ripple, runs).values["N_r"] == 7
+
+
+def test_a_piece_of_a_record_too_short_to_tell_an_order_does_no_harm(rng):
+    """A log with a pause after eight samples ended the diagnosis, "beyond what can be computed"."""
+    motor = mi.dc_motor() + mi.effects.coulomb(tau_c=8e-3)
+    t, v = np.arange(400) * 5e-3, np.repeat(rng.uniform(-8, 8, 20), 20)
+    runs = []
+    for n in (400, 8):
+        blank = mi.Experiment(t[:n], {"v": v[:n]}, {"omega": 0 * t[:n]})
+        omega = mi.simulate(motor, blank, initial="rest")[0].outputs["omega"]
+        runs.append(blank.with_(outputs={"omega": omega + rng.normal(0, 0.3, n)}))
+    found = mi.diagnose(mi.fit(mi.dc_motor(), runs), effects=["coulomb", "cogging", "encoder_zero"])
+    assert found.effects == ("coulomb",)
