@@ -106,7 +106,7 @@ def pwm_coast(m: Equations, s_c=P(0.5, "", null=0.0, lower=0.0, upper=1.5, doc="
 @effect(balance="voltage", includes=("pwm_coast",))
 def pwm_fast_decay(m: Equations, a_p=P(1.0, "", positive=True, grid=(0.3, 1.0, 3.0), doc="period of the PWM over L/R"),
                    s_f=P(1.0, "", null=0.0, vary=False, doc="share of the pauses that do so, fixed"),
-                   V_s=P(12.0, "V", positive=True, grid=(1.3, 1.0), doc="supply, the voltage of full duty")):
+                   V_s=P(12.0, "V", positive=True, grid=(1.1,), doc="supply, the voltage of full duty")):
     """PWM whose pauses lead the current back into the supply, then open. Mohan et al., Power Electronics, 2003.
 
     The bridge gives (d−φ)·V_s + (1−d−φ)·e in the mean, with e the back-EMF along the command and φ, at most 1−d, the
