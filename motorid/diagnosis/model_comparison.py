@@ -121,7 +121,7 @@ def choose(children: Sequence[Node], parent: Node) -> tuple[Node, list[Node]] | 
     chosen = reduce(lambda best, n: n if beats(n, best) else best, ordered)
     for _ in ordered:  # ties are not transitive: what is tied with the smaller model may be smaller still
         near = [n for n in ordered if n is chosen or not beats(chosen, n) or _as_likely(n, chosen)]
-        near = [n for n in near if _price(n)[:2] == min(_price(m)[:2] for m in near)]
+        near = [n for n in near if _price(n) == min(map(_price, near))]
         least = min(1 - evidence(parent, n).fall for n in near)  # no equal leaves plainly more, however unsure that is
         near = [n for n in near if (1 - PLAIN) * (1 - evidence(parent, n).fall) <= least]
         chosen = min(near, key=lambda n: (rarity(n.added), -evidence(parent, n).gain))
@@ -140,10 +140,10 @@ def _laws_as_good(chosen: Node, children: Sequence[Node], parent: Node) -> list[
             and len(n.fit.per_run) == len(parent.fit.per_run) and not n.objection]
 
 
-def _price(node: Node) -> tuple[bool, int, int]:
+def _price(node: Node) -> tuple[bool, int]:
     """What decides between equals: whether a model has a rare device in the place of dry friction (all that turns rubs,
     and few were built to brake like an eddy current), then its size."""
-    return "eddy_brake" in node.key and not rubs(node), node.size, rarity(node.added)
+    return "eddy_brake" in node.key and not rubs(node), node.size
 
 
 def rubs(node: Node) -> bool:
