@@ -84,7 +84,8 @@ def _too_large(fit: Fit, pars: Sequence[Parameter]) -> str:
     cogging is more than the motor ever makes: it would not leave its notch; or where a winding is hotter than any."""
     top = max(float(np.abs(r.inputs["v"]).max()) for r in fit.problem.experiments)
     if any(p.unit in ("K", "K/W") for p in pars) and (rise := hottest(fit)) > HOTTEST:
-        return f"the winding would be {'over ' * (rise > MELTS)}{min(rise, MELTS):.0f} K warmer, which none stands"
+        what = f"{'magnets' if pars[0].name == 'alpha_m' else 'winding'} would be {'over ' * (rise > MELTS)}"
+        return f"the {what}{min(rise, MELTS):.0f} K warmer, which none stands"
     for p in pars:
         if p.vary and p.unit in ("N·m", "N") and any(q.order for q in pars):
             made = max(fit.values["g"] * top if "g" in fit.values else
@@ -103,8 +104,8 @@ def _too_large(fit: Fit, pars: Sequence[Parameter]) -> str:
 
 
 def hottest(fit: Fit) -> float:
-    """Return by how much a winding heats up at most, K; beyond `MELTS` its resistance is that of nothing."""
-    return max((float(np.abs(s.states["dT"]).max()) for s in fit.simulations if "dT" in s.states), default=0.0)
+    """Return by how much winding or magnets heat up at most, K; beyond `MELTS` resistance is that of nothing."""
+    return max((float(np.abs(s.states[n]).max()) for s in fit.simulations for n in s.states if "dT" in n), default=0.0)
 
 
 def _emptied(fit: Fit, added: Effect, before: Fit) -> str:

@@ -15,7 +15,7 @@ from motorid.diagnosis.candidates import Stages, library
 from motorid.diagnosis.experiment_design import suggest_experiment
 from motorid.diagnosis.free_forms import WHERE
 from motorid.diagnosis.locate import acting_like, locate
-from motorid.diagnosis.misspecification import LIMITER
+from motorid.diagnosis.misspecification import LIMITER, in_turn
 from motorid.diagnosis.model_comparison import far
 from motorid.diagnosis.record_versions import parts_remark
 from motorid.diagnosis.refit import with_lags_exchanged
@@ -102,7 +102,7 @@ def _told(found: Climb, misread: str, driven: str, validated: bool, records: Seq
     ranking = found.rounds[0] if found.rounds else ()
     groups = tuple(g for g in found.groups if g[0] in names)
     rivals = found.rivals if groups[:1] == found.groups[:1] else ()
-    forms, suggestion = tuple(f.form for f in found.forms), None
+    forms, suggestion = in_turn(found.forms), None
     remaining = following(remaining, forms[0].text) if forms else remaining
     like = forms[0] if forms else next((g.form for g in found.grades if g.form is not None), None)
     missing = acting_like(missing, like) if like is not None and not names else missing

@@ -319,6 +319,9 @@ def _of_size(form: Form, span: Span, low: float, high: float) -> list[str]:
     if (span.finer > 1 and form.on != "load") or form.on == "most i":  # others compare better by few
         smooth += [f"(ca.tanh(({s} - {c}) / {wide}) + ca.tanh(({s} + {c}) / {wide}))" if both else
                    f"ca.tanh(({level} - {c}) / {wide})" for c in knees]
+    if form.channel == form.on:  # what is small is not read
+        least = np.geomspace(SOFT, BOTH_WAYS, KNEES * span.finer)
+        smooth += [f"{s} * (1 - ca.tanh(({size} - {_place(c, 0, 1)}) / {wide}))" for c in least]
     if not low < 0 < high:
         return ["1.0", *smooth]
     smooth += [f"(ca.fmax({s} - {c}, 0) - ca.fmax(-{s} - {c}, 0))" for c in knees]  # the same either way

@@ -32,7 +32,6 @@ from motorid.problem.runs import SGN_WIDTH_SHARE
 from motorid.records.checks import current_limit
 
 LIMITER = "driver_current_limit"
-SINCE_START = ("t", "distance", "most i")  # which begin anew in every part of a record, as what remembers does
 IN_ITS_PLACE = "{}, which the library lacks, predicts better in its place"
 
 
@@ -47,13 +46,11 @@ class FormGain:
     beside: bool = False  # it leaves noise beside that model, not in its place
 
 
-def better_forms(fit: Fit, rival: Fit, channels: Container[str] = CHANNELS, past: bool = False) -> list[FormGain]:
-    """Return the forms, or of the `past` alone, that added to `fit` predict these channels, and all, better than
-    `rival`, the best first. What remembers comes after a function of the present that is not surely worse.
-    """
+def better_forms(fit: Fit, rival: Fit, channels: Container[str] = CHANNELS) -> list[FormGain]:
+    """Return the forms that added to `fit` predict these channels, and all, better than `rival`, the best first. What
+    remembers comes after a function of the present that is not surely worse."""
     try:
         linear = free_forms.linearised(fit)
-        linear = replace(linear, forms=[f for f in linear.forms if not past or f.remembers or f.on in SINCE_START])
         answers = {form: Answers(fit, linear, form).predictions() for form in linear.forms}
         if far(fit) and free_forms.may_be_zeroed(fit):
             for form, plain in [(f, known) for f, known in answers.items() if f.on == "turn"]:
@@ -78,6 +75,12 @@ def better_forms(fit: Fit, rival: Fit, channels: Container[str] = CHANNELS, past
         best = gains[0].predictions
         gains.sort(key=lambda g: g.form.remembers or compare(g.predictions, best).sure)
     return gains
+
+
+def in_turn(gains: Sequence[FormGain]) -> tuple[Form, ...]:
+    """Return the forms by their gain and by what all channels leave, in turn: one sensor's error may gain most."""
+    both = zip(gains, sorted(gains, key=lambda g: -g.evidence.fall), strict=True)
+    return tuple(dict.fromkeys(g.form for pair in both for g in pair))
 
 
 def hum_of(fit: Fit, gains: Sequence[FormGain]) -> str:
@@ -289,9 +292,10 @@ def _insignificant(last: Node, effect: Effect, structure: bool, root: Node,
     open_ = [p.name for p in own if not sizes or p.name in sizes]
     known = any(fit.std[n] is not None or f"{n}_voltage" in torques for n in open_) or any(p.per_run for p in own)
     if open_ and not known:
-        smaller = without(effect.name) if sizes and not structure and far(root.fit) else None
-        if structure or not far(root.fit) or (smaller is not None and evidence(smaller, last).fall < PLAIN):
-            rest = ", and the rest is not noise" * structure
+        more = structure or bool(far(fit))  # than noise
+        smaller = without(effect.name) if sizes and not more and far(root.fit) else None
+        if more or not far(root.fit) or (smaller is not None and evidence(smaller, last).fall < PLAIN):
+            rest = ", and the rest is not noise" * more
             return f"{listed(open_)} {'is' if len(open_) == 1 else 'are'} not determined{rest}"
     return ""
 

@@ -204,6 +204,7 @@ class Reading:
     option: str
     of: Callable[[Experiment], Experiment]
     start: str = "model"  # where the fit begins; "auto" where records alone say so
+    delay: float = 0.0  # of the voltage, s
 
     def problem(self, fit: Fit) -> Problem:
         """Return the problem of the same model on records read so."""
@@ -253,7 +254,7 @@ def better_reading(fit: Fit, late: bool = False, earlier: bool = False) -> Readi
     if late and "i" in seen and len(seen) > 1:  # current and motion both follow a late voltage, not a late sensor
         readings += _best_delay(fit)
     elif not late:
-        readings += [_delay(min(d), span(d))] if not earlier and (d := dead_times(runs)) else _best_delay(fit, True)
+        readings += [delay_of(min(d), span(d))] if not earlier and (d := dead_times(runs)) else _best_delay(fit, True)
     for reading in readings:
         try:
             after = reading.fitted(fit, AS_IT_IS)
@@ -272,9 +273,9 @@ def _best_delay(fit: Fit, earlier: bool = False) -> list[Reading]:
     dt = float(np.median(np.concatenate([np.diff(r.t) for r in fit.problem.experiments])))
     for moves in DELAYS:
         samples = [n for move in moves if (n := round(best + move, 6)) < 0 or not earlier]
-        falls |= {n: _fall(fit, _delay(n * dt)) for n in samples if n not in falls}
+        falls |= {n: _fall(fit, delay_of(n * dt)) for n in samples if n not in falls}
         best = max(falls, key=lambda n: falls[n])
-    return [_delay(best * dt)] if falls[best] > PROMISING else []
+    return [delay_of(best * dt)] if falls[best] > PROMISING else []
 
 
 def _fall(fit: Fit, reading: Reading) -> float:
@@ -287,10 +288,11 @@ def _fall(fit: Fit, reading: Reading) -> float:
         return -np.inf
 
 
-def _delay(seconds: float, seen: str = "") -> Reading:
-    how = f"{seen or f'{number(abs(seconds) * 1e3, 3)} ms'} {'later' if seconds > 0 else 'earlier'} than it was logged"
-    option = f"--delay{' ' if seconds > 0 else '='}{seconds:.3g}"
-    return Reading(f"The voltage acts {how}", option, lambda r: r.delayed(seconds), "auto" if seen else "model")
+def delay_of(delay: float, seen: str = "") -> Reading:
+    """Return the reading of a voltage that acts later than logged, by `delay` (s) or as `seen`."""
+    how = f"{seen or f'{number(abs(delay) * 1e3, 3)} ms'} {'later' if delay > 0 else 'earlier'} than it was logged"
+    option = f"--delay{' ' if delay > 0 else '='}{delay:.3g}"
+    return Reading(f"The voltage acts {how}", option, lambda r: r.delayed(delay), "auto" if seen else "model", delay)
 
 
 def _readings(runs: Sequence[Experiment]) -> Iterator[Reading]:

@@ -14,14 +14,14 @@ import re
 from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial, reduce
-from itertools import chain, islice, product, takewhile, zip_longest
+from itertools import chain, islice, product, takewhile
 from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
 
 from motorid.channels import COMPUTED_INPUTS, worded
-from motorid.diagnosis import free_forms
+from motorid.diagnosis import free_forms, misspecification
 from motorid.diagnosis.free_forms import FINER, PAST, PLACE, WHERE, Form, Span
 from motorid.diagnosis.misspecification import FormGain, better_forms, chosen_functions, pitches_of, tells_the_zero
 from motorid.diagnosis.model_comparison import Node, at_noise, far
@@ -48,6 +48,7 @@ CLOSED = 300  # times that are tried as the end, or the beginning, of a constant
 FURTHER = 3  # times that a form beside those of the curve is sought
 FEW = 8  # functions at most whose places are fitted, too
 ROUNDS = 3  # of choosing functions and fitting: near the optimum slopes show what the misfit hid before
+CLEAN = 1.05  # times the noise, of which no more is known than that: what leaves less cannot be told from the law
 TASTED = 2  # functions by which forms are compared, and
 AHEAD = 2  # how many then go on, of those in short windows one
 _moments = partial(over_moments, solve=partial(solve, solver=QUICK))  # a model that is far off, in short windows
@@ -131,9 +132,9 @@ class Part:
         for f in self.functions:
             for m in {m[0]: m for m in PLACE.finditer(f)}.values():  # each once
                 f = f.replace(m[0], str(next(given)) if self.moved else m[1])
-            # Few functions are a law, which goes on; of many on a grid nothing is known beyond, nor what they drive.
-            goes_on = self.moved and self.form.balance == "sensor" and self.form.on in ("omega", "i", "v")
-            terms.append(CLIPPED.sub("z", f) if goes_on else f)
+            # Few functions are a law, which goes on, in a balance straight as R·i; of many nothing is known beyond.
+            on, law = CLIPPED.sub("z", f), self.moved and self.form.on in ("omega", "i", "v")
+            terms.append(on if law and (self.form.balance == "sensor" or "*" not in on) else f)
         return terms
 
     def unit(self, fit: Fit, bare: bool = False) -> str:
@@ -420,11 +421,7 @@ class Remainder:
             raise UsageError(f"the remainder is {self.kind}: nothing is left that a curve over a quantity predicts.")
         best = None
         with contextlib.suppress(OutOfTime), budget(SECONDS):
-            best = self._grown
-            whole = None if best is not None and best.done else self._on_whole
-            other = whole and whole._grown
-            there = [Predictions({}, g.predictions.held_out) for g in (best, other) if g]
-            best = other if other and (len(there) < 2 or compare(*there).worth_it) else best
+            best = (self._on_whole or self)._grown
         if best is None:
             raise UsageError("something predictable is left, but no curve over one quantity lowers the error on data "
                              "left out; do these hold voltages or speeds that others lack?")
@@ -434,17 +431,16 @@ class Remainder:
     def _grown(self) -> Grown | None:
         """The same, as far as it has grown; None where none helps. Raises OutOfTime before there is any."""
         short = (t for root in [self._root or self.fit] for t in _grown_in(_moments(root), root, self.forms))
-        every = chain.from_iterable(islice(some, TRIED) for some in (short, self._tried(), _beyond(self._anew)))
+        every = _by_turns(*(islice(some, TRIED) for some in (self._tried(), short, _beyond(self._anew))))
         return _best(self.fit, every, self._held or HeldOut.of(self.fit, None))
 
     @property
     def _on_whole(self) -> Remainder | None:
-        """The same on whole `_records`, where the fit is of parts, if what is lost between them predicts more."""
+        """The same on whole `_records`, where the fit is of parts: what was before each is not known there."""
         if not (runs := whole_of(self.fit, self._records)):
             return None
-        fits = [fitted_to(f, runs, QUICK) for f in dict.fromkeys((self.fit, self._root or self.fit))]
-        forms = tuple(dict.fromkeys(gain.form for f in fits for gain in better_forms(f, f, past=True)))
-        return Remainder(self.kind, fits[0], forms, self._held, fits[-1]) if forms else None
+        fit, root = fitted_to(self.fit, runs, QUICK), self._root and fitted_to(self._root, runs, QUICK)
+        return replace(self, fit=fit, _root=root, forms=misspecification.in_turn(better_forms(fit, fit)), _records=())
 
     def _tried(self) -> Iterator[tuple[Curve, Form]]:
         """Yield models and a form to fit with each, the likeliest first; what takes a fit to find only when asked for.
@@ -454,11 +450,8 @@ class Remainder:
         replaced = {name: form for name, form in self._approximating.items() if form is not None}
         if (base := self._without(replaced)) is not None:
             yield from _over_zeros(base, dict.fromkeys(replaced.values()))
-        beside = _over_zeros(self.fit, self.forms)
-        yield from islice(beside, 1)
         alone = _beyond(self._without(self._approximating) if far(self.fit) else None)
-        for pair in zip_longest(alone, beside):
-            yield from filter(None, pair)
+        yield from _by_turns(_over_zeros(self.fit, self.forms), alone)
 
     @property
     def _anew(self) -> Fit | None:
@@ -478,11 +471,19 @@ class Remainder:
         return None
 
 
+def _by_turns(*sources: Iterator[tuple[Curve, Form]]) -> Iterator[tuple[Curve, Form]]:
+    """Yield one from each source, each only when asked for, until all are at their end."""
+    for source in (waiting := list(sources)):
+        for found in islice(source, 1):
+            waiting.append(source)  # for its next turn
+            yield found
+
+
 def _beyond(base: Fit | None) -> Iterator[tuple[Curve, Form]]:
     """Yield a model, without a curve yet, with each form that predicts more than it does, the best first."""
     if base is not None:
         with contextlib.suppress(*FAILURES):
-            yield from _over_zeros(base, (gain.form for gain in better_forms(base, base)))
+            yield from _over_zeros(base, misspecification.in_turn(better_forms(base, base)))
 
 
 def _over_zeros(base: Fit, forms: Iterable[Form]) -> Iterator[tuple[Curve, Form]]:
@@ -519,9 +520,6 @@ def _zeroed_like(base: Fit, there: Fit) -> Fit | None:
     if before == after or len(runs) != len(windows):
         return base
     return _zeroed(base, {f"z_0[{k}]": free_forms.zero_of(there, w) for k, w in zip(runs, windows, strict=True)})
-
-
-CLEAN = 1.05  # times the noise, of which no more is known than that: what leaves less cannot be told from the law
 
 
 class Grown(NamedTuple):

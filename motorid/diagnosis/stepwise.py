@@ -350,10 +350,6 @@ def _looks(fit: Fit, held_out: Sequence[Experiment] | None, climbed: Callable[..
         yield found, records
     found, records = _read_late(found, records, as_it_was, climbed, look)
     yield found, records
-    if records.remarks != as_it_was.remarks:  # what is missing may look like another reading
-        here = HeldOut.of(as_it_was.fit, as_it_was.held_out)
-        if look(alone_leaving_noise, found.path[-1], as_it_was.fit, here, [gain.form for gain in found.forms]):
-            yield (found := climbed(as_it_was, 0)), (records := as_it_was)
     yield (found := look(_seen_on_whole, found, fit)), records
     found, records = _with_held_out(found, records, climbed)
     yield found, records
@@ -371,14 +367,17 @@ def _read_late(found: Climb, records: Records, as_it_was: Records, climbed: Call
     if suits:
         again = as_it_was
     elif reading := look(_late_reading, found.path):
-        late = records.read(reading)
+        first = records.reading.delay if records.reading and len(records.remarks) == len(as_it_was.remarks) + 1 else 0.0
+        both = versions.delay_of(first + reading.delay) if first and reading.delay else None  # are one
+        late = as_it_was.read(both) if both else records.read(reading)
         again = late if len(found.path) == 1 or late.suited(last)[1] else None
     if again is not None:
         anew = climbed(again)
         better = evidence(last, new := anew.path[-1])
         if better.gain > 0 and better.fall > 0:
-            if reading:
-                again = replace(again, remarks=(*records.remarks, reading.remark(last.fit, new.fit)))
+            if reading and again.reading:
+                before = last.fit if again.reading is reading or own is None else own
+                again = replace(again, remarks=(*again.remarks[:-1], again.reading.remark(before, new.fit)))
             records, found = again, anew
         found = replace(found, stopped=anew.stopped)
     return found, records
@@ -420,13 +419,13 @@ def _remembers(found: Climb, whole: Fit, held_out: Sequence[Experiment] | None) 
 
 
 def _seen_on_whole(found: Climb, whole: Fit) -> Climb:
-    """Return a climb that knows what of the time, or of what was before, predicts on whole records what is larger than
-    the noise and nothing predicts in parts of them: a sensor's zero that drifts."""
+    """Return a climb that knows what predicts on whole records what is larger than the noise and nothing predicts in
+    parts of them: a sensor's zero that drifts."""
     runs = versions.whole_of(last := found.path[-1].fit, whole.problem.experiments)
     if not (runs and found.remaining.adequate and far(last)):
         return found
     there = versions.fitted_to(last, runs, QUICK)
-    forms = better_forms(there, there, past=True)
+    forms = better_forms(there, there)
     return replace(found, forms=tuple(forms), remaining=following(found.remaining, forms[0].form.text)
                    ) if forms else found
 

@@ -23,7 +23,7 @@ def winding_heating(m: Equations,
                     C_th=P(10.0, "J/K", positive=True, grid=(0.3, 1.0, 3.0), doc="heat capacity of the winding")):
     """Heating of the winding, R(1+αΔT). Kirtley, Electric Power Principles, 2010.
 
-    ``C_th dΔT/dt = R i² − ΔT/R_th``, ΔT = 0 at the start of each run. Only α·R_th and α/C_th act on the
+    ``C_th dΔT/dt = R(1+αΔT) i² − ΔT/R_th``, ΔT = 0 at the start of each run. Only α·R_th and α/C_th act on the
     electrical signals, so α is fixed at copper's value.
     """
     dT = m.state("dT")

@@ -293,9 +293,8 @@ class Fit(Shown):
         """
         if self.formulation == "process noise":
             raise UsageError("a fit with process noise cannot be saved; its model can, mi.export(fit, 'motor.json').")
-        head = {"model": model_dict(self.model), "parameters": {
-            n: {"value": self.values[n], "std": self.std[n], "unit": p.unit, "fixed": not p.vary}
-            for n, p in self.model.parameters.items()}, "verdict": self.verdict}
+        head = {"model": model_dict(self.model), "parameters": {n: {"value": self.values[n], "std": self.std[n],
+            "unit": p.unit, "fixed": not p.vary} for n, p in self.model.parameters.items()}, "verdict": self.verdict}
         end = {f: getattr(self, f) for f in SAVED} | {"cost": self.cost, "extra": {
             k: [asdict(m) for m in v] if k in ("multipliers", "active") else v for k, v in self.extra.items()}}
         text = json_text(head, {"fit": {"problem": problem_dict(self.problem), **end}})

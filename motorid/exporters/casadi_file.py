@@ -63,9 +63,8 @@ def description(found: Fit | Model) -> dict[str, Any]:
         contents = fit_dict(found) | {"model": model_dict(model), "covariance": covariance,
                                       "data": [fingerprint(r) for r in found.problem.experiments]}
     else:
-        contents = {"model": model_dict(model), "data": [], "parameters": {
-            n: {"value": p.value, "std": None, "unit": p.unit, "fixed": not p.vary}
-            for n, p in model.parameters.items()}}
+        contents = {"model": model_dict(model), "data": [], "parameters": {n: {"value": p.value, "std": None,
+            "unit": p.unit, "fixed": not p.vary} for n, p in model.parameters.items()}}
     for name, p in model.parameters.items():
         contents["parameters"][name] |= {k: v for k in ("lower", "upper") if np.isfinite(v := getattr(p, k))}
     return contents | {"motorid": version, "export": FORMAT, "order": list(system_of(found).parameters), "versions": {

@@ -289,9 +289,8 @@ def progress(text: str, total: float | None = None, *, quiet: bool = False, at_m
     from rich.console import Console
     from rich.table import Column
 
-    columns: list[rich.ProgressColumn] = [
-        rich.SpinnerColumn(), rich.TextColumn("{task.description}", table_column=Column(overflow="ellipsis")),
-        rich.TimeElapsedColumn(table_column=Column(min_width=7))]
+    columns: list[rich.ProgressColumn] = [rich.SpinnerColumn(), rich.TextColumn("{task.description}",
+        table_column=Column(overflow="ellipsis")), rich.TimeElapsedColumn(table_column=Column(min_width=7))]
     if total:
         count = rich.TextColumn("at most") if at_most else rich.MofNCompleteColumn()
         columns += [rich.BarColumn(8), count, rich.TimeRemainingColumn(table_column=Column(min_width=7))]

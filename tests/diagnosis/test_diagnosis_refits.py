@@ -535,6 +535,17 @@ def test_a_winding_hotter_than_any_stands_is_refused():
     assert "K warmer, which none stands" in objections(hot, LIBRARY["winding_heating"])
 
 
+@pytest.mark.parametrize(("alpha_m", "why"), [(0.002, ""), (3e-4, "the magnets would be")])
+def test_magnets_hotter_than_any_are_refused(alpha_m, why):
+    t = np.arange(3000) * 1e-2
+    v = np.where(t % 6 < 4, 12.0, 6.0)
+    model = mi.dc_motor(R=2.0, L=2e-3, K=0.05, b=4e-3, J=1e-4) + mi.effects.magnet_heating(R_thm=4.0, C_thm=1.0)
+    shown = mi.simulate(model, mi.Experiment(t, {"v": v}, {"i": v, "omega": v}), initial="rest")[0].outputs
+    fit = mi.fit(model.replace(alpha_m=alpha_m), mi.Experiment(t, {"v": v}, dict(shown)))
+    assert objections(fit, LIBRARY["magnet_heating"]).startswith(why)
+    assert bool(objections(fit, LIBRARY["magnet_heating"])) == bool(why)
+
+
 def test_a_winding_that_would_melt_is_no_step_of_a_ladder(rng):
     t = np.arange(1500) * 2e-3
     v = np.repeat(rng.uniform(-6, 6, 15), 100)

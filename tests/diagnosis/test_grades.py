@@ -128,6 +128,19 @@ def test_a_size_that_could_as_well_be_zero_is_not_named(rubbing, monkeypatch, st
     assert told.why == why
 
 
+def test_a_size_that_is_open_is_not_named_beside_more_than_noise_that_nothing_predicts(rubbing, monkeypatch):
+    """Of a stirrer in a bucket a sag of no known size was named, and the errors were 1.6 times the noise."""
+    plain, check = rubbing
+    held, rubs = HeldOut.of(plain, check), mi.fit(plain.model + mi.effects.coulomb, plain.problem.experiments)
+    certain = rubs.std | {"tau_c": None}
+    monkeypatch.setattr(mi.Fit, "std", property(lambda fit: certain))
+    monkeypatch.setattr(misspecification, "far", lambda fit: ["i"])
+    nodes = node_of(rubs, held), node_of(plain, held)
+    smaller = mi.fit(plain.model, plain.problem.experiments)
+    (told,) = misspecification.grades_of(*nodes, (), (), False, lambda name: node_of(smaller, held))
+    assert (told.grade, told.why) == ("approximates", "tau_c is not determined, and the rest is not noise")
+
+
 @pytest.mark.parametrize(("name", "grade"), [("coulomb", "named"), ("winding_heating", "approximates")])
 def test_without_a_current_a_torque_is_known_as_a_voltage_and_a_heat_is_not(rubbing, name, grade):
     """In runs of two seconds a "heating" was named, of no known size, and the rest was no noise."""

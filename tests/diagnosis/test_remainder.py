@@ -33,7 +33,7 @@ from motorid.diagnosis.free_forms import (
     values_of,
 )
 from motorid.diagnosis.locate import locate
-from motorid.diagnosis.predictive_score import HeldOut
+from motorid.diagnosis.predictive_score import Evidence, HeldOut
 from motorid.diagnosis.remainder import Curve, Part, Remainder
 from motorid.estimation.fit import over_moments, solve
 from motorid.exporters.export import load
@@ -475,6 +475,44 @@ def test_a_sensor_that_reads_up_quickly_and_down_late_is_found(lab):
     assert max(after[c] / floor[c] for c in after) < 1.15
 
 
+@mi.effect(balance="voltage")
+def worn_leg(m, R_n=mi.P(0.5, "Ω", null=0.0)):
+    """A transistor that resists in one direction."""
+    m.voltage -= R_n * ca.fmin(m.i, 0)
+
+
+def test_a_straight_law_goes_on_beyond_the_currents_that_were_seen(lab):
+    runs, floor = _with_law(worn_leg, ANGLE[:2], lab, sizes=(0.5, 0.5, 1))
+    assert np.ptp(runs[2].outputs["i"]) > 1.5 * np.ptp(runs[0].outputs["i"])
+    root = mi.fit(mi.dc_motor(), runs[:2])
+    (form,) = (f for f in free_forms.FORMS if f.text == "a loss of voltage that changes with the current")
+    left = Remainder("structure", root, (form,), HeldOut.of(root, None), root)
+    after = mi.evaluate(left.fitted, runs[2]).nrmse
+    assert max(after[c] / floor[c] for c in after) < 1.05
+
+
+def test_forms_are_tried_by_their_gain_and_by_what_they_leave_in_turn():
+    """An error of one sensor gains most where it leaves that one white, and leaves the others as they were."""
+    falls = {"i": 0.5, "v": 0.4, "omega": 0.7}
+    gains = [grades.FormGain(Form("", "torque", on), Evidence(1.0, 0.1, fall), None) for on, fall in falls.items()]
+    assert [form.on for form in grades.in_turn(gains)] == ["i", "omega", "v"]
+    assert grades.in_turn([]) == ()
+
+
+def test_models_and_forms_are_taken_from_each_source_in_turn_and_only_when_asked_for():
+    asked = []
+
+    def source(name, count):
+        for k in range(count):
+            asked.append(name)
+            yield f"{name}{k}"
+
+    turns = remainder._by_turns(source("a", 3), source("b", 0), source("c", 1))
+    assert next(turns) == "a0"
+    assert asked == ["a"]
+    assert [*turns] == ["c0", "a1", "a2"]
+
+
 @mi.effect(balance="torque")
 def run_in(m, tau_c=mi.P(8e-3, "N·m", null=0.0), way=mi.P(60.0, "rad", positive=True)):
     """A dry friction that falls to a third with the distance run."""
@@ -809,7 +847,14 @@ def shared_ground(m, k_g=mi.P(2.0, "rad/s/A", null=0.0)):
     m.measure("omega", m.measured("omega") + k_g * m.i * ca.fabs(m.i))
 
 
+@mi.effect(balance="sensor")
+def timed_out(m, w_min=mi.P(15.0, "rad/s", null=0.0)):
+    """A speed from the time between pulses, which reads zero where the next one takes too long."""
+    m.measure("omega", m.measured("omega") * 0.5 * (1 + ca.tanh((ca.fabs(m.omega) - w_min) / 0.05)))
+
+
 @pytest.mark.parametrize(("law", "words"), [
+    (timed_out, "an error of the speed sensor that changes with the speed"),
     (humming, "a loss of voltage that changes with the time"),
     (thermistor, "a resistance that depends on the heat of the current before"),
     (hardening, "a load that changes with the angle"),
@@ -818,7 +863,7 @@ def shared_ground(m, k_g=mi.P(2.0, "rad/s/A", null=0.0)):
     (coil, "a motor constant that changes with the angle"),
     (shared_ground, "an error of the speed sensor that changes with the current")])
 def test_what_hums_heats_hardens_or_is_a_lobe_is_found_with_few_functions(law, words, lab):
-    runs, floor = _with_law(law, ANGLE if law in (hardening, lobe, latch, coil) else ANGLE[:2], lab)
+    runs, floor = _with_law(law, ANGLE if law in (hardening, lobe, latch, coil, timed_out) else ANGLE[:2], lab)
     found = mi.diagnose(mi.fit(mi.dc_motor(), runs[:2]), runs[2:], effects=("coulomb", "brush_drop"))
     effect = found.remainder.as_effect()
     assert effect.doc == f"What is left: {words}."
@@ -860,13 +905,14 @@ def test_what_a_curve_alone_leaves_as_noise_is_not_named(lab, monkeypatch):
     assert (found.verdict, found.effects, found.stopped) == ("missing", ("coulomb",), "interrupted")
 
 
-def _with_law(law, channels, lab):
+def _with_law(law, channels, lab, sizes=(1, 1, 1)):
     """Return three runs of the lab motor with a law beside it, the last to hold out, and the error of its noise."""
     rng = np.random.default_rng(3)
     plain = [record(driven(lab, {}, w, 800, 1e-3, rng), "logger", channels, lab, rng, w) for w in FAST]
     model = mi.fit(mi.dc_motor(), plain).model + law
     runs = []
-    for run in plain:
+    for run, size in zip(plain, sizes, strict=True):
+        run = run.with_(inputs={"v": size * run.inputs["v"]})
         clean = mi.simulate(model, run)[0].outputs
         runs.append(run.with_(outputs={c: y + 0.005 * np.std(y) * rng.standard_normal(len(y))
                                        for c, y in clean.items()}))

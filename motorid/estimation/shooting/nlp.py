@@ -168,9 +168,8 @@ def ipopt(nlp: ShootingNlp, z0: Array, bounds: tuple[Array, Array], options: Map
         told |= {"mu_strategy": "monotone", "mu_init": 1e-7, "warm_start_init_point": "yes",
                  "warm_start_bound_push": 1e-9, "warm_start_mult_bound_push": 1e-9, "warm_start_slack_bound_push": 1e-9}
         start |= {"lam_g0": warm.lam_g * nlp.scale, "lam_x0": warm.lam_x * nlp.scale}
-    solver = ca.nlpsol("solver", "ipopt", function, {
-        **derivatives, "no_nlp_grad": True, "calc_lam_p": False, "print_time": False, "show_eval_warnings": False,
-        "error_on_fail": False, "ipopt": told})
+    solver = ca.nlpsol("solver", "ipopt", function, {**derivatives, "no_nlp_grad": True, "calc_lam_p": False,
+        "print_time": False, "show_eval_warnings": False, "error_on_fail": False, "ipopt": told})
     found = solver(**start, lbx=bounds[0], ubx=bounds[1], lbg=nlp.lower, ubg=nlp.upper)
     x, lam_g, lam_x = (np.asarray(found[name]).ravel() for name in ("x", "lam_g", "lam_x"))
     stats = solver.stats()
