@@ -4,6 +4,7 @@ import tracemalloc
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import replace
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -671,3 +672,21 @@ def test_what_stopped_far_from_the_noise_goes_on_as_a_whole_fit(monkeypatch):
     monkeypatch.setattr(search, "led_on", lambda fit: None)
     found = tried.brought_to_its_end(node).fit
     assert max(found.misfit.values()) < 1.5 < max(begun.misfit.values()) / 2, found.misfit
+
+
+def test_a_voltage_that_acts_earlier_and_then_later_is_one_delay(lab, monkeypatch):
+    """Of the same records "11.8 ms earlier" and "5.75 ms later" was said; with a third between them all stay."""
+    rng = np.random.default_rng(3)
+    run = record(driven(lab, {}, "steps", 800, 1e-3, rng), "logger", ("i", "omega"), lab, rng, "steps")
+    fit = mi.fit(mi.dc_motor(), run)
+    as_it_was = stepwise.Records(fit, None)
+    once = as_it_was.read(parts.delay_of(-0.012))
+    monkeypatch.setattr(stepwise, "_late_reading", lambda path: parts.delay_of(0.005))
+    twice = once.read(parts.delay_of(0.001))
+    for records, remarks in ((once, ["7 ms earlier"]), (twice, ["12 ms earlier", "1 ms later", "5 ms later"])):
+        found = stepwise.Climb(None, (node_of(records.fit, held.HeldOut.of(fit, None)),), (), (), "", None, None)
+        climbed = Mock(return_value=found)
+        stepwise._read_late(found, records, as_it_was, climbed, lambda at, *given: at(*given))
+        told = climbed.call_args.args[0].remarks
+        assert len(told) == len(remarks)
+        assert all(said in remark for said, remark in zip(remarks, told, strict=True))
