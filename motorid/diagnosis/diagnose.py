@@ -99,8 +99,7 @@ def _told(found: Climb, misread: str, driven: str, validated: bool, records: Seq
     fit, ladder, remaining = found.search.root.fit, ladder_of(found, validated), found.remaining
     missing, judged, last, units = locate(fit), found.first, found.path[-1], units_of(fit.problem.experiments)
     names = tuple(g.effect for g in found.grades if g.grade != "approximates")
-    ranking = found.rounds[0] if found.rounds else ()
-    groups = tuple(g for g in found.groups if g[0] in names)
+    ranking, groups = found.rounds[0] if found.rounds else (), tuple(g for g in found.groups if g[0] in names)
     rivals = found.rivals if groups[:1] == found.groups[:1] else ()
     forms, suggestion = in_turn(found.forms), None
     remaining = following(remaining, forms[0].text) if forms else remaining
@@ -129,7 +128,8 @@ def _told(found: Climb, misread: str, driven: str, validated: bool, records: Seq
     else:
         verdict, where, judged = "adequate", None, remaining
         answer, *details = words.adequate_text(judged, ranking, ladder.best)
-    kind = "structure" if not remaining.adequate else "fluctuation" if far(ladder.best) else "noise"
+    more = "structure" if verdict == "unexplained" else "fluctuation"  # what imitates a structure hides it
+    kind = "structure" if not remaining.adequate else more if far(ladder.best) else "noise"
     details += [] if names else [words.unseen_remark(found.search.unseen(last), fit.model.base)]
     told = partial(worded, units=units, names=[run.name for run in fit.problem.experiments])
     answer, *details = (told(t) for t in (misread + answer, *details, *_remarks(found, driven)) if t)

@@ -289,14 +289,13 @@ def _insignificant(last: Node, effect: Effect, structure: bool, root: Node,
         smaller = without(effect.name)  # deviations are of slopes, and zero may be far from where these hold
         if smaller is None or evidence(smaller, last).fall < PLAIN:
             return f"{listed(sizes)} could as well be zero, within two standard deviations"
-    open_ = [p.name for p in own if not sizes or p.name in sizes]
-    known = any(fit.std[n] is not None or f"{n}_voltage" in torques for n in open_) or any(p.per_run for p in own)
-    if open_ and not known:
+    free = [p.name for p in own if not sizes or p.name in sizes]
+    known = any(fit.std[n] is not None or f"{n}_voltage" in torques for n in free) or any(p.per_run for p in own)
+    if free and not known:
         more = structure or bool(far(fit))  # than noise
         smaller = without(effect.name) if sizes and not more and far(root.fit) else None
         if more or not far(root.fit) or (smaller is not None and evidence(smaller, last).fall < PLAIN):
-            rest = ", and the rest is not noise" * more
-            return f"{listed(open_)} {'is' if len(open_) == 1 else 'are'} not determined{rest}"
+            return f"{listed(free)} {'are' if free[1:] else 'is'} not determined{', and the rest is not noise' * more}"
     return ""
 
 
