@@ -341,7 +341,8 @@ class Remainder:
     Attributes
     ----------
     kind : {"noise", "fluctuation", "structure"}
-        ``fluctuation``: larger than the noise of the sensors, and nothing predicts it; ``structure``: predictable.
+        ``fluctuation``: larger than the noise of the sensors, and nothing predicts it; ``structure``: predictable, or
+        perhaps hidden by effects that only approximate it.
     fit : Fit
         Of the model that leaves it.
     forms : tuple of Form

@@ -19,6 +19,7 @@ from motorid.diagnosis import (
     refit,
     stepwise,
 )
+from motorid.diagnosis import diagnose as diagnosing
 from motorid.diagnosis.adequacy import adequacy
 from motorid.diagnosis.admissibility import objections
 from motorid.diagnosis.candidates import library
@@ -109,6 +110,22 @@ def test_what_a_free_form_outdoes_in_its_place_approximates(lab):
     assert found.effects == ()
     accepted = next(c for c in found.ranking if c.effect == "coulomb")
     assert accepted.accepted  # it stays in the ladder
+
+
+def test_what_imitates_a_curve_does_not_hide_it_where_nothing_predicts_the_rest(lab, monkeypatch):
+    """A shaft and a clutch, none of them named, left 1.6 times the noise of a stirrer, and the curve was not sought."""
+    runs = runs_of(lab, {"grease_warm_up": {"tau_c": 3e-3, "extra": 4.0, "t_g": 0.3}})
+    explored = diagnosing.explored
+
+    def unpredicted(*given):
+        found, misread = explored(*given)
+        return replace(found, remaining=replace(found.remaining, adequate=True), forms=()), misread
+
+    monkeypatch.setattr(diagnosing, "explored", unpredicted)
+    found = mi.diagnose(mi.fit(mi.dc_motor(), runs[:2]), runs[2:], effects=("coulomb",))
+    assert (found.verdict, found.effects, found.remaining.adequate) == ("unexplained", (), True)
+    assert found.remainder.kind == "structure"
+    assert found.remainder.as_effect().doc == "What is left: a friction that changes with the time."
 
 
 @pytest.mark.parametrize(("std", "structure", "why"), [
