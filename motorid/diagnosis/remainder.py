@@ -341,8 +341,7 @@ class Remainder:
     Attributes
     ----------
     kind : {"noise", "fluctuation", "structure"}
-        ``fluctuation``: larger than the noise of the sensors, and nothing predicts it; ``structure``: predictable, or
-        perhaps hidden by effects that only approximate it.
+        ``fluctuation``: more than noise, unpredictable; ``structure``: predictable, or hidden by what imitates it.
     fit : Fit
         Of the model that leaves it.
     forms : tuple of Form
@@ -422,7 +421,9 @@ class Remainder:
             raise UsageError(f"the remainder is {self.kind}: nothing is left that a curve over a quantity predicts.")
         best = None
         with contextlib.suppress(OutOfTime), budget(SECONDS):
-            best = (self._on_whole or self)._grown
+            with contextlib.suppress(OutOfTime), budget(SECONDS / 2):  # they may be many times as long
+                best = (whole := self._on_whole) and whole._grown
+            best = best or self._grown
         if best is None:
             raise UsageError("something predictable is left, but no curve over one quantity lowers the error on data "
                              "left out; do these hold voltages or speeds that others lack?")

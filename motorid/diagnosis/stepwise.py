@@ -424,8 +424,7 @@ def _seen_on_whole(found: Climb, whole: Fit) -> Climb:
     runs = versions.whole_of(last := found.path[-1].fit, whole.problem.experiments)
     if not (runs and found.remaining.adequate and far(last)):
         return found
-    there = versions.fitted_to(last, runs, QUICK)
-    forms = better_forms(there, there)
+    forms = better_forms(there := versions.fitted_to(last, runs, QUICK), there)
     return replace(found, forms=tuple(forms), remaining=following(found.remaining, forms[0].form.text)
                    ) if forms else found
 

@@ -8,6 +8,7 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from functools import partial
 from multiprocessing import get_context
+from unittest.mock import Mock
 
 import casadi as ca
 import numpy as np
@@ -489,6 +490,15 @@ def test_a_straight_law_goes_on_beyond_the_currents_that_were_seen(lab):
     left = Remainder("structure", root, (form,), HeldOut.of(root, None), root)
     after = mi.evaluate(left.fitted, runs[2]).nrmse
     assert max(after[c] / floor[c] for c in after) < 1.05
+
+
+def test_where_whole_records_take_too_long_the_parts_tell(lab, monkeypatch):
+    runs, _ = _with_law(worn_leg, ANGLE[:2], lab)
+    root = mi.fit(mi.dc_motor(), runs[:2])
+    (form,) = (f for f in free_forms.FORMS if f.text == "a loss of voltage that changes with the current")
+    monkeypatch.setattr(Remainder, "_on_whole", property(lambda left: Mock(_grown=None)))
+    left = Remainder("structure", root, (form,), HeldOut.of(root, None), root)
+    assert left.as_effect().doc == f"What is left: {form.text}."
 
 
 def test_forms_are_tried_by_their_gain_and_by_what_they_leave_in_turn():
