@@ -368,8 +368,8 @@ def _read_late(found: Climb, records: Records, as_it_was: Records, climbed: Call
         again = as_it_was
     elif reading := look(_late_reading, found.path):
         first = records.reading.delay if records.reading and len(records.remarks) == len(as_it_was.remarks) + 1 else 0.0
-        both = versions.delay_of(first + reading.delay) if first and reading.delay else None  # are one
-        late = as_it_was.read(both) if both else records.read(reading)
+        both = first + reading.delay if first and reading.delay else 0.0  # are one, unless one takes the other back
+        late = as_it_was.read(versions.delay_of(both)) if both else records.read(reading)
         again = late if len(found.path) == 1 or late.suited(last)[1] else None
     if again is not None:
         anew = climbed(again)

@@ -683,7 +683,9 @@ def test_a_voltage_that_acts_earlier_and_then_later_is_one_delay(lab, monkeypatc
     once = as_it_was.read(parts.delay_of(-0.012))
     monkeypatch.setattr(stepwise, "_late_reading", lambda path: parts.delay_of(0.005))
     twice = once.read(parts.delay_of(0.001))
-    for records, remarks in ((once, ["7 ms earlier"]), (twice, ["12 ms earlier", "1 ms later", "5 ms later"])):
+    back = as_it_was.read(parts.delay_of(-0.005))
+    for records, remarks in ((once, ["7 ms earlier"]), (twice, ["12 ms earlier", "1 ms later", "5 ms later"]),
+                             (back, ["5 ms earlier", "5 ms later"])):
         found = stepwise.Climb(None, (node_of(records.fit, held.HeldOut.of(fit, None)),), (), (), "", None, None)
         climbed = Mock(return_value=found)
         stepwise._read_late(found, records, as_it_was, climbed, lambda at, *given: at(*given))

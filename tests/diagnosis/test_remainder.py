@@ -501,12 +501,14 @@ def test_where_whole_records_take_too_long_the_parts_tell(lab, monkeypatch):
     assert left.as_effect().doc == f"What is left: {form.text}."
 
 
-def test_forms_are_tried_by_their_gain_and_by_what_they_leave_in_turn():
+def test_forms_are_tried_by_their_gain_and_by_what_they_leave_in_turn(monkeypatch):
     """An error of one sensor gains most where it leaves that one white, and leaves the others as they were."""
     falls = {"i": 0.5, "v": 0.4, "omega": 0.7}
     gains = [grades.FormGain(Form("", "torque", on), Evidence(1.0, 0.1, fall), None) for on, fall in falls.items()]
     assert [form.on for form in grades.in_turn(gains)] == ["i", "omega", "v"]
     assert grades.in_turn([]) == ()
+    monkeypatch.setattr(remainder, "better_forms", lambda fit, rival: gains)
+    assert [form.on for _, form in remainder._beyond(Mock(model=Mock(effect_names=())))] == ["i", "omega", "v"]
 
 
 def test_models_and_forms_are_taken_from_each_source_in_turn_and_only_when_asked_for():
@@ -749,15 +751,19 @@ def test_what_changes_in_sensors_inertia_and_supply_is_found(law, channels, foll
     assert max(before[c] / after[c] for c in after) > 2.5
 
 
-def test_what_happened_before_a_part_of_a_record_shows_on_whole_ones(lab):
-    """In parts the distance run is that of each alone."""
+def test_what_happened_before_a_part_of_a_record_shows_on_whole_ones(lab, monkeypatch):
+    """In parts the distance run is that of each alone: they are not looked at where whole ones tell."""
     runs, floor = _with_law(run_in, ANGLE[:2], lab)
     cut = [(r, p) for r in runs[:2] for p in windows(r, r.duration / 5)]
     cut = [p.with_(meta={**p.meta, "part of": (r.name, r.n)}) for r, p in cut]
     parts = mi.fit(mi.dc_motor(), cut)
     left = Remainder("structure", parts, _held=HeldOut.of(parts, runs[2:]), _root=parts, _records=runs[:2])
     assert left._grown is None or not left._grown.done
+    looked, grown = list[int](), Remainder._grown.fget
+    monkeypatch.setattr(Remainder, "_grown", property(
+        lambda left: looked.append(len(left.fit.problem.experiments)) or grown(left)))
     assert left.as_effect().doc == "What is left: a friction that changes with the distance run."
+    assert looked == [2]
     after = mi.evaluate(left.fitted, runs[2]).nrmse
     assert max(after[c] / floor[c] for c in after) < 1.1
 
